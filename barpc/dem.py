@@ -56,7 +56,7 @@ class HeightGrid:
 
     @classmethod
     def open(cls, path: Path | str) -> HeightGrid:
-        """A grid from ``.hgt`` (SRTM), ``.gtx`` (NOAA's geoid grids) or any raster with a CRS; or InputError."""
+        """Return a grid from ``.hgt`` (SRTM), ``.gtx`` (NOAA's geoid grids) or any raster with a CRS; or InputError."""
         path = place(path)
         with opened(path, GRID) as file:
             length = file.seek(0, 2)
@@ -83,13 +83,13 @@ class HeightGrid:
         return cls(path, driver, shape, crs, to_pixel, float(extent.left), reference, period)
 
     def read(self, top: int, bottom: int, left: int, right: int) -> Array:
-        """Heights (bottom - top, right - left) [m] of a window, NaN in voids."""
+        """Read the heights (bottom - top, right - left) [m] of a window, NaN in voids."""
         with open_raster(self.path, self.driver) as dataset:
             window = Window.from_slices((top, bottom), (left, right))
             return np.asarray(dataset.read(1, window=window, masked=True).astype(np.float64).filled(np.nan))
 
     def locate(self, lon: Array, lat: Array) -> tuple[Array, Array]:
-        """Fractional row, col (N,) of lon, lat (N,) [deg], node centres at integers."""
+        """Return the fractional row, col (N,) of lon, lat (N,) [deg], node centres at integers."""
         if self.crs.is_geographic:
             x, y = self.west + np.mod(lon - self.west, 360.0), lat
         else:
@@ -102,7 +102,7 @@ class HeightGrid:
         return _snapped(d * x + e * y + f - 0.5), _snapped(a * x + b * y + c - 0.5)
 
     def sample(self, lon: npt.ArrayLike, lat: npt.ArrayLike) -> Array:
-        """Bilinear heights (...) [m] at lon, lat (...) [deg]; NaN outside and where a void has weight."""
+        """Return the bilinear heights (...) [m] at lon, lat (...) [deg]; NaN outside and where a void has weight."""
         lon, lat = np.broadcast_arrays(np.asarray(lon, np.float64), np.asarray(lat, np.float64))
         row, col = self.locate(lon.ravel(), lat.ravel())
         if self.period:
@@ -118,7 +118,9 @@ class HeightGrid:
         return height.reshape(lon.shape)
 
     def extremes(self, at: Array) -> tuple[float, float]:
-        """Lowest and highest height [m] in the window around fractional row, col (2, N); infinite where unknown."""
+        """Return the lowest and highest height [m] in the window around fractional row, col (2, N); infinite
+        where unknown.
+        """
         at, limits = at[:, np.isfinite(at).all(axis=0)], np.array(self.shape)
         if not at.size or self.period:  # around the Earth columns have no window
             return -np.inf, np.inf
@@ -247,7 +249,7 @@ def localize_on_terrain(
     terrain: Callable[[Array, Array], Array],
     alt_range: tuple[float, float],
 ) -> Array:
-    """Where lines of sight first meet the terrain, coming from the sensor.
+    """Return where lines of sight first meet the terrain, coming from the sensor.
 
     Lines are walked down by quarters of the posts of a `Dem` (of another terrain, in 64 steps) until they are below the
     terrain, then halved. A BarpcWarning where a line meets none and the terrain reaches out of `alt_range`.

@@ -105,7 +105,8 @@ _FRAME = "frame"
 
 
 def to_arrays(value: Any) -> Arrays:
-    """Named arrays that hold a value: its arrays with their type and bits, and around them a text (JSON).
+    """Return the named arrays that hold a value: its arrays with their type and bits, and around them a text
+    (JSON).
 
     A value is None, bool, int, float, str, an array, tuple, list, mapping with string keys, or a dataclass of barpc
     of such; TypeError where anything else is in it.
@@ -122,7 +123,8 @@ def to_arrays(value: Any) -> Arrays:
 
 
 def from_arrays(arrays: Mapping[str, npt.NDArray[Any]], *, sent: bool = False) -> Any:
-    """The value that `to_arrays` took apart; ValueError where it is damaged or names no loaded dataclass of barpc.
+    """Return the value that `to_arrays` took apart; ValueError where it is damaged or names no loaded
+    dataclass of barpc.
 
     A Remote is taken of arrays that were `sent` by our own process only: those of a file may be anybody's.
     """
@@ -183,7 +185,8 @@ _HEADER = 1 << 12
 
 
 def load_npz(path: Path | str, kind: Kind = ARRAYS) -> Arrays:
-    """The arrays of an ``.npz`` file, unpacked of no more bytes than `kind` allows; errors are of its class.
+    """Return the arrays of an ``.npz`` file, unpacked of no more bytes than `kind` allows; errors are of its
+    class.
 
     What the archive claims is added up before anything is unpacked: a few kilobytes can hold gigabytes of zeros.
     """

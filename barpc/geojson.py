@@ -10,7 +10,8 @@ from barpc.geodesy import Array
 
 
 def polygon(ring: Array) -> dict[str, Any] | None:
-    """The geometry of a footprint: counter-clockwise, closed; led to the pole where it goes once around one.
+    """Return the geometry of a footprint: counter-clockwise, closed; led to the pole where it goes once
+    around one.
 
     Of a ring (N, 2) as `barpc.sensor.geometry.footprint` gives it; a MultiPolygon where the antimeridian cuts it, None
     for an outline that is not finite.
@@ -39,12 +40,12 @@ def polygon(ring: Array) -> dict[str, Any] | None:
 
 
 def feature(ring: Array, **properties: Any) -> dict[str, Any]:
-    """A Feature of a footprint with its properties."""
+    """Return a Feature of a footprint with its properties."""
     return {"type": "Feature", "properties": properties, "geometry": polygon(ring)}
 
 
 def collection(features: list[dict[str, Any]]) -> dict[str, Any]:
-    """A FeatureCollection."""
+    """Return a FeatureCollection."""
     return {"type": "FeatureCollection", "features": features}
 
 

@@ -70,7 +70,7 @@ class Reading:
 def control_grid(
     model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]
 ) -> tuple[Array, Array]:
-    """Ground points (N, 3) over an image and its altitudes, and where `model` sees them (N, 2) [px]."""
+    """Return the ground points (N, 3) over an image and its altitudes, and where `model` sees them (N, 2) [px]."""
     ground = model.localize(*image_grid(size, alt_range))
     ground = ground[np.isfinite(ground).all(axis=1)]
     return ground, model.project(ground)
@@ -79,7 +79,9 @@ def control_grid(
 def difference(
     model: SensorModel, other: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]
 ) -> float:
-    """Largest distance [px] between two cameras of one image over the image and its altitudes; NaN if blind."""
+    """Return the largest distance [px] between two cameras of one image over the image and its altitudes; NaN
+    if blind.
+    """
     ground, image = control_grid(model, size, alt_range)
     return _largest(other.project, ground, image) if len(ground) else float("nan")
 
@@ -154,7 +156,7 @@ def _grid_reading(
 
 
 def unverified(paths: Sequence[Path | str]) -> list[str]:
-    """A sentence for each kind of these files that no installed tool but barpc reads."""
+    """Return a sentence for each kind of these files that no installed tool but barpc reads."""
     files = [
         path for path in map(Path, paths) if not path.name.endswith(STATE_END)
     ]  # whose readers are no packages

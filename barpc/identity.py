@@ -39,11 +39,11 @@ class Stamp:
         return cls(found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino, found.st_dev, _HOST)
 
     def times(self) -> tuple[int, int, int]:
-        """What every host sees alike."""
+        """Return what every host sees alike."""
         return self.size, self.mtime_ns, self.ctime_ns
 
     def matches(self, other: Stamp) -> bool:
-        """Whether both are of one file; the numbers of devices are each host's own."""
+        """Return whether both are of one file; the numbers of devices are each host's own."""
         same = self.times() == other.times() and self.inode == other.inode
         return same and (self.host != other.host or self.device == other.device)
 
@@ -98,7 +98,7 @@ _known: dict[str, Stamp] = {}  # files whose bytes were asked by this process
 
 
 def changed(path: str) -> InputError:
-    """The one line for a file that is no longer what it was."""
+    """Return the one line for a file that is no longer what it was."""
     return InputError(
         f"{path}: was changed or replaced while the run was at work; nothing of it is kept; run the same command again"
     )

@@ -102,7 +102,7 @@ class Declared:
 
 
 def declared(record: type[Options]) -> Mapping[str, Declared]:
-    """Field -> what is declared of it; a nested record has an empty rule."""
+    """Return the field -> what is declared of it; a nested record has an empty rule."""
     kind: Any = record  # a class can be hashed
     found: Mapping[str, Declared] = _declared(kind)
     return found
@@ -655,7 +655,7 @@ def with_values(options: Record, values: Mapping[str, Any], where: str = "option
 
 
 def read_options(path: str | Path, options: RunOptions | None = None) -> RunOptions:
-    """Options from a TOML file: top-level keys, and the tables [tie], [adjust], [fit].
+    """Read the options from a TOML file: top-level keys, and the tables [tie], [adjust], [fit].
 
     InputError where it does not exist or parse, or holds an unknown option or a value that it cannot have.
     """

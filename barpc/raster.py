@@ -154,7 +154,7 @@ def _mosaic(file: Place, name: str) -> Mosaic:
 
 
 def hashed(path: Place | str) -> Input:
-    """A file, hashed; a VRT with the sources that it shows. ImageError where one cannot be read."""
+    """Return a file, hashed; a VRT with the sources that it shows. ImageError where one cannot be read."""
     try:
         if isinstance(path, Remote) or driver_of(read_head(path, IMAGE, 64)) != "VRT":
             return identity.take(path)
@@ -170,7 +170,9 @@ def hashed(path: Place | str) -> Input:
 
 
 def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[Place, str]:
-    """Absolute path (or Remote) of a raster and the only driver that may open it, given or by its first bytes."""
+    """Return the absolute path (or Remote) of a raster and the only driver that may open it, given or by its
+    first bytes.
+    """
     name = os.fspath(path)
     if not isinstance(path, Remote) and INDIRECT.match(name) and not os.path.lexists(name):
         raise ImageError(f"{name}: remote and virtual paths are not read")
@@ -185,7 +187,7 @@ def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[P
 
 
 def driver_of(head: bytes) -> str | None:
-    """The driver for a file with these first bytes; None where no raster begins so."""
+    """Return the driver for a file with these first bytes; None where no raster begins so."""
     return next((driver for magic, driver in DRIVERS.items() if head.startswith(magic)), None)
 
 
@@ -243,13 +245,13 @@ class Mosaic:
         return points, self._crs(self._vrt.gcp_srs)
 
     def tags(self) -> dict[str, str]:
-        """Metadata of the default domain."""
+        """Return the metadata of the default domain."""
         return dict(self._vrt.metadata.get("", {}))
 
     def read(
         self, indexes: int | Sequence[int] | None = None, window: Window | None = None, masked: bool = False
     ) -> Pixels:
-        """Pixels of one band (H, W), or of several (bands, H, W); masked where they mean nothing, if asked."""
+        """Read the pixels of one band (H, W), or of several (bands, H, W); masked where they mean nothing, if asked."""
         wanted = [indexes] if isinstance(indexes, int) else list(indexes or self.indexes)
         box = self._box(window)
         pixels = np.stack([self._assembled(self._vrt.bands[i - 1], box) for i in wanted])
@@ -259,7 +261,7 @@ class Mosaic:
         return pixels[0] if isinstance(indexes, int) else pixels
 
     def read_masks(self, index: int, window: Window | None = None) -> npt.NDArray[np.uint8]:
-        """0 where a pixel of a band (H, W) means nothing: by the VRT's mask, nodata or alpha band."""
+        """Read 0 where a pixel of a band (H, W) means nothing: by the VRT's mask, nodata or alpha band."""
         box, band = self._box(window), self._vrt.bands[index - 1]
         if self._vrt.mask is not None:
             return np.asarray(self._assembled(self._vrt.mask, box), np.uint8)
@@ -271,7 +273,7 @@ class Mosaic:
         return np.full((box[3], box[2]), 255, np.uint8)
 
     def plain_source(self) -> Path | None:
-        """The raster that the VRT shows whole, as it is and alone; None if there is no such."""
+        """Return the raster that the VRT shows whole, as it is and alone; None if there is no such."""
         files = {source.file for source in self._vrt.sources}
         if len(files) != 1:
             return None

@@ -234,12 +234,16 @@ def _seen(view: IntArray, sigma: Array) -> str:
 
 
 def middle_altitude(views: Sequence[View]) -> float:
-    """Mean of the middle altitudes of views [m]: where points that several of them see are looked for first."""
+    """Return the mean of the middle altitudes of views [m]: where points that several of them see are looked
+    for first.
+    """
     return float(np.mean([view.alt_range for view in views]))
 
 
 def connected_labels(num: int, links: npt.ArrayLike) -> IntArray:
-    """Connected component (num,) of each of `num` nodes, numbered by its first node; links (M, 2) join two."""
+    """Return the connected component (num,) of each of `num` nodes, numbered by its first node; links (M, 2)
+    join two.
+    """
     first, second = np.asarray(links, dtype=np.int64).reshape(-1, 2).T
     graph = coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(num, num))
     label: IntArray = connected_components(graph, directed=False)[1].astype(np.int64)
@@ -247,7 +251,7 @@ def connected_labels(num: int, links: npt.ArrayLike) -> IntArray:
 
 
 def connected_groups(num_views: int, pairs: Sequence[tuple[int, int]]) -> list[list[int]]:
-    """Connected components of the views, the largest first (then by first view); each ascending."""
+    """Return the connected components of the views, the largest first (then by first view); each ascending."""
     groups: dict[int, list[int]] = {}
     for view, label in enumerate(connected_labels(num_views, pairs).tolist() if num_views else []):
         groups.setdefault(label, []).append(view)

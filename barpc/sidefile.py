@@ -111,7 +111,7 @@ def opened(path: Path | str, kind: Kind) -> Iterator[BinaryIO]:
 
 
 def versioned(path: Place, kind: Kind) -> Place:
-    """A Remote with the version that its file has now, which all who are given it read; a Path as it is."""
+    """Return a Remote with the version that its file has now, which all who are given it read; a Path as it is."""
     if not isinstance(path, Remote):
         return path
     try:
@@ -149,7 +149,9 @@ def _regular(path: Path | str, kind: Kind) -> BinaryIO:
 
 
 def encoding_of(head: bytes) -> str:
-    """How a text is encoded, by its first bytes: UTF-16 where a byte order mark or zeros between its letters say so."""
+    """Return how a text is encoded, by its first bytes: UTF-16 where a byte order mark or zeros between its
+    letters say so.
+    """
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
     for name, zeros, letters in (
@@ -182,7 +184,7 @@ def _utf8(file: BinaryIO, path: Path | str, kind: Kind, newline: str | None = No
 
 
 def read_bytes(path: Path | str, kind: Kind) -> bytes:
-    """All bytes of a file (see `opened`)."""
+    """Read all bytes of a file (see `opened`)."""
     with opened(path, kind) as file:
         data = file.read() if kind.most is None else file.read(kind.most + 1)
         kind.check(path, len(data))  # it may have grown, and /proc knows no sizes
@@ -190,13 +192,13 @@ def read_bytes(path: Path | str, kind: Kind) -> bytes:
 
 
 def read_head(path: Path | str, kind: Kind, size: int) -> bytes:
-    """The first `size` bytes of a file, however large it is."""
+    """Read the first `size` bytes of a file, however large it is."""
     with opened(path, replace(kind, most=None)) as file:
         return file.read(size)
 
 
 def read_text(path: Path | str, kind: Kind) -> str:
-    """All of a UTF-8 text, line ends of one kind (see `opened`)."""
+    """Read all of a UTF-8 text, line ends of one kind (see `opened`)."""
     with _utf8(io.BytesIO(read_bytes(path, kind)), path, kind) as text:
         return text.read()
 
@@ -205,7 +207,7 @@ _LINE = 4 * 4096  # no line of names is longer than two paths can be
 
 
 def read_names(path: Path | str, words: str) -> list[str]:
-    """The lines of a list of names, called `words` (see `opened`)."""
+    """Read the lines of a list of names, called `words` (see `opened`)."""
     kind = replace(NAMES, words=words)
     lines = read_text(path, kind).splitlines()
     for number, line in enumerate(lines, start=1):
@@ -219,7 +221,7 @@ _REFUSED = "\ufffe\uffff" + ("\\" if os.sep == "/" else "")
 
 
 def plain_path(path: str | os.PathLike[str]) -> Place:
-    """A path or a Remote as it is, once every file that barpc writes can carry it.
+    """Return a path or a Remote as it is, once every file that barpc writes can carry it.
 
     InputError for a control character, an end of line, bytes that are no text, a backslash that separates no folders.
     """
@@ -246,7 +248,7 @@ _STEPS = bytes.maketrans(b"[]{}", b"\x01\xff\x01\xff")  # one level down or up, 
 
 
 def read_json(path: Path | str, kind: Kind) -> Any:
-    """What a JSON file holds (see `parse_json`)."""
+    """Read what a JSON file holds (see `parse_json`)."""
     text = read_text(path, kind)
     try:
         return parse_json(text)
@@ -255,7 +257,9 @@ def read_json(path: Path | str, kind: Kind) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """What a JSON text holds; ValueError for numbers that are not finite or beyond 64 bits, or nested too deep."""
+    """Return what a JSON text holds; ValueError for numbers that are not finite or beyond 64 bits, or nested
+    too deep.
+    """
     if _depth(text) > _MAX_DEPTH:  # how deep json itself goes differs between versions of Python
         raise ValueError(f"nested too deep, at most {_MAX_DEPTH} levels are read")
     return json.loads(text, parse_constant=_refuse, parse_int=_whole, parse_float=_finite)
@@ -317,7 +321,8 @@ class _Builder(ElementTree.TreeBuilder):
 def parse_xml(
     source: bytes | Path, *, name: str | None = None, max_bytes: int = MAX_XML, strip_namespaces: bool = False
 ) -> ElementTree.Element:
-    """The root element of an XML document: bytes, or the file that holds it; messages call it `name`, or by its path.
+    """Return the root element of an XML document: bytes, or the file that holds it; messages call it `name`,
+    or by its path.
 
     No document type: an entity cannot be declared without one, so neither "billion laughs" nor a reference to another
     file can be written. `strip_namespaces` drops the ``{namespace}`` of every tag. RpcFormatError where it cannot be

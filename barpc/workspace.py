@@ -53,7 +53,7 @@ KEEP_AFTER = 30.0
 
 @cache
 def code_version() -> str:
-    """A hash of the release and of every source file: another code never reads this code's caches."""
+    """Return a hash of the release and of every source file: another code never reads this code's caches."""
     digest = hashlib.sha256(__version__.encode())
     root = Path(__file__).parent
     for path in sorted(root.rglob("*.py")):
@@ -63,7 +63,7 @@ def code_version() -> str:
 
 
 def key_of(*parts: object) -> str:
-    """The key of a stage, 32 hexadecimal digits: a hash of its inputs and options, and of the code.
+    """Return the key of a stage, 32 hexadecimal digits: a hash of its inputs and options, and of the code.
 
     Parts are strings, numbers, None, sequences, mappings, dataclasses, arrays, paths.
     """
@@ -85,7 +85,7 @@ def _plain(value: object) -> object:
 
 
 def peak_memory() -> int:
-    """Peak resident memory [bytes] of this process and its children so far; 0 where unknown."""
+    """Return the peak resident memory [bytes] of this process and its children so far; 0 where unknown."""
     try:
         import resource
     except ImportError:  # not on Windows
@@ -216,7 +216,7 @@ class Workspace:
             )
 
     def owns(self, name: str) -> bool:
-        """Whether a run in this folder wrote this file, and nobody has changed it since."""
+        """Return whether a run in this folder wrote this file, and nobody has changed it since."""
         known = self._earlier | self.outputs
         return name in known and _owns(self.folder, name, known[name])
 
@@ -255,7 +255,7 @@ class Workspace:
                 return
 
     def load(self, stage: str, key: str) -> Arrays | None:
-        """A kept result, or None; one that is damaged is taken away and counts as missing."""
+        """Return a kept result, or None; one that is damaged is taken away and counts as missing."""
         path = self.cache / stage / f"{key}.npz"
         if path.is_symlink() or not path.is_file():
             return None
@@ -273,7 +273,7 @@ class Workspace:
             np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
 
     def keeping(self, path: Path) -> AbstractContextManager[Path]:
-        """A temporary path for a file among the caches, which can be made again."""
+        """Return a temporary path for a file among the caches, which can be made again."""
         return replacing(path, overwrite=True, durable=False, room=self.partial)
 
     @contextmanager
@@ -392,7 +392,7 @@ def _read_own(folder: Path) -> dict[str, str]:
 
 
 def own_files(folder: Path) -> set[str]:
-    """The names of barpc's own files that are in a folder, as it wrote them."""
+    """Return the names of barpc's own files that are in a folder, as it wrote them."""
     return {name for name, sha in _read_own(folder).items() if _owns(folder, name, sha)}
 
 

@@ -92,14 +92,14 @@ class Offsets:
         return Offsets(self.own[keep], self.motions[keep])
 
     def moving(self, times: float) -> Offsets:
-        """The same with motions of the cameras so many times as large."""
+        """Return the same with motions of the cameras so many times as large."""
         factor = np.full(self.motions.shape[2], times)
         factor[-3:] = 1.0
         return Offsets(self.own, self.motions * factor)
 
 
 def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array) -> Offsets:
-    """The offsets of the control points of a block at a solution in which they hold nothing.
+    """Return the offsets of the control points of a block at a solution in which they hold nothing.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array
 
 
 def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
-    """The points that hold a block, of those that are `told` (G,) of at all; the others go with them.
+    """Return the points that hold a block, of those that are `told` (G,) of at all; the others go with them.
 
     Every set of up to twelve points is looked at; of more, those that agree with three drawn at random.
     """

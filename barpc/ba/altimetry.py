@@ -51,7 +51,9 @@ class AltimetryTest:
 def hold_by_altimetry(
     found: Solution, block: Block, outer: Block, options: AdjustOptions, given: Altimetry
 ) -> tuple[Solution, AltimetryTest]:
-    """The block held by heights too, or as it was where they do not agree with each other or with other control."""
+    """Return the block held by heights too, or as it was where they do not agree with each other or with
+    other control.
+    """
     ties = np.flatnonzero(found.seen[: block.num_tracks])
     points = found.final.points
     near, many = np.zeros(0, dtype=np.int64), len(given.sigma)

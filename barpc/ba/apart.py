@@ -69,7 +69,7 @@ class Apart:
         return len(self.views) == 1
 
     def is_view(self, view: int) -> bool:
-        """Whether it is clear, and that view."""
+        """Return whether it is clear, and that view."""
         return self.views == (view,)
 
 
@@ -108,7 +108,7 @@ class _Left:
 def find_apart(
     first: Solution | None, block: Block, outer: Block, options: AdjustOptions, solve: Solver
 ) -> tuple[Apart | None, Solution | None]:
-    """The view whose RPC is not its own where a block shows one, and the block solved without it.
+    """Return the view whose RPC is not its own where a block shows one, and the block solved without it.
 
     `first` is the block solved with all views; None: it has no solution. Nothing is tried where it agrees and no prior
     tells of one view. Measured on the observations of `outer`.
@@ -143,7 +143,7 @@ def find_apart(
 
 
 def agrees(found: Solution) -> bool:
-    """Whether the views of a block agree to the noise of their ties."""
+    """Return whether the views of a block agree to the noise of their ties."""
     return found.outcome.noise < MUCH_NOISE and not found.has_trend and not found.is_skew
 
 

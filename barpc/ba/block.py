@@ -55,7 +55,7 @@ class Block:
         return min(v.alt_range[0] for v in self.views), max(v.alt_range[1] for v in self.views)
 
     def without(self, rows: BoolArray) -> Block:
-        """The block without some of its observations (K,)."""
+        """Return the block without some of its observations (K,)."""
         keep = ~rows
         return replace(
             self,
@@ -68,13 +68,13 @@ class Block:
         )
 
     def in_order(self, rows: npt.NDArray[Scalar]) -> npt.NDArray[Scalar]:
-        """Rows (K, ...) back in the order they were given; zeros for those that the block is without."""
+        """Return the rows (K, ...) back in the order they were given; zeros for those that the block is without."""
         out = np.zeros((self.num_rows, *rows.shape[1:]), rows.dtype)
         out[self.order] = rows
         return out
 
     def first_points(self) -> Array:
-        """Where each point's first observing view puts it at its middle altitude (P, 3), ECEF [m]."""
+        """Return where each point's first observing view puts it at its middle altitude (P, 3), ECEF [m]."""
         return self._first_points.copy()
 
     @cached_property
@@ -101,7 +101,7 @@ def join(
     keep_largest: bool = False,
     reference: Reference | None = None,
 ) -> Block:
-    """The block of tracks and GCPs; arguments and errors as in `barpc.ba.adjust_tracks`."""
+    """Return the block of tracks and GCPs; arguments and errors as in `barpc.ba.adjust_tracks`."""
     names = [view.name for view in views]
     _check_names(names, options)
     gcps = GroundPoints.none() if gcps is None else gcps

@@ -51,7 +51,7 @@ class Cameras:
         self._stack = _RpcStack(self.sensors)
 
     def seeing(self, seen: Array) -> Cameras:
-        """The same views for other observations, seen at (2, K) [px]."""
+        """Return the same views for other observations, seen at (2, K) [px]."""
         cameras = copy(self)
         cameras.seen = seen
         return cameras
@@ -64,7 +64,7 @@ class Cameras:
         wanted: Wanted = "unknowns",
         out: Projected | None = None,
     ) -> Projected:
-        """Corrected image points with derivatives, put into `out` where it is given.
+        """Return the corrected image points with derivatives, put into `out` where it is given.
 
         Of unknowns (N, q) and every observation's point (3, K) [m]; observations of view v are bounds[v] :
         bounds[v + 1]. `wanted` are no derivatives ("image"), those by the "points", or by the "unknowns" too; what
@@ -83,7 +83,7 @@ class Cameras:
         return found
 
     def room(self, count: int, wanted: Wanted = "unknowns") -> Projected:
-        """Empty arrays for `count` observations."""
+        """Return the empty arrays for `count` observations."""
         by_point = np.empty((2, 0 if wanted == "image" else 3, count))
         by_unknown = np.empty((2, self.unknowns.size if wanted == "unknowns" else 0, count))
         return Projected(np.empty((2, count)), by_point, by_unknown)

@@ -44,7 +44,7 @@ class TwoGroups:
 def two_groups(
     structure: Structure, residual: Array, projected: Projected, use: BoolArray
 ) -> tuple[TwoGroups, ...]:
-    """Pairs of views whose offsets across the epipolar lines (observations in use) have two centres."""
+    """Return the pairs of views whose offsets across the epipolar lines (observations in use) have two centres."""
     rows = np.flatnonzero(use[structure.first] & use[structure.second])
     offset = _across(residual, projected.by_point, structure.first[rows], structure.second[rows])
     bounds = np.searchsorted(rows, structure.pair_bounds)
@@ -89,7 +89,8 @@ def _mixture(z: Array) -> tuple[float, float, float]:
 def agreeing(
     structure: Structure, xy: Array, residual: Array, projected: Projected, sigma: Array, use: BoolArray
 ) -> BoolArray:
-    """Observations (K,) of those to use that are left once those are put aside which most of their partners contradict.
+    """Return the observations (K,) of those to use that are left once those are put aside which most of their
+    partners contradict.
 
     Of observed col, row `xy` (2, K), residuals (2, K) with points anywhere near and `sigma` (K,), all [px].
     """

@@ -34,7 +34,7 @@ class Covariance:
         return int(self.reduced.cross.shape[2])
 
     def solve(self, rows: Array) -> Array:
-        """S^-1 b for right-hand sides (N q, m); zero for fixed unknowns."""
+        """Return S^-1 b for right-hand sides (N q, m); zero for fixed unknowns."""
         out = np.zeros(rows.shape)
         out[self.free] = self.factor.solve(np.ascontiguousarray(rows[self.free]))
         return out
@@ -45,13 +45,14 @@ class Covariance:
         return len(self.free) > _LARGE
 
     def variances(self) -> Array:
-        """Variances (N, q) of all unknowns; zero for fixed ones."""
+        """Return the variances (N, q) of all unknowns; zero for fixed ones."""
         if self.factor.inverse is None:
             return self.full.diagonal().reshape(-1, self.num_unknowns)
         return np.asarray(self._near.diagonal.diagonal(axis1=1, axis2=2))
 
     def probed_variances(self) -> Array:
-        """The same at the cost of a few solutions (Hutchinson 1990), each within a fifth (RMS), independent of another.
+        """Return the same at the cost of a few solutions (Hutchinson 1990), each within a fifth (RMS),
+        independent of another.
 
         Unknowns count in units of their standard deviation where all other views stood still: a variance would
         drown in those of others that are a hundred times as large.
@@ -65,11 +66,11 @@ class Covariance:
         return np.asarray(found.reshape(-1, q) * unit)
 
     def view(self, i: int, j: int | None = None) -> Array:
-        """Covariance (q, q) of the unknowns of view i (with those of view j)."""
+        """Return the covariance (q, q) of the unknowns of view i (with those of view j)."""
         return self._of_pair(i, i if j is None else j, "full" in self.__dict__)
 
     def joint(self, views: IntArray) -> Array:
-        """Covariance (m q, m q) of the unknowns of some views."""
+        """Return the covariance (m q, m q) of the unknowns of some views."""
         of_full = len(self.free) <= _SMALL or "full" in self.__dict__
         if of_full or self.factor.inverse is None:
             place = self._places(views)
@@ -116,7 +117,7 @@ class Covariance:
         return 0.5 * (out + out.T)
 
     def points(self, index: IntArray) -> Array:
-        """Covariance (n, 3, 3) [m^2], ECEF, of the points `index` (n,): their own noise and the cameras'."""
+        """Return the covariance (n, 3, 3) [m^2], ECEF, of the points `index` (n,): their own noise and the cameras'."""
         structure = self.reduced.structure
         out = np.empty((len(index), 3, 3))
         lower = self.reduced.lower[:, index]

@@ -36,7 +36,8 @@ def datum_shares(
     num_tracks: int,
     num_known: int,
 ) -> Mapping[str, Array]:
-    """Share (10,) of each source in what is known of the scene's motions; NaN for one that no free camera tells of.
+    """Return the share (10,) of each source in what is known of the scene's motions; NaN for one that no free
+    camera tells of.
 
     Parameters
     ----------

@@ -74,8 +74,8 @@ class _Columns:
 
 
 def find_edges(problem: Problem, state: State, residual: Array, use: BoolArray, sigma: Array) -> Array:
-    """Columns (N, C) [px] where other detectors begin, infinite where a view has fewer, of residuals (2, K) [px] with
-    standard deviations `sigma` (K,) as they were observed.
+    """Return the columns (N, C) [px] where other detectors begin, infinite where a view has fewer, of
+    residuals (2, K) [px] with standard deviations `sigma` (K,) as they were observed.
     """
     weight, widths = use / sigma, problem.cameras.unknowns.half[0]
     settled = problem.settling(problem.project_points(state.params, state.points), weight)

@@ -39,7 +39,7 @@ class Dissection:
 
 
 def dissect(pairs: IntArray, place: Array, use: BoolArray) -> Dissection:
-    """The order for views tied in `pairs` (M, 2) that stand at `place` (N, 2), those in `use` (N,) only."""
+    """Return the order for views tied in `pairs` (M, 2) that stand at `place` (N, 2), those in `use` (N,) only."""
     n = len(place)
     (i, j), own = pairs[use[pairs].all(axis=1)].astype(np.int32).T, np.arange(n, dtype=np.int32)
     ties = np.concatenate([i, j, own]), np.concatenate([j, i, own])

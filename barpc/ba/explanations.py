@@ -72,13 +72,14 @@ class Seen:
 
 
 def strip(seen: Seen, interval: Interval, sigma: float = _STRIP) -> list[Explanation]:
-    """Rows or columns of an image that lie off by themselves."""
+    """Return the rows or columns of an image that lie off by themselves."""
     start, stop = _open_ended(interval.start, interval.stop, float(seen.size[interval.axis, interval.view]))
     return [_local(STRIP, seen, interval.view, (interval.axis, start, stop, 0.0, 0.0), sigma)]
 
 
 def fade(seen: Seen, interval: Interval) -> list[Explanation]:
-    """Rows of an image that lie off at an end of an interval, and less and less from there, upwards or downwards.
+    """Return the rows of an image that lie off at an end of an interval, and less and less from there,
+    upwards or downwards.
 
     Either the interval lies off, or the rest of its image: what fades is tried on both sides of both ends.
     """
@@ -117,7 +118,8 @@ def _local(kind: str, seen: Seen, view: int, where: Where, sigma: float) -> Expl
 
 
 def settling(seen: Seen, _interval: Interval) -> list[Explanation]:
-    """Rows at the beginning, or the end, of all images that lie off, each by its own, and less and less from there.
+    """Return the rows at the beginning, or the end, of all images that lie off, each by its own, and less and
+    less from there.
 
     So does a satellite that settles after it has turned, before every image.
     """
@@ -141,7 +143,7 @@ def _settling(seen: Seen, rate: float, sigma: float) -> Explanation:
 
 
 def bent(seen: Seen, one: Explanation) -> Explanation:
-    """What fades, and two unknowns beside its own: what a change of the rate, as a logarithm, does to it."""
+    """Return what fades, and two unknowns beside its own: what a change of the rate, as a logarithm, does to it."""
     assert one.where is not None
     _, _, _, origin, rate = one.where
     if one.parts and rate < 0.0:
@@ -151,7 +153,7 @@ def bent(seen: Seen, one: Explanation) -> Explanation:
 
 
 def faster(one: Explanation, found: Fit) -> Explanation:
-    """What fades with the rate that a fit of it `bent` asks for, by e at most; only `where` is new."""
+    """Return what fades with the rate that a fit of it `bent` asks for, by e at most; only `where` is new."""
     assert one.where is not None
     moved, slope = np.split(found.extra[-2 * len(one.sigma) :], 2)
     step = float(np.clip(moved @ slope / max(float(moved @ moved), 1e-30), -1.0, 1.0))
@@ -159,7 +161,8 @@ def faster(one: Explanation, found: Fit) -> Explanation:
 
 
 def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explanation:
-    """A strip whose ends are where ties say, or what all rows do, whose prior is as wide as it is large.
+    """Return a strip whose ends are where ties say, or what all rows do, whose prior is as wide as it is
+    large.
 
     `found` is a fit with it, its own unknowns the last; `others` (2, K) is what those before it move [px].
     """
@@ -213,7 +216,7 @@ def _largest_part(gain: Array) -> tuple[int, int]:
 
 
 def wander(seen: Seen, interval: Interval) -> list[Explanation]:
-    """Rows of an image that wander: splines, apart from what a drift follows."""
+    """Return the rows of an image that wander: splines, apart from what a drift follows."""
     view = interval.view
     rows = np.flatnonzero(seen.linear.view == view)
     u = 2.0 * seen.place[1, rows] / seen.size[1, view] - 1.0
@@ -223,7 +226,7 @@ def wander(seen: Seen, interval: Interval) -> list[Explanation]:
 
 
 def swing(seen: Seen, found: Swing) -> Explanation:
-    """All rows of an image that swing with one period."""
+    """Return all rows of an image that swing with one period."""
     rows = np.flatnonzero(seen.linear.view == found.view)
     basis = waves_of(seen.place[1, rows], np.array(found.period))
     one = _on_both(seen, SWING, found.view, rows, basis, _WANDER)
@@ -232,7 +235,7 @@ def swing(seen: Seen, found: Swing) -> Explanation:
 
 
 def alike(seen: Seen, one: Explanation, found: Fit) -> list[Explanation]:
-    """The strip and what fades that a view's wandering rows look most like, apart from what a drift follows."""
+    """Return the strip and what fades that a view's wandering rows look most like, apart from what a drift follows."""
     size, view = float(seen.size[1, one.view]), one.view
     rows = (np.arange(BINS * _A_BIN) + 0.5) / (BINS * _A_BIN) * size
     unknowns = found.extra[-len(one.sigma) :]
@@ -261,7 +264,7 @@ def _on_both(seen: Seen, kind: str, view: int, rows: IntArray, basis: Array, sig
 
 
 def group(seen: Seen, _interval: Interval) -> list[Explanation]:
-    """Ties of a part of the ground that moves."""
+    """Return the ties of a part of the ground that moves."""
     one = moving.proposal(seen.linear, seen.ground, seen.base, seen.extra, seen.sigma)
     if one is None:
         return []
@@ -283,7 +286,8 @@ _OF_BLOCK = (MOVING, SETTLING)
 def proposed(
     seen: Seen, intervals: list[Interval], periods: list[Swing], known_kinds: Collection[str] = ()
 ) -> Iterator[Explanation]:
-    """Explanations of the intervals and periods that stand out; those of a whole image, or of the block, once.
+    """Yield the explanations of the intervals and periods that stand out; those of a whole image, or of the
+    block, once.
 
     None of the kinds that are known.
     """

@@ -25,7 +25,8 @@ _MOST_SPLINES = 4000  # of all views: what a block of 300 takes is 2.6 times as 
 
 
 def follow(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
-    """The block with splines over the rows and steps between detectors, where asked for or where they tell.
+    """Return the block with splines over the rows and steps between detectors, where asked for or where they
+    tell.
 
     Knots are set twice as dense until nothing is left that neighbours share, the observations are too few, or the
     tracks that took no part are met no better.
@@ -48,7 +49,8 @@ def follow(found: Solution, block: Block, outer: Block, options: AdjustOptions) 
 def without_strips(
     found: Solution, judged: Judgement, block: Block, outer: Block, options: AdjustOptions
 ) -> Solution:
-    """The block with the rows and columns moved that lie off by themselves, or swing, where the judge found such.
+    """Return the block with the rows and columns moved that lie off by themselves, or swing, where the judge
+    found such.
 
     Refused where it makes tracks worse that took no part, or no better than what follows an image as a whole.
     """

@@ -69,7 +69,8 @@ class GaugeReport:
 def gauge_report(
     covariance: Covariance, points: Array, before: Array, use: BoolArray, prior: Array | None = None
 ) -> GaugeReport:
-    """The report for points (P, 3), ECEF [m], after and before an adjustment; those that count in `use` (P,).
+    """Return the report for points (P, 3), ECEF [m], after and before an adjustment; those that count in
+    `use` (P,).
 
     `prior` (N, q) are the standard deviations of the cameras' unknowns as delivered; infinite ones do not count.
     """
@@ -92,7 +93,8 @@ def gauge_report(
 def earlier_scene(
     covariance: Covariance, prior: JointPrior, scene: EarlierScene, params: Array
 ) -> GaugeReport:
-    """The report for the scene of an earlier block, by unknowns (N, q) of its cameras that were adjusted again.
+    """Return the report for the scene of an earlier block, by unknowns (N, q) of its cameras that were
+    adjusted again.
 
     Whatever was added tells more of it: new points are another scene, and may know theirs less.
     """

@@ -44,13 +44,13 @@ def _join(priors: Sequence[PointPrior | None]) -> PointPrior | None:
 
 
 def ground_control(gcps: GroundPoints, index: IntArray) -> PointPrior:
-    """GCPs as priors on the points `index` (G,): east, north and up by their sigmas."""
+    """Return GCPs as priors on the points `index` (G,): east, north and up by their sigmas."""
     rows = enu_basis(gcps.lonlatalt) / gcps.sigma[..., None]
     return PointPrior(index, ecef_from_ground(gcps.lonlatalt), rows, np.zeros((len(index), 3, 0)))
 
 
 def reference_control(reference: Reference, index: IntArray) -> PointPrior:
-    """Points of a reference as priors on the points `index` (R,).
+    """Return the points of a reference as priors on the points `index` (R,).
 
     What they share: the height and slopes of the terrain, as points held to it do, the orthoimage's own place, and
     that what was matched may stand above the terrain (houses, trees). A terrain's errors reach over many points: all
@@ -75,7 +75,8 @@ def terrain_heights(
     span: Array | None = None,
     level: BoolArray | None = None,
 ) -> PointPrior:
-    """Points `index` (Q,) of (P, 3) held to a terrain: the height above its tangent plane where they stand now.
+    """Return the points `index` (Q,) of (P, 3) held to a terrain: the height above its tangent plane where
+    they stand now.
 
     Single altitudes are known to `sigma` [m]; all of them may be wrong by `common_sigma` [m], and by a slope that
     is as much at the scene's edges. Points where the terrain is unknown are left out.
@@ -105,14 +106,16 @@ def _believed_heights(ground: Array, index: IntArray, believed: Believed, common
 
 
 def flat_heights(points: Array, index: IntArray, alt: float, sigma: float, common_sigma: float) -> PointPrior:
-    """Points `index` held to one altitude [m]: each within `sigma` [m], all together within `common_sigma` [m]."""
+    """Return the points `index` held to one altitude [m]: each within `sigma` [m], all together within
+    `common_sigma` [m].
+    """
     ground = ground_from_ecef(points[index])
     n = len(index)
     return _heights(ground, index, np.full(n, alt), np.tile([0.0, 0.0, 1.0], (n, 1)), sigma, common_sigma)
 
 
 def staying(points: Array, index: IntArray) -> PointPrior:
-    """Points `index` (Q,) of (P, 3), ECEF [m], each held to the altitude where it stands."""
+    """Return the points `index` (Q,) of (P, 3), ECEF [m], each held to the altitude where it stands."""
     ground = ground_from_ecef(points[index])
     return _heights(ground, index, ground[:, 2], np.tile([0.0, 0.0, 1.0], (len(index), 1)), _STAYS, 0.0)
 
@@ -146,7 +149,7 @@ def _slopes(points: Array, span: Array) -> Array:
 
 
 def convergence_angles(structure: Structure, projected: Projected, points: Array) -> Array:
-    """Largest angle (P,) [rad] between a point's rays and their mean, doubled: the angle of two rays."""
+    """Return the largest angle (P,) [rad] between a point's rays and their mean, doubled: the angle of two rays."""
     by_point = projected.by_point
     ray = np.cross(by_point[0], by_point[1], axis=0)
     up = structure.of_points(points)
@@ -201,7 +204,7 @@ class Heights:
     placed: PointPrior | None = None  # tracks that altimetry holds, which nothing else does then
 
     def loose(self, sigma: float) -> Heights:
-        """The same where the places of GCPs are known to `sigma` [m] only."""
+        """Return the same where the places of GCPs are known to `sigma` [m] only."""
         first = self.control[0]
         rows = enu_basis(ground_from_ecef(first.mean)) / sigma
         return replace(self, control=(replace(first, rows=rows), *self.control[1:]), has_control=False)
@@ -213,7 +216,7 @@ class Heights:
         return not given and not self.options.dem_for_weak and self.options.learn_priors
 
     def hold(self, problem: Problem, points: Array) -> Problem:
-        """The problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
+        """Return the problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
         return replace(problem, point_prior=_join([*self.control, self._held(points), self.placed]))
 
     def _believed(self, points: Array) -> Believed | None:
@@ -276,7 +279,9 @@ class Heights:
         return getattr(self.dem, "known", None)
 
     def test(self, points: Array, seen: BoolArray) -> TerrainTest | None:
-        """What the terrain did to the tracks that are `seen` (P,), at their adjusted places; None without one."""
+        """Return what the terrain did to the tracks that are `seen` (P,), at their adjusted places; None
+        without one.
+        """
         if self.dem is None:
             return None
         index = self.tracks[seen[self.tracks]]

@@ -67,7 +67,7 @@ def _mean_square(values: Array) -> float:
 
 
 def keep_out(block: Block) -> BoolArray:
-    """Observations (K,) of about every tenth track.
+    """Return the observations (K,) of about every tenth track.
 
     They are drawn by their image positions alone, so that neither the order of rows nor the names of views matter.
     """
@@ -90,7 +90,7 @@ def _scrambled(numbers: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
 
 
 def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Array]:
-    """A problem with other observations, and where cameras of unknowns (N, q) put their points (Q, 3)."""
+    """Return a problem with other observations, and where cameras of unknowns (N, q) put their points (Q, 3)."""
     index, point = np.unique(block.point, return_inverse=True)
     part = replace(
         problem,
@@ -105,7 +105,7 @@ def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Arr
 
 
 def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
-    """The observations of a block that took no part in a problem, under cameras of unknowns (N, q)."""
+    """Return the observations of a block that took no part in a problem, under cameras of unknowns (N, q)."""
     views, index = len(block.views), np.unique(block.point)
     if not len(index):
         unknown = np.full(views, np.nan)
@@ -132,7 +132,8 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
 
 
 def scatter(squared: Array, freedom: Array) -> float:
-    """Observed over stated standard deviation of the right ones among observations, half of which may be wrong.
+    """Return the observed over stated standard deviation of the right ones among observations, half of which
+    may be wrong.
 
     Parameters
     ----------
@@ -157,7 +158,8 @@ def scatter(squared: Array, freedom: Array) -> float:
 
 
 def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:
-    """Whether cameras with more unknowns meet the tracks of a block that took no part better than others do.
+    """Return whether cameras with more unknowns meet the tracks of a block that took no part better than
+    others do.
 
     Track by track, as the same noise is in both; where one is wrong, by no more than so much.
     """
@@ -185,7 +187,9 @@ class CheckResiduals:
     ground: Array
 
     def rms(self) -> tuple[Array, Array]:
-        """Root mean squares: col, row (2,) [px]; east, north, up (3,) [m], NaN without a triangulated point."""
+        """Return the root mean squares: col, row (2,) [px]; east, north, up (3,) [m], NaN without a
+        triangulated point.
+        """
         known = np.isfinite(self.ground).all(axis=1)
         ground = np.full(3, np.nan)
         if known.any():
@@ -194,7 +198,7 @@ class CheckResiduals:
 
 
 def check_residuals(sensors: Sequence[SensorModel], points: GroundPoints) -> CheckResiduals:
-    """What cameras make of known points.
+    """Return what cameras make of known points.
 
     Parameters
     ----------
@@ -223,13 +227,13 @@ def check_residuals(sensors: Sequence[SensorModel], points: GroundPoints) -> Che
 
 
 def enu_offsets(points: Array, known: Array) -> Array:
-    """East, north, up (n, 3) [m] of points, ECEF [m], minus known lon, lat, alt (n, 3)."""
+    """Return the east, north, up (n, 3) [m] of points, ECEF [m], minus known lon, lat, alt (n, 3)."""
     offset = points - ecef_from_ground(known)
     return (enu_basis(known) @ offset[..., None])[..., 0]
 
 
 def split_points(points: GroundPoints, checks: Sequence[str]) -> tuple[GroundPoints, GroundPoints]:
-    """Points as control for the solve and as checks that stay out of it.
+    """Return the points as control for the solve and as checks that stay out of it.
 
     Parameters
     ----------

@@ -73,7 +73,7 @@ class BlockPrior:
     scene: EarlierScene | None = None
 
     def waves(self, names: tuple[str, ...]) -> Waves | None:
-        """The unknowns in the image of views that go on from the block; a new one has splines alone."""
+        """Return the unknowns in the image of views that go on from the block; a new one has splines alone."""
         of_views = self._edges, self._strips, self._periods
         if self.edges is None or not (self.splines or any(one.size for one in of_views)):
             return None
@@ -176,7 +176,7 @@ class BlockPrior:
         )
 
     def dense(self) -> Array:
-        """The information matrix as an array."""
+        """Return the information matrix as an array."""
         if isinstance(self.information, np.ndarray):
             return self.information
         if self.params.size > _LARGEST:
@@ -225,7 +225,7 @@ def _within(numbers: Array, most: int) -> bool:
 
 
 def block_prior(adjustment: Adjustment) -> BlockPrior:
-    """The prior that a later run starts from.
+    """Return the prior that a later run starts from.
 
     Parameters
     ----------
@@ -266,7 +266,8 @@ def apply_prior(
     cameras: CameraPrior,
     radars: Collection[str] = (),
 ) -> tuple[CameraPrior, JointPrior]:
-    """The priors of a run that goes on from an old block: the old views' own ones make way for the joint one.
+    """Return the priors of a run that goes on from an old block: the old views' own ones make way for the
+    joint one.
 
     `radars` are the views whose unknowns are now those of clocks.
 

@@ -94,7 +94,8 @@ class Judgement:
 
 
 def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
-    """Intervals of images in which ties were cut, or are off, more than elsewhere and chance allow.
+    """Return the intervals of images in which ties were cut, or are off, more than elsewhere and chance
+    allow.
 
     A mean below `floor` [px] is none.
     """
@@ -112,7 +113,7 @@ def _standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval
 
 
 def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
-    """What stands out at the end, with what the ties that were cut there are off by.
+    """Return what stands out at the end, with what the ties that were cut there are off by.
 
     As their tracks see it that are triangulated with all that may be seen, where all of one was cut.
     """
@@ -134,7 +135,7 @@ def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
 
 
 def swinging(outcome: Outcome, block: Block) -> list[Swing]:
-    """Periods with which the rows of images swing more than chance allows, one of each at most."""
+    """Return the periods with which the rows of images swing more than chance allows, one of each at most."""
     rows, off = _whitened(outcome, block)
     return swings(block.view[rows], block.xy[1, rows], _sizes(block), _told(outcome, block)[rows], off)
 
@@ -161,7 +162,8 @@ def _sizes(block: Block) -> Array:
 
 
 def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
-    """What explains the ties of a block beside its cameras, the first taken first; empty where nothing stands out.
+    """Return what explains the ties of a block beside its cameras, the first taken first; empty where nothing
+    stands out.
 
     Of more unknowns than `UNKNOWNS` each image that stands out is judged among those that it shares most tracks with:
     what moves on the ground competes there, but is not followed.
@@ -232,8 +234,8 @@ def _joined(all_of: Judgement, one: Judgement, views: IntArray, rows: IntArray) 
 
 
 def around(outcome: Outcome, block: Block, views: IntArray) -> tuple[Linear, State] | None:
-    """The ties among some views of a block, linearised where the rounds ended, and there; None where they are too many
-    to be judged.
+    """Return the ties among some views of a block, linearised where the rounds ended, and there; None where
+    they are too many to be judged.
     """
     problem = outcome.problem
     use = block.use & (block.point < block.num_tracks) & np.isin(block.view, views)

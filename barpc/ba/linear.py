@@ -62,7 +62,7 @@ def factorize(matrix: Array, damping: float = 0.0) -> Factor:
 def factorize_blocks(
     matrix: Blocks, order: Dissection, damping: float = 0.0, less: Array | None = None
 ) -> Factor:
-    """The same for the views that an order of elimination has, less B^T B with a few rows `less` (m, n) as B."""
+    """Return the same for the views that an order of elimination has, less B^T B with a few rows `less` (m, n) as B."""
     _check(matrix.diagonal)
     cholesky = Cholesky(matrix, order)
     cholesky.factorize(damping)

@@ -42,23 +42,25 @@ class Tracks:
     by_unknown: Array  # (T, n, 2, q)
 
     def of(self, values: Array) -> Array:
-        """Values (2, K) of observations as tracks have them (T, 2n)."""
+        """Return the values (2, K) of observations as tracks have them (T, 2n)."""
         count, n = self.rows.shape
         return np.ascontiguousarray(values[:, self.rows].transpose(1, 2, 0)).reshape(count, 2 * n)
 
     def followed(self, values: Array) -> Array:
-        """Coordinates (T, S, 3) of values (T, 2n) on what ground points follow."""
+        """Return the coordinates (T, S, 3) of values (T, 2n) on what ground points follow."""
         found: Array = self.follow @ values[..., None]
         return found.reshape(len(values), len(self.subsets), 3)
 
     def weighed(self, values: Array, followed: Array, weight: Array) -> Array:
-        """Values (T, 2n), less what ground points follow, summed over subsets with their weights (T, S)."""
+        """Return the values (T, 2n), less what ground points follow, summed over subsets with their weights (T, S)."""
         parts = (weight[..., None] * followed).reshape(len(values), 1, -1) @ self.follow
         seen: Array = np.repeat(weight @ self.subsets.astype(np.float64), 2, axis=1)
         return np.asarray(seen * values - parts[:, 0])
 
     def weight(self, weight: Array) -> Array:
-        """What takes away what ground points follow (T, 2n, 2n), summed over subsets with their weights (T, S)."""
+        """Return what takes away what ground points follow (T, 2n, 2n), summed over subsets with their
+        weights (T, S).
+        """
         of_rows = np.repeat(weight, 3, axis=1)[..., None] * self.follow
         out: Array = -(np.swapaxes(self.follow, 1, 2) @ of_rows)
         diagonal = np.einsum("tii->ti", out)
@@ -88,7 +90,7 @@ class Linear:
         return self.shape[0]
 
     def among(self, views: IntArray) -> Linear:
-        """The same with its own tracks' views (n,) only, counted anew; observations of others are left out."""
+        """Return the same with its own tracks' views (n,) only, counted anew; observations of others are left out."""
         number, index = np.full(self.views, -1), np.full(len(self.view), -1)
         number[views] = np.arange(len(views))
         rows = np.flatnonzero(number[self.view] >= 0)
@@ -137,12 +139,12 @@ class Linear:
         return rows
 
     def left(self, step: Array) -> Array:
-        """Residuals (2, K) after a step (N, q) of the cameras."""
+        """Return the residuals (2, K) after a step (N, q) of the cameras."""
         left: Array = self.residual + np.einsum("cqk,kq->ck", self.by_unknown, step[self.view])
         return left
 
     def thinned(self, most: int) -> Linear:
-        """The same with every n-th track, of about so many observations."""
+        """Return the same with every n-th track, of about so many observations."""
         every = -(-sum(tracks.rows.size for tracks in self.tracks) // most)
         if every <= 1:
             return self
@@ -155,7 +157,9 @@ class Linear:
 
 
 def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span: float) -> Linear:
-    """Tie points in use (K,) of a problem at a state where they may all be seen; heights span so much [m]."""
+    """Return the tie points in use (K,) of a problem at a state where they may all be seen; heights span so
+    much [m].
+    """
     structure = problem.structure
     projected = problem.linearise(state.params, state.points)
     residual = (projected.image - problem.xy) / sigma
@@ -202,7 +206,7 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
 
 
 def numbers(count: IntArray) -> float:
-    """How many numbers there are to tracks of so many views each (T,)."""
+    """Return how many numbers there are to tracks of so many views each (T,)."""
     subsets = np.where(count <= _MOST_SUBSETS, 2.0 ** count.astype(np.float64), count + 1.0)
     return float((6.0 * subsets * count).sum())
 

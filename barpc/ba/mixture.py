@@ -74,7 +74,8 @@ def fit(
     warm: Fit | None = None,
     group: Group | None = None,
 ) -> Fit:
-    """The block with cameras and, beside them, unknowns of which each moves observations by `extra` (2, e, K) [px].
+    """Return the block with cameras and, beside them, unknowns of which each moves observations by `extra`
+    (2, e, K) [px].
 
     Their prior standard deviations are `sigma` (e,) [px]. From a fit that is `warm`, whose unknowns may be fewer, it
     is cooled again only from where the further ones begin; with a `group` that moves from the top.
@@ -83,7 +84,9 @@ def fit(
 
 
 def moving(linear: Linear, extra: Array, group: Group, found: Fit) -> Array:
-    """Probability (K,) that the track of an observation is of a group, by a fit with it, of these tracks or others."""
+    """Return the probability (K,) that the track of an observation is of a group, by a fit with it, of these
+    tracks or others.
+    """
     left = linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma
     away = np.einsum("cmk,m->ck", group.by_move, found.move) / linear.sigma
     moved = _Moved(left + away, group.share, found.scatter)
@@ -94,7 +97,9 @@ def moving(linear: Linear, extra: Array, group: Group, found: Fit) -> Array:
 
 
 def log_likelihoods(linear: Linear, residual: Array, found: Fit) -> Array:
-    """Log-likelihood (K,) of the track of every observation, at residuals (2, K) in stated standard deviations."""
+    """Return the log-likelihood (K,) of the track of every observation, at residuals (2, K) in stated
+    standard deviations.
+    """
     out = np.zeros(len(linear.view))
     for tracks in linear.tracks:
         weight = _expect(linear, tracks, residual, found.noise, found.eps)
@@ -103,7 +108,8 @@ def log_likelihoods(linear: Linear, residual: Array, found: Fit) -> Array:
 
 
 def off_from_right(linear: Linear, residual: Array, right: Array) -> tuple[Array, BoolArray]:
-    """Residuals (2, K) of all observations once the ground points are where the right ones (K,) put them.
+    """Return the residuals (2, K) of all observations once the ground points are where the right ones (K,)
+    put them.
 
     In standard deviations that they would have if all were right; and which (K,) have at least two right others.
     """
@@ -129,7 +135,8 @@ def off_from_right(linear: Linear, residual: Array, right: Array) -> tuple[Array
 def first_guess(
     linear: Linear, found: Fit, extra: Array, new: Array, precision: Array
 ) -> tuple[Array, float, float]:
-    """Unknowns (e,) that move observations by `new` (2, e, K) [px], beside a fit's with its `extra` [px].
+    """Return the unknowns (e,) that move observations by `new` (2, e, K) [px], beside a fit's with its
+    `extra` [px].
 
     They have the least sum of what all tracks are off by, not of its squares; also the median of that, and the sum over
     the noise. Their prior's precisions are the last of `precision`.

@@ -65,13 +65,15 @@ class Ground:
         return float(1.0 / np.nanmedian(np.sqrt((self.by_ground[:, :2] ** 2).sum(axis=(0, 1)) / 2.0)))
 
     def cells(self, number: int) -> IntArray:
-        """Which of `number` x `number` cells of the ground an observation's point lies in (K,)."""
+        """Return which of `number` x `number` cells of the ground an observation's point lies in (K,)."""
         part = (self.place - self.low[:, None]) / np.maximum(self.high - self.low, 1e-9)[:, None]
         row, col = np.nan_to_num(part * number).astype(np.int64).clip(0, number - 1)
         return np.asarray(row * number + col)
 
     def by_moves(self, view: IntArray, views: int) -> Array:
-        """How a pixel east and north in every view but the first (2, 2 N - 2, K) moves its observations (K,) [px]."""
+        """Return how a pixel east and north in every view but the first (2, 2 N - 2, K) moves its
+        observations (K,) [px].
+        """
         out = np.zeros((2, 2 * (views - 1), len(view)))
         for v in range(1, views):
             rows = np.flatnonzero(view == v)
@@ -105,7 +107,9 @@ class Found:
 
 
 def proposal(linear: Linear, ground: Ground, base: Fit, extra: Array, sigma: Array) -> Group | None:
-    """The group that moves, where it is to be begun with; beside what else was found, with its unknowns' prior."""
+    """Return the group that moves, where it is to be begun with; beside what else was found, with its
+    unknowns' prior.
+    """
     few = linear.thinned(_FEW)
     by_move, cell = ground.by_moves(linear.view, linear.views), ground.cells(CELLS)
     group = Group(by_move, np.full(by_move.shape[1], _SIGMA), cell, np.full(len(cell), 0.5))
@@ -128,7 +132,7 @@ def proposal(linear: Linear, ground: Ground, base: Fit, extra: Array, sigma: Arr
 
 
 def price(linear: Linear, cell: IntArray) -> float:
-    """What the shares of the cells cost [nats]: each half the logarithm of the tracks that tell of it."""
+    """Return what the shares of the cells cost [nats]: each half the logarithm of the tracks that tell of it."""
     first = np.concatenate([tracks.rows[:, 0] for tracks in linear.tracks])
     count = np.bincount(cell[first])
     return float(0.5 * np.log(count[count > 0]).sum())
@@ -155,7 +159,7 @@ def _shares(member: Array, cell: IntArray, rows: BoolArray) -> Array:
 
 
 def group_of(linear: Linear, ground: Ground, group: Group, found: Fit) -> Found:
-    """What a fit with a group says of it."""
+    """Return what a fit with a group says of it."""
     rows = np.zeros(len(group.cell), dtype=bool)
     for tracks in linear.tracks:
         rows[tracks.rows] = True
@@ -178,7 +182,7 @@ def group_of(linear: Linear, ground: Ground, group: Group, found: Fit) -> Found:
 
 
 def members(problem: Problem, params: Array, one: Found, block: Block) -> BoolArray:
-    """Which observations (K,) of tracks that took no part are of a group found at cameras of unknowns (N, q)."""
+    """Return which observations (K,) of tracks that took no part are of a group found at cameras of unknowns (N, q)."""
     if not len(block.view):
         return np.zeros(0, dtype=bool)
     part, points = seen_in(problem, params, block)

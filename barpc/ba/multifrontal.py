@@ -34,7 +34,7 @@ class Blocks:
     pair_view: IntArray  # (M, 2) sorted
 
     def plain(self) -> Array:
-        """The matrix (N q, N q) as an array."""
+        """Return the matrix (N q, N q) as an array."""
         n, q, _ = self.diagonal.shape
         i, j = self.pair_view.T
         dense = np.zeros((n, q, n, q))
@@ -44,7 +44,7 @@ class Blocks:
         return dense.reshape(n * q, n * q)
 
     def sparse(self) -> sp.csr_array:
-        """The matrix (N q, N q) as scipy has it."""
+        """Return the matrix (N q, N q) as scipy has it."""
         n, q, _ = self.diagonal.shape
         (i, j), every = self.pair_view.T, np.arange(n)
         row, col = np.concatenate([every, i, j]), np.concatenate([every, j, i])
@@ -54,7 +54,7 @@ class Blocks:
         return sp.csr_array(sp.bsr_array((data, col[order], indptr), shape=(n * q, n * q)))
 
     def pair(self, i: int, j: int) -> int | None:
-        """Where the pair i < j stands; None where the block is zero."""
+        """Return where the pair i < j stands; None where the block is zero."""
         start, stop = np.searchsorted(self.pair_view[:, 0], [i, i + 1])
         at = start + int(np.searchsorted(self.pair_view[start:stop, 1], j))
         return at if at < stop and self.pair_view[at, 1] == j else None
@@ -165,7 +165,9 @@ class Cholesky:
         return matrix.reshape(count * q, count * q).T
 
     def solve(self, b: Array) -> Array:
-        """Solutions of right-hand sides (n,) or (n, m), n unknowns of the views that are eliminated, as given."""
+        """Return the solutions of right-hand sides (n,) or (n, m), n unknowns of the views that are
+        eliminated, as given.
+        """
         q, rank = self._size, self.order.rank
         chosen = _spread(np.argsort(rank[rank >= 0], kind="stable"), q)
         # rank of the m-th view in use -> place in b
@@ -195,7 +197,7 @@ class Cholesky:
         return slice(first * q, (first + len(front.pivots)) * q), _spread(self.order.rank[front.border], q)
 
     def inverse(self) -> Blocks:
-        """The inverse's blocks where the matrix has some; zero for views that are not eliminated."""
+        """Return the inverse's blocks where the matrix has some; zero for views that are not eliminated."""
         fronts = self.order.fronts
         out = Blocks(
             np.zeros_like(self.blocks.diagonal), np.zeros_like(self.blocks.pairs), self.blocks.pair_view

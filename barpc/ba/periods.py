@@ -39,14 +39,15 @@ class Swing:
 
 
 def price(rows: float, views: int) -> float:
-    """What the choice of a period, in images of so many rows, and of a view costs [nats]."""
+    """Return what the choice of a period, in images of so many rows, and of a view costs [nats]."""
     return float(np.log(max(_INDEPENDENT * rows / _SHORTEST, 1.0) * views))
 
 
 def swings(
     view: IntArray, row: Array, size: Array, right: Array, off: Array, least: float = SURE
 ) -> list[Swing]:
-    """The period that stands out most in every view, the best first; none that gains less than `least` [nats].
+    """Return the period that stands out most in every view, the best first; none that gains less than `least`
+    [nats].
 
     Parameters
     ----------

@@ -57,7 +57,8 @@ class Unused:
 
 
 def met_worse(unused: Unused, size: Array, limit: float, least: float, share: float) -> list[Place]:
-    """The place of every image that is met worst beside the rest of it, where chance hardly leaves as much.
+    """Return the place of every image that is met worst beside the rest of it, where chance hardly leaves as
+    much.
 
     Parameters
     ----------

@@ -46,15 +46,16 @@ class Placed:
         return self.noise < MUCH_NOISE
 
     def agree(self, limit: float) -> BoolArray:
-        """Which of its observations (n,) are no farther off than so many standard deviations."""
+        """Return which of its observations (n,) are no farther off than so many standard deviations."""
         return np.asarray(self.squared <= 2.0 * limit * limit)
 
     def contradicted(self, limit: float) -> float:
-        """Share of its observations farther off than so many standard deviations, whatever its rows do."""
+        """Return the share of its observations farther off than so many standard deviations, whatever its rows do."""
         return float(self._far(limit).mean())
 
     def is_coherent(self, limit: float) -> bool:
-        """Whether observations farther off than that are off as their neighbours are: a camera is wrong, not matches.
+        """Return whether observations farther off than that are off as their neighbours are: a camera is
+        wrong, not matches.
 
         Errors that know nothing of each other differ by 1.4 times what they are.
         """
@@ -87,14 +88,15 @@ class Look:
 
 
 def known_points(found: Solution, block: Block) -> BoolArray:
-    """Tracks (P,) of which two observations or more were kept."""
+    """Return the tracks (P,) of which two observations or more were kept."""
     kept = np.bincount(block.point[found.outcome.inlier], minlength=block.num_points) >= 2
     kept[block.num_tracks :] = False
     return kept
 
 
 def place(found: Solution, others: Block, block: Block, view: int) -> Placed | None:
-    """A view of a block placed against the points of a solution of the `others`; None with too few of them.
+    """Return a view of a block placed against the points of a solution of the `others`; None with too few of
+    them.
 
     Its camera is as good as free. Residuals are judged by the others' noise and what their points are known to.
     """
@@ -111,7 +113,7 @@ def place(found: Solution, others: Block, block: Block, view: int) -> Placed | N
 
 
 def median_noise(squared: Array) -> float:
-    """Observed over expected standard deviation, by the median of squares (n,) of two coordinates each."""
+    """Return the observed over expected standard deviation, by the median of squares (n,) of two coordinates each."""
     return float(np.sqrt(np.median(squared) / _MEDIAN))
 
 
@@ -174,7 +176,7 @@ class _Sight:
 
 
 def look(found: Solution, block: Block, placed: Placed, view: int) -> Look:
-    """What a view's RPC looks like: as good as stated with one thing changed.
+    """Return what a view's RPC looks like: as good as stated with one thing changed.
 
     Each is asked of the delivered camera at the points of the others: half of these are then met to what the camera is
     stated to be known to.

@@ -55,7 +55,7 @@ class Bands:
 
     @classmethod
     def of(cls, terrain: Terrain, ground: Array) -> Bands:
-        """The bands over ground points (n, 3)."""
+        """Return the bands over ground points (n, 3)."""
         from scipy.ndimage import gaussian_filter  # a tenth of a second, of blocks with a DEM alone
 
         lon = wrap_longitude(ground[:, 0], ground[0, 0])
@@ -86,12 +86,14 @@ class Bands:
         return cls(terrain, origin, unit, step, tuple(smoothed))
 
     def local(self, ground: Array) -> Array:
-        """Metres east and north (n, 2) of the first node of ground points (n, 3)."""
+        """Return the metres east and north (n, 2) of the first node of ground points (n, 3)."""
         lon = wrap_longitude(ground[:, 0], self.origin[0])
         return np.asarray((np.column_stack([lon, ground[:, 1]]) - self.origin) * self.unit)
 
     def at(self, ground: Array) -> tuple[Array, Array]:
-        """Heights (K, n) [m] of the bands at ground points (n, 3), which add up to the DEM's; slopes (K, n, 2)."""
+        """Return the heights (K, n) [m] of the bands at ground points (n, 3), which add up to the DEM's;
+        slopes (K, n, 2).
+        """
         heights = [np.asarray(self.terrain(ground[:, 0], ground[:, 1]), dtype=np.float64)]
         slopes = [np.nan_to_num(terrain_slopes(self.terrain, ground))]
         at = self.local(ground).T[::-1] / self.step
@@ -109,7 +111,7 @@ def _sampled(layer: Array, at: Array) -> Array:
 
 
 def terrain_slopes(terrain: Terrain, ground: Array) -> Array:
-    """Slopes (n, 2) of a terrain towards east and north at ground points (n, 3); NaN where it is unknown."""
+    """Return the slopes (n, 2) of a terrain towards east and north at ground points (n, 3); NaN where it is unknown."""
     step = SLOPE_STEP / metres_per_unit(ground)[:, :2]
     lon, lat = ground[:, 0], ground[:, 1]
     east = terrain(lon + step[:, 0], lat) - terrain(lon - step[:, 0], lat)
@@ -123,7 +125,7 @@ def _differences(layers: Array) -> Array:
 
 
 def bends(at: Array) -> Array:
-    """Level, slopes and bends (n, `NUM_BENDS`) of a surface at places (n, 2)."""
+    """Return the level, slopes and bends (n, `NUM_BENDS`) of a surface at places (n, 2)."""
     x, y = at.T
     return np.column_stack(
         [x ** (n - j) * y**j for n in range(DEGREE + 1) for j in range(n + 1)]  # level, x, y, x^2, ...
@@ -171,11 +173,15 @@ class Relief:
     cameras: Array  # (3,) what the cameras' accuracies let expect of that [m]; NaN where they do not say
 
     def beyond(self, bias: float) -> Array:
-        """How far from the DEM they lie as delivered (3,), over what cameras and a DEM wrong by `bias` [m] allow."""
+        """Return how far from the DEM they lie as delivered (3,), over what cameras and a DEM wrong by `bias`
+        [m] allow.
+        """
         return np.asarray(np.abs(self.delivered) / np.hypot(self.cameras, bias))
 
     def common_sigma(self, bias: float) -> Array:
-        """What all heights may be wrong by (`NUM_BENDS`,) [m] at the scene's edges: `bias`, and what contradicts it."""
+        """Return what all heights may be wrong by (`NUM_BENDS`,) [m] at the scene's edges: `bias`, and what
+        contradicts it.
+        """
         sigma = np.full(NUM_BENDS, bias)
         contradicts = self.beyond(bias) > BEYOND
         sigma[:3][contradicts] = _EDGE * np.abs(self.delivered)[contradicts]
@@ -211,7 +217,8 @@ class Relief:
 
 
 def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Believed | None:
-    """What is believed of a DEM at the points `index` (n,), at (n, 3); None where too few heights tell.
+    """Return what is believed of a DEM at the points `index` (n,), at (n, 3); None where too few heights
+    tell.
 
     Single altitudes are stated to be known to `stated` [m]. Points that tell are held where they are, less what a
     motion or a bend of the scene explains of their distance: what else they have is the DEM's error, and no ray is

@@ -52,14 +52,14 @@ class Resemblance:
         return found
 
     def overlap(self, first: IntArray, second: IntArray) -> Array:
-        """Part (...) of a template that observations of a reference have in common."""
+        """Return the part (...) of a template that observations of a reference have in common."""
         apart = np.abs(self.place[:, first] - self.place[:, second])
         if self.width == 0:
             return np.asarray((apart == 0).all(axis=0), np.float64)
         return np.asarray(np.maximum(1.0 - apart / self.width, 0.0).prod(axis=0))
 
     def correlation(self, first: IntArray, second: IntArray) -> Array:
-        """How far the noise of two observations (...) of one view is the same, 0 to 1."""
+        """Return how far the noise of two observations (...) of one view is the same, 0 to 1."""
         both = self.of_reference[first] & self.of_reference[second]
         same = self.overlap(first, second)
         return np.asarray(both * (same + (1.0 - same) / ALIKE))

@@ -196,7 +196,7 @@ class Adjustment:
         return np.bincount(self.view[self.inlier], minlength=len(self.names))
 
     def rmse(self, before: bool = False) -> Array:
-        """Root mean square reprojection error (N,) [px] of every view's kept observations."""
+        """Return the root mean square reprojection error (N,) [px] of every view's kept observations."""
         residual = self.residuals_before if before else self.residuals
         square = (residual[self.inlier] ** 2).sum(axis=1)
         total = np.bincount(self.view[self.inlier], square, len(self.names))
@@ -228,7 +228,7 @@ class PairHeights:
 
 
 def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights:
-    """Height uncertainty of a pair at the tie points that both views see.
+    """Return the height uncertainty of a pair at the tie points that both views see.
 
     Parameters
     ----------
@@ -259,7 +259,7 @@ def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights
 
 
 def height_by_unknowns(cameras: Cameras, params: Array, pair: tuple[int, int], points: Array) -> Array:
-    """Derivative (n, 2, q) of heights that two views measure, by the unknowns (N, q) of either.
+    """Return the derivative (n, 2, q) of heights that two views measure, by the unknowns (N, q) of either.
 
     Parameters
     ----------

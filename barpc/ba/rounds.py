@@ -230,7 +230,8 @@ class Rounds:
 
 
 def faintness(block: Block, heights: Heights) -> Array:
-    """Times (P,) by which observations of a point count as noisier: a control point that holds nothing ties nothing.
+    """Return the times (P,) by which observations of a point count as noisier: a control point that holds
+    nothing ties nothing.
 
     Those of many points marked a pixel off in one image would pull it away from its tie points, which together count
     for so much only. Points that are seen in an image without tie points are what ties that.
@@ -288,7 +289,8 @@ def _counted(observations: Observations, use: BoolArray, squared: Array, by_loss
 def revived(
     problem: Problem, state: State, residual: Array, use: BoolArray, weight: Array
 ) -> tuple[State, Array]:
-    """The state with tracks that were cut altogether where the cameras now see them, and the residuals (2, K) there.
+    """Return the state with tracks that were cut altogether where the cameras now see them, and the residuals
+    (2, K) there.
 
     Nothing moved them since; with what they were cut for mended, they may come back.
     """

@@ -41,14 +41,15 @@ class Interval:
 
 
 def price(views: int) -> float:
-    """What the choice among the intervals of all views, rows and columns, costs [nats]."""
+    """Return what the choice among the intervals of all views, rows and columns, costs [nats]."""
     return float(np.log(BINS * (BINS + 1) / 2 * 2 * views))
 
 
 def scan(
     view: IntArray, place: Array, size: Array, wrong: Array, off: Array, told: Array, floor: float = 0.0
 ) -> list[Interval]:
-    """The interval that stands out most, by each statistic, of every view's columns and rows; the best first.
+    """Return the interval that stands out most, by each statistic, of every view's columns and rows; the best
+    first.
 
     Parameters
     ----------
@@ -123,7 +124,8 @@ def _displacements(
 
 
 def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) -> Array:
-    """How surely neighbours lie off in the same direction (N,) [nats], what the choice among all tests costs taken off.
+    """Return how surely neighbours lie off in the same direction (N,) [nats], what the choice among all tests
+    costs taken off.
 
     Of wrong matches that lie anywhere they do so in half of the cases; of what moves, bends or shakes, in more.
 

@@ -52,7 +52,7 @@ class SmoothTest:
     shared: Array
 
     def found(self, least: float, level: float = 1e-4) -> BoolArray:
-        """Views (N,) with a smooth part above `least` [px] that is significant."""
+        """Return the views (N,) with a smooth part above `least` [px] that is significant."""
         return np.asarray((self.rms > least) & (self.significance < level))
 
 
@@ -86,7 +86,7 @@ class Smooth:
         return np.vstack([bsplines(row, SPLINES), col, col**2, col**3, row * col])
 
     def part(self, residual: Array, weight: Array, fit: Fit | None = None) -> Array:
-        """The smooth part (2, K) of residuals (2, K) [px], fitted with weights (K,) >= 0.
+        """Return the smooth part (2, K) of residuals (2, K) [px], fitted with weights (K,) >= 0.
 
         Zero for views with too few observations that count.
         """
@@ -96,7 +96,7 @@ class Smooth:
         return out
 
     def test(self, residual: Array, use: BoolArray, fit: Fit | None = None) -> SmoothTest:
-        """Whether the residuals (2, K) [px] of the observations in use hold more than scatter.
+        """Return whether the residuals (2, K) [px] of the observations in use hold more than scatter.
 
         What is too fine for the smooth part is not looked for.
         """
@@ -127,7 +127,7 @@ class Smooth:
         return SmoothTest(rms, significance, by_row, np.zeros(n))
 
     def test_neighbours(self, tested: SmoothTest, residual: Array, use: BoolArray) -> SmoothTest:
-        """The same test with what neighbours share, of views in which something was fitted."""
+        """Return the same test with what neighbours share, of views in which something was fitted."""
         shared, use = np.zeros_like(tested.rms), use & self._tells
         for v in np.flatnonzero(np.isfinite(tested.by_row)):
             shared[v] = self._shared(slice(*self.structure.bounds[v : v + 2]), residual, use)
@@ -158,7 +158,7 @@ class Smooth:
         return beyond / size, float(self.alike.share[second].sum())
 
     def fit(self, residual: Array, weight: Array) -> Fit:
-        """What `part` is made of, for views with enough observations that count."""
+        """Return what `part` is made of, for views with enough observations that count."""
         bounds, weight = self.structure.bounds, weight * self._tells
         counts = self.structure.sum_views(weight[None])[:, 0]
         found = {}

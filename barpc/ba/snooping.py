@@ -88,7 +88,7 @@ class ControlTest:
         return () if self.agreed is None else self.agreed.torn
 
     def status(self, point: int) -> str:
-        """What became of a point, in a word."""
+        """Return what became of a point, in a word."""
         if not self.used[point]:
             return "undecided" if self.sets else "rejected"
         return "contradicts" if self.w[point] > CRITICAL else "used"
@@ -97,7 +97,7 @@ class ControlTest:
 def control_test(
     covariance: Covariance, points: Array, first: int, gcps: GroundPoints, agreed: Agreement, faint: Array
 ) -> ControlTest:
-    """The test at a solution.
+    """Return the test at a solution.
 
     Parameters
     ----------
@@ -158,7 +158,8 @@ def _together(whitened: Array, redundancy: Array, used: BoolArray) -> tuple[floa
 def image_test(
     covariance: Covariance, problem: Problem, state: State, residual: Array, weight: Array, rows: IntArray
 ) -> Array:
-    """Baarda's w (n,) of observations in the images: the larger of |col| and |row| over its standard deviation.
+    """Return Baarda's w (n,) of observations in the images: the larger of |col| and |row| over its standard
+    deviation.
 
     A whitened residual has the covariance 1 - J C J^T, C that of camera and point together. NaN: nothing checks it.
 

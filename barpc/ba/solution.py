@@ -67,7 +67,8 @@ class Solution:
         return seen
 
     def first_points(self, block: Block) -> Array:
-        """Where the delivered cameras put the points (P, 3) [m] that are seen where the adjusted ones show them.
+        """Return where the delivered cameras put the points (P, 3) [m] that are seen where the adjusted ones
+        show them.
 
         Nothing but the cameras moves between the two: no observation that was cut, no place that was given, and no
         height where the rays of a point tell none.
@@ -115,7 +116,8 @@ def solve_block(
     centers: Array | None,
     prior: BlockPrior | None,
 ) -> Solution:
-    """Rounds with the model of the options, again from an agreement or with more drift where they ask for it.
+    """Return the rounds with the model of the options, again from an agreement or with more drift where they
+    ask for it.
 
     By its tie points first; then with the control points that agree with each other there. Measured on the
     observations of `outer`.
@@ -192,7 +194,9 @@ def _with_control(block: Block, heights: Heights, outcome: Outcome) -> tuple[Agr
 def finished(
     found: Solution, problem: Problem, block: Block, outer: Block, options: AdjustOptions, outcome: Outcome
 ) -> Solution:
-    """What the rounds of a problem ended with, its control tested and measured; where it started is `found`'s."""
+    """Return what the rounds of a problem ended with, its control tested and measured; where it started is
+    `found`'s.
+    """
     tested = None
     if found.agreed is not None:
         covariance, points = outcome.minimum.covariance(problem.free), outcome.minimum.state.points

@@ -44,7 +44,7 @@ class State:
     history: tuple[float, ...] = ()  # the cost at every linearisation, and at the end of every pass, so far
 
     def moved(self, step: Array, reduced: Reduced, cost: float) -> State:
-        """The state after a step (N, q) of the cameras and the points' step that goes with it."""
+        """Return the state after a step (N, q) of the cameras and the points' step that goes with it."""
         points = self.points + reduced.point_step(step)
         return replace(self, params=self.params + step, points=points, cost=cost)
 
@@ -60,7 +60,7 @@ class Minimum:
     _known: list[Covariance] = field(default_factory=list, repr=False)
 
     def covariance(self, free: BoolArray) -> Covariance:
-        """The posterior covariance, by the last linearisation; what it works out is kept."""
+        """Return the posterior covariance, by the last linearisation; what it works out is kept."""
         if not self._known:
             self._known.append(self._covariance(free))
         return self._known[0]
@@ -124,14 +124,14 @@ def _settled(gain: float, before: float, cost: float, tolerance: float) -> bool:
 
 
 def gauss_newton(problem: Problem, state: State, weight: Array, projected: Projected | None = None) -> State:
-    """One undamped step: for rounds whose weights change anyway. `projected` as in `minimise`."""
+    """Return one undamped step: for rounds whose weights change anyway. `projected` as in `minimise`."""
     reduced = problem.reduce(state.params, state.points, weight, projected)
     step, gain, _ = camera_step(problem, reduced)
     return state.moved(step, reduced, max(_finite(reduced.cost) - gain, 0.0))
 
 
 def camera_step(problem: Problem, reduced: Reduced, damping: float = 0.0) -> tuple[Array, float, Factor]:
-    """Gauss-Newton step (N, q) of the cameras, what it and the points' would gain, and the factor."""
+    """Return Gauss-Newton step (N, q) of the cameras, what it and the points' would gain, and the factor."""
     free = problem.free
     step = np.zeros(len(free))
     gradient = reduced.gradient[free]

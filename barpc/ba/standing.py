@@ -61,14 +61,16 @@ class Parts:
         return replace(self, group=group)
 
     def is_tied(self) -> bool:
-        """Whether every view keeps enough observations, and all hang together as they did."""
+        """Return whether every view keeps enough observations, and all hang together as they did."""
         block, inner = self.block, self.inner
         kept, had = (np.bincount(b.view[b.use], minlength=len(b.views)) for b in (inner, block))
         enough = bool((kept[had > 0] >= MIN_OBSERVATIONS).all())
         return enough and _groups(inner) == _groups(block)
 
     def mostly_moving(self, inlier: BoolArray) -> list[Interval]:
-        """Rows of images of which more ties move than stand, of those kept (K,) of `inner`: they may be what is off."""
+        """Return the rows of images of which more ties move than stand, of those kept (K,) of `inner`: they
+        may be what is off.
+        """
         block, gone = self.block, self.group > 0
         if not gone.any():
             return []
@@ -81,7 +83,7 @@ class Parts:
         return [replace(one, moves=True) for one in sure if one.share > 0.5]
 
     def motion(self, number: int, one: Found, points: Array) -> Motion:
-        """What is said of a group, of the points (P, 3) [m] of all tracks."""
+        """Return what is said of a group, of the points (P, 3) [m] of all tracks."""
         placed = self.block.point[self.block.point < self.block.num_tracks]
         placed = placed[np.isfinite(points[placed, 0])]
         every, of_group = np.unique(placed), np.unique(self.block.point[self.group == number])
@@ -113,7 +115,7 @@ def _groups(block: Block) -> int:
 def without_moving(
     found: Solution, parts: Parts, options: AdjustOptions, solve: Callable[[Parts], Solution]
 ) -> tuple[Solution, Parts, Judgement]:
-    """The block solved again without groups of ties that move, and what explains the rest.
+    """Return the block solved again without groups of ties that move, and what explains the rest.
 
     `Solution.findings` has both.
 

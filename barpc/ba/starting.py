@@ -32,7 +32,9 @@ def make_problem(
     drift: int | None = None,
     waves: Waves | None = None,
 ) -> Problem:
-    """Observations, cameras and priors, before anything is known about points; `drift` instead of the options'."""
+    """Return the observations, cameras and priors, before anything is known about points; `drift` instead of
+    the options'.
+    """
     views = block.views
     drift = _first_drift(options, prior) if drift is None else drift
     if prior is not None:
@@ -76,7 +78,7 @@ def _known_centers(block: Block, options: AdjustOptions, centers: Array | None, 
 def first_state(
     problem: Problem, block: Block, options: AdjustOptions, dem: Terrain | None
 ) -> tuple[State, Heights]:
-    """Points triangulated with the delivered cameras, and what holds those that the rays do not."""
+    """Return the points triangulated with the delivered cameras, and what holds those that the rays do not."""
     params = problem.camera_prior.mean
     points = block.first_points()
     points[~np.isfinite(points)] = 0.0

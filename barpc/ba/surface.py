@@ -55,7 +55,7 @@ class Surface:
 
     @classmethod
     def of(cls, points: Array) -> Surface:
-        """The surface of at least `NEIGHBOURS` points (P, 3)."""
+        """Return the surface of at least `NEIGHBOURS` points (P, 3)."""
         tree = cKDTree(points[:, :2])
         distance, near = (np.asarray(part) for part in tree.query(points[:, :2], k=NEIGHBOURS))
         reach = np.maximum(distance[:, -1], 1e-3)
@@ -79,7 +79,9 @@ class Surface:
         )
 
     def at(self, place: Array) -> tuple[Array, IntArray, BoolArray]:
-        """Height (n,) at places (n, 2), the tie point (n,) whose patch says so, and whether it reaches there."""
+        """Return the height (n,) at places (n, 2), the tie point (n,) whose patch says so, and whether it
+        reaches there.
+        """
         distance, nearest = (np.asarray(part) for part in self.tree.query(place))
         design = _powers(self._from(place, nearest))
         near = (distance <= self.reach[nearest]) & self.whole[nearest]
@@ -92,7 +94,7 @@ class Surface:
         return np.asarray(of_patch + self.scatter[nearest] ** 2)
 
     def slope(self, place: Array, nearest: IntArray) -> tuple[Array, Array]:
-        """Slopes (n, 2) to the east and north at places (n, 2), and their covariance (n, 2, 2)."""
+        """Return the slopes (n, 2) to the east and north at places (n, 2), and their covariance (n, 2, 2)."""
         u, v = self._from(place, nearest).T
         zero, one = np.zeros_like(u), np.ones_like(u)
         rates = np.array([[zero, one, zero, 2.0 * u, v, zero], [zero, zero, one, zero, u, 2.0 * v]])
@@ -154,7 +156,7 @@ class Registration:
 
 
 def displacement(local: Array) -> Array:
-    """(n, 3, 7): moves east, north, up of points at `local` (n, 2) radii by the seven motions of a scene."""
+    """Return (n, 3, 7): moves east, north, up of points at `local` (n, 2) radii by the seven motions of a scene."""
     e, o = local.T
     moves = np.zeros((len(e), 3, 7))
     moves[:, (0, 1, 2), (0, 1, 2)] = 1.0

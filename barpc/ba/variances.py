@@ -117,7 +117,7 @@ class Variances:
         control: bool,
         views: Sequence[View] = (),
     ) -> Variances:
-        """What the options leave to be learnt, with control points or without."""
+        """Return what the options leave to be learnt, with control points or without."""
         geometric = unknowns.geometric and options.learn_priors
         own = options.sigma_attitude is None and options.sigma_position is None and len(views) > 0
         stated = np.array([states_accuracy(view) for view in views]) if own else None
@@ -129,13 +129,13 @@ class Variances:
         return self.unknowns.constants if self.unknowns.geometric else 0
 
     def for_search(self) -> CameraPrior:
-        """Priors while outliers are looked for: a drift that was not expected must not look like them."""
+        """Return the priors while outliers are looked for: a drift that was not expected must not look like them."""
         return self._prior(np.ones(len(self.given.sigma)), np.full(self._degrees, _SEARCH))
 
     def learnt(
         self, problem: Problem, minimum: Minimum, exact: bool = False
     ) -> tuple[CameraPrior, PriorTest]:
-        """The priors that the block supports, in its linearisation at a minimum.
+        """Return the priors that the block supports, in its linearisation at a minimum.
 
         A large block's variances are probed unless they are to be `exact`.
         """
@@ -347,7 +347,8 @@ def _possible(total: float, freedom: float) -> float:
 
 
 def same_prior(a: CameraPrior, b: CameraPrior, share: float, part: slice | None = None) -> bool:
-    """Whether the standard deviations of two priors differ by less than a share; infinite ones are infinite in both.
+    """Return whether the standard deviations of two priors differ by less than a share; infinite ones are
+    infinite in both.
 
     Of all unknowns, or a part.
     """

@@ -53,7 +53,7 @@ class Waves:
         return vectors * np.where(vectors[-1] < 0, -1.0, 1.0)
 
     def splines(self, row: Array) -> Array:
-        """What one unit of the splines' unknowns of one coordinate adds (m, n) at rows (n,) normalised."""
+        """Return what one unit of the splines' unknowns of one coordinate adds (m, n) at rows (n,) normalised."""
         found: Array = self._of_splines.T @ bsplines(row, self.count)
         return found
 
@@ -113,7 +113,8 @@ class Waves:
         return self.size - of_swings + max(4.0 * float(waves.max(initial=0.0)), of_swings)
 
     def basis(self, row: Array, seen: Array, index: IntArray) -> list[Array]:
-        """What one unit of the unknowns of one coordinate adds (m, n), kind by kind, to points seen at (2, n) [px].
+        """Return what one unit of the unknowns of one coordinate adds (m, n), kind by kind, to points seen at
+        (2, n) [px].
 
         Their rows (n,) normalised are given, too.
         """
@@ -129,7 +130,9 @@ class Waves:
         return found
 
     def displaced(self, params: Array, index: IntArray, basis: list[Array]) -> Array:
-        """Displacement (2, n) [px] of observations of views `index` (n,) whose unknowns are `params` (N, size)."""
+        """Return the displacement (2, n) [px] of observations of views `index` (n,) whose unknowns are
+        `params` (N, size).
+        """
         out = np.zeros((2, len(index)))
         for part, one in zip(self._filled, basis, strict=True):
             of_views = params[:, part].reshape(len(params), 2, -1)
@@ -146,7 +149,7 @@ class Waves:
             out[0, part.start : middle] = out[1, middle : part.stop] = one
 
     def correction(self, params: Array, view: int, row_offset: float, row_scale: float) -> RowSpline:
-        """The correction of a view with the unknowns (size,)."""
+        """Return the correction of a view with the unknowns (size,)."""
         (m, s, num, swings), (_, of_steps, of_strips, of_swings) = self.parts, self.kinds
         coeffs = self._of_splines @ params[: 2 * m].reshape(2, m).T if m else np.zeros((0, 2))
         found = RowSpline(coeffs, row_offset, row_scale)
@@ -165,7 +168,9 @@ class Waves:
         return found
 
     def carried(self, params: Array, known: Waves) -> Array:
-        """Unknowns (N, size) that start from those of another layout (N, known.size), kind by kind where they agree."""
+        """Return the unknowns (N, size) that start from those of another layout (N, known.size), kind by kind
+        where they agree.
+        """
         out = np.zeros((len(params), self.size))
         same = self.count == known.count, False, bool(known.parts[2]), self.parts[3] == known.parts[3]
         for agrees, mine, theirs in zip(same, self.kinds, known.kinds, strict=True):

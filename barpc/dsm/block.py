@@ -51,7 +51,8 @@ class Block:
 
 
 def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: Path | None = None) -> Block:
-    """The images of a finished run behind its corrected cameras; altitudes by its tie points unless given.
+    """Return the images of a finished run behind its corrected cameras; altitudes by its tie points unless
+    given.
 
     `minus`: a run of some of these images (an earlier one, that this one went on from); they are another group then.
 
@@ -96,7 +97,7 @@ def _split(folder: Path, names: Sequence[str], minus: Path) -> list[list[int]]:
 
 
 def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = None, band: int = 1) -> Block:
-    """Images with the cameras that come with them; altitudes are those of the cameras unless given."""
+    """Return the images with the cameras that come with them; altitudes are those of the cameras unless given."""
     views = [replace(view, alt_range=alts or view.alt_range) for view in load_views(images, band=band).views]
     for view in views:
         if isinstance(view.sensor, Radar):

@@ -50,7 +50,9 @@ class Tile:
     alts: tuple[float, float]
 
     def nodes(self, count: int = _NODES) -> Array:
-        """Longitude, latitude (count^2, 2) [deg] on a grid from corner to corner, rows from the north slowest."""
+        """Return the longitude, latitude (count^2, 2) [deg] on a grid from corner to corner, rows from the
+        north slowest.
+        """
         x = self.west + self.step * np.linspace(0, self.size[0], count)
         y = self.north - self.step * np.linspace(0, self.size[1], count)
         east, north = (part.ravel() for part in np.meshgrid(x, y))
@@ -73,7 +75,7 @@ class Tile:
         ]
 
     def places(self) -> Callable[[Array], Array]:
-        """A function of lon, lat (n, 2) [deg]: col, row (n, 2) of its cells. Cubics: to 0.1 mm over 10 km."""
+        """Return a function of lon, lat (n, 2) [deg]: col, row (n, 2) of its cells. Cubics: to 0.1 mm over 10 km."""
         nodes = self.nodes()
         col, row = np.meshgrid(np.linspace(0, self.size[0], _NODES), np.linspace(0, self.size[1], _NODES))
         middle = nodes.mean(axis=0) if np.ptp(nodes[:, 0]) < 180.0 else nodes[0]
@@ -95,7 +97,8 @@ def _cubic(at: Array) -> Array:
 
 
 def surface_tile(pairs: Sequence[tuple[View, View]], tile: Tile, band: int) -> tuple[F32, ...]:
-    """The cells of a tile, in a worker: of each pair's matches the median, of the pairs' heights the median.
+    """Return the cells of a tile, in a worker: of each pair's matches the median, of the pairs' heights the
+    median.
 
     Returns
     -------

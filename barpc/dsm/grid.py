@@ -71,7 +71,7 @@ class Grid:
 
     @classmethod
     def of(cls, block: Block, options: DsmOptions) -> Grid:
-        """The cells in UTM or the CRS asked for, at twice the ground sampling distance unless told."""
+        """Return the cells in UTM or the CRS asked for, at twice the ground sampling distance unless told."""
         first = block.views[block.groups[0][0][0]]
         middle = first.sensor.localize((np.array(first.size) - 1) / 2, np.array(first.altitude))
         crs = _crs(options.crs, middle)
@@ -102,13 +102,13 @@ class Grid:
         return found
 
     def box(self, col: int, row: int) -> Any:
-        """The outline of a tile on the map."""
+        """Return the outline of a tile on the map."""
         width, height = min(SIDE, self.size[0] - col), min(SIDE, self.size[1] - row)
         left, top = self.west + self.step * col, self.north - self.step * row
         return shapely.box(left, top - self.step * height, left + self.step * width, top)
 
     def tile(self, col: int, row: int) -> Tile:
-        """The tile that begins at a cell."""
+        """Return the tile that begins at a cell."""
         size = min(SIDE, self.size[0] - col), min(SIDE, self.size[1] - row)
         views = self.block.views
         alts = max(v.alt_range[0] for v in views), min(v.alt_range[1] for v in views)

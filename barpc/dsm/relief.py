@@ -80,7 +80,9 @@ def _one(cameras: str, height: F32, nmad: F32, step: float) -> dict[str, object]
 
 
 def shaded(height: F32, step: float) -> npt.NDArray[np.uint8]:
-    """A relief (rows, cols) [m] in the light of the north-west, cells of `step` [m]; black where nothing is known."""
+    """Return a relief (rows, cols) [m] in the light of the north-west, cells of `step` [m]; black where
+    nothing is known.
+    """
     by_row, by_col = np.gradient(height.astype(np.float64), step)
     normal = np.stack([-by_col, by_row, np.ones(height.shape)])  # rows count to the south
     light = np.einsum("i,ijk->jk", _LIGHT, normal / np.linalg.norm(normal, axis=0))

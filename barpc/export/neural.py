@@ -37,12 +37,12 @@ _GL = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes right, down, forward -> rig
 
 
 def as_json(value: Any) -> bytes:
-    """A JSON text; what is not finite is null."""
+    """Return a JSON text; what is not finite is null."""
     return (json.dumps(plain(value), indent=1, ensure_ascii=False) + "\n").encode()
 
 
 def rpc_of(shot: Shot) -> dict[str, Any]:
-    """The corrected RPC in the names of rpcm."""
+    """Return the corrected RPC in the names of rpcm."""
     write = WRITABLE["json"].write
     assert write is not None
     found: dict[str, Any] = json.loads(write(shot.rpc))["rpc"]
@@ -75,7 +75,7 @@ def _record(scene: Scene, shot: Shot, img: str) -> dict[str, Any]:
 
 
 def satnerf(scene: Scene, out: Path) -> Files:
-    """``<image>.json`` each, the points in ``pts3d.npy`` (ECEF), ``train.txt`` and ``test.txt``."""
+    """Write ``<image>.json`` each, the points in ``pts3d.npy`` (ECEF), ``train.txt`` and ``test.txt``."""
     rows = zip(scene.shots, scene.file_names(out), strict=True)
     files = {f"{shot.name}.json": as_json(_record(scene, shot, img)) for shot, img in rows}
     names = list(files)
@@ -162,7 +162,7 @@ def _grid(scene: Scene, shot: Shot, nodes: tuple[int, int]) -> tuple[Array, Arra
 
 
 def pinhole_of(scene: Scene, shot: Shot) -> tuple[Pinhole, float]:
-    """The nearest pinhole of a shot, and its largest error over the scene [px]."""
+    """Return the nearest pinhole of a shot, and its largest error over the scene [px]."""
     pinhole = fit_pinhole(scene.samples(shot), **scene.view_of(shot))
     checked = scene.samples(shot, checked=True)
     error = checked.error(pinhole.project(checked.world))
@@ -172,7 +172,9 @@ def pinhole_of(scene: Scene, shot: Shot) -> tuple[Pinhole, float]:
 
 
 def nerfstudio(scene: Scene, out: Path) -> Files:
-    """``transforms.json``: pinhole, pose and largest error of every image, and simpler and nearer cameras beside."""
+    """Write ``transforms.json``: pinhole, pose and largest error of every image, and simpler and nearer
+    cameras beside.
+    """
     frames = [_frame(scene, shot, out) for shot in scene.shots]
     found = {
         "camera_model": "PINHOLE",
@@ -233,7 +235,9 @@ def _cloud(scene: Scene) -> bytes:
 
 
 def colmap(scene: Scene, out: Path) -> Files:
-    """A text model of pinhole cameras, tie points and their places; ``world.json`` says where it lies on Earth."""
+    """Return a text model of pinhole cameras, tie points and their places; ``world.json`` says where it lies
+    on Earth.
+    """
     world = scene.world(scene.points)
     cameras, images, errors = [], [], {}
     seen: dict[int, list[tuple[int, int, float]]] = {}

@@ -89,12 +89,12 @@ class Scene:
         return matrix
 
     def world(self, ground: Array) -> Array:
-        """East, north, up (N, 3) of the origin [m] of ground points (N, 3)."""
+        """Return the east, north, up (N, 3) of the origin [m] of ground points (N, 3)."""
         away = ecef_from_ground(ground) - ecef_from_ground(self.origin)
         return np.asarray(away @ enu_basis(self.origin).T)
 
     def samples(self, shot: Shot, checked: bool = False) -> Sampled:
-        """Points over an image and the scene's altitudes; to measure errors on, more of them."""
+        """Return the points over an image and the scene's altitudes; to measure errors on, more of them."""
         image, alt = image_grid(shot.size, self.alt_range, _CHECKED if checked else _NODES)
         ground = shot.rpc.localize(image, alt)
         known = np.isfinite(ground).all(axis=1)
@@ -103,7 +103,7 @@ class Scene:
         return Sampled(self.world(ground[known]), image[known])
 
     def view_of(self, shot: Shot) -> dict[str, Any]:
-        """How a shot sees the middle of its own ground: what `approx.fit_pinhole` starts from."""
+        """Return how a shot sees the middle of its own ground: what `approx.fit_pinhole` starts from."""
         pixel = (np.array(shot.size) - 1.0) / 2
         ground = shot.rpc.localize(pixel, np.array(self.origin[2]))
         local = enu_basis(ground) @ enu_basis(self.origin).T  # of the world's axes there
@@ -120,14 +120,14 @@ class Scene:
         }
 
     def file_names(self, out: Path) -> list[str]:
-        """What a file in `out` calls the images: by name where all lie in one folder, else relative to `out`."""
+        """Return what a file in `out` calls the images: by name where all lie in one folder, else relative to `out`."""
         if len({PurePath(shot.file).parent for shot in self.shots}) == 1:
             return [PurePath(shot.file).name for shot in self.shots]
         return [link(shot.file, out) for shot in self.shots]
 
 
 def link(target: Path | str, folder: Path) -> str:
-    """A file as a text in a folder names it: relative, with slashes, so that both may move; a URL as it is."""
+    """Return a file as a text in a folder names it: relative, with slashes, so that both may move; a URL as it is."""
     if is_url(str(target)):
         return str(target)
     absolute = os.path.abspath(target)  # noqa: PTH100  (no link is followed: it may be meant)
@@ -135,7 +135,7 @@ def link(target: Path | str, folder: Path) -> str:
 
 
 def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Scene:
-    """The scene of a run folder; altitudes [m] by its tie points unless they are given.
+    """Read the scene of a run folder; altitudes [m] by its tie points unless they are given.
 
     Raises
     ------
@@ -219,7 +219,9 @@ def _noise(files: RunFiles, counted: Any) -> float:
 
 
 def pairs_of(scene: Scene) -> Sequence[tuple[str, str]]:
-    """The pairs that stereo is made of: those with tie points and an angle that shows heights; else all of them."""
+    """Return the pairs that stereo is made of: those with tie points and an angle that shows heights; else
+    all of them.
+    """
     pairs = [(p.a, p.b, p.convergence_deg or 0.0) for p in scene.summary.pairs]
     good = [(a, b) for a, b, angle in pairs if 2.0 <= angle <= 50.0]
     return good or [(a, b) for a, b, _ in pairs]

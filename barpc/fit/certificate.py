@@ -73,7 +73,9 @@ class Sample:
         cells: int = CELLS,
         seed: int = 0,
     ) -> Sample:
-        """One point a cell of `cells` along each side of the image, at random in it, and those along the edges."""
+        """Return one point a cell of `cells` along each side of the image, at random in it, and those along
+        the edges.
+        """
         if min(size) < 1:
             raise FitError(f"image size {size[0]} x {size[1]}: nothing to fit over")
         rng = np.random.default_rng(seed)
@@ -101,7 +103,8 @@ class Sample:
         )
 
     def contradiction(self) -> float:
-        """Largest distance [px] of the points from where the model projects their ground; infinite where it fails.
+        """Return the largest distance [px] of the points from where the model projects their ground; infinite
+        where it fails.
 
         At the altitudes that were asked for, whatever altitudes it gave back.
         """
@@ -163,7 +166,7 @@ def _scaled(unit: Array, size: tuple[int, int], alt_range: tuple[float, float]) 
 
 
 def roundtrip(rpc: RPC, ground: Array) -> float:
-    """Largest distance [px] between ground points (N, 3) and where their projections are localised."""
+    """Return the largest distance [px] between ground points (N, 3) and where their projections are localised."""
     image, jacobian = rpc.project_jacobian(ground)
     back = rpc.localize(image, ground[:, 2])
     miss = back - ground
@@ -173,7 +176,7 @@ def roundtrip(rpc: RPC, ground: Array) -> float:
 
 
 def coverage(image: Array, low: Array, high: Array) -> float:
-    """Share of the rectangle `low`, `high` (2,) [px] inside the convex hull of image points (N, 2) [px]."""
+    """Return the share of the rectangle `low`, `high` (2,) [px] inside the convex hull of image points (N, 2) [px]."""
     angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
     direction = np.column_stack([np.cos(angle), np.sin(angle)])  # outside is beyond all in one direction
     reach = np.full(len(angle), -np.inf)

@@ -60,7 +60,9 @@ class Localisation:
 
 
 def off(rpc: RPC, found: Array, ground: Array, image: Array) -> Array:
-    """Distances (N, 2) [m, px] of places `found` (N, 3) from ground points (N, 3), and of their projections."""
+    """Return the distances (N, 2) [m, px] of places `found` (N, 3) from ground points (N, 3), and of their
+    projections.
+    """
     miss = found - ground
     miss[:, 0] = wrap_longitude(miss[:, 0])
     metres = np.linalg.norm((miss * metres_per_unit(ground))[:, :2], axis=1)

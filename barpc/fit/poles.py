@@ -106,7 +106,7 @@ class Region:
         return np.asarray(inverse @ monomials((places @ self.axes + self.offset).T).T)
 
     def bernstein(self, cubic: Array) -> Array:
-        """Bernstein coefficients (K,) of a cubic (20,), of which it lies above the least."""
+        """Return Bernstein coefficients (K,) of a cubic (20,), of which it lies above the least."""
         return np.asarray((_net() @ (self.there @ cubic))[self.inside].ravel())
 
     def rows(self, index: IntArray) -> Array:

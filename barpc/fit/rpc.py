@@ -259,7 +259,7 @@ def innermost(model: object) -> object:
 
 
 def relative_weight(sigma: npt.ArrayLike | None, count: int) -> Array | None:
-    """Weights (count,) of standard deviations (count,), 1 for the smallest; None for none."""
+    """Return the weights (count,) of standard deviations (count,), 1 for the smallest; None for none."""
     if sigma is None:
         return None
     value = np.asarray(sigma, dtype=np.float64)

@@ -62,7 +62,8 @@ _EVEN = 0.05  # a denominator within 1 -/+ this weights nothing
 
 
 def corner(systems: Sequence[Compressed]) -> float:
-    """Regularisation h at the corner of the L-curve of systems that share it: the largest curvature, by grids of h.
+    """Return the regularisation h at the corner of the L-curve of systems that share it: the largest
+    curvature, by grids of h.
 
     The curve (log |M x - y|, log |x|) and its curvature have a closed form in the singular values (Hansen,
     "Rank-deficient and discrete ill-posed problems", 1998).
@@ -176,7 +177,8 @@ class Solution:
         return self.method in BOUNDED and self.region.smallest(self.coeffs[1::2]) < FLOOR + _SLACK
 
     def leave_one_out(self) -> Iterator[Array]:
-        """Residuals (n, 2) that points would have if they had not been used, some hundred at a time.
+        """Yield the residuals (n, 2) that points would have if they had not been used, some hundred at a
+        time.
 
         r / (1 - leverage), the leverage from the final system: exact for a linear problem.
         """
@@ -208,14 +210,14 @@ def region_of(problem: Problem) -> Region:
 
 
 def tidy(values: Array) -> Array:
-    """Values of at most twelve significant digits: they survive every reader that prints fifteen."""
+    """Return the values of at most twelve significant digits: they survive every reader that prints fifteen."""
     return np.array([float(f"{value:.12g}") for value in values])
 
 
 def normalization(
     ground: Array, image: Array, options: FitOptions, vendor: RPC | None = None
 ) -> Normalization:
-    """Offsets and scales that take points into [-1, 1], rounded to the options' precision.
+    """Return the offsets and scales that take points into [-1, 1], rounded to the options' precision.
 
     Those of the ground are the vendor's where one is given.
     """

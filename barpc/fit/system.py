@@ -71,7 +71,7 @@ class Compressed:
         return abs(float(self.triangle[-1, -1])) / float(np.sqrt(self.freedom))
 
     def squares(self, solution: Array) -> float:
-        """Sum of squares of M x - y."""
+        """Return the sum of squares of M x - y."""
         rest = self.matrix @ solution - self.target
         return float(rest @ rest + self.triangle[-1, -1] ** 2)
 
@@ -125,7 +125,7 @@ class Problem:
         free: bool = True,
         numerator: Array | None = None,
     ) -> Iterator[tuple[slice, Array]]:
-        """Rows (n, k + 1) of (M | y) of col (`axis` 0) or row (1), some hundred points at a time.
+        """Yield the rows (n, k + 1) of (M | y) of col (`axis` 0) or row (1), some hundred points at a time.
 
         A denominator (20,) weights the rows by 1 / b; its coefficients are unknowns too where `free`. With a numerator,
         too, they are those of the linearised a / b.
@@ -171,7 +171,7 @@ class Problem:
         return Compressed(np.triu(triangle), len(self.image))
 
     def expanded(self, solution: Array, denominator: Array | None = None) -> Array:
-        """Numerator and denominator (2, 20) of a solution; monomials not in use are zero."""
+        """Return the numerator and denominator (2, 20) of a solution; monomials not in use are zero."""
         m, out = len(self.active), np.zeros((2, 20))
         out[0, self.active] = solution[:m]
         if denominator is not None:
@@ -191,7 +191,8 @@ class Problem:
 
 
 def expected_size(active: IntArray) -> Array:
-    """Size (k,) expected of each unknown, those of the denominator last; infinite where nothing is expected.
+    """Return the size (k,) expected of each unknown, those of the denominator last; infinite where nothing is
+    expected.
 
     Numerator: 0.1 of degree two, 0.03 of degree three. Denominator: `TAU` of degree one, a tenth of it
     of degree two, a hundredth of degree three: what vendors' RPCs show, with room.

@@ -34,7 +34,7 @@ _MISTAKES = {
 
 
 def load_gcps(paths: Sequence[str], views: Sequence[View], options: RunOptions) -> GroundPoints | None:
-    """Ground points of several files, one after the other; None without files.
+    """Return the ground points of several files, one after the other; None without files.
 
     Points that cannot be where they are said to be, images that are no views, and files that cannot be read are an
     InputError, or with `keep_going` left out and named in `left_out`.

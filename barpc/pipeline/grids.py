@@ -232,7 +232,9 @@ def verify_grids(view: View, model: SensorModel, errors: Misses, folder: str) ->
 
 
 def tile_boxes(size: tuple[int, int], side: int) -> list[Box]:
-    """Tiles (col, row, width, height) from multiples of `side` on; a rest of up to half a side joins its neighbour."""
+    """Return the tiles (col, row, width, height) from multiples of `side` on; a rest of up to half a side
+    joins its neighbour.
+    """
     edges = [[*range(0, max(1, length - side // 2), side), length] for length in size]
     return [(c, r, right - c, low - r) for r, low in pairwise(edges[1]) for c, right in pairwise(edges[0])]
 

@@ -151,7 +151,7 @@ def _resolved(path: str | Path) -> object:
 
 
 def only_new(tracks: Tracks, old: BoolArray) -> Tracks:
-    """Tracks that tell something an earlier block, of the views `old` (N,), did not know.
+    """Return the tracks that tell something an earlier block, of the views `old` (N,), did not know.
 
     Tracks without a new view are left out. Of those seen in several old views one old observation is kept: how
     these views lie to each other is in the earlier block's normal matrix already.

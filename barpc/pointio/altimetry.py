@@ -35,7 +35,8 @@ COLUMNS = {
 
 
 def read_altimetry(path: Path | str) -> Altimetry:
-    """Heights of a text: a header that names columns, or lines of lon, lat, alt and perhaps sigma and sigma_flat.
+    """Read the heights of a text: a header that names columns, or lines of lon, lat, alt and perhaps sigma
+    and sigma_flat.
 
     Cells between commas, semicolons, tabs or blanks. Lines whose height is blank, no number or a fill value are left
     out. InputError where a line does not parse, a place is none in degrees, or no height is left.

@@ -32,7 +32,7 @@ _STEPS = 2000  # of 100,000 instructions of SQLite, seconds of work: a damaged f
 
 
 def read_colmap(path: Path, views: ViewNames) -> Iterator[PairPoints]:
-    """The matches between two of the views; InputError where the file is no such database."""
+    """Read the matches between two of the views; InputError where the file is no such database."""
     with opened(path, _DATABASE):  # no pipe, no device
         pass
     for log in (path.with_name(f"{path.name}-{end}") for end in ("wal", "journal")):

@@ -41,7 +41,7 @@ class _Point:
 
 
 def read_gcps(path: Path | str, names: Sequence[str]) -> GroundPoints:
-    """GCPs and where they are seen, of a CSV or `.gcp` file, a GeoJSON file, or an image with GCP tags.
+    """Read GCPs and where they are seen, of a CSV or `.gcp` file, a GeoJSON file, or an image with GCP tags.
 
     Observations in other images than the views called `names` are left out, and these named in `strangers`. InputError
     where the file does not parse, or holds no point of these views.
@@ -139,7 +139,7 @@ def _gcp_columns(path: Path, words: Sequence[str], views: ViewNames) -> dict[str
 
 
 def cells_of(line: str, delimiter: str) -> list[str]:
-    """The cells of a line of a table, those that are empty too unless blanks part them."""
+    """Return the cells of a line of a table, those that are empty too unless blanks part them."""
     row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
     return [from_cell(cell.strip()) for cell in row if delimiter != " " or cell]
 
@@ -268,7 +268,7 @@ def read_correspondences(path: Path | str, *, altitudes: Sequence[float] | None 
 
 
 def correspondence_kind(path: Place, altitudes: Sequence[float] | None = None) -> str | None:
-    """What a file is: "csv", "npz", "geojson", "grid", or None for neither (an image or an RPC file)."""
+    """Return what a file is: "csv", "npz", "geojson", "grid", or None for neither (an image or an RPC file)."""
     head = read_head(path, TABLE, 65536)
     if driver_of(head) == "GTiff":
         with open_raster(path) as dataset:
@@ -296,7 +296,7 @@ def _split(line: str) -> list[str]:
 
 
 def numbers_of(words: Sequence[str]) -> list[float] | None:
-    """Words as numbers; None where one is none."""
+    """Return the words as numbers; None where one is none."""
     try:
         return [float(word) for word in words]
     except ValueError:
@@ -304,7 +304,7 @@ def numbers_of(words: Sequence[str]) -> list[float] | None:
 
 
 def header_of(words: Sequence[str], names: Mapping[str, Sequence[str]] | None = None) -> dict[str, int]:
-    """Column of each quantity that a header names, by default of `_COLUMNS` and the points' sigma [px]."""
+    """Return the column of each quantity that a header names, by default of `_COLUMNS` and the points' sigma [px]."""
     lower = [re.sub(r"[\[(].*", "", word.lower()).strip().replace(" ", "_") for word in words]
     names = {**_COLUMNS, "sigma": ("sigma", "sigma_px")} if names is None else names
     hits = {key: [lower.index(a) for a in aliases if a in lower] for key, aliases in names.items()}
@@ -381,7 +381,8 @@ def _read_features(path: Path) -> Correspondences:
 
 
 def geojson_points(path: Path, *needed: str) -> list[tuple[list[float], dict[str, Any]]]:
-    """Points of a GeoJSON: lon, lat, alt, col, row (of the property ``ji``, or ``col``, ``row``); properties.
+    """Return the points of a GeoJSON: lon, lat, alt, col, row (of the property ``ji``, or ``col``, ``row``);
+    properties.
 
     InputError where it is no such file, or has not all properties that are `needed`.
     """
@@ -403,7 +404,7 @@ def _feature(feature: dict[str, Any], needed: Sequence[str]) -> tuple[list[float
 
 
 def read_grid(path: Place, altitudes: Sequence[float] | None = None) -> Correspondences:
-    """A direct-localisation grid: bands lon, lat of each altitude layer, nodes by the geotransform.
+    """Read a direct-localisation grid: bands lon, lat of each altitude layer, nodes by the geotransform.
 
     The geotransform counts from the corner of the first pixel, as GDAL does; half a pixel is taken off. Altitudes of
     the layers [m] are those given, or of the tags ``ALTITUDE_B0``, ``ALTITUDE_B2``, ...

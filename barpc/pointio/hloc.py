@@ -29,7 +29,7 @@ _FEATURES = ("features.h5", "keypoints.h5")
 
 
 def read_hloc(path: Path, views: ViewNames) -> Iterator[PairPoints]:
-    """The matches between two of the views; the keypoints are looked for in the file, then beside it."""
+    """Read the matches between two of the views; the keypoints are looked for in the file, then beside it."""
     try:
         import h5py
     except ImportError:

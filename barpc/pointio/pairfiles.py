@@ -25,13 +25,13 @@ _HEAD = 45  # bytes of a keypoint in ASP's binary files, before its descriptor
 
 
 def in_folder(folder: Path) -> list[Path]:
-    """The files of pairs in a folder; of two that ASP wrote of a pair, the clean one."""
+    """Return the files of pairs in a folder; of two that ASP wrote of a pair, the clean one."""
     found = sorted(path for ending in ENDINGS for path in folder.glob(f"*_*{ending}"))
     return [path for path in found if path.with_stem(path.stem + _CLEAN) not in found]
 
 
 def read_pair_files(paths: Sequence[Path], views: ViewNames) -> Iterator[PairPoints]:
-    """The matches of the files between two of the views."""
+    """Read the matches of the files between two of the views."""
     for path in paths:
         pair = pair_of(path, views)
         if pair is not None:
@@ -39,13 +39,13 @@ def read_pair_files(paths: Sequence[Path], views: ViewNames) -> Iterator[PairPoi
 
 
 def pair_of(path: Path, views: ViewNames) -> tuple[int, int] | None:
-    """The two views that a file's name means; None where one is none of them."""
+    """Return the two views that a file's name means; None where one is none of them."""
     left, right = (views.find(name) for name in _images(path, views))
     return None if left is None or right is None or left == right else (left, right)
 
 
 def is_dictionary(arrays: Arrays) -> bool:
-    """Whether the arrays of an npz file are the matches of one pair."""
+    """Return whether the arrays of an npz file are the matches of one pair."""
     return "keypoints0" in arrays
 
 
@@ -105,7 +105,7 @@ def _dictionary(path: Path) -> tuple[Array, Array]:
 
 
 def matched_keypoints(path: Path, arrays: Arrays) -> tuple[Array, Array]:
-    """Points (M, 2), (M, 2) that the arrays of one pair say."""
+    """Return the points (M, 2), (M, 2) that the arrays of one pair say."""
     try:
         first, second = (_points(arrays[key]) for key in ("keypoints0", "keypoints1"))
         known = arrays.get("matches0", arrays.get("matches"))

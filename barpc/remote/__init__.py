@@ -83,23 +83,23 @@ Place = Path | Remote
 
 
 def is_url(text: str | os.PathLike[str]) -> bool:
-    """Whether a text names a file on another host, and none here."""
+    """Return whether a text names a file on another host, and none here."""
     found = re.match(r"(https?|s3|gs|az)://", os.fspath(text), re.IGNORECASE)
     return found is not None and not os.path.lexists(text)
 
 
 def place(path: str | os.PathLike[str]) -> Place:
-    """What a file is opened by: a Remote as it is, any other text as a path of this machine."""
+    """Return what a file is opened by: a Remote as it is, any other text as a path of this machine."""
     return path if isinstance(path, Remote) else Path(path)
 
 
 def here(names: Iterable[str | os.PathLike[str]]) -> list[Path]:
-    """The files of this machine among some."""
+    """Return the files of this machine among some."""
     return [Path(name) for name in names if not isinstance(name, Remote)]
 
 
 def pure(file: Place) -> PurePath:
-    """A file's folders and name; of a Remote its host and path."""
+    """Return a file's folders and name; of a Remote its host and path."""
     return file.pure if isinstance(file, Remote) else file
 
 
@@ -185,7 +185,7 @@ _blocks = _Blocks()
 
 
 def pinned(at: Remote) -> Remote:
-    """The same file with the version that it has now; OSError where there is none, or it does not answer."""
+    """Return the same file with the version that it has now; OSError where there is none, or it does not answer."""
     if at.size is not None:
         return at
     part = _fetch(at, 0, BLOCK)
@@ -216,7 +216,7 @@ class RemoteFile(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """Where the next byte is read."""
+        """Return where the next byte is read."""
         self._position = max(0, offset + (0, self._position, self.size)[whence])
         return self._position
 
@@ -269,7 +269,7 @@ def _runs(blocks: list[int]) -> Iterator[range]:
 
 
 def beside(image: Remote, names: Iterable[str]) -> dict[str, str]:
-    """The names of those of these files that are in an image's folder, by name in lower case.
+    """Return the names of those of these files that are in an image's folder, by name in lower case.
 
     A store lists the folder, and case does not count; a web server is asked for each name as it is and with its ending
     in lower case.

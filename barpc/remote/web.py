@@ -44,7 +44,7 @@ class _PassingError(OSError):
 
 
 def fetch(at: Remote, start: int, stop: int) -> Part:
-    """Bytes `start` to `stop` of a file, or to its end; OSError where the server does not hand them out."""
+    """Return the bytes `start` to `stop` of a file, or to its end; OSError where the server does not hand them out."""
     for wait in (*WAITS, None):
         try:
             return _moved(at, start, stop)

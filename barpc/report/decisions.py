@@ -28,7 +28,7 @@ _LEFT = 3  # places
 
 
 def decisions(summary: Summary) -> list[str]:
-    """The decisions on the whole run: what ties its pairs, what each camera may do, what was cut."""
+    """Return the decisions on the whole run: what ties its pairs, what each camera may do, what was cut."""
     found = _matching(summary)
     if (scene := summary.scene) is not None:
         found += [
@@ -43,14 +43,14 @@ def decisions(summary: Summary) -> list[str]:
 
 
 def second_attempts(pairs: Sequence[PairEntry]) -> Table | None:
-    """Pairs that were tried more than once; None without any."""
+    """Return the pairs that were tried more than once; None without any."""
     again = [pair for pair in pairs if pair.beaten]
     caption = "Pairs that were tried again, and what found fewer matches than were wanted"
     return table("again", caption, again, PairEntry, PairEntry.AGAIN, folded=True) if again else None
 
 
 def control_sentence(summary: Summary) -> str:
-    """What the test of every residual of control says; empty without control."""
+    """Return what the test of every residual of control says; empty without control."""
     test = summary.control_test
     if test is None:
         return ""

@@ -96,7 +96,7 @@ def _plane_of(lonlat: Array) -> Plane:
 
 
 def ground_map(files: RunFiles) -> str:
-    """Footprints, pairs by their matches, tie points, GCPs, on a graticule with a scale bar."""
+    """Return the footprints, pairs by their matches, tie points, GCPs, on a graticule with a scale bar."""
     summary = files.summary
     rings = [ring for outline in files.outlines for ring in outline]
     points_of: dict[str, Sequence[Known]] = {"gcps": summary.gcps, "check_points": summary.check_points}
@@ -258,7 +258,7 @@ class Cells:
 
 
 def residual_cells(xy: Array, residuals: Array, size: Sequence[int]) -> Cells:
-    """Mean and spread of residuals (m, 2) [px] over a grid of cells on the image."""
+    """Return the mean and spread of residuals (m, 2) [px] over a grid of cells on the image."""
     cell, num = cell_numbers(xy, size), CELLS**2
     count = np.bincount(cell, minlength=num)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -273,7 +273,8 @@ def residual_cells(xy: Array, residuals: Array, size: Sequence[int]) -> Cells:
 def residual_panels(
     views: Sequence[ViewEntry], observations: Observations, when: str
 ) -> tuple[list[tuple[str, str]], list[float], str]:
-    """Small maps of the residuals "before" or "after", with captions, of the images with the largest systematic part.
+    """Return the small maps of the residuals "before" or "after", with captions, of the images with the
+    largest systematic part.
 
     Cells are darker where the error is larger; thin lines are single residuals; a bold arrow is the mean of a cell
     where it is larger than chance allows. Returns, too, the systematic part of every image's cells, and what lengths

@@ -50,12 +50,12 @@ REPORT = "report"  # the stage that makes the page, which cannot tell how long i
 
 
 def can_render() -> bool:
-    """Whether jinja2, which the page needs, is installed (the extra ``report``)."""
+    """Return whether jinja2, which the page needs, is installed (the extra ``report``)."""
     return find_spec("jinja2") is not None
 
 
 def report_html(summary: Summary, folder: Path | str) -> str:
-    """The page of a run whose tables lie in a folder; the same files give the same text.
+    """Return the page of a run whose tables lie in a folder; the same files give the same text.
 
     Raises
     ------

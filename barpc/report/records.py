@@ -39,7 +39,7 @@ def said(
     default: Any = MISSING,
     **schema: Any,
 ) -> Any:
-    """A field of a record, with all that is said of it.
+    """Return a field of a record, with all that is said of it.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class Record:
 
     @classmethod
     def read(cls, found: Mapping[str, Any]) -> Self:
-        """The record of what a file holds, checked before; what it does not know is passed over."""
+        """Read the record of what a file holds, checked before; what it does not know is passed over."""
         readers = _readers(cls)  # type: ignore[arg-type]  # a class can be hashed
         known = ((key, value, readers[key]) for key, value in found.items() if key in readers)
         return cls(**{key: read(item) if read and item is not None else item for key, item, read in known})
@@ -119,7 +119,7 @@ def _reader(kind: Any) -> Callable[[Any], Any] | None:
 
 
 def schema_of(kind: Any) -> dict[str, Any]:
-    """The JSON schema of a type."""
+    """Return the JSON schema of a type."""
     origin, parts = get_origin(kind), get_args(kind)
     if origin is Annotated:
         return {**schema_of(parts[0]), **parts[1]}
@@ -147,7 +147,7 @@ def _either(parts: Sequence[Any]) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON holds it: arrays as lists, records as mappings, what is not finite as null."""
+    """Return a value as JSON holds it: arrays as lists, records as mappings, what is not finite as null."""
     if isinstance(value, float) and not isinstance(value, np.generic):
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, (bool, int, str)):
@@ -196,7 +196,7 @@ class Table:
     folded: bool = False
 
     def numbered(self, numbers: Sequence[Cell]) -> Table:
-        """The same behind a column of numbers."""
+        """Return the same behind a column of numbers."""
         rows = [[number, *row] for number, row in zip(numbers, self.rows, strict=True)]
         return replace(self, columns=["#", *self.columns], rows=rows)
 
@@ -254,7 +254,9 @@ def table(
     adjusted: bool = True,
     folded: bool = False,
 ) -> Table:
-    """The table of records: a row each; the words of `columns` are fields (``part.field``) and columns of its `OWN`."""
+    """Return the table of records: a row each; the words of `columns` are fields (``part.field``) and columns
+    of its `OWN`.
+    """
     found = [column_of(kind, name) for name in columns.split()]  # type: ignore[arg-type]
     found = [column for column in found if adjusted or not column.adjusted]
     cells = [[cell for column in found for cell in column.cells(row)] for row in rows]
@@ -263,7 +265,7 @@ def table(
 
 @cache
 def column_of(kind: Any, path: str) -> Column:
-    """One of its own columns, or that of a field, of a part of the record where the path has dots."""
+    """Return one of its own columns, or that of a field, of a part of the record where the path has dots."""
     if path in kind.OWN:
         return kind.OWN[path]  # type: ignore[no-any-return]
     for name in path.split("."):
@@ -275,14 +277,14 @@ def column_of(kind: Any, path: str) -> Column:
 
 
 def value_of(record: Any, path: str) -> Any:
-    """A field of a record, or of a part of it that may be None."""
+    """Return a field of a record, or of a part of it that may be None."""
     for name in path.split("."):
         record = None if record is None else getattr(record, name)
     return record
 
 
 def cell_of(value: Any, form: str = "") -> Cell:
-    """A value as a cell; nothing is a dash that sorts last."""
+    """Return a value as a cell; nothing is a dash that sorts last."""
     if isinstance(value, Cell):
         return value
     if value is None or (isinstance(value, tuple) and None in value):

@@ -139,7 +139,7 @@ def _points_ply(run: Run, _: Summary) -> bytes:
 
 
 def gcps_geojson(run: Run) -> bytes:
-    """The points of a reference that held the block, as `--gcp` reads them: a feature an observation."""
+    """Return the points of a reference that held the block, as `--gcp` reads them: a feature an observation."""
     control = None if run.reference is None else run.reference.control
     assert control is not None
     assert run.adjustment is not None
@@ -230,7 +230,7 @@ class RunFiles:
 
 
 def read_summary(folder: Path) -> Summary:
-    """summary.json of a run folder.
+    """Read the summary.json of a run folder.
 
     Raises
     ------
@@ -268,7 +268,7 @@ def _validate() -> Callable[[Any], Any]:
 
 
 def read_tables(summary: Summary, folder: Path) -> RunFiles:
-    """The tables of a run folder, beside a summary that is at hand.
+    """Read the tables of a run folder, beside a summary that is at hand.
 
     Raises
     ------

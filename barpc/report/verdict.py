@@ -49,7 +49,7 @@ _CONTROL_WORDS = {
 
 
 def view_status(view: ViewEntry, run: Run) -> dict[str, str]:
-    """The verdict on a view: a word of `STATUS_WORDS`, and what to do (empty when all is well)."""
+    """Return the verdict on a view: a word of `STATUS_WORDS`, and what to do (empty when all is well)."""
     for status, reason in (("failed", _failure), ("weak", _weakness), ("doubtful", _doubt)):
         if advice := reason(view, run):
             return {"status": status, "advice": advice}
@@ -312,7 +312,7 @@ def _place_is_free(run: Run) -> bool:
 
 
 def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
-    """The verdict on the whole: `status`, a `headline`, `lines`, and those of them that are `reasons`.
+    """Return the verdict on the whole: `status`, a `headline`, `lines`, and those of them that are `reasons`.
 
     The one rule of what passes: `status` is "good" when no image, no control point and no file has a reservation;
     "bad" when an image was not adjusted or a file left out; else "look". What is not good ends with exit code 3.
@@ -610,7 +610,7 @@ def _known(value: float | None) -> float:
 
 
 def summarize(run: Run) -> Summary:
-    """The summary of a run with the verdict on it; a number that is not finite is None, as a file has it."""
+    """Return the summary of a run with the verdict on it; a number that is not finite is None, as a file has it."""
     found = measure(run)
     views = tuple(replace(view, **view_status(view, run)) for view in found.views)  # type: ignore[arg-type]
     block = block_verdict(run, views)

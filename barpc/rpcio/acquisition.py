@@ -47,7 +47,8 @@ class Light:
 
 
 def light_of(image: str, camera: str | None = None) -> Light:
-    """What the file of an image's camera and the metadata beside the image say: Maxar's IMD and XML, Airbus' DIM file.
+    """Return what the file of an image's camera and the metadata beside the image say: Maxar's IMD and XML,
+    Airbus' DIM file.
 
     Of several values over the image (Airbus) the median is taken.
     """
@@ -65,7 +66,9 @@ def light_of(image: str, camera: str | None = None) -> Light:
 
 
 def date_taken(image: Place, camera: Place, tags: Mapping[str, str]) -> str:
-    """The day (ISO 8601) that the files of `light_of` state, an image's own `tags` last; empty where none does."""
+    """Return the day (ISO 8601) that the files of `light_of` state, an image's own `tags` last; empty where
+    none does.
+    """
     stated = next((time[:10] for text in _texts(image, camera) if (time := _time(text))), "")
     found = (_TAG.match(tags.get(tag, "").strip()) for tag in _TAGS)
     return stated or next((day for tag in found if tag and (day := _day("-".join(tag.groups())))), "")

@@ -60,7 +60,7 @@ def write_correction(grid: CorrectionGrid, rpc: RPC, path: Path | str, *, overwr
 
 
 def read_correction(path: Place) -> tuple[RPC, CorrectionGrid]:
-    """The RPC and the displacements of a correction grid; RpcFormatError where the file is none."""
+    """Read the RPC and the displacements of a correction grid; RpcFormatError where the file is none."""
     with open_raster(path) as dataset:
         _TABLE.check(f"{path}, read", NUMBER * dataset.count * dataset.width * dataset.height)
         if dataset.count != 2 or dataset.tags().get("CORRECTION") != SIGN:

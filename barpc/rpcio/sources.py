@@ -44,7 +44,7 @@ class Sidecar:
 
 
 def sidecars(image: Path | str) -> list[Sidecar]:
-    """The files beside an image that hold an RPC for some tool, in the order in which GDAL looks.
+    """Return the files beside an image that hold an RPC for some tool, in the order in which GDAL looks.
 
     Names are compared without regard to case, as GDAL does. XML files count only where their content is an RPC.
     """
@@ -65,7 +65,7 @@ def sidecars(image: Path | str) -> list[Sidecar]:
 
 
 def metadata_beside(image: Path) -> Path:
-    """The XML beside an image that may hold its physical model: Maxar's of its name, Airbus' ``DIM_*.XML``."""
+    """Return the XML beside an image that may hold its physical model: Maxar's of its name, Airbus' ``DIM_*.XML``."""
     present, product = files_of(image.parent), image.stem[4:]  # of IMG_<product>_R1C1
     names = (f"{image.stem}.xml", f"dim_{product}.xml", f"dim_{product.rpartition('_')[0]}.xml")
     for name in names:
@@ -75,7 +75,9 @@ def metadata_beside(image: Path) -> Path:
 
 
 def described(path: Place) -> tuple[tuple[int, int] | None, bool]:
-    """Width and height [px] that a vendor's XML states, if it does, and whether it holds a physical model."""
+    """Return the width and height [px] that a vendor's XML states, if it does, and whether it holds a
+    physical model.
+    """
     text = decode(read_bytes(path, RPC_FILE))
     found = [
         re.search(rf"<(?:\w+:)?(?:{tag})>\s*+(\d{{1,7}})\s*+<", text)
@@ -86,7 +88,7 @@ def described(path: Place) -> tuple[tuple[int, int] | None, bool]:
 
 
 def only_physical(path: Path) -> bool:
-    """Whether an XML holds a physical camera model and no RPC; not of one that cannot be read."""
+    """Return whether an XML holds a physical camera model and no RPC; not of one that cannot be read."""
     try:
         text = decode(read_bytes(path, RPC_FILE))
     except BarpcError:
@@ -135,7 +137,7 @@ def _holds_rpc(path: Place, kind: str) -> bool:
 
 
 def shadows(image: Path | str) -> list[Sidecar]:
-    """The files beside an image that some tool reads instead of the RPC in the image itself.
+    """Return the files beside an image that some tool reads instead of the RPC in the image itself.
 
     A VRT answers for itself in GDAL; what is beside a TIFF goes before its tag. A ``.geom`` is what OTB and CARS are
     given. GDAL's own ``.aux.xml`` counts where the image has no RPC.
@@ -148,7 +150,9 @@ def shadows(image: Path | str) -> list[Sidecar]:
 
 
 def hidden_by(paths: Iterable[Path]) -> Iterator[tuple[Path, Path, RPC]]:
-    """Images whose RPC some tool would no longer see if these files were written: file, image, the image's RPC."""
+    """Yield the images whose RPC some tool would no longer see if these files were written: file, image, the
+    image's RPC.
+    """
     wanted: dict[Path, dict[str, Path]] = {}
     for path in paths:
         wanted.setdefault(path.parent, {})[path.name.lower()] = path
@@ -170,12 +174,12 @@ def _rpc_of_image(path: Path) -> RPC | None:
 
 
 def read_rpc(path: Path | str, *, first_pixel: float | None = None, band: int = 1) -> RPC:
-    """The RPC of an image or of an RPC file; `read_rpc_source` says where it came from, too."""
+    """Read the RPC of an image or of an RPC file; `read_rpc_source` says where it came from, too."""
     return read_rpc_source(path, first_pixel=first_pixel, band=band).rpc
 
 
 def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band: int = 1) -> RpcSource:
-    """The RPC of an image or of an RPC file, and where it came from.
+    """Read the RPC of an image or of an RPC file, and where it came from.
 
     For an image: the vendor's file beside it, the RPC in the image, GDAL's ``.aux.xml``, OSSIM's ``.geom``,
     in this order. Any other file is read by what its content says it is.

@@ -67,7 +67,8 @@ class Motion:
         self.ecef = self._turned + np.repeat(center.T, count, axis=1)
 
     def derivatives(self, by_moved: Array) -> tuple[Array, Array, Array]:
-        """Derivatives (2, 3, n) by X [1/m], R and d [1/rad], each, of what has these by the moved points [1/m].
+        """Return the derivatives (2, 3, n) by X [1/m], R and d [1/rad], each, of what has these by the moved
+        points [1/m].
 
         By T they are those by X, negative; those by d are those by R where there is no drift.
         """
@@ -140,12 +141,14 @@ class Correction(Frozen):
         return Motion(self.scale * ecef, self.rotation[None], shift[None], self.center[None], bounds, drift)
 
     def drift_rate(self, row: Array) -> Array:
-        """Derivative of the drift by the row (3, n) [rad/px] at rows (n,) [px]."""
+        """Return the derivative of the drift by the row (3, n) [rad/px] at rows (n,) [px]."""
         u, degree = (row - self.row_offset) / self.row_scale, np.arange(1, len(self.drift) + 1)[:, None]
         return np.asarray(self.drift.T @ (degree * u ** (degree - 1)) / self.row_scale)
 
     def apply(self, ecef: Array, row: Array | None = None) -> Array:
-        """Points s R (X - T - C) + C of ECEF points X (..., 3) [m]; turned on by the drift at rows (...) if given."""
+        """Return the points s R (X - T - C) + C of ECEF points X (..., 3) [m]; turned on by the drift at rows
+        (...) if given.
+        """
         ecef = np.asarray(ecef, dtype=np.float64)
         rows = None if row is None else np.broadcast_to(row, ecef.shape[:-1]).reshape(-1)
         return self.motion(ecef.reshape(-1, 3).T, rows).ecef.T.reshape(ecef.shape)
@@ -179,7 +182,7 @@ class Corrected:
         return str(getattr(self.sensor, "advice", ""))
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
         ecef = ecef_from_ground(ground)
         if not len(self.correction.drift):
             return self.sensor.project(ground_from_ecef(self.correction.apply(ecef)))
@@ -193,12 +196,13 @@ class Corrected:
         return image
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, by_ecef, _, _ = self.project_ecef(ecef_from_ground(ground))
         return image, by_ecef @ ecef_from_ground_jacobian(ground)
 
     def project_ecef(self, ecef: Array) -> tuple[Array, Array, Array, Array]:
-        """Image points (..., 2) [px] of ECEF points X (..., 3) [m], with the derivatives that the adjustment needs.
+        """Return the image points (..., 2) [px] of ECEF points X (..., 3) [m], with the derivatives that the
+        adjustment needs.
 
         d(image)/dX [px/m], d(image)/dR [px/rad], d(image)/dT [px/m], (..., 2, 3) each.
         """
@@ -224,7 +228,7 @@ class Corrected:
         return image.reshape(*shape, 2), by_ecef, of_rotation, of_translation
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m].
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
 
         Newton on (lon, lat) from where the uncorrected sensor puts the point, with that sensor's derivative where the
         point is moved to: a correction turns by so little that each step gains four digits. NaN where it does not
@@ -276,16 +280,16 @@ class ImageCorrected:
     correction: ImageAffine  # what is added to its image points
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
         return self.sensor.project(ground) @ self._matrix.T + self.correction.shift
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = self.sensor.project_jacobian(ground)
         return image @ self._matrix.T + self.correction.shift, self._matrix @ jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m]."""
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
         image = np.asarray(image, dtype=np.float64) - self.correction.shift
         return self.sensor.localize(image @ np.linalg.inv(self._matrix).T, alt)
 

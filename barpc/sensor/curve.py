@@ -52,7 +52,7 @@ class Curve(Frozen):
 
     @classmethod
     def polynomial(cls, coeffs: npt.ArrayLike, start: float, stop: float) -> Curve:
-        """One polynomial, sum over k of coeffs[k] (t - start)^k, used from `start` to `stop` [s]."""
+        """Return one polynomial, sum over k of coeffs[k] (t - start)^k, used from `start` to `stop` [s]."""
         return cls(np.array([start, stop]), np.asarray(coeffs, dtype=np.float64)[None])
 
     @classmethod
@@ -87,7 +87,7 @@ class Curve(Frozen):
         return out[:3], out[3:]
 
     def states(self, time: Array) -> tuple[Array, Array, Array]:
-        """Position, velocity and acceleration (3, N) at times (N,) [s]."""
+        """Return the position, velocity and acceleration (3, N) at times (N,) [s]."""
         out = self._evaluate(time, 9)
         return out[:3], out[3:6], out[6:]
 
@@ -116,7 +116,7 @@ def about_middle(rotations: Rotation) -> tuple[Array, Array]:
 
 
 def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[Array, Curve]:
-    """Attitude from quaternions: axes at the middle sample, and the rotation vector from there.
+    """Return the attitude from quaternions: axes at the middle sample, and the rotation vector from there.
 
     Parameters
     ----------
@@ -265,19 +265,19 @@ class Turn:
             self._c = np.where(x > 1e-4, (1.0 - self._a) / x, 1.0 / 6 - x / 120)
 
     def forth(self, v: Array) -> Array:
-        """exp([w]x) v of vectors (..., 3, N): Rodrigues."""
+        """Return exp([w]x) v of vectors (..., 3, N): Rodrigues."""
         bent = cross(self._w, v)
         return np.asarray(v + self._a * bent + self._b * cross(self._w, bent))
 
     def back(self, v: Array, error: float = 0.0) -> Array:
-        """exp(-[w]x) v of vectors (..., 3, N), to a relative error."""
+        """Return exp(-[w]x) v of vectors (..., 3, N), to a relative error."""
         bent = cross(self._w, v)
         if self._largest < error:
             return np.asarray(v - bent)
         return np.asarray(v - self._a * bent + self._b * cross(self._w, bent))
 
     def back_and_rate(self, v: Array, error: float = 0.0) -> tuple[Array, Array]:
-        """`back` and `rate` of the same vectors."""
+        """Return `back` and `rate` of the same vectors."""
         bent = cross(self._w, v)
         if self._largest < error:
             return v - bent, v - 0.5 * bent
@@ -293,17 +293,19 @@ class Turn:
 
 
 def rotation_matrix(rotation: npt.ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
+    """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
     return Turn(np.asarray(rotation, dtype=np.float64)[..., None]).forth(np.eye(3))
 
 
 def rotation_left_jacobian(rotation: npt.ArrayLike) -> Array:
-    """Left Jacobians J (..., 3, 3) of rotation vectors (..., 3) [rad]: R(w + dw) = R(J dw) R(w) to first order."""
+    """Return the left Jacobians J (..., 3, 3) of rotation vectors (..., 3) [rad]: R(w + dw) = R(J dw) R(w) to
+    first order.
+    """
     return Turn(-np.asarray(rotation, dtype=np.float64)[..., None]).rate(np.eye(3))
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Cross products along the last axis but one of (..., 3, N) arrays, broadcast."""
+    """Return the cross products along the last axis but one of (..., 3, N) arrays, broadcast."""
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.multiply(a[..., j, :], b[..., k, :], out=out[..., i, :])

@@ -133,7 +133,7 @@ class DirectGrid(Frozen):
         to_px = np.linalg.inv(_slopes(model, middle)).T
 
         def seen(points: Array) -> Array:
-            """Ground points (..., 2) of points (..., 3) col, row, altitude, about in pixels."""
+            """Return the ground points (..., 2) of points (..., 3) col, row, altitude, about in pixels."""
             lonlat = model.localize(points[..., :2], points[..., 2])[..., :2]
             return np.asarray((wrap_longitude(lonlat, center[:2]) - center[:2]) @ to_px)
 
@@ -142,16 +142,16 @@ class DirectGrid(Frozen):
         return cls(cols, rows, alts, found @ np.linalg.inv(to_px) + center[:2])
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN off the grid."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN off the grid."""
         return pointwise(lambda part: [self._solve(part)], CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m]; NaN off the grid."""
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3); NaN off the grid."""
         return pointwise(self._localize, CHUNK, [(3,)], image, alt)[0]
 
     def _localize(self, image: Array, alt: Array) -> list[Array]:
@@ -288,7 +288,8 @@ def _slopes(model: SensorModel, at: Array) -> Array:
 def linear_axes(
     value: Callable[[Array], Array], low: Array, high: Array, longest: Array, tolerance: float
 ) -> list[Array]:
-    """Nodes along each axis of a box `low`, `high` (d,), between which values are linear to a tolerance.
+    """Return the nodes along each axis of a box `low`, `high` (d,), between which values are linear to a
+    tolerance.
 
     The error along each axis is measured at random places of random cells, whose phase no wave can hide in.
 

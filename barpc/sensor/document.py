@@ -18,7 +18,7 @@ _TIME = re.compile(r"(UTC=)?(?P<time>20\d\d-\d\d-\d\d[T ]\d\d:\d\d:\d\d(\.\d{1,9
 
 
 def seconds(time: Any, epoch: np.datetime64) -> Any:
-    """Seconds (float) from an epoch, exact to the nanosecond."""
+    """Return the seconds (float) from an epoch, exact to the nanosecond."""
     return (time - epoch) / np.timedelta64(1, "ns") * 1e-9
 
 

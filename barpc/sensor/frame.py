@@ -68,16 +68,17 @@ class Frame(Frozen):
             raise RpcError("frame camera: plane has no area")
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN behind the camera."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN behind the camera."""
         return pointwise(lambda part: [self._seen(ecef_from_ground(part).T)[0].T], _CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = pointwise(self._derivatives, _CHUNK, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m]; NaN off the Earth.
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3); NaN off the
+        Earth.
 
         Longitudes run on across the antimeridian.
         """

@@ -36,7 +36,7 @@ class Radar(Protocol):
     """A model that knows where its beam comes from: not from where the ground points of one pixel lie over altitude."""
 
     def to_radar(self, ground: Array) -> Array:
-        """Vectors (..., 3) [m], ECEF, from ground points (..., 3) to the radar that sees them."""
+        """Return the vectors (..., 3) [m], ECEF, from ground points (..., 3) to the radar that sees them."""
         ...
 
 
@@ -47,7 +47,7 @@ def altitude_range(rpc: RPC) -> tuple[float, float]:
 
 
 def image_border(size: tuple[int, int], per_side: int = 8) -> Array:
-    """Points (4 per_side, 2) [px] along the outline of an image, from the top-left corner, clockwise."""
+    """Return the points (4 per_side, 2) [px] along the outline of an image, from the top-left corner, clockwise."""
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     t = np.arange(per_side)[:, None] / per_side
     sides = corners[:, None] + t * (np.roll(corners, -1, axis=0) - corners)[:, None]
@@ -57,7 +57,9 @@ def image_border(size: tuple[int, int], per_side: int = 8) -> Array:
 def image_grid(
     size: tuple[int, int], alt_range: tuple[float, float], nodes: tuple[int, int] = (11, 5)
 ) -> tuple[Array, Array]:
-    """Image points (N, 2) [px] and altitudes (N,) [m] on a grid over an image and its altitudes, columns slowest."""
+    """Return the image points (N, 2) [px] and altitudes (N,) [m] on a grid over an image and its altitudes,
+    columns slowest.
+    """
     col, row = (np.linspace(0, side - 1, nodes[0]) for side in size)
     grid = np.stack(np.meshgrid(col, row, np.linspace(*alt_range, nodes[1]), indexing="ij"), axis=-1)
     return grid[..., :2].reshape(-1, 2), grid[..., 2].ravel()
@@ -66,7 +68,7 @@ def image_grid(
 def footprint(
     sensor: SensorModel, size: tuple[int, int], alt: float | npt.ArrayLike, per_side: int = 8
 ) -> Array:
-    """Outline of an image on the ground.
+    """Return the outline of an image on the ground.
 
     Parameters
     ----------
@@ -85,7 +87,7 @@ def footprint(
 
 
 def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, float]) -> tuple[Array, Array]:
-    """Straight lines through the ground points of image points at two altitudes.
+    """Return the straight lines through the ground points of image points at two altitudes.
 
     Parameters
     ----------
@@ -106,7 +108,9 @@ def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, fl
 
 
 def sight_enu(sensor: SensorModel, ground: Array) -> Array:
-    """Unit vectors (..., 3) east, north, up from ground points (..., 3) to the sensor: along them no pixel changes."""
+    """Return the unit vectors (..., 3) east, north, up from ground points (..., 3) to the sensor: along them
+    no pixel changes.
+    """
     ground = np.asarray(ground, dtype=np.float64)
     _, jacobian = sensor.project_jacobian(ground)
     metric = jacobian / metres_per_unit(ground)[..., None, :]
@@ -117,7 +121,7 @@ def sight_enu(sensor: SensorModel, ground: Array) -> Array:
 
 
 def view_angles(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
-    """Incidence and azimuth of the line of sight, or of a radar's beam, at ground points (..., 3).
+    """Return the incidence and azimuth of the line of sight, or of a radar's beam, at ground points (..., 3).
 
     Returns
     -------
@@ -154,14 +158,15 @@ def ground_sample_distance(sensor: SensorModel, ground: Array) -> tuple[Array, A
 
 
 def convergence_angle(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) -> Array:
-    """Angle (...) [deg] between the lines of sight of two cameras at ground points (..., 3)."""
+    """Return the angle (...) [deg] between the lines of sight of two cameras at ground points (..., 3)."""
     a, b = sight_enu(sensor_a, ground), sight_enu(sensor_b, ground)
     cross = np.linalg.norm(np.cross(a, b), axis=-1)
     return np.asarray(np.degrees(np.arctan2(cross, (a * b).sum(axis=-1))))
 
 
 def base_to_height(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) -> Array:
-    """B/H (...) of two cameras at ground points (..., 3): metres of parallax on level ground a metre of height.
+    """Return B/H (...) of two cameras at ground points (..., 3): metres of parallax on level ground a metre
+    of height.
 
     abs(t_a - t_b), t = (east, north) / up of a line of sight: the distance of the two cameras at the height 1. The
     textbook's 2 tan(angle / 2) is that only where the vertical halves the angle: of two cameras on one side of it,
@@ -191,21 +196,21 @@ class Several:
         return found
 
     def project(self, ground: Array) -> Array:
-        """Image points (N, 2) [px] of ground points (N, 3) [deg, deg, m]."""
+        """Project ground points (N, 3) [deg, deg, m] to image points (N, 2) [px]."""
         image = np.empty((len(ground), 2))
         for sensor, rows in self._parts:
             image[rows] = sensor.project(ground[rows])
         return image
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (N, 2) [px] and their derivative (N, 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (N, 2) [px] and their derivatives (N, 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = np.empty((len(ground), 2)), np.empty((len(ground), 2, 3))
         for sensor, rows in self._parts:
             image[rows], jacobian[rows] = sensor.project_jacobian(ground[rows])
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (N, 3) seen at image points (N, 2) [px] at altitudes (N,) [m]."""
+        """Localise image points (N, 2) [px] at altitudes (N,) [m]: ground points (N, 3)."""
         ground = np.empty((len(image), 3))
         for sensor, rows in self._parts:
             ground[rows] = sensor.localize(image[rows], alt[rows])
@@ -227,7 +232,7 @@ def camera_center(
     alt_range: tuple[float, float],
     how: Literal["line", "projective"] = "line",
 ) -> CameraCenter:
-    """Camera centre regressed from a sensor model.
+    """Return the camera centre regressed from a sensor model.
 
     One image line of a pushbroom camera IS a perspective camera, so its rays meet in one point, found by least
     squares. A point outside `PLAUSIBLE_ALTITUDE` is replaced by one at `NOMINAL_ALTITUDE` on the central ray, and says

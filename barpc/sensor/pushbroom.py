@@ -59,7 +59,9 @@ class Light:
     refraction: bool = False
 
     def seen(self, ecef: Array, origin: Array, velocity: Array) -> Array:
-        """Vectors (3, N) [m] along which points (3, N) are seen from places (3, N) at velocities (3, N), ECEF."""
+        """Return the vectors (3, N) [m] along which points (3, N) are seen from places (3, N) at velocities
+        (3, N), ECEF.
+        """
         sight = ecef - origin
         if self.refraction:
             sight = sight + self._lift(ecef, sight)[0]
@@ -68,7 +70,7 @@ class Light:
         return sight
 
     def by_point(self, gradient: Array, ecef: Array, origin: Array, velocity: Array) -> Array:
-        """Derivatives (3, N) by the points of what has the `gradient` (3, N) by `seen`, to 1e-6 of them."""
+        """Return the derivatives (3, N) by the points of what has the `gradient` (3, N) by `seen`, to 1e-6 of them."""
         sight = ecef - origin
         out = gradient
         if self.aberration:
@@ -180,21 +182,23 @@ class Pushbroom(Frozen):
         return self.first_line + self.line_period * np.asarray(row, dtype=np.float64)
 
     def position(self, row: npt.ArrayLike) -> Array:
-        """Camera centres (..., 3) [m, ECEF] of rows (...) [px]."""
+        """Return the camera centres (..., 3) [m, ECEF] of rows (...) [px]."""
         time = self.time(row)
         return np.moveaxis(self.orbit(time.reshape(-1))[0], 0, -1).reshape(*time.shape, 3)
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN behind the camera, off the orbit."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN behind the camera,
+        off the orbit.
+        """
         return pointwise(lambda part: [self._solve(ecef_from_ground(part).T).T], CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m].
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
 
         The line of sight meets the ellipsoid whose axes are longer by the altitude in closed form; Newton's
         method on the distance brings it to the altitude itself. Longitudes run on across the antimeridian; NaN where
@@ -203,7 +207,9 @@ class Pushbroom(Frozen):
         return pointwise(lambda *part: [self._meet(*part)], CHUNK, [(3,)], image, alt)[0]
 
     def line_of_sight(self, image: Array) -> tuple[Array, Array]:
-        """Camera centres [m] and unit directions of sight, (..., 3) in ECEF, of image points (..., 2) [px]."""
+        """Return the camera centres [m] and unit directions of sight, (..., 3) in ECEF, of image points (...,
+        2) [px].
+        """
         image = np.asarray(image, dtype=np.float64)
         origin, direction = self._rays(image.reshape(-1, 2))
         return origin.T.reshape(*image.shape[:-1], 3), direction.T.reshape(*image.shape[:-1], 3)

@@ -81,12 +81,12 @@ class Rational:
         self.gradients = np.einsum("pi,aij->apj", coeffs, DERIVATIVE).reshape(12, 10)
 
     def value(self, x: Array, work: Array | None = None, poly: Array | None = None) -> Array:
-        """Values (2, N) at points (3, N); `work` (20, N) and `poly` (4, N) are overwritten."""
+        """Return the values (2, N) at points (3, N); `work` (20, N) and `poly` (4, N) are overwritten."""
         poly = np.matmul(self.coeffs, monomials(x, work), out=poly)
         return np.divide(poly[::2], poly[1::2], out=poly[::2])
 
     def value_and_gradient(self, x: Array, axes: int = 3, work: Array | None = None) -> tuple[Array, Array]:
-        """Values (2, N) and derivatives (axes, 2, N) by the first `axes` variables at points (3, N)."""
+        """Return the values (2, N) and derivatives (axes, 2, N) by the first `axes` variables at points (3, N)."""
         basis = monomials(x, work)
         poly = self.coeffs @ basis
         gradient = (self.gradients[: 4 * axes] @ basis[:10]).reshape(axes, 4, -1)

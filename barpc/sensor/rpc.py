@@ -78,7 +78,9 @@ class RPC(Frozen):
         return ", ".join(word.format(o - s, o + s) for word, o, s in zip(words, offset, scale, strict=True))
 
     def normalize(self, ground: Array, out: Array | None = None) -> Array:
-        """Normalised longitude, latitude, altitude (3, N), -1 to 1 in the RPC's box, of ground points (N, 3)."""
+        """Return the normalised longitude, latitude, altitude (3, N), -1 to 1 in the RPC's box, of ground
+        points (N, 3).
+        """
         out = np.subtract(ground.T, self.ground_offset[:, None], out=out, order="C")
         if not (out[0].max(initial=0.0) <= 180.0 and out[0].min(initial=0.0) >= -180.0):
             out[0] = wrap_longitude(ground[:, 0], self.ground_offset[0]) - self.ground_offset[0]
@@ -86,16 +88,18 @@ class RPC(Frozen):
         return out
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN where a denominator vanishes."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN where a denominator
+        vanishes.
+        """
         return pointwise(self._project, CHUNK, [(2,)], ground, rows=27)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground, rows=20)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m].
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
 
         A cubic inverse, fitted once per RPC, and one Newton step; more, and damped, where that is not
         proven to be enough. Longitudes lie within 180 degrees of the RPC's offset; NaN where no point was found

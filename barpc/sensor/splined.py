@@ -24,7 +24,8 @@ _SETTLED = 1e-7  # px
 
 
 def bspline_pieces(u: Array, count: int, rate: bool = False) -> tuple[IntArray, Array]:
-    """Uniform cubic B-splines at u (n,) in -1 .. 1: the first (n,) of the four that are not zero, and these (4, n).
+    """Return the uniform cubic B-splines at u (n,) in -1 .. 1: the first (n,) of the four that are not zero,
+    and these (4, n).
 
     The first and the last value hold beyond; `rate`: their derivatives by u instead.
     """
@@ -55,7 +56,7 @@ def profile(place: Array, start: Array, stop: Array, origin: Array, rate: Array)
 
 
 def swing(row: Array, period: Array) -> Array:
-    """Cosine and sine (2, ...) of one period [px] at rows (...) [px]; zero where the period is infinite."""
+    """Return the cosine and sine (2, ...) of one period [px] at rows (...) [px]; zero where the period is infinite."""
     phase = 2.0 * np.pi * np.asarray(row) / period
     return np.where(np.isfinite(period), np.stack([np.cos(phase), np.sin(phase)]), 0.0)
 
@@ -165,11 +166,11 @@ class Splined:
     correction: RowSpline  # what is added to its image points
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
         return self._displaced(self.sensor.project(ground))
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = self.sensor.project_jacobian(ground)
         image = self._displaced(image)
         rate = self.correction.rate(image[..., 1])  # the row moves the spline, and the spline the row
@@ -177,7 +178,7 @@ class Splined:
         return image, jacobian + rate[..., None] * by_row[..., None, :]
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m]."""
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
         image = np.asarray(image, dtype=np.float64)
         return self.sensor.localize(image - self.correction.at(image), alt)
 

@@ -36,7 +36,7 @@ class Timing(Frozen):
             raise RpcError(f"timing: {len(self.coeffs)} terms, offset {self.offset}, scale {self.scale}")
 
     def at(self, along: Array) -> Array:
-        """Range [m] and azimuth time [s] (2, N) that are added at coordinates (N,)."""
+        """Return the range [m] and azimuth time [s] (2, N) that are added at coordinates (N,)."""
         return np.asarray(polynomial.polyval((along - self.offset) / self.scale, self.coeffs))
 
     def rate(self, along: Array) -> Array:
@@ -66,7 +66,8 @@ class Clocked(SensorModel, Protocol):
         ...
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """Image points (..., 2) [px] of ground points (..., 3), their derivatives, and where along the flight they are.
+        """Return the image points (..., 2) [px] of ground points (..., 3), their derivatives, and where along
+        the flight they are.
 
         d(image)/d(ground) (..., 2, 3), d(image)/d(range, azimuth time) (..., 2, 2) [px/m, px/s], and (...) [px].
         """
@@ -97,18 +98,20 @@ class Timed:
         return str(getattr(self.sensor, "advice", ""))
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
         return self._model.project(ground)
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         return self._model.project_jacobian(ground)
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m]."""
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
         return self._model.localize(image, alt)
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px], and their derivative by range and azimuth time (..., 2, 2) [px/m, px/s]."""
+        """Return the image points (..., 2) [px], and their derivative by range and azimuth time (..., 2, 2)
+        [px/m, px/s].
+        """
         image, _, by_timing, _ = self._model.timing_jacobian(ground)
         return image, by_timing

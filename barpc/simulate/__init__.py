@@ -165,7 +165,7 @@ class Block:
     truth: BlockTruth  # what is to be found
 
     def held_out_rms(self, sensors: list[SensorModel]) -> float:
-        """Root mean square residual [px, per coordinate] of the held-out points in other cameras.
+        """Return the root mean square residual [px, per coordinate] of the held-out points in other cameras.
 
         The points are triangulated anew from their exact image points: what no image can tell (a shift of the whole
         scene) does not count.
@@ -176,7 +176,7 @@ class Block:
 
 
 def recentred(correction: Correction, center: Array) -> Correction:
-    """The same correction about another camera centre (3,) [m, ECEF]: R stays, T takes up the difference."""
+    """Return the same correction about another camera centre (3,) [m, ECEF]: R stays, T takes up the difference."""
     turn = rotation_matrix(correction.rotation)
     shift = center - correction.center
     return Correction(correction.rotation, correction.translation + turn.T @ shift - shift, center)
@@ -193,7 +193,7 @@ def simulate_block(
     num_gcps: int = 0,
     **options: object,
 ) -> Block:
-    """A block of views with tie points, GCPs and held-out points.
+    """Return a block of views with tie points, GCPs and held-out points.
 
     Views stand in groups of `per_site` over sites on a square grid; neighbouring sites overlap.
 

@@ -45,7 +45,7 @@ def looks(count: int, turn: float = 0.0, altitude: float = 694e3) -> list[Look]:
 
 
 def fly(target: Array, look: Look, size: tuple[int, int], gsd: float) -> Pushbroom:
-    """A pushbroom camera that scans a target from a circular orbit.
+    """Return a pushbroom camera that scans a target from a circular orbit.
 
     The orbit is a circle in the inertial frame, seen from the turning Earth. The attitude follows the scan:
     the line of sight of the middle of the detector moves over the ground in the direction of scan at `gsd` a

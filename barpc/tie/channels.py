@@ -33,7 +33,7 @@ _SHOWN = 0.9  # of a template must be a picture
 
 
 def channels(pixels: FloatImage, valid: BoolArray, blurs: tuple[float, float] = COARSE) -> FloatImage:
-    """Channels (CHANNELS, H, W) of a picture (H, W), blurred twice [px]; zeros beside what is not valid."""
+    """Return the channels (CHANNELS, H, W) of a picture (H, W), blurred twice [px]; zeros beside what is not valid."""
     cv2.setNumThreads(1)
     filled = np.where(valid, pixels, np.float32(pixels[valid].mean() if valid.any() else 0.0))
     smooth = cv2.GaussianBlur(filled.astype(np.float32), (0, 0), blurs[0])
@@ -48,7 +48,9 @@ def channels(pixels: FloatImage, valid: BoolArray, blurs: tuple[float, float] = 
 
 
 def correlation(template: FloatImage, search: FloatImage) -> FloatImage:
-    """Correlation coefficients (B, H - h + 1, W - w + 1) of templates (B, C, h, w) within areas (B, C, H, W)."""
+    """Return the correlation coefficients (B, H - h + 1, W - w + 1) of templates (B, C, h, w) within areas
+    (B, C, H, W).
+    """
     (h, w), (height, width) = template.shape[2:], search.shape[2:]
     from scipy import fft  # of structure alone
 
@@ -104,12 +106,12 @@ def find(first: FloatImage, second: FloatImage, at: Array, half: int, search: in
 
 
 def joined(parts: Sequence[Found]) -> Found:
-    """What was found in several places, one after the other."""
+    """Return what was found in several places, one after the other."""
     return Found(*(np.concatenate([getattr(part, name) for part in parts]) for name in Found.__annotations__))
 
 
 def margin(half: int, search: int) -> int:
-    """How far from the edge of a picture templates must lie [px]."""
+    """Return how far from the edge of a picture templates must lie [px]."""
     return half + 3 * search + _GAP + 3
 
 
@@ -144,7 +146,7 @@ def _find(first: FloatImage, second: FloatImage, at: IntArray, half: int, search
 
 
 def cut(picture: FloatImage, at: IntArray, wide: int, high: int) -> FloatImage:
-    """Windows (n, C, 2 high + 1, 2 wide + 1) around whole px x, y (n, 2)."""
+    """Return the windows (n, C, 2 high + 1, 2 wide + 1) around whole px x, y (n, 2)."""
     view = np.lib.stride_tricks.sliding_window_view(picture, (2 * high + 1, 2 * wide + 1), axis=(1, 2))
     return np.moveaxis(view[:, at[:, 1] - high, at[:, 0] - wide], 0, 1)
 

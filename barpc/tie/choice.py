@@ -34,7 +34,8 @@ def select_pairs(
     area: Area | None = None,
     given: Collection[Link] = (),
 ) -> list[Pair]:
-    """The pairs of views to match, ascending, by overlap and angle: the best partners of every view, and a tree of all.
+    """Return the pairs of views to match, ascending, by overlap and angle: the best partners of every view,
+    and a tree of all.
 
     Parameters and errors are those of `possible_pairs`; `options.neighbours` counts, too.
     """
@@ -43,12 +44,12 @@ def select_pairs(
 
 
 def several_dates(views: Sequence[View]) -> bool:
-    """Whether the views are known to be of more than one date."""
+    """Return whether the views are known to be of more than one date."""
     return len({view.date for view in views if view.date}) > 1
 
 
 def judged(views: Sequence[View], pair: Pair, likeness: int) -> Pair:
-    """A pair with its quick score, and what speaks for it."""
+    """Return a pair with its quick score, and what speaks for it."""
     dates = {views[i].date for i in pair.views}
     same = len(dates) == 1 and dates != {""} and likeness
     return replace(pair, likeness=likeness, reason=SAME_DATE if same else f"quick score {likeness}")
@@ -64,7 +65,7 @@ def _order(pair: Pair) -> tuple[int, int, float, Link]:
 
 
 def best_pairs(pairs: Sequence[Pair], num_views: int, neighbours: int, twice: bool = False) -> list[Pair]:
-    """The best partners of every view, and what connects all views, `twice` by two paths, ascending.
+    """Return the best partners of every view, and what connects all views, `twice` by two paths, ascending.
 
     Pairs of one date take half of a view's partners at first, then what others leave. Pairs that are given are kept.
     """
@@ -117,7 +118,7 @@ def _root(tree: list[int], node: int) -> int:
 
 
 def forests(links: Sequence[Link], num: int, count: int) -> list[int]:
-    """Which links, the best first, `count` forests take: each the first in which it joins two trees.
+    """Return which links, the best first, `count` forests take: each the first in which it joins two trees.
 
     Together they keep what paths there are between two nodes, up to `count` (Nagamochi and Ibaraki 1992).
     """
@@ -133,7 +134,7 @@ def forests(links: Sequence[Link], num: int, count: int) -> list[int]:
 
 
 def twice_tied(num: int, links: Sequence[Link]) -> list[int]:
-    """A label (num,) that nodes share between which there are two paths without a link in common."""
+    """Return a label (num,) that nodes share between which there are two paths without a link in common."""
     tree = set(forests(links, num, 1))
     near: list[list[int]] = [[] for _ in range(num)]
     for i, j in (links[k] for k in tree):

@@ -72,7 +72,8 @@ class Matches:
 
 
 def epipolar_frame(a: Array, b: Array, alt: Array) -> EpipolarFrame:
-    """The frame of a part of two images, by where they show the same ground points at several altitudes.
+    """Return the frame of a part of two images, by where they show the same ground points at several
+    altitudes.
 
     Parameters
     ----------

@@ -54,12 +54,12 @@ class Keypoints:
         return len(self.xy)
 
     def select(self, which: IntArray | BoolArray) -> Keypoints:
-        """The keypoints of a mask or of indices."""
+        """Return the keypoints of a mask or of indices."""
         return Keypoints(*(getattr(self, field.name)[which] for field in fields(self)))
 
 
 def join(parts: Sequence[Keypoints]) -> Keypoints:
-    """Keypoints of several tiles as one set; an empty set of none."""
+    """Return the keypoints of several tiles as one set; an empty set of none."""
     none = np.empty(0)
     parts = parts or [Keypoints(np.empty((0, 2)), none, none, none, np.empty((0, 128), np.uint8))]
     columns = (np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Keypoints))
@@ -73,7 +73,7 @@ class Sift:
         self._sift: Any = cv2.SIFT.create(contrastThreshold=CONTRAST)
 
     def detect(self, picture: ByteImage, keep: Callable[[Array, Array, Array], IntArray]) -> Keypoints:
-        """Keypoints of which `keep(xy, scale, response)` gives the indices; only those are described."""
+        """Return the keypoints of which `keep(xy, scale, response)` gives the indices; only those are described."""
         found = self._sift.detect(picture, None)
         if not found:  # OpenCV fails where there is nothing to describe
             return join([])
@@ -121,17 +121,17 @@ class Share:
         return Share(options.keypoints_per_image / area, zoom)
 
     def expected(self, size: tuple[int, int]) -> float:
-        """How many keypoints an image of `size` (width, height) with detail all over may have, looked at so."""
+        """Return how many keypoints an image of `size` (width, height) with detail all over may have, looked at so."""
         return min(self.density, _HOLDS.get(self.zoom, np.inf)) * size[0] * size[1]
 
     def within(self, used: float) -> Share:
-        """The same where only a part of the image is used: by powers of two, not to be another one each time."""
+        """Return the same where only a part of the image is used: by powers of two, not to be another one each time."""
         return replace(
             self, density=self.density * 2.0 ** float(np.floor(-np.log2(min(max(used, 1e-6), 1.0))))
         )
 
     def most(self, box: Box) -> int:
-        """How many a box may hold."""
+        """Return how many a box may hold."""
         return int(np.ceil(_SPARE * self.density * box[2] * box[3]))
 
     @property
@@ -146,7 +146,7 @@ def ample_matches(options: TieOptions) -> int:
 
 
 def worth_a_first_look(sizes: Sequence[tuple[int, int]], options: TieOptions) -> bool:
-    """Whether images of `sizes` (width, height) hold so much that looking at less of it may be enough."""
+    """Return whether images of `sizes` (width, height) hold so much that looking at less of it may be enough."""
     needed = _HELD * ample_matches(options)
     return all(Share.of(size, options, coarse=True).expected(size) >= needed for size in sizes)
 
@@ -154,7 +154,7 @@ def worth_a_first_look(sizes: Sequence[tuple[int, int]], options: TieOptions) ->
 def detect_tile(
     path: str, size: tuple[int, int], box: Box, found: Survey, share: Share, options: TieOptions
 ) -> Keypoints:
-    """Keypoints of one tile of an image of `size` (width, height), those first that count first.
+    """Return the keypoints of one tile of an image of `size` (width, height), those first that count first.
 
     Coordinates and `found` are those of the whole image.
     """
@@ -216,12 +216,16 @@ def _cell_ranks(xy: Array, response: Array, cell: float) -> IntArray:
 
 
 def quota(xy: Array, response: Array, cell: float, most: int) -> IntArray:
-    """Indices of the strongest of points (N, 2) [px] in every cell of a side [px], at most so many each, ascending."""
+    """Return the indices of the strongest of points (N, 2) [px] in every cell of a side [px], at most so many
+    each, ascending.
+    """
     return np.flatnonzero(_cell_ranks(xy, response, cell) < most)
 
 
 def ranked(xy: Array, response: Array, cell: float, most: int) -> IntArray:
-    """Indices of at most so many points (N, 2) [px]: the strongest of every cell, then the second ones, and so on."""
+    """Return the indices of at most so many points (N, 2) [px]: the strongest of every cell, then the second
+    ones, and so on.
+    """
     order = np.lexsort((xy[:, 0], xy[:, 1], -response, _cell_ranks(xy, response, cell)))
     return order[:most]
 
@@ -246,7 +250,9 @@ class KeypointFiles:
         return replace(self, counts=tuple(int(np.ceil(share * count)) for count in self.counts))
 
     def load(self, wanted: Sequence[Box] | None = None) -> tuple[Keypoints, IntArray]:
-        """Keypoints of some tiles (None: of all), by row and column in a tile, and their numbers within the view."""
+        """Return the keypoints of some tiles (None: of all), by row and column in a tile, and their numbers
+        within the view.
+        """
         parts, numbers, first = [], [np.empty(0, dtype=np.int64)], self.start
         chosen = set(self.boxes if wanted is None else wanted)
         for box, name, count in zip(self.boxes, self.names, self.counts, strict=True):
@@ -294,7 +300,9 @@ def _unpacked(arrays: dict[str, npt.NDArray[Any]], box: Box) -> Keypoints:
 
 
 def allotted(found: IntArray, area: Array, most: int) -> IntArray:
-    """How many keypoints (T,) of the tiles count, `most` together: by area; poor tiles leave theirs to the rest."""
+    """Return how many keypoints (T,) of the tiles count, `most` together: by area; poor tiles leave theirs to
+    the rest.
+    """
     if found.sum() <= most:
         return found
     order = np.argsort(found / area, kind="stable")
@@ -316,7 +324,7 @@ def locate(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[KeypointFiles]:
-    """Keypoints of every view, in files of a store; none in an image in which nothing varies.
+    """Return the keypoints of every view, in files of a store; none in an image in which nothing varies.
 
     With `pairs`, tiles that no partner may see are not read, nor those outside `area`; with `coarse` images are looked
     at in less detail, and for fewer keypoints; the rest as for `find_tracks`.
@@ -357,7 +365,7 @@ def detect(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[Keypoints]:
-    """Keypoints of every view, in memory; the rest as for `locate`."""
+    """Return the keypoints of every view, in memory; the rest as for `locate`."""
     with store_of(executor) as store:
         files = locate(views, options, store, pairs=pairs, area=area, executor=executor, progress=progress)
         return [of_view.load()[0] for of_view in files]

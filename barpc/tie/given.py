@@ -53,7 +53,7 @@ def verify(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[Matches, PairReport]]:
-    """The matches of each pair that the cameras bear out, with its report: `match_pair` with what is given."""
+    """Return the matches of each pair that the cameras bear out, with its report: `match_pair` with what is given."""
     chosen = replace(options, matcher=_GIVEN)
     tasks = []
     for pair in pairs:

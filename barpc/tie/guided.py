@@ -37,7 +37,7 @@ class Guided:
         self._prepared: tuple[_Strips, _Described, _Described] | None = None
 
     def match(self, a: View, b: View, prediction: Prediction) -> Matches:
-        """Mutual best keypoints whose second best is farther by the ratio test (Lowe 2004)."""
+        """Return the mutual best keypoints whose second best is farther by the ratio test (Lowe 2004)."""
         if not (len(self._a) and len(self._b)):
             return NO_MATCHES
         where, across = prediction.at(self._a.xy), prediction.half_width

@@ -36,7 +36,7 @@ class Hook:
         return self
 
     def match(self, a: View, b: View, prediction: Prediction) -> Matches:
-        """What the function finds, as far as it may lie; its errors name it and the pair."""
+        """Return what the function finds, as far as it may lie; its errors name it and the pair."""
         try:
             xy, score = _places(self.function(a, b, prediction))
         except BarpcError:
@@ -66,7 +66,7 @@ def _places(found: Any) -> tuple[Any, Any]:
 
 
 def hooked(name: str) -> type[Matcher] | Hook:
-    """The matcher that `module:name` stands for; InputError where there is none."""
+    """Return the matcher that `module:name` stands for; InputError where there is none."""
     module, _, attribute = name.partition(":")
     try:
         found = getattr(import_module(module), attribute)
@@ -81,7 +81,8 @@ def hooked(name: str) -> type[Matcher] | Hook:
 
 
 def hook_files(name: str) -> list[Path]:
-    """What `module:name` is made of: its module, those beside it that it imports, and the files that it declares.
+    """Return what `module:name` is made of: its module, those beside it that it imports, and the files that
+    it declares.
 
     `name.files`, paths from where the module lies, are files that decide what it finds, such as weights. None for a
     matcher of the table, or a module without a file.

@@ -35,19 +35,20 @@ class Prediction:
     aside: float = 0.0  # how far the bands are moved across the epipolar lines [px]
 
     def at(self, xy: Array) -> Frame:
-        """The frame of points of A (N, 2) [px]; NaN: nowhere."""
+        """Return the frame of points of A (N, 2) [px]; NaN: nowhere."""
         return self.where(xy).moved(self.aside)
 
     def chosen(self, count: int) -> IntArray:
-        """Indices of the points that are wanted of `count`, ascending."""
+        """Return the indices of the points that are wanted of `count`, ascending."""
         return np.linspace(0, count - 1, min(count, self.probes or count)).astype(np.int64)
 
     def contains(self, xy: Array) -> BoolArray:
-        """Which matches (M, 2, 2) lie in the bands: for a matcher that looks everywhere."""
+        """Return which matches (M, 2, 2) lie in the bands: for a matcher that looks everywhere."""
         return self.judge(xy[:, 0], xy[:, 1])[0]
 
     def judge(self, first: Array, second: Array) -> tuple[BoolArray, Array]:
-        """Which places (M, 2), (M, 2) lie in the bands, and how far from their middles (M,), 1 at the edge.
+        """Return which places (M, 2), (M, 2) lie in the bands, and how far from their middles (M,), 1 at the
+        edge.
 
         False matches lie anywhere in a band: where nothing else tells how alike two places look, this does.
         """
@@ -73,12 +74,12 @@ class Matches:
 
     @staticmethod
     def of_places(xy: Array, score: Array) -> Matches:
-        """Matches whose points are numbered by the pixel in which they lie."""
+        """Return the matches whose points are numbered by the pixel in which they lie."""
         pixel = np.rint(xy).astype(np.int64)
         return Matches(xy, score, (pixel[..., 1] << 32) + pixel[..., 0])
 
     def select(self, keep: IntArray | BoolArray) -> Matches:
-        """The matches of a mask or of indices."""
+        """Return the matches of a mask or of indices."""
         return replace(self, xy=self.xy[keep], score=self.score[keep], index=self.index[keep])
 
 
@@ -94,5 +95,5 @@ class Matcher(Protocol):
     def __init__(self, options: TieOptions, keypoints: tuple[Keypoints, Keypoints]) -> None: ...
 
     def match(self, a: View, b: View, prediction: Prediction) -> Matches:
-        """The unambiguous matches inside the bands of the prediction, and no others; in any order."""
+        """Return the unambiguous matches inside the bands of the prediction, and no others; in any order."""
         ...

@@ -38,7 +38,7 @@ MATCHERS: dict[str, type[Matcher]] = {"guided": Guided, STRUCTURE: Structure}
 
 
 def matcher_named(name: str) -> type[Matcher] | Hook:
-    """The matcher that an option names: a row of `MATCHERS`, or what `module:name` stands for."""
+    """Return the matcher that an option names: a row of `MATCHERS`, or what `module:name` stands for."""
     return MATCHERS[name] if name in MATCHERS else hooked(name)
 
 
@@ -129,12 +129,12 @@ def match_pair(
 
 
 def ample(report: PairReport, options: TieOptions) -> bool:
-    """Whether a first look found so much that a closer one is needless."""
+    """Return whether a first look found so much that a closer one is needless."""
     return report.status == "ok" and report.verified >= ample_matches(options)
 
 
 def enough(report: PairReport) -> bool:
-    """Whether a pair has matches enough not to be tried again."""
+    """Return whether a pair has matches enough not to be tried again."""
     return report.status == "ok" and report.verified >= _wanted(report)
 
 
@@ -228,7 +228,7 @@ def _loaded(
 def quick_score(
     views: tuple[View, View], keypoints: tuple[KeypointFiles, KeypointFiles], options: TieOptions
 ) -> int:
-    """How many of a few keypoints match, at most 5 % of them falsely: what a pair promises, at little cost."""
+    """Return how many of a few keypoints match, at most 5 % of them falsely: what a pair promises, at little cost."""
     few = (keypoints[0].strongest(_QUICK), keypoints[1].strongest(_QUICK))
     if not (len(few[0]) and len(few[1])):
         return 0
@@ -249,7 +249,8 @@ def match(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[Matches, PairReport]]:
-    """Matches of every pair, each with its report: `match_pair` over all pairs, and `STRUCTURE` where it finds few.
+    """Return the matches of every pair, each with its report: `match_pair` over all pairs, and `STRUCTURE`
+    where it finds few.
 
     `terrain`, or else the matches of other pairs, some of them found `before`, tell the altitudes at which that looks.
     With `once` a first look's keypoints are tried once: `ample` says of which pairs that is all that they need.

@@ -48,19 +48,19 @@ class Area:
     outline: shapely.Geometry
 
     def plane(self, origin: Array, scale: Array) -> shapely.Geometry:
-        """The area in a plane [m]: (lon, lat) minus `origin` (2,) [deg], times `scale` (2,) [m/deg]."""
+        """Return the area in a plane [m]: (lon, lat) minus `origin` (2,) [deg], times `scale` (2,) [m/deg]."""
         near = np.array([float(wrap_longitude(origin[0])), origin[1]])
         return shapely.transform(self.outline, lambda lonlat: (lonlat - near) * scale)
 
     def contains(self, lonlat: Array) -> BoolArray:
-        """Which points (N, 2), lon, lat [deg], lie inside; NaN does not."""
+        """Return which points (N, 2), lon, lat [deg], lie inside; NaN does not."""
         shapely.prepare(self.outline)
         inside: BoolArray = shapely.contains_xy(self.outline, wrap_longitude(lonlat[:, 0]), lonlat[:, 1])
         return inside
 
 
 def read_area(path: str | os.PathLike[str]) -> Area:
-    """The polygons of a GeoJSON file as one area.
+    """Read the polygons of a GeoJSON file as one area.
 
     Parameters
     ----------
@@ -176,17 +176,17 @@ class Footprints:
             self.outlines.append(outline if near is None else shapely.intersection(outline, near))
 
     def plane(self, lonlat: Array) -> Array:
-        """East and north (..., 2) [m] of longitudes and latitudes (..., 2) [deg]."""
+        """Return the east and north (..., 2) [m] of longitudes and latitudes (..., 2) [deg]."""
         lon = wrap_longitude(lonlat[..., 0], self._origin[0])
         return (np.stack([lon, lonlat[..., 1]], axis=-1) - self._origin) * self._scale
 
     def ground(self, points: Array) -> Array:
-        """lon, lat [deg], alt [m] (N, 3) of points (N, 2) of the plane [m]."""
+        """Return the lon, lat [deg], alt [m] (N, 3) of points (N, 2) of the plane [m]."""
         return np.column_stack([points / self._scale + self._origin, np.full(len(points), self.alt)])
 
 
 def reach_of(view: View, options: TieOptions) -> float:
-    """How far the camera of a view may be wrong, in any direction [px]."""
+    """Return how far the camera of a view may be wrong, in any direction [px]."""
     if options.search is not None:
         return options.search
     ground = view.sensor.localize((np.array(view.size) - 1.0) / 2.0, np.array(view.altitude))
@@ -203,7 +203,7 @@ def _levels(views: Sequence[View]) -> tuple[float, float, float]:
 def overlapping_pairs(
     views: Sequence[View], options: TieOptions, reaches: Sequence[float] = (), area: Area | None = None
 ) -> list[Pair]:
-    """All pairs that overlap enough at some altitude, under an angle that is asked for, ascending."""
+    """Return all pairs that overlap enough at some altitude, under an angle that is asked for, ascending."""
     best: dict[tuple[int, int], Pair] = {}
     for alt in _levels(views):
         for pair in _overlapping_at(Footprints(views, alt, reaches, area), views, options):
@@ -236,7 +236,7 @@ def possible_pairs(
     area: Area | None = None,
     given: Collection[tuple[int, int]] = (),
 ) -> list[Pair]:
-    """The pairs of views that can be matched, ascending.
+    """Return the pairs of views that can be matched, ascending.
 
     Parameters
     ----------
@@ -319,7 +319,9 @@ def shared_tiles(
     area: Area | None = None,
     boxes: Sequence[Sequence[Box]] | None = None,
 ) -> list[list[Box]]:
-    """The tiles (or `boxes`) of every view that a partner may see in the area, though cameras be wrong (`reach_of`)."""
+    """Return the tiles (or `boxes`) of every view that a partner may see in the area, though cameras be wrong
+    (`reach_of`).
+    """
     boxes = boxes or [tiles(view.size, options) for view in views]
     seen = [np.zeros(len(of_view), dtype=bool) for of_view in boxes]
     partners: list[list[int]] = [[] for _ in views]

@@ -45,7 +45,7 @@ class Stretch:
     high: float
 
     def apply(self, pixels: Pixels, valid: BoolArray) -> ByteImage:
-        """8-bit picture; invalid pixels take the mean of the valid ones, so that they make few edges."""
+        """Return 8-bit picture; invalid pixels take the mean of the valid ones, so that they make few edges."""
         if pixels.dtype == np.float32:
             scaled = (pixels - np.float32(self.low)) * np.float32(255.0 / (self.high - self.low))
         else:
@@ -64,7 +64,7 @@ def _levelled(pixels: Pixels, low: float, high: float, levels: float) -> FloatIm
 
 
 def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
-    """Pixels of a window in float32, as they are or (from float64) on a scale of the window's own.
+    """Return the pixels of a window in float32, as they are or (from float64) on a scale of the window's own.
 
     Registration does not see offset and scale; float32 would lose the picture beside 2e9, and overflow squaring 1e30.
     """
@@ -82,7 +82,8 @@ def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
 def read_pixels(
     path: str | os.PathLike[str], box: Box, band: int = 1, size: tuple[int, int] | None = None
 ) -> tuple[Pixels, BoolArray]:
-    """Pixels (height, width) of a window as stored, 0 where invalid, and which of them mean something.
+    """Read the pixels (height, width) of a window as stored, 0 where invalid, and which of them mean
+    something.
 
     Those at nodata, masked, non-finite, saturated or in undeclared zero borders do not. ImageError: the file cannot
     be read, has no such band (from 1), or holds complex numbers.
@@ -111,7 +112,7 @@ class PixelReader(ExitStack):
             raise
 
     def read(self, box: Box) -> tuple[Pixels, BoolArray]:
-        """Pixels of a window, and which of them mean something."""
+        """Read the pixels of a window, and which of them mean something."""
         return _averaged(self._dataset, box, self._band, self._pixel)
 
 
@@ -183,7 +184,9 @@ def _mask(dataset: Any, band: int, raw: npt.NDArray[Any]) -> BoolArray | None:
 def sample_stretch(
     path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None
 ) -> Stretch | None:
-    """0.5 and 99.5 percentile of blocks spread over a raster, or its picture of a size; None where nothing varies."""
+    """Return 0.5 and 99.5 percentile of blocks spread over a raster, or its picture of a size; None where
+    nothing varies.
+    """
     found: list[Array] = []
     with open_raster(path) as dataset:
         _check_band(dataset, path, band)
@@ -215,7 +218,7 @@ class Survey:
 
 
 def survey(path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None) -> Survey | None:
-    """The stretch of a raster, or its picture of a size, and how it is stored; None where nothing varies."""
+    """Return the stretch of a raster, or its picture of a size, and how it is stored; None where nothing varies."""
     stretch = sample_stretch(path, band, size)
     with open_raster(path) as dataset:
         height, width = dataset.block_shapes[band - 1]
@@ -232,7 +235,8 @@ def _levels(dataset: Any, band: int) -> bool:
 def read_picture(
     path: str | os.PathLike[str], box: Box, found: Survey, zoom: int = 1, band: int = 1
 ) -> tuple[ByteImage, BoolArray]:
-    """8-bit picture of a window and its valid pixels, each of `zoom` px a side; `read_pixels` says which count.
+    """Read 8-bit picture of a window and its valid pixels, each of `zoom` px a side; `read_pixels` says which
+    count.
 
     `box` begins at whole multiples of `zoom`. Blocks are decoded once, row by row of them.
     """
@@ -265,12 +269,12 @@ def _reduced(picture: ByteImage, valid: BoolArray, zoom: int) -> tuple[ByteImage
 
 
 def jpeg(pixels: ByteImage) -> bytes:
-    """Grey values (H, W) as a JPEG file."""
+    """Return the grey values (H, W) as a JPEG file."""
     return bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 70])[1])
 
 
 def grow(box: Box, margin: int, size: tuple[int, int]) -> Box:
-    """A box with a margin on every side, cut at an image of `size` (width, height); a pixel at least."""
+    """Return a box with a margin on every side, cut at an image of `size` (width, height); a pixel at least."""
     col, row, width, height = box
     low = np.clip(np.array([col, row]) - margin, 0, np.array(size) - 1)
     high = np.clip(np.array([col + width, row + height]) + margin, low + 1, size)
@@ -280,7 +284,7 @@ def grow(box: Box, margin: int, size: tuple[int, int]) -> Box:
 def tiles(
     size: tuple[int, int], options: TieOptions, zoom: int = 1, found: Survey | None = None
 ) -> list[Box]:
-    """Boxes that cover an image of `size` (width, height) without overlap, cut at whole cells.
+    """Return the boxes that cover an image of `size` (width, height) without overlap, cut at whole cells.
 
     A side is `options.tile` times `zoom` px; strips are taken whole, and so are blocks that are dear to
     decode.

@@ -69,7 +69,7 @@ class ViewMatch:
         return float(np.sqrt(more) / self.slope) if self.slope > 0 else 0.0
 
     def shows_heights(self, sigma: float) -> bool:
-        """Whether points scatter along the line of sight as no terrain known to `sigma` [m] lets them."""
+        """Return whether points scatter along the line of sight as no terrain known to `sigma` [m] lets them."""
         return bool(self.along > _BEYOND * np.hypot(self.scatter, self.slope * sigma))
 
 
@@ -146,7 +146,8 @@ def register(
 
 
 def vote(view: View, band: int, paths: tuple[str, ...], patch: Patch, reach: int) -> FloatImage | None:
-    """How well a block of an image, the middle of a patch, goes with the reference at shifts of up to `reach` px.
+    """Return how well a block of an image, the middle of a patch, goes with the reference at shifts of up to
+    `reach` px.
 
     (2 reach + 1, 2 reach + 1) correlations; None where it or the reference shows nothing.
     """
@@ -158,7 +159,7 @@ def vote(view: View, band: int, paths: tuple[str, ...], patch: Patch, reach: int
 
 
 def search(view: View, band: int, paths: tuple[str, ...], patch: Patch, points: Array, reach: int) -> Found:
-    """Points x, y (n, 2) [px] of the reference on a patch, looked for in an image."""
+    """Return the points x, y (n, 2) [px] of the reference on a patch, looked for in an image."""
     return find(of_reference(paths, patch), of_image(view, band, patch), points, _HALF, reach)
 
 

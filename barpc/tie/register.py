@@ -183,7 +183,9 @@ def register_part(
     structural: bool,
     tile: int,
 ) -> Registration:
-    """Patches registered on their grey values, or on channels of oriented gradients; `ok` where they are alike."""
+    """Return the patches registered on their grey values, or on channels of oriented gradients; `ok` where
+    they are alike.
+    """
     if structural:
         xy, ok, correlation = structure.register_places(files, band, reference, start, linear)
         return Registration(xy, correlation, np.full(len(xy), structure.SIGMA), ok)
@@ -528,7 +530,7 @@ def _shared(tracks: Tracks, of_track: IntArray, rows: IntArray, xy: Array, sigma
 
 
 def references(tracks: Tracks, spreads: Mapping[tuple[int, int], float], num_views: int) -> IntArray:
-    """Row of the reference observation of every track (P,): the view that is most like the others.
+    """Return the row of the reference observation of every track (P,): the view that is most like the others.
 
     That is where the pairs' spread across the epipolar line [px] is least: it grows with the angle between two views
     and with all else that makes them look different.

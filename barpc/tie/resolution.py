@@ -51,12 +51,12 @@ class Coarser(Frozen):
 
 
 def coarser(xy: Array, pixel: Array) -> Array:
-    """Places (..., 2) [px] counted in pixels that hold several (2,); of one to the bit."""
+    """Return the places (..., 2) [px] counted in pixels that hold several (2,); of one to the bit."""
     return np.asarray((xy - 0.5 * (pixel - 1.0)) / pixel)
 
 
 def finer(xy: Array, pixel: Array) -> Array:
-    """The way back of `coarser`."""
+    """Return the way back of `coarser`."""
     return np.asarray(xy * pixel + 0.5 * (pixel - 1.0))
 
 
@@ -73,7 +73,7 @@ class Looks:
 
     @classmethod
     def at(cls, views: Sequence[View], pairs: Sequence[Pair], apart: bool = True) -> Looks:
-        """The looks that pairs need; without those of other resolutions (`apart`) the views as they are."""
+        """Return the looks that pairs need; without those of other resolutions (`apart`) the views as they are."""
         scale, whole = [_scale(view) for view in views], (1, 1)
         most = [
             (math.isqrt(v.size[0]), math.isqrt(v.size[1])) for v in views
@@ -92,15 +92,15 @@ class Looks:
         return cls(seen, pixel.astype(np.float64).reshape(-1, 2), of, ends)
 
     def pair(self, pair: Pair) -> Pair:
-        """A pair of views as one of looks."""
+        """Return a pair of views as one of looks."""
         return replace(pair, views=self.ends[pair.views])
 
     def matches(self, pair: Link, found: Matches) -> Matches:
-        """Matches of two views counted in the pixels of their looks."""
+        """Return the matches of two views counted in the pixels of their looks."""
         return replace(found, xy=coarser(found.xy, self.pixel[list(self.ends[pair])]))
 
     def tracks(self, found: Tracks) -> Tracks:
-        """Tracks over looks as tracks over views."""
+        """Return the tracks over looks as tracks over views."""
         pixel = self.pixel[found.view]
         sigma = found.sigma * pixel.max(axis=1)
         return Tracks(self.of[found.view], found.point, finer(found.xy, pixel), sigma)

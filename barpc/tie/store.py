@@ -42,7 +42,7 @@ class Store:
             np.savez(file, **arrays)  # type: ignore[arg-type]
 
     def read(self, name: str) -> Arrays | None:
-        """Arrays of a name; None where it is missing or damaged."""
+        """Read the arrays of a name; None where it is missing or damaged."""
         path = Path(self.folder) / f"{name}.npz"
         try:
             return None if path.is_symlink() or not path.is_file() else load_npz(path)
@@ -50,7 +50,7 @@ class Store:
             return None
 
     def need(self, name: str) -> Arrays:
-        """Arrays of a name that was written before; InputError where this worker does not find it."""
+        """Return the arrays of a name that was written before; InputError where this worker does not find it."""
         found = self.read(name)
         if found is None:
             raise InputError(
@@ -78,7 +78,9 @@ def store_of(executor: Executor | None) -> Iterator[Store]:
 def names_of(
     executor: Executor | None, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]
 ) -> list[str]:
-    """Names for results: by the content of inputs where the executor knows it, so that a later run finds them."""
+    """Return the names for results: by the content of inputs where the executor knows it, so that a later run
+    finds them.
+    """
     key = getattr(executor, "key", None)
     names = (key(function, task) if key else number for number, task in enumerate(tasks))
     return [f"{function.__name__}/{name}" for name in names]

@@ -60,7 +60,8 @@ class Structure:
         self._known: tuple[Callable[[Array], Frame], Matches] | None = None
 
     def match(self, a: View, b: View, prediction: Prediction) -> Matches:
-        """Points of a grid whose best place, in the band and to both sides of it, lies in the band.
+        """Return the points of a grid whose best place, in the band and to both sides of it, lies in the
+        band.
 
         All bands of a prediction, moved aside or not, are looked at at once; the next calls ask of what was found.
         """
@@ -226,7 +227,8 @@ def _found(
 def register_places(
     files: Files, band: int, reference: Array, start: Array, linear: Array
 ) -> tuple[Array, BoolArray, Array]:
-    """Patches of A at `reference` found again about `start` (n, 2) [px] of B: places, whether, correlations.
+    """Return the patches of A at `reference` found again about `start` (n, 2) [px] of B: places, whether,
+    correlations.
 
     On the channels, at the coarser of the two resolutions, and then at half its step: what is sharper than a pixel is
     lost between whole ones.
@@ -269,7 +271,7 @@ class Tile:
         half: int,
         blurs: tuple[float, float] = COARSE,
     ) -> Tile:
-        """The pictures of two images about points of A and B (n, 2) [px]."""
+        """Return the pictures of two images about points of A and B (n, 2) [px]."""
         matrix, pad = step * linear, half + _PAD
         corner = np.floor(at.min(axis=0) / step) * step - pad * step
         first = np.rint((at - corner) / step).astype(np.int64)
@@ -286,7 +288,7 @@ class Tile:
         return cls(pictures, first, whole, place - whole, reach, half, matrix, origin)
 
     def surfaces(self) -> FloatImage:
-        """Correlations (n, y, x) at all places within reach."""
+        """Return the correlations (n, y, x) at all places within reach."""
         x, y = (self.half + self.reach).tolist()
         parts = [
             correlation(
@@ -303,12 +305,12 @@ class Tile:
         return [slice(i, i + batch) for i in range(0, len(self.at), batch)]
 
     def offsets(self) -> Array:
-        """How far in B (y, x, 2) [px] the places of a surface lie from the whole px."""
+        """Return how far in B (y, x, 2) [px] the places of a surface lie from the whole px."""
         axes = (np.arange(-n, n + 1) for n in self.reach.tolist())
         return np.stack(np.meshgrid(*axes), axis=-1) @ self.matrix.T
 
     def peaks(self, surface: FloatImage) -> tuple[Array, Array]:
-        """Best places (n, 2) in the second picture, to a part of a pixel, and correlations there (n,)."""
+        """Return the best places (n, 2) in the second picture, to a part of a pixel, and correlations there (n,)."""
         n, height, width = surface.shape
         flat = surface.reshape(n, -1).argmax(axis=1)
         y, x = np.divmod(flat, width)
@@ -323,7 +325,7 @@ class Tile:
         return self.whole + np.stack([x, y], axis=1) - self.reach + part, score
 
     def returns(self, place: Array) -> BoolArray:
-        """Whether what is at places of the second picture is found where it is looked for from."""
+        """Return whether what is at places of the second picture is found where it is looked for from."""
         search, missed = 4, []
         for i in self._batches():
             there = cut(self.pictures[1], np.rint(place[i]).astype(np.int64), self.half, self.half)
@@ -340,7 +342,7 @@ class Tile:
         return np.asarray(cut(known, self.at, self.half, self.half).mean(axis=(1, 2, 3)) > _SHOWN)
 
     def in_b(self, place: Array) -> Array:
-        """Places (n, 2) of the second picture in B [px]."""
+        """Return the places (n, 2) of the second picture in B [px]."""
         return np.asarray(self.origin + place @ self.matrix.T)
 
 

@@ -18,7 +18,8 @@ def ordered(
     stage: str,
     progress: Progress | None = None,
 ) -> list[Any]:
-    """Results of `function(*task)` in the order of the tasks; the rest is cancelled when one fails.
+    """Return the results of `function(*task)` in the order of the tasks; the rest is cancelled when one
+    fails.
 
     Parameters
     ----------

@@ -323,7 +323,7 @@ def _joined(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
 
 
 def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
-    """The tracks whose ground points lie in an area, all without one; TiePointError where none does."""
+    """Return the tracks whose ground points lie in an area, all without one; TiePointError where none does."""
     if area is None or not len(tracks):
         return tracks
     cameras = [view.sensor for view in views]
@@ -448,7 +448,7 @@ def _fill(tracks: Tracks, cell: list[int], num_cells: int, most: int, num_views:
 
 
 def pair_counts(tracks: Tracks) -> dict[tuple[int, int], int]:
-    """How many tracks the pairs of views, ascending, have in common; only those that have any."""
+    """Return how many tracks the pairs of views, ascending, have in common; only those that have any."""
     found, step, num = [np.empty(0, np.int64)], 1, int(tracks.view.max(initial=0)) + 1
     while step < len(tracks) and (same := tracks.point[step:] == tracks.point[:-step]).any():
         found.append(tracks.view[:-step][same] * num + tracks.view[step:][same])
@@ -458,7 +458,7 @@ def pair_counts(tracks: Tracks) -> dict[tuple[int, int], int]:
 
 
 def common_tracks(tracks: Tracks, first: int, second: int) -> tuple[Array, Array]:
-    """Image points (M, 2), (M, 2) [px] of the tracks that two views have in common, in the same order."""
+    """Return the image points (M, 2), (M, 2) [px] of the tracks that two views have in common, in the same order."""
     a, b = tracks.view == first, tracks.view == second
     _, rows_a, rows_b = np.intersect1d(tracks.point[a], tracks.point[b], return_indices=True)
     return tracks.xy[a][rows_a], tracks.xy[b][rows_b]

@@ -158,7 +158,7 @@ class CheckPointEntry(KnownPoint):
 
 
 def measure_gcps(run: Run) -> tuple[GcpEntry, ...]:
-    """Ground control, and what the adjustment said of it."""
+    """Return the ground control, and what the adjustment said of it."""
     points = run.gcps
     if points is None:
         return ()
@@ -198,7 +198,7 @@ def _worst_in_images(run: Run, tests: Sequence[ControlResidual]) -> dict[str, An
 
 
 def measure_control(run: Run) -> ControlTestEntry | None:
-    """Every residual of control in the images in units of its own deviation; None without any."""
+    """Return every residual of control in the images in units of its own deviation; None without any."""
     tests = run.control_tests
     if not tests:
         return None
@@ -225,7 +225,7 @@ def _in_images(run: Run, given: Array, views: IntArray, residual: Array) -> floa
 
 
 def measure_reference(run: Run) -> ReferenceEntry | None:
-    """What an orthoimage said of each image; None without one."""
+    """Return what an orthoimage said of each image; None without one."""
     found, adjustment = run.reference, run.adjustment
     if found is None:
         return None
@@ -252,7 +252,9 @@ def measure_reference(run: Run) -> ReferenceEntry | None:
 
 
 def measure_check_points(run: Run) -> tuple[CheckPointEntry, ...]:
-    """Points that stayed out of the adjustment: image residuals of each observation, and the ground error."""
+    """Return the points that stayed out of the adjustment: image residuals of each observation, and the
+    ground error.
+    """
     points = run.check_points
     if points is None:
         return ()

@@ -111,7 +111,7 @@ class PairEntry(Record):
 
 
 def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
-    """Every two images with tie points in common."""
+    """Return every two images with tie points in common."""
     reports = {report.names: report for report in run.matched}
     geometry, before = _pair_geometry(run), _pair_offsets(run, run.before, run.altitudes_before)
     after: list[OffsetEntry | None] = [None] * len(before)
@@ -185,7 +185,7 @@ def _rows(run: Run, picks: Sequence[slice | IntArray]) -> tuple[IntArray, IntArr
 
 
 def medians(values: Array, group: IntArray, num: int) -> Array:
-    """The median (num,) of each group of values (n,); NaN without any."""
+    """Return the median (num,) of each group of values (n,); NaN without any."""
     ordered = values[np.lexsort((values, group))]
     count = np.bincount(group, minlength=num)
     start, some = np.cumsum(count) - count, count > 0

@@ -27,7 +27,8 @@ class EllipseEntry(Record):
 
 
 def shift_in_image(model: Corrected, covariance: Array, unknowns: str, ground: Array) -> tuple[Array, Array]:
-    """How far P_BA moves a ground point (3,) near the middle of the image, and the standard deviation of that.
+    """Return how far P_BA moves a ground point (3,) near the middle of the image, and the standard deviation
+    of that.
 
     Parameters
     ----------
@@ -50,7 +51,9 @@ def shift_in_image(model: Corrected, covariance: Array, unknowns: str, ground: A
 
 
 def ellipse(model: Corrected, covariance: Array, unknowns: str, ground: Array) -> EllipseEntry:
-    """The standard error ellipse of the place on the ground where P_BA sees a pixel; arguments of `shift_in_image`."""
+    """Return the standard error ellipse of the place on the ground where P_BA sees a pixel; arguments of
+    `shift_in_image`.
+    """
     _, variance, by_point = _in_image(model, covariance, unknowns, ground)
     return _drawn(variance, by_point @ enu_basis(ground)[:2].T)
 
@@ -91,7 +94,7 @@ def _in_image(
 
 
 def stated_ce90(view: View) -> float | None:
-    """CE90 [m] of a camera as delivered, of the accuracies per axis that it states."""
+    """Return CE90 [m] of a camera as delivered, of the accuracies per axis that it states."""
     sensor, sigma = view.sensor, None
     if isinstance(sensor, Pushbroom) and sensor.accuracy is not None:
         sigma = float(np.hypot(*sensor.accuracy))
@@ -101,7 +104,8 @@ def stated_ce90(view: View) -> float | None:
 
 
 def ce90(major: float, minor: float) -> float:
-    """Radius of the circle that holds 90 % of a normal distribution with such standard deviations along its axes.
+    """Return the radius of the circle that holds 90 % of a normal distribution with such standard deviations
+    along its axes.
 
     Examples
     --------

@@ -263,7 +263,7 @@ def _fit_entry(fit: RpcFit) -> FitEntry:
 
 
 def measure_views(run: Run) -> tuple[ViewEntry, ...]:
-    """Every image of a run; the verdict on it is still to come."""
+    """Return every image of a run; the verdict on it is still to come."""
     num, tracks, keep, adjustment = len(run.views), run.tracks, run.keep, run.adjustment
     after = run.ties_after
     first = rmse_by_view(run.ties_before.residuals[keep], tracks.view[keep], num)
@@ -342,7 +342,7 @@ def _coverage(run: Run) -> Array:
 
 
 def rmse_by_view(residuals: Array, view: IntArray, num_views: int) -> Array:
-    """RMS of each view (N,) [px]: sqrt(mean(dcol^2 + drow^2)) over those residuals (K, 2) that are not NaN."""
+    """Return RMS of each view (N,) [px]: sqrt(mean(dcol^2 + drow^2)) over those residuals (K, 2) that are not NaN."""
     use = np.isfinite(residuals).all(axis=1)
     squares = np.bincount(view[use], (residuals[use] ** 2).sum(axis=1), minlength=num_views)
     with np.errstate(invalid="ignore"):
@@ -350,7 +350,7 @@ def rmse_by_view(residuals: Array, view: IntArray, num_views: int) -> Array:
 
 
 def cell_numbers(xy: Array, size: Sequence[int] | IntArray) -> IntArray:
-    """Which of the `CELLS` x `CELLS` cells of an image, or each of its own (n, 2), points (n, 2) [px] lie in."""
+    """Return which of the `CELLS` x `CELLS` cells of an image, or each of its own (n, 2), points (n, 2) [px] lie in."""
     col, row = ((xy + 0.5) / np.asarray(size) * CELLS).astype(np.int64).clip(0, CELLS - 1).T
     number: IntArray = row * CELLS + col
     return number

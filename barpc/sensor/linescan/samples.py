@@ -112,7 +112,7 @@ def _track(times: Array, positions: Array) -> Curve:
 
 
 def unit(quaternions: Array, name: str) -> Array:
-    """Quaternions (N, 4) of length 1; RpcFormatError where theirs is another."""
+    """Return the quaternions (N, 4) of length 1; RpcFormatError where theirs is another."""
     length = np.linalg.norm(quaternions, axis=1)
     if not (np.abs(length - 1.0) < _UNIT).all():
         raise RpcFormatError(

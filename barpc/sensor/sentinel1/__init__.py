@@ -56,7 +56,7 @@ def mosaic(
     atmosphere: bool = False,
     bistatic: Bistatic | None = None,
 ) -> RangeDoppler:
-    """One model for the swaths of an SLC product, side by side.
+    """Return one model for the swaths of an SLC product, side by side.
 
     Column 0 is pixel 0 of the nearest swath (IW1, EW1) and row 0 the earliest line 0; the other swaths
     start at ``mosaic_offsets``.

@@ -109,7 +109,7 @@ class Annotation:
         return f"a {self.mode} {self.product_type} of {self.swath}"
 
     def line_time(self, line: Array) -> TimeArray:
-        """Annotated times (...), datetime64[ns], of lines (...) of the measurement file."""
+        """Return the annotated times (...), datetime64[ns], of lines (...) of the measurement file."""
         start, rest = np.array([self.first_line_time]), np.asarray(line, dtype=np.float64)
         index = np.zeros(rest.shape, dtype=np.int64)
         if self.bursts:

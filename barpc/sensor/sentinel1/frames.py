@@ -36,7 +36,7 @@ class SlantFrame(Frozen):
     interval: float  # azimuth time between rows [s]
 
     def image(self, times: Array) -> tuple[Array, Array]:
-        """Image points (2, N) [px] of times (2, N) [s], and d(col, row)/d(times) (2, 2, N)."""
+        """Return the image points (2, N) [px] of times (2, N) [s], and d(col, row)/d(times) (2, 2, N)."""
         out, slope = np.empty_like(times), np.zeros((2, *times.shape))
         out[0] = (times[1] - self.first_range_time) * self.sampling_rate
         out[1] = times[0] / self.interval
@@ -44,7 +44,7 @@ class SlantFrame(Frozen):
         return out, slope
 
     def times(self, image: Array) -> Array:
-        """Times (2, N) [s] of image points (2, N) [px]."""
+        """Return the times (2, N) [s] of image points (2, N) [px]."""
         return np.stack([image[1] * self.interval, image[0] / self.sampling_rate + self.first_range_time])
 
 
@@ -64,7 +64,7 @@ class GroundFrame(Frozen):
     slope: float  # slant range a ground range at mid swath, roughly: where the inversion starts
 
     def image(self, times: Array) -> tuple[Array, Array]:
-        """Image points (2, N) [px] of times (2, N) [s], and d(col, row)/d(times) (2, 2, N)."""
+        """Return the image points (2, N) [px] of times (2, N) [s], and d(col, row)/d(times) (2, 2, N)."""
         metres = 0.5 * SPEED_OF_LIGHT
         ground, by_slant, by_time = self._ground_range(times[0], metres * times[1])
         out, slope = np.empty_like(times), np.zeros((2, *times.shape))
@@ -74,7 +74,7 @@ class GroundFrame(Frozen):
         return out, slope
 
     def times(self, image: Array) -> Array:
-        """Times (2, N) [s] of image points (2, N) [px]: Newton on the polynomial."""
+        """Return the times (2, N) [s] of image points (2, N) [px]: Newton on the polynomial."""
         time, target = image[1] * self.interval, image[0] * self.spacing
         slant = self.origin.mean() + target * self.slope
         for _ in range(_INVERSION_STEPS):
@@ -143,7 +143,7 @@ class Delays:
     def shift_jacobian(
         self, times: Array, by_ground: Array, ground: Array, sight: Array, by_sight: Array
     ) -> Array:
-        """Derivative of `shift` by (lon, lat, alt) (2, N, 3) [s/deg, s/deg, s/m].
+        """Return the derivative of `shift` by (lon, lat, alt) (2, N, 3) [s/deg, s/deg, s/m].
 
         `by_ground` (2, N, 3) is that of the times, `by_sight` (N, 3, 3) that of the sight.
         """

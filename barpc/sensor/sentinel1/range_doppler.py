@@ -172,7 +172,8 @@ class RangeDoppler(Frozen):
         return image, by_ground, by_timing, row
 
     def azimuth_range(self, ground: Array) -> tuple[Array, Array]:
-        """Zero-Doppler [s from `epoch`] and two-way slant range times (...) [s] of ground points (..., 3).
+        """Return the zero-Doppler [s from `epoch`] and two-way slant range times (...) [s] of ground points
+        (..., 3).
 
         Pure geometry, without `delays`; NaN off the orbit's time span or on the other side.
         """
@@ -182,20 +183,22 @@ class RangeDoppler(Frozen):
         return azimuth_time, range_time
 
     def to_radar(self, ground: Array) -> Array:
-        """Vectors (..., 3) [m], ECEF, from ground points (..., 3) to the satellite; NaN where `azimuth_range` is."""
+        """Return the vectors (..., 3) [m], ECEF, from ground points (..., 3) to the satellite; NaN where
+        `azimuth_range` is.
+        """
         return pointwise(self._to_radar, CHUNK, [(3,)], ground)[0]
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN where `azimuth_range` is."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN where `azimuth_range` is."""
         return pointwise(self._project, CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = pointwise(lambda part: self._derivatives(part)[:2], CHUNK, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m].
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
 
         On the circle of zero Doppler and given slant range, Newton on the look angle until the point has the altitude.
         Longitudes run on across the antimeridian; NaN off the orbit's time span or where the range does not reach.
@@ -348,7 +351,7 @@ def build(
 
 
 def grid_residuals(annotation: Annotation, model: RangeDoppler) -> Array:
-    """Model - a swath's own geolocation grid, geometry only: range [samples], azimuth [lines], (G, 2)."""
+    """Return the model - a swath's own geolocation grid, geometry only: range [samples], azimuth [lines], (G, 2)."""
     grid = annotation.grid
     azimuth_time, range_time = model.azimuth_range(grid.ground)
     samples = (range_time - grid.range_time) * annotation.range_sampling_rate

@@ -69,18 +69,20 @@ class Monostatic(Frozen):
             raise RpcError(f"SICD: look {self.look!r}, expected 'right' or 'left'")
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN far off, or on the other side."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN far off, or on the
+        other side.
+        """
         return pointwise(
             lambda part: [self._image(self._solve(ecef_from_ground(part).T)[0])], CHUNK, [(2,)], ground
         )[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = pointwise(lambda part: self._derivatives(part)[:2], CHUNK, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m].
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
 
         Longitudes run on across the antimeridian; NaN far off the image or where the range does not reach.
         """
@@ -90,7 +92,9 @@ class Monostatic(Frozen):
         return ground
 
     def to_radar(self, ground: Array) -> Array:
-        """Vectors (..., 3) [m], ECEF, from ground points (..., 3) to the antenna that sees them; NaN as `project`."""
+        """Return the vectors (..., 3) [m], ECEF, from ground points (..., 3) to the antenna that sees them;
+        NaN as `project`.
+        """
         return pointwise(lambda part: [self._to_radar(part)], CHUNK, [(3,)], ground)[0]
 
     @property
