@@ -162,13 +162,15 @@ class HeightGrid:
 
 
 def _snapped(index: Array) -> Array:
-    """Fractional indices, on the node where they are within a millionth of it: a void beyond has no weight."""
+    """Return the fractional indices, on the node where they are within a millionth of it: a void beyond has
+    no weight.
+    """
     node = np.rint(index)
     return np.where(np.abs(index - node) < 1e-6, node, index)
 
 
 def _inverse(forward: Affine, path: Place) -> Affine:
-    """From coordinates to pixels, where the way there has one."""
+    """Return the from coordinates to pixels, where the way there has one."""
     numbers = np.array(forward[:6])
     area = abs(forward.determinant)
     if np.isfinite(numbers).all() and np.abs(numbers).max() <= _FAR and area >= _FAR**-2:
@@ -177,7 +179,7 @@ def _inverse(forward: Affine, path: Place) -> Affine:
 
 
 def _vertical_reference(wkt: str) -> str:
-    """What heights in a CRS count from: the name of its vertical part, or the ellipsoid of a 3-D CRS."""
+    """Return what heights in a CRS count from: the name of its vertical part, or the ellipsoid of a 3-D CRS."""
     match = _VERTICAL.search(wkt)
     if match:
         return "ellipsoid" if "ellipsoid" in match.group(1).lower() else match.group(1)
@@ -224,7 +226,8 @@ class Dem:
         return height if self.geoid is None else height + self.geoid.sample(lon, lat)
 
     def between(self, start: Array, end: Array) -> tuple[float, float, float]:
-        """Of lines from `start` to `end` (N, 3): the most posts that one passes; lowest and highest terrain there [m].
+        """Return, for lines from `start` to `end` (N, 3), the most posts that one passes, and the lowest and
+        highest terrain [m].
 
         Zero and infinite ends where none of them is on the DEM.
         """
@@ -292,7 +295,9 @@ def localize_on_terrain(
 
 
 def _met(sensor: SensorModel, image: Array, terrain: Callable[[Array, Array], Array], levels: Array) -> Array:
-    """The ground points (N, 3) between descending levels [m]; terrain at the first and the last of them counts."""
+    """Return the ground points (N, 3) between descending levels [m]; terrain at the first and the last of
+    them counts.
+    """
 
     def above(alt: Array) -> Array:
         ground = sensor.localize(np.broadcast_to(image, (*alt.shape, 2)), alt)

@@ -33,8 +33,8 @@ def pointwise(
     alt: npt.ArrayLike | None = None,
     rows: int = 0,
 ) -> list[Array]:
-    """Return what a function of a batch of points gives for points (..., k) and altitudes (...), broadcast,
-    `chunk` at a time.
+    """Apply a function of a batch of points to points (..., k) and altitudes (...), broadcast, `chunk` at a
+    time.
 
     The function takes (n, k) points, (n,) altitudes if there are any, and (rows, n) memory to overwrite if it asks for
     `rows` (fresh memory costs more than sums), and gives arrays (n, *shape); what is not finite is no news.
@@ -114,7 +114,8 @@ def ground_rows_from_ecef(ecef: Array) -> tuple[Array, Array]:
 
 
 def _geodetic(x: Array, y: Array, z: Array) -> tuple[Array, ...]:
-    """Ground (3, N); sin, cos of latitude, distance from the axis [m], sqrt(1 - e^2 sin^2(lat)), (N,) each.
+    """Return the ground (3, N); sin, cos of latitude, distance from the axis [m], sqrt(1 - e^2 sin^2(lat)),
+    (N,) each.
 
     Two steps (one leaves 1e-6 m, two 4e-9 m) of Bowring, "Transformation from spatial to geographical coordinates",
     from the start in "The accuracy of geodetic latitude and height equations", Survey Review 1976 and 1985.

@@ -50,7 +50,7 @@ def collection(features: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _around_pole(ring: Array, step: Array, turn: float) -> Array:
-    """The area between an outline around a pole and that pole, three turns of it: from it one is cut."""
+    """Return the area between an outline around a pole and that pole, three turns of it: from it one is cut."""
     lon = ring[0, 0] % 360.0 - 1.5 * turn + np.concatenate([[0.0], np.cumsum(np.tile(step, 3))])
     lat = np.append(np.tile(ring[:, 1], 3), ring[0, 1])
     pole = 90.0 if lat.mean() > 0 else -90.0
@@ -63,7 +63,7 @@ def _area(ring: Array) -> float:
 
 
 def _clip(ring: Array, west: float) -> Array:
-    """The part of a polygon within 360 degrees east of a meridian (Sutherland and Hodgman)."""
+    """Return the part of a polygon within 360 degrees east of a meridian (Sutherland and Hodgman)."""
     for lon, side in ((west, 1.0), (west + 360.0, -1.0)):
         out: list[Array] = []
         for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):

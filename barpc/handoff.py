@@ -49,7 +49,7 @@ Projection = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Reading:
-    """What one of `CONSUMERS` makes of one file.
+    """Result of reading one file by one of `CONSUMERS`.
 
     `max_error`: largest distance to the model over the grid [px], NaN where it was not read; `note`: why it was not.
     `rms`: of the distances at the points of a sample [px], where there is one.
@@ -176,7 +176,7 @@ _MACHINE = frozenset(
 
 
 def _readers(path: Path) -> dict[str, bool]:
-    """The tools besides barpc that read a file, and whether they are installed."""
+    """Return the tools besides barpc that read a file, and whether they are installed."""
     if path.name.endswith((GRID, CORRECTION, STATE_END)):
         return {name: one.installed for name, one in _grid_consumers(path).items() if one.package != "barpc"}
     row = row_of(path)
@@ -184,7 +184,7 @@ def _readers(path: Path) -> dict[str, bool]:
 
 
 def _readings(path: Path, ground: Array, image: Array) -> list[Reading]:
-    """What all consumers make of a file, which is lent to those that are not barpc."""
+    """Return what all consumers make of a file, which is lent to those that are not barpc."""
     names = [name for name, installed in _readers(path).items() if installed]
     try:
         with _lent(path) as lent:
@@ -207,7 +207,7 @@ def _reading(path: Path, lent: Path, name: str, ground: Array, image: Array) -> 
 
 
 def _unread(path: Path, name: str, failure: Exception) -> Reading:
-    """What a reader says; OutputError where it is the machine that says it, of which no file is to blame."""
+    """Return what a reader says; OutputError where it is the machine that says it, of which no file is to blame."""
     if isinstance(failure, OSError) and failure.errno in _MACHINE:
         raise OutputError(f"{path}: cannot be opened as {name} does ({failure.strerror})") from failure
     return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
@@ -285,7 +285,7 @@ def _gdal_raster(path: Path) -> Projection:
 
 
 def _gdal_text(path: Path) -> Projection:
-    """GDAL reads text only beside an image: one of a single pixel is lent to it."""
+    """Return GDAL reads text only beside an image: one of a single pixel is lent to it."""
     stem = path.name[: -len("_rpc.txt")] if path.name.lower().endswith("_rpc.txt") else path.stem
     with tempfile.TemporaryDirectory() as folder:
         image = Path(folder) / f"{stem}.tif"
@@ -325,7 +325,9 @@ def _shareloc(path: Path) -> Projection:
 
 
 def _told(found: Array, lon: Array) -> Array:
-    """What shareloc found (N, ...) at longitudes; OutputError where it leaves out those beyond 180 degrees alone."""
+    """Return what shareloc found (N, ...) at longitudes; OutputError where it leaves out those beyond 180
+    degrees alone.
+    """
     lost, beyond = ~np.isfinite(found).all(axis=1), np.abs(lon) > 180.0
     if lost.any() and not (lost & ~beyond).any():
         raise OutputError(
@@ -340,7 +342,7 @@ def _orthority(path: Path) -> Projection:
 
 
 def _keywords(path: Path) -> Projection:
-    """An OSSIM keyword list, read as its readers do: every line split at the first colon, all keys asked for."""
+    """Return an OSSIM keyword list, read as its readers do: every line split at the first colon, all keys asked for."""
     pairs = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line)
     if pairs["type"].strip() != "ossimRpcModel" or pairs["polynomial_format"].strip() != "B":
         raise OutputError("type or polynomial_format is not what OSSIM expects")

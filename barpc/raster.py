@@ -140,7 +140,7 @@ def _opened_remote(file: Remote, driver: str) -> Iterator[Any]:
 
 
 def _mosaic(file: Place, name: str) -> Mosaic:
-    """A VRT whose sources are all rasters that are read here."""
+    """Return a VRT whose sources are all rasters that are read here."""
     if isinstance(file, Remote):
         raise ImageError(f"{name}: a VRT is read from disk only; give the images it is made of")
     vrt = read_vrt(file, name=name)
@@ -154,7 +154,7 @@ def _mosaic(file: Place, name: str) -> Mosaic:
 
 
 def hashed(path: Place | str) -> Input:
-    """Return a file, hashed; a VRT with the sources that it shows. ImageError where one cannot be read."""
+    """Hash a file, of a VRT the sources that it shows, too; ImageError where one cannot be read."""
     try:
         if isinstance(path, Remote) or driver_of(read_head(path, IMAGE, 64)) != "VRT":
             return identity.take(path)
@@ -261,7 +261,7 @@ class Mosaic:
         return pixels[0] if isinstance(indexes, int) else pixels
 
     def read_masks(self, index: int, window: Window | None = None) -> npt.NDArray[np.uint8]:
-        """Read 0 where a pixel of a band (H, W) means nothing: by the VRT's mask, nodata or alpha band."""
+        """Read the mask of a band (H, W), 0 where a pixel is invalid: by the VRT's mask, nodata or alpha band."""
         box, band = self._box(window), self._vrt.bands[index - 1]
         if self._vrt.mask is not None:
             return np.asarray(self._assembled(self._vrt.mask, box), np.uint8)
@@ -273,7 +273,7 @@ class Mosaic:
         return np.full((box[3], box[2]), 255, np.uint8)
 
     def plain_source(self) -> Path | None:
-        """Return the raster that the VRT shows whole, as it is and alone; None if there is no such."""
+        """Return the raster that the VRT shows whole and unchanged; None if there is no such."""
         files = {source.file for source in self._vrt.sources}
         if len(files) != 1:
             return None
@@ -336,7 +336,7 @@ class Mosaic:
 
 
 def _handed_on(values: Pixels, source: Source, dtype: str) -> tuple[Any, Pixels]:
-    """Which values a source hands on, as an index, and what they become."""
+    """Return which values a source hands on, as an index, and what they become."""
     keep: Any = ...
     if source.plain:
         return keep, values
@@ -360,7 +360,7 @@ def _equal(values: Pixels, nodata: float) -> BoolArray:
 
 
 def _converted(values: Pixels, dtype: np.dtype[Any]) -> Pixels:
-    """Values of another type as GDAL makes them: rounded half away from zero and cut at the type's range."""
+    """Return the values of another type as GDAL makes them: rounded half away from zero and cut at the type's range."""
     if values.dtype == dtype:
         return values
     with np.errstate(all="ignore"):

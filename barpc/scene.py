@@ -54,7 +54,7 @@ class View(Frozen):
 
     @property
     def altitude(self) -> float:
-        """The middle of its altitudes [m]."""
+        """Middle of the view's altitudes [m]."""
         return sum(self.alt_range) / 2.0
 
     def _told(self) -> str:
@@ -156,7 +156,7 @@ class GroundPoints(Frozen):
 
     @classmethod
     def none(cls) -> GroundPoints:
-        """No points."""
+        """Return an empty set of points."""
         index, places = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
         return cls((), places, places, index, index, np.zeros((0, 2)), np.zeros(0))
 
@@ -177,7 +177,7 @@ class GroundPoints(Frozen):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Reference(Frozen):
-    """Control of an orthoimage and a terrain: many points that share the errors of both.
+    """Control points from an orthoimage and a terrain, which share the errors of both.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ class Reference(Frozen):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Altimetry(Frozen):
-    """Heights of the ground from elsewhere (a laser), without image coordinates.
+    """Heights of the ground from altimetry (a laser), without image coordinates.
 
     Parameters
     ----------
@@ -227,16 +227,14 @@ class Altimetry(Frozen):
 
 
 def _seen(view: IntArray, sigma: Array) -> str:
-    """Observations in a few words."""
+    """Return the observations in a few words."""
     if not len(view):
         return "no observations"
     return f"{len(view)} observations in {len(np.unique(view))} views, to {np.median(sigma):.2g} px"
 
 
 def middle_altitude(views: Sequence[View]) -> float:
-    """Return the mean of the middle altitudes of views [m]: where points that several of them see are looked
-    for first.
-    """
+    """Return the mean of the views' middle altitudes [m], where triangulation starts."""
     return float(np.mean([view.alt_range for view in views]))
 
 

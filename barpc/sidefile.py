@@ -59,7 +59,9 @@ class Kind:
             )
 
     def check_numbers(self, path: Path | str, file: BinaryIO) -> None:
-        """Raise if a text holds more numbers than `most` bytes can; short ones take more in memory than in the file."""
+        """Raise if a text holds more numbers than `most` bytes can hold: short ones take more in memory than
+        in the file.
+        """
         limit = (self.most or 0) // NUMBER
         if self.between and file.seek(0, os.SEEK_END) > limit:
             file.seek(0)
@@ -73,7 +75,7 @@ class Kind:
 
 
 def _count(text: bytes, between: bytes) -> int:
-    """How many values stand in a text: the signs between them, of blanks one of each row of them."""
+    """Return how many values stand in a text: the signs between them, of blanks one of each row of them."""
     one_each = sum(text.count(sign) for sign in between if sign != _BLANK)
     return one_each + (len(re.findall(rb" (?! )", text)) if _BLANK in between else 0)
 
@@ -97,7 +99,7 @@ SUMMARY = Kind("a run's summary", 512 * MB, between=_OF_JSON)
 
 @contextmanager
 def opened(path: Path | str, kind: Kind) -> Iterator[BinaryIO]:
-    """A regular file, open for reading; links are followed.
+    """Open a regular file for reading; links are followed.
 
     One line of the class of `kind` where there is no such file, it is a folder, pipe or device, or cannot be read.
     """
@@ -149,7 +151,7 @@ def _regular(path: Path | str, kind: Kind) -> BinaryIO:
 
 
 def encoding_of(head: bytes) -> str:
-    """Return how a text is encoded, by its first bytes: UTF-16 where a byte order mark or zeros between its
+    """Return the encoding of a text by its first bytes: UTF-16 where a byte order mark or zeros between its
     letters say so.
     """
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -165,7 +167,7 @@ def encoding_of(head: bytes) -> str:
 
 @contextmanager
 def opened_text(path: Path | str, kind: Kind, newline: str | None = None) -> Iterator[TextIO]:
-    """As `opened`, for text in UTF-8, with or without a byte order mark, or UTF-16."""
+    """Open a text as `opened` does, in UTF-8, with or without a byte order mark, or UTF-16."""
     with opened(path, kind) as file, _utf8(file, path, kind, newline) as text:
         yield text
 
@@ -257,16 +259,16 @@ def read_json(path: Path | str, kind: Kind) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """Return what a JSON text holds; ValueError for numbers that are not finite or beyond 64 bits, or nested
-    too deep.
-    """
+    """Parse a JSON text; ValueError for numbers that are not finite or beyond 64 bits, or nested too deep."""
     if _depth(text) > _MAX_DEPTH:  # how deep json itself goes differs between versions of Python
         raise ValueError(f"nested too deep, at most {_MAX_DEPTH} levels are read")
     return json.loads(text, parse_constant=_refuse, parse_int=_whole, parse_float=_finite)
 
 
 def _depth(text: str) -> int:
-    """How many brackets of a JSON text are open at most, those in its strings left out; a bound where they are few."""
+    """Return how many brackets of a JSON text are open at most, those in its strings left out; a bound where
+    they are few.
+    """
     few = text.count("[") + text.count("{")
     if few <= _MAX_DEPTH:
         return few

@@ -287,7 +287,8 @@ class Workspace:
 
     @contextmanager
     def output(self, name: str) -> Iterator[Path]:
-        """A temporary path for an output, called relative to the folder, that takes its name when the block ends well.
+        """Yield a temporary path for an output, relative to the folder, which takes its name when the block
+        ends well.
 
         OutputError where it would replace an input or a file that is not barpc's own, or cannot be written.
         """
@@ -333,7 +334,9 @@ class Workspace:
 
 
 def _content(path: Path) -> str | None:
-    """The sha256 of a regular file; None for anything else, OSError where it cannot be read. No link is followed."""
+    """Return the sha256 of a regular file; None for anything else, OSError where it cannot be read. No link
+    is followed.
+    """
     if not stat.S_ISREG(path.lstat().st_mode):
         return None
     with open(os.open(path, os.O_RDONLY | _CAREFUL), "rb") as file:  # noqa: PTH123  (no link)
@@ -349,7 +352,7 @@ def _digest(path: Path) -> str | None:
 
 
 def _owns(folder: Path, name: str, sha: str) -> bool:
-    """Whether the file of this name has this content, and is this folder's own."""
+    """Return whether the file of this name has this content, and is this folder's own."""
     parts = PurePosixPath(name)
     if not parts.parts or parts.is_absolute() or ".." in parts.parts or str(parts) != name:
         return False
@@ -365,7 +368,7 @@ def _owns(folder: Path, name: str, sha: str) -> bool:
 
 
 def _read_state(folder: Path) -> dict[str, Any]:
-    """What state.json holds; nothing where it is missing, damaged, too large or no regular file."""
+    """Return what state.json holds; nothing where it is missing, damaged, too large or no regular file."""
     try:
         state = json.loads(_text(folder / STATE / STATE_FILE))
     except (ValueError, RecursionError):
@@ -374,7 +377,9 @@ def _read_state(folder: Path) -> dict[str, Any]:
 
 
 def _read_own(folder: Path) -> dict[str, str]:
-    """The outputs of a folder's runs and their sha256; of two contents of one (a killed run's) that which is there."""
+    """Return the outputs of a folder's runs and their sha256; of two contents of one (a killed run's) that
+    which is there.
+    """
     listed = _read_state(folder).get("outputs")
     known: dict[str, dict[str, None]] = {}
     pairs: list[Any] = list(listed.items()) if isinstance(listed, dict) else []

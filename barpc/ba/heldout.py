@@ -42,7 +42,7 @@ _FEW = 20  # observations of a view that tell nothing by themselves
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """What the tracks that were kept out say."""
+    """Residuals of the tracks that were kept out of the adjustment."""
 
     residual: Array  # (2, H) projected - observed [px], points triangulated by the cameras
     index: IntArray  # (Q,) their points
@@ -67,7 +67,7 @@ def _mean_square(values: Array) -> float:
 
 
 def keep_out(block: Block) -> BoolArray:
-    """Return the observations (K,) of about every tenth track.
+    """Return the observations (K,) of about every tenth track, to be kept out.
 
     They are drawn by their image positions alone, so that neither the order of rows nor the names of views matter.
     """
@@ -83,14 +83,14 @@ def keep_out(block: Block) -> BoolArray:
 
 
 def _scrambled(numbers: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
-    """Numbers as if drawn at random (the finalizer of SplitMix64, Steele et al. 2014)."""
+    """Return the numbers as if drawn at random (the finalizer of SplitMix64, Steele et al. 2014)."""
     numbers = (numbers ^ (numbers >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     numbers = (numbers ^ (numbers >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return numbers ^ (numbers >> np.uint64(31))
 
 
 def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Array]:
-    """Return a problem with other observations, and where cameras of unknowns (N, q) put their points (Q, 3)."""
+    """Return a problem with other observations, and the points (Q, 3) that cameras of unknowns (N, q) give them."""
     index, point = np.unique(block.point, return_inverse=True)
     part = replace(
         problem,
@@ -105,7 +105,7 @@ def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Arr
 
 
 def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
-    """Return the observations of a block that took no part in a problem, under cameras of unknowns (N, q)."""
+    """Measure the observations of a block that took no part in a problem, under cameras of unknowns (N, q)."""
     views, index = len(block.views), np.unique(block.point)
     if not len(index):
         unknown = np.full(views, np.nan)
@@ -132,8 +132,7 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
 
 
 def scatter(squared: Array, freedom: Array) -> float:
-    """Return the observed over stated standard deviation of the right ones among observations, half of which
-    may be wrong.
+    """Return the observed over stated standard deviation of observations, half of which may be wrong.
 
     Parameters
     ----------
@@ -158,8 +157,7 @@ def scatter(squared: Array, freedom: Array) -> float:
 
 
 def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:
-    """Return whether cameras with more unknowns meet the tracks of a block that took no part better than
-    others do.
+    """Return whether cameras with more unknowns meet the held-out tracks of a block better than others do.
 
     Track by track, as the same noise is in both; where one is wrong, by no more than so much.
     """
@@ -173,7 +171,7 @@ def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class CheckResiduals:
-    """Known points against cameras.
+    """Residuals of known points under given cameras.
 
     Parameters
     ----------
@@ -198,7 +196,7 @@ class CheckResiduals:
 
 
 def check_residuals(sensors: Sequence[SensorModel], points: GroundPoints) -> CheckResiduals:
-    """Return what cameras make of known points.
+    """Return the residuals of known points under given cameras.
 
     Parameters
     ----------
@@ -233,7 +231,7 @@ def enu_offsets(points: Array, known: Array) -> Array:
 
 
 def split_points(points: GroundPoints, checks: Sequence[str]) -> tuple[GroundPoints, GroundPoints]:
-    """Return the points as control for the solve and as checks that stay out of it.
+    """Split points into control for the solve and check points that stay out of it.
 
     Parameters
     ----------

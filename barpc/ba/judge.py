@@ -84,7 +84,7 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What was taken, and where cameras and observations are with it."""
+    """The explanations taken, and the state of cameras and observations with them."""
 
     findings: tuple[Finding, ...] = ()
     step: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (N, q) of the cameras' unknowns
@@ -94,7 +94,7 @@ class Judgement:
 
 
 def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
-    """Return the intervals of images in which ties were cut, or are off, more than elsewhere and chance
+    """Find the intervals of images in which more ties were cut, or are displaced, than elsewhere and chance
     allow.
 
     A mean below `floor` [px] is none.
@@ -113,7 +113,7 @@ def _standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval
 
 
 def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
-    """Return what stands out at the end, with what the ties that were cut there are off by.
+    """Return the intervals that stand out at the end, with the offsets of the ties that were cut there.
 
     As their tracks see it that are triangulated with all that may be seen, where all of one was cut.
     """
@@ -135,19 +135,21 @@ def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
 
 
 def swinging(outcome: Outcome, block: Block) -> list[Swing]:
-    """Return the periods with which the rows of images swing more than chance allows, one of each at most."""
+    """Find the periods with which the rows of images swing more than chance allows, at most one an image."""
     rows, off = _whitened(outcome, block)
     return swings(block.view[rows], block.xy[1, rows], _sizes(block), _told(outcome, block)[rows], off)
 
 
 def _told(outcome: Outcome, block: Block) -> Array:
-    """1 for observations (K,) of points that are known: what was cut is seen as well as the rest where others tell."""
+    """Return 1 for observations (K,) of points that are known: what was cut is seen as well as the rest where
+    others tell.
+    """
     right = np.bincount(block.point[outcome.inlier], minlength=block.num_points)
     return (right[block.point] >= 2).astype(np.float64)
 
 
 def _whitened(outcome: Outcome, block: Block) -> tuple[BoolArray, Array]:
-    """Observations of tracks (K,), and residuals (2, k) of these in standard deviations."""
+    """Return the observations of tracks (K,), and residuals (2, k) of these in standard deviations."""
     is_tie = (block.point < block.num_tracks) & block.use
     freedom = Observations(outcome.problem, block.sigma, 0.0, is_tie).freedom(
         outcome.inlier.astype(np.float64)
@@ -162,7 +164,7 @@ def _sizes(block: Block) -> Array:
 
 
 def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
-    """Return what explains the ties of a block beside its cameras, the first taken first; empty where nothing
+    """Find what explains the ties of a block beside its cameras, the first taken first; empty where nothing
     stands out.
 
     Of more unknowns than `UNKNOWNS` each image that stands out is judged among those that it shares most tracks with:
@@ -189,7 +191,7 @@ def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
 
 
 def _judged_among(outcome: Outcome, block: Block, floor: float, views: IntArray) -> Judgement:
-    """What explains the ties that some views have among them; views and observations are counted anew."""
+    """Return what explains the ties that some views have among them; views and observations are counted anew."""
     found = around(outcome, block, views)
     if found is None:
         return Judgement()
@@ -210,7 +212,7 @@ def _judged_among(outcome: Outcome, block: Block, floor: float, views: IntArray)
 
 
 def _near(block: Block, view: int) -> IntArray:
-    """A view and those that share most tracks with it, in their order."""
+    """Return a view and those that share most tracks with it, in their order."""
     ties = block.use & (block.point < block.num_tracks)
     of_view = np.zeros(block.num_points, dtype=bool)
     of_view[block.point[ties & (block.view == view)]] = True
@@ -234,9 +236,7 @@ def _joined(all_of: Judgement, one: Judgement, views: IntArray, rows: IntArray) 
 
 
 def around(outcome: Outcome, block: Block, views: IntArray) -> tuple[Linear, State] | None:
-    """Return the ties among some views of a block, linearised where the rounds ended, and there; None where
-    they are too many to be judged.
-    """
+    """Linearise the ties among some views of a block at its solution; None where they are too many to be judged."""
     problem = outcome.problem
     use = block.use & (block.point < block.num_tracks) & np.isin(block.view, views)
     unknowns = problem.free.size // len(block.views) * len(views)
@@ -281,7 +281,9 @@ class _State:
         return sum(row.gain for row in self.taken)
 
     def may_pass(self, best: _State) -> bool:
-        """Whether some more, each of which gains less than the last, may explain more than another that ended."""
+        """Return whether some more, each of which gains less than the last, may explain more than another
+        that ended.
+        """
         left = _PARTS + len(best.taken) - 1 - len(self.taken)
         return self.gain + left * self.taken[-1].gain > best.gain
 
@@ -312,7 +314,7 @@ class _Search:
         self.group: list[Explanation] = []  # looked for once
 
     def run(self) -> Judgement:
-        """All that were taken."""
+        """Return all that were taken."""
         states, ended = [_State(self.start, self.start.base)], False
         while not ended:
             states, ended = self._grown(states)
@@ -326,7 +328,7 @@ class _Search:
         return Judgement(found, base.step, base.right)
 
     def _grown(self, states: list[_State]) -> tuple[list[_State], bool]:
-        """The best with one more explanation, and whether they are the last."""
+        """Return the best with one more explanation, and whether they are the last."""
         best, grown = states[0], list[_State]()
         for state in states:
             if state.ended or (best.ended and not state.may_pass(best)):
@@ -347,7 +349,9 @@ class _Search:
         return kept, all(one.ended or (kept[0].ended and not one.may_pass(kept[0])) for one in kept)
 
     def _tried(self) -> list[_Tried]:
-        """Explanations of what stands out now, fitted beside those taken, with their gains; the best first."""
+        """Return the explanations of what stands out now, fitted beside those taken, with their gains; the
+        best first.
+        """
         seen, linear = self.seen, self.seen.linear
         rows = linear.taking_part
         left = (
@@ -390,7 +394,7 @@ class _Search:
         return [one for one, gain in zip(offered, gains, strict=True) if gain >= least]
 
     def _is_nothing(self, one: Explanation, found: Fit) -> bool:
-        """Whether a swing or a group's motion is smaller than what an adjustment is asked to find."""
+        """Return whether a swing or a group's motion is smaller than what an adjustment is asked to find."""
         size = np.inf
         if one.kind == SWING:
             size = float(np.hypot(*_amplitude(found.extra[-len(one.sigma) :])))
@@ -400,14 +404,18 @@ class _Search:
         return bool(size < self.floor * _SEEN)
 
     def _proposed(self, out: list[Interval], periods: list[Swing]) -> list[Explanation]:
-        """Explanations of intervals and periods; the group is looked for once and then tried beside what was taken."""
+        """Return the explanations of intervals and periods; the group is looked for once and then tried
+        beside what was taken.
+        """
         known = (MOVING,) if self.group else ()
         found = [*self.group, *proposed(self.seen, out, periods, known)]
         self.group = [one for one in found if one.kind == MOVING]
         return found
 
     def _members(self, found: Fit, rows: BoolArray) -> Iterator[Explanation]:
-        """Parts of images that hold what a group does: rows of one image that lie off move on the ground, too."""
+        """Yield the parts of images that hold what a group does: rows of one image that lie off move on the
+        ground, too.
+        """
         seen, none = self.seen, np.zeros((2, int(rows.sum())))
         places = scan(
             seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none, none[0]
@@ -417,7 +425,7 @@ class _Search:
         return proposed(seen, intervals, [], (MOVING, WANDER))
 
     def _with(self, made: list[_Tried], more: list[Explanation]) -> list[_Tried]:
-        """What was tried and more, the best first."""
+        """Return what was tried and more, the best first."""
         return self._sorted([*(row[:2] for row in made), *((one, self._fit(one)) for one in more)])
 
     def _sorted(self, made: Iterable[tuple[Explanation, Fit]]) -> list[_Tried]:
@@ -476,7 +484,9 @@ def _said(rows: list[_Taken], n: int, seen: Seen) -> Iterator[Finding]:
 
 
 def _rivals(tried: list[_Tried]) -> list[int]:
-    """The best of other kinds or views than the first that are followed, and may be its betters with some beside."""
+    """Return the best of other kinds or views than the first that are followed, and may be its betters with
+    some beside.
+    """
     found: dict[tuple[str, int], int] = {}
     for n, (one, _, gain) in enumerate(tried):
         if one.kind in FOLLOWED and _differs(one, tried[0][0]) and gain > tried[0][2] / _PARTS:
@@ -500,18 +510,18 @@ def _same(one: Interval, other: Interval) -> bool:
 
 
 def _of_one_image(one: Explanation, other: Explanation) -> bool:
-    """Whether two explanations may be a part of an image and its complement."""
+    """Return whether two explanations may be a part of an image and its complement."""
     return one is other or (one.view == other.view and one.kind in LOCAL and other.kind in LOCAL)
 
 
 def _part(one: Explanation, seen: Seen) -> float:
-    """The part of its image that it moves: of two that explain as much it is the smaller one."""
+    """Return the part of its image that it moves: of two that explain as much it is the smaller one."""
     rows = (seen.linear.view == one.view) | (one.view < 0)
     return float(one.extra[:, :, rows].any(axis=(0, 1)).sum() / max(rows.sum(), 1))
 
 
 def _differs(one: Explanation, other: Explanation) -> bool:
-    """Whether two explanations say something else: of one view's rows, overlapping strips are the same."""
+    """Return whether two explanations say something else: of one view's rows, overlapping strips are the same."""
     if (one.kind, one.view) != (other.kind, other.view):
         return True
     if one.where is None or other.where is None:

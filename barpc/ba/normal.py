@@ -151,7 +151,9 @@ def reduce_normal(
 
 
 def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, cross: Array) -> Common:
-    """Common errors of the points of a prior; their gradient vanishes before the points move, as they are the best."""
+    """Return the common errors of the points of a prior; their gradient vanishes before the points move, as
+    they are the best.
+    """
     index, m = prior.index, prior.common.shape[2]
     by_point = np.swapaxes(prior.rows, 1, 2) @ -prior.common
     whitened = np.stack([solve_lower(lower[:, index], by_point[:, :, j].T).T for j in range(m)], axis=2)
@@ -177,7 +179,7 @@ def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, 
 
 
 def point_products(by_point: Array, residual: Array) -> Array:
-    """Return (9, K): the six elements of A^T A (order of `TRIANGLE`) and the three of A^T r."""
+    """Return the products (9, K): the six elements of A^T A (order of `TRIANGLE`) and the three of A^T r."""
     products = np.empty((9, residual.shape[1]))
     for part in parts(residual.shape[1], CHUNK):
         (a, b), r = by_point[..., part], residual[:, part]
@@ -221,7 +223,7 @@ def solve_transposed(lower: Array, rhs: Array) -> Array:
 
 
 def _eliminate(structure: Structure, by_point: Array, by_unknown: Array, lower: Array) -> Array:
-    """Y (K, 3, q)."""
+    """Return the y (K, 3, q)."""
     q, count = by_unknown.shape[1:]
     cross = np.empty((count, 3, q))
     for part in parts(count, CHUNK):
@@ -247,7 +249,7 @@ def whiten(by_point: Array, lower: Array) -> Array:
 def _of_views(
     structure: Structure, residual: Array, by_unknown: Array, cross: Array, half: Array
 ) -> tuple[Array, Array]:
-    """Sum B^T B - sum Y^T Y (N, q, q) and sum B^T r - sum Y^T h (N, q) of every view."""
+    """Return the sum B^T B - sum Y^T Y (N, q, q) and sum B^T r - sum Y^T h (N, q) of every view."""
     q = cross.shape[2]
     matrix, gradient = np.empty((structure.num_views, q, q)), np.empty((structure.num_views, q))
     of_points = np.ascontiguousarray(half.T)
@@ -261,7 +263,7 @@ def _of_views(
 
 
 def _pair_blocks(structure: Structure, cross: Array) -> Array:
-    """(M, q, q): -sum Y_i^T Y_j of every pair of views."""
+    """Return (M, q, q): -sum Y_i^T Y_j of every pair of views."""
     q = cross.shape[2]
     bounds = structure.pair_bounds
     out = np.empty((len(bounds) - 1, q, q))

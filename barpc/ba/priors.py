@@ -83,7 +83,7 @@ class PointPrior:
     common: Array
 
     def offset(self, points: Array) -> Array:
-        """Return the common errors (m,) that points (P, 3) [m] show, in their standard deviations."""
+        """Estimate the common errors (m,) of points (P, 3) [m], in their standard deviations."""
         whitened = self.apart(points)
         return np.linalg.solve(self.information(), np.einsum("qim,qi->m", self.common, whitened))
 
@@ -102,11 +102,11 @@ class PointPrior:
         return information
 
     def select(self, keep: BoolArray) -> PointPrior:
-        """Some of its rows (Q,)."""
+        """Return the prior on some of its rows (Q,)."""
         return PointPrior(self.index[keep], self.mean[keep], self.rows[keep], self.common[keep])
 
     def apart(self, points: Array) -> Array:
-        """Return the whitened offsets (Q, 3) of points (P, 3) [m], the common errors still in them."""
+        """Return the whitened offsets (Q, 3) of points (P, 3) [m] with the common errors still in them."""
         return (self.rows @ (points[self.index] - self.mean)[..., None])[..., 0]
 
     def jacobian(self) -> Array:
@@ -127,7 +127,7 @@ def states_accuracy(view: View) -> bool:
 
 
 def _stated(view: View) -> tuple[float, float]:
-    """What a view states for its attitude, as metres on the ground, and position, or for its two clocks [m]."""
+    """Return what a view states for its attitude, as metres on the ground, and position, or for its two clocks [m]."""
     sensor = view.sensor
     if (isinstance(sensor, Pushbroom) or is_clocked(sensor)) and sensor.accuracy is not None:
         attitude, position = sensor.accuracy

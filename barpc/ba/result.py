@@ -168,12 +168,12 @@ class Adjustment:
 
     @property
     def splines(self) -> tuple[RowSpline | None, ...]:
-        """What every view's correction is followed by in the image; None: nothing."""
+        """Corrections in the image behind each view's camera; None: nothing."""
         return tuple(sensor.correction if isinstance(sensor, Splined) else None for sensor in self.sensors)
 
     @property
     def bases(self) -> tuple[SensorModel, ...]:
-        """The sensors without what is in the image alone: the delivered ones behind their corrections."""
+        """The sensors without corrections that act in the image alone."""
         return tuple(sensor.sensor if isinstance(sensor, Splined) else sensor for sensor in self.sensors)
 
     @property

@@ -41,14 +41,14 @@ class Interval:
 
 
 def price(views: int) -> float:
-    """Return what the choice among the intervals of all views, rows and columns, costs [nats]."""
+    """Return the cost of choosing among the intervals of all views, rows and columns [nats]."""
     return float(np.log(BINS * (BINS + 1) / 2 * 2 * views))
 
 
 def scan(
     view: IntArray, place: Array, size: Array, wrong: Array, off: Array, told: Array, floor: float = 0.0
 ) -> list[Interval]:
-    """Return the interval that stands out most, by each statistic, of every view's columns and rows; the best
+    """Find the interval that stands out most, by each statistic, in every view's columns and rows; the best
     first.
 
     Parameters
@@ -86,7 +86,7 @@ def scan(
 
 
 def _intervals(bins: Array) -> Array:
-    """Sums (..., intervals) of all intervals of bins (..., `BINS`)."""
+    """Return the sums (..., intervals) of all intervals of bins (..., `BINS`)."""
     edges = np.pad(bins.cumsum(axis=-1), [(0, 0)] * (bins.ndim - 1) + [(1, 0)])
     return np.asarray(edges[..., _STOPS] - edges[..., _STARTS])
 
@@ -94,7 +94,8 @@ def _intervals(bins: Array) -> Array:
 def _displacements(
     view: IntArray, bin_: IntArray, off: Array, told: Array, views: int, floor: float
 ) -> tuple[Array, Array]:
-    """By how many nats (N, intervals) a displacement of an interval explains residuals, and how large it is.
+    """Return the by how many nats (N, intervals) a displacement of an interval explains residuals, and how
+    large it is.
 
     The score test beside what a camera follows along an axis: a constant, a slope and a bend are taken off both. What
     stands out beside a step is its middle; the step itself is what explains it.
@@ -124,8 +125,8 @@ def _displacements(
 
 
 def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) -> Array:
-    """Return how surely neighbours lie off in the same direction (N,) [nats], what the choice among all tests
-    costs taken off.
+    """Return the evidence (N,) [nats] that neighbouring residuals point in the same direction, the choice
+    among tests paid for.
 
     Of wrong matches that lie anywhere they do so in half of the cases; of what moves, bends or shakes, in more.
 
@@ -153,7 +154,7 @@ def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) 
 
 
 def _shares(count: Array, bad: Array, total: Array, all_bad: Array) -> Array:
-    """Logarithm of the likelihood ratio of two shares over one, where that inside is the larger."""
+    """Return the logarithm of the likelihood ratio of two shares over one, where that inside is the larger."""
 
     def log(k: Array, n: Array) -> Array:
         good = np.maximum(n - k, 0.0)

@@ -68,27 +68,29 @@ class ControlTest:
 
     @property
     def checked(self) -> bool:
-        """Whether any point used is checked by the others."""
+        """Whether the others check any point used."""
         return bool((self.redundancy[self.used] > CHECKED).any())
 
     @property
     def agrees(self) -> bool:
-        """Whether the points used contradict nothing, each and all together, and one set of them outweighs others."""
+        """Whether no point used is contradicted, alone or all together, and one set outweighs the others."""
         status = [self.status(g) for g in range(len(self.used))]
         return self.fits and not self.torn and not {"contradicts", "undecided"} & set(status)
 
     @property
     def sets(self) -> tuple[BoolArray, ...]:
-        """Two sets of points (G,) that contradict each other and weigh the same; none is used. Empty where one is."""
+        """Two sets of points (G,) that contradict each other with equal weight, so that none is used; empty
+        where one is.
+        """
         return () if self.agreed is None else self.agreed.sets
 
     @property
     def torn(self) -> tuple[float, ...]:
-        """Residuals of tie points that took no part without and with control [px], where that is why none is used."""
+        """Residuals of held-out tie points without and with control [px], where that is why none is used."""
         return () if self.agreed is None else self.agreed.torn
 
     def status(self, point: int) -> str:
-        """Return what became of a point, in a word."""
+        """Return the state of a point, in a word."""
         if not self.used[point]:
             return "undecided" if self.sets else "rejected"
         return "contradicts" if self.w[point] > CRITICAL else "used"
@@ -97,7 +99,7 @@ class ControlTest:
 def control_test(
     covariance: Covariance, points: Array, first: int, gcps: GroundPoints, agreed: Agreement, faint: Array
 ) -> ControlTest:
-    """Return the test at a solution.
+    """Test the control points at a solution.
 
     Parameters
     ----------
@@ -144,7 +146,7 @@ def control_test(
 
 
 def _together(whitened: Array, redundancy: Array, used: BoolArray) -> tuple[float, bool]:
-    """Scatter of the points used (G, 3), and whether it may be chance.
+    """Return the scatter of the points used (G, 3), and whether it may be chance.
 
     The sum of squares is expected to be the redundancies' sum R, and its variance at most 2 R: that of a chi-square.
     """

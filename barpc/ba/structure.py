@@ -15,7 +15,7 @@ from barpc.scene import BoolArray, IntArray
 
 @dataclass(frozen=True)
 class Structure:
-    """Index arrays of K observations of P points in N views; observations sorted by view."""
+    """Index arrays of K observations of P points in N views, sorted by view."""
 
     num_views: int
     num_points: int
@@ -33,7 +33,7 @@ class Structure:
     _orders: dict[bytes, Dissection] = field(default_factory=dict, repr=False)
 
     def order(self, use: BoolArray) -> Dissection:
-        """In which order the views in use (N,) are eliminated; worked out once."""
+        """Return the order of elimination of the views in use (N,), computed once."""
         key = use.tobytes()
         if key not in self._orders:
             self._orders[key] = dissect(self.pair_view, self.place, use)
@@ -101,8 +101,8 @@ def parts(stop: int, size: int, start: int = 0) -> Iterator[slice]:
 
 
 def counting_sort(key: IntArray, size: int) -> tuple[IntArray, IntArray]:
-    """Return the stable order (n,) of keys 0 .. size - 1, and where each key's part of it begins and ends
-    (size + 1,).
+    """Return the stable order (n,) of keys 0 .. size - 1, and the start and end of each key's part (size +
+    1,).
 
     What scipy does to compress the rows of a sparse matrix, three times as fast as `argsort`.
     """
@@ -113,7 +113,7 @@ def counting_sort(key: IntArray, size: int) -> tuple[IntArray, IntArray]:
 
 
 def _pairs(by_point: IntArray, starts: IntArray) -> tuple[IntArray, IntArray]:
-    """All pairs of observations of each point; views ascend within a point, so i < j in every pair."""
+    """Return all pairs of observations of each point; views ascend within a point, so i < j in every pair."""
     length = np.diff(starts)
     first, second = [], []
     for n in np.unique(length[length > 1]):

@@ -114,7 +114,9 @@ def fit_pinhole(samples: Sampled, at: Array, pixel: Array, rows: Array, sight: A
 
 
 def _start(sign: float, at: Array, pixel: Array, rows: Array, sight: Array, far: float) -> Pinhole:
-    """The pinhole with a derivative as given: axes that are not perpendicular are seen far from the principal point."""
+    """Return the pinhole with a derivative as given: axes that are not perpendicular are seen far from the
+    principal point.
+    """
     length = np.linalg.norm(rows, axis=1)
     axes = rows / length[:, None]
     mirrored = 1.0 if np.cross(axes[0], axes[1]) @ sight < 0 else -1.0
@@ -132,7 +134,9 @@ def _start(sign: float, at: Array, pixel: Array, rows: Array, sight: Array, far:
 
 
 def _refined(start: Pinhole, samples: Sampled) -> Pinhole:
-    """The least squares solution, by Levenberg's method on a small turn, move, focal lengths, principal point."""
+    """Return the least squares solution, by Levenberg's method on a small turn, move, focal lengths,
+    principal point.
+    """
     pinhole, damping = start, 1e-3
     cost, left = _cost(pinhole, samples)
     for _ in range(_STEPS):
@@ -158,7 +162,9 @@ def _cost(pinhole: Pinhole, samples: Sampled) -> tuple[float, Array]:
 
 
 def _jacobian(pinhole: Pinhole, world: Array) -> Array:
-    """Derivative (2 N, 10) of the projections by turn, translation, logarithms of the focal lengths, centre."""
+    """Return the derivative (2 N, 10) of the projections by turn, translation, logarithms of the focal
+    lengths, centre.
+    """
     turned = world @ pinhole.rotation.T
     x, y, depth = (turned + pinhole.translation).T
     out = np.zeros((len(world), 2, 10))

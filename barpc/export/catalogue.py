@@ -116,7 +116,9 @@ def _ply(scene: Scene, sums: Array, said: str) -> bytes:
 
 
 def _covariances(scene: Scene) -> Array:
-    """Covariance (P, 3, 3) of the points, east, north, up [m2]: the inverse of what their observations tell."""
+    """Return the covariance (P, 3, 3) of the points, east, north, up [m2]: the inverse of what their
+    observations tell.
+    """
     normal = np.zeros((len(scene.points), 3, 3))
     for shot in scene.shots:
         ground = scene.points[shot.index]

@@ -53,7 +53,7 @@ def rpc_of(shot: Shot) -> dict[str, Any]:
 
 
 def _record(scene: Scene, shot: Shot, img: str) -> dict[str, Any]:
-    """What Sat-NeRF and its relatives read of an image."""
+    """Return what Sat-NeRF and its relatives read of an image."""
     low, high = scene.alt_range
     ring = footprint(shot.rpc, shot.size, scene.origin[2])
     middle = shot.rpc.localize((np.array(shot.size) - 1.0) / 2, np.array(scene.origin[2]))
@@ -89,7 +89,9 @@ def satnerf(scene: Scene, out: Path) -> Files:
 
 
 def eogs(scene: Scene, out: Path) -> Files:
-    """As `satnerf`, and ``affine_models.json``: affine cameras in its frame of UTM metres, and their largest errors."""
+    """Write what `satnerf` writes, and ``affine_models.json``: affine cameras in its frame of UTM metres,
+    with their errors.
+    """
     frame = _Utm(scene)
     rows = zip(scene.shots, scene.file_names(out), strict=True)
     models = [_record(scene, shot, img) | frame.models(scene, shot) for shot, img in rows]
@@ -110,13 +112,15 @@ class _Utm:
         self.corners = (corners - self.center) / self.scale
 
     def metres(self, ground: Array) -> Array:
-        """UTM easting, northing, altitude (N, 3) [m] of ground points (N, 3)."""
+        """Return the uTM easting, northing, altitude (N, 3) [m] of ground points (N, 3)."""
         lon = wrap_longitude(ground[:, 0])
         east, north = transform("EPSG:4326", self._crs, lon.tolist(), ground[:, 1].tolist())
         return np.column_stack([east, north, ground[:, 2]])
 
     def models(self, scene: Scene, shot: Shot) -> dict[str, Any]:
-        """The affine camera of a shot: -1 to 1 over the image, altitudes in metres; the sun's where it is known."""
+        """Return the affine camera of a shot: -1 to 1 over the image, altitudes in metres; the sun's where it
+        is known.
+        """
         ground, image = _grid(scene, shot, (21, 9))
         world = (self.metres(ground) - self.center) / self.scale
         size = np.array(shot.size)
@@ -140,7 +144,7 @@ class _Utm:
 
 
 def _sun(shot: Shot, linear: Array, shift: Array) -> dict[str, Any] | None:
-    """The affine camera that looks from the sun: shadows fall where it sees two points in one place."""
+    """Return the affine camera that looks from the sun: shadows fall where it sees two points in one place."""
     if shot.light.elevation is None or shot.light.azimuth is None:
         return None
     up, around = np.radians([shot.light.elevation, shot.light.azimuth])
@@ -218,7 +222,7 @@ def _frame(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
 
 
 def _cloud(scene: Scene) -> bytes:
-    """The tie points in the world's frame, as renderers start from them: with a colour."""
+    """Return the tie points in the world's frame, as renderers start from them: with a colour."""
     kind = np.dtype(
         [*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
     )
@@ -235,9 +239,7 @@ def _cloud(scene: Scene) -> bytes:
 
 
 def colmap(scene: Scene, out: Path) -> Files:
-    """Return a text model of pinhole cameras, tie points and their places; ``world.json`` says where it lies
-    on Earth.
-    """
+    """Write a text model of pinhole cameras, tie points and their places; ``world.json`` places it on Earth."""
     world = scene.world(scene.points)
     cameras, images, errors = [], [], {}
     seen: dict[int, list[tuple[int, int, float]]] = {}
@@ -275,7 +277,7 @@ def _line(*values: float | str) -> str:
 
 
 def _quaternion(rotation: Array) -> Array:
-    """w, x, y, z of a rotation (3, 3), w not negative."""
+    """Return the w, x, y, z of a rotation (3, 3), w not negative."""
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)

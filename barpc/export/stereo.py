@@ -13,7 +13,7 @@ from barpc.rpcio import WRITABLE
 
 
 def _image(shot: Shot, out: Path) -> str:
-    """The image as a configuration in `out` names it: the run's VRT or copy where there is one."""
+    """Return the image as a configuration in `out` names it: the run's VRT or copy where there is one."""
     return link(shot.carrier or shot.file, out)
 
 
@@ -57,7 +57,7 @@ def asp(scene: Scene, out: Path) -> Files:
 
 
 def yaml(value: Any, indent: str = "") -> list[str]:
-    r"""Return the mappings with plain keys in blocks, all else as JSON has it, which is YAML, too.
+    r"""Return YAML text: mappings with plain keys in blocks, all else as JSON.
 
     Examples
     --------

@@ -38,7 +38,7 @@ class Errors:
     worst: Array = field(default_factory=lambda: np.empty((0, 3)))
 
     def add(self, residual: Array) -> None:
-        """Take in residuals (N, 2); one that is NaN makes the result NaN."""
+        """Add residuals (N, 2) [px]; one that is NaN makes the result NaN."""
         if len(residual):
             self.count += len(residual)
             self.squares = self.squares + np.einsum("ij,ij->j", residual, residual)
@@ -73,9 +73,7 @@ class Sample:
         cells: int = CELLS,
         seed: int = 0,
     ) -> Sample:
-        """Return one point a cell of `cells` along each side of the image, at random in it, and those along
-        the edges.
-        """
+        """Sample a model at one random point in each of `cells` x `cells` parts of an image, and along its edges."""
         if min(size) < 1:
             raise FitError(f"image size {size[0]} x {size[1]}: nothing to fit over")
         rng = np.random.default_rng(seed)
@@ -93,7 +91,9 @@ class Sample:
         )
 
     def also(self, points: Array) -> Sample:
-        """With more points (M, 3) col, row [px], altitude [m] from which the largest error is looked for."""
+        """Return the sample with more points (M, 3) col, row [px], altitude [m] around which the largest
+        error is searched.
+        """
         ground = self.model.localize(points[:, :2], points[:, 2])
         known = np.isfinite(ground).all(axis=1)
         return replace(
@@ -112,16 +112,16 @@ class Sample:
         return float(_size(self.model.project(asked) - self.points[:, :2]).max(initial=0.0))
 
     def errors(self, rpc: RPC) -> tuple[Errors, Array]:
-        """Return what an RPC makes of the points all over the image, and its largest errors (2,) [px], found
-        by looking on.
+        """Return the errors of an RPC at the sampled points, and its largest errors (2,) [px] after searching
+        around them.
 
         They are infinite where the RPC has no image point.
         """
         return self.sought(lambda ground, points: rpc.project(ground) - points[:, :2])
 
     def sought(self, off: Callable[[Array, Array], Array]) -> tuple[Errors, Array]:
-        """Return as `errors`, of what ground points (N, 3) and their (N, 3) col, row [px], altitude are off
-        by: (N, 2).
+        """Return the errors (N, 2) [px] of an RPC at ground points (N, 3) and their (N, 3) col, row [px],
+        altitude [m].
         """
         points, miss = self.points, _size(off(self.ground, self.points))
         errors = Errors()
@@ -160,7 +160,7 @@ def _size(values: Array) -> Array:
 
 
 def _scaled(unit: Array, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
-    """col, row, altitude (..., 3) of places in 0 .. 1."""
+    """Return the col, row, altitude (..., 3) of places in 0 .. 1."""
     low, high = alt_range
     return np.asarray(unit * [*size, high - low] + [-0.5, -0.5, low])
 

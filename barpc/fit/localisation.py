@@ -45,7 +45,7 @@ class Localisation:
     method: str
 
     def verdict(self, tolerance: float) -> str:
-        """Return what is wrong at a tolerance [px], in words; empty if nothing is."""
+        """Return the faults at a tolerance [px], in words; empty if there are none."""
         if not self.max_px <= tolerance:
             return (
                 f"the localisation RPC misses the ground by up to {self.max_m:.3g} m ({self.max_px:.3g} px), wanted "

@@ -29,7 +29,7 @@ def spaced(low: float, high: float, count: int, nodes: Nodes) -> Array:
 
 
 def widened(alt_range: tuple[float, float]) -> tuple[float, float]:
-    """Return `alt_range` [m], at least 2 `ALTITUDE_FLOOR` wide: a flat scene still gets its altitude terms."""
+    """Return `alt_range` [m] widened to twice `ALTITUDE_FLOOR`: a flat scene still gets its altitude terms."""
     low, high = float(alt_range[0]), float(alt_range[1])
     if not (np.isfinite(low) and np.isfinite(high) and low <= high):
         raise FitError(f"altitude range {low:g} to {high:g} m is not an interval")
@@ -90,7 +90,7 @@ def control_points(
 def _ground_box(
     model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Longitudes and latitudes [deg] of the box around the footprints at both altitudes."""
+    """Return the longitudes and latitudes [deg] of the box around the footprints at both altitudes."""
     ring = np.concatenate([footprint(model, size, alt) for alt in alt_range])
     ring = ring[np.isfinite(ring).all(axis=1)]
     if not len(ring):
@@ -106,8 +106,8 @@ def extent(points: Array) -> tuple[Array, Array]:
 
 
 def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) -> tuple[Array, Array]:
-    """Return as `numbers`; FitError too where columns look swapped (unless `allow_mirrored`) or points
-    determine no RPC.
+    """Return checked points as `numbers` does; FitError where columns look swapped (unless `allow_mirrored`)
+    or points determine no RPC.
     """
     ground, image = numbers(ground, image)
     _check_geometry(ground, image, allow_mirrored)
@@ -121,7 +121,7 @@ _FARTHEST = 1e9  # px: no image is as wide
 
 
 def numbers(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
-    """Return the points (N, 3) lon, lat [deg], alt [m] and (N, 2) [px] as finite arrays, longitudes made
+    """Return points (N, 3) lon, lat [deg], alt [m] and (N, 2) [px] as finite arrays, longitudes made
     continuous.
 
     FitError: no points, a wrong shape, numbers that are not finite or out of range.
@@ -170,7 +170,7 @@ def _check_geometry(ground: Array, image: Array, allow_mirrored: bool) -> None:
 
 
 def _covariance(ground: Array, image: Array, center: Array, span: Array) -> Array:
-    """Covariance (5, 5) of lon, lat, alt, col, row, each in units of its span."""
+    """Return the covariance (5, 5) of lon, lat, alt, col, row, each in units of its span."""
     total, squares = np.zeros(5), np.zeros((5, 5))
     for start in range(0, len(ground), _CHUNK):
         part = slice(start, start + _CHUNK)

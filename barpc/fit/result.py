@@ -18,7 +18,7 @@ EXACT = 1e-6  # px: what no other method is tried on, and no round trip is held 
 
 @dataclass(frozen=True)
 class Free:
-    """What an RPC reaches whose denominators are kept up over the image's own ground only.
+    """What an RPC reaches whose denominators are bounded over the image's own ground only.
 
     Parameters
     ----------
@@ -118,7 +118,9 @@ class RpcFit:
         return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
 
     def as_written(self, rpc: RPC) -> RpcFit:
-        """Return the fit with the RPC that a file of it holds: what that lost over its box is added to the errors."""
+        """Return the fit of the RPC as read back from its file: the differences over its box are added to the
+        errors.
+        """
         lost = self.rpc.off(rpc)
         return replace(
             self,
@@ -129,7 +131,7 @@ class RpcFit:
         )
 
     def verdict(self, tolerance: float) -> str:
-        """Return what is wrong with this fit at a tolerance [px], in words; empty if nothing is."""
+        """Return the faults of this fit at a tolerance [px], in words; empty if there are none."""
         worst = float(self.max_ckp.max())
         if not self.contradiction <= max(tolerance, EXACT):
             return (

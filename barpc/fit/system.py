@@ -52,12 +52,12 @@ class Compressed:
 
     @property
     def matrix(self) -> Array:
-        """(k, k): what stands for M."""
+        """Triangle (k, k) that stands for M."""
         return self.triangle[:-1, :-1]
 
     @property
     def target(self) -> Array:
-        """(k,): what stands for y."""
+        """Column (k,) that stands for y."""
         return self.triangle[:-1, -1]
 
     @property
@@ -76,7 +76,7 @@ class Compressed:
         return float(rest @ rest + self.triangle[-1, -1] ** 2)
 
     def solved_by(self, solution: Array) -> Compressed:
-        """Return the system of the same rows that a given solution (k,) leaves nothing of but what it never reaches."""
+        """Return the system that a given solution (k,) solves: y replaced by M x, the residual of the rows kept."""
         triangle = self.triangle.copy()
         triangle[:-1, -1] = self.matrix @ solution
         return Compressed(triangle, self.num_points)
@@ -88,7 +88,7 @@ class Compressed:
 
 
 def _take_in(triangle: Array, rows: Array) -> Array:
-    """Triangular factor of `triangle` on top of `rows`."""
+    """Return the triangular factor of `triangle` on top of `rows`."""
     block = min(_BLOCK, len(triangle))
     factor: Array = dtpqrt(0, block, triangle, np.asfortranarray(rows), overwrite_b=True)[0]
     return factor
@@ -108,8 +108,7 @@ class Problem:
     first: Compressed | None = None  # of col without a denominator, where it is known already
 
     def screened(self) -> Problem:
-        """Return the same problem without the monomials that its points do not tell from those of lower
-        degree.
+        """Return the problem without the monomials that its points cannot tell from those of lower degree.
 
         All twenty stay where altitudes abound; of points at one altitude those without H, of two altitudes those of
         degree one in H. A dependent one would make a = b = 0 a solution.
@@ -181,12 +180,12 @@ class Problem:
         return out
 
     def errors(self, axis: int, x: Array) -> Array:
-        """Return what a solution leaves of a coordinate (N,), in scales of the image."""
+        """Return the residuals (N,) of a coordinate under a solution, in units of the image scale."""
         rows = self.rows(axis, self.expanded(x)[-1])
         return np.concatenate([np.abs(block[:, :-1] @ x - block[:, -1]) for _, block in rows])
 
     def packed(self, expanded: Array) -> Array:
-        """Return the solution (k,) that `expanded` makes numerators and denominator of."""
+        """Return the solution (k,) of which `expanded` makes these numerators and denominator."""
         return np.concatenate([expanded[0, self.active], expanded[1, self.active[1:]]])
 
 

@@ -58,7 +58,7 @@ Box = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class Files:
-    """Which files are written of a view beside its RPC."""
+    """Files to be written of a view beside its RPC."""
 
     grids: bool
     resampled: bool
@@ -85,7 +85,7 @@ def write_grids(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[Written]:
-    """Write what is asked for of every view, grids also where its RPC misses it, and open every file again.
+    """Write the grids, tile RPCs and resampled images that are asked for, and reopen every file.
 
     OutputError where a file cannot be written, or does not hold what was written.
     """
@@ -115,7 +115,9 @@ Task = tuple[View, RPC, SensorModel, Files]
 def _write(
     run: Workspace, tasks: Sequence[Task], executor: Executor | None, progress: Progress | None
 ) -> list[Written]:
-    """Workers make the files in a room of the run folder, here they get their place, and workers open them again."""
+    """Return the workers make the files in a room of the run folder, here they get their place, and workers
+    open them again.
+    """
     room = run.partial / "grids"
     with CachingExecutor(run, {}, executor, keep=False) as fresh:
         try:
@@ -142,7 +144,9 @@ def _write(
 
 
 def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str) -> Misses:
-    """Write the grids of a view, and its resampled image, into a room; what each misses the model by [px]."""
+    """Write the grids of a view, and its resampled image, into a temporary folder; return how far each misses
+    the model [px].
+    """
     place, alts = Path(room) / view.name, widened(view.alt_range)
     place.mkdir(parents=True, exist_ok=True)
     sample, errors = Sample.of(model, view.size, alts), Misses()
@@ -201,7 +205,7 @@ def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss
 
 
 def _off(sample: Sample, camera: SensorModel) -> Miss:
-    """How far a camera is off the model of a sample."""
+    """Return how far a camera is off the model of a sample."""
     errors, largest = sample.sought(lambda ground, at: camera.project(ground) - at[:, :2])
     return float(np.linalg.norm(errors.rmse)), float(np.linalg.norm(largest)), errors.worst
 
@@ -252,7 +256,7 @@ def _write_tiles(
     options: RunOptions,
     executor: Executor | None,
 ) -> Written:
-    """An RPC for each tile, in the tile's own pixels, and a list of them."""
+    """Return an RPC for each tile, in the tile's own pixels, and a list of them."""
     assert options.tiles is not None
     boxes, alts = tile_boxes(view.size, options.tiles), widened(view.alt_range)
     tasks = [

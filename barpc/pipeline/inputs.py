@@ -84,7 +84,7 @@ def with_located(options: RunOptions) -> RunOptions:
 
 
 def reference_names(options: RunOptions) -> list[str]:
-    """Return the references as tasks call them."""
+    """Return the references by the names that tasks use."""
     return [os.fspath(place(path).absolute()) for path in options.reference]
 
 
@@ -130,7 +130,9 @@ def read_pairs(
 def _finder(
     folder: Path, views: Sequence[View], left_out: Sequence[str | Path]
 ) -> Callable[[str], int | None]:
-    """Index of the view that a list calls by its path or its name; None if it was left out, InputError if unknown."""
+    """Return the index of the view that a list calls by its path or its name; None if it was left out,
+    InputError if unknown.
+    """
     names = ViewNames([view.name for view in views], "the list of pairs")
     without = ViewNames([Path(path).name for path in left_out], "")
     places: dict[object, int | None] = {_resolved(path): None for path in left_out}
@@ -151,7 +153,7 @@ def _resolved(path: str | Path) -> object:
 
 
 def only_new(tracks: Tracks, old: BoolArray) -> Tracks:
-    """Return the tracks that tell something an earlier block, of the views `old` (N,), did not know.
+    """Return the tracks with observations that an earlier block, of the views `old` (N,), did not have.
 
     Tracks without a new view are left out. Of those seen in several old views one old observation is kept: how
     these views lie to each other is in the earlier block's normal matrix already.
@@ -173,8 +175,8 @@ def hash_inputs(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Input]:
-    """Return every input of a run by the name that tasks call it by; InputError where one changed since it
-    was read.
+    """Return every hashed input of a run by its name in tasks; InputError where one changed since it was
+    read.
 
     `seen` holds the files that were opened so far. A matcher of the user's goes by its name, with all its files.
     """
@@ -198,7 +200,7 @@ def hash_inputs(
 
 
 def _groups(names: Sequence[str]) -> list[tuple[tuple[str, ...]]]:
-    """Small files go together."""
+    """Return the small files go together."""
     groups: list[list[str]] = [[]]
     size = 0
     for name in names:
@@ -223,7 +225,7 @@ def given_tracks(paths: Sequence[str | Path], views: Sequence[View]) -> Tracks:
 def given_matches(
     paths: Sequence[str | Path], views: Sequence[View], *, partly: bool = False
 ) -> dict[tuple[int, int], Matches]:
-    """Return the matches of files, pair by pair; one without any is an error, but for a part (`partly`) of
+    """Read the matches of files, pair by pair; InputError for a file without any, but for part (`partly`) of
     the images.
     """
     links = _linked(paths, views, partly)
@@ -241,7 +243,7 @@ def given_matches(
 
 
 def _linked(paths: Sequence[str | Path], views: Sequence[View], partly: bool = False) -> Links:
-    """What the files say of the views, all of it inside their images."""
+    """Return what the files say of the views, all of it inside their images."""
     parts = [Links.of_pairs([])]
     for path in paths:
         try:

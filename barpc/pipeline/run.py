@@ -67,7 +67,7 @@ _GROUP = 8  # views that are fitted in one task, whose result is kept
 
 @dataclass(frozen=True, eq=False, repr=False)
 class AdjustResult:
-    """What a run ends with.
+    """The result of a run.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class AdjustResult:
 
     @cached_property
     def summary(self) -> dict[str, Any]:
-        """What summary.json holds."""
+        """Content of summary.json."""
         found: dict[str, Any] = plain(self.record)
         return found
 
@@ -111,7 +111,7 @@ class AdjustResult:
         return self.run.tracks
 
     def report(self) -> Path:
-        """Make report.html of this run again (extra `report`), from the files in its folder; its path.
+        """Make report.html of this run again from the files in its folder (extra `report`); return its path.
 
         A run that wrote no files (a check), or jinja2 that is not installed, is an InputError.
         """
@@ -187,7 +187,7 @@ def adjust(
 
 
 def _entries(inputs: Iterable[Input]) -> tuple[InputEntry, ...]:
-    """Every file that was read, once, by its path."""
+    """Return every file that was read, once, by its path."""
     files = {one.path: one for given in inputs for one in given.every()}
     return tuple(InputEntry(path, one.size, one.sha256) for path, one in sorted(files.items()))
 
@@ -232,7 +232,7 @@ def _loaded(
     progress: Progress | None,
     workers: list[float] | None = None,
 ) -> Run:
-    """The run with its views; CPU seconds of other processes go to `workers`."""
+    """Return the run with its views; CPU seconds of other processes go to `workers`."""
     for path in input_files(options):
         plain_path(path)
     least = 1 if options.gcp or options.reference else 2  # one image and control are enough
@@ -252,7 +252,9 @@ def _loaded(
 
 
 def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[Path]]:
-    """The files that a run writes and those that it must keep; what stands in the way is refused before any work."""
+    """Return the files that a run writes and those that it must keep; what stands in the way is refused
+    before any work.
+    """
     views = run.views
     if options.stop_after == "matching":
         require_pair_names([view.name for view in views])
@@ -290,7 +292,7 @@ def _solve(
 def _registered(
     run: Run, options: RunOptions, dem: Dem, executor: Executor, progress: Progress | None
 ) -> Registration:
-    """What the reference says of the cameras as delivered."""
+    """Return what the reference says of the cameras as delivered."""
     given = options.adjust.dem_bias_sigma
     bias = (KNOWN_BIAS if dem.known else DEM_BIAS) if given is None else given
     return register(
@@ -306,7 +308,7 @@ def _registered(
 
 
 def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior | None) -> Run:
-    """The run with an adjustment and what went into it."""
+    """Return the run with an adjustment and what went into it."""
     names = [view.name for view in run.views]
     if prior is not None:
         run = replace(run, tracks=only_new(run.tracks, np.isin(names, prior.names)))
@@ -339,7 +341,7 @@ def _with_ties(
     progress: Progress | None,
     terrain: Dem | None = None,
 ) -> Run:
-    """The run with tie points: from a file, or matched."""
+    """Return the run with tie points: from a file, or matched."""
     views = run.views
     if options.matches and options.matches_only:
         return replace(run, tracks=given_tracks(options.matches, views))
@@ -375,7 +377,7 @@ def _write_matches(run: Run, workspace: Workspace) -> None:
 
 
 def _only(run: Run, names: frozenset[str]) -> Run:
-    """The run as it was loaded, without the views that the others are not tied to."""
+    """Return the run as it was loaded, without the views that the others are not tied to."""
     why = "it shares no tie points with the largest group of images"
     dropped = tuple((view.path, why) for view in run.views if view.name not in names)
     kept = [i for i, view in enumerate(run.views) if view.name in names]
@@ -397,7 +399,7 @@ def _center(view: View, how: Literal["line", "projective"] = "line") -> CameraCe
 
 
 def _fitted(run: Run, options: RunOptions, executor: Executor, progress: Progress | None) -> Run:
-    """Refit every P_BA: only when all can be written is any."""
+    """Return the refit every P_BA: only when all can be written is any."""
     assert run.adjustment is not None
     # what is known of the place afterwards is the error common to the image; the noise of a point is the vendor's
     bias = float(np.sqrt((run.adjustment.gauge.sigma[:2] ** 2).mean()))
@@ -426,7 +428,7 @@ def fit_group(
     options: FitOptions,
     strict: bool,
 ) -> list[tuple[RpcFit | None, str, tuple[str, ...]]]:
-    """Fit RPCs to some cameras, in a worker: the fit, or None and why, and what was warned of."""
+    """Fit RPCs to some cameras in a worker: each fit, or None and the reason, and its warnings."""
     out: list[tuple[RpcFit | None, str, tuple[str, ...]]] = []
     for model, size, alt_range in cameras:
         with warnings.catch_warnings(record=True) as caught:

@@ -64,7 +64,9 @@ def read_altimetry(path: Path | str) -> Altimetry:
 
 
 def _columns(path: Path, line: str) -> dict[str, int]:
-    """Column of each quantity by the first line: its names, or the order lon, lat, alt, sigma, sigma_flat."""
+    """Return the column of each quantity by the first line: its names, or the order lon, lat, alt, sigma,
+    sigma_flat.
+    """
     delimiter = next((sign for sign in "\t;," if sign in line), " ")
     words = cells_of(line, delimiter)
     if numbers_of(words[:3]) is not None and 3 <= len(words) <= len(COLUMNS):

@@ -50,7 +50,7 @@ def is_dictionary(arrays: Arrays) -> bool:
 
 
 def _images(path: Path, views: ViewNames) -> tuple[str, str]:
-    """The two images that a file's name means, a run's prefix before the first one left out."""
+    """Return the two images that a file's name means, a run's prefix before the first one left out."""
     stem = path.stem.removesuffix(_CLEAN)
     cuts = [(stem[:i], stem[i + 2 :]) for i in range(len(stem) - 1) if stem.startswith("__", i)]
     bare = stem.removesuffix("_matches")
@@ -67,7 +67,7 @@ def _images(path: Path, views: ViewNames) -> tuple[str, str]:
 
 
 def _asp_text(path: Path) -> tuple[Array, Array]:
-    """Counts on the first line, then one keypoint a line, col and row first."""
+    """Return the counts on the first line, then one keypoint a line, col and row first."""
     try:
         lines = read_text(path, TABLE).split("\n")
         left, right = (int(word) for word in lines[0].split()[:2])
@@ -100,7 +100,7 @@ def _asp_binary(path: Path) -> tuple[Array, Array]:
 
 
 def _dictionary(path: Path) -> tuple[Array, Array]:
-    """The matched keypoints of a matcher's dictionary."""
+    """Return the matched keypoints of a matcher's dictionary."""
     return matched_keypoints(path, load_npz(path))
 
 

@@ -75,7 +75,7 @@ def _moved(at: str, start: int, stop: int) -> Part:
 
 
 def _once(url: str, start: int, stop: int) -> Part | str:
-    """The part, or the address where it is said to be."""
+    """Return the part, or the address where it is said to be."""
     scheme, host, path, query = urlsplit(url)[:4]
     connection = _connection(scheme, host)
     longest, late = TIMEOUT + (stop - start) / _SLOWEST, threading.Event()
@@ -138,7 +138,7 @@ def _connection(scheme: str, host: str) -> HTTPConnection:
 
 
 def _answered(answer: HTTPResponse, start: int, stop: int) -> Part | str | None:
-    """What a server hands out, the address that it sends us on to, None where there is no such file."""
+    """Return what a server hands out, the address that it sends us on to, None where there is no such file."""
     status, length = answer.status, answer.headers.get("Content-Length", "")
     tag = answer.headers.get("ETag") or answer.headers.get("Last-Modified") or ""
     if status in _AGAIN:

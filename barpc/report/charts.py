@@ -24,7 +24,7 @@ MAX_DOTS = 1500  # tie points on the map
 
 
 def tag(name: str, *children: str, **attributes: object) -> str:
-    """Return an element; `class_` is class, underscores are hyphens, numbers have two decimals at most.
+    """Return an SVG element; `class_` is class, underscores are hyphens, numbers have two decimals at most.
 
     Examples
     --------
@@ -120,7 +120,7 @@ class Scale:
 
 
 def round_ticks(low: float, high: float, most: int = 6) -> list[float]:
-    """At most `most` values of a step of 1, 2 or 5 times a power of ten in an interval.
+    """Return at most `most` values of a step of 1, 2 or 5 times a power of ten in an interval.
 
     Examples
     --------
@@ -135,7 +135,7 @@ def round_ticks(low: float, high: float, most: int = 6) -> list[float]:
 
 
 def x_axis(scale: Scale, top: float, bottom: float, title: str) -> list[str]:
-    """Return the ticks with grid lines, numbers below, and the title with its unit below these."""
+    """Draw ticks with grid lines, numbers below, and the title with its unit below these."""
     parts = []
     for value in scale.ticks:
         x = scale(value)
@@ -144,7 +144,7 @@ def x_axis(scale: Scale, top: float, bottom: float, title: str) -> list[str]:
 
 
 def histogram(before: Array, after: Array) -> str:
-    """Return the distributions of reprojection errors (n,) [px], before and after, each to its own peak, on a
+    """Draw the distributions of reprojection errors (n,) [px], before and after, each to its own peak, on a
     logarithmic axis.
     """
     series = [(name, norm[norm > 0]) for name, norm in (("before", before), ("after", after))]
@@ -171,7 +171,7 @@ def histogram(before: Array, after: Array) -> str:
 
 
 def legend(names: Sequence[str], right: float, y: float) -> list[str]:
-    """Return the coloured dots with the names of the series, ending at `right`."""
+    """Draw coloured dots with the names of the series, ending at `right`."""
     parts = []
     for name in reversed(names):
         parts.append(label(right, y, name, "end"))
@@ -182,5 +182,5 @@ def legend(names: Sequence[str], right: float, y: float) -> list[str]:
 
 
 def evenly(rows: Sequence[Any], most: int) -> Sequence[Any]:
-    """Return all rows, or so many of them as they come at even steps."""
+    """Return all rows, or a number of them at even steps."""
     return rows[:: max(1, -(-len(rows) // most))]

@@ -22,7 +22,7 @@ _NO_EFFECT = ("overwrite", "keep_going")  # Options that do not change a finishe
 
 
 def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
-    """Return what two runs of the same images found.
+    """Compare the results of two runs of the same images.
 
     Parameters
     ----------

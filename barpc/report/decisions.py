@@ -95,7 +95,7 @@ def _model(scene: SceneEntry, summary: Summary) -> list[str]:
 
 
 def _explained(scene: SceneEntry, summary: Summary) -> list[str]:
-    """What explains the tie points beside the cameras' errors as stated, what was refused, and what is left."""
+    """Return what explains the tie points beside the cameras' errors as stated, what was refused, and what is left."""
     found = [_won(one) for one in scene.explanations]
     tested = scene.held_out_places is not None  # not by earlier releases
     if not found and tested:
@@ -125,7 +125,7 @@ def _explained(scene: SceneEntry, summary: Summary) -> list[str]:
 
 
 def _won(one: ExplanationEntry) -> str:
-    """An explanation that was taken, and by how much over what."""
+    """Return an explanation that was taken, and by how much over what."""
     words = f"{one.sentence[0].upper()}{one.sentence[1:]}: {one.gain:.0f} nats more likely than without"
     if one.runner_up is None:
         return f"{words}; nothing else gained anything."
@@ -190,7 +190,7 @@ def _calm(views: Sequence[ViewEntry]) -> str:
 
 
 def _smooth(view: ViewEntry) -> float:
-    """What an F test finds smooth in an image [px]."""
+    """Return what an F test finds smooth in an image [px]."""
     found = view.smooth_p is not None and view.smooth_p < 1e-4
     return (view.smooth_px or 0.0) if found else 0.0
 
@@ -243,7 +243,7 @@ def _control(gcps: Sequence[GcpEntry]) -> list[str]:
 
 
 def _counts(words: Iterable[str | None], by: str = "") -> str:
-    """How often each word comes, the most frequent first."""
+    """Return how often each word comes, the most frequent first."""
     return ", ".join(f"{num} {by}{word}" for word, num in Counter(words).most_common())
 
 

@@ -70,7 +70,7 @@ def holds_reference(adjustment: Adjustment) -> bool:
 
 
 def _against(terrain: TerrainTest) -> list[str]:
-    """How the DEM contradicts the cameras as delivered."""
+    """Return how the DEM contradicts the cameras as delivered."""
     level, *rises = terrain.beyond
     out = []
     if level > BEYOND:

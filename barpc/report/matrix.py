@@ -47,8 +47,8 @@ MEASURES = (
 
 
 def pair_matrix(files: RunFiles) -> str:
-    """Return the rows and columns are the images as numbered in their table; above the diagonal the pairs,
-    below it the shades.
+    """Draw the matrix of pairs: rows and columns are the images as numbered in their table; above the
+    diagonal the pairs, below it the shades.
     """
     views, pairs, index = files.summary.views, files.summary.pairs, files.number
     side = (WIDTH - _LEFT - 4) / len(views)

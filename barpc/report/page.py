@@ -170,7 +170,7 @@ def _map(files: RunFiles) -> Section | None:
 
 
 def _lengths(files: RunFiles) -> list[tuple[str, str, float]]:
-    """How many images see a tie point, as bars."""
+    """Return how many images see a tie point, as bars."""
     found = {length: num for length, num in files.summary.tracks.by_length.items() if num}
     most = max(found.values(), default=1)
     return [(f"Tie points in {length} images", f"{num}", 100 * num / most) for length, num in found.items()]
@@ -376,7 +376,7 @@ def _check_points(files: RunFiles) -> Section | None:
 
 
 def _rms(rows: Any) -> Array:
-    """Root mean square of each column."""
+    """Return the root mean square of each column."""
     found: Array = np.sqrt((np.array(rows, dtype=np.float64) ** 2).mean(axis=0))
     return found
 
@@ -409,7 +409,7 @@ def _files(files: RunFiles) -> Section | None:
 
 
 def _reading(found: float | str | None) -> Cell:
-    """What a consumer read, or why it did not."""
+    """Return what a consumer read, or why it did not."""
     return Cell(found, 1e301) if isinstance(found, str) else cell_of(found, ".1e")
 
 

@@ -39,7 +39,7 @@ def said(
     default: Any = MISSING,
     **schema: Any,
 ) -> Any:
-    """Return a field of a record, with all that is said of it.
+    """Declare a field of a record, with all that is said of it.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ class Record:
 
     @classmethod
     def json_schema(cls) -> dict[str, Any]:
-        """Its JSON schema."""
+        """Return the record's JSON schema."""
         hints = get_type_hints(cls, include_extras=True)
         words = {one.name: {**schema_of(hints[one.name]), **one.metadata["schema"]} for one in fields(cls)}
         return {
@@ -96,7 +96,7 @@ class Record:
 
 @cache
 def _hints(record: Any) -> dict[str, Any]:
-    """Types of a record's fields; Python evaluates their texts anew whenever it is asked."""
+    """Return the types of a record's fields; Python evaluates their texts anew whenever it is asked."""
     return get_type_hints(record)
 
 
@@ -107,7 +107,7 @@ def _readers(record: Any) -> dict[str, Callable[[Any], Any] | None]:
 
 
 def _reader(kind: Any) -> Callable[[Any], Any] | None:
-    """What makes a value of a type from JSON; None where it stays as it is."""
+    """Return what makes a value of a type from JSON; None where it stays as it is."""
     if get_origin(kind) in (Union, UnionType):
         kind = next(part for part in get_args(kind) if part is not NoneType)
     if isinstance(kind, type) and issubclass(kind, Record):
@@ -166,7 +166,7 @@ def plain(value: Any) -> Any:
 
 @cache
 def _held(kind: Any) -> list[tuple[str, bool]]:
-    """The fields of a dataclass, and whether they are left out while None."""
+    """Return the fields of a dataclass, and whether they are left out while None."""
     of_record = issubclass(kind, Record)
     return [(f.name, of_record and f.default is None) for f in fields(kind) if f.name[0] != "_"]
 
@@ -214,7 +214,7 @@ class Table:
 
     @property
     def kinds(self) -> list[str]:
-        """How each column is set: "text" on the left, "number" on the right."""
+        """Alignment of each column: "text" on the left, "number" on the right."""
         first = self.rows[0] if self.rows else [Cell("", "", "name")] * len(self.columns)
         return ["number" if cell.kind == "number" else "text" for cell in first]
 
@@ -235,11 +235,11 @@ class Column:
 
     @property
     def heads(self) -> tuple[str, ...]:
-        """Its heads."""
+        """Heads of the column."""
         return (self.head,) if isinstance(self.head, str) else self.head
 
     def cells(self, row: Record) -> list[Cell]:
-        """Its cells in a row."""
+        """Return the column's cells in a row."""
         value, num = self.value(row), len(self.heads)
         values = [value] if num == 1 else [None] * num if value is None else value
         return [cell_of(item, self.form) for item in values]
@@ -265,7 +265,7 @@ def table(
 
 @cache
 def column_of(kind: Any, path: str) -> Column:
-    """Return one of its own columns, or that of a field, of a part of the record where the path has dots."""
+    """Return a column of a record by its name, or by its path with dots through parts of it."""
     if path in kind.OWN:
         return kind.OWN[path]  # type: ignore[no-any-return]
     for name in path.split("."):

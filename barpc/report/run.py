@@ -215,7 +215,7 @@ def pair_ties(tracks: Tracks, keep: BoolArray | None = None) -> list[PairTies]:
 
 
 def _whole_shift(ties: PairTies, tracks: Tracks) -> Array | None:
-    """The shift (2,) [px] by whole pixels that the matches of a pair share; None where there is none.
+    """Return the shift (2,) [px] by whole pixels that the matches of a pair share; None where there is none.
 
     Two images of one scene never match so: only one that is a part, or a copy, of the other.
     """

@@ -40,7 +40,7 @@ NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([EeDd][+-]?\d+)?")
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What the reader of an RPC cannot know from the file."""
+    """Choices that the reader of an RPC cannot take from the file."""
 
     first_pixel: float | None = None
     """The file's coordinate of the first pixel's centre: 0, 0.5 or 1; None: the format's rule (``docs/formats.md``)."""
@@ -129,7 +129,7 @@ def rpc_from_fields(
 
 
 def _accuracy(value: Sequence[float] | None) -> float | None:
-    """A stated accuracy [m]; zero and below mean that nobody knows, not that it is perfect."""
+    """Return a stated accuracy [m]; zero and below mean that nobody knows, not that it is perfect."""
     if not value or not math.isfinite(value[0]) or value[0] <= 0:
         return None
     return float(value[0])

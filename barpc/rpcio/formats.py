@@ -35,7 +35,7 @@ class Format:
 
 
 def _has(*patterns: str) -> Callable[[str], bool]:
-    """Whether a text holds all of some patterns, searched in time in proportion to it."""
+    """Return whether a text holds all of some patterns, searched in time in proportion to it."""
     return lambda content: all(re.search(pattern, content) for pattern in patterns)
 
 
@@ -192,7 +192,7 @@ holds_physical = _has(r"<(\w+:)?(ATTLIST|Refined_Model)\b")
 
 
 def _contents(content: str) -> str:
-    """The names of the fields in a text, those first that an RPC may have; of a list its name."""
+    """Return the names of the fields in a text, those first that an RPC may have; of a list its name."""
     if holds_physical(content):
         return "it holds a physical camera model: give FILE,model=physical"
     words = ("".join(found).rstrip("0123456789_") for found in _NAMED.findall(content[:_LOOKED]))

@@ -215,7 +215,7 @@ def write_crop(
 
 @contextmanager
 def copying(image_path: Path | str, target: Path | str, overwrite: bool) -> Iterator[tuple[Any, Path]]:
-    """An image and the temporary file of its copy; what GDAL says when it cannot write is told as one error."""
+    """Yield an image and the temporary file of its copy; GDAL's errors when it cannot write become one error."""
     source, _ = identify(image_path)
     target = Path(target).absolute()
     _refuse_same(source, target)

@@ -97,7 +97,7 @@ def only_physical(path: Path) -> bool:
 
 
 def _present(image: Place) -> Mapping[str, str]:
-    """The files beside an image, by name in lower case; on another host those that count."""
+    """Return the files beside an image, by name in lower case; on another host those that count."""
     if isinstance(image, Path):
         return files_of(image.parent)
     try:
@@ -109,7 +109,7 @@ def _present(image: Place) -> Mapping[str, str]:
 
 
 def _names(name: str) -> Iterator[tuple[str, str, bool]]:
-    """(kind, file name, read before the tag) of all sidecars that an image of this name may have."""
+    """Yield (kind, file name, read before the tag) of all sidecars that an image of this name may have."""
     stem = name.rpartition(".")[0] or name
     yield "rpb", f"{stem}.RPB", True
     yield "xml", f"{stem}.XML", True
@@ -266,7 +266,7 @@ _WHOLE: _Window = (0.0, 0.0, 1.0, 1.0)  # corner, steps
 
 
 def _crop_origin(image: Place, _path: Place) -> tuple[_Window, str]:
-    """A ``.geom`` speaks of the full image; a geotransform without CRS says where the crop is."""
+    """Return a ``.geom`` speaks of the full image; a geotransform without CRS says where the crop is."""
     with open_raster(image) as dataset:
         step_x, _, x, _, step_y, y = dataset.transform[:6]
         has_crs = dataset.crs is not None
@@ -279,7 +279,7 @@ def _crop_origin(image: Place, _path: Place) -> tuple[_Window, str]:
 
 
 def _tile_origin(image: Place, path: Place) -> tuple[_Window, str]:
-    """A DIMAP product in tiles: the RPC is the whole image's, ``DIM_*.XML`` gives the size of a tile."""
+    """Return a DIMAP product in tiles: the RPC is the whole image's, ``DIM_*.XML`` gives the size of a tile."""
     tile = re.search(r"_R(\d+)C(\d+)$", image.stem.upper())
     if tile is None or tile.groups() == ("1", "1"):
         return _WHOLE, ""

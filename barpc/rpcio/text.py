@@ -54,7 +54,7 @@ def _pairs(text: str) -> Iterator[tuple[str, str]]:
 
 
 def _numbered(fields: Fields, separator: str, indices: Sequence[str]) -> list[str]:
-    """A line for every number; the coefficients of a list have these indices."""
+    """Return a line for every number; the coefficients of a list have these indices."""
     lines = []
     for key, values in fields.items():
         names = [f"{key}_{index}" for index in indices] if key in LISTS else [key]
@@ -150,7 +150,7 @@ def read_envi(text: str, name: str, options: ReadOptions) -> RPC:
 
 
 def _in_order(values: list[float], what: str, name: str, options: ReadOptions) -> RPC:
-    """The RPC of offsets, scales and four times twenty coefficients."""
+    """Return the RPC of offsets, scales and four times twenty coefficients."""
     if len(values) not in _COUNTS:
         raise RpcFormatError(f"{name}: {what} has {len(values)} numbers, expected 90 or 93")
     fields: Fields = {key: [value] for key, value in zip(OFFSETS + SCALES, values, strict=False)}
@@ -212,7 +212,7 @@ def read_json(text: str, name: str, options: ReadOptions) -> RPC:
 
 
 def _find(document: Any, mark: str, depth: int = 3) -> dict[str, Any] | None:
-    """The first object that has the key `mark`, at most `depth` levels down."""
+    """Return the first object that has the key `mark`, at most `depth` levels down."""
     if not isinstance(document, dict):
         return None
     if mark in {str(key).lower() for key in document}:
@@ -222,7 +222,7 @@ def _find(document: Any, mark: str, depth: int = 3) -> dict[str, Any] | None:
 
 
 def _values(value: Any, name: str, key: str) -> list[float]:
-    """Numbers of a JSON value: a number, a list of numbers, or a text of numbers (GDAL's)."""
+    """Return the numbers of a JSON value: a number, a list of numbers, or a text of numbers (GDAL's)."""
     if isinstance(value, str):
         return numbers(value, name, key)
     items = value if isinstance(value, list) else [value]
@@ -272,7 +272,7 @@ _B_FROM_A = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 7, 11, 14, 17, 12, 15, 18, 13, 16, 1
 
 
 def _columns(text: str, widths: dict[str, int], name: str) -> Fields:
-    """The fields of one record: single numbers of these widths, then four times twenty coefficients."""
+    """Return the fields of one record: single numbers of these widths, then four times twenty coefficients."""
     cells = [(key, key, width) for key, width in widths.items()]
     cells += [(key, f"{key}_{i}", _COEFFICIENT_WIDTH) for key in COEFFICIENTS for i in range(1, 21)]
     needed = sum(width for _, _, width in cells)

@@ -58,7 +58,7 @@ class Directory:
 
     @property
     def formats(self) -> tuple[str, str, str]:
-        """Of an offset, of the number of entries and of an entry, for struct."""
+        """Formats of an offset, of the number of entries and of an entry, for struct."""
         offset, count, entry = ("Q", "Q", "HHQ8s") if self.big else ("I", "H", "HHI4s")
         return self.order + offset, self.order + count, self.order + entry
 
@@ -130,7 +130,7 @@ def tag_values(rpc: RPC) -> list[float]:
 
 
 def put_tag(path: Path, rpc: RPC, placed: bool = True) -> None:
-    """Give a TIFF an RPC tag, in place: for a fresh copy only, never for somebody's image.
+    """Put an RPC tag into a TIFF, in place: for a fresh copy only, never for somebody's image.
 
     A new directory, with its geotransform if `placed`, is written behind the end; ImageError if only BigTIFF holds it.
     """
@@ -183,8 +183,8 @@ def survives(rpc: RPC) -> bool:
 
 
 def printable(rpc: RPC) -> RPC:
-    """Return the same camera with offsets and scales of at most fifteen digits, as which GDAL hands the tag's
-    doubles on.
+    """Return the camera with offsets and scales of at most fifteen digits, as GDAL hands on the tag's
+    doubles.
 
     A longitude offset of 17 digits cut to 15 would move an image by up to 2e-8 px. The coefficients take up the
     difference: a normalised coordinate x becomes a x + b with b and a - 1 of 1e-13, the polynomials change by

@@ -44,7 +44,7 @@ def _text(parent: Element, path: str, name: str) -> str:
 
 
 def _element(parent: Element, paths: Iterable[str], name: str) -> Element:
-    """The first of several elements that is there, at any depth."""
+    """Return the first of several elements that is there, at any depth."""
     for path in paths:
         found = parent.find(f".//{path}")
         if found is not None:
@@ -105,7 +105,7 @@ def read_dimap(text: str, name: str, options: ReadOptions) -> RPC:
 
 
 def _read_dimap_v1(model: Element, name: str, options: ReadOptions) -> RPC:
-    """DIMAP v1: forty numbers an element, scales A and offsets B by axis."""
+    """Return the dIMAP v1: forty numbers an element, scales A and offsets B by axis."""
     fields: Fields = {}
     for axis, field in (("ROW", "LINE"), ("COL", "SAMP")):
         values = numbers(_text(_element(model, (f"F_{axis}",), name), ".", name), name, f"F_{axis}")

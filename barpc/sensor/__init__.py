@@ -17,7 +17,7 @@ from barpc.geodesy import Array
 
 @runtime_checkable
 class SensorModel(Protocol):
-    """What every camera can do."""
+    """The protocol of every camera: projection, its derivative, localisation."""
 
     def project(self, ground: Array) -> Array:
         """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""

@@ -12,7 +12,7 @@ _SETTLED = 1e-9  # rad, about a millimetre: what is left after such a step is be
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Return the products (N,) of vectors (3, N)."""
+    """Return the dot products (N,) of vectors (3, N)."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 

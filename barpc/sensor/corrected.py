@@ -37,7 +37,7 @@ _TOLERANCE = 1e-7  # px: a localised point must project this near to where it wa
 
 
 class Motion:
-    """exp(d) R (X - T - C) + C for points of one view or many, and the derivatives: all that P_BA adds to P.
+    """The motion exp(d) R (X - T - C) + C of ground points of one or many views, with its derivatives.
 
     Arrays are component-major, columns sorted by view; R, T, C are each view's, the drift d is each point's.
 
@@ -67,8 +67,7 @@ class Motion:
         self.ecef = self._turned + np.repeat(center.T, count, axis=1)
 
     def derivatives(self, by_moved: Array) -> tuple[Array, Array, Array]:
-        """Return the derivatives (2, 3, n) by X [1/m], R and d [1/rad], each, of what has these by the moved
-        points [1/m].
+        """Return the derivatives (2, 3, n) by X [1/m], R and d [1/rad] from those by the moved points [1/m].
 
         By T they are those by X, negative; those by d are those by R where there is no drift.
         """
@@ -84,7 +83,7 @@ class Motion:
 
 
 def _by_view(matrices: Array, rows: Array, bounds: IntArray) -> Array:
-    """Matrices (m, 3, 3) times the columns bounds[i] : bounds[i + 1] of rows (..., 3, n)."""
+    """Return the matrices (m, 3, 3) times the columns bounds[i] : bounds[i + 1] of rows (..., 3, n)."""
     out = np.empty_like(rows)
     for matrix, start, stop in zip(matrices, bounds[:-1], bounds[1:], strict=True):
         np.matmul(matrix, rows[..., start:stop], out=out[..., start:stop])
@@ -146,8 +145,8 @@ class Correction(Frozen):
         return np.asarray(self.drift.T @ (degree * u ** (degree - 1)) / self.row_scale)
 
     def apply(self, ecef: Array, row: Array | None = None) -> Array:
-        """Return the points s R (X - T - C) + C of ECEF points X (..., 3) [m]; turned on by the drift at rows
-        (...) if given.
+        """Return the points s R (X - T - C) + C of ECEF points X (..., 3) [m]; with the drift at rows (...)
+        if given.
         """
         ecef = np.asarray(ecef, dtype=np.float64)
         rows = None if row is None else np.broadcast_to(row, ecef.shape[:-1]).reshape(-1)
@@ -155,8 +154,8 @@ class Correction(Frozen):
 
 
 def correction_of(matrix: Array, at: Array) -> Correction:
-    """Return the correction that brings a motion of the ground into a camera: it shows X where it showed X
-    before the motion.
+    """Return the correction of a camera after its ground was moved: it shows X where it showed X before the
+    motion.
 
     Parameters
     ----------
@@ -201,7 +200,7 @@ class Corrected:
         return image, by_ecef @ ecef_from_ground_jacobian(ground)
 
     def project_ecef(self, ecef: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the image points (..., 2) [px] of ECEF points X (..., 3) [m], with the derivatives that the
+        """Project ECEF points X (..., 3) [m] to image points (..., 2) [px], with the derivatives that the
         adjustment needs.
 
         d(image)/dX [px/m], d(image)/dR [px/rad], d(image)/dT [px/m], (..., 2, 3) each.
@@ -257,7 +256,7 @@ class Corrected:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ImageAffine(Frozen):
-    """image + shift + slope @ image."""
+    """An affine correction in the image: image + shift + slope @ image."""
 
     shift: Array  # (2,): col, row [px]
     slope: Array  # (2, 2): change of (col, row) by (col, row) [px/px]

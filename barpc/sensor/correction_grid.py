@@ -55,8 +55,8 @@ class CorrectionGrid(Frozen):
         alt: float,
         tolerance: float = LINEAR,
     ) -> CorrectionGrid:
-        """Return what takes the image points of `rpc` to those of `model`, seen on ground of one altitude
-        [m].
+        """Return the displacements from the image points of `rpc` to those of `model` for ground of one
+        altitude [m].
 
         Linear interpolation misses by no more than `tolerance` [px]. RpcError where a camera sees no ground.
         """

@@ -78,7 +78,7 @@ class Curve(Frozen):
 
     @property
     def span(self) -> tuple[float, float]:
-        """First and last time that the curve is believed for [s]."""
+        """First and last time [s] at which the curve is used."""
         return float(self.knots[0]) - EXTRAPOLATION, float(self.knots[-1]) + EXTRAPOLATION
 
     def __call__(self, time: Array) -> tuple[Array, Array]:
@@ -92,7 +92,7 @@ class Curve(Frozen):
         return out[:3], out[3:6], out[6:]
 
     def _evaluate(self, time: Array, count: int) -> Array:
-        """The first `count` rows of the table's polynomials (count, N)."""
+        """Return the first `count` rows of the table's polynomials (count, N)."""
         table = self._table[:count]
         if len(self.coeffs) == 1:  # one matrix product: a fifth of the time of Horner's scheme
             dt = time - self.knots[0]
@@ -110,7 +110,9 @@ class Curve(Frozen):
 
 
 def about_middle(rotations: Rotation) -> tuple[Array, Array]:
-    """Return the middle one (3, 3) of N rotations, and the rotation vectors (N, 3) [rad] from there, in its axes."""
+    """Return the middle (3, 3) of N rotations and the rotation vectors (N, 3) [rad] of all relative to it, in
+    its axes.
+    """
     middle = rotations[len(rotations) // 2]
     return np.asarray(middle.as_matrix()), np.asarray((middle.inv() * rotations).as_rotvec())
 
@@ -143,7 +145,9 @@ def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[
 
 @dataclass(frozen=True, eq=False)
 class Orbit(Curve):
-    """The polynomial through state vectors, and the velocity that they state where it is not its derivative."""
+    """The polynomial through an orbit's state vectors, and the velocity that they state where it is not its
+    derivative.
+    """
 
     sigma: Array  # (3,): standard deviations of positions along and across the track [m], of velocities [m/s]
     stated: Array  # (K, 3): stated velocity less derivative [m/s], as a polynomial of the time from the first knot
@@ -209,7 +213,7 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
 
 
 def _fit_orbit(time: Array, position: Array, velocity: Array, degree: int) -> Orbit:
-    """Least squares of one degree, weighted by the standard deviations that its own residuals show."""
+    """Return the least squares of one degree, weighted by the standard deviations that its own residuals show."""
     half = 0.5 * (time[-1] - time[0])
     x = (time - time[0]) / half - 1.0
     basis = chebyshev.chebvander(x, degree)
@@ -249,7 +253,7 @@ def _fit_orbit(time: Array, position: Array, velocity: Array, degree: int) -> Or
 
 
 class Turn:
-    """The rotations exp([w]x) of rotation vectors w (..., 3, N) [rad], and their derivatives."""
+    """Rotations exp([w]x) of rotation vectors w (..., 3, N) [rad], and their derivatives."""
 
     def __init__(self, w: Array) -> None:
         x = (w * w).sum(axis=-2, keepdims=True)  # the angles, squared
@@ -265,12 +269,12 @@ class Turn:
             self._c = np.where(x > 1e-4, (1.0 - self._a) / x, 1.0 / 6 - x / 120)
 
     def forth(self, v: Array) -> Array:
-        """Return exp([w]x) v of vectors (..., 3, N): Rodrigues."""
+        """Return exp([w]x) v, vectors (..., 3, N) rotated (Rodrigues)."""
         bent = cross(self._w, v)
         return np.asarray(v + self._a * bent + self._b * cross(self._w, bent))
 
     def back(self, v: Array, error: float = 0.0) -> Array:
-        """Return exp(-[w]x) v of vectors (..., 3, N), to a relative error."""
+        """Return exp(-[w]x) v, vectors (..., 3, N) rotated back."""
         bent = cross(self._w, v)
         if self._largest < error:
             return np.asarray(v - bent)

@@ -23,7 +23,7 @@ def seconds(time: Any, epoch: np.datetime64) -> Any:
 
 
 def parse_time(text: str, name: str) -> np.datetime64:
-    """Return a UTC time, "2021-02-16T15:12:07.524369", perhaps with a Z behind it or "UTC=" before."""
+    """Parse a UTC time such as "2021-02-16T15:12:07.524369", perhaps with a Z behind it or "UTC=" before."""
     match = _TIME.fullmatch(text.strip())
     try:
         return np.datetime64(match["time"] if match else "none", "ns")
@@ -45,7 +45,7 @@ class Fields:
         return text.strip()
 
     def all(self, path: str) -> list[Self]:
-        """Return every element of this path, none too."""
+        """Return every element of this path, or an empty list."""
         return [type(self)(element, self.name) for element in self.element.findall(path)]
 
     def one(self, path: str) -> Self:

@@ -94,14 +94,18 @@ class Frame(Frozen):
         return ground
 
     def _seen(self, ecef: Array) -> tuple[Array, Array, Array]:
-        """Image points (2, N), places in the focal plane (2, N) and vectors in the camera (3, N) of ECEF points."""
+        """Return the image points (2, N), places in the focal plane (2, N) and vectors in the camera (3, N)
+        of ECEF points.
+        """
         p = self.rotation.T @ (ecef - self.center[:, None])
         tangents = p[:2] / np.where(p[2] > 0, p[2], np.nan)
         at = tangents * self._farther(np.sqrt((tangents**2).sum(axis=0)))
         return np.asarray(np.linalg.solve(self.plane[:, :2], at - self.plane[:, 2:]), np.float64), at, p
 
     def _farther(self, radius: Array) -> Array:
-        """By what factor (N,) the place in the focal plane is farther out than the tangents; NaN if nowhere."""
+        """Return the by what factor (N,) the place in the focal plane is farther out than the tangents; NaN
+        if nowhere.
+        """
         slope, found = polyder(self.distortion), radius
         step = np.zeros_like(radius)
         for _ in range(_STEPS):

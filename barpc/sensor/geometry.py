@@ -33,7 +33,7 @@ PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this r
 
 @runtime_checkable
 class Radar(Protocol):
-    """A model that knows where its beam comes from: not from where the ground points of one pixel lie over altitude."""
+    """A radar model, which knows the direction of its beam: it is not that of a pixel's ground points over altitude."""
 
     def to_radar(self, ground: Array) -> Array:
         """Return the vectors (..., 3) [m], ECEF, from ground points (..., 3) to the radar that sees them."""
@@ -108,8 +108,8 @@ def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, fl
 
 
 def sight_enu(sensor: SensorModel, ground: Array) -> Array:
-    """Return the unit vectors (..., 3) east, north, up from ground points (..., 3) to the sensor: along them
-    no pixel changes.
+    """Return the unit vectors (..., 3) east, north, up along the lines of sight from ground points (..., 3)
+    to the sensor.
     """
     ground = np.asarray(ground, dtype=np.float64)
     _, jacobian = sensor.project_jacobian(ground)
@@ -133,7 +133,7 @@ def view_angles(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
 
 
 def _to_sensor(sensor: SensorModel, ground: Array) -> Array:
-    """East, north, up (..., 3) of the direction to the sensor, of any length."""
+    """Return the east, north, up (..., 3) of the direction to the sensor, of any length."""
     if isinstance(sensor, Several):
         return sensor.each(_to_sensor, ground)
     if isinstance(sensor, Radar):
@@ -142,7 +142,7 @@ def _to_sensor(sensor: SensorModel, ground: Array) -> Array:
 
 
 def ground_sample_distance(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
-    """Return how large a pixel is on level ground at points (..., 3).
+    """Return the ground sampling distance [m] at points (..., 3) on level ground.
 
     Returns
     -------
@@ -189,7 +189,9 @@ class Several:
         self._parts = [(sensors[of_row[rows[0]]], rows) for rows in np.split(order, starts)[1:]]
 
     def each(self, function: Callable[[SensorModel, Array], Array], ground: Array) -> Array:
-        """Return what a function of a camera and ground points gives, (N, 3), for ground points (N, 3)."""
+        """Return what a function of a camera and ground points gives for ground points (N, 3), each with its
+        own camera.
+        """
         found = np.empty((len(ground), 3))
         for sensor, rows in self._parts:
             found[rows] = function(sensor, ground[rows])
@@ -219,7 +221,7 @@ class Several:
 
 @dataclass(frozen=True, eq=False)
 class CameraCenter:
-    """Where a camera stands."""
+    """Position of a camera, and how it was found."""
 
     ecef: Array  # (3,) [m]
     altitude: float
@@ -232,7 +234,7 @@ def camera_center(
     alt_range: tuple[float, float],
     how: Literal["line", "projective"] = "line",
 ) -> CameraCenter:
-    """Return the camera centre regressed from a sensor model.
+    """Estimate the camera centre by regression of a sensor model's rays.
 
     One image line of a pushbroom camera IS a perspective camera, so its rays meet in one point, found by least
     squares. A point outside `PLAUSIBLE_ALTITUDE` is replaced by one at `NOMINAL_ALTITUDE` on the central ray, and says
@@ -282,7 +284,9 @@ def _center_of_line(sensor: SensorModel, size: tuple[int, int], alt_range: tuple
 
 
 def _center_projective(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
-    """Centre (3,) of the 3 x 4 matrix that takes ground points to image points: its null space (Hartley, DLT)."""
+    """Return the centre (3,) of the 3 x 4 matrix that takes ground points to image points: its null space
+    (Hartley, DLT).
+    """
     ends = np.linspace(0.0, 1.0, _REGRESSED)
     unit = np.stack(np.meshgrid(ends, ends, ends), axis=-1).reshape(-1, 3)
     image, low = unit[:, :2] * (np.array(size) - 1.0), alt_range[0]
@@ -318,7 +322,7 @@ def epipolar_offset(
     alt: float | npt.ArrayLike = 0.0,
     steps: int = 6,
 ) -> tuple[Array, Array]:
-    """Return how far matches lie off the epipolar line: what no altitude explains.
+    """Return the distances of matches from their epipolar lines: what no altitude explains.
 
     The altitude that brings the ray of a nearest to the point in b is found by Gauss-Newton along the
     ray; the signed distance that is left, across the epipolar line, is the offset.
@@ -407,7 +411,9 @@ def triangulate(
 def _intersect(
     rows: _Rows, point: IntArray, xy: Array, weight: Array, alt: Array, steps: int
 ) -> tuple[Array, BoolArray]:
-    """Gauss-Newton on metres east, north, up from where a view sees a track at `alt`: ground (P, 3), if possible."""
+    """Return Gauss-Newton on metres east, north, up from where a view sees a track at `alt`: ground (P, 3),
+    if possible.
+    """
     ground = np.full((len(alt), 3), np.nan)
     for sensor, part in rows:
         new = np.flatnonzero(np.isnan(ground[point[part], 0])) + part.start
@@ -429,7 +435,7 @@ def _intersect(
 
 
 def _normal_step(jacobian: Array, residual: Array, point: IntArray, scale: Array) -> tuple[Array, BoolArray]:
-    """Gauss-Newton steps (3, num) [m] by cofactors, and for which points the rays determine one.
+    """Return Gauss-Newton steps (3, num) [m] by cofactors, and for which points the rays determine one.
 
     `jacobian` (3, 2, K) and `residual` (2, K) are weighted; `scale` (3, num): metres of a unit of lon, lat, alt.
     """

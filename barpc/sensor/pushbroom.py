@@ -48,7 +48,7 @@ _SETTLED = 1e-4  # px: Newton is quadratic, what is left after a step of this si
 
 @dataclass(frozen=True)
 class Light:
-    """What bends the line of sight of a camera.
+    """Aberration and refraction of a camera's lines of sight.
 
     A moving camera sees a point in the direction of (X - O) / |X - O| + b, b = V / c: V is the camera's velocity in the
     inertial frame less that of the point, O' - omega x (X - O) in ECEF. Refraction lets a point seem farther from
@@ -59,7 +59,7 @@ class Light:
     refraction: bool = False
 
     def seen(self, ecef: Array, origin: Array, velocity: Array) -> Array:
-        """Return the vectors (3, N) [m] along which points (3, N) are seen from places (3, N) at velocities
+        """Return the apparent directions (3, N) [m] of points (3, N) seen from places (3, N) at velocities
         (3, N), ECEF.
         """
         sight = ecef - origin
@@ -70,7 +70,9 @@ class Light:
         return sight
 
     def by_point(self, gradient: Array, ecef: Array, origin: Array, velocity: Array) -> Array:
-        """Return the derivatives (3, N) by the points of what has the `gradient` (3, N) by `seen`, to 1e-6 of them."""
+        """Return derivatives (3, N) by the ground points, from the `gradient` (3, N) by the apparent
+        directions, to 1e-6.
+        """
         sight = ecef - origin
         out = gradient
         if self.aberration:
@@ -82,7 +84,7 @@ class Light:
         return out
 
     def _lift(self, ecef: Array, sight: Array) -> tuple[Array, Array]:
-        """By how much points seem displaced (3, N) [m], and the vertical (3, N); NaN near the horizon."""
+        """Return the by how much points seem displaced (3, N) [m], and the vertical (3, N); NaN near the horizon."""
         ground = ground_from_ecef(ecef.T)
         vertical, along = up(ground), sight / np.sqrt((sight * sight).sum(axis=0))
         cosine = -(vertical * along).sum(axis=0)
@@ -92,7 +94,7 @@ class Light:
 
 
 def _drag(sight: Array, velocity: Array) -> Array:
-    """The velocity of a camera against the points (3, N) [m] away, over that of light."""
+    """Return the velocity of a camera against the points (3, N) [m] away, over that of light."""
     carried = np.stack([-sight[1], sight[0], np.zeros(sight.shape[1])]) * EARTH_RATE
     return np.asarray((velocity - carried) / SPEED_OF_LIGHT)
 
@@ -215,7 +217,7 @@ class Pushbroom(Frozen):
         return origin.T.reshape(*image.shape[:-1], 3), direction.T.reshape(*image.shape[:-1], 3)
 
     def _rays(self, image: Array) -> tuple[Array, Array]:
-        """Camera centres and unit directions of sight, (3, N), of image points (N, 2)."""
+        """Return the camera centres and unit directions of sight, (3, N), of image points (N, 2)."""
         time = self.time(image[:, 1])
         tangents = self._look(image[:, 0])[0]
         inside = np.stack([tangents[0], tangents[1], np.ones(len(time))])
@@ -224,7 +226,7 @@ class Pushbroom(Frozen):
         return self.orbit(time)[0], direction
 
     def _meet(self, image: Array, alt: Array) -> Array:
-        """Ground points (N, 3) where lines of sight (N, 2) reach altitudes (N,)."""
+        """Return the ground points (N, 3) where lines of sight (N, 2) reach altitudes (N,)."""
         origin, seen = self._rays(image)
         time, (start, stop) = self.time(image[:, 1]), self._span
         ground = reach(origin, seen, alt)
@@ -239,7 +241,7 @@ class Pushbroom(Frozen):
         return ground
 
     def _look(self, col: Array) -> tuple[Array, Array]:
-        """Tangents (2, N) of the line of sight and their derivatives by the column."""
+        """Return the tangents (2, N) of the line of sight and their derivatives by the column."""
         x = col - self.look_origin
         value = np.broadcast_to(self.look[:, -1:], (2, len(x)))
         rate = np.zeros((2, 1))
@@ -249,7 +251,7 @@ class Pushbroom(Frozen):
         return value, np.broadcast_to(rate, value.shape)
 
     def _seen(self, ecef: Array, time: Array) -> tuple[Array, Array, Array]:
-        """Tangents (2, N) under which points (3, N) are seen at times (N,), their rates, and p_z (N,)."""
+        """Return the tangents (2, N) under which points (3, N) are seen at times (N,), their rates, and p_z (N,)."""
         origin, velocity = self.orbit(time)
         w, w_rate = self.attitude(time)
         turn = Turn(w)
@@ -259,7 +261,7 @@ class Pushbroom(Frozen):
         return tangents, (p_rate[:2] - tangents * p_rate[2]) / p[2], p[2]
 
     def _solve(self, ecef: Array) -> Array:
-        """Image points (2, N) of ECEF points (3, N): Newton on (col, row)."""
+        """Return the image points (2, N) of ECEF points (3, N): Newton on (col, row)."""
         start, stop = self._span
         time = np.full(ecef.shape[1], (start + stop) / 2)
         col = np.full(ecef.shape[1], self.look_origin)
@@ -288,7 +290,7 @@ class Pushbroom(Frozen):
         return found.T, self._by_ecef(ecef, found) @ ecef_from_ground_jacobian(ground)
 
     def _by_ecef(self, ecef: Array, image: Array) -> Array:
-        """d(col, row)/dX (N, 2, 3) [px/m] at ECEF points (3, N) seen at image points (2, N)."""
+        """Return d(col, row)/dX (N, 2, 3) [px/m] at ECEF points (3, N) seen at image points (2, N)."""
         time = self.time(image[1])
         turn, motion = Turn(self.attitude(time)[0]), self.orbit(time)
         tangents, rate, depth = self._seen(ecef, time)

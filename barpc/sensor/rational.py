@@ -29,7 +29,7 @@ REACH = 1.25  # the cubic inverse is trusted this far out of the box; what lies 
 
 
 def _derivative_matrices() -> Array:
-    """(3, 20, 10): d(monomial i)/d(L, P, H) as a combination of the first ten monomials."""
+    """Return (3, 20, 10): d(monomial i)/d(L, P, H) as a combination of the first ten monomials."""
     index = {"".join(sorted(m)): i for i, m in enumerate(MONOMIALS[:10])}
     index[""] = index.pop("1")
     out = np.zeros((3, 20, 10))
@@ -133,7 +133,7 @@ class Rational:
         return np.asarray(self.accuracy[:, None] + 32 * np.finfo(float).eps * np.abs(target))
 
     def _step(self, target: Array, x: Array, work: Array | None = None) -> Array:
-        """One Newton step on `x[:2]`, in place; its length (N,)."""
+        """Return one Newton step on `x[:2]`, in place; its length (N,)."""
         value, ((a, c), (b, d)) = self.value_and_gradient(x, axes=2, work=work)
         np.subtract(target, value, out=value)
         det = a * d
@@ -171,7 +171,7 @@ class Rational:
         return _Inverse(coeffs, center, scale, float(min(safe, 1e-3)))
 
     def _regular(self, x: Array) -> BoolArray:
-        """Whether points lie on the sheet of the centre: no denominator and no determinant changed sign."""
+        """Return whether points lie on the sheet of the centre: no denominator and no determinant changed sign."""
         points = np.concatenate([np.zeros((3, 1)), x], axis=1)
         denominators = self.coeffs[1::2] @ monomials(points)
         _, ((a, c), (b, d)) = self.value_and_gradient(points, axes=2)
@@ -179,7 +179,7 @@ class Rational:
         return np.asarray((signs[:, 1:] == signs[:, :1]).all(axis=0))
 
     def _solve_with_care(self, target: Array, x: Array, index: npt.NDArray[np.int64]) -> BoolArray:
-        """Solve the columns `index` of `x` (their `x[2]` given) for `target`; whether each was found."""
+        """Return the solve the columns `index` of `x` (their `x[2]` given) for `target`; whether each was found."""
         z = x[2, index]
         state = np.zeros((3, len(index)))
         state[2] = z
@@ -190,7 +190,9 @@ class Rational:
         return ok
 
     def _damped_newton(self, target: Array, x: Array, steps: int = 60) -> Array:
-        """Newton on `x[:2]`, steps halved until the error falls, never across a pole; the error (2, N) left."""
+        """Return the newton on `x[:2]`, steps halved until the error falls, never across a pole; the error
+        (2, N) left.
+        """
         left = np.full(target.shape, np.inf)
         active = np.arange(target.shape[1])
         sign = np.sign(self.coeffs[1::2, :1])
@@ -210,7 +212,9 @@ class Rational:
         return left
 
     def _line_search(self, target: Array, x: Array, step: Array, sign: Array) -> BoolArray:
-        """Move `x[:2]` by the longest of step, step/2, .. step/128 that lowers the error; whether one did."""
+        """Return the move `x[:2]` by the longest of step, step/2, .. step/128 that lowers the error; whether
+        one did.
+        """
         error = np.abs(target - self.value(x)).sum(axis=0)
         todo = np.flatnonzero(np.isfinite(step).all(axis=0) & np.isfinite(error))
         improved = np.zeros(x.shape[1], dtype=bool)

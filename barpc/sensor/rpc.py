@@ -108,13 +108,13 @@ class RPC(Frozen):
         return pointwise(self._localize, CHUNK, [(3,)], image, alt, rows=20)[0]
 
     def off(self, other: RPC) -> Array:
-        """Return how far another RPC's image points are off (729, 2) [px], over the box; 0 where neither has any."""
+        """Return the differences (729, 2) [px] of another RPC's image points over the box; 0 where neither has any."""
         places = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 9)] * 3), axis=-1).reshape(-1, 3)
         image, seen = (rpc.project(self.ground_offset + places * self.ground_scale) for rpc in (self, other))
         return np.where(np.isnan(image) & np.isnan(seen), 0.0, np.abs(seen - image))
 
     def localize_direct(self, image: Array, alt: Array) -> Array:
-        """Return as `localize`, by the localisation RPC: no iteration, and as near as that was fitted."""
+        """Localise image points by the localisation RPC: without iteration, as exact as that was fitted."""
         return pointwise(self._localize_direct, CHUNK, [(3,)], image, alt, rows=20)[0]
 
     def _localize_direct(self, image: Array, alt: Array, work: Array) -> list[Array]:
@@ -160,7 +160,7 @@ class RPC(Frozen):
         return [ground]
 
     def _holds(self, ground: Array, image: Array) -> BoolArray:
-        """Whether ground points (N, 3) are on Earth and project to `image`: far out an ulp can be pixels."""
+        """Return whether ground points (N, 3) are on Earth and project to `image`: far out an ulp can be pixels."""
         tolerance = 10 * _ACCURACY + 1e-12 * np.abs(image)
         on_earth = (np.abs(ground[:, 0] - self.ground_offset[0]) <= 180.0) & (np.abs(ground[:, 1]) <= 90.0)
         return np.asarray(on_earth & (np.abs(self.project(ground) - image) <= tolerance).all(axis=1))

@@ -49,7 +49,7 @@ def bsplines(u: Array, count: int) -> Array:
 
 
 def profile(place: Array, start: Array, stop: Array, origin: Array, rate: Array) -> Array:
-    """Return how much of a strip's displacement there is at places [px]: see `RowSpline.strips`."""
+    """Return the share of a strip's displacement at places [px] (see `RowSpline.strips`)."""
     with np.errstate(invalid="ignore"):
         inside = (place >= start) & (place < stop)
         return np.asarray(np.where(inside, np.exp(-np.maximum((place - origin) * rate, 0.0)), 0.0))
@@ -183,7 +183,7 @@ class Splined:
         return self.sensor.localize(image - self.correction.at(image), alt)
 
     def _displaced(self, projected: Array) -> Array:
-        """Where points are seen that are projected to image points (..., 2) [px]."""
+        """Return where points are seen that are projected to image points (..., 2) [px]."""
         image = projected
         for _ in range(_STEPS):
             before, image = image, projected + self.correction.at(image)

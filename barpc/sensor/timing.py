@@ -17,7 +17,7 @@ from barpc.sensor import SensorModel
 
 @dataclass(frozen=True, eq=False)
 class Timing(Frozen):
-    """What a radar adds to range and azimuth time: polynomials of where along the flight a point is seen.
+    """Corrections of a radar's range and azimuth time: polynomials of the position along the flight.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class Timing(Frozen):
         return np.asarray(polynomial.polyval((along - self.offset) / self.scale, self.coeffs))
 
     def rate(self, along: Array) -> Array:
-        """Return their derivative by the coordinate (2, N)."""
+        """Return the derivative (2, N) of range and azimuth time by the coordinate."""
         slopes = polynomial.polyder(self.coeffs) / self.scale
         return np.asarray(polynomial.polyval((along - self.offset) / self.scale, slopes))
 
@@ -53,12 +53,12 @@ class Clocked(SensorModel, Protocol):
 
     @property
     def accuracy(self) -> tuple[float, float] | None:
-        """Stated standard deviations of range and of the place along the flight [m]."""
+        """Stated standard deviations of range and of the position along the flight [m]."""
         ...
 
     @property
     def speed(self) -> float:
-        """Of the flight [m/s]."""
+        """Speed of the flight [m/s]."""
         ...
 
     def timed(self, timing: Timing) -> Self:
@@ -66,8 +66,8 @@ class Clocked(SensorModel, Protocol):
         ...
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the image points (..., 2) [px] of ground points (..., 3), their derivatives, and where along
-        the flight they are.
+        """Return image points (..., 2) [px] of ground points (..., 3), their derivatives by range and azimuth
+        time, and the coordinate along the flight.
 
         d(image)/d(ground) (..., 2, 3), d(image)/d(range, azimuth time) (..., 2, 2) [px/m, px/s], and (...) [px].
         """

@@ -19,7 +19,7 @@ _WINDOW_POINTS = 60  # that a window needs for a fit of its own
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Points of image A in image B, in axes along and across the epipolar direction; between two altitudes."""
+    """Epipolar segments in image B of points of image A: axes along and across, between two altitudes."""
 
     axis: Array  # (2,) unit vector in B along which a point moves when its altitude grows
     along: Array  # (N,) coordinates of the points at the middle altitude [px]
@@ -45,9 +45,7 @@ class Frame:
         return out
 
     def errors(self, xy: Array) -> Array:
-        """Return the distance along and across (N, 2) of points of B (N, 2), one each, from where they are
-        predicted.
-        """
+        """Return the distances along and across (N, 2) of points of B (N, 2) from their predictions."""
         u, w = self.turn(xy).T
         along = u - self.along
         return np.stack([along, w - self.across - self.slope * along], axis=-1)
@@ -58,7 +56,7 @@ def _rotation(axis: Array) -> Array:
 
 
 def common_range(*views: View) -> tuple[float, float]:
-    """Return the altitudes [m] at which views may see the same ground."""
+    """Return the altitudes [m] that several views have in common."""
     low, high = max(view.alt_range[0] for view in views), min(view.alt_range[1] for view in views)
     return min(low, high), max(low, high)
 
@@ -150,7 +148,7 @@ def robust_spread(values: Array, center: float | Array = 0.0) -> Any:
 
 
 def agreeing(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:
-    """Return which values (N,) [px] agree with an affine function of position (N, 2) [px], and their
+    """Return the values (N,) [px] that agree with an affine function of position (N, 2) [px], and their
     distances from it (N,).
 
     Each window has its own function; what lies within three robust standard deviations of it, or `floor` [px], agrees.

@@ -58,7 +58,7 @@ class Patch(Frozen):
         return _nodes(self.lonlat, self.step, self.shape)
 
     def image(self, view: View) -> Array:
-        """Return where a camera that is off by `moved` shows the nodes (m, n, 2) [px]."""
+        """Return the image points (m, n, 2) [px] of the nodes by a view whose camera is off by `moved`."""
         lonlat = self.nodes() + self.moved / metres_per_unit(np.append(self.lonlat, 0.0))[:2]
         return view.sensor.project(np.concatenate([lonlat, self.heights[..., None]], axis=2))
 
@@ -69,12 +69,12 @@ class Patch(Frozen):
 
 
 def ticks(count: int) -> Array:
-    """Return where the nodes of an axis of `count` px lie [px]."""
+    """Return the positions of the nodes of an axis of `count` px [px]."""
     return np.linspace(0.0, count - 1.0, -(-(count - 1) // _NODE) + 1)
 
 
 def _between(at: Array, count: int) -> Array:
-    """Weights (n, nodes) of the nodes along an axis of `count` px for places (n,)."""
+    """Return the weights (n, nodes) of the nodes along an axis of `count` px for places (n,)."""
     nodes = ticks(count)
     return np.stack([np.interp(at, nodes, row) for row in np.eye(len(nodes))], axis=1)
 
@@ -88,7 +88,7 @@ def _nodes(lonlat: Array, step: float, shape: tuple[int, int]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """An orthoimage: how its pixels lie on the ground."""
+    """An orthoimage and its map projection."""
 
     path: str
     crs: CRS
@@ -119,12 +119,12 @@ class Sheet:
         return np.stack([a * x + b * y + c, d * x + e * y + f], axis=1).reshape(lonlat.shape) - 0.5
 
     def shows(self, lonlat: Array) -> BoolArray:
-        """Return whether places (..., 2) [deg] lie on it."""
+        """Return whether places (..., 2) [deg] lie on the orthoimage."""
         at = self.image(lonlat)
         return np.asarray(((at >= 0) & (at <= np.array(self.size) - 1.0)).all(axis=-1))
 
     def step(self, lonlat: Array) -> float:
-        """Return how large its pixels are at a place (2,) [m]."""
+        """Return the pixel size at a place (2,) [m]."""
         metres = metres_per_unit(np.append(lonlat, 0.0))[:2]
         at = self.image(lonlat + np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]]) / metres)
         return float(10.0 / np.sqrt(abs(np.linalg.det(at[1:] - at[0]))))
@@ -147,15 +147,15 @@ def of_reference(paths: Sequence[str], patch: Patch) -> FloatImage:
 
 
 def shown(picture: FloatImage) -> float:
-    """Return the share of a picture of channels (C, H, W) that shows something."""
+    """Return the share of the pixels of channels (C, H, W) that are not empty."""
     return float((np.abs(picture).sum(axis=0) > 0).mean())
 
 
 def picture(
     path: str, bands: Sequence[int], size: tuple[int, int], nodes: Array, shape: tuple[int, int]
 ) -> tuple[FloatImage, BoolArray]:
-    """Return a raster on a grid (H, W) whose nodes (m, n, 2) lie at its col, row [px], and which pixels mean
-    something.
+    """Resample a raster to a grid (H, W) whose nodes (m, n, 2) lie at its col, row [px]; return also the
+    valid pixels.
 
     Where it is finer than the grid, it is averaged first.
     """
@@ -188,7 +188,9 @@ def picture(
 def _thinned(
     file: tuple[str, tuple[int, int]], bands: Sequence[int], box: Box, thin: int
 ) -> tuple[FloatImage, FloatImage]:
-    """The mean of bands of a window, averaged over `thin` x `thin` px, and how much of each of these is known."""
+    """Return the mean of bands of a window, averaged over `thin` x `thin` px, and how much of each of these
+    is known.
+    """
     cv2.setNumThreads(1)
     picture, valid = np.zeros((box[3], box[2]), np.float32), np.ones((box[3], box[2]), dtype=bool)
     for band in bands:

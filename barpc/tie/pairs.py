@@ -53,7 +53,7 @@ class Area:
         return shapely.transform(self.outline, lambda lonlat: (lonlat - near) * scale)
 
     def contains(self, lonlat: Array) -> BoolArray:
-        """Return which points (N, 2), lon, lat [deg], lie inside; NaN does not."""
+        """Return the points (N, 2), lon, lat [deg], that lie inside; NaN does not."""
         shapely.prepare(self.outline)
         inside: BoolArray = shapely.contains_xy(self.outline, wrap_longitude(lonlat[:, 0]), lonlat[:, 1])
         return inside
@@ -90,7 +90,9 @@ def read_area(path: str | os.PathLike[str]) -> Area:
 
 
 def _valid(polygon: shapely.Polygon) -> shapely.Geometry:
-    """A polygon whose outline does not cross itself; ValueError where it does more often than can be untangled."""
+    """Return a polygon whose outline does not cross itself; ValueError where it does more often than can be
+    untangled.
+    """
     if polygon.is_valid:
         return polygon
     rings = [np.asarray(ring.coords) for ring in (polygon.exterior, *polygon.interiors)]
@@ -106,7 +108,7 @@ def _valid(polygon: shapely.Polygon) -> shapely.Geometry:
 
 
 def _polygons(data: dict[str, Any]) -> Iterator[shapely.Polygon]:
-    """All polygons of a GeoJSON object, whatever they are wrapped in."""
+    """Yield all polygons of a GeoJSON object, whatever they are wrapped in."""
     kind = data["type"]
     if kind in _WRAPPED:
         inner = data[_WRAPPED[kind]]
@@ -124,7 +126,7 @@ def _polygons(data: dict[str, Any]) -> Iterator[shapely.Polygon]:
 
 
 def _ring(positions: list[list[float]]) -> Array:
-    """Vertices (N, 2) of an outline, the first between -180 and 180, its longitudes without jumps."""
+    """Return the vertices (N, 2) of an outline, the first between -180 and 180, its longitudes without jumps."""
     ring = np.array([position[:2] for position in positions], dtype=np.float64).reshape(-1, 2)
     if not (np.isfinite(ring).all() and (np.abs(ring) <= [540.0, 90.0]).all()):
         raise ValueError("a position is not a longitude and a latitude")
@@ -186,7 +188,7 @@ class Footprints:
 
 
 def reach_of(view: View, options: TieOptions) -> float:
-    """Return how far the camera of a view may be wrong, in any direction [px]."""
+    """Return how far a view's camera may be wrong, in any direction [px]."""
     if options.search is not None:
         return options.search
     ground = view.sensor.localize((np.array(view.size) - 1.0) / 2.0, np.array(view.altitude))
@@ -195,7 +197,7 @@ def reach_of(view: View, options: TieOptions) -> float:
 
 
 def _levels(views: Sequence[View]) -> tuple[float, float, float]:
-    """Middle, lowest and highest altitude [m] of what the views' ranges have in common."""
+    """Return the middle, lowest and highest altitude [m] of what the views' ranges have in common."""
     low, high = common_range(*views)
     return 0.5 * (low + high), low, high
 
@@ -284,7 +286,9 @@ def _candidates(
     wanted: set[tuple[int, int]],
     area: Area | None,
 ) -> list[Pair]:
-    """Pairs that overlap, of those wanted (none: all); with grown outlines where that leaves something out."""
+    """Return the pairs that overlap, of those wanted (none: all); with grown outlines where that leaves
+    something out.
+    """
     pairs = overlapping_pairs(views, options, area=area)
     pairs = [pair for pair in pairs if not wanted or pair.views in wanted]
     known = {pair.views for pair in pairs}
@@ -319,8 +323,8 @@ def shared_tiles(
     area: Area | None = None,
     boxes: Sequence[Sequence[Box]] | None = None,
 ) -> list[list[Box]]:
-    """Return the tiles (or `boxes`) of every view that a partner may see in the area, though cameras be wrong
-    (`reach_of`).
+    """Return the tiles (or `boxes`) of every view that a partner may see in the area, with cameras wrong by
+    `reach_of`.
     """
     boxes = boxes or [tiles(view.size, options) for view in views]
     seen = [np.zeros(len(of_view), dtype=bool) for of_view in boxes]

@@ -32,7 +32,7 @@ class Store:
     scratch = "arrays"  # where names of a run that need not outlive it begin
 
     def write(self, name: str, arrays: Arrays) -> None:
-        """Keep named arrays, whole or not at all; not if a file that they were made of has changed."""
+        """Write named arrays, whole or not at all; not if a file that they were made of has changed."""
         identity.ask()
         path = Path(self.folder) / f"{name}.npz"
         with (
@@ -60,13 +60,13 @@ class Store:
         return found
 
     def clear(self) -> None:
-        """Take away what lies under `scratch`."""
+        """Remove what lies under `scratch`."""
         shutil.rmtree(Path(self.folder) / self.scratch, ignore_errors=True)
 
 
 @contextmanager
 def store_of(executor: Executor | None) -> Iterator[Store]:
-    """The executor's store (`barpc.pipeline.executor`), or a temporary one."""
+    """Yield the executor's store (`barpc.pipeline.executor`), or a temporary one."""
     given: Store | None = getattr(executor, "store", None)
     if given is not None:
         yield given
@@ -78,7 +78,7 @@ def store_of(executor: Executor | None) -> Iterator[Store]:
 def names_of(
     executor: Executor | None, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]
 ) -> list[str]:
-    """Return the names for results: by the content of inputs where the executor knows it, so that a later run
+    """Return names for results, by the content of inputs where the executor knows it, so that a later run
     finds them.
     """
     key = getattr(executor, "key", None)

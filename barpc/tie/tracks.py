@@ -55,7 +55,7 @@ _QUOTAS = (4, 8, 16)
 
 @dataclass(frozen=True, eq=False)
 class TieResult:
-    """Tie points, and how they came about."""
+    """Tie points and the reports of their pairs."""
 
     tracks: Tracks
     pairs: tuple[PairReport, ...]  # one a pair that was tried
@@ -122,7 +122,9 @@ def find_tracks(
 def _registered(
     trials: _Trials, area: Area | None, given: GivenMatches, options: TieOptions, work: dict[str, Any]
 ) -> tuple[Tracks, dict[tuple[int, int], int]]:
-    """What the pairs that were tried have in common, evenly thinned and registered, and how much of it is not."""
+    """Return what the pairs that were tried have in common, evenly thinned and registered, and how much of it
+    is not.
+    """
     looks, most = trials.looks, options.points_per_image
     tried = [(looks.ends[views], *trials.tried[views][1:]) for views in sorted(trials.tried)]
     linked = inside(looks.views, link([ends for ends, _, _ in tried], [found for _, found, _ in tried]), area)
@@ -147,7 +149,7 @@ def _registered(
 def _needed(
     looks: Looks, tracks: Tracks, pairs: Sequence[tuple[int, int]], options: TieOptions
 ) -> set[tuple[int, int]]:
-    """The pairs of looks between views that no pair with enough registered tracks connects."""
+    """Return the pairs of looks between views that no pair with enough registered tracks connects."""
     counts = pair_counts(tracks)
     firm = [
         (int(looks.of[i]), int(looks.of[j])) for i, j in pairs if counts.get((i, j), 0) >= options.min_matches
@@ -218,7 +220,7 @@ class _Trials:
         return tuple(count.astype(int).tolist())
 
     def _judged(self, pairs: Sequence[Pair]) -> list[Pair]:
-        """Pairs with their quick scores, where keypoints can tell."""
+        """Return the pairs with their quick scores, where keypoints can tell."""
         new = [
             p for p in pairs if self._compares and p.views not in self._given and p.views not in self._scores
         ]
@@ -247,7 +249,9 @@ class _Trials:
     def _matched(
         self, pairs: Sequence[Pair], before: Sequence[tuple[tuple[View, View], Matches]]
     ) -> list[tuple[Matches, PairReport]]:
-        """Matches of pairs of looks by a first look, and by a closer one at those of which that shows too little."""
+        """Return the matches of pairs of looks by a first look, and by a closer one at those of which that
+        shows too little.
+        """
         views, options, keypoints = self.looks.views, self._options, self._keypoints
         first = match(views, keypoints, pairs, options, once=True, **self._work) if self._coarse else []
         found = {p.views: one for p, one in zip(pairs, first, strict=False) if ample(one[1], options)}
@@ -269,7 +273,9 @@ class _Trials:
 def _unlike(
     views: Sequence[View], given: GivenMatches, options: TieOptions, work: Mapping[str, Any]
 ) -> list[tuple[int, int]]:
-    """The given pairs whose grey values do not compare: too few of their matches could be registered by these."""
+    """Return the given pairs whose grey values do not compare: too few of their matches could be registered
+    by these.
+    """
     some = {
         pair: m.select(np.linspace(0, len(m) - 1, min(len(m), THIN)).astype(int)) for pair, m in given.items()
     }
@@ -282,7 +288,7 @@ def _unlike(
 def _with_unregistered(
     views: Sequence[View], tracks: Tracks, given: GivenMatches, options: TieOptions
 ) -> Tracks:
-    """Tracks, and the verified matches of those of some pairs of which too few could be registered."""
+    """Return the tracks, and the verified matches of those of some pairs of which too few could be registered."""
     counts = pair_counts(tracks)
     lost = [pair for pair in given if counts.get(pair, 0) < options.min_matches]
     if not lost:
@@ -297,7 +303,9 @@ def _with_unregistered(
 
 
 def _joined(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
-    """Registered tracks and others: one that stands beside a registered one is the same point, seen by more views."""
+    """Return the registered tracks and others: one that stands beside a registered one is the same point,
+    seen by more views.
+    """
     known, asked = (np.array([_APART * part.view, *part.xy.T]).T for part in (tracks, others))
     near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=_SAME))
     same = np.flatnonzero(np.isfinite(near))
@@ -360,7 +368,7 @@ def require_tracks(
     pairs: Sequence[Pair],
     reports: Sequence[PairReport],
 ) -> None:
-    """As `require_matches`, for the pairs that `NEEDED` tracks or more are left of."""
+    """Raise as `require_matches`, for the pairs that keep `NEEDED` tracks or more."""
     left, counts = [], pair_counts(tracks)
     for pair, report in zip(pairs, reports, strict=True):
         common = counts.get(pair.views, 0)
@@ -370,7 +378,8 @@ def require_tracks(
 
 
 def link(pairs: Sequence[tuple[int, int]], matches: Sequence[Matches]) -> Tracks:
-    """Join matches of pairs of views that share points; a track that meets a view twice is thrown away.
+    """Link matches of pairs of views into tracks by shared points; a track that meets a view twice is thrown
+    away.
 
     The order of the pairs does not matter: tracks are ordered by their first observation. An observation's sigma is
     that of the best match it took part in.
@@ -389,7 +398,7 @@ def link(pairs: Sequence[tuple[int, int]], matches: Sequence[Matches]) -> Tracks
 
 
 def _clean(view: IntArray, label: IntArray, xy: Array, sigma: Array) -> Tracks:
-    """Rows grouped by track and sorted by view; tracks with two points of one view dropped."""
+    """Return the rows grouped by track and sorted by view; tracks with two points of one view dropped."""
     order = np.lexsort((view, label))
     view, label, xy, sigma = view[order], label[order], xy[order], sigma[order]
     twice = (np.diff(view) == 0) & (np.diff(label) == 0)
@@ -404,7 +413,7 @@ def _clean(view: IntArray, label: IntArray, xy: Array, sigma: Array) -> Tracks:
 
 
 def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], most: int) -> Tracks:
-    """Fewer tracks, evenly spread: long and accurate ones first, about `most` observations in an image.
+    """Thin tracks evenly: long and accurate ones first, about `most` observations in an image.
 
     `sizes` are those (width, height) of the images. A track is taken where a cell of one of its views is not full yet.
     """
@@ -421,7 +430,9 @@ def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], most: int) -> Tracks:
 
 
 def _fill(tracks: Tracks, cell: list[int], num_cells: int, most: int, num_views: int) -> BoolArray:
-    """Mask of the tracks that are taken, greedily, in rounds of growing quota where images have empty parts."""
+    """Return the mask of the tracks that are taken, greedily, in rounds of growing quota where images have
+    empty parts.
+    """
     starts = np.searchsorted(tracks.point, np.arange(tracks.num_points + 1))
     worst = np.maximum.reduceat(tracks.sigma, starts[:-1])
     # Knuth's multiplicative hash: an order without direction among equals
@@ -448,7 +459,7 @@ def _fill(tracks: Tracks, cell: list[int], num_cells: int, most: int, num_views:
 
 
 def pair_counts(tracks: Tracks) -> dict[tuple[int, int], int]:
-    """Return how many tracks the pairs of views, ascending, have in common; only those that have any."""
+    """Count the tracks that pairs of views, ascending, have in common; only pairs that have any."""
     found, step, num = [np.empty(0, np.int64)], 1, int(tracks.view.max(initial=0)) + 1
     while step < len(tracks) and (same := tracks.point[step:] == tracks.point[:-step]).any():
         found.append(tracks.view[:-step][same] * num + tracks.view[step:][same])
@@ -458,7 +469,7 @@ def pair_counts(tracks: Tracks) -> dict[tuple[int, int], int]:
 
 
 def common_tracks(tracks: Tracks, first: int, second: int) -> tuple[Array, Array]:
-    """Return the image points (M, 2), (M, 2) [px] of the tracks that two views have in common, in the same order."""
+    """Return image points (M, 2), (M, 2) [px] of the tracks that two views have in common, in the same order."""
     a, b = tracks.view == first, tracks.view == second
     _, rows_a, rows_b = np.intersect1d(tracks.point[a], tracks.point[b], return_indices=True)
     return tracks.xy[a][rows_a], tracks.xy[b][rows_b]

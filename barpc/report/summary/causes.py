@@ -175,7 +175,7 @@ def _moving(one: Finding, motion: Motion, names: Sequence[str]) -> ExplanationEn
 
 
 def _place(motion: Motion) -> str:
-    """Where most of a group lies: a side of the block where it is on one, and longitudes and latitudes."""
+    """Return where most of a group lies: a side of the block where it is on one, and longitudes and latitudes."""
     west, south, east, north = motion.box
     # as many digits as tell the ends apart by a hundredth: of a scene of any size
     size = max(min((east - west) % 360.0, north - south), 1e-6)

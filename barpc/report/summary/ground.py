@@ -210,13 +210,15 @@ def measure_control(run: Run) -> ControlTestEntry | None:
 
 
 def _grouped(index: IntArray, num: int) -> list[IntArray]:
-    """The places in `index` (n,) of each number below `num`."""
+    """Return the places in `index` (n,) of each number below `num`."""
     order = np.argsort(index, kind="stable")
     return np.split(order, np.searchsorted(index[order], np.arange(1, num)))[:num]
 
 
 def _in_images(run: Run, given: Array, views: IntArray, residual: Array) -> float:
-    """How far a residual (3,), east, north, up [m], of a ground point moves it in the images that show it, RMS [px]."""
+    """Return how far a residual (3,), east, north, up [m], of a ground point moves it in the images that show
+    it, RMS [px].
+    """
     if run.after is None or not np.isfinite(residual).all():
         return float("nan")
     moved = ground_from_ecef(ecef_from_ground(given) + residual @ enu_basis(given))

@@ -133,7 +133,9 @@ def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
 
 
 def _pair_geometry(run: Run) -> list[list[float]]:
-    """Medians over about a hundred of each pair's points: convergence angle [deg], B/H, height of a pixel [m]."""
+    """Return the medians over about a hundred of each pair's points: convergence angle [deg], B/H, height of
+    a pixel [m].
+    """
     picks = [slice(None, None, max(1, len(ties.a) // 100)) for ties in run.pairs]
     a, b, pair = _rows(run, picks)
     seen = np.isfinite(run.ground[run.tracks.point[a]]).all(axis=1)
@@ -149,7 +151,7 @@ def _pair_geometry(run: Run) -> list[list[float]]:
 
 
 def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> list[OffsetEntry | None]:
-    """The epipolar offsets of each pair's matches.
+    """Return the epipolar offsets of each pair's matches.
 
     The tracks' altitudes (P,) [m] through these cameras are so near to where a pair's own rays pass each other that
     two steps from there arrive.

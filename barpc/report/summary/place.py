@@ -72,7 +72,7 @@ def clocks_in_image(model: Timed, covariance: Array, ground: Array) -> tuple[Arr
 
 
 def _drawn(variance: Array, by_level: Array) -> EllipseEntry:
-    """The ellipse of a covariance [px^2] in an image, of its derivative (2, 2) [px/m] by east and north."""
+    """Return the ellipse of a covariance [px^2] in an image, of its derivative (2, 2) [px/m] by east and north."""
     seen = np.linalg.inv(by_level)  # at one altitude
     values, axes = np.linalg.eigh(seen @ variance @ seen.T)
     minor, major = np.sqrt(np.maximum(values, 0.0)).tolist()
@@ -83,7 +83,9 @@ def _drawn(variance: Array, by_level: Array) -> EllipseEntry:
 def _in_image(
     model: Corrected, covariance: Array, unknowns: str, ground: Array
 ) -> tuple[Array, Array, Array]:
-    """Image (2,) of a ground point, the covariance (2, 2) of that [px^2], its derivative (2, 3) by the point [px/m]."""
+    """Return the image (2,) of a ground point, the covariance (2, 2) of that [px^2], its derivative (2, 3) by
+    the point [px/m].
+    """
     ecef = ecef_from_ground(ground)
     image, by_point, by_rotation, by_translation = model.project_ecef(ecef)
     distance = np.linalg.norm(ecef - model.correction.center)
@@ -118,7 +120,7 @@ def ce90(major: float, minor: float) -> float:
 
 @cache
 def _radii() -> tuple[Array, Array]:
-    """The radius for a larger axis of one, by the smaller one: the integral over x of what y holds, bisected."""
+    """Return the radius for a larger axis of one, by the smaller one: the integral over x of what y holds, bisected."""
     ratio = np.linspace(0.0, 1.0, 101)
     nodes, weights = np.polynomial.legendre.leggauss(64)
     low, high = np.full(len(ratio), 1.6), np.full(len(ratio), 2.2)

@@ -75,8 +75,8 @@ def mosaic(
 
 
 def mosaic_offsets(swaths: Sequence[Annotation]) -> Array:
-    """Return where the stitched frames of the swaths of one SLC product begin in that of their mosaic: col,
-    row (S, 2) [px].
+    """Return the offsets col, row (S, 2) [px] of the stitched swath frames of one SLC product in that of
+    their mosaic.
 
     Whole numbers to within 1e-3 in products since 2016. InputError for a GRD, or swaths that are not of one product.
     """
@@ -180,7 +180,7 @@ def _from_zip(path: Path, what: str, use: Callable[[zipfile.ZipFile], T]) -> T:
 
 
 def _annotations(path: Path) -> list[_File]:
-    """The annotations of a product, in order of swath and polarisation."""
+    """Return the annotations of a product, in order of swath and polarisation."""
     if path.name == "manifest.safe":
         path = path.parent
     if path.is_dir():
@@ -199,7 +199,7 @@ def _annotations(path: Path) -> list[_File]:
 
 
 def _named(path: Path, member: str | None) -> _File | None:
-    """The file, if its name is that of an annotation."""
+    """Return the file, if its name is that of an annotation."""
     match = _NAME.fullmatch(path.name if member is None else PurePosixPath(member).name)
     return match and _File(match["swath"].lower(), match["pol"].lower(), path, member)
 

@@ -47,7 +47,7 @@ class Burst:
 
 @dataclass(frozen=True)
 class BurstRows:
-    """Where a burst stands in the stitched frame."""
+    """Rows of a burst in the stitched frame."""
 
     first_line: int  # of the burst in the measurement file
     first_row: int  # frame row of that line
@@ -105,7 +105,7 @@ class Annotation:
 
     @property
     def kind(self) -> str:
-        """What it is, for messages."""
+        """Kind of product, for messages."""
         return f"a {self.mode} {self.product_type} of {self.swath}"
 
     def line_time(self, line: Array) -> TimeArray:
@@ -122,7 +122,7 @@ class Annotation:
 
 
 def burst_rows(annotation: Annotation) -> list[BurstRows]:
-    """Return where the bursts of a TOPS SLC swath stand in the stitched frame; overlaps are cut at their
+    """Return the rows of the bursts of a TOPS SLC swath in the stitched frame; overlaps are cut at their
     middle.
 
     RpcFormatError for bursts out of order, or one without a valid line.
@@ -217,7 +217,7 @@ def _times(rows: Sequence[Fields], tag: str) -> TimeArray:
 
 
 def _states(vectors: Sequence[Fields], time: str, tags: Sequence[str], source: str) -> StateVectors:
-    """State vectors whose time is named `time`, and x, y, z of position and of velocity by `tags`."""
+    """Return the state vectors whose time is named `time`, and x, y, z of position and of velocity by `tags`."""
     table = np.reshape([[v.numbers(tag)[0] for tag in tags] for v in vectors], (-1, 6))
     return StateVectors(_times(vectors, time), table[:, :3], table[:, 3:], source)
 

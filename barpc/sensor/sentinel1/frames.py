@@ -86,7 +86,7 @@ class GroundFrame(Frozen):
         return np.stack([time, slant * (2.0 / SPEED_OF_LIGHT)])
 
     def _ground_range(self, time: Array, slant: Array) -> tuple[Array, Array, Array]:
-        """Ground range (N,) [m] and its derivatives by slant range [m/m] and time [m/s]."""
+        """Return the ground range (N,) [m] and its derivatives by slant range [m/m] and time [m/s]."""
         coeffs, rates, origin, drift = self._listed_at(time)
         u = slant - origin
         value, by_slant, by_time = np.zeros((3, len(u)))
@@ -97,7 +97,7 @@ class GroundFrame(Frozen):
         return value, by_slant, by_time - drift * by_slant
 
     def _listed_at(self, time: Array) -> tuple[Array, Array, Array, Array]:
-        """Coefficients (K, N) and their rates [1/s], origins (N,) [m] and theirs [m/s], at times (N,)."""
+        """Return the coefficients (K, N) and their rates [1/s], origins (N,) [m] and theirs [m/s], at times (N,)."""
         if len(self.listed) == 1:
             coeffs, still = np.repeat(self.coeffs.T, len(time), axis=1), np.zeros(len(time))
             return coeffs, np.zeros_like(coeffs), still + self.origin[0], still
@@ -113,7 +113,7 @@ Frame = SlantFrame | GroundFrame
 
 @dataclass(frozen=True)
 class Delays:
-    """Which delays are added to the geometric times.
+    """Delays that are added to the geometric times.
 
     That of the path through the atmosphere, one way, is (2.41 - h/3411 + h^2/8.55e7) m / cos(incidence), h the altitude
     [m] (Jehle et al., "Estimation of Atmospheric Path Delays in TerraSAR-X Data using Models vs. Measurements", Sensors
@@ -128,8 +128,8 @@ class Delays:
         return self.atmosphere or self.bistatic is not None or self.timing is not None
 
     def shift(self, times: Array, ground: Array, sight: Array) -> Array:
-        """Return what is added to times (2, N), of points (N, 3) that see the satellite along unit vectors
-        (3, N) [s].
+        """Return the delays (2, N) [s] added to the times of points (N, 3) that see the satellite along unit
+        vectors (3, N).
         """
         out = np.zeros_like(times)
         if self.bistatic is not None:
@@ -197,11 +197,11 @@ def bistatic_constant(annotation: Annotation, form: Bistatic) -> float:
 
 
 def _as_times(late: Array) -> Array:
-    """Range [m] and azimuth time [s] (2, N) as azimuth time and two-way range time [s]."""
+    """Return the range [m] and azimuth time [s] (2, N) as azimuth time and two-way range time [s]."""
     return np.stack([late[1], late[0] * (2.0 / SPEED_OF_LIGHT)])
 
 
 def _zenith(alt: Array) -> tuple[Array, Array]:
-    """Zenith path delay (N,) [m] at altitudes [m], and its derivative."""
+    """Return the zenith path delay (N,) [m] at altitudes [m], and its derivative."""
     a, b, c = _ZENITH
     return a + alt * (b + alt * c), b + 2 * c * alt

@@ -154,7 +154,7 @@ class RangeDoppler(Frozen):
 
     @property
     def speed(self) -> float:
-        """Of the flight, at the image's middle row [m/s]."""
+        """Speed of the flight at the image's middle row [m/s]."""
         _, velocity = self.orbit(np.array([0.5 * self.size[1] * self.frame.interval]))
         return float(np.linalg.norm(velocity))
 
@@ -165,7 +165,9 @@ class RangeDoppler(Frozen):
         return replace(self, delays=replace(self.delays, timing=timing))
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """Return as of `barpc.sensor.timing.Clocked`; rows of pure geometry."""
+        """Return image points and derivatives as `barpc.sensor.timing.Clocked` asks; the coordinate is the
+        row of pure geometry.
+        """
         image, by_ground, by_timing, row = pointwise(
             self._derivatives, CHUNK, [(2,), (2, 3), (2, 2), ()], ground
         )
@@ -250,7 +252,7 @@ class RangeDoppler(Frozen):
         return [image.T]
 
     def _derivatives(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """What `timing_jacobian` hands out."""
+        """Return what `timing_jacobian` hands out."""
         seen = self._geometry(ecef_from_ground(ground))
         by_ecef = np.stack([seen.time_by_ecef.T, seen.sight.T * (-2.0 / SPEED_OF_LIGHT)])  # (2, N, 3)
         ecef_by_ground = ecef_from_ground_jacobian(ground)
@@ -276,7 +278,7 @@ class RangeDoppler(Frozen):
         return ground
 
     def _on_circle(self, times: Array, alt: Array) -> tuple[Array, Array]:
-        """Points (N, 3) at times (2, N) and altitudes (N,), and the unit vectors (3, N) to the satellite."""
+        """Return the points (N, 3) at times (2, N) and altitudes (N,), and the unit vectors (3, N) to the satellite."""
         low, high = self.orbit.span
         time = np.where((times[0] >= low) & (times[0] <= high), times[0], np.nan)
         position, velocity, _ = self.orbit.states(time)
@@ -295,14 +297,14 @@ class _Seen:
     time_by_ecef: Array
 
     def sight_by_ecef(self) -> Array:
-        """(N, 3, 3): d(sight)/dX, the satellite moving along with the zero-Doppler time."""
+        """Return (N, 3, 3): d(sight)/dX, the satellite moving along with the zero-Doppler time."""
         moved = np.einsum("in,jn->nij", self.velocity, self.time_by_ecef) - np.eye(3)
         moved += np.einsum("in,jn->nij", self.sight, self.sight)  # velocity has no part along the sight
         return np.asarray(moved / self.distance[:, None, None])
 
 
 def extent(annotation: Annotation, burst: int | None = None) -> tuple[np.datetime64, int]:
-    """Time of row 0 and number of rows: of a burst, or of all there is, stitched."""
+    """Return the time of row 0 and the number of rows: of one burst, or of all bursts stitched."""
     if burst is not None:
         if not 0 <= burst < len(annotation.bursts):
             raise InputError(f"{annotation.name}: no burst {burst}, it has {len(annotation.bursts)}")
@@ -351,7 +353,9 @@ def build(
 
 
 def grid_residuals(annotation: Annotation, model: RangeDoppler) -> Array:
-    """Return the model - a swath's own geolocation grid, geometry only: range [samples], azimuth [lines], (G, 2)."""
+    """Return the model minus a swath's own geolocation grid, geometry only: range [samples], azimuth [lines],
+    (G, 2).
+    """
     grid = annotation.grid
     azimuth_time, range_time = model.azimuth_range(grid.ground)
     samples = (range_time - grid.range_time) * annotation.range_sampling_rate
@@ -365,7 +369,7 @@ def _orbit(annotation: Annotation, states: StateVectors, epoch: np.datetime64) -
 
 
 def _frame(annotation: Annotation, epoch: np.datetime64) -> Frame:
-    """The frame of an SLC, or of a GRD (which has ground range polynomials)."""
+    """Return the frame of an SLC, or of a GRD (which has ground range polynomials)."""
     interval, convert = annotation.azimuth_time_interval, annotation.ground_range
     if annotation.product_type == "SLC":
         return SlantFrame(annotation.slant_range_time, annotation.range_sampling_rate, interval)

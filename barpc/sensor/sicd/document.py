@@ -47,7 +47,7 @@ def find_sicd(path: Path) -> bytes | None:
 
 
 def _extensions(file: BinaryIO) -> list[bytes]:
-    """The data of all data extensions of a NITF."""
+    """Return the data of all data extensions of a NITF."""
     file.seek(_COUNTS - 6)
     place = _digits(file, 6)
     found = []
@@ -157,12 +157,12 @@ def _accuracy(root: Fields, scp: Array) -> tuple[float, float] | None:
 
 
 def _error(root: Fields, path: str) -> float:
-    """A standard deviation [m]; 0 where it is not stated."""
+    """Return a standard deviation [m]; 0 where it is not stated."""
     return max([0.0, *(float(one.numbers(".")[0]) for one in root.all(f"ErrorStatistics/{path}"))])
 
 
 def _orbit(root: Fields) -> Curve:
-    """ARPPoly over the time of the collection."""
+    """Return the aRPPoly over the time of the collection."""
     axes = [_polynomial(root, f"Position/ARPPoly/{axis}", 1) for axis in "XYZ"]
     coeffs = np.zeros((1, max(map(len, axes)), 3))
     for k, axis in enumerate(axes):
@@ -171,7 +171,7 @@ def _orbit(root: Fields) -> Curve:
 
 
 def _polynomial(root: Fields, path: str, variables: int) -> Array:
-    """Coefficients by their powers, (K,) or (K, L)."""
+    """Return the coefficients by their powers, (K,) or (K, L)."""
     terms = root.all(f"{path}/Coef")
     if not terms:
         raise RpcFormatError(f"{root.name}: no {path}; is the file complete?")
@@ -186,7 +186,7 @@ def _polynomial(root: Fields, path: str, variables: int) -> Array:
 
 
 def _formation(root: Fields, scp: Array) -> Formation:
-    """By Grid/Type and, for RGAZIM, ImageFormation/ImageFormAlgo."""
+    """Return the by Grid/Type and, for RGAZIM, ImageFormation/ImageFormAlgo."""
     time, kind = _polynomial(root, "Grid/TimeCOAPoly", 2), root.text("Grid/Type")
     if kind == "RGAZIM":
         algorithm = root.text("ImageFormation/ImageFormAlgo")
