@@ -209,7 +209,7 @@ def _open_sentinel1(path: Place, pol: str | None = None, **choices: Any) -> Came
 
 
 def _radar(key: str, path: Place, opened: Callable[[Path], Any]) -> Camera:
-    """Return a radar's own model; ImageError on another host, for it is of many files."""
+    """Open a radar's own model; ImageError on another host, as it consists of many files."""
     if not isinstance(path, Path):
         raise ImageError(f"{path}: a radar product is read from disk only")
     model = opened(path)
@@ -297,7 +297,7 @@ def _interval(text: str) -> tuple[float, float]:
 
 
 def _is_physical(path: Place, head: bytes, choices: Mapping[str, Any]) -> bool:
-    """Return where it is asked for, or an XML holds it and no RPC."""
+    """Return whether the physical model is asked for, or is all that an XML holds."""
     if "model" in choices or not isinstance(path, Path):
         return choices.get("model") == "physical"
     return _VENDORS(head) is not None and only_physical(path)

@@ -179,7 +179,7 @@ def _inverse(forward: Affine, path: Place) -> Affine:
 
 
 def _vertical_reference(wkt: str) -> str:
-    """Return what heights in a CRS count from: the name of its vertical part, or the ellipsoid of a 3-D CRS."""
+    """Return the vertical reference of a CRS: the name of its vertical part, or the ellipsoid of a 3-D CRS."""
     match = _VERTICAL.search(wkt)
     if match:
         return "ellipsoid" if "ellipsoid" in match.group(1).lower() else match.group(1)

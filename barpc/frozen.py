@@ -63,7 +63,7 @@ class Frozen:
         return [field.name for field in fields(self) if field.init]  # type: ignore[arg-type]  # children are dataclasses
 
     def _told(self) -> str:
-        """Return what is printed of it."""
+        """Return the fields to be printed."""
         return ", ".join(f"{name}={_short(getattr(self, name))}" for name in self._given())
 
     def __repr__(self) -> str:
@@ -84,7 +84,7 @@ class Frozen:
 
 
 def _plain(value: object) -> object:
-    """Return what stands for a value when it is compared; -0.0 is 0.0."""
+    """Return a value in the form in which it is compared; -0.0 is 0.0."""
     if not isinstance(value, np.ndarray):
         return value
     return value.shape, (value + 0.0 if value.dtype.kind == "f" else value).tobytes()

@@ -184,7 +184,7 @@ def _readers(path: Path) -> dict[str, bool]:
 
 
 def _readings(path: Path, ground: Array, image: Array) -> list[Reading]:
-    """Return what all consumers make of a file, which is lent to those that are not barpc."""
+    """Read a file with all consumers; those that are not barpc get it in a folder of its own."""
     names = [name for name, installed in _readers(path).items() if installed]
     try:
         with _lent(path) as lent:
@@ -207,7 +207,7 @@ def _reading(path: Path, lent: Path, name: str, ground: Array, image: Array) -> 
 
 
 def _unread(path: Path, name: str, failure: Exception) -> Reading:
-    """Return what a reader says; OutputError where it is the machine that says it, of which no file is to blame."""
+    """Return a reader's message; OutputError where the machine and not the file is to blame."""
     if isinstance(failure, OSError) and failure.errno in _MACHINE:
         raise OutputError(f"{path}: cannot be opened as {name} does ({failure.strerror})") from failure
     return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
@@ -325,8 +325,8 @@ def _shareloc(path: Path) -> Projection:
 
 
 def _told(found: Array, lon: Array) -> Array:
-    """Return what shareloc found (N, ...) at longitudes; OutputError where it leaves out those beyond 180
-    degrees alone.
+    """Return image points (N, ...) that shareloc found; OutputError where it fails beyond 180 degrees of
+    longitude alone.
     """
     lost, beyond = ~np.isfinite(found).all(axis=1), np.abs(lon) > 180.0
     if lost.any() and not (lost & ~beyond).any():
@@ -380,7 +380,7 @@ def _linear_grid(path: Path) -> Projection:
 
 
 def _gdal_correction(path: Path) -> Projection:
-    """As whoever resamples reads it: values at the places that GDAL gives for the centres of its pixels."""
+    """Read a correction grid as a resampler does: values at the places that GDAL gives for its pixels' centres."""
     from scipy.interpolate import RegularGridInterpolator
 
     rpc = _gdal_raster(path)

@@ -199,7 +199,7 @@ def _plain(kind: Any, rule: Rule, value: Any) -> Any:
 
 
 def _is_plain(number: float) -> bool:
-    """Return whether a number that is not 0 has a size that options have."""
+    """Return whether the size of a number other than 0 is one that options allow."""
     return 1 / _REAL <= abs(number) <= _REAL
 
 

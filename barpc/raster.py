@@ -97,7 +97,7 @@ def _opened(file: Place, driver: str) -> Any:
 
 
 class _Asked(RemoteFile):
-    """What GDAL reads from: it takes an exception for nothing, so failures are kept for `_opened_remote`."""
+    """A file object that GDAL reads from; failures are kept for `_opened_remote`, as GDAL takes no exception."""
 
     def __init__(self, at: Remote, failures: list[OSError]) -> None:
         super().__init__(at)
@@ -336,7 +336,7 @@ class Mosaic:
 
 
 def _handed_on(values: Pixels, source: Source, dtype: str) -> tuple[Any, Pixels]:
-    """Return which values a source hands on, as an index, and what they become."""
+    """Return the mask of values that a source passes on, and what they become."""
     keep: Any = ...
     if source.plain:
         return keep, values

@@ -75,7 +75,7 @@ class Kind:
 
 
 def _count(text: bytes, between: bytes) -> int:
-    """Return how many values stand in a text: the signs between them, of blanks one of each row of them."""
+    """Count the values of a text: by the signs between them, of blanks one a row."""
     one_each = sum(text.count(sign) for sign in between if sign != _BLANK)
     return one_each + (len(re.findall(rb" (?! )", text)) if _BLANK in between else 0)
 
@@ -266,9 +266,7 @@ def parse_json(text: str) -> Any:
 
 
 def _depth(text: str) -> int:
-    """Return how many brackets of a JSON text are open at most, those in its strings left out; a bound where
-    they are few.
-    """
+    """Return the nesting depth of a JSON text, strings left out; an upper bound where it is small."""
     few = text.count("[") + text.count("{")
     if few <= _MAX_DEPTH:
         return few

@@ -39,7 +39,7 @@ _SHIFT = 1e-3  # px; a rectangle that lies less beside whole pixels is meant to 
 
 
 class _Tag(NamedTuple):
-    """What may stand in an element: a pattern of its text, of its attributes, and its children."""
+    """Allowed content of an element: a pattern of its text, of its attributes, and its children."""
 
     text: str | None = None
     attributes: Mapping[str, str] = {}

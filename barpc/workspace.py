@@ -344,7 +344,7 @@ def _content(path: Path) -> str | None:
 
 
 def _digest(path: Path) -> str | None:
-    """As `_content`; None also where there is nothing, or it cannot be read. No FIFO is waited for."""
+    """Hash as `_content`; None also where there is nothing, or it cannot be read. No FIFO is waited for."""
     try:
         return _content(path)
     except (OSError, ValueError):
@@ -368,7 +368,7 @@ def _owns(folder: Path, name: str, sha: str) -> bool:
 
 
 def _read_state(folder: Path) -> dict[str, Any]:
-    """Return what state.json holds; nothing where it is missing, damaged, too large or no regular file."""
+    """Read state.json; nothing where it is missing, damaged, too large or no regular file."""
     try:
         state = json.loads(_text(folder / STATE / STATE_FILE))
     except (ValueError, RecursionError):

@@ -153,8 +153,7 @@ def _first(
 def _with_apart(
     whole: Adjustment, apart: Apart, found: Solution, others: Block, parts: tuple[Block, Block], limit: float
 ) -> Adjustment:
-    """Return what is handed out, with the view that the others were adjusted without: adjusted alone, or as
-    delivered.
+    """Return the result with the view that the others were adjusted without: adjusted alone, or as delivered.
 
     `parts` have its observations, those that might take part and those kept out; it is measured on the others' points.
     """
@@ -223,7 +222,7 @@ def _choose_model(
 
 
 def _in_image(found: Solution, parts: Parts, options: AdjustOptions, dem: Terrain | None) -> Solution | None:
-    """Return the block solved by an affine in the image, where something is left for it and that is much better."""
+    """Solve the block with an affine in every image, where something is left for it and that is much better."""
     skew = found.is_skew
     if not (skew or found.has_trend):
         return None
@@ -240,7 +239,7 @@ def _is_calm(found: Solution, block: Block, floor: float) -> bool:
 def _adjustment(
     found: Solution, parts: Parts, options: AdjustOptions, in_space: float | None, start: float
 ) -> Adjustment:
-    """Return what is handed out, in the order of the tracks given."""
+    """Assemble the `Adjustment`, its points and observations in the order of the tracks given."""
     block, outer, apart = parts.inner, parts.outer, parts.apart
     outcome, final, seen = found.outcome, found.final, found.seen
     delivered = found.problem.camera_prior.mean
@@ -325,7 +324,7 @@ def _said(findings: Sequence[Finding], parts: Parts, points: Array) -> Iterator[
 
 
 def _control(found: Solution, block: Block, covariance: Covariance, inlier: BoolArray) -> dict[str, Any]:
-    """Return what is said of GCPs and of a reference's points, whose observations (M + R,) were kept or not."""
+    """Return the tests of GCPs and of a reference's points, whose observations (M + R,) were kept or not."""
     w, gcps = block.in_order(_control_w(found, block, covariance)), len(block.gcps.view)
     w = w[len(w) - len(inlier) :]
     return {
@@ -355,8 +354,8 @@ def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
 
 
 def _place(found: Solution, block: Block, covariance: Covariance) -> tuple[GaugeReport, Mapping[str, Array]]:
-    """Return where the scene went and how well that is known, and what holds it; the scene of an earlier run
-    is its own.
+    """Report the motion and the accuracy of the scene's place, and what holds it; an earlier run keeps its
+    own scene.
     """
     known, outcome = (block.num_tracks, block.num_known), found.outcome
     gauge = _gauge(found, block, covariance)

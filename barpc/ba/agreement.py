@@ -223,7 +223,7 @@ class _Search:
                 yield mask
 
     def _refine(self, n: int) -> None:
-        """Put single points that may as well be in as out of a set where that is better, as long as it is."""
+        """Move single points into or out of a set as long as that raises its evidence."""
         for _ in range(self.count):
             squared = _evidence(self.offsets, self.masks[n][None], self.scale[n])[1][0]
             doubtful = np.flatnonzero((squared > 0.5 * _NEAR) & (squared < 2.0 * _NEAR))
@@ -234,7 +234,7 @@ class _Search:
                 break
 
     def _add(self, masks: BoolArray) -> None:
-        """Sets that are looked at, too."""
+        """Add sets to those whose evidence is compared."""
         score, scale = self._scored(masks)
         self.masks = np.concatenate([self.masks, masks])
         self.score, self.scale = np.append(self.score, score), np.append(self.scale, scale)

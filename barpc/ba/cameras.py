@@ -129,7 +129,7 @@ class Cameras:
         wanted: Wanted,
         seen: Array | None,
     ) -> Projected:
-        """Of cameras that are turned and shifted."""
+        """Project points through cameras that are turned and shifted."""
         unknowns = self.unknowns
         drift = row = None
         if unknowns.drift:
@@ -150,7 +150,7 @@ class Cameras:
         return Projected(image, by_point, by_unknown)
 
     def _timed(self, params: Array, ecef: Array, view: int, wanted: Wanted) -> Projected:
-        """Of a radar whose clocks are corrected."""
+        """Project points into a radar whose clocks are corrected."""
         unknowns = self.unknowns
         model = unknowns.radars[view].timed(unknowns.timing(params, view))
         ground, by_ecef = ground_rows_from_ecef(ecef)

@@ -64,8 +64,8 @@ def two_groups(
 
 
 def _mixture(z: Array) -> tuple[float, float, float]:
-    """Two normal distributions of one width in values of mean 0: part of the smaller, distance of the centres (0 if
-    they are not apart), gain in log-likelihood over one.
+    """Fit two normal distributions of one width to values of mean 0: share of the smaller, distance of the
+    centres (0 if they are not apart), gain in log-likelihood over one.
     """
     centers, sigma, part = np.quantile(z, [0.1, 0.9]), 0.5 * z.std(), 0.5
     likelihood = np.ones_like(z)

@@ -83,7 +83,7 @@ def _cut(graph: sp.csr_array, place: Array, views: IntArray, pieces: list[IntArr
 
 
 def _part(graph: sp.csr_array, place: Array, views: IntArray) -> tuple[IntArray, IntArray, IntArray] | None:
-    """Two sides of the views and the fewest between them; None where every cut leaves a side empty."""
+    """Return two sides of the views and the fewest between them; None where every cut leaves a side empty."""
     own = graph[views][:, views]
     at = place[views]
     order, cut = min((_best_cut(own, order) for order in _orders(own, at)), key=lambda found: found[2])[:2]

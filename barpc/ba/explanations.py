@@ -206,7 +206,7 @@ def _open_ended(start: float, stop: float, size: float) -> tuple[float, float]:
 
 
 def _largest_part(gain: Array) -> tuple[int, int]:
-    """First and last of the run of values whose sum is the largest."""
+    """Return the first and last of the run of values whose sum is the largest."""
     sums = np.concatenate([[0.0], np.cumsum(gain)])
     lowest = np.minimum.accumulate(sums[:-1])
     last = int((sums[1:] - lowest).argmax())

@@ -141,7 +141,7 @@ def _heights(
 
 
 def _slopes(points: Array, span: Array) -> Array:
-    """Return how far to the east and north points (n, 3) lie in a scene, 1 at the edges of `span` (m, 3), ECEF [m]."""
+    """Return the positions east and north of points (n, 3) in a scene, 1 at the edges of `span` (m, 3), ECEF [m]."""
     middle = span.mean(axis=0)
     enu = enu_basis(ground_from_ecef(middle))[:2]
     edge = np.abs((span - middle) @ enu.T).max(axis=0)

@@ -191,7 +191,7 @@ def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
 
 
 def _judged_among(outcome: Outcome, block: Block, floor: float, views: IntArray) -> Judgement:
-    """Return what explains the ties that some views have among them; views and observations are counted anew."""
+    """Judge the ties that some views have among them; views and observations are renumbered."""
     found = around(outcome, block, views)
     if found is None:
         return Judgement()
@@ -223,7 +223,7 @@ def _near(block: Block, view: int) -> IntArray:
 
 
 def _joined(all_of: Judgement, one: Judgement, views: IntArray, rows: IntArray) -> Judgement:
-    """With what was found among some views, of observations at `rows`; views that were moved before stay."""
+    """Return a judgement with the findings among some views added, for observations at `rows`."""
     step, right = all_of.step.copy(), all_of.right.copy()
     new = ~step[views].any(axis=1)
     step[views[new]] = one.step[new]
@@ -262,7 +262,7 @@ class _Taken:
 
     @property
     def what(self) -> tuple[str, int]:
-        """Its kind and view."""
+        """Kind and view of the explanation."""
         return self.one.kind, self.one.view
 
 
@@ -277,7 +277,7 @@ class _State:
 
     @property
     def gain(self) -> float:
-        """Of all that were taken, together."""
+        """Evidence gained by all explanations taken."""
         return sum(row.gain for row in self.taken)
 
     def may_pass(self, best: _State) -> bool:
@@ -288,7 +288,7 @@ class _State:
         return self.gain + left * self.taken[-1].gain > best.gain
 
     def added(self, tried: list[_Tried]) -> _State:
-        """With the first of those that were tried; the others are what it was chosen from."""
+        """Return the state with the first of the explanations tried; the others are its rivals."""
         first = tried[0]
         same = [row for row in tried if row[2] > first[2] - SURE and _of_one_image(row[0], first[0])]
         one, made, gain = min(same, key=lambda row: _part(row[0], self.seen))  # of two that are as good
@@ -384,7 +384,7 @@ class _Search:
         return self._sorted(row for row in sharp if not self._is_nothing(*row))
 
     def _worth_more(self, offered: list[Explanation]) -> list[Explanation]:
-        """Those of which few tracks show that they may gain most, alone or as the largest of some parts."""
+        """Return the explanations that, by few tracks, may gain most, alone or as the largest of some parts."""
         few = self.seen.few
         if few is self.seen.linear or len(offered) < 3:
             return offered
@@ -425,7 +425,7 @@ class _Search:
         return proposed(seen, intervals, [], (MOVING, WANDER))
 
     def _with(self, made: list[_Tried], more: list[Explanation]) -> list[_Tried]:
-        """Return what was tried and more, the best first."""
+        """Return the explanations tried so far and more, the best first."""
         return self._sorted([*(row[:2] for row in made), *((one, self._fit(one)) for one in more)])
 
     def _sorted(self, made: Iterable[tuple[Explanation, Fit]]) -> list[_Tried]:
@@ -458,7 +458,7 @@ class _Search:
 
 
 def _amplitude(unknowns: Array) -> Array:
-    """Of a swing (2,), col and row."""
+    """Return the amplitude of a swing (2,), col and row."""
     size: Array = np.hypot(*unknowns.reshape(2, 2).T)
     return size
 
@@ -495,7 +495,7 @@ def _rivals(tried: list[_Tried]) -> list[int]:
 
 
 def _distinct(intervals: list[Interval]) -> list[Interval]:
-    """Without those of which most is in a better one, and most of that in them."""
+    """Return the explanations without those that a better one covers."""
     out: list[Interval] = []
     for one in intervals:
         if not any(_same(one, other) for other in out):

@@ -212,7 +212,7 @@ def numbers(count: IntArray) -> float:
 
 
 def _subsets(n: int) -> BoolArray:
-    """Return which views of n may be right together (S, n): all, then fewer."""
+    """Return the subsets (S, n) of n views that may be right together: all, then fewer."""
     sizes = range(n, 1, -1) if n <= _MOST_SUBSETS else range(n, n - 2, -1)
     chosen = [subset for size in sizes for subset in combinations(range(n), size)]
     out = np.zeros((len(chosen), n), dtype=bool)

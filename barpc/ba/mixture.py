@@ -252,7 +252,7 @@ def _of_subsets(
 
 @dataclass(frozen=True, eq=False)
 class _Kind:
-    """What a mixture expects of what stands still, or of what moves."""
+    """Expectations of a mixture for ties that stand, or that move."""
 
     weight: tuple[Array, ...]  # of tracks their subsets' probabilities (T, S)
     right: Array  # (K,) probability of every observation, not by itself
@@ -263,7 +263,7 @@ class _Kind:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What a mixture expects of all tracks with its unknowns as they are."""
+    """Expectations of a mixture over all tracks at its present unknowns."""
 
     log: float
     right: Array  # (K,)
@@ -363,7 +363,7 @@ class Mixture:
         return bool(stands)
 
     def _group(self, seen: _Seen, noise: float, cold: bool) -> None:
-        """The share of every cell that moves, once it is cold, and how much its tracks scatter."""
+        """Estimate the moving share of every cell and the scatter of its tracks."""
         assert self.group is not None
         share, scatter = self.group.share, noise
         if cold:
@@ -470,7 +470,7 @@ class Mixture:
         return np.block([[cameras, cross], [cross.T, of_beside]])
 
     def _of_cameras(self, weight: Array) -> Array:
-        """Return the same by the cameras' unknowns alone (N q, N q), of the weights (M, 2, 2) of pairs of
+        """Return the normal matrix (N q, N q) of the cameras' unknowns, of the weights (M, 2, 2) of pairs of
         observations.
         """
         linear, (views, q), pairs = self.linear, self.linear.shape, self.linear.pairs

@@ -118,7 +118,7 @@ class _Rows:
         return np.asarray(0.5 * gain / determinant)
 
     def _level(self, k: int, period: float) -> float:
-        """Return how much more than noise there is beside a peak once that is taken away: at least 1."""
+        """Return the level of the spectrum beside a peak over that of noise, the peak taken away: at least 1."""
         basis = np.vstack([np.ones(len(self.row)), swing(self.row, np.array(period))])
         weighted = basis * self.right
         gain = self._spectrum(
@@ -136,7 +136,7 @@ def _worth(gain: float) -> float:
 
 
 def _vertex(gain: Array, k: int) -> float:
-    """Return where a parabola through a peak and its neighbours has its own, from the peak."""
+    """Return the offset of the vertex of a parabola through a peak and its neighbours."""
     if not 0 < k < len(gain) - 1:
         return 0.0
     bend = gain[k - 1] - 2.0 * gain[k] + gain[k + 1]

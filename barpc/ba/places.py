@@ -177,7 +177,7 @@ def _axes(standard: Array) -> tuple[Array, Array]:
 
 
 def _cells(near: BoolArray, col: IntArray, row: IntArray) -> Array:
-    """In which part of the image each near observation lies (K, C), 1 or 0."""
+    """Return the part of the image in which each near observation lies (K, C), 1 or 0."""
     parts = int(np.clip(np.sqrt(near.sum() / _TELLING), 1, _PARTS))
     cell = row * parts // _FINEST * parts + col * parts // _FINEST
     return np.asarray((cell[:, None] == np.arange(parts**2)) * near[:, None].astype(np.float64))

@@ -136,7 +136,7 @@ class _Sight:
         self.covariance += ((block.sigma[rows] * noise) ** 2)[:, None, None] * np.eye(2)
 
     def project(self, params: Array) -> Projected:
-        """Return where cameras of unknowns (N, q) see the points, with derivatives."""
+        """Project the points through cameras of unknowns (N, q), with derivatives."""
         return self.cameras.project(params, self.ecef, self.bounds)
 
     def fit(self, splines: Array | None = None) -> tuple[Array, Array, Array]:
@@ -209,6 +209,6 @@ def look(found: Solution, block: Block, placed: Placed, view: int) -> Look:
 
 
 def _half(off: Array) -> float:
-    """Return what half of the offsets (2, n) [px] are shorter than; infinity for what is none."""
+    """Return the median length of the offsets (2, n) [px]; infinity for an offset that is none."""
     length = np.linalg.norm(off, axis=0)
     return float(np.median(np.where(np.isfinite(length), length, np.inf)))

@@ -127,7 +127,9 @@ def states_accuracy(view: View) -> bool:
 
 
 def _stated(view: View) -> tuple[float, float]:
-    """Return what a view states for its attitude, as metres on the ground, and position, or for its two clocks [m]."""
+    """Return the stated accuracies of a view's attitude (metres on the ground) and position, or of its two
+    clocks [m].
+    """
     sensor = view.sensor
     if (isinstance(sensor, Pushbroom) or is_clocked(sensor)) and sensor.accuracy is not None:
         attitude, position = sensor.accuracy

@@ -305,7 +305,7 @@ def _compared(
 
 
 def _middling(values: Array) -> BoolArray:
-    """Return which of n values lie about their median."""
+    """Return the mask of n values about their median."""
     off = np.abs(values - np.median(values))
     return np.asarray(off <= _FAR * 1.4826 * np.median(off))
 
@@ -315,7 +315,8 @@ def _coefficients(design: Array, values: Array) -> Array:
 
 
 def _summed(at: Array, pull: Array) -> float:
-    """Return how many points at places (n, 2) are worth one, by their pulls (n, 2) to the east and north.
+    """Return the number of points at places (n, 2) that are worth one, by their pulls (n, 2) to the east and
+    north.
 
     Squared sums over cells against those of independent pulls, at the size of cells at which they are largest.
     """

@@ -120,7 +120,7 @@ class Rounds:
                 return outcome
 
     def _search(self) -> None:
-        """Robust rounds, under priors that leave room for what is not expected."""
+        """Run the robust rounds, under priors wide enough for what is not expected."""
         start = replace(self.problem, camera_prior=self.variances.for_search())
         self.state, self.residual, self.counted, self.noise, self.projected = _robust(
             start,
@@ -175,7 +175,7 @@ class Rounds:
         return None
 
     def _cut(self) -> None:
-        """Choose what is used by the residuals that scatter."""
+        """Cut observations by residuals without their smooth part."""
         if self.robust:
             scatter = self._scatter() if self.scatter is None else self.scatter
             s = self.observations.squared(scatter, self.use.astype(np.float64))
@@ -282,7 +282,7 @@ def _robust(
 
 
 def _counted(observations: Observations, use: BoolArray, squared: Array, by_loss: Array) -> Array:
-    """Return how much each observation counts (K,)."""
+    """Return the weight of each observation (K,)."""
     return np.where(observations.is_spared(squared), use.astype(np.float64), use * by_loss)
 
 

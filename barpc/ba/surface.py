@@ -236,7 +236,7 @@ def _jackknife(
 
 
 def _parts(place: Array, near: BoolArray) -> IntArray:
-    """Return which of some twenty square parts of a scene each place (n, 2) lies in; -1: it is not near."""
+    """Return the part (of some twenty squares of a scene) in which each place (n, 2) lies; -1: none is near."""
     group, number = np.full(len(place), -1), np.zeros(0, dtype=np.int64)
     at = place[near]
     size = float(np.ptp(at, axis=0).max()) if len(at) else 0.0

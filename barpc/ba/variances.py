@@ -210,7 +210,7 @@ class Variances:
         return self.unknowns.waves is not None
 
     def _going_on(self, sigma: Array) -> Variances:
-        """With splines and steps as large as in the standard deviations (N, q)."""
+        """Return the priors with splines and steps as large as in the standard deviations (N, q)."""
         part, given = self.unknowns.in_waves, self.given.sigma.copy()
         given[:, part] = sigma[:, part]
         return replace(self, given=CameraPrior(self.given.mean, given))
@@ -252,7 +252,7 @@ class Variances:
         return CameraPrior(self.given.mean, sigma)
 
     def _known(self, covariance: Covariance, prior: CameraPrior, exact: bool = True) -> Array:
-        """Return how far the observations determine each unknown (N, q): 0 not at all, 1 wholly."""
+        """Return the share (N, q), 0 to 1, by which the observations determine each unknown."""
         shape = prior.sigma.shape
         use = covariance.free.reshape(shape) & np.isfinite(prior.sigma)
         probed = covariance.is_large and not exact
@@ -301,7 +301,7 @@ class Variances:
         return np.sqrt(np.where(odd, np.maximum(alone, factor), factor)), odd
 
     def _odd(self, around: _Around, wide: Array) -> tuple[Array, BoolArray, float]:
-        """Few views whose cameras explain the corrections, by forward selection, and the evidence for them."""
+        """Find a few views whose cameras explain the corrections, by forward selection, and the evidence for them."""
         n = len(self.given.sigma)
         odd, chosen = np.zeros(n, dtype=bool), np.ones(n)
         scale, last = np.ones(n), -np.inf

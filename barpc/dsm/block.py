@@ -106,7 +106,7 @@ def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = No
 
 
 def _camera(folder: Path, shot: Shot) -> SensorModel:
-    """Return what a run says of a camera: its RPC with the correction grid, where it wrote one."""
+    """Read a camera from a run: its RPC with the correction grid, where it wrote one."""
     grid = shot.name + CORRECTION
     return open_camera(folder / grid).model if grid in shot.entry.outputs else shot.rpc
 

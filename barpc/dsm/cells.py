@@ -173,7 +173,7 @@ def _zoom(frame: EpipolarFrame) -> int:
 def _matched(
     pair: tuple[View, View], tile: Tile, band: int, zoom: int = 1
 ) -> tuple[Array, Array, float] | None:
-    """As `_points`, of pictures whose pixels are means of `zoom` px a side."""
+    """Match as `_points`, on pictures whose pixels are means of `zoom` px a side."""
     frame = _frame(pair, tile, zoom)
     sizes = [(view.size[0] // zoom, view.size[1] // zoom) for view in pair]
     found = None if frame is None else dense_matches([view.path for view in pair], sizes, frame, band)

@@ -41,7 +41,7 @@ def show_in_report(folder: Path, grid: Grid, out: Path) -> None:
 
 
 def _reliefs(folder: Path, grid: Grid, out: Path) -> list[dict[str, object]]:
-    """Return what `barpc.report.tables` reads: of the tile that has most heights."""
+    """Return the reliefs, as `barpc.report.tables` reads them, of the tile that has most heights."""
     with open_raster(out) as file:
         found = []
         for at, groups in grid.tiles():

@@ -108,7 +108,7 @@ def make_dsm(
 
 
 def _room(out: Path) -> Path:
-    """Return where results of tiles are kept beside the file until it is whole: the same command goes on with them."""
+    """Return the folder beside the file in which results of tiles are kept until it is whole."""
     return out.parent / f"{out.name}.unfinished"
 
 

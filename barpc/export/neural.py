@@ -53,7 +53,7 @@ def rpc_of(shot: Shot) -> dict[str, Any]:
 
 
 def _record(scene: Scene, shot: Shot, img: str) -> dict[str, Any]:
-    """Return what Sat-NeRF and its relatives read of an image."""
+    """Return the record of an image that Sat-NeRF and its relatives read."""
     low, high = scene.alt_range
     ring = footprint(shot.rpc, shot.size, scene.origin[2])
     middle = shot.rpc.localize((np.array(shot.size) - 1.0) / 2, np.array(scene.origin[2]))

@@ -186,7 +186,7 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
 
 
 def _places(known: IntArray, asked: IntArray) -> tuple[IntArray, Any]:
-    """Return where numbers (K,) stand in an ascending list, and whether they do."""
+    """Return the positions of numbers (K,) in an ascending list, and whether they are in it."""
     if not len(known):
         return np.zeros(len(asked), dtype=np.int64), np.zeros(len(asked), dtype=bool)
     at = np.minimum(np.searchsorted(known, asked), len(known) - 1)

@@ -108,8 +108,8 @@ def _tangent(rpc: RPC, ground: Array, axis: int) -> Array:
 
 
 def _along(left: Array, bases: list[Array], place: Array) -> tuple[float, Array]:
-    """Return the share of errors (N, 2) that is a function of `place` (N,), and it with what is left (N, 2),
-    in its order.
+    """Return the share of errors (N, 2) that is a function of `place` (N,), that function and the rest (N,
+    2), in its order.
     """
     order, rest = np.argsort(place, kind="stable"), 0.0
     smooth = left[order].copy()

@@ -118,7 +118,8 @@ def _compared(fit: RpcFit, free: RpcFit, region: Region, margin: float) -> RpcFi
 
 
 def _plainer(fit: RpcFit, plain: RpcFit) -> RpcFit:
-    """Of two RPCs for a camera behind a spline, which no RPC holds, the one made without it where it is about as good.
+    """Choose between two RPCs for a camera behind a spline: the one made without the spline where it is about
+    as good.
 
     Its denominators are calmer; jitter that is faster than cubics of the row only makes the other one wave.
     """
@@ -206,7 +207,7 @@ def fit_rpc_points(
 
 
 def _missed(sample: Sample, rpc: RPC, _: Solution) -> tuple[Errors, Array]:
-    """Return what a localisation RPC is off by on the check points of a model."""
+    """Return the errors of a localisation RPC on the check points of a model."""
     return sample.sought(
         lambda ground, at: off(rpc, rpc.localize_direct(at[:, :2], at[:, 2]), ground, at[:, :2])
     )
@@ -215,7 +216,7 @@ def _missed(sample: Sample, rpc: RPC, _: Solution) -> tuple[Errors, Array]:
 def _left_out(
     held_out: tuple[Array, Array] | None, ground: Array, image: Array, rpc: RPC, found: Solution
 ) -> tuple[Errors, Array]:
-    """Return the same on given check points, or on its own points, each without that point's help."""
+    """Return the errors of a localisation RPC on given check points, or its leave-one-out errors."""
     errors, start = Errors(), 0
     if held_out is not None:
         errors.add(off(rpc, rpc.localize_direct(held_out[1], held_out[0][:, 2]), *held_out))

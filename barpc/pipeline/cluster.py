@@ -81,7 +81,7 @@ def _waits(client: Any) -> bool:
 
 
 def _workers(client: Any) -> int | None:
-    """Return how many there are; None where the scheduler does not say."""
+    """Return the number of workers; None where the scheduler does not say."""
     if client.status != "running":
         return None
     try:

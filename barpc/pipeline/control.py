@@ -108,13 +108,13 @@ def _implausible(
 
 
 def _any(points: GroundPoints, observed: BoolArray) -> BoolArray:
-    """Return the points (G,) of which any observation (M,) is so."""
+    """Return the points (G,) for which a condition holds in any of their observations (M,)."""
     return np.bincount(points.point, observed, minlength=len(points.names)) > 0
 
 
 def _shown(points: GroundPoints, views: Sequence[View], alt: Array) -> tuple[Array, Array]:
-    """Return where each image shows a point (M, 3), lon, lat [deg], alt [m], at altitudes (M,), and a pixel
-    there (M,) [m].
+    """Localise where each image shows a point (M, 3), lon, lat [deg], alt [m], at altitudes (M,), and the
+    pixel size there (M,) [m].
     """
     ground, pixel = np.empty((len(alt), 3)), np.empty(len(alt))
     for v in np.unique(points.view):
@@ -157,7 +157,7 @@ def _heights_of(path: str, views: Sequence[View]) -> Altimetry:
 
 
 def _inside(lonlatalt: Array, views: Sequence[View]) -> BoolArray:
-    """Return which places (n, 3) are within the bounds of any image on the ground, or near them."""
+    """Return the places (n, 3) within the ground bounds of any image, or near them."""
     found = np.zeros(len(lonlatalt), dtype=bool)
     for view in views:
         ring = footprint(view.sensor, view.size, view.altitude)

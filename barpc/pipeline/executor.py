@@ -326,7 +326,7 @@ def run_batch(
 
 
 def _explained(error: BaseException) -> BaseException:
-    """Return a worker that is lost, in words; any other error as it is."""
+    """Return a lost worker's error in words; any other error as it is."""
     if not isinstance(error, (BrokenExecutor, CancelledError)) and type(error).__name__ not in _LOST:
         return error
     died = AdjustError(

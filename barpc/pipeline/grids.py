@@ -205,7 +205,7 @@ def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss
 
 
 def _off(sample: Sample, camera: SensorModel) -> Miss:
-    """Return how far a camera is off the model of a sample."""
+    """Return the largest error of a camera against the model of a sample."""
     errors, largest = sample.sought(lambda ground, at: camera.project(ground) - at[:, :2])
     return float(np.linalg.norm(errors.rmse)), float(np.linalg.norm(largest)), errors.worst
 

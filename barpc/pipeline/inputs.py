@@ -243,7 +243,7 @@ def given_matches(
 
 
 def _linked(paths: Sequence[str | Path], views: Sequence[View], partly: bool = False) -> Links:
-    """Return what the files say of the views, all of it inside their images."""
+    """Read the matches of files for the views, all of them inside their images."""
     parts = [Links.of_pairs([])]
     for path in paths:
         try:
@@ -258,7 +258,7 @@ def _linked(paths: Sequence[str | Path], views: Sequence[View], partly: bool = F
 
 
 def _in_images(path: str | Path, views: Sequence[View], links: Links) -> Links:
-    """Without points that lie outside their images; InputError where they are more than a few."""
+    """Return the matches without points outside their images; InputError where these are more than a few."""
     beyond = np.array([view.size for view in views])[links.view] + (_MARGIN - 1.0)
     inside = np.asarray(((links.xy >= -_MARGIN) & (links.xy <= beyond)).all(axis=1))
     wrong = np.flatnonzero(~inside)

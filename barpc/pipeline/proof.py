@@ -93,7 +93,7 @@ def _holds_camera(path: Path) -> bool:
 
 
 def _camera(view: ViewEntry, path: Path, name: str, stated: float) -> Proved:
-    """Return what a file says of its camera, as a reader finds it: another file beside it may go before."""
+    """Read the camera of a file as a reader finds it: another file beside it may go before."""
     points = np.array(view.certified)
     try:
         off = np.linalg.norm(open_camera(path).model.project(points[:, :3]) - points[:, 3:], axis=1)

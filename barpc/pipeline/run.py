@@ -199,7 +199,7 @@ def _tell(progress: Progress | None, stage: str, done: int) -> None:
 
 @contextmanager
 def _told(workspace: Workspace, stage: str, progress: Progress | None) -> Iterator[None]:
-    """A stage that is one task."""
+    """Report the progress of a stage that is one task."""
     _tell(progress, stage, 0)
     with workspace.stage(stage):
         yield
@@ -292,7 +292,7 @@ def _solve(
 def _registered(
     run: Run, options: RunOptions, dem: Dem, executor: Executor, progress: Progress | None
 ) -> Registration:
-    """Return what the reference says of the cameras as delivered."""
+    """Register the views, with the cameras as delivered, to the reference."""
     given = options.adjust.dem_bias_sigma
     bias = (KNOWN_BIAS if dem.known else DEM_BIAS) if given is None else given
     return register(

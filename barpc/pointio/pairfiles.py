@@ -81,7 +81,7 @@ def _asp_text(path: Path) -> tuple[Array, Array]:
 
 
 def _asp_binary(path: Path) -> tuple[Array, Array]:
-    """Two counts of 8 bytes, then the records of both images, each with a descriptor of one length."""
+    """Read two counts of 8 bytes, then the records of both images, each with a descriptor of one length."""
     data = read_bytes(path, TABLE)
     try:
         count, other = np.frombuffer(data, "<u8", 2).tolist()

@@ -95,7 +95,7 @@ def _listed(folder: str, _minute: int) -> tuple[str, ...]:
 
 
 def _told(ask: Any, *args: Any, **given: Any) -> Any:
-    """Return what a store answers; its errors, which are of many classes, as an OSError of one line."""
+    """Return a store's answer; errors of its many classes become an OSError of one line."""
     try:
         return ask(*args, **given)
     except FileNotFoundError as error:

@@ -107,7 +107,7 @@ def _readers(record: Any) -> dict[str, Callable[[Any], Any] | None]:
 
 
 def _reader(kind: Any) -> Callable[[Any], Any] | None:
-    """Return what makes a value of a type from JSON; None where it stays as it is."""
+    """Return the function that reads a type from JSON; None where values stay as they are."""
     if get_origin(kind) in (Union, UnionType):
         kind = next(part for part in get_args(kind) if part is not NoneType)
     if isinstance(kind, type) and issubclass(kind, Record):

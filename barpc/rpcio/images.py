@@ -227,7 +227,7 @@ def copying(image_path: Path | str, target: Path | str, overwrite: bool) -> Iter
 
 
 def _convert(dataset: Any, partial: Path, target: Path, **options: str) -> None:
-    """A copy by another driver; a VRT's pixels are GDAL's only when they stand in a file."""
+    """Copy an image by another driver; a VRT's pixels are GDAL's only when they stand in a file."""
     whole = Window(0, 0, dataset.width, dataset.height)
     if isinstance(dataset, Mosaic):
         _copy_window(dataset, partial, whole, **options)

@@ -44,7 +44,7 @@ def _text(parent: Element, path: str, name: str) -> str:
 
 
 def _element(parent: Element, paths: Iterable[str], name: str) -> Element:
-    """Return the first of several elements that is there, at any depth."""
+    """Return the first of several elements that exists, at any depth."""
     for path in paths:
         found = parent.find(f".//{path}")
         if found is not None:

@@ -119,7 +119,7 @@ def _step(base: Pushbroom) -> float:
 
 
 def _positions(model: SensorModel, rows: Array) -> Array:
-    """Return where a camera stands (N, 3) [m], ECEF, at rows (N,): what its corrections move there."""
+    """Return the camera positions (N, 3) [m], ECEF, at rows (N,), corrections included."""
     if not isinstance(model, Corrected):
         return np.asarray(_base(model).position(rows))
     stands, correction = _positions(model.sensor, rows), model.correction

@@ -231,7 +231,7 @@ def _inverse_cubic(axes: tuple[Array, Array, Array], lonlat: Array) -> Array:
 
 
 def _nodes(seen: Callable[[Array], Array], axes: tuple[Array, Array, Array], tolerance: float) -> Array:
-    """Return what is seen (L, H, W, 2) at the nodes of three axes, altitudes, rows, columns.
+    """Return the ground seen (L, H, W, 2) at the nodes of three axes, altitudes, rows, columns.
 
     Along altitudes and columns most cameras are smooth, whatever their attitude does along the rows: polynomials
     through a few of them serve where, at some rows, they miss by no more than `tolerance` [px].
@@ -250,7 +250,7 @@ def _nodes(seen: Callable[[Array], Array], axes: tuple[Array, Array, Array], tol
 
 
 def _on(seen: Callable[[Array], Array], axes: tuple[Array, Array, Array]) -> Array:
-    """Return what is seen (L, H, W, 2) at all nodes, layer by layer."""
+    """Return the ground seen (L, H, W, 2) at all nodes, layer by layer."""
     alts, rows, cols = axes
     plane = np.stack(np.meshgrid(cols, rows), axis=-1)
     return np.stack([seen(np.dstack([plane, np.full(plane.shape[:2], alt)])) for alt in alts])

@@ -183,7 +183,7 @@ class Splined:
         return self.sensor.localize(image - self.correction.at(image), alt)
 
     def _displaced(self, projected: Array) -> Array:
-        """Return where points are seen that are projected to image points (..., 2) [px]."""
+        """Return the displaced image points of points projected to (..., 2) [px]."""
         image = projected
         for _ in range(_STEPS):
             before, image = image, projected + self.correction.at(image)

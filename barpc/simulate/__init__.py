@@ -94,7 +94,7 @@ class _Scene:
     rng: np.random.Generator
 
     def observe(self, count: int, fewest: int, visible: float) -> tuple[Array, Tracks]:
-        """So many ground points (count, 3) that `fewest` views or more show, and their exact image points."""
+        """Return ground points (count, 3) that `fewest` views or more show, and their exact image points."""
         grounds = [np.empty((0, 3))]
         found = [(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 2)))]
         have = 0

@@ -86,7 +86,7 @@ def _level(azimuth: float) -> Array:
 
 
 def _standpoint(target: Array, look: Look) -> Array:
-    """Return where the satellite stands (3,) [m, ECEF]: on the line of sight, `altitude` beyond the radius at
+    """Return the satellite's position (3,) [m, ECEF]: on the line of sight, `altitude` beyond the radius at
     the target.
     """
     incidence, azimuth = np.radians([look.incidence, look.azimuth])

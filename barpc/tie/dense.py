@@ -154,7 +154,9 @@ def dense_matches(
 
 
 def _window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Array, tuple[int, int]] | None:
-    """First pixel (2,) and width, height of what is resampled: the part as far as both images reach, with margins."""
+    """Return the first pixel (2,) and width, height of what is resampled: the part as far as both images
+    reach, with margins.
+    """
     low, high = frame.places.min(axis=0) - _MARGIN, frame.places.max(axis=0) + _MARGIN
     reach = np.array([frame.num, 0.0])
     for size, one, more in zip(sizes, frame.maps, (np.zeros(2), reach), strict=True):
@@ -167,7 +169,7 @@ def _window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Arr
 
 
 def _inside(shape: tuple[int, int], low: Array, frame: EpipolarFrame) -> BoolArray:
-    """Return which pixels of the window belong to the part: the others only led there."""
+    """Return the pixels of the window that belong to the part."""
     hull = cv2.convexHull((frame.places - low).astype(np.float32))
     mask = cv2.fillConvexPoly(np.zeros(shape[::-1], np.uint8), np.rint(hull).astype(np.int32), 1)
     return np.asarray(mask > 0)

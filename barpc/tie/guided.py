@@ -77,7 +77,7 @@ class _Described:
         return _Described(values / norm, turned.astype(np.float32), zoom.astype(np.float32))
 
     def alike(self, row: IntArray, other: _Described, col: IntArray) -> npt.NDArray[np.bool_]:
-        """Return which candidates have about the orientation and the scale that they should have."""
+        """Return the candidates of about the expected orientation and scale."""
         turned = np.einsum("ij,ij->i", self.direction[row], other.direction[col])
         out: npt.NDArray[np.bool_] = turned >= np.float32(np.cos(_MAX_TURN))
         out &= np.abs(other.zoom[col] - self.zoom[row]) <= np.float32(_MAX_ZOOM)

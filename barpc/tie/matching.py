@@ -142,7 +142,7 @@ def enough(report: PairReport) -> bool:
 
 
 def _wanted(report: PairReport) -> int:
-    """So many matches a pair is to have: fewer where little is in common."""
+    """Return the number of matches that a pair should have: fewer where little is in common."""
     common = report.overlap * min(report.keypoints)
     return math.ceil(min(THIN, max(FEW, SHARE * common))) if common > 0 else THIN
 
@@ -208,7 +208,7 @@ def _attempt(
 
 
 def _apart(xy: Array, side: float) -> int:
-    """Return how many points (M, 2) stand so far apart that what is compared about them is not the same."""
+    """Count the points (M, 2) that stand far enough apart not to share their patches."""
     return len(np.unique(np.floor(xy / side), axis=0)) if side else len(xy)
 
 
@@ -319,7 +319,7 @@ def _within(
     known: tuple[float, float] | None,
     margin: float = _MARGINS[0],
 ) -> tuple[View, View]:
-    """Two views used for fewer altitudes: those of the terrain, or else known ones, with a margin."""
+    """Return two views with fewer altitudes: those of the terrain, or else known ones, with a margin."""
     low, high = common_range(*views)
     if terrain is not None:
         axes = (np.linspace(0.0, length - 1.0, _PROBES) for length in views[0].size)
@@ -350,7 +350,7 @@ def _latest(where: Callable[[Array], Frame]) -> Callable[[Array], Frame]:
 
 
 class _Peak(NamedTuple):
-    """What a blind pass finds."""
+    """Result of a blind pass."""
 
     prediction: Prediction  # where to search next
     share: float  # of the matches that stand in the peak
@@ -404,7 +404,7 @@ class _Search:
         return found.select(np.arange(count)), float(share[count - 1]) if count else 0.0
 
     def offset(self) -> Prediction | None:
-        """Return where to search in view of the cameras' error, from blind passes of growing width.
+        """Find the cameras' error by blind passes of growing width, and where to search.
 
         The first pass in whose peak most matches stand decides, else the one with the most significant peak, if any.
         """

@@ -170,7 +170,7 @@ def _read(dataset: Any, box: Box, band: int, zoom: int = 1) -> tuple[Pixels, Boo
 
 
 def _mask(dataset: Any, band: int, raw: npt.NDArray[Any]) -> BoolArray | None:
-    """Return which whole numbers mean something, where they say so themselves: GDAL would decode the window again."""
+    """Return the mask of valid whole numbers, where values alone tell: GDAL would decode the window again."""
     flags = dataset.mask_flag_enums[band - 1]
     if getattr(dataset, "driver", None) is None or flags not in ([MaskFlags.nodata], [MaskFlags.all_valid]):
         return None

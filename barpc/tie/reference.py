@@ -217,7 +217,7 @@ class _Work:
         return tuple(sheet.path for sheet in self.sheets)
 
     def vote(self) -> list[tuple[float, Array]]:
-        """Of every view the peak of its vote, and how far its camera is off (2,) [m]."""
+        """Return, for every view, the peak of its vote and the camera's error (2,) [m]."""
         coarse = max(self.step, _FINE)
         found = self._votes([np.zeros(2)] * len(self.views), coarse, REACH, "reference: vote")
         if coarse == self.step:

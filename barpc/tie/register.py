@@ -469,7 +469,9 @@ class _Links:
         return where.errors(found.xy[group]), where.after
 
     def verified(self, found: Registration, good: BoolArray) -> BoolArray:
-        """Those near their epipolar line, no less certain than others, at one altitude with their track."""
+        """Return the observations near their epipolar line, as certain as others, and at one altitude with
+        their track.
+        """
         verified = np.zeros(len(self), dtype=bool)
         altitude, reach = np.zeros((2, len(self)))  # from the middle of the range, in its halves
         for group in self.groups():

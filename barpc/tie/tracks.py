@@ -122,9 +122,7 @@ def find_tracks(
 def _registered(
     trials: _Trials, area: Area | None, given: GivenMatches, options: TieOptions, work: dict[str, Any]
 ) -> tuple[Tracks, dict[tuple[int, int], int]]:
-    """Return what the pairs that were tried have in common, evenly thinned and registered, and how much of it
-    is not.
-    """
+    """Link, thin and register the matches of the pairs tried; return also how many could not be registered."""
     looks, most = trials.looks, options.points_per_image
     tried = [(looks.ends[views], *trials.tried[views][1:]) for views in sorted(trials.tried)]
     linked = inside(looks.views, link([ends for ends, _, _ in tried], [found for _, found, _ in tried]), area)
@@ -181,7 +179,7 @@ class _Trials:
         self._scores: dict[tuple[int, int], int] = {}
 
     def run(self, pool: Sequence[Pair], all_of_them: bool) -> None:
-        """Try the best pairs of a pool, or all, and others in place of those that fail."""
+        """Match the best pairs of a pool, or all, and others in place of those that fail."""
         own = self._options.matcher in MATCHERS  # another one reads the files itself
         self.looks = Looks.at(self._views, pool, apart=own)
         self._keypoints = [KeypointFiles(self._store)] * len(self.looks.views)
@@ -215,7 +213,7 @@ class _Trials:
 
     @property
     def keypoints(self) -> tuple[int, ...]:
-        """How many were found in each view."""
+        """Number of keypoints found in each view."""
         count = np.bincount(self.looks.of, weights=[len(k) for k in self._keypoints])
         return tuple(count.astype(int).tolist())
 

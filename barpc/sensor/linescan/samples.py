@@ -92,8 +92,8 @@ def build(samples: Samples, detector: Detector, sigma: tuple[float, float] | Non
 
 
 def _track(times: Array, positions: Array) -> Curve:
-    """Return where the camera is: a polynomial that any orbit follows for so long, or through all samples if
-    these do not.
+    """Return the position over time: a polynomial that any orbit follows for so long, or a spline where
+    samples do not.
 
     Dense samples scatter by millimetres, which a curve through them all carries beyond the first by centimetres.
     """

@@ -252,7 +252,7 @@ class RangeDoppler(Frozen):
         return [image.T]
 
     def _derivatives(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """Return what `timing_jacobian` hands out."""
+        """Return image points and derivatives for `timing_jacobian`."""
         seen = self._geometry(ecef_from_ground(ground))
         by_ecef = np.stack([seen.time_by_ecef.T, seen.sight.T * (-2.0 / SPEED_OF_LIGHT)])  # (2, N, 3)
         ecef_by_ground = ecef_from_ground_jacobian(ground)

@@ -135,7 +135,7 @@ def _look(root: Fields) -> Literal["right", "left"]:
 
 
 def _accuracy(root: Fields, scp: Array) -> tuple[float, float] | None:
-    """Of range and along the flight [m]: those of the centre as a whole, else those of the orbit and of the range."""
+    """Return the stated accuracy of range and along the flight [m]: of the scene centre, else of orbit and range."""
     whole = _error(root, "CompositeSCP//Rg"), _error(root, "CompositeSCP//Az")
     orbit = np.array([_error(root, f"Components/PosVelErr/P{k}") for k in (1, 2, 3)])
     frame = root.element.findtext("ErrorStatistics/Components/PosVelErr/Frame", "").strip()

@@ -137,7 +137,7 @@ class Monostatic(Frozen):
         return np.column_stack([col, row])
 
     def _seen(self, plane: Array) -> Aperture:
-        """Return what the pixels (2, N) state, as the clocks have it."""
+        """Return range and range rate of the pixels (2, N), clocks corrected."""
         seen = self.formation.at(plane[0], plane[1], self.orbit)
         if self.timing is None:
             return seen
@@ -187,7 +187,7 @@ class Monostatic(Frozen):
         return (sight * distance).T
 
     def _derivatives(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """Return what `timing_jacobian` hands out."""
+        """Return image points and derivatives for `timing_jacobian`."""
         point = ecef_from_ground(ground).T
         plane, slope = self._solve(point)
         _, seen, sight, distance = self._miss(plane, point)
