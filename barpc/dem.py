@@ -170,7 +170,7 @@ def _snapped(index: Array) -> Array:
 
 
 def _inverse(forward: Affine, path: Place) -> Affine:
-    """Return the from coordinates to pixels, where the way there has one."""
+    """Return the inverse transformation, from coordinates to pixels, where there is one."""
     numbers = np.array(forward[:6])
     area = abs(forward.determinant)
     if np.isfinite(numbers).all() and np.abs(numbers).max() <= _FAR and area >= _FAR**-2:

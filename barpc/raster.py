@@ -360,7 +360,7 @@ def _equal(values: Pixels, nodata: float) -> BoolArray:
 
 
 def _converted(values: Pixels, dtype: np.dtype[Any]) -> Pixels:
-    """Return the values of another type as GDAL makes them: rounded half away from zero and cut at the type's range."""
+    """Convert values to another type as GDAL does: rounded half away from zero and cut at the type's range."""
     if values.dtype == dtype:
         return values
     with np.errstate(all="ignore"):

@@ -172,7 +172,7 @@ def _fits_as_stated(offsets: Offsets) -> bool:
 
 
 class _Search:
-    """The sets of points that are looked at, and their evidence."""
+    """Sets of points that are compared, and their evidence."""
 
     def __init__(self, offsets: Offsets) -> None:
         self.offsets, self.count = offsets, len(offsets.own)

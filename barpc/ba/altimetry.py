@@ -108,7 +108,7 @@ def _is_held(found: Solution, block: Block) -> bool:
 
 
 def _why_not(registered: Registration, known: Array, is_held: bool) -> str:
-    """Return the why heights are not to hold the block; empty where they may."""
+    """Return the reason why heights must not hold the block; empty where they may."""
     if registered.near.sum() < FEWEST or (registered.is_most and registered.agree.sum() < FEWEST):
         return f"at least {FEWEST} heights on the tie points' surface are needed"
     if not registered.is_most:

@@ -98,8 +98,8 @@ class _Left:
         return self.coherent and 1.0 - self.contradicted < _MOST * (1.0 - self.usual)
 
     def gain(self, lost: float) -> float:
-        """Return the by how many nats the share that it lost is likelier as its own; the choice among views
-        taken off.
+        """Return the log-likelihood gain [nats] of the view's own lost share over that of the others; the
+        choice among views is paid for.
         """
         rates = np.clip([max(lost, self.contradicted), self.usual], 1e-3, 1.0 - 1e-3)
         own, usual = np.array([rates, 1.0 - rates]).T

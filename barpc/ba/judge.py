@@ -306,7 +306,7 @@ class _State:
 
 
 class _Search:
-    """Taking one explanation after the other, of the best and of its rival."""
+    """Search for explanations, one after the other, by the best and its rivals."""
 
     def __init__(self, seen: Seen, first: list[Interval], floor: float, sigma: float) -> None:
         self.start, self.first, self.floor, self.sigma = seen, first, floor, sigma  # [px]

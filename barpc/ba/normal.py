@@ -223,7 +223,7 @@ def solve_transposed(lower: Array, rhs: Array) -> Array:
 
 
 def _eliminate(structure: Structure, by_point: Array, by_unknown: Array, lower: Array) -> Array:
-    """Return the y (K, 3, q)."""
+    """Return Y (K, 3, q), the whitened coupling of points and cameras."""
     q, count = by_unknown.shape[1:]
     cross = np.empty((count, 3, q))
     for part in parts(count, CHUNK):

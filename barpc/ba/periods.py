@@ -131,7 +131,7 @@ class _Rows:
 
 
 def _worth(gain: float) -> float:
-    """Return the minus the logarithm of how probable it is that noise takes away as much at one frequency."""
+    """Return minus the logarithm of the probability that noise takes away as much at one frequency."""
     return float(gain - np.log1p(gain))
 
 

@@ -120,7 +120,7 @@ def terrain_slopes(terrain: Terrain, ground: Array) -> Array:
 
 
 def _differences(layers: Array) -> Array:
-    """Return the bands (K, ...) of layers (K, ...), each without the next, which is smoother."""
+    """Return the bands (K, ...) of layers (K, ...): each minus the next, which is smoother."""
     return np.concatenate([layers[:-1] - layers[1:], layers[-1:]])
 
 

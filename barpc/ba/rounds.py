@@ -255,7 +255,7 @@ def _robust(
     options: AdjustOptions,
     smooth: Smooth,
 ) -> tuple[State, Array, Array, float, Projected | None]:
-    """Return the reweighted steps while the loss's scale shrinks to three standard deviations of the noise.
+    """Take reweighted steps while the loss's scale shrinks to three standard deviations of the noise.
 
     The state, its residuals, how much every observation counts, the noise, and what is kept of the state's projection.
     The noise is a median that counts observations by

@@ -94,8 +94,8 @@ def _intervals(bins: Array) -> Array:
 def _displacements(
     view: IntArray, bin_: IntArray, off: Array, told: Array, views: int, floor: float
 ) -> tuple[Array, Array]:
-    """Return the by how many nats (N, intervals) a displacement of an interval explains residuals, and how
-    large it is.
+    """Return the gain [nats] (N, intervals) by which a displacement of an interval explains residuals, and
+    its size.
 
     The score test beside what a camera follows along an axis: a constant, a slope and a bend are taken off both. What
     stands out beside a step is its middle; the step itself is what explains it.

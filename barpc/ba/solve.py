@@ -223,7 +223,7 @@ class _Compressed:
         return np.append(self.whitened, self.rest)
 
     def jacobian(self, x: Array) -> Array:
-        """Return their derivative."""
+        """Return the derivative of the residuals."""
         self.at(x)
         return np.vstack([self.slope, np.zeros((1, len(x)))])
 

@@ -104,7 +104,7 @@ class Parts:
 
 
 def _groups(block: Block) -> int:
-    """Return the into how many groups views fall."""
+    """Count the groups into which views fall."""
     rows = np.flatnonzero(block.use)
     rows = rows[np.lexsort((block.view[rows], block.point[rows]))]
     same = np.flatnonzero(np.diff(block.point[rows]) == 0)

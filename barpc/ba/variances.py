@@ -187,7 +187,7 @@ class Variances:
         return CameraPrior(prior.mean, sigma), tested
 
     def _shared(self, params: Array, known: Array) -> Array:
-        """Return the by how much views that state an accuracy are to be widened (N,), as they share the error
+        """Return the factors (N,) by which views that state an accuracy are widened, as they share the error
         that they state.
 
         Views that were adjusted together agree: what each is off by, they all are. Independent errors would leave
@@ -277,7 +277,7 @@ class Variances:
         return freedom > _LEAST and float(chdtrc(freedom, total)) < _LEVEL
 
     def _widened(self, around: _Around, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
-        """Return the by how much each view's prior is to be widened (N,), and which views are odd."""
+        """Return the factors (N,) by which each view's prior is widened, and the views that are odd."""
         n = len(params)
         total, freedom = self._squares(params, known)
         factor = max((_STRENGTH + total.sum()) / (_STRENGTH + freedom.sum()), 1.0)
@@ -332,9 +332,7 @@ class Variances:
         return around.under(self._prior(trial, wide))[0], float(trial[v])
 
     def _drift(self, params: Array, known: Array) -> Array:
-        """Return the by how much the drift's standard deviations are to be changed (D,), the given ones
-        counting for a few.
-        """
+        """Return the factors (D,) on the drift's standard deviations, the given ones counting for a few."""
         waves = self.unknowns.waves  # of which splines and steps follow what else bends heights
         careful = self.cautious and not (waves and (waves.count or waves.edges.size))
         factors = np.ones(self._degrees)

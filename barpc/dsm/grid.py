@@ -220,7 +220,7 @@ def _nodes(tile: Tile) -> Array:
 
 
 def _spread(values: Array, size: tuple[int, int]) -> Array:
-    """Return the values at a tile's nodes over its cells (rows, cols), linearly."""
+    """Interpolate values at a tile's nodes over its cells (rows, cols), linearly."""
     at = [(np.arange(side) + 0.5) / side * (_NODES - 1) for side in size]
     grid, nodes = values.reshape(_NODES, _NODES), np.arange(_NODES)
     along = np.stack([np.interp(at[0], nodes, row) for row in grid])

@@ -112,7 +112,7 @@ class _Utm:
         self.corners = (corners - self.center) / self.scale
 
     def metres(self, ground: Array) -> Array:
-        """Return the uTM easting, northing, altitude (N, 3) [m] of ground points (N, 3)."""
+        """Return the UTM easting, northing, altitude (N, 3) [m] of ground points (N, 3)."""
         lon = wrap_longitude(ground[:, 0])
         east, north = transform("EPSG:4326", self._crs, lon.tolist(), ground[:, 1].tolist())
         return np.column_stack([east, north, ground[:, 2]])

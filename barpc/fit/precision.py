@@ -80,7 +80,7 @@ def _nitf_normalization(norm: Normalization) -> Normalization:
 
 
 def _nitf_coeffs(coeffs: Array) -> Array:
-    """Return the seven digits and an exponent of one digit: +d.ddddddE-d."""
+    """Return coefficients rounded to seven digits and an exponent of one digit: +d.ddddddE-d."""
     value = np.asarray(coeffs, dtype=np.float64)
     exponent = np.clip(np.floor(np.log10(np.maximum(np.abs(value), 1e-300))), -9, 9)
     text = [f"{v:.{6 + int(e) * -1}f}" for v, e in zip(value.ravel(), exponent.ravel(), strict=True)]

@@ -197,7 +197,9 @@ class Solution:
             yield residual
 
     def _inverses(self) -> list[Array]:
-        """Return the for col and row, what takes its row of (M | y) to the unknowns' standard deviations (k, n)."""
+        """Return, for col and row, the matrices (k, n) from the rows of (M | y) to the unknowns' standard
+        deviations.
+        """
         return [np.asarray(np.linalg.pinv(system.matrix)) for system in self.solved]
 
 

@@ -115,7 +115,7 @@ Task = tuple[View, RPC, SensorModel, Files]
 def _write(
     run: Workspace, tasks: Sequence[Task], executor: Executor | None, progress: Progress | None
 ) -> list[Written]:
-    """Return the workers make the files in a room of the run folder, here they get their place, and workers
+    """Write grids: workers make the files in a folder of the run, they take their places here, and workers
     open them again.
     """
     room = run.partial / "grids"

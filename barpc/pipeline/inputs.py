@@ -200,7 +200,7 @@ def hash_inputs(
 
 
 def _groups(names: Sequence[str]) -> list[tuple[tuple[str, ...]]]:
-    """Return the small files go together."""
+    """Group files into tasks, small ones together."""
     groups: list[list[str]] = [[]]
     size = 0
     for name in names:

@@ -399,7 +399,7 @@ def _center(view: View, how: Literal["line", "projective"] = "line") -> CameraCe
 
 
 def _fitted(run: Run, options: RunOptions, executor: Executor, progress: Progress | None) -> Run:
-    """Return the refit every P_BA: only when all can be written is any."""
+    """Refit every P_BA: only when all can be written is any."""
     assert run.adjustment is not None
     # what is known of the place afterwards is the error common to the image; the noise of a point is the vendor's
     bias = float(np.sqrt((run.adjustment.gauge.sigma[:2] ** 2).mean()))

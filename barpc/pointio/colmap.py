@@ -92,7 +92,7 @@ class _Tables:
 def _allowed(
     action: int, first: str | None, _second: str | None, _base: str | None, source: str | None
 ) -> int:
-    """Return the reading the known tables, and by no view or trigger."""
+    """Authorise reading the known tables, and nothing by a view or trigger."""
     good = action == sqlite3.SQLITE_SELECT or (action == sqlite3.SQLITE_READ and first in _TABLES)
     return sqlite3.SQLITE_OK if good and source is None else sqlite3.SQLITE_DENY
 

@@ -65,7 +65,7 @@ def read_gcps(path: Path | str, names: Sequence[str]) -> GroundPoints:
 
 
 def _read_asp(path: Path, views: ViewNames) -> Iterator[_Point]:
-    """Yield the lines `id lat lon alt sigma_x sigma_y sigma_z image col row sigma_col sigma_row [image ...]`."""
+    """Read the lines `id lat lon alt sigma_x sigma_y sigma_z image col row sigma_col sigma_row [image ...]`."""
     for number, raw in enumerate(read_text(path, TABLE).split("\n"), start=1):
         words = re.split(r"(?:^|\s)#", raw, maxsplit=1)[0].replace(",", " ").split()
         if not words:

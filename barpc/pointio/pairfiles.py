@@ -67,7 +67,7 @@ def _images(path: Path, views: ViewNames) -> tuple[str, str]:
 
 
 def _asp_text(path: Path) -> tuple[Array, Array]:
-    """Return the counts on the first line, then one keypoint a line, col and row first."""
+    """Read an ASP text file: counts on the first line, then one keypoint a line, col and row first."""
     try:
         lines = read_text(path, TABLE).split("\n")
         left, right = (int(word) for word in lines[0].split()[:2])

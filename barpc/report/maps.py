@@ -202,7 +202,7 @@ def _stack_names(stacks: Sequence[Stack]) -> list[str]:
 
 
 def _pair_lines(stacks: Sequence[Stack], files: RunFiles) -> list[str]:
-    """Return the from stack to stack, stronger with more matches between them."""
+    """Draw lines from stack to stack, stronger with more matches between them."""
     index = files.number
     stack_of = {k: number for number, stack in enumerate(stacks) for k in stack.views}
     matches: Counter[tuple[int, ...]] = Counter()

@@ -105,7 +105,7 @@ def read_dimap(text: str, name: str, options: ReadOptions) -> RPC:
 
 
 def _read_dimap_v1(model: Element, name: str, options: ReadOptions) -> RPC:
-    """Return the dIMAP v1: forty numbers an element, scales A and offsets B by axis."""
+    """Read DIMAP v1: forty numbers an element, scales A and offsets B by axis."""
     fields: Fields = {}
     for axis, field in (("ROW", "LINE"), ("COL", "SAMP")):
         values = numbers(_text(_element(model, (f"F_{axis}",), name), ".", name), name, f"F_{axis}")

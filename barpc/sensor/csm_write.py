@@ -113,7 +113,7 @@ def _base(model: SensorModel) -> Pushbroom:
 
 
 def _step(base: Pushbroom) -> float:
-    """Return the from sample to sample [s]: half of the camera's own, which lie between those written."""
+    """Return the sampling step [s]: half of the camera's own."""
     own = np.diff(base.attitude.knots)
     return min(_STEP, float(np.median(own)) / 2) if len(own) > 1 else _STEP
 
@@ -134,9 +134,7 @@ def _positions(model: SensorModel, rows: Array) -> Array:
 def _attitude(
     model: SensorModel, base: Pushbroom, rows: Array, positions: Array, seen: tuple[int, float]
 ) -> Rotation:
-    """Return the ecef_from_camera, z away from the ground, by what pixels of each row see: the turn nearest
-    to all of them.
-    """
+    """Return the rotation ecef_from_camera, z away from the ground, nearest to the lines of sight of each row."""
     cols = np.linspace(0.0, seen[0] - 1.0, _COLUMNS)
     image = np.stack(np.broadcast_arrays(cols, rows[:, None]), axis=-1)
     away = ecef_from_ground(model.localize(image, np.full(image.shape[:2], seen[1]))) - positions[:, None]

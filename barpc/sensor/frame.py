@@ -103,8 +103,8 @@ class Frame(Frozen):
         return np.asarray(np.linalg.solve(self.plane[:, :2], at - self.plane[:, 2:]), np.float64), at, p
 
     def _farther(self, radius: Array) -> Array:
-        """Return the by what factor (N,) the place in the focal plane is farther out than the tangents; NaN
-        if nowhere.
+        """Return the factor (N,) by which a place in the focal plane is farther out than the tangents; NaN if
+        nowhere.
         """
         slope, found = polyder(self.distortion), radius
         step = np.zeros_like(radius)

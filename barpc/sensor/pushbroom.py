@@ -84,7 +84,7 @@ class Light:
         return out
 
     def _lift(self, ecef: Array, sight: Array) -> tuple[Array, Array]:
-        """Return the by how much points seem displaced (3, N) [m], and the vertical (3, N); NaN near the horizon."""
+        """Return the apparent displacement by refraction (3, N) [m], and the vertical (3, N); NaN near the horizon."""
         ground = ground_from_ecef(ecef.T)
         vertical, along = up(ground), sight / np.sqrt((sight * sight).sum(axis=0))
         cosine = -(vertical * along).sum(axis=0)

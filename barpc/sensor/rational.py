@@ -179,7 +179,7 @@ class Rational:
         return np.asarray((signs[:, 1:] == signs[:, :1]).all(axis=0))
 
     def _solve_with_care(self, target: Array, x: Array, index: npt.NDArray[np.int64]) -> BoolArray:
-        """Return the solve the columns `index` of `x` (their `x[2]` given) for `target`; whether each was found."""
+        """Solve the columns `index` of `x` (their `x[2]` given) for `target`; return whether each was found."""
         z = x[2, index]
         state = np.zeros((3, len(index)))
         state[2] = z
@@ -190,8 +190,8 @@ class Rational:
         return ok
 
     def _damped_newton(self, target: Array, x: Array, steps: int = 60) -> Array:
-        """Return the newton on `x[:2]`, steps halved until the error falls, never across a pole; the error
-        (2, N) left.
+        """Iterate damped Newton steps on `x[:2]`, halved until the error falls, never across a pole; return
+        the error (2, N) left.
         """
         left = np.full(target.shape, np.inf)
         active = np.arange(target.shape[1])
@@ -212,9 +212,7 @@ class Rational:
         return left
 
     def _line_search(self, target: Array, x: Array, step: Array, sign: Array) -> BoolArray:
-        """Return the move `x[:2]` by the longest of step, step/2, .. step/128 that lowers the error; whether
-        one did.
-        """
+        """Move `x[:2]` by the longest of step, step/2, .. step/128 that lowers the error; return whether one did."""
         error = np.abs(target - self.value(x)).sum(axis=0)
         todo = np.flatnonzero(np.isfinite(step).all(axis=0) & np.isfinite(error))
         improved = np.zeros(x.shape[1], dtype=bool)

@@ -118,7 +118,7 @@ class _Scene:
         return np.concatenate(grounds), Tracks(view[order], point[order], xy[order], np.ones(len(order)))
 
     def _draw(self, count: int, visible: float) -> tuple[Array, IntArray, IntArray, Array]:
-        """Return the random ground points and all of their observations: ground, view, point, xy."""
+        """Draw random ground points and all of their observations: ground, view, point, xy."""
         grid, per_site = self.grid, self.options.per_site
         home = np.sort(self.rng.integers(0, -(-len(self.cameras) // per_site), count))
         offset = self.rng.uniform(-0.5, 0.5, (2, count)) / (1.0 - self.options.overlap)

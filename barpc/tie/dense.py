@@ -222,7 +222,7 @@ def _resampled(
 def _both_ways(
     left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], num: int
 ) -> tuple[FloatImage, BoolArray]:
-    """Return the disparities of `left`, and where the way back from `right` ends at most a pixel beside."""
+    """Match both ways: disparities of `left`, kept where the way back from `right` ends at most a pixel beside."""
     matcher = cv2.StereoSGBM.create(minDisparity=0, numDisparities=num, **_SGBM)
     there = matcher.compute(left, right).astype(np.float32) / 16.0
     turned = [np.ascontiguousarray(one[:, ::-1]) for one in (right, left)]

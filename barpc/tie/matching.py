@@ -292,9 +292,7 @@ def _match_within(
     pair: Pair,
     options: TieOptions,
 ) -> tuple[Matches, PairReport]:
-    """Return `match_pair` of two views used for some altitudes, and for fewer where it finds few: with less
-    to confuse.
-    """
+    """Match two views at some altitudes, and at fewer where that finds few: with less to confuse."""
     tried = [match_pair(several[0], keypoints, pair, options)]
     for views in several[1:]:
         if not enough(tried[-1][1]) and views[0].alt_range != several[0][0].alt_range:
@@ -451,9 +449,7 @@ class _Search:
         return _Peak(self._predicted(corrected, TOLERANCE), most / len(values), float(significance))
 
     def local(self, tight: Matches) -> Prediction:
-        """Return the prediction corrected by the matches so far, for each point in a band about its
-        neighbours' places.
-        """
+        """Return the corrected prediction: each point in a band about its neighbours' places by the matches so far."""
         errors, places = self.errors(tight), tight.xy[:, 0]
         across, tree = robust_affine(places, errors[:, 1]), cKDTree(places)
 

@@ -243,7 +243,7 @@ def _at(mask: BoolArray, xy: Array) -> BoolArray:
 
 
 def _upsampled(image: FloatImage) -> FloatImage:
-    """Return the more samples a side, by a windowed sinc; the sample `_FINE` (row, col) is the pixel (row,
+    """Resample with more samples a side by a windowed sinc; the sample `_FINE` (row, col) is the pixel (row,
     col).
 
     Between these a linear sample moves no phase; OpenCV's bicubic one would, by up to a twentieth of the step.

@@ -138,7 +138,7 @@ def _bands(geo: Fields) -> Iterator[tuple[str, Fields]]:
 
 
 def _sigma(orbit: Array, attitude: Array) -> tuple[float, float] | None:
-    """Return the stated standard deviations of an angle [rad] and of a coordinate [m]: the upper triangles of
+    """Return the standard deviations of an angle [rad] and of a coordinate [m] from upper triangles of
     covariances.
 
     A turn by the small angle w changes the quaternion by w / 2.

@@ -162,7 +162,7 @@ def _error(root: Fields, path: str) -> float:
 
 
 def _orbit(root: Fields) -> Curve:
-    """Return the aRPPoly over the time of the collection."""
+    """Read ARPPoly over the time of the collection."""
     axes = [_polynomial(root, f"Position/ARPPoly/{axis}", 1) for axis in "XYZ"]
     coeffs = np.zeros((1, max(map(len, axes)), 3))
     for k, axis in enumerate(axes):
@@ -186,7 +186,7 @@ def _polynomial(root: Fields, path: str, variables: int) -> Array:
 
 
 def _formation(root: Fields, scp: Array) -> Formation:
-    """Return the by Grid/Type and, for RGAZIM, ImageFormation/ImageFormAlgo."""
+    """Return the formation by Grid/Type and, for RGAZIM, ImageFormation/ImageFormAlgo."""
     time, kind = _polynomial(root, "Grid/TimeCOAPoly", 2), root.text("Grid/Type")
     if kind == "RGAZIM":
         algorithm = root.text("ImageFormation/ImageFormAlgo")
