@@ -19,6 +19,7 @@ The excess is the baseline's cost over barpc's, less one.
     python benchmarks/ba.py --blocks 1000 3000 10000      # growth with views, by stage, and how far from the optimum
     python benchmarks/ba.py --fill 1000 10000             # what other orders of elimination would cost
     python benchmarks/ba.py --against 26f82d8             # with defaults beside another commit (here 0.2.0), in turns
+    python benchmarks/ba.py --ceres                       # plain, beside Ceres, in turns (needs libceres-dev and g++)
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ import time
 import warnings
 from pathlib import Path
 
+import ceres
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.sparse import bsr_array, coo_matrix
@@ -381,6 +383,7 @@ def main() -> None:
     parser.add_argument(
         "--against", metavar="COMMIT", help="adjustments with defaults beside another commit's"
     )
+    parser.add_argument("--ceres", action="store_true", help="plain adjustments beside Ceres")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     if arguments.growth:
@@ -393,6 +396,8 @@ def main() -> None:
         blocks(arguments.blocks, arguments.a_view)
     elif arguments.against:
         against(arguments.against, arguments.repeat)
+    elif arguments.ceres:
+        ceres.compare(arguments.repeat)
     elif arguments.fill:
         fill(arguments.fill)
     else:

@@ -16,7 +16,7 @@ from barpc.ba.consensus import two_groups
 from barpc.ba.covariance import Covariance
 from barpc.ba.datum import datum_shares
 from barpc.ba.following import follow, without_strips
-from barpc.ba.gauge import GaugeReport, earlier_scene, gauge_report
+from barpc.ba.gauge import GaugeReport, earlier_scene, gauge_report, sampled
 from barpc.ba.heldout import enu_offsets, keep_out, measure
 from barpc.ba.incremental import BlockPrior
 from barpc.ba.judge import Finding, left_over, standing_out
@@ -372,4 +372,5 @@ def _gauge(found: Solution, block: Block, covariance: Covariance) -> GaugeReport
     kinds = (found.seen & (number < last) for last in (block.num_tracks, block.num_known, len(number)))
     counted = next((kind for kind in kinds if kind.any()), found.seen)
     prior = found.outcome.problem.camera_prior.sigma
-    return gauge_report(covariance, found.final.points, found.first_points(block), counted, prior)
+    before = found.first_points(block, sampled(counted))
+    return gauge_report(covariance, found.final.points, before, counted, prior)

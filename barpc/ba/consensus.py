@@ -53,7 +53,7 @@ def two_groups(
     found = []
     with np.errstate(all="ignore"):
         z = offset - np.repeat(by_pair @ offset / count, count)
-        square, cube, fourth = (by_pair @ z**power / count for power in (2, 3, 4))
+        square, cube, fourth = (by_pair @ (z * z * more) / count for more in (1.0, z, z * z))
         maybe = (cube**2 / square**3 + 1.0) >= _BIMODAL * fourth / square**2
     for pair in np.flatnonzero(maybe & (count >= _GROUPED)):
         share, apart, gain = _mixture(z[bounds[pair] : bounds[pair + 1]])

@@ -89,17 +89,23 @@ def _scrambled(numbers: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
     return numbers ^ (numbers >> np.uint64(31))
 
 
-def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Array]:
-    """Return a problem with other observations, and the points (Q, 3) that cameras of unknowns (N, q) give them."""
-    index, point = np.unique(block.point, return_inverse=True)
-    part = replace(
+def of_part(problem: Problem, view: IntArray, point: IntArray, xy: Array) -> Problem:
+    """Return a problem's cameras with other observations (K,), sorted by view, of other points, seen at (2, K) [px]."""
+    points = int(point.max(initial=-1)) + 1
+    return replace(
         problem,
-        cameras=problem.cameras.seeing(block.xy),
-        structure=make_structure(block.view, point, len(block.views), len(index)),
-        xy=block.xy,
+        cameras=problem.cameras.seeing(xy),
+        structure=make_structure(view, point, problem.structure.num_views, points),
+        xy=xy,
         point_prior=None,
         _room=[],
     )
+
+
+def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Array]:
+    """Return a problem with other observations, and the points (Q, 3) that cameras of unknowns (N, q) give them."""
+    index, point = np.unique(block.point, return_inverse=True)
+    part = of_part(problem, block.view, point, block.xy)
     first = block.first_points()[index]
     return part, part.triangulate(first, part.project_points(params, first), 1.0 / block.sigma)
 
@@ -123,37 +129,52 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
     residual = part.residuals(params, points)
     squared = observations.squared(residual, counted)
     expected = block.sigma**2 * observations.freedom(counted)
-    noise, rms = np.full(views, np.nan), np.full(views, np.nan)
-    for v in np.flatnonzero(np.bincount(block.view, minlength=views) >= _FEW):
-        rows = slice(*part.structure.bounds[v : v + 2])
-        noise[v] = scatter(squared[rows], expected[rows] / block.sigma[rows] ** 2)
-        rms[v] = noise[v] * np.sqrt(expected[rows].mean())
+    count, noise = np.bincount(block.view, minlength=views), np.full(views, np.nan)
+    many = count >= _FEW
+    told = many[block.view]
+    number = (np.cumsum(many) - 1)[block.view[told]]
+    noise[many] = scatter(squared[told], expected[told] / block.sigma[told] ** 2, number)
+    rms = noise * np.sqrt(np.bincount(block.view, expected, views) / np.maximum(count, 1))
     return HeldOut(residual, index, points, noise, rms)
 
 
-def scatter(squared: Array, freedom: Array) -> float:
+def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
     """Return the observed over stated standard deviation of observations, half of which may be wrong.
+
+    Half of which may be wrong.
 
     Parameters
     ----------
-    squared : (n,), |r|^2 over its expectation under the stated deviations, at least one
-    freedom : (n,), degrees of freedom of each
+    squared : (K,), |r|^2 over its expectation under the stated deviations
+    freedom : (K,), degrees of freedom of each
+    view : (K,), 0 .. N - 1, ascending; each has one at least
 
     Expectation and maximisation of a chi-square about zero, and of a uniform density of residuals as far as the
     farthest goes; it is `NEAR_LIMIT` nats lower at least, or what is right would count as wrong by its tails.
     """
     half = 0.5 * np.maximum(freedom, 1.0)  # of two views all scatter across the epipolar line
-    far, middle = max(float(squared.max()), _NOTHING), float(np.quantile(squared, _START))
-    variance, wrong = max(middle / _START, _NOTHING), WRONG[0] / WRONG[1]
+    starts = np.flatnonzero(np.diff(view, prepend=-1))
+    count = np.diff(starts, append=len(view)).astype(np.float64)
+    ordered = squared[np.lexsort((squared, view))]
+    at = _START * (count - 1.0)
+    low = ordered[starts + np.floor(at).astype(np.int64)]
+    middle = low + (at % 1.0) * (ordered[starts + np.ceil(at).astype(np.int64)] - low)
+    far = np.maximum(ordered[starts + count.astype(np.int64) - 1], _NOTHING)
+    variance, wrong = np.maximum(middle / _START, _NOTHING), np.full(len(count), WRONG[0] / WRONG[1])
+    farthest, constant = half * np.log(half * far[view]) - gammaln(half + 1.0), half * squared
+    moves = np.ones(len(count), dtype=bool)  # of a view that stands nothing changes any more
     for _ in range(_ITERATIONS):
-        peak = np.maximum(half * np.log(half * far / variance) - gammaln(half + 1.0), NEAR_LIMIT)
-        odds = np.log(wrong / (1.0 - wrong)) + half * squared / variance - peak
-        right = expit(-odds)
-        before, variance = variance, max(float((right @ squared) / max(right.sum(), 1e-300)), _NOTHING)
-        wrong = float((WRONG[0] + (1.0 - right).sum()) / (WRONG[1] + len(right)))
-        if abs(variance - before) < _SAME * before:
+        peak = np.maximum(farthest - half * np.log(variance)[view], NEAR_LIMIT)
+        right = expit(peak - constant / variance[view] - np.log(wrong / (1.0 - wrong))[view])
+        of_right, squares = (np.add.reduceat(rows, starts) for rows in (right, right * squared))
+        found = np.maximum(squares / np.maximum(of_right, 1e-300), _NOTHING)
+        stands = np.abs(found - variance) < _SAME * variance
+        variance = np.where(moves, found, variance)
+        wrong = np.where(moves, (WRONG[0] + count - of_right) / (WRONG[1] + count), wrong)
+        moves &= ~stands
+        if not moves.any():
             break
-    return float(np.sqrt(variance))
+    return np.asarray(np.sqrt(variance))
 
 
 def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 
 from barpc.ba.block import Block
 from barpc.ba.explanations import (
+    EXPLANATIONS,
     FADE,
     FOLLOWED,
     LOCAL,
@@ -287,6 +288,15 @@ class _State:
         left = _PARTS + len(best.taken) - 1 - len(self.taken)
         return self.gain + left * self.taken[-1].gain > best.gain
 
+    def adds_to(self, best: _State, beside: list[_Tried]) -> bool:
+        """Return whether what was taken last gains as much beside the best, of what was taken before: it is
+        no other way.
+        """
+        last, one = self.taken[-1], self.taken[-1].one
+        same = [row.what for row in self.taken[:-1]] == [row.what for row in best.taken[:-1]]
+        gains = [row[2] for row in beside if row[0].kind == one.kind and not _differs(row[0], one)]
+        return same and max(gains, default=0.0) > last.gain - SURE
+
     def added(self, tried: list[_Tried]) -> _State:
         """Return the state with the first of the explanations tried; the others are its rivals."""
         first = tried[0]
@@ -329,15 +339,18 @@ class _Search:
 
     def _grown(self, states: list[_State]) -> tuple[list[_State], bool]:
         """Return the best with one more explanation, and whether they are the last."""
-        best, grown = states[0], list[_State]()
+        best, grown, beside = states[0], list[_State](), list[_Tried]()
         for state in states:
             if state.ended or (best.ended and not state.may_pass(best)):
                 grown.append(state)
+                continue
+            if state is not best and state.adds_to(best, beside):
                 continue
             self.seen, self.taken = state.seen, state.taken
             tried = [row for row in self._tried() if row[2] > SURE]
             if not tried and state is best:  # it explains all
                 return states, True
+            beside = tried if state is best else beside
             for n in [0, *_rivals(tried)] if tried else []:
                 grown.append(state.added([tried[n], *tried[:n], *tried[n + 1 :]]))
             grown += [] if tried else [replace(state, ended=True)]
@@ -352,36 +365,65 @@ class _Search:
         """Return the explanations of what stands out now, fitted beside those taken, with their gains; the
         best first.
         """
-        seen, linear = self.seen, self.seen.linear
-        rows = linear.taking_part
-        left = (
-            linear.left(seen.base.step) + np.einsum("cek,e->ck", seen.extra, seen.base.extra) / linear.sigma
-        )
-        wrong, view, place = (1.0 - seen.base.right)[rows], linear.view[rows], seen.place[:, rows]
-        all_off, known = off_from_right(linear, left, seen.base.right)
-        off, told = all_off[:, rows] / seen.base.noise, (known[rows] | (wrong < 0.5)).astype(np.float64)
-        periods = swings(view, place[1], seen.size, told, off)
-        floor = self.floor / self.sigma / seen.base.noise
-        out = scan(view, place, seen.size, wrong, off, told, floor)
+        seen = self.seen
+        out, periods = self._standing_out(seen.base, seen.extra)
         # in a pair more wrong matches at an end explain what was cut there as well, and nothing stands out beside them
-        out = [one for one in out if one.gain > SURE] or ([] if self.taken else self.first)
-        out = _distinct(out)[:_TRIED]
-        offered = self._worth_more(self._proposed(out, periods[:_TRIED]))
-        made = self._with([], offered)
-        sure = [row for row in made if row[0].group and row[2] > SURE]
-        made = self._with(made, [one for row in sure for one in self._members(row[1], rows)])
+        out = out or ([] if self.taken else self.first)
+        made = self._with([], self._worth_more(list(proposed(seen, out, periods, (MOVING,)))))
         if made and made[0][0].kind == WANDER:
             made = self._with(made, alike(seen, *made[0][:2]))
+        made = self._sharp(made)
+        if (out or self.group) and not self._leaves_nothing(made):
+            made = self._sorted([row[:2] for row in (*made, *self._moving(out, made))])
+        return self._sorted(row[:2] for row in made if not self._is_nothing(*row[:2]))
+
+    def _standing_out(self, found: Fit, extra: Array) -> tuple[list[Interval], list[Swing]]:
+        """Return the intervals and periods that stand out beside what a fit moves (2, e, K)."""
+        seen, linear = self.seen, self.seen.linear
+        rows = linear.taking_part
+        left = linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma
+        wrong, view, place = (1.0 - found.right)[rows], linear.view[rows], seen.place[:, rows]
+        all_off, known = off_from_right(linear, left, found.right)
+        off, told = all_off[:, rows] / found.noise, (known[rows] | (wrong < 0.5)).astype(np.float64)
+        floor = self.floor / self.sigma / found.noise
+        out = [one for one in scan(view, place, seen.size, wrong, off, told, floor) if one.gain > SURE]
+        return _distinct(out)[:_TRIED], swings(view, place[1], seen.size, told, off)[:_TRIED]
+
+    def _leaves_nothing(self, made: list[_Tried]) -> bool:
+        """Return whether nothing stands out beside the best of few unknowns: no rival of a cell's each is
+        needed then.
+        """
+        best = [row for row in made[:1] if row[2] > SURE and row[0].kind in FOLLOWED]
+        beside = (
+            self._standing_out(found, np.concatenate([self.seen.extra, one.extra], axis=1))
+            for one, found, _ in best
+        )
+        return any(not any(one) for one in beside)
+
+    def _moving(self, out: list[Interval], made: list[_Tried]) -> list[_Tried]:
+        """Return the ties that move on the ground, and parts of images that hold what they do.
+
+        They are looked for once and then tried beside what was taken.
+        """
+        self.group = self.group or EXPLANATIONS[MOVING](self.seen, out[0])
+        found = self._with([], self.group)
+        rows = self.seen.linear.taking_part
+        sure = [row for row in found if row[2] > SURE]
+        return self._sharp(self._with(found, [one for row in sure for one in self._members(row[1], rows)]))
+
+    def _sharp(self, made: list[_Tried]) -> list[_Tried]:
+        """Return the explanations with ends, periods and lengths searched for, where these may gain most; the
+        best first.
+        """
         local = [one for kind in LOCAL for one in [row[0] for row in made if row[0].kind == kind][:_LOCAL]]
         # where something is sure already, what is not waits for the next round
         blunt = max(SURE, made[0][2] / _PARTS) if made and made[0][2] > SURE else -np.inf
-        sharp = [
+        return self._sorted(
             self._sharpened(one, found)
             if gain > blunt and (one in local or one.kind in (SETTLING, SWING, WANDER))
             else (one, found)
             for one, found, gain in made
-        ]
-        return self._sorted(row for row in sharp if not self._is_nothing(*row))
+        )
 
     def _worth_more(self, offered: list[Explanation]) -> list[Explanation]:
         """Return the explanations that, by few tracks, may gain most, alone or as the largest of some parts."""
@@ -402,15 +444,6 @@ class _Search:
             away = np.einsum("cmk,m->ck", one.group.by_move[:, :, found.moving > 0.5], found.move)
             size = float(np.sqrt((away**2).sum(axis=0).mean()))
         return bool(size < self.floor * _SEEN)
-
-    def _proposed(self, out: list[Interval], periods: list[Swing]) -> list[Explanation]:
-        """Return the explanations of intervals and periods; the group is looked for once and then tried
-        beside what was taken.
-        """
-        known = (MOVING,) if self.group else ()
-        found = [*self.group, *proposed(self.seen, out, periods, known)]
-        self.group = [one for one in found if one.kind == MOVING]
-        return found
 
     def _members(self, found: Fit, rows: BoolArray) -> Iterator[Explanation]:
         """Yield the parts of images that hold what a group does: rows of one image that lie off move on the

@@ -67,14 +67,12 @@ def scan(
         rows = np.array([np.ones(len(view)), wrong])
         sums = np.array([np.bincount(view * BINS + bin_, row, views * BINS) for row in rows])
         whole = sums.reshape(2, views, BINS)
-        count, bad = _intervals(whole)
-        shares = _shares(count, bad, *whole.sum(axis=2)[..., None])
+        shares = _shares(*_intervals(whole).swapaxes(0, 1), *whole.sum(axis=2))
         gains, displaced = _displacements(view, bin_, off, told, views, floor)
         for by_share, gain in zip((True, False), (shares, gains), strict=True):
-            gain[:, _WHOLE] = 0.0
-            for v in range(views):
-                at = int(gain[v].argmax())
-                worth, common = float(gain[v, at]) - price(views), float(displaced[v, at])
+            gain[_WHOLE] = 0.0
+            for v, at in enumerate(gain.argmax(axis=0).tolist()):
+                worth, common = float(gain[at, v]) - price(views), float(displaced[at, v])
                 i, j = int(_STARTS[at]), int(_STOPS[at])
                 if not by_share and 2 * (j - i) > BINS and (i == 0 or j == BINS):
                     i, j = (0, i) if j == BINS else (j, BINS)  # of two parts the smaller one lies off
@@ -86,9 +84,12 @@ def scan(
 
 
 def _intervals(bins: Array) -> Array:
-    """Return the sums (..., intervals) of all intervals of bins (..., `BINS`)."""
-    edges = np.pad(bins.cumsum(axis=-1), [(0, 0)] * (bins.ndim - 1) + [(1, 0)])
-    return np.asarray(edges[..., _STOPS] - edges[..., _STARTS])
+    """Return the sums (intervals, ...) of all intervals of bins (..., `BINS`): rows of one array, which are
+    copied fast.
+    """
+    edges = np.zeros((BINS + 1, *bins.shape[:-1]))
+    np.moveaxis(bins, -1, 0).cumsum(axis=0, out=edges[1:])
+    return np.asarray(edges[_STOPS] - edges[_STARTS])
 
 
 def _displacements(
@@ -117,11 +118,13 @@ def _displacements(
         np.moveaxis(np.array(scatter), 2, 0) / (count.sum(axis=1) + 1.0)[:, None, None]
     )
     rest = np.swapaxes((shift - count[:, :, None] * followed) @ axes, 1, 2)
-    across = np.moveaxis(_intervals(np.swapaxes(weighted, 1, 2)), 1, 2)  # (N, intervals, 3)
-    own = _intervals(count) - (across @ np.linalg.inv(normal) * across).sum(axis=2)
-    own, score = np.maximum(own, 0.5), _intervals(rest)  # (N, 2, intervals)
-    spread = own[:, None] * np.maximum(size, 1.0)[..., None] + (own * floor)[:, None] ** 2
-    return 0.5 * (score**2 / spread).sum(axis=1), np.hypot(*np.swapaxes(score, 0, 1)) / own
+    across = np.linalg.solve(np.linalg.cholesky(normal), np.swapaxes(weighted, 1, 2))
+    squares = (_intervals(bins) ** 2 for bins in (*np.moveaxis(rest, 1, 0), *np.moveaxis(across, 1, 0)))
+    own, (one, other, *by_smooth) = _intervals(count), squares
+    own, size = np.maximum(own - sum(by_smooth), 0.5), np.maximum(size, 1.0)
+    more = own * floor**2
+    gain = 0.5 / own * (one / (size[:, 0] + more) + other / (size[:, 1] + more))
+    return gain, np.sqrt(one + other) / own
 
 
 def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) -> Array:
@@ -160,6 +163,10 @@ def _shares(count: Array, bad: Array, total: Array, all_bad: Array) -> Array:
         good = np.maximum(n - k, 0.0)
         return np.asarray(xlogy(k, k) + xlogy(good, good) - xlogy(n, n))
 
+    whole, gain = log(all_bad, total), np.zeros_like(count)
+    told = whole < -SURE  # where all that are wrong lie in one interval, the rest are certain
+    count, bad, total, all_bad = count[:, told], bad[:, told], total[told], all_bad[told]
     outside, bad_outside = total - count, all_bad - bad
     more = bad * np.maximum(outside, 1e-9) > bad_outside * count
-    return np.where(more, log(bad, count) + log(bad_outside, outside) - log(all_bad, total), 0.0)
+    gain[:, told] = np.where(more, log(bad, count) + log(bad_outside, outside) - whole[told], 0.0)
+    return gain

@@ -11,7 +11,7 @@ from barpc.ba.agreement import LOOSE, Agreement, agreement, offsets_of
 from barpc.ba.block import Block
 from barpc.ba.consensus import agreeing
 from barpc.ba.ground import Heights, staying
-from barpc.ba.heldout import HeldOut, is_better, measure
+from barpc.ba.heldout import HeldOut, is_better, measure, of_part
 from barpc.ba.incremental import BlockPrior
 from barpc.ba.judge import Finding
 from barpc.ba.priors import DRIFT_SIGMA
@@ -66,22 +66,27 @@ class Solution:
         seen[self.problem.structure.point[self.outcome.inlier]] = True
         return seen
 
-    def first_points(self, block: Block) -> Array:
+    def first_points(self, block: Block, some: BoolArray) -> Array:
         """Return the points (P, 3) [m] that the delivered cameras give for where the adjusted ones show them.
 
-        Nothing but the cameras moves between the two: no observation that was cut, no place that was given, and no
-        height where the rays of a point tell none.
+        NaN for the others. Nothing but the cameras moves between the two: no observation that was cut, no place that
+        was given, and no height where the rays of a point tell none.
         """
-        problem, points = self.problem, self.final.points
-        shown = self.outcome.residual + problem.xy
-        held = staying(points, np.flatnonzero(self.heights.weak))
-        mended = replace(problem, xy=shown, point_prior=held)
+        index, rows = np.flatnonzero(some), np.flatnonzero(some[block.point])
+        points, weak = self.final.points[index], np.flatnonzero(self.heights.weak[index])
+        shown = (self.outcome.residual + self.problem.xy)[:, rows]
+        number = np.searchsorted(index, block.point[rows])
+        part = of_part(self.problem, block.view[rows], number, block.xy[:, rows])
+        mended = replace(part, xy=shown, point_prior=staying(points, weak))
+        delivered = self.problem.camera_prior.mean
         for _ in range(_STEPS_BACK):
-            projected, before = problem.project_points(problem.camera_prior.mean, points), points
-            points = mended.triangulate(points, projected, block.use / block.sigma)
+            projected, before = mended.project_points(delivered, points), points
+            points = mended.triangulate(points, projected, (block.use / block.sigma)[rows])
             if np.nanmax(np.abs(points - before), initial=0.0) < _STANDS:
                 break
-        return points
+        out = np.full((len(some), 3), np.nan)
+        out[index] = points
+        return out
 
     @property
     def has_trend(self) -> bool:

@@ -289,7 +289,12 @@ def test_the_scenes_move_is_from_where_the_delivered_cameras_put_what_is_seen_no
     inlier = np.arange(len(block.view)) < kept * len(block.view)
     residual = problem.residuals(params, final.points)
     outcome: Any = SimpleNamespace(inlier=inlier, residual=residual, minimum=SimpleNamespace(state=final))
-    found = Solution(problem, state, None, heights, outcome, None, None, None).first_points(block)  # type: ignore[arg-type]
+    solution = Solution(problem, state, None, heights, outcome, None, None, None)  # type: ignore[arg-type]
+    found = solution.first_points(block, np.ones(block.num_points, dtype=bool))
+    few = np.arange(block.num_points) % 7 == 3
+    some = solution.first_points(block, few)
+    np.testing.assert_allclose(some[few], found[few], atol=1e-6)
+    assert np.isnan(some[~few]).all()
     sensors = problem.cameras.unknowns.corrected(params, given.views)
     ground = ground_from_ecef(final.points)
     seen = np.array(
