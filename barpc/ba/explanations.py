@@ -102,7 +102,7 @@ def fade(seen: Seen, interval: Interval) -> list[Explanation]:
 
 
 def _untouched(seen: Seen, one: Explanation) -> float:
-    """Return the cost of the same tracks without it: others may be touched by another."""
+    """Return the cost of the same tracks without an explanation: others may be touched by another."""
     nothing = np.full(len(one.sigma), 1e18)
     return first_guess(seen.few, seen.base, seen.extra, one.extra, nothing)[2]
 

@@ -168,8 +168,8 @@ def _at_least(found: int, count: int, alike: int, whole: int) -> float:
 
 
 def _axes(standard: Array) -> tuple[Array, Array]:
-    """Return the along which residuals (2, K) scatter most and least, as columns, and how much; of two views
-    along one line.
+    """Return the axes along which residuals (2, K) scatter most and least, as columns, and their scatter; of
+    two views along one line.
     """
     off = standard - standard.mean(axis=1, keepdims=True)
     variance, axes = np.linalg.eigh(off @ off.T / standard.shape[1])
@@ -184,7 +184,7 @@ def _cells(near: BoolArray, col: IntArray, row: IntArray) -> Array:
 
 
 def _variances(along: Array, of_near: Array, mean: Array, cells: Array) -> Array:
-    """Return the variance (P, 2) of the mean of each place about zero, once its own is taken off it.
+    """Return the variance (P, 2) of the mean of each place about zero, its own part taken off.
 
     By how much observations scatter in each part of the image, where that is more than in the whole.
     """

@@ -321,7 +321,7 @@ def header_of(words: Sequence[str], names: Mapping[str, Sequence[str]] | None = 
 
 
 def _read_table(path: Path) -> Correspondences:
-    """Return a text table: separated by commas, semicolons, tabs or blanks; ``#`` begins a comment."""
+    """Read a text table: columns by commas, semicolons, tabs or blanks; ``#`` begins a comment."""
     rows: list[list[float]] = []
     columns: dict[str, int] = {}
     for number, raw in enumerate(read_text(path, TABLE).splitlines(), start=1):

@@ -136,7 +136,7 @@ def ground_map(files: RunFiles) -> str:
 
 
 def _moving_ground(plane: Plane, summary: Summary) -> list[str]:
-    """Return the cells of the ground in which tie points move together, stronger with more of them, and where
+    """Draw the cells of the ground in which tie points move together, stronger with more of them, and where
     each group lies.
     """
     scene = summary.scene

@@ -279,7 +279,9 @@ def _crop_origin(image: Place, _path: Place) -> tuple[_Window, str]:
 
 
 def _tile_origin(image: Place, path: Place) -> tuple[_Window, str]:
-    """Return a DIMAP product in tiles: the RPC is the whole image's, ``DIM_*.XML`` gives the size of a tile."""
+    """Return the origin of a tile of a DIMAP product: the RPC is the whole image's, ``DIM_*.XML`` gives the
+    size of a tile.
+    """
     tile = re.search(r"_R(\d+)C(\d+)$", image.stem.upper())
     if tile is None or tile.groups() == ("1", "1"):
         return _WHOLE, ""

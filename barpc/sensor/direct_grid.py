@@ -201,7 +201,7 @@ class DirectGrid(Frozen):
         return image, by_lon, by_lat
 
     def _value(self, image: Array, alt: Array, derivative: tuple[int, int, int] = _VALUE) -> Array:
-        """Return the east of the centre and lat (N, 2) [deg], or a derivative of them; NaN off the grid."""
+        """Return degrees east of the centre and lat (N, 2) [deg], or a derivative of them; NaN off the grid."""
         place = np.column_stack([alt, image[:, 1], image[:, 0]])
         margin = [0.1 * np.ptp(self.alts), self.rows[1] - self.rows[0], self.cols[1] - self.cols[0]]
         low, high = np.array([(axis[0], axis[-1]) for axis in (self.alts, self.rows, self.cols)]).T

@@ -462,8 +462,8 @@ class _Links:
         return (ends[0], ends[1]) in self.structural
 
     def errors(self, found: Registration, group: IntArray) -> tuple[Array, Array]:
-        """Return the along and across the epipolar lines (M, 2) [px] between two views; half the segments'
-        length (M,).
+        """Return the distances along and across the epipolar lines (M, 2) [px] between two views, and half
+        the segments' length (M,).
         """
         where = frame(*self.of(group), self.origin[group])
         return where.errors(found.xy[group]), where.after
