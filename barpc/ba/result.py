@@ -43,7 +43,7 @@ class Adjustment:
     params : (N, q)
         The unknowns in metres (or px for image models), see `barpc.ba.unknowns`.
     points : (P, 3)
-        Tracks, ECEF [m]; NaN for a track that was cut altogether.
+        Ground points of the tracks, ECEF [m]; NaN for a track of which nothing was kept.
     residuals_before, residuals : (K, 2)
         Projected - observed [px], in the order of the tracks given; before: cameras as they came (those of
         an earlier block as it left them), points triangulated with them.
@@ -52,7 +52,8 @@ class Adjustment:
     held_out : (K,)
         Observations that took no part, to be measured on; their residuals are those of points triangulated anew.
     held_out_rms, held_out_noise : (N,)
-        What their medians say of every view: root mean square residual [px], and over what is stated; NaN without any.
+        Root mean square residual [px] of every view's held-out observations, from their median, and over the
+        stated one; NaN without any.
     view : (K,)
         The tracks' views.
     noise : float
@@ -68,35 +69,35 @@ class Adjustment:
     covariance : Covariance
         Of the corrections, of points, of relative heights.
     gauge : GaugeReport
-        Shift of the scene, what it is known to, the weakest modes.
+        Shift of the scene, its standard deviation, the weakest modes.
     datum : mapping
         Source (`barpc.ba.datum.SOURCES`) -> its share (10,) in what is known of the scene's `MOTIONS`.
     prior : PriorTest
-        How the corrections compare with the priors given, and what the priors became.
+        Comparison of the corrections with the priors given, and the priors learnt.
     smooth : SmoothTest
-        What is smooth in the residuals that are left.
+        Smooth part of the residuals that are left, with its test.
     asked : mapping
-        "drift" or "jitter" -> what was smooth before a degree was added, or splines or steps were followed, for that.
+        "drift" or "jitter" -> the smooth part that asked for another degree, or for splines and steps.
     findings : tuple of Finding
-        What explains tie points beside the cameras' errors as stated, the first taken first.
+        Explanations of tie points beside the cameras' errors as stated, the first taken first.
     moving : (K,)
-        Observations of ties that move together, as such were found: they took no part.
+        Observations of ties that were found to move together; they took no part.
     left : tuple of Interval
         Rows and columns in which ties were cut, or are off, more than elsewhere and chance allow, at the end.
     alike : (N,)
         How surely neighbours among a view's rejected tie points lie off in the same direction, which wrong matches do
         not (`barpc.ba.scan.neighbours_alike`) [nats].
     in_space_rms : float or None
-        Where the data chose an affine in the image: what rotations, translations and drifts leave of the tracks
-        that took no part [px].
+        Where an affine in the image was chosen: RMS of held-out tracks under rotations, translations and drifts
+        [px].
     two_groups : tuple of TwoGroups
         Pairs of views whose tie points fall into two groups.
     held : (P,)
         Tracks held in height because their rays meet under too small an angle.
     terrain : TerrainTest or None
-        What a terrain did; None without one.
+        Result of holding tie points to a terrain; None without one.
     altimetry : AltimetryTest or None
-        What heights without image coordinates did; None without any.
+        Result of registering heights without image coordinates; None without any.
     left_out : tuple of str
         Views outside the largest group (`AdjustOptions.keep_largest`); they keep their cameras.
     apart : Apart or None

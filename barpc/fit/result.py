@@ -59,8 +59,8 @@ class RpcFit:
         The same on check points all over image and altitudes, which the fit has not seen [px]; the largest error was
         also looked for around the worst of them.
     beyond : float
-        Part of the image and the altitudes that may miss by more than `max_ckp`: no more, with 95 % confidence. 1 for
-        given points, which may lie anywhere and say nothing of the rest.
+        Largest share of image and altitudes, with 95 % confidence, that misses by more than `max_ckp`. 1 for
+        given points, which may lie anywhere.
     min_denominator : float
         Lower bound of the denominators over the hull of the image's own ground and a margin (`FitOptions.pole_margin`)
         around it, over what they are at its centre; above 0 there is no pole.
@@ -82,9 +82,9 @@ class RpcFit:
         Largest distance of a check point from where the model, not the RPC, projects the ground that it localises
         there [px]; 0 for given points. What else projects with the model may be off by as much more.
     free : Free or None
-        What denominators without a margin would reach, where that is less than half the RMSE.
+        Result without a margin around the ground, where its RMSE is less than half.
     reason : Reason or None
-        Why it misses its tolerance, of a model that it misses.
+        Cause of a miss of the tolerance, of a model.
     """
 
     rpc: RPC

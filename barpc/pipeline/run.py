@@ -73,8 +73,8 @@ class AdjustResult:
     ----------
     views : tuple of View, the images used, in the order given; after an adjustment with their refitted RPCs as sensors
     run : Run
-        Everything found on the way. Here and in all that comes of it (`tracks`, `adjustment`, `summary`, files) images
-        stand in the order of their names, `run.views`, so that the order given does not matter.
+        All intermediate results. Here and in `tracks`, `adjustment`, `summary` and files images stand in the
+        order of their names, `run.views`, whatever the order given.
     record : Summary, what summary.json holds, as a typed record
     """
 
@@ -133,9 +133,9 @@ def adjust(
     Parameters
     ----------
     images : sequence of path or View
-        Two or more rasters, in any order: the files written do not depend on it. They are opened read-only. What
-        a camera is read from is found as `barpc.cameras.open_camera` does; a View brings its own model (a frozen
-        dataclass, so that its results can be kept).
+        Two or more rasters, in any order: the files written do not depend on it. They are opened read-only.
+        Cameras are found as by `barpc.cameras.open_camera`; a View brings its own model (a frozen dataclass, so
+        that results can be cached).
     out_dir : path, folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``
     options : RunOptions, optional, None: the defaults
     executor : concurrent.futures.Executor, optional, works on images, tiles, pairs, fits; results do not depend on it

@@ -76,15 +76,14 @@ class RowSpline(Frozen):
     steps : (C + 1, 2)
         Displacement of each detector, (col, row) [px]; without any detector (0, 2).
     strips : (M, 5)
-        What lies off by itself: axis (0: columns, 1: rows), first and last place, and the origin from
-        which, and the rate at which, that fades as exp(-(x - origin) rate) [px, 1/px]; rate 0: it does not. They may
-        overlap.
+        Displaced strips: axis (0: columns, 1: rows), first and last place, and origin and rate of their fading,
+        exp(-(x - origin) rate) [px, 1/px]; rate 0: none. They may overlap.
     moved : (M, 2)
-        By how much each of them, (col, row) [px]; where it fades, at first.
+        Displacement of each strip, (col, row) [px]; of one that fades, at its origin.
     periods : (M,)
-        Rows after which a swing of all rows repeats itself [px].
+        Periods of the swings of all rows [px].
     swings : (M, 2, 2)
-        What its cosine and its sine of 2 pi row / period move, (col, row) [px].
+        Amplitudes of cosine and sine of 2 pi row / period, (col, row) [px].
     """
 
     coeffs: Array

@@ -80,19 +80,18 @@ def find_tracks(
     views : sequence of View
         At least two; in a second pass with their corrected cameras, `replace(view, sensor=...)`.
     options : TieOptions
-        How.
+        Options of the search.
     executor, progress : optional
-        Who does the work, and who hears how far it is: see `ordered`. The result does not depend on them.
+        Executor of the tasks, and callable for progress: see `ordered`. The result does not depend on them.
     only : sequence of (int, int)
         Match these pairs and no others.
     area : Area, optional
-        Tie points only here, as the cameras see it; None: everywhere.
+        Area in which tie points are looked for, as the cameras see it; None: everywhere.
     given : mapping of (int, int), ascending, to Matches
-        Pairs that others have matched: verified and registered as the rest, which is matched here; on channels where
-        grey values do not compare. Where too few can be registered they are taken at their places, as exact as they
-        were found.
+        Matches given for some pairs: verified and registered like those of the other pairs, which are matched
+        here. Where too few can be registered, they keep their places with the measured standard deviation.
     terrain : callable, optional
-        lon, lat (n,) [deg] -> altitude [m above the ellipsoid], NaN outside: where structure is looked for.
+        lon, lat (n,) [deg] -> altitude [m above the ellipsoid], NaN outside: narrows the search for structure.
 
     Raises
     ------
