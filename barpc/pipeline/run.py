@@ -213,7 +213,10 @@ def check(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> AdjustResult:
-    """Measure how well the cameras of overlapping images agree; nothing is adjusted or written."""
+    """Measure how well the cameras of overlapping images agree; nothing is adjusted or written.
+
+    Parameters and errors are those of `adjust`, without a folder; the result has no adjustment.
+    """
     options = with_located(options or RunOptions())
     run = _with_ties(_loaded("check", images, options, executor, progress), options, executor, progress)
     return AdjustResult(_as_given(run.views, images, options), run, summarize(run))
