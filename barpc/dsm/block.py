@@ -21,7 +21,7 @@ from barpc.report.tables import read_summary
 from barpc.rpcio.grids import CORRECTION
 from barpc.scene import View
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import Radar, base_to_height
+from barpc.sensor.geometry import base_to_height, is_radar
 from barpc.tie.pairs import overlapping_pairs
 
 ANGLES = 2.0, 45.0
@@ -100,7 +100,7 @@ def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = No
     """Return the images with the cameras that come with them; altitudes are those of the cameras unless given."""
     views = [replace(view, alt_range=alts or view.alt_range) for view in load_views(images, band=band).views]
     for view in views:
-        if isinstance(view.sensor, Radar):
+        if is_radar(view.sensor):
             raise NoSurfaceError(_radar(view.name))
     return Block(tuple(views), (_best(views),), None, ", ".join(view.name for view in views))
 

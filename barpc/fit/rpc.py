@@ -21,7 +21,7 @@ from barpc.fit.solve import BOUNDED, Solution, solve
 from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import Radar
+from barpc.sensor.geometry import is_radar
 from barpc.sensor.rpc import RPC
 from barpc.sensor.splined import Splined
 
@@ -76,7 +76,7 @@ def fit_rpc(
         message = f"{sample.missing:.1%} of the image has no ground point and is left out: the RPC extrapolates there"
         warnings.warn(message, BarpcWarning, stacklevel=2)
     vendor = underlying_rpc(model)
-    mirrored = options.allow_mirrored or vendor is not None or isinstance(innermost(model), Radar)
+    mirrored = options.allow_mirrored or vendor is not None or is_radar(innermost(model))
     screened(sample.ground, sample.points[:, :2], mirrored)
     contradiction = sample.contradiction()
 
