@@ -51,9 +51,7 @@ Known = GcpEntry | CheckPointEntry
 
 
 def _ties(links: Sequence[Link], width: tuple[float, float], opacity: tuple[float, float]) -> list[str]:
-    """Return the lines of least width and opacity, and by how much those of the link with the most matches
-    are above these.
-    """
+    """Lines of least width and opacity, and by how much those of the link with the most matches are above these."""
     most, parts = max([count for *_, count, _ in links], default=1), []
     for (x1, y1), (x2, y2), count, title in sorted(links, key=itemgetter(2))[-_MOST_LINKS:]:
         share = math.sqrt(count / most)
@@ -87,7 +85,7 @@ class Plane:
 
 
 def _plane_of(lonlat: Array) -> Plane:
-    """Return the map on which points (n, 2) [deg] fill the sheet."""
+    """The map on which points (n, 2) [deg] fill the sheet."""
     lonlat = np.column_stack([wrap_longitude(lonlat[:, 0], lonlat[0, 0]), lonlat[:, 1]])
     low, high = lonlat.min(axis=0), lonlat.max(axis=0)
     lon, lat = ((low + high) / 2).tolist()
@@ -98,7 +96,7 @@ def _plane_of(lonlat: Array) -> Plane:
 
 
 def ground_map(files: RunFiles) -> str:
-    """Draw the footprints, pairs by their matches, tie points and GCPs, on a graticule with a scale bar."""
+    """Footprints, pairs by their matches, tie points, GCPs, on a graticule with a scale bar."""
     summary = files.summary
     rings = [ring for outline in files.outlines for ring in outline]
     points_of: dict[str, Sequence[Known]] = {"gcps": summary.gcps, "check_points": summary.check_points}
@@ -136,9 +134,7 @@ def ground_map(files: RunFiles) -> str:
 
 
 def _moving_ground(plane: Plane, summary: Summary) -> list[str]:
-    """Draw the cells of the ground in which tie points move together, stronger with more of them, and where
-    each group lies.
-    """
+    """Cells of the ground in which tie points move together, stronger with more of them, and where each group lies."""
     scene = summary.scene
     if scene is None:
         return []
@@ -173,7 +169,7 @@ class Stack:
 
 
 def _stacks(plane: Plane, outlines: Sequence[Sequence[Array]]) -> list[Stack]:
-    """Return the images whose middles stand nearer than their numbers are wide."""
+    """Images whose middles stand nearer than their numbers are wide."""
     stacks: list[Stack] = []
     cells: dict[tuple[int, int], list[int]] = {}  # of a width of _APART: their stacks
     for k, outline in ((k, outline) for k, outline in enumerate(outlines) if outline):
@@ -190,7 +186,7 @@ def _stacks(plane: Plane, outlines: Sequence[Sequence[Array]]) -> list[Stack]:
 
 
 def _stack_names(stacks: Sequence[Stack]) -> list[str]:
-    """Return the numbers of stacks, without those that would stand on others."""
+    """The numbers of stacks, without those that would stand on others."""
     taken: list[tuple[float, float, float]] = []
     names, gap = [], 14 if len(stacks) > _MANY else 0
     for stack in stacks:
@@ -202,7 +198,7 @@ def _stack_names(stacks: Sequence[Stack]) -> list[str]:
 
 
 def _pair_lines(stacks: Sequence[Stack], files: RunFiles) -> list[str]:
-    """Draw lines from stack to stack, stronger with more matches between them."""
+    """From stack to stack, stronger with more matches between them."""
     index = files.number
     stack_of = {k: number for number, stack in enumerate(stacks) for k in stack.views}
     matches: Counter[tuple[int, ...]] = Counter()
@@ -218,7 +214,7 @@ def _pair_lines(stacks: Sequence[Stack], files: RunFiles) -> list[str]:
 
 
 def _graticule(plane: Plane) -> tuple[list[str], list[str]]:
-    """Return the lines of longitude and latitude; their degrees and the scale bar, which go on top."""
+    """Lines of longitude and latitude; their degrees and the scale bar, which go on top."""
     right, bottom = WIDTH - 4, plane.height - 24
     reach = np.array([WIDTH / 2, plane.height / 2]) / plane.unit
     lines, texts = [], []
@@ -262,7 +258,7 @@ class Cells:
 
 
 def residual_cells(xy: Array, residuals: Array, size: Sequence[int]) -> Cells:
-    """Return the mean and spread of residuals (m, 2) [px] over a grid of cells on the image."""
+    """Mean and spread of residuals (m, 2) [px] over a grid of cells on the image."""
     cell, num = cell_numbers(xy, size), CELLS**2
     count = np.bincount(cell, minlength=num)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -277,8 +273,7 @@ def residual_cells(xy: Array, residuals: Array, size: Sequence[int]) -> Cells:
 def residual_panels(
     views: Sequence[ViewEntry], observations: Observations, when: str
 ) -> tuple[list[tuple[str, str]], list[float], str]:
-    """Draw small maps of the residuals "before" or "after", with captions, of the images with the largest
-    systematic part.
+    """Small maps of the residuals "before" or "after", with captions, of the images with the largest systematic part.
 
     Cells are darker where the error is larger; thin lines are single residuals; a bold arrow is the mean of a cell
     where it is larger than chance allows. Returns, too, the systematic part of every image's cells, and what lengths
@@ -342,7 +337,7 @@ def _panel(
 
 
 def _arrow(middle: Array, vector: Array) -> str:
-    """Return an arrow centred on a cell, not longer than reaches its neighbours' middles."""
+    """An arrow centred on a cell, not longer than reaches its neighbours' middles."""
     length = float(np.hypot(*vector))
     vector, length = vector * min(1.0, 24.0 / max(length, 1e-9)), min(length, 24.0)
     tip, tail = middle + vector / 2, middle - vector / 2

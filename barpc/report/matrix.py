@@ -26,7 +26,7 @@ class Measure:
     limits: tuple[float, ...]
 
     def shade(self, value: float) -> int:
-        """Return the number of the shade of a value."""
+        """The number of the shade of a value."""
         return sum(value >= limit for limit in self.limits)
 
     @property
@@ -47,9 +47,7 @@ MEASURES = (
 
 
 def pair_matrix(files: RunFiles) -> str:
-    """Draw the matrix of pairs: rows and columns are the images as numbered in their table; above the
-    diagonal the pairs, below it the shades.
-    """
+    """Rows and columns are the images as numbered in their table; above the diagonal the pairs, below it the shades."""
     views, pairs, index = files.summary.views, files.summary.pairs, files.number
     side = (WIDTH - _LEFT - 4) / len(views)
     cells = [(min(ends), max(ends), p) for p in pairs for ends in [(index[p.a], index[p.b])]]
@@ -81,9 +79,7 @@ def pair_matrix(files: RunFiles) -> str:
 
 
 def facts(files: RunFiles) -> dict[str, list[list[object]]]:
-    """Return what the page's script says of an image or a pair that is pointed at: names, and pairs with
-    their figures.
-    """
+    """What the page's script says of an image or a pair that is pointed at: names, and pairs with their figures."""
     index = files.number
     names: list[list[object]] = [[view.name, view.num_observations] for view in files.summary.views]
     pairs: list[list[object]] = []

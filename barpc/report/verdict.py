@@ -49,7 +49,7 @@ _CONTROL_WORDS = {
 
 
 def view_status(view: ViewEntry, run: Run) -> dict[str, str]:
-    """Return the verdict on a view: a word of `STATUS_WORDS`, and what to do (empty when all is well)."""
+    """The verdict on a view: a word of `STATUS_WORDS`, and what to do (empty when all is well)."""
     for status, reason in (("failed", _failure), ("weak", _weakness), ("doubtful", _doubt)):
         if advice := reason(view, run):
             return {"status": status, "advice": advice}
@@ -74,7 +74,7 @@ def _failure(view: ViewEntry, run: Run) -> str:
 
 
 def _apart(view: ViewEntry, run: Run) -> Apart | None:
-    """Return what is known of a view if its RPC is not its own."""
+    """What is known of a view if its RPC is not its own."""
     apart = None if run.adjustment is None else run.adjustment.apart
     return apart if apart is not None and apart.is_view(run.number[view.name]) else None
 
@@ -132,12 +132,12 @@ def _lost(view: ViewEntry) -> float:
 
 
 def _anywhere(view: ViewEntry, run: Run) -> bool:
-    """Return whether the tie points of a view that were rejected lie off in any direction, as wrong matches do."""
+    """Whether the tie points of a view that were rejected lie off in any direction, as wrong matches do."""
     return run.adjustment is not None and bool(-np.inf < run.adjustment.alike[run.number[view.name]] <= SURE)
 
 
 def _oddity(i: int, adjustment: Adjustment) -> str:
-    """Return what is wrong with view i beside the others: its RPC, or something smooth that no correction follows."""
+    """What is wrong with view i beside the others: its RPC, or something smooth that no correction follows."""
     prior, smooth = adjustment.prior, adjustment.smooth
     if prior.odd[i]:
         others = [adjustment.names[j] for j in np.flatnonzero(prior.odd) if j != i]
@@ -164,7 +164,7 @@ def _oddity(i: int, adjustment: Adjustment) -> str:
 
 
 def _beyond(view: ViewEntry, run: Run) -> str:
-    """Return what one RPC does not hold of a camera that jitter or steps between detectors are corrected in."""
+    """What one RPC does not hold of a camera that jitter or steps between detectors are corrected in."""
     told = any(getattr(run.options, name, None) for name in ("grids", "tiles", "resample"))
     if view.fit is None or told or not _follows_more(view, run):
         return ""
@@ -189,14 +189,14 @@ def _beyond(view: ViewEntry, run: Run) -> str:
 
 
 def _follows_more(view: ViewEntry, run: Run) -> bool:
-    """Return whether a camera is more than one RPC holds, as it was delivered or by what it was corrected by."""
+    """Whether a camera is more than one RPC holds, as it was delivered or by what it was corrected by."""
     one = view.correction
     physical = not isinstance(run.views[run.number[view.name]].sensor, RPC)
     return one is not None and any((physical, one.jitter_px, one.detector_px, one.strip_px, one.swing_px))
 
 
 def _left(i: int, adjustment: Adjustment) -> str:
-    """Return what tie points of view i say that took no part: the others were chosen to agree."""
+    """What tie points of view i say that took no part: the others were chosen to agree."""
     noise, error = adjustment.held_out_noise[i], adjustment.held_out_rms[i]
     if not noise > NOISE_LIMIT:
         return ""
@@ -207,7 +207,7 @@ def _left(i: int, adjustment: Adjustment) -> str:
 
 
 def _block_reasons(run: Run) -> list[str]:
-    """Return what the adjustment says of itself that does not fit: priors, noise, the scene's move."""
+    """What the adjustment says of itself that does not fit: priors, noise, the scene's move."""
     if run.adjustment is None or not len(run.tracks):
         return []
     prior, gauge, noise = run.adjustment.prior, run.adjustment.gauge, run.adjustment.noise
@@ -261,9 +261,7 @@ def _block_reasons(run: Run) -> list[str]:
 
 
 def _left_reasons(run: Run) -> list[str]:
-    """Return where tie points were cut, or are off, more than elsewhere, or took no part and are; each
-    image's worst.
-    """
+    """Where tie points were cut, or are off, more than elsewhere, or took no part and are; each image's worst."""
     assert run.adjustment is not None
     worst: dict[str, str] = {}
     found, names = left_entries(run.adjustment), run.adjustment.names
@@ -293,7 +291,7 @@ def _left_reasons(run: Run) -> list[str]:
 
 
 def _ambiguous(adjustment: Adjustment) -> list[str]:
-    """Return the groups that move, where something else explains tie points as well."""
+    """Groups that move, where something else explains tie points as well."""
     rivals = [one.runner_up for one in adjustment.findings if one.motion is not None and one.gap < SURE]
     return [
         f"That tie points move together explains them no better than that {RIVALS[rival]}: look at where they are."
@@ -303,7 +301,7 @@ def _ambiguous(adjustment: Adjustment) -> list[str]:
 
 
 def _place_is_free(run: Run) -> bool:
-    """Return whether nothing but the cameras' priors holds the scene's place: control moves it as far as it must."""
+    """Whether nothing but the cameras' priors holds the scene's place: control moves it as far as it must."""
     given = [getattr(run.options, name, None) for name in ("dem", "fixed_run")]
     assert run.adjustment is not None
     tested = run.adjustment.control
@@ -314,7 +312,7 @@ def _place_is_free(run: Run) -> bool:
 
 
 def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
-    """Return the verdict on the whole: `status`, a `headline`, `lines`, and those of them that are `reasons`.
+    """The verdict on the whole: `status`, a `headline`, `lines`, and those of them that are `reasons`.
 
     The one rule of what passes: `status` is "good" when no image, no control point and no file has a reservation;
     "bad" when an image was not adjusted or a file left out; else "look". What is not good ends with exit code 3.
@@ -349,7 +347,7 @@ def _headline(run: Run, num: int, bad: int, look: int, more: str) -> str:
 
 
 def _control_reasons(run: Run) -> list[str]:
-    """Return the ground points that were cut, what was left out of their files, a reference of no use."""
+    """Ground points that were cut, what was left out of their files, a reference of no use."""
     out = []
     if run.reference is not None and run.adjustment is not None and run.reference.control is None:
         whys = (
@@ -389,9 +387,7 @@ def _control_reasons(run: Run) -> list[str]:
 
 
 def _wrong_heights(run: Run) -> list[str]:
-    """Return a reference whose points lie off each other along the lines of sight, where the terrain's errors
-    move them.
-    """
+    """A reference whose points lie off each other along the lines of sight, where the terrain's errors move them."""
     if run.reference is None or run.adjustment is None:
         return []
     stated = run.adjustment.options.dem_sigma
@@ -407,9 +403,7 @@ def _wrong_heights(run: Run) -> list[str]:
 
 
 def _bends(run: Run) -> list[str]:
-    """Return the images in which a reference's points lie farther off each other than finding them leaves: a
-    pixel at most.
-    """
+    """Images in which a reference's points lie farther off each other than finding them leaves: a pixel at most."""
     if run.reference is None:
         return []
     step = run.reference.step
@@ -423,7 +417,7 @@ def _bends(run: Run) -> list[str]:
 
 
 def _undecided(names: Sequence[str], tested: ControlTest) -> list[str]:
-    """Return the sets of GCPs that contradict each other and weigh the same."""
+    """Sets of GCPs that contradict each other and weigh the same."""
     if not tested.sets:
         return []
     one, other = (
@@ -440,7 +434,7 @@ def _undecided(names: Sequence[str], tested: ControlTest) -> list[str]:
 
 
 def _torn(tested: ControlTest) -> list[str]:
-    """Return the control that agrees with itself and not with the images."""
+    """Control that agrees with itself and not with the images."""
     if not tested.torn:
         return []
     without, held = tested.torn
@@ -504,7 +498,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
 
 
 def _held_lines(run: Run, gcps: GroundPoints, views: Sequence[ViewEntry], known: str) -> list[str]:
-    """Return what ground control says of the scene's place; `known` is what the adjustment states of it."""
+    """What ground control says of the scene's place; `known` is what the adjustment states of it."""
     assert run.adjustment is not None
     is_seen = np.bincount(gcps.point, minlength=len(gcps.names)) > 0
     tested, lines = run.adjustment.control, []
@@ -531,7 +525,7 @@ def _held_lines(run: Run, gcps: GroundPoints, views: Sequence[ViewEntry], known:
 
 
 def _jitter_lines(views: Sequence[ViewEntry]) -> list[str]:
-    """Return what follows the corrections in the images."""
+    """What follows the corrections in the images."""
     lines = []
     found = [view.correction for view in views if view.correction is not None]
     if waving := [one for one in found if one.jitter_px is not None]:
@@ -554,7 +548,7 @@ def _jitter_lines(views: Sequence[ViewEntry]) -> list[str]:
 
 
 def _radar_lines(views: Sequence[ViewEntry]) -> list[str]:
-    """Return what the clocks of radars were off by."""
+    """What the clocks of radars were off by."""
     found = [
         f"{view.name}: range {one.range_m:+.2f} ± {sigma[0]:.2f} m, azimuth {one.azimuth_ms:+.3f} ± {sigma[1]:.3f} ms"
         for view in views
@@ -564,7 +558,7 @@ def _radar_lines(views: Sequence[ViewEntry]) -> list[str]:
 
 
 def _altimetry_lines(adjustment: Adjustment) -> list[str]:
-    """Return what heights without image coordinates did."""
+    """What heights without image coordinates did."""
     test = adjustment.altimetry
     if test is None or test.why_not:
         return []
@@ -575,7 +569,7 @@ def _altimetry_lines(adjustment: Adjustment) -> list[str]:
 
 
 def _reference_lines(run: Run) -> list[str]:
-    """Return what a reference was good for."""
+    """What a reference was good for."""
     found = run.reference
     if found is None or found.control is None:
         return []
@@ -616,7 +610,7 @@ def _known(value: float | None) -> float:
 
 
 def summarize(run: Run) -> Summary:
-    """Return the summary of a run with the verdict on it; a number that is not finite is None, as a file has it."""
+    """The summary of a run with the verdict on it; a number that is not finite is None, as a file has it."""
     found = measure(run)
     views = tuple(replace(view, **view_status(view, run)) for view in found.views)  # type: ignore[arg-type]
     block = block_verdict(run, views)
