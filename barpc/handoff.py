@@ -100,7 +100,8 @@ def verify(
     paths : sequence of path
         Files written for one image: rasters, text files, ``.geom``, JSON.
     model : SensorModel
-        What they should hold, over an image of `size` (width, height) [px] and `alt_range` [m above the ellipsoid].
+        The camera that they should hold, over an image of `size` (width, height) [px] and `alt_range` [m above
+        the ellipsoid].
 
     Returns
     -------

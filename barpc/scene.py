@@ -123,7 +123,7 @@ class GroundPoints(Frozen):
     xy : (M, 2), col, row [px]
     xy_sigma : (M,), standard deviation of each coordinate [px]
     strangers : tuple of str, images that their file names and that are none of the views
-    left_out : tuple of str, what was left out of their files and why, in sentences
+    left_out : tuple of str, points left out of their files, with the reason, in sentences
     """
 
     names: tuple[str, ...]

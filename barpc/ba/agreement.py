@@ -58,7 +58,7 @@ class Agreement:
     sets : tuple of (G,)
         Two sets that contradict each other and weigh the same: none is used. Empty where one is.
     scale : float
-        By how much the stated accuracies of the points used are too good; 1: they are not.
+        Factor by which the stated accuracies of the points used are too good; 1: they are not.
     alike : bool
         Whether the points that are not used, two or more, agree with each other: in another datum, perhaps.
     torn : (2,)

@@ -39,7 +39,7 @@ class BlockPrior:
     Parameters
     ----------
     names : tuple of str
-        Its n views that were free.
+        Views of the block that were free, n of them.
     model, drift : str, int
         The unknowns (see `AdjustOptions`).
     params : (n, q)
@@ -53,9 +53,9 @@ class BlockPrior:
     splines, edges, strips, periods : int, (n, C), (n, M, 5), (n, M)
         Layout of the unknowns in the image (see `barpc.ba.waves`).
     radars : tuple of str
-        Those of its views whose unknowns are of a radar's clocks.
+        Views of the block whose unknowns are a radar's clocks.
     scene : EarlierScene or None
-        Its scene, by its cameras' unknowns; None: written by an earlier release.
+        Scene of the block, by its cameras' unknowns; None: written by an earlier release.
     """
 
     names: tuple[str, ...]

@@ -66,7 +66,7 @@ def met_worse(unused: Unused, size: Array, limit: float, least: float, share: fl
     size : (2, N), of the images [px]
     limit : float, standard deviations from which on an observation is far off
     least, share : float
-        What near ones may have in common [px], and the part of a place that may be far off: no more is named.
+        Tolerances: displacement that near ones may have in common [px], share of a place that may be far off.
     """
     whole = [_thinned(unused.part(unused.view == v), size[:, v]) for v in range(size.shape[1])]
     whole = [one for one in whole if len(one.view) >= _FEWEST]

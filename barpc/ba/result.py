@@ -67,7 +67,7 @@ class Adjustment:
     cameras : Cameras
         The views as the solver saw them.
     covariance : Covariance
-        Of the corrections, of points, of relative heights.
+        Covariance of corrections, points and relative heights.
     gauge : GaugeReport
         Shift of the scene, its standard deviation, the weakest modes.
     datum : mapping
@@ -85,7 +85,8 @@ class Adjustment:
     left : tuple of Interval
         Rows and columns in which ties were cut, or are off, more than elsewhere and chance allow, at the end.
     alike : (N,)
-        How surely neighbours among a view's rejected tie points lie off in the same direction, which wrong matches do
+        Evidence that neighbours among a view's rejected tie points lie off in the same direction, which wrong
+        matches do
         not (`barpc.ba.scan.neighbours_alike`) [nats].
     in_space_rms : float or None
         Where an affine in the image was chosen: RMS of held-out tracks under rotations, translations and drifts
@@ -215,9 +216,9 @@ class PairHeights:
     views : tuple of int
         The pair.
     absolute : float
-        Of a height [m].
+        Standard deviation of a height [m].
     relative : float
-        Of a height against the mean height of the pair's tie points [m].
+        Standard deviation of a height against the mean height of the pair's tie points [m].
     count : int
         Tie points that it was evaluated at.
     """

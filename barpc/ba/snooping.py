@@ -44,18 +44,18 @@ class ControlTest:
     used : (G,)
         Points that hold the block; the others were found wrong.
     residual : (G, 3)
-        What all the others say of a point minus its given place, east, north, up [m], in the directions that they
+        Place of a point by all others minus its given place, east, north, up [m], in the directions that they
         tell of; NaN where there is none.
     w : (G,)
-        Its largest component over its standard deviation.
+        Largest component of the residual over its standard deviation.
     redundancy : (G,)
-        How far the others could tell: 0 not at all, 1 as if the point were not used.
+        Redundancy, how far the others could tell: 0 not at all, 1 as if the point were not used.
     scatter : float
         Root mean square residual of the points used over what is expected; NaN where too little is told.
     fits : bool
         Whether that may be chance.
     agreed : Agreement or None
-        How the points used were found.
+        Agreement by which the points used were found.
     """
 
     used: BoolArray

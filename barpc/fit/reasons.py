@@ -45,9 +45,9 @@ class Reason:
     share : float
         Part of the squared errors that is due to it; of "all", what is left by the best of the others.
     size_px : float
-        Its root mean square; of a step its height.
+        Root mean square of that part; of a step its height.
     col, row : float
-        Where it is, of a step and of a place [px].
+        Position of a step or a place [px].
     """
 
     cause: str

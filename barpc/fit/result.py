@@ -23,11 +23,11 @@ class Free:
     Parameters
     ----------
     rmse_px, max_px : float
-        Of its check points, the larger of col and row.
+        RMSE on its check points, the larger of col and row.
     pole : (lon, lat, alt)
-        Where a denominator is 0 nearest to the middle of that ground; NaN where none was found.
+        Place nearest to the middle of that ground where a denominator is 0; NaN where none was found.
     far : float
-        How far, 1 being the end of the ground.
+        Distance of that place, 1 being the end of the ground.
     """
 
     rmse_px: float

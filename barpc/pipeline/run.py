@@ -75,7 +75,7 @@ class AdjustResult:
     run : Run
         All intermediate results. Here and in `tracks`, `adjustment`, `summary` and files images stand in the
         order of their names, `run.views`, whatever the order given.
-    record : Summary, what summary.json holds, as a typed record
+    record : Summary, content of summary.json as a typed record
     """
 
     views: tuple[View, ...]

@@ -105,7 +105,7 @@ def load_views(
     Parameters
     ----------
     images : sequence of path or View, files, perhaps with choices behind them (`open_camera`), or views of them
-    min_views : int, how many are needed
+    min_views : int, least number of views
     keep_going : bool, leave a bad file (ImageError, RpcError) out instead of stopping
     band : int, the band that will be read, from 1
     distinct : bool, refuse an image that is there twice, also as other files or under another RPC (see `Twins`)

@@ -115,7 +115,7 @@ class Pushbroom(Frozen):
     look_origin : float, column [px] from which `look` counts
     line_period : float, time from one row to the next [s]; negative where the image was turned over
     first_line : float, time of row 0 [s]
-    light : Light, what bends the line of sight
+    light : Light, bending of the line of sight
     accuracy : (float, float) or None, stated standard deviations of attitude, as metres on the ground, and position [m]
 
     Raises

@@ -68,7 +68,7 @@ class RowSpline(Frozen):
     Parameters
     ----------
     coeffs : (M, 2)
-        Of uniform cubic B-splines over the rows, (col, row) [px]; M = 0: none, else at least 4.
+        Coefficients of uniform cubic B-splines over the rows, (col, row) [px]; M = 0: none, else at least 4.
     row_offset, row_scale : float
         Middle row, and rows from there to the ends of the knots [px].
     edges : (C,)

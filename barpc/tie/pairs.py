@@ -249,7 +249,7 @@ def possible_pairs(
     only : sequence of (int, int)
         These pairs, all that overlap, and no others.
     area : Area, optional
-        Where the overlap counts; None: everywhere.
+        Area in which the overlap counts; None: everywhere.
     given : collection of (int, int)
         Pairs, ascending, that are matched already: they are among those returned, overlap or not.
 

@@ -34,7 +34,7 @@ def read_linescan(
     path : Path, Maxar's image support data or Airbus' ``DIM_*.XML``
     band : str, optional, the band whose detector is taken, where they have detectors of their own
     aberration, refraction : bool, optional
-        What bends the line of sight (`Light`); None: both for Maxar, what the settings of a DIMAP say for Airbus.
+        Bending of the line of sight (`Light`); None: both kinds for Maxar, by the settings of a DIMAP for Airbus.
 
     Raises
     ------
