@@ -23,7 +23,7 @@ STATE, PARTIAL = ".barpc", "partial"
 def replacing(
     path: Path | str, *, overwrite: bool = False, durable: bool = True, room: Path | None = None
 ) -> Iterator[Path]:
-    """A temporary path for `path`, renamed to it when the block ends without an error.
+    """Yield a temporary path for `path`, renamed to it when the block ends without an error.
 
     It has the target's own name, in a folder of its own: what a writer takes from a name stays right, however long.
 

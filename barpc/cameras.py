@@ -54,7 +54,7 @@ class Camera:
 
     @property
     def rpc(self) -> RPC:
-        """The model where it is an RPC; InputError where it is not."""
+        """The RPC, where the model is one; InputError where it is not."""
         if isinstance(self.model, RPC):
             return self.model
         raise InputError(
@@ -72,7 +72,7 @@ class Camera:
 
     @property
     def altitude(self) -> float:
-        """The middle of its altitudes [m]."""
+        """Middle of the camera's altitudes [m]."""
         return (self.alt_range[0] + self.alt_range[1]) / 2
 
 
@@ -117,7 +117,7 @@ def open_camera(spec: str | Path, **choices: Any) -> Camera:
 
 
 def open_split(path: Place, texts: Mapping[str, str], **choices: Any) -> Camera:
-    """As `open_camera`, of a file and the choices behind it (see `split_spec`)."""
+    """Open the camera of a file with the choices behind its name (see `open_camera`, `split_spec`)."""
     texts = dict(texts)
     size, holder = (choices.pop(key, texts.pop(key, None)) for key in ("size", "camera"))
     file = path if holder is None else place(holder)
@@ -141,7 +141,7 @@ def open_split(path: Place, texts: Mapping[str, str], **choices: Any) -> Camera:
 
 
 def split_spec(spec: str | Path, hosts: Sequence[str] = ()) -> tuple[Place, dict[str, str]]:
-    """A file and the choices given behind it, as texts; files on other hosts where these are allowed (ImageError)."""
+    """Split a file from the choices given behind it, as texts; ImageError for a host that is not allowed."""
     name, texts = os.fspath(spec), dict[str, str]()
     known = {"camera", "size", *(key for opener in OPENERS.values() for key in opener.choices)}
     last = re.compile(rf"(.*),({'|'.join(sorted(known))})=(.*)", re.DOTALL)
@@ -154,7 +154,7 @@ def split_spec(spec: str | Path, hosts: Sequence[str] = ()) -> tuple[Place, dict
 
 
 def read_points(spec: str | Path) -> tuple[Correspondences | None, tuple[int, int] | None]:
-    """The points of a table or of a localisation grid, and the image size given behind it; None of a camera."""
+    """Return the points of a table or of a localisation grid, and the image size given behind it; None of a camera."""
     path, texts = split_spec(spec)
     if path.is_dir() or b"<adsHeader>" in read_head(path, IMAGE, _HEAD):
         return None, None
@@ -198,7 +198,7 @@ def _open_rpc(path: Place, first_pixel: float | None = None, band: int = 1) -> C
 
 
 def _is_sentinel1(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
-    """A product folder or zip, its manifest, or an annotation."""
+    """Return a product folder or zip, its manifest, or an annotation."""
     return path.is_dir() or path.suffix.lower() in (".safe", ".zip") or b"<adsHeader>" in head
 
 
@@ -209,7 +209,7 @@ def _open_sentinel1(path: Place, pol: str | None = None, **choices: Any) -> Came
 
 
 def _radar(key: str, path: Place, opened: Callable[[Path], Any]) -> Camera:
-    """A radar's own model; ImageError on another host, for it is of many files."""
+    """Open a radar's own model; ImageError on another host, as it consists of many files."""
     if not isinstance(path, Path):
         raise ImageError(f"{path}: a radar product is read from disk only")
     model = opened(path)
@@ -217,7 +217,7 @@ def _radar(key: str, path: Place, opened: Callable[[Path], Any]) -> Camera:
 
 
 def _is_terrasar(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
-    """A product folder, or its annotation."""
+    """Return a product folder, or its annotation."""
     if not (path.is_dir() and isinstance(path, Path)):
         return b"<level1Product" in head
     from barpc.sensor.terrasar import find_annotation
@@ -232,7 +232,7 @@ def _open_terrasar(path: Place) -> Camera:
 
 
 def _is_sicd(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
-    """The XML of a SICD image, or a NITF that holds it."""
+    """Return the XML of a SICD image, or a NITF that holds it."""
     if b"SICD" not in head and not head.startswith(b"NITF02.10"):
         return False
     from barpc.sensor.sicd import find_sicd, is_sicd
@@ -297,7 +297,7 @@ def _interval(text: str) -> tuple[float, float]:
 
 
 def _is_physical(path: Place, head: bytes, choices: Mapping[str, Any]) -> bool:
-    """Where it is asked for, or an XML holds it and no RPC."""
+    """Return whether the physical model is asked for, or is all that an XML holds."""
     if "model" in choices or not isinstance(path, Path):
         return choices.get("model") == "physical"
     return _VENDORS(head) is not None and only_physical(path)
@@ -317,7 +317,9 @@ def _open_physical(
 
 
 def _stated_altitudes(file: Path) -> tuple[float, float]:
-    """The altitudes of the RPC that was delivered with a physical model; all ground on Earth where there is none."""
+    """Return the altitudes of the RPC that was delivered with a physical model; all ground on Earth where
+    there is none.
+    """
     for name in (file.name, f"RPC_{file.name[4:]}"):
         try:
             return altitude_range(read_rpc_source(file.parent / name).rpc)

@@ -56,7 +56,7 @@ class HeightGrid:
 
     @classmethod
     def open(cls, path: Path | str) -> HeightGrid:
-        """A grid from ``.hgt`` (SRTM), ``.gtx`` (NOAA's geoid grids) or any raster with a CRS; or InputError."""
+        """Return a grid from ``.hgt`` (SRTM), ``.gtx`` (NOAA's geoid grids) or any raster with a CRS; or InputError."""
         path = place(path)
         with opened(path, GRID) as file:
             length = file.seek(0, 2)
@@ -83,13 +83,13 @@ class HeightGrid:
         return cls(path, driver, shape, crs, to_pixel, float(extent.left), reference, period)
 
     def read(self, top: int, bottom: int, left: int, right: int) -> Array:
-        """Heights (bottom - top, right - left) [m] of a window, NaN in voids."""
+        """Read the heights (bottom - top, right - left) [m] of a window, NaN in voids."""
         with open_raster(self.path, self.driver) as dataset:
             window = Window.from_slices((top, bottom), (left, right))
             return np.asarray(dataset.read(1, window=window, masked=True).astype(np.float64).filled(np.nan))
 
     def locate(self, lon: Array, lat: Array) -> tuple[Array, Array]:
-        """Fractional row, col (N,) of lon, lat (N,) [deg], node centres at integers."""
+        """Return the fractional row, col (N,) of lon, lat (N,) [deg], node centres at integers."""
         if self.crs.is_geographic:
             x, y = self.west + np.mod(lon - self.west, 360.0), lat
         else:
@@ -102,7 +102,7 @@ class HeightGrid:
         return _snapped(d * x + e * y + f - 0.5), _snapped(a * x + b * y + c - 0.5)
 
     def sample(self, lon: npt.ArrayLike, lat: npt.ArrayLike) -> Array:
-        """Bilinear heights (...) [m] at lon, lat (...) [deg]; NaN outside and where a void has weight."""
+        """Return the bilinear heights (...) [m] at lon, lat (...) [deg]; NaN outside and where a void has weight."""
         lon, lat = np.broadcast_arrays(np.asarray(lon, np.float64), np.asarray(lat, np.float64))
         row, col = self.locate(lon.ravel(), lat.ravel())
         if self.period:
@@ -118,7 +118,9 @@ class HeightGrid:
         return height.reshape(lon.shape)
 
     def extremes(self, at: Array) -> tuple[float, float]:
-        """Lowest and highest height [m] in the window around fractional row, col (2, N); infinite where unknown."""
+        """Return the lowest and highest height [m] in the window around fractional row, col (2, N); infinite
+        where unknown.
+        """
         at, limits = at[:, np.isfinite(at).all(axis=0)], np.array(self.shape)
         if not at.size or self.period:  # around the Earth columns have no window
             return -np.inf, np.inf
@@ -160,13 +162,15 @@ class HeightGrid:
 
 
 def _snapped(index: Array) -> Array:
-    """Fractional indices, on the node where they are within a millionth of it: a void beyond has no weight."""
+    """Return the fractional indices, on the node where they are within a millionth of it: a void beyond has
+    no weight.
+    """
     node = np.rint(index)
     return np.where(np.abs(index - node) < 1e-6, node, index)
 
 
 def _inverse(forward: Affine, path: Place) -> Affine:
-    """From coordinates to pixels, where the way there has one."""
+    """Return the inverse transformation, from coordinates to pixels, where there is one."""
     numbers = np.array(forward[:6])
     area = abs(forward.determinant)
     if np.isfinite(numbers).all() and np.abs(numbers).max() <= _FAR and area >= _FAR**-2:
@@ -175,7 +179,7 @@ def _inverse(forward: Affine, path: Place) -> Affine:
 
 
 def _vertical_reference(wkt: str) -> str:
-    """What heights in a CRS count from: the name of its vertical part, or the ellipsoid of a 3-D CRS."""
+    """Return the vertical reference of a CRS: the name of its vertical part, or the ellipsoid of a 3-D CRS."""
     match = _VERTICAL.search(wkt)
     if match:
         return "ellipsoid" if "ellipsoid" in match.group(1).lower() else match.group(1)
@@ -222,7 +226,8 @@ class Dem:
         return height if self.geoid is None else height + self.geoid.sample(lon, lat)
 
     def between(self, start: Array, end: Array) -> tuple[float, float, float]:
-        """Of lines from `start` to `end` (N, 3): the most posts that one passes; lowest and highest terrain there [m].
+        """Return, for lines from `start` to `end` (N, 3), the most posts that one passes, and the lowest and
+        highest terrain [m].
 
         Zero and infinite ends where none of them is on the DEM.
         """
@@ -247,7 +252,7 @@ def localize_on_terrain(
     terrain: Callable[[Array, Array], Array],
     alt_range: tuple[float, float],
 ) -> Array:
-    """Where lines of sight first meet the terrain, coming from the sensor.
+    """Return where lines of sight first meet the terrain, coming from the sensor.
 
     Lines are walked down by quarters of the posts of a `Dem` (of another terrain, in 64 steps) until they are below the
     terrain, then halved. A BarpcWarning where a line meets none and the terrain reaches out of `alt_range`.
@@ -290,7 +295,9 @@ def localize_on_terrain(
 
 
 def _met(sensor: SensorModel, image: Array, terrain: Callable[[Array, Array], Array], levels: Array) -> Array:
-    """The ground points (N, 3) between descending levels [m]; terrain at the first and the last of them counts."""
+    """Return the ground points (N, 3) between descending levels [m]; terrain at the first and the last of
+    them counts.
+    """
 
     def above(alt: Array) -> Array:
         ground = sensor.localize(np.broadcast_to(image, (*alt.shape, 2)), alt)

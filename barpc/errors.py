@@ -66,7 +66,7 @@ class BarpcWarning(UserWarning):
 
 
 def visible(text: str) -> str:
-    r"""A text with everything that does not print escaped as in JSON; lines stay lines.
+    r"""Return a text with everything that does not print escaped as in JSON; lines stay lines.
 
     Examples
     --------

@@ -63,7 +63,7 @@ class Frozen:
         return [field.name for field in fields(self) if field.init]  # type: ignore[arg-type]  # children are dataclasses
 
     def _told(self) -> str:
-        """What is printed of it."""
+        """Return the fields to be printed."""
         return ", ".join(f"{name}={_short(getattr(self, name))}" for name in self._given())
 
     def __repr__(self) -> str:
@@ -84,14 +84,14 @@ class Frozen:
 
 
 def _plain(value: object) -> object:
-    """What stands for a value when it is compared; -0.0 is 0.0."""
+    """Return a value in the form in which it is compared; -0.0 is 0.0."""
     if not isinstance(value, np.ndarray):
         return value
     return value.shape, (value + 0.0 if value.dtype.kind == "f" else value).tobytes()
 
 
 def _short(value: object) -> str:
-    """A value in a few words: of an array with more than three numbers its shape."""
+    """Return a value in a few words: of an array with more than three numbers its shape."""
     if isinstance(value, np.ndarray) and value.size > 3:
         return f"{' x '.join(map(str, value.shape))} numbers"
     return np.array2string(value, precision=6) if isinstance(value, np.ndarray) else repr(value)
@@ -105,7 +105,8 @@ _FRAME = "frame"
 
 
 def to_arrays(value: Any) -> Arrays:
-    """Named arrays that hold a value: its arrays with their type and bits, and around them a text (JSON).
+    """Return the named arrays that hold a value: its arrays with their type and bits, and around them a text
+    (JSON).
 
     A value is None, bool, int, float, str, an array, tuple, list, mapping with string keys, or a dataclass of barpc
     of such; TypeError where anything else is in it.
@@ -122,7 +123,8 @@ def to_arrays(value: Any) -> Arrays:
 
 
 def from_arrays(arrays: Mapping[str, npt.NDArray[Any]], *, sent: bool = False) -> Any:
-    """The value that `to_arrays` took apart; ValueError where it is damaged or names no loaded dataclass of barpc.
+    """Return the value that `to_arrays` took apart; ValueError where it is damaged or no loaded dataclass of
+    barpc.
 
     A Remote is taken of arrays that were `sent` by our own process only: those of a file may be anybody's.
     """
@@ -183,7 +185,8 @@ _HEADER = 1 << 12
 
 
 def load_npz(path: Path | str, kind: Kind = ARRAYS) -> Arrays:
-    """The arrays of an ``.npz`` file, unpacked of no more bytes than `kind` allows; errors are of its class.
+    """Return the arrays of an ``.npz`` file, unpacked of no more bytes than `kind` allows; errors are of its
+    class.
 
     What the archive claims is added up before anything is unpacked: a few kilobytes can hold gigabytes of zeros.
     """
@@ -207,7 +210,9 @@ def _unpack(file: IO[bytes], path: Path | str, kind: Kind) -> Arrays:
 
 
 def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> tuple[int, int]:
-    """Elements and bytes of a member, as many as the archive claims; ValueError where it cannot hold them."""
+    """Return the elements and bytes of a member, as many as the archive claims; ValueError where it cannot
+    hold them.
+    """
     packed = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: _DEFLATE}.get(member.compress_type)
     if packed is None or member.file_size > packed * member.compress_size + _HEADER:
         raise ValueError(f"{member.filename} claims more bytes than it can hold")
@@ -225,6 +230,6 @@ def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> tuple[int, int
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any]:
-    """A member whose header was looked at."""
+    """Return a member whose header was looked at."""
     with archive.open(member) as file:
         return np.asarray(npy.read_array(file, allow_pickle=False))

@@ -10,7 +10,8 @@ from barpc.geodesy import Array
 
 
 def polygon(ring: Array) -> dict[str, Any] | None:
-    """The geometry of a footprint: counter-clockwise, closed; led to the pole where it goes once around one.
+    """Return the geometry of a footprint: counter-clockwise, closed; led to the pole where it goes once
+    around one.
 
     Of a ring (N, 2) as `barpc.sensor.geometry.footprint` gives it; a MultiPolygon where the antimeridian cuts it, None
     for an outline that is not finite.
@@ -39,17 +40,17 @@ def polygon(ring: Array) -> dict[str, Any] | None:
 
 
 def feature(ring: Array, **properties: Any) -> dict[str, Any]:
-    """A Feature of a footprint with its properties."""
+    """Return a Feature of a footprint with its properties."""
     return {"type": "Feature", "properties": properties, "geometry": polygon(ring)}
 
 
 def collection(features: list[dict[str, Any]]) -> dict[str, Any]:
-    """A FeatureCollection."""
+    """Return a FeatureCollection."""
     return {"type": "FeatureCollection", "features": features}
 
 
 def _around_pole(ring: Array, step: Array, turn: float) -> Array:
-    """The area between an outline around a pole and that pole, three turns of it: from it one is cut."""
+    """Return the area between an outline around a pole and that pole, three turns of it: from it one is cut."""
     lon = ring[0, 0] % 360.0 - 1.5 * turn + np.concatenate([[0.0], np.cumsum(np.tile(step, 3))])
     lat = np.append(np.tile(ring[:, 1], 3), ring[0, 1])
     pole = 90.0 if lat.mean() > 0 else -90.0
@@ -62,7 +63,7 @@ def _area(ring: Array) -> float:
 
 
 def _clip(ring: Array, west: float) -> Array:
-    """The part of a polygon within 360 degrees east of a meridian (Sutherland and Hodgman)."""
+    """Return the part of a polygon within 360 degrees east of a meridian (Sutherland and Hodgman)."""
     for lon, side in ((west, 1.0), (west + 360.0, -1.0)):
         out: list[Array] = []
         for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):

@@ -49,7 +49,7 @@ Projection = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Reading:
-    """What one of `CONSUMERS` makes of one file.
+    """Result of reading one file by one of `CONSUMERS`.
 
     `max_error`: largest distance to the model over the grid [px], NaN where it was not read; `note`: why it was not.
     `rms`: of the distances at the points of a sample [px], where there is one.
@@ -70,7 +70,7 @@ class Reading:
 def control_grid(
     model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]
 ) -> tuple[Array, Array]:
-    """Ground points (N, 3) over an image and its altitudes, and where `model` sees them (N, 2) [px]."""
+    """Return the ground points (N, 3) over an image and its altitudes, and where `model` sees them (N, 2) [px]."""
     ground = model.localize(*image_grid(size, alt_range))
     ground = ground[np.isfinite(ground).all(axis=1)]
     return ground, model.project(ground)
@@ -79,7 +79,9 @@ def control_grid(
 def difference(
     model: SensorModel, other: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]
 ) -> float:
-    """Largest distance [px] between two cameras of one image over the image and its altitudes; NaN if blind."""
+    """Return the largest distance [px] between two cameras of one image over the image and its altitudes; NaN
+    if blind.
+    """
     ground, image = control_grid(model, size, alt_range)
     return _largest(other.project, ground, image) if len(ground) else float("nan")
 
@@ -98,7 +100,8 @@ def verify(
     paths : sequence of path
         Files written for one image: rasters, text files, ``.geom``, JSON.
     model : SensorModel
-        What they should hold, over an image of `size` (width, height) [px] and `alt_range` [m above the ellipsoid].
+        The camera that they should hold, over an image of `size` (width, height) [px] and `alt_range` [m above
+        the ellipsoid].
 
     Returns
     -------
@@ -154,7 +157,7 @@ def _grid_reading(
 
 
 def unverified(paths: Sequence[Path | str]) -> list[str]:
-    """A sentence for each kind of these files that no installed tool but barpc reads."""
+    """Return a sentence for each kind of these files that no installed tool but barpc reads."""
     files = [
         path for path in map(Path, paths) if not path.name.endswith(STATE_END)
     ]  # whose readers are no packages
@@ -174,7 +177,7 @@ _MACHINE = frozenset(
 
 
 def _readers(path: Path) -> dict[str, bool]:
-    """The tools besides barpc that read a file, and whether they are installed."""
+    """Return the tools besides barpc that read a file, and whether they are installed."""
     if path.name.endswith((GRID, CORRECTION, STATE_END)):
         return {name: one.installed for name, one in _grid_consumers(path).items() if one.package != "barpc"}
     row = row_of(path)
@@ -182,7 +185,7 @@ def _readers(path: Path) -> dict[str, bool]:
 
 
 def _readings(path: Path, ground: Array, image: Array) -> list[Reading]:
-    """What all consumers make of a file, which is lent to those that are not barpc."""
+    """Read a file with all consumers; those that are not barpc get it in a folder of its own."""
     names = [name for name, installed in _readers(path).items() if installed]
     try:
         with _lent(path) as lent:
@@ -205,7 +208,7 @@ def _reading(path: Path, lent: Path, name: str, ground: Array, image: Array) -> 
 
 
 def _unread(path: Path, name: str, failure: Exception) -> Reading:
-    """What a reader says; OutputError where it is the machine that says it, of which no file is to blame."""
+    """Return a reader's message; OutputError where the machine and not the file is to blame."""
     if isinstance(failure, OSError) and failure.errno in _MACHINE:
         raise OutputError(f"{path}: cannot be opened as {name} does ({failure.strerror})") from failure
     return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
@@ -283,7 +286,7 @@ def _gdal_raster(path: Path) -> Projection:
 
 
 def _gdal_text(path: Path) -> Projection:
-    """GDAL reads text only beside an image: one of a single pixel is lent to it."""
+    """Return GDAL reads text only beside an image: one of a single pixel is lent to it."""
     stem = path.name[: -len("_rpc.txt")] if path.name.lower().endswith("_rpc.txt") else path.stem
     with tempfile.TemporaryDirectory() as folder:
         image = Path(folder) / f"{stem}.tif"
@@ -323,7 +326,9 @@ def _shareloc(path: Path) -> Projection:
 
 
 def _told(found: Array, lon: Array) -> Array:
-    """What shareloc found (N, ...) at longitudes; OutputError where it leaves out those beyond 180 degrees alone."""
+    """Return image points (N, ...) that shareloc found; OutputError where it fails beyond 180 degrees of
+    longitude alone.
+    """
     lost, beyond = ~np.isfinite(found).all(axis=1), np.abs(lon) > 180.0
     if lost.any() and not (lost & ~beyond).any():
         raise OutputError(
@@ -338,7 +343,7 @@ def _orthority(path: Path) -> Projection:
 
 
 def _keywords(path: Path) -> Projection:
-    """An OSSIM keyword list, read as its readers do: every line split at the first colon, all keys asked for."""
+    """Return an OSSIM keyword list, read as its readers do: every line split at the first colon, all keys asked for."""
     pairs = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line)
     if pairs["type"].strip() != "ossimRpcModel" or pairs["polynomial_format"].strip() != "B":
         raise OutputError("type or polynomial_format is not what OSSIM expects")
@@ -376,7 +381,7 @@ def _linear_grid(path: Path) -> Projection:
 
 
 def _gdal_correction(path: Path) -> Projection:
-    """As whoever resamples reads it: values at the places that GDAL gives for the centres of its pixels."""
+    """Read a correction grid as a resampler does: values at the places that GDAL gives for its pixels' centres."""
     from scipy.interpolate import RegularGridInterpolator
 
     rpc = _gdal_raster(path)

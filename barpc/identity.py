@@ -24,7 +24,7 @@ _HOST = platform.node()
 
 @dataclass(frozen=True)
 class Stamp:
-    """What the system says of a file: its times change with whatever is written or put in its place."""
+    """File status by the system: its times change with whatever is written or put in its place."""
 
     size: int
     mtime_ns: int
@@ -35,15 +35,15 @@ class Stamp:
 
     @classmethod
     def of(cls, found: os.stat_result) -> Stamp:
-        """Of what `os.stat` finds here."""
+        """Return the stamp that `os.stat` gives."""
         return cls(found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino, found.st_dev, _HOST)
 
     def times(self) -> tuple[int, int, int]:
-        """What every host sees alike."""
+        """Return the parts of the stamp that every host sees alike."""
         return self.size, self.mtime_ns, self.ctime_ns
 
     def matches(self, other: Stamp) -> bool:
-        """Whether both are of one file; the numbers of devices are each host's own."""
+        """Return whether both are of one file; the numbers of devices are each host's own."""
         same = self.times() == other.times() and self.inode == other.inode
         return same and (self.host != other.host or self.device == other.device)
 
@@ -68,13 +68,13 @@ class Input:
         ).hexdigest()
 
     def every(self) -> Iterator[Input]:
-        """Itself and its parts."""
+        """Yield the input itself and its parts."""
         yield self
         for part in self.parts:
             yield from part.every()
 
     def ask(self) -> None:
-        """InputError unless it and its parts are still what was hashed."""
+        """Raise InputError unless the input and its parts are still what was hashed."""
         for one in self.every():
             if one.stamp is not None and not one._same():
                 raise changed(one.path)
@@ -98,7 +98,7 @@ _known: dict[str, Stamp] = {}  # files whose bytes were asked by this process
 
 
 def changed(path: str) -> InputError:
-    """The one line for a file that is no longer what it was."""
+    """Return the error line for a file that is no longer what it was."""
     return InputError(
         f"{path}: was changed or replaced while the run was at work; nothing of it is kept; run the same command again"
     )
@@ -132,7 +132,7 @@ _guard: ContextVar[Mapping[str, Input]] = ContextVar("guard")
 
 @contextmanager
 def guarded(inputs: Iterable[Input]) -> Iterator[None]:
-    """Within the block `ask` knows these; at its good end all are asked again."""
+    """Register inputs for `ask` within the block; at its good end all are asked again."""
     token = _guard.set({one.path: one for one in inputs})
     try:
         yield
@@ -145,7 +145,7 @@ def guarded(inputs: Iterable[Input]) -> Iterator[None]:
 
 
 def ask(path: str | os.PathLike[str] | None = None) -> None:
-    """InputError where a file that the block relies on is no longer what was hashed; None: any of them."""
+    """Raise InputError where a file that the block relies on (None: any of them) is no longer what was hashed."""
     known = _guard.get({})
     for one in known.values() if path is None else filter(None, [known.get(os.fspath(path))]):
         one.ask()
@@ -158,7 +158,7 @@ _seen: ContextVar[dict[str, Stamp] | None] = ContextVar("seen", default=None)
 
 @contextmanager
 def recorded(seen: dict[str, Stamp]) -> Iterator[dict[str, Stamp]]:
-    """Every file that `barpc.sidefile` opens in the block, as it was the first time."""
+    """Record every file that `barpc.sidefile` opens in the block, as it was the first time."""
     token = _seen.set(seen)
     try:
         yield seen
@@ -167,12 +167,12 @@ def recorded(seen: dict[str, Stamp]) -> Iterator[dict[str, Stamp]]:
 
 
 def note(path: str | os.PathLike[str], found: os.stat_result) -> None:
-    """A file was opened: InputError where it is another one than the last time."""
+    """Note that a file was opened; InputError where it is another one than the last time."""
     also_seen({os.fspath(Path(path).absolute()): Stamp.of(found)})
 
 
 def also_seen(files: Mapping[str, Stamp]) -> None:
-    """What was opened, here or in another process."""
+    """Note files that were opened here or in another process."""
     seen = _seen.get()
     if seen is not None:
         for name, stamp in files.items():

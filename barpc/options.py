@@ -41,7 +41,7 @@ _SHORT.maxstring, _SHORT.maxother = 60, 200
 
 @dataclass(frozen=True)
 class Rule:
-    """What a field may hold beside its type, and what it means."""
+    """Bounds, unit and meaning of a field."""
 
     help: str  # sentences; Markdown's back quotes mark code
     unit: str = ""  # of numbers; of texts what they are: "file", "dir", "name"
@@ -54,7 +54,7 @@ class Rule:
     spoken: bool = False  # said by a person: no options file may set it
 
     def holds(self, number: float) -> bool:
-        """Whether a number lies within the bounds; NaN and the infinities do not."""
+        """Return whether a number lies within the bounds; NaN and the infinities do not."""
         return (
             math.isfinite(number)
             and (self.least is None or number >= self.least)
@@ -64,7 +64,7 @@ class Rule:
         )
 
     def bounds(self) -> str:
-        """The bounds and the unit in words, with a blank before them."""
+        """Return the bounds and the unit in words, with a blank before them."""
         ends = {"at least": self.least, "above": self.above, "at most": self.most, "below": self.below}
         words = " and ".join(f"{word} {value:g}" for word, value in ends.items() if value is not None)
         if self.least is not None and self.most is not None:
@@ -72,7 +72,7 @@ class Rule:
         return (f" {words}" if words else "") + (f" [{self.unit}]" if self.unit else "")
 
     def choices(self, kind: Any) -> tuple[Any, ...]:
-        """The values allowed where they are listed: of a Literal, or the rows of a table; else none."""
+        """Return the values allowed where they are listed: of a Literal, or the rows of a table; else none."""
         if get_origin(kind) is Literal:
             return get_args(kind)
         if self.rows:
@@ -82,7 +82,7 @@ class Rule:
 
 
 def option(default: T, help: str, **rule: Any) -> T:
-    """A field of an option record: its default, its meaning, and the rest of its `Rule`."""
+    """Declare a field of an option record: its default, its meaning, and the rest of its `Rule`."""
     metadata = {"rule": Rule(" ".join(help.split()), **rule)}
     given: dict[str, Any] = (
         {"default_factory": default.copy} if isinstance(default, dict) else {"default": default}
@@ -102,7 +102,7 @@ class Declared:
 
 
 def declared(record: type[Options]) -> Mapping[str, Declared]:
-    """Field -> what is declared of it; a nested record has an empty rule."""
+    """Return what is declared of each field of an option record; a nested record has an empty rule."""
     kind: Any = record  # a class can be hashed
     found: Mapping[str, Declared] = _declared(kind)
     return found
@@ -138,7 +138,7 @@ class Options:
 
 
 def wanted(kind: Any, rule: Rule) -> str:
-    """What a field may hold, in words."""
+    """Return the values that a field may hold, in words."""
     parts = get_args(kind)
     if get_origin(kind) is Mapping:
         return f"a table, each value {wanted(parts[1], rule)}"
@@ -157,7 +157,7 @@ def wanted(kind: Any, rule: Rule) -> str:
 
 
 def checked(name: str, kind: Any, rule: Rule, value: Any) -> Any:
-    """A value as its field holds it; InputError names the field where it is of another type or out of range."""
+    """Return a value converted to its field's type; InputError names the field where type or range is wrong."""
     parts, found = get_args(kind), None
     if get_origin(kind) is tuple and rule.unit == "file" and isinstance(value, (str, os.PathLike)):
         value = (value,)  # of files one is as good as a list of one
@@ -181,7 +181,9 @@ def checked(name: str, kind: Any, rule: Rule, value: Any) -> Any:
 
 
 def _plain(kind: Any, rule: Rule, value: Any) -> Any:
-    """A single value as its type, numpy's numbers and paths included; None where it is not one, or out of range."""
+    """Return a single value as its type, numpy's numbers and paths included; None where it is not one, or out
+    of range.
+    """
     if kind is str:
         text = os.fspath(value) if isinstance(value, (str, os.PathLike)) else None
         return text if isinstance(text, str) else None
@@ -197,7 +199,7 @@ def _plain(kind: Any, rule: Rule, value: Any) -> Any:
 
 
 def _is_plain(number: float) -> bool:
-    """Whether a number that is not 0 has a size that options have."""
+    """Return whether the size of a number other than 0 is one that options allow."""
     return 1 / _REAL <= abs(number) <= _REAL
 
 
@@ -206,7 +208,7 @@ def _is_plain(number: float) -> bool:
 
 @dataclass(frozen=True, repr=False)
 class TieOptions(Options):
-    """How tie points are found; every length is in pixels of the full image."""
+    """Options of tie-point search; every length is in pixels of the full image."""
 
     band: int = option(1, "Band of multi-band images, from 1.", least=1)
     matcher: str = option(
@@ -261,7 +263,7 @@ class TieOptions(Options):
 
 @dataclass(frozen=True, repr=False)
 class AdjustOptions(Options):
-    """How the adjustment runs."""
+    """Options of the adjustment."""
 
     model: Model = option(
         "auto",
@@ -389,13 +391,13 @@ class AdjustOptions(Options):
 
     @property
     def is_plain(self) -> bool:
-        """Whether rotations stand still and no waves are asked for: what these leave is to be seen, not bent."""
+        """Whether rotations are constant and no splines are asked for: such a run reports what these would follow."""
         return self.jitter == AUTO and self.drift == 0
 
 
 @dataclass(frozen=True, repr=False)
 class FitOptions(Options):
-    """How an RPC is fitted to a sensor model or to points."""
+    """Options of fitting an RPC to a sensor model or to points."""
 
     method: Literal[
         "auto",
@@ -455,7 +457,7 @@ class FitOptions(Options):
 
 @dataclass(frozen=True, repr=False)
 class RunOptions(Options):
-    """How `barpc.adjust` runs: files, passes, outputs, and the records of its stages."""
+    """Options of `barpc.adjust`: files, outputs, and the records of its stages."""
 
     tie: TieOptions = field(default_factory=TieOptions)
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
@@ -593,7 +595,7 @@ FORMER = {
 
 @dataclass(frozen=True, repr=False)
 class DsmOptions(Options):
-    """How `barpc.dsm.make_dsm` makes a surface."""
+    """Options of `barpc.dsm.make_dsm`."""
 
     gsd: float | None = option(
         None,
@@ -633,7 +635,7 @@ class DsmOptions(Options):
 
 
 def with_values(options: Record, values: Mapping[str, Any], where: str = "options") -> Record:
-    """A copy of a record with some fields changed, nested records by nested mappings.
+    """Return a copy of a record with some fields changed, nested records by nested mappings.
 
     InputError for an unknown field, or a value of the wrong type or out of range, of the source called `where`.
     """
@@ -655,7 +657,7 @@ def with_values(options: Record, values: Mapping[str, Any], where: str = "option
 
 
 def read_options(path: str | Path, options: RunOptions | None = None) -> RunOptions:
-    """Options from a TOML file: top-level keys, and the tables [tie], [adjust], [fit].
+    """Read options from a TOML file: top-level keys, and the tables [tie], [adjust], [fit].
 
     InputError where it does not exist or parse, or holds an unknown option or a value that it cannot have.
     """
@@ -688,7 +690,7 @@ def _refuse_code(path: str | Path, record: type[Options], values: Mapping[str, A
 
 
 def schema(record: type[Options] = RunOptions) -> dict[str, Any]:
-    """The JSON schema (draft 7) of a record, as an options file spells it."""
+    """Return the JSON schema (draft 7) of a record, as an options file spells it."""
     properties = {}
     for name, one in declared(record).items():
         if isinstance(one.default, Options):

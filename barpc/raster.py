@@ -97,7 +97,7 @@ def _opened(file: Place, driver: str) -> Any:
 
 
 class _Asked(RemoteFile):
-    """What GDAL reads from: it takes an exception for nothing, so failures are kept for `_opened_remote`."""
+    """A file object that GDAL reads from; failures are kept for `_opened_remote`, as GDAL takes no exception."""
 
     def __init__(self, at: Remote, failures: list[OSError]) -> None:
         super().__init__(at)
@@ -140,7 +140,7 @@ def _opened_remote(file: Remote, driver: str) -> Iterator[Any]:
 
 
 def _mosaic(file: Place, name: str) -> Mosaic:
-    """A VRT whose sources are all rasters that are read here."""
+    """Return a VRT whose sources are all rasters that are read here."""
     if isinstance(file, Remote):
         raise ImageError(f"{name}: a VRT is read from disk only; give the images it is made of")
     vrt = read_vrt(file, name=name)
@@ -154,7 +154,7 @@ def _mosaic(file: Place, name: str) -> Mosaic:
 
 
 def hashed(path: Place | str) -> Input:
-    """A file, hashed; a VRT with the sources that it shows. ImageError where one cannot be read."""
+    """Hash a file, of a VRT the sources that it shows, too; ImageError where one cannot be read."""
     try:
         if isinstance(path, Remote) or driver_of(read_head(path, IMAGE, 64)) != "VRT":
             return identity.take(path)
@@ -170,7 +170,9 @@ def hashed(path: Place | str) -> Input:
 
 
 def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[Place, str]:
-    """Absolute path (or Remote) of a raster and the only driver that may open it, given or by its first bytes."""
+    """Return the absolute path (or Remote) of a raster and the only driver that may open it, given or by its
+    first bytes.
+    """
     name = os.fspath(path)
     if not isinstance(path, Remote) and INDIRECT.match(name) and not os.path.lexists(name):
         raise ImageError(f"{name}: remote and virtual paths are not read")
@@ -185,7 +187,7 @@ def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[P
 
 
 def driver_of(head: bytes) -> str | None:
-    """The driver for a file with these first bytes; None where no raster begins so."""
+    """Return the driver for a file with these first bytes; None where no raster begins so."""
     return next((driver for magic, driver in DRIVERS.items() if head.startswith(magic)), None)
 
 
@@ -243,13 +245,13 @@ class Mosaic:
         return points, self._crs(self._vrt.gcp_srs)
 
     def tags(self) -> dict[str, str]:
-        """Metadata of the default domain."""
+        """Return the metadata of the default domain."""
         return dict(self._vrt.metadata.get("", {}))
 
     def read(
         self, indexes: int | Sequence[int] | None = None, window: Window | None = None, masked: bool = False
     ) -> Pixels:
-        """Pixels of one band (H, W), or of several (bands, H, W); masked where they mean nothing, if asked."""
+        """Read the pixels of one band (H, W), or of several (bands, H, W); masked where they mean nothing, if asked."""
         wanted = [indexes] if isinstance(indexes, int) else list(indexes or self.indexes)
         box = self._box(window)
         pixels = np.stack([self._assembled(self._vrt.bands[i - 1], box) for i in wanted])
@@ -259,7 +261,7 @@ class Mosaic:
         return pixels[0] if isinstance(indexes, int) else pixels
 
     def read_masks(self, index: int, window: Window | None = None) -> npt.NDArray[np.uint8]:
-        """0 where a pixel of a band (H, W) means nothing: by the VRT's mask, nodata or alpha band."""
+        """Read the mask of a band (H, W), 0 where a pixel is invalid: by the VRT's mask, nodata or alpha band."""
         box, band = self._box(window), self._vrt.bands[index - 1]
         if self._vrt.mask is not None:
             return np.asarray(self._assembled(self._vrt.mask, box), np.uint8)
@@ -271,7 +273,7 @@ class Mosaic:
         return np.full((box[3], box[2]), 255, np.uint8)
 
     def plain_source(self) -> Path | None:
-        """The raster that the VRT shows whole, as it is and alone; None if there is no such."""
+        """Return the raster that the VRT shows whole and unchanged; None if there is no such."""
         files = {source.file for source in self._vrt.sources}
         if len(files) != 1:
             return None
@@ -334,7 +336,7 @@ class Mosaic:
 
 
 def _handed_on(values: Pixels, source: Source, dtype: str) -> tuple[Any, Pixels]:
-    """Which values a source hands on, as an index, and what they become."""
+    """Return the mask of values that a source passes on, and what they become."""
     keep: Any = ...
     if source.plain:
         return keep, values
@@ -358,7 +360,7 @@ def _equal(values: Pixels, nodata: float) -> BoolArray:
 
 
 def _converted(values: Pixels, dtype: np.dtype[Any]) -> Pixels:
-    """Values of another type as GDAL makes them: rounded half away from zero and cut at the type's range."""
+    """Convert values to another type as GDAL does: rounded half away from zero and cut at the type's range."""
     if values.dtype == dtype:
         return values
     with np.errstate(all="ignore"):

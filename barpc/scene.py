@@ -54,7 +54,7 @@ class View(Frozen):
 
     @property
     def altitude(self) -> float:
-        """The middle of its altitudes [m]."""
+        """Middle of the view's altitudes [m]."""
         return sum(self.alt_range) / 2.0
 
     def _told(self) -> str:
@@ -103,7 +103,7 @@ class Tracks(Frozen):
         return int(self.point.max()) + 1 if len(self.point) else 0
 
     def select(self, keep: BoolArray) -> Tracks:
-        """The observations of a mask (K,); tracks left with fewer than two views go, indices close up."""
+        """Return the observations of a mask (K,); tracks left with fewer than two views go, indices close up."""
         count = np.bincount(self.point[keep], minlength=self.num_points)
         keep = keep & (count[self.point] >= 2)
         _, point = np.unique(self.point[keep], return_inverse=True)
@@ -123,7 +123,7 @@ class GroundPoints(Frozen):
     xy : (M, 2), col, row [px]
     xy_sigma : (M,), standard deviation of each coordinate [px]
     strangers : tuple of str, images that their file names and that are none of the views
-    left_out : tuple of str, what was left out of their files and why, in sentences
+    left_out : tuple of str, points left out of their files, with the reason, in sentences
     """
 
     names: tuple[str, ...]
@@ -156,12 +156,12 @@ class GroundPoints(Frozen):
 
     @classmethod
     def none(cls) -> GroundPoints:
-        """No points."""
+        """Return an empty set of points."""
         index, places = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
         return cls((), places, places, index, index, np.zeros((0, 2)), np.zeros(0))
 
     def select(self, keep: BoolArray) -> GroundPoints:
-        """The points of a mask (G,) with their observations."""
+        """Return the points of a mask (G,) with their observations."""
         rows = keep[self.point]
         return replace(
             self,
@@ -177,7 +177,7 @@ class GroundPoints(Frozen):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Reference(Frozen):
-    """Control of an orthoimage and a terrain: many points that share the errors of both.
+    """Control points from an orthoimage and a terrain, which share the errors of both.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ class Reference(Frozen):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Altimetry(Frozen):
-    """Heights of the ground from elsewhere (a laser), without image coordinates.
+    """Heights of the ground from altimetry (a laser), without image coordinates.
 
     Parameters
     ----------
@@ -227,19 +227,21 @@ class Altimetry(Frozen):
 
 
 def _seen(view: IntArray, sigma: Array) -> str:
-    """Observations in a few words."""
+    """Return the observations in a few words."""
     if not len(view):
         return "no observations"
     return f"{len(view)} observations in {len(np.unique(view))} views, to {np.median(sigma):.2g} px"
 
 
 def middle_altitude(views: Sequence[View]) -> float:
-    """Mean of the middle altitudes of views [m]: where points that several of them see are looked for first."""
+    """Return the mean of the views' middle altitudes [m], where triangulation starts."""
     return float(np.mean([view.alt_range for view in views]))
 
 
 def connected_labels(num: int, links: npt.ArrayLike) -> IntArray:
-    """Connected component (num,) of each of `num` nodes, numbered by its first node; links (M, 2) join two."""
+    """Return the connected component (num,) of each of `num` nodes, numbered by its first node; links (M, 2)
+    join two.
+    """
     first, second = np.asarray(links, dtype=np.int64).reshape(-1, 2).T
     graph = coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(num, num))
     label: IntArray = connected_components(graph, directed=False)[1].astype(np.int64)
@@ -247,7 +249,7 @@ def connected_labels(num: int, links: npt.ArrayLike) -> IntArray:
 
 
 def connected_groups(num_views: int, pairs: Sequence[tuple[int, int]]) -> list[list[int]]:
-    """Connected components of the views, the largest first (then by first view); each ascending."""
+    """Return the connected components of the views, the largest first (then by first view); each ascending."""
     groups: dict[int, list[int]] = {}
     for view, label in enumerate(connected_labels(num_views, pairs).tolist() if num_views else []):
         groups.setdefault(label, []).append(view)

@@ -59,7 +59,9 @@ class Kind:
             )
 
     def check_numbers(self, path: Path | str, file: BinaryIO) -> None:
-        """Raise if a text holds more numbers than `most` bytes can; short ones take more in memory than in the file."""
+        """Raise if a text holds more numbers than `most` bytes can hold: short ones take more in memory than
+        in the file.
+        """
         limit = (self.most or 0) // NUMBER
         if self.between and file.seek(0, os.SEEK_END) > limit:
             file.seek(0)
@@ -73,7 +75,7 @@ class Kind:
 
 
 def _count(text: bytes, between: bytes) -> int:
-    """How many values stand in a text: the signs between them, of blanks one of each row of them."""
+    """Count the values of a text: by the signs between them, of blanks one a row."""
     one_each = sum(text.count(sign) for sign in between if sign != _BLANK)
     return one_each + (len(re.findall(rb" (?! )", text)) if _BLANK in between else 0)
 
@@ -97,7 +99,7 @@ SUMMARY = Kind("a run's summary", 512 * MB, between=_OF_JSON)
 
 @contextmanager
 def opened(path: Path | str, kind: Kind) -> Iterator[BinaryIO]:
-    """A regular file, open for reading; links are followed.
+    """Open a regular file for reading; links are followed.
 
     One line of the class of `kind` where there is no such file, it is a folder, pipe or device, or cannot be read.
     """
@@ -111,7 +113,7 @@ def opened(path: Path | str, kind: Kind) -> Iterator[BinaryIO]:
 
 
 def versioned(path: Place, kind: Kind) -> Place:
-    """A Remote with the version that its file has now, which all who are given it read; a Path as it is."""
+    """Return a Remote with the version that its file has now, which all who are given it read; a Path as it is."""
     if not isinstance(path, Remote):
         return path
     try:
@@ -149,7 +151,9 @@ def _regular(path: Path | str, kind: Kind) -> BinaryIO:
 
 
 def encoding_of(head: bytes) -> str:
-    """How a text is encoded, by its first bytes: UTF-16 where a byte order mark or zeros between its letters say so."""
+    """Return the encoding of a text by its first bytes: UTF-16 where a byte order mark or zeros between its
+    letters say so.
+    """
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
     for name, zeros, letters in (
@@ -163,7 +167,7 @@ def encoding_of(head: bytes) -> str:
 
 @contextmanager
 def opened_text(path: Path | str, kind: Kind, newline: str | None = None) -> Iterator[TextIO]:
-    """As `opened`, for text in UTF-8, with or without a byte order mark, or UTF-16."""
+    """Open a text as `opened` does, in UTF-8, with or without a byte order mark, or UTF-16."""
     with opened(path, kind) as file, _utf8(file, path, kind, newline) as text:
         yield text
 
@@ -182,7 +186,7 @@ def _utf8(file: BinaryIO, path: Path | str, kind: Kind, newline: str | None = No
 
 
 def read_bytes(path: Path | str, kind: Kind) -> bytes:
-    """All bytes of a file (see `opened`)."""
+    """Read all bytes of a file (see `opened`)."""
     with opened(path, kind) as file:
         data = file.read() if kind.most is None else file.read(kind.most + 1)
         kind.check(path, len(data))  # it may have grown, and /proc knows no sizes
@@ -190,13 +194,13 @@ def read_bytes(path: Path | str, kind: Kind) -> bytes:
 
 
 def read_head(path: Path | str, kind: Kind, size: int) -> bytes:
-    """The first `size` bytes of a file, however large it is."""
+    """Read the first `size` bytes of a file, however large it is."""
     with opened(path, replace(kind, most=None)) as file:
         return file.read(size)
 
 
 def read_text(path: Path | str, kind: Kind) -> str:
-    """All of a UTF-8 text, line ends of one kind (see `opened`)."""
+    """Read all of a UTF-8 text, line ends of one kind (see `opened`)."""
     with _utf8(io.BytesIO(read_bytes(path, kind)), path, kind) as text:
         return text.read()
 
@@ -205,7 +209,7 @@ _LINE = 4 * 4096  # no line of names is longer than two paths can be
 
 
 def read_names(path: Path | str, words: str) -> list[str]:
-    """The lines of a list of names, called `words` (see `opened`)."""
+    """Read the lines of a list of names, called `words` (see `opened`)."""
     kind = replace(NAMES, words=words)
     lines = read_text(path, kind).splitlines()
     for number, line in enumerate(lines, start=1):
@@ -219,7 +223,7 @@ _REFUSED = "\ufffe\uffff" + ("\\" if os.sep == "/" else "")
 
 
 def plain_path(path: str | os.PathLike[str]) -> Place:
-    """A path or a Remote as it is, once every file that barpc writes can carry it.
+    """Return a path or a Remote as it is, once every file that barpc writes can carry it.
 
     InputError for a control character, an end of line, bytes that are no text, a backslash that separates no folders.
     """
@@ -246,7 +250,7 @@ _STEPS = bytes.maketrans(b"[]{}", b"\x01\xff\x01\xff")  # one level down or up, 
 
 
 def read_json(path: Path | str, kind: Kind) -> Any:
-    """What a JSON file holds (see `parse_json`)."""
+    """Read what a JSON file holds (see `parse_json`)."""
     text = read_text(path, kind)
     try:
         return parse_json(text)
@@ -255,14 +259,14 @@ def read_json(path: Path | str, kind: Kind) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """What a JSON text holds; ValueError for numbers that are not finite or beyond 64 bits, or nested too deep."""
+    """Parse a JSON text; ValueError for numbers that are not finite or beyond 64 bits, or nested too deep."""
     if _depth(text) > _MAX_DEPTH:  # how deep json itself goes differs between versions of Python
         raise ValueError(f"nested too deep, at most {_MAX_DEPTH} levels are read")
     return json.loads(text, parse_constant=_refuse, parse_int=_whole, parse_float=_finite)
 
 
 def _depth(text: str) -> int:
-    """How many brackets of a JSON text are open at most, those in its strings left out; a bound where they are few."""
+    """Return the nesting depth of a JSON text, strings left out; an upper bound where it is small."""
     few = text.count("[") + text.count("{")
     if few <= _MAX_DEPTH:
         return few
@@ -317,7 +321,8 @@ class _Builder(ElementTree.TreeBuilder):
 def parse_xml(
     source: bytes | Path, *, name: str | None = None, max_bytes: int = MAX_XML, strip_namespaces: bool = False
 ) -> ElementTree.Element:
-    """The root element of an XML document: bytes, or the file that holds it; messages call it `name`, or by its path.
+    """Return the root element of an XML document: bytes, or the file that holds it; messages call it `name`,
+    or by its path.
 
     No document type: an entity cannot be declared without one, so neither "billion laughs" nor a reference to another
     file can be written. `strip_namespaces` drops the ``{namespace}`` of every tag. RpcFormatError where it cannot be

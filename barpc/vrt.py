@@ -39,7 +39,7 @@ _SHIFT = 1e-3  # px; a rectangle that lies less beside whole pixels is meant to 
 
 
 class _Tag(NamedTuple):
-    """What may stand in an element: a pattern of its text, of its attributes, and its children."""
+    """Allowed content of an element: a pattern of its text, of its attributes, and its children."""
 
     text: str | None = None
     attributes: Mapping[str, str] = {}
@@ -125,7 +125,7 @@ class Band:
 
 @dataclass(frozen=True)
 class Vrt:
-    """What a VRT says."""
+    """Content of a VRT."""
 
     size: tuple[int, int]  # width, height [px]
     bands: tuple[Band, ...]
@@ -138,7 +138,7 @@ class Vrt:
 
     @property
     def sources(self) -> list[Source]:
-        """Of all bands and of the mask."""
+        """Sources of all bands and of the mask."""
         return [s for band in (*self.bands, *([self.mask] if self.mask else [])) for s in band.sources]
 
 
@@ -156,7 +156,7 @@ def read_vrt(path: Path, *, name: str | None = None) -> Vrt:
 
 
 def vrt_from_xml(root: Element, folder: Path, name: str) -> Vrt:
-    """As `read_vrt`, from the parsed document and the folder to which its sources are relative."""
+    """Read a VRT as `read_vrt`, from the parsed document and the folder to which its sources are relative."""
     if root.tag != "VRTDataset":
         raise ImageError(f"{name}: <{root.tag}> where <VRTDataset> was expected")
     _check(root, name)

@@ -53,7 +53,7 @@ KEEP_AFTER = 30.0
 
 @cache
 def code_version() -> str:
-    """A hash of the release and of every source file: another code never reads this code's caches."""
+    """Return a hash of the release and of every source file: another code never reads this code's caches."""
     digest = hashlib.sha256(__version__.encode())
     root = Path(__file__).parent
     for path in sorted(root.rglob("*.py")):
@@ -63,7 +63,7 @@ def code_version() -> str:
 
 
 def key_of(*parts: object) -> str:
-    """The key of a stage, 32 hexadecimal digits: a hash of its inputs and options, and of the code.
+    """Return the key of a stage, 32 hexadecimal digits: a hash of its inputs and options, and of the code.
 
     Parts are strings, numbers, None, sequences, mappings, dataclasses, arrays, paths.
     """
@@ -85,7 +85,7 @@ def _plain(value: object) -> object:
 
 
 def peak_memory() -> int:
-    """Peak resident memory [bytes] of this process and its children so far; 0 where unknown."""
+    """Return the peak resident memory [bytes] of this process and its children so far; 0 where unknown."""
     try:
         import resource
     except ImportError:  # not on Windows
@@ -216,7 +216,7 @@ class Workspace:
             )
 
     def owns(self, name: str) -> bool:
-        """Whether a run in this folder wrote this file, and nobody has changed it since."""
+        """Return whether a run in this folder wrote this file, and nobody has changed it since."""
         known = self._earlier | self.outputs
         return name in known and _owns(self.folder, name, known[name])
 
@@ -255,7 +255,7 @@ class Workspace:
                 return
 
     def load(self, stage: str, key: str) -> Arrays | None:
-        """A kept result, or None; one that is damaged is taken away and counts as missing."""
+        """Return a kept result, or None; one that is damaged is taken away and counts as missing."""
         path = self.cache / stage / f"{key}.npz"
         if path.is_symlink() or not path.is_file():
             return None
@@ -273,7 +273,7 @@ class Workspace:
             np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
 
     def keeping(self, path: Path) -> AbstractContextManager[Path]:
-        """A temporary path for a file among the caches, which can be made again."""
+        """Return a temporary path for a file among the caches, which can be made again."""
         return replacing(path, overwrite=True, durable=False, room=self.partial)
 
     @contextmanager
@@ -287,7 +287,8 @@ class Workspace:
 
     @contextmanager
     def output(self, name: str) -> Iterator[Path]:
-        """A temporary path for an output, called relative to the folder, that takes its name when the block ends well.
+        """Yield a temporary path for an output, relative to the folder, which takes its name when the block
+        ends well.
 
         OutputError where it would replace an input or a file that is not barpc's own, or cannot be written.
         """
@@ -333,7 +334,9 @@ class Workspace:
 
 
 def _content(path: Path) -> str | None:
-    """The sha256 of a regular file; None for anything else, OSError where it cannot be read. No link is followed."""
+    """Return the sha256 of a regular file; None for anything else, OSError where it cannot be read. No link
+    is followed.
+    """
     if not stat.S_ISREG(path.lstat().st_mode):
         return None
     with open(os.open(path, os.O_RDONLY | _CAREFUL), "rb") as file:  # noqa: PTH123  (no link)
@@ -341,7 +344,7 @@ def _content(path: Path) -> str | None:
 
 
 def _digest(path: Path) -> str | None:
-    """As `_content`; None also where there is nothing, or it cannot be read. No FIFO is waited for."""
+    """Hash as `_content`; None also where there is nothing, or it cannot be read. No FIFO is waited for."""
     try:
         return _content(path)
     except (OSError, ValueError):
@@ -349,7 +352,7 @@ def _digest(path: Path) -> str | None:
 
 
 def _owns(folder: Path, name: str, sha: str) -> bool:
-    """Whether the file of this name has this content, and is this folder's own."""
+    """Return whether the file of this name has this content, and is this folder's own."""
     parts = PurePosixPath(name)
     if not parts.parts or parts.is_absolute() or ".." in parts.parts or str(parts) != name:
         return False
@@ -365,7 +368,7 @@ def _owns(folder: Path, name: str, sha: str) -> bool:
 
 
 def _read_state(folder: Path) -> dict[str, Any]:
-    """What state.json holds; nothing where it is missing, damaged, too large or no regular file."""
+    """Read state.json; nothing where it is missing, damaged, too large or no regular file."""
     try:
         state = json.loads(_text(folder / STATE / STATE_FILE))
     except (ValueError, RecursionError):
@@ -374,7 +377,9 @@ def _read_state(folder: Path) -> dict[str, Any]:
 
 
 def _read_own(folder: Path) -> dict[str, str]:
-    """The outputs of a folder's runs and their sha256; of two contents of one (a killed run's) that which is there."""
+    """Return the outputs of a folder's runs and their sha256; of two contents of one (a killed run's) that
+    which is there.
+    """
     listed = _read_state(folder).get("outputs")
     known: dict[str, dict[str, None]] = {}
     pairs: list[Any] = list(listed.items()) if isinstance(listed, dict) else []
@@ -392,7 +397,7 @@ def _read_own(folder: Path) -> dict[str, str]:
 
 
 def own_files(folder: Path) -> set[str]:
-    """The names of barpc's own files that are in a folder, as it wrote them."""
+    """Return the names of barpc's own files that are in a folder, as it wrote them."""
     return {name for name, sha in _read_own(folder).items() if _owns(folder, name, sha)}
 
 

@@ -47,7 +47,8 @@ HEAD = """# Accuracy
 
 All figures of this page come from one run of `python benchmarks/accuracy.py --data DATA`: {versions}.
 Methods, more figures and the tests that assert bounds: [adjustment](adjustment.md), [tie points](tie_points.md),
-[RPC fit](fit.md), [the RPC](rpc.md), [Sentinel-1](sensors.md), [pushbroom](sensors_pushbroom.md).
+[RPC fit](fit.md), [the RPC](rpc.md), [Sentinel-1](sensors.md), [SICD](sensors_sicd.md),
+[pushbroom](sensors_pushbroom.md).
 """
 
 
@@ -126,7 +127,7 @@ def real(data: Path, work: Path) -> Iterator[str]:
     yield (
         "Pléiades crops, 0.5 m. *Tie points*: RMS of what is left. *dy*: vertical offset of patches that "
         "are no tie points, in images resampled along the epipolar lines; *valid*: share of pixels that "
-        "OpenCV's semi-global matching keeps ([how](recipes/before_after.md))."
+        "OpenCV's semi-global matching keeps ([how](recipes/stereo.md#before-and-after-in-numbers))."
     )
     yield from table(
         "pair", "tie points [px]", "dy before [px]", "dy after [px]", "valid before", "valid after"

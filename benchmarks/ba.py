@@ -59,13 +59,15 @@ TIGHT = {"ftol": 1e-8, "xtol": 1e-15, "gtol": 1e-15, "tr_options": {"atol": 1e-9
 """Tolerances with which finite differences reach the minimum to 1e-6 with the fewest evaluations."""
 
 PLAIN = {"loss": "linear", "estimate_noise": False, "noise_floor": 0.0, "min_convergence": 0.0}
+PEERS = {"drift": 0, "jitter": "off", "learn_priors": False}
+"""Unknowns that the baseline does not have, off: both solve for rotations and points, of all observations."""
 
 
 def adjust(block: Block, model: str = "rotation", **options: object) -> Adjustment:
     """The block by barpc, plain least squares."""
     centers = np.array([correction.center for correction in block.truth.corrections])
-    chosen = AdjustOptions(**{**PLAIN, "model": model, "sigma_attitude": 1e4, **options})
-    return adjust_tracks(block.views, block.tracks, chosen, centers=centers)
+    chosen = AdjustOptions(**{**PLAIN, **PEERS, "model": model, "sigma_attitude": 1e4, **options})
+    return adjust_tracks(block.views, block.tracks, chosen, centers=centers, hold_out=False)
 
 
 class Baseline:

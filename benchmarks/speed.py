@@ -6,6 +6,8 @@ print. Peers that are not given are left out. Options name site-packages folders
 python benchmarks/speed.py --data DATA --peers PYTHON --rpcfit SITE_PACKAGES --write
 """
 
+# ruff: noqa: E402  (the path comes first)
+
 from __future__ import annotations
 
 import argparse
@@ -20,6 +22,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from barpc import __version__
+
 THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 HEAD = """# Speed
@@ -105,7 +111,7 @@ def main() -> None:
     names = ("numpy", "scipy", "opencv-python-headless", "rasterio")
     head = HEAD.format(
         machine=machine(),
-        versions=", ".join(f"{name} {version(name)}" for name in names),
+        versions=", ".join([f"barpc {__version__}", *(f"{name} {version(name)}" for name in names)]),
         load=os.getloadavg()[0],
         cores=os.cpu_count(),
     )

@@ -1,4 +1,4 @@
-"""Write the table of limits of docs/reliability.md from the constants of the code.
+"""Write the list of limits of docs/reliability.md from the constants of the code.
 
 python docs/generate_limits.py            # writes it
 python docs/generate_limits.py --print    # prints it
@@ -126,13 +126,13 @@ def rows() -> list[tuple[str, str]]:
 
 
 def table() -> str:
-    """The table between its marks."""
-    lines = ["| what | at most |", "|---|---|", *(f"| {what} | {limit} |" for what, limit in rows())]
+    """Return the list between its marks."""
+    lines = [f"- {what}: {limit}" for what, limit in rows()]
     return "\n".join([BEGIN, "", *lines, "", END])
 
 
 def page(text: str) -> str:
-    """The page with the table in its place; ValueError where it has none."""
+    """Return the page with the list in its place; ValueError where it has none."""
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:

@@ -9,14 +9,15 @@ from __future__ import annotations
 import argparse
 import inspect
 import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import click
 
 from barpc.cli.main import COMMANDS, cli
-from barpc.cli.options import ADJUSTMENT, RUN, TIE, flag_name
-from barpc.options import AdjustOptions, FitOptions, Options, RunOptions, TieOptions, declared, wanted
+from barpc.cli.options import ADJUSTMENT, REMOTE, RUN, TIE, field_of, flag_name
+from barpc.options import AdjustOptions, FitOptions, Options, Rule, RunOptions, TieOptions, declared
 
 PAGE = Path(__file__).with_name("options.md")
 MANUAL = Path(__file__).parent / "man" / "barpc.1"
@@ -27,8 +28,8 @@ HEAD = """# Options
 
 <!-- Written by docs/generate_options.py. Edit barpc/options.py and the verbs' help texts, then run it again. -->
 
-Every option has a default. Later ones win: the defaults, then the file given with `--options`, then the flags.
-An unknown name, a wrong type or a value out of range is refused before anything is computed.
+Every option has a default; a file given with `--options` wins over it, and a flag over both. An unknown name, a wrong
+type or a value out of range is refused before anything is computed. In brackets: what it may hold, and the default.
 
 ```toml
 # run.toml: barpc adjust scene/*.tif --options run.toml -o adjusted
@@ -36,22 +37,17 @@ rpc_formats = ["txt", "geom"]
 
 [tie]
 points_per_image = 8000
-
-[adjust]
-sigma_attitude = 3.0
 ```
 
-The same from Python, with the records named in the headings below; `print` shows what differs from the defaults:
+From Python the same, with the records named in the headings (`barpc.options.schema()`: the JSON schema of such a
+file):
 
 ```python
 import barpc
 
 options = barpc.RunOptions(adjust=barpc.AdjustOptions(sigma_attitude=3.0))
-print(options)  # RunOptions(adjust=AdjustOptions(sigma_attitude=3.0))
-result = barpc.adjust(["a.tif", "b.tif"], "adjusted", options)
+print(options)  # what differs from the defaults
 ```
-
-`barpc.options.schema()` is the JSON schema of such a file.
 """
 
 
@@ -66,26 +62,36 @@ def default(value: Any) -> str:
     return f'`"{value}"`' if isinstance(value, str) else f"`{value}`"
 
 
-def row(*cells: str) -> str:
-    """One row of a table."""
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+def short(kind: Any, rule: Rule) -> str:
+    """Return what an option may hold in as few words as tell it."""
+    of, bounds = get_args(kind), rule.bounds().strip()
+    if get_origin(kind) is tuple:
+        return f"{'list' if of[-1] is ... else len(of)} of {short(of[0], rule)}"
+    if get_origin(kind) is Mapping:
+        return f"table of {short(of[1], rule)}"
+    if choices := rule.choices(kind):
+        return ", ".join(map(str, choices)) + (", module:name" if rule.hook else "")
+    if kind is bool:
+        return ""
+    if kind is int:
+        return f"integer {bounds}".strip()
+    return (bounds or "number") if kind is float else rule.unit or "text"
 
 
-def option_table(name: str, record: type[Options], flags: dict[str, str]) -> list[str]:
-    """The options of one table of the file, with the flags that set them."""
-    title = f"[{name}]: `{record.__name__}`" if name else f"Top level: `{record.__name__}`"
-    lines = ["", f"### {title}", "", row("option", "value", "default", "flag", "meaning"), row(*["---"] * 5)]
+def option_list(name: str, record: type[Options], flags: dict[str, str]) -> list[str]:
+    """Return the options of one table of the file, a line each, with the flags that set them."""
+    lines = ["", f"### {f'[{name}]' if name else 'Top level'}: `{record.__name__}`", ""]
     for field, one in declared(record).items():
         if field in TABLES:
             continue
         flag = flags.get(f"{name}.{field}" if name else field, "")
-        kind = wanted(one.kind, one.rule)
-        lines.append(row(f"`{field}`", kind, default(one.default), flag and f"`{flag}`", one.rule.help))
+        held = "; ".join(word for word in (short(one.kind, one.rule), default(one.default)) if word)
+        lines.append(f"- `{field}`{flag and f', `{flag}`'} ({held}): {one.rule.help}")
     return lines
 
 
 def parts(command: click.Command, name: str) -> tuple[str, str, str, list[tuple[str, str]]]:
-    """A command in four parts: its usage, its first words, its examples, its flags with their help."""
+    """Return a command in four parts: its usage, its first words, its examples, its flags with their help."""
     context = click.Context(command, info_name=name, terminal_width=100)
     usage = " ".join([name, *command.collect_usage_pieces(context)])
     first, *examples = command.help.replace("\b", "\\b").split("\\b")
@@ -94,16 +100,21 @@ def parts(command: click.Command, name: str) -> tuple[str, str, str, list[tuple[
     return usage, " ".join(first.split()), text, [record for record in records if record is not None]
 
 
-def verb_section(name: str) -> list[str]:
-    """A verb: its usage, its first words and its flags."""
+def verb_section(name: str, known: dict[str, str]) -> list[str]:
+    """Return a verb: its usage, its first words, its examples, and the flags that are not known yet."""
     usage, first, examples, flags = parts(cli.get_command(click.Context(cli), name), f"barpc {name}")
-    lines = ["", f"### barpc {name}", "", f"`{usage}`", "", first]
+    lines = ["", f"### {usage.replace(' [OPTIONS]', '')}".replace("[", r"\["), "", first]
     if examples:
-        lines += ["", "```", examples, "```"]
-    if flags:
-        lines += ["", row("flag", "meaning"), row("---", "---")]
-        lines += [row(f"`{names}`", help_text(text)) for names, text in flags]
-    return lines
+        lines += ["", "```", *(line.strip() for line in examples.splitlines() if line.strip()), "```"]
+    new, old = [], []
+    for names, text in flags:
+        flag, words = names.split(", ")[-1].split()[0], help_text(text)
+        if known.setdefault(flag, words) is words or not words.startswith(known[flag]):
+            new.append(f"- `{names}`: {words}")
+        else:
+            old.append(f"`{flag}`")
+    lines += ["", *new] if new else []
+    return lines + (["", f"As above: {', '.join(old)}."] if old else [])
 
 
 def help_text(text: str) -> str:
@@ -112,17 +123,16 @@ def help_text(text: str) -> str:
 
 
 def page() -> str:
-    """The whole page."""
-    flags = {target: flag_name(target) for target in (*TIE, *ADJUSTMENT, *RUN)}
+    """Return the whole page."""
+    flags = {target: flag_name(target) for target in (*TIE, *ADJUSTMENT, *RUN, REMOTE)}
     lines = [HEAD, "## Options of a run"]
     for name, record in TABLES.items():
-        lines += option_table(name, record, flags)
+        lines += option_list(name, record, flags)
     lines += ["", "## Verbs", ""]
-    lines += [
-        "Before or behind every verb: `--json` (results as JSON on stdout), `-q`, `-v`, `-vv`, `--debug`."
-    ]
+    lines += ["Before or behind every verb: `--json` (results as JSON), `-q`, `-v`, `-vv`, `--debug`."]
+    known = {flag: help_text(field_of(target).rule.help) for target, flag in flags.items()}
     for name in COMMANDS:
-        lines += verb_section(name)
+        lines += verb_section(name, known)
     return "\n".join(lines) + "\n"
 
 

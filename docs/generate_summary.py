@@ -20,9 +20,13 @@ HEAD = """# The values of summary.json
 
 <!-- Written by docs/generate_summary.py. Edit the records in barpc/report/summary/, then run it again. -->
 
-Pixel (0, 0) is the centre of the first one. A number that is not finite is null. An *optional* value may be missing.
-The same as a [JSON schema](summary.schema.json).
+Pixel (0, 0) is the centre of the first one. A number that is not finite is null; `?` behind a type: it may be null; no
+type: a number or null; `*` behind a name: it may be missing. Records have headings of their own. The same as a
+[JSON schema](summary.schema.json).
 """
+
+WORDS = {"string": "text", "boolean": "true/false", "object": "record", "array": "list"}
+"""Types of JSON in the words of the page, where it has shorter ones."""
 
 
 def parts_of(record: type[Record], name: str = "") -> Iterator[tuple[str, type[Record]]]:
@@ -38,25 +42,30 @@ def parts_of(record: type[Record], name: str = "") -> Iterator[tuple[str, type[R
 
 
 def in_words(part: Mapping[str, Any]) -> str:
-    """A type."""
+    """Return a type in as few characters as tell it."""
     if "enum" in part:
-        return ", ".join(f"`{value}`" for value in part["enum"])
+        return "/".join(f"`{value}`" for value in part["enum"] if value is not None)
     kinds = part["type"] if isinstance(part["type"], list) else [part["type"]]
-    return " or ".join(
-        f"array of {part['minItems']}" if k == "array" and "maxItems" in part else k for k in kinds
-    )
+    words = [WORDS.get(kind, kind) for kind in kinds if kind != "null"]
+    if "maxItems" in part:
+        words = [f"{part['minItems']} values"]
+    return " or ".join(words) + ("?" if "null" in kinds else "")
 
 
 def page() -> str:
-    """The whole page."""
-    lines = [HEAD]
+    """Return the whole page: a heading for each record, however many places hold one, and a line for each field."""
+    places: dict[type[Record], list[str]] = {}
     for name, record in parts_of(Summary):
+        places.setdefault(record, []).append(name)
+    lines = [HEAD]
+    for record, names in places.items():
         schema = record.json_schema()
-        lines += [f"## `{name}`" if name else "## The file", "", record.__doc__ or "", ""]
-        lines += ["| value | type | meaning |", "|---|---|---|"]
+        lines += ["## " + (", ".join(f"`{name}`" for name in names if name) or "The file"), ""]
+        lines += [record.__doc__ or "", ""]
         for key, part in schema["properties"].items():
-            optional = "" if key in schema["required"] else " *optional*"
-            lines.append(f"| `{key}`{optional} | {in_words(part)} | {part['description']} |")
+            star = "" if key in schema["required"] else r"\*"
+            kind = "" if (words := in_words(part)) == "number?" else f" ({words})"
+            lines.append(f"- `{key}`{star}{kind}: {part['description']}")
         lines.append("")
     return "\n".join(lines)
 

@@ -123,7 +123,9 @@ def _first(
     centers: Array | None,
     prior: BlockPrior | None,
 ) -> tuple[Solution, Apart | None]:
-    """The block solved with the model to start with, without a view whose RPC is not its own where there is one."""
+    """Return the block solved with the model to start with, without a view whose RPC is not its own where
+    there is one.
+    """
 
     def solve(inner: Block, outer: Block) -> Solution:
         return solve_block(inner, outer, options, dem, centers, prior)
@@ -151,7 +153,7 @@ def _first(
 def _with_apart(
     whole: Adjustment, apart: Apart, found: Solution, others: Block, parts: tuple[Block, Block], limit: float
 ) -> Adjustment:
-    """What is handed out, with the view that the others were adjusted without: adjusted alone, or as delivered.
+    """Return the result with the view that the others were adjusted without: adjusted alone, or as delivered.
 
     `parts` have its observations, those that might take part and those kept out; it is measured on the others' points.
     """
@@ -192,7 +194,8 @@ def _choose_model(
     prior: BlockPrior | None,
     first: Solution | None = None,
 ) -> tuple[Solution, float | None, Parts]:
-    """The block solved; by an affine in the image where the data choose it, and what the model in space left [px].
+    """Return the block solved; by an affine in the image where the data choose it, and what the model in
+    space left [px].
 
     Without ties that move. `first` is the block solved with the model to start with, where it was.
     """
@@ -219,7 +222,7 @@ def _choose_model(
 
 
 def _in_image(found: Solution, parts: Parts, options: AdjustOptions, dem: Terrain | None) -> Solution | None:
-    """The block solved by an affine in the image, where something is left for it and that is much better."""
+    """Solve the block with an affine in every image, where something is left for it and that is much better."""
     skew = found.is_skew
     if not (skew or found.has_trend):
         return None
@@ -229,14 +232,14 @@ def _in_image(found: Solution, parts: Parts, options: AdjustOptions, dem: Terrai
 
 
 def _is_calm(found: Solution, block: Block, floor: float) -> bool:
-    """Whether nothing is left of which a part of an image, or what moves, might be the cause."""
+    """Return whether nothing is left of which a part of an image, or what moves, might be the cause."""
     return not (found.has_trend or found.has_waves or standing_out(found.outcome, block, floor))
 
 
 def _adjustment(
     found: Solution, parts: Parts, options: AdjustOptions, in_space: float | None, start: float
 ) -> Adjustment:
-    """What is handed out, in the order of the tracks given."""
+    """Assemble the `Adjustment`, its points and observations in the order of the tracks given."""
     block, outer, apart = parts.inner, parts.outer, parts.apart
     outcome, final, seen = found.outcome, found.final, found.seen
     delivered = found.problem.camera_prior.mean
@@ -310,7 +313,7 @@ def _alike(block: Block, outcome: Outcome, is_tie: BoolArray) -> Array:
 
 
 def _said(findings: Sequence[Finding], parts: Parts, points: Array) -> Iterator[Finding]:
-    """Findings without what the judge worked with."""
+    """Yield the findings without what the judge worked with."""
     number = 0
     for one in findings:
         if one.moved is None:
@@ -321,7 +324,7 @@ def _said(findings: Sequence[Finding], parts: Parts, points: Array) -> Iterator[
 
 
 def _control(found: Solution, block: Block, covariance: Covariance, inlier: BoolArray) -> dict[str, Any]:
-    """What is said of GCPs and of a reference's points, whose observations (M + R,) were kept or not."""
+    """Return the tests of GCPs and of a reference's points, whose observations (M + R,) were kept or not."""
     w, gcps = block.in_order(_control_w(found, block, covariance)), len(block.gcps.view)
     w = w[len(w) - len(inlier) :]
     return {
@@ -337,7 +340,7 @@ def _control(found: Solution, block: Block, covariance: Covariance, inlier: Bool
 
 
 def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
-    """Baarda's w (K,) of the observations of known points; NaN for all others, and those that do not count."""
+    """Return Baarda's w (K,) of the observations of known points; NaN for all others, and those that do not count."""
     outcome, w = found.outcome, np.full(len(block.point), np.nan)
     held = outcome.problem.point_prior
     is_held = outcome.inlier & (False if held is None else np.isin(block.point, held.index))
@@ -351,7 +354,9 @@ def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
 
 
 def _place(found: Solution, block: Block, covariance: Covariance) -> tuple[GaugeReport, Mapping[str, Array]]:
-    """Where the scene went and how well that is known, and what holds it; the scene of an earlier run is its own."""
+    """Report the motion and the accuracy of the scene's place, and what holds it; an earlier run keeps its
+    own scene.
+    """
     known, outcome = (block.num_tracks, block.num_known), found.outcome
     gauge = _gauge(found, block, covariance)
     shares = datum_shares(covariance, gauge.by_unknown, outcome.problem, found.final, outcome.weight, *known)

@@ -49,7 +49,7 @@ _AS_MANY = 10.0  # nats, where that other has as many points: how well points ha
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """Which control points hold a block.
+    """The set of control points that agree and hold a block.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class Agreement:
     sets : tuple of (G,)
         Two sets that contradict each other and weigh the same: none is used. Empty where one is.
     scale : float
-        By how much the stated accuracies of the points used are too good; 1: they are not.
+        Factor by which the stated accuracies of the points used are too good; 1: they are not.
     alike : bool
         Whether the points that are not used, two or more, agree with each other: in another datum, perhaps.
     torn : (2,)
@@ -75,7 +75,7 @@ class Agreement:
 
 @dataclass(frozen=True, eq=False)
 class Offsets:
-    """What a block says of points minus where they are said to be, in units of what is each point's own.
+    """The adjusted places of control points minus their given ones, in units of each point's own accuracy.
 
     Parameters
     ----------
@@ -88,18 +88,18 @@ class Offsets:
     motions: Array
 
     def select(self, keep: BoolArray) -> Offsets:
-        """Those of some of the points."""
+        """Return the offsets of some of the points."""
         return Offsets(self.own[keep], self.motions[keep])
 
     def moving(self, times: float) -> Offsets:
-        """The same with motions of the cameras so many times as large."""
+        """Return the offsets with the free motions of the cameras scaled by a factor."""
         factor = np.full(self.motions.shape[2], times)
         factor[-3:] = 1.0
         return Offsets(self.own, self.motions * factor)
 
 
 def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array) -> Offsets:
-    """The offsets of the control points of a block at a solution in which they hold nothing.
+    """Estimate the offsets of control points at a solution in which they hold nothing.
 
     Parameters
     ----------
@@ -134,7 +134,8 @@ def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array
 
 
 def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
-    """The points that hold a block, of those that are `told` (G,) of at all; the others go with them.
+    """Find the control points that hold a block, among those that can be judged, `told` (G,); the others go
+    with them.
 
     Every set of up to twelve points is looked at; of more, those that agree with three drawn at random.
     """
@@ -160,7 +161,9 @@ def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
 
 
 def _fits_as_stated(offsets: Offsets) -> bool:
-    """Whether all points together are as near as nineteen times of twenty, and without none of them it is better."""
+    """Return whether all points together are as near as nineteen times of twenty, and without none of them it
+    is better.
+    """
     count = len(offsets.own)
     one_less = np.concatenate([np.ones((1, count), dtype=bool), ~np.eye(count, dtype=bool)])
     score, _, squares = _evidence(offsets, one_less, 1.0)
@@ -169,7 +172,7 @@ def _fits_as_stated(offsets: Offsets) -> bool:
 
 
 class _Search:
-    """The sets of points that are looked at, and their evidence."""
+    """Sets of points that are compared, and their evidence."""
 
     def __init__(self, offsets: Offsets) -> None:
         self.offsets, self.count = offsets, len(offsets.own)
@@ -186,12 +189,14 @@ class _Search:
                 self._add(np.unique(np.array(list(self._drawn(rest))) & rest, axis=0))
 
     def best(self) -> tuple[BoolArray, float, float]:
-        """The set with the largest evidence, that, and the scale of its accuracies."""
+        """Return the set with the largest evidence, that, and the scale of its accuracies."""
         n = int(self.score.argmax())
         return self.masks[n], float(self.score[n]), float(self.scale[n])
 
     def against(self, best: BoolArray, score: float) -> BoolArray | None:
-        """The set that contradicts the best and weighs as much; the rest where the best is none; None where it wins."""
+        """Return the set that contradicts the best and weighs as much; the rest where the best is none; None
+        where it wins.
+        """
         size, common = self.masks.sum(axis=1), (self.masks & best).sum(axis=1)
         other = np.flatnonzero((size > common) & (2 * common <= best.sum()))
         other = other[np.argsort(-self.score[other], kind="stable")[:_KEPT]]
@@ -204,7 +209,7 @@ class _Search:
         return None if 2 * best.sum() >= self.count else ~best
 
     def _drawn(self, among: BoolArray) -> Iterator[BoolArray]:
-        """Sets that agree with three points drawn from some; the same whenever they are drawn."""
+        """Yield the sets that agree with three points drawn from some; the same whenever they are drawn."""
         rng, places = np.random.default_rng(0), np.flatnonzero(among)
         yield among.copy()
         for trial in range(_TRIALS):
@@ -218,7 +223,7 @@ class _Search:
                 yield mask
 
     def _refine(self, n: int) -> None:
-        """Put single points that may as well be in as out of a set where that is better, as long as it is."""
+        """Move single points into or out of a set as long as that raises its evidence."""
         for _ in range(self.count):
             squared = _evidence(self.offsets, self.masks[n][None], self.scale[n])[1][0]
             doubtful = np.flatnonzero((squared > 0.5 * _NEAR) & (squared < 2.0 * _NEAR))
@@ -229,13 +234,13 @@ class _Search:
                 break
 
     def _add(self, masks: BoolArray) -> None:
-        """Sets that are looked at, too."""
+        """Add sets to those whose evidence is compared."""
         score, scale = self._scored(masks)
         self.masks = np.concatenate([self.masks, masks])
         self.score, self.scale = np.append(self.score, score), np.append(self.scale, scale)
 
     def _scored(self, masks: BoolArray) -> tuple[Array, Array]:
-        """Evidence (B,) of sets (B, G), and the scale of the accuracies that it has it with."""
+        """Return the evidence (B,) of sets (B, G), and the scale of the accuracies that it has it with."""
         score, scale = np.full(len(masks), -np.inf), np.ones(len(masks))
         rows = np.arange(len(masks))
         for n, (motions, times) in enumerate(product(_MOTIONS, _SCALES)):
@@ -255,8 +260,8 @@ class _Search:
 
 
 def _evidence(offsets: Offsets, masks: BoolArray, scale: float) -> tuple[Array, Array, Array]:
-    """Logarithmic evidence (B,) of sets (B, G), squared deviation (B, G) of every point from what a set says, and
-    that of all points of a set together (B,).
+    """Return the logarithmic evidence (B,) of sets (B, G), squared deviation (B, G) of every point from what
+    a set says, and that of all points of a set together (B,).
     """
     own, motions, variance = offsets.own, offsets.motions, scale**2
     if len(masks) > (room := max(_ROOM // len(own), 1)):

@@ -36,7 +36,7 @@ _BENT = 3  # ways in which the scene bends that stay open
 
 @dataclass(frozen=True)
 class AltimetryTest:
-    """What heights without image coordinates did to the block."""
+    """Result of registering heights without image coordinates to the block."""
 
     given: int  # heights in the files
     near: int  # that lie on the surface of the tie points, of those looked at
@@ -51,7 +51,9 @@ class AltimetryTest:
 def hold_by_altimetry(
     found: Solution, block: Block, outer: Block, options: AdjustOptions, given: Altimetry
 ) -> tuple[Solution, AltimetryTest]:
-    """The block held by heights too, or as it was where they do not agree with each other or with other control."""
+    """Return the block held by heights too, or as it was where they do not agree with each other or with
+    other control.
+    """
     ties = np.flatnonzero(found.seen[: block.num_tracks])
     points = found.final.points
     near, many = np.zeros(0, dtype=np.int64), len(given.sigma)
@@ -88,7 +90,7 @@ def hold_by_altimetry(
 
 
 def _known(covariance: Covariance, found: Solution, ties: IntArray) -> Array:
-    """Covariance (7, 7) of the scene's motions without the heights [m^2]."""
+    """Return the covariance (7, 7) of the scene's motions without the heights [m^2]."""
     use = np.zeros(len(found.seen), dtype=bool)
     use[ties] = True
     report = gauge_report(covariance, found.final.points, found.final.points, use)
@@ -99,14 +101,14 @@ def _known(covariance: Covariance, found: Solution, ties: IntArray) -> Array:
 
 
 def _is_held(found: Solution, block: Block) -> bool:
-    """Whether other control, an earlier run or fixed views know the scene's place."""
+    """Return whether other control, an earlier run or fixed views know the scene's place."""
     problem = found.problem
     others = block.gcps.names or block.reference is not None or problem.joint_prior is not None
     return bool(others) or not problem.free.all()
 
 
 def _why_not(registered: Registration, known: Array, is_held: bool) -> str:
-    """Why heights are not to hold the block; empty where they may."""
+    """Return the reason why heights must not hold the block; empty where they may."""
     if registered.near.sum() < FEWEST or (registered.is_most and registered.agree.sum() < FEWEST):
         return f"at least {FEWEST} heights on the tie points' surface are needed"
     if not registered.is_most:
@@ -127,7 +129,9 @@ def _placed(
     registered: Registration,
     before: Array,
 ) -> PointPrior:
-    """Tie points held where the motion takes them, with its errors in common and ways to bend that stay open."""
+    """Return the tie points held where the motion takes them, with its errors in common and ways to bend that
+    stay open.
+    """
     at = local[:, :2] / radius
     moves = displacement(at)
     own = _OWN * float(np.sqrt(np.diag(registered.covariance)[:3].min() * len(index)))
@@ -143,7 +147,7 @@ def _placed(
 def _solved(
     found: Solution, block: Block, outer: Block, options: AdjustOptions, placed: PointPrior
 ) -> Solution:
-    """The block solved again from where it ended, held at some tie points."""
+    """Return the block solved again from where it ended, held at some tie points."""
     held = replace(found, heights=replace(found.heights, placed=placed))
     state = found.final
     rounds = Rounds(found.problem, block, state, options, held.heights, block.use, found.outcome)

@@ -42,7 +42,7 @@ Solver = Callable[[Block, Block], Solution]
 
 @dataclass(frozen=True, eq=False)
 class Apart:
-    """A view that the others contradict, or several of which that may be so.
+    """A view that the others contradict, or several of which one may be.
 
     `gain` is by how many nats its share of contradicted tie points is likelier as its own than as that of the others
     (Kulldorff 1997; NaN where its prior told), `gap` the evidence over the runner-up, the view without which the
@@ -60,16 +60,16 @@ class Apart:
 
     @property
     def view(self) -> int:
-        """The likeliest."""
+        """The likeliest view."""
         return self.views[0]
 
     @property
     def clear(self) -> bool:
-        """Whether it is this view and no other."""
+        """Whether it can only be this view."""
         return len(self.views) == 1
 
     def is_view(self, view: int) -> bool:
-        """Whether it is clear, and that view."""
+        """Return whether a view is clearly the one that the others contradict."""
         return self.views == (view,)
 
 
@@ -98,7 +98,9 @@ class _Left:
         return self.coherent and 1.0 - self.contradicted < _MOST * (1.0 - self.usual)
 
     def gain(self, lost: float) -> float:
-        """By how many nats the share that it lost is likelier as its own; the choice among views taken off."""
+        """Return the log-likelihood gain [nats] of the view's own lost share over that of the others; the
+        choice among views is paid for.
+        """
         rates = np.clip([max(lost, self.contradicted), self.usual], 1e-3, 1.0 - 1e-3)
         own, usual = np.array([rates, 1.0 - rates]).T
         seen = len(self.placed.squared)
@@ -108,7 +110,7 @@ class _Left:
 def find_apart(
     first: Solution | None, block: Block, outer: Block, options: AdjustOptions, solve: Solver
 ) -> tuple[Apart | None, Solution | None]:
-    """The view whose RPC is not its own where a block shows one, and the block solved without it.
+    """Find the view whose RPC is not its own, where a block shows one, and the block solved without it.
 
     `first` is the block solved with all views; None: it has no solution. Nothing is tried where it agrees and no prior
     tells of one view. Measured on the observations of `outer`.
@@ -143,12 +145,14 @@ def find_apart(
 
 
 def agrees(found: Solution) -> bool:
-    """Whether the views of a block agree to the noise of their ties."""
+    """Return whether the views of a block agree to the noise of their ties."""
     return found.outcome.noise < MUCH_NOISE and not found.has_trend and not found.is_skew
 
 
 def _odd(found: Solution, block: Block) -> int | None:
-    """The one view that is farther off than stated, where the priors tell of one and no control point is in it."""
+    """Return the one view that is farther off than stated by the priors, with no control point in it; None
+    without one.
+    """
     odd = np.flatnonzero(found.outcome.prior.odd)
     if len(odd) != 1 or (block.view[block.point >= block.num_tracks] == odd[0]).any():
         return None
@@ -156,7 +160,7 @@ def _odd(found: Solution, block: Block) -> int | None:
 
 
 def _lost(found: Solution, block: Block) -> Array:
-    """Share (N,) of each view's tie points that were cut; of a view without any all."""
+    """Return the share (N,) of each view's tie points that were cut; of a view without any all."""
     ties = block.use & (block.point < block.num_tracks)
     had, kept = (
         np.bincount(block.view[rows], minlength=len(block.views))
@@ -168,7 +172,7 @@ def _lost(found: Solution, block: Block) -> Array:
 def _agreeing(
     views: Sequence[int], block: Block, outer: Block, options: AdjustOptions, solve: Solver
 ) -> Iterator[_Left]:
-    """The block without one view after the other, where the rest is tied together and agrees."""
+    """Yield the block without one view after the other, where the rest is tied together and agrees."""
     for v in views:
         others = block.without(block.view == v)
         if not _is_tied(others, v):
@@ -186,7 +190,7 @@ def _agreeing(
 
 
 def _is_tied(block: Block, without: int) -> bool:
-    """Whether the views of a block are tied to each other but for one."""
+    """Return whether the views of a block are tied to each other but for one."""
     order = np.lexsort((block.view, block.point))
     order = order[(block.use & (block.point < block.num_tracks))[order]]
     view, point = block.view[order], block.point[order]
@@ -196,7 +200,7 @@ def _is_tied(block: Block, without: int) -> bool:
 
 
 def _by_prior(left: list[_Left], scale: float, block: Block) -> tuple[Apart | None, Solution | None]:
-    """The view that its prior tells of, if it meets the others' points where it is found alone."""
+    """Return the view that its prior tells of, if it meets the others' points where it is found alone."""
     if not left or not left[0].placed.meets:
         return None, None
     (one,) = left
@@ -208,7 +212,9 @@ def _by_prior(left: list[_Left], scale: float, block: Block) -> tuple[Apart | No
 def _likeliest(
     chosen: list[_Left], left: list[_Left], lost: Array, block: Block
 ) -> tuple[Apart | None, Solution | None]:
-    """Which of the views `chosen` it is, by the evidence of all ties; `left` are all without which the rest agrees."""
+    """Return the likeliest of the views `chosen`, by the evidence of all ties; `left` are those without which
+    the rest agrees.
+    """
     evidence = {one.view: _evidence(one, block) for one in left} if len(left) > 1 else {chosen[0].view: 0.0}
     chosen = sorted(chosen, key=lambda one: -evidence[one.view])
     best = chosen[0]
@@ -223,7 +229,8 @@ def _likeliest(
 
 
 def _evidence(left: _Left, block: Block) -> float:
-    """Logarithm of the evidence of all ties of a block, of which those without one view are explained.
+    """Return the logarithm of the evidence of all ties of a block, of which those without one view are
+    explained.
 
     Others lie anywhere in their images, as what is wrong does here: how far off a strange camera sees is not known. A
     part that is too large to be judged explains nothing.

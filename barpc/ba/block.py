@@ -55,7 +55,7 @@ class Block:
         return min(v.alt_range[0] for v in self.views), max(v.alt_range[1] for v in self.views)
 
     def without(self, rows: BoolArray) -> Block:
-        """The block without some of its observations (K,)."""
+        """Return the block without some of its observations (K,)."""
         keep = ~rows
         return replace(
             self,
@@ -68,13 +68,15 @@ class Block:
         )
 
     def in_order(self, rows: npt.NDArray[Scalar]) -> npt.NDArray[Scalar]:
-        """Rows (K, ...) back in the order they were given; zeros for those that the block is without."""
+        """Return rows (K, ...) in the order in which observations were given; zeros for those that the block
+        is without.
+        """
         out = np.zeros((self.num_rows, *rows.shape[1:]), rows.dtype)
         out[self.order] = rows
         return out
 
     def first_points(self) -> Array:
-        """Where each point's first observing view puts it at its middle altitude (P, 3), ECEF [m]."""
+        """Return the points (P, 3), ECEF [m], on the first observing view's rays at its middle altitude."""
         return self._first_points.copy()
 
     @cached_property
@@ -101,7 +103,7 @@ def join(
     keep_largest: bool = False,
     reference: Reference | None = None,
 ) -> Block:
-    """The block of tracks and GCPs; arguments and errors as in `barpc.ba.adjust_tracks`."""
+    """Join tracks and GCPs into one block; arguments and errors as in `barpc.ba.adjust_tracks`."""
     names = [view.name for view in views]
     _check_names(names, options)
     gcps = GroundPoints.none() if gcps is None else gcps
@@ -160,7 +162,9 @@ def _check_names(names: Sequence[str], options: AdjustOptions) -> None:
 def _left_out(
     names: Sequence[str], view: IntArray, point: IntArray, num_tracks: int, keep_largest: bool
 ) -> tuple[str, ...]:
-    """Views outside the largest connected group, rows sorted by point; GCPs tie their views to each other."""
+    """Return the views outside the largest connected group, rows sorted by point; GCPs tie their views to
+    each other.
+    """
     point = np.where(point >= num_tracks, num_tracks, point)
     same = point[1:] == point[:-1]
     keys = np.unique((view[:-1] * len(names) + view[1:])[same])

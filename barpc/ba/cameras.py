@@ -51,7 +51,7 @@ class Cameras:
         self._stack = _RpcStack(self.sensors)
 
     def seeing(self, seen: Array) -> Cameras:
-        """The same views for other observations, seen at (2, K) [px]."""
+        """Return the views with other observations, at image points (2, K) [px]."""
         cameras = copy(self)
         cameras.seen = seen
         return cameras
@@ -64,7 +64,8 @@ class Cameras:
         wanted: Wanted = "unknowns",
         out: Projected | None = None,
     ) -> Projected:
-        """Corrected image points with derivatives, put into `out` where it is given.
+        """Project the block's points: corrected image points with derivatives, written into `out` where it is
+        given.
 
         Of unknowns (N, q) and every observation's point (3, K) [m]; observations of view v are bounds[v] :
         bounds[v + 1]. `wanted` are no derivatives ("image"), those by the "points", or by the "unknowns" too; what
@@ -83,13 +84,13 @@ class Cameras:
         return found
 
     def room(self, count: int, wanted: Wanted = "unknowns") -> Projected:
-        """Empty arrays for `count` observations."""
+        """Return empty arrays for the projections of `count` observations."""
         by_point = np.empty((2, 0 if wanted == "image" else 3, count))
         by_unknown = np.empty((2, self.unknowns.size if wanted == "unknowns" else 0, count))
         return Projected(np.empty((2, count)), by_point, by_unknown)
 
     def _chunks(self, bounds: IntArray) -> Iterator[slice]:
-        """Runs of views of one kind with about CHUNK observations together; other sensors one by one."""
+        """Yield the runs of views of one kind with about CHUNK observations together; other sensors one by one."""
         run: slice | None = None
         for v in np.flatnonzero(np.diff(bounds)).tolist():
             if run is not None:
@@ -128,7 +129,7 @@ class Cameras:
         wanted: Wanted,
         seen: Array | None,
     ) -> Projected:
-        """Of cameras that are turned and shifted."""
+        """Project points through cameras that are turned and shifted."""
         unknowns = self.unknowns
         drift = row = None
         if unknowns.drift:
@@ -149,7 +150,7 @@ class Cameras:
         return Projected(image, by_point, by_unknown)
 
     def _timed(self, params: Array, ecef: Array, view: int, wanted: Wanted) -> Projected:
-        """Of a radar whose clocks are corrected."""
+        """Project points into a radar whose clocks are corrected."""
         unknowns = self.unknowns
         model = unknowns.radars[view].timed(unknowns.timing(params, view))
         ground, by_ecef = ground_rows_from_ecef(ecef)
@@ -164,7 +165,7 @@ class Cameras:
         return Projected(image.T, by_point, by_unknown)
 
     def _image(self, ecef: Array, views: slice, bounds: IntArray) -> Array:
-        """Uncorrected image points (2, n) without a derivative."""
+        """Return the uncorrected image points (2, n) without a derivative."""
         ground = ground_from_ecef(ecef.T)
         if self.is_rpc[views.start]:
             return self._stack.image(ground.T, views, bounds)
@@ -172,7 +173,7 @@ class Cameras:
         return image
 
     def _by_ecef(self, ecef: Array, views: slice, bounds: IntArray) -> tuple[Array, Array]:
-        """Uncorrected image points (2, n) and their derivative by ECEF (2, 3, n)."""
+        """Return the uncorrected image points (2, n) and their derivative by ECEF (2, 3, n)."""
         ground, by_ecef = ground_rows_from_ecef(ecef)
         if self.is_rpc[views.start]:
             image, by_ground = self._stack.project(ground, views, bounds)
@@ -200,7 +201,7 @@ class _RpcStack:
                 self.image_offset[i], self.image_scale[i] = sensor.image_offset, sensor.image_scale
 
     def image(self, ground: Array, views: slice, bounds: IntArray) -> Array:
-        """Image points (2, n) of ground points (3, n) seen by consecutive views."""
+        """Return the image points (2, n) of ground points (3, n) seen by consecutive views."""
         count = np.diff(bounds)
         poly = _polynomials(self.coeffs[views], self._basis(ground, views, count), bounds)
         with np.errstate(all="ignore"):
@@ -210,7 +211,7 @@ class _RpcStack:
         return value
 
     def project(self, ground: Array, views: slice, bounds: IntArray) -> tuple[Array, Array]:
-        """Image points (2, n) and derivative (2, 3, n) of ground points (3, n) seen by consecutive views."""
+        """Return the image points (2, n) and derivative (2, 3, n) of ground points (3, n) seen by consecutive views."""
         count = np.diff(bounds)
         basis = self._basis(ground, views, count)
         poly = _polynomials(self.coeffs[views], basis, bounds)
@@ -228,7 +229,7 @@ class _RpcStack:
         return value, jacobian
 
     def _basis(self, ground: Array, views: slice, count: IntArray) -> Array:
-        """Monomials (20, n) of the normalised coordinates of ground points, `count` of each view."""
+        """Return the monomials (20, n) of the normalised coordinates of ground points, `count` of each view."""
         normalized = ground - np.repeat(self.ground_offset[views].T, count, axis=1)
         if not np.abs(normalized[0]).max(initial=0.0) <= 180.0:
             normalized[0] = wrap_longitude(normalized[0])
@@ -237,7 +238,7 @@ class _RpcStack:
 
 
 def _polynomials(coeffs: Array, basis: Array, bounds: IntArray) -> Array:
-    """Polynomials (m, n) of consecutive views (v, m, 20), each at its own points: a small product a view."""
+    """Return the polynomials (m, n) of consecutive views (v, m, 20), each at its own points: a small product a view."""
     out = np.empty((coeffs.shape[1], basis.shape[1]))
     for matrix, start, stop in zip(coeffs, bounds[:-1], bounds[1:], strict=True):
         out[:, start:stop] = matrix @ basis[:, start:stop]
@@ -245,7 +246,7 @@ def _polynomials(coeffs: Array, basis: Array, bounds: IntArray) -> Array:
 
 
 def _times(a: Array, b: Array) -> Array:
-    """Products (i, k, n) of small matrices (i, j, n) and (j, k, n)."""
+    """Return the products (i, k, n) of small matrices (i, j, n) and (j, k, n)."""
     out: Array = a[:, 0, None] * b[0]
     for j in range(1, len(b)):
         out += a[:, j, None] * b[j]

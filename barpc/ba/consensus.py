@@ -34,7 +34,7 @@ _EVIDENT = 15.0  # gain in log-likelihood over one group
 
 @dataclass(frozen=True)
 class TwoGroups:
-    """A pair of views whose tie points fall into two groups: which of them is right, the pair does not tell."""
+    """A pair of views whose epipolar offsets fall into two groups; the pair cannot tell which is right."""
 
     views: tuple[int, int]  # the pair
     share: float  # part of the matches in the smaller group
@@ -44,7 +44,7 @@ class TwoGroups:
 def two_groups(
     structure: Structure, residual: Array, projected: Projected, use: BoolArray
 ) -> tuple[TwoGroups, ...]:
-    """Pairs of views whose offsets across the epipolar lines (observations in use) have two centres."""
+    """Find the pairs of views whose offsets across the epipolar lines (of observations in use) have two centres."""
     rows = np.flatnonzero(use[structure.first] & use[structure.second])
     offset = _across(residual, projected.by_point, structure.first[rows], structure.second[rows])
     bounds = np.searchsorted(rows, structure.pair_bounds)
@@ -64,8 +64,8 @@ def two_groups(
 
 
 def _mixture(z: Array) -> tuple[float, float, float]:
-    """Two normal distributions of one width in values of mean 0: part of the smaller, distance of the centres (0 if
-    they are not apart), gain in log-likelihood over one.
+    """Fit two normal distributions of one width to values of mean 0: share of the smaller, distance of the
+    centres (0 if they are not apart), gain in log-likelihood over one.
     """
     centers, sigma, part = np.quantile(z, [0.1, 0.9]), 0.5 * z.std(), 0.5
     likelihood = np.ones_like(z)
@@ -89,7 +89,7 @@ def _mixture(z: Array) -> tuple[float, float, float]:
 def agreeing(
     structure: Structure, xy: Array, residual: Array, projected: Projected, sigma: Array, use: BoolArray
 ) -> BoolArray:
-    """Observations (K,) of those to use that are left once those are put aside which most of their partners contradict.
+    """Return the observations (K,) in use without those that most of their partners contradict.
 
     Of observed col, row `xy` (2, K), residuals (2, K) with points anywhere near and `sigma` (K,), all [px].
     """
@@ -118,7 +118,9 @@ def agreeing(
 
 
 def _across(residual: Array, by_point: Array, first: IntArray, second: IntArray) -> Array:
-    """Offset across the epipolar line (Q,) [px]: what no move of the point takes away from two observations."""
+    """Return the offset across the epipolar line (Q,) [px]: what no move of the point takes away from two
+    observations.
+    """
     offset = np.empty(len(first))
     for part in parts(len(first), CHUNK):
         one, two = by_point.take(first[part], axis=2), by_point.take(second[part], axis=2)
@@ -132,7 +134,7 @@ def _across(residual: Array, by_point: Array, first: IntArray, second: IntArray)
 
 
 def _on_one_plane(place: Array, offset: Array, spread: Array, seed: int) -> BoolArray:
-    """The largest set of offsets (n,) that lie on a plane over the image, by random triples and refits."""
+    """Return the largest set of offsets (n,) that lie on a plane over the image, by random triples and refits."""
     low, high = place.min(axis=1, keepdims=True), place.max(axis=1, keepdims=True)
     design = np.vstack([np.ones(len(offset)), 2.0 * (place - low) / np.maximum(high - low, 1.0) - 1.0])
     rng = np.random.default_rng(seed)

@@ -30,28 +30,29 @@ class Covariance:
 
     @property
     def num_unknowns(self) -> int:
-        """q, the unknowns of a view."""
+        """Number of unknowns q of a view."""
         return int(self.reduced.cross.shape[2])
 
     def solve(self, rows: Array) -> Array:
-        """S^-1 b for right-hand sides (N q, m); zero for fixed unknowns."""
+        """Return S^-1 b for right-hand sides (N q, m); zero for fixed unknowns."""
         out = np.zeros(rows.shape)
         out[self.free] = self.factor.solve(np.ascontiguousarray(rows[self.free]))
         return out
 
     @property
     def is_large(self) -> bool:
-        """Whether there are so many unknowns that exact variances take seconds: as much as two factorisations."""
+        """Whether exact variances take seconds: as long as two factorisations."""
         return len(self.free) > _LARGE
 
     def variances(self) -> Array:
-        """Variances (N, q) of all unknowns; zero for fixed ones."""
+        """Return the variances (N, q) of all unknowns; zero for fixed ones."""
         if self.factor.inverse is None:
             return self.full.diagonal().reshape(-1, self.num_unknowns)
         return np.asarray(self._near.diagonal.diagonal(axis1=1, axis2=2))
 
     def probed_variances(self) -> Array:
-        """The same at the cost of a few solutions (Hutchinson 1990), each within a fifth (RMS), independent of another.
+        """Estimate the variances (N, q) by random probes (Hutchinson 1990) at the cost of a few solutions:
+        each within a fifth (RMS).
 
         Unknowns count in units of their standard deviation where all other views stood still: a variance would
         drown in those of others that are a hundred times as large.
@@ -65,11 +66,11 @@ class Covariance:
         return np.asarray(found.reshape(-1, q) * unit)
 
     def view(self, i: int, j: int | None = None) -> Array:
-        """Covariance (q, q) of the unknowns of view i (with those of view j)."""
+        """Return the covariance (q, q) of the unknowns of view i (with those of view j)."""
         return self._of_pair(i, i if j is None else j, "full" in self.__dict__)
 
     def joint(self, views: IntArray) -> Array:
-        """Covariance (m q, m q) of the unknowns of some views."""
+        """Return the covariance (m q, m q) of the unknowns of some views."""
         of_full = len(self.free) <= _SMALL or "full" in self.__dict__
         if of_full or self.factor.inverse is None:
             place = self._places(views)
@@ -77,7 +78,7 @@ class Covariance:
         return np.block([[self._of_pair(int(i), int(j), False) for j in views] for i in views])
 
     def _of_pair(self, i: int, j: int, of_full: bool) -> Array:
-        """Covariance (q, q) of view i with view j: where they share points, all such are known at once."""
+        """Return the covariance (q, q) of view i with view j: where they share points, all such are known at once."""
         if self.factor.inverse is not None and not of_full:
             if i == j:
                 return np.asarray(self._near.diagonal[i])
@@ -96,7 +97,7 @@ class Covariance:
         return (views[:, None] * q + np.arange(q)).ravel()
 
     def _columns(self, place: IntArray, of_full: bool) -> Array:
-        """Covariance (N q, m) of all unknowns with those at `place` (m,)."""
+        """Return the covariance (N q, m) of all unknowns with those at `place` (m,)."""
         if of_full:
             return self.full[:, place]
         unit = np.zeros((len(self.free), len(place)))
@@ -116,7 +117,7 @@ class Covariance:
         return 0.5 * (out + out.T)
 
     def points(self, index: IntArray) -> Array:
-        """Covariance (n, 3, 3) [m^2], ECEF, of the points `index` (n,): their own noise and the cameras'."""
+        """Return the covariance (n, 3, 3) [m^2], ECEF, of the points `index` (n,): their own noise and the cameras'."""
         structure = self.reduced.structure
         out = np.empty((len(index), 3, 3))
         lower = self.reduced.lower[:, index]
@@ -129,7 +130,7 @@ class Covariance:
         return out if self.reduced.common is None else self._with_common(index, inverse, out)
 
     def _with_common(self, index: IntArray, inverse: Array, out: Array) -> Array:
-        """`out` where points share errors, which move with every camera."""
+        """Return `out` where points share errors, which move with every camera."""
         structure, common, q = self.reduced.structure, self.reduced.common, self.num_unknowns
         assert common is not None
         place = {int(p): n for n, p in enumerate(common.index)}

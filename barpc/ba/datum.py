@@ -36,7 +36,8 @@ def datum_shares(
     num_tracks: int,
     num_known: int,
 ) -> Mapping[str, Array]:
-    """Share (10,) of each source in what is known of the scene's motions; NaN for one that no free camera tells of.
+    """Return the share (10,) that each source has in what is known of the scene's motions; NaN where no free
+    camera tells.
 
     Parameters
     ----------
@@ -66,7 +67,7 @@ def datum_shares(
 
 
 def _at_rest(reduced: Reduced) -> Reduced:
-    """The linearisation as if it stood at its minimum: steps are those of the cameras alone."""
+    """Return the linearisation as if it stood at its minimum: steps are those of the cameras alone."""
     common = reduced.common
     if common is not None:
         common = replace(common, half=np.zeros_like(common.half))

@@ -43,7 +43,7 @@ class _Columns:
         self.places = [0.5 * (one[1:] + one[:-1]) for one in every]
 
     def means(self, residual: Array, edges: Edges) -> Array:
-        """Every detector's mean (2, K) of residuals (2, K) at its observations in use; zero elsewhere."""
+        """Return every detector's mean (2, K) of residuals (2, K) at its observations in use; zero elsewhere."""
         out = np.zeros_like(residual)
         for group, of_group in zip(self.groups, edges, strict=True):
             for v in group if of_group else ():
@@ -53,7 +53,9 @@ class _Columns:
         return out
 
     def split(self, g: int, low: float, high: float, residual: Array) -> tuple[float, float]:
-        """The largest change between two columns of a group: how much it explains beyond chance, and where it is."""
+        """Return the largest change between two columns of a group: how much it explains beyond chance, and
+        where it is.
+        """
         places = self.places[g][np.searchsorted(self.places[g], low) : np.searchsorted(self.places[g], high)]
         if not len(places):
             return 0.0, low
@@ -74,8 +76,8 @@ class _Columns:
 
 
 def find_edges(problem: Problem, state: State, residual: Array, use: BoolArray, sigma: Array) -> Array:
-    """Columns (N, C) [px] where other detectors begin, infinite where a view has fewer, of residuals (2, K) [px] with
-    standard deviations `sigma` (K,) as they were observed.
+    """Find the columns (N, C) [px] at which residuals (2, K) [px] with standard deviations `sigma` (K,) step
+    from one detector to the next; infinite where a view has fewer.
     """
     weight, widths = use / sigma, problem.cameras.unknowns.half[0]
     settled = problem.settling(problem.project_points(state.params, state.points), weight)
@@ -91,7 +93,7 @@ def find_edges(problem: Problem, state: State, residual: Array, use: BoolArray, 
 
 
 def _without_steps(problem: Problem, state: State, residual: Array) -> Array:
-    """Residuals (2, K) [px] of cameras without the steps that were found before."""
+    """Return the residuals (2, K) [px] of cameras without the steps that were found before."""
     unknowns, steps = problem.cameras.unknowns, np.zeros_like(residual)
     if unknowns.waves is not None and unknowns.waves.edges.size:
         params = state.params.copy()
@@ -104,8 +106,8 @@ def _without_steps(problem: Problem, state: State, residual: Array) -> Array:
 def _grown(
     columns: _Columns, residual: Array, settled: Callable[[Array], Array], weight: Array
 ) -> tuple[Edges, float]:
-    """Edges one after the other, the largest first; then each where it is best between its neighbours. And what is
-    left of the squared residuals, with as much for every edge as it has to explain.
+    """Return the edges one after the other, the largest first; then each where it is best between its
+    neighbours. And what is left of the squared residuals, with as much for every edge as it has to explain.
     """
     edges: Edges = [[] for _ in columns.groups]
     part = np.zeros_like(residual)
@@ -134,7 +136,9 @@ def _grown(
 
 
 def _placed(columns: _Columns, g: int, edges: list[float], residual: Array) -> list[float]:
-    """The edges of a group, each where it is best between its neighbours; without those that explain too little."""
+    """Return the edges of a group, each where it is best between its neighbours; without those that explain
+    too little.
+    """
     found: list[float] = []
     for at in range(len(edges)):
         low = found[-1] if found else -np.inf

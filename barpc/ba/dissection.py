@@ -22,7 +22,7 @@ LEAF = 32  # views that are not cut any further
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """Views eliminated together, and whom that ties to each other."""
+    """Views eliminated together, and the views that this ties to each other."""
 
     pivots: IntArray  # views, in the order of elimination
     border: IntArray  # later ones that are tied to them by then, in that order
@@ -39,7 +39,7 @@ class Dissection:
 
 
 def dissect(pairs: IntArray, place: Array, use: BoolArray) -> Dissection:
-    """The order for views tied in `pairs` (M, 2) that stand at `place` (N, 2), those in `use` (N,) only."""
+    """Return the nested-dissection order of the views in `use` (N,), tied in `pairs` (M, 2), at `place` (N, 2)."""
     n = len(place)
     (i, j), own = pairs[use[pairs].all(axis=1)].astype(np.int32).T, np.arange(n, dtype=np.int32)
     ties = np.concatenate([i, j, own]), np.concatenate([j, i, own])
@@ -54,7 +54,7 @@ def dissect(pairs: IntArray, place: Array, use: BoolArray) -> Dissection:
 
 
 def _fronts(graph: sp.csr_array, pieces: list[IntArray], rank: IntArray, owner: IntArray) -> list[Front]:
-    """The fronts of pieces in their order: a border is what the pivots touch, or the fronts below them."""
+    """Return the fronts of pieces in their order: a border is what the pivots touch, or the fronts below them."""
     fronts: list[Front] = []
     below: list[list[IntArray]] = [[] for _ in pieces]
     for number, piece in enumerate(pieces):
@@ -83,7 +83,7 @@ def _cut(graph: sp.csr_array, place: Array, views: IntArray, pieces: list[IntArr
 
 
 def _part(graph: sp.csr_array, place: Array, views: IntArray) -> tuple[IntArray, IntArray, IntArray] | None:
-    """Two sides of the views and the fewest between them; None where every cut leaves a side empty."""
+    """Return two sides of the views and the fewest between them; None where every cut leaves a side empty."""
     own = graph[views][:, views]
     at = place[views]
     order, cut = min((_best_cut(own, order) for order in _orders(own, at)), key=lambda found: found[2])[:2]
@@ -98,7 +98,9 @@ def _part(graph: sp.csr_array, place: Array, views: IntArray) -> tuple[IntArray,
 
 
 def _orders(graph: sp.csr_array, place: Array) -> Iterator[IntArray]:
-    """Orders of n views that a cut may part in two: by their parts, or along the ground and along the ties."""
+    """Yield the orders of n views that a cut may part in two: by their parts, or along the ground and along
+    the ties.
+    """
     count, part = connected_components(graph, connection="strong")  # ties go both ways
     if count > 1:
         yield np.argsort(part, kind="stable")
@@ -112,7 +114,7 @@ def _orders(graph: sp.csr_array, place: Array) -> Iterator[IntArray]:
 
 
 def _best_cut(graph: sp.csr_array, order: IntArray) -> tuple[IntArray, int, float]:
-    """An order, how many of it stand before its best cut (0: none parts it), and what that costs.
+    """Return an order, how many of it stand before its best cut (0: none parts it), and what that costs.
 
     A cut that s views touch from one side, and that leaves a and b, costs s / (a b): few views, and balanced sides.
     """
@@ -133,7 +135,7 @@ def _best_cut(graph: sp.csr_array, order: IntArray) -> tuple[IntArray, int, floa
 
 
 def _touching(graph: sp.csr_array, near: IntArray, far: IntArray) -> IntArray:
-    """The fewest views that touch all ties between two sides (König's theorem)."""
+    """Return the fewest views that touch all ties between two sides (König's theorem)."""
     across = graph[near][:, far]
     rows = np.flatnonzero(np.diff(across.indptr))
     cols = np.unique(across.indices)
@@ -155,7 +157,8 @@ def _touching(graph: sp.csr_array, near: IntArray, far: IntArray) -> IntArray:
 
 
 def _matching(across: sp.csr_array) -> IntArray:
-    """The row that each column is matched with, or -1, as many as can be: a flow of one from each row to a column.
+    """Return the row that each column is matched with, or -1, as many as can be: a flow of one from each row
+    to a column.
 
     scipy's `maximum_bipartite_matching` takes time exponential in the depth of such graphs (scipy issue 26147).
     """

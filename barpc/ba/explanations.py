@@ -40,7 +40,7 @@ SCALE = float(np.log(2.0 * np.log(30.0)))
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Unknowns, of one view or of a group of ties, that may explain what the cameras do not."""
+    """Unknowns of one view, or of a group of ties, with a prior: a candidate for what the cameras do not explain."""
 
     kind: str  # a name of `EXPLANATIONS`
     view: int  # -1: of none
@@ -59,7 +59,7 @@ Where = tuple[int, float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Observations as explanations see them."""
+    """Observations in the form that explanations use."""
 
     linear: Linear
     few: Linear  # of it some tracks, to choose with
@@ -72,13 +72,13 @@ class Seen:
 
 
 def strip(seen: Seen, interval: Interval, sigma: float = _STRIP) -> list[Explanation]:
-    """Rows or columns of an image that lie off by themselves."""
+    """Return the explanation that a stretch of rows or columns of one image is displaced as a whole."""
     start, stop = _open_ended(interval.start, interval.stop, float(seen.size[interval.axis, interval.view]))
     return [_local(STRIP, seen, interval.view, (interval.axis, start, stop, 0.0, 0.0), sigma)]
 
 
 def fade(seen: Seen, interval: Interval) -> list[Explanation]:
-    """Rows of an image that lie off at an end of an interval, and less and less from there, upwards or downwards.
+    """Return the explanation that rows are displaced at one end of an interval, fading upwards or downwards.
 
     Either the interval lies off, or the rest of its image: what fades is tried on both sides of both ends.
     """
@@ -102,7 +102,7 @@ def fade(seen: Seen, interval: Interval) -> list[Explanation]:
 
 
 def _untouched(seen: Seen, one: Explanation) -> float:
-    """The cost of the same tracks without it: others may be touched by another."""
+    """Return the cost of the same tracks without an explanation: others may be touched by another."""
     nothing = np.full(len(one.sigma), 1e18)
     return first_guess(seen.few, seen.base, seen.extra, one.extra, nothing)[2]
 
@@ -117,7 +117,8 @@ def _local(kind: str, seen: Seen, view: int, where: Where, sigma: float) -> Expl
 
 
 def settling(seen: Seen, _interval: Interval) -> list[Explanation]:
-    """Rows at the beginning, or the end, of all images that lie off, each by its own, and less and less from there.
+    """Return the explanation that the first, or last, rows of all images are displaced and fade, each image
+    by its own amount.
 
     So does a satellite that settles after it has turned, before every image.
     """
@@ -141,7 +142,7 @@ def _settling(seen: Seen, rate: float, sigma: float) -> Explanation:
 
 
 def bent(seen: Seen, one: Explanation) -> Explanation:
-    """What fades, and two unknowns beside its own: what a change of the rate, as a logarithm, does to it."""
+    """Return a fade with two more unknowns: the effect of a change of the logarithm of its rate."""
     assert one.where is not None
     _, _, _, origin, rate = one.where
     if one.parts and rate < 0.0:
@@ -151,7 +152,7 @@ def bent(seen: Seen, one: Explanation) -> Explanation:
 
 
 def faster(one: Explanation, found: Fit) -> Explanation:
-    """What fades with the rate that a fit of it `bent` asks for, by e at most; only `where` is new."""
+    """Return a fade with the rate that a fit of `bent` asks for, changed by a factor e at most; only `where` is new."""
     assert one.where is not None
     moved, slope = np.split(found.extra[-2 * len(one.sigma) :], 2)
     step = float(np.clip(moved @ slope / max(float(moved @ moved), 1e-30), -1.0, 1.0))
@@ -159,7 +160,7 @@ def faster(one: Explanation, found: Fit) -> Explanation:
 
 
 def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explanation:
-    """A strip whose ends are where ties say, or what all rows do, whose prior is as wide as it is large.
+    """Return an explanation with ends where single ties put them and a prior as wide as it is large.
 
     `found` is a fit with it, its own unknowns the last; `others` (2, K) is what those before it move [px].
     """
@@ -188,7 +189,7 @@ def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explan
 
 
 def _begun(seen: Seen, one: Explanation, gain: Array, place: Array, sigma: float) -> Explanation:
-    """A fade that begins where single ties say, by their gains in the order of their places (n,)."""
+    """Return a fade that begins where single ties say, by their gains in the order of their places (n,)."""
     assert one.where is not None
     axis, _, _, _, rate = one.where
     size = float(seen.size[axis, one.view])
@@ -200,12 +201,12 @@ def _begun(seen: Seen, one: Explanation, gain: Array, place: Array, sigma: float
 
 
 def _open_ended(start: float, stop: float, size: float) -> tuple[float, float]:
-    """A strip that reaches an image's end goes on beyond it."""
+    """Return a strip that reaches an image's end goes on beyond it."""
     return (-size if start <= 0.0 else start), (2.0 * size if stop >= size else stop)
 
 
 def _largest_part(gain: Array) -> tuple[int, int]:
-    """First and last of the run of values whose sum is the largest."""
+    """Return the first and last of the run of values whose sum is the largest."""
     sums = np.concatenate([[0.0], np.cumsum(gain)])
     lowest = np.minimum.accumulate(sums[:-1])
     last = int((sums[1:] - lowest).argmax())
@@ -213,7 +214,7 @@ def _largest_part(gain: Array) -> tuple[int, int]:
 
 
 def wander(seen: Seen, interval: Interval) -> list[Explanation]:
-    """Rows of an image that wander: splines, apart from what a drift follows."""
+    """Return the explanation that the rows of an image wander: splines, orthogonal to the drift."""
     view = interval.view
     rows = np.flatnonzero(seen.linear.view == view)
     u = 2.0 * seen.place[1, rows] / seen.size[1, view] - 1.0
@@ -223,7 +224,7 @@ def wander(seen: Seen, interval: Interval) -> list[Explanation]:
 
 
 def swing(seen: Seen, found: Swing) -> Explanation:
-    """All rows of an image that swing with one period."""
+    """Return the explanation that all rows of an image swing with one period."""
     rows = np.flatnonzero(seen.linear.view == found.view)
     basis = waves_of(seen.place[1, rows], np.array(found.period))
     one = _on_both(seen, SWING, found.view, rows, basis, _WANDER)
@@ -232,7 +233,7 @@ def swing(seen: Seen, found: Swing) -> Explanation:
 
 
 def alike(seen: Seen, one: Explanation, found: Fit) -> list[Explanation]:
-    """The strip and what fades that a view's wandering rows look most like, apart from what a drift follows."""
+    """Return the strip and the fade that a view's wandering rows resemble most, drift aside."""
     size, view = float(seen.size[1, one.view]), one.view
     rows = (np.arange(BINS * _A_BIN) + 0.5) / (BINS * _A_BIN) * size
     unknowns = found.extra[-len(one.sigma) :]
@@ -261,7 +262,7 @@ def _on_both(seen: Seen, kind: str, view: int, rows: IntArray, basis: Array, sig
 
 
 def group(seen: Seen, _interval: Interval) -> list[Explanation]:
-    """Ties of a part of the ground that moves."""
+    """Return the explanation that the ties of a part of the ground move."""
     one = moving.proposal(seen.linear, seen.ground, seen.base, seen.extra, seen.sigma)
     if one is None:
         return []
@@ -283,7 +284,8 @@ _OF_BLOCK = (MOVING, SETTLING)
 def proposed(
     seen: Seen, intervals: list[Interval], periods: list[Swing], known_kinds: Collection[str] = ()
 ) -> Iterator[Explanation]:
-    """Explanations of the intervals and periods that stand out; those of a whole image, or of the block, once.
+    """Yield the explanations proposed by the intervals and periods that stand out; those of a whole image, or
+    block, once.
 
     None of the kinds that are known.
     """
@@ -301,7 +303,9 @@ def proposed(
 
 
 def _at_one_end(seen: Seen, intervals: list[Interval]) -> bool:
-    """Whether all that stands out is where images begin, or all where they end: what wanders is seen all over."""
+    """Return whether all that stands out is where images begin, or all where they end: what wanders is seen
+    all over.
+    """
     at_end = [
         (one.start <= 0.0, one.stop >= seen.size[1, one.view]) if one.axis == 1 else (False, False)
         for one in intervals

@@ -25,7 +25,8 @@ _MOST_SPLINES = 4000  # of all views: what a block of 300 takes is 2.6 times as 
 
 
 def follow(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
-    """The block with splines over the rows and steps between detectors, where asked for or where they tell.
+    """Solve the block with splines over the rows and detector steps, where asked for or where residuals show
+    them.
 
     Knots are set twice as dense until nothing is left that neighbours share, the observations are too few, or the
     tracks that took no part are met no better.
@@ -48,7 +49,7 @@ def follow(found: Solution, block: Block, outer: Block, options: AdjustOptions) 
 def without_strips(
     found: Solution, judged: Judgement, block: Block, outer: Block, options: AdjustOptions
 ) -> Solution:
-    """The block with the rows and columns moved that lie off by themselves, or swing, where the judge found such.
+    """Solve the block with the strips, fades and swings that the judge found.
 
     Refused where it makes tracks worse that took no part, or no better than what follows an image as a whole.
     """
@@ -75,7 +76,7 @@ def without_strips(
 
 
 def _judged(found: Solution, judged: Judgement, block: Block) -> Solution:
-    """The block where the judge leaves it: cameras, and tracks that meet where its right observations do."""
+    """Return the block where the judge leaves it: cameras, and tracks that meet where its right observations do."""
     outcome, is_tie = found.outcome, block.point < block.num_tracks
     inlier = np.where(is_tie, block.use & (judged.right > 0.5), outcome.inlier)
     ended = outcome.minimum.state
@@ -86,7 +87,7 @@ def _judged(found: Solution, judged: Judgement, block: Block) -> Solution:
 
 
 def _waves_of(parts: list[Finding], views: int) -> tuple[Waves, Array]:
-    """The unknowns in the image that explanations are, and what these found (N, size)."""
+    """Return the unknowns in the image that explanations are, and what these found (N, size)."""
     own = [
         [[one for one in parts if one.view == v and one.kind in kinds] for v in range(views)]
         for kinds in ((*LOCAL, SETTLING), (SWING,))
@@ -106,7 +107,8 @@ def _waves_of(parts: list[Finding], views: int) -> tuple[Waves, Array]:
 
 
 def _with_edges(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
-    """The block, of which one pass was solved with splines, with steps between detectors where residuals show them.
+    """Return the block, of which one pass was solved with splines, with steps between detectors where
+    residuals show them.
 
     What they explain shows others: it is looked for them again.
     """
@@ -128,7 +130,7 @@ def _given_edges(block: Block, options: AdjustOptions) -> Array:
 
 
 def _spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> list[int]:
-    """Numbers of splines to try, the fewest first, as many as the observations of a view hold."""
+    """Return the numbers of splines to try, the fewest first, as many as the observations of a view hold."""
     rows = max(view.size[1] for view in block.views)
     if options.jitter == OFF or options.is_plain:
         return [0] if options.detectors else []
@@ -150,7 +152,8 @@ def _with_waves(
     once: bool = False,
     start: Array | None = None,
 ) -> Solution:
-    """A block solved again with splines and steps, from where it ended; every observation may come back.
+    """Return a block solved again with splines and steps, from where it ended; every observation may come
+    back.
 
     `start` (N, waves.size) are those unknowns, where something is known of them.
     """

@@ -40,7 +40,7 @@ _SAMPLE = 2000  # points that stand for the scene's shape
 
 @dataclass(frozen=True)
 class Mode:
-    """One of the scene's motions, and how all others go with it."""
+    """One of the scene's motions, and how the others go with it."""
 
     sigma: float  # its posterior standard deviation [m]
     # (10,) all `MOTIONS` where this one is off by that [m]: a column of their covariance over it
@@ -50,7 +50,7 @@ class Mode:
 
 @dataclass(frozen=True)
 class GaugeReport:
-    """How the adjustment moved the scene, and how well that is known."""
+    """Motion of the scene by an adjustment, and its standard deviations."""
 
     # (3,) mean move of the points from their place under the delivered cameras, east, north, up [m]
     shift: Array
@@ -69,7 +69,8 @@ class GaugeReport:
 def gauge_report(
     covariance: Covariance, points: Array, before: Array, use: BoolArray, prior: Array | None = None
 ) -> GaugeReport:
-    """The report for points (P, 3), ECEF [m], after and before an adjustment; those that count in `use` (P,).
+    """Report how an adjustment moved the scene: points (P, 3), ECEF [m], after and before it; those that
+    count in `use` (P,).
 
     The scene is a sample of these, `sampled(use)`: of other points nothing is read. `prior` (N, q) are the standard
     deviations of the cameras' unknowns as delivered; infinite ones do not count.
@@ -89,7 +90,7 @@ def gauge_report(
 
 
 def sampled(use: BoolArray) -> BoolArray:
-    """Points (P,) that stand for all of those in use, regularly taken."""
+    """Return the points (P,) that stand for all of those in use, regularly taken."""
     index, out = np.flatnonzero(use), np.zeros_like(use)
     out[index[:: len(index) // _SAMPLE + 1]] = True
     return out
@@ -98,7 +99,7 @@ def sampled(use: BoolArray) -> BoolArray:
 def earlier_scene(
     covariance: Covariance, prior: JointPrior, scene: EarlierScene, params: Array
 ) -> GaugeReport:
-    """The report for the scene of an earlier block, by unknowns (N, q) of its cameras that were adjusted again.
+    """Report the scene of an earlier block, by unknowns (N, q) of its cameras that were adjusted again.
 
     Whatever was added tells more of it: new points are another scene, and may know theirs less.
     """
@@ -119,7 +120,9 @@ def _report(
 def _motion_by_unknowns(
     covariance: Covariance, local: Array, enu: Array, use: BoolArray
 ) -> tuple[Array, Array]:
-    """The scene's motions by the camera unknowns (10, N q), their covariance (10, 10) where the cameras are known."""
+    """Return the scene's motions by the camera unknowns (10, N q), their covariance (10, 10) where the
+    cameras are known.
+    """
     reduced = covariance.reduced
     structure = reduced.structure
     count, q = len(MOTIONS), covariance.num_unknowns
@@ -145,7 +148,7 @@ def _motion_by_unknowns(
 
 
 def _motion_of_points(local: Array) -> Array:
-    """(10, n, 3): least-squares motions by the moves (east, north, up) of points at `local` (n, 3) radii."""
+    """Return (10, n, 3): least-squares motions by the moves (east, north, up) of points at `local` (n, 3) radii."""
     n = len(local)
     e, o, one, zero = local[:, 0], local[:, 1], np.ones(n), np.zeros(n)
     shifts = [[one, zero, zero], [zero, one, zero], [zero, zero, one]]
@@ -159,7 +162,9 @@ def _motion_of_points(local: Array) -> Array:
 
 
 def _bends(east: Array, north: Array) -> Array:
-    """Heights (3, n) of a twist and of bending to the east and north without the plane in them, each a metre in all."""
+    """Return the heights (3, n) of a twist and of bending to the east and north without the plane in them,
+    each a metre in all.
+    """
     plane = np.stack([np.ones_like(east), east, north])
     curved = np.stack([east * north, east**2, north**2])
     if not len(east):
@@ -169,7 +174,7 @@ def _bends(east: Array, north: Array) -> Array:
 
 
 def _modes(motion_covariance: Array) -> tuple[Mode, ...]:
-    """The scene's motions by their covariance, the weakest first."""
+    """Return the scene's motions by their covariance, the weakest first."""
     sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
     along = np.where(sigma > 0, motion_covariance, 0.0) / np.where(sigma > 0, sigma, 1.0)
     weakest = np.argsort(-sigma, kind="stable").tolist()

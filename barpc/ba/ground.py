@@ -31,7 +31,7 @@ _TOGETHER = 0.25  # of it: what their mean may be wrong by (RPCs' ranges lie abo
 
 
 def _join(priors: Sequence[PointPrior | None]) -> PointPrior | None:
-    """One block of several that speak of different points, and share their errors; None where all are empty."""
+    """Return one block of several that speak of different points, and share their errors; None where all are empty."""
     given = [prior for prior in priors if prior is not None and len(prior.index)]
     if not given:
         return None
@@ -44,13 +44,13 @@ def _join(priors: Sequence[PointPrior | None]) -> PointPrior | None:
 
 
 def ground_control(gcps: GroundPoints, index: IntArray) -> PointPrior:
-    """GCPs as priors on the points `index` (G,): east, north and up by their sigmas."""
+    """Return GCPs as priors on the points `index` (G,): east, north and up by their sigmas."""
     rows = enu_basis(gcps.lonlatalt) / gcps.sigma[..., None]
     return PointPrior(index, ecef_from_ground(gcps.lonlatalt), rows, np.zeros((len(index), 3, 0)))
 
 
 def reference_control(reference: Reference, index: IntArray) -> PointPrior:
-    """Points of a reference as priors on the points `index` (R,).
+    """Return the points of a reference as priors on the points `index` (R,).
 
     What they share: the height and slopes of the terrain, as points held to it do, the orthoimage's own place, and
     that what was matched may stand above the terrain (houses, trees). A terrain's errors reach over many points: all
@@ -75,7 +75,8 @@ def terrain_heights(
     span: Array | None = None,
     level: BoolArray | None = None,
 ) -> PointPrior:
-    """Points `index` (Q,) of (P, 3) held to a terrain: the height above its tangent plane where they stand now.
+    """Return priors that hold points `index` (Q,) of (P, 3) to a terrain: their height above its tangent
+    plane.
 
     Single altitudes are known to `sigma` [m]; all of them may be wrong by `common_sigma` [m], and by a slope that
     is as much at the scene's edges. Points where the terrain is unknown are left out.
@@ -92,7 +93,7 @@ def terrain_heights(
 
 
 def _believed_heights(ground: Array, index: IntArray, believed: Believed, common_sigma: Array) -> PointPrior:
-    """Points `index` (Q,) at ground points (Q, 3) held to what is believed of a DEM.
+    """Return the points `index` (Q,) at ground points (Q, 3) held to what is believed of a DEM.
 
     All of it may be wrong by a level, slopes and bends that are as much as `common_sigma` (`NUM_BENDS`,) [m] at the
     scene's edges.
@@ -105,14 +106,16 @@ def _believed_heights(ground: Array, index: IntArray, believed: Believed, common
 
 
 def flat_heights(points: Array, index: IntArray, alt: float, sigma: float, common_sigma: float) -> PointPrior:
-    """Points `index` held to one altitude [m]: each within `sigma` [m], all together within `common_sigma` [m]."""
+    """Return priors that hold points `index` to one altitude [m]: each within `sigma` [m], all together
+    within `common_sigma` [m].
+    """
     ground = ground_from_ecef(points[index])
     n = len(index)
     return _heights(ground, index, np.full(n, alt), np.tile([0.0, 0.0, 1.0], (n, 1)), sigma, common_sigma)
 
 
 def staying(points: Array, index: IntArray) -> PointPrior:
-    """Points `index` (Q,) of (P, 3), ECEF [m], each held to the altitude where it stands."""
+    """Return priors that hold points `index` (Q,) of (P, 3), ECEF [m], each to its present altitude."""
     ground = ground_from_ecef(points[index])
     return _heights(ground, index, ground[:, 2], np.tile([0.0, 0.0, 1.0], (len(index), 1)), _STAYS, 0.0)
 
@@ -138,7 +141,7 @@ def _heights(
 
 
 def _slopes(points: Array, span: Array) -> Array:
-    """How far to the east and north points (n, 3) lie in a scene, 1 at the edges of `span` (m, 3), ECEF [m]."""
+    """Return the positions east and north of points (n, 3) in a scene, 1 at the edges of `span` (m, 3), ECEF [m]."""
     middle = span.mean(axis=0)
     enu = enu_basis(ground_from_ecef(middle))[:2]
     edge = np.abs((span - middle) @ enu.T).max(axis=0)
@@ -146,7 +149,7 @@ def _slopes(points: Array, span: Array) -> Array:
 
 
 def convergence_angles(structure: Structure, projected: Projected, points: Array) -> Array:
-    """Largest angle (P,) [rad] between a point's rays and their mean, doubled: the angle of two rays."""
+    """Return the convergence angle (P,) [rad] of each point's rays: twice the largest angle to their mean."""
     by_point = projected.by_point
     ray = np.cross(by_point[0], by_point[1], axis=0)
     up = structure.of_points(points)
@@ -163,7 +166,7 @@ def convergence_angles(structure: Structure, projected: Projected, points: Array
 
 @dataclass(frozen=True)
 class TerrainTest:
-    """What a terrain did to the tie points, and how they lie to it."""
+    """Result of holding tie points to a terrain, and their heights above it."""
 
     held: int  # tie points that it holds
     known: int  # tie points where it has a height
@@ -201,19 +204,19 @@ class Heights:
     placed: PointPrior | None = None  # tracks that altimetry holds, which nothing else does then
 
     def loose(self, sigma: float) -> Heights:
-        """The same where the places of GCPs are known to `sigma` [m] only."""
+        """Return the priors with GCPs known to `sigma` [m] only."""
         first = self.control[0]
         rows = enu_basis(ground_from_ecef(first.mean)) / sigma
         return replace(self, control=(replace(first, rows=rows), *self.control[1:]), has_control=False)
 
     @property
     def is_judged(self) -> bool:
-        """Whether tie points are to tell how much of the DEM is believed."""
+        """Whether the tie points decide how far the DEM is believed."""
         given = self.dem is None or self.reference is not None
         return not given and not self.options.dem_for_weak and self.options.learn_priors
 
     def hold(self, problem: Problem, points: Array) -> Problem:
-        """The problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
+        """Return the problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
         return replace(problem, point_prior=_join([*self.control, self._held(points), self.placed]))
 
     def _believed(self, points: Array) -> Believed | None:
@@ -276,7 +279,9 @@ class Heights:
         return getattr(self.dem, "known", None)
 
     def test(self, points: Array, seen: BoolArray) -> TerrainTest | None:
-        """What the terrain did to the tracks that are `seen` (P,), at their adjusted places; None without one."""
+        """Compare the terrain with the tracks that are `seen` (P,), at their adjusted places; None without a
+        terrain.
+        """
         if self.dem is None:
             return None
         index = self.tracks[seen[self.tracks]]
@@ -299,7 +304,7 @@ class Heights:
         return replace(found, gains=tuple(map(float, believed.gains)), **judged)
 
     def warn(self) -> None:
-        """Say that tracks are held in height without a DEM."""
+        """Warn that tracks are held in height without a DEM."""
         count = int(self.weak[self.tracks].sum())
         if count and self.dem is None:
             message = (

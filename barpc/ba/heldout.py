@@ -42,7 +42,7 @@ _FEW = 20  # observations of a view that tell nothing by themselves
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """What the tracks that were kept out say."""
+    """Residuals of the tracks that were kept out of the adjustment."""
 
     residual: Array  # (2, H) projected - observed [px], points triangulated by the cameras
     index: IntArray  # (Q,) their points
@@ -67,7 +67,7 @@ def _mean_square(values: Array) -> float:
 
 
 def keep_out(block: Block) -> BoolArray:
-    """Observations (K,) of about every tenth track.
+    """Return the observations (K,) of about every tenth track, to be kept out.
 
     They are drawn by their image positions alone, so that neither the order of rows nor the names of views matter.
     """
@@ -83,14 +83,14 @@ def keep_out(block: Block) -> BoolArray:
 
 
 def _scrambled(numbers: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
-    """Numbers as if drawn at random (the finalizer of SplitMix64, Steele et al. 2014)."""
+    """Return the numbers as if drawn at random (the finalizer of SplitMix64, Steele et al. 2014)."""
     numbers = (numbers ^ (numbers >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     numbers = (numbers ^ (numbers >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return numbers ^ (numbers >> np.uint64(31))
 
 
 def of_part(problem: Problem, view: IntArray, point: IntArray, xy: Array) -> Problem:
-    """A problem's cameras with other observations (K,), sorted by view, of other points, seen at (2, K) [px]."""
+    """Return a problem's cameras with other observations (K,), sorted by view, of other points, seen at (2, K) [px]."""
     points = int(point.max(initial=-1)) + 1
     return replace(
         problem,
@@ -103,7 +103,7 @@ def of_part(problem: Problem, view: IntArray, point: IntArray, xy: Array) -> Pro
 
 
 def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Array]:
-    """A problem with other observations, and where cameras of unknowns (N, q) put their points (Q, 3)."""
+    """Return a problem with other observations, and the points (Q, 3) that cameras of unknowns (N, q) give them."""
     index, point = np.unique(block.point, return_inverse=True)
     part = of_part(problem, block.view, point, block.xy)
     first = block.first_points()[index]
@@ -111,7 +111,7 @@ def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Arr
 
 
 def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
-    """The observations of a block that took no part in a problem, under cameras of unknowns (N, q)."""
+    """Measure the observations of a block that took no part in a problem, under cameras of unknowns (N, q)."""
     views, index = len(block.views), np.unique(block.point)
     if not len(index):
         unknown = np.full(views, np.nan)
@@ -139,7 +139,7 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
 
 
 def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
-    """Observed over stated standard deviation (N,) of the right ones among each view's observations.
+    """Return the observed over stated standard deviation of observations, half of which may be wrong.
 
     Half of which may be wrong.
 
@@ -178,7 +178,7 @@ def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
 
 
 def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:
-    """Whether cameras with more unknowns meet the tracks of a block that took no part better than others do.
+    """Return whether cameras with more unknowns meet the held-out tracks of a block better than others do.
 
     Track by track, as the same noise is in both; where one is wrong, by no more than so much.
     """
@@ -192,7 +192,7 @@ def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class CheckResiduals:
-    """Known points against cameras.
+    """Residuals of known points under given cameras.
 
     Parameters
     ----------
@@ -206,7 +206,9 @@ class CheckResiduals:
     ground: Array
 
     def rms(self) -> tuple[Array, Array]:
-        """Root mean squares: col, row (2,) [px]; east, north, up (3,) [m], NaN without a triangulated point."""
+        """Return the root mean squares: col, row (2,) [px]; east, north, up (3,) [m], NaN without a
+        triangulated point.
+        """
         known = np.isfinite(self.ground).all(axis=1)
         ground = np.full(3, np.nan)
         if known.any():
@@ -215,7 +217,7 @@ class CheckResiduals:
 
 
 def check_residuals(sensors: Sequence[SensorModel], points: GroundPoints) -> CheckResiduals:
-    """What cameras make of known points.
+    """Return the residuals of known points under given cameras.
 
     Parameters
     ----------
@@ -244,13 +246,13 @@ def check_residuals(sensors: Sequence[SensorModel], points: GroundPoints) -> Che
 
 
 def enu_offsets(points: Array, known: Array) -> Array:
-    """East, north, up (n, 3) [m] of points, ECEF [m], minus known lon, lat, alt (n, 3)."""
+    """Return the east, north, up (n, 3) [m] of points, ECEF [m], minus known lon, lat, alt (n, 3)."""
     offset = points - ecef_from_ground(known)
     return (enu_basis(known) @ offset[..., None])[..., 0]
 
 
 def split_points(points: GroundPoints, checks: Sequence[str]) -> tuple[GroundPoints, GroundPoints]:
-    """Points as control for the solve and as checks that stay out of it.
+    """Split points into control for the solve and check points that stay out of it.
 
     Parameters
     ----------

@@ -34,12 +34,12 @@ _LARGEST = 20_000  # unknowns of a block that is gone on from: its matrix is den
 
 @dataclass(frozen=True, eq=False)
 class BlockPrior:
-    """What an adjustment knows about its views.
+    """The reduced normal matrix of an adjustment, as a prior on its views.
 
     Parameters
     ----------
     names : tuple of str
-        Its n views that were free.
+        Views of the block that were free, n of them.
     model, drift : str, int
         The unknowns (see `AdjustOptions`).
     params : (n, q)
@@ -53,9 +53,9 @@ class BlockPrior:
     splines, edges, strips, periods : int, (n, C), (n, M, 5), (n, M)
         Layout of the unknowns in the image (see `barpc.ba.waves`).
     radars : tuple of str
-        Those of its views whose unknowns are of a radar's clocks.
+        Views of the block whose unknowns are a radar's clocks.
     scene : EarlierScene or None
-        Its scene, by its cameras' unknowns; None: written by an earlier release.
+        Scene of the block, by its cameras' unknowns; None: written by an earlier release.
     """
 
     names: tuple[str, ...]
@@ -73,7 +73,7 @@ class BlockPrior:
     scene: EarlierScene | None = None
 
     def waves(self, names: tuple[str, ...]) -> Waves | None:
-        """The unknowns in the image of views that go on from the block; a new one has splines alone."""
+        """Return the unknowns in the image of the views that go on from the block; a new view has splines alone."""
         of_views = self._edges, self._strips, self._periods
         if self.edges is None or not (self.splines or any(one.size for one in of_views)):
             return None
@@ -121,7 +121,7 @@ class BlockPrior:
 
     @classmethod
     def load(cls, path: Path) -> BlockPrior:
-        """Read what `save` wrote.
+        """Load a prior that `save` wrote.
 
         Raises
         ------
@@ -151,7 +151,7 @@ class BlockPrior:
         return prior
 
     def _is_whole(self) -> bool:
-        """Whether the arrays have the shapes that the names ask for, and hold numbers that a prior can."""
+        """Return whether the arrays have the shapes that the names ask for, and hold numbers that a prior can."""
         n, q = len(self.names), self.params.shape[-1] if self.params.ndim else 0
         shapes = {"params": (n, q), "information": (n * q, n * q), "center": (n, 3)}
         arrays = [getattr(self, name) for name in shapes]
@@ -176,7 +176,7 @@ class BlockPrior:
         )
 
     def dense(self) -> Array:
-        """The information matrix as an array."""
+        """Return the information matrix as an array."""
         if isinstance(self.information, np.ndarray):
             return self.information
         if self.params.size > _LARGEST:
@@ -189,7 +189,7 @@ class BlockPrior:
 
 
 def _is_scene(scene: EarlierScene, size: int) -> bool:
-    """Whether the motions of a scene by so many unknowns are what they can be."""
+    """Return whether the motions of a scene by so many unknowns are what they can be."""
     arrays, count = (scene.by_unknown, scene.own), len(MOTIONS)
     return (
         tuple(array.shape for array in arrays) == ((count, size), (count, count))
@@ -199,7 +199,7 @@ def _is_scene(scene: EarlierScene, size: int) -> bool:
 
 
 def _is_plain(array: Array | sp.csr_array) -> bool:
-    """Whether all numbers are finite, and their squares."""
+    """Return whether all numbers are finite, and their squares."""
     numbers = array.data if sp.issparse(array) else array
     return bool((np.abs(np.asarray(numbers)) <= LARGEST).all())
 
@@ -218,14 +218,14 @@ def _csr(file: Mapping[str, Array], size: int) -> sp.csr_array:
 
 
 def _within(numbers: Array, most: int) -> bool:
-    """Whether all are whole, and from 0 to `most`."""
+    """Return whether all are whole, and from 0 to `most`."""
     return bool(
         numbers.ndim == 1 and numbers.dtype.kind in "iu" and ((numbers >= 0) & (numbers <= most)).all()
     )
 
 
 def block_prior(adjustment: Adjustment) -> BlockPrior:
-    """The prior that a later run starts from.
+    """Return the prior that a later run starts from.
 
     Parameters
     ----------
@@ -266,7 +266,8 @@ def apply_prior(
     cameras: CameraPrior,
     radars: Collection[str] = (),
 ) -> tuple[CameraPrior, JointPrior]:
-    """The priors of a run that goes on from an old block: the old views' own ones make way for the joint one.
+    """Return the priors of a run that goes on from an old block: a joint prior replaces those of the old
+    views.
 
     `radars` are the views whose unknowns are now those of clocks.
 

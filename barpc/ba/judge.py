@@ -85,7 +85,7 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What was taken, and where cameras and observations are with it."""
+    """The explanations taken, and the state of cameras and observations with them."""
 
     findings: tuple[Finding, ...] = ()
     step: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (N, q) of the cameras' unknowns
@@ -95,7 +95,8 @@ class Judgement:
 
 
 def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
-    """Intervals of images in which ties were cut, or are off, more than elsewhere and chance allow.
+    """Find the intervals of images in which more ties were cut, or are displaced, than elsewhere and chance
+    allow.
 
     A mean below `floor` [px] is none.
     """
@@ -113,7 +114,7 @@ def _standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval
 
 
 def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
-    """What stands out at the end, with what the ties that were cut there are off by.
+    """Return the intervals that stand out at the end, with the offsets of the ties that were cut there.
 
     As their tracks see it that are triangulated with all that may be seen, where all of one was cut.
     """
@@ -135,19 +136,21 @@ def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
 
 
 def swinging(outcome: Outcome, block: Block) -> list[Swing]:
-    """Periods with which the rows of images swing more than chance allows, one of each at most."""
+    """Find the periods with which the rows of images swing more than chance allows, at most one an image."""
     rows, off = _whitened(outcome, block)
     return swings(block.view[rows], block.xy[1, rows], _sizes(block), _told(outcome, block)[rows], off)
 
 
 def _told(outcome: Outcome, block: Block) -> Array:
-    """1 for observations (K,) of points that are known: what was cut is seen as well as the rest where others tell."""
+    """Return 1 for observations (K,) of points that are known: what was cut is seen as well as the rest where
+    others tell.
+    """
     right = np.bincount(block.point[outcome.inlier], minlength=block.num_points)
     return (right[block.point] >= 2).astype(np.float64)
 
 
 def _whitened(outcome: Outcome, block: Block) -> tuple[BoolArray, Array]:
-    """Observations of tracks (K,), and residuals (2, k) of these in standard deviations."""
+    """Return the observations of tracks (K,), and residuals (2, k) of these in standard deviations."""
     is_tie = (block.point < block.num_tracks) & block.use
     freedom = Observations(outcome.problem, block.sigma, 0.0, is_tie).freedom(
         outcome.inlier.astype(np.float64)
@@ -162,7 +165,8 @@ def _sizes(block: Block) -> Array:
 
 
 def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
-    """What explains the ties of a block beside its cameras, the first taken first; empty where nothing stands out.
+    """Find what explains the ties of a block beside its cameras, the first taken first; empty where nothing
+    stands out.
 
     Of more unknowns than `UNKNOWNS` each image that stands out is judged among those that it shares most tracks with:
     what moves on the ground competes there, but is not followed.
@@ -188,7 +192,7 @@ def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
 
 
 def _judged_among(outcome: Outcome, block: Block, floor: float, views: IntArray) -> Judgement:
-    """What explains the ties that some views have among them; views and observations are counted anew."""
+    """Judge the ties that some views have among them; views and observations are renumbered."""
     found = around(outcome, block, views)
     if found is None:
         return Judgement()
@@ -209,7 +213,7 @@ def _judged_among(outcome: Outcome, block: Block, floor: float, views: IntArray)
 
 
 def _near(block: Block, view: int) -> IntArray:
-    """A view and those that share most tracks with it, in their order."""
+    """Return a view and those that share most tracks with it, in their order."""
     ties = block.use & (block.point < block.num_tracks)
     of_view = np.zeros(block.num_points, dtype=bool)
     of_view[block.point[ties & (block.view == view)]] = True
@@ -220,7 +224,7 @@ def _near(block: Block, view: int) -> IntArray:
 
 
 def _joined(all_of: Judgement, one: Judgement, views: IntArray, rows: IntArray) -> Judgement:
-    """With what was found among some views, of observations at `rows`; views that were moved before stay."""
+    """Return a judgement with the findings among some views added, for observations at `rows`."""
     step, right = all_of.step.copy(), all_of.right.copy()
     new = ~step[views].any(axis=1)
     step[views[new]] = one.step[new]
@@ -233,9 +237,7 @@ def _joined(all_of: Judgement, one: Judgement, views: IntArray, rows: IntArray) 
 
 
 def around(outcome: Outcome, block: Block, views: IntArray) -> tuple[Linear, State] | None:
-    """The ties among some views of a block, linearised where the rounds ended, and there; None where they are too many
-    to be judged.
-    """
+    """Linearise the ties among some views of a block at its solution; None where they are too many to be judged."""
     problem = outcome.problem
     use = block.use & (block.point < block.num_tracks) & np.isin(block.view, views)
     unknowns = problem.free.size // len(block.views) * len(views)
@@ -261,7 +263,7 @@ class _Taken:
 
     @property
     def what(self) -> tuple[str, int]:
-        """Its kind and view."""
+        """Kind and view of the explanation."""
         return self.one.kind, self.one.view
 
 
@@ -276,23 +278,27 @@ class _State:
 
     @property
     def gain(self) -> float:
-        """Of all that were taken, together."""
+        """Evidence gained by all explanations taken."""
         return sum(row.gain for row in self.taken)
 
     def may_pass(self, best: _State) -> bool:
-        """Whether some more, each of which gains less than the last, may explain more than another that ended."""
+        """Return whether some more, each of which gains less than the last, may explain more than another
+        that ended.
+        """
         left = _PARTS + len(best.taken) - 1 - len(self.taken)
         return self.gain + left * self.taken[-1].gain > best.gain
 
     def adds_to(self, best: _State, beside: list[_Tried]) -> bool:
-        """Whether what was taken last gains as much beside the best, of what was taken before: it is no other way."""
+        """Return whether what was taken last gains as much beside the best, of what was taken before: it is
+        no other way.
+        """
         last, one = self.taken[-1], self.taken[-1].one
         same = [row.what for row in self.taken[:-1]] == [row.what for row in best.taken[:-1]]
         gains = [row[2] for row in beside if row[0].kind == one.kind and not _differs(row[0], one)]
         return same and max(gains, default=0.0) > last.gain - SURE
 
     def added(self, tried: list[_Tried]) -> _State:
-        """With the first of those that were tried; the others are what it was chosen from."""
+        """Return the state with the first of the explanations tried; the others are its rivals."""
         first = tried[0]
         same = [row for row in tried if row[2] > first[2] - SURE and _of_one_image(row[0], first[0])]
         one, made, gain = min(same, key=lambda row: _part(row[0], self.seen))  # of two that are as good
@@ -310,7 +316,7 @@ class _State:
 
 
 class _Search:
-    """Taking one explanation after the other, of the best and of its rival."""
+    """Search for explanations, one after the other, by the best and its rivals."""
 
     def __init__(self, seen: Seen, first: list[Interval], floor: float, sigma: float) -> None:
         self.start, self.first, self.floor, self.sigma = seen, first, floor, sigma  # [px]
@@ -318,7 +324,7 @@ class _Search:
         self.group: list[Explanation] = []  # looked for once
 
     def run(self) -> Judgement:
-        """All that were taken."""
+        """Return all that were taken."""
         states, ended = [_State(self.start, self.start.base)], False
         while not ended:
             states, ended = self._grown(states)
@@ -332,7 +338,7 @@ class _Search:
         return Judgement(found, base.step, base.right)
 
     def _grown(self, states: list[_State]) -> tuple[list[_State], bool]:
-        """The best with one more explanation, and whether they are the last."""
+        """Return the best with one more explanation, and whether they are the last."""
         best, grown, beside = states[0], list[_State](), list[_Tried]()
         for state in states:
             if state.ended or (best.ended and not state.may_pass(best)):
@@ -356,7 +362,9 @@ class _Search:
         return kept, all(one.ended or (kept[0].ended and not one.may_pass(kept[0])) for one in kept)
 
     def _tried(self) -> list[_Tried]:
-        """Explanations of what stands out now, fitted beside those taken, with their gains; the best first."""
+        """Return the explanations of what stands out now, fitted beside those taken, with their gains; the
+        best first.
+        """
         seen = self.seen
         out, periods = self._standing_out(seen.base, seen.extra)
         # in a pair more wrong matches at an end explain what was cut there as well, and nothing stands out beside them
@@ -370,7 +378,7 @@ class _Search:
         return self._sorted(row[:2] for row in made if not self._is_nothing(*row[:2]))
 
     def _standing_out(self, found: Fit, extra: Array) -> tuple[list[Interval], list[Swing]]:
-        """Intervals and periods that stand out beside what a fit moves (2, e, K)."""
+        """Return the intervals and periods that stand out beside what a fit moves (2, e, K)."""
         seen, linear = self.seen, self.seen.linear
         rows = linear.taking_part
         left = linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma
@@ -382,7 +390,9 @@ class _Search:
         return _distinct(out)[:_TRIED], swings(view, place[1], seen.size, told, off)[:_TRIED]
 
     def _leaves_nothing(self, made: list[_Tried]) -> bool:
-        """Whether nothing stands out beside the best of few unknowns: no rival of a cell's each is needed then."""
+        """Return whether nothing stands out beside the best of few unknowns: no rival of a cell's each is
+        needed then.
+        """
         best = [row for row in made[:1] if row[2] > SURE and row[0].kind in FOLLOWED]
         beside = (
             self._standing_out(found, np.concatenate([self.seen.extra, one.extra], axis=1))
@@ -391,7 +401,7 @@ class _Search:
         return any(not any(one) for one in beside)
 
     def _moving(self, out: list[Interval], made: list[_Tried]) -> list[_Tried]:
-        """The ties that move on the ground, and parts of images that hold what they do.
+        """Return the ties that move on the ground, and parts of images that hold what they do.
 
         They are looked for once and then tried beside what was taken.
         """
@@ -402,7 +412,9 @@ class _Search:
         return self._sharp(self._with(found, [one for row in sure for one in self._members(row[1], rows)]))
 
     def _sharp(self, made: list[_Tried]) -> list[_Tried]:
-        """With ends, periods and lengths looked for, where these may gain most; the best first."""
+        """Return the explanations with ends, periods and lengths searched for, where these may gain most; the
+        best first.
+        """
         local = [one for kind in LOCAL for one in [row[0] for row in made if row[0].kind == kind][:_LOCAL]]
         # where something is sure already, what is not waits for the next round
         blunt = max(SURE, made[0][2] / _PARTS) if made and made[0][2] > SURE else -np.inf
@@ -414,7 +426,7 @@ class _Search:
         )
 
     def _worth_more(self, offered: list[Explanation]) -> list[Explanation]:
-        """Those of which few tracks show that they may gain most, alone or as the largest of some parts."""
+        """Return the explanations that, by few tracks, may gain most, alone or as the largest of some parts."""
         few = self.seen.few
         if few is self.seen.linear or len(offered) < 3:
             return offered
@@ -424,7 +436,7 @@ class _Search:
         return [one for one, gain in zip(offered, gains, strict=True) if gain >= least]
 
     def _is_nothing(self, one: Explanation, found: Fit) -> bool:
-        """Whether a swing or a group's motion is smaller than what an adjustment is asked to find."""
+        """Return whether a swing or a group's motion is smaller than what an adjustment is asked to find."""
         size = np.inf
         if one.kind == SWING:
             size = float(np.hypot(*_amplitude(found.extra[-len(one.sigma) :])))
@@ -434,7 +446,9 @@ class _Search:
         return bool(size < self.floor * _SEEN)
 
     def _members(self, found: Fit, rows: BoolArray) -> Iterator[Explanation]:
-        """Parts of images that hold what a group does: rows of one image that lie off move on the ground, too."""
+        """Yield the parts of images that hold what a group does: rows of one image that lie off move on the
+        ground, too.
+        """
         seen, none = self.seen, np.zeros((2, int(rows.sum())))
         places = scan(
             seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none, none[0]
@@ -444,7 +458,7 @@ class _Search:
         return proposed(seen, intervals, [], (MOVING, WANDER))
 
     def _with(self, made: list[_Tried], more: list[Explanation]) -> list[_Tried]:
-        """What was tried and more, the best first."""
+        """Return the explanations tried so far and more, the best first."""
         return self._sorted([*(row[:2] for row in made), *((one, self._fit(one)) for one in more)])
 
     def _sorted(self, made: Iterable[tuple[Explanation, Fit]]) -> list[_Tried]:
@@ -477,7 +491,7 @@ class _Search:
 
 
 def _amplitude(unknowns: Array) -> Array:
-    """Of a swing (2,), col and row."""
+    """Return the amplitude of a swing (2,), col and row."""
     size: Array = np.hypot(*unknowns.reshape(2, 2).T)
     return size
 
@@ -503,7 +517,9 @@ def _said(rows: list[_Taken], n: int, seen: Seen) -> Iterator[Finding]:
 
 
 def _rivals(tried: list[_Tried]) -> list[int]:
-    """The best of other kinds or views than the first that are followed, and may be its betters with some beside."""
+    """Return the best of other kinds or views than the first that are followed, and may be its betters with
+    some beside.
+    """
     found: dict[tuple[str, int], int] = {}
     for n, (one, _, gain) in enumerate(tried):
         if one.kind in FOLLOWED and _differs(one, tried[0][0]) and gain > tried[0][2] / _PARTS:
@@ -512,7 +528,7 @@ def _rivals(tried: list[_Tried]) -> list[int]:
 
 
 def _distinct(intervals: list[Interval]) -> list[Interval]:
-    """Without those of which most is in a better one, and most of that in them."""
+    """Return the explanations without those that a better one covers."""
     out: list[Interval] = []
     for one in intervals:
         if not any(_same(one, other) for other in out):
@@ -527,18 +543,18 @@ def _same(one: Interval, other: Interval) -> bool:
 
 
 def _of_one_image(one: Explanation, other: Explanation) -> bool:
-    """Whether two explanations may be a part of an image and its complement."""
+    """Return whether two explanations may be a part of an image and its complement."""
     return one is other or (one.view == other.view and one.kind in LOCAL and other.kind in LOCAL)
 
 
 def _part(one: Explanation, seen: Seen) -> float:
-    """The part of its image that it moves: of two that explain as much it is the smaller one."""
+    """Return the part of its image that it moves: of two that explain as much it is the smaller one."""
     rows = (seen.linear.view == one.view) | (one.view < 0)
     return float(one.extra[:, :, rows].any(axis=(0, 1)).sum() / max(rows.sum(), 1))
 
 
 def _differs(one: Explanation, other: Explanation) -> bool:
-    """Whether two explanations say something else: of one view's rows, overlapping strips are the same."""
+    """Return whether two explanations say something else: of one view's rows, overlapping strips are the same."""
     if (one.kind, one.view) != (other.kind, other.view):
         return True
     if one.where is None or other.where is None:

@@ -62,7 +62,7 @@ def factorize(matrix: Array, damping: float = 0.0) -> Factor:
 def factorize_blocks(
     matrix: Blocks, order: Dissection, damping: float = 0.0, less: Array | None = None
 ) -> Factor:
-    """The same for the views that an order of elimination has, less B^T B with a few rows `less` (m, n) as B."""
+    """Factorise S, of the views in an order of elimination, less B^T B of a few rows `less` (m, n)."""
     _check(matrix.diagonal)
     cholesky = Cholesky(matrix, order)
     cholesky.factorize(damping)
@@ -78,7 +78,7 @@ def _check(diagonal: Array) -> None:
 
 
 def _updated(factor: Factor, less: Array, order: Dissection) -> Factor:
-    """The factor of S - B^T B from that of S (Woodbury's formula)."""
+    """Return the factor of S - B^T B from that of S (Woodbury's formula)."""
     pulled = factor.solve(np.ascontiguousarray(less.T))
     upper = la.cholesky(np.eye(len(less)) - less @ pulled)
     root = la.solve_triangular(upper, pulled.T, trans="T").T  # (S - B^T B)^-1 = S^-1 + root root^T

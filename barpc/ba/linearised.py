@@ -21,7 +21,7 @@ _TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Pairs of observations i <= j of the same tracks, sorted by what views these are of."""
+    """Pairs of observations i <= j of the same tracks, sorted by their views."""
 
     order: IntArray  # (M,) of the pairs as they come, track by track
     first: IntArray  # (M,) observations
@@ -42,23 +42,27 @@ class Tracks:
     by_unknown: Array  # (T, n, 2, q)
 
     def of(self, values: Array) -> Array:
-        """Values (2, K) of observations as tracks have them (T, 2n)."""
+        """Return values (2, K) of observations arranged by track (T, 2n)."""
         count, n = self.rows.shape
         return np.ascontiguousarray(values[:, self.rows].transpose(1, 2, 0)).reshape(count, 2 * n)
 
     def followed(self, values: Array) -> Array:
-        """Coordinates (T, S, 3) of values (T, 2n) on what ground points follow."""
+        """Return the coordinates (T, S, 3) of values (T, 2n) along the ground points' derivatives."""
         found: Array = self.follow @ values[..., None]
         return found.reshape(len(values), len(self.subsets), 3)
 
     def weighed(self, values: Array, followed: Array, weight: Array) -> Array:
-        """Values (T, 2n), less what ground points follow, summed over subsets with their weights (T, S)."""
+        """Return the values (T, 2n) without the part that ground points absorb, summed over subsets with
+        their weights (T, S).
+        """
         parts = (weight[..., None] * followed).reshape(len(values), 1, -1) @ self.follow
         seen: Array = np.repeat(weight @ self.subsets.astype(np.float64), 2, axis=1)
         return np.asarray(seen * values - parts[:, 0])
 
     def weight(self, weight: Array) -> Array:
-        """What takes away what ground points follow (T, 2n, 2n), summed over subsets with their weights (T, S)."""
+        """Return the projectors (T, 2n, 2n) that take away what ground points absorb, summed over subsets
+        with their weights (T, S).
+        """
         of_rows = np.repeat(weight, 3, axis=1)[..., None] * self.follow
         out: Array = -(np.swapaxes(self.follow, 1, 2) @ of_rows)
         diagonal = np.einsum("tii->ti", out)
@@ -84,11 +88,11 @@ class Linear:
 
     @property
     def views(self) -> int:
-        """N."""
+        """Number of views N."""
         return self.shape[0]
 
     def among(self, views: IntArray) -> Linear:
-        """The same with its own tracks' views (n,) only, counted anew; observations of others are left out."""
+        """Return the linearised ties among some views (n,) only, renumbered; observations of others are left out."""
         number, index = np.full(self.views, -1), np.full(len(self.view), -1)
         number[views] = np.arange(len(views))
         rows = np.flatnonzero(number[self.view] >= 0)
@@ -137,12 +141,12 @@ class Linear:
         return rows
 
     def left(self, step: Array) -> Array:
-        """Residuals (2, K) after a step (N, q) of the cameras."""
+        """Return the residuals (2, K) after a step (N, q) of the cameras."""
         left: Array = self.residual + np.einsum("cqk,kq->ck", self.by_unknown, step[self.view])
         return left
 
     def thinned(self, most: int) -> Linear:
-        """The same with every n-th track, of about so many observations."""
+        """Return every n-th track, of about so many observations."""
         every = -(-sum(tracks.rows.size for tracks in self.tracks) // most)
         if every <= 1:
             return self
@@ -155,7 +159,7 @@ class Linear:
 
 
 def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span: float) -> Linear:
-    """Tie points in use (K,) of a problem at a state where they may all be seen; heights span so much [m]."""
+    """Linearise the tie points in use (K,) of a problem at a state; heights span a given range [m]."""
     structure = problem.structure
     projected = problem.linearise(state.params, state.points)
     residual = (projected.image - problem.xy) / sigma
@@ -202,13 +206,13 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
 
 
 def numbers(count: IntArray) -> float:
-    """How many numbers there are to tracks of so many views each (T,)."""
+    """Return the count of numbers that tracks of so many views each (T,) need."""
     subsets = np.where(count <= _MOST_SUBSETS, 2.0 ** count.astype(np.float64), count + 1.0)
     return float((6.0 * subsets * count).sum())
 
 
 def _subsets(n: int) -> BoolArray:
-    """Which views of n may be right together (S, n): all, then fewer."""
+    """Return the subsets (S, n) of n views that may be right together: all, then fewer."""
     sizes = range(n, 1, -1) if n <= _MOST_SUBSETS else range(n, n - 2, -1)
     chosen = [subset for size in sizes for subset in combinations(range(n), size)]
     out = np.zeros((len(chosen), n), dtype=bool)
@@ -218,7 +222,7 @@ def _subsets(n: int) -> BoolArray:
 
 
 def _followed(ground: Array, subsets: BoolArray, held: Array) -> tuple[Array, Array]:
-    """L^-1 J' of each subset's rows, where L L' = J' J + held (T, 3 S, 2n), and -log det L (T, S)."""
+    """Return L^-1 J' of each subset's rows, where L L' = J' J + held (T, 3 S, 2n), and -log det L (T, S)."""
     count, size = ground.shape[:2]
     follow, room = np.empty((count, len(subsets), 3, size)), np.empty((count, len(subsets)))
     for k, subset in enumerate(subsets):

@@ -44,7 +44,7 @@ NEAR_LIMIT = (
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Tracks that may have moved while the views were taken, those of every cell of the ground with their share."""
+    """Tracks that may have moved while the views were taken, with the share that moves in each cell of the ground."""
 
     by_move: Array  # (2, m, K) how a unit of each of its unknowns moves observations [px]
     sigma: Array  # (m,) their prior
@@ -54,7 +54,7 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What one explanation makes of a block."""
+    """The result of fitting one explanation to a block."""
 
     evidence: float  # log, but for a constant of the block
     step: Array  # (N, q) of the cameras' unknowns from the state
@@ -74,7 +74,8 @@ def fit(
     warm: Fit | None = None,
     group: Group | None = None,
 ) -> Fit:
-    """The block with cameras and, beside them, unknowns of which each moves observations by `extra` (2, e, K) [px].
+    """Fit cameras and extra unknowns, which move observations by `extra` (2, e, K) [px] a unit, to a block as
+    a mixture.
 
     Their prior standard deviations are `sigma` (e,) [px]. From a fit that is `warm`, whose unknowns may be fewer, it
     is cooled again only from where the further ones begin; with a `group` that moves from the top.
@@ -83,7 +84,7 @@ def fit(
 
 
 def moving(linear: Linear, extra: Array, group: Group, found: Fit) -> Array:
-    """Probability (K,) that the track of an observation is of a group, by a fit with it, of these tracks or others."""
+    """Return the probability (K,) that the track of an observation belongs to a moving group, by a fit with it."""
     left = linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma
     away = np.einsum("cmk,m->ck", group.by_move, found.move) / linear.sigma
     moved = _Moved(left + away, group.share, found.scatter)
@@ -94,7 +95,9 @@ def moving(linear: Linear, extra: Array, group: Group, found: Fit) -> Array:
 
 
 def log_likelihoods(linear: Linear, residual: Array, found: Fit) -> Array:
-    """Log-likelihood (K,) of the track of every observation, at residuals (2, K) in stated standard deviations."""
+    """Return the log-likelihood (K,) of the track of every observation, at residuals (2, K) in stated
+    standard deviations.
+    """
     out = np.zeros(len(linear.view))
     for tracks in linear.tracks:
         weight = _expect(linear, tracks, residual, found.noise, found.eps)
@@ -103,7 +106,7 @@ def log_likelihoods(linear: Linear, residual: Array, found: Fit) -> Array:
 
 
 def off_from_right(linear: Linear, residual: Array, right: Array) -> tuple[Array, BoolArray]:
-    """Residuals (2, K) of all observations once the ground points are where the right ones (K,) put them.
+    """Return the residuals (2, K) of all observations from ground points intersected by the right ones (K,).
 
     In standard deviations that they would have if all were right; and which (K,) have at least two right others.
     """
@@ -129,7 +132,8 @@ def off_from_right(linear: Linear, residual: Array, right: Array) -> tuple[Array
 def first_guess(
     linear: Linear, found: Fit, extra: Array, new: Array, precision: Array
 ) -> tuple[Array, float, float]:
-    """Unknowns (e,) that move observations by `new` (2, e, K) [px], beside a fit's with its `extra` [px].
+    """Estimate starting values (e,) of unknowns that move observations by `new` (2, e, K) [px], beside a fit
+    with `extra` [px].
 
     They have the least sum of what all tracks are off by, not of its squares; also the median of that, and the sum over
     the noise. Their prior's precisions are the last of `precision`.
@@ -192,7 +196,7 @@ class _Expected:
         return np.asarray(gone / np.maximum(still + gone, 1e-300))
 
     def pull(self, tracks: Tracks) -> Array:
-        """Residuals (T, 2n), less what ground points follow, as far as they are right."""
+        """Return the residuals (T, 2n), less what ground points follow, as far as they are right."""
         return tracks.weighed(self.values, self.followed, self.of_subset)
 
 
@@ -232,7 +236,9 @@ def _expect(
 def _of_subsets(
     tracks: Tracks, residual: Array, noise: float, area: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Log-likelihoods (T, S) of residuals (2, K) if a subset is right, their squares, and what they are made of."""
+    """Return the log-likelihoods (T, S) of residuals (2, K) if a subset is right, their squares, and what
+    they are made of.
+    """
     n = tracks.rows.shape[1]
     values = tracks.of(residual)
     followed = tracks.followed(values)
@@ -246,7 +252,7 @@ def _of_subsets(
 
 @dataclass(frozen=True, eq=False)
 class _Kind:
-    """What a mixture expects of what stands still, or of what moves."""
+    """Expectations of a mixture for ties that stand, or that move."""
 
     weight: tuple[Array, ...]  # of tracks their subsets' probabilities (T, S)
     right: Array  # (K,) probability of every observation, not by itself
@@ -257,7 +263,7 @@ class _Kind:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What a mixture expects of all tracks with its unknowns as they are."""
+    """Expectations of a mixture over all tracks at its present unknowns."""
 
     log: float
     right: Array  # (K,)
@@ -309,7 +315,9 @@ class Mixture:
         self.summed: list[Array] = []
 
     def run(self, most: int = _ITERATIONS, cooled: float = _COOLED) -> Fit:
-        """Expect and maximise until nothing changes, or so often; from where the last run ended."""
+        """Iterate expectation and maximisation until nothing changes, or a number of times; goes on where the
+        last run ended.
+        """
         linear, last, known, ends = self.linear, -np.inf, 0.0, False
         self.cooled = cooled
         for left in range(most, 0, -1):
@@ -339,7 +347,7 @@ class Mixture:
         return Fit(evidence, step, extra, self.noise, self.eps, seen.right, move, seen.moving, scatter)
 
     def _noise(self, seen: _Seen, known: float) -> bool:
-        """The noise, and what is wrong, as they are seen; whether the noise stands."""
+        """Return the noise, and what is wrong, as they are seen; whether the noise stands."""
         still = seen.kinds[0]
         found = max(float(np.sqrt(still.squares / max(still.freedom - known, 1.0))), _LEAST_NOISE)
         cold = self.noise <= found
@@ -355,7 +363,7 @@ class Mixture:
         return bool(stands)
 
     def _group(self, seen: _Seen, noise: float, cold: bool) -> None:
-        """The share of every cell that moves, once it is cold, and how much its tracks scatter."""
+        """Estimate the moving share of every cell and the scatter of its tracks."""
         assert self.group is not None
         share, scatter = self.group.share, noise
         if cold:
@@ -402,7 +410,7 @@ class Mixture:
         return [self.noise] if self.group is None else [self.noise, self.moved.noise]
 
     def _has_changed(self, seen: _Seen) -> bool:
-        """Whether what views and unknowns rest on is another part of the observations than the curvature's."""
+        """Return whether what views and unknowns rest on is another part of the observations than the curvature's."""
         sums, further = [], self.precision[self.linear.precision.size :]
         for kind, squared, noise in zip(seen.kinds, self.squared, self._noises, strict=True):
             of_views = np.bincount(self.linear.view, kind.right, minlength=self.linear.views)
@@ -414,7 +422,7 @@ class Mixture:
         return True
 
     def _matrix(self) -> Array:
-        """The normal matrix, with the precisions of the priors."""
+        """Return the normal matrix, with the precisions of the priors."""
         out = np.diag(self.precision)
         for matrix, noise in zip(self.curvature, self._noises, strict=True):
             out[: len(matrix), : len(matrix)] += matrix / noise**2
@@ -433,7 +441,7 @@ class Mixture:
         return out
 
     def _curvature(self, weights: Sequence[Array], beside: Array) -> Array:
-        """Second derivatives of half the squares by the cameras' unknowns and those beside them."""
+        """Return the second derivatives of half the squares by the cameras' unknowns and those beside them."""
         linear, (views, q), size = self.linear, self.linear.shape, beside.shape[1]
         of_beside, across = np.zeros((size, size)), np.zeros((views, q, size))
         of_pairs, seen, turned = list[Array](), list[IntArray](), list[Array]()
@@ -462,7 +470,9 @@ class Mixture:
         return np.block([[cameras, cross], [cross.T, of_beside]])
 
     def _of_cameras(self, weight: Array) -> Array:
-        """The same by the cameras' unknowns alone (N q, N q), of the weights (M, 2, 2) of pairs of observations."""
+        """Return the normal matrix (N q, N q) of the cameras' unknowns, of the weights (M, 2, 2) of pairs of
+        observations.
+        """
         linear, (views, q), pairs = self.linear, self.linear.shape, self.linear.pairs
         out, at = np.zeros((views, q, views, q)), pairs.bounds
         starts = at[np.searchsorted(at, np.arange(0, at[-1] + _CHUNK, _CHUNK), side="right").clip(1) - 1]

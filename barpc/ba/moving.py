@@ -34,7 +34,7 @@ _SIGMA = 30.0  # px on the ground: a displacement from view to view, before it i
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """Where the tracks of a block lie, as seen from one point, and how they move images."""
+    """Ground points of a block's tracks in a local frame, and how their motion moves images."""
 
     center: Array  # (3,) [m], ECEF
     low: Array  # (2,) least east and north of its points [m]
@@ -44,7 +44,7 @@ class Ground:
 
     @classmethod
     def of(cls, problem: Problem, state: State, like: Ground | None = None) -> Ground:
-        """Of a problem's points, in the frame of another where one is given."""
+        """Return the ground of a problem's points, in the frame of another one where it is given."""
         points = state.points[problem.structure.point]
         center = np.nanmedian(points, axis=0) if like is None else like.center
         basis = enu_basis(ground_from_ecef(center))
@@ -56,7 +56,7 @@ class Ground:
         return cls(center, like.low, like.high, place, by_ground)
 
     def part(self, rows: IntArray) -> Ground:
-        """Of some observations."""
+        """Return the ground of some observations."""
         return replace(self, place=self.place[:, rows], by_ground=self.by_ground[..., rows])
 
     @cached_property
@@ -65,13 +65,15 @@ class Ground:
         return float(1.0 / np.nanmedian(np.sqrt((self.by_ground[:, :2] ** 2).sum(axis=(0, 1)) / 2.0)))
 
     def cells(self, number: int) -> IntArray:
-        """Which of `number` x `number` cells of the ground an observation's point lies in (K,)."""
+        """Return the cell (K,) of `number` x `number` on the ground in which each observation's point lies."""
         part = (self.place - self.low[:, None]) / np.maximum(self.high - self.low, 1e-9)[:, None]
         row, col = np.nan_to_num(part * number).astype(np.int64).clip(0, number - 1)
         return np.asarray(row * number + col)
 
     def by_moves(self, view: IntArray, views: int) -> Array:
-        """How a pixel east and north in every view but the first (2, 2 N - 2, K) moves its observations (K,) [px]."""
+        """Return the image displacements (2, 2 N - 2, K) [px] of observations by a pixel's move east and
+        north in every view but the first.
+        """
         out = np.zeros((2, 2 * (views - 1), len(view)))
         for v in range(1, views):
             rows = np.flatnonzero(view == v)
@@ -81,7 +83,7 @@ class Ground:
 
 @dataclass(frozen=True)
 class Motion:
-    """What is said of a group of ties that moves."""
+    """Share, place and size of the motion of a group of ties."""
 
     metres: float  # by how much, from one of two views to the other, beside what may be its height
     between: tuple[int, int]
@@ -105,7 +107,7 @@ class Found:
 
 
 def proposal(linear: Linear, ground: Ground, base: Fit, extra: Array, sigma: Array) -> Group | None:
-    """The group that moves, where it is to be begun with; beside what else was found, with its unknowns' prior."""
+    """Return the moving group to start with, beside other explanations, with its unknowns' prior."""
     few = linear.thinned(_FEW)
     by_move, cell = ground.by_moves(linear.view, linear.views), ground.cells(CELLS)
     group = Group(by_move, np.full(by_move.shape[1], _SIGMA), cell, np.full(len(cell), 0.5))
@@ -128,14 +130,14 @@ def proposal(linear: Linear, ground: Ground, base: Fit, extra: Array, sigma: Arr
 
 
 def price(linear: Linear, cell: IntArray) -> float:
-    """What the shares of the cells cost [nats]: each half the logarithm of the tracks that tell of it."""
+    """Return the cost of the shares of the cells [nats]: half the logarithm of the number of tracks of each."""
     first = np.concatenate([tracks.rows[:, 0] for tracks in linear.tracks])
     count = np.bincount(cell[first])
     return float(0.5 * np.log(count[count > 0]).sum())
 
 
 def _first_shares(ground: Ground, rows: BoolArray, right: Array) -> Iterator[Array]:
-    """Probabilities (K,) that tracks move, to start from."""
+    """Yield the probabilities (K,) that tracks move, to start from."""
     cut = np.where(right < 0.5, _LIKELY, 1.0 - _LIKELY)
     if (cut[rows] > 0.5).any():
         yield cut
@@ -155,7 +157,7 @@ def _shares(member: Array, cell: IntArray, rows: BoolArray) -> Array:
 
 
 def group_of(linear: Linear, ground: Ground, group: Group, found: Fit) -> Found:
-    """What a fit with a group says of it."""
+    """Return the motion of a group by a fit with it."""
     rows = np.zeros(len(group.cell), dtype=bool)
     for tracks in linear.tracks:
         rows[tracks.rows] = True
@@ -178,7 +180,7 @@ def group_of(linear: Linear, ground: Ground, group: Group, found: Fit) -> Found:
 
 
 def members(problem: Problem, params: Array, one: Found, block: Block) -> BoolArray:
-    """Which observations (K,) of tracks that took no part are of a group found at cameras of unknowns (N, q)."""
+    """Return the held-out observations (K,) that belong to a group found at cameras of unknowns (N, q)."""
     if not len(block.view):
         return np.zeros(0, dtype=bool)
     part, points = seen_in(problem, params, block)

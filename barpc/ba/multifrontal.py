@@ -34,7 +34,7 @@ class Blocks:
     pair_view: IntArray  # (M, 2) sorted
 
     def plain(self) -> Array:
-        """The matrix (N q, N q) as an array."""
+        """Return the matrix (N q, N q) as an array."""
         n, q, _ = self.diagonal.shape
         i, j = self.pair_view.T
         dense = np.zeros((n, q, n, q))
@@ -44,7 +44,7 @@ class Blocks:
         return dense.reshape(n * q, n * q)
 
     def sparse(self) -> sp.csr_array:
-        """The matrix (N q, N q) as scipy has it."""
+        """Return the matrix (N q, N q) as scipy has it."""
         n, q, _ = self.diagonal.shape
         (i, j), every = self.pair_view.T, np.arange(n)
         row, col = np.concatenate([every, i, j]), np.concatenate([every, j, i])
@@ -54,7 +54,7 @@ class Blocks:
         return sp.csr_array(sp.bsr_array((data, col[order], indptr), shape=(n * q, n * q)))
 
     def pair(self, i: int, j: int) -> int | None:
-        """Where the pair i < j stands; None where the block is zero."""
+        """Return the index of the pair i < j; None where the block is zero."""
         start, stop = np.searchsorted(self.pair_view[:, 0], [i, i + 1])
         at = start + int(np.searchsorted(self.pair_view[start:stop, 1], j))
         return at if at < stop and self.pair_view[at, 1] == j else None
@@ -116,7 +116,7 @@ class Cholesky:
         return pairs[by_front], early[by_front], late[by_front], bounds
 
     def _entries(self, number: int, front: Front) -> tuple[IntArray, IntArray, IntArray, BoolArray]:
-        """Pairs of a front's pivots: which, their rows and columns in it, and whether row, col is j, i."""
+        """Return the pairs of a front's pivots: which, their rows and columns in it, and whether row, col is j, i."""
         pairs, early, late, bounds = self._owned
         part = slice(*bounds[number : number + 2])
         return (
@@ -127,14 +127,14 @@ class Cholesky:
         )
 
     def _local(self, front: Front, views: IntArray) -> IntArray:
-        """Places of views in a front."""
+        """Return the places of views in a front."""
         rank = self.order.rank
         own = rank[views] - rank[front.pivots[0]]
         beyond = len(front.pivots) + np.searchsorted(rank[front.border], rank[views])
         return np.where(own < len(front.pivots), own, beyond)
 
     def factorize(self, damping: float) -> None:
-        """L of the matrix, its diagonal larger by a share `damping` of itself."""
+        """Factorise a matrix, its diagonal larger by a share `damping` of itself."""
         left: dict[int, list[tuple[IntArray, Array]]] = {}
         for number, front in enumerate(self.order.fronts):
             matrix, split = self._assembled(number, front, damping), len(front.pivots) * self._size
@@ -151,7 +151,7 @@ class Cholesky:
                 left.setdefault(front.parent, []).append((front.border, rest))
 
     def _assembled(self, number: int, front: Front, damping: float) -> Array:
-        """The matrix's own part of a front: what its pivots have, the lower triangle."""
+        """Return the matrix's own part of a front: what its pivots have, the lower triangle."""
         q, count = self._size, len(front.pivots) + len(front.border)
         matrix = np.zeros((count, q, count, q))  # its transpose: as LAPACK has it
         diagonal = self.blocks.diagonal[front.pivots]
@@ -165,7 +165,9 @@ class Cholesky:
         return matrix.reshape(count * q, count * q).T
 
     def solve(self, b: Array) -> Array:
-        """Solutions of right-hand sides (n,) or (n, m), n unknowns of the views that are eliminated, as given."""
+        """Return the solutions of right-hand sides (n,) or (n, m), n unknowns of the views that are
+        eliminated, as given.
+        """
         q, rank = self._size, self.order.rank
         chosen = _spread(np.argsort(rank[rank >= 0], kind="stable"), q)
         # rank of the m-th view in use -> place in b
@@ -185,17 +187,17 @@ class Cholesky:
         return out.reshape(b.shape)
 
     def _of(self, number: int) -> tuple[Array, Array]:
-        """L of a front: of its pivots and of its border."""
+        """Return L of a front: of its pivots and of its border."""
         return self.parts[2 * number], self.parts[2 * number + 1]
 
     def _rows(self, front: Front) -> tuple[slice, IntArray]:
-        """Unknowns of a front's pivots and its border, in the order of elimination."""
+        """Return the unknowns of a front's pivots and its border, in the order of elimination."""
         first = int(self.order.rank[front.pivots[0]])
         q = self._size
         return slice(first * q, (first + len(front.pivots)) * q), _spread(self.order.rank[front.border], q)
 
     def inverse(self) -> Blocks:
-        """The inverse's blocks where the matrix has some; zero for views that are not eliminated."""
+        """Return the inverse's blocks where the matrix has some; zero for views that are not eliminated."""
         fronts = self.order.fronts
         out = Blocks(
             np.zeros_like(self.blocks.diagonal), np.zeros_like(self.blocks.pairs), self.blocks.pair_view
@@ -215,7 +217,7 @@ class Cholesky:
         return out
 
     def _inverse_of(self, number: int, front: Front, known: dict[int, Array]) -> Array:
-        """The inverse's part (m q, m q) of a front, by that of its parent."""
+        """Return the inverse's part (m q, m q) of a front, by that of its parent."""
         (upper, lower), split = self._of(number), len(front.pivots) * self._size
         found, failed = dpotri(upper, lower=1)
         if failed:
@@ -245,7 +247,7 @@ class Cholesky:
 
 
 def _spread(index: IntArray, size: int) -> IntArray:
-    """Unknowns of views."""
+    """Return the unknowns of views."""
     return np.asarray((index[:, None] * size + np.arange(size)).ravel())
 
 

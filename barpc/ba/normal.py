@@ -37,7 +37,7 @@ class Common:
     half: Array  # (m,) U^-T times their gradient
 
     def step(self, step: Array) -> Array:
-        """The move of the errors (m,) that goes with a step (N q,) of the camera unknowns."""
+        """Return the move of the errors (m,) that goes with a step (N q,) of the camera unknowns."""
         return -la.solve_triangular(self.upper, self.half + self.by_camera @ step)
 
 
@@ -57,14 +57,14 @@ class Reduced:
     common: Common | None = None  # errors that the points have in common
 
     def plain(self, free: BoolArray) -> Array:
-        """S (n, n) as an array, of the unknowns that are free (N q,)."""
+        """Return S (n, n) as an array, of the unknowns that are free (N q,)."""
         dense = self.matrix if isinstance(self.matrix, np.ndarray) else self.matrix.plain()
         if self.common is not None and dense is not self.matrix:
             dense -= self.common.by_camera.T @ self.common.by_camera
         return dense if free.all() else dense[np.ix_(free, free)]
 
     def of_views(self) -> Array:
-        """The blocks (N, q, q) on S's diagonal."""
+        """Return the blocks (N, q, q) on S's diagonal."""
         if not isinstance(self.matrix, np.ndarray):
             if self.common is None:
                 return self.matrix.diagonal
@@ -74,7 +74,7 @@ class Reduced:
         return np.asarray(self.matrix.reshape(n, q, n, q)[every, :, every, :])
 
     def factor(self, free: BoolArray, damping: float = 0.0) -> Factor:
-        """The factorised S, of the unknowns that are free (N q,): those of whole views."""
+        """Return the factorised S, of the unknowns that are free (N q,): those of whole views."""
         if isinstance(self.matrix, np.ndarray):
             return factorize(self.plain(free), damping)
         order = self.structure.order(free[:: self.cross.shape[2]])
@@ -82,7 +82,7 @@ class Reduced:
         return factorize_blocks(self.matrix, order, damping, less)
 
     def with_joint(self, index: IntArray, information: Array) -> Matrix:
-        """S and the information (n, n) of unknowns `index` (n,), which are those of views that are joined."""
+        """Return S and the information (n, n) of unknowns `index` (n,), which are those of views that are joined."""
         if isinstance(self.matrix, np.ndarray):
             matrix = self.matrix.copy()
             matrix[np.ix_(index, index)] += information
@@ -99,7 +99,7 @@ class Reduced:
         return Blocks(diagonal, pairs, self.structure.pair_view)
 
     def point_step(self, step: Array) -> Array:
-        """The move of the points (P, 3) [m] that goes with a step (N, q) of the camera unknowns."""
+        """Return the move of the points (P, 3) [m] that goes with a step (N, q) of the camera unknowns."""
         structure = self.structure
         moved = np.empty((3, len(self.cross)))
         for v, (start, stop) in enumerate(zip(structure.bounds[:-1], structure.bounds[1:], strict=True)):
@@ -151,7 +151,9 @@ def reduce_normal(
 
 
 def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, cross: Array) -> Common:
-    """Common errors of the points of a prior; their gradient vanishes before the points move, as they are the best."""
+    """Return the common errors of the points of a prior; their gradient vanishes before the points move, as
+    they are the best.
+    """
     index, m = prior.index, prior.common.shape[2]
     by_point = np.swapaxes(prior.rows, 1, 2) @ -prior.common
     whitened = np.stack([solve_lower(lower[:, index], by_point[:, :, j].T).T for j in range(m)], axis=2)
@@ -177,7 +179,7 @@ def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, 
 
 
 def point_products(by_point: Array, residual: Array) -> Array:
-    """(9, K): the six elements of A^T A (order of `TRIANGLE`) and the three of A^T r."""
+    """Return the products (9, K): the six elements of A^T A (order of `TRIANGLE`) and the three of A^T r."""
     products = np.empty((9, residual.shape[1]))
     for part in parts(residual.shape[1], CHUNK):
         (a, b), r = by_point[..., part], residual[:, part]
@@ -188,7 +190,7 @@ def point_products(by_point: Array, residual: Array) -> Array:
 
 
 def cholesky3(matrix: Array) -> Array:
-    """Lower Cholesky factors (6, P) of symmetric 3x3 matrices, elements 00, 10, 20, 11, 21, 22.
+    """Return the lower Cholesky factors (6, P) of symmetric 3x3 matrices, elements 00, 10, 20, 11, 21, 22.
 
     A direction without information gets a factor of one metre's worth, so that it does not move.
     """
@@ -205,7 +207,7 @@ def cholesky3(matrix: Array) -> Array:
 
 
 def solve_lower(lower: Array, rhs: Array) -> Array:
-    """L^-1 b for factors (6, P) and right-hand sides (3, P)."""
+    """Return L^-1 b for factors (6, P) and right-hand sides (3, P)."""
     l00, l10, l20, l11, l21, l22 = lower
     x = rhs[0] / l00
     y = (rhs[1] - l10 * x) / l11
@@ -213,7 +215,7 @@ def solve_lower(lower: Array, rhs: Array) -> Array:
 
 
 def solve_transposed(lower: Array, rhs: Array) -> Array:
-    """L^-T b for factors (6, P) and right-hand sides (3, P)."""
+    """Return L^-T b for factors (6, P) and right-hand sides (3, P)."""
     l00, l10, l20, l11, l21, l22 = lower
     z = rhs[2] / l22
     y = (rhs[1] - l21 * z) / l11
@@ -221,7 +223,7 @@ def solve_transposed(lower: Array, rhs: Array) -> Array:
 
 
 def _eliminate(structure: Structure, by_point: Array, by_unknown: Array, lower: Array) -> Array:
-    """Y (K, 3, q)."""
+    """Return Y (K, 3, q), the whitened coupling of points and cameras."""
     q, count = by_unknown.shape[1:]
     cross = np.empty((count, 3, q))
     for part in parts(count, CHUNK):
@@ -235,7 +237,7 @@ def _eliminate(structure: Structure, by_point: Array, by_unknown: Array, lower: 
 
 
 def whiten(by_point: Array, lower: Array) -> Array:
-    """A L^-T, (2, 3, n), of derivatives (2, 3, n) and factors (6, n)."""
+    """Return a L^-T, (2, 3, n), of derivatives (2, 3, n) and factors (6, n)."""
     l00, l10, l20, l11, l21, l22 = lower
     out = np.empty_like(by_point)
     np.divide(by_point[:, 0], l00, out=out[:, 0])
@@ -247,7 +249,7 @@ def whiten(by_point: Array, lower: Array) -> Array:
 def _of_views(
     structure: Structure, residual: Array, by_unknown: Array, cross: Array, half: Array
 ) -> tuple[Array, Array]:
-    """Sum B^T B - sum Y^T Y (N, q, q) and sum B^T r - sum Y^T h (N, q) of every view."""
+    """Return the sum B^T B - sum Y^T Y (N, q, q) and sum B^T r - sum Y^T h (N, q) of every view."""
     q = cross.shape[2]
     matrix, gradient = np.empty((structure.num_views, q, q)), np.empty((structure.num_views, q))
     of_points = np.ascontiguousarray(half.T)
@@ -261,7 +263,7 @@ def _of_views(
 
 
 def _pair_blocks(structure: Structure, cross: Array) -> Array:
-    """(M, q, q): -sum Y_i^T Y_j of every pair of views."""
+    """Return (M, q, q): -sum Y_i^T Y_j of every pair of views."""
     q = cross.shape[2]
     bounds = structure.pair_bounds
     out = np.empty((len(bounds) - 1, q, q))

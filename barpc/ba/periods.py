@@ -39,14 +39,15 @@ class Swing:
 
 
 def price(rows: float, views: int) -> float:
-    """What the choice of a period, in images of so many rows, and of a view costs [nats]."""
+    """Return the cost of choosing a period, in images of so many rows, and a view [nats]."""
     return float(np.log(max(_INDEPENDENT * rows / _SHORTEST, 1.0) * views))
 
 
 def swings(
     view: IntArray, row: Array, size: Array, right: Array, off: Array, least: float = SURE
 ) -> list[Swing]:
-    """The period that stands out most in every view, the best first; none that gains less than `least` [nats].
+    """Find the period that stands out most in every view, the best first; none that gains less than `least`
+    [nats].
 
     Parameters
     ----------
@@ -79,7 +80,9 @@ class _Rows:
         self.first = int(np.ceil(_FINE * _FEWEST))
 
     def largest(self, costs: float) -> tuple[float, float] | None:
-        """Period, and minus the logarithm of how probable such a peak is at one frequency; None where it is `costs`."""
+        """Return the period, and minus the logarithm of how probable such a peak is at one frequency; None
+        where it is `costs`.
+        """
         coarse = self._spectrum(self.off, _COARSE)[int(_COARSE * _FEWEST) :]
         if not len(coarse) or _worth(coarse.max() / _SEEN) <= costs:
             return None
@@ -96,7 +99,7 @@ class _Rows:
         return best
 
     def _spectrum(self, off: Array, fine: int = _FINE) -> Array:
-        """Half the chi-square that a cosine and a sine of both coordinates take away, by frequency."""
+        """Return the half the chi-square that a cosine and a sine of both coordinates take away, by frequency."""
         right, last = self.right, int(fine * self.last)
         centred = (off - (off @ right / right.sum())[:, None]) * right
         spread = centred @ centred.T / right.sum()  # what noise leaves of it once points have followed
@@ -115,7 +118,7 @@ class _Rows:
         return np.asarray(0.5 * gain / determinant)
 
     def _level(self, k: int, period: float) -> float:
-        """How much more than noise there is beside a peak once that is taken away: at least 1."""
+        """Return the level of the spectrum beside a peak over that of noise, the peak taken away: at least 1."""
         basis = np.vstack([np.ones(len(self.row)), swing(self.row, np.array(period))])
         weighted = basis * self.right
         gain = self._spectrum(
@@ -128,12 +131,12 @@ class _Rows:
 
 
 def _worth(gain: float) -> float:
-    """Minus the logarithm of how probable it is that noise takes away as much at one frequency."""
+    """Return minus the logarithm of the probability that noise takes away as much at one frequency."""
     return float(gain - np.log1p(gain))
 
 
 def _vertex(gain: Array, k: int) -> float:
-    """Where a parabola through a peak and its neighbours has its own, from the peak."""
+    """Return the offset of the vertex of a parabola through a peak and its neighbours."""
     if not 0 < k < len(gain) - 1:
         return 0.0
     bend = gain[k - 1] - 2.0 * gain[k] + gain[k + 1]

@@ -31,7 +31,7 @@ _LINE = 0.5  # of the larger spread: a smaller one is that of epipolar lines, wh
 
 @dataclass(frozen=True)
 class Place:
-    """Rows, columns or a cell of an image that is met worse than the rest of it."""
+    """Rows, columns or a cell of an image in which held-out tie points are met worse than in the rest."""
 
     view: int
     columns: tuple[float, float] | None  # from, to [px]; None: all
@@ -44,7 +44,7 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Unused:
-    """Observations of tie points that took no part."""
+    """Held-out observations of tie points."""
 
     view: IntArray  # (K,)
     xy: Array  # (2, K) where they are [px]
@@ -52,12 +52,13 @@ class Unused:
     deviation: Array  # (K,) that residuals have [px]
 
     def part(self, rows: BoolArray | IntArray) -> Unused:
-        """Some of them."""
+        """Return some of the held-out observations."""
         return Unused(self.view[rows], self.xy[:, rows], self.residual[:, rows], self.deviation[rows])
 
 
 def met_worse(unused: Unused, size: Array, limit: float, least: float, share: float) -> list[Place]:
-    """The place of every image that is met worst beside the rest of it, where chance hardly leaves as much.
+    """Find the place of every image in which held-out tie points are met worst, where chance is unlikely to
+    explain it.
 
     Parameters
     ----------
@@ -65,7 +66,7 @@ def met_worse(unused: Unused, size: Array, limit: float, least: float, share: fl
     size : (2, N), of the images [px]
     limit : float, standard deviations from which on an observation is far off
     least, share : float
-        What near ones may have in common [px], and the part of a place that may be far off: no more is named.
+        Tolerances: displacement that near ones may have in common [px], share of a place that may be far off.
     """
     whole = [_thinned(unused.part(unused.view == v), size[:, v]) for v in range(size.shape[1])]
     whole = [one for one in whole if len(one.view) >= _FEWEST]
@@ -76,7 +77,7 @@ def met_worse(unused: Unused, size: Array, limit: float, least: float, share: fl
 
 
 def _places() -> IntArray:
-    """(4, P) of every place parts of the columns, and which, parts of the rows, and which; one part is all."""
+    """Return (4, P) of every place parts of the columns, and which, parts of the rows, and which; one part is all."""
     halved = [2**n for n in range(1, _FINEST.bit_length())]
     lines = [(n, k, 1, 0) for n in halved for k in range(n)]
     cells = [(n, k % n, n, k // n) for n in halved if n <= _CELLS for k in range(n * n)]
@@ -87,7 +88,7 @@ _PLACES = _places()
 
 
 def _held() -> BoolArray:
-    """(P, C) which places hold which of the smallest parts of an image."""
+    """Return (P, C) which places hold which of the smallest parts of an image."""
     columns, k, rows, n = _PLACES[:, :, None]
     row, col = np.divmod(np.arange(_FINEST**2), _FINEST)
     return np.asarray((col * columns // _FINEST == k) & (row * rows // _FINEST == n))
@@ -97,18 +98,20 @@ _HELD = _held()
 
 
 def _part(unused: Unused, size: Array) -> IntArray:
-    """(2, K) of so many columns and rows of an image, which."""
+    """Return (2, K) of so many columns and rows of an image, which."""
     return np.clip(unused.xy / size[:, None] * _FINEST, 0, _FINEST - 1).astype(np.int64)
 
 
 def _thinned(unused: Unused, size: Array) -> Unused:
-    """One observation, the first, of every small part of an image."""
+    """Return one observation, the first, of every small part of an image."""
     col, row = _part(unused, size)
     return unused.part(np.unique(row * _FINEST + col, return_index=True)[1])
 
 
 def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -> Place | None:
-    """The place of one image of which chance leaves least, not yet times the places; None where none stands out."""
+    """Return the place of one image of which chance leaves least, not yet times the places; None where none
+    stands out.
+    """
     col, row = _part(one, size)
     inside = _HELD[:, row * _FINEST + col]
     count = inside.sum(axis=1)
@@ -153,7 +156,9 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
 
 
 def _at_least(found: int, count: int, alike: int, whole: int) -> float:
-    """Probability that of so many that are alike in a whole at least the found are among a count (hypergeometric)."""
+    """Return the probability that of so many that are alike in a whole at least the found are among a count
+    (hypergeometric).
+    """
     k = np.arange(found, min(count, alike) + 1)
 
     def ways(n: int, m: IntArray | int) -> Array:
@@ -163,21 +168,23 @@ def _at_least(found: int, count: int, alike: int, whole: int) -> float:
 
 
 def _axes(standard: Array) -> tuple[Array, Array]:
-    """Along which residuals (2, K) scatter most and least, as columns, and how much; of two views along one line."""
+    """Return the axes along which residuals (2, K) scatter most and least, as columns, and their scatter; of
+    two views along one line.
+    """
     off = standard - standard.mean(axis=1, keepdims=True)
     variance, axes = np.linalg.eigh(off @ off.T / standard.shape[1])
     return axes[:, ::-1], np.sqrt(np.maximum(variance[::-1], 0.0))
 
 
 def _cells(near: BoolArray, col: IntArray, row: IntArray) -> Array:
-    """In which part of the image each near observation lies (K, C), 1 or 0."""
+    """Return the part of the image in which each near observation lies (K, C), 1 or 0."""
     parts = int(np.clip(np.sqrt(near.sum() / _TELLING), 1, _PARTS))
     cell = row * parts // _FINEST * parts + col * parts // _FINEST
     return np.asarray((cell[:, None] == np.arange(parts**2)) * near[:, None].astype(np.float64))
 
 
 def _variances(along: Array, of_near: Array, mean: Array, cells: Array) -> Array:
-    """Variance (P, 2) of the mean of each place about zero, once its own is taken off it.
+    """Return the variance (P, 2) of the mean of each place about zero, its own part taken off.
 
     By how much observations scatter in each part of the image, where that is more than in the whole.
     """

@@ -30,7 +30,7 @@ _SURFACES = 110.0  # m: no geoid lies farther from the ellipsoid, so no mistaken
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A view whose camera was found alone."""
+    """A view whose camera was estimated alone against known points."""
 
     params: Array  # (q,)
     covariance: Array  # (q, q) with the points as they are
@@ -46,15 +46,16 @@ class Placed:
         return self.noise < MUCH_NOISE
 
     def agree(self, limit: float) -> BoolArray:
-        """Which of its observations (n,) are no farther off than so many standard deviations."""
+        """Return the observations (n,) within a number of standard deviations."""
         return np.asarray(self.squared <= 2.0 * limit * limit)
 
     def contradicted(self, limit: float) -> float:
-        """Share of its observations farther off than so many standard deviations, whatever its rows do."""
+        """Return the share of observations beyond a number of standard deviations, rows wandering allowed."""
         return float(self._far(limit).mean())
 
     def is_coherent(self, limit: float) -> bool:
-        """Whether observations farther off than that are off as their neighbours are: a camera is wrong, not matches.
+        """Return whether observations beyond that are displaced like their neighbours: the camera is wrong,
+        not the matches.
 
         Errors that know nothing of each other differ by 1.4 times what they are.
         """
@@ -75,7 +76,8 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What makes a view's RPC as good as stated: it is, or nothing, or an offset, other heights, its axes swapped.
+    """What would make a view's RPC as good as stated: nothing needed, nothing found, an offset, other
+    heights, swapped axes.
 
     Where it is, and more than half of its tie points contradict the others', these may be wrong as well as it.
     """
@@ -87,14 +89,15 @@ class Look:
 
 
 def known_points(found: Solution, block: Block) -> BoolArray:
-    """Tracks (P,) of which two observations or more were kept."""
+    """Return the tracks (P,) with two or more observations kept."""
     kept = np.bincount(block.point[found.outcome.inlier], minlength=block.num_points) >= 2
     kept[block.num_tracks :] = False
     return kept
 
 
 def place(found: Solution, others: Block, block: Block, view: int) -> Placed | None:
-    """A view of a block placed against the points of a solution of the `others`; None with too few of them.
+    """Estimate the camera of a view alone against the points of a solution of the `others`; None with too few
+    of them.
 
     Its camera is as good as free. Residuals are judged by the others' noise and what their points are known to.
     """
@@ -111,7 +114,7 @@ def place(found: Solution, others: Block, block: Block, view: int) -> Placed | N
 
 
 def median_noise(squared: Array) -> float:
-    """Observed over expected standard deviation, by the median of squares (n,) of two coordinates each."""
+    """Return the observed over expected standard deviation, by the median of squares (n,) of two coordinates each."""
     return float(np.sqrt(np.median(squared) / _MEDIAN))
 
 
@@ -133,11 +136,12 @@ class _Sight:
         self.covariance += ((block.sigma[rows] * noise) ** 2)[:, None, None] * np.eye(2)
 
     def project(self, params: Array) -> Projected:
-        """Where cameras of unknowns (N, q) see the points, with derivatives."""
+        """Project the points through cameras of unknowns (N, q), with derivatives."""
         return self.cameras.project(params, self.ecef, self.bounds)
 
     def fit(self, splines: Array | None = None) -> tuple[Array, Array, Array]:
-        """The view's unknowns (q,), their covariance, and residuals (2, n) over their standard deviations.
+        """Return the view's unknowns (q,), their covariance, and residuals (2, n) over their standard
+        deviations.
 
         Robust, as rounds are (`barpc.ba.rounds`): beside them splines (m, n) move columns and rows.
         """
@@ -174,7 +178,7 @@ class _Sight:
 
 
 def look(found: Solution, block: Block, placed: Placed, view: int) -> Look:
-    """What a view's RPC looks like: as good as stated with one thing changed.
+    """Find the one change with which a view's RPC is as good as stated.
 
     Each is asked of the delivered camera at the points of the others: half of these are then met to what the camera is
     stated to be known to.
@@ -205,6 +209,6 @@ def look(found: Solution, block: Block, placed: Placed, view: int) -> Look:
 
 
 def _half(off: Array) -> float:
-    """What half of the offsets (2, n) [px] are shorter than; infinity for what is none."""
+    """Return the median length of the offsets (2, n) [px]; infinity for an offset that is none."""
     length = np.linalg.norm(off, axis=0)
     return float(np.median(np.where(np.isfinite(length), length, np.inf)))

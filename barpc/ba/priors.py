@@ -34,11 +34,11 @@ class CameraPrior:
     sigma: Array  # (N, q)
 
     def residual(self, params: Array) -> Array:
-        """Whitened residuals (N, q) of unknowns (N, q)."""
+        """Return the whitened residuals (N, q) of unknowns (N, q)."""
         return (params - self.mean) / self.sigma
 
     def jacobian(self) -> Array:
-        """Diagonal of the derivative (N, q)."""
+        """Return the diagonal of the derivative (N, q)."""
         return 1.0 / self.sigma
 
 
@@ -61,11 +61,11 @@ class JointPrior:
     scene: EarlierScene | None = None  # that these views knew; None: not known
 
     def residual(self, params: Array) -> Array:
-        """Whitened residuals (n,) of unknowns (N, q)."""
+        """Return the whitened residuals (n,) of unknowns (N, q)."""
         return self.root @ (params.ravel()[self.index] - self.mean)
 
     def jacobian(self) -> Array:
-        """Derivative (n, n) by the unknowns `index`."""
+        """Return the derivative (n, n) by the unknowns `index`."""
         return self.root
 
 
@@ -83,51 +83,53 @@ class PointPrior:
     common: Array
 
     def offset(self, points: Array) -> Array:
-        """The common errors (m,) that points (P, 3) [m] show, in their standard deviations."""
+        """Estimate the common errors (m,) of points (P, 3) [m], in their standard deviations."""
         whitened = self.apart(points)
         return np.linalg.solve(self.information(), np.einsum("qim,qi->m", self.common, whitened))
 
     def residual(self, points: Array) -> Array:
-        """Whitened residuals (Q, 3) of points (P, 3) [m], the common errors taken away."""
+        """Return the whitened residuals (Q, 3) of points (P, 3) [m], the common errors taken away."""
         return self.apart(points) - self.common @ self.offset(points)
 
     def cost(self, points: Array) -> float:
-        """Sum of the squared residuals, with the common errors' own."""
+        """Return the sum of the squared residuals, with the common errors' own."""
         return float((self.residual(points) ** 2).sum() + (self.offset(points) ** 2).sum())
 
     def information(self) -> Array:
-        """Information (m, m) on the common errors where the points are known."""
+        """Return the information (m, m) on the common errors where the points are known."""
         information: Array = np.einsum("qim,qin->mn", self.common, self.common)
         information += np.eye(len(information))
         return information
 
     def select(self, keep: BoolArray) -> PointPrior:
-        """Some of its rows (Q,)."""
+        """Return the prior on some of its rows (Q,)."""
         return PointPrior(self.index[keep], self.mean[keep], self.rows[keep], self.common[keep])
 
     def apart(self, points: Array) -> Array:
-        """Whitened offsets (Q, 3) of points (P, 3) [m], the common errors still in them."""
+        """Return the whitened offsets (Q, 3) of points (P, 3) [m] with the common errors still in them."""
         return (self.rows @ (points[self.index] - self.mean)[..., None])[..., 0]
 
     def jacobian(self) -> Array:
-        """Derivatives (Q, 3, 3) by the points `index` [1/m]."""
+        """Return the derivatives (Q, 3, 3) by the points `index` [1/m]."""
         return self.rows
 
 
 def stated_accuracy(view: View) -> float:
-    """Horizontal accuracy of a view as delivered [m]: what its RPC states where usable, else 7.5 m."""
+    """Return the horizontal accuracy of a view as delivered [m]: what its RPC states where usable, else 7.5 m."""
     stated = view.sensor.err_bias if isinstance(view.sensor, RPC) else None
     return stated if stated is not None and states_accuracy(view) else DEFAULT_ACCURACY
 
 
 def states_accuracy(view: View) -> bool:
-    """Whether a view's RPC states a usable accuracy."""
+    """Return whether a view's RPC states a usable accuracy."""
     stated = view.sensor.err_bias if isinstance(view.sensor, RPC) else None
     return stated is not None and stated > USABLE_ACCURACY
 
 
 def _stated(view: View) -> tuple[float, float]:
-    """What a view states for its attitude, as metres on the ground, and position, or for its two clocks [m]."""
+    """Return the stated accuracies of a view's attitude (metres on the ground) and position, or of its two
+    clocks [m].
+    """
     sensor = view.sensor
     if (isinstance(sensor, Pushbroom) or is_clocked(sensor)) and sensor.accuracy is not None:
         attitude, position = sensor.accuracy
@@ -138,7 +140,7 @@ def _stated(view: View) -> tuple[float, float]:
 def prior_sigmas(
     views: tuple[View, ...], options: AdjustOptions, drift: int, off: Array | None = None, waves: int = 0
 ) -> Array:
-    """Prior standard deviations (N, q) of every view's unknowns, in the unknowns' units (m or px).
+    """Return the prior standard deviations (N, q) of every view's unknowns, in the unknowns' units (m or px).
 
     A view that is known to be `off` (N,) [m] by more than it states is not held to that.
     """

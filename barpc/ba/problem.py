@@ -40,25 +40,25 @@ class Problem:
     _room: list[Projected] = field(default_factory=list, repr=False)
 
     def residuals(self, params: Array, points: Array) -> Array:
-        """Projected - observed (2, K) [px], sorted by view."""
+        """Return the residuals, projected - observed (2, K) [px], sorted by view."""
         structure = self.structure
         ecef = structure.of_points(points)
         return self.cameras.project(params, ecef, structure.bounds, "image").image - self.xy
 
     def prior_cost(self, params: Array, points: Array) -> float:
-        """Sum of the squared residuals of all priors."""
+        """Return the sum of the squared residuals of all priors."""
         cost = float((self.camera_prior.residual(params) ** 2).sum())
         if self.joint_prior is not None:
             cost += float((self.joint_prior.residual(params) ** 2).sum())
         return cost if self.point_prior is None else cost + self.point_prior.cost(points)
 
     def cost(self, params: Array, points: Array, whitened: Array) -> float:
-        """The whole sum of squares, of whitened residuals (2, K) and the priors'."""
+        """Return the whole sum of squares, of whitened residuals (2, K) and the priors'."""
         flat = whitened.ravel()
         return float(flat @ flat) + self.prior_cost(params, points)
 
     def linearise(self, params: Array, points: Array) -> Projected:
-        """Image points with all derivatives, for `reduce`; the next call may write over them."""
+        """Project all points with derivatives, for `reduce`; the next call may write over them."""
         structure, out = self.structure, None
         if self.xy.shape[1] <= _KEPT:
             if not self._room:
@@ -67,7 +67,7 @@ class Problem:
         return self.cameras.project(params, structure.of_points(points), structure.bounds, out=out)
 
     def prepare(self, params: Array, points: Array) -> tuple[Array, Projected | None]:
-        """Residuals (2, K) [px], and `linearise` unless it is too much to keep until `reduce` uses it up."""
+        """Return the residuals (2, K) [px], and what `linearise` gives unless it is too large to keep for `reduce`."""
         if self.xy.shape[1] > _KEPT:
             return self.residuals(params, points), None
         projected = self.linearise(params, points)
@@ -102,12 +102,12 @@ class Problem:
         return self._add_joint(reduced, params)
 
     def project_points(self, params: Array, points: Array) -> Projected:
-        """Image points and their derivative by the points, for `triangulate`."""
+        """Return the image points and their derivative by the points, for `triangulate`."""
         structure = self.structure
         return self.cameras.project(params, structure.of_points(points), structure.bounds, "points")
 
     def triangulate(self, points: Array, projected: Projected, weight: Array) -> Array:
-        """One Gauss-Newton step of all points (P, 3) [m] with the cameras held."""
+        """Move all points (P, 3) [m] by one Gauss-Newton step with the cameras held."""
         residual = (projected.image - self.xy) * weight
         matrix, gradient = self.point_terms(points)
         sums = self.structure.sum_points(point_products(projected.by_point * weight, residual))
@@ -116,7 +116,7 @@ class Problem:
         return points - step.T
 
     def settling(self, projected: Projected, weight: Array) -> Callable[[Array], Array]:
-        """Residuals (2, K) [px] -> the same once the points have moved to where they are smallest, to first order."""
+        """Return a function that takes residuals (2, K) [px] to those after the points have settled, to first order."""
         structure, by_point = self.structure, projected.by_point
         sums = structure.sum_points(point_products(by_point * weight, np.zeros_like(projected.image))[:6])
         whitened = whiten(by_point, cholesky3(sums).take(structure.point, axis=1))
@@ -130,7 +130,7 @@ class Problem:
         return settled
 
     def point_terms(self, points: Array) -> tuple[Array, Array]:
-        """What the priors add to the points' normal matrices (6, P) and gradients (3, P)."""
+        """Return what the priors add to the points' normal matrices (6, P) and gradients (3, P)."""
         matrix, gradient = np.zeros((6, len(points))), np.zeros((3, len(points)))
         prior = self.point_prior
         if prior is not None:

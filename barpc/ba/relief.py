@@ -55,7 +55,7 @@ class Bands:
 
     @classmethod
     def of(cls, terrain: Terrain, ground: Array) -> Bands:
-        """The bands over ground points (n, 3)."""
+        """Split a DEM into bands of scales over ground points (n, 3)."""
         from scipy.ndimage import gaussian_filter  # a tenth of a second, of blocks with a DEM alone
 
         lon = wrap_longitude(ground[:, 0], ground[0, 0])
@@ -86,12 +86,14 @@ class Bands:
         return cls(terrain, origin, unit, step, tuple(smoothed))
 
     def local(self, ground: Array) -> Array:
-        """Metres east and north (n, 2) of the first node of ground points (n, 3)."""
+        """Return the positions (n, 2) [m] east and north of the first node, of ground points (n, 3)."""
         lon = wrap_longitude(ground[:, 0], self.origin[0])
         return np.asarray((np.column_stack([lon, ground[:, 1]]) - self.origin) * self.unit)
 
     def at(self, ground: Array) -> tuple[Array, Array]:
-        """Heights (K, n) [m] of the bands at ground points (n, 3), which add up to the DEM's; slopes (K, n, 2)."""
+        """Return the heights (K, n) [m] of the bands at ground points (n, 3), which add up to the DEM's;
+        slopes (K, n, 2).
+        """
         heights = [np.asarray(self.terrain(ground[:, 0], ground[:, 1]), dtype=np.float64)]
         slopes = [np.nan_to_num(terrain_slopes(self.terrain, ground))]
         at = self.local(ground).T[::-1] / self.step
@@ -109,7 +111,7 @@ def _sampled(layer: Array, at: Array) -> Array:
 
 
 def terrain_slopes(terrain: Terrain, ground: Array) -> Array:
-    """Slopes (n, 2) of a terrain towards east and north at ground points (n, 3); NaN where it is unknown."""
+    """Return the slopes (n, 2) of a terrain towards east and north at ground points (n, 3); NaN where it is unknown."""
     step = SLOPE_STEP / metres_per_unit(ground)[:, :2]
     lon, lat = ground[:, 0], ground[:, 1]
     east = terrain(lon + step[:, 0], lat) - terrain(lon - step[:, 0], lat)
@@ -118,12 +120,12 @@ def terrain_slopes(terrain: Terrain, ground: Array) -> Array:
 
 
 def _differences(layers: Array) -> Array:
-    """Bands (K, ...) of layers (K, ...), each without the next, which is smoother."""
+    """Return the bands (K, ...) of layers (K, ...): each minus the next, which is smoother."""
     return np.concatenate([layers[:-1] - layers[1:], layers[-1:]])
 
 
 def bends(at: Array) -> Array:
-    """Level, slopes and bends (n, `NUM_BENDS`) of a surface at places (n, 2)."""
+    """Return the level, slopes and bends (n, `NUM_BENDS`) of a surface at places (n, 2)."""
     x, y = at.T
     return np.column_stack(
         [x ** (n - j) * y**j for n in range(DEGREE + 1) for j in range(n + 1)]  # level, x, y, x^2, ...
@@ -131,7 +133,7 @@ def bends(at: Array) -> Array:
 
 
 def _bend_slopes(at: Array) -> Array:
-    """Derivatives (n, `NUM_BENDS`, 2) of `bends` by the places."""
+    """Return the derivatives (n, `NUM_BENDS`, 2) of `bends` by the places."""
     x, y = at.T
     terms = [(n - j, j) for n in range(DEGREE + 1) for j in range(n + 1)]
     by_x = [i * x ** max(i - 1, 0) * y**j for i, j in terms]
@@ -141,7 +143,7 @@ def _bend_slopes(at: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Believed:
-    """What is believed of a DEM at n points."""
+    """Heights and slopes that are believed of a DEM at n points."""
 
     alt: (
         Array  # (n,) altitudes to hold the points to [m]; NaN where the DEM has none, or they are far from it
@@ -171,11 +173,15 @@ class Relief:
     cameras: Array  # (3,) what the cameras' accuracies let expect of that [m]; NaN where they do not say
 
     def beyond(self, bias: float) -> Array:
-        """How far from the DEM they lie as delivered (3,), over what cameras and a DEM wrong by `bias` [m] allow."""
+        """Return level and slopes (3,) of the points above the DEM as delivered, over what cameras and a DEM
+        wrong by `bias` [m] allow.
+        """
         return np.asarray(np.abs(self.delivered) / np.hypot(self.cameras, bias))
 
     def common_sigma(self, bias: float) -> Array:
-        """What all heights may be wrong by (`NUM_BENDS`,) [m] at the scene's edges: `bias`, and what contradicts it."""
+        """Return the standard deviations (`NUM_BENDS`,) [m] of errors that all heights share: `bias`, or more
+        where the points contradict it.
+        """
         sigma = np.full(NUM_BENDS, bias)
         contradicts = self.beyond(bias) > BEYOND
         sigma[:3][contradicts] = _EDGE * np.abs(self.delivered)[contradicts]
@@ -185,7 +191,8 @@ class Relief:
     def of(
         cls, terrain: Terrain, ground: Array, strong: BoolArray, sharp: Array, stated: float = 0.0
     ) -> Relief:
-        """Of points (P, 3) where rays put them; heights of those that are `strong` (P,) are known to `sharp` (P,) [m].
+        """Compare a DEM with points (P, 3) by rays alone; heights of the `strong` (P,) ones are known to
+        `sharp` (P,) [m].
 
         Those tell that are known better than single heights of the DEM are, as `stated` [m] or as they lie to it.
         Rises are measured at the RMS distance of the points from their middle.
@@ -211,7 +218,8 @@ class Relief:
 
 
 def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Believed | None:
-    """What is believed of a DEM at the points `index` (n,), at (n, 3); None where too few heights tell.
+    """Estimate what to believe of a DEM at the points `index` (n,), at (n, 3); None where too few heights
+    tell.
 
     Single altitudes are stated to be known to `stated` [m]. Points that tell are held where they are, less what a
     motion or a bend of the scene explains of their distance: what else they have is the DEM's error, and no ray is
@@ -268,7 +276,8 @@ class _Compared:
 def _compared(
     at: Array, above: Array, bent: Array, slopes: Array, smooth: Array, tell: BoolArray
 ) -> _Compared:
-    """Heights (n,) [m] of points that `tell` (n,) by bands (n, K) of slopes (K, n, 2), a motion and a bend (n, m).
+    """Return the heights (n,) [m] of points that `tell` (n,) by bands (n, K) of slopes (K, n, 2), a motion
+    and a bend (n, m).
 
     Where hills are too few to be told from what errors happen to be, no slope is believed.
     """
@@ -296,7 +305,7 @@ def _compared(
 
 
 def _middling(values: Array) -> BoolArray:
-    """Which of n values lie about their median."""
+    """Return the mask of n values about their median."""
     off = np.abs(values - np.median(values))
     return np.asarray(off <= _FAR * 1.4826 * np.median(off))
 
@@ -306,7 +315,8 @@ def _coefficients(design: Array, values: Array) -> Array:
 
 
 def _summed(at: Array, pull: Array) -> float:
-    """How many points at places (n, 2) are worth one, by their pulls (n, 2) to the east and north.
+    """Return the number of points at places (n, 2) that are worth one, by their pulls (n, 2) to the east and
+    north.
 
     Squared sums over cells against those of independent pulls, at the size of cells at which they are largest.
     """
@@ -320,7 +330,7 @@ def _summed(at: Array, pull: Array) -> float:
 
 
 def _shown(relief: Array, above: Array, smooth: Array, stated: float) -> tuple[float, bool]:
-    """A DEM's relief (n,) as a multiple of that of the tie points (n,) [m], and whether it may be theirs."""
+    """Return a DEM's relief (n,) as a multiple of that of the tie points (n,) [m], and whether it may be theirs."""
     seen = above - smooth @ _coefficients(smooth, above)
     size = max(float(seen @ seen), 1e-12)
     times = float(relief @ seen) / size

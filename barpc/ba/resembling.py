@@ -20,7 +20,7 @@ _ASKED = 400  # points of a view whose neighbours are counted, at most: they lie
 
 @dataclass(frozen=True, eq=False)
 class Resemblance:
-    """How far the noise of a block's K observations is the same."""
+    """Correlation of the noise of a block's K observations."""
 
     of_reference: BoolArray  # (K,)
     place: Array  # (2, K) where a reference's points lie, east, north [m]
@@ -30,7 +30,9 @@ class Resemblance:
 
     @classmethod
     def of(cls, block: Block, terms: int) -> Resemblance | None:
-        """That of a block's observations, beside `terms` that smooth errors have; None without a reference."""
+        """Return the noise correlation of a block's observations, with `terms` of smooth errors; None without
+        a reference.
+        """
         given = block.reference
         if given is None:
             return None
@@ -52,14 +54,14 @@ class Resemblance:
         return found
 
     def overlap(self, first: IntArray, second: IntArray) -> Array:
-        """Part (...) of a template that observations of a reference have in common."""
+        """Return the share (...) by which the templates of two reference observations overlap."""
         apart = np.abs(self.place[:, first] - self.place[:, second])
         if self.width == 0:
             return np.asarray((apart == 0).all(axis=0), np.float64)
         return np.asarray(np.maximum(1.0 - apart / self.width, 0.0).prod(axis=0))
 
     def correlation(self, first: IntArray, second: IntArray) -> Array:
-        """How far the noise of two observations (...) of one view is the same, 0 to 1."""
+        """Return the correlation (...), 0 to 1, of the noise of two observations of one view."""
         both = self.of_reference[first] & self.of_reference[second]
         same = self.overlap(first, second)
         return np.asarray(both * (same + (1.0 - same) / ALIKE))

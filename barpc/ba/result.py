@@ -43,7 +43,7 @@ class Adjustment:
     params : (N, q)
         The unknowns in metres (or px for image models), see `barpc.ba.unknowns`.
     points : (P, 3)
-        Tracks, ECEF [m]; NaN for a track that was cut altogether.
+        Ground points of the tracks, ECEF [m]; NaN for a track of which nothing was kept.
     residuals_before, residuals : (K, 2)
         Projected - observed [px], in the order of the tracks given; before: cameras as they came (those of
         an earlier block as it left them), points triangulated with them.
@@ -52,7 +52,8 @@ class Adjustment:
     held_out : (K,)
         Observations that took no part, to be measured on; their residuals are those of points triangulated anew.
     held_out_rms, held_out_noise : (N,)
-        What their medians say of every view: root mean square residual [px], and over what is stated; NaN without any.
+        Root mean square residual [px] of every view's held-out observations, from their median, and over the
+        stated one; NaN without any.
     view : (K,)
         The tracks' views.
     noise : float
@@ -66,37 +67,38 @@ class Adjustment:
     cameras : Cameras
         The views as the solver saw them.
     covariance : Covariance
-        Of the corrections, of points, of relative heights.
+        Covariance of corrections, points and relative heights.
     gauge : GaugeReport
-        Shift of the scene, what it is known to, the weakest modes.
+        Shift of the scene, its standard deviation, the weakest modes.
     datum : mapping
         Source (`barpc.ba.datum.SOURCES`) -> its share (10,) in what is known of the scene's `MOTIONS`.
     prior : PriorTest
-        How the corrections compare with the priors given, and what the priors became.
+        Comparison of the corrections with the priors given, and the priors learnt.
     smooth : SmoothTest
-        What is smooth in the residuals that are left.
+        Smooth part of the residuals that are left, with its test.
     asked : mapping
-        "drift" or "jitter" -> what was smooth before a degree was added, or splines or steps were followed, for that.
+        "drift" or "jitter" -> the smooth part that asked for another degree, or for splines and steps.
     findings : tuple of Finding
-        What explains tie points beside the cameras' errors as stated, the first taken first.
+        Explanations of tie points beside the cameras' errors as stated, the first taken first.
     moving : (K,)
-        Observations of ties that move together, as such were found: they took no part.
+        Observations of ties that were found to move together; they took no part.
     left : tuple of Interval
         Rows and columns in which ties were cut, or are off, more than elsewhere and chance allow, at the end.
     alike : (N,)
-        How surely neighbours among a view's rejected tie points lie off in the same direction, which wrong matches do
+        Evidence that neighbours among a view's rejected tie points lie off in the same direction, which wrong
+        matches do
         not (`barpc.ba.scan.neighbours_alike`) [nats].
     in_space_rms : float or None
-        Where the data chose an affine in the image: what rotations, translations and drifts leave of the tracks
-        that took no part [px].
+        Where an affine in the image was chosen: RMS of held-out tracks under rotations, translations and drifts
+        [px].
     two_groups : tuple of TwoGroups
         Pairs of views whose tie points fall into two groups.
     held : (P,)
         Tracks held in height because their rays meet under too small an angle.
     terrain : TerrainTest or None
-        What a terrain did; None without one.
+        Result of holding tie points to a terrain; None without one.
     altimetry : AltimetryTest or None
-        What heights without image coordinates did; None without any.
+        Result of registering heights without image coordinates; None without any.
     left_out : tuple of str
         Views outside the largest group (`AdjustOptions.keep_largest`); they keep their cameras.
     apart : Apart or None
@@ -168,12 +170,12 @@ class Adjustment:
 
     @property
     def splines(self) -> tuple[RowSpline | None, ...]:
-        """What every view's correction is followed by in the image; None: nothing."""
+        """Corrections in the image behind each view's camera; None: nothing."""
         return tuple(sensor.correction if isinstance(sensor, Splined) else None for sensor in self.sensors)
 
     @property
     def bases(self) -> tuple[SensorModel, ...]:
-        """The sensors without what is in the image alone: the delivered ones behind their corrections."""
+        """The sensors without corrections that act in the image alone."""
         return tuple(sensor.sensor if isinstance(sensor, Splined) else sensor for sensor in self.sensors)
 
     @property
@@ -196,7 +198,7 @@ class Adjustment:
         return np.bincount(self.view[self.inlier], minlength=len(self.names))
 
     def rmse(self, before: bool = False) -> Array:
-        """Root mean square reprojection error (N,) [px] of every view's kept observations."""
+        """Return the root mean square reprojection error (N,) [px] of every view's kept observations."""
         residual = self.residuals_before if before else self.residuals
         square = (residual[self.inlier] ** 2).sum(axis=1)
         total = np.bincount(self.view[self.inlier], square, len(self.names))
@@ -214,9 +216,9 @@ class PairHeights:
     views : tuple of int
         The pair.
     absolute : float
-        Of a height [m].
+        Standard deviation of a height [m].
     relative : float
-        Of a height against the mean height of the pair's tie points [m].
+        Standard deviation of a height against the mean height of the pair's tie points [m].
     count : int
         Tie points that it was evaluated at.
     """
@@ -228,7 +230,7 @@ class PairHeights:
 
 
 def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights:
-    """Height uncertainty of a pair at the tie points that both views see.
+    """Return the height uncertainty of a pair at the tie points that both views see.
 
     Parameters
     ----------
@@ -259,7 +261,7 @@ def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights
 
 
 def height_by_unknowns(cameras: Cameras, params: Array, pair: tuple[int, int], points: Array) -> Array:
-    """Derivative (n, 2, q) of heights that two views measure, by the unknowns (N, q) of either.
+    """Return the derivative (n, 2, q) of heights that two views measure, by the unknowns (N, q) of either.
 
     Parameters
     ----------

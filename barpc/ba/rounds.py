@@ -44,7 +44,7 @@ _FIRST_TOLERANCE = 0.1  # of the first pass after robust rounds: the second, whi
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the rounds end with."""
+    """The end of the rounds."""
 
     problem: Problem  # with the priors on points as they ended
     minimum: Minimum  # unknowns, points, the last linearisation
@@ -111,7 +111,7 @@ class Rounds:
         self.weight = self.counted
 
     def run(self, once: bool = False) -> Outcome:
-        """Go on until nothing changes, or pass `once`."""
+        """Repeat the rounds until nothing changes, or pass `once`."""
         if self.robust and not self.is_known:
             self._search()
         while True:
@@ -120,7 +120,7 @@ class Rounds:
                 return outcome
 
     def _search(self) -> None:
-        """Robust rounds, under priors that leave room for what is not expected."""
+        """Run the robust rounds, under priors wide enough for what is not expected."""
         start = replace(self.problem, camera_prior=self.variances.for_search())
         self.state, self.residual, self.counted, self.noise, self.projected = _robust(
             start,
@@ -135,7 +135,7 @@ class Rounds:
         self.misfit = self.smooth.test(self.residual, self.use).rms
 
     def _cut_and_solve(self, once: bool) -> Outcome | None:
-        """One pass; the outcome where it is the last."""
+        """Return one pass; the outcome where it is the last."""
         options, was_in_use, noise = self.options, self.use, self.noise
         many_cut = self.use.sum() < (1.0 - _MANY_CUT) * self.everything.sum()
         if self.robust and self.passes and many_cut:
@@ -175,7 +175,7 @@ class Rounds:
         return None
 
     def _cut(self) -> None:
-        """Choose what is used by the residuals that scatter."""
+        """Cut observations by residuals without their smooth part."""
         if self.robust:
             scatter = self._scatter() if self.scatter is None else self.scatter
             s = self.observations.squared(scatter, self.use.astype(np.float64))
@@ -183,7 +183,7 @@ class Rounds:
             self.use = self.observations.tied(self.everything & near)
 
     def _solve(self) -> Minimum:
-        """Least squares of what is used; a second pass follows the first robust one always, and is exact."""
+        """Return the least squares of what is used; a second pass follows the first robust one always, and is exact."""
         again = self.passes > 1 or self.goes_on
         solver = "sparse" if self.options.solver == "auto" and self.passes == 1 else self.options.solver
         tolerance = TOLERANCE if again or not self.robust else _FIRST_TOLERANCE
@@ -198,7 +198,7 @@ class Rounds:
         return replace(found, state=self.state)
 
     def _estimate_noise(self) -> SmoothTest:
-        """The noise, and what no camera can follow, by the residuals of the observations in use."""
+        """Return the noise, and what no camera can follow, by the residuals of the observations in use."""
         fit = self.smooth.fit(self.residual, self.counted)
         tested = self.smooth.test(self.residual, self.use, fit)
         if self.robust:
@@ -211,7 +211,7 @@ class Rounds:
         return tested
 
     def _scatter(self, fit: Fit | None = None) -> Array:
-        """Residuals (2, K) [px] without the smooth parts of all views that see a point.
+        """Return the residuals (2, K) [px] without the smooth parts of all views that see a point.
 
         A point shares what one of its views is wrong by among all of them, and relief moves the rows of the views
         against each other: so the smooth parts are found view by view and the points follow, until they stand.
@@ -230,7 +230,8 @@ class Rounds:
 
 
 def faintness(block: Block, heights: Heights) -> Array:
-    """Times (P,) by which observations of a point count as noisier: a control point that holds nothing ties nothing.
+    """Return the factors (P,) on the noise of a point's observations: a control point that holds nothing ties
+    nothing.
 
     Those of many points marked a pixel off in one image would pull it away from its tie points, which together count
     for so much only. Points that are seen in an image without tie points are what ties that.
@@ -254,7 +255,7 @@ def _robust(
     options: AdjustOptions,
     smooth: Smooth,
 ) -> tuple[State, Array, Array, float, Projected | None]:
-    """Reweighted steps while the loss's scale shrinks to three standard deviations of the noise.
+    """Take reweighted steps while the loss's scale shrinks to three standard deviations of the noise.
 
     The state, its residuals, how much every observation counts, the noise, and what is kept of the state's projection.
     The noise is a median that counts observations by
@@ -281,14 +282,15 @@ def _robust(
 
 
 def _counted(observations: Observations, use: BoolArray, squared: Array, by_loss: Array) -> Array:
-    """How much each observation counts (K,)."""
+    """Return the weight of each observation (K,)."""
     return np.where(observations.is_spared(squared), use.astype(np.float64), use * by_loss)
 
 
 def revived(
     problem: Problem, state: State, residual: Array, use: BoolArray, weight: Array
 ) -> tuple[State, Array]:
-    """The state with tracks that were cut altogether where the cameras now see them, and the residuals (2, K) there.
+    """Return the state with wholly cut tracks triangulated anew by the present cameras, and their residuals
+    (2, K).
 
     Nothing moved them since; with what they were cut for mended, they may come back.
     """
@@ -303,7 +305,7 @@ def revived(
 
 
 def _median(values: Array, weights: Array) -> float:
-    """Median of `values`, each counted as often as its weight says."""
+    """Return the median of `values`, each counted as often as its weight says."""
     order = np.argsort(values)
     total = np.cumsum(weights[order])
     if not len(total) or not total[-1] > 0:

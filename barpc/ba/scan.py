@@ -41,14 +41,15 @@ class Interval:
 
 
 def price(views: int) -> float:
-    """What the choice among the intervals of all views, rows and columns, costs [nats]."""
+    """Return the cost of choosing among the intervals of all views, rows and columns [nats]."""
     return float(np.log(BINS * (BINS + 1) / 2 * 2 * views))
 
 
 def scan(
     view: IntArray, place: Array, size: Array, wrong: Array, off: Array, told: Array, floor: float = 0.0
 ) -> list[Interval]:
-    """The interval that stands out most, by each statistic, of every view's columns and rows; the best first.
+    """Find the interval that stands out most, by each statistic, in every view's columns and rows; the best
+    first.
 
     Parameters
     ----------
@@ -83,7 +84,9 @@ def scan(
 
 
 def _intervals(bins: Array) -> Array:
-    """Sums (intervals, ...) of all intervals of bins (..., `BINS`): rows of one array, which are copied fast."""
+    """Return the sums (intervals, ...) of all intervals of bins (..., `BINS`): rows of one array, which are
+    copied fast.
+    """
     edges = np.zeros((BINS + 1, *bins.shape[:-1]))
     np.moveaxis(bins, -1, 0).cumsum(axis=0, out=edges[1:])
     return np.asarray(edges[_STOPS] - edges[_STARTS])
@@ -92,7 +95,8 @@ def _intervals(bins: Array) -> Array:
 def _displacements(
     view: IntArray, bin_: IntArray, off: Array, told: Array, views: int, floor: float
 ) -> tuple[Array, Array]:
-    """By how many nats (intervals, N) a displacement of an interval explains residuals, and how large it is.
+    """Return the gain [nats] (N, intervals) by which a displacement of an interval explains residuals, and
+    its size.
 
     The score test beside what a camera follows along an axis: a constant, a slope and a bend are taken off both. What
     stands out beside a step is its middle; the step itself is what explains it.
@@ -124,7 +128,8 @@ def _displacements(
 
 
 def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) -> Array:
-    """How surely neighbours lie off in the same direction (N,) [nats], what the choice among all tests costs taken off.
+    """Return the evidence (N,) [nats] that neighbouring residuals point in the same direction, the choice
+    among tests paid for.
 
     Of wrong matches that lie anywhere they do so in half of the cases; of what moves, bends or shakes, in more.
 
@@ -152,7 +157,7 @@ def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) 
 
 
 def _shares(count: Array, bad: Array, total: Array, all_bad: Array) -> Array:
-    """Logarithm of the likelihood ratio of two shares over one, where that inside is the larger."""
+    """Return the logarithm of the likelihood ratio of two shares over one, where that inside is the larger."""
 
     def log(k: Array, n: Array) -> Array:
         good = np.maximum(n - k, 0.0)

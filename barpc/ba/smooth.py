@@ -52,7 +52,7 @@ class SmoothTest:
     shared: Array
 
     def found(self, least: float, level: float = 1e-4) -> BoolArray:
-        """Views (N,) with a smooth part above `least` [px] that is significant."""
+        """Return the views (N,) with a smooth part above `least` [px] that is significant."""
         return np.asarray((self.rms > least) & (self.significance < level))
 
 
@@ -78,7 +78,7 @@ class Smooth:
         self._kept = self._terms(slice(None)) if len(col) <= _KEPT else None
 
     def _basis(self, rows: slice) -> Array:
-        """The terms (TERMS, n) at some observations."""
+        """Return the terms (TERMS, n) at some observations."""
         return self._terms(rows) if self._kept is None else self._kept[:, rows]
 
     def _terms(self, rows: slice) -> Array:
@@ -86,7 +86,7 @@ class Smooth:
         return np.vstack([bsplines(row, SPLINES), col, col**2, col**3, row * col])
 
     def part(self, residual: Array, weight: Array, fit: Fit | None = None) -> Array:
-        """The smooth part (2, K) of residuals (2, K) [px], fitted with weights (K,) >= 0.
+        """Return the smooth part (2, K) of residuals (2, K) [px], fitted with weights (K,) >= 0.
 
         Zero for views with too few observations that count.
         """
@@ -96,7 +96,7 @@ class Smooth:
         return out
 
     def test(self, residual: Array, use: BoolArray, fit: Fit | None = None) -> SmoothTest:
-        """Whether the residuals (2, K) [px] of the observations in use hold more than scatter.
+        """Test whether the residuals (2, K) [px] of the observations in use hold more than scatter.
 
         What is too fine for the smooth part is not looked for.
         """
@@ -127,14 +127,14 @@ class Smooth:
         return SmoothTest(rms, significance, by_row, np.zeros(n))
 
     def test_neighbours(self, tested: SmoothTest, residual: Array, use: BoolArray) -> SmoothTest:
-        """The same test with what neighbours share, of views in which something was fitted."""
+        """Test the same with what neighbours share, in views in which something was fitted."""
         shared, use = np.zeros_like(tested.rms), use & self._tells
         for v in np.flatnonzero(np.isfinite(tested.by_row)):
             shared[v] = self._shared(slice(*self.structure.bounds[v : v + 2]), residual, use)
         return replace(tested, shared=shared)
 
     def _shared(self, rows: slice, residual: Array, use: BoolArray) -> float:
-        """Root of the mean product of neighbours' residuals [px], along the rows or the columns."""
+        """Return the root of the mean product of neighbours' residuals [px], along the rows or the columns."""
         kept = np.arange(rows.start, rows.stop)[use[rows]]
         most = 0.0
         for place in self._place[:, kept]:
@@ -148,7 +148,9 @@ class Smooth:
         return most
 
     def _beyond_noise(self, product: Array, square: Array, order: IntArray) -> tuple[Array, float]:
-        """Products (n - 1,) of neighbours (n,) without what the noise that they share makes of them; their number."""
+        """Return the products (n - 1,) of neighbours (n,) without what the noise that they share makes of
+        them; their number.
+        """
         assert self.alike is not None
         first, second = order[:-1], order[1:]
         same = self.alike.correlation(first, second)
@@ -158,7 +160,7 @@ class Smooth:
         return beyond / size, float(self.alike.share[second].sum())
 
     def fit(self, residual: Array, weight: Array) -> Fit:
-        """What `part` is made of, for views with enough observations that count."""
+        """Fit the smooth part of the residuals, of views with enough observations that count."""
         bounds, weight = self.structure.bounds, weight * self._tells
         counts = self.structure.sum_views(weight[None])[:, 0]
         found = {}
@@ -168,7 +170,7 @@ class Smooth:
         return found
 
     def _coefficients(self, rows: slice, residual: Array, weight: Array) -> Array:
-        """Coefficients (2, terms) of one view."""
+        """Return the coefficients (2, terms) of one view."""
         basis = self._basis(rows)
         weighted = basis * (weight[rows] if self.alike is None else weight[rows] * self.alike.precision[rows])
         matrix = weighted @ basis.T

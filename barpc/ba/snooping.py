@@ -44,18 +44,18 @@ class ControlTest:
     used : (G,)
         Points that hold the block; the others were found wrong.
     residual : (G, 3)
-        What all the others say of a point minus its given place, east, north, up [m], in the directions that they
+        Place of a point by all others minus its given place, east, north, up [m], in the directions that they
         tell of; NaN where there is none.
     w : (G,)
-        Its largest component over its standard deviation.
+        Largest component of the residual over its standard deviation.
     redundancy : (G,)
-        How far the others could tell: 0 not at all, 1 as if the point were not used.
+        Redundancy, how far the others could tell: 0 not at all, 1 as if the point were not used.
     scatter : float
         Root mean square residual of the points used over what is expected; NaN where too little is told.
     fits : bool
         Whether that may be chance.
     agreed : Agreement or None
-        How the points used were found.
+        Agreement by which the points used were found.
     """
 
     used: BoolArray
@@ -68,27 +68,29 @@ class ControlTest:
 
     @property
     def checked(self) -> bool:
-        """Whether any point used is checked by the others."""
+        """Whether the others check any point used."""
         return bool((self.redundancy[self.used] > CHECKED).any())
 
     @property
     def agrees(self) -> bool:
-        """Whether the points used contradict nothing, each and all together, and one set of them outweighs others."""
+        """Whether no point used is contradicted, alone or all together, and one set outweighs the others."""
         status = [self.status(g) for g in range(len(self.used))]
         return self.fits and not self.torn and not {"contradicts", "undecided"} & set(status)
 
     @property
     def sets(self) -> tuple[BoolArray, ...]:
-        """Two sets of points (G,) that contradict each other and weigh the same; none is used. Empty where one is."""
+        """Two sets of points (G,) that contradict each other with equal weight, so that none is used; empty
+        where one is.
+        """
         return () if self.agreed is None else self.agreed.sets
 
     @property
     def torn(self) -> tuple[float, ...]:
-        """Residuals of tie points that took no part without and with control [px], where that is why none is used."""
+        """Residuals of held-out tie points without and with control [px], where that is why none is used."""
         return () if self.agreed is None else self.agreed.torn
 
     def status(self, point: int) -> str:
-        """What became of a point, in a word."""
+        """Return the state of a point, in a word."""
         if not self.used[point]:
             return "undecided" if self.sets else "rejected"
         return "contradicts" if self.w[point] > CRITICAL else "used"
@@ -97,7 +99,7 @@ class ControlTest:
 def control_test(
     covariance: Covariance, points: Array, first: int, gcps: GroundPoints, agreed: Agreement, faint: Array
 ) -> ControlTest:
-    """The test at a solution.
+    """Test the control points at a solution.
 
     Parameters
     ----------
@@ -144,7 +146,7 @@ def control_test(
 
 
 def _together(whitened: Array, redundancy: Array, used: BoolArray) -> tuple[float, bool]:
-    """Scatter of the points used (G, 3), and whether it may be chance.
+    """Return the scatter of the points used (G, 3), and whether it may be chance.
 
     The sum of squares is expected to be the redundancies' sum R, and its variance at most 2 R: that of a chi-square.
     """
@@ -158,7 +160,8 @@ def _together(whitened: Array, redundancy: Array, used: BoolArray) -> tuple[floa
 def image_test(
     covariance: Covariance, problem: Problem, state: State, residual: Array, weight: Array, rows: IntArray
 ) -> Array:
-    """Baarda's w (n,) of observations in the images: the larger of |col| and |row| over its standard deviation.
+    """Return Baarda's w (n,) of observations in the images: the larger of |col| and |row| over its standard
+    deviation.
 
     A whitened residual has the covariance 1 - J C J^T, C that of camera and point together. NaN: nothing checks it.
 

@@ -39,7 +39,7 @@ _BETTER = 0.8  # of the noise
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A block solved with one model."""
+    """A block solved with one model: its start, its rounds, and what is left."""
 
     problem: Problem  # as it was solved last
     state: State  # where it started: delivered cameras, points triangulated with them
@@ -67,7 +67,7 @@ class Solution:
         return seen
 
     def first_points(self, block: Block, some: BoolArray) -> Array:
-        """Where the delivered cameras put some points (P,) that are seen where the adjusted ones show them (P, 3) [m].
+        """Return the points (P, 3) [m] that the delivered cameras give for where the adjusted ones show them.
 
         NaN for the others. Nothing but the cameras moves between the two: no observation that was cut, no place that
         was given, and no height where the rays of a point tell none.
@@ -120,7 +120,8 @@ def solve_block(
     centers: Array | None,
     prior: BlockPrior | None,
 ) -> Solution:
-    """Rounds with the model of the options, again from an agreement or with more drift where they ask for it.
+    """Solve a block with the model of the options, again from an agreement or with more drift where residuals
+    ask for it.
 
     By its tie points first; then with the control points that agree with each other there. Measured on the
     observations of `outer`.
@@ -165,7 +166,7 @@ def solve_block(
 
 
 def _untorn(found: Solution, free: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
-    """The block held by control; as it was `free` of it where tracks that took no part are met worse with it."""
+    """Return the block held by control; as it was `free` of it where tracks that took no part are met worse with it."""
     without = measure(free.problem, free.final.params, outer)
     raised = found.after.whole_rms**2 - without.whole_rms**2
     # ties of a view are worth 1 / noise_floor^2 in all: its q unknowns are known to q noise_floor^2 [px^2] by them
@@ -178,7 +179,9 @@ def _untorn(found: Solution, free: Solution, block: Block, outer: Block, options
 
 
 def _with_control(block: Block, heights: Heights, outcome: Outcome) -> tuple[Agreement, Heights]:
-    """The control points that agree with each other at an outcome that none of them holds, and what holds them."""
+    """Return the control points that agree with each other at an outcome that none of them holds, and what
+    holds them.
+    """
     count, first = len(block.gcps.names), block.num_tracks
     mine = (block.point >= first) & (block.point < block.num_known)
     lost = np.isin(
@@ -197,7 +200,7 @@ def _with_control(block: Block, heights: Heights, outcome: Outcome) -> tuple[Agr
 def finished(
     found: Solution, problem: Problem, block: Block, outer: Block, options: AdjustOptions, outcome: Outcome
 ) -> Solution:
-    """What the rounds of a problem ended with, its control tested and measured; where it started is `found`'s."""
+    """Complete the rounds of a problem: control tested, held-out tracks measured; the start is that of `found`."""
     tested = None
     if found.agreed is not None:
         covariance, points = outcome.minimum.covariance(problem.free), outcome.minimum.state.points
@@ -208,6 +211,6 @@ def finished(
 
 
 def _is_suspect(outcome: Outcome, structure: Structure, use: BoolArray) -> bool:
-    """Whether the rounds may have ended between two solutions: much noise, or a view that lost much."""
+    """Return whether the rounds may have ended between two solutions: much noise, or a view that lost much."""
     had, kept = (structure.sum_views(rows.astype(np.float64)[None])[:, 0] for rows in (use, outcome.inlier))
     return outcome.noise > MUCH_NOISE or bool((kept < _MUCH_LOST * had).any())

@@ -36,7 +36,7 @@ _LOST = 1e-6  # nor where it promises less than this one, and no damping however
 
 @dataclass(frozen=True)
 class State:
-    """Where the iteration stands."""
+    """State of the iteration: cameras and points."""
 
     params: Array  # (N, q) unknowns of the views
     points: Array  # (P, 3) ECEF [m]
@@ -44,14 +44,14 @@ class State:
     history: tuple[float, ...] = ()  # the cost at every linearisation, and at the end of every pass, so far
 
     def moved(self, step: Array, reduced: Reduced, cost: float) -> State:
-        """The state after a step (N, q) of the cameras and the points' step that goes with it."""
+        """Return the state after a step (N, q) of the cameras and the points' step that goes with it."""
         points = self.points + reduced.point_step(step)
         return replace(self, params=self.params + step, points=points, cost=cost)
 
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where a minimisation ended."""
+    """End of a minimisation."""
 
     state: State  # the minimum
     reduced: Reduced  # the last linearisation: at the minimum (scipy), or one small step before it
@@ -60,7 +60,7 @@ class Minimum:
     _known: list[Covariance] = field(default_factory=list, repr=False)
 
     def covariance(self, free: BoolArray) -> Covariance:
-        """The posterior covariance, by the last linearisation; what it works out is kept."""
+        """Return the posterior covariance by the last linearisation, computed once."""
         if not self._known:
             self._known.append(self._covariance(free))
         return self._known[0]
@@ -116,7 +116,7 @@ def minimise(
 
 
 def _settled(gain: float, before: float, cost: float, tolerance: float) -> bool:
-    """Whether a step that should gain `gain`, after one that should have gained `before`, is the last.
+    """Return whether a step that should gain `gain`, after one that should have gained `before`, is the last.
 
     The gains shrink at least in the proportion of the last two: what the step leaves is gain^2 / before.
     """
@@ -124,14 +124,14 @@ def _settled(gain: float, before: float, cost: float, tolerance: float) -> bool:
 
 
 def gauss_newton(problem: Problem, state: State, weight: Array, projected: Projected | None = None) -> State:
-    """One undamped step: for rounds whose weights change anyway. `projected` as in `minimise`."""
+    """Take one undamped Gauss-Newton step, for rounds whose weights change anyway; `projected` as in `minimise`."""
     reduced = problem.reduce(state.params, state.points, weight, projected)
     step, gain, _ = camera_step(problem, reduced)
     return state.moved(step, reduced, max(_finite(reduced.cost) - gain, 0.0))
 
 
 def camera_step(problem: Problem, reduced: Reduced, damping: float = 0.0) -> tuple[Array, float, Factor]:
-    """Gauss-Newton step (N, q) of the cameras, what it and the points' would gain, and the factor."""
+    """Return the Gauss-Newton step (N, q) of the cameras, its gain with the points', and the factor."""
     free = problem.free
     step = np.zeros(len(free))
     gradient = reduced.gradient[free]
@@ -145,7 +145,7 @@ def camera_step(problem: Problem, reduced: Reduced, damping: float = 0.0) -> tup
 def _levenberg_marquardt(
     problem: Problem, state: State, weight: Array, tolerance: float, projected: Projected | None
 ) -> Minimum:
-    """Gauss-Newton steps, damped only when one fails."""
+    """Return Gauss-Newton steps, damped only when one fails."""
     damping, before = 0.0, np.inf
     reduced = problem.reduce(state.params, state.points, weight, projected)
     state = replace(state, cost=_finite(reduced.cost), history=(*state.history, reduced.cost))
@@ -218,12 +218,12 @@ class _Compressed:
         self._compress(la.cholesky(self.reduced.plain(self.problem.free), check_finite=False))
 
     def residual(self, x: Array) -> Array:
-        """The N q + 1 residuals."""
+        """Return the N q + 1 residuals."""
         self.at(x)
         return np.append(self.whitened, self.rest)
 
     def jacobian(self, x: Array) -> Array:
-        """Their derivative."""
+        """Return the derivative of the residuals."""
         self.at(x)
         return np.vstack([self.slope, np.zeros((1, len(x)))])
 

@@ -25,7 +25,7 @@ _NAMES = ("west", "east"), ("south", "north")
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """The observations (K,) of a block, each in one part."""
+    """Observations (K,) of a block, each in one part: solved, held out, or moving."""
 
     block: Block
     kept_out: BoolArray  # (K,)
@@ -33,26 +33,26 @@ class Parts:
 
     @cached_property
     def inner(self) -> Block:
-        """What is solved."""
+        """Observations that are solved."""
         return self.block.without(self.kept_out | (self.group > 0))
 
     @cached_property
     def outer(self) -> Block:
-        """What measures it."""
+        """Observations that measure the result."""
         return self.block.without(~self.kept_out | (self.group > 0))
 
     @cached_property
     def apart(self) -> Block:
-        """What moved."""
+        """Observations that move."""
         return self.block.without(self.group == 0)
 
     def without_view(self, view: int) -> Parts:
-        """Without all observations of one view."""
+        """Return the parts without all observations of one view."""
         of_it = self.block.view == view
         return Parts(self.block.without(of_it), self.kept_out[~of_it], self.group[~of_it])
 
     def less(self, found: Solution, one: Found) -> Parts:
-        """Without one group more."""
+        """Return the parts with one more group taken out."""
         number, group = self.group.max(initial=0) + 1, self.group.copy()
         still = group == 0
         group[still & ~self.kept_out] = number * one.member
@@ -61,14 +61,16 @@ class Parts:
         return replace(self, group=group)
 
     def is_tied(self) -> bool:
-        """Whether every view keeps enough observations, and all hang together as they did."""
+        """Return whether every view keeps enough observations and the views stay connected as they were."""
         block, inner = self.block, self.inner
         kept, had = (np.bincount(b.view[b.use], minlength=len(b.views)) for b in (inner, block))
         enough = bool((kept[had > 0] >= MIN_OBSERVATIONS).all())
         return enough and _groups(inner) == _groups(block)
 
     def mostly_moving(self, inlier: BoolArray) -> list[Interval]:
-        """Rows of images of which more ties move than stand, of those kept (K,) of `inner`: they may be what is off."""
+        """Return the rows of images, of the kept (K,) of `inner`, of which more ties move than stand: the
+        camera may be wrong there.
+        """
         block, gone = self.block, self.group > 0
         if not gone.any():
             return []
@@ -81,7 +83,7 @@ class Parts:
         return [replace(one, moves=True) for one in sure if one.share > 0.5]
 
     def motion(self, number: int, one: Found, points: Array) -> Motion:
-        """What is said of a group, of the points (P, 3) [m] of all tracks."""
+        """Return the motion of a group, of the points (P, 3) [m] of all tracks."""
         placed = self.block.point[self.block.point < self.block.num_tracks]
         placed = placed[np.isfinite(points[placed, 0])]
         every, of_group = np.unique(placed), np.unique(self.block.point[self.group == number])
@@ -102,7 +104,7 @@ class Parts:
 
 
 def _groups(block: Block) -> int:
-    """Into how many groups views fall."""
+    """Count the groups into which views fall."""
     rows = np.flatnonzero(block.use)
     rows = rows[np.lexsort((block.view[rows], block.point[rows]))]
     same = np.flatnonzero(np.diff(block.point[rows]) == 0)
@@ -113,7 +115,7 @@ def _groups(block: Block) -> int:
 def without_moving(
     found: Solution, parts: Parts, options: AdjustOptions, solve: Callable[[Parts], Solution]
 ) -> tuple[Solution, Parts, Judgement]:
-    """The block solved again without groups of ties that move, and what explains the rest.
+    """Solve the block again without groups of ties that move, and find what explains the rest.
 
     `Solution.findings` has both.
 

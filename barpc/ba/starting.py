@@ -32,7 +32,7 @@ def make_problem(
     drift: int | None = None,
     waves: Waves | None = None,
 ) -> Problem:
-    """Observations, cameras and priors, before anything is known about points; `drift` instead of the options'."""
+    """Set up observations, cameras and priors before anything is known about points; `drift` overrides the options'."""
     views = block.views
     drift = _first_drift(options, prior) if drift is None else drift
     if prior is not None:
@@ -57,7 +57,7 @@ def make_problem(
 
 
 def _first_drift(options: AdjustOptions, prior: BlockPrior | None) -> int:
-    """The degree of the drift to start with."""
+    """Return the degree of the drift to start with."""
     if options.drift is not None:
         return options.drift
     if prior is not None:
@@ -66,7 +66,7 @@ def _first_drift(options: AdjustOptions, prior: BlockPrior | None) -> int:
 
 
 def _known_centers(block: Block, options: AdjustOptions, centers: Array | None, prior: BlockPrior) -> Array:
-    """Camera centres (N, 3) [m]: the earlier block's where it had them."""
+    """Return the camera centres (N, 3) [m]: the earlier block's where it had them."""
     if centers is None:
         centers = make_unknowns(block.views, options.first_model).center
     known = dict(zip(prior.names, prior.center, strict=True))
@@ -76,7 +76,7 @@ def _known_centers(block: Block, options: AdjustOptions, centers: Array | None, 
 def first_state(
     problem: Problem, block: Block, options: AdjustOptions, dem: Terrain | None
 ) -> tuple[State, Heights]:
-    """Points triangulated with the delivered cameras, and what holds those that the rays do not."""
+    """Triangulate the points with the delivered cameras, and return priors for those that the rays do not fix."""
     params = problem.camera_prior.mean
     points = block.first_points()
     points[~np.isfinite(points)] = 0.0
@@ -100,7 +100,7 @@ def first_state(
 
 
 def _relief(problem: Problem, heights: Heights, points: Array, weight: Array) -> Relief:
-    """The DEM beside points (P, 3) [m] that stand where the rays of the delivered cameras put them.
+    """Return the DEM beside points (P, 3) [m] that stand where the rays of the delivered cameras put them.
 
     What the cameras let expect of how these lie to it is first-order: points move by -V^-1 A^T B with the cameras.
     """

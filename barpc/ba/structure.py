@@ -15,7 +15,7 @@ from barpc.scene import BoolArray, IntArray
 
 @dataclass(frozen=True)
 class Structure:
-    """Index arrays of K observations of P points in N views; observations sorted by view."""
+    """Index arrays of K observations of P points in N views, sorted by view."""
 
     num_views: int
     num_points: int
@@ -33,22 +33,22 @@ class Structure:
     _orders: dict[bytes, Dissection] = field(default_factory=dict, repr=False)
 
     def order(self, use: BoolArray) -> Dissection:
-        """In which order the views in use (N,) are eliminated; worked out once."""
+        """Return the order of elimination of the views in use (N,), computed once."""
         key = use.tobytes()
         if key not in self._orders:
             self._orders[key] = dissect(self.pair_view, self.place, use)
         return self._orders[key]
 
     def sum_points(self, rows: Array) -> Array:
-        """Sums (m, P) over every point's observations of rows (m, K)."""
+        """Return the sums (m, P) over every point's observations of rows (m, K)."""
         return np.array([np.bincount(self.point, row, self.num_points) for row in rows])
 
     def of_points(self, points: Array) -> Array:
-        """Coordinates (3, K) of every observation's point, of points (P, 3)."""
+        """Return the coordinates (3, K) of every observation's point, of points (P, 3)."""
         return np.ascontiguousarray(points.T).take(self.point, axis=1, mode="clip")
 
     def sum_views(self, rows: Array) -> Array:
-        """Sums (N, m) over every view's observations of rows (m, K)."""
+        """Return the sums (N, m) over every view's observations of rows (m, K)."""
         out = np.zeros((self.num_views, len(rows)))
         filled = np.flatnonzero(np.diff(self.bounds))
         if len(filled):
@@ -64,7 +64,7 @@ def make_structure(
     place: Array | None = None,
     joined: IntArray | None = None,
 ) -> Structure:
-    """The structure of observations (K,) that are already sorted by view; all views `joined` are pairs, too."""
+    """Return the structure of observations (K,) that are already sorted by view; all views `joined` are pairs, too."""
     bounds = np.searchsorted(view, np.arange(num_views + 1))
     by_point, point_bounds = counting_sort(point, num_points)
     first, second = _pairs(by_point, point_bounds)
@@ -95,13 +95,14 @@ def make_structure(
 
 
 def parts(stop: int, size: int, start: int = 0) -> Iterator[slice]:
-    """Pieces of observations start .. stop, of `size` that stay in cache."""
+    """Yield the pieces of observations start .. stop, of `size` that stay in cache."""
     for first in range(start, stop, size):
         yield slice(first, min(first + size, stop))
 
 
 def counting_sort(key: IntArray, size: int) -> tuple[IntArray, IntArray]:
-    """The stable order (n,) of keys 0 .. size - 1, and where each key's part of it begins and ends (size + 1,).
+    """Return the stable order (n,) of keys 0 .. size - 1, and the start and end of each key's part (size +
+    1,).
 
     What scipy does to compress the rows of a sparse matrix, three times as fast as `argsort`.
     """
@@ -112,7 +113,7 @@ def counting_sort(key: IntArray, size: int) -> tuple[IntArray, IntArray]:
 
 
 def _pairs(by_point: IntArray, starts: IntArray) -> tuple[IntArray, IntArray]:
-    """All pairs of observations of each point; views ascend within a point, so i < j in every pair."""
+    """Return all pairs of observations of each point; views ascend within a point, so i < j in every pair."""
     length = np.diff(starts)
     first, second = [], []
     for n in np.unique(length[length > 1]):

@@ -55,7 +55,7 @@ class Surface:
 
     @classmethod
     def of(cls, points: Array) -> Surface:
-        """The surface of at least `NEIGHBOURS` points (P, 3)."""
+        """Fit the surface of at least `NEIGHBOURS` points (P, 3)."""
         tree = cKDTree(points[:, :2])
         distance, near = (np.asarray(part) for part in tree.query(points[:, :2], k=NEIGHBOURS))
         reach = np.maximum(distance[:, -1], 1e-3)
@@ -79,20 +79,22 @@ class Surface:
         )
 
     def at(self, place: Array) -> tuple[Array, IntArray, BoolArray]:
-        """Height (n,) at places (n, 2), the tie point (n,) whose patch says so, and whether it reaches there."""
+        """Return the height (n,) at places (n, 2), the tie point (n,) of the patch used, and whether the
+        patch reaches there.
+        """
         distance, nearest = (np.asarray(part) for part in self.tree.query(place))
         design = _powers(self._from(place, nearest))
         near = (distance <= self.reach[nearest]) & self.whole[nearest]
         return (design * self.patch[nearest]).sum(axis=1), nearest, near
 
     def variance(self, place: Array, nearest: IntArray) -> Array:
-        """Of the height of the ground at places (n, 2) minus what the patches say [m^2]."""
+        """Return the variance [m^2] of the ground's height at places (n, 2) about the patches."""
         design = _powers(self._from(place, nearest))
         of_patch = np.einsum("ni,nij,nj->n", design, self.covariance[nearest], design)
         return np.asarray(of_patch + self.scatter[nearest] ** 2)
 
     def slope(self, place: Array, nearest: IntArray) -> tuple[Array, Array]:
-        """Slopes (n, 2) to the east and north at places (n, 2), and their covariance (n, 2, 2)."""
+        """Return the slopes (n, 2) to the east and north at places (n, 2), and their covariance (n, 2, 2)."""
         u, v = self._from(place, nearest).T
         zero, one = np.zeros_like(u), np.ones_like(u)
         rates = np.array([[zero, one, zero, 2.0 * u, v, zero], [zero, zero, one, zero, u, 2.0 * v]])
@@ -101,7 +103,7 @@ class Surface:
         return np.einsum("nci,ni->nc", rates, self.patch[nearest]), covariance
 
     def _from(self, place: Array, nearest: IntArray) -> Array:
-        """Places from a tie point, in lengths of its patch's reach."""
+        """Return the places from a tie point, in lengths of its patch's reach."""
         away = (place - self.points[nearest, :2]) / self.reach[nearest, None]
         return np.asarray(np.clip(away, -1.0, 1.0))
 
@@ -120,7 +122,7 @@ class Given:
     sigma_flat: Array  # (n,) of the place, along an axis [m]
 
     def select(self, keep: BoolArray) -> Given:
-        """Those of a mask (n,)."""
+        """Return the heights of a mask (n,)."""
         return Given(self.place[keep], self.sigma[keep], self.sigma_flat[keep])
 
 
@@ -138,12 +140,12 @@ class Registration:
 
     @property
     def share(self) -> float:
-        """How many of the heights on the surface agree, 0 to 1."""
+        """Share of the heights on the surface that agree, 0 to 1."""
         return float(self.agree.sum() / max(self.near.sum(), 1))
 
     @property
     def is_most(self) -> bool:
-        """Whether those that agree may be most of all, and are clearly more than any other group.
+        """Whether those that agree may be most of all, and clearly outnumber any other group.
 
         Clearly is two standard deviations of a count; of n heights, half of them right, as many less than a half agree
         by chance.
@@ -154,7 +156,9 @@ class Registration:
 
 
 def displacement(local: Array) -> Array:
-    """(n, 3, 7): moves east, north, up of points at `local` (n, 2) radii by the seven motions of a scene."""
+    """Return the derivatives (n, 3, 7) of points at `local` (n, 2) radii, east, north, up, by the seven
+    motions of a scene.
+    """
     e, o = local.T
     moves = np.zeros((len(e), 3, 7))
     moves[:, (0, 1, 2), (0, 1, 2)] = 1.0
@@ -180,7 +184,9 @@ def register(surface: Surface, given: Given, radius: float, before: Array) -> Re
 def _settled(
     surface: Surface, given: Given, motion: Array, radius: float, free: Array, noise: float | None = None
 ) -> tuple[Array, float]:
-    """The motion (7,) that reweighted steps end at, and the noise over what is stated; learnt where it is not known."""
+    """Return the motion (7,) that reweighted steps end at, and the noise over what is stated; learnt where it
+    is not known.
+    """
     is_known, noise = noise is not None, _MOST_NOISE if noise is None else noise
     for step in range(_STEPS):
         seen = _Seen.of(surface, given, motion, radius)
@@ -206,7 +212,8 @@ def _settled(
 def _jackknife(
     surface: Surface, given: Given, found: Registration, radius: float, noise: float, free: Array
 ) -> Array:
-    """Factors (7,) of standard deviations: how the motion changes where the heights of one part are left out.
+    """Return the factors (7,) of standard deviations: how the motion changes where the heights of one part
+    are left out.
 
     Slopes tell where heights lie on them, and steps of roofs and trees move with the place that is found: no
     linearisation at its end has that (the delete-a-group jackknife: Shao and Tu, "The Jackknife and Bootstrap", 1995).
@@ -229,7 +236,7 @@ def _jackknife(
 
 
 def _parts(place: Array, near: BoolArray) -> IntArray:
-    """Which of some twenty square parts of a scene each place (n, 2) lies in; -1: it is not near."""
+    """Return the part (of some twenty squares of a scene) in which each place (n, 2) lies; -1: none is near."""
     group, number = np.full(len(place), -1), np.zeros(0, dtype=np.int64)
     at = place[near]
     size = float(np.ptp(at, axis=0).max()) if len(at) else 0.0
@@ -270,7 +277,7 @@ class _Seen:
 
 
 def _search(surface: Surface, given: Given, before: Array) -> Array:
-    """The shift (7,; tilts, turn and scale 0) on which the most heights agree, east and north within 4 sigma."""
+    """Return the shift (7,; tilts, turn and scale 0) on which the most heights agree, east and north within 4 sigma."""
     few = given.select(np.arange(len(given.sigma)) % -(-len(given.sigma) // _SEARCHED) == 0)
     first = _Seen.of(surface, few, np.zeros(7), 1.0)
     steep = float(np.sqrt(((surface.patch[:, 1:3] / surface.reach[:, None]) ** 2).mean()))
@@ -298,7 +305,7 @@ def _search(surface: Surface, given: Given, before: Array) -> Array:
 def _told(
     surface: Surface, given: Given, motion: Array, radius: float, noise: float, free: Array
 ) -> Registration:
-    """The covariance at the end, and which heights agree."""
+    """Return the covariance at the end, and which heights agree."""
     seen = _Seen.of(surface, given, motion, radius)
     scale = min(max(noise, 1.0), _MOST_NOISE)
     agree = seen.near & (np.abs(seen.residual) < _NEAR * scale * seen.sigma)
@@ -336,7 +343,7 @@ def _told(
 
 
 def _rivals(seen: _Seen, agree: BoolArray, scale: float) -> int:
-    """The most of the heights that do not agree and lie within each other's noise."""
+    """Return the most of the heights that do not agree and lie within each other's noise."""
     others = seen.near & ~agree
     off = np.sort(seen.residual[others])
     if not len(off):
@@ -346,7 +353,8 @@ def _rivals(seen: _Seen, agree: BoolArray, scale: float) -> int:
 
 
 def _inflation(place: Array, forms: Array, alone: Array, surface: Surface) -> Array:
-    """Factors (7,) of standard deviations: what neighbours share, by groups of growing size (a sandwich estimate).
+    """Return the factors (7,) of standard deviations: what neighbours share, by groups of growing size (a
+    sandwich estimate).
 
     `forms` (n, 7) are the weighted residuals by the motions, `alone` (7,) the variances of their sums if each were
     independent.

@@ -60,51 +60,53 @@ class Unknowns:
 
     @property
     def constants(self) -> int:
-        """Of these, the first, which are not of the drift."""
+        """Number of unknowns of a view before those of the drift."""
         return 3 * (self.rotates + self.translates)
 
     @property
     def in_waves(self) -> slice:
-        """Where a view's unknowns in the image are."""
+        """Slice of a view's unknowns that act in the image."""
         return slice(self._in_space, self.size)
 
     @property
     def rotates(self) -> bool:
-        """Whether there is a rotation."""
+        """Whether views rotate."""
         return "rotation" in self.model
 
     @property
     def translates(self) -> bool:
-        """Whether there is a translation."""
+        """Whether views translate."""
         return "translation" in self.model
 
     def rotation(self, params: Array, views: slice = slice(None)) -> Array:
-        """Rotation vectors (n, 3) [rad] at the middle row, of the views whose unknowns (n, q) are given."""
+        """Return the rotation vectors (n, 3) [rad] at the middle row, of the views whose unknowns (n, q) are given."""
         if not self.rotates:
             return np.zeros((len(params), 3))
         return params[:, :3] / self.distance[views, None]
 
     def translation(self, params: Array) -> Array:
-        """Translations (N, 3) [m]."""
+        """Return the translations (N, 3) [m]."""
         if not self.translates:
             return np.zeros((len(params), 3))
         start = 3 * self.rotates
         return params[:, start : start + 3]
 
     def drift_vectors(self, params: Array) -> Array:
-        """Rotation vectors (N, D, 3) [rad] that the powers of the normalised row add."""
+        """Return the rotation vectors (N, D, 3) [rad] that the powers of the normalised row add."""
         vectors = params[:, self.constants : self._in_space].reshape(len(params), self.drift, 3)
         return vectors / self.distance[:, None, None]
 
     def timing(self, params: Array, view: int) -> Timing:
-        """What the clocks of a radar with the unknowns (q,) are off by."""
+        """Return the clock correction of a radar with the unknowns (q,)."""
         radar = self.radars[view]
         drift = params[self.constants : self._in_space].reshape(-1, 3)[:, :2]
         place = (float(values[radar.azimuth_axis, view]) for values in (self.middle, self.half))
         return Timing(np.vstack([params[:2], drift]) / [1.0, radar.speed], *place)
 
     def stack_timing(self, by_timing: Array, along: Array, view: int) -> Array:
-        """Derivatives (2, 2, n) by range [px/m] and azimuth time [px/s] as (2, q, n) by a radar's unknowns."""
+        """Return derivatives (2, q, n) by a radar's unknowns from those (2, 2, n) by range [px/m] and azimuth
+        time [px/s].
+        """
         radar, out = self.radars[view], np.zeros((2, self.size, len(along)))
         u = (along - self.middle[radar.azimuth_axis, view]) / self.half[radar.azimuth_axis, view]
         part = by_timing / np.array([[1.0], [radar.speed]])
@@ -114,11 +116,11 @@ class Unknowns:
         return out
 
     def normalized(self, image: Array, index: IntArray) -> Array:
-        """col, row (2, n) [px] -> -1 at the left and the top, 1 at the right and the bottom of their images."""
+        """Return col, row (2, n) [px] normalised: -1 at the left and the top, 1 at the right and the bottom."""
         return (image - self.middle[:, index]) / self.half[:, index]
 
     def drift_rotation(self, params: Array, index: IntArray, row: Array) -> Array:
-        """Rotation (3, n) [rad] that the drift adds at normalised rows (n,)."""
+        """Return the rotation (3, n) [rad] that the drift adds at normalised rows (n,)."""
         vectors = self.drift_vectors(params).transpose(1, 2, 0)[:, :, index]  # (D, 3, n)
         added: Array = vectors[-1] * row
         for degree in range(self.drift - 2, -1, -1):
@@ -128,7 +130,7 @@ class Unknowns:
     def stack(
         self, by_rotation: Array, by_drift: Array, by_point: Array, index: IntArray, row: Array | None
     ) -> Array:
-        """Derivatives (2, 3, n) by rotations [px/rad] and point as derivatives (2, q, n) by unknowns."""
+        """Return derivatives (2, q, n) by unknowns from those (2, 3, n) by rotations [px/rad] and point."""
         out = np.empty((2, self.size, len(index)))
         inverse = (1.0 / self.distance)[index]
         at = 0
@@ -147,7 +149,9 @@ class Unknowns:
         return out
 
     def add_waves(self, image: Array, by_unknown: Array, params: Array, index: IntArray, seen: Array) -> None:
-        """Add what splines and steps do to points seen at (2, n) [px]: to image points (2, n) and derivatives."""
+        """Add the displacements by splines and steps to image points (2, n) seen at (2, n) [px], and to their
+        derivatives.
+        """
         assert self.waves is not None
         row = (seen[1] - self.middle[1, index]) / self.half[1, index]
         basis = self.waves.basis(row, seen, index)
@@ -158,7 +162,7 @@ class Unknowns:
     def in_image(
         self, params: Array, index: IntArray, image: Array, by_point: Array
     ) -> tuple[Array, Array, Array]:
-        """Image models: corrected image points (2, n), and the derivatives by point and by unknown."""
+        """Apply the models in the image: corrected image points (2, n), and the derivatives by point and by unknown."""
         basis = np.vstack([np.ones((1, image.shape[1])), self.normalized(image, index)])
         chosen = list(_IMAGE_TERMS[self.model])
         m = len(chosen)
@@ -172,7 +176,7 @@ class Unknowns:
         return moved, by_moved, by_unknown
 
     def corrected(self, params: Array, views: Sequence[View]) -> tuple[SensorModel, ...]:
-        """Every view's sensor behind the correction that its unknowns (N, q) stand for."""
+        """Return every view's sensor behind the correction that its unknowns (N, q) stand for."""
         if not self.geometric:
             return tuple(
                 ImageCorrected(view.sensor, self._affine(params[i], i)) for i, view in enumerate(views)
@@ -207,7 +211,7 @@ def make_unknowns(
     centers: Array | None = None,
     waves: Waves | None = None,
 ) -> Unknowns:
-    """The layout for N views; `centers` (N, 3), ECEF [m], are regressed from the sensors where None."""
+    """Return the layout for N views; `centers` (N, 3), ECEF [m], are regressed from the sensors where None."""
     size = np.array([view.size for view in views], dtype=np.float64).reshape(-1, 2)
     if model in _IMAGE_TERMS:
         centers = np.zeros((len(views), 3))

@@ -52,7 +52,7 @@ _LEAST = 0.5  # degrees of freedom below which nothing is said
 
 @dataclass(frozen=True, eq=False)
 class PriorTest:
-    """How the corrections of the views compare with the priors that were given."""
+    """Comparison of the views' corrections with the priors that were given."""
 
     # squared constant corrections (rotation, translation) over the variances given, over their degrees of
     # freedom: about 1 where the priors hold. NaN where the observations determine nothing
@@ -80,7 +80,7 @@ class _Around:
         return len(self.problem.free) <= _SMALL
 
     def under(self, prior: CameraPrior) -> tuple[float, Array, Covariance]:
-        """Evidence (logarithm, but for a constant), unknowns (N, q) and covariance under other priors."""
+        """Return the evidence (logarithm, but for a constant), unknowns (N, q) and covariance under other priors."""
         now, reduced, start = self.problem.camera_prior, self.minimum.reduced, self.minimum.state.params
         free = self.problem.free
         change = np.where(free, (1.0 / prior.sigma**2 - 1.0 / now.sigma**2).ravel(), 0.0)
@@ -117,7 +117,7 @@ class Variances:
         control: bool,
         views: Sequence[View] = (),
     ) -> Variances:
-        """What the options leave to be learnt, with control points or without."""
+        """Return the priors to be learnt by the options, with control points or without."""
         geometric = unknowns.geometric and options.learn_priors
         own = options.sigma_attitude is None and options.sigma_position is None and len(views) > 0
         stated = np.array([states_accuracy(view) for view in views]) if own else None
@@ -125,17 +125,17 @@ class Variances:
 
     @property
     def constants(self) -> int:
-        """Constant unknowns of a view, which come first."""
+        """Constant unknowns of a view."""
         return self.unknowns.constants if self.unknowns.geometric else 0
 
     def for_search(self) -> CameraPrior:
-        """Priors while outliers are looked for: a drift that was not expected must not look like them."""
+        """Return the wider priors used while outliers are looked for, so that unexpected drift is not cut."""
         return self._prior(np.ones(len(self.given.sigma)), np.full(self._degrees, _SEARCH))
 
     def learnt(
         self, problem: Problem, minimum: Minimum, exact: bool = False
     ) -> tuple[CameraPrior, PriorTest]:
-        """The priors that the block supports, in its linearisation at a minimum.
+        """Estimate the priors that the block supports, in its linearisation at a minimum.
 
         A large block's variances are probed unless they are to be `exact`.
         """
@@ -187,7 +187,8 @@ class Variances:
         return CameraPrior(prior.mean, sigma), tested
 
     def _shared(self, params: Array, known: Array) -> Array:
-        """By how much views that state an accuracy are to be widened (N,), as they share the error that they state.
+        """Return the factors (N,) by which views that state an accuracy are widened, as they share the error
+        that they state.
 
         Views that were adjusted together agree: what each is off by, they all are. Independent errors would leave
         them as large a part of the variance stated as their corrections show, at most. The rest does not average:
@@ -209,13 +210,13 @@ class Variances:
         return self.unknowns.waves is not None
 
     def _going_on(self, sigma: Array) -> Variances:
-        """With splines and steps as large as in the standard deviations (N, q)."""
+        """Return the priors with splines and steps as large as in the standard deviations (N, q)."""
         part, given = self.unknowns.in_waves, self.given.sigma.copy()
         given[:, part] = sigma[:, part]
         return replace(self, given=CameraPrior(self.given.mean, given))
 
     def _waves(self, params: Array, known: Array, sigma: Array) -> Array:
-        """The standard deviations (N, q), splines and steps as large as each view's show."""
+        """Return the standard deviations (N, q), splines and steps as large as each view's show."""
         assert self.unknowns.waves is not None
         first, bands = self.unknowns.in_waves.start, self.unknowns.waves.bands
         out = sigma.copy()
@@ -240,7 +241,7 @@ class Variances:
         return slice(self.constants + 3 * degree, self.constants + 3 * degree + 3)
 
     def _prior(self, scale: Array, wide: Array) -> CameraPrior:
-        """The priors given, constants wider by `scale` (N,), drifts by `wide` (D,)."""
+        """Return the priors given, constants wider by `scale` (N,), drifts by `wide` (D,)."""
         sigma = self.given.sigma.copy()
         sigma[:, : self.constants] *= scale[:, None]
         for degree, factor in enumerate(wide):
@@ -251,7 +252,7 @@ class Variances:
         return CameraPrior(self.given.mean, sigma)
 
     def _known(self, covariance: Covariance, prior: CameraPrior, exact: bool = True) -> Array:
-        """How far the observations determine each unknown (N, q): 0 not at all, 1 wholly."""
+        """Return the share (N, q), 0 to 1, by which the observations determine each unknown."""
         shape = prior.sigma.shape
         use = covariance.free.reshape(shape) & np.isfinite(prior.sigma)
         probed = covariance.is_large and not exact
@@ -262,19 +263,21 @@ class Variances:
     def _squares(
         self, params: Array, known: Array, scale: Array | float = 1.0, part: slice | None = None
     ) -> tuple[Array, Array]:
-        """Squared unknowns of every view (the constants, or a part) over their variances, and their freedom (N,)."""
+        """Return the squared unknowns of every view (the constants, or a part) over their variances, and
+        their freedom (N,).
+        """
         part = slice(self.constants) if part is None else part
         sigma = self.given.sigma[:, part] * np.reshape(scale, (-1, 1))
         squared = ((params - self.given.mean)[:, part] / sigma) ** 2
         return np.where(known[:, part] > 0, squared, 0.0).sum(axis=1), known[:, part].sum(axis=1)
 
     def _too_large(self, params: Array, known: Array, scale: Array) -> bool:
-        """Whether the corrections are larger than chance allows."""
+        """Return whether the corrections are larger than chance allows."""
         total, freedom = (float(part.sum()) for part in self._squares(params, known, scale))
         return freedom > _LEAST and float(chdtrc(freedom, total)) < _LEVEL
 
     def _widened(self, around: _Around, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
-        """By how much each view's prior is to be widened (N,), and which views are odd."""
+        """Return the factors (N,) by which each view's prior is widened, and the views that are odd."""
         n = len(params)
         total, freedom = self._squares(params, known)
         factor = max((_STRENGTH + total.sum()) / (_STRENGTH + freedom.sum()), 1.0)
@@ -298,7 +301,7 @@ class Variances:
         return np.sqrt(np.where(odd, np.maximum(alone, factor), factor)), odd
 
     def _odd(self, around: _Around, wide: Array) -> tuple[Array, BoolArray, float]:
-        """Few views whose cameras explain the corrections, by forward selection, and the evidence for them."""
+        """Find a few views whose cameras explain the corrections, by forward selection, and the evidence for them."""
         n = len(self.given.sigma)
         odd, chosen = np.zeros(n, dtype=bool), np.ones(n)
         scale, last = np.ones(n), -np.inf
@@ -315,7 +318,7 @@ class Variances:
         return scale, odd, last
 
     def _alone(self, around: _Around, wide: Array, scale: Array, v: int) -> tuple[float, float]:
-        """Evidence for view v being odd as well, and the factor that its prior then needs."""
+        """Return the evidence for view v being odd as well, and the factor that its prior then needs."""
         trial = scale.copy()
         trial[v] = _FREE
         prior = self._prior(trial, wide)
@@ -329,7 +332,7 @@ class Variances:
         return around.under(self._prior(trial, wide))[0], float(trial[v])
 
     def _drift(self, params: Array, known: Array) -> Array:
-        """By how much the drift's standard deviations are to be changed (D,), the given ones counting for a few."""
+        """Return the factors (D,) on the drift's standard deviations, the given ones counting for a few."""
         waves = self.unknowns.waves  # of which splines and steps follow what else bends heights
         careful = self.cautious and not (waves and (waves.count or waves.edges.size))
         factors = np.ones(self._degrees)
@@ -342,12 +345,13 @@ class Variances:
 
 
 def _possible(total: float, freedom: float) -> float:
-    """A variance, in units of the one given, that still makes such a sum of squares likely enough."""
+    """Return a variance, in units of the one given, that still makes such a sum of squares likely enough."""
     return float(total / (2.0 * gammaincinv(0.5 * freedom, _LOW)))
 
 
 def same_prior(a: CameraPrior, b: CameraPrior, share: float, part: slice | None = None) -> bool:
-    """Whether the standard deviations of two priors differ by less than a share; infinite ones are infinite in both.
+    """Return whether the standard deviations of two priors differ by less than a share; infinite ones are
+    infinite in both.
 
     Of all unknowns, or a part.
     """

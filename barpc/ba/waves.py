@@ -53,7 +53,7 @@ class Waves:
         return vectors * np.where(vectors[-1] < 0, -1.0, 1.0)
 
     def splines(self, row: Array) -> Array:
-        """What one unit of the splines' unknowns of one coordinate adds (m, n) at rows (n,) normalised."""
+        """Return the displacement (m, n) at normalised rows (n,) by one unit of each spline unknown of a coordinate."""
         found: Array = self._of_splines.T @ bsplines(row, self.count)
         return found
 
@@ -67,7 +67,7 @@ class Waves:
 
     @property
     def parts(self) -> tuple[int, int, int, int]:
-        """Unknowns of one coordinate: of splines, of steps, of strips, of swings: all cosines, then all sines."""
+        """Numbers of unknowns of one coordinate: splines, steps, strips, swings (cosines, then sines)."""
         return (
             self._of_splines.shape[1],
             self._of_steps.shape[1],
@@ -77,7 +77,7 @@ class Waves:
 
     @property
     def size(self) -> int:
-        """Unknowns of a view."""
+        """Number of unknowns of a view."""
         return 2 * sum(self.parts)
 
     @property
@@ -92,7 +92,9 @@ class Waves:
 
     @cached_property
     def bands(self) -> Array:
-        """Which unknowns (size,) are about as large: half an octave of waves, or steps, or strips, or swings."""
+        """Groups of unknowns (size,) expected to be about as large: half an octave of waves, steps, strips,
+        or swings.
+        """
         m, *others = self.parts
         octave = 2.0 * np.log2(np.arange(m) + _DEGREE + 1.0)
         rank = np.unique(np.floor(octave), return_inverse=True)[1]
@@ -103,7 +105,8 @@ class Waves:
         return np.concatenate(found)
 
     def stretches(self, rows: float) -> float:
-        """In how many parts of images of so many rows an error that neighbours share is another to these unknowns.
+        """Return the number of parts of an image of so many rows over which an error shared by neighbours
+        counts anew.
 
         A swing takes the mean of one in each half of its waves, and of each coordinate.
         """
@@ -113,7 +116,8 @@ class Waves:
         return self.size - of_swings + max(4.0 * float(waves.max(initial=0.0)), of_swings)
 
     def basis(self, row: Array, seen: Array, index: IntArray) -> list[Array]:
-        """What one unit of the unknowns of one coordinate adds (m, n), kind by kind, to points seen at (2, n) [px].
+        """Return the displacement (m, n) of points seen at (2, n) [px] by one unit of each unknown of a
+        coordinate, kind by kind.
 
         Their rows (n,) normalised are given, too.
         """
@@ -129,7 +133,9 @@ class Waves:
         return found
 
     def displaced(self, params: Array, index: IntArray, basis: list[Array]) -> Array:
-        """Displacement (2, n) [px] of observations of views `index` (n,) whose unknowns are `params` (N, size)."""
+        """Return the displacement (2, n) [px] of observations of views `index` (n,) whose unknowns are
+        `params` (N, size).
+        """
         out = np.zeros((2, len(index)))
         for part, one in zip(self._filled, basis, strict=True):
             of_views = params[:, part].reshape(len(params), 2, -1)
@@ -139,14 +145,14 @@ class Waves:
         return out
 
     def stack(self, out: Array, basis: list[Array]) -> None:
-        """Put the derivatives by the unknowns into (2, size, n)."""
+        """Write the derivatives by the unknowns into (2, size, n)."""
         out[...] = 0.0
         for part, one in zip(self._filled, basis, strict=True):
             middle = (part.start + part.stop) // 2
             out[0, part.start : middle] = out[1, middle : part.stop] = one
 
     def correction(self, params: Array, view: int, row_offset: float, row_scale: float) -> RowSpline:
-        """The correction of a view with the unknowns (size,)."""
+        """Return the correction of a view with the unknowns (size,)."""
         (m, s, num, swings), (_, of_steps, of_strips, of_swings) = self.parts, self.kinds
         coeffs = self._of_splines @ params[: 2 * m].reshape(2, m).T if m else np.zeros((0, 2))
         found = RowSpline(coeffs, row_offset, row_scale)
@@ -165,7 +171,7 @@ class Waves:
         return found
 
     def carried(self, params: Array, known: Waves) -> Array:
-        """Unknowns (N, size) that start from those of another layout (N, known.size), kind by kind where they agree."""
+        """Return unknowns (N, size) started from those of another layout (N, known.size), where kinds agree."""
         out = np.zeros((len(params), self.size))
         same = self.count == known.count, False, bool(known.parts[2]), self.parts[3] == known.parts[3]
         for agrees, mine, theirs in zip(same, self.kinds, known.kinds, strict=True):
@@ -178,6 +184,6 @@ class Waves:
 
 
 def _complement(vectors: Array) -> Array:
-    """An orthonormal basis (n, n - k) of what is orthogonal to vectors (n, k)."""
+    """Return an orthonormal basis (n, n - k) of what is orthogonal to vectors (n, k)."""
     q: Array = np.asarray(la.qr(vectors)[0], dtype=np.float64)
     return q[:, vectors.shape[1] :]

@@ -28,29 +28,31 @@ Loss = Callable[[Array], tuple[Array, Array]]
 
 
 def linear(s: Array) -> tuple[Array, Array]:
-    """Least squares: rho = s."""
+    """Return rho(s) = s and its derivative: least squares."""
     return s, np.ones_like(s)
 
 
 def huber(s: Array) -> tuple[Array, Array]:
-    """Squares up to 1, absolute values beyond."""
+    """Return rho(s) and its derivative: squares up to 1, absolute values beyond."""
     root = np.sqrt(np.maximum(s, 1.0))
     return np.where(s <= 1.0, s, 2.0 * root - 1.0), 1.0 / root
 
 
 def soft_l1(s: Array) -> tuple[Array, Array]:
-    """A smooth form of the absolute value: rho = 2 (sqrt(1 + s) - 1)."""
+    """Return rho(s) = 2 (sqrt(1 + s) - 1) and its derivative: a smooth absolute value."""
     root = np.sqrt(1.0 + s)
     return 2.0 * (root - 1.0), 1.0 / root
 
 
 def cauchy(s: Array) -> tuple[Array, Array]:
-    """Rho = log(1 + s)."""
+    """Return rho(s) = log(1 + s) and its derivative."""
     return np.log1p(s), 1.0 / (1.0 + s)
 
 
 def geman_mcclure(s: Array) -> tuple[Array, Array]:
-    """Rho = s / (1 + s): an outlier's pull vanishes; meant for a scale that shrinks round by round."""
+    """Return rho(s) = s / (1 + s) and its derivative: an outlier's pull vanishes; for scales that shrink
+    round by round.
+    """
     return s / (1.0 + s), 1.0 / (1.0 + s) ** 2
 
 
@@ -65,7 +67,7 @@ LOSSES: dict[str, Loss] = {
 
 
 class Observations:
-    """How much observations count: stated sigmas, the observed noise, and the cap on a view's information."""
+    """Weights of observations: stated sigmas, the observed noise, and the cap on a view's information."""
 
     def __init__(
         self,
@@ -90,19 +92,21 @@ class Observations:
         self.is_control = ~is_tie & ~self.of_reference & self.has_prior[self.structure.point]
 
     def is_spared(self, squared: Array) -> BoolArray:
-        """Observations (K,) of control points: they are tested point by point at the end, unless grossly wrong.
+        """Return the observations (K,) of control points, which are tested at the end instead of cut, unless
+        grossly wrong.
 
         Those of a reference agree with each other: how far the cameras are off says nothing of them.
         """
         return np.asarray((self.is_control & (squared < _GROSS**2)) | self.of_reference)
 
     def is_near(self, squared: Array, scale: float) -> BoolArray:
-        """Observations (K,) that are no farther off than so many standard deviations; a reference's by their own."""
+        """Return the observations (K,) within a number of standard deviations; a reference's by their own limit."""
         near = np.where(self.of_reference, squared <= _CUT**2, squared <= scale * scale)
         return np.asarray(near | (self.is_control & (squared < _GROSS**2)))
 
     def freedom(self, counted: Array) -> Array:
-        """Degrees of freedom (K,) of an observation once its point is estimated: 1/2 of two views', to 2.
+        """Return the degrees of freedom (K,) left of an observation once its point is estimated, 1/2 (two
+        views) to 2.
 
         `counted` (K,) says how much each observation counts; a track with one that counts for nothing is a
         track of the others.
@@ -117,12 +121,12 @@ class Observations:
         return freedom
 
     def squared(self, residual: Array, counted: Array) -> Array:
-        """|r|^2 (K,) over its expectation under the stated sigmas."""
+        """Return the squared residuals (K,) over their expectation under the stated sigmas."""
         s: Array = (residual**2).sum(axis=0) / self.sigma**2 / self.freedom(counted)
         return np.where(np.isfinite(s), s, np.inf)
 
     def weight(self, use: BoolArray, noise: float, misfit: Array | float = 0.0) -> Array:
-        """1 / sigma (K,) [1/px], tie points under the cap; 0 where not used.
+        """Return the weights 1 / sigma (K,) [1/px], tie points under the cap; 0 where not used.
 
         What a view's camera cannot follow, `misfit` (N,) [px], does not average away either: it is as good as
         `SPLINES` independent errors.
@@ -137,7 +141,8 @@ class Observations:
         return np.where(self.is_tie, weight * cap[self.structure.view], weight)
 
     def noise(self, residual: Array, use: BoolArray, problem: Problem, fitted: int = 0) -> float:
-        """Observed over stated standard deviation of the observations in use; 1 where there are too few.
+        """Estimate the observed over stated standard deviation of the observations in use; 1 where there are
+        too few.
 
         `fitted` further parameters have been taken out of the residuals.
         """
@@ -151,7 +156,7 @@ class Observations:
         return max(float(np.sqrt((whitened**2).sum() / freedom)), 1e-6)
 
     def tied(self, use: BoolArray) -> BoolArray:
-        """`use` without the observations whose point is left without a second one (or a prior)."""
+        """Return `use` without the observations whose point is left without a second one (or a prior)."""
         structure = self.structure
         count = np.bincount(structure.point[use], minlength=structure.num_points)
         return use & ((count >= 2) | self.has_prior)[structure.point]

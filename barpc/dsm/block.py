@@ -34,12 +34,12 @@ Pairs = tuple[tuple[int, int], ...]
 
 
 class NoSurfaceError(BarpcError):
-    """Images of which no surface can be made in this way: why, in a sentence."""
+    """Images of which no surface can be made, with the reason."""
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Views with the cameras that are believed, their pairs, and the cameras' errors if they are known.
+    """Views with the cameras that are believed, their pairs, and the covariance of the cameras where known.
 
     `groups`: the pairs of which a surface is made; of a difference those of the surface that is taken away, too.
     """
@@ -51,7 +51,8 @@ class Block:
 
 
 def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: Path | None = None) -> Block:
-    """The images of a finished run behind its corrected cameras; altitudes by its tie points unless given.
+    """Return the images of a finished run behind its corrected cameras; altitudes by its tie points unless
+    given.
 
     `minus`: a run of some of these images (an earlier one, that this one went on from); they are another group then.
 
@@ -84,7 +85,7 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: P
 
 
 def _split(folder: Path, names: Sequence[str], minus: Path) -> list[list[int]]:
-    """The images that another run does not have, and those that it has; InputError where either are too few."""
+    """Return the images that another run does not have, and those that it has; InputError where either are too few."""
     there = {view.name for view in read_summary(minus).views}
     parts = [[i for i, name in enumerate(names) if (name in there) == old] for old in (False, True)]
     if min(map(len, parts)) < 2:
@@ -96,7 +97,7 @@ def _split(folder: Path, names: Sequence[str], minus: Path) -> list[list[int]]:
 
 
 def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = None, band: int = 1) -> Block:
-    """Images with the cameras that come with them; altitudes are those of the cameras unless given."""
+    """Return the images with the cameras that come with them; altitudes are those of the cameras unless given."""
     views = [replace(view, alt_range=alts or view.alt_range) for view in load_views(images, band=band).views]
     for view in views:
         if is_radar(view.sensor):
@@ -105,7 +106,7 @@ def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = No
 
 
 def _camera(folder: Path, shot: Shot) -> SensorModel:
-    """What a run says of a camera: its RPC with the correction grid, where it wrote one."""
+    """Read a camera from a run: its RPC with the correction grid, where it wrote one."""
     grid = shot.name + CORRECTION
     return open_camera(folder / grid).model if grid in shot.entry.outputs else shot.rpc
 
@@ -123,7 +124,8 @@ def _best(
     ties: dict[tuple[int, int], float] | None = None,
     among: Sequence[int] | None = None,
 ) -> Pairs:
-    """Pairs (`among` some views) by what they say of heights: of one date first, then by tie points times (B/H)^2.
+    """Return the pairs (`among` some views) by what they say of heights: of one date first, then by tie
+    points times (B/H)^2.
 
     A height's variance is that of a match over (B/H)^2, and where tie points are found, dense matches are. Without
     tie points the overlap and the angle stand for them (`barpc.tie.pairs.Pair.score`).

@@ -50,14 +50,16 @@ class Tile:
     alts: tuple[float, float]
 
     def nodes(self, count: int = _NODES) -> Array:
-        """Longitude, latitude (count^2, 2) [deg] on a grid from corner to corner, rows from the north slowest."""
+        """Return the longitude, latitude (count^2, 2) [deg] on a grid from corner to corner, rows from the
+        north slowest.
+        """
         x = self.west + self.step * np.linspace(0, self.size[0], count)
         y = self.north - self.step * np.linspace(0, self.size[1], count)
         east, north = (part.ravel() for part in np.meshgrid(x, y))
         return np.column_stack(transform(CRS.from_wkt(self.crs), CRS.from_epsg(4326), east, north))
 
     def parts(self) -> list[Tile]:
-        """Its quarters."""
+        """Return the tile's quarters."""
         half = self.size[0] // 2, self.size[1] // 2
         cols, rows = ((0, half[0]), (half[0], self.size[0])), ((0, half[1]), (half[1], self.size[1]))
         return [
@@ -73,7 +75,9 @@ class Tile:
         ]
 
     def places(self) -> Callable[[Array], Array]:
-        """A function of lon, lat (n, 2) [deg]: col, row (n, 2) of its cells. Cubics: to 0.1 mm over 10 km."""
+        """Return a function from lon, lat (n, 2) [deg] to col, row (n, 2) of the tile's cells (cubics: 0.1 mm
+        over 10 km).
+        """
         nodes = self.nodes()
         col, row = np.meshgrid(np.linspace(0, self.size[0], _NODES), np.linspace(0, self.size[1], _NODES))
         middle = nodes.mean(axis=0) if np.ptp(nodes[:, 0]) < 180.0 else nodes[0]
@@ -88,14 +92,14 @@ class Tile:
 
 
 def _cubic(at: Array) -> Array:
-    """Monomials (n, 10) up to the third degree."""
+    """Return the monomials (n, 10) up to the third degree."""
     x, y = at.T
     xx, yy = x * x, y * y
     return np.column_stack([np.ones(len(x)), x, y, xx, x * y, yy, xx * x, xx * y, x * yy, yy * y])
 
 
 def surface_tile(pairs: Sequence[tuple[View, View]], tile: Tile, band: int) -> tuple[F32, ...]:
-    """The cells of a tile, in a worker: of each pair's matches the median, of the pairs' heights the median.
+    """Compute the cells of a tile in a worker: the median of each pair's matches, then of the pairs' heights.
 
     Returns
     -------
@@ -118,7 +122,7 @@ def surface_tile(pairs: Sequence[tuple[View, View]], tile: Tile, band: int) -> t
 
 
 def _merged(heights: F32, sigmas: F32) -> tuple[F32, ...]:
-    """Median height of the pairs, their NMAD (NaN of one pair), RMS sigma, and which pairs have one."""
+    """Return the median height of the pairs, their NMAD (NaN of one pair), RMS sigma, and which pairs have one."""
     known = np.isfinite(heights)
     height = _median(heights)
     nmad = 1.4826 * _median(np.abs(heights - height))
@@ -130,7 +134,7 @@ def _merged(heights: F32, sigmas: F32) -> tuple[F32, ...]:
 
 
 def _median(values: F32) -> F32:
-    """Median over the first axis of what is known; NaN where nothing is."""
+    """Return the median over the first axis of what is known; NaN where nothing is."""
     ordered, count = np.sort(values, axis=0), np.isfinite(values).sum(axis=0)  # NaN come last
     at = np.stack([np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1)])
     return np.asarray(np.take_along_axis(ordered, at, axis=0).mean(axis=0), np.float32)
@@ -139,7 +143,9 @@ def _median(values: F32) -> F32:
 def _points(
     pair: tuple[View, View], tile: Tile, band: int, halved: int = 0
 ) -> tuple[Array, Array, float] | None:
-    """Ground points (n, 3), their standard deviation in height (n,) [m] and the share matched; None where unseen."""
+    """Return the ground points (n, 3), their standard deviation in height (n,) [m] and the share matched;
+    None where unseen.
+    """
     frame = _frame(pair, tile)
     zoom = 1 if frame is None else _zoom(frame)
     while zoom > 1 and frame is not None:
@@ -160,14 +166,14 @@ def _points(
 
 
 def _zoom(frame: EpipolarFrame) -> int:
-    """Pixels a side that are one of a picture in which all disparities are searched at once."""
+    """Return the pixels a side that are one of a picture in which all disparities are searched at once."""
     return min(_COARSE, 1 << max(0, int(np.ceil(np.log2(frame.num / (FINER * _SPAN))))))
 
 
 def _matched(
     pair: tuple[View, View], tile: Tile, band: int, zoom: int = 1
 ) -> tuple[Array, Array, float] | None:
-    """As `_points`, of pictures whose pixels are means of `zoom` px a side."""
+    """Match as `_points`, on pictures whose pixels are means of `zoom` px a side."""
     frame = _frame(pair, tile, zoom)
     sizes = [(view.size[0] // zoom, view.size[1] // zoom) for view in pair]
     found = None if frame is None else dense_matches([view.path for view in pair], sizes, frame, band)
@@ -186,7 +192,7 @@ def _joined(parts: Sequence[tuple[Array, Array, float]]) -> tuple[Array, Array, 
 
 
 def _frame(pair: tuple[View, View], tile: Tile, zoom: int = 1) -> EpipolarFrame | None:
-    """The frame of the part of two pictures that shows a tile; None where a camera has no answer."""
+    """Return the frame of the part of two pictures that shows a tile; None where a camera has no answer."""
     nodes = tile.nodes()
     levels = np.repeat(np.linspace(tile.alts[0], max(tile.alts[1], tile.alts[0] + 1.0), _LEVELS), len(nodes))
     ground = np.column_stack([np.tile(nodes, (_LEVELS, 1)), levels])
@@ -195,7 +201,7 @@ def _frame(pair: tuple[View, View], tile: Tile, zoom: int = 1) -> EpipolarFrame 
 
 
 def _intersected(pair: tuple[View, View], found: Matches, zoom: int) -> Array:
-    """Ground points (n, 3) of matches; NaN where the rays do not meet."""
+    """Return the ground points (n, 3) of matches; NaN where the rays do not meet."""
     ground = np.empty((len(found.a), 3))
     places = (np.stack([found.a, found.b], axis=1) + 0.5) * zoom - 0.5
     for start in range(0, len(ground), _AT_ONCE):
@@ -209,7 +215,7 @@ def _intersected(pair: tuple[View, View], found: Matches, zoom: int) -> Array:
 
 
 def _gathered(tile: Tile, ground: Array, sigma: Array) -> tuple[F32, F32]:
-    """Median height and RMS sigma of the points in each cell (rows, cols); NaN where there is none."""
+    """Return the median height and RMS sigma of the points in each cell (rows, cols); NaN where there is none."""
     width, height = tile.size
     col, row = np.floor(tile.places()(ground[:, :2])).astype(np.int64).T
     inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)

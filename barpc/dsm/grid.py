@@ -48,7 +48,7 @@ _BITS = 16  # of a pattern of pairs
 
 @dataclass
 class Counts:
-    """What is counted as tiles come: cells with a height, the largest share matched, some cells' bands, the datum."""
+    """Statistics gathered over tiles: cells with a height, largest share matched, some cells' bands, the datum."""
 
     known: int = 0
     share: float = float("nan")
@@ -71,7 +71,7 @@ class Grid:
 
     @classmethod
     def of(cls, block: Block, options: DsmOptions) -> Grid:
-        """The cells in UTM or the CRS asked for, at twice the ground sampling distance unless told."""
+        """Return the grid of cells in UTM or the CRS asked for, of twice the ground sampling distance unless told."""
         first = block.views[block.groups[0][0][0]]
         middle = first.sensor.localize((np.array(first.size) - 1) / 2, np.array(first.altitude))
         crs = _crs(options.crs, middle)
@@ -88,7 +88,7 @@ class Grid:
         return cls(block, options, crs, west, north, step, size, outlines)
 
     def tiles(self) -> list[tuple[tuple[int, int], tuple[Pairs, ...]]]:
-        """First col, row of every tile that is seen, and the best pairs of each group that see it."""
+        """Yield the first col, row of every tile that is seen, and the best pairs of each group that see it."""
         found = []
         for row in range(0, self.size[1], SIDE):
             for col in range(0, self.size[0], SIDE):
@@ -102,13 +102,13 @@ class Grid:
         return found
 
     def box(self, col: int, row: int) -> Any:
-        """The outline of a tile on the map."""
+        """Return the outline of a tile on the map."""
         width, height = min(SIDE, self.size[0] - col), min(SIDE, self.size[1] - row)
         left, top = self.west + self.step * col, self.north - self.step * row
         return shapely.box(left, top - self.step * height, left + self.step * width, top)
 
     def tile(self, col: int, row: int) -> Tile:
-        """The tile that begins at a cell."""
+        """Return the tile that begins at a cell."""
         size = min(SIDE, self.size[0] - col), min(SIDE, self.size[1] - row)
         views = self.block.views
         alts = max(v.alt_range[0] for v in views), min(v.alt_range[1] for v in views)
@@ -144,7 +144,9 @@ class Grid:
         return counts
 
     def _shared(self, seen: Sequence[tuple[tuple[int, int], tuple[Pairs, ...]]]) -> Array:
-        """Derivative (V q,) of the mean height of all cells, or difference of it, by the cameras' unknowns."""
+        """Return the derivative (V q,) of the mean height of all cells, or difference of it, by the cameras'
+        unknowns.
+        """
         errors, rows = self.block.errors, []
         if errors is None:
             return np.zeros(0)
@@ -159,7 +161,7 @@ class Grid:
     def _bands(
         self, tile: Tile, groups: Sequence[Pairs], results: Sequence[Sequence[F32]], shared: Array
     ) -> F32:
-        """The bands (5, rows, cols) of a tile: of one group of pairs, or of the first minus the second."""
+        """Return the bands (5, rows, cols) of a tile: of one group of pairs, or of the first minus the second."""
         errors, shape = self.block.errors, results[0][0].shape
         height = results[0][0] - sum(one[0] for one in results[1:])
         parts = [np.nan_to_num(one[3]).astype(np.int64) << _BITS * g for g, one in enumerate(results)]
@@ -212,13 +214,13 @@ class Grid:
 
 
 def _nodes(tile: Tile) -> Array:
-    """Ground points of a tile at its middle altitude."""
+    """Return the ground points of a tile at its middle altitude."""
     nodes = tile.nodes(_NODES)
     return np.column_stack([nodes, np.full(len(nodes), sum(tile.alts) / 2)])
 
 
 def _spread(values: Array, size: tuple[int, int]) -> Array:
-    """Values at a tile's nodes over its cells (rows, cols), linearly."""
+    """Interpolate values at a tile's nodes over its cells (rows, cols), linearly."""
     at = [(np.arange(side) + 0.5) / side * (_NODES - 1) for side in size]
     grid, nodes = values.reshape(_NODES, _NODES), np.arange(_NODES)
     along = np.stack([np.interp(at[0], nodes, row) for row in grid])
@@ -232,7 +234,7 @@ def _pixel(view: View) -> float:
 
 
 def _crs(given: str | None, middle: Array) -> CRS:
-    """The CRS that was asked for, in metres, or the UTM zone of a place."""
+    """Return the CRS that was asked for, in metres, or the UTM zone of a place."""
     if given is None:
         zone = int((middle[0] + 180.0) // 6.0) % 60 + 1
         return CRS.from_epsg((32600 if middle[1] >= 0 else 32700) + zone)
@@ -248,7 +250,7 @@ def _crs(given: str | None, middle: Array) -> CRS:
 
 
 def _common(first: View, second: View, crs: CRS) -> Any:
-    """The ground that two views see at their lowest or highest altitude, on the map."""
+    """Return the ground that two views see at their lowest or highest altitude, on the map."""
     low, high = max(first.alt_range[0], second.alt_range[0]), min(first.alt_range[1], second.alt_range[1])
     parts = []
     for alt in (low, high):

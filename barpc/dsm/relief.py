@@ -29,7 +29,7 @@ _LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])  # from the north-west, 45 degrees 
 
 
 def show_in_report(folder: Path, grid: Grid, out: Path) -> None:
-    """Put both into the report of a run; where that cannot be, a line says why, and the surface stays as it is."""
+    """Add both reliefs to the report of a run; where that fails a line says why, and the surface stays."""
     try:
         text = json.dumps(_reliefs(folder, grid, out))
         with Workspace(folder, overwrite=True, names=[SURFACE], adds=True) as run:
@@ -41,7 +41,7 @@ def show_in_report(folder: Path, grid: Grid, out: Path) -> None:
 
 
 def _reliefs(folder: Path, grid: Grid, out: Path) -> list[dict[str, object]]:
-    """What `barpc.report.tables` reads: of the tile that has most heights."""
+    """Return the reliefs, as `barpc.report.tables` reads them, of the tile that has most heights."""
     with open_raster(out) as file:
         found = []
         for at, groups in grid.tiles():
@@ -57,7 +57,7 @@ def _reliefs(folder: Path, grid: Grid, out: Path) -> list[dict[str, object]]:
 
 
 def _delivered(folder: Path, views: tuple[View, ...]) -> list[View]:
-    """The views with the cameras that came with their images."""
+    """Return the views with the cameras that came with their images."""
     sources = {view.name: view.rpc_source for view in read_summary(folder).views}
     found = []
     for view in views:
@@ -80,7 +80,9 @@ def _one(cameras: str, height: F32, nmad: F32, step: float) -> dict[str, object]
 
 
 def shaded(height: F32, step: float) -> npt.NDArray[np.uint8]:
-    """A relief (rows, cols) [m] in the light of the north-west, cells of `step` [m]; black where nothing is known."""
+    """Return a relief (rows, cols) [m] in the light of the north-west, cells of `step` [m]; black where
+    nothing is known.
+    """
     by_row, by_col = np.gradient(height.astype(np.float64), step)
     normal = np.stack([-by_col, by_row, np.ones(height.shape)])  # rows count to the south
     light = np.einsum("i,ijk->jk", _LIGHT, normal / np.linalg.norm(normal, axis=0))

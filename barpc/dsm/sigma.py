@@ -26,7 +26,8 @@ class CameraErrors:
 
     @classmethod
     def of(cls, prior: BlockPrior, views: Sequence[View]) -> CameraErrors:
-        """The errors that an adjustment left in the cameras of these views; those that it held fixed have none.
+        """Return the errors that an adjustment left in the cameras of these views; those that it held fixed
+        have none.
 
         The derivatives are those at the corrected cameras: corrections are so small that they change none of them.
         """
@@ -60,7 +61,7 @@ class CameraErrors:
         return cls(Cameras(views, unknowns), covariance)
 
     def rows(self, pair: tuple[int, int], ground: Array) -> Array:
-        """Derivative (n, V q) of heights that a pair measures at ground points (n, 3) by all unknowns."""
+        """Return the derivative (n, V q) of heights that a pair measures at ground points (n, 3) by all unknowns."""
         q = self.cameras.unknowns.size
         params = np.zeros((len(self.cameras.sensors), q))
         by_pair = height_by_unknowns(self.cameras, params, pair, ecef_from_ground(ground))
@@ -70,6 +71,8 @@ class CameraErrors:
         return out
 
     def sigma(self, rows: Array) -> Array:
-        """Standard deviation (n,) [m] of heights, or differences of them, with these derivatives (n, V q)."""
+        """Return the standard deviation (n,) [m] of heights, or differences of them, with these derivatives
+        (n, V q).
+        """
         square: Array = np.einsum("ni,ij,nj->n", rows, self.covariance, rows)
         return np.asarray(np.sqrt(np.maximum(square, 0.0)))

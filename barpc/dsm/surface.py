@@ -27,7 +27,7 @@ from barpc.workspace import Workspace
 
 @dataclass(frozen=True)
 class Surface:
-    """What became of a surface: the file, its cells, and medians over them [m]; NaN where not known.
+    """Result of a surface: its file, its cells, and medians over them [m]; NaN where not known.
 
     `known`: cells with a height; `share`: of the pixels that both images of a pair show so many were matched;
     `datum`: standard deviation of the height that all cells share.
@@ -108,7 +108,7 @@ def make_dsm(
 
 
 def _room(out: Path) -> Path:
-    """Where results of tiles are kept beside the file until it is whole: the same command goes on with them."""
+    """Return the folder beside the file in which results of tiles are kept until it is whole."""
     return out.parent / f"{out.name}.unfinished"
 
 

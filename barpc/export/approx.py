@@ -29,7 +29,7 @@ class Sampled:
     image: Array
 
     def error(self, projected: Array) -> float:
-        """Largest distance [px] of projections (N, 2) from where the image shows the points."""
+        """Return the largest distance [px] of projections (N, 2) from where the image shows the points."""
         return float(np.linalg.norm(projected - self.image, axis=1).max())
 
 
@@ -43,13 +43,13 @@ class Pinhole:
     translation: Array
 
     def project(self, world: Array) -> Array:
-        """Image points (N, 2) [px] of points (N, 3) [m]."""
+        """Return the image points (N, 2) [px] of points (N, 3) [m]."""
         seen = world @ self.rotation.T + self.translation
         return np.asarray(seen[:, :2] / seen[:, 2:] * self.focal + self.center)
 
 
 def fit_affine(samples: Sampled) -> Array:
-    """The matrix (2, 4) of (X, Y, Z, 1), by least squares."""
+    """Return the matrix (2, 4) of (X, Y, Z, 1), by least squares."""
     scale = np.abs(samples.world).max()
     rows = np.column_stack([samples.world / scale, np.ones(len(samples.world))])
     found = np.linalg.lstsq(rows, samples.image)[0].T
@@ -57,12 +57,14 @@ def fit_affine(samples: Sampled) -> Array:
 
 
 def project_affine(matrix: Array, world: Array) -> Array:
-    """Image points (N, 2) [px]."""
+    """Return the image points (N, 2) [px]."""
     return np.asarray(world @ matrix[:, :3].T + matrix[:, 3])
 
 
 def fit_projective(samples: Sampled) -> Array:
-    """The matrix (3, 4) of a pinhole with skew, 1 in its last place, by least squares weighted anew with its depths."""
+    """Return the matrix (3, 4) of a pinhole with skew, 1 in its last place, by least squares weighted anew
+    with its depths.
+    """
     scale, middle = np.abs(samples.world).max(), samples.image.mean(axis=0)
     reach = np.abs(samples.image - middle).max()
     world, image = samples.world / scale, (samples.image - middle) / reach
@@ -81,13 +83,13 @@ def fit_projective(samples: Sampled) -> Array:
 
 
 def project_projective(matrix: Array, world: Array) -> Array:
-    """Image points (N, 2) [px]."""
+    """Return the image points (N, 2) [px]."""
     seen = world @ matrix[:, :3].T + matrix[:, 3]
     return np.asarray(seen[:, :2] / seen[:, 2:])
 
 
 def factored(matrix: Array) -> tuple[Array, Array, Array]:
-    """K (3, 3) with its skew, rotation, translation of a projective matrix: K [R | t] in proportion to it."""
+    """Return K (3, 3) with its skew, rotation, translation of a projective matrix: K [R | t] in proportion to it."""
     calibration, rotation = rq(matrix[:, :3])
     signs = np.where(np.diag(calibration) < 0, -1.0, 1.0)
     calibration, rotation = calibration * signs, signs[:, None] * rotation
@@ -97,7 +99,7 @@ def factored(matrix: Array) -> tuple[Array, Array, Array]:
 
 
 def fit_pinhole(samples: Sampled, at: Array, pixel: Array, rows: Array, sight: Array, far: float) -> Pinhole:
-    """The nearest pinhole camera without skew.
+    """Return the nearest pinhole camera without skew.
 
     Parameters
     ----------
@@ -112,7 +114,9 @@ def fit_pinhole(samples: Sampled, at: Array, pixel: Array, rows: Array, sight: A
 
 
 def _start(sign: float, at: Array, pixel: Array, rows: Array, sight: Array, far: float) -> Pinhole:
-    """The pinhole with a derivative as given: axes that are not perpendicular are seen far from the principal point."""
+    """Return the pinhole with a derivative as given: axes that are not perpendicular are seen far from the
+    principal point.
+    """
     length = np.linalg.norm(rows, axis=1)
     axes = rows / length[:, None]
     mirrored = 1.0 if np.cross(axes[0], axes[1]) @ sight < 0 else -1.0
@@ -130,7 +134,9 @@ def _start(sign: float, at: Array, pixel: Array, rows: Array, sight: Array, far:
 
 
 def _refined(start: Pinhole, samples: Sampled) -> Pinhole:
-    """The least squares solution, by Levenberg's method on a small turn, move, focal lengths, principal point."""
+    """Return the least squares solution, by Levenberg's method on a small turn, move, focal lengths,
+    principal point.
+    """
     pinhole, damping = start, 1e-3
     cost, left = _cost(pinhole, samples)
     for _ in range(_STEPS):
@@ -156,7 +162,9 @@ def _cost(pinhole: Pinhole, samples: Sampled) -> tuple[float, Array]:
 
 
 def _jacobian(pinhole: Pinhole, world: Array) -> Array:
-    """Derivative (2 N, 10) of the projections by turn, translation, logarithms of the focal lengths, centre."""
+    """Return the derivative (2 N, 10) of the projections by turn, translation, logarithms of the focal
+    lengths, centre.
+    """
     turned = world @ pinhole.rotation.T
     x, y, depth = (turned + pinhole.translation).T
     out = np.zeros((len(world), 2, 10))

@@ -29,7 +29,7 @@ _VARIANCES = tuple(f"var_{'enu'[i]}{'enu'[j]}" for i, j in _AXES)
 
 
 def stac(scene: Scene, out: Path) -> Files:
-    """``<image>.json``: a STAC item of every image with its files in the run folder."""
+    """Write ``<image>.json``: a STAC item of every image with its files in the run folder."""
     return {f"{shot.name}.json": as_json(_item(scene, shot, out)) for shot in scene.shots}
 
 
@@ -76,7 +76,8 @@ def _asset(path: Path, out: Path) -> dict[str, Any]:
 
 
 def points(scene: Scene, _out: Path) -> Files:
-    """``points.csv`` and ``points.ply``: every tie point with the covariance of its intersection, east, north, up [m2].
+    """Write ``points.csv`` and ``points.ply``: every tie point with the covariance of its intersection, east,
+    north, up [m2].
 
     It is what the noise of the observations leaves with cameras as they are; what is common to all points, the place of
     the scene, is stated in the head of both.
@@ -115,7 +116,9 @@ def _ply(scene: Scene, sums: Array, said: str) -> bytes:
 
 
 def _covariances(scene: Scene) -> Array:
-    """Covariance (P, 3, 3) of the points, east, north, up [m2]: the inverse of what their observations tell."""
+    """Return the covariance (P, 3, 3) of the points, east, north, up [m2]: the inverse of what their
+    observations tell.
+    """
     normal = np.zeros((len(scene.points), 3, 3))
     for shot in scene.shots:
         ground = scene.points[shot.index]

@@ -37,12 +37,12 @@ _GL = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes right, down, forward -> rig
 
 
 def as_json(value: Any) -> bytes:
-    """A JSON text; what is not finite is null."""
+    """Return a JSON text; what is not finite is null."""
     return (json.dumps(plain(value), indent=1, ensure_ascii=False) + "\n").encode()
 
 
 def rpc_of(shot: Shot) -> dict[str, Any]:
-    """The corrected RPC in the names of rpcm."""
+    """Return the corrected RPC in the names of rpcm."""
     write = WRITABLE["json"].write
     assert write is not None
     found: dict[str, Any] = json.loads(write(shot.rpc))["rpc"]
@@ -53,7 +53,7 @@ def rpc_of(shot: Shot) -> dict[str, Any]:
 
 
 def _record(scene: Scene, shot: Shot, img: str) -> dict[str, Any]:
-    """What Sat-NeRF and its relatives read of an image."""
+    """Return the record of an image that Sat-NeRF and its relatives read."""
     low, high = scene.alt_range
     ring = footprint(shot.rpc, shot.size, scene.origin[2])
     middle = shot.rpc.localize((np.array(shot.size) - 1.0) / 2, np.array(scene.origin[2]))
@@ -75,7 +75,7 @@ def _record(scene: Scene, shot: Shot, img: str) -> dict[str, Any]:
 
 
 def satnerf(scene: Scene, out: Path) -> Files:
-    """``<image>.json`` each, the points in ``pts3d.npy`` (ECEF), ``train.txt`` and ``test.txt``."""
+    """Write ``<image>.json`` each, the points in ``pts3d.npy`` (ECEF), ``train.txt`` and ``test.txt``."""
     rows = zip(scene.shots, scene.file_names(out), strict=True)
     files = {f"{shot.name}.json": as_json(_record(scene, shot, img)) for shot, img in rows}
     names = list(files)
@@ -89,7 +89,9 @@ def satnerf(scene: Scene, out: Path) -> Files:
 
 
 def eogs(scene: Scene, out: Path) -> Files:
-    """As `satnerf`, and ``affine_models.json``: affine cameras in its frame of UTM metres, and their largest errors."""
+    """Write what `satnerf` writes, and ``affine_models.json``: affine cameras in its frame of UTM metres,
+    with their errors.
+    """
     frame = _Utm(scene)
     rows = zip(scene.shots, scene.file_names(out), strict=True)
     models = [_record(scene, shot, img) | frame.models(scene, shot) for shot, img in rows]
@@ -110,13 +112,15 @@ class _Utm:
         self.corners = (corners - self.center) / self.scale
 
     def metres(self, ground: Array) -> Array:
-        """UTM easting, northing, altitude (N, 3) [m] of ground points (N, 3)."""
+        """Return the UTM easting, northing, altitude (N, 3) [m] of ground points (N, 3)."""
         lon = wrap_longitude(ground[:, 0])
         east, north = transform("EPSG:4326", self._crs, lon.tolist(), ground[:, 1].tolist())
         return np.column_stack([east, north, ground[:, 2]])
 
     def models(self, scene: Scene, shot: Shot) -> dict[str, Any]:
-        """The affine camera of a shot: -1 to 1 over the image, altitudes in metres; the sun's where it is known."""
+        """Return the affine camera of a shot: -1 to 1 over the image, altitudes in metres; the sun's where it
+        is known.
+        """
         ground, image = _grid(scene, shot, (21, 9))
         world = (self.metres(ground) - self.center) / self.scale
         size = np.array(shot.size)
@@ -140,7 +144,7 @@ class _Utm:
 
 
 def _sun(shot: Shot, linear: Array, shift: Array) -> dict[str, Any] | None:
-    """The affine camera that looks from the sun: shadows fall where it sees two points in one place."""
+    """Return the affine camera that looks from the sun: shadows fall where it sees two points in one place."""
     if shot.light.elevation is None or shot.light.azimuth is None:
         return None
     up, around = np.radians([shot.light.elevation, shot.light.azimuth])
@@ -162,7 +166,7 @@ def _grid(scene: Scene, shot: Shot, nodes: tuple[int, int]) -> tuple[Array, Arra
 
 
 def pinhole_of(scene: Scene, shot: Shot) -> tuple[Pinhole, float]:
-    """The nearest pinhole of a shot, and its largest error over the scene [px]."""
+    """Return the nearest pinhole of a shot, and its largest error over the scene [px]."""
     pinhole = fit_pinhole(scene.samples(shot), **scene.view_of(shot))
     checked = scene.samples(shot, checked=True)
     error = checked.error(pinhole.project(checked.world))
@@ -172,7 +176,9 @@ def pinhole_of(scene: Scene, shot: Shot) -> tuple[Pinhole, float]:
 
 
 def nerfstudio(scene: Scene, out: Path) -> Files:
-    """``transforms.json``: pinhole, pose and largest error of every image, and simpler and nearer cameras beside."""
+    """Write ``transforms.json``: pinhole, pose and largest error of every image, and simpler and nearer
+    cameras beside.
+    """
     frames = [_frame(scene, shot, out) for shot in scene.shots]
     found = {
         "camera_model": "PINHOLE",
@@ -216,7 +222,7 @@ def _frame(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
 
 
 def _cloud(scene: Scene) -> bytes:
-    """The tie points in the world's frame, as renderers start from them: with a colour."""
+    """Return the tie points in the world's frame, as renderers start from them: with a colour."""
     kind = np.dtype(
         [*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
     )
@@ -233,7 +239,7 @@ def _cloud(scene: Scene) -> bytes:
 
 
 def colmap(scene: Scene, out: Path) -> Files:
-    """A text model of pinhole cameras, tie points and their places; ``world.json`` says where it lies on Earth."""
+    """Write a text model of pinhole cameras, tie points and their places; ``world.json`` places it on Earth."""
     world = scene.world(scene.points)
     cameras, images, errors = [], [], {}
     seen: dict[int, list[tuple[int, int, float]]] = {}
@@ -271,7 +277,7 @@ def _line(*values: float | str) -> str:
 
 
 def _quaternion(rotation: Array) -> Array:
-    """w, x, y, z of a rotation (3, 3), w not negative."""
+    """Return the w, x, y, z of a rotation (3, 3), w not negative."""
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)

@@ -50,7 +50,7 @@ class Shot:
 
     @property
     def name(self) -> str:
-        """Its name in the run."""
+        """Name of the image in the run."""
         return self.entry.name
 
     @property
@@ -89,12 +89,12 @@ class Scene:
         return matrix
 
     def world(self, ground: Array) -> Array:
-        """East, north, up (N, 3) of the origin [m] of ground points (N, 3)."""
+        """Return the east, north, up (N, 3) of the origin [m] of ground points (N, 3)."""
         away = ecef_from_ground(ground) - ecef_from_ground(self.origin)
         return np.asarray(away @ enu_basis(self.origin).T)
 
     def samples(self, shot: Shot, checked: bool = False) -> Sampled:
-        """Points over an image and the scene's altitudes; to measure errors on, more of them."""
+        """Return the points over an image and the scene's altitudes; to measure errors on, more of them."""
         image, alt = image_grid(shot.size, self.alt_range, _CHECKED if checked else _NODES)
         ground = shot.rpc.localize(image, alt)
         known = np.isfinite(ground).all(axis=1)
@@ -103,7 +103,7 @@ class Scene:
         return Sampled(self.world(ground[known]), image[known])
 
     def view_of(self, shot: Shot) -> dict[str, Any]:
-        """How a shot sees the middle of its own ground: what `approx.fit_pinhole` starts from."""
+        """Return the approximate view of a shot's ground middle, where `approx.fit_pinhole` starts."""
         pixel = (np.array(shot.size) - 1.0) / 2
         ground = shot.rpc.localize(pixel, np.array(self.origin[2]))
         local = enu_basis(ground) @ enu_basis(self.origin).T  # of the world's axes there
@@ -120,14 +120,16 @@ class Scene:
         }
 
     def file_names(self, out: Path) -> list[str]:
-        """What a file in `out` calls the images: by name where all lie in one folder, else relative to `out`."""
+        """Return the names of the images for files in `out`: the file names where all lie in one folder, else
+        paths relative to `out`.
+        """
         if len({PurePath(shot.file).parent for shot in self.shots}) == 1:
             return [PurePath(shot.file).name for shot in self.shots]
         return [link(shot.file, out) for shot in self.shots]
 
 
 def link(target: Path | str, folder: Path) -> str:
-    """A file as a text in a folder names it: relative, with slashes, so that both may move; a URL as it is."""
+    """Return the path of a file relative to a folder, with slashes, so that both may move; a URL as it is."""
     if is_url(str(target)):
         return str(target)
     absolute = os.path.abspath(target)  # noqa: PTH100  (no link is followed: it may be meant)
@@ -135,7 +137,7 @@ def link(target: Path | str, folder: Path) -> str:
 
 
 def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Scene:
-    """The scene of a run folder; altitudes [m] by its tie points unless they are given.
+    """Read the scene of a run folder; altitudes [m] by its tie points unless they are given.
 
     Raises
     ------
@@ -184,7 +186,7 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
 
 
 def _places(known: IntArray, asked: IntArray) -> tuple[IntArray, Any]:
-    """Where numbers (K,) stand in an ascending list, and whether they do."""
+    """Return the positions of numbers (K,) in an ascending list, and whether they are in it."""
     if not len(known):
         return np.zeros(len(asked), dtype=np.int64), np.zeros(len(asked), dtype=bool)
     at = np.minimum(np.searchsorted(known, asked), len(known) - 1)
@@ -192,7 +194,7 @@ def _places(known: IntArray, asked: IntArray) -> tuple[IntArray, Any]:
 
 
 def _altitudes(alt: Array, summary: Summary) -> tuple[float, float]:
-    """The altitudes of a scene: those of its tie points and a margin, or of its cameras without any."""
+    """Return the altitudes of a scene: those of its tie points and a margin, or of its cameras without any."""
     if not len(alt):
         ranges = np.array([view.alt_range_m for view in summary.views])
         return float(ranges[:, 0].min()), float(ranges[:, 1].max())
@@ -202,7 +204,7 @@ def _altitudes(alt: Array, summary: Summary) -> tuple[float, float]:
 
 
 def _carrier(folder: Path, view: ViewEntry) -> Path | None:
-    """The raster with the corrected RPC that a run wrote for an image, in its own folder."""
+    """Return the raster with the corrected RPC that a run wrote for an image, in its own folder."""
     for name in (view.name + end for row in CARRIERS.values() for end in row.suffixes):
         path = (folder / name).absolute()
         if name in view.outputs and path.is_file() and path.resolve().parent == folder.resolve():
@@ -211,7 +213,9 @@ def _carrier(folder: Path, view: ViewEntry) -> Path | None:
 
 
 def _noise(files: RunFiles, counted: Any) -> float:
-    """Standard deviation [px] of a coordinate: what is left, over the observations that points did not take."""
+    """Return the standard deviation [px] of a coordinate: what is left, over the observations that points did
+    not take.
+    """
     left = files.observations.after[counted]
     left = left[np.isfinite(left).all(axis=1)]
     free = left.size - 3 * len(np.unique(files.observations.track[counted]))
@@ -219,7 +223,9 @@ def _noise(files: RunFiles, counted: Any) -> float:
 
 
 def pairs_of(scene: Scene) -> Sequence[tuple[str, str]]:
-    """The pairs that stereo is made of: those with tie points and an angle that shows heights; else all of them."""
+    """Return the pairs that stereo is made of: those with tie points and an angle that shows heights; else
+    all of them.
+    """
     pairs = [(p.a, p.b, p.convergence_deg or 0.0) for p in scene.summary.pairs]
     good = [(a, b) for a, b, angle in pairs if 2.0 <= angle <= 50.0]
     return good or [(a, b) for a, b, _ in pairs]

@@ -13,7 +13,7 @@ from barpc.rpcio import WRITABLE
 
 
 def _image(shot: Shot, out: Path) -> str:
-    """The image as a configuration in `out` names it: the run's VRT or copy where there is one."""
+    """Return the image as a configuration in `out` names it: the run's VRT or copy where there is one."""
     return link(shot.carrier or shot.file, out)
 
 
@@ -24,13 +24,15 @@ def _text(shot: Shot, name: str) -> bytes:
 
 
 def s2p(scene: Scene, out: Path) -> Files:
-    """``config.json``: the images, the first as reference, each with its corrected RPC."""
+    """Write ``config.json``: the images, the first as reference, each with its corrected RPC."""
     images = [{"img": _image(shot, out), "rpc": rpc_of(shot)} for shot in scene.shots]
     return {"config.json": as_json({"out_dir": "s2p_out", "images": images, "full_img": True})}
 
 
 def cars(scene: Scene, out: Path) -> Files:
-    """``inputs.yaml`` and a ``.geom`` an image; pairs are those with tie points and an angle that shows heights."""
+    """Write ``inputs.yaml`` and a ``.geom`` an image; pairs are those with tie points and an angle that shows
+    heights.
+    """
     sensors = {
         shot.name: {
             "image": _image(shot, out),
@@ -45,7 +47,7 @@ def cars(scene: Scene, out: Path) -> Files:
 
 
 def asp(scene: Scene, out: Path) -> Files:
-    """``<image>.xml`` each (in Maxar's form), and lists of images and cameras for its tools, run in `out`."""
+    """Write ``<image>.xml`` each (in Maxar's form), and lists of images and cameras for its tools, run in `out`."""
     files = {f"{shot.name}.xml": _text(shot, "xml") for shot in scene.shots}
     lists = {
         "images.txt": [_image(shot, out) for shot in scene.shots],
@@ -55,7 +57,7 @@ def asp(scene: Scene, out: Path) -> Files:
 
 
 def yaml(value: Any, indent: str = "") -> list[str]:
-    r"""Mappings with plain keys in blocks, all else as JSON has it, which is YAML, too.
+    r"""Return YAML text: mappings with plain keys in blocks, all else as JSON.
 
     Examples
     --------

@@ -38,7 +38,7 @@ class Errors:
     worst: Array = field(default_factory=lambda: np.empty((0, 3)))
 
     def add(self, residual: Array) -> None:
-        """Take in residuals (N, 2); one that is NaN makes the result NaN."""
+        """Add residuals (N, 2) [px]; one that is NaN makes the result NaN."""
         if len(residual):
             self.count += len(residual)
             self.squares = self.squares + np.einsum("ij,ij->j", residual, residual)
@@ -73,7 +73,7 @@ class Sample:
         cells: int = CELLS,
         seed: int = 0,
     ) -> Sample:
-        """One point a cell of `cells` along each side of the image, at random in it, and those along the edges."""
+        """Sample a model at one random point in each of `cells` x `cells` parts of an image, and along its edges."""
         if min(size) < 1:
             raise FitError(f"image size {size[0]} x {size[1]}: nothing to fit over")
         rng = np.random.default_rng(seed)
@@ -91,7 +91,9 @@ class Sample:
         )
 
     def also(self, points: Array) -> Sample:
-        """With more points (M, 3) col, row [px], altitude [m] from which the largest error is looked for."""
+        """Return the sample with more points (M, 3) col, row [px], altitude [m] around which the largest
+        error is searched.
+        """
         ground = self.model.localize(points[:, :2], points[:, 2])
         known = np.isfinite(ground).all(axis=1)
         return replace(
@@ -101,7 +103,8 @@ class Sample:
         )
 
     def contradiction(self) -> float:
-        """Largest distance [px] of the points from where the model projects their ground; infinite where it fails.
+        """Return the largest distance [px] of the points from where the model projects their ground; infinite
+        where it fails.
 
         At the altitudes that were asked for, whatever altitudes it gave back.
         """
@@ -109,14 +112,17 @@ class Sample:
         return float(_size(self.model.project(asked) - self.points[:, :2]).max(initial=0.0))
 
     def errors(self, rpc: RPC) -> tuple[Errors, Array]:
-        """What an RPC makes of the points all over the image, and its largest errors (2,) [px], found by looking on.
+        """Return the errors of an RPC at the sampled points, and its largest errors (2,) [px] after searching
+        around them.
 
         They are infinite where the RPC has no image point.
         """
         return self.sought(lambda ground, points: rpc.project(ground) - points[:, :2])
 
     def sought(self, off: Callable[[Array, Array], Array]) -> tuple[Errors, Array]:
-        """As `errors`, of what ground points (N, 3) and their (N, 3) col, row [px], altitude are off by: (N, 2)."""
+        """Return the errors (N, 2) [px] of an RPC at ground points (N, 3) and their (N, 3) col, row [px],
+        altitude [m].
+        """
         points, miss = self.points, _size(off(self.ground, self.points))
         errors = Errors()
         errors.add(miss[: self.count])
@@ -154,13 +160,13 @@ def _size(values: Array) -> Array:
 
 
 def _scaled(unit: Array, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
-    """col, row, altitude (..., 3) of places in 0 .. 1."""
+    """Return the col, row, altitude (..., 3) of places in 0 .. 1."""
     low, high = alt_range
     return np.asarray(unit * [*size, high - low] + [-0.5, -0.5, low])
 
 
 def roundtrip(rpc: RPC, ground: Array) -> float:
-    """Largest distance [px] between ground points (N, 3) and where their projections are localised."""
+    """Return the largest distance [px] between ground points (N, 3) and where their projections are localised."""
     image, jacobian = rpc.project_jacobian(ground)
     back = rpc.localize(image, ground[:, 2])
     miss = back - ground
@@ -170,7 +176,7 @@ def roundtrip(rpc: RPC, ground: Array) -> float:
 
 
 def coverage(image: Array, low: Array, high: Array) -> float:
-    """Share of the rectangle `low`, `high` (2,) [px] inside the convex hull of image points (N, 2) [px]."""
+    """Return the share of the rectangle `low`, `high` (2,) [px] inside the convex hull of image points (N, 2) [px]."""
     angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
     direction = np.column_stack([np.cos(angle), np.sin(angle)])  # outside is beyond all in one direction
     reach = np.full(len(angle), -np.inf)

@@ -45,7 +45,7 @@ class Localisation:
     method: str
 
     def verdict(self, tolerance: float) -> str:
-        """What is wrong at a tolerance [px], in words; empty if nothing is."""
+        """Return the faults at a tolerance [px], in words; empty if there are none."""
         if not self.max_px <= tolerance:
             return (
                 f"the localisation RPC misses the ground by up to {self.max_m:.3g} m ({self.max_px:.3g} px), wanted "
@@ -60,7 +60,9 @@ class Localisation:
 
 
 def off(rpc: RPC, found: Array, ground: Array, image: Array) -> Array:
-    """Distances (N, 2) [m, px] of places `found` (N, 3) from ground points (N, 3), and of their projections."""
+    """Return the distances (N, 2) [m, px] of places `found` (N, 3) from ground points (N, 3), and of their
+    projections.
+    """
     miss = found - ground
     miss[:, 0] = wrap_longitude(miss[:, 0])
     metres = np.linalg.norm((miss * metres_per_unit(ground))[:, :2], axis=1)
@@ -68,7 +70,9 @@ def off(rpc: RPC, found: Array, ground: Array, image: Array) -> Array:
 
 
 def inverse(rpc: RPC, ground: Array, image: Array, weight: Array | None = None) -> Problem:
-    """The problem of the localisation RPC that goes with an RPC: its normalisation, its points, roles exchanged."""
+    """Return the problem of the localisation RPC that goes with an RPC: its normalisation, its points, roles
+    exchanged.
+    """
     norm = Normalization(
         np.append(rpc.image_offset, rpc.ground_offset[2]),
         np.append(rpc.image_scale, rpc.ground_scale[2]),
@@ -82,7 +86,9 @@ def inverse(rpc: RPC, ground: Array, image: Array, weight: Array | None = None) 
 def with_localisation(
     rpc: RPC, problem: Callable[[str], Problem], seen: Seen, options: FitOptions, exact: bool
 ) -> tuple[RPC, Localisation]:
-    """An RPC and its localisation RPC, by a ridge; of a model (`exact`) also by Gauss-Newton, where that is better."""
+    """Return an RPC and its localisation RPC, by a ridge; of a model (`exact`) also by Gauss-Newton, where
+    that is better.
+    """
     found: list[tuple[RPC, Localisation]] = []
     for method in ("ridge", "gauss-newton") if exact else ("ridge",):
         solution = solve_problem(problem(method), options, method)

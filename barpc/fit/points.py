@@ -21,7 +21,7 @@ _CHUNK = 8192
 
 
 def spaced(low: float, high: float, count: int, nodes: Nodes) -> Array:
-    """Positions (count,) from `low` to `high`, both ends included."""
+    """Return the positions (count,) from `low` to `high`, both ends included."""
     t = np.linspace(-1.0, 1.0, count)
     if nodes == "chebyshev":
         t = np.sin(0.5 * np.pi * t)
@@ -29,7 +29,7 @@ def spaced(low: float, high: float, count: int, nodes: Nodes) -> Array:
 
 
 def widened(alt_range: tuple[float, float]) -> tuple[float, float]:
-    """`alt_range` [m], at least 2 `ALTITUDE_FLOOR` wide: a flat scene still gets its altitude terms."""
+    """Return `alt_range` [m] widened to twice `ALTITUDE_FLOOR`: a flat scene still gets its altitude terms."""
     low, high = float(alt_range[0]), float(alt_range[1])
     if not (np.isfinite(low) and np.isfinite(high) and low <= high):
         raise FitError(f"altitude range {low:g} to {high:g} m is not an interval")
@@ -44,7 +44,8 @@ def terrain_range(
     dem: Callable[[Array, Array], Array],
     margin: float,
 ) -> tuple[float, float]:
-    """Lowest and highest altitude [m] of a DEM under an image of `size` (width, height), with a margin either side.
+    """Return the lowest and highest altitude [m] of a DEM under an image of `size` (width, height), with a
+    margin either side.
 
     `alt_range` [m] is where the footprint is looked for; `dem` takes lon, lat [deg] and gives altitudes [m above the
     ellipsoid], NaN where it has none; the paper's `margin` [m] is 500.
@@ -64,7 +65,8 @@ def terrain_range(
 def control_points(
     model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], options: FitOptions
 ) -> tuple[Array, Array]:
-    """Grid of control points: ground (n_x, n_y, n_alt, 3) lon, lat [deg], alt [m], and image (n_x, n_y, n_alt, 2) [px].
+    """Return the grid of control points: ground (n_x, n_y, n_alt, 3) lon, lat [deg], alt [m], and image (n_x,
+    n_y, n_alt, 2) [px].
 
     It spans the outer edges of the image and `alt_range` [m]; longitudes run on across the antimeridian. NaN where
     the model fails.
@@ -88,7 +90,7 @@ def control_points(
 def _ground_box(
     model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Longitudes and latitudes [deg] of the box around the footprints at both altitudes."""
+    """Return the longitudes and latitudes [deg] of the box around the footprints at both altitudes."""
     ring = np.concatenate([footprint(model, size, alt) for alt in alt_range])
     ring = ring[np.isfinite(ring).all(axis=1)]
     if not len(ring):
@@ -98,13 +100,15 @@ def _ground_box(
 
 
 def extent(points: Array) -> tuple[Array, Array]:
-    """Smallest and largest value of each column of (N, k); columns one by one are faster than rows."""
+    """Return the smallest and largest value of each column of (N, k); columns one by one are faster than rows."""
     columns = points.T
     return np.array([c.min() for c in columns]), np.array([c.max() for c in columns])
 
 
 def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) -> tuple[Array, Array]:
-    """As `numbers`; FitError too where columns look swapped (unless `allow_mirrored`) or points determine no RPC."""
+    """Return checked points as `numbers` does; FitError where columns look swapped (unless `allow_mirrored`)
+    or points determine no RPC.
+    """
     ground, image = numbers(ground, image)
     _check_geometry(ground, image, allow_mirrored)
     distinct = len(np.unique(ground, axis=0)) if len(ground) < 400 else len(ground)
@@ -117,7 +121,8 @@ _FARTHEST = 1e9  # px: no image is as wide
 
 
 def numbers(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
-    """Points (N, 3) lon, lat [deg], alt [m] and (N, 2) [px] as finite arrays, longitudes made continuous.
+    """Return points (N, 3) lon, lat [deg], alt [m] and (N, 2) [px] as finite arrays, longitudes made
+    continuous.
 
     FitError: no points, a wrong shape, numbers that are not finite or out of range.
     """
@@ -165,7 +170,7 @@ def _check_geometry(ground: Array, image: Array, allow_mirrored: bool) -> None:
 
 
 def _covariance(ground: Array, image: Array, center: Array, span: Array) -> Array:
-    """Covariance (5, 5) of lon, lat, alt, col, row, each in units of its span."""
+    """Return the covariance (5, 5) of lon, lat, alt, col, row, each in units of its span."""
     total, squares = np.zeros(5), np.zeros((5, 5))
     for start in range(0, len(ground), _CHUNK):
         part = slice(start, start + _CHUNK)

@@ -41,7 +41,9 @@ _STEPS, _FARTHEST = 400, 20.0  # along a ray that a pole is looked for on; half 
 
 @cache
 def _net() -> Array:
-    """Bernstein coefficients (n, n, n, 20) of the monomials over the pieces of the cube -1 .. 1, n = `_NODES`."""
+    """Return Bernstein coefficients (n, n, n, 20) of the monomials over the pieces of the cube -1 .. 1, n =
+    `_NODES`.
+    """
     width, rows = 2.0 / _PIECES, []
     for start in -1.0 + width * np.arange(_PIECES):
         shifted = np.zeros((4, 4))  # x^p as a polynomial of the place in the piece
@@ -56,7 +58,7 @@ def _net() -> Array:
 
 @cache
 def _lattice() -> tuple[Array, Array]:
-    """Places (64, 3) in the cube, and what takes values there to the coefficients of a cubic (20, 64)."""
+    """Return the places (64, 3) in the cube, and what takes values there to the coefficients of a cubic (20, 64)."""
     places = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 4)] * 3), axis=-1).reshape(-1, 3)
     return places, np.asarray(np.linalg.pinv(monomials(places.T).T))
 
@@ -71,14 +73,14 @@ class Region:
 
     @classmethod
     def box(cls, box: Array) -> Region:
-        """A box (3, 2)."""
+        """Return a region that is a box (3, 2) in normalised coordinates."""
         return cls(
             box.mean(axis=1), np.diag(0.5 * (box[:, 1] - box[:, 0])), np.ones((_NODES, _NODES), dtype=bool)
         )
 
     @classmethod
     def around(cls, ground: Array, image: Array, margin: float) -> Region:
-        """The hull of normalised points (N, 3) and a margin, a share of its half width.
+        """Return the region of the hull of normalised points (N, 3) and a margin, a share of its half width.
 
         The sides stand as those of the image do: lon, lat = `image` M + altitude k, M and k by least squares of points
         (N, 2) in the image.
@@ -101,34 +103,37 @@ class Region:
 
     @cached_property
     def there(self) -> Array:
-        """What takes a cubic to that of the place in the skew box (20, 20); first to its value at the centre."""
+        """Matrix (20, 20) that takes a cubic's coefficients to those in the skew box; its first row gives the
+        value at the centre.
+        """
         places, inverse = _lattice()
         return np.asarray(inverse @ monomials((places @ self.axes + self.offset).T).T)
 
     def bernstein(self, cubic: Array) -> Array:
-        """Bernstein coefficients (K,) of a cubic (20,), of which it lies above the least."""
+        """Return the Bernstein coefficients (K,) of a cubic (20,); the cubic is nowhere below the least of them."""
         return np.asarray((_net() @ (self.there @ cubic))[self.inside].ravel())
 
     def rows(self, index: IntArray) -> Array:
-        """What takes a cubic to some of its Bernstein coefficients (len(index), 20)."""
+        """Return the rows (len(index), 20) that take a cubic's coefficients to some of its Bernstein coefficients."""
         nodes = np.flatnonzero(np.broadcast_to(self.inside[..., None], (_NODES,) * 3))
         return np.asarray(_net().reshape(-1, 20)[nodes[index]] @ self.there)
 
     def least(self, cubic: Array) -> float:
-        """A lower bound, near the least value, of a cubic (20,)."""
+        """Return a lower bound of a cubic (20,) over the region, near its least value."""
         return float(self.bernstein(cubic).min())
 
     def above(self, cubic: Array) -> bool:
-        """Whether a denominator (20,) is above `FLOOR` of what it is at the centre."""
+        """Return whether a denominator (20,) is above `FLOOR` of what it is at the centre."""
         return self.least(cubic) > FLOOR * float(self.there[0] @ cubic)
 
     def smallest(self, cubics: Array) -> float:
-        """A lower bound of cubics (k, 20) over what they are at the centre; NaN where one is 0 there."""
+        """Return a lower bound of cubics (k, 20) over what they are at the centre; NaN where one is 0 there."""
         with np.errstate(all="ignore"):
             return float(min(self.least(cubic / (self.there[0] @ cubic)) for cubic in cubics))
 
     def nearest_pole(self, cubics: Array, margin: float) -> tuple[Array, float]:
-        """Where one of cubics (k, 20) is 0 nearest to the centre (3,), and how far, 1 being the end of the points.
+        """Return the place (3,) nearest to the centre at which one of cubics (k, 20) is 0, and its distance
+        (1: the end of the points).
 
         Of a region with a `margin`, along rays from its centre to every side; NaN and infinite where there is none.
         """
@@ -145,7 +150,9 @@ class Region:
 
 
 def _inside(reach: Array, half: Array) -> npt.NDArray[np.bool_]:
-    """Nodes (n, n) of the net of the pieces that a hull touches: its `reach` in all directions, half widths (2,)."""
+    """Return the nodes (n, n) of the net of the pieces that a hull touches: its `reach` in all directions,
+    half widths (2,).
+    """
     width, level = 2.0 / _PIECES, _DIRECTIONS[:, :2] * half
     start = -1.0 + width * np.arange(_PIECES)
     corner = np.stack(np.meshgrid(start, start, indexing="ij"), axis=-1)
@@ -157,12 +164,13 @@ def _inside(reach: Array, half: Array) -> npt.NDArray[np.bool_]:
 
 
 def least_value(cubic: Array, box: Array) -> float:
-    """A lower bound, near the least value, of a cubic (20,) over a `box` (3, 2)."""
+    """Return a lower bound, near the least value, of a cubic (20,) over a `box` (3, 2)."""
     return Region.box(box).least(cubic)
 
 
 def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:
-    """A lower bound of the denominators over a box `low`, `high` (3,) [deg, deg, m] and 25 % around it.
+    """Return a lower bound of the denominators over a box `low`, `high` (3,) [deg, deg, m] and 25 % around
+    it.
 
     Over what they are at its centre.
     """
@@ -170,13 +178,14 @@ def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:
 
 
 def smallest_value(cubics: Array, box: Array) -> float:
-    """A lower bound of cubics (k, 20) over a box (3, 2) and 25 % around it, over what they are at its centre."""
+    """Return a lower bound of cubics (k, 20) over a box (3, 2) and 25 % around it, over what they are at its centre."""
     middle, half = box.mean(axis=1), 0.5 * np.abs(box[:, 1] - box[:, 0])
     return Region.box(middle[:, None] + (1.0 + BOX) * half[:, None] * np.array([-1.0, 1.0])).smallest(cubics)
 
 
 def bounded(system: Compressed, region: Region, active: IntArray) -> Array | None:
-    """The least squares x (k,) of a system whose denominator is at least `FLOOR` over a region; None if there is none.
+    """Return the least-squares solution x (k,) of a system whose denominator is at least `FLOOR` over a
+    region; None if there is none.
 
     The last unknowns are the coefficients of its `active` monomials but the constant one, which is 1. By the
     inequalities that x breaks, taken in few by few: least distance programming, by non-negative least squares (Lawson

@@ -69,7 +69,7 @@ def _rounded(norm: Normalization, ground_step: Array, image_step: Array) -> Norm
 
 
 def _nitf_normalization(norm: Normalization) -> Normalization:
-    """1e-4 degrees, metres, pixels."""
+    """Return 1e-4 degrees, metres, pixels."""
     rounded = _rounded(norm, np.array([1e-4, 1e-4, 1.0]), np.ones(2))
     return Normalization(  # 1e-4 is no binary number: take what the printed digits read back as
         np.round(rounded.ground_offset, 4),
@@ -80,7 +80,7 @@ def _nitf_normalization(norm: Normalization) -> Normalization:
 
 
 def _nitf_coeffs(coeffs: Array) -> Array:
-    """Seven digits and an exponent of one digit: +d.ddddddE-d."""
+    """Return coefficients rounded to seven digits and an exponent of one digit: +d.ddddddE-d."""
     value = np.asarray(coeffs, dtype=np.float64)
     exponent = np.clip(np.floor(np.log10(np.maximum(np.abs(value), 1e-300))), -9, 9)
     text = [f"{v:.{6 + int(e) * -1}f}" for v, e in zip(value.ravel(), exponent.ravel(), strict=True)]

@@ -36,7 +36,7 @@ _WORDS = {
 
 @dataclass(frozen=True)
 class Reason:
-    """What most of an RPC's errors go by.
+    """What most of an RPC's errors depend on: row, column, altitude, a place.
 
     Parameters
     ----------
@@ -45,9 +45,9 @@ class Reason:
     share : float
         Part of the squared errors that is due to it; of "all", what is left by the best of the others.
     size_px : float
-        Its root mean square; of a step its height.
+        Root mean square of that part; of a step its height.
     col, row : float
-        Where it is, of a step and of a place [px].
+        Position of a step or a place [px].
     """
 
     cause: str
@@ -62,7 +62,9 @@ class Reason:
 
 
 def reason(rpc: RPC, sample: Sample) -> Reason | None:
-    """What the errors of an RPC on the points of a sample all over an image go by; None where they are no numbers."""
+    """Return what most of the errors of an RPC at the points of a sample depend on; None where errors are not
+    finite.
+    """
     ground, points = sample.ground[: sample.count], sample.points[: sample.count]
     error = rpc.project(ground) - points[:, :2]
     if not (np.isfinite(error).all() and error.any()):
@@ -96,7 +98,9 @@ def reason(rpc: RPC, sample: Sample) -> Reason | None:
 
 
 def _tangent(rpc: RPC, ground: Array, axis: int) -> Array:
-    """Directions (N, 39) that small changes of the coefficients of col (`axis` 0) or row (1) move its points in."""
+    """Return the directions (N, 39) that small changes of the coefficients of col (`axis` 0) or row (1) move
+    its points in.
+    """
     basis = monomials(rpc.normalize(ground)).T
     above, below = basis @ rpc.coeffs[2 * axis], basis @ rpc.coeffs[2 * axis + 1]
     rows = np.hstack([basis, -(above / below)[:, None] * basis[:, 1:]]) / below[:, None]
@@ -104,7 +108,9 @@ def _tangent(rpc: RPC, ground: Array, axis: int) -> Array:
 
 
 def _along(left: Array, bases: list[Array], place: Array) -> tuple[float, Array]:
-    """Share of errors (N, 2) that is a function of `place` (N,), and it with what is left (N, 2), in its order."""
+    """Return the share of errors (N, 2) that is a function of `place` (N,), that function and the rest (N,
+    2), in its order.
+    """
     order, rest = np.argsort(place, kind="stable"), 0.0
     smooth = left[order].copy()
     for axis, basis in enumerate(bases):
@@ -117,7 +123,9 @@ def _along(left: Array, bases: list[Array], place: Array) -> tuple[float, Array]
 
 
 def _shapes(points: Array, sample: Sample) -> dict[str, list[Array]]:
-    """Shapes (N, k) of col and of row that a lens gives, and an altitude range that changes from place to place."""
+    """Return the shapes (N, k) of col and of row that a lens gives, and an altitude range that changes from
+    place to place.
+    """
     away = (points[:, :2] - (np.array(sample.size) - 1) / 2) / (max(sample.size) / 2)
     lens = (away**2).sum(axis=1)[:, None] ** _POWERS  # in either coordinate the same
     low, high = sample.alt_range
@@ -131,7 +139,7 @@ def _shapes(points: Array, sample: Sample) -> dict[str, list[Array]]:
 
 
 def _shaped(left: Array, bases: list[Array], shapes: list[Array]) -> float:
-    """Share of errors (N, 2) that shapes of col and row give together."""
+    """Return the share of errors (N, 2) that shapes of col and row give together."""
     rows = np.vstack([shape - basis @ (basis.T @ shape) for shape, basis in zip(shapes, bases, strict=True)])
     error = left.T.ravel()
     rest = error - rows @ np.linalg.lstsq(rows, error, rcond=1e-10)[0]
@@ -139,7 +147,8 @@ def _shaped(left: Array, bases: list[Array], shapes: list[Array]) -> float:
 
 
 def _step(smooth: Array, cols: Array) -> tuple[float, float]:
-    """Height [px] and column of the largest step of errors (N, 2) in the order of columns (N,); 0 where there is none.
+    """Return the height [px] and column of the largest step of errors (N, 2) in the order of columns (N,); 0
+    where there is none.
 
     A step is as high between means of few points as of many; what is smooth changes by less the nearer they are.
     """

@@ -18,16 +18,16 @@ EXACT = 1e-6  # px: what no other method is tried on, and no round trip is held 
 
 @dataclass(frozen=True)
 class Free:
-    """What an RPC reaches whose denominators are kept up over the image's own ground only.
+    """What an RPC reaches whose denominators are bounded over the image's own ground only.
 
     Parameters
     ----------
     rmse_px, max_px : float
-        Of its check points, the larger of col and row.
+        RMSE on its check points, the larger of col and row.
     pole : (lon, lat, alt)
-        Where a denominator is 0 nearest to the middle of that ground; NaN where none was found.
+        Place nearest to the middle of that ground where a denominator is 0; NaN where none was found.
     far : float
-        How far, 1 being the end of the ground.
+        Distance of that place, 1 being the end of the ground.
     """
 
     rmse_px: float
@@ -59,8 +59,8 @@ class RpcFit:
         The same on check points all over image and altitudes, which the fit has not seen [px]; the largest error was
         also looked for around the worst of them.
     beyond : float
-        Part of the image and the altitudes that may miss by more than `max_ckp`: no more, with 95 % confidence. 1 for
-        given points, which may lie anywhere and say nothing of the rest.
+        Largest share of image and altitudes, with 95 % confidence, that misses by more than `max_ckp`. 1 for
+        given points, which may lie anywhere.
     min_denominator : float
         Lower bound of the denominators over the hull of the image's own ground and a margin (`FitOptions.pole_margin`)
         around it, over what they are at its centre; above 0 there is no pole.
@@ -82,9 +82,9 @@ class RpcFit:
         Largest distance of a check point from where the model, not the RPC, projects the ground that it localises
         there [px]; 0 for given points. What else projects with the model may be off by as much more.
     free : Free or None
-        What denominators without a margin would reach, where that is less than half the RMSE.
+        Result without a margin around the ground, where its RMSE is less than half.
     reason : Reason or None
-        Why it misses its tolerance, of a model that it misses.
+        Cause of a miss of the tolerance, of a model.
     """
 
     rpc: RPC
@@ -110,7 +110,7 @@ class RpcFit:
         return f"RpcFit({self.method}, at most {self.max_ckp.max():.2g} px at {self.num_ckp} check points, {self.rpc})"
 
     def summary(self) -> dict[str, Any]:
-        """The certificate as plain numbers and lists, col before row, lengths in px."""
+        """Return the certificate as plain numbers and lists, col before row, lengths in px."""
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rpc"}
         for name in ("localisation", "free", "reason"):
             part = values.pop(name)
@@ -118,7 +118,9 @@ class RpcFit:
         return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
 
     def as_written(self, rpc: RPC) -> RpcFit:
-        """The fit with the RPC that a file of it holds: what that lost over its box is added to the errors."""
+        """Return the fit of the RPC as read back from its file: the differences over its box are added to the
+        errors.
+        """
         lost = self.rpc.off(rpc)
         return replace(
             self,
@@ -129,7 +131,7 @@ class RpcFit:
         )
 
     def verdict(self, tolerance: float) -> str:
-        """What is wrong with this fit at a tolerance [px], in words; empty if nothing is."""
+        """Return the faults of this fit at a tolerance [px], in words; empty if there are none."""
         worst = float(self.max_ckp.max())
         if not self.contradiction <= max(tolerance, EXACT):
             return (

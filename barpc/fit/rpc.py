@@ -106,7 +106,9 @@ def fit_rpc(
 
 
 def _compared(fit: RpcFit, free: RpcFit, region: Region, margin: float) -> RpcFit:
-    """A fit that knows what `free`, whose denominators are kept up over the image's own ground only, makes better."""
+    """Return a fit that knows what `free`, whose denominators are kept up over the image's own ground only,
+    makes better.
+    """
     if not np.linalg.norm(fit.rmse_ckp) > _WORTH * np.linalg.norm(free.rmse_ckp):
         return fit
     place, far = region.nearest_pole(free.rpc.coeffs[1::2], margin)
@@ -116,7 +118,8 @@ def _compared(fit: RpcFit, free: RpcFit, region: Region, margin: float) -> RpcFi
 
 
 def _plainer(fit: RpcFit, plain: RpcFit) -> RpcFit:
-    """Of two RPCs for a camera behind a spline, which no RPC holds, the one made without it where it is about as good.
+    """Choose between two RPCs for a camera behind a spline: the one made without the spline where it is about
+    as good.
 
     Its denominators are calmer; jitter that is faster than cubics of the row only makes the other one wave.
     """
@@ -131,7 +134,7 @@ def _given(
     options: FitOptions,
     method: str,
 ) -> tuple[Array, Array]:
-    """Ground (N, 3) and image points (N, 2) for a method."""
+    """Return the ground (N, 3) and image points (N, 2) for a method."""
     if method in BOUNDED:  # what an RPC cannot follow has any frequency: scattered points alias none
         scattered = Sample.of(model, size, alt_range, _CELLS, seed=1)
         ground, image = scattered.ground, scattered.points[:, :2]
@@ -204,7 +207,7 @@ def fit_rpc_points(
 
 
 def _missed(sample: Sample, rpc: RPC, _: Solution) -> tuple[Errors, Array]:
-    """What a localisation RPC is off by on the check points of a model."""
+    """Return the errors of a localisation RPC on the check points of a model."""
     return sample.sought(
         lambda ground, at: off(rpc, rpc.localize_direct(at[:, :2], at[:, 2]), ground, at[:, :2])
     )
@@ -213,7 +216,7 @@ def _missed(sample: Sample, rpc: RPC, _: Solution) -> tuple[Errors, Array]:
 def _left_out(
     held_out: tuple[Array, Array] | None, ground: Array, image: Array, rpc: RPC, found: Solution
 ) -> tuple[Errors, Array]:
-    """The same on given check points, or on its own points, each without that point's help."""
+    """Return the errors of a localisation RPC on given check points, or its leave-one-out errors."""
     errors, start = Errors(), 0
     if held_out is not None:
         errors.add(off(rpc, rpc.localize_direct(held_out[1], held_out[0][:, 2]), *held_out))
@@ -235,7 +238,9 @@ def _localised(
     weight: Array | None = None,
     exact: bool = True,
 ) -> RpcFit:
-    """The fit, where asked for with a localisation RPC and its certificate; FitError where `strict` and it misses."""
+    """Return the fit, where asked for with a localisation RPC and its certificate; FitError where `strict`
+    and it misses.
+    """
     if not options.localisation:
         return fit
     rpc, certificate = with_localisation(
@@ -247,19 +252,19 @@ def _localised(
 
 
 def underlying_rpc(model: object) -> RPC | None:
-    """The RPC that a model is built on: itself, or what its corrections stand in front of."""
+    """Return the RPC that a model is built on: itself, or what its corrections stand in front of."""
     return inner if isinstance(inner := innermost(model), RPC) else None
 
 
 def innermost(model: object) -> object:
-    """The camera that a model's corrections stand in front of, or itself."""
+    """Return the camera that a model's corrections stand in front of, or itself."""
     while (inner := getattr(model, "sensor", None)) is not None:
         model = inner
     return model
 
 
 def relative_weight(sigma: npt.ArrayLike | None, count: int) -> Array | None:
-    """Weights (count,) of standard deviations (count,), 1 for the smallest; None for none."""
+    """Return the weights (count,) of standard deviations (count,), 1 for the smallest; None for none."""
     if sigma is None:
         return None
     value = np.asarray(sigma, dtype=np.float64)
@@ -279,7 +284,7 @@ def _certified(
     size: tuple[int, int] | None,
     beyond: float = 1.0,
 ) -> RpcFit:
-    """The fit with its certificate: errors on the check points, the largest (2,) [px] found near them."""
+    """Return the fit with its certificate: errors on the check points, the largest (2,) [px] found near them."""
     problem, rpc = solution.problem, solution.rpc
     ground, image = problem.ground, problem.image
     used = Errors()
@@ -308,7 +313,7 @@ def _certified(
 
 
 def _accepted(fit: RpcFit, options: FitOptions, strict: bool) -> RpcFit:
-    """The fit; FitError where `strict` and something is wrong with it."""
+    """Return the fit; FitError where `strict` and something is wrong with it."""
     if strict and (wrong := fit.verdict(options.tolerance)):
         raise FitError(wrong)
     return fit
@@ -317,7 +322,8 @@ def _accepted(fit: RpcFit, options: FitOptions, strict: bool) -> RpcFit:
 def _best(
     attempt: Callable[[str], RpcFit], options: FitOptions, vendor: RPC | None, strict: bool, exact: bool
 ) -> RpcFit:
-    """The fit by the method asked for, of several (``auto``) the best accepted; without one the best, or a FitError.
+    """Return the fit by the method asked for, of several (``auto``) the best accepted; without one the best,
+    or a FitError.
 
     Points of a model are `exact`: what a ridge leaves of them is misfit, and the least squares of that are looked for.
     """

@@ -62,7 +62,8 @@ _EVEN = 0.05  # a denominator within 1 -/+ this weights nothing
 
 
 def corner(systems: Sequence[Compressed]) -> float:
-    """Regularisation h at the corner of the L-curve of systems that share it: the largest curvature, by grids of h.
+    """Return the regularisation h at the corner of the L-curve of systems that share it: the largest
+    curvature, by grids of h.
 
     The curve (log |M x - y|, log |x|) and its curvature have a closed form in the singular values (Hansen,
     "Rank-deficient and discrete ill-posed problems", 1998).
@@ -84,7 +85,7 @@ def corner(systems: Sequence[Compressed]) -> float:
 
 
 def _curvature(h: Array, s: Array, beta: Array, rest: float) -> Array:
-    """Curvature (n,) of the L-curve at h (n, 1) for singular values s and projections beta (k,)."""
+    """Return the curvature (n,) of the L-curve at h (n, 1) for singular values s and projections beta (k,)."""
     xi2, beta2 = (beta / s) ** 2, beta**2
     f = s**2 / (s**2 + h**2)
     g = 1.0 - f
@@ -127,14 +128,14 @@ def _coefficients(problem: Problem, systems: list[Compressed], quantize: Roundin
 
 
 def _quotients(parts: Sequence[Array]) -> Array:
-    """Coefficients (4, 20) of col and row, each its numerator and its denominator."""
+    """Return the coefficients (4, 20) of col and row, each its numerator and its denominator."""
     return np.concatenate(parts)
 
 
 def _reweighted(
     problem: Problem, axes: Sequence[int], coeffs: Array, penalty: Array, corrected: bool
 ) -> tuple[float, list[Compressed]]:
-    """RMSE [px] of coefficients, and the systems that their denominators weight."""
+    """Return RMSE [px] of coefficients, and the systems that their denominators weight."""
     squares, following = 0.0, []
     for i, axis in enumerate(axes):
         with np.errstate(
@@ -167,16 +168,16 @@ class Solution:
 
     @cached_property
     def region(self) -> Region:
-        """Where its denominators are looked at."""
+        """Region of the ground over which denominators are bounded."""
         return region_of(self.problem)
 
     @property
     def held(self) -> bool:
-        """Whether a denominator is as small as it may be: without the bound it were smaller."""
+        """Whether the bound holds a denominator: without it, it would be smaller."""
         return self.method in BOUNDED and self.region.smallest(self.coeffs[1::2]) < FLOOR + _SLACK
 
     def leave_one_out(self) -> Iterator[Array]:
-        """Residuals (n, 2) that points would have if they had not been used, some hundred at a time.
+        """Yield the leave-one-out residuals (n, 2) of the points, some hundred at a time.
 
         r / (1 - leverage), the leverage from the final system: exact for a linear problem.
         """
@@ -196,26 +197,28 @@ class Solution:
             yield residual
 
     def _inverses(self) -> list[Array]:
-        """For col and row, what takes its row of (M | y) to the unknowns' standard deviations (k, n)."""
+        """Return, for col and row, the matrices (k, n) from the rows of (M | y) to the unknowns' standard
+        deviations.
+        """
         return [np.asarray(np.linalg.pinv(system.matrix)) for system in self.solved]
 
 
 def region_of(problem: Problem) -> Region:
-    """The hull of a problem's own points and its margin."""
+    """Return the hull of a problem's own points and its margin."""
     norm = problem.norm
     ground = (problem.ground - norm.ground_offset) / norm.ground_scale
     return Region.around(ground, (problem.image - norm.image_offset) / norm.image_scale, problem.margin)
 
 
 def tidy(values: Array) -> Array:
-    """Values of at most twelve significant digits: they survive every reader that prints fifteen."""
+    """Return values rounded to twelve significant digits: they survive every reader that prints fifteen."""
     return np.array([float(f"{value:.12g}") for value in values])
 
 
 def normalization(
     ground: Array, image: Array, options: FitOptions, vendor: RPC | None = None
 ) -> Normalization:
-    """Offsets and scales that take points into [-1, 1], rounded to the options' precision.
+    """Return the offsets and scales that take points into [-1, 1], rounded to the options' precision.
 
     Those of the ground are the vendor's where one is given.
     """
@@ -261,7 +264,7 @@ def solve(
 
 
 def solve_problem(problem: Problem, options: FitOptions, method: str, vendor: RPC | None = None) -> Solution:
-    """The solution of a problem by a method, its numbers rounded to the options' precision."""
+    """Return the solution of a problem by a method, its numbers rounded to the options' precision."""
     quantize = None if options.precision is None else PRECISIONS[options.precision].coeffs
     coeffs, systems, h, passes = METHODS[method](problem, quantize, vendor)
     return Solution(coeffs, problem, systems, h, passes, method)
@@ -299,7 +302,7 @@ def _gauss_newton(problem: Problem, quantize: Rounding | None, vendor: RPC | Non
 
 
 def _minimised(problem: Problem, axis: int, x: Array, region: Region) -> tuple[Array, Compressed, int]:
-    """Least squares of y - a / b from unknowns x (k,), the system there, and the passes over the points."""
+    """Return the least squares of y - a / b from unknowns x (k,), the system there, and the passes over the points."""
 
     def linearised(x: Array) -> Compressed:
         numerator, denominator = problem.expanded(x)
@@ -323,7 +326,9 @@ def _minimised(problem: Problem, axis: int, x: Array, region: Region) -> tuple[A
 def _ahead(
     problem: Problem, system: Compressed, x: Array, penalty: Array, size: Array, region: Region
 ) -> Array:
-    """The solution of a system damped towards x, its denominator kept up over a region; x where there is none."""
+    """Return the solution of a system damped towards x, its denominator kept up over a region; x where there
+    is none.
+    """
     for least, solver in (
         (_LEAST_DAMPED, solution),
         (

@@ -52,12 +52,12 @@ class Compressed:
 
     @property
     def matrix(self) -> Array:
-        """(k, k): what stands for M."""
+        """Triangle (k, k) that stands for M."""
         return self.triangle[:-1, :-1]
 
     @property
     def target(self) -> Array:
-        """(k,): what stands for y."""
+        """Column (k,) that stands for y."""
         return self.triangle[:-1, -1]
 
     @property
@@ -71,24 +71,24 @@ class Compressed:
         return abs(float(self.triangle[-1, -1])) / float(np.sqrt(self.freedom))
 
     def squares(self, solution: Array) -> float:
-        """Sum of squares of M x - y."""
+        """Return the sum of squares of M x - y."""
         rest = self.matrix @ solution - self.target
         return float(rest @ rest + self.triangle[-1, -1] ** 2)
 
     def solved_by(self, solution: Array) -> Compressed:
-        """The system of the same rows that a given solution (k,) leaves nothing of but what it never reaches."""
+        """Return the system that a given solution (k,) solves: y replaced by M x, the residual of the rows kept."""
         triangle = self.triangle.copy()
         triangle[:-1, -1] = self.matrix @ solution
         return Compressed(triangle, self.num_points)
 
     def penalized(self, penalty: Array, toward: Array | float = 0.0) -> Compressed:
-        """The system with the rows diag(`penalty`) x = `toward` below."""
+        """Return the system with the rows diag(`penalty`) x = `toward` below."""
         rows = np.column_stack([np.diag(penalty), np.broadcast_to(toward, penalty.shape)])
         return Compressed(_take_in(self.triangle, rows), self.num_points)
 
 
 def _take_in(triangle: Array, rows: Array) -> Array:
-    """Triangular factor of `triangle` on top of `rows`."""
+    """Return the triangular factor of `triangle` on top of `rows`."""
     block = min(_BLOCK, len(triangle))
     factor: Array = dtpqrt(0, block, triangle, np.asfortranarray(rows), overwrite_b=True)[0]
     return factor
@@ -108,7 +108,7 @@ class Problem:
     first: Compressed | None = None  # of col without a denominator, where it is known already
 
     def screened(self) -> Problem:
-        """The same problem without the monomials that its points do not tell from those of lower degree.
+        """Return the problem without the monomials that its points cannot tell from those of lower degree.
 
         All twenty stay where altitudes abound; of points at one altitude those without H, of two altitudes those of
         degree one in H. A dependent one would make a = b = 0 a solution.
@@ -124,7 +124,7 @@ class Problem:
         free: bool = True,
         numerator: Array | None = None,
     ) -> Iterator[tuple[slice, Array]]:
-        """Rows (n, k + 1) of (M | y) of col (`axis` 0) or row (1), some hundred points at a time.
+        """Yield the rows (n, k + 1) of (M | y) of col (`axis` 0) or row (1), some hundred points at a time.
 
         A denominator (20,) weights the rows by 1 / b; its coefficients are unknowns too where `free`. With a numerator,
         too, they are those of the linearised a / b.
@@ -160,7 +160,7 @@ class Problem:
         free: bool = True,
         numerator: Array | None = None,
     ) -> Compressed:
-        """The system of the rows of the same parameters."""
+        """Return the system of the rows of the same parameters."""
         if self.first is not None and axis == 0 and denominator is None and free:
             return self.first
         size = 2 * len(self.active) if free else len(self.active) + 1
@@ -170,7 +170,7 @@ class Problem:
         return Compressed(np.triu(triangle), len(self.image))
 
     def expanded(self, solution: Array, denominator: Array | None = None) -> Array:
-        """Numerator and denominator (2, 20) of a solution; monomials not in use are zero."""
+        """Return the numerator and denominator (2, 20) of a solution; monomials not in use are zero."""
         m, out = len(self.active), np.zeros((2, 20))
         out[0, self.active] = solution[:m]
         if denominator is not None:
@@ -180,17 +180,18 @@ class Problem:
         return out
 
     def errors(self, axis: int, x: Array) -> Array:
-        """What a solution leaves of a coordinate (N,), in scales of the image."""
+        """Return the residuals (N,) of a coordinate under a solution, in units of the image scale."""
         rows = self.rows(axis, self.expanded(x)[-1])
         return np.concatenate([np.abs(block[:, :-1] @ x - block[:, -1]) for _, block in rows])
 
     def packed(self, expanded: Array) -> Array:
-        """The solution (k,) that `expanded` makes numerators and denominator of."""
+        """Return the solution (k,) of which `expanded` makes these numerators and denominator."""
         return np.concatenate([expanded[0, self.active], expanded[1, self.active[1:]]])
 
 
 def expected_size(active: IntArray) -> Array:
-    """Size (k,) expected of each unknown, those of the denominator last; infinite where nothing is expected.
+    """Return the size (k,) expected of each unknown, those of the denominator last; infinite where nothing is
+    expected.
 
     Numerator: 0.1 of degree two, 0.03 of degree three. Denominator: `TAU` of degree one, a tenth of it
     of degree two, a hundredth of degree three: what vendors' RPCs show, with room.
@@ -200,7 +201,7 @@ def expected_size(active: IntArray) -> Array:
 
 
 def noise_scaled(system: Compressed, expected: Array) -> tuple[Compressed, float]:
-    """The system with each unknown penalised by sigma / its expected size, and sigma.
+    """Return the system with each unknown penalised by sigma / its expected size, and sigma.
 
     The free solution lets noisy denominators shrink, and the residual with them; the residual of the
     penalised one tells the noise better. Never quite singular: there is a floor at the rounding.
@@ -215,7 +216,7 @@ def noise_scaled(system: Compressed, expected: Array) -> tuple[Compressed, float
 
 
 def solution(system: Compressed, quantize: Rounding | None = None) -> Array:
-    """The least-squares solution (k,), by back substitution.
+    """Return the least-squares solution (k,), by back substitution.
 
     Where quantized, each coefficient is rounded in turn and the ones still to come make up for it (Babai's nearest
     plane).

@@ -21,7 +21,7 @@ POLL, REMIND = 5.0, 60.0
 
 @contextmanager
 def watched(executor: Executor | None) -> Iterator[None]:
-    """Say when a dask cluster has no worker, once a minute that one is waited for, and when work goes on.
+    """Log when a dask cluster has no worker, once a minute while the run waits, and when work goes on.
 
     InputError where a worker has another version of barpc.
     """
@@ -39,7 +39,7 @@ def watched(executor: Executor | None) -> Iterator[None]:
 
 
 def other_version(theirs: str, own: str, where: str = "a worker") -> InputError:
-    """What is wrong with a worker that would give other bytes."""
+    """Return why a worker would give other bytes (its version), or nothing."""
     return InputError(
         f"{where} has barpc {theirs}, this process {own}: results would differ; install the same version everywhere"
     )
@@ -76,12 +76,12 @@ def _watch(client: Any, end: threading.Event) -> None:
 
 
 def _waits(client: Any) -> bool:
-    """Whether a task is under way: a cluster that adapts may do without workers while there is none."""
+    """Return whether a task is under way: a cluster that adapts may do without workers while there is none."""
     return any(state.status == "pending" for state in list(client.futures.values()))
 
 
 def _workers(client: Any) -> int | None:
-    """How many there are; None where the scheduler does not say."""
+    """Return the number of workers; None where the scheduler does not say."""
     if client.status != "running":
         return None
     try:

@@ -34,7 +34,7 @@ _MISTAKES = {
 
 
 def load_gcps(paths: Sequence[str], views: Sequence[View], options: RunOptions) -> GroundPoints | None:
-    """Ground points of several files, one after the other; None without files.
+    """Return the ground points of several files, one after the other; None without files.
 
     Points that cannot be where they are said to be, images that are no views, and files that cannot be read are an
     InputError, or with `keep_going` left out and named in `left_out`.
@@ -82,7 +82,9 @@ def _listed(names: Sequence[str]) -> str:
 def _implausible(
     points: GroundPoints, views: Sequence[View], search: Array
 ) -> Iterator[tuple[BoolArray, str]]:
-    """Points (G,) that cannot be meant, and why; the first reason counts. `search` (M,) [px] as of `reach_of`."""
+    """Yield the points (G,) that cannot be meant, and why; the first reason counts. `search` (M,) [px] as of
+    `reach_of`.
+    """
     low, high = np.array([view.alt_range for view in views])[points.view].T
     alt = points.lonlatalt[points.point, 2]
     shown, pixel = _shown(points, views, np.clip(alt, low, high))
@@ -106,12 +108,14 @@ def _implausible(
 
 
 def _any(points: GroundPoints, observed: BoolArray) -> BoolArray:
-    """Points (G,) of which any observation (M,) is so."""
+    """Return the points (G,) for which a condition holds in any of their observations (M,)."""
     return np.bincount(points.point, observed, minlength=len(points.names)) > 0
 
 
 def _shown(points: GroundPoints, views: Sequence[View], alt: Array) -> tuple[Array, Array]:
-    """Where each image shows a point (M, 3), lon, lat [deg], alt [m], at altitudes (M,), and a pixel there (M,) [m]."""
+    """Localise where each image shows a point (M, 3), lon, lat [deg], alt [m], at altitudes (M,), and the
+    pixel size there (M,) [m].
+    """
     ground, pixel = np.empty((len(alt), 3)), np.empty(len(alt))
     for v in np.unique(points.view):
         rows = points.view == v
@@ -121,14 +125,16 @@ def _shown(points: GroundPoints, views: Sequence[View], alt: Array) -> tuple[Arr
 
 
 def _distance(points: GroundPoints, shown: Array, columns: tuple[int, int], signs: tuple[int, int]) -> Array:
-    """Metres (M,) from where images show points to where these are said to be, coordinates taken from `columns`."""
+    """Return the metres (M,) from where images show points to where these are said to be, coordinates taken
+    from `columns`.
+    """
     level = points.lonlatalt[points.point][:, columns] * signs
     given = np.column_stack([level, shown[:, 2]])
     return np.asarray(np.linalg.norm(ecef_from_ground(given) - ecef_from_ground(shown), axis=1))
 
 
 def load_altimetry(paths: Sequence[str], views: Sequence[View]) -> Altimetry | None:
-    """The heights of several files in the images, one after the other; None without files.
+    """Return the heights of several files in the images, one after the other; None without files.
 
     InputError for a file that cannot be read or has no height in the images.
     """
@@ -151,7 +157,7 @@ def _heights_of(path: str, views: Sequence[View]) -> Altimetry:
 
 
 def _inside(lonlatalt: Array, views: Sequence[View]) -> BoolArray:
-    """Which places (n, 3) are within the bounds of any image on the ground, or near them."""
+    """Return the places (n, 3) within the ground bounds of any image, or near them."""
     found = np.zeros(len(lonlatalt), dtype=bool)
     for view in views:
         ring = footprint(view.sensor, view.size, view.altitude)

@@ -46,7 +46,9 @@ Outcome = tuple[float, Any, BaseException | None]  # seconds, result, error of o
 
 
 def worker_count(executor: Executor | None) -> int:
-    """How many tasks an executor works on at a time; of a dask cluster at least what it may grow to."""
+    """Return the number of tasks that an executor works on at a time; of a dask cluster at least what it may
+    grow to.
+    """
     client = getattr(executor, "_client", None)
     if client is not None:
         return max(_CLUSTER, sum(int(n) for n in client.nthreads().values()))
@@ -83,7 +85,7 @@ class CachingExecutor(Executor):
         self._spilled: set[str] = set()
 
     def submit(self, fn: Function, /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Hand in `fn(*args)`; its result is looked up, or made when its turn comes."""
+        """Submit `fn(*args)`; its result is looked up in the workspace, or computed when its turn comes."""
         if kwargs:
             raise TypeError("tasks take positional arguments only")
         task = _Task(self, fn, args)
@@ -94,7 +96,7 @@ class CachingExecutor(Executor):
         return task
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Nothing is handed out or kept from now on; the executor behind is left as it is."""
+        """Stop accepting tasks and keeping results; the executor behind stays as it is."""
         with self._storing:
             self._open = False
             self._waiting.clear()
@@ -102,7 +104,7 @@ class CachingExecutor(Executor):
             self.store.clear()
 
     def key(self, fn: Function, args: tuple[Any, ...]) -> str:
-        """The key under which the result of a task is kept."""
+        """Return the key under which the result of a task is kept."""
         return key_of(fn.__module__, fn.__qualname__, [self._canonical(arg) for arg in args])
 
     def _canonical(self, value: Any) -> Any:
@@ -118,7 +120,7 @@ class CachingExecutor(Executor):
         return value
 
     def guards(self, args: Any) -> tuple[Input, ...]:
-        """The inputs that the arguments of a task name."""
+        """Return the hashed inputs that the arguments of a task name."""
         if isinstance(args, str):
             return (self._inputs[args],) if args in self._inputs else ()
         if is_dataclass(args) and not isinstance(args, type):
@@ -150,7 +152,9 @@ class CachingExecutor(Executor):
                 future.add_done_callback(partial(self._completed, batch))
 
     def _spill(self, args: tuple[Any, ...]) -> tuple[Any, ...] | Spilled:
-        """Arguments as they are, or without the large arrays among them, which a file of the run folder keeps."""
+        """Return the arguments as they are, or without the large arrays among them, which a file of the run
+        folder keeps.
+        """
         try:
             record = to_arrays(args)
         except TypeError:  # something that is not kept as a record, such as a user's own sensor
@@ -170,7 +174,9 @@ class CachingExecutor(Executor):
         )
 
     def _next_batch(self) -> list[_Task]:
-        """Waiting tasks of one function that have no kept result; they count as in flight, empty does not."""
+        """Return the waiting tasks of one function that have no kept result; they count as in flight, empty
+        does not.
+        """
         with self._lock:
             if not self._open or self._in_flight >= self._limit:
                 return []
@@ -185,7 +191,7 @@ class CachingExecutor(Executor):
         return batch
 
     def _next_task(self, batch: Sequence[_Task]) -> _Task | None:
-        """One more for a batch: as many as take BATCH_SECONDS, as far as the other workers get as many."""
+        """Return one more for a batch: as many as take BATCH_SECONDS, as far as the other workers get as many."""
         with self._lock:
             if not self._waiting:
                 return None
@@ -229,7 +235,7 @@ class _Task(Future[Any]):
         self._kept_here = owner.keep and not (args and isinstance(args[0], Store))
 
     def begin(self) -> bool:
-        """Whether there is work to do: it was not cancelled, and no result is kept."""
+        """Return whether there is work to do: it was not cancelled, and no result is kept."""
         if not self.set_running_or_notify_cancel():
             return False
         try:
@@ -255,7 +261,7 @@ class _Task(Future[Any]):
             self.set_exception(error)
 
     def result(self, timeout: float | None = None) -> Any:
-        """The result, worked out here where there is no executor."""
+        """Return the result, worked out here where there is no executor."""
         if self._owner.executor is None and not self.done() and self.begin():
             with guarded(self._owner.guards(self.args)):
                 found = self.fn(*self.args)
@@ -276,14 +282,14 @@ class _Task(Future[Any]):
 
 @dataclass(frozen=True)
 class Spilled:
-    """The arguments of a task whose large arrays lie in a store: what `to_arrays` made of them, name -> place."""
+    """Arguments of a task whose large arrays are stored in files: what `to_arrays` made of them, by name."""
 
     small: Arrays
     large: Mapping[str, str]
     store: Store
 
     def load(self) -> tuple[Any, ...]:
-        """The arguments; InputError where the worker does not see the store."""
+        """Return the arguments; InputError where the worker does not see the store."""
         arrays = {name: self.store.need(place)["array"] for name, place in self.large.items()}
         arguments: tuple[Any, ...] = from_arrays({**self.small, **arrays}, sent=True)
         return arguments
@@ -295,7 +301,8 @@ def run_batch(
     version: str,
     guards: Sequence[tuple[Input, ...]] | None = None,
 ) -> tuple[list[Outcome], float]:
-    """Work on a batch, in a worker: one task's error leaves the others their results; CPU seconds that it took.
+    """Run a batch of tasks in a worker; an error of one leaves the others their results. Returns CPU seconds,
+    too.
 
     `guards`: the inputs that each task names. One that came to a cluster with another `version` works on nothing.
     """
@@ -319,7 +326,7 @@ def run_batch(
 
 
 def _explained(error: BaseException) -> BaseException:
-    """A worker that is lost, in words; any other error as it is."""
+    """Return a lost worker's error in words; any other error as it is."""
     if not isinstance(error, (BrokenExecutor, CancelledError)) and type(error).__name__ not in _LOST:
         return error
     died = AdjustError(

@@ -58,20 +58,20 @@ Box = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class Files:
-    """Which files are written of a view beside its RPC."""
+    """Files to be written of a view beside its RPC."""
 
     grids: bool
     resampled: bool
     state: bool = False
 
     def names(self, view: View) -> list[str]:
-        """Their names."""
+        """Return their names."""
         ends = [STATE] * self.state + [GRID] * self.grids + [CORRECTION] * (self.grids or self.resampled)
         return [view.name + end for end in (*ends, *[RESAMPLED] * self.resampled)]
 
 
 def grid_names(view: View, options: RunOptions) -> list[str]:
-    """The files that `write_grids` may write for a view, before it is known whether its RPC holds it."""
+    """Return the files that `write_grids` may write for a view, before it is known whether its RPC holds it."""
     boxes = [] if options.tiles is None else tile_boxes(view.size, options.tiles)
     tiles = [*(tile_name(view, box) for box in boxes), *[view.name + TILES] * bool(boxes)]
     files = Files(grids=True, resampled=options.resample, state=is_writable(view.sensor))
@@ -85,7 +85,7 @@ def write_grids(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[Written]:
-    """Write what is asked for of every view, grids also where its RPC misses it, and open every file again.
+    """Write the grids, tile RPCs and resampled images that are asked for, and reopen every file.
 
     OutputError where a file cannot be written, or does not hold what was written.
     """
@@ -115,7 +115,9 @@ Task = tuple[View, RPC, SensorModel, Files]
 def _write(
     run: Workspace, tasks: Sequence[Task], executor: Executor | None, progress: Progress | None
 ) -> list[Written]:
-    """Workers make the files in a room of the run folder, here they get their place, and workers open them again."""
+    """Write grids: workers make the files in a folder of the run, they take their places here, and workers
+    open them again.
+    """
     room = run.partial / "grids"
     with CachingExecutor(run, {}, executor, keep=False) as fresh:
         try:
@@ -142,7 +144,9 @@ def _write(
 
 
 def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str) -> Misses:
-    """Write the grids of a view, and its resampled image, into a room; what each misses the model by [px]."""
+    """Write the grids of a view, and its resampled image, into a temporary folder; return how far each misses
+    the model [px].
+    """
     place, alts = Path(room) / view.name, widened(view.alt_range)
     place.mkdir(parents=True, exist_ok=True)
     sample, errors = Sample.of(model, view.size, alts), Misses()
@@ -169,7 +173,7 @@ def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str
 
 
 def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss]:
-    """An RPC and what it lacks, and how far both together are off the camera of a sample.
+    """Return an RPC and what it lacks, and how far both together are off the camera of a sample.
 
     What `rpc` lacks may depend on the altitude: the best RPC of all trades denominators, which see altitudes, for what
     changes with the rows. Then another one serves better here, though it misses by more.
@@ -201,7 +205,7 @@ def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss
 
 
 def _off(sample: Sample, camera: SensorModel) -> Miss:
-    """How far a camera is off the model of a sample."""
+    """Return the largest error of a camera against the model of a sample."""
     errors, largest = sample.sought(lambda ground, at: camera.project(ground) - at[:, :2])
     return float(np.linalg.norm(errors.rmse)), float(np.linalg.norm(largest)), errors.worst
 
@@ -232,13 +236,15 @@ def verify_grids(view: View, model: SensorModel, errors: Misses, folder: str) ->
 
 
 def tile_boxes(size: tuple[int, int], side: int) -> list[Box]:
-    """Tiles (col, row, width, height) from multiples of `side` on; a rest of up to half a side joins its neighbour."""
+    """Return the tiles (col, row, width, height) from multiples of `side` on; a rest of up to half a side
+    joins its neighbour.
+    """
     edges = [[*range(0, max(1, length - side // 2), side), length] for length in size]
     return [(c, r, right - c, low - r) for r, low in pairwise(edges[1]) for c, right in pairwise(edges[0])]
 
 
 def tile_name(view: View, box: Box) -> str:
-    """The file with the RPC of a tile: its first row and column."""
+    """Return the file with the RPC of a tile: its first row and column."""
     return f"{view.name}_tiles/{box[1]:05d}_{box[0]:05d}_RPC.TXT"
 
 
@@ -250,7 +256,7 @@ def _write_tiles(
     options: RunOptions,
     executor: Executor | None,
 ) -> Written:
-    """An RPC for each tile, in the tile's own pixels, and a list of them."""
+    """Return an RPC for each tile, in the tile's own pixels, and a list of them."""
     assert options.tiles is not None
     boxes, alts = tile_boxes(view.size, options.tiles), widened(view.alt_range)
     tasks = [
@@ -284,7 +290,7 @@ def _write_tiles(
 def fit_tiles(
     model: SensorModel, boxes: Sequence[Box], alt_range: tuple[float, float], options: FitOptions
 ) -> list[RpcFit]:
-    """The RPCs of some tiles of a camera, whose images begin at their first pixels."""
+    """Return the RPCs of some tiles of a camera, whose images begin at their first pixels."""
     fits = []
     for col, row, *size in boxes:
         tile = ImageCorrected(model, ImageAffine(-np.array([col, row], dtype=np.float64), np.zeros((2, 2))))

@@ -42,7 +42,7 @@ _ASTRAY = 0.05  # of the points may lie farther off, where a matcher looks over 
 
 
 def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None, BlockPrior | None]:
-    """The terrain, and what an earlier run knows about its views, read before any work starts.
+    """Return the terrain, and what an earlier run knows about its views, read before any work starts.
 
     A file that cannot be used, those of ground points included, stops the run here (InputError), not after an hour.
     """
@@ -73,7 +73,7 @@ def _require_cover(dem: Dem, path: str, views: Sequence[View]) -> None:
 
 
 def with_located(options: RunOptions) -> RunOptions:
-    """The options with the rasters that may lie on other hosts found there; others are refused (ImageError)."""
+    """Return the options with the rasters that may lie on other hosts found there; others are refused (ImageError)."""
 
     def at(path: str) -> str:
         found = located(path, options.allow_remote)
@@ -84,12 +84,12 @@ def with_located(options: RunOptions) -> RunOptions:
 
 
 def reference_names(options: RunOptions) -> list[str]:
-    """The references as tasks call them."""
+    """Return the references by the names that tasks use."""
     return [os.fspath(place(path).absolute()) for path in options.reference]
 
 
 def input_files(options: RunOptions) -> list[Path]:
-    """Every file of this machine that the options name; none of them is ever written."""
+    """Return every file of this machine that the options name; none of them is ever written."""
     found = [] if options.fixed_run is None else [Path(options.fixed_run) / PRIOR]
     for name, one in declared(RunOptions).items():
         value = getattr(options, name)
@@ -102,7 +102,7 @@ def input_files(options: RunOptions) -> list[Path]:
 def read_pairs(
     path: str | Path, views: Sequence[View], left_out: Sequence[str | Path] = ()
 ) -> list[tuple[int, int]]:
-    """The pairs of a list: two image names or paths a line; blank lines and # comments are skipped.
+    """Return the pairs of a list: two image names or paths a line; blank lines and # comments are skipped.
 
     Relative paths start from where the list lies, or from the current folder; pairs with an image that was `left_out`
     of the run are passed over. InputError where a line is not two images of the run, or none is left.
@@ -130,7 +130,9 @@ def read_pairs(
 def _finder(
     folder: Path, views: Sequence[View], left_out: Sequence[str | Path]
 ) -> Callable[[str], int | None]:
-    """Index of the view that a list calls by its path or its name; None if it was left out, InputError if unknown."""
+    """Return the index of the view that a list calls by its path or its name; None if it was left out,
+    InputError if unknown.
+    """
     names = ViewNames([view.name for view in views], "the list of pairs")
     without = ViewNames([Path(path).name for path in left_out], "")
     places: dict[object, int | None] = {_resolved(path): None for path in left_out}
@@ -151,7 +153,7 @@ def _resolved(path: str | Path) -> object:
 
 
 def only_new(tracks: Tracks, old: BoolArray) -> Tracks:
-    """Tracks that tell something an earlier block, of the views `old` (N,), did not know.
+    """Return the tracks with observations that an earlier block, of the views `old` (N,), did not have.
 
     Tracks without a new view are left out. Of those seen in several old views one old observation is kept: how
     these views lie to each other is in the earlier block's normal matrix already.
@@ -173,7 +175,8 @@ def hash_inputs(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Input]:
-    """Every input of a run by the name that tasks call it by; InputError where one changed since it was read.
+    """Return every hashed input of a run by its name in tasks; InputError where one changed since it was
+    read.
 
     `seen` holds the files that were opened so far. A matcher of the user's goes by its name, with all its files.
     """
@@ -197,7 +200,7 @@ def hash_inputs(
 
 
 def _groups(names: Sequence[str]) -> list[tuple[tuple[str, ...]]]:
-    """Small files go together."""
+    """Group files into tasks, small ones together."""
     groups: list[list[str]] = [[]]
     size = 0
     for name in names:
@@ -215,14 +218,16 @@ def hash_files(names: Sequence[str]) -> list[Input]:
 
 
 def given_tracks(paths: Sequence[str | Path], views: Sequence[View]) -> Tracks:
-    """The tie points of files as they are."""
+    """Return the tie points of files as they are."""
     return tracks_of(_linked(paths, views), ", ".join(map(str, paths)))
 
 
 def given_matches(
     paths: Sequence[str | Path], views: Sequence[View], *, partly: bool = False
 ) -> dict[tuple[int, int], Matches]:
-    """The matches of files, pair by pair; one without any is an error, but for a part (`partly`) of the images."""
+    """Read the matches of files, pair by pair; InputError for a file without any, but for part (`partly`) of
+    the images.
+    """
     links = _linked(paths, views, partly)
     swapped = links.view[links.ends[:, 0]] > links.view[links.ends[:, 1]]
     ends = np.where(swapped[:, None], links.ends[:, ::-1], links.ends)
@@ -238,7 +243,7 @@ def given_matches(
 
 
 def _linked(paths: Sequence[str | Path], views: Sequence[View], partly: bool = False) -> Links:
-    """What the files say of the views, all of it inside their images."""
+    """Read the matches of files for the views, all of them inside their images."""
     parts = [Links.of_pairs([])]
     for path in paths:
         try:
@@ -253,7 +258,7 @@ def _linked(paths: Sequence[str | Path], views: Sequence[View], partly: bool = F
 
 
 def _in_images(path: str | Path, views: Sequence[View], links: Links) -> Links:
-    """Without points that lie outside their images; InputError where they are more than a few."""
+    """Return the matches without points outside their images; InputError where these are more than a few."""
     beyond = np.array([view.size for view in views])[links.view] + (_MARGIN - 1.0)
     inside = np.asarray(((links.xy >= -_MARGIN) & (links.xy <= beyond)).all(axis=1))
     wrong = np.flatnonzero(~inside)

@@ -82,7 +82,7 @@ def write_views(
 def make_files(
     view: View, rpc: RPC, images: str, formats: Sequence[str], folder: str, room: str
 ) -> tuple[str, ...]:
-    """Write the files of a view that are meant for `folder` into a room; their paths there."""
+    """Write the files of a view into a temporary folder before they go to `folder`; return their final paths."""
     place, names = Path(room) / view.name, file_names(view, images, formats)
     for name in names:
         try:
@@ -113,13 +113,13 @@ def verify_files(paths: Sequence[str], view: View, fit: RpcFit, model: SensorMod
 
 
 def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
-    """The files that `write_views` writes for a view."""
+    """Return the files that `write_views` writes for a view."""
     ends = [CARRIERS[images].suffixes[0]] if images in CARRIERS else []
     return [view.name + end for end in (*ends, *(WRITABLE[key].beside for key in formats))]
 
 
 def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> list[str]:
-    """The outputs of a run, before it starts; of the tie points of pairs those that are in the folder."""
+    """Return the names of a run's outputs before it starts; of match files those that are already in the folder."""
     names = [*TABLES, "summary.json", *(["report.html"] if can_render() else [])]
     names += [GCPS] * bool(options.reference)
     if options.stop_after == "matching":
@@ -133,7 +133,7 @@ def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> li
 
 
 def _is_pair(stem: str, names: Set[str]) -> bool:
-    """Whether a file name is two view names with __ between them; either may hold one, too."""
+    """Return whether a file name is two view names with __ between them; either may hold one, too."""
     parts = stem.split("__")
     cuts = (("__".join(parts[:i]), "__".join(parts[i:])) for i in range(1, len(parts)))
     return any(a in names and b in names for a, b in cuts)
@@ -153,7 +153,8 @@ def refuse_shadows(folder: Path, names: Sequence[str]) -> None:
 
 
 def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
-    """The tables, report.html where jinja2 is installed, and summary.json last: a folder with it is complete.
+    """Write the tables, report.html where jinja2 is installed, and summary.json last: a folder with it is
+    complete.
 
     Returns the summary with the stages that this took.
     """
@@ -182,7 +183,7 @@ def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
 
 
 def _json(value: Any) -> str:
-    """A value as JSON, an item of a list a line."""
+    """Return a value as JSON, an item of a list a line."""
     if not isinstance(value, list):
         return json.dumps(value)
     return "[\n" + ",\n".join(map(json.dumps, value)) + "\n]" if value else "[]"

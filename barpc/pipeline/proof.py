@@ -25,7 +25,7 @@ GOOD = (SAME, MOVED)
 
 @dataclass(frozen=True)
 class Proved:
-    """What became of a file: `kind` input, output or camera, one of the words above, and more of it."""
+    """What became of a file: its `kind` (input, output or camera), a word for its state, and details."""
 
     kind: str
     file: str
@@ -84,14 +84,16 @@ def _cameras(summary: Summary, folder: Path) -> Iterator[Proved]:
 
 
 def _holds_camera(path: Path) -> bool:
-    """Whether a file holds the camera of its whole image: tiles and a resampled image have cameras of their own."""
+    """Return whether a file holds the camera of its whole image: tiles and a resampled image have cameras of
+    their own.
+    """
     if path.name.endswith((TILES, RESAMPLED)):
         return False
     return path.name.endswith((GRID, CORRECTION)) or row_of(path) is not None
 
 
 def _camera(view: ViewEntry, path: Path, name: str, stated: float) -> Proved:
-    """What a file says of its camera, as a reader finds it: another file beside it may go before."""
+    """Read the camera of a file as a reader finds it: another file beside it may go before."""
     points = np.array(view.certified)
     try:
         off = np.linalg.norm(open_camera(path).model.project(points[:, :3]) - points[:, 3:], axis=1)

@@ -67,15 +67,15 @@ _GROUP = 8  # views that are fitted in one task, whose result is kept
 
 @dataclass(frozen=True, eq=False, repr=False)
 class AdjustResult:
-    """What a run ends with.
+    """The result of a run.
 
     Parameters
     ----------
     views : tuple of View, the images used, in the order given; after an adjustment with their refitted RPCs as sensors
     run : Run
-        Everything found on the way. Here and in all that comes of it (`tracks`, `adjustment`, `summary`, files) images
-        stand in the order of their names, `run.views`, so that the order given does not matter.
-    record : Summary, what summary.json holds, as a typed record
+        All intermediate results. Here and in `tracks`, `adjustment`, `summary` and files images stand in the
+        order of their names, `run.views`, whatever the order given.
+    record : Summary, content of summary.json as a typed record
     """
 
     views: tuple[View, ...]
@@ -84,7 +84,7 @@ class AdjustResult:
 
     @cached_property
     def summary(self) -> dict[str, Any]:
-        """What summary.json holds."""
+        """Content of summary.json."""
         found: dict[str, Any] = plain(self.record)
         return found
 
@@ -111,7 +111,7 @@ class AdjustResult:
         return self.run.tracks
 
     def report(self) -> Path:
-        """Make report.html of this run again (extra `report`), from the files in its folder; its path.
+        """Make report.html of this run again from the files in its folder (extra `report`); return its path.
 
         A run that wrote no files (a check), or jinja2 that is not installed, is an InputError.
         """
@@ -133,9 +133,9 @@ def adjust(
     Parameters
     ----------
     images : sequence of path or View
-        Two or more rasters, in any order: the files written do not depend on it. They are opened read-only. What
-        a camera is read from is found as `barpc.cameras.open_camera` does; a View brings its own model (a frozen
-        dataclass, so that its results can be kept).
+        Two or more rasters, in any order: the files written do not depend on it. They are opened read-only.
+        Cameras are found as by `barpc.cameras.open_camera`; a View brings its own model (a frozen dataclass, so
+        that results can be cached).
     out_dir : path, folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``
     options : RunOptions, optional, None: the defaults
     executor : concurrent.futures.Executor, optional, works on images, tiles, pairs, fits; results do not depend on it
@@ -187,7 +187,7 @@ def adjust(
 
 
 def _entries(inputs: Iterable[Input]) -> tuple[InputEntry, ...]:
-    """Every file that was read, once, by its path."""
+    """Return every file that was read, once, by its path."""
     files = {one.path: one for given in inputs for one in given.every()}
     return tuple(InputEntry(path, one.size, one.sha256) for path, one in sorted(files.items()))
 
@@ -199,7 +199,7 @@ def _tell(progress: Progress | None, stage: str, done: int) -> None:
 
 @contextmanager
 def _told(workspace: Workspace, stage: str, progress: Progress | None) -> Iterator[None]:
-    """A stage that is one task."""
+    """Report the progress of a stage that is one task."""
     _tell(progress, stage, 0)
     with workspace.stage(stage):
         yield
@@ -213,7 +213,10 @@ def check(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> AdjustResult:
-    """Measure how well the cameras of overlapping images agree; nothing is adjusted or written."""
+    """Measure how well the cameras of overlapping images agree; nothing is adjusted or written.
+
+    Parameters and errors are those of `adjust`, without a folder; the result has no adjustment.
+    """
     options = with_located(options or RunOptions())
     run = _with_ties(_loaded("check", images, options, executor, progress), options, executor, progress)
     return AdjustResult(_as_given(run.views, images, options), run, summarize(run))
@@ -232,7 +235,7 @@ def _loaded(
     progress: Progress | None,
     workers: list[float] | None = None,
 ) -> Run:
-    """The run with its views; CPU seconds of other processes go to `workers`."""
+    """Return the run with its views; CPU seconds of other processes go to `workers`."""
     for path in input_files(options):
         plain_path(path)
     least = 1 if options.gcp or options.reference else 2  # one image and control are enough
@@ -252,7 +255,9 @@ def _loaded(
 
 
 def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[Path]]:
-    """The files that a run writes and those that it must keep; what stands in the way is refused before any work."""
+    """Return the files that a run writes and those that it must keep; what stands in the way is refused
+    before any work.
+    """
     views = run.views
     if options.stop_after == "matching":
         require_pair_names([view.name for view in views])
@@ -290,7 +295,7 @@ def _solve(
 def _registered(
     run: Run, options: RunOptions, dem: Dem, executor: Executor, progress: Progress | None
 ) -> Registration:
-    """What the reference says of the cameras as delivered."""
+    """Register the views, with the cameras as delivered, to the reference."""
     given = options.adjust.dem_bias_sigma
     bias = (KNOWN_BIAS if dem.known else DEM_BIAS) if given is None else given
     return register(
@@ -306,7 +311,7 @@ def _registered(
 
 
 def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior | None) -> Run:
-    """The run with an adjustment and what went into it."""
+    """Return the run with an adjustment and what went into it."""
     names = [view.name for view in run.views]
     if prior is not None:
         run = replace(run, tracks=only_new(run.tracks, np.isin(names, prior.names)))
@@ -339,7 +344,7 @@ def _with_ties(
     progress: Progress | None,
     terrain: Dem | None = None,
 ) -> Run:
-    """The run with tie points: from a file, or matched."""
+    """Return the run with tie points: from a file, or matched."""
     views = run.views
     if options.matches and options.matches_only:
         return replace(run, tracks=given_tracks(options.matches, views))
@@ -375,7 +380,7 @@ def _write_matches(run: Run, workspace: Workspace) -> None:
 
 
 def _only(run: Run, names: frozenset[str]) -> Run:
-    """The run as it was loaded, without the views that the others are not tied to."""
+    """Return the run as it was loaded, without the views that the others are not tied to."""
     why = "it shares no tie points with the largest group of images"
     dropped = tuple((view.path, why) for view in run.views if view.name not in names)
     kept = [i for i, view in enumerate(run.views) if view.name in names]
@@ -426,7 +431,7 @@ def fit_group(
     options: FitOptions,
     strict: bool,
 ) -> list[tuple[RpcFit | None, str, tuple[str, ...]]]:
-    """Fit RPCs to some cameras, in a worker: the fit, or None and why, and what was warned of."""
+    """Fit RPCs to some cameras in a worker: each fit, or None and the reason, and its warnings."""
     out: list[tuple[RpcFit | None, str, tuple[str, ...]]] = []
     for model, size, alt_range in cameras:
         with warnings.catch_warnings(record=True) as caught:

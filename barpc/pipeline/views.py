@@ -50,7 +50,7 @@ Image = str | Path | View
 
 @dataclass(frozen=True, eq=False)
 class LoadedViews:
-    """Views in the order of their names, where their cameras came from, path and reason of what was left out."""
+    """Views in the order of their names, the sources of their cameras, and path and reason of those left out."""
 
     views: tuple[View, ...]
     sources: tuple[Camera, ...]
@@ -69,7 +69,7 @@ class _Read:
     files: Mapping[str, Stamp] = field(default_factory=dict)  # all that was opened for it
 
     def usable(self, twins: Twins | None) -> tuple[View, Camera]:
-        """The image and its camera; what was found wrong with it, or that it is there twice, is raised."""
+        """Return the image and its camera; what was found wrong with it, or that it is there twice, is raised."""
         if self.error is not None:
             raise self.error
         also_seen(self.files)
@@ -84,7 +84,7 @@ _Given = tuple[str, Place, Image]  # name, file, and what was given
 
 
 def image_path(image: Image, hosts: Sequence[str] = ()) -> Place:
-    """The file with the pixels, absolute; on another host where it is one of `hosts`."""
+    """Return the file with the pixels, absolute; on another host where it is one of `hosts`."""
     path = located(image.path, hosts) if isinstance(image, View) else split_spec(image, hosts)[0]
     return path.absolute()
 
@@ -100,12 +100,12 @@ def load_views(
     progress: Progress | None = None,
     hosts: Sequence[str] = (),
 ) -> LoadedViews:
-    """Read the camera of every image, in the order of their names, whatever order they are given in.
+    """Read the camera of every image, in the order of their names.
 
     Parameters
     ----------
     images : sequence of path or View, files, perhaps with choices behind them (`open_camera`), or views of them
-    min_views : int, how many are needed
+    min_views : int, least number of views
     keep_going : bool, leave a bad file (ImageError, RpcError) out instead of stopping
     band : int, the band that will be read, from 1
     distinct : bool, refuse an image that is there twice, also as other files or under another RPC (see `Twins`)
@@ -148,7 +148,7 @@ def _read_all(
     executor: Executor | None,
     progress: Progress | None,
 ) -> tuple[list[_Read], float]:
-    """Every image as it was read, and CPU seconds of other processes."""
+    """Return every image as it was read, and CPU seconds of other processes."""
     tasks = [(given[at : at + _GROUP], *how) for at in range(0, len(given), _GROUP)]
     told = progress and (lambda stage, done, _: progress(stage, min(done * _GROUP, len(given)), len(given)))
     groups = ordered(executor, read_group, tasks, "cameras", told)
@@ -159,7 +159,7 @@ def _read_all(
 def read_group(
     given: Sequence[_Given], band: int, distinct: bool, hosts: Sequence[str] = ()
 ) -> tuple[list[_Read], float]:
-    """Read some images, in a worker: one that is bad leaves the others theirs; CPU seconds that it took."""
+    """Read some images in a worker; an error of one leaves the others theirs. Returns CPU seconds, too."""
     start, out = time.thread_time(), []
     for name, file, image in given:
         try:
@@ -196,7 +196,7 @@ def _load(name: str, file: Place, image: Image, band: int, hosts: Sequence[str])
 
 
 def _altitudes(camera: Camera) -> tuple[float, float]:
-    """The altitudes that a camera is used for [m]."""
+    """Return the altitudes that a camera is used for [m]."""
     low, high = max(camera.alt_range[0], ALTITUDE_LIMITS[0]), min(camera.alt_range[1], ALTITUDE_LIMITS[1])
     if high - low < MIN_ALTITUDE_SPAN:
         middle = min(max((low + high) / 2, ALTITUDE_LIMITS[0]), ALTITUDE_LIMITS[1])
@@ -218,7 +218,7 @@ class Twins:
         self._alike: dict[Hashable, str | None] = {}
 
     def add(self, view: View, sampled: bytes | None) -> None:
-        """Take in a view with the mark of its samples; InputError names both where it was taken in before."""
+        """Add a view with the hash of its sampled pixels; InputError names both views where it was added before."""
         marks: dict[Hashable, str] = {
             _identity(view.path): "is the same file as {}",
             (view.size, view.sensor): "is the same size and the same RPC as {}",
@@ -236,7 +236,7 @@ class Twins:
                 raise InputError(f"{view.path}: {what.format(self._known[mark])}; give each image once")
 
     def _pixels(self, view: View, sampled: bytes) -> Hashable | None:
-        """A mark of the whole image where another is like it in the samples; None for the first of its like."""
+        """Return a mark of the whole image where another is like it in the samples; None for the first of its like."""
         like = (view.size, sampled)
         if like not in self._alike:
             self._alike[like] = view.path
@@ -253,7 +253,7 @@ class Twins:
 
 
 def _sampled(view: View, band: int) -> bytes | None:
-    """A mark of the pixels in a few windows; None where nothing varies in them."""
+    """Return a mark of the pixels in a few windows; None where nothing varies in them."""
     with open_raster(view.path) as image:
         # fill, perhaps: more is asked before anything is read whole
         return _digest(image, band, _samples(*view.size)) or _digest(image, band, _samples(*view.size, _MORE))
@@ -272,7 +272,7 @@ def _samples(width: int, height: int, at: Sequence[tuple[float, float]] = _SAMPL
 
 
 def _whole(image: Any, band: int) -> bytes | None:
-    """A hash of all pixels, row by row; None for an image in which nothing varies: it shows nothing."""
+    """Return a hash of all pixels, row by row; None for an image in which nothing varies: it shows nothing."""
     block = image.block_shapes[band - 1][0]
     rows = max(1, _CHUNK // (image.width * block)) * block  # whole blocks, so that each is decoded once
     tops = range(0, image.height, rows)
@@ -291,7 +291,7 @@ def _digest(image: Any, band: int, windows: list[Window]) -> bytes | None:
 
 
 def _numbers(raw: Any) -> Any:
-    """Pixels as 8-byte floats (complex ones as two), with one kind of zero and one of NaN."""
+    """Return the pixels as 8-byte floats (complex ones as two), with one kind of zero and one of NaN."""
     parts = raw.astype(np.complex128).view(np.float64) if np.iscomplexobj(raw) else raw
     numbers = parts.astype(np.float64) + 0.0
     numbers[np.isnan(numbers)] = np.nan

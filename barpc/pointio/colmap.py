@@ -32,7 +32,7 @@ _STEPS = 2000  # of 100,000 instructions of SQLite, seconds of work: a damaged f
 
 
 def read_colmap(path: Path, views: ViewNames) -> Iterator[PairPoints]:
-    """The matches between two of the views; InputError where the file is no such database."""
+    """Read the matches between two of the views; InputError where the file is no such database."""
     with opened(path, _DATABASE):  # no pipe, no device
         pass
     for log in (path.with_name(f"{path.name}-{end}") for end in ("wal", "journal")):
@@ -49,7 +49,7 @@ def read_colmap(path: Path, views: ViewNames) -> Iterator[PairPoints]:
 
 
 def _is_hot(log: Path) -> bool:
-    """Whether a log holds what the database has not; one of zeros is over, and kept for the next time."""
+    """Return whether a log holds what the database has not; one of zeros is over, and kept for the next time."""
     if not os.path.lexists(log):
         return False
     return any(read_head(log, _DATABASE, len(_JOURNAL)))
@@ -74,11 +74,11 @@ class _Tables:
         database.set_progress_handler(lambda: int(next(steps, None) is None), 100_000)
 
     def rows(self, columns: str, table: str) -> Iterator[tuple[Any, ...]]:
-        """The rows of a table, in order of their first column."""
+        """Yield the rows of a table, in order of their first column."""
         yield from self._database.execute(f"SELECT {columns} FROM {table}")  # noqa: S608  (names of ours)
 
     def array(self, table: str, key: str, number: int, dtype: str) -> Array | IntArray | None:
-        """The array (rows, cols) of an image or pair; None where there is none."""
+        """Return the array (rows, cols) of an image or pair; None where there is none."""
         query = f"SELECT rows, cols, data FROM {table} WHERE {key} = ?"  # noqa: S608
         found = self._database.execute(query, (number,)).fetchone()
         if found is None or not found[0]:
@@ -92,7 +92,7 @@ class _Tables:
 def _allowed(
     action: int, first: str | None, _second: str | None, _base: str | None, source: str | None
 ) -> int:
-    """Reading the known tables, and by no view or trigger."""
+    """Authorise reading the known tables, and nothing by a view or trigger."""
     good = action == sqlite3.SQLITE_SELECT or (action == sqlite3.SQLITE_READ and first in _TABLES)
     return sqlite3.SQLITE_OK if good and source is None else sqlite3.SQLITE_DENY
 
@@ -122,7 +122,7 @@ def _matches(tables: _Tables, views: ViewNames) -> Iterator[PairPoints]:
 
 
 def _pairs(tables: _Tables, known: Mapping[int, int]) -> dict[int, tuple[int, int]]:
-    """Pair number -> its images, of those that are views."""
+    """Return the pair number -> its images, of those that are views."""
     numbers = sorted({int(row[0]) for table in tables.names[2:] for row in tables.rows("pair_id", table)})
     found = {number: divmod(number, _IDS) for number in numbers}
     return {

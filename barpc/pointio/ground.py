@@ -41,7 +41,7 @@ class _Point:
 
 
 def read_gcps(path: Path | str, names: Sequence[str]) -> GroundPoints:
-    """GCPs and where they are seen, of a CSV or `.gcp` file, a GeoJSON file, or an image with GCP tags.
+    """Read GCPs and where they are seen, of a CSV or `.gcp` file, a GeoJSON file, or an image with GCP tags.
 
     Observations in other images than the views called `names` are left out, and these named in `strangers`. InputError
     where the file does not parse, or holds no point of these views.
@@ -65,7 +65,7 @@ def read_gcps(path: Path | str, names: Sequence[str]) -> GroundPoints:
 
 
 def _read_asp(path: Path, views: ViewNames) -> Iterator[_Point]:
-    """Lines `id lat lon alt sigma_x sigma_y sigma_z image col row sigma_col sigma_row [image ...]`."""
+    """Read the lines `id lat lon alt sigma_x sigma_y sigma_z image col row sigma_col sigma_row [image ...]`."""
     for number, raw in enumerate(read_text(path, TABLE).split("\n"), start=1):
         words = re.split(r"(?:^|\s)#", raw, maxsplit=1)[0].replace(",", " ").split()
         if not words:
@@ -90,7 +90,9 @@ def _read_asp(path: Path, views: ViewNames) -> Iterator[_Point]:
 
 
 def _read_csv(path: Path, views: ViewNames) -> Iterator[_Point]:
-    """A header of column names, then a line for each point and image; what is not stated of sigmas is the default."""
+    """Yield a header of column names, then a line for each point and image; what is not stated of sigmas is
+    the default.
+    """
     columns: dict[str, int] = {}
     for number, raw in enumerate(read_text(path, TABLE).splitlines(), start=1):
         if not raw.strip() or raw.lstrip().startswith("#"):
@@ -116,7 +118,7 @@ def _read_csv(path: Path, views: ViewNames) -> Iterator[_Point]:
 
 
 def _csv_point(name: str, view: int, of: Mapping[str, float]) -> _Point:
-    """The point of a line: its numbers by the names of `_COLUMNS` and `_SIGMAS`."""
+    """Return the point of a line: its numbers by the names of `_COLUMNS` and `_SIGMAS`."""
     every = of.get("sigma", GROUND_SIGMA)
     level = of.get("sigma_xy", every)
     sigma = (of.get("sigma_x", level), of.get("sigma_y", level), of.get("sigma_z", every))
@@ -125,7 +127,7 @@ def _csv_point(name: str, view: int, of: Mapping[str, float]) -> _Point:
 
 
 def _gcp_columns(path: Path, words: Sequence[str], views: ViewNames) -> dict[str, int]:
-    """Column of each quantity; a file of one image need not name it."""
+    """Return the column of each quantity; a file of one image need not name it."""
     found = header_of(words, {**_COLUMNS, **_NAMES, **_SIGMAS})
     needed = [*_COLUMNS, "image"][: len(_COLUMNS) + (len(views.names) > 1)]
     if missing := [name for name in needed if name not in found]:
@@ -139,13 +141,13 @@ def _gcp_columns(path: Path, words: Sequence[str], views: ViewNames) -> dict[str
 
 
 def cells_of(line: str, delimiter: str) -> list[str]:
-    """The cells of a line of a table, those that are empty too unless blanks part them."""
+    """Return the cells of a line of a table, those that are empty too unless blanks part them."""
     row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
     return [from_cell(cell.strip()) for cell in row if delimiter != " " or cell]
 
 
 def _names_columns(head: bytes) -> bool:
-    """Whether a text begins with a line of column names."""
+    """Return whether a text begins with a line of column names."""
     lines = head.decode("utf-8-sig", errors="replace").splitlines()
     first = next((line for line in lines if line.strip() and not line.lstrip().startswith("#")), "")
     words = _split(first)
@@ -153,7 +155,9 @@ def _names_columns(head: bytes) -> bool:
 
 
 def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Point]:
-    """Features with a 3-D point and the properties `ji` (col, row), `filename` and, perhaps, `id` and sigmas."""
+    """Yield the features with a 3-D point and the properties `ji` (col, row), `filename` and, perhaps, `id`
+    and sigmas.
+    """
     for (lon, lat, alt, col, row), properties in geojson_points(path, "filename"):
         view = views.find(str(properties["filename"]))
         if view is not None:
@@ -169,7 +173,7 @@ def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Point]:
 
 
 def _read_tags(path: Path, views: ViewNames) -> Iterator[_Point]:
-    """The GCP tags of an image: they are seen in that image alone."""
+    """Yield the GCP tags of an image: they are seen in that image alone."""
     view = views.index(str(path))
     with open_raster(path) as dataset:
         gcps, crs = dataset.gcps
@@ -183,7 +187,7 @@ def _read_tags(path: Path, views: ViewNames) -> Iterator[_Point]:
 
 
 def _assembled(found: list[_Point]) -> GroundPoints:
-    """Observations of points of the same name and place belong to one point."""
+    """Return the observations of points of the same name and place belong to one point."""
     first: dict[tuple[str, tuple[float, float, float]], _Point] = {}
     for point in found:
         first.setdefault((point.name, point.lonlatalt), point)
@@ -268,7 +272,7 @@ def read_correspondences(path: Path | str, *, altitudes: Sequence[float] | None 
 
 
 def correspondence_kind(path: Place, altitudes: Sequence[float] | None = None) -> str | None:
-    """What a file is: "csv", "npz", "geojson", "grid", or None for neither (an image or an RPC file)."""
+    """Return the kind of a file: "csv", "npz", "geojson", "grid", or None for neither (an image or an RPC file)."""
     head = read_head(path, TABLE, 65536)
     if driver_of(head) == "GTiff":
         with open_raster(path) as dataset:
@@ -281,7 +285,7 @@ def correspondence_kind(path: Place, altitudes: Sequence[float] | None = None) -
 
 
 def _is_table(head: bytes) -> bool:
-    """Whether a text begins with a header that names columns, or with a line of five numbers."""
+    """Return whether a text begins with a header that names columns, or with a line of five numbers."""
     try:
         lines = head.decode("utf-8-sig", errors="strict" if len(head) < 65536 else "ignore").splitlines()
     except UnicodeDecodeError:
@@ -296,7 +300,7 @@ def _split(line: str) -> list[str]:
 
 
 def numbers_of(words: Sequence[str]) -> list[float] | None:
-    """Words as numbers; None where one is none."""
+    """Return the words as numbers; None where one is none."""
     try:
         return [float(word) for word in words]
     except ValueError:
@@ -304,7 +308,7 @@ def numbers_of(words: Sequence[str]) -> list[float] | None:
 
 
 def header_of(words: Sequence[str], names: Mapping[str, Sequence[str]] | None = None) -> dict[str, int]:
-    """Column of each quantity that a header names, by default of `_COLUMNS` and the points' sigma [px]."""
+    """Return the column of each quantity that a header names, by default of `_COLUMNS` and the points' sigma [px]."""
     lower = [re.sub(r"[\[(].*", "", word.lower()).strip().replace(" ", "_") for word in words]
     names = {**_COLUMNS, "sigma": ("sigma", "sigma_px")} if names is None else names
     hits = {key: [lower.index(a) for a in aliases if a in lower] for key, aliases in names.items()}
@@ -317,7 +321,7 @@ def header_of(words: Sequence[str], names: Mapping[str, Sequence[str]] | None = 
 
 
 def _read_table(path: Path) -> Correspondences:
-    """A text table: separated by commas, semicolons, tabs or blanks; ``#`` begins a comment."""
+    """Read a text table: columns by commas, semicolons, tabs or blanks; ``#`` begins a comment."""
     rows: list[list[float]] = []
     columns: dict[str, int] = {}
     for number, raw in enumerate(read_text(path, TABLE).splitlines(), start=1):
@@ -341,7 +345,7 @@ def _read_table(path: Path) -> Correspondences:
 
 
 def _read_npz(path: Path) -> Correspondences:
-    """Arrays ``ground`` (N, 3) and ``image`` (N, 2), or one array a column; ``sigma`` (N,) if known."""
+    """Return the arrays ``ground`` (N, 3) and ``image`` (N, 2), or one array a column; ``sigma`` (N,) if known."""
     found = load_npz(path)
     try:
         arrays = {name: np.asarray(value, dtype=np.float64) for name, value in found.items()}
@@ -365,7 +369,7 @@ def _correspondences(path: Path, columns: dict[str, Array]) -> Correspondences:
 
 
 def _checked(path: Path, ground: Array, image: Array, sigma: Array | None) -> Correspondences:
-    """The points, whose arrays must have one length."""
+    """Return the points, whose arrays must have one length."""
     shapes = [array.shape for array in (ground, image, sigma) if array is not None]
     n = len(ground) if ground.ndim else 0
     if shapes != [(n, 3), (n, 2), (n,)][: len(shapes)]:
@@ -381,7 +385,8 @@ def _read_features(path: Path) -> Correspondences:
 
 
 def geojson_points(path: Path, *needed: str) -> list[tuple[list[float], dict[str, Any]]]:
-    """Points of a GeoJSON: lon, lat, alt, col, row (of the property ``ji``, or ``col``, ``row``); properties.
+    """Return the points of a GeoJSON: lon, lat, alt, col, row (of the property ``ji``, or ``col``, ``row``);
+    properties.
 
     InputError where it is no such file, or has not all properties that are `needed`.
     """
@@ -403,7 +408,7 @@ def _feature(feature: dict[str, Any], needed: Sequence[str]) -> tuple[list[float
 
 
 def read_grid(path: Place, altitudes: Sequence[float] | None = None) -> Correspondences:
-    """A direct-localisation grid: bands lon, lat of each altitude layer, nodes by the geotransform.
+    """Read a direct-localisation grid: bands lon, lat of each altitude layer, nodes by the geotransform.
 
     The geotransform counts from the corner of the first pixel, as GDAL does; half a pixel is taken off. Altitudes of
     the layers [m] are those given, or of the tags ``ALTITUDE_B0``, ``ALTITUDE_B2``, ...

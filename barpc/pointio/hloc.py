@@ -29,7 +29,7 @@ _FEATURES = ("features.h5", "keypoints.h5")
 
 
 def read_hloc(path: Path, views: ViewNames) -> Iterator[PairPoints]:
-    """The matches between two of the views; the keypoints are looked for in the file, then beside it."""
+    """Read the matches between two of the views; the keypoints are looked for in the file, then beside it."""
     try:
         import h5py
     except ImportError:
@@ -51,7 +51,7 @@ def read_hloc(path: Path, views: ViewNames) -> Iterator[PairPoints]:
 
 
 def _features(path: Path) -> Path:
-    """The file of the keypoints that belongs to a file of matches."""
+    """Return the file of the keypoints that belongs to a file of matches."""
     names = [*([path.stem.split("_matches")[0] + path.suffix] if "_matches" in path.stem else []), *_FEATURES]
     for name in names:
         if (path.parent / name).is_file():
@@ -60,7 +60,7 @@ def _features(path: Path) -> Path:
 
 
 def _datasets(file: Any, h5py: Any) -> Iterator[tuple[str, Any]]:
-    """The datasets of a file by their names; links, to other files and within, are passed over."""
+    """Yield the datasets of a file by their names; links, to other files and within, are passed over."""
     waiting, count = [(file, "", 0)], 0
     while waiting:
         group, place, depth = waiting.pop()
@@ -94,7 +94,7 @@ class _Datasets:
                 self.matches[ends[0], ends[1]] = found
 
     def array(self, found: Any) -> Any:
-        """The content of a dataset that lies in the file itself."""
+        """Return the content of a dataset that lies in the file itself."""
         if found.is_virtual or found.external:
             raise ValueError(f"{found.name} lies in another file")
         if found.nbytes > _DEFLATE * found.id.get_storage_size() + _HEADER:
@@ -120,13 +120,13 @@ def _matches(matches: _Datasets, keypoints: _Datasets, views: ViewNames) -> Iter
 
 
 def _coordinates(name: str, found: Any) -> Array:
-    """Columns and rows (N, 2) [px] of keypoints (N, 2 or more); ValueError for an array of anything else."""
+    """Return the columns and rows (N, 2) [px] of keypoints (N, 2 or more); ValueError for an array of anything else."""
     if found.ndim != 2 or found.shape[1] < 2 or found.dtype.kind not in "fiu":
         raise ValueError(f"keypoints of {name} of shape {found.shape} and type {found.dtype}")
     return np.asarray(found[:, :2], dtype=np.float64)
 
 
 def _view(name: str, keypoints: _Datasets, views: ViewNames) -> int | None:
-    """The view of an image, by its name with slashes or with dashes for them."""
+    """Return the view of an image, by its name with slashes or with dashes for them."""
     path = keypoints.keypoints[name].name.strip("/").removesuffix(f"/{_KEYPOINTS}")
     return views.find(path)

@@ -29,7 +29,7 @@ class Links:
 
     @staticmethod
     def of_pairs(pairs: Iterable[PairPoints]) -> Links:
-        """Matches of pairs of views: points of a view at the very same place are one."""
+        """Return the matches of pairs of views: points of a view at the very same place are one."""
         given = list(pairs)
         view = np.concatenate(
             [np.full(len(xy), i) for a, b, *ends in given for i, xy in zip((a, b), ends, strict=True)]
@@ -46,7 +46,7 @@ class Links:
 
     @staticmethod
     def joined(parts: Sequence[Links]) -> Links:
-        """The matches of several files."""
+        """Return the matches of several files."""
         starts = np.cumsum([0, *(len(part.view) for part in parts)])
         view, xy, sigma = (
             np.concatenate([getattr(part, name) for part in parts]) for name in ("view", "xy", "sigma")
@@ -56,7 +56,7 @@ class Links:
         return whole.merged() if len(parts) > 1 else parts[0]
 
     def merged(self) -> Links:
-        """Points of a view at the very same place as one, the most certain."""
+        """Return the points of a view at the very same place as one, the most certain."""
         table = np.column_stack([self.view, self.xy])
         order = np.lexsort((self.sigma, *table.T[::-1]))
         new = np.ones(len(table), dtype=bool)
@@ -68,7 +68,7 @@ class Links:
 
     @staticmethod
     def of_tracks(view: IntArray, track: IntArray, xy: Array, sigma: Array) -> Links:
-        """Observations of tracks: each is linked to the next ones of its track."""
+        """Return the observations of tracks: each is linked to the next ones of its track."""
         order = np.lexsort((view, track))
         label, ends = track[order], [np.zeros((0, 2), dtype=np.int64)]
         for step in range(1, min(_STEPS, len(view) - 1) + 1):
@@ -79,12 +79,13 @@ class Links:
         return Links(view, xy, sigma, np.concatenate(ends))
 
     def tracks(self) -> IntArray:
-        """The track (K,) of every point: points that are linked belong to one."""
+        """Return the track (K,) of every point: points that are linked belong to one."""
         return connected_labels(len(self.view), self.ends)
 
 
 def index_pairs(matches: npt.NDArray[np.generic], counts: tuple[int, int]) -> IntArray:
-    """Numbers (M, 2) of matched keypoints, from such a table or from the partner of each of the first (-1: none).
+    """Return the numbers (M, 2) of matched keypoints, from such a table or from the partner of each of the
+    first (-1: none).
 
     ValueError for another shape, or a number beyond the `counts` of keypoints.
     """

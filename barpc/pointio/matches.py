@@ -37,7 +37,7 @@ _COLUMNS = ("image", "col", "row", "track")
 
 
 def read_links(path: Path | str, names: Sequence[str]) -> Links:
-    """The matches in a file, or a folder of files of pairs, between the views called `names`.
+    """Read the matches in a file, or a folder of files of pairs, between the views called `names`.
 
     What a file holds is told by its content. Points in other images are left out; InputError where it does not parse,
     or holds no match of these views.
@@ -58,7 +58,8 @@ def read_links(path: Path | str, names: Sequence[str]) -> Links:
 
 
 def read_matches(path: Path | str, names: Sequence[str]) -> Tracks:
-    """Tie points as a file states them; tracks with fewer than two views, or two points in one, are left out.
+    """Read the tie points as a file states them; tracks with fewer than two views, or two points in one, are
+    left out.
 
     As `read_links`; points that are linked, by way of others too, are one track.
     """
@@ -86,7 +87,7 @@ def write_matches(path: Path | str, tracks: Tracks, names: Sequence[str]) -> Non
 
 
 def asp_text(first: Array, second: Array) -> str:
-    """The matches of a pair as an ASP text match file.
+    """Return the matches of a pair as an ASP text match file.
 
     The counts on the first line, then one keypoint a line, those of the first image (M, 2) first: x, y, their whole
     pixels, orientation, scale, interest, polarity, octave, scale level and the length of the descriptor (0).
@@ -171,7 +172,7 @@ def _table(path: Path, file: Arrays, views: ViewNames) -> Links:
 
 
 def tracks_of(links: Links, path: Path | str) -> Tracks:
-    """Tracks of linked points, sorted by view, without those that are seen once, or twice in one view."""
+    """Return the tracks of linked points, sorted by view, without those that are seen once, or twice in one view."""
     view, point, xy, sigma = links.view, links.tracks(), links.xy, links.sigma
     order = np.lexsort((view, point))
     view, point, xy, sigma = view[order], point[order], xy[order], sigma[order]

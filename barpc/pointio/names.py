@@ -21,7 +21,7 @@ _FORMULA = frozenset("=+-@＝＋－＠\t\r")
 
 
 def unique_names(files: Sequence[Place]) -> list[str]:
-    """A name for each file: its stem, with as many folders before it as it takes to tell them apart.
+    """Return a name for each file: its stem, with as many folders before it as it takes to tell them apart.
 
     Names that differ in case or composition only are taken for one, as file systems and GDAL do; two files of one
     folder that differ in their ending alone keep it. InputError for a name longer than `MAX_NAME`, or files that
@@ -75,7 +75,7 @@ def _folded(name: str) -> str:
 
 
 def pair_name(first: str, second: str) -> str:
-    """Name of the match file of two views, without its ending."""
+    """Return the name of the match file of two views, without its ending."""
     return f"{first}__{second}"
 
 
@@ -100,7 +100,8 @@ def require_pair_names(names: Sequence[str]) -> None:
 
 
 def cell(text: str) -> str:
-    r"""A text as a cell of a CSV table: quoted where it must be, and never a formula for a spreadsheet.
+    r"""Return a text as a cell of a CSV table: quoted where it must be, and never a formula for a
+    spreadsheet.
 
     A text that a spreadsheet would compute gets an apostrophe in front, which `from_cell` takes away.
 
@@ -116,7 +117,7 @@ def cell(text: str) -> str:
 
 
 def from_cell(text: str) -> str:
-    """The text of a cell, as `csv` gives it, that `cell` wrote."""
+    """Return the text of a cell, as `csv` gives it, that `cell` wrote."""
     return text[1:] if text.startswith("'") and _computes(text[1:]) else text
 
 
@@ -144,11 +145,11 @@ class ViewNames:
         self._known: dict[str, int | None] = {}  # what names meant: a table repeats them in every line
 
     def exact(self, name: str) -> int | None:
-        """Index of the view that has this very name."""
+        """Return the index of the view that has this very name."""
         return self._exact.get(name)
 
     def find(self, name: str) -> int | None:
-        """Index of the view that `name` means; None where it means none, which `strangers` counts."""
+        """Return the index of the view that `name` means; None where it means none, which `strangers` counts."""
         if name not in self._known:
             self._known[name] = self._meant(name)
         found = self._known[name]
@@ -166,7 +167,7 @@ class ViewNames:
         return None
 
     def index(self, name: str) -> int:
-        """Index of the view that `name` means; InputError where there is none."""
+        """Return the index of the view that `name` means; InputError where there is none."""
         found = self.find(name)
         if found is None:
             listed = ", ".join(self.names[:10])

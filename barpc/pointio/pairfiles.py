@@ -25,13 +25,13 @@ _HEAD = 45  # bytes of a keypoint in ASP's binary files, before its descriptor
 
 
 def in_folder(folder: Path) -> list[Path]:
-    """The files of pairs in a folder; of two that ASP wrote of a pair, the clean one."""
+    """Return the files of pairs in a folder; of two that ASP wrote of a pair, the clean one."""
     found = sorted(path for ending in ENDINGS for path in folder.glob(f"*_*{ending}"))
     return [path for path in found if path.with_stem(path.stem + _CLEAN) not in found]
 
 
 def read_pair_files(paths: Sequence[Path], views: ViewNames) -> Iterator[PairPoints]:
-    """The matches of the files between two of the views."""
+    """Read the matches of the files between two of the views."""
     for path in paths:
         pair = pair_of(path, views)
         if pair is not None:
@@ -39,18 +39,18 @@ def read_pair_files(paths: Sequence[Path], views: ViewNames) -> Iterator[PairPoi
 
 
 def pair_of(path: Path, views: ViewNames) -> tuple[int, int] | None:
-    """The two views that a file's name means; None where one is none of them."""
+    """Return the two views that a file's name means; None where one is none of them."""
     left, right = (views.find(name) for name in _images(path, views))
     return None if left is None or right is None or left == right else (left, right)
 
 
 def is_dictionary(arrays: Arrays) -> bool:
-    """Whether the arrays of an npz file are the matches of one pair."""
+    """Return whether the arrays of an npz file are the matches of one pair."""
     return "keypoints0" in arrays
 
 
 def _images(path: Path, views: ViewNames) -> tuple[str, str]:
-    """The two images that a file's name means, a run's prefix before the first one left out."""
+    """Return the two images that a file's name means, a run's prefix before the first one left out."""
     stem = path.stem.removesuffix(_CLEAN)
     cuts = [(stem[:i], stem[i + 2 :]) for i in range(len(stem) - 1) if stem.startswith("__", i)]
     bare = stem.removesuffix("_matches")
@@ -67,7 +67,7 @@ def _images(path: Path, views: ViewNames) -> tuple[str, str]:
 
 
 def _asp_text(path: Path) -> tuple[Array, Array]:
-    """Counts on the first line, then one keypoint a line, col and row first."""
+    """Read an ASP text file: counts on the first line, then one keypoint a line, col and row first."""
     try:
         lines = read_text(path, TABLE).split("\n")
         left, right = (int(word) for word in lines[0].split()[:2])
@@ -81,7 +81,7 @@ def _asp_text(path: Path) -> tuple[Array, Array]:
 
 
 def _asp_binary(path: Path) -> tuple[Array, Array]:
-    """Two counts of 8 bytes, then the records of both images, each with a descriptor of one length."""
+    """Read two counts of 8 bytes, then the records of both images, each with a descriptor of one length."""
     data = read_bytes(path, TABLE)
     try:
         count, other = np.frombuffer(data, "<u8", 2).tolist()
@@ -100,12 +100,12 @@ def _asp_binary(path: Path) -> tuple[Array, Array]:
 
 
 def _dictionary(path: Path) -> tuple[Array, Array]:
-    """The matched keypoints of a matcher's dictionary."""
+    """Return the matched keypoints of a matcher's dictionary."""
     return matched_keypoints(path, load_npz(path))
 
 
 def matched_keypoints(path: Path, arrays: Arrays) -> tuple[Array, Array]:
-    """Points (M, 2), (M, 2) that the arrays of one pair say."""
+    """Return the points (M, 2), (M, 2) that the arrays of one pair say."""
     try:
         first, second = (_points(arrays[key]) for key in ("keypoints0", "keypoints1"))
         known = arrays.get("matches0", arrays.get("matches"))

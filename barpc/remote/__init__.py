@@ -67,15 +67,15 @@ class Remote(str):
         return Remote(f"{self}/{name}")
 
     def absolute(self) -> Remote:
-        """Itself, as every URL is absolute."""
+        """Return the URL itself: every URL is absolute."""
         return self
 
     def resolve(self) -> Remote:
-        """Itself, as no link leads elsewhere."""
+        """Return the URL itself: no link leads elsewhere."""
         return self
 
     def is_dir(self) -> bool:
-        """No: folders are not opened."""
+        """Return False: folders are not opened."""
         return False
 
 
@@ -83,28 +83,28 @@ Place = Path | Remote
 
 
 def is_url(text: str | os.PathLike[str]) -> bool:
-    """Whether a text names a file on another host, and none here."""
+    """Return whether a text names a file on another host, and none here."""
     found = re.match(r"(https?|s3|gs|az)://", os.fspath(text), re.IGNORECASE)
     return found is not None and not os.path.lexists(text)
 
 
 def place(path: str | os.PathLike[str]) -> Place:
-    """What a file is opened by: a Remote as it is, any other text as a path of this machine."""
+    """Return a file's location: a Remote as it is, any other text as a path of this machine."""
     return path if isinstance(path, Remote) else Path(path)
 
 
 def here(names: Iterable[str | os.PathLike[str]]) -> list[Path]:
-    """The files of this machine among some."""
+    """Return those files that are on this machine."""
     return [Path(name) for name in names if not isinstance(name, Remote)]
 
 
 def pure(file: Place) -> PurePath:
-    """A file's folders and name; of a Remote its host and path."""
+    """Return a file's folders and name; of a Remote its host and path."""
     return file.pure if isinstance(file, Remote) else file
 
 
 def located(path: str | os.PathLike[str], hosts: Iterable[str]) -> Place:
-    """As `place`, of a name that the user gave: a URL of a host among `hosts` becomes a Remote.
+    """Return a name that the user gave as `place` does; a URL of a host among `hosts` becomes a Remote.
 
     ImageError for a URL that is refused: its host is not among them, or it holds a user, a query or a fragment.
     """
@@ -127,7 +127,7 @@ def located(path: str | os.PathLike[str], hosts: Iterable[str]) -> Place:
 
 
 def _is_host(text: str) -> bool:
-    """Whether a host and its port can be asked: labels of a name, a number in brackets, a port that there is."""
+    """Return whether a host and its port can be asked: labels of a name, a number in brackets, a port that there is."""
     name, _, port = text.rpartition(":") if re.search(r":\d+$", text) else (text, "", "80")
     if name.startswith("["):
         try:
@@ -185,7 +185,7 @@ _blocks = _Blocks()
 
 
 def pinned(at: Remote) -> Remote:
-    """The same file with the version that it has now; OSError where there is none, or it does not answer."""
+    """Return a file with the version that it has now; OSError where there is none, or it does not answer."""
     if at.size is not None:
         return at
     part = _fetch(at, 0, BLOCK)
@@ -208,20 +208,20 @@ class RemoteFile(io.RawIOBase):
         self.size, self._position, self._end, self._ahead = self._at.size or 0, 0, 0, 0
 
     def readable(self) -> bool:
-        """It is."""
+        """Return True."""
         return True
 
     def seekable(self) -> bool:
-        """It is."""
+        """Return True."""
         return True
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """Where the next byte is read."""
+        """Move to where the next byte is read, and return that place."""
         self._position = max(0, offset + (0, self._position, self.size)[whence])
         return self._position
 
     def readinto(self, buffer: Any) -> int:
-        """As many bytes as the buffer takes, up to the end of the file."""
+        """Read as many bytes as the buffer takes, up to the end of the file."""
         start = min(self._position, self.size)
         data = self._read(start, min(start + len(buffer), self.size))
         buffer[: len(data)] = data
@@ -259,7 +259,7 @@ class RemoteFile(io.RawIOBase):
 
 
 def _runs(blocks: list[int]) -> Iterator[range]:
-    """Ascending numbers as ranges, none of more bytes than a request has."""
+    """Yield the ascending numbers as ranges, none of more bytes than a request has."""
     start = before = blocks[0]
     for block in [*blocks[1:], -1]:
         if block != before + 1 or (block - start) * BLOCK >= _LONGEST:
@@ -269,7 +269,7 @@ def _runs(blocks: list[int]) -> Iterator[range]:
 
 
 def beside(image: Remote, names: Iterable[str]) -> dict[str, str]:
-    """The names of those of these files that are in an image's folder, by name in lower case.
+    """Return the names of those of these files that are in an image's folder, by name in lower case.
 
     A store lists the folder, and case does not count; a web server is asked for each name as it is and with its ending
     in lower case.

@@ -71,7 +71,7 @@ def _pinned(url: str, size: int, tag: str) -> _Opened:
 
 
 def fetch(at: Remote, start: int, stop: int) -> Part:
-    """Bytes `start` to `stop` of a file, or to its end; OSError where the store does not hand them out."""
+    """Return the bytes `start` to `stop` of a file, or to its end; OSError where the store does not hand them out."""
     file = _Opened(at) if at.size is None else _pinned(str(at), at.size, at.tag)
     size, tag = file.version
     wanted = max(0, min(stop, size) - start)
@@ -95,7 +95,7 @@ def _listed(folder: str, _minute: int) -> tuple[str, ...]:
 
 
 def _told(ask: Any, *args: Any, **given: Any) -> Any:
-    """What a store answers; its errors, which are of many classes, as an OSError of one line."""
+    """Return a store's answer; errors of its many classes become an OSError of one line."""
     try:
         return ask(*args, **given)
     except FileNotFoundError as error:

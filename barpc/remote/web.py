@@ -40,11 +40,11 @@ _lock = threading.Lock()
 
 
 class _PassingError(OSError):
-    """What may be over at the next attempt."""
+    """An error that may be over at the next attempt."""
 
 
 def fetch(at: Remote, start: int, stop: int) -> Part:
-    """Bytes `start` to `stop` of a file, or to its end; OSError where the server does not hand them out."""
+    """Return the bytes `start` to `stop` of a file, or to its end; OSError where the server does not hand them out."""
     for wait in (*WAITS, None):
         try:
             return _moved(at, start, stop)
@@ -56,7 +56,7 @@ def fetch(at: Remote, start: int, stop: int) -> Part:
 
 
 def _moved(at: str, start: int, stop: int) -> Part:
-    """As `fetch`, once; a server may send us on within itself."""
+    """Fetch as `fetch` does, once; a server may redirect within itself."""
     url = at
     for _ in range(_MOVES):
         found = _once(url, start, stop)
@@ -75,7 +75,7 @@ def _moved(at: str, start: int, stop: int) -> Part:
 
 
 def _once(url: str, start: int, stop: int) -> Part | str:
-    """The part, or the address where it is said to be."""
+    """Return the part, or the address where it is said to be."""
     scheme, host, path, query = urlsplit(url)[:4]
     connection = _connection(scheme, host)
     longest, late = TIMEOUT + (stop - start) / _SLOWEST, threading.Event()
@@ -138,7 +138,7 @@ def _connection(scheme: str, host: str) -> HTTPConnection:
 
 
 def _answered(answer: HTTPResponse, start: int, stop: int) -> Part | str | None:
-    """What a server hands out, the address that it sends us on to, None where there is no such file."""
+    """Return a server's response, the address that it redirects to, or None where there is no such file."""
     status, length = answer.status, answer.headers.get("Content-Length", "")
     tag = answer.headers.get("ETag") or answer.headers.get("Last-Modified") or ""
     if status in _AGAIN:
@@ -167,7 +167,7 @@ def _answered(answer: HTTPResponse, start: int, stop: int) -> Part | str | None:
 
 
 def _body(answer: HTTPResponse, wanted: int) -> bytes:
-    """So many bytes, and no more."""
+    """Read a given number of bytes, and no more."""
     data = answer.read(wanted)
     if len(data) < wanted:
         raise _PassingError(f"its host sent {len(data)} of {wanted} bytes")

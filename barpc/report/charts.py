@@ -24,7 +24,7 @@ MAX_DOTS = 1500  # tie points on the map
 
 
 def tag(name: str, *children: str, **attributes: object) -> str:
-    """An element; `class_` is class, underscores are hyphens, numbers have two decimals at most.
+    """Return an SVG element; `class_` is class, underscores are hyphens, numbers have two decimals at most.
 
     Examples
     --------
@@ -44,34 +44,36 @@ def _value(value: object) -> str:
 
 
 def number(value: float) -> str:
-    """A coordinate in as few characters as two decimals take."""
+    """Return a coordinate in as few characters as two decimals take."""
     text = f"{value:.2f}".rstrip("0").rstrip(".")
     return "0" if text == "-0" else text
 
 
 def label(x: float, y: float, text: str, anchor: str = "start", class_: str = "tick") -> str:
-    """Text at a place."""
+    """Return the text at a place."""
     return tag("text", escape(text), x=x, y=y, text_anchor=anchor, class_=class_)
 
 
 def line(x1: float, y1: float, x2: float, y2: float, class_: str) -> str:
-    """A straight line."""
+    """Return a straight line."""
     return tag("line", x1=x1, y1=y1, x2=x2, y2=y2, class_=class_)
 
 
 def path(points: Iterable[Sequence[float] | Array], class_: str, closed: bool = False) -> str:
-    """A line through points."""
+    """Return a line through points."""
     text = "L".join(f"{number(x)} {number(y)}" for x, y in points)
     return tag("path", d=f"M{text}{'Z' if closed else ''}", class_=class_)
 
 
 def titled(shape: str, title: str, **attributes: object) -> str:
-    """A shape that says `title` under the pointer and to screen readers."""
+    """Return a shape that says `title` under the pointer and to screen readers."""
     return tag("g", tag("title", escape(title)), shape, **attributes)
 
 
 def sheet(key: str, title: str, description: str, height: float, body: Sequence[str], **more: object) -> str:
-    """A whole chart: a key unique on the page, what it is, what it shows for those who do not see it, its elements."""
+    """Return a whole chart: a key unique on the page, what it is, what it shows for those who do not see it,
+    its elements.
+    """
     width = more.pop("width", WIDTH)
     return tag(
         "svg",
@@ -118,7 +120,7 @@ class Scale:
 
 
 def round_ticks(low: float, high: float, most: int = 6) -> list[float]:
-    """At most `most` values of a step of 1, 2 or 5 times a power of ten in an interval.
+    """Return at most `most` values of a step of 1, 2 or 5 times a power of ten in an interval.
 
     Examples
     --------
@@ -133,7 +135,7 @@ def round_ticks(low: float, high: float, most: int = 6) -> list[float]:
 
 
 def x_axis(scale: Scale, top: float, bottom: float, title: str) -> list[str]:
-    """Ticks with grid lines, numbers below, and the title with its unit below these."""
+    """Draw ticks with grid lines, numbers below, and the title with its unit below these."""
     parts = []
     for value in scale.ticks:
         x = scale(value)
@@ -142,7 +144,9 @@ def x_axis(scale: Scale, top: float, bottom: float, title: str) -> list[str]:
 
 
 def histogram(before: Array, after: Array) -> str:
-    """Distributions of reprojection errors (n,) [px], before and after, each to its own peak, on a logarithmic axis."""
+    """Draw the distributions of reprojection errors (n,) [px], before and after, each to its own peak, on a
+    logarithmic axis.
+    """
     series = [(name, norm[norm > 0]) for name, norm in (("before", before), ("after", after))]
     series = [(name, norm) for name, norm in series if len(norm)]
     low, high = np.quantile(np.concatenate([np.ones(0), *(norm for _, norm in series)]), [0.002, 0.9995])
@@ -167,7 +171,7 @@ def histogram(before: Array, after: Array) -> str:
 
 
 def legend(names: Sequence[str], right: float, y: float) -> list[str]:
-    """Coloured dots with the names of the series, ending at `right`."""
+    """Draw coloured dots with the names of the series, ending at `right`."""
     parts = []
     for name in reversed(names):
         parts.append(label(right, y, name, "end"))
@@ -178,5 +182,5 @@ def legend(names: Sequence[str], right: float, y: float) -> list[str]:
 
 
 def evenly(rows: Sequence[Any], most: int) -> Sequence[Any]:
-    """All rows, or so many of them as they come at even steps."""
+    """Return all rows, or a number of them at even steps."""
     return rows[:: max(1, -(-len(rows) // most))]

@@ -22,7 +22,7 @@ _NO_EFFECT = ("overwrite", "keep_going")  # Options that do not change a finishe
 
 
 def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
-    """What two runs of the same images found.
+    """Compare the results of two runs of the same images.
 
     Parameters
     ----------
@@ -95,7 +95,9 @@ def _rpc_difference(
 
 
 def written_rpc(folder: Path, view: ViewEntry) -> RPC | None:
-    """The first RPC that can be read of those that a run wrote for a view, in its own folder, whatever it names."""
+    """Return the first RPC that can be read of those that a run wrote for a view, in its own folder, whatever
+    it names.
+    """
     for name in view.outputs:
         try:
             path = (folder / name).resolve()
@@ -119,7 +121,7 @@ def _pairs(run_a: Summary, run_b: Summary) -> list[dict[str, Any]]:
 
 
 def flat_options(options: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Nested options as one level, names joined by dots.
+    """Return the nested options as one level, names joined by dots.
 
     Examples
     --------

@@ -28,7 +28,7 @@ _LEFT = 3  # places
 
 
 def decisions(summary: Summary) -> list[str]:
-    """The decisions on the whole run: what ties its pairs, what each camera may do, what was cut."""
+    """Return the decisions on the whole run: what ties its pairs, what each camera may do, what was cut."""
     found = _matching(summary)
     if (scene := summary.scene) is not None:
         found += [
@@ -43,14 +43,14 @@ def decisions(summary: Summary) -> list[str]:
 
 
 def second_attempts(pairs: Sequence[PairEntry]) -> Table | None:
-    """Pairs that were tried more than once; None without any."""
+    """Return the pairs that were tried more than once; None without any."""
     again = [pair for pair in pairs if pair.beaten]
     caption = "Pairs that were tried again, and what found fewer matches than were wanted"
     return table("again", caption, again, PairEntry, PairEntry.AGAIN, folded=True) if again else None
 
 
 def control_sentence(summary: Summary) -> str:
-    """What the test of every residual of control says; empty without control."""
+    """Return what the test of every residual of control says; empty without control."""
     test = summary.control_test
     if test is None:
         return ""
@@ -95,7 +95,7 @@ def _model(scene: SceneEntry, summary: Summary) -> list[str]:
 
 
 def _explained(scene: SceneEntry, summary: Summary) -> list[str]:
-    """What explains the tie points beside the cameras' errors as stated, what was refused, and what is left."""
+    """Return what explains the tie points beside the cameras' errors as stated, what was refused, and what is left."""
     found = [_won(one) for one in scene.explanations]
     tested = scene.held_out_places is not None  # not by earlier releases
     if not found and tested:
@@ -125,7 +125,7 @@ def _explained(scene: SceneEntry, summary: Summary) -> list[str]:
 
 
 def _won(one: ExplanationEntry) -> str:
-    """An explanation that was taken, and by how much over what."""
+    """Return an explanation that was taken, and by how much over what."""
     words = f"{one.sentence[0].upper()}{one.sentence[1:]}: {one.gain:.0f} nats more likely than without"
     if one.runner_up is None:
         return f"{words}; nothing else gained anything."
@@ -190,7 +190,7 @@ def _calm(views: Sequence[ViewEntry]) -> str:
 
 
 def _smooth(view: ViewEntry) -> float:
-    """What an F test finds smooth in an image [px]."""
+    """Return what an F test finds smooth in an image [px]."""
     found = view.smooth_p is not None and view.smooth_p < 1e-4
     return (view.smooth_px or 0.0) if found else 0.0
 
@@ -243,7 +243,7 @@ def _control(gcps: Sequence[GcpEntry]) -> list[str]:
 
 
 def _counts(words: Iterable[str | None], by: str = "") -> str:
-    """How often each word comes, the most frequent first."""
+    """Return how often each word comes, the most frequent first."""
     return ", ".join(f"{num} {by}{word}" for word, num in Counter(words).most_common())
 
 

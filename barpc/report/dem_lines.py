@@ -13,7 +13,7 @@ _GEOID = 110.0  # m: no geoid lies farther from the ellipsoid
 
 
 def dem_lines(adjustment: Adjustment) -> list[str]:
-    """What the DEM did."""
+    """Return what the DEM did."""
     terrain, options = adjustment.terrain, adjustment.options
     if terrain is None or not terrain.shows:
         return []
@@ -44,7 +44,7 @@ def dem_lines(adjustment: Adjustment) -> list[str]:
 
 
 def dem_reasons(adjustment: Adjustment | None) -> list[str]:
-    """What is wrong with the DEM."""
+    """Return what is wrong with the DEM."""
     if adjustment is None or adjustment.terrain is None:
         return []
     terrain = adjustment.terrain
@@ -65,12 +65,12 @@ def dem_reasons(adjustment: Adjustment | None) -> list[str]:
 
 
 def holds_reference(adjustment: Adjustment) -> bool:
-    """Whether points of a reference hold the scene."""
+    """Return whether points of a reference hold the scene."""
     return bool(adjustment.reference_inlier.any())
 
 
 def _against(terrain: TerrainTest) -> list[str]:
-    """How the DEM contradicts the cameras as delivered."""
+    """Return how the DEM contradicts the cameras as delivered."""
     level, *rises = terrain.beyond
     out = []
     if level > BEYOND:

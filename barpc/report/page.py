@@ -50,12 +50,12 @@ REPORT = "report"  # the stage that makes the page, which cannot tell how long i
 
 
 def can_render() -> bool:
-    """Whether jinja2, which the page needs, is installed (the extra ``report``)."""
+    """Return whether jinja2, which the page needs, is installed (the extra ``report``)."""
     return find_spec("jinja2") is not None
 
 
 def report_html(summary: Summary, folder: Path | str) -> str:
-    """The page of a run whose tables lie in a folder; the same files give the same text.
+    """Return the page of a run whose tables lie in a folder; the same files give the same text.
 
     Raises
     ------
@@ -170,7 +170,7 @@ def _map(files: RunFiles) -> Section | None:
 
 
 def _lengths(files: RunFiles) -> list[tuple[str, str, float]]:
-    """How many images see a tie point, as bars."""
+    """Return how many images see a tie point, as bars."""
     found = {length: num for length, num in files.summary.tracks.by_length.items() if num}
     most = max(found.values(), default=1)
     return [(f"Tie points in {length} images", f"{num}", 100 * num / most) for length, num in found.items()]
@@ -376,7 +376,7 @@ def _check_points(files: RunFiles) -> Section | None:
 
 
 def _rms(rows: Any) -> Array:
-    """Root mean square of each column."""
+    """Return the root mean square of each column."""
     found: Array = np.sqrt((np.array(rows, dtype=np.float64) ** 2).mean(axis=0))
     return found
 
@@ -409,7 +409,7 @@ def _files(files: RunFiles) -> Section | None:
 
 
 def _reading(found: float | str | None) -> Cell:
-    """What a consumer read, or why it did not."""
+    """Return what a consumer read, or why it did not."""
     return Cell(found, 1e301) if isinstance(found, str) else cell_of(found, ".1e")
 
 

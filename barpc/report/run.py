@@ -195,7 +195,7 @@ class Run:
 
 
 def pair_ties(tracks: Tracks, keep: BoolArray | None = None) -> list[PairTies]:
-    """All pairs of views with tracks in common, in ascending order; `keep` (K,): the observations to count."""
+    """Return all pairs of views with tracks in common, in ascending order; `keep` (K,): the observations to count."""
     rows = np.arange(len(tracks)) if keep is None else np.flatnonzero(keep)
     rows = rows[np.lexsort((tracks.view[rows], tracks.point[rows]))]
     point = tracks.point[rows]
@@ -215,7 +215,7 @@ def pair_ties(tracks: Tracks, keep: BoolArray | None = None) -> list[PairTies]:
 
 
 def _whole_shift(ties: PairTies, tracks: Tracks) -> Array | None:
-    """The shift (2,) [px] by whole pixels that the matches of a pair share; None where there is none.
+    """Return the shift (2,) [px] by whole pixels that the matches of a pair share; None where there is none.
 
     Two images of one scene never match so: only one that is a part, or a copy, of the other.
     """
@@ -228,7 +228,8 @@ def _whole_shift(ties: PairTies, tracks: Tracks) -> Array | None:
 def triangulate_tracks(
     tracks: Tracks, sensors: Sequence[SensorModel], alt: float, keep: BoolArray
 ) -> Triangulation:
-    """All tracks intersected through given cameras from the observations (K,) that count, from altitude `alt` [m] on.
+    """Return all tracks intersected through given cameras from the observations (K,) that count, from
+    altitude `alt` [m] on.
 
     The residuals of the others are measured against the same points; a track with fewer than two observations that
     count is NaN.

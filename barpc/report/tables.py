@@ -50,7 +50,7 @@ _RESIDUAL_CELLS = "{:.3f},{:.3f},{:.4f},{:.4f},{:.4f},{:.4f}".format
 
 
 def _per_track(run: Run) -> Array:
-    """Rows of `RESIDUALS` (n, 7)."""
+    """Return the rows of `RESIDUALS` (n, 7)."""
     tracks, keep, num = run.tracks, run.keep, run.tracks.num_points
     count = np.bincount(tracks.point[keep], minlength=num)
     means = []
@@ -104,7 +104,9 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def _footprints(run: Run, summary: Summary) -> bytes:
-    """Every image at the scene's altitude, through the adjusted cameras, or the cameras as they are for a check."""
+    """Return every image at the scene's altitude, through the adjusted cameras, or the cameras as they are
+    for a check.
+    """
     features = []
     for view, sensor, entry in zip(run.views, run.after or run.before, summary.views, strict=True):
         ring = np.round(footprint(sensor, view.size, run.altitude), 9)
@@ -114,7 +116,7 @@ def _footprints(run: Run, summary: Summary) -> bytes:
 
 
 def _points_ply(run: Run, _: Summary) -> bytes:
-    """Tie points in metres east, north, up of an origin that the header states, binary."""
+    """Return the tie points in metres east, north, up of an origin that the header states, binary."""
     rows = _per_track(run)
     origin = rows[:, :3].mean(axis=0) if len(rows) else np.zeros(3)
     if len(rows):
@@ -139,7 +141,7 @@ def _points_ply(run: Run, _: Summary) -> bytes:
 
 
 def gcps_geojson(run: Run) -> bytes:
-    """The points of a reference that held the block, as `--gcp` reads them: a feature an observation."""
+    """Return the points of a reference that held the block, as `--gcp` reads them: a feature an observation."""
     control = None if run.reference is None else run.reference.control
     assert control is not None
     assert run.adjustment is not None
@@ -210,7 +212,7 @@ class Relief:
 
 @dataclass(frozen=True, eq=False)
 class RunFiles:
-    """What lies in the folder of a run.
+    """Files in the folder of a run.
 
     `points` (n, 4): lon, lat [deg], altitude [m], mean residual [px] of the tie points, whose numbers are `tracks`
     (n,); `outlines`: the rings (m, 2) of every view's footprint, lon, lat [deg], closed, cut at the antimeridian.
@@ -230,7 +232,7 @@ class RunFiles:
 
 
 def read_summary(folder: Path) -> Summary:
-    """summary.json of a run folder.
+    """Read the summary.json of a run folder.
 
     Raises
     ------
@@ -268,7 +270,7 @@ def _validate() -> Callable[[Any], Any]:
 
 
 def read_tables(summary: Summary, folder: Path) -> RunFiles:
-    """The tables of a run folder, beside a summary that is at hand.
+    """Read the tables of a run folder, beside a summary that is at hand.
 
     Raises
     ------
@@ -330,7 +332,9 @@ def _columns(text: str, header: Sequence[str]) -> list[list[str]]:
 
 
 def _floats(columns: Sequence[Sequence[str]], known: int) -> Array:
-    """Columns (n, len(columns)) of numbers, of which only those after the first `known` may be empty (NaN)."""
+    """Return the columns (n, len(columns)) of numbers, of which only those after the first `known` may be
+    empty (NaN).
+    """
     table = np.array([[float(cell or "nan") for cell in column] for column in columns], dtype=np.float64).T
     if np.isnan(table[:, :known]).any() or (np.abs(table) > _FAR).any():
         raise ValueError("a number is missing or absurdly large")
@@ -352,7 +356,7 @@ def _points(text: str) -> tuple[Array, IntArray]:
 
 
 def _numbers(cells: Sequence[str]) -> IntArray:
-    """Numbers of tracks."""
+    """Return the numbers of tracks."""
     if not all(cell.isdecimal() and len(cell) <= 18 for cell in cells):
         raise ValueError("a number of a track is none")
     return np.array(list(map(int, cells)), dtype=np.int64)
@@ -375,7 +379,7 @@ def _outlines(text: str) -> list[list[Array]]:
 
 
 def _ring(positions: Any) -> Array:
-    """A closed outline (m, 2) [deg]."""
+    """Return a closed outline (m, 2) [deg]."""
     ring = np.array(positions, dtype=np.float64)
     if ring.ndim != 2 or ring.shape[1] != 2 or len(ring) < 4:
         raise ValueError(f"an outline of shape {ring.shape}")

@@ -47,7 +47,8 @@ class Light:
 
 
 def light_of(image: str, camera: str | None = None) -> Light:
-    """What the file of an image's camera and the metadata beside the image say: Maxar's IMD and XML, Airbus' DIM file.
+    """Read sun angles and time from the file of an image's camera and the metadata beside the image: Maxar's
+    IMD and XML, Airbus' DIM file.
 
     Of several values over the image (Airbus) the median is taken.
     """
@@ -65,14 +66,16 @@ def light_of(image: str, camera: str | None = None) -> Light:
 
 
 def date_taken(image: Place, camera: Place, tags: Mapping[str, str]) -> str:
-    """The day (ISO 8601) that the files of `light_of` state, an image's own `tags` last; empty where none does."""
+    """Return the day (ISO 8601) that the files of `light_of` state, an image's own `tags` last; empty where
+    none does.
+    """
     stated = next((time[:10] for text in _texts(image, camera) if (time := _time(text))), "")
     found = (_TAG.match(tags.get(tag, "").strip()) for tag in _TAGS)
     return stated or next((day for tag in found if tag and (day := _day("-".join(tag.groups())))), "")
 
 
 def _day(text: str) -> str:
-    """A day, if it is one of a time with satellites; else empty."""
+    """Return a day, if it is one of a time with satellites; else empty."""
     try:
         return text if date.fromisoformat(text).year >= _FIRST else ""
     except ValueError:
@@ -91,7 +94,7 @@ def _time(text: bytes) -> str:
 
 
 def _texts(image: Place, camera: Place) -> Iterator[bytes]:
-    """How the file of the camera and the metadata beside an image begin; nothing of images elsewhere."""
+    """Yield how the file of the camera and the metadata beside an image begin; nothing of images elsewhere."""
     if isinstance(image, Remote) or isinstance(camera, Remote):
         return
     product = image.stem[4:]

@@ -40,7 +40,7 @@ NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([EeDd][+-]?\d+)?")
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What the reader of an RPC cannot know from the file."""
+    """Choices that the reader of an RPC cannot take from the file."""
 
     first_pixel: float | None = None
     """The file's coordinate of the first pixel's centre: 0, 0.5 or 1; None: the format's rule (``docs/formats.md``)."""
@@ -49,7 +49,9 @@ class ReadOptions:
 
 
 def number(text: str, name: str, key: str) -> float:
-    """The number at the start of `text` (or RpcFormatError); a unit may follow, the exponent may be Fortran's D."""
+    """Return the number at the start of `text` (or RpcFormatError); a unit may follow, the exponent may be
+    Fortran's D.
+    """
     text = text.strip()
     match = NUMBER.match(text)
     rest = text[match.end() :] if match else text
@@ -62,12 +64,12 @@ def number(text: str, name: str, key: str) -> float:
 
 
 def numbers(text: str, name: str, key: str) -> list[float]:
-    """The numbers of a list separated by blanks or commas."""
+    """Return the numbers of a list separated by blanks or commas."""
     return [number(part, name, key) for part in re.split(r"[\s,]+", text.strip()) if part]
 
 
 def format_number(value: float) -> str:
-    """The shortest text that reads back as the same double."""
+    """Return the shortest text that reads back as the same double."""
     return repr(float(value)).removesuffix(".0")
 
 
@@ -94,7 +96,7 @@ def rpc_from_fields(
     options: ReadOptions | None = None,
     first_pixel: float = 0.0,
 ) -> RPC:
-    """The RPC of the fields of a file called `name`.
+    """Return the RPC of the fields of a file called `name`.
 
     The format's coordinate of the centre of the first pixel, or the options', is subtracted from the image offsets.
     RpcFormatError where a field (but ERR_BIAS and ERR_RAND) is missing, has the wrong length, is not finite, or a
@@ -127,14 +129,14 @@ def rpc_from_fields(
 
 
 def _accuracy(value: Sequence[float] | None) -> float | None:
-    """A stated accuracy [m]; zero and below mean that nobody knows, not that it is perfect."""
+    """Return a stated accuracy [m]; zero and below mean that nobody knows, not that it is perfect."""
     if not value or not math.isfinite(value[0]) or value[0] <= 0:
         return None
     return float(value[0])
 
 
 def fields_from_rpc(rpc: RPC, direct: bool = False) -> Fields:
-    """The fields of an RPC, in the order that files give them; unknown accuracies are left out.
+    """Return the fields of an RPC, in the order that files give them; unknown accuracies are left out.
 
     Those of its localisation RPC come last, in files that hold them (`direct`).
     """

@@ -35,7 +35,7 @@ class Format:
 
 
 def _has(*patterns: str) -> Callable[[str], bool]:
-    """Whether a text holds all of some patterns, searched in time in proportion to it."""
+    """Return whether a text holds all of some patterns, searched in time in proportion to it."""
     return lambda content: all(re.search(pattern, content) for pattern in patterns)
 
 
@@ -111,7 +111,7 @@ def _rows() -> list[Format | Carrier]:
 
 
 def row_of(path: Path | str) -> Format | Carrier | None:
-    """The row of a file to be written, by its name; None where no name ends so."""
+    """Return the row of a file to be written, by its name; None where no name ends so."""
     name = Path(path).name.lower()
     return next((row for row in _rows() if name.endswith(tuple(end.lower() for end in row.suffixes))), None)
 
@@ -136,7 +136,7 @@ _SETTLED = 2_000_000_000  # ns: after so long a change shows in a folder's time
 
 
 def files_of(folder: Path) -> Mapping[str, str]:
-    """The names in a folder by themselves in lower case; none where it cannot be read.
+    """Return the names in a folder by themselves in lower case; none where it cannot be read.
 
     A folder of ten thousand images is asked for each of them: it is listed once while its time stays the same.
     """
@@ -154,7 +154,9 @@ def _listed(folder: Path, _changed: int) -> Mapping[str, str]:
 
 
 def find_rpc(folder: Path, image: Path) -> Path:
-    """The file in a folder that holds the RPC of an image of that name, in a format that is written (or InputError)."""
+    """Return the file in a folder that holds the RPC of an image of that name, in a format that is written
+    (or InputError).
+    """
     present = files_of(folder)
     ends = [suffix for row in _rows() for suffix in row.suffixes]
     ends += [row.beside for row in WRITABLE.values()]
@@ -166,7 +168,9 @@ def find_rpc(folder: Path, image: Path) -> Path:
 
 
 def parse(data: bytes, name: str, options: ReadOptions | None = None) -> tuple[RPC, str]:
-    """The RPC in all bytes of a file called `name`, and its format; RpcFormatError where there is no valid one."""
+    """Return the RPC in all bytes of a file called `name`, and its format; RpcFormatError where there is no
+    valid one.
+    """
     if not data.strip():
         raise RpcFormatError(f"{name}: the file is empty, expected an RPC")
     RPC_FILE.check(name, len(data))
@@ -188,7 +192,7 @@ holds_physical = _has(r"<(\w+:)?(ATTLIST|Refined_Model)\b")
 
 
 def _contents(content: str) -> str:
-    """The names of the fields in a text, those first that an RPC may have; of a list its name."""
+    """Return the names of the fields in a text, those first that an RPC may have; of a list its name."""
     if holds_physical(content):
         return "it holds a physical camera model: give FILE,model=physical"
     words = ("".join(found).rstrip("0123456789_") for found in _NAMED.findall(content[:_LOOKED]))

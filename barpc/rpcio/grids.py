@@ -60,7 +60,7 @@ def write_correction(grid: CorrectionGrid, rpc: RPC, path: Path | str, *, overwr
 
 
 def read_correction(path: Place) -> tuple[RPC, CorrectionGrid]:
-    """The RPC and the displacements of a correction grid; RpcFormatError where the file is none."""
+    """Read the RPC and the displacements of a correction grid; RpcFormatError where the file is none."""
     with open_raster(path) as dataset:
         _TABLE.check(f"{path}, read", NUMBER * dataset.count * dataset.width * dataset.height)
         if dataset.count != 2 or dataset.tags().get("CORRECTION") != SIGN:
@@ -83,7 +83,7 @@ def read_correction(path: Place) -> tuple[RPC, CorrectionGrid]:
 
 
 def _even(cols: Array, rows: Array) -> tuple[Array, Array]:
-    """First node (2,), from the corner of the first pixel, and steps (2,) [px]."""
+    """Return the first node (2,), from the corner of the first pixel, and the steps (2,) [px] of an even grid."""
     steps = np.array([(axis[-1] - axis[0]) / (len(axis) - 1) for axis in (cols, rows)])
     for axis, step in zip((cols, rows), steps, strict=True):
         if np.abs(np.diff(axis) - step).max() > _EVEN * step:

@@ -57,7 +57,7 @@ def write_rpc_vrt(
 
 
 def rpc_vrt(rpc: RPC, image_path: Path | str, vrt_path: Path | str, *, relative: bool = True) -> str:
-    """The text that `write_rpc_vrt` writes."""
+    """Return the text that `write_rpc_vrt` writes."""
     source, target = plain_source(image_path), Path(vrt_path).absolute()
     plain_path(source)
     plain_path(target)
@@ -103,7 +103,7 @@ def _vrt_source(dataset: Any, name: str, relative: bool, band: str) -> list[str]
 
 
 def plain_source(image_path: Path | str) -> Path:
-    """The file that holds an image's pixels: itself, or what a VRT written here points at (or ImageError)."""
+    """Return the file that holds an image's pixels: itself, or what a VRT written here points at (or ImageError)."""
     source, driver = identify(image_path)
     if not isinstance(source, Path):
         raise ImageError(
@@ -122,7 +122,7 @@ def plain_source(image_path: Path | str) -> Path:
 
 
 def has_mask(dataset: Any) -> bool:
-    """Whether a raster has a mask of its own, apart from an alpha band."""
+    """Return whether a raster has a mask of its own, apart from an alpha band."""
     return (
         MaskFlags.per_dataset in dataset.mask_flag_enums[0] and ColorInterp.alpha not in dataset.colorinterp
     )
@@ -215,7 +215,7 @@ def write_crop(
 
 @contextmanager
 def copying(image_path: Path | str, target: Path | str, overwrite: bool) -> Iterator[tuple[Any, Path]]:
-    """An image and the temporary file of its copy; what GDAL says when it cannot write is told as one error."""
+    """Yield an image and the temporary file of its copy; GDAL's errors when it cannot write become one error."""
     source, _ = identify(image_path)
     target = Path(target).absolute()
     _refuse_same(source, target)
@@ -227,7 +227,7 @@ def copying(image_path: Path | str, target: Path | str, overwrite: bool) -> Iter
 
 
 def _convert(dataset: Any, partial: Path, target: Path, **options: str) -> None:
-    """A copy by another driver; a VRT's pixels are GDAL's only when they stand in a file."""
+    """Copy an image by another driver; a VRT's pixels are GDAL's only when they stand in a file."""
     whole = Window(0, 0, dataset.width, dataset.height)
     if isinstance(dataset, Mosaic):
         _copy_window(dataset, partial, whole, **options)
@@ -272,7 +272,7 @@ def _require_same(dataset: Any, window: Window, partial: Path, target: Path) -> 
 
 
 def unwritten(target: Path, reason: str) -> OutputError:
-    """The error of a file that does not hold what was written; GDAL does not say that a disk is full."""
+    """Return the error of a file that does not hold what was written; GDAL does not say that a disk is full."""
     full = shutil.disk_usage(target.parent).free < _FULL
     return OutputError(f"{target}: cannot be written ({os.strerror(errno.ENOSPC) if full else reason})")
 

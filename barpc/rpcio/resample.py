@@ -113,7 +113,9 @@ def _require_sums(partial: Path, sums: list[int], target: Path) -> None:
 
 
 def _interpolated(pixels: Pixels, known: BoolArray, place: Array) -> Array:
-    """Values of a block at places (2, H, W), row before col; unknown pixels take the value of the nearest known one."""
+    """Return the values of a block at places (2, H, W), row before col; unknown pixels take the value of the
+    nearest known one.
+    """
     from scipy.ndimage import distance_transform_edt, map_coordinates, spline_filter  # of no other output
 
     values = pixels.astype(np.float64)
@@ -128,7 +130,7 @@ def _interpolated(pixels: Pixels, known: BoolArray, place: Array) -> Array:
 
 
 def _stored(values: Array, shown: BoolArray, dtype: np.dtype[Any], nodata: float | None) -> Pixels:
-    """Values in the type of the image: rounded and cut at its range, none of those shown equal to nodata."""
+    """Return the values in the type of the image: rounded and cut at its range, none of those shown equal to nodata."""
     if dtype.kind in "iu":
         limits = np.iinfo(dtype)
         values = np.clip(np.rint(values), limits.min, limits.max)

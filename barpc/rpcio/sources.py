@@ -44,7 +44,7 @@ class Sidecar:
 
 
 def sidecars(image: Path | str) -> list[Sidecar]:
-    """The files beside an image that hold an RPC for some tool, in the order in which GDAL looks.
+    """Return the files beside an image that hold an RPC for some tool, in the order in which GDAL looks.
 
     Names are compared without regard to case, as GDAL does. XML files count only where their content is an RPC.
     """
@@ -65,7 +65,7 @@ def sidecars(image: Path | str) -> list[Sidecar]:
 
 
 def metadata_beside(image: Path) -> Path:
-    """The XML beside an image that may hold its physical model: Maxar's of its name, Airbus' ``DIM_*.XML``."""
+    """Return the XML beside an image that may hold its physical model: Maxar's of its name, Airbus' ``DIM_*.XML``."""
     present, product = files_of(image.parent), image.stem[4:]  # of IMG_<product>_R1C1
     names = (f"{image.stem}.xml", f"dim_{product}.xml", f"dim_{product.rpartition('_')[0]}.xml")
     for name in names:
@@ -75,7 +75,9 @@ def metadata_beside(image: Path) -> Path:
 
 
 def described(path: Place) -> tuple[tuple[int, int] | None, bool]:
-    """Width and height [px] that a vendor's XML states, if it does, and whether it holds a physical model."""
+    """Return the width and height [px] that a vendor's XML states, if it does, and whether it holds a
+    physical model.
+    """
     text = decode(read_bytes(path, RPC_FILE))
     found = [
         re.search(rf"<(?:\w+:)?(?:{tag})>\s*+(\d{{1,7}})\s*+<", text)
@@ -86,7 +88,7 @@ def described(path: Place) -> tuple[tuple[int, int] | None, bool]:
 
 
 def only_physical(path: Path) -> bool:
-    """Whether an XML holds a physical camera model and no RPC; not of one that cannot be read."""
+    """Return whether an XML holds a physical camera model and no RPC; not of one that cannot be read."""
     try:
         text = decode(read_bytes(path, RPC_FILE))
     except BarpcError:
@@ -95,7 +97,7 @@ def only_physical(path: Path) -> bool:
 
 
 def _present(image: Place) -> Mapping[str, str]:
-    """The files beside an image, by name in lower case; on another host those that count."""
+    """Return the files beside an image, by name in lower case; on another host those that count."""
     if isinstance(image, Path):
         return files_of(image.parent)
     try:
@@ -107,7 +109,7 @@ def _present(image: Place) -> Mapping[str, str]:
 
 
 def _names(name: str) -> Iterator[tuple[str, str, bool]]:
-    """(kind, file name, read before the tag) of all sidecars that an image of this name may have."""
+    """Yield (kind, file name, read before the tag) of all sidecars that an image of this name may have."""
     stem = name.rpartition(".")[0] or name
     yield "rpb", f"{stem}.RPB", True
     yield "xml", f"{stem}.XML", True
@@ -135,7 +137,7 @@ def _holds_rpc(path: Place, kind: str) -> bool:
 
 
 def shadows(image: Path | str) -> list[Sidecar]:
-    """The files beside an image that some tool reads instead of the RPC in the image itself.
+    """Return the files beside an image that some tool reads instead of the RPC in the image itself.
 
     A VRT answers for itself in GDAL; what is beside a TIFF goes before its tag. A ``.geom`` is what OTB and CARS are
     given. GDAL's own ``.aux.xml`` counts where the image has no RPC.
@@ -148,7 +150,9 @@ def shadows(image: Path | str) -> list[Sidecar]:
 
 
 def hidden_by(paths: Iterable[Path]) -> Iterator[tuple[Path, Path, RPC]]:
-    """Images whose RPC some tool would no longer see if these files were written: file, image, the image's RPC."""
+    """Yield the images whose RPC some tool would no longer see if these files were written: file, image, the
+    image's RPC.
+    """
     wanted: dict[Path, dict[str, Path]] = {}
     for path in paths:
         wanted.setdefault(path.parent, {})[path.name.lower()] = path
@@ -170,12 +174,12 @@ def _rpc_of_image(path: Path) -> RPC | None:
 
 
 def read_rpc(path: Path | str, *, first_pixel: float | None = None, band: int = 1) -> RPC:
-    """The RPC of an image or of an RPC file; `read_rpc_source` says where it came from, too."""
+    """Read the RPC of an image or of an RPC file; `read_rpc_source` says where it came from, too."""
     return read_rpc_source(path, first_pixel=first_pixel, band=band).rpc
 
 
 def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band: int = 1) -> RpcSource:
-    """The RPC of an image or of an RPC file, and where it came from.
+    """Read the RPC of an image or of an RPC file, and where it came from.
 
     For an image: the vendor's file beside it, the RPC in the image, GDAL's ``.aux.xml``, OSSIM's ``.geom``,
     in this order. Any other file is read by what its content says it is.
@@ -262,7 +266,7 @@ _WHOLE: _Window = (0.0, 0.0, 1.0, 1.0)  # corner, steps
 
 
 def _crop_origin(image: Place, _path: Place) -> tuple[_Window, str]:
-    """A ``.geom`` speaks of the full image; a geotransform without CRS says where the crop is."""
+    """Return a ``.geom`` speaks of the full image; a geotransform without CRS says where the crop is."""
     with open_raster(image) as dataset:
         step_x, _, x, _, step_y, y = dataset.transform[:6]
         has_crs = dataset.crs is not None
@@ -275,7 +279,9 @@ def _crop_origin(image: Place, _path: Place) -> tuple[_Window, str]:
 
 
 def _tile_origin(image: Place, path: Place) -> tuple[_Window, str]:
-    """A DIMAP product in tiles: the RPC is the whole image's, ``DIM_*.XML`` gives the size of a tile."""
+    """Return the origin of a tile of a DIMAP product: the RPC is the whole image's, ``DIM_*.XML`` gives the
+    size of a tile.
+    """
     tile = re.search(r"_R(\d+)C(\d+)$", image.stem.upper())
     if tile is None or tile.groups() == ("1", "1"):
         return _WHOLE, ""

@@ -40,7 +40,7 @@ _LINE = re.compile(r"^[ \t]*+([A-Za-z][\w.]*+)[ \t]*+[:=](.*)$", re.MULTILINE)
 
 
 def decode(data: bytes) -> str:
-    """Text of a file, with line ends of one kind: UTF-8, UTF-16, else Latin-1 (a degree sign, say)."""
+    """Return the text of a file, with line ends of one kind: UTF-8, UTF-16, else Latin-1 (a degree sign, say)."""
     try:
         text = data.decode(encoding_of(data))
     except UnicodeDecodeError:
@@ -54,7 +54,7 @@ def _pairs(text: str) -> Iterator[tuple[str, str]]:
 
 
 def _numbered(fields: Fields, separator: str, indices: Sequence[str]) -> list[str]:
-    """A line for every number; the coefficients of a list have these indices."""
+    """Return a line for every number; the coefficients of a list have these indices."""
     lines = []
     for key, values in fields.items():
         names = [f"{key}_{index}" for index in indices] if key in LISTS else [key]
@@ -63,7 +63,7 @@ def _numbered(fields: Fields, separator: str, indices: Sequence[str]) -> list[st
 
 
 def read_txt(text: str, name: str, options: ReadOptions) -> RPC:
-    """``KEY: value``, with or without a unit behind (GDAL, Planet, IKONOS, GeoEye, OrbView, KOMPSAT).
+    """Read ``KEY: value``, with or without a unit behind (GDAL, Planet, IKONOS, GeoEye, OrbView, KOMPSAT).
 
     Coefficients are numbered or, as GDAL shows them, twenty in a line.
     """
@@ -76,7 +76,7 @@ def read_txt(text: str, name: str, options: ReadOptions) -> RPC:
 
 
 def write_txt(rpc: RPC) -> str:
-    """``KEY: value`` without units (rpcm stumbles on them); every number reads back to the bit."""
+    """Write ``KEY: value`` without units (rpcm stumbles on them); every number reads back to the bit."""
     return (
         "\n".join(_numbered(fields_from_rpc(rpc, direct=True), ": ", [str(i) for i in range(1, 21)])) + "\n"
     )
@@ -88,7 +88,7 @@ _RPB_PAIR = re.compile(r"\b(\w++)\s*+=\s*+(\([^()]*+\)|[^;\n()]*+);?")
 
 
 def read_rpb(text: str, name: str, options: ReadOptions) -> RPC:
-    """Maxar's ``key = value;`` with lists in parentheses."""
+    """Read Maxar's ``key = value;`` with lists in parentheses."""
     keys = {word.lower(): key for key, word in MAXAR.items()}
     fields: Fields = {}
     for word, value in _RPB_PAIR.findall(text):
@@ -100,7 +100,7 @@ def read_rpb(text: str, name: str, options: ReadOptions) -> RPC:
 
 
 def write_rpb(rpc: RPC) -> str:
-    """Maxar's syntax; an unknown accuracy is left out, as a zero would read as perfect."""
+    """Write Maxar's syntax; an unknown accuracy is left out, as a zero would read as perfect."""
     lines = ['satId = "????";', 'bandId = "?";', 'SpecId = "RPC00B";', "BEGIN_GROUP = IMAGE"]
     for key, values in fields_from_rpc(rpc).items():
         if key in COEFFICIENTS:
@@ -118,7 +118,7 @@ _GEOM_COEFF = re.compile(r"(line|samp)_(num|den)_coeff_(\d\d)")
 
 
 def read_geom(text: str, name: str, options: ReadOptions) -> RPC:
-    """OSSIM's keyword list, as OTB and CARS use it; the RPC of the FULL image."""
+    """Read OSSIM's keyword list, as OTB and CARS use it; the RPC of the FULL image."""
     kind = re.search(r"^[ \t]*+polynomial_format:[ \t]*+(\w*+)", text, re.MULTILINE)
     if kind and kind.group(1) != "B":
         raise RpcFormatError(f"{name}: polynomial_format {kind.group(1)!r}, only B (RPC00B) is read")
@@ -131,7 +131,7 @@ def read_geom(text: str, name: str, options: ReadOptions) -> RPC:
 
 
 def write_geom(rpc: RPC) -> str:
-    """OSSIM's keyword list with all keys that its readers ask for (they add the half pixel themselves)."""
+    """Write OSSIM's keyword list with all keys that its readers ask for (they add the half pixel themselves)."""
     fields = fields_from_rpc(rpc)
     errors = {word: fields.pop(key, [0.0]) for word, key in _GEOM_ERRORS.items()}  # 0 is OSSIM's "unknown"
     lines = _numbered(errors | fields, ":  ", [f"{i:02d}" for i in range(20)])
@@ -143,14 +143,14 @@ _ENVI = re.compile(r"^[ \t]*+rpc info\s*+=\s*+\{([^{}]*+)\}", re.MULTILINE | re.
 
 
 def read_envi(text: str, name: str, options: ReadOptions) -> RPC:
-    """ENVI's header: offsets, scales, four times twenty coefficients; three more numbers may follow."""
+    """Read ENVI's header: offsets, scales, four times twenty coefficients; three more numbers may follow."""
     match = _ENVI.search(text)
     values = numbers(match.group(1), name, "rpc info") if match else []
     return _in_order(values, "rpc info", name, options)
 
 
 def _in_order(values: list[float], what: str, name: str, options: ReadOptions) -> RPC:
-    """The RPC of offsets, scales and four times twenty coefficients."""
+    """Return the RPC of offsets, scales and four times twenty coefficients."""
     if len(values) not in _COUNTS:
         raise RpcFormatError(f"{name}: {what} has {len(values)} numbers, expected 90 or 93")
     fields: Fields = {key: [value] for key, value in zip(OFFSETS + SCALES, values, strict=False)}
@@ -164,13 +164,15 @@ _ONE = 0.01  # by which the first coefficient of a denominator may miss 1: OrbVi
 
 
 def bare(text: str) -> bool:
-    """Whether a text holds the numbers of an RPC and nothing else."""
+    """Return whether a text holds the numbers of an RPC and nothing else."""
     parts = [part for part in _BETWEEN.split(text, maxsplit=100) if part]
     return len(parts) in _COUNTS and all(map(NUMBER.fullmatch, parts))
 
 
 def read_bare(text: str, name: str, options: ReadOptions) -> RPC:
-    """Numbers without names, separated by commas, blanks or lines, in the order of ENVI's header (IARPA, s2p)."""
+    """Read the numbers without names, separated by commas, blanks or lines, in the order of ENVI's header
+    (IARPA, s2p).
+    """
     values = [number(part, name, "a number") for part in _BETWEEN.split(text) if part]
     rpc = _in_order(values, "a list without names", name, options)
     first = rpc.coeffs[1::2, 0]
@@ -193,7 +195,7 @@ _PLAIN = {key: key.lower() for key in KEYS}
 
 
 def read_json(text: str, name: str, options: ReadOptions) -> RPC:
-    """``{"rpc": {"row_offset": ...}}`` (rpcm, s2p) or ``{"line_off": ...}`` (rasterio), nested or not."""
+    """Read ``{"rpc": {"row_offset": ...}}`` (rpcm, s2p) or ``{"line_off": ...}`` (rasterio), nested or not."""
     try:
         document = parse_json(text)
     except ValueError as error:
@@ -210,7 +212,7 @@ def read_json(text: str, name: str, options: ReadOptions) -> RPC:
 
 
 def _find(document: Any, mark: str, depth: int = 3) -> dict[str, Any] | None:
-    """The first object that has the key `mark`, at most `depth` levels down."""
+    """Return the first object that has the key `mark`, at most `depth` levels down."""
     if not isinstance(document, dict):
         return None
     if mark in {str(key).lower() for key in document}:
@@ -220,7 +222,7 @@ def _find(document: Any, mark: str, depth: int = 3) -> dict[str, Any] | None:
 
 
 def _values(value: Any, name: str, key: str) -> list[float]:
-    """Numbers of a JSON value: a number, a list of numbers, or a text of numbers (GDAL's)."""
+    """Return the numbers of a JSON value: a number, a list of numbers, or a text of numbers (GDAL's)."""
     if isinstance(value, str):
         return numbers(value, name, key)
     items = value if isinstance(value, list) else [value]
@@ -230,7 +232,7 @@ def _values(value: Any, name: str, key: str) -> list[float]:
 
 
 def write_json(rpc: RPC) -> str:
-    """The dictionary of rpcm and s2p."""
+    """Write the dictionary of rpcm and s2p."""
     fields = fields_from_rpc(rpc, direct=True)
     order = (*(key for key in KEYS if key not in ERRORS), *DIRECT, *ERRORS)
     rpcm = {_RPCM[k]: fields[k] if k in LISTS else fields[k][0] for k in order if k in fields}
@@ -241,7 +243,7 @@ _PAIR = re.compile(r"^[ \t-]*+(\w++):[ \t]*+(\[[^\[\]]*+\]|[^\n\[{]*+)", re.MULT
 
 
 def read_yaml(text: str, name: str, options: ReadOptions) -> RPC:
-    """A parameter file of orthority with one image: names as rasterio's, lists in brackets or as dashes."""
+    """Read a parameter file of orthority with one image: names as rasterio's, lists in brackets or as dashes."""
     text = re.sub(r"\n[ \t]*+-[ \t]++(?=[+-.\d])", ", ", text)  # a block list into one line
     keys = {word: key for key, word in _PLAIN.items()}
     fields: Fields = {}
@@ -270,7 +272,7 @@ _B_FROM_A = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 7, 11, 14, 17, 12, 15, 18, 13, 16, 1
 
 
 def _columns(text: str, widths: dict[str, int], name: str) -> Fields:
-    """The fields of one record: single numbers of these widths, then four times twenty coefficients."""
+    """Return the fields of one record: single numbers of these widths, then four times twenty coefficients."""
     cells = [(key, key, width) for key, width in widths.items()]
     cells += [(key, f"{key}_{i}", _COEFFICIENT_WIDTH) for key in COEFFICIENTS for i in range(1, 21)]
     needed = sum(width for _, _, width in cells)
@@ -285,7 +287,7 @@ def _columns(text: str, widths: dict[str, int], name: str) -> Fields:
 
 
 def read_nitf(path: Place) -> RPC | None:
-    """The RPC in a NITF's RPC00B (or RPC00A) extension, None without one; RpcFormatError where it is not valid."""
+    """Read the RPC in a NITF's RPC00B (or RPC00A) extension, None without one; RpcFormatError where it is not valid."""
     data = read_head(path, IMAGE, _SCAN_LIMIT)
     match = re.search(rb"RPC00([AB])01041", data)
     if match is None:
@@ -301,7 +303,8 @@ def read_nitf(path: Place) -> RPC | None:
 
 
 def nitf_record(rpc: RPC) -> str:
-    """The 1041 characters of an RPC00B extension; RpcFormatError where a number does not fit its field.
+    """Return the 1041 characters of an RPC00B extension; RpcFormatError where a number does not fit its
+    field.
 
     Image and height offsets and scales are integers, degrees have four decimals, coefficients seven digits: an
     RPC that was not fitted for it (`barpc.fit`, precision "nitf") loses tenths of a pixel. An unknown accuracy
@@ -333,5 +336,5 @@ def _nitf_coefficient(value: float, key: str) -> str:
 
 
 def read_alos(text: str, name: str, options: ReadOptions) -> RPC:
-    """ALOS PRISM's and AVNIR's ``RPC-*.txt``: offsets, scales, four times twenty coefficients."""
+    """Read ALOS PRISM's and AVNIR's ``RPC-*.txt``: offsets, scales, four times twenty coefficients."""
     return rpc_from_fields(_columns(text.split("\n", 1)[0], _ALOS, name), name, options)

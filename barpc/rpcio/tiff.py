@@ -53,18 +53,18 @@ class Directory:
     following: bytes  # offset of the next directory, as it stands in the file
 
     def find(self, tag: int) -> Entry | None:
-        """The entry of a tag, or None."""
+        """Return the entry of a tag, or None."""
         return next((entry for entry in self.entries if entry.tag == tag), None)
 
     @property
     def formats(self) -> tuple[str, str, str]:
-        """Of an offset, of the number of entries and of an entry, for struct."""
+        """Formats of an offset, of the number of entries and of an entry, for struct."""
         offset, count, entry = ("Q", "Q", "HHQ8s") if self.big else ("I", "H", "HHI4s")
         return self.order + offset, self.order + count, self.order + entry
 
 
 def read_directory(file: BinaryIO, name: str) -> Directory:
-    """The first directory of an open TIFF file; RpcFormatError where it ends too early or makes no sense."""
+    """Read the first directory of an open TIFF file; RpcFormatError where it ends too early or makes no sense."""
     try:
         head = file.read(16)
         found = Directory("<" if head[:2] == b"II" else ">", head[2:4] in (b"+\0", b"\0+"), (), b"")
@@ -85,7 +85,7 @@ def read_directory(file: BinaryIO, name: str) -> Directory:
 
 
 def read_values(file: BinaryIO, directory: Directory, entry: Entry, name: str) -> bytes:
-    """The bytes of an entry's values, wherever they stand."""
+    """Read the bytes of an entry's values, wherever they stand."""
     size = _SIZES.get(entry.kind, 1) * entry.count
     if size > _MAX_VALUES:
         raise RpcFormatError(f"{name}: TIFF tag {entry.tag} claims {size} bytes")
@@ -103,7 +103,9 @@ def read_values(file: BinaryIO, directory: Directory, entry: Entry, name: str) -
 
 
 def read_tag(path: Place) -> RPC | None:
-    """The RPC in a TIFF's tag, None without such a tag; RpcFormatError where it does not hold 92 usable doubles."""
+    """Read the RPC in a TIFF's tag, None without such a tag; RpcFormatError where it does not hold 92 usable
+    doubles.
+    """
     with opened(path, IMAGE) as file:
         directory = read_directory(file, str(path))
         entry = directory.find(RPC_TAG)
@@ -122,13 +124,13 @@ def read_tag(path: Place) -> RPC | None:
 
 
 def tag_values(rpc: RPC) -> list[float]:
-    """The 92 doubles of the tag; an unknown accuracy is -1."""
+    """Return the 92 doubles of the tag; an unknown accuracy is -1."""
     fields = fields_from_rpc(rpc)
     return [value for key in SINGLE + COEFFICIENTS for value in fields.get(key, [-1.0])]
 
 
 def put_tag(path: Path, rpc: RPC, placed: bool = True) -> None:
-    """Give a TIFF an RPC tag, in place: for a fresh copy only, never for somebody's image.
+    """Put an RPC tag into a TIFF, in place: for a fresh copy only, never for somebody's image.
 
     A new directory, with its geotransform if `placed`, is written behind the end; ImageError if only BigTIFF holds it.
     """
@@ -175,13 +177,14 @@ def _fifteen(values: Array) -> Array:
 
 
 def survives(rpc: RPC) -> bool:
-    """Whether offsets and scales are the same after being printed with fifteen digits."""
+    """Return whether offsets and scales are the same after being printed with fifteen digits."""
     arrays = (rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
     return all(np.array_equal(_fifteen(array), array) for array in arrays)
 
 
 def printable(rpc: RPC) -> RPC:
-    """The same camera with offsets and scales of at most fifteen digits, as which GDAL hands the tag's doubles on.
+    """Return the camera with offsets and scales of at most fifteen digits, as GDAL hands on the tag's
+    doubles.
 
     A longitude offset of 17 digits cut to 15 would move an image by up to 2e-8 px. The coefficients take up the
     difference: a normalised coordinate x becomes a x + b with b and a - 1 of 1e-13, the polynomials change by

@@ -44,7 +44,7 @@ def _text(parent: Element, path: str, name: str) -> str:
 
 
 def _element(parent: Element, paths: Iterable[str], name: str) -> Element:
-    """The first of several elements that is there, at any depth."""
+    """Return the first of several elements that exists, at any depth."""
     for path in paths:
         found = parent.find(f".//{path}")
         if found is not None:
@@ -53,7 +53,7 @@ def _element(parent: Element, paths: Iterable[str], name: str) -> Element:
 
 
 def read_maxar(text: str, name: str, options: ReadOptions) -> RPC:
-    """Maxar's image support data: `<RPB><IMAGE>`, twenty numbers in one element a list."""
+    """Read Maxar's image support data: `<RPB><IMAGE>`, twenty numbers in one element a list."""
     root = _root(text, name)
     rpb = root if root.tag == "RPB" else _element(root, ("RPB",), name)
     spec = rpb.findtext("SPECID", "RPC00B").strip()
@@ -70,7 +70,7 @@ def read_maxar(text: str, name: str, options: ReadOptions) -> RPC:
 
 
 def write_maxar(rpc: RPC) -> str:
-    """The `<RPB>` part of Maxar's image support data."""
+    """Write the `<RPB>` part of Maxar's image support data."""
     lines = []
     for key, values in fields_from_rpc(rpc).items():
         tag = MAXAR[key].upper()
@@ -85,7 +85,8 @@ def write_maxar(rpc: RPC) -> str:
 
 
 def read_dimap(text: str, name: str, options: ReadOptions) -> RPC:
-    """Airbus' DIMAP: Pleiades, SPOT 6/7, PeruSat (v1, v2) and Pleiades Neo (v3); its inverse model, never the direct.
+    """Read Airbus' DIMAP: Pleiades, SPOT 6/7, PeruSat (v1, v2) and Pleiades Neo (v3); its inverse model,
+    never the direct.
 
     The first pixel's centre is (1, 1) in v1 and v2 and (0, 0) in v3. ERR_BIAS_ROW and _COL are the error of the
     vendor's own fit [px], no geolocation accuracy: they are left out.
@@ -104,7 +105,7 @@ def read_dimap(text: str, name: str, options: ReadOptions) -> RPC:
 
 
 def _read_dimap_v1(model: Element, name: str, options: ReadOptions) -> RPC:
-    """DIMAP v1: forty numbers an element, scales A and offsets B by axis."""
+    """Read DIMAP v1: forty numbers an element, scales A and offsets B by axis."""
     fields: Fields = {}
     for axis, field in (("ROW", "LINE"), ("COL", "SAMP")):
         values = numbers(_text(_element(model, (f"F_{axis}",), name), ".", name), name, f"F_{axis}")
@@ -124,7 +125,7 @@ _ENMAP_AXES = {"LINE": "ROW", "SAMP": "COL"}
 
 
 def read_enmap(text: str, name: str, options: ReadOptions) -> RPC:
-    """EnMAP's metadata: `options.band` chooses among the bands' RPCs."""
+    """Read EnMAP's metadata: `options.band` chooses among the bands' RPCs."""
     root = _root(text, name)
     bands = [
         b for rpc in root.iter("RPC") for b in rpc.iter("bandID") if b.get("number") == str(options.band)
@@ -146,7 +147,7 @@ def read_enmap(text: str, name: str, options: ReadOptions) -> RPC:
 
 
 def read_gdal(text: str, name: str, options: ReadOptions) -> RPC:
-    """GDAL's RPC metadata domain; a VRT is read by the grammar by which it is opened (`barpc.vrt`)."""
+    """Read GDAL's RPC metadata domain; a VRT is read by the grammar by which it is opened (`barpc.vrt`)."""
     root = _root(text, name, strip_namespaces=False)
     found = root.find("Metadata[@domain='RPC']")
     if root.tag == "VRTDataset":
@@ -162,13 +163,13 @@ def read_gdal(text: str, name: str, options: ReadOptions) -> RPC:
 
 
 def rpc_from_domain(items: Mapping[str, str], name: str, options: ReadOptions) -> RPC:
-    """The RPC in GDAL's metadata domain; other keys are passed over."""
+    """Return the RPC in GDAL's metadata domain; other keys are passed over."""
     fields = {key: numbers(value, name, key) for key, value in items.items() if key in KEYS + DIRECT}
     return rpc_from_fields(fields, name, options)
 
 
 def rpc_domain(rpc: RPC) -> str:
-    """The `<Metadata domain="RPC">` element of an RPC, numbers that read back to the bit."""
+    """Return the `<Metadata domain="RPC">` element of an RPC, numbers that read back to the bit."""
     rows = [
         f'    <MDI key="{key}">{" ".join(map(format_number, values))}</MDI>'
         for key, values in sorted(fields_from_rpc(rpc, direct=True).items())

@@ -12,12 +12,12 @@ _SETTLED = 1e-9  # rad, about a millimetre: what is left after such a step is be
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Products (N,) of vectors (3, N)."""
+    """Return the dot products (N,) of vectors (3, N)."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def aside(position: Array, velocity: Array, right: bool) -> Array:
-    """Vectors (3, N) across the track, to its right or left."""
+    """Return the vectors (3, N) across the track, to its right or left."""
     across = cross(velocity, position)
     return across if right else -across
 
@@ -25,7 +25,7 @@ def aside(position: Array, velocity: Array, right: bool) -> Array:
 def on_circle(
     position: Array, velocity: Array, distance: Array, alt: Array, right: bool, ahead: Array | float = 0.0
 ) -> tuple[Array, Array]:
-    """The points of a circle that have a given altitude: Newton on the look angle.
+    """Return the points of a circle that have a given altitude: Newton on the look angle.
 
     Parameters
     ----------

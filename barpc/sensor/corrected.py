@@ -37,7 +37,7 @@ _TOLERANCE = 1e-7  # px: a localised point must project this near to where it wa
 
 
 class Motion:
-    """exp(d) R (X - T - C) + C for points of one view or many, and the derivatives: all that P_BA adds to P.
+    """The motion exp(d) R (X - T - C) + C of ground points of one or many views, with its derivatives.
 
     Arrays are component-major, columns sorted by view; R, T, C are each view's, the drift d is each point's.
 
@@ -67,7 +67,7 @@ class Motion:
         self.ecef = self._turned + np.repeat(center.T, count, axis=1)
 
     def derivatives(self, by_moved: Array) -> tuple[Array, Array, Array]:
-        """Derivatives (2, 3, n) by X [1/m], R and d [1/rad], each, of what has these by the moved points [1/m].
+        """Return the derivatives (2, 3, n) by X [1/m], R and d [1/rad] from those by the moved points [1/m].
 
         By T they are those by X, negative; those by d are those by R where there is no drift.
         """
@@ -83,7 +83,7 @@ class Motion:
 
 
 def _by_view(matrices: Array, rows: Array, bounds: IntArray) -> Array:
-    """Matrices (m, 3, 3) times the columns bounds[i] : bounds[i + 1] of rows (..., 3, n)."""
+    """Return the matrices (m, 3, 3) times the columns bounds[i] : bounds[i + 1] of rows (..., 3, n)."""
     out = np.empty_like(rows)
     for matrix, start, stop in zip(matrices, bounds[:-1], bounds[1:], strict=True):
         np.matmul(matrix, rows[..., start:stop], out=out[..., start:stop])
@@ -130,7 +130,7 @@ class Correction(Frozen):
         return f"rotation {1e6 * turn:.3g} urad, translation {move:.3g} m{bent}{grown}"
 
     def motion(self, ecef: Array, row: Array | None = None) -> Motion:
-        """The motion of points (3, n) [m], ECEF, seen at the rows (n,) [px]."""
+        """Return the motion of points (3, n) [m], ECEF, seen at the rows (n,) [px]."""
         drift = None
         if row is not None:
             u = (row - self.row_offset) / self.row_scale
@@ -140,19 +140,22 @@ class Correction(Frozen):
         return Motion(self.scale * ecef, self.rotation[None], shift[None], self.center[None], bounds, drift)
 
     def drift_rate(self, row: Array) -> Array:
-        """Derivative of the drift by the row (3, n) [rad/px] at rows (n,) [px]."""
+        """Return the derivative of the drift by the row (3, n) [rad/px] at rows (n,) [px]."""
         u, degree = (row - self.row_offset) / self.row_scale, np.arange(1, len(self.drift) + 1)[:, None]
         return np.asarray(self.drift.T @ (degree * u ** (degree - 1)) / self.row_scale)
 
     def apply(self, ecef: Array, row: Array | None = None) -> Array:
-        """Points s R (X - T - C) + C of ECEF points X (..., 3) [m]; turned on by the drift at rows (...) if given."""
+        """Return the points s R (X - T - C) + C of ECEF points X (..., 3) [m]; with the drift at rows (...)
+        if given.
+        """
         ecef = np.asarray(ecef, dtype=np.float64)
         rows = None if row is None else np.broadcast_to(row, ecef.shape[:-1]).reshape(-1)
         return self.motion(ecef.reshape(-1, 3).T, rows).ecef.T.reshape(ecef.shape)
 
 
 def correction_of(matrix: Array, at: Array) -> Correction:
-    """The correction that brings a motion of the ground into a camera: it shows X where it showed X before the motion.
+    """Return the correction of a camera after its ground was moved: it shows X where it showed X before the
+    motion.
 
     Parameters
     ----------
@@ -178,7 +181,7 @@ class Corrected:
         return str(getattr(self.sensor, "advice", ""))
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
         ecef = ecef_from_ground(ground)
         if not len(self.correction.drift):
             return self.sensor.project(ground_from_ecef(self.correction.apply(ecef)))
@@ -192,12 +195,13 @@ class Corrected:
         return image
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, by_ecef, _, _ = self.project_ecef(ecef_from_ground(ground))
         return image, by_ecef @ ecef_from_ground_jacobian(ground)
 
     def project_ecef(self, ecef: Array) -> tuple[Array, Array, Array, Array]:
-        """Image points (..., 2) [px] of ECEF points X (..., 3) [m], with the derivatives that the adjustment needs.
+        """Project ECEF points X (..., 3) [m] to image points (..., 2) [px], with the derivatives that the
+        adjustment needs.
 
         d(image)/dX [px/m], d(image)/dR [px/rad], d(image)/dT [px/m], (..., 2, 3) each.
         """
@@ -223,7 +227,7 @@ class Corrected:
         return image.reshape(*shape, 2), by_ecef, of_rotation, of_translation
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m].
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
 
         Newton on (lon, lat) from where the uncorrected sensor puts the point, with that sensor's derivative where the
         point is moved to: a correction turns by so little that each step gains four digits. NaN where it does not
@@ -252,7 +256,7 @@ class Corrected:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ImageAffine(Frozen):
-    """image + shift + slope @ image."""
+    """An affine correction in the image: image + shift + slope @ image."""
 
     shift: Array  # (2,): col, row [px]
     slope: Array  # (2, 2): change of (col, row) by (col, row) [px/px]
@@ -275,16 +279,16 @@ class ImageCorrected:
     correction: ImageAffine  # what is added to its image points
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
         return self.sensor.project(ground) @ self._matrix.T + self.correction.shift
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = self.sensor.project_jacobian(ground)
         return image @ self._matrix.T + self.correction.shift, self._matrix @ jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m]."""
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
         image = np.asarray(image, dtype=np.float64) - self.correction.shift
         return self.sensor.localize(image @ np.linalg.inv(self._matrix).T, alt)
 

@@ -55,7 +55,8 @@ class CorrectionGrid(Frozen):
         alt: float,
         tolerance: float = LINEAR,
     ) -> CorrectionGrid:
-        """What takes the image points of `rpc` to those of `model`, seen on ground of one altitude [m].
+        """Return the displacements from the image points of `rpc` to those of `model` for ground of one
+        altitude [m].
 
         Linear interpolation misses by no more than `tolerance` [px]. RpcError where a camera sees no ground.
         """
@@ -69,13 +70,15 @@ class CorrectionGrid(Frozen):
         return cls(cols, rows, lacking(nodes).astype(np.float32).astype(np.float64))
 
     def at(self, image: Array) -> Array:
-        """Displacements (..., 2) [px] at image points (..., 2) [px] of the RPC; NaN at NaN."""
+        """Return the displacements (..., 2) [px] at image points (..., 2) [px] of the RPC; NaN at NaN."""
         low, high = np.array([(axis[0], axis[-1]) for axis in (self.cols, self.rows)]).T
         inside = np.clip(image, low, high)[..., ::-1]
         return np.asarray(self._linear(inside)).reshape(inside.shape)
 
     def slope(self, image: Array) -> Array:
-        """Derivative (..., 2, 2) of the displacements by col, row, over a tenth of a cell around image points."""
+        """Return the derivative (..., 2, 2) of the displacements by col, row, over a tenth of a cell around
+        image points.
+        """
         reach = 0.05 * np.array([self.cols[1] - self.cols[0], self.rows[1] - self.rows[0]])
         by_axis = [
             (self.at(image + step) - self.at(image - step)) / step.sum() for step in 2 * np.diag(reach)
@@ -83,7 +86,7 @@ class CorrectionGrid(Frozen):
         return np.stack(by_axis, axis=-1) / 2
 
     def apply(self, image: Array) -> Array:
-        """True image points (..., 2) [px] of those of the RPC (..., 2) [px]."""
+        """Return the true image points (..., 2) [px] of those of the RPC (..., 2) [px]."""
         return np.asarray(image + self.at(image))
 
 
@@ -95,16 +98,16 @@ class GridCorrected:
     correction: CorrectionGrid  # what is added to its image points
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
         return self.correction.apply(self.sensor.project(ground))
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = self.sensor.project_jacobian(ground)
         return self.correction.apply(image), (np.eye(2) + self.correction.slope(image)) @ jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m]."""
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
         image = np.asarray(image, dtype=np.float64)
         of_rpc = image
         for _ in range(_STEPS):

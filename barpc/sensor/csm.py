@@ -37,14 +37,14 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def is_state(head: bytes) -> bool:
-    """Whether the first bytes of a file begin a state."""
+    """Return whether the first bytes of a file begin a state."""
     return re.match(rb"\s*(USGS_ASTRO_\w+\s*)?\{", head) is not None and (
         b"USGS_ASTRO_" in head or b'"m_centerEphemerisTime"' in head or b'"m_modelName"' in head
     )
 
 
 def open_state(path: Path) -> tuple[Pushbroom | Frame, tuple[int, int]]:
-    """The camera of a state and the size (width, height) [px] of its image.
+    """Return the camera of a state and the size (width, height) [px] of its image.
 
     Raises
     ------
@@ -75,7 +75,7 @@ class _State:
         self.content, self.name = content, name
 
     def numbers(self, key: str, count: int | None = None) -> Array:
-        """A list of finite numbers, perhaps of a stated length."""
+        """Return a list of finite numbers, perhaps of a stated length."""
         value = self.content.get(key)
         if not isinstance(value, list) or not all(type(v) in (int, float) for v in value):
             raise RpcFormatError(
@@ -86,14 +86,14 @@ class _State:
         return np.array(value, dtype=np.float64)
 
     def number(self, key: str) -> float:
-        """A finite number."""
+        """Return a finite number."""
         value = self.content.get(key)
         if type(value) not in (int, float):
             raise RpcFormatError(f"{self.name}: {key} is missing or no number; is the file complete?")
         return float(value)  # type: ignore[arg-type]  # looked at
 
     def positive(self, key: str, most: float = 1e9) -> float:
-        """A number above 0 and at most `most`."""
+        """Return a number above 0 and at most `most`."""
         value = self.number(key)
         if not 0 < value <= most:
             raise RpcFormatError(f"{self.name}: {key} is {value:g}, expected above 0 and at most {most:g}")
@@ -105,7 +105,7 @@ class _State:
         return int(self.positive("m_nSamples", _MOST)), int(self.positive("m_nLines", _MOST))
 
     def plane(self, origin: tuple[float, float]) -> Array:
-        """(2, 3): detector's sample and line of CSM's (sample, line, 1) to the place in the focal plane."""
+        """Return (2, 3): detector's sample and line of CSM's (sample, line, 1) to the place in the focal plane."""
         by_sample, by_line = self.numbers("m_iTransS", 3), self.numbers("m_iTransL", 3)
         forth = np.stack([by_sample[1:], by_line[1:]])
         if not abs(np.linalg.det(forth)) > 0:
@@ -120,7 +120,7 @@ class _State:
         return np.linalg.solve(forth, detector)
 
     def distortion(self) -> Array:
-        """Coefficients (3,) by powers of the squared distance from the axis, in focal lengths."""
+        """Return the coefficients (3,) by powers of the squared distance from the axis, in focal lengths."""
         given = np.trim_zeros(self.numbers("m_opticalDistCoeffs"), "b")
         if len(given) and (self.number("m_distortionType") != _RADIAL or len(given) > 3):
             raise InputError(
@@ -170,7 +170,7 @@ def _lines(state: _State) -> tuple[float, float]:
 
 
 def _sampled(state: _State, what: str, kind: str, width: int, first: float) -> tuple[Array, Array]:
-    """Times [s from row 0] and rows of a list of samples at equal steps."""
+    """Return the times [s from row 0] and rows of a list of samples at equal steps."""
     values = state.numbers(f"m_{what}")
     stated = state.content.get(f"m_num{what.capitalize()}", len(values))
     if len(values) % width or stated != len(values):
@@ -183,7 +183,7 @@ def _sampled(state: _State, what: str, kind: str, width: int, first: float) -> t
 
 
 def _look(state: _State, width: int) -> tuple[Array, float]:
-    """`Pushbroom.look` of the column and its origin, the middle of the image; exact, distortion too."""
+    """Return `Pushbroom.look` of the column and its origin, the middle of the image; exact, distortion too."""
     origin = (width - 1) / 2.0
     plane = state.plane((state.number("m_detectorSampleOrigin"), state.number("m_detectorLineOrigin")))
     plane = plane / state.positive("m_focalLength") * np.sign(state.number("m_zDirection"))

@@ -52,14 +52,14 @@ _PLAIN: dict[str, Any] = {
 
 
 def is_writable(model: SensorModel) -> bool:
-    """Whether a camera is a pushbroom one of a straight detector, behind corrections in space only."""
+    """Return whether a camera is a pushbroom one of a straight detector, behind corrections in space only."""
     while isinstance(model, Corrected):
         model = model.sensor
     return isinstance(model, Pushbroom) and model.look.shape[1] == 2 and bool(model.line_period > 0)
 
 
 def state_text(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> str:
-    """The state of a camera that `is_writable`, of an image of `size` (width, height) [px].
+    """Return the state of a camera that `is_writable`, of an image of `size` (width, height) [px].
 
     Orbit and attitude are sampled with the corrections in them. What bends light is a turn of the camera that changes
     with the row, true in the middle of the altitudes; what that lacks is measured by opening the state again.
@@ -113,13 +113,13 @@ def _base(model: SensorModel) -> Pushbroom:
 
 
 def _step(base: Pushbroom) -> float:
-    """From sample to sample [s]: half of the camera's own, which lie between those written."""
+    """Return the sampling step [s]: half of the camera's own."""
     own = np.diff(base.attitude.knots)
     return min(_STEP, float(np.median(own)) / 2) if len(own) > 1 else _STEP
 
 
 def _positions(model: SensorModel, rows: Array) -> Array:
-    """Where a camera stands (N, 3) [m], ECEF, at rows (N,): what its corrections move there."""
+    """Return the camera positions (N, 3) [m], ECEF, at rows (N,), corrections included."""
     if not isinstance(model, Corrected):
         return np.asarray(_base(model).position(rows))
     stands, correction = _positions(model.sensor, rows), model.correction
@@ -134,7 +134,7 @@ def _positions(model: SensorModel, rows: Array) -> Array:
 def _attitude(
     model: SensorModel, base: Pushbroom, rows: Array, positions: Array, seen: tuple[int, float]
 ) -> Rotation:
-    """ecef_from_camera, z away from the ground, by what pixels of each row see: the turn nearest to all of them."""
+    """Return the rotation ecef_from_camera, z away from the ground, nearest to the lines of sight of each row."""
     cols = np.linspace(0.0, seen[0] - 1.0, _COLUMNS)
     image = np.stack(np.broadcast_arrays(cols, rows[:, None]), axis=-1)
     away = ecef_from_ground(model.localize(image, np.full(image.shape[:2], seen[1]))) - positions[:, None]
@@ -151,7 +151,7 @@ def _attitude(
 
 
 def _detector(base: Pushbroom) -> dict[str, Any]:
-    """Focal length [px] and where iTransS and iTransL put the detector: line 0, sample = column + 0.5."""
+    """Return the focal length [px] and where iTransS and iTransL put the detector: line 0, sample = column + 0.5."""
     slope = base.look[:, 1]
     focal = 1.0 / float(np.linalg.norm(slope))
     first = base.look @ np.array([1.0, -0.5 - base.look_origin])

@@ -52,12 +52,12 @@ class Curve(Frozen):
 
     @classmethod
     def polynomial(cls, coeffs: npt.ArrayLike, start: float, stop: float) -> Curve:
-        """One polynomial, sum over k of coeffs[k] (t - start)^k, used from `start` to `stop` [s]."""
+        """Return one polynomial, sum over k of coeffs[k] (t - start)^k, used from `start` to `stop` [s]."""
         return cls(np.array([start, stop]), np.asarray(coeffs, dtype=np.float64)[None])
 
     @classmethod
     def through(cls, times: npt.ArrayLike, values: npt.ArrayLike, degree: int = 5) -> Curve:
-        """The spline through samples: smooth to the second but one derivative, not-a-knot at its ends.
+        """Return the spline through samples: smooth to the second but one derivative, not-a-knot at its ends.
 
         `values` (N, 3) are positions [m] or rotation vectors [rad]; `degree` is 3 or 5, less where there are too few
         samples. A quintic through positions every 10 s is true to 1e-4 m between them. RpcError for fewer than two
@@ -78,7 +78,7 @@ class Curve(Frozen):
 
     @property
     def span(self) -> tuple[float, float]:
-        """First and last time that the curve is believed for [s]."""
+        """First and last time [s] at which the curve is used."""
         return float(self.knots[0]) - EXTRAPOLATION, float(self.knots[-1]) + EXTRAPOLATION
 
     def __call__(self, time: Array) -> tuple[Array, Array]:
@@ -87,12 +87,12 @@ class Curve(Frozen):
         return out[:3], out[3:]
 
     def states(self, time: Array) -> tuple[Array, Array, Array]:
-        """Position, velocity and acceleration (3, N) at times (N,) [s]."""
+        """Return the position, velocity and acceleration (3, N) at times (N,) [s]."""
         out = self._evaluate(time, 9)
         return out[:3], out[3:6], out[6:]
 
     def _evaluate(self, time: Array, count: int) -> Array:
-        """The first `count` rows of the table's polynomials (count, N)."""
+        """Return the first `count` rows of the table's polynomials (count, N)."""
         table = self._table[:count]
         if len(self.coeffs) == 1:  # one matrix product: a fifth of the time of Horner's scheme
             dt = time - self.knots[0]
@@ -110,13 +110,15 @@ class Curve(Frozen):
 
 
 def about_middle(rotations: Rotation) -> tuple[Array, Array]:
-    """The middle one (3, 3) of N rotations, and the rotation vectors (N, 3) [rad] from there, in its axes."""
+    """Return the middle (3, 3) of N rotations and the rotation vectors (N, 3) [rad] of all relative to it, in
+    its axes.
+    """
     middle = rotations[len(rotations) // 2]
     return np.asarray(middle.as_matrix()), np.asarray((middle.inv() * rotations).as_rotvec())
 
 
 def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[Array, Curve]:
-    """Attitude from quaternions: axes at the middle sample, and the rotation vector from there.
+    """Return the attitude from quaternions: axes at the middle sample, and the rotation vector from there.
 
     Parameters
     ----------
@@ -143,7 +145,9 @@ def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[
 
 @dataclass(frozen=True, eq=False)
 class Orbit(Curve):
-    """The polynomial through state vectors, and the velocity that they state where it is not its derivative."""
+    """The polynomial through an orbit's state vectors, and the velocity that they state where it is not its
+    derivative.
+    """
 
     sigma: Array  # (3,): standard deviations of positions along and across the track [m], of velocities [m/s]
     stated: Array  # (K, 3): stated velocity less derivative [m/s], as a polynomial of the time from the first knot
@@ -158,7 +162,7 @@ class Orbit(Curve):
 
 
 def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float, float]) -> Orbit:
-    """The orbit through state vectors around the time of an image: one polynomial of time.
+    """Return the orbit through state vectors around the time of an image: one polynomial of time.
 
     Least squares on positions AND velocities. How far each can be trusted differs from product to product
     (Sentinel-1: positions to 2e-6 m in auxiliary products and 2e-4 m in downlinked ones, velocities to 1e-5 and
@@ -209,7 +213,7 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
 
 
 def _fit_orbit(time: Array, position: Array, velocity: Array, degree: int) -> Orbit:
-    """Least squares of one degree, weighted by the standard deviations that its own residuals show."""
+    """Return the least squares of one degree, weighted by the standard deviations that its own residuals show."""
     half = 0.5 * (time[-1] - time[0])
     x = (time - time[0]) / half - 1.0
     basis = chebyshev.chebvander(x, degree)
@@ -249,7 +253,7 @@ def _fit_orbit(time: Array, position: Array, velocity: Array, degree: int) -> Or
 
 
 class Turn:
-    """The rotations exp([w]x) of rotation vectors w (..., 3, N) [rad], and their derivatives."""
+    """Rotations exp([w]x) of rotation vectors w (..., 3, N) [rad], and their derivatives."""
 
     def __init__(self, w: Array) -> None:
         x = (w * w).sum(axis=-2, keepdims=True)  # the angles, squared
@@ -265,19 +269,19 @@ class Turn:
             self._c = np.where(x > 1e-4, (1.0 - self._a) / x, 1.0 / 6 - x / 120)
 
     def forth(self, v: Array) -> Array:
-        """exp([w]x) v of vectors (..., 3, N): Rodrigues."""
+        """Return exp([w]x) v, vectors (..., 3, N) rotated (Rodrigues)."""
         bent = cross(self._w, v)
         return np.asarray(v + self._a * bent + self._b * cross(self._w, bent))
 
     def back(self, v: Array, error: float = 0.0) -> Array:
-        """exp(-[w]x) v of vectors (..., 3, N), to a relative error."""
+        """Return exp(-[w]x) v, vectors (..., 3, N) rotated back."""
         bent = cross(self._w, v)
         if self._largest < error:
             return np.asarray(v - bent)
         return np.asarray(v - self._a * bent + self._b * cross(self._w, bent))
 
     def back_and_rate(self, v: Array, error: float = 0.0) -> tuple[Array, Array]:
-        """`back` and `rate` of the same vectors."""
+        """Return `back` and `rate` of the same vectors."""
         bent = cross(self._w, v)
         if self._largest < error:
             return v - bent, v - 0.5 * bent
@@ -285,23 +289,27 @@ class Turn:
         return v - self._a * bent + self._b * twice, v - self._b * bent + self._c * twice
 
     def rate(self, v: Array) -> Array:
-        """The right Jacobian times v: exp([w + v]x) is exp([w]x) exp([rate]x) to first order in v (..., 3, N)."""
+        """Return the right Jacobian times v: exp([w + v]x) is exp([w]x) exp([rate]x) to first order in v
+        (..., 3, N).
+        """
         bent = cross(self._w, v)
         return np.asarray(v - self._b * bent + self._c * cross(self._w, bent))
 
 
 def rotation_matrix(rotation: npt.ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
+    """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
     return Turn(np.asarray(rotation, dtype=np.float64)[..., None]).forth(np.eye(3))
 
 
 def rotation_left_jacobian(rotation: npt.ArrayLike) -> Array:
-    """Left Jacobians J (..., 3, 3) of rotation vectors (..., 3) [rad]: R(w + dw) = R(J dw) R(w) to first order."""
+    """Return the left Jacobians J (..., 3, 3) of rotation vectors (..., 3) [rad]: R(w + dw) = R(J dw) R(w) to
+    first order.
+    """
     return Turn(-np.asarray(rotation, dtype=np.float64)[..., None]).rate(np.eye(3))
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Cross products along the last axis but one of (..., 3, N) arrays, broadcast."""
+    """Return the cross products along the last axis but one of (..., 3, N) arrays, broadcast."""
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.multiply(a[..., j, :], b[..., k, :], out=out[..., i, :])

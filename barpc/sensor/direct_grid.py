@@ -98,7 +98,9 @@ class DirectGrid(Frozen):
 
     @classmethod
     def from_points(cls, ground: npt.ArrayLike, image: npt.ArrayLike) -> DirectGrid:
-        """The grid whose nodes, ground (N, 3) and image (N, 2), are listed in any order; RpcError if one is missing."""
+        """Return the grid whose nodes, ground (N, 3) and image (N, 2), are listed in any order; RpcError if
+        one is missing.
+        """
         ground = np.asarray(ground, dtype=np.float64)
         image = np.asarray(image, dtype=np.float64)
         values = (ground[:, 2], image[:, 1], image[:, 0])
@@ -118,7 +120,8 @@ class DirectGrid(Frozen):
         alt_range: tuple[float, float],
         tolerance: float = LINEAR,
     ) -> DirectGrid:
-        """The grid of a camera from corner to corner of an image of `size` (width, height) and over its altitudes.
+        """Return the grid of a camera from corner to corner of an image of `size` (width, height) and over
+        its altitudes.
 
         Linear interpolation between its nodes misses by no more than `tolerance` [px], unless that asks for
         millions of nodes. RpcError where the camera sees no ground.
@@ -130,7 +133,7 @@ class DirectGrid(Frozen):
         to_px = np.linalg.inv(_slopes(model, middle)).T
 
         def seen(points: Array) -> Array:
-            """Ground points (..., 2) of points (..., 3) col, row, altitude, about in pixels."""
+            """Return the ground points (..., 2) of points (..., 3) col, row, altitude, about in pixels."""
             lonlat = model.localize(points[..., :2], points[..., 2])[..., :2]
             return np.asarray((wrap_longitude(lonlat, center[:2]) - center[:2]) @ to_px)
 
@@ -139,16 +142,16 @@ class DirectGrid(Frozen):
         return cls(cols, rows, alts, found @ np.linalg.inv(to_px) + center[:2])
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN off the grid."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN off the grid."""
         return pointwise(lambda part: [self._solve(part)], CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m]; NaN off the grid."""
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3); NaN off the grid."""
         return pointwise(self._localize, CHUNK, [(3,)], image, alt)[0]
 
     def _localize(self, image: Array, alt: Array) -> list[Array]:
@@ -162,7 +165,9 @@ class DirectGrid(Frozen):
         return image, np.stack([by_lon, by_lat, by_alt], axis=2)
 
     def _solve(self, ground: Array) -> Array:
-        """Image points (N, 2) of ground points (N, 3): Newton from an inverse cubic, whose derivatives mostly serve."""
+        """Return the image points (N, 2) of ground points (N, 3): Newton from an inverse cubic, whose
+        derivatives mostly serve.
+        """
         target, alt = ground[:, :2].copy(), ground[:, 2]
         target[:, 0] = wrap_longitude(target[:, 0], self._lon) - self._lon
         with np.errstate(all="ignore"):
@@ -183,7 +188,9 @@ class DirectGrid(Frozen):
         return image
 
     def _guess(self, lonlat: Array, alt: Array) -> tuple[Array, Array, Array]:
-        """Image points (N, 2) by the inverse cubic, brought back onto the grid, and their derivatives by lon, lat."""
+        """Return the image points (N, 2) by the inverse cubic, brought back onto the grid, and their
+        derivatives by lon, lat.
+        """
         offset, scale, coeffs = self._inverse[0, :3], self._inverse[1, :3], self._inverse[2:, :2]
         basis = monomials(((np.column_stack([lonlat, alt]) - offset) / scale).T)
         image = basis.T @ coeffs
@@ -194,7 +201,7 @@ class DirectGrid(Frozen):
         return image, by_lon, by_lat
 
     def _value(self, image: Array, alt: Array, derivative: tuple[int, int, int] = _VALUE) -> Array:
-        """East of the centre and lat (N, 2) [deg], or a derivative of them; NaN off the grid."""
+        """Return degrees east of the centre and lat (N, 2) [deg], or a derivative of them; NaN off the grid."""
         place = np.column_stack([alt, image[:, 1], image[:, 0]])
         margin = [0.1 * np.ptp(self.alts), self.rows[1] - self.rows[0], self.cols[1] - self.cols[0]]
         low, high = np.array([(axis[0], axis[-1]) for axis in (self.alts, self.rows, self.cols)]).T
@@ -205,14 +212,14 @@ class DirectGrid(Frozen):
         return value
 
     def _inverse_2x2(self, image: Array, alt: Array) -> tuple[Array, Array]:
-        """d(col, row)/dlon and d(col, row)/dlat (N, 2)."""
+        """Return d(col, row)/dlon and d(col, row)/dlat (N, 2)."""
         (a, b), (c, d) = self._value(image, alt, _BY_COL).T, self._value(image, alt, _BY_ROW).T
         det = a * d - b * c
         return np.stack([d / det, -b / det], axis=1), np.stack([-c / det, a / det], axis=1)
 
 
 def _inverse_cubic(axes: tuple[Array, Array, Array], lonlat: Array) -> Array:
-    """Offsets, scales and coefficients (22, 3) of cubic polynomials from (lon, lat, alt) to (col, row)."""
+    """Return the offsets, scales and coefficients (22, 3) of cubic polynomials from (lon, lat, alt) to (col, row)."""
     thin = tuple(slice(None, None, max(1, len(axis) // 12)) for axis in axes)
     alt, row, col = np.meshgrid(*(axis[part] for axis, part in zip(axes, thin, strict=True)), indexing="ij")
     lonlat = lonlat[thin]
@@ -224,7 +231,7 @@ def _inverse_cubic(axes: tuple[Array, Array, Array], lonlat: Array) -> Array:
 
 
 def _nodes(seen: Callable[[Array], Array], axes: tuple[Array, Array, Array], tolerance: float) -> Array:
-    """What is seen (L, H, W, 2) at the nodes of three axes, altitudes, rows, columns.
+    """Return the ground seen (L, H, W, 2) at the nodes of three axes, altitudes, rows, columns.
 
     Along altitudes and columns most cameras are smooth, whatever their attitude does along the rows: polynomials
     through a few of them serve where, at some rows, they miss by no more than `tolerance` [px].
@@ -243,20 +250,20 @@ def _nodes(seen: Callable[[Array], Array], axes: tuple[Array, Array, Array], tol
 
 
 def _on(seen: Callable[[Array], Array], axes: tuple[Array, Array, Array]) -> Array:
-    """What is seen (L, H, W, 2) at all nodes, layer by layer."""
+    """Return the ground seen (L, H, W, 2) at all nodes, layer by layer."""
     alts, rows, cols = axes
     plane = np.stack(np.meshgrid(cols, rows), axis=-1)
     return np.stack([seen(np.dstack([plane, np.full(plane.shape[:2], alt)])) for alt in alts])
 
 
 def _spread(values: Array, by_alt: Array, by_col: Array) -> Array:
-    """Values (l, H, w, 2) of a few nodes at all of them (L, H, W, 2)."""
+    """Return the values (l, H, w, 2) of a few nodes at all of them (L, H, W, 2)."""
     wide = np.matmul(by_col, values)
     return np.asarray(np.tensordot(by_alt, wide, axes=1))
 
 
 def _chebyshev(axis: Array, count: int) -> Array:
-    """Places between which a polynomial is at its best, its ends among them."""
+    """Return the places between which a polynomial is at its best, its ends among them."""
     if count >= len(axis):
         return axis
     return np.asarray(
@@ -265,7 +272,7 @@ def _chebyshev(axis: Array, count: int) -> Array:
 
 
 def _lagrange(nodes: Array, at: Array) -> Array:
-    """Matrix (M, N) from values at nodes (N,) to those of their polynomial at places (M,)."""
+    """Return the matrix (M, N) from values at nodes (N,) to those of their polynomial at places (M,)."""
     away = at[:, None] - nodes
     apart = nodes[:, None] - nodes + np.eye(len(nodes)) * np.ptp(nodes)
     weight = 1.0 / np.prod(apart / np.ptp(nodes), axis=1)
@@ -276,7 +283,7 @@ def _lagrange(nodes: Array, at: Array) -> Array:
 
 
 def _slopes(model: SensorModel, at: Array) -> Array:
-    """Derivative (2, 2) [deg/px] of lon, lat by col, row at a point (3,) col, row, altitude."""
+    """Return the derivative (2, 2) [deg/px] of lon, lat by col, row at a point (3,) col, row, altitude."""
     steps = np.concatenate([np.eye(2), -np.eye(2)])
     ground = model.localize(at[:2] + steps, np.full(4, at[2]))[:, :2]
     return np.asarray((wrap_longitude(ground[:2] - ground[2:]) / 2).T)
@@ -285,7 +292,8 @@ def _slopes(model: SensorModel, at: Array) -> Array:
 def linear_axes(
     value: Callable[[Array], Array], low: Array, high: Array, longest: Array, tolerance: float
 ) -> list[Array]:
-    """Nodes along each axis of a box `low`, `high` (d,), between which values are linear to a tolerance.
+    """Return the nodes along each axis of a box `low`, `high` (d,), so dense that linear interpolation is
+    within a tolerance.
 
     The error along each axis is measured at random places of random cells, whose phase no wave can hide in.
 

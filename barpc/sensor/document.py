@@ -18,12 +18,12 @@ _TIME = re.compile(r"(UTC=)?(?P<time>20\d\d-\d\d-\d\d[T ]\d\d:\d\d:\d\d(\.\d{1,9
 
 
 def seconds(time: Any, epoch: np.datetime64) -> Any:
-    """Seconds (float) from an epoch, exact to the nanosecond."""
+    """Return the seconds (float) from an epoch, exact to the nanosecond."""
     return (time - epoch) / np.timedelta64(1, "ns") * 1e-9
 
 
 def parse_time(text: str, name: str) -> np.datetime64:
-    """A UTC time, "2021-02-16T15:12:07.524369", perhaps with a Z behind it or "UTC=" before."""
+    """Parse a UTC time such as "2021-02-16T15:12:07.524369", perhaps with a Z behind it or "UTC=" before."""
     match = _TIME.fullmatch(text.strip())
     try:
         return np.datetime64(match["time"] if match else "none", "ns")
@@ -38,29 +38,30 @@ class Fields:
         self.element, self.name = element, name
 
     def text(self, path: str) -> str:
-        """The text of a field; RpcFormatError where there is none."""
+        """Return the text of a field; RpcFormatError where there is none."""
         text = self.element.findtext(path)
         if text is None or not text.strip():
             raise RpcFormatError(f"{self.name}: no {path} below <{self.element.tag}>; is the file complete?")
         return text.strip()
 
     def all(self, path: str) -> list[Self]:
-        """Every element of this path, none too."""
+        """Return every element of this path, or an empty list."""
         return [type(self)(element, self.name) for element in self.element.findall(path)]
 
     def one(self, path: str) -> Self:
-        """The first element of this path; RpcFormatError where there is none."""
+        """Return the first element of this path; RpcFormatError where there is none."""
         found = self.element.find(path)
         if found is None:
             raise RpcFormatError(f"{self.name}: no {path} below <{self.element.tag}>; is the file complete?")
         return type(self)(found, self.name)
 
     def time(self, path: str) -> np.datetime64:
-        """A UTC time; RpcFormatError where it is missing or none."""
+        """Return a UTC time; RpcFormatError where it is missing or none."""
         return parse_time(self.text(path), self.name)
 
     def numbers(self, path: str, count: int | None = None, between: str = " ") -> Array:
-        """The finite numbers (N,) of a field; RpcFormatError where it is missing, holds others, or not `count`.
+        """Return the finite numbers (N,) of a field; RpcFormatError where it is missing, holds others, or not
+        `count`.
 
         `between` is a character that may separate them, beside blanks.
         """
@@ -75,11 +76,11 @@ class Fields:
         return numbers
 
     def number(self, path: str) -> float:
-        """The only number of a field."""
+        """Return the only number of a field."""
         return float(self.numbers(path, 1)[0])
 
     def positive(self, path: str, most: float = LARGEST) -> float:
-        """The first number of a field; RpcFormatError where it is not above 0 and at most `most`."""
+        """Return the first number of a field; RpcFormatError where it is not above 0 and at most `most`."""
         value = float(self.numbers(path)[0])
         if not 0 < value <= most:
             raise RpcFormatError(f"{self.name}: {path} is {value:g}, expected above 0 and at most {most:g}")

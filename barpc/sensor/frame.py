@@ -68,16 +68,17 @@ class Frame(Frozen):
             raise RpcError("frame camera: plane has no area")
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN behind the camera."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN behind the camera."""
         return pointwise(lambda part: [self._seen(ecef_from_ground(part).T)[0].T], _CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = pointwise(self._derivatives, _CHUNK, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m]; NaN off the Earth.
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3); NaN off the
+        Earth.
 
         Longitudes run on across the antimeridian.
         """
@@ -93,14 +94,18 @@ class Frame(Frozen):
         return ground
 
     def _seen(self, ecef: Array) -> tuple[Array, Array, Array]:
-        """Image points (2, N), places in the focal plane (2, N) and vectors in the camera (3, N) of ECEF points."""
+        """Return the image points (2, N), places in the focal plane (2, N) and vectors in the camera (3, N)
+        of ECEF points.
+        """
         p = self.rotation.T @ (ecef - self.center[:, None])
         tangents = p[:2] / np.where(p[2] > 0, p[2], np.nan)
         at = tangents * self._farther(np.sqrt((tangents**2).sum(axis=0)))
         return np.asarray(np.linalg.solve(self.plane[:, :2], at - self.plane[:, 2:]), np.float64), at, p
 
     def _farther(self, radius: Array) -> Array:
-        """By what factor (N,) the place in the focal plane is farther out than the tangents; NaN if nowhere."""
+        """Return the factor (N,) by which a place in the focal plane is farther out than the tangents; NaN if
+        nowhere.
+        """
         slope, found = polyder(self.distortion), radius
         step = np.zeros_like(radius)
         for _ in range(_STEPS):

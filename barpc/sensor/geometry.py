@@ -32,26 +32,26 @@ PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this r
 
 
 class Radar(SensorModel, Protocol):
-    """A model that knows where its beam comes from: not from where the ground points of one pixel lie over altitude."""
+    """A radar model, which knows the direction of its beam: it is not that of a pixel's ground points over altitude."""
 
     def to_radar(self, ground: Array) -> Array:
-        """Vectors (..., 3) [m], ECEF, from ground points (..., 3) to the radar that sees them."""
+        """Return the vectors (..., 3) [m], ECEF, from ground points (..., 3) to the radar that sees them."""
         ...
 
 
 def is_radar(sensor: object) -> TypeGuard[Radar]:
-    """Whether a model knows where its beam comes from: asking the protocol itself costs 70 us a view."""
+    """Return whether a model knows where its beam comes from: asking the protocol itself costs 70 us a view."""
     return hasattr(sensor, "to_radar")
 
 
 def altitude_range(rpc: RPC) -> tuple[float, float]:
-    """The altitudes [m] that an RPC states: its offset -/+ its scale."""
+    """Return the altitudes [m] that an RPC states: its offset -/+ its scale."""
     offset, scale = float(rpc.ground_offset[2]), abs(float(rpc.ground_scale[2]))
     return offset - scale, offset + scale
 
 
 def image_border(size: tuple[int, int], per_side: int = 8) -> Array:
-    """Points (4 per_side, 2) [px] along the outline of an image, from the top-left corner, clockwise."""
+    """Return the points (4 per_side, 2) [px] along the outline of an image, from the top-left corner, clockwise."""
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     t = np.arange(per_side)[:, None] / per_side
     sides = corners[:, None] + t * (np.roll(corners, -1, axis=0) - corners)[:, None]
@@ -61,7 +61,9 @@ def image_border(size: tuple[int, int], per_side: int = 8) -> Array:
 def image_grid(
     size: tuple[int, int], alt_range: tuple[float, float], nodes: tuple[int, int] = (11, 5)
 ) -> tuple[Array, Array]:
-    """Image points (N, 2) [px] and altitudes (N,) [m] on a grid over an image and its altitudes, columns slowest."""
+    """Return the image points (N, 2) [px] and altitudes (N,) [m] on a grid over an image and its altitudes,
+    columns slowest.
+    """
     col, row = (np.linspace(0, side - 1, nodes[0]) for side in size)
     grid = np.stack(np.meshgrid(col, row, np.linspace(*alt_range, nodes[1]), indexing="ij"), axis=-1)
     return grid[..., :2].reshape(-1, 2), grid[..., 2].ravel()
@@ -70,7 +72,7 @@ def image_grid(
 def footprint(
     sensor: SensorModel, size: tuple[int, int], alt: float | npt.ArrayLike, per_side: int = 8
 ) -> Array:
-    """Outline of an image on the ground.
+    """Return the outline of an image on the ground.
 
     Parameters
     ----------
@@ -89,7 +91,7 @@ def footprint(
 
 
 def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, float]) -> tuple[Array, Array]:
-    """Straight lines through the ground points of image points at two altitudes.
+    """Return the straight lines through the ground points of image points at two altitudes.
 
     Parameters
     ----------
@@ -110,7 +112,9 @@ def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, fl
 
 
 def sight_enu(sensor: SensorModel, ground: Array) -> Array:
-    """Unit vectors (..., 3) east, north, up from ground points (..., 3) to the sensor: along them no pixel changes."""
+    """Return the unit vectors (..., 3) east, north, up along the lines of sight from ground points (..., 3)
+    to the sensor.
+    """
     ground = np.asarray(ground, dtype=np.float64)
     _, jacobian = sensor.project_jacobian(ground)
     metric = jacobian / metres_per_unit(ground)[..., None, :]
@@ -121,7 +125,7 @@ def sight_enu(sensor: SensorModel, ground: Array) -> Array:
 
 
 def view_angles(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
-    """Incidence and azimuth of the line of sight, or of a radar's beam, at ground points (..., 3).
+    """Return the incidence and azimuth of the line of sight, or of a radar's beam, at ground points (..., 3).
 
     Returns
     -------
@@ -133,7 +137,7 @@ def view_angles(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
 
 
 def _to_sensor(sensor: SensorModel, ground: Array) -> Array:
-    """East, north, up (..., 3) of the direction to the sensor, of any length."""
+    """Return the east, north, up (..., 3) of the direction to the sensor, of any length."""
     if isinstance(sensor, Several):
         return sensor.each(_to_sensor, ground)
     if is_radar(sensor):
@@ -142,7 +146,7 @@ def _to_sensor(sensor: SensorModel, ground: Array) -> Array:
 
 
 def ground_sample_distance(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
-    """How large a pixel is on level ground at points (..., 3).
+    """Return the ground sampling distance [m] at points (..., 3) on level ground.
 
     Returns
     -------
@@ -158,14 +162,15 @@ def ground_sample_distance(sensor: SensorModel, ground: Array) -> tuple[Array, A
 
 
 def convergence_angle(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) -> Array:
-    """Angle (...) [deg] between the lines of sight of two cameras at ground points (..., 3)."""
+    """Return the angle (...) [deg] between the lines of sight of two cameras at ground points (..., 3)."""
     a, b = sight_enu(sensor_a, ground), sight_enu(sensor_b, ground)
     cross = np.linalg.norm(np.cross(a, b), axis=-1)
     return np.asarray(np.degrees(np.arctan2(cross, (a * b).sum(axis=-1))))
 
 
 def base_to_height(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) -> Array:
-    """B/H (...) of two cameras at ground points (..., 3): metres of parallax on level ground a metre of height.
+    """Return B/H (...) of two cameras at ground points (..., 3): metres of parallax on level ground a metre
+    of height.
 
     abs(t_a - t_b), t = (east, north) / up of a line of sight: the distance of the two cameras at the height 1. The
     textbook's 2 tan(angle / 2) is that only where the vertical halves the angle: of two cameras on one side of it,
@@ -188,28 +193,30 @@ class Several:
         self._parts = [(sensors[of_row[rows[0]]], rows) for rows in np.split(order, starts)[1:]]
 
     def each(self, function: Callable[[SensorModel, Array], Array], ground: Array) -> Array:
-        """What a function of a camera and ground points gives, (N, 3), for ground points (N, 3)."""
+        """Return what a function of a camera and ground points gives for ground points (N, 3), each with its
+        own camera.
+        """
         found = np.empty((len(ground), 3))
         for sensor, rows in self._parts:
             found[rows] = function(sensor, ground[rows])
         return found
 
     def project(self, ground: Array) -> Array:
-        """Image points (N, 2) [px] of ground points (N, 3) [deg, deg, m]."""
+        """Project ground points (N, 3) [deg, deg, m] to image points (N, 2) [px]."""
         image = np.empty((len(ground), 2))
         for sensor, rows in self._parts:
             image[rows] = sensor.project(ground[rows])
         return image
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (N, 2) [px] and their derivative (N, 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (N, 2) [px] and their derivatives (N, 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = np.empty((len(ground), 2)), np.empty((len(ground), 2, 3))
         for sensor, rows in self._parts:
             image[rows], jacobian[rows] = sensor.project_jacobian(ground[rows])
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (N, 3) seen at image points (N, 2) [px] at altitudes (N,) [m]."""
+        """Localise image points (N, 2) [px] at altitudes (N,) [m]: ground points (N, 3)."""
         ground = np.empty((len(image), 3))
         for sensor, rows in self._parts:
             ground[rows] = sensor.localize(image[rows], alt[rows])
@@ -218,7 +225,7 @@ class Several:
 
 @dataclass(frozen=True, eq=False)
 class CameraCenter:
-    """Where a camera stands."""
+    """Position of a camera, and how it was found."""
 
     ecef: Array  # (3,) [m]
     altitude: float
@@ -231,7 +238,7 @@ def camera_center(
     alt_range: tuple[float, float],
     how: Literal["line", "projective"] = "line",
 ) -> CameraCenter:
-    """Camera centre regressed from a sensor model.
+    """Estimate the camera centre by regression of a sensor model's rays.
 
     One image line of a pushbroom camera IS a perspective camera, so its rays meet in one point, found by least
     squares. A point outside `PLAUSIBLE_ALTITUDE` is replaced by one at `NOMINAL_ALTITUDE` on the central ray, and says
@@ -281,7 +288,9 @@ def _center_of_line(sensor: SensorModel, size: tuple[int, int], alt_range: tuple
 
 
 def _center_projective(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
-    """Centre (3,) of the 3 x 4 matrix that takes ground points to image points: its null space (Hartley, DLT)."""
+    """Return the centre (3,) of the 3 x 4 matrix that takes ground points to image points: its null space
+    (Hartley, DLT).
+    """
     ends = np.linspace(0.0, 1.0, _REGRESSED)
     unit = np.stack(np.meshgrid(ends, ends, ends), axis=-1).reshape(-1, 3)
     image, low = unit[:, :2] * (np.array(size) - 1.0), alt_range[0]
@@ -317,7 +326,7 @@ def epipolar_offset(
     alt: float | npt.ArrayLike = 0.0,
     steps: int = 6,
 ) -> tuple[Array, Array]:
-    """How far matches lie off the epipolar line: what no altitude explains.
+    """Return the distances of matches from their epipolar lines: what no altitude explains.
 
     The altitude that brings the ray of a nearest to the point in b is found by Gauss-Newton along the
     ray; the signed distance that is left, across the epipolar line, is the offset.
@@ -406,7 +415,9 @@ def triangulate(
 def _intersect(
     rows: _Rows, point: IntArray, xy: Array, weight: Array, alt: Array, steps: int
 ) -> tuple[Array, BoolArray]:
-    """Gauss-Newton on metres east, north, up from where a view sees a track at `alt`: ground (P, 3), if possible."""
+    """Return Gauss-Newton on metres east, north, up from where a view sees a track at `alt`: ground (P, 3),
+    if possible.
+    """
     ground = np.full((len(alt), 3), np.nan)
     for sensor, part in rows:
         new = np.flatnonzero(np.isnan(ground[point[part], 0])) + part.start
@@ -428,7 +439,7 @@ def _intersect(
 
 
 def _normal_step(jacobian: Array, residual: Array, point: IntArray, scale: Array) -> tuple[Array, BoolArray]:
-    """Gauss-Newton steps (3, num) [m] by cofactors, and for which points the rays determine one.
+    """Return Gauss-Newton steps (3, num) [m] by cofactors, and for which points the rays determine one.
 
     `jacobian` (3, 2, K) and `residual` (2, K) are weighted; `scale` (3, num): metres of a unit of lon, lat, alt.
     """

@@ -48,7 +48,7 @@ _SETTLED = 1e-4  # px: Newton is quadratic, what is left after a step of this si
 
 @dataclass(frozen=True)
 class Light:
-    """What bends the line of sight of a camera.
+    """Aberration and refraction of a camera's lines of sight.
 
     A moving camera sees a point in the direction of (X - O) / |X - O| + b, b = V / c: V is the camera's velocity in the
     inertial frame less that of the point, O' - omega x (X - O) in ECEF. Refraction lets a point seem farther from
@@ -59,7 +59,9 @@ class Light:
     refraction: bool = False
 
     def seen(self, ecef: Array, origin: Array, velocity: Array) -> Array:
-        """Vectors (3, N) [m] along which points (3, N) are seen from places (3, N) at velocities (3, N), ECEF."""
+        """Return the apparent directions (3, N) [m] of points (3, N) seen from places (3, N) at velocities
+        (3, N), ECEF.
+        """
         sight = ecef - origin
         if self.refraction:
             sight = sight + self._lift(ecef, sight)[0]
@@ -68,7 +70,9 @@ class Light:
         return sight
 
     def by_point(self, gradient: Array, ecef: Array, origin: Array, velocity: Array) -> Array:
-        """Derivatives (3, N) by the points of what has the `gradient` (3, N) by `seen`, to 1e-6 of them."""
+        """Return derivatives (3, N) by the ground points, from the `gradient` (3, N) by the apparent
+        directions, to 1e-6.
+        """
         sight = ecef - origin
         out = gradient
         if self.aberration:
@@ -80,7 +84,7 @@ class Light:
         return out
 
     def _lift(self, ecef: Array, sight: Array) -> tuple[Array, Array]:
-        """By how much points seem displaced (3, N) [m], and the vertical (3, N); NaN near the horizon."""
+        """Return the apparent displacement by refraction (3, N) [m], and the vertical (3, N); NaN near the horizon."""
         ground = ground_from_ecef(ecef.T)
         vertical, along = up(ground), sight / np.sqrt((sight * sight).sum(axis=0))
         cosine = -(vertical * along).sum(axis=0)
@@ -90,7 +94,7 @@ class Light:
 
 
 def _drag(sight: Array, velocity: Array) -> Array:
-    """The velocity of a camera against the points (3, N) [m] away, over that of light."""
+    """Return the velocity of a camera against the points (3, N) [m] away, over that of light."""
     carried = np.stack([-sight[1], sight[0], np.zeros(sight.shape[1])]) * EARTH_RATE
     return np.asarray((velocity - carried) / SPEED_OF_LIGHT)
 
@@ -111,7 +115,7 @@ class Pushbroom(Frozen):
     look_origin : float, column [px] from which `look` counts
     line_period : float, time from one row to the next [s]; negative where the image was turned over
     first_line : float, time of row 0 [s]
-    light : Light, what bends the line of sight
+    light : Light, bending of the line of sight
     accuracy : (float, float) or None, stated standard deviations of attitude, as metres on the ground, and position [m]
 
     Raises
@@ -180,21 +184,23 @@ class Pushbroom(Frozen):
         return self.first_line + self.line_period * np.asarray(row, dtype=np.float64)
 
     def position(self, row: npt.ArrayLike) -> Array:
-        """Camera centres (..., 3) [m, ECEF] of rows (...) [px]."""
+        """Return the camera centres (..., 3) [m, ECEF] of rows (...) [px]."""
         time = self.time(row)
         return np.moveaxis(self.orbit(time.reshape(-1))[0], 0, -1).reshape(*time.shape, 3)
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN behind the camera, off the orbit."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN behind the camera,
+        off the orbit.
+        """
         return pointwise(lambda part: [self._solve(ecef_from_ground(part).T).T], CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m].
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
 
         The line of sight meets the ellipsoid whose axes are longer by the altitude in closed form; Newton's
         method on the distance brings it to the altitude itself. Longitudes run on across the antimeridian; NaN where
@@ -203,13 +209,15 @@ class Pushbroom(Frozen):
         return pointwise(lambda *part: [self._meet(*part)], CHUNK, [(3,)], image, alt)[0]
 
     def line_of_sight(self, image: Array) -> tuple[Array, Array]:
-        """Camera centres [m] and unit directions of sight, (..., 3) in ECEF, of image points (..., 2) [px]."""
+        """Return the camera centres [m] and unit directions of sight, (..., 3) in ECEF, of image points (...,
+        2) [px].
+        """
         image = np.asarray(image, dtype=np.float64)
         origin, direction = self._rays(image.reshape(-1, 2))
         return origin.T.reshape(*image.shape[:-1], 3), direction.T.reshape(*image.shape[:-1], 3)
 
     def _rays(self, image: Array) -> tuple[Array, Array]:
-        """Camera centres and unit directions of sight, (3, N), of image points (N, 2)."""
+        """Return the camera centres and unit directions of sight, (3, N), of image points (N, 2)."""
         time = self.time(image[:, 1])
         tangents = self._look(image[:, 0])[0]
         inside = np.stack([tangents[0], tangents[1], np.ones(len(time))])
@@ -218,7 +226,7 @@ class Pushbroom(Frozen):
         return self.orbit(time)[0], direction
 
     def _meet(self, image: Array, alt: Array) -> Array:
-        """Ground points (N, 3) where lines of sight (N, 2) reach altitudes (N,)."""
+        """Return the ground points (N, 3) where lines of sight (N, 2) reach altitudes (N,)."""
         origin, seen = self._rays(image)
         time, (start, stop) = self.time(image[:, 1]), self._span
         ground = reach(origin, seen, alt)
@@ -233,7 +241,7 @@ class Pushbroom(Frozen):
         return ground
 
     def _look(self, col: Array) -> tuple[Array, Array]:
-        """Tangents (2, N) of the line of sight and their derivatives by the column."""
+        """Return the tangents (2, N) of the line of sight and their derivatives by the column."""
         x = col - self.look_origin
         value = np.broadcast_to(self.look[:, -1:], (2, len(x)))
         rate = np.zeros((2, 1))
@@ -243,7 +251,7 @@ class Pushbroom(Frozen):
         return value, np.broadcast_to(rate, value.shape)
 
     def _seen(self, ecef: Array, time: Array) -> tuple[Array, Array, Array]:
-        """Tangents (2, N) under which points (3, N) are seen at times (N,), their rates, and p_z (N,)."""
+        """Return the tangents (2, N) under which points (3, N) are seen at times (N,), their rates, and p_z (N,)."""
         origin, velocity = self.orbit(time)
         w, w_rate = self.attitude(time)
         turn = Turn(w)
@@ -253,7 +261,7 @@ class Pushbroom(Frozen):
         return tangents, (p_rate[:2] - tangents * p_rate[2]) / p[2], p[2]
 
     def _solve(self, ecef: Array) -> Array:
-        """Image points (2, N) of ECEF points (3, N): Newton on (col, row)."""
+        """Return the image points (2, N) of ECEF points (3, N): Newton on (col, row)."""
         start, stop = self._span
         time = np.full(ecef.shape[1], (start + stop) / 2)
         col = np.full(ecef.shape[1], self.look_origin)
@@ -282,7 +290,7 @@ class Pushbroom(Frozen):
         return found.T, self._by_ecef(ecef, found) @ ecef_from_ground_jacobian(ground)
 
     def _by_ecef(self, ecef: Array, image: Array) -> Array:
-        """d(col, row)/dX (N, 2, 3) [px/m] at ECEF points (3, N) seen at image points (2, N)."""
+        """Return d(col, row)/dX (N, 2, 3) [px/m] at ECEF points (3, N) seen at image points (2, N)."""
         time = self.time(image[1])
         turn, motion = Turn(self.attitude(time)[0]), self.orbit(time)
         tangents, rate, depth = self._seen(ecef, time)

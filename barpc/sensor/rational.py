@@ -29,7 +29,7 @@ REACH = 1.25  # the cubic inverse is trusted this far out of the box; what lies 
 
 
 def _derivative_matrices() -> Array:
-    """(3, 20, 10): d(monomial i)/d(L, P, H) as a combination of the first ten monomials."""
+    """Return (3, 20, 10): d(monomial i)/d(L, P, H) as a combination of the first ten monomials."""
     index = {"".join(sorted(m)): i for i, m in enumerate(MONOMIALS[:10])}
     index[""] = index.pop("1")
     out = np.zeros((3, 20, 10))
@@ -45,7 +45,7 @@ DERIVATIVE = _derivative_matrices()  # the derivatives of the monomials on the f
 
 
 def monomials(normalized: Array, out: Array | None = None) -> Array:
-    """The twenty monomials (20, N), in RPC00B order, of normalised ground points (3, N)."""
+    """Return the twenty monomials (20, N), in RPC00B order, of normalised ground points (3, N)."""
     x, y, z = normalized
     if out is None:
         out = np.empty((20, x.shape[0]))
@@ -81,12 +81,12 @@ class Rational:
         self.gradients = np.einsum("pi,aij->apj", coeffs, DERIVATIVE).reshape(12, 10)
 
     def value(self, x: Array, work: Array | None = None, poly: Array | None = None) -> Array:
-        """Values (2, N) at points (3, N); `work` (20, N) and `poly` (4, N) are overwritten."""
+        """Return the values (2, N) at points (3, N); `work` (20, N) and `poly` (4, N) are overwritten."""
         poly = np.matmul(self.coeffs, monomials(x, work), out=poly)
         return np.divide(poly[::2], poly[1::2], out=poly[::2])
 
     def value_and_gradient(self, x: Array, axes: int = 3, work: Array | None = None) -> tuple[Array, Array]:
-        """Values (2, N) and derivatives (axes, 2, N) by the first `axes` variables at points (3, N)."""
+        """Return the values (2, N) and derivatives (axes, 2, N) by the first `axes` variables at points (3, N)."""
         basis = monomials(x, work)
         poly = self.coeffs @ basis
         gradient = (self.gradients[: 4 * axes] @ basis[:10]).reshape(axes, 4, -1)
@@ -98,7 +98,8 @@ class Rational:
         return value, out
 
     def solve(self, target: Array, z: Array, work: Array | None = None) -> tuple[Array, BoolArray]:
-        """The inverse: points (3, N) whose third variable is `z` (N,) and whose values are `target` (2, N).
+        """Return the inverse: points (3, N) whose third variable is `z` (N,) and whose values are `target`
+        (2, N).
 
         The cubic inverse and one Newton step; one more where that was too long to prove it enough; then, and out
         of the box, damped Newton from the centre and a check of value, denominators and orientation. The second result
@@ -132,7 +133,7 @@ class Rational:
         return np.asarray(self.accuracy[:, None] + 32 * np.finfo(float).eps * np.abs(target))
 
     def _step(self, target: Array, x: Array, work: Array | None = None) -> Array:
-        """One Newton step on `x[:2]`, in place; its length (N,)."""
+        """Return one Newton step on `x[:2]`, in place; its length (N,)."""
         value, ((a, c), (b, d)) = self.value_and_gradient(x, axes=2, work=work)
         np.subtract(target, value, out=value)
         det = a * d
@@ -170,7 +171,7 @@ class Rational:
         return _Inverse(coeffs, center, scale, float(min(safe, 1e-3)))
 
     def _regular(self, x: Array) -> BoolArray:
-        """Whether points lie on the sheet of the centre: no denominator and no determinant changed sign."""
+        """Return whether points lie on the sheet of the centre: no denominator and no determinant changed sign."""
         points = np.concatenate([np.zeros((3, 1)), x], axis=1)
         denominators = self.coeffs[1::2] @ monomials(points)
         _, ((a, c), (b, d)) = self.value_and_gradient(points, axes=2)
@@ -178,7 +179,7 @@ class Rational:
         return np.asarray((signs[:, 1:] == signs[:, :1]).all(axis=0))
 
     def _solve_with_care(self, target: Array, x: Array, index: npt.NDArray[np.int64]) -> BoolArray:
-        """Solve the columns `index` of `x` (their `x[2]` given) for `target`; whether each was found."""
+        """Solve the columns `index` of `x` (their `x[2]` given) for `target`; return whether each was found."""
         z = x[2, index]
         state = np.zeros((3, len(index)))
         state[2] = z
@@ -189,7 +190,9 @@ class Rational:
         return ok
 
     def _damped_newton(self, target: Array, x: Array, steps: int = 60) -> Array:
-        """Newton on `x[:2]`, steps halved until the error falls, never across a pole; the error (2, N) left."""
+        """Iterate damped Newton steps on `x[:2]`, halved until the error falls, never across a pole; return
+        the error (2, N) left.
+        """
         left = np.full(target.shape, np.inf)
         active = np.arange(target.shape[1])
         sign = np.sign(self.coeffs[1::2, :1])
@@ -209,7 +212,7 @@ class Rational:
         return left
 
     def _line_search(self, target: Array, x: Array, step: Array, sign: Array) -> BoolArray:
-        """Move `x[:2]` by the longest of step, step/2, .. step/128 that lowers the error; whether one did."""
+        """Move `x[:2]` by the longest of step, step/2, .. step/128 that lowers the error; return whether one did."""
         error = np.abs(target - self.value(x)).sum(axis=0)
         todo = np.flatnonzero(np.isfinite(step).all(axis=0) & np.isfinite(error))
         improved = np.zeros(x.shape[1], dtype=bool)

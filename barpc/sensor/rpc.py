@@ -78,7 +78,9 @@ class RPC(Frozen):
         return ", ".join(word.format(o - s, o + s) for word, o, s in zip(words, offset, scale, strict=True))
 
     def normalize(self, ground: Array, out: Array | None = None) -> Array:
-        """Normalised longitude, latitude, altitude (3, N), -1 to 1 in the RPC's box, of ground points (N, 3)."""
+        """Return the normalised longitude, latitude, altitude (3, N), -1 to 1 in the RPC's box, of ground
+        points (N, 3).
+        """
         out = np.subtract(ground.T, self.ground_offset[:, None], out=out, order="C")
         if not (out[0].max(initial=0.0) <= 180.0 and out[0].min(initial=0.0) >= -180.0):
             out[0] = wrap_longitude(ground[:, 0], self.ground_offset[0]) - self.ground_offset[0]
@@ -86,16 +88,18 @@ class RPC(Frozen):
         return out
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN where a denominator vanishes."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN where a denominator
+        vanishes.
+        """
         return pointwise(self._project, CHUNK, [(2,)], ground, rows=27)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground, rows=20)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m].
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
 
         A cubic inverse, fitted once per RPC, and one Newton step; more, and damped, where that is not
         proven to be enough. Longitudes lie within 180 degrees of the RPC's offset; NaN where no point was found
@@ -104,13 +108,13 @@ class RPC(Frozen):
         return pointwise(self._localize, CHUNK, [(3,)], image, alt, rows=20)[0]
 
     def off(self, other: RPC) -> Array:
-        """How far another RPC's image points are off (729, 2) [px], over the box; 0 where neither has any."""
+        """Return the differences (729, 2) [px] of another RPC's image points over the box; 0 where neither has any."""
         places = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 9)] * 3), axis=-1).reshape(-1, 3)
         image, seen = (rpc.project(self.ground_offset + places * self.ground_scale) for rpc in (self, other))
         return np.where(np.isnan(image) & np.isnan(seen), 0.0, np.abs(seen - image))
 
     def localize_direct(self, image: Array, alt: Array) -> Array:
-        """As `localize`, by the localisation RPC: no iteration, and as near as that was fitted."""
+        """Localise image points by the localisation RPC: without iteration, as exact as that was fitted."""
         return pointwise(self._localize_direct, CHUNK, [(3,)], image, alt, rows=20)[0]
 
     def _localize_direct(self, image: Array, alt: Array, work: Array) -> list[Array]:
@@ -156,17 +160,17 @@ class RPC(Frozen):
         return [ground]
 
     def _holds(self, ground: Array, image: Array) -> BoolArray:
-        """Whether ground points (N, 3) are on Earth and project to `image`: far out an ulp can be pixels."""
+        """Return whether ground points (N, 3) are on Earth and project to `image`: far out an ulp can be pixels."""
         tolerance = 10 * _ACCURACY + 1e-12 * np.abs(image)
         on_earth = (np.abs(ground[:, 0] - self.ground_offset[0]) <= 180.0) & (np.abs(ground[:, 1]) <= 90.0)
         return np.asarray(on_earth & (np.abs(self.project(ground) - image) <= tolerance).all(axis=1))
 
     def crop(self, col: float, row: float) -> RPC:
-        """The RPC of a crop whose top-left pixel is (col, row) [px] of this image: exact, no refit."""
+        """Return the RPC of a crop whose top-left pixel is (col, row) [px] of this image: exact, no refit."""
         return replace(self, image_offset=self.image_offset - np.array([col, row], dtype=np.float64))
 
     def window(self, col: float, row: float, step_col: float = 1.0, step_row: float = 1.0) -> RPC:
-        """The RPC of an image cut out of this one and resampled: exact, no refit.
+        """Return the RPC of an image cut out of this one and resampled: exact, no refit.
 
         Parameters
         ----------

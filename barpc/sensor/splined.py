@@ -24,7 +24,8 @@ _SETTLED = 1e-7  # px
 
 
 def bspline_pieces(u: Array, count: int, rate: bool = False) -> tuple[IntArray, Array]:
-    """Uniform cubic B-splines at u (n,) in -1 .. 1: the first (n,) of the four that are not zero, and these (4, n).
+    """Return the uniform cubic B-splines at u (n,) in -1 .. 1: the first (n,) of the four that are not zero,
+    and these (4, n).
 
     The first and the last value hold beyond; `rate`: their derivatives by u instead.
     """
@@ -39,7 +40,7 @@ def bspline_pieces(u: Array, count: int, rate: bool = False) -> tuple[IntArray, 
 
 
 def bsplines(u: Array, count: int) -> Array:
-    """All uniform cubic B-splines (count, n) at u (n,) in -1 .. 1."""
+    """Return all uniform cubic B-splines (count, n) at u (n,) in -1 .. 1."""
     first, pieces = bspline_pieces(u, count)
     basis = np.zeros((count, len(u)))
     for n, piece in enumerate(pieces):
@@ -48,14 +49,14 @@ def bsplines(u: Array, count: int) -> Array:
 
 
 def profile(place: Array, start: Array, stop: Array, origin: Array, rate: Array) -> Array:
-    """How much of a strip's displacement there is at places [px]: see `RowSpline.strips`."""
+    """Return the share of a strip's displacement at places [px] (see `RowSpline.strips`)."""
     with np.errstate(invalid="ignore"):
         inside = (place >= start) & (place < stop)
         return np.asarray(np.where(inside, np.exp(-np.maximum((place - origin) * rate, 0.0)), 0.0))
 
 
 def swing(row: Array, period: Array) -> Array:
-    """Cosine and sine (2, ...) of one period [px] at rows (...) [px]; zero where the period is infinite."""
+    """Return the cosine and sine (2, ...) of one period [px] at rows (...) [px]; zero where the period is infinite."""
     phase = 2.0 * np.pi * np.asarray(row) / period
     return np.where(np.isfinite(period), np.stack([np.cos(phase), np.sin(phase)]), 0.0)
 
@@ -67,7 +68,7 @@ class RowSpline(Frozen):
     Parameters
     ----------
     coeffs : (M, 2)
-        Of uniform cubic B-splines over the rows, (col, row) [px]; M = 0: none, else at least 4.
+        Coefficients of uniform cubic B-splines over the rows, (col, row) [px]; M = 0: none, else at least 4.
     row_offset, row_scale : float
         Middle row, and rows from there to the ends of the knots [px].
     edges : (C,)
@@ -75,15 +76,14 @@ class RowSpline(Frozen):
     steps : (C + 1, 2)
         Displacement of each detector, (col, row) [px]; without any detector (0, 2).
     strips : (M, 5)
-        What lies off by itself: axis (0: columns, 1: rows), first and last place, and the origin from
-        which, and the rate at which, that fades as exp(-(x - origin) rate) [px, 1/px]; rate 0: it does not. They may
-        overlap.
+        Displaced strips: axis (0: columns, 1: rows), first and last place, and origin and rate of their fading,
+        exp(-(x - origin) rate) [px, 1/px]; rate 0: none. They may overlap.
     moved : (M, 2)
-        By how much each of them, (col, row) [px]; where it fades, at first.
+        Displacement of each strip, (col, row) [px]; of one that fades, at its origin.
     periods : (M,)
-        Rows after which a swing of all rows repeats itself [px].
+        Periods of the swings of all rows [px].
     swings : (M, 2, 2)
-        What its cosine and its sine of 2 pi row / period move, (col, row) [px].
+        Amplitudes of cosine and sine of 2 pi row / period, (col, row) [px].
     """
 
     coeffs: Array
@@ -124,7 +124,7 @@ class RowSpline(Frozen):
         return 2.0 * self.row_scale / (len(self.coeffs) - 3) if len(self.coeffs) else np.nan
 
     def at(self, image: Array) -> Array:
-        """The displacement (..., 2) [px] of points seen at image points (..., 2) [px]."""
+        """Return the displacement (..., 2) [px] of points seen at image points (..., 2) [px]."""
         out = self._along(image[..., 1], rate=False)
         if len(self.steps):
             out += self.steps[
@@ -137,7 +137,7 @@ class RowSpline(Frozen):
         return np.where(np.isfinite(image).all(axis=-1, keepdims=True), out, np.nan)
 
     def rate(self, row: Array) -> Array:
-        """Its derivative by the row (..., 2) [px/px] at rows (...) [px]."""
+        """Return its derivative by the row (..., 2) [px/px] at rows (...) [px]."""
         out = self._along(row, rate=True) / self.row_scale
         for (axis, start, stop, origin, rate), moved in zip(self.strips, self.moved, strict=True):
             if axis == 1.0:
@@ -165,11 +165,11 @@ class Splined:
     correction: RowSpline  # what is added to its image points
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
         return self._displaced(self.sensor.project(ground))
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = self.sensor.project_jacobian(ground)
         image = self._displaced(image)
         rate = self.correction.rate(image[..., 1])  # the row moves the spline, and the spline the row
@@ -177,12 +177,12 @@ class Splined:
         return image, jacobian + rate[..., None] * by_row[..., None, :]
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m]."""
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
         image = np.asarray(image, dtype=np.float64)
         return self.sensor.localize(image - self.correction.at(image), alt)
 
     def _displaced(self, projected: Array) -> Array:
-        """Where points are seen that are projected to image points (..., 2) [px]."""
+        """Return the displaced image points of points projected to (..., 2) [px]."""
         image = projected
         for _ in range(_STEPS):
             before, image = image, projected + self.correction.at(image)

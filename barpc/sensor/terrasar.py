@@ -37,13 +37,13 @@ _GRID_TOLERANCE = 5.0  # px: a grid farther off does not belong to the orbit
 
 
 def find_annotation(folder: Path) -> Path | None:
-    """The annotation in a product folder; None where it is not one."""
+    """Return the annotation in a product folder; None where it is not one."""
     found = sorted(folder.glob(_NAME))
     return found[0] if len(found) == 1 else None
 
 
 def open_terrasar(path: str | Path) -> RangeDoppler:
-    """The model of a TerraSAR-X, TanDEM-X or PAZ image.
+    """Return the model of a TerraSAR-X, TanDEM-X or PAZ image.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def _refuse(root: Fields) -> None:
 
 
 def _model(root: Fields, late: tuple[float, float]) -> RangeDoppler:
-    """The model whose times of range and azimuth are later [s] than geometry has them."""
+    """Return the model whose times of range and azimuth are later [s] than geometry has them."""
     scene, raster = root.one("productInfo/sceneInfo"), root.one("productInfo/imageDataInfo/imageRaster")
     size = (int(raster.positive("numberOfColumns", _MOST)), int(raster.positive("numberOfRows", _MOST)))
     start, near = scene.time("start/timeUTC"), scene.positive("rangeTime/firstPixel", 1.0)
@@ -142,7 +142,7 @@ def _look(root: Fields) -> Literal["right", "left"]:
 
 
 def _stated(georef: Fields, kind: str, root: Fields) -> float:
-    """The sum of the delays of one kind at mid range [s]."""
+    """Return the sum of the delays of one kind at mid range [s]."""
     ends = [root.number(f"productInfo/sceneInfo/rangeTime/{end}Pixel") for end in ("first", "last")]
     total = 0.0
     for part in georef.all(f"signalPropagationEffects/{kind}"):
@@ -154,7 +154,7 @@ def _stated(georef: Fields, kind: str, root: Fields) -> float:
 
 
 def _held(model: RangeDoppler, georef: Fields, late: tuple[float, float]) -> RangeDoppler:
-    """The model with the altitudes of the product's grid, which it is held against."""
+    """Return the model with the altitudes of the product's grid, which it is held against."""
     origin = georef.one("geolocationGrid/gridReferenceTime")
     since = seconds(origin.time("tReferenceTimeUTC"), model.epoch) - late[1]
     near = origin.positive("tauReferenceTime", 1.0) - late[0]

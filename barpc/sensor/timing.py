@@ -17,7 +17,7 @@ from barpc.sensor import SensorModel
 
 @dataclass(frozen=True, eq=False)
 class Timing(Frozen):
-    """What a radar adds to range and azimuth time: polynomials of where along the flight a point is seen.
+    """Corrections of a radar's range and azimuth time: polynomials of the position along the flight.
 
     Parameters
     ----------
@@ -36,11 +36,11 @@ class Timing(Frozen):
             raise RpcError(f"timing: {len(self.coeffs)} terms, offset {self.offset}, scale {self.scale}")
 
     def at(self, along: Array) -> Array:
-        """Range [m] and azimuth time [s] (2, N) that are added at coordinates (N,)."""
+        """Return the range [m] and azimuth time [s] (2, N) that are added at coordinates (N,)."""
         return np.asarray(polynomial.polyval((along - self.offset) / self.scale, self.coeffs))
 
     def rate(self, along: Array) -> Array:
-        """Their derivative by the coordinate (2, N)."""
+        """Return the derivative (2, N) of range and azimuth time by the coordinate."""
         slopes = polynomial.polyder(self.coeffs) / self.scale
         return np.asarray(polynomial.polyval((along - self.offset) / self.scale, slopes))
 
@@ -53,20 +53,21 @@ class Clocked(SensorModel, Protocol):
 
     @property
     def accuracy(self) -> tuple[float, float] | None:
-        """Stated standard deviations of range and of the place along the flight [m]."""
+        """Stated standard deviations of range and of the position along the flight [m]."""
         ...
 
     @property
     def speed(self) -> float:
-        """Of the flight [m/s]."""
+        """Speed of the flight [m/s]."""
         ...
 
     def timed(self, timing: Timing) -> Self:
-        """The model with a timing, its coordinate in pixels, in place of its own."""
+        """Return the model with a timing, its coordinate in pixels, in place of its own."""
         ...
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """Image points (..., 2) [px] of ground points (..., 3), their derivatives, and where along the flight they are.
+        """Return image points (..., 2) [px] of ground points (..., 3), their derivatives by range and azimuth
+        time, and the coordinate along the flight.
 
         d(image)/d(ground) (..., 2, 3), d(image)/d(range, azimuth time) (..., 2, 2) [px/m, px/s], and (...) [px].
         """
@@ -74,7 +75,9 @@ class Clocked(SensorModel, Protocol):
 
 
 def is_clocked(sensor: SensorModel) -> TypeGuard[Clocked]:
-    """Whether a model is a radar whose clocks can be corrected: asking the protocol itself costs 70 us a view."""
+    """Return whether a model is a radar whose clocks can be corrected: asking the protocol itself costs 70 us
+    a view.
+    """
     return hasattr(sensor, "timed")
 
 
@@ -95,18 +98,20 @@ class Timed:
         return str(getattr(self.sensor, "advice", ""))
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
         return self._model.project(ground)
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         return self._model.project_jacobian(ground)
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m]."""
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
         return self._model.localize(image, alt)
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px], and their derivative by range and azimuth time (..., 2, 2) [px/m, px/s]."""
+        """Return the image points (..., 2) [px], and their derivative by range and azimuth time (..., 2, 2)
+        [px/m, px/s].
+        """
         image, _, by_timing, _ = self._model.timing_jacobian(ground)
         return image, by_timing

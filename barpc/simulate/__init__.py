@@ -29,7 +29,7 @@ __all__ = ["Block", "BlockOptions", "BlockTruth", "Look", "fly", "recentred", "s
 
 @dataclass(frozen=True)
 class BlockOptions:
-    """How a block is laid out and disturbed."""
+    """Layout and errors of a simulated block."""
 
     per_site: int = 3  # views of every site
     size: tuple[int, int] = (20000, 20000)  # width, height of every image [px]
@@ -67,7 +67,7 @@ class _Grid:
 
     @classmethod
     def square(cls, num_views: int, options: BlockOptions, lon: float, lat: float) -> _Grid:
-        """The grid that holds `num_views` views around a centre [deg]."""
+        """Return the grid that holds `num_views` views around a centre [deg]."""
         sites = -(-num_views // options.per_site)
         columns = int(np.ceil(np.sqrt(sites)))
         rows = -(-sites // columns)
@@ -78,7 +78,7 @@ class _Grid:
         return cls(columns, rows, lon, lat, (float(step[0]), float(step[1])))
 
     def lonlat(self, row: npt.ArrayLike, column: npt.ArrayLike) -> tuple[Array, Array]:
-        """Longitude and latitude [deg] of (fractional) places on the grid."""
+        """Return the longitude and latitude [deg] of (fractional) places on the grid."""
         lon = self.lon + self.step[0] * (np.asarray(column) - 0.5 * (self.columns - 1))
         lat = self.lat - self.step[1] * (np.asarray(row) - 0.5 * (self.rows - 1))
         return wrap_longitude(lon), lat
@@ -94,7 +94,7 @@ class _Scene:
     rng: np.random.Generator
 
     def observe(self, count: int, fewest: int, visible: float) -> tuple[Array, Tracks]:
-        """So many ground points (count, 3) that `fewest` views or more show, and their exact image points."""
+        """Return ground points (count, 3) that `fewest` views or more show, and their exact image points."""
         grounds = [np.empty((0, 3))]
         found = [(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 2)))]
         have = 0
@@ -118,7 +118,7 @@ class _Scene:
         return np.concatenate(grounds), Tracks(view[order], point[order], xy[order], np.ones(len(order)))
 
     def _draw(self, count: int, visible: float) -> tuple[Array, IntArray, IntArray, Array]:
-        """Random ground points and all of their observations: ground, view, point, xy."""
+        """Draw random ground points and all of their observations: ground, view, point, xy."""
         grid, per_site = self.grid, self.options.per_site
         home = np.sort(self.rng.integers(0, -(-len(self.cameras) // per_site), count))
         offset = self.rng.uniform(-0.5, 0.5, (2, count)) / (1.0 - self.options.overlap)
@@ -135,7 +135,9 @@ class _Scene:
         return ground, views, point, image
 
     def _near(self, site: int, home: IntArray) -> IntArray:
-        """Indices of the points whose home is this site or one of its eight neighbours; `home` (N,) ascends."""
+        """Return the indices of the points whose home is this site or one of its eight neighbours; `home`
+        (N,) ascends.
+        """
         row, column = divmod(site, self.grid.columns)
         rows = np.arange(max(0, row - 1), min(self.grid.rows, row + 2)) * self.grid.columns
         first = np.searchsorted(home, rows + max(0, column - 1))
@@ -145,7 +147,7 @@ class _Scene:
 
 @dataclass(frozen=True, eq=False)
 class BlockTruth:
-    """What a block was made from."""
+    """Truth of a simulated block."""
 
     corrections: tuple[Correction, ...]  # of each view's sensor: with it, and its drift, the camera is exact
     drift: Array  # (V, 3): rotation vector over the height of the image [rad]; zero in the middle row
@@ -165,7 +167,7 @@ class Block:
     truth: BlockTruth  # what is to be found
 
     def held_out_rms(self, sensors: list[SensorModel]) -> float:
-        """Root mean square residual [px, per coordinate] of the held-out points in other cameras.
+        """Return the root mean square residual [px, per coordinate] of the held-out points in other cameras.
 
         The points are triangulated anew from their exact image points: what no image can tell (a shift of the whole
         scene) does not count.
@@ -176,7 +178,7 @@ class Block:
 
 
 def recentred(correction: Correction, center: Array) -> Correction:
-    """The same correction about another camera centre (3,) [m, ECEF]: R stays, T takes up the difference."""
+    """Return a correction expressed about another camera centre (3,) [m, ECEF]: R stays, T takes up the difference."""
     turn = rotation_matrix(correction.rotation)
     shift = center - correction.center
     return Correction(correction.rotation, correction.translation + turn.T @ shift - shift, center)
@@ -193,7 +195,7 @@ def simulate_block(
     num_gcps: int = 0,
     **options: object,
 ) -> Block:
-    """A block of views with tie points, GCPs and held-out points.
+    """Return a block of views with tie points, GCPs and held-out points.
 
     Views stand in groups of `per_site` over sites on a square grid; neighbouring sites overlap.
 
@@ -232,14 +234,14 @@ def simulate_block(
 
 
 def _gcps(ground: Array, seen: Tracks, options: BlockOptions, rng: np.random.Generator) -> GroundPoints:
-    """GCPs at ground points (G, 3), where they are seen but for noise."""
+    """Return GCPs at ground points (G, 3), where they are seen but for noise."""
     noisy, _ = _disturbed(seen, replace(options, outliers=0.0), rng)
     names, sigma = tuple(f"gcp_{i:03d}" for i in range(len(ground))), np.full((len(ground), 3), 0.1)
     return GroundPoints(names, ground, sigma, noisy.point, noisy.view, noisy.xy, noisy.sigma)
 
 
 def _cameras(grid: _Grid, num_views: int, options: BlockOptions) -> tuple[tuple[View, ...], list[Array]]:
-    """Views with delivered RPCs, and their camera centres (3,) [m, ECEF]; site by site."""
+    """Return the views with delivered RPCs, and their camera centres (3,) [m, ECEF]; site by site."""
     views: list[View] = []
     centers: list[Array] = []
     low, high = options.alt_range
@@ -269,7 +271,7 @@ def _turned(rpc: RPC, degrees: float) -> RPC:
 
 
 def _disturbed(tracks: Tracks, options: BlockOptions, rng: np.random.Generator) -> tuple[Tracks, BoolArray]:
-    """The observations with noise and outliers, and which are outliers (K,)."""
+    """Return the observations with noise and outliers, and which are outliers (K,)."""
     count = len(tracks)
     xy = tracks.xy + (rng.normal(0, options.noise, (count, 2)) if options.noise else 0.0)
     outlier = np.zeros(count, dtype=bool)

@@ -21,7 +21,7 @@ _NODES = 9  # times at which the guided motion is sampled for them
 
 @dataclass(frozen=True)
 class Look:
-    """Where a satellite stands and how it scans."""
+    """Viewing direction, orbit and scan of a satellite."""
 
     incidence: float = 0.0  # angle between the vertical at the target and the satellite [deg]
     azimuth: float = 90.0  # of the satellite seen from the target, clockwise from north [deg]
@@ -31,7 +31,7 @@ class Look:
 
 
 def looks(count: int, turn: float = 0.0, altitude: float = 694e3) -> list[Look]:
-    """So many looks at one place: pitch spread evenly, roll by the golden section, which starts at `turn` [turns]."""
+    """Return looks at one place: pitch spread evenly, roll by the golden section, which starts at `turn` [turns]."""
     flight = Look().heading
     out = []
     for k in range(count):
@@ -45,7 +45,7 @@ def looks(count: int, turn: float = 0.0, altitude: float = 694e3) -> list[Look]:
 
 
 def fly(target: Array, look: Look, size: tuple[int, int], gsd: float) -> Pushbroom:
-    """A pushbroom camera that scans a target from a circular orbit.
+    """Return a pushbroom camera that scans a target from a circular orbit.
 
     The orbit is a circle in the inertial frame, seen from the turning Earth. The attitude follows the scan:
     the line of sight of the middle of the detector moves over the ground in the direction of scan at `gsd` a
@@ -86,7 +86,9 @@ def _level(azimuth: float) -> Array:
 
 
 def _standpoint(target: Array, look: Look) -> Array:
-    """Where the satellite stands (3,) [m, ECEF]: on the line of sight, `altitude` beyond the radius at the target."""
+    """Return the satellite's position (3,) [m, ECEF]: on the line of sight, `altitude` beyond the radius at
+    the target.
+    """
     incidence, azimuth = np.radians([look.incidence, look.azimuth])
     enu = np.sin(incidence) * _level(azimuth) + [0.0, 0.0, np.cos(incidence)]
     origin, direction = ecef_from_ground(target), enu @ enu_basis(target)
@@ -97,7 +99,7 @@ def _standpoint(target: Array, look: Look) -> Array:
 
 
 def _circle(place: Array, forward: Array, rate: float, times: Array) -> Array:
-    """ECEF positions (N, 3) on a circular inertial orbit, at `place` at time 0 and flying `forward`."""
+    """Return ECEF positions (N, 3) on a circular inertial orbit, at `place` at time 0 and flying `forward`."""
     forward = forward - (forward @ place) / (place @ place) * place
     forward *= np.linalg.norm(place) / np.linalg.norm(forward)
     inertial = np.outer(np.cos(rate * times), place) + np.outer(np.sin(rate * times), forward)

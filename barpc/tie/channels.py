@@ -33,7 +33,7 @@ _SHOWN = 0.9  # of a template must be a picture
 
 
 def channels(pixels: FloatImage, valid: BoolArray, blurs: tuple[float, float] = COARSE) -> FloatImage:
-    """Channels (CHANNELS, H, W) of a picture (H, W), blurred twice [px]; zeros beside what is not valid."""
+    """Return the channels (CHANNELS, H, W) of a picture (H, W), blurred twice [px]; zeros beside what is not valid."""
     cv2.setNumThreads(1)
     filled = np.where(valid, pixels, np.float32(pixels[valid].mean() if valid.any() else 0.0))
     smooth = cv2.GaussianBlur(filled.astype(np.float32), (0, 0), blurs[0])
@@ -48,7 +48,9 @@ def channels(pixels: FloatImage, valid: BoolArray, blurs: tuple[float, float] = 
 
 
 def correlation(template: FloatImage, search: FloatImage) -> FloatImage:
-    """Correlation coefficients (B, H - h + 1, W - w + 1) of templates (B, C, h, w) within areas (B, C, H, W)."""
+    """Return the correlation coefficients (B, H - h + 1, W - w + 1) of templates (B, C, h, w) within areas
+    (B, C, H, W).
+    """
     (h, w), (height, width) = template.shape[2:], search.shape[2:]
     from scipy import fft  # of structure alone
 
@@ -68,7 +70,7 @@ def correlation(template: FloatImage, search: FloatImage) -> FloatImage:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Where templates were found.
+    """Places at which templates were found.
 
     Parameters
     ----------
@@ -86,12 +88,12 @@ class Found:
     known: BoolArray
 
     def passed(self, margin: float = 0.0, back: float = 1.0) -> BoolArray:
-        """Those (n,) that beat their decoy by a margin and come back to within so many px."""
+        """Return the matches (n,) that beat their decoy by a margin and come back to within a distance [px]."""
         return np.asarray(self.known & (self.score > self.decoy + margin) & (self.back <= back))
 
 
 def find(first: FloatImage, second: FloatImage, at: Array, half: int, search: int) -> Found:
-    """Templates of one picture's channels looked for in another's (C, H, W), of the same grid.
+    """Find templates of one picture's channels (C, H, W) in another's, on the same grid.
 
     `at` (n, 2), n > 0, holds their centres x, y as whole px, at least `margin(half, search)` from the edge; they reach
     `half` px to each side, and are looked for up to `search` px away. The decoy area of the same size lies beside, to
@@ -104,12 +106,12 @@ def find(first: FloatImage, second: FloatImage, at: Array, half: int, search: in
 
 
 def joined(parts: Sequence[Found]) -> Found:
-    """What was found in several places, one after the other."""
+    """Join matches found in several places, one after the other."""
     return Found(*(np.concatenate([getattr(part, name) for part in parts]) for name in Found.__annotations__))
 
 
 def margin(half: int, search: int) -> int:
-    """How far from the edge of a picture templates must lie [px]."""
+    """Return the least distance [px] of templates from the edge of a picture."""
     return half + 3 * search + _GAP + 3
 
 
@@ -144,13 +146,14 @@ def _find(first: FloatImage, second: FloatImage, at: IntArray, half: int, search
 
 
 def cut(picture: FloatImage, at: IntArray, wide: int, high: int) -> FloatImage:
-    """Windows (n, C, 2 high + 1, 2 wide + 1) around whole px x, y (n, 2)."""
+    """Return the windows (n, C, 2 high + 1, 2 wide + 1) around whole px x, y (n, 2)."""
     view = np.lib.stride_tricks.sliding_window_view(picture, (2 * high + 1, 2 * wide + 1), axis=(1, 2))
     return np.moveaxis(view[:, at[:, 1] - high, at[:, 0] - wide], 0, 1)
 
 
 def _registered(template: FloatImage, around: FloatImage) -> tuple[Array, BoolArray]:
-    """Least squares on the channels: how far (n, 2), at most a pixel, templates (n, C, h, w) lie beside the middle.
+    """Return the least squares on the channels: how far (n, 2), at most a pixel, templates (n, C, h, w) lie
+    beside the middle.
 
     Of patches that are 2 px larger all around; and whether that ended.
     """
@@ -179,7 +182,9 @@ def _unit(patches: FloatImage) -> FloatImage:
 
 
 def _shifted(patches: FloatImage, shift: Array, axis: int) -> FloatImage:
-    """Patches between their pixels, by cubic convolution along an axis (2 or 3), which loses 2 px at each end."""
+    """Return the patches between their pixels, by cubic convolution along an axis (2 or 3), which loses 2 px
+    at each end.
+    """
     length = patches.shape[axis] - 4
     out = np.zeros([n - 4 * (i == axis) for i, n in enumerate(patches.shape)], np.float32)
     for k in range(-2, 3):

@@ -59,7 +59,8 @@ class EpipolarFrame:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Places (n, 2) in both images [px], their altitude to begin with [m], standard deviation along the line [px].
+    """Dense matches: places (n, 2) in both images [px], starting altitude [m], standard deviation along the
+    line [px].
 
     `share`: of the pixels that both images show so many were matched.
     """
@@ -72,7 +73,7 @@ class Matches:
 
 
 def epipolar_frame(a: Array, b: Array, alt: Array) -> EpipolarFrame:
-    """The frame of a part of two images, by where they show the same ground points at several altitudes.
+    """Estimate the epipolar frame of a part of two images from ground points at several altitudes.
 
     Parameters
     ----------
@@ -153,7 +154,9 @@ def dense_matches(
 
 
 def _window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Array, tuple[int, int]] | None:
-    """First pixel (2,) and width, height of what is resampled: the part as far as both images reach, with margins."""
+    """Return the first pixel (2,) and width, height of what is resampled: the part as far as both images
+    reach, with margins.
+    """
     low, high = frame.places.min(axis=0) - _MARGIN, frame.places.max(axis=0) + _MARGIN
     reach = np.array([frame.num, 0.0])
     for size, one, more in zip(sizes, frame.maps, (np.zeros(2), reach), strict=True):
@@ -166,7 +169,7 @@ def _window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Arr
 
 
 def _inside(shape: tuple[int, int], low: Array, frame: EpipolarFrame) -> BoolArray:
-    """Which pixels of the window belong to the part: the others only led there."""
+    """Return the pixels of the window that belong to the part."""
     hull = cv2.convexHull((frame.places - low).astype(np.float32))
     mask = cv2.fillConvexPoly(np.zeros(shape[::-1], np.uint8), np.rint(hull).astype(np.int32), 1)
     return np.asarray(mask > 0)
@@ -177,13 +180,13 @@ def _moved(one: Array, by: Array) -> Array:
 
 
 def _back(one: Array, place: Array) -> Array:
-    """Image points (n, 2) of places (n, 2) in the frame."""
+    """Return the image points (n, 2) of places (n, 2) in the frame."""
     out: Array = (place - one[:, 2]) @ np.linalg.inv(one[:, :2]).T
     return out
 
 
 def _shifted(shown: BoolArray, by: int) -> BoolArray:
-    """A mask moved to the right, as matches of the middle disparity are."""
+    """Return a mask moved to the right, as matches of the middle disparity are."""
     out = np.zeros_like(shown)
     out[:, by:] = shown[:, : shown.shape[1] - by]
     return out
@@ -192,7 +195,7 @@ def _shifted(shown: BoolArray, by: int) -> BoolArray:
 def _resampled(
     path: str, size: tuple[int, int], one: Array, shape: tuple[int, int], band: int
 ) -> tuple[npt.NDArray[np.uint8], BoolArray] | None:
-    """An image in the frame, in 8 bits, and where it is known; None where it holds nothing there."""
+    """Return an image in the frame, in 8 bits, and where it is known; None where it holds nothing there."""
     corners = _back(one, np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]) * shape)
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, size)
     high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 3, 0, size)
@@ -219,7 +222,7 @@ def _resampled(
 def _both_ways(
     left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], num: int
 ) -> tuple[FloatImage, BoolArray]:
-    """Disparities of `left`, and where the way back from `right` ends at most a pixel beside."""
+    """Match both ways: disparities of `left`, kept where the way back from `right` ends at most a pixel beside."""
     matcher = cv2.StereoSGBM.create(minDisparity=0, numDisparities=num, **_SGBM)
     there = matcher.compute(left, right).astype(np.float32) / 16.0
     turned = [np.ascontiguousarray(one[:, ::-1]) for one in (right, left)]
@@ -231,7 +234,8 @@ def _both_ways(
 
 
 def _sigma(left: npt.NDArray[np.uint8], partner: npt.NDArray[np.uint8], good: BoolArray) -> FloatImage:
-    """Standard deviation of a match along the line [px]: of grey values that differ, over their slope.
+    """Return the standard deviation of a match along the line [px]: of grey values that differ, over their
+    slope.
 
     As least squares matching states it, of windows with a gain and an offset of their own; SGBM's own
     interpolation is never better than `_FLOOR`.

@@ -19,7 +19,7 @@ _WINDOW_POINTS = 60  # that a window needs for a fit of its own
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Points of image A in image B, in axes along and across the epipolar direction; between two altitudes."""
+    """Epipolar segments in image B of points of image A: axes along and across, between two altitudes."""
 
     axis: Array  # (2,) unit vector in B along which a point moves when its altitude grows
     along: Array  # (N,) coordinates of the points at the middle altitude [px]
@@ -30,22 +30,22 @@ class Frame:
     linear: Array  # (2, 2) d(image B)/d(image A) at constant altitude, in the middle of the points
 
     def turn(self, xy: Array) -> Array:
-        """Coordinates along and across (..., 2) of points (..., 2) of image B [px]."""
+        """Return the coordinates along and across (..., 2) of points (..., 2) of image B [px]."""
         turned: Array = xy @ _rotation(self.axis)
         return turned
 
     def moved(self, across: Array | float) -> Frame:
-        """The frame with its points moved across the epipolar lines [px]."""
+        """Return the frame with its points moved across the epipolar lines [px]."""
         return replace(self, across=self.across + across)
 
     def place(self, along: Array) -> Array:
-        """Points of B (N, 2) [px] on the epipolar lines, `along` (N,) [px] from the middle altitude's."""
+        """Return the points of B (N, 2) [px] on the epipolar lines, `along` (N,) [px] from the middle altitude's."""
         turned = np.stack([self.along + along, self.across + self.slope * along], axis=-1)
         out: Array = turned @ _rotation(self.axis).T
         return out
 
     def errors(self, xy: Array) -> Array:
-        """Distance along and across (N, 2) of points of B (N, 2), one each, from where they are predicted."""
+        """Return the distances along and across (N, 2) of points of B (N, 2) from their predictions."""
         u, w = self.turn(xy).T
         along = u - self.along
         return np.stack([along, w - self.across - self.slope * along], axis=-1)
@@ -56,7 +56,7 @@ def _rotation(axis: Array) -> Array:
 
 
 def common_range(*views: View) -> tuple[float, float]:
-    """The altitudes [m] at which views may see the same ground."""
+    """Return the altitudes [m] that several views have in common."""
     low, high = max(view.alt_range[0] for view in views), min(view.alt_range[1] for view in views)
     return min(low, high), max(low, high)
 
@@ -84,7 +84,9 @@ def frame(first: View, second: View, xy: Array, axis: Array | None = None) -> Fr
 
 
 def linear_map(first: View, second: View, xy: Array) -> Array:
-    """Derivative (..., 2, 2) of the place in B by that in A (..., 2) [px] at mid altitude; identity if one fails."""
+    """Return the derivative (..., 2, 2) of the place in B by that in A (..., 2) [px] at mid altitude;
+    identity if one fails.
+    """
     alt = 0.5 * sum(common_range(first, second))
     ground = first.sensor.localize(xy, np.full(xy.shape[:-1], alt))
     by_a, by_b = (view.sensor.project_jacobian(ground)[1][..., :2] for view in (first, second))
@@ -134,7 +136,8 @@ def robust_affine(xy: Array, values: Array, steps: int = 12) -> Affine:
 
 
 def robust_spread(values: Array, center: float | Array = 0.0) -> Any:
-    """Robust standard deviation: 1.4826 times the median over the last axis of the distances from a centre.
+    """Return the robust standard deviation: 1.4826 times the median over the last axis of the distances from
+    a centre.
 
     Residuals are measured from zero; a sample that is stated with its median from that median.
     """
@@ -145,7 +148,8 @@ def robust_spread(values: Array, center: float | Array = 0.0) -> Any:
 
 
 def agreeing(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:
-    """Which values (N,) [px] agree with an affine function of position (N, 2) [px], and their distances from it (N,).
+    """Return the values (N,) [px] that agree with an affine function of position (N, 2) [px], and their
+    distances from it (N,).
 
     Each window has its own function; what lies within three robust standard deviations of it, or `floor` [px], agrees.
     """
@@ -161,7 +165,7 @@ def agreeing(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, A
 
 
 def grouped(*keys: npt.NDArray[Any]) -> list[IntArray]:
-    """Indices of rows with equal keys, in ascending order of the keys."""
+    """Return the indices of rows with equal keys, in ascending order of the keys."""
     table = np.stack(keys)
     order = np.lexsort(table[::-1])
     cuts = np.flatnonzero((np.diff(table[:, order], axis=1) != 0).any(axis=0)) + 1

@@ -41,7 +41,7 @@ _SPARE = 1.2  # of a tile's share: what poor tiles leave goes to the others
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Points of an image that can be found again in another one."""
+    """Keypoints of an image with descriptors."""
 
     xy: Array  # (N, 2) col, row [full-resolution px]
     scale: Array  # (N,) diameter of the neighbourhood described [px]
@@ -54,12 +54,12 @@ class Keypoints:
         return len(self.xy)
 
     def select(self, which: IntArray | BoolArray) -> Keypoints:
-        """The keypoints of a mask or of indices."""
+        """Return the keypoints of a mask or of indices."""
         return Keypoints(*(getattr(self, field.name)[which] for field in fields(self)))
 
 
 def join(parts: Sequence[Keypoints]) -> Keypoints:
-    """Keypoints of several tiles as one set; an empty set of none."""
+    """Join the keypoints of several tiles; an empty set of none."""
     none = np.empty(0)
     parts = parts or [Keypoints(np.empty((0, 2)), none, none, none, np.empty((0, 128), np.uint8))]
     columns = (np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Keypoints))
@@ -73,7 +73,7 @@ class Sift:
         self._sift: Any = cv2.SIFT.create(contrastThreshold=CONTRAST)
 
     def detect(self, picture: ByteImage, keep: Callable[[Array, Array, Array], IntArray]) -> Keypoints:
-        """Keypoints of which `keep(xy, scale, response)` gives the indices; only those are described."""
+        """Detect keypoints, of which `keep(xy, scale, response)` gives the indices; only those are described."""
         found = self._sift.detect(picture, None)
         if not found:  # OpenCV fails where there is nothing to describe
             return join([])
@@ -88,7 +88,8 @@ class Sift:
 
 
 def _an_octave_up(keypoint: Any) -> Any:
-    """The keypoint, to be described in the picture of half the size: a quarter of the samples, and as distinct.
+    """Return the keypoint, to be described in the picture of half the size: a quarter of the samples, and as
+    distinct.
 
     OpenCV packs the octave (signed) and its picture, 1 to 3, into a byte each; picture 3 is the next octave's 0.
     """
@@ -104,14 +105,14 @@ def _table(found: Sequence[Any]) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True)
 class Share:
-    """What a tile's keypoints are taken for."""
+    """How densely a tile's keypoints are looked for."""
 
     density: float  # keypoints a px of the image
     zoom: int = 1  # px of the image a side of a pixel that is looked at
 
     @staticmethod
     def of(size: tuple[int, int], options: TieOptions, coarse: bool = False) -> Share:
-        """That of a whole image of `size` (width, height); `coarse`: of a first look, for what is wanted alone."""
+        """Return the share of a whole image of `size` (width, height); `coarse`: of a first look."""
         area = size[0] * size[1]
         wanted = min(options.keypoints_per_image, _AMPLE * options.points_per_image) / area
         zooms = (zoom for below, zoom in _ZOOMS if wanted < below and min(size) > zoom * options.tile)
@@ -121,32 +122,34 @@ class Share:
         return Share(options.keypoints_per_image / area, zoom)
 
     def expected(self, size: tuple[int, int]) -> float:
-        """How many keypoints an image of `size` (width, height) with detail all over may have, looked at so."""
+        """Estimate the number of keypoints of an image of `size` (width, height) with detail all over, at
+        this share.
+        """
         return min(self.density, _HOLDS.get(self.zoom, np.inf)) * size[0] * size[1]
 
     def within(self, used: float) -> Share:
-        """The same where only a part of the image is used: by powers of two, not to be another one each time."""
+        """Return the share where only a part of the image is used, in powers of two, so that it seldom changes."""
         return replace(
             self, density=self.density * 2.0 ** float(np.floor(-np.log2(min(max(used, 1e-6), 1.0))))
         )
 
     def most(self, box: Box) -> int:
-        """How many a box may hold."""
+        """Return the largest number of keypoints of a box."""
         return int(np.ceil(_SPARE * self.density * box[2] * box[3]))
 
     @property
     def cell(self) -> int:
-        """Side of the cells that take their strongest in turns [px]."""
+        """Side of the quota's cells [px]."""
         return CELL * max(1, round(float(np.sqrt(_FEW / self.density)) / CELL))
 
 
 def ample_matches(options: TieOptions) -> int:
-    """So many verified matches of a pair at a first look make a closer one needless."""
+    """Return the number of verified matches at a first look that makes a closer one needless."""
     return max(_LEAST, int(np.ceil(_PART * options.points_per_image)))
 
 
 def worth_a_first_look(sizes: Sequence[tuple[int, int]], options: TieOptions) -> bool:
-    """Whether images of `sizes` (width, height) hold so much that looking at less of it may be enough."""
+    """Return whether images of `sizes` (width, height) are large enough for a first look at less detail."""
     needed = _HELD * ample_matches(options)
     return all(Share.of(size, options, coarse=True).expected(size) >= needed for size in sizes)
 
@@ -154,7 +157,7 @@ def worth_a_first_look(sizes: Sequence[tuple[int, int]], options: TieOptions) ->
 def detect_tile(
     path: str, size: tuple[int, int], box: Box, found: Survey, share: Share, options: TieOptions
 ) -> Keypoints:
-    """Keypoints of one tile of an image of `size` (width, height), those first that count first.
+    """Detect the keypoints of one tile of an image of `size` (width, height), the most important first.
 
     Coordinates and `found` are those of the whole image.
     """
@@ -180,7 +183,7 @@ def detect_tile(
 
 
 def _detect_part(picture: ByteImage, valid: BoolArray, part: Box, origin: Array, share: Share) -> Keypoints:
-    """Keypoints inside a part of an image; the first pixel's centre is at `origin` [px]."""
+    """Return the keypoints inside a part of an image; the first pixel's centre is at `origin` [px]."""
     inner = np.array(part[:2]) - 0.5, np.add(part[:2], part[2:]) - 0.5
     distance = None
     if not valid.all():
@@ -203,7 +206,7 @@ def _detect_part(picture: ByteImage, valid: BoolArray, part: Box, origin: Array,
 
 
 def _cell_ranks(xy: Array, response: Array, cell: float) -> IntArray:
-    """Place of every point (N, 2) [px] among those of its cell, the strongest first, from 0."""
+    """Return the place of every point (N, 2) [px] among those of its cell, the strongest first, from 0."""
     cells = np.floor((xy + 0.5) / cell).astype(np.int64)
     cells -= cells.min(axis=0, initial=0)
     key = cells[:, 1] * (cells[:, 0].max(initial=0) + 1) + cells[:, 0]
@@ -216,19 +219,21 @@ def _cell_ranks(xy: Array, response: Array, cell: float) -> IntArray:
 
 
 def quota(xy: Array, response: Array, cell: float, most: int) -> IntArray:
-    """Indices of the strongest of points (N, 2) [px] in every cell of a side [px], at most so many each, ascending."""
+    """Return the indices, ascending, of the strongest of points (N, 2) [px] in every cell, at most so many each."""
     return np.flatnonzero(_cell_ranks(xy, response, cell) < most)
 
 
 def ranked(xy: Array, response: Array, cell: float, most: int) -> IntArray:
-    """Indices of at most so many points (N, 2) [px]: the strongest of every cell, then the second ones, and so on."""
+    """Return the indices of at most so many points (N, 2) [px]: the strongest of every cell, then the second
+    ones, and so on.
+    """
     order = np.lexsort((xy[:, 0], xy[:, 1], -response, _cell_ranks(xy, response, cell)))
     return order[:most]
 
 
 @dataclass(frozen=True)
 class KeypointFiles:
-    """Keypoints of a view by reference: the first so many of every tile's file count."""
+    """Keypoints of a view kept in files: of every tile the first so many count."""
 
     store: Store
     boxes: tuple[Box, ...] = ()
@@ -241,12 +246,14 @@ class KeypointFiles:
         return sum(self.counts)
 
     def strongest(self, most: int) -> KeypointFiles:
-        """About `most` keypoints, the same share of every tile."""
+        """Return about `most` keypoints, the same share of every tile."""
         share = min(1.0, most / max(len(self), 1))
         return replace(self, counts=tuple(int(np.ceil(share * count)) for count in self.counts))
 
     def load(self, wanted: Sequence[Box] | None = None) -> tuple[Keypoints, IntArray]:
-        """Keypoints of some tiles (None: of all), by row and column in a tile, and their numbers within the view."""
+        """Return the keypoints of some tiles (None: of all), by row and column in a tile, and their numbers
+        within the view.
+        """
         parts, numbers, first = [], [np.empty(0, dtype=np.int64)], self.start
         chosen = set(self.boxes if wanted is None else wanted)
         for box, name, count in zip(self.boxes, self.names, self.counts, strict=True):
@@ -269,7 +276,7 @@ def keep_tile(
     share: Share,
     options: TieOptions,
 ) -> int:
-    """Find the keypoints of a tile (`detect_tile`) and keep them in the store; their number."""
+    """Detect the keypoints of a tile (`detect_tile`) and keep them in the store; return their number."""
     known = store.read(name)
     if known is not None and "xy" in known:
         return len(known["xy"])
@@ -279,7 +286,7 @@ def keep_tile(
 
 
 def _packed(keypoints: Keypoints, box: Box) -> dict[str, npt.NDArray[Any]]:
-    """Arrays of 148 bytes a keypoint; places count from the tile's corner."""
+    """Return the arrays of 148 bytes a keypoint; places count from the tile's corner."""
     local = replace(keypoints, xy=keypoints.xy - np.array(box[:2]))
     values = {field.name: getattr(local, field.name) for field in fields(Keypoints)}
     return {name: v.astype(np.float32) if v.dtype == np.float64 else v for name, v in values.items()}
@@ -294,7 +301,9 @@ def _unpacked(arrays: dict[str, npt.NDArray[Any]], box: Box) -> Keypoints:
 
 
 def allotted(found: IntArray, area: Array, most: int) -> IntArray:
-    """How many keypoints (T,) of the tiles count, `most` together: by area; poor tiles leave theirs to the rest."""
+    """Return the numbers of keypoints (T,) of the tiles, `most` together: by area; poor tiles leave theirs to
+    the rest.
+    """
     if found.sum() <= most:
         return found
     order = np.argsort(found / area, kind="stable")
@@ -316,7 +325,7 @@ def locate(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[KeypointFiles]:
-    """Keypoints of every view, in files of a store; none in an image in which nothing varies.
+    """Detect the keypoints of every view into files of a store; none in an image in which nothing varies.
 
     With `pairs`, tiles that no partner may see are not read, nor those outside `area`; with `coarse` images are looked
     at in less detail, and for fewer keypoints; the rest as for `find_tracks`.
@@ -357,7 +366,7 @@ def detect(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[Keypoints]:
-    """Keypoints of every view, in memory; the rest as for `locate`."""
+    """Detect the keypoints of every view in memory; the rest as for `locate`."""
     with store_of(executor) as store:
         files = locate(views, options, store, pairs=pairs, area=area, executor=executor, progress=progress)
         return [of_view.load()[0] for of_view in files]

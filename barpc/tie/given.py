@@ -25,7 +25,7 @@ GivenMatches = Mapping[tuple[int, int], Matches]
 
 
 class Given:
-    """The matches that are there: row i of the first view's points belongs to row i of the second's."""
+    """Matches given by others: row i of the first view's points belongs to row i of the second's."""
 
     detects: ClassVar[bool] = True
 
@@ -33,7 +33,7 @@ class Given:
         self._first, self._second = (points.xy for points in keypoints)
 
     def match(self, a: View, b: View, prediction: Prediction) -> Matches:
-        """Those in the bands; the nearer to a band's middle, the more alike: false ones lie anywhere in it."""
+        """Return the given matches inside the bands; the nearer to a band's middle, the more credible."""
         rows, first = prediction.chosen(len(self._first)), self._first
         first = first if len(rows) == len(first) else first[rows]
         inside, score = prediction.judge(first, self._second[rows])
@@ -53,7 +53,7 @@ def verify(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[Matches, PairReport]]:
-    """The matches of each pair that the cameras bear out, with its report: `match_pair` with what is given."""
+    """Verify given matches of each pair against the cameras, with its report: `match_pair` with what is given."""
     chosen = replace(options, matcher=_GIVEN)
     tasks = []
     for pair in pairs:
@@ -75,7 +75,7 @@ def verify(
 
 
 def _keypoints(matches: Matches, end: int) -> Keypoints:
-    """The points of one view; nothing is known of them but their places."""
+    """Return the points of one view; nothing is known of them but their places."""
     none = np.zeros(len(matches))
     xy = np.ascontiguousarray(matches.xy[:, end])
     return Keypoints(xy, none, none, none, np.empty((len(xy), 0), np.uint8))

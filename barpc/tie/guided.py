@@ -37,7 +37,7 @@ class Guided:
         self._prepared: tuple[_Strips, _Described, _Described] | None = None
 
     def match(self, a: View, b: View, prediction: Prediction) -> Matches:
-        """Mutual best keypoints whose second best is farther by the ratio test (Lowe 2004)."""
+        """Return the mutual best keypoints whose second best is farther by the ratio test (Lowe 2004)."""
         if not (len(self._a) and len(self._b)):
             return NO_MATCHES
         where, across = prediction.at(self._a.xy), prediction.half_width
@@ -77,14 +77,14 @@ class _Described:
         return _Described(values / norm, turned.astype(np.float32), zoom.astype(np.float32))
 
     def alike(self, row: IntArray, other: _Described, col: IntArray) -> npt.NDArray[np.bool_]:
-        """Which candidates have about the orientation and the scale that they should have."""
+        """Return the candidates of about the expected orientation and scale."""
         turned = np.einsum("ij,ij->i", self.direction[row], other.direction[col])
         out: npt.NDArray[np.bool_] = turned >= np.float32(np.cos(_MAX_TURN))
         out &= np.abs(other.zoom[col] - self.zoom[row]) <= np.float32(_MAX_ZOOM)
         return out
 
     def likeness(self, row: IntArray, other: _Described, col: IntArray) -> FloatArray:
-        """Cosines of the descriptors, pair by pair."""
+        """Return the cosines of the descriptors, pair by pair."""
         out: FloatArray = np.einsum("ij,ij->i", self.unit[row], other.unit[col])
         return out
 
@@ -113,7 +113,7 @@ class _Best:
         self._second[rows] = np.maximum.reduceat(np.where(same, _NONE, likeness[order]), start)
 
     def mutual(self) -> tuple[IntArray, Array, Array]:
-        """Mutual best pairs (M, 2), their distances, and these over those to the second best (M,).
+        """Return the mutual best pairs (M, 2), their distances, and these over those to the second best (M,).
 
         Distances of descriptors are 0 to 2; where there is no second best, its distance counts as 1.
         """
@@ -140,7 +140,9 @@ class _Strips:
         self._key, self._last = key[self._order], int(strip.max())
 
     def near(self, where: Frame, across: float, wanted: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
-        """Points of A and the points of B in the strips that their bands touch, all of a point of A together."""
+        """Yield the points of A and the points of B in the strips that their bands touch, all of a point of A
+        together.
+        """
         rows = wanted[np.isfinite(where.along + where.across + where.slope)[wanted]]
         before, after, u, w = (x[rows] for x in (where.before, where.after, where.along, where.across))
         reach = across + np.abs(where.slope[rows]) * np.maximum(np.abs(before), np.abs(after))
@@ -164,13 +166,15 @@ class _Strips:
             yield rows[point[part][number]], self._order[place]
 
     def apart(self, where: Frame, row: IntArray, col: IntArray) -> tuple[Array, Array]:
-        """Distances along and across of points of B from the predicted ones of A, pair by pair."""
+        """Return the distances along and across of points of B from the predicted ones of A, pair by pair."""
         du = self._turned[col, 0] - where.along[row]
         return du, self._turned[col, 1] - where.across[row] - where.slope[row] * du
 
 
 def _expanded(first: IntArray, count: IntArray) -> tuple[IntArray, IntArray]:
-    """Ranges that begin at `first` and hold `count` numbers: the number of its range, and each number in it."""
+    """Return the ranges that begin at `first` and hold `count` numbers: the number of its range, and each
+    number in it.
+    """
     which = np.repeat(np.arange(len(first)), count)
     within = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
     return which, first[which] + within

@@ -25,7 +25,7 @@ from barpc.tie.matcher import Matcher, Matches, Prediction
 
 @dataclass(frozen=True)
 class Hook:
-    """A function as a matcher: it may look everywhere, what lies in the bands of the prediction counts."""
+    """A user's function as a matcher: it may look everywhere, matches inside the bands count."""
 
     name: str
     function: Callable[[View, View, Prediction], Any]
@@ -36,7 +36,7 @@ class Hook:
         return self
 
     def match(self, a: View, b: View, prediction: Prediction) -> Matches:
-        """What the function finds, as far as it may lie; its errors name it and the pair."""
+        """Return the function's matches inside the bands; errors name the function and the pair."""
         try:
             xy, score = _places(self.function(a, b, prediction))
         except BarpcError:
@@ -51,7 +51,7 @@ class Hook:
 
 
 def _places(found: Any) -> tuple[Any, Any]:
-    """Places (M, 2, 2) [px] and how unlike they look (M,), or None, of what a function gave back."""
+    """Return the places (M, 2, 2) [px] and how unlike they look (M,), or None, of what a function gave back."""
     if isinstance(found, Matches):
         found = found.xy, found.score
     xy, score = found if isinstance(found, tuple) else (found, None)
@@ -66,7 +66,7 @@ def _places(found: Any) -> tuple[Any, Any]:
 
 
 def hooked(name: str) -> type[Matcher] | Hook:
-    """The matcher that `module:name` stands for; InputError where there is none."""
+    """Import the matcher that `module:name` names; InputError where there is none."""
     module, _, attribute = name.partition(":")
     try:
         found = getattr(import_module(module), attribute)
@@ -81,7 +81,8 @@ def hooked(name: str) -> type[Matcher] | Hook:
 
 
 def hook_files(name: str) -> list[Path]:
-    """What `module:name` is made of: its module, those beside it that it imports, and the files that it declares.
+    """Return the files of `module:name`: its module, those beside it that it imports, and those that it
+    declares.
 
     `name.files`, paths from where the module lies, are files that decide what it finds, such as weights. None for a
     matcher of the table, or a module without a file.

@@ -25,7 +25,7 @@ from barpc.tie.raster import Box
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Where points of A may lie in B."""
+    """Bands in B in which points of A may lie."""
 
     where: Callable[[Array], Frame]  # of points of A (N, 2) [px]; one axis for all predictions of a pair
     half_width: float  # how far across the epipolar lines to look [px]
@@ -35,19 +35,20 @@ class Prediction:
     aside: float = 0.0  # how far the bands are moved across the epipolar lines [px]
 
     def at(self, xy: Array) -> Frame:
-        """The frame of points of A (N, 2) [px]; NaN: nowhere."""
+        """Return the epipolar frame of points of A (N, 2) [px]; NaN: nowhere."""
         return self.where(xy).moved(self.aside)
 
     def chosen(self, count: int) -> IntArray:
-        """Indices of the points that are wanted of `count`, ascending."""
+        """Return the indices of the wanted ones of `count` points, ascending."""
         return np.linspace(0, count - 1, min(count, self.probes or count)).astype(np.int64)
 
     def contains(self, xy: Array) -> BoolArray:
-        """Which matches (M, 2, 2) lie in the bands: for a matcher that looks everywhere."""
+        """Return the matches (M, 2, 2) that lie in the bands, for a matcher that looks everywhere."""
         return self.judge(xy[:, 0], xy[:, 1])[0]
 
     def judge(self, first: Array, second: Array) -> tuple[BoolArray, Array]:
-        """Which places (M, 2), (M, 2) lie in the bands, and how far from their middles (M,), 1 at the edge.
+        """Return the places (M, 2), (M, 2) that lie in the bands, and their distance from the middles (M,), 1
+        at the edge.
 
         False matches lie anywhere in a band: where nothing else tells how alike two places look, this does.
         """
@@ -73,12 +74,12 @@ class Matches:
 
     @staticmethod
     def of_places(xy: Array, score: Array) -> Matches:
-        """Matches whose points are numbered by the pixel in which they lie."""
+        """Return the matches whose points are numbered by the pixel in which they lie."""
         pixel = np.rint(xy).astype(np.int64)
         return Matches(xy, score, (pixel[..., 1] << 32) + pixel[..., 0])
 
     def select(self, keep: IntArray | BoolArray) -> Matches:
-        """The matches of a mask or of indices."""
+        """Return the matches of a mask or of indices."""
         return replace(self, xy=self.xy[keep], score=self.score[keep], index=self.index[keep])
 
 
@@ -86,7 +87,7 @@ NO_MATCHES = Matches(np.empty((0, 2, 2)), np.empty(0), np.empty((0, 2), dtype=np
 
 
 class Matcher(Protocol):
-    """Made for a pair of views, and asked several times: about wide bands, narrow ones, and ones moved aside."""
+    """A matcher of one pair of views, asked several times: in wide bands, narrow ones, and decoy bands aside."""
 
     detects: ClassVar[bool]
     """Whether it wants the views' keypoints: they are found once a view, for all its pairs."""
@@ -94,5 +95,5 @@ class Matcher(Protocol):
     def __init__(self, options: TieOptions, keypoints: tuple[Keypoints, Keypoints]) -> None: ...
 
     def match(self, a: View, b: View, prediction: Prediction) -> Matches:
-        """The unambiguous matches inside the bands of the prediction, and no others; in any order."""
+        """Return the unambiguous matches inside the bands of the prediction, and no others; in any order."""
         ...

@@ -38,7 +38,7 @@ MATCHERS: dict[str, type[Matcher]] = {"guided": Guided, STRUCTURE: Structure}
 
 
 def matcher_named(name: str) -> type[Matcher] | Hook:
-    """The matcher that an option names: a row of `MATCHERS`, or what `module:name` stands for."""
+    """Return the matcher that an option names: a row of `MATCHERS`, or what `module:name` stands for."""
     return MATCHERS[name] if name in MATCHERS else hooked(name)
 
 
@@ -72,7 +72,7 @@ _PROBES = 12  # pixels along a side at which the terrain is asked
 
 @dataclass(frozen=True)
 class PairReport:
-    """What became of a pair of views."""
+    """Result of matching a pair of views."""
 
     names: tuple[str, str]
     status: str  # "ok", or what went wrong
@@ -97,7 +97,9 @@ class PairReport:
 
     @property
     def means(self) -> str:
-        """What found the matches, whether with loosened thresholds, and whether keypoints tie the pair themselves."""
+        """Method that found the matches, whether with loosened thresholds, and whether keypoints tie the pair
+        themselves.
+        """
         return self.matcher + ", loosened" * self.loosened + ", by keypoints" * bool(self.unregistered)
 
 
@@ -107,7 +109,8 @@ def match_pair(
     pair: Pair,
     options: TieOptions,
 ) -> tuple[Matches, PairReport]:
-    """Match two views; keypoints are empty for a matcher that wants none. No matches: the report says why.
+    """Match two views; keypoints are empty for a matcher that wants none. Without matches the report gives
+    the reason.
 
     Where few or none are found, loosened thresholds are tried, and what finds more counts.
     """
@@ -129,23 +132,23 @@ def match_pair(
 
 
 def ample(report: PairReport, options: TieOptions) -> bool:
-    """Whether a first look found so much that a closer one is needless."""
+    """Return whether a first look found enough matches to spare a closer one."""
     return report.status == "ok" and report.verified >= ample_matches(options)
 
 
 def enough(report: PairReport) -> bool:
-    """Whether a pair has matches enough not to be tried again."""
+    """Return whether a pair has enough matches not to be tried again."""
     return report.status == "ok" and report.verified >= _wanted(report)
 
 
 def _wanted(report: PairReport) -> int:
-    """So many matches a pair is to have: fewer where little is in common."""
+    """Return the number of matches that a pair should have: fewer where little is in common."""
     common = report.overlap * min(report.keypoints)
     return math.ceil(min(THIN, max(FEW, SHARE * common))) if common > 0 else THIN
 
 
 def _better(*attempts: tuple[Matches, PairReport]) -> tuple[Matches, PairReport]:
-    """The attempt with most verified matches, of those that count; the earlier one of equals."""
+    """Return the attempt with most verified matches, of those that count; the earlier one of equals."""
     best = max(attempts, key=lambda attempt: attempt[1].verified if attempt[1].status == "ok" else -1)
     beaten = tuple(
         text
@@ -164,7 +167,7 @@ def _attempt(
     pair: Pair,
     options: TieOptions,
 ) -> tuple[Matches, PairReport]:
-    """All passes over a pair with one matcher and its thresholds."""
+    """Return all passes over a pair with one matcher and its thresholds."""
     names, counts = (views[0].name, views[1].name), (len(keypoints[0]), len(keypoints[1]))
     report = PairReport(
         names,
@@ -205,7 +208,7 @@ def _attempt(
 
 
 def _apart(xy: Array, side: float) -> int:
-    """How many points (M, 2) stand so far apart that what is compared about them is not the same."""
+    """Count the points (M, 2) that stand far enough apart not to share their patches."""
     return len(np.unique(np.floor(xy / side), axis=0)) if side else len(xy)
 
 
@@ -214,7 +217,9 @@ def _loaded(
     keypoints: tuple[Keypoints | KeypointFiles, Keypoints | KeypointFiles],
     options: TieOptions,
 ) -> tuple[tuple[Keypoints, Keypoints], tuple[IntArray, IntArray] | None]:
-    """Keypoints of the tiles that both views may see, and their numbers within the views; None: as they stand."""
+    """Return the keypoints of the tiles that both views may see, and their numbers within the views; None: as
+    they stand.
+    """
     a, b = keypoints
     if isinstance(a, Keypoints) or isinstance(b, Keypoints):
         assert isinstance(a, Keypoints)
@@ -228,7 +233,7 @@ def _loaded(
 def quick_score(
     views: tuple[View, View], keypoints: tuple[KeypointFiles, KeypointFiles], options: TieOptions
 ) -> int:
-    """How many of a few keypoints match, at most 5 % of them falsely: what a pair promises, at little cost."""
+    """Estimate how many of a few keypoints match, with at most 5 % false ones: a cheap forecast for a pair."""
     few = (keypoints[0].strongest(_QUICK), keypoints[1].strongest(_QUICK))
     if not (len(few[0]) and len(few[1])):
         return 0
@@ -249,7 +254,8 @@ def match(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[Matches, PairReport]]:
-    """Matches of every pair, each with its report: `match_pair` over all pairs, and `STRUCTURE` where it finds few.
+    """Match every pair, each with its report: `match_pair` over all pairs, and `STRUCTURE` where it finds
+    few.
 
     `terrain`, or else the matches of other pairs, some of them found `before`, tell the altitudes at which that looks.
     With `once` a first look's keypoints are tried once: `ample` says of which pairs that is all that they need.
@@ -286,7 +292,7 @@ def _match_within(
     pair: Pair,
     options: TieOptions,
 ) -> tuple[Matches, PairReport]:
-    """`match_pair` of two views used for some altitudes, and for fewer where it finds few: with less to confuse."""
+    """Match two views at some altitudes, and at fewer where that finds few: with less to confuse."""
     tried = [match_pair(several[0], keypoints, pair, options)]
     for views in several[1:]:
         if not enough(tried[-1][1]) and views[0].alt_range != several[0][0].alt_range:
@@ -295,7 +301,7 @@ def _match_within(
 
 
 def _altitudes(ties: Sequence[tuple[tuple[View, View], Matches]]) -> tuple[float, float] | None:
-    """The lowest and the highest altitude [m] that most matches of some pairs lie at."""
+    """Return the lowest and the highest altitude [m] that most matches of some pairs lie at."""
     found = []
     for views, matches in ties:
         where, (low, high) = frame(*views, matches.xy[:, 0]), common_range(*views)
@@ -311,7 +317,7 @@ def _within(
     known: tuple[float, float] | None,
     margin: float = _MARGINS[0],
 ) -> tuple[View, View]:
-    """Two views used for fewer altitudes: those of the terrain, or else known ones, with a margin."""
+    """Return two views with fewer altitudes: those of the terrain, or else known ones, with a margin."""
     low, high = common_range(*views)
     if terrain is not None:
         axes = (np.linspace(0.0, length - 1.0, _PROBES) for length in views[0].size)
@@ -330,7 +336,7 @@ def _within(
 
 
 def _latest(where: Callable[[Array], Frame]) -> Callable[[Array], Frame]:
-    """A function of points that remembers its last value: a matcher asks about the same array again."""
+    """Return a function of points that remembers its last value: a matcher asks about the same array again."""
     known: list[tuple[Array, Frame]] = []
 
     def remembered(xy: Array) -> Frame:
@@ -342,7 +348,7 @@ def _latest(where: Callable[[Array], Frame]) -> Callable[[Array], Frame]:
 
 
 class _Peak(NamedTuple):
-    """What a blind pass finds."""
+    """Result of a blind pass."""
 
     prediction: Prediction  # where to search next
     share: float  # of the matches that stand in the peak
@@ -368,21 +374,21 @@ class _Search:
         self._frame = _latest(lambda xy: first if xy is points else frame(*views, xy, first.axis))
 
     def errors(self, found: Matches) -> Array:
-        """Distance along and across (M, 2) [px] of matches from where the cameras say."""
+        """Return the distance along and across (M, 2) [px] of matches from where the cameras say."""
         return frame(*self._views, found.xy[:, 0], self._axis).errors(found.xy[:, 1])
 
     def _predicted(self, where: Callable[[Array], Frame], half_width: float) -> Prediction:
         return Prediction(_latest(where), half_width, self._windows)
 
     def _distinct(self, prediction: Prediction) -> Matches:
-        """Matches, the best first, at most one between the same two pixels."""
+        """Return the matches, the best first, at most one between the same two pixels."""
         found = self._matcher.match(*self._views, prediction)
         found = found.select(np.argsort(found.score, kind="stable"))
         pixels = np.rint(found.xy).reshape(-1, 4)
         return found.select(np.sort(np.unique(pixels, axis=0, return_index=True)[1]))
 
     def trusted(self, prediction: Prediction, false_share: float) -> tuple[Matches, float]:
-        """Matches among which at most a share is false, and that share as estimated.
+        """Return the matches among which at most a share is false, and that share as estimated.
 
         Bands shifted to either side hold no true match: theirs tell how many false ones come with a score. (The
         "decoys" of peptide identification: Elias and Gygi 2007.)
@@ -396,7 +402,7 @@ class _Search:
         return found.select(np.arange(count)), float(share[count - 1]) if count else 0.0
 
     def offset(self) -> Prediction | None:
-        """Where to search in view of the cameras' error, from blind passes of growing width.
+        """Find the cameras' error by blind passes of growing width, and where to search.
 
         The first pass in whose peak most matches stand decides, else the one with the most significant peak, if any.
         """
@@ -411,7 +417,7 @@ class _Search:
         return None if best is None else best.prediction
 
     def _blind(self, width: float, probes: int) -> _Peak | None:
-        """One pass: a peak among the errors across the epipolar lines of some points, if there is one."""
+        """Return one pass: a peak among the errors across the epipolar lines of some points, if there is one."""
 
         def everywhere(xy: Array) -> Frame:
             where = self._frame(xy)
@@ -443,7 +449,7 @@ class _Search:
         return _Peak(self._predicted(corrected, TOLERANCE), most / len(values), float(significance))
 
     def local(self, tight: Matches) -> Prediction:
-        """Prediction corrected by the matches so far, for each point in a band about its neighbours' places."""
+        """Return the corrected prediction: each point in a band about its neighbours' places by the matches so far."""
         errors, places = self.errors(tight), tight.xy[:, 0]
         across, tree = robust_affine(places, errors[:, 1]), cKDTree(places)
 

@@ -49,32 +49,32 @@ class Patch(Frozen):
 
     @classmethod
     def on(cls, terrain: Terrain, lonlat: Array, step: float, shape: tuple[int, int], moved: Array) -> Patch:
-        """A patch with the heights of a terrain."""
+        """Return a patch with the heights of a terrain."""
         nodes = _nodes(lonlat, step, shape)
         return cls(lonlat, step, shape, terrain(nodes[..., 0], nodes[..., 1]), moved)
 
     def nodes(self) -> Array:
-        """lon, lat (m, n, 2) [deg] of the nodes."""
+        """Return the lon, lat (m, n, 2) [deg] of the nodes."""
         return _nodes(self.lonlat, self.step, self.shape)
 
     def image(self, view: View) -> Array:
-        """Where a camera that is off by `moved` shows the nodes (m, n, 2) [px]."""
+        """Return the image points (m, n, 2) [px] of the nodes by a view whose camera is off by `moved`."""
         lonlat = self.nodes() + self.moved / metres_per_unit(np.append(self.lonlat, 0.0))[:2]
         return view.sensor.project(np.concatenate([lonlat, self.heights[..., None]], axis=2))
 
     def seen(self, view: View, at: Array) -> Array:
-        """Image points (n, 2) [px] of places x, y (n, 2) [px] of the grid."""
+        """Return the image points (n, 2) [px] of places x, y (n, 2) [px] of the grid."""
         rows, cols = _between(at[:, 1], self.shape[0]), _between(at[:, 0], self.shape[1])
         return np.asarray(np.einsum("nr,rck,nc->nk", rows, self.image(view), cols))
 
 
 def ticks(count: int) -> Array:
-    """Where the nodes of an axis of `count` px lie [px]."""
+    """Return the positions of the nodes of an axis of `count` px [px]."""
     return np.linspace(0.0, count - 1.0, -(-(count - 1) // _NODE) + 1)
 
 
 def _between(at: Array, count: int) -> Array:
-    """Weights (n, nodes) of the nodes along an axis of `count` px for places (n,)."""
+    """Return the weights (n, nodes) of the nodes along an axis of `count` px for places (n,)."""
     nodes = ticks(count)
     return np.stack([np.interp(at, nodes, row) for row in np.eye(len(nodes))], axis=1)
 
@@ -88,7 +88,7 @@ def _nodes(lonlat: Array, step: float, shape: tuple[int, int]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """An orthoimage: how its pixels lie on the ground."""
+    """An orthoimage and its map projection."""
 
     path: str
     crs: CRS
@@ -98,7 +98,7 @@ class Sheet:
 
     @classmethod
     def read(cls, path: str) -> Sheet:
-        """An orthoimage from any raster with a CRS; else an InputError."""
+        """Read an orthoimage from any raster with a CRS; else an InputError."""
         with open_raster(path) as dataset:
             crs, forward, size = dataset.crs, dataset.transform, (dataset.width, dataset.height)
             bands = (1, 2, 3) if dataset.count >= 3 else (1,)
@@ -109,7 +109,7 @@ class Sheet:
         return cls(path, crs, ~forward, size, bands)
 
     def image(self, lonlat: Array) -> Array:
-        """col, row (..., 2) [px] of lon, lat (..., 2) [deg]."""
+        """Return the col, row (..., 2) [px] of lon, lat (..., 2) [deg]."""
         lon, lat = lonlat.reshape(-1, 2).T
         try:
             x, y = np.array(warp_points("EPSG:4326", self.crs, lon, lat))
@@ -119,24 +119,24 @@ class Sheet:
         return np.stack([a * x + b * y + c, d * x + e * y + f], axis=1).reshape(lonlat.shape) - 0.5
 
     def shows(self, lonlat: Array) -> BoolArray:
-        """Whether places (..., 2) [deg] lie on it."""
+        """Return whether places (..., 2) [deg] lie on the orthoimage."""
         at = self.image(lonlat)
         return np.asarray(((at >= 0) & (at <= np.array(self.size) - 1.0)).all(axis=-1))
 
     def step(self, lonlat: Array) -> float:
-        """How large its pixels are at a place (2,) [m]."""
+        """Return the pixel size at a place (2,) [m]."""
         metres = metres_per_unit(np.append(lonlat, 0.0))[:2]
         at = self.image(lonlat + np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]]) / metres)
         return float(10.0 / np.sqrt(abs(np.linalg.det(at[1:] - at[0]))))
 
 
 def of_image(view: View, band: int, patch: Patch) -> FloatImage:
-    """Channels (C, H, W) of an image on a patch, through its camera."""
+    """Return the channels (C, H, W) of an image on a patch, through its camera."""
     return channels(*picture(view.path, (band,), view.size, patch.image(view), patch.shape))
 
 
 def of_reference(paths: Sequence[str], patch: Patch) -> FloatImage:
-    """Channels (C, H, W) of a patch, of the first of several orthoimages that shows a place."""
+    """Return the channels (C, H, W) of a patch, of the first of several orthoimages that shows a place."""
     nodes, whole = patch.nodes(), np.zeros((CHANNELS, *patch.shape), np.float32)
     for path in paths:
         sheet = Sheet.read(path)
@@ -147,14 +147,15 @@ def of_reference(paths: Sequence[str], patch: Patch) -> FloatImage:
 
 
 def shown(picture: FloatImage) -> float:
-    """Share of a picture of channels (C, H, W) that shows something."""
+    """Return the share of the pixels of channels (C, H, W) that are not empty."""
     return float((np.abs(picture).sum(axis=0) > 0).mean())
 
 
 def picture(
     path: str, bands: Sequence[int], size: tuple[int, int], nodes: Array, shape: tuple[int, int]
 ) -> tuple[FloatImage, BoolArray]:
-    """A raster on a grid (H, W) whose nodes (m, n, 2) lie at its col, row [px], and which pixels mean something.
+    """Resample a raster to a grid (H, W) whose nodes (m, n, 2) lie at its col, row [px]; return also the
+    valid pixels.
 
     Where it is finer than the grid, it is averaged first.
     """
@@ -187,7 +188,9 @@ def picture(
 def _thinned(
     file: tuple[str, tuple[int, int]], bands: Sequence[int], box: Box, thin: int
 ) -> tuple[FloatImage, FloatImage]:
-    """The mean of bands of a window, averaged over `thin` x `thin` px, and how much of each of these is known."""
+    """Return the mean of bands of a window, averaged over `thin` x `thin` px, and how much of each of these
+    is known.
+    """
     cv2.setNumThreads(1)
     picture, valid = np.zeros((box[3], box[2]), np.float32), np.ones((box[3], box[2]), dtype=bool)
     for band in bands:

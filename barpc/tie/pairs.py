@@ -48,19 +48,19 @@ class Area:
     outline: shapely.Geometry
 
     def plane(self, origin: Array, scale: Array) -> shapely.Geometry:
-        """The area in a plane [m]: (lon, lat) minus `origin` (2,) [deg], times `scale` (2,) [m/deg]."""
+        """Return the area in a plane [m]: (lon, lat) minus `origin` (2,) [deg], times `scale` (2,) [m/deg]."""
         near = np.array([float(wrap_longitude(origin[0])), origin[1]])
         return shapely.transform(self.outline, lambda lonlat: (lonlat - near) * scale)
 
     def contains(self, lonlat: Array) -> BoolArray:
-        """Which points (N, 2), lon, lat [deg], lie inside; NaN does not."""
+        """Return the points (N, 2), lon, lat [deg], that lie inside; NaN does not."""
         shapely.prepare(self.outline)
         inside: BoolArray = shapely.contains_xy(self.outline, wrap_longitude(lonlat[:, 0]), lonlat[:, 1])
         return inside
 
 
 def read_area(path: str | os.PathLike[str]) -> Area:
-    """The polygons of a GeoJSON file as one area.
+    """Read the polygons of a GeoJSON file as one area.
 
     Parameters
     ----------
@@ -90,7 +90,9 @@ def read_area(path: str | os.PathLike[str]) -> Area:
 
 
 def _valid(polygon: shapely.Polygon) -> shapely.Geometry:
-    """A polygon whose outline does not cross itself; ValueError where it does more often than can be untangled."""
+    """Return a polygon whose outline does not cross itself; ValueError where it does more often than can be
+    untangled.
+    """
     if polygon.is_valid:
         return polygon
     rings = [np.asarray(ring.coords) for ring in (polygon.exterior, *polygon.interiors)]
@@ -106,7 +108,7 @@ def _valid(polygon: shapely.Polygon) -> shapely.Geometry:
 
 
 def _polygons(data: dict[str, Any]) -> Iterator[shapely.Polygon]:
-    """All polygons of a GeoJSON object, whatever they are wrapped in."""
+    """Yield all polygons of a GeoJSON object, whatever they are wrapped in."""
     kind = data["type"]
     if kind in _WRAPPED:
         inner = data[_WRAPPED[kind]]
@@ -124,7 +126,7 @@ def _polygons(data: dict[str, Any]) -> Iterator[shapely.Polygon]:
 
 
 def _ring(positions: list[list[float]]) -> Array:
-    """Vertices (N, 2) of an outline, the first between -180 and 180, its longitudes without jumps."""
+    """Return the vertices (N, 2) of an outline, the first between -180 and 180, its longitudes without jumps."""
     ring = np.array([position[:2] for position in positions], dtype=np.float64).reshape(-1, 2)
     if not (np.isfinite(ring).all() and (np.abs(ring) <= [540.0, 90.0]).all()):
         raise ValueError("a position is not a longitude and a latitude")
@@ -176,17 +178,17 @@ class Footprints:
             self.outlines.append(outline if near is None else shapely.intersection(outline, near))
 
     def plane(self, lonlat: Array) -> Array:
-        """East and north (..., 2) [m] of longitudes and latitudes (..., 2) [deg]."""
+        """Return the east and north (..., 2) [m] of longitudes and latitudes (..., 2) [deg]."""
         lon = wrap_longitude(lonlat[..., 0], self._origin[0])
         return (np.stack([lon, lonlat[..., 1]], axis=-1) - self._origin) * self._scale
 
     def ground(self, points: Array) -> Array:
-        """lon, lat [deg], alt [m] (N, 3) of points (N, 2) of the plane [m]."""
+        """Return the lon, lat [deg], alt [m] (N, 3) of points (N, 2) of the plane [m]."""
         return np.column_stack([points / self._scale + self._origin, np.full(len(points), self.alt)])
 
 
 def reach_of(view: View, options: TieOptions) -> float:
-    """How far the camera of a view may be wrong, in any direction [px]."""
+    """Return how far a view's camera may be wrong, in any direction [px]."""
     if options.search is not None:
         return options.search
     ground = view.sensor.localize((np.array(view.size) - 1.0) / 2.0, np.array(view.altitude))
@@ -195,7 +197,7 @@ def reach_of(view: View, options: TieOptions) -> float:
 
 
 def _levels(views: Sequence[View]) -> tuple[float, float, float]:
-    """Middle, lowest and highest altitude [m] of what the views' ranges have in common."""
+    """Return the middle, lowest and highest altitude [m] of what the views' ranges have in common."""
     low, high = common_range(*views)
     return 0.5 * (low + high), low, high
 
@@ -203,7 +205,7 @@ def _levels(views: Sequence[View]) -> tuple[float, float, float]:
 def overlapping_pairs(
     views: Sequence[View], options: TieOptions, reaches: Sequence[float] = (), area: Area | None = None
 ) -> list[Pair]:
-    """All pairs that overlap enough at some altitude, under an angle that is asked for, ascending."""
+    """Return all pairs that overlap enough at some altitude, under an angle that is asked for, ascending."""
     best: dict[tuple[int, int], Pair] = {}
     for alt in _levels(views):
         for pair in _overlapping_at(Footprints(views, alt, reaches, area), views, options):
@@ -236,7 +238,7 @@ def possible_pairs(
     area: Area | None = None,
     given: Collection[tuple[int, int]] = (),
 ) -> list[Pair]:
-    """The pairs of views that can be matched, ascending.
+    """Return the pairs of views that can be matched, ascending.
 
     Parameters
     ----------
@@ -247,7 +249,7 @@ def possible_pairs(
     only : sequence of (int, int)
         These pairs, all that overlap, and no others.
     area : Area, optional
-        Where the overlap counts; None: everywhere.
+        Area in which the overlap counts; None: everywhere.
     given : collection of (int, int)
         Pairs, ascending, that are matched already: they are among those returned, overlap or not.
 
@@ -284,7 +286,9 @@ def _candidates(
     wanted: set[tuple[int, int]],
     area: Area | None,
 ) -> list[Pair]:
-    """Pairs that overlap, of those wanted (none: all); with grown outlines where that leaves something out."""
+    """Return the pairs that overlap, of those wanted (none: all); with grown outlines where that leaves
+    something out.
+    """
     pairs = overlapping_pairs(views, options, area=area)
     pairs = [pair for pair in pairs if not wanted or pair.views in wanted]
     known = {pair.views for pair in pairs}
@@ -319,7 +323,9 @@ def shared_tiles(
     area: Area | None = None,
     boxes: Sequence[Sequence[Box]] | None = None,
 ) -> list[list[Box]]:
-    """The tiles (or `boxes`) of every view that a partner may see in the area, though cameras be wrong (`reach_of`)."""
+    """Return the tiles (or `boxes`) of every view that a partner may see in the area, with cameras wrong by
+    `reach_of`.
+    """
     boxes = boxes or [tiles(view.size, options) for view in views]
     seen = [np.zeros(len(of_view), dtype=bool) for of_view in boxes]
     partners: list[list[int]] = [[] for _ in views]

@@ -39,13 +39,13 @@ _OUTLIER = 1e6  # grey values beyond which a pixel is cut: it would drown its su
 
 @dataclass(frozen=True)
 class Stretch:
-    """The pixel values that become 0 and 255."""
+    """Linear stretch of pixel values to 0 .. 255."""
 
     low: float
     high: float
 
     def apply(self, pixels: Pixels, valid: BoolArray) -> ByteImage:
-        """8-bit picture; invalid pixels take the mean of the valid ones, so that they make few edges."""
+        """Return an 8-bit picture; invalid pixels take the mean of the valid ones, so that they make few edges."""
         if pixels.dtype == np.float32:
             scaled = (pixels - np.float32(self.low)) * np.float32(255.0 / (self.high - self.low))
         else:
@@ -57,14 +57,14 @@ class Stretch:
 
 
 def _levelled(pixels: Pixels, low: float, high: float, levels: float) -> FloatImage:
-    """`low` and `high` as 0 and `levels`; whatever the scale, nothing overflows."""
+    """Return `low` and `high` as 0 and `levels`; whatever the scale, nothing overflows."""
     with np.errstate(over="ignore"):
         share = (pixels / 2 - low / 2) / (high / 2 - low / 2)  # halves: a difference may have no number
     return np.clip(share * levels, -_OUTLIER, _OUTLIER).astype(np.float32)
 
 
 def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
-    """Pixels of a window in float32, as they are or (from float64) on a scale of the window's own.
+    """Return the pixels of a window in float32, as they are or (from float64) on a scale of the window's own.
 
     Registration does not see offset and scale; float32 would lose the picture beside 2e9, and overflow squaring 1e30.
     """
@@ -82,7 +82,7 @@ def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
 def read_pixels(
     path: str | os.PathLike[str], box: Box, band: int = 1, size: tuple[int, int] | None = None
 ) -> tuple[Pixels, BoolArray]:
-    """Pixels (height, width) of a window as stored, 0 where invalid, and which of them mean something.
+    """Read the pixels (height, width) of a window as stored, 0 where invalid, and the mask of valid ones.
 
     Those at nodata, masked, non-finite, saturated or in undeclared zero borders do not. ImageError: the file cannot
     be read, has no such band (from 1), or holds complex numbers.
@@ -111,12 +111,12 @@ class PixelReader(ExitStack):
             raise
 
     def read(self, box: Box) -> tuple[Pixels, BoolArray]:
-        """Pixels of a window, and which of them mean something."""
+        """Read the pixels of a window and the mask of valid ones."""
         return _averaged(self._dataset, box, self._band, self._pixel)
 
 
 def _pixel(dataset: Any, size: tuple[int, int] | None) -> tuple[int, int]:
-    """Columns and rows of a raster that one pixel of its picture of a size (width, height) holds."""
+    """Return the columns and rows of a raster that one pixel of its picture of a size (width, height) holds."""
     width, height = size or (dataset.width, dataset.height)
     return max(1, dataset.width // width), max(1, dataset.height // height)
 
@@ -124,7 +124,7 @@ def _pixel(dataset: Any, size: tuple[int, int] | None) -> tuple[int, int]:
 def _averaged(
     dataset: Any, box: Box, band: int, pixel: tuple[int, int], level: int = 1
 ) -> tuple[Pixels, BoolArray]:
-    """Pixels of a window whose sides hold so many of the file's, as means; valid where all of these are."""
+    """Return the pixels of a window whose sides hold so many of the file's, as means; valid where all of these are."""
     if pixel == (1, 1):
         return _read(dataset, box, band, level)
     (col, row, width, height), (wide, high), parts = box, pixel, []
@@ -148,7 +148,7 @@ def _check_band(dataset: Any, path: str | os.PathLike[str], band: int) -> None:
 
 
 def _read(dataset: Any, box: Box, band: int, zoom: int = 1) -> tuple[Pixels, BoolArray]:
-    """Pixels of a window, of every `zoom` a side one; above 1 only where the file holds that level."""
+    """Return the pixels of a window, of every `zoom` a side one; above 1 only where the file holds that level."""
     window = Window(*box)
     more: dict[str, Any] = {"out_shape": (box[3] // zoom, box[2] // zoom)} if zoom > 1 else {}
     raw = dataset.read(band, window=window, **more)
@@ -170,7 +170,7 @@ def _read(dataset: Any, box: Box, band: int, zoom: int = 1) -> tuple[Pixels, Boo
 
 
 def _mask(dataset: Any, band: int, raw: npt.NDArray[Any]) -> BoolArray | None:
-    """Which whole numbers mean something, where they say so themselves: GDAL would decode the window again."""
+    """Return the mask of valid whole numbers, where values alone tell: GDAL would decode the window again."""
     flags = dataset.mask_flag_enums[band - 1]
     if getattr(dataset, "driver", None) is None or flags not in ([MaskFlags.nodata], [MaskFlags.all_valid]):
         return None
@@ -183,7 +183,9 @@ def _mask(dataset: Any, band: int, raw: npt.NDArray[Any]) -> BoolArray | None:
 def sample_stretch(
     path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None
 ) -> Stretch | None:
-    """0.5 and 99.5 percentile of blocks spread over a raster, or its picture of a size; None where nothing varies."""
+    """Estimate the stretch from the 0.5 and 99.5 percentiles of blocks spread over a raster, or its picture
+    of a size; None where nothing varies.
+    """
     found: list[Array] = []
     with open_raster(path) as dataset:
         _check_band(dataset, path, band)
@@ -206,7 +208,7 @@ def sample_stretch(
 
 @dataclass(frozen=True)
 class Survey:
-    """What is known of a raster before its tiles are searched."""
+    """Stretch and layout of a raster, known before its tiles are searched."""
 
     stretch: Stretch
     block: tuple[int, int]  # width and height of what is decoded at a time [px]
@@ -215,7 +217,7 @@ class Survey:
 
 
 def survey(path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None) -> Survey | None:
-    """The stretch of a raster, or its picture of a size, and how it is stored; None where nothing varies."""
+    """Survey a raster: its stretch, or its picture of a size, and its layout; None where nothing varies."""
     stretch = sample_stretch(path, band, size)
     with open_raster(path) as dataset:
         height, width = dataset.block_shapes[band - 1]
@@ -232,7 +234,7 @@ def _levels(dataset: Any, band: int) -> bool:
 def read_picture(
     path: str | os.PathLike[str], box: Box, found: Survey, zoom: int = 1, band: int = 1
 ) -> tuple[ByteImage, BoolArray]:
-    """8-bit picture of a window and its valid pixels, each of `zoom` px a side; `read_pixels` says which count.
+    """Read an 8-bit picture of a window and its valid pixels, each of `zoom` px a side; see `read_pixels`.
 
     `box` begins at whole multiples of `zoom`. Blocks are decoded once, row by row of them.
     """
@@ -255,7 +257,7 @@ def read_picture(
 
 
 def _reduced(picture: ByteImage, valid: BoolArray, zoom: int) -> tuple[ByteImage, BoolArray]:
-    """A picture of every `zoom` pixels a side one; valid are those of which all are."""
+    """Return a picture of every `zoom` pixels a side one; valid are those of which all are."""
     if zoom == 1:
         return picture, valid
     size = picture.shape[1] // zoom, picture.shape[0] // zoom
@@ -265,12 +267,12 @@ def _reduced(picture: ByteImage, valid: BoolArray, zoom: int) -> tuple[ByteImage
 
 
 def jpeg(pixels: ByteImage) -> bytes:
-    """Grey values (H, W) as a JPEG file."""
+    """Encode grey values (H, W) as a JPEG file."""
     return bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 70])[1])
 
 
 def grow(box: Box, margin: int, size: tuple[int, int]) -> Box:
-    """A box with a margin on every side, cut at an image of `size` (width, height); a pixel at least."""
+    """Return a box with a margin on every side, cut at an image of `size` (width, height); at least one pixel."""
     col, row, width, height = box
     low = np.clip(np.array([col, row]) - margin, 0, np.array(size) - 1)
     high = np.clip(np.array([col + width, row + height]) + margin, low + 1, size)
@@ -280,7 +282,7 @@ def grow(box: Box, margin: int, size: tuple[int, int]) -> Box:
 def tiles(
     size: tuple[int, int], options: TieOptions, zoom: int = 1, found: Survey | None = None
 ) -> list[Box]:
-    """Boxes that cover an image of `size` (width, height) without overlap, cut at whole cells.
+    """Return the boxes that cover an image of `size` (width, height) without overlap, cut at whole cells.
 
     A side is `options.tile` times `zoom` px; strips are taken whole, and so are blocks that are dear to
     decode.

@@ -49,7 +49,7 @@ _NEAR, _FAR, _ROUNDS = (
 
 @dataclass(frozen=True)
 class ViewMatch:
-    """What became of a view."""
+    """Result of matching a view to a reference."""
 
     name: str
     peak: float  # standard deviations by which the vote's peak stands out
@@ -64,18 +64,18 @@ class ViewMatch:
 
     @property
     def heights(self) -> float:
-        """What the terrain's heights would be wrong by, point by point, for points to scatter as they do [m]."""
+        """Height errors [m] of the terrain that would explain the scatter, point by point."""
         more = max(self.along**2 - self.scatter**2, 0.0)
         return float(np.sqrt(more) / self.slope) if self.slope > 0 else 0.0
 
     def shows_heights(self, sigma: float) -> bool:
-        """Whether points scatter along the line of sight as no terrain known to `sigma` [m] lets them."""
+        """Return whether points scatter along the line of sight more than a terrain known to `sigma` [m] allows."""
         return bool(self.along > _BEYOND * np.hypot(self.scatter, self.slope * sigma))
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """What a reference says of views: control, where any view was matched, and what became of each."""
+    """Control from a reference, where any view was matched, and the result of each view."""
 
     control: Reference | None
     views: tuple[ViewMatch, ...]
@@ -84,7 +84,7 @@ class Registration:
 
     @property
     def refusal(self) -> str:
-        """Why it is no control, in words without an end; for one that is none."""
+        """Reason why a reference is no control, in words without an end."""
         best = max(self.views, key=lambda view: view.peak, default=ViewMatch("", 0.0, (0.0, 0.0)))
         if best.peak < PEAK:
             return (
@@ -146,7 +146,7 @@ def register(
 
 
 def vote(view: View, band: int, paths: tuple[str, ...], patch: Patch, reach: int) -> FloatImage | None:
-    """How well a block of an image, the middle of a patch, goes with the reference at shifts of up to `reach` px.
+    """Correlate a block of an image, the middle of a patch, with the reference at shifts of up to `reach` px.
 
     (2 reach + 1, 2 reach + 1) correlations; None where it or the reference shows nothing.
     """
@@ -158,7 +158,7 @@ def vote(view: View, band: int, paths: tuple[str, ...], patch: Patch, reach: int
 
 
 def search(view: View, band: int, paths: tuple[str, ...], patch: Patch, points: Array, reach: int) -> Found:
-    """Points x, y (n, 2) [px] of the reference on a patch, looked for in an image."""
+    """Find points x, y (n, 2) [px] of the reference on a patch in an image."""
     return find(of_reference(paths, patch), of_image(view, band, patch), points, _HALF, reach)
 
 
@@ -170,7 +170,7 @@ def _middle(view: View) -> Array:
 
 
 def _on_terrain(view: View, terrain: Terrain, image: Array) -> Array:
-    """Ground points (n, 3) that pixels (n, 2) show, NaN where the terrain is unknown."""
+    """Return the ground points (n, 3) that pixels (n, 2) show, NaN where the terrain is unknown."""
     ground = view.sensor.localize(image, np.full(len(image), view.altitude))
     for _ in range(6):
         ground = view.sensor.localize(image, terrain(ground[:, 0], ground[:, 1]))
@@ -178,7 +178,7 @@ def _on_terrain(view: View, terrain: Terrain, image: Array) -> Array:
 
 
 def peak(votes: Sequence[FloatImage | None]) -> tuple[float, Array]:
-    """Of the sum of votes: how many standard deviations its peak stands out by, and where, x, y from the middle."""
+    """Return the height of the peak of summed votes in standard deviations, and its place x, y from the middle."""
     cast = [one for one in votes if one is not None]
     if not cast:
         return 0.0, np.zeros(2)
@@ -217,7 +217,7 @@ class _Work:
         return tuple(sheet.path for sheet in self.sheets)
 
     def vote(self) -> list[tuple[float, Array]]:
-        """Of every view the peak of its vote, and how far its camera is off (2,) [m]."""
+        """Return, for every view, the peak of its vote and the camera's error (2,) [m]."""
         coarse = max(self.step, _FINE)
         found = self._votes([np.zeros(2)] * len(self.views), coarse, REACH, "reference: vote")
         if coarse == self.step:
@@ -241,7 +241,7 @@ class _Work:
         return [(z, shift - at * [step, -step]) for (z, at), shift in zip(peaks, moved, strict=True)]
 
     def _blocks(self, view: View, moved: Array, step: float, reach: int) -> list[Patch]:
-        """Patches around blocks of an image, evenly spread, that the reference may show."""
+        """Return the patches around blocks of an image, evenly spread, that the reference may show."""
         wide = _SIDE * step / float(ground_sample_distance(view.sensor, _middle(view))[1])
         axes = []
         for length in view.size:
@@ -263,7 +263,7 @@ class _Work:
     def search(
         self, votes: Sequence[tuple[float, Array]], sigma: float, height_sigma: tuple[float, float]
     ) -> Registration:
-        """Points looked for in every view whose vote stands out, and what they make."""
+        """Return the points looked for in every view whose vote stands out, and what they make."""
         places, heights = self._lattice(
             [view for view, (z, _) in zip(self.views, votes, strict=True) if z >= PEAK]
         )
@@ -301,7 +301,9 @@ class _Work:
         return Registration(control, tuple(reports), self.step, sigma)
 
     def _lattice(self, views: Sequence[View]) -> tuple[Array, Array]:
-        """Places (n, 2) [deg] on a regular grid over views, where the reference shows them, and their heights (n,)."""
+        """Return the places (n, 2) [deg] on a regular grid over views, where the reference shows them, and
+        their heights (n,).
+        """
         if not views:
             return np.zeros((0, 2)), np.zeros(0)
         rings = [footprint(view.sensor, view.size, view.altitude) for view in views]
@@ -324,7 +326,7 @@ class _Work:
         return places[np.isfinite(heights)], heights[np.isfinite(heights)]
 
     def _tiles(self, view: View, moved: Array, places: Array, heights: Array, reach: int) -> list[_Tile]:
-        """The points of a view, tile by tile."""
+        """Return the points of a view, tile by tile."""
         metres = metres_per_unit(np.append(places.mean(axis=0), 0.0))[:2]
         at = view.sensor.project(np.column_stack([places + moved / metres, heights]))
         edge = 0.5 * _HALF * self.step / float(ground_sample_distance(view.sensor, _middle(view))[1])
@@ -347,7 +349,9 @@ class _Work:
     def _agreeing(
         self, view: View, report: ViewMatch, parts: Sequence[tuple[_Tile, Found]], places: Array
     ) -> tuple[ViewMatch, tuple[IntArray, Array, Array] | None]:
-        """A view's points that agree with an affine: report; their index, image points, standard deviations [px]."""
+        """Return a view's points that agree with an affine: report; their index, image points, standard
+        deviations [px].
+        """
         if not parts:
             return report, None
         point, found = np.concatenate([tile.points for tile, _ in parts]), joined([part for _, part in parts])
@@ -376,7 +380,8 @@ class _Work:
 def _affine(
     local: Array, shift: Array, passed: BoolArray, step: float
 ) -> tuple[Array, BoolArray, tuple[float, float]] | None:
-    """An affine (n, 2) through most of the shifts (n, 2), those near it, their standard deviations along both axes.
+    """Return an affine (n, 2) through most of the shifts (n, 2), those near it, their standard deviations
+    along both axes.
 
     The search starts where most shifts lie together. None where too few agree.
     """

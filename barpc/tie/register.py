@@ -57,7 +57,7 @@ _FEW = 20  # observations of a pair of views below which their sigmas are not sc
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Where the reference patches were found in the other image."""
+    """Places at which reference patches were found in the other image."""
 
     xy: Array  # (N, 2) [px]
     correlation: Array  # (N,) of the patches after registration
@@ -68,12 +68,12 @@ class Registration:
 
     @staticmethod
     def none(start: Array) -> Registration:
-        """Nothing found yet of points (N, 2)."""
+        """Return an empty registration of points (N, 2)."""
         zero = np.zeros(len(start))
         return Registration(start.copy(), zero, zero + np.inf, zero > 0)
 
     def put(self, rows: IntArray, found: Registration) -> None:
-        """Take in what was found of some rows."""
+        """Add the registration of some rows."""
         for field in fields(self):
             getattr(self, field.name)[rows] = getattr(found, field.name)
 
@@ -114,12 +114,12 @@ Read = tuple[
 
 
 def _sparse(xy: Array, margin: int) -> bool:
-    """Whether windows about single points (N, 2) are less than half of the window about all."""
+    """Return whether windows about single points (N, 2) are less than half of the window about all."""
     return len(xy) * (2 * margin + 1) ** 2 < 0.5 * float(np.prod(np.ptp(xy, axis=0) + 2 * margin + 1))
 
 
 def _window(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int) -> Read:
-    """The pixels about all points."""
+    """Return the pixels about all points."""
     low, high = np.floor(xy.min(axis=0)).astype(int), np.ceil(xy.max(axis=0)).astype(int)
     box = grow((low[0], low[1], *(high - low + 1)), margin, size)
     pixels, usable = reader.read(box)
@@ -127,7 +127,7 @@ def _window(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int) 
 
 
 def _mosaics(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int) -> Read:
-    """The pixels about every point, side by side in one picture: what lies between points is not worked on."""
+    """Return the pixels about every point, side by side in one picture: what lies between points is not worked on."""
     side = 2 * margin + 1
     columns = int(np.ceil(np.sqrt(len(xy))))
     shape = -(-len(xy) // columns) * side, columns * side
@@ -147,7 +147,9 @@ def _mosaics(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int)
 
 
 def _parts(origin: Array, links: IntArray, tile: int) -> list[IntArray]:
-    """Links that are registered in one task: of whole tiles, or, where they are few, of whole bands of rows."""
+    """Return the links that are registered in one task: of whole tiles, or, where they are few, of whole
+    bands of rows.
+    """
     if not _sparse(origin, PATCH + _TAPS + int(_REACH)):
         return [links[rows] for rows in _joined(_by_tile(origin, tile), _ALL_OF_A_PAIR)]
     order = np.lexsort((origin[:, 0], origin[:, 1] // _BAND))
@@ -157,12 +159,12 @@ def _parts(origin: Array, links: IntArray, tile: int) -> list[IntArray]:
 
 
 def _by_tile(xy: Array, tile: int) -> list[IntArray]:
-    """Rows of the points (N, 2) in every tile, row by row of tiles."""
+    """Return the rows of the points (N, 2) in every tile, row by row of tiles."""
     return grouped(*np.floor(xy[:, ::-1] / tile).astype(np.int64).T)
 
 
 def _joined(groups: Sequence[IntArray], most: int) -> list[IntArray]:
-    """Groups that follow each other as one, as far as they hold so many together."""
+    """Return the groups that follow each other as one, as far as they hold so many together."""
     parts: list[list[IntArray]] = []
     count = most
     for group in groups:
@@ -183,7 +185,7 @@ def register_part(
     structural: bool,
     tile: int,
 ) -> Registration:
-    """Patches registered on their grey values, or on channels of oriented gradients; `ok` where they are alike."""
+    """Register patches by their grey values, or by channels of oriented gradients; `ok` where they are alike."""
     if structural:
         xy, ok, correlation = structure.register_places(files, band, reference, start, linear)
         return Registration(xy, correlation, np.full(len(xy), structure.SIGMA), ok)
@@ -192,7 +194,7 @@ def register_part(
 
 
 def _usable(valid: BoolArray, patch: int) -> BoolArray:
-    """Pixels about which a whole patch is valid and inside."""
+    """Return the pixels about which a whole patch is valid and inside."""
     whole, kernel = valid.astype(np.uint8), np.ones((patch, patch), np.uint8)
     usable: BoolArray = cv2.erode(whole, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
     return usable
@@ -241,7 +243,8 @@ def _at(mask: BoolArray, xy: Array) -> BoolArray:
 
 
 def _upsampled(image: FloatImage) -> FloatImage:
-    """More samples a side, by a windowed sinc; the sample `_FINE` (row, col) is the pixel (row, col).
+    """Resample with more samples a side by a windowed sinc; the sample `_FINE` (row, col) is the pixel (row,
+    col).
 
     Between these a linear sample moves no phase; OpenCV's bicubic one would, by up to a twentieth of the step.
     """
@@ -257,7 +260,7 @@ def _upsampled(image: FloatImage) -> FloatImage:
 
 
 def _kernels() -> list[FloatImage]:
-    """Weights (2 `_TAPS`,) of the pixels about a point, for every fraction of a pixel but 0."""
+    """Return the weights (2 `_TAPS`,) of the pixels about a point, for every fraction of a pixel but 0."""
     kernels = []
     for phase in range(1, _FINE):
         offset = np.arange(1 - _TAPS, _TAPS + 1) - phase / _FINE
@@ -267,7 +270,7 @@ def _kernels() -> list[FloatImage]:
 
 
 def _with_derivatives(image: FloatImage) -> list[FloatImage]:
-    """The pixels (H W,) of an image and their derivatives by column and row."""
+    """Return the pixels (H W,) of an image and their derivatives by column and row."""
     derivative = np.array([1, -8, 0, 8, -1], np.float32) / 12
     smooth = np.array([1, 2, 1], np.float32) / 4
     by_col = cv2.sepFilter2D(image, -1, derivative, smooth)
@@ -290,7 +293,7 @@ class _Template:
         self._root = np.sqrt(self._weight)
 
     def _normalized(self, patches: FloatImage) -> tuple[FloatImage, FloatImage]:
-        """Patches of weighted mean 0 and variance 1, and their standard deviations (N, 1)."""
+        """Return the patches of weighted mean 0 and variance 1, and their standard deviations (N, 1)."""
         mean = (patches @ self._weight)[:, None]
         centred = patches - mean
         deviation = np.sqrt((centred * centred) @ self._weight)[:, None]
@@ -335,7 +338,8 @@ class _Template:
         linear: Array,
         settled: float,
     ) -> tuple[Array, Array, Array]:
-        """Centres after the iterations, the length of each one's last step [px], and the correlation there.
+        """Return the centres after the iterations, the length of each one's last step [px], and the
+        correlation there.
 
         The gain between patches of variance 1, where nothing else is left to fit, is their correlation.
         """
@@ -363,7 +367,7 @@ class _Template:
         return centre, length, gain
 
     def _sample(self, fine: FloatImage, centre: Array, linear: Array) -> FloatImage:
-        """Patches (N, P) of the other image about centres (N, 2) under distortions (N, 2, 2)."""
+        """Return the patches (N, P) of the other image about centres (N, 2) under distortions (N, 2, 2)."""
         offsets = np.stack([self._col, self._row]).astype(np.float32)
         where = _FINE * (linear.astype(np.float32) @ offsets + centre.astype(np.float32)[:, :, None])
         border = cv2.BORDER_REFLECT_101
@@ -419,12 +423,12 @@ class _Links:
         return np.rint(self.tracks.xy[self.reference])
 
     def of(self, part: IntArray) -> tuple[View, View]:
-        """The two views of links that have them in common."""
+        """Return the two views of links that have them in common."""
         ends = self.reference[part[0]], self.other[part[0]]
         return self.views[self.tracks.view[ends[0]]], self.views[self.tracks.view[ends[1]]]
 
     def groups(self, *more: IntArray) -> list[IntArray]:
-        """Indices of the links between the same two views, and of equal values of `more`."""
+        """Return the indices of the links between the same two views, and of equal values of `more`."""
         return grouped(self.tracks.view[self.reference], self.tracks.view[self.other], *more)
 
     def register(
@@ -451,19 +455,23 @@ class _Links:
         return found
 
     def _is_structural(self, part: IntArray) -> bool:
-        """Whether links that have their views in common are of a structural pair."""
+        """Return whether links that have their views in common are of a structural pair."""
         ends = sorted(
             (int(self.tracks.view[self.reference[part[0]]]), int(self.tracks.view[self.other[part[0]]]))
         )
         return (ends[0], ends[1]) in self.structural
 
     def errors(self, found: Registration, group: IntArray) -> tuple[Array, Array]:
-        """Along and across the epipolar lines (M, 2) [px] between two views; half the segments' length (M,)."""
+        """Return the distances along and across the epipolar lines (M, 2) [px] between two views, and half
+        the segments' length (M,).
+        """
         where = frame(*self.of(group), self.origin[group])
         return where.errors(found.xy[group]), where.after
 
     def verified(self, found: Registration, good: BoolArray) -> BoolArray:
-        """Those near their epipolar line, no less certain than others, at one altitude with their track."""
+        """Return the observations near their epipolar line, as certain as others, and at one altitude with
+        their track.
+        """
         verified = np.zeros(len(self), dtype=bool)
         altitude, reach = np.zeros((2, len(self)))  # from the middle of the range, in its halves
         for group in self.groups():
@@ -477,7 +485,9 @@ class _Links:
         return verified & ~self._torn(verified, altitude, reach)
 
     def _torn(self, good: BoolArray, altitude: Array, reach: Array) -> BoolArray:
-        """Links that disagree in altitude with all their neighbours in the track, up to an affine function."""
+        """Return the links that disagree in altitude with all their neighbours in the track, up to an affine
+        function.
+        """
         rows = np.flatnonzero(good & (reach >= _LEAST_REACH))
         first, second = rows[:-1], rows[1:]
         same = self.reference[first] == self.reference[second]
@@ -495,7 +505,7 @@ class _Links:
         return torn
 
     def scaled(self, found: Registration, good: BoolArray) -> Array:
-        """Sigmas [px] made larger where the distances from the epipolar lines are."""
+        """Return the sigmas [px] made larger where the distances from the epipolar lines are."""
         sigma = found.sigma.copy()
         for group in self.groups():
             group = group[good[group]]
@@ -507,14 +517,14 @@ class _Links:
 
 
 def _usual(places: Array, sigma: Array) -> Array:
-    """Median of the sigmas (N,) of the nearest places (N, 2)."""
+    """Return the median of the sigmas (N,) of the nearest places (N, 2)."""
     near = cKDTree(places).query(places, k=min(_ABOUT, len(places)))[1]
     out: Array = np.median(sigma[near.reshape(len(places), -1)], axis=1)
     return out
 
 
 def _shared(tracks: Tracks, of_track: IntArray, rows: IntArray, xy: Array, sigma: Array) -> Tracks:
-    """Registered rows and their references; the variance of a registration is shared by both its ends."""
+    """Return the registered rows and their references; the variance of a registration is shared by both its ends."""
     points = tracks.point[rows]
     count = np.bincount(points, minlength=tracks.num_points)
     variance = np.zeros(len(tracks))
@@ -528,7 +538,7 @@ def _shared(tracks: Tracks, of_track: IntArray, rows: IntArray, xy: Array, sigma
 
 
 def references(tracks: Tracks, spreads: Mapping[tuple[int, int], float], num_views: int) -> IntArray:
-    """Row of the reference observation of every track (P,): the view that is most like the others.
+    """Return the row of the reference observation of every track (P,): the view that is most like the others.
 
     That is where the pairs' spread across the epipolar line [px] is least: it grows with the angle between two views
     and with all else that makes them look different.

@@ -25,7 +25,7 @@ Link = tuple[int, int]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Coarser(Frozen):
-    """The camera of an image whose pixels hold several of another one's.
+    """Camera of an image averaged over whole blocks of pixels.
 
     Parameters
     ----------
@@ -37,32 +37,32 @@ class Coarser(Frozen):
     pixel: Array
 
     def project(self, ground: Array) -> Array:
-        """As of `SensorModel`."""
+        """Project ground points, as in `SensorModel`."""
         return coarser(self.sensor.project(ground), self.pixel)
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """As of `SensorModel`."""
+        """Project ground points with derivatives, as in `SensorModel`."""
         image, jacobian = self.sensor.project_jacobian(ground)
         return coarser(image, self.pixel), jacobian / self.pixel[:, None]
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """As of `SensorModel`."""
+        """Localise image points, as in `SensorModel`."""
         return self.sensor.localize(finer(image, self.pixel), alt)
 
 
 def coarser(xy: Array, pixel: Array) -> Array:
-    """Places (..., 2) [px] counted in pixels that hold several (2,); of one to the bit."""
+    """Return places (..., 2) [px] counted in blocks of pixels (2,); for blocks of one pixel the same bits."""
     return np.asarray((xy - 0.5 * (pixel - 1.0)) / pixel)
 
 
 def finer(xy: Array, pixel: Array) -> Array:
-    """The way back of `coarser`."""
+    """Return places counted in pixels from those in blocks: the inverse of `coarser`."""
     return np.asarray(xy * pixel + 0.5 * (pixel - 1.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """The views of a block, each with its looks."""
+    """Views of a block, each with its looks: averaged versions for partners of coarser pixels."""
 
     views: tuple[View, ...]
     """All looks, those of a view together, itself first."""
@@ -73,7 +73,7 @@ class Looks:
 
     @classmethod
     def at(cls, views: Sequence[View], pairs: Sequence[Pair], apart: bool = True) -> Looks:
-        """The looks that pairs need; without those of other resolutions (`apart`) the views as they are."""
+        """Return the looks that pairs need; with none of other resolutions (`apart`) the views themselves."""
         scale, whole = [_scale(view) for view in views], (1, 1)
         most = [
             (math.isqrt(v.size[0]), math.isqrt(v.size[1])) for v in views
@@ -92,28 +92,31 @@ class Looks:
         return cls(seen, pixel.astype(np.float64).reshape(-1, 2), of, ends)
 
     def pair(self, pair: Pair) -> Pair:
-        """A pair of views as one of looks."""
+        """Return a pair of views as a pair of looks."""
         return replace(pair, views=self.ends[pair.views])
 
     def matches(self, pair: Link, found: Matches) -> Matches:
-        """Matches of two views counted in the pixels of their looks."""
+        """Return matches of two views counted in the pixels of their looks."""
         return replace(found, xy=coarser(found.xy, self.pixel[list(self.ends[pair])]))
 
     def tracks(self, found: Tracks) -> Tracks:
-        """Tracks over looks as tracks over views."""
+        """Return tracks over looks as tracks over views."""
         pixel = self.pixel[found.view]
         sigma = found.sigma * pixel.max(axis=1)
         return Tracks(self.of[found.view], found.point, finer(found.xy, pixel), sigma)
 
 
 def _scale(view: View) -> Array:
-    """Derivative (2, 2) of the place in an image by that on the ground, in its middle [px/m east, px/m north]."""
+    """Return the derivative (2, 2) of the place in an image by that on the ground, in its middle [px/m east,
+    px/m north].
+    """
     ground = view.sensor.localize((np.array(view.size) - 1.0) / 2.0, np.array(view.altitude))
     return view.sensor.project_jacobian(ground)[1][:, :2] / metres_per_unit(ground)[:2]
 
 
 def _pixels(scales: tuple[Array, Array], most: tuple[Link, Link]) -> tuple[Link, Link]:
-    """Columns and rows of two images, of scales (2, 2), that a pixel of their looks holds, `most` of them each.
+    """Return the columns and rows of two images, of scales (2, 2), that a pixel of their looks holds, `most`
+    of them each.
 
     The whole number nearest to the other's pixel over its own, along either axis: below a ratio of 1.5 images are
     compared as they are, above it by pixels that differ by a third at most. Registration takes that for distortion.
@@ -129,6 +132,6 @@ def _pixels(scales: tuple[Array, Array], most: tuple[Link, Link]) -> tuple[Link,
 
 
 def _look(view: View, pixel: Link) -> View:
-    """A view by means of so many columns and rows."""
+    """Return a view by means of so many columns and rows."""
     size = view.size[0] // pixel[0], view.size[1] // pixel[1]
     return replace(view, size=size, sensor=Coarser(view.sensor, np.array(pixel, dtype=np.float64)))

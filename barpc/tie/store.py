@@ -32,7 +32,7 @@ class Store:
     scratch = "arrays"  # where names of a run that need not outlive it begin
 
     def write(self, name: str, arrays: Arrays) -> None:
-        """Keep named arrays, whole or not at all; not if a file that they were made of has changed."""
+        """Write named arrays, whole or not at all; not if a file that they were made of has changed."""
         identity.ask()
         path = Path(self.folder) / f"{name}.npz"
         with (
@@ -42,7 +42,7 @@ class Store:
             np.savez(file, **arrays)  # type: ignore[arg-type]
 
     def read(self, name: str) -> Arrays | None:
-        """Arrays of a name; None where it is missing or damaged."""
+        """Read the arrays of a name; None where it is missing or damaged."""
         path = Path(self.folder) / f"{name}.npz"
         try:
             return None if path.is_symlink() or not path.is_file() else load_npz(path)
@@ -50,7 +50,7 @@ class Store:
             return None
 
     def need(self, name: str) -> Arrays:
-        """Arrays of a name that was written before; InputError where this worker does not find it."""
+        """Return the arrays of a name that was written before; InputError where this worker does not find it."""
         found = self.read(name)
         if found is None:
             raise InputError(
@@ -60,13 +60,13 @@ class Store:
         return found
 
     def clear(self) -> None:
-        """Take away what lies under `scratch`."""
+        """Remove what lies under `scratch`."""
         shutil.rmtree(Path(self.folder) / self.scratch, ignore_errors=True)
 
 
 @contextmanager
 def store_of(executor: Executor | None) -> Iterator[Store]:
-    """The executor's store (`barpc.pipeline.executor`), or a temporary one."""
+    """Yield the executor's store (`barpc.pipeline.executor`), or a temporary one."""
     given: Store | None = getattr(executor, "store", None)
     if given is not None:
         yield given
@@ -78,7 +78,9 @@ def store_of(executor: Executor | None) -> Iterator[Store]:
 def names_of(
     executor: Executor | None, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]
 ) -> list[str]:
-    """Names for results: by the content of inputs where the executor knows it, so that a later run finds them."""
+    """Return names for results, by the content of inputs where the executor knows it, so that a later run
+    finds them.
+    """
     key = getattr(executor, "key", None)
     names = (key(function, task) if key else number for number, task in enumerate(tasks))
     return [f"{function.__name__}/{name}" for name in names]

@@ -49,7 +49,7 @@ _INNER = 16  # px: the last look sees less, so that it is the place itself that 
 
 
 class Structure:
-    """The place in each point's band that looks most alike, where nothing beside the band is more alike."""
+    """A matcher of gradient structure: the most alike place in each point's band, where no decoy is more alike."""
 
     detects: ClassVar[bool] = False
     patch: ClassVar[float] = 4.0 * _HALF
@@ -60,7 +60,8 @@ class Structure:
         self._known: tuple[Callable[[Array], Frame], Matches] | None = None
 
     def match(self, a: View, b: View, prediction: Prediction) -> Matches:
-        """Points of a grid whose best place, in the band and to both sides of it, lies in the band.
+        """Match a grid of points: those whose best place, in the band and in decoys to both sides, lies in
+        the band.
 
         All bands of a prediction, moved aside or not, are looked at at once; the next calls ask of what was found.
         """
@@ -88,7 +89,7 @@ class _Search:
         self._step, self._points = self._level(float(np.median(lengths)) if len(lengths) else 0.0, windows)
 
     def _level(self, half: float, windows: Sequence[Box]) -> tuple[int, Array]:
-        """Step of the picture for bands of half a length [px of B], and the points of the grid."""
+        """Return the step of the picture for bands of half a length [px of B], and the points of the grid."""
         if not windows:
             return 1, np.empty((0, 2))
         if self._prediction.probes is None:
@@ -107,7 +108,7 @@ class _Search:
         return step, np.concatenate([_lattice(box, pitch) for box in windows])
 
     def matches(self) -> Matches:
-        """The best place of every point, on whole bands; found again in finer pictures."""
+        """Return the best place of every point, on whole bands; found again in finer pictures."""
         a, b = self._views
         where = self._prediction.where(self._points)
         middle = 0.5 * (where.before + where.after)
@@ -146,7 +147,7 @@ class _Search:
         return Matches.of_places(np.stack([at, xy], axis=1), score)
 
     def _tile(self, where: Frame, rows: IntArray) -> tuple[Array, Array, Array]:
-        """Points of A, their best places in B and how unlike these look, of some rows."""
+        """Return the points of A, their best places in B and how unlike these look, of some rows."""
         at, asked = self._points[rows], self._prediction
         reach_along, slope = 0.5 * (where.after - where.before)[rows], where.slope[rows]
         middle = 0.5 * (where.before + where.after)
@@ -183,7 +184,9 @@ class _Search:
         return at[ok], tile.in_b(place)[ok], 1.0 - score[ok]
 
     def _part_in_b(self, where: Frame, middle: Array, rows: IntArray, wide: float) -> tuple[float, float]:
-        """Middle and half the length [px] of what a tile's segments have in B, from their middles: one for all."""
+        """Return the middle and half the length [px] of what a tile's segments have in B, from their middles:
+        one for all.
+        """
         start = where.place(middle)[rows]
         step = where.place(middle + 1.0)[rows] - start
         size = np.array(self._files[1][1], dtype=np.float64)
@@ -199,12 +202,12 @@ class _Search:
 
 
 def _resolution(linear: Array) -> int:
-    """Pixels of A in one of B, where these are larger, as a power of two."""
+    """Return the pixels of A in one of B, where these are larger, as a power of two."""
     return 1 << int(np.rint(np.log2(max(1.0, abs(float(np.linalg.det(linear))) ** -0.5))).clip(0, 6))
 
 
 def _lattice(box: Box, pitch: int) -> Array:
-    """Points (n, 2) in a box whose coordinates are multiples of the pitch."""
+    """Return the points (n, 2) in a box whose coordinates are multiples of the pitch."""
     axes = [
         np.arange(-(-first // pitch) * pitch, first + length, pitch)
         for first, length in zip(box[:2], box[2:], strict=True)
@@ -215,7 +218,9 @@ def _lattice(box: Box, pitch: int) -> Array:
 def _found(
     files: Files, band: int, step: int, at: Array, xy: Array, linear: Array, half: int = _HALF
 ) -> tuple[Array, BoolArray, Array]:
-    """Places (n, 2) near those given, whether they stand out and the way back ends at its start; correlations."""
+    """Return the places (n, 2) near those given, whether they stand out and the way back ends at its start;
+    correlations.
+    """
     tile = Tile.of(files, band, step, at, xy, linear, np.array([_FINER, _FINER]), half)
     surface = tile.surfaces()
     place, score = tile.peaks(surface)
@@ -226,7 +231,7 @@ def _found(
 def register_places(
     files: Files, band: int, reference: Array, start: Array, linear: Array
 ) -> tuple[Array, BoolArray, Array]:
-    """Patches of A at `reference` found again about `start` (n, 2) [px] of B: places, whether, correlations.
+    """Register patches of A at `reference` about `start` (n, 2) [px] of B: places, success, correlations.
 
     On the channels, at the coarser of the two resolutions, and then at half its step: what is sharper than a pixel is
     lost between whole ones.
@@ -245,7 +250,7 @@ def register_places(
 
 @dataclass(frozen=True, eq=False)
 class Tile:
-    """Points of A and where in B they are looked for, in pictures of the same resolution and orientation."""
+    """Pictures around points of A and their search areas in B, of the same resolution and orientation."""
 
     pictures: tuple[FloatImage, FloatImage]  # channels (C, H, W) of A and of B
     at: IntArray  # (n, 2) in the first
@@ -269,7 +274,7 @@ class Tile:
         half: int,
         blurs: tuple[float, float] = COARSE,
     ) -> Tile:
-        """The pictures of two images about points of A and B (n, 2) [px]."""
+        """Return the pictures of two images about points of A and B (n, 2) [px]."""
         matrix, pad = step * linear, half + _PAD
         corner = np.floor(at.min(axis=0) / step) * step - pad * step
         first = np.rint((at - corner) / step).astype(np.int64)
@@ -286,7 +291,7 @@ class Tile:
         return cls(pictures, first, whole, place - whole, reach, half, matrix, origin)
 
     def surfaces(self) -> FloatImage:
-        """Correlations (n, y, x) at all places within reach."""
+        """Return the correlations (n, y, x) at all places within reach."""
         x, y = (self.half + self.reach).tolist()
         parts = [
             correlation(
@@ -303,12 +308,12 @@ class Tile:
         return [slice(i, i + batch) for i in range(0, len(self.at), batch)]
 
     def offsets(self) -> Array:
-        """How far in B (y, x, 2) [px] the places of a surface lie from the whole px."""
+        """Return the offsets (y, x, 2) [px] in B of the places of a surface from the whole pixel."""
         axes = (np.arange(-n, n + 1) for n in self.reach.tolist())
         return np.stack(np.meshgrid(*axes), axis=-1) @ self.matrix.T
 
     def peaks(self, surface: FloatImage) -> tuple[Array, Array]:
-        """Best places (n, 2) in the second picture, to a part of a pixel, and correlations there (n,)."""
+        """Return the best places (n, 2) in the second picture, to sub-pixel precision, and their correlations (n,)."""
         n, height, width = surface.shape
         flat = surface.reshape(n, -1).argmax(axis=1)
         y, x = np.divmod(flat, width)
@@ -323,7 +328,7 @@ class Tile:
         return self.whole + np.stack([x, y], axis=1) - self.reach + part, score
 
     def returns(self, place: Array) -> BoolArray:
-        """Whether what is at places of the second picture is found where it is looked for from."""
+        """Return whether matching back from places of the second picture ends where it began."""
         search, missed = 4, []
         for i in self._batches():
             there = cut(self.pictures[1], np.rint(place[i]).astype(np.int64), self.half, self.half)
@@ -335,12 +340,12 @@ class Tile:
         return np.asarray(np.concatenate(missed) <= _BACK)
 
     def shown(self) -> BoolArray:
-        """Templates that are pictures."""
+        """Return the templates that hold structure."""
         known = (np.abs(self.pictures[0]).sum(axis=0, keepdims=True) > 0).astype(np.float32)
         return np.asarray(cut(known, self.at, self.half, self.half).mean(axis=(1, 2, 3)) > _SHOWN)
 
     def in_b(self, place: Array) -> Array:
-        """Places (n, 2) of the second picture in B [px]."""
+        """Return the places (n, 2) of the second picture in B [px]."""
         return np.asarray(self.origin + place @ self.matrix.T)
 
 
@@ -352,7 +357,7 @@ def _seen(
     size: IntArray,
     blurs: tuple[float, float],
 ) -> FloatImage:
-    """Channels (C, H, W) of an image on a grid: pixel k at `origin` + `matrix` k."""
+    """Return the channels (C, H, W) of an image on a grid: pixel k at `origin` + `matrix` k."""
     shape = int(size[1]), int(size[0])
     nodes = np.stack(np.meshgrid(ticks(shape[1]), ticks(shape[0])), axis=-1)
     return channels(*picture(file[0], (band,), file[1], origin + nodes @ matrix.T, shape), blurs)

@@ -18,7 +18,8 @@ def ordered(
     stage: str,
     progress: Progress | None = None,
 ) -> list[Any]:
-    """Results of `function(*task)` in the order of the tasks; the rest is cancelled when one fails.
+    """Run `function(*task)` on an executor and return the results in order; the rest is cancelled when one
+    fails.
 
     Parameters
     ----------
@@ -39,7 +40,7 @@ def one_by_one(
     stage: str,
     progress: Progress | None = None,
 ) -> Iterator[Any]:
-    """As `ordered`, each result as it comes: none is kept here."""
+    """Run tasks as `ordered`, but yield each result as it comes and keep none."""
     futures = deque(executor.submit(function, *task) for task in tasks) if executor is not None else deque()
     try:
         for done, task in enumerate(tasks, start=1):

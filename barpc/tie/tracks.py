@@ -55,7 +55,7 @@ _QUOTAS = (4, 8, 16)
 
 @dataclass(frozen=True, eq=False)
 class TieResult:
-    """Tie points, and how they came about."""
+    """Tie points and the reports of their pairs."""
 
     tracks: Tracks
     pairs: tuple[PairReport, ...]  # one a pair that was tried
@@ -80,19 +80,18 @@ def find_tracks(
     views : sequence of View
         At least two; in a second pass with their corrected cameras, `replace(view, sensor=...)`.
     options : TieOptions
-        How.
+        Options of the search.
     executor, progress : optional
-        Who does the work, and who hears how far it is: see `ordered`. The result does not depend on them.
+        Executor of the tasks, and callable for progress: see `ordered`. The result does not depend on them.
     only : sequence of (int, int)
         Match these pairs and no others.
     area : Area, optional
-        Tie points only here, as the cameras see it; None: everywhere.
+        Area in which tie points are looked for, as the cameras see it; None: everywhere.
     given : mapping of (int, int), ascending, to Matches
-        Pairs that others have matched: verified and registered as the rest, which is matched here; on channels where
-        grey values do not compare. Where too few can be registered they are taken at their places, as exact as they
-        were found.
+        Matches given for some pairs: verified and registered like those of the other pairs, which are matched
+        here. Where too few can be registered, they keep their places with the measured standard deviation.
     terrain : callable, optional
-        lon, lat (n,) [deg] -> altitude [m above the ellipsoid], NaN outside: where structure is looked for.
+        lon, lat (n,) [deg] -> altitude [m above the ellipsoid], NaN outside: narrows the search for structure.
 
     Raises
     ------
@@ -122,7 +121,7 @@ def find_tracks(
 def _registered(
     trials: _Trials, area: Area | None, given: GivenMatches, options: TieOptions, work: dict[str, Any]
 ) -> tuple[Tracks, dict[tuple[int, int], int]]:
-    """What the pairs that were tried have in common, evenly thinned and registered, and how much of it is not."""
+    """Link, thin and register the matches of the pairs tried; return also how many could not be registered."""
     looks, most = trials.looks, options.points_per_image
     tried = [(looks.ends[views], *trials.tried[views][1:]) for views in sorted(trials.tried)]
     linked = inside(looks.views, link([ends for ends, _, _ in tried], [found for _, found, _ in tried]), area)
@@ -147,7 +146,7 @@ def _registered(
 def _needed(
     looks: Looks, tracks: Tracks, pairs: Sequence[tuple[int, int]], options: TieOptions
 ) -> set[tuple[int, int]]:
-    """The pairs of looks between views that no pair with enough registered tracks connects."""
+    """Return the pairs of looks between views that no pair with enough registered tracks connects."""
     counts = pair_counts(tracks)
     firm = [
         (int(looks.of[i]), int(looks.of[j])) for i, j in pairs if counts.get((i, j), 0) >= options.min_matches
@@ -179,7 +178,7 @@ class _Trials:
         self._scores: dict[tuple[int, int], int] = {}
 
     def run(self, pool: Sequence[Pair], all_of_them: bool) -> None:
-        """Try the best pairs of a pool, or all, and others in place of those that fail."""
+        """Match the best pairs of a pool, or all, and others in place of those that fail."""
         own = self._options.matcher in MATCHERS  # another one reads the files itself
         self.looks = Looks.at(self._views, pool, apart=own)
         self._keypoints = [KeypointFiles(self._store)] * len(self.looks.views)
@@ -213,12 +212,12 @@ class _Trials:
 
     @property
     def keypoints(self) -> tuple[int, ...]:
-        """How many were found in each view."""
+        """Number of keypoints found in each view."""
         count = np.bincount(self.looks.of, weights=[len(k) for k in self._keypoints])
         return tuple(count.astype(int).tolist())
 
     def _judged(self, pairs: Sequence[Pair]) -> list[Pair]:
-        """Pairs with their quick scores, where keypoints can tell."""
+        """Return the pairs with their quick scores, where keypoints can tell."""
         new = [
             p for p in pairs if self._compares and p.views not in self._given and p.views not in self._scores
         ]
@@ -247,7 +246,9 @@ class _Trials:
     def _matched(
         self, pairs: Sequence[Pair], before: Sequence[tuple[tuple[View, View], Matches]]
     ) -> list[tuple[Matches, PairReport]]:
-        """Matches of pairs of looks by a first look, and by a closer one at those of which that shows too little."""
+        """Return the matches of pairs of looks by a first look, and by a closer one at those of which that
+        shows too little.
+        """
         views, options, keypoints = self.looks.views, self._options, self._keypoints
         first = match(views, keypoints, pairs, options, once=True, **self._work) if self._coarse else []
         found = {p.views: one for p, one in zip(pairs, first, strict=False) if ample(one[1], options)}
@@ -269,7 +270,9 @@ class _Trials:
 def _unlike(
     views: Sequence[View], given: GivenMatches, options: TieOptions, work: Mapping[str, Any]
 ) -> list[tuple[int, int]]:
-    """The given pairs whose grey values do not compare: too few of their matches could be registered by these."""
+    """Return the given pairs whose grey values do not compare: too few of their matches could be registered
+    by these.
+    """
     some = {
         pair: m.select(np.linspace(0, len(m) - 1, min(len(m), THIN)).astype(int)) for pair, m in given.items()
     }
@@ -282,7 +285,7 @@ def _unlike(
 def _with_unregistered(
     views: Sequence[View], tracks: Tracks, given: GivenMatches, options: TieOptions
 ) -> Tracks:
-    """Tracks, and the verified matches of those of some pairs of which too few could be registered."""
+    """Return the tracks, and the verified matches of those of some pairs of which too few could be registered."""
     counts = pair_counts(tracks)
     lost = [pair for pair in given if counts.get(pair, 0) < options.min_matches]
     if not lost:
@@ -297,7 +300,9 @@ def _with_unregistered(
 
 
 def _joined(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
-    """Registered tracks and others: one that stands beside a registered one is the same point, seen by more views."""
+    """Return the registered tracks and others: one that stands beside a registered one is the same point,
+    seen by more views.
+    """
     known, asked = (np.array([_APART * part.view, *part.xy.T]).T for part in (tracks, others))
     near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=_SAME))
     same = np.flatnonzero(np.isfinite(near))
@@ -323,7 +328,7 @@ def _joined(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
 
 
 def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
-    """The tracks whose ground points lie in an area, all without one; TiePointError where none does."""
+    """Return the tracks whose ground points lie in an area, all without one; TiePointError where none does."""
     if area is None or not len(tracks):
         return tracks
     cameras = [view.sensor for view in views]
@@ -360,7 +365,7 @@ def require_tracks(
     pairs: Sequence[Pair],
     reports: Sequence[PairReport],
 ) -> None:
-    """As `require_matches`, for the pairs that `NEEDED` tracks or more are left of."""
+    """Raise as `require_matches`, for the pairs that keep `NEEDED` tracks or more."""
     left, counts = [], pair_counts(tracks)
     for pair, report in zip(pairs, reports, strict=True):
         common = counts.get(pair.views, 0)
@@ -370,7 +375,8 @@ def require_tracks(
 
 
 def link(pairs: Sequence[tuple[int, int]], matches: Sequence[Matches]) -> Tracks:
-    """Join matches of pairs of views that share points; a track that meets a view twice is thrown away.
+    """Link matches of pairs of views into tracks by shared points; a track that meets a view twice is thrown
+    away.
 
     The order of the pairs does not matter: tracks are ordered by their first observation. An observation's sigma is
     that of the best match it took part in.
@@ -389,7 +395,7 @@ def link(pairs: Sequence[tuple[int, int]], matches: Sequence[Matches]) -> Tracks
 
 
 def _clean(view: IntArray, label: IntArray, xy: Array, sigma: Array) -> Tracks:
-    """Rows grouped by track and sorted by view; tracks with two points of one view dropped."""
+    """Return the rows grouped by track and sorted by view; tracks with two points of one view dropped."""
     order = np.lexsort((view, label))
     view, label, xy, sigma = view[order], label[order], xy[order], sigma[order]
     twice = (np.diff(view) == 0) & (np.diff(label) == 0)
@@ -404,7 +410,7 @@ def _clean(view: IntArray, label: IntArray, xy: Array, sigma: Array) -> Tracks:
 
 
 def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], most: int) -> Tracks:
-    """Fewer tracks, evenly spread: long and accurate ones first, about `most` observations in an image.
+    """Thin tracks evenly: long and accurate ones first, about `most` observations in an image.
 
     `sizes` are those (width, height) of the images. A track is taken where a cell of one of its views is not full yet.
     """
@@ -421,7 +427,9 @@ def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], most: int) -> Tracks:
 
 
 def _fill(tracks: Tracks, cell: list[int], num_cells: int, most: int, num_views: int) -> BoolArray:
-    """Mask of the tracks that are taken, greedily, in rounds of growing quota where images have empty parts."""
+    """Return the mask of the tracks that are taken, greedily, in rounds of growing quota where images have
+    empty parts.
+    """
     starts = np.searchsorted(tracks.point, np.arange(tracks.num_points + 1))
     worst = np.maximum.reduceat(tracks.sigma, starts[:-1])
     # Knuth's multiplicative hash: an order without direction among equals
@@ -448,7 +456,7 @@ def _fill(tracks: Tracks, cell: list[int], num_cells: int, most: int, num_views:
 
 
 def pair_counts(tracks: Tracks) -> dict[tuple[int, int], int]:
-    """How many tracks the pairs of views, ascending, have in common; only those that have any."""
+    """Count the tracks that pairs of views, ascending, have in common; only pairs that have any."""
     found, step, num = [np.empty(0, np.int64)], 1, int(tracks.view.max(initial=0)) + 1
     while step < len(tracks) and (same := tracks.point[step:] == tracks.point[:-step]).any():
         found.append(tracks.view[:-step][same] * num + tracks.view[step:][same])
@@ -458,7 +466,7 @@ def pair_counts(tracks: Tracks) -> dict[tuple[int, int], int]:
 
 
 def common_tracks(tracks: Tracks, first: int, second: int) -> tuple[Array, Array]:
-    """Image points (M, 2), (M, 2) [px] of the tracks that two views have in common, in the same order."""
+    """Return image points (M, 2), (M, 2) [px] of the tracks that two views have in common, in the same order."""
     a, b = tracks.view == first, tracks.view == second
     _, rows_a, rows_b = np.intersect1d(tracks.point[a], tracks.point[b], return_indices=True)
     return tracks.xy[a][rows_a], tracks.xy[b][rows_b]

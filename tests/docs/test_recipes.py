@@ -28,7 +28,7 @@ LATE = (
     "absolute",
     "dates",
     "drift",
-    "json",
+    "export",
     "matches",
 )  # five seconds or more each, and more of the same kind
 

@@ -204,7 +204,7 @@ class Summary(Record):
 
 
 def published_schema() -> dict[str, Any]:
-    """The JSON schema of summary.json."""
+    """Return the JSON schema of summary.json."""
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "summary.json of a barpc run",
@@ -214,7 +214,7 @@ def published_schema() -> dict[str, Any]:
 
 
 def measure(run: Run) -> Summary:
-    """The summary of a run, without the verdict on it. Numbers may be NaN here."""
+    """Return the summary of a run, without the verdict on it. Numbers may be NaN here."""
     usable, written = int(np.isfinite(run.ground).all(axis=1).sum()), len(run.written_tracks)
     lengths = np.bincount(np.bincount(run.tracks.point))
     names = ("numpy", "scipy", "opencv-python-headless", "rasterio", "shapely")

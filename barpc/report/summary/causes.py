@@ -92,7 +92,7 @@ class HeldOutEntry(Record):
 
 
 def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
-    """What was taken, the first first."""
+    """Return what was taken, the first first."""
     found = []
     if (apart := adjustment.apart) is not None and apart.clear and np.isfinite(apart.gain):
         other = None if apart.runner_up is None else f"{APART}: {adjustment.names[apart.runner_up]}"
@@ -130,7 +130,7 @@ def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
 
 
 def strangeness(apart: Apart) -> str:
-    """What is known of a view whose RPC is not its own."""
+    """Return what is known of a view whose RPC is not its own."""
     look, met = apart.look, "it would agree with the other images as well as is stated of it"
     if look.swapped:
         return f"with its axes swapped, samples taken for lines, {met}"
@@ -175,7 +175,7 @@ def _moving(one: Finding, motion: Motion, names: Sequence[str]) -> ExplanationEn
 
 
 def _place(motion: Motion) -> str:
-    """Where most of a group lies: a side of the block where it is on one, and longitudes and latitudes."""
+    """Return where most of a group lies: a side of the block where it is on one, and longitudes and latitudes."""
     west, south, east, north = motion.box
     # as many digits as tell the ends apart by a hundredth: of a scene of any size
     size = max(min((east - west) % 360.0, north - south), 1e-6)
@@ -193,12 +193,12 @@ def _degrees(low: float, high: float, sides: str, digits: int) -> str:
 
 
 def left_entries(adjustment: Adjustment) -> tuple[LeftEntry, ...]:
-    """Where something stands out at the end, the most first."""
+    """Return where something stands out at the end, the most first."""
     return tuple(_left(one, adjustment.names) for one in adjustment.left)
 
 
 def held_out_places(places: Sequence[Place], names: Sequence[str]) -> tuple[HeldOutEntry, ...]:
-    """Where tie points that took no part are met worse, the surest first."""
+    """Return where tie points that took no part are met worse, the surest first."""
     return tuple(
         HeldOutEntry(
             names[one.view],
@@ -215,7 +215,7 @@ def held_out_places(places: Sequence[Place], names: Sequence[str]) -> tuple[Held
 
 
 def held_out_place(one: Place, names: Sequence[str]) -> str:
-    """The same of one, in words."""
+    """Return the same of one, in words."""
     ends = [
         f"{axis} {side[0]:.0f}-{side[1] - 1.0:.0f}"
         for axis, side in (("rows", one.rows), ("columns", one.columns))

@@ -158,7 +158,7 @@ class CheckPointEntry(KnownPoint):
 
 
 def measure_gcps(run: Run) -> tuple[GcpEntry, ...]:
-    """Ground control, and what the adjustment said of it."""
+    """Return the ground control, and what the adjustment said of it."""
     points = run.gcps
     if points is None:
         return ()
@@ -198,7 +198,7 @@ def _worst_in_images(run: Run, tests: Sequence[ControlResidual]) -> dict[str, An
 
 
 def measure_control(run: Run) -> ControlTestEntry | None:
-    """Every residual of control in the images in units of its own deviation; None without any."""
+    """Return every residual of control in the images in units of its own deviation; None without any."""
     tests = run.control_tests
     if not tests:
         return None
@@ -210,13 +210,15 @@ def measure_control(run: Run) -> ControlTestEntry | None:
 
 
 def _grouped(index: IntArray, num: int) -> list[IntArray]:
-    """The places in `index` (n,) of each number below `num`."""
+    """Return the places in `index` (n,) of each number below `num`."""
     order = np.argsort(index, kind="stable")
     return np.split(order, np.searchsorted(index[order], np.arange(1, num)))[:num]
 
 
 def _in_images(run: Run, given: Array, views: IntArray, residual: Array) -> float:
-    """How far a residual (3,), east, north, up [m], of a ground point moves it in the images that show it, RMS [px]."""
+    """Return how far a residual (3,), east, north, up [m], of a ground point moves it in the images that show
+    it, RMS [px].
+    """
     if run.after is None or not np.isfinite(residual).all():
         return float("nan")
     moved = ground_from_ecef(ecef_from_ground(given) + residual @ enu_basis(given))
@@ -225,7 +227,7 @@ def _in_images(run: Run, given: Array, views: IntArray, residual: Array) -> floa
 
 
 def measure_reference(run: Run) -> ReferenceEntry | None:
-    """What an orthoimage said of each image; None without one."""
+    """Return what an orthoimage said of each image; None without one."""
     found, adjustment = run.reference, run.adjustment
     if found is None:
         return None
@@ -252,7 +254,9 @@ def measure_reference(run: Run) -> ReferenceEntry | None:
 
 
 def measure_check_points(run: Run) -> tuple[CheckPointEntry, ...]:
-    """Points that stayed out of the adjustment: image residuals of each observation, and the ground error."""
+    """Return the points that stayed out of the adjustment: image residuals of each observation, and the
+    ground error.
+    """
     points = run.check_points
     if points is None:
         return ()

@@ -111,7 +111,7 @@ class PairEntry(Record):
 
 
 def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
-    """Every two images with tie points in common."""
+    """Return every two images with tie points in common."""
     reports = {report.names: report for report in run.matched}
     geometry, before = _pair_geometry(run), _pair_offsets(run, run.before, run.altitudes_before)
     after: list[OffsetEntry | None] = [None] * len(before)
@@ -133,7 +133,9 @@ def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
 
 
 def _pair_geometry(run: Run) -> list[list[float]]:
-    """Medians over about a hundred of each pair's points: convergence angle [deg], B/H, height of a pixel [m]."""
+    """Return the medians over about a hundred of each pair's points: convergence angle [deg], B/H, height of
+    a pixel [m].
+    """
     picks = [slice(None, None, max(1, len(ties.a) // 100)) for ties in run.pairs]
     a, b, pair = _rows(run, picks)
     seen = np.isfinite(run.ground[run.tracks.point[a]]).all(axis=1)
@@ -149,7 +151,7 @@ def _pair_geometry(run: Run) -> list[list[float]]:
 
 
 def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> list[OffsetEntry | None]:
-    """The epipolar offsets of each pair's matches.
+    """Return the epipolar offsets of each pair's matches.
 
     The tracks' altitudes (P,) [m] through these cameras are so near to where a pair's own rays pass each other that
     two steps from there arrive.
@@ -185,7 +187,7 @@ def _rows(run: Run, picks: Sequence[slice | IntArray]) -> tuple[IntArray, IntArr
 
 
 def medians(values: Array, group: IntArray, num: int) -> Array:
-    """The median (num,) of each group of values (n,); NaN without any."""
+    """Return the median (num,) of each group of values (n,); NaN without any."""
     ordered = values[np.lexsort((values, group))]
     count = np.bincount(group, minlength=num)
     start, some = np.cumsum(count) - count, count > 0

@@ -27,7 +27,8 @@ class EllipseEntry(Record):
 
 
 def shift_in_image(model: Corrected, covariance: Array, unknowns: str, ground: Array) -> tuple[Array, Array]:
-    """How far P_BA moves a ground point (3,) near the middle of the image, and the standard deviation of that.
+    """Return how far P_BA moves a ground point (3,) near the middle of the image, and the standard deviation
+    of that.
 
     Parameters
     ----------
@@ -50,7 +51,9 @@ def shift_in_image(model: Corrected, covariance: Array, unknowns: str, ground: A
 
 
 def ellipse(model: Corrected, covariance: Array, unknowns: str, ground: Array) -> EllipseEntry:
-    """The standard error ellipse of the place on the ground where P_BA sees a pixel; arguments of `shift_in_image`."""
+    """Return the standard error ellipse of the place on the ground where P_BA sees a pixel; arguments of
+    `shift_in_image`.
+    """
     _, variance, by_point = _in_image(model, covariance, unknowns, ground)
     return _drawn(variance, by_point @ enu_basis(ground)[:2].T)
 
@@ -69,7 +72,7 @@ def clocks_in_image(model: Timed, covariance: Array, ground: Array) -> tuple[Arr
 
 
 def _drawn(variance: Array, by_level: Array) -> EllipseEntry:
-    """The ellipse of a covariance [px^2] in an image, of its derivative (2, 2) [px/m] by east and north."""
+    """Return the ellipse of a covariance [px^2] in an image, of its derivative (2, 2) [px/m] by east and north."""
     seen = np.linalg.inv(by_level)  # at one altitude
     values, axes = np.linalg.eigh(seen @ variance @ seen.T)
     minor, major = np.sqrt(np.maximum(values, 0.0)).tolist()
@@ -80,7 +83,9 @@ def _drawn(variance: Array, by_level: Array) -> EllipseEntry:
 def _in_image(
     model: Corrected, covariance: Array, unknowns: str, ground: Array
 ) -> tuple[Array, Array, Array]:
-    """Image (2,) of a ground point, the covariance (2, 2) of that [px^2], its derivative (2, 3) by the point [px/m]."""
+    """Return the image (2,) of a ground point, the covariance (2, 2) of that [px^2], its derivative (2, 3) by
+    the point [px/m].
+    """
     ecef = ecef_from_ground(ground)
     image, by_point, by_rotation, by_translation = model.project_ecef(ecef)
     distance = np.linalg.norm(ecef - model.correction.center)
@@ -91,7 +96,7 @@ def _in_image(
 
 
 def stated_ce90(view: View) -> float | None:
-    """CE90 [m] of a camera as delivered, of the accuracies per axis that it states."""
+    """Return CE90 [m] of a camera as delivered, of the accuracies per axis that it states."""
     sensor, sigma = view.sensor, None
     if isinstance(sensor, Pushbroom) and sensor.accuracy is not None:
         sigma = float(np.hypot(*sensor.accuracy))
@@ -101,7 +106,8 @@ def stated_ce90(view: View) -> float | None:
 
 
 def ce90(major: float, minor: float) -> float:
-    """Radius of the circle that holds 90 % of a normal distribution with such standard deviations along its axes.
+    """Return the radius of the circle that holds 90 % of a normal distribution with such standard deviations
+    along its axes.
 
     Examples
     --------
@@ -114,7 +120,7 @@ def ce90(major: float, minor: float) -> float:
 
 @cache
 def _radii() -> tuple[Array, Array]:
-    """The radius for a larger axis of one, by the smaller one: the integral over x of what y holds, bisected."""
+    """Return the radius for a larger axis of one, by the smaller one: the integral over x of what y holds, bisected."""
     ratio = np.linspace(0.0, 1.0, 101)
     nodes, weights = np.polynomial.legendre.leggauss(64)
     low, high = np.full(len(ratio), 1.6), np.full(len(ratio), 2.2)

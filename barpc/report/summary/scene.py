@@ -99,7 +99,7 @@ class DatumEntry(Record):
 
     @classmethod
     def columns(cls, entries: Sequence[DatumEntry]) -> str:
-        """The columns of a table: sources that tell nothing of any motion are left out."""
+        """Return the columns of a table: sources that tell nothing of any motion are left out."""
         told = [name for name in _DATUM_HEADS if any((getattr(one, name) or 0.0) >= 0.005 for one in entries)]
         return " ".join(["part", "sigma_m", *told])
 
@@ -206,7 +206,7 @@ _DEM = attrgetter("held", "known", "total", "offset", "spread", "sigma", "alike"
 
 
 def measure_scene(run: Run) -> SceneEntry | None:
-    """The block as a whole; None for a check."""
+    """Return the block as a whole; None for a check."""
     adjustment = run.adjustment
     if adjustment is None:
         return None
@@ -268,12 +268,14 @@ def _asked(adjustment: Adjustment, what: str) -> AskedEntry | None:
 
 
 def mode_in_words(mode: Mode) -> str:
-    """One weak mode of the scene as a sentence without its full stop."""
+    """Return one weak mode of the scene as a sentence without its full stop."""
     return _MODE_WORDS[mode.meaning].format(metres(mode.sigma))
 
 
 def moving_cells(run: Run) -> tuple[MovingEntry, ...]:
-    """Cells of the ground of which tie points move, from south to north and west to east; all groups together."""
+    """Return the cells of the ground of which tie points move, from south to north and west to east; all
+    groups together.
+    """
     found = run.adjustment
     if found is None or not found.moving.any():
         return ()

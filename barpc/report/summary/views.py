@@ -263,7 +263,7 @@ def _fit_entry(fit: RpcFit) -> FitEntry:
 
 
 def measure_views(run: Run) -> tuple[ViewEntry, ...]:
-    """Every image of a run; the verdict on it is still to come."""
+    """Return every image of a run; the verdict on it is still to come."""
     num, tracks, keep, adjustment = len(run.views), run.tracks, run.keep, run.adjustment
     after = run.ties_after
     first = rmse_by_view(run.ties_before.residuals[keep], tracks.view[keep], num)
@@ -316,7 +316,7 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
 
 
 def _certified(run: Run, number: int) -> tuple[Any, ...]:
-    """Ground points at the ends of an image and its altitudes, and where its new camera sees them."""
+    """Return the ground points at the ends of an image and its altitudes, and where its new camera sees them."""
     assert run.adjustment is not None
     view, model = run.views[number], run.adjustment.sensors[number]
     ground = model.localize(*image_grid(view.size, view.alt_range, (3, 2)))
@@ -329,20 +329,20 @@ def _control(worst: ControlResidual | None) -> dict[str, Any]:
 
 
 def _middles(run: Run) -> Array:
-    """The ground (N, 3) in the middle of each image, at the altitude of the scene."""
+    """Return the ground (N, 3) in the middle of each image, at the altitude of the scene."""
     at = (np.array([view.size for view in run.views]) - 1) / 2
     return Several(run.before, np.arange(len(at))).localize(at, np.full(len(at), run.altitude))
 
 
 def _coverage(run: Run) -> Array:
-    """Share (N,) of the cells of each image that hold a tie point."""
+    """Return the share (N,) of the cells of each image that hold a tie point."""
     view, size = run.tracks.view[run.keep], np.array([view.size for view in run.views])
     cells = cell_numbers(run.tracks.xy[run.keep], size[view]) + view * CELLS**2
     return np.bincount(np.unique(cells) // CELLS**2, minlength=len(size)) / CELLS**2
 
 
 def rmse_by_view(residuals: Array, view: IntArray, num_views: int) -> Array:
-    """RMS of each view (N,) [px]: sqrt(mean(dcol^2 + drow^2)) over those residuals (K, 2) that are not NaN."""
+    """Return RMS of each view (N,) [px]: sqrt(mean(dcol^2 + drow^2)) over those residuals (K, 2) that are not NaN."""
     use = np.isfinite(residuals).all(axis=1)
     squares = np.bincount(view[use], (residuals[use] ** 2).sum(axis=1), minlength=num_views)
     with np.errstate(invalid="ignore"):
@@ -350,14 +350,14 @@ def rmse_by_view(residuals: Array, view: IntArray, num_views: int) -> Array:
 
 
 def cell_numbers(xy: Array, size: Sequence[int] | IntArray) -> IntArray:
-    """Which of the `CELLS` x `CELLS` cells of an image, or each of its own (n, 2), points (n, 2) [px] lie in."""
+    """Return which of the `CELLS` x `CELLS` cells of an image, or each of its own (n, 2), points (n, 2) [px] lie in."""
     col, row = ((xy + 0.5) / np.asarray(size) * CELLS).astype(np.int64).clip(0, CELLS - 1).T
     number: IntArray = row * CELLS + col
     return number
 
 
 def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntry:
-    """The correction of a view, at the ground point (3,) in the middle of its image."""
+    """Return the correction of a view, at the ground point (3,) in the middle of its image."""
     whole, model = adjustment.sensors[i], adjustment.cameras.unknowns.model
     sensor, spline = (whole.sensor, whole.correction) if isinstance(whole, Splined) else (whole, None)
     covariance, apart = adjustment.covariance.view(i), adjustment.apart
@@ -404,7 +404,7 @@ def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntr
 
 
 def _in_image(spline: RowSpline | None) -> dict[str, Any]:
-    """What follows the correction in the image."""
+    """Return what follows the correction in the image."""
     if spline is None:
         return {}
     found: dict[str, Any] = {}

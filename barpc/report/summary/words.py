@@ -28,34 +28,34 @@ ABOVE = "m above the ellipsoid"
 
 
 def largest(values: Sequence[float | None] | None) -> float | None:
-    """The largest number; None where one is missing, which may be larger."""
+    """Return the largest number; None where one is missing, which may be larger."""
     return None if not values or None in values else max(value for value in values if value is not None)
 
 
 def listed(names: Sequence[str], most: int = 10) -> str:
-    """Names in a sentence."""
+    """Return the names in a sentence."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def median(values: Iterable[float | None]) -> float:
-    """The median of the finite numbers; NaN without any."""
+    """Return the median of the finite numbers; NaN without any."""
     found = np.array(list(values), dtype=np.float64)
     found = found[np.isfinite(found)]
     return float(np.median(found)) if len(found) else float("nan")
 
 
 def percent(share: float | None) -> float | None:
-    """A share in percent."""
+    """Return a share in percent."""
     return None if share is None else 100 * share
 
 
 def percent_of(name: str) -> Callable[[Any], float | None]:
-    """What makes percent of a field of a record."""
+    """Return what makes percent of a field of a record."""
     return lambda record: percent(getattr(record, name))
 
 
 def metres(value: float) -> str:
-    """A length with a unit that keeps it readable.
+    """Return a length with a unit that keeps it readable.
 
     Examples
     --------

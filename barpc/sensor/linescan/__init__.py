@@ -27,14 +27,14 @@ def read_linescan(
     aberration: bool | None = None,
     refraction: bool | None = None,
 ) -> Linescan:
-    """The physical model in an XML file.
+    """Return the physical model in an XML file.
 
     Parameters
     ----------
     path : Path, Maxar's image support data or Airbus' ``DIM_*.XML``
     band : str, optional, the band whose detector is taken, where they have detectors of their own
     aberration, refraction : bool, optional
-        What bends the line of sight (`Light`); None: both for Maxar, what the settings of a DIMAP say for Airbus.
+        Bending of the line of sight (`Light`); None: both kinds for Maxar, by the settings of a DIMAP for Airbus.
 
     Raises
     ------

@@ -31,14 +31,14 @@ _STEP = 0.05  # s: at which a polynomial attitude is sampled
 
 
 def light(root: Fields) -> Light:
-    """What the product's settings say that its model allows for: nothing (Pleiades), refraction (Neo)."""
+    """Return the light bending that the product's settings state: none (Pleiades), refraction (Neo)."""
     stated = "Processing_Information/Product_Settings/Geometric_Settings/{}_SETTING"
     said = (root.element.findtext(stated.format(w), "") for w in ("LIGHT_SPEED", "ATMOSPHERIC_REFRACTION"))
     return Light(*(text.strip().lower() == "true" for text in said))
 
 
 def read(root: Fields, band: str | None = None) -> Linescan:
-    """The model of a DIMAP; RpcFormatError where it is damaged or has none, InputError for no such `band`."""
+    """Return the model of a DIMAP; RpcFormatError where it is damaged or has none, InputError for no such `band`."""
     if root.element.find("Geometric_Data/Refined_Model") is None:
         raise RpcFormatError(
             f"{root.name}: no Geometric_Data/Refined_Model: it holds no physical camera model"
@@ -76,7 +76,7 @@ def _lines(model: Fields, rows: int) -> tuple[np.datetime64, float]:
 
 
 def _attitude(attitudes: Fields, first: np.datetime64, lasts: float) -> tuple[Array, Array]:
-    """Times [s from the first row] and quaternions, scalar first."""
+    """Return the times [s from the first row] and quaternions, scalar first."""
     listed = attitudes.all("Quaternion_List/Quaternion")
     if listed:
         return _times(listed, first), np.array([[q.number(f"Q{k}") for k in range(4)] for q in listed])
@@ -95,7 +95,7 @@ def _attitude(attitudes: Fields, first: np.datetime64, lasts: float) -> tuple[Ar
 
 
 def _look(calibration: Fields, band: str | None) -> tuple[Array, float]:
-    """`Pushbroom.look` and its origin."""
+    """Return `Pushbroom.look` and its origin."""
     bands = calibration.all("Band_Calibration_List/Band_Calibration")
     names = [part.element.findtext("BAND_ID", "").strip() for part in bands]
     if band is not None and band not in names:
@@ -114,6 +114,6 @@ def _look(calibration: Fields, band: str | None) -> tuple[Array, float]:
 
 
 def _tangents(angles: Fields, axis: str) -> list[float]:
-    """The coefficients of one look angle, ascending, as many as there are."""
+    """Return the coefficients of one look angle, ascending, as many as there are."""
     tags = takewhile(lambda tag: angles.element.find(tag) is not None, (f"{axis}LOS_{k}" for k in count()))
     return [angles.number(tag) for tag in tags]

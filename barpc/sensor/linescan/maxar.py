@@ -29,12 +29,14 @@ _TABLES = {"EPH": (13, 7), "ATT": (15, 5)}  # numbers of a row: with covariances
 
 
 def light(_root: Fields) -> Light:
-    """Both: star trackers tell where the body points, not what it sees."""
+    """Return the light bending of Maxar's cameras: aberration and refraction, as star trackers tell where the
+    body points.
+    """
     return Light(aberration=True, refraction=True)
 
 
 def read(root: Fields, band: str | None = None) -> Linescan:
-    """The model of an ISD; RpcFormatError where it is damaged, InputError where `band` is none of its bands."""
+    """Return the model of an ISD; RpcFormatError where it is damaged, InputError where `band` is none of its bands."""
     level = root.text("IMD/PRODUCTLEVEL")
     if "1B" not in level.upper():
         raise RpcFormatError(
@@ -91,7 +93,7 @@ def _lines(root: Fields, rows: int) -> tuple[float, np.datetime64]:
 
 
 def _table(root: Fields, part: str, epoch: np.datetime64) -> tuple[Array, Array]:
-    """Times [s from the epoch] and rows of EPHEMLIST or ATTLIST."""
+    """Return the times [s from the epoch] and rows of EPHEMLIST or ATTLIST."""
     of, tag = root.one(part), f"{part}{'EM' * (part == 'EPH')}LIST"
     stated = int(of.positive("NUMPOINTS"))
     rows = [row.numbers(".") for row in of.all(f"{tag}List/{tag}")]
@@ -111,7 +113,7 @@ def _table(root: Fields, part: str, epoch: np.datetime64) -> tuple[Array, Array]
 
 
 def _look(root: Fields, band: str | None) -> Array:
-    """The detector line in the focal plane, as `Pushbroom.look` of the column."""
+    """Return the detector line in the focal plane, as `Pushbroom.look` of the column."""
     geo = root.one("GEO")
     if geo.number("OPTICAL_DISTORTION/POLYORDER") >= 0:
         raise RpcFormatError(f"{root.name}: an optical distortion polynomial, which is not read")
@@ -136,7 +138,8 @@ def _bands(geo: Fields) -> Iterator[tuple[str, Fields]]:
 
 
 def _sigma(orbit: Array, attitude: Array) -> tuple[float, float] | None:
-    """Stated standard deviations of an angle [rad] and of a coordinate [m]: the upper triangles of covariances.
+    """Return the standard deviations of an angle [rad] and of a coordinate [m] from upper triangles of
+    covariances.
 
     A turn by the small angle w changes the quaternion by w / 2.
     """

@@ -26,7 +26,7 @@ _OFF = 700.0  # m/s: by more than the Earth's rotation no stated velocity differ
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What a vendor samples over time, in seconds from the time of row 0."""
+    """Sampled positions and attitudes of a vendor, times in seconds from that of row 0."""
 
     name: str  # the file, for messages
     times: Array  # (N,) of the positions
@@ -38,7 +38,7 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class Detector:
-    """How rows and columns look out of the camera; see `Pushbroom`."""
+    """Lines of sight of rows and columns in camera axes; see `Pushbroom`."""
 
     look: Array
     look_origin: float
@@ -48,7 +48,7 @@ class Detector:
 
 @dataclass(frozen=True, eq=False)
 class Linescan:
-    """A vendor's physical model and the image that it is of."""
+    """A vendor's physical model and the size of its image."""
 
     model: Pushbroom
     size: tuple[int, int]
@@ -56,7 +56,8 @@ class Linescan:
 
 
 def build(samples: Samples, detector: Detector, sigma: tuple[float, float] | None = None) -> Linescan:
-    """The camera of some samples; `sigma` are stated standard deviations of attitude [rad] and position [m].
+    """Return the camera of some samples; `sigma` are stated standard deviations of attitude [rad] and
+    position [m].
 
     RpcFormatError for samples that cannot be those of one image.
     """
@@ -91,7 +92,8 @@ def build(samples: Samples, detector: Detector, sigma: tuple[float, float] | Non
 
 
 def _track(times: Array, positions: Array) -> Curve:
-    """Where the camera is: a polynomial that any orbit follows for so long, or through all samples if these do not.
+    """Return the position over time: a polynomial that any orbit follows for so long, or a spline where
+    samples do not.
 
     Dense samples scatter by millimetres, which a curve through them all carries beyond the first by centimetres.
     """
@@ -111,7 +113,7 @@ def _track(times: Array, positions: Array) -> Curve:
 
 
 def unit(quaternions: Array, name: str) -> Array:
-    """Quaternions (N, 4) of length 1; RpcFormatError where theirs is another."""
+    """Return quaternions (N, 4) scaled to length 1; RpcFormatError where theirs is another."""
     length = np.linalg.norm(quaternions, axis=1)
     if not (np.abs(length - 1.0) < _UNIT).all():
         raise RpcFormatError(

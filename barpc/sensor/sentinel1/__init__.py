@@ -56,7 +56,7 @@ def mosaic(
     atmosphere: bool = False,
     bistatic: Bistatic | None = None,
 ) -> RangeDoppler:
-    """One model for the swaths of an SLC product, side by side.
+    """Return one model for the swaths of an SLC product, side by side.
 
     Column 0 is pixel 0 of the nearest swath (IW1, EW1) and row 0 the earliest line 0; the other swaths
     start at ``mosaic_offsets``.
@@ -75,7 +75,8 @@ def mosaic(
 
 
 def mosaic_offsets(swaths: Sequence[Annotation]) -> Array:
-    """Where the stitched frames of the swaths of one SLC product begin in that of their mosaic: col, row (S, 2) [px].
+    """Return the offsets col, row (S, 2) [px] of the stitched swath frames of one SLC product in that of
+    their mosaic.
 
     Whole numbers to within 1e-3 in products since 2016. InputError for a GRD, or swaths that are not of one product.
     """
@@ -110,7 +111,7 @@ def open_product(
     atmosphere: bool = False,
     bistatic: Bistatic | None = None,
 ) -> RangeDoppler:
-    """The model of a Sentinel-1 product.
+    """Return the model of a Sentinel-1 product.
 
     Parameters
     ----------
@@ -179,7 +180,7 @@ def _from_zip(path: Path, what: str, use: Callable[[zipfile.ZipFile], T]) -> T:
 
 
 def _annotations(path: Path) -> list[_File]:
-    """The annotations of a product, in order of swath and polarisation."""
+    """Return the annotations of a product, in order of swath and polarisation."""
     if path.name == "manifest.safe":
         path = path.parent
     if path.is_dir():
@@ -198,7 +199,7 @@ def _annotations(path: Path) -> list[_File]:
 
 
 def _named(path: Path, member: str | None) -> _File | None:
-    """The file, if its name is that of an annotation."""
+    """Return the file, if its name is that of an annotation."""
     match = _NAME.fullmatch(path.name if member is None else PurePosixPath(member).name)
     return match and _File(match["swath"].lower(), match["pol"].lower(), path, member)
 

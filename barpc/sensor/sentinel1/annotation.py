@@ -47,7 +47,7 @@ class Burst:
 
 @dataclass(frozen=True)
 class BurstRows:
-    """Where a burst stands in the stitched frame."""
+    """Rows of a burst in the stitched frame."""
 
     first_line: int  # of the burst in the measurement file
     first_row: int  # frame row of that line
@@ -105,11 +105,11 @@ class Annotation:
 
     @property
     def kind(self) -> str:
-        """What it is, for messages."""
+        """Kind of product, for messages."""
         return f"a {self.mode} {self.product_type} of {self.swath}"
 
     def line_time(self, line: Array) -> TimeArray:
-        """Annotated times (...), datetime64[ns], of lines (...) of the measurement file."""
+        """Return the annotated times (...), datetime64[ns], of lines (...) of the measurement file."""
         start, rest = np.array([self.first_line_time]), np.asarray(line, dtype=np.float64)
         index = np.zeros(rest.shape, dtype=np.int64)
         if self.bursts:
@@ -122,7 +122,8 @@ class Annotation:
 
 
 def burst_rows(annotation: Annotation) -> list[BurstRows]:
-    """Where the bursts of a TOPS SLC swath stand in the stitched frame; overlaps are cut at their middle.
+    """Return the rows of the bursts of a TOPS SLC swath in the stitched frame; overlaps are cut at their
+    middle.
 
     RpcFormatError for bursts out of order, or one without a valid line.
     """
@@ -183,7 +184,8 @@ def read_annotation(source: bytes | Path, name: str | None = None) -> Annotation
 
 
 def read_orbit_file(path: Path, annotation: Annotation) -> StateVectors:
-    """The state vectors of a precise or restituted orbit file (``S1A_OPER_AUX_POEORB_....EOF``) around an image.
+    """Return the state vectors of a precise or restituted orbit file (``S1A_OPER_AUX_POEORB_....EOF``) around
+    an image.
 
     RpcFormatError where it is no orbit file, another satellite's, or without a vector near that time.
     """
@@ -215,7 +217,7 @@ def _times(rows: Sequence[Fields], tag: str) -> TimeArray:
 
 
 def _states(vectors: Sequence[Fields], time: str, tags: Sequence[str], source: str) -> StateVectors:
-    """State vectors whose time is named `time`, and x, y, z of position and of velocity by `tags`."""
+    """Return the state vectors whose time is named `time`, and x, y, z of position and of velocity by `tags`."""
     table = np.reshape([[v.numbers(tag)[0] for tag in tags] for v in vectors], (-1, 6))
     return StateVectors(_times(vectors, time), table[:, :3], table[:, 3:], source)
 

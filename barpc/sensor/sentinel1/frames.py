@@ -36,7 +36,7 @@ class SlantFrame(Frozen):
     interval: float  # azimuth time between rows [s]
 
     def image(self, times: Array) -> tuple[Array, Array]:
-        """Image points (2, N) [px] of times (2, N) [s], and d(col, row)/d(times) (2, 2, N)."""
+        """Return the image points (2, N) [px] of times (2, N) [s], and d(col, row)/d(times) (2, 2, N)."""
         out, slope = np.empty_like(times), np.zeros((2, *times.shape))
         out[0] = (times[1] - self.first_range_time) * self.sampling_rate
         out[1] = times[0] / self.interval
@@ -44,7 +44,7 @@ class SlantFrame(Frozen):
         return out, slope
 
     def times(self, image: Array) -> Array:
-        """Times (2, N) [s] of image points (2, N) [px]."""
+        """Return the times (2, N) [s] of image points (2, N) [px]."""
         return np.stack([image[1] * self.interval, image[0] / self.sampling_rate + self.first_range_time])
 
 
@@ -64,7 +64,7 @@ class GroundFrame(Frozen):
     slope: float  # slant range a ground range at mid swath, roughly: where the inversion starts
 
     def image(self, times: Array) -> tuple[Array, Array]:
-        """Image points (2, N) [px] of times (2, N) [s], and d(col, row)/d(times) (2, 2, N)."""
+        """Return the image points (2, N) [px] of times (2, N) [s], and d(col, row)/d(times) (2, 2, N)."""
         metres = 0.5 * SPEED_OF_LIGHT
         ground, by_slant, by_time = self._ground_range(times[0], metres * times[1])
         out, slope = np.empty_like(times), np.zeros((2, *times.shape))
@@ -74,7 +74,7 @@ class GroundFrame(Frozen):
         return out, slope
 
     def times(self, image: Array) -> Array:
-        """Times (2, N) [s] of image points (2, N) [px]: Newton on the polynomial."""
+        """Return the times (2, N) [s] of image points (2, N) [px]: Newton on the polynomial."""
         time, target = image[1] * self.interval, image[0] * self.spacing
         slant = self.origin.mean() + target * self.slope
         for _ in range(_INVERSION_STEPS):
@@ -86,7 +86,7 @@ class GroundFrame(Frozen):
         return np.stack([time, slant * (2.0 / SPEED_OF_LIGHT)])
 
     def _ground_range(self, time: Array, slant: Array) -> tuple[Array, Array, Array]:
-        """Ground range (N,) [m] and its derivatives by slant range [m/m] and time [m/s]."""
+        """Return the ground range (N,) [m] and its derivatives by slant range [m/m] and time [m/s]."""
         coeffs, rates, origin, drift = self._listed_at(time)
         u = slant - origin
         value, by_slant, by_time = np.zeros((3, len(u)))
@@ -97,7 +97,7 @@ class GroundFrame(Frozen):
         return value, by_slant, by_time - drift * by_slant
 
     def _listed_at(self, time: Array) -> tuple[Array, Array, Array, Array]:
-        """Coefficients (K, N) and their rates [1/s], origins (N,) [m] and theirs [m/s], at times (N,)."""
+        """Return the coefficients (K, N) and their rates [1/s], origins (N,) [m] and theirs [m/s], at times (N,)."""
         if len(self.listed) == 1:
             coeffs, still = np.repeat(self.coeffs.T, len(time), axis=1), np.zeros(len(time))
             return coeffs, np.zeros_like(coeffs), still + self.origin[0], still
@@ -113,7 +113,7 @@ Frame = SlantFrame | GroundFrame
 
 @dataclass(frozen=True)
 class Delays:
-    """Which delays are added to the geometric times.
+    """Delays that are added to the geometric times.
 
     That of the path through the atmosphere, one way, is (2.41 - h/3411 + h^2/8.55e7) m / cos(incidence), h the altitude
     [m] (Jehle et al., "Estimation of Atmospheric Path Delays in TerraSAR-X Data using Models vs. Measurements", Sensors
@@ -128,7 +128,9 @@ class Delays:
         return self.atmosphere or self.bistatic is not None or self.timing is not None
 
     def shift(self, times: Array, ground: Array, sight: Array) -> Array:
-        """What is added to times (2, N), of points (N, 3) that see the satellite along unit vectors (3, N) [s]."""
+        """Return the delays (2, N) [s] added to the times of points (N, 3) that see the satellite along unit
+        vectors (3, N).
+        """
         out = np.zeros_like(times)
         if self.bistatic is not None:
             out[0] = self.bistatic - 0.5 * times[1]
@@ -141,7 +143,7 @@ class Delays:
     def shift_jacobian(
         self, times: Array, by_ground: Array, ground: Array, sight: Array, by_sight: Array
     ) -> Array:
-        """Derivative of `shift` by (lon, lat, alt) (2, N, 3) [s/deg, s/deg, s/m].
+        """Return the derivative of `shift` by (lon, lat, alt) (2, N, 3) [s/deg, s/deg, s/m].
 
         `by_ground` (2, N, 3) is that of the times, `by_sight` (N, 3, 3) that of the sight.
         """
@@ -164,7 +166,7 @@ class Delays:
 
 
 def bistatic_constant(annotation: Annotation, form: Bistatic) -> float:
-    """The constant b [s] of the bistatic correction of azimuth time, b - tau/2.
+    """Return the constant b [s] of the bistatic correction of azimuth time, b - tau/2.
 
     The satellite flies on while the pulse is on its way. The processor allows for that at one range, the
     middle of the whole product (IW2, EW3), which shows in its geolocation grid: the time of a grid line
@@ -195,11 +197,11 @@ def bistatic_constant(annotation: Annotation, form: Bistatic) -> float:
 
 
 def _as_times(late: Array) -> Array:
-    """Range [m] and azimuth time [s] (2, N) as azimuth time and two-way range time [s]."""
+    """Return the range [m] and azimuth time [s] (2, N) as azimuth time and two-way range time [s]."""
     return np.stack([late[1], late[0] * (2.0 / SPEED_OF_LIGHT)])
 
 
 def _zenith(alt: Array) -> tuple[Array, Array]:
-    """Zenith path delay (N,) [m] at altitudes [m], and its derivative."""
+    """Return the zenith path delay (N,) [m] at altitudes [m], and its derivative."""
     a, b, c = _ZENITH
     return a + alt * (b + alt * c), b + 2 * c * alt

@@ -114,7 +114,7 @@ class RangeDoppler(Frozen):
         atmosphere: bool = False,
         bistatic: Bistatic | None = None,
     ) -> RangeDoppler:
-        """The model of one SLC swath (bursts stitched, or stripmap), one burst, or a GRD.
+        """Return the model of one SLC swath (bursts stitched, or stripmap), one burst, or a GRD.
 
         Column 0 is the annotation's pixel 0. Row 0 is its line 0; in a stitched swath rows go on by
         zero-Doppler time, and `burst_rows` says where the lines of each burst lie.
@@ -154,25 +154,28 @@ class RangeDoppler(Frozen):
 
     @property
     def speed(self) -> float:
-        """Of the flight, at the image's middle row [m/s]."""
+        """Speed of the flight at the image's middle row [m/s]."""
         _, velocity = self.orbit(np.array([0.5 * self.size[1] * self.frame.interval]))
         return float(np.linalg.norm(velocity))
 
     def timed(self, timing: Timing) -> RangeDoppler:
-        """The model with a timing by the row [px] in place of its own."""
+        """Return the model with a timing by the row [px] in place of its own."""
         interval = self.frame.interval
         timing = replace(timing, offset=timing.offset * interval, scale=timing.scale * interval)
         return replace(self, delays=replace(self.delays, timing=timing))
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """As of `barpc.sensor.timing.Clocked`; rows of pure geometry."""
+        """Return image points and derivatives as `barpc.sensor.timing.Clocked` asks; the coordinate is the
+        row of pure geometry.
+        """
         image, by_ground, by_timing, row = pointwise(
             self._derivatives, CHUNK, [(2,), (2, 3), (2, 2), ()], ground
         )
         return image, by_ground, by_timing, row
 
     def azimuth_range(self, ground: Array) -> tuple[Array, Array]:
-        """Zero-Doppler [s from `epoch`] and two-way slant range times (...) [s] of ground points (..., 3).
+        """Return the zero-Doppler [s from `epoch`] and two-way slant range times (...) [s] of ground points
+        (..., 3).
 
         Pure geometry, without `delays`; NaN off the orbit's time span or on the other side.
         """
@@ -182,20 +185,22 @@ class RangeDoppler(Frozen):
         return azimuth_time, range_time
 
     def to_radar(self, ground: Array) -> Array:
-        """Vectors (..., 3) [m], ECEF, from ground points (..., 3) to the satellite; NaN where `azimuth_range` is."""
+        """Return the vectors (..., 3) [m], ECEF, from ground points (..., 3) to the satellite; NaN where
+        `azimuth_range` is.
+        """
         return pointwise(self._to_radar, CHUNK, [(3,)], ground)[0]
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN where `azimuth_range` is."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN where `azimuth_range` is."""
         return pointwise(self._project, CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = pointwise(lambda part: self._derivatives(part)[:2], CHUNK, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m].
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
 
         On the circle of zero Doppler and given slant range, Newton on the look angle until the point has the altitude.
         Longitudes run on across the antimeridian; NaN off the orbit's time span or where the range does not reach.
@@ -247,7 +252,7 @@ class RangeDoppler(Frozen):
         return [image.T]
 
     def _derivatives(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """What `timing_jacobian` hands out."""
+        """Return image points and derivatives for `timing_jacobian`."""
         seen = self._geometry(ecef_from_ground(ground))
         by_ecef = np.stack([seen.time_by_ecef.T, seen.sight.T * (-2.0 / SPEED_OF_LIGHT)])  # (2, N, 3)
         ecef_by_ground = ecef_from_ground_jacobian(ground)
@@ -273,7 +278,7 @@ class RangeDoppler(Frozen):
         return ground
 
     def _on_circle(self, times: Array, alt: Array) -> tuple[Array, Array]:
-        """Points (N, 3) at times (2, N) and altitudes (N,), and the unit vectors (3, N) to the satellite."""
+        """Return the points (N, 3) at times (2, N) and altitudes (N,), and the unit vectors (3, N) to the satellite."""
         low, high = self.orbit.span
         time = np.where((times[0] >= low) & (times[0] <= high), times[0], np.nan)
         position, velocity, _ = self.orbit.states(time)
@@ -292,14 +297,14 @@ class _Seen:
     time_by_ecef: Array
 
     def sight_by_ecef(self) -> Array:
-        """(N, 3, 3): d(sight)/dX, the satellite moving along with the zero-Doppler time."""
+        """Return (N, 3, 3): d(sight)/dX, the satellite moving along with the zero-Doppler time."""
         moved = np.einsum("in,jn->nij", self.velocity, self.time_by_ecef) - np.eye(3)
         moved += np.einsum("in,jn->nij", self.sight, self.sight)  # velocity has no part along the sight
         return np.asarray(moved / self.distance[:, None, None])
 
 
 def extent(annotation: Annotation, burst: int | None = None) -> tuple[np.datetime64, int]:
-    """Time of row 0 and number of rows: of a burst, or of all there is, stitched."""
+    """Return the time of row 0 and the number of rows: of one burst, or of all bursts stitched."""
     if burst is not None:
         if not 0 <= burst < len(annotation.bursts):
             raise InputError(f"{annotation.name}: no burst {burst}, it has {len(annotation.bursts)}")
@@ -318,7 +323,7 @@ def build(
     atmosphere: bool,
     bistatic: Bistatic | None,
 ) -> RangeDoppler:
-    """The model of swaths side by side, the nearest first; row 0 at `epoch`."""
+    """Return the model of swaths side by side, the nearest first; row 0 at `epoch`."""
     nearest = swaths[0]
     alt = np.concatenate([a.grid.ground[:, 2] for a in swaths])
     states = nearest.states if orbit is None else read_orbit_file(orbit, nearest)
@@ -348,7 +353,9 @@ def build(
 
 
 def grid_residuals(annotation: Annotation, model: RangeDoppler) -> Array:
-    """Model - a swath's own geolocation grid, geometry only: range [samples], azimuth [lines], (G, 2)."""
+    """Return the model minus a swath's own geolocation grid, geometry only: range [samples], azimuth [lines],
+    (G, 2).
+    """
     grid = annotation.grid
     azimuth_time, range_time = model.azimuth_range(grid.ground)
     samples = (range_time - grid.range_time) * annotation.range_sampling_rate
@@ -362,7 +369,7 @@ def _orbit(annotation: Annotation, states: StateVectors, epoch: np.datetime64) -
 
 
 def _frame(annotation: Annotation, epoch: np.datetime64) -> Frame:
-    """The frame of an SLC, or of a GRD (which has ground range polynomials)."""
+    """Return the frame of an SLC, or of a GRD (which has ground range polynomials)."""
     interval, convert = annotation.azimuth_time_interval, annotation.ground_range
     if annotation.product_type == "SLC":
         return SlantFrame(annotation.slant_range_time, annotation.range_sampling_rate, interval)

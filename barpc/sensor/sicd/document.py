@@ -27,12 +27,12 @@ _SEGMENTS = ((6, 10), (4, 6), (0, 0), (4, 5), (4, 9))
 
 
 def is_sicd(head: bytes) -> bool:
-    """Whether the first bytes of a document begin a SICD, its namespace with a prefix or without."""
+    """Return whether the first bytes of a document begin a SICD, its namespace with a prefix or without."""
     return re.search(rb"<([\w.-]{1,40}:)?SICD[\s>]", head) is not None
 
 
 def find_sicd(path: Path) -> bytes | None:
-    """The SICD document that a file is or, in a NITF, holds; None where there is none.
+    """Return the SICD document that a file is or, in a NITF, holds; None where there is none.
 
     RpcFormatError for a NITF whose header is damaged, InputError for a document that is too large.
     """
@@ -47,7 +47,7 @@ def find_sicd(path: Path) -> bytes | None:
 
 
 def _extensions(file: BinaryIO) -> list[bytes]:
-    """The data of all data extensions of a NITF."""
+    """Return the data of all data extensions of a NITF."""
     file.seek(_COUNTS - 6)
     place = _digits(file, 6)
     found = []
@@ -75,7 +75,7 @@ def _digits(file: BinaryIO, count: int) -> int:
 
 
 def open_sicd(path: Path) -> Monostatic:
-    """The model of a SICD image, an XML or a NITF file.
+    """Return the model of a SICD image, an XML or a NITF file.
 
     Row and column 0 are the image's own first, also where it is a part of a larger one.
 
@@ -135,7 +135,7 @@ def _look(root: Fields) -> Literal["right", "left"]:
 
 
 def _accuracy(root: Fields, scp: Array) -> tuple[float, float] | None:
-    """Of range and along the flight [m]: those of the centre as a whole, else those of the orbit and of the range."""
+    """Return the stated accuracy of range and along the flight [m]: of the scene centre, else of orbit and range."""
     whole = _error(root, "CompositeSCP//Rg"), _error(root, "CompositeSCP//Az")
     orbit = np.array([_error(root, f"Components/PosVelErr/P{k}") for k in (1, 2, 3)])
     frame = root.element.findtext("ErrorStatistics/Components/PosVelErr/Frame", "").strip()
@@ -157,12 +157,12 @@ def _accuracy(root: Fields, scp: Array) -> tuple[float, float] | None:
 
 
 def _error(root: Fields, path: str) -> float:
-    """A standard deviation [m]; 0 where it is not stated."""
+    """Return a standard deviation [m]; 0 where it is not stated."""
     return max([0.0, *(float(one.numbers(".")[0]) for one in root.all(f"ErrorStatistics/{path}"))])
 
 
 def _orbit(root: Fields) -> Curve:
-    """ARPPoly over the time of the collection."""
+    """Read ARPPoly over the time of the collection."""
     axes = [_polynomial(root, f"Position/ARPPoly/{axis}", 1) for axis in "XYZ"]
     coeffs = np.zeros((1, max(map(len, axes)), 3))
     for k, axis in enumerate(axes):
@@ -171,7 +171,7 @@ def _orbit(root: Fields) -> Curve:
 
 
 def _polynomial(root: Fields, path: str, variables: int) -> Array:
-    """Coefficients by their powers, (K,) or (K, L)."""
+    """Return the coefficients by their powers, (K,) or (K, L)."""
     terms = root.all(f"{path}/Coef")
     if not terms:
         raise RpcFormatError(f"{root.name}: no {path}; is the file complete?")
@@ -186,7 +186,7 @@ def _polynomial(root: Fields, path: str, variables: int) -> Array:
 
 
 def _formation(root: Fields, scp: Array) -> Formation:
-    """By Grid/Type and, for RGAZIM, ImageFormation/ImageFormAlgo."""
+    """Return the formation by Grid/Type and, for RGAZIM, ImageFormation/ImageFormAlgo."""
     time, kind = _polynomial(root, "Grid/TimeCOAPoly", 2), root.text("Grid/Type")
     if kind == "RGAZIM":
         algorithm = root.text("ImageFormation/ImageFormAlgo")

@@ -21,7 +21,7 @@ from barpc.sensor.curve import Curve
 
 
 class Aperture(NamedTuple):
-    """Where the radar is for N pixels, and what it measures there."""
+    """Position and velocity of the radar for N pixels, and the range and range rate measured there."""
 
     position: Array  # (3, N): ECEF [m]
     velocity: Array  # (3, N): [m/s]
@@ -32,7 +32,7 @@ class Aperture(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Formation(Frozen, ABC):
-    """How an image was formed.
+    """Image formation: from pixels to range and range rate.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class Formation(Frozen, ABC):
         self._array("time", (None, None), RpcError)
 
     def at(self, x: Array, y: Array, orbit: Curve) -> Aperture:
-        """The apertures of N pixels at x, y (N,) [m]."""
+        """Return the apertures of N pixels at x, y (N,) [m]."""
         time: Array = np.asarray(polynomial.polyval2d(x, y, self.time), dtype=np.float64)
         position, velocity = orbit(time)
         return Aperture(position, velocity, *self._contour(x, y, time, position, velocity, orbit), time)
@@ -57,7 +57,7 @@ class Formation(Frozen, ABC):
 
 
 def _to(point: Array, position: Array, velocity: Array) -> tuple[Array, Array]:
-    """Range and its rate (N,) of a point (3, N) or (3, 1)."""
+    """Return the range and its rate (N,) of a point (3, N) or (3, 1)."""
     sight = position - point
     distance = np.sqrt(dot(sight, sight))
     return distance, dot(velocity, sight) / distance

@@ -69,18 +69,20 @@ class Monostatic(Frozen):
             raise RpcError(f"SICD: look {self.look!r}, expected 'right' or 'left'")
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN far off, or on the other side."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN far off, or on the
+        other side.
+        """
         return pointwise(
             lambda part: [self._image(self._solve(ecef_from_ground(part).T)[0])], CHUNK, [(2,)], ground
         )[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = pointwise(lambda part: self._derivatives(part)[:2], CHUNK, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m].
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
 
         Longitudes run on across the antimeridian; NaN far off the image or where the range does not reach.
         """
@@ -90,23 +92,25 @@ class Monostatic(Frozen):
         return ground
 
     def to_radar(self, ground: Array) -> Array:
-        """Vectors (..., 3) [m], ECEF, from ground points (..., 3) to the antenna that sees them; NaN as `project`."""
+        """Return the vectors (..., 3) [m], ECEF, from ground points (..., 3) to the antenna that sees them;
+        NaN as `project`.
+        """
         return pointwise(lambda part: [self._to_radar(part)], CHUNK, [(3,)], ground)[0]
 
     @property
     def speed(self) -> float:
-        """Of the flight, in the middle of the collection [m/s]."""
+        """Speed of the flight in the middle of the collection [m/s]."""
         _, velocity = self.orbit(np.array([np.mean(self.orbit.knots)]))
         return float(np.linalg.norm(velocity))
 
     def timed(self, timing: Timing) -> Monostatic:
-        """The model with a timing by the column [px] in place of its own."""
+        """Return the model with a timing by the column [px] in place of its own."""
         pixel, zero = self.spacing[1], self.origin[1]
         timing = replace(timing, offset=(timing.offset - zero) * pixel, scale=timing.scale * pixel)
         return replace(self, timing=timing)
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """As of `barpc.sensor.timing.Clocked`; columns where the points are seen."""
+        """Return image points and derivatives as `barpc.sensor.timing.Clocked` asks; the coordinate is the column."""
         image, by_ground, by_timing, col = pointwise(
             self._derivatives, CHUNK, [(2,), (2, 3), (2, 2), ()], ground
         )
@@ -128,12 +132,12 @@ class Monostatic(Frozen):
         return low[:, None], high[:, None]
 
     def _image(self, plane: Array) -> Array:
-        """(col, row) (N, 2) of (x, y) (2, N)."""
+        """Return (col, row) (N, 2) of (x, y) (2, N)."""
         row, col = plane / np.array(self.spacing)[:, None] + np.array(self.origin)[:, None]
         return np.column_stack([col, row])
 
     def _seen(self, plane: Array) -> Aperture:
-        """What the pixels (2, N) state, as the clocks have it."""
+        """Return range and range rate of the pixels (2, N), clocks corrected."""
         seen = self.formation.at(plane[0], plane[1], self.orbit)
         if self.timing is None:
             return seen
@@ -143,7 +147,9 @@ class Monostatic(Frozen):
         return seen._replace(position=position, velocity=velocity, distance=distance, time=time)
 
     def _miss(self, plane: Array, point: Array) -> tuple[Array, Aperture, Array, Array]:
-        """Pixel - point in range and rate (2, N), the aperture, and the point's sight (3, N) and distance (N,)."""
+        """Return the pixel - point in range and rate (2, N), the aperture, and the point's sight (3, N) and
+        distance (N,).
+        """
         seen = self._seen(plane)
         sight = seen.position - point
         distance = np.sqrt(dot(sight, sight))
@@ -152,13 +158,15 @@ class Monostatic(Frozen):
         return miss, seen, sight, distance
 
     def _by_plane(self, plane: Array, point: Array) -> Array:
-        """Derivative (2, 2, N) of `_miss` by (x, y)."""
+        """Return the derivative (2, 2, N) of `_miss` by (x, y)."""
         steps = _STEP * np.eye(2)[:, :, None]
         columns = [self._miss(plane + s, point)[0] - self._miss(plane - s, point)[0] for s in steps]
         return np.stack(columns, axis=1) / (2 * _STEP)
 
     def _solve(self, point: Array) -> tuple[Array, Array]:
-        """(x, y) (2, N) of points (3, N), ECEF, by Newton from the scene centre; and the last derivative (2, 2, N)."""
+        """Return (x, y) (2, N) of points (3, N), ECEF, by Newton from the scene centre; and the last
+        derivative (2, 2, N).
+        """
         low, high = self._bounds
         plane = np.where(np.isfinite(point[:2]), 0.0, np.nan)
         for _ in range(_STEPS):
@@ -179,7 +187,7 @@ class Monostatic(Frozen):
         return (sight * distance).T
 
     def _derivatives(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """What `timing_jacobian` hands out."""
+        """Return image points and derivatives for `timing_jacobian`."""
         point = ecef_from_ground(ground).T
         plane, slope = self._solve(point)
         _, seen, sight, distance = self._miss(plane, point)
@@ -207,7 +215,7 @@ class Monostatic(Frozen):
 
 
 def _solve(matrix: Array, right: Array) -> Array:
-    """Solutions (2, N) of 2 x 2 systems (2, 2, N)."""
+    """Return the solutions (2, N) of 2 x 2 systems (2, 2, N)."""
     (a, b), (c, d) = matrix
     solved: Array = np.stack([d * right[0] - b * right[1], a * right[1] - c * right[0]]) / (a * d - b * c)
     return solved

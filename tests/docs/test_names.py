@@ -1,0 +1,177 @@
+"""What a page names in code exists: flags, options, modules, functions, files, values of the summary."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+
+from barpc.cli.main import COMMANDS, cli
+from barpc.options import RunOptions, declared
+from barpc.report.summary import published_schema
+from tests.docs.pages import DOCS, PAGES, ROOT, blocks
+
+PRESENT = [page for page in PAGES if page.name != "CHANGELOG.md"]
+GENERAL = {"--help", "--version", "--quiet", "--verbose", "--debug", "--json"}
+"""Flags of every verb."""
+SCRIPTS = [ROOT / "benchmarks", ROOT / "tests", ROOT / "docs", ROOT / ".ci"]
+"""Where flags of the project's other programs are declared."""
+OTHERS = {"--nthreads", "--use-lon-lat-height-gcp-error"}
+"""Flags of dask's worker and of ASP."""
+FOLDERS = "barpc|benchmarks|tests|docs|examples|notebooks|data_samples|changelog.d|recipe|.ci"
+
+
+def inline(page: Path) -> list[str]:
+    """Pieces of code within sentences and tables."""
+    text = re.sub(r"^( *)```.*?^\1```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    return re.findall(r"`([^`\n]+)`", text)
+
+
+@cache
+def flags() -> set[str]:
+    """Flags of all verbs."""
+    verbs = [cli.get_command(click.Context(cli), verb) for verb in COMMANDS]
+    return GENERAL | {
+        name for verb in verbs if verb for p in verb.params for name in (*p.opts, *p.secondary_opts)
+    }
+
+
+@cache
+def other_flags() -> set[str]:
+    """Flags that scripts of the repository declare."""
+    sources = [path.read_text(encoding="utf-8") for folder in SCRIPTS for path in folder.rglob("*.py")]
+    sources += [(ROOT / ".ci" / "nightly").read_text(encoding="utf-8")] if (ROOT / ".ci").exists() else []
+    return OTHERS | set(re.findall(r"(?:add_argument|click\.option)\(\s*\"(--[a-z-]+)\"", "\n".join(sources)))
+
+
+def unknown_flags(code: str) -> set[str]:
+    """Flags of a piece of code that neither a verb nor a script has."""
+    if re.match(
+        r"(pip|rattler-build|pytest|ruff|mkdocs|gdal|git|python -m build|twine|oty|otbcli|sbatch|srun|towncrier)",
+        code,
+    ):
+        return set()
+    return set(re.findall(r"(?<!\S)--[a-z][a-z-]*", code)) - flags() - other_flags()
+
+
+@pytest.mark.parametrize("page", PRESENT, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_flag_in_a_sentence_exists(page):
+    assert {code: wrong for code in inline(page) if (wrong := unknown_flags(code))} == {}
+
+
+def options() -> dict[str, set[str]]:
+    """Table of an options file -> its options; "" holds those of all tables."""
+    top = declared(RunOptions)
+    tables = {name: set(declared(type(top[name].default))) for name in ("tie", "adjust", "fit")}
+    return {**tables, "": set(top).union(*tables.values())}
+
+
+def wrong_options(code: str) -> list[str]:
+    """Options of a piece of code, as `[tie] search` or `search = 2000`, that no table has."""
+    known = options()
+    named = re.fullmatch(r"\[(tie|adjust|fit)\] (\w+)(?: = .*)?", code)
+    if named:
+        return [] if named[2] in known[named[1]] else [code]
+    given = re.fullmatch(r"([a-z_]{3,})\s?=\s?(?:\d[\d.e-]*|\"[\w+-]+\"|true|false)", code)
+    return [code] if given and given[1] not in known[""] | KEYWORDS else []
+
+
+KEYWORDS = {"atmosphere", "bistatic", "first_pixel", "strict", "model", "executor", "driver", "keep_largest"}
+"""Arguments of functions, and choices behind a file's name."""
+
+
+@pytest.mark.parametrize("page", PRESENT, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_option_in_a_sentence_exists(page):
+    assert [wrong for code in inline(page) for wrong in wrong_options(code)] == []
+
+
+def found(name: str) -> bool:
+    """Whether a dotted name leads to a module, or to something in one."""
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            thing: Any = importlib.import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[count:]:
+            if part not in getattr(thing, "__dataclass_fields__", ()) and not hasattr(thing, part):
+                return False
+            thing = getattr(thing, part, None)
+        return True
+    return False
+
+
+def names(page: Path) -> set[str]:
+    """Dotted names of the package in a page's sentences and references, from `barpc` or from a folder of it."""
+    text = page.read_text(encoding="utf-8")
+    codes = [re.match(r"(?:barpc|ba|tie|fit)\.[\w.]*\w(?=$|[(\[ ,])", code) for code in inline(page)]
+    said = {code[0] for code in codes if code} | set(re.findall(r"^::: (\S+)$", text, re.MULTILINE))
+    return {name if name.startswith("barpc") else f"barpc.{name}" for name in said}
+
+
+@pytest.mark.parametrize("page", PRESENT, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_module_and_function_that_a_page_names_exists(page):
+    assert sorted(name for name in names(page) if not found(name)) == []
+
+
+def paths(page: Path) -> set[str]:
+    """Files and folders of the repository in a page's sentences and commands."""
+    shell = [line for block in blocks(page, "", "bash", "sh") for line in block.text.splitlines()]
+    text = "\n".join([*inline(page), *shell])
+    modules = re.findall(r"python -m ((?:benchmarks|tests)[\w.]*)", text)
+    plain = re.findall(rf"(?<![\w/.-])(?:{FOLDERS})/[\w./-]*\w", text)
+    return {*plain, *(module.replace(".", "/") for module in modules)}
+
+
+@pytest.mark.parametrize("page", PRESENT, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_file_of_the_repository_that_a_page_names_exists(page):
+    for path in paths(page):
+        assert (ROOT / path).exists() or (ROOT / f"{path}.py").exists(), path
+
+
+def value(name: str) -> bool:
+    """Whether the schema of summary.json has a value, such as `pairs[].chosen_by`."""
+    part: Any = published_schema()
+    for step in name.split("."):
+        part = part.get("properties", {}).get(step.removesuffix("[]"))
+        if part is None:
+            return False
+        part = part.get("items", part) if step.endswith("[]") else part
+    return True
+
+
+@pytest.mark.parametrize("page", PRESENT, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_value_of_the_summary_that_a_page_names_exists(page):
+    if "truth.json" in page.read_text(encoding="utf-8"):
+        return  # has views of its own
+    said = [
+        code
+        for code in inline(page)
+        if re.fullmatch(r"(views\[\]|pairs\[\]|gcps\[\]|scene)\.[\w.\[\]]+", code)
+    ]
+    assert [name for name in said if not value(name)] == []
+
+
+def test_the_checks_notice_what_does_not_exist(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("`--no-such`, `[tie] drift`, `serach = 3`, `barpc.tie.no`, `ba.no`, `benchmarks/no.py`\n")
+    assert [code for code in inline(page) if unknown_flags(code)] == ["--no-such"]
+    assert [wrong for code in inline(page) for wrong in wrong_options(code)] == ["[tie] drift", "serach = 3"]
+    assert sorted(name for name in names(page) if not found(name)) == ["barpc.ba.no", "barpc.tie.no"]
+    assert paths(page) == {"benchmarks/no.py"}
+    assert not value("scene.no")
+    assert not value("views[].no")
+    assert value("pairs[].chosen_by")
+    assert found("barpc.RpcFit.no") is False
+    assert found("barpc.rpcio.FORMATS")
+
+
+def test_the_names_are_read_from_pages_that_have_them():
+    assert sum(len(names(page)) for page in PRESENT) > 60
+    assert sum(len(paths(page)) for page in PRESENT) > 40
+    assert "barpc.ba.judge" in names(DOCS / "adjustment.md")
