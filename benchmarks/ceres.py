@@ -4,7 +4,7 @@ Ceres gets analytic derivatives in C++ (`ceres.cpp`), first points for nothing a
 of its dense, sparse and iterative Schur complements counts. barpc's "whole" is `adjust_tracks`: first points, tests of
 what is left, and covariance with it; "solve" is its minimisation alone, as Ceres' is. CPU seconds, one thread.
 
-    python benchmarks/ceres.py [--repeat 3]  # or benchmarks/ba.py --ceres; needs g++ and Ceres' headers (libceres-dev); says so where they are not
+    python benchmarks/ceres.py     # or benchmarks/ba.py --ceres; needs g++ and libceres-dev, or says so
 """
 
 from __future__ import annotations
