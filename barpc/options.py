@@ -331,7 +331,7 @@ class AdjustOptions(Options):
     loss: str = option(
         "geman_mcclure",
         "Robust loss of the first rounds; `linear` skips them.",
-        rows="barpc.ba.weights.LOSSES",
+        rows="barpc.ba.robust.weights.LOSSES",
     )
     robust_threshold: float = option(
         4.0, "Observations beyond so many standard deviations are cut after the robust rounds.", above=0

@@ -40,13 +40,15 @@ from scipy.optimize import OptimizeResult, least_squares
 from scipy.sparse import bsr_array, coo_matrix
 from scipy.sparse.linalg import splu
 
-from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, solution, structure
-from barpc.ba.block import join
-from barpc.ba.multifrontal import Cholesky
-from barpc.ba.problem import Problem
-from barpc.ba.smooth import Smooth
-from barpc.ba.solve import State, camera_step, minimise
-from barpc.ba.starting import make_problem
+from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
+from barpc.ba.algebra import structure
+from barpc.ba.algebra.multifrontal import Cholesky
+from barpc.ba.held.block import join
+from barpc.ba.held.starting import make_problem
+from barpc.ba.judging import solution
+from barpc.ba.robust.smooth import Smooth
+from barpc.ba.solving.problem import Problem
+from barpc.ba.solving.solve import State, camera_step, minimise
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.sensor.curve import rotation_matrix
 from barpc.sensor.geometry import triangulate

@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.ba.block import Block, join
-from barpc.ba.problem import Problem
-from barpc.ba.solve import State, minimise
-from barpc.ba.starting import first_state, make_problem
+from barpc.ba.held.block import Block, join
+from barpc.ba.held.starting import first_state, make_problem
+from barpc.ba.solving.problem import Problem
+from barpc.ba.solving.solve import State, minimise
 from barpc.simulate import simulate_block
 
 SIZES = (3, 1500), (10, 5000), (30, 10000), (100, 15000), (300, 30000), (1000, 100000)

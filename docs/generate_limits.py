@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 
 from barpc import dem, frozen, options, raster, scene, sidefile, vrt, workspace
-from barpc.ba import incremental
+from barpc.ba.held import incremental
 from barpc.fit import points
 from barpc.pointio import colmap, ground, hloc, names
 from barpc.remote import _KEPT as HELD

@@ -21,11 +21,11 @@ CONSTANTS: dict[type[Options], dict[str, tuple[str, ...]]] = {
         "min_correlation": ("barpc.tie.register.MIN_CORRELATION",),
     },
     AdjustOptions: {
-        "sigma_shift": ("barpc.ba.priors.IMAGE_SIGMA",),
-        "num_passes": ("barpc.ba.rounds.MAX_PASSES",),
-        "max_steps": ("barpc.ba.solve.MAX_STEPS",),
-        "tolerance": ("barpc.ba.rounds.TOLERANCE",),
-        "min_observations": ("barpc.ba.block.MIN_OBSERVATIONS",),
+        "sigma_shift": ("barpc.ba.estimated.priors.IMAGE_SIGMA",),
+        "num_passes": ("barpc.ba.robust.rounds.MAX_PASSES",),
+        "max_steps": ("barpc.ba.solving.solve.MAX_STEPS",),
+        "tolerance": ("barpc.ba.robust.rounds.TOLERANCE",),
+        "min_observations": ("barpc.ba.held.block.MIN_OBSERVATIONS",),
     },
     FitOptions: {
         "tau": ("barpc.fit.system.TAU", "barpc.fit.solve.TAU"),

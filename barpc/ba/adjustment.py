@@ -11,22 +11,22 @@ import numpy as np
 
 from barpc.ba.altimetry import hold_by_altimetry
 from barpc.ba.apart import Apart, find_apart
-from barpc.ba.block import Block, join
-from barpc.ba.consensus import two_groups
-from barpc.ba.covariance import Covariance
-from barpc.ba.datum import datum_shares
-from barpc.ba.following import follow, without_strips
-from barpc.ba.gauge import GaugeReport, earlier_scene, gauge_report, sampled
-from barpc.ba.heldout import enu_offsets, keep_out, measure
-from barpc.ba.incremental import BlockPrior
-from barpc.ba.judge import Finding, left_over, standing_out
+from barpc.ba.evidence.scan import neighbours_alike
+from barpc.ba.held.block import Block, join
+from barpc.ba.held.datum import datum_shares
+from barpc.ba.held.gauge import GaugeReport, earlier_scene, gauge_report, sampled
+from barpc.ba.held.incremental import BlockPrior
+from barpc.ba.held.relief import Terrain
+from barpc.ba.judging.following import follow, without_strips
+from barpc.ba.judging.judge import Finding, left_over, standing_out
+from barpc.ba.judging.snooping import MOST_TESTED, image_test
+from barpc.ba.judging.solution import Solution, solve_block
 from barpc.ba.placing import place
-from barpc.ba.relief import Terrain
 from barpc.ba.result import Adjustment
-from barpc.ba.rounds import Outcome
-from barpc.ba.scan import neighbours_alike
-from barpc.ba.snooping import MOST_TESTED, image_test
-from barpc.ba.solution import Solution, solve_block
+from barpc.ba.robust.consensus import two_groups
+from barpc.ba.robust.heldout import enu_offsets, keep_out, measure
+from barpc.ba.robust.rounds import Outcome
+from barpc.ba.solving.covariance import Covariance
 from barpc.ba.standing import Parts, without_moving
 from barpc.errors import AdjustError
 from barpc.geodesy import Array, ground_from_ecef

@@ -1,8 +1,8 @@
 """Altimetry as control: heights without image coordinates hold the block where its surface lies on them.
 
 The block is solved without them first. The motion that brings the surface of its tie points onto the heights is found
-where most of them agree (`barpc.ba.surface`), and held, with its covariance, at the tie points. Tilts, turn, scale and
-bending that the heights do not tell stay as open as they were.
+where most of them agree (`barpc.ba.held.surface`), and held, with its covariance, at the tie points. Tilts, turn,
+scale and bending that the heights do not tell stay as open as they were.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barpc.ba.block import Block
-from barpc.ba.covariance import Covariance
-from barpc.ba.gauge import SIMILAR, gauge_report
-from barpc.ba.ground import FIRST_PLACED
-from barpc.ba.heldout import is_better
-from barpc.ba.priors import PointPrior
-from barpc.ba.rounds import Rounds
-from barpc.ba.snooping import CRITICAL
-from barpc.ba.solution import Solution, finished
-from barpc.ba.surface import NEIGHBOURS, Given, Registration, Surface, displacement, register
+from barpc.ba.estimated.priors import PointPrior
+from barpc.ba.held.block import Block
+from barpc.ba.held.gauge import SIMILAR, gauge_report
+from barpc.ba.held.ground import FIRST_PLACED
+from barpc.ba.held.surface import NEIGHBOURS, Given, Registration, Surface, displacement, register
+from barpc.ba.judging.snooping import CRITICAL
+from barpc.ba.judging.solution import Solution, finished
+from barpc.ba.robust.heldout import is_better
+from barpc.ba.robust.rounds import Rounds
+from barpc.ba.solving.covariance import Covariance
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.options import AdjustOptions
 from barpc.scene import Altimetry, IntArray

@@ -6,7 +6,7 @@ solved without each of its views; where the others agree then, the one left out 
 (`barpc.ba.placing`). If more than half of its tie points contradict them wherever its camera is, it is the camera of
 another image and stays as delivered. If they agree, though the block had to let go of them, or though the priors
 leave no doubt that it is this view, it keeps the place found alone and bends the others no more. Where more than half
-agree and the rest does not, parts of its image lie off (`barpc.ba.judge`), and the camera is its own.
+agree and the rest does not, parts of its image lie off (`barpc.ba.judging.judge`), and the camera is its own.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barpc.ba.block import Block
-from barpc.ba.judge import LARGEST, UNKNOWNS, around
-from barpc.ba.mixture import fit
+from barpc.ba.evidence.mixture import fit
+from barpc.ba.evidence.scan import SURE
+from barpc.ba.held.block import Block
+from barpc.ba.judging.judge import LARGEST, UNKNOWNS, around
+from barpc.ba.judging.solution import MUCH_NOISE, Solution
 from barpc.ba.placing import Look, Placed, look, place
-from barpc.ba.scan import SURE
-from barpc.ba.solution import MUCH_NOISE, Solution
 from barpc.errors import AdjustError
 from barpc.geodesy import Array
 from barpc.options import GEOMETRIC, AdjustOptions

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from barpc.ba.block import Block
-from barpc.ba.cameras import Projected
-from barpc.ba.normal import cholesky3, point_products, whiten
-from barpc.ba.smooth import SPLINES
-from barpc.ba.solution import MUCH_NOISE, Solution
-from barpc.ba.weights import geman_mcclure
+from barpc.ba.estimated.cameras import Projected
+from barpc.ba.held.block import Block
+from barpc.ba.judging.solution import MUCH_NOISE, Solution
+from barpc.ba.robust.smooth import SPLINES
+from barpc.ba.robust.weights import geman_mcclure
+from barpc.ba.solving.normal import cholesky3, point_products, whiten
 from barpc.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray
 from barpc.sensor.splined import bsplines
 
-_FEWEST = 30  # points: fewer are no view (`barpc.ba.consensus`)
-_SPLINE = 15.0  # px: a row may be anywhere near, as what wanders may (`barpc.ba.explanations`)
+_FEWEST = 30  # points: fewer are no view (`barpc.ba.robust.consensus`)
+_SPLINE = 15.0  # px: a row may be anywhere near, as what wanders may (`barpc.ba.judging.explanations`)
 _STATED = 3.0  # standard deviations
 _WIDE = 100.0  # times its prior: a camera that may be anywhere
 _STEPS = 25
@@ -143,7 +143,7 @@ class _Sight:
         """Return the view's unknowns (q,), their covariance, and residuals (2, n) over their standard
         deviations.
 
-        Robust, as rounds are (`barpc.ba.rounds`): beside them splines (m, n) move columns and rows.
+        Robust, as rounds are (`barpc.ba.robust.rounds`): beside them splines (m, n) move columns and rows.
         """
         params = self.problem.camera_prior.mean.copy()
         beside = np.zeros((0, self.xy.shape[1])) if splines is None else splines

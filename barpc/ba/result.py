@@ -9,16 +9,16 @@ import numpy as np
 
 from barpc.ba.altimetry import AltimetryTest
 from barpc.ba.apart import Apart
-from barpc.ba.cameras import Cameras
-from barpc.ba.consensus import TwoGroups
-from barpc.ba.covariance import Covariance
-from barpc.ba.gauge import GaugeReport
-from barpc.ba.ground import TerrainTest
-from barpc.ba.judge import Finding
-from barpc.ba.scan import Interval
-from barpc.ba.smooth import SmoothTest
-from barpc.ba.snooping import ControlTest
-from barpc.ba.variances import PriorTest
+from barpc.ba.estimated.cameras import Cameras
+from barpc.ba.evidence.scan import Interval
+from barpc.ba.held.gauge import GaugeReport
+from barpc.ba.held.ground import TerrainTest
+from barpc.ba.judging.judge import Finding
+from barpc.ba.judging.snooping import ControlTest
+from barpc.ba.robust.consensus import TwoGroups
+from barpc.ba.robust.smooth import SmoothTest
+from barpc.ba.robust.variances import PriorTest
+from barpc.ba.solving.covariance import Covariance
 from barpc.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray
@@ -41,7 +41,7 @@ class Adjustment:
     sensors : tuple of SensorModel
         P_BA of every view: the delivered sensor behind its correction.
     params : (N, q)
-        The unknowns in metres (or px for image models), see `barpc.ba.unknowns`.
+        The unknowns in metres (or px for image models), see `barpc.ba.estimated.unknowns`.
     points : (P, 3)
         Ground points of the tracks, ECEF [m]; NaN for a track of which nothing was kept.
     residuals_before, residuals : (K, 2)
@@ -71,7 +71,7 @@ class Adjustment:
     gauge : GaugeReport
         Shift of the scene, its standard deviation, the weakest modes.
     datum : mapping
-        Source (`barpc.ba.datum.SOURCES`) -> its share (10,) in what is known of the scene's `MOTIONS`.
+        Source (`barpc.ba.held.datum.SOURCES`) -> its share (10,) in what is known of the scene's `MOTIONS`.
     prior : PriorTest
         Comparison of the corrections with the priors given, and the priors learnt.
     smooth : SmoothTest
@@ -87,7 +87,7 @@ class Adjustment:
     alike : (N,)
         Evidence that neighbours among a view's rejected tie points lie off in the same direction, which wrong
         matches do
-        not (`barpc.ba.scan.neighbours_alike`) [nats].
+        not (`barpc.ba.evidence.scan.neighbours_alike`) [nats].
     in_space_rms : float or None
         Where an affine in the image was chosen: RMS of held-out tracks under rotations, translations and drifts
         [px].
@@ -108,8 +108,8 @@ class Adjustment:
     control : ControlTest or None
         Ground control points against each other and the cameras.
     gcp_w, reference_w : (M,), (R,)
-        Baarda's w of the observations of GCPs and of a reference's points (`barpc.ba.snooping.image_test`); NaN for
-        those that do not count, and of a large reference for all but every n-th.
+        Baarda's w of the observations of GCPs and of a reference's points (`judging.snooping.image_test`);
+        NaN for those that do not count, and of a large reference for all but every n-th.
     gcp_inlier : (M,)
         Observations of GCPs that were kept.
     reference_inlier : (M,)

@@ -8,12 +8,12 @@ from functools import cached_property
 
 import numpy as np
 
-from barpc.ba.block import MIN_OBSERVATIONS, Block
-from barpc.ba.heldout import is_better, measure
-from barpc.ba.judge import Finding, Judgement, judge
-from barpc.ba.moving import Found, Motion, members
-from barpc.ba.scan import SURE, Interval, scan
-from barpc.ba.solution import MUCH_NOISE, Solution
+from barpc.ba.evidence.scan import SURE, Interval, scan
+from barpc.ba.held.block import MIN_OBSERVATIONS, Block
+from barpc.ba.judging.judge import Finding, Judgement, judge
+from barpc.ba.judging.moving import Found, Motion, members
+from barpc.ba.judging.solution import MUCH_NOISE, Solution
+from barpc.ba.robust.heldout import is_better, measure
 from barpc.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray, connected_groups

@@ -9,9 +9,9 @@ import numpy as np
 import scipy.linalg as la
 
 from barpc.ba import BlockPrior
-from barpc.ba.cameras import Cameras
+from barpc.ba.estimated.cameras import Cameras
+from barpc.ba.estimated.unknowns import make_unknowns
 from barpc.ba.result import height_by_unknowns
-from barpc.ba.unknowns import make_unknowns
 from barpc.errors import InputError
 from barpc.geodesy import Array, ecef_from_ground
 from barpc.scene import View

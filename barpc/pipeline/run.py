@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior
-from barpc.ba.ground import DEM_BIAS, KNOWN_BIAS
+from barpc.ba.held.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.dem import Dem
 from barpc.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
 from barpc.fit import RpcFit, fit_rpc

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from barpc.ba.apart import APART
-from barpc.ba.judge import LARGEST
-from barpc.ba.scan import SURE
+from barpc.ba.evidence.scan import SURE
+from barpc.ba.judging.judge import LARGEST
 from barpc.report.records import Table, table
 from barpc.report.summary import (
     AskedEntry,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.ba.ground import TerrainTest
-from barpc.ba.relief import BEYOND
+from barpc.ba.held.ground import TerrainTest
+from barpc.ba.held.relief import BEYOND
 from barpc.report.summary import metres
 
 _GEOID = 110.0  # m: no geoid lies farther from the ellipsoid

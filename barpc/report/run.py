@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.ba.places import Place, Unused, met_worse
+from barpc.ba.evidence.places import Place, Unused, met_worse
 from barpc.cameras import Camera
 from barpc.fit import RpcFit
 from barpc.geodesy import Array, ground_from_ecef

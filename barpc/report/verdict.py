@@ -10,8 +10,8 @@ import numpy as np
 
 from barpc.ba import Adjustment, check_residuals
 from barpc.ba.apart import APART, Apart
-from barpc.ba.scan import SURE
-from barpc.ba.snooping import ControlTest
+from barpc.ba.evidence.scan import SURE
+from barpc.ba.judging.snooping import ControlTest
 from barpc.geodesy import Array
 from barpc.report.dem_lines import dem_lines, dem_reasons, holds_reference
 from barpc.report.records import plain

@@ -11,10 +11,10 @@ from scipy.linalg import null_space
 from scipy.optimize import minimize
 
 from barpc.ba import AdjustOptions
-from barpc.ba.block import join
-from barpc.ba.consensus import TwoGroups, _across, _mixture, _on_one_plane, agreeing, two_groups
-from barpc.ba.problem import Problem
-from barpc.ba.starting import make_problem
+from barpc.ba.held.block import join
+from barpc.ba.held.starting import make_problem
+from barpc.ba.robust.consensus import TwoGroups, _across, _mixture, _on_one_plane, agreeing, two_groups
+from barpc.ba.solving.problem import Problem
 from barpc.geodesy import ecef_from_ground
 from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of
@@ -168,9 +168,9 @@ def test_groups_are_told_where_they_are_evident(seen, offset: np.ndarray, said: 
 def test_what_looks_like_one_group_by_skewness_and_kurtosis_is_one(seen, monkeypatch, share, apart) -> None:
     z = groups(400, share, apart)
     coefficient = (stats.skew(z) ** 2 + 1) / stats.kurtosis(z, fisher=False)
-    monkeypatch.setattr("barpc.ba.consensus._mixture", lambda z: (0.5, 1.0, 100.0))
+    monkeypatch.setattr("barpc.ba.robust.consensus._mixture", lambda z: (0.5, 1.0, 100.0))
     for bound, said in ((0.98 * coefficient, True), (1.02 * coefficient, False)):
-        monkeypatch.setattr("barpc.ba.consensus._BIMODAL", bound)
+        monkeypatch.setattr("barpc.ba.robust.consensus._BIMODAL", bound)
         assert len(two_groups(seen[0].structure, *_given(seen, z))) == said
 
 

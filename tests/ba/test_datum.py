@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
-from barpc.ba.datum import SOURCES
+from barpc.ba.held.datum import SOURCES
 from barpc.report import Run, summarize
 from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block

@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba import AdjustOptions, detectors, following
-from barpc.ba.block import join
-from barpc.ba.detectors import _Columns, find_edges
-from barpc.ba.following import _given_edges, _spline_counts, _with_edges, follow
-from barpc.ba.problem import Problem
-from barpc.ba.solve import State
-from barpc.ba.starting import make_problem
-from barpc.ba.waves import Waves
+from barpc.ba import AdjustOptions
+from barpc.ba.estimated.waves import Waves
+from barpc.ba.evidence import detectors
+from barpc.ba.evidence.detectors import _Columns, find_edges
+from barpc.ba.held.block import join
+from barpc.ba.held.starting import make_problem
+from barpc.ba.judging import following
+from barpc.ba.judging.following import _given_edges, _spline_counts, _with_edges, follow
+from barpc.ba.solving.problem import Problem
+from barpc.ba.solving.solve import State
 from barpc.geodesy import ecef_from_ground
 from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of

@@ -11,13 +11,13 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pytest
 
-from barpc.ba import ground as on_points
-from barpc.ba.cameras import Cameras
-from barpc.ba.ground import flat_heights, ground_control, reference_control, staying, terrain_heights
-from barpc.ba.priors import CameraPrior, JointPrior, PointPrior
-from barpc.ba.unknowns import make_unknowns
-from barpc.ba.waves import Waves
-from barpc.ba.weights import LOSSES
+from barpc.ba.estimated.cameras import Cameras
+from barpc.ba.estimated.priors import CameraPrior, JointPrior, PointPrior
+from barpc.ba.estimated.unknowns import make_unknowns
+from barpc.ba.estimated.waves import Waves
+from barpc.ba.held import ground as on_points
+from barpc.ba.held.ground import flat_heights, ground_control, reference_control, staying, terrain_heights
+from barpc.ba.robust.weights import LOSSES
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.options import AUTO, Model
 from barpc.scene import GroundPoints, Reference, View

@@ -10,8 +10,9 @@ import numpy as np
 import pyproj
 import pytest
 
-from barpc.ba.gauge import MOTIONS, _motion_of_points
-from barpc.ba.ground import (
+from barpc.ba.estimated.priors import DEFAULT_ACCURACY, USABLE_ACCURACY, _stated, prior_sigmas
+from barpc.ba.held.gauge import MOTIONS, _motion_of_points
+from barpc.ba.held.ground import (
     DEM_BIAS,
     Heights,
     _join,
@@ -21,7 +22,6 @@ from barpc.ba.ground import (
     reference_control,
     terrain_heights,
 )
-from barpc.ba.priors import DEFAULT_ACCURACY, USABLE_ACCURACY, _stated, prior_sigmas
 from barpc.errors import BarpcWarning
 from barpc.geodesy import ecef_from_ground
 from barpc.options import AdjustOptions

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions
-from barpc.ba.block import Block, join
-from barpc.ba.heldout import HeldOut, _scrambled, is_better, keep_out, measure, scatter
-from barpc.ba.starting import make_problem
+from barpc.ba.held.block import Block, join
+from barpc.ba.held.starting import make_problem
+from barpc.ba.robust.heldout import HeldOut, _scrambled, is_better, keep_out, measure, scatter
 from barpc.geodesy import ecef_from_ground
 from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of

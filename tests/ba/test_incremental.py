@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from barpc.ba.incremental import BlockPrior, apply_prior, block_prior
-from barpc.ba.priors import CameraPrior, EarlierScene
+from barpc.ba.estimated.priors import CameraPrior, EarlierScene
+from barpc.ba.held.incremental import BlockPrior, apply_prior, block_prior
 from barpc.errors import InputError
 from barpc.simulate import simulate_block
 from tests.ba.conftest import solve
@@ -182,7 +182,7 @@ def test_a_block_leaves_what_it_knows_of_its_free_views() -> None:
 def test_a_large_block_leaves_a_sparse_matrix_that_says_the_same(monkeypatch, tmp_path) -> None:
     made = simulate_block(6, 300, seed=5)
     dense = block_prior(solve(made, fixed=("view_0001",), min_convergence=60.0))
-    monkeypatch.setattr("barpc.ba.normal.DENSE_UNKNOWNS", 0)
+    monkeypatch.setattr("barpc.ba.solving.normal.DENSE_UNKNOWNS", 0)
     block_prior(solve(made, fixed=("view_0001",), min_convergence=60.0)).save(tmp_path / "prior.npz")
     read = BlockPrior.load(tmp_path / "prior.npz")
     assert read.less is not None
@@ -190,7 +190,7 @@ def test_a_large_block_leaves_a_sparse_matrix_that_says_the_same(monkeypatch, tm
     scale = np.sqrt(np.outer(dense.information.diagonal(), dense.information.diagonal()))
     np.testing.assert_allclose(read.dense() / scale, dense.information / scale, atol=2e-8)
     assert np.abs((read.information.toarray() - dense.information) / scale).max() > 5e-8
-    monkeypatch.setattr("barpc.ba.incremental._LARGEST", 44)
+    monkeypatch.setattr("barpc.ba.held.incremental._LARGEST", 44)
     with pytest.raises(InputError, match="5 views, too many to go on from: at most 4"):
         read.dense()
     for name, damaged in (("less", np.full((3, 45), np.nan)), ("less", np.zeros((3, 44)))):

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.ba.incremental import BlockPrior, block_prior
-from barpc.ba.waves import Waves
+from barpc.ba.estimated.waves import Waves
+from barpc.ba.held.incremental import BlockPrior, block_prior
 from barpc.errors import InputError
 from barpc.fit import fit_rpc
 from barpc.sensor.splined import Splined

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
-from barpc.ba.explanations import FADE, LOCAL, SETTLING, STRIP, SWING, WANDER
+from barpc.ba.judging.explanations import FADE, LOCAL, SETTLING, STRIP, SWING, WANDER
 from barpc.scene import Tracks
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.splined import Splined
@@ -257,7 +257,7 @@ def test_what_cannot_be_judged_is_adjusted_all_the_same(monkeypatch: pytest.Monk
     def fails(*_: Any) -> None:
         raise np.linalg.LinAlgError("7-th leading minor")
 
-    monkeypatch.setattr("barpc.ba.judge.fit", fails)
+    monkeypatch.setattr("barpc.ba.judging.judge.fit", fails)
     found = adjusted(*flawed(3, 400, MIDDLE))
     assert not found.findings
     assert {one.view for one in found.left} == {1}  # and what stands out is still said

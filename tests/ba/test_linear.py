@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import scipy.linalg as la
 
-from barpc.ba import Adjustment, linear, normal
-from barpc.ba.dissection import dissect
-from barpc.ba.multifrontal import Blocks
-from barpc.ba.structure import counting_sort
+from barpc.ba import Adjustment
+from barpc.ba.algebra import linear
+from barpc.ba.algebra.dissection import dissect
+from barpc.ba.algebra.multifrontal import Blocks
+from barpc.ba.algebra.structure import counting_sort
+from barpc.ba.solving import normal
 from barpc.errors import AdjustError
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import solve as adjust
@@ -61,8 +63,8 @@ def test_a_large_block_is_solved_in_sparse_form_as_in_dense_form(block, adjusted
 
 def test_what_a_large_block_does_not_keep_it_works_out_again(block, adjusted, monkeypatch):
     """Derivatives from one step to the next, and the terms of the smooth parts."""
-    monkeypatch.setattr("barpc.ba.problem._KEPT", 0)
-    monkeypatch.setattr("barpc.ba.smooth._KEPT", 0)
+    monkeypatch.setattr("barpc.ba.solving.problem._KEPT", 0)
+    monkeypatch.setattr("barpc.ba.robust.smooth._KEPT", 0)
     found = adjust(block)
     np.testing.assert_allclose(found.params, adjusted.params, atol=1e-7)
     np.testing.assert_allclose(found.smooth.rms, adjusted.smooth.rms, atol=1e-9)

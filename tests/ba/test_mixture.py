@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from barpc.ba import linearised, mixture
-from barpc.ba.block import join
-from barpc.ba.linearised import Linear, Tracks, linearise
-from barpc.ba.mixture import Fit, fit, log_likelihoods, off_from_right
-from barpc.ba.starting import first_state, make_problem
+from barpc.ba.evidence import linearised, mixture
+from barpc.ba.evidence.linearised import Linear, Tracks, linearise
+from barpc.ba.evidence.mixture import Fit, fit, log_likelihoods, off_from_right
+from barpc.ba.held.block import join
+from barpc.ba.held.starting import first_state, make_problem
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
 from barpc.simulate import simulate_block

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, adjustment, block_prior
-from barpc.ba import solution as solved
-from barpc.ba.block import join
-from barpc.ba.judge import Judgement
-from barpc.ba.rounds import Outcome
-from barpc.ba.solution import Solution
-from barpc.ba.starting import first_state, make_problem
-from barpc.ba.structure import make_structure
+from barpc.ba.algebra.structure import make_structure
+from barpc.ba.held.block import join
+from barpc.ba.held.starting import first_state, make_problem
+from barpc.ba.judging import solution as solved
+from barpc.ba.judging.judge import Judgement
+from barpc.ba.judging.solution import Solution
+from barpc.ba.robust.rounds import Outcome
 from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
 from barpc.scene import GroundPoints, Tracks

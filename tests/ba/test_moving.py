@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.ba.block import Block as Joined
-from barpc.ba.block import join
-from barpc.ba.explanations import MOVING, STRIP
-from barpc.ba.linearised import linearise
-from barpc.ba.mixture import Group, fit
-from barpc.ba.moving import CELLS, Ground, group_of
-from barpc.ba.problem import Problem
-from barpc.ba.solve import State
+from barpc.ba.evidence.linearised import linearise
+from barpc.ba.evidence.mixture import Group, fit
+from barpc.ba.held.block import Block as Joined
+from barpc.ba.held.block import join
+from barpc.ba.held.starting import first_state, make_problem
+from barpc.ba.judging.explanations import MOVING, STRIP
+from barpc.ba.judging.moving import CELLS, Ground, group_of
+from barpc.ba.solving.problem import Problem
+from barpc.ba.solving.solve import State
 from barpc.ba.standing import Parts
-from barpc.ba.starting import first_state, make_problem
 from barpc.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
 from barpc.scene import BoolArray, Tracks
 from barpc.sensor.corrected import Corrected

@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 import scipy.linalg as la
 
-from barpc.ba import adjust_tracks, dissection, multifrontal, normal
-from barpc.ba.block import join
-from barpc.ba.dissection import Dissection, dissect
-from barpc.ba.incremental import BlockPrior
-from barpc.ba.linear import factorize_blocks
-from barpc.ba.multifrontal import Blocks
-from barpc.ba.solve import camera_step
-from barpc.ba.starting import make_problem
+from barpc.ba import adjust_tracks
+from barpc.ba.algebra import dissection, multifrontal
+from barpc.ba.algebra.dissection import Dissection, dissect
+from barpc.ba.algebra.linear import factorize_blocks
+from barpc.ba.algebra.multifrontal import Blocks
+from barpc.ba.held.block import join
+from barpc.ba.held.incremental import BlockPrior
+from barpc.ba.held.starting import make_problem
+from barpc.ba.solving import normal
+from barpc.ba.solving.solve import camera_step
 from barpc.geodesy import ecef_from_ground
 from barpc.options import AdjustOptions
 from barpc.scene import GroundPoints, Tracks

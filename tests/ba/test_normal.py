@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.covariance import Covariance
-from barpc.ba.linear import Factor
-from barpc.ba.multifrontal import Blocks
-from barpc.ba.normal import (
+from barpc.ba.algebra.linear import Factor
+from barpc.ba.algebra.multifrontal import Blocks
+from barpc.ba.solving.covariance import Covariance
+from barpc.ba.solving.normal import (
     TRIANGLE,
     Common,
     Reduced,

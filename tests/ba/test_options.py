@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
-from barpc.ba.block import join
-from barpc.ba.priors import prior_sigmas, stated_accuracy
+from barpc.ba.estimated.priors import prior_sigmas, stated_accuracy
+from barpc.ba.held.block import join
 from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
 from barpc.scene import Tracks
@@ -271,7 +271,7 @@ def test_the_largest_group_goes_on_alone_where_asked(dirty):
 def test_the_solver_that_is_asked_for_is_the_one_that_runs(dirty, caplog):
     for asked, runs in (("scipy", ["scipy"]), ("sparse", ["sparse"]), ("auto", ["scipy", "sparse"])):
         caplog.clear()
-        with caplog.at_level(logging.INFO, logger="barpc.ba.solve"):
+        with caplog.at_level(logging.INFO, logger="barpc.ba.solving.solve"):
             found = run(dirty, solver=asked)
         names = [record.getMessage().split(":")[0] for record in caplog.records]
         assert sorted(set(names)) == runs
@@ -282,9 +282,9 @@ def test_the_solver_that_is_asked_for_is_the_one_that_runs(dirty, caplog):
 def test_auto_leaves_scipy_where_unknowns_are_many(caplog, monkeypatch):
     dirty = simulate_block(4, 60, seed=21)
     for most, runs in ((35, "sparse"), (36, "scipy")):
-        monkeypatch.setattr("barpc.ba.solve.SCIPY_UNKNOWNS", most)
+        monkeypatch.setattr("barpc.ba.solving.solve.SCIPY_UNKNOWNS", most)
         caplog.clear()
-        with caplog.at_level(logging.INFO, logger="barpc.ba.solve"):
+        with caplog.at_level(logging.INFO, logger="barpc.ba.solving.solve"):
             run(dirty)
         assert caplog.records[-1].getMessage().split(":")[0] == runs
 

@@ -10,17 +10,19 @@ import numpy as np
 import pytest
 import scipy.linalg as la
 
-from barpc.ba import AdjustOptions, adjust_tracks, block_prior, normal, rounds
-from barpc.ba.block import join
-from barpc.ba.cameras import Cameras
-from barpc.ba.datum import datum_shares
-from barpc.ba.gauge import MOTIONS, _modes, gauge_report
-from barpc.ba.ground import Heights, convergence_angles, ground_control
-from barpc.ba.problem import Problem
-from barpc.ba.snooping import image_test
-from barpc.ba.solve import Minimum, State, _Compressed, camera_step, gauss_newton
-from barpc.ba.starting import make_problem
-from barpc.ba.weights import Observations
+from barpc.ba import AdjustOptions, adjust_tracks, block_prior
+from barpc.ba.estimated.cameras import Cameras
+from barpc.ba.held.block import join
+from barpc.ba.held.datum import datum_shares
+from barpc.ba.held.gauge import MOTIONS, _modes, gauge_report
+from barpc.ba.held.ground import Heights, convergence_angles, ground_control
+from barpc.ba.held.starting import make_problem
+from barpc.ba.judging.snooping import image_test
+from barpc.ba.robust import rounds
+from barpc.ba.robust.weights import Observations
+from barpc.ba.solving import normal
+from barpc.ba.solving.problem import Problem
+from barpc.ba.solving.solve import Minimum, State, _Compressed, camera_step, gauss_newton
 from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of
@@ -157,7 +159,7 @@ def test_the_reduced_system_is_the_schur_complement_of_the_whole_differenced_pro
 def test_pieces_of_any_size_make_the_same_system(case, monkeypatch):
     whole = case.reduced
     monkeypatch.setattr(normal, "CHUNK", 3)
-    monkeypatch.setattr("barpc.ba.cameras.CHUNK", 5)
+    monkeypatch.setattr("barpc.ba.estimated.cameras.CHUNK", 5)
     pieces = case.reduced
     _assert_close(pieces.matrix, whole.matrix, 1e-12)
     _assert_close(pieces.gradient, whole.gradient, 1e-9)
@@ -307,7 +309,7 @@ def test_the_whole_covariance_is_put_together_of_any_number_of_columns(case, mon
     matrix, _, _ = case.dense
     size = case.params.size
     for columns in (1, 5, size - 1, size, 1000):
-        monkeypatch.setattr("barpc.ba.covariance._COLUMNS", columns)
+        monkeypatch.setattr("barpc.ba.solving.covariance._COLUMNS", columns)
         covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
         _assert_close(covariance.full, np.linalg.inv(matrix)[:size, :size], 1e-4)
         np.testing.assert_array_equal(covariance.full, covariance.full.T)
@@ -315,7 +317,7 @@ def test_the_whole_covariance_is_put_together_of_any_number_of_columns(case, mon
 
 @pytest.mark.parametrize("small", [0, 2000])
 def test_blocks_of_views_are_the_same_whether_the_whole_is_kept_or_not(case, monkeypatch, small):
-    monkeypatch.setattr("barpc.ba.covariance._SMALL", small)
+    monkeypatch.setattr("barpc.ba.solving.covariance._SMALL", small)
     q = case.params.shape[1]
     inverse = np.linalg.inv(case.dense[0])
     fresh = Minimum(_state(case), case.reduced).covariance(case.problem.free)
@@ -372,9 +374,9 @@ def test_a_sample_of_many_points_stands_for_the_scene(case, monkeypatch):
     covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
     before, use = case.points - [3.0, 0.0, 1.0] * (np.arange(12) == 7)[:, None], np.ones(12, dtype=bool)
     whole = gauge_report(covariance, case.points, before, use)
-    monkeypatch.setattr("barpc.ba.gauge._SAMPLE", 12)
+    monkeypatch.setattr("barpc.ba.held.gauge._SAMPLE", 12)
     assert gauge_report(covariance, case.points, before, use).radius != whole.radius  # every second
-    monkeypatch.setattr("barpc.ba.gauge._SAMPLE", 4)
+    monkeypatch.setattr("barpc.ba.held.gauge._SAMPLE", 4)
     some = gauge_report(covariance, case.points, before, use)
     monkeypatch.undo()
     sample = np.arange(12) % 4 == 0

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.ba.periods import swings
-from barpc.ba.scan import SURE
+from barpc.ba.evidence.periods import swings
+from barpc.ba.evidence.scan import SURE
 
 
 def ties(

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
-from barpc.ba.gauge import MOTIONS
-from barpc.ba.incremental import BlockPrior
+from barpc.ba.held.gauge import MOTIONS
+from barpc.ba.held.incremental import BlockPrior
 from barpc.fit import fit_rpc
 from barpc.geodesy import enu_basis, metres_per_unit
 from barpc.options import RunOptions

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from barpc.ba.block import join
-from barpc.ba.ground import ALIKE
-from barpc.ba.resembling import Resemblance
-from barpc.ba.smooth import TERMS, Smooth
-from barpc.ba.structure import make_structure
-from barpc.ba.unknowns import Unknowns
+from barpc.ba.algebra.structure import make_structure
+from barpc.ba.estimated.unknowns import Unknowns
+from barpc.ba.held.block import join
+from barpc.ba.held.ground import ALIKE
+from barpc.ba.robust.resembling import Resemblance
+from barpc.ba.robust.smooth import TERMS, Smooth
 from barpc.geodesy import metres_per_unit
 from barpc.options import AdjustOptions
 from barpc.scene import GroundPoints, Reference, Tracks

@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba import AdjustOptions, adjust_tracks, rounds, solution
-from barpc.ba.block import join
-from barpc.ba.priors import CameraPrior
-from barpc.ba.problem import Problem
-from barpc.ba.rounds import _median
-from barpc.ba.solve import State
-from barpc.ba.starting import first_state, make_problem
+from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.ba.estimated.priors import CameraPrior
+from barpc.ba.held.block import join
+from barpc.ba.held.starting import first_state, make_problem
+from barpc.ba.judging import solution
+from barpc.ba.robust import rounds
+from barpc.ba.robust.rounds import _median
+from barpc.ba.solving.problem import Problem
+from barpc.ba.solving.solve import State
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import centers_of, solve
 

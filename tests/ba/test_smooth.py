@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from barpc.ba.smooth import SPLINES, Smooth, SmoothTest
-from barpc.ba.structure import make_structure
-from barpc.ba.unknowns import Unknowns
+from barpc.ba.algebra.structure import make_structure
+from barpc.ba.estimated.unknowns import Unknowns
+from barpc.ba.robust.smooth import SPLINES, Smooth, SmoothTest
 from barpc.sensor.splined import bsplines
 
 SIZE = (10000, 20000)
@@ -209,7 +209,7 @@ def test_what_neighbours_share_is_found_though_it_is_no_smooth_function(axis: in
 
 @pytest.mark.parametrize(("most", "once"), [(599, False), (600, True)])
 def test_terms_of_a_block_that_is_not_large_are_worked_out_once(monkeypatch, most: int, once: bool) -> None:
-    monkeypatch.setattr("barpc.ba.smooth._KEPT", most)
+    monkeypatch.setattr("barpc.ba.robust.smooth._KEPT", most)
     asked: list[slice] = []
     terms = Smooth._terms
     monkeypatch.setattr(Smooth, "_terms", lambda self, rows: asked.append(rows) or terms(self, rows))

@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, adjustment
-from barpc.ba.snooping import CRITICAL, ControlTest, _together
+from barpc.ba.judging.snooping import CRITICAL, ControlTest, _together
 from barpc.geodesy import ecef_from_ground, enu_basis, metres_per_unit
 from barpc.options import RunOptions
 from barpc.report import Run, summarize

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba import solve
-from barpc.ba.solve import Minimum, State, _settled
+from barpc.ba.solving import solve
+from barpc.ba.solving.solve import Minimum, State, _settled
 from barpc.errors import AdjustError
 
 STATE = State(np.zeros((1, 2)), np.zeros((1, 3)), history=(7.0,))

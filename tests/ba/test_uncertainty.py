@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior, pair_heights
-from barpc.ba.incremental import BlockPrior
-from barpc.ba.priors import DRIFT_SIGMA
+from barpc.ba.estimated.priors import DRIFT_SIGMA
+from barpc.ba.held.incremental import BlockPrior
 from barpc.errors import InputError
 from barpc.geodesy import ecef_from_ground, enu_basis
 from barpc.scene import Tracks

@@ -11,13 +11,13 @@ import pytest
 from scipy.stats import chi2
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
-from barpc.ba.block import join
-from barpc.ba.priors import CameraPrior, prior_sigmas
-from barpc.ba.solve import State, minimise
-from barpc.ba.starting import make_problem
-from barpc.ba.unknowns import Unknowns
-from barpc.ba.variances import Variances, _Around, same_prior
-from barpc.ba.waves import Waves
+from barpc.ba.estimated.priors import CameraPrior, prior_sigmas
+from barpc.ba.estimated.unknowns import Unknowns
+from barpc.ba.estimated.waves import Waves
+from barpc.ba.held.block import join
+from barpc.ba.held.starting import make_problem
+from barpc.ba.robust.variances import Variances, _Around, same_prior
+from barpc.ba.solving.solve import State, minimise
 from barpc.errors import BarpcWarning
 from barpc.geodesy import ecef_from_ground
 from barpc.simulate import Block, simulate_block
@@ -254,8 +254,8 @@ def test_variances_of_a_large_block_are_exact_where_they_are_stated_and_probed_w
     """Against the inverse of the whole matrix (9 unknowns a view), whose drifts are a hundredth of the rotations."""
     block = simulate_block(n, 20 * n, seed=1, num_checks=0)
     if n < 300:
-        monkeypatch.setattr("barpc.ba.normal.DENSE_UNKNOWNS", 0)
-        monkeypatch.setattr("barpc.ba.covariance._LARGE", 0)
+        monkeypatch.setattr("barpc.ba.solving.normal.DENSE_UNKNOWNS", 0)
+        monkeypatch.setattr("barpc.ba.solving.covariance._LARGE", 0)
     options = AdjustOptions(**({"min_convergence": 60.0} if n < 300 else {}))
     with pytest.warns(
         BarpcWarning, match="held in height"
@@ -433,7 +433,7 @@ def determined(problem: Any, minimum: Any, sigma: np.ndarray) -> np.ndarray:
 def test_a_large_block_learns_once_a_solve(at_minimum, monkeypatch) -> None:
     """By the covariance at hand: the drift of all views by its squares, the constants by those of most."""
     problem, minimum = at_minimum
-    monkeypatch.setattr("barpc.ba.variances._SMALL", 0)
+    monkeypatch.setattr("barpc.ba.robust.variances._SMALL", 0)
     sigma, params = problem.camera_prior.sigma, minimum.state.params
     known = determined(problem, minimum, sigma)
     squares = (params / sigma) ** 2
@@ -455,7 +455,7 @@ def test_a_large_block_learns_once_a_solve(at_minimum, monkeypatch) -> None:
 
 def test_priors_that_are_too_narrow_are_widened_by_what_most_views_show(at_minimum, monkeypatch) -> None:
     problem, minimum = at_minimum
-    monkeypatch.setattr("barpc.ba.variances._SMALL", 0)
+    monkeypatch.setattr("barpc.ba.robust.variances._SMALL", 0)
     narrow = problem.camera_prior.sigma.copy()
     narrow[:, :6] /= 5.0
     known = determined(problem, minimum, problem.camera_prior.sigma)

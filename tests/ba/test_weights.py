@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from barpc.ba import rounds
-from barpc.ba.ground import ALIKE
-from barpc.ba.priors import PointPrior
-from barpc.ba.rounds import _robust
-from barpc.ba.smooth import SPLINES
-from barpc.ba.structure import make_structure
-from barpc.ba.waves import Waves
-from barpc.ba.weights import LOSSES, MEDIAN, Observations
+from barpc.ba.algebra.structure import make_structure
+from barpc.ba.estimated.priors import PointPrior
+from barpc.ba.estimated.waves import Waves
+from barpc.ba.held.ground import ALIKE
+from barpc.ba.robust import rounds
+from barpc.ba.robust.rounds import _robust
+from barpc.ba.robust.smooth import SPLINES
+from barpc.ba.robust.weights import LOSSES, MEDIAN, Observations
 from barpc.options import AdjustOptions
 
 

@@ -16,8 +16,8 @@ import numpy as np
 import rasterio
 
 from barpc.ba import BlockPrior
-from barpc.ba.incremental import apply_prior
-from barpc.ba.priors import CameraPrior
+from barpc.ba.estimated.priors import CameraPrior
+from barpc.ba.held.incremental import apply_prior
 from barpc.cameras import open_camera
 from barpc.cli.images import read_config
 from barpc.cli.options import image_paths

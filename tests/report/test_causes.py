@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from barpc.ba.apart import APART, Apart
-from barpc.ba.explanations import EXPLANATIONS, FADE, MOVING, SETTLING, STRIP, SWING, WANDER
-from barpc.ba.judge import Finding
-from barpc.ba.moving import Motion
+from barpc.ba.evidence.scan import Interval
+from barpc.ba.judging.explanations import EXPLANATIONS, FADE, MOVING, SETTLING, STRIP, SWING, WANDER
+from barpc.ba.judging.judge import Finding
+from barpc.ba.judging.moving import Motion
 from barpc.ba.placing import Look
-from barpc.ba.scan import Interval
 from barpc.report import verdict
 from barpc.report.summary.causes import _WORDS, _place, explanations, left_entries, strangeness
 

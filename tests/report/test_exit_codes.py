@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.ba.consensus import TwoGroups
+from barpc.ba.robust.consensus import TwoGroups
 from barpc.report.summary import STATUS_WORDS, measure
 from barpc.report.verdict import GOOD, block_verdict
 from tests.lanes import diagonal

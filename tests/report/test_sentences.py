@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.consensus import TwoGroups
-from barpc.ba.ground import TerrainTest
-from barpc.ba.smooth import SmoothTest
-from barpc.ba.snooping import ControlTest
+from barpc.ba.held.ground import TerrainTest
+from barpc.ba.judging.snooping import ControlTest
+from barpc.ba.robust.consensus import TwoGroups
+from barpc.ba.robust.smooth import SmoothTest
 from barpc.report import verdict as verdicts
 from barpc.report.summary import FitEntry
 from barpc.report.verdict import block_verdict, view_status

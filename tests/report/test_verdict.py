@@ -10,7 +10,7 @@ import pytest
 
 from barpc.ba import adjust_tracks
 from barpc.ba.apart import Apart
-from barpc.ba.gauge import MOTIONS, Mode
+from barpc.ba.held.gauge import MOTIONS, Mode
 from barpc.ba.placing import Look
 from barpc.errors import BarpcWarning
 from barpc.fit import FitOptions

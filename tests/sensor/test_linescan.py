@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barpc.ba.priors import prior_sigmas
+from barpc.ba.estimated.priors import prior_sigmas
 from barpc.errors import BarpcError, FitError, InputError, RpcFormatError
 from barpc.fit import fit_rpc
 from barpc.geodesy import ecef_from_ground, enu_basis

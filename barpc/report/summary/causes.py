@@ -9,11 +9,11 @@ import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.ba.apart import APART, Apart
-from barpc.ba.explanations import FADE, MOVING, SETTLING, STRIP, SWING, WANDER
-from barpc.ba.judge import Finding
-from barpc.ba.moving import Motion
-from barpc.ba.places import Place
-from barpc.ba.scan import Interval
+from barpc.ba.evidence.places import Place
+from barpc.ba.evidence.scan import Interval
+from barpc.ba.judging.explanations import FADE, MOVING, SETTLING, STRIP, SWING, WANDER
+from barpc.ba.judging.judge import Finding
+from barpc.ba.judging.moving import Motion
 from barpc.report.records import Number, Record, said
 from barpc.report.summary.words import Count
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.ba.altimetry import AltimetryTest
-from barpc.ba.gauge import MOTIONS, Mode
+from barpc.ba.held.gauge import MOTIONS, Mode
 from barpc.geodesy import ground_from_ecef, wrap_longitude
 from barpc.report.records import Column, Number, Record, said
 from barpc.report.run import Run

@@ -1,0 +1,1 @@
+"""The linear algebra of blocks: who sees what, the order of elimination, and Cholesky in it."""

@@ -1,0 +1,163 @@
+"""What is expected of cameras and points before any is known, as whitened residual blocks.
+
+Every block gives residuals and their derivative, divided by sigma. All of them are linear in the unknowns; the tie
+observations, which are not, are in `problem`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barpc.ba.estimated.waves import FIRST_SIGMA
+from barpc.geodesy import Array
+from barpc.options import AdjustOptions
+from barpc.scene import BoolArray, IntArray, View
+from barpc.sensor.pushbroom import Pushbroom
+from barpc.sensor.rpc import RPC
+from barpc.sensor.timing import is_clocked
+
+DEFAULT_ACCURACY = (
+    7.5  # m, of rotation and of translation, 10.6 m of both: the harsh end of what is delivered
+)
+DRIFT_SIGMA = 0.2  # m, at a view's first and last row: 0.3 microradian from 700 km, as good platforms have it
+USABLE_ACCURACY = 0.1  # m: less is stated in pixels of a fit (as Airbus does), not in metres of geolocation
+IMAGE_SIGMA = 20.0  # px, at the edge of the image: of every coefficient of models in the image
+
+
+@dataclass(frozen=True)
+class CameraPrior:
+    """Independent priors: (p - mean) / sigma."""
+
+    mean: Array  # (N, q) of every view's unknowns
+    sigma: Array  # (N, q)
+
+    def residual(self, params: Array) -> Array:
+        """Return the whitened residuals (N, q) of unknowns (N, q)."""
+        return (params - self.mean) / self.sigma
+
+    def jacobian(self) -> Array:
+        """Return the diagonal of the derivative (N, q)."""
+        return 1.0 / self.sigma
+
+
+@dataclass(frozen=True, eq=False)
+class EarlierScene:
+    """The scene of an earlier block: its motions (`barpc.ba.held.gauge.MOTIONS`) by the unknowns of its cameras."""
+
+    by_unknown: Array  # (10, n)
+    own: Array  # (10, 10) covariance of the motions where the cameras are known [m^2]
+    radius: float  # where tilts, turn and scale are measured [m]
+
+
+@dataclass(frozen=True)
+class JointPrior:
+    """A prior on several views together, with all of their correlations: root (p - mean)."""
+
+    index: IntArray  # (n,) places of the unknowns in the raveled (N, q) array
+    mean: Array  # (n,) their prior mean
+    root: Array  # (n, n) upper triangular factor of the information matrix
+    scene: EarlierScene | None = None  # that these views knew; None: not known
+
+    def residual(self, params: Array) -> Array:
+        """Return the whitened residuals (n,) of unknowns (N, q)."""
+        return self.root @ (params.ravel()[self.index] - self.mean)
+
+    def jacobian(self) -> Array:
+        """Return the derivative (n, n) by the unknowns `index`."""
+        return self.root
+
+
+@dataclass(frozen=True)
+class PointPrior:
+    """Priors on points with errors in common: rows (X - mean) - common b, and b itself is standard normal.
+
+    b is never a state of its own: residuals are those that the best b for the points leaves.
+    """
+
+    index: IntArray  # (Q,) which points; none twice
+    mean: Array  # (Q, 3) ECEF [m]
+    rows: Array  # (Q, 3, 3) whitening rows [1/m]; rows of zeros say nothing
+    # (Q, 3, m) what one standard deviation of each of m common errors adds to the whitened residuals
+    common: Array
+
+    def offset(self, points: Array) -> Array:
+        """Estimate the common errors (m,) of points (P, 3) [m], in their standard deviations."""
+        whitened = self.apart(points)
+        return np.linalg.solve(self.information(), np.einsum("qim,qi->m", self.common, whitened))
+
+    def residual(self, points: Array) -> Array:
+        """Return the whitened residuals (Q, 3) of points (P, 3) [m], the common errors taken away."""
+        return self.apart(points) - self.common @ self.offset(points)
+
+    def cost(self, points: Array) -> float:
+        """Return the sum of the squared residuals, with the common errors' own."""
+        return float((self.residual(points) ** 2).sum() + (self.offset(points) ** 2).sum())
+
+    def information(self) -> Array:
+        """Return the information (m, m) on the common errors where the points are known."""
+        information: Array = np.einsum("qim,qin->mn", self.common, self.common)
+        information += np.eye(len(information))
+        return information
+
+    def select(self, keep: BoolArray) -> PointPrior:
+        """Return the prior on some of its rows (Q,)."""
+        return PointPrior(self.index[keep], self.mean[keep], self.rows[keep], self.common[keep])
+
+    def apart(self, points: Array) -> Array:
+        """Return the whitened offsets (Q, 3) of points (P, 3) [m] with the common errors still in them."""
+        return (self.rows @ (points[self.index] - self.mean)[..., None])[..., 0]
+
+    def jacobian(self) -> Array:
+        """Return the derivatives (Q, 3, 3) by the points `index` [1/m]."""
+        return self.rows
+
+
+def stated_accuracy(view: View) -> float:
+    """Return the horizontal accuracy of a view as delivered [m]: what its RPC states where usable, else 7.5 m."""
+    stated = view.sensor.err_bias if isinstance(view.sensor, RPC) else None
+    return stated if stated is not None and states_accuracy(view) else DEFAULT_ACCURACY
+
+
+def states_accuracy(view: View) -> bool:
+    """Return whether a view's RPC states a usable accuracy."""
+    stated = view.sensor.err_bias if isinstance(view.sensor, RPC) else None
+    return stated is not None and stated > USABLE_ACCURACY
+
+
+def _stated(view: View) -> tuple[float, float]:
+    """Return the stated accuracies of a view's attitude (metres on the ground) and position, or of its two
+    clocks [m].
+    """
+    sensor = view.sensor
+    if (isinstance(sensor, Pushbroom) or is_clocked(sensor)) and sensor.accuracy is not None:
+        attitude, position = sensor.accuracy
+        return max(attitude, USABLE_ACCURACY), max(position, USABLE_ACCURACY)
+    return (stated_accuracy(view),) * 2
+
+
+def prior_sigmas(
+    views: tuple[View, ...], options: AdjustOptions, drift: int, off: Array | None = None, waves: int = 0
+) -> Array:
+    """Return the prior standard deviations (N, q) of every view's unknowns, in the unknowns' units (m or px).
+
+    A view that is known to be `off` (N,) [m] by more than it states is not held to that.
+    """
+    stated = np.array([_stated(view) for view in views])
+    if off is not None:
+        stated = np.fmax(stated, off[:, None])
+    parts, count = [], len(views)
+    given = (("rotation", options.sigma_attitude), ("translation", options.sigma_position))
+    for (name, sigma), own in zip(given, stated.T, strict=True):
+        if name in options.first_model:
+            one = own if sigma is None else np.full(count, sigma)
+            parts.append(np.tile(one[:, None], (1, 3)))
+    if not parts:
+        size = {"shift": 2, "shift-drift": 4, "affine": 6}[options.first_model]
+        return np.full((count, size), IMAGE_SIGMA)
+    radars = [is_clocked(view.sensor) for view in views]
+    parts[0][radars, :2] = stated[radars] if options.sigma_position is None else options.sigma_position
+    parts += [np.full((count, 3), options.sigma_drift or DRIFT_SIGMA)] * drift
+    parts.append(np.full((count, waves), FIRST_SIGMA))
+    return np.hstack(parts)

@@ -1,0 +1,232 @@
+"""The unknowns of a view: a row of numbers in metres (or pixels), and the correction that it stands for.
+
+Geometric models count a rotation in metres on the ground (angle x distance of the scene), so that every
+unknown moves the image by about one pixel a pixel's size. Image models count pixels at the image's edge. A radar whose
+clocks can be corrected has the first two unknowns of the constants and of every degree of the drift: range and place
+along the flight (azimuth time x speed). The others are nothing to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from barpc.ba.estimated.waves import Waves
+from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.scene import IntArray, View
+from barpc.sensor import SensorModel
+from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
+from barpc.sensor.geometry import camera_center
+from barpc.sensor.splined import Splined
+from barpc.sensor.timing import Clocked, Timed, Timing, is_clocked
+
+_IMAGE_TERMS = {"shift": (0,), "shift-drift": (0, 2), "affine": (0, 1, 2)}
+"""Image models: which of the terms 1, col, row each coordinate's correction has."""
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Layout of the unknowns of N views."""
+
+    model: str  # A name of `AdjustOptions.model`
+    drift: int  # degree of the rotation in the image row
+    center: Array  # (N, 3) camera centres [m], ECEF
+    distance: Array  # (N,) from the centre to the scene [m]: a rotation unknown is angle x distance
+    middle: Array  # (2, N) of every image, col and row [px]
+    half: Array  # (2, N) its half width and height [px]
+    # (N, 2) where its scene stands, east and north of the middle of all [m]
+    place: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    waves: Waves | None = None  # what is left in the image
+    radars: Mapping[int, Clocked] = field(default_factory=dict)  # views whose unknowns are those of clocks
+
+    @property
+    def geometric(self) -> bool:
+        """Whether the unknowns act in space (else in the image)."""
+        return self.model not in _IMAGE_TERMS
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns q of a view."""
+        if not self.geometric:
+            return 2 * len(_IMAGE_TERMS[self.model])
+        return self._in_space + (0 if self.waves is None else self.waves.size)
+
+    @property
+    def _in_space(self) -> int:
+        """Unknowns of a view that move the camera; those in the image follow."""
+        return self.constants + 3 * self.drift
+
+    @property
+    def constants(self) -> int:
+        """Number of unknowns of a view before those of the drift."""
+        return 3 * (self.rotates + self.translates)
+
+    @property
+    def in_waves(self) -> slice:
+        """Slice of a view's unknowns that act in the image."""
+        return slice(self._in_space, self.size)
+
+    @property
+    def rotates(self) -> bool:
+        """Whether views rotate."""
+        return "rotation" in self.model
+
+    @property
+    def translates(self) -> bool:
+        """Whether views translate."""
+        return "translation" in self.model
+
+    def rotation(self, params: Array, views: slice = slice(None)) -> Array:
+        """Return the rotation vectors (n, 3) [rad] at the middle row, of the views whose unknowns (n, q) are given."""
+        if not self.rotates:
+            return np.zeros((len(params), 3))
+        return params[:, :3] / self.distance[views, None]
+
+    def translation(self, params: Array) -> Array:
+        """Return the translations (N, 3) [m]."""
+        if not self.translates:
+            return np.zeros((len(params), 3))
+        start = 3 * self.rotates
+        return params[:, start : start + 3]
+
+    def drift_vectors(self, params: Array) -> Array:
+        """Return the rotation vectors (N, D, 3) [rad] that the powers of the normalised row add."""
+        vectors = params[:, self.constants : self._in_space].reshape(len(params), self.drift, 3)
+        return vectors / self.distance[:, None, None]
+
+    def timing(self, params: Array, view: int) -> Timing:
+        """Return the clock correction of a radar with the unknowns (q,)."""
+        radar = self.radars[view]
+        drift = params[self.constants : self._in_space].reshape(-1, 3)[:, :2]
+        place = (float(values[radar.azimuth_axis, view]) for values in (self.middle, self.half))
+        return Timing(np.vstack([params[:2], drift]) / [1.0, radar.speed], *place)
+
+    def stack_timing(self, by_timing: Array, along: Array, view: int) -> Array:
+        """Return derivatives (2, q, n) by a radar's unknowns from those (2, 2, n) by range [px/m] and azimuth
+        time [px/s].
+        """
+        radar, out = self.radars[view], np.zeros((2, self.size, len(along)))
+        u = (along - self.middle[radar.azimuth_axis, view]) / self.half[radar.azimuth_axis, view]
+        part = by_timing / np.array([[1.0], [radar.speed]])
+        for at in (0, *range(self.constants, self._in_space, 3)):
+            out[:, at : at + 2] = part
+            part = part * u
+        return out
+
+    def normalized(self, image: Array, index: IntArray) -> Array:
+        """Return col, row (2, n) [px] normalised: -1 at the left and the top, 1 at the right and the bottom."""
+        return (image - self.middle[:, index]) / self.half[:, index]
+
+    def drift_rotation(self, params: Array, index: IntArray, row: Array) -> Array:
+        """Return the rotation (3, n) [rad] that the drift adds at normalised rows (n,)."""
+        vectors = self.drift_vectors(params).transpose(1, 2, 0)[:, :, index]  # (D, 3, n)
+        added: Array = vectors[-1] * row
+        for degree in range(self.drift - 2, -1, -1):
+            added = (added + vectors[degree]) * row
+        return added
+
+    def stack(
+        self, by_rotation: Array, by_drift: Array, by_point: Array, index: IntArray, row: Array | None
+    ) -> Array:
+        """Return derivatives (2, q, n) by unknowns from those (2, 3, n) by rotations [px/rad] and point."""
+        out = np.empty((2, self.size, len(index)))
+        inverse = (1.0 / self.distance)[index]
+        at = 0
+        if self.rotates:
+            np.multiply(by_rotation, inverse, out=out[:, :3])
+            at = 3
+        if self.translates:
+            np.negative(by_point, out=out[:, at : at + 3])
+            at += 3
+        scale = inverse
+        for _ in range(self.drift):
+            assert row is not None
+            scale = scale * row
+            np.multiply(by_drift, scale, out=out[:, at : at + 3])
+            at += 3
+        return out
+
+    def add_waves(self, image: Array, by_unknown: Array, params: Array, index: IntArray, seen: Array) -> None:
+        """Add the displacements by splines and steps to image points (2, n) seen at (2, n) [px], and to their
+        derivatives.
+        """
+        assert self.waves is not None
+        row = (seen[1] - self.middle[1, index]) / self.half[1, index]
+        basis = self.waves.basis(row, seen, index)
+        image += self.waves.displaced(params[:, self.in_waves], index, basis)
+        if by_unknown.shape[1]:
+            self.waves.stack(by_unknown[:, self.in_waves], basis)
+
+    def in_image(
+        self, params: Array, index: IntArray, image: Array, by_point: Array
+    ) -> tuple[Array, Array, Array]:
+        """Apply the models in the image: corrected image points (2, n), and the derivatives by point and by unknown."""
+        basis = np.vstack([np.ones((1, image.shape[1])), self.normalized(image, index)])
+        chosen = list(_IMAGE_TERMS[self.model])
+        m = len(chosen)
+        coefficients = np.zeros((2, 3, image.shape[1]))
+        coefficients[:, chosen] = np.moveaxis(params.reshape(-1, 2, m)[index], 0, -1)
+        moved = image + (coefficients * basis).sum(axis=1)
+        slope = coefficients[:, 1:] / self.half[:, index]
+        by_moved = by_point + slope[:, 0, None] * by_point[0] + slope[:, 1, None] * by_point[1]
+        by_unknown = np.zeros((2, 2 * m, image.shape[1]))
+        by_unknown[0, :m] = by_unknown[1, m:] = basis[chosen]
+        return moved, by_moved, by_unknown
+
+    def corrected(self, params: Array, views: Sequence[View]) -> tuple[SensorModel, ...]:
+        """Return every view's sensor behind the correction that its unknowns (N, q) stand for."""
+        if not self.geometric:
+            return tuple(
+                ImageCorrected(view.sensor, self._affine(params[i], i)) for i, view in enumerate(views)
+            )
+        vectors = self.rotation(params), self.translation(params), self.center, self.drift_vectors(params)
+        rows = zip(self.middle[1].tolist(), self.half[1].tolist(), strict=True)
+        corrections = [
+            Correction(*of_view, *(row if self.drift else ()))
+            for *of_view, row in zip(*vectors, rows, strict=True)
+        ]
+        found: list[SensorModel] = [Corrected(v.sensor, c) for v, c in zip(views, corrections, strict=True)]
+        for i, radar in self.radars.items():
+            found[i] = Timed(radar, self.timing(params[i], i))
+        if self.waves is not None:
+            for i, one in enumerate(params[:, self.in_waves]):
+                of_rows = float(self.middle[1, i]), float(self.half[1, i])
+                found[i] = Splined(found[i], self.waves.correction(one, i, *of_rows))
+        return tuple(found)
+
+    def _affine(self, params: Array, i: int) -> ImageAffine:
+        normalized = np.zeros((2, 3))
+        normalized[:, list(_IMAGE_TERMS[self.model])] = params.reshape(2, -1)
+        slope = normalized[:, 1:] / self.half[:, i]
+        shift = normalized[:, 0] - slope @ self.middle[:, i]
+        return ImageAffine(shift, slope)
+
+
+def make_unknowns(
+    views: Sequence[View],
+    model: str,
+    drift: int = 0,
+    centers: Array | None = None,
+    waves: Waves | None = None,
+) -> Unknowns:
+    """Return the layout for N views; `centers` (N, 3), ECEF [m], are regressed from the sensors where None."""
+    size = np.array([view.size for view in views], dtype=np.float64).reshape(-1, 2)
+    if model in _IMAGE_TERMS:
+        centers = np.zeros((len(views), 3))
+    elif centers is None:
+        found = [camera_center(v.sensor, v.size, v.alt_range).ecef for v in views]
+        centers = np.array(found).reshape(-1, 3)
+    scene = np.array([_middle_of_scene(view) for view in views]).reshape(-1, 3)
+    distance = np.linalg.norm(centers - scene, axis=1)
+    middle = scene.mean(axis=0)
+    place = (scene - middle) @ enu_basis(ground_from_ecef(middle))[:2].T
+    sensors = enumerate(view.sensor for view in views) if model not in _IMAGE_TERMS else ()
+    radars = {i: sensor for i, sensor in sensors if is_clocked(sensor)}
+    return Unknowns(model, drift, centers, distance, (size.T - 1.0) / 2.0, size.T / 2.0, place, waves, radars)
+
+
+def _middle_of_scene(view: View) -> Array:
+    middle = (np.array(view.size) - 1.0) / 2.0
+    return ecef_from_ground(view.sensor.localize(middle, np.array(view.altitude)))

@@ -1,0 +1,189 @@
+"""What rotations, translations and drifts leave in the images: splines over the rows, steps between detectors, strips,
+swings.
+
+All are displacements in the image, of where a point is seen: linear unknowns of a view beside its others. What the
+drift can do is not theirs, so that their prior does not loosen it: splines are orthogonal to its polynomials of the
+row, steps to a shift and a scale of the columns. A strip of rows or columns is moved as a whole, and all
+rows of an image swing with a period that is known. How large all of them
+are in a view is learnt (`barpc.ba.robust.variances`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg as la
+
+from barpc.geodesy import Array
+from barpc.scene import IntArray
+from barpc.sensor.splined import RowSpline, bsplines, profile, swing
+
+PER_SPLINE = 30  # observations of a view
+FEWEST = 7  # splines
+FIRST_SIGMA = 0.3  # px: a prior's standard deviation before anything is known
+_DEGREE = 2  # of the polynomials of the row that are the drift's
+DRIFTS = _DEGREE + 1
+"""How many polynomials these are: splines are apart from them."""
+_SAMPLES = 40  # a spline, to integrate over
+
+
+@dataclass(frozen=True, eq=False)
+class Waves:
+    """Layout of a view's unknowns in the image [px]: (col, row) of splines, then of steps, strips and swings."""
+
+    count: int  # B-splines over the rows of an image; 0: none
+    # (N, C) columns where another detector begins [px], ascending; infinite where a view has fewer
+    edges: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    # (N, M, 5) strips that lie off, as `RowSpline` has them; infinite where a view has fewer
+    strips: Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
+    # (N, M) periods of the rows' swings [px]; infinite where a view has fewer
+    periods: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @cached_property
+    def _of_splines(self) -> Array:
+        """(M, m) orthonormal coefficients of what is orthogonal to the polynomials, the slowest first."""
+        if not self.count:
+            return np.zeros((0, 0))
+        u = np.linspace(-1.0, 1.0, self.count * _SAMPLES, dtype=np.float64)
+        free = _complement(bsplines(u, self.count) @ np.vander(u, _DEGREE + 1))
+        rough = np.diff(free, axis=0)
+        vectors: Array = free @ la.eigh(rough.T @ rough)[1]
+        return vectors * np.where(vectors[-1] < 0, -1.0, 1.0)
+
+    def splines(self, row: Array) -> Array:
+        """Return the displacement (m, n) at normalised rows (n,) by one unit of each spline unknown of a coordinate."""
+        found: Array = self._of_splines.T @ bsplines(row, self.count)
+        return found
+
+    @cached_property
+    def _of_steps(self) -> Array:
+        """(C + 1, s) the same of detectors, against a shift and, of three and more, a scale."""
+        num = self.edges.shape[1] + 1
+        return (
+            _complement(np.vander(np.linspace(-1, 1, num), min(num - 1, 2))) if num > 1 else np.zeros((0, 0))
+        )
+
+    @property
+    def parts(self) -> tuple[int, int, int, int]:
+        """Numbers of unknowns of one coordinate: splines, steps, strips, swings (cosines, then sines)."""
+        return (
+            self._of_splines.shape[1],
+            self._of_steps.shape[1],
+            self.strips.shape[1],
+            2 * self.periods.shape[1],
+        )
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns of a view."""
+        return 2 * sum(self.parts)
+
+    @property
+    def kinds(self) -> tuple[slice, ...]:
+        """The unknowns of splines, steps, strips and swings: those of the columns, then those of the rows."""
+        stops = 2 * np.cumsum((0, *self.parts))
+        return tuple(map(slice, stops[:-1].tolist(), stops[1:].tolist()))
+
+    @property
+    def _filled(self) -> list[slice]:
+        return [part for part in self.kinds if part.stop > part.start]
+
+    @cached_property
+    def bands(self) -> Array:
+        """Groups of unknowns (size,) expected to be about as large: half an octave of waves, steps, strips,
+        or swings.
+        """
+        m, *others = self.parts
+        octave = 2.0 * np.log2(np.arange(m) + _DEGREE + 1.0)
+        rank = np.unique(np.floor(octave), return_inverse=True)[1]
+        found, further = [rank, rank], rank.max(initial=-1) + 1
+        for count in others:
+            found.append(np.full(2 * count, further))
+            further += bool(count)
+        return np.concatenate(found)
+
+    def stretches(self, rows: float) -> float:
+        """Return the number of parts of an image of so many rows over which an error shared by neighbours
+        counts anew.
+
+        A swing takes the mean of one in each half of its waves, and of each coordinate.
+        """
+        known = np.isfinite(self.periods)
+        waves = np.divide(rows, self.periods, where=known, out=np.zeros_like(self.periods)).sum(axis=1)
+        of_swings = 2 * self.parts[3]
+        return self.size - of_swings + max(4.0 * float(waves.max(initial=0.0)), of_swings)
+
+    def basis(self, row: Array, seen: Array, index: IntArray) -> list[Array]:
+        """Return the displacement (m, n) of points seen at (2, n) [px] by one unit of each unknown of a
+        coordinate, kind by kind.
+
+        Their rows (n,) normalised are given, too.
+        """
+        found = [self.splines(row)] if self.count else []
+        if self.edges.shape[1]:
+            steps = self._of_steps.T[:, (seen[0][:, None] >= self.edges[index]).sum(axis=1)]
+            found.append(steps * np.isfinite(self.edges[index, 0]))
+        if self.strips.shape[1]:
+            axis, *shape = np.moveaxis(self.strips, -1, 0)[:, index]  # (n, M) each
+            found.append(profile(np.where(axis == 0.0, seen[0][:, None], seen[1][:, None]), *shape).T)
+        if self.periods.shape[1]:
+            found.append(np.concatenate(list(swing(seen[1][:, None], self.periods[index])), axis=1).T)
+        return found
+
+    def displaced(self, params: Array, index: IntArray, basis: list[Array]) -> Array:
+        """Return the displacement (2, n) [px] of observations of views `index` (n,) whose unknowns are
+        `params` (N, size).
+        """
+        out = np.zeros((2, len(index)))
+        for part, one in zip(self._filled, basis, strict=True):
+            of_views = params[:, part].reshape(len(params), 2, -1)
+            for v in np.unique(index):
+                rows = index == v
+                out[:, rows] += of_views[v] @ one[:, rows]
+        return out
+
+    def stack(self, out: Array, basis: list[Array]) -> None:
+        """Write the derivatives by the unknowns into (2, size, n)."""
+        out[...] = 0.0
+        for part, one in zip(self._filled, basis, strict=True):
+            middle = (part.start + part.stop) // 2
+            out[0, part.start : middle] = out[1, middle : part.stop] = one
+
+    def correction(self, params: Array, view: int, row_offset: float, row_scale: float) -> RowSpline:
+        """Return the correction of a view with the unknowns (size,)."""
+        (m, s, num, swings), (_, of_steps, of_strips, of_swings) = self.parts, self.kinds
+        coeffs = self._of_splines @ params[: 2 * m].reshape(2, m).T if m else np.zeros((0, 2))
+        found = RowSpline(coeffs, row_offset, row_scale)
+        known = np.isfinite(self.edges[view]) if s else np.zeros(0, dtype=bool)
+        if known.any():
+            steps = self._of_steps @ params[of_steps].reshape(2, s).T
+            found = replace(found, edges=self.edges[view][known], steps=steps[: known.sum() + 1])
+        if num:
+            there = np.isfinite(self.strips[view, :, 1])
+            moved = params[of_strips].reshape(2, num).T
+            found = replace(found, strips=self.strips[view][there], moved=moved[there])
+        if swings:
+            there = np.isfinite(self.periods[view])
+            swung = params[of_swings].reshape(2, 2, -1).T  # swing, cosine or sine, coordinate
+            found = replace(found, periods=self.periods[view][there], swings=swung[there])
+        return found
+
+    def carried(self, params: Array, known: Waves) -> Array:
+        """Return unknowns (N, size) started from those of another layout (N, known.size), where kinds agree."""
+        out = np.zeros((len(params), self.size))
+        same = self.count == known.count, False, bool(known.parts[2]), self.parts[3] == known.parts[3]
+        for agrees, mine, theirs in zip(same, self.kinds, known.kinds, strict=True):
+            if agrees:
+                old = params[:, theirs].reshape(len(params), 2, -1)
+                new = np.zeros((len(params), 2, (mine.stop - mine.start) // 2))
+                new[..., : old.shape[2]] = old
+                out[:, mine] = new.reshape(len(params), -1)
+        return out
+
+
+def _complement(vectors: Array) -> Array:
+    """Return an orthonormal basis (n, n - k) of what is orthogonal to vectors (n, k)."""
+    q: Array = np.asarray(la.qr(vectors)[0], dtype=np.float64)
+    return q[:, vectors.shape[1] :]

@@ -1,0 +1,1 @@
+"""What ties show beside the cameras: stretches, periods, steps, and the evidence for what explains them."""

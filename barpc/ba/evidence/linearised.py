@@ -1,0 +1,234 @@
+"""Tie points linearised at a state of a block, track by track, their ground points ready to be integrated out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+
+from barpc.ba.solving.normal import cholesky3, whiten
+from barpc.ba.solving.problem import Problem
+from barpc.ba.solving.solve import State
+from barpc.geodesy import Array
+from barpc.scene import BoolArray, IntArray
+
+# views of a track up to which every subset may be right; of more, all of them or all but one
+_MOST_SUBSETS = 4
+_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of observations i <= j of the same tracks, sorted by their views."""
+
+    order: IntArray  # (M,) of the pairs as they come, track by track
+    first: IntArray  # (M,) observations
+    second: IntArray
+    bounds: IntArray  # where pairs of other views begin, and the end
+    views: IntArray  # (P, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Tracks of n views each."""
+
+    rows: IntArray  # (T, n) their observations, sorted by what views they are of
+    view: IntArray  # (T, n)
+    subsets: BoolArray  # (S, n) which may be right together
+    follow: Array  # (T, 3 S, 2n) a basis of what the ground point follows of each subset; zero outside it
+    volume: Array  # (T, S) log of what the integral over the ground point leaves
+    by_unknown: Array  # (T, n, 2, q)
+
+    def of(self, values: Array) -> Array:
+        """Return values (2, K) of observations arranged by track (T, 2n)."""
+        count, n = self.rows.shape
+        return np.ascontiguousarray(values[:, self.rows].transpose(1, 2, 0)).reshape(count, 2 * n)
+
+    def followed(self, values: Array) -> Array:
+        """Return the coordinates (T, S, 3) of values (T, 2n) along the ground points' derivatives."""
+        found: Array = self.follow @ values[..., None]
+        return found.reshape(len(values), len(self.subsets), 3)
+
+    def weighed(self, values: Array, followed: Array, weight: Array) -> Array:
+        """Return the values (T, 2n) without the part that ground points absorb, summed over subsets with
+        their weights (T, S).
+        """
+        parts = (weight[..., None] * followed).reshape(len(values), 1, -1) @ self.follow
+        seen: Array = np.repeat(weight @ self.subsets.astype(np.float64), 2, axis=1)
+        return np.asarray(seen * values - parts[:, 0])
+
+    def weight(self, weight: Array) -> Array:
+        """Return the projectors (T, 2n, 2n) that take away what ground points absorb, summed over subsets
+        with their weights (T, S).
+        """
+        of_rows = np.repeat(weight, 3, axis=1)[..., None] * self.follow
+        out: Array = -(np.swapaxes(self.follow, 1, 2) @ of_rows)
+        diagonal = np.einsum("tii->ti", out)
+        diagonal += np.repeat(weight @ self.subsets.astype(np.float64), 2, axis=1)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Tie points linearised at a state, in units of their stated standard deviations, and the cameras' priors."""
+
+    view: IntArray  # (K,)
+    residual: Array  # (2, K)
+    by_unknown: Array  # (2, q, K)
+    sigma: Array  # (K,) [px]
+    tracks: tuple[Tracks, ...]
+    shape: tuple[int, int]  # N views, q unknowns
+    precision: Array  # (N q,) of the priors
+    offset: Array  # (N q,) unknowns at the state, less the priors' means
+    area: float  # in which a wrong match may lie
+    image: float  # of an image
+    choices: int  # views of the block of which these were chosen
+
+    @property
+    def views(self) -> int:
+        """Number of views N."""
+        return self.shape[0]
+
+    def among(self, views: IntArray) -> Linear:
+        """Return the linearised ties among some views (n,) only, renumbered; observations of others are left out."""
+        number, index = np.full(self.views, -1), np.full(len(self.view), -1)
+        number[views] = np.arange(len(views))
+        rows = np.flatnonzero(number[self.view] >= 0)
+        index[rows] = np.arange(len(rows))
+        tracks = tuple(replace(one, rows=index[one.rows], view=number[one.view]) for one in self.tracks)
+        return replace(
+            self,
+            view=number[self.view[rows]],
+            residual=self.residual[:, rows],
+            by_unknown=self.by_unknown[..., rows],
+            sigma=self.sigma[rows],
+            tracks=tracks,
+            shape=(len(views), self.shape[1]),
+            precision=self.precision.reshape(self.shape)[views].ravel(),
+            offset=self.offset.reshape(self.shape)[views].ravel(),
+        )
+
+    @cached_property
+    def pairs(self) -> Pairs:
+        """All pairs of observations of the same track, an observation with itself among them."""
+        rows = np.concatenate(
+            [
+                tracks.rows[:, np.triu_indices(tracks.rows.shape[1])].transpose(1, 0, 2).reshape(2, -1)
+                for tracks in self.tracks
+            ],
+            axis=1,
+        )
+        views = self.view[rows]
+        order = np.lexsort(views[::-1])
+        sorted_views = views[:, order]
+        begin = np.flatnonzero((np.diff(sorted_views, axis=1, prepend=-1) != 0).any(axis=0))
+        bounds = np.append(begin, len(order))
+        return Pairs(order, rows[0, order], rows[1, order], bounds, sorted_views[:, begin].T)
+
+    @cached_property
+    def by_row(self) -> Array:
+        """`by_unknown` observation by observation (K, 2, q)."""
+        return np.ascontiguousarray(self.by_unknown.transpose(2, 0, 1))
+
+    @property
+    def taking_part(self) -> BoolArray:
+        """Observations (K,) of tracks."""
+        rows = np.zeros(len(self.view), dtype=bool)
+        for tracks in self.tracks:
+            rows[tracks.rows] = True
+        return rows
+
+    def left(self, step: Array) -> Array:
+        """Return the residuals (2, K) after a step (N, q) of the cameras."""
+        left: Array = self.residual + np.einsum("cqk,kq->ck", self.by_unknown, step[self.view])
+        return left
+
+    def thinned(self, most: int) -> Linear:
+        """Return every n-th track, of about so many observations."""
+        every = -(-sum(tracks.rows.size for tracks in self.tracks) // most)
+        if every <= 1:
+            return self
+        few = []
+        for tracks in self.tracks:
+            view = tracks.view[::every]
+            parts = (tracks.follow[::every], tracks.volume[::every], tracks.by_unknown[::every])
+            few.append(Tracks(tracks.rows[::every], view, tracks.subsets, *parts))
+        return replace(self, tracks=tuple(few))
+
+
+def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span: float) -> Linear:
+    """Linearise the tie points in use (K,) of a problem at a state; heights span a given range [m]."""
+    structure = problem.structure
+    projected = problem.linearise(state.params, state.points)
+    residual = (projected.image - problem.xy) / sigma
+    by_point, by_unknown = projected.by_point / sigma, projected.by_unknown / sigma
+    finite = np.isfinite(residual).all(axis=0) & np.isfinite(by_point).all(axis=(0, 1))
+    order = structure.by_point[(use & finite)[structure.by_point]]
+    point = structure.point[order]
+    start = np.flatnonzero(np.diff(point, prepend=-1))
+    count = np.diff(np.append(start, len(point)))
+    half, held = problem.cameras.unknowns.half, problem.point_terms(state.points)[0]
+    image = float(np.median(4.0 * half[0] * half[1]) / np.median(sigma) ** 2)
+    pixels = float(np.median(np.linalg.norm(by_point[:, :, order], axis=1)))  # a metre
+    volume = image / pixels**2 * max(span, 1.0)
+    tracks, bases = [], [np.zeros(0)]
+    for n in np.unique(count[count >= 2]).tolist():
+        rows = order[start[count == n][:, None] + np.arange(n)]
+        rows = rows[np.lexsort(structure.view[rows].T)]
+        view = structure.view[rows]
+        ground = by_point[:, :, rows].transpose(2, 3, 0, 1).reshape(len(rows), 2 * n, 3)
+        subsets = _subsets(n)
+        follow, room = _followed(ground, subsets, held[:, structure.point[rows[:, 0]]])
+        of_cameras = np.ascontiguousarray(by_unknown[:, :, rows].transpose(2, 3, 0, 1))
+        tracks.append(Tracks(rows, view, subsets, follow, room - np.log(volume), of_cameras))
+        ends = ground.reshape(len(rows), n, 2, 3)[:, [0, -1]].reshape(len(rows), 4, 3)
+        bases.append(np.sqrt(np.maximum(np.linalg.det(np.swapaxes(ends, 1, 2) @ ends), 0.0)))
+    far = (
+        max(float(np.quantile(np.linalg.norm(residual[:, order], axis=0), 0.99)), 5.0) if len(order) else 5.0
+    )
+    parallax = float(np.median(np.concatenate(bases))) * volume / image if len(order) else 0.0
+    prior = problem.camera_prior
+    return Linear(
+        structure.view,
+        residual,
+        by_unknown,
+        sigma,
+        tuple(tracks),
+        (structure.num_views, by_unknown.shape[1]),
+        (1.0 / prior.sigma**2).ravel(),
+        (state.params - prior.mean).ravel(),
+        2.0 * far * max(2.0 * far, parallax),
+        image,
+        structure.num_views,
+    )
+
+
+def numbers(count: IntArray) -> float:
+    """Return the count of numbers that tracks of so many views each (T,) need."""
+    subsets = np.where(count <= _MOST_SUBSETS, 2.0 ** count.astype(np.float64), count + 1.0)
+    return float((6.0 * subsets * count).sum())
+
+
+def _subsets(n: int) -> BoolArray:
+    """Return the subsets (S, n) of n views that may be right together: all, then fewer."""
+    sizes = range(n, 1, -1) if n <= _MOST_SUBSETS else range(n, n - 2, -1)
+    chosen = [subset for size in sizes for subset in combinations(range(n), size)]
+    out = np.zeros((len(chosen), n), dtype=bool)
+    for row, subset in zip(out, chosen, strict=True):
+        row[list(subset)] = True
+    return out
+
+
+def _followed(ground: Array, subsets: BoolArray, held: Array) -> tuple[Array, Array]:
+    """Return L^-1 J' of each subset's rows, where L L' = J' J + held (T, 3 S, 2n), and -log det L (T, S)."""
+    count, size = ground.shape[:2]
+    follow, room = np.empty((count, len(subsets), 3, size)), np.empty((count, len(subsets)))
+    for k, subset in enumerate(subsets):
+        part = ground * np.repeat(subset, 2).astype(np.float64)[:, None]
+        matrix = np.swapaxes(part, 1, 2) @ part
+        lower = cholesky3(np.stack([matrix[:, i, j] for i, j in _TRIANGLE]) + held)
+        follow[:, k] = whiten(part.transpose(1, 2, 0), lower).transpose(2, 1, 0)
+        room[:, k] = -np.log(lower[[0, 3, 5]]).sum(axis=0)
+    return follow.reshape(count, -1, size), room

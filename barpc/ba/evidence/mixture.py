@@ -1,0 +1,491 @@
+"""A block near its solution as a mixture: each observation, kept or cut, is noise about the model, or lies anywhere.
+
+With probability 1 - eps of its view an observation is normal about the model, else it is uniform over the area in
+which matches were found. Of a track of n views any subset of two or more may be right, its ground point integrated
+out, or none. Camera unknowns and what is tried beside them have normal priors; all is linear in them. The logarithm
+of the evidence is that of all observations, of the priors, and of the room that they leave (Laplace), so that
+explanations with different unknowns compare; eps and the noise are found by expectation and maximisation, cooled from
+gross errors down (MacKay 2003, "Information Theory, Inference, and Learning Algorithms", chapters 22 and 28).
+
+Beside them tracks may belong to a group that moves on the ground while the views are taken (`Group`): every subset
+then counts twice, still and moved, and of every cell of the ground the share that moves is found with the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dtrtri
+
+from barpc.ba.evidence.linearised import Linear, Tracks
+from barpc.geodesy import Array
+from barpc.scene import BoolArray, IntArray
+
+_HOTTEST = 200.0  # times the noise stated, where it is cooled from: 20 px of 0.1
+_COOLED = 0.6  # from one iteration to the next, at most
+_LEAST_NOISE = 0.2  # of what is stated
+_ITERATIONS = 60
+_BEGINNINGS = 6  # reweightings of a first guess
+_STANDS = 2e-3, 0.3  # change of the noise (logarithm) and of the log-likelihood at the end
+WRONG = 1.0, 10.0  # of so many observations of a view so many are wrong, before any is seen
+_EPS = 1e-3, 0.98
+_CHUNK = 8192  # pairs of observations worked on at a time, so that temporaries stay in cache
+_CHANGED = 0.1  # of what an unknown rests on: its curvature is summed anew
+_LOOSE = 1e-6  # of what all observations of a track tell of its place
+_TWO = 1.5  # observations: half of the next
+NEAR_LIMIT = (
+    4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise is large wrong ones lie no nearer
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Tracks that may have moved while the views were taken, with the share that moves in each cell of the ground."""
+
+    by_move: Array  # (2, m, K) how a unit of each of its unknowns moves observations [px]
+    sigma: Array  # (m,) their prior
+    cell: IntArray  # (K,) of the ground, where an observation's track lies
+    share: Array  # (K,) probability that its track moves, before anything is known
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The result of fitting one explanation to a block."""
+
+    evidence: float  # log, but for a constant of the block
+    step: Array  # (N, q) of the cameras' unknowns from the state
+    extra: Array  # (e,) of what was tried beside them
+    noise: float  # observed over stated
+    eps: Array  # (N,) part of each view's observations that is wrong
+    right: Array  # (K,) probability that an observation is; 0 for those that take no part
+    move: Array = field(default_factory=lambda: np.zeros(0))  # (m,) unknowns of a group that moves
+    moving: Array = field(default_factory=lambda: np.zeros(0))  # (K,) probability that the track is of it
+    scatter: float = 0.0  # its noise, observed over stated
+
+
+def fit(
+    linear: Linear,
+    extra: Array | None = None,
+    sigma: Array | None = None,
+    warm: Fit | None = None,
+    group: Group | None = None,
+) -> Fit:
+    """Fit cameras and extra unknowns, which move observations by `extra` (2, e, K) [px] a unit, to a block as
+    a mixture.
+
+    Their prior standard deviations are `sigma` (e,) [px]. From a fit that is `warm`, whose unknowns may be fewer, it
+    is cooled again only from where the further ones begin; with a `group` that moves from the top.
+    """
+    return Mixture(linear, extra, sigma, warm, group).run()
+
+
+def moving(linear: Linear, extra: Array, group: Group, found: Fit) -> Array:
+    """Return the probability (K,) that the track of an observation belongs to a moving group, by a fit with it."""
+    left = linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma
+    away = np.einsum("cmk,m->ck", group.by_move, found.move) / linear.sigma
+    moved = _Moved(left + away, group.share, found.scatter)
+    out = np.zeros(len(linear.view))
+    for tracks in linear.tracks:
+        out[tracks.rows] = _expect(linear, tracks, left, found.noise, found.eps, moved).gone[:, None]
+    return out
+
+
+def log_likelihoods(linear: Linear, residual: Array, found: Fit) -> Array:
+    """Return the log-likelihood (K,) of the track of every observation, at residuals (2, K) in stated
+    standard deviations.
+    """
+    out = np.zeros(len(linear.view))
+    for tracks in linear.tracks:
+        weight = _expect(linear, tracks, residual, found.noise, found.eps)
+        out[tracks.rows] = weight.log[:, None]
+    return out
+
+
+def off_from_right(linear: Linear, residual: Array, right: Array) -> tuple[Array, BoolArray]:
+    """Return the residuals (2, K) of all observations from ground points intersected by the right ones (K,).
+
+    In standard deviations that they would have if all were right; and which (K,) have at least two right others.
+    """
+    out, known = np.zeros_like(residual), np.zeros(residual.shape[1], dtype=bool)
+    for tracks in linear.tracks:
+        count, n = tracks.rows.shape
+        ground = np.swapaxes(tracks.follow[:, :3], 1, 2)  # in units in which all observations know it alike
+        weight = right[tracks.rows]
+        weighted = np.swapaxes(ground * np.repeat(weight, 2, axis=1)[..., None], 1, 2)
+        matrix = weighted @ ground + _LOOSE * np.eye(3)
+        by_row = np.linalg.solve(matrix, np.swapaxes(ground, 1, 2))  # (T, 3, 2n)
+        values = tracks.of(residual)
+        left = values - (np.swapaxes(by_row, 1, 2) @ (weighted @ values[..., None]))[..., 0]
+        spread = 1.0 + (1.0 - 2.0 * np.repeat(weight, 2, axis=1)) * (np.swapaxes(ground, 1, 2) * by_row).sum(
+            axis=1
+        )
+        off = (left / np.sqrt(np.maximum(spread, 0.1))).reshape(count, n, 2)
+        out[:, tracks.rows] = off.transpose(2, 0, 1)
+        known[tracks.rows] = weight.sum(axis=1, keepdims=True) - weight > _TWO
+    return out, known
+
+
+def first_guess(
+    linear: Linear, found: Fit, extra: Array, new: Array, precision: Array
+) -> tuple[Array, float, float]:
+    """Estimate starting values (e,) of unknowns that move observations by `new` (2, e, K) [px], beside a fit
+    with `extra` [px].
+
+    They have the least sum of what all tracks are off by, not of its squares; also the median of that, and the sum over
+    the noise. Their prior's precisions are the last of `precision`.
+    """
+    left = linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma
+    prior = np.diag(precision[len(precision) - new.shape[1] :])
+    parts, beside = [], new / linear.sigma
+    touched = np.asarray(beside.any(axis=(0, 1)))
+    for tracks in linear.tracks:
+        some = np.flatnonzero(touched[tracks.rows].any(axis=1))
+        rows, size = tracks.rows[some], 2 * tracks.rows.shape[1]
+        columns = beside[:, :, rows].transpose(2, 3, 0, 1).reshape(len(some), size, new.shape[1])
+        off = left[:, rows].transpose(1, 2, 0).reshape(len(some), size, 1)
+        follow = tracks.follow[some, :3]
+        parts.append(tuple(one - np.swapaxes(follow, 1, 2) @ (follow @ one) for one in (off, columns)))
+    moved, far = np.zeros(new.shape[1]), [np.zeros(0)]
+    for _ in range(_BEGINNINGS):
+        matrix, gradient, far = prior.copy(), prior @ moved, []
+        for off, turned in parts:
+            now = off + turned @ moved[:, None]
+            far.append(np.sqrt((now**2).sum(axis=(1, 2)) + found.noise**2))
+            weight = turned / far[-1][:, None, None]
+            matrix += (np.swapaxes(weight, 1, 2) @ turned).sum(axis=0)
+            gradient = gradient + (np.swapaxes(weight, 1, 2) @ now).sum(axis=0)[:, 0]
+        moved = moved - np.linalg.solve(matrix, gradient)
+    distances = np.concatenate(far)
+    middle = float(np.median(distances)) if len(distances) else 0.0
+    return moved, middle, float(distances.sum()) / found.noise
+
+
+@dataclass(frozen=True, eq=False)
+class _Moved:
+    """Observations as they are for tracks of a group that moves."""
+
+    residual: Array  # (2, K)
+    share: Array  # (K,) of the track's cell
+    noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Expected:
+    log: Array  # (T,) log-likelihood of a track
+    of_subset: Array  # (T, S) probability of each subset
+    right: Array  # (T, n) of each observation, alone or with others
+    square: Array  # (T, S) squared residuals of the subsets
+    values: Array  # (T, 2n) residuals
+    followed: Array  # (T, S, 3) what ground points follow of them
+    moved: _Expected | None = None  # the same of tracks that move
+
+    @property
+    def sums(self) -> tuple[float, Array]:
+        """Squared residuals of subsets as often as they are right, and how often each is."""
+        return float((self.of_subset * self.square).sum()), self.of_subset.sum(axis=0)
+
+    @property
+    def gone(self) -> Array:
+        """Probability (T,) that a track of which something is right moves."""
+        assert self.moved is not None
+        still, gone = self.of_subset.sum(axis=1), self.moved.of_subset.sum(axis=1)
+        return np.asarray(gone / np.maximum(still + gone, 1e-300))
+
+    def pull(self, tracks: Tracks) -> Array:
+        """Return the residuals (T, 2n), less what ground points follow, as far as they are right."""
+        return tracks.weighed(self.values, self.followed, self.of_subset)
+
+
+def _expect(
+    linear: Linear, tracks: Tracks, residual: Array, noise: float, eps: Array, moved: _Moved | None = None
+) -> _Expected:
+    n, size = tracks.rows.shape[1], len(tracks.subsets)
+    area = max(linear.area, 2.0 * np.pi * noise**2 * np.exp(NEAR_LIMIT))
+    right, wrong = np.log1p(-eps)[tracks.view], np.log(eps)[tracks.view]
+    subsets = tracks.subsets.astype(np.float64)
+    log, square, values, followed = _of_subsets(tracks, residual, noise, area)
+    both = [log]
+    if moved is not None:
+        share = moved.share[tracks.rows[:, 0], None]
+        log_moved, square_moved, values_moved, followed_moved = _of_subsets(
+            tracks, moved.residual, moved.noise, area
+        )
+        both = [log + np.log1p(-share), log_moved + np.log(share)]
+    chance = right @ subsets.T + wrong @ (1.0 - subsets).T
+    log = np.concatenate([one + chance for one in both], axis=1)
+    odds = np.exp(right - wrong)
+    alone = wrong.sum(axis=1) + np.log1p(odds.sum(axis=1)) - np.log(linear.image) - (n - 1) * np.log(area)
+    top = np.maximum(log.max(axis=1), alone)
+    share, of_none = np.exp(log - top[:, None]), np.exp(alone - top)
+    total = share.sum(axis=1) + of_none
+    share /= total[:, None]
+    single = (of_none / total / (1.0 + odds.sum(axis=1)))[:, None] * odds
+    all_log, still = top + np.log(total), share[:, :size]
+    if moved is None:
+        return _Expected(all_log, still, still @ subsets + single, square, values, followed)
+    gone = share[:, size:]
+    right_of_all = (still + gone) @ subsets + single
+    of_moved = _Expected(all_log, gone, gone @ subsets, square_moved, values_moved, followed_moved)
+    return _Expected(all_log, still, right_of_all, square, values, followed, of_moved)
+
+
+def _of_subsets(
+    tracks: Tracks, residual: Array, noise: float, area: float
+) -> tuple[Array, Array, Array, Array]:
+    """Return the log-likelihoods (T, S) of residuals (2, K) if a subset is right, their squares, and what
+    they are made of.
+    """
+    n = tracks.rows.shape[1]
+    values = tracks.of(residual)
+    followed = tracks.followed(values)
+    of_each = (values**2).reshape(len(values), n, 2).sum(axis=2)
+    square = np.maximum(of_each @ tracks.subsets.T - (followed**2).sum(axis=2), 0.0)
+    members = tracks.subsets.sum(axis=1)
+    log = tracks.volume - square / (2.0 * noise**2)
+    log -= (n - members) * np.log(area) + 0.5 * (2 * members - 3) * np.log(2.0 * np.pi * noise**2)
+    return log, square, values, followed
+
+
+@dataclass(frozen=True, eq=False)
+class _Kind:
+    """Expectations of a mixture for ties that stand, or that move."""
+
+    weight: tuple[Array, ...]  # of tracks their subsets' probabilities (T, S)
+    right: Array  # (K,) probability of every observation, not by itself
+    pull: Array  # (2, K) residuals less what ground points follow, as far as they are right
+    squares: float
+    freedom: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Expectations of a mixture over all tracks at its present unknowns."""
+
+    log: float
+    right: Array  # (K,)
+    moving: Array  # (K,)
+    kinds: tuple[_Kind, ...]
+
+
+class Mixture:
+    """One fit at work: unknowns x = (cameras N q, extra e, those of a group that moves m).
+
+    Each step is Newton's for the weights expected now, but for the curvature, which is summed anew only where weights
+    have changed: at the end it is that of the weights there.
+    """
+
+    def __init__(
+        self,
+        linear: Linear,
+        extra: Array | None,
+        sigma: Array | None,
+        warm: Fit | None,
+        group: Group | None = None,
+    ) -> None:
+        self.linear, self.group = linear, group
+        self.extra = np.zeros((2, 0, len(linear.sigma))) if extra is None else extra / linear.sigma
+        own = np.zeros(0) if sigma is None else 1.0 / sigma**2
+        further = own if group is None else np.append(own, 1.0 / group.sigma**2)
+        self.precision = np.concatenate([linear.precision, further])
+        self.offset = np.concatenate([linear.offset, np.zeros(len(further))])
+        self.x = np.zeros(len(self.precision))
+        self.noise, self.eps = _HOTTEST, np.full(linear.views, WRONG[0] / WRONG[1])
+        if warm is not None:
+            known = warm.step.size + len(warm.extra)
+            self.x[:known] = *warm.step.ravel(), *warm.extra
+            self.noise, self.eps = warm.noise, warm.eps
+            if extra is not None and group is None and known < len(self.x):
+                old, new = np.split(extra, [len(warm.extra)], axis=1)
+                self.x[known:], far, _ = first_guess(linear, warm, old, new, own)
+                self.noise = max(self.noise, far)
+        self.beside = [self.extra]  # of what stands still, and of what moves
+        if group is not None:
+            self.noise, self.eps = _HOTTEST, np.full(linear.views, WRONG[0] / WRONG[1])
+            self.beside.append(np.concatenate([self.extra, group.by_move / linear.sigma], axis=1))
+            self.moved = _Moved(linear.residual, group.share, self.noise)
+        self.squared = [(beside**2).sum(axis=0) for beside in self.beside]
+        self.part = np.flatnonzero(linear.taking_part)
+        self.count = np.bincount(linear.view[self.part], minlength=linear.views)
+        self.touched = np.asarray(self.beside[-1].any(axis=(0, 1)))
+        self.curvature: list[Array] = []
+        self.summed: list[Array] = []
+
+    def run(self, most: int = _ITERATIONS, cooled: float = _COOLED) -> Fit:
+        """Iterate expectation and maximisation until nothing changes, or a number of times; goes on where the
+        last run ended.
+        """
+        linear, last, known, ends = self.linear, -np.inf, 0.0, False
+        self.cooled = cooled
+        for left in range(most, 0, -1):
+            seen = self._expected()
+            is_new = self._has_changed(seen) or ends or left == 1
+            if is_new:
+                kinds = zip(seen.kinds, self.beside, strict=True)
+                self.curvature = [self._curvature(kind.weight, beside) for kind, beside in kinds]
+            matrix = self._matrix()
+            factor = cho_factor(matrix, lower=True, check_finite=False)
+            if is_new:
+                inverse = np.tril(dtrtri(factor[0], lower=1)[0])
+                known = len(matrix) - float((inverse**2).sum(axis=0) @ self.precision)
+            self.x = self.x - cho_solve(factor, self._gradient(seen), check_finite=False)
+            settled = self._noise(seen, known) and abs(seen.log - last) < _STANDS[1]
+            last = seen.log
+            if settled and is_new:
+                break
+            ends = settled
+        away = self.offset + self.x
+        room = 2.0 * float(np.log(factor[0].diagonal()).sum()) - float(np.log(self.precision).sum())
+        evidence = seen.log - 0.5 * float(self.precision @ away**2) - 0.5 * room
+        sizes = linear.precision.size, linear.precision.size + self.extra.shape[1]
+        step, extra, move = np.split(self.x, sizes)
+        scatter = 0.0 if self.group is None else self.moved.noise
+        step = step.reshape(linear.shape)
+        return Fit(evidence, step, extra, self.noise, self.eps, seen.right, move, seen.moving, scatter)
+
+    def _noise(self, seen: _Seen, known: float) -> bool:
+        """Return the noise, and what is wrong, as they are seen; whether the noise stands."""
+        still = seen.kinds[0]
+        found = max(float(np.sqrt(still.squares / max(still.freedom - known, 1.0))), _LEAST_NOISE)
+        cold = self.noise <= found
+        noise = found if cold else max(found, self.cooled * self.noise)
+        wrong = np.bincount(
+            self.linear.view[self.part], 1.0 - seen.right[self.part], minlength=self.linear.views
+        )
+        self.eps = np.clip((wrong + WRONG[0]) / (self.count + WRONG[1]), *_EPS)
+        if self.group is not None:
+            self._group(seen, noise, noise <= found)
+        stands = abs(np.log(noise / self.noise)) < _STANDS[0]
+        self.noise = noise
+        return bool(stands)
+
+    def _group(self, seen: _Seen, noise: float, cold: bool) -> None:
+        """Estimate the moving share of every cell and the scatter of its tracks."""
+        assert self.group is not None
+        share, scatter = self.group.share, noise
+        if cold:
+            rows = np.concatenate([tracks.rows[:, 0] for tracks in self.linear.tracks])
+            cell, moved = self.group.cell, seen.kinds[1]
+            weights = seen.moving[rows], np.ones(len(rows))
+            gone, all_of = (np.bincount(cell[rows], w, cell.max() + 1) for w in weights)
+            share = ((gone + 0.5) / (all_of + 1.0))[cell]
+            scatter = max(float(np.sqrt(moved.squares / max(moved.freedom, 1.0))), noise)
+        self.moved = _Moved(self.moved.residual, share, scatter)
+
+    def _expected(self) -> _Seen:
+        linear, size = self.linear, self.extra.shape[1]
+        step, extra, move = np.split(self.x, [linear.precision.size, linear.precision.size + size])
+        left = linear.left(step.reshape(linear.shape)) + np.einsum("cek,e->ck", self.extra, extra)
+        moved, log = None, 0.0
+        if self.group is not None:
+            away = np.einsum("cmk,m->ck", self.beside[1][:, size:], move)
+            moved = self.moved = replace(self.moved, residual=left + away)
+        right, moving = np.zeros((2, len(linear.view)))
+        found = [_expect(linear, tracks, left, self.noise, self.eps, moved) for tracks in linear.tracks]
+        for tracks, one in zip(linear.tracks, found, strict=True):
+            log += float(one.log.sum())
+            right[tracks.rows] = one.right
+            if moved is not None:
+                moving[tracks.rows] = one.gone[:, None]
+        kinds = [found] if moved is None else [found, [one.moved for one in found if one.moved is not None]]
+        return _Seen(log, right, moving if moved is not None else moving[:0], tuple(map(self._kind, kinds)))
+
+    def _kind(self, found: Sequence[_Expected]) -> _Kind:
+        squares, freedom = 0.0, 0.0
+        right, pull = np.zeros(len(self.linear.view)), np.zeros((2, len(self.linear.view)))
+        for tracks, one in zip(self.linear.tracks, found, strict=True):
+            count, n = tracks.rows.shape
+            square, often = one.sums
+            squares += square
+            freedom += float(often @ (2 * tracks.subsets.sum(axis=1) - 3))
+            right[tracks.rows] = one.of_subset @ tracks.subsets.astype(np.float64)
+            pull[:, tracks.rows] = one.pull(tracks).reshape(count, n, 2).transpose(2, 0, 1)
+        return _Kind(tuple(one.of_subset for one in found), right, pull, squares, freedom)
+
+    @property
+    def _noises(self) -> list[float]:
+        return [self.noise] if self.group is None else [self.noise, self.moved.noise]
+
+    def _has_changed(self, seen: _Seen) -> bool:
+        """Return whether what views and unknowns rest on is another part of the observations than the curvature's."""
+        sums, further = [], self.precision[self.linear.precision.size :]
+        for kind, squared, noise in zip(seen.kinds, self.squared, self._noises, strict=True):
+            of_views = np.bincount(self.linear.view, kind.right, minlength=self.linear.views)
+            sums += [of_views + 1.0, squared @ kind.right + further[: len(squared)] * noise**2]
+        new = np.log(np.concatenate(sums))
+        if len(self.summed) and bool((np.abs(new - self.summed) < _CHANGED).all()):
+            return False
+        self.summed = new
+        return True
+
+    def _matrix(self) -> Array:
+        """Return the normal matrix, with the precisions of the priors."""
+        out = np.diag(self.precision)
+        for matrix, noise in zip(self.curvature, self._noises, strict=True):
+            out[: len(matrix), : len(matrix)] += matrix / noise**2
+        return out
+
+    def _gradient(self, seen: _Seen) -> Array:
+        linear, out = self.linear, self.precision * (self.offset + self.x)
+        camera, pulls = linear.precision.size, np.zeros_like(linear.residual)
+        for kind, beside, noise in zip(seen.kinds, self.beside, self._noises, strict=True):
+            pull = kind.pull / noise**2
+            pulls += pull
+            out[camera : camera + beside.shape[1]] += np.einsum("cek,ck->e", beside, pull)
+        of_each = np.einsum("cqk,ck->qk", linear.by_unknown, pulls)
+        of_views = [np.bincount(linear.view, one, minlength=linear.views) for one in of_each]
+        out[:camera] += np.stack(of_views, axis=1).ravel()
+        return out
+
+    def _curvature(self, weights: Sequence[Array], beside: Array) -> Array:
+        """Return the second derivatives of half the squares by the cameras' unknowns and those beside them."""
+        linear, (views, q), size = self.linear, self.linear.shape, beside.shape[1]
+        of_beside, across = np.zeros((size, size)), np.zeros((views, q, size))
+        of_pairs, seen, turned = list[Array](), list[IntArray](), list[Array]()
+        for tracks, of_subset in zip(linear.tracks, weights, strict=True):
+            n = tracks.rows.shape[1]
+            weight = tracks.weight(of_subset)
+            of_pairs.append(weight.reshape(-1, n, 2, n, 2).transpose(0, 1, 3, 2, 4)[:, *np.triu_indices(n)])
+            some = np.flatnonzero(self.touched[tracks.rows].any(axis=1)) if size else ()
+            if len(some):
+                columns = beside[:, :, tracks.rows[some]].transpose(2, 3, 0, 1).reshape(len(some), -1, size)
+                weighted = weight[some] @ columns
+                of_beside += columns.reshape(-1, size).T @ weighted.reshape(-1, size)
+                seen.append(tracks.rows[some].ravel())
+                turned.append(weighted.reshape(-1, 2, size))
+        if seen:
+            rows = np.concatenate(seen)
+            order = np.argsort(linear.view[rows], kind="stable")
+            left = linear.by_row[rows[order]].reshape(-1, q)
+            right = np.concatenate(turned)[order].reshape(-1, size)
+            for v, (a, b) in enumerate(
+                pairwise(2 * np.searchsorted(linear.view[rows[order]], np.arange(views + 1)))
+            ):
+                across[v] = left[a:b].T @ right[a:b]
+        cameras = self._of_cameras(np.concatenate([one.reshape(-1, 2, 2) for one in of_pairs]))
+        cross = across.reshape(views * q, size)
+        return np.block([[cameras, cross], [cross.T, of_beside]])
+
+    def _of_cameras(self, weight: Array) -> Array:
+        """Return the normal matrix (N q, N q) of the cameras' unknowns, of the weights (M, 2, 2) of pairs of
+        observations.
+        """
+        linear, (views, q), pairs = self.linear, self.linear.shape, self.linear.pairs
+        out, at = np.zeros((views, q, views, q)), pairs.bounds
+        starts = at[np.searchsorted(at, np.arange(0, at[-1] + _CHUNK, _CHUNK), side="right").clip(1) - 1]
+        for start, stop in pairwise(np.unique([*starts.tolist(), at[-1]]).tolist()):
+            part = slice(start, stop)
+            left = linear.by_row[pairs.first[part]].reshape(-1, q).T
+            right = (weight[pairs.order[part]] @ linear.by_row[pairs.second[part]]).reshape(-1, q)
+            kinds = slice(*np.searchsorted(at, [start, stop]).tolist())
+            ends = 2 * (at[kinds.start : kinds.stop + 1] - start)
+            for (one, other), (a, b) in zip(
+                pairs.views[kinds].tolist(), pairwise(ends.tolist()), strict=True
+            ):
+                sums = left[:, a:b] @ right[a:b]
+                out[one, :, other] = sums
+                out[other, :, one] = sums.T
+        return out.reshape(views * q, -1)

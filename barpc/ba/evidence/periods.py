@@ -1,0 +1,143 @@
+"""Whether the rows of an image swing with one period: a periodogram of what ties are off by along them.
+
+The score test of a cosine and a sine in each coordinate (Lomb 1976, Scargle 1982) at all frequencies at once, by the
+fast Fourier transform of residuals summed over few rows. Noise alone exceeds x with the probability (1 + x) exp(-x);
+errors that change along the rows without a period raise whole stretches of the spectrum, and a peak is measured by
+those beside it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barpc.ba.evidence.scan import CLIPPED, SURE
+from barpc.geodesy import Array
+from barpc.scene import IntArray
+from barpc.sensor.splined import swing
+
+_SHORTEST = 32.0  # rows: of what is shorter a matcher's window shows the mean
+_BIN = _SHORTEST / 8.0  # rows summed: 2 % of the shortest are lost
+_FEWEST_SEEN = 30  # observations of a view
+_FEWEST = 1.5  # waves of an image: fewer are no swing yet
+_COARSE, _FINE = 2, 8  # frequencies a wave more, to see whether there is a peak and where it is
+_SEEN = 0.8  # of a peak, where it lies amid two coarse ones: sinc^2(1/4)
+_INDEPENDENT = 4  # as many of these count as tests: Baluev 2008's bound, near the levels asked for
+_LOBE = 1.5  # waves: what is nearer to a peak is its own
+_BESIDE = 5.0  # waves at least, and as many as the peak has
+_MIDDLE = 1.6783  # median of half a chi-square of 4 degrees of freedom
+
+
+@dataclass(frozen=True)
+class Swing:
+    """A period that stands out."""
+
+    view: int
+    period: float  # [px]
+    gain: float  # nats, what the choice among all frequencies and views costs taken off
+
+
+def price(rows: float, views: int) -> float:
+    """Return the cost of choosing a period, in images of so many rows, and a view [nats]."""
+    return float(np.log(max(_INDEPENDENT * rows / _SHORTEST, 1.0) * views))
+
+
+def swings(
+    view: IntArray, row: Array, size: Array, right: Array, off: Array, least: float = SURE
+) -> list[Swing]:
+    """Find the period that stands out most in every view, the best first; none that gains less than `least`
+    [nats].
+
+    Parameters
+    ----------
+    view, row : (K,), where observations are [px], in images of `size` (2, N)
+    right : (K,), weights; 0 of those that tell nothing
+    off : (2, K), residuals in standard deviations
+    """
+    views = size.shape[1]
+    found = []
+    for v in range(views):
+        mine = (view == v) & (right > 0.0)
+        rows = float(size[1, v])
+        costs = price(rows, views)
+        if mine.sum() >= _FEWEST_SEEN and rows > 2.0 * _FEWEST * _SHORTEST:
+            clipped = np.clip(off[:, mine], -CLIPPED, CLIPPED)
+            best = _Rows(row[mine], rows, right[mine], clipped).largest(costs + least)
+            if best is not None:
+                found.append(Swing(v, best[0], best[1] - costs))
+    return sorted(found, key=lambda one: -one.gain)
+
+
+class _Rows:
+    """Residuals of one image, summed over few rows."""
+
+    def __init__(self, row: Array, rows: float, right: Array, off: Array) -> None:
+        self.row, self.off, self.right = row, off, right
+        self.bins = int(np.ceil(rows / _BIN))
+        self.last = rows / _SHORTEST
+        self.waves = np.arange(int(_FINE * self.last)) / _FINE  # of an image
+        self.first = int(np.ceil(_FINE * _FEWEST))
+
+    def largest(self, costs: float) -> tuple[float, float] | None:
+        """Return the period, and minus the logarithm of how probable such a peak is at one frequency; None
+        where it is `costs`.
+        """
+        coarse = self._spectrum(self.off, _COARSE)[int(_COARSE * _FEWEST) :]
+        if not len(coarse) or _worth(coarse.max() / _SEEN) <= costs:
+            return None
+        gain = self._spectrum(self.off)
+        band = np.floor(2.0 * np.log2(self.waves[self.first :]))
+        best = None
+        for start in np.flatnonzero(np.diff(band, prepend=-1.0)).tolist():
+            k = self.first + start + int(gain[self.first + start :][band[start:] == band[start]].argmax())
+            if _worth(gain[k]) > max(costs, 0.0 if best is None else best[1]):
+                period = self.bins * _BIN / (self.waves[k] + _vertex(gain, k) / _FINE)
+                worth = _worth(gain[k] / self._level(k, period))
+                if worth > max(costs, 0.0 if best is None else best[1]):
+                    best = float(period), worth
+        return best
+
+    def _spectrum(self, off: Array, fine: int = _FINE) -> Array:
+        """Return the half the chi-square that a cosine and a sine of both coordinates take away, by frequency."""
+        right, last = self.right, int(fine * self.last)
+        centred = (off - (off @ right / right.sum())[:, None]) * right
+        spread = centred @ centred.T / right.sum()  # what noise leaves of it once points have followed
+        spread[np.diag_indices(2)] += 1e-9 * np.trace(spread) + 1e-30
+        at = (self.row / _BIN).astype(np.int64).clip(0, self.bins - 1)
+        sums = np.array([np.bincount(at, weight, self.bins) for weight in (*centred, right)])
+        col, along, count = np.fft.rfft(sums, fine * self.bins, axis=1)
+        half, twice = 0.5 * right.sum(), 0.5 * count[: 2 * last : 2]
+        cos, sin, both = half + twice.real, half - twice.real, twice.imag
+        determinant = np.maximum(cos * sin - both**2, 1e-12 * half**2)
+        lower = np.linalg.cholesky(np.linalg.inv(spread))
+        gain = np.zeros(last)
+        for weights in lower.T:  # of what noise leaves alike in every direction
+            one = weights[0] * col[:last] + weights[1] * along[:last]
+            gain += sin * one.real**2 - 2.0 * both * one.real * one.imag + cos * one.imag**2
+        return np.asarray(0.5 * gain / determinant)
+
+    def _level(self, k: int, period: float) -> float:
+        """Return the level of the spectrum beside a peak over that of noise, the peak taken away: at least 1."""
+        basis = np.vstack([np.ones(len(self.row)), swing(self.row, np.array(period))])
+        weighted = basis * self.right
+        gain = self._spectrum(
+            self.off - (np.linalg.solve(weighted @ basis.T, weighted @ self.off.T)).T @ basis
+        )
+        away = np.abs(self.waves - self.waves[k])
+        beside = (away > _LOBE) & (away < max(_BESIDE, self.waves[k]))
+        beside[: self.first] = False
+        return max(float(np.median(gain[beside])) / _MIDDLE, 1.0) if beside.any() else 1.0
+
+
+def _worth(gain: float) -> float:
+    """Return minus the logarithm of the probability that noise takes away as much at one frequency."""
+    return float(gain - np.log1p(gain))
+
+
+def _vertex(gain: Array, k: int) -> float:
+    """Return the offset of the vertex of a parabola through a peak and its neighbours."""
+    if not 0 < k < len(gain) - 1:
+        return 0.0
+    bend = gain[k - 1] - 2.0 * gain[k] + gain[k + 1]
+    return float(np.clip(0.5 * (gain[k - 1] - gain[k + 1]) / bend, -0.5, 0.5)) if bend < 0 else 0.0

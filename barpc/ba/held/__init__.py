@@ -1,0 +1,1 @@
+"""What holds a block: observations, points, heights, earlier runs; where it starts, and how its place is known."""

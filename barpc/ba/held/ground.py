@@ -1,0 +1,314 @@
+"""What is known of points: GCPs, a terrain, and heights for tracks that the rays alone do not fix."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barpc.ba.algebra.structure import Structure
+from barpc.ba.estimated.cameras import Projected
+from barpc.ba.estimated.priors import PointPrior
+from barpc.ba.held.relief import NUM_BENDS, Believed, Relief, Terrain, believe, terrain_slopes
+from barpc.ba.solving.problem import Problem
+from barpc.errors import BarpcWarning
+from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.options import AdjustOptions
+from barpc.scene import BoolArray, GroundPoints, IntArray, Reference
+
+FIRST_PLACED = NUM_BENDS
+"""Errors in common in front of altimetry's own: a terrain's bends, or a terrain's and a reference's."""
+DEM_BIAS = 20.0  # m, where none is stated
+KNOWN_BIAS = 5.0  # m: the same, where it is known what its heights count from
+ALIKE = (
+    25.0  # independent errors that those of a reference are worth together, at most: they resemble each other
+)
+_STAYS = 1.0  # m: rays of weak points tell heights to hundreds of metres (0.05 m under 0.01 degrees: 290 m)
+_FLAT_SIGMA = 50.0  # m: least spread of altitudes that tracks held without a DEM are given
+_TOGETHER = 0.25  # of it: what their mean may be wrong by (RPCs' ranges lie about the terrain, roughly)
+
+
+def _join(priors: Sequence[PointPrior | None]) -> PointPrior | None:
+    """Return one block of several that speak of different points, and share their errors; None where all are empty."""
+    given = [prior for prior in priors if prior is not None and len(prior.index)]
+    if not given:
+        return None
+    most = max(prior.common.shape[2] for prior in given)
+    common = [np.pad(p.common, ((0, 0), (0, 0), (0, most - p.common.shape[2]))) for p in given]
+    index, mean, rows = (
+        np.concatenate([getattr(p, name) for p in given]) for name in ("index", "mean", "rows")
+    )
+    return PointPrior(index, mean, rows, np.concatenate(common))
+
+
+def ground_control(gcps: GroundPoints, index: IntArray) -> PointPrior:
+    """Return GCPs as priors on the points `index` (G,): east, north and up by their sigmas."""
+    rows = enu_basis(gcps.lonlatalt) / gcps.sigma[..., None]
+    return PointPrior(index, ecef_from_ground(gcps.lonlatalt), rows, np.zeros((len(index), 3, 0)))
+
+
+def reference_control(reference: Reference, index: IntArray) -> PointPrior:
+    """Return the points of a reference as priors on the points `index` (R,).
+
+    What they share: the height and slopes of the terrain, as points held to it do, the orthoimage's own place, and
+    that what was matched may stand above the terrain (houses, trees). A terrain's errors reach over many points: all
+    of these are worth `ALIKE` independent heights, at most.
+    """
+    sigma = reference.points.sigma * [1.0, 1.0, np.sqrt(max(len(index) / ALIKE, 1.0))]
+    alone = ground_control(replace(reference.points, sigma=sigma), index)
+    common = np.zeros((len(index), 3, 6))
+    common[:, 2, 0] = reference.bias[2] / sigma[:, 2]
+    common[:, 2, 1:3] = _slopes(alone.mean, alone.mean) * (reference.bias[2] / sigma[:, 2:])
+    common[:, 2, 5] = reference.points.sigma[:, 2] / sigma[:, 2]
+    common[:, 0, 3], common[:, 1, 4] = reference.bias[0] / sigma[:, 0], reference.bias[1] / sigma[:, 1]
+    return replace(alone, common=common)
+
+
+def terrain_heights(
+    points: Array,
+    index: IntArray,
+    terrain: Terrain,
+    sigma: float,
+    common_sigma: float,
+    span: Array | None = None,
+    level: BoolArray | None = None,
+) -> PointPrior:
+    """Return priors that hold points `index` (Q,) of (P, 3) to a terrain: their height above its tangent
+    plane.
+
+    Single altitudes are known to `sigma` [m]; all of them may be wrong by `common_sigma` [m], and by a slope that
+    is as much at the scene's edges. Points where the terrain is unknown are left out.
+    The edges are the points' own, or those of `span` (n, 3) [m], with which they share these errors. Points that are
+    `level` (Q,) are held in height alone.
+    """
+    ground = ground_from_ecef(points[index])
+    alt = terrain(ground[:, 0], ground[:, 1])
+    slopes = np.nan_to_num(terrain_slopes(terrain, ground))
+    if level is not None:
+        slopes[level] = 0.0
+    normal = np.column_stack([-slopes, np.ones(len(alt))])
+    return _heights(ground, index, alt, normal, sigma, common_sigma, span)
+
+
+def _believed_heights(ground: Array, index: IntArray, believed: Believed, common_sigma: Array) -> PointPrior:
+    """Return the points `index` (Q,) at ground points (Q, 3) held to what is believed of a DEM.
+
+    All of it may be wrong by a level, slopes and bends that are as much as `common_sigma` (`NUM_BENDS`,) [m] at the
+    scene's edges.
+    """
+    normal, sigma = np.column_stack([-believed.slopes, np.ones(len(ground))]), believed.effective_sigma
+    held = _heights(ground, index, believed.alt, normal, sigma, 0.0)
+    common = np.zeros((len(held.index), 3, NUM_BENDS))
+    common[:, 0] = believed.bends[np.isfinite(believed.alt)] * (common_sigma / sigma)
+    return replace(held, common=common)
+
+
+def flat_heights(points: Array, index: IntArray, alt: float, sigma: float, common_sigma: float) -> PointPrior:
+    """Return priors that hold points `index` to one altitude [m]: each within `sigma` [m], all together
+    within `common_sigma` [m].
+    """
+    ground = ground_from_ecef(points[index])
+    n = len(index)
+    return _heights(ground, index, np.full(n, alt), np.tile([0.0, 0.0, 1.0], (n, 1)), sigma, common_sigma)
+
+
+def staying(points: Array, index: IntArray) -> PointPrior:
+    """Return priors that hold points `index` (Q,) of (P, 3), ECEF [m], each to its present altitude."""
+    ground = ground_from_ecef(points[index])
+    return _heights(ground, index, ground[:, 2], np.tile([0.0, 0.0, 1.0], (len(index), 1)), _STAYS, 0.0)
+
+
+def _heights(
+    ground: Array,
+    index: IntArray,
+    alt: Array,
+    normal: Array,
+    sigma: float,
+    common_sigma: float,
+    span: Array | None = None,
+) -> PointPrior:
+    known = np.isfinite(alt)
+    foot = np.column_stack([ground[known, :2], alt[known]])
+    rows, common = np.zeros((len(foot), 3, 3)), np.zeros((len(foot), 3, 3))
+    rows[:, 0] = np.einsum("qe,qex->qx", normal[known], enu_basis(foot)) / sigma
+    common[:, 0, 0] = common_sigma / sigma
+    mean = ecef_from_ground(foot)
+    if len(foot):
+        common[:, 0, 1:] = _slopes(mean, mean if span is None else span) * (common_sigma / sigma)
+    return PointPrior(index[known], mean, rows, common)
+
+
+def _slopes(points: Array, span: Array) -> Array:
+    """Return the positions east and north of points (n, 3) in a scene, 1 at the edges of `span` (m, 3), ECEF [m]."""
+    middle = span.mean(axis=0)
+    enu = enu_basis(ground_from_ecef(middle))[:2]
+    edge = np.abs((span - middle) @ enu.T).max(axis=0)
+    return np.asarray((points - middle) @ enu.T / np.maximum(edge, 1.0))
+
+
+def convergence_angles(structure: Structure, projected: Projected, points: Array) -> Array:
+    """Return the convergence angle (P,) [rad] of each point's rays: twice the largest angle to their mean."""
+    by_point = projected.by_point
+    ray = np.cross(by_point[0], by_point[1], axis=0)
+    up = structure.of_points(points)
+    with np.errstate(all="ignore"):
+        ray *= np.sign((ray * up).sum(axis=0)) / np.linalg.norm(ray, axis=0)
+    ray = np.nan_to_num(ray)
+    mean = structure.sum_points(ray)
+    mean /= np.maximum(np.linalg.norm(mean, axis=0), 1e-12)
+    apart = np.linalg.norm(ray - mean.take(structure.point, axis=1, mode="clip"), axis=0)
+    largest = np.zeros(structure.num_points)
+    np.maximum.at(largest, structure.point, apart)
+    return 4.0 * np.arcsin(np.minimum(0.5 * largest, 1.0))
+
+
+@dataclass(frozen=True)
+class TerrainTest:
+    """Result of holding tie points to a terrain, and their heights above it."""
+
+    held: int  # tie points that it holds
+    known: int  # tie points where it has a height
+    total: int  # tie points in use
+    offset: float  # median of the adjusted altitudes minus the terrain's [m]; NaN where it has none
+    spread: float  # 1.4826 times their median absolute deviation [m]
+    bias: float  # what its heights may be wrong by together [m]
+    sigma: float = (
+        np.nan
+    )  # standard deviation of single heights, as the tie points show it [m]; NaN: as stated
+    alike: float = 1.0  # as many single heights are worth one
+    gains: tuple[float, ...] = ()  # how much of its relief is believed, scale by scale, the finest first
+    relief: float = np.nan  # its relief as a multiple of the tie points'
+    shows: bool = True  # whether that may be one: else it is of another terrain, and holds nothing
+    is_known: bool = True  # whether it is known what its heights count from
+    # (3,) how the tie points lie to it as delivered, level, rise to the east and to the north [m]
+    delivered: tuple[float, ...] = (np.nan,) * 3
+
+    beyond: tuple[float, ...] = (np.nan,) * 3  # times what its accuracy and the cameras' let expect of that
+
+
+@dataclass(frozen=True)
+class Heights:
+    """The priors on points: GCPs, and heights for tracks that need (or are given) them."""
+
+    control: tuple[PointPrior, ...]  # GCPs, then a reference if there is one
+    weak: BoolArray  # (P,) points whose rays meet under too small an angle
+    tracks: IntArray  # (T,) points that are tracks (GCPs are held already)
+    alt_range: tuple[float, float]  # altitudes [m] to expect where no other track tells
+    options: AdjustOptions  # `dem_sigma`, `dem_bias_sigma`, `dem_for_weak`
+    dem: Terrain | None  # none: weak tracks are held to the altitude of the others, within their spread
+    reference: Reference | None = None  # whose heights are the DEM's
+    has_control: bool = False  # whether GCPs hold the scene's place
+    relief: Relief | None = None  # the DEM beside what rays alone say of heights, where these may judge it
+    placed: PointPrior | None = None  # tracks that altimetry holds, which nothing else does then
+
+    def loose(self, sigma: float) -> Heights:
+        """Return the priors with GCPs known to `sigma` [m] only."""
+        first = self.control[0]
+        rows = enu_basis(ground_from_ecef(first.mean)) / sigma
+        return replace(self, control=(replace(first, rows=rows), *self.control[1:]), has_control=False)
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether the tie points decide how far the DEM is believed."""
+        given = self.dem is None or self.reference is not None
+        return not given and not self.options.dem_for_weak and self.options.learn_priors
+
+    def hold(self, problem: Problem, points: Array) -> Problem:
+        """Return the problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
+        return replace(problem, point_prior=_join([*self.control, self._held(points), self.placed]))
+
+    def _believed(self, points: Array) -> Believed | None:
+        if self.relief is None:
+            return None
+        return believe(
+            self.relief, self.tracks, ground_from_ecef(points[self.tracks]), self.options.dem_sigma
+        )
+
+    def _held(self, points: Array) -> PointPrior | None:
+        weak, believed = self.weak[self.tracks], self._believed(points)
+        free = np.ones(len(weak), dtype=bool)
+        if self.placed is not None:
+            free = ~np.isin(self.tracks, self.placed.index)
+        if believed is not None and believed.shows:
+            ground = ground_from_ecef(points[self.tracks])
+            assert self.relief is not None
+            common = self.relief.common_sigma(self._bias)
+            held = _believed_heights(ground, self.tracks, believed, common)
+            return held.select(np.isin(held.index, self.tracks[free]))
+        dem = self.dem if believed is None else None
+        judged_later = self.is_judged and self.relief is None
+        is_whole = dem is not None and self.is_whole and not judged_later
+        index = self.tracks[free if is_whole else free & weak]
+        if not len(index):
+            return None
+        if dem is not None:
+            alike, span = 1.0, None
+            if self.reference is not None:
+                alike, span = max(len(index) / ALIKE, 1.0), self.control[1].mean
+            elif self.relief is not None:
+                alike = max(len(index) / ALIKE, 1.0)
+            level = None if self.relief is None else ~weak
+            sigma = self.options.dem_sigma * alike**0.5
+            return terrain_heights(points, index, dem, sigma, self._bias, span, level)
+        others = self.tracks[~weak]
+        if len(others) >= 10:
+            low, middle, high = np.percentile(ground_from_ecef(points[others])[:, 2], [5, 50, 95])
+        else:
+            low, high = self.alt_range
+            middle = 0.5 * (low + high)
+        sigma = max(float(high - low) * (1.0 if len(others) >= 10 else 0.5), _FLAT_SIGMA)
+        return flat_heights(points, index, float(middle), sigma, _TOGETHER * sigma)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether a terrain holds all tracks."""
+        return self.dem is not None and (not self.options.dem_for_weak or self.reference is not None)
+
+    @property
+    def _bias(self) -> float:
+        """What a terrain may be wrong by as a whole [m]."""
+        if self.reference is not None:
+            return float(self.reference.bias[2])
+        return self.options.dem_bias_sigma or (KNOWN_BIAS if self._is_known is True else DEM_BIAS)
+
+    @property
+    def _is_known(self) -> bool | None:
+        """Whether it is known what a DEM's heights count from; None of a function."""
+        return getattr(self.dem, "known", None)
+
+    def test(self, points: Array, seen: BoolArray) -> TerrainTest | None:
+        """Compare the terrain with the tracks that are `seen` (P,), at their adjusted places; None without a
+        terrain.
+        """
+        if self.dem is None:
+            return None
+        index = self.tracks[seen[self.tracks]]
+        lon, lat, alt = ground_from_ecef(points[index]).T
+        above = alt - self.dem(lon, lat)
+        known = np.isfinite(above)
+        believed = self._believed(points)
+        held, shows = self._held(points), believed is None or believed.shows
+        count = 0 if held is None or not shows else int(np.isin(index[known], held.index).sum())
+        offset = float(np.median(above[known])) if known.any() else np.nan
+        spread = 1.4826 * float(np.median(np.abs(above[known] - offset))) if known.any() else np.nan
+        found = TerrainTest(count, int(known.sum()), len(index), offset, spread, self._bias)
+        found = replace(found, is_known=self._is_known is not False)
+        if self.relief is not None:
+            delivered, beyond = self.relief.delivered, self.relief.beyond(self._bias)
+            found = replace(found, delivered=tuple(map(float, delivered)), beyond=tuple(map(float, beyond)))
+        if believed is None:
+            return found
+        judged = {name: getattr(believed, name) for name in ("sigma", "alike", "relief", "shows")}
+        return replace(found, gains=tuple(map(float, believed.gains)), **judged)
+
+    def warn(self) -> None:
+        """Warn that tracks are held in height without a DEM."""
+        count = int(self.weak[self.tracks].sum())
+        if count and self.dem is None:
+            message = (
+                f"{count} of {len(self.tracks)} tracks are seen under less than "
+                f"{self.options.min_convergence:g} deg: without a DEM they are held in height"
+            )
+            warnings.warn(message, BarpcWarning, stacklevel=3)

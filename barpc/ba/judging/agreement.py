@@ -1,0 +1,286 @@
+"""Which control points agree with each other, found before any of them moves a camera.
+
+The block is solved by its tie points alone; control points are seen in it, and their places hold nothing. What the
+block says of a point minus its given place is d = U a + n: the block's free motions (a, standard normal; a shift of
+any size is one of them) and what is the point's own, n, whitened to unit variance: the stated accuracy of its place and
+that of its rays. A set S of points agrees as well as its evidence says, the density of d with the motions integrated
+out; the points outside are wrong by anything, alike at all sizes. All accuracies of n may be s times too good, and
+the cameras' motions l times larger than their covariance: the data choose among a few (MacKay 1992).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from scipy.special import chdtri
+
+from barpc.ba.held.block import Block
+from barpc.ba.robust.heldout import enu_offsets
+from barpc.ba.solving.covariance import Covariance
+from barpc.ba.solving.normal import solve_transposed
+from barpc.geodesy import Array, enu_basis
+from barpc.scene import BoolArray, IntArray
+
+LOOSE = 1e4  # m: a place so uncertain holds nothing, and keeps a point that one ray shows from running away
+_SHIFT = 1e3  # m: of the scene, farther than any delivered camera is off
+_SEEN = 0.01  # of a point's own variance: motions that are smaller cannot be told from it
+_EVERY = 12  # points of which every set is looked at
+_TRIALS = 100  # sets of three drawn of more: 2e-6 to miss three right ones where half are
+_TRIPLE = 3  # points that tell shift, tilts, turn and scale
+_USUAL = 0.05  # of chance: sets are looked at where all points together are farther off
+_KEPT = 64  # of the sets looked at, those that are looked at again with every scale
+_NEAR = 16.0  # squared deviation of a point that goes with a set: that of `snooping.CRITICAL`
+_ROOM = 20_000  # points of sets at a time: some 10 MB
+_SCALES = (1.0, 3.0, 2.0, 5.0)  # every set with the first two; more than five times is wrong, not optimistic
+_MOTIONS = (1.0, 3.0)
+_OPTIMISTIC = (
+    3.5  # nats for each factor of e in the accuracies. Measured, 60 draws each: with 3, 3.5, 4 one of five
+)
+# points 3 m off is found in 55, 57, 57; six with sigmas 3 x too small stay together in 59, 59, 59
+_FLOPPY = 2.0  # nats, the same for the motions
+_WRONG = 2.9  # nats that it costs to call a point wrong: one in twenty is
+_ANYWHERE = 4.8  # nats: the density at one sigma of an error between one and 10,000, alike in its logarithm
+_CLEAR = 3.0  # nats by which a set must beat any other that contradicts it: one in twenty
+_AS_MANY = 10.0  # nats, where that other has as many points: how well points happen to fit is no vote
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """The set of control points that agree and hold a block.
+
+    Parameters
+    ----------
+    used : (G,)
+        Points that agree with each other, and more than half of what may be said against them does not.
+    sets : tuple of (G,)
+        Two sets that contradict each other and weigh the same: none is used. Empty where one is.
+    scale : float
+        Factor by which the stated accuracies of the points used are too good; 1: they are not.
+    alike : bool
+        Whether the points that are not used, two or more, agree with each other: in another datum, perhaps.
+    torn : (2,)
+        Residuals of tie points that took no part, without control and with it [px, RMS], where control that agrees with
+        itself would raise them, so that none is used; else empty.
+    """
+
+    used: BoolArray
+    sets: tuple[BoolArray, ...] = ()
+    scale: float = 1.0
+    alike: bool = False
+    torn: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Offsets:
+    """The adjusted places of control points minus their given ones, in units of each point's own accuracy.
+
+    Parameters
+    ----------
+    own : (G, 3)
+    motions : (G, 3, r)
+        By the free motions of the block, of one standard deviation; the last three are shifts of any size.
+    """
+
+    own: Array
+    motions: Array
+
+    def select(self, keep: BoolArray) -> Offsets:
+        """Return the offsets of some of the points."""
+        return Offsets(self.own[keep], self.motions[keep])
+
+    def moving(self, times: float) -> Offsets:
+        """Return the offsets with the free motions of the cameras scaled by a factor."""
+        factor = np.full(self.motions.shape[2], times)
+        factor[-3:] = 1.0
+        return Offsets(self.own, self.motions * factor)
+
+
+def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array) -> Offsets:
+    """Estimate the offsets of control points at a solution in which they hold nothing.
+
+    Parameters
+    ----------
+    covariance : Covariance, of the solution
+    block : Block
+    points : (P, 3), adjusted, ECEF [m]
+    faint : (P,), times by which observations of a point count as noisier there
+    """
+    gcps, first, structure = block.gcps, block.num_tracks, covariance.reduced.structure
+    count, q = len(gcps.names), covariance.num_unknowns
+    index = np.arange(first, first + count)
+    enu = enu_basis(gcps.lonlatalt)
+    rays = solve_transposed(covariance.reduced.lower[:, index], np.eye(3)[..., None]).transpose(2, 0, 1)
+    bounds = structure.point_bounds
+    rows = [structure.by_point[bounds[p] : bounds[p + 1]] for p in index]
+    views = np.unique(structure.view[np.concatenate(rows)])
+    of_cameras = np.zeros((count, 3, len(views) * q))
+    for g, mine in enumerate(rows):
+        for k in mine:
+            at = int(np.searchsorted(views, structure.view[k])) * q
+            of_cameras[g, :, at : at + q] -= enu[g] @ rays[g] @ covariance.reduced.cross[k]
+    turned = enu @ rays / faint[index, None, None]
+    own = turned @ np.swapaxes(turned, 1, 2) + gcps.sigma[:, :, None] ** 2 * np.eye(3)
+    whitening = np.linalg.inv(np.linalg.cholesky(own))
+    flat = (whitening @ of_cameras).reshape(3 * count, -1)
+    size, root = np.linalg.eigh(covariance.joint(views))
+    modes, size, _ = np.linalg.svd(flat @ (root * np.sqrt(np.maximum(size, 0.0))), full_matrices=False)
+    modes = (modes * size)[:, size**2 > _SEEN].reshape(count, 3, -1)
+    motions = np.concatenate([modes, _SHIFT * whitening @ enu], axis=2)
+    offset = enu_offsets(points[index], gcps.lonlatalt)
+    return Offsets((whitening @ offset[..., None])[..., 0], motions)
+
+
+def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
+    """Find the control points that hold a block, among those that can be judged, `told` (G,); the others go
+    with them.
+
+    Every set of up to twelve points is looked at; of more, those that agree with three drawn at random.
+    """
+    given = np.flatnonzero(told)
+    if len(given) < 2:
+        return Agreement(np.ones(len(told), dtype=bool))
+    if _fits_as_stated(offsets.select(told)):
+        return Agreement(np.ones(len(told), dtype=bool))
+    found = _Search(offsets.select(told))
+    best, score, scale = found.best()
+    others = found.against(best, score)
+
+    def whole(mask: BoolArray) -> BoolArray:
+        out = np.zeros(len(told), dtype=bool)
+        out[given[mask]] = True
+        return out
+
+    if others is not None:
+        one, other = sorted((whole(best), whole(others)), key=lambda mask: int(mask.argmax()))
+        return Agreement(np.zeros(len(told), dtype=bool), (one, other))
+    alike = int(np.count_nonzero(~best)) > 1 and _fits_as_stated(found.offsets.select(~best))
+    return Agreement(whole(best) | ~told, scale=scale, alike=alike)
+
+
+def _fits_as_stated(offsets: Offsets) -> bool:
+    """Return whether all points together are as near as nineteen times of twenty, and without none of them it
+    is better.
+    """
+    count = len(offsets.own)
+    one_less = np.concatenate([np.ones((1, count), dtype=bool), ~np.eye(count, dtype=bool)])
+    score, _, squares = _evidence(offsets, one_less, 1.0)
+    freedom = 3.0 * (count - 1)  # a shift is free
+    return bool(squares[0] < chdtri(freedom, _USUAL) and score[0] >= score.max())
+
+
+class _Search:
+    """Sets of points that are compared, and their evidence."""
+
+    def __init__(self, offsets: Offsets) -> None:
+        self.offsets, self.count = offsets, len(offsets.own)
+        if self.count <= _EVERY:
+            numbers = np.arange(1, 2**self.count)
+            self.masks = ((numbers[:, None] >> np.arange(self.count)) & 1).astype(bool)
+        else:
+            self.masks = np.unique(np.array(list(self._drawn(np.ones(self.count, dtype=bool)))), axis=0)
+        self.score, self.scale = self._scored(self.masks)
+        if self.count > _EVERY:
+            self._refine(int(self.score.argmax()))
+            rest = ~self.masks[self.score.argmax()]
+            if rest.sum() >= _TRIPLE:
+                self._add(np.unique(np.array(list(self._drawn(rest))) & rest, axis=0))
+
+    def best(self) -> tuple[BoolArray, float, float]:
+        """Return the set with the largest evidence, that, and the scale of its accuracies."""
+        n = int(self.score.argmax())
+        return self.masks[n], float(self.score[n]), float(self.scale[n])
+
+    def against(self, best: BoolArray, score: float) -> BoolArray | None:
+        """Return the set that contradicts the best and weighs as much; the rest where the best is none; None
+        where it wins.
+        """
+        size, common = self.masks.sum(axis=1), (self.masks & best).sum(axis=1)
+        other = np.flatnonzero((size > common) & (2 * common <= best.sum()))
+        other = other[np.argsort(-self.score[other], kind="stable")[:_KEPT]]
+        if len(other):
+            masks, found = self.masks[other], self._scored(self.masks[other])[0]
+            least = np.where(size[other] >= best.sum(), _AS_MANY, _CLEAR)
+            rival = np.where(found > score - least, found, -np.inf)
+            if np.isfinite(rival).any():
+                return np.asarray(masks[rival.argmax()])
+        return None if 2 * best.sum() >= self.count else ~best
+
+    def _drawn(self, among: BoolArray) -> Iterator[BoolArray]:
+        """Yield the sets that agree with three points drawn from some; the same whenever they are drawn."""
+        rng, places = np.random.default_rng(0), np.flatnonzero(among)
+        yield among.copy()
+        for trial in range(_TRIALS):
+            mask = np.zeros(self.count, dtype=bool)
+            mask[rng.choice(places, _TRIPLE, replace=False)] = True
+            scale = (1.0, 3.0)[trial % 2]
+            for _ in range(2):
+                squared = _evidence(self.offsets, mask[None], scale)[1][0]
+                mask = among & (squared < _NEAR)
+            if mask.any():
+                yield mask
+
+    def _refine(self, n: int) -> None:
+        """Move single points into or out of a set as long as that raises its evidence."""
+        for _ in range(self.count):
+            squared = _evidence(self.offsets, self.masks[n][None], self.scale[n])[1][0]
+            doubtful = np.flatnonzero((squared > 0.5 * _NEAR) & (squared < 2.0 * _NEAR))
+            before = self.score[n]
+            self._add(self.masks[n] ^ np.eye(self.count, dtype=bool)[doubtful])
+            n = int(self.score.argmax())
+            if self.score[n] <= before:
+                break
+
+    def _add(self, masks: BoolArray) -> None:
+        """Add sets to those whose evidence is compared."""
+        score, scale = self._scored(masks)
+        self.masks = np.concatenate([self.masks, masks])
+        self.score, self.scale = np.append(self.score, score), np.append(self.scale, scale)
+
+    def _scored(self, masks: BoolArray) -> tuple[Array, Array]:
+        """Return the evidence (B,) of sets (B, G), and the scale of the accuracies that it has it with."""
+        score, scale = np.full(len(masks), -np.inf), np.ones(len(masks))
+        rows = np.arange(len(masks))
+        for n, (motions, times) in enumerate(product(_MOTIONS, _SCALES)):
+            if n == 2:
+                rows = np.sort(np.argsort(-score, kind="stable")[:_KEPT])
+            self._better(masks, rows, times, motions, score, scale)
+        return score, scale
+
+    def _better(
+        self, masks: BoolArray, rows: IntArray, times: float, motions: float, score: Array, scale: Array
+    ) -> None:
+        offsets = self.offsets if motions == 1.0 else self.offsets.moving(motions)
+        found = _evidence(offsets, masks[rows], times)[0]
+        found -= _OPTIMISTIC * np.log(times) + _FLOPPY * np.log(motions)
+        better = found > score[rows]
+        score[rows[better]], scale[rows[better]] = found[better], times
+
+
+def _evidence(offsets: Offsets, masks: BoolArray, scale: float) -> tuple[Array, Array, Array]:
+    """Return the logarithmic evidence (B,) of sets (B, G), squared deviation (B, G) of every point from what
+    a set says, and that of all points of a set together (B,).
+    """
+    own, motions, variance = offsets.own, offsets.motions, scale**2
+    if len(masks) > (room := max(_ROOM // len(own), 1)):
+        parts = [_evidence(offsets, masks[n : n + room], scale) for n in range(0, len(masks), room)]
+        score, squared, squares = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return score, squared, squares
+    chosen = masks.astype(np.float64)
+    count, r = motions.shape[0], motions.shape[2]
+    gram = np.einsum("gir,gis->grs", motions, motions).reshape(count, -1) / variance
+    matrix = np.eye(r) + (chosen @ gram).reshape(-1, r, r)
+    vector = chosen @ (np.einsum("gir,gi->gr", motions, own) / variance)
+    inverse = np.linalg.inv(matrix)
+    mean = np.einsum("brs,bs->br", inverse, vector)
+    volume = np.linalg.slogdet(matrix)[1]
+    squares = chosen @ ((own**2).sum(axis=1) / variance) - (vector * mean).sum(axis=1)
+    inside = -0.5 * (squares + volume) - 1.5 * np.log(2.0 * np.pi * variance) * chosen.sum(axis=1)
+    left = own[None] - np.einsum("gir,br->bgi", motions, mean)
+    spread = np.einsum("gir,brs,gjs->bgij", motions, inverse, motions, optimize=True)
+    spread = spread + variance * np.eye(3)
+    squared = np.einsum("bgi,bgi->bg", left, np.linalg.solve(spread, left[..., None])[..., 0])
+    anywhere = 1.5 * np.log(np.maximum(squared, 1.0)) + _ANYWHERE + 0.5 * np.linalg.slogdet(spread)[1]
+    return inside - ((1.0 - chosen) * (anywhere + _WRONG)).sum(axis=1), squared, squares

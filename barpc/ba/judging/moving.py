@@ -1,0 +1,195 @@
+"""Ties that move together on the ground while the views are taken: a cloud, water, shadows.
+
+Such a group is as good a block as what stands still, so that a cut may keep both, or the wrong one. It is taken for the
+smaller part of the ties and for local: its share is free in each of `CELLS` x `CELLS` cells of the ground. Where it
+lies is looked for from several starts, with few tracks: what was cut moves, or each of some cells does, with what is
+far from it standing still.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from barpc.ba.evidence.linearised import Linear, linearise
+from barpc.ba.evidence.mixture import Fit, Group, Mixture, moving
+from barpc.ba.held.block import Block
+from barpc.ba.robust.heldout import seen_in
+from barpc.ba.solving.problem import Problem
+from barpc.ba.solving.solve import State
+from barpc.geodesy import Array, enu_basis, ground_from_ecef
+from barpc.scene import BoolArray, IntArray
+
+CELLS = 6  # a side of the ground: the group's share is free in each
+_STARTS = 3  # a side of the ground, of which each moves in turn
+_LIKELY = 0.95  # that a track moves where the group is looked for, and that it stands far from there
+_FEW = 1500  # observations that are looked at from every start
+_LOOK, _QUICK = 8, 0.36  # steps of every start, cooled so much in each; only the best go on
+_KEPT = 3
+_SIGMA = 30.0  # px on the ground: a displacement from view to view, before it is known
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """Ground points of a block's tracks in a local frame, and how their motion moves images."""
+
+    center: Array  # (3,) [m], ECEF
+    low: Array  # (2,) least east and north of its points [m]
+    high: Array  # (2,)
+    place: Array  # (2, K) east and north of every observation's point [m]
+    by_ground: Array  # (2, 3, K) how a metre east, north and up moves observations [px]
+
+    @classmethod
+    def of(cls, problem: Problem, state: State, like: Ground | None = None) -> Ground:
+        """Return the ground of a problem's points, in the frame of another one where it is given."""
+        points = state.points[problem.structure.point]
+        center = np.nanmedian(points, axis=0) if like is None else like.center
+        basis = enu_basis(ground_from_ecef(center))
+        place = (basis[:2] @ (points - center).T) if len(points) else np.zeros((2, 0))
+        by_point = problem.project_points(state.params, state.points).by_point
+        by_ground = np.einsum("cpk,gp->cgk", by_point, basis)
+        if like is None:
+            return cls(center, np.nanmin(place, axis=1), np.nanmax(place, axis=1), place, by_ground)
+        return cls(center, like.low, like.high, place, by_ground)
+
+    def part(self, rows: IntArray) -> Ground:
+        """Return the ground of some observations."""
+        return replace(self, place=self.place[:, rows], by_ground=self.by_ground[..., rows])
+
+    @cached_property
+    def pixel(self) -> float:
+        """A pixel on the ground [m]."""
+        return float(1.0 / np.nanmedian(np.sqrt((self.by_ground[:, :2] ** 2).sum(axis=(0, 1)) / 2.0)))
+
+    def cells(self, number: int) -> IntArray:
+        """Return the cell (K,) of `number` x `number` on the ground in which each observation's point lies."""
+        part = (self.place - self.low[:, None]) / np.maximum(self.high - self.low, 1e-9)[:, None]
+        row, col = np.nan_to_num(part * number).astype(np.int64).clip(0, number - 1)
+        return np.asarray(row * number + col)
+
+    def by_moves(self, view: IntArray, views: int) -> Array:
+        """Return the image displacements (2, 2 N - 2, K) [px] of observations by a pixel's move east and
+        north in every view but the first.
+        """
+        out = np.zeros((2, 2 * (views - 1), len(view)))
+        for v in range(1, views):
+            rows = np.flatnonzero(view == v)
+            out[:, 2 * v - 2 : 2 * v, rows] = self.by_ground[:, :2, rows] * self.pixel
+        return out
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Share, place and size of the motion of a group of ties."""
+
+    metres: float  # by how much, from one of two views to the other, beside what may be its height
+    between: tuple[int, int]
+    share: float  # of the tracks
+    box: tuple[
+        float, float, float, float
+    ]  # west, south, east, north [deg], of nine in ten of its tracks each way
+    side: str  # of the middle of the block on which they lie, as "north-west"; "" where on both
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A group of ties that moves, as the judge found it."""
+
+    metres: float  # as in `Motion`
+    between: tuple[int, int]
+    member: BoolArray  # (K,) observations of its tracks
+    shares: Array  # (CELLS^2,) of the ground's cells
+    ground: Ground
+    fit: Fit
+
+
+def proposal(linear: Linear, ground: Ground, base: Fit, extra: Array, sigma: Array) -> Group | None:
+    """Return the moving group to start with, beside other explanations, with its unknowns' prior."""
+    few = linear.thinned(_FEW)
+    by_move, cell = ground.by_moves(linear.view, linear.views), ground.cells(CELLS)
+    group = Group(by_move, np.full(by_move.shape[1], _SIGMA), cell, np.full(len(cell), 0.5))
+    rows = np.zeros(len(cell), dtype=bool)
+    for tracks in few.tracks:
+        rows[tracks.rows] = True
+    if not rows.any():
+        return None
+    starts = [replace(group, share=share) for share in _first_shares(ground, rows, base.right)]
+    begun = [Mixture(few, extra, sigma, base, start) for start in starts]
+    looks = [one.run(_LOOK, _QUICK) for one in begun]
+    best = sorted(range(len(looks)), key=lambda n: -looks[n].evidence)[:_KEPT]
+    ended = [(begun[n].run(), starts[n]) for n in best]
+    found, start = max(ended, key=lambda row: row[0].evidence)
+    shares = _shares(found.moving, cell, rows)[cell]
+    member = moving(linear, extra, replace(start, share=shares), found)
+    if np.mean(member[rows] > 0.5) > 0.5:  # of two groups the larger stands
+        member = 1.0 - member
+    return replace(group, share=np.clip(member, 1.0 - _LIKELY, _LIKELY))
+
+
+def price(linear: Linear, cell: IntArray) -> float:
+    """Return the cost of the shares of the cells [nats]: half the logarithm of the number of tracks of each."""
+    first = np.concatenate([tracks.rows[:, 0] for tracks in linear.tracks])
+    count = np.bincount(cell[first])
+    return float(0.5 * np.log(count[count > 0]).sum())
+
+
+def _first_shares(ground: Ground, rows: BoolArray, right: Array) -> Iterator[Array]:
+    """Yield the probabilities (K,) that tracks move, to start from."""
+    cut = np.where(right < 0.5, _LIKELY, 1.0 - _LIKELY)
+    if (cut[rows] > 0.5).any():
+        yield cut
+    cell, place = ground.cells(_STARTS), ground.place
+    for one in np.unique(cell[rows]):
+        inside = cell == one
+        middle = np.median(place[:, inside & rows], axis=1, keepdims=True)
+        far = np.nan_to_num(np.linalg.norm(place - middle, axis=0))
+        share = np.where(far > np.median(far[rows]), 1.0 - _LIKELY, 0.5)
+        share[inside] = _LIKELY
+        yield share
+
+
+def _shares(member: Array, cell: IntArray, rows: BoolArray) -> Array:
+    gone, count = (np.bincount(cell[rows], w, CELLS**2) for w in (member[rows], np.ones(rows.sum())))
+    return np.asarray((gone + 0.5) / (count + 1.0))
+
+
+def group_of(linear: Linear, ground: Ground, group: Group, found: Fit) -> Found:
+    """Return the motion of a group by a fit with it."""
+    rows = np.zeros(len(group.cell), dtype=bool)
+    for tracks in linear.tracks:
+        rows[tracks.rows] = True
+    member = rows & (found.moving > 0.5)
+    moved = np.vstack([np.zeros(2), found.move.reshape(-1, 2)]) * ground.pixel
+    seen = np.flatnonzero(np.bincount(linear.view[member], minlength=linear.views))
+    up = np.array([ground.by_ground[:, :, member & (linear.view == v)].mean(axis=2) for v in seen])
+    apart = np.zeros((1, 1)), (0, 0)
+    if len(seen) >= 2:
+        # what all share is no motion, what goes with a view's parallax may be height
+        parallax = -np.linalg.solve(up[:, :, :2], up[:, :, 2:])[..., 0]
+        design = np.column_stack([np.tile(np.eye(2), (len(seen), 1)), parallax.ravel()])
+        flat = moved[seen].ravel()
+        flat = (flat - design @ np.linalg.lstsq(design, flat, rcond=None)[0]).reshape(-1, 2)
+        between = np.linalg.norm(flat[:, None] - flat, axis=2)
+        i, j = np.unravel_index(int(between.argmax()), between.shape)
+        apart = between, (int(seen[min(i, j)]), int(seen[max(i, j)]))
+    shares = _shares(found.moving, group.cell, rows)
+    return Found(float(apart[0].max()), apart[1], member, shares, ground, found)
+
+
+def members(problem: Problem, params: Array, one: Found, block: Block) -> BoolArray:
+    """Return the held-out observations (K,) that belong to a group found at cameras of unknowns (N, q)."""
+    if not len(block.view):
+        return np.zeros(0, dtype=bool)
+    part, points = seen_in(problem, params, block)
+    state = State(params, points)
+    low, high = block.alt_range
+    linear = linearise(part, state, np.ones(len(block.view), dtype=bool), block.sigma, high - low)
+    ground = Ground.of(part, state, one.ground)
+    by_move, cell = ground.by_moves(block.view, len(block.views)), ground.cells(CELLS)
+    group = Group(by_move, np.full(by_move.shape[1], _SIGMA), cell, one.shares[cell])
+    found = replace(one.fit, extra=np.zeros(0))
+    none = np.zeros((2, 0, len(block.view)))
+    return moving(linear, none, group, found) > 0.5

@@ -1,0 +1,216 @@
+"""A block solved with one model: where it started, how the rounds ended, what is left."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from barpc.ba.algebra.structure import Structure
+from barpc.ba.estimated.priors import DRIFT_SIGMA
+from barpc.ba.held.block import Block
+from barpc.ba.held.ground import Heights, staying
+from barpc.ba.held.incremental import BlockPrior
+from barpc.ba.held.relief import Terrain
+from barpc.ba.held.starting import first_state, make_problem
+from barpc.ba.judging.agreement import LOOSE, Agreement, agreement, offsets_of
+from barpc.ba.judging.judge import Finding
+from barpc.ba.judging.snooping import ControlTest, control_test
+from barpc.ba.robust.consensus import agreeing
+from barpc.ba.robust.heldout import HeldOut, is_better, measure, of_part
+from barpc.ba.robust.rounds import Outcome, Rounds, faintness, revived
+from barpc.ba.robust.smooth import SmoothTest
+from barpc.ba.solving.problem import Problem
+from barpc.ba.solving.solve import State
+from barpc.geodesy import Array
+from barpc.options import AdjustOptions
+from barpc.scene import BoolArray
+
+SMOOTH_LEAST = 0.06  # smooth residuals below this [px] are left alone: two views share what one is wrong by
+_TREND = 0.03  # px: another model is tried
+MUCH_NOISE = 1.5  # times what is stated
+_MUCH_LOST = 0.85  # of a view's observations are to be left
+_SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
+_STEPS_BACK = 3  # to the delivered cameras, at most: kilometres away, what is left is below a micrometre
+_STANDS = 30.0  # m: what is left after a step from so near is below a millimetre
+_BETTER = 0.8  # of the noise
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A block solved with one model: its start, its rounds, and what is left."""
+
+    problem: Problem  # as it was solved last
+    state: State  # where it started: delivered cameras, points triangulated with them
+    before: Array  # (2, K) residuals there [px]
+    heights: Heights  # what holds points
+    outcome: Outcome  # of the rounds
+    start: HeldOut  # what the tracks that took no part say before
+    after: HeldOut  # and after
+    tested: ControlTest | None  # control points against the rest
+    # "drift", "jitter" -> what was smooth before another degree was taken, splines or steps followed
+    asked: Mapping[str, SmoothTest] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()  # what explains ties beside the cameras, the first taken first
+    agreed: Agreement | None = None  # which control points hold it
+
+    @property
+    def final(self) -> State:
+        """The minimum."""
+        return self.outcome.minimum.state
+
+    @property
+    def seen(self) -> BoolArray:
+        """Points (P,) with an observation that was kept."""
+        seen = np.zeros(self.problem.structure.num_points, dtype=bool)
+        seen[self.problem.structure.point[self.outcome.inlier]] = True
+        return seen
+
+    def first_points(self, block: Block, some: BoolArray) -> Array:
+        """Return the points (P, 3) [m] that the delivered cameras give for where the adjusted ones show them.
+
+        NaN for the others. Nothing but the cameras moves between the two: no observation that was cut, no place that
+        was given, and no height where the rays of a point tell none.
+        """
+        index, rows = np.flatnonzero(some), np.flatnonzero(some[block.point])
+        points, weak = self.final.points[index], np.flatnonzero(self.heights.weak[index])
+        shown = (self.outcome.residual + self.problem.xy)[:, rows]
+        number = np.searchsorted(index, block.point[rows])
+        part = of_part(self.problem, block.view[rows], number, block.xy[:, rows])
+        mended = replace(part, xy=shown, point_prior=staying(points, weak))
+        delivered = self.problem.camera_prior.mean
+        for _ in range(_STEPS_BACK):
+            projected, before = mended.project_points(delivered, points), points
+            points = mended.triangulate(points, projected, (block.use / block.sigma)[rows])
+            if np.nanmax(np.abs(points - before), initial=0.0) < _STANDS:
+                break
+        out = np.full((len(some), 3), np.nan)
+        out[index] = points
+        return out
+
+    @property
+    def has_trend(self) -> bool:
+        """Whether something is left that another model may follow: smooth, or in what was cut."""
+        left = bool(self.outcome.smooth.found(_TREND).any())
+        return left or self.after.error > MUCH_NOISE * self.outcome.noise
+
+    @property
+    def has_waves(self) -> bool:
+        """Whether neighbours share something that splines over the rows or steps between detectors may follow."""
+        tested = self.outcome.smooth
+        return bool((tested.found(_TREND) | (tested.shared > _TREND)).any())
+
+    @property
+    def is_skew(self) -> bool:
+        """Whether the drift that was learnt shears images more than a platform does: one of them was turned."""
+        learnt = self.outcome.prior.drift_sigma
+        if not learnt or learnt[0] < 2.0 * DRIFT_SIGMA:
+            return False
+        problem = self.problem
+        by_point = problem.project_points(self.final.params, self.final.points).by_point
+        pixels = float(np.nanmedian(np.linalg.norm(by_point[1], axis=0)))  # a metre
+        return learnt[0] > _SKEW * float(np.median(problem.cameras.unknowns.half[1])) / pixels
+
+
+def solve_block(
+    block: Block,
+    outer: Block,
+    options: AdjustOptions,
+    dem: Terrain | None,
+    centers: Array | None,
+    prior: BlockPrior | None,
+) -> Solution:
+    """Solve a block with the model of the options, again from an agreement or with more drift where residuals
+    ask for it.
+
+    By its tie points first; then with the control points that agree with each other there. Measured on the
+    observations of `outer`.
+    """
+    problem = make_problem(block, options, centers, prior)
+    state, given = first_state(problem, block, options, dem)
+    heights = given.loose(LOOSE) if block.gcps.names else given
+    start = measure(problem, state.params, outer)
+    rounds = Rounds(problem, block, state, options, heights, block.use)
+    before, agreed, free = rounds.residual, None, None
+    if (
+        block.gcps.names and not (block.point < block.num_tracks).any()
+    ):  # control is all that holds the cameras
+        agreed, heights = _with_control(block, given, rounds.run(once=True))
+        rounds = Rounds(problem, block, state, options, heights, block.use)
+    outcome = rounds.run()
+    if options.loss != "linear" and _is_suspect(outcome, problem.structure, block.use):
+        projected = problem.project_points(state.params, state.points)
+        agree = agreeing(problem.structure, problem.xy, before, projected, block.sigma, block.use)
+        again = Rounds(problem, block, state, options, heights, agree).run()
+        if again.noise < _BETTER * outcome.noise and again.inlier.sum() > 0.5 * agree.sum():
+            outcome = again
+    drift, asked = problem.cameras.unknowns.drift, dict[str, SmoothTest]()
+    if options.drift is None and prior is None and drift and outcome.smooth.found(SMOOTH_LEAST).any():
+        bent = make_problem(block, options, problem.cameras.unknowns.center, None, drift + 1)
+        ended, weight = outcome.minimum.state, block.use / block.sigma
+        there, _ = revived(problem, ended, outcome.residual, outcome.inlier, weight)
+        there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
+        asked = {"drift": outcome.smooth}
+        problem, outcome = bent, Rounds(bent, block, there, options, heights, outcome.inlier).run()
+    if block.gcps.names and agreed is None:
+        free = Solution(problem, state, before, heights, outcome, start, start, None, asked)
+        agreed, heights = _with_control(block, given, outcome)
+        outcome = Rounds(problem, block, outcome.minimum.state, options, heights, block.use, outcome).run()
+    first = Solution(problem, state, before, heights, outcome, start, start, None, asked, agreed=agreed)
+    found = finished(first, problem, block, outer, options, outcome)
+    return (
+        found
+        if free is None or not found.heights.has_control
+        else _untorn(found, free, block, outer, options)
+    )
+
+
+def _untorn(found: Solution, free: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
+    """Return the block held by control; as it was `free` of it where tracks that took no part are met worse with it."""
+    without = measure(free.problem, free.final.params, outer)
+    raised = found.after.whole_rms**2 - without.whole_rms**2
+    # ties of a view are worth 1 / noise_floor^2 in all: its q unknowns are known to q noise_floor^2 [px^2] by them
+    known = free.final.params.shape[1] * options.noise_floor**2
+    if raised <= known or not is_better(without, found.after, outer):
+        return found
+    assert found.agreed is not None
+    none = Agreement(np.zeros_like(found.agreed.used), torn=(without.whole_rms, found.after.whole_rms))
+    return finished(replace(free, agreed=none), free.problem, block, outer, options, free.outcome)
+
+
+def _with_control(block: Block, heights: Heights, outcome: Outcome) -> tuple[Agreement, Heights]:
+    """Return the control points that agree with each other at an outcome that none of them holds, and what
+    holds them.
+    """
+    count, first = len(block.gcps.names), block.num_tracks
+    mine = (block.point >= first) & (block.point < block.num_known)
+    lost = np.isin(
+        np.arange(count), block.point[mine & block.use & ~outcome.inlier] - first
+    )  # by hundreds of sigmas
+    told = np.isin(np.arange(count), block.point[mine & outcome.inlier] - first) & ~lost
+    covariance = outcome.minimum.covariance(outcome.problem.free)
+    faint = faintness(block, heights.loose(LOOSE))
+    found = agreement(offsets_of(covariance, block, outcome.minimum.state.points, faint), told)
+    found = replace(found, used=found.used & ~lost)
+    kept = heights.control[0].select(found.used[heights.control[0].index - first])
+    kept = replace(kept, rows=kept.rows / found.scale)
+    return found, replace(heights, control=(kept, *heights.control[1:]), has_control=bool(found.used.any()))
+
+
+def finished(
+    found: Solution, problem: Problem, block: Block, outer: Block, options: AdjustOptions, outcome: Outcome
+) -> Solution:
+    """Complete the rounds of a problem: control tested, held-out tracks measured; the start is that of `found`."""
+    tested = None
+    if found.agreed is not None:
+        covariance, points = outcome.minimum.covariance(problem.free), outcome.minimum.state.points
+        faint = faintness(block, found.heights)[block.num_tracks : block.num_known]
+        tested = control_test(covariance, points, block.num_tracks, block.gcps, found.agreed, faint)
+    after = measure(problem, outcome.minimum.state.params, outer)
+    return replace(found, problem=problem, outcome=outcome, after=after, tested=tested)
+
+
+def _is_suspect(outcome: Outcome, structure: Structure, use: BoolArray) -> bool:
+    """Return whether the rounds may have ended between two solutions: much noise, or a view that lost much."""
+    had, kept = (structure.sum_views(rows.astype(np.float64)[None])[:, 0] for rows in (use, outcome.inlier))
+    return outcome.noise > MUCH_NOISE or bool((kept < _MUCH_LOST * had).any())

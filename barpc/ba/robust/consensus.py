@@ -1,0 +1,154 @@
+"""Which observations agree before any camera has moved: for blocks in which many of a view's moved together.
+
+Moving clouds, or a repeated pattern, shift a good part of one view's tie points by the same amount. Least squares, also
+robust, then starts in the middle. Two views' rays miss each other by an offset across the epipolar line that changes
+slowly over the image, whatever the cameras are wrong by: so for every pair of views the largest set of observations
+whose offsets lie on one plane is looked for, and an observation that most of its partners contradict is put aside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from barpc.ba.algebra.structure import Structure, parts
+from barpc.ba.estimated.cameras import Projected
+from barpc.ba.solving.normal import CHUNK
+from barpc.geodesy import Array
+from barpc.scene import BoolArray, IntArray
+from barpc.sensor.curve import cross
+
+_TRIALS = 150
+_LEAST = 30  # matches of a pair that is looked at
+_NEAR = 10.0  # sigmas: what a plane cannot follow of a drift and of relief
+_STEPS = 3
+
+_GROUPED = 100  # matches of a pair that may fall into two groups
+_BIMODAL = 0.45  # Sarle's coefficient: 1/3 for a normal distribution, 5/9 for a uniform one
+_APART = 2.0  # standard deviations between two groups
+_SMALLER = 0.05  # part of the smaller one
+_EVIDENT = 15.0  # gain in log-likelihood over one group
+
+
+@dataclass(frozen=True)
+class TwoGroups:
+    """A pair of views whose epipolar offsets fall into two groups; the pair cannot tell which is right."""
+
+    views: tuple[int, int]  # the pair
+    share: float  # part of the matches in the smaller group
+    apart: float  # across the epipolar lines [px]
+
+
+def two_groups(
+    structure: Structure, residual: Array, projected: Projected, use: BoolArray
+) -> tuple[TwoGroups, ...]:
+    """Find the pairs of views whose offsets across the epipolar lines (of observations in use) have two centres."""
+    rows = np.flatnonzero(use[structure.first] & use[structure.second])
+    offset = _across(residual, projected.by_point, structure.first[rows], structure.second[rows])
+    bounds = np.searchsorted(rows, structure.pair_bounds)
+    count = np.diff(bounds)
+    by_pair = sp.csr_array((np.ones(len(rows)), np.arange(len(rows)), bounds), (len(count), len(rows)))
+    found = []
+    with np.errstate(all="ignore"):
+        z = offset - np.repeat(by_pair @ offset / count, count)
+        square, cube, fourth = (by_pair @ (z * z * more) / count for more in (1.0, z, z * z))
+        maybe = (cube**2 / square**3 + 1.0) >= _BIMODAL * fourth / square**2
+    for pair in np.flatnonzero(maybe & (count >= _GROUPED)):
+        share, apart, gain = _mixture(z[bounds[pair] : bounds[pair + 1]])
+        if share > _SMALLER and gain > _EVIDENT:
+            first, second = structure.pair_view[pair].tolist()
+            found.append(TwoGroups((first, second), share, apart))
+    return tuple(found)
+
+
+def _mixture(z: Array) -> tuple[float, float, float]:
+    """Fit two normal distributions of one width to values of mean 0: share of the smaller, distance of the
+    centres (0 if they are not apart), gain in log-likelihood over one.
+    """
+    centers, sigma, part = np.quantile(z, [0.1, 0.9]), 0.5 * z.std(), 0.5
+    likelihood = np.ones_like(z)
+    for _ in range(50):
+        density = np.array([part, 1.0 - part])[:, None] * np.exp(-0.5 * ((z - centers[:, None]) / sigma) ** 2)
+        likelihood = density.sum(axis=0) + 1e-300
+        first, second = density / likelihood
+        part = float(first.mean())
+        if not 0.0 < part < 1.0:
+            return 0.0, 0.0, 0.0
+        centers = np.array([(first * z).sum() / first.sum(), (second * z).sum() / second.sum()])
+        sigma = np.sqrt((first * (z - centers[0]) ** 2 + second * (z - centers[1]) ** 2).mean())
+    one = -0.5 * len(z) - len(z) * np.log(z.std())
+    gain = float(np.log(likelihood).sum() - len(z) * np.log(sigma) - one)
+    apart = float(centers[1] - centers[0])
+    if apart < _APART * sigma:
+        return 0.0, 0.0, gain
+    return min(part, 1.0 - part), apart, gain
+
+
+def agreeing(
+    structure: Structure, xy: Array, residual: Array, projected: Projected, sigma: Array, use: BoolArray
+) -> BoolArray:
+    """Return the observations (K,) in use without those that most of their partners contradict.
+
+    Of observed col, row `xy` (2, K), residuals (2, K) with points anywhere near and `sigma` (K,), all [px].
+    """
+    first, second = structure.first, structure.second
+    offset = _across(residual, projected.by_point, first, second)
+    spread = np.hypot(sigma[first], sigma[second])
+    against = np.zeros(len(first), dtype=bool)
+    usable = use[first] & use[second] & np.isfinite(offset)
+    for m, (start, stop) in enumerate(
+        zip(structure.pair_bounds[:-1], structure.pair_bounds[1:], strict=True)
+    ):
+        rows = start + np.flatnonzero(usable[start:stop])
+        if len(rows) >= _LEAST:
+            place = xy[:, first[rows]]
+            against[rows] = ~_on_one_plane(place, offset[rows], spread[rows], seed=m)
+    keep = use.copy()
+    for _ in range(structure.num_views):
+        live = against & keep[first] & keep[second]
+        if not live.any():
+            break
+        count = np.bincount(first[live], minlength=len(use)) + np.bincount(second[live], minlength=len(use))
+        worst = np.zeros(structure.num_points)
+        np.maximum.at(worst, structure.point, count)
+        keep &= ~((count > 0) & (count == worst[structure.point]))
+    return keep
+
+
+def _across(residual: Array, by_point: Array, first: IntArray, second: IntArray) -> Array:
+    """Return the offset across the epipolar line (Q,) [px]: what no move of the point takes away from two
+    observations.
+    """
+    offset = np.empty(len(first))
+    for part in parts(len(first), CHUNK):
+        one, two = by_point.take(first[part], axis=2), by_point.take(second[part], axis=2)
+        rays = cross(one[0], one[1]), cross(two[0], two[1])  # of a ray only the other's image moves
+        of_first, of_second = (one * rays[1]).sum(axis=1), (two * rays[0]).sum(axis=1)
+        normal = np.stack([of_first[1], -of_first[0], of_second[1], -of_second[0]])
+        four = np.concatenate([residual.take(first[part], axis=1), residual.take(second[part], axis=1)])
+        with np.errstate(all="ignore"):
+            offset[part] = np.sqrt(2.0) * (normal * four).sum(axis=0) / np.linalg.norm(normal, axis=0)
+    return offset
+
+
+def _on_one_plane(place: Array, offset: Array, spread: Array, seed: int) -> BoolArray:
+    """Return the largest set of offsets (n,) that lie on a plane over the image, by random triples and refits."""
+    low, high = place.min(axis=1, keepdims=True), place.max(axis=1, keepdims=True)
+    design = np.vstack([np.ones(len(offset)), 2.0 * (place - low) / np.maximum(high - low, 1.0) - 1.0])
+    rng = np.random.default_rng(seed)
+    triples = rng.integers(0, len(offset), (_TRIALS, 3))
+    matrices = design[:, triples].transpose(1, 2, 0)
+    good = np.abs(np.linalg.det(matrices)) > 1e-2
+    planes = np.linalg.solve(matrices[good], offset[triples[good]][..., None])[..., 0]
+    flat = np.column_stack([offset[triples[:, 0]], np.zeros((_TRIALS, 2))])
+    planes = np.concatenate([flat, planes])
+    near = np.abs(planes @ design - offset) < _NEAR * spread
+    best: BoolArray = near[int(near.sum(axis=1).argmax())]
+    for _ in range(_STEPS):
+        if best.sum() < 3:
+            break
+        plane = np.linalg.lstsq(design[:, best].T, offset[best], rcond=None)[0]
+        best = np.abs(plane @ design - offset) < _NEAR * spread
+    return best

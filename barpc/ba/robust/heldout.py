@@ -1,0 +1,277 @@
+"""What takes no part in the solve, and measures it: known check points, and tie points that are kept out.
+
+Survivors of a rejection agree because the others were cut. A tenth of the tracks, drawn from all alike, is kept out
+before; triangulated by the adjusted cameras they tell what those are worth, wrong matches and all: their figures are
+those of a mixture of right ones, which scatter, and wrong ones, which lie anywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import expit, gammaln
+
+from barpc.ba.algebra.structure import make_structure
+from barpc.ba.evidence.mixture import NEAR_LIMIT, WRONG
+from barpc.ba.held.block import Block
+from barpc.ba.robust.weights import Observations, geman_mcclure
+from barpc.ba.solving.problem import Problem
+from barpc.errors import InputError
+from barpc.geodesy import Array, ecef_from_ground, enu_basis
+from barpc.scene import BoolArray, GroundPoints, IntArray
+from barpc.sensor import SensorModel
+from barpc.sensor.geometry import triangulate
+
+_SHARE = 0.1
+_STEPS_A_PIXEL = 4.0  # so coarse that rounding draws hardly another track
+_ODD = np.uint64(0x9E3779B97F4A7C15)
+_LEAST = 100  # observations of a view, or its tracks are all needed
+_ROBUST_STEPS = 3
+_WIDE = 4.0  # sigmas
+_LESS = 0.99  # of the error, at most
+_SURELY = 3.0  # standard deviations
+_START = 0.2  # of the observations, the nearest: where even of many wrong ones right ones are
+_ITERATIONS = 100
+_SAME = 1e-4
+_NOTHING = 1e-12  # of a variance: residuals may be exactly zero
+_FEW = 20  # observations of a view that tell nothing by themselves
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Residuals of the tracks that were kept out of the adjustment."""
+
+    residual: Array  # (2, H) projected - observed [px], points triangulated by the cameras
+    index: IntArray  # (Q,) their points
+    points: Array  # (Q, 3) where these are, ECEF [m]
+    noise: Array  # (N,) observed over stated standard deviation of every view's; NaN with too few
+    rms: Array  # (N,) the same as a root mean square of residuals [px]
+
+    @property
+    def error(self) -> float:
+        """Observed over stated standard deviation, all views alike; NaN where none is known."""
+        return _mean_square(self.noise)
+
+    @property
+    def whole_rms(self) -> float:
+        """Root mean square residual of all views alike [px]; NaN where none is known."""
+        return _mean_square(self.rms)
+
+
+def _mean_square(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.sqrt((known**2).mean())) if len(known) else np.nan
+
+
+def keep_out(block: Block) -> BoolArray:
+    """Return the observations (K,) of about every tenth track, to be kept out.
+
+    They are drawn by their image positions alone, so that neither the order of rows nor the names of views matter.
+    """
+    few = np.bincount(block.view[block.use], minlength=len(block.views)) < _LEAST
+    needed = np.bincount(block.point[few[block.view] | ~block.use], minlength=block.num_points)
+    count = np.bincount(block.point, minlength=block.num_points)
+    drawn = np.zeros(block.num_points, dtype=np.uint64)
+    col, row = np.rint(block.xy * _STEPS_A_PIXEL).astype(np.int64).astype(np.uint64)
+    np.add.at(drawn, block.point, _scrambled(col * _ODD + row))
+    chosen = _scrambled(drawn) < np.uint64(_SHARE * 2.0**64)
+    chosen &= (count >= 2) & (needed == 0) & (np.arange(block.num_points) < block.num_tracks)
+    return chosen[block.point]
+
+
+def _scrambled(numbers: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """Return the numbers as if drawn at random (the finalizer of SplitMix64, Steele et al. 2014)."""
+    numbers = (numbers ^ (numbers >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    numbers = (numbers ^ (numbers >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return numbers ^ (numbers >> np.uint64(31))
+
+
+def of_part(problem: Problem, view: IntArray, point: IntArray, xy: Array) -> Problem:
+    """Return a problem's cameras with other observations (K,), sorted by view, of other points, seen at (2, K) [px]."""
+    points = int(point.max(initial=-1)) + 1
+    return replace(
+        problem,
+        cameras=problem.cameras.seeing(xy),
+        structure=make_structure(view, point, problem.structure.num_views, points),
+        xy=xy,
+        point_prior=None,
+        _room=[],
+    )
+
+
+def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Array]:
+    """Return a problem with other observations, and the points (Q, 3) that cameras of unknowns (N, q) give them."""
+    index, point = np.unique(block.point, return_inverse=True)
+    part = of_part(problem, block.view, point, block.xy)
+    first = block.first_points()[index]
+    return part, part.triangulate(first, part.project_points(params, first), 1.0 / block.sigma)
+
+
+def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
+    """Measure the observations of a block that took no part in a problem, under cameras of unknowns (N, q)."""
+    views, index = len(block.views), np.unique(block.point)
+    if not len(index):
+        unknown = np.full(views, np.nan)
+        return HeldOut(np.zeros((2, 0)), index, np.zeros((0, 3)), unknown, unknown)
+    part, first = seen_in(problem, params, block)
+    observations = Observations(part, block.sigma, 0.0, np.ones(len(block.view), dtype=bool))
+    counted = np.ones(len(block.view))
+    projected = part.project_points(params, first)  # near the end: from here it is linear
+    points = part.triangulate(first, projected, 1.0 / block.sigma)
+    for _ in range(_ROBUST_STEPS):  # of three views that do not agree two may
+        residual = projected.image - block.xy
+        residual += (projected.by_point * part.structure.of_points(points - first)).sum(axis=1)
+        counted = geman_mcclure((residual**2).sum(axis=0) / (_WIDE * block.sigma) ** 2)[1]
+        points = part.triangulate(first, projected, np.sqrt(counted) / block.sigma)
+    residual = part.residuals(params, points)
+    squared = observations.squared(residual, counted)
+    expected = block.sigma**2 * observations.freedom(counted)
+    count, noise = np.bincount(block.view, minlength=views), np.full(views, np.nan)
+    many = count >= _FEW
+    told = many[block.view]
+    number = (np.cumsum(many) - 1)[block.view[told]]
+    noise[many] = scatter(squared[told], expected[told] / block.sigma[told] ** 2, number)
+    rms = noise * np.sqrt(np.bincount(block.view, expected, views) / np.maximum(count, 1))
+    return HeldOut(residual, index, points, noise, rms)
+
+
+def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
+    """Return the observed over stated standard deviation of observations, half of which may be wrong.
+
+    Half of which may be wrong.
+
+    Parameters
+    ----------
+    squared : (K,), |r|^2 over its expectation under the stated deviations
+    freedom : (K,), degrees of freedom of each
+    view : (K,), 0 .. N - 1, ascending; each has one at least
+
+    Expectation and maximisation of a chi-square about zero, and of a uniform density of residuals as far as the
+    farthest goes; it is `NEAR_LIMIT` nats lower at least, or what is right would count as wrong by its tails.
+    """
+    half = 0.5 * np.maximum(freedom, 1.0)  # of two views all scatter across the epipolar line
+    starts = np.flatnonzero(np.diff(view, prepend=-1))
+    count = np.diff(starts, append=len(view)).astype(np.float64)
+    ordered = squared[np.lexsort((squared, view))]
+    at = _START * (count - 1.0)
+    low = ordered[starts + np.floor(at).astype(np.int64)]
+    middle = low + (at % 1.0) * (ordered[starts + np.ceil(at).astype(np.int64)] - low)
+    far = np.maximum(ordered[starts + count.astype(np.int64) - 1], _NOTHING)
+    variance, wrong = np.maximum(middle / _START, _NOTHING), np.full(len(count), WRONG[0] / WRONG[1])
+    farthest, constant = half * np.log(half * far[view]) - gammaln(half + 1.0), half * squared
+    moves = np.ones(len(count), dtype=bool)  # of a view that stands nothing changes any more
+    for _ in range(_ITERATIONS):
+        peak = np.maximum(farthest - half * np.log(variance)[view], NEAR_LIMIT)
+        right = expit(peak - constant / variance[view] - np.log(wrong / (1.0 - wrong))[view])
+        of_right, squares = (np.add.reduceat(rows, starts) for rows in (right, right * squared))
+        found = np.maximum(squares / np.maximum(of_right, 1e-300), _NOTHING)
+        stands = np.abs(found - variance) < _SAME * variance
+        variance = np.where(moves, found, variance)
+        wrong = np.where(moves, (WRONG[0] + count - of_right) / (WRONG[1] + count), wrong)
+        moves &= ~stands
+        if not moves.any():
+            break
+    return np.asarray(np.sqrt(variance))
+
+
+def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:
+    """Return whether cameras with more unknowns meet the held-out tracks of a block better than others do.
+
+    Track by track, as the same noise is in both; where one is wrong, by no more than so much.
+    """
+    if not len(block.point) or not one.error < _LESS * other.error:
+        return False
+    index, point = np.unique(block.point, return_inverse=True)
+    cost = [(h.residual**2).sum(axis=0) / (other.error * block.sigma) ** 2 for h in (one, other)]
+    less = np.bincount(point, (cost[1] / (1.0 + cost[1] / _WIDE**2)) - (cost[0] / (1.0 + cost[0] / _WIDE**2)))
+    return bool(less.mean() > _SURELY * less.std() / np.sqrt(len(index)))
+
+
+@dataclass(frozen=True, eq=False)
+class CheckResiduals:
+    """Residuals of known points under given cameras.
+
+    Parameters
+    ----------
+    image : (M, 2)
+        Projected - observed [px] of every observation.
+    ground : (G, 3)
+        Triangulated - known, east, north, up [m]; NaN for a point that fewer than two views see.
+    """
+
+    image: Array
+    ground: Array
+
+    def rms(self) -> tuple[Array, Array]:
+        """Return the root mean squares: col, row (2,) [px]; east, north, up (3,) [m], NaN without a
+        triangulated point.
+        """
+        known = np.isfinite(self.ground).all(axis=1)
+        ground = np.full(3, np.nan)
+        if known.any():
+            ground = np.sqrt((self.ground[known] ** 2).mean(axis=0))
+        return np.sqrt((self.image**2).mean(axis=0)), ground
+
+
+def check_residuals(sensors: Sequence[SensorModel], points: GroundPoints) -> CheckResiduals:
+    """Return the residuals of known points under given cameras.
+
+    Parameters
+    ----------
+    sensors : sequence of SensorModel
+        One a view: `Adjustment.sensors`, or the delivered ones.
+    points : GroundPoints
+        Check points.
+
+    Returns
+    -------
+    CheckResiduals
+    """
+    image = np.empty((len(points.view), 2))
+    for v in np.unique(points.view):
+        rows = points.view == v
+        image[rows] = sensors[v].project(points.lonlatalt[points.point[rows]]) - points.xy[rows]
+    ground = np.full((len(points.names), 3), np.nan)
+    seen = np.bincount(points.point, minlength=len(points.names)) >= 2
+    rows = np.flatnonzero(seen[points.point])
+    if len(rows):
+        order = rows[np.lexsort((points.view[rows], points.point[rows]))]
+        index, place = np.unique(points.point[order], return_inverse=True)
+        found = triangulate(list(sensors), points.view[order], place.ravel(), points.xy[order])
+        ground[index] = enu_offsets(found.points, points.lonlatalt[index])
+    return CheckResiduals(image, ground)
+
+
+def enu_offsets(points: Array, known: Array) -> Array:
+    """Return the east, north, up (n, 3) [m] of points, ECEF [m], minus known lon, lat, alt (n, 3)."""
+    offset = points - ecef_from_ground(known)
+    return (enu_basis(known) @ offset[..., None])[..., 0]
+
+
+def split_points(points: GroundPoints, checks: Sequence[str]) -> tuple[GroundPoints, GroundPoints]:
+    """Split points into control for the solve and check points that stay out of it.
+
+    Parameters
+    ----------
+    points : GroundPoints
+        All of them.
+    checks : sequence of str
+        Names of the check points.
+
+    Returns
+    -------
+    control, check : GroundPoints
+
+    Raises
+    ------
+    InputError
+        A name is not among the points.
+    """
+    unknown = sorted(set(checks) - set(points.names))
+    if unknown:
+        raise InputError(f"no ground point is named {', '.join(unknown[:10])}")
+    is_check = np.isin(np.array(points.names, dtype=object), list(checks))
+    return points.select(~is_check), points.select(is_check)

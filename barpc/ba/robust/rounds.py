@@ -1,0 +1,313 @@
+"""Rounds of solving: robust with a shrinking scale, then a cut, then least squares on what is left."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from barpc.ba.estimated.cameras import Projected
+from barpc.ba.evidence.scan import Interval
+from barpc.ba.held.block import Block
+from barpc.ba.held.ground import Heights
+from barpc.ba.robust.resembling import Resemblance
+from barpc.ba.robust.smooth import TERMS, Fit, Smooth, SmoothTest
+from barpc.ba.robust.variances import SAME_PRIOR, STANDS, PriorTest, Variances, same_prior
+from barpc.ba.robust.weights import LOSSES, MEDIAN, Observations
+from barpc.ba.solving.problem import Problem
+from barpc.ba.solving.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
+from barpc.geodesy import Array
+from barpc.options import AdjustOptions
+from barpc.scene import BoolArray
+
+_LOG = logging.getLogger(__name__)
+
+_LOW = 0.2  # part of the observations, and the |r|^2 over its expectation that they stay below, about
+_LEAST_NOISE = 0.5  # of the stated sigmas, while outliers are about
+_SAME = 1e-3  # a cut that changes less than this part of the observations is not solved again
+_SAME_NOISE = 0.02  # nor is a change of the noise by less than this part
+FAINT = 100.0  # times their noise have observations of control points that hold nothing, in images with tie points
+_SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each view by itself
+_BACKFITTING = 6
+_MANY_CUT = 0.01  # of the observations: more are looked at again
+_REVIVING = 2
+_ROBUST_ROUNDS = 20
+_AS_STATED = 1.5  # times the noise stated, and
+_CLEAN = 5.0  # sigmas
+_FEW = 0.002  # of the observations farther away than that: there is nothing to be careful about
+_NEAR = 12.0  # sigmas: a loss that is no wider asks what is smooth
+_SHRINK = 0.25  # of the loss's scale in one round, at most
+MAX_PASSES = 5  # rounds of cutting and solving, at most: they end when nothing changes
+_FIRST_TOLERANCE = 0.1  # of the first pass after robust rounds: the second, which follows always, is exact
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The end of the rounds."""
+
+    problem: Problem  # with the priors on points as they ended
+    minimum: Minimum  # unknowns, points, the last linearisation
+    residual: Array  # (2, K) projected - observed [px]
+    weight: Array  # (K,) 1 / sigma of the observations, as solved last [1/px]
+    inlier: BoolArray  # (K,) observations in the final solve
+    noise: float  # observed over stated standard deviation
+    passes: int  # rounds of cutting
+    prior: PriorTest  # how the corrections compare with the priors given, and what the priors became
+    smooth: SmoothTest  # what is smooth in the residuals that are left
+    # floor [px] -> intervals of images that stand out there, once they were looked for
+    standing_out: dict[float, list[Interval]] = field(default_factory=dict, init=False, repr=False)
+
+
+class Rounds:
+    """Robust rounds, cuts and the final least squares, with the observations in use (K,) to start with.
+
+    Outliers are judged by what is left of their residuals once the smooth part of every view is taken away: a
+    camera that the unknowns cannot follow yet does not make its tie points wrong. Where a solve with fewer unknowns
+    is `known`, it told them: robust rounds would let go of what the further unknowns are to follow.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        block: Block,
+        state: State,
+        options: AdjustOptions,
+        heights: Heights,
+        use: BoolArray,
+        known: Outcome | None = None,
+    ) -> None:
+        unknowns = problem.cameras.unknowns
+        residual, projected = problem.prepare(state.params, state.points)
+        self.problem = heights.hold(problem, state.points)
+        self.state, self.options, self.heights, self.residual = state, options, heights, residual
+        self.robust = options.loss != "linear"
+        is_tie = block.point < block.num_tracks
+        of_reference = block.point >= block.num_known
+        faint = faintness(block, heights)[block.point]
+        sigma = block.sigma * faint
+        self.observations = Observations(self.problem, sigma, options.noise_floor, is_tie, of_reference)
+        alike = Resemblance.of(block, TERMS)
+        self.smooth = Smooth(problem.structure, problem.xy, unknowns, alike, tells=faint == 1.0)
+        given, control = problem.camera_prior, heights.has_control
+        self.variances = Variances.of(given, unknowns, options, control, block.views)
+        # what the same unknowns ended with is gone on with: cut, accuracies, misfit
+        self.goes_on = known is not None and known.problem.cameras.unknowns is unknowns
+        if known is not None and self.goes_on:
+            self.problem, use = (
+                replace(self.problem, camera_prior=known.problem.camera_prior),
+                use & known.inlier,
+            )
+        self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
+        self.use = self.observations.tied(use & self.everything)
+        self.counted = (self.use if known is None else self.use & known.inlier).astype(np.float64)
+        self.is_known = known is not None
+        self.projected = projected  # of the state, until the first pass moves it
+        self.passes, self.noise = 0, 1.0 if known is None else known.noise
+        self.misfit: Array | float = (
+            known.smooth.rms if known is not None and self.goes_on and self.robust else 0.0
+        )
+        self.scatter: Array | None = None  # residuals without smooth parts, where they are known
+        self.weight = self.counted
+
+    def run(self, once: bool = False) -> Outcome:
+        """Repeat the rounds until nothing changes, or pass `once`."""
+        if self.robust and not self.is_known:
+            self._search()
+        while True:
+            outcome = self._cut_and_solve(once)
+            if outcome is not None:
+                return outcome
+
+    def _search(self) -> None:
+        """Run the robust rounds, under priors wide enough for what is not expected."""
+        start = replace(self.problem, camera_prior=self.variances.for_search())
+        self.state, self.residual, self.counted, self.noise, self.projected = _robust(
+            start,
+            self.observations,
+            self.state,
+            self.residual,
+            self.projected,
+            self.use,
+            self.options,
+            self.smooth,
+        )
+        self.misfit = self.smooth.test(self.residual, self.use).rms
+
+    def _cut_and_solve(self, once: bool) -> Outcome | None:
+        """Return one pass; the outcome where it is the last."""
+        options, was_in_use, noise = self.options, self.use, self.noise
+        many_cut = self.use.sum() < (1.0 - _MANY_CUT) * self.everything.sum()
+        if self.robust and self.passes and many_cut:
+            weight = self.everything / self.observations.sigma
+            self.state, self.residual = revived(self.problem, self.state, self.residual, self.use, weight)
+            self.scatter = None
+        self.problem = self.heights.hold(self.problem, self.state.points)
+        self.passes += 1
+        self._cut()
+        found = self._solve()
+        prior, tested = self.variances.learnt(self.problem, found)
+        smooth = self._estimate_noise()
+        numbers = self.passes, self.use.sum(), len(self.use), self.noise
+        _LOG.info("pass %d: %d of %d observations, noise %.3f", *numbers)
+        again = self.passes > 1 or self.goes_on
+        same = again and int((self.use != was_in_use).sum()) <= _SAME * len(self.use)
+        settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < _SAME_NOISE
+        # what is known of the place goes with what is shared, and nothing else learns of it
+        share = STANDS if tested.shared > 1.0 else SAME_PRIOR
+        settled &= same_prior(prior, self.problem.camera_prior, share)
+        if once or self.passes > MAX_PASSES or (settled and (same or not self.robust)):
+            smooth = self.smooth.test_neighbours(smooth, self.residual, self.use)
+            if found.covariance(self.problem.free).is_large:
+                tested = self.variances.learnt(self.problem, found, exact=True)[1]
+            return Outcome(
+                self.problem,
+                found,
+                self.residual,
+                self.weight,
+                self.use,
+                self.noise,
+                self.passes,
+                tested,
+                smooth,
+            )
+        self.problem = replace(self.problem, camera_prior=prior)
+        return None
+
+    def _cut(self) -> None:
+        """Cut observations by residuals without their smooth part."""
+        if self.robust:
+            scatter = self._scatter() if self.scatter is None else self.scatter
+            s = self.observations.squared(scatter, self.use.astype(np.float64))
+            near = self.observations.is_near(s, self.options.robust_threshold * self.noise)
+            self.use = self.observations.tied(self.everything & near)
+
+    def _solve(self) -> Minimum:
+        """Return the least squares of what is used; a second pass follows the first robust one always, and is exact."""
+        again = self.passes > 1 or self.goes_on
+        solver = "sparse" if self.options.solver == "auto" and self.passes == 1 else self.options.solver
+        tolerance = TOLERANCE if again or not self.robust else _FIRST_TOLERANCE
+        noise = self.noise if self.options.estimate_noise else 1.0
+        self.weight = weight = self.observations.weight(self.use, noise, self.misfit)
+        found = minimise(self.problem, self.state, weight, solver, tolerance, self.projected)
+        state, self.projected = found.state, None
+        self.residual = self.problem.residuals(state.params, state.points)
+        cost = self.problem.cost(state.params, state.points, self.residual * weight)
+        self.state = replace(state, cost=cost, history=(*state.history, cost))
+        self.counted = self.use.astype(np.float64)
+        return replace(found, state=self.state)
+
+    def _estimate_noise(self) -> SmoothTest:
+        """Return the noise, and what no camera can follow, by the residuals of the observations in use."""
+        fit = self.smooth.fit(self.residual, self.counted)
+        tested = self.smooth.test(self.residual, self.use, fit)
+        if self.robust:
+            fitted = 2 * TERMS * len(fit)
+            self.scatter = self._scatter(fit)
+            self.noise = self.observations.noise(self.scatter, self.use, self.problem, fitted)
+            self.misfit = tested.rms
+        else:
+            self.noise = self.observations.noise(self.residual, self.use, self.problem)
+        return tested
+
+    def _scatter(self, fit: Fit | None = None) -> Array:
+        """Return the residuals (2, K) [px] without the smooth parts of all views that see a point.
+
+        A point shares what one of its views is wrong by among all of them, and relief moves the rows of the views
+        against each other: so the smooth parts are found view by view and the points follow, until they stand.
+        """
+        residual, counted, sigma = self.residual, self.counted, self.observations.sigma
+        part = self.smooth.part(residual, counted, fit)
+        size = float(np.sqrt((counted * (part / sigma) ** 2).sum() / max(counted.sum(), 1.0)))
+        if size < _SMOOTH_SEEN:
+            return residual - part
+        projected = self.problem.project_points(self.state.params, self.state.points)
+        weight = counted**0.5 / sigma
+        settled = self.problem.settling(projected, weight)
+        for _ in range(_BACKFITTING):
+            part += self.smooth.part(settled(residual - part), counted)
+        return settled(residual - part)
+
+
+def faintness(block: Block, heights: Heights) -> Array:
+    """Return the factors (P,) on the noise of a point's observations: a control point that holds nothing ties
+    nothing.
+
+    Those of many points marked a pixel off in one image would pull it away from its tie points, which together count
+    for so much only. Points that are seen in an image without tie points are what ties that.
+    """
+    alone = np.bincount(block.view[block.point < block.num_tracks], minlength=len(block.views)) == 0
+    faint = np.zeros(block.num_points, dtype=bool)
+    faint[block.num_tracks : block.num_known] = True
+    faint[block.point[alone[block.view]]] = False
+    if heights.has_control:
+        faint[heights.control[0].index] = False
+    return np.where(faint, FAINT, 1.0)
+
+
+def _robust(
+    problem: Problem,
+    observations: Observations,
+    state: State,
+    residual: Array,
+    projected: Projected | None,
+    use: BoolArray,
+    options: AdjustOptions,
+    smooth: Smooth,
+) -> tuple[State, Array, Array, float, Projected | None]:
+    """Take reweighted steps while the loss's scale shrinks to three standard deviations of the noise.
+
+    The state, its residuals, how much every observation counts, the noise, and what is kept of the state's projection.
+    The noise is a median that counts observations by
+    their weights and so leaves the wrong ones behind, but not below what the best fifth of all shows, nor below half of
+    what is stated, or a few that fit by chance would be left.
+    """
+    loss = LOSSES[options.loss]
+    counted, scale, noise = use.astype(np.float64), np.inf, 1.0
+    s = observations.squared(residual, counted)
+    for _ in range(_ROBUST_ROUNDS):
+        least = float(np.sqrt(np.quantile(s[use], _LOW) / _LOW)) if use.any() else 1.0
+        noise = max(float(np.sqrt(_median(s, counted) / MEDIAN)), least, _LEAST_NOISE)
+        if scale <= 3.6 * noise:
+            break
+        clean = noise < _AS_STATED and float((s[use] > (_CLEAN * noise) ** 2).mean()) < _FEW
+        scale = 3.0 * noise if np.isinf(scale) or clean else max(3.0 * noise, _SHRINK * scale)
+        counted = _counted(observations, use, s, loss(s / scale**2)[1])
+        state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)
+        residual, projected = problem.prepare(state.params, state.points)
+        near = scale <= _NEAR * noise
+        s = observations.squared(residual - smooth.part(residual, counted) if near else residual, counted)
+        counted = _counted(observations, use, s, loss(s / scale**2)[1])
+    return state, residual, counted, noise, projected
+
+
+def _counted(observations: Observations, use: BoolArray, squared: Array, by_loss: Array) -> Array:
+    """Return the weight of each observation (K,)."""
+    return np.where(observations.is_spared(squared), use.astype(np.float64), use * by_loss)
+
+
+def revived(
+    problem: Problem, state: State, residual: Array, use: BoolArray, weight: Array
+) -> tuple[State, Array]:
+    """Return the state with wholly cut tracks triangulated anew by the present cameras, and their residuals
+    (2, K).
+
+    Nothing moved them since; with what they were cut for mended, they may come back.
+    """
+    structure = problem.structure
+    dead = structure.sum_points(use[None].astype(np.float64))[0] == 0
+    points = state.points.copy()
+    for _ in range(_REVIVING):
+        moved = problem.triangulate(points, problem.project_points(state.params, points), weight)
+        points[dead] = moved[dead]
+    again = problem.residuals(state.params, points)
+    return replace(state, points=points), np.where(dead[structure.point], again, residual)
+
+
+def _median(values: Array, weights: Array) -> float:
+    """Return the median of `values`, each counted as often as its weight says."""
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    if not len(total) or not total[-1] > 0:
+        return 1.0
+    return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])

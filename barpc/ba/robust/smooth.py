@@ -1,0 +1,182 @@
+"""What is smooth in the residuals of a view: judged before anything is cut, and tested at the end.
+
+Noise and wrong matches scatter; what a camera model cannot follow (jitter, optics, a crop that was turned) is a
+smooth function of the image. An outlier test that does not know the difference takes the second for the first. So
+the residuals of every view are split into a smooth part, a spline over the row and low polynomials of the column
+fitted by weighted least squares, and the scatter around it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import fdtrc
+
+from barpc.ba.algebra.structure import Structure
+from barpc.ba.estimated.unknowns import Unknowns
+from barpc.ba.robust.resembling import Resemblance
+from barpc.geodesy import Array
+from barpc.scene import BoolArray, IntArray
+from barpc.sensor.splined import bsplines
+
+Fit = dict[int, tuple[slice, Array]]
+"""View -> where its observations are, coefficients (2, TERMS) of their smooth part."""
+
+SPLINES = 14
+"""Cubic B-splines over the rows of an image: what changes over a tenth of it, or more slowly, is smooth."""
+
+TERMS = SPLINES + 4  # and col, col^2, col^3, row col
+_KEPT = 1_000_000  # observations whose terms are kept: they are worked out once, and take 144 bytes each
+_PER_TERM = 10  # observations a term, or the view is left as it is
+_SIGMAS = 5.0  # a mean product of neighbours that is smaller may be chance
+_RIDGE = 1e-6  # of a term's own weight
+_BEND = 1e-2  # of a spline's weight: rows without observations continue what their neighbours show
+_BENDING = np.diff(np.eye(SPLINES), n=2, axis=0).T @ np.diff(np.eye(SPLINES), n=2, axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothTest:
+    """The smooth part of every view's residuals, and whether it is more than chance."""
+
+    # (N,) root mean square of the smooth part over the view's observations, both coordinates together, less
+    # what noise alone would leave [px]; 0 for a view with too few observations
+    rms: Array
+    # (N,) probability that noise alone leaves as much (F-test); 1 for a view with too few observations
+    significance: Array
+    # (N,) part of the smooth part's square that the row alone explains; NaN where nothing was fitted
+    by_row: Array
+    # (N,) error that an observation shares with its neighbour in the row, or in the column where that is more
+    # [px]: waves and steps that are too fine for the smooth part are in it, too. 0 where it is not
+    # significant
+    shared: Array
+
+    def found(self, least: float, level: float = 1e-4) -> BoolArray:
+        """Return the views (N,) with a smooth part above `least` [px] that is significant."""
+        return np.asarray((self.rms > least) & (self.significance < level))
+
+
+class Smooth:
+    """The smooth model of a block's views, of observations at `xy` (2, K) [px], which may resemble each other.
+
+    Only those that `tells` (K,) are looked at.
+    """
+
+    def __init__(
+        self,
+        structure: Structure,
+        xy: Array,
+        unknowns: Unknowns,
+        alike: Resemblance | None = None,
+        tells: BoolArray | None = None,
+    ) -> None:
+        self.structure, self.alike = structure, alike
+        self._tells = np.ones(xy.shape[1], dtype=bool) if tells is None else tells
+        col, row = unknowns.normalized(xy, structure.view).clip(-1.0, 1.0)
+        self._place = xy
+        self._col, self._row = col, row
+        self._kept = self._terms(slice(None)) if len(col) <= _KEPT else None
+
+    def _basis(self, rows: slice) -> Array:
+        """Return the terms (TERMS, n) at some observations."""
+        return self._terms(rows) if self._kept is None else self._kept[:, rows]
+
+    def _terms(self, rows: slice) -> Array:
+        col, row = self._col[rows], self._row[rows]
+        return np.vstack([bsplines(row, SPLINES), col, col**2, col**3, row * col])
+
+    def part(self, residual: Array, weight: Array, fit: Fit | None = None) -> Array:
+        """Return the smooth part (2, K) of residuals (2, K) [px], fitted with weights (K,) >= 0.
+
+        Zero for views with too few observations that count.
+        """
+        out = np.zeros_like(residual)
+        for rows, coefficients in (self.fit(residual, weight) if fit is None else fit).values():
+            out[:, rows] = coefficients @ self._basis(rows)
+        return out
+
+    def test(self, residual: Array, use: BoolArray, fit: Fit | None = None) -> SmoothTest:
+        """Test whether the residuals (2, K) [px] of the observations in use hold more than scatter.
+
+        What is too fine for the smooth part is not looked for.
+        """
+        n = self.structure.num_views
+        rms, significance, by_row = np.zeros(n), np.ones(n), np.full(n, np.nan)
+        use = use & self._tells
+        weight = use.astype(np.float64)
+        residual = np.where(use, residual, 0.0)
+        share, precision = (
+            (weight, weight)
+            if self.alike is None
+            else (weight * self.alike.share, weight * self.alike.precision)
+        )
+        terms = 2.0 * TERMS
+        for v, (rows, coefficients) in (self.fit(residual, weight) if fit is None else fit).items():
+            count, root = 2 * float(share[rows].sum()), np.sqrt(precision[rows])
+            basis = self._basis(rows)
+            smooth = (coefficients @ basis) * root
+            explained = float((smooth**2).sum())
+            along = (coefficients[:, :SPLINES] @ basis[:SPLINES]) * root
+            by_row[v] = min(float((along**2).sum()) / max(explained, 1e-30), 1.0)
+            if count <= terms + 1.0:  # as few as these tell no curve from noise
+                continue
+            left = float(((residual[:, rows] * root) ** 2).sum()) - explained
+            scatter = max(left / (count - terms), 1e-30)
+            significance[v] = float(fdtrc(terms, count - terms, explained / terms / scatter))
+            rms[v] = np.sqrt(max(explained - terms * scatter, 0.0) / float(precision[rows].sum()))
+        return SmoothTest(rms, significance, by_row, np.zeros(n))
+
+    def test_neighbours(self, tested: SmoothTest, residual: Array, use: BoolArray) -> SmoothTest:
+        """Test the same with what neighbours share, in views in which something was fitted."""
+        shared, use = np.zeros_like(tested.rms), use & self._tells
+        for v in np.flatnonzero(np.isfinite(tested.by_row)):
+            shared[v] = self._shared(slice(*self.structure.bounds[v : v + 2]), residual, use)
+        return replace(tested, shared=shared)
+
+    def _shared(self, rows: slice, residual: Array, use: BoolArray) -> float:
+        """Return the root of the mean product of neighbours' residuals [px], along the rows or the columns."""
+        kept = np.arange(rows.start, rows.stop)[use[rows]]
+        most = 0.0
+        for place in self._place[:, kept]:
+            order = kept[np.argsort(place, kind="stable")]
+            ordered = residual[:, order]
+            product, count = (ordered[:, 1:] * ordered[:, :-1]).sum(axis=0), len(order) - 1.0
+            if self.alike is not None:
+                product, count = self._beyond_noise(product, (ordered**2).sum(axis=0), order)
+            if product.mean() > _SIGMAS * product.std() / np.sqrt(max(count, 1.0)):
+                most = max(most, float(np.sqrt(product.mean())))
+        return most
+
+    def _beyond_noise(self, product: Array, square: Array, order: IntArray) -> tuple[Array, float]:
+        """Return the products (n - 1,) of neighbours (n,) without what the noise that they share makes of
+        them; their number.
+        """
+        assert self.alike is not None
+        first, second = order[:-1], order[1:]
+        same = self.alike.correlation(first, second)
+        weight = np.sqrt(self.alike.precision[first] * self.alike.precision[second])
+        beyond = weight * (product - same * 0.5 * (square[1:] + square[:-1]))
+        size = max(float((weight * (1.0 - same)).mean()), 1e-12)
+        return beyond / size, float(self.alike.share[second].sum())
+
+    def fit(self, residual: Array, weight: Array) -> Fit:
+        """Fit the smooth part of the residuals, of views with enough observations that count."""
+        bounds, weight = self.structure.bounds, weight * self._tells
+        counts = self.structure.sum_views(weight[None])[:, 0]
+        found = {}
+        for v in np.flatnonzero(counts >= _PER_TERM * TERMS).tolist():
+            rows = slice(int(bounds[v]), int(bounds[v + 1]))
+            found[v] = rows, self._coefficients(rows, residual, weight)
+        return found
+
+    def _coefficients(self, rows: slice, residual: Array, weight: Array) -> Array:
+        """Return the coefficients (2, terms) of one view."""
+        basis = self._basis(rows)
+        weighted = basis * (weight[rows] if self.alike is None else weight[rows] * self.alike.precision[rows])
+        matrix = weighted @ basis.T
+        diagonal = np.diag(matrix)
+        matrix[np.diag_indices(TERMS)] += _RIDGE * (diagonal + diagonal.mean())
+        matrix[:SPLINES, :SPLINES] += _BEND * diagonal[:SPLINES].mean() * _BENDING
+        with np.errstate(invalid="ignore"):
+            target = np.where(weight[rows] > 0, residual[:, rows], 0.0)
+        return np.asarray(np.linalg.solve(matrix, weighted @ target.T).T, dtype=np.float64)

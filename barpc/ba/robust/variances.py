@@ -1,0 +1,360 @@
+"""Priors on the cameras that learn from the block: variance components, and views that are odd.
+
+A prior's standard deviation is a guess. What the observations say about it is the size of the corrections that they
+determine: with the posterior covariance C of unknowns whose prior is s, gamma = n - trace(C) / s^2 of them are
+determined, and their squares sum to gamma s^2 on average (MacKay 1992, "Bayesian Interpolation", eq. 4.8). Where the
+sum is larger than chance allows, some prior was too narrow: that of one view, if its correction alone explains it
+(every view that would is held possible: three in a row along the flight cannot tell which), else that of all.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtrc, gammaincinv
+
+from barpc.ba.algebra.linear import factorize
+from barpc.ba.estimated.priors import CameraPrior, states_accuracy
+from barpc.ba.estimated.unknowns import Unknowns
+from barpc.ba.solving.covariance import Covariance
+from barpc.ba.solving.problem import Problem
+from barpc.ba.solving.solve import Minimum
+from barpc.geodesy import Array
+from barpc.options import AdjustOptions
+from barpc.scene import BoolArray, View
+
+_LOG = logging.getLogger(__name__)
+
+_STRENGTH = 4.0  # degrees of freedom with which the given figure counts beside what the block shows
+_LEVEL = 0.05  # a sum of squares less probable than this is too large
+_SURE = 5.0  # of two explanations whose evidences differ by less (a factor of 150) none is ruled out
+_LIKELIER = -np.log(
+    _LEVEL
+)  # but one odd view is named where all being worse than stated is as improbable beside it
+_FREE = 100.0  # times its prior: a view whose camera may be anywhere
+_SEARCH = 10.0  # times the drift's standard deviation while outliers are looked for
+_MOVING = 0.01  # of a rotation, as drift: the centre it turns about flies some km while an image is taken
+_UNEXPECTED = (
+    1e-3  # drifts less probable than this are another platform's, and what was given counts for nothing
+)
+_LOW = 0.1  # then as much is let be as leaves what is seen this likely: a prior too narrow bends all heights alike
+_ITERATIONS = 10
+STANDS = 0.05  # change of a standard deviation, as a logarithm, below which it stands
+SAME_PRIOR = 0.2  # the same, below which a block is not solved again
+_SMALL = 400  # unknowns up to which every view is tried
+LEAST_WAVES = 0.01  # px: of splines and steps, counting as one observation
+_OWN = 2.0  # as many degrees of freedom has the size of all views beside that of one
+_LEAST = 0.5  # degrees of freedom below which nothing is said
+
+
+@dataclass(frozen=True, eq=False)
+class PriorTest:
+    """Comparison of the views' corrections with the priors that were given."""
+
+    # squared constant corrections (rotation, translation) over the variances given, over their degrees of
+    # freedom: about 1 where the priors hold. NaN where the observations determine nothing
+    ratio: float
+    freedom: float  # constant unknowns that the observations determine
+    scale: Array  # (N,) by how much the standard deviations given were widened; 1: not at all
+    odd: BoolArray  # (N,) views whose camera alone explains the corrections. More than one: any of them would
+    # standard deviation of the drift's coefficients in use, degree by degree [m]
+    drift_sigma: tuple[float, ...]
+    shared: float = (
+        1.0  # by how much standard deviations that RPCs state were widened, as all views share what is off
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Around:
+    """The problem near a minimum, quadratic: its cost, minimum and covariance under other priors."""
+
+    problem: Problem
+    minimum: Minimum
+
+    @property
+    def small(self) -> bool:
+        """Whether it can be solved many times."""
+        return len(self.problem.free) <= _SMALL
+
+    def under(self, prior: CameraPrior) -> tuple[float, Array, Covariance]:
+        """Return the evidence (logarithm, but for a constant), unknowns (N, q) and covariance under other priors."""
+        now, reduced, start = self.problem.camera_prior, self.minimum.reduced, self.minimum.state.params
+        free = self.problem.free
+        change = np.where(free, (1.0 / prior.sigma**2 - 1.0 / now.sigma**2).ravel(), 0.0)
+        given = reduced.plain(np.ones_like(free))
+        matrix = given + np.diag(change)
+        factor = factorize(matrix[np.ix_(free, free)])
+        covariance = Covariance(replace(reduced, matrix=matrix), factor, free)
+        offset = (start - now.mean).ravel()
+        step = -covariance.solve(change * offset)
+        moved = offset + step
+        cost = float(step @ (given @ step) + change @ moved**2)
+        held = free & np.isfinite(prior.sigma.ravel())
+        volume = factor.log_determinant + 2.0 * float(np.log(prior.sigma.ravel()[held]).sum())
+        return -0.5 * (cost + volume), start + step.reshape(start.shape), covariance
+
+
+@dataclass(frozen=True, eq=False)
+class Variances:
+    """The priors of a block and what may be learnt about them."""
+
+    given: CameraPrior  # with the standard deviations as they were given
+    unknowns: Unknowns  # which unknown is what
+    learn_constant: bool  # whether the constants' standard deviations may change
+    learn_drift: bool
+    cautious: bool  # rather too wide than too narrow: no control holds the scene
+    stated: BoolArray | None = None  # (N,) views whose RPCs state what counts here; None: none does
+
+    @classmethod
+    def of(
+        cls,
+        given: CameraPrior,
+        unknowns: Unknowns,
+        options: AdjustOptions,
+        control: bool,
+        views: Sequence[View] = (),
+    ) -> Variances:
+        """Return the priors to be learnt by the options, with control points or without."""
+        geometric = unknowns.geometric and options.learn_priors
+        own = options.sigma_attitude is None and options.sigma_position is None and len(views) > 0
+        stated = np.array([states_accuracy(view) for view in views]) if own else None
+        return cls(given, unknowns, geometric, geometric and options.sigma_drift is None, not control, stated)
+
+    @property
+    def constants(self) -> int:
+        """Constant unknowns of a view."""
+        return self.unknowns.constants if self.unknowns.geometric else 0
+
+    def for_search(self) -> CameraPrior:
+        """Return the wider priors used while outliers are looked for, so that unexpected drift is not cut."""
+        return self._prior(np.ones(len(self.given.sigma)), np.full(self._degrees, _SEARCH))
+
+    def learnt(
+        self, problem: Problem, minimum: Minimum, exact: bool = False
+    ) -> tuple[CameraPrior, PriorTest]:
+        """Estimate the priors that the block supports, in its linearisation at a minimum.
+
+        A large block's variances are probed unless they are to be `exact`.
+        """
+        try:
+            return self._learnt(problem, minimum, exact)
+        except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
+            _LOG.warning("the priors of the cameras are left as they are: %s", error)
+            n = len(minimum.state.params)
+            nothing = PriorTest(float("nan"), 0.0, np.ones(n), np.zeros(n, dtype=bool), ())
+            return problem.camera_prior, nothing
+
+    def _learnt(self, problem: Problem, minimum: Minimum, exact: bool) -> tuple[CameraPrior, PriorTest]:
+        if self.learn_waves:
+            self = self._going_on(problem.camera_prior.sigma)
+        around = _Around(problem, minimum)
+        now, params = problem.camera_prior, minimum.state.params
+        covariance = minimum.covariance(problem.free)
+        scale, wide, odd = np.ones(len(params)), np.ones(self._degrees), np.zeros(len(params), dtype=bool)
+        prior = self._prior(scale, wide)
+        if around.small and (now.sigma != prior.sigma).any():
+            _, params, covariance = around.under(prior)
+        known = self._known(covariance, prior if around.small else now, exact)
+        total, freedom = (float(part.sum()) for part in self._squares(params, known))
+        ratio = total / freedom if freedom > _LEAST else float("nan")
+        shared = self._shared(params, known)
+        stands = not self.learn_drift
+        for _ in range(2 * _ITERATIONS):
+            before = prior
+            if self.learn_waves:
+                self = self._going_on(self._waves(params, known, prior.sigma))
+            wide = self._drift(params, known) if self.learn_drift else wide
+            prior = self._prior(scale, wide)
+            # a drift that is larger than thought looks like constants that are: it is learnt before they are asked
+            last, least = (before, STANDS) if around.small else (now, SAME_PRIOR)
+            stands |= same_prior(prior, last, least, self._of_drift)
+            if stands and self.learn_constant and self._too_large(params, known, scale):
+                scale, odd = self._widened(around, params, known, wide)
+                prior = self._prior(scale, wide)
+            if not around.small or same_prior(prior, before, STANDS):
+                break
+            _, params, covariance = around.under(prior)
+            known = self._known(covariance, prior)
+        drift = tuple(
+            float(np.median(prior.sigma[:, self._drift_part(d).start])) for d in range(self._degrees)
+        )
+        sigma = prior.sigma.copy()
+        sigma[:, : self.constants] *= shared[:, None]
+        tested = PriorTest(ratio, freedom, scale, odd, drift, float(shared.max()))
+        return CameraPrior(prior.mean, sigma), tested
+
+    def _shared(self, params: Array, known: Array) -> Array:
+        """Return the factors (N,) by which views that state an accuracy are widened, as they share the error
+        that they state.
+
+        Views that were adjusted together agree: what each is off by, they all are. Independent errors would leave
+        them as large a part of the variance stated as their corrections show, at most. The rest does not average:
+        n views of two unknowns (rotation, translation) a direction would tell the place sqrt(n / 2) times too well.
+        """
+        wider = np.ones(len(params))
+        if self.stated is None or not self.learn_constant:
+            return wider
+        squares, freedom = (part[self.stated].sum() for part in self._squares(params, known))
+        if freedom > _LEAST:
+            alone = min(float(squares / (2.0 * gammaincinv(0.5 * freedom, _UNEXPECTED))), 1.0)
+            count = np.count_nonzero(known[self.stated, : self.constants].any(axis=1))
+            wider[self.stated] = np.sqrt(max(alone + (1.0 - alone) * count * 3.0 / self.constants, 1.0))
+        return wider
+
+    @property
+    def learn_waves(self) -> bool:
+        """Whether there are splines or steps, whose sizes are always learnt."""
+        return self.unknowns.waves is not None
+
+    def _going_on(self, sigma: Array) -> Variances:
+        """Return the priors with splines and steps as large as in the standard deviations (N, q)."""
+        part, given = self.unknowns.in_waves, self.given.sigma.copy()
+        given[:, part] = sigma[:, part]
+        return replace(self, given=CameraPrior(self.given.mean, given))
+
+    def _waves(self, params: Array, known: Array, sigma: Array) -> Array:
+        """Return the standard deviations (N, q), splines and steps as large as each view's show."""
+        assert self.unknowns.waves is not None
+        first, bands = self.unknowns.in_waves.start, self.unknowns.waves.bands
+        out = sigma.copy()
+        for band in range(int(bands.max()) + 1):
+            rows = first + np.flatnonzero(bands == band)
+            learnt = np.isfinite(sigma[:, rows[0]])  # those of an earlier block are in its matrix
+            squares, freedom = (learnt * part.sum(axis=1) for part in (params[:, rows] ** 2, known[:, rows]))
+            common = (LEAST_WAVES**2 + squares.sum()) / (1.0 + freedom.sum())
+            size = np.sqrt((_OWN * common + squares) / (_OWN + freedom))
+            out[:, rows] = np.where(learnt, size, np.inf)[:, None]
+        return out
+
+    @property
+    def _degrees(self) -> int:
+        return self.unknowns.drift if self.unknowns.geometric else 0
+
+    @property
+    def _of_drift(self) -> slice:
+        return slice(self.constants, self.constants + 3 * self._degrees)
+
+    def _drift_part(self, degree: int) -> slice:
+        return slice(self.constants + 3 * degree, self.constants + 3 * degree + 3)
+
+    def _prior(self, scale: Array, wide: Array) -> CameraPrior:
+        """Return the priors given, constants wider by `scale` (N,), drifts by `wide` (D,)."""
+        sigma = self.given.sigma.copy()
+        sigma[:, : self.constants] *= scale[:, None]
+        for degree, factor in enumerate(wide):
+            part = self._drift_part(degree)
+            sigma[:, part] *= factor
+            if degree == 0 and self.learn_drift:
+                sigma[:, part] = np.hypot(sigma[:, part], _MOVING * sigma[:, :3])
+        return CameraPrior(self.given.mean, sigma)
+
+    def _known(self, covariance: Covariance, prior: CameraPrior, exact: bool = True) -> Array:
+        """Return the share (N, q), 0 to 1, by which the observations determine each unknown."""
+        shape = prior.sigma.shape
+        use = covariance.free.reshape(shape) & np.isfinite(prior.sigma)
+        probed = covariance.is_large and not exact
+        variance = covariance.probed_variances() if probed else covariance.variances()
+        known = 1.0 - variance / prior.sigma**2
+        return np.where(use, known.clip(0.0, 1.0), 0.0)
+
+    def _squares(
+        self, params: Array, known: Array, scale: Array | float = 1.0, part: slice | None = None
+    ) -> tuple[Array, Array]:
+        """Return the squared unknowns of every view (the constants, or a part) over their variances, and
+        their freedom (N,).
+        """
+        part = slice(self.constants) if part is None else part
+        sigma = self.given.sigma[:, part] * np.reshape(scale, (-1, 1))
+        squared = ((params - self.given.mean)[:, part] / sigma) ** 2
+        return np.where(known[:, part] > 0, squared, 0.0).sum(axis=1), known[:, part].sum(axis=1)
+
+    def _too_large(self, params: Array, known: Array, scale: Array) -> bool:
+        """Return whether the corrections are larger than chance allows."""
+        total, freedom = (float(part.sum()) for part in self._squares(params, known, scale))
+        return freedom > _LEAST and float(chdtrc(freedom, total)) < _LEVEL
+
+    def _widened(self, around: _Around, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
+        """Return the factors (N,) by which each view's prior is widened, and the views that are odd."""
+        n = len(params)
+        total, freedom = self._squares(params, known)
+        factor = max((_STRENGTH + total.sum()) / (_STRENGTH + freedom.sum()), 1.0)
+        if self.cautious:
+            factor = max(factor, _possible(total.sum(), freedom.sum()))
+        odd = np.zeros(n, dtype=bool)
+        if around.small and n > 2:
+            common = np.full(n, np.sqrt(factor))
+            scale, alone, evidence = self._odd(around, wide)
+            together = around.under(self._prior(common, wide))[0]
+            evidence -= float(np.log(n))  # of the choice among the views
+            if evidence >= together + _LIKELIER:
+                return scale, alone
+            both_may_be = evidence >= together - _SURE  # the priors cover both
+            return (np.maximum(scale, common) if both_may_be else common), odd
+        if n > 2 and not around.small:  # one view of many is seen at once
+            own = np.median(total[freedom > _LEAST] / freedom[freedom > _LEAST])
+            factor = max((_STRENGTH + own * freedom.sum()) / (_STRENGTH + freedom.sum()), 1.0)
+            odd = np.asarray(chdtrc(np.maximum(freedom, _LEAST), total / factor) < _LEVEL / n)
+        alone = (_STRENGTH * factor + total) / (_STRENGTH + freedom)
+        return np.sqrt(np.where(odd, np.maximum(alone, factor), factor)), odd
+
+    def _odd(self, around: _Around, wide: Array) -> tuple[Array, BoolArray, float]:
+        """Find a few views whose cameras explain the corrections, by forward selection, and the evidence for them."""
+        n = len(self.given.sigma)
+        odd, chosen = np.zeros(n, dtype=bool), np.ones(n)
+        scale, last = np.ones(n), -np.inf
+        for _ in range(max(1, n // 3)):
+            tried = {v: self._alone(around, wide, chosen, v) for v in np.flatnonzero(chosen == 1.0).tolist()}
+            best = max(tried, key=lambda v: tried[v][0])
+            if tried[best][0] < last + _SURE:
+                break
+            last = tried[best][0]
+            for v, (evidence, size) in tried.items():
+                if evidence > last - _SURE:  # as good an explanation as the best
+                    odd[v], scale[v] = True, size
+            chosen[best] = tried[best][1]
+        return scale, odd, last
+
+    def _alone(self, around: _Around, wide: Array, scale: Array, v: int) -> tuple[float, float]:
+        """Return the evidence for view v being odd as well, and the factor that its prior then needs."""
+        trial = scale.copy()
+        trial[v] = _FREE
+        prior = self._prior(trial, wide)
+        try:
+            _, params, covariance = around.under(prior)
+        except np.linalg.LinAlgError:
+            return -np.inf, 1.0
+        known = self._known(covariance, prior)
+        total, freedom = (part[v] for part in self._squares(params, known))
+        trial[v] = max(np.sqrt((_STRENGTH + total) / (_STRENGTH + freedom)), 1.0)
+        return around.under(self._prior(trial, wide))[0], float(trial[v])
+
+    def _drift(self, params: Array, known: Array) -> Array:
+        """Return the factors (D,) on the drift's standard deviations, the given ones counting for a few."""
+        waves = self.unknowns.waves  # of which splines and steps follow what else bends heights
+        careful = self.cautious and not (waves and (waves.count or waves.edges.size))
+        factors = np.ones(self._degrees)
+        for degree in range(self._degrees):
+            total, freedom = (x.sum() for x in self._squares(params, known, part=self._drift_part(degree)))
+            factors[degree] = (_STRENGTH + total) / (_STRENGTH + freedom)
+            if careful and freedom > _LEAST and chdtrc(freedom, total) < _UNEXPECTED:
+                factors[degree] = max(factors[degree], _possible(total, freedom))
+        return np.sqrt(factors)
+
+
+def _possible(total: float, freedom: float) -> float:
+    """Return a variance, in units of the one given, that still makes such a sum of squares likely enough."""
+    return float(total / (2.0 * gammaincinv(0.5 * freedom, _LOW)))
+
+
+def same_prior(a: CameraPrior, b: CameraPrior, share: float, part: slice | None = None) -> bool:
+    """Return whether the standard deviations of two priors differ by less than a share; infinite ones are
+    infinite in both.
+
+    Of all unknowns, or a part.
+    """
+    one, other = (prior.sigma[:, slice(None) if part is None else part] for prior in (a, b))
+    finite = np.isfinite(one) & np.isfinite(other)
+    return bool((np.abs(np.log(one[finite] / other[finite])) < share).all())

@@ -1,0 +1,162 @@
+"""How much observations count: robust losses, stated sigmas, the observed noise.
+
+A loss rho(s) is of a squared, normalised residual s = (|r| / scale)^2. The adjustment minimises sum scale^2 rho(s) by
+reweighting: an observation's squared weight is rho'(s), so that the gradient of the weighted problem is the gradient
+of the robust one. One loss a function, one row in `LOSSES`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from barpc.ba.held.ground import ALIKE
+from barpc.ba.robust.smooth import SPLINES
+from barpc.ba.solving.problem import Problem
+from barpc.geodesy import Array
+from barpc.scene import BoolArray
+
+MEDIAN = 0.55  # of |r|^2 over its expectation: chi-square with 1 (two views) to 2 (many) degrees of freedom
+_LARGEST_MISFIT = 3.0  # px: or a misfit would loosen the view that causes it
+_LEAST_FREEDOM = 20
+_GROSS = 100.0  # sigmas: a control point of another place would take the block with it
+_CUT = 5.0  # sigmas: of a reference's points, which were compared with each other before
+
+Loss = Callable[[Array], tuple[Array, Array]]
+"""s (...) -> rho(s), rho'(s); rho(0) = 0, rho'(0) = 1."""
+
+
+def linear(s: Array) -> tuple[Array, Array]:
+    """Return rho(s) = s and its derivative: least squares."""
+    return s, np.ones_like(s)
+
+
+def huber(s: Array) -> tuple[Array, Array]:
+    """Return rho(s) and its derivative: squares up to 1, absolute values beyond."""
+    root = np.sqrt(np.maximum(s, 1.0))
+    return np.where(s <= 1.0, s, 2.0 * root - 1.0), 1.0 / root
+
+
+def soft_l1(s: Array) -> tuple[Array, Array]:
+    """Return rho(s) = 2 (sqrt(1 + s) - 1) and its derivative: a smooth absolute value."""
+    root = np.sqrt(1.0 + s)
+    return 2.0 * (root - 1.0), 1.0 / root
+
+
+def cauchy(s: Array) -> tuple[Array, Array]:
+    """Return rho(s) = log(1 + s) and its derivative."""
+    return np.log1p(s), 1.0 / (1.0 + s)
+
+
+def geman_mcclure(s: Array) -> tuple[Array, Array]:
+    """Return rho(s) = s / (1 + s) and its derivative: an outlier's pull vanishes; for scales that shrink
+    round by round.
+    """
+    return s / (1.0 + s), 1.0 / (1.0 + s) ** 2
+
+
+LOSSES: dict[str, Loss] = {
+    "linear": linear,
+    "huber": huber,
+    "soft_l1": soft_l1,
+    "cauchy": cauchy,
+    "geman_mcclure": geman_mcclure,
+}
+"""Name -> loss."""
+
+
+class Observations:
+    """Weights of observations: stated sigmas, the observed noise, and the cap on a view's information."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        sigma: Array,
+        noise_floor: float,
+        is_tie: BoolArray,
+        of_reference: BoolArray | None = None,
+    ) -> None:
+        self.structure, self.sigma, self.noise_floor = problem.structure, sigma, noise_floor
+        self.is_tie = is_tie
+        waves = problem.cameras.unknowns.waves
+        # errors that neighbours share are others in every stretch of a spline, of columns and of rows
+        self.stretches = (
+            1.0 if waves is None else waves.stretches(2.0 * float(problem.cameras.unknowns.half[1].max()))
+        )
+        self.has_prior = np.zeros(self.structure.num_points, dtype=bool)
+        if problem.point_prior is not None:
+            self.has_prior[problem.point_prior.index] = True
+        self.of_reference = np.zeros_like(is_tie) if of_reference is None else of_reference
+        # control points are tested point by point
+        self.is_control = ~is_tie & ~self.of_reference & self.has_prior[self.structure.point]
+
+    def is_spared(self, squared: Array) -> BoolArray:
+        """Return the observations (K,) of control points, which are tested at the end instead of cut, unless
+        grossly wrong.
+
+        Those of a reference agree with each other: how far the cameras are off says nothing of them.
+        """
+        return np.asarray((self.is_control & (squared < _GROSS**2)) | self.of_reference)
+
+    def is_near(self, squared: Array, scale: float) -> BoolArray:
+        """Return the observations (K,) within a number of standard deviations; a reference's by their own limit."""
+        near = np.where(self.of_reference, squared <= _CUT**2, squared <= scale * scale)
+        return np.asarray(near | (self.is_control & (squared < _GROSS**2)))
+
+    def freedom(self, counted: Array) -> Array:
+        """Return the degrees of freedom (K,) left of an observation once its point is estimated, 1/2 (two
+        views) to 2.
+
+        `counted` (K,) says how much each observation counts; a track with one that counts for nothing is a
+        track of the others.
+        """
+        structure = self.structure
+        largest = np.zeros(structure.num_points)
+        np.maximum.at(largest, structure.point, counted)
+        count = structure.sum_points(counted[None])[0] / np.maximum(largest, 1e-300)
+        rows = 2.0 * np.maximum(count, 1.0)
+        free = np.where(self.has_prior, rows, np.maximum(rows - 3.0, 0.25))
+        freedom: Array = (2.0 * free / rows)[structure.point]
+        return freedom
+
+    def squared(self, residual: Array, counted: Array) -> Array:
+        """Return the squared residuals (K,) over their expectation under the stated sigmas."""
+        s: Array = (residual**2).sum(axis=0) / self.sigma**2 / self.freedom(counted)
+        return np.where(np.isfinite(s), s, np.inf)
+
+    def weight(self, use: BoolArray, noise: float, misfit: Array | float = 0.0) -> Array:
+        """Return the weights 1 / sigma (K,) [1/px], tie points under the cap; 0 where not used.
+
+        What a view's camera cannot follow, `misfit` (N,) [px], does not average away either: it is as good as
+        `SPLINES` independent errors.
+        """
+        weight: Array = use / (self.sigma * noise)
+        information = self.structure.sum_views((weight * self.is_tie)[None] ** 2)[:, 0]
+        floor = self.noise_floor**2 / self.stretches + np.minimum(misfit, _LARGEST_MISFIT) ** 2 / SPLINES
+        cap = 1.0 / np.sqrt(np.maximum(information * floor, 1.0))
+        count = self.structure.sum_views((use & self.of_reference).astype(np.float64)[None])[:, 0]
+        alike = np.sqrt(np.minimum(ALIKE / np.maximum(count, 1.0), 1.0))
+        weight = np.where(self.of_reference, use / self.sigma * alike[self.structure.view], weight)
+        return np.where(self.is_tie, weight * cap[self.structure.view], weight)
+
+    def noise(self, residual: Array, use: BoolArray, problem: Problem, fitted: int = 0) -> float:
+        """Estimate the observed over stated standard deviation of the observations in use; 1 where there are
+        too few.
+
+        `fitted` further parameters have been taken out of the residuals.
+        """
+        use = use & ~self.is_control & ~self.of_reference
+        whitened = residual[:, use] / self.sigma[use]
+        seen = np.zeros(self.structure.num_points, dtype=bool)
+        seen[self.structure.point[use]] = True
+        freedom = whitened.size - 3 * int((seen & ~self.has_prior).sum()) - int(problem.free.sum()) - fitted
+        if freedom < _LEAST_FREEDOM:
+            return 1.0
+        return max(float(np.sqrt((whitened**2).sum() / freedom)), 1e-6)
+
+    def tied(self, use: BoolArray) -> BoolArray:
+        """Return `use` without the observations whose point is left without a second one (or a prior)."""
+        structure = self.structure
+        count = np.bincount(structure.point[use], minlength=structure.num_points)
+        return use & ((count >= 2) | self.has_prior)[structure.point]

@@ -1,0 +1,149 @@
+"""Covariance of corrections, points and relative heights from the reduced normal matrix."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg as la
+
+from barpc.ba.algebra.linear import Factor
+from barpc.ba.algebra.multifrontal import Blocks
+from barpc.ba.algebra.structure import parts
+from barpc.ba.solving.normal import Reduced, solve_transposed
+from barpc.geodesy import Array
+from barpc.scene import BoolArray, IntArray
+
+_COLUMNS = 240  # unit vectors solved for at a time
+_LARGE, _PROBES = 900, 32
+_SMALL = 2000  # unknowns up to which the whole matrix is kept
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """Posterior covariance of an adjustment; computed when asked, from the factorised normal matrix."""
+
+    reduced: Reduced  # the problem linearised at its solution
+    factor: Factor  # of the reduced matrix, free unknowns only
+    free: BoolArray  # (N q,) unknowns that are not fixed
+
+    @property
+    def num_unknowns(self) -> int:
+        """Number of unknowns q of a view."""
+        return int(self.reduced.cross.shape[2])
+
+    def solve(self, rows: Array) -> Array:
+        """Return S^-1 b for right-hand sides (N q, m); zero for fixed unknowns."""
+        out = np.zeros(rows.shape)
+        out[self.free] = self.factor.solve(np.ascontiguousarray(rows[self.free]))
+        return out
+
+    @property
+    def is_large(self) -> bool:
+        """Whether exact variances take seconds: as long as two factorisations."""
+        return len(self.free) > _LARGE
+
+    def variances(self) -> Array:
+        """Return the variances (N, q) of all unknowns; zero for fixed ones."""
+        if self.factor.inverse is None:
+            return self.full.diagonal().reshape(-1, self.num_unknowns)
+        return np.asarray(self._near.diagonal.diagonal(axis1=1, axis2=2))
+
+    def probed_variances(self) -> Array:
+        """Estimate the variances (N, q) by random probes (Hutchinson 1990) at the cost of a few solutions:
+        each within a fifth (RMS).
+
+        Unknowns count in units of their standard deviation where all other views stood still: a variance would
+        drown in those of others that are a hundred times as large.
+        """
+        q = self.num_unknowns
+        views, unit = np.flatnonzero(self.free[::q]), np.ones((len(self.free) // q, q))
+        unit[views] = np.sqrt(np.linalg.inv(self.reduced.of_views()[views]).diagonal(axis1=1, axis2=2))
+        random = np.random.default_rng(unit.size).integers(0, 2, (unit.size, _PROBES))
+        probes = np.where(random > 0, 1.0, -1.0)
+        found = (probes * self.solve(probes / unit.reshape(-1, 1))).mean(axis=1)
+        return np.asarray(found.reshape(-1, q) * unit)
+
+    def view(self, i: int, j: int | None = None) -> Array:
+        """Return the covariance (q, q) of the unknowns of view i (with those of view j)."""
+        return self._of_pair(i, i if j is None else j, "full" in self.__dict__)
+
+    def joint(self, views: IntArray) -> Array:
+        """Return the covariance (m q, m q) of the unknowns of some views."""
+        of_full = len(self.free) <= _SMALL or "full" in self.__dict__
+        if of_full or self.factor.inverse is None:
+            place = self._places(views)
+            return self._columns(place, of_full)[place]
+        return np.block([[self._of_pair(int(i), int(j), False) for j in views] for i in views])
+
+    def _of_pair(self, i: int, j: int, of_full: bool) -> Array:
+        """Return the covariance (q, q) of view i with view j: where they share points, all such are known at once."""
+        if self.factor.inverse is not None and not of_full:
+            if i == j:
+                return np.asarray(self._near.diagonal[i])
+            if (at := self._near.pair(min(i, j), max(i, j))) is not None:
+                return np.asarray(self._near.pairs[at] if i < j else self._near.pairs[at].T)
+        return self._columns(self._places(np.array([j])), of_full)[self._places(np.array([i]))]
+
+    @cached_property
+    def _near(self) -> Blocks:
+        """The covariance of every view, and of those that share points."""
+        assert self.factor.inverse is not None
+        return self.factor.inverse()
+
+    def _places(self, views: IntArray) -> IntArray:
+        q = self.num_unknowns
+        return (views[:, None] * q + np.arange(q)).ravel()
+
+    def _columns(self, place: IntArray, of_full: bool) -> Array:
+        """Return the covariance (N q, m) of all unknowns with those at `place` (m,)."""
+        if of_full:
+            return self.full[:, place]
+        unit = np.zeros((len(self.free), len(place)))
+        unit[place, np.arange(len(place))] = 1.0
+        return self.solve(unit)
+
+    @cached_property
+    def full(self) -> Array:
+        """Covariance (N q, N q) of all unknowns: N^2 numbers, meant for some hundred views."""
+        out = np.zeros((len(self.free), len(self.free)))
+        if self.factor.whole_inverse is not None:
+            out[np.ix_(self.free, self.free)] = self.factor.whole_inverse()
+            return out
+        every = np.arange(len(self.free))
+        for part in parts(len(every), _COLUMNS):
+            out[:, part] = self._columns(every[part], False)
+        return 0.5 * (out + out.T)
+
+    def points(self, index: IntArray) -> Array:
+        """Return the covariance (n, 3, 3) [m^2], ECEF, of the points `index` (n,): their own noise and the cameras'."""
+        structure = self.reduced.structure
+        out = np.empty((len(index), 3, 3))
+        lower = self.reduced.lower[:, index]
+        inverse = solve_transposed(lower, np.eye(3)[..., None]).transpose(2, 0, 1)  # L^-T
+        for n, p in enumerate(index):
+            rows = structure.by_point[structure.point_bounds[p] : structure.point_bounds[p + 1]]
+            sensitivity = -inverse[n] @ self.reduced.cross[rows].transpose(1, 0, 2).reshape(3, -1)
+            cameras = self.joint(structure.view[rows])
+            out[n] = inverse[n] @ inverse[n].T + sensitivity @ cameras @ sensitivity.T
+        return out if self.reduced.common is None else self._with_common(index, inverse, out)
+
+    def _with_common(self, index: IntArray, inverse: Array, out: Array) -> Array:
+        """Return `out` where points share errors, which move with every camera."""
+        structure, common, q = self.reduced.structure, self.reduced.common, self.num_unknowns
+        assert common is not None
+        place = {int(p): n for n, p in enumerate(common.index)}
+        for n, p in enumerate(index):
+            if int(p) not in place:
+                continue
+            shared = (
+                -inverse[n] @ la.solve_triangular(common.upper, common.cross[place[int(p)]].T, trans="T").T
+            )
+            rows = structure.by_point[structure.point_bounds[p] : structure.point_bounds[p + 1]]
+            sensitivity = -shared @ common.by_camera
+            for k in rows:
+                at = structure.view[k] * q
+                sensitivity[:, at : at + q] -= inverse[n] @ self.reduced.cross[k]
+            out[n] = inverse[n] @ inverse[n].T + shared @ shared.T + sensitivity @ self.solve(sensitivity.T)
+        return out

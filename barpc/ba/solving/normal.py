@@ -1,0 +1,287 @@
+"""The reduced normal equations: points eliminated (Schur complement), cameras left.
+
+With whitened derivatives A_k by the point and B_k by the view's unknowns, V_p = sum A^T A = L L^T and
+Y_k = L^-1 A_k^T B_k, the camera matrix is S = diag(sum B^T B) - sum_p Y^T Y and its gradient
+g = sum B^T r - sum Y^T h, where h_p = L^-1 sum A^T r. Errors that heights have in common are eliminated after the
+points: they couple all cameras, so that what they take off S stays apart from it where S is sparse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as la
+
+from barpc.ba.algebra.linear import Factor, Matrix, factorize, factorize_blocks
+from barpc.ba.algebra.multifrontal import Blocks
+from barpc.ba.algebra.structure import Structure, parts
+from barpc.ba.estimated.priors import PointPrior
+from barpc.geodesy import Array
+from barpc.scene import BoolArray, IntArray
+
+CHUNK = 8192  # observations, or pairs of them, multiplied at a time
+DENSE_UNKNOWNS = 900  # up to so many camera unknowns the reduced matrix is a plain array
+
+TRIANGLE = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))  # order of the elements of symmetric 3x3 matrices
+
+
+@dataclass(frozen=True)
+class Common:
+    """Errors that points have in common, eliminated after the points."""
+
+    index: IntArray  # (Q,) the points
+    cross: Array  # (Q, 3, m) L^-1 times the points' second derivative with the errors
+    upper: Array  # (m, m) U of their matrix U^T U once the points are eliminated
+    by_camera: Array  # (m, N q) U^-T times their second derivative with the cameras
+    half: Array  # (m,) U^-T times their gradient
+
+    def step(self, step: Array) -> Array:
+        """Return the move of the errors (m,) that goes with a step (N q,) of the camera unknowns."""
+        return -la.solve_triangular(self.upper, self.half + self.by_camera @ step)
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """The linearised problem with its points eliminated."""
+
+    structure: Structure
+    matrix: Matrix  # (N q, N q) S; where it is sparse, without what the common errors take off it
+    # (N q,) g: derivative of half the cost by the camera unknowns, points at their (linear) optimum
+    gradient: Array
+    cost: float  # sum of squared whitened residuals
+    gain: float  # what moving the points (and common errors) alone would take off the cost: sum |h|^2
+    lower: Array  # (6, P) L: its elements 00, 10, 20, 11, 21, 22
+    half: Array  # (P, 3) h
+    cross: Array  # (K, 3, q) Y
+    common: Common | None = None  # errors that the points have in common
+
+    def plain(self, free: BoolArray) -> Array:
+        """Return S (n, n) as an array, of the unknowns that are free (N q,)."""
+        dense = self.matrix if isinstance(self.matrix, np.ndarray) else self.matrix.plain()
+        if self.common is not None and dense is not self.matrix:
+            dense -= self.common.by_camera.T @ self.common.by_camera
+        return dense if free.all() else dense[np.ix_(free, free)]
+
+    def of_views(self) -> Array:
+        """Return the blocks (N, q, q) on S's diagonal."""
+        if not isinstance(self.matrix, np.ndarray):
+            if self.common is None:
+                return self.matrix.diagonal
+            less = self.common.by_camera.reshape(-1, *self.matrix.diagonal.shape[:2])
+            return np.asarray(self.matrix.diagonal - np.einsum("mni,mnj->nij", less, less))
+        n, q, every = self.structure.num_views, self.cross.shape[2], np.arange(self.structure.num_views)
+        return np.asarray(self.matrix.reshape(n, q, n, q)[every, :, every, :])
+
+    def factor(self, free: BoolArray, damping: float = 0.0) -> Factor:
+        """Return the factorised S, of the unknowns that are free (N q,): those of whole views."""
+        if isinstance(self.matrix, np.ndarray):
+            return factorize(self.plain(free), damping)
+        order = self.structure.order(free[:: self.cross.shape[2]])
+        less = None if self.common is None else self.common.by_camera[:, free]
+        return factorize_blocks(self.matrix, order, damping, less)
+
+    def with_joint(self, index: IntArray, information: Array) -> Matrix:
+        """Return S and the information (n, n) of unknowns `index` (n,), which are those of views that are joined."""
+        if isinstance(self.matrix, np.ndarray):
+            matrix = self.matrix.copy()
+            matrix[np.ix_(index, index)] += information
+            return matrix
+        q = self.cross.shape[2]
+        views = index[::q] // q
+        blocks = information.reshape(len(views), q, len(views), q)
+        diagonal, pairs = self.matrix.diagonal.copy(), self.matrix.pairs.copy()
+        every = np.arange(len(views))
+        diagonal[views] += blocks[every, :, every, :]
+        i, j = np.nonzero(views[:, None] < views)
+        key, n = self.structure.pair_view @ [len(diagonal), 1], len(diagonal)
+        pairs[np.searchsorted(key, views[i] * n + views[j])] += blocks[i, :, j, :]
+        return Blocks(diagonal, pairs, self.structure.pair_view)
+
+    def point_step(self, step: Array) -> Array:
+        """Return the move of the points (P, 3) [m] that goes with a step (N, q) of the camera unknowns."""
+        structure = self.structure
+        moved = np.empty((3, len(self.cross)))
+        for v, (start, stop) in enumerate(zip(structure.bounds[:-1], structure.bounds[1:], strict=True)):
+            rows = self.cross[start:stop].reshape(-1, step.shape[1])
+            moved[:, start:stop] = (rows @ step[v]).reshape(-1, 3).T
+        half = self.half.T + structure.sum_points(moved)
+        if self.common is not None:
+            half[:, self.common.index] += (self.common.cross @ self.common.step(step.ravel())).T
+        return -solve_transposed(self.lower, half).T
+
+
+def reduce_normal(
+    structure: Structure,
+    residual: Array,
+    by_point: Array,
+    by_unknown: Array,
+    point_matrix: Array,
+    point_gradient: Array,
+    camera_diagonal: Array,
+    camera_gradient: Array,
+    point_prior: PointPrior | None = None,
+) -> Reduced:
+    """Eliminate the points of a linearised problem; the cost is without the priors' part.
+
+    Of whitened residuals (2, K) and their derivatives (2, 3, K) and (2, q, K). Priors add `point_matrix` (6, P,
+    elements as in `Reduced.lower`) to V, `point_gradient` (3, P) to the points' gradient, `camera_diagonal` and
+    `camera_gradient` (N, q) to the diagonal of S and to g; the common errors of `point_prior` are eliminated too.
+    """
+    q = by_unknown.shape[1]
+    sums = structure.sum_points(point_products(by_point, residual))
+    lower = cholesky3(sums[:6] + point_matrix)
+    half = solve_lower(lower, sums[6:] + point_gradient)
+    cross = _eliminate(structure, by_point, by_unknown, lower)
+    diagonal, gradient = _of_views(structure, residual, by_unknown, cross, half)
+    gradient += camera_gradient
+    diagonal[:, np.arange(q), np.arange(q)] += camera_diagonal
+    matrix, slope_all = _assemble(structure, diagonal, _pair_blocks(structure, cross)), gradient.ravel()
+    gain = float((half**2).sum())
+    common = None
+    if point_prior is not None and point_prior.common.shape[2]:
+        common = _common(structure, point_prior, lower, half, cross)
+        slope_all = slope_all - common.by_camera.T @ common.half
+        gain += float(common.half @ common.half)
+        if isinstance(matrix, np.ndarray):
+            matrix = matrix - common.by_camera.T @ common.by_camera
+    return Reduced(
+        structure, matrix, slope_all, float((residual**2).sum()), gain, lower, half.T, cross, common
+    )
+
+
+def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, cross: Array) -> Common:
+    """Return the common errors of the points of a prior; their gradient vanishes before the points move, as
+    they are the best.
+    """
+    index, m = prior.index, prior.common.shape[2]
+    by_point = np.swapaxes(prior.rows, 1, 2) @ -prior.common
+    whitened = np.stack([solve_lower(lower[:, index], by_point[:, :, j].T).T for j in range(m)], axis=2)
+    flat = whitened.reshape(-1, m)
+    upper = la.cholesky(prior.information() - flat.T @ flat)
+    place = np.full(structure.num_points, -1)
+    place[index] = np.arange(len(index))
+    rows = np.flatnonzero(place[structure.point] >= 0)
+    bounds, q = np.searchsorted(rows, structure.bounds), cross.shape[2]
+    by_view = np.empty((m, structure.num_views, q))
+    for v, of_view in enumerate(np.split(rows, bounds[1:-1])):
+        of_points = whitened[place[structure.point[of_view]]].reshape(-1, m)
+        by_view[:, v] = -of_points.T @ cross[of_view].reshape(-1, q)
+    by_camera = by_view.reshape(m, -1)
+    gradient = -np.einsum("qim,iq->m", whitened, half[:, index])
+    return Common(
+        index,
+        whitened,
+        upper,
+        la.solve_triangular(upper, by_camera, trans="T"),
+        la.solve_triangular(upper, gradient, trans="T"),
+    )
+
+
+def point_products(by_point: Array, residual: Array) -> Array:
+    """Return the products (9, K): the six elements of A^T A (order of `TRIANGLE`) and the three of A^T r."""
+    products = np.empty((9, residual.shape[1]))
+    for part in parts(residual.shape[1], CHUNK):
+        (a, b), r = by_point[..., part], residual[:, part]
+        for n, (i, j) in enumerate(TRIANGLE):
+            np.add(a[i] * a[j], b[i] * b[j], out=products[n, part])
+        np.add(a * r[0], b * r[1], out=products[6:, part])
+    return products
+
+
+def cholesky3(matrix: Array) -> Array:
+    """Return the lower Cholesky factors (6, P) of symmetric 3x3 matrices, elements 00, 10, 20, 11, 21, 22.
+
+    A direction without information gets a factor of one metre's worth, so that it does not move.
+    """
+    a, b, c, d, e, f = matrix
+    tiny = 1e-12 * np.maximum(a + d + f, 1e-12)
+    l00 = np.sqrt(np.where(a > tiny, a, 1.0))
+    l10, l20 = b / l00, c / l00
+    rest = d - l10 * l10
+    l11 = np.sqrt(np.where(rest > tiny, rest, 1.0))
+    l21 = (e - l20 * l10) / l11
+    rest = f - l20 * l20 - l21 * l21
+    l22 = np.sqrt(np.where(rest > tiny, rest, 1.0))
+    return np.stack([l00, l10, l20, l11, l21, l22])
+
+
+def solve_lower(lower: Array, rhs: Array) -> Array:
+    """Return L^-1 b for factors (6, P) and right-hand sides (3, P)."""
+    l00, l10, l20, l11, l21, l22 = lower
+    x = rhs[0] / l00
+    y = (rhs[1] - l10 * x) / l11
+    return np.stack([x, y, (rhs[2] - l20 * x - l21 * y) / l22])
+
+
+def solve_transposed(lower: Array, rhs: Array) -> Array:
+    """Return L^-T b for factors (6, P) and right-hand sides (3, P)."""
+    l00, l10, l20, l11, l21, l22 = lower
+    z = rhs[2] / l22
+    y = (rhs[1] - l21 * z) / l11
+    return np.stack([(rhs[0] - l10 * y - l20 * z) / l00, y, z])
+
+
+def _eliminate(structure: Structure, by_point: Array, by_unknown: Array, lower: Array) -> Array:
+    """Return Y (K, 3, q), the whitened coupling of points and cameras."""
+    q, count = by_unknown.shape[1:]
+    cross = np.empty((count, 3, q))
+    for part in parts(count, CHUNK):
+        point = structure.point[part]
+        whitened = whiten(by_point[..., part], lower.take(point, axis=1, mode="clip"))
+        unknown = by_unknown[..., part]
+        rows = whitened[0, :, None] * unknown[0]
+        rows += whitened[1, :, None] * unknown[1]
+        cross[part] = rows.reshape(3 * q, -1).T.reshape(-1, 3, q)
+    return cross
+
+
+def whiten(by_point: Array, lower: Array) -> Array:
+    """Return a L^-T, (2, 3, n), of derivatives (2, 3, n) and factors (6, n)."""
+    l00, l10, l20, l11, l21, l22 = lower
+    out = np.empty_like(by_point)
+    np.divide(by_point[:, 0], l00, out=out[:, 0])
+    np.divide(by_point[:, 1] - l10 * out[:, 0], l11, out=out[:, 1])
+    np.divide(by_point[:, 2] - l20 * out[:, 0] - l21 * out[:, 1], l22, out=out[:, 2])
+    return out
+
+
+def _of_views(
+    structure: Structure, residual: Array, by_unknown: Array, cross: Array, half: Array
+) -> tuple[Array, Array]:
+    """Return the sum B^T B - sum Y^T Y (N, q, q) and sum B^T r - sum Y^T h (N, q) of every view."""
+    q = cross.shape[2]
+    matrix, gradient = np.empty((structure.num_views, q, q)), np.empty((structure.num_views, q))
+    of_points = np.ascontiguousarray(half.T)
+    for v, (start, stop) in enumerate(zip(structure.bounds[:-1], structure.bounds[1:], strict=True)):
+        (col, row), r = by_unknown[..., start:stop], residual[:, start:stop]
+        pulled = cross[start:stop].reshape(-1, q)
+        h = of_points.take(structure.point[start:stop], axis=0, mode="clip").ravel()
+        np.subtract(col @ col.T + row @ row.T, pulled.T @ pulled, out=matrix[v])
+        gradient[v] = col @ r[0] + row @ r[1] - h @ pulled
+    return matrix, gradient
+
+
+def _pair_blocks(structure: Structure, cross: Array) -> Array:
+    """Return (M, q, q): -sum Y_i^T Y_j of every pair of views."""
+    q = cross.shape[2]
+    bounds = structure.pair_bounds
+    out = np.empty((len(bounds) - 1, q, q))
+    m = 0
+    while m < len(out):  # as many whole view pairs as fit the chunk, at least one
+        stop = max(m + 1, int(np.searchsorted(bounds, bounds[m] + CHUNK, side="right")) - 1)
+        base = bounds[m]
+        rows = slice(base, bounds[stop])  # "clip": indices are right, and unchecked they are taken faster
+        first = cross.take(structure.first[rows], axis=0, mode="clip").reshape(-1, q)
+        second = cross.take(structure.second[rows], axis=0, mode="clip").reshape(-1, q)
+        for n in range(m, stop):
+            part = slice(3 * (bounds[n] - base), 3 * (bounds[n + 1] - base))
+            np.matmul(first[part].T, second[part], out=out[n])
+        m = stop
+    return np.negative(out, out=out)
+
+
+def _assemble(structure: Structure, diagonal: Array, pairs: Array) -> Matrix:
+    n, q, _ = diagonal.shape
+    blocks = Blocks(diagonal, pairs, structure.pair_view)
+    return blocks.plain() if n * q <= DENSE_UNKNOWNS else blocks
