@@ -23,7 +23,7 @@ from barpc.cli.options import (
     with_flags,
 )
 from barpc.cli.progress import executor_for, progress_told
-from barpc.cli.terminal import echo, print_summary, say, tell_gate, wants_json
+from barpc.cli.terminal import echo, output_width, print_summary, say, tell_gate, wants_json
 
 if TYPE_CHECKING:
     from barpc.options import RunOptions
@@ -184,7 +184,12 @@ def _tell(obj: Mapping[str, Any], result: AdjustResult) -> int:
         echo(json.dumps(result.summary, indent=1))
     elif not obj["quiet"]:
         print_summary(result.record)
-    return 0 if result.passed else tell_gate(result.record.headline, list(result.record.reasons))
+    said = output_width() is not None and not (
+        wants_json() or obj["quiet"]
+    )  # on the screen: every reason once
+    return (
+        0 if result.passed else tell_gate(result.record.headline, [] if said else list(result.record.reasons))
+    )
 
 
 def _compare(images: list[str], against: Path) -> int:

@@ -23,6 +23,7 @@ from barpc.report.decisions import decisions, second_attempts
 from barpc.report.maps import ground_map, residual_panels
 from barpc.report.matrix import facts, pair_matrix
 from barpc.report.records import Cell, Table, cell_of, table
+from barpc.report.reservations import GOOD
 from barpc.report.summary import (
     DATUM,
     GCPS,
@@ -40,7 +41,6 @@ from barpc.report.summary import (
     metres,
 )
 from barpc.report.tables import Relief, RunFiles, read_summary, read_tables
-from barpc.report.verdict import GOOD
 from barpc.scene import connected_groups
 from barpc.workspace import Workspace
 

@@ -9,33 +9,31 @@ from typing import Any
 import numpy as np
 
 from barpc.ba import Adjustment, check_residuals
-from barpc.ba.apart import APART, Apart
+from barpc.ba.apart import APART
 from barpc.ba.scan import SURE
 from barpc.ba.snooping import ControlTest
 from barpc.geodesy import Array
-from barpc.report.dem_lines import dem_lines, dem_reasons, holds_reference
+from barpc.report.dem_lines import dem_lines, dem_reasons
 from barpc.report.records import plain
-from barpc.report.run import MANY_REJECTED, SMOOTH_LEFT, Run
-from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
-from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_entries, strangeness
+from barpc.report.reservations import NOISE_LIMIT, anywhere, is_smooth, lost, standing_out, view_status
+from barpc.report.run import MANY_REJECTED, Run
+from barpc.report.summary import LeftOutEntry, Summary, ViewEntry, listed, measure, median, metres
+from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_entries
 from barpc.scene import GroundPoints
-from barpc.sensor.rpc import RPC
 from barpc.tie.reference import PEAK
 
-GOOD_RMSE = 0.5  # A view whose tie points are left with more than this [px] is called doubtful
-FEW_OBSERVATIONS = 30  # A view with fewer is called weakly tied, unless control points hold it
-ENOUGH_GCPS = 3  # Control points that hold a view without any tie point
-
-WORST_LEFT = 0.15  # px: an image with more anywhere is called doubtful
 PRIOR_WIDENED = 2.0  # Cameras that are farther off than stated by more than this factor need a look
-NOISE_LIMIT = 2.5  # Tie points that scatter by more than so many times what the matcher states need a look
 _MOST_NAMED = 5  # images in a sentence
 MOVED = (
     3.0  # A scene that moved by more than so many times what its cameras' accuracies let expect needs a look
 )
 
-GOOD = {"adjust": "adjusted", "check": "consistent", "match": "tied"}
-"""Kind of a run -> the status of a view without reservation."""
+_SAY_REJECTED = (
+    "contradicted",
+    "rejected",
+    "wrong_matches",
+)  # causes whose sentence says how many were rejected
+_SAY_WHERE = "rejected", "place"  # causes whose sentence says where in the image
 _ALL_WELL = {
     "adjust": "All {} images are adjusted",
     "check": "The cameras of all {} images agree",
@@ -48,165 +46,7 @@ _CONTROL_WORDS = {
 }
 
 
-def view_status(view: ViewEntry, run: Run) -> dict[str, str]:
-    """The verdict on a view: a word of `STATUS_WORDS`, and what to do (empty when all is well)."""
-    for status, reason in (("failed", _failure), ("weak", _weakness), ("doubtful", _doubt)):
-        if advice := reason(view, run):
-            return {"status": status, "advice": advice}
-    return {"status": GOOD[run.kind], "advice": ""}
-
-
-def _failure(view: ViewEntry, run: Run) -> str:
-    tolerance = getattr(getattr(run.options, "fit", None), "tolerance", np.inf)
-    if run.adjustment is not None and view.name in run.adjustment.left_out:
-        return "not tied to the other images: its camera was left as it was"
-    if (apart := _apart(view, run)) is not None and apart.placed is None:
-        left = "They were adjusted without it, and its camera was left as it was: check "
-        if apart.look.as_stated:
-            return f"{strangeness(apart)}. {left}clouds, water and change, and that the RPC belongs to this image"
-        return f"its RPC is not its own: {strangeness(apart)}. {left}that the RPC belongs to this image"
-    beyond = _follows_more(view, run) or getattr(
-        run.options, "grids", False
-    )  # grids hold what the RPC does not
-    if view.fit is not None and not beyond and not all(_known(v) <= tolerance for v in view.fit.max_px):
-        return f"one RPC cannot hold the corrected camera to {tolerance:g} px: lower --drift or the range"
-    return ""
-
-
-def _apart(view: ViewEntry, run: Run) -> Apart | None:
-    """What is known of a view if its RPC is not its own."""
-    apart = None if run.adjustment is None else run.adjustment.apart
-    return apart if apart is not None and apart.is_view(run.number[view.name]) else None
-
-
-def _weakness(view: ViewEntry, run: Run) -> str:
-    few = view.num_observations
-    if few >= FEW_OBSERVATIONS or view.num_gcps >= ENOUGH_GCPS:
-        return ""
-    if run.reference is not None and any(
-        found.points and found.name == view.name for found in run.reference.views
-    ):
-        return ""
-    return f"{f'only {few}' if few else 'no'} tie points: check overlap, clouds and dates"
-
-
-def _doubt(view: ViewEntry, run: Run) -> str:
-    if run.kind == "match":  # how well cameras agree is not what was asked
-        return ""
-    if view.name in run.copies:
-        return f"shows the same pixels as {run.copies[view.name]}: give each image once"
-    if run.adjustment is not None:
-        i = run.number[view.name]
-        if (apart := _apart(view, run)) is not None:
-            stated = (
-                f"{apart.scale:.0f} times farther off than stated" if apart.scale > 1.0 else "not its own"
-            )
-            return (
-                f"its RPC is {stated}: {strangeness(apart)}. It was adjusted alone, against points of the other "
-                "images: check that the RPC belongs to this image"
-            )
-        found = _oddity(i, run.adjustment) or _left(i, run.adjustment) or _beyond(view, run)
-        if found:
-            return found
-    error = _known(view.rmse_after if run.kind == "adjust" else view.rmse_before)
-    if not error <= GOOD_RMSE and view.num_observations:
-        if run.kind == "check":
-            return f"tie points disagree by {error:.2f} px: adjust the cameras"
-        return f"tie points are left with {error:.2f} px: look for wrong matches and moving things"
-    moving = view.num_moving / max(view.num_moving + view.num_rejected + view.num_observations, 1)
-    if moving > MANY_REJECTED:
-        return (
-            f"{100 * moving:.0f} % of its tie points move together and took no part: check that the others are the "
-            "ground that stands still"
-        )
-    if (lost := _lost(view)) > MANY_REJECTED and not _anywhere(view, run):
-        return (
-            f"{100 * lost:.0f} % of its tie points were rejected, neighbours in the same direction: look for clouds, "
-            "water, change"
-        )
-    return ""
-
-
-def _lost(view: ViewEntry) -> float:
-    return view.num_rejected / max(view.num_rejected + view.num_observations, 1)
-
-
-def _anywhere(view: ViewEntry, run: Run) -> bool:
-    """Whether the tie points of a view that were rejected lie off in any direction, as wrong matches do."""
-    return run.adjustment is not None and bool(-np.inf < run.adjustment.alike[run.number[view.name]] <= SURE)
-
-
-def _oddity(i: int, adjustment: Adjustment) -> str:
-    """What is wrong with view i beside the others: its RPC, or something smooth that no correction follows."""
-    prior, smooth = adjustment.prior, adjustment.smooth
-    if prior.odd[i]:
-        others = [adjustment.names[j] for j in np.flatnonzero(prior.odd) if j != i]
-        either = f" (or that of {listed(others)}: the tie points cannot tell)" if others else ""
-        return (
-            f"its RPC is {prior.scale[i]:.0f} times farther off than stated, beside the other images{either}: check "
-            "that it belongs to this image"
-        )
-    if smooth.found(SMOOTH_LEFT)[i] or smooth.shared[i] > SMOOTH_LEFT:
-        along = "along the rows" if smooth.by_row[i] > 0.5 else "over the image"
-        why = "attitude jitter, optics, or steps between detectors, which one RPC does not follow"
-        if adjustment.options.drift == 0:
-            why = "a drift was not allowed (--drift 0)"
-        elif holds_reference(adjustment):
-            unstated = adjustment.terrain is not None and not adjustment.terrain.is_known
-            why = (
-                f"the heights of the DEM (no --geoid), or {why}"
-                if unstated
-                else f"{why}; or the reference bends, or the heights under it do"
-            )
-        size = max(smooth.rms[i], smooth.shared[i])
-        return f"an error of {size:.2f} px that changes {along} is left: {why}"
-    return ""
-
-
-def _beyond(view: ViewEntry, run: Run) -> str:
-    """What one RPC does not hold of a camera that jitter or steps between detectors are corrected in."""
-    told = any(getattr(run.options, name, None) for name in ("grids", "tiles", "resample"))
-    if view.fit is None or told or not _follows_more(view, run):
-        return ""
-    left, most = (
-        float(np.linalg.norm([_known(v) for v in view.fit.rmse_px])),
-        max(map(_known, view.fit.max_px)),
-    )
-    if left <= SMOOTH_LEFT and most <= WORST_LEFT:
-        return ""
-    assert view.correction is not None
-    follows = "attitude jitter or steps between detectors"
-    if not isinstance(run.views[run.number[view.name]].sensor, RPC):
-        follows = "its own orbit and attitude"
-    if view.correction.strip_px:
-        follows = "rows or columns that lie off by themselves"
-    elif view.correction.swing_px:
-        follows = "a swing of its rows"
-    return (
-        f"its corrected camera follows {follows}, of which one RPC leaves "
-        f"{left:.2f} px (RMS; {most:.2f} px at most): use its grids ({view.name}_grid.tif), --tiles or --resample"
-    )
-
-
-def _follows_more(view: ViewEntry, run: Run) -> bool:
-    """Whether a camera is more than one RPC holds, as it was delivered or by what it was corrected by."""
-    one = view.correction
-    physical = not isinstance(run.views[run.number[view.name]].sensor, RPC)
-    return one is not None and any((physical, one.jitter_px, one.detector_px, one.strip_px, one.swing_px))
-
-
-def _left(i: int, adjustment: Adjustment) -> str:
-    """What tie points of view i say that took no part: the others were chosen to agree."""
-    noise, error = adjustment.held_out_noise[i], adjustment.held_out_rms[i]
-    if not noise > NOISE_LIMIT:
-        return ""
-    return (
-        f"tie points that took no part are left with {error:.2f} px, {noise:.1f} times what the matcher states: "
-        "look for wrong matches, moving things, or errors that these unknowns cannot follow"
-    )
-
-
-def _block_reasons(run: Run) -> list[str]:
+def _block_reasons(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     """What the adjustment says of itself that does not fit: priors, noise, the scene's move."""
     if run.adjustment is None or not len(run.tracks):
         return []
@@ -236,10 +76,10 @@ def _block_reasons(run: Run) -> list[str]:
             "these images the others agree, with all they do not. The tie points do not tell which: check the RPCs, "
             "or add an image."
         )
-    out += _left_reasons(run) + _ambiguous(run.adjustment)
+    out += _left_reasons(run, views) + _ambiguous(run.adjustment)
     for group in run.adjustment.two_groups:
         i, j = group.views
-        if not (_oddity(i, run.adjustment) or _oddity(j, run.adjustment)):
+        if not any(prior.odd[v] or is_smooth(v, run.adjustment) for v in (i, j)):
             out.append(
                 f"Tie points of {names[i]} and {names[j]} fall into two groups, {100 * group.share:.0f} % lying "
                 f"{group.apart:.2f} px from the others: there are two solutions, and this is the one between them. "
@@ -260,9 +100,13 @@ def _block_reasons(run: Run) -> list[str]:
     return out
 
 
-def _left_reasons(run: Run) -> list[str]:
-    """Where tie points were cut, or are off, more than elsewhere, or took no part and are; each image's worst."""
+def _left_reasons(run: Run, views: Sequence[ViewEntry] = ()) -> list[str]:
+    """Where tie points were cut, or are off, more than elsewhere, or took no part and are; each image's worst.
+
+    What an image's own reason says is not said again.
+    """
     assert run.adjustment is not None
+    said = {view.name for view in views if view.cause in _SAY_WHERE}
     worst: dict[str, str] = {}
     found, names = left_entries(run.adjustment), run.adjustment.names
     moving = [f"rows {one.first:.0f}-{one.last:.0f} of {one.image}" for one in found if one.moving]
@@ -272,22 +116,12 @@ def _left_reasons(run: Run) -> list[str]:
             "and no camera follows them."
         )
     for one in found:
-        if one.moving:
-            continue
-        if one.rejected > MANY_REJECTED:
-            what = (
-                f"{100 * one.rejected:.0f} % of their tie points contradict the others, half of these by more than "
-                f"{one.apart_px:.2f} px"
-            )
-        elif one.off_px > SMOOTH_LEFT:
-            what = f"their tie points are left with {one.off_px:.2f} px in common"
-        else:
-            continue
-        place = f"{one.axis} {one.first:.0f}-{one.last:.0f} of {one.image}"
-        worst.setdefault(one.image, f"{place[0].upper()}{place[1:]} stand out: {what}.")
+        if what := standing_out(one):
+            place = f"{one.axis.capitalize()} {one.first:.0f}-{one.last:.0f} of {one.image}"
+            worst.setdefault(one.image, f"{place} stand out: {what}.")
     for unmet in run.met_worse:  # what was solved with may agree with what it bent
         worst.setdefault(names[unmet.view], f"{held_out_place(unmet, names)}.")
-    return list(worst.values())
+    return [line for image, line in worst.items() if image not in said]
 
 
 def _ambiguous(adjustment: Adjustment) -> list[str]:
@@ -319,9 +153,9 @@ def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
     """
     bad = [view for view in views if view.status == "failed"]
     look = [view for view in views if view.advice and view.status != "failed"]
-    reasons = [f"{view.name}: {STATUS_WORDS[view.status]}: {view.advice}." for view in bad + look]
-    reasons += [f"{path} was left out: {reason}" for path, reason in run.left_out]
-    whole, points = _block_reasons(run) + dem_reasons(run.adjustment), _control_reasons(run)
+    reasons = [view.reservation for view in bad + look]
+    reasons += [LeftOutEntry(path, reason).reason_text for path, reason in run.left_out]
+    whole, points = _block_reasons(run, views) + dem_reasons(run.adjustment), _control_reasons(run)
     reasons += whole + points
     words = {"adjust": _adjusted_lines, "check": _checked_lines, "match": _matched_lines}[run.kind]
     num_bad = len(bad) + len(run.left_out)
@@ -461,9 +295,10 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         sizes = f"{_lengths(prior.drift_sigma)} at the first and last row"
         lines.append(f"Rotations change along the rows ({drift}; {sizes}).")
     lines += _jitter_lines(views) + _radar_lines(views)
-    if many := [view.name for view in views if _lost(view) > MANY_REJECTED and _anywhere(view, run)]:
+    unsaid = [view for view in views if lost(view) > MANY_REJECTED and view.cause not in _SAY_REJECTED]
+    if many := [view.name for view in unsaid if anywhere(view, run)]:
         # what is wrong in one image takes the tie points of the others with it
-        alike = [view.name for view in views if _lost(view) > MANY_REJECTED and view.name not in many]
+        alike = [view.name for view in unsaid if view.name not in many]
         why = f"but those of {listed(alike)} in the same" if alike else "as wrong matches are"
         lines.append(
             f"More than {100 * MANY_REJECTED:.0f} % of the tie points of {listed(many)} were rejected, neighbours in "
@@ -603,10 +438,6 @@ def _checked_lines(_: Run, views: Sequence[ViewEntry]) -> list[str]:
 
 def _matched_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     return [f"{run.tracks.num_points} tie points of {len(views)} images, {len(run.tracks)} observations."]
-
-
-def _known(value: float | None) -> float:
-    return float("nan") if value is None else value
 
 
 def summarize(run: Run) -> Summary:
