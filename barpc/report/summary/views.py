@@ -139,6 +139,9 @@ class ViewEntry(Record):
 
     OWN: ClassVar = {
         "verdict": Column("verdict", _verdict),
+        "wrong": Column(
+            "what is wrong", lambda view: CAUSES[view.cause].label if view.cause in CAUSES else None
+        ),
         "rejected": Column("rejected [%]", _rejected, ".1f"),
         "covered": Column("covered [%]", lambda view: percent(view.tie_coverage), ".0f"),
         "moves": Column(("col [px]", "row [px]"), _moves, ".3f"),
@@ -150,8 +153,8 @@ class ViewEntry(Record):
         "fitted": Column("covered [%]", lambda view: percent(value_of(view, "fit.coverage")), ".0f"),
     }
     PAGE: ClassVar = (
-        "name verdict num_observations rejected covered rmse_before rmse_after held_out_px correction.center_shift_px "
-        "gsd_m incidence_deg rpc_source.format"
+        "name verdict wrong num_observations rejected covered rmse_before rmse_after held_out_px "
+        "correction.center_shift_px gsd_m incidence_deg rpc_source.format"
     )
     TERMINAL: ClassVar = (
         "name verdict num_observations rmse_before rmse_after correction.center_shift_px about"
