@@ -12,7 +12,7 @@ from barpc.report.tables import RunFiles
 
 _LEFT = 30.0  # at least: names are to its right end
 _TOP = 18.0
-_CHARACTER = 7.5  # units of a character at the sides
+_CHARACTER = 8.2  # units of a character at the sides
 _LONGEST = 10  # characters of a name there
 _TEXTS = 12  # images: of no more the figures stand in the cells
 

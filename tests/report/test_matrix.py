@@ -92,8 +92,8 @@ def test_as_many_names_stand_at_the_sides_as_have_room(num, digits, step):
     for k, (word, x, y, _), (_, u, v, _) in zip(range(0, num, step), across, down, strict=True):
         place = side * (k + 0.5)
         assert (y, u, v) == pytest.approx((13, 26, 18 + place + 4), abs=0.006)
-        assert x == pytest.approx(min(30 + place, 420 - 3.75 * len(word)), abs=0.006)
-    ends = [(x - 3.75 * digits, x + 3.75 * digits) for _, x, _, _ in across]
+        assert x == pytest.approx(min(30 + place, 420 - 4.1 * len(word)), abs=0.006)
+    ends = [(x - 4.1 * digits, x + 3.75 * digits) for _, x, _, _ in across]
     assert all(a[1] < b[0] for a, b in pairwise(ends[:-1]))
 
 
@@ -103,8 +103,8 @@ def test_long_names_leave_room_at_the_left_and_are_cut_to_their_ends():
     assert [text[0] for text in drawn.texts("tick") if text[3] == "end"] == [
         f"…R1A_P_{k:04d}"[:1] + f"R1A_P_{k:04d}"[-9:] for k in range(3)
     ]
-    assert drawn.root.get("data-left") == "81"
-    assert drawn.rects("empty")[0][0] == 81
+    assert drawn.root.get("data-left") == "88"
+    assert drawn.rects("empty")[0][0] == 88
 
 
 @pytest.mark.parametrize(("num", "written"), [(12, True), (13, False)])

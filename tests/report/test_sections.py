@@ -190,9 +190,9 @@ def test_pairs_are_told_by_the_worst_offset_and_the_best_heights():
     section = asked("pairs", pairs=pairs)
     assert section.answer == (
         "The epipolar offset, which no height explains, is 0.100 px (RMS) in the worst pair (A - B); stereo matching "
-        "along epipolar lines wants it well below 0.5 px. Heights come best from A - C: the rays meet under 0.9 degrees "
-        "(B/H 0.02), so one pixel of parallax is 71.2 cm of height. 1 of 3 pairs meet under less than one degree and say "
-        "next to nothing about heights."
+        "along epipolar lines wants it well below 0.5 px. Heights come best from A - C: the rays meet under 0.9 "
+        "degrees (B/H 0.02), so one pixel of parallax is 71.2 cm of height. 1 of 3 pairs meet under less than one "
+        "degree and say next to nothing about heights."
     )
     assert section.tables[0].marks == ["0-1", "0-2", "1-2"]
     assert texts(section.tables[0])[0] == [
