@@ -64,8 +64,8 @@ def adjust(
     \b
     Examples:
       barpc adjust scene/*.tif -o adjusted
-      barpc adjust a.tif b.tif --gcp points.gcp --dem srtm.tif --geoid egm96.gtx -o adjusted
-      barpc adjust scene/*.tif --reference ortho.tif --dem srtm.tif --geoid egm96.gtx -o adjusted
+      barpc adjust a.tif b.tif --gcp points.gcp --dem srtm.tif --geoid egm96 -o adjusted
+      barpc adjust scene/*.tif --reference ortho.tif --dem srtm.tif --geoid egm96 -o adjusted
       barpc adjust --image-list images.txt -j 8 --keep-going -o adjusted
       barpc adjust a.tif,model=physical b.tif,model=physical -o adjusted
       barpc adjust img_a.tif img_b.tif --rpc img_a.tif=cameras/1.xml --rpc img_b.tif=cameras/2.xml -o adjusted

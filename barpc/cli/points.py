@@ -75,7 +75,7 @@ def localize(
     \b
     Examples:
       barpc localize image.tif 512.5 300 --alt 180
-      barpc localize image.tif 512.5 300 --dem N44E005.hgt --geoid egm96_15.gtx
+      barpc localize image.tif 512.5 300 --dem N44E005.hgt --geoid egm96
     """
     terrain = opened_dem(heights.dem, heights.geoid)
     camera = open_camera(image)

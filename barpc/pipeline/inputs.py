@@ -15,6 +15,7 @@ import numpy as np
 from barpc.ba import BlockPrior
 from barpc.dem import Dem
 from barpc.errors import InputError
+from barpc.geoids import geoid_file
 from barpc.identity import Input, Stamp, changed, take
 from barpc.options import RunOptions, declared
 from barpc.pipeline.control import load_altimetry, load_gcps
@@ -79,7 +80,8 @@ def with_located(options: RunOptions) -> RunOptions:
         found = located(path, options.allow_remote)
         return path if here([found]) else os.fspath(versioned(found, IMAGE))
 
-    dem, geoid = (path if path is None else at(path) for path in (options.dem, options.geoid))
+    geoid = None if options.geoid is None else geoid_file(options.geoid)
+    dem, geoid = (path if path is None else at(path) for path in (options.dem, geoid))
     return replace(options, dem=dem, geoid=geoid, reference=tuple(map(at, options.reference)))
 
 
