@@ -7,6 +7,7 @@ then one block a row. No column and no unit is ever dropped; in a pipe a row is 
 from __future__ import annotations
 
 import logging
+import shlex
 import shutil
 import sys
 import textwrap
@@ -79,7 +80,7 @@ def print_summary(summary: Summary) -> None:
     counted = width and max(width, _USUAL)  # nothing is dropped because a terminal is narrow
     for rows in range(SHOWN, 0, -1):
         tables = _tables(summary, rows)
-        room = MOST_LINES - 2 - sum(_height(table, counted) for table in tables)
+        room = MOST_LINES - 3 - sum(_height(table, counted) for table in tables)
         if room >= min(len(lines), _SENTENCES):
             break
     for title, texts, more in tables:
@@ -88,6 +89,9 @@ def print_summary(summary: Summary) -> None:
     _echo_lines(_fitting(lines, room, counted), width)
     if summary.out_dir:
         echo(f"Written to {summary.out_dir}")
+        if any(view.outputs for view in summary.views):
+            folder = shlex.quote(summary.out_dir)
+            echo(f"Orthoimages by GDAL: barpc export {folder} ortho --to ortho && sh ortho/ortho.sh")
 
 
 def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str]]:

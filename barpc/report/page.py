@@ -41,6 +41,7 @@ from barpc.report.summary import (
     listed,
     metres,
 )
+from barpc.report.summary.words import counted
 from barpc.report.tables import Relief, RunFiles, read_summary, read_tables
 from barpc.scene import connected_groups
 from barpc.workspace import Workspace
@@ -444,9 +445,9 @@ def _reading(found: float | str | None) -> Cell:
 def _run(files: RunFiles) -> Section:
     summary, tracks = files.summary, files.summary.tracks
     stages = [stage for stage in summary.stages if stage.stage != REPORT]
-    counts = f"{tracks.num_tracks} tie points, {tracks.num_observations} observations"
+    counts = f"{counted(tracks.num_tracks, 'tie point')}, {counted(tracks.num_observations, 'observation')}"
     seconds = f", {sum(stage.seconds for stage in stages):.1f} s" if stages else ""
-    answer = f"{len(summary.views)} images, {counts}{seconds}."
+    answer = f"{counted(len(summary.views), 'image')}, {counts}{seconds}."
     if not summary.tables.complete:
         answer += f" Tables and charts hold {summary.tables.num_written_tracks} tie points, evenly taken."
     longest = max([stage.seconds for stage in stages], default=1.0) or 1.0

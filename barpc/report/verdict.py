@@ -19,6 +19,7 @@ from barpc.report.reservations import NOISE_LIMIT, anywhere, is_smooth, lost, st
 from barpc.report.run import MANY_REJECTED, Run
 from barpc.report.summary import LeftOutEntry, Summary, ViewEntry, listed, measure, median, metres
 from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_entries
+from barpc.report.summary.words import counted
 from barpc.scene import GroundPoints
 from barpc.tie.reference import PEAK
 
@@ -35,10 +36,15 @@ _SAY_REJECTED = (
 )  # causes whose sentence says how many were rejected
 _SAY_WHERE = "rejected", "place"  # causes whose sentence says where in the image
 _ALL_WELL = {
-    "adjust": "All {} images are adjusted",
-    "check": "The cameras of all {} images agree",
-    "match": "All {} images are tied together",
+    "adjust": ("The image is adjusted", "Both images are adjusted", "All {} images are adjusted"),
+    "check": (
+        "The image was looked at",
+        "The cameras of both images agree",
+        "The cameras of all {} images agree",
+    ),
+    "match": ("The image was looked at", "Both images are tied together", "All {} images are tied together"),
 }
+"""Kind of a run -> what is said of one, two and more images of which all is well."""
 _CONTROL_WORDS = {
     "rejected": "{} rejected, contradicted by the rest: check coordinates, axes and image positions",
     "contradicts": "{} off by more than 4 standard deviations, used all the same: the stated accuracies are too good, "
@@ -169,7 +175,7 @@ def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
 
 
 def _headline(run: Run, num: int, bad: int, look: int, more: str) -> str:
-    text, parts = _ALL_WELL[run.kind].format(num), []
+    text, parts = _ALL_WELL[run.kind][min(num, 3) - 1].format(num), []
     if bad:
         word = "not adjusted" if run.kind == "adjust" else "not usable"
         parts.append(f"{bad} {'image is' if bad == 1 else 'images are'} {word}")
@@ -210,11 +216,11 @@ def _control_reasons(run: Run) -> list[str]:
             if names:
                 alike = status == "rejected" and tested.agreed is not None and tested.agreed.alike
                 datum = " They agree with each other: is their datum, or their height, another one?" * alike
-                out.append(f"{words.format(_count(len(names), 'GCP'))}: {listed(names)}.{datum}")
+                out.append(f"{words.format(counted(len(names), 'GCP'))}: {listed(names)}.{datum}")
         out += _undecided(run.gcps.names, tested) + _torn(tested)
         if not tested.fits and not any(tested.status(g) == "contradicts" for g in range(len(tested.used))):
             out.append(
-                f"{_count(int(tested.used.sum()), 'GCP')} scatter {tested.scatter:.1f} times as much as stated: the "
+                f"{counted(int(tested.used.sum()), 'GCP')} scatter {tested.scatter:.1f} times as much as stated: the "
                 "accuracies are too good, or more than one is wrong."
             )
     return out + [f"{line}." for p in (run.gcps, run.check_points) if p is not None for line in p.left_out]
@@ -278,8 +284,8 @@ def _torn(tested: ControlTest) -> list[str]:
     ]
 
 
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
+def _are(some: Sequence[object]) -> str:
+    return "is" if len(some) == 1 else "are"
 
 
 def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
@@ -287,8 +293,9 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     before, after = (median([getattr(view, key) for view in views]) for key in ("rmse_before", "rmse_after"))
     gauge, prior = run.adjustment.gauge, run.adjustment.prior
     tied = sum(view.num_observations > 0 for view in views)
-    lines = [f"Tie points of {tied} images agree to {after:.3f} px (before: {before:.3f} px)."]
-    if not len(run.tracks):
+    was = f" (before: {before:.3f} px)" if np.isfinite(before) else ""
+    lines = [f"Tie points of {counted(tied, 'image')} agree to {after:.3f} px{was}."]
+    if not len(run.tracks) or not np.isfinite(after):
         lines = ["There are no tie points: the cameras are held by control alone."]
     drift = f"drift of degree {run.adjustment.cameras.unknowns.drift}"
     if prior.drift_sigma and np.isfinite(prior.drift_sigma).all():  # an earlier run's are in its matrix
@@ -328,7 +335,11 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         seen = f"{np.hypot(*image):.2f} px in the images"
         if np.isfinite(ground).all():
             seen += f" and {_lengths(ground)} on the ground (east, north, up)"
-        lines.append(f"{len(run.check_points.names)} check points, not used above, are met to {seen} (RMS).")
+        met = f"{counted(len(run.check_points.names), 'check point')}, not used above, {_are(run.check_points.names)}"
+        if np.isfinite(image).all():
+            lines.append(f"{met} met to {seen} (RMS).")
+        else:
+            lines.append(f"{met} seen by no camera.")
     return lines
 
 
@@ -338,7 +349,7 @@ def _held_lines(run: Run, gcps: GroundPoints, views: Sequence[ViewEntry], known:
     is_seen = np.bincount(gcps.point, minlength=len(gcps.names)) > 0
     tested, lines = run.adjustment.control, []
     held = int(np.count_nonzero(is_seen if tested is None else is_seen & tested.used))
-    with_points = f"With {_count(held, 'GCP')}"
+    with_points = f"With {counted(held, 'GCP')}"
     scale = 1.0 if tested is None or tested.agreed is None else tested.agreed.scale
     if tested is None or tested.agrees:
         lines.append(f"{with_points} {known}{'' if held else ' only'}.")
@@ -348,7 +359,7 @@ def _held_lines(run: Run, gcps: GroundPoints, views: Sequence[ViewEntry], known:
         lines.append(f"{with_points}, taken for {scale:.0f} times less accurate than stated, {known}.")
     else:
         lines.append(
-            f"{_count(held, 'GCP')} that hold the scene do not agree: what is known of its place they do not tell."
+            f"{counted(held, 'GCP')} that hold the scene do not agree: what is known of its place they do not tell."
         )
     if held and tested is not None and tested.agrees and not tested.checked:
         lines.append(f"Nothing checks {'it' if held == 1 else 'them'}: an error in a GCP would not show.")
@@ -377,7 +388,7 @@ def _jitter_lines(views: Sequence[ViewEntry]) -> list[str]:
             median([one.detector_px for one in stepping]),
         )
         lines.append(
-            f"Detectors begin at up to {_count(most, 'column')} of an image, {size:.2f} px RMS apart."
+            f"Detectors begin at up to {counted(most, 'column')} of an image, {size:.2f} px RMS apart."
         )
     return lines
 
@@ -409,18 +420,21 @@ def _reference_lines(run: Run) -> list[str]:
     if found is None or found.control is None:
         return []
     matched = [view for view in found.views if view.points]
+    rest = listed([view.name for view in found.views if not view.points])
+    if not matched:
+        return [f"The reference holds no point of {rest}."] if rest else []
     used, tried = sum(view.points for view in matched), sum(view.tried for view in matched)
     off = ", ".join(f"{np.hypot(*view.offset):.1f} m ({view.name})" for view in matched[:_MOST_NAMED])
     more = f" and {len(matched) - _MOST_NAMED} more" if len(matched) > _MOST_NAMED else ""
     text = (
-        f"Reference: {used} of {tried} points matched at {metres(found.step)} in {_count(len(matched), 'image')}, peak "
-        f"{min(view.peak for view in matched):.1f} or more; as delivered they were off by {off}{more}."
+        f"Reference: {used} of {counted(tried, 'point')} matched at {metres(found.step)} in "
+        f"{counted(len(matched), 'image')}, peak {min(view.peak for view in matched):.1f} or more; as delivered they "
+        f"were off by {off}{more}."
     )
-    if matched:
-        pixels = found.step / max(view.gsd for view in matched)
+    pixels = found.step / max(view.gsd for view in matched)
+    if np.isfinite(pixels):
         text += f" Bends of an image by less than its pixel, {pixels:.2g} px here, it does not tell."
-    rest = [view.name for view in found.views if not view.points]
-    return [text, f"The reference holds no point of {listed(rest)}."] if rest else [text]
+    return [text, f"The reference holds no point of {rest}."] if rest else [text]
 
 
 def _lengths(values: Iterable[float]) -> str:
@@ -433,11 +447,14 @@ def _enu(shift: Array) -> str:
 
 def _checked_lines(_: Run, views: Sequence[ViewEntry]) -> list[str]:
     rmse = median([view.rmse_before for view in views])
-    return [f"Tie points of {len(views)} images agree to {rmse:.3f} px as the cameras are."]
+    if not np.isfinite(rmse):
+        return ["No camera sees tie points of another image."]
+    return [f"Tie points of {counted(len(views), 'image')} agree to {rmse:.3f} px as the cameras are."]
 
 
 def _matched_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
-    return [f"{run.tracks.num_points} tie points of {len(views)} images, {len(run.tracks)} observations."]
+    points = counted(run.tracks.num_points, "tie point")
+    return [f"{points} of {counted(len(views), 'image')}, {counted(len(run.tracks), 'observation')}."]
 
 
 def summarize(run: Run) -> Summary:

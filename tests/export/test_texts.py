@@ -312,7 +312,10 @@ def model(south) -> tuple[Scene, dict[str, list[str]], dict[str, Any]]:
         south, shots=tuple(replace(shot, file=f"/images/{k}.tif") for k, shot in enumerate(south.shots))
     )
     files = neural.colmap(of, OUT)
-    assert set(files) == {"cameras.txt", "images.txt", "points3D.txt", "world.json"}
+    assert set(files) == {f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D")} | {
+        "world.json"
+    }
+    files = {name.removeprefix("sparse/0/"): data for name, data in files.items()}
     return (
         of,
         {name: data.decode().split("\n")[:-1] for name, data in files.items()},
@@ -422,7 +425,10 @@ def test_the_yaml_of_cars(south):
 def test_a_stac_item_says_where_when_and_how(south, southern):
     name = south.shots[0].name
     item = json.loads(catalogue.stac(south, OUT)[f"{name}.json"])
-    assert (item["type"], item["stac_version"], item["id"], item["links"]) == ("Feature", "1.1.0", name, [])
+    assert (item["type"], item["stac_version"], item["id"]) == ("Feature", "1.1.0", name)
+    assert [(one["rel"], one["href"]) for one in item["links"]] == [
+        (rel, "./collection.json") for rel in ("root", "parent", "collection")
+    ]
     assert item["stac_extensions"][0] == "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
     ring = np.array(item["geometry"]["coordinates"][0])
     assert item["bbox"] == pytest.approx(

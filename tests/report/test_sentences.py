@@ -501,7 +501,7 @@ def test_a_dem_is_said_to_hold_and_how_the_points_lie_to_it():
         "It has a height for 50 % of the tie points; they lie +2.0 m above it (median; spread 3.0 m).",
     ]
     assert lines(known=0)[1] == "It has a height for 0 % of the tie points."
-    assert lines(known=0, total=0, held=0)[1] == "It has a height for 0 % of the tie points."
+    assert lines(known=0, total=0, held=0)[1] == "The DEM holds nothing: there are no tie points."
     held = "The DEM holds 0 of 40 tie points: "
     assert (
         lines(held=0)[0]
