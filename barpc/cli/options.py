@@ -10,6 +10,7 @@ from typing import Any, TypeVar, get_origin
 
 import click
 
+from barpc.cli.terminal import echo
 from barpc.errors import InputError
 from barpc.options import PAPER, Declared, RunOptions, checked, declared, read_options, with_values
 
@@ -102,7 +103,7 @@ def _help_all(context: click.Context, _parameter: click.Parameter, value: bool) 
     """Print the whole help and end."""
     if value and not context.resilient_parsing:
         context.meta[_ALL] = True
-        click.echo(context.get_help(), color=context.color)
+        echo(context.get_help())
         context.exit()
 
 
