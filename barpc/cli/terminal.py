@@ -28,8 +28,8 @@ MOST_LINES = 60  # of a summary, whatever its size
 _SENTENCES = 20  # for which rows of tables make room
 _USUAL = 80  # columns of a terminal
 _LIMITS = {
-    "views": "{:,} images, none with a reservation: {}",
-    "pairs": "{:,} pairs, none with an epipolar offset of more than 0.5 px (RMS): {}",
+    "views": "{:,} images, none with a reservation: all {}",
+    "pairs": "{:,} pairs, none with an epipolar offset of more than 0.5 px (RMS): all {}",
 }
 _REASONS = 5  # in the line that says why a run does not pass
 GAP = "  "
@@ -109,7 +109,7 @@ def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str
     errors = "Reprojection error of the tie points"
     offsets = "Epipolar offset: median ± spread (1.4826 MAD) across the epipolar line"
     gcps = GcpEntry.worst(summary.gcps)
-    places = ("summary.json", "pairs.csv") if summary.out_dir else ("--json", "--json")
+    places = ("in summary.json", "in pairs.csv") if summary.out_dir else ("with --json",) * 2
     wanted = (
         (table("views", errors, some_views, ViewEntry, ViewEntry.TERMINAL, adjusted), len(views), places[0]),
         (table("pairs", offsets, some_pairs, PairEntry, PairEntry.TERMINAL, adjusted), len(pairs), places[1]),
@@ -120,7 +120,7 @@ def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str
     for shown, total, place in wanted:
         left = total - len(shown.rows)
         if total:
-            more = f"{left:,} more in {place}" if shown.rows else _LIMITS[shown.key].format(total, place)
+            more = f"{left:,} more {place}" if shown.rows else _LIMITS[shown.key].format(total, place)
             found.append((shown.caption, shown.texts if shown.rows else [], more if left else ""))
     return found
 

@@ -158,9 +158,9 @@ def test_of_three_hundred_images_the_worst_are_shown_and_the_rest_is_counted(mon
 def test_of_a_large_run_that_is_good_only_counts_are_shown(monkeypatch):
     text = shown(SimpleNamespace(record=a_large_run(0, torn=0)), None, monkeypatch)
     assert text.splitlines() == [
-        "300 images, none with a reservation: summary.json",
+        "300 images, none with a reservation: all in summary.json",
         "",
-        "299 pairs, none with an epipolar offset of more than 0.5 px (RMS): pairs.csv",
+        "299 pairs, none with an epipolar offset of more than 0.5 px (RMS): all in pairs.csv",
         "",
         "Look.",
         "It rests on this.",
