@@ -109,7 +109,7 @@ def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str
     errors = "Reprojection error of the tie points"
     offsets = "Epipolar offset: median ± spread (1.4826 MAD) across the epipolar line"
     gcps = GcpEntry.worst(summary.gcps)
-    places = ("in summary.json", "in pairs.csv") if summary.out_dir else ("with --json",) * 2
+    places = ("in summary.json", "in tables/pairs.csv") if summary.out_dir else ("with --json",) * 2
     wanted = (
         (table("views", errors, some_views, ViewEntry, ViewEntry.TERMINAL, adjusted), len(views), places[0]),
         (table("pairs", offsets, some_pairs, PairEntry, PairEntry.TERMINAL, adjusted), len(pairs), places[1]),

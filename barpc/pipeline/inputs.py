@@ -33,6 +33,7 @@ from barpc.tie.epipolar import grouped
 from barpc.tie.hook import hook_files
 from barpc.tie.ortho import Sheet
 from barpc.tie.tasks import Progress, ordered
+from barpc.workspace import table_path
 
 logger = logging.getLogger(__name__)
 
@@ -59,7 +60,7 @@ def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None,
     dem = None if options.dem is None else Dem.open(options.dem, options.geoid)
     if dem is not None:
         _require_cover(dem, str(options.dem), views)
-    prior = None if options.fixed_run is None else BlockPrior.load(Path(options.fixed_run) / PRIOR)
+    prior = None if options.fixed_run is None else BlockPrior.load(table_path(Path(options.fixed_run), PRIOR))
     return dem, prior
 
 
@@ -92,7 +93,7 @@ def reference_names(options: RunOptions) -> list[str]:
 
 def input_files(options: RunOptions) -> list[Path]:
     """Every file of this machine that the options name; none of them is ever written."""
-    found = [] if options.fixed_run is None else [Path(options.fixed_run) / PRIOR]
+    found = [] if options.fixed_run is None else [table_path(Path(options.fixed_run), PRIOR)]
     for name, one in declared(RunOptions).items():
         value = getattr(options, name)
         if one.rule.unit == "file" and value is not None:

@@ -242,7 +242,7 @@ def test_points_come_with_the_covariance_of_their_rays(southern, tmp_path):
     comment, *lines = (out / "points.csv").read_text().splitlines()
     assert comment.startswith("# covariance")
     rows = list(csv.DictReader(lines))
-    table = {int(row["track"]): row for row in rows_of(southern / "residuals.csv")}
+    table = {int(row["track"]): row for row in rows_of(southern / "tables/residuals.csv")}
     assert {int(row["track"]) for row in rows} == set(table)
     assert all(row["alt"] == table[int(row["track"])]["height_above_datum"] for row in rows)
     ply = plyfile.PlyData.read(str(out / "points.ply"))["vertex"]
@@ -255,7 +255,7 @@ def test_points_come_with_the_covariance_of_their_rays(southern, tmp_path):
     assert (values[:, 5] > 2 * values[:, 0]).mean() > 0.9  # heights are worse than places
     # by a Monte Carlo of one point: image noise in, scatter of the intersection out
     rng, track = np.random.default_rng(3), rows[7]["track"]
-    seen = [r for r in rows_of(southern / "observations.csv") if r["track"] == track]
+    seen = [r for r in rows_of(southern / "tables/observations.csv") if r["track"] == track]
     noise = float(comment.split("noise ")[1].split(" px")[0])
     from barpc.geodesy import ecef_from_ground, enu_basis
     from barpc.sensor.geometry import triangulate
@@ -363,8 +363,8 @@ def test_a_run_that_lies_about_names_writes_and_reads_nothing_outside(name, sout
     old = summary["views"][0]["name"]
     text = (run / "summary.json").read_text().replace(json.dumps(old), json.dumps(name))
     (run / "summary.json").write_text(text)
-    table = (run / "observations.csv").read_text().replace(f"\n{old},", f'\n"{name}",')
-    (run / "observations.csv").write_text(table)
+    table = (run / "tables/observations.csv").read_text().replace(f"\n{old},", f'\n"{name}",')
+    (run / "tables/observations.csv").write_text(table)
     with pytest.raises((InputError, OutputError)):
         export_run(run, "satnerf", tmp_path / "out")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
@@ -453,7 +453,7 @@ def test_the_points_of_renderers_are_a_ply(southern, tmp_path):
     out = exported(southern, "nerfstudio", tmp_path)
     assert read(out / "transforms.json")["ply_file_path"] == "points.ply"
     vertex = plyfile.PlyData.read(io.BytesIO((out / "points.ply").read_bytes()))["vertex"]
-    assert len(vertex) == len((southern / "residuals.csv").read_text().splitlines()) - 1
+    assert len(vertex) == len((southern / "tables/residuals.csv").read_text().splitlines()) - 1
     assert vertex["red"].tolist() == [128] * len(vertex)
     assert "numpy" in sys.modules
 

@@ -47,8 +47,8 @@ def with_shot(of: Scene, **fields: Any) -> Scene:
 
 
 def test_a_scene_holds_what_counts_of_its_run(south, southern):
-    lines = [line.split(",") for line in (southern / "observations.csv").read_text().splitlines()[1:]]
-    table = np.loadtxt(southern / "residuals.csv", delimiter=",", skiprows=1)
+    lines = [line.split(",") for line in (southern / "tables/observations.csv").read_text().splitlines()[1:]]
+    table = np.loadtxt(southern / "tables/residuals.csv", delimiter=",", skiprows=1)
     for shot in south.shots:
         rows = [line for line in lines if line[0] == shot.name and line[8] == "1"]
         assert south.tracks[shot.index].tolist() == [int(row[1]) for row in rows]

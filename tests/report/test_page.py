@@ -203,9 +203,9 @@ def test_a_folder_without_a_finished_run_is_refused_with_a_reason(block_run, tmp
 @pytest.mark.parametrize("damage", [None, "nonsense\n1,2,3\n"])
 def test_a_table_that_is_missing_or_damaged_is_named(block_run, tmp_path, name, damage):
     shutil.copytree(block_run.folder, tmp_path / "run")
-    (tmp_path / "run" / name).unlink()
+    (tmp_path / "run/tables" / name).unlink()
     if damage is not None:
-        (tmp_path / "run" / name).write_text(damage)
+        (tmp_path / "run/tables" / name).write_text(damage)
     with pytest.raises(InputError, match=re.escape(name)):
         page.remake_report(tmp_path / "run")
 

@@ -145,7 +145,7 @@ def test_of_three_hundred_images_the_worst_are_shown_and_the_rest_is_counted(mon
     assert "290 more in summary.json" in lines
     pairs = [line.split()[2] for line in lines if " - view_" in line]
     assert pairs == [f"view_{k + 1:04d}" for k in range(39, 29, -1)]
-    assert "289 more in pairs.csv" in lines
+    assert "289 more in tables/pairs.csv" in lines
     causes = [line for line in lines if "images are" in line]
     assert [line.split(":")[0] for line in causes] == [
         "100 images are doubtful, contradicts the others",
@@ -160,7 +160,7 @@ def test_of_a_large_run_that_is_good_only_counts_are_shown(monkeypatch):
     assert text.splitlines() == [
         "300 images, none with a reservation: all in summary.json",
         "",
-        "299 pairs, none with an epipolar offset of more than 0.5 px (RMS): all in pairs.csv",
+        "299 pairs, none with an epipolar offset of more than 0.5 px (RMS): all in tables/pairs.csv",
         "",
         "Look.",
         "It rests on this.",
