@@ -570,3 +570,17 @@ def test_nothing_is_known_of_noise_without_observations_to_spare():
     observed = SimpleNamespace(after=np.full((3, 2), 0.5), track=np.array([0, 0, 1]))
     assert np.isnan(scene._noise(SimpleNamespace(observations=observed), np.arange(3)))
     assert np.isnan(scene._noise(SimpleNamespace(observations=observed), np.zeros(0, int)))
+
+
+def test_stereo_is_made_of_images_without_reservation_that_share_thirty_matches(south):
+    views = [replace(view, name=name, advice="look" if name == "C" else "") for view, name in
+             zip(south.summary.views, "ABC", strict=True)]  # fmt: skip
+    base = replace(south.summary.pairs[0], convergence_deg=12.0, num_matches=30)
+    rows = [replace(base, a="A", b="B"), replace(base, a="A", b="C", num_matches=900)]
+
+    def of(*pairs):
+        return list(pairs_of(replace(south, summary=replace(south.summary, views=tuple(views), pairs=pairs))))
+
+    assert of(*rows) == [("A", "B")]
+    assert of(rows[1], replace(rows[0], num_matches=29)) == [("A", "C"), ("A", "B")]  # better than none
+    assert of(rows[1]) == [("A", "C")]
