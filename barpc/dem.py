@@ -23,8 +23,9 @@ from rasterio.windows import Window
 
 from barpc.errors import BarpcWarning, ImageError, InputError
 from barpc.geodesy import Array
+from barpc.geoids import geoid_file
 from barpc.raster import open_raster
-from barpc.remote import Place, place
+from barpc.remote import Place, Remote, place
 from barpc.sensor import SensorModel
 from barpc.sidefile import GRID, opened
 
@@ -198,12 +199,13 @@ class Dem:
 
     @classmethod
     def open(cls, path: Path | str, geoid: Path | str | None = None) -> Dem:
-        """Open a DEM (``.hgt``, or any raster with a CRS), and the ``.gtx`` or raster with the height of its geoid.
+        """Open a DEM (``.hgt``, or any raster with a CRS), and the ``.gtx``, raster or name of `GEOIDS` of its geoid.
 
         InputError or ImageError where it is none, or a geoid is given for heights that are ellipsoidal already; a
         BarpcWarning for an unknown vertical reference, or orthometric heights that are taken as they are.
         """
         grid = HeightGrid.open(path)
+        geoid = geoid if geoid is None or isinstance(geoid, Remote) else geoid_file(geoid)
         known = grid.reference
         if known == "ellipsoid" and geoid is not None:
             raise InputError(f"{path}: its heights are ellipsoidal already; leave out the geoid {geoid}")

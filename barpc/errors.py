@@ -33,6 +33,10 @@ class ImageError(BarpcError, OSError):
     """A raster cannot be read, or carries no RPC."""
 
 
+class MissingRpcError(ImageError):
+    """An image without an RPC, and no file beside it that holds one."""
+
+
 class TiePointError(BarpcError):
     """Too few tie points between views."""
 

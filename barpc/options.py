@@ -33,6 +33,7 @@ Model = Literal["auto", "rotation+translation", "rotation", "translation", "shif
 HOOK = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"  # a name in a module
 _MOST = 1 << 53  # whole numbers stay below: beyond, not every one has a double of its own
 _REAL = 1e30  # no option is larger, or smaller and not 0: squares, and squares of them, are numbers then
+GEOID_HELP = "Geoid of a DEM of orthometric heights: `egm96`, `egm2008`, or the file of a grid."
 MOST_POINTS = (TABLE.most or 0) // (5 * NUMBER)
 """Control points of a fit: as many as a table of them may hold, five numbers each."""
 _SHORT = reprlib.Repr()
@@ -532,7 +533,7 @@ class RunOptions(Options):
         "Terrain heights: they hold the scene's height and, as far as its relief tells, its place.",
         unit="file",
     )
-    geoid: str | None = option(None, "Geoid grid for a DEM of orthometric heights.", unit="file")
+    geoid: str | None = option(None, GEOID_HELP, unit="file")
     reference: tuple[str, ...] = option(
         (),
         """Orthoimage in the right place, of any date, resolution and CRS: with the heights of `dem` it holds the block.

@@ -37,7 +37,7 @@ def image_of(path: str | Path) -> np.ndarray:
 
 def heights(run: Path) -> tuple[float, float]:
     """Altitudes of the run's tie points [m]."""
-    with (run / "residuals.csv").open(encoding="utf-8", newline="") as stream:
+    with (run / "tables/residuals.csv").open(encoding="utf-8", newline="") as stream:
         lines = [line for line in stream if not line.startswith("#")]
     alt = [float(row["height_above_datum"]) for row in csv.DictReader(lines)]
     low, high = np.percentile(alt, [1, 99])

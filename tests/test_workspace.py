@@ -16,7 +16,7 @@ import pytest
 
 from barpc.errors import OutputError, TiePointError
 from barpc.identity import take
-from barpc.workspace import Workspace, code_version, key_of, peak_memory, timed
+from barpc.workspace import Workspace, code_version, key_of, peak_memory, table_path, timed
 
 
 @dataclass(frozen=True)
@@ -517,3 +517,17 @@ def test_killed_at_any_rename_the_same_command_finishes(tmp_path, mode, numbers)
                 "c": "new asp/c",
             }
             assert json.loads((folder / ".barpc/state.json").read_text())["status"] == "done"
+
+
+def test_a_table_lies_in_its_folder_and_that_of_an_earlier_run_beside_the_summary(tmp_path):
+    new, old = tmp_path / "tables/pairs.csv", tmp_path / "pairs.csv"
+    assert table_path(tmp_path, "pairs.csv") == new  # a message names the new place
+    old.write_text("old")
+    assert table_path(tmp_path, "pairs.csv") == old
+    new.parent.mkdir()
+    new.write_text("new")
+    assert table_path(tmp_path, "pairs.csv") == new
+    old.unlink()
+    new.unlink()
+    old.symlink_to(tmp_path / "nowhere")
+    assert table_path(tmp_path, "pairs.csv") == old  # to be refused by who opens it

@@ -23,7 +23,7 @@ from barpc.cli.options import (
     with_flags,
 )
 from barpc.cli.progress import executor_for, progress_told
-from barpc.cli.terminal import echo, print_summary, say, tell_gate, wants_json
+from barpc.cli.terminal import echo, output_width, print_summary, say, tell_gate, wants_json
 
 if TYPE_CHECKING:
     from barpc.options import RunOptions
@@ -64,8 +64,8 @@ def adjust(
     \b
     Examples:
       barpc adjust scene/*.tif -o adjusted
-      barpc adjust a.tif b.tif --gcp points.gcp --dem srtm.tif --geoid egm96.gtx -o adjusted
-      barpc adjust scene/*.tif --reference ortho.tif --dem srtm.tif --geoid egm96.gtx -o adjusted
+      barpc adjust a.tif b.tif --gcp points.gcp --dem srtm.tif --geoid egm96 -o adjusted
+      barpc adjust scene/*.tif --reference ortho.tif --dem srtm.tif --geoid egm96 -o adjusted
       barpc adjust --image-list images.txt -j 8 --keep-going -o adjusted
       barpc adjust a.tif,model=physical b.tif,model=physical -o adjusted
       barpc adjust img_a.tif img_b.tif --rpc img_a.tif=cameras/1.xml --rpc img_b.tif=cameras/2.xml -o adjusted
@@ -184,7 +184,12 @@ def _tell(obj: Mapping[str, Any], result: AdjustResult) -> int:
         echo(json.dumps(result.summary, indent=1))
     elif not obj["quiet"]:
         print_summary(result.record)
-    return 0 if result.passed else tell_gate(result.record.headline, list(result.record.reasons))
+    said = output_width() is not None and not (
+        wants_json() or obj["quiet"]
+    )  # on the screen: every reason once
+    return (
+        0 if result.passed else tell_gate(result.record.headline, [] if said else list(result.record.reasons))
+    )
 
 
 def _compare(images: list[str], against: Path) -> int:

@@ -5,20 +5,19 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.alignment import moved, read_move
-from barpc.cli.heights import Heights, altitude_of, exchanged, with_heights
+from barpc.cli.crops import Window, box_of, crop_all, window_of
+from barpc.cli.heights import Heights, with_heights
 from barpc.cli.images import expanded
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
-from barpc.dem import Dem
 from barpc.errors import FitError, InputError, OutputError
 from barpc.fit import FitOptions, fit_rpc
 from barpc.fit.certificate import Sample
@@ -40,13 +39,9 @@ from barpc.rpcio import (
 )
 from barpc.rpcio.grids import GRID, write_grid
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
-from barpc.sensor.geometry import image_border
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import plain_path
 from barpc.workspace import Workspace
-
-Window = tuple[int, int, int, int]
-Box = tuple[float, float, float, float]
 
 
 @click.command("convert")
@@ -75,7 +70,14 @@ Box = tuple[float, float, float, float]
     help="With -o: the same by a 4 x 4 (or 3 x 4) matrix of ECEF coordinates, as pc_align writes it.",
 )
 @click.option("--window", type=(int, int, int, int), help="Cut out COL ROW WIDTH HEIGHT [px].")
-@click.option("--bbox", type=(float, float, float, float), help="Cut out WEST SOUTH EAST NORTH [deg].")
+@click.option(
+    "--bbox",
+    type=(float, float, float, float),
+    help="Cut out WEST SOUTH EAST NORTH [deg]; with -o of every image that shows it.",
+)
+@click.option(
+    "--aoi", metavar="FILE", help="Cut out the box around polygons in lon/lat (GeoJSON), as --bbox."
+)
 @with_heights(
     "Altitude of the ground of --bbox [m].  [default: of the run's tie points, else the camera's middle]"
 )
@@ -84,8 +86,8 @@ def convert(files: tuple[str, ...], out_dir: str | None, **flags: Any) -> int:
     r"""Write the RPC of SOURCE to TARGET, whose name chooses the format, or those of many images to a folder.
 
     TARGET ends as --rpc-format says (xml is Maxar's, json rpcm's); .vrt, .tif and .ntf carry the image, too;
-    _grid.tif is a localisation grid. A SOURCE that is a grid goes into an RPC where one holds it. With
-    --window or --bbox the GeoTIFF TARGET is a part of the image, with the RPC of exactly that part. With -o images get
+    _grid.tif is a localisation grid. A SOURCE that is a grid goes into an RPC where one holds it. With --window,
+    --bbox or --aoi the GeoTIFF TARGET is a part of the image, with the RPC of exactly that part. With -o images get
     their RPCs, or those of --rpc, in a new folder; every file is then opened as GDAL, rpcm and others do, and what
     lies beside an image and would hide an RPC put into it is named. Images stay as they are. --move and --transform
     bring an alignment of a DEM or a point cloud back into the cameras that it was made with.
@@ -95,6 +97,7 @@ def convert(files: tuple[str, ...], out_dir: str | None, **flags: Any) -> int:
       barpc convert RPC_PHR1A.XML image_RPC.TXT
       barpc convert image.tif,camera=vendor.XML with_rpc.vrt
       barpc convert image.tif part.tif --bbox 5.43 43.25 5.44 43.26 --alt 180
+      barpc convert scene/*.tif --rpc adjusted -o crops --bbox 5.43 43.25 5.44 43.26
       barpc convert scene/*.tif --rpc adjusted -o handoff
       barpc convert scene/*.tif --rpc adjusted -o aligned --transform run-transform.txt
     """
@@ -105,15 +108,23 @@ def convert(files: tuple[str, ...], out_dir: str | None, **flags: Any) -> int:
 
 def _to_folder(files: tuple[str, ...], folder: Path, flags: Mapping[str, Any]) -> int:
     """Images with their RPCs, or those of --rpc, moved or not, in a new folder."""
-    if flags["window"] or flags["bbox"]:
-        raise click.UsageError("--window and --bbox go with a TARGET, not with -o")
+    if flags["window"] is not None:
+        raise click.UsageError(
+            "--window goes with a TARGET, not with -o: images differ in where their pixels are"
+        )
+    cut = flags["bbox"] is not None or flags["aoi"] is not None
+    if cut and flags["carrier"] is not None:
+        raise click.UsageError("--images goes with whole images, not with --bbox or --aoi")
     carrier: str = flags["carrier"] or "vrt"
-    names = [name.strip() for name in (flags["formats"] or "txt").split(",") if name.strip()]
+    names = [name.strip() for name in (flags["formats"] or ("" if cut else "txt")).split(",") if name.strip()]
     images = tuple(expanded(files))
     _check([Path(split_spec(image)[0]) for image in images], folder, names)
     cameras = _cameras(images, flags["rpcs"])
     if flags["move"] is not None or flags["transform"] is not None:
         cameras = moved(cameras, flags["move"], flags["transform"], carrier)
+    if cut:
+        shown = [(Path(split_spec(image)[0]), camera) for image, camera in zip(images, cameras, strict=True)]
+        return _told(crop_all(shown, folder, _window(flags), names, flags["overwrite"]))
     return _hand_off(images, cameras, folder, carrier, names, flags["overwrite"])
 
 
@@ -128,7 +139,7 @@ def _to_target(files: tuple[str, ...], flags: Mapping[str, Any]) -> int:
         raise click.UsageError(f"give SOURCE and TARGET, or images and -o DIR (with it: {with_it})")
     source, target = files
     camera, image = open_camera(source), Path(split_spec(source)[0])
-    cut = bool(flags["window"] or flags["bbox"])
+    cut = any(flags[name] is not None for name in ("window", "bbox", "aoi"))
     if target.endswith(GRID) and not cut:
         check_target(target, [image, camera.path], overwrite)
         return _as_grid(camera, target, overwrite)
@@ -137,8 +148,7 @@ def _to_target(files: tuple[str, ...], flags: Mapping[str, Any]) -> int:
     check_target(target, [image, camera.path], overwrite, None if cut else camera.rpc)
     if not cut:
         return _copy(camera, image, target, flags["formats"], overwrite)
-    heights: Heights = flags["heights"]
-    window = _window(camera, image, flags["window"], flags["bbox"], heights.alt, heights.terrain())
+    window = _window(flags)(camera, image)
     write_crop(camera.rpc, image, target, window, overwrite=overwrite)
     text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
     echo(json.dumps({"path": target, "window": window}) if wants_json() else text)
@@ -211,29 +221,16 @@ def check_target(
         say(f"{target} is read in place of the RPC that {image} had")
 
 
-def _window(
-    camera: Camera, path: Path, window: Window | None, bbox: Box | None, alt: float | None, dem: Dem | None
-) -> Window:
-    """The window, or the pixels that a box on the ground covers, cut to the image."""
-    if bbox is None and window is not None:
-        return window
-    if bbox is None or window is not None:
-        raise click.UsageError("give either --window or --bbox")
-    west, south, east, north = bbox
-    east += 360.0 * (east < west)  # a box across the antimeridian
-    t = (image_border((1, 1), 16) + 0.5) * [east - west, north - south] + [west, south]
-    level = np.full(len(t), altitude_of(camera, path, alt)) if dem is None else dem(t[:, 0], t[:, 1])
-    ground = np.column_stack([t, level])
-    image = camera.model.project(ground)
-    whole = np.array([np.floor(image.min(axis=0) + 0.5), np.ceil(image.max(axis=0) + 0.5)])
-    low, high = np.maximum(whole[0], 0), np.minimum(whole[1], camera.extent)
-    if not (np.isfinite(image).all() and (high > low).all()):
-        missed = exchanged(camera, np.nan_to_num(ground)) or f"does not meet {camera.path}"
-        raise click.UsageError(f"--bbox {bbox}: {missed} (ground at {np.median(level):g} m)")
-    if (kept := float(np.prod((high - low) / (whole[1] - whole[0])))) < 1.0:
-        say(f"{path}: --bbox reaches beyond the image; {100 * (1 - kept):.2g} % of it is cut off")
-    (col, row), (width, height) = low.astype(int).tolist(), (high - low).astype(int).tolist()
-    return col, row, width, height
+def _window(flags: Mapping[str, Any]) -> Callable[[Camera, Path], Window]:
+    """What tells the window of an image that is asked for, or the pixels of a box or area on the ground."""
+    if sum(flags[name] is not None for name in ("window", "bbox", "aoi")) != 1:
+        raise click.UsageError("give one of --window, --bbox and --aoi")
+    window: Window | None = flags["window"]
+    if window is not None:
+        return lambda *_: window
+    heights: Heights = flags["heights"]
+    bbox, dem = box_of(flags["aoi"]) if flags["aoi"] else flags["bbox"], heights.terrain()
+    return lambda camera, path: window_of(camera, path, bbox, heights.alt, dem)
 
 
 # --- a folder ---------------------------------------------------------------------------------------------
@@ -277,11 +274,19 @@ def _hand_off(
                 size = dataset.width, dataset.height
             readings += verify(written, camera.rpc, size, camera.alt_range)
             reasons += _shadow_reasons(file, written)
+    return _told(readings, reasons, unverified([folder / name for name in names[0]]))
+
+
+def _told(readings: list[Reading], reasons: Sequence[str] = (), notes: Sequence[str] = ()) -> int:
+    """What readers of the files see, and the exit code."""
     _tell(readings)
-    for sentence in unverified([folder / name for name in names[0]]):
+    for sentence in notes:
         say(sentence)
     off = [reading for reading in readings if not reading.passed]
-    reasons += [f"{r.path}: {r.consumer} {r.note or f'reads it {r.max_error:.1e} px off'}." for r in off]
+    reasons = [
+        *reasons,
+        *(f"{r.path}: {r.consumer} {r.note or f'reads it {r.max_error:.1e} px off'}." for r in off),
+    ]
     return tell_gate("The hand-off needs a look.", reasons) if reasons else 0
 
 

@@ -11,7 +11,7 @@ import click
 
 from barpc.cli.terminal import echo, print_comparison, say, tell_gate, wants_json
 
-_TARGETS = ("satnerf", "eogs", "nerfstudio", "colmap", "s2p", "cars", "asp", "stac", "points")
+_TARGETS = ("satnerf", "eogs", "nerfstudio", "colmap", "s2p", "cars", "asp", "ortho", "stac", "points")
 
 
 @click.command("report")
@@ -60,8 +60,9 @@ def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | N
     r"""Hand a finished run to another tool: its images, corrected cameras and tie points in files that it reads.
 
     satnerf, eogs: JSON an image with the RPC; nerfstudio, colmap: pinhole cameras that come near the RPCs, with the
-    largest error of each; s2p, cars, asp: a configuration that is ready to run; stac: items of a catalogue; points:
-    tie points with their covariance. Images are pointed at, relative to OUT_DIR, and never copied.
+    largest error of each; s2p, cars, asp: a configuration that is ready to run; ortho: GDAL's
+    commands for orthoimages; stac: a collection for catalogues; points: tie points with their covariance. Images are
+    pointed at, relative to OUT_DIR, and never copied.
 
     \b
     Examples:

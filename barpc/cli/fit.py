@@ -10,6 +10,7 @@ import click
 
 from barpc.cli.options import flag, paper, run_options
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
+from barpc.options import GEOID_HELP
 
 if TYPE_CHECKING:
     from barpc.fit import Localisation, RpcFit
@@ -38,7 +39,7 @@ _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third 
     metavar="M",
     help="Margin below and above the DEM.",
 )
-@click.option("--geoid", metavar="FILE", help="Geoid grid for a DEM of orthometric heights.")
+@click.option("--geoid", metavar="NAME|FILE", help=GEOID_HELP)
 @flag("fit.tolerance")
 @flag("fit.localisation")
 @paper

@@ -15,6 +15,7 @@ from barpc.cli.terminal import say
 from barpc.dem import Dem, localize_on_terrain
 from barpc.errors import BarpcError
 from barpc.geodesy import Array
+from barpc.options import GEOID_HELP
 from barpc.remote import Place
 from barpc.scene import BoolArray
 
@@ -39,7 +40,7 @@ def with_heights(alt: str) -> Callable[[Function], Function]:
     def added(verb: Function) -> Function:
         @click.option("--alt", type=float, help=alt)
         @click.option("--dem", metavar="FILE", help="Take the altitudes from a DEM.")
-        @click.option("--geoid", metavar="FILE", help="Geoid grid for a DEM of orthometric heights.")
+        @click.option("--geoid", metavar="NAME|FILE", help=GEOID_HELP)
         @wraps(verb)
         def told(*, alt: float | None, dem: str | None, geoid: str | None, **given: Any) -> Any:
             return verb(heights=Heights(alt, dem, geoid), **given)

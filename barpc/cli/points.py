@@ -20,6 +20,7 @@ from barpc.geodesy import Array, ground_from_ecef
 from barpc.sensor import geometry
 from barpc.sidefile import TABLE, opened_text
 
+_APART = 1.0  # px: lines of sight that a point's places miss by as much (RMS) do not meet
 _NUMBERS = {"ignore_unknown_options": True}  # -3.5 is a number, not an option
 
 
@@ -75,7 +76,7 @@ def localize(
     \b
     Examples:
       barpc localize image.tif 512.5 300 --alt 180
-      barpc localize image.tif 512.5 300 --dem N44E005.hgt --geoid egm96_15.gtx
+      barpc localize image.tif 512.5 300 --dem N44E005.hgt --geoid egm96
     """
     terrain = opened_dem(heights.dem, heights.geoid)
     camera = open_camera(image)
@@ -95,7 +96,8 @@ def triangulate(images: tuple[str, ...], at: tuple[tuple[float, float], ...], po
     r"""Print the ground points where the lines of sight of several images meet, and the error that is left.
 
     A point that an image does not see has nan there. `error` is the root mean square distance between a
-    point's projections and what was given [px].
+    point's projections and what was given [px]; exit code 3 where it is a pixel or more, as lines of sight that far
+    apart do not meet.
 
     \b
     Examples:
@@ -118,7 +120,13 @@ def triangulate(images: tuple[str, ...], at: tuple[tuple[float, float], ...], po
     with np.errstate(invalid="ignore", divide="ignore"):
         table[:count, 3] = np.sqrt(square / np.bincount(point, minlength=count))
     _print_points(("lon", "lat", "alt", "error"), table, (10, 10, 4, 4))
-    return _tell_failures(table[:, :1], "could not be intersected")
+    apart = np.flatnonzero(table[:, 3] >= _APART)
+    if not len(apart):
+        return _tell_failures(table[:, :1], "could not be intersected")
+    failed = int(np.isnan(table[:, 0]).sum())
+    worst = f"{len(apart)} of {len(table)} points do not meet: they are up to {table[apart, 3].max():.2f} px apart"
+    why = "Wrong correspondences, or cameras that were not adjusted."
+    return tell_gate(f"{worst}.", [why] + [f"{failed} could not be intersected."] * bool(failed))
 
 
 # --- tables of points -------------------------------------------------------------------------------------

@@ -7,10 +7,12 @@ then one block a row. No column and no unit is ever dropped; in a pipe a row is 
 from __future__ import annotations
 
 import logging
+import shlex
 import shutil
 import sys
 import textwrap
 from collections.abc import Mapping, Sequence
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -22,6 +24,13 @@ if TYPE_CHECKING:
 
 EXIT_GATE = 3
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+MOST_LINES = 60  # of a summary, whatever its size
+_SENTENCES = 20  # for which rows of tables make room
+_USUAL = 80  # columns of a terminal
+_LIMITS = {
+    "views": "{:,} images, none with a reservation: all {}",
+    "pairs": "{:,} pairs, none with an epipolar offset of more than 0.5 px (RMS): all {}",
+}
 _REASONS = 5  # in the line that says why a run does not pass
 GAP = "  "
 NARROWEST = 12  # The first column of a table is not folded below so many characters
@@ -64,28 +73,75 @@ class Formatter(logging.Formatter):
 
 
 def print_summary(summary: Summary) -> None:
-    """The verdict, a table of views and a table of pairs, on stdout."""
+    """Tables of views, pairs and control, and the verdict, on stdout: `MOST_LINES` in a pipe, or 80 columns wide."""
+    from barpc.report.digest import SHOWN, sentences
+
+    width, lines = output_width(), sentences(summary)
+    counted = width and max(width, _USUAL)  # nothing is dropped because a terminal is narrow
+    for rows in range(SHOWN, 0, -1):
+        tables = _tables(summary, rows)
+        room = MOST_LINES - 3 - sum(_height(table, counted) for table in tables)
+        if room >= min(len(lines), _SENTENCES):
+            break
+    for title, texts, more in tables:
+        _echo_table(title, texts, width, more)
+    echo(summary.headline, bold=True, fg=_COLORS[summary.status])
+    _echo_lines(_fitting(lines, room, counted), width)
+    if summary.out_dir:
+        echo(f"Written to {summary.out_dir}")
+        if any(view.outputs for view in summary.views):
+            folder = shlex.quote(summary.out_dir)
+            echo(f"Orthoimages by GDAL: barpc export {folder} ortho --to ortho && sh ortho/ortho.sh")
+
+
+def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str]]:
+    """Titles, cells and what is said of the rest: of more rows than these the worst of those that pass a limit."""
+    from barpc.report import digest
     from barpc.report.records import table
     from barpc.report.summary import DATUM, GCPS, DatumEntry, GcpEntry, PairEntry, ViewEntry
 
-    width = output_width()
-    errors = "Reprojection error of the tie points"
-    offsets = "Epipolar offset: median ± spread (1.4826 MAD) across the epipolar line"
+    views, pairs, adjusted = summary.views, summary.pairs, summary.adjusted
+    some_views = views if len(views) <= rows else digest.flagged(views)[:rows]
+    some_pairs = pairs if len(pairs) <= rows else digest.torn(pairs)[:rows]
     datum = () if summary.scene is None else summary.scene.datum
     if len(DatumEntry.columns(datum).split()) <= 3:  # one source holds all: the verdict says so
         datum = ()
-    for shown in (
-        table("views", errors, summary.views, ViewEntry, ViewEntry.TERMINAL, summary.adjusted),
-        table("pairs", offsets, summary.pairs, PairEntry, PairEntry.TERMINAL, summary.adjusted),
-        table("gcps", GCPS, GcpEntry.worst(summary.gcps), GcpEntry, GcpEntry.TERMINAL),
-        table("datum", DATUM, datum, DatumEntry, DatumEntry.columns(datum)),
-    ):
-        if shown.rows:
-            _echo_table(shown.caption, shown.texts, width)
-    echo(summary.headline, bold=True, fg=_COLORS[summary.status])
-    _echo_lines(summary.verdict, width)
-    if summary.out_dir:
-        echo(f"Written to {summary.out_dir}")
+    errors = "Reprojection error of the tie points"
+    offsets = "Epipolar offset: median ± spread (1.4826 MAD) across the epipolar line"
+    gcps = GcpEntry.worst(summary.gcps)
+    places = ("in summary.json", "in tables/pairs.csv") if summary.out_dir else ("with --json",) * 2
+    wanted = (
+        (table("views", errors, some_views, ViewEntry, ViewEntry.TERMINAL, adjusted), len(views), places[0]),
+        (table("pairs", offsets, some_pairs, PairEntry, PairEntry.TERMINAL, adjusted), len(pairs), places[1]),
+        (table("gcps", GCPS, gcps, GcpEntry, GcpEntry.TERMINAL), len(gcps), ""),
+        (table("datum", DATUM, datum, DatumEntry, DatumEntry.columns(datum)), len(datum), ""),
+    )
+    found = []
+    for shown, total, place in wanted:
+        left = total - len(shown.rows)
+        if total:
+            more = f"{left:,} more {place}" if shown.rows else _LIMITS[shown.key].format(total, place)
+            found.append((shown.caption, shown.texts if shown.rows else [], more if left else ""))
+    return found
+
+
+def _height(table: tuple[str, list[list[str]], str], width: int | None) -> int:
+    """Lines of a table with its title, what is said of the rest, and empty ones behind."""
+    title, texts, more = table
+    return (len(_wrapped(title, width)) + len(layout(texts, width)) if texts else 0) + bool(more) + 1
+
+
+def _fitting(lines: Sequence[str], room: int, width: int | None) -> list[str]:
+    """So many sentences as there is room for, and how many more there are."""
+    heights = [len(_wrapped(line, width)) for line in lines]
+    if sum(heights) <= room:
+        return list(lines)
+    num = sum(total <= room - 1 for total in accumulate(heights))
+    return [*lines[:num], f"And {len(lines) - num} more: verdict in summary.json."]
+
+
+def _wrapped(text: str, width: int | None) -> list[str]:
+    return [text] if width is None else textwrap.wrap(text, width, break_on_hyphens=False) or [""]
 
 
 def print_comparison(comparison: Mapping[str, Any]) -> None:
@@ -159,9 +215,11 @@ def _line(row: Sequence[str], widths: Sequence[int]) -> str:
     return GAP.join([row[0].ljust(widths[0]), *numbers]).rstrip()
 
 
-def _echo_table(title: str, table: Sequence[Sequence[str]], width: int | None) -> None:
-    echo("\n".join([title] if width is None else textwrap.wrap(title, width)), bold=True)
-    echo("\n".join(layout(table, width)) + "\n")
+def _echo_table(title: str, table: Sequence[Sequence[str]], width: int | None, more: str = "") -> None:
+    if table:
+        echo("\n".join(_wrapped(title, width)), bold=True)
+    lines = [*(layout(table, width) if table else ()), *(_wrapped(more, width) if more else ())]
+    echo("\n".join(lines) + "\n")
 
 
 def _echo_lines(lines: Sequence[str], width: int | None) -> None:

@@ -23,6 +23,7 @@ from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import base_to_height, is_radar
 from barpc.tie.pairs import overlapping_pairs
+from barpc.workspace import table_path
 
 ANGLES = 2.0, 45.0
 """Convergence angles [deg] of pairs that are matched: below, a pixel is 30 of height; above, SGBM finds decoys."""
@@ -77,7 +78,7 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: P
         views.append(View(shot.name, shot.file, shot.size, _camera(folder, shot), scene.alt_range, date))
     ties = {frozenset((pair.a, pair.b)): float(pair.num_matches) for pair in scene.summary.pairs}
     names = [view.name for view in views]
-    errors = CameraErrors.of(BlockPrior.load(folder / PRIOR), views)
+    errors = CameraErrors.of(BlockPrior.load(table_path(folder, PRIOR)), views)
     worth = {(i, j): ties.get(frozenset((names[i], names[j])), 0.0) for i, j in _numbered(len(views))}
     parts = [range(len(views))] if minus is None else _split(folder, names, minus)
     groups = tuple(_best(views, worth, part) for part in parts)

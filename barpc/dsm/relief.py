@@ -21,7 +21,7 @@ from barpc.report.page import can_render, remake_report
 from barpc.report.tables import SURFACE, read_summary
 from barpc.scene import View
 from barpc.tie.raster import jpeg
-from barpc.workspace import Workspace
+from barpc.workspace import TABLES, Workspace
 
 logger = logging.getLogger(__name__)
 
@@ -31,9 +31,9 @@ _LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])  # from the north-west, 45 degrees 
 def show_in_report(folder: Path, grid: Grid, out: Path) -> None:
     """Add both reliefs to the report of a run; where that fails a line says why, and the surface stays."""
     try:
-        text = json.dumps(_reliefs(folder, grid, out))
-        with Workspace(folder, overwrite=True, names=[SURFACE], adds=True) as run:
-            run.write_text(SURFACE, text)
+        text, name = json.dumps(_reliefs(folder, grid, out)), f"{TABLES}/{SURFACE}"
+        with Workspace(folder, overwrite=True, names=[name], adds=True) as run:
+            run.write_text(name, text)
         if can_render():
             remake_report(folder)
     except (BarpcError, OSError) as error:

@@ -5,20 +5,24 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from pathlib import Path
 
 from barpc.errors import InputError, OutputError
 from barpc.export.catalogue import CATALOGUE
-from barpc.export.neural import NEURAL, Files
-from barpc.export.scene import Scene, read_scene
+from barpc.export.neural import NEURAL, Files, image_links
+from barpc.export.ortho import ORTHO
+from barpc.export.scene import Scene, link, read_scene
 from barpc.export.stereo import STEREO
 from barpc.sidefile import plain_path
 from barpc.workspace import Workspace
 
 __all__ = ["TARGETS", "export_run"]
 
-TARGETS: dict[str, Callable[[Scene, Path], Files]] = {**NEURAL, **STEREO, **CATALOGUE}
+_LOG = logging.getLogger(__name__)
+
+TARGETS: dict[str, Callable[[Scene, Path], Files]] = {**NEURAL, **STEREO, **ORTHO, **CATALOGUE}
 """Tool -> the files made for it, by name, of a scene and the folder where they will lie."""
 
 
@@ -67,4 +71,21 @@ def export_run(
             with workspace.output(name) as partial:
                 partial.write_bytes(data)
         workspace.remove_stale()
+    for name, image in (image_links(scene) if target == "colmap" else {}).items():
+        _link(out / name, link(image, (out / name).parent))
     return [out / name for name in files]
+
+
+def _link(path: Path, image: str) -> None:
+    """A link to an image in place of an earlier one; a note in the log where the system makes none."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_symlink():
+            path.unlink()
+        path.symlink_to(image)
+    except FileExistsError:
+        raise OutputError(
+            f"{path}: is there already and no link of an earlier export; move it away"
+        ) from None
+    except OSError as error:
+        _LOG.warning("%s: no link to %s (%s): copy the image there", path, image, error.strerror)

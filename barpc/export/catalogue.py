@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
+from barpc.errors import InputError
 from barpc.export.neural import Files, as_json, rpc_of
 from barpc.export.scene import Scene, Shot, link
 from barpc.geodesy import Array, enu_basis, metres_per_unit, wrap_longitude
 from barpc.geojson import polygon
 from barpc.sensor.geometry import footprint
 
+_COLLECTION = "collection.json"
 _EXTENSIONS = ("projection/v2.0.0", "view/v1.0.0")
 _UNKNOWN = {"start_datetime": "1957-10-04T00:00:00Z", "end_datetime": "9999-12-31T23:59:59Z"}
 """When an image was taken of which no file says it: since there are satellites."""
@@ -29,8 +32,42 @@ _VARIANCES = tuple(f"var_{'enu'[i]}{'enu'[j]}" for i, j in _AXES)
 
 
 def stac(scene: Scene, out: Path) -> Files:
-    """Write ``<image>.json``: a STAC item of every image with its files in the run folder."""
-    return {f"{shot.name}.json": as_json(_item(scene, shot, out)) for shot in scene.shots}
+    """Write ``collection.json``, and ``<image>.json``: a STAC item of every image with its files in the run folder."""
+    items = {f"{shot.name}.json": _item(scene, shot, out) for shot in scene.shots}
+    if _COLLECTION in items:
+        raise InputError(
+            f"an image is called {_COLLECTION[:-5]}, as the collection of its catalogue is: rename it"
+        )
+    return {name: as_json(item) for name, item in ({_COLLECTION: _collection(scene, items)} | items).items()}
+
+
+def _collection(scene: Scene, items: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the STAC collection of a run's items."""
+    boxes = np.array([item["bbox"] for item in items.values()])
+    west = wrap_longitude(boxes[:, 0], boxes[0, 0])
+    east = west + np.mod(boxes[:, 2] - boxes[:, 0], 360.0)
+    ends = [
+        float(wrap_longitude(west.min())),
+        boxes[:, 1].min(),
+        float(wrap_longitude(east.max())),
+        boxes[:, 3].max(),
+    ]
+    times = sorted(time for item in items.values() if (time := item["properties"]["datetime"]) is not None)
+    return {
+        "type": "Collection",
+        "stac_version": "1.1.0",
+        "id": scene.folder.resolve().name or "barpc",
+        "description": f"{len(items)} images with RPCs corrected by bundle adjustment (barpc {scene.summary.barpc})",
+        "license": "other",
+        "extent": {
+            "spatial": {"bbox": [ends]},
+            "temporal": {"interval": [[times[0], times[-1]] if times else [None, None]]},
+        },
+        "links": [
+            {"rel": "root", "href": f"./{_COLLECTION}", "type": "application/json"},
+            *({"rel": "item", "href": f"./{quote(name)}", "type": "application/geo+json"} for name in items),
+        ],
+    }
 
 
 def _item(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
@@ -63,7 +100,11 @@ def _item(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
             "processing:software": {"barpc": scene.summary.barpc},
             "rpc": rpc_of(shot),
         },
-        "links": [],
+        "collection": scene.folder.resolve().name or "barpc",
+        "links": [
+            {"rel": rel, "href": f"./{_COLLECTION}", "type": "application/json"}
+            for rel in ("root", "parent", "collection")
+        ],
         "assets": {name: _asset(scene.folder / name, out) for name in view.outputs}
         | {"image": {"href": link(shot.file, out), "roles": ["source"]}},
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from barpc.export.approx import (
 from barpc.export.scene import Scene, Shot, link
 from barpc.geodesy import Array, ecef_from_ground, wrap_longitude
 from barpc.geojson import polygon
+from barpc.remote import is_url
 from barpc.report.records import plain
 from barpc.rpcio import WRITABLE
 from barpc.sensor.geometry import footprint, image_grid
@@ -239,14 +240,17 @@ def _cloud(scene: Scene) -> bytes:
 
 
 def colmap(scene: Scene, out: Path) -> Files:
-    """Write a text model of pinhole cameras, tie points and their places; ``world.json`` places it on Earth."""
+    """Write a text model of pinhole cameras, tie points and their places; ``world.json`` places it on Earth.
+
+    Images are called by their names in the folder ``images`` (`image_links`).
+    """
     world = scene.world(scene.points)
     cameras, images, errors = [], [], {}
     seen: dict[int, list[tuple[int, int, float]]] = {}
-    for number, (shot, name) in enumerate(zip(scene.shots, scene.file_names(out), strict=True), start=1):
+    for number, (shot, name) in enumerate(zip(scene.shots, _called(scene), strict=True), start=1):
         if any(char.isspace() for char in name):
             raise InputError(
-                f"{shot.file}: COLMAP ends the name of an image at a space; give a link without one"
+                f"{shot.file}: COLMAP ends the name of an image at a space; rename it, or give a link without one"
             )
         pinhole, errors[name] = pinhole_of(scene, shot)
         center = pinhole.center + _CORNER
@@ -265,11 +269,27 @@ def colmap(scene: Scene, out: Path) -> Files:
         mean = float(np.mean([error for *_, error in seen[point]]))
         points.append(_line(point + 1, *world[point].tolist(), 128, 128, 128, mean, *track))
     about = {"world_to_ecef": scene.world_to_ecef, "alt_range": scene.alt_range, "pinhole_error_px": errors}
-    about["images"] = {n: link(s.file, out) for s, n in zip(scene.shots, scene.file_names(out), strict=True)}
+    about["images"] = {
+        name: link(shot.file, out) for shot, name in zip(scene.shots, _called(scene), strict=True)
+    }
     texts = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": points}
-    return {name: ("\n".join(lines) + "\n").encode() for name, lines in texts.items()} | {
+    return {f"sparse/0/{name}": ("\n".join(lines) + "\n").encode() for name, lines in texts.items()} | {
         "world.json": as_json(about)
     }
+
+
+def _called(scene: Scene) -> list[str]:
+    """Return what the model calls the images: as their files where these names differ, else as the run."""
+    names = [PurePath(shot.file).name for shot in scene.shots]
+    if len(set(names)) == len(names):
+        return names
+    return [shot.name + PurePath(shot.file).suffix for shot in scene.shots]
+
+
+def image_links(scene: Scene) -> dict[str, str]:
+    """Return the links in the folder of a COLMAP model and the local images that they point at: nothing is copied."""
+    rows = zip(scene.shots, _called(scene), strict=True)
+    return {f"images/{name}": shot.file for shot, name in rows if not is_url(shot.file)}
 
 
 def _line(*values: float | str) -> str:

@@ -16,6 +16,7 @@ from barpc.export.approx import Sampled
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, wrap_longitude
 from barpc.remote import is_url
 from barpc.report.compare import written_rpc
+from barpc.report.reservations import FEW_OBSERVATIONS
 from barpc.report.summary import Summary, ViewEntry
 from barpc.report.tables import RunFiles, read_summary, read_tables
 from barpc.rpcio import CARRIERS
@@ -223,9 +224,12 @@ def _noise(files: RunFiles, counted: Any) -> float:
 
 
 def pairs_of(scene: Scene) -> Sequence[tuple[str, str]]:
-    """Return the pairs that stereo is made of: those with tie points and an angle that shows heights; else
-    all of them.
+    """Return the pairs that stereo is made of: with an angle that shows heights, of images without
+    reservation; else all.
+
+    Of those under such an angle: two images that need no look, with enough matches to know it, where there are any.
     """
-    pairs = [(p.a, p.b, p.convergence_deg or 0.0) for p in scene.summary.pairs]
-    good = [(a, b) for a, b, angle in pairs if 2.0 <= angle <= 50.0]
-    return good or [(a, b) for a, b, _ in pairs]
+    doubted = {view.name for view in scene.summary.views if view.advice}
+    shown = [pair for pair in scene.summary.pairs if 2.0 <= (pair.convergence_deg or 0.0) <= 50.0]
+    sure = [p for p in shown if p.num_matches >= FEW_OBSERVATIONS and not {p.a, p.b} & doubted]
+    return [(pair.a, pair.b) for pair in sure or shown or scene.summary.pairs]

@@ -15,6 +15,7 @@ import numpy as np
 from barpc.ba import BlockPrior
 from barpc.dem import Dem
 from barpc.errors import InputError
+from barpc.geoids import geoid_file
 from barpc.identity import Input, Stamp, changed, take
 from barpc.options import RunOptions, declared
 from barpc.pipeline.control import load_altimetry, load_gcps
@@ -32,6 +33,7 @@ from barpc.tie.epipolar import grouped
 from barpc.tie.hook import hook_files
 from barpc.tie.ortho import Sheet
 from barpc.tie.tasks import Progress, ordered
+from barpc.workspace import table_path
 
 logger = logging.getLogger(__name__)
 
@@ -58,7 +60,7 @@ def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None,
     dem = None if options.dem is None else Dem.open(options.dem, options.geoid)
     if dem is not None:
         _require_cover(dem, str(options.dem), views)
-    prior = None if options.fixed_run is None else BlockPrior.load(Path(options.fixed_run) / PRIOR)
+    prior = None if options.fixed_run is None else BlockPrior.load(table_path(Path(options.fixed_run), PRIOR))
     return dem, prior
 
 
@@ -79,7 +81,8 @@ def with_located(options: RunOptions) -> RunOptions:
         found = located(path, options.allow_remote)
         return path if here([found]) else os.fspath(versioned(found, IMAGE))
 
-    dem, geoid = (path if path is None else at(path) for path in (options.dem, options.geoid))
+    geoid = None if options.geoid is None else geoid_file(options.geoid)
+    dem, geoid = (path if path is None else at(path) for path in (options.dem, geoid))
     return replace(options, dem=dem, geoid=geoid, reference=tuple(map(at, options.reference)))
 
 
@@ -90,7 +93,7 @@ def reference_names(options: RunOptions) -> list[str]:
 
 def input_files(options: RunOptions) -> list[Path]:
     """Return every file of this machine that the options name; none of them is ever written."""
-    found = [] if options.fixed_run is None else [Path(options.fixed_run) / PRIOR]
+    found = [] if options.fixed_run is None else [table_path(Path(options.fixed_run), PRIOR)]
     for name, one in declared(RunOptions).items():
         value = getattr(options, name)
         if one.rule.unit == "file" and value is not None:
@@ -102,7 +105,7 @@ def input_files(options: RunOptions) -> list[Path]:
 def read_pairs(
     path: str | Path, views: Sequence[View], left_out: Sequence[str | Path] = ()
 ) -> list[tuple[int, int]]:
-    """Return the pairs of a list: two image names or paths a line; blank lines and # comments are skipped.
+    """Read the pairs of a list: two image names or paths a line; blank lines and # comments are skipped.
 
     Relative paths start from where the list lies, or from the current folder; pairs with an image that was `left_out`
     of the run are passed over. InputError where a line is not two images of the run, or none is left.

@@ -29,10 +29,11 @@ from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
 from barpc.tie.tasks import Progress, ordered
+from barpc.workspace import TABLES as TABLES_FOLDER
 from barpc.workspace import Workspace, own_files
 
 MATCHES = ("matches.csv", "matches.npz")
-GCPS = "gcps.geojson"  # of a reference
+GCPS = f"{TABLES_FOLDER}/gcps.geojson"  # of a reference
 
 REOPENED = 1e-5
 """A reopened file may differ from P_BA by the error of the fit and this [px] more (15-digit printing)."""
@@ -120,7 +121,11 @@ def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
 
 def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> list[str]:
     """Return the names of a run's outputs before it starts; of match files those that are already in the folder."""
-    names = [*TABLES, "summary.json", *(["report.html"] if can_render() else [])]
+    names = [
+        *(f"{TABLES_FOLDER}/{name}" for name in TABLES),
+        "summary.json",
+        *(["report.html"] if can_render() else []),
+    ]
     names += [GCPS] * bool(options.reference)
     if options.stop_after == "matching":
         stems = {view.name for view in views}
@@ -129,7 +134,7 @@ def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> li
     if options.stop_after == "all":
         names += [name for view in views for name in file_names(view, options.images, options.rpc_formats)]
         names += [name for view in views for name in grid_names(view, options)]
-    return [*names, PRIOR]
+    return [*names, f"{TABLES_FOLDER}/{PRIOR}"]
 
 
 def _is_pair(stem: str, names: Set[str]) -> bool:
@@ -165,7 +170,7 @@ def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
 
     with workspace.stage("tables"):
         for name, content in TABLES.items():
-            with workspace.output(name) as partial:
+            with workspace.output(f"{TABLES_FOLDER}/{name}") as partial:
                 partial.write_bytes(content(run, summary))
         if run.reference is not None and run.reference.control is not None and run.adjustment is not None:
             workspace.write_text(GCPS, gcps_geojson(run).decode())

@@ -58,7 +58,7 @@ from barpc.sidefile import plain_path
 from barpc.tie import find_tracks, read_area
 from barpc.tie.reference import Registration, register
 from barpc.tie.tasks import Progress, ordered
-from barpc.workspace import Workspace, timed
+from barpc.workspace import TABLES, Workspace, timed
 
 logger = logging.getLogger(__name__)
 
@@ -171,7 +171,7 @@ def adjust(
             if run.fits:
                 run = _written(run, options, workspace, executor, progress)
         if run.adjustment is not None:
-            with _told(workspace, "block", progress), workspace.output(PRIOR) as partial:
+            with _told(workspace, "block", progress), workspace.output(f"{TABLES}/{PRIOR}") as partial:
                 block_prior(run.adjustment).save(partial)
         with _told(workspace, "summary", progress):
             run = replace(run, out_dir=str(out_dir), stages=workspace.stages)

@@ -19,7 +19,7 @@ import numpy as np
 from rasterio.windows import Window
 
 from barpc.cameras import Camera, open_split, split_spec
-from barpc.errors import BarpcError, ImageError, InputError, RpcError
+from barpc.errors import BarpcError, ImageError, InputError, MissingRpcError, RpcError
 from barpc.identity import Stamp, also_seen, recorded
 from barpc.pointio.names import unique_names
 from barpc.raster import open_raster
@@ -43,6 +43,7 @@ _MORE = tuple((x / 5, y / 5) for x in range(6) for y in range(6))  # where nothi
 _SAMPLE_SIDE = (256, 16)  # px: many columns and few rows, so that few strips are decoded
 _CHUNK = 1 << 20  # px that are hashed at a time
 _GROUP = 16  # images that are read in one task
+_GIVE_RPC = "name its file with --rpc {}=FILE, or leave the image out (--keep-going of adjust and match)"
 _MANY = 64  # images from which on they are read by other processes
 
 Image = str | Path | View
@@ -133,6 +134,8 @@ def load_views(
             used.append(read.usable(twins if distinct else None))
         except BarpcError as error:
             if not keep_going:
+                if isinstance(error, MissingRpcError):
+                    raise MissingRpcError(f"{error}; {_GIVE_RPC.format(file.name)}") from error
                 raise
             logger.warning("%s is left out: %s", file, error)
             left_out.append((str(file), str(error)))

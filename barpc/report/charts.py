@@ -54,6 +54,17 @@ def label(x: float, y: float, text: str, anchor: str = "start", class_: str = "t
     return tag("text", escape(text), x=x, y=y, text_anchor=anchor, class_=class_)
 
 
+def shortened(name: str, most: int) -> str:
+    """A name of so many characters at most: its end, which tells images of a series apart.
+
+    Examples
+    --------
+    >>> shortened("view_0137", 10), shortened("IMG_PHR1A_P_0001", 6)
+    ('view_0137', '…_0001')
+    """
+    return name if len(name) <= most else f"…{name[len(name) - most + 1 :]}"
+
+
 def line(x1: float, y1: float, x2: float, y2: float, class_: str) -> str:
     """Return a straight line."""
     return tag("line", x1=x1, y1=y1, x2=x2, y2=y2, class_=class_)

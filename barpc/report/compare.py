@@ -46,15 +46,24 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
     runs = (read_summary(folders[0]), read_summary(folders[1]))
     a, b = ({view.name: view for view in run.views} for run in runs)
     if not a.keys() & b.keys():
-        raise InputError(f"{folder_a} and {folder_b}: the runs have no image in common")
+        first, second = (run.views[0].name for run in runs)
+        raise InputError(
+            f"{folder_a} and {folder_b}: the runs have no image in common ({first} and others there, {second} here): "
+            "nothing to compare"
+        )
+    if not (same := [name for name in a if name in b and not _other_file(name, runs)]):
+        raise InputError(
+            f"{folder_a} and {folder_b}: images of the same names are other files, so these runs have none in common: "
+            "nothing to compare"
+        )
     given = [flat_options(run.options or {}) for run in runs]
     comparison = {
         "a": str(folder_a),
         "b": str(folder_b),
-        "views": [_view(folders, (a[name], b[name])) for name in a if name in b],
+        "views": [_view(folders, (a[name], b[name])) for name in same],
         "pairs": _pairs(*runs),
-        "only_a": [name for name in a if name not in b],
-        "only_b": [name for name in b if name not in a],
+        "only_a": [name for name in a if name not in same],
+        "only_b": [name for name in b if name not in same],
         "options": [
             {"option": key, "values": [one.get(key) for one in given]}
             for key in given[0] | given[1]
@@ -64,6 +73,15 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
     }
     found: dict[str, Any] = plain({**comparison, "lines": _lines(comparison)})
     return found
+
+
+def _other_file(name: str, runs: tuple[Summary, Summary]) -> bool:
+    """Whether an image of this name is known to be another file in either run, by what was read of it."""
+    content = []
+    for run in runs:
+        path = next(view.path for view in run.views if view.name == name)
+        content.append({one.path: one.sha256 for one in run.inputs or ()}.get(path))
+    return None not in content and content[0] != content[1]
 
 
 def _view(folders: tuple[Path, Path], views: tuple[ViewEntry, ViewEntry]) -> dict[str, Any]:

@@ -19,7 +19,9 @@ def dem_lines(adjustment: Adjustment) -> list[str]:
         return []
     if not terrain.total and holds_reference(adjustment):  # which stands on it: no tie point does
         return []
-    held = f"The DEM holds {terrain.held} of {terrain.total} tie points"
+    if not terrain.total:
+        return ["The DEM holds nothing: there are no tie points."]
+    held = f"The DEM holds {terrain.held} of {terrain.total} tie point{'s' * (terrain.total != 1)}"
     if terrain.held:
         single, common = metres(options.dem_sigma), metres(terrain.bias)
         if np.isfinite(terrain.sigma):
@@ -30,7 +32,7 @@ def dem_lines(adjustment: Adjustment) -> list[str]:
         held += f": all rays meet under more than {least}; without --dem-for-weak it holds the scene"
     else:
         held += ": it has no height where it is needed"
-    share = 100 * terrain.known / max(terrain.total, 1)
+    share = 100 * terrain.known / terrain.total
     lie = f"they lie {terrain.offset:+.1f} m above it (median; spread {terrain.spread:.1f} m)"
     lines = [
         f"{held}.",

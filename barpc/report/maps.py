@@ -21,9 +21,11 @@ from barpc.report.charts import (
     path,
     round_ticks,
     sheet,
+    shortened,
     tag,
     titled,
 )
+from barpc.report.digest import SHOWN, flagged
 from barpc.report.summary import (
     CELLS,
     CheckPointEntry,
@@ -41,7 +43,9 @@ _AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
 _MOST = 60  # images on the page: those with the largest systematic part
 _VECTORS = 6000
 _PANEL = 180.0
-_MANY = 30  # stacks of images: of more there are fewer numbers, and thinner lines
+_MANY = 30  # stacks of images: of more there are fewer names, and thinner lines
+_NAMED = 30  # images that need a look: of more the worst have their names on the map
+_LONGEST = 16  # characters of a name there
 _REACH = 12.0  # units of a long residual
 _DARKEST = 0.7  # opacity where all tie points move
 
@@ -105,21 +109,25 @@ def ground_map(files: RunFiles) -> str:
         for kind, places in points_of.items()
     }
     plane = _plane_of(np.concatenate([*rings, files.points[:, :2], *known.values()]))
-    grid, degrees = _graticule(plane)
+    grid, degrees, taken = _graticule(plane)
     points = plane(files.points[:: max(1, -(-len(files.points) // MAX_DOTS)), :2])
     parts = [
         *grid,
         *_moving_ground(plane, summary),
         tag("path", d="".join(f"M{x:.1f} {y:.1f}h0" for x, y in points.tolist()) or "M0 0", class_="point"),
     ]
-    outlines = list(zip(range(len(summary.views)), summary.views, files.outlines, strict=True))
-    for k, view, outline in evenly(outlines, MAX_DRAWN):
+    for k, view, outline in _drawn(files):
         shape = "".join(path(plane(ring[:-1]), f"outline {view.status}", closed=True) for ring in outline)
         parts.append(titled(shape, f"{view.name}: {view.num_observations} tie points", data_v=k))
-    stacks = _stacks(plane, files.outlines)
+    stacks = _stacks(plane, files.outlines, list(files.number))
     parts += _pair_lines(stacks, files)
-    if len(stacks) <= 100:
-        parts += _stack_names(stacks)
+    bad = [
+        Stack([files.number[view.name]], middle, view.name, view.status)
+        for view, middle in _marked(plane, files)
+    ]
+    parts += _stack_names(
+        [*bad[:_NAMED], *(stacks if len(stacks) <= 100 else ())], len(stacks) > _MANY, taken
+    )
     for kind, places in known.items():
         up = 1 if kind == "gcps" else -1
         for point, (x, y) in evenly(list(zip(points_of[kind], plane(places), strict=True)), MAX_DRAWN):
@@ -154,46 +162,70 @@ def _box(plane: Plane, box: Sequence[float], class_: str, **style: float) -> str
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Images that lie over each other on the map: their indices, and the place (2,) of their middle."""
+    """Images that lie over each other on the map.
+
+    Their indices, the place (2,) of the first one's middle and its name; of one that needs a look its status.
+    """
 
     views: list[int]
     place: Array
+    name: str
+    status: str = ""
 
     @property
     def text(self) -> str:
-        """Their numbers, runs of them as 1-3."""
-        numbers = np.array(self.views) + 1
-        runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
-        words = [f"{run[0]}" if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs]
-        return ", ".join(words) if len(words) <= 4 else f"{', '.join(words[:3])} …"
+        """The name of the first, and how many more."""
+        return shortened(self.name, _LONGEST) + f" + {len(self.views) - 1}" * (len(self.views) > 1)
 
 
-def _stacks(plane: Plane, outlines: Sequence[Sequence[Array]]) -> list[Stack]:
-    """Images whose middles stand nearer than their numbers are wide."""
+def _drawn(files: RunFiles) -> list[tuple[int, ViewEntry, Sequence[Array]]]:
+    """Images whose outlines are drawn, with their indices: those that need a look last, so on top."""
+    whole = {view.name: (k, view, files.outlines[k]) for k, view in enumerate(files.summary.views)}
+    bad = flagged(files.summary.views)[:MAX_DRAWN]
+    good = [row for name, row in whole.items() if name not in {view.name for view in bad}]
+    room = MAX_DRAWN - len(bad)
+    return [*(evenly(good, room) if room else ()), *(whole[view.name] for view in bad[::-1])]
+
+
+def _marked(plane: Plane, files: RunFiles) -> list[tuple[ViewEntry, Array]]:
+    """Images that need a look and the places (2,) of their middles, the worst first."""
+    found = [(view, files.outlines[files.number[view.name]]) for view in flagged(files.summary.views)]
+    return [(view, _middle(plane, outline)) for view, outline in found if outline]
+
+
+def _middle(plane: Plane, outline: Sequence[Array]) -> Array:
+    middle: Array = plane(np.concatenate([ring[:-1] for ring in outline])).mean(axis=0)
+    return middle
+
+
+def _stacks(plane: Plane, outlines: Sequence[Sequence[Array]], names: Sequence[str]) -> list[Stack]:
+    """Images whose middles stand nearer than a name is tall."""
     stacks: list[Stack] = []
     cells: dict[tuple[int, int], list[int]] = {}  # of a width of _APART: their stacks
     for k, outline in ((k, outline) for k, outline in enumerate(outlines) if outline):
-        place = plane(np.concatenate([ring[:-1] for ring in outline])).mean(axis=0)
+        place = _middle(plane, outline)
         col, row = (place // _APART).astype(int).tolist()
         around = [n for i, j in _AROUND for n in cells.get((col + i, row + j), ())]
         near = min((n for n in around if math.dist(stacks[n].place, place) < _APART), default=None)
         if near is None:
             cells.setdefault((col, row), []).append(len(stacks))
-            stacks.append(Stack([k], place))
+            stacks.append(Stack([k], place, names[k]))
         else:
             stacks[near].views.append(k)
     return stacks
 
 
-def _stack_names(stacks: Sequence[Stack]) -> list[str]:
-    """The numbers of stacks, without those that would stand on others."""
-    taken: list[tuple[float, float, float]] = []
-    names, gap = [], 14 if len(stacks) > _MANY else 0
+def _stack_names(
+    stacks: Sequence[Stack], many: bool, taken: Sequence[tuple[float, float, float]] = ()
+) -> list[str]:
+    """The names of stacks, without those that would stand on others or on what is taken: x, y, half width."""
+    taken, names, gap = list(taken), [], 14 if many else 0
     for stack in stacks:
         (x, y), half = stack.place.tolist(), 3.6 * len(stack.text)
+        x = min(max(x, half), WIDTH - half)
         if all(abs(x - u) > half + other + gap or abs(y - v) > 14 + gap for u, v, other in taken):
             taken.append((x, y, half))
-            names.append(label(x, y + 4, stack.text, "middle", "stack"))
+            names.append(label(x, y + 4, stack.text, "middle", f"stack {stack.status}".strip()))
     return names
 
 
@@ -213,27 +245,30 @@ def _pair_lines(stacks: Sequence[Stack], files: RunFiles) -> list[str]:
     return _ties(links, (0.6, 2.4), (0.2, 0.7))
 
 
-def _graticule(plane: Plane) -> tuple[list[str], list[str]]:
-    """Lines of longitude and latitude; their degrees and the scale bar, which go on top."""
+def _graticule(plane: Plane) -> tuple[list[str], list[str], list[tuple[float, float, float]]]:
+    """Lines of longitude and latitude; their degrees and the scale bar, which go on top; places x, y, half widths."""
     right, bottom = WIDTH - 4, plane.height - 24
     reach = np.array([WIDTH / 2, plane.height / 2]) / plane.unit
-    lines, texts = [], []
+    lines, texts, taken = [], [], []
     for lon in round_ticks(plane.lon - reach[0], plane.lon + reach[0], 4):
         x, _ = plane(np.array([lon, plane.lat]))
         if 50 < x < right - 40:
             words = _degrees((lon + 180.0) % 360.0 - 180.0, "EW")
             lines.append(line(x, 4, x, bottom, "grid"))
             texts.append(label(x, bottom - 4, words, "middle", "degrees"))
+            taken.append((float(x), bottom - 8, 3.6 * len(words)))
     for lat in round_ticks(plane.lat - reach[1], plane.lat + reach[1], 4):
         _, y = plane(np.array([plane.lon, lat]))
         if 16 < y < bottom - 20:
             lines.append(line(4, y, right, y, "grid"))
-            texts.append(label(4, y - 3, _degrees(lat, "NS"), class_="degrees"))
+            texts.append(label(4, y - 3, words := _degrees(lat, "NS"), class_="degrees"))
+            taken.append((4 + 3.6 * len(words), float(y) - 7, 3.6 * len(words)))
     length = max(round_ticks(0.0, 110.0 / plane.scale, 3))
     words = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
     x = right - length * plane.scale
     texts.append(tag("rect", x=x, y=bottom + 9, width=right - x, height=4, class_="scalebar"))
-    return lines, [*texts, label(x - 6, bottom + 15, words, "end"), label(4, bottom + 15, "north is up")]
+    texts += [label(x - 6, bottom + 15, words, "end"), label(4, bottom + 15, "north is up")]
+    return lines, texts, taken
 
 
 def _degrees(value: float, letters: str) -> str:
@@ -271,9 +306,9 @@ def residual_cells(xy: Array, residuals: Array, size: Sequence[int]) -> Cells:
 
 
 def residual_panels(
-    views: Sequence[ViewEntry], observations: Observations, when: str
+    views: Sequence[ViewEntry], observations: Observations, when: str, first: Sequence[int] = ()
 ) -> tuple[list[tuple[str, str]], list[float], str]:
-    """Small maps of the residuals "before" or "after", with captions, of the images with the largest systematic part.
+    """Small maps of the residuals "before" or "after", with captions: `first`, then by their systematic part.
 
     Cells are darker where the error is larger; thin lines are single residuals; a bold arrow is the mean of a cell
     where it is larger than chance allows. Returns, too, the systematic part of every image's cells, and what lengths
@@ -293,14 +328,18 @@ def residual_panels(
     ]
     shares = [cells.share for cells in grids]
     charts = []
-    for k in sorted(sorted(range(len(views)), key=lambda k: -shares[k])[:_MOST]):
+    rest = [k for k in range(len(views)) if k not in first]
+    if len(views) > SHOWN:
+        rest.sort(key=lambda k: -shares[k])
+    for k in [*first, *rest][:_MOST]:
         rows = rows_of[k][:: max(1, -(-len(rows_of[k]) // most))]
         svg = _panel(when, k, views[k], grids[k], observations.xy[rows], residuals[rows], longest)
-        charts.append((svg, f"{k + 1} {views[k].name}: {_note(grids[k])}"))
+        charts.append((svg, f"{views[k].name}: {_note(grids[k])}"))
     words = f"A thin line of a {_PANEL / _REACH:.0f}th of a panel's width is {longest:.2g} px"
     key = f"{words}; bold arrows are drawn twice as long."
     if len(charts) < len(views):
-        key += f" The {len(charts)} of {len(views)} images with the largest systematic part are shown."
+        key += f" Of {len(views)} images {len(charts)} are shown: "
+        key += "those that need a look, then " * bool(first) + "those with the largest systematic part."
     return charts, shares, key
 
 

@@ -6,12 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from barpc.report.charts import WIDTH, label, number, sheet, tag
+from barpc.report.charts import WIDTH, label, number, sheet, shortened, tag
 from barpc.report.summary import PairEntry
 from barpc.report.tables import RunFiles
 
-_LEFT = 30.0
+_LEFT = 30.0  # at least: names are to its right end
 _TOP = 18.0
+_CHARACTER = 8.2  # units of a character at the sides
+_LONGEST = 10  # characters of a name there
 _TEXTS = 12  # images: of no more the figures stand in the cells
 
 
@@ -47,19 +49,21 @@ MEASURES = (
 
 
 def pair_matrix(files: RunFiles) -> str:
-    """Rows and columns are the images as numbered in their table; above the diagonal the pairs, below it the shades."""
+    """Rows and columns are the images by name; above the diagonal the pairs, below it the shades."""
     views, pairs, index = files.summary.views, files.summary.pairs, files.number
-    side = (WIDTH - _LEFT - 4) / len(views)
+    names = [shortened(view.name, _LONGEST) for view in views]
+    left = max(_LEFT, _CHARACTER * max(map(len, names)) + 6.0)
+    side = (WIDTH - left - 4) / len(views)
     cells = [(min(ends), max(ends), p) for p in pairs for ends in [(index[p.a], index[p.b])]]
     parts = [
-        tag("rect", x=_LEFT, y=_TOP, width=side * len(views), height=side * len(views), class_="empty"),
-        *_numbers(len(views), side),
+        tag("rect", x=left, y=_TOP, width=side * len(views), height=side * len(views), class_="empty"),
+        *_names(names, side, left),
     ]
     for place, measure in enumerate(MEASURES):
         parts.append(
             tag(
                 "g",
-                *_layer(measure, cells, side, len(views)),
+                *_layer(measure, cells, side, (len(views), left)),
                 class_=f"layer l{place}",
                 data_words=measure.words,
             )
@@ -73,7 +77,7 @@ def pair_matrix(files: RunFiles) -> str:
         parts,
         class_="matrix",
         data_side=side,
-        data_left=_LEFT,
+        data_left=left,
         data_top=_TOP,
     )
 
@@ -90,17 +94,25 @@ def facts(files: RunFiles) -> dict[str, list[list[object]]]:
     return {"views": names, "pairs": pairs}
 
 
-def _numbers(num: int, side: float) -> list[str]:
-    step = next(s for s in (1, 2, 5, 10, 20, 50, 100) if s * side >= 15 or s == 100)
+def _names(names: Sequence[str], side: float, left: float) -> list[str]:
+    """Names at the left and above, as many as have room."""
+    wide = _CHARACTER * max(map(len, names)) + 6.0
+    step = next(
+        s for s in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000) if s * side >= max(15.0, wide) or s == 1000
+    )
     parts = []
-    for k in sorted({0, *range(step - 1, num, step)} if step > 2 else range(step - 1, num, step)):
+    for k in range(0, len(names), step):
         middle = side * (k + 0.5)
-        parts.append(label(_LEFT + middle, _TOP - 5, str(k + 1), "middle"))
-        parts.append(label(_LEFT - 4, _TOP + middle + 4, str(k + 1), "end"))
+        half = 0.5 * _CHARACTER * len(names[k])
+        parts.append(label(min(left + middle, WIDTH - half), _TOP - 5, names[k], "middle"))
+        parts.append(label(left - 4, _TOP + middle + 4, names[k], "end"))
     return parts
 
 
-def _layer(measure: Measure, cells: Sequence[tuple[int, int, PairEntry]], side: float, num: int) -> list[str]:
+def _layer(
+    measure: Measure, cells: Sequence[tuple[int, int, PairEntry]], side: float, whole: tuple[int, float]
+) -> list[str]:
+    num, left = whole
     shades: dict[int, list[str]] = {}
     texts = []
     box = f"h{number(side)}v{number(side)}h-{number(side)}z"
@@ -108,22 +120,22 @@ def _layer(measure: Measure, cells: Sequence[tuple[int, int, PairEntry]], side: 
         value = measure.value(pair)
         if value is None:
             continue
-        x, y = _LEFT + b * side, _TOP + a * side
+        x, y = left + b * side, _TOP + a * side
         shades.setdefault(measure.shade(value), []).append(f"M{number(x)} {number(y)}{box}")
         if num <= _TEXTS:
             texts.append(
                 label(x + side / 2, y + side / 2 + 4, format(value, measure.form), "middle", "value")
             )
     parts = [tag("path", d="".join(d), class_=f"cell s{k}") for k, d in sorted(shades.items())]
-    return [*parts, *texts, *_legend(measure, side * num)]
+    return [*parts, *texts, *_legend(measure, side * num, left)]
 
 
-def _legend(measure: Measure, whole: float) -> list[str]:
+def _legend(measure: Measure, whole: float, left: float) -> list[str]:
     """In the lower left, where no pair stands."""
     top = _TOP + whole - 18 * len(measure.legend) - 6
-    parts = [label(_LEFT + 8, top - 6, measure.words, class_="axis")]
+    parts = [label(left + 8, top - 6, measure.words, class_="axis")]
     for k, words in enumerate(measure.legend):
         y = top + 18 * k
-        parts.append(tag("rect", x=_LEFT + 8, y=y, width=14, height=14, class_=f"cell s{k}"))
-        parts.append(label(_LEFT + 28, y + 11, words))
+        parts.append(tag("rect", x=left + 8, y=y, width=14, height=14, class_=f"cell s{k}"))
+        parts.append(label(left + 28, y + 11, words))
     return parts

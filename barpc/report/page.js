@@ -1,4 +1,7 @@
 "use strict";
+const unfold = sections => { for (const section of sections) for (const e of section.querySelectorAll(":scope > .whole")) e.open = true; };
+const asked = () => unfold([...document.querySelectorAll("section")].filter(section => "#" + section.id === location.hash));
+addEventListener("hashchange", asked); addEventListener("beforeprint", () => unfold(document.querySelectorAll("section"))); asked();
 // The page is whole without this: tables that sort and filter, one selection in map, matrix, tables and panels,
 // and residual maps in large.
 const make = (name, set, ...children) => { const e = Object.assign(document.createElement(name), set); e.append(...children); return e; };
@@ -7,7 +10,7 @@ const pairs = new Map(facts.pairs.map(([a, b, ...rest]) => [a + "-" + b, rest]))
 const bar = document.querySelector(".chosen"), matrix = document.querySelector(".matrix");
 let chosen = [];
 
-const image = k => `${k + 1} ${facts.views[k][0]}`;
+const image = k => facts.views[k][0];
 const say = ([a, b]) => {
   if (b === undefined) return `${image(a)}: ${facts.views[a][1]} tie points`;
   const found = pairs.get(a + "-" + b);
@@ -75,11 +78,10 @@ for (const table of document.querySelectorAll("table")) {
     const compare = (a, b) => a !== "" && b !== "" && !isNaN(a) && !isNaN(b) ? a - b : a.localeCompare(b, undefined, { numeric: true });
     body.append(...[...body.rows].sort((a, b) => compare(key(a), key(b)) * (down ? -1 : 1)));
   }));
-  if (heads[0].textContent.trim() === "#" && facts.views.length) {
+  if (rows.length && rows[0].dataset.views && facts.views.length) {
     table.classList.add("live");
     rows.forEach((row, k) => {
-      const views = row.cells[0].textContent.trim().split("-").map(n => n - 1).sort((a, b) => a - b);
-      row.dataset.views = views.join("-");
+      const views = row.dataset.views.split("-").map(Number);
       row.tabIndex = k ? -1 : 0;
       row.addEventListener("click", () => choose(views, row));
       row.addEventListener("keydown", event => {

@@ -6,8 +6,8 @@ A section is a question that a user has, the answer in words, and the charts and
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence, Set
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,9 +20,11 @@ from barpc.geodesy import Array
 from barpc.report import charts
 from barpc.report.compare import flat_options
 from barpc.report.decisions import decisions, second_attempts
+from barpc.report.digest import SHOWN, flagged, offset_of, sentences, worst_first, worst_pairs
 from barpc.report.maps import ground_map, residual_panels
 from barpc.report.matrix import facts, pair_matrix
 from barpc.report.records import Cell, Table, cell_of, table
+from barpc.report.reservations import FEW_OBSERVATIONS, GOOD, GOOD_RMSE
 from barpc.report.summary import (
     DATUM,
     GCPS,
@@ -39,13 +41,17 @@ from barpc.report.summary import (
     listed,
     metres,
 )
+from barpc.report.summary.words import counted
 from barpc.report.tables import Relief, RunFiles, read_summary, read_tables
-from barpc.report.verdict import GOOD
 from barpc.scene import connected_groups
 from barpc.workspace import Workspace
 
 NAME = "report.html"
 _MOST_LINES = 200  # sentences of the verdict
+_SHOWN_LINES = 16  # of these, before the rest is unfolded
+_LENGTHS = "How many images see a tie point"
+_OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
+_FEW_PANELS = 10  # residual maps of as many, before the rest is unfolded
 REPORT = "report"  # the stage that makes the page, which cannot tell how long it took
 
 
@@ -64,11 +70,16 @@ def report_html(summary: Summary, folder: Path | str) -> str:
     """
     files = read_tables(summary, Path(folder))
     shown = [section for make in SECTIONS if (section := make(files)) is not None]
+    if len(summary.views) > SHOWN:
+        shown = [replace(section, folded=section.key not in _OPEN, half=False) for section in shown]
     known = facts(files) if len(summary.views) <= charts.MAX_DRAWN else {"views": [], "pairs": []}
     return visible(
         _template().render(
             summary=summary,
             sections=shown,
+            verdict=sentences(summary),
+            large=len(summary.views) > SHOWN,
+            shown_lines=_SHOWN_LINES,
             words=STATUS_WORDS,
             most_lines=_MOST_LINES,
             facts=json.dumps(known, separators=(",", ":")).replace("<", "\\u003c"),
@@ -117,7 +128,8 @@ class Section:
     """A question and its answer, with what shows it.
 
     `points`: sentences; `panels`: small maps; `folds`: words and more of them that open on demand; `bars`: words, a
-    value as text and a length in percent; `half`: half the width of a desk's screen is enough.
+    value as text and a length in percent; `half`: half the width of a desk's screen is enough; `folded`: it opens on
+    demand; `bars_called`: words under which many images fold the bars.
     """
 
     key: str
@@ -130,6 +142,8 @@ class Section:
     bars: Sequence[tuple[str, str, float]] = ()
     tables: Sequence[Table] = ()
     half: bool = False
+    folded: bool = False
+    bars_called: str = ""
 
 
 def _images(files: RunFiles) -> Section:
@@ -139,8 +153,11 @@ def _images(files: RunFiles) -> Section:
     if any(view.advice for view in views):
         answer += " What to do about the others stands in the verdict above."
     caption = "Images: reprojection error (RMS) of the tie points that count"
-    shown = table("images", caption, views, ViewEntry, ViewEntry.PAGE, files.summary.adjusted)
-    shown = shown.numbered([cell_of(k + 1) for k in range(len(views))])
+    caption += "; those that need a look first" * any(view.advice for view in views)
+    rows = worst_first(views)
+    columns = ViewEntry.PAGE if any(view.cause for view in views) else ViewEntry.PAGE.replace("wrong ", "")
+    shown = table("images", caption, rows, ViewEntry, columns, files.summary.adjusted)
+    shown = shown.marked([f"{files.number[view.name]}" for view in rows])
     return Section("images", "Which images can I use?", answer, tables=[shown])
 
 
@@ -149,8 +166,8 @@ def _map(files: RunFiles) -> Section | None:
     shown = []
     if any(files.outlines):
         caption = (
-            "Outlines at the altitude of the scene with their numbers in the table of images; dots are tie points;"
-            " a stronger line stands for more matches."
+            "Outlines at the altitude of the scene, named where there is room, those that need a look on top; dots are"
+            " tie points; a stronger line stands for more matches."
         )
         if files.summary.gcps or files.summary.check_points:
             caption += " Triangles are GCPs, those on their tip check points."
@@ -160,13 +177,13 @@ def _map(files: RunFiles) -> Section | None:
             )
         shown.append((ground_map(files), caption))
     if shown and len(views) > charts.MAX_DRAWN:
-        more = f"At most {charts.MAX_DRAWN} of {len(views)} outlines are drawn, evenly taken, and no matrix"
+        more = f"At most {charts.MAX_DRAWN} of {len(views)} outlines are drawn, good ones evenly taken, and no matrix"
         shown[0] = (shown[0][0], f"{shown[0][1]} {more}; all are in footprints.geojson and pairs.csv.")
     if pairs and 2 < len(views) <= charts.MAX_DRAWN:
-        caption = "Every two images with tie points in common, numbered as in their table."
+        caption = "Every two images with tie points in common; point at a cell for their names."
         shown.append((pair_matrix(files), caption))
     question = "Where are the images, and which hold together?"
-    return Section("map", question, _bonds(files), shown, bars=_lengths(files))
+    return Section("map", question, _bonds(files), shown, bars=_lengths(files), bars_called=_LENGTHS)
 
 
 def _lengths(files: RunFiles) -> list[tuple[str, str, float]]:
@@ -209,7 +226,9 @@ def _randomness(files: RunFiles) -> Section | None:
     if not len(files.observations.view):
         return None
     views, adjusted, folds = files.summary.views, files.summary.adjusted, []
-    panels, shares, key = residual_panels(views, files.observations, "after" if adjusted else "before")
+    first = [files.number[view.name] for view in flagged(views)]
+    when = "after" if adjusted else "before"
+    panels, shares, key = residual_panels(views, files.observations, when, first)
     marked = [view.name for view, share in zip(views, shares, strict=True) if share > 0.5]
     answer = "Mostly: in no image do residuals point the same way in more than half of the cells."
     if marked:
@@ -220,8 +239,11 @@ def _randomness(files: RunFiles) -> Section | None:
         " A cell is darker where its error is larger; thin lines are single residuals; a bold arrow is the mean of a"
         f" cell that is larger than chance allows. {key}"
     )
+    if len(panels) > _FEW_PANELS:
+        folds.append((f"{len(panels) - _FEW_PANELS} more images", panels[_FEW_PANELS:]))
+        panels = panels[:_FEW_PANELS]
     if adjusted:
-        before, _, key = residual_panels(views, files.observations, "before")
+        before, _, key = residual_panels(views, files.observations, "before", first)
         folds.append((f"Before the adjustment. {key}", before))
     return Section("random", "Are the residuals random?", answer, panels=panels, folds=folds)
 
@@ -251,31 +273,38 @@ def _relief(one: Relief) -> tuple[str, str]:
 
 
 def _pairs(files: RunFiles) -> Section | None:
-    pairs, number = files.summary.pairs, files.number
+    pairs, number = worst_pairs(files.summary.pairs), files.number
     if not pairs:
         return None
-    ends = [(number[pair.a] + 1, number[pair.b] + 1) for pair in pairs]
-    worst = max(
-        (before if after is None else after) or 0.0 for before, after in (p.offset_rms for p in pairs)
-    )
+    ends = [sorted((number[pair.a], number[pair.b])) for pair in pairs]
+    worst = max(pairs, key=offset_of)
     answer = (
-        f"The epipolar offset, which no height explains, is {worst:.3f} px (RMS) in the worst"
-        " pair; stereo matching along epipolar lines wants it well below 0.5 px."
+        f"The epipolar offset, which no height explains, is {offset_of(worst):.3f} px (RMS) in the worst pair"
+        f" ({worst.a} - {worst.b}); stereo matching along epipolar lines wants it well below {GOOD_RMSE:g} px."
     )
     seen = [pair for pair in pairs if None not in (pair.convergence_deg, pair.base_to_height)]
     if seen:
-        answer += _heights(seen)
+        answer += _heights(seen, {view.name for view in files.summary.views if view.advice})
     caption = "Pairs: distance of matches from the epipolar line, median ± spread (1.4826 MAD)"
     found = table("pairs", caption, pairs, PairEntry, PairEntry.PAGE, files.summary.adjusted)
-    found = found.numbered([Cell(f"{a}-{b}", a + b / 1e6) for a, b in ends])
+    found = found.marked([f"{a}-{b}" for a, b in ends])
     question = "Do the pairs fit for stereo, and can heights be measured?"
     return Section("pairs", question, answer, tables=[found])
 
 
-def _heights(pairs: Sequence[PairEntry]) -> str:
-    best = min(pairs, key=lambda pair: pair.height_m_per_px or np.inf)
-    if not best.height_m_per_px:
+def _heights(pairs: Sequence[PairEntry], doubted: Set[str]) -> str:
+    """Which pair heights come best from: of images without reservation, with enough matches to know it."""
+    if not any(pair.height_m_per_px for pair in pairs):
         return " No pair says anything about heights: all rays are parallel."
+    sure = [
+        pair
+        for pair in pairs
+        if pair.height_m_per_px and pair.num_matches >= FEW_OBSERVATIONS and not {pair.a, pair.b} & doubted
+    ]
+    best = min(sure, key=lambda pair: pair.height_m_per_px or np.inf, default=None)
+    if best is None or best.height_m_per_px is None:
+        few = f"{FEW_OBSERVATIONS} matches or more"
+        return f" No pair of images without reservation has {few}: none is named for heights."
     words = (
         f" Heights come best from {best.a} - {best.b}: the rays meet under {best.convergence_deg:.1f} degrees"
         f" (B/H {best.base_to_height:.2f}), so one pixel of parallax is {metres(best.height_m_per_px)} of height."
@@ -384,7 +413,7 @@ def _rms(rows: Any) -> Array:
 def _files(files: RunFiles) -> Section | None:
     views, tables = files.summary.views, []
     if all(view.fit for view in views):
-        caption = "Refitted RPCs against P_BA, on points that the fit has not seen"
+        caption = "Refitted RPCs against the corrected cameras, on points that the fit has not seen"
         tables.append(table("fits", caption, views, ViewEntry, ViewEntry.FITS))
     outputs = {file: found for view in views for file, found in view.outputs.items()}
     if outputs:
@@ -393,7 +422,7 @@ def _files(files: RunFiles) -> Section | None:
         rows = [
             [cell_of(file), *(_reading(found.get(c)) for c in consumers)] for file, found in outputs.items()
         ]
-        caption = "Files reopened as their readers do: largest difference to P_BA [px]"
+        caption = "Files reopened as their readers do: largest difference to the corrected cameras [px]"
         tables.append(Table("files", caption, heads, rows))
     if not tables:
         return None
@@ -416,9 +445,9 @@ def _reading(found: float | str | None) -> Cell:
 def _run(files: RunFiles) -> Section:
     summary, tracks = files.summary, files.summary.tracks
     stages = [stage for stage in summary.stages if stage.stage != REPORT]
-    counts = f"{tracks.num_tracks} tie points, {tracks.num_observations} observations"
+    counts = f"{counted(tracks.num_tracks, 'tie point')}, {counted(tracks.num_observations, 'observation')}"
     seconds = f", {sum(stage.seconds for stage in stages):.1f} s" if stages else ""
-    answer = f"{len(summary.views)} images, {counts}{seconds}."
+    answer = f"{counted(len(summary.views), 'image')}, {counts}{seconds}."
     if not summary.tables.complete:
         answer += f" Tables and charts hold {summary.tables.num_written_tracks} tie points, evenly taken."
     longest = max([stage.seconds for stage in stages], default=1.0) or 1.0

@@ -194,11 +194,11 @@ class Table:
     columns: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     folded: bool = False
+    marks: Sequence[str] = ()
 
-    def numbered(self, numbers: Sequence[Cell]) -> Table:
-        """The same behind a column of numbers."""
-        rows = [[number, *row] for number, row in zip(numbers, self.rows, strict=True)]
-        return replace(self, columns=["#", *self.columns], rows=rows)
+    def marked(self, marks: Sequence[str]) -> Table:
+        """The same with the indices of the images of each row, for the page's script: one, or two with a hyphen."""
+        return replace(self, marks=list(marks))
 
     @property
     def shown(self) -> Sequence[Sequence[Cell]]:

@@ -123,6 +123,24 @@ class Run:
         return met_worse(unused, size, found.options.robust_threshold, SMOOTH_LEFT, MANY_REJECTED)
 
     @cached_property
+    def beside(self) -> dict[int, int]:
+        """Views most of whose tie points that took no part are seen, too, in one whose own contradict the others.
+
+        View -> that view: tie points are intersected with its rays, so it is seen in the residuals of all.
+        """
+        view, point, num = self.tracks.view, self.tracks.point, len(self.views)
+        kept = np.bincount(view[self.keep], minlength=num)
+        cut = np.bincount(view[~(self.keep | self.held_out | self.moving)], minlength=num)
+        held = np.bincount(view[self.held_out], minlength=num)
+        found: dict[int, int] = {}
+        for bad in np.flatnonzero(cut > kept).tolist():
+            seen = np.zeros(self.tracks.num_points, dtype=bool)
+            seen[point[view == bad]] = True
+            shared = np.bincount(view[self.held_out & seen[point]], minlength=num)
+            found |= {v: bad for v in np.flatnonzero(2 * shared > held).tolist() if v != bad}
+        return found
+
+    @cached_property
     def control_tests(self) -> list[ControlResidual]:
         """The residuals of control and of a reference's points in the images that could be tested."""
         if self.adjustment is None:

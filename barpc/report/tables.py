@@ -30,6 +30,7 @@ from barpc.report.summary import SCHEMA, PairEntry, Summary, ViewEntry, publishe
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.geometry import footprint
 from barpc.sidefile import GEOJSON, SUMMARY, TABLE, Kind, parse_json, read_json, read_text
+from barpc.workspace import table_path
 
 RESIDUALS = (
     "lon",
@@ -278,13 +279,17 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
         A table is missing or damaged; the message names it.
     """
     names = [view.name for view in summary.views]
-    outlines = _read(folder / "footprints.geojson", GEOJSON, _outlines)
+    outlines = _read(table_path(folder, "footprints.geojson"), GEOJSON, _outlines)
     if len(outlines) != len(names):
-        raise InputError(f"{folder / 'footprints.geojson'}: {len(outlines)} outlines of {len(names)} images")
-    observations = _read(folder / "observations.csv", TABLE, lambda text: _observations(text, names))
-    points, tracks = _read(folder / "residuals.csv", TABLE, _points)
-    there = os.path.lexists(folder / SURFACE)
-    reliefs = _read(folder / SURFACE, SUMMARY, _reliefs) if there else ()
+        raise InputError(
+            f"{table_path(folder, 'footprints.geojson')}: {len(outlines)} outlines of {len(names)} images"
+        )
+    observations = _read(
+        table_path(folder, "observations.csv"), TABLE, lambda text: _observations(text, names)
+    )
+    points, tracks = _read(table_path(folder, "residuals.csv"), TABLE, _points)
+    surface = table_path(folder, SURFACE)
+    reliefs = _read(surface, SUMMARY, _reliefs) if os.path.lexists(surface) else ()
     return RunFiles(summary, observations, points, tracks, outlines, reliefs)
 
 

@@ -9,38 +9,42 @@ from typing import Any
 import numpy as np
 
 from barpc.ba import Adjustment, check_residuals
-from barpc.ba.apart import APART, Apart
+from barpc.ba.apart import APART
 from barpc.ba.evidence.scan import SURE
 from barpc.ba.judging.snooping import ControlTest
 from barpc.geodesy import Array
-from barpc.report.dem_lines import dem_lines, dem_reasons, holds_reference
+from barpc.report.dem_lines import dem_lines, dem_reasons
 from barpc.report.records import plain
-from barpc.report.run import MANY_REJECTED, SMOOTH_LEFT, Run
-from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
-from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_entries, strangeness
+from barpc.report.reservations import NOISE_LIMIT, anywhere, is_smooth, lost, standing_out, view_status
+from barpc.report.run import MANY_REJECTED, Run
+from barpc.report.summary import LeftOutEntry, Summary, ViewEntry, listed, measure, median, metres
+from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_entries
+from barpc.report.summary.words import counted
 from barpc.scene import GroundPoints
-from barpc.sensor.rpc import RPC
 from barpc.tie.reference import PEAK
 
-GOOD_RMSE = 0.5  # A view whose tie points are left with more than this [px] is called doubtful
-FEW_OBSERVATIONS = 30  # A view with fewer is called weakly tied, unless control points hold it
-ENOUGH_GCPS = 3  # Control points that hold a view without any tie point
-
-WORST_LEFT = 0.15  # px: an image with more anywhere is called doubtful
 PRIOR_WIDENED = 2.0  # Cameras that are farther off than stated by more than this factor need a look
-NOISE_LIMIT = 2.5  # Tie points that scatter by more than so many times what the matcher states need a look
 _MOST_NAMED = 5  # images in a sentence
 MOVED = (
     3.0  # A scene that moved by more than so many times what its cameras' accuracies let expect needs a look
 )
 
-GOOD = {"adjust": "adjusted", "check": "consistent", "match": "tied"}
-"""Kind of a run -> the status of a view without reservation."""
+_SAY_REJECTED = (
+    "contradicted",
+    "rejected",
+    "wrong_matches",
+)  # causes whose sentence says how many were rejected
+_SAY_WHERE = "rejected", "place"  # causes whose sentence says where in the image
 _ALL_WELL = {
-    "adjust": "All {} images are adjusted",
-    "check": "The cameras of all {} images agree",
-    "match": "All {} images are tied together",
+    "adjust": ("The image is adjusted", "Both images are adjusted", "All {} images are adjusted"),
+    "check": (
+        "The image was looked at",
+        "The cameras of both images agree",
+        "The cameras of all {} images agree",
+    ),
+    "match": ("The image was looked at", "Both images are tied together", "All {} images are tied together"),
 }
+"""Kind of a run -> what is said of one, two and more images of which all is well."""
 _CONTROL_WORDS = {
     "rejected": "{} rejected, contradicted by the rest: check coordinates, axes and image positions",
     "contradicts": "{} off by more than 4 standard deviations, used all the same: the stated accuracies are too good, "
@@ -48,165 +52,7 @@ _CONTROL_WORDS = {
 }
 
 
-def view_status(view: ViewEntry, run: Run) -> dict[str, str]:
-    """The verdict on a view: a word of `STATUS_WORDS`, and what to do (empty when all is well)."""
-    for status, reason in (("failed", _failure), ("weak", _weakness), ("doubtful", _doubt)):
-        if advice := reason(view, run):
-            return {"status": status, "advice": advice}
-    return {"status": GOOD[run.kind], "advice": ""}
-
-
-def _failure(view: ViewEntry, run: Run) -> str:
-    tolerance = getattr(getattr(run.options, "fit", None), "tolerance", np.inf)
-    if run.adjustment is not None and view.name in run.adjustment.left_out:
-        return "not tied to the other images: its camera was left as it was"
-    if (apart := _apart(view, run)) is not None and apart.placed is None:
-        left = "They were adjusted without it, and its camera was left as it was: check "
-        if apart.look.as_stated:
-            return f"{strangeness(apart)}. {left}clouds, water and change, and that the RPC belongs to this image"
-        return f"its RPC is not its own: {strangeness(apart)}. {left}that the RPC belongs to this image"
-    beyond = _follows_more(view, run) or getattr(
-        run.options, "grids", False
-    )  # grids hold what the RPC does not
-    if view.fit is not None and not beyond and not all(_known(v) <= tolerance for v in view.fit.max_px):
-        return f"one RPC cannot hold the corrected camera to {tolerance:g} px: lower --drift or the range"
-    return ""
-
-
-def _apart(view: ViewEntry, run: Run) -> Apart | None:
-    """What is known of a view if its RPC is not its own."""
-    apart = None if run.adjustment is None else run.adjustment.apart
-    return apart if apart is not None and apart.is_view(run.number[view.name]) else None
-
-
-def _weakness(view: ViewEntry, run: Run) -> str:
-    few = view.num_observations
-    if few >= FEW_OBSERVATIONS or view.num_gcps >= ENOUGH_GCPS:
-        return ""
-    if run.reference is not None and any(
-        found.points and found.name == view.name for found in run.reference.views
-    ):
-        return ""
-    return f"{f'only {few}' if few else 'no'} tie points: check overlap, clouds and dates"
-
-
-def _doubt(view: ViewEntry, run: Run) -> str:
-    if run.kind == "match":  # how well cameras agree is not what was asked
-        return ""
-    if view.name in run.copies:
-        return f"shows the same pixels as {run.copies[view.name]}: give each image once"
-    if run.adjustment is not None:
-        i = run.number[view.name]
-        if (apart := _apart(view, run)) is not None:
-            stated = (
-                f"{apart.scale:.0f} times farther off than stated" if apart.scale > 1.0 else "not its own"
-            )
-            return (
-                f"its RPC is {stated}: {strangeness(apart)}. It was adjusted alone, against points of the other "
-                "images: check that the RPC belongs to this image"
-            )
-        found = _oddity(i, run.adjustment) or _left(i, run.adjustment) or _beyond(view, run)
-        if found:
-            return found
-    error = _known(view.rmse_after if run.kind == "adjust" else view.rmse_before)
-    if not error <= GOOD_RMSE and view.num_observations:
-        if run.kind == "check":
-            return f"tie points disagree by {error:.2f} px: adjust the cameras"
-        return f"tie points are left with {error:.2f} px: look for wrong matches and moving things"
-    moving = view.num_moving / max(view.num_moving + view.num_rejected + view.num_observations, 1)
-    if moving > MANY_REJECTED:
-        return (
-            f"{100 * moving:.0f} % of its tie points move together and took no part: check that the others are the "
-            "ground that stands still"
-        )
-    if (lost := _lost(view)) > MANY_REJECTED and not _anywhere(view, run):
-        return (
-            f"{100 * lost:.0f} % of its tie points were rejected, neighbours in the same direction: look for clouds, "
-            "water, change"
-        )
-    return ""
-
-
-def _lost(view: ViewEntry) -> float:
-    return view.num_rejected / max(view.num_rejected + view.num_observations, 1)
-
-
-def _anywhere(view: ViewEntry, run: Run) -> bool:
-    """Whether the tie points of a view that were rejected lie off in any direction, as wrong matches do."""
-    return run.adjustment is not None and bool(-np.inf < run.adjustment.alike[run.number[view.name]] <= SURE)
-
-
-def _oddity(i: int, adjustment: Adjustment) -> str:
-    """What is wrong with view i beside the others: its RPC, or something smooth that no correction follows."""
-    prior, smooth = adjustment.prior, adjustment.smooth
-    if prior.odd[i]:
-        others = [adjustment.names[j] for j in np.flatnonzero(prior.odd) if j != i]
-        either = f" (or that of {listed(others)}: the tie points cannot tell)" if others else ""
-        return (
-            f"its RPC is {prior.scale[i]:.0f} times farther off than stated, beside the other images{either}: check "
-            "that it belongs to this image"
-        )
-    if smooth.found(SMOOTH_LEFT)[i] or smooth.shared[i] > SMOOTH_LEFT:
-        along = "along the rows" if smooth.by_row[i] > 0.5 else "over the image"
-        why = "attitude jitter, optics, or steps between detectors, which one RPC does not follow"
-        if adjustment.options.drift == 0:
-            why = "a drift was not allowed (--drift 0)"
-        elif holds_reference(adjustment):
-            unstated = adjustment.terrain is not None and not adjustment.terrain.is_known
-            why = (
-                f"the heights of the DEM (no --geoid), or {why}"
-                if unstated
-                else f"{why}; or the reference bends, or the heights under it do"
-            )
-        size = max(smooth.rms[i], smooth.shared[i])
-        return f"an error of {size:.2f} px that changes {along} is left: {why}"
-    return ""
-
-
-def _beyond(view: ViewEntry, run: Run) -> str:
-    """What one RPC does not hold of a camera that jitter or steps between detectors are corrected in."""
-    told = any(getattr(run.options, name, None) for name in ("grids", "tiles", "resample"))
-    if view.fit is None or told or not _follows_more(view, run):
-        return ""
-    left, most = (
-        float(np.linalg.norm([_known(v) for v in view.fit.rmse_px])),
-        max(map(_known, view.fit.max_px)),
-    )
-    if left <= SMOOTH_LEFT and most <= WORST_LEFT:
-        return ""
-    assert view.correction is not None
-    follows = "attitude jitter or steps between detectors"
-    if not isinstance(run.views[run.number[view.name]].sensor, RPC):
-        follows = "its own orbit and attitude"
-    if view.correction.strip_px:
-        follows = "rows or columns that lie off by themselves"
-    elif view.correction.swing_px:
-        follows = "a swing of its rows"
-    return (
-        f"its corrected camera follows {follows}, of which one RPC leaves "
-        f"{left:.2f} px (RMS; {most:.2f} px at most): use its grids ({view.name}_grid.tif), --tiles or --resample"
-    )
-
-
-def _follows_more(view: ViewEntry, run: Run) -> bool:
-    """Whether a camera is more than one RPC holds, as it was delivered or by what it was corrected by."""
-    one = view.correction
-    physical = not isinstance(run.views[run.number[view.name]].sensor, RPC)
-    return one is not None and any((physical, one.jitter_px, one.detector_px, one.strip_px, one.swing_px))
-
-
-def _left(i: int, adjustment: Adjustment) -> str:
-    """What tie points of view i say that took no part: the others were chosen to agree."""
-    noise, error = adjustment.held_out_noise[i], adjustment.held_out_rms[i]
-    if not noise > NOISE_LIMIT:
-        return ""
-    return (
-        f"tie points that took no part are left with {error:.2f} px, {noise:.1f} times what the matcher states: "
-        "look for wrong matches, moving things, or errors that these unknowns cannot follow"
-    )
-
-
-def _block_reasons(run: Run) -> list[str]:
+def _block_reasons(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     """What the adjustment says of itself that does not fit: priors, noise, the scene's move."""
     if run.adjustment is None or not len(run.tracks):
         return []
@@ -236,10 +82,10 @@ def _block_reasons(run: Run) -> list[str]:
             "these images the others agree, with all they do not. The tie points do not tell which: check the RPCs, "
             "or add an image."
         )
-    out += _left_reasons(run) + _ambiguous(run.adjustment)
+    out += _left_reasons(run, views) + _ambiguous(run.adjustment)
     for group in run.adjustment.two_groups:
         i, j = group.views
-        if not (_oddity(i, run.adjustment) or _oddity(j, run.adjustment)):
+        if not any(prior.odd[v] or is_smooth(v, run.adjustment) for v in (i, j)):
             out.append(
                 f"Tie points of {names[i]} and {names[j]} fall into two groups, {100 * group.share:.0f} % lying "
                 f"{group.apart:.2f} px from the others: there are two solutions, and this is the one between them. "
@@ -260,9 +106,13 @@ def _block_reasons(run: Run) -> list[str]:
     return out
 
 
-def _left_reasons(run: Run) -> list[str]:
-    """Where tie points were cut, or are off, more than elsewhere, or took no part and are; each image's worst."""
+def _left_reasons(run: Run, views: Sequence[ViewEntry] = ()) -> list[str]:
+    """Where tie points were cut, or are off, more than elsewhere, or took no part and are; each image's worst.
+
+    What an image's own reason says is not said again.
+    """
     assert run.adjustment is not None
+    said = {view.name for view in views if view.cause in _SAY_WHERE}
     worst: dict[str, str] = {}
     found, names = left_entries(run.adjustment), run.adjustment.names
     moving = [f"rows {one.first:.0f}-{one.last:.0f} of {one.image}" for one in found if one.moving]
@@ -272,22 +122,12 @@ def _left_reasons(run: Run) -> list[str]:
             "and no camera follows them."
         )
     for one in found:
-        if one.moving:
-            continue
-        if one.rejected > MANY_REJECTED:
-            what = (
-                f"{100 * one.rejected:.0f} % of their tie points contradict the others, half of these by more than "
-                f"{one.apart_px:.2f} px"
-            )
-        elif one.off_px > SMOOTH_LEFT:
-            what = f"their tie points are left with {one.off_px:.2f} px in common"
-        else:
-            continue
-        place = f"{one.axis} {one.first:.0f}-{one.last:.0f} of {one.image}"
-        worst.setdefault(one.image, f"{place[0].upper()}{place[1:]} stand out: {what}.")
+        if what := standing_out(one):
+            place = f"{one.axis.capitalize()} {one.first:.0f}-{one.last:.0f} of {one.image}"
+            worst.setdefault(one.image, f"{place} stand out: {what}.")
     for unmet in run.met_worse:  # what was solved with may agree with what it bent
         worst.setdefault(names[unmet.view], f"{held_out_place(unmet, names)}.")
-    return list(worst.values())
+    return [line for image, line in worst.items() if image not in said]
 
 
 def _ambiguous(adjustment: Adjustment) -> list[str]:
@@ -319,9 +159,9 @@ def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
     """
     bad = [view for view in views if view.status == "failed"]
     look = [view for view in views if view.advice and view.status != "failed"]
-    reasons = [f"{view.name}: {STATUS_WORDS[view.status]}: {view.advice}." for view in bad + look]
-    reasons += [f"{path} was left out: {reason}" for path, reason in run.left_out]
-    whole, points = _block_reasons(run) + dem_reasons(run.adjustment), _control_reasons(run)
+    reasons = [view.reservation for view in bad + look]
+    reasons += [LeftOutEntry(path, reason).reason_text for path, reason in run.left_out]
+    whole, points = _block_reasons(run, views) + dem_reasons(run.adjustment), _control_reasons(run)
     reasons += whole + points
     words = {"adjust": _adjusted_lines, "check": _checked_lines, "match": _matched_lines}[run.kind]
     num_bad = len(bad) + len(run.left_out)
@@ -335,7 +175,7 @@ def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
 
 
 def _headline(run: Run, num: int, bad: int, look: int, more: str) -> str:
-    text, parts = _ALL_WELL[run.kind].format(num), []
+    text, parts = _ALL_WELL[run.kind][min(num, 3) - 1].format(num), []
     if bad:
         word = "not adjusted" if run.kind == "adjust" else "not usable"
         parts.append(f"{bad} {'image is' if bad == 1 else 'images are'} {word}")
@@ -376,11 +216,11 @@ def _control_reasons(run: Run) -> list[str]:
             if names:
                 alike = status == "rejected" and tested.agreed is not None and tested.agreed.alike
                 datum = " They agree with each other: is their datum, or their height, another one?" * alike
-                out.append(f"{words.format(_count(len(names), 'GCP'))}: {listed(names)}.{datum}")
+                out.append(f"{words.format(counted(len(names), 'GCP'))}: {listed(names)}.{datum}")
         out += _undecided(run.gcps.names, tested) + _torn(tested)
         if not tested.fits and not any(tested.status(g) == "contradicts" for g in range(len(tested.used))):
             out.append(
-                f"{_count(int(tested.used.sum()), 'GCP')} scatter {tested.scatter:.1f} times as much as stated: the "
+                f"{counted(int(tested.used.sum()), 'GCP')} scatter {tested.scatter:.1f} times as much as stated: the "
                 "accuracies are too good, or more than one is wrong."
             )
     return out + [f"{line}." for p in (run.gcps, run.check_points) if p is not None for line in p.left_out]
@@ -444,8 +284,8 @@ def _torn(tested: ControlTest) -> list[str]:
     ]
 
 
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
+def _are(some: Sequence[object]) -> str:
+    return "is" if len(some) == 1 else "are"
 
 
 def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
@@ -453,17 +293,19 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     before, after = (median([getattr(view, key) for view in views]) for key in ("rmse_before", "rmse_after"))
     gauge, prior = run.adjustment.gauge, run.adjustment.prior
     tied = sum(view.num_observations > 0 for view in views)
-    lines = [f"Tie points of {tied} images agree to {after:.3f} px (before: {before:.3f} px)."]
-    if not len(run.tracks):
+    was = f" (before: {before:.3f} px)" if np.isfinite(before) else ""
+    lines = [f"Tie points of {counted(tied, 'image')} agree to {after:.3f} px{was}."]
+    if not len(run.tracks) or not np.isfinite(after):
         lines = ["There are no tie points: the cameras are held by control alone."]
     drift = f"drift of degree {run.adjustment.cameras.unknowns.drift}"
     if prior.drift_sigma and np.isfinite(prior.drift_sigma).all():  # an earlier run's are in its matrix
         sizes = f"{_lengths(prior.drift_sigma)} at the first and last row"
         lines.append(f"Rotations change along the rows ({drift}; {sizes}).")
     lines += _jitter_lines(views) + _radar_lines(views)
-    if many := [view.name for view in views if _lost(view) > MANY_REJECTED and _anywhere(view, run)]:
+    unsaid = [view for view in views if lost(view) > MANY_REJECTED and view.cause not in _SAY_REJECTED]
+    if many := [view.name for view in unsaid if anywhere(view, run)]:
         # what is wrong in one image takes the tie points of the others with it
-        alike = [view.name for view in views if _lost(view) > MANY_REJECTED and view.name not in many]
+        alike = [view.name for view in unsaid if view.name not in many]
         why = f"but those of {listed(alike)} in the same" if alike else "as wrong matches are"
         lines.append(
             f"More than {100 * MANY_REJECTED:.0f} % of the tie points of {listed(many)} were rejected, neighbours in "
@@ -493,7 +335,11 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         seen = f"{np.hypot(*image):.2f} px in the images"
         if np.isfinite(ground).all():
             seen += f" and {_lengths(ground)} on the ground (east, north, up)"
-        lines.append(f"{len(run.check_points.names)} check points, not used above, are met to {seen} (RMS).")
+        met = f"{counted(len(run.check_points.names), 'check point')}, not used above, {_are(run.check_points.names)}"
+        if np.isfinite(image).all():
+            lines.append(f"{met} met to {seen} (RMS).")
+        else:
+            lines.append(f"{met} seen by no camera.")
     return lines
 
 
@@ -503,7 +349,7 @@ def _held_lines(run: Run, gcps: GroundPoints, views: Sequence[ViewEntry], known:
     is_seen = np.bincount(gcps.point, minlength=len(gcps.names)) > 0
     tested, lines = run.adjustment.control, []
     held = int(np.count_nonzero(is_seen if tested is None else is_seen & tested.used))
-    with_points = f"With {_count(held, 'GCP')}"
+    with_points = f"With {counted(held, 'GCP')}"
     scale = 1.0 if tested is None or tested.agreed is None else tested.agreed.scale
     if tested is None or tested.agrees:
         lines.append(f"{with_points} {known}{'' if held else ' only'}.")
@@ -513,7 +359,7 @@ def _held_lines(run: Run, gcps: GroundPoints, views: Sequence[ViewEntry], known:
         lines.append(f"{with_points}, taken for {scale:.0f} times less accurate than stated, {known}.")
     else:
         lines.append(
-            f"{_count(held, 'GCP')} that hold the scene do not agree: what is known of its place they do not tell."
+            f"{counted(held, 'GCP')} that hold the scene do not agree: what is known of its place they do not tell."
         )
     if held and tested is not None and tested.agrees and not tested.checked:
         lines.append(f"Nothing checks {'it' if held == 1 else 'them'}: an error in a GCP would not show.")
@@ -542,7 +388,7 @@ def _jitter_lines(views: Sequence[ViewEntry]) -> list[str]:
             median([one.detector_px for one in stepping]),
         )
         lines.append(
-            f"Detectors begin at up to {_count(most, 'column')} of an image, {size:.2f} px RMS apart."
+            f"Detectors begin at up to {counted(most, 'column')} of an image, {size:.2f} px RMS apart."
         )
     return lines
 
@@ -574,18 +420,21 @@ def _reference_lines(run: Run) -> list[str]:
     if found is None or found.control is None:
         return []
     matched = [view for view in found.views if view.points]
+    rest = listed([view.name for view in found.views if not view.points])
+    if not matched:
+        return [f"The reference holds no point of {rest}."] if rest else []
     used, tried = sum(view.points for view in matched), sum(view.tried for view in matched)
     off = ", ".join(f"{np.hypot(*view.offset):.1f} m ({view.name})" for view in matched[:_MOST_NAMED])
     more = f" and {len(matched) - _MOST_NAMED} more" if len(matched) > _MOST_NAMED else ""
     text = (
-        f"Reference: {used} of {tried} points matched at {metres(found.step)} in {_count(len(matched), 'image')}, peak "
-        f"{min(view.peak for view in matched):.1f} or more; as delivered they were off by {off}{more}."
+        f"Reference: {used} of {counted(tried, 'point')} matched at {metres(found.step)} in "
+        f"{counted(len(matched), 'image')}, peak {min(view.peak for view in matched):.1f} or more; as delivered they "
+        f"were off by {off}{more}."
     )
-    if matched:
-        pixels = found.step / max(view.gsd for view in matched)
+    pixels = found.step / max(view.gsd for view in matched)
+    if np.isfinite(pixels):
         text += f" Bends of an image by less than its pixel, {pixels:.2g} px here, it does not tell."
-    rest = [view.name for view in found.views if not view.points]
-    return [text, f"The reference holds no point of {listed(rest)}."] if rest else [text]
+    return [text, f"The reference holds no point of {rest}."] if rest else [text]
 
 
 def _lengths(values: Iterable[float]) -> str:
@@ -598,15 +447,14 @@ def _enu(shift: Array) -> str:
 
 def _checked_lines(_: Run, views: Sequence[ViewEntry]) -> list[str]:
     rmse = median([view.rmse_before for view in views])
-    return [f"Tie points of {len(views)} images agree to {rmse:.3f} px as the cameras are."]
+    if not np.isfinite(rmse):
+        return ["No camera sees tie points of another image."]
+    return [f"Tie points of {counted(len(views), 'image')} agree to {rmse:.3f} px as the cameras are."]
 
 
 def _matched_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
-    return [f"{run.tracks.num_points} tie points of {len(views)} images, {len(run.tracks)} observations."]
-
-
-def _known(value: float | None) -> float:
-    return float("nan") if value is None else value
+    points = counted(run.tracks.num_points, "tie point")
+    return [f"{points} of {counted(len(views), 'image')}, {counted(len(run.tracks), 'observation')}."]
 
 
 def summarize(run: Run) -> Summary:

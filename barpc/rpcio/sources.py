@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from barpc.errors import BarpcError, ImageError, RpcError, RpcFormatError
+from barpc.errors import BarpcError, ImageError, MissingRpcError, RpcError, RpcFormatError
 from barpc.raster import driver_of, identify, open_raster
 from barpc.remote import Place, Remote, beside, place
 from barpc.rpcio.fields import ReadOptions
@@ -235,7 +235,7 @@ def _image_source(path: Place, head: bytes, options: ReadOptions) -> RpcSource:
     elif own is not None:
         source = RpcSource(own, "tag" if driver_of(head) == "GTiff" else "nitf", path)
     else:
-        raise ImageError(
+        raise MissingRpcError(
             f"{path}: no RPC in the image and none beside it (.RPB, _RPC.TXT, .XML, .geom and others)"
             + (
                 "; HDF5 files are not read: write its coefficients as an _RPC.TXT"

@@ -270,7 +270,8 @@ def possible_pairs(
         views,
         [*(pair.views for pair in pairs), *given],
         f"no overlap of at least {options.min_overlap:.0%} under {options.angles[0]:g} to "
-        f"{options.angles[1]:g} deg {where}; remove the stray images or lower the minimum overlap",
+        f"{options.angles[1]:g} deg {where}; remove the stray images (--keep-going keeps the largest group), or lower "
+        "min_overlap ([tie] of a file given with --options)",
     )
     for i, j in sorted(wanted - {pair.views for pair in pairs}):
         logger.warning("%s - %s: listed, but they do not overlap as asked", views[i].name, views[j].name)

@@ -349,7 +349,8 @@ def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Seque
     )
     bare = [r for r in failed if r.status == "too few keypoints"]
     blank = sorted({name for r in bare for name, n in zip(r.names, r.keypoints, strict=True) if not n})
-    advice = "look at the images (clouds? dates? band?), or loosen ratio, search or min_matches"
+    loosen = "loosen ratio, search or min_matches ([tie] of a file given with --options)"
+    advice = f"look at the images (clouds? dates? band?), or {loosen}"
     if blank:
         names = ", ".join(blank[:4])
         advice = f"no detail in {names} (one value? no valid pixels? clouds?): look at the images"

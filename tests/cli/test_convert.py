@@ -10,10 +10,13 @@ from typing import Any
 import click
 import numpy as np
 import pytest
+import rasterio
+from rasterio.windows import Window
 
 from barpc.cameras import Camera, open_camera
 from barpc.cli import convert as module
 from barpc.cli.convert import _check, _shadow_reasons, _tell, _window, check_target
+from barpc.cli.crops import box_of, window_of
 from barpc.errors import InputError, OutputError
 from barpc.fit.certificate import Sample
 from barpc.handoff import Reading
@@ -43,11 +46,11 @@ def file(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("words", "told"),
     [
+        (["a", "-o", "d", "--window", "0", "0", "1", "1"], "--window goes with a TARGET, not with -o"),
         (
-            ["a", "-o", "d", "--window", "0", "0", "1", "1"],
-            "--window and --bbox go with a TARGET, not with -o",
+            ["a", "-o", "d", "--bbox", "0", "0", "1", "1", "--images", "vrt"],
+            "--images goes with whole images",
         ),
-        (["a", "-o", "d", "--bbox", "0", "0", "1", "1"], "--window and --bbox go with a TARGET, not with -o"),
         (["a"], "give SOURCE and TARGET, or images and -o DIR"),
         (["a", "b", "c"], "give SOURCE and TARGET, or images and -o DIR"),
         (["a", "b", "--rpc", "c"], "give SOURCE and TARGET, or images and -o DIR"),
@@ -161,7 +164,7 @@ CAMERA = Camera(Flat(), Path("flat"), "rpb", (200, 100), (0.0, 2000.0))  # type:
 
 
 def window(bbox: Any, alt: float | None = 0.0, dem: Any = None, camera: Camera = CAMERA) -> Any:
-    return _window(camera, Path("flat.tif"), None, bbox, alt, dem)
+    return window_of(camera, Path("flat.tif"), bbox, alt, dem)
 
 
 @pytest.mark.parametrize(
@@ -207,10 +210,96 @@ def test_a_box_may_lie_across_the_antimeridian() -> None:
 
 
 def test_a_window_stands_as_given_and_one_of_both_is_taken() -> None:
-    assert _window(CAMERA, Path("a"), (1, 2, 3, 4), None, None, None) == (1, 2, 3, 4)
-    for both in ((None, None), ((1, 2, 3, 4), (0.0, 0.0, 1.0, 1.0))):
-        with pytest.raises(click.UsageError, match="give either --window or --bbox"):
-            _window(CAMERA, Path("a"), *both, None, None)  # type: ignore[arg-type]
+    none: dict[str, Any] = {"window": None, "bbox": None, "aoi": None}
+    assert _window({**none, "window": (1, 2, 3, 4)})(CAMERA, Path("a")) == (1, 2, 3, 4)
+    for both in (
+        {},
+        {"window": (1, 2, 3, 4), "bbox": (0.0, 0.0, 1.0, 1.0)},
+        {"bbox": (0.0,) * 4, "aoi": "a"},
+    ):
+        with pytest.raises(click.UsageError, match="give one of --window, --bbox and --aoi"):
+            _window({**none, **both})
+
+
+# --- a part of the ground out of many images --------------------------------------------------------------
+
+
+def an_area(path: Path, west: float, south: float, east: float, north: float) -> Path:
+    ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
+    path.write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    return path
+
+
+@pytest.mark.parametrize(
+    "box",
+    [(5.25, 43.0, 5.5, 43.5), (-10.0, -1.0, 10.0, 1.0), (179.5, 10.0, 180.0, 11.0), (0.0, 0.0, 180.0, 1.0)],
+)
+def test_the_box_around_an_area_is_its_own(box: Any, tmp_path: Path) -> None:
+    assert box_of(str(an_area(tmp_path / "a.geojson", *box))) == pytest.approx(box)
+
+
+def test_the_box_around_an_area_on_the_180th_meridian_is_not_the_earth(tmp_path: Path) -> None:
+    west, south, east, north = box_of(str(an_area(tmp_path / "a.geojson", 179.75, 10.0, 180.5, 11.0)))
+    assert (west, south, east, north) == pytest.approx((179.75, 10.0, -179.5, 11.0))
+
+
+@pytest.fixture
+def four(image: Path, tmp_path: Path) -> tuple[list[str], tuple[float, float, float, float]]:
+    """Three images of a place and one of another, and a box of some sixty pixels in the first three."""
+    rpc, paths = read_rpc(image), []
+    for k in range(4):
+        path = tmp_path / f"in/view_{k}.tif"
+        moved = replace(rpc, ground_offset=rpc.ground_offset + [1.0 * (k == 3), 0.0, 0.0])
+        write_rpc_copy(moved, tmp_path / "raw.tif", path)
+        paths.append(str(path))
+    lon, lat, _ = rpc.localize(np.array([[100.0, 100.0]]), np.array([rpc.ground_offset[2]]))[0]
+    return paths, (lon - 1e-4, lat - 1e-4, lon + 1e-4, lat + 1e-4)
+
+
+def test_a_box_is_cut_out_of_every_image_that_shows_it(
+    four: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths, box = four
+    before = {path: Path(path).read_bytes() for path in paths}
+    words = [
+        "convert",
+        *paths,
+        "-o",
+        str(tmp_path / "crops"),
+        "--bbox",
+        *map(str, box),
+        "--rpc-format",
+        "txt",
+    ]
+    assert run(*words) == 0
+    said = capsys.readouterr()
+    found = sorted(p.name for p in (tmp_path / "crops").iterdir() if not p.name.startswith("."))
+    assert found == sorted(f"view_{k}{end}" for k in range(3) for end in (".tif", "_RPC.TXT"))
+    assert f"{paths[3]} is left out" in said.err
+    for k in range(3):
+        crop, whole = read_rpc(tmp_path / f"crops/view_{k}.tif"), read_rpc(paths[k])
+        ground = np.array([[*np.reshape(box, (2, 2)).mean(axis=0), whole.ground_offset[2]]])
+        col, row = np.rint(whole.image_offset - crop.image_offset).astype(int)
+        assert np.allclose(crop.project(ground) + [col, row], whole.project(ground), atol=1e-6)
+        with rasterio.open(tmp_path / f"crops/view_{k}.tif") as cut, rasterio.open(paths[k]) as full:
+            assert max(cut.shape) < 120
+            pixels = full.read(window=Window(col, row, cut.width, cut.height))
+            assert np.array_equal(cut.read(), pixels)
+        text = read_rpc(tmp_path / f"crops/view_{k}_RPC.TXT")
+        assert np.allclose(text.project(ground), crop.project(ground), atol=1e-6)
+    assert {path: Path(path).read_bytes() for path in paths} == before
+    assert run(*words) == 1  # the folder is another's now
+    assert run(*words, "--overwrite") == 0
+
+
+def test_an_area_that_no_image_shows_leaves_no_folder(
+    four: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths, _ = four
+    area = an_area(tmp_path / "a.geojson", 100.0, 10.0, 100.1, 10.1)
+    assert run("convert", *paths, "-o", str(tmp_path / "crops"), "--aoi", str(area)) == 2
+    assert "no image shows what is to be cut out" in capsys.readouterr().err
+    assert not (tmp_path / "crops").exists()
 
 
 def test_a_window_is_cut_and_told(image: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

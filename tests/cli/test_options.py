@@ -10,6 +10,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
+from barpc.cli.adjust import adjust
 from barpc.cli.main import cli
 from barpc.cli.options import _jobs, field_of, flag, flag_name, image_paths, run_options
 from barpc.errors import InputError
@@ -189,14 +190,33 @@ def test_one_word_gives_the_paper_s_method_and_the_file_and_flags_win_over_it(tm
     assert run_options({}, None) == RunOptions()
 
 
-def test_the_help_of_a_run_has_its_flags_under_what_they_are_about() -> None:
-    text = CliRunner().invoke(cli, ["adjust", "--help"], prog_name="barpc").output
-    found: dict[str, set[str]] = {}
+def listed_in_help(verb: str, flag: str) -> dict[str, list[str]]:
+    """Words of a section of the help -> the long flags in it."""
+    text = CliRunner().invoke(cli, [verb, flag], prog_name="barpc").output
+    found: dict[str, list[str]] = {}
     for line in text.splitlines():
         if line.endswith(":") and not line.startswith(" "):
-            found[line[:-1]] = flags = set()
+            found[line[:-1]] = flags = []
         elif line.startswith("  -"):
-            flags.update(word.strip(",") for word in line.split() if word.startswith("--"))
+            flags += [word.strip(",") for word in line.split()[:2] if word.startswith("--")]
+    return found
+
+
+def test_the_help_of_a_run_has_the_usual_flags_and_says_where_the_rest_is() -> None:
+    usual = [flag for flags in listed_in_help("adjust", "--help").values() for flag in flags]
+    assert len(set(usual) - {"--help", "--help-all"}) == 15
+    assert {"--help", "--help-all", "--out-dir", "--gcp", "--dem", "--rpc", "--keep-going"} <= set(usual)
+    assert "--jitter" not in usual
+    whole = [flag for flags in listed_in_help("adjust", "--help-all").values() for flag in flags]
+    known = {flag for one in adjust.params for flag in one.opts if flag.startswith("--")}
+    assert set(whole) == known | {"--help"}
+    assert {"--against", "--rpc"} <= {
+        flag for flags in listed_in_help("check", "--help").values() for flag in flags
+    }
+
+
+def test_the_whole_help_of_a_run_has_its_flags_under_what_they_are_about() -> None:
+    found = {words: set(flags) for words, flags in listed_in_help("adjust", "--help-all").items()}
     assert list(found) == ["Files and the run", "Tie points", "Cameras", "Ground"]
     assert {"--out-dir", "--overwrite", "--jobs", "--help"} <= found["Files and the run"]
     assert {"--matcher", "--aoi"} <= found["Tie points"]

@@ -173,7 +173,7 @@ def test_what_holds_the_scene_is_a_table_where_several_sources_do(
     print_summary(a_summary([], scene=SimpleNamespace(datum=(entry,))))
     title, head, row, *_ = capsys.readouterr().out.splitlines()
     assert title == DATUM
-    assert [word in head for word in ("motion", "cameras as delivered [%]", "earlier run")] == [
+    assert [word in head for word in ("motion", "cameras [%]", "earlier run")] == [
         True,
         True,
         False,

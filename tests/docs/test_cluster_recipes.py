@@ -76,7 +76,7 @@ def test_slurm_runs_the_job_script_and_gives_the_same_bytes(tmp_path):
     barpc.adjust(
         images, tmp_path / "alone", RunOptions(images="none", tie=TieOptions(keypoints_per_image=3000))
     )
-    for name in ("observations.csv", "block.npz", "view_01_RPC.TXT"):
+    for name in ("tables/observations.csv", "tables/block.npz", "view_01_RPC.TXT"):
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes(), name
 
 

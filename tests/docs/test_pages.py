@@ -94,7 +94,7 @@ def test_the_limits_are_those_of_the_code():
 
 def test_the_page_of_the_report_names_every_table_of_a_run():
     text = (DOCS / "report.md").read_text(encoding="utf-8")
-    assert all(f"`{name}`" in text for name in TABLES)
+    assert all(f"`tables/{name}`" in text for name in TABLES)
 
 
 def test_every_page_of_the_navigation_exists_and_every_page_is_in_it():

@@ -5,21 +5,24 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shlex
 import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 
 from barpc.cli import main
 from barpc.errors import InputError, OutputError
-from barpc.export import TARGETS, export_run
+from barpc.export import TARGETS, export_run, neural
 from barpc.export.approx import Sampled, factored, fit_affine, fit_projective, project_affine
-from barpc.rpcio import read_rpc
+from barpc.rpcio import read_rpc, write_rpc_copy
 from barpc.rpcio.acquisition import light_of
 from barpc.sensor.geometry import image_grid
 from tests.lanes import rest_slow
+from tests.rpcio.conftest import write_image
 
 
 def exported(run: Path, target: str, tmp_path: Path, **options: object) -> Path:
@@ -158,7 +161,7 @@ def test_images_of_one_folder_are_called_by_their_names(southern, tmp_path):
 def test_pycolmap_opens_the_model_and_finds_the_errors_that_it_states(southern, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     out = exported(in_one_folder(southern, tmp_path), "colmap", tmp_path)
-    model = pycolmap.Reconstruction(str(out))
+    model = pycolmap.Reconstruction(str(out / "sparse/0"))
     stated = read(out / "world.json")
     assert (model.num_images(), model.num_reg_images()) == (3, 3)
     assert model.num_points3D() > 250
@@ -180,8 +183,27 @@ def test_pycolmap_opens_the_model_and_finds_the_errors_that_it_states(southern, 
     np.testing.assert_allclose(rows[:3, :3] @ rows[:3, :3].T, np.eye(3), atol=1e-12)
 
 
-def test_colmap_refuses_a_name_that_its_text_cannot_hold(southern, tmp_path):
-    with pytest.raises(InputError, match="space"):  # of a folder's name
+def test_colmap_finds_every_image_in_its_folder_and_none_is_copied(southern, tmp_path):
+    for _ in range(2):  # again: in place of the first
+        export_run(southern, "colmap", tmp_path / "model", overwrite=True)
+    lines = (tmp_path / "model/sparse/0/images.txt").read_text().splitlines()[::2]
+    views = read(southern / "summary.json")["views"]
+    for line, view in zip(lines, views, strict=True):
+        path = tmp_path / "model/images" / line.split()[-1]
+        assert path.is_symlink()
+        assert path.resolve() == Path(view["path"]).resolve()
+    assert len(list((tmp_path / "model/images").iterdir())) == len(views)
+    (tmp_path / "other/images").mkdir(parents=True)
+    theirs = tmp_path / "other/images" / lines[0].split()[-1]
+    theirs.write_bytes(b"mine")
+    with pytest.raises(OutputError):
+        export_run(southern, "colmap", tmp_path / "other", overwrite=True)
+    assert theirs.read_bytes() == b"mine"
+
+
+def test_colmap_refuses_a_name_that_its_text_cannot_hold(southern, tmp_path, monkeypatch):
+    monkeypatch.setattr(neural, "_called", lambda scene: [f"{shot.name} a.tif" for shot in scene.shots])
+    with pytest.raises(InputError, match="space"):
         export_run(southern, "colmap", tmp_path / "out")
 
 
@@ -220,7 +242,7 @@ def test_points_come_with_the_covariance_of_their_rays(southern, tmp_path):
     comment, *lines = (out / "points.csv").read_text().splitlines()
     assert comment.startswith("# covariance")
     rows = list(csv.DictReader(lines))
-    table = {int(row["track"]): row for row in rows_of(southern / "residuals.csv")}
+    table = {int(row["track"]): row for row in rows_of(southern / "tables/residuals.csv")}
     assert {int(row["track"]) for row in rows} == set(table)
     assert all(row["alt"] == table[int(row["track"])]["height_above_datum"] for row in rows)
     ply = plyfile.PlyData.read(str(out / "points.ply"))["vertex"]
@@ -233,7 +255,7 @@ def test_points_come_with_the_covariance_of_their_rays(southern, tmp_path):
     assert (values[:, 5] > 2 * values[:, 0]).mean() > 0.9  # heights are worse than places
     # by a Monte Carlo of one point: image noise in, scatter of the intersection out
     rng, track = np.random.default_rng(3), rows[7]["track"]
-    seen = [r for r in rows_of(southern / "observations.csv") if r["track"] == track]
+    seen = [r for r in rows_of(southern / "tables/observations.csv") if r["track"] == track]
     noise = float(comment.split("noise ")[1].split(" px")[0])
     from barpc.geodesy import ecef_from_ground, enu_basis
     from barpc.sensor.geometry import triangulate
@@ -287,6 +309,19 @@ def test_stac_items_are_valid_without_a_date_and_across_the_date_line(run_dir, t
         assert (west > east) == (abs(west) > 100)
         for name in view["outputs"]:
             assert (out / item.assets[name].href).resolve() == (run_dir / name).resolve()
+    collection = read(out / "collection.json")
+    validator.validate_core(collection, pystac.STACObjectType.COLLECTION, "1.1.0", href=None)
+    whole = pystac.Collection.from_file(str(out / "collection.json"))
+    items = list(whole.get_items())
+    assert [item.id for item in items] == [view["name"] for view in views]
+    assert all(item.get_collection().id == whole.id for item in items)
+    (west, south, east, north), turn = whole.extent.spatial.bboxes[0], 360.0
+    assert (east - west) % turn < 1.0
+    for item in items:
+        assert south <= item.bbox[1] < item.bbox[3] <= north
+        assert (
+            0.0 <= (item.bbox[0] - west) % turn <= (item.bbox[2] - west) % turn <= (east - west) % turn + 1e-9
+        )
     assert read(out / f"{views[0]['name']}.json")["properties"]["datetime"] == "2013-04-17T10:32:15.5Z"
     assert read(out / f"{views[1]['name']}.json")["properties"]["datetime"] is None
 
@@ -328,8 +363,8 @@ def test_a_run_that_lies_about_names_writes_and_reads_nothing_outside(name, sout
     old = summary["views"][0]["name"]
     text = (run / "summary.json").read_text().replace(json.dumps(old), json.dumps(name))
     (run / "summary.json").write_text(text)
-    table = (run / "observations.csv").read_text().replace(f"\n{old},", f'\n"{name}",')
-    (run / "observations.csv").write_text(table)
+    table = (run / "tables/observations.csv").read_text().replace(f"\n{old},", f'\n"{name}",')
+    (run / "tables/observations.csv").write_text(table)
     with pytest.raises((InputError, OutputError)):
         export_run(run, "satnerf", tmp_path / "out")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
@@ -418,7 +453,7 @@ def test_the_points_of_renderers_are_a_ply(southern, tmp_path):
     out = exported(southern, "nerfstudio", tmp_path)
     assert read(out / "transforms.json")["ply_file_path"] == "points.ply"
     vertex = plyfile.PlyData.read(io.BytesIO((out / "points.ply").read_bytes()))["vertex"]
-    assert len(vertex) == len((southern / "residuals.csv").read_text().splitlines()) - 1
+    assert len(vertex) == len((southern / "tables/residuals.csv").read_text().splitlines()) - 1
     assert vertex["red"].tolist() == [128] * len(vertex)
     assert "numpy" in sys.modules
 
@@ -431,3 +466,51 @@ def test_an_export_of_another_name_and_altitudes_upside_down_are_refused(souther
             export_run(southern, "s2p", tmp_path / "x", alt_range=altitudes)
     assert not (tmp_path / "x").exists()
     assert export_run(southern, "s2p", tmp_path / "x") == [tmp_path / "x" / "config.json"]
+
+
+def test_the_commands_of_orthoimages_are_ones_that_gdal_takes(southern, tmp_path):
+    """Each line, with its options, through GDAL's own warper: the tie points' ground is where it belongs."""
+    from rasterio.vrt import WarpedVRT
+
+    script = exported(southern, "ortho", tmp_path) / "ortho.sh"
+    head, *lines = script.read_text().split("\n")
+    assert head == "#!/bin/sh"
+    commands = [shlex.split(line) for line in lines if line.startswith("gdalwarp")]
+    views = read(southern / "summary.json")["views"]
+    assert [command[-1] for command in commands] == [f"{view['name']}.tif" for view in views]
+    for command, view in zip(commands, views, strict=True):
+        options = dict(zip(command[2:-2:2], command[3:-2:2], strict=False))
+        assert command[:2] == ["gdalwarp", "-rpc"]
+        key, height = options["-to"].split("=")
+        assert key == "RPC_HEIGHT"
+        assert float(height) == pytest.approx(read(southern / "summary.json")["altitude_m"], abs=300)
+        assert options["-t_srs"].startswith("EPSG:327")
+        assert float(options["-tr"]) == pytest.approx(view["gsd_m"], rel=0.06)
+        assert (script.parent / command[-2]).resolve() == Path(view["path"]).resolve()
+        rpc = read_rpc(southern / next(iter(view["outputs"])))
+        raw = write_image(tmp_path / f"{view['name']}.tif", shape=(1, 700, 900))
+        write_rpc_copy(rpc, raw, tmp_path / "with" / raw.name)
+        how = {"src_crs": "EPSG:4326", "crs": options["-t_srs"], "RPC_HEIGHT": height}
+        with rasterio.open(tmp_path / "with" / raw.name) as opened, WarpedVRT(opened, **how) as ortho:
+            middle = rpc.localize(np.array([450.0, 350.0]), float(height))
+            assert ortho.lnglat() == pytest.approx(tuple(middle[:2]), abs=5e-4)
+
+
+def test_orthoimages_stand_on_the_run_s_dem_made_ellipsoidal(southern, tmp_path):
+    shutil.copytree(southern, tmp_path / "run")
+    summary = read(tmp_path / "run/summary.json")
+    for options, first in (
+        ({"dem": "/d/my dem.tif", "geoid": None}, "gdalwarp -rpc -to 'RPC_DEM="),
+        (
+            {"dem": "/d/my dem.tif", "geoid": "/g/egm96.tif"},
+            "gdalwarp -s_srs '+proj=longlat +datum=WGS84 +geoidgrids=",
+        ),
+    ):
+        (tmp_path / "run/summary.json").write_text(json.dumps({**summary, "options": options}))
+        export_run(tmp_path / "run", "ortho", tmp_path / "maps", overwrite=True)
+        lines = (tmp_path / "maps/ortho.sh").read_text().splitlines()
+        found = [line for line in lines if line.startswith("gdalwarp")]
+        assert found[0].startswith(first)
+        assert found[-1].count("RPC_DEM") == 1
+        assert "my dem.tif" in " ".join(shlex.split(found[0]))
+        assert ("RPC_DEM=dem_ellipsoidal.tif" in found[-1]) == (options["geoid"] is not None)

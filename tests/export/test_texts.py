@@ -47,8 +47,8 @@ def with_shot(of: Scene, **fields: Any) -> Scene:
 
 
 def test_a_scene_holds_what_counts_of_its_run(south, southern):
-    lines = [line.split(",") for line in (southern / "observations.csv").read_text().splitlines()[1:]]
-    table = np.loadtxt(southern / "residuals.csv", delimiter=",", skiprows=1)
+    lines = [line.split(",") for line in (southern / "tables/observations.csv").read_text().splitlines()[1:]]
+    table = np.loadtxt(southern / "tables/residuals.csv", delimiter=",", skiprows=1)
     for shot in south.shots:
         rows = [line for line in lines if line[0] == shot.name and line[8] == "1"]
         assert south.tracks[shot.index].tolist() == [int(row[1]) for row in rows]
@@ -312,7 +312,10 @@ def model(south) -> tuple[Scene, dict[str, list[str]], dict[str, Any]]:
         south, shots=tuple(replace(shot, file=f"/images/{k}.tif") for k, shot in enumerate(south.shots))
     )
     files = neural.colmap(of, OUT)
-    assert set(files) == {"cameras.txt", "images.txt", "points3D.txt", "world.json"}
+    assert set(files) == {f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D")} | {
+        "world.json"
+    }
+    files = {name.removeprefix("sparse/0/"): data for name, data in files.items()}
     return (
         of,
         {name: data.decode().split("\n")[:-1] for name, data in files.items()},
@@ -422,7 +425,10 @@ def test_the_yaml_of_cars(south):
 def test_a_stac_item_says_where_when_and_how(south, southern):
     name = south.shots[0].name
     item = json.loads(catalogue.stac(south, OUT)[f"{name}.json"])
-    assert (item["type"], item["stac_version"], item["id"], item["links"]) == ("Feature", "1.1.0", name, [])
+    assert (item["type"], item["stac_version"], item["id"]) == ("Feature", "1.1.0", name)
+    assert [(one["rel"], one["href"]) for one in item["links"]] == [
+        (rel, "./collection.json") for rel in ("root", "parent", "collection")
+    ]
     assert item["stac_extensions"][0] == "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
     ring = np.array(item["geometry"]["coordinates"][0])
     assert item["bbox"] == pytest.approx(
@@ -564,3 +570,17 @@ def test_nothing_is_known_of_noise_without_observations_to_spare():
     observed = SimpleNamespace(after=np.full((3, 2), 0.5), track=np.array([0, 0, 1]))
     assert np.isnan(scene._noise(SimpleNamespace(observations=observed), np.arange(3)))
     assert np.isnan(scene._noise(SimpleNamespace(observations=observed), np.zeros(0, int)))
+
+
+def test_stereo_is_made_of_images_without_reservation_that_share_thirty_matches(south):
+    views = [replace(view, name=name, advice="look" if name == "C" else "") for view, name in
+             zip(south.summary.views, "ABC", strict=True)]  # fmt: skip
+    base = replace(south.summary.pairs[0], convergence_deg=12.0, num_matches=30)
+    rows = [replace(base, a="A", b="B"), replace(base, a="A", b="C", num_matches=900)]
+
+    def of(*pairs):
+        return list(pairs_of(replace(south, summary=replace(south.summary, views=tuple(views), pairs=pairs))))
+
+    assert of(*rows) == [("A", "B")]
+    assert of(rows[1], replace(rows[0], num_matches=29)) == [("A", "C"), ("A", "B")]  # better than none
+    assert of(rows[1]) == [("A", "C")]

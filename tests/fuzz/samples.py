@@ -47,7 +47,7 @@ from barpc.sensor.sentinel1 import open_product
 from barpc.sensor.sicd import open_sicd
 from barpc.sensor.terrasar import open_terrasar
 from barpc.tie.pairs import read_area
-from barpc.workspace import Workspace
+from barpc.workspace import Workspace, table_path
 from tests.pointio.test_foreign import binary, colmap
 from tests.report.conftest import run_of_block, written
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
@@ -282,7 +282,7 @@ def _run() -> Path:
 
 
 def _beside_run(folder: Path) -> None:
-    for path in _run().iterdir():
+    for path in (*_run().iterdir(), *(_run() / "tables").iterdir()):  # where earlier releases put them
         if path.is_file():
             (folder / path.name).write_bytes(path.read_bytes())
 
@@ -305,7 +305,7 @@ def _in_state(folder: Path) -> None:
 
 
 def _run_sample(name: str, read: Callable[[Path], object], *mutations: Mutate, share: float = 1.0) -> Sample:
-    return Sample(name, read, lambda: (_run() / name).read_bytes(), mutations, _beside_run, share)
+    return Sample(name, read, lambda: table_path(_run(), name).read_bytes(), mutations, _beside_run, share)
 
 
 def _report(path: Path) -> object:

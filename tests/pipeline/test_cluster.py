@@ -175,7 +175,7 @@ def test_workers_close_and_come_during_a_run_and_the_bytes_are_the_same(
     lines = [record.message for record in caplog.records if record.name == cluster.__name__]
     assert any("no worker" in line for line in lines)
     assert any("worker(s), after" in line for line in lines)
-    for name in ("view_00_RPC.TXT", "view_01_RPC.TXT", "observations.csv", "block.npz"):
+    for name in ("view_00_RPC.TXT", "view_01_RPC.TXT", "tables/observations.csv", "tables/block.npz"):
         assert (tmp_path / "dask_run" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes(), name
 
 

@@ -135,9 +135,9 @@ def rpc_formats(run: Run, out: Path, scene: Path) -> None:
 def stop_after(run: Run, out: Path, scene: Path) -> None:
     run("m", stop_after="matching")
     assert (out / "m/matches.csv").exists()
-    assert not (out / "m/block.npz").exists()
+    assert not (out / "m/tables/block.npz").exists()
     run("a", stop_after="adjustment")
-    assert (out / "a/block.npz").exists()
+    assert (out / "a/tables/block.npz").exists()
     assert not list((out / "a").glob("*.vrt"))
     assert list(run.folder.glob("*.vrt"))
 

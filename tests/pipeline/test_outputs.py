@@ -285,13 +285,16 @@ def test_the_outputs_of_a_run_are_known_before_it_starts(tmp_path, view) -> None
         stop: output_names([view, other], RunOptions(stop_after=stop, rpc_formats=("rpb",)), tmp_path)
         for stop in ("matching", "adjustment", "all")
     }
-    common = [*TABLES, "summary.json"] + (["report.html"] if can_render() else [])
+    prior, common = (
+        f"tables/{PRIOR}",
+        [*(f"tables/{name}" for name in TABLES), "summary.json"] + (["report.html"] if can_render() else []),
+    )
     pairs = ["asp/b__c__scene.txt", "asp/scene__b__c.txt"]
     assert sorted(names["matching"]) == sorted([*common, "matches.csv", "matches.npz", *pairs])
-    assert sorted(names["adjustment"]) == sorted([*common, PRIOR])
+    assert sorted(names["adjustment"]) == sorted([*common, prior])
     ends = [".vrt", ".RPB", "_grid.tif", "_correction.tif"]  # grids where an RPC turns out not to do
     files = [name + end for name in ("scene", "b__c") for end in ends]
-    assert sorted(names["all"]) == sorted([*common, *files, PRIOR])
+    assert sorted(names["all"]) == sorted([*common, *files, prior])
     assert sorted(output_names([view], RunOptions(stop_after="matching"), tmp_path / "new")) == sorted(
         [*common, "matches.csv", "matches.npz"]
     )
@@ -315,7 +318,7 @@ def test_a_folder_with_a_summary_is_complete(tmp_path, monkeypatch, page: bool) 
     with Workspace(tmp_path / "out") as run:
         plain = SimpleNamespace(reference=None, options=RunOptions())
         told = outputs.write_tables(run, plain, Said("what was found"))  # type: ignore[arg-type]
-    names = ["a.csv", "b.csv", *(["report.html"] if page else []), "summary.json"]
+    names = ["tables/a.csv", "tables/b.csv", *(["report.html"] if page else []), "summary.json"]
     assert list(dict.fromkeys(written)) == names
     folder = tmp_path / "out"
     assert [(folder / name).read_bytes() for name in names[:2]] == [b"1", b"2"]
@@ -434,7 +437,7 @@ def test_points_of_a_reference_are_written_where_it_held_the_block(
     run = SimpleNamespace(reference=held, adjustment=object() if adjusted else None, options=None)
     with Workspace(tmp_path / "out") as workspace:
         outputs.write_tables(workspace, run, Said("x"))  # type: ignore[arg-type]
-    assert (tmp_path / "out/gcps.geojson").exists() == written
+    assert (tmp_path / "out/tables/gcps.geojson").exists() == written
 
 
 @pytest.mark.parametrize("page", [True, False])

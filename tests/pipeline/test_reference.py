@@ -85,14 +85,14 @@ def test_the_run_says_what_the_reference_did(held, place):
     (line,) = [line for line in held.summary["verdict"] if line.startswith("Reference:")]
     assert "in 3 images" in line
     assert not [line for line in held.summary["verdict"] if "Without ground control" in line]
-    points = read_gcps(place / "held/gcps.geojson", [view.name for view in held.run.views])
+    points = read_gcps(place / "held/tables/gcps.geojson", [view.name for view in held.run.views])
     assert len(points.names) == found["num_points"]
     assert len(points.view) == sum(view["num_points"] for view in found["views"])
 
 
 @pytest.mark.slow
 def test_its_points_can_be_read_as_gcps(held, place):
-    points = read_gcps(place / "held/gcps.geojson", [view.name for view in held.run.views])
+    points = read_gcps(place / "held/tables/gcps.geojson", [view.name for view in held.run.views])
     image = np.array(
         [
             held.adjustment.sensors[v].project(points.lonlatalt[p])
@@ -124,7 +124,7 @@ def test_a_reference_of_another_place_moves_nothing(place, options, tmp_path, ca
         main(["adjust", *map(str, IMAGES), *flags, "-o", str(tmp_path / "wrong")])
     assert stopped.value.code == 3
     assert "does not show what the images show" in capsys.readouterr().out
-    assert not (tmp_path / "wrong/gcps.geojson").exists()
+    assert not (tmp_path / "wrong/tables/gcps.geojson").exists()
     for view in alone.run.views:
         name = f"{view.name}_RPC.TXT"
         assert (tmp_path / "wrong" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()

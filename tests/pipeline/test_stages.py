@@ -62,7 +62,7 @@ def test_every_file_that_options_name_is_an_input() -> None:
         "area.json",
     ]
     found = input_files(given)
-    assert found[0] == Path("earlier") / PRIOR
+    assert found[0] == Path("earlier/tables") / PRIOR
     assert sorted(map(str, found[1:])) == sorted(names)
     assert input_files(RunOptions()) == []
 
@@ -240,7 +240,7 @@ def test_ground_points_that_are_left_out_are_said_and_references_are_looked_at(
     monkeypatch.setattr(inputs, "Dem", SimpleNamespace(open=lambda *given: given))
     monkeypatch.setattr(inputs, "BlockPrior", SimpleNamespace(load=lambda path: path))
     with_all = RunOptions(dem="d.tif", geoid="g.gtx", reference=("r.tif", "s.tif"), fixed_run="earlier")
-    assert side_inputs(with_all, views()) == (("d.tif", "g.gtx"), Path("earlier") / PRIOR)
+    assert side_inputs(with_all, views()) == (("d.tif", "g.gtx"), Path("earlier/tables") / PRIOR)
     assert read == ["r.tif", "s.tif"]
 
 
@@ -252,9 +252,11 @@ def test_the_page_is_named_where_it_can_be_drawn(tmp_path, monkeypatch, drawn) -
     monkeypatch.setattr("barpc.pipeline.outputs.can_render", lambda: drawn)
     names = output_names(views(), RunOptions(), tmp_path)
     assert ("report.html" in names) is drawn
-    assert ("gcps.geojson" in output_names(views(), RunOptions(dem="d", reference=("r",)), tmp_path)) is True
-    assert "gcps.geojson" not in names
-    assert names[-1] == PRIOR
+    assert (
+        "tables/gcps.geojson" in output_names(views(), RunOptions(dem="d", reference=("r",)), tmp_path)
+    ) is True
+    assert "tables/gcps.geojson" not in names
+    assert names[-1] == f"tables/{PRIOR}"
 
 
 # --- the run itself ---------------------------------------------------------------------------------------

@@ -164,7 +164,7 @@ def outliers(scene: Scene) -> Args:
     done = barpc("adjust", scene.a, scene.b, "-o", scene.folder / "good")
     assert done.code == 0, done
     rows = ["image,col,row,track"]
-    for line in (scene.folder / "good/observations.csv").read_text().splitlines()[1:]:
+    for line in (scene.folder / "good/tables/observations.csv").read_text().splitlines()[1:]:
         view, track, *xy = line.split(",")[:4]
         wrong = int(track) % 10 and view == "view_01"
         rows.append(",".join([view, *(map(str, RNG.uniform(0, SIDE, 2)) if wrong else xy), track]))

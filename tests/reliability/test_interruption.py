@@ -214,14 +214,14 @@ def test_results_of_another_version_are_not_used(crops, out, monkeypatch):
 
 
 def test_an_image_that_changed_is_worked_on_again_whatever_its_date(crops, out):
-    first = outputs(out)["observations.csv"]
+    first = outputs(out)["tables/observations.csv"]
     times = crops[0].stat()
     data = bytearray(crops[0].read_bytes())
     data[20000:60000] = bytes(40000)
     crops[0].write_bytes(data)
     os.utime(crops[0], ns=(times.st_atime_ns, times.st_mtime_ns))
     assert barpc("adjust", *crops, "-o", out, "--overwrite").code == 0
-    assert outputs(out)["observations.csv"] != first
+    assert outputs(out)["tables/observations.csv"] != first
 
 
 @pytest.mark.parametrize("year", rest_slow([1971, 2099]))

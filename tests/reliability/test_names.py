@@ -134,10 +134,11 @@ def test_a_name_goes_through_every_file_and_back(names, pristine, tmp_path):
         with rasterio.open(out / f"{name}.vrt") as vrt, rasterio.open(view["path"]) as image:
             assert (vrt.read(1) == image.read(1)).all()
     assert [
-        f["properties"]["name"] for f in json.loads((out / "footprints.geojson").read_text())["features"]
+        f["properties"]["name"]
+        for f in json.loads((out / "tables/footprints.geojson").read_text())["features"]
     ] == names
     for table, columns in (("observations.csv", 1), ("pairs.csv", 2)):
-        with (out / table).open(encoding="utf-8", newline="") as file:
+        with (out / "tables" / table).open(encoding="utf-8", newline="") as file:
             rows = list(csv.reader(file))[1:]
         cells = {text for row in rows for text in row[:columns]}
         assert {from_cell(text) for text in cells} == set(names)

@@ -19,7 +19,14 @@ from .conftest import Said, assert_one_line, barpc, hashes
 from .test_interruption import ROOT, posix, relative
 from .trials import outputs
 
-OTHERS = ("summary.json", "pairs.csv", "report.html", "footprints.geojson", "view_00_RPC.TXT", "view_00.vrt")
+OTHERS = (
+    "summary.json",
+    "tables/pairs.csv",
+    "report.html",
+    "tables/footprints.geojson",
+    "view_00_RPC.TXT",
+    "view_00.vrt",
+)
 
 
 def assert_untouched(folder: Path, before: dict[Path, str], said: Said, *words: str) -> None:
@@ -85,7 +92,7 @@ def test_a_folder_above_or_below_the_images_is_fine(crops, out, tmp_path):
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_user_s_file_is_never_replaced_and_refused_by_name(crops, tmp_path, name):
-    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).parent.mkdir(parents=True)
     (tmp_path / "out" / name).write_text("mine")
     before = hashes([tmp_path])
     said = barpc("adjust", *crops, "-o", tmp_path / "out", "--overwrite")

@@ -93,7 +93,7 @@ def require_same(scene: Path, tmp_path: Path, way: str, orders: list[tuple[Path,
         files.append(outputs(tmp_path / str(number)))
         given = [str(path) for path in order if path.name != "bad.tif"]
         assert [view.path for view in result.views] == given
-    assert {"view_00_RPC.TXT", "view_00.vrt", "summary.json", "block.npz"} <= set(files[0])
+    assert {"view_00_RPC.TXT", "view_00.vrt", "summary.json", "tables/block.npz"} <= set(files[0])
     assert all(other == files[0] for other in files[1:])
 
 

@@ -88,7 +88,7 @@ def test_a_bucket_is_read_by_itself_and_by_workers(store: Store, tmp_path: Path)
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         barpc.adjust(urls, tmp_path / "a", options, executor=pool)
     barpc.adjust([SAMPLES / name for name in NAMES[:2]], tmp_path / "b", options)
-    for name in ("view_00.tif", "view_01_RPC.TXT", "observations.csv", "block.npz"):
+    for name in ("view_00.tif", "view_01_RPC.TXT", "tables/observations.csv", "tables/block.npz"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 

@@ -35,7 +35,7 @@ function use() {
   for (const radio of [...page.querySelectorAll("input[name=measure]")].slice(1)) { radio.click(); found.layers.push(layers()); }
   const field = page.querySelector("#images input[type=search]");
   field.value = "view_0003"; field.dispatchEvent(new view.Event("input"));
-  found.filtered = [...page.querySelectorAll("#t-images tbody tr")].filter(r => r.getBoundingClientRect().height).map(r => r.cells[1].textContent);
+  found.filtered = [...page.querySelectorAll("#t-images tbody tr")].filter(r => r.getBoundingClientRect().height).map(r => r.cells[0].textContent);
   found.count = field.closest(".tools").querySelector(".note").textContent;
   const panel = page.querySelector(".panels figure"); key(panel, "Enter");
   const dialog = page.querySelector("dialog");

@@ -128,3 +128,25 @@ def test_options_of_one_run_alone_count_and_those_without_effect_do_not(tmp_path
     assert (found["a"], found["b"], found["versions"]) == (str(both[0]), str(both[1]), ["1", "1"])
     assert [view["name"] for view in found["views"]] == ["A"]
     assert flat_options({"a": {"b": {"c": 1}}, "d": {}}) == {"a.b.c": 1, "d": {}}
+
+
+def test_runs_of_other_images_of_the_same_names_are_not_compared(block_run, tmp_path):
+    for name, digit in (("one", "1"), ("two", "2")):
+        shutil.copytree(block_run.folder, tmp_path / name)
+        summary = json.loads((tmp_path / name / "summary.json").read_text())
+        for view in summary["views"]:
+            view["path"] = f"/{name}/{view['name']}.tif"
+        summary["inputs"] = [
+            {"path": view["path"], "bytes": 9, "sha256": digit * 64} for view in summary["views"]
+        ]
+        summary["inputs"][0]["sha256"] = "0" * 64  # but for the first
+        (tmp_path / name / "summary.json").write_text(json.dumps(summary))
+    found = compare_runs(tmp_path / "one", tmp_path / "two")
+    assert [view["name"] for view in found["views"]] == ["view_0000"]
+    assert found["only_a"] == found["only_b"] == [view.name for view in block_run.views[1:]]
+    summary["inputs"][0]["sha256"] = "2" * 64
+    (tmp_path / "two/summary.json").write_text(json.dumps(summary))
+    with pytest.raises(
+        InputError, match="are other files, so these runs have none in common: nothing to compare"
+    ):
+        compare_runs(tmp_path / "one", tmp_path / "two")

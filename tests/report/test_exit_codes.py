@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from barpc.ba.robust.consensus import TwoGroups
+from barpc.report.reservations import GOOD
 from barpc.report.summary import STATUS_WORDS, measure
-from barpc.report.verdict import GOOD, block_verdict
+from barpc.report.verdict import block_verdict
 from tests.lanes import diagonal
 from tests.report.conftest import summarize
 

@@ -12,7 +12,7 @@ from barpc.geojson import polygon
 
 
 def outlines(finished):
-    return json.loads((finished.folder / "footprints.geojson").read_text())["features"]
+    return json.loads((finished.folder / "tables/footprints.geojson").read_text())["features"]
 
 
 def rings(geometry):

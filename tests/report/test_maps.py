@@ -31,6 +31,9 @@ from .made import (
 LON, LAT = 111319.491, 110574.276  # m of a degree at the equator, WGS84
 
 
+NAMES = list("ABCDEFGH")
+
+
 def drawn_of(parts) -> Drawing:
     return Drawing(f"<svg>{''.join(parts)}</svg>")
 
@@ -72,7 +75,7 @@ def test_a_scene_across_the_antimeridian_is_not_round_the_earth():
 
 
 def test_the_graticule_says_round_degrees_and_the_scale_bar_a_round_length():
-    lines, texts = maps._graticule(plane(unit=120.0))  # 420 units are 3.5 degrees, 390 km
+    lines, texts, _ = maps._graticule(plane(unit=120.0))  # 420 units are 3.5 degrees, 390 km
     drawn = drawn_of([*lines, *texts])
     assert drawn.lines("grid") == [
         (90, 4, 90, 276), (210, 4, 210, 276), (330, 4, 330, 276), (4, 150, 416, 150), (4, 30, 416, 30),
@@ -102,7 +105,7 @@ def test_a_short_scale_bar_is_in_metres(metres, words):
 def test_no_number_of_the_graticule_stands_at_the_sheet_s_edge():
     for lon, lat in ((10.0, 0.0), (10.3, 0.13), (179.9, -33.3), *((k / 7.0, k / 9.0) for k in range(14))):
         found = Plane(lon, lat, np.array([77.0, 91.0]), 300.0, 77.0 / LON)
-        drawn = drawn_of([*chain(*maps._graticule(found))])
+        drawn = drawn_of([*chain(*maps._graticule(found)[:2])])
         across = [line for line in drawn.lines("grid") if line[0] == line[2]]
         down = [line for line in drawn.lines("grid") if line[1] == line[3]]
         assert all(50 < x < 376 for x, *_ in across)
@@ -148,12 +151,19 @@ def test_the_ground_map_has_outlines_dots_lines_and_points():
     assert drawn.titles("outline adjusted") == ["A: 5 tie points"]
     (dots,) = drawn.all("path", "point")
     assert np.array(corners(dots.get("d"))) == pytest.approx(at(np.array(points)[:, :2]), abs=0.06)
-    assert drawn.titles("tie") == ["1-2 - 3: 100 matches"]  # of all pairs between the stacks; none within one
+    assert drawn.titles("tie") == [
+        "A + 1 - C: 100 matches"
+    ]  # of all pairs between the stacks; none within one
     middle = (at(outlines[0][0][:-1]).mean(axis=0), at(outlines[2][0][:-1]).mean(axis=0))
     assert drawn.lines("tie") == [pytest.approx(np.concatenate(middle), abs=0.006)]
     assert drawn.texts("stack") == [
-        ("1-2", pytest.approx(middle[0][0], abs=0.006), pytest.approx(middle[0][1] + 4, abs=0.006), "middle"),
-        ("3", pytest.approx(middle[1][0], abs=0.006), pytest.approx(middle[1][1] + 4, abs=0.006), "middle"),
+        (
+            "A + 1",
+            pytest.approx(middle[0][0], abs=0.006),
+            pytest.approx(middle[0][1] + 4, abs=0.006),
+            "middle",
+        ),
+        ("C", pytest.approx(middle[1][0], abs=0.006), pytest.approx(middle[1][1] + 4, abs=0.006), "middle"),
     ]
     x, y = at(np.array([10.05, 0.005]))
     assert np.array(drawn.points("gcps")[0]) == pytest.approx(
@@ -259,29 +269,34 @@ def test_lines_between_images_grow_with_the_root_of_their_matches(monkeypatch):
 @pytest.mark.parametrize(
     ("views", "text"),
     [
-        ([0], "1"), ([0, 1], "1-2"), ([0, 1, 2, 5], "1-3, 6"), ([0, 2, 4, 6], "1, 3, 5, 7"),
-        ([0, 2, 4, 6, 8], "1, 3, 5 …"), ([3, 4, 6], "4-5, 7"),
+        ([0], "view_0137"), ([0, 1], "view_0137 + 1"), ([0, 2, 4, 6], "view_0137 + 3"),
     ],
 )  # fmt: skip
-def test_a_stack_is_called_by_the_numbers_of_its_images(views, text):
-    assert maps.Stack(views, np.zeros(2)).text == text
+def test_a_stack_is_called_by_the_name_of_its_first_image(views, text):
+    assert maps.Stack(views, np.zeros(2), "view_0137").text == text
+    long = maps.Stack(views, np.zeros(2), f"{'x' * 60}_0137").text
+    assert long.startswith("…")
+    assert "_0137" in long
+    assert len(long) <= 16 + len(" + 3")
 
 
 def test_images_nearer_than_26_units_are_one_stack_whatever_cell_they_lie_in():
     middles = [(100.0, 100.0), (125.9, 100.0), (126.1, 100.0), (100.0, 126.1), (300.0, 20.0), (318.0, 38.0)]
     at = plane()
     outlines = [[np.array([[10 + (x - 210) / 100, (150 - y) / 200]] * 4)] for x, y in middles]
-    found = maps._stacks(at, outlines)
+    found = maps._stacks(at, outlines, NAMES)
     assert [stack.views for stack in found] == [[0, 1], [2], [3], [4, 5]]
     assert np.array([stack.place for stack in found]) == pytest.approx(
         np.array([middles[k] for k in (0, 2, 3, 4)])
     )
-    assert maps._stacks(at, [[], outlines[0]])[0].views == [1]  # an image that shows no ground has none
+    assert maps._stacks(at, [[], outlines[0]], NAMES)[0].views == [
+        1
+    ]  # an image that shows no ground has none
 
 
 def test_of_two_stacks_as_near_the_earlier_takes_an_image():
     outlines = [[np.array([[10 + (x - 210) / 100, 0.0]] * 4)] for x in (100.0, 140.0, 120.0)]
-    assert [stack.views for stack in maps._stacks(plane(), outlines)] == [[0, 2], [1]]
+    assert [stack.views for stack in maps._stacks(plane(), outlines, NAMES)] == [[0, 2], [1]]
 
 
 @pytest.mark.parametrize(
@@ -292,9 +307,38 @@ def test_of_two_stacks_as_near_the_earlier_takes_an_image():
     ],
 )  # fmt: skip
 def test_numbers_do_not_stand_on_each_other_and_farther_apart_where_there_are_many(dx, dy, num, shown):
-    places = [np.zeros(2), np.array([dx, dy]), *(np.array([1000.0 * k, 500.0]) for k in range(1, num - 1))]
-    stacks = [maps.Stack([0], place) for place in places]
-    assert len(maps._stack_names(stacks)) == num - (not shown)
+    first = np.array([50.0, 50.0])
+    places = [first, first + [dx, dy], *(np.array([200.0, 500.0 * k]) for k in range(1, num - 1))]
+    stacks = [maps.Stack([0], place, "V") for place in places]
+    assert len(maps._stack_names(stacks, num > 30)) == num - (not shown)
+
+
+def test_a_name_stands_on_no_degree_and_in_the_sheet():
+    stacks = [
+        maps.Stack([0], np.array([2.0, 100.0]), "view_0137"),
+        maps.Stack([1], np.array([419.0, 50.0]), "B"),
+    ]
+    drawn = drawn_of(maps._stack_names(stacks, False))
+    assert drawn.texts("stack") == [("view_0137", 32.4, 104.0, "middle"), ("B", 416.4, 54.0, "middle")]
+    assert len(maps._stack_names(stacks, False, [(30.0, 90.0, 20.0)])) == 1
+
+
+def test_outlines_of_images_that_need_a_look_are_on_top_with_their_names():
+    bad = {"status": "doubtful", "advice": "look", "cause": "held_out"}
+    worst = {"status": "failed", "advice": "look", "cause": "untied"}
+    views = [a_view("A", **bad), a_view("B"), a_view("C", **worst), a_view("D")]
+    outlines = [a_square(10.0 + 0.001 * k, 0.0) for k in range(4)]
+    drawn = Drawing(ground_map(files_of(a_summary(views), outlines)))
+    assert [e.get("data-v") for e in drawn.all("g") if e.get("data-v")] == ["1", "3", "0", "2"]
+    assert [text[0] for text in drawn.texts("stack failed")] == ["C"]
+    assert not drawn.texts("stack")  # it would stand on that one
+    many = [a_view(f"V{k}", **(bad if k in (100, 300) else {})) for k in range(500)]
+    drawn = Drawing(
+        ground_map(files_of(a_summary(many), [a_square(10.0 + 0.1 * k, 0.0) for k in range(500)]))
+    )
+    assert [e.get("data-v") for e in drawn.all("g") if e.get("data-v")][-2:] == ["300", "100"]
+    assert len(drawn.all("path", "outline doubtful")) == 2
+    assert len(drawn.all("path", "outline adjusted")) <= 398
 
 
 # --- error ellipses ---------------------------------------------------------------------------------------
@@ -352,7 +396,7 @@ def test_a_panel_draws_residuals_cells_and_arrows_to_one_length():
         == f"A thin line of a 15th of a panel's width is {longest:.2g} px; bold arrows are drawn twice as long."
     )
     assert shares == [1.0, 0.0]
-    assert [caption for _, caption in charts_of] == ["1 A: 100 % systematic", "2 B: 0 % systematic"]
+    assert [caption for _, caption in charts_of] == ["A: 100 % systematic", "B: 0 % systematic"]
     first, second = (Drawing(svg) for svg, _ in charts_of)
     assert first.box == (180, 90)
     assert first.rects("empty") == [(0, 0, 180, 90)]
@@ -388,7 +432,7 @@ def test_a_panel_has_the_shape_of_its_image_within_reason(size, tall):
     charts_of, _, _ = panels([], [a_view(size=size)])
     drawn = Drawing(charts_of[0][0])
     assert drawn.box == (180, tall)
-    assert charts_of[0][1] == "1 A: no tie points"
+    assert charts_of[0][1] == "A: no tie points"
     assert drawn.all("path", "vector")[0].get("d") == "M0 0"
 
 
@@ -428,12 +472,17 @@ def test_of_many_residuals_every_few_th_is_drawn_and_of_many_images_the_most_sys
     many = [a_view(f"V{k}") for k in range(61)]
     pushed = [(60, k, (50.0, 50.0), (0, 0), (0.1, 0.0), True) for k in range(20)]
     found, shares, key = panels([*rows[:101], *pushed], many)
-    assert Drawing(found[0][0]).described.startswith("51 ")  # a hundred an image of sixty
+    assert Drawing(found[1][0]).described.startswith("51 ")  # a hundred an image of sixty
     assert len(found) == 60
-    assert found[-1][1].startswith("61 V60: 100 %")
+    assert found[0][1].startswith("V60: 100 %")
+    flagged = maps.residual_panels(many, seen([*rows[:101], *pushed]), "after", [7, 3])
+    assert [caption.split(":")[0] for _, caption in flagged[0][:3]] == ["V7", "V3", "V60"]
+    assert flagged[2].endswith(
+        "60 are shown: those that need a look, then those with the largest systematic part."
+    )
     assert len(shares) == 61
-    assert key.endswith(" The 60 of 61 images with the largest systematic part are shown.")
-    assert "images with" not in panels(rows, many[:60])[2]
+    assert key.endswith(" Of 61 images 60 are shown: those with the largest systematic part.")
+    assert "are shown" not in panels(rows, many[:60])[2]
 
 
 def test_before_and_after_are_two_and_what_is_not_known_or_used_is_left_out():
@@ -452,7 +501,7 @@ def test_before_and_after_are_two_and_what_is_not_known_or_used_is_left_out():
 )
 def test_a_meridian_has_room_for_its_number(x, shown):
     found = Plane(10.0 - (x - 210) / 200, 0.25, np.array([200.0, 200.0]), 300.0, 1e-3)
-    lines = drawn_of(chain(*maps._graticule(found))).lines("grid")
+    lines = drawn_of(chain(*maps._graticule(found)[:2])).lines("grid")
     assert (any(line[0] == pytest.approx(x, abs=0.006) and line[0] == line[2] for line in lines)) == shown
 
 
@@ -461,5 +510,5 @@ def test_a_meridian_has_room_for_its_number(x, shown):
 )
 def test_a_parallel_has_room_for_its_number(y, shown):
     found = Plane(10.25, (y - 150) / 200, np.array([200.0, 200.0]), 300.0, 1e-3)
-    lines = drawn_of(chain(*maps._graticule(found))).lines("grid")
+    lines = drawn_of(chain(*maps._graticule(found)[:2])).lines("grid")
     assert (any(line[1] == pytest.approx(y, abs=0.006) and line[1] == line[3] for line in lines)) == shown

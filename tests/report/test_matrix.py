@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from barpc.report import matrix
@@ -78,27 +80,31 @@ def test_the_legend_stands_in_the_lower_left_where_no_pair_does():
 
 
 @pytest.mark.parametrize(
-    ("num", "shown"),
-    [
-        (3, [1, 2, 3]),
-        (25, [*range(1, 26)]),  # 15.4 units each
-        (26, [*range(2, 27, 2)]),
-        (51, [*range(2, 52, 2)]),
-        (52, [1, *range(5, 51, 5)]),
-        (200, [1, *range(10, 201, 10)]),
-        (400, [1, *range(20, 401, 20)]),
-        (3000, [1, *range(100, 3001, 100)]),
-    ],
+    ("num", "digits", "step"),
+    [(3, 1, 1), (25, 1, 1), (26, 1, 2), (9, 9, 2), (52, 2, 5), (200, 3, 20), (400, 4, 50), (3000, 4, 500)],
 )
-def test_as_many_numbers_stand_at_the_sides_as_have_room(num, shown):
-    side = 386 / num
-    drawn = Drawing(f"<svg>{''.join(matrix._numbers(num, side))}</svg>")
+def test_as_many_names_stand_at_the_sides_as_have_room(num, digits, step):
+    side, called = 386 / num, [f"{k:0{digits}d}"[-digits:] for k in range(num)]
+    drawn = Drawing(f"<svg>{''.join(matrix._names(called, side, 30.0))}</svg>")
     across = [text for text in drawn.texts("tick") if text[3] == "middle"]
     down = [text for text in drawn.texts("tick") if text[3] == "end"]
-    assert [int(text[0]) for text in across] == [int(text[0]) for text in down] == shown
-    for (word, x, y, _), (_, u, v, _) in zip(across, down, strict=True):
-        place = side * (int(word) - 0.5)
-        assert (x, y, u, v) == pytest.approx((30 + place, 13, 26, 18 + place + 4), abs=0.006)
+    assert [text[0] for text in across] == [text[0] for text in down] == called[::step]
+    for k, (word, x, y, _), (_, u, v, _) in zip(range(0, num, step), across, down, strict=True):
+        place = side * (k + 0.5)
+        assert (y, u, v) == pytest.approx((13, 26, 18 + place + 4), abs=0.006)
+        assert x == pytest.approx(min(30 + place, 420 - 4.1 * len(word)), abs=0.006)
+    ends = [(x - 4.1 * digits, x + 3.75 * digits) for _, x, _, _ in across]
+    assert all(a[1] < b[0] for a, b in pairwise(ends[:-1]))
+
+
+def test_long_names_leave_room_at_the_left_and_are_cut_to_their_ends():
+    views = [a_view(f"IMG_PHR1A_P_{k:04d}") for k in range(3)]
+    drawn = Drawing(pair_matrix(files_of(a_summary(views), [a_pair("IMG_PHR1A_P_0000", "IMG_PHR1A_P_0002")])))
+    assert [text[0] for text in drawn.texts("tick") if text[3] == "end"] == [
+        f"…R1A_P_{k:04d}"[:1] + f"R1A_P_{k:04d}"[-9:] for k in range(3)
+    ]
+    assert drawn.root.get("data-left") == "88"
+    assert drawn.rects("empty")[0][0] == 88
 
 
 @pytest.mark.parametrize(("num", "written"), [(12, True), (13, False)])

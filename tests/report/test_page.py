@@ -116,7 +116,7 @@ def test_a_page_of_many_images_shows_the_worst_and_says_so(block_run, monkeypatc
     monkeypatch.setattr(maps, "_MOST", 4)
     monkeypatch.setattr(records, "MAX_TABLE_ROWS", 5)
     html = page.report_html(block_run.record, block_run.folder)
-    assert "The 4 of 9 images with the largest systematic part are shown." in html
+    assert "Of 9 images 4 are shown: those with the largest systematic part." in html
     assert "the first 5 of 9, all in the files beside this page" in html
     assert html.count('id="panel-after') == 2 * 4  # title and description
 
@@ -167,7 +167,7 @@ def test_the_page_of_many_images_is_bounded_and_says_what_it_leaves_out(block_ru
     assert 1e6 < len(html.encode()) < 3e6
     assert f"And {views - 200} more; all are in summary.json." in html
     assert html.count('class="outline doubtful"') == (views if num == 300 else views // 3)
-    assert ("At most 400 of 1008 outlines are drawn, evenly taken" in html) == (num == 1000)
+    assert ("At most 400 of 1008 outlines are drawn, good ones evenly taken" in html) == (num == 1000)
     assert ('id="matrix-chart-t"' in html) == (num == 300)
 
 
@@ -203,9 +203,9 @@ def test_a_folder_without_a_finished_run_is_refused_with_a_reason(block_run, tmp
 @pytest.mark.parametrize("damage", [None, "nonsense\n1,2,3\n"])
 def test_a_table_that_is_missing_or_damaged_is_named(block_run, tmp_path, name, damage):
     shutil.copytree(block_run.folder, tmp_path / "run")
-    (tmp_path / "run" / name).unlink()
+    (tmp_path / "run/tables" / name).unlink()
     if damage is not None:
-        (tmp_path / "run" / name).write_text(damage)
+        (tmp_path / "run/tables" / name).write_text(damage)
     with pytest.raises(InputError, match=re.escape(name)):
         page.remake_report(tmp_path / "run")
 

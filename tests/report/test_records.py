@@ -187,8 +187,8 @@ def test_a_table_shows_so_many_rows_and_says_what_is_missing(monkeypatch):
     assert (len(cut.shown), cut.heading) == (2, "words; the first 2 of 3, all in the files beside this page")
     assert cut.kinds == ["text", "number"]
     assert Table("k", "words", ["x", "y"], []).kinds == ["text", "text"]
-    numbered = whole.numbered([Cell("1", 1.0), Cell("2", 2.0)])
-    assert numbered.texts == [["#", "x", "y"], ["1", "a", "1"], ["2", "b", "1"]]
+    assert whole.marked(["1", "2-3"]).marks == ["1", "2-3"]
+    assert whole.marked(["1", "2-3"]).texts == whole.texts
 
 
 # --- words ------------------------------------------------------------------------------------------------
@@ -256,11 +256,6 @@ def test_an_image_shows_shares_in_percent():
     pairs = table("k", "c", [a_pair()], PairEntry, PairEntry.PAGE, adjusted=False).columns
     assert "before [px]" in pairs
     assert "after [px]" not in pairs
-
-
-def test_a_table_is_numbered_row_by_row():
-    with pytest.raises(ValueError, match="zip"):
-        Table("k", "words", ["x"], [[Cell("a", "a", "name")]]).numbered([Cell("1", 1.0), Cell("2", 2.0)])
 
 
 def test_what_numbers_a_file_may_hold():

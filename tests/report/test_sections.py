@@ -15,6 +15,7 @@ from barpc.report.summary import (
     EllipseEntry,
     FitEntry,
     ModeEntry,
+    OffsetEntry,
     ReferenceEntry,
     ReferenceViewEntry,
     SceneEntry,
@@ -43,8 +44,9 @@ def test_images_without_reservation_are_counted():
     section = asked("images")
     assert section.answer == "3 of 3 without reservation."
     (table,) = section.tables
-    assert table.columns[:3] == ["#", "image", "verdict"]
-    assert [row[0].text for row in table.rows] == ["1", "2", "3"]
+    assert table.columns[:3] == ["image", "verdict", "tie points"]
+    assert [row[0].text for row in table.rows] == ["A", "B", "C"]
+    assert table.marks == ["0", "1", "2"]
     doubted = asked("images", [VIEWS[0], a_view("B", status="weak", advice="look")])
     assert (
         doubted.answer
@@ -64,7 +66,6 @@ def test_a_row_of_the_table_of_images_is_in_percent_and_pixels():
     (table,) = asked("images", [view]).tables
     assert texts(table) == [
         [
-            "1",
             "A",
             "doubtful",
             "60",
@@ -79,10 +80,10 @@ def test_a_row_of_the_table_of_images_is_in_percent_and_pixels():
             "-",
         ]
     ]
-    assert [cell.key for cell in table.rows[0]][2:6] == [4, 60, 25.0, 25.4]
-    assert table.rows[0][2].kind == "status doubtful"
+    assert [cell.key for cell in table.rows[0]][1:5] == [4, 60, 25.0, 25.4]
+    assert table.rows[0][1].kind == "status doubtful"
     (nothing,) = asked("images", [a_view(num_observations=0, num_rejected=0)]).tables
-    assert nothing.rows[0][4].text == "-"
+    assert nothing.rows[0][3].text == "-"
 
 
 def test_a_map_needs_an_outline_and_a_matrix_three_images_and_a_pair():
@@ -107,7 +108,7 @@ def test_of_too_many_images_there_is_no_matrix_and_the_map_says_so(monkeypatch, 
     monkeypatch.setattr(charts, "MAX_DRAWN", most)
     found = asked("map", pairs=[a_pair()], outlines=[a_square(10.0, 0.0)] * 3).charts
     assert len(found) == charts_shown
-    said = "At most 2 of 3 outlines are drawn, evenly taken, and no matrix; "
+    said = "At most 2 of 3 outlines are drawn, good ones evenly taken, and no matrix; "
     said += "all are in footprints.geojson and pairs.csv."
     assert found[0][1].endswith(said) == cut
 
@@ -188,14 +189,13 @@ def test_pairs_are_told_by_the_worst_offset_and_the_best_heights():
     ]
     section = asked("pairs", pairs=pairs)
     assert section.answer == (
-        "The epipolar offset, which no height explains, is 0.100 px (RMS) in the worst pair; stereo matching along "
-        "epipolar lines wants it well below 0.5 px. Heights come best from A - C: the rays meet under 0.9 degrees (B/H "
-        "0.02), so one pixel of parallax is 71.2 cm of height. 1 of 3 pairs meet under less than one degree and say "
-        "next to nothing about heights."
+        "The epipolar offset, which no height explains, is 0.100 px (RMS) in the worst pair (A - B); stereo matching "
+        "along epipolar lines wants it well below 0.5 px. Heights come best from A - C: the rays meet under 0.9 "
+        "degrees (B/H 0.02), so one pixel of parallax is 71.2 cm of height. 1 of 3 pairs meet under less than one "
+        "degree and say next to nothing about heights."
     )
-    assert [row[0].text for row in section.tables[0].rows] == ["1-2", "1-3", "2-3"]
-    assert [row[0].key for row in section.tables[0].rows] == pytest.approx([1.000002, 1.000003, 2.000003])
-    assert texts(section.tables[0])[0][1:] == [
+    assert section.tables[0].marks == ["0-1", "0-2", "1-2"]
+    assert texts(section.tables[0])[0] == [
         "A - B",
         "100",
         "-",
@@ -403,3 +403,54 @@ def test_a_verdict_of_two_hundred_sentences_is_shown_whole(monkeypatch, num, mor
     html = page.report_html(files.summary, "")
     assert "<li>s199.</li>" in html
     assert ("And 1 more; all are in summary.json." in html) == more
+
+
+# --- many images ------------------------------------------------------------------------------------------
+
+BAD = {"status": "doubtful", "advice": "look", "cause": "held_out"}
+
+
+def test_images_that_need_a_look_are_first_by_verdict_then_by_what_is_wrong():
+    views = [
+        a_view("A"),
+        a_view("B", status="weak", advice="x", cause="few"),
+        a_view("C", **BAD, held_out_px=3.0),
+        a_view("D", **BAD, held_out_px=9.0),
+        a_view("E", status="doubtful", advice="x", cause="contradicted"),
+        a_view("F", status="failed", advice="x", cause="untied"),
+        a_view("G", status="doubtful", advice="x"),  # of an earlier release
+    ]
+    (table,) = asked("images", views).tables
+    assert [row[0].text for row in table.rows] == ["F", "E", "D", "C", "G", "B", "A"]
+    assert table.marks == ["5", "4", "3", "2", "6", "1", "0"]
+    assert [row[2].text for row in table.rows][:3] == [
+        "not tied to the others",
+        "contradicts the others",
+        "tie points that took no part lie off",
+    ]
+    assert "first" in table.caption
+    assert table.columns[2] == "what is wrong"
+
+
+def test_heights_are_recommended_of_images_without_reservation_with_thirty_matches():
+    def answer(*pairs, views=VIEWS):
+        return asked("pairs", views, pairs=pairs).answer
+
+    best = a_pair("A", "B", 29, height_m_per_px=0.5)
+    next_best = a_pair("A", "C", 30, height_m_per_px=0.6)
+    assert "come best from A - C" in answer(best, next_best)
+    assert "come best from A - B" in answer(replace(best, num_matches=30), next_best)
+    doubted = [VIEWS[0], a_view("B", **BAD), VIEWS[2]]
+    assert "come best from A - C" in answer(replace(best, num_matches=900), next_best, views=doubted)
+    assert answer(best).endswith(
+        "No pair of images without reservation has 30 matches or more: none is named for heights."
+    )
+
+
+def test_pairs_that_are_torn_are_first():
+    pairs = [a_pair("A", "B"), a_pair("A", "C", epipolar_after=OffsetEntry(0.0, 0.1, 0.6, 9)),
+             a_pair("B", "C", epipolar_after=OffsetEntry(0.0, 0.1, 0.9, 9))]  # fmt: skip
+    section = asked("pairs", pairs=pairs)
+    assert [row[0].text for row in section.tables[0].rows] == ["B - C", "A - C", "A - B"]
+    assert section.tables[0].marks == ["1-2", "0-2", "0-1"]
+    assert "0.900 px (RMS) in the worst pair (B - C)" in section.answer

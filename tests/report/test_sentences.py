@@ -13,6 +13,7 @@ from barpc.ba.held.ground import TerrainTest
 from barpc.ba.judging.snooping import ControlTest
 from barpc.ba.robust.consensus import TwoGroups
 from barpc.ba.robust.smooth import SmoothTest
+from barpc.report import reservations
 from barpc.report import verdict as verdicts
 from barpc.report.summary import FitEntry
 from barpc.report.verdict import block_verdict, view_status
@@ -47,7 +48,7 @@ def run_of(adjustment: Any = None, kind: str = "adjust", **fields: Any) -> Any:
     usual = {
         "kind": kind, "adjustment": adjustment or adjusted(), "options": SimpleNamespace(), "reference": None,
         "copies": {}, "number": {name: k for k, name in enumerate(NAMES)}, "gcps": None, "check_points": None,
-        "left_out": (), "after": None, "tracks": [0] * 9, "met_worse": (),
+        "left_out": (), "after": None, "tracks": [0] * 9, "met_worse": (), "matched": (), "beside": {},
         "views": tuple(SimpleNamespace(name=name, sensor=make_rpc()) for name in NAMES),
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **fields})
@@ -65,14 +66,19 @@ def said(run: Any, of: Any = None) -> list[str]:
 
 
 def test_the_figures_that_decide():
-    found = (verdicts.GOOD_RMSE, verdicts.FEW_OBSERVATIONS, verdicts.ENOUGH_GCPS, verdicts.MANY_REJECTED)
+    found = (
+        reservations.GOOD_RMSE,
+        reservations.FEW_OBSERVATIONS,
+        reservations.ENOUGH_GCPS,
+        verdicts.MANY_REJECTED,
+    )
     assert found == (0.5, 30, 3, 0.3)
-    found = (verdicts.SMOOTH_LEFT, verdicts.PRIOR_WIDENED, verdicts.NOISE_LIMIT, verdicts.MOVED)
+    found = (reservations.SMOOTH_LEFT, verdicts.PRIOR_WIDENED, verdicts.NOISE_LIMIT, verdicts.MOVED)
     assert found == (0.06, 2.0, 2.5, 3.0)
 
 
 def test_an_image_of_which_all_is_well_has_no_advice():
-    assert view_status(a_view(), run_of()) == {"status": "adjusted", "advice": ""}
+    assert view_status(a_view(), run_of()) == {"status": "adjusted", "advice": "", "cause": None}
 
 
 @pytest.mark.parametrize(
@@ -175,7 +181,7 @@ def test_an_rpc_is_to_hold_its_camera_to_the_tolerance(largest, options, status)
     if status == "failed":
         assert (
             found["advice"]
-            == "one RPC cannot hold the corrected camera to 0.01 px: lower --drift or the range"
+            == "one RPC cannot hold the corrected camera to 0.01 px: lower --drift, or hand its grid on (--grids)"
         )
     assert view_status(a_view(fit=a_fit(9.0)), run_of())["status"] == "adjusted"  # no tolerance was given
 
@@ -212,7 +218,8 @@ def test_an_rpc_that_is_far_off_beside_the_others_is_asked_about():
         return view_status(a_view(name), run_of(adjusted(prior=prior)))["advice"]
 
     assert advice([0]) == (
-        "its RPC is 7 times farther off than stated, beside the other images: check that it belongs to this image"
+        "its RPC is 7 times farther off than stated, beside the other images: check that it belongs to this image "
+        "(--rpc names another)"
     )
     assert "(or that of A, C: the tie points cannot tell)" in advice([0, 1, 2], "B")
     assert "is 8 times" in advice([0, 1, 2], "B")
@@ -494,7 +501,7 @@ def test_a_dem_is_said_to_hold_and_how_the_points_lie_to_it():
         "It has a height for 50 % of the tie points; they lie +2.0 m above it (median; spread 3.0 m).",
     ]
     assert lines(known=0)[1] == "It has a height for 0 % of the tie points."
-    assert lines(known=0, total=0, held=0)[1] == "It has a height for 0 % of the tie points."
+    assert lines(known=0, total=0, held=0)[1] == "The DEM holds nothing: there are no tie points."
     held = "The DEM holds 0 of 40 tie points: "
     assert (
         lines(held=0)[0]

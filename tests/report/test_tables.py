@@ -40,13 +40,13 @@ def rows_of(path):
 
 
 def test_residuals_have_the_column_names_of_asp(block_run):
-    header, _ = rows_of(block_run.folder / "residuals.csv")
+    header, _ = rows_of(block_run.folder / "tables/residuals.csv")
     assert header[:5] == ["lon", "lat", "height_above_datum", "mean_residual", "num_observations"]
 
 
 def test_a_row_of_residuals_is_a_track_where_the_new_cameras_see_it(block_run):
     run = block_run.run
-    _, rows = rows_of(block_run.folder / "residuals.csv")
+    _, rows = rows_of(block_run.folder / "tables/residuals.csv")
     table = np.array(rows, dtype=float)
     usable = np.flatnonzero(np.isfinite(run.ground).all(axis=1))
     assert len(table) == len(usable)
@@ -61,7 +61,7 @@ def test_a_row_of_residuals_is_a_track_where_the_new_cameras_see_it(block_run):
 
 
 def test_observations_give_the_errors_of_the_summary_back(block_run):
-    header, rows = rows_of(block_run.folder / "observations.csv")
+    header, rows = rows_of(block_run.folder / "tables/observations.csv")
     assert tuple(header) == OBSERVATIONS
     for view in block_run.summary["views"]:
         own = [row for row in rows if row[0] == view["name"] and row[8] == "1"]
@@ -82,7 +82,7 @@ def test_outliers_are_in_the_table_with_the_residual_that_had_them_cut(block_run
 
 
 def test_pairs_hold_the_figures_of_the_summary(block_run):
-    header, rows = rows_of(block_run.folder / "pairs.csv")
+    header, rows = rows_of(block_run.folder / "tables/pairs.csv")
     assert len(rows) == len(block_run.summary["pairs"])
     row, pair = dict(zip(header, rows[0], strict=True)), block_run.summary["pairs"][0]
     assert (row["a"], row["b"], int(row["num_matches"])) == (pair["a"], pair["b"], pair["num_matches"])
@@ -91,7 +91,7 @@ def test_pairs_hold_the_figures_of_the_summary(block_run):
 
 
 def test_the_point_cloud_is_the_tie_points_about_the_origin_it_states(block_run):
-    data = (block_run.folder / "points.ply").read_bytes()
+    data = (block_run.folder / "tables/points.ply").read_bytes()
     head, body = data.split(b"end_header\n", 1)
     words = next(line for line in head.decode().splitlines() if line.startswith("comment")).split()
     origin = np.array([float(words[words.index(key) + 1]) for key in ("lon", "lat", "alt")])
@@ -115,7 +115,7 @@ def test_the_same_run_gives_the_same_bytes(block_run):
     assert again == summary
     assert json.dumps(plain(again)) == json.dumps(block_run.summary)
     for name, content in TABLES.items():
-        assert content(run, again) == (block_run.folder / name).read_bytes(), name
+        assert content(run, again) == (block_run.folder / "tables" / name).read_bytes(), name
 
 
 def test_a_huge_run_is_thinned_evenly_and_says_so(block_run, monkeypatch):
@@ -138,12 +138,12 @@ def test_names_with_commas_and_quotes_come_back(antimeridian_run):
     tracks = antimeridian_run.run.tracks
     usable = np.isfinite(antimeridian_run.run.ground).all(axis=1)[tracks.point]
     assert (files.observations.view == tracks.view[usable]).all()
-    _, pairs = rows_of(antimeridian_run.folder / "pairs.csv")
+    _, pairs = rows_of(antimeridian_run.folder / "tables/pairs.csv")
     assert pairs[0][0] == antimeridian_run.views[0].name
 
 
 def test_a_check_leaves_the_columns_of_new_cameras_empty(check_run):
-    _, rows = rows_of(check_run.folder / "observations.csv")
+    _, rows = rows_of(check_run.folder / "tables/observations.csv")
     assert {tuple(row[6:8]) for row in rows} == {("", "")}
 
 
@@ -247,10 +247,14 @@ def test_numbers_of_a_table():
 
 def test_as_many_outlines_as_images_are_needed(block_run, tmp_path):
     for name in TABLES:
-        (tmp_path / name).write_bytes((block_run.folder / name).read_bytes())
+        (tmp_path / name).write_bytes((block_run.folder / "tables" / name).read_bytes())
+    assert (
+        len(read_tables(block_run.record, tmp_path).outlines) == 9
+    )  # beside the summary, as runs before kept them
     collection = json.loads((tmp_path / "footprints.geojson").read_text())
     del collection["features"][0]
-    (tmp_path / "footprints.geojson").write_text(json.dumps(collection))
+    (tmp_path / "tables").mkdir()
+    (tmp_path / "tables/footprints.geojson").write_text(json.dumps(collection))  # which counts now
     with pytest.raises(InputError, match="8 outlines of 9 images"):
         read_tables(block_run.record, tmp_path)
 
@@ -260,7 +264,7 @@ def test_as_many_outlines_as_images_are_needed(block_run, tmp_path):
 
 def test_a_track_s_errors_are_those_of_what_counts_before_and_after(block_run):
     run = block_run.run
-    header, rows = rows_of(block_run.folder / "residuals.csv")
+    header, rows = rows_of(block_run.folder / "tables/residuals.csv")
     for row in rows[:40]:
         named = dict(zip(header, row, strict=True))
         own = (run.tracks.point == int(named["track"])) & run.keep
@@ -270,25 +274,25 @@ def test_a_track_s_errors_are_those_of_what_counts_before_and_after(block_run):
 
 
 def test_a_check_s_errors_are_those_of_the_cameras_as_they_are(check_run):
-    header, rows = rows_of(check_run.folder / "residuals.csv")
+    header, rows = rows_of(check_run.folder / "tables/residuals.csv")
     first = dict(zip(header, rows[0], strict=True))
     assert first["mean_residual"] == first["mean_residual_before"] != ""
 
 
 def test_an_observation_s_numbers_have_three_and_four_decimals(block_run, check_run):
     for finished, filled in ((block_run, 6), (check_run, 4)):
-        _, rows = rows_of(finished.folder / "observations.csv")
+        _, rows = rows_of(finished.folder / "tables/observations.csv")
         digits = [len(cell.partition(".")[2]) for cell in rows[0][2:8]]
         assert digits[:filled] == ([3, 3, 4, 4, 4, 4] if filled == 6 else [4, 4, 4, 4])
 
 
 def test_a_point_cloud_across_the_antimeridian_is_in_one_place(antimeridian_run):
-    data = (antimeridian_run.folder / "points.ply").read_bytes()
+    data = (antimeridian_run.folder / "tables/points.ply").read_bytes()
     head, body = data.split(b"end_header\n", 1)
     kind = np.dtype([("xyz", "<f8", 3), ("mean_residual", "<f4"), ("num_observations", "<i4")])
     cloud = np.frombuffer(body, dtype=kind)
     assert np.abs(cloud["xyz"]).max() < 30e3
-    _, rows = rows_of(antimeridian_run.folder / "residuals.csv")
+    _, rows = rows_of(antimeridian_run.folder / "tables/residuals.csv")
     assert cloud["mean_residual"] == pytest.approx(np.array([float(row[3]) for row in rows]), abs=1e-4)
     assert cloud["num_observations"].tolist() == [int(row[4]) for row in rows]
     assert b"property float mean_residual\nproperty int num_observations\n" in head + b"\n"

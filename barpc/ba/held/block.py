@@ -125,7 +125,7 @@ def join(
     if few and not keep_largest:
         raise TiePointError(
             f"too few observations in {', '.join(few)}: at least {MIN_OBSERVATIONS} are needed; "
-            "loosen the matching or leave these views out"
+            "give more matches (--matches) or leave these views out (--keep-going)"
         )
     left_out = _left_out(names, view[rows], point[rows], tracks.num_points, keep_largest)
     order, _ = counting_sort(view, len(views))
@@ -176,7 +176,7 @@ def _left_out(
     if not keep_largest:
         raise DisconnectedError(
             f"the views fall into {len(groups)} groups without common tie points: {listed}; add overlapping "
-            "views, loosen the matching, or keep the largest group only",
+            "views or matches (--matches), or adjust the largest group only (--keep-going)",
             named,
         )
     rest = tuple(name for group in named[1:] for name in group)

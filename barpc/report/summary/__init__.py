@@ -111,6 +111,11 @@ class LeftOutEntry(Record):
     path: str = said("File")
     reason: str = said("Why")
 
+    @property
+    def reason_text(self) -> str:
+        """The same as a sentence."""
+        return f"{self.path} was left out: {self.reason}"
+
 
 class InputEntry(Record):
     """A file that the run read."""

@@ -81,7 +81,7 @@ class PairEntry(Record):
     )
     decoy_share: Number = said(
         "Share of its matches that bands which hold no true one say is false",
-        head="decoys",
+        head="false [share]",
         form=".3f",
         default=None,
     )

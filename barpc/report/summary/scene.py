@@ -39,7 +39,7 @@ _MODE_WORDS = {
 }
 
 _DATUM_HEADS = {
-    "cameras": "cameras as delivered",
+    "cameras": "cameras",
     "earlier_run": "earlier run",
     "fixed_views": "fixed views",
     "gcps": "GCPs",

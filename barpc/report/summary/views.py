@@ -15,6 +15,7 @@ from barpc.geodesy import Array
 from barpc.report.records import Cell, Column, Number, Record, said, value_of
 from barpc.report.run import ControlResidual, Run
 from barpc.report.summary.place import EllipseEntry, clocks_in_image, ellipse, shift_in_image, stated_ce90
+from barpc.report.summary.reasons import CAUSES
 from barpc.report.summary.words import (
     ABOVE,
     STATUS_WORDS,
@@ -138,6 +139,9 @@ class ViewEntry(Record):
 
     OWN: ClassVar = {
         "verdict": Column("verdict", _verdict),
+        "wrong": Column(
+            "what is wrong", lambda view: CAUSES[view.cause].label if view.cause in CAUSES else None
+        ),
         "rejected": Column("rejected [%]", _rejected, ".1f"),
         "covered": Column("covered [%]", lambda view: percent(view.tie_coverage), ".0f"),
         "moves": Column(("col [px]", "row [px]"), _moves, ".3f"),
@@ -149,8 +153,8 @@ class ViewEntry(Record):
         "fitted": Column("covered [%]", lambda view: percent(value_of(view, "fit.coverage")), ".0f"),
     }
     PAGE: ClassVar = (
-        "name verdict num_observations rejected covered rmse_before rmse_after held_out_px correction.center_shift_px "
-        "gsd_m incidence_deg rpc_source.format"
+        "name verdict wrong num_observations rejected covered rmse_before rmse_after held_out_px "
+        "correction.center_shift_px gsd_m incidence_deg rpc_source.format"
     )
     TERMINAL: ClassVar = (
         "name verdict num_observations rmse_before rmse_after correction.center_shift_px about"
@@ -171,6 +175,12 @@ class ViewEntry(Record):
     FITS: ClassVar = (
         "name fit.rmse_px largest fit.min_denominator fit.roundtrip_px fitted fit.num_check_points fit.method"
     )
+
+    @property
+    def reservation(self) -> str:
+        """Its verdict and what to do as a sentence; of an image of which all is well without a meaning."""
+        return f"{self.name}: {STATUS_WORDS[self.status]}: {self.advice}."
+
     FOOTPRINT: ClassVar = "name path status num_observations rmse_before rmse_after gsd_m"
 
     name: str = said("Unique in the run", head="image", minLength=1)
@@ -206,6 +216,7 @@ class ViewEntry(Record):
         "Verdict on the image"
     )
     advice: str = said("What to do; empty when all is well")
+    cause: str | None = said("Why, by its name; null when all is well", default=None, enum=[*CAUSES, None])
     num_moving: Count = said("Observations of tie points that move together, and took no part", default=0)
     held_out_px: Number = said(
         "RMS reprojection error of tie points that took no part in the adjustment, by their median",

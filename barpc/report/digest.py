@@ -1,0 +1,98 @@
+"""What of a summary stands on one screen, whatever its size: the worst first, what is alike said once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from barpc.report.reservations import GOOD_RMSE
+from barpc.report.summary import STATUS_WORDS, LeftOutEntry, PairEntry, Summary, ViewEntry
+from barpc.report.summary.reasons import CAUSES
+from barpc.report.summary.words import listed
+
+SHOWN = 10  # rows of a table on the terminal, images and pairs alike
+ALONE = 3  # images of one cause that have a sentence each; more share one
+_NAMED = 5  # of these
+_ORDER = list(STATUS_WORDS)[::-1]
+_CAUSES = list(CAUSES)
+
+
+def worst_first(views: Sequence[ViewEntry]) -> list[ViewEntry]:
+    """Images by their verdicts, then by what is wrong, then by their error; those without reservation as they come."""
+    return sorted(views, key=_badness)
+
+
+def _badness(view: ViewEntry) -> tuple[int, int, float]:
+    if not view.advice:
+        return len(_ORDER), 0, 0.0
+    cause = _CAUSES.index(view.cause) if view.cause in CAUSES else len(_CAUSES)
+    errors = (view.rmse_after, view.held_out_px, view.rmse_before if view.rmse_after is None else None)
+    return (
+        _ORDER.index(view.status),
+        cause,
+        -max((error for error in errors if error is not None), default=0.0),
+    )
+
+
+def flagged(views: Sequence[ViewEntry]) -> list[ViewEntry]:
+    """Images that need a look, the worst first."""
+    return [view for view in worst_first(views) if view.advice]
+
+
+def offset_of(pair: PairEntry) -> float:
+    """The epipolar offset (RMS) of a pair at the end of its run [px]; 0 where it is not known."""
+    before, after = pair.offset_rms
+    return (before if pair.epipolar_after is None else after) or 0.0
+
+
+def worst_pairs(pairs: Sequence[PairEntry]) -> list[PairEntry]:
+    """Pairs by their epipolar offset, the largest first, where it is more than stereo wants; then the others."""
+    return sorted(pairs, key=lambda pair: -max(offset_of(pair), GOOD_RMSE))
+
+
+def torn(pairs: Sequence[PairEntry]) -> list[PairEntry]:
+    """Pairs whose epipolar offset is more than stereo wants, the worst first."""
+    return [pair for pair in worst_pairs(pairs) if offset_of(pair) > GOOD_RMSE]
+
+
+def sentences(summary: Summary) -> list[str]:
+    """The verdict, one sentence for all images that share a cause, and one for all files left out for one reason."""
+    own = {view.reservation for view in summary.views if view.advice}
+    own |= {one.reason_text for one in summary.left_out}
+    together = [*_of_views(flagged(summary.views)), *_of_files(summary.left_out)]
+    rest = [line for line in summary.verdict if line not in own]
+    place = next((k for k, line in enumerate(summary.verdict) if line in own), len(rest))
+    return [*rest[:place], *together, *rest[place:]]
+
+
+def _of_views(views: Sequence[ViewEntry]) -> list[str]:
+    found: dict[tuple[str, str], list[ViewEntry]] = {}
+    for view in views:
+        found.setdefault((view.status, view.cause or view.advice), []).append(view)
+    out = []
+    for (status, cause), alike in found.items():
+        if len(alike) <= ALONE or cause not in CAUSES:
+            out += [view.reservation for view in alike]
+            continue
+        names, words = listed([view.name for view in alike], _NAMED), CAUSES[cause]
+        start = f"{len(alike)} images are {STATUS_WORDS[status]}, {words.label}: {names}"
+        out.append(". ".join(filter(None, (start, _capital(words.remedy.format(image="IMAGE"))))) + ".")
+    return out
+
+
+def _of_files(files: Sequence[LeftOutEntry]) -> list[str]:
+    """A reason often begins with its file."""
+    found: dict[str, list[LeftOutEntry]] = {}
+    for one in files:
+        found.setdefault(one.reason.replace(one.path, "").lstrip(": "), []).append(one)
+    out = []
+    for reason, alike in found.items():
+        if len(alike) <= ALONE:
+            out += [one.reason_text for one in alike]
+        else:
+            names = listed([one.path for one in alike], _NAMED)
+            out.append(f"{len(alike)} files were left out, {names}: {reason}")
+    return out
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]

@@ -1,0 +1,102 @@
+"""Sentences of none, one and two of everything: no 'All 1 images', no '0 of 0', no number that is none."""
+
+from __future__ import annotations
+
+import re
+from itertools import product
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barpc.ba.held.ground import TerrainTest
+from barpc.report import decisions, page
+from barpc.report.summary import TracksEntry
+from barpc.report.verdict import block_verdict
+from barpc.tie.reference import Registration, ViewMatch
+
+from .made import a_correction, a_gcp, a_pair, a_square, a_summary, a_view, files_of
+from .test_sentences import adjusted, control, gcps, run_of
+
+WRONG = re.compile(
+    r"\b1 (images|pairs|points|tie points|GCPs|check points|observations|files|groups|columns)\b(?! of)"
+    r"|\b0 of 0\b|\bAll [012] |\ball [012] |\bnan\b|\binf\b|\bNone\b"
+)
+
+
+def spoken(lines: Any) -> None:
+    for line in lines:
+        assert not WRONG.search(line), line
+
+
+class Ties:
+    def __init__(self, num: int) -> None:
+        self.num_points = num
+
+    def __len__(self) -> int:
+        return 2 * self.num_points
+
+
+def the_views(num: int, seen: int, **fields: Any) -> list[Any]:
+    error = {"rmse_before": 1.0, "rmse_after": 0.1} if seen else {"rmse_before": None, "rmse_after": None}
+    return [a_view(name, num_observations=seen, **error, **fields) for name in "ABC"[:num]]
+
+
+@pytest.mark.parametrize("kind", ["adjust", "check", "match"])
+@pytest.mark.parametrize(("num", "seen"), list(product((1, 2, 3), (0, 1, 2))))
+def test_images_and_tie_points(kind, num, seen):
+    found = block_verdict(run_of(kind=kind, tracks=Ties(seen)), the_views(num, seen))
+    spoken([found["headline"], *found["lines"]])
+    if kind == "adjust":
+        assert found["headline"].split(" are")[0].split(" is")[0] == {1: "The image", 2: "Both images"}.get(
+            num, "All 3 images"
+        )
+
+
+def unknown_residuals(num: int, seen: bool) -> Any:
+    residual = np.full((num, 2), 0.2 if seen else np.nan)
+    ground = np.full((num, 3), np.nan)
+    return SimpleNamespace(rms=lambda: (np.sqrt((residual**2).mean(axis=0)), ground.mean(axis=0)))
+
+
+@pytest.mark.parametrize(("num", "seen"), [(1, True), (1, False), (2, True), (2, False)])
+def test_check_points(num, seen, monkeypatch):
+    monkeypatch.setattr("barpc.report.verdict.check_residuals", lambda *_: unknown_residuals(num, seen))
+    run = run_of(check_points=gcps(num), after=())
+    (line,) = [line for line in block_verdict(run, the_views(3, 9))["lines"] if "check point" in line]
+    spoken([line])
+    assert line.startswith(
+        f"{num} check point{'s' * (num > 1)}, not used above, {'are' if num > 1 else 'is'} "
+    )
+    assert ("met to" in line) == seen
+
+
+@pytest.mark.parametrize("num", [0, 1, 2])
+def test_control_a_dem_and_a_reference(num):
+    terrain = TerrainTest(num, num, num, 2.0 if num else np.nan, 3.0 if num else np.nan, 0.5)
+    used = np.arange(3) < num
+    matches = tuple(ViewMatch(name, 9.0, (1.0, 0.0), tried=1, points=1) for name in "AB"[:num])
+    for fields in (
+        {"adjustment": adjusted(terrain=terrain)},
+        {"adjustment": adjusted(control=control(used=used)), "gcps": gcps()},
+        {"adjustment": adjusted(), "reference": Registration(SimpleNamespace(), matches, 0.5, 1.0)},
+        {"left_out": (("a.tif", "a.tif: no RPC"),) * num},
+    ):
+        found = block_verdict(run_of(**fields), the_views(3, 40))
+        spoken([found["headline"], *found["lines"]])
+
+
+@pytest.mark.parametrize(("views", "pairs", "tracks"), list(product((1, 2), (0, 1), (0, 1, 2))))
+def test_the_answers_of_the_page(views, pairs, tracks):
+    shown = the_views(views, tracks, correction=a_correction())
+    found = [a_pair("A", "B", tracks)] * (pairs and views == 2)
+    lengths = TracksEntry(tracks, 2 * tracks, {"2": tracks} if tracks else {})
+    summary = a_summary(
+        shown, found, tracks=lengths, gcps=tuple(a_gcp(f"g{k}", 5.0, 43.0) for k in range(tracks))
+    )
+    files = files_of(summary, [a_square(10.0, 0.0)] * views)
+    for make in page.SECTIONS:
+        if (section := make(files)) is not None:
+            spoken([section.answer, *section.points, *(words for _, words in section.charts)])
+    spoken(decisions.decisions(summary))
