@@ -11,8 +11,8 @@ phases, and its own standard deviation (patches overlap: at most twice that); ou
 
 *Pairs*: at the tie points of real pairs, what registration says across the epipolar line minus what others say at the
 same places: the peak of the correlation of patches resampled to eighths of a pixel, least squares written for this page
-(forward, symmetric, sampled by splines), the phase of the cross spectrum, and the method of the check points; and at the
-check points what they say themselves. The mean difference and its standard deviation [px].
+(forward, symmetric, sampled by splines), the phase of the cross spectrum, and the method of the check points; and at
+the check points what they say themselves. The mean difference and its standard deviation [px].
 """
 
 from __future__ import annotations
@@ -110,9 +110,7 @@ def warped(slope: float) -> Callable[[Array, Array], Shifted]:
             return at + np.stack([bend * 20.0 * np.sin(xy[..., 1] / 20.0), 0.0 * xy[..., 0]], axis=-1)
 
         source = back(np.stack([x, y], axis=-1))
-        second = ndimage.map_coordinates(
-            image, [source[..., 1], source[..., 0]], order=5, mode="mirror"
-        )
+        second = ndimage.map_coordinates(image, [source[..., 1], source[..., 0]], order=5, mode="mirror")
 
         def where(xy: Array) -> Array:  # first -> second, by iteration
             found = xy.copy()
@@ -126,7 +124,7 @@ def warped(slope: float) -> Callable[[Array, Array], Shifted]:
 
 
 def lens(image: Array, phase: Array) -> Shifted:
-    """Means of an image that is blurred first, as by a lens that passes an eighth of the contrast of the finest lines."""
+    """Means of an image that is blurred first, by a lens that passes an eighth of the finest lines' contrast."""
     return means(ndimage.gaussian_filter(image, 0.58 * MEANS), phase)
 
 
@@ -186,7 +184,9 @@ def shifts(data: Path) -> None:
     print("|---|---|---|---|---|")
     images = [pixels(data / f"optical/phr_triplet_north/{name}.tif") for name in ("img_01", "img_02")]
     cases = [(kind, *case, False) for kind, case in KINDS.items()]
-    cases += [(f"{kind}: as check points", *KINDS[kind], True) for kind in ("means, a lens", "fourier", "slope")]
+    cases += [
+        (f"{kind}: as check points", *KINDS[kind], True) for kind in ("means, a lens", "fourier", "slope")
+    ]
     for kind, make, noise, exchanged, checks in cases:
         rng, rows = np.random.default_rng(0), []
         for phase in phases(kind):
@@ -197,7 +197,9 @@ def shifts(data: Path) -> None:
                 both = [one + noise * one.std() * rng.normal(size=one.shape) for one in (first, second)]
                 off.append(errors(*both, where, exchanged, checks))
             one = np.concatenate(off)
-            rows.append((len(one), *one.mean(axis=0), *(one.std(axis=0) / len(one) ** 0.5), np.sqrt((one**2).mean())))
+            rows.append(
+                (len(one), *one.mean(axis=0), *(one.std(axis=0) / len(one) ** 0.5), np.sqrt((one**2).mean()))
+            )
         table = np.array(rows)
         worst = np.abs(table[:, 1:3]).argmax(axis=0)
         mean = [table[worst[k], 1 + k] for k in (0, 1)]
@@ -229,9 +231,11 @@ def by_correlation(pair: tuple[Array, Array], a: Array, b: Array, linear: Array,
     score: Array = np.zeros((3, 3))
     while step >= 0.125:
         axis = step * np.arange(-reach, reach + 1)
-        score = np.array([[_alike(template, pair[1], b, linear, best + (x, y), half) for x in axis] for y in axis])
+        score = np.array(
+            [[_alike(template, pair[1], b, linear, np.add(best, (x, y)), half) for x in axis] for y in axis]
+        )
         row, col = np.unravel_index(score.argmax(), score.shape)
-        best = best + (axis[col], axis[row])
+        best = np.add(best, (axis[col], axis[row]))
         if not (0 < row < 2 * reach and 0 < col < 2 * reach):
             return np.full(2, np.nan)
         score, step, reach = score[row - 1 : row + 2, col - 1 : col + 2], step / 2, 2
@@ -268,7 +272,9 @@ def by_least_squares(pair: tuple[Array, Array], a: Array, b: Array, linear: Arra
         return np.full(2, np.nan)
     if np.hypot(*shift) > 2.0:
         return np.full(2, np.nan)
-    whole = linear @ (np.eye(2) + 0.5 * turn) @ np.linalg.inv(np.eye(2) - 0.5 * turn)  # first -> second about them
+    whole = (
+        linear @ (np.eye(2) + 0.5 * turn) @ np.linalg.inv(np.eye(2) - 0.5 * turn)
+    )  # first -> second about them
     return np.asarray(b + 0.5 * linear @ shift + whole @ (0.5 * shift))
 
 
@@ -307,7 +313,7 @@ def by_parabolas(images: Sequence[Array], a: Array, b: Array, half: int = 15, re
             continue
         s = cv2.matchTemplate(area, template, cv2.TM_CCOEFF_NORMED).astype(np.float64)
         y, x = np.unravel_index(s.argmax(), s.shape)
-        if 0 < min(x, y) and max(x, y) < 2 * reach:
+        if min(x, y) > 0 and max(x, y) < 2 * reach:
             part = [
                 0.5 * (low - high) / (low - 2 * s[y, x] + high)
                 for low, high in ((s[y, x - 1], s[y, x + 1]), (s[y - 1, x], s[y + 1, x]))
