@@ -363,8 +363,8 @@ class _Search:
         self, views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints], options: TieOptions
     ) -> None:
         self._views, self._options = views, options
-        self.reach = reach_of(views[1], options)
         self._matcher = matcher_named(options.matcher)(options, keypoints)
+        self.reach = min(reach_of(views[1], options), getattr(self._matcher, "widest", float("inf")))
         points = keypoints[0].xy
         self._windows = cache(lambda: shared_tiles(views, [Pair((0, 1), 1.0, 0.0)], options)[0])
         if not self._matcher.detects:
@@ -413,8 +413,7 @@ class _Search:
         The first pass in whose peak most matches stand decides, else the one with the most significant peak, if any.
         """
         best: _Peak | None = None
-        reach = min(self.reach, getattr(self._matcher, "widest", float("inf")))
-        passes = {min(width, reach): probes for width, probes in _PASSES}  # of one width the last
+        passes = {min(width, self.reach): probes for width, probes in _PASSES}  # of one width the last
         for width, probes in passes.items():
             found = self._blind(width, probes)
             if found is not None and (best is None or found.significance > best.significance):

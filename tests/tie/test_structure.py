@@ -359,9 +359,7 @@ def redrawn_pair(shared_data, folder: Path, change) -> list[View]:
     source = shared_data / "optical/phr_triplet_north"
     with rasterio.open(source / "img_03.tif") as file:
         pixels, rpcs = redrawn(file.read(1), 1), file.rpcs
-    path = write_image(folder / "other.tif", change(pixels))
-    with rasterio.open(path, "r+") as file:
-        file.rpcs = rpcs
+    path = write_image(folder / "other.tif", change(pixels), rpcs=rpcs)
     return list(load_views([source / "img_02.tif", path]).views)
 
 
