@@ -215,7 +215,8 @@ class TieOptions(Options):
     matcher: str = option(
         "guided",
         """What matches a pair: `guided`, keypoints, and structure where they find few; `structure`, gradients
-        whatever the grey values. `module:name`: a function of yours, in a module that Python finds; it is run.""",
+        whatever the grey values, and where that finds nothing `fine-structure`, at whole pixels.
+        `module:name`: a function of yours, in a module that Python finds; it is run.""",
         rows="barpc.tie.matching.MATCHERS",
         hook=True,
     )

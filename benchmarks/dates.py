@@ -2,6 +2,7 @@
 
     python benchmarks/dates.py                      forty views of forty dates; today's choice and the one before
     python benchmarks/dates.py --dates 12 --neighbours 2 --seeds 3
+    python benchmarks/dates.py --dates 100 --seasons 4 --size 400 --neighbours 8 --only now
 
 Rendered with known cameras (`tests/scenes/dates.py`); the delivered RPCs are shifted and stretched in the image, which
 no rotation or translation makes up for. Judged on exact places of ground points: the RMS distance in each view from
@@ -37,11 +38,25 @@ from tests.scenes.dates import Years  # noqa: E402
 warnings.simplefilter("ignore")
 
 
-def block(dates: int, twice: int, seed: int, size: int, growth: float) -> Years:
-    """A scene of so many dates at random times of the year, some with two views."""
-    phases = np.random.default_rng(seed + 100).uniform(0, 1, dates).tolist()
+def block(dates: int, twice: int, seed: int, size: int, growth: float, seasons: int = 0) -> Years:
+    """A scene of so many dates at random times of the year, some with two views.
+
+    Or about the middles of so many seasons in turn, every third date under 40 % of clouds.
+    """
+    phases, clouds = np.random.default_rng(seed + 100).uniform(0, 1, dates), np.zeros(dates)
+    if seasons:
+        phases = (np.arange(dates) % seasons / seasons + 0.12 * (phases - 0.5)) % 1.0
+        clouds[1::3] = 0.4
     views = sorted([*range(dates), *range(twice)])
-    return Years(tuple(phases), tuple(views), (size, size), seed, growth, snow=0.6)
+    return Years(
+        tuple(phases.tolist()),
+        tuple(views),
+        (size, size),
+        seed,
+        growth,
+        snow=0.6,
+        clouds=tuple(clouds.tolist()),
+    )
 
 
 def run(years: Years, views: list[View], out: Path, neighbours: int) -> str:
@@ -77,6 +92,9 @@ def main() -> None:
     parser.add_argument(
         "--growth", type=float, default=0.3, help="share of the ground that is its season's own"
     )
+    parser.add_argument(
+        "--seasons", type=int, default=0, help="so many seasons in turn, and clouds on every third date"
+    )
     parser.add_argument("--only", default="", help="choices with this in their name")
     given = parser.parse_args()
     print(
@@ -85,7 +103,7 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|---|")
     rounds = tracks.TRIES
     for seed in given.seeds:
-        years = block(given.dates, given.twice, seed, given.size, given.growth)
+        years = block(given.dates, given.twice, seed, given.size, given.growth, given.seasons)
         days = [
             date(2015 + k % 5, 1, 1) + timedelta(int(365 * phase)) for k, phase in enumerate(years.phases)
         ]

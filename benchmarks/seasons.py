@@ -47,6 +47,7 @@ from barpc.tie.features import join  # noqa: E402
 from barpc.tie.raster import read_pixels  # noqa: E402
 from barpc.tie.structure import PATCH, register_places  # noqa: E402
 from tests.scenes import ImageOptions  # noqa: E402
+from tests.scenes.redrawn import redrawn  # noqa: E402
 from tests.scenes.season import SEASONS, _part, disguised  # noqa: E402
 from tests.tie.conftest import Rendered, write_image  # noqa: E402
 
@@ -85,6 +86,7 @@ def season(level: str) -> Change:
 
 
 CASES: dict[str, tuple[Change, int]] = {level: (season(level), 1) for level in SEASONS}
+CASES["redrawn"] = redrawn, 1
 CASES |= {f"clouds {share:.0%}": (covered(share), 1) for share in (0.1, 0.4)}
 CASES |= {"winter, x2 coarser": (season("winter"), 2), "as it was, x4 coarser": (lambda p, _: p, 4)}
 CASES |= {"mild, x4 coarser": (season("mild"), 4), "4-look speckle": (speckled, 1)}

@@ -28,12 +28,14 @@ from barpc.tie.hook import Hook, hooked
 from barpc.tie.matcher import NO_MATCHES, Matcher, Matches, Prediction
 from barpc.tie.ortho import Terrain
 from barpc.tie.pairs import Pair, reach_of, shared_tiles
-from barpc.tie.structure import Structure
+from barpc.tie.structure import FineStructure, Structure
 from barpc.tie.tasks import Progress, ordered
 
 STRUCTURE = "structure"
 """What tries again where another matcher finds few."""
-MATCHERS: dict[str, type[Matcher]] = {"guided": Guided, STRUCTURE: Structure}
+FINE = "fine-structure"
+"""And where that finds nothing."""
+MATCHERS: dict[str, type[Matcher]] = {"guided": Guided, STRUCTURE: Structure, FINE: FineStructure}
 """Name -> matcher."""
 
 
@@ -123,12 +125,17 @@ def match_pair(
         false_share=max(options.false_share, _LOOSE[1]),
         min_matches=max(4, math.ceil(options.min_matches * _LOOSE[2])),
     )
-    if options.matcher == STRUCTURE and first[1].matches < loose.min_matches:
-        return first  # thresholds do not say where it looks
-    if first[1].status.startswith(_NOWHERE) and options.ratio >= CLEAR_RATIO:
-        return first  # nor do looser ones let more through where only clear matches count
-    found, report = _attempt(views, keypoints, pair, loose)
-    return _better(first, (found, replace(report, loosened=True)))
+    tried, structural = [first], options.matcher == STRUCTURE
+    if not (
+        (structural and first[1].matches < loose.min_matches)  # thresholds do not say where it looks
+        or (first[1].status.startswith(_NOWHERE) and options.ratio >= CLEAR_RATIO)
+    ):  # nor do looser ones let more through where only clear matches count
+        found, report = _attempt(views, keypoints, pair, loose)
+        tried.append((found, replace(report, loosened=True)))
+    if structural and all(report.status != "ok" for _, report in tried):
+        found, report = _attempt(views, keypoints, pair, replace(loose, matcher=FINE))
+        tried.append((found, replace(report, loosened=True)))
+    return _better(*tried)
 
 
 def ample(report: PairReport, options: TieOptions) -> bool:
@@ -194,7 +201,7 @@ def _attempt(
     errors = search.errors(found)
     keep, residual = agreeing(found.xy[:, 0], errors[:, 1])
     report = replace(report, matches=len(found), verified=int(keep.sum()), control_share=control)
-    if _apart(found.xy[keep, 0], getattr(kind, "patch", 0.0)) < options.min_matches:
+    if _apart(found.xy[keep, 0], search.patch) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches on common epipolar lines")
     spread, share = robust_spread(residual[keep]), report.verified / len(found)
     along, across = np.median(errors[keep], axis=0).tolist()
@@ -362,8 +369,8 @@ class _Search:
         self, views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints], options: TieOptions
     ) -> None:
         self._views, self._options = views, options
-        self.reach = reach_of(views[1], options)
         self._matcher = matcher_named(options.matcher)(options, keypoints)
+        self.reach = min(reach_of(views[1], options), getattr(self._matcher, "widest", float("inf")))
         points = keypoints[0].xy
         self._windows = cache(lambda: shared_tiles(views, [Pair((0, 1), 1.0, 0.0)], options)[0])
         if not self._matcher.detects:
@@ -372,6 +379,11 @@ class _Search:
         first = frame(*views, points)
         self._axis = first.axis
         self._frame = _latest(lambda xy: first if xy is points else frame(*views, xy, first.axis))
+
+    @property
+    def patch(self) -> float:
+        """Side of what is compared about a point [px]; 0: it has no extent."""
+        return float(getattr(self._matcher, "patch", 0.0))
 
     def errors(self, found: Matches) -> Array:
         """Return the distance along and across (M, 2) [px] of matches from where the cameras say."""

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+import cv2
 import numpy as np
 
 from barpc.geodesy import Array
@@ -39,6 +40,12 @@ _AREA = 1 << 21  # of areas of so many px together: 60 bytes a px
 _SURFACE = 1 << 23  # places at which a tile's points are compared, all together: 30 bytes each
 _PITCH = 8  # px between points, at least
 _POINTS = 200, 500, 1000  # looked for: of the cameras' error, in long bands, in short ones
+_FINE_POINTS = 600, 1500  # of the cameras' error, in bands, where whole pixels are looked at
+_RING = 3.5  # pitches about a point whose neighbours speak for its places, together
+_SAY = (
+    4.0  # times as loud as it does itself. Of four pairs that were hardest 1 is tied by 1.5 and 1, 3 by this
+)
+_BENT = 2  # px by which their parallax may differ, and does not count
 _LONG, _LONGER = 48.0, 130.0  # px of half a band
 _SMALLEST = 60  # px of a side of the common part, in the coarsest picture
 _SHOWN = 0.9  # of a template must be a picture
@@ -52,8 +59,11 @@ class Structure:
     """A matcher of gradient structure: the most alike place in each point's band, where no decoy is more alike."""
 
     detects: ClassVar[bool] = False
-    patch: ClassVar[float] = 4.0 * _HALF
+    patch: float = 4.0 * _HALF
     """Side of a template [px], in the finest picture that is searched freely: matches nearer to each other are one."""
+    widest: ClassVar[float] = float("inf")
+    """How wrong cameras may be [px] where their error is looked for."""
+    whole: ClassVar[bool] = False  # pixels are looked at, and no coarser picture
 
     def __init__(self, options: TieOptions, keypoints: tuple[Keypoints, Keypoints]) -> None:
         self._band = options.band
@@ -66,7 +76,10 @@ class Structure:
         All bands of a prediction, moved aside or not, are looked at at once; the next calls ask of what was found.
         """
         if self._known is None or self._known[0] is not prediction.where:
-            self._known = prediction.where, _Search(a, b, self._band, prediction).matches()
+            search = _Search(a, b, self._band, prediction, self.whole)
+            if self.whole:
+                self.patch = 2.0 * _RING * search.pitch
+            self._known = prediction.where, search.matches()
         found = self._known[1]
         if not len(found):
             return NO_MATCHES
@@ -74,11 +87,22 @@ class Structure:
         return found.select(np.abs(across) <= max(prediction.half_width, 1.5))
 
 
-class _Search:
-    """One look at all points of a grid."""
+class FineStructure(Structure):
+    """The same on whole pixels, about cameras that are not far off: lines that coarser pictures have lost.
 
-    def __init__(self, a: View, b: View, band: int, prediction: Prediction) -> None:
-        self._views, self._band, self._prediction = (a, b), band, prediction
+    Where half of what is left has grown anew, few places are the best of their bands by themselves: neighbours speak
+    for them, a little to the side of where they would be, and matches count as one that the same neighbours spoke for.
+    """
+
+    widest: ClassVar[float] = 20.0
+    whole: ClassVar[bool] = True
+
+
+class _Search:
+    """One look at all points of a grid, at `whole` pixels or in a picture as coarse as the bands are long."""
+
+    def __init__(self, a: View, b: View, band: int, prediction: Prediction, whole: bool = False) -> None:
+        self._views, self._band, self._prediction, self._whole = (a, b), band, prediction, whole
         self._files = (a.path, a.size), (b.path, b.size)
         windows = prediction.windows()
         middles = np.array([(col + 0.5 * w, row + 0.5 * h) for col, row, w, h in windows]).reshape(-1, 2)
@@ -86,13 +110,16 @@ class _Search:
         with np.errstate(invalid="ignore"):
             lengths = 0.5 * (where.after - where.before)[np.isfinite(where.after)]
         self._least = _resolution(where.linear)
+        self.pitch = 1
         self._step, self._points = self._level(float(np.median(lengths)) if len(lengths) else 0.0, windows)
 
     def _level(self, half: float, windows: Sequence[Box]) -> tuple[int, Array]:
         """Return the step of the picture for bands of half a length [px of B], and the points of the grid."""
         if not windows:
             return 1, np.empty((0, 2))
-        if self._prediction.probes is None:
+        if self._whole:
+            wanted, count = 1, _FINE_POINTS[self._prediction.probes is None]
+        elif self._prediction.probes is None:
             wanted, count = (4, _POINTS[1]) if half > _LONGER else (2, _POINTS[1 + (half < _LONG)])
         else:
             width = self._prediction.half_width  # a twentieth of the image, or the altitudes, may be wide
@@ -104,8 +131,8 @@ class _Search:
             step //= 2
         step *= self._least
         area = float((boxes[:, 2] * boxes[:, 3]).sum())
-        pitch = step * max(_PITCH, int((area / count) ** 0.5 / step))
-        return step, np.concatenate([_lattice(box, pitch) for box in windows])
+        self.pitch = step * max(_PITCH, int((area / count) ** 0.5 / step))
+        return step, np.concatenate([_lattice(box, self.pitch) for box in windows])
 
     def matches(self) -> Matches:
         """Return the best place of every point, on whole bands; found again in finer pictures."""
@@ -168,9 +195,10 @@ class _Search:
         centers = where.place(middle + shift)[rows]
         tile = Tile.of(self._files, self._band, self._step, at, centers, linear, reach, _HALF)
         surface = tile.surfaces()
-        if asked.probes:  # neighbours are moved alike
-            apart = np.abs(at[:, None] - at[None]).max(axis=2)
-            near = (apart <= 1.5 * max(float(apart[apart > 0].min(initial=np.inf)), 1.0)).astype(np.float32)
+        if self._whole:
+            surface = _supported(surface, _near(at, _RING * self.pitch), _SAY)
+        elif asked.probes:  # neighbours are moved alike
+            near = _near(at, 1.5 * self.pitch)
             surface = np.tensordot(near, surface, axes=1) / near.sum(axis=1)[:, None, None]
         off = tile.offsets() @ axes.T  # along, across
         part = (tile.left @ tile.matrix.T @ axes.T)[:, None, None]
@@ -199,6 +227,20 @@ class _Search:
         cut = low <= high
         first, last = float(low[cut].min(initial=np.inf)), float(high[cut].max(initial=-np.inf))
         return (0.5 * (first + last), 0.5 * (last - first)) if first <= last else (0.0, 0.0)
+
+
+def _near(at: Array, reach: float) -> FloatImage:
+    """1 where points (n, 2) lie within reach [px] of each other along both axes, else 0: (n, n)."""
+    return np.asarray(np.abs(at[:, None] - at[None]).max(axis=2) <= reach, np.float32)
+
+
+def _supported(surface: FloatImage, near: FloatImage, loud: float) -> FloatImage:
+    """Correlations (n, y, x) averaged with the best of neighbours' (n, n) about the same place, so much `loud`er."""
+    others = near - np.eye(len(near), dtype=np.float32)
+    kernel = np.ones((2 * _BENT + 1,) * 2, np.uint8)
+    about = np.stack([cv2.dilate(one, kernel) for one in surface])
+    share = np.float32(loud) / np.maximum(others.sum(axis=1, keepdims=True), 1.0)
+    return np.asarray((surface + np.tensordot(share * others, about, axes=1)) / np.float32(1.0 + loud))
 
 
 def _resolution(linear: Array) -> int:

@@ -23,6 +23,7 @@ from barpc.tie.features import KeypointFiles, locate, worth_a_first_look
 from barpc.tie.given import GivenMatches, verify
 from barpc.tie.matcher import Matches
 from barpc.tie.matching import (
+    FINE,
     MATCHERS,
     STRUCTURE,
     THIN,
@@ -128,7 +129,7 @@ def _registered(
     spreads = {ends: report.spread for ends, _, report in tried if report.status == "ok"}
     sizes = [view.size for view in looks.views]
     linked = thin(linked, sizes, int(_SPARE * most))
-    structural = [ends for ends, _, report in tried if report.matcher == STRUCTURE]
+    structural = [ends for ends, _, report in tried if report.matcher in (STRUCTURE, FINE)]
     theirs = {looks.ends[views] for views in given}
     verified = {ends: found for ends, found, _ in tried if len(found)}
     structural += _unlike(looks.views, {p: verified[p] for p in theirs & set(verified)}, options, work)

@@ -81,11 +81,28 @@ def test_what_looser_thresholds_cannot_change_is_not_tried_again(attempts, monke
     made = attempts(report(20), report(120))
     assert match_pair((None, None), NOBODY, PAIR, own)[1].verified == 20  # type: ignore[arg-type]
     structure = TieOptions(matcher=matching.STRUCTURE)
-    for matches, again in ((7, False), (8, True)):
+    for matches, second in ((7, matching.FINE), (8, matching.STRUCTURE)):
         made.clear()
         attempts(report(0, "too few matches", matches), report(120))
         match_pair((None, None), NOBODY, PAIR, structure)  # type: ignore[arg-type]
-        assert len(made) == 1 + again
+        assert [one.matcher for one in made] == [matching.STRUCTURE, second]
+
+
+def test_whole_pixels_are_looked_at_where_structure_finds_nothing_and_only_there(attempts) -> None:
+    """Once, with looser thresholds; what it does not find either is refused for the first reason."""
+    structure, nothing = TieOptions(matcher=matching.STRUCTURE), report(0, "no common offset within 700 px")
+    made = attempts(nothing, replace(report(30), matcher=matching.FINE))
+    found = match_pair((None, None), NOBODY, PAIR, structure)[1]  # type: ignore[arg-type]
+    assert found.means == "fine-structure, loosened"
+    assert [(one.matcher, one.false_share, one.min_matches) for one in made[1:]] == [(matching.FINE, 0.05, 8)]
+    made.clear()
+    attempts(nothing, report(0, "too few matches"))
+    assert match_pair((None, None), NOBODY, PAIR, structure)[1].status == nothing.status  # type: ignore[arg-type]
+    assert len(made) == 2
+    made.clear()
+    attempts(report(20), report(19))
+    match_pair((None, None), NOBODY, PAIR, structure)  # type: ignore[arg-type]
+    assert matching.FINE not in [one.matcher for one in made]
 
 
 # --- structure ----------------------------------------------------------------------------------------------

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import rasterio
 from scipy import ndimage
 
 from barpc.errors import TiePointError
+from barpc.pipeline.views import load_views
 from barpc.scene import View
 from barpc.tie import (
     Matches,
@@ -21,12 +24,21 @@ from barpc.tie import (
     select_pairs,
     structure,
 )
-from barpc.tie.epipolar import Frame, robust_affine
+from barpc.tie.epipolar import Frame, frame, robust_affine
 from barpc.tie.features import join
 from barpc.tie.matcher import NO_MATCHES, Prediction
-from barpc.tie.matching import STRUCTURE, _altitudes, _better, _match_within, _within, match_pair
+from barpc.tie.matching import FINE, STRUCTURE, _altitudes, _better, _match_within, _within, match_pair
 from barpc.tie.raster import read_pixels
-from barpc.tie.structure import Tile, _lattice, _resolution, _Search, register_places
+from barpc.tie.structure import (
+    Tile,
+    _lattice,
+    _near,
+    _resolution,
+    _Search,
+    _supported,
+    register_places,
+)
+from tests.scenes.redrawn import redrawn
 from tests.scenes.season import SEASONS, disguised
 from tests.tie.conftest import write_image
 from tests.tie.test_pairs import camera, views
@@ -249,7 +261,7 @@ def level(
 ):
     """Step and number of points of a look at a window, and their pitch."""
     search = _Search.__new__(_Search)
-    search._least = least
+    search._least, search._whole = least, False
     search._prediction = Prediction(None, band, lambda: [], probes)  # type: ignore[arg-type]
     step, points = search._level(half, [(0, 0, int(width), int(height))])
     return step, np.diff(np.unique(points[:, 0]))[0]
@@ -325,6 +337,60 @@ def test_a_segment_is_looked_at_as_far_as_it_lies_in_the_image(start, axis, most
     assert found == pytest.approx(expected)
 
 
+def test_neighbours_speak_for_a_place_and_bend_a_little() -> None:
+    """Three points in a row see one place, some pixels apart; the middle one another one better. One is far away."""
+    at = np.array([[0.0, 0.0], [10.0, 0.0], [20.0, 0.0], [500.0, 0.0]])
+    near = _near(at, 10.0)
+    assert near.tolist() == [[1, 1, 0, 0], [1, 1, 1, 0], [0, 1, 1, 0], [0, 0, 0, 1]]
+    seen = np.zeros((4, 9, 9), np.float32)
+    seen[0, 4, 3] = seen[1, 4, 5] = seen[2, 4, 7] = seen[3, 1, 1] = 0.3
+    seen[1, 8, 0] = 0.4
+    found = _supported(seen, near, 4.0)
+    assert np.unravel_index(found[1].argmax(), (9, 9)) == (4, 5)
+    assert found[1, 4, 5] == pytest.approx(0.3)
+    assert found[1, 8, 0] == pytest.approx(0.4 / 5)
+    assert found[1, 4, 3] == pytest.approx(4 * 0.3 / 2 / 5)  # the third one lies four pixels beside
+    assert found[0, 4, 2] == 0.0  # three from where the second one lies
+    np.testing.assert_allclose(found[3], seen[3] / 5)
+
+
+def redrawn_pair(shared_data, folder: Path, change) -> list[View]:
+    """Two Pleiades images, the second on another date; changed."""
+    source = shared_data / "optical/phr_triplet_north"
+    with rasterio.open(source / "img_03.tif") as file:
+        pixels, rpcs = redrawn(file.read(1), 1), file.rpcs
+    path = write_image(folder / "other.tif", change(pixels), rpcs=rpcs)
+    return list(load_views([source / "img_02.tif", path]).views)
+
+
+@pytest.mark.slow
+def test_lines_that_coarser_pictures_lose_tie_a_pair_where_it_lies(shared_data, tmp_path) -> None:
+    """Half of what snow leaves has grown anew, the rest is turned over: check points of the images as they were."""
+    views = redrawn_pair(shared_data, tmp_path, lambda pixels: pixels)
+    found = find_tracks(views, TieOptions(matcher=STRUCTURE))
+    assert found.pairs[0].matcher == FINE
+    a, b = common_tracks(found.tracks, 0, 1)
+    table = np.genfromtxt(
+        shared_data / "truth/ties/phr_triplet_north__img_02__img_03__ncc_check.csv", delimiter=",", names=True
+    )
+    at, xy = (np.stack([table[f"col_{k}"], table[f"row_{k}"]], axis=1) for k in "ab")
+    where = frame(*views, at)
+    true = robust_affine(at, where.errors(xy)[:, 1])
+    off = frame(*views, a, where.axis).errors(b)[:, 1] - true(a)
+    assert len(off) > 30
+    assert np.abs(np.median(off)) < 0.1
+    assert np.sqrt((off**2).mean()) < 0.4
+
+
+@pytest.mark.slow
+def test_another_place_is_no_more_like_it_by_its_neighbours(shared_data, tmp_path) -> None:
+    for name, change in (("mirrored", np.fliplr), ("turned", lambda pixels: pixels[::-1, ::-1])):
+        (tmp_path / name).mkdir()
+        views = redrawn_pair(shared_data, tmp_path / name, change)
+        with pytest.raises(TiePointError, match=r"no common offset|too few matches"):
+            find_tracks(views, TieOptions(matcher=STRUCTURE, search=20.0))
+
+
 @pytest.fixture(scope="module")
 def textured(tmp_path_factory) -> tuple[structure.Files, np.ndarray]:
     """Files of an image and of the same moved by as much as is said: x, y [px]."""
@@ -352,7 +418,7 @@ def test_a_place_beyond_the_band_and_its_sides_is_not_found_however_alike(
     where = Frame(axis, along, across, np.zeros(3), -half, half, np.eye(2))
     monkeypatch.setattr(structure, "linear_map", lambda *_: np.eye(2))
     search = _Search.__new__(_Search)
-    search._views, search._files, search._band = (), files, 1  # type: ignore[assignment]
+    search._views, search._files, search._band, search._whole = (), files, 1, False  # type: ignore[assignment]
     search._points, search._step = at, 1
     search._prediction = Prediction(lambda _: where, 2.0, list)
     found, xy, _ = search._tile(where, np.arange(3))
