@@ -14,7 +14,7 @@ from barpc.ba.apart import Apart, find_apart
 from barpc.ba.evidence.scan import neighbours_alike
 from barpc.ba.held.block import Block, join
 from barpc.ba.held.datum import datum_shares
-from barpc.ba.held.gauge import GaugeReport, earlier_scene, gauge_report, sampled
+from barpc.ba.held.gauge import GaugeReport, earlier_scene, gauge_report
 from barpc.ba.held.incremental import BlockPrior
 from barpc.ba.held.relief import Terrain
 from barpc.ba.judging.following import follow, without_strips
@@ -372,5 +372,5 @@ def _gauge(found: Solution, block: Block, covariance: Covariance) -> GaugeReport
     kinds = (found.seen & (number < last) for last in (block.num_tracks, block.num_known, len(number)))
     counted = next((kind for kind in kinds if kind.any()), found.seen)
     prior = found.outcome.problem.camera_prior.sigma
-    before = found.first_points(block, sampled(counted))
+    before = found.first_points(block, counted)
     return gauge_report(covariance, found.final.points, before, counted, prior)

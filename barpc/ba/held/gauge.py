@@ -72,28 +72,22 @@ def gauge_report(
     """Report how an adjustment moved the scene: points (P, 3), ECEF [m], after and before it; those that
     count in `use` (P,).
 
-    The scene is a sample of these, `sampled(use)`: of other points nothing is read. `prior` (N, q) are the standard
-    deviations of the cameras' unknowns as delivered; infinite ones do not count.
+    `prior` (N, q) are the standard deviations of the cameras' unknowns as delivered; infinite ones do not count.
     """
-    use = sampled(use)
-    shift = (points[use] - before[use]).mean(axis=0)
+    shift, count = (points[use] - before[use]).mean(axis=0), use.sum()
+    index = np.flatnonzero(use)
+    use = np.zeros_like(use)
+    use[index[:: len(index) // _SAMPLE + 1]] = True
     middle = points[use].mean(axis=0)
     enu = enu_basis(ground_from_ecef(middle))
     local = (points[use] - middle) @ enu.T
     radius = max(float(np.sqrt((local[:, :2] ** 2).sum(axis=1).mean())), 1e-6)
-    by_unknown, own = _motion_by_unknowns(covariance, local / radius, enu, use)
+    by_unknown, own = _motion_by_unknowns(covariance, local / radius, enu, use, use.sum() / count)
     found = _report(covariance, enu @ shift, by_unknown, own, radius)
     if prior is None:
         return found
     variance = np.where(np.isfinite(prior), prior, 0.0).ravel() ** 2
     return replace(found, delivered_sigma=np.sqrt(by_unknown[:3] ** 2 @ variance))
-
-
-def sampled(use: BoolArray) -> BoolArray:
-    """Return the points (P,) that stand for all of those in use, regularly taken."""
-    index, out = np.flatnonzero(use), np.zeros_like(use)
-    out[index[:: len(index) // _SAMPLE + 1]] = True
-    return out
 
 
 def earlier_scene(
@@ -118,7 +112,7 @@ def _report(
 
 
 def _motion_by_unknowns(
-    covariance: Covariance, local: Array, enu: Array, use: BoolArray
+    covariance: Covariance, local: Array, enu: Array, use: BoolArray, share: float
 ) -> tuple[Array, Array]:
     """Return the scene's motions by the camera unknowns (10, N q), their covariance (10, 10) where the
     cameras are known.
@@ -139,7 +133,7 @@ def _motion_by_unknowns(
     by_unknown[filled] = -np.add.reduceat(products.reshape(-1, q * count), bounds[filled], axis=0)
     flat = whitened[index].reshape(-1, count)
     by_camera = by_unknown.reshape(-1, q, count).transpose(2, 0, 1).reshape(count, -1)
-    own = flat.T @ flat
+    own = share * flat.T @ flat
     if reduced.common is not None:
         moved = np.einsum("qic,qim->cm", whitened[reduced.common.index], reduced.common.cross)
         shared = -la.solve_triangular(reduced.common.upper, moved.T, trans="T").T

@@ -102,7 +102,7 @@ class FitEntry(Record):
     rmse_px: Pixel = said("Error col, row on check points", "px", "RMSE col, row", ".1e")
     max_px: Pixel = said("Largest error col, row on check points", "px")
     min_denominator: Number = said(
-        "Over the box and 25 % around it, relative to its centre", "", "smallest denominator", ".3f"
+        "Over the image's ground and around it, relative to its centre", "", "smallest denominator", ".3f"
     )
     roundtrip_px: Number = said(
         "Largest move by projection and back; null where it fails", "px", "round trip", ".1e"
