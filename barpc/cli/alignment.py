@@ -25,7 +25,7 @@ _TOLD = 0.01  # m: rounding of a matrix that is told
 
 
 def read_move(_: click.Context, __: click.Parameter, text: str | None) -> Array | None:
-    """The three numbers of --move, metres east, north and up."""
+    """Return the three numbers of --move, metres east, north and up."""
     if text is None:
         return None
     try:
@@ -39,7 +39,7 @@ def read_move(_: click.Context, __: click.Parameter, text: str | None) -> Array 
 
 
 def moved(cameras: Sequence[Camera], move: Array | None, transform: str | None, carrier: str) -> list[Camera]:
-    """Cameras that show the moved ground where these show it unmoved, each refitted into an RPC and certified.
+    """Return cameras that show the moved ground where these show it unmoved, each refitted into an RPC and certified.
 
     The motion is `move` (3,) [m], east, north and up at the middle of all the images, or that of the file
     `transform`: it takes the points that these cameras make to their true place. One motion for all cameras: rays that
@@ -71,7 +71,7 @@ def moved(cameras: Sequence[Camera], move: Array | None, transform: str | None, 
 
 
 def _corners(camera: Camera) -> Array:
-    """Ground (n, 3) along the border of a camera's image, at its lowest and highest altitude."""
+    """Return ground (n, 3) along the border of a camera's image, at its lowest and highest altitude."""
     edge = image_border(camera.extent, 4)
     ground = np.concatenate(
         [camera.model.localize(edge, np.full(len(edge), alt)) for alt in camera.alt_range]
@@ -104,7 +104,7 @@ def _refitted(camera: Camera, model: Corrected, alt_range: tuple[float, float], 
 
 
 def _tell(matrix: Array, middle: Array) -> None:
-    """What the motion is at the middle of the images, and what the digits of its matrix are worth there."""
+    """Say what the motion is at the middle of the images, and what the digits of its matrix are worth there."""
     at, stretch = ground_from_ecef(middle), np.linalg.svd(matrix[:, :3], compute_uv=False)
     rounding = float((stretch[0] - stretch[-1]) / stretch.mean() * np.linalg.norm(middle))
     if rounding > _TOLD:

@@ -107,7 +107,7 @@ def convert(files: tuple[str, ...], out_dir: str | None, **flags: Any) -> int:
 
 
 def _to_folder(files: tuple[str, ...], folder: Path, flags: Mapping[str, Any]) -> int:
-    """Images with their RPCs, or those of --rpc, moved or not, in a new folder."""
+    """Write images with their RPCs, or those of --rpc, moved or not, into a new folder."""
     if flags["window"] is not None:
         raise click.UsageError(
             "--window goes with a TARGET, not with -o: images differ in where their pixels are"
@@ -132,7 +132,7 @@ def _to_folder(files: tuple[str, ...], folder: Path, flags: Mapping[str, Any]) -
 
 
 def _to_target(files: tuple[str, ...], flags: Mapping[str, Any]) -> int:
-    """One RPC, in another syntax, as a grid, or with a part of its image."""
+    """Write one RPC in another syntax, as a grid, or with a part of its image."""
     overwrite: bool = flags["overwrite"]
     if len(files) != 2 or any(flags[name] is not None for name in ("rpcs", "carrier", "move", "transform")):
         with_it = "--rpc, --images, --move, --transform"
@@ -156,7 +156,7 @@ def _to_target(files: tuple[str, ...], flags: Mapping[str, Any]) -> int:
 
 
 def _refitted(camera: Camera) -> Camera:
-    """A grid as an RPC; FitError where none holds it."""
+    """Fit an RPC to a grid; FitError where none holds it."""
     options = FitOptions()
     fit = fit_rpc(camera.model, camera.extent, camera.alt_range, options=options, strict=False)
     if wrong := fit.verdict(options.tolerance):
@@ -222,7 +222,7 @@ def check_target(
 
 
 def _window(flags: Mapping[str, Any]) -> Callable[[Camera, Path], Window]:
-    """What tells the window of an image that is asked for, or the pixels of a box or area on the ground."""
+    """Return what tells the window of an image that is asked for, or the pixels of a box or area on the ground."""
     if sum(flags[name] is not None for name in ("window", "bbox", "aoi")) != 1:
         raise click.UsageError("give one of --window, --bbox and --aoi")
     window: Window | None = flags["window"]
@@ -237,7 +237,7 @@ def _window(flags: Mapping[str, Any]) -> Callable[[Camera, Path], Window]:
 
 
 def _cameras(images: Sequence[str], rpcs: str | None) -> list[Camera]:
-    """The cameras of images: their own, or those of a file or a folder of RPCs, for images of that size."""
+    """Return the cameras of images: their own, or those of a file or a folder of RPCs, for images of that size."""
     if rpcs is None:
         return [open_camera(image) for image in images]
     cameras = []
@@ -278,7 +278,7 @@ def _hand_off(
 
 
 def _told(readings: list[Reading], reasons: Sequence[str] = (), notes: Sequence[str] = ()) -> int:
-    """What readers of the files see, and the exit code."""
+    """Say what readers of the files see; return the exit code."""
     _tell(readings)
     for sentence in notes:
         say(sentence)
@@ -301,7 +301,7 @@ def _tell(readings: list[Reading]) -> None:
 
 
 def _shadow_reasons(image: Path, written: list[Path]) -> list[str]:
-    """What lies beside a new file and hides its RPC; what lies beside the image is only said."""
+    """Return what lies beside a new file and hides its RPC; what lies beside the image is only said."""
     for sidecar in shadows(image):
         say(f"beside {image}: {sidecar.path.name} hides an RPC put into the image")
     hiding = [sidecar.path for sidecar in shadows(written[0]) if sidecar.path not in written]

@@ -24,7 +24,7 @@ Box = tuple[float, float, float, float]
 
 
 def box_of(path: str) -> Box:
-    """West, south, east, north [deg] of an area of interest; east is less than west across the antimeridian."""
+    """Return west, south, east, north [deg] of an area of interest; east is less than west across the antimeridian."""
     outline = read_area(path).outline  # three times, a whole turn apart
     found = [shapely.clip_by_rect(outline, west, -90.0, west + 360.0, 90.0).bounds for west in (-180.0, 0.0)]
     west, south, east, north = min(found, key=lambda bounds: bounds[2] - bounds[0])
@@ -32,7 +32,7 @@ def box_of(path: str) -> Box:
 
 
 def window_of(camera: Camera, path: Path, bbox: Box, alt: float | None, dem: Dem | None) -> Window:
-    """The pixels that a box on the ground covers, cut to the image; a usage error where it does not meet it."""
+    """Return the pixels that a box on the ground covers, cut to the image; a usage error where it does not meet it."""
     west, south, east, north = bbox
     east += 360.0 * (east < west)  # a box across the antimeridian
     t = (image_border((1, 1), 16) + 0.5) * [east - west, north - south] + [west, south]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def _flag(name: str, kind: Any, metavar: str | None = None) -> Callable[[Function], Function]:
-    """A click option whose words and default are the field's own."""
+    """Return a click option whose words and default are the field's own."""
     one = declared(DsmOptions)[name]
     default = "" if one.default in (None, False) else f"  [default: {one.default}]"
     if kind is bool:

@@ -97,7 +97,7 @@ def fit(
 
 
 def _fit(source: str, output: str | None, flags: dict[str, Any]) -> tuple[RpcFit, float]:
-    """The fit and the tolerance [px] that it is to meet."""
+    """Return the fit and the tolerance [px] that it is to meet."""
     from barpc.cameras import open_camera, read_points, split_spec
     from barpc.dem import Dem
     from barpc.fit import FitOptions, fit_rpc, fit_rpc_points

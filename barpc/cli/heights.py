@@ -30,12 +30,12 @@ class Heights(NamedTuple):
     geoid: str | None
 
     def terrain(self) -> Dem | None:
-        """The DEM, if one is given; a usage error beside --alt, or for a geoid alone."""
+        """Return the DEM, if one is given; a usage error beside --alt, or for a geoid alone."""
         return opened_dem(self.dem, self.geoid, self.alt)
 
 
 def with_heights(alt: str) -> Callable[[Function], Function]:
-    """The flags --alt, with this help, --dem and --geoid of a verb, which gets them as its `heights`."""
+    """Return the flags --alt, with this help, --dem and --geoid of a verb, which gets them as its `heights`."""
 
     def added(verb: Function) -> Function:
         @click.option("--alt", type=float, help=alt)
@@ -51,7 +51,7 @@ def with_heights(alt: str) -> Callable[[Function], Function]:
 
 
 def opened_dem(dem: str | None, geoid: str | None, alt: float | None = None) -> Dem | None:
-    """The DEM of a command line, if it gives one; a usage error beside --alt, or for a geoid alone."""
+    """Return the DEM of a command line, if it gives one; a usage error beside --alt, or for a geoid alone."""
     if dem is None:
         if geoid is not None:
             raise click.UsageError("--geoid goes with --dem")
@@ -62,7 +62,8 @@ def opened_dem(dem: str | None, geoid: str | None, alt: float | None = None) -> 
 
 
 def altitude_of(camera: Camera, image: Place, given: float | None = None) -> float:
-    """The altitude of an image's ground [m]: as given, of the tie points of the run that it lies in, else the middle.
+    """Return the altitude of an image's ground [m]: as given, of the tie points of the run that it lies in, else the
+    middle.
 
     Where nothing is known of the ground a line says so, and what that may be worth.
     """
@@ -77,7 +78,7 @@ def altitude_of(camera: Camera, image: Place, given: float | None = None) -> flo
 
 
 def _unknown(camera: Camera) -> str:
-    """What it is worth not to know the ground, in words."""
+    """Return what it is worth not to know the ground, in words."""
     text = f"its ground is taken at {camera.altitude:g} m, the middle of its altitudes"
     if camera.size is None:
         return text
@@ -87,13 +88,13 @@ def _unknown(camera: Camera) -> str:
 
 
 def _of_run(file: Path) -> float | None:
-    """The altitude of the tie points of the run that wrote a file."""
+    """Return the altitude of the tie points of the run that wrote a file."""
     return _written_in(file.absolute().parent).get(file.name)
 
 
 @cache
 def _written_in(folder: Path) -> dict[str, float]:
-    """The files that a run wrote for its images into a folder, and the median altitude of its tie points [m]."""
+    """Return the files that a run wrote for its images into a folder, and the median altitude of its tie points [m]."""
     from barpc.report.tables import read_summary
 
     if not (folder / "summary.json").is_file():
@@ -108,14 +109,14 @@ def _written_in(folder: Path) -> dict[str, float]:
 
 
 def ground_at(camera: Camera, image: Array, alt: Array | float, dem: Dem | None) -> Array:
-    """Ground points (N, 3) of image points (N, 2), on the DEM where there is one, else at altitudes [m]."""
+    """Return ground points (N, 3) of image points (N, 2), on the DEM where there is one, else at altitudes [m]."""
     if dem is not None:
         return localize_on_terrain(camera.model, image, dem, camera.alt_range)
     return camera.model.localize(image, np.broadcast_to(np.asarray(alt, dtype=np.float64), len(image)))
 
 
 def exchanged(camera: Camera, ground: Array) -> str:
-    """What to say of points (N, 3) far off an image that shows them with lon and lat exchanged; else empty."""
+    """Return what to say of points (N, 3) far off an image that shows them with lon and lat exchanged; else empty."""
     if camera.size is None or not len(ground):
         return ""
     swapped = ground[:, [1, 0, 2]]
@@ -126,7 +127,7 @@ def exchanged(camera: Camera, ground: Array) -> str:
 
 
 def _near(camera: Camera, ground: Array) -> BoolArray:
-    """Which points (N, 3) are on the image, or less than its size off it."""
+    """Return which points (N, 3) are on the image, or less than its size off it."""
     size = np.array(camera.extent)
     with np.errstate(invalid="ignore"):
         return np.asarray((np.abs(camera.model.project(ground) - size / 2) <= 1.5 * size).all(axis=1))

@@ -21,7 +21,8 @@ _DEEP = 40  # levels of a configuration
 
 
 def expanded(specs: Sequence[str]) -> list[str]:
-    """Files instead of folders (their rasters, by name; a radar product is one) and of patterns that no shell took.
+    """Return files instead of folders (their rasters, by name; a radar product is one) and of patterns that no shell
+    took.
 
     InputError for an empty name, a folder that holds no raster, a pattern that finds nothing.
     """
@@ -38,7 +39,7 @@ def expanded(specs: Sequence[str]) -> list[str]:
 
 
 def _name_of(spec: str) -> str:
-    """The file's part of a name with choices behind it, as it was typed."""
+    """Return the file's part of a name with choices behind it, as it was typed."""
     from barpc.cameras import split_spec
 
     with suppress(BarpcError):
@@ -84,7 +85,8 @@ def _is_raster(path: Path) -> bool:
 
 
 def with_cameras(images: Sequence[str], named: Sequence[str]) -> list[str]:
-    """Images with the cameras that IMAGE=FILE names for them; IMAGE is a path as given, a file's name, or its stem.
+    """Return images with the cameras that IMAGE=FILE names for them; IMAGE is a path as given, a file's name, or its
+    stem.
 
     InputError for a text that names none of the images, several of them, or one for the second time.
     """
@@ -111,7 +113,7 @@ def with_cameras(images: Sequence[str], named: Sequence[str]) -> list[str]:
 
 
 def _with_camera(spec: str, image: str, file: str) -> str:
-    """The image with this file as its camera, if that is not the one that is found anyway."""
+    """Return the image with this file as its camera, if that is not the one that is found anyway."""
     from barpc.rpcio import read_rpc_source
 
     if not is_url(image) and not is_url(file):
@@ -143,12 +145,12 @@ class Config:
     items: tuple[Item, ...]
 
     def images(self, hosts: Sequence[str] = ()) -> list[Any]:
-        """The images, as `barpc.adjust` takes them."""
+        """Return the images, as `barpc.adjust` takes them."""
         return [_as_image(item, hosts, self.path) for item in self.items]
 
 
 def read_config(tool: str, file: str) -> Config:
-    """The images and cameras that a configuration of s2p, CARS or sat-bundleadjust lists; paths relative to it.
+    """Return the images and cameras that a configuration of s2p, CARS or sat-bundleadjust lists; paths relative to it.
 
     InputError where it does not parse, or lists no images.
     """
@@ -265,7 +267,8 @@ def _as_image(item: Item, hosts: Sequence[str], path: Path) -> Any:
 
 
 def corrected(config: Config, folder: Path, views: Sequence[Any]) -> str:
-    """The configuration as a text for the folder of a run, with the corrected cameras of its images (in their order).
+    """Return the configuration as a text for the folder of a run, with the corrected cameras of its images (in their
+    order).
 
     What names files relative to where it lay names them from there.
     """
@@ -291,7 +294,7 @@ def corrected(config: Config, folder: Path, views: Sequence[Any]) -> str:
 
 
 def _moved(value: Any, before: Path, now: Path, depth: int = 0) -> Any:
-    """A part of a configuration in which relative names of files that exist are relative to another folder."""
+    """Return a part of a configuration in which relative names of files that exist are relative to another folder."""
     if depth > _DEEP:
         raise InputError(f"a configuration nested more than {_DEEP} deep")
     if isinstance(value, dict):

@@ -103,7 +103,7 @@ def _print(images: Sequence[str], reports: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _lines(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """What is told of a camera in words: label and sentence of each line."""
+    """Yield what is told of a camera in words: label and sentence of each line."""
     is_rpc = "domain" in report
     yield "camera", f"RPC ({report['rpc'].replace(' in ', ') in ', 1)}" if is_rpc else report["rpc"]
     yield from (("note", note) for note in report["notes"])
@@ -151,7 +151,9 @@ def _lines_of_geometry(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _altitude(image: str, camera: Camera, alt: float | None, terrain: Dem | None) -> float:
-    """Altitude of the ground in the middle of an image [m]; that of the camera where no size tells the middle."""
+    """Return altitude of the ground in the middle of an image [m]; that of the camera where no size tells the
+    middle.
+    """
     if camera.size is None:
         return camera.altitude if alt is None else alt
     if terrain is None:
@@ -165,7 +167,7 @@ def _altitude(image: str, camera: Camera, alt: float | None, terrain: Dem | None
 def _outlines(
     images: Sequence[str], cameras: Sequence[Camera], alt: float | None, terrain: Dem | None
 ) -> dict[str, Any]:
-    """GeoJSON (RFC 7946: cut at the antimeridian) of the images' outlines."""
+    """Return GeoJSON (RFC 7946: cut at the antimeridian) of the images' outlines."""
     features = []
     for image, camera in zip(images, cameras, strict=True):
         height = _altitude(image, camera, alt, terrain)
@@ -182,7 +184,7 @@ def _outlines(
 def _pairs(
     images: Sequence[str], cameras: Sequence[Camera], i: int, alt: float, at: tuple[float, ...] | None
 ) -> list[dict[str, Any]]:
-    """What an image and each later one see together at its centre: the angle between their rays, and B/H."""
+    """Return what an image and each later one see together at its centre: the angle between their rays, and B/H."""
     first, height = cameras[i], np.asarray(alt)
     point = first.model.localize((np.array(first.extent) - 1) / 2, height) if at is None else np.array(at)
     rows = []
@@ -194,7 +196,7 @@ def _pairs(
 
 
 def _describe(camera: Camera, alt: float, at: tuple[float, ...] | None) -> dict[str, Any]:
-    """Everything that is told of a camera, with plain values."""
+    """Return everything that is told of a camera, with plain values."""
     report: dict[str, Any] = {
         "rpc": f"{camera.format} in {camera.path}",
         "notes": list(camera.notes),
@@ -209,7 +211,7 @@ def _describe(camera: Camera, alt: float, at: tuple[float, ...] | None) -> dict[
 
 
 def _box(rpc: RPC) -> dict[str, Any]:
-    """What an RPC alone states: its box on the ground, its accuracy, and how near to a pole it comes there."""
+    """Return what an RPC alone states: its box on the ground, its accuracy, and how near to a pole it comes there."""
     low, high = rpc.ground_offset - np.abs(rpc.ground_scale), rpc.ground_offset + np.abs(rpc.ground_scale)
     lon, lat, _ = np.stack([low, high], axis=1).tolist()
     return {
@@ -223,7 +225,7 @@ def _box(rpc: RPC) -> dict[str, Any]:
 def _geometry(
     camera: Camera, size: tuple[int, int], alt: float, at: tuple[float, ...] | None
 ) -> dict[str, Any]:
-    """What follows from the camera and the image's size: angles, ground sample distance, footprint."""
+    """Return what follows from the camera and the image's size: angles, ground sample distance, footprint."""
     model = camera.model
     middle = (np.array(size) - 1) / 2
     center = model.localize(middle, np.asarray(alt))

@@ -97,7 +97,7 @@ def _kept_lines(text: str | None) -> str | None:
 
 
 def _in_file(flag: str) -> str:
-    """Where an options file says what a flag would, if it is an option."""
+    """Return where an options file says what a flag would, if it is an option."""
     from barpc.options import Options, RunOptions, declared
 
     name = flag[2:].replace("-", "_")
@@ -113,7 +113,7 @@ class Verbs(click.Group):
     """A group that imports a verb's module when the verb is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """The verbs, in the table's order."""
+        """Return the verbs, in the table's order."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -222,7 +222,7 @@ def main(args: list[str] | None = None) -> None:
 
 
 def _told(error: BaseException) -> tuple[int, str]:
-    """The exit code of an error, and what to say."""
+    """Return the exit code of an error, and what to say."""
     if isinstance(error, (click.Abort, KeyboardInterrupt)):
         return EXIT_INTERRUPTED, "interrupted; run the same command again to go on"
     if isinstance(error, click.ClickException):
@@ -256,7 +256,7 @@ def _interruptible() -> Iterator[None]:
 def _log_warning(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: object, **__: object
 ) -> None:
-    """A warning as one line of the log: barpc's own always, those of libraries with -v."""
+    """Log a warning as one line: barpc's own always, those of libraries with -v."""
     text = " ".join(str(message).split())
     if issubclass(category, BarpcWarning):
         logging.getLogger("barpc").warning(text)

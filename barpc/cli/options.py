@@ -50,12 +50,12 @@ _NAMES = {"rpc_formats": "--rpc-format"}
 
 
 def flag_name(target: str) -> str:
-    """The flag that sets a field."""
+    """Return the flag that sets a field."""
     return _NAMES.get(target) or "--" + target.rpartition(".")[2].replace("_", "-")
 
 
 def field_of(target: str) -> Declared:
-    """What is declared of a field, by its name with its table before a dot."""
+    """Return what is declared of a field, by its name with its table before a dot."""
     *table, name = target.split(".")
     record = type(declared(RunOptions)[table[0]].default) if table else RunOptions
     return declared(record)[name]
@@ -84,7 +84,7 @@ class Grouped(click.Command):
         self.params.append(shown)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """What the user gives, then tie points, cameras and ground."""
+        """List what the user gives, then tie points, cameras and ground."""
         groups = {"Tie points": TIE, "Cameras": CAMERA, "Ground": GROUND}
         of = {_parameter(target): words for words, targets in groups.items() for target in targets}
         rows: dict[str, list[tuple[str, str]]] = {"Files and the run": [], **{words: [] for words in groups}}
@@ -108,12 +108,12 @@ def _help_all(context: click.Context, _parameter: click.Parameter, value: bool) 
 
 
 def _parameter(target: str) -> str:
-    """What click calls the flag that sets a field."""
+    """Return what click calls the flag that sets a field."""
     return "flag_" + target.replace(".", "_")
 
 
 def flag(target: str) -> Callable[[Function], Function]:
-    """The click option that sets a field: its type, range, choices, help and default are the field's own."""
+    """Return the click option that sets a field: its type, range, choices, help and default are the field's own."""
     one, name = field_of(target), flag_name(target)
     rule, kind, parameter = one.rule, one.kind, _parameter(target)
     if kind is bool:  # None: the options file decides
@@ -187,7 +187,7 @@ def with_flags(*targets: str) -> Callable[[Function], Function]:
 
 
 def _jobs(_context: click.Context, _parameter: click.Parameter, value: str) -> int | str:
-    """A number of processes, or the address of a cluster."""
+    """Return a number of processes, or the address of a cluster."""
     if "://" in value:
         return value
     if not value.isdecimal() or not 1 <= len(value) <= 4 or int(value) < 1:
@@ -218,7 +218,7 @@ _RUN_OPTIONS = (
 
 
 def image_paths(images: tuple[str, ...], image_list: str | None) -> list[str]:
-    """Images of the command line, then those of a list file (blank lines and # comments are skipped)."""
+    """Return images of the command line, then those of a list file (blank lines and # comments are skipped)."""
     from barpc.remote import is_url
     from barpc.sidefile import read_names
 
@@ -231,7 +231,7 @@ def image_paths(images: tuple[str, ...], image_list: str | None) -> list[str]:
 
 
 def run_options(flags: Mapping[str, Any], options_file: str | None) -> RunOptions:
-    """Defaults, or the paper's options, then the options file, then the flags that were given."""
+    """Return defaults, or the paper's options, then the options file, then the flags that were given."""
     options = with_values(RunOptions(), PAPER if flags.get("paper") else {})
     options = options if options_file is None else read_options(options_file, options)
     values: dict[str, Any] = {}

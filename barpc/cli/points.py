@@ -135,7 +135,7 @@ def triangulate(images: tuple[str, ...], at: tuple[tuple[float, float], ...], po
 def given_points(
     numbers: Sequence[float], file: str | None, names: Sequence[str], fill: float | None = None
 ) -> Array:
-    """Points (N, columns) from arguments, a CSV file, or standard input ("-").
+    """Return points (N, columns) from arguments, a CSV file, or standard input ("-").
 
     A file has a header with the columns' names, or their order; blanks separate, too. `fill` is the value of the last
     column where it is not given.
@@ -187,7 +187,7 @@ def _is_number(text: str) -> bool:
 
 
 def _print_points(names: Sequence[str], values: Array, digits: Sequence[int]) -> None:
-    """A table of points as CSV with a header, or as a JSON list of objects (null for NaN)."""
+    """Print a table of points as CSV with a header, or as a JSON list of objects (null for NaN)."""
     rows = [list(zip(row, digits, strict=True)) for row in values.tolist()]
     if wants_json():
         plain = [[round(v, d) if np.isfinite(v) else None for v, d in row] for row in rows]
@@ -198,6 +198,6 @@ def _print_points(names: Sequence[str], values: Array, digits: Sequence[int]) ->
 
 
 def _tell_failures(points: Array, what: str) -> int:
-    """The exit code of a verb on points; where some came out without a value, it is said on stderr."""
+    """Return the exit code of a verb on points; where some came out without a value, it is said on stderr."""
     count = int((~np.isfinite(points).all(axis=1)).sum())
     return tell_gate(f"{count} of {len(points)} points {what}", []) if count else 0

@@ -30,7 +30,7 @@ MINUTE = 60.0  # s between two lines where nobody sees bars
 
 @contextmanager
 def progress_told(quiet: bool, verbose: int) -> Iterator[Progress]:
-    """A callback `progress(stage, done, total)`: bars on a terminal, else and with -v lines; silent with -q."""
+    """Yield a callback `progress(stage, done, total)`: bars on a terminal, else and with -v lines; silent with -q."""
     if quiet:
         yield lambda _stage, _done, _total: None
     elif sys.stderr.isatty() and not verbose:
@@ -100,7 +100,7 @@ def _minutes(seconds: float) -> str:
 
 @contextmanager
 def _bars() -> Iterator[Progress]:
-    """One bar a stage at a time, with the time that is left."""
+    """Yield one bar a stage at a time, with the time that is left."""
     bars: dict[str, ProgressBar[int]] = {}
 
     def finish() -> None:
@@ -124,7 +124,7 @@ def _bars() -> Iterator[Progress]:
 
 @contextmanager
 def executor_for(jobs: int | str) -> Iterator[Executor | None]:
-    """The executor of a run: None works in this process."""
+    """Yield the executor of a run: None works in this process."""
     with (
         nullcontext()
         if jobs == 1
@@ -164,7 +164,7 @@ def _processes(jobs: int) -> Iterator[Executor]:
 
 
 def _enter_worker() -> None:
-    """One BLAS thread, so that sums keep their order; Ctrl-C is the parent's, and its end the worker's."""
+    """Keep to one BLAS thread, so that sums keep their order; Ctrl-C is the parent's, and its end the worker's."""
     os.environ.update(dict.fromkeys(THREADS, "1"))  # before numpy is imported
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     warnings.simplefilter("ignore")

@@ -38,7 +38,7 @@ _COLORS = {"good": "green", "look": "yellow", "bad": "red"}
 
 
 def wants_json() -> bool:
-    """Whether results go to stdout as JSON: `--json`, before or behind the verb."""
+    """Return whether results go to stdout as JSON: `--json`, before or behind the verb."""
     context = click.get_current_context(silent=True)
     return context is not None and bool(context.find_root().params.get("as_json"))
 
@@ -49,7 +49,7 @@ def echo(text: object = "", *, err: bool = False, nl: bool = True, **style: Any)
 
 
 def say(message: str) -> None:
-    """One line on stderr, of this command."""
+    """Print one line on stderr, of this command."""
     echo(f"barpc: {' '.join(message.split())}", err=True)
 
 
@@ -64,16 +64,16 @@ class Formatter(logging.Formatter):
     """Records of the log as single lines; only a traceback has more."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        """The line of a record."""
+        """Return the line of a record."""
         return visible(super().formatMessage(record).replace("\n", " "))
 
     def formatException(self, ei: Any) -> str:
-        """A traceback."""
+        """Return a traceback."""
         return visible(super().formatException(ei))
 
 
 def print_summary(summary: Summary) -> None:
-    """Tables of views, pairs and control, and the verdict, on stdout: `MOST_LINES` in a pipe, or 80 columns wide."""
+    """Print tables of views, pairs and control, and the verdict: `MOST_LINES` in a pipe, or 80 columns wide."""
     from barpc.report.digest import SHOWN, sentences
 
     width, lines = output_width(), sentences(summary)
@@ -95,7 +95,9 @@ def print_summary(summary: Summary) -> None:
 
 
 def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str]]:
-    """Titles, cells and what is said of the rest: of more rows than these the worst of those that pass a limit."""
+    """Return titles, cells and what is said of the rest: of more rows than these the worst of those that pass a
+    limit.
+    """
     from barpc.report import digest
     from barpc.report.records import table
     from barpc.report.summary import DATUM, GCPS, DatumEntry, GcpEntry, PairEntry, ViewEntry
@@ -126,13 +128,13 @@ def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str
 
 
 def _height(table: tuple[str, list[list[str]], str], width: int | None) -> int:
-    """Lines of a table with its title, what is said of the rest, and empty ones behind."""
+    """Return lines of a table with its title, what is said of the rest, and empty ones behind."""
     title, texts, more = table
     return (len(_wrapped(title, width)) + len(layout(texts, width)) if texts else 0) + bool(more) + 1
 
 
 def _fitting(lines: Sequence[str], room: int, width: int | None) -> list[str]:
-    """So many sentences as there is room for, and how many more there are."""
+    """Return so many sentences as there is room for, and how many more there are."""
     heights = [len(_wrapped(line, width)) for line in lines]
     if sum(heights) <= room:
         return list(lines)
@@ -145,7 +147,7 @@ def _wrapped(text: str, width: int | None) -> list[str]:
 
 
 def print_comparison(comparison: Mapping[str, Any]) -> None:
-    """Two runs side by side, on stdout."""
+    """Print two runs side by side, on stdout."""
     width = output_width()
     echo(f"A: {comparison['a']}\nB: {comparison['b']}\n")
     heads = ["image", "points A", "points B", "error A [px]", "error B [px]", "RPCs differ [px]"]
@@ -166,12 +168,12 @@ def print_comparison(comparison: Mapping[str, Any]) -> None:
 
 
 def output_width() -> int | None:
-    """Columns of the terminal that stdout is; None for a pipe or a file, where lines have no end."""
+    """Return columns of the terminal that stdout is; None for a pipe or a file, where lines have no end."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def layout(table: Sequence[Sequence[str]], width: int | None) -> list[str]:
-    r"""Lines of a table whose first row are the heads and whose first column is text, the others numbers.
+    r"""Return lines of a table whose first row are the heads and whose first column is text, the others numbers.
 
     The table has `width` columns on the terminal; None: any number.
 

@@ -17,7 +17,9 @@ _CAUSES = list(CAUSES)
 
 
 def worst_first(views: Sequence[ViewEntry]) -> list[ViewEntry]:
-    """Images by their verdicts, then by what is wrong, then by their error; those without reservation as they come."""
+    """Return images by their verdicts, then by what is wrong, then by their error; those without reservation as they
+    come.
+    """
     return sorted(views, key=_badness)
 
 
@@ -34,28 +36,30 @@ def _badness(view: ViewEntry) -> tuple[int, int, float]:
 
 
 def flagged(views: Sequence[ViewEntry]) -> list[ViewEntry]:
-    """Images that need a look, the worst first."""
+    """Return images that need a look, the worst first."""
     return [view for view in worst_first(views) if view.advice]
 
 
 def offset_of(pair: PairEntry) -> float:
-    """The epipolar offset (RMS) of a pair at the end of its run [px]; 0 where it is not known."""
+    """Return the epipolar offset (RMS) of a pair at the end of its run [px]; 0 where it is not known."""
     before, after = pair.offset_rms
     return (before if pair.epipolar_after is None else after) or 0.0
 
 
 def worst_pairs(pairs: Sequence[PairEntry]) -> list[PairEntry]:
-    """Pairs by their epipolar offset, the largest first, where it is more than stereo wants; then the others."""
+    """Return pairs by their epipolar offset, the largest first, where it is more than stereo wants; then the others."""
     return sorted(pairs, key=lambda pair: -max(offset_of(pair), GOOD_RMSE))
 
 
 def torn(pairs: Sequence[PairEntry]) -> list[PairEntry]:
-    """Pairs whose epipolar offset is more than stereo wants, the worst first."""
+    """Return pairs whose epipolar offset is more than stereo wants, the worst first."""
     return [pair for pair in worst_pairs(pairs) if offset_of(pair) > GOOD_RMSE]
 
 
 def sentences(summary: Summary) -> list[str]:
-    """The verdict, one sentence for all images that share a cause, and one for all files left out for one reason."""
+    """Return the verdict, one sentence for all images that share a cause, and one for all files left out for one
+    reason.
+    """
     own = {view.reservation for view in summary.views if view.advice}
     own |= {one.reason_text for one in summary.left_out}
     together = [*_of_views(flagged(summary.views)), *_of_files(summary.left_out)]
@@ -80,7 +84,7 @@ def _of_views(views: Sequence[ViewEntry]) -> list[str]:
 
 
 def _of_files(files: Sequence[LeftOutEntry]) -> list[str]:
-    """A reason often begins with its file."""
+    """Return the reasons of files, without the file that a reason often begins with."""
     found: dict[str, list[LeftOutEntry]] = {}
     for one in files:
         found.setdefault(one.reason.replace(one.path, "").lstrip(": "), []).append(one)

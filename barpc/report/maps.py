@@ -55,7 +55,9 @@ Known = GcpEntry | CheckPointEntry
 
 
 def _ties(links: Sequence[Link], width: tuple[float, float], opacity: tuple[float, float]) -> list[str]:
-    """Lines of least width and opacity, and by how much those of the link with the most matches are above these."""
+    """Return lines of least width and opacity, and by how much those of the link with the most matches are above
+    these.
+    """
     most, parts = max([count for *_, count, _ in links], default=1), []
     for (x1, y1), (x2, y2), count, title in sorted(links, key=itemgetter(2))[-_MOST_LINKS:]:
         share = math.sqrt(count / most)
@@ -82,14 +84,14 @@ class Plane:
     scale: float
 
     def __call__(self, lonlat: Array) -> Array:
-        """Places (..., 2) on the sheet of lon, lat [deg] (..., 2)."""
+        """Return places (..., 2) on the sheet of lon, lat [deg] (..., 2)."""
         east = (wrap_longitude(lonlat[..., 0], self.lon) - self.lon) * self.unit[0]
         north = (lonlat[..., 1] - self.lat) * self.unit[1]
         return np.stack([WIDTH / 2 + east, self.height / 2 - north], axis=-1)
 
 
 def _plane_of(lonlat: Array) -> Plane:
-    """The map on which points (n, 2) [deg] fill the sheet."""
+    """Return the map on which points (n, 2) [deg] fill the sheet."""
     lonlat = np.column_stack([wrap_longitude(lonlat[:, 0], lonlat[0, 0]), lonlat[:, 1]])
     low, high = lonlat.min(axis=0), lonlat.max(axis=0)
     lon, lat = ((low + high) / 2).tolist()
@@ -100,7 +102,7 @@ def _plane_of(lonlat: Array) -> Plane:
 
 
 def ground_map(files: RunFiles) -> str:
-    """Footprints, pairs by their matches, tie points, GCPs, on a graticule with a scale bar."""
+    """Draw footprints, pairs by their matches, tie points, GCPs, on a graticule with a scale bar."""
     summary = files.summary
     rings = [ring for outline in files.outlines for ring in outline]
     points_of: dict[str, Sequence[Known]] = {"gcps": summary.gcps, "check_points": summary.check_points}
@@ -142,7 +144,9 @@ def ground_map(files: RunFiles) -> str:
 
 
 def _moving_ground(plane: Plane, summary: Summary) -> list[str]:
-    """Cells of the ground in which tie points move together, stronger with more of them, and where each group lies."""
+    """Return cells of the ground in which tie points move together, stronger with more of them, and where each group
+    lies.
+    """
     scene = summary.scene
     if scene is None:
         return []
@@ -179,7 +183,7 @@ class Stack:
 
 
 def _drawn(files: RunFiles) -> list[tuple[int, ViewEntry, Sequence[Array]]]:
-    """Images whose outlines are drawn, with their indices: those that need a look last, so on top."""
+    """Return images whose outlines are drawn, with their indices: those that need a look last, so on top."""
     whole = {view.name: (k, view, files.outlines[k]) for k, view in enumerate(files.summary.views)}
     bad = flagged(files.summary.views)[:MAX_DRAWN]
     good = [row for name, row in whole.items() if name not in {view.name for view in bad}]
@@ -188,7 +192,7 @@ def _drawn(files: RunFiles) -> list[tuple[int, ViewEntry, Sequence[Array]]]:
 
 
 def _marked(plane: Plane, files: RunFiles) -> list[tuple[ViewEntry, Array]]:
-    """Images that need a look and the places (2,) of their middles, the worst first."""
+    """Return images that need a look and the places (2,) of their middles, the worst first."""
     found = [(view, files.outlines[files.number[view.name]]) for view in flagged(files.summary.views)]
     return [(view, _middle(plane, outline)) for view, outline in found if outline]
 
@@ -199,7 +203,7 @@ def _middle(plane: Plane, outline: Sequence[Array]) -> Array:
 
 
 def _stacks(plane: Plane, outlines: Sequence[Sequence[Array]], names: Sequence[str]) -> list[Stack]:
-    """Images whose middles stand nearer than a name is tall."""
+    """Return images whose middles stand nearer than a name is tall."""
     stacks: list[Stack] = []
     cells: dict[tuple[int, int], list[int]] = {}  # of a width of _APART: their stacks
     for k, outline in ((k, outline) for k, outline in enumerate(outlines) if outline):
@@ -218,7 +222,7 @@ def _stacks(plane: Plane, outlines: Sequence[Sequence[Array]], names: Sequence[s
 def _stack_names(
     stacks: Sequence[Stack], many: bool, taken: Sequence[tuple[float, float, float]] = ()
 ) -> list[str]:
-    """The names of stacks, without those that would stand on others or on what is taken: x, y, half width."""
+    """Return the names of stacks, without those that would stand on others or on what is taken: x, y, half width."""
     taken, names, gap = list(taken), [], 14 if many else 0
     for stack in stacks:
         (x, y), half = stack.place.tolist(), 3.6 * len(stack.text)
@@ -230,7 +234,7 @@ def _stack_names(
 
 
 def _pair_lines(stacks: Sequence[Stack], files: RunFiles) -> list[str]:
-    """From stack to stack, stronger with more matches between them."""
+    """Draw lines from stack to stack, stronger with more matches between them."""
     index = files.number
     stack_of = {k: number for number, stack in enumerate(stacks) for k in stack.views}
     matches: Counter[tuple[int, ...]] = Counter()
@@ -246,7 +250,9 @@ def _pair_lines(stacks: Sequence[Stack], files: RunFiles) -> list[str]:
 
 
 def _graticule(plane: Plane) -> tuple[list[str], list[str], list[tuple[float, float, float]]]:
-    """Lines of longitude and latitude; their degrees and the scale bar, which go on top; places x, y, half widths."""
+    """Return lines of longitude and latitude; their degrees and the scale bar, which go on top; places x, y, half
+    widths.
+    """
     right, bottom = WIDTH - 4, plane.height - 24
     reach = np.array([WIDTH / 2, plane.height / 2]) / plane.unit
     lines, texts, taken = [], [], []
@@ -293,7 +299,7 @@ class Cells:
 
 
 def residual_cells(xy: Array, residuals: Array, size: Sequence[int]) -> Cells:
-    """Mean and spread of residuals (m, 2) [px] over a grid of cells on the image."""
+    """Return mean and spread of residuals (m, 2) [px] over a grid of cells on the image."""
     cell, num = cell_numbers(xy, size), CELLS**2
     count = np.bincount(cell, minlength=num)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -308,7 +314,7 @@ def residual_cells(xy: Array, residuals: Array, size: Sequence[int]) -> Cells:
 def residual_panels(
     views: Sequence[ViewEntry], observations: Observations, when: str, first: Sequence[int] = ()
 ) -> tuple[list[tuple[str, str]], list[float], str]:
-    """Small maps of the residuals "before" or "after", with captions: `first`, then by their systematic part.
+    """Draw small maps of the residuals "before" or "after", with captions: `first`, then by their systematic part.
 
     Cells are darker where the error is larger; thin lines are single residuals; a bold arrow is the mean of a cell
     where it is larger than chance allows. Returns, too, the systematic part of every image's cells, and what lengths
@@ -376,7 +382,7 @@ def _panel(
 
 
 def _arrow(middle: Array, vector: Array) -> str:
-    """An arrow centred on a cell, not longer than reaches its neighbours' middles."""
+    """Draw an arrow centred on a cell, not longer than reaches its neighbours' middles."""
     length = float(np.hypot(*vector))
     vector, length = vector * min(1.0, 24.0 / max(length, 1e-9)), min(length, 24.0)
     tip, tail = middle + vector / 2, middle - vector / 2

@@ -28,7 +28,7 @@ class Measure:
     limits: tuple[float, ...]
 
     def shade(self, value: float) -> int:
-        """The number of the shade of a value."""
+        """Return the number of the shade of a value."""
         return sum(value >= limit for limit in self.limits)
 
     @property
@@ -49,7 +49,7 @@ MEASURES = (
 
 
 def pair_matrix(files: RunFiles) -> str:
-    """Rows and columns are the images by name; above the diagonal the pairs, below it the shades."""
+    """Draw the matrix of pairs: rows and columns are the images by name, below the diagonal stand the shades."""
     views, pairs, index = files.summary.views, files.summary.pairs, files.number
     names = [shortened(view.name, _LONGEST) for view in views]
     left = max(_LEFT, _CHARACTER * max(map(len, names)) + 6.0)
@@ -83,7 +83,9 @@ def pair_matrix(files: RunFiles) -> str:
 
 
 def facts(files: RunFiles) -> dict[str, list[list[object]]]:
-    """What the page's script says of an image or a pair that is pointed at: names, and pairs with their figures."""
+    """Return what the page's script says of an image or a pair that is pointed at: names, and pairs with their
+    figures.
+    """
     index = files.number
     names: list[list[object]] = [[view.name, view.num_observations] for view in files.summary.views]
     pairs: list[list[object]] = []
@@ -95,7 +97,7 @@ def facts(files: RunFiles) -> dict[str, list[list[object]]]:
 
 
 def _names(names: Sequence[str], side: float, left: float) -> list[str]:
-    """Names at the left and above, as many as have room."""
+    """Draw names at the left and above, as many as have room."""
     wide = _CHARACTER * max(map(len, names)) + 6.0
     step = next(
         s for s in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000) if s * side >= max(15.0, wide) or s == 1000
@@ -131,7 +133,7 @@ def _layer(
 
 
 def _legend(measure: Measure, whole: float, left: float) -> list[str]:
-    """In the lower left, where no pair stands."""
+    """Draw the legend in the lower left, where no pair stands."""
     top = _TOP + whole - 18 * len(measure.legend) - 6
     parts = [label(left + 8, top - 6, measure.words, class_="axis")]
     for k, words in enumerate(measure.legend):

@@ -39,7 +39,7 @@ def said(
     default: Any = MISSING,
     **schema: Any,
 ) -> Any:
-    """A field of a record, with all that is said of it.
+    """Return a field of a record, with all that is said of it.
 
     Parameters
     ----------
@@ -76,14 +76,14 @@ class Record:
 
     @classmethod
     def read(cls, found: Mapping[str, Any]) -> Self:
-        """The record of what a file holds, checked before; what it does not know is passed over."""
+        """Return the record of what a file holds, checked before; what it does not know is passed over."""
         readers = _readers(cls)  # type: ignore[arg-type]  # a class can be hashed
         known = ((key, value, readers[key]) for key, value in found.items() if key in readers)
         return cls(**{key: read(item) if read and item is not None else item for key, item, read in known})
 
     @classmethod
     def json_schema(cls) -> dict[str, Any]:
-        """Its JSON schema."""
+        """Return its JSON schema."""
         hints = get_type_hints(cls, include_extras=True)
         words = {one.name: {**schema_of(hints[one.name]), **one.metadata["schema"]} for one in fields(cls)}
         return {
@@ -96,7 +96,7 @@ class Record:
 
 @cache
 def _hints(record: Any) -> dict[str, Any]:
-    """Types of a record's fields; Python evaluates their texts anew whenever it is asked."""
+    """Return types of a record's fields; Python evaluates their texts anew whenever it is asked."""
     return get_type_hints(record)
 
 
@@ -107,7 +107,7 @@ def _readers(record: Any) -> dict[str, Callable[[Any], Any] | None]:
 
 
 def _reader(kind: Any) -> Callable[[Any], Any] | None:
-    """What makes a value of a type from JSON; None where it stays as it is."""
+    """Return what makes a value of a type from JSON; None where it stays as it is."""
     if get_origin(kind) in (Union, UnionType):
         kind = next(part for part in get_args(kind) if part is not NoneType)
     if isinstance(kind, type) and issubclass(kind, Record):
@@ -119,7 +119,7 @@ def _reader(kind: Any) -> Callable[[Any], Any] | None:
 
 
 def schema_of(kind: Any) -> dict[str, Any]:
-    """The JSON schema of a type."""
+    """Return the JSON schema of a type."""
     origin, parts = get_origin(kind), get_args(kind)
     if origin is Annotated:
         return {**schema_of(parts[0]), **parts[1]}
@@ -147,7 +147,7 @@ def _either(parts: Sequence[Any]) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON holds it: arrays as lists, records as mappings, what is not finite as null."""
+    """Return a value as JSON holds it: arrays as lists, records as mappings, what is not finite as null."""
     if isinstance(value, float) and not isinstance(value, np.generic):
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, (bool, int, str)):
@@ -166,7 +166,7 @@ def plain(value: Any) -> Any:
 
 @cache
 def _held(kind: Any) -> list[tuple[str, bool]]:
-    """The fields of a dataclass, and whether they are left out while None."""
+    """Return the fields of a dataclass, and whether they are left out while None."""
     of_record = issubclass(kind, Record)
     return [(f.name, of_record and f.default is None) for f in fields(kind) if f.name[0] != "_"]
 
@@ -197,7 +197,9 @@ class Table:
     marks: Sequence[str] = ()
 
     def marked(self, marks: Sequence[str]) -> Table:
-        """The same with the indices of the images of each row, for the page's script: one, or two with a hyphen."""
+        """Return the same with the indices of the images of each row, for the page's script: one, or two with a
+        hyphen.
+        """
         return replace(self, marks=list(marks))
 
     @property
@@ -239,7 +241,7 @@ class Column:
         return (self.head,) if isinstance(self.head, str) else self.head
 
     def cells(self, row: Record) -> list[Cell]:
-        """Its cells in a row."""
+        """Return its cells in a row."""
         value, num = self.value(row), len(self.heads)
         values = [value] if num == 1 else [None] * num if value is None else value
         return [cell_of(item, self.form) for item in values]
@@ -254,7 +256,9 @@ def table(
     adjusted: bool = True,
     folded: bool = False,
 ) -> Table:
-    """The table of records: a row each; the words of `columns` are fields (``part.field``) and columns of its `OWN`."""
+    """Return the table of records: a row each; the words of `columns` are fields (``part.field``) and columns of its
+    `OWN`.
+    """
     found = [column_of(kind, name) for name in columns.split()]  # type: ignore[arg-type]
     found = [column for column in found if adjusted or not column.adjusted]
     cells = [[cell for column in found for cell in column.cells(row)] for row in rows]
@@ -263,7 +267,7 @@ def table(
 
 @cache
 def column_of(kind: Any, path: str) -> Column:
-    """One of its own columns, or that of a field, of a part of the record where the path has dots."""
+    """Return one of its own columns, or that of a field, of a part of the record where the path has dots."""
     if path in kind.OWN:
         return kind.OWN[path]  # type: ignore[no-any-return]
     for name in path.split("."):
@@ -275,14 +279,14 @@ def column_of(kind: Any, path: str) -> Column:
 
 
 def value_of(record: Any, path: str) -> Any:
-    """A field of a record, or of a part of it that may be None."""
+    """Return a field of a record, or of a part of it that may be None."""
     for name in path.split("."):
         record = None if record is None else getattr(record, name)
     return record
 
 
 def cell_of(value: Any, form: str = "") -> Cell:
-    """A value as a cell; nothing is a dash that sorts last."""
+    """Return a value as a cell; nothing is a dash that sorts last."""
     if isinstance(value, Cell):
         return value
     if value is None or (isinstance(value, tuple) and None in value):

@@ -28,7 +28,7 @@ GOOD = {"adjust": "adjusted", "check": "consistent", "match": "tied"}
 
 
 def view_status(view: ViewEntry, run: Run) -> dict[str, str | None]:
-    """The verdict on a view: a word of `STATUS_WORDS`, what to do (empty when all is well), and the cause."""
+    """Return the verdict on a view: a word of `STATUS_WORDS`, what to do (empty when all is well), and the cause."""
     for reason in _RESERVATIONS:
         if (found := reason(view, run)) is not None:
             return {"status": CAUSES[found.cause].status, "advice": found.advice, "cause": found.cause}
@@ -63,7 +63,9 @@ def _misses(view: ViewEntry, run: Run) -> Reason | None:
 
 
 def _contradicted(view: ViewEntry, run: Run) -> Reason | None:
-    """Most tie points of a view contradict the others, all over it and not as wrong matches do: these are right."""
+    """Say that most tie points of a view contradict the others, all over it and not as wrong matches do: these are
+    right.
+    """
     many = run.kind == "adjust" and view.num_rejected >= FEW_OBSERVATIONS and lost(view) > MOST
     if not many or _apart(view, run) is not None or anywhere(view, run) or _most_in(view, run):
         return None
@@ -95,7 +97,7 @@ def _adjusted_alone(view: ViewEntry, run: Run) -> Reason | None:
 
 
 def _odd(view: ViewEntry, run: Run) -> Reason | None:
-    """An RPC that is farther off than stated, beside the others."""
+    """Say that an RPC is farther off than stated, beside the others."""
     if run.kind == "match" or run.adjustment is None:
         return None
     prior, i = run.adjustment.prior, run.number[view.name]
@@ -107,7 +109,7 @@ def _odd(view: ViewEntry, run: Run) -> Reason | None:
 
 
 def _smooth(view: ViewEntry, run: Run) -> Reason | None:
-    """Something smooth that no correction follows."""
+    """Say that something smooth is left that no correction follows."""
     if run.kind == "match" or run.adjustment is None:
         return None
     i, smooth = run.number[view.name], run.adjustment.smooth
@@ -119,7 +121,7 @@ def _smooth(view: ViewEntry, run: Run) -> Reason | None:
 
 
 def is_smooth(i: int, adjustment: Adjustment) -> bool:
-    """Whether something smooth is left of view i that no correction follows."""
+    """Return whether something smooth is left of view i that no correction follows."""
     smooth = adjustment.smooth
     return bool(smooth.found(SMOOTH_LEFT)[i] or smooth.shared[i] > SMOOTH_LEFT)
 
@@ -143,7 +145,7 @@ def _rejected_alike(view: ViewEntry, run: Run) -> Reason | None:
 
 
 def _unused(view: ViewEntry, run: Run) -> Reason | None:
-    """What tie points that took no part say of a view: the others were chosen to agree."""
+    """Return what tie points that took no part say of a view: the others were chosen to agree."""
     if run.kind == "match" or run.adjustment is None:
         return None
     i = run.number[view.name]
@@ -158,7 +160,7 @@ def _unused(view: ViewEntry, run: Run) -> Reason | None:
 
 
 def _one_place(view: ViewEntry, run: Run) -> Reason | None:
-    """Rows or columns of a view in which tie points contradict the others, or are off together."""
+    """Name rows or columns of a view in which tie points contradict the others, or are off together."""
     if run.kind == "match" or run.adjustment is None:
         return None
     for one in left_entries(run.adjustment):
@@ -168,7 +170,7 @@ def _one_place(view: ViewEntry, run: Run) -> Reason | None:
 
 
 def standing_out(one: LeftEntry) -> str:
-    """What is wrong in rows or columns that stand out; empty where it is not so much as to need a look."""
+    """Return what is wrong in rows or columns that stand out; empty where it is not so much as to need a look."""
     if one.moving:
         return ""
     if one.rejected > MANY_REJECTED:
@@ -180,7 +182,7 @@ def standing_out(one: LeftEntry) -> str:
 
 
 def _most_in(view: ViewEntry, run: Run) -> str:
-    """Where most of a view's rejected tie points are, if the adjustment found them to stand out somewhere."""
+    """Return where most of a view's rejected tie points are, if the adjustment found them to stand out somewhere."""
     found = () if run.adjustment is None else left_entries(run.adjustment)
     for one in found:
         if one.image == view.name and one.rejected > MANY_REJECTED and not one.moving:
@@ -192,7 +194,7 @@ def _most_in(view: ViewEntry, run: Run) -> str:
 
 
 def _beyond(view: ViewEntry, run: Run) -> Reason | None:
-    """What one RPC does not hold of a camera that jitter or steps between detectors are corrected in."""
+    """Return what one RPC does not hold of a camera that jitter or steps between detectors are corrected in."""
     told = any(getattr(run.options, name, None) for name in ("grids", "tiles", "resample"))
     if run.adjustment is None or view.fit is None or told or not _follows_more(view, run):
         return None
@@ -235,28 +237,28 @@ _RESERVATIONS: tuple[Callable[[ViewEntry, Run], Reason | None], ...] = (
 
 
 def known(value: float | None) -> float:
-    """A number, NaN where there is none."""
+    """Return a number, NaN where there is none."""
     return float("nan") if value is None else value
 
 
 def lost(view: ViewEntry) -> float:
-    """The share of a view's tie points that was rejected."""
+    """Return the share of a view's tie points that was rejected."""
     return view.num_rejected / max(view.num_rejected + view.num_observations, 1)
 
 
 def anywhere(view: ViewEntry, run: Run) -> bool:
-    """Whether the tie points of a view that were rejected lie off in any direction, as wrong matches do."""
+    """Return whether the tie points of a view that were rejected lie off in any direction, as wrong matches do."""
     return run.adjustment is not None and bool(-np.inf < run.adjustment.alike[run.number[view.name]] <= SURE)
 
 
 def _apart(view: ViewEntry, run: Run) -> Apart | None:
-    """What is known of a view if its RPC is not its own."""
+    """Return what is known of a view if its RPC is not its own."""
     apart = None if run.adjustment is None else run.adjustment.apart
     return apart if apart is not None and apart.is_view(run.number[view.name]) else None
 
 
 def _follows_more(view: ViewEntry, run: Run) -> bool:
-    """Whether a camera is more than one RPC holds, as it was delivered or by what it was corrected by."""
+    """Return whether a camera is more than one RPC holds, as it was delivered or by what it was corrected by."""
     one = view.correction
     physical = not isinstance(run.views[run.number[view.name]].sensor, RPC)
     return one is not None and any((physical, one.jitter_px, one.detector_px, one.strip_px, one.swing_px))

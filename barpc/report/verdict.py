@@ -53,7 +53,7 @@ _CONTROL_WORDS = {
 
 
 def _block_reasons(run: Run, views: Sequence[ViewEntry]) -> list[str]:
-    """What the adjustment says of itself that does not fit: priors, noise, the scene's move."""
+    """Return what the adjustment says of itself that does not fit: priors, noise, the scene's move."""
     if run.adjustment is None or not len(run.tracks):
         return []
     prior, gauge, noise = run.adjustment.prior, run.adjustment.gauge, run.adjustment.noise
@@ -107,7 +107,7 @@ def _block_reasons(run: Run, views: Sequence[ViewEntry]) -> list[str]:
 
 
 def _left_reasons(run: Run, views: Sequence[ViewEntry] = ()) -> list[str]:
-    """Where tie points were cut, or are off, more than elsewhere, or took no part and are; each image's worst.
+    """Name where tie points were cut, or are off, more than elsewhere, or took no part and are; each image's worst.
 
     What an image's own reason says is not said again.
     """
@@ -131,7 +131,7 @@ def _left_reasons(run: Run, views: Sequence[ViewEntry] = ()) -> list[str]:
 
 
 def _ambiguous(adjustment: Adjustment) -> list[str]:
-    """Groups that move, where something else explains tie points as well."""
+    """Name groups that move, where something else explains tie points as well."""
     rivals = [one.runner_up for one in adjustment.findings if one.motion is not None and one.gap < SURE]
     return [
         f"That tie points move together explains them no better than that {RIVALS[rival]}: look at where they are."
@@ -141,7 +141,7 @@ def _ambiguous(adjustment: Adjustment) -> list[str]:
 
 
 def _place_is_free(run: Run) -> bool:
-    """Whether nothing but the cameras' priors holds the scene's place: control moves it as far as it must."""
+    """Return whether nothing but the cameras' priors holds the scene's place: control moves it as far as it must."""
     given = [getattr(run.options, name, None) for name in ("dem", "fixed_run")]
     assert run.adjustment is not None
     tested = run.adjustment.control
@@ -152,7 +152,7 @@ def _place_is_free(run: Run) -> bool:
 
 
 def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
-    """The verdict on the whole: `status`, a `headline`, `lines`, and those of them that are `reasons`.
+    """Return the verdict on the whole: `status`, a `headline`, `lines`, and those of them that are `reasons`.
 
     The one rule of what passes: `status` is "good" when no image, no control point and no file has a reservation;
     "bad" when an image was not adjusted or a file left out; else "look". What is not good ends with exit code 3.
@@ -187,7 +187,7 @@ def _headline(run: Run, num: int, bad: int, look: int, more: str) -> str:
 
 
 def _control_reasons(run: Run) -> list[str]:
-    """Ground points that were cut, what was left out of their files, a reference of no use."""
+    """Name ground points that were cut, what was left out of their files, a reference of no use."""
     out = []
     if run.reference is not None and run.adjustment is not None and run.reference.control is None:
         whys = (
@@ -227,7 +227,9 @@ def _control_reasons(run: Run) -> list[str]:
 
 
 def _wrong_heights(run: Run) -> list[str]:
-    """A reference whose points lie off each other along the lines of sight, where the terrain's errors move them."""
+    """Say that a reference's points lie off each other along the lines of sight, where the terrain's errors move
+    them.
+    """
     if run.reference is None or run.adjustment is None:
         return []
     stated = run.adjustment.options.dem_sigma
@@ -243,7 +245,9 @@ def _wrong_heights(run: Run) -> list[str]:
 
 
 def _bends(run: Run) -> list[str]:
-    """Images in which a reference's points lie farther off each other than finding them leaves: a pixel at most."""
+    """Name images in which a reference's points lie farther off each other than finding them leaves: a pixel at
+    most.
+    """
     if run.reference is None:
         return []
     step = run.reference.step
@@ -257,7 +261,7 @@ def _bends(run: Run) -> list[str]:
 
 
 def _undecided(names: Sequence[str], tested: ControlTest) -> list[str]:
-    """Sets of GCPs that contradict each other and weigh the same."""
+    """Name sets of GCPs that contradict each other and weigh the same."""
     if not tested.sets:
         return []
     one, other = (
@@ -274,7 +278,7 @@ def _undecided(names: Sequence[str], tested: ControlTest) -> list[str]:
 
 
 def _torn(tested: ControlTest) -> list[str]:
-    """Control that agrees with itself and not with the images."""
+    """Say that control agrees with itself and not with the images."""
     if not tested.torn:
         return []
     without, held = tested.torn
@@ -344,7 +348,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
 
 
 def _held_lines(run: Run, gcps: GroundPoints, views: Sequence[ViewEntry], known: str) -> list[str]:
-    """What ground control says of the scene's place; `known` is what the adjustment states of it."""
+    """Return what ground control says of the scene's place; `known` is what the adjustment states of it."""
     assert run.adjustment is not None
     is_seen = np.bincount(gcps.point, minlength=len(gcps.names)) > 0
     tested, lines = run.adjustment.control, []
@@ -371,7 +375,7 @@ def _held_lines(run: Run, gcps: GroundPoints, views: Sequence[ViewEntry], known:
 
 
 def _jitter_lines(views: Sequence[ViewEntry]) -> list[str]:
-    """What follows the corrections in the images."""
+    """Return what follows the corrections in the images."""
     lines = []
     found = [view.correction for view in views if view.correction is not None]
     if waving := [one for one in found if one.jitter_px is not None]:
@@ -394,7 +398,7 @@ def _jitter_lines(views: Sequence[ViewEntry]) -> list[str]:
 
 
 def _radar_lines(views: Sequence[ViewEntry]) -> list[str]:
-    """What the clocks of radars were off by."""
+    """Return what the clocks of radars were off by."""
     found = [
         f"{view.name}: range {one.range_m:+.2f} ± {sigma[0]:.2f} m, azimuth {one.azimuth_ms:+.3f} ± {sigma[1]:.3f} ms"
         for view in views
@@ -404,7 +408,7 @@ def _radar_lines(views: Sequence[ViewEntry]) -> list[str]:
 
 
 def _altimetry_lines(adjustment: Adjustment) -> list[str]:
-    """What heights without image coordinates did."""
+    """Return what heights without image coordinates did."""
     test = adjustment.altimetry
     if test is None or test.why_not:
         return []
@@ -415,7 +419,7 @@ def _altimetry_lines(adjustment: Adjustment) -> list[str]:
 
 
 def _reference_lines(run: Run) -> list[str]:
-    """What a reference was good for."""
+    """Return what a reference was good for."""
     found = run.reference
     if found is None or found.control is None:
         return []
@@ -458,7 +462,7 @@ def _matched_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
 
 
 def summarize(run: Run) -> Summary:
-    """The summary of a run with the verdict on it; a number that is not finite is None, as a file has it."""
+    """Return the summary of a run with the verdict on it; a number that is not finite is None, as a file has it."""
     found = measure(run)
     views = tuple(replace(view, **view_status(view, run)) for view in found.views)  # type: ignore[arg-type]
     block = block_verdict(run, views)

@@ -147,6 +147,6 @@ class Reason:
 
     @classmethod
     def of(cls, cause: str, **figures: object) -> Reason:
-        """The reason in words, with its figures."""
+        """Return the reason in words, with its figures."""
         words = CAUSES[cause]
         return cls(cause, ": ".join(filter(None, (words.sentence, words.remedy))).format_map(figures))
