@@ -18,12 +18,13 @@ from barpc.tie.pairs import GIVEN, Area, Pair, possible_pairs
 
 Link = tuple[int, int]
 
-SAME_DATE, CONNECTS, PATH = "same date", "connects all", "second path"
+SAME_DATE, CONNECTS, PATH, BEYOND = "same date", "connects all", "second path", "between groups"
 """Why a pair is tried."""
 COMPARED = 48
 """Partners of a view, the best by overlap and angle, that are compared with it."""
 TRIES = (2, 4, 8)
 """Round by round: so many pairs lead to what is not tied yet, where there are so many."""
+_BEYOND = 4  # partners of a view, for each of which one more is of another group
 
 
 def select_pairs(
@@ -88,8 +89,31 @@ def best_pairs(pairs: Sequence[Pair], num_views: int, neighbours: int, twice: bo
                 taken[i] += 1
                 taken[j] += 1
     left = [pair for pair in ranked if pair.views not in chosen]
-    more = further_pairs(left, num_views, list(chosen), TRIES[0], twice=True) if twice else []
+    more = _beyond(left, num_views, list(chosen), neighbours // _BEYOND) if twice else []
+    links = [*chosen, *(pair.views for pair in more)]
+    left = [pair for pair in left if pair.views not in links]
+    more += further_pairs(left, num_views, links, TRIES[0], twice=True) if twice else []
     return sorted([*chosen.values(), *more], key=lambda pair: pair.views)
+
+
+def _beyond(left: Sequence[Pair], num_views: int, links: Sequence[Link], count: int) -> list[Pair]:
+    """Return the best pairs of each view with views that have no partner in common with it, `count` at most.
+
+    The partners most alike are of one season. Two views of a season and two of another tie the seasons by one pair's
+    epipolar lines, along which both may slide.
+    """
+    near = [{v} for v in range(num_views)]
+    for i, j in links:
+        near[i].add(j)
+        near[j].add(i)
+    taken, found = [0] * num_views, []
+    for pair in left:
+        i, j = pair.views
+        if min(taken[i], taken[j]) < count and pair.likeness and not near[i] & near[j]:
+            taken[i] += 1
+            taken[j] += 1
+            found.append(replace(pair, reason=BEYOND))
+    return found
 
 
 def further_pairs(

@@ -81,6 +81,23 @@ def test_a_second_path_is_the_best_pair_that_makes_one_and_none_is_tried_that_ma
     assert [p.views for p in further_pairs(left, 7, links[:-1], 2)] == [(4, 6)]
 
 
+def test_seasons_are_tied_by_many_of_their_views() -> None:
+    """Two of 20 views: partners within one are much more alike, and one pair between them would connect them."""
+    rng, num = np.random.default_rng(0), 40
+    pairs = [
+        Pair((i, j), 1.0, 10.0, likeness=int(rng.integers(200, 300) if (i < 20) == (j < 20) else 20))
+        for i in range(num)
+        for j in range(i + 1, num)
+    ]
+    chosen = best_pairs(pairs, num, 8, twice=True)
+    between = [pair for pair in chosen if (pair.views[0] < 20) != (pair.views[1] < 20)]
+    across = np.bincount(np.ravel([pair.views for pair in between]), minlength=num)
+    assert (across > 0).mean() > 0.8
+    assert len(chosen) - len(best_pairs(pairs, num, 8)) <= num * 8 // 4
+    near = [pair for pair in pairs if max(pair.views) < 9]  # each is a partner of each
+    assert best_pairs(near, 9, 8, twice=True) == best_pairs(near, 9, 8)
+
+
 def test_what_shares_nothing_is_tried_where_there_is_no_path_and_not_for_a_second_one() -> None:
     hopeless = Pair((0, 2), 0.9, 5.0, likeness=0)
     assert further_pairs([hopeless], 3, [(0, 1), (1, 2)], 2, twice=True) == []
