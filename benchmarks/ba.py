@@ -19,6 +19,7 @@ The excess is the baseline's cost over barpc's, less one.
     python benchmarks/ba.py --blocks 1000 3000 10000      # growth with views, by stage, and how far from the optimum
     python benchmarks/ba.py --fill 1000 10000             # what other orders of elimination would cost
     python benchmarks/ba.py --against 26f82d8             # with defaults beside another commit (here 0.2.0), in turns
+    python benchmarks/ba.py --jump                        # one flawed view of 36 beside the same block without
     python benchmarks/ba.py --ceres                       # plain, beside Ceres, in turns (needs libceres-dev and g++)
 """
 
@@ -32,6 +33,7 @@ import sys
 import tempfile
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import ceres
@@ -370,6 +372,21 @@ def against(commit: str, repeat: int) -> None:
             subprocess.run([*git, "remove", "--force", str(other)], check=True, capture_output=True)
 
 
+def jump(repeat: int) -> None:
+    """CPU seconds of 36 views of which one jumps by 3 px in its middle row, and without that."""
+    cpu: dict[str, list[float]] = {"clean": [], "jump": []}
+    for seed in range(2, 2 + repeat):
+        made = simulate_block(36, 700, seed=seed)
+        below = (made.tracks.view == 18) & (made.tracks.xy[:, 1] > 0.5 * made.views[18].size[1])
+        moved = replace(made.tracks, xy=made.tracks.xy + np.outer(below, [3.0, 1.0]))
+        for name, tracks in (("clean", made.tracks), ("jump", moved)):
+            seconds, found = timed(lambda m=made, t=tracks: adjust_tracks(m.views, t))
+            cpu[name].append(seconds)
+            kinds = [finding.kind for finding in found.findings]
+            print(f"seed {seed} {name}: {seconds:.2f} s, {kinds}", flush=True)
+    print({name: round(statistics.median(seconds), 2) for name, seconds in cpu.items()})
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -385,6 +402,7 @@ def main() -> None:
     parser.add_argument(
         "--against", metavar="COMMIT", help="adjustments with defaults beside another commit's"
     )
+    parser.add_argument("--jump", action="store_true", help="one flawed view of 36")
     parser.add_argument("--ceres", action="store_true", help="plain adjustments beside Ceres")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -398,6 +416,8 @@ def main() -> None:
         blocks(arguments.blocks, arguments.a_view)
     elif arguments.against:
         against(arguments.against, arguments.repeat)
+    elif arguments.jump:
+        jump(arguments.repeat)
     elif arguments.ceres:
         ceres.compare(arguments.repeat)
     elif arguments.fill:

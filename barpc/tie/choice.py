@@ -91,7 +91,8 @@ def best_pairs(pairs: Sequence[Pair], num_views: int, neighbours: int, twice: bo
     left = [pair for pair in ranked if pair.views not in chosen]
     more = _beyond(left, num_views, list(chosen), neighbours // _BEYOND) if twice else []
     links = [*chosen, *(pair.views for pair in more)]
-    left = [pair for pair in left if pair.views not in links]
+    known = set(links)
+    left = [pair for pair in left if pair.views not in known]
     more += further_pairs(left, num_views, links, TRIES[0], twice=True) if twice else []
     return sorted([*chosen.values(), *more], key=lambda pair: pair.views)
 

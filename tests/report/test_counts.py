@@ -26,7 +26,9 @@ WRONG = re.compile(
 
 
 def spoken(lines: Any) -> None:
-    for line in lines:
+    said = [line for line in lines if line]
+    assert said
+    for line in said:
         assert not WRONG.search(line), line
 
 
@@ -85,6 +87,8 @@ def test_control_a_dem_and_a_reference(num):
     ):
         found = block_verdict(run_of(**fields), the_views(3, 40))
         spoken([found["headline"], *found["lines"]])
+        left = [line for line in found["lines"] if "a.tif" in line]
+        assert len(left) == (num if "left_out" in fields else 0)
 
 
 @pytest.mark.parametrize(("views", "pairs", "tracks"), list(product((1, 2), (0, 1), (0, 1, 2))))
@@ -96,7 +100,8 @@ def test_the_answers_of_the_page(views, pairs, tracks):
         shown, found, tracks=lengths, gcps=tuple(a_gcp(f"g{k}", 5.0, 43.0) for k in range(tracks))
     )
     files = files_of(summary, [a_square(10.0, 0.0)] * views)
-    for make in page.SECTIONS:
-        if (section := make(files)) is not None:
-            spoken([section.answer, *section.points, *(words for _, words in section.charts)])
-    spoken(decisions.decisions(summary))
+    made = [section for make in page.SECTIONS if (section := make(files)) is not None]
+    assert len(made) >= 4
+    for section in made:
+        spoken([section.answer, *section.points, *(words for _, words in section.charts)])
+    spoken(["decisions:", *decisions.decisions(summary)])  # of nothing none
