@@ -475,7 +475,7 @@ class _Search:
             )
             again = [sharpened(self.seen, shape, found, others) for shape in tried]
             better, made = max(
-                ((self._fit(shape), shape) for shape in again), key=lambda row: row[0].evidence
+                ((self._fit(shape, base=found), shape) for shape in again), key=lambda row: row[0].evidence
             )
             more = better.evidence - found.evidence
             if more > 0.0:
