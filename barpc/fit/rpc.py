@@ -18,6 +18,7 @@ from barpc.fit.poles import Region
 from barpc.fit.reasons import reason
 from barpc.fit.result import EXACT, Free, RpcFit
 from barpc.fit.solve import BOUNDED, Solution, solve
+from barpc.fit.system import Problem
 from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor import SensorModel
@@ -99,7 +100,9 @@ def fit_rpc(
         if not float(fit.max_ckp.max()) <= options.tolerance:
             fit = replace(fit, reason=reason(fit.rpc, sample))
         _accepted(fit, options, strict and not isinstance(model, Splined))
-        return _localised(fit, given, partial(_missed, sample), options, strict)
+        return _localised(
+            fit, lambda rpc, method: inverse(rpc, *given(method)), partial(_missed, sample), options, strict
+        )
     except FitError as error:
         advice = getattr(model, "advice", "")  # of a model that knows why
         raise FitError("; ".join(filter(None, (str(error), advice)))) from error
@@ -203,7 +206,7 @@ def fit_rpc_points(
 
     fit = _best(attempt, options, vendor, strict, exact=False)
     seen = partial(_left_out, held_out, *given)
-    return _localised(fit, lambda _: given, seen, options, strict, weight, exact=False)
+    return _localised(fit, lambda rpc, _: inverse(rpc, *given, weight), seen, options, strict, exact=False)
 
 
 def _missed(sample: Sample, rpc: RPC, _: Solution) -> tuple[Errors, Array]:
@@ -231,11 +234,10 @@ def _left_out(
 
 def _localised(
     fit: RpcFit,
-    given: Callable[[str], tuple[Array, Array]],
+    problem: Callable[[RPC, str], Problem],
     seen: Seen,
     options: FitOptions,
     strict: bool,
-    weight: Array | None = None,
     exact: bool = True,
 ) -> RpcFit:
     """Return the fit, where asked for with a localisation RPC and its certificate; FitError where `strict`
@@ -243,9 +245,7 @@ def _localised(
     """
     if not options.localisation:
         return fit
-    rpc, certificate = with_localisation(
-        fit.rpc, lambda method: inverse(fit.rpc, *given(method), weight), seen, options, exact
-    )
+    rpc, certificate = with_localisation(fit.rpc, partial(problem, fit.rpc), seen, options, exact)
     if strict and (wrong := certificate.verdict(options.tolerance)):
         raise FitError(wrong)
     return replace(fit, rpc=rpc, localisation=certificate)
