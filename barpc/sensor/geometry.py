@@ -269,22 +269,25 @@ def camera_centers(
     how: Literal["line", "projective"] = "line",
 ) -> list[CameraCenter]:
     """Estimate the centres of cameras: `camera_center` of each, in one go."""
-    found: dict[int, CameraCenter] = {}
-    optical = [i for i, sensor in enumerate(sensors) if not is_radar(sensor)]
-    for i, sensor in enumerate(sensors):
-        if is_radar(sensor):
-            found[i] = _center_stated(sensor, sizes[i], alt_ranges[i])
-    given = [[rows[i] for i in optical] for rows in (sensors, sizes, alt_ranges)]
+    number = [i for i, sensor in enumerate(sensors) if not is_radar(sensor)]
+    ecef = np.full((len(sensors), 3), np.nan)
     if how == "line":
-        ecef = _centers_of_lines(*given)
+        some = [sensors[i] for i in number], [sizes[i] for i in number], [alt_ranges[i] for i in number]
+        ecef[number] = _centers_of_lines(*some)
     else:
-        ecef = np.array([_center_projective(*one) for one in zip(*given, strict=True)]).reshape(-1, 3)
-    altitudes = ground_from_ecef(ecef)[:, 2].tolist()
-    for i, center, altitude, *one in zip(optical, ecef, altitudes, *given, strict=True):
-        low, high = PLAUSIBLE_ALTITUDE if how == "line" else (one[2][1], np.inf)
-        fits = low <= altitude <= high
-        found[i] = CameraCenter(center, altitude, how) if fits else _center_nominal(*one, altitude)
-    return [found[i] for i in range(len(sensors))]
+        for i in number:
+            ecef[i] = _center_projective(sensors[i], sizes[i], alt_ranges[i])
+    altitude = ground_from_ecef(ecef)[:, 2].tolist()
+    found = []
+    for i, (sensor, size, alt_range) in enumerate(zip(sensors, sizes, alt_ranges, strict=True)):
+        low, high = PLAUSIBLE_ALTITUDE if how == "line" else (alt_range[1], np.inf)
+        if is_radar(sensor):
+            found.append(_center_stated(sensor, size, alt_range))
+        elif low <= altitude[i] <= high:
+            found.append(CameraCenter(ecef[i], altitude[i], how))
+        else:
+            found.append(_center_nominal(sensor, size, alt_range, altitude[i]))
+    return found
 
 
 def _center_stated(sensor: Radar, size: tuple[int, int], alt_range: tuple[float, float]) -> CameraCenter:
@@ -316,7 +319,7 @@ def _centers_of_lines(
     normal = m * np.eye(3) - np.swapaxes(direction, 1, 2) @ direction
     along = (direction * local).sum(axis=2, keepdims=True)
     rhs = (local - along * direction).sum(axis=1)
-    seen = np.isfinite(normal).all(axis=(1, 2))
+    seen = np.asarray(np.isfinite(normal).all(axis=(1, 2)))
     inverse = np.linalg.pinv(np.where(seen[:, None, None], normal, 0.0), rcond=1e-15)
     found = (inverse @ rhs[..., None])[..., 0] + shift
     return np.where(seen[:, None], found, np.nan)

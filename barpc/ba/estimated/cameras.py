@@ -129,23 +129,27 @@ class Cameras:
         seen: Array | None,
     ) -> Projected:
         """Project points through cameras that are turned and shifted."""
-        unknowns = self.unknowns
+        unknowns, of_views = self.unknowns, params[views]
+        if wanted != "unknowns" and not of_views.any():  # cameras as delivered
+            none = np.empty((2, 0, len(index)))
+            if wanted == "image":
+                return Projected(self._image(ecef, views, bounds), none, none)
+            return Projected(*self._by_ecef(ecef, views, bounds), none)
         drift = row = None
         if unknowns.drift:
             assert seen is not None
             row = (seen[1] - unknowns.middle[1, index]) / unknowns.half[1, index]
             drift = unknowns.drift_rotation(params, index, row)
-        of_views = params[views]
         rotation, translation = unknowns.rotation(of_views, views), unknowns.translation(of_views)
         motion = Motion(ecef, rotation, translation, unknowns.center[views], bounds, drift)
         if wanted == "image":
             none = np.empty((2, 0, len(index)))
             return Projected(self._image(motion.ecef, views, bounds), none, none)
         image, by_moved = self._by_ecef(motion.ecef, views, bounds)
-        by_point, by_rotation, by_drift = motion.derivatives(by_moved)
-        by_unknown = by_point[:, :0]
-        if wanted == "unknowns":
-            by_unknown = unknowns.stack(by_rotation, by_drift, by_point, index, row)
+        by_point = motion.by_point(by_moved)
+        if wanted == "points":
+            return Projected(image, by_point, by_point[:, :0])
+        by_unknown = unknowns.stack(*motion.by_turns(by_moved), by_point, index, row)
         return Projected(image, by_point, by_unknown)
 
     def _timed(self, params: Array, ecef: Array, view: int, wanted: Wanted) -> Projected:
