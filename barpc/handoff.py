@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from html import escape
 from importlib import import_module
 from importlib.util import find_spec
@@ -129,15 +129,18 @@ def verify_grid(path: Path, sample: Sample, correction: CorrectionGrid | None = 
     sample : Sample
         Of the model that it should hold.
     """
-    return [
-        _grid_reading(path, name, consumer, sample, correction)
-        for name, consumer in _grid_consumers(path).items()
-        if consumer.installed
-    ]
+    consumers = {name: one for name, one in _grid_consumers(path).items() if one.installed}
+    try:
+        with _lent(path) as lent:
+            found = [_grid_reading(path, lent, *one, sample, correction) for one in consumers.items()]
+    except Exception as failure:  # noqa: BLE001 - what cannot be lent is read by none
+        found = [_lost(path, name, failure) for name in consumers]
+    _opened.cache_clear()
+    return found
 
 
 def _grid_reading(
-    path: Path, name: str, consumer: Consumer, sample: Sample, correction: CorrectionGrid | None
+    path: Path, lent: Path, name: str, consumer: Consumer, sample: Sample, correction: CorrectionGrid | None
 ) -> Reading:
     model = sample.model
 
@@ -146,14 +149,18 @@ def _grid_reading(
         return (image if correction is None else correction.apply(image)) - at[:, :2]
 
     try:
-        with warnings.catch_warnings(), _lent(path) as lent:
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             errors, largest = sample.sought(partial(off, consumer.open(lent)))
     except Exception as failure:  # noqa: BLE001 - a foreign reader may raise anything; that is the finding
-        return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
+        return _lost(path, name, failure)
     error = float(np.linalg.norm(largest))
     note = "" if np.isfinite(error) else "it has no finite point"
     return Reading(path, name, error, note, float(np.linalg.norm(errors.rmse)))
+
+
+def _lost(path: Path, name: str, failure: Exception) -> Reading:
+    return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
 
 
 def unverified(paths: Sequence[Path | str]) -> list[str]:
@@ -367,14 +374,20 @@ def _shareloc_grid(path: Path) -> Projection:
     return localize
 
 
+@lru_cache(maxsize=1)
+def _opened(path: Path) -> SensorModel:
+    """Return the camera of a file, which two consumers ask for one after the other."""
+    return open_camera(path).model
+
+
 def _own_grid(path: Path) -> Projection:
-    return open_camera(path).model.project
+    return _opened(path).project
 
 
 def _linear_grid(path: Path) -> Projection:
     from scipy.interpolate import RegularGridInterpolator  # a quarter of a second, of grids alone
 
-    grid = open_camera(path).model
+    grid = _opened(path)
     assert isinstance(grid, DirectGrid)
     lonlat = RegularGridInterpolator((grid.alts, grid.rows, grid.cols), grid.lonlat, bounds_error=False)
     return lambda at: np.column_stack([lonlat(at[:, ::-1]), at[:, 2]])

@@ -66,20 +66,19 @@ class Motion:
         self._turned = lever if self._drift is None else self._drift.forth(lever)
         self.ecef = self._turned + np.repeat(center.T, count, axis=1)
 
-    def derivatives(self, by_moved: Array) -> tuple[Array, Array, Array]:
-        """Return the derivatives (2, 3, n) by X [1/m], R and d [1/rad] from those by the moved points [1/m].
+    def by_point(self, by_moved: Array) -> Array:
+        """Return the derivatives (2, 3, n) by X [1/m] from those by the moved points; by T they are negative."""
+        back = by_moved if self._drift is None else self._drift.back(by_moved, _DIGITS)
+        return _by_view(self._matrix.swapaxes(1, 2), back, self._bounds)
 
-        By T they are those by X, negative; those by d are those by R where there is no drift.
-        """
-        by_turn = cross(self._turned, by_moved)
-        back, before, by_drift = by_moved, by_turn, by_turn
+    def by_turns(self, by_moved: Array) -> tuple[Array, Array]:
+        """Return those by R and d [1/rad]: the same where there is no drift."""
+        before = by_turn = cross(self._turned, by_moved)
         if self._drift is not None:
-            back = self._drift.back(by_moved, _DIGITS)
-            before, by_drift = self._drift.back_and_rate(by_turn, _DIGITS)
-        by_point = _by_view(self._matrix.swapaxes(1, 2), back, self._bounds)
+            before, by_turn = self._drift.back_and_rate(by_turn, _DIGITS)
         left = rotation_left_jacobian(self._rotation).swapaxes(1, 2)
         by_rotation = _by_view(left, before, self._bounds)
-        return by_point, by_rotation, by_rotation if self._drift is None else by_drift
+        return by_rotation, by_rotation if self._drift is None else by_turn
 
 
 def _by_view(matrices: Array, rows: Array, bounds: IntArray) -> Array:
@@ -214,7 +213,7 @@ class Corrected:
         ground = ground_from_ecef(motion.ecef.T)
         image, by_ground = self.sensor.project_jacobian(ground)
         by_moved = np.moveaxis(by_ground @ ground_from_ecef_jacobian(ground), 0, -1)
-        by_point, by_rotation, by_drift = motion.derivatives(by_moved)
+        by_point, (by_rotation, by_drift) = motion.by_point(by_moved), motion.by_turns(by_moved)
         by_point *= self.correction.scale
         parts = [by_point, by_rotation, -by_point]
         if row is not None:  # the point moves the row, and the row the drift

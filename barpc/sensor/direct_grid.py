@@ -104,6 +104,9 @@ class DirectGrid(Frozen):
         ground = np.asarray(ground, dtype=np.float64)
         image = np.asarray(image, dtype=np.float64)
         values = (ground[:, 2], image[:, 1], image[:, 0])
+        if (listed := _listed(values)) is not None:
+            alts, rows, cols = listed
+            return cls(cols, rows, alts, ground[:, :2].reshape(len(alts), len(rows), len(cols), 2))
         axes, places = zip(*(np.unique(value, return_inverse=True) for value in values), strict=True)
         shape = tuple(len(axis) for axis in axes)
         if len(ground) != np.prod(shape):
@@ -287,6 +290,24 @@ def _slopes(model: SensorModel, at: Array) -> Array:
     steps = np.concatenate([np.eye(2), -np.eye(2)])
     ground = model.localize(at[:2] + steps, np.full(4, at[2]))[:, :2]
     return np.asarray((wrap_longitude(ground[:2] - ground[2:]) / 2).T)
+
+
+def _listed(values: tuple[Array, Array, Array]) -> list[Array] | None:
+    """Return the axes of nodes that are listed layer by layer, row by row, as files have them; None of others."""
+    axes, left = list[Array](), [value for value in values if len(value)]
+    while left:
+        slowest, *faster = left
+        step = int(np.argmax(slowest != slowest[0])) or len(slowest)
+        axis = slowest[::step]
+        even = len(slowest) == len(axis) * step and (np.diff(axis) > 0).all()
+        if not even or any(
+            (value.reshape(len(axis), -1) != part).any()
+            for value, part in ((slowest, axis[:, None]), *((value, value[:step]) for value in faster))
+        ):
+            return None
+        axes.append(axis)
+        left = [value[:step] for value in faster]
+    return axes if len(axes) == len(values) else None
 
 
 def linear_axes(

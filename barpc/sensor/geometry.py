@@ -20,12 +20,15 @@ from barpc.geodesy import (
 )
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
+from barpc.sensor.stack import localize
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 CenterMethod = Literal["line", "projective", "nominal", "stated"]
 _Rows = list[tuple[SensorModel, slice]]  # the observations of each camera
 
+_RAYS = 41  # of a line
+_LEAST_APART = 100.0  # m: altitudes between which a ray is drawn
 _REGRESSED = 10  # points along col, row and altitude
 NOMINAL_ALTITUDE = 650e3  # orbit altitude [m] assumed where a model does not tell its own
 PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this range [m] is not believed
@@ -105,7 +108,7 @@ def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, fl
     """
     image = np.asarray(image, dtype=np.float64)
     alt = np.empty((2, *image.shape[:-1]))
-    alt[0], alt[1] = alt_range[0], max(alt_range[1], alt_range[0] + 100.0)
+    alt[0], alt[1] = alt_range[0], max(alt_range[1], alt_range[0] + _LEAST_APART)
     origin, end = ecef_from_ground(sensor.localize(np.broadcast_to(image, (2, *image.shape)), alt))
     direction = end - origin
     return origin, direction / np.linalg.norm(direction, axis=-1, keepdims=True)
@@ -256,35 +259,70 @@ def camera_center(
     RpcError
         The model cannot be localised over its own image.
     """
-    if is_radar(sensor):
-        point = sensor.localize((np.array(size) - 1) / 2.0, np.array(np.mean(alt_range)))
-        ecef = ecef_from_ground(point) + sensor.to_radar(point)
-        if not np.isfinite(ecef).all():
-            raise RpcError("camera centre: the model has no ground point at its image's centre")
-        return CameraCenter(ecef, float(ground_from_ecef(ecef)[2]), "stated")
-    ecef = (_center_of_line if how == "line" else _center_projective)(sensor, size, alt_range)
-    altitude = float(ground_from_ecef(ecef)[2])
-    low, high = PLAUSIBLE_ALTITUDE if how == "line" else (alt_range[1], np.inf)
-    if low <= altitude <= high:
-        return CameraCenter(ecef, altitude, how)
-    middle = sensor.localize(np.array(size) / 2.0, np.array(alt_range[0]))
-    if not np.isfinite(altitude) and not np.isfinite(middle).all():
+    return camera_centers([sensor], [size], [alt_range], how)[0]
+
+
+def camera_centers(
+    sensors: Sequence[SensorModel],
+    sizes: Sequence[tuple[int, int]],
+    alt_ranges: Sequence[tuple[float, float]],
+    how: Literal["line", "projective"] = "line",
+) -> list[CameraCenter]:
+    """Estimate the centres of cameras: `camera_center` of each, in one go."""
+    number = [i for i, sensor in enumerate(sensors) if not is_radar(sensor)]
+    ecef = np.full((len(sensors), 3), np.nan)
+    if how == "line":
+        some = [sensors[i] for i in number], [sizes[i] for i in number], [alt_ranges[i] for i in number]
+        ecef[number] = _centers_of_lines(*some)
+    else:
+        for i in number:
+            ecef[i] = _center_projective(sensors[i], sizes[i], alt_ranges[i])
+    altitude = ground_from_ecef(ecef)[:, 2].tolist()
+    found = []
+    for i, (sensor, size, alt_range) in enumerate(zip(sensors, sizes, alt_ranges, strict=True)):
+        low, high = PLAUSIBLE_ALTITUDE if how == "line" else (alt_range[1], np.inf)
+        if is_radar(sensor):
+            found.append(_center_stated(sensor, size, alt_range))
+        elif low <= altitude[i] <= high:
+            found.append(CameraCenter(ecef[i], altitude[i], how))
+        else:
+            found.append(_center_nominal(sensor, size, alt_range, altitude[i]))
+    return found
+
+
+def _center_stated(sensor: Radar, size: tuple[int, int], alt_range: tuple[float, float]) -> CameraCenter:
+    point = sensor.localize((np.array(size) - 1) / 2.0, np.array(np.mean(alt_range)))
+    ecef = ecef_from_ground(point) + sensor.to_radar(point)
+    if not np.isfinite(ecef).all():
         raise RpcError("camera centre: the model has no ground point at its image's centre")
-    ecef = _center_nominal(sensor, size, alt_range)
-    return CameraCenter(ecef, float(ground_from_ecef(ecef)[2]), "nominal")
+    return CameraCenter(ecef, float(ground_from_ecef(ecef)[2]), "stated")
 
 
-def _center_of_line(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
-    width, height = size
-    image = np.column_stack([np.linspace(0, width - 1, 41), np.full(41, (height - 1) / 2)])
-    origin, direction = lines_of_sight(sensor, image, alt_range)
-    shift = origin.mean(axis=0)
-    projector = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-    normal = projector.sum(axis=0)
-    rhs = (projector @ (origin - shift)[..., None]).sum(axis=0)[:, 0]
-    if not np.isfinite(normal).all():
-        return np.full(3, np.nan)
-    return np.asarray(np.linalg.lstsq(normal, rhs, rcond=1e-15)[0] + shift)
+def _centers_of_lines(
+    sensors: Sequence[SensorModel],
+    sizes: Sequence[tuple[int, int]],
+    alt_ranges: Sequence[tuple[float, float]],
+) -> Array:
+    """Return the points (N, 3) nearest to the rays of every camera's middle line; NaN where one has none."""
+    side, ends = np.array(sizes, dtype=np.float64).reshape(-1, 2) - 1.0, np.array(alt_ranges).reshape(-1, 2)
+    n, m = len(side), _RAYS
+    image = np.empty((n, 2, m, 2))
+    image[..., 0] = side[:, :1, None] * np.linspace(0.0, 1.0, m)
+    image[..., 1] = side[:, 1:, None] / 2.0
+    alt = np.repeat(np.column_stack([ends[:, 0], np.maximum(ends[:, 1], ends[:, 0] + _LEAST_APART)]), m)
+    ground = localize(sensors, image.reshape(-1, 2), alt, 2 * m * np.arange(n + 1))
+    origin, end = ecef_from_ground(ground).reshape(n, 2, m, 3).swapaxes(0, 1)
+    direction = end - origin
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    shift = origin.mean(axis=1)
+    local = origin - shift[:, None]
+    normal = m * np.eye(3) - np.swapaxes(direction, 1, 2) @ direction
+    along = (direction * local).sum(axis=2, keepdims=True)
+    rhs = (local - along * direction).sum(axis=1)
+    seen = np.asarray(np.isfinite(normal).all(axis=(1, 2)))
+    inverse = np.linalg.pinv(np.where(seen[:, None, None], normal, 0.0), rcond=1e-15)
+    found = (inverse @ rhs[..., None])[..., 0] + shift
+    return np.where(seen[:, None], found, np.nan)
 
 
 def _center_projective(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
@@ -308,14 +346,20 @@ def _center_projective(sensor: SensorModel, size: tuple[int, int], alt_range: tu
     return np.asarray(middle - spread * np.linalg.solve(matrix[:, :3], matrix[:, 3]))
 
 
-def _center_nominal(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
+def _center_nominal(
+    sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], regressed: float
+) -> CameraCenter:
+    """Return the centre on the central ray at the nominal altitude, where the one regressed is at none plausible."""
+    middle = sensor.localize(np.array(size) / 2.0, np.array(alt_range[0]))
+    if not np.isfinite(regressed) and not np.isfinite(middle).all():
+        raise RpcError("camera centre: the model has no ground point at its image's centre")
     image = np.array([(size[0] - 1) / 2, (size[1] - 1) / 2])
     origin, direction = lines_of_sight(sensor, image, alt_range)
     cosine = max(float(direction @ enu_basis(ground_from_ecef(origin))[2]), 0.3)
     point = origin
     for _ in range(6):  # the Earth curves away: a few steps along the ray reach the altitude
         point = point + (NOMINAL_ALTITUDE - float(ground_from_ecef(point)[2])) / cosine * direction
-    return np.asarray(point)
+    return CameraCenter(np.asarray(point), float(ground_from_ecef(point)[2]), "nominal")
 
 
 def epipolar_offset(

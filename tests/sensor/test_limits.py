@@ -239,7 +239,7 @@ def test_motions_of_many_views_are_those_of_each() -> None:
         expected = turn.apply(ecef[:, n] - translation[v] - center[v]) + center[v]
         np.testing.assert_allclose(whole.ecef[:, n], expected, atol=1e-12)
     by_moved = rng.normal(size=(2, 3, 5))
-    parts = whole.derivatives(by_moved)
+    parts = whole.by_point(by_moved), *whole.by_turns(by_moved)
     for k, step in enumerate((1e-4, 1e-6, 1e-6)):
         for axis, e in enumerate(np.eye(3)):
             ends = []
@@ -250,8 +250,8 @@ def test_motions_of_many_views_are_those_of_each() -> None:
                 ends.append(Motion(x, r.T, translation, center, np.array([0, 2, 5]), d).ecef)
             rate = (ends[0] - ends[1]) / (2 * step)
             np.testing.assert_allclose(parts[k][:, axis], (by_moved * rate).sum(axis=1), rtol=1e-6, atol=1e-7)
-    still = Motion(ecef, rotation, translation, center, np.array([0, 2, 5])).derivatives(by_moved)
-    np.testing.assert_array_equal(still[1], still[2])
+    still = Motion(ecef, rotation, translation, center, np.array([0, 2, 5])).by_turns(by_moved)
+    np.testing.assert_array_equal(*still)
 
 
 @pytest.mark.parametrize(

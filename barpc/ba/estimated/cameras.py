@@ -16,12 +16,11 @@ import numpy as np
 
 from barpc.ba.algebra.structure import parts
 from barpc.ba.estimated.unknowns import Unknowns
-from barpc.geodesy import Array, ground_from_ecef, ground_rows_from_ecef, wrap_longitude
+from barpc.geodesy import Array, ground_from_ecef, ground_rows_from_ecef
 from barpc.scene import IntArray, View
-from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Motion
-from barpc.sensor.rational import Rational, monomials
 from barpc.sensor.rpc import RPC
+from barpc.sensor.stack import RpcStack
 
 CHUNK = 8192  # observations worked on at a time, so that temporaries stay in cache
 
@@ -48,7 +47,7 @@ class Cameras:
         self.sensors = tuple(view.sensor for view in views)
         self.unknowns = unknowns
         self.is_rpc = np.array([isinstance(sensor, RPC) for sensor in self.sensors])
-        self._stack = _RpcStack(self.sensors)
+        self._stack = RpcStack(self.sensors)
 
     def seeing(self, seen: Array) -> Cameras:
         """Return the views with other observations, at image points (2, K) [px]."""
@@ -130,23 +129,27 @@ class Cameras:
         seen: Array | None,
     ) -> Projected:
         """Project points through cameras that are turned and shifted."""
-        unknowns = self.unknowns
+        unknowns, of_views = self.unknowns, params[views]
+        if wanted != "unknowns" and not of_views.any():  # cameras as delivered
+            none = np.empty((2, 0, len(index)))
+            if wanted == "image":
+                return Projected(self._image(ecef, views, bounds), none, none)
+            return Projected(*self._by_ecef(ecef, views, bounds), none)
         drift = row = None
         if unknowns.drift:
             assert seen is not None
             row = (seen[1] - unknowns.middle[1, index]) / unknowns.half[1, index]
             drift = unknowns.drift_rotation(params, index, row)
-        of_views = params[views]
         rotation, translation = unknowns.rotation(of_views, views), unknowns.translation(of_views)
         motion = Motion(ecef, rotation, translation, unknowns.center[views], bounds, drift)
         if wanted == "image":
             none = np.empty((2, 0, len(index)))
             return Projected(self._image(motion.ecef, views, bounds), none, none)
         image, by_moved = self._by_ecef(motion.ecef, views, bounds)
-        by_point, by_rotation, by_drift = motion.derivatives(by_moved)
-        by_unknown = by_point[:, :0]
-        if wanted == "unknowns":
-            by_unknown = unknowns.stack(by_rotation, by_drift, by_point, index, row)
+        by_point = motion.by_point(by_moved)
+        if wanted == "points":
+            return Projected(image, by_point, by_point[:, :0])
+        by_unknown = unknowns.stack(*motion.by_turns(by_moved), by_point, index, row)
         return Projected(image, by_point, by_unknown)
 
     def _timed(self, params: Array, ecef: Array, view: int, wanted: Wanted) -> Projected:
@@ -182,67 +185,6 @@ class Cameras:
             image = points.T  # components laid out anew: products of strided ones take twice as long
             by_ground = np.ascontiguousarray(np.moveaxis(jacobian, 0, -1))
         return image, _times(by_ground, by_ecef)
-
-
-class _RpcStack:
-    """The RPCs among the sensors, their numbers stacked (V of N rows are used, the others stay zero)."""
-
-    def __init__(self, sensors: Sequence[SensorModel]) -> None:
-        n = len(sensors)
-        self.coeffs, self.gradient = np.zeros((n, 4, 20)), np.zeros((n, 12, 10))
-        self.ground_offset, self.ground_scale = np.zeros((n, 3)), np.ones((n, 3))
-        self.image_offset, self.image_scale = np.zeros((n, 2)), np.ones((n, 2))
-        for i, sensor in enumerate(sensors):
-            if isinstance(sensor, RPC):
-                by_axis = Rational(sensor.coeffs, np.ones(2)).gradients.reshape(3, 4, 10)
-                by_axis = by_axis / sensor.ground_scale[:, None, None]
-                self.coeffs[i], self.gradient[i] = sensor.coeffs, by_axis.swapaxes(0, 1).reshape(12, 10)
-                self.ground_offset[i], self.ground_scale[i] = sensor.ground_offset, sensor.ground_scale
-                self.image_offset[i], self.image_scale[i] = sensor.image_offset, sensor.image_scale
-
-    def image(self, ground: Array, views: slice, bounds: IntArray) -> Array:
-        """Return the image points (2, n) of ground points (3, n) seen by consecutive views."""
-        count = np.diff(bounds)
-        poly = _polynomials(self.coeffs[views], self._basis(ground, views, count), bounds)
-        with np.errstate(all="ignore"):
-            value = poly[::2] / poly[1::2]
-        value *= np.repeat(self.image_scale[views].T, count, axis=1)
-        value += np.repeat(self.image_offset[views].T, count, axis=1)
-        return value
-
-    def project(self, ground: Array, views: slice, bounds: IntArray) -> tuple[Array, Array]:
-        """Return the image points (2, n) and derivative (2, 3, n) of ground points (3, n) seen by consecutive views."""
-        count = np.diff(bounds)
-        basis = self._basis(ground, views, count)
-        poly = _polynomials(self.coeffs[views], basis, bounds)
-        slope = _polynomials(self.gradient[views], basis[:10], bounds).reshape(4, 3, -1)
-        image_scale = np.repeat(self.image_scale[views].T, count, axis=1)
-        with np.errstate(all="ignore"):
-            inverse = 1.0 / poly[1::2]
-            value = poly[::2] * inverse
-            inverse *= image_scale
-            jacobian = value[:, None] * slope[1::2]
-            np.subtract(slope[::2], jacobian, out=jacobian)
-            jacobian *= inverse[:, None]
-        value *= image_scale
-        value += np.repeat(self.image_offset[views].T, count, axis=1)
-        return value, jacobian
-
-    def _basis(self, ground: Array, views: slice, count: IntArray) -> Array:
-        """Return the monomials (20, n) of the normalised coordinates of ground points, `count` of each view."""
-        normalized = ground - np.repeat(self.ground_offset[views].T, count, axis=1)
-        if not np.abs(normalized[0]).max(initial=0.0) <= 180.0:
-            normalized[0] = wrap_longitude(normalized[0])
-        normalized *= np.repeat(1.0 / self.ground_scale[views].T, count, axis=1)
-        return monomials(normalized)
-
-
-def _polynomials(coeffs: Array, basis: Array, bounds: IntArray) -> Array:
-    """Return the polynomials (m, n) of consecutive views (v, m, 20), each at its own points: a small product a view."""
-    out = np.empty((coeffs.shape[1], basis.shape[1]))
-    for matrix, start, stop in zip(coeffs, bounds[:-1], bounds[1:], strict=True):
-        out[:, start:stop] = matrix @ basis[:, start:stop]
-    return out
 
 
 def _times(a: Array, b: Array) -> Array:

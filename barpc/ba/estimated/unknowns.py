@@ -18,8 +18,9 @@ from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import IntArray, View
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
-from barpc.sensor.geometry import camera_center
+from barpc.sensor.geometry import camera_centers
 from barpc.sensor.splined import Splined
+from barpc.sensor.stack import localize
 from barpc.sensor.timing import Clocked, Timed, Timing, is_clocked
 
 _IMAGE_TERMS = {"shift": (0,), "shift-drift": (0, 2), "affine": (0, 1, 2)}
@@ -216,17 +217,15 @@ def make_unknowns(
     if model in _IMAGE_TERMS:
         centers = np.zeros((len(views), 3))
     elif centers is None:
-        found = [camera_center(v.sensor, v.size, v.alt_range).ecef for v in views]
-        centers = np.array(found).reshape(-1, 3)
-    scene = np.array([_middle_of_scene(view) for view in views]).reshape(-1, 3)
+        found = camera_centers(
+            [v.sensor for v in views], [v.size for v in views], [v.alt_range for v in views]
+        )
+        centers = np.array([center.ecef for center in found]).reshape(-1, 3)
+    altitude, number = np.array([view.altitude for view in views]), np.arange(len(views) + 1)
+    scene = ecef_from_ground(localize([v.sensor for v in views], (size - 1.0) / 2.0, altitude, number))
     distance = np.linalg.norm(centers - scene, axis=1)
     middle = scene.mean(axis=0)
     place = (scene - middle) @ enu_basis(ground_from_ecef(middle))[:2].T
     sensors = enumerate(view.sensor for view in views) if model not in _IMAGE_TERMS else ()
     radars = {i: sensor for i, sensor in sensors if is_clocked(sensor)}
     return Unknowns(model, drift, centers, distance, (size.T - 1.0) / 2.0, size.T / 2.0, place, waves, radars)
-
-
-def _middle_of_scene(view: View) -> Array:
-    middle = (np.array(view.size) - 1.0) / 2.0
-    return ecef_from_ground(view.sensor.localize(middle, np.array(view.altitude)))

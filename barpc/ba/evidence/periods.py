@@ -56,12 +56,13 @@ def swings(
     off : (2, K), residuals in standard deviations
     """
     views = size.shape[1]
+    told = np.flatnonzero(right > 0.0)
+    by_view = told[np.argsort(view[told], kind="stable")]
     found = []
-    for v in range(views):
-        mine = (view == v) & (right > 0.0)
+    for v, mine in enumerate(np.split(by_view, np.searchsorted(view[by_view], np.arange(1, views)))):
         rows = float(size[1, v])
         costs = price(rows, views)
-        if mine.sum() >= _FEWEST_SEEN and rows > 2.0 * _FEWEST * _SHORTEST:
+        if len(mine) >= _FEWEST_SEEN and rows > 2.0 * _FEWEST * _SHORTEST:
             clipped = np.clip(off[:, mine], -CLIPPED, CLIPPED)
             best = _Rows(row[mine], rows, right[mine], clipped).largest(costs + least)
             if best is not None:

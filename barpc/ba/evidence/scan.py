@@ -61,7 +61,7 @@ def scan(
     floor : float, what displacements are let be [the same]: no adjustment is asked to be better
     """
     views, found = size.shape[1], []
-    off = np.clip(off, -CLIPPED, CLIPPED)
+    off, costs = np.clip(off, -CLIPPED, CLIPPED), price(views)
     for axis in (0, 1):
         bin_ = (place[axis] / size[axis][view] * BINS).astype(np.int64).clip(0, BINS - 1)
         rows = np.array([np.ones(len(view)), wrong])
@@ -72,7 +72,7 @@ def scan(
         for by_share, gain in zip((True, False), (shares, gains), strict=True):
             gain[_WHOLE] = 0.0
             for v, at in enumerate(gain.argmax(axis=0).tolist()):
-                worth, common = float(gain[at, v]) - price(views), float(displaced[at, v])
+                worth, common = float(gain[at, v]) - costs, float(displaced[at, v])
                 i, j = int(_STARTS[at]), int(_STOPS[at])
                 if not by_share and 2 * (j - i) > BINS and (i == 0 or j == BINS):
                     i, j = (0, i) if j == BINS else (j, BINS)  # of two parts the smaller one lies off

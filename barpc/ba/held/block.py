@@ -16,6 +16,7 @@ from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointEr
 from barpc.geodesy import Array, ecef_from_ground
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, Tracks, View, connected_groups
+from barpc.sensor.stack import localize
 
 MIN_OBSERVATIONS = 4  # of a view, or it stops: six unknowns need three points, and one to check them
 _LISTED = 10  # views named in a message
@@ -81,14 +82,14 @@ class Block:
 
     @cached_property
     def _first_points(self) -> Array:
-        first = np.sort(np.unique(self.point, return_index=True)[1])
+        seen, first = np.unique(self.point, return_index=True)
         points = np.full((self.num_points, 3), np.nan)
+        order = np.argsort(first)
+        first, seen = first[order], seen[order]
         bounds = np.searchsorted(self.view[first], np.arange(len(self.views) + 1))
-        for v, view in enumerate(self.views):
-            rows = first[bounds[v] : bounds[v + 1]]
-            if len(rows):
-                alt = np.full(len(rows), view.altitude)
-                points[self.point[rows]] = ecef_from_ground(view.sensor.localize(self.xy[:, rows].T, alt))
+        alt = np.array([view.altitude for view in self.views])[self.view[first]]
+        ground = localize([view.sensor for view in self.views], self.xy[:, first].T, alt, bounds)
+        points[seen] = ecef_from_ground(ground)
         points[self.num_tracks : self.num_known] = ecef_from_ground(self.gcps.lonlatalt)
         if self.reference is not None:
             points[self.num_known :] = ecef_from_ground(self.reference.points.lonlatalt)

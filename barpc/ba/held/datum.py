@@ -55,7 +55,8 @@ def datum_shares(
     if (joint := problem.joint_prior) is not None:
         flat = unknowns.reshape(-1, len(variance))[joint.index]
         paid["earlier_run"] += ((joint.jacobian() @ flat) ** 2).sum(axis=0)
-    if problem.point_prior is not None or not problem.free.all():
+    prior = problem.point_prior
+    if (prior is not None and len(prior.index)) or not problem.free.all():
         reduced = _at_rest(covariance.reduced)
         points = np.stack([reduced.point_step(unknowns[..., m]) for m in range(len(variance))], axis=-1)
         number = np.arange(problem.structure.num_points)

@@ -18,7 +18,7 @@ from barpc.ba.judging.agreement import LOOSE, Agreement, agreement, offsets_of
 from barpc.ba.judging.judge import Finding
 from barpc.ba.judging.snooping import ControlTest, control_test
 from barpc.ba.robust.consensus import agreeing
-from barpc.ba.robust.heldout import HeldOut, is_better, measure, of_part
+from barpc.ba.robust.heldout import HeldOut, is_better, measure
 from barpc.ba.robust.rounds import Outcome, Rounds, faintness, revived
 from barpc.ba.robust.smooth import SmoothTest
 from barpc.ba.solving.problem import Problem
@@ -72,21 +72,16 @@ class Solution:
         NaN for the others. Nothing but the cameras moves between the two: no observation that was cut, no place that
         was given, and no height where the rays of a point tell none.
         """
-        index, rows = np.flatnonzero(some), np.flatnonzero(some[block.point])
-        points, weak = self.final.points[index], np.flatnonzero(self.heights.weak[index])
-        shown = (self.outcome.residual + self.problem.xy)[:, rows]
-        number = np.searchsorted(index, block.point[rows])
-        part = of_part(self.problem, block.view[rows], number, block.xy[:, rows])
-        mended = replace(part, xy=shown, point_prior=staying(points, weak))
+        points, shown = self.final.points, self.outcome.residual + self.problem.xy
+        held = staying(points, np.flatnonzero(some & self.heights.weak))
+        mended = replace(self.problem, xy=shown, point_prior=held)
         delivered = self.problem.camera_prior.mean
         for _ in range(_STEPS_BACK):
             projected, before = mended.project_points(delivered, points), points
-            points = mended.triangulate(points, projected, (block.use / block.sigma)[rows])
-            if np.nanmax(np.abs(points - before), initial=0.0) < _STANDS:
+            points = mended.triangulate(points, projected, block.use / block.sigma)
+            if np.nanmax(np.abs(points - before)[some], initial=0.0) < _STANDS:
                 break
-        out = np.full((len(some), 3), np.nan)
-        out[index] = points
-        return out
+        return np.where(some[:, None], points, np.nan)
 
     @property
     def has_trend(self) -> bool:

@@ -45,7 +45,8 @@ def two_groups(
     structure: Structure, residual: Array, projected: Projected, use: BoolArray
 ) -> tuple[TwoGroups, ...]:
     """Find the pairs of views whose offsets across the epipolar lines (of observations in use) have two centres."""
-    rows = np.flatnonzero(use[structure.first] & use[structure.second])
+    many = np.repeat(np.diff(structure.pair_bounds) >= _GROUPED, np.diff(structure.pair_bounds))
+    rows = np.flatnonzero(many & use[structure.first] & use[structure.second])
     offset = _across(residual, projected.by_point, structure.first[rows], structure.second[rows])
     bounds = np.searchsorted(rows, structure.pair_bounds)
     count = np.diff(bounds)

@@ -161,22 +161,23 @@ class Smooth:
 
     def fit(self, residual: Array, weight: Array) -> Fit:
         """Fit the smooth part of the residuals, of views with enough observations that count."""
-        bounds, weight = self.structure.bounds, weight * self._tells
+        weight = weight * self._tells
         counts = self.structure.sum_views(weight[None])[:, 0]
-        found = {}
-        for v in np.flatnonzero(counts >= _PER_TERM * TERMS).tolist():
-            rows = slice(int(bounds[v]), int(bounds[v + 1]))
-            found[v] = rows, self._coefficients(rows, residual, weight)
-        return found
-
-    def _coefficients(self, rows: slice, residual: Array, weight: Array) -> Array:
-        """Return the coefficients (2, terms) of one view."""
-        basis = self._basis(rows)
-        weighted = basis * (weight[rows] if self.alike is None else weight[rows] * self.alike.precision[rows])
-        matrix = weighted @ basis.T
-        diagonal = np.diag(matrix)
-        matrix[np.diag_indices(TERMS)] += _RIDGE * (diagonal + diagonal.mean())
-        matrix[:SPLINES, :SPLINES] += _BEND * diagonal[:SPLINES].mean() * _BENDING
+        views = np.flatnonzero(counts >= _PER_TERM * TERMS)
+        counted = weight if self.alike is None else weight * self.alike.precision
         with np.errstate(invalid="ignore"):
-            target = np.where(weight[rows] > 0, residual[:, rows], 0.0)
-        return np.asarray(np.linalg.solve(matrix, weighted @ target.T).T, dtype=np.float64)
+            target = np.where(weight > 0, residual, 0.0)
+        parts = [slice(*self.structure.bounds[v : v + 2].tolist()) for v in views]
+        matrix, right = np.empty((len(views), TERMS, TERMS)), np.empty((len(views), TERMS, 2))
+        for n, rows in enumerate(parts):
+            basis = self._basis(rows)
+            weighted = basis * counted[rows]
+            np.matmul(weighted, basis.T, out=matrix[n])
+            np.matmul(weighted, target[:, rows].T, out=right[n])
+        every = np.arange(TERMS)
+        diagonal = matrix[:, every, every]
+        matrix[:, every, every] += _RIDGE * (diagonal + diagonal.mean(axis=1, keepdims=True))
+        bend = _BEND * diagonal[:, :SPLINES].mean(axis=1)
+        matrix[:, :SPLINES, :SPLINES] += bend[:, None, None] * _BENDING
+        found = np.swapaxes(np.linalg.solve(matrix, right), 1, 2)
+        return dict(zip(views.tolist(), zip(parts, found, strict=True), strict=True))
