@@ -317,9 +317,7 @@ def _open_physical(
 
 
 def _stated_altitudes(file: Path) -> tuple[float, float]:
-    """Return the altitudes of the RPC that was delivered with a physical model; all ground on Earth where
-    there is none.
-    """
+    """Return the altitudes of the RPC delivered with a physical model; all ground on Earth where there is none."""
     for name in (file.name, f"RPC_{file.name[4:]}"):
         try:
             return altitude_range(read_rpc_source(file.parent / name).rpc)

@@ -119,9 +119,7 @@ class HeightGrid:
         return height.reshape(lon.shape)
 
     def extremes(self, at: Array) -> tuple[float, float]:
-        """Return the lowest and highest height [m] in the window around fractional row, col (2, N); infinite
-        where unknown.
-        """
+        """Return the ends of the heights [m] around fractional row, col (2, N); infinite where unknown."""
         at, limits = at[:, np.isfinite(at).all(axis=0)], np.array(self.shape)
         if not at.size or self.period:  # around the Earth columns have no window
             return -np.inf, np.inf
@@ -163,9 +161,7 @@ class HeightGrid:
 
 
 def _snapped(index: Array) -> Array:
-    """Return the fractional indices, on the node where they are within a millionth of it: a void beyond has
-    no weight.
-    """
+    """Return the fractional indices, on the node within a millionth of it: a void beyond has no weight."""
     node = np.rint(index)
     return np.where(np.abs(index - node) < 1e-6, node, index)
 
@@ -228,8 +224,7 @@ class Dem:
         return height if self.geoid is None else height + self.geoid.sample(lon, lat)
 
     def between(self, start: Array, end: Array) -> tuple[float, float, float]:
-        """Return, for lines from `start` to `end` (N, 3), the most posts that one passes, and the lowest and
-        highest terrain [m].
+        """Return, for lines from `start` to `end` (N, 3), the most posts that one passes, and the terrain's ends [m].
 
         Zero and infinite ends where none of them is on the DEM.
         """
@@ -297,9 +292,7 @@ def localize_on_terrain(
 
 
 def _met(sensor: SensorModel, image: Array, terrain: Callable[[Array, Array], Array], levels: Array) -> Array:
-    """Return the ground points (N, 3) between descending levels [m]; terrain at the first and the last of
-    them counts.
-    """
+    """Return the ground points (N, 3) between descending levels [m]; terrain at the first and last counts."""
 
     def above(alt: Array) -> Array:
         ground = sensor.localize(np.broadcast_to(image, (*alt.shape, 2)), alt)

@@ -79,9 +79,7 @@ def control_grid(
 def difference(
     model: SensorModel, other: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]
 ) -> float:
-    """Return the largest distance [px] between two cameras of one image over the image and its altitudes; NaN
-    if blind.
-    """
+    """Return the largest distance [px] between two cameras of an image and its altitudes; NaN if blind."""
     ground, image = control_grid(model, size, alt_range)
     return _largest(other.project, ground, image) if len(ground) else float("nan")
 
@@ -326,9 +324,7 @@ def _shareloc(path: Path) -> Projection:
 
 
 def _told(found: Array, lon: Array) -> Array:
-    """Return image points (N, ...) that shareloc found; OutputError where it fails beyond 180 degrees of
-    longitude alone.
-    """
+    """Return what shareloc found (N, ...); OutputError where it fails beyond 180 degrees of longitude alone."""
     lost, beyond = ~np.isfinite(found).all(axis=1), np.abs(lon) > 180.0
     if lost.any() and not (lost & ~beyond).any():
         raise OutputError(

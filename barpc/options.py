@@ -182,9 +182,7 @@ def checked(name: str, kind: Any, rule: Rule, value: Any) -> Any:
 
 
 def _plain(kind: Any, rule: Rule, value: Any) -> Any:
-    """Return a single value as its type, numpy's numbers and paths included; None where it is not one, or out
-    of range.
-    """
+    """Return a single value as its type, numpy's numbers and paths included; None if it is none, or out of range."""
     if kind is str:
         text = os.fspath(value) if isinstance(value, (str, os.PathLike)) else None
         return text if isinstance(text, str) else None

@@ -62,8 +62,7 @@ def opened_dem(dem: str | None, geoid: str | None, alt: float | None = None) -> 
 
 
 def altitude_of(camera: Camera, image: Place, given: float | None = None) -> float:
-    """Return the altitude of an image's ground [m]: as given, of the tie points of the run that it lies in, else the
-    middle.
+    """Return the altitude of an image's ground [m]: as given, of the tie points of its run, else the camera's middle.
 
     Where nothing is known of the ground a line says so, and what that may be worth.
     """

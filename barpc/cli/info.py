@@ -151,9 +151,7 @@ def _lines_of_geometry(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _altitude(image: str, camera: Camera, alt: float | None, terrain: Dem | None) -> float:
-    """Return altitude of the ground in the middle of an image [m]; that of the camera where no size tells the
-    middle.
-    """
+    """Return the altitude of the ground in the middle of an image [m]; the camera's where no size tells the middle."""
     if camera.size is None:
         return camera.altitude if alt is None else alt
     if terrain is None:

@@ -117,8 +117,7 @@ def _asset(path: Path, out: Path) -> dict[str, Any]:
 
 
 def points(scene: Scene, _out: Path) -> Files:
-    """Write ``points.csv`` and ``points.ply``: every tie point with the covariance of its intersection, east,
-    north, up [m2].
+    """Write ``points.csv`` and ``points.ply``: every tie point with the covariance of its place, east, north, up [m2].
 
     It is what the noise of the observations leaves with cameras as they are; what is common to all points, the place of
     the scene, is stated in the head of both.
@@ -157,9 +156,7 @@ def _ply(scene: Scene, sums: Array, said: str) -> bytes:
 
 
 def _covariances(scene: Scene) -> Array:
-    """Return the covariance (P, 3, 3) of the points, east, north, up [m2]: the inverse of what their
-    observations tell.
-    """
+    """Return the covariance (P, 3, 3) of the points, east, north, up [m2]: the inverse of what observations tell."""
     normal = np.zeros((len(scene.points), 3, 3))
     for shot in scene.shots:
         ground = scene.points[shot.index]

@@ -90,9 +90,7 @@ def satnerf(scene: Scene, out: Path) -> Files:
 
 
 def eogs(scene: Scene, out: Path) -> Files:
-    """Write what `satnerf` writes, and ``affine_models.json``: affine cameras in its frame of UTM metres,
-    with their errors.
-    """
+    """Write what `satnerf` writes, and ``affine_models.json``: affine cameras in UTM metres, with their errors."""
     frame = _Utm(scene)
     rows = zip(scene.shots, scene.file_names(out), strict=True)
     models = [_record(scene, shot, img) | frame.models(scene, shot) for shot, img in rows]
@@ -119,9 +117,7 @@ class _Utm:
         return np.column_stack([east, north, ground[:, 2]])
 
     def models(self, scene: Scene, shot: Shot) -> dict[str, Any]:
-        """Return the affine camera of a shot: -1 to 1 over the image, altitudes in metres; the sun's where it
-        is known.
-        """
+        """Return the affine camera of a shot: -1 to 1 over the image, altitudes in metres; the sun's where known."""
         ground, image = _grid(scene, shot, (21, 9))
         world = (self.metres(ground) - self.center) / self.scale
         size = np.array(shot.size)
@@ -177,9 +173,7 @@ def pinhole_of(scene: Scene, shot: Shot) -> tuple[Pinhole, float]:
 
 
 def nerfstudio(scene: Scene, out: Path) -> Files:
-    """Write ``transforms.json``: pinhole, pose and largest error of every image, and simpler and nearer
-    cameras beside.
-    """
+    """Write ``transforms.json``: pinhole, pose and largest error of every image, simpler and nearer cameras beside."""
     frames = [_frame(scene, shot, out) for shot in scene.shots]
     found = {
         "camera_model": "PINHOLE",

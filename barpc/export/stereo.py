@@ -30,9 +30,7 @@ def s2p(scene: Scene, out: Path) -> Files:
 
 
 def cars(scene: Scene, out: Path) -> Files:
-    """Write ``inputs.yaml`` and a ``.geom`` an image; pairs are those with tie points and an angle that shows
-    heights.
-    """
+    """Write ``inputs.yaml``, with the pairs whose angle shows heights, and a ``.geom`` an image."""
     sensors = {
         shot.name: {
             "image": _image(shot, out),

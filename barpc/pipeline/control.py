@@ -82,9 +82,7 @@ def _listed(names: Sequence[str]) -> str:
 def _implausible(
     points: GroundPoints, views: Sequence[View], search: Array
 ) -> Iterator[tuple[BoolArray, str]]:
-    """Yield the points (G,) that cannot be meant, and why; the first reason counts. `search` (M,) [px] as of
-    `reach_of`.
-    """
+    """Yield the points (G,) that cannot be meant, and why; the first reason counts. `search` (M,): `reach_of` [px]."""
     low, high = np.array([view.alt_range for view in views])[points.view].T
     alt = points.lonlatalt[points.point, 2]
     shown, pixel = _shown(points, views, np.clip(alt, low, high))
@@ -113,9 +111,7 @@ def _any(points: GroundPoints, observed: BoolArray) -> BoolArray:
 
 
 def _shown(points: GroundPoints, views: Sequence[View], alt: Array) -> tuple[Array, Array]:
-    """Localise where each image shows a point (M, 3), lon, lat [deg], alt [m], at altitudes (M,), and the
-    pixel size there (M,) [m].
-    """
+    """Return where each image shows a point (M, 3) at altitudes (M,) [m], and the pixel size there (M,) [m]."""
     ground, pixel = np.empty((len(alt), 3)), np.empty(len(alt))
     for v in np.unique(points.view):
         rows = points.view == v
@@ -125,9 +121,7 @@ def _shown(points: GroundPoints, views: Sequence[View], alt: Array) -> tuple[Arr
 
 
 def _distance(points: GroundPoints, shown: Array, columns: tuple[int, int], signs: tuple[int, int]) -> Array:
-    """Return the metres (M,) from where images show points to where these are said to be, coordinates taken
-    from `columns`.
-    """
+    """Return the metres (M,) from where images show points to where these are said to be, taken from `columns`."""
     level = points.lonlatalt[points.point][:, columns] * signs
     given = np.column_stack([level, shown[:, 2]])
     return np.asarray(np.linalg.norm(ecef_from_ground(given) - ecef_from_ground(shown), axis=1))

@@ -144,9 +144,7 @@ def _write(
 
 
 def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str) -> Misses:
-    """Write the grids of a view, and its resampled image, into a temporary folder; return how far each misses
-    the model [px].
-    """
+    """Write the grids of a view, and its image resampled, into a temporary folder; return what each misses by [px]."""
     place, alts = Path(room) / view.name, widened(view.alt_range)
     place.mkdir(parents=True, exist_ok=True)
     sample, errors = Sample.of(model, view.size, alts), Misses()
@@ -236,9 +234,7 @@ def verify_grids(view: View, model: SensorModel, errors: Misses, folder: str) ->
 
 
 def tile_boxes(size: tuple[int, int], side: int) -> list[Box]:
-    """Return the tiles (col, row, width, height) from multiples of `side` on; a rest of up to half a side
-    joins its neighbour.
-    """
+    """Return the tiles (col, row, width, height); a rest of up to half a `side` joins its neighbour."""
     edges = [[*range(0, max(1, length - side // 2), side), length] for length in size]
     return [(c, r, right - c, low - r) for r, low in pairwise(edges[1]) for c, right in pairwise(edges[0])]
 

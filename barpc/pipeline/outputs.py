@@ -158,8 +158,7 @@ def refuse_shadows(folder: Path, names: Sequence[str]) -> None:
 
 
 def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
-    """Write the tables, report.html where jinja2 is installed, and summary.json last: a folder with it is
-    complete.
+    """Write the tables, report.html where jinja2 is there, and summary.json last: with it a folder is complete.
 
     Returns the summary with the stages that this took.
     """

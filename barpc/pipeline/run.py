@@ -255,9 +255,7 @@ def _loaded(
 
 
 def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[Path]]:
-    """Return the files that a run writes and those that it must keep; what stands in the way is refused
-    before any work.
-    """
+    """Return the files that a run writes and those that it keeps; what is in the way is refused before any work."""
     views = run.views
     if options.stop_after == "matching":
         require_pair_names([view.name for view in views])

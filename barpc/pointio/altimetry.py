@@ -35,8 +35,7 @@ COLUMNS = {
 
 
 def read_altimetry(path: Path | str) -> Altimetry:
-    """Read the heights of a text: a header that names columns, or lines of lon, lat, alt and perhaps sigma
-    and sigma_flat.
+    """Read the heights of a text: a header that names columns, or lines of lon, lat, alt, perhaps sigma, sigma_flat.
 
     Cells between commas, semicolons, tabs or blanks. Lines whose height is blank, no number or a fill value are left
     out. InputError where a line does not parse, a place is none in degrees, or no height is left.
@@ -64,9 +63,7 @@ def read_altimetry(path: Path | str) -> Altimetry:
 
 
 def _columns(path: Path, line: str) -> dict[str, int]:
-    """Return the column of each quantity by the first line: its names, or the order lon, lat, alt, sigma,
-    sigma_flat.
-    """
+    """Return each quantity's column by the first line: its names, or the order lon, lat, alt, sigma, sigma_flat."""
     delimiter = next((sign for sign in "\t;," if sign in line), " ")
     words = cells_of(line, delimiter)
     if numbers_of(words[:3]) is not None and 3 <= len(words) <= len(COLUMNS):

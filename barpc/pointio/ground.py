@@ -90,9 +90,7 @@ def _read_asp(path: Path, views: ViewNames) -> Iterator[_Point]:
 
 
 def _read_csv(path: Path, views: ViewNames) -> Iterator[_Point]:
-    """Yield a header of column names, then a line for each point and image; what is not stated of sigmas is
-    the default.
-    """
+    """Read a header of column names, then a line for each point and image; sigmas not stated are the default."""
     columns: dict[str, int] = {}
     for number, raw in enumerate(read_text(path, TABLE).splitlines(), start=1):
         if not raw.strip() or raw.lstrip().startswith("#"):
@@ -155,9 +153,7 @@ def _names_columns(head: bytes) -> bool:
 
 
 def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Point]:
-    """Yield the features with a 3-D point and the properties `ji` (col, row), `filename` and, perhaps, `id`
-    and sigmas.
-    """
+    """Yield the features with a 3-D point and the properties `ji` (col, row), `filename`, perhaps `id` and sigmas."""
     for (lon, lat, alt, col, row), properties in geojson_points(path, "filename"):
         view = views.find(str(properties["filename"]))
         if view is not None:
@@ -385,8 +381,7 @@ def _read_features(path: Path) -> Correspondences:
 
 
 def geojson_points(path: Path, *needed: str) -> list[tuple[list[float], dict[str, Any]]]:
-    """Return the points of a GeoJSON: lon, lat, alt, col, row (of the property ``ji``, or ``col``, ``row``);
-    properties.
+    """Return the points of a GeoJSON: lon, lat, alt, col, row (property ``ji``, or ``col``, ``row``); properties.
 
     InputError where it is no such file, or has not all properties that are `needed`.
     """

@@ -58,8 +58,7 @@ def read_links(path: Path | str, names: Sequence[str]) -> Links:
 
 
 def read_matches(path: Path | str, names: Sequence[str]) -> Tracks:
-    """Read the tie points as a file states them; tracks with fewer than two views, or two points in one, are
-    left out.
+    """Read the tie points that a file states; tracks of fewer than two views, or two points in one, are left out.
 
     As `read_links`; points that are linked, by way of others too, are one track.
     """

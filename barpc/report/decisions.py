@@ -10,17 +10,13 @@ from barpc.ba.apart import APART
 from barpc.ba.evidence.scan import SURE
 from barpc.ba.judging.judge import LARGEST
 from barpc.report.records import Table, table
-from barpc.report.summary import (
-    AskedEntry,
-    GcpEntry,
-    PairEntry,
-    SceneEntry,
-    Summary,
-    ViewEntry,
-    listed,
-    metres,
-)
+from barpc.report.summary import Summary
 from barpc.report.summary.causes import RIVALS, ExplanationEntry
+from barpc.report.summary.ground import GcpEntry
+from barpc.report.summary.pairs import PairEntry
+from barpc.report.summary.scene import AskedEntry, SceneEntry
+from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.words import listed, metres
 
 SHARED = 0.03  # px: what neighbours share and is less is not followed
 _NAMED = 5  # of many points

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from barpc.report.reservations import GOOD_RMSE
-from barpc.report.summary import STATUS_WORDS, LeftOutEntry, PairEntry, Summary, ViewEntry
+from barpc.report.summary import LeftOutEntry, Summary
+from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.reasons import CAUSES
-from barpc.report.summary.words import listed
+from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.words import STATUS_WORDS, listed
 
 SHOWN = 10  # rows of a table on the terminal, images and pairs alike
 ALONE = 3  # images of one cause that have a sentence each; more share one
@@ -17,9 +19,7 @@ _CAUSES = list(CAUSES)
 
 
 def worst_first(views: Sequence[ViewEntry]) -> list[ViewEntry]:
-    """Return images by their verdicts, then by what is wrong, then by their error; those without reservation as they
-    come.
-    """
+    """Return images by verdict, by what is wrong, by error; those without reservation as they come."""
     return sorted(views, key=_badness)
 
 
@@ -57,9 +57,7 @@ def torn(pairs: Sequence[PairEntry]) -> list[PairEntry]:
 
 
 def sentences(summary: Summary) -> list[str]:
-    """Return the verdict, one sentence for all images that share a cause, and one for all files left out for one
-    reason.
-    """
+    """Return the verdict, one sentence for all images of one cause, one for all files left out for one reason."""
     own = {view.reservation for view in summary.views if view.advice}
     own |= {one.reason_text for one in summary.left_out}
     together = [*_of_views(flagged(summary.views)), *_of_files(summary.left_out)]

@@ -26,14 +26,9 @@ from barpc.report.charts import (
     titled,
 )
 from barpc.report.digest import SHOWN, flagged
-from barpc.report.summary import (
-    CELLS,
-    CheckPointEntry,
-    GcpEntry,
-    Summary,
-    ViewEntry,
-    cell_numbers,
-)
+from barpc.report.summary import Summary
+from barpc.report.summary.ground import CheckPointEntry, GcpEntry
+from barpc.report.summary.views import CELLS, ViewEntry, cell_numbers
 from barpc.report.tables import Observations, RunFiles
 
 _MOST_LINKS = 1500
@@ -55,9 +50,7 @@ Known = GcpEntry | CheckPointEntry
 
 
 def _ties(links: Sequence[Link], width: tuple[float, float], opacity: tuple[float, float]) -> list[str]:
-    """Return lines of least width and opacity, and by how much those of the link with the most matches are above
-    these.
-    """
+    """Return lines of least width and opacity, and what the link with the most matches has beyond these."""
     most, parts = max([count for *_, count, _ in links], default=1), []
     for (x1, y1), (x2, y2), count, title in sorted(links, key=itemgetter(2))[-_MOST_LINKS:]:
         share = math.sqrt(count / most)
@@ -144,9 +137,7 @@ def ground_map(files: RunFiles) -> str:
 
 
 def _moving_ground(plane: Plane, summary: Summary) -> list[str]:
-    """Return cells of the ground in which tie points move together, stronger with more of them, and where each group
-    lies.
-    """
+    """Return cells of the ground in which tie points move together, darker with more, and where each group lies."""
     scene = summary.scene
     if scene is None:
         return []
@@ -250,9 +241,7 @@ def _pair_lines(stacks: Sequence[Stack], files: RunFiles) -> list[str]:
 
 
 def _graticule(plane: Plane) -> tuple[list[str], list[str], list[tuple[float, float, float]]]:
-    """Return lines of longitude and latitude; their degrees and the scale bar, which go on top; places x, y, half
-    widths.
-    """
+    """Return lines of longitude and latitude; degrees and scale bar, which go on top; places x, y, half widths."""
     right, bottom = WIDTH - 4, plane.height - 24
     reach = np.array([WIDTH / 2, plane.height / 2]) / plane.unit
     lines, texts, taken = [], [], []

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from barpc.report.charts import WIDTH, label, number, sheet, shortened, tag
-from barpc.report.summary import PairEntry
+from barpc.report.summary.pairs import PairEntry
 from barpc.report.tables import RunFiles
 
 _LEFT = 30.0  # at least: names are to its right end
@@ -83,9 +83,7 @@ def pair_matrix(files: RunFiles) -> str:
 
 
 def facts(files: RunFiles) -> dict[str, list[list[object]]]:
-    """Return what the page's script says of an image or a pair that is pointed at: names, and pairs with their
-    figures.
-    """
+    """Return what the page's script says of an image or a pair that is pointed at: names, pairs with figures."""
     index = files.number
     names: list[list[object]] = [[view.name, view.num_observations] for view in files.summary.views]
     pairs: list[list[object]] = []

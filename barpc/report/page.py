@@ -25,23 +25,12 @@ from barpc.report.maps import ground_map, residual_panels
 from barpc.report.matrix import facts, pair_matrix
 from barpc.report.records import Cell, Table, cell_of, table
 from barpc.report.reservations import FEW_OBSERVATIONS, GOOD, GOOD_RMSE
-from barpc.report.summary import (
-    DATUM,
-    GCPS,
-    STATUS_WORDS,
-    CheckPointEntry,
-    DatumEntry,
-    GcpEntry,
-    PairEntry,
-    ReferenceViewEntry,
-    StageEntry,
-    Summary,
-    ViewEntry,
-    largest,
-    listed,
-    metres,
-)
-from barpc.report.summary.words import counted
+from barpc.report.summary import StageEntry, Summary
+from barpc.report.summary.ground import GCPS, CheckPointEntry, GcpEntry, ReferenceViewEntry
+from barpc.report.summary.pairs import PairEntry
+from barpc.report.summary.scene import DATUM, DatumEntry
+from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.words import STATUS_WORDS, counted, largest, listed, metres
 from barpc.report.tables import Relief, RunFiles, read_summary, read_tables
 from barpc.scene import connected_groups
 from barpc.workspace import Workspace

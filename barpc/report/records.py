@@ -197,9 +197,7 @@ class Table:
     marks: Sequence[str] = ()
 
     def marked(self, marks: Sequence[str]) -> Table:
-        """Return the same with the indices of the images of each row, for the page's script: one, or two with a
-        hyphen.
-        """
+        """Return the same with the indices of each row's images, for the page's script: one, or two with a hyphen."""
         return replace(self, marks=list(marks))
 
     @property
@@ -256,9 +254,7 @@ def table(
     adjusted: bool = True,
     folded: bool = False,
 ) -> Table:
-    """Return the table of records: a row each; the words of `columns` are fields (``part.field``) and columns of its
-    `OWN`.
-    """
+    """Return the table of records, a row each; words of `columns`: fields (``part.field``), columns of `OWN`."""
     found = [column_of(kind, name) for name in columns.split()]  # type: ignore[arg-type]
     found = [column for column in found if adjusted or not column.adjusted]
     cells = [[cell for column in found for cell in column.cells(row)] for row in rows]

@@ -26,7 +26,9 @@ from barpc.geojson import collection, feature
 from barpc.pointio.names import cell, from_cell
 from barpc.report.records import value_of
 from barpc.report.run import Run
-from barpc.report.summary import SCHEMA, PairEntry, Summary, ViewEntry, published_schema
+from barpc.report.summary import SCHEMA, Summary, published_schema
+from barpc.report.summary.pairs import PairEntry
+from barpc.report.summary.views import ViewEntry
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.geometry import footprint
 from barpc.sidefile import GEOJSON, SUMMARY, TABLE, Kind, parse_json, read_json, read_text
@@ -105,9 +107,7 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def _footprints(run: Run, summary: Summary) -> bytes:
-    """Return every image at the scene's altitude, through the adjusted cameras, or the cameras as they are
-    for a check.
-    """
+    """Return every image at the scene's altitude, through the adjusted cameras, or for a check as they are."""
     features = []
     for view, sensor, entry in zip(run.views, run.after or run.before, summary.views, strict=True):
         ring = np.round(footprint(sensor, view.size, run.altitude), 9)
@@ -337,9 +337,7 @@ def _columns(text: str, header: Sequence[str]) -> list[list[str]]:
 
 
 def _floats(columns: Sequence[Sequence[str]], known: int) -> Array:
-    """Return the columns (n, len(columns)) of numbers, of which only those after the first `known` may be
-    empty (NaN).
-    """
+    """Return the columns (n, len(columns)) of numbers, of which only those from `known` on may be empty (NaN)."""
     table = np.array([[float(cell or "nan") for cell in column] for column in columns], dtype=np.float64).T
     if np.isnan(table[:, :known]).any() or (np.abs(table) > _FAR).any():
         raise ValueError("a number is missing or absurdly large")

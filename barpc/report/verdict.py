@@ -17,9 +17,10 @@ from barpc.report.dem_lines import dem_lines, dem_reasons
 from barpc.report.records import plain
 from barpc.report.reservations import NOISE_LIMIT, anywhere, is_smooth, lost, standing_out, view_status
 from barpc.report.run import MANY_REJECTED, Run
-from barpc.report.summary import LeftOutEntry, Summary, ViewEntry, listed, measure, median, metres
+from barpc.report.summary import LeftOutEntry, Summary, measure
 from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_entries
-from barpc.report.summary.words import counted
+from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.words import counted, listed, median, metres
 from barpc.scene import GroundPoints
 from barpc.tie.reference import PEAK
 
@@ -227,9 +228,7 @@ def _control_reasons(run: Run) -> list[str]:
 
 
 def _wrong_heights(run: Run) -> list[str]:
-    """Say that a reference's points lie off each other along the lines of sight, where the terrain's errors move
-    them.
-    """
+    """Say that a reference's points lie off each other along the lines of sight, as the terrain's errors move them."""
     if run.reference is None or run.adjustment is None:
         return []
     stated = run.adjustment.options.dem_sigma
@@ -245,9 +244,7 @@ def _wrong_heights(run: Run) -> list[str]:
 
 
 def _bends(run: Run) -> list[str]:
-    """Name images in which a reference's points lie farther off each other than finding them leaves: a pixel at
-    most.
-    """
+    """Name images in which a reference's points lie off each other by more than a pixel, which finding them leaves."""
     if run.reference is None:
         return []
     step = run.reference.step

@@ -16,11 +16,11 @@ from barpc.report import Run
 from barpc.report import run as runs
 from barpc.report.decisions import decisions
 from barpc.report.run import ControlResidual, PairTies, pair_ties, triangulate_tracks
-from barpc.report.summary import cell_numbers, measure
+from barpc.report.summary import measure
 from barpc.report.summary.ground import GcpEntry, measure_control, measure_gcps, measure_reference
 from barpc.report.summary.place import ce90
 from barpc.report.summary.scene import _asked
-from barpc.report.summary.views import _in_image, rmse_by_view
+from barpc.report.summary.views import _in_image, cell_numbers, rmse_by_view
 from barpc.scene import Tracks
 from barpc.sensor.geometry import epipolar_offset
 from barpc.sensor.splined import RowSpline

@@ -25,18 +25,10 @@ from barpc.report.records import (
     table,
     value_of,
 )
-from barpc.report.summary import (
-    SCHEMA,
-    OffsetEntry,
-    PairEntry,
-    ViewEntry,
-    listed,
-    median,
-    metres,
-    published_schema,
-)
-from barpc.report.summary.pairs import medians
-from barpc.report.summary.words import Count, Share, Side, largest, percent
+from barpc.report.summary import SCHEMA, published_schema
+from barpc.report.summary.pairs import OffsetEntry, PairEntry, medians
+from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.words import Count, Share, Side, largest, listed, median, metres, percent
 
 from .made import a_correction, a_pair, a_view
 

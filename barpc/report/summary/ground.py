@@ -216,9 +216,7 @@ def _grouped(index: IntArray, num: int) -> list[IntArray]:
 
 
 def _in_images(run: Run, given: Array, views: IntArray, residual: Array) -> float:
-    """Return how far a residual (3,), east, north, up [m], of a ground point moves it in the images that show
-    it, RMS [px].
-    """
+    """Return how far a residual (3,), east, north, up [m], moves a ground point in its images, RMS [px]."""
     if run.after is None or not np.isfinite(residual).all():
         return float("nan")
     moved = ground_from_ecef(ecef_from_ground(given) + residual @ enu_basis(given))
@@ -254,9 +252,7 @@ def measure_reference(run: Run) -> ReferenceEntry | None:
 
 
 def measure_check_points(run: Run) -> tuple[CheckPointEntry, ...]:
-    """Return the points that stayed out of the adjustment: image residuals of each observation, and the
-    ground error.
-    """
+    """Return the points that stayed out of the adjustment: residuals in images, and the ground error."""
     points = run.check_points
     if points is None:
         return ()

@@ -273,9 +273,7 @@ def mode_in_words(mode: Mode) -> str:
 
 
 def moving_cells(run: Run) -> tuple[MovingEntry, ...]:
-    """Return the cells of the ground of which tie points move, from south to north and west to east; all
-    groups together.
-    """
+    """Return the cells of the ground whose tie points move, south to north, west to east; all groups together."""
     found = run.adjustment
     if found is None or not found.moving.any():
         return ()
