@@ -25,7 +25,7 @@ from barpc.errors import BarpcWarning, ImageError, InputError
 from barpc.geodesy import Array
 from barpc.geoids import geoid_file
 from barpc.raster import open_raster
-from barpc.remote import Place, Remote, place
+from barpc.remote import Place, place
 from barpc.sensor import SensorModel
 from barpc.sidefile import GRID, opened
 
@@ -33,9 +33,7 @@ HEIGHTS = {".hgt": ("SRTMHGT", "EGM96 height"), ".gtx": ("GTX", "ellipsoid")}
 """Suffix -> the driver that may open it (its first bytes say nothing), and what its heights count from."""
 _MAX_CELLS = 400_000_000
 _EXACT = 1e-4  # m: of a place on the terrain
-_A_POST = (
-    4.0  # steps: 60 m of noise a post under 27 degrees: 1.7 % of lines pass a corner, of two steps 3.2 %
-)
+_A_POST = 4.0  # steps: with 60 m of noise a post, under 27 degrees, 1.7 % of lines pass a corner, of two steps 3.2 %
 _STEPS = 64  # of a line of sight over a terrain whose posts are not known
 _AT_ONCE = 500_000  # heights
 _FAR = 1e12  # no coordinate [m or deg] comes near
@@ -152,10 +150,8 @@ class HeightGrid:
         for i, row_weight in enumerate((r0 + 1 - row, row - r0)):
             for j, col_weight in enumerate((c0 + 1 - col, col - c0)):
                 weight = row_weight * col_weight
-                rows, cols = (
-                    (r0 + i - top).clip(max=len(cells) - 1),
-                    (c0 + j - left).clip(max=cells.shape[1] - 1),
-                )
+                rows = (r0 + i - top).clip(max=len(cells) - 1)
+                cols = (c0 + j - left).clip(max=cells.shape[1] - 1)
                 height += np.where(weight > 0, weight * cells[rows, cols], 0.0)
         return height
 
@@ -201,7 +197,7 @@ class Dem:
         BarpcWarning for an unknown vertical reference, or orthometric heights that are taken as they are.
         """
         grid = HeightGrid.open(path)
-        geoid = geoid if geoid is None or isinstance(geoid, Remote) else geoid_file(geoid)
+        geoid = None if geoid is None else geoid_file(geoid)
         known = grid.reference
         if known == "ellipsoid" and geoid is not None:
             raise InputError(f"{path}: its heights are ellipsoidal already; leave out the geoid {geoid}")
@@ -209,10 +205,8 @@ class Dem:
         if geoid is not None:
             done = f"made ellipsoidal with {place(geoid).name}"
         elif known != "ellipsoid":
-            done, advice = (
-                "TAKEN AS ELLIPSOIDAL",
-                "; give a geoid grid, or expect errors up to 100 m in height",
-            )
+            done = "TAKEN AS ELLIPSOIDAL"
+            advice = "; give a geoid grid, or expect errors up to 100 m in height"
         description = f"{place(path).name}: vertical reference {known}, {done}"
         if advice or known == "unknown":
             warnings.warn(f"DEM {description}{advice}", BarpcWarning, stacklevel=2)

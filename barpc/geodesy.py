@@ -160,9 +160,7 @@ def up(ground: Array) -> Array:
 
 
 def metres_per_unit(ground: npt.ArrayLike) -> Array:
-    """Return the metres (..., 3) of one degree of longitude (zero at a pole), of latitude, one metre up, at
-    points (..., 3).
-    """
+    """Return the metres (..., 3) of one degree of longitude, of latitude, and one metre up, at points (..., 3)."""
     ground = np.asarray(ground, dtype=np.float64)
     lat, alt = ground[..., 1] * _RAD, ground[..., 2]
     w2 = 1.0 - WGS84_E2 * np.sin(lat) ** 2
@@ -190,6 +188,12 @@ def wrap_longitude(lon: npt.ArrayLike, center: npt.ArrayLike = 0.0) -> Array:
     lon = np.asarray(lon, dtype=np.float64)
     turns = np.rint((lon - center) / 360.0)
     return lon - 360.0 * turns
+
+
+def utm(lon: float, lat: float) -> tuple[int, str]:
+    """Return the UTM zone of a place [deg], by its longitude alone, and the reference system of the zone."""
+    zone = int((lon + 180.0) // 6.0) % 60 + 1
+    return zone, f"EPSG:{(32600 if lat >= 0 else 32700) + zone}"
 
 
 def reach(origin: Array, direction: Array, alt: Array) -> Array:

@@ -411,10 +411,7 @@ _GRIDS: dict[str, dict[str, Consumer]] = {
         "linear": Consumer("barpc", _linear_grid, locates=True),
         "barpc": Consumer("barpc", _own_grid),
     },
-    CORRECTION: {
-        "gdal": Consumer("rasterio", _gdal_correction),
-        "barpc": Consumer("barpc", _own_grid),
-    },
+    CORRECTION: {"gdal": Consumer("rasterio", _gdal_correction), "barpc": Consumer("barpc", _own_grid)},
     STATE_END: {"barpc": Consumer("barpc", _own_grid)},
     "": {"gdal": Consumer("rasterio", _gdal_raster), "barpc": CONSUMERS["barpc"]},
 }

@@ -400,13 +400,7 @@ class FitOptions(Options):
     """Options of fitting an RPC to a sensor model or to points."""
 
     method: Literal[
-        "auto",
-        "ridge",
-        "gauss-newton",
-        "minimax",
-        "lcurve",
-        "lcurve-joint",
-        "vendor-denominators",
+        "auto", "ridge", "gauss-newton", "minimax", "lcurve", "lcurve-joint", "vendor-denominators"
     ] = option(
         "auto",
         """`ridge`: QR compression and a noise-scaled ridge. `lcurve-joint`: the paper's solver, one h for col and row

@@ -48,13 +48,7 @@ _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third 
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 @click.pass_obj
 def fit(
-    obj: dict[str, Any],
-    /,
-    source: str,
-    output: str | None,
-    keep_going: bool,
-    overwrite: bool,
-    **flags: Any,
+    obj: dict[str, Any], /, source: str, output: str | None, keep_going: bool, overwrite: bool, **flags: Any
 ) -> int:
     r"""Fit an RPC to a camera or to points, and certify it on points that the fit has not seen.
 

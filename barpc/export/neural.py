@@ -22,10 +22,11 @@ from barpc.export.approx import (
     project_projective,
 )
 from barpc.export.scene import Scene, Shot, link
-from barpc.geodesy import Array, ecef_from_ground, wrap_longitude
+from barpc.geodesy import Array, ecef_from_ground, utm, wrap_longitude
 from barpc.geojson import polygon
 from barpc.remote import is_url
 from barpc.report.records import plain
+from barpc.report.tables import ply
 from barpc.rpcio import WRITABLE
 from barpc.sensor.geometry import footprint, image_grid
 
@@ -102,9 +103,8 @@ class _Utm:
 
     def __init__(self, scene: Scene) -> None:
         lon, lat, _ = scene.origin
-        self.zone = int((lon + 180.0) // 6.0) % 60 + 1
+        self.zone, self._crs = utm(lon, lat)
         self.band = _BANDS[int(np.clip((lat + 80.0) // 8.0, 0, len(_BANDS) - 1))]
-        self._crs = f"EPSG:{(32600 if lat >= 0 else 32700) + self.zone}"
         corners = np.concatenate([self.metres(_grid(scene, shot, (2, 2))[0]) for shot in scene.shots])
         self.center = np.append(corners[:, :2].mean(axis=0), scene.alt_range[0])
         self.scale = float(np.linalg.norm(corners - self.center, axis=1).max())
@@ -218,16 +218,9 @@ def _frame(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
 
 def _cloud(scene: Scene) -> bytes:
     """Return the tie points in the world's frame, as renderers start from them: with a colour."""
-    kind = np.dtype(
-        [*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
-    )
-    rows = np.full(len(scene.points), 128, dtype=np.uint8).astype(kind)
-    for axis, values in zip("xyz", scene.world(scene.points).T, strict=True):
-        rows[axis] = values
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    head += [f"property float {axis}" for axis in "xyz"]
-    head += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    return ("\n".join([*head, "end_header"]) + "\n").encode() + rows.tobytes()
+    places = dict(zip("xyz", scene.world(scene.points).T.astype(np.float32), strict=True))
+    grey = np.full(len(scene.points), 128, dtype=np.uint8)
+    return ply(places | dict.fromkeys(("red", "green", "blue"), grey))
 
 
 # --- COLMAP -----------------------------------------------------------------------------------------------

@@ -47,10 +47,7 @@ def cars(scene: Scene, out: Path) -> Files:
 def asp(scene: Scene, out: Path) -> Files:
     """Write ``<image>.xml`` each (in Maxar's form), and lists of images and cameras for its tools, run in `out`."""
     files = {f"{shot.name}.xml": _text(shot, "xml") for shot in scene.shots}
-    lists = {
-        "images.txt": [_image(shot, out) for shot in scene.shots],
-        "cameras.txt": list(files),
-    }
+    lists = {"images.txt": [_image(shot, out) for shot in scene.shots], "cameras.txt": list(files)}
     return files | {name: ("\n".join(lines) + "\n").encode() for name, lines in lists.items()}
 
 

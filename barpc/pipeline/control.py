@@ -12,13 +12,13 @@ from barpc.geodesy import Array, ecef_from_ground, metres_per_unit, wrap_longitu
 from barpc.options import RunOptions
 from barpc.pointio.altimetry import read_altimetry
 from barpc.pointio.ground import read_gcps
+from barpc.report.summary.words import listed
 from barpc.scene import Altimetry, BoolArray, GroundPoints, View
 from barpc.sensor.geometry import footprint, ground_sample_distance
 from barpc.tie.pairs import reach_of
 
 _REACH = 1000.0  # m: ten times what delivered cameras are wrong by where they are bad
 _ALT_REACH = 500.0  # m beyond a camera's altitudes: a geoid is 100 m, and ranges miss relief by some hundred
-_LISTED = 10
 
 _MISTAKES = {
     "longitude and latitude are exchanged: GeoJSON and image tags give longitude first, .gcp files latitude, and a CSV "
@@ -64,19 +64,14 @@ def _load(path: str, views: Sequence[View], options: RunOptions) -> GroundPoints
     for wrong, what in _implausible(points, views, search):
         names = [points.names[g] for g in np.flatnonzero(wrong & keep)]
         if names:
-            many = f"{len(names)} of {len(keep)} points ({_listed(names)})"
+            many = f"{len(names)} of {len(keep)} points ({listed(names)})"
             out.append(f"{many if len(names) > 1 else f'point {names[0]}'}: {what}")
         keep &= ~wrong
     if points.strangers:
-        out.append(f"it names images that are not in this run: {_listed(points.strangers)}")
+        out.append(f"it names images that are not in this run: {listed(points.strangers)}")
     if out and not options.keep_going:
         raise InputError(f"{path}: {out[0]}; correct it, or leave it out with --keep-going")
     return replace(points.select(keep), left_out=tuple(f"{path}: {line}; left out" for line in out))
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return ", ".join(names[:_LISTED]) + more
 
 
 def _implausible(

@@ -197,9 +197,7 @@ def _errors(files: RunFiles) -> Section | None:
     norms = [np.hypot(*r[found.used & np.isfinite(r).all(axis=1)].T) for r in (found.before, found.after)]
     if not any((norm > 0).any() for norm in norms):
         return None
-    shown = [
-        (charts.histogram(*norms), "All observations that count; each curve is drawn to its own peak."),
-    ]
+    shown = [(charts.histogram(*norms), "All observations that count; each curve is drawn to its own peak.")]
     if not files.summary.adjusted:
         answer = f"Half of the observations lie within {np.median(norms[0]):.3f} px of where their cameras put them."
         return Section("errors", "How large are the errors?", answer, shown)

@@ -11,13 +11,14 @@ import io
 import json
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from barpc import __version__
 from barpc.errors import InputError
@@ -34,15 +35,8 @@ from barpc.sensor.geometry import footprint
 from barpc.sidefile import GEOJSON, SUMMARY, TABLE, Kind, parse_json, read_json, read_text
 from barpc.workspace import table_path
 
-RESIDUALS = (
-    "lon",
-    "lat",
-    "height_above_datum",
-    "mean_residual",
-    "num_observations",
-    "mean_residual_before",
-    "track",
-)
+_PLACE = "lon", "lat", "height_above_datum"
+RESIDUALS = (*_PLACE, "mean_residual", "num_observations", "mean_residual_before", "track")
 """Columns of residuals.csv, one row a track. Heights: above the ellipsoid."""
 
 OBSERVATIONS = ("view", "track", "col", "row", "col_before", "row_before", "col_after", "row_after", "used")
@@ -123,22 +117,25 @@ def _points_ply(run: Run, _: Summary) -> bytes:
     if len(rows):
         origin[0] = rows[0, 0]  # a mean of longitudes may fall on the other side of the Earth
     local = (ecef_from_ground(rows[:, :3]) - ecef_from_ground(origin)) @ enu_basis(origin).T
-    kind = np.dtype([(n, "<f8") for n in "xyz"] + [("mean_residual", "<f4"), ("num_observations", "<i4")])
-    records = np.empty(len(rows), dtype=kind)
-    for name, values in zip(kind.names or (), [*local.T, rows[:, 3], rows[:, 4]], strict=True):
-        records[name] = values
+    columns: dict[str, Any] = dict(zip("xyz", local.T, strict=True))
+    columns |= {
+        "mean_residual": rows[:, 3].astype(np.float32),
+        "num_observations": rows[:, 4].astype(np.int32),
+    }
     place = f"lon {origin[0]:.9f} lat {origin[1]:.9f} alt {origin[2]:.4f} (WGS84, above the ellipsoid)"
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"comment barpc {__version__}: x east, y north, z up [m] of {place}",
-        f"element vertex {len(rows)}",
-        *(f"property double {name}" for name in "xyz"),
-        "property float mean_residual",
-        "property int num_observations",
-        "end_header",
-    ]
-    return ("\n".join(header) + "\n").encode() + records.tobytes()
+    return ply(columns, f"barpc {__version__}: x east, y north, z up [m] of {place}")
+
+
+_PLY = {"float64": "double", "float32": "float", "int32": "int", "uint8": "uchar"}
+
+
+def ply(columns: Mapping[str, npt.NDArray[Any]], *comments: str) -> bytes:
+    """Return points as a binary PLY: columns (n,) by their names, of the types of `_PLY`, and comments."""
+    records = np.rec.fromarrays(list(columns.values()), names=list(columns))
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
+    header.append(f"element vertex {len(records)}")
+    header += [f"property {_PLY[column.dtype.name]} {name}" for name, column in columns.items()]
+    return ("\n".join([*header, "end_header"]) + "\n").encode() + records.tobytes()
 
 
 def gcps_geojson(run: Run) -> bytes:
