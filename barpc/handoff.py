@@ -156,9 +156,8 @@ def _grid_reading(
 
 def unverified(paths: Sequence[Path | str]) -> list[str]:
     """Return a sentence for each kind of these files that no installed tool but barpc reads."""
-    files = [
-        path for path in map(Path, paths) if not path.name.endswith(STATE_END)
-    ]  # whose readers are no packages
+    # the readers of a state are no packages
+    files = [path for path in map(Path, paths) if not path.name.endswith(STATE_END)]
     kinds = {path.suffix: path for path in files if not any(_readers(path).values())}
     return [
         f"{path}: only barpc itself has read it ({kind}: {' and '.join(_readers(path)) or 'no other tool'} would, and "

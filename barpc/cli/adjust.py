@@ -184,12 +184,11 @@ def _tell(obj: Mapping[str, Any], result: AdjustResult) -> int:
         echo(json.dumps(result.summary, indent=1))
     elif not obj["quiet"]:
         print_summary(result.record)
-    said = output_width() is not None and not (
-        wants_json() or obj["quiet"]
-    )  # on the screen: every reason once
-    return (
-        0 if result.passed else tell_gate(result.record.headline, [] if said else list(result.record.reasons))
-    )
+    if result.passed:
+        return 0
+    # on the screen: every reason once
+    said = output_width() is not None and not (wants_json() or obj["quiet"])
+    return tell_gate(result.record.headline, [] if said else list(result.record.reasons))
 
 
 def _compare(images: list[str], against: Path) -> int:

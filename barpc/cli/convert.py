@@ -14,7 +14,7 @@ import click
 
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.alignment import moved, read_move
-from barpc.cli.crops import Window, box_of, crop_all, window_of
+from barpc.cli.crops import Window, box_of, window_of, windows_of
 from barpc.cli.heights import Heights, with_heights
 from barpc.cli.images import expanded
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
@@ -118,14 +118,16 @@ def _to_folder(files: tuple[str, ...], folder: Path, flags: Mapping[str, Any]) -
     carrier: str = flags["carrier"] or "vrt"
     names = [name.strip() for name in (flags["formats"] or ("" if cut else "txt")).split(",") if name.strip()]
     images = tuple(expanded(files))
-    _check([Path(split_spec(image)[0]) for image in images], folder, names)
+    files_of = [Path(split_spec(image)[0]) for image in images]
+    _check(files_of, folder, names)
     cameras = _cameras(images, flags["rpcs"])
     if flags["move"] is not None or flags["transform"] is not None:
         cameras = moved(cameras, flags["move"], flags["transform"], carrier)
-    if cut:
-        shown = [(Path(split_spec(image)[0]), camera) for image, camera in zip(images, cameras, strict=True)]
-        return _told(crop_all(shown, folder, _window(flags), names, flags["overwrite"]))
-    return _hand_off(images, cameras, folder, carrier, names, flags["overwrite"])
+    ends = [".tif" if cut else CARRIERS[carrier].suffixes[0], *(WRITABLE[name].beside for name in names)]
+    shown = list(zip(files_of, cameras, strict=True))
+    keep = [*files_of, *(Path(camera.path) for camera in cameras)]
+    parts = windows_of(shown, _window(flags)) if cut else [(file, camera, None) for file, camera in shown]
+    return _hand_off(parts, folder, ends, keep, flags["overwrite"])
 
 
 # --- one file ---------------------------------------------------------------------------------------------
@@ -243,38 +245,40 @@ def _cameras(images: Sequence[str], rpcs: str | None) -> list[Camera]:
     cameras = []
     for file in (Path(split_spec(image)[0]) for image in images):
         camera = open_camera(str(find_rpc(Path(rpcs), file)) if Path(rpcs).is_dir() else rpcs)
-        with open_raster(file) as dataset:
-            cameras.append(replace(camera, size=(dataset.width, dataset.height)))
+        cameras.append(replace(camera, size=_size(file)))
     return cameras
 
 
 def _hand_off(
-    images: tuple[str, ...],
-    cameras: Sequence[Camera],
+    images: Sequence[tuple[Path, Camera, Window | None]],
     folder: Path,
-    carrier: str,
-    formats: list[str],
+    ends: Sequence[str],
+    keep: Sequence[Path],
     overwrite: bool,
 ) -> int:
-    """Write images with their RPCs, open every file as its readers do, and say what they see."""
-    files = [Path(split_spec(image)[0]) for image in images]
-    ends = [CARRIERS[carrier].suffixes[0], *(WRITABLE[name].beside for name in formats)]
-    names = [[file.stem + end for end in ends] for file in files]
+    """Write images, or windows of them, with their RPCs, open every file as its readers do, and say what they see."""
+    names = [[path.stem + end for end in ends] for path, *_ in images]
     together = [name for row in names for name in row]
-    inputs = [*files, *(Path(camera.path) for camera in cameras)]
     readings: list[Reading] = []
     reasons: list[str] = []
-    with Workspace(folder, overwrite=overwrite, keep=inputs, names=together, adds=True) as workspace:
-        for file, camera, row in zip(files, cameras, names, strict=True):
+    with Workspace(folder, overwrite=overwrite, keep=keep, names=together, adds=True) as workspace:
+        for (path, camera, window), row in zip(images, names, strict=True):
+            rpc, written = camera.rpc, [folder / name for name in row]
             for name in row:
                 with workspace.output(name) as partial:
-                    write_camera(camera.rpc, partial, file, place=folder / name, overwrite=True)
-            written = [folder / name for name in row]
-            with open_raster(file) as dataset:
-                size = dataset.width, dataset.height
-            readings += verify(written, camera.rpc, size, camera.alt_range)
-            reasons += _shadow_reasons(file, written)
-    return _told(readings, reasons, unverified([folder / name for name in names[0]]))
+                    if window is not None and name == row[0]:
+                        rpc = write_crop(rpc, path, partial, window, overwrite=True)
+                    else:
+                        write_camera(rpc, partial, path, place=folder / name, overwrite=True)
+            readings += verify(written, rpc, _size(path) if window is None else window[2:], camera.alt_range)
+            reasons += _shadow_reasons(path, written) if window is None else []
+    whole = images[0][2] is None
+    return _told(readings, reasons, unverified([folder / name for name in names[0]]) if whole else ())
+
+
+def _size(image: Path) -> tuple[int, int]:
+    with open_raster(image) as dataset:
+        return dataset.width, dataset.height
 
 
 def _told(readings: list[Reading], reasons: Sequence[str] = (), notes: Sequence[str] = ()) -> int:

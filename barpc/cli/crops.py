@@ -13,11 +13,8 @@ from barpc.cameras import Camera
 from barpc.cli.heights import altitude_of, exchanged
 from barpc.cli.terminal import say
 from barpc.dem import Dem
-from barpc.handoff import Reading, verify
-from barpc.rpcio import WRITABLE, write_camera, write_crop
 from barpc.sensor.geometry import image_border
 from barpc.tie.pairs import read_area
-from barpc.workspace import Workspace
 
 Window = tuple[int, int, int, int]
 Box = tuple[float, float, float, float]
@@ -50,40 +47,18 @@ def window_of(camera: Camera, path: Path, bbox: Box, alt: float | None, dem: Dem
     return col, row, width, height
 
 
-def crop_all(
-    shown: Sequence[tuple[Path, Camera]],
-    folder: Path,
-    window: Callable[[Camera, Path], Window],
-    formats: Sequence[str],
-    overwrite: bool,
-) -> list[Reading]:
-    """Write a part of every image that shows it, with its RPC inside and in files, and open all of them again.
-
-    An image that does not show it is said on stderr and left out; a usage error where none does.
-    """
-    windows: list[tuple[Path, Camera, Window]] = []
-    for path, camera in shown:
+def windows_of(
+    images: Sequence[tuple[Path, Camera]], window: Callable[[Camera, Path], Window]
+) -> list[tuple[Path, Camera, Window]]:
+    """Return the images that show what is asked for, and where; a usage error where none does, else it is said."""
+    found = []
+    for path, camera in images:
         try:
-            windows.append((path, camera, window(camera, path)))
+            found.append((path, camera, window(camera, path)))
         except click.UsageError as error:
-            if len(shown) == 1:
+            if len(images) == 1:
                 raise
             say(f"{path} is left out: {error.message}")
-    if not windows:
+    if not found:
         raise click.UsageError("no image shows what is to be cut out")
-    names = [
-        [path.stem + end for end in (".tif", *(WRITABLE[one].beside for one in formats))]
-        for path, *_ in windows
-    ]
-    inputs = [*(path for path, _ in shown), *(Path(camera.path) for _, camera in shown)]
-    readings: list[Reading] = []
-    every = [name for row in names for name in row]
-    with Workspace(folder, overwrite=overwrite, keep=inputs, names=every, adds=True) as workspace:
-        for (path, camera, place), row in zip(windows, names, strict=True):
-            with workspace.output(row[0]) as partial:
-                rpc = write_crop(camera.rpc, path, partial, place, overwrite=True)
-            for name in row[1:]:
-                with workspace.output(name) as partial:
-                    write_camera(rpc, partial, path, place=folder / name, overwrite=True)
-            readings += verify([folder / name for name in row], rpc, place[2:], camera.alt_range)
-    return readings
+    return found

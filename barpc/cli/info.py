@@ -244,16 +244,7 @@ def _geometry(
 
 # --- the installation -------------------------------------------------------------------------------------
 
-_REQUIRED = [
-    "numpy",
-    "scipy",
-    "opencv-python-headless",
-    "rasterio",
-    "shapely",
-    "click",
-    "filelock",
-    "fastjsonschema",
-]
+_REQUIRED = "numpy scipy opencv-python-headless rasterio shapely click filelock fastjsonschema"
 _OPTIONAL = {"jinja2": "report", "distributed": "cluster"}
 
 
@@ -302,7 +293,7 @@ def _examine() -> int:
     """Print the versions of what barpc stands on, try each part once, and give the exit code."""
     versions = {"barpc": __version__, "python": platform.python_version()}
     missing = {name: f"not installed (pip install 'barpc[{extra}]')" for name, extra in _OPTIONAL.items()}
-    for name in (*_REQUIRED, *_OPTIONAL):
+    for name in (*_REQUIRED.split(), *_OPTIONAL):
         try:
             versions[name] = version(name)
         except PackageNotFoundError:

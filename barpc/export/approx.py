@@ -14,11 +14,7 @@ from barpc.geodesy import Array
 
 _STEPS = 40  # of Levenberg's method
 _REWEIGHTED = 8
-_TIMES = (
-    1.0,
-    2.0,
-    3.0,
-)  # an image that is affine along its flight is best seen from farther away than it was
+_TIMES = 1.0, 2.0, 3.0  # an image that is affine along its flight is best seen from farther away than it was
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,12 +49,8 @@ def _collection(scene: Scene, items: Mapping[str, Any]) -> dict[str, Any]:
     boxes = np.array([item["bbox"] for item in items.values()])
     west = wrap_longitude(boxes[:, 0], boxes[0, 0])
     east = west + np.mod(boxes[:, 2] - boxes[:, 0], 360.0)
-    ends = [
-        float(wrap_longitude(west.min())),
-        boxes[:, 1].min(),
-        float(wrap_longitude(east.max())),
-        boxes[:, 3].max(),
-    ]
+    first, last = (float(wrap_longitude(lon)) for lon in (west.min(), east.max()))
+    ends = [first, boxes[:, 1].min(), last, boxes[:, 3].max()]
     times = sorted(time for item in items.values() if (time := item["properties"]["datetime"]) is not None)
     return {
         "type": "Collection",

@@ -83,10 +83,8 @@ def satnerf(scene: Scene, out: Path) -> Files:
     names = list(files)
     points = io.BytesIO()
     np.save(points, ecef_from_ground(scene.points), allow_pickle=False)
-    lists = {
-        "train.txt": "\n".join(names).encode(),
-        "test.txt": names[-1].encode(),
-    }  # (no end of line after the last)
+    # no end of line after the last
+    lists = {"train.txt": "\n".join(names).encode(), "test.txt": names[-1].encode()}
     return {**files, **lists, "pts3d.npy": points.getvalue()}
 
 

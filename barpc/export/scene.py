@@ -168,19 +168,9 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
                 f"{folder / 'summary.json'}: names no RPC file of {view.name} that can be read: run it again"
             )
         rows = counted[starts[number] : starts[number + 1]]
-        camera = None if view.rpc_source is None else view.rpc_source.path
-        carrier = _carrier(folder, view)
-        shots.append(
-            Shot(
-                view,
-                rpc,
-                view.path,
-                carrier,
-                light_of(view.path, camera),
-                order[index[rows]],
-                files.observations.xy[rows],
-            )
-        )
+        light = light_of(view.path, None if view.rpc_source is None else view.rpc_source.path)
+        seen = order[index[rows]], files.observations.xy[rows]
+        shots.append(Shot(view, rpc, view.path, _carrier(folder, view), light, *seen))
     noise = _noise(files, counted)
     return Scene(folder, summary, tuple(shots), files.points[:, :3], files.tracks, alt_range, noise)
 

@@ -31,13 +31,10 @@ def s2p(scene: Scene, out: Path) -> Files:
 
 def cars(scene: Scene, out: Path) -> Files:
     """Write ``inputs.yaml``, with the pairs whose angle shows heights, and a ``.geom`` an image."""
-    sensors = {
-        shot.name: {
-            "image": _image(shot, out),
-            "geomodel": {"path": f"{shot.name}.geom", "model_type": "RPC"},
-        }
-        for shot in scene.shots
-    }
+    sensors = {}
+    for shot in scene.shots:
+        camera = {"path": f"{shot.name}.geom", "model_type": "RPC"}
+        sensors[shot.name] = {"image": _image(shot, out), "geomodel": camera}
     pairing = [list(pair) for pair in pairs_of(scene)]
     found = {"input": {"sensors": sensors, "pairing": pairing}, "output": {"directory": "cars_out"}}
     files = {f"{shot.name}.geom": _text(shot, "geom") for shot in scene.shots}

@@ -173,17 +173,23 @@ def adjust(
         if run.adjustment is not None:
             with _told(workspace, "block", progress), workspace.output(f"{TABLES}/{PRIOR}") as partial:
                 block_prior(run.adjustment).save(partial)
-        with _told(workspace, "summary", progress):
-            run = replace(run, out_dir=str(out_dir), stages=workspace.stages)
-            summary = replace(summarize(run), inputs=_entries(inputs.values()))
-        summary = replace(summary, stages=tuple(map(StageEntry.read, run.stages)))
-        _tell(progress, REPORT, 0)
-        summary = write_tables(workspace, run, summary)
-        _tell(progress, REPORT, 1)
+        run = replace(run, out_dir=str(out_dir), stages=workspace.stages)
+        summary = _summed_up(run, inputs.values(), workspace, progress)
         workspace.remove_stale()
     sensors = run.after or run.before
     views = [replace(view, sensor=sensor) for view, sensor in zip(run.views, sensors, strict=True)]
     return AdjustResult(_as_given(views, images, options), run, summary)
+
+
+def _summed_up(run: Run, inputs: Iterable[Input], workspace: Workspace, progress: Progress | None) -> Summary:
+    """Write summary, tables and report."""
+    with _told(workspace, "summary", progress):
+        summary = replace(summarize(run), inputs=_entries(inputs))
+    summary = replace(summary, stages=tuple(map(StageEntry.read, run.stages)))
+    _tell(progress, REPORT, 0)
+    summary = write_tables(workspace, run, summary)
+    _tell(progress, REPORT, 1)
+    return summary
 
 
 def _entries(inputs: Iterable[Input]) -> tuple[InputEntry, ...]:
@@ -263,8 +269,7 @@ def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[
         for view in views:
             plain_source(view.path)
     inputs = (*(view.path for view in views), *(source.path for source in run.sources))
-    keep = set(here(inputs))
-    keep |= set(input_files(options))
+    keep = {*here(inputs), *input_files(options)}
     names = output_names(views, options, folder)
     refuse_shadows(folder, names)
     return names, keep

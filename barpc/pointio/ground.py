@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -127,9 +127,7 @@ def _csv_point(name: str, view: int, of: Mapping[str, float]) -> _Point:
 def _gcp_columns(path: Path, words: Sequence[str], views: ViewNames) -> dict[str, int]:
     """Return the column of each quantity; a file of one image need not name it."""
     found = header_of(words, {**_COLUMNS, **_NAMES, **_SIGMAS})
-    needed = [*_COLUMNS, "image"][: len(_COLUMNS) + (len(views.names) > 1)]
-    if missing := [name for name in needed if name not in found]:
-        raise InputError(f"{path}: no column {', '.join(missing)} among the {len(words)} of its first line")
+    require_columns(path, [*_COLUMNS, "image"][: len(_COLUMNS) + (len(views.names) > 1)], found, words)
     for i, word in enumerate(words):
         if i not in found.values() and re.match("sigma|std|stdev|acc|err", word.lower()):
             raise InputError(
@@ -316,6 +314,12 @@ def header_of(words: Sequence[str], names: Mapping[str, Sequence[str]] | None = 
     return found
 
 
+def require_columns(path: Path, needed: Iterable[str], found: Container[str], words: Sequence[str]) -> None:
+    """Raise InputError unless all columns needed were found among the words of a table's first line."""
+    if missing := [name for name in needed if name not in found]:
+        raise InputError(f"{path}: no column {', '.join(missing)} among the {len(words)} of its first line")
+
+
 def _read_table(path: Path) -> Correspondences:
     """Read a text table: columns by commas, semicolons, tabs or blanks; ``#`` begins a comment."""
     rows: list[list[float]] = []
@@ -325,10 +329,7 @@ def _read_table(path: Path) -> Correspondences:
         values = numbers_of(words)
         if not columns and words:
             columns = dict(zip(_COLUMNS, range(5), strict=True)) if values else header_of(words)
-            if missing := [name for name in _COLUMNS if name not in columns]:
-                raise InputError(
-                    f"{path}: no column {', '.join(missing)} among the {len(words)} of its first line"
-                )
+            require_columns(path, _COLUMNS, columns, words)
         elif words and values is None:
             raise InputError(f"{path}, line {number}: expected numbers")
         if values:

@@ -188,6 +188,6 @@ def legend(names: Sequence[str], right: float, y: float) -> list[str]:
     return parts
 
 
-def evenly(rows: Sequence[Any], most: int) -> Sequence[Any]:
+def evenly(rows: Any, most: int) -> Any:
     """Return all rows, or a number of them at even steps."""
     return rows[:: max(1, -(-len(rows) // most))]

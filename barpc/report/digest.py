@@ -28,11 +28,8 @@ def _badness(view: ViewEntry) -> tuple[int, int, float]:
         return len(_ORDER), 0, 0.0
     cause = _CAUSES.index(view.cause) if view.cause in CAUSES else len(_CAUSES)
     errors = (view.rmse_after, view.held_out_px, view.rmse_before if view.rmse_after is None else None)
-    return (
-        _ORDER.index(view.status),
-        cause,
-        -max((error for error in errors if error is not None), default=0.0),
-    )
+    worst = max((error for error in errors if error is not None), default=0.0)
+    return _ORDER.index(view.status), cause, -worst
 
 
 def flagged(views: Sequence[ViewEntry]) -> list[ViewEntry]:

@@ -60,14 +60,8 @@ def pair_matrix(files: RunFiles) -> str:
         *_names(names, side, left),
     ]
     for place, measure in enumerate(MEASURES):
-        parts.append(
-            tag(
-                "g",
-                *_layer(measure, cells, side, (len(views), left)),
-                class_=f"layer l{place}",
-                data_words=measure.words,
-            )
-        )
+        layer = _layer(measure, cells, side, (len(views), left))
+        parts.append(tag("g", *layer, class_=f"layer l{place}", data_words=measure.words))
     parts.append(tag("rect", x=0, y=0, width=side, height=side, class_="cursor"))
     return sheet(
         "matrix-chart",

@@ -14,7 +14,7 @@ from barpc.report.run import MANY_REJECTED, SMOOTH_LEFT, Run
 from barpc.report.summary.causes import LeftEntry, left_entries, strangeness
 from barpc.report.summary.reasons import CAUSES, Reason
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import listed
+from barpc.report.summary.words import known, listed
 from barpc.sensor.rpc import RPC
 
 GOOD_RMSE = 0.5  # A view whose tie points are left with more than this [px] is called doubtful
@@ -233,11 +233,6 @@ _RESERVATIONS: tuple[Callable[[ViewEntry, Run], Reason | None], ...] = (
     _unused, _beyond, _error, _moving, _one_place,
 )  # fmt: skip
 """In this order: the first that holds is the reason."""
-
-
-def known(value: float | None) -> float:
-    """Return a number, NaN where there is none."""
-    return float("nan") if value is None else value
 
 
 def lost(view: ViewEntry) -> float:

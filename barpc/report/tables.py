@@ -131,11 +131,13 @@ _PLY = {"float64": "double", "float32": "float", "int32": "int", "uint8": "uchar
 
 def ply(columns: Mapping[str, npt.NDArray[Any]], *comments: str) -> bytes:
     """Return points as a binary PLY: columns (n,) by their names, of the types of `_PLY`, and comments."""
-    records = np.rec.fromarrays(list(columns.values()), names=list(columns))
+    kinds = [(name, column.dtype) for name, column in columns.items()]
+    records: Any = np.rec.fromarrays(list(columns.values()), dtype=kinds)
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
     header.append(f"element vertex {len(records)}")
     header += [f"property {_PLY[column.dtype.name]} {name}" for name, column in columns.items()]
-    return ("\n".join([*header, "end_header"]) + "\n").encode() + records.tobytes()
+    rows: bytes = records.tobytes()
+    return ("\n".join([*header, "end_header"]) + "\n").encode() + rows
 
 
 def gcps_geojson(run: Run) -> bytes:
@@ -144,20 +146,12 @@ def gcps_geojson(run: Run) -> bytes:
     assert control is not None
     assert run.adjustment is not None
     points, kept = control.points, run.adjustment.reference_inlier
-    places, sigmas, pixels = (
-        points.lonlatalt.round(9).tolist(),
-        points.sigma.tolist(),
-        points.xy.round(4).tolist(),
-    )
-    features = []
+    places, sigmas = points.lonlatalt.round(9).tolist(), points.sigma.tolist()
+    pixels, features = points.xy.round(4).tolist(), []
     for row in np.flatnonzero(kept).tolist():
         g, view = int(points.point[row]), run.views[points.view[row]]
-        properties = {
-            "id": points.names[g],
-            "filename": Path(view.path).name,
-            "ji": pixels[row],
-            "sigma_m": sigmas[g],
-        }
+        where = {"id": points.names[g], "filename": Path(view.path).name}
+        properties = {**where, "ji": pixels[row], "sigma_m": sigmas[g]}
         place = {"type": "Point", "coordinates": places[g]}
         features.append(json.dumps({"type": "Feature", "geometry": place, "properties": properties}))
     text = ",\n".join(features)

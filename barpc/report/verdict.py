@@ -29,21 +29,17 @@ _MOST_NAMED = 5  # images in a sentence
 MOVED = (
     3.0  # A scene that moved by more than so many times what its cameras' accuracies let expect needs a look
 )
-
 _SAY_REJECTED = (
     "contradicted",
     "rejected",
     "wrong_matches",
 )  # causes whose sentence says how many were rejected
 _SAY_WHERE = "rejected", "place"  # causes whose sentence says where in the image
+_LOOKED_AT = "The image was looked at"
 _ALL_WELL = {
     "adjust": ("The image is adjusted", "Both images are adjusted", "All {} images are adjusted"),
-    "check": (
-        "The image was looked at",
-        "The cameras of both images agree",
-        "The cameras of all {} images agree",
-    ),
-    "match": ("The image was looked at", "Both images are tied together", "All {} images are tied together"),
+    "check": (_LOOKED_AT, "The cameras of both images agree", "The cameras of all {} images agree"),
+    "match": (_LOOKED_AT, "Both images are tied together", "All {} images are tied together"),
 }
 """Kind of a run -> what is said of one, two and more images of which all is well."""
 _CONTROL_WORDS = {
@@ -384,10 +380,8 @@ def _jitter_lines(views: Sequence[ViewEntry]) -> list[str]:
             "along the epipolar lines: control points, a DEM or a reference do."
         )
     if stepping := [one for one in found if one.detectors]:
-        most, size = (
-            max(len(one.detectors or ()) for one in stepping),
-            median([one.detector_px for one in stepping]),
-        )
+        most = max(len(one.detectors or ()) for one in stepping)
+        size = median([one.detector_px for one in stepping])
         lines.append(
             f"Detectors begin at up to {counted(most, 'column')} of an image, {size:.2f} px RMS apart."
         )

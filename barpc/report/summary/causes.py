@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -165,13 +166,8 @@ def _moving(one: Finding, motion: Motion, names: Sequence[str]) -> ExplanationEn
         share=share, side=side, metres=metres, first=between[0], second=between[1]
     )
     numbers = one.gain, one.gap, one.runner_up or None
-    place: dict[str, Any] = {
-        "share": motion.share,
-        "moved_m": motion.metres,
-        "between": between,
-        "box": motion.box,
-    }
-    return ExplanationEntry(one.kind, sentence, None, *numbers, **place)
+    whole: dict[str, Any] = {"share": motion.share, "moved_m": motion.metres}
+    return ExplanationEntry(one.kind, sentence, None, *numbers, **whole, between=between, box=motion.box)
 
 
 def _place(motion: Motion) -> str:
@@ -197,21 +193,12 @@ def left_entries(adjustment: Adjustment) -> tuple[LeftEntry, ...]:
     return tuple(_left(one, adjustment.names) for one in adjustment.left)
 
 
+_HELD_OUT = attrgetter("columns", "rows", "count", "far", "off", "chance")
+
+
 def held_out_places(places: Sequence[Place], names: Sequence[str]) -> tuple[HeldOutEntry, ...]:
     """Return where tie points that took no part are met worse, the surest first."""
-    return tuple(
-        HeldOutEntry(
-            names[one.view],
-            held_out_place(one, names),
-            one.columns,
-            one.rows,
-            one.count,
-            one.far,
-            one.off,
-            one.chance,
-        )
-        for one in places
-    )
+    return tuple(HeldOutEntry(names[one.view], held_out_place(one, names), *_HELD_OUT(one)) for one in places)
 
 
 def held_out_place(one: Place, names: Sequence[str]) -> str:

@@ -172,12 +172,7 @@ def measure_gcps(run: Run) -> tuple[GcpEntry, ...]:
         status = "not seen" if not images else "used" if tested is None else tested.status(g)
         entries.append(
             GcpEntry(
-                name,
-                lon,
-                lat,
-                alt,
-                sigma,
-                left[g].tolist(),
+                *(name, lon, lat, alt, sigma, left[g].tolist()),
                 used=status in ("used", "contradicts"),
                 status=status,  # type: ignore[arg-type]  # one of these words
                 images=images,
@@ -236,19 +231,13 @@ def measure_reference(run: Run) -> ReferenceEntry | None:
         rows = adjustment.reference_inlier
         kept = np.bincount(control.points.view[rows], minlength=len(run.views))
         points = len(np.unique(control.points.point[rows]))
-    views = tuple(
-        ReferenceViewEntry(
-            name=view.name,
-            peak=view.peak,
-            offset_en_m=view.offset if view.points else None,
-            num_tried=view.tried,
-            num_passed=view.passed,
-            num_points=int(count),
-            scatter_m=view.scatter,
+    views = []
+    for view, count in zip(found.views, kept.tolist(), strict=True):
+        offset = view.offset if view.points else None
+        views.append(
+            ReferenceViewEntry(view.name, view.peak, offset, view.tried, view.passed, count, view.scatter)
         )
-        for view, count in zip(found.views, kept, strict=True)
-    )
-    return ReferenceEntry(points > 0, found.step, found.sigma, points, views)
+    return ReferenceEntry(points > 0, found.step, found.sigma, points, tuple(views))
 
 
 def measure_check_points(run: Run) -> tuple[CheckPointEntry, ...]:

@@ -211,14 +211,10 @@ def measure_scene(run: Run) -> SceneEntry | None:
     if adjustment is None:
         return None
     gauge, prior, terrain = adjustment.gauge, adjustment.prior, adjustment.terrain
-    datum = [
-        DatumEntry(
-            part,
-            float(gauge.motion_sigma[m]),
-            **{key: float(row[m]) for key, row in adjustment.datum.items()},
-        )
-        for m, part in enumerate(MOTIONS)
-    ]
+    datum = []
+    for m, part in enumerate(MOTIONS):
+        shares = {key: float(row[m]) for key, row in adjustment.datum.items()}
+        datum.append(DatumEntry(part, float(gauge.motion_sigma[m]), **shares))
     modes = [ModeEntry(m.sigma, m.meaning, m.motion.tolist(), mode_in_words(m)) for m in gauge.modes]
     return SceneEntry(
         shift_enu_m=gauge.shift.tolist(),
