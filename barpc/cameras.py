@@ -15,7 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from barpc.errors import ImageError, InputError, RpcError
-from barpc.pointio.ground import Correspondences, correspondence_kind, read_correspondences, read_grid
+from barpc.pointio.correspondences import (
+    Correspondences,
+    correspondence_kind,
+    read_correspondences,
+    read_grid,
+)
 from barpc.raster import driver_of, open_raster
 from barpc.remote import Place, located, place
 from barpc.rpcio import read_rpc_source

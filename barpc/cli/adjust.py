@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.cli.images import Config, corrected, expanded, read_config, with_cameras
-from barpc.cli.options import (
+from barpc.cli.flags import (
     ADJUSTMENT,
     MATCH,
     RUN,
@@ -23,6 +22,7 @@ from barpc.cli.options import (
     with_flags,
 )
 from barpc.cli.progress import executor_for, progress_told
+from barpc.cli.specs import Config, corrected, expanded, read_config, with_cameras
 from barpc.cli.terminal import echo, output_width, print_summary, say, tell_gate, wants_json
 
 if TYPE_CHECKING:

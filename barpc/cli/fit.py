@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.cli.options import flag, paper, run_options
+from barpc.cli.flags import flag, paper, run_options
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
 from barpc.options import GEOID_HELP
 

@@ -18,7 +18,7 @@ import numpy as np
 from barpc import __version__
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.heights import Heights, altitude_of, exchanged, ground_at, with_heights
-from barpc.cli.images import expanded
+from barpc.cli.specs import expanded
 from barpc.cli.terminal import echo, wants_json
 from barpc.dem import Dem
 from barpc.errors import InputError, RpcError
@@ -84,7 +84,8 @@ def info(
     if wants_json():
         echo(json.dumps(reports))
     else:
-        _print(images, reports)
+        for image, report in zip(images, reports, strict=True):
+            echo("\n".join([image, *(f"  {label:<13}{line}" for label, line in _lines(report))]))
     return 0
 
 
@@ -93,13 +94,6 @@ _METHODS = {
     "stated": "by its orbit",
     "nominal": "assumed: the rays of an image line meet in no orbit",
 }
-
-
-def _print(images: Sequence[str], reports: Sequence[Mapping[str, Any]]) -> None:
-    for image, report in zip(images, reports, strict=True):
-        echo(image)
-        for label, line in _lines(report):
-            echo(f"  {label:<13}{line}")
 
 
 def _lines(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from barpc.errors import InputError, OutputError
 from barpc.export.catalogue import CATALOGUE
 from barpc.export.neural import NEURAL, Files, image_links
-from barpc.export.scene import Scene, link, read_scene
+from barpc.export.shots import Scene, link, read_scene
 from barpc.export.stereo import STEREO
 from barpc.sidefile import plain_path
 from barpc.workspace import Workspace

@@ -21,7 +21,7 @@ from barpc.export.approx import (
     project_affine,
     project_projective,
 )
-from barpc.export.scene import Scene, Shot, link
+from barpc.export.shots import Scene, Shot, link
 from barpc.geodesy import Array, ecef_from_ground, utm, wrap_longitude
 from barpc.geojson import polygon
 from barpc.remote import is_url

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from barpc.export.neural import Files, as_json, rpc_of
-from barpc.export.scene import Scene, Shot, link, pairs_of
+from barpc.export.shots import Scene, Shot, link, pairs_of
 from barpc.rpcio import WRITABLE
 
 

@@ -15,8 +15,8 @@ from barpc.errors import OutputError
 from barpc.fit import RpcFit
 from barpc.handoff import verify
 from barpc.options import RunOptions
+from barpc.pipeline.beyond import grid_names, made_in_room
 from barpc.pipeline.executor import CachingExecutor
-from barpc.pipeline.grids import grid_names, made_in_room
 from barpc.pipeline.inputs import PRIOR
 from barpc.report import Run, Summary
 from barpc.report.page import REPORT, can_render, report_html

@@ -11,7 +11,7 @@ import numpy as np
 from barpc.cameras import open_camera
 from barpc.errors import BarpcError, InputError
 from barpc.identity import take
-from barpc.pipeline.grids import REOPENED, RESAMPLED, TILES
+from barpc.pipeline.beyond import REOPENED, RESAMPLED, TILES
 from barpc.remote import is_url
 from barpc.report import Summary
 from barpc.report.summary.views import ViewEntry

@@ -18,7 +18,7 @@ from barpc.frozen import Arrays, load_npz
 from barpc.geodesy import Array
 from barpc.pointio.colmap import MAGIC as COLMAP
 from barpc.pointio.colmap import read_colmap
-from barpc.pointio.ground import require_columns
+from barpc.pointio.correspondences import require_columns
 from barpc.pointio.hloc import MAGIC as HDF5
 from barpc.pointio.hloc import read_hloc
 from barpc.pointio.links import SIGMA, Links

@@ -11,11 +11,11 @@ from barpc.ba.evidence.scan import SURE
 from barpc.ba.judging.judge import LARGEST
 from barpc.report.records import Table, table
 from barpc.report.summary import Summary
-from barpc.report.summary.causes import RIVALS, ExplanationEntry
-from barpc.report.summary.ground import GcpEntry
+from barpc.report.summary.findings import RIVALS, ExplanationEntry
+from barpc.report.summary.known import GcpEntry
 from barpc.report.summary.pairs import PairEntry
-from barpc.report.summary.scene import AskedEntry, SceneEntry
 from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.whole import AskedEntry, SceneEntry
 from barpc.report.summary.words import known, listed, metres
 
 SHARED = 0.03  # px: what neighbours share and is less is not followed
@@ -42,7 +42,7 @@ def second_attempts(pairs: Sequence[PairEntry]) -> Table | None:
     """Return the pairs that were tried more than once; None without any."""
     again = [pair for pair in pairs if pair.beaten]
     caption = "Pairs that were tried again, and what found fewer matches than were wanted"
-    return table("again", caption, again, PairEntry, PairEntry.AGAIN, folded=True) if again else None
+    return table("again", caption, again, PairEntry, PairEntry.AGAIN).fold() if again else None
 
 
 def control_sentence(summary: Summary) -> str:
@@ -194,11 +194,9 @@ def _priors(scene: SceneEntry, summary: Summary) -> list[str]:
         return []
     words = f"Squared corrections are {scene.prior_ratio:.2g} times what the accuracies stated let expect"
     widened = [(view.prior_scale, view.name) for view in summary.views if (view.prior_scale or 1.0) > 1.005]
-    together = (
-        f" Taken as shared by all images, the accuracies stated were widened {scene.prior_shared:.1f} times."
-        if (scene.prior_shared or 1.0) > 1.005
-        else ""
-    )
+    shared = scene.prior_shared or 1.0
+    together = f" Taken as shared by all images, the accuracies stated were widened {shared:.1f} times."
+    together *= shared > 1.005
     if not widened:
         return [f"{words}: none was widened.{together}"]
     scale, worst = max(widened)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from barpc.report.reservations import GOOD_RMSE
 from barpc.report.summary import LeftOutEntry, Summary
+from barpc.report.summary.causes import CAUSES
 from barpc.report.summary.pairs import PairEntry
-from barpc.report.summary.reasons import CAUSES
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import STATUS_WORDS, listed
 
@@ -74,7 +74,8 @@ def _of_views(views: Sequence[ViewEntry]) -> list[str]:
             continue
         names, words = listed([view.name for view in alike], _NAMED), CAUSES[cause]
         start = f"{len(alike)} images are {STATUS_WORDS[status]}, {words.label}: {names}"
-        out.append(". ".join(filter(None, (start, _capital(words.remedy.format(image="IMAGE"))))) + ".")
+        remedy = words.remedy.format(image="IMAGE")
+        out.append(". ".join(filter(None, (start, remedy[:1].upper() + remedy[1:]))) + ".")
     return out
 
 
@@ -91,7 +92,3 @@ def _of_files(files: Sequence[LeftOutEntry]) -> list[str]:
             names = listed([one.path for one in alike], _NAMED)
             out.append(f"{len(alike)} files were left out, {names}: {reason}")
     return out
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

@@ -27,7 +27,7 @@ from barpc.report.charts import (
 )
 from barpc.report.digest import SHOWN, flagged
 from barpc.report.summary import Summary
-from barpc.report.summary.ground import CheckPointEntry, GcpEntry
+from barpc.report.summary.known import CheckPointEntry, GcpEntry
 from barpc.report.summary.views import CELLS, ViewEntry, cell_numbers
 from barpc.report.tables import Observations, RunFiles
 

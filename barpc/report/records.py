@@ -200,6 +200,10 @@ class Table:
         """Return the same with the indices of each row's images, for the page's script: one, or two with a hyphen."""
         return replace(self, marks=list(marks))
 
+    def fold(self) -> Table:
+        """Return the same, to be opened on demand."""
+        return replace(self, folded=True)
+
     @property
     def shown(self) -> Sequence[Sequence[Cell]]:
         """The rows on the page."""
@@ -246,19 +250,13 @@ class Column:
 
 
 def table(
-    key: str,
-    caption: str,
-    rows: Sequence[Record],
-    kind: type[Record],
-    columns: str,
-    adjusted: bool = True,
-    folded: bool = False,
+    key: str, caption: str, rows: Sequence[Record], kind: type[Record], columns: str, adjusted: bool = True
 ) -> Table:
     """Return the table of records, a row each; words of `columns`: fields (``part.field``), columns of `OWN`."""
     found = [column_of(kind, name) for name in columns.split()]  # type: ignore[arg-type]
     found = [column for column in found if adjusted or not column.adjusted]
     cells = [[cell for column in found for cell in column.cells(row)] for row in rows]
-    return Table(key, caption, [head for column in found for head in column.heads], cells, folded)
+    return Table(key, caption, [head for column in found for head in column.heads], cells)
 
 
 @cache

@@ -10,9 +10,9 @@ from barpc.ba import Adjustment
 from barpc.ba.apart import Apart
 from barpc.ba.evidence.scan import SURE
 from barpc.report.dem_lines import holds_reference
-from barpc.report.run import MANY_REJECTED, SMOOTH_LEFT, Run
-from barpc.report.summary.causes import LeftEntry, left_entries, strangeness
-from barpc.report.summary.reasons import CAUSES, Reason
+from barpc.report.outcome import MANY_REJECTED, SMOOTH_LEFT, Run
+from barpc.report.summary.causes import CAUSES, Reason
+from barpc.report.summary.findings import LeftEntry, left_entries, strangeness
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import known, listed
 from barpc.sensor.rpc import RPC

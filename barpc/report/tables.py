@@ -10,12 +10,11 @@ import csv
 import io
 import json
 import os
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -25,11 +24,12 @@ from barpc.errors import InputError
 from barpc.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.geojson import collection, feature
 from barpc.pointio.names import cell, from_cell
-from barpc.report.records import value_of
-from barpc.report.run import Run
+from barpc.report.outcome import Run
+from barpc.report.records import Number, Record, said, value_of
 from barpc.report.summary import SCHEMA, Summary, published_schema
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.words import Share, Side
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.geometry import footprint
 from barpc.sidefile import GEOJSON, SUMMARY, TABLE, Kind, parse_json, read_json, read_text
@@ -188,18 +188,16 @@ class Observations:
     used: BoolArray
 
 
-@dataclass(frozen=True)
-class Relief:
-    """A window of the ground by the cameras "delivered" or "corrected": a shaded relief, a JPEG in base64.
+class Relief(Record):
+    """A window of the ground, as one of two kinds of cameras give it."""
 
-    `size`: of the picture [px]; `share`: of the window that has heights; `nmad_m`: how far pairs disagree, by median.
-    """
+    MORE: ClassVar = Any
 
-    cameras: str
-    size: tuple[int, int]
-    share: float
-    nmad_m: float | None
-    picture: str
+    cameras: Literal["delivered", "corrected"] = said("Which cameras")
+    size: tuple[Side, Side] = said("Width and height of the picture", "px")
+    share: Share = said("Part of the window that has heights")
+    nmad_m: Number = said("How far pairs of images disagree, by median", "m")
+    picture: str = said("A shaded relief, a JPEG in base64", pattern=r"^[A-Za-z0-9+/]{4,400000}={0,2}\Z")
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,29 +282,15 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
     return RunFiles(summary, observations, points, tracks, outlines, reliefs)
 
 
-_BASE64 = re.compile(r"[A-Za-z0-9+/]{4,400000}={0,2}")
-
-
 def _reliefs(text: str) -> tuple[Relief, ...]:
-    found = tuple(
-        Relief(
-            {"delivered": "delivered", "corrected": "corrected"}[one["cameras"]],
-            (int(one["size"][0]), int(one["size"][1])),
-            float(one["share"]),
-            None if one["nmad_m"] is None else float(one["nmad_m"]),
-            _jpeg(one["picture"]),
-        )
-        for one in parse_json(text)
-    )
-    if [one.cameras for one in found] != ["delivered", "corrected"]:
+    import fastjsonschema
+
+    found = parse_json(text)
+    fastjsonschema.validate({"type": "array", "items": Relief.json_schema()}, found)
+    reliefs = tuple(map(Relief.read, found))
+    if [one.cameras for one in reliefs] != ["delivered", "corrected"]:
         raise ValueError("reliefs that are not one before and one after")
-    return found
-
-
-def _jpeg(data: str) -> str:
-    if not _BASE64.fullmatch(data):
-        raise ValueError("a picture that is none")
-    return data
+    return reliefs
 
 
 def _read(path: Path, kind: Kind, parse: Any) -> Any:

@@ -14,11 +14,11 @@ from barpc.ba.evidence.scan import SURE
 from barpc.ba.judging.snooping import ControlTest
 from barpc.geodesy import Array
 from barpc.report.dem_lines import dem_lines, dem_reasons
+from barpc.report.outcome import MANY_REJECTED, Run
 from barpc.report.records import plain
 from barpc.report.reservations import NOISE_LIMIT, anywhere, is_smooth, lost, standing_out, view_status
-from barpc.report.run import MANY_REJECTED, Run
 from barpc.report.summary import LeftOutEntry, Summary, measure
-from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_entries
+from barpc.report.summary.findings import RIVALS, explanations, held_out_place, left_entries
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import counted, listed, median, metres
 from barpc.scene import GroundPoints
@@ -187,11 +187,9 @@ def _control_reasons(run: Run) -> list[str]:
     """Name ground points that were cut, what was left out of their files, a reference of no use."""
     out = []
     if run.reference is not None and run.adjustment is not None and run.reference.control is None:
-        whys = (
-            "another place, too old, or without texture"
-            if all(view.peak < PEAK for view in run.reference.views)
-            else "the DEM under it is of another place, or it is too old or too coarse"
-        )
+        whys = "the DEM under it is of another place, or it is too old or too coarse"
+        if all(view.peak < PEAK for view in run.reference.views):
+            whys = "another place, too old, or without texture"
         out.append(f"The reference {run.reference.refusal}: {whys}. It was not used, and moved nothing.")
     out += _bends(run) + _wrong_heights(run)
     heights = None if run.adjustment is None else run.adjustment.altimetry
@@ -281,10 +279,6 @@ def _torn(tested: ControlTest) -> list[str]:
     ]
 
 
-def _are(some: Sequence[object]) -> str:
-    return "is" if len(some) == 1 else "are"
-
-
 def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     assert run.adjustment is not None
     before, after = (median([getattr(view, key) for view in views]) for key in ("rmse_before", "rmse_after"))
@@ -332,7 +326,8 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         seen = f"{np.hypot(*image):.2f} px in the images"
         if np.isfinite(ground).all():
             seen += f" and {_lengths(ground)} on the ground (east, north, up)"
-        met = f"{counted(len(run.check_points.names), 'check point')}, not used above, {_are(run.check_points.names)}"
+        num = len(run.check_points.names)
+        met = f"{counted(num, 'check point')}, not used above, {'is' if num == 1 else 'are'}"
         if np.isfinite(image).all():
             lines.append(f"{met} met to {seen} (RMS).")
         else:

@@ -12,7 +12,7 @@ from barpc.errors import InputError
 from barpc.options import RunOptions, TieOptions
 from barpc.pipeline import control
 from barpc.pipeline.control import load_gcps
-from barpc.pointio.ground import GROUND_SIGMA, IMAGE_SIGMA
+from barpc.pointio.correspondences import GROUND_SIGMA, IMAGE_SIGMA
 from barpc.scene import GroundPoints, View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.simulate import simulate_block

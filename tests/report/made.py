@@ -10,7 +10,7 @@ import numpy as np
 
 from barpc.geodesy import Array
 from barpc.report.summary import SCHEMA, Summary, TablesEntry, TracksEntry
-from barpc.report.summary.ground import GcpEntry
+from barpc.report.summary.known import GcpEntry
 from barpc.report.summary.pairs import OffsetEntry, PairEntry
 from barpc.report.summary.views import CorrectionEntry, ViewEntry
 from barpc.report.tables import Observations, RunFiles

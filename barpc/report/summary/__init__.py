@@ -1,7 +1,7 @@
 """The summary of a run: what summary.json holds. In here alone stands what a value is, its column, how it is measured.
 
 A new value is a field with what is `said` of it and a line in the function that measures its record; named among the
-columns of a table there, it stands in that, too. A module for each thing: views, pairs, scene, ground points.
+columns of a table there, it stands in that, too. A module for each thing: views, pairs, the whole, known points.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from barpc import __version__
+from barpc.report.outcome import Run
 from barpc.report.records import Number, Record, plain, said
-from barpc.report.run import Run
-from barpc.report.summary.ground import (
+from barpc.report.summary.known import (
     CheckPointEntry,
     ControlTestEntry,
     GcpEntry,
@@ -27,8 +27,8 @@ from barpc.report.summary.ground import (
     measure_reference,
 )
 from barpc.report.summary.pairs import PairEntry, measure_pairs
-from barpc.report.summary.scene import SceneEntry, measure_scene
 from barpc.report.summary.views import ViewEntry, measure_views
+from barpc.report.summary.whole import SceneEntry, measure_scene
 from barpc.report.summary.words import ABOVE, Count
 
 SCHEMA = 2  # Version of summary.json

@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from barpc.geodesy import Array
+from barpc.report.outcome import Run
 from barpc.report.records import Cell, Column, Number, Record, plain, said
-from barpc.report.run import Run
 from barpc.report.summary.words import Count
 from barpc.scene import IntArray
 from barpc.sensor import SensorModel

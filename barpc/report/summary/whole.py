@@ -12,9 +12,9 @@ from barpc.ba import Adjustment
 from barpc.ba.altimetry import AltimetryTest
 from barpc.ba.held.gauge import MOTIONS, Mode
 from barpc.geodesy import ground_from_ecef, wrap_longitude
+from barpc.report.outcome import Run
 from barpc.report.records import Column, Number, Record, said
-from barpc.report.run import Run
-from barpc.report.summary.causes import (
+from barpc.report.summary.findings import (
     ExplanationEntry,
     HeldOutEntry,
     LeftEntry,

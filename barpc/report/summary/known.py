@@ -10,8 +10,8 @@ from scipy.special import ndtr
 
 from barpc.ba import check_residuals
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.report.outcome import ControlResidual, Run
 from barpc.report.records import Column, Number, Record, said
-from barpc.report.run import ControlResidual, Run
 from barpc.report.summary.words import ABOVE, Count, Pixel, Vector
 from barpc.scene import IntArray
 

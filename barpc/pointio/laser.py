@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from barpc.errors import InputError
-from barpc.pointio.ground import cells_of, header_of, numbers_of, require_columns
+from barpc.pointio.correspondences import cells_of, header_of, numbers_of, require_columns
 from barpc.scene import Altimetry
 from barpc.sidefile import TABLE, read_text
 

@@ -270,7 +270,7 @@ def corrected(config: Config, folder: Path, views: Sequence[Any]) -> str:
     What names files relative to where it lay names them from there.
     """
     from barpc.export.neural import as_json
-    from barpc.export.scene import link
+    from barpc.export.shots import link
     from barpc.export.stereo import yaml
     from barpc.rpcio import WRITABLE
 
@@ -301,7 +301,7 @@ def _moved(value: Any, before: Path, now: Path, depth: int = 0) -> Any:
     if isinstance(value, date):
         return value.isoformat()
     if isinstance(value, str) and value.strip(".") and "\0" not in value and not Path(value).is_absolute():
-        from barpc.export.scene import link
+        from barpc.export.shots import link
 
         with suppress(OSError):
             return link(before / value, now) if os.path.lexists(before / value) else value
