@@ -10,17 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.cli.flags import (
-    ADJUSTMENT,
-    MATCH,
-    RUN,
-    TIE,
-    Grouped,
-    image_paths,
-    paper,
-    run_options,
-    with_flags,
-)
+from barpc.cli.flags import ADJUSTMENT, MATCH, RUN, TIE, Grouped, image_paths, paper, run_options, with_flags
 from barpc.cli.progress import executor_for, progress_told
 from barpc.cli.specs import Config, corrected, expanded, read_config, with_cameras
 from barpc.cli.terminal import echo, output_width, print_summary, say, tell_gate, wants_json

@@ -10,23 +10,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from functools import cache, partial
 from types import NoneType, UnionType
-from typing import (
-    Annotated,
-    Any,
-    ClassVar,
-    Literal,
-    Self,
-    Union,
-    dataclass_transform,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Any, ClassVar, Self, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+from barpc.options import schema_of
+
 Number = float | None  # A number; None (null) stands for what is not finite
-_WORDS = {str: "string", int: "integer", float: "number", bool: "boolean", NoneType: "null"}
 
 
 def said(
@@ -116,34 +106,6 @@ def _reader(kind: Any) -> Callable[[Any], Any] | None:
         return None
     item = _reader(get_args(kind)[0])
     return tuple if item is None else lambda values: tuple(map(item, values))
-
-
-def schema_of(kind: Any) -> dict[str, Any]:
-    """Return the JSON schema of a type."""
-    origin, parts = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        return {**schema_of(parts[0]), **parts[1]}
-    if origin is Literal:
-        return {"enum": list(parts)}
-    if origin is Mapping:
-        return {"type": "object", "additionalProperties": schema_of(parts[1])}
-    if origin is tuple:
-        fixed = {} if parts[-1] is Ellipsis else {"minItems": len(parts), "maxItems": len(parts)}
-        return {"type": "array", **fixed, "items": schema_of(parts[0])}
-    if origin is not None:
-        return _either(parts)
-    if isinstance(kind, type) and issubclass(kind, Record):
-        return kind.json_schema()
-    return {} if kind is Any else {"type": _WORDS[kind]}
-
-
-def _either(parts: Sequence[Any]) -> dict[str, Any]:
-    schemas = [schema_of(part) for part in parts]
-    simple: list[Any] = [schema["type"] for schema in schemas if schema.keys() == {"type"}]
-    rest = [schema for schema in schemas if schema.keys() != {"type"}]
-    if len(rest) > 1:
-        return {"anyOf": [{"type": simple}, *rest]}  # the usual first
-    return {**rest[0], "type": [rest[0]["type"], *simple]} if rest else {"type": simple}
 
 
 def plain(value: Any) -> Any:

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import pytest
 
+from barpc.options import schema_of
 from barpc.report import records
 from barpc.report.records import (
     Cell,
@@ -21,7 +22,6 @@ from barpc.report.records import (
     column_of,
     plain,
     said,
-    schema_of,
     table,
     value_of,
 )
