@@ -71,12 +71,7 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def write_bytes(path: Path | str, data: bytes, *, overwrite: bool = False) -> None:
-    """Write `data` to `path`, whole or not at all (`replacing`)."""
-    with replacing(path, overwrite=overwrite) as partial:
-        partial.write_bytes(data)
-
-
 def write_text(path: Path | str, text: str, *, overwrite: bool = False) -> None:
     """Write `text` to `path` as UTF-8 with the line ends it has, whole or not at all (`replacing`)."""
-    write_bytes(path, text.encode(), overwrite=overwrite)
+    with replacing(path, overwrite=overwrite) as partial:
+        partial.write_bytes(text.encode())

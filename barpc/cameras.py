@@ -15,7 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from barpc.errors import ImageError, InputError, RpcError
-from barpc.pointio.ground import Correspondences, correspondence_kind, read_correspondences, read_grid
+from barpc.pointio.correspondences import (
+    Correspondences,
+    correspondence_kind,
+    read_correspondences,
+    read_grid,
+)
 from barpc.raster import driver_of, open_raster
 from barpc.remote import Place, located, place
 from barpc.rpcio import read_rpc_source
@@ -317,9 +322,7 @@ def _open_physical(
 
 
 def _stated_altitudes(file: Path) -> tuple[float, float]:
-    """Return the altitudes of the RPC that was delivered with a physical model; all ground on Earth where
-    there is none.
-    """
+    """Return the altitudes of the RPC delivered with a physical model; all ground on Earth where there is none."""
     for name in (file.name, f"RPC_{file.name[4:]}"):
         try:
             return altitude_range(read_rpc_source(file.parent / name).rpc)

@@ -25,7 +25,7 @@ from barpc.errors import BarpcWarning, ImageError, InputError
 from barpc.geodesy import Array
 from barpc.geoids import geoid_file
 from barpc.raster import open_raster
-from barpc.remote import Place, Remote, place
+from barpc.remote import Place, place
 from barpc.sensor import SensorModel
 from barpc.sidefile import GRID, opened
 
@@ -33,9 +33,7 @@ HEIGHTS = {".hgt": ("SRTMHGT", "EGM96 height"), ".gtx": ("GTX", "ellipsoid")}
 """Suffix -> the driver that may open it (its first bytes say nothing), and what its heights count from."""
 _MAX_CELLS = 400_000_000
 _EXACT = 1e-4  # m: of a place on the terrain
-_A_POST = (
-    4.0  # steps: 60 m of noise a post under 27 degrees: 1.7 % of lines pass a corner, of two steps 3.2 %
-)
+_A_POST = 4.0  # steps: with 60 m of noise a post, under 27 degrees, 1.7 % of lines pass a corner, of two steps 3.2 %
 _STEPS = 64  # of a line of sight over a terrain whose posts are not known
 _AT_ONCE = 500_000  # heights
 _FAR = 1e12  # no coordinate [m or deg] comes near
@@ -119,9 +117,7 @@ class HeightGrid:
         return height.reshape(lon.shape)
 
     def extremes(self, at: Array) -> tuple[float, float]:
-        """Return the lowest and highest height [m] in the window around fractional row, col (2, N); infinite
-        where unknown.
-        """
+        """Return the ends of the heights [m] around fractional row, col (2, N); infinite where unknown."""
         at, limits = at[:, np.isfinite(at).all(axis=0)], np.array(self.shape)
         if not at.size or self.period:  # around the Earth columns have no window
             return -np.inf, np.inf
@@ -154,18 +150,14 @@ class HeightGrid:
         for i, row_weight in enumerate((r0 + 1 - row, row - r0)):
             for j, col_weight in enumerate((c0 + 1 - col, col - c0)):
                 weight = row_weight * col_weight
-                rows, cols = (
-                    (r0 + i - top).clip(max=len(cells) - 1),
-                    (c0 + j - left).clip(max=cells.shape[1] - 1),
-                )
+                rows = (r0 + i - top).clip(max=len(cells) - 1)
+                cols = (c0 + j - left).clip(max=cells.shape[1] - 1)
                 height += np.where(weight > 0, weight * cells[rows, cols], 0.0)
         return height
 
 
 def _snapped(index: Array) -> Array:
-    """Return the fractional indices, on the node where they are within a millionth of it: a void beyond has
-    no weight.
-    """
+    """Return the fractional indices, on the node within a millionth of it: a void beyond has no weight."""
     node = np.rint(index)
     return np.where(np.abs(index - node) < 1e-6, node, index)
 
@@ -205,7 +197,7 @@ class Dem:
         BarpcWarning for an unknown vertical reference, or orthometric heights that are taken as they are.
         """
         grid = HeightGrid.open(path)
-        geoid = geoid if geoid is None or isinstance(geoid, Remote) else geoid_file(geoid)
+        geoid = None if geoid is None else geoid_file(geoid)
         known = grid.reference
         if known == "ellipsoid" and geoid is not None:
             raise InputError(f"{path}: its heights are ellipsoidal already; leave out the geoid {geoid}")
@@ -213,10 +205,8 @@ class Dem:
         if geoid is not None:
             done = f"made ellipsoidal with {place(geoid).name}"
         elif known != "ellipsoid":
-            done, advice = (
-                "TAKEN AS ELLIPSOIDAL",
-                "; give a geoid grid, or expect errors up to 100 m in height",
-            )
+            done = "TAKEN AS ELLIPSOIDAL"
+            advice = "; give a geoid grid, or expect errors up to 100 m in height"
         description = f"{place(path).name}: vertical reference {known}, {done}"
         if advice or known == "unknown":
             warnings.warn(f"DEM {description}{advice}", BarpcWarning, stacklevel=2)
@@ -228,8 +218,7 @@ class Dem:
         return height if self.geoid is None else height + self.geoid.sample(lon, lat)
 
     def between(self, start: Array, end: Array) -> tuple[float, float, float]:
-        """Return, for lines from `start` to `end` (N, 3), the most posts that one passes, and the lowest and
-        highest terrain [m].
+        """Return, for lines from `start` to `end` (N, 3), the most posts that one passes, and the terrain's ends [m].
 
         Zero and infinite ends where none of them is on the DEM.
         """
@@ -297,9 +286,7 @@ def localize_on_terrain(
 
 
 def _met(sensor: SensorModel, image: Array, terrain: Callable[[Array, Array], Array], levels: Array) -> Array:
-    """Return the ground points (N, 3) between descending levels [m]; terrain at the first and the last of
-    them counts.
-    """
+    """Return the ground points (N, 3) between descending levels [m]; terrain at the first and last counts."""
 
     def above(alt: Array) -> Array:
         ground = sensor.localize(np.broadcast_to(image, (*alt.shape, 2)), alt)

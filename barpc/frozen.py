@@ -105,8 +105,7 @@ _FRAME = "frame"
 
 
 def to_arrays(value: Any) -> Arrays:
-    """Return the named arrays that hold a value: its arrays with their type and bits, and around them a text
-    (JSON).
+    """Return the named arrays that hold a value: its own, with their bits, and around them a text (JSON).
 
     A value is None, bool, int, float, str, an array, tuple, list, mapping with string keys, or a dataclass of barpc
     of such; TypeError where anything else is in it.
@@ -123,8 +122,7 @@ def to_arrays(value: Any) -> Arrays:
 
 
 def from_arrays(arrays: Mapping[str, npt.NDArray[Any]], *, sent: bool = False) -> Any:
-    """Return the value that `to_arrays` took apart; ValueError where it is damaged or no loaded dataclass of
-    barpc.
+    """Return the value that `to_arrays` took apart; ValueError where it is damaged or no dataclass of barpc.
 
     A Remote is taken of arrays that were `sent` by our own process only: those of a file may be anybody's.
     """
@@ -185,8 +183,7 @@ _HEADER = 1 << 12
 
 
 def load_npz(path: Path | str, kind: Kind = ARRAYS) -> Arrays:
-    """Return the arrays of an ``.npz`` file, unpacked of no more bytes than `kind` allows; errors are of its
-    class.
+    """Return the arrays of an ``.npz`` file, unpacked of no more bytes than `kind` allows, with its error.
 
     What the archive claims is added up before anything is unpacked: a few kilobytes can hold gigabytes of zeros.
     """
@@ -210,9 +207,7 @@ def _unpack(file: IO[bytes], path: Path | str, kind: Kind) -> Arrays:
 
 
 def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> tuple[int, int]:
-    """Return the elements and bytes of a member, as many as the archive claims; ValueError where it cannot
-    hold them.
-    """
+    """Return the elements and bytes of a member that the archive claims; ValueError where it cannot hold them."""
     packed = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: _DEFLATE}.get(member.compress_type)
     if packed is None or member.file_size > packed * member.compress_size + _HEADER:
         raise ValueError(f"{member.filename} claims more bytes than it can hold")

@@ -33,8 +33,7 @@ def pointwise(
     alt: npt.ArrayLike | None = None,
     rows: int = 0,
 ) -> list[Array]:
-    """Apply a function of a batch of points to points (..., k) and altitudes (...), broadcast, `chunk` at a
-    time.
+    """Apply a function of points (..., k) and altitudes (...), broadcast, to `chunk` of them at a time.
 
     The function takes (n, k) points, (n,) altitudes if there are any, and (rows, n) memory to overwrite if it asks for
     `rows` (fresh memory costs more than sums), and gives arrays (n, *shape); what is not finite is no news.
@@ -75,8 +74,7 @@ def ecef_from_ground(ground: npt.ArrayLike) -> Array:
 
 
 def ground_from_ecef(ecef: npt.ArrayLike) -> Array:
-    """Return the ground coordinates (..., 3), lon in -180 to 180, of ECEF points (..., 3): the inverse of
-    `ecef_from_ground`.
+    """Return the ground coordinates (..., 3) of ECEF points (..., 3), lon in -180 to 180: inverts `ecef_from_ground`.
 
     Within 5e-9 m from -10 km to 900 km of altitude, and to the rounding of the coordinates far beyond.
     """
@@ -85,8 +83,7 @@ def ground_from_ecef(ecef: npt.ArrayLike) -> Array:
 
 
 def ground_rows_from_ecef(ecef: Array) -> tuple[Array, Array]:
-    """Return the ground coordinates (3, N) of ECEF points (3, N) and their derivative (3, 3, N), one row a
-    coordinate.
+    """Return the ground coordinates (3, N) of ECEF points (3, N) and their derivative (3, 3, N), row by row.
 
     `ground_from_ecef` and `ground_from_ecef_jacobian` in one, without the trigonometry of the second; as many points
     as suit the cache. Not finite for longitude at a pole.
@@ -114,8 +111,7 @@ def ground_rows_from_ecef(ecef: Array) -> tuple[Array, Array]:
 
 
 def _geodetic(x: Array, y: Array, z: Array) -> tuple[Array, ...]:
-    """Return the ground (3, N); sin, cos of latitude, distance from the axis [m], sqrt(1 - e^2 sin^2(lat)),
-    (N,) each.
+    """Return the ground (3, N); sin, cos of latitude, distance from the axis [m], sqrt(1 - e^2 sin^2(lat)) (N,).
 
     Two steps (one leaves 1e-6 m, two 4e-9 m) of Bowring, "Transformation from spatial to geographical coordinates",
     from the start in "The accuracy of geodetic latitude and height equations", Survey Review 1976 and 1985.
@@ -145,9 +141,7 @@ def _geodetic(x: Array, y: Array, z: Array) -> tuple[Array, ...]:
 
 
 def enu_basis(ground: npt.ArrayLike) -> Array:
-    """Return the rotation (..., 3, 3) of ECEF vectors into (east, north, up) at ground points (..., 3); rows:
-    unit vectors.
-    """
+    """Return the rotation (..., 3, 3) of ECEF vectors into (east, north, up), its rows, at ground points (..., 3)."""
     ground = np.asarray(ground, dtype=np.float64)
     lon, lat = ground[..., 0] * _RAD, ground[..., 1] * _RAD
     sin_lon, cos_lon, sin_lat, cos_lat = np.sin(lon), np.cos(lon), np.sin(lat), np.cos(lat)
@@ -166,9 +160,7 @@ def up(ground: Array) -> Array:
 
 
 def metres_per_unit(ground: npt.ArrayLike) -> Array:
-    """Return the metres (..., 3) of one degree of longitude (zero at a pole), of latitude, one metre up, at
-    points (..., 3).
-    """
+    """Return the metres (..., 3) of one degree of longitude, of latitude, and one metre up, at points (..., 3)."""
     ground = np.asarray(ground, dtype=np.float64)
     lat, alt = ground[..., 1] * _RAD, ground[..., 2]
     w2 = 1.0 - WGS84_E2 * np.sin(lat) ** 2
@@ -186,25 +178,26 @@ def ecef_from_ground_jacobian(ground: npt.ArrayLike) -> Array:
 
 
 def ground_from_ecef_jacobian(ground: npt.ArrayLike) -> Array:
-    """Return d(lon, lat, alt) / d(x, y, z) (..., 3, 3) [deg/m, deg/m, m/m] at GROUND points; infinite for lon
-    at a pole.
-    """
+    """Return d(lon, lat, alt) / d(x, y, z) (..., 3, 3) [deg/m, deg/m, m/m] at GROUND points; infinite at a pole."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return enu_basis(ground) / metres_per_unit(ground)[..., None]
 
 
 def wrap_longitude(lon: npt.ArrayLike, center: npt.ArrayLike = 0.0) -> Array:
-    """Return the longitudes (...) [deg] moved by whole turns to within 180 degrees of `center`; unchanged if
-    they are there.
-    """
+    """Return the longitudes (...) [deg] by whole turns within 180 degrees of `center`; unchanged if they are there."""
     lon = np.asarray(lon, dtype=np.float64)
     turns = np.rint((lon - center) / 360.0)
     return lon - 360.0 * turns
 
 
+def utm(lon: float, lat: float) -> tuple[int, str]:
+    """Return the UTM zone of a place [deg], by its longitude alone, and the reference system of the zone."""
+    zone = int((lon + 180.0) // 6.0) % 60 + 1
+    return zone, f"EPSG:{(32600 if lat >= 0 else 32700) + zone}"
+
+
 def reach(origin: Array, direction: Array, alt: Array) -> Array:
-    """Return the ground points (N, 3) where lines from points (3, N) [m] along unit vectors (3, N) come down
-    to altitudes (N,).
+    """Return the ground (N, 3) where lines from points (3, N) [m] along unit vectors come down to altitudes (N,).
 
     NaN where they miss.
     """

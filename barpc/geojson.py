@@ -10,8 +10,7 @@ from barpc.geodesy import Array
 
 
 def polygon(ring: Array) -> dict[str, Any] | None:
-    """Return the geometry of a footprint: counter-clockwise, closed; led to the pole where it goes once
-    around one.
+    """Return the geometry of a footprint: counter-clockwise, closed; led to the pole if it goes around one.
 
     Of a ring (N, 2) as `barpc.sensor.geometry.footprint` gives it; a MultiPolygon where the antimeridian cuts it, None
     for an outline that is not finite.

@@ -79,9 +79,7 @@ def control_grid(
 def difference(
     model: SensorModel, other: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]
 ) -> float:
-    """Return the largest distance [px] between two cameras of one image over the image and its altitudes; NaN
-    if blind.
-    """
+    """Return the largest distance [px] between two cameras of an image and its altitudes; NaN if blind."""
     ground, image = control_grid(model, size, alt_range)
     return _largest(other.project, ground, image) if len(ground) else float("nan")
 
@@ -165,9 +163,8 @@ def _lost(path: Path, name: str, failure: Exception) -> Reading:
 
 def unverified(paths: Sequence[Path | str]) -> list[str]:
     """Return a sentence for each kind of these files that no installed tool but barpc reads."""
-    files = [
-        path for path in map(Path, paths) if not path.name.endswith(STATE_END)
-    ]  # whose readers are no packages
+    # the readers of a state are no packages
+    files = [path for path in map(Path, paths) if not path.name.endswith(STATE_END)]
     kinds = {path.suffix: path for path in files if not any(_readers(path).values())}
     return [
         f"{path}: only barpc itself has read it ({kind}: {' and '.join(_readers(path)) or 'no other tool'} would, and "
@@ -333,9 +330,7 @@ def _shareloc(path: Path) -> Projection:
 
 
 def _told(found: Array, lon: Array) -> Array:
-    """Return image points (N, ...) that shareloc found; OutputError where it fails beyond 180 degrees of
-    longitude alone.
-    """
+    """Return what shareloc found (N, ...); OutputError where it fails beyond 180 degrees of longitude alone."""
     lost, beyond = ~np.isfinite(found).all(axis=1), np.abs(lon) > 180.0
     if lost.any() and not (lost & ~beyond).any():
         raise OutputError(
@@ -428,10 +423,7 @@ _GRIDS: dict[str, dict[str, Consumer]] = {
         "linear": Consumer("barpc", _linear_grid, locates=True),
         "barpc": Consumer("barpc", _own_grid),
     },
-    CORRECTION: {
-        "gdal": Consumer("rasterio", _gdal_correction),
-        "barpc": Consumer("barpc", _own_grid),
-    },
+    CORRECTION: {"gdal": Consumer("rasterio", _gdal_correction), "barpc": Consumer("barpc", _own_grid)},
     STATE_END: {"barpc": Consumer("barpc", _own_grid)},
     "": {"gdal": Consumer("rasterio", _gdal_raster), "barpc": CONSUMERS["barpc"]},
 }

@@ -10,14 +10,14 @@ import math
 import os
 import re
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache
 from importlib import import_module
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from barpc.errors import InputError
 from barpc.remote import HOST
@@ -82,6 +82,9 @@ class Rule:
         return ()
 
 
+_FREE = Rule("")
+
+
 def option(default: T, help: str, **rule: Any) -> T:
     """Declare a field of an option record: its default, its meaning, and the rest of its `Rule`."""
     metadata = {"rule": Rule(" ".join(help.split()), **rule)}
@@ -117,7 +120,7 @@ def _declared(record: Any) -> Mapping[str, Declared]:
         if get_origin(kind) in (Union, UnionType):
             kind, optional = next(part for part in get_args(kind) if part is not NoneType), True
         default = one.default if one.default_factory is MISSING else one.default_factory()
-        found[one.name] = Declared(kind, optional, one.metadata.get("rule", Rule("")), default)
+        found[one.name] = Declared(kind, optional, one.metadata.get("rule", _FREE), default)
     return found
 
 
@@ -182,9 +185,7 @@ def checked(name: str, kind: Any, rule: Rule, value: Any) -> Any:
 
 
 def _plain(kind: Any, rule: Rule, value: Any) -> Any:
-    """Return a single value as its type, numpy's numbers and paths included; None where it is not one, or out
-    of range.
-    """
+    """Return a single value as its type, numpy's numbers and paths included; None if it is none, or out of range."""
     if kind is str:
         text = os.fspath(value) if isinstance(value, (str, os.PathLike)) else None
         return text if isinstance(text, str) else None
@@ -402,13 +403,7 @@ class FitOptions(Options):
     """Options of fitting an RPC to a sensor model or to points."""
 
     method: Literal[
-        "auto",
-        "ridge",
-        "gauss-newton",
-        "minimax",
-        "lcurve",
-        "lcurve-joint",
-        "vendor-denominators",
+        "auto", "ridge", "gauss-newton", "minimax", "lcurve", "lcurve-joint", "vendor-denominators"
     ] = option(
         "auto",
         """`ridge`: QR compression and a noise-scaled ridge. `lcurve-joint`: the paper's solver, one h for col and row
@@ -698,36 +693,50 @@ def schema(record: type[Options] = RunOptions) -> dict[str, Any]:
         if isinstance(one.default, Options):
             properties[name] = schema(type(one.default))
         elif not one.rule.spoken:
-            properties[name] = {**_schema(one.kind, one.rule), "description": one.rule.help}
+            properties[name] = {**schema_of(one.kind, one.rule), "description": one.rule.help}
             if one.default is not None:
                 listed = isinstance(one.default, tuple)
                 properties[name]["default"] = list(one.default) if listed else one.default
     return {"type": "object", "additionalProperties": False, "properties": properties}
 
 
-def _schema(kind: Any, rule: Rule) -> dict[str, Any]:
-    parts = get_args(kind)
-    if get_origin(kind) is Mapping:
-        return {"type": "object", "additionalProperties": _schema(parts[1], rule)}
-    if get_origin(kind) is tuple:
+_WORDS = {str: "string", int: "integer", float: "number", bool: "boolean", NoneType: "null"}
+
+
+def schema_of(kind: Any, rule: Rule = _FREE) -> dict[str, Any]:
+    """Return the JSON schema of a type, its values within the bounds of a rule."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return {**schema_of(parts[0], rule), **parts[1]}
+    if origin is Mapping:
+        return {"type": "object", "additionalProperties": schema_of(parts[1], rule)}
+    if origin is tuple:
         count = {} if parts[-1] is ... else {"minItems": len(parts), "maxItems": len(parts)}
-        return {"type": "array", "items": _schema(parts[0], rule), **count}
+        return {"type": "array", **count, "items": schema_of(parts[0], rule)}
     if choices := rule.choices(kind):
         return {"enum": list(choices)}
-    bounds = {
-        "minimum": rule.least,
-        "exclusiveMinimum": rule.above,
-        "maximum": rule.most,
-        "exclusiveMaximum": rule.below,
-    }
-    name = {bool: "boolean", int: "integer", float: "number", str: "string"}[kind]
-    return {"type": name, **{key: value for key, value in bounds.items() if value is not None}}
+    if origin is not None:
+        return _either([schema_of(part, rule) for part in parts])
+    if (of_record := getattr(kind, "json_schema", None)) is not None:
+        return dict(of_record())
+    ends = ("minimum", rule.least), ("exclusiveMinimum", rule.above)
+    ends += ("maximum", rule.most), ("exclusiveMaximum", rule.below)
+    bounds = {word: value for word, value in ends if value is not None}
+    return {} if kind is Any else {"type": _WORDS[kind], **bounds}
+
+
+def _either(schemas: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    simple: list[Any] = [schema["type"] for schema in schemas if schema.keys() == {"type"}]
+    rest = [schema for schema in schemas if schema.keys() != {"type"}]
+    if len(rest) > 1:
+        return {"anyOf": [{"type": simple}, *rest]}  # the usual first
+    return {**rest[0], "type": [rest[0]["type"], *simple]} if rest else {"type": simple}
 
 
 def _documented(record: type[Options]) -> str:
     rows = []
     for name, one in declared(record).items():
-        rows += [f"{name} : {wanted(one.kind, Rule('') if one.rule.rows else one.rule)}"]
+        rows += [f"{name} : {wanted(one.kind, _FREE if one.rule.rows else one.rule)}"]
         rows += [f"    {one.rule.help or 'See there.'} Default: {one.default!r}."]
     return "\n".join([str(record.__doc__), "", "Parameters", "----------", *rows])
 

@@ -170,9 +170,7 @@ def hashed(path: Place | str) -> Input:
 
 
 def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[Place, str]:
-    """Return the absolute path (or Remote) of a raster and the only driver that may open it, given or by its
-    first bytes.
-    """
+    """Return a raster's absolute path (or Remote) and the only driver that may open it, given or by its first bytes."""
     name = os.fspath(path)
     if not isinstance(path, Remote) and INDIRECT.match(name) and not os.path.lexists(name):
         raise ImageError(f"{name}: remote and virtual paths are not read")

@@ -239,9 +239,7 @@ def middle_altitude(views: Sequence[View]) -> float:
 
 
 def connected_labels(num: int, links: npt.ArrayLike) -> IntArray:
-    """Return the connected component (num,) of each of `num` nodes, numbered by its first node; links (M, 2)
-    join two.
-    """
+    """Return the connected component (num,) of each node, numbered by its first; links (M, 2) join two."""
     first, second = np.asarray(links, dtype=np.int64).reshape(-1, 2).T
     graph = coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(num, num))
     label: IntArray = connected_components(graph, directed=False)[1].astype(np.int64)

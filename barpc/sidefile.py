@@ -59,9 +59,7 @@ class Kind:
             )
 
     def check_numbers(self, path: Path | str, file: BinaryIO) -> None:
-        """Raise if a text holds more numbers than `most` bytes can hold: short ones take more in memory than
-        in the file.
-        """
+        """Raise if a text holds more numbers than `most` bytes can: short ones take more in memory than in the file."""
         limit = (self.most or 0) // NUMBER
         if self.between and file.seek(0, os.SEEK_END) > limit:
             file.seek(0)
@@ -151,9 +149,7 @@ def _regular(path: Path | str, kind: Kind) -> BinaryIO:
 
 
 def encoding_of(head: bytes) -> str:
-    """Return the encoding of a text by its first bytes: UTF-16 where a byte order mark or zeros between its
-    letters say so.
-    """
+    """Return the encoding of a text: UTF-16 where a byte order mark or zeros between its first letters say so."""
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
     for name, zeros, letters in (
@@ -321,8 +317,7 @@ class _Builder(ElementTree.TreeBuilder):
 def parse_xml(
     source: bytes | Path, *, name: str | None = None, max_bytes: int = MAX_XML, strip_namespaces: bool = False
 ) -> ElementTree.Element:
-    """Return the root element of an XML document: bytes, or the file that holds it; messages call it `name`,
-    or by its path.
+    """Return the root element of an XML document, of bytes or a file; messages call it `name`, or by its path.
 
     No document type: an entity cannot be declared without one, so neither "billion laughs" nor a reference to another
     file can be written. `strip_namespaces` drops the ``{namespace}`` of every tag. RpcFormatError where it cannot be

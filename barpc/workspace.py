@@ -297,8 +297,7 @@ class Workspace:
 
     @contextmanager
     def output(self, name: str) -> Iterator[Path]:
-        """Yield a temporary path for an output, relative to the folder, which takes its name when the block
-        ends well.
+        """Yield a temporary path for an output of the folder, which takes its name when the block ends well.
 
         OutputError where it would replace an input or a file that is not barpc's own, or cannot be written.
         """
@@ -344,9 +343,7 @@ class Workspace:
 
 
 def _content(path: Path) -> str | None:
-    """Return the sha256 of a regular file; None for anything else, OSError where it cannot be read. No link
-    is followed.
-    """
+    """Return the sha256 of a regular file, no link; None for anything else, OSError where it cannot be read."""
     if not stat.S_ISREG(path.lstat().st_mode):
         return None
     with open(os.open(path, os.O_RDONLY | _CAREFUL), "rb") as file:  # noqa: PTH123  (no link)
@@ -387,9 +384,7 @@ def _read_state(folder: Path) -> dict[str, Any]:
 
 
 def _read_own(folder: Path) -> dict[str, str]:
-    """Return the outputs of a folder's runs and their sha256; of two contents of one (a killed run's) that
-    which is there.
-    """
+    """Return the outputs of a folder's runs and their sha256; of two contents (a killed run's) the one there."""
     listed = _read_state(folder).get("outputs")
     known: dict[str, dict[str, None]] = {}
     pairs: list[Any] = list(listed.items()) if isinstance(listed, dict) else []

@@ -29,7 +29,7 @@ import rasterio
 from rasterio.warp import Resampling, reproject
 
 from barpc.dsm import NoSurfaceError, make_dsm
-from barpc.export.scene import read_scene
+from barpc.export.shots import read_scene
 from barpc.options import DsmOptions
 
 

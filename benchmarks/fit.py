@@ -189,7 +189,7 @@ def radar(data: Path, peer: Peer) -> None:
 
 
 def physical(data: Path) -> None:
-    from barpc.pointio.ground import read_correspondences
+    from barpc.pointio.correspondences import read_correspondences
 
     points = read_correspondences(data / "physical" / "GRID_P1BP--2017092838284574CP.tif")
     vendors = read_rpc(data / "physical" / "RPC_P1BP--2017092838284574CP.XML")

@@ -29,7 +29,7 @@ from rasterio.windows import from_bounds
 
 from barpc import read_rpc
 from barpc.export import export_run
-from barpc.export.scene import Scene, Shot, pairs_of, read_scene
+from barpc.export.shots import Scene, Shot, pairs_of, read_scene
 from barpc.rpcio import WRITABLE
 
 Figures = dict[str, list[str]]

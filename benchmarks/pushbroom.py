@@ -80,7 +80,7 @@ def main() -> None:
     warnings.simplefilter("ignore")
 
     from barpc.fit import fit_rpc
-    from barpc.pointio.ground import read_grid
+    from barpc.pointio.correspondences import read_grid
     from barpc.sensor.direct_grid import DirectGrid
     from barpc.simulate.orbit import Look, fly
 

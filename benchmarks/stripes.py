@@ -34,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # tests, where bar
 from barpc.cameras import open_camera
 from barpc.fit import fit_rpc
 from barpc.options import RunOptions
-from barpc.pipeline.grids import tile_boxes, write_grids
+from barpc.pipeline.beyond import tile_boxes, write_grids
 from barpc.rpcio import WRITABLE, read_rpc
 from barpc.scene import View
 from barpc.simulate.orbit import Look, fly

@@ -31,7 +31,7 @@ import rasterio  # noqa: E402
 from rasterio.windows import Window  # noqa: E402
 
 from barpc.pipeline.executor import CachingExecutor  # noqa: E402
-from barpc.pipeline.views import load_views  # noqa: E402
+from barpc.pipeline.loading import load_views  # noqa: E402
 from barpc.scene import View  # noqa: E402
 from barpc.sensor.rpc import RPC  # noqa: E402
 from barpc.tie import (  # noqa: E402

@@ -13,7 +13,7 @@ from pathlib import Path
 from barpc import dem, frozen, options, raster, scene, sidefile, vrt, workspace
 from barpc.ba.held import incremental
 from barpc.fit import points
-from barpc.pointio import colmap, ground, hloc, names
+from barpc.pointio import colmap, correspondences, hloc, names
 from barpc.remote import _KEPT as HELD
 from barpc.remote import _LONGEST as REQUEST
 from barpc.remote import BLOCK, web
@@ -117,7 +117,7 @@ def rows() -> list[tuple[str, str]]:
         ("numbers of metadata of a camera", many(metadata.LARGEST)),
         (
             "points of a fit, of a table, of a grid",
-            " and ".join(sorted({f"{many(far)} px" for far in (points._FARTHEST, ground._FAR, grids._FAR)})),
+            " and ".join(sorted({f"{many(far)} px" for far in (points._FARTHEST, correspondences._FAR, grids._FAR)})),
         ),
         ("numbers of a run's tables", many(tables._FAR)),
         ("coordinates of a DEM", many(dem._FAR)),

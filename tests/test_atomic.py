@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from barpc.atomic import replacing, write_bytes, write_text
+from barpc.atomic import replacing, write_text
 from barpc.errors import OutputError
 
 
@@ -43,7 +43,7 @@ def test_folders_are_made_and_line_ends_stay(tmp_path):
 def test_a_folder_that_cannot_be_written_is_an_error_in_one_line(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written"):
-        write_bytes(tmp_path / "file" / "a", b"")
+        write_text(tmp_path / "file" / "a", "")
 
 
 def test_the_temporary_name_keeps_the_suffix(tmp_path):
@@ -54,10 +54,10 @@ def test_the_temporary_name_keeps_the_suffix(tmp_path):
 
 _WRITER = """
 import sys
-from barpc.atomic import write_bytes
+from barpc.atomic import write_text
 while True:
-    for fill in (b"a", b"b"):
-        write_bytes(sys.argv[1], fill * 3_000_000, overwrite=True)
+    for fill in ("a", "b"):
+        write_text(sys.argv[1], fill * 3_000_000, overwrite=True)
 """
 
 

@@ -152,7 +152,7 @@ def test_a_localisation_grid_is_a_camera(tmp_path, monkeypatch):
 
 
 def _nodes(grid):
-    from barpc.pointio.ground import Correspondences
+    from barpc.pointio.correspondences import Correspondences
 
     alt, row, col = np.meshgrid(grid.alts, grid.rows, grid.cols, indexing="ij")
     ground = np.concatenate([grid.lonlat, alt[..., None]], axis=-1)

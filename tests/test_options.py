@@ -17,8 +17,8 @@ import pytest
 from click.testing import CliRunner
 
 import barpc
+from barpc.cli.flags import ADJUSTMENT, RUN, TIE, flag, flag_name, run_options
 from barpc.cli.main import cli
-from barpc.cli.options import ADJUSTMENT, RUN, TIE, flag, flag_name, run_options
 from barpc.errors import InputError
 from barpc.options import (
     AdjustOptions,

@@ -10,19 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.cli.images import Config, corrected, expanded, read_config, with_cameras
-from barpc.cli.options import (
-    ADJUSTMENT,
-    MATCH,
-    RUN,
-    TIE,
-    Grouped,
-    image_paths,
-    paper,
-    run_options,
-    with_flags,
-)
+from barpc.cli.flags import ADJUSTMENT, MATCH, RUN, TIE, Grouped, image_paths, paper, run_options, with_flags
 from barpc.cli.progress import executor_for, progress_told
+from barpc.cli.specs import Config, corrected, expanded, read_config, with_cameras
 from barpc.cli.terminal import echo, output_width, print_summary, say, tell_gate, wants_json
 
 if TYPE_CHECKING:
@@ -184,12 +174,11 @@ def _tell(obj: Mapping[str, Any], result: AdjustResult) -> int:
         echo(json.dumps(result.summary, indent=1))
     elif not obj["quiet"]:
         print_summary(result.record)
-    said = output_width() is not None and not (
-        wants_json() or obj["quiet"]
-    )  # on the screen: every reason once
-    return (
-        0 if result.passed else tell_gate(result.record.headline, [] if said else list(result.record.reasons))
-    )
+    if result.passed:
+        return 0
+    # on the screen: every reason once
+    said = output_width() is not None and not (wants_json() or obj["quiet"])
+    return tell_gate(result.record.headline, [] if said else list(result.record.reasons))
 
 
 def _compare(images: list[str], against: Path) -> int:

@@ -112,9 +112,6 @@ def _tell(matrix: Array, middle: Array) -> None:
     east, north, up = enu_basis(at) @ (matrix @ np.append(middle, 1.0) - middle)
     scale = float(stretch.mean())
     turn = float(np.arccos(np.clip((np.trace(matrix[:, :3]) / scale - 1.0) / 2.0, -1.0, 1.0)))
-    more = (
-        f", turned by {1e6 * turn:.3g} urad, scaled by {scale:.9g}"
-        if (matrix[:, :3] != np.eye(3)).any()
-        else ""
-    )
+    more = f", turned by {1e6 * turn:.3g} urad, scaled by {scale:.9g}"
+    more *= bool((matrix[:, :3] != np.eye(3)).any())
     say(f"the ground moves by {east:+.3f} m east, {north:+.3f} m north, {up:+.3f} m up at its middle{more}")

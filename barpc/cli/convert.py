@@ -11,13 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
+import shapely
 
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.alignment import moved, read_move
-from barpc.cli.crops import Window, box_of, crop_all, window_of
-from barpc.cli.heights import Heights, with_heights
-from barpc.cli.images import expanded
+from barpc.cli.heights import Heights, altitude_of, exchanged, with_heights
+from barpc.cli.specs import expanded
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
+from barpc.dem import Dem
 from barpc.errors import FitError, InputError, OutputError
 from barpc.fit import FitOptions, fit_rpc
 from barpc.fit.certificate import Sample
@@ -39,9 +41,14 @@ from barpc.rpcio import (
 )
 from barpc.rpcio.grids import GRID, write_grid
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
+from barpc.sensor.geometry import image_border
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import plain_path
+from barpc.tie.pairs import read_area
 from barpc.workspace import Workspace
+
+Window = tuple[int, int, int, int]
+Box = tuple[float, float, float, float]
 
 
 @click.command("convert")
@@ -118,14 +125,16 @@ def _to_folder(files: tuple[str, ...], folder: Path, flags: Mapping[str, Any]) -
     carrier: str = flags["carrier"] or "vrt"
     names = [name.strip() for name in (flags["formats"] or ("" if cut else "txt")).split(",") if name.strip()]
     images = tuple(expanded(files))
-    _check([Path(split_spec(image)[0]) for image in images], folder, names)
+    files_of = [Path(split_spec(image)[0]) for image in images]
+    _check(files_of, folder, names)
     cameras = _cameras(images, flags["rpcs"])
     if flags["move"] is not None or flags["transform"] is not None:
         cameras = moved(cameras, flags["move"], flags["transform"], carrier)
-    if cut:
-        shown = [(Path(split_spec(image)[0]), camera) for image, camera in zip(images, cameras, strict=True)]
-        return _told(crop_all(shown, folder, _window(flags), names, flags["overwrite"]))
-    return _hand_off(images, cameras, folder, carrier, names, flags["overwrite"])
+    ends = [".tif" if cut else CARRIERS[carrier].suffixes[0], *(WRITABLE[name].beside for name in names)]
+    shown = list(zip(files_of, cameras, strict=True))
+    keep = [*files_of, *(Path(camera.path) for camera in cameras)]
+    parts = windows_of(shown, _window(flags)) if cut else [(file, camera, None) for file, camera in shown]
+    return _hand_off(parts, folder, ends, keep, flags["overwrite"])
 
 
 # --- one file ---------------------------------------------------------------------------------------------
@@ -221,6 +230,9 @@ def check_target(
         say(f"{target} is read in place of the RPC that {image} had")
 
 
+# --- windows -----------------------------------------------------------------------------------------------
+
+
 def _window(flags: Mapping[str, Any]) -> Callable[[Camera, Path], Window]:
     """Return what tells the window of an image that is asked for, or the pixels of a box or area on the ground."""
     if sum(flags[name] is not None for name in ("window", "bbox", "aoi")) != 1:
@@ -233,6 +245,50 @@ def _window(flags: Mapping[str, Any]) -> Callable[[Camera, Path], Window]:
     return lambda camera, path: window_of(camera, path, bbox, heights.alt, dem)
 
 
+def box_of(path: str) -> Box:
+    """Return west, south, east, north [deg] of an area of interest; east is less than west across the antimeridian."""
+    outline = read_area(path).outline  # three times, a whole turn apart
+    found = [shapely.clip_by_rect(outline, west, -90.0, west + 360.0, 90.0).bounds for west in (-180.0, 0.0)]
+    west, south, east, north = min(found, key=lambda bounds: bounds[2] - bounds[0])
+    return west, south, east - 360.0 * (east > 180.0), north
+
+
+def window_of(camera: Camera, path: Path, bbox: Box, alt: float | None, dem: Dem | None) -> Window:
+    """Return the pixels that a box on the ground covers, cut to the image; a usage error where it does not meet it."""
+    west, south, east, north = bbox
+    east += 360.0 * (east < west)  # a box across the antimeridian
+    t = (image_border((1, 1), 16) + 0.5) * [east - west, north - south] + [west, south]
+    level = np.full(len(t), altitude_of(camera, path, alt)) if dem is None else dem(t[:, 0], t[:, 1])
+    ground = np.column_stack([t, level])
+    image = camera.model.project(ground)
+    whole = np.array([np.floor(image.min(axis=0) + 0.5), np.ceil(image.max(axis=0) + 0.5)])
+    low, high = np.maximum(whole[0], 0), np.minimum(whole[1], camera.extent)
+    if not (np.isfinite(image).all() and (high > low).all()):
+        missed = exchanged(camera, np.nan_to_num(ground)) or f"does not meet {camera.path}"
+        raise click.UsageError(f"--bbox {bbox}: {missed} (ground at {np.median(level):g} m)")
+    if (kept := float(np.prod((high - low) / (whole[1] - whole[0])))) < 1.0:
+        say(f"{path}: --bbox reaches beyond the image; {100 * (1 - kept):.2g} % of it is cut off")
+    (col, row), (width, height) = low.astype(int).tolist(), (high - low).astype(int).tolist()
+    return col, row, width, height
+
+
+def windows_of(
+    images: Sequence[tuple[Path, Camera]], window: Callable[[Camera, Path], Window]
+) -> list[tuple[Path, Camera, Window]]:
+    """Return the images that show what is asked for, and where; a usage error where none does, else it is said."""
+    found = []
+    for path, camera in images:
+        try:
+            found.append((path, camera, window(camera, path)))
+        except click.UsageError as error:
+            if len(images) == 1:
+                raise
+            say(f"{path} is left out: {error.message}")
+    if not found:
+        raise click.UsageError("no image shows what is to be cut out")
+    return found
+
+
 # --- a folder ---------------------------------------------------------------------------------------------
 
 
@@ -243,38 +299,40 @@ def _cameras(images: Sequence[str], rpcs: str | None) -> list[Camera]:
     cameras = []
     for file in (Path(split_spec(image)[0]) for image in images):
         camera = open_camera(str(find_rpc(Path(rpcs), file)) if Path(rpcs).is_dir() else rpcs)
-        with open_raster(file) as dataset:
-            cameras.append(replace(camera, size=(dataset.width, dataset.height)))
+        cameras.append(replace(camera, size=_size(file)))
     return cameras
 
 
 def _hand_off(
-    images: tuple[str, ...],
-    cameras: Sequence[Camera],
+    images: Sequence[tuple[Path, Camera, Window | None]],
     folder: Path,
-    carrier: str,
-    formats: list[str],
+    ends: Sequence[str],
+    keep: Sequence[Path],
     overwrite: bool,
 ) -> int:
-    """Write images with their RPCs, open every file as its readers do, and say what they see."""
-    files = [Path(split_spec(image)[0]) for image in images]
-    ends = [CARRIERS[carrier].suffixes[0], *(WRITABLE[name].beside for name in formats)]
-    names = [[file.stem + end for end in ends] for file in files]
+    """Write images, or windows of them, with their RPCs, open every file as its readers do, and say what they see."""
+    names = [[path.stem + end for end in ends] for path, *_ in images]
     together = [name for row in names for name in row]
-    inputs = [*files, *(Path(camera.path) for camera in cameras)]
     readings: list[Reading] = []
     reasons: list[str] = []
-    with Workspace(folder, overwrite=overwrite, keep=inputs, names=together, adds=True) as workspace:
-        for file, camera, row in zip(files, cameras, names, strict=True):
+    with Workspace(folder, overwrite=overwrite, keep=keep, names=together, adds=True) as workspace:
+        for (path, camera, window), row in zip(images, names, strict=True):
+            rpc, written = camera.rpc, [folder / name for name in row]
             for name in row:
                 with workspace.output(name) as partial:
-                    write_camera(camera.rpc, partial, file, place=folder / name, overwrite=True)
-            written = [folder / name for name in row]
-            with open_raster(file) as dataset:
-                size = dataset.width, dataset.height
-            readings += verify(written, camera.rpc, size, camera.alt_range)
-            reasons += _shadow_reasons(file, written)
-    return _told(readings, reasons, unverified([folder / name for name in names[0]]))
+                    if window is not None and name == row[0]:
+                        rpc = write_crop(rpc, path, partial, window, overwrite=True)
+                    else:
+                        write_camera(rpc, partial, path, place=folder / name, overwrite=True)
+            readings += verify(written, rpc, _size(path) if window is None else window[2:], camera.alt_range)
+            reasons += _shadow_reasons(path, written) if window is None else []
+    whole = images[0][2] is None
+    return _told(readings, reasons, unverified([folder / name for name in names[0]]) if whole else ())
+
+
+def _size(image: Path) -> tuple[int, int]:
+    with open_raster(image) as dataset:
+        return dataset.width, dataset.height
 
 
 def _told(readings: list[Reading], reasons: Sequence[str] = (), notes: Sequence[str] = ()) -> int:

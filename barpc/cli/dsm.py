@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.cli.images import expanded
-from barpc.cli.options import Function, jobs_option
+from barpc.cli.flags import Function, jobs_option
 from barpc.cli.progress import executor_for, progress_told
+from barpc.cli.specs import expanded
 from barpc.cli.terminal import echo, tell_gate, wants_json
 from barpc.options import DsmOptions, declared
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.cli.options import flag, paper, run_options
+from barpc.cli.flags import flag, paper, run_options
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
 from barpc.options import GEOID_HELP
 
@@ -48,13 +48,7 @@ _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third 
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 @click.pass_obj
 def fit(
-    obj: dict[str, Any],
-    /,
-    source: str,
-    output: str | None,
-    keep_going: bool,
-    overwrite: bool,
-    **flags: Any,
+    obj: dict[str, Any], /, source: str, output: str | None, keep_going: bool, overwrite: bool, **flags: Any
 ) -> int:
     r"""Fit an RPC to a camera or to points, and certify it on points that the fit has not seen.
 

@@ -62,15 +62,14 @@ def opened_dem(dem: str | None, geoid: str | None, alt: float | None = None) -> 
 
 
 def altitude_of(camera: Camera, image: Place, given: float | None = None) -> float:
-    """Return the altitude of an image's ground [m]: as given, of the tie points of the run that it lies in, else the
-    middle.
+    """Return the altitude of an image's ground [m]: as given, of the tie points of its run, else the camera's middle.
 
     Where nothing is known of the ground a line says so, and what that may be worth.
     """
     if given is not None:
         return given
     for path in (camera.path, image):
-        known = _of_run(path) if isinstance(path, Path) else None
+        known = _written_in(path.absolute().parent).get(path.name) if isinstance(path, Path) else None
         if known is not None:
             return known
     say(f"{image}: {_unknown(camera)}; give --alt or --dem")
@@ -85,11 +84,6 @@ def _unknown(camera: Camera) -> str:
     at = camera.model.localize((np.array(camera.size) - 1) / 2, np.array(camera.altitude))
     _, jacobian = camera.model.project_jacobian(at)
     return f"{text}: 100 m more or less are {100 * float(np.linalg.norm(jacobian[:, 2])):.3g} px"
-
-
-def _of_run(file: Path) -> float | None:
-    """Return the altitude of the tie points of the run that wrote a file."""
-    return _written_in(file.absolute().parent).get(file.name)
 
 
 @cache

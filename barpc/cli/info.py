@@ -18,7 +18,7 @@ import numpy as np
 from barpc import __version__
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.heights import Heights, altitude_of, exchanged, ground_at, with_heights
-from barpc.cli.images import expanded
+from barpc.cli.specs import expanded
 from barpc.cli.terminal import echo, wants_json
 from barpc.dem import Dem
 from barpc.errors import InputError, RpcError
@@ -84,7 +84,8 @@ def info(
     if wants_json():
         echo(json.dumps(reports))
     else:
-        _print(images, reports)
+        for image, report in zip(images, reports, strict=True):
+            echo("\n".join([image, *(f"  {label:<13}{line}" for label, line in _lines(report))]))
     return 0
 
 
@@ -93,13 +94,6 @@ _METHODS = {
     "stated": "by its orbit",
     "nominal": "assumed: the rays of an image line meet in no orbit",
 }
-
-
-def _print(images: Sequence[str], reports: Sequence[Mapping[str, Any]]) -> None:
-    for image, report in zip(images, reports, strict=True):
-        echo(image)
-        for label, line in _lines(report):
-            echo(f"  {label:<13}{line}")
 
 
 def _lines(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -151,9 +145,7 @@ def _lines_of_geometry(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _altitude(image: str, camera: Camera, alt: float | None, terrain: Dem | None) -> float:
-    """Return altitude of the ground in the middle of an image [m]; that of the camera where no size tells the
-    middle.
-    """
+    """Return the altitude of the ground in the middle of an image [m]; the camera's where no size tells the middle."""
     if camera.size is None:
         return camera.altitude if alt is None else alt
     if terrain is None:
@@ -246,16 +238,7 @@ def _geometry(
 
 # --- the installation -------------------------------------------------------------------------------------
 
-_REQUIRED = [
-    "numpy",
-    "scipy",
-    "opencv-python-headless",
-    "rasterio",
-    "shapely",
-    "click",
-    "filelock",
-    "fastjsonschema",
-]
+_REQUIRED = "numpy scipy opencv-python-headless rasterio shapely click filelock fastjsonschema"
 _OPTIONAL = {"jinja2": "report", "distributed": "cluster"}
 
 
@@ -304,7 +287,7 @@ def _examine() -> int:
     """Print the versions of what barpc stands on, try each part once, and give the exit code."""
     versions = {"barpc": __version__, "python": platform.python_version()}
     missing = {name: f"not installed (pip install 'barpc[{extra}]')" for name, extra in _OPTIONAL.items()}
-    for name in (*_REQUIRED, *_OPTIONAL):
+    for name in (*_REQUIRED.split(), *_OPTIONAL):
         try:
             versions[name] = version(name)
         except PackageNotFoundError:

@@ -50,7 +50,7 @@ COMMANDS = {
 _MODULES = {
     **dict.fromkeys(("match", "check"), "adjust"),
     **dict.fromkeys(("report", "export", "verify"), "finished"),
-    **dict.fromkeys(("project", "localize", "triangulate"), "points"),
+    **dict.fromkeys(("localize", "triangulate"), "project"),
 }
 
 MOVED = {

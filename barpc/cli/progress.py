@@ -11,7 +11,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import click
@@ -125,13 +125,10 @@ def _bars() -> Iterator[Progress]:
 @contextmanager
 def executor_for(jobs: int | str) -> Iterator[Executor | None]:
     """Yield the executor of a run: None works in this process."""
-    with (
-        nullcontext()
-        if jobs == 1
-        else _cluster(jobs)
-        if isinstance(jobs, str)
-        else _processes(jobs) as executor
-    ):
+    if jobs == 1:
+        yield None
+        return
+    with _cluster(jobs) if isinstance(jobs, str) else _processes(jobs) as executor:
         yield executor
 
 

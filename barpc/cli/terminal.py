@@ -95,12 +95,13 @@ def print_summary(summary: Summary) -> None:
 
 
 def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str]]:
-    """Return titles, cells and what is said of the rest: of more rows than these the worst of those that pass a
-    limit.
-    """
+    """Return titles, cells and what is said of the rest: of more rows the worst of those that pass a limit."""
     from barpc.report import digest
     from barpc.report.records import table
-    from barpc.report.summary import DATUM, GCPS, DatumEntry, GcpEntry, PairEntry, ViewEntry
+    from barpc.report.summary.known import GCPS, GcpEntry
+    from barpc.report.summary.pairs import PairEntry
+    from barpc.report.summary.views import ViewEntry
+    from barpc.report.summary.whole import DATUM, DatumEntry
 
     views, pairs, adjusted = summary.views, summary.pairs, summary.adjusted
     some_views = views if len(views) <= rows else digest.flagged(views)[:rows]

@@ -12,7 +12,7 @@ from barpc.ba import BlockPrior
 from barpc.cameras import open_camera
 from barpc.dsm.sigma import CameraErrors
 from barpc.errors import BarpcError, InputError
-from barpc.export.scene import Shot, read_scene
+from barpc.export.shots import Shot, read_scene
 from barpc.options import TieOptions
 from barpc.pipeline import load_views
 from barpc.pipeline.inputs import PRIOR

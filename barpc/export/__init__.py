@@ -12,8 +12,7 @@ from pathlib import Path
 from barpc.errors import InputError, OutputError
 from barpc.export.catalogue import CATALOGUE
 from barpc.export.neural import NEURAL, Files, image_links
-from barpc.export.ortho import ORTHO
-from barpc.export.scene import Scene, link, read_scene
+from barpc.export.shots import Scene, link, read_scene
 from barpc.export.stereo import STEREO
 from barpc.sidefile import plain_path
 from barpc.workspace import Workspace
@@ -22,7 +21,7 @@ __all__ = ["TARGETS", "export_run"]
 
 _LOG = logging.getLogger(__name__)
 
-TARGETS: dict[str, Callable[[Scene, Path], Files]] = {**NEURAL, **STEREO, **ORTHO, **CATALOGUE}
+TARGETS: dict[str, Callable[[Scene, Path], Files]] = {**NEURAL, **STEREO, **CATALOGUE}
 """Tool -> the files made for it, by name, of a scene and the folder where they will lie."""
 
 

@@ -14,11 +14,7 @@ from barpc.geodesy import Array
 
 _STEPS = 40  # of Levenberg's method
 _REWEIGHTED = 8
-_TIMES = (
-    1.0,
-    2.0,
-    3.0,
-)  # an image that is affine along its flight is best seen from farther away than it was
+_TIMES = 1.0, 2.0, 3.0  # an image that is affine along its flight is best seen from farther away than it was
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +58,7 @@ def project_affine(matrix: Array, world: Array) -> Array:
 
 
 def fit_projective(samples: Sampled) -> Array:
-    """Return the matrix (3, 4) of a pinhole with skew, 1 in its last place, by least squares weighted anew
-    with its depths.
-    """
+    """Return the matrix (3, 4) of a pinhole with skew, 1 in its last place: least squares, weighted with its depths."""
     scale, middle = np.abs(samples.world).max(), samples.image.mean(axis=0)
     reach = np.abs(samples.image - middle).max()
     world, image = samples.world / scale, (samples.image - middle) / reach
@@ -114,9 +108,7 @@ def fit_pinhole(samples: Sampled, at: Array, pixel: Array, rows: Array, sight: A
 
 
 def _start(sign: float, at: Array, pixel: Array, rows: Array, sight: Array, far: float) -> Pinhole:
-    """Return the pinhole with a derivative as given: axes that are not perpendicular are seen far from the
-    principal point.
-    """
+    """Return the pinhole of a derivative: axes that are not perpendicular are seen far from the principal point."""
     length = np.linalg.norm(rows, axis=1)
     axes = rows / length[:, None]
     mirrored = 1.0 if np.cross(axes[0], axes[1]) @ sight < 0 else -1.0

@@ -1,7 +1,9 @@
-"""For catalogues and GIS: a STAC item an image, tie points with their covariance."""
+"""For catalogues and maps: a STAC item an image, tie points with their covariance, GDAL's commands for orthoimages."""
 
 from __future__ import annotations
 
+import os
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,9 +13,10 @@ import numpy as np
 
 from barpc.errors import InputError
 from barpc.export.neural import Files, as_json, rpc_of
-from barpc.export.scene import Scene, Shot, link
-from barpc.geodesy import Array, enu_basis, metres_per_unit, wrap_longitude
+from barpc.export.shots import Scene, Shot, link
+from barpc.geodesy import Array, enu_basis, metres_per_unit, utm, wrap_longitude
 from barpc.geojson import polygon
+from barpc.report.tables import ply
 from barpc.sensor.geometry import footprint
 
 _COLLECTION = "collection.json"
@@ -46,12 +49,8 @@ def _collection(scene: Scene, items: Mapping[str, Any]) -> dict[str, Any]:
     boxes = np.array([item["bbox"] for item in items.values()])
     west = wrap_longitude(boxes[:, 0], boxes[0, 0])
     east = west + np.mod(boxes[:, 2] - boxes[:, 0], 360.0)
-    ends = [
-        float(wrap_longitude(west.min())),
-        boxes[:, 1].min(),
-        float(wrap_longitude(east.max())),
-        boxes[:, 3].max(),
-    ]
+    first, last = (float(wrap_longitude(lon)) for lon in (west.min(), east.max()))
+    ends = [first, boxes[:, 1].min(), last, boxes[:, 3].max()]
     times = sorted(time for item in items.values() if (time := item["properties"]["datetime"]) is not None)
     return {
         "type": "Collection",
@@ -117,8 +116,7 @@ def _asset(path: Path, out: Path) -> dict[str, Any]:
 
 
 def points(scene: Scene, _out: Path) -> Files:
-    """Write ``points.csv`` and ``points.ply``: every tie point with the covariance of its intersection, east,
-    north, up [m2].
+    """Write ``points.csv`` and ``points.ply``: every tie point with the covariance of its place, east, north, up [m2].
 
     It is what the noise of the observations leaves with cameras as they are; what is common to all points, the place of
     the scene, is stated in the head of both.
@@ -134,32 +132,16 @@ def points(scene: Scene, _out: Path) -> Files:
         lon, lat, alt = place_of
         cells = (f"{value:.6g}" if np.isfinite(value) else "" for value in row)
         lines.append(f"{track},{lon:.9f},{lat:.9f},{alt:.4f},{','.join(cells)}")
-    return {"points.csv": ("\n".join(lines) + "\n").encode(), "points.ply": _ply(scene, sums, said)}
-
-
-def _ply(scene: Scene, sums: Array, said: str) -> bytes:
-    kind = np.dtype(
-        [*((axis, "<f8") for axis in "xyz"), ("track", "<i4"), *((name, "<f4") for name in _VARIANCES)]
-    )
-    rows = np.empty(len(sums), dtype=kind)
-    columns = [*scene.world(scene.points).T, scene.tracks, *sums.T]
-    for name, values in zip(kind.names or (), columns, strict=True):
-        rows[name] = values
+    east, north, up = scene.world(scene.points).T
+    columns = {"x": east, "y": north, "z": up, "track": scene.tracks.astype(np.int32)}
+    columns |= dict(zip(_VARIANCES, sums.T.astype(np.float32), strict=True))
     lon, lat, alt = scene.origin
-    head = ["ply", "format binary_little_endian 1.0", f"comment {said}"]
-    head.append(
-        f"comment x east, y north, z up [m] of lon {lon:.9f} lat {lat:.9f} alt {alt:.4f} (WGS84, ellipsoid)"
-    )
-    head.append(f"element vertex {len(rows)}")
-    head += [*(f"property double {axis}" for axis in "xyz"), "property int track"]
-    head += [*(f"property float {name}" for name in _VARIANCES), "end_header"]
-    return ("\n".join(head) + "\n").encode() + rows.tobytes()
+    frame = f"x east, y north, z up [m] of lon {lon:.9f} lat {lat:.9f} alt {alt:.4f} (WGS84, ellipsoid)"
+    return {"points.csv": ("\n".join(lines) + "\n").encode(), "points.ply": ply(columns, said, frame)}
 
 
 def _covariances(scene: Scene) -> Array:
-    """Return the covariance (P, 3, 3) of the points, east, north, up [m2]: the inverse of what their
-    observations tell.
-    """
+    """Return the covariance (P, 3, 3) of the points, east, north, up [m2]: the inverse of what observations tell."""
     normal = np.zeros((len(scene.points), 3, 3))
     for shot in scene.shots:
         ground = scene.points[shot.index]
@@ -174,4 +156,50 @@ def _covariances(scene: Scene) -> Array:
     return out
 
 
-CATALOGUE: Mapping[str, Any] = {"stac": stac, "points": points}
+# --- orthoimages ------------------------------------------------------------------------------------------
+
+
+_HEAD = """#!/bin/sh
+# Orthoimages of the corrected cameras: gdalwarp is of GDAL ({about}).
+set -e
+cd "$(dirname "$0")"
+"""
+
+
+def ortho(scene: Scene, out: Path) -> Files:
+    """``ortho.sh``: a line of gdalwarp an image, in the scene's UTM zone, at the image's own resolution.
+
+    On the run's DEM, made ellipsoidal where it had a geoid; without one at the altitude of the tie points.
+    """
+    dem, geoid = (_option(scene, name) for name in ("dem", "geoid"))
+    lines, heights = [], f"RPC_HEIGHT={scene.origin[2]:.0f}"
+    about = "all ground at one altitude; give a DEM to adjust"
+    if dem:
+        heights, about = f"RPC_DEM={link(dem, out)}", f"heights of {Path(dem).name}"
+    if dem and geoid:
+        heights = "RPC_DEM=dem_ellipsoidal.tif"
+        above = f"+proj=longlat +datum=WGS84 +geoidgrids={os.path.abspath(geoid)} +vto_meter=1"  # noqa: PTH100
+        lines.append(_gdalwarp("-s_srs", above, "-t_srs", "EPSG:4979", link(dem, out), "dem_ellipsoidal.tif"))
+    crs = utm(*scene.origin[:2])[1]
+    lines += [_warp(shot, heights, crs, out) for shot in scene.shots]
+    return {"ortho.sh": (_HEAD.format(about=about) + "\n".join(lines) + "\n").encode()}
+
+
+def _warp(shot: Shot, heights: str, crs: str, out: Path) -> str:
+    side = f"{shot.entry.gsd_m:.2g}" if shot.entry.gsd_m else None
+    pixel = ("-tr", side, side) if side else ()
+    image = link(shot.carrier or shot.file, out)
+    return _gdalwarp("-rpc", "-to", heights, "-t_srs", crs, *pixel, image, f"{shot.name}.tif")
+
+
+def _gdalwarp(*words: str) -> str:
+    return shlex.join(("gdalwarp", *words))
+
+
+def _option(scene: Scene, name: str) -> str | None:
+    """A file of the run's options."""
+    found = (scene.summary.options or {}).get(name)
+    return found if isinstance(found, str) else None
+
+
+CATALOGUE: Mapping[str, Any] = {"ortho": ortho, "stac": stac, "points": points}

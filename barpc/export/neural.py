@@ -21,11 +21,12 @@ from barpc.export.approx import (
     project_affine,
     project_projective,
 )
-from barpc.export.scene import Scene, Shot, link
-from barpc.geodesy import Array, ecef_from_ground, wrap_longitude
+from barpc.export.shots import Scene, Shot, link
+from barpc.geodesy import Array, ecef_from_ground, utm, wrap_longitude
 from barpc.geojson import polygon
 from barpc.remote import is_url
 from barpc.report.records import plain
+from barpc.report.tables import ply
 from barpc.rpcio import WRITABLE
 from barpc.sensor.geometry import footprint, image_grid
 
@@ -82,17 +83,13 @@ def satnerf(scene: Scene, out: Path) -> Files:
     names = list(files)
     points = io.BytesIO()
     np.save(points, ecef_from_ground(scene.points), allow_pickle=False)
-    lists = {
-        "train.txt": "\n".join(names).encode(),
-        "test.txt": names[-1].encode(),
-    }  # (no end of line after the last)
+    # no end of line after the last
+    lists = {"train.txt": "\n".join(names).encode(), "test.txt": names[-1].encode()}
     return {**files, **lists, "pts3d.npy": points.getvalue()}
 
 
 def eogs(scene: Scene, out: Path) -> Files:
-    """Write what `satnerf` writes, and ``affine_models.json``: affine cameras in its frame of UTM metres,
-    with their errors.
-    """
+    """Write what `satnerf` writes, and ``affine_models.json``: affine cameras in UTM metres, with their errors."""
     frame = _Utm(scene)
     rows = zip(scene.shots, scene.file_names(out), strict=True)
     models = [_record(scene, shot, img) | frame.models(scene, shot) for shot, img in rows]
@@ -104,9 +101,8 @@ class _Utm:
 
     def __init__(self, scene: Scene) -> None:
         lon, lat, _ = scene.origin
-        self.zone = int((lon + 180.0) // 6.0) % 60 + 1
+        self.zone, self._crs = utm(lon, lat)
         self.band = _BANDS[int(np.clip((lat + 80.0) // 8.0, 0, len(_BANDS) - 1))]
-        self._crs = f"EPSG:{(32600 if lat >= 0 else 32700) + self.zone}"
         corners = np.concatenate([self.metres(_grid(scene, shot, (2, 2))[0]) for shot in scene.shots])
         self.center = np.append(corners[:, :2].mean(axis=0), scene.alt_range[0])
         self.scale = float(np.linalg.norm(corners - self.center, axis=1).max())
@@ -119,9 +115,7 @@ class _Utm:
         return np.column_stack([east, north, ground[:, 2]])
 
     def models(self, scene: Scene, shot: Shot) -> dict[str, Any]:
-        """Return the affine camera of a shot: -1 to 1 over the image, altitudes in metres; the sun's where it
-        is known.
-        """
+        """Return the affine camera of a shot: -1 to 1 over the image, altitudes in metres; the sun's where known."""
         ground, image = _grid(scene, shot, (21, 9))
         world = (self.metres(ground) - self.center) / self.scale
         size = np.array(shot.size)
@@ -177,9 +171,7 @@ def pinhole_of(scene: Scene, shot: Shot) -> tuple[Pinhole, float]:
 
 
 def nerfstudio(scene: Scene, out: Path) -> Files:
-    """Write ``transforms.json``: pinhole, pose and largest error of every image, and simpler and nearer
-    cameras beside.
-    """
+    """Write ``transforms.json``: pinhole, pose and largest error of every image, simpler and nearer cameras beside."""
     frames = [_frame(scene, shot, out) for shot in scene.shots]
     found = {
         "camera_model": "PINHOLE",
@@ -224,16 +216,9 @@ def _frame(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
 
 def _cloud(scene: Scene) -> bytes:
     """Return the tie points in the world's frame, as renderers start from them: with a colour."""
-    kind = np.dtype(
-        [*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
-    )
-    rows = np.full(len(scene.points), 128, dtype=np.uint8).astype(kind)
-    for axis, values in zip("xyz", scene.world(scene.points).T, strict=True):
-        rows[axis] = values
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    head += [f"property float {axis}" for axis in "xyz"]
-    head += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    return ("\n".join([*head, "end_header"]) + "\n").encode() + rows.tobytes()
+    places = dict(zip("xyz", scene.world(scene.points).T.astype(np.float32), strict=True))
+    grey = np.full(len(scene.points), 128, dtype=np.uint8)
+    return ply(places | dict.fromkeys(("red", "green", "blue"), grey))
 
 
 # --- COLMAP -----------------------------------------------------------------------------------------------

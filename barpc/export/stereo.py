@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from barpc.export.neural import Files, as_json, rpc_of
-from barpc.export.scene import Scene, Shot, link, pairs_of
+from barpc.export.shots import Scene, Shot, link, pairs_of
 from barpc.rpcio import WRITABLE
 
 
@@ -30,16 +30,11 @@ def s2p(scene: Scene, out: Path) -> Files:
 
 
 def cars(scene: Scene, out: Path) -> Files:
-    """Write ``inputs.yaml`` and a ``.geom`` an image; pairs are those with tie points and an angle that shows
-    heights.
-    """
-    sensors = {
-        shot.name: {
-            "image": _image(shot, out),
-            "geomodel": {"path": f"{shot.name}.geom", "model_type": "RPC"},
-        }
-        for shot in scene.shots
-    }
+    """Write ``inputs.yaml``, with the pairs whose angle shows heights, and a ``.geom`` an image."""
+    sensors = {}
+    for shot in scene.shots:
+        camera = {"path": f"{shot.name}.geom", "model_type": "RPC"}
+        sensors[shot.name] = {"image": _image(shot, out), "geomodel": camera}
     pairing = [list(pair) for pair in pairs_of(scene)]
     found = {"input": {"sensors": sensors, "pairing": pairing}, "output": {"directory": "cars_out"}}
     files = {f"{shot.name}.geom": _text(shot, "geom") for shot in scene.shots}
@@ -49,10 +44,7 @@ def cars(scene: Scene, out: Path) -> Files:
 def asp(scene: Scene, out: Path) -> Files:
     """Write ``<image>.xml`` each (in Maxar's form), and lists of images and cameras for its tools, run in `out`."""
     files = {f"{shot.name}.xml": _text(shot, "xml") for shot in scene.shots}
-    lists = {
-        "images.txt": [_image(shot, out) for shot in scene.shots],
-        "cameras.txt": list(files),
-    }
+    lists = {"images.txt": [_image(shot, out) for shot in scene.shots], "cameras.txt": list(files)}
     return files | {name: ("\n".join(lines) + "\n").encode() for name, lines in lists.items()}
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from barpc.options import RunOptions
+from barpc.pipeline.loading import LoadedViews, load_views
 from barpc.pipeline.run import AdjustResult, adjust, check
-from barpc.pipeline.views import LoadedViews, load_views
 
 __all__ = ["AdjustResult", "LoadedViews", "RunOptions", "adjust", "check", "load_views"]

@@ -10,15 +10,15 @@ import numpy as np
 from barpc.errors import InputError
 from barpc.geodesy import Array, ecef_from_ground, metres_per_unit, wrap_longitude
 from barpc.options import RunOptions
-from barpc.pointio.altimetry import read_altimetry
-from barpc.pointio.ground import read_gcps
+from barpc.pointio.correspondences import read_gcps
+from barpc.pointio.laser import read_altimetry
+from barpc.report.summary.words import listed
 from barpc.scene import Altimetry, BoolArray, GroundPoints, View
 from barpc.sensor.geometry import footprint, ground_sample_distance
 from barpc.tie.pairs import reach_of
 
 _REACH = 1000.0  # m: ten times what delivered cameras are wrong by where they are bad
 _ALT_REACH = 500.0  # m beyond a camera's altitudes: a geoid is 100 m, and ranges miss relief by some hundred
-_LISTED = 10
 
 _MISTAKES = {
     "longitude and latitude are exchanged: GeoJSON and image tags give longitude first, .gcp files latitude, and a CSV "
@@ -64,27 +64,20 @@ def _load(path: str, views: Sequence[View], options: RunOptions) -> GroundPoints
     for wrong, what in _implausible(points, views, search):
         names = [points.names[g] for g in np.flatnonzero(wrong & keep)]
         if names:
-            many = f"{len(names)} of {len(keep)} points ({_listed(names)})"
+            many = f"{len(names)} of {len(keep)} points ({listed(names)})"
             out.append(f"{many if len(names) > 1 else f'point {names[0]}'}: {what}")
         keep &= ~wrong
     if points.strangers:
-        out.append(f"it names images that are not in this run: {_listed(points.strangers)}")
+        out.append(f"it names images that are not in this run: {listed(points.strangers)}")
     if out and not options.keep_going:
         raise InputError(f"{path}: {out[0]}; correct it, or leave it out with --keep-going")
     return replace(points.select(keep), left_out=tuple(f"{path}: {line}; left out" for line in out))
 
 
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return ", ".join(names[:_LISTED]) + more
-
-
 def _implausible(
     points: GroundPoints, views: Sequence[View], search: Array
 ) -> Iterator[tuple[BoolArray, str]]:
-    """Yield the points (G,) that cannot be meant, and why; the first reason counts. `search` (M,) [px] as of
-    `reach_of`.
-    """
+    """Yield the points (G,) that cannot be meant, and why; the first reason counts. `search` (M,): `reach_of` [px]."""
     low, high = np.array([view.alt_range for view in views])[points.view].T
     alt = points.lonlatalt[points.point, 2]
     shown, pixel = _shown(points, views, np.clip(alt, low, high))
@@ -113,9 +106,7 @@ def _any(points: GroundPoints, observed: BoolArray) -> BoolArray:
 
 
 def _shown(points: GroundPoints, views: Sequence[View], alt: Array) -> tuple[Array, Array]:
-    """Localise where each image shows a point (M, 3), lon, lat [deg], alt [m], at altitudes (M,), and the
-    pixel size there (M,) [m].
-    """
+    """Return where each image shows a point (M, 3) at altitudes (M,) [m], and the pixel size there (M,) [m]."""
     ground, pixel = np.empty((len(alt), 3)), np.empty(len(alt))
     for v in np.unique(points.view):
         rows = points.view == v
@@ -125,9 +116,7 @@ def _shown(points: GroundPoints, views: Sequence[View], alt: Array) -> tuple[Arr
 
 
 def _distance(points: GroundPoints, shown: Array, columns: tuple[int, int], signs: tuple[int, int]) -> Array:
-    """Return the metres (M,) from where images show points to where these are said to be, coordinates taken
-    from `columns`.
-    """
+    """Return the metres (M,) from where images show points to where these are said to be, taken from `columns`."""
     level = points.lonlatalt[points.point][:, columns] * signs
     given = np.column_stack([level, shown[:, 2]])
     return np.asarray(np.linalg.norm(ecef_from_ground(given) - ecef_from_ground(shown), axis=1))

@@ -46,9 +46,7 @@ Outcome = tuple[float, Any, BaseException | None]  # seconds, result, error of o
 
 
 def worker_count(executor: Executor | None) -> int:
-    """Return the number of tasks that an executor works on at a time; of a dask cluster at least what it may
-    grow to.
-    """
+    """Return the number of tasks that an executor works on at a time; of a dask cluster what it may grow to."""
     client = getattr(executor, "_client", None)
     if client is not None:
         return max(_CLUSTER, sum(int(n) for n in client.nthreads().values()))
@@ -152,9 +150,7 @@ class CachingExecutor(Executor):
                 future.add_done_callback(partial(self._completed, batch))
 
     def _spill(self, args: tuple[Any, ...]) -> tuple[Any, ...] | Spilled:
-        """Return the arguments as they are, or without the large arrays among them, which a file of the run
-        folder keeps.
-        """
+        """Return the arguments, large arrays among them as files of the run folder."""
         try:
             record = to_arrays(args)
         except TypeError:  # something that is not kept as a record, such as a user's own sensor
@@ -174,9 +170,7 @@ class CachingExecutor(Executor):
         )
 
     def _next_batch(self) -> list[_Task]:
-        """Return the waiting tasks of one function that have no kept result; they count as in flight, empty
-        does not.
-        """
+        """Return the waiting tasks of one function without a kept result; they count as in flight, if any."""
         with self._lock:
             if not self._open or self._in_flight >= self._limit:
                 return []
@@ -301,8 +295,7 @@ def run_batch(
     version: str,
     guards: Sequence[tuple[Input, ...]] | None = None,
 ) -> tuple[list[Outcome], float]:
-    """Run a batch of tasks in a worker; an error of one leaves the others their results. Returns CPU seconds,
-    too.
+    """Run a batch of tasks in a worker; an error of one leaves the others theirs. Returns CPU seconds, too.
 
     `guards`: the inputs that each task names. One that came to a cluster with another `version` works on nothing.
     """

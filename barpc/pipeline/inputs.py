@@ -133,9 +133,7 @@ def read_pairs(
 def _finder(
     folder: Path, views: Sequence[View], left_out: Sequence[str | Path]
 ) -> Callable[[str], int | None]:
-    """Return the index of the view that a list calls by its path or its name; None if it was left out,
-    InputError if unknown.
-    """
+    """Return what finds a view by path or name: its index, None if it was left out, InputError if unknown."""
     names = ViewNames([view.name for view in views], "the list of pairs")
     without = ViewNames([Path(path).name for path in left_out], "")
     places: dict[object, int | None] = {_resolved(path): None for path in left_out}
@@ -178,8 +176,7 @@ def hash_inputs(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Input]:
-    """Return every hashed input of a run by its name in tasks; InputError where one changed since it was
-    read.
+    """Return every hashed input by its name in tasks; InputError where one changed since it was read.
 
     `seen` holds the files that were opened so far. A matcher of the user's goes by its name, with all its files.
     """
@@ -228,9 +225,7 @@ def given_tracks(paths: Sequence[str | Path], views: Sequence[View]) -> Tracks:
 def given_matches(
     paths: Sequence[str | Path], views: Sequence[View], *, partly: bool = False
 ) -> dict[tuple[int, int], Matches]:
-    """Read the matches of files, pair by pair; InputError for a file without any, but for part (`partly`) of
-    the images.
-    """
+    """Read the matches of files by pairs; InputError for a file without any, but for part (`partly`) of the images."""
     links = _linked(paths, views, partly)
     swapped = links.view[links.ends[:, 0]] > links.view[links.ends[:, 1]]
     ends = np.where(swapped[:, None], links.ends[:, ::-1], links.ends)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Sequence, Set
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -16,8 +15,8 @@ from barpc.errors import OutputError
 from barpc.fit import RpcFit
 from barpc.handoff import verify
 from barpc.options import RunOptions
+from barpc.pipeline.beyond import grid_names, made_in_room
 from barpc.pipeline.executor import CachingExecutor
-from barpc.pipeline.grids import grid_names
 from barpc.pipeline.inputs import PRIOR
 from barpc.report import Run, Summary
 from barpc.report.page import REPORT, can_render, report_html
@@ -40,9 +39,8 @@ REOPENED = 1e-5
 
 
 Fitted = tuple[View, RpcFit, SensorModel]  # a view, its refitted RPC and P_BA
-Written = dict[
-    str, dict[str, float | str]
-]  # file -> consumer -> difference to P_BA [px], or why it does not read it
+Written = dict[str, dict[str, float | str]]
+"""File -> consumer -> difference to P_BA [px], or why it does not read it."""
 
 
 def write_views(
@@ -58,24 +56,15 @@ def write_views(
     Workers make the files in a room of the run folder, here they get their place, and workers open them again.
     OutputError where a file cannot be written, or barpc and GDAL do not read it back.
     """
-    room = run.partial / "files"
     with CachingExecutor(run, {}, executor, keep=False) as fresh:
         with run.stage("write"):
-            tasks = [
-                (view, fit.rpc, images, tuple(formats), str(run.folder), str(room)) for view, fit, _ in fitted
-            ]
-            try:
-                made = ordered(fresh, make_files, tasks, "write", progress)
-                for made_here in made:
-                    for path in map(Path, made_here):
-                        with run.output(path.name) as partial:
-                            path.replace(partial)
-            finally:
-                shutil.rmtree(room, ignore_errors=True)
+            tasks = [(view, fit.rpc, images, tuple(formats), str(run.folder)) for view, fit, _ in fitted]
+            made = made_in_room(run, fresh, make_files, tasks, "write", progress)
         with run.stage("verify"):
+            folder = run.folder
             again = [
-                (tuple(str(run.folder / Path(path).name) for path in paths), *one)
-                for paths, one in zip(made, fitted, strict=True)
+                (tuple(str(folder / name) for name in names), *one)
+                for names, one in zip(made, fitted, strict=True)
             ]
             return ordered(fresh, verify_files, again, "verify", progress)
 
@@ -83,7 +72,7 @@ def write_views(
 def make_files(
     view: View, rpc: RPC, images: str, formats: Sequence[str], folder: str, room: str
 ) -> tuple[str, ...]:
-    """Write the files of a view into a temporary folder before they go to `folder`; return their final paths."""
+    """Write the files of a view into a temporary folder before they go to `folder`; return their names."""
     place, names = Path(room) / view.name, file_names(view, images, formats)
     for name in names:
         try:
@@ -93,7 +82,7 @@ def make_files(
             if isinstance(error, OutputError) or error.errno is None:
                 raise
             raise OutputError(f"{Path(folder) / name}: cannot be written ({error.strerror})") from error
-    return tuple(str(place / name) for name in names)
+    return tuple(names)
 
 
 def verify_files(paths: Sequence[str], view: View, fit: RpcFit, model: SensorModel) -> Written:
@@ -158,8 +147,7 @@ def refuse_shadows(folder: Path, names: Sequence[str]) -> None:
 
 
 def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
-    """Write the tables, report.html where jinja2 is installed, and summary.json last: a folder with it is
-    complete.
+    """Write the tables, report.html where jinja2 is there, and summary.json last: with it a folder is complete.
 
     Returns the summary with the stages that this took.
     """

@@ -11,10 +11,10 @@ import numpy as np
 from barpc.cameras import open_camera
 from barpc.errors import BarpcError, InputError
 from barpc.identity import take
-from barpc.pipeline.grids import REOPENED, RESAMPLED, TILES
+from barpc.pipeline.beyond import REOPENED, RESAMPLED, TILES
 from barpc.remote import is_url
 from barpc.report import Summary
-from barpc.report.summary import ViewEntry
+from barpc.report.summary.views import ViewEntry
 from barpc.report.tables import read_summary
 from barpc.rpcio import row_of
 from barpc.rpcio.grids import CORRECTION, GRID
@@ -84,9 +84,7 @@ def _cameras(summary: Summary, folder: Path) -> Iterator[Proved]:
 
 
 def _holds_camera(path: Path) -> bool:
-    """Return whether a file holds the camera of its whole image: tiles and a resampled image have cameras of
-    their own.
-    """
+    """Return whether a file holds the camera of its whole image: tiles and resampled images have their own."""
     if path.name.endswith((TILES, RESAMPLED)):
         return False
     return path.name.endswith((GRID, CORRECTION)) or row_of(path) is not None

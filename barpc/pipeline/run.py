@@ -23,10 +23,10 @@ from barpc.fit.rpc import innermost
 from barpc.handoff import unverified
 from barpc.identity import Input, Stamp, ask, guarded, recorded
 from barpc.options import FitOptions, RunOptions
+from barpc.pipeline.beyond import write_grids
 from barpc.pipeline.cluster import watched
 from barpc.pipeline.control import load_altimetry, load_gcps
 from barpc.pipeline.executor import CachingExecutor
-from barpc.pipeline.grids import write_grids
 from barpc.pipeline.inputs import (
     PRIOR,
     given_matches,
@@ -39,15 +39,15 @@ from barpc.pipeline.inputs import (
     side_inputs,
     with_located,
 )
+from barpc.pipeline.loading import Image, image_path, load_views
 from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_views
-from barpc.pipeline.views import Image, image_path, load_views
 from barpc.pointio.matches import asp_text, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
 from barpc.remote import here
 from barpc.report import Run, Summary, summarize
+from barpc.report.outcome import pair_ties
 from barpc.report.page import REPORT, remake_report
 from barpc.report.records import plain
-from barpc.report.run import pair_ties
 from barpc.report.summary import InputEntry, StageEntry
 from barpc.rpcio import plain_source
 from barpc.scene import Tracks, View
@@ -148,8 +148,7 @@ def adjust(
     """
     options, folder = with_located(options or RunOptions()), Path(out_dir)
     plain_path(folder.absolute())
-    stages: list[dict[str, Any]] = []
-    seen: dict[str, Stamp] = {}
+    stages, seen = list[dict[str, Any]](), dict[str, Stamp]()
     with watched(executor), timed("inputs", stages) as workers:
         with recorded(seen):
             run = _loaded("adjust", images, options, executor, progress, workers)
@@ -170,20 +169,26 @@ def adjust(
             ask()
             if run.fits:
                 run = _written(run, options, workspace, executor, progress)
-        if run.adjustment is not None:
-            with _told(workspace, "block", progress), workspace.output(f"{TABLES}/{PRIOR}") as partial:
-                block_prior(run.adjustment).save(partial)
-        with _told(workspace, "summary", progress):
-            run = replace(run, out_dir=str(out_dir), stages=workspace.stages)
-            summary = replace(summarize(run), inputs=_entries(inputs.values()))
-        summary = replace(summary, stages=tuple(map(StageEntry.read, run.stages)))
-        _tell(progress, REPORT, 0)
-        summary = write_tables(workspace, run, summary)
-        _tell(progress, REPORT, 1)
+        run = replace(run, out_dir=str(out_dir), stages=workspace.stages)
+        summary = _summed_up(run, inputs.values(), workspace, progress)
         workspace.remove_stale()
     sensors = run.after or run.before
     views = [replace(view, sensor=sensor) for view, sensor in zip(run.views, sensors, strict=True)]
     return AdjustResult(_as_given(views, images, options), run, summary)
+
+
+def _summed_up(run: Run, inputs: Iterable[Input], workspace: Workspace, progress: Progress | None) -> Summary:
+    """Write what a later run starts from, summary, tables and report."""
+    if run.adjustment is not None:
+        with _told(workspace, "block", progress), workspace.output(f"{TABLES}/{PRIOR}") as partial:
+            block_prior(run.adjustment).save(partial)
+    with _told(workspace, "summary", progress):
+        summary = replace(summarize(run), inputs=_entries(inputs))
+    summary = replace(summary, stages=tuple(map(StageEntry.read, run.stages)))
+    _tell(progress, REPORT, 0)
+    summary = write_tables(workspace, run, summary)
+    _tell(progress, REPORT, 1)
+    return summary
 
 
 def _entries(inputs: Iterable[Input]) -> tuple[InputEntry, ...]:
@@ -255,9 +260,7 @@ def _loaded(
 
 
 def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[Path]]:
-    """Return the files that a run writes and those that it must keep; what stands in the way is refused
-    before any work.
-    """
+    """Return the files that a run writes and those that it keeps; what is in the way is refused before any work."""
     views = run.views
     if options.stop_after == "matching":
         require_pair_names([view.name for view in views])
@@ -265,8 +268,7 @@ def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[
         for view in views:
             plain_source(view.path)
     inputs = (*(view.path for view in views), *(source.path for source in run.sources))
-    keep = set(here(inputs))
-    keep |= set(input_files(options))
+    keep = {*here(inputs), *input_files(options)}
     names = output_names(views, options, folder)
     refuse_shadows(folder, names)
     return names, keep

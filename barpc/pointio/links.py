@@ -84,8 +84,7 @@ class Links:
 
 
 def index_pairs(matches: npt.NDArray[np.generic], counts: tuple[int, int]) -> IntArray:
-    """Return the numbers (M, 2) of matched keypoints, from such a table or from the partner of each of the
-    first (-1: none).
+    """Return the numbers (M, 2) of matched keypoints, from such a table or the partner of each (-1: none).
 
     ValueError for another shape, or a number beyond the `counts` of keypoints.
     """

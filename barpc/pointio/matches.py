@@ -18,6 +18,7 @@ from barpc.frozen import Arrays, load_npz
 from barpc.geodesy import Array
 from barpc.pointio.colmap import MAGIC as COLMAP
 from barpc.pointio.colmap import read_colmap
+from barpc.pointio.correspondences import require_columns
 from barpc.pointio.hloc import MAGIC as HDF5
 from barpc.pointio.hloc import read_hloc
 from barpc.pointio.links import SIGMA, Links
@@ -58,8 +59,7 @@ def read_links(path: Path | str, names: Sequence[str]) -> Links:
 
 
 def read_matches(path: Path | str, names: Sequence[str]) -> Tracks:
-    """Read the tie points as a file states them; tracks with fewer than two views, or two points in one, are
-    left out.
+    """Read the tie points that a file states; tracks of fewer than two views, or two points in one, are left out.
 
     As `read_links`; points that are linked, by way of others too, are one track.
     """
@@ -128,10 +128,7 @@ def _read_csv(path: Path, views: ViewNames) -> Links:
     with opened_text(path, TABLE, newline="") as text:
         lines = csv.reader(line for line in text if line.strip() and not line.startswith("#"))
         header = [word.strip().lower() for word in next(lines, [])]
-        if missing := [name for name in _COLUMNS if name not in header]:
-            raise InputError(
-                f"{path}: no column {', '.join(missing)} among the {len(header)} of its first line"
-            )
+        require_columns(path, _COLUMNS, header, header)
         image, *numbers = (header.index(name) for name in _COLUMNS)
         spread = header.index("sigma") if "sigma" in header else None
         rows, tracks = [], []
@@ -142,9 +139,8 @@ def _read_csv(path: Path, views: ViewNames) -> Links:
                 own = SIGMA if spread is None else float(line[spread])
                 track = line[numbers[2]].strip()
             except (ValueError, IndexError) as error:
-                raise InputError(
-                    f"{path}: line {lines.line_num} does not hold image, col, row, track"  # whatever it holds
-                ) from error
+                line_at = f"{path}: line {lines.line_num}"  # whatever it holds
+                raise InputError(f"{line_at} does not hold image, col, row, track") from error
             if view is not None:
                 rows.append((view, col, row, own))
                 tracks.append(track)

@@ -100,8 +100,7 @@ def require_pair_names(names: Sequence[str]) -> None:
 
 
 def cell(text: str) -> str:
-    r"""Return a text as a cell of a CSV table: quoted where it must be, and never a formula for a
-    spreadsheet.
+    r"""Return a text as a cell of a CSV table: quoted where it must be, never a spreadsheet's formula.
 
     A text that a spreadsheet would compute gets an apostrophe in front, which `from_cell` takes away.
 

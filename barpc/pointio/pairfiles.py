@@ -6,7 +6,7 @@ without these the rows correspond.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -99,11 +99,6 @@ def _asp_binary(path: Path) -> tuple[Array, Array]:
     return points[:count], points[count:]
 
 
-def _dictionary(path: Path) -> tuple[Array, Array]:
-    """Return the matched keypoints of a matcher's dictionary."""
-    return matched_keypoints(path, load_npz(path))
-
-
 def matched_keypoints(path: Path, arrays: Arrays) -> tuple[Array, Array]:
     """Return the points (M, 2), (M, 2) that the arrays of one pair say."""
     try:
@@ -128,4 +123,8 @@ def _points(array: object) -> Array:
     return points
 
 
-_READERS = {".txt": _asp_text, ".match": _asp_binary, ".npz": _dictionary}
+_READERS: dict[str, Callable[[Path], tuple[Array, Array]]] = {
+    ".txt": _asp_text,
+    ".match": _asp_binary,
+    ".npz": lambda path: matched_keypoints(path, load_npz(path)),
+}

@@ -18,8 +18,7 @@ _WANTED = (
 
 
 def read_transform(path: Path | str) -> Array:
-    """Read the matrix (3, 4) of a motion of the ground, ECEF [m]: a rotation times a scale, and a
-    translation.
+    """Read the matrix (3, 4) of a motion of the ground, ECEF [m]: a rotation times a scale, a translation.
 
     Lines of four numbers between blanks, commas or semicolons, perhaps in brackets, three of them or, with the last
     line 0 0 0 1, four: what pc_align of the Ames Stereo Pipeline, CloudCompare and PDAL write. InputError for anything

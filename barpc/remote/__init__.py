@@ -78,6 +78,10 @@ class Remote(str):
         """Return False: folders are not opened."""
         return False
 
+    def is_file(self) -> bool:
+        """Return True: whether there is one shows as it is read."""
+        return True
+
 
 Place = Path | Remote
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from barpc.report.run import Run
+from barpc.report.outcome import Run
 from barpc.report.summary import Summary
 from barpc.report.verdict import summarize
 

@@ -82,9 +82,7 @@ def titled(shape: str, title: str, **attributes: object) -> str:
 
 
 def sheet(key: str, title: str, description: str, height: float, body: Sequence[str], **more: object) -> str:
-    """Return a whole chart: a key unique on the page, what it is, what it shows for those who do not see it,
-    its elements.
-    """
+    """Return a whole chart: a key unique on the page, what it is, what it shows for those who do not see it."""
     width = more.pop("width", WIDTH)
     return tag(
         "svg",
@@ -155,9 +153,7 @@ def x_axis(scale: Scale, top: float, bottom: float, title: str) -> list[str]:
 
 
 def histogram(before: Array, after: Array) -> str:
-    """Draw the distributions of reprojection errors (n,) [px], before and after, each to its own peak, on a
-    logarithmic axis.
-    """
+    """Draw the distributions of reprojection errors (n,) [px], each to its own peak, on a logarithmic axis."""
     series = [(name, norm[norm > 0]) for name, norm in (("before", before), ("after", after))]
     series = [(name, norm) for name, norm in series if len(norm)]
     low, high = np.quantile(np.concatenate([np.ones(0), *(norm for _, norm in series)]), [0.002, 0.9995])
@@ -192,6 +188,6 @@ def legend(names: Sequence[str], right: float, y: float) -> list[str]:
     return parts
 
 
-def evenly(rows: Sequence[Any], most: int) -> Sequence[Any]:
+def evenly(rows: Any, most: int) -> Any:
     """Return all rows, or a number of them at even steps."""
     return rows[:: max(1, -(-len(rows) // most))]

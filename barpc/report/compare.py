@@ -11,7 +11,9 @@ import numpy as np
 
 from barpc.errors import BarpcError, InputError
 from barpc.report.records import plain
-from barpc.report.summary import Summary, ViewEntry, median
+from barpc.report.summary import Summary
+from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.words import median
 from barpc.report.tables import read_summary
 from barpc.rpcio import read_rpc
 from barpc.sensor.geometry import image_grid
@@ -113,9 +115,7 @@ def _rpc_difference(
 
 
 def written_rpc(folder: Path, view: ViewEntry) -> RPC | None:
-    """Return the first RPC that can be read of those that a run wrote for a view, in its own folder, whatever
-    it names.
-    """
+    """Return the first RPC that can be read of those that a run wrote for a view, in its own folder."""
     for name in view.outputs:
         try:
             path = (folder / name).resolve()

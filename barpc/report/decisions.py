@@ -10,17 +10,13 @@ from barpc.ba.apart import APART
 from barpc.ba.evidence.scan import SURE
 from barpc.ba.judging.judge import LARGEST
 from barpc.report.records import Table, table
-from barpc.report.summary import (
-    AskedEntry,
-    GcpEntry,
-    PairEntry,
-    SceneEntry,
-    Summary,
-    ViewEntry,
-    listed,
-    metres,
-)
-from barpc.report.summary.causes import RIVALS, ExplanationEntry
+from barpc.report.summary import Summary
+from barpc.report.summary.findings import RIVALS, ExplanationEntry
+from barpc.report.summary.known import GcpEntry
+from barpc.report.summary.pairs import PairEntry
+from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.whole import AskedEntry, SceneEntry
+from barpc.report.summary.words import known, listed, metres
 
 SHARED = 0.03  # px: what neighbours share and is less is not followed
 _NAMED = 5  # of many points
@@ -46,7 +42,7 @@ def second_attempts(pairs: Sequence[PairEntry]) -> Table | None:
     """Return the pairs that were tried more than once; None without any."""
     again = [pair for pair in pairs if pair.beaten]
     caption = "Pairs that were tried again, and what found fewer matches than were wanted"
-    return table("again", caption, again, PairEntry, PairEntry.AGAIN, folded=True) if again else None
+    return table("again", caption, again, PairEntry, PairEntry.AGAIN).fold() if again else None
 
 
 def control_sentence(summary: Summary) -> str:
@@ -54,7 +50,7 @@ def control_sentence(summary: Summary) -> str:
     test = summary.control_test
     if test is None:
         return ""
-    largest = f"the largest: w = {_known(test.largest_w):.1f}, {test.point} in {test.image}"
+    largest = f"the largest: w = {known(test.largest_w):.1f}, {test.point} in {test.image}"
     of_all = f"of {test.num} residuals of control in the images"
     each = f"{test.critical:g} times its own standard deviation"
     if not test.num_beyond:
@@ -154,7 +150,7 @@ def _drift(scene: SceneEntry, summary: Summary) -> list[str]:
 def _left(asked: AskedEntry) -> str:
     shared = f", and neighbours shared {asked.shared_px:.2f} px" if asked.shared_px else ""
     tested = f"F test: {_probability(asked.smooth_p)}; below 1e-4 in {asked.num_images} images"
-    return f"{_known(asked.smooth_px):.2f} px that was smooth in {asked.image} ({tested}){shared}"
+    return f"{known(asked.smooth_px):.2f} px that was smooth in {asked.image} ({tested}){shared}"
 
 
 def _jitter(scene: SceneEntry, summary: Summary) -> list[str]:
@@ -165,7 +161,7 @@ def _jitter(scene: SceneEntry, summary: Summary) -> list[str]:
         size, worst, rows = max(sizes, key=lambda of_image: of_image[0])
         before = f": without them there was {_left(scene.jitter_asked)}" if scene.jitter_asked else ""
         follow = f"follow jitter in {len(sizes)} images, up to {size:.2f} px RMS ({worst}){before}"
-        found.append(f"Splines with a knot every {_known(rows):.0f} rows {follow}.")
+        found.append(f"Splines with a knot every {known(rows):.0f} rows {follow}.")
     if steps := [len(one.detectors) for one, _ in corrections if one.detectors]:
         found.append(f"Detectors begin at up to {max(steps)} columns of {len(steps)} images.")
     if found:
@@ -174,9 +170,7 @@ def _jitter(scene: SceneEntry, summary: Summary) -> list[str]:
         return ["Jitter was not looked for, as asked."]
     if _option(summary, "adjust", "drift") == 0 and _option(summary, "adjust", "jitter") == "auto":
         return ["Jitter was not looked for, as one rotation an image was asked for."]
-    if any(
-        one.axis or one.period for one in scene.explanations
-    ):  # rows, columns and swings are followed, said above
+    if any(one.axis or one.period for one in scene.explanations):  # they are followed, as is said above
         return []
     return [_calm(summary.views)] if any(view.shared_px is not None for view in summary.views) else []
 
@@ -200,11 +194,9 @@ def _priors(scene: SceneEntry, summary: Summary) -> list[str]:
         return []
     words = f"Squared corrections are {scene.prior_ratio:.2g} times what the accuracies stated let expect"
     widened = [(view.prior_scale, view.name) for view in summary.views if (view.prior_scale or 1.0) > 1.005]
-    together = (
-        f" Taken as shared by all images, the accuracies stated were widened {scene.prior_shared:.1f} times."
-        if (scene.prior_shared or 1.0) > 1.005
-        else ""
-    )
+    shared = scene.prior_shared or 1.0
+    together = f" Taken as shared by all images, the accuracies stated were widened {shared:.1f} times."
+    together *= shared > 1.005
     if not widened:
         return [f"{words}: none was widened.{together}"]
     scale, worst = max(widened)
@@ -249,10 +241,6 @@ def _counts(words: Iterable[str | None], by: str = "") -> str:
 
 def _probability(value: float | None) -> str:
     return "p unknown" if value is None else "p < 1e-16" if value < 1e-16 else f"p = {value:.1g}"
-
-
-def _known(value: float | None) -> float:
-    return float("nan") if value is None else value
 
 
 def _option(summary: Summary, part: str, name: str) -> Any:

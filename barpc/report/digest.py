@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from barpc.report.reservations import GOOD_RMSE
-from barpc.report.summary import STATUS_WORDS, LeftOutEntry, PairEntry, Summary, ViewEntry
-from barpc.report.summary.reasons import CAUSES
-from barpc.report.summary.words import listed
+from barpc.report.summary import LeftOutEntry, Summary
+from barpc.report.summary.causes import CAUSES
+from barpc.report.summary.pairs import PairEntry
+from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.words import STATUS_WORDS, listed
 
 SHOWN = 10  # rows of a table on the terminal, images and pairs alike
 ALONE = 3  # images of one cause that have a sentence each; more share one
@@ -17,9 +19,7 @@ _CAUSES = list(CAUSES)
 
 
 def worst_first(views: Sequence[ViewEntry]) -> list[ViewEntry]:
-    """Return images by their verdicts, then by what is wrong, then by their error; those without reservation as they
-    come.
-    """
+    """Return images by verdict, by what is wrong, by error; those without reservation as they come."""
     return sorted(views, key=_badness)
 
 
@@ -28,11 +28,8 @@ def _badness(view: ViewEntry) -> tuple[int, int, float]:
         return len(_ORDER), 0, 0.0
     cause = _CAUSES.index(view.cause) if view.cause in CAUSES else len(_CAUSES)
     errors = (view.rmse_after, view.held_out_px, view.rmse_before if view.rmse_after is None else None)
-    return (
-        _ORDER.index(view.status),
-        cause,
-        -max((error for error in errors if error is not None), default=0.0),
-    )
+    worst = max((error for error in errors if error is not None), default=0.0)
+    return _ORDER.index(view.status), cause, -worst
 
 
 def flagged(views: Sequence[ViewEntry]) -> list[ViewEntry]:
@@ -57,9 +54,7 @@ def torn(pairs: Sequence[PairEntry]) -> list[PairEntry]:
 
 
 def sentences(summary: Summary) -> list[str]:
-    """Return the verdict, one sentence for all images that share a cause, and one for all files left out for one
-    reason.
-    """
+    """Return the verdict, one sentence for all images of one cause, one for all files left out for one reason."""
     own = {view.reservation for view in summary.views if view.advice}
     own |= {one.reason_text for one in summary.left_out}
     together = [*_of_views(flagged(summary.views)), *_of_files(summary.left_out)]
@@ -79,7 +74,8 @@ def _of_views(views: Sequence[ViewEntry]) -> list[str]:
             continue
         names, words = listed([view.name for view in alike], _NAMED), CAUSES[cause]
         start = f"{len(alike)} images are {STATUS_WORDS[status]}, {words.label}: {names}"
-        out.append(". ".join(filter(None, (start, _capital(words.remedy.format(image="IMAGE"))))) + ".")
+        remedy = words.remedy.format(image="IMAGE")
+        out.append(". ".join(filter(None, (start, remedy[:1].upper() + remedy[1:]))) + ".")
     return out
 
 
@@ -96,7 +92,3 @@ def _of_files(files: Sequence[LeftOutEntry]) -> list[str]:
             names = listed([one.path for one in alike], _NAMED)
             out.append(f"{len(alike)} files were left out, {names}: {reason}")
     return out
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

@@ -26,14 +26,9 @@ from barpc.report.charts import (
     titled,
 )
 from barpc.report.digest import SHOWN, flagged
-from barpc.report.summary import (
-    CELLS,
-    CheckPointEntry,
-    GcpEntry,
-    Summary,
-    ViewEntry,
-    cell_numbers,
-)
+from barpc.report.summary import Summary
+from barpc.report.summary.known import CheckPointEntry, GcpEntry
+from barpc.report.summary.views import CELLS, ViewEntry, cell_numbers
 from barpc.report.tables import Observations, RunFiles
 
 _MOST_LINKS = 1500
@@ -55,17 +50,16 @@ Known = GcpEntry | CheckPointEntry
 
 
 def _ties(links: Sequence[Link], width: tuple[float, float], opacity: tuple[float, float]) -> list[str]:
-    """Return lines of least width and opacity, and by how much those of the link with the most matches are above
-    these.
-    """
+    """Return lines of least width and opacity, and what the link with the most matches has beyond these."""
     most, parts = max([count for *_, count, _ in links], default=1), []
     for (x1, y1), (x2, y2), count, title in sorted(links, key=itemgetter(2))[-_MOST_LINKS:]:
         share = math.sqrt(count / most)
+        ends = {"x1": x1, "y1": y1, "x2": x2, "y2": y2}
         style = {
             "stroke_width": width[0] + width[1] * share,
             "stroke_opacity": opacity[0] + opacity[1] * share,
         }
-        shape = tag("line", x1=x1, y1=y1, x2=x2, y2=y2, class_="tie", **style)
+        shape = tag("line", **ends, class_="tie", **style)
         parts.append(titled(shape, f"{title}: {count} matches"))
     return parts
 
@@ -112,7 +106,7 @@ def ground_map(files: RunFiles) -> str:
     }
     plane = _plane_of(np.concatenate([*rings, files.points[:, :2], *known.values()]))
     grid, degrees, taken = _graticule(plane)
-    points = plane(files.points[:: max(1, -(-len(files.points) // MAX_DOTS)), :2])
+    points = plane(evenly(files.points, MAX_DOTS)[:, :2])
     parts = [
         *grid,
         *_moving_ground(plane, summary),
@@ -144,9 +138,7 @@ def ground_map(files: RunFiles) -> str:
 
 
 def _moving_ground(plane: Plane, summary: Summary) -> list[str]:
-    """Return cells of the ground in which tie points move together, stronger with more of them, and where each group
-    lies.
-    """
+    """Return cells of the ground in which tie points move together, darker with more, and where each group lies."""
     scene = summary.scene
     if scene is None:
         return []
@@ -250,9 +242,7 @@ def _pair_lines(stacks: Sequence[Stack], files: RunFiles) -> list[str]:
 
 
 def _graticule(plane: Plane) -> tuple[list[str], list[str], list[tuple[float, float, float]]]:
-    """Return lines of longitude and latitude; their degrees and the scale bar, which go on top; places x, y, half
-    widths.
-    """
+    """Return lines of longitude and latitude; degrees and scale bar, which go on top; places x, y, half widths."""
     right, bottom = WIDTH - 4, plane.height - 24
     reach = np.array([WIDTH / 2, plane.height / 2]) / plane.unit
     lines, texts, taken = [], [], []
@@ -338,8 +328,10 @@ def residual_panels(
     if len(views) > SHOWN:
         rest.sort(key=lambda k: -shares[k])
     for k in [*first, *rest][:_MOST]:
-        rows = rows_of[k][:: max(1, -(-len(rows_of[k]) // most))]
-        svg = _panel(when, k, views[k], grids[k], observations.xy[rows], residuals[rows], longest)
+        rows = evenly(rows_of[k], most)
+        svg = _panel(
+            when, k, views[k], grids[k], np.hstack([observations.xy[rows], residuals[rows]]), longest
+        )
         charts.append((svg, f"{views[k].name}: {_note(grids[k])}"))
     words = f"A thin line of a {_PANEL / _REACH:.0f}th of a panel's width is {longest:.2g} px"
     key = f"{words}; bold arrows are drawn twice as long."
@@ -353,9 +345,8 @@ def _note(cells: Cells) -> str:
     return f"{100 * cells.share:.0f} % systematic" if np.isfinite(cells.rms).any() else "no tie points"
 
 
-def _panel(
-    when: str, number: int, view: ViewEntry, cells: Cells, xy: Array, residuals: Array, longest: float
-) -> str:
+def _panel(when: str, number: int, view: ViewEntry, cells: Cells, drawn: Array, longest: float) -> str:
+    """Draw the map of an image, with the residuals that are drawn (m, 4): col, row, dcol, drow [px]."""
     width, height = view.size
     tall = _PANEL * min(max(height / width, 0.4), 2.5)
     stretch = np.array([_PANEL / width, tall / height])
@@ -366,15 +357,15 @@ def _panel(
             opacity = 0.06 + 0.5 * min(float(rms) / (2 * longest), 1.0)
             place = {"x": j * side[0], "y": i * side[1], "width": side[0], "height": side[1]}
             parts.append(tag("rect", **place, class_="heat", fill_opacity=opacity))
-    start = (xy + 0.5) * stretch
-    end = start + residuals * (_REACH / longest)
+    start = (drawn[:, :2] + 0.5) * stretch
+    end = start + drawn[:, 2:] * (_REACH / longest)
     ends = np.hstack([start, end]).tolist()
     shafts = "".join(f"M{x:.1f} {y:.1f}L{u:.1f} {v:.1f}" for x, y, u, v in ends)
     parts.append(tag("path", d=shafts or "M0 0", class_="vector"))
     for i, j in np.argwhere(cells.systematic):
         middle = side * (j + 0.5, i + 0.5)
         parts.append(_arrow(middle, cells.mean[i, j] * (2 * _REACH / longest)))
-    described = f"{len(residuals)} residuals are drawn; {_note(cells)}."
+    described = f"{len(drawn)} residuals are drawn; {_note(cells)}."
     title = f"Residuals over {view.name}"
     return sheet(
         f"panel-{when}{number}", title, described, tall, parts, width=_PANEL, class_="panel", data_v=number

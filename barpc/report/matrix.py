@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from barpc.report.charts import WIDTH, label, number, sheet, shortened, tag
-from barpc.report.summary import PairEntry
+from barpc.report.summary.pairs import PairEntry
 from barpc.report.tables import RunFiles
 
 _LEFT = 30.0  # at least: names are to its right end
@@ -60,14 +60,8 @@ def pair_matrix(files: RunFiles) -> str:
         *_names(names, side, left),
     ]
     for place, measure in enumerate(MEASURES):
-        parts.append(
-            tag(
-                "g",
-                *_layer(measure, cells, side, (len(views), left)),
-                class_=f"layer l{place}",
-                data_words=measure.words,
-            )
-        )
+        layer = _layer(measure, cells, side, (len(views), left))
+        parts.append(tag("g", *layer, class_=f"layer l{place}", data_words=measure.words))
     parts.append(tag("rect", x=0, y=0, width=side, height=side, class_="cursor"))
     return sheet(
         "matrix-chart",
@@ -83,9 +77,7 @@ def pair_matrix(files: RunFiles) -> str:
 
 
 def facts(files: RunFiles) -> dict[str, list[list[object]]]:
-    """Return what the page's script says of an image or a pair that is pointed at: names, and pairs with their
-    figures.
-    """
+    """Return what the page's script says of an image or a pair that is pointed at: names, pairs with figures."""
     index = files.number
     names: list[list[object]] = [[view.name, view.num_observations] for view in files.summary.views]
     pairs: list[list[object]] = []

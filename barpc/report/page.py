@@ -25,23 +25,12 @@ from barpc.report.maps import ground_map, residual_panels
 from barpc.report.matrix import facts, pair_matrix
 from barpc.report.records import Cell, Table, cell_of, table
 from barpc.report.reservations import FEW_OBSERVATIONS, GOOD, GOOD_RMSE
-from barpc.report.summary import (
-    DATUM,
-    GCPS,
-    STATUS_WORDS,
-    CheckPointEntry,
-    DatumEntry,
-    GcpEntry,
-    PairEntry,
-    ReferenceViewEntry,
-    StageEntry,
-    Summary,
-    ViewEntry,
-    largest,
-    listed,
-    metres,
-)
-from barpc.report.summary.words import counted
+from barpc.report.summary import StageEntry, Summary
+from barpc.report.summary.known import GCPS, CheckPointEntry, GcpEntry, ReferenceViewEntry
+from barpc.report.summary.pairs import PairEntry
+from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.whole import DATUM, DatumEntry
+from barpc.report.summary.words import STATUS_WORDS, counted, largest, listed, metres
 from barpc.report.tables import Relief, RunFiles, read_summary, read_tables
 from barpc.scene import connected_groups
 from barpc.workspace import Workspace
@@ -208,9 +197,7 @@ def _errors(files: RunFiles) -> Section | None:
     norms = [np.hypot(*r[found.used & np.isfinite(r).all(axis=1)].T) for r in (found.before, found.after)]
     if not any((norm > 0).any() for norm in norms):
         return None
-    shown = [
-        (charts.histogram(*norms), "All observations that count; each curve is drawn to its own peak."),
-    ]
+    shown = [(charts.histogram(*norms), "All observations that count; each curve is drawn to its own peak.")]
     if not files.summary.adjusted:
         answer = f"Half of the observations lie within {np.median(norms[0]):.3f} px of where their cameras put them."
         return Section("errors", "How large are the errors?", answer, shown)
@@ -336,7 +323,7 @@ def _corrections(files: RunFiles) -> Section | None:
     if any(view.correction and view.correction.ellipse for view in views):
         caption = "Place on the ground of the middle of each image, its altitude given: one-sigma ellipse, CE90, and"
         caption += " CE90 as stated with the camera as delivered (-: nothing is)"
-        tables.append(table("places", caption, views, ViewEntry, ViewEntry.PLACES, folded=True))
+        tables.append(table("places", caption, views, ViewEntry, ViewEntry.PLACES).fold())
     return Section("moves", "What was changed in each camera?", answer, tables=tables, half=True)
 
 
@@ -350,7 +337,7 @@ def _decisions(files: RunFiles) -> Section | None:
         caption = (
             "What was decided by of each image: its prior widened, what was cut, what is left that is smooth"
         )
-        tables.append(table("decided", caption, views, ViewEntry, ViewEntry.DECISIONS, folded=True))
+        tables.append(table("decided", caption, views, ViewEntry, ViewEntry.DECISIONS).fold())
     again = second_attempts(summary.pairs)
     tables += [again] if again else []
     answer = "Figures that the run decided by; what was asked for by an option is said to be."
@@ -369,20 +356,17 @@ def _gauge(files: RunFiles) -> Section | None:
         answer += f" {scene.num_held_in_height} tie points seen under too small an angle were held in height."
     if not gcps and not (files.summary.reference and files.summary.reference.used):
         answer += " Ground control points (--gcp) are what helps where it matters."
-    tables = (
-        [table("datum", DATUM, scene.datum, DatumEntry, DatumEntry.columns(scene.datum))]
-        if scene.datum
-        else []
-    )
+    tables = []
+    if scene.datum:
+        tables.append(table("datum", DATUM, scene.datum, DatumEntry, DatumEntry.columns(scene.datum)))
     tables += [table("gcps", GCPS, gcps, GcpEntry, GcpEntry.PAGE)] if gcps else []
     if tested := [view for view in files.summary.views if view.control_w is not None]:
         caption = "Control in each image: the largest residual in units of its own deviation (Baarda's w)"
-        tables.append(table("control", caption, tested, ViewEntry, ViewEntry.CONTROL, folded=True))
+        tables.append(table("control", caption, tested, ViewEntry, ViewEntry.CONTROL).fold())
     if (reference := files.summary.reference) is not None:
         caption = "Reference: what it says of each camera as delivered"
-        tables.append(
-            table("reference", caption, reference.views, ReferenceViewEntry, ReferenceViewEntry.PAGE)
-        )
+        kind = ReferenceViewEntry
+        tables.append(table("reference", caption, reference.views, kind, kind.PAGE))
     return Section("gauge", "What can the images not tell?", answer, bars=bars, tables=tables, half=True)
 
 
@@ -455,7 +439,7 @@ def _run(files: RunFiles) -> Section:
     options = flat_options(summary.options or {})
     rows = [[cell_of(key), cell_of(str(value))] for key, value in options.items()]
     tables = [
-        table("stages", "Stages of the run", stages, StageEntry, StageEntry.PAGE, folded=True),
+        table("stages", "Stages of the run", stages, StageEntry, StageEntry.PAGE).fold(),
         Table("options", "Options of the run", ["option", "value"], rows, folded=True),
     ]
     return Section("run", "How was this made, and how long did it take?", answer, bars=bars, tables=tables)

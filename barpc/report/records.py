@@ -10,23 +10,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from functools import cache, partial
 from types import NoneType, UnionType
-from typing import (
-    Annotated,
-    Any,
-    ClassVar,
-    Literal,
-    Self,
-    Union,
-    dataclass_transform,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Any, ClassVar, Self, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+from barpc.options import schema_of
+
 Number = float | None  # A number; None (null) stands for what is not finite
-_WORDS = {str: "string", int: "integer", float: "number", bool: "boolean", NoneType: "null"}
 
 
 def said(
@@ -118,34 +108,6 @@ def _reader(kind: Any) -> Callable[[Any], Any] | None:
     return tuple if item is None else lambda values: tuple(map(item, values))
 
 
-def schema_of(kind: Any) -> dict[str, Any]:
-    """Return the JSON schema of a type."""
-    origin, parts = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        return {**schema_of(parts[0]), **parts[1]}
-    if origin is Literal:
-        return {"enum": list(parts)}
-    if origin is Mapping:
-        return {"type": "object", "additionalProperties": schema_of(parts[1])}
-    if origin is tuple:
-        fixed = {} if parts[-1] is Ellipsis else {"minItems": len(parts), "maxItems": len(parts)}
-        return {"type": "array", **fixed, "items": schema_of(parts[0])}
-    if origin is not None:
-        return _either(parts)
-    if isinstance(kind, type) and issubclass(kind, Record):
-        return kind.json_schema()
-    return {} if kind is Any else {"type": _WORDS[kind]}
-
-
-def _either(parts: Sequence[Any]) -> dict[str, Any]:
-    schemas = [schema_of(part) for part in parts]
-    simple: list[Any] = [schema["type"] for schema in schemas if schema.keys() == {"type"}]
-    rest = [schema for schema in schemas if schema.keys() != {"type"}]
-    if len(rest) > 1:
-        return {"anyOf": [{"type": simple}, *rest]}  # the usual first
-    return {**rest[0], "type": [rest[0]["type"], *simple]} if rest else {"type": simple}
-
-
 def plain(value: Any) -> Any:
     """Return a value as JSON holds it: arrays as lists, records as mappings, what is not finite as null."""
     if isinstance(value, float) and not isinstance(value, np.generic):
@@ -197,10 +159,12 @@ class Table:
     marks: Sequence[str] = ()
 
     def marked(self, marks: Sequence[str]) -> Table:
-        """Return the same with the indices of the images of each row, for the page's script: one, or two with a
-        hyphen.
-        """
+        """Return the same with the indices of each row's images, for the page's script: one, or two with a hyphen."""
         return replace(self, marks=list(marks))
+
+    def fold(self) -> Table:
+        """Return the same, to be opened on demand."""
+        return replace(self, folded=True)
 
     @property
     def shown(self) -> Sequence[Sequence[Cell]]:
@@ -248,21 +212,13 @@ class Column:
 
 
 def table(
-    key: str,
-    caption: str,
-    rows: Sequence[Record],
-    kind: type[Record],
-    columns: str,
-    adjusted: bool = True,
-    folded: bool = False,
+    key: str, caption: str, rows: Sequence[Record], kind: type[Record], columns: str, adjusted: bool = True
 ) -> Table:
-    """Return the table of records: a row each; the words of `columns` are fields (``part.field``) and columns of its
-    `OWN`.
-    """
+    """Return the table of records, a row each; words of `columns`: fields (``part.field``), columns of `OWN`."""
     found = [column_of(kind, name) for name in columns.split()]  # type: ignore[arg-type]
     found = [column for column in found if adjusted or not column.adjusted]
     cells = [[cell for column in found for cell in column.cells(row)] for row in rows]
-    return Table(key, caption, [head for column in found for head in column.heads], cells, folded)
+    return Table(key, caption, [head for column in found for head in column.heads], cells)
 
 
 @cache

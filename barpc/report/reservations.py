@@ -10,10 +10,11 @@ from barpc.ba import Adjustment
 from barpc.ba.apart import Apart
 from barpc.ba.evidence.scan import SURE
 from barpc.report.dem_lines import holds_reference
-from barpc.report.run import MANY_REJECTED, SMOOTH_LEFT, Run
-from barpc.report.summary import ViewEntry, listed
-from barpc.report.summary.causes import LeftEntry, left_entries, strangeness
-from barpc.report.summary.reasons import CAUSES, Reason
+from barpc.report.outcome import MANY_REJECTED, SMOOTH_LEFT, Run
+from barpc.report.summary.causes import CAUSES, Reason
+from barpc.report.summary.findings import LeftEntry, left_entries, strangeness
+from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.words import known, listed
 from barpc.sensor.rpc import RPC
 
 GOOD_RMSE = 0.5  # A view whose tie points are left with more than this [px] is called doubtful
@@ -63,9 +64,7 @@ def _misses(view: ViewEntry, run: Run) -> Reason | None:
 
 
 def _contradicted(view: ViewEntry, run: Run) -> Reason | None:
-    """Say that most tie points of a view contradict the others, all over it and not as wrong matches do: these are
-    right.
-    """
+    """Say that most tie points of a view contradict the others all over it, not as wrong matches do."""
     many = run.kind == "adjust" and view.num_rejected >= FEW_OBSERVATIONS and lost(view) > MOST
     if not many or _apart(view, run) is not None or anywhere(view, run) or _most_in(view, run):
         return None
@@ -234,11 +233,6 @@ _RESERVATIONS: tuple[Callable[[ViewEntry, Run], Reason | None], ...] = (
     _unused, _beyond, _error, _moving, _one_place,
 )  # fmt: skip
 """In this order: the first that holds is the reason."""
-
-
-def known(value: float | None) -> float:
-    """Return a number, NaN where there is none."""
-    return float("nan") if value is None else value
 
 
 def lost(view: ViewEntry) -> float:

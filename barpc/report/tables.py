@@ -10,37 +10,33 @@ import csv
 import io
 import json
 import os
-import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from barpc import __version__
 from barpc.errors import InputError
 from barpc.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.geojson import collection, feature
 from barpc.pointio.names import cell, from_cell
-from barpc.report.records import value_of
-from barpc.report.run import Run
-from barpc.report.summary import SCHEMA, PairEntry, Summary, ViewEntry, published_schema
+from barpc.report.outcome import Run
+from barpc.report.records import Number, Record, said, value_of
+from barpc.report.summary import SCHEMA, Summary, published_schema
+from barpc.report.summary.pairs import PairEntry
+from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.words import Share, Side
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.geometry import footprint
 from barpc.sidefile import GEOJSON, SUMMARY, TABLE, Kind, parse_json, read_json, read_text
 from barpc.workspace import table_path
 
-RESIDUALS = (
-    "lon",
-    "lat",
-    "height_above_datum",
-    "mean_residual",
-    "num_observations",
-    "mean_residual_before",
-    "track",
-)
+_PLACE = "lon", "lat", "height_above_datum"
+RESIDUALS = (*_PLACE, "mean_residual", "num_observations", "mean_residual_before", "track")
 """Columns of residuals.csv, one row a track. Heights: above the ellipsoid."""
 
 OBSERVATIONS = ("view", "track", "col", "row", "col_before", "row_before", "col_after", "row_after", "used")
@@ -105,9 +101,7 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def _footprints(run: Run, summary: Summary) -> bytes:
-    """Return every image at the scene's altitude, through the adjusted cameras, or the cameras as they are
-    for a check.
-    """
+    """Return every image at the scene's altitude, through the adjusted cameras, or for a check as they are."""
     features = []
     for view, sensor, entry in zip(run.views, run.after or run.before, summary.views, strict=True):
         ring = np.round(footprint(sensor, view.size, run.altitude), 9)
@@ -123,22 +117,27 @@ def _points_ply(run: Run, _: Summary) -> bytes:
     if len(rows):
         origin[0] = rows[0, 0]  # a mean of longitudes may fall on the other side of the Earth
     local = (ecef_from_ground(rows[:, :3]) - ecef_from_ground(origin)) @ enu_basis(origin).T
-    kind = np.dtype([(n, "<f8") for n in "xyz"] + [("mean_residual", "<f4"), ("num_observations", "<i4")])
-    records = np.empty(len(rows), dtype=kind)
-    for name, values in zip(kind.names or (), [*local.T, rows[:, 3], rows[:, 4]], strict=True):
-        records[name] = values
+    columns: dict[str, Any] = dict(zip("xyz", local.T, strict=True))
+    columns |= {
+        "mean_residual": rows[:, 3].astype(np.float32),
+        "num_observations": rows[:, 4].astype(np.int32),
+    }
     place = f"lon {origin[0]:.9f} lat {origin[1]:.9f} alt {origin[2]:.4f} (WGS84, above the ellipsoid)"
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"comment barpc {__version__}: x east, y north, z up [m] of {place}",
-        f"element vertex {len(rows)}",
-        *(f"property double {name}" for name in "xyz"),
-        "property float mean_residual",
-        "property int num_observations",
-        "end_header",
-    ]
-    return ("\n".join(header) + "\n").encode() + records.tobytes()
+    return ply(columns, f"barpc {__version__}: x east, y north, z up [m] of {place}")
+
+
+_PLY = {"float64": "double", "float32": "float", "int32": "int", "uint8": "uchar"}
+
+
+def ply(columns: Mapping[str, npt.NDArray[Any]], *comments: str) -> bytes:
+    """Return points as a binary PLY: columns (n,) by their names, of the types of `_PLY`, and comments."""
+    kinds = [(name, column.dtype) for name, column in columns.items()]
+    records: Any = np.rec.fromarrays(list(columns.values()), dtype=kinds)
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
+    header.append(f"element vertex {len(records)}")
+    header += [f"property {_PLY[column.dtype.name]} {name}" for name, column in columns.items()]
+    rows: bytes = records.tobytes()
+    return ("\n".join([*header, "end_header"]) + "\n").encode() + rows
 
 
 def gcps_geojson(run: Run) -> bytes:
@@ -147,20 +146,12 @@ def gcps_geojson(run: Run) -> bytes:
     assert control is not None
     assert run.adjustment is not None
     points, kept = control.points, run.adjustment.reference_inlier
-    places, sigmas, pixels = (
-        points.lonlatalt.round(9).tolist(),
-        points.sigma.tolist(),
-        points.xy.round(4).tolist(),
-    )
-    features = []
+    places, sigmas = points.lonlatalt.round(9).tolist(), points.sigma.tolist()
+    pixels, features = points.xy.round(4).tolist(), []
     for row in np.flatnonzero(kept).tolist():
         g, view = int(points.point[row]), run.views[points.view[row]]
-        properties = {
-            "id": points.names[g],
-            "filename": Path(view.path).name,
-            "ji": pixels[row],
-            "sigma_m": sigmas[g],
-        }
+        where = {"id": points.names[g], "filename": Path(view.path).name}
+        properties = {**where, "ji": pixels[row], "sigma_m": sigmas[g]}
         place = {"type": "Point", "coordinates": places[g]}
         features.append(json.dumps({"type": "Feature", "geometry": place, "properties": properties}))
     text = ",\n".join(features)
@@ -197,18 +188,16 @@ class Observations:
     used: BoolArray
 
 
-@dataclass(frozen=True)
-class Relief:
-    """A window of the ground by the cameras "delivered" or "corrected": a shaded relief, a JPEG in base64.
+class Relief(Record):
+    """A window of the ground, as one of two kinds of cameras give it."""
 
-    `size`: of the picture [px]; `share`: of the window that has heights; `nmad_m`: how far pairs disagree, by median.
-    """
+    MORE: ClassVar = Any
 
-    cameras: str
-    size: tuple[int, int]
-    share: float
-    nmad_m: float | None
-    picture: str
+    cameras: Literal["delivered", "corrected"] = said("Which cameras")
+    size: tuple[Side, Side] = said("Width and height of the picture", "px")
+    share: Share = said("Part of the window that has heights")
+    nmad_m: Number = said("How far pairs of images disagree, by median", "m")
+    picture: str = said("A shaded relief, a JPEG in base64", pattern=r"^[A-Za-z0-9+/]{4,400000}={0,2}\Z")
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,29 +282,15 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
     return RunFiles(summary, observations, points, tracks, outlines, reliefs)
 
 
-_BASE64 = re.compile(r"[A-Za-z0-9+/]{4,400000}={0,2}")
-
-
 def _reliefs(text: str) -> tuple[Relief, ...]:
-    found = tuple(
-        Relief(
-            {"delivered": "delivered", "corrected": "corrected"}[one["cameras"]],
-            (int(one["size"][0]), int(one["size"][1])),
-            float(one["share"]),
-            None if one["nmad_m"] is None else float(one["nmad_m"]),
-            _jpeg(one["picture"]),
-        )
-        for one in parse_json(text)
-    )
-    if [one.cameras for one in found] != ["delivered", "corrected"]:
+    import fastjsonschema
+
+    found = parse_json(text)
+    fastjsonschema.validate({"type": "array", "items": Relief.json_schema()}, found)
+    reliefs = tuple(map(Relief.read, found))
+    if [one.cameras for one in reliefs] != ["delivered", "corrected"]:
         raise ValueError("reliefs that are not one before and one after")
-    return found
-
-
-def _jpeg(data: str) -> str:
-    if not _BASE64.fullmatch(data):
-        raise ValueError("a picture that is none")
-    return data
+    return reliefs
 
 
 def _read(path: Path, kind: Kind, parse: Any) -> Any:
@@ -337,9 +312,7 @@ def _columns(text: str, header: Sequence[str]) -> list[list[str]]:
 
 
 def _floats(columns: Sequence[Sequence[str]], known: int) -> Array:
-    """Return the columns (n, len(columns)) of numbers, of which only those after the first `known` may be
-    empty (NaN).
-    """
+    """Return the columns (n, len(columns)) of numbers, of which only those from `known` on may be empty (NaN)."""
     table = np.array([[float(cell or "nan") for cell in column] for column in columns], dtype=np.float64).T
     if np.isnan(table[:, :known]).any() or (np.abs(table) > _FAR).any():
         raise ValueError("a number is missing or absurdly large")

@@ -14,12 +14,13 @@ from barpc.ba.evidence.scan import SURE
 from barpc.ba.judging.snooping import ControlTest
 from barpc.geodesy import Array
 from barpc.report.dem_lines import dem_lines, dem_reasons
+from barpc.report.outcome import MANY_REJECTED, Run
 from barpc.report.records import plain
 from barpc.report.reservations import NOISE_LIMIT, anywhere, is_smooth, lost, standing_out, view_status
-from barpc.report.run import MANY_REJECTED, Run
-from barpc.report.summary import LeftOutEntry, Summary, ViewEntry, listed, measure, median, metres
-from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_entries
-from barpc.report.summary.words import counted
+from barpc.report.summary import LeftOutEntry, Summary, measure
+from barpc.report.summary.findings import RIVALS, explanations, held_out_place, left_entries
+from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.words import counted, listed, median, metres
 from barpc.scene import GroundPoints
 from barpc.tie.reference import PEAK
 
@@ -28,21 +29,17 @@ _MOST_NAMED = 5  # images in a sentence
 MOVED = (
     3.0  # A scene that moved by more than so many times what its cameras' accuracies let expect needs a look
 )
-
 _SAY_REJECTED = (
     "contradicted",
     "rejected",
     "wrong_matches",
 )  # causes whose sentence says how many were rejected
 _SAY_WHERE = "rejected", "place"  # causes whose sentence says where in the image
+_LOOKED_AT = "The image was looked at"
 _ALL_WELL = {
     "adjust": ("The image is adjusted", "Both images are adjusted", "All {} images are adjusted"),
-    "check": (
-        "The image was looked at",
-        "The cameras of both images agree",
-        "The cameras of all {} images agree",
-    ),
-    "match": ("The image was looked at", "Both images are tied together", "All {} images are tied together"),
+    "check": (_LOOKED_AT, "The cameras of both images agree", "The cameras of all {} images agree"),
+    "match": (_LOOKED_AT, "Both images are tied together", "All {} images are tied together"),
 }
 """Kind of a run -> what is said of one, two and more images of which all is well."""
 _CONTROL_WORDS = {
@@ -190,11 +187,9 @@ def _control_reasons(run: Run) -> list[str]:
     """Name ground points that were cut, what was left out of their files, a reference of no use."""
     out = []
     if run.reference is not None and run.adjustment is not None and run.reference.control is None:
-        whys = (
-            "another place, too old, or without texture"
-            if all(view.peak < PEAK for view in run.reference.views)
-            else "the DEM under it is of another place, or it is too old or too coarse"
-        )
+        whys = "the DEM under it is of another place, or it is too old or too coarse"
+        if all(view.peak < PEAK for view in run.reference.views):
+            whys = "another place, too old, or without texture"
         out.append(f"The reference {run.reference.refusal}: {whys}. It was not used, and moved nothing.")
     out += _bends(run) + _wrong_heights(run)
     heights = None if run.adjustment is None else run.adjustment.altimetry
@@ -227,9 +222,7 @@ def _control_reasons(run: Run) -> list[str]:
 
 
 def _wrong_heights(run: Run) -> list[str]:
-    """Say that a reference's points lie off each other along the lines of sight, where the terrain's errors move
-    them.
-    """
+    """Say that a reference's points lie off each other along the lines of sight, as the terrain's errors move them."""
     if run.reference is None or run.adjustment is None:
         return []
     stated = run.adjustment.options.dem_sigma
@@ -245,9 +238,7 @@ def _wrong_heights(run: Run) -> list[str]:
 
 
 def _bends(run: Run) -> list[str]:
-    """Name images in which a reference's points lie farther off each other than finding them leaves: a pixel at
-    most.
-    """
+    """Name images in which a reference's points lie off each other by more than a pixel, which finding them leaves."""
     if run.reference is None:
         return []
     step = run.reference.step
@@ -286,10 +277,6 @@ def _torn(tested: ControlTest) -> list[str]:
         f"Held by the GCPs the images would agree less with each other: {without:.3f} px became {held:.3f} px at tie "
         "points that took no part. None of the GCPs was used: check coordinates, image positions and stated accuracies."
     ]
-
-
-def _are(some: Sequence[object]) -> str:
-    return "is" if len(some) == 1 else "are"
 
 
 def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
@@ -339,7 +326,8 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         seen = f"{np.hypot(*image):.2f} px in the images"
         if np.isfinite(ground).all():
             seen += f" and {_lengths(ground)} on the ground (east, north, up)"
-        met = f"{counted(len(run.check_points.names), 'check point')}, not used above, {_are(run.check_points.names)}"
+        num = len(run.check_points.names)
+        met = f"{counted(num, 'check point')}, not used above, {'is' if num == 1 else 'are'}"
         if np.isfinite(image).all():
             lines.append(f"{met} met to {seen} (RMS).")
         else:
@@ -387,10 +375,8 @@ def _jitter_lines(views: Sequence[ViewEntry]) -> list[str]:
             "along the epipolar lines: control points, a DEM or a reference do."
         )
     if stepping := [one for one in found if one.detectors]:
-        most, size = (
-            max(len(one.detectors or ()) for one in stepping),
-            median([one.detector_px for one in stepping]),
-        )
+        most = max(len(one.detectors or ()) for one in stepping)
+        size = median([one.detector_px for one in stepping])
         lines.append(
             f"Detectors begin at up to {counted(most, 'column')} of an image, {size:.2f} px RMS apart."
         )

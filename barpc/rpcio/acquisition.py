@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from barpc.errors import BarpcError
-from barpc.remote import Place, Remote, is_url
+from barpc.remote import Place, is_url
 from barpc.rpcio.formats import files_of
 from barpc.sidefile import RPC_FILE, read_head
 
@@ -95,7 +95,7 @@ def _time(text: bytes) -> str:
 
 def _texts(image: Place, camera: Place) -> Iterator[bytes]:
     """Yield how the file of the camera and the metadata beside an image begin; nothing of images elsewhere."""
-    if isinstance(image, Remote) or isinstance(camera, Remote):
+    if not (isinstance(image, Path) and isinstance(camera, Path)):
         return
     product = image.stem[4:]
     wanted = [f"{image.stem}.imd", f"{image.stem}.xml", f"{image.stem}_metadata.json"]

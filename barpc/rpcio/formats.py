@@ -11,9 +11,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
+from barpc import remote
 from barpc.atomic import write_text
 from barpc.errors import InputError, RpcFormatError
-from barpc.remote import Place, Remote
+from barpc.remote import Place
 from barpc.rpcio import text, xml
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.images import rpc_vrt, write_rpc_copy, write_rpc_nitf
@@ -127,7 +128,7 @@ def write_camera(
     place = Path(path if place is None else place)
     row = row_of(place)
     if isinstance(row, Carrier):
-        row.write(rpc, image if isinstance(image, Remote) else Path(image), Path(path), place, overwrite)
+        row.write(rpc, remote.place(image), Path(path), place, overwrite)
     else:
         write_text(path, _writer(place, None)(rpc), overwrite=overwrite)
 

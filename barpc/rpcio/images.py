@@ -22,7 +22,7 @@ from rasterio.windows import Window
 from barpc.atomic import replacing, write_text
 from barpc.errors import ImageError, OutputError
 from barpc.raster import Mosaic, identify, open_raster
-from barpc.remote import Place, Remote
+from barpc.remote import Place, here
 from barpc.rpcio.text import nitf_record
 from barpc.rpcio.tiff import printable, put_tag
 from barpc.rpcio.xml import rpc_domain
@@ -157,7 +157,7 @@ def write_rpc_copy(
 
 
 def _copy_bytes(source: Path | str, target: Path) -> None:
-    if not isinstance(source, Remote):
+    if here([source]):
         shutil.copyfile(source, target)
         return
     with opened(source, IMAGE) as file, target.open("wb") as copy:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from barpc.errors import BarpcError, ImageError, MissingRpcError, RpcError, RpcFormatError
 from barpc.raster import driver_of, identify, open_raster
-from barpc.remote import Place, Remote, beside, place
+from barpc.remote import Place, beside, place
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.formats import FORMATS, files_of, holds_physical, parse
 from barpc.rpcio.text import decode, read_nitf
@@ -55,7 +55,7 @@ def sidecars(image: Path | str) -> list[Sidecar]:
     for kind, name, before_tag in _names(image.name):
         found_name = present.get(name.lower())
         path = image.parent / (found_name or "")
-        if found_name in (None, image.name) or not (isinstance(path, Remote) or path.is_file()):
+        if found_name in (None, image.name) or not path.is_file():
             continue
         if kind in ("xml", "dimap", "pam") and not _holds_rpc(path, kind):
             continue

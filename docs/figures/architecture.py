@@ -18,7 +18,7 @@ OUT = Path(__file__).with_suffix(".svg")
 JOURNEYS = {
     "images -> files": (
         ("pipeline/run.py", "adjust", "paths"),
-        ("pipeline/views.py", "load_views", "paths -> views with cameras"),
+        ("pipeline/loading.py", "load_views", "paths -> views with cameras"),
         ("tie/tracks.py", "find_tracks", "views -> tracks"),
         ("ba/adjustment.py", "adjust_tracks", "tracks -> cameras P_BA"),
         ("fit/rpc.py", "fit_rpc", "P_BA -> RPC and its certificate"),

@@ -16,7 +16,7 @@ from barpc.ba.judging.snooping import CRITICAL, ControlTest, _together
 from barpc.geodesy import ecef_from_ground, enu_basis, metres_per_unit
 from barpc.options import RunOptions
 from barpc.report import Run, summarize
-from barpc.report.summary import GcpEntry
+from barpc.report.summary.known import GcpEntry
 from barpc.scene import GroundPoints
 from barpc.sensor.geometry import sight_enu, triangulate
 from barpc.simulate import Block, simulate_block

@@ -15,8 +15,7 @@ from rasterio.windows import Window
 
 from barpc.cameras import Camera, open_camera
 from barpc.cli import convert as module
-from barpc.cli.convert import _check, _shadow_reasons, _tell, _window, check_target
-from barpc.cli.crops import box_of, window_of
+from barpc.cli.convert import _check, _shadow_reasons, _tell, _window, box_of, check_target, window_of
 from barpc.errors import InputError, OutputError
 from barpc.fit.certificate import Sample
 from barpc.handoff import Reading

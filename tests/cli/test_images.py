@@ -13,7 +13,7 @@ import pytest
 import rasterio
 
 from barpc.cli import main
-from barpc.cli.images import corrected, expanded, read_config, with_cameras
+from barpc.cli.specs import corrected, expanded, read_config, with_cameras
 from barpc.errors import BarpcError, InputError
 from barpc.raster import open_raster
 from barpc.rpcio import WRITABLE, read_rpc, write_rpc, write_rpc_copy

@@ -276,7 +276,7 @@ def doctor(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """An installation of made-up versions and checks."""
     checks: dict[str, Any] = {"add": lambda: "2"}
     monkeypatch.setattr(module, "_CHECKS", checks)
-    monkeypatch.setattr(module, "_REQUIRED", ["numpy"])
+    monkeypatch.setattr(module, "_REQUIRED", "numpy")
     monkeypatch.setattr(module, "_OPTIONAL", {"jinja2": "report"})
     missing: set[str] = set()
 

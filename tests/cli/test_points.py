@@ -10,8 +10,8 @@ import click
 import numpy as np
 import pytest
 
-from barpc.cli import points as module
-from barpc.cli.points import _print_points, _tell_failures, given_points
+from barpc.cli import project as module
+from barpc.cli.project import _print_points, _tell_failures, given_points
 from barpc.errors import InputError
 from barpc.rpcio import write_rpc
 from barpc.sensor.rpc import RPC
@@ -112,7 +112,7 @@ def test_points_are_printed_with_their_digits(
     values = np.array([[1 / 3, 2.0], [np.nan, -2 / 3]])
     _print_points(("a", "b"), values, (6, 3))
     assert capsys.readouterr().out == "a,b\n0.333333,2.000\nnan,-0.667\n"
-    monkeypatch.setattr("barpc.cli.points.wants_json", lambda: True)
+    monkeypatch.setattr("barpc.cli.project.wants_json", lambda: True)
     _print_points(("a", "b"), values, (6, 3))
     assert json.loads(capsys.readouterr().out) == [{"a": 0.333333, "b": 2.0}, {"a": None, "b": -0.667}]
 

@@ -12,7 +12,8 @@ import pytest
 
 from barpc.cli import terminal
 from barpc.cli.terminal import Formatter, layout, output_width, print_comparison, print_summary, tell_gate
-from barpc.report.summary import DATUM, GCPS, DatumEntry
+from barpc.report.summary.known import GCPS
+from barpc.report.summary.whole import DATUM, DatumEntry
 from tests.report.made import a_gcp, a_pair, a_summary, a_view
 
 NUMBERS = [["image", "error [px]", "tie points"], ["a", "0.5", "12"], ["bb", "10.25", "3"]]

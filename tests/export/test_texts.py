@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from barpc.errors import InputError
-from barpc.export import catalogue, neural, scene, stereo
+from barpc.export import catalogue, neural, stereo
+from barpc.export import shots as scene
 from barpc.export.approx import Sampled
-from barpc.export.scene import Scene, link, pairs_of, read_scene
+from barpc.export.shots import Scene, link, pairs_of, read_scene
 from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.rpcio import read_rpc
 from barpc.rpcio.acquisition import Light

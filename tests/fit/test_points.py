@@ -10,7 +10,7 @@ import pytest
 from barpc.errors import FitError
 from barpc.fit import FitOptions, fit_rpc_points
 from barpc.geodesy import Array
-from barpc.pointio.ground import read_correspondences
+from barpc.pointio.correspondences import read_correspondences
 from barpc.rpcio import read_rpc
 from tests.fit.cameras import Camera, random_points, synthetic
 

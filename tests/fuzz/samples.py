@@ -19,9 +19,9 @@ from barpc.ba import BlockPrior
 from barpc.ba.estimated.priors import CameraPrior
 from barpc.ba.held.incremental import apply_prior
 from barpc.cameras import open_camera
-from barpc.cli.images import read_config
-from barpc.cli.options import image_paths
-from barpc.cli.points import given_points
+from barpc.cli.flags import image_paths
+from barpc.cli.project import given_points
+from barpc.cli.specs import read_config
 from barpc.cli.terminal import print_comparison
 from barpc.dem import Dem
 from barpc.errors import RpcError
@@ -29,7 +29,7 @@ from barpc.export import export_run
 from barpc.frozen import from_arrays, load_npz, to_arrays
 from barpc.options import read_options
 from barpc.pipeline.inputs import read_pairs
-from barpc.pointio.ground import read_correspondences, read_gcps
+from barpc.pointio.correspondences import read_correspondences, read_gcps
 from barpc.pointio.matches import read_matches
 from barpc.report.compare import compare_runs
 from barpc.report.page import report_html

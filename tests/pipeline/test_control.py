@@ -12,7 +12,7 @@ from barpc.errors import InputError
 from barpc.options import RunOptions, TieOptions
 from barpc.pipeline import control
 from barpc.pipeline.control import load_gcps
-from barpc.pointio.ground import GROUND_SIGMA, IMAGE_SIGMA
+from barpc.pointio.correspondences import GROUND_SIGMA, IMAGE_SIGMA
 from barpc.scene import GroundPoints, View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.simulate import simulate_block
@@ -301,8 +301,8 @@ def test_without_files_there_are_no_points() -> None:
 def test_ten_names_are_listed_and_the_others_counted() -> None:
     names = [f"g{n}" for n in range(13)]
     ten = ", ".join(names[:10])
-    assert [control._listed(names[:count]) for count in (1, 2, 10)] == ["g0", "g0, g1", ten]
-    assert [control._listed(names[:count]) for count in (11, 13)] == [f"{ten} and {n} more" for n in (1, 3)]
+    assert [control.listed(names[:count]) for count in (1, 2, 10)] == ["g0", "g0, g1", ten]
+    assert [control.listed(names[:count]) for count in (11, 13)] == [f"{ten} and {n} more" for n in (1, 3)]
 
 
 class Plain:

@@ -20,8 +20,9 @@ from barpc.cli.main import cli
 from barpc.errors import FitError, ImageError, OutputError
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.options import RunOptions
-from barpc.pipeline import adjust, check, grids
-from barpc.pipeline.grids import CORRECTION, GRID, RESAMPLED, TILES, grid_names, tile_boxes, write_grids
+from barpc.pipeline import adjust, check
+from barpc.pipeline import beyond as grids
+from barpc.pipeline.beyond import CORRECTION, GRID, RESAMPLED, TILES, grid_names, tile_boxes, write_grids
 from barpc.rpcio import read_rpc
 from barpc.rpcio.grids import read_correction
 from barpc.scene import View

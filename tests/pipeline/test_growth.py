@@ -16,7 +16,8 @@ from rasterio.errors import NotGeoreferencedWarning
 from barpc import report
 from barpc.errors import BarpcError
 from barpc.options import RunOptions
-from barpc.pipeline import adjust, load_views, outputs, run, views
+from barpc.pipeline import adjust, load_views, outputs, run
+from barpc.pipeline import loading as views
 from barpc.pointio.matches import write_matches
 from barpc.report import Run
 from barpc.rpcio import formats

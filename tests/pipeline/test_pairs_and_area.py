@@ -13,7 +13,7 @@ from barpc.errors import DisconnectedError, InputError
 from barpc.geodesy import ground_from_ecef
 from barpc.pipeline import RunOptions, adjust
 from barpc.pipeline.inputs import input_files, read_pairs
-from barpc.pipeline.views import load_views
+from barpc.pipeline.loading import load_views
 from barpc.pointio.matches import read_matches
 from barpc.scene import View
 from barpc.sensor.geometry import triangulate

@@ -12,7 +12,7 @@ import pytest
 
 from barpc.errors import InputError
 from barpc.pipeline import proof
-from barpc.pipeline.grids import REOPENED
+from barpc.pipeline.beyond import REOPENED
 from barpc.pipeline.proof import CHANGED, GOOD, MISSING, MOVED, SAME, UNKNOWN, Proved, prove
 from barpc.rpcio import write_rpc
 from tests.rpcio.conftest import make_rpc
@@ -158,7 +158,7 @@ def test_what_holds_no_certified_camera_is_not_opened(camera, tmp_path, name, st
 
 
 def test_a_grid_holds_the_camera_of_its_image_and_tiles_do_not() -> None:
-    from barpc.pipeline.grids import RESAMPLED, TILES
+    from barpc.pipeline.beyond import RESAMPLED, TILES
     from barpc.rpcio.grids import CORRECTION, GRID
 
     for end, holds in (

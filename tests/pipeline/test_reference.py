@@ -13,7 +13,7 @@ from barpc.cli import main
 from barpc.errors import InputError, TiePointError
 from barpc.options import RunOptions
 from barpc.pipeline import adjust
-from barpc.pointio.ground import read_gcps
+from barpc.pointio.correspondences import read_gcps
 from barpc.rpcio import read_rpc
 from tests.pipeline.known import FOLDER, SAMPLES, errors_at_check_points
 from tests.scenes import ImageOptions, Scene

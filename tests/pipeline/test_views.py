@@ -14,8 +14,9 @@ import pytest
 import rasterio
 
 from barpc.errors import ImageError, InputError, RpcError
-from barpc.pipeline import load_views, views
-from barpc.pipeline.views import image_path
+from barpc.pipeline import load_views
+from barpc.pipeline import loading as views
+from barpc.pipeline.loading import image_path
 from barpc.rpcio import write_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC

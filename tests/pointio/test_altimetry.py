@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barpc.errors import InputError
-from barpc.pointio.altimetry import FLAT_SIGMA, HEIGHT_SIGMA, read_altimetry
+from barpc.pointio.laser import FLAT_SIGMA, HEIGHT_SIGMA, read_altimetry
 
 WANTED = [[5.44, 43.25, 120.5], [5.45, 43.26, 130.0]]
 

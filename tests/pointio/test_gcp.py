@@ -10,7 +10,7 @@ import rasterio
 from rasterio.control import GroundControlPoint
 
 from barpc.errors import InputError
-from barpc.pointio.ground import GROUND_SIGMA, IMAGE_SIGMA, read_gcps
+from barpc.pointio.correspondences import GROUND_SIGMA, IMAGE_SIGMA, read_gcps
 
 NAMES = ["left", "right"]
 

@@ -11,7 +11,7 @@ import rasterio
 from rasterio.control import GroundControlPoint
 
 from barpc.errors import InputError
-from barpc.pointio.ground import (
+from barpc.pointio.correspondences import (
     GROUND_SIGMA,
     IMAGE_SIGMA,
     correspondence_kind,

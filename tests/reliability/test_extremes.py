@@ -219,7 +219,7 @@ def test_a_scheme_may_be_written_in_any_case() -> None:
 @pytest.mark.parametrize("reader", ["matches", "gcp", "points", "asp"])
 def test_no_reader_shows_lines_of_a_text_that_is_none_of_its_files(tmp_path, reader) -> None:
     """A link in a folder of somebody else's may lead anywhere that this user may read."""
-    from barpc.pointio.ground import read_correspondences, read_gcps
+    from barpc.pointio.correspondences import read_correspondences, read_gcps
 
     secret = tmp_path / "secret"
     secret.write_text(

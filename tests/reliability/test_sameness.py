@@ -15,8 +15,9 @@ import pytest
 import rasterio
 
 from barpc.errors import BarpcWarning, InputError
-from barpc.pipeline import AdjustResult, RunOptions, adjust, load_views, views
-from barpc.pipeline.views import unique_names
+from barpc.pipeline import AdjustResult, RunOptions, adjust, load_views
+from barpc.pipeline import loading as views
+from barpc.pipeline.loading import unique_names
 from barpc.rpcio import read_rpc, write_rpc_vrt
 from tests.pipeline.known import part
 from tests.scenes import ImageOptions, write_scene

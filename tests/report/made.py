@@ -9,17 +9,10 @@ from xml.etree import ElementTree
 import numpy as np
 
 from barpc.geodesy import Array
-from barpc.report.summary import (
-    SCHEMA,
-    CorrectionEntry,
-    GcpEntry,
-    OffsetEntry,
-    PairEntry,
-    Summary,
-    TablesEntry,
-    TracksEntry,
-    ViewEntry,
-)
+from barpc.report.summary import SCHEMA, Summary, TablesEntry, TracksEntry
+from barpc.report.summary.known import GcpEntry
+from barpc.report.summary.pairs import OffsetEntry, PairEntry
+from barpc.report.summary.views import CorrectionEntry, ViewEntry
 from barpc.report.tables import Observations, RunFiles
 
 _VIEW: dict[str, Any] = {

@@ -16,7 +16,7 @@ from barpc.ba.judging.judge import Finding
 from barpc.ba.judging.moving import Motion
 from barpc.ba.placing import Look
 from barpc.report import verdict
-from barpc.report.summary.causes import _WORDS, _place, explanations, left_entries, strangeness
+from barpc.report.summary.findings import _WORDS, _place, explanations, left_entries, strangeness
 
 NAMES = "west", "east"
 

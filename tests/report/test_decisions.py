@@ -9,8 +9,11 @@ import pytest
 
 from barpc.options import AUTO
 from barpc.report.decisions import control_sentence, decisions, second_attempts
-from barpc.report.summary import AskedEntry, ControlTestEntry, PairEntry, Summary
-from barpc.report.summary.causes import ExplanationEntry, HeldOutEntry, LeftEntry
+from barpc.report.summary import Summary
+from barpc.report.summary.findings import ExplanationEntry, HeldOutEntry, LeftEntry
+from barpc.report.summary.known import ControlTestEntry
+from barpc.report.summary.pairs import PairEntry
+from barpc.report.summary.whole import AskedEntry
 
 
 def said(summary: Summary, **scene: Any) -> str:

@@ -9,7 +9,8 @@ import pytest
 
 from barpc.ba.robust.consensus import TwoGroups
 from barpc.report.reservations import GOOD
-from barpc.report.summary import STATUS_WORDS, measure
+from barpc.report.summary import measure
+from barpc.report.summary.words import STATUS_WORDS
 from barpc.report.verdict import block_verdict
 from tests.lanes import diagonal
 from tests.report.conftest import summarize

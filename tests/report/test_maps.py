@@ -12,9 +12,9 @@ import pytest
 
 from barpc.report import maps
 from barpc.report.maps import Plane, ground_map, residual_cells, residual_panels
-from barpc.report.summary import CheckPointEntry
-from barpc.report.summary.causes import ExplanationEntry
-from barpc.report.summary.scene import MovingEntry
+from barpc.report.summary.findings import ExplanationEntry
+from barpc.report.summary.known import CheckPointEntry
+from barpc.report.summary.whole import MovingEntry
 
 from .made import (
     Drawing,

@@ -13,14 +13,14 @@ from scipy.stats import norm
 from barpc.ba.robust.smooth import SmoothTest
 from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report import Run
-from barpc.report import run as runs
+from barpc.report import outcome as runs
 from barpc.report.decisions import decisions
-from barpc.report.run import ControlResidual, PairTies, pair_ties, triangulate_tracks
-from barpc.report.summary import cell_numbers, measure
-from barpc.report.summary.ground import GcpEntry, measure_control, measure_gcps, measure_reference
+from barpc.report.outcome import ControlResidual, PairTies, pair_ties, triangulate_tracks
+from barpc.report.summary import measure
+from barpc.report.summary.known import GcpEntry, measure_control, measure_gcps, measure_reference
 from barpc.report.summary.place import ce90
-from barpc.report.summary.scene import _asked
-from barpc.report.summary.views import _in_image, rmse_by_view
+from barpc.report.summary.views import _in_image, cell_numbers, rmse_by_view
+from barpc.report.summary.whole import _asked
 from barpc.scene import Tracks
 from barpc.sensor.geometry import epipolar_offset
 from barpc.sensor.splined import RowSpline

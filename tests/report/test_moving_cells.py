@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from barpc.geodesy import ecef_from_ground
-from barpc.report.summary.scene import moving_cells
+from barpc.report.summary.whole import moving_cells
 
 
 def run_of(lonlat: np.ndarray, moves: np.ndarray, cut: np.ndarray, unknown: Any = ()) -> Any:

@@ -17,7 +17,7 @@ from barpc.cli.main import cli
 from barpc.errors import BarpcError, InputError
 from barpc.pipeline import outputs
 from barpc.report import Run, maps, page, records, summarize
-from barpc.report.summary import metres
+from barpc.report.summary.words import metres
 from barpc.report.tables import TABLES, Observations, RunFiles
 from barpc.scene import Tracks
 from tests.lanes import rest_slow

@@ -17,10 +17,10 @@ import barpc
 from barpc.cli.adjust import adjust
 from barpc.cli.main import COMMANDS, cli
 from barpc.options import TieOptions, declared
+from barpc.report.outcome import Run
 from barpc.report.reservations import view_status
-from barpc.report.run import Run
-from barpc.report.summary import STATUS_WORDS
-from barpc.report.summary.reasons import CAUSES, OVERLAP
+from barpc.report.summary.causes import CAUSES, OVERLAP
+from barpc.report.summary.words import STATUS_WORDS
 from barpc.scene import Tracks
 
 from .made import a_view

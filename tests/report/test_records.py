@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import pytest
 
+from barpc.options import schema_of
 from barpc.report import records
 from barpc.report.records import (
     Cell,
@@ -21,22 +22,13 @@ from barpc.report.records import (
     column_of,
     plain,
     said,
-    schema_of,
     table,
     value_of,
 )
-from barpc.report.summary import (
-    SCHEMA,
-    OffsetEntry,
-    PairEntry,
-    ViewEntry,
-    listed,
-    median,
-    metres,
-    published_schema,
-)
-from barpc.report.summary.pairs import medians
-from barpc.report.summary.words import Count, Share, Side, largest, percent
+from barpc.report.summary import SCHEMA, published_schema
+from barpc.report.summary.pairs import OffsetEntry, PairEntry, medians
+from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.words import Count, Share, Side, largest, listed, median, metres, percent
 
 from .made import a_correction, a_pair, a_view
 

@@ -8,22 +8,12 @@ import numpy as np
 import pytest
 
 from barpc.report import charts, page
-from barpc.report.summary import (
-    CenterEntry,
-    CheckPointEntry,
-    DatumEntry,
-    EllipseEntry,
-    FitEntry,
-    ModeEntry,
-    OffsetEntry,
-    ReferenceEntry,
-    ReferenceViewEntry,
-    SceneEntry,
-    SeenEntry,
-    StageEntry,
-    TablesEntry,
-    TracksEntry,
-)
+from barpc.report.summary import StageEntry, TablesEntry, TracksEntry
+from barpc.report.summary.known import CheckPointEntry, ReferenceEntry, ReferenceViewEntry, SeenEntry
+from barpc.report.summary.pairs import OffsetEntry
+from barpc.report.summary.place import EllipseEntry
+from barpc.report.summary.views import CenterEntry, FitEntry
+from barpc.report.summary.whole import DatumEntry, ModeEntry, SceneEntry
 
 from .made import a_correction, a_gcp, a_pair, a_square, a_summary, a_view, files_of, seen
 

@@ -15,7 +15,7 @@ from barpc.ba.robust.consensus import TwoGroups
 from barpc.ba.robust.smooth import SmoothTest
 from barpc.report import reservations
 from barpc.report import verdict as verdicts
-from barpc.report.summary import FitEntry
+from barpc.report.summary.views import FitEntry
 from barpc.report.verdict import block_verdict, view_status
 from barpc.tie.reference import PEAK, Registration, ViewMatch
 from tests.rpcio.conftest import make_rpc

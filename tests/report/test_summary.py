@@ -13,9 +13,11 @@ from barpc import report
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.report import Run
 from barpc.report.decisions import decisions
+from barpc.report.outcome import pair_ties, triangulate_tracks
 from barpc.report.records import Number, plain, said, table
-from barpc.report.run import pair_ties, triangulate_tracks
-from barpc.report.summary import ViewEntry, published_schema, shift_in_image
+from barpc.report.summary import published_schema
+from barpc.report.summary.place import shift_in_image
+from barpc.report.summary.views import ViewEntry
 from barpc.report.tables import read_summary
 from barpc.scene import middle_altitude
 from barpc.sensor.corrected import Corrected

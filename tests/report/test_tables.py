@@ -12,7 +12,7 @@ import pytest
 
 from barpc.errors import InputError
 from barpc.geodesy import ecef_from_ground, enu_basis
-from barpc.report import run as runs
+from barpc.report import outcome as runs
 from barpc.report import summarize
 from barpc.report import tables as modules
 from barpc.report.records import plain

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from barpc.cli import terminal
 from barpc.cli.terminal import layout, print_summary
-from barpc.report.summary import LeftOutEntry, OffsetEntry
-from barpc.report.summary.reasons import CAUSES, Reason
+from barpc.report.summary import LeftOutEntry
+from barpc.report.summary.causes import CAUSES, Reason
+from barpc.report.summary.pairs import OffsetEntry
 
 from .made import a_pair, a_summary, a_view
 

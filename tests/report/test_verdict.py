@@ -16,7 +16,8 @@ from barpc.errors import BarpcWarning
 from barpc.fit import FitOptions
 from barpc.options import RunOptions
 from barpc.report import Run
-from barpc.report.summary import metres, mode_in_words
+from barpc.report.summary.whole import mode_in_words
+from barpc.report.summary.words import metres
 from tests.report.conftest import summarize
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from barpc.errors import RpcError
 from barpc.fit import fit_rpc
-from barpc.pointio.ground import read_grid
+from barpc.pointio.correspondences import read_grid
 from barpc.rpcio import read_rpc
 from barpc.sensor.direct_grid import DirectGrid, linear_axes
 from barpc.simulate.orbit import Look, fly

@@ -15,7 +15,7 @@ from rasterio.transform import rowcol
 from rasterio.warp import transform
 
 from barpc.geodesy import Array
-from barpc.pipeline.views import load_views
+from barpc.pipeline.loading import load_views
 from barpc.scene import View
 from barpc.tie import PairReport, TieOptions, common_tracks, find_tracks, matching, structure
 from barpc.tie.epipolar import frame

@@ -14,7 +14,7 @@ from scipy import ndimage
 from barpc.dem import Dem
 from barpc.errors import InputError
 from barpc.geodesy import metres_per_unit
-from barpc.pipeline.views import load_views
+from barpc.pipeline.loading import load_views
 from barpc.rpcio import read_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC

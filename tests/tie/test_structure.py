@@ -12,7 +12,7 @@ import rasterio
 from scipy import ndimage
 
 from barpc.errors import TiePointError
-from barpc.pipeline.views import load_views
+from barpc.pipeline.loading import load_views
 from barpc.scene import View
 from barpc.tie import (
     Matches,

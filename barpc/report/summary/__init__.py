@@ -1,7 +1,7 @@
 """The summary of a run: what summary.json holds. In here alone stands what a value is, its column, how it is measured.
 
 A new value is a field with what is `said` of it and a line in the function that measures its record; named among the
-columns of a table there, it stands in that, too. A module for each thing: views, pairs, scene, ground points.
+columns of a table there, it stands in that, too. A module for each thing: views, pairs, the whole, known points.
 """
 
 from __future__ import annotations
@@ -14,91 +14,22 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from barpc import __version__
+from barpc.report.outcome import Run
 from barpc.report.records import Number, Record, plain, said
-from barpc.report.run import Run
-from barpc.report.summary.ground import (
-    GCPS,
+from barpc.report.summary.known import (
     CheckPointEntry,
     ControlTestEntry,
     GcpEntry,
-    KnownPoint,
     ReferenceEntry,
-    ReferenceViewEntry,
-    SeenEntry,
     measure_check_points,
     measure_control,
     measure_gcps,
     measure_reference,
 )
-from barpc.report.summary.pairs import OffsetEntry, PairEntry, measure_pairs
-from barpc.report.summary.place import EllipseEntry, shift_in_image
-from barpc.report.summary.scene import (
-    DATUM,
-    AltimetryEntry,
-    AskedEntry,
-    DatumEntry,
-    DemEntry,
-    ModeEntry,
-    SceneEntry,
-    measure_scene,
-    mode_in_words,
-)
-from barpc.report.summary.views import (
-    CELLS,
-    CenterEntry,
-    CorrectionEntry,
-    FitEntry,
-    SourceEntry,
-    ViewEntry,
-    cell_numbers,
-    measure_views,
-)
-from barpc.report.summary.words import ABOVE, STATUS_WORDS, Count, largest, listed, median, metres
-
-__all__ = [
-    "CELLS",
-    "DATUM",
-    "GCPS",
-    "SCHEMA",
-    "STATUS_WORDS",
-    "AltimetryEntry",
-    "AskedEntry",
-    "CenterEntry",
-    "CheckPointEntry",
-    "ControlTestEntry",
-    "CorrectionEntry",
-    "DatumEntry",
-    "DemEntry",
-    "EllipseEntry",
-    "FitEntry",
-    "GcpEntry",
-    "InputEntry",
-    "KnownPoint",
-    "LeftOutEntry",
-    "ModeEntry",
-    "OffsetEntry",
-    "OutputEntry",
-    "PairEntry",
-    "ReferenceEntry",
-    "ReferenceViewEntry",
-    "SceneEntry",
-    "SeenEntry",
-    "SourceEntry",
-    "StageEntry",
-    "Summary",
-    "TablesEntry",
-    "TracksEntry",
-    "ViewEntry",
-    "cell_numbers",
-    "largest",
-    "listed",
-    "measure",
-    "median",
-    "metres",
-    "mode_in_words",
-    "published_schema",
-    "shift_in_image",
-]  # fmt: skip
+from barpc.report.summary.pairs import PairEntry, measure_pairs
+from barpc.report.summary.views import ViewEntry, measure_views
+from barpc.report.summary.whole import SceneEntry, measure_scene
+from barpc.report.summary.words import ABOVE, Count
 
 SCHEMA = 2  # Version of summary.json
 _Plain = float | str | bool | None

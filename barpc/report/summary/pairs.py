@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from barpc.geodesy import Array
+from barpc.report.outcome import Run
 from barpc.report.records import Cell, Column, Number, Record, plain, said
-from barpc.report.run import Run
 from barpc.report.summary.words import Count
 from barpc.scene import IntArray
 from barpc.sensor import SensorModel
@@ -133,9 +133,7 @@ def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
 
 
 def _pair_geometry(run: Run) -> list[list[float]]:
-    """Return the medians over about a hundred of each pair's points: convergence angle [deg], B/H, height of
-    a pixel [m].
-    """
+    """Return the medians over a hundred of each pair's points: angle [deg], B/H, height of a pixel [m]."""
     picks = [slice(None, None, max(1, len(ties.a) // 100)) for ties in run.pairs]
     a, b, pair = _rows(run, picks)
     seen = np.isfinite(run.ground[run.tracks.point[a]]).all(axis=1)

@@ -27,8 +27,7 @@ class EllipseEntry(Record):
 
 
 def shift_in_image(model: Corrected, covariance: Array, unknowns: str, ground: Array) -> tuple[Array, Array]:
-    """Return how far P_BA moves a ground point (3,) near the middle of the image, and the standard deviation
-    of that.
+    """Return how far P_BA moves a ground point (3,) near the image's middle, and that one's deviation.
 
     Parameters
     ----------
@@ -51,9 +50,7 @@ def shift_in_image(model: Corrected, covariance: Array, unknowns: str, ground: A
 
 
 def ellipse(model: Corrected, covariance: Array, unknowns: str, ground: Array) -> EllipseEntry:
-    """Return the standard error ellipse of the place on the ground where P_BA sees a pixel; arguments of
-    `shift_in_image`.
-    """
+    """Return the standard error ellipse of where P_BA sees a pixel on the ground; arguments of `shift_in_image`."""
     _, variance, by_point = _in_image(model, covariance, unknowns, ground)
     return _drawn(variance, by_point @ enu_basis(ground)[:2].T)
 
@@ -83,9 +80,7 @@ def _drawn(variance: Array, by_level: Array) -> EllipseEntry:
 def _in_image(
     model: Corrected, covariance: Array, unknowns: str, ground: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the image (2,) of a ground point, the covariance (2, 2) of that [px^2], its derivative (2, 3) by
-    the point [px/m].
-    """
+    """Return the image (2,) of a ground point, its covariance [px^2], its derivative (2, 3) by the point [px/m]."""
     ecef = ecef_from_ground(ground)
     image, by_point, by_rotation, by_translation = model.project_ecef(ecef)
     distance = np.linalg.norm(ecef - model.correction.center)
@@ -106,8 +101,7 @@ def stated_ce90(view: View) -> float | None:
 
 
 def ce90(major: float, minor: float) -> float:
-    """Return the radius of the circle that holds 90 % of a normal distribution with such standard deviations
-    along its axes.
+    """Return the radius that holds 90 % of a normal distribution with such standard deviations along its axes.
 
     Examples
     --------

@@ -12,10 +12,10 @@ import numpy as np
 from barpc.ba import Adjustment
 from barpc.fit import RpcFit
 from barpc.geodesy import Array
+from barpc.report.outcome import ControlResidual, Run
 from barpc.report.records import Cell, Column, Number, Record, said, value_of
-from barpc.report.run import ControlResidual, Run
+from barpc.report.summary.causes import CAUSES
 from barpc.report.summary.place import EllipseEntry, clocks_in_image, ellipse, shift_in_image, stated_ce90
-from barpc.report.summary.reasons import CAUSES
 from barpc.report.summary.words import (
     ABOVE,
     STATUS_WORDS,

@@ -55,6 +55,11 @@ def median(values: Iterable[float | None]) -> float:
     return float(np.median(found)) if len(found) else float("nan")
 
 
+def known(value: float | None) -> float:
+    """Return a number, NaN where there is none."""
+    return float("nan") if value is None else value
+
+
 def percent(share: float | None) -> float | None:
     """Return a share in percent."""
     return None if share is None else 100 * share

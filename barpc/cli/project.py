@@ -33,12 +33,7 @@ def _points(columns: str) -> Callable[..., Any]:
 @click.argument("numbers", nargs=-1, type=float, metavar="[LON LAT ALT]...")
 @_points("lon, lat, alt")
 @with_heights("Altitude of points without one [m above the ellipsoid].")
-def project(
-    image: str,
-    numbers: tuple[float, ...],
-    points: str | None,
-    heights: Heights,
-) -> int:
+def project(image: str, numbers: tuple[float, ...], points: str | None, heights: Heights) -> int:
     r"""Print the image points (col, row; the first pixel's centre is 0, 0) of ground points.
 
     \b
@@ -65,12 +60,7 @@ def project(
 @with_heights(
     "Altitude of points without one [m].  [default: of the run's tie points, else the middle of the camera's]"
 )
-def localize(
-    image: str,
-    numbers: tuple[float, ...],
-    points: str | None,
-    heights: Heights,
-) -> int:
+def localize(image: str, numbers: tuple[float, ...], points: str | None, heights: Heights) -> int:
     r"""Print the ground points (lon, lat, alt) seen at image points.
 
     \b

@@ -17,7 +17,8 @@ from barpc.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, w
 from barpc.remote import is_url
 from barpc.report.compare import written_rpc
 from barpc.report.reservations import FEW_OBSERVATIONS
-from barpc.report.summary import Summary, ViewEntry
+from barpc.report.summary import Summary
+from barpc.report.summary.views import ViewEntry
 from barpc.report.tables import RunFiles, read_summary, read_tables
 from barpc.rpcio import CARRIERS
 from barpc.rpcio.acquisition import Light, light_of
@@ -121,9 +122,7 @@ class Scene:
         }
 
     def file_names(self, out: Path) -> list[str]:
-        """Return the names of the images for files in `out`: the file names where all lie in one folder, else
-        paths relative to `out`.
-        """
+        """Return the images' names for files in `out`: file names where all lie in one folder, else relative paths."""
         if len({PurePath(shot.file).parent for shot in self.shots}) == 1:
             return [PurePath(shot.file).name for shot in self.shots]
         return [link(shot.file, out) for shot in self.shots]
@@ -169,19 +168,9 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
                 f"{folder / 'summary.json'}: names no RPC file of {view.name} that can be read: run it again"
             )
         rows = counted[starts[number] : starts[number + 1]]
-        camera = None if view.rpc_source is None else view.rpc_source.path
-        carrier = _carrier(folder, view)
-        shots.append(
-            Shot(
-                view,
-                rpc,
-                view.path,
-                carrier,
-                light_of(view.path, camera),
-                order[index[rows]],
-                files.observations.xy[rows],
-            )
-        )
+        light = light_of(view.path, None if view.rpc_source is None else view.rpc_source.path)
+        seen = order[index[rows]], files.observations.xy[rows]
+        shots.append(Shot(view, rpc, view.path, _carrier(folder, view), light, *seen))
     noise = _noise(files, counted)
     return Scene(folder, summary, tuple(shots), files.points[:, :3], files.tracks, alt_range, noise)
 
@@ -214,9 +203,7 @@ def _carrier(folder: Path, view: ViewEntry) -> Path | None:
 
 
 def _noise(files: RunFiles, counted: Any) -> float:
-    """Return the standard deviation [px] of a coordinate: what is left, over the observations that points did
-    not take.
-    """
+    """Return the standard deviation [px] of a coordinate: what is left, over the observations not taken by points."""
     left = files.observations.after[counted]
     left = left[np.isfinite(left).all(axis=1)]
     free = left.size - 3 * len(np.unique(files.observations.track[counted]))
@@ -224,8 +211,7 @@ def _noise(files: RunFiles, counted: Any) -> float:
 
 
 def pairs_of(scene: Scene) -> Sequence[tuple[str, str]]:
-    """Return the pairs that stereo is made of: with an angle that shows heights, of images without
-    reservation; else all.
+    """Return the pairs that stereo is made of: of images without reservation, at an angle that shows heights; else all.
 
     Of those under such an angle: two images that need no look, with enough matches to know it, where there are any.
     """

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -90,9 +90,7 @@ def _read_asp(path: Path, views: ViewNames) -> Iterator[_Point]:
 
 
 def _read_csv(path: Path, views: ViewNames) -> Iterator[_Point]:
-    """Yield a header of column names, then a line for each point and image; what is not stated of sigmas is
-    the default.
-    """
+    """Read a header of column names, then a line for each point and image; sigmas not stated are the default."""
     columns: dict[str, int] = {}
     for number, raw in enumerate(read_text(path, TABLE).splitlines(), start=1):
         if not raw.strip() or raw.lstrip().startswith("#"):
@@ -129,9 +127,7 @@ def _csv_point(name: str, view: int, of: Mapping[str, float]) -> _Point:
 def _gcp_columns(path: Path, words: Sequence[str], views: ViewNames) -> dict[str, int]:
     """Return the column of each quantity; a file of one image need not name it."""
     found = header_of(words, {**_COLUMNS, **_NAMES, **_SIGMAS})
-    needed = [*_COLUMNS, "image"][: len(_COLUMNS) + (len(views.names) > 1)]
-    if missing := [name for name in needed if name not in found]:
-        raise InputError(f"{path}: no column {', '.join(missing)} among the {len(words)} of its first line")
+    require_columns(path, [*_COLUMNS, "image"][: len(_COLUMNS) + (len(views.names) > 1)], found, words)
     for i, word in enumerate(words):
         if i not in found.values() and re.match("sigma|std|stdev|acc|err", word.lower()):
             raise InputError(
@@ -155,9 +151,7 @@ def _names_columns(head: bytes) -> bool:
 
 
 def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Point]:
-    """Yield the features with a 3-D point and the properties `ji` (col, row), `filename` and, perhaps, `id`
-    and sigmas.
-    """
+    """Yield the features with a 3-D point and the properties `ji` (col, row), `filename`, perhaps `id` and sigmas."""
     for (lon, lat, alt, col, row), properties in geojson_points(path, "filename"):
         view = views.find(str(properties["filename"]))
         if view is not None:
@@ -320,6 +314,12 @@ def header_of(words: Sequence[str], names: Mapping[str, Sequence[str]] | None = 
     return found
 
 
+def require_columns(path: Path, needed: Iterable[str], found: Container[str], words: Sequence[str]) -> None:
+    """Raise InputError unless all columns needed were found among the words of a table's first line."""
+    if missing := [name for name in needed if name not in found]:
+        raise InputError(f"{path}: no column {', '.join(missing)} among the {len(words)} of its first line")
+
+
 def _read_table(path: Path) -> Correspondences:
     """Read a text table: columns by commas, semicolons, tabs or blanks; ``#`` begins a comment."""
     rows: list[list[float]] = []
@@ -329,10 +329,7 @@ def _read_table(path: Path) -> Correspondences:
         values = numbers_of(words)
         if not columns and words:
             columns = dict(zip(_COLUMNS, range(5), strict=True)) if values else header_of(words)
-            if missing := [name for name in _COLUMNS if name not in columns]:
-                raise InputError(
-                    f"{path}: no column {', '.join(missing)} among the {len(words)} of its first line"
-                )
+            require_columns(path, _COLUMNS, columns, words)
         elif words and values is None:
             raise InputError(f"{path}, line {number}: expected numbers")
         if values:
@@ -385,8 +382,7 @@ def _read_features(path: Path) -> Correspondences:
 
 
 def geojson_points(path: Path, *needed: str) -> list[tuple[list[float], dict[str, Any]]]:
-    """Return the points of a GeoJSON: lon, lat, alt, col, row (of the property ``ji``, or ``col``, ``row``);
-    properties.
+    """Return the points of a GeoJSON: lon, lat, alt, col, row (property ``ji``, or ``col``, ``row``); properties.
 
     InputError where it is no such file, or has not all properties that are `needed`.
     """

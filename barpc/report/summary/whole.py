@@ -12,9 +12,9 @@ from barpc.ba import Adjustment
 from barpc.ba.altimetry import AltimetryTest
 from barpc.ba.held.gauge import MOTIONS, Mode
 from barpc.geodesy import ground_from_ecef, wrap_longitude
+from barpc.report.outcome import Run
 from barpc.report.records import Column, Number, Record, said
-from barpc.report.run import Run
-from barpc.report.summary.causes import (
+from barpc.report.summary.findings import (
     ExplanationEntry,
     HeldOutEntry,
     LeftEntry,
@@ -211,14 +211,10 @@ def measure_scene(run: Run) -> SceneEntry | None:
     if adjustment is None:
         return None
     gauge, prior, terrain = adjustment.gauge, adjustment.prior, adjustment.terrain
-    datum = [
-        DatumEntry(
-            part,
-            float(gauge.motion_sigma[m]),
-            **{key: float(row[m]) for key, row in adjustment.datum.items()},
-        )
-        for m, part in enumerate(MOTIONS)
-    ]
+    datum = []
+    for m, part in enumerate(MOTIONS):
+        shares = {key: float(row[m]) for key, row in adjustment.datum.items()}
+        datum.append(DatumEntry(part, float(gauge.motion_sigma[m]), **shares))
     modes = [ModeEntry(m.sigma, m.meaning, m.motion.tolist(), mode_in_words(m)) for m in gauge.modes]
     return SceneEntry(
         shift_enu_m=gauge.shift.tolist(),
@@ -273,9 +269,7 @@ def mode_in_words(mode: Mode) -> str:
 
 
 def moving_cells(run: Run) -> tuple[MovingEntry, ...]:
-    """Return the cells of the ground of which tie points move, from south to north and west to east; all
-    groups together.
-    """
+    """Return the cells of the ground whose tie points move, south to north, west to east; all groups together."""
     found = run.adjustment
     if found is None or not found.moving.any():
         return ()

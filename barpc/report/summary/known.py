@@ -10,8 +10,8 @@ from scipy.special import ndtr
 
 from barpc.ba import check_residuals
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.report.outcome import ControlResidual, Run
 from barpc.report.records import Column, Number, Record, said
-from barpc.report.run import ControlResidual, Run
 from barpc.report.summary.words import ABOVE, Count, Pixel, Vector
 from barpc.scene import IntArray
 
@@ -172,12 +172,7 @@ def measure_gcps(run: Run) -> tuple[GcpEntry, ...]:
         status = "not seen" if not images else "used" if tested is None else tested.status(g)
         entries.append(
             GcpEntry(
-                name,
-                lon,
-                lat,
-                alt,
-                sigma,
-                left[g].tolist(),
+                *(name, lon, lat, alt, sigma, left[g].tolist()),
                 used=status in ("used", "contradicts"),
                 status=status,  # type: ignore[arg-type]  # one of these words
                 images=images,
@@ -216,9 +211,7 @@ def _grouped(index: IntArray, num: int) -> list[IntArray]:
 
 
 def _in_images(run: Run, given: Array, views: IntArray, residual: Array) -> float:
-    """Return how far a residual (3,), east, north, up [m], of a ground point moves it in the images that show
-    it, RMS [px].
-    """
+    """Return how far a residual (3,), east, north, up [m], moves a ground point in its images, RMS [px]."""
     if run.after is None or not np.isfinite(residual).all():
         return float("nan")
     moved = ground_from_ecef(ecef_from_ground(given) + residual @ enu_basis(given))
@@ -238,25 +231,17 @@ def measure_reference(run: Run) -> ReferenceEntry | None:
         rows = adjustment.reference_inlier
         kept = np.bincount(control.points.view[rows], minlength=len(run.views))
         points = len(np.unique(control.points.point[rows]))
-    views = tuple(
-        ReferenceViewEntry(
-            name=view.name,
-            peak=view.peak,
-            offset_en_m=view.offset if view.points else None,
-            num_tried=view.tried,
-            num_passed=view.passed,
-            num_points=int(count),
-            scatter_m=view.scatter,
+    views = []
+    for view, count in zip(found.views, kept.tolist(), strict=True):
+        offset = view.offset if view.points else None
+        views.append(
+            ReferenceViewEntry(view.name, view.peak, offset, view.tried, view.passed, count, view.scatter)
         )
-        for view, count in zip(found.views, kept, strict=True)
-    )
-    return ReferenceEntry(points > 0, found.step, found.sigma, points, views)
+    return ReferenceEntry(points > 0, found.step, found.sigma, points, tuple(views))
 
 
 def measure_check_points(run: Run) -> tuple[CheckPointEntry, ...]:
-    """Return the points that stayed out of the adjustment: image residuals of each observation, and the
-    ground error.
-    """
+    """Return the points that stayed out of the adjustment: residuals in images, and the ground error."""
     points = run.check_points
     if points is None:
         return ()

@@ -6,12 +6,12 @@ import json
 import logging
 import shutil
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -112,22 +112,37 @@ def write_grids(
 Task = tuple[View, RPC, SensorModel, Files]
 
 
+def made_in_room(
+    run: Workspace,
+    executor: Executor,
+    make: Callable[..., Any],
+    tasks: Sequence[Any],
+    what: str,
+    progress: Progress | None,
+) -> list[Any]:
+    """Make files of views by workers in a room of the run folder, and give them their places here.
+
+    `make` takes a task, which begins with its view, and the room; it gives the names of the files, which lie there in
+    a folder called as the view.
+    """
+    room = run.partial / what
+    try:
+        made = ordered(executor, make, [(*task, str(room)) for task in tasks], what, progress)
+        for (view, *_), names in zip(tasks, made, strict=True):
+            for name in names:
+                with run.output(name) as partial:
+                    (room / view.name / name).replace(partial)
+    finally:
+        shutil.rmtree(room, ignore_errors=True)
+    return made
+
+
 def _write(
     run: Workspace, tasks: Sequence[Task], executor: Executor | None, progress: Progress | None
 ) -> list[Written]:
-    """Write grids: workers make the files in a folder of the run, they take their places here, and workers
-    open them again.
-    """
-    room = run.partial / "grids"
+    """Write grids, and open them again."""
     with CachingExecutor(run, {}, executor, keep=False) as fresh:
-        try:
-            made = ordered(fresh, make_grids, [(*task, str(room)) for task in tasks], "grids", progress)
-            for (view, *_), errors in zip(tasks, made, strict=True):
-                for name in errors:
-                    with run.output(name) as partial:
-                        (room / view.name / name).replace(partial)
-        finally:
-            shutil.rmtree(room, ignore_errors=True)
+        made = made_in_room(run, fresh, make_grids, tasks, "grids", progress)
         again = [
             (view, model, errors, str(run.folder))
             for (view, _, model, _), errors in zip(tasks, made, strict=True)
@@ -144,9 +159,7 @@ def _write(
 
 
 def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str) -> Misses:
-    """Write the grids of a view, and its resampled image, into a temporary folder; return how far each misses
-    the model [px].
-    """
+    """Write the grids of a view, and its image resampled, into a temporary folder; return what each misses by [px]."""
     place, alts = Path(room) / view.name, widened(view.alt_range)
     place.mkdir(parents=True, exist_ok=True)
     sample, errors = Sample.of(model, view.size, alts), Misses()
@@ -198,9 +211,8 @@ def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss
     if not found:
         assert failed is not None
         raise failed
-    rms, largest, where, best, lacking = min(
-        found, key=lambda row: row[0]
-    )  # the largest is a step's, if there is one
+    # the largest is a step's, if there is one
+    rms, largest, where, best, lacking = min(found, key=lambda row: row[0])
     return replace(best, err_bias=rpc.err_bias, err_rand=rpc.err_rand), lacking, (rms, largest, where)
 
 
@@ -236,9 +248,7 @@ def verify_grids(view: View, model: SensorModel, errors: Misses, folder: str) ->
 
 
 def tile_boxes(size: tuple[int, int], side: int) -> list[Box]:
-    """Return the tiles (col, row, width, height) from multiples of `side` on; a rest of up to half a side
-    joins its neighbour.
-    """
+    """Return the tiles (col, row, width, height); a rest of up to half a `side` joins its neighbour."""
     edges = [[*range(0, max(1, length - side // 2), side), length] for length in size]
     return [(c, r, right - c, low - r) for r, low in pairwise(edges[1]) for c, right in pairwise(edges[0])]
 
@@ -269,10 +279,8 @@ def _write_tiles(
         raise FitError(f"{view.name}, {error}") from error
     errors, rows = [], []
     for box, tile in zip(boxes, fits, strict=True):
-        name, known = (
-            tile_name(view, box),
-            replace(tile.rpc, err_bias=fit.rpc.err_bias, err_rand=fit.rpc.err_rand),
-        )
+        name = tile_name(view, box)
+        known = replace(tile.rpc, err_bias=fit.rpc.err_bias, err_rand=fit.rpc.err_rand)
         with run.output(name) as partial:
             write_rpc(known, partial, format="txt", overwrite=True)
             errors.append(float(np.linalg.norm(tile.as_written(read_rpc(partial)).max_ckp)))

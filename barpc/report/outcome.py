@@ -246,8 +246,7 @@ def _whole_shift(ties: PairTies, tracks: Tracks) -> Array | None:
 def triangulate_tracks(
     tracks: Tracks, sensors: Sequence[SensorModel], alt: float, keep: BoolArray
 ) -> Triangulation:
-    """Return all tracks intersected through given cameras from the observations (K,) that count, from
-    altitude `alt` [m] on.
+    """Return all tracks intersected through given cameras from the observations (K,) that count, starting at `alt` [m].
 
     The residuals of the others are measured against the same points; a track with fewer than two observations that
     count is NaN.

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from barpc.errors import InputError
-from barpc.pointio.ground import cells_of, header_of, numbers_of
+from barpc.pointio.correspondences import cells_of, header_of, numbers_of, require_columns
 from barpc.scene import Altimetry
 from barpc.sidefile import TABLE, read_text
 
@@ -35,8 +35,7 @@ COLUMNS = {
 
 
 def read_altimetry(path: Path | str) -> Altimetry:
-    """Read the heights of a text: a header that names columns, or lines of lon, lat, alt and perhaps sigma
-    and sigma_flat.
+    """Read the heights of a text: a header that names columns, or lines of lon, lat, alt, perhaps sigma, sigma_flat.
 
     Cells between commas, semicolons, tabs or blanks. Lines whose height is blank, no number or a fill value are left
     out. InputError where a line does not parse, a place is none in degrees, or no height is left.
@@ -49,8 +48,9 @@ def read_altimetry(path: Path | str) -> Altimetry:
             continue
         if not columns:
             delimiter = next((sign for sign in "\t;," if sign in raw), " ")
-            columns = _columns(path, raw)
-            if numbers_of(cells_of(raw, delimiter)[:3]) is None:
+            words = cells_of(raw, delimiter)
+            columns = _columns(path, words)
+            if numbers_of(words[:3]) is None:
                 continue
         try:
             row = cells_of(raw, delimiter)
@@ -63,17 +63,12 @@ def read_altimetry(path: Path | str) -> Altimetry:
     return _checked(path, columns, rows)
 
 
-def _columns(path: Path, line: str) -> dict[str, int]:
-    """Return the column of each quantity by the first line: its names, or the order lon, lat, alt, sigma,
-    sigma_flat.
-    """
-    delimiter = next((sign for sign in "\t;," if sign in line), " ")
-    words = cells_of(line, delimiter)
+def _columns(path: Path, words: Sequence[str]) -> dict[str, int]:
+    """Return each quantity's column by the first line: its names, or the order lon, lat, alt, sigma, sigma_flat."""
     if numbers_of(words[:3]) is not None and 3 <= len(words) <= len(COLUMNS):
         return dict(zip(COLUMNS, range(len(words)), strict=False))
     found = header_of(words, COLUMNS)
-    if missing := [name for name in ("lon", "lat", "alt") if name not in found]:
-        raise InputError(f"{path}: no column {', '.join(missing)} among the {len(words)} of its first line")
+    require_columns(path, ("lon", "lat", "alt"), found, words)
     return found
 
 

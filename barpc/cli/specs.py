@@ -21,8 +21,7 @@ _DEEP = 40  # levels of a configuration
 
 
 def expanded(specs: Sequence[str]) -> list[str]:
-    """Return files instead of folders (their rasters, by name; a radar product is one) and of patterns that no shell
-    took.
+    """Return files instead of folders (their rasters; a radar product is one) and of patterns that no shell took.
 
     InputError for an empty name, a folder that holds no raster, a pattern that finds nothing.
     """
@@ -85,8 +84,7 @@ def _is_raster(path: Path) -> bool:
 
 
 def with_cameras(images: Sequence[str], named: Sequence[str]) -> list[str]:
-    """Return images with the cameras that IMAGE=FILE names for them; IMAGE is a path as given, a file's name, or its
-    stem.
+    """Return images with the cameras that IMAGE=FILE names for them; IMAGE: a path as given, a file's name, its stem.
 
     InputError for a text that names none of the images, several of them, or one for the second time.
     """
@@ -267,13 +265,12 @@ def _as_image(item: Item, hosts: Sequence[str], path: Path) -> Any:
 
 
 def corrected(config: Config, folder: Path, views: Sequence[Any]) -> str:
-    """Return the configuration as a text for the folder of a run, with the corrected cameras of its images (in their
-    order).
+    """Return the configuration as a text for the folder of a run, with the corrected cameras of its images in order.
 
     What names files relative to where it lay names them from there.
     """
     from barpc.export.neural import as_json
-    from barpc.export.scene import link
+    from barpc.export.shots import link
     from barpc.export.stereo import yaml
     from barpc.rpcio import WRITABLE
 
@@ -304,7 +301,7 @@ def _moved(value: Any, before: Path, now: Path, depth: int = 0) -> Any:
     if isinstance(value, date):
         return value.isoformat()
     if isinstance(value, str) and value.strip(".") and "\0" not in value and not Path(value).is_absolute():
-        from barpc.export.scene import link
+        from barpc.export.shots import link
 
         with suppress(OSError):
             return link(before / value, now) if os.path.lexists(before / value) else value

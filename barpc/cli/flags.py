@@ -18,30 +18,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 REMOTE = "allow_remote"
 _ALL = "barpc.help_all"  # key of a context whose help shows every flag
-TIE = (
-    "tie.band",
-    "tie.matcher",
-    "matches",
-    "matches_only",
-    "overlap_list",
-    "aoi",
-)
-CAMERA = (
-    "adjust.model",
-    "adjust.drift",
-    "adjust.jitter",
-    "adjust.fixed",
-)
-GROUND = (
-    "gcp",
-    "altimetry",
-    "check_points",
-    "fixed_run",
-    "dem",
-    "adjust.dem_for_weak",
-    "geoid",
-    "reference",
-)
+TIE = ("tie.band", "tie.matcher", "matches", "matches_only", "overlap_list", "aoi")
+CAMERA = ("adjust.model", "adjust.drift", "adjust.jitter", "adjust.fixed")
+GROUND = ("gcp", "altimetry", "check_points", "fixed_run", "dem", "adjust.dem_for_weak", "geoid", "reference")
 ADJUSTMENT = (*CAMERA, *GROUND)
 MATCH = ("overwrite", "keep_going")
 RUN = (*MATCH, "images", "rpc_formats", "grids", "tiles", "resample")
@@ -139,28 +118,16 @@ def flag(target: str) -> Callable[[Function], Function]:
     def complete(_context: click.Context, _parameter: click.Parameter, begun: str) -> list[str]:
         return [choice for choice in choices if choice.startswith(begun)]
 
-    metavar = (
-        ("NAMES" if several else "NAME")
-        if rule.rows
-        else f"[{listed}]"
-        if listed
-        else (rule.unit or kind.__name__).upper()
-    )
+    metavar = f"[{listed}]" if listed else (rule.unit or kind.__name__).upper()
+    if rule.rows:
+        metavar = "NAMES" if several else "NAME"
     notes = [f"default: {_shown(one.default)}"] if one.default not in (None, ()) else []
     if kind in (int, float) and (bounds := replace(rule, unit="").bounds()):
         notes.append(bounds.strip())
     how = " Names of 'barpc convert --help', commas between." if rule.rows else " (repeatable)"
     text = rule.help + (how if several else "") + (f"  [{'; '.join(notes)}]" if notes else "")
-    repeats = several and not rule.rows
-    return click.option(
-        name,
-        parameter,
-        help=text,
-        metavar=metavar,
-        callback=convert,
-        multiple=repeats,
-        shell_complete=complete,
-    )
+    how_given: dict[str, Any] = {"multiple": several and not rule.rows, "shell_complete": complete}
+    return click.option(name, parameter, help=text, metavar=metavar, callback=convert, **how_given)
 
 
 def _shown(default: Any) -> str:
