@@ -1,0 +1,65 @@
+"""Many cameras at once give what each gives alone."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from barpc.rpcio import read_rpc
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.geometry import camera_center, camera_centers
+from barpc.sensor.stack import localize
+from barpc.simulate import simulate_block
+from tests.sensor.test_rpc import VENDORS, box
+
+
+@pytest.fixture(scope="module")
+def sensors():
+    """RPCs on both sides of the antimeridian; one with a pole in its box; one that is no RPC."""
+    views = [view.sensor for view in simulate_block(6, 0, num_checks=0, lon=179.99).views]
+    bent = views[2].coeffs.copy()
+    bent[1, 1] = 2.0
+    views[2] = type(views[2])(bent, *(getattr(views[2], name) for name in (
+        "ground_offset", "ground_scale", "image_offset", "image_scale")))  # fmt: skip
+    views[4] = Corrected(views[4], Correction(np.full(3, 1e-5), np.zeros(3), np.array([4e6, 4e5, 5e6])))
+    return views
+
+
+@pytest.mark.parametrize("reach", [1.0, 3.0])
+@pytest.mark.parametrize("counts", [(5, 0, 40, 7, 3, 60), (0, 0, 0, 1, 0, 0), (1500, 1, 1, 0, 9000, 2)])
+def test_ground_points_are_those_of_each_camera(sensors, counts, reach):
+    rng, bounds = np.random.default_rng(1), np.cumsum([0, *counts])
+    image, alt = (
+        10_000 + reach * rng.uniform(-10_000, 10_000, (bounds[-1], 2)),
+        rng.uniform(0, 900, bounds[-1]),
+    )
+    with np.errstate(all="ignore"):
+        found = localize(sensors, image, alt, bounds)
+        parts = [slice(*ends) for ends in pairwise(bounds)]
+        alone = [one.localize(image[part], alt[part]) for one, part in zip(sensors, parts, strict=True)]
+    np.testing.assert_allclose(found, np.concatenate(alone), rtol=0, atol=2e-12)
+
+
+def test_nothing_is_asked_of_no_camera():
+    assert localize([], np.zeros((0, 2)), np.zeros(0), np.zeros(1, dtype=np.int64)).shape == (0, 3)
+    assert camera_centers([], [], []) == []
+
+
+def test_centres_are_those_of_each_camera(sensors):
+    some = [sensors[i] for i in (0, 1, 4)]
+    found = camera_centers(some, [(20_000, 19_000)] * 3, [(0.0, 1000.0)] * 3)
+    for sensor, one in zip(some, found, strict=True):
+        alone = camera_center(sensor, (20_000, 19_000), (0.0, 1000.0))
+        np.testing.assert_allclose(one.ecef, alone.ecef, rtol=0, atol=1e-3)
+        assert one.method == alone.method == "line"
+
+
+def test_vendors_cameras_are_met_far_from_their_boxes(shared_data):
+    rpcs = [read_rpc(shared_data / file) for file in VENDORS]
+    image, alt = map(np.concatenate, zip(*(box(rpc, 3.0, 200) for rpc in rpcs), strict=True))
+    with np.errstate(all="ignore"):
+        found = localize(rpcs, image, alt, 200 * np.arange(len(rpcs) + 1))
+        alone = [rpc.localize(image[200 * n :][:200], alt[200 * n :][:200]) for n, rpc in enumerate(rpcs)]
+    np.testing.assert_allclose(found, np.concatenate(alone), rtol=0, atol=1e-12)
