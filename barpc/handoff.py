@@ -350,9 +350,8 @@ def _keywords(path: Path) -> Projection:
     if pairs["type"].strip() != "ossimRpcModel" or pairs["polynomial_format"].strip() != "B":
         raise OutputError("type or polynomial_format is not what OSSIM expects")
     axes, sets = ("line", "samp", "lat", "long", "height"), ("line_num", "line_den", "samp_num", "samp_den")
-    values: dict[str, Any] = {
-        key: float(pairs[key]) for axis in axes for key in (f"{axis}_off", f"{axis}_scale")
-    }
+    keys = (f"{axis}_{what}" for axis in axes for what in ("off", "scale"))
+    values: dict[str, Any] = {key: float(pairs[key]) for key in keys}
     for key in (f"{name}_coeff" for name in sets):
         values[key] = [float(pairs[f"{key}_{i:02d}"]) for i in range(20)]
     return _transformer(rasterio.rpc.RPC(**values))

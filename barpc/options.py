@@ -719,9 +719,9 @@ def schema_of(kind: Any, rule: Rule = _FREE) -> dict[str, Any]:
         return _either([schema_of(part, rule) for part in parts])
     if (of_record := getattr(kind, "json_schema", None)) is not None:
         return dict(of_record())
-    ends = ("minimum", rule.least), ("exclusiveMinimum", rule.above)
-    ends += ("maximum", rule.most), ("exclusiveMaximum", rule.below)
-    bounds = {word: value for word, value in ends if value is not None}
+    ends = {"minimum": rule.least, "exclusiveMinimum": rule.above}
+    ends |= {"maximum": rule.most, "exclusiveMaximum": rule.below}
+    bounds = {word: value for word, value in ends.items() if value is not None}
     return {} if kind is Any else {"type": _WORDS[kind], **bounds}
 
 

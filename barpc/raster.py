@@ -214,9 +214,8 @@ class Mosaic:
         names = ColorInterp.__members__
         self.colorinterp = tuple(names.get(band.color, ColorInterp.undefined) for band in vrt.bands)
         self.crs = self._crs(vrt.srs)
-        self.transform = (
-            rasterio.Affine.from_gdal(*vrt.transform) if vrt.transform else rasterio.Affine.identity()
-        )
+        affine = rasterio.Affine
+        self.transform = affine.from_gdal(*vrt.transform) if vrt.transform else affine.identity()
         self.bounds = BoundingBox(*array_bounds(self.height, self.width, self.transform))
         self.mask_flag_enums = ([MaskFlags.per_dataset if vrt.mask else MaskFlags.all_valid],) * self.count
 

@@ -63,9 +63,8 @@ def moved(cameras: Sequence[Camera], move: Array | None, transform: str | None, 
             what = "a matrix of other coordinates than ECEF?" if transform else "give metres"
             file, ends = transform or "--move", f"{low:.0f} to {high:.0f} m"
             raise InputError(f"{file}: takes the ground of {camera.path} to altitudes of {ends}: {what}")
-        out.append(
-            _refitted(camera, Corrected(camera.model, correction_of(matrix, middle)), (low, high), carrier)
-        )
+        moving = Corrected(camera.model, correction_of(matrix, middle))
+        out.append(_refitted(camera, moving, (low, high), carrier))
     _tell(matrix, middle)
     return out
 
@@ -73,9 +72,8 @@ def moved(cameras: Sequence[Camera], move: Array | None, transform: str | None, 
 def _corners(camera: Camera) -> Array:
     """Return ground (n, 3) along the border of a camera's image, at its lowest and highest altitude."""
     edge = image_border(camera.extent, 4)
-    ground = np.concatenate(
-        [camera.model.localize(edge, np.full(len(edge), alt)) for alt in camera.alt_range]
-    )
+    levels = (np.full(len(edge), alt) for alt in camera.alt_range)
+    ground = np.concatenate([camera.model.localize(edge, level) for level in levels])
     found: Array = ground[np.isfinite(ground).all(axis=1)]
     if not len(found):
         raise InputError(f"{camera.path}: shows no ground along the border of its image")

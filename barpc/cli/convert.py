@@ -16,7 +16,7 @@ import shapely
 
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.alignment import moved, read_move
-from barpc.cli.heights import Heights, altitude_of, exchanged, with_heights
+from barpc.cli.heights import Altitudes, altitude_of, exchanged, with_heights
 from barpc.cli.specs import expanded
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
 from barpc.dem import Dem
@@ -240,7 +240,7 @@ def _window(flags: Mapping[str, Any]) -> Callable[[Camera, Path], Window]:
     window: Window | None = flags["window"]
     if window is not None:
         return lambda *_: window
-    heights: Heights = flags["heights"]
+    heights: Altitudes = flags["heights"]
     bbox, dem = box_of(flags["aoi"]) if flags["aoi"] else flags["bbox"], heights.terrain()
     return lambda camera, path: window_of(camera, path, bbox, heights.alt, dem)
 
@@ -341,10 +341,8 @@ def _told(readings: list[Reading], reasons: Sequence[str] = (), notes: Sequence[
     for sentence in notes:
         say(sentence)
     off = [reading for reading in readings if not reading.passed]
-    reasons = [
-        *reasons,
-        *(f"{r.path}: {r.consumer} {r.note or f'reads it {r.max_error:.1e} px off'}." for r in off),
-    ]
+    wrong = (f"{r.path}: {r.consumer} {r.note or f'reads it {r.max_error:.1e} px off'}." for r in off)
+    reasons = [*reasons, *wrong]
     return tell_gate("The hand-off needs a look.", reasons) if reasons else 0
 
 

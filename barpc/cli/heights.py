@@ -22,7 +22,7 @@ from barpc.scene import BoolArray
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-class Heights(NamedTuple):
+class Altitudes(NamedTuple):
     """Where a verb takes altitudes from: --alt [m], or --dem and its --geoid."""
 
     alt: float | None
@@ -43,7 +43,7 @@ def with_heights(alt: str) -> Callable[[Function], Function]:
         @click.option("--geoid", metavar="NAME|FILE", help=GEOID_HELP)
         @wraps(verb)
         def told(*, alt: float | None, dem: str | None, geoid: str | None, **given: Any) -> Any:
-            return verb(heights=Heights(alt, dem, geoid), **given)
+            return verb(heights=Altitudes(alt, dem, geoid), **given)
 
         return cast(Function, told)
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from barpc import __version__
 from barpc.cameras import Camera, open_camera, split_spec
-from barpc.cli.heights import Heights, altitude_of, exchanged, ground_at, with_heights
+from barpc.cli.heights import Altitudes, altitude_of, exchanged, ground_at, with_heights
 from barpc.cli.specs import expanded
 from barpc.cli.terminal import echo, wants_json
 from barpc.dem import Dem
@@ -43,7 +43,7 @@ from barpc.sensor.rpc import RPC
 def info(
     images: tuple[str, ...],
     at: tuple[float, float, float] | None,
-    heights: Heights,
+    heights: Altitudes,
     outlines: bool,
     doctor: bool,
 ) -> int:

@@ -101,10 +101,9 @@ def _in_file(flag: str) -> str:
     from barpc.options import Options, RunOptions, declared
 
     name = flag[2:].replace("-", "_")
+    defaults = {key: one.default for key, one in declared(RunOptions).items()}
     tables: dict[str, Options] = {"": RunOptions()}
-    tables |= {
-        f"[{k}] ": one.default for k, one in declared(RunOptions).items() if isinstance(one.default, Options)
-    }
+    tables |= {f"[{key}] ": table for key, table in defaults.items() if isinstance(table, Options)}
     places = [table for table, options in tables.items() if name in declared(type(options))]
     return f"{places[0]}{name} of a file given with --options" if places else ""
 

@@ -13,7 +13,7 @@ import click
 import numpy as np
 
 from barpc.cameras import open_camera, split_spec
-from barpc.cli.heights import Heights, altitude_of, exchanged, ground_at, opened_dem, with_heights
+from barpc.cli.heights import Altitudes, altitude_of, exchanged, ground_at, opened_dem, with_heights
 from barpc.cli.terminal import echo, tell_gate, wants_json
 from barpc.errors import InputError
 from barpc.geodesy import Array, ground_from_ecef
@@ -33,7 +33,7 @@ def _points(columns: str) -> Callable[..., Any]:
 @click.argument("numbers", nargs=-1, type=float, metavar="[LON LAT ALT]...")
 @_points("lon, lat, alt")
 @with_heights("Altitude of points without one [m above the ellipsoid].")
-def project(image: str, numbers: tuple[float, ...], points: str | None, heights: Heights) -> int:
+def project(image: str, numbers: tuple[float, ...], points: str | None, heights: Altitudes) -> int:
     r"""Print the image points (col, row; the first pixel's centre is 0, 0) of ground points.
 
     \b
@@ -60,7 +60,7 @@ def project(image: str, numbers: tuple[float, ...], points: str | None, heights:
 @with_heights(
     "Altitude of points without one [m].  [default: of the run's tie points, else the middle of the camera's]"
 )
-def localize(image: str, numbers: tuple[float, ...], points: str | None, heights: Heights) -> int:
+def localize(image: str, numbers: tuple[float, ...], points: str | None, heights: Altitudes) -> int:
     r"""Print the ground points (lon, lat, alt) seen at image points.
 
     \b

@@ -203,10 +203,8 @@ def layout(table: Sequence[Sequence[str]], width: int | None) -> list[str]:
     widths = [min(narrow[0], room), *narrow[1:]]
     broken = [textwrap.wrap(head, size) for head, size in zip(heads, widths, strict=True)]
     depth = max(map(len, broken))
-    lines = [
-        _line(row, widths)
-        for row in zip(*([""] * (depth - len(head)) + head for head in broken), strict=True)
-    ]
+    deep = ([""] * (depth - len(head)) + head for head in broken)
+    lines = [_line(row, widths) for row in zip(*deep, strict=True)]
     for row in rows:
         first, *folded = textwrap.wrap(row[0], widths[0]) or [""]
         lines += [_line([first, *row[1:]], widths), *folded]

@@ -126,9 +126,7 @@ def _start(sign: float, at: Array, pixel: Array, rows: Array, sight: Array, far:
 
 
 def _refined(start: Pinhole, samples: Sampled) -> Pinhole:
-    """Return the least squares solution, by Levenberg's method on a small turn, move, focal lengths,
-    principal point.
-    """
+    """Return the least squares solution, by Levenberg's method on small turn, move, focal lengths, principal point."""
     pinhole, damping = start, 1e-3
     cost, left = _cost(pinhole, samples)
     for _ in range(_STEPS):
@@ -154,9 +152,7 @@ def _cost(pinhole: Pinhole, samples: Sampled) -> tuple[float, Array]:
 
 
 def _jacobian(pinhole: Pinhole, world: Array) -> Array:
-    """Return the derivative (2 N, 10) of the projections by turn, translation, logarithms of the focal
-    lengths, centre.
-    """
+    """Return the derivative (2 N, 10) of the projections by turn, translation, logarithms of focal lengths, centre."""
     turned = world @ pinhole.rotation.T
     x, y, depth = (turned + pinhole.translation).T
     out = np.zeros((len(world), 2, 10))

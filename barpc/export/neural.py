@@ -254,9 +254,8 @@ def colmap(scene: Scene, out: Path) -> Files:
         mean = float(np.mean([error for *_, error in seen[point]]))
         points.append(_line(point + 1, *world[point].tolist(), 128, 128, 128, mean, *track))
     about = {"world_to_ecef": scene.world_to_ecef, "alt_range": scene.alt_range, "pinhole_error_px": errors}
-    about["images"] = {
-        name: link(shot.file, out) for shot, name in zip(scene.shots, _called(scene), strict=True)
-    }
+    named = zip(scene.shots, _called(scene), strict=True)
+    about["images"] = {name: link(shot.file, out) for shot, name in named}
     texts = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": points}
     return {f"sparse/0/{name}": ("\n".join(lines) + "\n").encode() for name, lines in texts.items()} | {
         "world.json": as_json(about)

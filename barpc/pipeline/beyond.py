@@ -89,12 +89,10 @@ def write_grids(
 
     OutputError where a file cannot be written, or does not hold what was written.
     """
-    files = [
-        Files(
-            options.grids or not np.linalg.norm(fit.max_ckp) <= MISFIT, options.resample, is_writable(model)
-        )
-        for _, fit, model in fitted
-    ]
+    files = []
+    for _, fit, model in fitted:
+        grids = options.grids or not np.linalg.norm(fit.max_ckp) <= MISFIT
+        files.append(Files(grids, options.resample, is_writable(model)))
     written: list[Written] = [{} for _ in fitted]
     some = [i for i, one in enumerate(files) if one.names(fitted[i][0])]
     if some:
@@ -143,10 +141,8 @@ def _write(
     """Write grids, and open them again."""
     with CachingExecutor(run, {}, executor, keep=False) as fresh:
         made = made_in_room(run, fresh, make_grids, tasks, "grids", progress)
-        again = [
-            (view, model, errors, str(run.folder))
-            for (view, _, model, _), errors in zip(tasks, made, strict=True)
-        ]
+        pairs, folder = zip(tasks, made, strict=True), str(run.folder)
+        again = [(view, model, errors, folder) for (view, _, model, _), errors in pairs]
         written = ordered(fresh, verify_grids, again, "verify grids", progress)
     for errors, seen in zip(made, written, strict=True):
         for name, (rms, largest, _) in errors.items():

@@ -182,9 +182,8 @@ def hash_inputs(
     """
     images = [view.path for view in run.views]
     rasters = dict.fromkeys([*images, *reference_names(options)])
-    others = dict.fromkeys(
-        [*seen, *(os.fspath(path.absolute()) for path in input_files(options) if path.is_file())]
-    )
+    given = (os.fspath(path.absolute()) for path in input_files(options) if path.is_file())
+    others = dict.fromkeys([*seen, *given])
     names = [*rasters, *(name for name in others if name not in rasters)]
     groups = _groups(names)
     found = [one for group in ordered(executor, hash_files, groups, "hash", progress) for one in group]

@@ -61,11 +61,8 @@ def write_views(
             tasks = [(view, fit.rpc, images, tuple(formats), str(run.folder)) for view, fit, _ in fitted]
             made = made_in_room(run, fresh, make_files, tasks, "write", progress)
         with run.stage("verify"):
-            folder = run.folder
-            again = [
-                (tuple(str(folder / name) for name in names), *one)
-                for names, one in zip(made, fitted, strict=True)
-            ]
+            paths = [tuple(str(run.folder / name) for name in names) for names in made]
+            again = [(there, *one) for there, one in zip(paths, fitted, strict=True)]
             return ordered(fresh, verify_files, again, "verify", progress)
 
 
@@ -110,12 +107,8 @@ def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
 
 def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> list[str]:
     """Return the names of a run's outputs before it starts; of match files those that are already in the folder."""
-    names = [
-        *(f"{TABLES_FOLDER}/{name}" for name in TABLES),
-        "summary.json",
-        *(["report.html"] if can_render() else []),
-    ]
-    names += [GCPS] * bool(options.reference)
+    names = [*(f"{TABLES_FOLDER}/{name}" for name in TABLES), "summary.json"]
+    names += ["report.html"] * can_render() + [GCPS] * bool(options.reference)
     if options.stop_after == "matching":
         stems = {view.name for view in views}
         pairs = [path.name for path in (folder / "asp").glob("*__*.txt") if _is_pair(path.stem, stems)]

@@ -70,9 +70,8 @@ def _inputs(summary: Summary, places: Iterable[Path]) -> Iterator[Proved]:
 def _outputs(summary: Summary, folder: Path) -> Iterator[Proved]:
     for one in summary.outputs or ():
         found = _digest(folder / one.file)
-        yield Proved(
-            "output", one.file, SAME if found == one.sha256 else MISSING if found is None else CHANGED
-        )
+        now = SAME if found == one.sha256 else MISSING if found is None else CHANGED
+        yield Proved("output", one.file, now)
 
 
 def _cameras(summary: Summary, folder: Path) -> Iterator[Proved]:
@@ -99,9 +98,8 @@ def _camera(view: ViewEntry, path: Path, name: str, stated: float) -> Proved:
         return Proved("camera", name, MISSING if not path.exists() else CHANGED, str(error))
     if off.max() <= stated + REOPENED:
         return Proved("camera", name, SAME)
-    return Proved(
-        "camera", name, CHANGED, f"reads {off.max():.3g} px off the certified camera, {stated:.1g} stated"
-    )
+    far = f"reads {off.max():.3g} px off the certified camera, {stated:.1g} stated"
+    return Proved("camera", name, CHANGED, far)
 
 
 def _digest(path: Path) -> str | None:

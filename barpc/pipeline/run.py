@@ -409,10 +409,8 @@ def _fitted(run: Run, options: RunOptions, executor: Executor, progress: Progres
     # what is known of the place afterwards is the error common to the image; the noise of a point is the vendor's
     bias = float(np.sqrt((run.adjustment.gauge.sigma[:2] ** 2).mean()))
     known = bias if np.isfinite(bias) and bias > 0 else None
-    cameras = [
-        (model, view.size, view.alt_range)
-        for view, model in zip(run.views, run.adjustment.sensors, strict=True)
-    ]
+    corrected = zip(run.views, run.adjustment.sensors, strict=True)
+    cameras = [(model, view.size, view.alt_range) for view, model in corrected]
     strict, num = not (options.keep_going or options.grids), len(cameras)
     tasks = [(tuple(cameras[at : at + _GROUP]), options.fit, strict) for at in range(0, num, _GROUP)]
     told = progress and (lambda stage, done, _: progress(stage, min(done * _GROUP, num), num))

@@ -125,6 +125,4 @@ def _pairs(tables: _Tables, known: Mapping[int, int]) -> dict[int, tuple[int, in
     """Return the pair number -> its images, of those that are views."""
     numbers = sorted({int(row[0]) for table in tables.names[2:] for row in tables.rows("pair_id", table)})
     found = {number: divmod(number, _IDS) for number in numbers}
-    return {
-        number: ends for number, ends in found.items() if set(ends) <= known.keys() and ends[0] != ends[1]
-    }
+    return {number: (a, b) for number, (a, b) in found.items() if {a, b} <= known.keys() and a != b}

@@ -105,9 +105,8 @@ class _Datasets:
 
 
 def _matches(matches: _Datasets, keypoints: _Datasets, views: ViewNames) -> Iterator[PairPoints]:
-    known = {
-        name: view for name in keypoints.keypoints if (view := _view(name, keypoints, views)) is not None
-    }
+    named = {name: _view(name, keypoints, views) for name in keypoints.keypoints}
+    known = {name: view for name, view in named.items() if view is not None}
     points: dict[str, Any] = {}
     for ends, numbers in matches.matches.items():
         if not known.keys() >= set(ends) or known[ends[0]] == known[ends[1]]:

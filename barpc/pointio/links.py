@@ -48,9 +48,8 @@ class Links:
     def joined(parts: Sequence[Links]) -> Links:
         """Return the matches of several files."""
         starts = np.cumsum([0, *(len(part.view) for part in parts)])
-        view, xy, sigma = (
-            np.concatenate([getattr(part, name) for part in parts]) for name in ("view", "xy", "sigma")
-        )
+        columns = ([getattr(part, name) for part in parts] for name in ("view", "xy", "sigma"))
+        view, xy, sigma = map(np.concatenate, columns)
         ends = [start + part.ends for start, part in zip(starts, parts, strict=False)]
         whole = Links(view, xy, sigma, np.concatenate(ends))
         return whole.merged() if len(parts) > 1 else parts[0]

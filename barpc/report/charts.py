@@ -40,10 +40,10 @@ def tag(name: str, *children: str, **attributes: object) -> str:
 
 
 def _value(value: object) -> str:
-    return number(value) if isinstance(value, (int, float)) else escape(str(value))
+    return coordinate(value) if isinstance(value, (int, float)) else escape(str(value))
 
 
-def number(value: float) -> str:
+def coordinate(value: float) -> str:
     """Return a coordinate in as few characters as two decimals take."""
     text = f"{value:.2f}".rstrip("0").rstrip(".")
     return "0" if text == "-0" else text
@@ -72,7 +72,7 @@ def line(x1: float, y1: float, x2: float, y2: float, class_: str) -> str:
 
 def path(points: Iterable[Sequence[float] | Array], class_: str, closed: bool = False) -> str:
     """Return a line through points."""
-    text = "L".join(f"{number(x)} {number(y)}" for x, y in points)
+    text = "L".join(f"{coordinate(x)} {coordinate(y)}" for x, y in points)
     return tag("path", d=f"M{text}{'Z' if closed else ''}", class_=class_)
 
 
@@ -89,7 +89,7 @@ def sheet(key: str, title: str, description: str, height: float, body: Sequence[
         tag("title", escape(title), id=f"{key}-t"),
         tag("desc", escape(description), id=f"{key}-d"),
         *body,
-        viewBox=f"0 0 {_value(width)} {number(height)}",
+        viewBox=f"0 0 {_value(width)} {coordinate(height)}",
         role="img",
         aria_labelledby=f"{key}-t {key}-d",
         **more,
@@ -172,9 +172,8 @@ def histogram(before: Array, after: Array) -> str:
         words.append(f"median {name} {np.median(norm):.3g} px")
         parts.append(titled(area, words[-1]))
     parts += legend([name for name, _ in series], _RIGHT, 14)
-    return sheet(
-        "errors-chart", "Histogram of reprojection errors", f"{'; '.join(words)}.", bottom + 32, parts
-    )
+    title = "Histogram of reprojection errors"
+    return sheet("errors-chart", title, f"{'; '.join(words)}.", bottom + 32, parts)
 
 
 def legend(names: Sequence[str], right: float, y: float) -> list[str]:

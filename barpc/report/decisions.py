@@ -95,15 +95,12 @@ def _explained(scene: SceneEntry, summary: Summary) -> list[str]:
     found = [_won(one) for one in scene.explanations]
     tested = scene.held_out_places is not None  # not by earlier releases
     if not found and tested:
-        found = [
-            "Nothing stood out that the cameras' errors as stated do not explain: nothing else was tried."
-        ]
+        why = "Nothing stood out that the cameras' errors as stated do not explain: nothing else was tried."
         if sum(len(view.correction.unknowns) for view in summary.views if view.correction) > LARGEST:
-            found = [
-                f"Nothing else was tried: in blocks of more than {LARGEST:,} unknowns explanations do not compete."
-            ]
+            why = f"Nothing else was tried: in blocks of more than {LARGEST:,} unknowns explanations do not compete."
         elif scene.left:
-            found = [f"None of what was tried explains what is left ({', '.join(RIVALS.values())}): refused."]
+            why = f"None of what was tried explains what is left ({', '.join(RIVALS.values())}): refused."
+        found = [why]
     if scene.left:
         rows = [
             f"{one.axis} {one.first:.0f}-{one.last:.0f} of {one.image} ({one.gain:.0f} nats; "
@@ -114,9 +111,7 @@ def _explained(scene: SceneEntry, summary: Summary) -> list[str]:
     if scene.held_out_places:
         found += [f"{one.sentence} (p < {one.chance:.0e})." for one in scene.held_out_places[:_LEFT]]
     elif tested and scene.num_held_out:
-        found.append(
-            "Tie points that took no part are met alike over rows, columns and cells of every image."
-        )
+        found += ["Tie points that took no part are met alike over rows, columns and cells of every image."]
     return found
 
 
@@ -200,9 +195,8 @@ def _priors(scene: SceneEntry, summary: Summary) -> list[str]:
     if not widened:
         return [f"{words}: none was widened.{together}"]
     scale, worst = max(widened)
-    return [
-        f"{words}: those of {len(widened)} images were widened, {scale:.1f} times at most ({worst}).{together}"
-    ]
+    most = f"{scale:.1f} times at most ({worst})"
+    return [f"{words}: those of {len(widened)} images were widened, {most}.{together}"]
 
 
 def _cut(scene: SceneEntry, views: Sequence[ViewEntry]) -> list[str]:

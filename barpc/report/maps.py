@@ -117,13 +117,10 @@ def ground_map(files: RunFiles) -> str:
         parts.append(titled(shape, f"{view.name}: {view.num_observations} tie points", data_v=k))
     stacks = _stacks(plane, files.outlines, list(files.number))
     parts += _pair_lines(stacks, files)
-    bad = [
-        Stack([files.number[view.name]], middle, view.name, view.status)
-        for view, middle in _marked(plane, files)
-    ]
-    parts += _stack_names(
-        [*bad[:_NAMED], *(stacks if len(stacks) <= 100 else ())], len(stacks) > _MANY, taken
-    )
+    marked, number = _marked(plane, files), files.number
+    bad = [Stack([number[view.name]], middle, view.name, view.status) for view, middle in marked]
+    named = [*bad[:_NAMED], *(stacks if len(stacks) <= 100 else ())]
+    parts += _stack_names(named, len(stacks) > _MANY, taken)
     for kind, places in known.items():
         up = 1 if kind == "gcps" else -1
         for point, (x, y) in evenly(list(zip(points_of[kind], plane(places), strict=True)), MAX_DRAWN):

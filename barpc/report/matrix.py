@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from barpc.report.charts import WIDTH, label, number, sheet, shortened, tag
+from barpc.report.charts import WIDTH, coordinate, label, sheet, shortened, tag
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.tables import RunFiles
 
@@ -91,9 +91,8 @@ def facts(files: RunFiles) -> dict[str, list[list[object]]]:
 def _names(names: Sequence[str], side: float, left: float) -> list[str]:
     """Draw names at the left and above, as many as have room."""
     wide = _CHARACTER * max(map(len, names)) + 6.0
-    step = next(
-        s for s in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000) if s * side >= max(15.0, wide) or s == 1000
-    )
+    steps = 1, 2, 5, 10, 20, 50, 100, 200, 500
+    step = next((s for s in steps if s * side >= max(15.0, wide)), 1000)
     parts = []
     for k in range(0, len(names), step):
         middle = side * (k + 0.5)
@@ -109,17 +108,16 @@ def _layer(
     num, left = whole
     shades: dict[int, list[str]] = {}
     texts = []
-    box = f"h{number(side)}v{number(side)}h-{number(side)}z"
+    box = f"h{coordinate(side)}v{coordinate(side)}h-{coordinate(side)}z"
     for a, b, pair in cells:
         value = measure.value(pair)
         if value is None:
             continue
         x, y = left + b * side, _TOP + a * side
-        shades.setdefault(measure.shade(value), []).append(f"M{number(x)} {number(y)}{box}")
+        shades.setdefault(measure.shade(value), []).append(f"M{coordinate(x)} {coordinate(y)}{box}")
         if num <= _TEXTS:
-            texts.append(
-                label(x + side / 2, y + side / 2 + 4, format(value, measure.form), "middle", "value")
-            )
+            middle = x + side / 2, y + side / 2 + 4
+            texts.append(label(*middle, format(value, measure.form), "middle", "value"))
     parts = [tag("path", d="".join(d), class_=f"cell s{k}") for k, d in sorted(shades.items())]
     return [*parts, *texts, *_legend(measure, side * num, left)]
 

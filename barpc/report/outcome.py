@@ -259,7 +259,6 @@ def triangulate_tracks(
     residuals[keep] = found.residuals
     ground = ground_from_ecef(points)
     rest = np.flatnonzero(~keep)
-    residuals[rest] = (
-        Several(sensors, tracks.view[rest]).project(ground[tracks.point[rest]]) - tracks.xy[rest]
-    )
+    projected = Several(sensors, tracks.view[rest]).project(ground[tracks.point[rest]])
+    residuals[rest] = projected - tracks.xy[rest]
     return Triangulation(points, residuals, np.isfinite(points).all(axis=1))

@@ -247,9 +247,8 @@ def _surface(files: RunFiles) -> Section | None:
         answer += (
             f" Pairs of images disagree by {metres(before.nmad_m)} and by {metres(after.nmad_m)} (medians)."
         )
-    return Section(
-        "surface", "What do they make of the ground?", answer, [_relief(one) for one in files.reliefs]
-    )
+    shown = [_relief(one) for one in files.reliefs]
+    return Section("surface", "What do they make of the ground?", answer, shown)
 
 
 def _relief(one: Relief) -> tuple[str, str]:
@@ -403,9 +402,9 @@ def _files(files: RunFiles) -> Section | None:
     if outputs:
         consumers = list(dict.fromkeys(consumer for found in outputs.values() for consumer in found))
         heads = ["file", *(f"{consumer} [px]" for consumer in consumers)]
-        rows = [
-            [cell_of(file), *(_reading(found.get(c)) for c in consumers)] for file, found in outputs.items()
-        ]
+        rows = []
+        for file, found in outputs.items():
+            rows.append([cell_of(file), *(_reading(found.get(consumer)) for consumer in consumers)])
         caption = "Files reopened as their readers do: largest difference to the corrected cameras [px]"
         tables.append(Table("files", caption, heads, rows))
     if not tables:

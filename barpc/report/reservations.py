@@ -11,7 +11,7 @@ from barpc.ba.apart import Apart
 from barpc.ba.evidence.scan import SURE
 from barpc.report.dem_lines import holds_reference
 from barpc.report.outcome import MANY_REJECTED, SMOOTH_LEFT, Run
-from barpc.report.summary.causes import CAUSES, Reason
+from barpc.report.summary.causes import CAUSES, Reservation
 from barpc.report.summary.findings import LeftEntry, left_entries, strangeness
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import known, listed
@@ -36,42 +36,43 @@ def view_status(view: ViewEntry, run: Run) -> dict[str, str | None]:
     return {"status": GOOD[run.kind], "advice": "", "cause": None}
 
 
-def _untied(view: ViewEntry, run: Run) -> Reason | None:
+def _untied(view: ViewEntry, run: Run) -> Reservation | None:
     if run.adjustment is None or view.name not in run.adjustment.left_out:
         return None
     tried = sum(view.name in report.names for report in run.matched)
     if run.matched and not tried:
-        return Reason.of("no_overlap")
-    return Reason.of("untied", tried=f" ({tried} pair{'s' * (tried > 1)} with it tried)" if tried else "")
-
-
-def _left_alone(view: ViewEntry, run: Run) -> Reason | None:
-    apart = _apart(view, run)
-    if apart is None or apart.placed is not None:
-        return None
-    return Reason.of(
-        "contradicts_all" if apart.look.as_stated else "other_rpc", strangeness=strangeness(apart)
+        return Reservation.of("no_overlap")
+    return Reservation.of(
+        "untied", tried=f" ({tried} pair{'s' * (tried > 1)} with it tried)" if tried else ""
     )
 
 
-def _misses(view: ViewEntry, run: Run) -> Reason | None:
+def _left_alone(view: ViewEntry, run: Run) -> Reservation | None:
+    apart = _apart(view, run)
+    if apart is None or apart.placed is not None:
+        return None
+    cause = "contradicts_all" if apart.look.as_stated else "other_rpc"
+    return Reservation.of(cause, strangeness=strangeness(apart))
+
+
+def _misses(view: ViewEntry, run: Run) -> Reservation | None:
     tolerance = getattr(getattr(run.options, "fit", None), "tolerance", np.inf)
     # grids hold what the RPC does not
     beyond = _follows_more(view, run) or getattr(run.options, "grids", False)
     if view.fit is not None and not beyond and not all(known(v) <= tolerance for v in view.fit.max_px):
-        return Reason.of("one_rpc_misses", tolerance=tolerance)
+        return Reservation.of("one_rpc_misses", tolerance=tolerance)
     return None
 
 
-def _contradicted(view: ViewEntry, run: Run) -> Reason | None:
+def _contradicted(view: ViewEntry, run: Run) -> Reservation | None:
     """Say that most tie points of a view contradict the others all over it, not as wrong matches do."""
     many = run.kind == "adjust" and view.num_rejected >= FEW_OBSERVATIONS and lost(view) > MOST
     if not many or _apart(view, run) is not None or anywhere(view, run) or _most_in(view, run):
         return None
-    return Reason.of("contradicted", share=100 * lost(view))
+    return Reservation.of("contradicted", share=100 * lost(view))
 
 
-def _weakness(view: ViewEntry, run: Run) -> Reason | None:
+def _weakness(view: ViewEntry, run: Run) -> Reservation | None:
     few = view.num_observations
     if few >= FEW_OBSERVATIONS or view.num_gcps >= ENOUGH_GCPS:
         return None
@@ -79,23 +80,23 @@ def _weakness(view: ViewEntry, run: Run) -> Reason | None:
         found.points and found.name == view.name for found in run.reference.views
     ):
         return None
-    return Reason.of("few", few=few) if few else Reason.of("none")
+    return Reservation.of("few", few=few) if few else Reservation.of("none")
 
 
-def _copied(view: ViewEntry, run: Run) -> Reason | None:
+def _copied(view: ViewEntry, run: Run) -> Reservation | None:
     if run.kind == "match" or view.name not in run.copies:  # how well cameras agree is not what was asked
         return None
-    return Reason.of("copy", other=run.copies[view.name])
+    return Reservation.of("copy", other=run.copies[view.name])
 
 
-def _adjusted_alone(view: ViewEntry, run: Run) -> Reason | None:
+def _adjusted_alone(view: ViewEntry, run: Run) -> Reservation | None:
     if run.kind == "match" or (apart := _apart(view, run)) is None:
         return None
     stated = f"{apart.scale:.0f} times farther off than stated" if apart.scale > 1.0 else "not its own"
-    return Reason.of("apart", stated=stated, strangeness=strangeness(apart))
+    return Reservation.of("apart", stated=stated, strangeness=strangeness(apart))
 
 
-def _odd(view: ViewEntry, run: Run) -> Reason | None:
+def _odd(view: ViewEntry, run: Run) -> Reservation | None:
     """Say that an RPC is farther off than stated, beside the others."""
     if run.kind == "match" or run.adjustment is None:
         return None
@@ -104,10 +105,10 @@ def _odd(view: ViewEntry, run: Run) -> Reason | None:
         return None
     others = [run.adjustment.names[j] for j in np.flatnonzero(prior.odd) if j != i]
     either = f" (or that of {listed(others)}: the tie points cannot tell)" if others else ""
-    return Reason.of("odd", scale=prior.scale[i], either=either)
+    return Reservation.of("odd", scale=prior.scale[i], either=either)
 
 
-def _smooth(view: ViewEntry, run: Run) -> Reason | None:
+def _smooth(view: ViewEntry, run: Run) -> Reservation | None:
     """Say that something smooth is left that no correction follows."""
     if run.kind == "match" or run.adjustment is None:
         return None
@@ -116,7 +117,7 @@ def _smooth(view: ViewEntry, run: Run) -> Reason | None:
         return None
     along = "along the rows" if smooth.by_row[i] > 0.5 else "over the image"
     size = max(smooth.rms[i], smooth.shared[i])
-    return Reason.of("smooth", size=size, along=along, why=_why_smooth(run.adjustment))
+    return Reservation.of("smooth", size=size, along=along, why=_why_smooth(run.adjustment))
 
 
 def is_smooth(i: int, adjustment: Adjustment) -> bool:
@@ -137,13 +138,13 @@ def _why_smooth(adjustment: Adjustment) -> str:
     return f"{why}; or the reference bends, or the heights under it do"
 
 
-def _rejected_alike(view: ViewEntry, run: Run) -> Reason | None:
+def _rejected_alike(view: ViewEntry, run: Run) -> Reservation | None:
     if run.kind == "match" or not (share := lost(view)) > MANY_REJECTED or anywhere(view, run):
         return None
-    return Reason.of("rejected", share=100 * share, place=_most_in(view, run))
+    return Reservation.of("rejected", share=100 * share, place=_most_in(view, run))
 
 
-def _unused(view: ViewEntry, run: Run) -> Reason | None:
+def _unused(view: ViewEntry, run: Run) -> Reservation | None:
     """Return what tie points that took no part say of a view: the others were chosen to agree."""
     if run.kind == "match" or run.adjustment is None:
         return None
@@ -152,23 +153,23 @@ def _unused(view: ViewEntry, run: Run) -> Reason | None:
     if not noise > NOISE_LIMIT:
         return None
     if lost(view) > MANY_REJECTED and anywhere(view, run):
-        return Reason.of("wrong_matches", share=100 * lost(view), error=error)
+        return Reservation.of("wrong_matches", share=100 * lost(view), error=error)
     if i in run.beside:
-        return Reason.of("beside", error=error, other=run.adjustment.names[run.beside[i]])
-    return Reason.of("held_out", error=error, noise=noise)
+        return Reservation.of("beside", error=error, other=run.adjustment.names[run.beside[i]])
+    return Reservation.of("held_out", error=error, noise=noise)
 
 
-def _one_place(view: ViewEntry, run: Run) -> Reason | None:
+def _one_place(view: ViewEntry, run: Run) -> Reservation | None:
     """Name rows or columns of a view in which tie points contradict the others, or are off together."""
     if run.kind == "match" or run.adjustment is None:
         return None
     for one in left_entries(run.adjustment):
-        if one.image == view.name and (what := standing_out(one)):
-            return Reason.of("place", place=f"{one.axis} {one.first:.0f}-{one.last:.0f}", what=what)
+        if one.image == view.name and (what := stands_out(one)):
+            return Reservation.of("place", place=f"{one.axis} {one.first:.0f}-{one.last:.0f}", what=what)
     return None
 
 
-def standing_out(one: LeftEntry) -> str:
+def stands_out(one: LeftEntry) -> str:
     """Return what is wrong in rows or columns that stand out; empty where it is not so much as to need a look."""
     if one.moving:
         return ""
@@ -192,7 +193,7 @@ def _most_in(view: ViewEntry, run: Run) -> str:
     return ""
 
 
-def _beyond(view: ViewEntry, run: Run) -> Reason | None:
+def _beyond(view: ViewEntry, run: Run) -> Reservation | None:
     """Return what one RPC does not hold of a camera that jitter or steps between detectors are corrected in."""
     told = any(getattr(run.options, name, None) for name in ("grids", "tiles", "resample"))
     if run.adjustment is None or view.fit is None or told or not _follows_more(view, run):
@@ -209,26 +210,26 @@ def _beyond(view: ViewEntry, run: Run) -> Reason | None:
         follows = "rows or columns that lie off by themselves"
     elif view.correction.swing_px:
         follows = "a swing of its rows"
-    return Reason.of("follows_more", follows=follows, left=left, most=most, image=view.name)
+    return Reservation.of("follows_more", follows=follows, left=left, most=most, image=view.name)
 
 
-def _error(view: ViewEntry, run: Run) -> Reason | None:
+def _error(view: ViewEntry, run: Run) -> Reservation | None:
     error = known(view.rmse_after if run.kind == "adjust" else view.rmse_before)
     if run.kind == "match" or error <= GOOD_RMSE or not view.num_observations:
         return None
     if not np.isfinite(error):
-        return Reason.of("unseen")
-    return Reason.of("disagrees" if run.kind == "check" else "left", error=error)
+        return Reservation.of("unseen")
+    return Reservation.of("disagrees" if run.kind == "check" else "left", error=error)
 
 
-def _moving(view: ViewEntry, run: Run) -> Reason | None:
+def _moving(view: ViewEntry, run: Run) -> Reservation | None:
     moving = view.num_moving / max(view.num_moving + view.num_rejected + view.num_observations, 1)
     if run.kind == "match" or moving <= MANY_REJECTED:
         return None
-    return Reason.of("moving", share=100 * moving)
+    return Reservation.of("moving", share=100 * moving)
 
 
-_RESERVATIONS: tuple[Callable[[ViewEntry, Run], Reason | None], ...] = (
+_RESERVATIONS: tuple[Callable[[ViewEntry, Run], Reservation | None], ...] = (
     _untied, _left_alone, _misses, _contradicted, _weakness, _copied, _adjusted_alone, _odd, _smooth, _rejected_alike,
     _unused, _beyond, _error, _moving, _one_place,
 )  # fmt: skip

@@ -12,7 +12,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -55,9 +55,8 @@ def _per_track(run: Run) -> Array:
         norm = np.hypot(*ties.residuals[keep].T)
         with np.errstate(invalid="ignore"):
             means.append(np.bincount(tracks.point[keep], norm, minlength=num) / count)
-    return np.asarray(
-        np.column_stack([run.ground, means[0], count, means[1], np.arange(num)])[run.written_tracks]
-    )
+    table = np.column_stack([run.ground, means[0], count, means[1], np.arange(num)])
+    return np.asarray(table[run.written_tracks])
 
 
 def _residuals_csv(run: Run, _: Summary) -> bytes:
@@ -268,14 +267,11 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
         A table is missing or damaged; the message names it.
     """
     names = [view.name for view in summary.views]
-    outlines = _read(table_path(folder, "footprints.geojson"), GEOJSON, _outlines)
+    outlines = _read(place := table_path(folder, "footprints.geojson"), GEOJSON, _outlines)
     if len(outlines) != len(names):
-        raise InputError(
-            f"{table_path(folder, 'footprints.geojson')}: {len(outlines)} outlines of {len(names)} images"
-        )
-    observations = _read(
-        table_path(folder, "observations.csv"), TABLE, lambda text: _observations(text, names)
-    )
+        raise InputError(f"{place}: {len(outlines)} outlines of {len(names)} images")
+    of_names = partial(_observations, names=names)
+    observations = _read(table_path(folder, "observations.csv"), TABLE, of_names)
     points, tracks = _read(table_path(folder, "residuals.csv"), TABLE, _points)
     surface = table_path(folder, SURFACE)
     reliefs = _read(surface, SUMMARY, _reliefs) if os.path.lexists(surface) else ()

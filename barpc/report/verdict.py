@@ -16,8 +16,8 @@ from barpc.geodesy import Array
 from barpc.report.dem_lines import dem_lines, dem_reasons
 from barpc.report.outcome import MANY_REJECTED, Run
 from barpc.report.records import plain
-from barpc.report.reservations import NOISE_LIMIT, anywhere, is_smooth, lost, standing_out, view_status
-from barpc.report.summary import LeftOutEntry, Summary, measure
+from barpc.report.reservations import NOISE_LIMIT, anywhere, is_smooth, lost, stands_out, view_status
+from barpc.report.summary import LeftOutEntry, Summary, measure_run
 from barpc.report.summary.findings import RIVALS, explanations, held_out_place, left_entries
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import counted, listed, median, metres
@@ -62,9 +62,7 @@ def _block_reasons(run: Run, views: Sequence[ViewEntry]) -> list[str]:
             "what is known of the scene's place with them."
         )
     if (in_space := run.adjustment.in_space_rms) is not None:
-        tilts, bends = (
-            _lengths(run.adjustment.gauge.motion_sigma[part]) for part in (slice(3, 5), slice(7, 10))
-        )
+        tilts, bends = (_lengths(gauge.motion_sigma[part]) for part in (slice(3, 5), slice(7, 10)))
         out.append(
             f"Rotations and translations leave {in_space:.3f} px of tie points that took no part; an affine in each "
             f"image leaves {median(run.adjustment.held_out_rms):.3f} px and was taken: images that were turned, "
@@ -119,7 +117,7 @@ def _left_reasons(run: Run, views: Sequence[ViewEntry] = ()) -> list[str]:
             "and no camera follows them."
         )
     for one in found:
-        if what := standing_out(one):
+        if what := stands_out(one):
             place = f"{one.axis.capitalize()} {one.first:.0f}-{one.last:.0f} of {one.image}"
             worst.setdefault(one.image, f"{place} stand out: {what}.")
     for unmet in run.met_worse:  # what was solved with may agree with what it bent
@@ -255,9 +253,8 @@ def _undecided(names: Sequence[str], tested: ControlTest) -> list[str]:
     """Name sets of GCPs that contradict each other and weigh the same."""
     if not tested.sets:
         return []
-    one, other = (
-        listed([names[g] for g in np.flatnonzero(points).tolist()], _MOST_NAMED) for points in tested.sets
-    )
+    both = (np.flatnonzero(points).tolist() for points in tested.sets)
+    one, other = (listed([names[g] for g in points], _MOST_NAMED) for points in both)
     middle = [tested.residual[points & np.isfinite(tested.w)] for points in tested.sets]
     apart = ""
     if all(len(residual) for residual in middle):
@@ -377,9 +374,7 @@ def _jitter_lines(views: Sequence[ViewEntry]) -> list[str]:
     if stepping := [one for one in found if one.detectors]:
         most = max(len(one.detectors or ()) for one in stepping)
         size = median([one.detector_px for one in stepping])
-        lines.append(
-            f"Detectors begin at up to {counted(most, 'column')} of an image, {size:.2f} px RMS apart."
-        )
+        lines += [f"Detectors begin at up to {counted(most, 'column')} of an image, {size:.2f} px RMS apart."]
     return lines
 
 
@@ -449,7 +444,7 @@ def _matched_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
 
 def summarize(run: Run) -> Summary:
     """Return the summary of a run with the verdict on it; a number that is not finite is None, as a file has it."""
-    found = measure(run)
+    found = measure_run(run)
     views = tuple(replace(view, **view_status(view, run)) for view in found.views)  # type: ignore[arg-type]
     block = block_verdict(run, views)
     verdict = {"status": block["status"], "headline": block["headline"], "reasons": block["reasons"]}

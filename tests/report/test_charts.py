@@ -10,8 +10,8 @@ import pytest
 from barpc.report import charts
 from barpc.report.charts import (
     Scale,
+    coordinate,
     evenly,
-    number,
     round_ticks,
     tag,
 )
@@ -26,7 +26,7 @@ from .made import Drawing
     [(1.0, "1"), (1.5, "1.5"), (1.256, "1.26"), (100.0, "100"), (-0.001, "0"), (-0.5, "-0.5"), (0.0, "0")],
 )
 def test_a_coordinate_takes_as_few_characters_as_two_decimals_do(value, text):
-    assert number(value) == text
+    assert coordinate(value) == text
 
 
 def test_words_in_a_drawing_carry_no_markup():

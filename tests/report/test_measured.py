@@ -16,7 +16,7 @@ from barpc.report import Run
 from barpc.report import outcome as runs
 from barpc.report.decisions import decisions
 from barpc.report.outcome import ControlResidual, PairTies, pair_ties, triangulate_tracks
-from barpc.report.summary import measure
+from barpc.report.summary import measure_run
 from barpc.report.summary.known import GcpEntry, measure_control, measure_gcps, measure_reference
 from barpc.report.summary.place import ce90
 from barpc.report.summary.views import _in_image, cell_numbers, rmse_by_view
@@ -145,7 +145,7 @@ def test_a_summary_counts_tie_points_by_the_views_that_see_them(check_run):
         *((p, v, 10.0 * p, 5.0) for p, views in enumerate([(0, 1), (0, 1, 2), (1, 2), (0, 2)]) for v in views)
     )
     run = Run("check", check_run.views, (), tracks)
-    found = measure(run)
+    found = measure_run(run)
     assert found.tracks.by_length == {"2": 3, "3": 1}
     assert (found.tracks.num_tracks, found.tracks.num_observations) == (4, 9)
     assert found.tables.num_usable_tracks == np.isfinite(run.ground).all(axis=1).sum()
@@ -304,7 +304,7 @@ def test_check_points_are_measured_with_the_new_cameras_or_the_old_ones(block_ru
     run = replace(block_run.run, gcps=None, check_points=block_run.run.gcps)
     points = run.check_points
     for sensors, changed in ((run.after, run), (run.before, replace(run, adjustment=None, fits=()))):
-        entries = measure(changed).check_points
+        entries = measure_run(changed).check_points
         assert [entry.name for entry in entries] == list(points.names)
         for g, entry in enumerate(entries):
             rows = np.flatnonzero(points.point == g)
@@ -314,7 +314,7 @@ def test_check_points_are_measured_with_the_new_cameras_or_the_old_ones(block_ru
             for k, seen in zip(rows, entry.observations, strict=True):
                 off = sensors[points.view[k]].project(points.lonlatalt[g]) - points.xy[k]
                 assert seen.residual_px == pytest.approx(off, abs=1e-9)
-    assert measure(block_run.run).check_points == ()
+    assert measure_run(block_run.run).check_points == ()
 
 
 # --- what was left, and decided by ------------------------------------------------------------------------

@@ -149,7 +149,7 @@ def published_schema() -> dict[str, Any]:
     }
 
 
-def measure(run: Run) -> Summary:
+def measure_run(run: Run) -> Summary:
     """Return the summary of a run, without the verdict on it. Numbers may be NaN here."""
     usable, written = int(np.isfinite(run.ground).all(axis=1).sum()), len(run.written_tracks)
     lengths = np.bincount(np.bincount(run.tracks.point))

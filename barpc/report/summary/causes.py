@@ -139,14 +139,14 @@ CAUSES = {
 
 
 @dataclass(frozen=True)
-class Reason:
+class Reservation:
     """Why an image needs a look: a cause with its figures."""
 
     cause: str
     advice: str
 
     @classmethod
-    def of(cls, cause: str, **figures: object) -> Reason:
+    def of(cls, cause: str, **figures: object) -> Reservation:
         """Return the reason in words, with its figures."""
         words = CAUSES[cause]
         return cls(cause, ": ".join(filter(None, (words.sentence, words.remedy))).format_map(figures))

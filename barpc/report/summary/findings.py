@@ -160,11 +160,9 @@ def _settling(findings: Sequence[Finding]) -> ExplanationEntry:
 
 def _moving(one: Finding, motion: Motion, names: Sequence[str]) -> ExplanationEntry:
     between = names[motion.between[0]], names[motion.between[1]]
-    side = f", {_place(motion)},"
-    share, metres = f"{100.0 * motion.share:.0f}", f"{motion.metres:.2g} m"
-    sentence = _WORDS[one.kind].format(
-        share=share, side=side, metres=metres, first=between[0], second=between[1]
-    )
+    words = {"share": f"{100.0 * motion.share:.0f}", "side": f", {_place(motion)},"}
+    words |= {"metres": f"{motion.metres:.2g} m", "first": between[0], "second": between[1]}
+    sentence = _WORDS[one.kind].format(**words)
     numbers = one.gain, one.gap, one.runner_up or None
     whole: dict[str, Any] = {"share": motion.share, "moved_m": motion.metres}
     return ExplanationEntry(one.kind, sentence, None, *numbers, **whole, between=between, box=motion.box)
@@ -217,7 +215,5 @@ def held_out_place(one: Place, names: Sequence[str]) -> str:
 
 
 def _left(one: Interval, names: Sequence[str]) -> LeftEntry:
-    ends = one.start, one.stop - 1.0
-    return LeftEntry(
-        names[one.view], AXES[one.axis], *ends, one.share, one.off, one.apart, one.gain, one.moves
-    )
+    place = names[one.view], AXES[one.axis], one.start, one.stop - 1.0
+    return LeftEntry(*place, one.share, one.off, one.apart, one.gain, one.moves)

@@ -123,11 +123,10 @@ def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
         report = reports.get(names)
         entry = PairEntry(*names, len(ties.a), angle, base, height, first, last, None)
         if report is not None:
-            share, noise = report.control_share, report.spread
             entry = replace(
-                entry, matching=plain(report), tied_by=report.means, decoy_share=share, noise_px=noise
+                entry, decoy_share=report.control_share, noise_px=report.spread, tied_by=report.means
             )
-            entry = replace(entry, chosen_by=report.reason, beaten=report.beaten)
+            entry = replace(entry, matching=plain(report), chosen_by=report.reason, beaten=report.beaten)
         entries.append(entry)
     return tuple(entries)
 
