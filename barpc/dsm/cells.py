@@ -13,7 +13,7 @@ from rasterio.warp import transform
 from barpc.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.scene import View
 from barpc.sensor.geometry import triangulate
-from barpc.tie.dense import ACROSS, FINER, EpipolarFrame, Matches, dense_matches, epipolar_frame
+from barpc.tie.dense import ACROSS, FINER, WINDOW, EpipolarFrame, Matches, dense_matches, epipolar_frame
 
 SIDE = 512
 """Cells a side of a tile: the blocks of the file."""
@@ -215,7 +215,7 @@ def _intersected(pair: tuple[View, View], found: Matches, zoom: int) -> Array:
 
 
 def _gathered(tile: Tile, ground: Array, sigma: Array) -> tuple[F32, F32]:
-    """Return the median height and RMS sigma of the points in each cell (rows, cols); NaN where there is none."""
+    """Return the median height of the points in each cell (rows, cols) and its sigma; NaN where there is none."""
     width, height = tile.size
     col, row = np.floor(tile.places()(ground[:, :2])).astype(np.int64).T
     inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
@@ -229,5 +229,14 @@ def _gathered(tile: Tile, ground: Array, sigma: Array) -> tuple[F32, F32]:
     middle = ((ranked[start + (count - 1) // 2] + ranked[start + count // 2]) / 2) - (of[start] << _BITS)
     cells[0, of[start]] = low + _EXACT * middle
     total = np.bincount(cell, sigma[inside] ** 2, width * height)[of[start]]
-    cells[1, of[start]] = np.sqrt(total / count)
+    cells[1, of[start]] = np.sqrt(total / count) * _averaged(np.sqrt(count))
     return cells[0].reshape(height, width), cells[1].reshape(height, width)
+
+
+def _averaged(side: Array) -> Array:
+    """Return what is left of sigma in the mean of `side` x `side` matches, whose windows overlap.
+
+    Of matches k px apart 1 - k / WINDOW of the grey values are the same: a sum over all pairs, an axis at a time.
+    """
+    shorter, longer = np.minimum(side, WINDOW), np.maximum(side, WINDOW)
+    return np.asarray(WINDOW / longer * (1.0 - (shorter**2 - 1.0) / (3.0 * side * WINDOW)))

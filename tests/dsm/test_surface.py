@@ -51,7 +51,7 @@ def test_heights_are_those_of_the_ground_and_sigma_says_how_well(made, rendered)
     assert abs(np.median(error[known])) < 0.1
     assert nmad(error[known]) < 0.5  # a pixel of disparity is 2.4 m
     within = np.mean(np.abs(error[known]) < bands[3][known])
-    assert 0.60 < within < 0.82
+    assert 0.60 < within < 0.76
     assert np.isnan(bands[2]).all()  # one pair disagrees with nobody
     assert np.isnan(bands[4]).all()
     assert np.array_equal(bands[1] == 1.0, np.isfinite(bands[0]))
@@ -115,16 +115,28 @@ def test_three_views_are_better_than_two_and_say_so(rendered, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("snr", [30.0, 300.0])
-def test_sigma_follows_the_noise_of_the_images(snr, tmp_path):
+@pytest.mark.parametrize(
+    "scene",
+    [
+        {"snr": 30.0},
+        {"snr": 300.0},
+        {"relief": 4.0, "buildings": 1.0},
+        {"relief": 200.0, "buildings": 0.0},
+        {"sun_azimuth": (150.0, 190.0), "change": 0.3},
+    ],
+    ids=["noisy", "clean", "flat", "steep", "two dates"],
+)
+def test_sigma_follows_noise_slopes_and_change(scene, tmp_path):
     from tests.dsm.conftest import Rendered
 
-    found = Rendered(Scene(replace(SMALL, snr=snr, views=2, size=(500, 500))), tmp_path).write()
-    make_dsm(found.paths, tmp_path / "dsm.tif", OPTIONS)
+    found = Rendered(Scene(replace(SMALL, views=2, size=(500, 500), **scene)), tmp_path).write()
+    heights = np.concatenate([one.altitude.ravel() for one in found.pictures])
+    alts = float(np.nanmin(heights)) - 10.0, float(np.nanmax(heights)) + 10.0
+    make_dsm(found.paths, tmp_path / "dsm.tif", DsmOptions(alt=alts))
     with rasterio.open(tmp_path / "dsm.tif") as file:
         error, sigma = file.read(1) - found.truth(tmp_path / "dsm.tif"), file.read(4)
     known = np.isfinite(error)
-    assert 0.56 < np.mean(np.abs(error[known]) < sigma[known]) < 0.80
+    assert 0.60 < np.mean(np.abs(error[known]) < sigma[known]) < 0.76
 
 
 # --- what is refused --------------------------------------------------------------------------------------
