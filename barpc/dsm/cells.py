@@ -49,14 +49,18 @@ class Tile:
     size: tuple[int, int]
     alts: tuple[float, float]
 
-    def nodes(self, count: int = _NODES) -> Array:
-        """Return the longitude, latitude (count^2, 2) [deg] on a grid from corner to corner, rows from the
-        north slowest.
-        """
-        x = self.west + self.step * np.linspace(0, self.size[0], count)
-        y = self.north - self.step * np.linspace(0, self.size[1], count)
+    def nodes(self, cols: int = _NODES, rows: int | None = None) -> Array:
+        """Return the longitude, latitude (rows cols, 2) [deg] on a grid from corner to corner, the north first."""
+        x = self.west + self.step * np.linspace(0, self.size[0], cols)
+        y = self.north - self.step * np.linspace(0, self.size[1], rows or cols)
         east, north = (part.ravel() for part in np.meshgrid(x, y))
         return np.column_stack(transform(CRS.from_wkt(self.crs), CRS.from_epsg(4326), east, north))
+
+    def centres(self) -> Array:
+        """Return the longitude, latitude (rows cols, 2) [deg] of the cells' middles."""
+        half, (cols, rows) = self.step / 2, self.size
+        inner = replace(self, west=self.west + half, north=self.north - half, size=(cols - 1, rows - 1))
+        return inner.nodes(cols, rows)
 
     def parts(self) -> list[Tile]:
         """Return the tile's quarters."""

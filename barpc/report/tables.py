@@ -176,7 +176,7 @@ TABLES: dict[str, Callable[[Run, Summary], bytes]] = {
 }
 """File name -> its bytes, of a run and its summary."""
 SURFACE = "surface.json"
-"""Two reliefs for the report, of a run of which a surface was made."""
+"""Two reliefs and two images on the surface for the report, of a run of which one was made."""
 
 
 # --- read back --------------------------------------------------------------------------------------------
@@ -211,6 +211,15 @@ class Relief:
     picture: str
 
 
+@dataclass(frozen=True)
+class Draped:
+    """An image on the surface, in the window of the reliefs: a JPEG in base64, `size` [px]."""
+
+    image: str
+    size: tuple[int, int]
+    picture: str
+
+
 @dataclass(frozen=True, eq=False)
 class RunFiles:
     """Files in the folder of a run.
@@ -225,6 +234,7 @@ class RunFiles:
     tracks: IntArray
     outlines: Sequence[Sequence[Array]]
     reliefs: Sequence[Relief] = ()
+    draped: Sequence[Draped] = ()
 
     @property
     def number(self) -> dict[str, int]:
@@ -289,27 +299,33 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
     )
     points, tracks = _read(table_path(folder, "residuals.csv"), TABLE, _points)
     surface = table_path(folder, SURFACE)
-    reliefs = _read(surface, SUMMARY, _reliefs) if os.path.lexists(surface) else ()
-    return RunFiles(summary, observations, points, tracks, outlines, reliefs)
+    shown = _read(surface, SUMMARY, _surface) if os.path.lexists(surface) else ((), ())
+    return RunFiles(summary, observations, points, tracks, outlines, *shown)
 
 
 _BASE64 = re.compile(r"[A-Za-z0-9+/]{4,400000}={0,2}")
 
 
-def _reliefs(text: str) -> tuple[Relief, ...]:
-    found = tuple(
+def _surface(text: str) -> tuple[tuple[Relief, ...], tuple[Draped, ...]]:
+    rows = parse_json(text)
+    reliefs = tuple(
         Relief(
-            {"delivered": "delivered", "corrected": "corrected"}[one["cameras"]],
-            (int(one["size"][0]), int(one["size"][1])),
+            one["cameras"],
+            _size(one),
             float(one["share"]),
             None if one["nmad_m"] is None else float(one["nmad_m"]),
             _jpeg(one["picture"]),
         )
-        for one in parse_json(text)
+        for one in rows[:2]
     )
-    if [one.cameras for one in found] != ["delivered", "corrected"]:
+    draped = tuple(Draped(str(one["image"]), _size(one), _jpeg(one["picture"])) for one in rows[2:])
+    if [one.cameras for one in reliefs] != ["delivered", "corrected"] or len(draped) not in (0, 2):
         raise ValueError("reliefs that are not one before and one after")
-    return found
+    return reliefs, draped
+
+
+def _size(one: Any) -> tuple[int, int]:
+    return int(one["size"][0]), int(one["size"][1])
 
 
 def _jpeg(data: str) -> str:
