@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
@@ -64,8 +65,7 @@ class Tile:
 
     def parts(self) -> list[Tile]:
         """Return the tile's quarters."""
-        half = self.size[0] // 2, self.size[1] // 2
-        cols, rows = ((0, half[0]), (half[0], self.size[0])), ((0, half[1]), (half[1], self.size[1]))
+        cols, rows = (((0, side // 2), (side // 2, side)) for side in self.size)
         return [
             replace(
                 self,
@@ -73,8 +73,7 @@ class Tile:
                 north=self.north - self.step * r0,
                 size=(c1 - c0, r1 - r0),
             )
-            for r0, r1 in rows
-            for c0, c1 in cols
+            for (r0, r1), (c0, c1) in product(rows, cols)
             if c1 > c0 and r1 > r0
         ]
 

@@ -44,22 +44,23 @@ def show_in_report(folder: Path, grid: Grid, out: Path) -> None:
 def _reliefs(folder: Path, grid: Grid, out: Path) -> list[dict[str, object]]:
     """Return the pictures, as `barpc.report.tables` reads them, of the tile that has most heights."""
     with open_raster(out) as file:
-        found = []
-        for at, groups in grid.tiles():
-            bands = file.read([1, 3], window=Window(*at, *grid.tile(*at).size))
-            found.append((np.isfinite(bands[0]).sum(), at, groups[0], bands))
-    _, at, pairs, after = max(found, key=lambda row: row[0])
+        read = (
+            (at, groups[0], file.read([1, 3], window=Window(*at, *grid.tile(*at).size)))
+            for at, groups in grid.tiles()
+        )
+        at, pairs, after = max(read, key=lambda row: np.isfinite(row[2][0]).sum())
     views = _delivered(folder, grid.block.views)
     before = surface_tile([(views[i], views[j]) for i, j in pairs], grid.tile(*at), grid.options.band)
-    shown = [grid.block.views[i] for i in pairs[0]]
-    return [
-        _one("delivered", before[0], before[1], grid.step),
-        _one("corrected", after[0], after[1], grid.step),
-        *(
-            {"image": view.name, **_picture(draped(view, grid.tile(*at), after[0], grid.options.band))}
-            for view in shown
-        ),
-    ]
+    found: list[dict[str, object]] = []
+    for cameras, (height, nmad) in (("delivered", before[:2]), ("corrected", after)):
+        known = np.isfinite(nmad)
+        middle = float(np.median(nmad[known])) if known.any() else None
+        row = {"cameras": cameras, "share": float(np.isfinite(height).mean()), "nmad_m": middle}
+        found.append(row | _picture(shaded(height, grid.step)))
+    for view in (grid.block.views[i] for i in pairs[0]):
+        grey = draped(view, grid.tile(*at), after[0], grid.options.band)
+        found.append({"image": view.name, **_picture(grey)})
+    return found
 
 
 def _delivered(folder: Path, views: tuple[View, ...]) -> list[View]:
@@ -72,16 +73,6 @@ def _delivered(folder: Path, views: tuple[View, ...]) -> list[View]:
             raise BarpcError(f"{view.name}: no file holds its delivered camera")
         found.append(replace(view, sensor=open_camera(view.path, camera=source.path).model))
     return found
-
-
-def _one(cameras: str, height: F32, nmad: F32, step: float) -> dict[str, object]:
-    known = np.isfinite(nmad)
-    return {
-        "cameras": cameras,
-        "share": float(np.isfinite(height).mean()),
-        "nmad_m": float(np.median(nmad[known])) if known.any() else None,
-        **_picture(shaded(height, step)),
-    }
 
 
 def _picture(grey: npt.NDArray[np.uint8]) -> dict[str, object]:
