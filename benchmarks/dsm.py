@@ -7,10 +7,10 @@ delivered:
   against the same of heights minus another tool's DSM (`--against`, of s2p or CARS), with the share of its cells
   CPU     seconds a million pixels of the smaller image of a pair, and the peak memory [MB]
 
-python benchmarks/dsm.py RUN... [--against DSM] [--rendered SIDE]
+python benchmarks/dsm.py RUN... [--against DSM] [--rendered SIDE [--kinds]]
 
 `--rendered` makes images of SIDE px of a scene whose ground is known: nmad is of heights minus the truth, and `within`
-the share of cells within one sigma.
+the share of cells within one sigma. `--kinds`: of scenes that differ in slopes, buildings, noise, pixel and dates.
 """
 
 from __future__ import annotations
@@ -31,6 +31,19 @@ from rasterio.warp import Resampling, reproject
 from barpc.dsm import NoSurfaceError, make_dsm
 from barpc.export.shots import read_scene
 from barpc.options import DsmOptions
+
+KINDS: dict[str, dict[str, object]] = {
+    "usual": {},
+    "flat": {"relief": 12.0, "buildings": 2.0, "seed": 3},
+    "steep": {"relief": 300.0, "buildings": 4.0, "seed": 4},
+    "town": {"relief": 20.0, "buildings": 25.0, "seed": 6},
+    "noisy": {"relief": 30.0, "snr": 30.0, "seed": 7},
+    "clean": {"relief": 30.0, "snr": 400.0, "seed": 8},
+    "bare": {"buildings": 0.0, "seed": 10},
+    "coarse": {"gsd": 2.0, "relief": 200.0, "buildings": 1.0, "seed": 12},
+    "two dates": {"relief": 30.0, "sun_azimuth": (150.0, 190.0), "change": 0.3, "seed": 13},
+}
+"""Kinds of scenes, by what differs from `tests.scenes.ImageOptions`."""
 
 
 def nmad(values: np.ndarray) -> float:
@@ -65,16 +78,16 @@ def measure(
     return found | {"peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
 
 
-def rendered(side: int) -> dict[str, object]:
-    """A pair of rendered images with exact cameras, against the ground that they show."""
+def rendered(side: int, kind: str = "usual") -> dict[str, object]:
+    """A pair of rendered images of a kind with exact cameras, against the ground that they show."""
     from tests.dsm.conftest import Rendered
     from tests.scenes import ImageOptions, Scene
 
     with tempfile.TemporaryDirectory() as folder:
-        options = ImageOptions(views=2, size=(side, side))
-        made = Rendered(Scene(options), Path(folder)).write()
-        alt = options.alt - options.relief / 2 - 10.0, options.alt + options.relief / 2 + 40.0
-        out, call = Path(folder) / "dsm.tif", json.dumps([made.paths, alt])
+        made = Rendered(Scene(ImageOptions(views=2, size=(side, side), **KINDS[kind])), Path(folder)).write()
+        shown = [picture.altitude for picture in made.pictures]
+        alt = min(map(np.nanmin, shown)) - 10.0, max(map(np.nanmax, shown)) + 10.0
+        out, call = Path(folder) / "dsm.tif", json.dumps([made.paths, [float(one) for one in alt]])
         code = (
             "import json,sys,time; from barpc.dsm import make_dsm; from barpc.options import DsmOptions\n"
             "paths, alt = json.loads(sys.argv[1]); start = time.process_time()\n"
@@ -107,6 +120,7 @@ def main() -> None:
     parser.add_argument("runs", nargs="*", type=Path)
     parser.add_argument("--against", type=Path)
     parser.add_argument("--rendered", type=int)
+    parser.add_argument("--kinds", action="store_true")
     arguments = parser.parse_args()
     for run in arguments.runs:
         views = json.loads((run / "summary.json").read_text())["views"]
@@ -131,11 +145,12 @@ def main() -> None:
                 f"{run.name:12}{name:11}{row['pairs']} pairs {row['cells']:8} cells {row['share']:6.1%} matched "
                 f"nmad {row['nmad']:.2f} m sigma {row['sigma']:.2f} m {cost:5.1f} CPU s/Mpx {row['peak']:.0f} MB{more}"
             )
-    if arguments.rendered:
-        row, area = rendered(arguments.rendered), arguments.rendered**2 / 1e6
+    for kind in (KINDS if arguments.kinds else ["usual"]) if arguments.rendered else ():
+        row, area = rendered(arguments.rendered, kind), arguments.rendered**2 / 1e6
         print(
-            f"rendered {arguments.rendered} px: {row['cells']} cells, nmad {row['nmad']:.2f} m, within sigma "
-            f"{row['within']:.1%}, {row['cpu'] / area:.1f} CPU s/Mpx, {row['peak']:.0f} MB"
+            f"rendered {arguments.rendered} px, {kind}: {row['cells']} cells, nmad {row['nmad']:.2f} m, within sigma "
+            f"{row['within']:.1%}, {row['cpu'] / area:.1f} CPU s/Mpx, {row['peak']:.0f} MB",
+            flush=True,
         )
 
 

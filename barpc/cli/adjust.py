@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from barpc.cli.dsm import made
 from barpc.cli.flags import ADJUSTMENT, MATCH, RUN, TIE, Grouped, image_paths, paper, run_options, with_flags
 from barpc.cli.progress import executor_for, progress_told
 from barpc.cli.specs import Config, corrected, expanded, read_config, with_cameras
 from barpc.cli.terminal import echo, output_width, print_summary, say, tell_gate, wants_json
+from barpc.options import DsmOptions
 
 if TYPE_CHECKING:
     from barpc.options import RunOptions
@@ -35,6 +37,7 @@ _out_dir = click.option("-o", "--out-dir", required=True, metavar="DIR", help="F
     "sat-bundleadjust.",
 )
 @paper
+@click.option("--surface", is_flag=True, help="Make a first surface, dsm.tif, too, as `barpc dsm` does.")
 @with_flags(*RUN, *TIE, *ADJUSTMENT)
 @click.pass_obj
 def adjust(
@@ -43,6 +46,7 @@ def adjust(
     images: tuple[str, ...],
     out_dir: str,
     source: tuple[str, str] | None,
+    surface: bool,
     **flags: Any,
 ) -> int:
     r"""Correct the cameras of overlapping images and write fresh RPCs.
@@ -66,8 +70,14 @@ def adjust(
     from barpc import pipeline
 
     if source is None:
-        return _run(obj, pipeline.adjust, images, flags, out_dir=out_dir)
-    return _run_from(obj, read_config(*source), images, flags, out_dir)
+        code = _run(obj, pipeline.adjust, images, flags, out_dir=out_dir)
+    else:
+        code = _run_from(obj, read_config(*source), images, flags, out_dir)
+    if surface:
+        options, place = DsmOptions(overwrite=True), Path(out_dir)
+        if made(obj, place, place / "dsm.tif", options, flags["jobs"]) is None:
+            return 3
+    return code
 
 
 @click.command("match", cls=Grouped)

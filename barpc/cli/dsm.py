@@ -60,23 +60,31 @@ def dsm(obj: dict[str, Any], /, source: tuple[str, ...], out: str, jobs: int | s
       barpc dsm both_dates -o change.tif --minus first_date
       barpc dsm adjusted -o dsm.tif --gsd 2 --crs EPSG:2154 -j 4
     """
-    from barpc.dsm import NoSurfaceError, make_dsm
-
     run = Path(source[0]) if len(source) == 1 and (Path(source[0]) / "summary.json").is_file() else None
     options = DsmOptions(**{name: value for name, value in flags.items() if value is not None})
     if run is None and options.minus is not None:
         raise click.UsageError("--minus goes with a RUN: what two dates share is not known of images")
+    surface = made(obj, run or expanded(source), out, options, jobs)
+    if surface is not None and wants_json():
+        echo(json.dumps({key: _plain(value) for key, value in asdict(surface).items()}, indent=1))
+    return 3 if surface is None else 0
+
+
+def made(
+    obj: dict[str, Any], source: Path | list[str], out: str | Path, options: DsmOptions, jobs: int | str
+) -> Surface | None:
+    """Make a surface and tell of it; None where the images cannot be matched, and a line says why."""
+    from barpc.dsm import NoSurfaceError, make_dsm
+
     try:
         with executor_for(jobs) as executor, progress_told(obj["quiet"], obj["verbose"]) as progress:
-            given = expanded(source) if run is None else run
-            surface = make_dsm(given, out, options, executor=executor, progress=progress)
+            surface = make_dsm(source, out, options, executor=executor, progress=progress)
     except NoSurfaceError as error:
-        return tell_gate(f"no surface: {error}", [])
-    if wants_json():
-        echo(json.dumps({key: _plain(value) for key, value in asdict(surface).items()}, indent=1))
-    elif not obj["quiet"]:
+        tell_gate(f"no surface: {error}", [])
+        return None
+    if not (wants_json() or obj["quiet"]):
         _tell(surface)
-    return 0
+    return surface
 
 
 def _plain(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +25,8 @@ from barpc.sensor import SensorModel
 from barpc.sensor.geometry import base_to_height, is_radar
 from barpc.tie.pairs import overlapping_pairs
 from barpc.workspace import table_path
+
+logger = logging.getLogger(__name__)
 
 ANGLES = 2.0, 45.0
 """Convergence angles [deg] of pairs that are matched: below, a pixel is 30 of height; above, SGBM finds decoys."""
@@ -81,7 +84,8 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: P
     errors = CameraErrors.of(BlockPrior.load(table_path(folder, PRIOR)), views)
     worth = {(i, j): ties.get(frozenset((names[i], names[j])), 0.0) for i, j in _numbered(len(views))}
     parts = [range(len(views))] if minus is None else _split(folder, names, minus)
-    groups = tuple(_best(views, worth, part) for part in parts)
+    flagged = frozenset(i for i, shot in enumerate(scene.shots) if shot.entry.advice)
+    groups = tuple(_best(views, worth, part, flagged) for part in parts)
     return Block(tuple(views), groups, errors, str(folder) + ("" if minus is None else f" minus {minus}"))
 
 
@@ -124,9 +128,10 @@ def _best(
     views: Sequence[View],
     ties: dict[tuple[int, int], float] | None = None,
     among: Sequence[int] | None = None,
+    flagged: frozenset[int] = frozenset(),
 ) -> Pairs:
-    """Return the pairs (`among` some views) by what they say of heights: of one date first, then by tie
-    points times (B/H)^2.
+    """Return the pairs (`among` some views) by what they say of heights: of one date first, without `flagged` views
+    first, then by tie points times (B/H)^2.
 
     A height's variance is that of a match over (B/H)^2, and where tie points are found, dense matches are. Without
     tie points the overlap and the angle stand for them (`barpc.tie.pairs.Pair.score`).
@@ -147,6 +152,13 @@ def _best(
         middle = first.sensor.localize((np.array(first.size) - 1.0) / 2.0, np.array(first.altitude))
         base = float(base_to_height(first.sensor, second.sensor, middle))
         worth = pair.score if ties is None else ties[pair.views]
-        rows.append((first.date != second.date, -worth * base**2, pair.views))
-    same = [row for row in rows if not row[0]]
-    return tuple(row[2] for row in sorted(same or rows))
+        doubted = not flagged.isdisjoint(pair.views)
+        rows.append((first.date != second.date, doubted, -worth * base**2, pair.views))
+    rows = sorted([row for row in rows if not row[0]] or rows)
+    late = sorted({views[i].name for row in rows if row[1] for i in flagged.intersection(row[3])})
+    if late and not rows[0][1]:
+        logger.warning(
+            "%s: the verdict of the run has a reservation, so pairs with it come after the others",
+            ", ".join(late),
+        )
+    return tuple(row[3] for row in rows)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,7 @@ from rasterio.warp import transform
 from barpc.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.scene import View
 from barpc.sensor.geometry import triangulate
-from barpc.tie.dense import ACROSS, FINER, EpipolarFrame, Matches, dense_matches, epipolar_frame
+from barpc.tie.dense import ACROSS, FINER, WINDOW, EpipolarFrame, Matches, dense_matches, epipolar_frame
 
 SIDE = 512
 """Cells a side of a tile: the blocks of the file."""
@@ -49,19 +50,22 @@ class Tile:
     size: tuple[int, int]
     alts: tuple[float, float]
 
-    def nodes(self, count: int = _NODES) -> Array:
-        """Return the longitude, latitude (count^2, 2) [deg] on a grid from corner to corner, rows from the
-        north slowest.
-        """
-        x = self.west + self.step * np.linspace(0, self.size[0], count)
-        y = self.north - self.step * np.linspace(0, self.size[1], count)
+    def nodes(self, cols: int = _NODES, rows: int | None = None) -> Array:
+        """Return the longitude, latitude (rows cols, 2) [deg] on a grid from corner to corner, the north first."""
+        x = self.west + self.step * np.linspace(0, self.size[0], cols)
+        y = self.north - self.step * np.linspace(0, self.size[1], rows or cols)
         east, north = (part.ravel() for part in np.meshgrid(x, y))
         return np.column_stack(transform(CRS.from_wkt(self.crs), CRS.from_epsg(4326), east, north))
 
+    def centres(self) -> Array:
+        """Return the longitude, latitude (rows cols, 2) [deg] of the cells' middles."""
+        half, (cols, rows) = self.step / 2, self.size
+        inner = replace(self, west=self.west + half, north=self.north - half, size=(cols - 1, rows - 1))
+        return inner.nodes(cols, rows)
+
     def parts(self) -> list[Tile]:
         """Return the tile's quarters."""
-        half = self.size[0] // 2, self.size[1] // 2
-        cols, rows = ((0, half[0]), (half[0], self.size[0])), ((0, half[1]), (half[1], self.size[1]))
+        cols, rows = (((0, side // 2), (side // 2, side)) for side in self.size)
         return [
             replace(
                 self,
@@ -69,8 +73,7 @@ class Tile:
                 north=self.north - self.step * r0,
                 size=(c1 - c0, r1 - r0),
             )
-            for r0, r1 in rows
-            for c0, c1 in cols
+            for (r0, r1), (c0, c1) in product(rows, cols)
             if c1 > c0 and r1 > r0
         ]
 
@@ -215,7 +218,7 @@ def _intersected(pair: tuple[View, View], found: Matches, zoom: int) -> Array:
 
 
 def _gathered(tile: Tile, ground: Array, sigma: Array) -> tuple[F32, F32]:
-    """Return the median height and RMS sigma of the points in each cell (rows, cols); NaN where there is none."""
+    """Return the median height of the points in each cell (rows, cols) and its sigma; NaN where there is none."""
     width, height = tile.size
     col, row = np.floor(tile.places()(ground[:, :2])).astype(np.int64).T
     inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
@@ -229,5 +232,14 @@ def _gathered(tile: Tile, ground: Array, sigma: Array) -> tuple[F32, F32]:
     middle = ((ranked[start + (count - 1) // 2] + ranked[start + count // 2]) / 2) - (of[start] << _BITS)
     cells[0, of[start]] = low + _EXACT * middle
     total = np.bincount(cell, sigma[inside] ** 2, width * height)[of[start]]
-    cells[1, of[start]] = np.sqrt(total / count)
+    cells[1, of[start]] = np.sqrt(total / count) * _averaged(np.sqrt(count))
     return cells[0].reshape(height, width), cells[1].reshape(height, width)
+
+
+def _averaged(side: Array) -> Array:
+    """Return what is left of sigma in the mean of `side` x `side` matches, whose windows overlap.
+
+    Of matches k px apart 1 - k / WINDOW of the grey values are the same: a sum over all pairs, an axis at a time.
+    """
+    shorter, longer = np.minimum(side, WINDOW), np.maximum(side, WINDOW)
+    return np.asarray(WINDOW / longer * (1.0 - (shorter**2 - 1.0) / (3.0 * side * WINDOW)))

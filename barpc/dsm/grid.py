@@ -72,12 +72,11 @@ class Grid:
     @classmethod
     def of(cls, block: Block, options: DsmOptions) -> Grid:
         """Return the grid of cells in UTM or the CRS asked for, of twice the ground sampling distance unless told."""
-        first = block.views[block.groups[0][0][0]]
-        middle = first.sensor.localize((np.array(first.size) - 1) / 2, np.array(first.altitude))
-        crs = _crs(options.crs, middle)
-        pixel = [_pixel(view) for view in block.views]
-        step = options.gsd or float(f"{2 * max(pixel):.2g}")
         views = block.views
+        middles = [v.sensor.localize((np.array(v.size) - 1) / 2, np.array(v.altitude)) for v in views]
+        crs = _crs(options.crs, middles[block.groups[0][0][0]])
+        pixels = [ground_sample_distance(v.sensor, at)[1] for v, at in zip(views, middles, strict=True)]
+        step = options.gsd or float(f"{2 * max(pixels):.2g}")
         outlines = tuple(tuple(_common(views[i], views[j], crs) for i, j in group) for group in block.groups)
         whole = shapely.intersection_all([shapely.union_all(group) for group in outlines])
         if whole.is_empty:
@@ -103,9 +102,8 @@ class Grid:
 
     def box(self, col: int, row: int) -> Any:
         """Return the outline of a tile on the map."""
-        width, height = min(SIDE, self.size[0] - col), min(SIDE, self.size[1] - row)
-        left, top = self.west + self.step * col, self.north - self.step * row
-        return shapely.box(left, top - self.step * height, left + self.step * width, top)
+        at = self.tile(col, row)
+        return shapely.box(at.west, at.north - at.step * at.size[1], at.west + at.step * at.size[0], at.north)
 
     def tile(self, col: int, row: int) -> Tile:
         """Return the tile that begins at a cell."""
@@ -190,15 +188,9 @@ class Grid:
 
     @contextmanager
     def _opened(self, path: Path, datum: float) -> Iterator[Any]:
-        profile: dict[str, Any] = {"width": self.size[0], "height": self.size[1], "count": len(BANDS)}
-        profile |= {
-            "dtype": "float32",
-            "nodata": float("nan"),
-            "crs": self.crs,
-            "tiled": True,
-            "BIGTIFF": "IF_SAFER",
-        }
-        profile |= {"blockxsize": SIDE, "blockysize": SIDE, "compress": "deflate", "SPARSE_OK": True}
+        profile = {"width": self.size[0], "height": self.size[1], "count": len(BANDS), "crs": self.crs}
+        profile |= {"dtype": "float32", "nodata": float("nan"), "compress": "deflate", "BIGTIFF": "IF_SAFER"}
+        profile |= {"tiled": True, "blockxsize": SIDE, "blockysize": SIDE, "SPARSE_OK": True}
         profile["transform"] = Affine(self.step, 0.0, self.west, 0.0, -self.step, self.north)
         tags = {"BARPC": __version__, "VERTICAL_REFERENCE": "WGS84 ellipsoid", "IMAGES": self.block.source}
         if np.isfinite(datum):
@@ -225,12 +217,6 @@ def _spread(values: Array, size: tuple[int, int]) -> Array:
     grid, nodes = values.reshape(_NODES, _NODES), np.arange(_NODES)
     along = np.stack([np.interp(at[0], nodes, row) for row in grid])
     return np.stack([np.interp(at[1], nodes, col) for col in along.T], axis=1)
-
-
-def _pixel(view: View) -> float:
-    middle = (np.array(view.size) - 1) / 2
-    ground = view.sensor.localize(middle, np.array(view.altitude))
-    return float(ground_sample_distance(view.sensor, ground)[1])
 
 
 def _crs(given: str | None, middle: Array) -> CRS:

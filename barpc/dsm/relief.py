@@ -11,16 +11,17 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from rasterio.windows import Window
+from scipy.ndimage import map_coordinates
 
 from barpc.cameras import open_camera
-from barpc.dsm.cells import F32, surface_tile
+from barpc.dsm.cells import F32, Tile, surface_tile
 from barpc.dsm.grid import Grid
 from barpc.errors import BarpcError
 from barpc.raster import open_raster
 from barpc.report.page import can_render, remake_report
 from barpc.report.tables import SURFACE, read_summary
 from barpc.scene import View
-from barpc.tie.raster import jpeg
+from barpc.tie.raster import jpeg, read_pixels, sample_stretch
 from barpc.workspace import TABLES, Workspace
 
 logger = logging.getLogger(__name__)
@@ -29,7 +30,7 @@ _LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])  # from the north-west, 45 degrees 
 
 
 def show_in_report(folder: Path, grid: Grid, out: Path) -> None:
-    """Add both reliefs to the report of a run; where that fails a line says why, and the surface stays."""
+    """Show both reliefs, and two images on the surface, in a run's report; where that fails a line says why."""
     try:
         text, name = json.dumps(_reliefs(folder, grid, out)), f"{TABLES}/{SURFACE}"
         with Workspace(folder, overwrite=True, names=[name], adds=True) as run:
@@ -41,19 +42,25 @@ def show_in_report(folder: Path, grid: Grid, out: Path) -> None:
 
 
 def _reliefs(folder: Path, grid: Grid, out: Path) -> list[dict[str, object]]:
-    """Return the reliefs, as `barpc.report.tables` reads them, of the tile that has most heights."""
+    """Return the pictures, as `barpc.report.tables` reads them, of the tile that has most heights."""
     with open_raster(out) as file:
-        found = []
-        for at, groups in grid.tiles():
-            bands = file.read([1, 3], window=Window(*at, *grid.tile(*at).size))
-            found.append((np.isfinite(bands[0]).sum(), at, groups[0], bands))
-    _, at, pairs, after = max(found, key=lambda row: row[0])
+        read = (
+            (at, groups[0], file.read([1, 3], window=Window(*at, *grid.tile(*at).size)))
+            for at, groups in grid.tiles()
+        )
+        at, pairs, after = max(read, key=lambda row: np.isfinite(row[2][0]).sum())
     views = _delivered(folder, grid.block.views)
     before = surface_tile([(views[i], views[j]) for i, j in pairs], grid.tile(*at), grid.options.band)
-    return [
-        _one("delivered", before[0], before[1], grid.step),
-        _one("corrected", after[0], after[1], grid.step),
-    ]
+    found: list[dict[str, object]] = []
+    for cameras, (height, nmad) in (("delivered", before[:2]), ("corrected", after)):
+        known = np.isfinite(nmad)
+        middle = float(np.median(nmad[known])) if known.any() else None
+        row = {"cameras": cameras, "share": float(np.isfinite(height).mean()), "nmad_m": middle}
+        found.append(row | _picture(shaded(height, grid.step)))
+    for view in (grid.block.views[i] for i in pairs[0]):
+        grey = draped(view, grid.tile(*at), after[0], grid.options.band)
+        found.append({"image": view.name, **_picture(grey)})
+    return found
 
 
 def _delivered(folder: Path, views: tuple[View, ...]) -> list[View]:
@@ -68,15 +75,22 @@ def _delivered(folder: Path, views: tuple[View, ...]) -> list[View]:
     return found
 
 
-def _one(cameras: str, height: F32, nmad: F32, step: float) -> dict[str, object]:
-    known = np.isfinite(nmad)
-    return {
-        "cameras": cameras,
-        "size": [height.shape[1], height.shape[0]],
-        "share": float(np.isfinite(height).mean()),
-        "nmad_m": float(np.median(nmad[known])) if known.any() else None,
-        "picture": base64.b64encode(jpeg(shaded(height, step))).decode(),
-    }
+def _picture(grey: npt.NDArray[np.uint8]) -> dict[str, object]:
+    return {"size": [grey.shape[1], grey.shape[0]], "picture": base64.b64encode(jpeg(grey)).decode()}
+
+
+def draped(view: View, tile: Tile, height: F32, band: int) -> npt.NDArray[np.uint8]:
+    """Return what a view shows of a tile's cells of these heights (rows, cols) [m]; black where nothing is known."""
+    grey, known = np.zeros(height.shape, np.uint8), np.isfinite(height)
+    at = view.sensor.project(np.column_stack([tile.centres(), height.ravel()])[known.ravel()])
+    at = np.clip(np.nan_to_num(at), 0.0, np.array(view.size) - 1.0)
+    low, high = np.floor(at.min(axis=0)).astype(int), np.ceil(at.max(axis=0)).astype(int) + 1
+    box = int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
+    stretch = sample_stretch(view.path, band, view.size)
+    if stretch is not None:
+        picture = stretch.apply(*read_pixels(view.path, box, band, view.size))
+        grey[known] = map_coordinates(picture, (at - low).T[::-1], order=1)
+    return grey
 
 
 def shaded(height: F32, step: float) -> npt.NDArray[np.uint8]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import shutil
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,8 +82,9 @@ def make_dsm(
         block = block_of_images(source, options.alt, options.band)
     if out.is_dir() or out.resolve() in {Path(view.path).resolve() for view in block.views}:
         raise OutputError(f"{out}: is a folder or one of the images; give -o the name of a new file")
-    grid = Grid.of(block, options)
-    with replacing(out, overwrite=options.overwrite) as partial, Workspace(_room(out)) as run:
+    grid, folder = Grid.of(block, options), Path(source) if isinstance(source, str | Path) else None
+    room = out.parent / f"{out.name}.unfinished"  # results of tiles, until the file is whole
+    with _placed(out, folder, options.overwrite) as partial, Workspace(room) as run:
         rough = run.partial / "tiles.tif"
         with run.stage("surface"):
             counts = grid.fill(rough, run, executor, progress)
@@ -91,25 +93,25 @@ def make_dsm(
                 f"of the pixels that both images show {100 * max(counts.share, 0):.0f} % are found back at most, "
                 f"fewer than {100 * MATCHED:.0f} %: other seasons, water, clouds or wrong cameras; nothing is written"
             )
+        how = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "BLOCKSIZE": str(SIDE), "BIGTIFF": "IF_SAFER"}
         with run.stage("write"), rasterio.Env(GDAL_NUM_THREADS="1"):
-            rasterio.shutil.copy(
-                rough,
-                partial,
-                driver="COG",
-                COMPRESS="DEFLATE",
-                PREDICTOR="YES",
-                BLOCKSIZE=str(SIDE),
-                BIGTIFF="IF_SAFER",
-            )
-    if isinstance(source, str | Path) and options.minus is None:
-        show_in_report(Path(source), grid, out)
-    shutil.rmtree(run.folder, ignore_errors=True)  # (what was kept for going on; it is done)
+            rasterio.shutil.copy(rough, partial, driver="COG", **how)
+    if folder is not None and options.minus is None:
+        show_in_report(folder, grid, out)
+    shutil.rmtree(room, ignore_errors=True)
     return _told(out, grid, counts)
 
 
-def _room(out: Path) -> Path:
-    """Return the folder beside the file in which results of tiles are kept until it is whole."""
-    return out.parent / f"{out.name}.unfinished"
+@contextmanager
+def _placed(out: Path, folder: Path | None, overwrite: bool) -> Iterator[Path]:
+    """Yield a temporary path for the file; in the folder of its run it becomes one of the run's own."""
+    if folder is None or out.parent.resolve() != folder.resolve():
+        with replacing(out, overwrite=overwrite) as partial:
+            yield partial
+    else:
+        own = Workspace(folder, overwrite=overwrite, names=[out.name], adds=True)
+        with own as run, run.output(out.name) as partial:
+            yield partial
 
 
 def _told(out: Path, grid: Grid, counts: Counts) -> Surface:

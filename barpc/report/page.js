@@ -124,3 +124,11 @@ for (const panel of document.querySelectorAll(".panels figure")) {
   panel.addEventListener("click", open);
   panel.addEventListener("keydown", event => { if (event.key === "Enter" || event.key === " ") { event.preventDefault(); open(); } });
 }
+
+for (const e of document.querySelectorAll(".swipe")) {
+  const seam = percent => e.style.setProperty("--seam", percent + "%");
+  const flip = () => seam(parseFloat(e.style.getPropertyValue("--seam")) === 0 ? 100 : 0);
+  e.onpointermove = move => { const box = e.getBoundingClientRect(); seam(Math.max(0, Math.min(100, 100 * (move.clientX - box.left) / box.width))); };
+  e.onclick = flip;
+  e.onkeydown = key => { if (key.key === " " || key.key === "Enter") { key.preventDefault(); flip(); } };
+}

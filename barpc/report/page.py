@@ -31,7 +31,7 @@ from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.whole import DATUM, DatumEntry
 from barpc.report.summary.words import STATUS_WORDS, counted, largest, listed, metres
-from barpc.report.tables import Relief, RunFiles, read_summary, read_tables
+from barpc.report.tables import Draped, Relief, RunFiles, read_summary, read_tables
 from barpc.scene import connected_groups
 from barpc.workspace import Workspace
 
@@ -248,14 +248,31 @@ def _surface(files: RunFiles) -> Section | None:
             f" Pairs of images disagree by {metres(before.nmad_m)} and by {metres(after.nmad_m)} (medians)."
         )
     shown = [_relief(one) for one in files.reliefs]
+    if files.draped:
+        shown.append(_swiped(*files.draped))
     return Section("surface", "What do they make of the ground?", answer, shown)
 
 
 def _relief(one: Relief) -> tuple[str, str]:
-    width, height = one.size
-    shown = charts.tag("image", href=f"data:image/jpeg;base64,{one.picture}", width=width, height=height)
     words = f"The ground by the {one.cameras} cameras, lit from the north-west; black: no height"
-    return f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{words}">{shown}</svg>', f"{words}."
+    return _svg(one.size, words, _jpeg(one)), f"{words}."
+
+
+def _swiped(left: Draped, right: Draped) -> tuple[str, str]:
+    words = f"{left.image} (left) and {right.image} (right) on the surface by the corrected cameras"
+    seam = charts.tag("rect", class_="seam", width=2, height=left.size[1])
+    svg = _svg(left.size, words, _jpeg(left), _jpeg(right, class_="over"), seam, class_="swipe", tabindex=0)
+    return svg, f"{words}: move over it to swipe, click to flicker. What stands still has the right height."
+
+
+def _svg(size: tuple[int, int], words: str, *children: str, **attributes: object) -> str:
+    box = f"0 0 {size[0]} {size[1]}"
+    return charts.tag("svg", *children, viewBox=box, role="img", aria_label=words, **attributes)
+
+
+def _jpeg(one: Relief | Draped, **attributes: object) -> str:
+    href, (width, height) = f"data:image/jpeg;base64,{one.picture}", one.size
+    return charts.tag("image", href=href, width=width, height=height, **attributes)
 
 
 def _pairs(files: RunFiles) -> Section | None:

@@ -42,6 +42,7 @@ RESIDUALS = (*_PLACE, "mean_residual", "num_observations", "mean_residual_before
 OBSERVATIONS = ("view", "track", "col", "row", "col_before", "row_before", "col_after", "row_after", "used")
 """Columns of observations.csv, one row an observation: residuals are projected - observed [px]."""
 
+_BASE64 = r"^[A-Za-z0-9+/]{4,400000}={0,2}\Z"
 _FAR = 1e12  # px, deg and m: no number of a table comes near
 _RESIDUAL_CELLS = "{:.3f},{:.3f},{:.4f},{:.4f},{:.4f},{:.4f}".format
 
@@ -166,7 +167,7 @@ TABLES: dict[str, Callable[[Run, Summary], bytes]] = {
 }
 """File name -> its bytes, of a run and its summary."""
 SURFACE = "surface.json"
-"""Two reliefs for the report, of a run of which a surface was made."""
+"""Two reliefs and two images on the surface for the report, of a run of which one was made."""
 
 
 # --- read back --------------------------------------------------------------------------------------------
@@ -196,7 +197,17 @@ class Relief(Record):
     size: tuple[Side, Side] = said("Width and height of the picture", "px")
     share: Share = said("Part of the window that has heights")
     nmad_m: Number = said("How far pairs of images disagree, by median", "m")
-    picture: str = said("A shaded relief, a JPEG in base64", pattern=r"^[A-Za-z0-9+/]{4,400000}={0,2}\Z")
+    picture: str = said("A shaded relief, a JPEG in base64", pattern=_BASE64)
+
+
+class Draped(Record):
+    """An image on the surface, in the window of the reliefs."""
+
+    MORE: ClassVar = Any
+
+    image: str = said("Its name")
+    size: tuple[Side, Side] = said("Width and height of the picture", "px")
+    picture: str = said("The image, a JPEG in base64", pattern=_BASE64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,6 +224,7 @@ class RunFiles:
     tracks: IntArray
     outlines: Sequence[Sequence[Array]]
     reliefs: Sequence[Relief] = ()
+    draped: Sequence[Draped] = ()
 
     @property
     def number(self) -> dict[str, int]:
@@ -274,19 +286,20 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
     observations = _read(table_path(folder, "observations.csv"), TABLE, of_names)
     points, tracks = _read(table_path(folder, "residuals.csv"), TABLE, _points)
     surface = table_path(folder, SURFACE)
-    reliefs = _read(surface, SUMMARY, _reliefs) if os.path.lexists(surface) else ()
-    return RunFiles(summary, observations, points, tracks, outlines, reliefs)
+    shown = _read(surface, SUMMARY, _surface) if os.path.lexists(surface) else ((), ())
+    return RunFiles(summary, observations, points, tracks, outlines, *shown)
 
 
-def _reliefs(text: str) -> tuple[Relief, ...]:
+def _surface(text: str) -> tuple[tuple[Relief, ...], tuple[Draped, ...]]:
     import fastjsonschema
 
-    found = parse_json(text)
-    fastjsonschema.validate({"type": "array", "items": Relief.json_schema()}, found)
-    reliefs = tuple(map(Relief.read, found))
-    if [one.cameras for one in reliefs] != ["delivered", "corrected"]:
-        raise ValueError("reliefs that are not one before and one after")
-    return reliefs
+    rows = parse_json(text)
+    shown = {"type": "array", "items": [*2 * [Relief.json_schema()], *2 * [Draped.json_schema()]]}
+    fastjsonschema.validate({**shown, "additionalItems": False}, rows)
+    reliefs, draped = tuple(map(Relief.read, rows[:2])), tuple(map(Draped.read, rows[2:]))
+    if [one.cameras for one in reliefs] != ["delivered", "corrected"] or len(draped) not in (0, 2):
+        raise ValueError("reliefs that are not one before and one after, images that are not two")
+    return reliefs, draped
 
 
 def _read(path: Path, kind: Kind, parse: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +19,8 @@ ACROSS = 0.02
 FINER = (
     2  # columns of the frame a pixel: of a Pleiades triplet heights differ by 0.62 m (NMAD), of one by 0.83 m
 )
+WINDOW = 5
+"""Pixels a side over which grey values are compared."""
 _BLOCK = 5  # px of the frame
 _SGBM = {
     "blockSize": _BLOCK,
@@ -32,8 +35,12 @@ _SGBM = {
 }
 _BACK = 1.0  # px that a match may come back beside where it began
 _MARGIN = 16  # px about a part that are matched, too: paths of SGBM begin at the ends
-_WINDOW = 5  # px a side, over which grey values are compared
-_FLOOR, _FACTOR = 0.065, 1.9  # px; over what least squares matching states: see docs/recipes/dsm.md
+_LEFT, _SLOPE = (
+    0.741,
+    0.305,
+)  # of white noise of variance 1, in the frame: its variance, and that of its slope
+_ROUNDED = 2 / 12  # variance of two pictures' rounding to whole numbers
+_COLUMN = 1 / 6  # columns^2: variance of what SGBM says, a column either way with the weights of a hat
 _FEW = 32  # px a side of what is matched at all
 
 
@@ -132,12 +139,9 @@ def dense_matches(
         return None
     (left, shown_left), (right, shown_right) = parts  # type: ignore[misc]
     disparity, good = _both_ways(left, right, frame.num)
-    cols, rows = np.meshgrid(np.arange(shape[0], dtype=np.float32), np.arange(shape[1], dtype=np.float32))
-    at = cols - disparity
-    partner = np.asarray(cv2.remap(right, at, rows, cv2.INTER_LINEAR), np.uint8)
-    seen = shown_left & (cv2.remap(shown_right.astype(np.uint8), at, rows, cv2.INTER_NEAREST) > 0)
+    seen = shown_left & (_warped(shown_right.astype(np.uint8), disparity, cv2.INTER_NEAREST) > 0)
     good &= seen
-    sigma = _sigma(left, partner, good)
+    disparity, sigma = _refined(left, right, disparity, good)
     row, col = np.nonzero((good & _inside(shape, low, frame))[:, ::FINER])  # a match a pixel
     col *= FINER
     place = np.column_stack([col, row]) + low
@@ -233,26 +237,52 @@ def _both_ways(
     return there, good
 
 
-def _sigma(left: npt.NDArray[np.uint8], partner: npt.NDArray[np.uint8], good: BoolArray) -> FloatImage:
-    """Return the standard deviation of a match along the line [px]: of grey values that differ, over their
-    slope.
+def _refined(
+    left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], disparity: FloatImage, good: BoolArray
+) -> tuple[FloatImage, FloatImage]:
+    """Return disparities [columns] after a step of least squares matching from SGBM's, and their standard deviation
+    [px].
 
-    As least squares matching states it, of windows with a gain and an offset of their own; SGBM's own
-    interpolation is never better than `_FLOOR`.
+    SGBM locks to whole columns and lags on slopes; the step does not. A window's grey values are a gain, an offset and
+    a shift along the line of the other's; noise is what these leave. Noise is in the slopes, too, and is taken out of
+    what they tell. The step counts by the variance of SGBM's word over the sum of both.
     """
-    weight = good.astype(np.float32)
-    side = (FINER * _WINDOW, _WINDOW)
+    side, weight = (FINER * WINDOW, WINDOW), good.astype(np.float32)
     total = np.maximum(cv2.boxFilter(weight, cv2.CV_32F, side), 1e-3)
 
     def mean(values: FloatImage) -> FloatImage:
         return np.asarray(cv2.boxFilter(values * weight, cv2.CV_32F, side) / total, np.float32)
 
-    a, b = left.astype(np.float32), partner.astype(np.float32)
-    mean_a, mean_b = mean(a), mean(b)
-    var_a, var_b = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2
-    both = mean(a * b) - mean_a * mean_b
-    noise = np.maximum(var_a - both**2 / np.maximum(var_b, 1e-3), 0.0)
-    slope = np.zeros_like(a)
-    slope[:, 1:-1] = (a[:, 2:] - a[:, :-2]) * (FINER / 2)
-    stated = noise / np.maximum(mean(slope * slope), 1e-3) / _WINDOW**2
-    return np.asarray(np.sqrt(_FLOOR**2 + _FACTOR**2 * stated), np.float32)
+    level = mean(disparity)
+    even = mean(disparity * disparity) - level**2 < 1.0  # a column: no edge of a roof in the window
+    start = np.where(good & even, level, disparity).astype(np.float32)
+    a, other = left.astype(np.float32), right.astype(np.float32)
+    b = _warped(other, start, cv2.INTER_CUBIC)
+    slope = (_slope(a) + _warped(_slope(other), start, cv2.INTER_LINEAR)) / 2
+    level_a, level_b, level_s = mean(a), mean(b), mean(slope)
+    aa, bb, ss = mean(a * a) - level_a**2, mean(b * b) - level_b**2, mean(slope * slope) - level_s**2
+    ab, bs = mean(a * b) - level_a * level_b, mean(b * slope) - level_b * level_s
+    a_s = mean(a * slope) - level_a * level_s
+    bb = np.maximum(bb, 1e-3)
+    told = np.maximum(ss - bs**2 / bb, 1e-3)
+    shift = (a_s - ab * bs / bb) / told
+    pixels = WINDOW**2 * total
+    left_over = np.maximum(aa - ab**2 / bb - told * shift**2, 0.0)
+    noise = np.maximum(left_over * pixels / np.maximum(pixels - 3, 1) / _LEFT, _ROUNDED)  # 3: the unknowns
+    variance = noise / pixels / np.maximum(told - noise * _SLOPE / 4, 0.1 * told)
+    found = start - shift * _COLUMN / (_COLUMN + variance)
+    kept = np.clip(found, disparity - 1.0, disparity + 1.0)
+    return np.asarray(kept, np.float32), np.asarray(np.sqrt(variance) / FINER, np.float32)
+
+
+def _warped(values: npt.NDArray[Any], disparity: FloatImage, how: int) -> npt.NDArray[Any]:
+    """Return what the right picture has where the left one's pixels are found."""
+    cols, rows = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in disparity.shape[::-1]))
+    return np.asarray(cv2.remap(values, np.asarray(cols - disparity, np.float32), rows, how))
+
+
+def _slope(values: FloatImage) -> FloatImage:
+    """Return the central difference along the line, by column."""
+    out = np.zeros_like(values)
+    out[:, 1:-1] = (values[:, 2:] - values[:, :-2]) / 2
+    return out
