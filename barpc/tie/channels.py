@@ -57,9 +57,9 @@ def correlation(template: FloatImage, search: FloatImage) -> FloatImage:
     size = fft.next_fast_len(height, real=True), fft.next_fast_len(width, real=True)
     spectrum = (fft.rfft2(search, size) * fft.rfft2(template, size).conj()).sum(axis=1)
     product = fft.irfft2(spectrum, size)[:, : height - h + 1, : width - w + 1]
-    energy = np.zeros((len(search), height + 1, width + 1))
-    energy[:, 1:, 1:] = (search**2).sum(axis=1).cumsum(axis=1, dtype=np.float64).cumsum(axis=2)
-    here = energy[:, h:, w:] - energy[:, :-h, w:] - energy[:, h:, :-w] + energy[:, :-h, :-w]
+    inner = np.s_[h // 2 : height - (h - 1) // 2, w // 2 : width - (w - 1) // 2]
+    energy = (cv2.boxFilter(one, -1, (w, h), normalize=False)[inner] for one in (search**2).sum(axis=1))
+    here = np.stack([*energy])
     own = (template.astype(np.float64) ** 2).sum(axis=(1, 2, 3))
     scale = np.sqrt(
         np.maximum(here, 0.02 * own[:, None, None]) * own[:, None, None]

@@ -24,7 +24,8 @@ _MAX_TURN = np.radians(30.0)  # between the orientation seen and the one expecte
 _MAX_ZOOM = np.log(1.8)  # the same for the scale
 _APART = 2.0  # px; nearer candidates are the same point
 _NONE = np.float32(-2.0)  # below every cosine
-_CANDIDATES = 400_000  # looked at together
+_ROWS = 64  # points of A, near each other, that are compared with all their candidates at a time,
+_CANDIDATES = 1 << 18  # as long as these products stay in cache
 
 
 class Guided:
@@ -34,25 +35,26 @@ class Guided:
 
     def __init__(self, options: TieOptions, keypoints: tuple[Keypoints, Keypoints]) -> None:
         self._ratio, (self._a, self._b) = options.ratio, keypoints
-        self._prepared: tuple[_Strips, _Described, _Described] | None = None
+        self._prepared: tuple[Array, _Described, _Described] | None = None
 
     def match(self, a: View, b: View, prediction: Prediction) -> Matches:
         """Return the mutual best keypoints whose second best is farther by the ratio test (Lowe 2004)."""
         if not (len(self._a) and len(self._b)):
             return NO_MATCHES
-        where, across = prediction.at(self._a.xy), prediction.half_width
+        where = prediction.at(self._a.xy)
         if self._prepared is None:  # the axis of the frames, and so all this, is one for a pair
             described = _Described.of(self._a, where.linear), _Described.of(self._b, np.eye(2))
-            self._prepared = _Strips(where.turn(self._b.xy)), *described
-        strips, first, second = self._prepared
+            self._prepared = where.turn(self._b.xy), *described
+        turned, first, second = self._prepared
         best = _Best(len(self._a), len(self._b))
-        for row, col in strips.near(where, across, prediction.chosen(len(self._a))):
-            du, dw = strips.apart(where, row, col)
-            allowed = (np.abs(dw) <= across) & (du >= where.before[row]) & (du <= where.after[row])
-            allowed[allowed] = first.alike(row[allowed], second, col[allowed])
-            if allowed.any():
-                a_of, b_of = row[allowed], col[allowed]
-                best.update(a_of, b_of, first.likeness(a_of, second, b_of), du[allowed], dw[allowed])
+        for rows, cols in _near(where, prediction.half_width, prediction.chosen(len(self._a)), turned):
+            others = second.select(cols)
+            for some in np.array_split(rows, min(len(rows), -(-len(rows) * len(cols) // _CANDIDATES))):
+                du = turned[cols, 0] - where.along[some, None]
+                dw = turned[cols, 1] - where.across[some, None] - where.slope[some, None] * du
+                allowed = (np.abs(dw) <= prediction.half_width) & (du <= where.after[some, None])
+                allowed &= du >= where.before[some, None]
+                best.update(some, cols, first.select(some).likeness(others, allowed), du, dw)
         index, distance, ambiguity = best.mutual()
         clear = ambiguity <= (self._ratio if prediction.probes is None else min(self._ratio, CLEAR_RATIO))
         xy = np.stack([self._a.xy[index[:, 0]], self._b.xy[index[:, 1]]], axis=1)
@@ -70,23 +72,23 @@ class _Described:
     @staticmethod
     def of(keypoints: Keypoints, linear: Array) -> _Described:
         values = keypoints.descriptors.astype(np.float32)
-        norm = np.maximum(np.linalg.norm(values, axis=1, keepdims=True), np.float32(1e-6))
+        values /= np.maximum(np.linalg.norm(values, axis=1, keepdims=True), np.float32(1e-6))
         turned = np.stack([np.cos(keypoints.angle), np.sin(keypoints.angle)], axis=-1) @ linear.T
         turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-9)
         zoom = np.log(keypoints.scale * np.sqrt(np.abs(np.linalg.det(linear))))
-        return _Described(values / norm, turned.astype(np.float32), zoom.astype(np.float32))
+        return _Described(values, turned.astype(np.float32), zoom.astype(np.float32))
 
-    def alike(self, row: IntArray, other: _Described, col: IntArray) -> npt.NDArray[np.bool_]:
-        """Return the candidates of about the expected orientation and scale."""
-        turned = np.einsum("ij,ij->i", self.direction[row], other.direction[col])
-        out: npt.NDArray[np.bool_] = turned >= np.float32(np.cos(_MAX_TURN))
-        out &= np.abs(other.zoom[col] - self.zoom[row]) <= np.float32(_MAX_ZOOM)
-        return out
+    def select(self, which: IntArray) -> _Described:
+        """Return those of some keypoints."""
+        return _Described(self.unit[which], self.direction[which], self.zoom[which])
 
-    def likeness(self, row: IntArray, other: _Described, col: IntArray) -> FloatArray:
-        """Return the cosines of the descriptors, pair by pair."""
-        out: FloatArray = np.einsum("ij,ij->i", self.unit[row], other.unit[col])
-        return out
+    def likeness(self, other: _Described, allowed: npt.NDArray[np.bool_]) -> FloatArray:
+        """Return the cosines (n, m) of the descriptors that are allowed, where orientation and scale are as
+        expected; else `_NONE`.
+        """
+        allowed &= self.direction @ other.direction.T >= np.float32(np.cos(_MAX_TURN))
+        allowed &= np.abs(other.zoom - self.zoom[:, None]) <= np.float32(_MAX_ZOOM)
+        return np.where(allowed, self.unit @ other.unit.T, _NONE)
 
 
 class _Best:
@@ -98,19 +100,20 @@ class _Best:
         self._of_b = np.full(size_b, -1)
         self._top_b = np.full(size_b, _NONE)
 
-    def update(self, row: IntArray, col: IntArray, likeness: FloatArray, du: Array, dw: Array) -> None:
-        """Take in all candidates of some points of A: their cosines and their places about the predicted ones."""
-        order = np.lexsort((row, -likeness, col))
-        back = order[np.unique(col[order], return_index=True)[1]]
-        back = back[likeness[back] > self._top_b[col[back]]]
-        self._of_b[col[back]], self._top_b[col[back]] = row[back], likeness[back]
-        order = np.lexsort((col, -likeness, row))
-        rows, start, number = np.unique(row[order], return_index=True, return_inverse=True)
-        pick = order[start]
-        self._of_a[rows], self._top[rows] = col[pick], likeness[pick]
-        same = np.abs(du[order] - du[pick][number]) <= _APART
-        same &= np.abs(dw[order] - dw[pick][number]) <= _APART
-        self._second[rows] = np.maximum.reduceat(np.where(same, _NONE, likeness[order]), start)
+    def update(self, rows: IntArray, cols: IntArray, likeness: FloatArray, du: Array, dw: Array) -> None:
+        """Take in the cosines (n, m) of all candidates of some points of A, and their places about the predicted
+        ones.
+        """
+        back = likeness.argmax(axis=0)
+        top = likeness[back, np.arange(len(cols))]
+        more = top > self._top_b[cols]
+        self._of_b[cols[more]], self._top_b[cols[more]] = rows[back[more]], top[more]
+        pick = likeness.argmax(axis=1)[:, None]
+        self._of_a[rows] = cols[pick[:, 0]]
+        self._top[rows] = np.take_along_axis(likeness, pick, axis=1)[:, 0]
+        same = np.abs(du - np.take_along_axis(du, pick, axis=1)) <= _APART
+        same &= np.abs(dw - np.take_along_axis(dw, pick, axis=1)) <= _APART
+        self._second[rows] = np.where(same, _NONE, likeness).max(axis=1)
 
     def mutual(self) -> tuple[IntArray, Array, Array]:
         """Return the mutual best pairs (M, 2), their distances, and these over those to the second best (M,).
@@ -125,56 +128,25 @@ class _Best:
         return np.stack([found, self._of_a[found]], axis=1), distance, distance / rival
 
 
-class _Strips:
-    """Points of B sorted into strips across the epipolar direction, and along it within a strip."""
-
-    height = 8.0
-
-    def __init__(self, turned: Array) -> None:
-        self._turned = turned
-        self._corner = turned.min(axis=0)
-        self._length = float(np.ptp(turned[:, 0])) + 3.0
-        strip = np.floor((turned[:, 1] - self._corner[1]) / self.height)
-        key = strip * self._length + turned[:, 0] - self._corner[0] + 1.0
-        self._order = np.argsort(key, kind="stable")
-        self._key, self._last = key[self._order], int(strip.max())
-
-    def near(self, where: Frame, across: float, wanted: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
-        """Yield the points of A and the points of B in the strips that their bands touch, all of a point of A
-        together.
-        """
-        rows = wanted[np.isfinite(where.along + where.across + where.slope)[wanted]]
-        before, after, u, w = (x[rows] for x in (where.before, where.after, where.along, where.across))
-        reach = across + np.abs(where.slope[rows]) * np.maximum(np.abs(before), np.abs(after))
-        ends = ((end - self._corner[1]) / self.height for end in (w - reach, w + reach))
-        first, last = (np.floor(end).clip(-1, self._last + 1).astype(np.int64) for end in ends)
-        first, last = first.clip(0), last.clip(None, self._last)
-        point, strip = _expanded(first, (last - first + 1).clip(0))
-        span = (
-            (u + end - self._corner[0])[point].clip(-1.0, self._length - 2.0) + 1.0 for end in (before, after)
-        )
-        low, high = (strip * self._length + end for end in span)
-        begin, end = (
-            np.searchsorted(self._key, low, side="left"),
-            np.searchsorted(self._key, high, side="right"),
-        )
-        count = (end - begin).clip(0)
-        of_point = np.bincount(point, weights=count, minlength=len(rows))
-        cuts = np.searchsorted(point, np.flatnonzero(np.diff(np.cumsum(of_point) // _CANDIDATES)) + 1)
-        for part in np.split(np.arange(len(point)), cuts):
-            number, place = _expanded(begin[part], count[part])
-            yield rows[point[part][number]], self._order[place]
-
-    def apart(self, where: Frame, row: IntArray, col: IntArray) -> tuple[Array, Array]:
-        """Return the distances along and across of points of B from the predicted ones of A, pair by pair."""
-        du = self._turned[col, 0] - where.along[row]
-        return du, self._turned[col, 1] - where.across[row] - where.slope[row] * du
-
-
-def _expanded(first: IntArray, count: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the ranges that begin at `first` and hold `count` numbers: the number of its range, and each
-    number in it.
+def _near(
+    where: Frame, across: float, wanted: IntArray, turned: Array
+) -> Iterator[tuple[IntArray, IntArray]]:
+    """Yield points of A whose bands lie near each other, and the points of B, `turned` (N, 2) as the frame is, about
+    all these bands; both ascending.
     """
-    which = np.repeat(np.arange(len(first)), count)
-    within = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
-    return which, first[which] + within
+    rows = wanted[np.isfinite(where.along + where.across + where.slope)[wanted]]
+    if not len(rows):
+        return
+    u, w = where.along[rows], where.across[rows]
+    reach = across + np.abs(where.slope[rows]) * np.maximum(np.abs(where.before), np.abs(where.after))[rows]
+    strip = np.floor(w / max(float(np.ptp(w)) * min(1.0, (_ROWS / len(rows)) ** 0.5), across))
+    order, by_w = np.lexsort((u, strip)), np.argsort(turned[:, 1], kind="stable")
+    height = turned[by_w, 1]
+    for first in range(0, len(order), _ROWS):
+        some = order[first : first + _ROWS]
+        low, high = (w - reach)[some].min(), (w + reach)[some].max()
+        cols = by_w[np.searchsorted(height, low, "left") : np.searchsorted(height, high, "right")]
+        left, right = (u + where.before[rows])[some].min(), (u + where.after[rows])[some].max()
+        cols = cols[(turned[cols, 0] >= left) & (turned[cols, 0] <= right)]
+        if len(cols):
+            yield np.sort(rows[some]), np.sort(cols)

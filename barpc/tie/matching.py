@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple
@@ -116,7 +117,8 @@ def match_pair(
 
     Where few or none are found, loosened thresholds are tried, and what finds more counts.
     """
-    first = _attempt(views, keypoints, pair, options)
+    looked: dict[str, _Search] = {}
+    first = _attempt(views, keypoints, pair, options, looked)
     if enough(first[1]) or "keypoints" in first[1].status or options.matcher not in MATCHERS:
         return first
     loose = replace(
@@ -130,7 +132,7 @@ def match_pair(
         (structural and first[1].matches < loose.min_matches)  # thresholds do not say where it looks
         or (first[1].status.startswith(_NOWHERE) and options.ratio >= CLEAR_RATIO)
     ):  # nor do looser ones let more through where only clear matches count
-        found, report = _attempt(views, keypoints, pair, loose)
+        found, report = _attempt(views, keypoints, pair, loose, looked)
         tried.append((found, replace(report, loosened=True)))
     if structural and all(report.status != "ok" for _, report in tried):
         found, report = _attempt(views, keypoints, pair, replace(loose, matcher=FINE))
@@ -173,8 +175,11 @@ def _attempt(
     keypoints: tuple[Keypoints | KeypointFiles, Keypoints | KeypointFiles],
     pair: Pair,
     options: TieOptions,
+    looked: dict[str, _Search] | None = None,
 ) -> tuple[Matches, PairReport]:
-    """Return all passes over a pair with one matcher and its thresholds."""
+    """Return all passes over a pair with one matcher and its thresholds; by its name, what was `looked` at is
+    known to the next attempt.
+    """
     names, counts = (views[0].name, views[1].name), (len(keypoints[0]), len(keypoints[1]))
     report = PairReport(
         names,
@@ -189,7 +194,10 @@ def _attempt(
     if kind.detects and min(counts) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few keypoints")
     loaded, numbers = _loaded(views, keypoints, options)
-    search = _Search(views, loaded, options)
+    looked = {} if looked is None else looked
+    before = looked.get(options.matcher)
+    search = _Search(views, loaded, options) if before is None else before.loosened(loaded, options)
+    looked[options.matcher] = search
     coarse = search.offset()
     if coarse is None:
         return NO_MATCHES, replace(report, status=f"{_NOWHERE} within {search.reach:.4g} px")
@@ -369,6 +377,7 @@ class _Search:
         self, views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints], options: TieOptions
     ) -> None:
         self._views, self._options = views, options
+        self._offset: list[Prediction | None] = []
         self._matcher = matcher_named(options.matcher)(options, keypoints)
         self.reach = min(reach_of(views[1], options), getattr(self._matcher, "widest", float("inf")))
         points = keypoints[0].xy
@@ -379,6 +388,15 @@ class _Search:
         first = frame(*views, points)
         self._axis = first.axis
         self._frame = _latest(lambda xy: first if xy is points else frame(*views, xy, first.axis))
+
+    def loosened(self, keypoints: tuple[Keypoints, Keypoints], options: TieOptions) -> _Search:
+        """Return the search at looser thresholds, which do not change where it looks."""
+        other = copy(self)
+        if self._matcher.detects:
+            other._matcher = matcher_named(options.matcher)(options, keypoints)
+        if self._options.ratio < CLEAR_RATIO:  # nor which matches are clear, but for this
+            other._offset = []
+        return other
 
     @property
     def patch(self) -> float:
@@ -414,7 +432,13 @@ class _Search:
         return found.select(np.arange(count)), float(share[count - 1]) if count else 0.0
 
     def offset(self) -> Prediction | None:
-        """Find the cameras' error by blind passes of growing width, and where to search.
+        """Return where to search, once the cameras' error is found by blind passes of growing width."""
+        if not self._offset:
+            self._offset.append(self._passes())
+        return self._offset[0]
+
+    def _passes(self) -> Prediction | None:
+        """Return where to search by several blind passes.
 
         The first pass in whose peak most matches stand decides, else the one with the most significant peak, if any.
         """
@@ -430,9 +454,10 @@ class _Search:
 
     def _blind(self, width: float, probes: int) -> _Peak | None:
         """Return one pass: a peak among the errors across the epipolar lines of some points, if there is one."""
+        every = self._frame  # and not this search: what it found would keep it, and it what it found
 
         def everywhere(xy: Array) -> Frame:
-            where = self._frame(xy)
+            where = every(xy)
             return replace(where, before=where.before - width, after=where.after + width)
 
         prediction = replace(self._predicted(everywhere, width), probes=probes)
@@ -455,7 +480,7 @@ class _Search:
         first, last = low - margin, high + margin
 
         def corrected(xy: Array) -> Frame:
-            where, same = self._frame(xy).moved(across(xy)), np.ones(len(xy))
+            where, same = every(xy).moved(across(xy)), np.ones(len(xy))
             return replace(where, before=first * same, after=last * same)
 
         return _Peak(self._predicted(corrected, TOLERANCE), most / len(values), float(significance))
@@ -463,12 +488,12 @@ class _Search:
     def local(self, tight: Matches) -> Prediction:
         """Return the corrected prediction: each point in a band about its neighbours' places by the matches so far."""
         errors, places = self.errors(tight), tight.xy[:, 0]
-        across, tree = robust_affine(places, errors[:, 1]), cKDTree(places)
+        across, tree, every = robust_affine(places, errors[:, 1]), cKDTree(places), self._frame
 
         def nearby(xy: Array) -> Frame:
             along = errors[tree.query(xy, k=min(_NEIGHBOURS, len(tight)))[1], 0]
             middle = np.median(along, axis=1)
             half = 4.0 + 3.0 * robust_spread(along, middle[:, None])
-            return replace(self._frame(xy).moved(across(xy)), before=middle - half, after=middle + half)
+            return replace(every(xy).moved(across(xy)), before=middle - half, after=middle + half)
 
         return self._predicted(nearby, float(np.clip(4.0 * across.spread, 0.6, TOLERANCE)))

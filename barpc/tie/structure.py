@@ -67,7 +67,7 @@ class Structure:
 
     def __init__(self, options: TieOptions, keypoints: tuple[Keypoints, Keypoints]) -> None:
         self._band = options.band
-        self._known: tuple[Callable[[Array], Frame], Matches] | None = None
+        self._known: dict[Callable[[Array], Frame], Matches] = {}
 
     def match(self, a: View, b: View, prediction: Prediction) -> Matches:
         """Match a grid of points: those whose best place, in the band and in decoys to both sides, lies in
@@ -75,12 +75,12 @@ class Structure:
 
         All bands of a prediction, moved aside or not, are looked at at once; the next calls ask of what was found.
         """
-        if self._known is None or self._known[0] is not prediction.where:
+        if prediction.where not in self._known:
             search = _Search(a, b, self._band, prediction, self.whole)
             if self.whole:
                 self.patch = 2.0 * _RING * search.pitch
-            self._known = prediction.where, search.matches()
-        found = self._known[1]
+            self._known[prediction.where] = search.matches()
+        found = self._known[prediction.where]
         if not len(found):
             return NO_MATCHES
         across = prediction.at(found.xy[:, 0]).errors(found.xy[:, 1])[:, 1]

@@ -31,7 +31,7 @@ def attempts(monkeypatch):
     def scripted(*reports: PairReport) -> list[TieOptions]:
         script = iter(reports)
 
-        def attempt(_views, _keypoints, _pair, options: TieOptions) -> tuple[Matches, PairReport]:
+        def attempt(_views, _keypoints, _pair, options: TieOptions, *_) -> tuple[Matches, PairReport]:
             made.append(options)
             return NO_MATCHES, replace(next(script), matcher=options.matcher)
 
