@@ -49,8 +49,8 @@ from barpc.tie import (  # noqa: E402
     refine,
     select_pairs,
 )
-from barpc.tie.epipolar import agreeing, frame, robust_spread  # noqa: E402
-from barpc.tie.raster import read_pixels, sample_stretch  # noqa: E402
+from barpc.tie.pairing.epipolar import agreeing, frame, robust_spread  # noqa: E402
+from barpc.tie.pixels import read_pixels, sample_stretch  # noqa: E402
 from barpc.workspace import Workspace  # noqa: E402
 
 

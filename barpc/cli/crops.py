@@ -16,7 +16,7 @@ from barpc.dem import Dem
 from barpc.handoff import Reading, verify
 from barpc.rpcio import WRITABLE, write_camera, write_crop
 from barpc.sensor.geometry import image_border
-from barpc.tie.pairs import read_area
+from barpc.tie.pairing.area import read_area
 from barpc.workspace import Workspace
 
 Window = tuple[int, int, int, int]

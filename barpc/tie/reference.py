@@ -3,7 +3,7 @@
 An image is projected through its camera and the terrain onto a local grid, at the coarser of the two resolutions. First
 many blocks vote together for one shift of the whole camera, within `REACH` metres; how far the peak stands above the
 rest of the sum says whether this is the same place. With the camera moved so, points on a regular grid on the ground,
-the same for all views, are looked for one by one (`barpc.tie.channels`), and those are kept that agree.
+the same for all views, are looked for one by one (`barpc.tie.patches.channels`), and those are kept that agree.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import numpy as np
 from barpc.geodesy import Array, metres_per_unit
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
-from barpc.tie.channels import Found, correlation, find, joined, margin
-from barpc.tie.ortho import Patch, Sheet, Terrain, of_image, of_reference, shown
-from barpc.tie.raster import FloatImage
+from barpc.tie.patches.channels import Found, correlation, find, joined, margin
+from barpc.tie.patches.resampled import Patch, Sheet, Terrain, of_image, of_reference, shown
+from barpc.tie.pixels import FloatImage
 from barpc.tie.tasks import Progress, ordered
 
 REACH = 150.0  # m: how far a camera may be off

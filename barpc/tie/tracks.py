@@ -17,12 +17,10 @@ from barpc.geodesy import Array, ground_from_ecef
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
-from barpc.tie.choice import COMPARED, TRIES, best_pairs, further_pairs, judged, several_dates
-from barpc.tie.epipolar import grouped, linear_map
-from barpc.tie.features import KeypointFiles, locate, worth_a_first_look
-from barpc.tie.given import GivenMatches, verify
-from barpc.tie.matcher import Matches
-from barpc.tie.matching import (
+from barpc.tie.matchers.features import KeypointFiles, locate, worth_a_first_look
+from barpc.tie.matchers.given import GivenMatches, verify
+from barpc.tie.matchers.matcher import Matches
+from barpc.tie.matchers.matching import (
     FINE,
     MATCHERS,
     STRUCTURE,
@@ -34,10 +32,13 @@ from barpc.tie.matching import (
     matcher_named,
     quick_score,
 )
-from barpc.tie.ortho import Terrain
-from barpc.tie.pairs import Area, Pair, possible_pairs, require_connected
-from barpc.tie.register import refine
-from barpc.tie.resolution import Looks
+from barpc.tie.pairing.area import Area
+from barpc.tie.pairing.choice import COMPARED, TRIES, best_pairs, further_pairs, judged, several_dates
+from barpc.tie.pairing.epipolar import grouped, linear_map
+from barpc.tie.pairing.overlaps import Pair, possible_pairs, require_connected
+from barpc.tie.pairing.resolution import Looks
+from barpc.tie.patches.register import refine
+from barpc.tie.patches.resampled import Terrain
 from barpc.tie.store import Store, store_of
 from barpc.tie.tasks import Progress, ordered
 
@@ -239,7 +240,10 @@ class _Trials:
         ]
         looks, options = self.looks, self._options
         own = self._matched([looks.pair(pair) for pair in others], before)
-        given = {looks.ends[pair.views]: looks.matches(pair.views, self._given[pair.views]) for pair in known}
+        given = {
+            looks.ends[pair]: replace(self._given[pair], xy=looks.places(pair, self._given[pair].xy))
+            for pair in (pair.views for pair in known)
+        }
         theirs = verify(looks.views, given, [looks.pair(pair) for pair in known], options, **self._work)
         for pair, (found, report) in zip([*others, *known], [*own, *theirs], strict=True):
             self.tried[pair.views] = pair, found, report

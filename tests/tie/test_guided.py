@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from barpc.tie import TieOptions
-from barpc.tie.epipolar import Frame
-from barpc.tie.features import Keypoints, Share, Sift, allotted, detect_tile, join, quota, ranked
-from barpc.tie.guided import _ROWS, Guided, _near
-from barpc.tie.matcher import Matches, Prediction
-from barpc.tie.raster import Stretch, grow, read_pixels, sample_stretch, survey, tiles
+from barpc.tie.matchers.features import Keypoints, Share, Sift, allotted, detect_tile, join, quota, ranked
+from barpc.tie.matchers.guided import _ROWS, Guided, _near
+from barpc.tie.matchers.matcher import Matches, Prediction
+from barpc.tie.pairing.epipolar import Frame
+from barpc.tie.pixels import Stretch, grow, read_pixels, sample_stretch, survey, tiles
 from tests.constants import chosen
 from tests.tie.conftest import write_image
 
@@ -281,7 +281,7 @@ def test_all_points_of_slanted_bands_are_looked_at_and_few_others(
 def test_candidates_come_in_portions_that_hold_all_of_a_point(pair, monkeypatch) -> None:
     a, b, where = pair
     whole = guided(a, b, where, 0.85)
-    monkeypatch.setattr("barpc.tie.guided._CANDIDATES", 50)
+    monkeypatch.setattr("barpc.tie.matchers.guided._CANDIDATES", 50)
     parts = guided(a, b, where, 0.85)
     np.testing.assert_array_equal(whole.index, parts.index)
     assert len(whole) > 40

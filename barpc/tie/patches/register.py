@@ -20,9 +20,9 @@ from scipy.spatial import cKDTree
 from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View
-from barpc.tie import structure
-from barpc.tie.epipolar import agreeing, frame, grouped, linear_map, robust_spread
-from barpc.tie.raster import FloatImage, PixelReader, grow, levelled
+from barpc.tie.pairing.epipolar import agreeing, frame, grouped, linear_map, robust_spread
+from barpc.tie.patches import oriented
+from barpc.tie.pixels import FloatImage, PixelReader, grow, levelled
 from barpc.tie.tasks import Progress, ordered
 
 MIN_CORRELATION = 0.8
@@ -187,8 +187,8 @@ def register_part(
 ) -> Registration:
     """Register patches by their grey values, or by channels of oriented gradients; `ok` where they are alike."""
     if structural:
-        xy, ok, correlation = structure.register_places(files, band, reference, start, linear)
-        return Registration(xy, correlation, np.full(len(xy), structure.SIGMA), ok)
+        xy, ok, correlation = oriented.register_places(files, band, reference, start, linear)
+        return Registration(xy, correlation, np.full(len(xy), oriented.SIGMA), ok)
     found = register_places(files, band, reference, start, linear, PATCH, tile)
     return replace(found, ok=found.ok & (found.correlation >= MIN_CORRELATION))
 

@@ -12,9 +12,9 @@ import numpy.typing as npt
 from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import IntArray, View
-from barpc.tie.epipolar import Frame
-from barpc.tie.features import Keypoints
-from barpc.tie.matcher import NO_MATCHES, Matches, Prediction
+from barpc.tie.matchers.features import Keypoints
+from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
+from barpc.tie.pairing.epipolar import Frame
 
 FloatArray = npt.NDArray[np.float32]
 

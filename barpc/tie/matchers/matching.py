@@ -22,14 +22,14 @@ from scipy.spatial import cKDTree
 from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import IntArray, View
-from barpc.tie.epipolar import Frame, agreeing, common_range, frame, robust_affine, robust_spread
-from barpc.tie.features import KeypointFiles, Keypoints, ample_matches, join
-from barpc.tie.guided import CLEAR_RATIO, Guided
-from barpc.tie.hook import Hook, hooked
-from barpc.tie.matcher import NO_MATCHES, Matcher, Matches, Prediction
-from barpc.tie.ortho import Terrain
-from barpc.tie.pairs import Pair, reach_of, shared_tiles
-from barpc.tie.structure import FineStructure, Structure
+from barpc.tie.matchers.features import KeypointFiles, Keypoints, ample_matches, join
+from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
+from barpc.tie.matchers.hook import Hook, hooked
+from barpc.tie.matchers.matcher import NO_MATCHES, Matcher, Matches, Prediction
+from barpc.tie.matchers.structural import FineStructure, Structure
+from barpc.tie.pairing.epipolar import Frame, agreeing, common_range, frame, robust_affine, robust_spread
+from barpc.tie.pairing.overlaps import Pair, reach_of, shared_tiles
+from barpc.tie.patches.resampled import Terrain
 from barpc.tie.tasks import Progress, ordered
 
 STRUCTURE = "structure"

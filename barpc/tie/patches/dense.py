@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
-from barpc.tie.raster import Box, FloatImage, Stretch, levelled, read_pixels
+from barpc.tie.pixels import Box, FloatImage, Stretch, levelled, read_pixels
 
 ACROSS = 0.02
 """A part in which an affine frame is farther off the epipolar lines [px] is too large for one."""

@@ -18,18 +18,21 @@ import numpy as np
 
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
-from barpc.tie.raster import FloatImage
+from barpc.tie.pixels import FloatImage
 
 CHANNELS = 2
 COARSE, FINE = (0.8, 0.8), (1.0, 0.7)
 """How far pictures are blurred [px] before the gradients, and the channels: to be found, and to be found exactly."""
 _WEAK = 0.5  # of the median gradient: what is weaker is noise
-_EDGE = 6  # px beside invalid ones that know of them
-_BATCH = 32  # templates that are correlated at a time
+EDGE = 6
+"""Pixels so near to invalid ones know of them [px]."""
+BATCH = 32
+"""Templates that are correlated at a time."""
 _STEPS = 5
 _STILL = 0.003  # px
 _GAP = 5  # px between a search area and its decoy: where a true peak ends
-_SHOWN = 0.9  # of a template must be a picture
+SHOWN = 0.9
+"""Part of a template that must be a picture."""
 
 
 def channels(pixels: FloatImage, valid: BoolArray, blurs: tuple[float, float] = COARSE) -> FloatImage:
@@ -42,7 +45,7 @@ def channels(pixels: FloatImage, valid: BoolArray, blurs: tuple[float, float] = 
     doubled = np.stack([east**2 - south**2, 2.0 * east * south]) / (length + np.float32(1e-12))
     found = np.stack([cv2.GaussianBlur(part, (0, 0), blurs[1]) for part in doubled])
     size = cv2.GaussianBlur(length, (0, 0), blurs[1])
-    known = cv2.erode(valid.astype(np.uint8), np.ones((2 * _EDGE + 1,) * 2, np.uint8), borderValue=1) > 0
+    known = cv2.erode(valid.astype(np.uint8), np.ones((2 * EDGE + 1,) * 2, np.uint8), borderValue=1) > 0
     weak = _WEAK * float(np.median(size[known])) if known.any() else 0.0
     return np.asarray(found * (known / (size + np.float32(weak + 1e-12))), np.float32)
 
@@ -101,7 +104,7 @@ def find(first: FloatImage, second: FloatImage, at: Array, half: int, search: in
     """
     rows = np.asarray(at, np.int64)
     return joined(
-        [_find(first, second, rows[i : i + _BATCH], half, search) for i in range(0, len(rows), _BATCH)]
+        [_find(first, second, rows[i : i + BATCH], half, search) for i in range(0, len(rows), BATCH)]
     )
 
 
@@ -132,7 +135,7 @@ def _find(first: FloatImage, second: FloatImage, at: IntArray, half: int, search
     there = at + whole
     around = cut(second, there, half + 2, half + 2)
     found = around[:, :, 2:-2, 2:-2]
-    pictures = [(np.abs(part).sum(axis=1) > 0).mean(axis=(1, 2)) > _SHOWN for part in (template, found)]
+    pictures = [(np.abs(part).sum(axis=1) > 0).mean(axis=(1, 2)) > SHOWN for part in (template, found)]
     back = correlation(found, cut(first, at, half + search, half + search)).reshape(n, -1)
     back_y, back_x = np.divmod(back.argmax(axis=1), wide)
     part, still = _registered(template, around)
