@@ -50,7 +50,6 @@ _DEFAULTS = TieOptions()
 _NOTHING: GivenMatches = MappingProxyType({})
 _SPARE = 1.3  # tracks registered for each one kept
 _SAME = 2.2  # px that registration may move a point by, rounding included
-_APART = 1e7  # px, more than an image measures
 _QUOTAS = (4, 8, 16)
 """Tracks that a cell takes, round by round; with the first an image of full cells holds what is asked for."""
 
@@ -308,7 +307,7 @@ def _joined(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
     """Return the registered tracks and others: one that stands beside a registered one is the same point,
     seen by more views.
     """
-    known, asked = (np.array([_APART * part.view, *part.xy.T]).T for part in (tracks, others))
+    known, asked = (np.array([2 * _SAME * part.view, *part.xy.T]).T for part in (tracks, others))
     near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=_SAME))
     same = np.flatnonzero(np.isfinite(near))
     point, which = np.unique(others.point[same], return_index=True)

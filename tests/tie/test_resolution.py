@@ -132,7 +132,7 @@ def test_the_camera_of_a_look_is_that_of_the_coarser_image() -> None:
 
 
 def test_pixels_are_means_and_valid_where_all_that_they_hold_is(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(reading, "_ROWS", 12)  # several parts
+    monkeypatch.setattr(reading, "SPAN", 12)  # several parts
     data = RNG.integers(1, 4000, (83, 62)).astype(np.uint16)  # a rest on both sides
     data[30:40, 20:30] = 9
     path = write_image(tmp_path / "a.tif", data, nodata=9)

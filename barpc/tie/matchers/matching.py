@@ -27,7 +27,15 @@ from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
 from barpc.tie.matchers.hook import Hook, hooked
 from barpc.tie.matchers.matcher import NO_MATCHES, Matcher, Matches, Prediction
 from barpc.tie.matchers.structural import FineStructure, Structure
-from barpc.tie.pairing.epipolar import Frame, agreeing, common_range, frame, robust_affine, robust_spread
+from barpc.tie.pairing.epipolar import (
+    LEAST_REACH,
+    Frame,
+    agreeing,
+    common_range,
+    frame,
+    robust_affine,
+    robust_spread,
+)
 from barpc.tie.pairing.overlaps import Pair, reach_of, shared_tiles
 from barpc.tie.patches.resampled import Terrain
 from barpc.tie.tasks import Progress, ordered
@@ -67,7 +75,6 @@ _LOOSE = (
     2 / 3,
 )  # ratio and false share of the second attempt; its part of the matches that a pair needs
 _QUICK = 500  # keypoints of a view that tell what a pair promises
-_LEAST_REACH = 5.0  # px of half a segment, below which matches say nothing of altitudes
 _MARGINS = 150.0, 50.0  # m beyond known altitudes: how wrong cameras make them, and seldom do
 _BESIDE = 100.0  # px beyond the other image at which terrain counts
 _PROBES = 12  # pixels along a side at which the terrain is asked
@@ -320,7 +327,7 @@ def _altitudes(ties: Sequence[tuple[tuple[View, View], Matches]]) -> tuple[float
     found = []
     for views, matches in ties:
         where, (low, high) = frame(*views, matches.xy[:, 0]), common_range(*views)
-        if np.median(where.after) >= _LEAST_REACH:
+        if np.median(where.after) >= LEAST_REACH:
             along = where.errors(matches.xy[:, 1])[:, 0] / where.after
             found.append(0.5 * (low + high) + 0.5 * (high - low) * np.percentile(along, [2, 98]))
     return (float(np.min(found)), float(np.max(found))) if found else None

@@ -25,16 +25,15 @@ from barpc.tie.patches.oriented import HALF, TILE, Sampling, Tile, found_about, 
 from barpc.tie.pixels import Box, FloatImage
 
 _SURFACE = 1 << 23  # places at which a tile's points are compared, all together: 30 bytes each
-_PITCH = 8  # px between points, at least
 _POINTS = 200, 500, 1000  # looked for: of the cameras' error, in long bands, in short ones
 _FINE_POINTS = 600, 1500  # of the cameras' error, in bands, where whole pixels are looked at
 _RING = 3.5  # pitches about a point whose neighbours speak for its places, together
 _SAY = (
     4.0  # times as loud as it does itself. Of four pairs that were hardest 1 is tied by 1.5 and 1, 3 by this
 )
+_SMALLEST = 60  # px of a side of the common part, in the coarsest picture
 _BENT = 2  # px by which their parallax may differ, and does not count
 _LONG, _LONGER = 48.0, 130.0  # px of half a band
-_SMALLEST = 60  # px of a side of the common part, in the coarsest picture
 
 
 class Structure:
@@ -113,7 +112,7 @@ class _Search:
             step //= 2
         step *= self._least
         area = float((boxes[:, 2] * boxes[:, 3]).sum())
-        self.pitch = step * max(_PITCH, int((area / count) ** 0.5 / step))
+        self.pitch = step * max(HALF // 2, int((area / count) ** 0.5 / step))
         return step, np.concatenate([_lattice(box, self.pitch) for box in windows])
 
     def matches(self) -> Matches:

@@ -21,8 +21,9 @@ from barpc.tie.pixels import Box, tiles
 
 logger = logging.getLogger(__name__)
 
-_BEST_ANGLE = 15.0  # deg; matches are many and heights still well determined
-_ANGLE_DECAY = 15.0  # deg
+_BEST_ANGLE = (
+    15.0  # deg; matches are many and heights still well determined; so many more, and it is worth 1 / e
+)
 ASTRAY = 700.0
 """How far two cameras may be wrong about each other [m]: by 350 m each, as SPOT 1 to 4 state it, the worst of all."""
 _REACH = 20.0, 700.0  # px that are searched at least and at most, unless another number is asked for
@@ -43,7 +44,7 @@ class Pair:
     @property
     def score(self) -> float:
         """Worth of the pair: large overlap, moderate angle."""
-        return self.overlap * float(np.exp(-max(0.0, self.angle - _BEST_ANGLE) / _ANGLE_DECAY))
+        return self.overlap * float(np.exp(-max(0.0, self.angle - _BEST_ANGLE) / _BEST_ANGLE))
 
 
 class Footprints:

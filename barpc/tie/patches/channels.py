@@ -29,7 +29,8 @@ EDGE = 6
 BATCH = 32
 """Templates that are correlated at a time."""
 _STEPS = 5
-_STILL = 0.003  # px
+SETTLED = 0.003
+"""A step below it is the last [px]."""
 _GAP = 5  # px between a search area and its decoy: where a true peak ends
 SHOWN = 0.9
 """Part of a template that must be a picture."""
@@ -174,9 +175,9 @@ def _registered(template: FloatImage, around: FloatImage) -> tuple[Array, BoolAr
         right = (slopes @ (wanted.reshape(flat.shape) - flat)[..., None]).astype(np.float64)
         step = np.linalg.solve(normal, right)[..., 0].clip(-0.5, 0.5)
         shift = (shift + step).clip(-1.0, 1.0)
-        if np.abs(step).max() < _STILL:
+        if np.abs(step).max() < SETTLED:
             break
-    return shift, np.asarray((np.abs(step).max(axis=1) < 10 * _STILL) & (np.abs(shift) < 1.0).all(axis=1))
+    return shift, np.asarray((np.abs(step).max(axis=1) < 10 * SETTLED) & (np.abs(shift) < 1.0).all(axis=1))
 
 
 def _unit(patches: FloatImage) -> FloatImage:

@@ -30,11 +30,8 @@ _SGBM = {
     "disp12MaxDiff": -1,  # asked for here, of a second pass
     "mode": cv2.STEREO_SGBM_MODE_SGBM_3WAY,  # 0.64 m, of five ways 0.62 m at half as much time again
 }
-_BACK = 1.0  # px that a match may come back beside where it began
 _MARGIN = 16  # px about a part that are matched, too: paths of SGBM begin at the ends
-_WINDOW = 5  # px a side, over which grey values are compared
 _FLOOR, _FACTOR = 0.065, 1.9  # px; over what least squares matching states: see docs/recipes/dsm.md
-_FEW = 32  # px a side of what is matched at all
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +159,7 @@ def _window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Arr
     for size, one, more in zip(sizes, frame.maps, (np.zeros(2), reach), strict=True):
         corners = (np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size - 0.5) @ one[:, :2].T + one[:, 2]
         low, high = np.maximum(low, corners.min(axis=0)), np.minimum(high, corners.max(axis=0) + more)
-    if (high - low < _FEW).any():
+    if (high - low < 2 * _MARGIN).any():
         return None
     low, high = np.floor(low - reach), np.ceil(high + reach)
     return low, (int(high[0] - low[0]), int(high[1] - low[1]))
@@ -229,7 +226,7 @@ def _both_ways(
     back = matcher.compute(*turned)[:, ::-1].astype(np.float32) / 16.0
     rows, cols = np.ogrid[: left.shape[0], : left.shape[1]]
     at = np.clip(np.rint(cols - there).astype(np.int64), 0, left.shape[1] - 1)
-    good: BoolArray = (there >= 0) & (np.abs(there - back[rows, at]) <= _BACK * FINER)
+    good: BoolArray = (there >= 0) & (np.abs(there - back[rows, at]) <= FINER)
     return there, good
 
 
@@ -241,7 +238,7 @@ def _sigma(left: npt.NDArray[np.uint8], partner: npt.NDArray[np.uint8], good: Bo
     interpolation is never better than `_FLOOR`.
     """
     weight = good.astype(np.float32)
-    side = (FINER * _WINDOW, _WINDOW)
+    side = (FINER * _BLOCK, _BLOCK)
     total = np.maximum(cv2.boxFilter(weight, cv2.CV_32F, side), 1e-3)
 
     def mean(values: FloatImage) -> FloatImage:
@@ -254,5 +251,5 @@ def _sigma(left: npt.NDArray[np.uint8], partner: npt.NDArray[np.uint8], good: Bo
     noise = np.maximum(var_a - both**2 / np.maximum(var_b, 1e-3), 0.0)
     slope = np.zeros_like(a)
     slope[:, 1:-1] = (a[:, 2:] - a[:, :-2]) * (FINER / 2)
-    stated = noise / np.maximum(mean(slope * slope), 1e-3) / _WINDOW**2
+    stated = noise / np.maximum(mean(slope * slope), 1e-3) / _BLOCK**2
     return np.asarray(np.sqrt(_FLOOR**2 + _FACTOR**2 * stated), np.float32)
