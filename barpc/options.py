@@ -218,7 +218,7 @@ class TieOptions(Options):
         """What matches a pair: `guided`, keypoints, and structure where they find few; `structure`, gradients
         whatever the grey values, and where that finds nothing `fine-structure`, at whole pixels.
         `module:name`: a function of yours, in a module that Python finds; it is run.""",
-        rows="barpc.tie.matching.MATCHERS",
+        rows="barpc.tie.matchers.matching.MATCHERS",
         hook=True,
     )
     tile: int = option(

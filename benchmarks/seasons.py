@@ -42,10 +42,10 @@ from barpc.scene import View  # noqa: E402
 from barpc.sensor.geometry import altitude_range, epipolar_offset  # noqa: E402
 from barpc.simulate import orbit  # noqa: E402
 from barpc.tie import common_tracks, find_tracks, match, select_pairs  # noqa: E402
-from barpc.tie.epipolar import frame, robust_affine  # noqa: E402
-from barpc.tie.features import join  # noqa: E402
-from barpc.tie.raster import read_pixels  # noqa: E402
-from barpc.tie.structure import PATCH, register_places  # noqa: E402
+from barpc.tie.matchers.features import join  # noqa: E402
+from barpc.tie.pairing.epipolar import frame, robust_affine  # noqa: E402
+from barpc.tie.patches.oriented import PATCH, register_places  # noqa: E402
+from barpc.tie.pixels import read_pixels  # noqa: E402
 from tests.scenes import ImageOptions  # noqa: E402
 from tests.scenes.redrawn import redrawn  # noqa: E402
 from tests.scenes.season import SEASONS, _part, disguised  # noqa: E402

@@ -37,8 +37,8 @@ from scipy import ndimage  # noqa: E402
 from barpc.options import TieOptions  # noqa: E402
 from barpc.pipeline.loading import load_views  # noqa: E402
 from barpc.tie import common_tracks, find_tracks  # noqa: E402
-from barpc.tie.epipolar import frame, linear_map  # noqa: E402
-from barpc.tie.register import MIN_CORRELATION, PATCH, register  # noqa: E402
+from barpc.tie.pairing.epipolar import frame, linear_map  # noqa: E402
+from barpc.tie.patches.register import MIN_CORRELATION, PATCH, register  # noqa: E402
 
 warnings.simplefilter("ignore")
 PAIRS = (

@@ -4,6 +4,8 @@
     python benchmarks/ties.py IMG IMG --cars PYTHON     and cars-bundleadjustment, run by that interpreter
     python benchmarks/ties.py --size SIDE               evenness, memory, CPU on a made-up pair of SIDE x SIDE pixels
     python benchmarks/ties.py --size SIDE --area 0.3    the same with an area of interest, so much of a side wide
+    python benchmarks/ties.py --size SIDE --unrelated   two textures that have nothing in common: what a refusal takes
+    python benchmarks/ties.py IMG IMG --refused         the first and the second image mirrored: what a refusal takes
 
 Ratios are of CPU seconds, measured in the same run, one thread.
 """
@@ -30,6 +32,7 @@ import numpy as np  # noqa: E402
 import rasterio  # noqa: E402
 from rasterio.windows import Window  # noqa: E402
 
+from barpc.errors import BarpcError  # noqa: E402
 from barpc.pipeline.executor import CachingExecutor  # noqa: E402
 from barpc.pipeline.loading import load_views  # noqa: E402
 from barpc.scene import View  # noqa: E402
@@ -46,8 +49,8 @@ from barpc.tie import (  # noqa: E402
     refine,
     select_pairs,
 )
-from barpc.tie.epipolar import agreeing, frame, robust_spread  # noqa: E402
-from barpc.tie.raster import read_pixels, sample_stretch  # noqa: E402
+from barpc.tie.pairing.epipolar import agreeing, frame, robust_spread  # noqa: E402
+from barpc.tie.pixels import read_pixels, sample_stretch  # noqa: E402
 from barpc.workspace import Workspace  # noqa: E402
 
 
@@ -180,8 +183,11 @@ def middle(share: float, degrees: float, folder: str) -> Area:
     return read_area(path)
 
 
-def scene(side: int, folder: str, layout: dict[str, object]) -> list[View]:
-    """A pair of `side` x `side` px: turned crops of one texture, the left half with a third of the contrast."""
+def scene(side: int, folder: str, layout: dict[str, object], unrelated: bool = False) -> list[View]:
+    """A pair of `side` x `side` px: turned crops of one texture, the left half with a third of the contrast.
+
+    `unrelated`: the second is mirrored in its middle row, column by column of crops: the same places, other ground.
+    """
     rng = np.random.default_rng(0)
     paths = [Path(folder) / f"{k}.tif" for k in range(2)]
     profile = {"driver": "GTiff", "width": side, "height": side, "count": 1, "dtype": "uint16", **layout}
@@ -206,6 +212,7 @@ def scene(side: int, folder: str, layout: dict[str, object]) -> list[View]:
         for k, file in enumerate(files):
             height, (right, down) = min(1024, side - row), rng.integers(0, 64, 2)
             part = both[8 - 2 * k :][:height, 8 - 3 * k :][:, :side]
+            part = part[::-1] if unrelated and k else part
             part = 900 + quiet * part + noise[down : down + height, right : right + side]
             file.write(part.clip(1, 4095).astype(np.uint16), 1, window=Window(0, row, side, height))
     for file in files:
@@ -220,6 +227,30 @@ LAYOUTS: dict[str, dict[str, object]] = {
     "tiles": {"tiled": True, "blockxsize": 512, "blockysize": 512, "compress": "zstd", "zstd_level": 1},
     "strips": {"compress": "deflate", "zlevel": 1, "blockysize": 16},
 }
+
+
+def mirrored(path: Path, folder: str) -> Path:
+    """An image turned over in its middle column, with its RPC: other ground at the same place."""
+    with rasterio.open(path) as file:
+        pixels, rpcs = file.read(1), file.rpcs
+    target = Path(folder) / f"mirrored_{path.stem}.tif"
+    layout = {"driver": "GTiff", "count": 1, "dtype": pixels.dtype}
+    with rasterio.open(target, "w", height=len(pixels), width=len(pixels[0]), **layout) as file:
+        file.write(np.ascontiguousarray(pixels[:, ::-1]), 1)
+        file.rpcs = rpcs
+    return target
+
+
+def refused(views: list[View]) -> None:
+    """CPU seconds and memory of a pair of which nothing can be said, all in this process."""
+    start = time.process_time()
+    try:
+        found = find_tracks(views)
+        said = f"tied by {found.pairs[0].means}: {found.tracks.num_points} tracks"
+    except BarpcError as error:
+        said = " ".join(str(error).split())[:100]
+    seconds, area = time.process_time() - start, 1e-6 * sum(v.size[0] * v.size[1] for v in views)
+    print(f"  {seconds:.1f} CPU s, {seconds / area:.3f} s a Mpx, peak {peak(os.getpid()):.0f} MB: {said}")
 
 
 def size(side: int, share: float | None, layout: str) -> None:
@@ -276,7 +307,17 @@ def main() -> int:
     )
     parser.add_argument("--layout", choices=LAYOUTS, default="tiles", help="how that pair is stored")
     parser.add_argument("--area", type=float, metavar="SHARE", help="only in the middle of that pair")
+    parser.add_argument("--unrelated", action="store_true", help="a made-up pair that has nothing in common")
+    parser.add_argument("--refused", action="store_true", help="the first image and the second mirrored")
     given = parser.parse_args()
+    if given.unrelated or given.refused:
+        with tempfile.TemporaryDirectory() as folder:
+            if given.refused:
+                first, second = given.images
+                refused(list(load_views([first, mirrored(second, folder)]).views))
+            else:
+                refused(scene(given.size, folder, LAYOUTS[given.layout], unrelated=True))
+        return 0
     if given.size:
         size(given.size, given.area, given.layout)
     if given.images:

@@ -23,7 +23,7 @@ from barpc.sensor import document as metadata
 from barpc.sensor import terrasar
 from barpc.sensor.linescan import dimap, maxar
 from barpc.sensor.sicd import document as sicd
-from barpc.tie import pairs
+from barpc.tie.pairing import area
 
 PAGE = Path(__file__).with_name("reliability.md")
 BEGIN = "<!-- Limits: written by docs/generate_limits.py. Edit the constants beside the readers, then run it again. -->"
@@ -105,7 +105,7 @@ def rows() -> list[tuple[str, str]]:
         ("a name of an image", f"{names.MAX_NAME} bytes"),
         ("control points of a fit", many(options.MOST_POINTS)),
         ("unknowns of an earlier block", many(incremental._LARGEST)),
-        ("an area", f"{many(pairs._MOST_CROSSED)} times that its outline crosses itself"),
+        ("an area", f"{many(area._MOST_CROSSED)} times that its outline crosses itself"),
         (
             "numbers of JSON and `block.npz`",
             f"{many(sidefile.LARGEST)}; whole ones of JSON {sidefile._DIGITS} digits",

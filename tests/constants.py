@@ -13,12 +13,12 @@ Record = TypeVar("Record", bound=Options)
 
 CONSTANTS: dict[type[Options], dict[str, tuple[str, ...]]] = {
     TieOptions: {
-        "cell": ("barpc.tie.raster.CELL", "barpc.tie.features.CELL"),
-        "keypoints_per_cell": ("barpc.tie.features.PER_CELL",),
-        "contrast": ("barpc.tie.features.CONTRAST",),
-        "tolerance": ("barpc.tie.matching.TOLERANCE",),
-        "patch": ("barpc.tie.register.PATCH",),
-        "min_correlation": ("barpc.tie.register.MIN_CORRELATION",),
+        "cell": ("barpc.tie.pixels.CELL", "barpc.tie.matchers.features.CELL"),
+        "keypoints_per_cell": ("barpc.tie.matchers.features.PER_CELL",),
+        "contrast": ("barpc.tie.matchers.features.CONTRAST",),
+        "tolerance": ("barpc.tie.matchers.matching.TOLERANCE",),
+        "patch": ("barpc.tie.patches.register.PATCH",),
+        "min_correlation": ("barpc.tie.patches.register.MIN_CORRELATION",),
     },
     AdjustOptions: {
         "sigma_shift": ("barpc.ba.estimated.priors.IMAGE_SIGMA",),

@@ -44,7 +44,7 @@ from barpc.sensor.direct_grid import LINEAR, DirectGrid
 from barpc.sensor.geometry import image_border
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import plain_path
-from barpc.tie.pairs import read_area
+from barpc.tie import read_area
 from barpc.workspace import Workspace
 
 Window = tuple[int, int, int, int]

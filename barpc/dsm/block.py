@@ -23,7 +23,7 @@ from barpc.rpcio.grids import CORRECTION
 from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import base_to_height, is_radar
-from barpc.tie.pairs import overlapping_pairs
+from barpc.tie.pairing.overlaps import overlapping_pairs
 from barpc.workspace import table_path
 
 logger = logging.getLogger(__name__)
@@ -134,7 +134,7 @@ def _best(
     first, then by tie points times (B/H)^2.
 
     A height's variance is that of a match over (B/H)^2, and where tie points are found, dense matches are. Without
-    tie points the overlap and the angle stand for them (`barpc.tie.pairs.Pair.score`).
+    tie points the overlap and the angle stand for them (`barpc.tie.pairing.overlaps.Pair.score`).
     """
     found = overlapping_pairs(views, TieOptions(angles=(0.0, 180.0)))
     found = [pair for pair in found if among is None or set(pair.views) <= set(among)]

@@ -14,7 +14,15 @@ from rasterio.warp import transform
 from barpc.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.scene import View
 from barpc.sensor.geometry import triangulate
-from barpc.tie.dense import ACROSS, FINER, WINDOW, EpipolarFrame, Matches, dense_matches, epipolar_frame
+from barpc.tie.patches.dense import (
+    ACROSS,
+    FINER,
+    WINDOW,
+    EpipolarFrame,
+    Matches,
+    dense_matches,
+    epipolar_frame,
+)
 
 SIDE = 512
 """Cells a side of a tile: the blocks of the file."""

@@ -21,7 +21,7 @@ from barpc.raster import open_raster
 from barpc.report.page import can_render, remake_report
 from barpc.report.tables import SURFACE, read_summary
 from barpc.scene import View
-from barpc.tie.raster import jpeg, read_pixels, sample_stretch
+from barpc.tie.pixels import jpeg, read_pixels, sample_stretch
 from barpc.workspace import TABLES, Workspace
 
 logger = logging.getLogger(__name__)

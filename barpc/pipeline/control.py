@@ -15,7 +15,7 @@ from barpc.pointio.laser import read_altimetry
 from barpc.report.summary.words import listed
 from barpc.scene import Altimetry, BoolArray, GroundPoints, View
 from barpc.sensor.geometry import footprint, ground_sample_distance
-from barpc.tie.pairs import reach_of
+from barpc.tie.pairing.overlaps import reach_of
 
 _REACH = 1000.0  # m: ten times what delivered cameras are wrong by where they are bad
 _ALT_REACH = 500.0  # m beyond a camera's altitudes: a geoid is 100 m, and ranges miss relief by some hundred

@@ -4,13 +4,14 @@
 """
 
 from barpc.options import TieOptions
-from barpc.tie.choice import select_pairs
-from barpc.tie.features import Keypoints, detect
-from barpc.tie.matcher import Matches
-from barpc.tie.matching import PairReport, match, match_pair
-from barpc.tie.pairs import Area, Pair, read_area
+from barpc.tie.matchers.features import Keypoints, detect
+from barpc.tie.matchers.matcher import Matches
+from barpc.tie.matchers.matching import PairReport, match, match_pair
+from barpc.tie.pairing.area import Area, read_area
+from barpc.tie.pairing.choice import select_pairs
+from barpc.tie.pairing.overlaps import Pair
+from barpc.tie.patches.register import refine
 from barpc.tie.reference import Registration
-from barpc.tie.register import refine
 from barpc.tie.tracks import TieResult, common_tracks, find_tracks, link, require_matches, thin
 
 __all__ = [

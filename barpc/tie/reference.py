@@ -3,7 +3,7 @@
 An image is projected through its camera and the terrain onto a local grid, at the coarser of the two resolutions. First
 many blocks vote together for one shift of the whole camera, within `REACH` metres; how far the peak stands above the
 rest of the sum says whether this is the same place. With the camera moved so, points on a regular grid on the ground,
-the same for all views, are looked for one by one (`barpc.tie.channels`), and those are kept that agree.
+the same for all views, are looked for one by one (`barpc.tie.patches.channels`), and those are kept that agree.
 """
 
 from __future__ import annotations
@@ -18,16 +18,15 @@ import numpy as np
 from barpc.geodesy import Array, metres_per_unit
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
-from barpc.tie.channels import Found, correlation, find, joined, margin
-from barpc.tie.ortho import Patch, Sheet, Terrain, of_image, of_reference, shown
-from barpc.tie.raster import FloatImage
+from barpc.tie.patches.channels import Found, correlation, find, joined, margin
+from barpc.tie.patches.oriented import HALF
+from barpc.tie.patches.resampled import Patch, Sheet, Terrain, of_image, of_reference, shown
+from barpc.tie.pixels import FloatImage
 from barpc.tie.tasks import Progress, ordered
 
 REACH = 150.0  # m: how far a camera may be off
 PEAK = 6.5  # a vote that stands out by fewer standard deviations is none: other places reach 5.1
 _QUOTA = 1000  # points in a view, about
-_HALF = 16  # px: templates reach so far to each side
-_APART = 8  # px between points, at least
 _SEARCH = 6, 5.0  # px and m: what the vote and the terrain leave, together
 _FINE, _SIDE, _BLOCKS = (
     2.0,
@@ -159,7 +158,7 @@ def vote(view: View, band: int, paths: tuple[str, ...], patch: Patch, reach: int
 
 def search(view: View, band: int, paths: tuple[str, ...], patch: Patch, points: Array, reach: int) -> Found:
     """Find points x, y (n, 2) [px] of the reference on a patch in an image."""
-    return find(of_reference(paths, patch), of_image(view, band, patch), points, _HALF, reach)
+    return find(of_reference(paths, patch), of_image(view, band, patch), points, HALF, reach)
 
 
 # --- all of it --------------------------------------------------------------------------------------------
@@ -297,7 +296,7 @@ class _Work:
             points = GroundPoints(names, ground, single, closed, view_of, xy, xy_sigma)
             offset = np.array([r.offset if r.points else (np.nan, np.nan) for r in reports])
             bias = np.array([sigma, sigma, height_sigma[1]])
-            control = Reference(points, bias, offset, (2 * _HALF + 1) * self.step)
+            control = Reference(points, bias, offset, (2 * HALF + 1) * self.step)
         return Registration(control, tuple(reports), self.step, sigma)
 
     def _lattice(self, views: Sequence[View]) -> tuple[Array, Array]:
@@ -313,7 +312,7 @@ class _Work:
         areas = [
             0.5 * abs(float((x * np.roll(y, 1) - y * np.roll(x, 1)).sum())) for x, y in (r.T for r in local)
         ]
-        apart = self.step * max(_APART, round((max(areas) / _QUOTA) ** 0.5 / self.step))
+        apart = self.step * max(HALF // 2, round((max(areas) / _QUOTA) ** 0.5 / self.step))
         every = np.concatenate(local)
         low, high = (
             np.floor((every.min(axis=0) - REACH) / apart),
@@ -329,10 +328,10 @@ class _Work:
         """Return the points of a view, tile by tile."""
         metres = metres_per_unit(np.append(places.mean(axis=0), 0.0))[:2]
         at = view.sensor.project(np.column_stack([places + moved / metres, heights]))
-        edge = 0.5 * _HALF * self.step / float(ground_sample_distance(view.sensor, _middle(view))[1])
+        edge = 0.5 * HALF * self.step / float(ground_sample_distance(view.sensor, _middle(view))[1])
         with np.errstate(invalid="ignore"):
             inside = np.flatnonzero(((at >= edge) & (at <= np.array(view.size) - 1.0 - edge)).all(axis=1))
-        pad = margin(_HALF, reach) + 1
+        pad = margin(HALF, reach) + 1
         fits = (_TILE[0] + 2 * pad) ** 2 * (self.step / self.pixel) ** 2 < _PIXELS
         cell = np.floor(places[inside] * metres / self.step / _TILE[0 if fits else 1]).astype(np.int64)
         _, group = np.unique(cell, axis=0, return_inverse=True)

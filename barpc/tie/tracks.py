@@ -17,12 +17,10 @@ from barpc.geodesy import Array, ground_from_ecef
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
-from barpc.tie.choice import COMPARED, TRIES, best_pairs, further_pairs, judged, several_dates
-from barpc.tie.epipolar import grouped, linear_map
-from barpc.tie.features import KeypointFiles, locate, worth_a_first_look
-from barpc.tie.given import GivenMatches, verify
-from barpc.tie.matcher import Matches
-from barpc.tie.matching import (
+from barpc.tie.matchers.features import KeypointFiles, locate, worth_a_first_look
+from barpc.tie.matchers.given import GivenMatches, verify
+from barpc.tie.matchers.matcher import Matches
+from barpc.tie.matchers.matching import (
     FINE,
     MATCHERS,
     STRUCTURE,
@@ -34,10 +32,13 @@ from barpc.tie.matching import (
     matcher_named,
     quick_score,
 )
-from barpc.tie.ortho import Terrain
-from barpc.tie.pairs import Area, Pair, possible_pairs, require_connected
-from barpc.tie.register import refine
-from barpc.tie.resolution import Looks
+from barpc.tie.pairing.area import Area
+from barpc.tie.pairing.choice import COMPARED, TRIES, best_pairs, further_pairs, judged, several_dates
+from barpc.tie.pairing.epipolar import grouped, linear_map
+from barpc.tie.pairing.overlaps import Pair, possible_pairs, require_connected
+from barpc.tie.pairing.resolution import Looks
+from barpc.tie.patches.register import refine
+from barpc.tie.patches.resampled import Terrain
 from barpc.tie.store import Store, store_of
 from barpc.tie.tasks import Progress, ordered
 
@@ -49,7 +50,6 @@ _DEFAULTS = TieOptions()
 _NOTHING: GivenMatches = MappingProxyType({})
 _SPARE = 1.3  # tracks registered for each one kept
 _SAME = 2.2  # px that registration may move a point by, rounding included
-_APART = 1e7  # px, more than an image measures
 _QUOTAS = (4, 8, 16)
 """Tracks that a cell takes, round by round; with the first an image of full cells holds what is asked for."""
 
@@ -239,7 +239,10 @@ class _Trials:
         ]
         looks, options = self.looks, self._options
         own = self._matched([looks.pair(pair) for pair in others], before)
-        given = {looks.ends[pair.views]: looks.matches(pair.views, self._given[pair.views]) for pair in known}
+        given = {
+            looks.ends[pair]: replace(self._given[pair], xy=looks.places(pair, self._given[pair].xy))
+            for pair in (pair.views for pair in known)
+        }
         theirs = verify(looks.views, given, [looks.pair(pair) for pair in known], options, **self._work)
         for pair, (found, report) in zip([*others, *known], [*own, *theirs], strict=True):
             self.tried[pair.views] = pair, found, report
@@ -304,7 +307,7 @@ def _joined(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
     """Return the registered tracks and others: one that stands beside a registered one is the same point,
     seen by more views.
     """
-    known, asked = (np.array([_APART * part.view, *part.xy.T]).T for part in (tracks, others))
+    known, asked = (np.array([2 * _SAME * part.view, *part.xy.T]).T for part in (tracks, others))
     near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=_SAME))
     same = np.flatnonzero(np.isfinite(near))
     point, which = np.unique(others.point[same], return_index=True)

@@ -14,7 +14,7 @@ from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.scene import View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center, triangulate
-from barpc.tie.dense import _LEFT, _SLOPE, FINER, WINDOW, _slope, epipolar_frame
+from barpc.tie.patches.dense import _LEFT, _SLOPE, FINER, WINDOW, _slope, epipolar_frame
 from tests.dsm.conftest import ALTS
 
 

@@ -46,7 +46,7 @@ from barpc.sensor.linescan import read_linescan
 from barpc.sensor.sentinel1 import open_product
 from barpc.sensor.sicd import open_sicd
 from barpc.sensor.terrasar import open_terrasar
-from barpc.tie.pairs import read_area
+from barpc.tie.pairing.area import read_area
 from barpc.workspace import Workspace, table_path
 from tests.pointio.test_foreign import binary, colmap
 from tests.report.conftest import run_of_block, written

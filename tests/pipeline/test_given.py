@@ -18,7 +18,7 @@ from barpc.pipeline import RunOptions, adjust, check
 from barpc.pipeline.inputs import given_matches, given_tracks
 from barpc.pipeline.loading import load_views
 from barpc.pointio.matches import read_matches
-from barpc.tie.epipolar import agreeing, frame, robust_spread
+from barpc.tie.pairing.epipolar import agreeing, frame, robust_spread
 from tests.pointio.test_foreign import binary
 
 from .conftest import check_points

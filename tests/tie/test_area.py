@@ -17,9 +17,11 @@ from barpc.geodesy import ground_from_ecef
 from barpc.raster import open_raster
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import triangulate
-from barpc.tie import TieOptions, features, find_tracks, read_area, select_pairs
-from barpc.tie.pairs import Area, Footprints, shared_tiles
-from barpc.tie.raster import tiles
+from barpc.tie import TieOptions, find_tracks, read_area, select_pairs
+from barpc.tie.matchers import features
+from barpc.tie.pairing.area import Area
+from barpc.tie.pairing.overlaps import Footprints, shared_tiles
+from barpc.tie.pixels import tiles
 from tests.constants import chosen
 
 from .conftest import Rendered, write_image

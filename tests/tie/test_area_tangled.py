@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from barpc.errors import InputError
-from barpc.tie import pairs
-from barpc.tie.pairs import read_area
+from barpc.tie.pairing import area
+from barpc.tie.pairing.area import read_area
 
 
 def an_area(folder: Path, *rings: np.ndarray) -> Path:
@@ -31,17 +31,17 @@ def test_an_outline_that_crosses_itself_is_two_areas(tmp_path):
 
 def test_an_outline_is_untangled_of_as_many_crossings_as_allowed_and_no_more(tmp_path, monkeypatch):
     star = np.array([[np.sin(k * 0.8 * np.pi), np.cos(k * 0.8 * np.pi)] for k in range(5)])  # five crossings
-    monkeypatch.setattr(pairs, "_MOST_CROSSED", 5)
+    monkeypatch.setattr(area, "_MOST_CROSSED", 5)
     read_area(an_area(tmp_path, star))
-    monkeypatch.setattr(pairs, "_MOST_CROSSED", 4)
+    monkeypatch.setattr(area, "_MOST_CROSSED", 4)
     with pytest.raises(InputError, match="an outline crosses itself more than 4 times"):
         read_area(an_area(tmp_path, star))
     monkeypatch.setattr(
-        pairs, "_TOGETHER", 1
+        area, "_TOGETHER", 1
     )  # found from both sides of a side, whatever is looked at together
     with pytest.raises(InputError, match="more than 4 times"):
         read_area(an_area(tmp_path, star))
-    monkeypatch.setattr(pairs, "_MOST_CROSSED", 0)
+    monkeypatch.setattr(area, "_MOST_CROSSED", 0)
     read_area(an_area(tmp_path, np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from barpc.tie.channels import (
+from barpc.tie.patches.channels import (
     COARSE,
     FINE,
     Found,

@@ -15,11 +15,11 @@ from barpc.options import RunOptions
 from barpc.pipeline import adjust
 from barpc.scene import connected_groups
 from barpc.tie import TieOptions, find_tracks, select_pairs, tracks
-from barpc.tie.choice import best_pairs, forests, further_pairs, judged, several_dates, twice_tied
-from barpc.tie.features import KeypointFiles
-from barpc.tie.matcher import NO_MATCHES
-from barpc.tie.matching import PairReport
-from barpc.tie.pairs import Pair, possible_pairs
+from barpc.tie.matchers.features import KeypointFiles
+from barpc.tie.matchers.matcher import NO_MATCHES
+from barpc.tie.matchers.matching import PairReport
+from barpc.tie.pairing.choice import best_pairs, forests, further_pairs, judged, several_dates, twice_tied
+from barpc.tie.pairing.overlaps import Pair, possible_pairs
 from tests.lanes import diagonal, rest_slow
 from tests.scenes.dates import Years
 

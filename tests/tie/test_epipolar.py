@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.tie.epipolar import (
+from barpc.tie.pairing.epipolar import (
     Affine,
     agreeing,
     common_range,

@@ -12,8 +12,8 @@ import pytest
 from barpc.pipeline.executor import CachingExecutor
 from barpc.scene import View
 from barpc.tie import TieOptions, detect
-from barpc.tie.features import KeypointFiles, Share, _an_octave_up, detect_tile, quota
-from barpc.tie.raster import survey, tiles
+from barpc.tie.matchers.features import KeypointFiles, Share, _an_octave_up, detect_tile, quota
+from barpc.tie.pixels import survey, tiles
 from barpc.workspace import Workspace
 from tests.constants import chosen
 

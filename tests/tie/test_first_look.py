@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from barpc.tie import TieOptions, TieResult, common_tracks, find_tracks, tracks
-from barpc.tie.features import Share, worth_a_first_look
-from barpc.tie.matching import PairReport, ample
+from barpc.tie.matchers.features import Share, worth_a_first_look
+from barpc.tie.matchers.matching import PairReport, ample
 
 FEW = TieOptions(points_per_image=500)  # of which 300 px hold enough to look twice
 

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+import barpc.tie.pixels as reading
 from barpc.errors import DisconnectedError
 from barpc.raster import open_raster
 from barpc.scene import Tracks
-from barpc.tie import Matches, TieOptions, common_tracks, find_tracks, raster
+from barpc.tie import Matches, TieOptions, common_tracks, find_tracks
 from barpc.tie.tracks import pair_counts
 from tests.lanes import rest_slow
 
@@ -171,13 +172,13 @@ def test_no_more_is_read_for_matches_of_others_than_patches_about_them(render, t
         with open_raster(view.path) as image:
             path = write_image(tmp_path / f"{view.name}.tif", np.tile(image.read(1), (10, 10)), tiled=True)
         large.append(replace(view, path=str(path), size=(3000, 3000)))
-    read, pixels = raster._read, []
+    read, pixels = reading._read, []
 
     def watched(dataset, box, *more):
         pixels.append(box[2] * box[3])
         return read(dataset, box, *more)
 
-    monkeypatch.setattr(raster, "_read", watched)
+    monkeypatch.setattr(reading, "_read", watched)
     given = true_matches(scene, (0, 1), count=200)
     assert find_tracks(large, given=given).tracks.num_points > 100
     assert sum(pixels) <= 2 * 2 * 356**2  # 300 and a margin of 28 px

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from barpc.tie import TieOptions
-from barpc.tie.epipolar import Frame
-from barpc.tie.features import Keypoints, Share, Sift, allotted, detect_tile, join, quota, ranked
-from barpc.tie.guided import Guided, _Strips
-from barpc.tie.matcher import Matches, Prediction
-from barpc.tie.raster import Stretch, grow, read_pixels, sample_stretch, survey, tiles
+from barpc.tie.matchers.features import Keypoints, Share, Sift, allotted, detect_tile, join, quota, ranked
+from barpc.tie.matchers.guided import _ROWS, Guided, _near
+from barpc.tie.matchers.matcher import Matches, Prediction
+from barpc.tie.pairing.epipolar import Frame
+from barpc.tie.pixels import Stretch, grow, read_pixels, sample_stretch, survey, tiles
 from tests.constants import chosen
 from tests.tie.conftest import write_image
 
@@ -260,27 +260,28 @@ def test_all_points_of_slanted_bands_are_looked_at_and_few_others(
     """Bands that rise or fall by some strips along their length, to one side of the prediction or to both."""
     rng = np.random.default_rng(0)
     turned = rng.uniform(0, 2000, (4000, 2))
-    strips, every = _Strips(turned), np.arange(4000)
-    for _ in range(30):
-        place = rng.uniform(300, 1700, 2) + rng.uniform(-400, 400, (5, 2))
-        where = Frame(np.array([1.0, 0.0]), place[:, 0], place[:, 1], np.full(5, slope), np.full(5, reach[0]),
-                      np.full(5, reach[1]), np.eye(2))  # fmt: skip
-        found = [np.concatenate(part) for part in zip(*strips.near(where, 3.0, np.arange(5)), strict=True)]
-        for row in range(5):
-            du, dw = strips.apart(where, np.full(4000, row), every)
-            inside = (du >= reach[0]) & (du <= reach[1]) & (np.abs(dw) <= 3.0)
-            near = found[1][found[0] == row]
-            assert len(set(near)) == len(near)
-            assert np.isin(np.flatnonzero(inside), near).all()
-            assert ((du[near] >= reach[0]) & (du[near] <= reach[1])).all()
-            tilt = abs(slope) * max(abs(end) for end in reach)
-            assert (np.abs(turned[near, 1] - place[row, 1]) <= 3.0 + tilt + strips.height).all()
+    place = rng.uniform(-100, 2100, (500, 2))
+    where = Frame(np.array([1.0, 0.0]), *place.T, *(np.full(500, x) for x in (slope, *reach)), np.eye(2))
+    asked, seen = np.arange(0, 500, 3), []
+    for rows, cols in _near(where, 3.0, asked, turned):
+        seen.append(rows)
+        du = turned[:, 0] - where.along[rows, None]
+        dw = turned[:, 1] - where.across[rows, None] - slope * du
+        inside = (du >= reach[0]) & (du <= reach[1]) & (np.abs(dw) <= 3.0)
+        assert np.isin(np.flatnonzero(inside.any(axis=0)), cols).all()
+        assert (np.diff(cols) > 0).all()
+        tilt = 3.0 + abs(slope) * max(abs(end) for end in reach)
+        assert (turned[cols] >= (place[rows] + [reach[0], -tilt]).min(axis=0)).all()
+        assert (turned[cols] <= (place[rows] + [reach[1], tilt]).max(axis=0)).all()
+    assert max(len(rows) for rows in seen) <= _ROWS
+    assert len(np.unique(np.concatenate(seen))) == sum(len(rows) for rows in seen) > 140
+    assert np.isin(np.concatenate(seen), asked).all()
 
 
 def test_candidates_come_in_portions_that_hold_all_of_a_point(pair, monkeypatch) -> None:
     a, b, where = pair
     whole = guided(a, b, where, 0.85)
-    monkeypatch.setattr("barpc.tie.guided._CANDIDATES", 50)
+    monkeypatch.setattr("barpc.tie.matchers.guided._CANDIDATES", 50)
     parts = guided(a, b, where, 0.85)
     np.testing.assert_array_equal(whole.index, parts.index)
     assert len(whole) > 40

@@ -17,10 +17,10 @@ from barpc.options import TieOptions, read_options
 from barpc.pipeline import RunOptions, adjust
 from barpc.scene import View
 from barpc.tie import Matches, common_tracks, find_tracks
-from barpc.tie.epipolar import Frame
-from barpc.tie.hook import Hook, hook_files, hooked
-from barpc.tie.matcher import Prediction
-from barpc.tie.matching import MATCHERS, matcher_named
+from barpc.tie.matchers.hook import Hook, hook_files, hooked
+from barpc.tie.matchers.matcher import Prediction
+from barpc.tie.matchers.matching import MATCHERS, matcher_named
+from barpc.tie.pairing.epipolar import Frame
 from tests.lanes import rest_slow
 from tests.tie.test_pairs import METRE, camera, views
 
@@ -125,7 +125,7 @@ def test_an_options_file_names_no_code_and_reading_it_imports_nothing(tmp_path: 
 
 def test_rows_of_the_table_and_classes_are_what_they_are(module) -> None:
     assert matcher_named("guided") is MATCHERS["guided"]
-    assert hooked("barpc.tie.guided:Guided") is MATCHERS["guided"]
+    assert hooked("barpc.tie.matchers.guided:Guided") is MATCHERS["guided"]
     assert hook_files("guided") == []
     with pytest.raises(InputError, match="cannot be imported"):
         hook_files("nowhere_at_all.x:match")

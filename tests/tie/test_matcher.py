@@ -12,10 +12,10 @@ import pytest
 
 from barpc.errors import TiePointError
 from barpc.tie import Keypoints, Matches, TieOptions, common_tracks, find_tracks
-from barpc.tie.epipolar import frame
-from barpc.tie.matcher import Prediction
-from barpc.tie.matching import MATCHERS
-from barpc.tie.raster import levelled, read_pixels
+from barpc.tie.matchers.matcher import Prediction
+from barpc.tie.matchers.matching import MATCHERS
+from barpc.tie.pairing.epipolar import frame
+from barpc.tie.pixels import levelled, read_pixels
 from tests.lanes import rest_slow
 
 HALF = 8

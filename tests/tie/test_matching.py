@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from barpc.tie import TieOptions
-from barpc.tie.epipolar import (
+from barpc.tie.matchers.features import join
+from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
+from barpc.tie.matchers.matching import MATCHERS, PairReport, _better, _latest, _Search, enough
+from barpc.tie.pairing.epipolar import (
     Frame,
 )
-from barpc.tie.features import join
-from barpc.tie.matcher import NO_MATCHES, Matches, Prediction
-from barpc.tie.matching import MATCHERS, PairReport, _better, _latest, _Search, enough
 from tests.tie.test_pairs import camera, views
 
 

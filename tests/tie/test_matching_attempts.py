@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from barpc.scene import Tracks
-from barpc.tie import Matches, TieOptions, matching, tracks
-from barpc.tie.features import join
-from barpc.tie.matcher import NO_MATCHES
-from barpc.tie.matching import PairReport, _altitudes, match, match_pair
-from barpc.tie.pairs import Pair
+from barpc.tie import Matches, TieOptions, tracks
+from barpc.tie.matchers import matching
+from barpc.tie.matchers.features import join
+from barpc.tie.matchers.matcher import NO_MATCHES
+from barpc.tie.matchers.matching import PairReport, _altitudes, match, match_pair
+from barpc.tie.pairing.overlaps import Pair
 from barpc.tie.tracks import _joined, _unlike, _with_unregistered
 
 from .test_pairs import camera, views
@@ -31,7 +32,7 @@ def attempts(monkeypatch):
     def scripted(*reports: PairReport) -> list[TieOptions]:
         script = iter(reports)
 
-        def attempt(_views, _keypoints, _pair, options: TieOptions) -> tuple[Matches, PairReport]:
+        def attempt(_views, _keypoints, _pair, options: TieOptions, *_) -> tuple[Matches, PairReport]:
             made.append(options)
             return NO_MATCHES, replace(next(script), matcher=options.matcher)
 
@@ -240,7 +241,7 @@ def test_given_matches_are_added_where_fewer_than_are_wanted_could_be_registered
 
 
 def test_the_quick_score_is_of_the_strongest_and_nought_where_there_are_none(render) -> None:
-    from barpc.tie.features import locate
+    from barpc.tie.matchers.features import locate
     from barpc.tie.store import Store, store_of
 
     scene = render(views=2, size=(300, 300))

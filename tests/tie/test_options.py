@@ -14,15 +14,15 @@ from barpc.errors import InputError
 from barpc.raster import open_raster
 from barpc.scene import Tracks
 from barpc.tie import TieOptions, detect, find_tracks, link, select_pairs
-from barpc.tie.epipolar import (
+from barpc.tie.matchers.features import Keypoints, Share, detect_tile
+from barpc.tie.matchers.matching import PairReport, match_pair
+from barpc.tie.pairing.epipolar import (
     common_range,
     frame,
 )
-from barpc.tie.features import Keypoints, Share, detect_tile
-from barpc.tie.matching import PairReport, match_pair
-from barpc.tie.pairs import Pair
-from barpc.tie.raster import survey, tiles
-from barpc.tie.register import refine
+from barpc.tie.pairing.overlaps import Pair
+from barpc.tie.patches.register import refine
+from barpc.tie.pixels import survey, tiles
 from tests.constants import CONSTANTS, chosen
 from tests.tie.conftest import Rendered, write_image
 from tests.tie.test_pairs import METRE, camera, views

@@ -11,8 +11,8 @@ from barpc.errors import DisconnectedError, TiePointError
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
 from barpc.tie import TieOptions, select_pairs
-from barpc.tie.pairs import shared_tiles
-from barpc.tie.raster import tiles
+from barpc.tie.pairing.overlaps import shared_tiles
+from barpc.tie.pixels import tiles
 from tests.constants import chosen
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.errors import ImageError
-from barpc.tie.raster import Stretch, grow, levelled, read_pixels, sample_stretch
+from barpc.tie.pixels import Stretch, grow, levelled, read_pixels, sample_stretch
 
 from .conftest import write_image
 

@@ -17,13 +17,15 @@ from rasterio.warp import transform
 from barpc.geodesy import Array
 from barpc.pipeline.loading import load_views
 from barpc.scene import View
-from barpc.tie import PairReport, TieOptions, common_tracks, find_tracks, matching, structure
-from barpc.tie.epipolar import frame
-from barpc.tie.features import join
-from barpc.tie.matcher import NO_MATCHES, Prediction
-from barpc.tie.matching import _Search, match_pair
-from barpc.tie.pairs import Pair, reach_of
-from barpc.tie.structure import Tile
+from barpc.tie import PairReport, TieOptions, common_tracks, find_tracks
+from barpc.tie.matchers import matching, structural
+from barpc.tie.matchers.features import join
+from barpc.tie.matchers.matcher import NO_MATCHES, Prediction
+from barpc.tie.matchers.matching import _Search, match_pair
+from barpc.tie.pairing.epipolar import frame
+from barpc.tie.pairing.overlaps import Pair, reach_of
+from barpc.tie.patches import oriented
+from barpc.tie.patches.oriented import Tile
 
 from .conftest import write_image
 from .test_pairs import METRE, camera, views
@@ -151,7 +153,7 @@ def test_a_search_in_parts_finds_what_a_search_in_one_finds(monkeypatch, scene) 
     search = _Search(tuple(scene.views), (join([]), join([])), options)
     coarse = search.offset()
     assert coarse is not None
-    whole = structure._Search(*scene.views, 1, coarse).matches()
+    whole = structural._Search(*scene.views, 1, coarse).matches()
     sizes, of = [], Tile.surfaces
 
     def watched(self):
@@ -160,9 +162,9 @@ def test_a_search_in_parts_finds_what_a_search_in_one_finds(monkeypatch, scene) 
         return found
 
     monkeypatch.setattr(Tile, "surfaces", watched)
-    monkeypatch.setattr(structure, "_SURFACE", 60_000)
-    monkeypatch.setattr(structure, "_AREA", 20_000)
-    parts = structure._Search(*scene.views, 1, coarse).matches()
+    monkeypatch.setattr(structural, "_SURFACE", 60_000)
+    monkeypatch.setattr(oriented, "_AREA", 20_000)
+    parts = structural._Search(*scene.views, 1, coarse).matches()
     assert len(sizes) >= 8
     assert max(sizes) <= 60_000
     assert len(parts) == len(whole) > 100

@@ -9,7 +9,7 @@ import pytest
 
 from barpc.scene import Tracks, View
 from barpc.tie import TieOptions, TieResult, common_tracks, detect, find_tracks, match, select_pairs
-from barpc.tie.epipolar import Affine, agreeing, frame, robust_affine, robust_spread
+from barpc.tie.pairing.epipolar import Affine, agreeing, frame, robust_affine, robust_spread
 
 PAIRS = [(0, 1), (0, 2), (1, 2)]
 

@@ -10,10 +10,10 @@ import pytest
 
 from barpc.scene import Tracks
 from barpc.tie import TieOptions
-from barpc.tie.epipolar import (
+from barpc.tie.pairing.epipolar import (
     frame,
 )
-from barpc.tie.register import (
+from barpc.tie.patches.register import (
     Registration,
     _at,
     _joined,
@@ -202,7 +202,7 @@ def test_places_far_apart_are_found_as_in_one_window(tmp_path, monkeypatch, inte
     linear = np.tile(np.eye(2), (len(start), 1, 1))
     assert _sparse(reference, 28)
     apart = register_places(files, 1, reference, start, linear, 21)
-    monkeypatch.setattr("barpc.tie.register._sparse", lambda *_: False)
+    monkeypatch.setattr("barpc.tie.patches.register._sparse", lambda *_: False)
     together = register_places(files, 1, reference, start, linear, 21)
     np.testing.assert_array_equal(apart.ok, together.ok)
     assert 4 <= apart.ok.sum() < len(start)  # a patch that reaches beyond the border is not registered
@@ -217,9 +217,9 @@ def test_patches_are_registered_tile_by_tile(monkeypatch) -> None:
         seen.extend(tasks)
         return [Registration.none(task[3]) for task in tasks]
 
-    monkeypatch.setattr("barpc.tie.register.ordered", ordered)
-    monkeypatch.setattr("barpc.tie.register._sparse", lambda *_: False)
-    monkeypatch.setattr("barpc.tie.register._ALL_OF_A_PAIR", 1)
+    monkeypatch.setattr("barpc.tie.patches.register.ordered", ordered)
+    monkeypatch.setattr("barpc.tie.patches.register._sparse", lambda *_: False)
+    monkeypatch.setattr("barpc.tie.patches.register._ALL_OF_A_PAIR", 1)
     found = links.register(TieOptions(tile=256), None, None)
     assert len(found.xy) == 160
     for _, band, origin, start, linear, structural, tile in seen:

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import barpc.tie.pixels as reading
 from barpc.raster import open_raster
 from barpc.rpcio import read_rpc
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import altitude_range, epipolar_offset
-from barpc.tie import Matches, Pair, TieOptions, common_tracks, find_tracks, raster
-from barpc.tie.raster import PixelReader, read_picture, read_pixels, survey
-from barpc.tie.resolution import Coarser, Looks
+from barpc.tie import Matches, Pair, TieOptions, common_tracks, find_tracks
+from barpc.tie.pairing.resolution import Coarser, Looks
+from barpc.tie.pixels import PixelReader, read_picture, read_pixels, survey
 from barpc.tie.tracks import _needed
 from tests.lanes import rest_slow
 
@@ -107,9 +108,9 @@ def test_a_view_is_looked_at_as_often_as_its_partners_ask_for_and_tracks_return_
     assert looks.pixel[:, 0].tolist() == [1, 2, 4, 1, 1, 2, 1]
     assert looks.ends == {(0, 1): (0, 3), (0, 2): (1, 4), (0, 3): (2, 6), (2, 3): (5, 6)}
     xy = np.array([[[10.0, 20.0], [3.0, 4.5]]])
-    found = looks.matches((0, 3), Matches(xy, np.zeros(1), np.zeros((1, 2), np.int64)))
-    assert found.xy.tolist() == [[[2.125, 4.625], [3.0, 4.5]]]
-    back = looks.tracks(Tracks(np.array([2, 6]), np.zeros(2, np.int64), found.xy[0], np.array([0.1, 0.1])))
+    found = looks.places((0, 3), xy)
+    assert found.tolist() == [[[2.125, 4.625], [3.0, 4.5]]]
+    back = looks.tracks(Tracks(np.array([2, 6]), np.zeros(2, np.int64), found[0], np.array([0.1, 0.1])))
     assert back.view.tolist() == [0, 3]
     np.testing.assert_allclose(back.xy, xy[0], atol=1e-12)
     np.testing.assert_allclose(back.sigma, [0.4, 0.1])  # as exact as the coarser one's pixel
@@ -131,7 +132,7 @@ def test_the_camera_of_a_look_is_that_of_the_coarser_image() -> None:
 
 
 def test_pixels_are_means_and_valid_where_all_that_they_hold_is(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(raster, "_ROWS", 12)  # several parts
+    monkeypatch.setattr(reading, "SPAN", 12)  # several parts
     data = RNG.integers(1, 4000, (83, 62)).astype(np.uint16)  # a rest on both sides
     data[30:40, 20:30] = 9
     path = write_image(tmp_path / "a.tif", data, nodata=9)

@@ -14,13 +14,15 @@ import cv2
 import numpy as np
 import pytest
 
+import barpc.tie.pixels as reading
 from barpc.errors import ImageError, InputError
 from barpc.pipeline.executor import CachingExecutor
 from barpc.scene import View
-from barpc.tie import TieOptions, features, find_tracks, raster
-from barpc.tie.features import KeypointFiles, Share, detect_tile, keep_tile, locate
-from barpc.tie.raster import Survey, read_picture, survey, tiles
-from barpc.tie.register import _usual
+from barpc.tie import TieOptions, find_tracks
+from barpc.tie.matchers import features
+from barpc.tie.matchers.features import KeypointFiles, Share, detect_tile, keep_tile, locate
+from barpc.tie.patches.register import _usual
+from barpc.tie.pixels import Survey, read_picture, survey, tiles
 from barpc.tie.store import Store
 from barpc.workspace import Workspace
 from tests.lanes import diagonal, rest_slow
@@ -287,14 +289,14 @@ def test_blocks_are_decoded_once_a_stage(pair, tmp_path, monkeypatch, layout, zo
     views, options = [stored(view, tmp_path, layout) for view in pair], TieOptions(tile=512)
     log: list[Any] = []
     opened: list[str] = []
-    read, start = raster._read, raster.open_raster
-    monkeypatch.setattr(raster, "open_raster", lambda path: opened.append(str(path)) or start(path))
+    read, start = reading._read, reading.open_raster
+    monkeypatch.setattr(reading, "open_raster", lambda path: opened.append(str(path)) or start(path))
 
     def noted(dataset, box, band, zoom=1):
         log.append((len(opened), dataset.name, dataset.block_shapes[0], box, zoom))
         return read(dataset, box, band, zoom)
 
-    monkeypatch.setattr(raster, "_read", noted)
+    monkeypatch.setattr(reading, "_read", noted)
     known = survey(views[0].path)
     assert known is not None
     assert 0.0 < decoded(log)[views[0].path] <= surveyed
@@ -354,10 +356,10 @@ def test_the_store_goes_with_the_run_folder(tmp_path) -> None:
 def test_a_block_that_two_windows_share_is_decoded_once(tmp_path) -> None:
     """The pixels are gone from the file when the second window asks for them."""
     path = write_image(tmp_path / "a.tif", quiet(10.0), **BLOCKS)
-    with raster.PixelReader(path) as reader:
+    with reading.PixelReader(path) as reader:
         before = reader.read((10, 10, 600, 600))[0]
         with path.open("r+b") as file:
             file.write(bytes(path.stat().st_size))
         np.testing.assert_array_equal(reader.read((100, 200, 300, 400))[0], before[190:590, 90:390])
     with pytest.raises(ImageError):
-        raster.read_pixels(path, (100, 200, 300, 400))
+        reading.read_pixels(path, (100, 200, 300, 400))

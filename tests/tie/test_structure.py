@@ -20,24 +20,29 @@ from barpc.tie import (
     TieOptions,
     common_tracks,
     find_tracks,
-    matching,
     select_pairs,
-    structure,
 )
-from barpc.tie.epipolar import Frame, frame, robust_affine
-from barpc.tie.features import join
-from barpc.tie.matcher import NO_MATCHES, Prediction
-from barpc.tie.matching import FINE, STRUCTURE, _altitudes, _better, _match_within, _within, match_pair
-from barpc.tie.raster import read_pixels
-from barpc.tie.structure import (
-    Tile,
+from barpc.tie.matchers import matching, structural
+from barpc.tie.matchers.features import join
+from barpc.tie.matchers.matcher import NO_MATCHES, Prediction
+from barpc.tie.matchers.matching import (
+    FINE,
+    STRUCTURE,
+    _altitudes,
+    _better,
+    _match_within,
+    _within,
+    match_pair,
+)
+from barpc.tie.matchers.structural import (
     _lattice,
     _near,
-    _resolution,
     _Search,
     _supported,
-    register_places,
 )
+from barpc.tie.pairing.epipolar import Frame, frame, robust_affine
+from barpc.tie.patches.oriented import Files, Sampling, Tile, register_places, resolution
+from barpc.tie.pixels import read_pixels
 from tests.scenes.redrawn import redrawn
 from tests.scenes.season import SEASONS, disguised
 from tests.tie.conftest import write_image
@@ -246,7 +251,7 @@ def test_pictures_are_as_coarse_as_the_coarser_image_by_a_power_of_two(side, pix
     """A pixel of A measures `side` px of B; with any turn, and mirrored."""
     turn = np.array([[0.6, -0.8], [0.8, 0.6]])
     for linear in (side * np.eye(2), side * turn, side * turn @ np.diag([1.0, -1.0])):
-        assert _resolution(linear) == pixels
+        assert resolution(linear) == pixels
 
 
 def test_a_lattice_holds_the_multiples_of_its_pitch_in_a_box() -> None:
@@ -392,7 +397,7 @@ def test_another_place_is_no_more_like_it_by_its_neighbours(shared_data, tmp_pat
 
 
 @pytest.fixture(scope="module")
-def textured(tmp_path_factory) -> tuple[structure.Files, np.ndarray]:
+def textured(tmp_path_factory) -> tuple[Files, np.ndarray]:
     """Files of an image and of the same moved by as much as is said: x, y [px]."""
     folder, moved = tmp_path_factory.mktemp("textured"), np.array([20, -10])
     grey = 2000 + 400 * ndimage.gaussian_filter(np.random.default_rng(0).normal(size=(300, 300)), 1.5)
@@ -416,7 +421,7 @@ def test_a_place_beyond_the_band_and_its_sides_is_not_found_however_alike(
     along, across = (at + moved) @ axis + beyond, (at + moved) @ [-0.8, 0.6] + aside
     half = np.full(3, 25.0)
     where = Frame(axis, along, across, np.zeros(3), -half, half, np.eye(2))
-    monkeypatch.setattr(structure, "linear_map", lambda *_: np.eye(2))
+    monkeypatch.setattr(structural, "linear_map", lambda *_: np.eye(2))
     search = _Search.__new__(_Search)
     search._views, search._files, search._band, search._whole = (), files, 1, False  # type: ignore[assignment]
     search._points, search._step = at, 1
@@ -431,8 +436,8 @@ def test_a_place_beyond_the_band_and_its_sides_is_not_found_however_alike(
 def test_patches_that_lie_together_share_a_picture(textured, monkeypatch) -> None:
     """Of 256 px a side, at either resolution: each is read and brought onto A's pixels once."""
     files, moved = textured
-    made, real = [], structure._seen
-    monkeypatch.setattr(structure, "_seen", lambda *given: made.append(given) or real(*given))
+    made, real = [], Sampling.seen
+    monkeypatch.setattr(Sampling, "seen", lambda *given: made.append(given) or real(*given))
     axis = np.arange(80.0, 241.0, 40.0)
     at = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     turn = np.broadcast_to(np.eye(2), (len(at), 2, 2))

@@ -2,7 +2,7 @@
 
 Without dates, overlap and angle decide, and pairs that fail are replaced as long as views are not connected. Two dates
 may share no grey value: where the views are of several, pairs are compared by a few keypoints first
-(`barpc.tie.matching.quick_score`), those most alike are tried, and two paths lead to every view where there are two.
+(`quick_score` of the matchers), those most alike are tried, and two paths lead to every view where there are two.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from math import isfinite
 
 from barpc.options import TieOptions
 from barpc.scene import View, connected_labels
-from barpc.tie.pairs import GIVEN, Area, Pair, possible_pairs
+from barpc.tie.pairing.area import Area
+from barpc.tie.pairing.overlaps import GIVEN, Pair, possible_pairs
 
 Link = tuple[int, int]
 

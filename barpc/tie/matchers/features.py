@@ -14,8 +14,9 @@ import numpy.typing as npt
 from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, View
-from barpc.tie.pairs import Area, Pair, shared_tiles
-from barpc.tie.raster import CELL, Box, ByteImage, Survey, grow, read_picture, survey, tiles
+from barpc.tie.pairing.area import Area
+from barpc.tie.pairing.overlaps import Pair, shared_tiles
+from barpc.tie.pixels import CELL, Box, ByteImage, Survey, grow, read_picture, survey, tiles
 from barpc.tie.store import Store, names_of, store_of
 from barpc.tie.tasks import Progress, ordered
 

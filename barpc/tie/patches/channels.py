@@ -18,18 +18,22 @@ import numpy as np
 
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
-from barpc.tie.raster import FloatImage
+from barpc.tie.pixels import FloatImage
 
 CHANNELS = 2
 COARSE, FINE = (0.8, 0.8), (1.0, 0.7)
 """How far pictures are blurred [px] before the gradients, and the channels: to be found, and to be found exactly."""
 _WEAK = 0.5  # of the median gradient: what is weaker is noise
-_EDGE = 6  # px beside invalid ones that know of them
-_BATCH = 32  # templates that are correlated at a time
+EDGE = 6
+"""Pixels so near to invalid ones know of them [px]."""
+BATCH = 32
+"""Templates that are correlated at a time."""
 _STEPS = 5
-_STILL = 0.003  # px
+SETTLED = 0.003
+"""A step below it is the last [px]."""
 _GAP = 5  # px between a search area and its decoy: where a true peak ends
-_SHOWN = 0.9  # of a template must be a picture
+SHOWN = 0.9
+"""Part of a template that must be a picture."""
 
 
 def channels(pixels: FloatImage, valid: BoolArray, blurs: tuple[float, float] = COARSE) -> FloatImage:
@@ -42,7 +46,7 @@ def channels(pixels: FloatImage, valid: BoolArray, blurs: tuple[float, float] = 
     doubled = np.stack([east**2 - south**2, 2.0 * east * south]) / (length + np.float32(1e-12))
     found = np.stack([cv2.GaussianBlur(part, (0, 0), blurs[1]) for part in doubled])
     size = cv2.GaussianBlur(length, (0, 0), blurs[1])
-    known = cv2.erode(valid.astype(np.uint8), np.ones((2 * _EDGE + 1,) * 2, np.uint8), borderValue=1) > 0
+    known = cv2.erode(valid.astype(np.uint8), np.ones((2 * EDGE + 1,) * 2, np.uint8), borderValue=1) > 0
     weak = _WEAK * float(np.median(size[known])) if known.any() else 0.0
     return np.asarray(found * (known / (size + np.float32(weak + 1e-12))), np.float32)
 
@@ -57,9 +61,9 @@ def correlation(template: FloatImage, search: FloatImage) -> FloatImage:
     size = fft.next_fast_len(height, real=True), fft.next_fast_len(width, real=True)
     spectrum = (fft.rfft2(search, size) * fft.rfft2(template, size).conj()).sum(axis=1)
     product = fft.irfft2(spectrum, size)[:, : height - h + 1, : width - w + 1]
-    energy = np.zeros((len(search), height + 1, width + 1))
-    energy[:, 1:, 1:] = (search**2).sum(axis=1).cumsum(axis=1, dtype=np.float64).cumsum(axis=2)
-    here = energy[:, h:, w:] - energy[:, :-h, w:] - energy[:, h:, :-w] + energy[:, :-h, :-w]
+    inner = np.s_[h // 2 : height - (h - 1) // 2, w // 2 : width - (w - 1) // 2]
+    energy = (cv2.boxFilter(one, -1, (w, h), normalize=False)[inner] for one in (search**2).sum(axis=1))
+    here = np.stack([*energy])
     own = (template.astype(np.float64) ** 2).sum(axis=(1, 2, 3))
     scale = np.sqrt(
         np.maximum(here, 0.02 * own[:, None, None]) * own[:, None, None]
@@ -101,7 +105,7 @@ def find(first: FloatImage, second: FloatImage, at: Array, half: int, search: in
     """
     rows = np.asarray(at, np.int64)
     return joined(
-        [_find(first, second, rows[i : i + _BATCH], half, search) for i in range(0, len(rows), _BATCH)]
+        [_find(first, second, rows[i : i + BATCH], half, search) for i in range(0, len(rows), BATCH)]
     )
 
 
@@ -132,7 +136,7 @@ def _find(first: FloatImage, second: FloatImage, at: IntArray, half: int, search
     there = at + whole
     around = cut(second, there, half + 2, half + 2)
     found = around[:, :, 2:-2, 2:-2]
-    pictures = [(np.abs(part).sum(axis=1) > 0).mean(axis=(1, 2)) > _SHOWN for part in (template, found)]
+    pictures = [(np.abs(part).sum(axis=1) > 0).mean(axis=(1, 2)) > SHOWN for part in (template, found)]
     back = correlation(found, cut(first, at, half + search, half + search)).reshape(n, -1)
     back_y, back_x = np.divmod(back.argmax(axis=1), wide)
     part, still = _registered(template, around)
@@ -171,9 +175,9 @@ def _registered(template: FloatImage, around: FloatImage) -> tuple[Array, BoolAr
         right = (slopes @ (wanted.reshape(flat.shape) - flat)[..., None]).astype(np.float64)
         step = np.linalg.solve(normal, right)[..., 0].clip(-0.5, 0.5)
         shift = (shift + step).clip(-1.0, 1.0)
-        if np.abs(step).max() < _STILL:
+        if np.abs(step).max() < SETTLED:
             break
-    return shift, np.asarray((np.abs(step).max(axis=1) < 10 * _STILL) & (np.abs(shift) < 1.0).all(axis=1))
+    return shift, np.asarray((np.abs(step).max(axis=1) < 10 * SETTLED) & (np.abs(shift) < 1.0).all(axis=1))
 
 
 def _unit(patches: FloatImage) -> FloatImage:

@@ -13,8 +13,9 @@ from barpc.scene import BoolArray, IntArray, View
 
 _FEW = 30  # points below which an affine error is not told from a constant one
 _TUKEY = 4.685
+LEAST_REACH = 5.0
+"""Half a segment [px] below which places along it say nothing of altitudes."""
 _WINDOW = 2048.0  # px, side of the windows of the verification
-_WINDOW_POINTS = 60  # that a window needs for a fit of its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +159,7 @@ def agreeing(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, A
         return keep, values
     residual = values - robust_affine(xy, values)(xy)
     for rows in grouped(*np.floor(xy[:, ::-1] / _WINDOW).T):
-        if len(rows) >= _WINDOW_POINTS:
+        if len(rows) >= 2 * _FEW:
             residual[rows] = values[rows] - robust_affine(xy[rows], values[rows])(xy[rows])
         keep[rows] = np.abs(residual[rows]) <= max(3.0 * robust_spread(residual[rows]), floor)
     return keep, residual

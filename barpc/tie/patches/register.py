@@ -20,22 +20,19 @@ from scipy.spatial import cKDTree
 from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View
-from barpc.tie import structure
-from barpc.tie.epipolar import agreeing, frame, grouped, linear_map, robust_spread
-from barpc.tie.raster import FloatImage, PixelReader, grow, levelled
+from barpc.tie.pairing.epipolar import LEAST_REACH, agreeing, frame, grouped, linear_map, robust_spread
+from barpc.tie.patches import oriented
+from barpc.tie.patches.channels import SETTLED
+from barpc.tie.pixels import SPAN, FloatImage, PixelReader, grow, levelled
 from barpc.tie.tasks import Progress, ordered
 
 MIN_CORRELATION = 0.8
 """Of two registered patches, or the match is left out."""
 PATCH = 21
 """Side of the patches that are registered [px], odd."""
-_CHUNK = 256  # patches worked on at a time: they stay in cache
-_BAND = 512  # rows that are swept by columns where points are few: strips and blocks are decoded once
-_TOGETHER = 512  # such points of a task, at most
-_ALL_OF_A_PAIR = 8192  # points of a task where they are many: its tiles share what is decoded
-_PIECE = 512  # px a side that are upsampled at a time: memory is taken again, and not asked of the system
 _STEPS = 12
-_SETTLED = 0.003  # px; a step below it is the last
+_CHUNK = 256  # patches worked on at a time: they stay in cache
+_ALL_OF_A_PAIR = 8192  # points of a task where they are many: its tiles share what is decoded
 _ROUGHLY = 0.05  # px; the same where a place is only compared
 _SMALLER = 0.7  # side of the patch of the second try and of the check
 _TORN = 0.5  # px that the smaller patch may lie apart
@@ -51,7 +48,6 @@ _FLOOR = 0.1  # px across the epipolar line that are always tolerated
 _DISTORTED = 2.0  # times the median sigma about it: the patch lies across a step of the ground
 _ABOUT = 64  # nearest points that tell it: contrast and noise are not alike all over a scene
 _LEAST_END_SIGMA = 0.02  # px, of an observation
-_LEAST_REACH = 5.0  # px of half a segment, below which altitudes are not compared
 _FEW = 20  # observations of a pair of views below which their sigmas are not scaled by their errors
 
 
@@ -95,7 +91,7 @@ def register_places(
     margin = patch + _TAPS + int(_REACH)
     sparse, every = _sparse(reference, margin), Registration.none(start)
     read, groups = (
-        (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, min(tile, _PIECE)))
+        (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, min(tile, SPAN)))
     )
     (path, size), (other, beyond) = files
     with PixelReader(path, band, size) as first, PixelReader(other, band, beyond) as second:
@@ -148,14 +144,14 @@ def _mosaics(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int)
 
 def _parts(origin: Array, links: IntArray, tile: int) -> list[IntArray]:
     """Return the links that are registered in one task: of whole tiles, or, where they are few, of whole
-    bands of rows.
+    bands of rows, swept by columns: strips and blocks are decoded once.
     """
     if not _sparse(origin, PATCH + _TAPS + int(_REACH)):
         return [links[rows] for rows in _joined(_by_tile(origin, tile), _ALL_OF_A_PAIR)]
-    order = np.lexsort((origin[:, 0], origin[:, 1] // _BAND))
-    bands = np.split(order, np.flatnonzero(np.diff(origin[order, 1] // _BAND)) + 1)
-    pieces = [band[at : at + _TOGETHER] for band in bands for at in range(0, len(band), _TOGETHER)]
-    return [links[rows] for rows in _joined(pieces, _TOGETHER)]
+    order = np.lexsort((origin[:, 0], origin[:, 1] // SPAN))
+    bands = np.split(order, np.flatnonzero(np.diff(origin[order, 1] // SPAN)) + 1)
+    pieces = [band[at : at + SPAN] for band in bands for at in range(0, len(band), SPAN)]
+    return [links[rows] for rows in _joined(pieces, SPAN)]
 
 
 def _by_tile(xy: Array, tile: int) -> list[IntArray]:
@@ -187,8 +183,8 @@ def register_part(
 ) -> Registration:
     """Register patches by their grey values, or by channels of oriented gradients; `ok` where they are alike."""
     if structural:
-        xy, ok, correlation = structure.register_places(files, band, reference, start, linear)
-        return Registration(xy, correlation, np.full(len(xy), structure.SIGMA), ok)
+        xy, ok, correlation = oriented.register_places(files, band, reference, start, linear)
+        return Registration(xy, correlation, np.full(len(xy), oriented.SIGMA), ok)
     found = register_places(files, band, reference, start, linear, PATCH, tile)
     return replace(found, ok=found.ok & (found.correlation >= MIN_CORRELATION))
 
@@ -307,7 +303,7 @@ class _Template:
         reference: IntArray,
         start: Array,
         linear: Array,
-        settled: float = _SETTLED,
+        settled: float = SETTLED,
     ) -> Registration:
         """Register the patches about `reference` (N, 2), begun at `start` with the distortion `linear`."""
         offset = self._row * self._width + self._col
@@ -488,7 +484,7 @@ class _Links:
         """Return the links that disagree in altitude with all their neighbours in the track, up to an affine
         function.
         """
-        rows = np.flatnonzero(good & (reach >= _LEAST_REACH))
+        rows = np.flatnonzero(good & (reach >= LEAST_REACH))
         first, second = rows[:-1], rows[1:]
         same = self.reference[first] == self.reference[second]
         first, second = first[same], second[same]

@@ -12,10 +12,10 @@ import numpy as np
 
 from barpc.options import TieOptions
 from barpc.scene import View
-from barpc.tie.features import Keypoints
-from barpc.tie.matcher import Matches, Prediction
-from barpc.tie.matching import PairReport, match_pair
-from barpc.tie.pairs import Pair
+from barpc.tie.matchers.features import Keypoints
+from barpc.tie.matchers.matcher import Matches, Prediction
+from barpc.tie.matchers.matching import PairReport, match_pair
+from barpc.tie.pairing.overlaps import Pair
 from barpc.tie.tasks import Progress, ordered
 
 logger = logging.getLogger(__name__)

@@ -19,8 +19,8 @@ import numpy as np
 from barpc.errors import BarpcError, InputError, TiePointError
 from barpc.options import TieOptions
 from barpc.scene import View
-from barpc.tie.features import Keypoints
-from barpc.tie.matcher import Matcher, Matches, Prediction
+from barpc.tie.matchers.features import Keypoints
+from barpc.tie.matchers.matcher import Matcher, Matches, Prediction
 
 
 @dataclass(frozen=True)

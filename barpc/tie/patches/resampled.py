@@ -1,4 +1,4 @@
-"""Images and orthoimages on one grid on the ground, as channels that can be compared (`barpc.tie.channels`)."""
+"""Images and orthoimages on one grid on the ground, as channels that can be compared (`barpc.tie.patches.channels`)."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from barpc.frozen import Frozen
 from barpc.geodesy import Array, metres_per_unit
 from barpc.raster import open_raster
 from barpc.scene import BoolArray, View
-from barpc.tie.channels import CHANNELS, channels
-from barpc.tie.raster import Box, FloatImage, grow, levelled, read_pixels
+from barpc.tie.patches.channels import CHANNELS, channels
+from barpc.tie.pixels import Box, FloatImage, grow, levelled, read_pixels
 
 Terrain = Callable[[Array, Array], Array]
 """lon, lat (...) [deg] -> altitude (...) [m above the ellipsoid], NaN where it is unknown."""

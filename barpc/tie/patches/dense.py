@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
-from barpc.tie.raster import Box, FloatImage, Stretch, levelled, read_pixels
+from barpc.tie.pixels import Box, FloatImage, Stretch, levelled, read_pixels
 
 ACROSS = 0.02
 """A part in which an affine frame is farther off the epipolar lines [px] is too large for one."""
@@ -21,11 +21,10 @@ FINER = (
 )
 WINDOW = 5
 """Pixels a side over which grey values are compared."""
-_BLOCK = 5  # px of the frame
 _SGBM = {
-    "blockSize": _BLOCK,
-    "P1": 16 * _BLOCK**2,  # twice OpenCV's own, as disparities are twice as fine: 0.62 m, of its own 0.71 m
-    "P2": 64 * _BLOCK**2,
+    "blockSize": WINDOW,
+    "P1": 16 * WINDOW**2,  # twice OpenCV's own, as disparities are twice as fine: 0.62 m, of its own 0.71 m
+    "P2": 64 * WINDOW**2,
     "preFilterCap": 63,  # of 15, OpenCV's own, 0.96 m in place of 0.83 m: it cuts strong edges
     "uniquenessRatio": 5,
     "speckleWindowSize": 100,
@@ -33,7 +32,6 @@ _SGBM = {
     "disp12MaxDiff": -1,  # asked for here, of a second pass
     "mode": cv2.STEREO_SGBM_MODE_SGBM_3WAY,  # 0.64 m, of five ways 0.62 m at half as much time again
 }
-_BACK = 1.0  # px that a match may come back beside where it began
 _MARGIN = 16  # px about a part that are matched, too: paths of SGBM begin at the ends
 _LEFT, _SLOPE = (
     0.741,
@@ -166,7 +164,7 @@ def _window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Arr
     for size, one, more in zip(sizes, frame.maps, (np.zeros(2), reach), strict=True):
         corners = (np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size - 0.5) @ one[:, :2].T + one[:, 2]
         low, high = np.maximum(low, corners.min(axis=0)), np.minimum(high, corners.max(axis=0) + more)
-    if (high - low < _FEW).any():
+    if (high - low < 2 * _MARGIN).any():
         return None
     low, high = np.floor(low - reach), np.ceil(high + reach)
     return low, (int(high[0] - low[0]), int(high[1] - low[1]))
@@ -233,7 +231,7 @@ def _both_ways(
     back = matcher.compute(*turned)[:, ::-1].astype(np.float32) / 16.0
     rows, cols = np.ogrid[: left.shape[0], : left.shape[1]]
     at = np.clip(np.rint(cols - there).astype(np.int64), 0, left.shape[1] - 1)
-    good: BoolArray = (there >= 0) & (np.abs(there - back[rows, at]) <= _BACK * FINER)
+    good: BoolArray = (there >= 0) & (np.abs(there - back[rows, at]) <= FINER)
     return there, good
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple
@@ -21,14 +22,22 @@ from scipy.spatial import cKDTree
 from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import IntArray, View
-from barpc.tie.epipolar import Frame, agreeing, common_range, frame, robust_affine, robust_spread
-from barpc.tie.features import KeypointFiles, Keypoints, ample_matches, join
-from barpc.tie.guided import CLEAR_RATIO, Guided
-from barpc.tie.hook import Hook, hooked
-from barpc.tie.matcher import NO_MATCHES, Matcher, Matches, Prediction
-from barpc.tie.ortho import Terrain
-from barpc.tie.pairs import Pair, reach_of, shared_tiles
-from barpc.tie.structure import FineStructure, Structure
+from barpc.tie.matchers.features import KeypointFiles, Keypoints, ample_matches, join
+from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
+from barpc.tie.matchers.hook import Hook, hooked
+from barpc.tie.matchers.matcher import NO_MATCHES, Matcher, Matches, Prediction
+from barpc.tie.matchers.structural import FineStructure, Structure
+from barpc.tie.pairing.epipolar import (
+    LEAST_REACH,
+    Frame,
+    agreeing,
+    common_range,
+    frame,
+    robust_affine,
+    robust_spread,
+)
+from barpc.tie.pairing.overlaps import Pair, reach_of, shared_tiles
+from barpc.tie.patches.resampled import Terrain
 from barpc.tie.tasks import Progress, ordered
 
 STRUCTURE = "structure"
@@ -66,7 +75,6 @@ _LOOSE = (
     2 / 3,
 )  # ratio and false share of the second attempt; its part of the matches that a pair needs
 _QUICK = 500  # keypoints of a view that tell what a pair promises
-_LEAST_REACH = 5.0  # px of half a segment, below which matches say nothing of altitudes
 _MARGINS = 150.0, 50.0  # m beyond known altitudes: how wrong cameras make them, and seldom do
 _BESIDE = 100.0  # px beyond the other image at which terrain counts
 _PROBES = 12  # pixels along a side at which the terrain is asked
@@ -116,7 +124,8 @@ def match_pair(
 
     Where few or none are found, loosened thresholds are tried, and what finds more counts.
     """
-    first = _attempt(views, keypoints, pair, options)
+    looked: dict[str, _Search] = {}
+    first = _attempt(views, keypoints, pair, options, looked)
     if enough(first[1]) or "keypoints" in first[1].status or options.matcher not in MATCHERS:
         return first
     loose = replace(
@@ -130,7 +139,7 @@ def match_pair(
         (structural and first[1].matches < loose.min_matches)  # thresholds do not say where it looks
         or (first[1].status.startswith(_NOWHERE) and options.ratio >= CLEAR_RATIO)
     ):  # nor do looser ones let more through where only clear matches count
-        found, report = _attempt(views, keypoints, pair, loose)
+        found, report = _attempt(views, keypoints, pair, loose, looked)
         tried.append((found, replace(report, loosened=True)))
     if structural and all(report.status != "ok" for _, report in tried):
         found, report = _attempt(views, keypoints, pair, replace(loose, matcher=FINE))
@@ -173,8 +182,11 @@ def _attempt(
     keypoints: tuple[Keypoints | KeypointFiles, Keypoints | KeypointFiles],
     pair: Pair,
     options: TieOptions,
+    looked: dict[str, _Search] | None = None,
 ) -> tuple[Matches, PairReport]:
-    """Return all passes over a pair with one matcher and its thresholds."""
+    """Return all passes over a pair with one matcher and its thresholds; by its name, what was `looked` at is
+    known to the next attempt.
+    """
     names, counts = (views[0].name, views[1].name), (len(keypoints[0]), len(keypoints[1]))
     report = PairReport(
         names,
@@ -189,7 +201,10 @@ def _attempt(
     if kind.detects and min(counts) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few keypoints")
     loaded, numbers = _loaded(views, keypoints, options)
-    search = _Search(views, loaded, options)
+    looked = {} if looked is None else looked
+    before = looked.get(options.matcher)
+    search = _Search(views, loaded, options) if before is None else before.loosened(loaded, options)
+    looked[options.matcher] = search
     coarse = search.offset()
     if coarse is None:
         return NO_MATCHES, replace(report, status=f"{_NOWHERE} within {search.reach:.4g} px")
@@ -312,7 +327,7 @@ def _altitudes(ties: Sequence[tuple[tuple[View, View], Matches]]) -> tuple[float
     found = []
     for views, matches in ties:
         where, (low, high) = frame(*views, matches.xy[:, 0]), common_range(*views)
-        if np.median(where.after) >= _LEAST_REACH:
+        if np.median(where.after) >= LEAST_REACH:
             along = where.errors(matches.xy[:, 1])[:, 0] / where.after
             found.append(0.5 * (low + high) + 0.5 * (high - low) * np.percentile(along, [2, 98]))
     return (float(np.min(found)), float(np.max(found))) if found else None
@@ -369,6 +384,7 @@ class _Search:
         self, views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints], options: TieOptions
     ) -> None:
         self._views, self._options = views, options
+        self._offset: list[Prediction | None] = []
         self._matcher = matcher_named(options.matcher)(options, keypoints)
         self.reach = min(reach_of(views[1], options), getattr(self._matcher, "widest", float("inf")))
         points = keypoints[0].xy
@@ -379,6 +395,15 @@ class _Search:
         first = frame(*views, points)
         self._axis = first.axis
         self._frame = _latest(lambda xy: first if xy is points else frame(*views, xy, first.axis))
+
+    def loosened(self, keypoints: tuple[Keypoints, Keypoints], options: TieOptions) -> _Search:
+        """Return the search at looser thresholds, which do not change where it looks."""
+        other = copy(self)
+        if self._matcher.detects:
+            other._matcher = matcher_named(options.matcher)(options, keypoints)
+        if self._options.ratio < CLEAR_RATIO:  # nor which matches are clear, but for this
+            other._offset = []
+        return other
 
     @property
     def patch(self) -> float:
@@ -414,7 +439,13 @@ class _Search:
         return found.select(np.arange(count)), float(share[count - 1]) if count else 0.0
 
     def offset(self) -> Prediction | None:
-        """Find the cameras' error by blind passes of growing width, and where to search.
+        """Return where to search, once the cameras' error is found by blind passes of growing width."""
+        if not self._offset:
+            self._offset.append(self._passes())
+        return self._offset[0]
+
+    def _passes(self) -> Prediction | None:
+        """Return where to search by several blind passes.
 
         The first pass in whose peak most matches stand decides, else the one with the most significant peak, if any.
         """
@@ -430,9 +461,10 @@ class _Search:
 
     def _blind(self, width: float, probes: int) -> _Peak | None:
         """Return one pass: a peak among the errors across the epipolar lines of some points, if there is one."""
+        every = self._frame  # and not this search: what it found would keep it, and it what it found
 
         def everywhere(xy: Array) -> Frame:
-            where = self._frame(xy)
+            where = every(xy)
             return replace(where, before=where.before - width, after=where.after + width)
 
         prediction = replace(self._predicted(everywhere, width), probes=probes)
@@ -455,7 +487,7 @@ class _Search:
         first, last = low - margin, high + margin
 
         def corrected(xy: Array) -> Frame:
-            where, same = self._frame(xy).moved(across(xy)), np.ones(len(xy))
+            where, same = every(xy).moved(across(xy)), np.ones(len(xy))
             return replace(where, before=first * same, after=last * same)
 
         return _Peak(self._predicted(corrected, TOLERANCE), most / len(values), float(significance))
@@ -463,12 +495,12 @@ class _Search:
     def local(self, tight: Matches) -> Prediction:
         """Return the corrected prediction: each point in a band about its neighbours' places by the matches so far."""
         errors, places = self.errors(tight), tight.xy[:, 0]
-        across, tree = robust_affine(places, errors[:, 1]), cKDTree(places)
+        across, tree, every = robust_affine(places, errors[:, 1]), cKDTree(places), self._frame
 
         def nearby(xy: Array) -> Frame:
             along = errors[tree.query(xy, k=min(_NEIGHBOURS, len(tight)))[1], 0]
             middle = np.median(along, axis=1)
             half = 4.0 + 3.0 * robust_spread(along, middle[:, None])
-            return replace(self._frame(xy).moved(across(xy)), before=middle - half, after=middle + half)
+            return replace(every(xy).moved(across(xy)), before=middle - half, after=middle + half)
 
         return self._predicted(nearby, float(np.clip(4.0 * across.spread, 0.6, TOLERANCE)))

@@ -28,13 +28,12 @@ Box = tuple[int, int, int, int]
 
 CELL = 64
 """Side of the cells that each hold a quota of keypoints [px]; tiles are whole cells."""
-_ROWS = 512  # px read at a time, at least one row of blocks
+SPAN = 512
+"""Rows that are read at a time (at least one row of blocks), and what else is done in parts of so many."""
 _SAMPLES = 5  # blocks a side whose pixels make the stretch
-_SAMPLE_SIDE = 128  # px
 _LEVEL = 4  # px a side of a pixel of the samples, where decoding is dear
 _NEGLIGIBLE = 8.0  # a range below so many steps of a float type is a constant image
 _LEVELS = 1000.0  # grey values that most of a window is spread over
-_OUTLIER = 1e6  # grey values beyond which a pixel is cut: it would drown its surroundings
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,8 @@ def _levelled(pixels: Pixels, low: float, high: float, levels: float) -> FloatIm
     """Return `low` and `high` as 0 and `levels`; whatever the scale, nothing overflows."""
     with np.errstate(over="ignore"):
         share = (pixels / 2 - low / 2) / (high / 2 - low / 2)  # halves: a difference may have no number
-    return np.clip(share * levels, -_OUTLIER, _OUTLIER).astype(np.float32)
+    most = _LEVELS**2  # beyond it a pixel would drown its surroundings
+    return np.clip(share * levels, -most, most).astype(np.float32)
 
 
 def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
@@ -128,7 +128,7 @@ def _averaged(
     if pixel == (1, 1):
         return _read(dataset, box, band, level)
     (col, row, width, height), (wide, high), parts = box, pixel, []
-    step = max(1, _ROWS // high)
+    step = max(1, SPAN // high)
     for top in range(row, row + height, step):
         rows = min(step, row + height - top)
         raw, known = _read(dataset, (wide * col, high * top, wide * width, high * rows), band)
@@ -192,7 +192,7 @@ def sample_stretch(
         kind = np.dtype(dataset.dtypes[band - 1])
         pixel, (width, height) = _pixel(dataset, size), size or (dataset.width, dataset.height)
         zoom = _LEVEL if pixel == (1, 1) and _levels(dataset, band) else 1
-        side_x, side_y = (min(zoom * _SAMPLE_SIDE, n) for n in (width, height))
+        side_x, side_y = (min(zoom * 2 * CELL, n) for n in (width, height))
         for row in np.linspace(0, height - side_y, _SAMPLES).astype(int):
             for col in np.linspace(0, width - side_x, _SAMPLES).astype(int):
                 box = int(col), int(row), side_x, side_y
@@ -245,7 +245,7 @@ def read_picture(
     with open_raster(path) as dataset:
         _check_band(dataset, path, band)
         step = zoom * found.block[1]
-        step *= max(1, _ROWS // step)
+        step *= max(1, SPAN // step)
         top = row
         while top < row + height:
             stop = min(row + height, (top // step + 1) * step)

@@ -17,8 +17,7 @@ from barpc.frozen import Frozen
 from barpc.geodesy import Array, metres_per_unit
 from barpc.scene import IntArray, Tracks, View
 from barpc.sensor import SensorModel
-from barpc.tie.matcher import Matches
-from barpc.tie.pairs import Pair
+from barpc.tie.pairing.overlaps import Pair
 
 Link = tuple[int, int]
 
@@ -95,9 +94,9 @@ class Looks:
         """Return a pair of views as a pair of looks."""
         return replace(pair, views=self.ends[pair.views])
 
-    def matches(self, pair: Link, found: Matches) -> Matches:
-        """Return matches of two views counted in the pixels of their looks."""
-        return replace(found, xy=coarser(found.xy, self.pixel[list(self.ends[pair])]))
+    def places(self, pair: Link, xy: Array) -> Array:
+        """Return places (M, 2, 2) [px] in two views counted in the pixels of their looks."""
+        return coarser(xy, self.pixel[list(self.ends[pair])])
 
     def tracks(self, found: Tracks) -> Tracks:
         """Return tracks over looks as tracks over views."""

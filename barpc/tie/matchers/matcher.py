@@ -1,6 +1,6 @@
 """What a matcher is given, and what it gives back.
 
-A matcher is a class of one file and one row in `barpc.tie.matching.MATCHERS`: `match(a, b, prediction)` looks
+A matcher is a class of one file and one row in `barpc.tie.matchers.matching.MATCHERS`: `match(a, b, prediction)` looks
 for points of view A in view B. A view has a path to read pixels from and the camera; the prediction says where
 in B any point of A may lie. What is found goes, whatever found it, the same way: bands that hold no true match
 tell how many are false, a robust fit throws out what does not lie on the epipolar lines, matches that share a
@@ -18,9 +18,9 @@ import numpy as np
 from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, View
-from barpc.tie.epipolar import Frame
-from barpc.tie.features import Keypoints
-from barpc.tie.raster import Box
+from barpc.tie.matchers.features import Keypoints
+from barpc.tie.pairing.epipolar import Frame
+from barpc.tie.pixels import Box
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,1 @@
+"""Which views are compared, and where one sees what another shows."""

@@ -1,0 +1,1 @@
+"""Pictures about points, brought onto each other: channels of gradients, registration, dense matching."""

@@ -1,0 +1,175 @@
+"""Pictures of the same resolution and orientation about points of two images, as channels that are correlated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from barpc.geodesy import Array
+from barpc.scene import BoolArray, IntArray
+from barpc.tie.pairing.epipolar import grouped
+from barpc.tie.patches.channels import BATCH, COARSE, EDGE, FINE, SHOWN, channels, correlation, cut
+from barpc.tie.patches.resampled import picture, ticks
+from barpc.tie.pixels import FloatImage
+
+Files = Sequence[tuple[str, tuple[int, int]]]
+"""Path and size (width, height) of two images."""
+
+PATCH = 24
+"""How far a patch reaches to each side when matches are registered [px]."""
+SIGMA = 0.1
+"""Standard deviation of a coordinate after that, at least [px]."""
+HALF = 16
+"""How far a template reaches to each side [px]."""
+TILE = 256
+"""Points of a tile of so many px a side share a picture."""
+_AREA = 1 << 21  # px of areas that templates are correlated with at a time, together: 60 bytes a px
+_BACK = 1.5  # px that the way back may miss by
+_FINER = 3  # px to each side that a finer picture is searched, and the last one, of half its step
+
+
+def resolution(linear: Array) -> int:
+    """Return the pixels of A in one of B, where these are larger, as a power of two."""
+    return 1 << int(np.rint(np.log2(max(1.0, abs(float(np.linalg.det(linear))) ** -0.5))).clip(0, 6))
+
+
+@dataclass(frozen=True, eq=False)
+class Sampling:
+    """How two images are seen on grids of one resolution and orientation."""
+
+    files: Files
+    band: int
+    step: float  # px of A that a pixel of the grids holds
+    linear: Array  # (2, 2) d(B)/d(A)
+    blurs: tuple[float, float] = COARSE
+
+    def seen(self, which: int, origin: Array, matrix: Array, size: IntArray) -> FloatImage:
+        """Return the channels (C, H, W) of an image on a grid: pixel k at `origin` + `matrix` k."""
+        (path, whole), shape = self.files[which], (int(size[1]), int(size[0]))
+        nodes = np.stack(np.meshgrid(ticks(shape[1]), ticks(shape[0])), axis=-1)
+        return channels(*picture(path, (self.band,), whole, origin + nodes @ matrix.T, shape), self.blurs)
+
+
+def found_about(sampling: Sampling, at: Array, xy: Array, half: int = HALF) -> tuple[Array, BoolArray, Array]:
+    """Return the places (n, 2) near those given, whether they stand out and the way back ends at its start;
+    correlations.
+    """
+    tile = Tile.of(sampling, at, xy, np.full(2, _FINER), half)
+    surface = tile.surfaces()
+    place, score = tile.peaks(surface)
+    edge = np.abs(np.rint(place) - tile.whole).max(axis=1) < _FINER
+    return tile.in_b(place), edge & tile.shown() & tile.returns(place), score
+
+
+def register_places(
+    files: Files, band: int, reference: Array, start: Array, linear: Array
+) -> tuple[Array, BoolArray, Array]:
+    """Register patches of A at `reference` about `start` (n, 2) [px] of B: places, success, correlations.
+
+    On the channels, at the coarser of the two resolutions, and then at half its step: what is sharper than a pixel is
+    lost between whole ones.
+    """
+    place, ok, score = start.copy(), np.zeros(len(start), dtype=bool), np.zeros(len(start))
+    step = resolution(np.median(linear, axis=0))
+    for rows in grouped(*np.floor(reference[:, ::-1] / (step * TILE)).T):
+        at, turn = reference[rows], np.median(linear[rows], axis=0)
+        near, found, _ = found_about(Sampling(files, band, step, turn), at, start[rows], PATCH)
+        closer = Sampling(files, band, 0.5 * step, turn, FINE)
+        tile = Tile.of(closer, at, near, np.full(2, _FINER), 2 * HALF)
+        best, score[rows] = tile.peaks(tile.surfaces())
+        inside = np.abs(np.rint(best) - tile.whole).max(axis=1) < _FINER
+        place[rows], ok[rows] = tile.in_b(best), found & inside
+    return place, ok, score
+
+
+@dataclass(frozen=True, eq=False)
+class Tile:
+    """Pictures around points of A and their search areas in B, of the same resolution and orientation."""
+
+    pictures: tuple[FloatImage, FloatImage]  # channels (C, H, W) of A and of B
+    at: IntArray  # (n, 2) in the first
+    whole: IntArray  # (n, 2) in the second: whole px next to what is predicted
+    left: Array  # (n, 2) what that leaves [px]
+    reach: IntArray  # (2,) how far to look, x, y [px]
+    half: int  # how far templates reach [px]
+    matrix: Array  # (2, 2) d(B)/d(second picture)
+    origin: Array  # (2,) of the second picture, in B
+
+    @classmethod
+    def of(cls, sampling: Sampling, at: Array, xy: Array, reach: IntArray, half: int) -> Tile:
+        """Return the pictures of two images about points of A and B (n, 2) [px]."""
+        step, matrix = sampling.step, sampling.step * sampling.linear
+        pad = half + EDGE + 2  # beside it, channels do not know what lies beyond
+        corner = np.floor(at.min(axis=0) / step) * step - pad * step
+        first = np.rint((at - corner) / step).astype(np.int64)
+        middle = np.median(xy, axis=0)
+        place = (xy - middle) @ np.linalg.inv(matrix).T
+        low = np.floor(place.min(axis=0)) - pad - reach - 1
+        place -= low
+        whole = np.rint(place).astype(np.int64)
+        origin = middle + matrix @ low
+        pictures = (
+            sampling.seen(0, corner, step * np.eye(2), first.max(axis=0) + pad + 1),
+            sampling.seen(1, origin, matrix, whole.max(axis=0) + pad + reach + 2),
+        )
+        return cls(pictures, first, whole, place - whole, reach, half, matrix, origin)
+
+    def surfaces(self) -> FloatImage:
+        """Return the correlations (n, y, x) at all places within reach."""
+        x, y = (self.half + self.reach).tolist()
+        parts = [
+            correlation(
+                cut(self.pictures[0], self.at[i], self.half, self.half),
+                cut(self.pictures[1], self.whole[i], x, y),
+            )
+            for i in self._batches()
+        ]
+        return np.concatenate(parts)
+
+    def _batches(self) -> list[slice]:
+        area = int((2 * (self.half + self.reach) + 1).prod())
+        batch = max(1, min(BATCH, _AREA // area))
+        return [slice(i, i + batch) for i in range(0, len(self.at), batch)]
+
+    def offsets(self) -> Array:
+        """Return the offsets (y, x, 2) [px] in B of the places of a surface from the whole pixel."""
+        axes = (np.arange(-n, n + 1) for n in self.reach.tolist())
+        return np.stack(np.meshgrid(*axes), axis=-1) @ self.matrix.T
+
+    def peaks(self, surface: FloatImage) -> tuple[Array, Array]:
+        """Return the best places (n, 2) in the second picture, to sub-pixel precision, and their correlations (n,)."""
+        n, height, width = surface.shape
+        flat = surface.reshape(n, -1).argmax(axis=1)
+        y, x = np.divmod(flat, width)
+        part = np.zeros((n, 2))
+        inside = (x > 0) & (x < width - 1) & (y > 0) & (y < height - 1)
+        i, row, col = np.flatnonzero(inside), y[inside], x[inside]
+        for k, (dy, dx) in enumerate(((0, 1), (1, 0))):
+            low, here, high = (surface[i, row + s * dy, col + s * dx].astype(np.float64) for s in (-1, 0, 1))
+            bend = np.minimum(low - 2.0 * here + high, -1e-6)
+            part[i, k] = (0.5 * (low - high) / bend).clip(-0.5, 0.5)
+        score = surface.reshape(n, -1)[np.arange(n), flat].astype(np.float64)
+        return self.whole + np.stack([x, y], axis=1) - self.reach + part, score
+
+    def returns(self, place: Array) -> BoolArray:
+        """Return whether matching back from places of the second picture ends where it began."""
+        search, missed = 4, []
+        for i in self._batches():
+            there = cut(self.pictures[1], np.rint(place[i]).astype(np.int64), self.half, self.half)
+            back = correlation(
+                there, cut(self.pictures[0], self.at[i], self.half + search, self.half + search)
+            )
+            y, x = np.divmod(back.reshape(len(back), -1).argmax(axis=1), back.shape[2])
+            missed.append(np.hypot(x - search, y - search))
+        return np.asarray(np.concatenate(missed) <= _BACK)
+
+    def shown(self) -> BoolArray:
+        """Return the templates that hold structure."""
+        known = (np.abs(self.pictures[0]).sum(axis=0, keepdims=True) > 0).astype(np.float32)
+        return np.asarray(cut(known, self.at, self.half, self.half).mean(axis=(1, 2, 3)) > SHOWN)
+
+    def in_b(self, place: Array) -> Array:
+        """Return the places (n, 2) of the second picture in B [px]."""
+        return np.asarray(self.origin + place @ self.matrix.T)
