@@ -43,6 +43,8 @@ from barpc.rpcio import hidden_by
 logger = logging.getLogger(__name__)
 
 STATE_FILE, NOTES, LOCK, CACHE = "state.json", "outputs.jsonl", "lock", "cache"
+LAST = "summary.json"
+"""Output of a run that is written last: with it its folder is complete."""
 _FILES = (STATE_FILE, NOTES, LOCK)
 _MAX_STATE = 32 << 20  # bytes: larger state files (some 300,000 outputs) count as missing
 _CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
@@ -247,7 +249,9 @@ class Workspace:
             self._save_state(status)
         except BarpcError:
             if status == "done":  # it may say so, and only the disk was not told
-                with suppress(BarpcError):
+                with suppress(BarpcError, OSError):
+                    if LAST in self.outputs:
+                        (self.folder / LAST).unlink(missing_ok=True)
                     self._save_state("failed")
             raise
 

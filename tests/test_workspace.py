@@ -531,3 +531,23 @@ def test_a_table_lies_in_its_folder_and_that_of_an_earlier_run_beside_the_summar
     new.unlink()
     old.symlink_to(tmp_path / "nowhere")
     assert table_path(tmp_path, "pairs.csv") == old  # to be refused by who opens it
+
+
+def test_a_run_whose_last_state_cannot_be_saved_is_not_taken_for_finished(tmp_path, monkeypatch):
+    save = Workspace._save_state
+
+    def full(self, status):
+        if status == "done":
+            raise OutputError("no space left")
+        save(self, status)
+
+    monkeypatch.setattr(Workspace, "_save_state", full)
+    with pytest.raises(OutputError, match="no space left"), Workspace(tmp_path / "run") as run:
+        run.write_text("a_RPC.TXT", "a")
+        run.write_text("summary.json", "{}")
+    monkeypatch.undo()
+    assert (tmp_path / "run/a_RPC.TXT").exists()
+    assert not (tmp_path / "run/summary.json").exists()
+    with Workspace(tmp_path / "run") as again:  # the same command goes on
+        again.write_text("summary.json", "{}")
+    assert (tmp_path / "run/summary.json").exists()

@@ -28,8 +28,8 @@ from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
 from barpc.tie.tasks import Progress, ordered
+from barpc.workspace import LAST, Workspace, own_files
 from barpc.workspace import TABLES as TABLES_FOLDER
-from barpc.workspace import Workspace, own_files
 
 MATCHES = ("matches.csv", "matches.npz")
 GCPS = f"{TABLES_FOLDER}/gcps.geojson"  # of a reference
@@ -107,7 +107,7 @@ def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
 
 def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> list[str]:
     """Return the names of a run's outputs before it starts; of match files those that are already in the folder."""
-    names = [*(f"{TABLES_FOLDER}/{name}" for name in TABLES), "summary.json"]
+    names = [*(f"{TABLES_FOLDER}/{name}" for name in TABLES), LAST]
     names += ["report.html"] * can_render() + [GCPS] * bool(options.reference)
     if options.stop_after == "matching":
         stems = {view.name for view in views}
@@ -164,7 +164,7 @@ def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
     texts = {key: _json(value) for key, value in plain(summary).items()}
     texts["stages"] = _json(plain(now().stages))
     body = ",\n".join(f"{json.dumps(key)}: {text}" for key, text in texts.items())
-    workspace.write_text("summary.json", f"{{\n{body}\n}}\n")
+    workspace.write_text(LAST, f"{{\n{body}\n}}\n")
     return now()
 
 
