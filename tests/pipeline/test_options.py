@@ -254,7 +254,7 @@ def _height(found: AdjustResult) -> float:
     return float(np.median(ground_from_ecef(points[np.isfinite(points[:, 0])])[:, 2]))
 
 
-TIGHT = AdjustOptions(dem_sigma=1.0, dem_bias_sigma=0.01)
+TIGHT = AdjustOptions(dem_sigma=2.0, dem_bias_sigma=0.01)
 
 
 def _held(run: Run) -> AdjustResult:
@@ -270,7 +270,7 @@ def dem(run: Run, out: Path, scene: Path) -> None:
     with pytest.raises(InputError):
         run("c", dem=str(out / "nowhere.tif"))
     with pytest.raises(InputError, match="dem_for_weak is given without dem"):
-        run("d", adjust=TIGHT)
+        run("d", adjust=AdjustOptions(dem_for_weak=True))
 
 
 @pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
