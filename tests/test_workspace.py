@@ -145,6 +145,7 @@ def test_what_an_earlier_run_wrote_and_this_one_did_not_goes_away(tmp_path):
     assert (tmp_path / "run/both.vrt").read_text() == "new"
 
 
+@pytest.mark.slow
 def test_leftovers_of_a_killed_run_are_cleaned_and_its_stages_stay(tmp_path):
     code = (
         "import os, signal, numpy as np\n"

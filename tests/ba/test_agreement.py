@@ -68,6 +68,7 @@ def any_way(seed: int, count: int, size: float) -> dict[int, Any]:
 # --- linear, with truth -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("times", "whole"), [(1.0, 20), (3.0, 18)])
 def test_points_without_a_blunder_stay_one_set_whatever_their_accuracies(times, whole) -> None:
     all_of = [found(6, seed, times=times) for seed in range(20)]
@@ -112,6 +113,7 @@ def test_two_sets_of_equal_weight_are_both_said_and_none_is_used(count, moved) -
         assert 2 * min(first.sum(), second.sum()) >= moved
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "moved"), rest_slow(starmap(pytest.param, [(9, 4), (5, 2), (12, 4), (30, 9)]))
 )
@@ -309,6 +311,7 @@ def test_control_that_passes_as_agreeing_and_tears_the_images_is_let_go(what, mo
     assert any("; the images contradict gcp_000, " in line for line in decisions(summary))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixels", [1.0, 10.0])
 def test_control_marked_beside_itself_in_one_image_does_not_move_it(pixels) -> None:
     block = simulate_block(3, 400, seed=5, num_gcps=6)
@@ -322,6 +325,7 @@ def test_control_marked_beside_itself_in_one_image_does_not_move_it(pixels) -> N
     assert one.apart is None  # its RPC is its own
 
 
+@pytest.mark.slow
 def test_control_that_is_right_is_not_let_go_where_the_images_are_worse_with_it_by_less_than_they_are_asked_to_be(
     monkeypatch,
 ) -> None:

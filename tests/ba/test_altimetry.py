@@ -72,6 +72,7 @@ def test_motions_are_those_that_are_reported():
     np.testing.assert_array_equal(moves[1] @ [0, 0, 0, 0, 0, 0, 1], [1, 2, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "seeds"), rest_slow(starmap(pytest.param, product([0.4, 0.0], [range(3), range(3, 6)])))
 )
@@ -88,6 +89,7 @@ def test_a_surface_finds_its_place_with_the_right_sign_and_says_how_well(wrong: 
     assert 0.4 < np.sqrt(np.mean(np.square(ratio))) < 1.5
 
 
+@pytest.mark.slow
 def test_heights_that_mostly_disagree_agree_on_nothing():
     rng = np.random.default_rng(1)
     assert not registered(rng, given(rng, 150, [5.0, -7.0, 90.0], wrong=0.8)).is_most
@@ -97,6 +99,7 @@ def test_heights_that_mostly_disagree_agree_on_nothing():
     assert not registered(rng, elsewhere).is_most
 
 
+@pytest.mark.slow
 def test_two_groups_of_equal_weight_are_no_majority():
     """Half of the heights in another datum, 30 m off: which half is right nobody knows."""
     rng = np.random.default_rng(3)
@@ -111,6 +114,7 @@ def test_two_groups_of_equal_weight_are_no_majority():
     np.testing.assert_allclose(found.motion[:3], [5.0, -7.0, 90.0], atol=0.6)
 
 
+@pytest.mark.slow
 def test_a_plain_tells_heights_and_no_place():
     """Slopes of a plain are its noise: they do not know where it is."""
     rng = np.random.default_rng(2)
@@ -121,6 +125,7 @@ def test_a_plain_tells_heights_and_no_place():
     assert found.motion[2] == pytest.approx(90.0, abs=4.0 * sigma[2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", rest_slow([range(2), range(2, 6)]), ids=str)
 def test_noise_that_neighbours_share_is_no_knowledge(seeds: range):
     """Along twelve tracks a canopy moves stretches of 40 m by a metre or so: said is what is met."""
@@ -219,6 +224,7 @@ def test_heights_that_disagree_move_nothing(scene: Any, before: Adjustment):
         np.testing.assert_array_equal(after.gauge.sigma, before.gauge.sigma)
 
 
+@pytest.mark.slow
 def test_heights_that_contradict_control_points_are_not_used(scene: Any):
     views, tracks, true = scene
     rng = np.random.default_rng(0)
@@ -246,6 +252,7 @@ def test_heights_that_contradict_control_points_are_not_used(scene: Any):
     assert (right.gauge.sigma <= 1.001 * alone.gauge.sigma).all()
 
 
+@pytest.mark.slow
 def test_heights_and_a_terrain_hold_together(scene: Any):
     """A terrain 3 m too high with 5 m stated does not move what the heights know."""
     from barpc.options import AdjustOptions

@@ -107,6 +107,7 @@ def test_a_wrong_rpc_is_named_and_the_others_are_as_without_it(
         assert found.inlier[taking_part].mean() > 0.9
 
 
+@pytest.mark.slow
 def test_nothing_is_tried_where_the_block_agrees(monkeypatch) -> None:
     def no_solve(*_: Any) -> Any:
         raise AssertionError
@@ -126,6 +127,7 @@ def test_nothing_is_tried_where_the_block_agrees(monkeypatch) -> None:
     assert tried == [(None, None)] * 2
 
 
+@pytest.mark.slow
 def test_a_view_of_wrong_matches_is_no_foreign_one() -> None:
     made, rng = simulate_block(3, 150, seed=3, attitude=10e-6, position=2.0), np.random.default_rng(1)
     wrong = (made.tracks.view == 2) & (rng.uniform(size=len(made.tracks)) < 0.7)

@@ -48,6 +48,7 @@ def likeliest(z: np.ndarray, logits: tuple[float, ...] = (-2.0, 0.0, 2.0)) -> tu
     return min(part, 1 - part), abs(found.x[2] - found.x[1]), float(gain)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("share", "apart"),
     [
@@ -174,6 +175,7 @@ def test_what_looks_like_one_group_by_skewness_and_kurtosis_is_one(seen, monkeyp
         assert len(two_groups(seen[0].structure, *_given(seen, z))) == said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "said"), [(120, False), (340, True)])
 def test_groups_are_told_where_two_are_likelier_by_a_factor_of_three_million(
     seen, count: int, said: bool

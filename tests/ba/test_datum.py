@@ -39,6 +39,7 @@ def test_without_control_the_cameras_as_delivered_hold_the_scene():
         assert (found.datum[other] == 0.0).all()
 
 
+@pytest.mark.slow
 def test_control_points_hold_it_by_their_accuracy():
     shares = [
         solved(replace(BLOCK.gcps, sigma=np.full((6, 3), sigma))).datum["gcps"] for sigma in (0.1, 10.0)
@@ -48,6 +49,7 @@ def test_control_points_hold_it_by_their_accuracy():
     assert (shares[1][PLACE] > 0.05).all()
 
 
+@pytest.mark.slow
 def test_a_terrain_holds_heights_and_no_more_than_its_common_error_lets_it():
     tight, loose = (
         solved(dem=level, learn_priors=False, dem_bias_sigma=sigma).datum["heights"] for sigma in (0.5, 20.0)
@@ -76,6 +78,7 @@ def test_an_earlier_run_holds_the_views_that_are_added():
     np.testing.assert_allclose(sum(both.datum.values()), 1.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_summary_has_it_in_a_table_without_the_sources_that_tell_nothing():
     gcps = replace(BLOCK.gcps, sigma=np.full((6, 3), 0.2))
     found = solved(gcps)

@@ -147,6 +147,7 @@ def test_detectors_are_found_where_they_begin(tracks):
     assert after.across < 0.05 < 0.1 < off.across
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "seeds"),
     [

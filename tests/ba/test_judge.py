@@ -138,6 +138,7 @@ def swung(
     return block, replace(block.tracks, xy=block.tracks.xy + moved[:, None] * np.array([0.8, 0.6]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "size", rest_slow([(0.15, 200.0), (0.08, 200.0), (0.15, 60.0), (0.3, 600.0)]), ids=str
 )
@@ -253,6 +254,7 @@ def test_exact_points_meet_in_the_strip_and_beside_it() -> None:
     assert np.nanmax(found.held_out_rms) < 0.16
 
 
+@pytest.mark.slow
 def test_what_cannot_be_judged_is_adjusted_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_: Any) -> None:
         raise np.linalg.LinAlgError("7-th leading minor")

@@ -82,6 +82,7 @@ def test_a_track_s_likelihood_is_the_integral_over_its_ground_point(linear: Line
     np.testing.assert_allclose(found.of_subset.sum(axis=1) <= 1.0 + 1e-12, True)
 
 
+@pytest.mark.slow
 def test_the_true_noise_and_the_true_share_of_outliers_are_found() -> None:
     found = fit(linear_of(3, 1500, outliers=0.2))
     assert found.noise == pytest.approx(1.0, rel=0.05)

@@ -197,6 +197,7 @@ def test_a_drift_that_no_platform_flies_is_a_skew(drift, half, pixel, skew) -> N
     assert solution(outcome_of(0.0, drift=drift), problem=problem).is_skew == skew
 
 
+@pytest.mark.slow
 def test_an_earlier_blocks_drift_goes_on(made) -> None:
     centers = centers_of(made)
     for drift in (0, 2):
@@ -320,6 +321,7 @@ def chain(sizes: tuple[int, ...], keep_largest: bool = False) -> Any:
         return join(views, tracks, None, options, keep_largest)
 
 
+@pytest.mark.slow
 def test_groups_are_listed_the_largest_first_five_views_of_five() -> None:
     assert chain((3,)).left_out == ()
     with pytest.raises(DisconnectedError) as caught:

@@ -209,6 +209,7 @@ def test_a_tenth_of_the_tracks_takes_no_part():
     np.testing.assert_array_equal(again.held_out, out[order])
 
 
+@pytest.mark.slow
 def test_a_view_with_few_observations_gives_none_away(dirty):
     tracks = dirty.tracks
     first = np.flatnonzero(tracks.view == 0)
@@ -268,6 +269,7 @@ def test_the_largest_group_goes_on_alone_where_asked(dirty):
     assert np.abs(found.params[:3]).max() > 0.1
 
 
+@pytest.mark.slow
 def test_the_solver_that_is_asked_for_is_the_one_that_runs(dirty, caplog):
     for asked, runs in (("scipy", ["scipy"]), ("sparse", ["sparse"]), ("auto", ["scipy", "sparse"])):
         caplog.clear()
@@ -279,6 +281,7 @@ def test_the_solver_that_is_asked_for_is_the_one_that_runs(dirty, caplog):
         assert ("scipy least_squares" in found.status) == (names[-1] == "scipy")
 
 
+@pytest.mark.slow
 def test_auto_leaves_scipy_where_unknowns_are_many(caplog, monkeypatch):
     dirty = simulate_block(4, 60, seed=21)
     for most, runs in ((35, "sparse"), (36, "scipy")):

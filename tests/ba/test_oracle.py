@@ -137,6 +137,7 @@ def _assert_close(found: np.ndarray, expected: np.ndarray, rtol: float = 1e-5) -
     np.testing.assert_allclose(found, expected, rtol=rtol, atol=rtol * np.abs(expected).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dense_unknowns", [900, 0])
 def test_the_reduced_system_is_the_schur_complement_of_the_whole_differenced_problem(
     case, monkeypatch, dense_unknowns
@@ -218,6 +219,7 @@ def test_damping_adds_its_part_of_the_diagonal(case):
     _assert_close(step.ravel(), wanted, 1e-4)
 
 
+@pytest.mark.slow
 def test_fixed_views_do_not_move_and_have_no_variance():
     held = make_case(0, fixed=("view_0002",))
     matrix, gradient, _ = held.dense
@@ -263,6 +265,7 @@ def test_covariances_are_blocks_of_the_inverse_of_the_whole(case):
     _assert_close(covariance.joint(np.array([1, 3])), inverse[np.ix_(pair, pair)], 1e-4)
 
 
+@pytest.mark.slow
 def test_a_residual_in_an_image_is_taken_in_units_of_its_own_deviation(case):
     """Baarda's w against 1 - J (J^T J)^-1 J^T of the whole differenced problem; heights that share errors, too."""
     matrix, _, _ = case.dense
@@ -554,6 +557,7 @@ def test_residuals_of_gcps_point_from_the_given_to_the_adjusted_place():
     np.testing.assert_allclose(found.gcp_residuals, np.tile(-offset, (4, 1)), atol=1.0)
 
 
+@pytest.mark.slow
 def test_robust_rounds_end_where_the_losss_scale_is_three_sigmas_of_the_noise(monkeypatch):
     made = simulate_block(4, 150, seed=21, noise=0.1, outliers=0.4)
     scales, noises = [], []
@@ -630,6 +634,7 @@ def test_only_observations_of_known_points_are_looked_at_again_for_the_datum(cas
     assert asked == [np.count_nonzero((case.problem.structure.point == 11) & (case.weight > 0))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("known", "fixed"), diagonal([12, 11], [(), (1,)])
 )  # the last point: a GCP, a reference's

@@ -40,6 +40,7 @@ def right_cameras(num_tracks: int, num_gcps: int) -> Block:
     return replace(block, tracks=seen(tracks, block.truth.ground, sensors, 1), gcps=gcps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [(300.0, 0.0, 0.0), (0.0, 0.0, 500.0)])
 def test_a_gcp_that_is_rejected_moves_no_scene(wrong: tuple[float, ...]) -> None:
     """Its place was given and then found: that is no move of what the cameras show (-27.8 m up was said)."""
@@ -53,6 +54,7 @@ def test_a_gcp_that_is_rejected_moves_no_scene(wrong: tuple[float, ...]) -> None
     assert np.abs(found.scene_shift).max() < 0.2
 
 
+@pytest.mark.slow
 def test_gcps_that_hold_the_scene_move_it_as_far_as_its_rays_meet_elsewhere() -> None:
     """Three in four points are GCPs, 40 m above where the cameras show them: the scene moved 40 m, not 10."""
     block = right_cameras(12, 36)
@@ -67,6 +69,7 @@ def test_gcps_that_hold_the_scene_move_it_as_far_as_its_rays_meet_elsewhere() ->
     np.testing.assert_allclose(found.scene_shift, moved, atol=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::barpc.BarpcWarning")
 @pytest.mark.parametrize("wrong", rest_slow([0.1, 0.0]))
 def test_two_images_with_one_rpc_have_no_height_to_move(wrong: float) -> None:
@@ -84,6 +87,7 @@ def test_two_images_with_one_rpc_have_no_height_to_move(wrong: float) -> None:
     assert np.abs(found.scene_shift).max() < 1.0
 
 
+@pytest.mark.slow
 def test_list_table_verdict_and_summary_say_one_figure_of_a_motion() -> None:
     block = simulate_block(3, 100, seed=3, num_gcps=1)
     found = adjust_tracks(block.views, block.tracks, AdjustOptions(), block.gcps, centers=centers_of(block))
@@ -97,6 +101,7 @@ def test_list_table_verdict_and_summary_say_one_figure_of_a_motion() -> None:
         assert mode.motion_m[MOTIONS.index(mode.meaning)] == pytest.approx(mode.sigma_m)
 
 
+@pytest.mark.slow
 def test_an_image_that_is_added_makes_no_motion_less_known(tmp_path) -> None:
     """Its ties with the one view that it resembles are another scene, which is tilted more easily."""
     block, centers = simulate_block(4, 600, seed=4, per_site=4), None
@@ -138,6 +143,7 @@ def stating(block: Block, sensors: list, accuracy: float) -> tuple:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", rest_slow([2, 4, 8]))
 def test_adjusting_what_was_adjusted_makes_its_place_no_better_known(count: int) -> None:
     """Its errors are shared: n views that state what the place is known to are not n witnesses (36.6 -> 13.0 m)."""
@@ -166,6 +172,7 @@ def test_accuracies_that_independent_errors_have_are_taken_as_they_are() -> None
     np.testing.assert_array_equal(stated.gauge.sigma, silent.gauge.sigma)
 
 
+@pytest.mark.slow
 def test_what_the_user_states_of_the_cameras_is_taken_as_stated() -> None:
     block = simulate_block(4, 100, seed=8, per_site=4, attitude=1e-9, position=1e-3)
     views = tuple(replace(view, sensor=replace(view.sensor, err_bias=7.5)) for view in block.views)
@@ -178,6 +185,7 @@ def test_what_the_user_states_of_the_cameras_is_taken_as_stated() -> None:
     assert of_file.prior.shared > 1.2
 
 
+@pytest.mark.slow
 def test_accuracies_that_are_shared_are_in_the_summary() -> None:
     block = simulate_block(4, 100, seed=8, per_site=4)
     views = tuple(replace(view, sensor=replace(view.sensor, err_bias=40.0)) for view in block.views)

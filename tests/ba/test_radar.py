@@ -183,6 +183,7 @@ def found(slc: Scene) -> Adjustment:
     return adjust_tracks(slc.views, slc.tracks())
 
 
+@pytest.mark.slow
 def test_a_moved_orbit_is_followed_by_clocks_as_well_as_by_an_attitude(request, scene: Scene) -> None:
     known = scene is request.getfixturevalue("slc")
     clocks = request.getfixturevalue("found") if known else adjust_tracks(scene.views, scene.tracks())
@@ -202,6 +203,7 @@ def test_a_moved_orbit_is_followed_by_clocks_as_well_as_by_an_attitude(request, 
     assert 0.9 < clocks.noise < 1.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "alone"), diagonal(["PFA", "slc"], [False, True]))
 def test_reflectors_seen_by_the_radar_alone_tell_both_offsets(kind, alone, tmp_path) -> None:
     """Ranges are written too long, so that range is added; the orbit is late, so that time is taken off."""
@@ -227,6 +229,7 @@ def test_reflectors_seen_by_the_radar_alone_tell_both_offsets(kind, alone, tmp_p
         assert made.misses(result.sensors)[0].max() < 0.02
 
 
+@pytest.mark.slow
 def test_a_radar_that_is_known_well_gives_the_block_its_place(slc: Scene) -> None:
     """The two directions that it measures are as exact as its clocks are said to be; the attitude of a camera not."""
     near = scene_of("slc", Path(), moved((0.3, -0.2, 0.2)))
@@ -278,6 +281,7 @@ def test_priors_of_clocks_stand_at_their_unknowns(slc: Scene) -> None:
     np.testing.assert_array_equal(prior_sigmas(slc.views, AdjustOptions(), 0, off)[2, :2], 30.0)
 
 
+@pytest.mark.slow
 def test_a_radar_goes_on_as_a_radar_only(slc: Scene, found: Adjustment, tmp_path) -> None:
     block_prior(found).save(tmp_path / "prior.npz")
     prior = BlockPrior.load(tmp_path / "prior.npz")
@@ -292,6 +296,7 @@ def test_a_radar_goes_on_as_a_radar_only(slc: Scene, found: Adjustment, tmp_path
         adjust_tracks(slc.views, slc.tracks(), prior=replace(prior, radars=()))
 
 
+@pytest.mark.slow
 def test_the_summary_states_metres_and_milliseconds(slc: Scene, found: Adjustment) -> None:
     summary = summarize(Run("adjust", slc.views, (), slc.tracks(), adjustment=found))
     told, (first, _, radar) = found.corrections[2], (view.correction for view in summary.views)

@@ -130,6 +130,7 @@ def test_one_quickbird_image_is_refined_by_its_gcps(shared_data):
     assert np.sqrt((after**2).mean()) < 0.5 * np.sqrt((before**2).mean())
 
 
+@pytest.mark.slow
 def test_a_gcp_that_was_left_out_lies_nearer_than_before(shared_data):
     path = shared_data / "optical" / "qb2_single" / "qb2_basic1b.tif"
     view = _view(path, read_rpc(path), (850, 1450))

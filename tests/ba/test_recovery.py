@@ -25,6 +25,7 @@ def truth_sensors(block):
     return [Corrected(v.sensor, c) for v, c in zip(block.views, block.truth.corrections, strict=True)]
 
 
+@pytest.mark.slow
 def test_without_noise_the_held_out_points_are_met_to_a_millionth_of_a_pixel():
     exact = simulate_block(6, 500, seed=2, noise=0.0)
     found = solve(exact, **L2, sigma_attitude=1e4, sigma_position=1e3)
@@ -32,6 +33,7 @@ def test_without_noise_the_held_out_points_are_met_to_a_millionth_of_a_pixel():
     assert exact.held_out_rms(list(found.sensors)) < 1e-5
 
 
+@pytest.mark.slow
 def test_an_adjusted_block_meets_held_out_points_to_a_fraction_of_the_noise(block, adjusted):
     assert block.held_out_rms([v.sensor for v in block.views]) > 1.0
     assert block.held_out_rms(list(adjusted.sensors)) < 0.1 * 0.1  # noise 0.1 px, thousands of points
@@ -79,6 +81,7 @@ def test_both_solvers_reach_the_same_minimum(request, size, model):
 PLACES = [(5.4, 43.3), (5.0, 0.0), (0.0, 51.0), (90.0, 30.0), (180.0, 10.0), (30.0, 84.0)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("views", "tracks", "places"),
     [(4, 500, PLACES[4:]), pytest.param(10, 1500, PLACES, marks=pytest.mark.slow)],
@@ -135,6 +138,7 @@ def test_outliers_cost_little(views, bounds):
         assert np.sqrt(np.mean(np.square(rms[part]))) <= bound * clean, (part, rms)
 
 
+@pytest.mark.slow
 def test_a_fixed_view_keeps_its_camera_and_the_others_come_to_it(block):
     fixed = block.views[4].name
     found = solve(block, fixed=(fixed,))
@@ -185,6 +189,7 @@ def test_image_models_correct_what_they_can(model, bound):
     assert small.held_out_rms([v.sensor for v in small.views]) > 3 * small.held_out_rms(list(found.sensors))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tracks", "seeds"),
     rest_slow(starmap(pytest.param, [(50, range(3)), (50, range(3, 6)), (600, range(6))])),
@@ -212,6 +217,7 @@ def test_three_gcps_bring_the_scene_to_its_place(tracks, seeds):
     assert 0.6 < np.sqrt(((np.array(errors) / np.array(sigmas)) ** 2).mean()) < 1.3
 
 
+@pytest.mark.slow
 def test_check_points_stay_out_of_the_solve_and_measure_it():
     triplet = simulate_block(3, 600, seed=2, num_gcps=12)
     control, check = split_points(triplet.gcps, triplet.gcps.names[6:])
@@ -255,6 +261,7 @@ def test_a_single_view_is_refined_by_gcps_alone():
     assert np.abs(found.gcp_residuals).max() < 0.5
 
 
+@pytest.mark.slow
 def test_a_dem_holds_the_height_of_the_scene():
     block = simulate_block(3, 600, seed=8, alt_range=(200.0, 201.0))
     options = AdjustOptions(**{**INDEPENDENT, "dem_sigma": 2.0, "dem_bias_sigma": 0.3})
@@ -326,6 +333,7 @@ def test_rows_of_tracks_may_come_in_any_order(block, adjusted):
     np.testing.assert_allclose(found.residuals, adjusted.residuals[order], atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", ["small", pytest.param("block", marks=pytest.mark.slow)])
 def test_centers_are_regressed_where_none_are_given(request, size):
     block = request.getfixturevalue(size)

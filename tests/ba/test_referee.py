@@ -41,6 +41,7 @@ def median(found, value):
     return float(np.median([value(v) for v in found]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "across", "shape", "seeds"),
     rest_slow(
@@ -144,6 +145,7 @@ def test_forty_percent_of_a_view_moved_together_is_left_out():
         ).all()  # 7 m without: pairs of delivered cameras meet at many heights
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", ONE_OR_ALL)
 def test_a_pair_whose_tie_points_fall_into_two_groups_says_so(seeds):
     for seed in seeds:
@@ -212,6 +214,7 @@ def test_what_is_stated_of_weak_heights_is_as_large_as_it_is(angle):
     assert 0.5 < np.sqrt((said**2).mean() / (true**2).mean()) < 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::barpc.BarpcWarning")
 @pytest.mark.parametrize(
     ("bias", "seeds"), rest_slow(starmap(pytest.param, product([30.0, 0.0], [range(1), range(1, 3)])))

@@ -58,6 +58,7 @@ def move(found, block) -> np.ndarray:
     return enu_basis(block.truth.ground.mean(axis=0)) @ offset
 
 
+@pytest.mark.slow
 def test_the_scene_comes_to_where_the_reference_says(block):
     alone = adjust_tracks(block.views, block.tracks, hold_out=False)
     assert np.abs(move(alone, block)).max() > 10.0
@@ -66,6 +67,7 @@ def test_the_scene_comes_to_where_the_reference_says(block):
     assert found.reference_inlier.mean() > 0.97
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", rest_slow([(3.0, -2.0), (-0.7, 0.4)]))
 def test_what_a_reference_is_wrong_by_moves_the_scene_and_is_stated(block, shift):
     free, moved = (adjusted(block, reference_of(block, (*there, 0.0))) for there in ((0.0, 0.0), shift))
@@ -75,6 +77,7 @@ def test_what_a_reference_is_wrong_by_moves_the_scene_and_is_stated(block, shift
     assert 0.95 * BIAS[2] < moved.gauge.sigma[2] < 1.3 * BIAS[2]
 
 
+@pytest.mark.slow
 def test_points_that_disagree_are_cut_by_themselves(block):
     reference = reference_of(block)
     wrong = np.arange(len(reference.points.view)) % 20 == 0

@@ -66,6 +66,7 @@ def sure(found: Believed | None) -> Believed:
     return found
 
 
+@pytest.mark.slow
 def test_what_is_error_is_not_believed_and_what_is_terrain_is() -> None:
     """Errors that are short waves: their bands have no gain, those of the hills have all."""
     found = sure(judged(sum_of(HILLS, SINGLE), points()))
@@ -88,6 +89,7 @@ def test_what_is_error_is_not_believed_and_what_is_terrain_is() -> None:
         assert np.sqrt(np.mean((believed.slopes - true) ** 2)) < 0.2 * np.sqrt(np.mean(true**2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("east", rest_slow([-25.0, 25.0, 0.0], keep=2))
 def test_points_are_asked_to_move_back_to_where_the_terrain_is(east: float) -> None:
     """Heights to hold to fall short along the slopes by as much as points lie too far to the east, and no more."""
@@ -103,6 +105,7 @@ def test_points_are_asked_to_move_back_to_where_the_terrain_is(east: float) -> N
     assert 0.7 < found.sigma < 1.6  # with a DEM whose errors, of 5 m, are not believed
 
 
+@pytest.mark.slow
 def test_errors_that_neighbours_share_make_heights_count_less() -> None:
     alone = sure(judged(sum_of(HILLS, SINGLE), points()))
     together = sure(judged(sum_of(HILLS, SINGLE, LONG), points()))
@@ -111,6 +114,7 @@ def test_errors_that_neighbours_share_make_heights_count_less() -> None:
     assert together.effective_sigma == pytest.approx(together.sigma * together.alike**0.5)
 
 
+@pytest.mark.slow
 def test_a_dem_of_another_terrain_is_told_from_one_that_is_only_coarse() -> None:
     ground = points()
     flat = sure(judged(lambda lon, lat: np.full(len(lon), ALT), ground))

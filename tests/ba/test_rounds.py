@@ -85,6 +85,7 @@ def test_rounds_go_on_until_the_noise_stands(clean, monkeypatch) -> None:
     assert first / last == pytest.approx(found.noise, rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("outliers", "looked"), [pytest.param(0.05, True, marks=pytest.mark.slow), (0.008, True), (0.004, False)]
 )

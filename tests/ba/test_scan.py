@@ -62,6 +62,7 @@ def test_of_two_parts_the_smaller_one_lies_off_at_either_end() -> None:
         assert found.off == pytest.approx(2.0 * np.sqrt(2.0), abs=0.2)  # along both
 
 
+@pytest.mark.slow
 def test_chance_and_outliers_that_lie_anywhere_stand_out_nowhere() -> None:
     """An image alike all over gains 5 nats once in 150 scans, at most: the price is what the choice costs."""
     gains = []

@@ -90,6 +90,7 @@ def test_some_trials_agree_with_the_prediction(tracks, count):
     assert trials.nees.mean() / trials.unknowns == pytest.approx(1.0, abs=4 * spread)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("views", "tracks", "count", "near"),
     [
@@ -157,6 +158,7 @@ def _divided(block: Block, old: int) -> tuple[Tracks, Tracks, np.ndarray]:
     return tracks.select(is_old), tracks.select(~is_old), is_old
 
 
+@pytest.mark.slow
 def test_views_added_to_an_adjusted_block_end_where_the_joint_adjustment_puts_them(tmp_path):
     block = simulate_block(12, 2500, seed=3)
     old, new, _ = _divided(block, 9)

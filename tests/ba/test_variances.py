@@ -247,6 +247,7 @@ def test_what_is_determined_is_what_the_prior_alone_does_not_say() -> None:
 # --- on a block ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", rest_slow([50, 300]))
 def test_variances_of_a_large_block_are_exact_where_they_are_stated_and_probed_within_their_bound(
     monkeypatch, n: int
@@ -315,6 +316,7 @@ def adjusted(block: Block, **options: Any) -> Adjustment:
     return solve(block, drift=0, hold_out=False, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", rest_slow([3, 8]))
 def test_priors_that_hold_have_a_ratio_of_one_and_stand(seeds: int) -> None:
     ratio, freedom = [], []
@@ -329,6 +331,7 @@ def test_priors_that_hold_have_a_ratio_of_one_and_stand(seeds: int) -> None:
     assert 6 < np.mean(freedom) < 14
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "seeds"), [(3.0, 3), *(pytest.param(wrong, 5, marks=pytest.mark.slow) for wrong in (3.0, 10.0))]
 )
@@ -343,6 +346,7 @@ def test_priors_that_are_too_narrow_are_widened_by_as_much(wrong: float, seeds: 
     assert 0.9 * wrong < np.median(scale) < 2.0 * wrong  # rather too wide
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "by"), [(2, (200.0, -150.0)), pytest.param(1, (0.0, 300.0), marks=pytest.mark.slow)]
 )

@@ -103,6 +103,7 @@ def test_the_main_job_writes_what_other_tools_read(crops, tmp_path):
     assert [sha256(path.read_bytes()).hexdigest() for path in crops] == hashes
 
 
+@pytest.mark.slow
 def test_check_shows_the_same_residuals_and_writes_nothing(crops, finished):
     before = sorted(path.name for path in crops[0].parent.iterdir())
     code, out, _ = barpc("check", *crops, "--json")
@@ -293,6 +294,7 @@ def test_help_imports_nothing_heavy():
     assert "adjust" in done.stdout
 
 
+@pytest.mark.slow
 def test_warnings_are_not_shown_as_python_sees_them(crops):
     assert issubclass(NotGeoreferencedWarning, UserWarning)
     code, _, err = alone("info", *crops, "--alt", "0")

@@ -39,6 +39,7 @@ def findings(run: Path, *places: Path) -> tuple[int, dict[tuple[str, str], str]]
     return said.code, {(one["kind"], Path(one["file"]).name): one["now"] for one in rows}
 
 
+@pytest.mark.slow
 def test_a_run_that_nobody_touched_is_what_it_was(run) -> None:
     code, found = findings(run)
     assert code == 0

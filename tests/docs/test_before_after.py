@@ -39,6 +39,7 @@ def test_semi_global_matching_finds_a_surface_where_it_found_none(ventoux):
     assert after.valid > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_cars_reads_the_same_camera_from_the_files_that_the_manual_gives_it(ventoux, tmp_path):
     models = pytest.importorskip("shareloc.geomodels")

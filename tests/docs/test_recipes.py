@@ -74,6 +74,7 @@ def expanded(word: str) -> list[str]:
     return sorted(str(path) for path in Path().glob(word)) or [word] if "*" in word else [word]
 
 
+@pytest.mark.slow
 def test_the_first_pages_run_on_parts_of_the_images(small, monkeypatch):
     monkeypatch.chdir(small)
     codes: dict[str, int] = {}

@@ -80,6 +80,7 @@ def test_the_same_bytes_whoever_works_and_in_whatever_order_images_are_given(mad
     assert (tmp_path / "again.tif").read_bytes() == made[1].read_bytes()
 
 
+@pytest.mark.slow
 def test_an_interrupted_command_goes_on_where_it_was(rendered, tmp_path, monkeypatch):
     monkeypatch.setattr(surface_module, "SIDE", 128)
     asked = []
@@ -194,6 +195,7 @@ def test_a_run_makes_its_surface_as_one_of_its_own_files(rendered, tmp_path, cap
 # --- what is refused --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_other_ground_is_refused_with_exit_code_3_and_leaves_nothing(rendered, tmp_path, capsys):
     other = Scene(replace(SMALL, seed=77))
     path = tmp_path / "other.tif"

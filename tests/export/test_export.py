@@ -60,6 +60,7 @@ def seen_by(frame: dict, world: np.ndarray) -> np.ndarray:
     )
 
 
+@pytest.mark.slow
 def test_every_rpc_dictionary_is_the_written_rpc_for_rpcm(run_dir, tmp_path):
     rpcm = pytest.importorskip("rpcm")
     views = read(run_dir / "summary.json")["views"]
@@ -113,6 +114,7 @@ def test_satnerf_files_hold_what_its_loader_reads(run_dir, tmp_path):
         assert len(rings) == (2 if abs(one["geojson"]["center"][0]) > 100 else 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run_dir", rest_slow(["on_date_line", "southern"]), indirect=True)
 def test_nerfstudio_s_pinholes_are_as_near_as_they_say(run_dir, tmp_path):
     out = exported(run_dir, "nerfstudio", tmp_path)
@@ -183,6 +185,7 @@ def test_pycolmap_opens_the_model_and_finds_the_errors_that_it_states(southern, 
     np.testing.assert_allclose(rows[:3, :3] @ rows[:3, :3].T, np.eye(3), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_colmap_finds_every_image_in_its_folder_and_none_is_copied(southern, tmp_path):
     for _ in range(2):  # again: in place of the first
         export_run(southern, "colmap", tmp_path / "model", overwrite=True)

@@ -80,6 +80,7 @@ def test_every_grid_reaches_the_rounding_of_coordinates(camera: Camera, space: s
     assert fit.coverage == 1.0
 
 
+@pytest.mark.slow
 def test_the_error_does_not_grow_with_the_area(some_vendors: list[Camera]) -> None:
     for camera in some_vendors:
         if camera.name == PECULIAR:
@@ -140,6 +141,7 @@ def test_the_papers_solver_fits_a_ten_thousandth_of_a_pixel(camera: Camera, join
     assert (fit.h[0] == fit.h[1]) == joint
 
 
+@pytest.mark.slow
 def test_numbers_fitted_for_nitf_survive_it(some_vendors: list[Camera]) -> None:
     """Copying a good RPC into that format costs whole pixels."""
     limits = PRECISIONS["nitf"]

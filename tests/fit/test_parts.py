@@ -351,6 +351,7 @@ def test_the_certificate_counts_what_it_says(camera: Camera) -> None:
 # --- looking for the largest error -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_around_the_worst_points_of_either_coordinate_more_are_looked_at_closer_and_closer() -> None:
     camera = synthetic()
     sample = Sample.of(camera.model, camera.size, camera.alt_range)

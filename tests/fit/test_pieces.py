@@ -178,6 +178,7 @@ def test_nodes_are_where_they_are_asked_for() -> None:
     np.testing.assert_allclose(spaced(2.0, 10.0, 5, "chebyshev"), expected)
 
 
+@pytest.mark.slow
 def test_a_wider_margin_keeps_denominators_up_farther_out(camera: Camera) -> None:
     """The same misfit under two margins: the narrower, the better, and the smaller what is a step outside."""
     bent = Bent(

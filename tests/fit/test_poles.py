@@ -134,6 +134,7 @@ def test_a_region_is_the_images_own_ground_and_not_the_box_around_it():
     assert Region.around(ground, round_[:, :2], 0.0).least(cubic) > 0.5 > 0.4
 
 
+@pytest.mark.slow
 def test_a_bounded_least_squares_is_that_of_another_solver():
     rng = np.random.default_rng(4)
     region = Region.box(np.array([[-1.0, 1.0]] * 3))

@@ -123,6 +123,7 @@ def test_each_cause_is_named_with_its_size_and_its_place(name):
     assert fit.summary()["reason"]["cause"] == cause
 
 
+@pytest.mark.slow
 def test_the_refusal_says_it_too_and_a_fit_that_holds_says_nothing():
     model = CASES["a swing of 7 waves"][0]()
     with pytest.raises(FitError, match=r"wanted 0\.01: 9\d% of its squares, 0\.4\d+ px RMS, go by the row"):

@@ -160,6 +160,7 @@ def test_given_points_have_no_other_direction():
     assert fit_rpc_points(HONEST.localize(image, np.linspace(*ALTS, 300)), image).contradiction == 0.0
 
 
+@pytest.mark.slow
 def test_a_lens_beyond_its_fold_is_refused_in_one_line():
     """Its distances from the middle shrink again: the way back ends anywhere, and no solver is at home there."""
     size = (14000, 10000)

@@ -115,6 +115,7 @@ def test_no_altitude_changes_what_is_added_to_the_rpc_of_a_correction(once, came
     assert rpc.err_bias == fit.rpc.err_bias
 
 
+@pytest.mark.slow
 def test_an_rpc_of_a_tile_is_the_camera_in_its_own_pixels(tmp_path, view, camera, fit):
     (written,) = run_of(tmp_path, (view, fit, camera), tiles=500)
     table = json.loads((tmp_path / ("a" + TILES)).read_text())

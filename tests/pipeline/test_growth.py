@@ -102,6 +102,7 @@ def test_other_workers_read_the_same_views_and_the_first_error_counts(block, fol
     assert (alone.worker_seconds, found.worker_seconds > 0) == (0.0, True)
 
 
+@pytest.mark.slow
 def test_a_summary_asks_each_camera_as_often_in_a_large_block_as_in_a_small_one(monkeypatch):
     calls = []
     for num in (12, 48):

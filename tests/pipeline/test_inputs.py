@@ -193,6 +193,7 @@ def test_paths_with_spaces_and_accents_and_equal_stems(corner, tmp_path):
         assert read_rpc(Path(tmp_path / "out à moi" / f"{name}.vrt")) is not None
 
 
+@pytest.mark.slow
 @WHOLE_AT_NIGHT
 def test_check_points_are_measured_and_not_used(known, matched, tmp_path):
     given = RunOptions(matches_only=True, matches=str(matched[1] / "matches.npz"), stop_after="adjustment")

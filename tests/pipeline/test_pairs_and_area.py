@@ -140,6 +140,7 @@ def area_file(path: Path, views: tuple[View, ...]) -> Path:
     return path
 
 
+@pytest.mark.slow
 @WHOLE_AT_NIGHT
 def test_only_the_listed_pairs_are_matched_and_only_in_the_area(known, tmp_path) -> None:
     views = load_views(known.images).views

@@ -35,6 +35,7 @@ def blank(path, size):
     return str(path)
 
 
+@pytest.mark.slow
 def test_a_radar_image_is_adjusted_by_its_clocks_and_said_to_be(tmp_path):
     pytest.importorskip("jinja2", reason="the page")
     (tmp_path / "radar.xml").write_text(document("PLANE", squint=0.1).replace("</SICD>", STATED))

@@ -322,6 +322,7 @@ def test_what_a_fit_warns_of_comes_back_from_its_worker_and_is_said_with_the_vie
         stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), None, None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sigma", "stated"),
     [

@@ -31,6 +31,7 @@ def block():
     return simulate_block(3, 200, seed=1, num_checks=0, num_gcps=4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "draws"),
     [

@@ -339,6 +339,7 @@ def surrounded(trap: Trap, name: str, file: Path, suffixes: Sequence[str] = BESI
                 write(trap, name, file.with_name(stem + suffix))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

@@ -56,6 +56,7 @@ def moved_in(path: Path, data: bytes) -> None:
 FAST, SLOW = (in_place, "detect"), (moved_in, "cameras")
 
 
+@pytest.mark.slow
 def test_a_vrt_whose_image_was_replaced_is_another_input(images, tmp_path) -> None:
     views = []
     for path in images:
@@ -77,6 +78,7 @@ def test_a_vrt_whose_image_was_replaced_is_another_input(images, tmp_path) -> No
     assert after[name] != before[name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "stage"),
     [
@@ -125,6 +127,7 @@ def test_workers_see_it_too(images, tmp_path) -> None:
     assert done
 
 
+@pytest.mark.slow
 def test_what_does_not_change_a_file_does_not_end_a_run(images, tmp_path) -> None:
     def progress(name: str, number: int, total: int) -> None:
         images[0].read_bytes()

@@ -191,6 +191,7 @@ def emptied(path: Path) -> None:
     path.write_bytes(b"")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", rest_slow([flipped, cut_short, other_content, Path.unlink, emptied]))
 def test_damaged_results_are_made_again(crops, ran, out, tmp_path, damage):
     kept = list(out.glob(".barpc/cache/*/*.npz"))
@@ -201,6 +202,7 @@ def test_damaged_results_are_made_again(crops, ran, out, tmp_path, damage):
     assert relative(outputs(out), tmp_path) == relative(outputs(ran / "out"), ran)
 
 
+@pytest.mark.slow
 def test_results_of_another_version_are_not_used(crops, out, monkeypatch):
     made, kept = [], set(out.glob(".barpc/cache/*/*.npz"))
     store = Workspace.store

@@ -100,6 +100,7 @@ class Page(HTMLParser):
         self.texts.append(data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
     [pytest.param(three, marks=[pytest.mark.nightly] * (k >= SHORT)) for k, three in enumerate(THREES)],

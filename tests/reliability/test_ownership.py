@@ -75,6 +75,7 @@ def test_nor_beside_an_image_that_is_no_input(crops, tmp_path):
     assert_untouched(tmp_path, before, said, "out/view_00.tif", "give another -o")
 
 
+@pytest.mark.slow
 def test_a_folder_above_or_below_the_images_is_fine(crops, out, tmp_path):
     shutil.copytree(out / ".barpc/cache", tmp_path / ".barpc/cache")  # what needs not be done again
     shutil.copytree(out / ".barpc/cache", crops[0].parent / "below/out/.barpc/cache")
@@ -132,6 +133,7 @@ def test_a_prior_is_not_replaced_by_the_run_that_starts_from_it(crops, out, tmp_
     assert hashes([tmp_path]) == before
 
 
+@pytest.mark.slow
 def test_a_report_is_made_again_only_where_it_is_barpc_s(crops, out):
     assert barpc("report", out).code == 0
     assert barpc("adjust", *crops, "-o", out, "--overwrite").code == 0
@@ -143,6 +145,7 @@ def test_a_report_is_made_again_only_where_it_is_barpc_s(crops, out):
     assert barpc("adjust", *crops, "-o", out, "--overwrite").code == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", rest_slow([9, 2]))
 def test_stopped_between_two_outputs_the_same_command_finishes(
     crops, ran, out, tmp_path, monkeypatch, number

@@ -129,6 +129,7 @@ def distance(first: AdjustResult, second: AdjustResult, names: dict[str, str] | 
     return worst
 
 
+@pytest.mark.slow
 def test_the_order_of_rows_and_the_names_of_files_change_rounding_alone(scene, tmp_path):
     images = images_of(scene, "given matches")
     given = RunOptions(
@@ -248,6 +249,7 @@ def test_an_image_in_which_only_nan_differs_is_no_twin(scene, tmp_path):
         load_views([first, third])
 
 
+@pytest.mark.slow
 def test_a_part_of_an_image_is_named_in_the_verdict(scene, tmp_path):
     images = images_of(scene, "")
     part = crop(SAMPLES[0], tmp_path / "part.tif", side=100, start=START + 30)

@@ -19,6 +19,7 @@ from barpc.rpcio import read_rpc, write_rpc
 from .made import a_pair, a_summary, a_view
 
 
+@pytest.mark.slow
 def test_a_run_does_not_differ_from_itself(block_run):
     found = compare_runs(block_run.folder, block_run.folder)
     assert len(found["views"]) == 9

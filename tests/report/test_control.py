@@ -40,6 +40,7 @@ def test_control_that_is_as_stated_is_within_what_chance_allows(block_run):
         assert view.control_w_point == gcps.names[gcps.point[worst]]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*held in height")
 def test_a_wrong_position_in_one_image_is_found_there_and_said(block_run):
     run, gcps = block_run.run, block_run.run.gcps
@@ -71,6 +72,7 @@ def test_the_page_shows_it_by_point_and_by_image(block_run):
     assert 'id="t-control"' not in report_html(without, block_run.folder)
 
 
+@pytest.mark.slow
 def test_a_run_without_control_tests_none(check_run, block_run):
     assert check_run.record.control_test is None
     _, summary = summary_of(block_run.run, None)

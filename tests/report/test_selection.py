@@ -40,6 +40,7 @@ def pair(block_run) -> dict:
     return next(p for p in block_run.summary["pairs"] if {p["a"], p["b"]} == {"view_0000", "view_0001"})
 
 
+@pytest.mark.slow
 def test_nothing_goes_wrong(found):
     assert found["errors"] == []
 

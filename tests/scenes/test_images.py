@@ -154,6 +154,7 @@ def test_dates_differ_in_light_and_views_of_a_date_do_not():
     assert scene.surfaces[0].terrain is scene.surfaces[1].terrain
 
 
+@pytest.mark.slow
 def test_nothing_is_overwritten_unless_asked(folder):
     with pytest.raises(OutputError, match="--overwrite"):
         write_scene(folder, SMALL)

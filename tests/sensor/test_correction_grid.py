@@ -80,6 +80,7 @@ def test_a_grid_of_millions_of_nodes_is_not_made():
     assert np.prod([len(axis) for axis in axes]) < 4.2e6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("period", [2700.0, 1024.0])
 def test_a_localisation_grid_is_the_camera_for_those_who_interpolate_linearly(period):
     from scipy.interpolate import RegularGridInterpolator
@@ -144,6 +145,7 @@ def test_what_is_no_grid_is_refused(cols, rows, shift):
         CorrectionGrid(cols, rows, shift)
 
 
+@pytest.mark.slow
 def test_the_best_single_rpc_is_no_base_for_a_correction_that_knows_no_altitude():
     """The reason why another RPC may stand in a correction grid: what the best one lacks depends on the altitude."""
     camera = scene(4000.0, 0.7)

@@ -135,6 +135,7 @@ def test_stated_covariances_are_the_priors_of_the_view(tmp_path):
 # What the files of two satellites say, against their RPC over five altitudes: mean and spread [px]. Both were put
 # together from tiles by other software, which fitted the RPC anew with strong damping, of WV03 without aberration and
 # refraction and of WV01 with both: the spread is that fit's. The mean is the model's.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "bent", "mean", "spread"),
     [
@@ -191,6 +192,7 @@ def test_a_vendor_s_corner_of_unknown_height_lies_on_the_line_of_sight_with_aber
     assert low <= across <= high
 
 
+@pytest.mark.slow
 def test_a_fit_to_an_attitude_that_swings_says_why_it_fails(tmp_path):
     model = read(tmp_path, isd(Flight(swing=2e-5))[0]).model
     with pytest.raises(FitError, match="attitude may swing within the image"):

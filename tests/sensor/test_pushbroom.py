@@ -281,6 +281,7 @@ def test_beyond_the_ephemeris_points_are_nan_after_a_second(sensor):
     assert np.array_equal(np.isnan(cut.localize(image, np.array(0.0)))[:, 0], [False, True])
 
 
+@pytest.mark.slow
 @given(
     lon=st.floats(-180, 180),
     lat=st.floats(-80, 80),

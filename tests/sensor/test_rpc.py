@@ -229,6 +229,7 @@ def test_there_is_no_ground_beyond_a_pole():
     assert np.nanmax(ground[:, 1]) <= 90.0
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     lon=st.floats(-180, 180),

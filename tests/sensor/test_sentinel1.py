@@ -323,6 +323,7 @@ def test_the_atmosphere_lengthens_the_path_by_its_zenith_delay_over_the_cosine(i
 # --- products
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("packed", [False, True])
 def test_a_product_opens_as_folder_manifest_or_zip(
     safe: Path, tmp_path: Path, model: RangeDoppler, packed: bool
@@ -446,6 +447,7 @@ def test_a_broken_annotation_is_refused_with_what_and_where(iw1: Product, index:
         RangeDoppler.from_annotation(read_annotation(xml, name="s1a.xml"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", rest_slow([20, 200]))
 def test_no_mutation_of_an_annotation_gets_past_the_errors_that_are_meant(count: int) -> None:
     rng = np.random.default_rng(4)
@@ -542,6 +544,7 @@ def test_an_rpc_of_a_moved_swath_is_fitted_by_the_same_function(model: RangeDopp
     assert 0.5 <= np.abs(moved.project(ground) - model.project(ground)).max() <= 10.0
 
 
+@pytest.mark.slow
 def test_the_command_line_fits_swaths_bursts_and_mosaics(
     safe: Path, tmp_path: Path, model: RangeDoppler
 ) -> None:
@@ -656,6 +659,7 @@ def test_incidence_angles_are_those_of_the_grid(shared_data: Path, stamp: str) -
     assert np.abs(np.rad2deg(np.arccos(cosine)) - stated).max() <= 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stamp", rest_slow([*SLC[:1], "20211223t051122", *SLC[1:]], keep=2))
 def test_an_independent_tool_finds_the_same_image_points(shared_data: Path, stamp: str) -> None:
     """Another tool's points; its orbit is of degree 11, and its times are UNIX seconds in a float.
@@ -721,6 +725,7 @@ def test_an_rpc_of_three_swaths_reaches_two_thousandths_of_a_pixel(shared_data: 
     assert np.max(errors) <= 2.6e-3  # at 57 degrees north; the others stay below 1.8e-3
 
 
+@pytest.mark.slow
 def test_the_rpc_of_a_grd_is_refused(shared_data: Path) -> None:
     built = RangeDoppler.from_annotation(annotation_path(shared_data, "20211223t051122"))
     with pytest.raises(FitError, match=r"misses its check points by .* take the SLC of the scene$"):

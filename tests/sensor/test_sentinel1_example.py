@@ -64,6 +64,7 @@ def safe(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 def test_gdal_orthorectifies_a_stitched_swath_with_its_rpc(example: ModuleType, safe: Path) -> None:
     out = safe.parent / "out"

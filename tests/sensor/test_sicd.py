@@ -193,6 +193,7 @@ def test_a_nitf_that_ends_early_is_one_line(cut, tmp_path):
         open_sicd(path)
 
 
+@pytest.mark.slow
 def test_a_radar_and_two_optical_images_are_adjusted_together(model_of):
     """Errors of a metre and a microradian, found from 300 noisy tie points; exact points agree afterwards."""
     rng, radar = np.random.default_rng(8), model_of("PFA", squint=0.1)

@@ -208,6 +208,7 @@ def test_a_grid_five_pixels_off_belongs_to_another_orbit(tmp_path, rows, columns
     assert [issubclass(one.category, BarpcWarning) for one in told] == [True] * warned
 
 
+@pytest.mark.slow
 def test_state_vectors_are_those_of_the_earth(tmp_path):
     path = Terrasar().write(tmp_path)
     whole = open_terrasar(path)

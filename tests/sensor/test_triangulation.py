@@ -24,6 +24,7 @@ def scene(tracks: int = 12, noise: float = 2.0):
     return truth, view[order], point[order], (xy + rng.normal(0, noise, xy.shape))[order], sigma
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weighted", [False, True])
 def test_points_are_the_weighted_least_squares_ones(weighted) -> None:
     truth, view, point, xy, sigma = scene()

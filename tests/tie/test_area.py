@@ -302,6 +302,7 @@ def test_all_tie_points_lie_in_the_area_and_other_tiles_are_not_even_read(
     all_inside(scene, result.tracks, everywhere.tracks, area)
 
 
+@pytest.mark.slow
 def test_an_area_without_tie_points_is_said(render, tmp_path) -> None:
     scene = render(views=2, size=(300, 300))
     area = read_area(written(tmp_path / "a.json", corner(scene, 0.004)))

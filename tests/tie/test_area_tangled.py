@@ -45,6 +45,7 @@ def test_an_outline_is_untangled_of_as_many_crossings_as_allowed_and_no_more(tmp
     read_area(an_area(tmp_path, np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])))
 
 
+@pytest.mark.slow
 def test_a_tangle_is_refused_at_once(tmp_path):
     tangle = np.random.default_rng(0).uniform(0.0, 1.0, (5000, 2))
     start = time.process_time()

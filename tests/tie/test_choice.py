@@ -235,6 +235,7 @@ def days(count: int) -> dict[int, str]:
     return {k: f"2020-{1 + k // 28:02d}-{1 + k % 28:02d}" for k in range(count)}
 
 
+@pytest.mark.slow
 def test_the_one_chain_through_forty_dates_is_found_at_once(monkeypatch) -> None:
     looks = Looks(monkeypatch, neighbours_in_the_year)
     tried, tied = looks.run(dated(40, days(40)))
@@ -245,6 +246,7 @@ def test_the_one_chain_through_forty_dates_is_found_at_once(monkeypatch) -> None
     assert len(set(looks.compared)) == len(looks.compared) <= 40 * 39 / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "said",
     rest_slow(
@@ -290,6 +292,7 @@ def test_groups_that_nothing_joins_end_after_some_tries(monkeypatch) -> None:
     assert 1 + 2 <= len(tried) - len(tied) <= 1 + 2 + 4 + 8
 
 
+@pytest.mark.slow
 def test_a_year_that_closes_ties_every_view_by_two_paths(monkeypatch) -> None:
     ring = Looks(monkeypatch, lambda i, j: abs(int(PLACE[i]) - int(PLACE[j])) in (1, 39), neighbours=1)
     _, tied = ring.run(dated(40, days(40)))

@@ -41,6 +41,7 @@ def test_tiles_cover_the_image_once_and_are_cut_at_whole_cells() -> None:
     assert (count == 1).all()
 
 
+@pytest.mark.slow
 def test_an_image_read_in_tiles_has_the_keypoints_of_the_image_read_at_once(tmp_path, texture) -> None:
     path = write_image(tmp_path / "a.tif", texture)
     with chosen(TieOptions, keypoints_per_cell=1000) as options:
@@ -119,6 +120,7 @@ def test_views_of_one_name_keep_their_own_keypoints(tmp_path, texture) -> None:
         np.testing.assert_array_equal(found.xy, expected.xy)
 
 
+@pytest.mark.slow
 def test_keypoints_are_kept_for_a_later_pass_with_another_camera(tmp_path, texture) -> None:
     blocks = {"tiled": True, "blockxsize": 64, "blockysize": 64}
     first = view(write_image(tmp_path / "a.tif", texture, **blocks))

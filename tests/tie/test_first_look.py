@@ -78,6 +78,7 @@ def test_a_tenth_of_the_points_wanted_is_ample(points, verified, status, is_ampl
     assert ample(report, TieOptions(points_per_image=points)) == is_ample
 
 
+@pytest.mark.slow
 def test_what_a_first_look_shows_enough_of_is_looked_at_once(scene, looks, without) -> None:
     found = find_tracks(scene.views, FEW)
     assert looks == [True]
@@ -87,6 +88,7 @@ def test_what_a_first_look_shows_enough_of_is_looked_at_once(scene, looks, witho
     assert np.abs(np.median(errors, axis=0)).max() <= 0.01
 
 
+@pytest.mark.slow
 def test_what_it_shows_too_little_of_is_matched_as_if_it_had_not_been(
     scene, looks, without, monkeypatch
 ) -> None:
@@ -98,6 +100,7 @@ def test_what_it_shows_too_little_of_is_matched_as_if_it_had_not_been(
     assert found.pairs == expected.pairs
 
 
+@pytest.mark.slow
 def test_points_of_two_looks_are_not_taken_for_each_other(render, looks, monkeypatch) -> None:
     """One pair of three is looked at closely: a number stands for one place of a view, and tracks are true."""
     scene = render(views=3, size=(300, 300))

@@ -78,6 +78,7 @@ def test_false_matches_alone_are_refused_and_said(render, caplog) -> None:
         find_tracks(scene.views, given=true_matches(scene, (0, 1), count=11))
 
 
+@pytest.mark.slow
 def test_pairs_that_are_not_given_are_matched_and_points_in_common_are_one_track(render) -> None:
     scene = render(views=3, size=(300, 300))
     result = find_tracks(scene.views, given=true_matches(scene, (0, 1), (0, 2)))
@@ -117,6 +118,7 @@ def test_a_negative_is_registered_on_channels(render, tmp_path, caplog) -> None:
     assert typical(scene, tracks, 0, 2) <= 0.1  # of one date: by grey values
 
 
+@pytest.mark.slow
 def test_what_cannot_be_registered_is_used_as_it_is_and_once(render, tmp_path, caplog) -> None:
     """Of the second image three sixteenths are left, the rest says nothing: places stay true, and each counts once."""
     scene = render(views=2, size=(300, 300))

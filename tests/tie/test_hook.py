@@ -70,6 +70,7 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     sys.modules.pop("users_matcher", None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("returns", rest_slow(["xy, np.array([m.distance for m in pairs])", "xy"]))
 def test_a_function_is_a_matcher_with_and_without_scores(render, module, returns: str) -> None:
     scene = render(views=2, size=(300, 300))

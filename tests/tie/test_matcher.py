@@ -90,6 +90,7 @@ def matcher(request, monkeypatch) -> str:
     return "another"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "side"), [(2, 300), pytest.param(3, 600, marks=pytest.mark.nightly)])
 def test_a_dense_matcher_gives_tracks_as_good_as_the_detectors(
     render, matcher, number: int, side: int
@@ -132,6 +133,7 @@ class Blocks(Correlated):
     patch: ClassVar[float] = 150.0
 
 
+@pytest.mark.slow
 def test_matches_of_a_few_patches_are_not_many(render, monkeypatch) -> None:
     """Templates wider than their pitch share their pixels: of noise so many agree by chance as stand on one patch."""
     monkeypatch.setitem(MATCHERS, "another", Blocks)

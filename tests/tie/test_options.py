@@ -212,6 +212,7 @@ def test_a_view_gets_as_many_partners_as_asked_for() -> None:
     assert len(pairs) < 12 * 11 / 2
 
 
+@pytest.mark.slow
 def test_the_search_reaches_as_far_as_asked_for(scene: Rendered) -> None:
     """The second camera is 80 px wrong across the epipolar lines."""
     where = frame(*scene.views, np.array([[150.0, 150.0]]))
@@ -225,6 +226,7 @@ def test_the_search_reaches_as_far_as_asked_for(scene: Rendered) -> None:
     assert nowhere.status == "no common offset within 30 px"
 
 
+@pytest.mark.slow
 def test_a_pair_needs_as_many_matches_as_asked_for(scene: Rendered) -> None:
     kept, verified = len(scene.tied.tracks) // 2, scene.tied.pairs[0].verified
     assert kept < verified

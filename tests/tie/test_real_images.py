@@ -59,6 +59,7 @@ def test_the_spread_across_epipolar_lines_is_a_twelfth_of_a_pixel_and_under_half
     assert robust_spread(residual) <= 0.45 * triplet_spread[i, j]
 
 
+@pytest.mark.slow
 def test_the_spread_on_steep_ground_under_twenty_degrees_holds_too(ventoux, ventoux_ties) -> None:
     residual = fit(ventoux, ventoux_ties.tracks, 0, 1)[1]
     assert robust_spread(residual) <= 0.12

@@ -223,6 +223,7 @@ def wrong(view: View, px: tuple[float, float]) -> tuple[View, np.ndarray]:
     return there, off[0, :2]
 
 
+@pytest.mark.slow
 def test_every_camera_of_a_plain_is_off_by_what_was_done_to_it(plains):
     seen, _, reference, _ = plains
     (first, one), (second, two) = wrong(seen[0], (20.0, -11.0)), wrong(seen[1], (-7.5, 4.25))
@@ -254,6 +255,7 @@ def test_every_camera_of_a_plain_is_off_by_what_was_done_to_it(plains):
         assert stated == pytest.approx(np.full_like(stated, found.views[k].scatter / 2.08), rel=0.02)
 
 
+@pytest.mark.slow
 def test_what_a_plain_does_not_show_is_not_found_and_what_two_files_share_is(plains):
     seen, grey, _, folder = plains
     other, far = plain(folder / "other.tif", ground(2)), plain(folder / "far.tif", grey, left=3000)

@@ -33,6 +33,7 @@ def typical(scene, tracks: Tracks, i: int, j: int) -> np.ndarray:
     return 1.4826 * np.median(np.abs(errors), axis=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", SIDES)
 def test_the_true_error_is_below_a_twelfth_of_a_pixel_in_both_directions(render, side: int) -> None:
     scene = render(views=3, size=(side, side))
@@ -93,6 +94,7 @@ def _unpickled(task: bytes):
     return pickle.loads(pickle.dumps(function(*args, **rest)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("workers", "number", "side"),
     [

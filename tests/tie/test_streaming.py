@@ -58,6 +58,7 @@ def left(xy: np.ndarray) -> float:
     return float(np.mean(xy[:, 0] < SIDE / 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("most", "zoom"),
     [
@@ -99,6 +100,7 @@ def test_a_sigma_is_judged_beside_those_about_it() -> None:
     assert _usual(places[:1], sigma[:1]).tolist() == sigma[:1].tolist()
 
 
+@pytest.mark.slow
 def test_what_a_poor_tile_leaves_goes_to_the_others(tmp_path) -> None:
     data = quiet(10.0).copy()
     data[:560, :560] = 900  # nothing is found in the first of four tiles
@@ -334,6 +336,7 @@ def test_tiles_are_whole_strips_and_whole_blocks_where_decoding_is_dear(
     assert sum(w * h for _, _, w, h in boxes) == size[0] * size[1]
 
 
+@pytest.mark.slow
 def test_a_wide_tile_is_searched_in_parts_without_a_seam(pair) -> None:
     found, options = survey(pair[0].path), TieOptions(tile=128)
     assert found is not None

@@ -130,6 +130,7 @@ def test_a_patch_is_registered_where_the_truth_says(render, side, axis, most) ->
     assert ((score[ok] > 0.1) & (score[ok] < 1.0)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [120.0, pytest.param(40.0, marks=pytest.mark.slow)])
 def test_two_dates_of_a_satellite_lie_where_they_lie(shared_data, step: float) -> None:
     """Fields ten days apart on one grid, a corner of one under clouds, another without data."""
@@ -165,6 +166,7 @@ def matched(small) -> tuple[Matches, PairReport]:
     return match_pair(small, (join([]), join([])), pair, TieOptions(matcher=STRUCTURE))
 
 
+@pytest.mark.slow
 def test_terrain_or_other_ties_narrow_the_altitudes(render, small, matched) -> None:
     pair, (found, report) = small, matched
     low, high = pair[0].alt_range
