@@ -194,8 +194,8 @@ def _thinned(
     """
     if box[2] * box[3] > _MOST and box[3] >= 2 * thin:
         first = box[3] // thin // 2 * thin
-        parts = (box[0], box[1], box[2], first), (box[0], box[1] + first, box[2], box[3] - first)
-        means, shares = zip(*(_thinned(file, bands, part, thin) for part in parts), strict=True)
+        halves = (box[0], box[1], box[2], first), (box[0], box[1] + first, box[2], box[3] - first)
+        means, shares = zip(*(_thinned(file, bands, half, thin) for half in halves), strict=True)
         return np.vstack(means), np.vstack(shares)
     cv2.setNumThreads(1)
     picture, valid = np.zeros((box[3], box[2]), np.float32), np.ones((box[3], box[2]), dtype=bool)
