@@ -151,7 +151,7 @@ def test_a_pair_reads_the_tiles_that_it_needs(pair, tmp_path) -> None:
 def test_a_damaged_tile_is_made_again_and_a_missing_one_is_named(pair, tmp_path, damage: str) -> None:
     store, view, box = Store(str(tmp_path / "kept"), str(tmp_path)), pair[0], (0, 0, 256, 256)
     found, options = survey(view.path), TieOptions()
-    task = (store, "tile/a", view.path, view.size, box, found, Share(0.002), options)
+    task = (store, "tile/a", (view.path, view.size, box, found, Share(0.002), options))
     count = keep_tile(*task)
     path = tmp_path / "kept/tile/a.npz"
     whole = path.read_bytes()

@@ -268,21 +268,14 @@ class KeypointFiles:
 
 
 def keep_tile(
-    store: Store,
-    name: str,
-    path: str,
-    size: tuple[int, int],
-    box: Box,
-    found: Survey,
-    share: Share,
-    options: TieOptions,
+    store: Store, name: str, task: tuple[str, tuple[int, int], Box, Survey, Share, TieOptions]
 ) -> int:
-    """Detect the keypoints of a tile (`detect_tile`) and keep them in the store; return their number."""
+    """Detect the keypoints of a tile by `detect_tile(*task)` and keep them in the store; return their number."""
     known = store.read(name)
     if known is not None and "xy" in known:
         return len(known["xy"])
-    keypoints = detect_tile(path, size, box, found, share, options)
-    store.write(name, _packed(keypoints, box))
+    keypoints = detect_tile(*task)
+    store.write(name, _packed(keypoints, task[2]))
     return len(keypoints)
 
 
@@ -347,7 +340,7 @@ def locate(
         for box in of_view
     ]
     names = [f"{name}{'-coarse' * coarse}" for name in names_of(executor, detect_tile, tasks)]
-    keeping = [(store, name, *task) for name, task in zip(names, tasks, strict=True)]
+    keeping = [(store, name, task) for name, task in zip(names, tasks, strict=True)]
     counts = np.array(ordered(executor, keep_tile, keeping, "detect", progress), dtype=np.int64)
     files, first = [], 0
     for of_view, share in zip(boxes, shares, strict=True):

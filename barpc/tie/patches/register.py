@@ -33,18 +33,16 @@ PATCH = 21
 _STEPS = 12
 _CHUNK = 256  # patches worked on at a time: they stay in cache
 _ALL_OF_A_PAIR = 8192  # points of a task where they are many: its tiles share what is decoded
-_ROUGHLY = 0.05  # px; the same where a place is only compared
 _SMALLER = 0.7  # side of the patch of the second try and of the check
 _TORN = 0.5  # px that the smaller patch may lie apart
 _FINE = 4  # samples a pixel and axis
 _GRID = 1.0 / (32 * _FINE)  # px; positions that the sampler tells apart
 _REACH = 1.5  # px; a patch that moves farther has left its point
 _WEIGHT = 0.7  # standard deviation of the patch's Gaussian weight, in half sides
-_MIN_DETAIL = 1e-12  # relative variance below which a patch is flat
 _LEAST_SIGMA = 1e-3  # px, of a registration
 _TAPS = 6  # samples on either side in the interpolation
-_RIDGE = 1e-6
-_FLOOR = 0.1  # px across the epipolar line that are always tolerated
+_RIDGE = 1e-6  # of what a normal matrix holds; relative deviation below which a patch is flat
+_FLOOR = 0.1  # px across the epipolar line that are always tolerated, and in a place only compared
 _DISTORTED = 2.0  # times the median sigma about it: the patch lies across a step of the ground
 _ABOUT = 64  # nearest points that tell it: contrast and noise are not alike all over a scene
 _LEAST_END_SIGMA = 0.02  # px, of an observation
@@ -221,7 +219,7 @@ def register(
             found = template.find(fine, reference[rows].astype(np.int64), start[rows], linear[rows])
             best.put(rows, replace(found, ok=found.ok & _at(usable[1], found.xy)))
     for rows in _chunks(np.flatnonzero(best.ok)):  # on a step of the ground the inner part goes elsewhere
-        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], _ROUGHLY)
+        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], _FLOOR)
         apart = np.hypot(*(inner.xy - best.xy[rows]).T)
         best.ok[rows] = apart <= np.maximum(_TORN, 5.0 * inner.sigma)
     return best
@@ -293,7 +291,7 @@ class _Template:
         mean = (patches @ self._weight)[:, None]
         centred = patches - mean
         deviation = np.sqrt((centred * centred) @ self._weight)[:, None]
-        flat = deviation**2 <= _MIN_DETAIL * (1.0 + mean * mean)
+        flat = deviation**2 <= _RIDGE**2 * (1.0 + mean * mean)
         deviation = np.where(flat, np.float32(np.inf), deviation)
         return centred / deviation, deviation
 

@@ -25,6 +25,7 @@ Terrain = Callable[[Array, Array], Array]
 """lon, lat (...) [deg] -> altitude (...) [m above the ellipsoid], NaN where it is unknown."""
 
 _NODE = 8  # px between exact projections; straight lines between them
+_MOST = 1 << 24  # px that are averaged at a time: 16 bytes each
 _KNOWN = 0.99  # of what a pixel is made of must be valid
 
 
@@ -191,6 +192,11 @@ def _thinned(
     """Return the mean of bands of a window, averaged over `thin` x `thin` px, and how much of each of these
     is known.
     """
+    if box[2] * box[3] > _MOST and box[3] >= 2 * thin:
+        first = box[3] // thin // 2 * thin
+        halves = (box[0], box[1], box[2], first), (box[0], box[1] + first, box[2], box[3] - first)
+        means, shares = zip(*(_thinned(file, bands, half, thin) for half in halves), strict=True)
+        return np.vstack(means), np.vstack(shares)
     cv2.setNumThreads(1)
     picture, valid = np.zeros((box[3], box[2]), np.float32), np.ones((box[3], box[2]), dtype=bool)
     for band in bands:
