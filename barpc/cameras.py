@@ -62,17 +62,13 @@ class Camera:
         """The RPC, where the model is one; InputError where it is not."""
         if isinstance(self.model, RPC):
             return self.model
-        raise InputError(
-            f"{self.path}: a camera of the kind {self.format}, no RPC; make one with 'barpc fit'"
-        )
+        raise InputError(f"{self.path}: a camera of the kind {self.format}, no RPC; make one with 'barpc fit'")
 
     @property
     def extent(self) -> tuple[int, int]:
         """The image's size [px]; InputError where it is not known."""
         if self.size is None:
-            raise InputError(
-                f"{self.path}: a camera without its image; give the size: FILE,size=WIDTH:HEIGHT"
-            )
+            raise InputError(f"{self.path}: a camera without its image; give the size: FILE,size=WIDTH:HEIGHT")
         return self.size
 
     @property
@@ -127,9 +123,7 @@ def open_split(path: Place, texts: Mapping[str, str], **choices: Any) -> Camera:
     size, holder = (choices.pop(key, texts.pop(key, None)) for key in ("size", "camera"))
     file = path if holder is None else place(holder)
     head = b"" if file.is_dir() else read_head(file, IMAGE, _HEAD)
-    name, opener = next(
-        (n, o) for n, o in reversed(OPENERS.items()) if o.sniff(file, head, {**texts, **choices})
-    )
+    name, opener = next((n, o) for n, o in reversed(OPENERS.items()) if o.sniff(file, head, {**texts, **choices}))
     for key in (*texts, *choices):
         if key not in opener.choices:
             known = ", ".join(("camera", "size", *opener.choices))
@@ -242,9 +236,7 @@ def _is_sicd(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
         return False
     from barpc.sensor.sicd import find_sicd, is_sicd
 
-    return is_sicd(head) or (
-        head.startswith(b"NITF02.10") and isinstance(path, Path) and find_sicd(path) is not None
-    )
+    return is_sicd(head) or (head.startswith(b"NITF02.10") and isinstance(path, Path) and find_sicd(path) is not None)
 
 
 def _open_sicd(path: Place) -> Camera:

@@ -50,9 +50,7 @@ class Frozen:
         """Make a field a read-only array of the given shape (None: any length), its numbers `finite` if so asked."""
         value: npt.NDArray[Any] = np.array(getattr(self, name), dtype=dtype)
         what = f"{type(self).__name__} {name}"
-        if value.ndim != len(shape) or any(
-            n not in (None, m) for n, m in zip(shape, value.shape, strict=True)
-        ):
+        if value.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, value.shape, strict=True)):
             raise error(f"{what}: shape {value.shape}, expected {shape}")
         if finite and not np.isfinite(value).all():
             raise error(f"{what}: not finite ({value[~np.isfinite(value)][0]})")
@@ -218,9 +216,7 @@ def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> tuple[int, int
         if dtype.hasobject:
             raise ValueError(f"{member.filename} holds Python objects")
         if math.prod(shape) * dtype.itemsize != member.file_size - file.tell():
-            raise ValueError(
-                f"{member.filename} holds another number of bytes than its shape {shape} asks for"
-            )
+            raise ValueError(f"{member.filename} holds another number of bytes than its shape {shape} asks for")
     return math.prod(shape), member.file_size
 
 

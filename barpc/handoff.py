@@ -67,18 +67,14 @@ class Reading:
         return bool(self.max_error <= TOLERANCE)
 
 
-def control_grid(
-    model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]
-) -> tuple[Array, Array]:
+def control_grid(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> tuple[Array, Array]:
     """Return the ground points (N, 3) over an image and its altitudes, and where `model` sees them (N, 2) [px]."""
     ground = model.localize(*image_grid(size, alt_range))
     ground = ground[np.isfinite(ground).all(axis=1)]
     return ground, model.project(ground)
 
 
-def difference(
-    model: SensorModel, other: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]
-) -> float:
+def difference(model: SensorModel, other: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> float:
     """Return the largest distance [px] between two cameras of an image and its altitudes; NaN if blind."""
     ground, image = control_grid(model, size, alt_range)
     return _largest(other.project, ground, image) if len(ground) else float("nan")
@@ -174,9 +170,7 @@ def unverified(paths: Sequence[Path | str]) -> list[str]:
 
 
 _MACHINE = frozenset(
-    getattr(errno, name)
-    for name in ("EIO", "ENOSPC", "EDQUOT", "EMFILE", "ENFILE", "EROFS")
-    if hasattr(errno, name)
+    getattr(errno, name) for name in ("EIO", "ENOSPC", "EDQUOT", "EMFILE", "ENFILE", "EROFS") if hasattr(errno, name)
 )
 
 

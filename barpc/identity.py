@@ -63,9 +63,7 @@ class Input:
         """A hash of all that it is made of."""
         if not self.parts:
             return self.sha256
-        return hashlib.sha256(
-            " ".join([self.sha256, *(part.key for part in self.parts)]).encode()
-        ).hexdigest()
+        return hashlib.sha256(" ".join([self.sha256, *(part.key for part in self.parts)]).encode()).hexdigest()
 
     def every(self) -> Iterator[Input]:
         """Yield the input itself and its parts."""

@@ -88,9 +88,7 @@ _FREE = Rule("")
 def option(default: T, help: str, **rule: Any) -> T:
     """Declare a field of an option record: its default, its meaning, and the rest of its `Rule`."""
     metadata = {"rule": Rule(" ".join(help.split()), **rule)}
-    given: dict[str, Any] = (
-        {"default_factory": default.copy} if isinstance(default, dict) else {"default": default}
-    )
+    given: dict[str, Any] = {"default_factory": default.copy} if isinstance(default, dict) else {"default": default}
     made: T = field(**given, metadata=metadata)
     return made
 
@@ -221,9 +219,7 @@ class TieOptions(Options):
         rows="barpc.tie.matchers.matching.MATCHERS",
         hook=True,
     )
-    tile: int = option(
-        1024, "Side of the tiles that are read and searched for keypoints.", unit="px", least=128
-    )
+    tile: int = option(1024, "Side of the tiles that are read and searched for keypoints.", unit="px", least=128)
     keypoints_per_image: int = option(
         100_000, "Keypoints an image, at most; its cells hold fewer where more would be found.", least=1
     )
@@ -402,14 +398,14 @@ class AdjustOptions(Options):
 class FitOptions(Options):
     """Options of fitting an RPC to a sensor model or to points."""
 
-    method: Literal[
-        "auto", "ridge", "gauss-newton", "minimax", "lcurve", "lcurve-joint", "vendor-denominators"
-    ] = option(
-        "auto",
-        """`ridge`: QR compression and a noise-scaled ridge. `lcurve-joint`: the paper's solver, one h for col and row
-        (78 unknowns); `lcurve`: with one each (39 + 39). `gauss-newton`: the least squares of the error
+    method: Literal["auto", "ridge", "gauss-newton", "minimax", "lcurve", "lcurve-joint", "vendor-denominators"] = (
+        option(
+            "auto",
+            """`ridge`: QR compression and a noise-scaled ridge. `lcurve-joint`: the paper's solver, one h for col and
+        row (78 unknowns); `lcurve`: with one each (39 + 39). `gauss-newton`: the least squares of the error
         itself, for models without noise; `minimax`: the least largest error instead. `vendor-denominators`: numerators
         only. `auto`: `ridge`, and another one where the certificate says that it is better.""",
+        )
     )
     grid: tuple[int, int, int] = option(
         (12, 12, 7), "Control points along col (or lon), row (or lat) and altitude.", least=4
@@ -417,9 +413,7 @@ class FitOptions(Options):
     space: Literal["image", "ground"] = option(
         "image", "Whether the grid is regular in (col, row, alt), or in (lon, lat, alt) as in the paper."
     )
-    nodes: Nodes = option(
-        "chebyshev", "Spacing of the control points; Chebyshev-Lobatto nodes crowd towards the ends."
-    )
+    nodes: Nodes = option("chebyshev", "Spacing of the control points; Chebyshev-Lobatto nodes crowd towards the ends.")
     tolerance: float = option(
         0.01, "A fit whose check points miss by more in one coordinate is refused.", unit="px", above=0
     )
@@ -430,9 +424,7 @@ class FitOptions(Options):
         followed better.""",
         least=0,
     )
-    precision: Literal["nitf", "rpcm"] | None = option(
-        None, "Fit numbers that a format with few digits can hold."
-    )
+    precision: Literal["nitf", "rpcm"] | None = option(None, "Fit numbers that a format with few digits can hold.")
     localisation: bool = option(
         False,
         """Fit the localisation RPC, too: lon, lat as quotients of cubics of col, row and altitude, which txt, json and
@@ -447,9 +439,7 @@ class FitOptions(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         if (count := math.prod(self.grid)) > MOST_POINTS:
-            raise InputError(
-                f"grid {list(self.grid)}: {count} control points, at most {MOST_POINTS} are fitted to"
-            )
+            raise InputError(f"grid {list(self.grid)}: {count} control points, at most {MOST_POINTS} are fitted to")
 
 
 @dataclass(frozen=True, repr=False)
@@ -501,9 +491,7 @@ class RunOptions(Options):
         unit="file",
     )
     matches_only: bool = option(False, "Take the given matches as tie points as they are, and match nothing.")
-    overlap_list: str | None = option(
-        None, "Match only these pairs: two image names or paths a line.", unit="file"
-    )
+    overlap_list: str | None = option(None, "Match only these pairs: two image names or paths a line.", unit="file")
     aoi: str | None = option(
         None,
         "Tie points only inside polygons in lon/lat (GeoJSON), and only what may show them is read.",
@@ -559,9 +547,7 @@ class RunOptions(Options):
                 raise InputError(f"allow_remote {host!r} is no HOST, HOST:PORT or s3://BUCKET")
         for name in ("overlap_list", "aoi"):
             if self.matches_only and getattr(self, name) is not None:
-                raise InputError(
-                    f"{name} is given with matches_only: nothing is matched then; leave one of them out"
-                )
+                raise InputError(f"{name} is given with matches_only: nothing is matched then; leave one of them out")
 
 
 # --- what is made of them ---------------------------------------------------------------------------------
@@ -667,9 +653,7 @@ def read_options(path: str | Path, options: RunOptions | None = None) -> RunOpti
         raise InputError(f"{path}: not an options file (TOML): {error}") from error
     for name in data:
         if (one := declared(RunOptions).get(name)) is not None and one.rule.spoken:
-            raise InputError(
-                f"{path}: {name} is not taken from a file, which may be anybody's; give the flag"
-            )
+            raise InputError(f"{path}: {name} is not taken from a file, which may be anybody's; give the flag")
     _refuse_code(path, RunOptions, data)
     return with_values(options or RunOptions(), data, str(path))
 

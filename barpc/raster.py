@@ -290,9 +290,7 @@ class Mosaic:
             return 0, 0, self.width, self.height
         box = int(window.col_off), int(window.row_off), int(window.width), int(window.height)
         if min(box) < 0 or box[0] + box[2] > self.width or box[1] + box[3] > self.height:
-            raise ImageError(
-                f"{self.name}: window {box} is not inside the image of {self.width} x {self.height}"
-            )
+            raise ImageError(f"{self.name}: window {box} is not inside the image of {self.width} x {self.height}")
         return box
 
     def _dataset(self, file: Path) -> Any:

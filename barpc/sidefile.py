@@ -54,9 +54,7 @@ class Kind:
     def check(self, path: Path | str, size: int) -> None:
         """Raise if a file of `size` bytes is too large."""
         if self.most is not None and size > self.most:
-            raise self.error(
-                f"{path}: {size} bytes, too large for {self.words} (at most {self.most} are read)"
-            )
+            raise self.error(f"{path}: {size} bytes, too large for {self.words} (at most {self.most} are read)")
 
     def check_numbers(self, path: Path | str, file: BinaryIO) -> None:
         """Raise if a text holds more numbers than `most` bytes can: short ones take more in memory than in the file."""
@@ -65,9 +63,7 @@ class Kind:
             file.seek(0)
             count = sum(_count(part, self.between) for part in iter(lambda: file.read(MB), b""))
             if count > limit:
-                raise self.error(
-                    f"{path}: {count} numbers, too many for {self.words} (at most {limit} are read)"
-                )
+                raise self.error(f"{path}: {count} numbers, too many for {self.words} (at most {limit} are read)")
         if self.between:
             file.seek(0)
 

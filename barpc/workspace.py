@@ -169,9 +169,7 @@ class Workspace:
             self._lock = filelock.FileLock(own / LOCK, timeout=0)
             self._lock.acquire()
         except filelock.Timeout:
-            raise OutputError(
-                f"{self.folder}: another run is at work in it; wait, or choose another -o"
-            ) from None
+            raise OutputError(f"{self.folder}: another run is at work in it; wait, or choose another -o") from None
         except OSError as error:
             raise OutputError(f"{self.folder}: cannot be written ({error.strerror or error})") from error
         shutil.rmtree(self.partial, ignore_errors=True)  # of a run that was killed
@@ -207,9 +205,7 @@ class Workspace:
         for path, image, _ in hidden_by(self.folder / name for name in names):
             known = "the input " * (image.resolve() in self._keep)
             if known or not (self.owns(image.name) or os.path.lexists(path)):
-                raise OutputError(
-                    f"{path}: would be read in place of the RPC of {known}{image}; give another -o"
-                )
+                raise OutputError(f"{path}: would be read in place of the RPC of {known}{image}; give another -o")
 
     def _refuse_foreign(self, name: str) -> None:
         path = self.folder / name
@@ -257,9 +253,7 @@ class Workspace:
 
     def _discard(self) -> None:
         """Take away what this run made, where it was refused before it made anything worth keeping."""
-        if (
-            self._noted or self.folder / STATE not in self._made
-        ):  # an output may have its name, whatever came then
+        if self._noted or self.folder / STATE not in self._made:  # an output may have its name, whatever came then
             return
         shutil.rmtree(self.folder / STATE, ignore_errors=True)
         for made in self._made[1:]:  # innermost first; only what this run made, and only when empty
@@ -436,9 +430,7 @@ def _refuse_odd(folder: Path) -> None:
         except OSError:  # not there; where it cannot be reached, it cannot be written either
             continue
         if _is_odd(path, found):
-            raise OutputError(
-                f"{path}: cannot be written: it is not barpc's own; move {own} away, or give another -o"
-            )
+            raise OutputError(f"{path}: cannot be written: it is not barpc's own; move {own} away, or give another -o")
 
 
 def _is_odd(path: Path, found: os.stat_result) -> bool:

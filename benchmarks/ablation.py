@@ -82,9 +82,7 @@ def _times(value: Any, factor: float) -> Any:
 def constants(package: str) -> Iterator[Constant]:
     """Those of all modules below a package."""
     place = ROOT / Path(*package.split("."))
-    for path in (
-        [place.with_suffix(".py")] if place.with_suffix(".py").exists() else sorted(place.rglob("*.py"))
-    ):
+    for path in [place.with_suffix(".py")] if place.with_suffix(".py").exists() else sorted(place.rglob("*.py")):
         module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             names = (
@@ -128,18 +126,14 @@ def _figures(result: Result) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def row(
-    found: list[dict[str, Any]] | str, base: list[dict[str, Any]], worlds: tuple[str, ...]
-) -> dict[str, Any]:
+def row(found: list[dict[str, Any]] | str, base: list[dict[str, Any]], worlds: tuple[str, ...]) -> dict[str, Any]:
     """A line of the table: largest changes over the worlds."""
     if isinstance(found, str):
         return {"fails": found}
     px = np.array([a["left"] - b["left"] for a, b in zip(found, base, strict=True)]) / NOISE
     cut = np.array([a["cut"] - b["cut"] for a, b in zip(found, base, strict=True)])
     with np.errstate(invalid="ignore", divide="ignore"):
-        sigma = np.array(
-            [np.log(np.divide(a["sigma"], b["sigma"])) for a, b in zip(found, base, strict=True)]
-        )
+        sigma = np.array([np.log(np.divide(a["sigma"], b["sigma"])) for a, b in zip(found, base, strict=True)])
     cpu = sum(a["seconds"] for a in found) / sum(b["seconds"] for b in base)
     px, sigma = np.nan_to_num(px, nan=np.inf), np.nan_to_num(sigma)
     if not (px.any() or cut.any() or sigma.any()):
@@ -163,9 +157,7 @@ def line(constant: Constant, factor: float, got: dict[str, Any]) -> str:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("package", help="such as barpc.ba.judging")
     parser.add_argument("--only", nargs="+", help="names of constants")
     parser.add_argument("--worlds", nargs="+", default=WORLDS, help="FAMILY:SEED")

@@ -71,9 +71,7 @@ def samples(work: Path) -> Iterator[str]:
         "Triangulated check points minus true ones, metres; 200 points that no run sees. *Shape* is the RMS "
         "about the mean."
     )
-    yield from table(
-        "cameras", "tie points [px]", "place: mean east, north, up", "shape: RMS east, north, up"
-    )
+    yield from table("cameras", "tie points [px]", "place: mean east, north, up", "shape: RMS east, north, up")
     steps = {
         "as delivered": None,
         "adjusted": RunOptions(),
@@ -129,9 +127,7 @@ def real(data: Path, work: Path) -> Iterator[str]:
         "are no tie points, in images resampled along the epipolar lines; *valid*: share of pixels that "
         "OpenCV's semi-global matching keeps ([how](recipes/stereo.md#before-and-after-in-numbers))."
     )
-    yield from table(
-        "pair", "tie points [px]", "dy before [px]", "dy after [px]", "valid before", "valid after"
-    )
+    yield from table("pair", "tie points [px]", "dy before [px]", "dy after [px]", "valid before", "valid after")
     sets = {"triplet": "phr_triplet_north/img_*.tif", "Ventoux": "phr_ventoux/*_image.tif"}
     for name, pattern in sets.items():
         images = sorted((data / "optical").glob(pattern))
@@ -193,9 +189,7 @@ def page(data: Path | None) -> str:
 
 def main() -> None:
     """Measure, then print or write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder with optical/ and rpc_formats/")
     parser.add_argument("--write", action="store_true", help="write docs/accuracy.md")
     arguments = parser.parse_args()

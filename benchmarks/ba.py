@@ -119,9 +119,7 @@ class Baseline:
 
     def two_passes(self) -> OptimizeResult:
         """Soft L1 at one pixel, rejection at four robust standard deviations, least squares."""
-        first = self.solve(
-            self.start, loss="soft_l1", f_scale=1.0 / np.median(self.block.tracks.sigma), **PEER
-        )
+        first = self.solve(self.start, loss="soft_l1", f_scale=1.0 / np.median(self.block.tracks.sigma), **PEER)
         size = np.linalg.norm(first.fun.reshape(-1, 2), axis=1)
         self.keep = size <= 4.0 * np.median(size) / 1.18
         return self.solve(first.x, **PEER)
@@ -175,9 +173,7 @@ def growth(views: int) -> None:
         runs = [adjust(block, "rotation+translation", sigma_attitude=4.0).seconds for _ in range(3)]
         counts.append(len(block.tracks))
         seconds.append(statistics.median(runs))
-        print(
-            f"{counts[-1]:8d} observations: {seconds[-1]:7.3f} s, {1e6 * seconds[-1] / counts[-1]:.2f} us each"
-        )
+        print(f"{counts[-1]:8d} observations: {seconds[-1]:7.3f} s, {1e6 * seconds[-1] / counts[-1]:.2f} us each")
     slope = np.polyfit(np.log(counts), np.log(seconds), 1)[0]
     print(f"CPU grows as observations^{slope:.2f}")
 
@@ -271,9 +267,7 @@ def one_block(views: int, tracks: int) -> None:
     if reduced.common is not None:
         product -= reduced.common.by_camera.T @ (reduced.common.by_camera @ solution.ravel())
     left = np.linalg.norm(product - wanted) / np.linalg.norm(wanted)
-    print(
-        f"    a further step would gain {gain / reduced.cost:.1e} of the cost; what is solved is left to {left:.1e}"
-    )
+    print(f"    a further step would gain {gain / reduced.cost:.1e} of the cost; what is solved is left to {left:.1e}")
     inverse, _ = timed(factor.inverse)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     print(
@@ -301,9 +295,7 @@ def _fill_of(views: int, made: Block) -> None:
     joined = join(made.views, made.tracks, None, options)
     centers = np.array([correction.center for correction in made.truth.corrections])
     problem = make_problem(joined, options, centers, None)
-    reduced = problem.reduce(
-        problem.camera_prior.mean, ecef_from_ground(made.truth.ground), 1.0 / joined.sigma
-    )
+    reduced = problem.reduce(problem.camera_prior.mean, ecef_from_ground(made.truth.ground), 1.0 / joined.sigma)
     seconds, order = timed(lambda: problem.structure.order(np.ones(views, dtype=bool)))
     factorised, _ = timed(lambda: reduced.factor(problem.free))
     count = sum(len(f.pivots) * (len(f.pivots) + len(f.border)) for f in order.fronts) * 81
@@ -388,9 +380,7 @@ def jump(repeat: int) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--all", action="store_true", help="ratios for 100 views, too (minutes)")
     parser.add_argument("--repeat", type=int, default=3, help="interleaved runs, of which the median counts")
     parser.add_argument("--growth", action="store_true", help="CPU over the number of observations")
@@ -399,9 +389,7 @@ def main() -> None:
     parser.add_argument("--a-view", type=int, default=50, help="tracks a view of these blocks")
     parser.add_argument("--one-block", nargs=2, type=int, help=argparse.SUPPRESS)
     parser.add_argument("--fill", nargs="+", type=int, metavar="VIEWS", help="other orders of elimination")
-    parser.add_argument(
-        "--against", metavar="COMMIT", help="adjustments with defaults beside another commit's"
-    )
+    parser.add_argument("--against", metavar="COMMIT", help="adjustments with defaults beside another commit's")
     parser.add_argument("--jump", action="store_true", help="one flawed view of 36")
     parser.add_argument("--ceres", action="store_true", help="plain adjustments beside Ceres")
     arguments = parser.parse_args()

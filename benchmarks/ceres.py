@@ -91,9 +91,7 @@ def compare(repeat: int) -> None:
         program = build(Path(folder))
         if program is None:
             sys.exit("Ceres is not compared: g++ and its headers (libceres-dev) are needed")
-        print(
-            "views  tracks | whole [s]  solve [s] | Ceres [s]  by         MB | whole / it  solve / it | excess"
-        )
+        print("views  tracks | whole [s]  solve [s] | Ceres [s]  by         MB | whole / it  solve / it | excess")
         for views, tracks in SIZES:
             one_size(program, Path(folder) / "block", views, tracks, repeat)
 
@@ -113,9 +111,7 @@ def one_size(program: Path, path: Path, views: int, tracks: int, repeat: int) ->
         solve = time.process_time() - start
         reduced = problem.reduce(found.state.params, found.state.points, 1.0 / block.sigma)
         ours.append((whole, solve, reduced.cost))
-        ran = [
-            subprocess.run([program, path, way], capture_output=True, text=True, check=True) for way in ways
-        ]
+        ran = [subprocess.run([program, path, way], capture_output=True, text=True, check=True) for way in ways]
         told = [[*map(float, one.stdout.split())] for one in ran]
         theirs.append(min((row[0], row[1], way, row[3]) for row, way in zip(told, ways, strict=True)))
     whole, solve, ceres = (
@@ -132,10 +128,6 @@ def one_size(program: Path, path: Path, views: int, tracks: int, repeat: int) ->
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--repeat", type=int, default=3, help="scenes of each size, of which the median counts"
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeat", type=int, default=3, help="scenes of each size, of which the median counts")
     compare(parser.parse_args().repeat)

@@ -81,17 +81,13 @@ def run(years: Years, views: list[View], out: Path, neighbours: int) -> str:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--dates", type=int, default=40)
     parser.add_argument("--twice", type=int, default=0, help="dates with two views")
     parser.add_argument("--neighbours", type=int, nargs="+", default=[3])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--size", type=int, default=256, help="side of the images [px]")
-    parser.add_argument(
-        "--growth", type=float, default=0.3, help="share of the ground that is its season's own"
-    )
+    parser.add_argument("--growth", type=float, default=0.3, help="share of the ground that is its season's own")
     parser.add_argument(
         "--seasons", type=int, default=0, help="so many seasons in turn, and clouds on every third date"
     )
@@ -104,9 +100,7 @@ def main() -> None:
     rounds = tracks.TRIES
     for seed in given.seeds:
         years = block(given.dates, given.twice, seed, given.size, given.growth, given.seasons)
-        days = [
-            date(2015 + k % 5, 1, 1) + timedelta(int(365 * phase)) for k, phase in enumerate(years.phases)
-        ]
+        days = [date(2015 + k % 5, 1, 1) + timedelta(int(365 * phase)) for k, phase in enumerate(years.phases)]
         with tempfile.TemporaryDirectory() as name:
             views = years.write(Path(name))
             dated = [replace(view, date=str(days[k])) for view, k in zip(views, years.views, strict=True)]

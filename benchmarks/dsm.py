@@ -63,9 +63,7 @@ def against(path: Path, other: Path) -> tuple[float, float]:
     return nmad((own - heights)[both]), float(both.sum() / max(np.isfinite(heights).sum(), 1))
 
 
-def measure(
-    source: str | list[str], alt: tuple[float, float] | None, other: Path | None
-) -> dict[str, object]:
+def measure(source: str | list[str], alt: tuple[float, float] | None, other: Path | None) -> dict[str, object]:
     """One surface."""
     with tempfile.TemporaryDirectory() as folder:
         out, start = Path(folder) / "dsm.tif", time.process_time()
@@ -94,12 +92,8 @@ def rendered(side: int, kind: str = "usual") -> dict[str, object]:
             "make_dsm(paths, sys.argv[2], DsmOptions(alt=tuple(alt))); cpu = time.process_time() - start\n"
             "print(cpu, open('/proc/self/status').read().split('VmHWM:')[1].split()[0])"
         )
-        done = subprocess.run(
-            [sys.executable, "-c", code, call, str(out)], capture_output=True, text=True, check=True
-        )
-        cpu, peak = map(
-            float, done.stdout.split()
-        )  # (what getrusage says is the parent's, where that was larger)
+        done = subprocess.run([sys.executable, "-c", code, call, str(out)], capture_output=True, text=True, check=True)
+        cpu, peak = map(float, done.stdout.split())  # (what getrusage says is the parent's, where that was larger)
         with rasterio.open(out) as file:
             height, sigma = file.read(1), file.read(4)
         error = height - made.truth(out)
@@ -136,11 +130,7 @@ def main() -> None:
             if row is None:
                 continue
             cost = row["cpu"] / (smallest * row["pairs"])
-            more = (
-                ""
-                if "against" not in row
-                else " against {:.2f} m, {:.1%} of its cells".format(*row["against"])
-            )
+            more = "" if "against" not in row else " against {:.2f} m, {:.1%} of its cells".format(*row["against"])
             print(
                 f"{run.name:12}{name:11}{row['pairs']} pairs {row['cells']:8} cells {row['share']:6.1%} matched "
                 f"nmad {row['nmad']:.2f} m sigma {row['sigma']:.2f} m {cost:5.1f} CPU s/Mpx {row['peak']:.0f} MB{more}"

@@ -60,17 +60,13 @@ class Peer:
         return RPC(coeffs, ground_offset, ground_scale, image_offset, image_scale)
 
 
-def grid_of(
-    camera: Camera, grid: tuple[int, int, int], space: Space = "image"
-) -> tuple[Array, Array, Array, Array]:
+def grid_of(camera: Camera, grid: tuple[int, int, int], space: Space = "image") -> tuple[Array, Array, Array, Array]:
     """Control and check points of a uniform grid over an image, or a box around it: ground and image of each."""
     options = FitOptions(grid=grid, nodes="uniform", space=space)
     ground, image = control_points(camera.model, camera.size, camera.alt_range, options)
     check = ground
     for axis in range(3):
-        check = 0.5 * (
-            check.take(range(1, check.shape[axis]), axis) + check.take(range(check.shape[axis] - 1), axis)
-        )
+        check = 0.5 * (check.take(range(1, check.shape[axis]), axis) + check.take(range(check.shape[axis] - 1), axis))
     check = check.reshape(-1, 3)
     return ground.reshape(-1, 3), image.reshape(-1, 2), check, camera.model.project(check)
 
@@ -135,11 +131,7 @@ def area(cameras: list[Camera], peer: Peer) -> None:
                 width, height = (max(1, round(n * np.sqrt(share))) for n in camera.size)
                 part = Camera(camera.name, camera.rpc, camera.model, (width, height), camera.alt_range)
                 ground, image, check, truth = grid_of(part, (10, 10, 10))
-                rpc = (
-                    fit_rpc_points(ground, image, strict=False).rpc
-                    if name == "barpc"
-                    else peer.fit(ground, image)
-                )
+                rpc = fit_rpc_points(ground, image, strict=False).rpc if name == "barpc" else peer.fit(ground, image)
                 errors.append(rms(rpc.project(check) - truth).max())
             growth.append(max(errors) / min(errors))
         if growth:
@@ -170,9 +162,7 @@ def noise(cameras: list[Camera], peer: Peer) -> None:
                 ratios.append(np.linalg.norm(rms(fit.rpc.project(truth_ground) - truth)) / missed)
         line = f"  {count:5d} points: smallest denominator {min(ours):.2f}"
         if ratios:
-            line += (
-                f" (rpcfit {min(theirs):.2f}), ratio median {np.median(ratios):.2f} worst {max(ratios):.2f}"
-            )
+            line += f" (rpcfit {min(theirs):.2f}), ratio median {np.median(ratios):.2f} worst {max(ratios):.2f}"
         print(line)
 
 
@@ -275,12 +265,8 @@ def memory(camera: Camera, peer: Peer) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--data", type=Path, help="folder of vendors' RPC files (optical, rpc_formats, physical, sar)"
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, help="folder of vendors' RPC files (optical, rpc_formats, physical, sar)")
     parser.add_argument("--rpcfit", metavar="DIR", help="site-packages folder that holds rpcfit")
     parser.add_argument("--repeat", type=int, default=5, help="repetitions of a timing")
     parser.add_argument("--tmp", type=Path, default=Path("/tmp"), help="folder for files that are written")

@@ -144,9 +144,7 @@ def otb(square: Square, image: Path, to: Path) -> None:
     where += ["-outputs.spacingx", STEP, "-outputs.spacingy", -STEP, "-outputs.mode", "outputroi"]
     what = ["-map", "epsg", "-map.epsg.code", square.epsg, "-elev.default", square.alt, "-opt.gridspacing", 4]
     geom, write = to.with_suffix(".geom"), WRITABLE["geom"].write
-    geom.write_text(
-        write(read_rpc(image))
-    )  # of a VRT's or GeoTIFF's own RPC this application says "no information"
+    geom.write_text(write(read_rpc(image)))  # of a VRT's or GeoTIFF's own RPC this application says "no information"
     source = f"{image}?&geom={geom}"
     run(["otbcli_OrthoRectification", "-io.in", source, "-io.out", to, "float", *what, *where], to.parent)
 
@@ -198,9 +196,7 @@ def s2p(folder: Path, place: Path) -> Figures:
             assert not whole or (out / "dsm.tif").is_file()
             wanted = [np.hypot(*np.loadtxt(p)[:2, 2]) for p in sorted(out.glob("global_pointing_pair_*.txt"))]
             if pointing == "on":
-                found.setdefault("wanted pointing correction [px]", []).append(
-                    " / ".join(f"{w:.3f}" for w in wanted)
-                )
+                found.setdefault("wanted pointing correction [px]", []).append(" / ".join(f"{w:.3f}" for w in wanted))
             for name, value in _heights(out).items():
                 found.setdefault(f"{name}, pointing correction {pointing}", []).append(value)
     return found
@@ -228,9 +224,7 @@ def cars(folder: Path, place: Path) -> Figures:
     scene = read_scene(folder)
     export_run(folder, "cars", place / "export")
     ready = (place / "export/inputs.yaml").read_text(encoding="utf-8")
-    ready = re.sub(
-        r'"pairing":\n(    - .*\n)+', f'"pairing":\n    - {json.dumps(pairs_of(scene)[0])}\n', ready
-    )
+    ready = re.sub(r'"pairing":\n(    - .*\n)+', f'"pairing":\n    - {json.dumps(pairs_of(scene)[0])}\n', ready)
     ready += '"subsampling":\n  "advanced":\n    "resolutions": [1]\n'  # a quarter of a small image matches nothing
     found: Figures = {}
     for kind in ("delivered", "corrected"):

@@ -205,9 +205,7 @@ def main() -> None:
     """Run all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--points", type=int, default=1_000_000, help="points a call (default 1e6)")
-    parser.add_argument(
-        "--rounds", type=int, default=5, help="rounds, of which the median counts (default 5)"
-    )
+    parser.add_argument("--rounds", type=int, default=5, help="rounds, of which the median counts (default 5)")
     parser.add_argument("--rpc", help="image or RPC file (default: a synthetic camera)")
     parser.add_argument(
         "--python",

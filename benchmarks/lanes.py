@@ -39,9 +39,7 @@ def cpu() -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="*", help="all by default")
     parser.add_argument("-m", dest="lane", default="not slow", help="pytest's expression of markers")
     args = parser.parse_args()

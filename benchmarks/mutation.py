@@ -224,9 +224,7 @@ def chosen() -> list[Mutant]:
 def _listed(row: dict[str, str]) -> Mutant:
     raw = (ROOT / row["file"]).read_bytes()
     if raw.count(row["old"].encode()) != 1:
-        raise SystemExit(
-            f"{TOML.name}: {row['old']!r} stands {raw.count(row['old'].encode())} times in {row['file']}"
-        )
+        raise SystemExit(f"{TOML.name}: {row['old']!r} stands {raw.count(row['old'].encode())} times in {row['file']}")
     start = raw.index(row["old"].encode())
     return Mutant(row["file"], start, start + len(row["old"].encode()), row["new"])
 
@@ -370,9 +368,7 @@ def score(rows: list[dict[str, object]]) -> dict[str, object]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sample", type=int, default=60, help="mutants drawn at random")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--part", action="append", choices=[*parts()], help="part of barpc; all by default")

@@ -117,9 +117,7 @@ def radar(data: Path, length: int, share: float | None) -> Points:
     lines = [np.unique(ground[:, i].round(9)) for i in (0, 1)]
     middle = 0.5 * (low + high)
     lines = [line[np.abs(line - middle[i]) <= half[i]] for i, line in enumerate(lines)]
-    wanted = [
-        line[np.unique(np.linspace(0, len(line) - 1, min(length, len(line))).astype(int))] for line in lines
-    ]
+    wanted = [line[np.unique(np.linspace(0, len(line) - 1, min(length, len(line))).astype(int))] for line in lines]
     used = np.all([np.isin(ground[:, i].round(9), wanted[i]) for i in (0, 1)], axis=0)
     inside = np.all(np.abs(check[:, :2] - middle) <= half, axis=1)
     return ground[used], image[used], check[inside], truth[inside]
@@ -135,30 +133,18 @@ def error(fit: Fit, points: Points) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--data", type=Path, required=True, help="folder of vendors' RPC files and radar points"
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, help="folder of vendors' RPC files and radar points")
     parser.add_argument("--rpcfit", metavar="DIR", help="site-packages folder that holds rpcfit")
     parser.add_argument("--every", type=int, default=1, help="take every so many optical files")
-    parser.add_argument(
-        "--sensors", nargs="+", default=["optical", "points", "swaths"], help="which of these"
-    )
-    parser.add_argument(
-        "--altitudes", nargs=2, type=float, help="of the three swaths, in place of the scene's [m]"
-    )
-    parser.add_argument(
-        "--space", choices=("image", "ground"), default="image", help="grids of the three swaths"
-    )
+    parser.add_argument("--sensors", nargs="+", default=["optical", "points", "swaths"], help="which of these")
+    parser.add_argument("--altitudes", nargs=2, type=float, help="of the three swaths, in place of the scene's [m]")
+    parser.add_argument("--space", choices=("image", "ground"), default="image", help="grids of the three swaths")
     parser.add_argument("--longest", type=int, default=LONGEST, help="largest grid length")
     parser.add_argument("-o", "--output", type=Path, help="figure to write (svg, png)")
     args = parser.parse_args()
     cameras = vendor(args.data)[:: args.every] if "optical" in args.sensors else []
-    images = (
-        three_swaths(args.data, args.altitudes and tuple(args.altitudes)) if "swaths" in args.sensors else []
-    )
+    images = three_swaths(args.data, args.altitudes and tuple(args.altitudes)) if "swaths" in args.sensors else []
     fits: dict[str, Fit] = {"barpc": ours, "barpc, lcurve-joint": paper}
     if args.rpcfit:
         fits["rpcfit"] = Peer(args.rpcfit).fit
@@ -176,8 +162,7 @@ def main() -> None:
                 found["optical"] = errors, [c.name for c in cameras]
             if "points" in args.sensors:
                 errors = [
-                    [error(fit, radar(args.data, n, s))] if s or n <= RADAR_LENGTH else [np.nan]
-                    for n, s in settings
+                    [error(fit, radar(args.data, n, s))] if s or n <= RADAR_LENGTH else [np.nan] for n, s in settings
                 ]
                 found["Sentinel-1"] = errors, ["points"]
             if images:

@@ -55,9 +55,7 @@ def report(path: Path) -> None:
             f"  rotated {words(rotated(Corrected(model, fixed), seen, image))}"
         )
     best = fit_rpc(found.model, found.size, (low, high), strict=False)
-    print(
-        f"  the best RPC of the model misses it by {words(best.rmse_ckp)} RMSE, {best.max_ckp.max():.2f} at most"
-    )
+    print(f"  the best RPC of the model misses it by {words(best.rmse_ckp)} RMSE, {best.max_ckp.max():.2f} at most")
 
 
 def main() -> None:

@@ -232,12 +232,7 @@ def _measured_series(name: str, span: float, rng: np.random.Generator) -> tuple[
     )
     sign = np.sign(w * d - x * a - y * b - z * c)[:, None]
     size = np.linalg.norm(vector, axis=1, keepdims=True)
-    rotation = (
-        2.0
-        * sign
-        * vector
-        * np.where(size > 1e-12, np.arcsin(np.clip(size, 0, 1)) / np.maximum(size, 1e-12), 1)
-    )
+    rotation = 2.0 * sign * vector * np.where(size > 1e-12, np.arcsin(np.clip(size, 0, 1)) / np.maximum(size, 1e-12), 1)
     t = np.arange(count) * step
     basis = np.vander((t - t.mean()) / np.ptp(t), 4)
     return t - step, rotation - basis @ np.linalg.lstsq(basis, rotation, rcond=None)[0]
@@ -253,9 +248,7 @@ def _attitude_error(errors: Errors, span: float, rng: np.random.Generator) -> Ca
         u = (2.0 * t / span - 1.0)[:, None]
         out = errors.attitude * constant + errors.drift * linear * u
         out = out + errors.quadratic * square * (1.5 * u**2 - 0.5)
-        out = out + errors.jitter * np.sqrt(2.0) * waves * np.sin(
-            2 * np.pi * errors.hertz * t[:, None] + phase
-        )
+        out = out + errors.jitter * np.sqrt(2.0) * waves * np.sin(2 * np.pi * errors.hertz * t[:, None] + phase)
         if measured is not None:
             at = np.clip(t + 0.1, measured[0][0], measured[0][-1])
             out = out + np.stack([np.interp(at, measured[0], axis) for axis in measured[1].T], axis=1)
@@ -349,9 +342,7 @@ def make(case: Case, relief: Callable[[Array, Array], Array] | None = None) -> S
     ground = _scatter(case, case.tracks, relief, rng, textured=True)
     made = [_fly(case, i, ground, np.random.default_rng([case.seed, i, 3])) for i in range(len(case.pitch))]
     size = (case.cols, case.rows)
-    views = tuple(
-        View(f"view_{i:02d}", f"view_{i:02d}.tif", size, rpc, alt) for i, (rpc, _, alt) in enumerate(made)
-    )
+    views = tuple(View(f"view_{i:02d}", f"view_{i:02d}.tif", size, rpc, alt) for i, (rpc, _, alt) in enumerate(made))
     flown = tuple(camera for _, camera, _ in made)
     tracks = _observe(flown, ground, size, rng, visible=0.9, fewest=2)
     xy = tracks.xy + rng.normal(0.0, case.noise, tracks.xy.shape)
@@ -375,9 +366,7 @@ def _observe(
     views, points, places = [], [], []
     for i, camera in enumerate(flown):
         image = camera.project(ground)
-        seen = ((image >= 0) & (image <= np.array(size) - 1)).all(axis=1) & (
-            rng.uniform(size=len(ground)) < visible
-        )
+        seen = ((image >= 0) & (image <= np.array(size) - 1)).all(axis=1) & (rng.uniform(size=len(ground)) < visible)
         index = np.flatnonzero(seen)
         views.append(np.full(len(index), i))
         points.append(index)
@@ -458,15 +447,9 @@ def judge(scene: Scene, sensors: Sequence[SensorModel]) -> Judged:
 def _epipolar(scene: Scene, sensors: Sequence[SensorModel], i: int, j: int) -> Array:
     """Offsets (n, 2) [px] of held-out points in view j, across and along the epipolar curve of view i."""
     check, truth = scene.check, scene.check_ground
-    row_i = dict(
-        zip(check.point[check.view == i].tolist(), np.flatnonzero(check.view == i).tolist(), strict=True)
-    )
+    row_i = dict(zip(check.point[check.view == i].tolist(), np.flatnonzero(check.view == i).tolist(), strict=True))
     rows_j = np.flatnonzero(check.view == j)
-    both = [
-        (row_i[p], r)
-        for p, r in zip(check.point[rows_j].tolist(), rows_j.tolist(), strict=True)
-        if p in row_i
-    ]
+    both = [(row_i[p], r) for p, r in zip(check.point[rows_j].tolist(), rows_j.tolist(), strict=True) if p in row_i]
     if not both:
         return np.zeros((0, 2))
     a, b = np.array(both).T
@@ -572,9 +555,7 @@ def referee(case: Case, options: AdjustOptions | None = None, relief: Any = None
             found.status,
             len(found.cost_history),
         )
-    return _verdict(
-        scene, sensors, found.gauge.sigma, found.gauge.shift, rejected, "", 0, (), cpu, ~found.held_out
-    )
+    return _verdict(scene, sensors, found.gauge.sigma, found.gauge.shift, rejected, "", 0, (), cpu, ~found.held_out)
 
 
 def referee_run(case: Case, relief: Any = None, **options: Any) -> Verdict:
@@ -720,9 +701,7 @@ GOOD_MOVE = 3.0
 def statements(seeds: int, relief: Any) -> str:
     """What is said of every case under several seeds, against what is true."""
     runs, unsaid, false = 0, [], []
-    clean = {
-        name for name, case in cases().items() if case.name.startswith(("no drift", "drift 0.3", "scale"))
-    }
+    clean = {name for name, case in cases().items() if case.name.startswith(("no drift", "drift 0.3", "scale"))}
     for name, case in cases().items():
         for seed in range(seeds):
             found = referee_run(replace(case, seed=seed), relief)
@@ -745,9 +724,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="Cases whose name holds this.")
     parser.add_argument("--run", action="store_true", help="The whole command, not the solver alone.")
     parser.add_argument("--statements", action="store_true", help="Count what is said and what is true.")
-    parser.add_argument(
-        "--option", action="append", default=[], metavar="NAME=VALUE", help="Of AdjustOptions."
-    )
+    parser.add_argument("--option", action="append", default=[], metavar="NAME=VALUE", help="Of AdjustOptions.")
     given = parser.parse_args()
     warnings.simplefilter("ignore", NotGeoreferencedWarning)
     options = {name: json.loads(value) for name, _, value in (o.partition("=") for o in given.option)}

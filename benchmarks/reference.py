@@ -83,9 +83,7 @@ def errors(scene: Scene, folder: Path, images: list[Path]) -> tuple[np.ndarray, 
     return np.einsum("nij,nj->ni", enu_basis(ground), offset).mean(axis=0), ground
 
 
-def row(
-    case: Case, off: float, seed: int, folder: Path
-) -> tuple[np.ndarray, float, np.ndarray, float, float]:
+def row(case: Case, off: float, seed: int, folder: Path) -> tuple[np.ndarray, float, np.ndarray, float, float]:
     """Error (3,) [m], mean error of the terrain [m], what is stated (3,), lowest peak, farthest camera as delivered."""
     scene = scene_of(case, off, seed)
     kind = folder / f"scene_{scene.options.gsd:g}_{off:g}_{seed}"
@@ -115,9 +113,7 @@ def row(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--cases", type=float, nargs="*", help="resolutions of references [m]; default: all")
     given = parser.parse_args()

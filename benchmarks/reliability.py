@@ -59,9 +59,7 @@ def cost_of_a_task() -> None:
             for future in [caching.submit(nothing, n) for n in range(tasks)]:
                 future.result()
         cached = 1e3 * (time.perf_counter() - began) / tasks
-        print(
-            f"{name:22} one by one {alone:6.2f} ms, by CachingExecutor (result kept on disk) {cached:6.2f} ms"
-        )
+        print(f"{name:22} one by one {alone:6.2f} ms, by CachingExecutor (result kept on disk) {cached:6.2f} ms")
 
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         measure("process pool, 2", pool, 2000)
@@ -209,9 +207,7 @@ def main() -> None:
     kill.add_argument("--trials", type=int, default=200)
     kill.add_argument("--jobs", type=int, default=1)
     verbs.add_parser("fuzz").add_argument("--runs", type=int, default=1_000_000)
-    verbs.add_parser("faults").add_argument(
-        "--every", type=int, default=5, help="each so many-th call of a kind"
-    )
+    verbs.add_parser("faults").add_argument("--every", type=int, default=5, help="each so many-th call of a kind")
     verbs.add_parser("identity")
     verbs.add_parser("task")
     peak = verbs.add_parser("memory")

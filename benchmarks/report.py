@@ -25,9 +25,7 @@ from barpc.simulate import simulate_block
 def block_run(num_views: int, num_tracks: int) -> Run:
     block = simulate_block(num_views, num_tracks, seed=1, outliers=0.05, attitude=3e-6)
     adjustment = adjust_tracks(block.views, block.tracks)
-    fits = tuple(
-        fit_rpc(s, v.size, v.alt_range) for s, v in zip(adjustment.sensors, block.views, strict=True)
-    )
+    fits = tuple(fit_rpc(s, v.size, v.alt_range) for s, v in zip(adjustment.sensors, block.views, strict=True))
     return Run("adjust", block.views, (), block.tracks, adjustment=adjustment, fits=fits)
 
 
@@ -42,9 +40,7 @@ def seconds(function: Callable[[], Any], repeats: int) -> tuple[float, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", type=int, nargs="+", default=[3, 30, 50, 200], help="views of each block")
     parser.add_argument("--tracks", type=int, default=400, help="tracks a view")
     parser.add_argument("--repeats", type=int, default=3, help="the median of so many runs is printed")
@@ -68,9 +64,7 @@ def main() -> None:
         )
         if num_views == 50:
             everything = tables_seconds + page_seconds
-            print(
-                f"        page {megabytes / 3:.2f} of the 3 MB, tables and page {everything / 5:.2f} of the 5 s"
-            )
+            print(f"        page {megabytes / 3:.2f} of the 3 MB, tables and page {everything / 5:.2f} of the 5 s")
 
 
 if __name__ == "__main__":

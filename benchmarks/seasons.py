@@ -69,11 +69,7 @@ def covered(share: float) -> Change:
 def speckled(pixels: np.ndarray, seed: int) -> np.ndarray:
     """Classes of grey in other tones under the speckle of four looks: no radar image, but as noisy as one."""
     rng = np.random.default_rng([seed, 81])
-    return (
-        (disguised(pixels, seed, 0.5, 0.0) * rng.gamma(4.0, 0.25, pixels.shape))
-        .clip(1, 9e3)
-        .astype(np.uint16)
-    )
+    return (disguised(pixels, seed, 0.5, 0.0) * rng.gamma(4.0, 0.25, pixels.shape)).clip(1, 9e3).astype(np.uint16)
 
 
 def banded(pixels: np.ndarray, seed: int) -> np.ndarray:
@@ -203,9 +199,7 @@ def ground(files: list[tuple[str, tuple[int, int]]], at: np.ndarray) -> np.ndarr
 
 def angles(seeds: int) -> None:
     """Tie points of rendered pairs against what was rendered, the second image disguised."""
-    print(
-        "| rays apart [deg] | case | seed | tracks | across, along [px] | more than 1, 2 px off across | tied by |"
-    )
+    print("| rays apart [deg] | case | seed | tracks | across, along [px] | more than 1, 2 px off across | tied by |")
     print("|---|---|---|---|---|---|---|")
     for apart, seed in itertools.product((15, 30, 45, 58), range(seeds)):
         orbit.PITCH = 0.5 * apart
@@ -234,9 +228,7 @@ def angles(seeds: int) -> None:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, metavar="DATA")
     parser.add_argument("--judge", metavar="TOOL", help="program that prints JSON with rms")
     parser.add_argument("--seeds", type=int, default=3)

@@ -181,9 +181,7 @@ def measure_rpc(model, ground, image, options, other) -> None:
     fit = fit_rpc(model, model.size, model.alt_range, options=FitOptions(nodes="uniform"), strict=False)
     error = fit.rpc.project(ground) - image
     print(f"  {'':44s}{'barpc':>12s}{'rpcfit' if other else '':>12s}")
-    line(
-        "RPC, 50x50x10 box, columns, check RMSE [px]", box.rmse_ckp[0], other and float(other["rmse_True"][0])
-    )
+    line("RPC, 50x50x10 box, columns, check RMSE [px]", box.rmse_ckp[0], other and float(other["rmse_True"][0]))
     line("RPC, 50x50x10 box, rows, check RMSE [px]", box.rmse_ckp[1], other and float(other["rmse_True"][1]))
     line("RPC, image grid, columns, inside RMSE [px]", float(np.sqrt((error[:, 0] ** 2).mean())), None)
     line("RPC, image grid, largest error certified [px]", float(fit.max_ckp.max()), None)
@@ -200,14 +198,10 @@ def main() -> None:
             result = {"eos": peer_eos, "rpcfit": peer_rpcfit}[peer](annotation, dict(data))
         np.savez(f"{folder}/out.npz", **result)
         return
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("annotations", nargs="*", type=Path, help="annotation XML files")
     parser.add_argument("--ew", action="store_true", help="also a synthetic EW swath")
-    parser.add_argument(
-        "--eos", default=os.environ.get("BARPC_EOS_PYTHON"), help="interpreter that has eos-sar"
-    )
+    parser.add_argument("--eos", default=os.environ.get("BARPC_EOS_PYTHON"), help="interpreter that has eos-sar")
     parser.add_argument("--rpcfit", default=os.environ.get("BARPC_RPCFIT_PYTHON"), help="one that has rpcfit")
     args = parser.parse_args()
     warnings.simplefilter("ignore")

@@ -95,9 +95,7 @@ def machine() -> str:
 
 def main() -> None:
     """Run, then print or write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder of real images and RPC files")
     parser.add_argument("--peers", metavar="PYTHON", help="interpreter that has rpcm and shareloc")
     parser.add_argument("--rpcfit", metavar="DIR", help="site-packages folder that holds rpcfit")

@@ -59,14 +59,10 @@ def rectification(cameras, sizes, alts):
     a, b, alt = virtual_matches(cameras, sizes, alts)
     rows = np.hstack([a, b])
     mean = rows.mean(axis=0)
-    n = np.linalg.svd(rows - mean, full_matrices=False)[2][
-        -1
-    ]  # n . (a, b) = n . mean: affine epipolar geometry
+    n = np.linalg.svd(rows - mean, full_matrices=False)[2][-1]  # n . (a, b) = n . mean: affine epipolar geometry
     n = n if n[1] > 0 else -n
     k = np.sqrt(np.hypot(*n[:2]) * np.hypot(*n[2:]))
-    left = np.array([[n[1], -n[0], 0.0], [n[0], n[1], -n[:2] @ mean[:2]]]) / np.array(
-        [[np.hypot(*n[:2])], [k]]
-    )
+    left = np.array([[n[1], -n[0], 0.0], [n[0], n[1], -n[:2] @ mean[:2]]]) / np.array([[np.hypot(*n[:2])], [k]])
     y_b = -(b - mean[2:]) @ n[2:] / k
     x_a = a @ left[0, :2]
     middle = abs(alt - np.mean(alts)) < 1
@@ -99,12 +95,7 @@ def vertical_offsets(a, b, disparities):
         for x in range(PATCH + max(high, 0), a.shape[1] - PATCH + min(low, 0), 2 * PATCH):
             patch = a[y - PATCH : y + PATCH + 1, x - PATCH : x + PATCH + 1]
             window = b[y - PATCH - reach : y + PATCH + reach + 1, x - high - PATCH : x - low + PATCH + 1]
-            if (
-                window.shape[1] < 2 * PATCH + 4
-                or (patch == 0).any()
-                or (window == 0).any()
-                or patch.std() < 8
-            ):
+            if window.shape[1] < 2 * PATCH + 4 or (patch == 0).any() or (window == 0).any() or patch.std() < 8:
                 continue
             score = cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED)
             row, col = np.unravel_index(score.argmax(), score.shape)

@@ -79,9 +79,7 @@ def scene(size: tuple[int, int], period: float, pixels: float):
     """Views with their RPCs as delivered, true cameras, images, and the ground (H, W, 3) in the middle."""
     cols, rows = size
     nadir = fly(TARGET, Look(0.0, 12.0), size, GSD)
-    reach = np.abs(
-        np.array([nadir.localize(np.array([c, r]), np.array(230.0)) for c in (0, cols) for r in (0, rows)])
-    )
+    reach = np.abs(np.array([nadir.localize(np.array([c, r]), np.array(230.0)) for c in (0, cols) for r in (0, rows)]))
     plane = Plane(5.4, 43.3)
     edge = float(np.abs(plane.xy(reach)).max()) + 60.0
     rng = np.random.default_rng(5)
@@ -198,9 +196,7 @@ def main() -> None:
     parser.add_argument("--cols", type=int, default=240)
     parser.add_argument("--period", type=float, default=1200.0, help="of the swing [rows]")
     parser.add_argument("--pixels", type=float, default=0.5, help="of the swing")
-    parser.add_argument(
-        "--dense", action="store_true", help="every pixel's disparity; no tiles, none resampled"
-    )
+    parser.add_argument("--dense", action="store_true", help="every pixel's disparity; no tiles, none resampled")
     parser.add_argument("--cars", type=Path, help="leave files for CARS in this new folder")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -221,9 +217,7 @@ def main() -> None:
                                     for p in (arguments.period, 1.3 * arguments.period)])  # fmt: skip
             wave = waves.T @ np.linalg.lstsq(waves.T, heights, rcond=None)[0]
             across = float(np.sqrt((rest[:, 0] ** 2).mean()))
-            print(
-                f"{kind:18}{across:17.3f}{heights.std():17.3f}{np.abs(heights).max():13.3f}{wave.std():18.3f}"
-            )
+            print(f"{kind:18}{across:17.3f}{heights.std():17.3f}{np.abs(heights).max():13.3f}{wave.std():18.3f}")
 
 
 if __name__ == "__main__":

@@ -184,9 +184,7 @@ def shifts(data: Path) -> None:
     print("|---|---|---|---|---|")
     images = [pixels(data / f"optical/phr_triplet_north/{name}.tif") for name in ("img_01", "img_02")]
     cases = [(kind, *case, False) for kind, case in KINDS.items()]
-    cases += [
-        (f"{kind}: as check points", *KINDS[kind], True) for kind in ("means, a lens", "fourier", "slope")
-    ]
+    cases += [(f"{kind}: as check points", *KINDS[kind], True) for kind in ("means, a lens", "fourier", "slope")]
     for kind, make, noise, exchanged, checks in cases:
         rng, rows = np.random.default_rng(0), []
         for phase in phases(kind):
@@ -197,9 +195,7 @@ def shifts(data: Path) -> None:
                 both = [one + noise * one.std() * rng.normal(size=one.shape) for one in (first, second)]
                 off.append(errors(*both, where, exchanged, checks))
             one = np.concatenate(off)
-            rows.append(
-                (len(one), *one.mean(axis=0), *(one.std(axis=0) / len(one) ** 0.5), np.sqrt((one**2).mean()))
-            )
+            rows.append((len(one), *one.mean(axis=0), *(one.std(axis=0) / len(one) ** 0.5), np.sqrt((one**2).mean())))
         table = np.array(rows)
         worst = np.abs(table[:, 1:3]).argmax(axis=0)
         mean = [table[worst[k], 1 + k] for k in (0, 1)]
@@ -218,9 +214,7 @@ def patch_of(coefficients: Array, centre: Array, linear: Array, half: int) -> Ar
     """A patch of an image's quintic spline about a place, on axes turned by `linear`."""
     y, x = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64)
     at = centre[:, None, None] + np.tensordot(linear, np.stack([x, y]), axes=1)
-    return np.asarray(
-        ndimage.map_coordinates(coefficients, at[::-1], order=5, mode="mirror", prefilter=False)
-    )
+    return np.asarray(ndimage.map_coordinates(coefficients, at[::-1], order=5, mode="mirror", prefilter=False))
 
 
 def by_correlation(pair: tuple[Array, Array], a: Array, b: Array, linear: Array, half: int = 10) -> Array:
@@ -272,9 +266,7 @@ def by_least_squares(pair: tuple[Array, Array], a: Array, b: Array, linear: Arra
         return np.full(2, np.nan)
     if np.hypot(*shift) > 2.0:
         return np.full(2, np.nan)
-    whole = (
-        linear @ (np.eye(2) + 0.5 * turn) @ np.linalg.inv(np.eye(2) - 0.5 * turn)
-    )  # first -> second about them
+    whole = linear @ (np.eye(2) + 0.5 * turn) @ np.linalg.inv(np.eye(2) - 0.5 * turn)  # first -> second about them
     return np.asarray(b + 0.5 * linear @ shift + whole @ (0.5 * shift))
 
 
@@ -379,9 +371,7 @@ def row(name: str, places: str, other: str, off: Array, good: Array) -> None:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("--only", choices=["shifts", "pairs"])
     given = parser.parse_args()

@@ -154,9 +154,7 @@ def left(listed: Path, out: Path) -> tuple[float, float]:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", type=int, nargs="+", default=[100, 300, 1000], help="images, ascending")
     parser.add_argument("--tracks", type=int, default=95, help="tracks an image")
     parser.add_argument("--matching", type=int, metavar="SIDE", help="match images of so many pixels a side")
@@ -175,9 +173,7 @@ def main() -> None:
             trials[num] = found = run(listed, folder / f"run_{listed.parent.name}", options.jobs)
             if options.matching is not None:
                 before, after = left(listed, folder / f"run_{listed.parent.name}")
-                print(
-                    f"{num} images: exact tie points are left with {before:.2f} -> {after:.3f} px", flush=True
-                )
+                print(f"{num} images: exact tie points are left with {before:.2f} -> {after:.3f} px", flush=True)
             counts = f"{num:7d}  {found.summary['tracks']['num_tracks']:7d}  {len(found.summary['pairs']):7d}"
             print(
                 f"{counts}  {found.cpu:7.1f}  {found.wall:9.1f}  {found.memory:11.0f}  {found.page:16.2f}",

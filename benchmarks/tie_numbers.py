@@ -41,9 +41,7 @@ from benchmarks.seasons import CASES, write  # noqa: E402
 from benchmarks.ties import spread  # noqa: E402
 
 warnings.simplefilter("ignore")
-MODULES = [
-    importlib.import_module(found.name) for found in pkgutil.walk_packages(barpc.tie.__path__, "barpc.tie.")
-]
+MODULES = [importlib.import_module(found.name) for found in pkgutil.walk_packages(barpc.tie.__path__, "barpc.tie.")]
 
 
 def numbers() -> Iterator[tuple[Any, str]]:
@@ -78,9 +76,7 @@ def times(value: Any, factor: float) -> Any:
 def changed(module: Any, name: str, value: object) -> Iterator[None]:
     """Set a number in all modules that hold it under its name."""
     was = getattr(module, name)
-    places = [
-        m for m in MODULES if getattr(m, name, None) is was and (m is module or not name.startswith("_"))
-    ]
+    places = [m for m in MODULES if getattr(m, name, None) is was and (m is module or not name.startswith("_"))]
     for place in places:
         setattr(place, name, value)
     try:
@@ -127,9 +123,7 @@ def figures(views: list[View], options: TieOptions) -> str:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, metavar="DATA")
     parser.add_argument("--only", default="", help="modules with this in their names")
     parser.add_argument("--numbers", nargs="*", help="only these names")
@@ -148,9 +142,7 @@ def main() -> None:
                     continue
                 with changed(module, name, other):
                     row = " | ".join(figures(*pair) for pair in chosen.values())
-                print(
-                    f"| {module.__name__.removeprefix('barpc.tie.')}.{name} | {other} | {row} |", flush=True
-                )
+                print(f"| {module.__name__.removeprefix('barpc.tie.')}.{name} | {other} | {row} |", flush=True)
 
 
 if __name__ == "__main__":

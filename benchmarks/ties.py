@@ -114,16 +114,12 @@ def opencv(views: list[View]) -> float:
         for j in range(i + 1, len(views)):
             (points_a, described_a), (points_b, described_b) = found[i], found[j]
             flann = cv2.FlannBasedMatcher({"algorithm": 1, "trees": 4}, {"checks": 64})
-            pairs = [
-                m for m, n in flann.knnMatch(described_a, described_b, k=2) if m.distance < 0.7 * n.distance
-            ]
+            pairs = [m for m, n in flann.knnMatch(described_a, described_b, k=2) if m.distance < 0.7 * n.distance]
             a = np.float64([points_a[m.queryIdx].pt for m in pairs])
             b = np.float64([points_b[m.trainIdx].pt for m in pairs])
             _, mask = cv2.findFundamentalMat(a, b, cv2.USAC_MAGSAC, 1.0, 0.999, 10000)
             keep = mask.ravel() > 0
-            print(
-                f"  {i} - {j}: {keep.sum()} inliers, spread {spread(views[i], views[j], a[keep], b[keep]):.3f} px"
-            )
+            print(f"  {i} - {j}: {keep.sum()} inliers, spread {spread(views[i], views[j], a[keep], b[keep]):.3f} px")
     return time.process_time() - start
 
 
@@ -192,20 +188,14 @@ def scene(side: int, folder: str, layout: dict[str, object], unrelated: bool = F
     paths = [Path(folder) / f"{k}.tif" for k in range(2)]
     profile = {"driver": "GTiff", "width": side, "height": side, "count": 1, "dtype": "uint16", **layout}
     files = [rasterio.open(path, "w", BIGTIFF="YES", **profile) for path in paths]
-    fine, coarse = (
-        cv2.GaussianBlur(rng.normal(0, 1, (1500, 1500)).astype(np.float32), (0, 0), s) for s in (1.2, 5.0)
-    )
+    fine, coarse = (cv2.GaussianBlur(rng.normal(0, 1, (1500, 1500)).astype(np.float32), (0, 0), s) for s in (1.2, 5.0))
     texture = 150 * fine / fine.std() + 250 * coarse / coarse.std()
     noise = rng.normal(0, 10, (1024 + 64, side + 64)).astype(np.float32)
     quiet = np.where(np.arange(side) < side / 2, 1 / 3, 1.0).astype(np.float32)
     above = None
     for row in range(0, side, 1024):
-        blocks = [
-            texture[r : r + 1024, c : c + 1024] for r, c in rng.integers(0, 470, (-(-side // 1024) + 1, 2))
-        ]
-        turned = [
-            np.rot90(block, n) for block, n in zip(blocks, rng.integers(0, 4, len(blocks)), strict=True)
-        ]
+        blocks = [texture[r : r + 1024, c : c + 1024] for r, c in rng.integers(0, 470, (-(-side // 1024) + 1, 2))]
+        turned = [np.rot90(block, n) for block, n in zip(blocks, rng.integers(0, 4, len(blocks)), strict=True)]
         band = np.hstack(turned)
         both = np.vstack([band[:8] if above is None else above[-8:], band])
         above = band
@@ -272,9 +262,7 @@ def size(side: int, share: float | None, layout: str) -> None:
     left = np.mean(tracks.xy[tracks.view == 0, 0] < side / 2)
     print(f"{side} x {side}, {layout}: {result.keypoints} keypoints, {tracks.num_points} tracks")
     print(f"  {left:.3f} of them in the half with a third of the contrast")
-    print(
-        f"  {sum(seconds):.0f} CPU s (caller {seconds[0]:.0f}), {sum(seconds) / (2e-6 * side * side):.3f} s a Mpx"
-    )
+    print(f"  {sum(seconds):.0f} CPU s (caller {seconds[0]:.0f}), {sum(seconds) / (2e-6 * side * side):.3f} s a Mpx")
     print(f"  caller grew by {peak(os.getpid()) - fresh:.0f} MB to its peak, worker's peak {worker:.0f} MB")
     print(f"  {kept / 2e6:.1f} MB an image in the run folder")
 
@@ -297,14 +285,10 @@ def _status(process: int, name: str) -> float:
 
 def main() -> int:
     """Run what is asked for."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("images", nargs="*", type=Path, metavar="IMG")
     parser.add_argument("--cars", metavar="PYTHON", help="interpreter of an environment with cars")
-    parser.add_argument(
-        "--size", type=int, metavar="SIDE", help="evenness, memory and time of a made-up pair"
-    )
+    parser.add_argument("--size", type=int, metavar="SIDE", help="evenness, memory and time of a made-up pair")
     parser.add_argument("--layout", choices=LAYOUTS, default="tiles", help="how that pair is stored")
     parser.add_argument("--area", type=float, metavar="SHARE", help="only in the middle of that pair")
     parser.add_argument("--unrelated", action="store_true", help="a made-up pair that has nothing in common")

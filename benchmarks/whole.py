@@ -40,9 +40,7 @@ def turn(checkout: Path, compiled: str, arguments: list[str]) -> dict[str, float
 
 def main() -> int:
     """Run what is asked for."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("arguments", nargs="+", metavar="IMG", help="images and options of `barpc adjust`")
     parser.add_argument("--against", type=Path, action="append", default=[], metavar="FOLDER")
     parser.add_argument("--turns", type=int, default=7)

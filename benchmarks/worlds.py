@@ -113,11 +113,7 @@ def command(world: World) -> Outcome:
             return Outcome("refused", 1, words, words, none, none, (np.nan,) * 3, 0, {}, seconds)
         told = result.summary
     rows = {row["name"]: row for row in told["views"]}
-    marks = {
-        n: f"{r['status']}: {r['advice']}"
-        for n, r in rows.items()
-        if r["status"] != "adjusted" or r["advice"]
-    }
+    marks = {n: f"{r['status']}: {r['advice']}" for n, r in rows.items() if r["status"] != "adjusted" or r["advice"]}
     files = {view.name: view.sensor for view in result.views}
     adjusted = dict(zip(result.adjustment.names, result.adjustment.sensors, strict=True))
     return Outcome(
@@ -151,9 +147,7 @@ def solver(world: World) -> Outcome:
         found = adjust_tracks(world.views, world.tracks, DEM_AS_STATED, world.gcps, world.dem)
     except BarpcError as error:
         none = tuple(view.sensor for view in world.views)
-        return Outcome(
-            "refused", 1, (str(error),), (), none, none, (np.nan,) * 3, 0, {}, time.process_time() - start
-        )
+        return Outcome("refused", 1, (str(error),), (), none, none, (np.nan,) * 3, 0, {}, time.process_time() - start)
     cut = int((~(found.inlier | found.held_out)).sum())
     sigma = tuple(float(s) for s in found.gauge.sigma)
     return Outcome("-", -1, (), (), found.sensors, found.sensors, sigma, cut, {}, time.process_time() - start)
@@ -381,9 +375,7 @@ def _far(r: Result) -> list[str]:
 
 
 def _want_local(r: Result, _plan: Plan) -> list[str]:
-    left = min(
-        r.files.left, r.adjusted.left
-    )  # no RPC holds a step: what one leaves is said, and grids are offered
+    left = min(r.files.left, r.adjusted.left)  # no RPC holds a step: what one leaves is said, and grids are offered
     return _unsaid(r) + ([f"left {left:.3f}"] if not left <= 0.05 else [])
 
 
@@ -400,9 +392,7 @@ def _want_swing(r: Result, plan: Plan) -> list[str]:
     spoken = [w for w in (*r.words, *r.marks.values()) if re.search(_SWINGS, w)]
     faults = ["says detector"] if "detector" in _all_words(r) else []
     if fault.size < 0.03:
-        return faults + (
-            ["claims a swing"] if spoken or re.search("jitter|spline|step", _all_words(r)) else []
-        )
+        return faults + (["claims a swing"] if spoken or re.search("jitter|spline|step", _all_words(r)) else [])
     if not r.adjusted.left <= 0.03:  # no RPC holds hundreds of waves: what one leaves is said of its image
         faults.append(f"left {r.adjusted.left:.3f}")
     if r.code < 0:
@@ -604,9 +594,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help=f"Families, by commas: {', '.join(FAMILIES)}.")
     parser.add_argument("--seeds", default="0-5", metavar="0-9,12")
     parser.add_argument("--json", type=Path, help="Everything, for programs.")
-    parser.add_argument(
-        "--solver-only", action="store_true", help="adjust_tracks alone: no files, nothing said."
-    )
+    parser.add_argument("--solver-only", action="store_true", help="adjust_tracks alone: no files, nothing said.")
     parser.add_argument("--words", action="store_true", help="What was said of each.")
     parser.add_argument("--selftest", action="store_true", help="The worlds against themselves.")
     given = parser.parse_args()

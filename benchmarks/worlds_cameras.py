@@ -96,9 +96,7 @@ def vector(matrix: Array) -> Array:
         -1,
     )
     sine = np.linalg.norm(skew, axis=1, keepdims=True) / 2.0
-    return np.asarray(
-        skew / 2.0 * np.where(sine > 1e-9, np.arcsin(np.clip(sine, 0, 1)) / np.maximum(sine, 1e-30), 1)
-    )
+    return np.asarray(skew / 2.0 * np.where(sine > 1e-9, np.arcsin(np.clip(sine, 0, 1)) / np.maximum(sine, 1e-30), 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,9 +222,7 @@ class Camera:
     def _pose(self, row: Array, flaw: Flaw) -> tuple[Array, Array]:
         """Place (n, 3) and attitude (n, 3, 3) at rows."""
         lag = (row - (self.size[1] - 1) / 2.0) * self.period * (1.0 + flaw.rate)
-        turn = np.asarray(
-            np.polynomial.chebyshev.chebval(np.clip(lag / self._half(), -1.2, 1.2), self.turns).T, float
-        )
+        turn = np.asarray(np.polynomial.chebyshev.chebval(np.clip(lag / self._half(), -1.2, 1.2), self.turns).T, float)
         off = np.zeros((len(row), 2))
         for pointing in flaw.pointing:
             off = off + pointing(row)
@@ -238,9 +234,7 @@ class Camera:
         """Tangents x, y (n, 2) of columns; of `flaw` the focal length."""
         half = (self.size[0] - 1) / 2.0
         u = (col - half) / half
-        return (
-            np.stack([self.bow * u**2, -(u * half + self.bend * u**3)], -1) * self.ifov * (1.0 + flaw.focal)
-        )
+        return np.stack([self.bow * u**2, -(u * half + self.bend * u**3)], -1) * self.ifov * (1.0 + flaw.focal)
 
     def _column(self, y: Array, flaw: Flaw) -> Array:
         """The column (n,) of a tangent y (n,)."""
@@ -340,9 +334,7 @@ def aim(
         look = aims[1] - orbit.at(time + lag)[0]
         attitude = np.stack([_frame(d, v) for d, v in zip(look, aims[2] - aims[0], strict=True)])
         first = _frame(target - place[0], over)
-    turns = np.polynomial.chebyshev.chebfit(
-        lag / _half_span(size[1], period), vector(first.T @ attitude), _DEGREE
-    )
+    turns = np.polynomial.chebyshev.chebfit(lag / _half_span(size[1], period), vector(first.T @ attitude), _DEGREE)
     return Camera(orbit, time, period, size, ifov, first, np.asarray(turns, dtype=float), *optics)
 
 
@@ -407,9 +399,7 @@ def rpc_of(camera: Camera, alt_range: tuple[float, float]) -> tuple[RPC, float]:
     return rpc, float(np.abs(rpc.project(ground) - image).max())
 
 
-def _grid(
-    camera: Camera, alt_range: tuple[float, float], counts: Sequence[int], margin: float
-) -> tuple[Array, Array]:
+def _grid(camera: Camera, alt_range: tuple[float, float], counts: Sequence[int], margin: float) -> tuple[Array, Array]:
     cols, rows = camera.size
     col = np.linspace(-margin, 1 + margin, counts[0]) * (cols - 1)
     row = np.linspace(-margin, 1 + margin, counts[1]) * (rows - 1)
@@ -424,9 +414,7 @@ def _quotient(terms: Array, goal: Array) -> Array:
     ridge = 1e-7 * np.sqrt(len(goal)) * np.eye(39)
     for _ in range(4):
         matrix = np.hstack([terms, -goal[:, None] * terms[:, 1:]]) * weight[:, None]
-        found = np.linalg.lstsq(
-            np.vstack([matrix, ridge]), np.append(goal * weight, np.zeros(39)), rcond=None
-        )[0]
+        found = np.linalg.lstsq(np.vstack([matrix, ridge]), np.append(goal * weight, np.zeros(39)), rcond=None)[0]
         below = np.append(1.0, found[20:])
         weight = 1.0 / (terms @ below)
     return np.concatenate([found[:20], below])
@@ -469,9 +457,7 @@ class Relief:
 
 def main() -> None:
     """Say what this is for."""
-    argparse.ArgumentParser(
-        description="Cameras for benchmarks/worlds.py, which has the commands."
-    ).parse_args()
+    argparse.ArgumentParser(description="Cameras for benchmarks/worlds.py, which has the commands.").parse_args()
 
 
 if __name__ == "__main__":

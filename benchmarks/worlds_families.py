@@ -67,9 +67,7 @@ class Injected:
     note: str = ""
 
     def __str__(self) -> str:
-        where = (
-            f" {('cols', 'rows')[self.axis]} {self.low:.0f}-{self.high:.0f}" if self.high > self.low else ""
-        )
+        where = f" {('cols', 'rows')[self.axis]} {self.low:.0f}-{self.high:.0f}" if self.high > self.low else ""
         names = "+".join(NAMES[v] for v in self.views) if len(self.views) < 4 else f"{len(self.views)} views"
         return f"{self.kind} {names}{where} {self.size:.3g} px{' ' if self.note else ''}{self.note}"
 
@@ -121,9 +119,7 @@ class Plan:
         return np.array([np.cos(angle), np.sin(angle)])
 
 
-def draw(
-    rng: np.random.Generator, num: int, *, agile: bool = False, side: tuple[int, int] = (8000, 30000)
-) -> Plan:
+def draw(rng: np.random.Generator, num: int, *, agile: bool = False, side: tuple[int, int] = (8000, 30000)) -> Plan:
     """A world of `num` views without any fault but constant ones."""
     place = np.array([rng.uniform(-170, 170), rng.uniform(-58, 64), rng.uniform(0, 1500)])
     gsd = float(np.exp(rng.uniform(np.log(0.3), np.log(2.0))))
@@ -142,9 +138,7 @@ def draw(
         looks = [Look(float(p), roll + rng.uniform(-1, 1), heading) for p in pitches]
     if agile:
         scans = rng.uniform(0, 360, num)
-        looks = [
-            replace(k, scan=float(s), speed=rng.uniform(0.8, 1.3)) for k, s in zip(looks, scans, strict=True)
-        ]
+        looks = [replace(k, scan=float(s), speed=rng.uniform(0.8, 1.3)) for k, s in zip(looks, scans, strict=True)]
     flaws = [Flaw(rng.normal(0, 10e-6, 3), rng.normal(0, 2.0, 3)) for _ in range(num)]
     return Plan(
         rng,
@@ -236,12 +230,8 @@ def _vehicles(plan: Plan) -> None:
 
     def move(uv: Array, gap: float) -> tuple[Array, Array]:
         road = roads[rng.integers(0, 3, len(uv))]
-        speed = (
-            (rng.uniform(size=len(uv)) < part) * rng.uniform(*sizes, len(uv)) * rng.choice([-1, 1], len(uv))
-        )
-        return (speed * plan.gsd / gap)[:, None] * np.stack([np.cos(road), np.sin(road)], -1), np.zeros(
-            len(uv)
-        )
+        speed = (rng.uniform(size=len(uv)) < part) * rng.uniform(*sizes, len(uv)) * rng.choice([-1, 1], len(uv))
+        return (speed * plan.gsd / gap)[:, None] * np.stack([np.cos(road), np.sin(road)], -1), np.zeros(len(uv))
 
     plan.moves.append(move)
     plan.injected.append(Injected("vehicles", (), 1, 0, 0, sizes[1], f"{100 * part:.1f} % of ties"))
@@ -267,9 +257,7 @@ def _strange(plan: Plan, view: int, kind: str) -> None:
 
     def axes(rpc: RPC, _orbit: Pass, _alt: tuple[float, float]) -> RPC:
         coeffs = rpc.coeffs[[2, 3, 0, 1]]
-        return replace(
-            rpc, coeffs=coeffs, image_offset=rpc.image_offset[::-1], image_scale=rpc.image_scale[::-1]
-        )
+        return replace(rpc, coeffs=coeffs, image_offset=rpc.image_offset[::-1], image_scale=rpc.image_scale[::-1])
 
     def shifted(rpc: RPC, _orbit: Pass, _alt: tuple[float, float]) -> RPC:
         return replace(rpc, image_offset=rpc.image_offset + tile)
@@ -284,9 +272,7 @@ def _strange(plan: Plan, view: int, kind: str) -> None:
         "datum": 50.0 * slope / plan.gsd,
     }
     plan.deliver[view] = {"date": date, "axes": axes, "tile": shifted, "datum": datum}[kind]
-    note = {"date": f"roll {other.roll - look.roll:+.0f} pitch {other.pitch - look.pitch:+.0f} deg"}.get(
-        kind, ""
-    )
+    note = {"date": f"roll {other.roll - look.roll:+.0f} pitch {other.pitch - look.pitch:+.0f} deg"}.get(kind, "")
     plan.injected.append(Injected(f"foreign {kind}", (view,), 1, 0, 0, float(sizes[kind]), note))
 
 
@@ -347,13 +333,9 @@ def _priors(seed: int, rng: np.random.Generator) -> Plan:
     factor = (3.0, 6.0)[(seed // 2) % 2]
     for view, look in enumerate(plan.looks):
         metres = plan.altitude / np.cos(np.radians(np.hypot(look.pitch, look.roll)))
-        plan.flaw(
-            view, attitude=rng.normal(0, factor * PRIOR / metres, 3), place=rng.normal(0, factor * PRIOR, 3)
-        )
+        plan.flaw(view, attitude=rng.normal(0, factor * PRIOR / metres, 3), place=rng.normal(0, factor * PRIOR, 3))
     size = factor * PRIOR / plan.gsd
-    plan.injected.append(
-        Injected("priors", tuple(range(len(plan.looks))), 1, 0, 0, size, f"{factor:g} times")
-    )
+    plan.injected.append(Injected("priors", tuple(range(len(plan.looks))), 1, 0, 0, size, f"{factor:g} times"))
     return plan
 
 
@@ -370,9 +352,7 @@ def _wander(seed: int, rng: np.random.Generator) -> Plan:
             start = float(rng.uniform(0, 0.8) * rows)
             shift = 20e-6 / ifov * plan.direction()
             plan.flaw(view, pointing=_fade(start, 1.0 / period, shift))
-            plan.injected.append(
-                Injected("settling", (view,), 1, start, start, 20e-6 / ifov, f"from row {start:.0f}")
-            )
+            plan.injected.append(Injected("settling", (view,), 1, start, start, 20e-6 / ifov, f"from row {start:.0f}"))
         if kind in ("focal", "all"):
             plan.flaw(view, focal=rng.choice([-1e-4, 1e-4]))
         if kind in ("rate", "all"):
@@ -388,8 +368,7 @@ def _foreign(seed: int, rng: np.random.Generator) -> Plan:
     plan = draw(rng, 3 + seed % 4)
     if len(plan.looks) > 4:
         plan.looks = [
-            replace(look, pitch=p)
-            for look, p in zip(plan.looks, np.linspace(20, -20, len(plan.looks)), strict=True)
+            replace(look, pitch=p) for look, p in zip(plan.looks, np.linspace(20, -20, len(plan.looks)), strict=True)
         ]
     kind = ("date", "axes", "tile", "datum")[(seed + seed // 4) % 4]
     if kind == "axes":
@@ -581,9 +560,7 @@ def fly(plan: Plan, family: str = "", seed: int = 0) -> World:
     for look in plan.looks:
         orbit = Pass(plan.place, plan.altitude, look.heading, look.roll)
         optics = (rng.uniform(-3, 3), rng.uniform(-3, 3))
-        cameras.append(
-            aim(orbit, look.pitch, plan.size, plan.gsd, scan=look.scan, speed=look.speed, optics=optics)
-        )
+        cameras.append(aim(orbit, look.pitch, plan.size, plan.gsd, scan=look.scan, speed=look.speed, optics=optics))
     spots = rng.normal(0.0, 5.0, (10, 2)), rng.uniform(0, 2 * np.pi, 10)
     turn = np.radians(plan.looks[0].scan if plan.looks[0].scan is not None else plan.looks[0].heading)
 
@@ -612,15 +589,9 @@ def fly(plan: Plan, family: str = "", seed: int = 0) -> World:
             rpc = plan.deliver[v](rpc, camera.orbit, alt)
         views.append(View(NAMES[v], f"{NAMES[v]}.tif", plan.size, rpc, alt))
     assert worst < 0.01, f"{family} {seed}: an RPC misses its camera by {worst:.3g} px"
-    gcps = (
-        None
-        if plan.control is None
-        else _points(plan, cameras, scatter(20 * len(plan.control.wrong), False)[0])
-    )
+    gcps = None if plan.control is None else _points(plan, cameras, scatter(20 * len(plan.control.wrong), False)[0])
     dem = None if plan.dem is None else make_dem(relief, extent, rng, plan.dem)
-    return World(
-        family, seed, plan, tuple(cameras), tuple(views), tracks, bad, check, ground, worst, gcps, dem
-    )
+    return World(family, seed, plan, tuple(cameras), tuple(views), tracks, bad, check, ground, worst, gcps, dem)
 
 
 def _points(plan: Plan, cameras: Sequence[Camera], ground: Array) -> GroundPoints:
@@ -635,9 +606,7 @@ def _points(plan: Plan, cameras: Sequence[Camera], ground: Array) -> GroundPoint
     moved = np.einsum("ni,nij->nj", control.wrong + own, compass(true))
     xy = xy + rng.normal(0, 0.3, xy.shape)
     names, lonlatalt = tuple(f"P{g}" for g in range(count)), geodetic(ecef(true) + moved)
-    return GroundPoints(
-        names, lonlatalt, np.tile(sigma, (count, 1)), point, view, xy, np.full(len(view), 0.3)
-    )
+    return GroundPoints(names, lonlatalt, np.tile(sigma, (count, 1)), point, view, xy, np.full(len(view), 0.3))
 
 
 def _ties(plan: Plan, cameras: Sequence[Camera], ground: Array, uv: Array) -> tuple[Tracks, BoolArray]:
@@ -683,9 +652,7 @@ def _seen(
 
 def main() -> None:
     """Say what this is for."""
-    argparse.ArgumentParser(
-        description="Worlds for benchmarks/worlds.py, which has the commands."
-    ).parse_args()
+    argparse.ArgumentParser(description="Worlds for benchmarks/worlds.py, which has the commands.").parse_args()
 
 
 if __name__ == "__main__":

@@ -41,11 +41,7 @@ def size(value: int | None) -> str:
 
 def many(value: float) -> str:
     """A number: counts with commas, sizes of numbers in powers of ten."""
-    return (
-        f"{value:,}"
-        if isinstance(value, int)
-        else re.sub(r"e([+-])0*", r"e\1", f"{value:g}").replace("e+", "e")
-    )
+    return f"{value:,}" if isinstance(value, int) else re.sub(r"e([+-])0*", r"e\1", f"{value:g}").replace("e+", "e")
 
 
 def _numbers(kind: sidefile.Kind) -> str:
@@ -142,9 +138,7 @@ def page(text: str) -> str:
 
 def main() -> None:
     """Write or print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--print", action="store_true", dest="show", help="print instead of writing")
     if parser.parse_args().show:
         print(table())

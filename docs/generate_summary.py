@@ -72,9 +72,7 @@ def page() -> str:
 
 def main() -> None:
     """Write or print the page."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--print", action="store_true", dest="show", help="print instead of writing")
     if parser.parse_args().show:
         print(page(), end="")

@@ -41,9 +41,7 @@ def jittered(camera: Pushbroom, period: float, pixels: float, distance: float = 
     return replace(camera, attitude=Curve.through(times, camera.attitude(times)[0].T + swing, degree=3))
 
 
-def scene(
-    period: float, pixels: float, size: tuple[int, int] = (8000, 8000), alt_range=(0.0, 1000.0)
-) -> Delivered:
+def scene(period: float, pixels: float, size: tuple[int, int] = (8000, 8000), alt_range=(0.0, 1000.0)) -> Delivered:
     """A full camera with its RPC as delivered, which knows nothing of the jitter."""
     camera = fly(np.array([5.4, 43.3, 500.0]), Look(22.0, 140.0), size, 0.5)
     return Delivered(fit_rpc(camera, size, alt_range).rpc, jittered(camera, period, pixels))

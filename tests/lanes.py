@@ -9,9 +9,7 @@ from typing import Any
 import pytest
 
 
-def rest_slow(
-    values: Iterable[Any], keep: int = 1, mark: pytest.MarkDecorator = pytest.mark.slow
-) -> list[Any]:
+def rest_slow(values: Iterable[Any], keep: int = 1, mark: pytest.MarkDecorator = pytest.mark.slow) -> list[Any]:
     """Arguments of `parametrize`: the first `keep` are fast, the others are marked.
 
     >>> [bool(param.marks) for param in rest_slow("abc")]
@@ -31,9 +29,7 @@ def diagonal(*axes: Iterable[Any], mark: pytest.MarkDecorator = pytest.mark.slow
     shown = {tuple(min(n, len(axis) - 1) for axis in table) for n in range(longest)}
     places = product(*(range(len(axis)) for axis in table))
     return [
-        pytest.param(
-            *(axis[i] for axis, i in zip(table, place, strict=True)), marks=() if place in shown else mark
-        )
+        pytest.param(*(axis[i] for axis, i in zip(table, place, strict=True)), marks=() if place in shown else mark)
         for place in places
     ]
 

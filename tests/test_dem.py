@@ -93,9 +93,7 @@ def test_a_projected_dem_is_met_in_its_own_crs(tmp_path):
     """UTM 31, nodes every kilometre, h = northing in kilometres - 4800."""
     row, _ = np.mgrid[:60, :80]
     transform = rasterio.Affine(1000, 0, 600_000 - 500, 0, -1000, 4_900_000 + 500)
-    path = write_dem(
-        tmp_path / "a.tif", "EPSG:32631+5773", (100.0 - row).astype(np.float32), transform=transform
-    )
+    path = write_dem(tmp_path / "a.tif", "EPSG:32631+5773", (100.0 - row).astype(np.float32), transform=transform)
     dem = Dem.open(path, write_geoid(tmp_path / "g.gtx", 0.0))
     pyproj = pytest.importorskip("pyproj")
     lon, lat = pyproj.Transformer.from_crs(32631, 4326, always_xy=True).transform(630_250.0, 4_880_500.0)
@@ -152,9 +150,7 @@ def test_a_tile_and_a_geoid_are_read_as_their_bytes_stand(tmp_path):
     (tmp_path / "g.gtx").write_bytes(HEADER + geoid.tobytes())
     grid = HeightGrid.open(tmp_path / "g.gtx")
     heights = grid.sample(*np.meshgrid(np.arange(-180, 180, 10.0), np.arange(-90, 91, 10.0)))
-    np.testing.assert_array_equal(
-        heights, np.where(geoid == np.float32(-88.8888), np.nan, geoid.astype(float))
-    )
+    np.testing.assert_array_equal(heights, np.where(geoid == np.float32(-88.8888), np.nan, geoid.astype(float)))
     assert grid.reference == "ellipsoid"
 
 
@@ -213,12 +209,8 @@ def test_a_line_of_sight_stops_at_the_first_ridge():
 
 def test_where_no_terrain_is_met_there_is_no_point():
     rpc = make_rpc()
-    nothing = localize_on_terrain(
-        rpc, np.array([[9000.0, 9000.0]]), lambda lon, lat: np.full_like(lon, np.nan), (0, 9)
-    )
-    below = localize_on_terrain(
-        rpc, np.array([[9000.0, 9000.0]]), lambda lon, lat: np.full_like(lon, -50.0), (0, 9)
-    )
+    nothing = localize_on_terrain(rpc, np.array([[9000.0, 9000.0]]), lambda lon, lat: np.full_like(lon, np.nan), (0, 9))
+    below = localize_on_terrain(rpc, np.array([[9000.0, 9000.0]]), lambda lon, lat: np.full_like(lon, -50.0), (0, 9))
     assert np.isnan(nothing).all()
     assert np.isnan(below).all()
 

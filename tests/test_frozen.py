@@ -99,18 +99,13 @@ def test_what_is_printed_is_what_it_holds():
     )
     box = "RPC(lon 5.3000 to 5.5000, lat 43.1000 to 43.5000, -50 to 550 m, col -0.5 to 999.5, row -0.5 to 999.5)"
     assert repr(rpc) == box
-    assert (
-        repr(View("left", "", (20, 10), rpc, (-50.0, 550.0)))
-        == "View('left', 20 x 10 px, RPC for -50 to 550 m)"
-    )
+    assert repr(View("left", "", (20, 10), rpc, (-50.0, 550.0))) == "View('left', 20 x 10 px, RPC for -50 to 550 m)"
     assert repr(replace(MAKE["View"](), date="2013-04-17")).endswith("m, 2013-04-17)")
     sigmas = np.array([0.1, 0.1, 0.3, 0.5, 0.7])
     tracks = Tracks(np.array([0, 1, 3, 0, 1]), np.array([0, 0, 0, 1, 1]), np.ones((5, 2)), sigmas)
     assert repr(tracks) == "Tracks(2 tie points, 5 observations in 3 views, to 0.3 px)"
     assert repr(GroundPoints.none()) == "GroundPoints(0 points, no observations)"
-    correction = Correction(
-        np.array([3e-6, 0, 4e-6]), np.array([0, -2.0, 0]), np.full(3, 6e6), np.eye(3)[:1] * 1e-7
-    )
+    correction = Correction(np.array([3e-6, 0, 4e-6]), np.array([0, -2.0, 0]), np.full(3, 6e6), np.eye(3)[:1] * 1e-7)
     assert repr(Corrected(rpc, correction)) == (
         f"Corrected(sensor={box}, correction=Correction(rotation 5 urad, translation 2 m, drift 0.1 urad))"
     )

@@ -12,9 +12,7 @@ from barpc import geodesy
 def ground():
     rng = np.random.default_rng(0)
     n = 20000
-    return np.column_stack(
-        [rng.uniform(-180, 180, n), rng.uniform(-89.9, 89.9, n), rng.uniform(-1e4, 9e5, n)]
-    )
+    return np.column_stack([rng.uniform(-180, 180, n), rng.uniform(-89.9, 89.9, n), rng.uniform(-1e4, 9e5, n)])
 
 
 def test_ecef_equals_proj(ground):
@@ -59,12 +57,8 @@ def test_jacobians_are_central_differences_and_each_others_inverse(ground):
     for axis, step in enumerate((1e-4, 1e-4, 10.0)):
         d = np.zeros(3)
         d[axis] = step
-        difference = (geodesy.ecef_from_ground(ground + d) - geodesy.ecef_from_ground(ground - d)) / (
-            2 * step
-        )
-        np.testing.assert_allclose(
-            forward[..., axis], difference, rtol=0, atol=2e-6 * np.abs(difference).max()
-        )
+        difference = (geodesy.ecef_from_ground(ground + d) - geodesy.ecef_from_ground(ground - d)) / (2 * step)
+        np.testing.assert_allclose(forward[..., axis], difference, rtol=0, atol=2e-6 * np.abs(difference).max())
     product = forward @ geodesy.ground_from_ecef_jacobian(ground)
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), rtol=0, atol=1e-12)
 

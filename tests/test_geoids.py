@@ -56,9 +56,7 @@ def test_egm2008_is_found_where_proj_keeps_it(nowhere, tmp_path, variable, file)
 
 def test_a_geoid_that_is_not_there_is_a_line_that_says_where_to_get_it(nowhere):
     nowhere.setattr(geoids, "proj_folders", lambda: [Path("/a"), Path("/b")])
-    with pytest.raises(
-        InputError, match=r"geoid egm2008: no us_nga_egm08_25\.tif or egm08_25\.gtx in PROJ's"
-    ) as told:
+    with pytest.raises(InputError, match=r"geoid egm2008: no us_nga_egm08_25\.tif or egm08_25\.gtx in PROJ's") as told:
         geoid_file("egm2008")
     text = str(told.value)
     assert "\n" not in text

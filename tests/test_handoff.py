@@ -105,9 +105,7 @@ def test_a_file_that_a_tool_cannot_read_is_reported_with_its_reason(tmp_path):
         assert "\n" not in reading.note
 
 
-@pytest.mark.parametrize(
-    ("code", "refused"), [(errno.ENOSPC, True), (errno.EIO, True), (errno.ENOENT, False)]
-)
+@pytest.mark.parametrize(("code", "refused"), [(errno.ENOSPC, True), (errno.EIO, True), (errno.ENOENT, False)])
 def test_a_fault_of_the_machine_is_no_finding_about_a_file(image, tmp_path, monkeypatch, code, refused):
     """Else a run would end well whose file nobody has looked at."""
     path = write(make_rpc(), image, tmp_path / "out", "a_RPC.TXT")
@@ -250,9 +248,7 @@ def shareloc(rpc: RPC, takes: Callable[[Array], BoolArray] = lambda lon: np.abs(
 
 
 @pytest.mark.parametrize(("lon", "turn"), [(5.0, 0.0), (179.98, 0.0), (-160.0, 360.0), (160.0, -360.0)])
-def test_shareloc_counts_from_the_corner_of_the_first_pixel_and_row_before_col(
-    lon, turn, monkeypatch, tmp_path
-):
+def test_shareloc_counts_from_the_corner_of_the_first_pixel_and_row_before_col(lon, turn, monkeypatch, tmp_path):
     rpc = make_rpc(lon=lon)
     model = shareloc(rpc)
     monkeypatch.setattr("barpc.handoff.import_module", lambda _: model)
@@ -318,9 +314,7 @@ def with_own_camera(path: Path) -> Path:
 
 def test_a_file_that_would_hide_an_image_s_own_rpc_is_refused(tmp_path):
     image = with_own_camera(tmp_path / "scene.tif")
-    with pytest.raises(
-        OutputError, match=r"scene_RPC\.TXT: would be read in place of the RPC of .*scene\.tif"
-    ):
+    with pytest.raises(OutputError, match=r"scene_RPC\.TXT: would be read in place of the RPC of .*scene\.tif"):
         refuse_hiding(tmp_path, ["scene_RPC.TXT"], [])
     with pytest.raises(OutputError, match="of the input"):
         refuse_hiding(tmp_path, ["scene_RPC.TXT"], [image])

@@ -23,9 +23,7 @@ def test_a_file_whose_number_changes_and_whose_bytes_do_not_is_the_same(tmp_path
         found.path, found.size, found.sha256, identity.Stamp(*found.stamp.times(), 1, 2, "here")
     )
     renumbered.ask()
-    wrong = identity.Input(
-        found.path, found.size, "0" * 64, identity.Stamp(*found.stamp.times(), 3, 2, "here")
-    )
+    wrong = identity.Input(found.path, found.size, "0" * 64, identity.Stamp(*found.stamp.times(), 3, 2, "here"))
     identity._known.clear()
     with pytest.raises(InputError, match="was changed or replaced"):
         wrong.ask()

@@ -92,9 +92,7 @@ def test_terrain_at_an_end_of_the_range_is_ground(tmp_path, alt):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = localize_on_terrain(Oblique(0.5), image, terrain, (0.0, 500.0))
-        plain = localize_on_terrain(
-            Oblique(0.5), image, lambda lon, lat: np.full(np.shape(lon), alt), (0.0, 500.0)
-        )
+        plain = localize_on_terrain(Oblique(0.5), image, lambda lon, lat: np.full(np.shape(lon), alt), (0.0, 500.0))
     np.testing.assert_allclose(found[:, 2], alt, atol=2e-4)
     np.testing.assert_allclose(plain[:, 2], alt, atol=2e-4)
 

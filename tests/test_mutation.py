@@ -112,9 +112,7 @@ def test_what_tests_see_is_caught_and_what_they_do_not_see_survives(small, tmp_p
 def test_tests_that_fail_without_a_mutant_are_refused(small, tmp_path, capfd) -> None:
     """Else every mutant would count as caught."""
     (tmp_path / "benchmarks/data.py").unlink()
-    with pytest.raises(
-        SystemExit, match=r"ba: the tests fail without a mutant: ERROR tests/ba/test_sums\.py"
-    ):
+    with pytest.raises(SystemExit, match=r"ba: the tests fail without a mutant: ERROR tests/ba/test_sums\.py"):
         list(small.run(small.mutants(["ba"]), 1))
     capfd.readouterr()
 
@@ -143,9 +141,7 @@ def test_what_runs_the_tests_was_not_forked_from_a_process_with_threads(small, t
 
 @pytest.mark.nightly
 def test_a_mutant_of_each_part_is_tried_by_tests_that_pass_without_it(mutation, every, capfd) -> None:
-    picked = [
-        random.Random(0).choice([one for one in every if one.part == part]) for part in mutation.parts()
-    ]
+    picked = [random.Random(0).choice([one for one in every if one.part == part]) for part in mutation.parts()]
     rows = list(mutation.run(picked, 2))
     assert [row["part"] for row in rows] == [*mutation.parts()]
     assert {row["fate"] for row in rows} <= {"caught", "SURVIVED", "equivalent"}

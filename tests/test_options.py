@@ -226,9 +226,7 @@ def test_records_print_what_differs_from_the_defaults() -> None:
         gcp=tuple(f"points_{i}.gcp" for i in range(99)),
         keep_going=True,
     )
-    assert repr(many).startswith(
-        "RunOptions(adjust=AdjustOptions(robust_threshold=3.0), keep_going=True, gcp=("
-    )
+    assert repr(many).startswith("RunOptions(adjust=AdjustOptions(robust_threshold=3.0), keep_going=True, gcp=(")
     assert len(repr(many)) < 250
     assert eval(repr(AdjustOptions(drift=0, fixed=("a",)))) == AdjustOptions(drift=0, fixed=("a",))
 
@@ -264,9 +262,7 @@ def test_a_message_says_where_and_what(values: dict[str, Any], message: str) -> 
 
 
 def test_the_names_are_public_and_cost_no_numpy() -> None:
-    assert {"RunOptions", "AdjustOptions", "TieOptions", "FitOptions", "AdjustResult", "check"} <= set(
-        barpc.__all__
-    )
+    assert {"RunOptions", "AdjustOptions", "TieOptions", "FitOptions", "AdjustResult", "check"} <= set(barpc.__all__)
     assert barpc.AdjustOptions is AdjustOptions
     code = (
         "import sys, barpc\nfrom barpc.cli import main\n"

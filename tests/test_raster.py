@@ -93,9 +93,7 @@ def test_a_file_that_is_no_image_is_refused_in_one_line(tmp_path: Path, content:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "path", ["/vsicurl/http://127.0.0.1:9/x.tif", "s3://bucket/x.tif", "GTIFF_DIR:1:x.tif"]
-)
+@pytest.mark.parametrize("path", ["/vsicurl/http://127.0.0.1:9/x.tif", "s3://bucket/x.tif", "GTIFF_DIR:1:x.tif"])
 def test_a_remote_or_indirect_path_is_refused(path: str) -> None:
     with pytest.raises(ImageError, match="remote and virtual"), open_raster(path):
         pass

@@ -31,9 +31,7 @@ def test_namespaces_are_dropped_when_asked() -> None:
         pytest.param(LAUGHS, id="entities"),
         pytest.param(b'<!DOCTYPE a SYSTEM "file:///etc/passwd"><a/>', id="external"),
         pytest.param(LAUGHS.decode().encode("utf-16"), id="entities in UTF-16"),
-        pytest.param(
-            b'<?xml version="1.0" encoding="cp037"?>' + LAUGHS.decode().encode("cp037"), id="EBCDIC"
-        ),
+        pytest.param(b'<?xml version="1.0" encoding="cp037"?>' + LAUGHS.decode().encode("cp037"), id="EBCDIC"),
         pytest.param(b"<a><b></a>", id="not well-formed"),
         pytest.param(b"<a><b>", id="truncated"),
         pytest.param(b"", id="empty"),

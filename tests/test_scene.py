@@ -93,9 +93,7 @@ def test_the_smallest_size_and_an_interval_of_one_altitude_are_enough():
 def test_what_a_record_says_of_itself():
     view = View("a", "", (30, 40), make_rpc(), (-10.0, 30.0))
     assert repr(view) == "View('a', 30 x 40 px, RPC for -10 to 30 m)"
-    assert "RPC for -10 to 30 m, 2020-02-03)" in repr(
-        View("a", "", (3, 4), make_rpc(), (-10.0, 30.0), "2020-02-03")
-    )
+    assert "RPC for -10 to 30 m, 2020-02-03)" in repr(View("a", "", (3, 4), make_rpc(), (-10.0, 30.0), "2020-02-03"))
     assert repr(make_tracks()) == "Tracks(2 tie points, 5 observations in 3 views, to 0.2 px)"
     assert repr(GroundPoints.none()) == "GroundPoints(0 points, no observations)"
 
@@ -139,9 +137,7 @@ def test_an_observation_is_of_a_point_that_is_there(point, taken):
 def test_a_position_in_an_image_that_is_none_spoils_no_other_point():
     """Whoever reads control names the point and leaves it out: the others must get so far."""
     place = [[5.0, 43.0, 100.0], [5.1, 43.1, 200.0]]
-    points = GroundPoints(
-        ("a", "b"), place, np.ones((2, 3)), [0, 1], [0, 0], [[np.nan, 3.0], [4.0, 5.0]], [1, 1]
-    )
+    points = GroundPoints(("a", "b"), place, np.ones((2, 3)), [0, 1], [0, 0], [[np.nan, 3.0], [4.0, 5.0]], [1, 1])
     assert points.select(np.isfinite(points.xy).all(axis=1)).xy.tolist() == [[4.0, 5.0]]
 
 
@@ -180,9 +176,7 @@ def test_labels_are_numbered_by_the_first_node():
 
 
 def test_selecting_keeps_tracks_of_two_and_closes_up_their_numbers():
-    tracks = Tracks(
-        [0, 1, 0, 1, 1, 2], [0, 0, 1, 1, 2, 2], np.arange(12.0).reshape(6, 2), np.arange(1.0, 7.0)
-    )
+    tracks = Tracks([0, 1, 0, 1, 1, 2], [0, 0, 1, 1, 2, 2], np.arange(12.0).reshape(6, 2), np.arange(1.0, 7.0))
     kept = tracks.select(np.array([True, False, True, True, True, True]))
     assert kept.point.tolist() == [0, 0, 1, 1]
     assert kept.view.tolist() == [0, 1, 1, 2]

@@ -137,9 +137,7 @@ def test_json_of_many_values_is_not_deep():
 def bomb(path: Path, claimed: int, stored: bytes, compression: int = zipfile.ZIP_DEFLATED) -> Path:
     """An archive whose array claims so many bytes."""
     header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        header, {"descr": "|u1", "fortran_order": False, "shape": (claimed,)}
-    )
+    np.lib.format.write_array_header_1_0(header, {"descr": "|u1", "fortran_order": False, "shape": (claimed,)})
     with zipfile.ZipFile(path, "w", compression) as archive, archive.open("names.npy", "w") as file:
         file.write(header.getvalue() + stored)
     return path
@@ -273,9 +271,7 @@ def direct_opens(source: str) -> list[int]:
     """Lines with a call that opens a path for reading by itself."""
     if not OPENS.search(source):  # most modules: they need not be parsed
         return []
-    return [
-        node.lineno for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call) and _opens(node)
-    ]
+    return [node.lineno for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call) and _opens(node)]
 
 
 def _opens(call: ast.Call) -> bool:

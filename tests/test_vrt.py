@@ -40,9 +40,7 @@ def _no_georeference():
 def raster(path: Path, dtype: str = "uint16", bands: int = 1, mask: bool = False, **profile: object) -> Path:
     """Numbers over the whole range of a type."""
     if dtype.startswith("complex"):
-        data = RNG.normal(0, 900, (bands, SIZE[1], SIZE[0])) + 1j * RNG.normal(
-            0, 900, (bands, SIZE[1], SIZE[0])
-        )
+        data = RNG.normal(0, 900, (bands, SIZE[1], SIZE[0])) + 1j * RNG.normal(0, 900, (bands, SIZE[1], SIZE[0]))
         data = np.rint(data) if dtype == "complex_int16" else data
     elif dtype.startswith("float"):
         data = RNG.normal(0, 40000, (bands, SIZE[1], SIZE[0]))
@@ -86,9 +84,7 @@ def band(*body: str, dtype: str = "uint16", number: int = 1) -> str:
 
 
 def vrt(path: Path, *body: str, size: tuple[int, int] = SIZE) -> Path:
-    path.write_text(
-        f'<VRTDataset rasterXSize="{size[0]}" rasterYSize="{size[1]}">{"".join(body)}</VRTDataset>'
-    )
+    path.write_text(f'<VRTDataset rasterXSize="{size[0]}" rasterYSize="{size[1]}">{"".join(body)}</VRTDataset>')
     return path
 
 
@@ -106,9 +102,7 @@ def assert_as_gdal(path: Path) -> None:
             np.testing.assert_array_equal(found, expected)
             for i in by_gdal.indexes:
                 np.testing.assert_array_equal(ours.read(i, window=window), by_gdal.read(i, window=window))
-                np.testing.assert_array_equal(
-                    ours.read_masks(i, window=window), by_gdal.read_masks(i, window=window)
-                )
+                np.testing.assert_array_equal(ours.read_masks(i, window=window), by_gdal.read_masks(i, window=window))
             masked = ours.read(1, window=window, masked=True), by_gdal.read(1, window=window, masked=True)
             np.testing.assert_array_equal(*(m.filled(0) for m in masked))
             np.testing.assert_array_equal(*(np.ma.getmaskarray(m) for m in masked))
@@ -335,9 +329,7 @@ def test_the_rpc_of_a_vrt_is_what_its_opening_finds(tmp_path: Path, change) -> N
 def test_a_vrt_that_is_less_or_more_than_its_image_is_not_pointed_at(tmp_path: Path, body: str) -> None:
     for name, bands in (("a", 1), ("b", 1), ("two", 2)):
         raster(tmp_path / f"{name}.tif", bands=bands)
-    with rasterio.open(
-        tmp_path / "big.tif", "w", driver="GTiff", width=50, height=50, count=1, dtype="uint16"
-    ) as out:
+    with rasterio.open(tmp_path / "big.tif", "w", driver="GTiff", width=50, height=50, count=1, dtype="uint16") as out:
         out.write(np.ones((1, 50, 50), np.uint16))
     with pytest.raises(ImageError, match="more than one whole image"):
         plain_source(vrt(tmp_path / "x.vrt", body))

@@ -313,9 +313,7 @@ def test_nothing_is_deleted_because_a_state_lists_it(tmp_path, text, notes):
     put_state(folder, {name: sha(text) for name in names} if not notes else {})
     if notes:
         lines = [json.dumps([name, sha(text)]) for name in names]
-        (folder / ".barpc/outputs.jsonl").write_text(
-            "\n".join([*lines, "[", "7", '["a"]', "[[]]", "[" * 9999])
-        )
+        (folder / ".barpc/outputs.jsonl").write_text("\n".join([*lines, "[", "7", '["a"]', "[[]]", "[" * 9999]))
     if text != "thesis":
         put_state(folder, {"thesis.doc": sha(text)})
     before = {p for p in tmp_path.rglob("*") if ".barpc" not in p.parts}
@@ -510,9 +508,7 @@ def test_killed_at_any_rename_the_same_command_finishes(tmp_path, mode, numbers)
             again = subprocess.run(command, check=False, capture_output=True)
             if again.returncode:  # all was done: a finished folder is not written over
                 assert (mode, number, when) == ("fresh", 5, "after"), again.stderr
-            assert {
-                p.name: p.read_text() for p in folder.rglob("*") if ".barpc" not in p.parts and p.is_file()
-            } == {
+            assert {p.name: p.read_text() for p in folder.rglob("*") if ".barpc" not in p.parts and p.is_file()} == {
                 "a": "new a",
                 "b": "new b",
                 "c": "new asp/c",

@@ -256,9 +256,7 @@ def _adjustment(
     is_tie = found.problem.structure.point < block.num_tracks
     view = parts.block.in_order(parts.block.view)[ties]
     before, after = (
-        (block.in_order(inside.T) + outer.in_order(outside.residual.T) + apart.in_order(gone.residual.T))[
-            ties
-        ]
+        (block.in_order(inside.T) + outer.in_order(outside.residual.T) + apart.in_order(gone.residual.T))[ties]
         for inside, outside, gone in (
             (found.before, found.start, moved[0]),
             (outcome.residual, found.after, moved[1]),
@@ -307,9 +305,7 @@ def _adjustment(
 
 def _alike(block: Block, outcome: Outcome, is_tie: BoolArray) -> Array:
     wrong = is_tie & block.use & ~outcome.inlier & np.isfinite(outcome.residual).all(axis=0)
-    return neighbours_alike(
-        block.view[wrong], block.xy[:, wrong], outcome.residual[:, wrong], len(block.views)
-    )
+    return neighbours_alike(block.view[wrong], block.xy[:, wrong], outcome.residual[:, wrong], len(block.views))
 
 
 def _said(findings: Sequence[Finding], parts: Parts, points: Array) -> Iterator[Finding]:
@@ -333,9 +329,7 @@ def _control(found: Solution, block: Block, covariance: Covariance, inlier: Bool
         "reference_inlier": inlier[gcps:],
         "gcp_w": w[:gcps],
         "reference_w": w[gcps:],
-        "gcp_residuals": enu_offsets(
-            found.final.points[block.num_tracks : block.num_known], block.gcps.lonlatalt
-        ),
+        "gcp_residuals": enu_offsets(found.final.points[block.num_tracks : block.num_known], block.gcps.lonlatalt),
     }
 
 

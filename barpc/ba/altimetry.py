@@ -70,9 +70,7 @@ def hold_by_altimetry(
         near = np.flatnonzero(((place[:, :2] >= low) & (place[:, :2] <= high)).all(axis=1))
         near = near[:: -(-len(near) // _MOST) or 1]
     if len(near) < FEWEST:
-        return found, _nothing(
-            many, len(near), f"at least {FEWEST} heights on the tie points' surface are needed"
-        )
+        return found, _nothing(many, len(near), f"at least {FEWEST} heights on the tie points' surface are needed")
     surface = Surface.of(local)
     heights = Given(place[near], given.sigma[near], given.sigma_flat[near])
     registered = register(surface, heights, radius, np.sqrt(np.diag(known)))
@@ -144,9 +142,7 @@ def _placed(
     return PointPrior(index, mean, np.tile(enu / own, (len(index), 1, 1)), common)
 
 
-def _solved(
-    found: Solution, block: Block, outer: Block, options: AdjustOptions, placed: PointPrior
-) -> Solution:
+def _solved(found: Solution, block: Block, outer: Block, options: AdjustOptions, placed: PointPrior) -> Solution:
     """Return the block solved again from where it ended, held at some tie points."""
     held = replace(found, heights=replace(found.heights, placed=placed))
     state = found.final

@@ -133,9 +133,7 @@ def find_apart(
     left: list[_Left] = []
     for one in _agreeing(views, block, outer, options, solve):
         left.append(one)
-        if (
-            num > _TELLING
-        ):  # those that agree without it contradict it, as far as it is wrong, in any block with it
+        if num > _TELLING:  # those that agree without it contradict it, as far as it is wrong, in any block with it
             break
     if odd is not None and first is not None:
         return _by_prior(left, float(first.outcome.prior.scale[odd]), block)
@@ -163,8 +161,7 @@ def _lost(found: Solution, block: Block) -> Array:
     """Return the share (N,) of each view's tie points that were cut; of a view without any all."""
     ties = block.use & (block.point < block.num_tracks)
     had, kept = (
-        np.bincount(block.view[rows], minlength=len(block.views))
-        for rows in (ties, ties & found.outcome.inlier)
+        np.bincount(block.view[rows], minlength=len(block.views)) for rows in (ties, ties & found.outcome.inlier)
     )
     return np.asarray(1.0 - kept / np.maximum(had, 1))
 

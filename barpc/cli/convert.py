@@ -54,9 +54,7 @@ Box = tuple[float, float, float, float]
 @click.command("convert")
 @click.argument("files", nargs=-1, required=True, metavar="SOURCE... [TARGET]")
 @click.option("-o", "--out-dir", metavar="DIR", help="New folder for images of the same names, with proof.")
-@click.option(
-    "--rpc", "rpcs", metavar="PATH", help="With -o: an RPC file, or a folder of them by image name."
-)
+@click.option("--rpc", "rpcs", metavar="PATH", help="With -o: an RPC file, or a folder of them by image name.")
 @click.option("--images", "carrier", type=click.Choice(["vrt", "copy"]), help="With -o.  [default: vrt]")
 @click.option(
     "--rpc-format",
@@ -82,12 +80,8 @@ Box = tuple[float, float, float, float]
     type=(float, float, float, float),
     help="Cut out WEST SOUTH EAST NORTH [deg]; with -o of every image that shows it.",
 )
-@click.option(
-    "--aoi", metavar="FILE", help="Cut out the box around polygons in lon/lat (GeoJSON), as --bbox."
-)
-@with_heights(
-    "Altitude of the ground of --bbox [m].  [default: of the run's tie points, else the camera's middle]"
-)
+@click.option("--aoi", metavar="FILE", help="Cut out the box around polygons in lon/lat (GeoJSON), as --bbox.")
+@with_heights("Altitude of the ground of --bbox [m].  [default: of the run's tie points, else the camera's middle]")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file, or files of an earlier run.")
 def convert(files: tuple[str, ...], out_dir: str | None, **flags: Any) -> int:
     r"""Write the RPC of SOURCE to TARGET, whose name chooses the format, or those of many images to a folder.
@@ -116,9 +110,7 @@ def convert(files: tuple[str, ...], out_dir: str | None, **flags: Any) -> int:
 def _to_folder(files: tuple[str, ...], folder: Path, flags: Mapping[str, Any]) -> int:
     """Write images with their RPCs, or those of --rpc, moved or not, into a new folder."""
     if flags["window"] is not None:
-        raise click.UsageError(
-            "--window goes with a TARGET, not with -o: images differ in where their pixels are"
-        )
+        raise click.UsageError("--window goes with a TARGET, not with -o: images differ in where their pixels are")
     cut = flags["bbox"] is not None or flags["aoi"] is not None
     if cut and flags["carrier"] is not None:
         raise click.UsageError("--images goes with whole images, not with --bbox or --aoi")
@@ -205,9 +197,7 @@ def _as_grid(camera: Camera, target: str, overwrite: bool) -> int:
     return tell_gate(f"{target} does not hold the camera to {LINEAR:g} px", off) if off else 0
 
 
-def check_target(
-    target: str | Path, sources: Sequence[str | Path], overwrite: bool, rpc: RPC | None = None
-) -> None:
+def check_target(target: str | Path, sources: Sequence[str | Path], overwrite: bool, rpc: RPC | None = None) -> None:
     """Raise if a file to be written is an input, or would be read in place of the RPC that an image has.
 
     The RPC files beside the sources belong to them; none is ever replaced. With `overwrite` an image may get another

@@ -93,16 +93,12 @@ def _plain(value: Any) -> Any:
 
 def _tell(surface: Surface) -> None:
     cells = surface.size[0] * surface.size[1]
-    echo(
-        f"{surface.known} of {cells} cells of {surface.gsd:g} m have a height, by {', '.join(surface.pairs)}"
-    )
+    echo(f"{surface.known} of {cells} cells of {surface.gsd:g} m have a height, by {', '.join(surface.pairs)}")
     said = {
         "pairs disagree by": surface.nmad,
         "sigma by matching": surface.sigma,
         "by cameras": surface.sigma_cameras,
         "shared by all cells": surface.datum,
     }
-    echo(
-        ", ".join(f"{words} {value:.2f} m" for words, value in said.items() if value == value) + " (medians)"
-    )
+    echo(", ".join(f"{words} {value:.2f} m" for words, value in said.items() if value == value) + " (medians)")
     echo(f"Written to {surface.path}")

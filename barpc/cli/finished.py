@@ -79,9 +79,7 @@ def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | N
     for path in paths:
         echo(path)
     if target != "points" and any(Path(run_dir).glob("*.vrt")):  # (points name no image)
-        say(
-            "the images stay where they are: move them together with both folders, or adjust with --images copy"
-        )
+        say("the images stay where they are: move them together with both folders, or adjust with --images copy")
     return 0
 
 

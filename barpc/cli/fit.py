@@ -20,9 +20,7 @@ _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third 
 
 @click.command("fit")
 @click.argument("source", metavar="SOURCE")
-@click.option(
-    "-o", "--output", metavar="RPC", help="Where to write; the name chooses the format. Else measure."
-)
+@click.option("-o", "--output", metavar="RPC", help="Where to write; the name chooses the format. Else measure.")
 @click.option(
     "--alt-range",
     type=(float, float),
@@ -119,9 +117,7 @@ def _fit(source: str, output: str | None, flags: dict[str, Any]) -> tuple[RpcFit
         if not fit.verdict(options.tolerance):
             return fit, options.tolerance
         low, high = alt_range
-        say(
-            f"no RPC holds all ground on Earth here: fitted over the scene's altitudes, {low:g} to {high:g} m"
-        )
+        say(f"no RPC holds all ground on Earth here: fitted over the scene's altitudes, {low:g} to {high:g} m")
     fit = fit_rpc(camera.model, camera.extent, alt_range, options=options, strict=False)
     return fit, options.tolerance
 
@@ -130,9 +126,7 @@ class _Missed(Exception):  # noqa: N818 - it never leaves this page
     """What was written does not hold the fit: it goes again."""
 
 
-def _write(
-    fit: RpcFit, source: str, output: str, overwrite: bool, tolerance: float | None
-) -> tuple[RpcFit, bool]:
+def _write(fit: RpcFit, source: str, output: str, overwrite: bool, tolerance: float | None) -> tuple[RpcFit, bool]:
     """Write the RPC and read it back: the fit as its file holds it, and whether it stays there (within a tolerance)."""
     from barpc.atomic import replacing
     from barpc.rpcio import read_rpc, write_camera
@@ -160,8 +154,7 @@ def _certificate(fit: RpcFit, verdict: str) -> str:
         *([more] if fit.beyond < 1 else []),  # given points say nothing of the rest
         f"denominators  at least {fit.min_denominator:.3g} over the image's ground and around it",
         *([] if fit.free is None else [f"              {fit.free}"]),
-        f"round trip    {fit.roundtrip:.1g} px"
-        + f"; the camera's own {fit.contradiction:.1g}" * (fit.beyond < 1),
+        f"round trip    {fit.roundtrip:.1g} px" + f"; the camera's own {fit.contradiction:.1g}" * (fit.beyond < 1),
         *([] if fit.localisation is None else [_localisation(fit.localisation)]),
         f"verdict       {verdict or 'within tolerance'}",
     ]

@@ -33,12 +33,8 @@ from barpc.sensor.rpc import RPC
 @click.option(
     "--at", type=(float, float, float), help="Ground point of the angles: LON LAT ALT.  [default: the centre]"
 )
-@with_heights(
-    "Altitude of the ground [m].  [default: of the run's tie points, else the middle of the camera's]"
-)
-@click.option(
-    "--footprint", "outlines", is_flag=True, help="Print outlines on the ground as GeoJSON instead."
-)
+@with_heights("Altitude of the ground [m].  [default: of the run's tie points, else the middle of the camera's]")
+@click.option("--footprint", "outlines", is_flag=True, help="Print outlines on the ground as GeoJSON instead.")
 @click.option("--doctor", is_flag=True, help="Print versions and try the installation instead.")
 def info(
     images: tuple[str, ...],
@@ -214,9 +210,7 @@ def _box(rpc: RPC) -> dict[str, Any]:
     }
 
 
-def _geometry(
-    camera: Camera, size: tuple[int, int], alt: float, at: tuple[float, ...] | None
-) -> dict[str, Any]:
+def _geometry(camera: Camera, size: tuple[int, int], alt: float, at: tuple[float, ...] | None) -> dict[str, Any]:
     """Return what follows from the camera and the image's size: angles, ground sample distance, footprint."""
     model = camera.model
     middle = (np.array(size) - 1) / 2

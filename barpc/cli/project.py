@@ -122,9 +122,7 @@ def triangulate(images: tuple[str, ...], at: tuple[tuple[float, float], ...], po
 # --- tables of points -------------------------------------------------------------------------------------
 
 
-def given_points(
-    numbers: Sequence[float], file: str | None, names: Sequence[str], fill: float | None = None
-) -> Array:
+def given_points(numbers: Sequence[float], file: str | None, names: Sequence[str], fill: float | None = None) -> Array:
     """Return points (N, columns) from arguments, a CSV file, or standard input ("-").
 
     A file has a header with the columns' names, or their order; blanks separate, too. `fill` is the value of the last

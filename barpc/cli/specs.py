@@ -57,9 +57,7 @@ def _files(name: str) -> list[str]:
         if (path / "manifest.safe").exists() or path.suffix.upper() == ".SAFE":
             return [name]
         inside = sorted(entry.name for entry in os.scandir(path) if entry.is_file())
-        rasters = [
-            str(path / one) for one in inside if one.lower().endswith(_ENDS) and _is_raster(path / one)
-        ]
+        rasters = [str(path / one) for one in inside if one.lower().endswith(_ENDS) and _is_raster(path / one)]
         if not rasters:
             from barpc.sensor.terrasar import find_annotation
 

@@ -151,9 +151,7 @@ def _median(values: F32) -> F32:
     return np.asarray(np.take_along_axis(ordered, at, axis=0).mean(axis=0), np.float32)
 
 
-def _points(
-    pair: tuple[View, View], tile: Tile, band: int, halved: int = 0
-) -> tuple[Array, Array, float] | None:
+def _points(pair: tuple[View, View], tile: Tile, band: int, halved: int = 0) -> tuple[Array, Array, float] | None:
     """Return the ground points (n, 3), their standard deviation in height (n,) [m] and the share matched;
     None where unseen.
     """
@@ -165,9 +163,7 @@ def _points(
             return found
         low, high = np.percentile(found[0][:, 2], [_ENDS, 100.0 - _ENDS])
         room = _ROOM * zoom * frame.metres
-        tile = replace(
-            tile, alts=(max(tile.alts[0], float(low) - room), min(tile.alts[1], float(high) + room))
-        )
+        tile = replace(tile, alts=(max(tile.alts[0], float(low) - room), min(tile.alts[1], float(high) + room)))
         frame = _frame(pair, tile)
         zoom = 1 if frame is None else min(zoom // 2, _zoom(frame))
     if frame is not None and frame.across > ACROSS and halved < _SPLIT:
@@ -181,9 +177,7 @@ def _zoom(frame: EpipolarFrame) -> int:
     return min(_COARSE, 1 << max(0, int(np.ceil(np.log2(frame.num / (FINER * _SPAN))))))
 
 
-def _matched(
-    pair: tuple[View, View], tile: Tile, band: int, zoom: int = 1
-) -> tuple[Array, Array, float] | None:
+def _matched(pair: tuple[View, View], tile: Tile, band: int, zoom: int = 1) -> tuple[Array, Array, float] | None:
     """Match as `_points`, on pictures whose pixels are means of `zoom` px a side."""
     frame = _frame(pair, tile, zoom)
     sizes = [(view.size[0] // zoom, view.size[1] // zoom) for view in pair]

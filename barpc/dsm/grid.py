@@ -113,9 +113,7 @@ class Grid:
         corner = self.west + self.step * col, self.north - self.step * row
         return Tile(self.crs.to_wkt(), *corner, self.step, size, (min(alts), max(alts)))
 
-    def fill(
-        self, path: Path, run: Workspace, executor: Executor | None, progress: Progress | None
-    ) -> Counts:
+    def fill(self, path: Path, run: Workspace, executor: Executor | None, progress: Progress | None) -> Counts:
         """Write all tiles into a plain GeoTIFF; each is made by a worker and forgotten once it is written."""
         views, seen = self.block.views, self.tiles()
         tasks = [
@@ -150,15 +148,11 @@ class Grid:
             return np.zeros(0)
         for at, groups in seen[:: 1 + len(seen) // _DATUM_NODES]:
             nodes = _nodes(self.tile(*at))
-            means = [
-                np.mean([errors.rows(pair, nodes).mean(axis=0) for pair in one], axis=0) for one in groups
-            ]
+            means = [np.mean([errors.rows(pair, nodes).mean(axis=0) for pair in one], axis=0) for one in groups]
             rows.append(means[0] - sum(means[1:]))
         return np.asarray(np.mean(rows, axis=0))
 
-    def _bands(
-        self, tile: Tile, groups: Sequence[Pairs], results: Sequence[Sequence[F32]], shared: Array
-    ) -> F32:
+    def _bands(self, tile: Tile, groups: Sequence[Pairs], results: Sequence[Sequence[F32]], shared: Array) -> F32:
         """Return the bands (5, rows, cols) of a tile: of one group of pairs, or of the first minus the second."""
         errors, shape = self.block.errors, results[0][0].shape
         height = results[0][0] - sum(one[0] for one in results[1:])
@@ -172,8 +166,7 @@ class Grid:
         for pattern in np.unique(bits[known]):
             cells = known & (bits == pattern)
             chosen = [
-                [pair for k, pair in enumerate(group) if pattern >> _BITS * g + k & 1]
-                for g, group in enumerate(groups)
+                [pair for k, pair in enumerate(group) if pattern >> _BITS * g + k & 1] for g, group in enumerate(groups)
             ]
             count[cells] = min(map(len, chosen))
             # pairs of n images have n - 1 independent parallaxes
@@ -229,9 +222,7 @@ def _crs(given: str | None, middle: Array) -> CRS:
     except CRSError as error:
         raise InputError(f"--crs {given}: no reference system that PROJ knows ({error})") from error
     if not found.is_projected or found.linear_units_factor[1] != 1.0:
-        raise InputError(
-            f"--crs {given}: cells need a projected reference system in metres, such as EPSG:32631"
-        )
+        raise InputError(f"--crs {given}: cells need a projected reference system in metres, such as EPSG:32631")
     return found
 
 

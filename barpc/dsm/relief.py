@@ -45,8 +45,7 @@ def _reliefs(folder: Path, grid: Grid, out: Path) -> list[dict[str, object]]:
     """Return the pictures, as `barpc.report.tables` reads them, of the tile that has most heights."""
     with open_raster(out) as file:
         read = (
-            (at, groups[0], file.read([1, 3], window=Window(*at, *grid.tile(*at).size)))
-            for at, groups in grid.tiles()
+            (at, groups[0], file.read([1, 3], window=Window(*at, *grid.tile(*at).size))) for at, groups in grid.tiles()
         )
         at, pairs, after = max(read, key=lambda row: np.isfinite(row[2][0]).sum())
     views = _delivered(folder, grid.block.views)

@@ -36,18 +36,14 @@ class CameraErrors:
         place = {name: n for n, name in enumerate(prior.names)}
         free = [i for i, name in enumerate(names) if name in place]
         if not free:
-            raise InputError(
-                "the block's covariance names none of the run's images: run the adjustment again"
-            )
+            raise InputError("the block's covariance names none of the run's images: run the adjustment again")
         at = np.array([place[names[i]] for i in free])
         centers[free] = prior.center[at]
         fixed = [i for i in range(len(views)) if i not in free]
         waves = prior.waves(names)
         unknowns = make_unknowns(views, prior.model, prior.drift, None if fixed else centers, waves)
         if unknowns.size != q:
-            raise InputError(
-                f"the block's covariance is of {q} unknowns an image, its cameras have {unknowns.size}"
-            )
+            raise InputError(f"the block's covariance is of {q} unknowns an image, its cameras have {unknowns.size}")
         columns = (at[:, None] * q + np.arange(q)).ravel()
         unit = np.zeros((prior.params.size, len(columns)))
         unit[columns, np.arange(len(columns))] = 1.0

@@ -73,9 +73,7 @@ def make_dsm(
     options, out = options or DsmOptions(), Path(out)
     plain_path(out.absolute())
     if isinstance(source, str | Path):
-        block = block_of_run(
-            Path(source), options.alt, None if options.minus is None else Path(options.minus)
-        )
+        block = block_of_run(Path(source), options.alt, None if options.minus is None else Path(options.minus))
     elif options.minus is not None:
         raise InputError("minus: what two dates share is known of a run alone, not of images")
     else:

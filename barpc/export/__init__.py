@@ -83,8 +83,6 @@ def _link(path: Path, image: str) -> None:
             path.unlink()
         path.symlink_to(image)
     except FileExistsError:
-        raise OutputError(
-            f"{path}: is there already and no link of an earlier export; move it away"
-        ) from None
+        raise OutputError(f"{path}: is there already and no link of an earlier export; move it away") from None
     except OSError as error:
         _LOG.warning("%s: no link to %s (%s): copy the image there", path, image, error.strerror)

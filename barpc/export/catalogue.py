@@ -38,9 +38,7 @@ def stac(scene: Scene, out: Path) -> Files:
     """Write ``collection.json``, and ``<image>.json``: a STAC item of every image with its files in the run folder."""
     items = {f"{shot.name}.json": _item(scene, shot, out) for shot in scene.shots}
     if _COLLECTION in items:
-        raise InputError(
-            f"an image is called {_COLLECTION[:-5]}, as the collection of its catalogue is: rename it"
-        )
+        raise InputError(f"an image is called {_COLLECTION[:-5]}, as the collection of its catalogue is: rename it")
     return {name: as_json(item) for name, item in ({_COLLECTION: _collection(scene, items)} | items).items()}
 
 

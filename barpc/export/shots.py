@@ -146,9 +146,7 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
     """
     summary = read_summary(folder)
     if summary.kind != "adjust":
-        raise InputError(
-            f"{folder / 'summary.json'}: a run of the kind {summary.kind}, without corrected cameras"
-        )
+        raise InputError(f"{folder / 'summary.json'}: a run of the kind {summary.kind}, without corrected cameras")
     files = read_tables(summary, folder)
     order = np.argsort(files.tracks, kind="stable")
     index, found = _places(files.tracks[order], files.observations.track)

@@ -57,9 +57,7 @@ class Sample:
     model: SensorModel
     size: tuple[int, int]
     alt_range: tuple[float, float]
-    points: (
-        Array  # (N, 3) col, row [px], altitude [m] with a ground point; those all over the image come first
-    )
+    points: Array  # (N, 3) col, row [px], altitude [m] with a ground point; those all over the image come first
     ground: Array  # (N, 3) lon, lat [deg], alt [m]
     count: int  # of those all over the image
     missing: float  # part of the image and the altitudes without a ground point
@@ -86,9 +84,7 @@ class Sample:
         ground = model.localize(points[:, :2], points[:, 2])
         known: BoolArray = np.asarray(np.isfinite(ground).all(axis=1))
         share = float(known[: len(inside)].mean())
-        return cls(
-            model, size, alt_range, points[known], ground[known], int(known[: len(inside)].sum()), 1.0 - share
-        )
+        return cls(model, size, alt_range, points[known], ground[known], int(known[: len(inside)].sum()), 1.0 - share)
 
     def also(self, points: Array) -> Sample:
         """Return the sample with more points (M, 3) col, row [px], altitude [m] around which the largest
@@ -129,9 +125,7 @@ class Sample:
         rng, reach = np.random.default_rng(1), np.array([1.0 / CELLS, 1.0 / CELLS, 0.25])
         unit = (points - _scaled(np.zeros(3), self.size, self.alt_range)) / self._span
         for _ in range(_ROUNDS if float(miss.max(initial=0.0)) > _TINY else 0):
-            worst = np.unique(
-                np.concatenate([np.argsort(-miss[:, axis], kind="stable")[:_WORST] for axis in range(2)])
-            )
+            worst = np.unique(np.concatenate([np.argsort(-miss[:, axis], kind="stable")[:_WORST] for axis in range(2)]))
             near = unit[np.repeat(worst, _AROUND)] + reach * rng.uniform(-1.0, 1.0, (len(worst) * _AROUND, 3))
             near = near.clip(0.0, 1.0)
             at = _scaled(near, self.size, self.alt_range)

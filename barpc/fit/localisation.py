@@ -52,11 +52,7 @@ class Localisation:
                 f"{tolerance:g} px: fit a smaller altitude range or a smaller image, raise the tolerance, or do "
                 "without it"
             )
-        return (
-            ""
-            if self.min_denominator > 0
-            else "the localisation RPC has a pole near the scene: do without it"
-        )
+        return "" if self.min_denominator > 0 else "the localisation RPC has a pole near the scene: do without it"
 
 
 def off(rpc: RPC, found: Array, ground: Array, image: Array) -> Array:

@@ -137,9 +137,7 @@ def numbers(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
     for value, (name, low, high) in zip(ground.T, _RANGES, strict=True):
         if value.min() < low or value.max() > high:
             wrong = value.min() if value.min() < low else value.max()
-            raise FitError(
-                f"points: {wrong:g} is not a {name}: are the columns swapped? Give lon, lat [deg], alt [m]"
-            )
+            raise FitError(f"points: {wrong:g} is not a {name}: are the columns swapped? Give lon, lat [deg], alt [m]")
     if not (np.abs(image) <= _FARTHEST).all():
         raise FitError(f"points: {np.abs(image).max():g} px is no place in an image")
     if np.ptp(ground[:, 0]) > 180.0:

@@ -29,9 +29,7 @@ _POWERS = np.array([[monomial.count(letter) for letter in "LPH"] for monomial in
 _BERNSTEIN = np.array([[comb(i, k) / comb(3, k) for k in range(4)] for i in range(4)])
 _LEVEL = 32  # directions that a hull is cut in, level with the ground; up and down are two more
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, _LEVEL, endpoint=False)
-_DIRECTIONS = np.vstack(
-    [np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES), 0 * _ANGLES]), [[0, 0, 1], [0, 0, -1]]]
-)
+_DIRECTIONS = np.vstack([np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES), 0 * _ANGLES]), [[0, 0, 1], [0, 0, -1]]])
 _AXES = np.array([[0, _LEVEL // 4, -2], [_LEVEL // 2, 3 * _LEVEL // 4, -1]])  # of them, and their opposites
 _SOME = 4096  # points that the sides of a hull are told from; worked on at a time
 _ROUNDS, _CUTS = 20, 40  # of a bounded least squares; inequalities that are taken in in one
@@ -74,9 +72,7 @@ class Region:
     @classmethod
     def box(cls, box: Array) -> Region:
         """Return a region that is a box (3, 2) in normalised coordinates."""
-        return cls(
-            box.mean(axis=1), np.diag(0.5 * (box[:, 1] - box[:, 0])), np.ones((_NODES, _NODES), dtype=bool)
-        )
+        return cls(box.mean(axis=1), np.diag(0.5 * (box[:, 1] - box[:, 0])), np.ones((_NODES, _NODES), dtype=bool))
 
     @classmethod
     def around(cls, ground: Array, image: Array, margin: float) -> Region:
@@ -87,15 +83,11 @@ class Region:
         """
         some = slice(None, None, 1 + len(ground) // _SOME)
         design = np.hstack([image[some], ground[some, 2:], np.ones((len(ground[some]), 1))])
-        slope = np.linalg.lstsq(
-            design - np.append(design[:, :3].mean(axis=0), 0.0), ground[some, :2], rcond=None
-        )[0]
+        slope = np.linalg.lstsq(design - np.append(design[:, :3].mean(axis=0), 0.0), ground[some, :2], rcond=None)[0]
         skew = np.zeros((3, 3))
         skew[:2, :2], skew[2] = slope[:2], [*slope[2], 1.0]
         inverse = np.linalg.pinv(skew) @ _DIRECTIONS.T
-        reach = np.max(
-            [(ground[i : i + _SOME] @ inverse).max(axis=0) for i in range(0, len(ground), _SOME)], axis=0
-        )
+        reach = np.max([(ground[i : i + _SOME] @ inverse).max(axis=0) for i in range(0, len(ground), _SOME)], axis=0)
         ends = reach[_AXES]
         middle, half = 0.5 * (ends[0] - ends[1]), 0.5 * (ends[0] + ends[1])
         inside = _inside(reach - _DIRECTIONS @ middle, half[:2])
@@ -205,9 +197,7 @@ def bounded(system: Compressed, region: Region, active: IntArray) -> Array | Non
             return x
         used = np.append(used, broken)
         rows = region.rows(used) - floor * region.there[0]
-        normal = solve_triangular(
-            system.matrix, np.pad(rows[:, active[1:]], ((0, 0), (len(x) - m, 0))).T, trans="T"
-        )
+        normal = solve_triangular(system.matrix, np.pad(rows[:, active[1:]], ((0, 0), (len(x) - m, 0))).T, trans="T")
         below = -rows[:, 0] - system.target @ normal
         size, last = np.linalg.norm(normal, axis=0), np.eye(len(x) + 1)[-1]
         columns = np.vstack([normal, below]) / size

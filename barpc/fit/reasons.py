@@ -156,9 +156,7 @@ def _step(smooth: Array, cols: Array) -> tuple[float, float]:
     heights = []
     for n in (_FEW, _MANY):
         mean = (sums[n:] - sums[:-n]) / n
-        change = np.linalg.norm(
-            mean[n:] - mean[:-n], axis=1
-        )  # at i: between points i .. i + n - 1 and the n after
+        change = np.linalg.norm(mean[n:] - mean[:-n], axis=1)  # at i: between points i .. i + n - 1 and the n after
         heights.append(np.pad(change, (n - 1, n)))  # at i: between points i and i + 1
     at = _MANY - 1 + int(heights[0][_MANY - 1 : len(heights[1]) - _MANY].argmax())  # as far as both reach
     if heights[0][at] < np.sqrt(_FEW / _MANY) * heights[1][at]:  # halfway between no step and nothing else

@@ -39,9 +39,7 @@ class Free:
         lon, lat, alt = self.pole
         pole = f"a pole at lon {lon:.4f}, lat {lat:.4f}, {alt:.0f} m, {self.far:.3g} times as far from the middle as"
         return f"without a margin around the image (pole_margin 0) up to {self.max_px:.3g} px, with " + (
-            f"{pole} the image's end"
-            if np.isfinite(self.far)
-            else "small denominators around it, but no pole"
+            f"{pole} the image's end" if np.isfinite(self.far) else "small denominators around it, but no pole"
         )
 
 
@@ -145,8 +143,7 @@ class RpcFit:
                 f"row {self.rmse_ckp[1]:.3g}), wanted {tolerance:g}: "
                 + (f"{self.reason}" if self.reason else "fit a smaller altitude range or a smaller image")
                 + ", or raise the tolerance"
-                + ", or fit by the method minimax"
-                * (self.method == "gauss-newton" and worst < _HOPE * tolerance)
+                + ", or fit by the method minimax" * (self.method == "gauss-newton" and worst < _HOPE * tolerance)
                 + (f"; {self.free}" if self.free else "")
             )
         if not self.min_denominator > 0:

@@ -211,9 +211,7 @@ def fit_rpc_points(
 
 def _missed(sample: Sample, rpc: RPC, _: Solution) -> tuple[Errors, Array]:
     """Return the errors of a localisation RPC on the check points of a model."""
-    return sample.sought(
-        lambda ground, at: off(rpc, rpc.localize_direct(at[:, :2], at[:, 2]), ground, at[:, :2])
-    )
+    return sample.sought(lambda ground, at: off(rpc, rpc.localize_direct(at[:, :2], at[:, 2]), ground, at[:, :2]))
 
 
 def _left_out(

@@ -52,9 +52,7 @@ TOLERANCE = 1e-10
 """Change of the RMSE [px] at which the iterations stop."""
 _SAMPLES = 200  # of the L-curve
 _LEAST_DAMPED, _FIRST_DAMPED, _MOST_DAMPED = 1e-12, 1e-6, 1e3  # of the size of a column
-_POWER = (
-    1.5  # of the errors that weights grow with, and 20 rounds: 0.94 px for 1.21 at 89.9 N, 60 rounds 0.89
-)
+_POWER = 1.5  # of the errors that weights grow with, and 20 rounds: 0.94 px for 1.21 at 89.9 N, 60 rounds 0.89
 _REWEIGHTED = 20  # times, of ``minimax``
 _SLACK = 1e-6  # of the least denominator: rounding
 _GAIN = 1e-3  # of the sum of squares: less in a step, and it stands
@@ -138,9 +136,7 @@ def _reweighted(
     """Return RMSE [px] of coefficients, and the systems that their denominators weight."""
     squares, following = 0.0, []
     for i, axis in enumerate(axes):
-        with np.errstate(
-            all="ignore"
-        ):  # a denominator that is 0 at a point: no number comes of it, and the passes end
+        with np.errstate(all="ignore"):  # a denominator that is 0 at a point: no number comes of it, and the passes end
             system = problem.compressed(axis, coeffs[2 * i + 1])
         x = problem.packed(coeffs[2 * i : 2 * i + 2])
         squares += system.squares(x) * float(problem.norm.image_scale[axis]) ** 2
@@ -215,9 +211,7 @@ def tidy(values: Array) -> Array:
     return np.array([float(f"{value:.12g}") for value in values])
 
 
-def normalization(
-    ground: Array, image: Array, options: FitOptions, vendor: RPC | None = None
-) -> Normalization:
+def normalization(ground: Array, image: Array, options: FitOptions, vendor: RPC | None = None) -> Normalization:
     """Return the offsets and scales that take points into [-1, 1], rounded to the options' precision.
 
     Those of the ground are the vendor's where one is given.
@@ -323,9 +317,7 @@ def _minimised(problem: Problem, axis: int, x: Array, region: Region) -> tuple[A
     return x, system, passes
 
 
-def _ahead(
-    problem: Problem, system: Compressed, x: Array, penalty: Array, size: Array, region: Region
-) -> Array:
+def _ahead(problem: Problem, system: Compressed, x: Array, penalty: Array, size: Array, region: Region) -> Array:
     """Return the solution of a system damped towards x, its denominator kept up over a region; x where there
     is none.
     """
@@ -361,9 +353,7 @@ def _minimax(problem: Problem, quantize: Rounding | None, vendor: RPC | None) ->
             heavy = replace(problem, weight=given * np.sqrt(weight), first=None)
             x, solved[axis], steps = _minimised(heavy, axis, x, region)
             passes += steps
-        parts.append(
-            problem.expanded(best if quantize is None else solution(solved[axis].solved_by(best), quantize))
-        )
+        parts.append(problem.expanded(best if quantize is None else solution(solved[axis].solved_by(best), quantize)))
     return _quotients(parts), solved, h, passes
 
 

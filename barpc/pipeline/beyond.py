@@ -265,9 +265,7 @@ def _write_tiles(
     """Return an RPC for each tile, in the tile's own pixels, and a list of them."""
     assert options.tiles is not None
     boxes, alts = tile_boxes(view.size, options.tiles), widened(view.alt_range)
-    tasks = [
-        (model, tuple(boxes[at : at + _GROUP]), alts, options.fit) for at in range(0, len(boxes), _GROUP)
-    ]
+    tasks = [(model, tuple(boxes[at : at + _GROUP]), alts, options.fit) for at in range(0, len(boxes), _GROUP)]
     try:
         with CachingExecutor(run, {}, executor) as caching:
             fits = [one for group in ordered(caching, fit_tiles, tasks, "tiles") for one in group]

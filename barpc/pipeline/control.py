@@ -74,9 +74,7 @@ def _load(path: str, views: Sequence[View], options: RunOptions) -> GroundPoints
     return replace(points.select(keep), left_out=tuple(f"{path}: {line}; left out" for line in out))
 
 
-def _implausible(
-    points: GroundPoints, views: Sequence[View], search: Array
-) -> Iterator[tuple[BoolArray, str]]:
+def _implausible(points: GroundPoints, views: Sequence[View], search: Array) -> Iterator[tuple[BoolArray, str]]:
     """Yield the points (G,) that cannot be meant, and why; the first reason counts. `search` (M,): `reach_of` [px]."""
     low, high = np.array([view.alt_range for view in views])[points.view].T
     alt = points.lonlatalt[points.point, 2]

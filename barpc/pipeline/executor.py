@@ -165,9 +165,7 @@ class CachingExecutor(Executor):
                     self._spilled.add(place)
         if not large:
             return args
-        return Spilled(
-            {name: array for name, array in record.items() if name not in large}, large, self.store
-        )
+        return Spilled({name: array for name, array in record.items() if name not in large}, large, self.store)
 
     def _next_batch(self) -> list[_Task]:
         """Return the waiting tasks of one function without a kept result; they count as in flight, if any."""

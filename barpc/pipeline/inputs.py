@@ -102,9 +102,7 @@ def input_files(options: RunOptions) -> list[Path]:
     return found
 
 
-def read_pairs(
-    path: str | Path, views: Sequence[View], left_out: Sequence[str | Path] = ()
-) -> list[tuple[int, int]]:
+def read_pairs(path: str | Path, views: Sequence[View], left_out: Sequence[str | Path] = ()) -> list[tuple[int, int]]:
     """Read the pairs of a list: two image names or paths a line; blank lines and # comments are skipped.
 
     Relative paths start from where the list lies, or from the current folder; pairs with an image that was `left_out`
@@ -130,9 +128,7 @@ def read_pairs(
     return pairs
 
 
-def _finder(
-    folder: Path, views: Sequence[View], left_out: Sequence[str | Path]
-) -> Callable[[str], int | None]:
+def _finder(folder: Path, views: Sequence[View], left_out: Sequence[str | Path]) -> Callable[[str], int | None]:
     """Return what finds a view by path or name: its index, None if it was left out, InputError if unknown."""
     names = ViewNames([view.name for view in views], "the list of pairs")
     without = ViewNames([Path(path).name for path in left_out], "")

@@ -66,9 +66,7 @@ def write_views(
             return ordered(fresh, verify_files, again, "verify", progress)
 
 
-def make_files(
-    view: View, rpc: RPC, images: str, formats: Sequence[str], folder: str, room: str
-) -> tuple[str, ...]:
+def make_files(view: View, rpc: RPC, images: str, formats: Sequence[str], folder: str, room: str) -> tuple[str, ...]:
     """Write the files of a view into a temporary folder before they go to `folder`; return their names."""
     place, names = Path(room) / view.name, file_names(view, images, formats)
     for name in names:

@@ -40,9 +40,7 @@ def prove(folder: Path, places: Sequence[Path] = ()) -> list[Proved]:
     """
     summary = read_summary(folder)
     if summary.inputs is None or summary.outputs is None:
-        raise InputError(
-            f"{folder}: its summary holds no hashes: an older release wrote it; run the adjustment again"
-        )
+        raise InputError(f"{folder}: its summary holds no hashes: an older release wrote it; run the adjustment again")
     return [
         *_inputs(summary, (folder, folder.parent, *places)),
         *_outputs(summary, folder),

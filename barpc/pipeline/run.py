@@ -294,9 +294,7 @@ def _solve(
         return _adjusted(run, options, *given)
 
 
-def _registered(
-    run: Run, options: RunOptions, dem: Dem, executor: Executor, progress: Progress | None
-) -> Registration:
+def _registered(run: Run, options: RunOptions, dem: Dem, executor: Executor, progress: Progress | None) -> Registration:
     """Register the views, with the cameras as delivered, to the reference."""
     given = options.adjust.dem_bias_sigma
     bias = (KNOWN_BIAS if dem.known else DEM_BIAS) if given is None else given

@@ -37,9 +37,7 @@ def read_colmap(path: Path, views: ViewNames) -> Iterator[PairPoints]:
         pass
     for log in (path.with_name(f"{path.name}-{end}") for end in ("wal", "journal")):
         if _is_hot(log):
-            raise InputError(
-                f"{path}: another program has not finished writing it ({log.name}); close it first"
-            )
+            raise InputError(f"{path}: another program has not finished writing it ({log.name}); close it first")
     where = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
     try:
         with closing(sqlite3.connect(where, uri=True)) as database:
@@ -89,9 +87,7 @@ class _Tables:
         return np.frombuffer(data, dtype).reshape(found[0], found[1])
 
 
-def _allowed(
-    action: int, first: str | None, _second: str | None, _base: str | None, source: str | None
-) -> int:
+def _allowed(action: int, first: str | None, _second: str | None, _base: str | None, source: str | None) -> int:
     """Authorise reading the known tables, and nothing by a view or trigger."""
     good = action == sqlite3.SQLITE_SELECT or (action == sqlite3.SQLITE_READ and first in _TABLES)
     return sqlite3.SQLITE_OK if good and source is None else sqlite3.SQLITE_DENY

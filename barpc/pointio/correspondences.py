@@ -160,9 +160,7 @@ def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Point]:
                 east, north, up = (float(value) for value in properties.get("sigma_m", (GROUND_SIGMA,) * 3))
                 spread = float(properties.get("sigma_px", IMAGE_SIGMA))
             except (TypeError, ValueError) as error:
-                raise InputError(
-                    f"{path}: sigma_m is [east, north, up], sigma_px a number ({error})"
-                ) from error
+                raise InputError(f"{path}: sigma_m is [east, north, up], sigma_px a number ({error})") from error
             yield _Point(name, (lon, lat, alt), (east, north, up), view, (col, row), spread)
 
 
@@ -352,9 +350,7 @@ def _read_npz(path: Path) -> Correspondences:
         return _checked(path, arrays["ground"], arrays["image"], arrays.get("sigma"))
     columns = {key: arrays[list(arrays)[i]] for key, i in header_of(list(arrays)).items()}
     if missing := [name for name in _COLUMNS if name not in columns]:
-        raise InputError(
-            f"{path}: neither ground and image nor {', '.join(missing)}; has {', '.join(arrays)}"
-        )
+        raise InputError(f"{path}: neither ground and image nor {', '.join(missing)}; has {', '.join(arrays)}")
     return _correspondences(path, columns)
 
 

@@ -33,9 +33,7 @@ def read_hloc(path: Path, views: ViewNames) -> Iterator[PairPoints]:
     try:
         import h5py
     except ImportError:
-        raise InputError(
-            f"{path}: HDF5 is read with h5py, which is not installed: pip install h5py"
-        ) from None
+        raise InputError(f"{path}: HDF5 is read with h5py, which is not installed: pip install h5py") from None
     try:
         with ExitStack() as files:
             matches = _Datasets(path, files, h5py)

@@ -15,9 +15,7 @@ from barpc.sidefile import TABLE, read_text
 
 HEIGHT_SIGMA = 0.5  # m, of a height whose file states none: ICESat-2 and GEDI over gentle ground
 FLAT_SIGMA = 1.0  # m, of its place along an axis, each point's own
-_HIGHEST = (
-    12e3  # m: what is higher or lower stands for "no height" (-9999 is so low, and is no place on land)
-)
+_HIGHEST = 12e3  # m: what is higher or lower stands for "no height" (-9999 is so low, and is no place on land)
 _FILL = -9999.0  # m: of GEDI and many others
 _TURNS = 540.0  # deg: longitudes are taken by whole turns
 

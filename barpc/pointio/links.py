@@ -32,8 +32,7 @@ class Links:
         """Return the matches of pairs of views: points of a view at the very same place are one."""
         given = list(pairs)
         view = np.concatenate(
-            [np.full(len(xy), i) for a, b, *ends in given for i, xy in zip((a, b), ends, strict=True)]
-            or [np.zeros(0)]
+            [np.full(len(xy), i) for a, b, *ends in given for i, xy in zip((a, b), ends, strict=True)] or [np.zeros(0)]
         )
         xy = np.concatenate([xy for _, _, *ends in given for xy in ends] or [np.zeros((0, 2))])
         starts = np.cumsum([0, *(2 * len(first) for _, _, first, _ in given)])

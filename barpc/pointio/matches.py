@@ -72,9 +72,7 @@ def write_matches(path: Path | str, tracks: Tracks, names: Sequence[str]) -> Non
     if path.suffix.lower() == ".npz":
         with path.open("wb") as file:
             view, track = tracks.view, tracks.point
-            np.savez_compressed(
-                file, names=np.array(names), view=view, track=track, xy=tracks.xy, sigma=tracks.sigma
-            )
+            np.savez_compressed(file, names=np.array(names), view=view, track=track, xy=tracks.xy, sigma=tracks.sigma)
         return
     if path.suffix.lower() != ".csv":
         raise InputError(f"{path}: tie points are written as .csv or .npz")

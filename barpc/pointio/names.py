@@ -40,9 +40,7 @@ def unique_names(files: Sequence[Place]) -> list[str]:
     ends = [file.stem if stems[file.parent, _folded(file.stem)] == 1 else file.name for file in places]
     depth = [1] * len(places)
     while True:
-        names = [
-            "_".join([*file.parts[-n:-1], end]) for file, end, n in zip(places, ends, depth, strict=True)
-        ]
+        names = ["_".join([*file.parts[-n:-1], end]) for file, end, n in zip(places, ends, depth, strict=True)]
         count = Counter(map(_folded, names))
         again = [i for i, name in enumerate(names) if count[_folded(name)] > 1]
         deeper = [i for i in again if depth[i] < len(places[i].relative_to(places[i].anchor).parts)]

@@ -110,9 +110,7 @@ def matched_keypoints(path: Path, arrays: Arrays) -> tuple[Array, Array]:
             return first, second
         pairs = index_pairs(known, (len(first), len(second)))
     except (KeyError, ValueError, TypeError) as error:
-        raise InputError(
-            f"{path}: not an npz of keypoints0, keypoints1 (N, 2), matches0 ({error})"
-        ) from error
+        raise InputError(f"{path}: not an npz of keypoints0, keypoints1 (N, 2), matches0 ({error})") from error
     return first[pairs[:, 0]], second[pairs[:, 1]]
 
 

@@ -12,9 +12,7 @@ from barpc.sidefile import LARGEST, OPTIONS, read_text
 
 _ROUNDED = 2e-6
 """What the squares of a rotation's rows are off by at most where each number has the six decimals that `%f` writes."""
-_WANTED = (
-    "expected three or four lines of four numbers: a rotation (with a scale) and a translation [m], ECEF"
-)
+_WANTED = "expected three or four lines of four numbers: a rotation (with a scale) and a translation [m], ECEF"
 
 
 def read_transform(path: Path | str) -> Array:

@@ -194,9 +194,7 @@ def pinned(at: Remote) -> Remote:
         return at
     part = _fetch(at, 0, BLOCK)
     if not part.tag:
-        raise OSError(
-            "its host names no version of it (ETag, Last-Modified), so it might change unseen; fetch it"
-        )
+        raise OSError("its host names no version of it (ETag, Last-Modified), so it might change unseen; fetch it")
     found = Remote(at, part.size, part.tag)
     _blocks.put((str(found), found.size, found.tag, 0), part.data)
     return found

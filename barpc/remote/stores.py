@@ -57,9 +57,7 @@ class _Opened:
 
 
 def _version(found: Mapping[str, Any]) -> tuple[int, str]:
-    tags = (
-        found.get(key) for key in ("ETag", "etag", "generation", "mtime", "LastModified", "last_modified")
-    )
+    tags = (found.get(key) for key in ("ETag", "etag", "generation", "mtime", "LastModified", "last_modified"))
     return int(found["size"]), str(next(filter(None, tags), ""))
 
 

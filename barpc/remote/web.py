@@ -33,9 +33,7 @@ _PIECE = 1 << 16
 _KEPT = "/%:@!$&'()*+,;=~"  # characters that stand in an address as they are
 _TOGETHER = 8  # requests for side files at a time
 
-_idle: dict[
-    tuple[int, str, str], list[HTTPConnection]
-] = {}  # process (a fork shares no socket), scheme, host
+_idle: dict[tuple[int, str, str], list[HTTPConnection]] = {}  # process (a fork shares no socket), scheme, host
 _lock = threading.Lock()
 
 
@@ -68,9 +66,7 @@ def _moved(at: str, start: int, stop: int) -> Part:
         except ValueError as error:
             raise OSError(f"its host sends us on to what is no address ({visible(found[:200])})") from error
         if not same:
-            raise OSError(
-                f"its host sends us on to {visible(url[:200])}, which is not followed; give that address"
-            )
+            raise OSError(f"its host sends us on to {visible(url[:200])}, which is not followed; give that address")
     raise OSError("its host sends us on and on")
 
 
@@ -93,9 +89,7 @@ def _once(url: str, start: int, stop: int) -> Part | str:
             again = answer.isclosed() and not answer.will_close
     except (HTTPException, TimeoutError, ConnectionError, ssl.SSLError, _PassingError) as error:
         if late.is_set():  # however the cut shows: as an end, as a reset
-            raise _PassingError(
-                f"its host takes more than {longest:.3g} s for {stop - start} bytes"
-            ) from error
+            raise _PassingError(f"its host takes more than {longest:.3g} s for {stop - start} bytes") from error
         if isinstance(error, _PassingError):
             raise
         raise _PassingError(f"its host broke off ({type(error).__name__})") from error

@@ -33,9 +33,7 @@ def tag(name: str, *children: str, **attributes: object) -> str:
     >>> tag("path", d="M0 0")
     '<path d="M0 0"/>'
     """
-    words = "".join(
-        f' {key.rstrip("_").replace("_", "-")}="{_value(value)}"' for key, value in attributes.items()
-    )
+    words = "".join(f' {key.rstrip("_").replace("_", "-")}="{_value(value)}"' for key, value in attributes.items())
     return f"<{name}{words}>{''.join(children)}</{name}>" if children else f"<{name}{words}/>"
 
 

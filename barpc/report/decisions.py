@@ -204,8 +204,7 @@ def _cut(scene: SceneEntry, views: Sequence[ViewEntry]) -> list[str]:
     found = ["No observation of a tie point was cut."] if kept and not lost else []
     if lost:
         share, worst = max(
-            (view.num_rejected / max(view.num_rejected + view.num_observations, 1), view.name)
-            for view in views
+            (view.num_rejected / max(view.num_rejected + view.num_observations, 1), view.name) for view in views
         )
         most = f"the most in {worst}: {100 * share:.1f} %"
         whole = f"{lost} of {lost + kept} observations of tie points ({100 * lost / (lost + kept):.1f} %)"

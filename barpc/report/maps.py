@@ -208,9 +208,7 @@ def _stacks(plane: Plane, outlines: Sequence[Sequence[Array]], names: Sequence[s
     return stacks
 
 
-def _stack_names(
-    stacks: Sequence[Stack], many: bool, taken: Sequence[tuple[float, float, float]] = ()
-) -> list[str]:
+def _stack_names(stacks: Sequence[Stack], many: bool, taken: Sequence[tuple[float, float, float]] = ()) -> list[str]:
     """Return the names of stacks, without those that would stand on others or on what is taken: x, y, half width."""
     taken, names, gap = list(taken), [], 14 if many else 0
     for stack in stacks:
@@ -326,9 +324,7 @@ def residual_panels(
         rest.sort(key=lambda k: -shares[k])
     for k in [*first, *rest][:_MOST]:
         rows = evenly(rows_of[k], most)
-        svg = _panel(
-            when, k, views[k], grids[k], np.hstack([observations.xy[rows], residuals[rows]]), longest
-        )
+        svg = _panel(when, k, views[k], grids[k], np.hstack([observations.xy[rows], residuals[rows]]), longest)
         charts.append((svg, f"{views[k].name}: {_note(grids[k])}"))
     words = f"A thin line of a {_PANEL / _REACH:.0f}th of a panel's width is {longest:.2g} px"
     key = f"{words}; bold arrows are drawn twice as long."
@@ -364,9 +360,7 @@ def _panel(when: str, number: int, view: ViewEntry, cells: Cells, drawn: Array, 
         parts.append(_arrow(middle, cells.mean[i, j] * (2 * _REACH / longest)))
     described = f"{len(drawn)} residuals are drawn; {_note(cells)}."
     title = f"Residuals over {view.name}"
-    return sheet(
-        f"panel-{when}{number}", title, described, tall, parts, width=_PANEL, class_="panel", data_v=number
-    )
+    return sheet(f"panel-{when}{number}", title, described, tall, parts, width=_PANEL, class_="panel", data_v=number)
 
 
 def _arrow(middle: Array, vector: Array) -> str:

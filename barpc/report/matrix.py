@@ -41,9 +41,7 @@ class Measure:
 
 MEASURES = (
     Measure("matches", "matches", lambda p: p.num_matches, ".0f", (10, 30, 100, 300, 1000)),
-    Measure(
-        "offset", "epipolar offset, RMS [px]", lambda p: p.offset_rms[-1], ".2f", (0.05, 0.1, 0.2, 0.5, 1)
-    ),
+    Measure("offset", "epipolar offset, RMS [px]", lambda p: p.offset_rms[-1], ".2f", (0.05, 0.1, 0.2, 0.5, 1)),
     Measure("angle", "angle of convergence [deg]", lambda p: p.convergence_deg, ".1f", (1, 5, 15, 35, 60)),
 )
 

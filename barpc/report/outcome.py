@@ -227,8 +227,7 @@ def pair_ties(tracks: Tracks, keep: BoolArray | None = None) -> list[PairTies]:
     a, b, views = a[order], b[order], views[:, order]
     starts = np.flatnonzero((np.diff(views, axis=1, prepend=-1) != 0).any(axis=0))
     return [
-        PairTies((int(views[0, s]), int(views[1, s])), a[s:e], b[s:e])
-        for s, e in pairwise([*starts.tolist(), len(a)])
+        PairTies((int(views[0, s]), int(views[1, s])), a[s:e], b[s:e]) for s, e in pairwise([*starts.tolist(), len(a)])
     ]
 
 
@@ -243,9 +242,7 @@ def _whole_shift(ties: PairTies, tracks: Tracks) -> Array | None:
     return whole if len(shift) >= LEAST and same >= MOST else None
 
 
-def triangulate_tracks(
-    tracks: Tracks, sensors: Sequence[SensorModel], alt: float, keep: BoolArray
-) -> Triangulation:
+def triangulate_tracks(tracks: Tracks, sensors: Sequence[SensorModel], alt: float, keep: BoolArray) -> Triangulation:
     """Return all tracks intersected through given cameras from the observations (K,) that count, starting at `alt` [m].
 
     The residuals of the others are measured against the same points; a track with fewer than two observations that

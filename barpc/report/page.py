@@ -161,9 +161,7 @@ def _map(files: RunFiles) -> Section | None:
         if files.summary.gcps or files.summary.check_points:
             caption += " Triangles are GCPs, those on their tip check points."
         if files.summary.scene is not None and files.summary.scene.moving:
-            caption += (
-                " Shaded: where tie points move together, stronger with more of them; dashed: where most are."
-            )
+            caption += " Shaded: where tie points move together, stronger with more of them; dashed: where most are."
         shown.append((ground_map(files), caption))
     if shown and len(views) > charts.MAX_DRAWN:
         more = f"At most {charts.MAX_DRAWN} of {len(views)} outlines are drawn, good ones evenly taken, and no matrix"
@@ -244,9 +242,7 @@ def _surface(files: RunFiles) -> Section | None:
         f" cameras, {100 * after.share:.0f} % by the corrected ones."
     )
     if before.nmad_m is not None and after.nmad_m is not None:
-        answer += (
-            f" Pairs of images disagree by {metres(before.nmad_m)} and by {metres(after.nmad_m)} (medians)."
-        )
+        answer += f" Pairs of images disagree by {metres(before.nmad_m)} and by {metres(after.nmad_m)} (medians)."
     shown = [_relief(one) for one in files.reliefs]
     if files.draped:
         shown.append(_swiped(*files.draped))
@@ -350,9 +346,7 @@ def _decisions(files: RunFiles) -> Section | None:
         return None
     tables = []
     if summary.adjusted:
-        caption = (
-            "What was decided by of each image: its prior widened, what was cut, what is left that is smooth"
-        )
+        caption = "What was decided by of each image: its prior widened, what was cut, what is left that is smooth"
         tables.append(table("decided", caption, views, ViewEntry, ViewEntry.DECISIONS).fold())
     again = second_attempts(summary.pairs)
     tables += [again] if again else []

@@ -42,9 +42,7 @@ def _untied(view: ViewEntry, run: Run) -> Reservation | None:
     tried = sum(view.name in report.names for report in run.matched)
     if run.matched and not tried:
         return Reservation.of("no_overlap")
-    return Reservation.of(
-        "untied", tried=f" ({tried} pair{'s' * (tried > 1)} with it tried)" if tried else ""
-    )
+    return Reservation.of("untied", tried=f" ({tried} pair{'s' * (tried > 1)} with it tried)" if tried else "")
 
 
 def _left_alone(view: ViewEntry, run: Run) -> Reservation | None:
@@ -76,9 +74,7 @@ def _weakness(view: ViewEntry, run: Run) -> Reservation | None:
     few = view.num_observations
     if few >= FEW_OBSERVATIONS or view.num_gcps >= ENOUGH_GCPS:
         return None
-    if run.reference is not None and any(
-        found.points and found.name == view.name for found in run.reference.views
-    ):
+    if run.reference is not None and any(found.points and found.name == view.name for found in run.reference.views):
         return None
     return Reservation.of("few", few=few) if few else Reservation.of("none")
 

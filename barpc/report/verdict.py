@@ -26,9 +26,7 @@ from barpc.tie.reference import PEAK
 
 PRIOR_WIDENED = 2.0  # Cameras that are farther off than stated by more than this factor need a look
 _MOST_NAMED = 5  # images in a sentence
-MOVED = (
-    3.0  # A scene that moved by more than so many times what its cameras' accuracies let expect needs a look
-)
+MOVED = 3.0  # A scene that moved by more than so many times what its cameras' accuracies let expect needs a look
 _SAY_REJECTED = (
     "contradicted",
     "rejected",
@@ -192,9 +190,7 @@ def _control_reasons(run: Run) -> list[str]:
     out += _bends(run) + _wrong_heights(run)
     heights = None if run.adjustment is None else run.adjustment.altimetry
     if heights is not None and heights.why_not:
-        counts = (
-            f"{heights.agree} of {heights.near} on the tie points' surface agree, of {heights.given} given"
-        )
+        counts = f"{heights.agree} of {heights.near} on the tie points' surface agree, of {heights.given} given"
         out.append(f"The altimetry holds nothing: {heights.why_not} ({counts}).")
     tested = None if run.adjustment is None else run.adjustment.control
     if run.gcps is not None and tested is not None:
@@ -300,9 +296,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
             f"any direction, {why}."
         )
     lines += [
-        f"{one.sentence[0].upper()}{one.sentence[1:]}."
-        for one in explanations(run.adjustment)
-        if one.name != APART
+        f"{one.sentence[0].upper()}{one.sentence[1:]}." for one in explanations(run.adjustment) if one.name != APART
     ]
     if len(run.tracks) or run.gcps is not None:
         lines.append(f"The scene as a whole moved by {_enu(gauge.shift)}.")

@@ -82,9 +82,7 @@ class Carrier:
     suffixes: tuple[str, ...]
     write: Callable[[RPC, Place, Path, Path, bool], None]  # rpc, image, path, where it will stand, overwrite
     consumers: tuple[str, ...] = ("gdal", "rpcm", "shareloc", "orthority")
-    precision: Literal["nitf"] | None = (
-        None  # whose digits it holds (`barpc.fit.precision`); None: all of them
-    )
+    precision: Literal["nitf"] | None = None  # whose digits it holds (`barpc.fit.precision`); None: all of them
 
 
 def _vrt(rpc: RPC, image: Place, path: Path, place: Path, overwrite: bool) -> None:
@@ -179,9 +177,7 @@ def parse(data: bytes, name: str, options: ReadOptions | None = None) -> tuple[R
     for row in FORMATS.values():
         if row.sniff(content):
             return row.read(content, name, options or ReadOptions()), row.name
-    raise RpcFormatError(
-        f"{name}: no RPC format recognised (known: {', '.join(FORMATS)}); {_contents(content)}"
-    )
+    raise RpcFormatError(f"{name}: no RPC format recognised (known: {', '.join(FORMATS)}); {_contents(content)}")
 
 
 _NAMED = re.compile(

@@ -123,14 +123,10 @@ def plain_source(image_path: Path | str) -> Path:
 
 def has_mask(dataset: Any) -> bool:
     """Return whether a raster has a mask of its own, apart from an alpha band."""
-    return (
-        MaskFlags.per_dataset in dataset.mask_flag_enums[0] and ColorInterp.alpha not in dataset.colorinterp
-    )
+    return MaskFlags.per_dataset in dataset.mask_flag_enums[0] and ColorInterp.alpha not in dataset.colorinterp
 
 
-def write_rpc_copy(
-    rpc: RPC, image_path: Path | str, copy_path: Path | str, *, overwrite: bool = False
-) -> None:
+def write_rpc_copy(rpc: RPC, image_path: Path | str, copy_path: Path | str, *, overwrite: bool = False) -> None:
     """Write a GeoTIFF copy of an image that carries an RPC in its tag.
 
     A TIFF is copied byte by byte (pixels, compression, overviews and masks untouched, BigTIFF as well); any
@@ -164,9 +160,7 @@ def _copy_bytes(source: Path | str, target: Path) -> None:
         shutil.copyfileobj(file, copy, _COPIED)
 
 
-def write_rpc_nitf(
-    rpc: RPC, image_path: Path | str, nitf_path: Path | str, *, overwrite: bool = False
-) -> None:
+def write_rpc_nitf(rpc: RPC, image_path: Path | str, nitf_path: Path | str, *, overwrite: bool = False) -> None:
     """Write a NITF copy of an image with an RPC in its RPC00B extension (`nitf_record` says what it holds)."""
     record = nitf_record(rpc)
     with copying(image_path, nitf_path, overwrite) as (dataset, partial):

@@ -55,9 +55,7 @@ def write_resampled(
     """
     with copying(image_path, path, overwrite) as (dataset, partial):
         if any(np.dtype(kind).kind == "c" for kind in dataset.dtypes):
-            raise ImageError(
-                f"{image_path}: complex pixels are not resampled; give the amplitude as an image"
-            )
+            raise ImageError(f"{image_path}: complex pixels are not resampled; give the amplitude as an image")
         profile = {"width": dataset.width, "height": dataset.height, "count": dataset.count, **TIFF}
         profile |= {"dtype": dataset.dtypes[0], "nodata": dataset.nodata}
         profile |= {"blockxsize": BLOCK, "blockysize": BLOCK}

@@ -80,8 +80,7 @@ def described(path: Place) -> tuple[tuple[int, int] | None, bool]:
     """
     text = decode(read_bytes(path, RPC_FILE))
     found = [
-        re.search(rf"<(?:\w+:)?(?:{tag})>\s*+(\d{{1,7}})\s*+<", text)
-        for tag in ("NUMCOLUMNS|NCOLS", "NUMROWS|NROWS")
+        re.search(rf"<(?:\w+:)?(?:{tag})>\s*+(\d{{1,7}})\s*+<", text) for tag in ("NUMCOLUMNS|NCOLS", "NUMROWS|NROWS")
     ]
     width, height = (int(one[1]) if one is not None else 0 for one in found)
     return ((width, height) if width and height else None), holds_physical(text)
@@ -199,9 +198,7 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
     path = place(path)
     options = ReadOptions(first_pixel, band)
     head = read_head(path, IMAGE, 64)
-    text = (
-        encoding_of(head)[:6] == "utf-16" or b"\0" not in head
-    )  # no other text holds a zero byte near its start
+    text = encoding_of(head)[:6] == "utf-16" or b"\0" not in head  # no other text holds a zero byte near its start
     if not text or driver_of(head) not in (None, "VRT"):
         return _image_source(path, head, options)
     if _is_vrt(head) and isinstance(path, Path):
@@ -237,11 +234,7 @@ def _image_source(path: Place, head: bytes, options: ReadOptions) -> RpcSource:
     else:
         raise MissingRpcError(
             f"{path}: no RPC in the image and none beside it (.RPB, _RPC.TXT, .XML, .geom and others)"
-            + (
-                "; HDF5 files are not read: write its coefficients as an _RPC.TXT"
-                if head.startswith(_HDF5)
-                else ""
-            )
+            + ("; HDF5 files are not read: write its coefficients as an _RPC.TXT" if head.startswith(_HDF5) else "")
         )
     return replace(source, notes=source.notes + ((f"not used: {', '.join(ignored)}",) if ignored else ()))
 
@@ -289,13 +282,9 @@ def _tile_origin(image: Place, path: Place) -> tuple[_Window, str]:
     near = files_of(image.parent) if isinstance(image, Path) else beside(image, [f"DIM_{product}"])
     dim = near.get(f"dim_{product}".lower())
     text = decode(read_bytes(image.parent / dim, RPC_FILE)) if dim else ""
-    width, height = (
-        re.search(rf"<NTILES_SIZE\b[^<>]*\b{key}=\"(\d{{1,9}})\"", text) for key in ("ncols", "nrows")
-    )
+    width, height = (re.search(rf"<NTILES_SIZE\b[^<>]*\b{key}=\"(\d{{1,9}})\"", text) for key in ("ncols", "nrows"))
     if width is None or height is None:
-        raise RpcFormatError(
-            f"{path}: the tile size of {image.name} is unknown (no DIM_{product} with NTILES_SIZE)"
-        )
+        raise RpcFormatError(f"{path}: the tile size of {image.name} is unknown (no DIM_{product} with NTILES_SIZE)")
     row, col = (int(index) - 1 for index in tile.groups())
     x, y = col * int(width.group(1)), row * int(height.group(1))
     return (x, y, 1.0, 1.0), f"tile origin ({x}, {y}) applied"

@@ -69,17 +69,13 @@ def read_txt(text: str, name: str, options: ReadOptions) -> RPC:
     """
     found = [(key.upper(), value) for key, value in _pairs(text)]
     pairs = [(k, number(v, name, k)) for k, v in found if k in SINGLE or k.rpartition("_")[0] in LISTS]
-    pairs += [
-        (f"{k}_{i}", value) for k, v in found if k in LISTS for i, value in enumerate(numbers(v, name, k), 1)
-    ]
+    pairs += [(f"{k}_{i}", value) for k, v in found if k in LISTS for i, value in enumerate(numbers(v, name, k), 1)]
     return rpc_from_fields(collect_numbered(pairs, name), name, options)
 
 
 def write_txt(rpc: RPC) -> str:
     """Write ``KEY: value`` without units (rpcm stumbles on them); every number reads back to the bit."""
-    return (
-        "\n".join(_numbered(fields_from_rpc(rpc, direct=True), ": ", [str(i) for i in range(1, 21)])) + "\n"
-    )
+    return "\n".join(_numbered(fields_from_rpc(rpc, direct=True), ": ", [str(i) for i in range(1, 21)])) + "\n"
 
 
 # --- .RPB -------------------------------------------------------------------------------------------------
@@ -204,9 +200,7 @@ def read_json(text: str, name: str, options: ReadOptions) -> RPC:
         found = _find(document, mark)
         if found is not None:
             values = {word.lower(): value for word, value in found.items() if value is not None}
-            fields = {
-                key: _values(values[word], name, word) for key, word in dialect.items() if word in values
-            }
+            fields = {key: _values(values[word], name, word) for key, word in dialect.items() if word in values}
             return rpc_from_fields(fields, name, options)
     raise RpcFormatError(f"{name}: no RPC in this JSON (looked for row_num and line_num_coeff)")
 

@@ -139,9 +139,7 @@ def put_tag(path: Path, rpc: RPC, placed: bool = True) -> None:
     size = path.stat().st_size
     start = size + -size % 16
     if not directory.big and start + (1 << 16) > 0xFFFFFFFF:
-        raise ImageError(
-            f"{path}: a tag does not fit behind {size} bytes of classic TIFF; convert it to BigTIFF"
-        )
+        raise ImageError(f"{path}: a tag does not fit behind {size} bytes of classic TIFF; convert it to BigTIFF")
     offset, number, layout = directory.formats
     values = struct.pack(f"{directory.order}92d", *tag_values(rpc))
     drop = {RPC_TAG} if placed else {RPC_TAG, *_GEOREFERENCE_TAGS}

@@ -30,9 +30,7 @@ from barpc.vrt import vrt_from_xml
 
 
 def _root(text: str, name: str, *, strip_namespaces: bool = True) -> Element:
-    body = re.sub(
-        r"\A\s*+<\?xml[^<>]*\?>", "", text, count=1
-    )  # the encoding it declares is no longer its own
+    body = re.sub(r"\A\s*+<\?xml[^<>]*\?>", "", text, count=1)  # the encoding it declares is no longer its own
     return parse_xml(body.encode(), name=name, strip_namespaces=strip_namespaces)
 
 
@@ -127,9 +125,7 @@ _ENMAP_AXES = {"LINE": "ROW", "SAMP": "COL"}
 def read_enmap(text: str, name: str, options: ReadOptions) -> RPC:
     """Read EnMAP's metadata: `options.band` chooses among the bands' RPCs."""
     root = _root(text, name)
-    bands = [
-        b for rpc in root.iter("RPC") for b in rpc.iter("bandID") if b.get("number") == str(options.band)
-    ]
+    bands = [b for rpc in root.iter("RPC") for b in rpc.iter("bandID") if b.get("number") == str(options.band)]
     if not bands:
         raise RpcFormatError(f"{name}: no RPC of band {options.band}")
     values = {e.tag.upper(): number(e.text or "", name, e.tag) for e in bands[0]}
@@ -140,9 +136,7 @@ def read_enmap(text: str, name: str, options: ReadOptions) -> RPC:
     for key in COEFFICIENTS:
         axis, part, _ = key.split("_")
         stem = f"{_ENMAP_AXES[axis]}_{part}_"
-        fields[key] = [
-            values[k] for i in range(1, 21) for k in (f"{stem}{i}", f"{stem}{i:02d}") if k in values
-        ][:20]
+        fields[key] = [values[k] for i in range(1, 21) for k in (f"{stem}{i}", f"{stem}{i:02d}") if k in values][:20]
     return rpc_from_fields(fields, name, options)
 
 

@@ -220,9 +220,7 @@ class Corrected:
             by_row = (by_drift * self.correction.drift_rate(row)).sum(axis=1)
             share = by_row / (1.0 - by_row[1])
             parts = [part + share[:, None] * part[1] for part in parts]
-        by_ecef, of_rotation, of_translation = (
-            np.moveaxis(part, -1, 0).reshape(*shape, 2, 3) for part in parts
-        )
+        by_ecef, of_rotation, of_translation = (np.moveaxis(part, -1, 0).reshape(*shape, 2, 3) for part in parts)
         return image.reshape(*shape, 2), by_ecef, of_rotation, of_translation
 
     def localize(self, image: Array, alt: Array) -> Array:

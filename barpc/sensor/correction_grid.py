@@ -80,9 +80,7 @@ class CorrectionGrid(Frozen):
         image points.
         """
         reach = 0.05 * np.array([self.cols[1] - self.cols[0], self.rows[1] - self.rows[0]])
-        by_axis = [
-            (self.at(image + step) - self.at(image - step)) / step.sum() for step in 2 * np.diag(reach)
-        ]
+        by_axis = [(self.at(image + step) - self.at(image - step)) / step.sum() for step in 2 * np.diag(reach)]
         return np.stack(by_axis, axis=-1) / 2
 
     def apply(self, image: Array) -> Array:

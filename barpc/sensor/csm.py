@@ -78,9 +78,7 @@ class _State:
         """Return a list of finite numbers, perhaps of a stated length."""
         value = self.content.get(key)
         if not isinstance(value, list) or not all(type(v) in (int, float) for v in value):
-            raise RpcFormatError(
-                f"{self.name}: {key} is missing or no list of numbers; is the file complete?"
-            )
+            raise RpcFormatError(f"{self.name}: {key} is missing or no list of numbers; is the file complete?")
         if count not in (None, len(value)):
             raise RpcFormatError(f"{self.name}: {key} holds {len(value)} numbers, expected {count}")
         return np.array(value, dtype=np.float64)
@@ -126,9 +124,7 @@ class _State:
             raise InputError(
                 f"{self.name}: a distortion of type {self.number('m_distortionType'):g}, only radial (0) is read"
             )
-        return np.asarray(
-            np.pad(given, (0, 3 - len(given))) * self.positive("m_focalLength") ** np.array([0, 2, 4])
-        )
+        return np.asarray(np.pad(given, (0, 3 - len(given))) * self.positive("m_focalLength") ** np.array([0, 2, 4]))
 
 
 def _linescan(state: _State) -> Pushbroom:
@@ -154,9 +150,7 @@ def _lines(state: _State) -> tuple[float, float]:
     """Time of row 0 and from one row to the next [s]."""
     line, start, step = (state.numbers(f"m_intTime{what}") for what in ("Lines", "StartTimes", "s"))
     if not 0 < len(line) == len(start) == len(step):
-        raise RpcFormatError(
-            f"{state.name}: {len(line)} m_intTimeLines, {len(start)} times, {len(step)} steps"
-        )
+        raise RpcFormatError(f"{state.name}: {len(line)} m_intTimeLines, {len(start)} times, {len(step)} steps")
     rows, period = (
         line - 1.0,
         float(step[0]),
@@ -174,9 +168,7 @@ def _sampled(state: _State, what: str, kind: str, width: int, first: float) -> t
     values = state.numbers(f"m_{what}")
     stated = state.content.get(f"m_num{what.capitalize()}", len(values))
     if len(values) % width or stated != len(values):
-        raise RpcFormatError(
-            f"{state.name}: m_{what} holds {len(values)} of {stated} numbers; is the file complete?"
-        )
+        raise RpcFormatError(f"{state.name}: m_{what} holds {len(values)} of {stated} numbers; is the file complete?")
     step = state.positive(f"m_dt{kind}", 100.0)
     times: Array = state.number(f"m_t0{kind}") - first + step * np.arange(float(len(values) // width))
     return np.asarray(times, np.float64), values.reshape(-1, width)
@@ -187,9 +179,7 @@ def _look(state: _State, width: int) -> tuple[Array, float]:
     origin = (width - 1) / 2.0
     plane = state.plane((state.number("m_detectorSampleOrigin"), state.number("m_detectorLineOrigin")))
     plane = plane / state.positive("m_focalLength") * np.sign(state.number("m_zDirection"))
-    at = [
-        Polynomial([part[0] * (origin + 0.5) + part[2], part[0]]) for part in plane
-    ]  # of line 0 of the detector
+    at = [Polynomial([part[0] * (origin + 0.5) + part[2], part[0]]) for part in plane]  # of line 0 of the detector
     square = at[0] ** 2 + at[1] ** 2
     bend = 1.0 - Polynomial(state.distortion())(square)
     parts = [(part * bend).coef for part in at]

@@ -124,16 +124,12 @@ def _positions(model: SensorModel, rows: Array) -> Array:
         return np.asarray(_base(model).position(rows))
     stands, correction = _positions(model.sensor, rows), model.correction
     at = correction.center + _FAR * np.vstack([np.zeros(3), np.eye(3)])
-    moved = correction.apply(
-        np.broadcast_to(at[:, None], (4, len(rows), 3)), np.broadcast_to(rows, (4, len(rows)))
-    )
+    moved = correction.apply(np.broadcast_to(at[:, None], (4, len(rows), 3)), np.broadcast_to(rows, (4, len(rows))))
     matrix = np.moveaxis(moved[1:] - moved[0], 0, -1) / _FAR  # (N, 3, 3)
     return np.asarray(correction.center + np.linalg.solve(matrix, (stands - moved[0])[..., None])[..., 0])
 
 
-def _attitude(
-    model: SensorModel, base: Pushbroom, rows: Array, positions: Array, seen: tuple[int, float]
-) -> Rotation:
+def _attitude(model: SensorModel, base: Pushbroom, rows: Array, positions: Array, seen: tuple[int, float]) -> Rotation:
     """Return the rotation ecef_from_camera, z away from the ground, nearest to the lines of sight of each row."""
     cols = np.linspace(0.0, seen[0] - 1.0, _COLUMNS)
     image = np.stack(np.broadcast_arrays(cols, rows[:, None]), axis=-1)

@@ -206,9 +206,7 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
     limit = _GAIN * max(_FLOOR, min(float(fit.sigma[1]) for fit in fits))
     orbit = next(fit for fit in fits if fit.sigma[1] <= limit)
     if not orbit.sigma[:2].max() <= _TOLERANCE:
-        raise RpcError(
-            f"orbit: the state vectors scatter by {orbit.sigma.max():.3g} m about any smooth orbit"
-        )
+        raise RpcError(f"orbit: the state vectors scatter by {orbit.sigma.max():.3g} m about any smooth orbit")
     return orbit
 
 
@@ -240,8 +238,7 @@ def _fit_orbit(time: Array, position: Array, velocity: Array, degree: int) -> Or
         sigma = np.maximum(np.sqrt(squares / count), _DIGITS)
     series = solution.reshape(degree + 1, 3)
     taylor = [
-        chebyshev.chebval(-1.0, chebyshev.chebder(series, k)) / (half**k * math.factorial(k))
-        for k in range(degree + 1)
+        chebyshev.chebval(-1.0, chebyshev.chebder(series, k)) / (half**k * math.factorial(k)) for k in range(degree + 1)
     ]
     lacking = velocity - chebyshev.chebval(x, chebyshev.chebder(series)).T / half
     quadratic = (time - time[0])[:, None] ** np.arange(3)

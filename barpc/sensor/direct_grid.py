@@ -269,9 +269,7 @@ def _chebyshev(axis: Array, count: int) -> Array:
     """Return the places between which a polynomial is at its best, its ends among them."""
     if count >= len(axis):
         return axis
-    return np.asarray(
-        (axis[0] + axis[-1] - np.ptp(axis) * np.cos(np.pi * np.arange(count) / (count - 1))) / 2
-    )
+    return np.asarray((axis[0] + axis[-1] - np.ptp(axis) * np.cos(np.pi * np.arange(count) / (count - 1))) / 2)
 
 
 def _lagrange(nodes: Array, at: Array) -> Array:

@@ -59,10 +59,7 @@ class Frame(Frozen):
             ("distortion", (None,)),
         ):
             self._array(name, shape, RpcError)
-        if (
-            np.abs(self.rotation @ self.rotation.T - np.eye(3)).max() > 1e-9
-            or np.linalg.det(self.rotation) < 0
-        ):
+        if np.abs(self.rotation @ self.rotation.T - np.eye(3)).max() > 1e-9 or np.linalg.det(self.rotation) < 0:
             raise RpcError("frame camera: rotation is not a rotation matrix")
         if not abs(np.linalg.det(self.plane[:, :2])) > 0:
             raise RpcError("frame camera: plane has no area")
@@ -117,23 +114,16 @@ class Frame(Frozen):
             if not (np.abs(step) > _SETTLED).any():
                 break
         found = np.where(np.abs(step) < np.sqrt(_SETTLED), found, np.nan)
-        return np.where(
-            radius > 0, found / np.where(radius > 0, radius, 1.0), 1.0 / (1.0 - self.distortion[:1].sum())
-        )
+        return np.where(radius > 0, found / np.where(radius > 0, radius, 1.0), 1.0 / (1.0 - self.distortion[:1].sum()))
 
     def _derivatives(self, ground: Array) -> list[Array]:
         image, at, p = self._seen(ecef_from_ground(ground).T)
         square = (at**2).sum(axis=0)
         size = 1.0 - polyval(square, self.distortion)
         bend = -2.0 * polyval(square, polyder(self.distortion))
-        by_place = (
-            size * np.eye(2)[:, :, None] + bend * at[:, None] * at[None]
-        )  # d tangent / d place (2, 2, N)
+        by_place = size * np.eye(2)[:, :, None] + bend * at[:, None] * at[None]  # d tangent / d place (2, 2, N)
         tangents = p[:2] / p[2]
-        rows = (
-            np.stack([self.rotation[:, k, None] - tangents[k] * self.rotation[:, 2, None] for k in range(2)])
-            / p[2]
-        )
+        rows = np.stack([self.rotation[:, k, None] - tangents[k] * self.rotation[:, 2, None] for k in range(2)]) / p[2]
         by_image = np.einsum("ijn,jk->nik", by_place, self.plane[:, :2])
         jacobian = np.linalg.solve(by_image, np.moveaxis(rows, 2, 0)) @ ecef_from_ground_jacobian(ground)
         return [image.T, jacobian]

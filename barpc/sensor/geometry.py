@@ -72,9 +72,7 @@ def image_grid(
     return grid[..., :2].reshape(-1, 2), grid[..., 2].ravel()
 
 
-def footprint(
-    sensor: SensorModel, size: tuple[int, int], alt: float | npt.ArrayLike, per_side: int = 8
-) -> Array:
+def footprint(sensor: SensorModel, size: tuple[int, int], alt: float | npt.ArrayLike, per_side: int = 8) -> Array:
     """Return the outline of an image on the ground.
 
     Parameters
@@ -440,9 +438,7 @@ def triangulate(
     order = np.argsort(view, kind="stable")  # so that the rows of a view are a slice
     at, goal = point[order], xy[order]
     first = np.flatnonzero(np.diff(view[order], prepend=-1))
-    rows = [
-        (sensors[view[order[i]]], slice(i, j)) for i, j in zip(first, [*first[1:], len(view)], strict=True)
-    ]
+    rows = [(sensors[view[order[i]]], slice(i, j)) for i, j in zip(first, [*first[1:], len(view)], strict=True)]
     weight = np.ones(len(xy)) if sigma is None else 1.0 / np.asarray(sigma, dtype=np.float64)[order]
     left = np.empty((len(xy), 2))
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
@@ -503,7 +499,5 @@ def _normal_step(jacobian: Array, residual: Array, point: IntArray, scale: Array
     det = aa * paa + ab * pab + ac * pac
     # parallel rays: the determinant against the trace; 1e-10 is 0.0006 degrees
     ok = np.isfinite(det) & (det > 1e-10 * (aa + bb + cc) ** 3 / 27)
-    step = np.stack(
-        [paa * ra + pab * rb + pac * rc, pab * ra + pbb * rb + pbc * rc, pac * ra + pbc * rb + pcc * rc]
-    )
+    step = np.stack([paa * ra + pab * rb + pac * rc, pab * ra + pbb * rb + pbc * rc, pac * ra + pbc * rb + pcc * rc])
     return step / det, ok

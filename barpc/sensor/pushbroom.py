@@ -36,9 +36,7 @@ from barpc.sensor.curve import EXTRAPOLATION, Curve, Turn, cross
 
 CHUNK = 4096  # points worked on at a time, so that what Newton's method needs stays in cache
 
-_AIR = (
-    2.316  # m: of refraction at sea level, times tan z / cos^2 z of the zenith distance z (Noerdlinger 1999)
-)
+_AIR = 2.316  # m: of refraction at sea level, times tan z / cos^2 z of the zenith distance z (Noerdlinger 1999)
 _AIR_HEIGHT = 8000.0  # m: in which the air thins to 1/e
 _STEPS = 12
 _BENDS = 3  # light is bent by 3e-5: each step gains four digits
@@ -173,9 +171,7 @@ class Pushbroom(Frozen):
 
     def _told(self) -> str:
         start, end = self._span
-        height = ground_from_ecef(self.position((np.mean(self._span) - self.first_line) / self.line_period))[
-            2
-        ]
+        height = ground_from_ecef(self.position((np.mean(self._span) - self.first_line) / self.line_period))[2]
         period = f"{1e3 * self.line_period:.6g} ms a row"
         return f"{height / 1e3:.1f} km high, {period}, orbit and attitude for {end - start:.3g} s"
 
@@ -275,9 +271,7 @@ class Pushbroom(Frozen):
             d_col = (rate[0] * miss[1] - rate[1] * miss[0]) / det
             time = np.clip(time + d_time, start, stop)
             col = col + d_col
-            settled = (
-                (np.abs(d_time) < _SETTLED * abs(self.line_period)) & (np.abs(d_col) < _SETTLED) & (depth > 0)
-            )
+            settled = (np.abs(d_time) < _SETTLED * abs(self.line_period)) & (np.abs(d_col) < _SETTLED) & (depth > 0)
             if not (~settled & np.isfinite(col) & np.isfinite(time)).any():
                 break
         out = np.stack([col, (time - self.first_line) / self.line_period])
@@ -299,9 +293,7 @@ class Pushbroom(Frozen):
         by_x = self.light.by_point(
             self.mount @ turn.forth(np.stack([one, zero, -tangents[0]])) / depth, ecef, *motion
         )  # d(tangent x)/dX
-        by_y = self.light.by_point(
-            self.mount @ turn.forth(np.stack([zero, one, -tangents[1]])) / depth, ecef, *motion
-        )
+        by_y = self.light.by_point(self.mount @ turn.forth(np.stack([zero, one, -tangents[1]])) / depth, ecef, *motion)
         det = rate[1] * slope[0] - rate[0] * slope[1]
         row = (slope[1] * by_x - slope[0] * by_y) / det / self.line_period
         col = (rate[1] * by_x - rate[0] * by_y) / det

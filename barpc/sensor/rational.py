@@ -123,9 +123,7 @@ class Rational:
         ok = np.ones(len(z), dtype=bool)
         if len(bad):
             near = np.abs(self.value(x[:, bad]) - target[:, bad]) <= self._tolerance(target[:, bad])
-            bad = bad[
-                ~(near.all(axis=0) & self._regular(x[:, bad]))
-            ]  # most have arrived, out of the box or not
+            bad = bad[~(near.all(axis=0) & self._regular(x[:, bad]))]  # most have arrived, out of the box or not
             ok[bad] = self._solve_with_care(target[:, bad], x, bad)
         return x, ok
 

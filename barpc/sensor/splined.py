@@ -103,17 +103,12 @@ class RowSpline(Frozen):
             self._array(name, shape, RpcError)
         fine = np.isin(self.strips[:, 0], (0.0, 1.0)).all()
         if len(self.strips) != len(self.moved) or not fine:
-            raise RpcError(
-                "strips: each has an axis (0 or 1), two ends, an origin, a rate and a displacement"
-            )
+            raise RpcError("strips: each has an axis (0 or 1), two ends, an origin, a rate and a displacement")
         if len(self.periods) != len(self.swings) or not (self.periods > 0).all():
             raise RpcError("swings: each has a period above 0 and what its cosine and sine move")
         if 0 < len(self.coeffs) < 4:
             raise RpcError(f"a cubic spline has at least 4 coefficients, found {len(self.coeffs)}")
-        if (
-            len(self.steps) != (len(self.edges) + 1) * bool(len(self.edges))
-            or (np.diff(self.edges) <= 0).any()
-        ):
+        if len(self.steps) != (len(self.edges) + 1) * bool(len(self.edges)) or (np.diff(self.edges) <= 0).any():
             raise RpcError("detectors: their edges ascend, and there is one detector more than edges")
         if not (np.isfinite(self.row_offset) and np.isfinite(self.row_scale) and self.row_scale > 0):
             raise RpcError(f"spline rows: offset {self.row_offset}, scale {self.row_scale}")
@@ -127,9 +122,7 @@ class RowSpline(Frozen):
         """Return the displacement (..., 2) [px] of points seen at image points (..., 2) [px]."""
         out = self._along(image[..., 1], rate=False)
         if len(self.steps):
-            out += self.steps[
-                np.searchsorted(self.edges, image[..., 0], side="right").clip(0, len(self.edges))
-            ]
+            out += self.steps[np.searchsorted(self.edges, image[..., 0], side="right").clip(0, len(self.edges))]
         for strip, moved in zip(self.strips, self.moved, strict=True):
             out += profile(image[..., int(strip[0])], *strip[1:])[..., None] * moved
         for period, moves in zip(self.periods, self.swings, strict=True):

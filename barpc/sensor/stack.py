@@ -107,16 +107,12 @@ def localize(sensors: Sequence[SensorModel], image: Array, alt: Array, bounds: I
     return ground
 
 
-def _newton(
-    stack: RpcStack, image: Array, alt: Array, views: slice, bounds: IntArray
-) -> tuple[Array, BoolArray]:
+def _newton(stack: RpcStack, image: Array, alt: Array, views: slice, bounds: IntArray) -> tuple[Array, BoolArray]:
     """Return Newton's ground points (n, 3) of consecutive RPCs from their centres, and whether each (n,) is
     certain: within the box, and no step long beside the one before.
     """
     count = np.diff(bounds)
-    offset, scale = (
-        np.repeat(rows[views].T, count, axis=1) for rows in (stack.ground_offset, stack.ground_scale)
-    )
+    offset, scale = (np.repeat(rows[views].T, count, axis=1) for rows in (stack.ground_offset, stack.ground_scale))
     ground, before = offset.copy(), np.full(len(alt), np.inf)
     ground[2] = alt
     certain = np.ones(len(alt), dtype=bool)

@@ -60,9 +60,7 @@ def open_terrasar(path: str | Path) -> RangeDoppler:
     file = (find_annotation(path) or path) if path.is_dir() else path
     root = Fields(parse_xml(file, strip_namespaces=True), str(file))
     if root.element.tag != ROOT:
-        raise RpcFormatError(
-            f"{file}: no TerraSAR-X annotation; its root is <{root.element.tag}>, not <{ROOT}>"
-        )
+        raise RpcFormatError(f"{file}: no TerraSAR-X annotation; its root is <{root.element.tag}>, not <{ROOT}>")
     _refuse(root)
     path = file.parent / "ANNOTATION" / "GEOREF.xml"
     if not path.exists():
@@ -88,9 +86,7 @@ def _refuse(root: Fields) -> None:
     if mode not in _MODES:
         raise InputError(f"{root.name}: an image of mode {mode[:20]}, read are {', '.join(_MODES)}")
     if "_BRX" in root.one("generalHeader").element.get("fileName", ""):
-        raise InputError(
-            f"{root.name}: received by another satellite than sent, only monostatic images are read"
-        )
+        raise InputError(f"{root.name}: received by another satellite than sent, only monostatic images are read")
     image = root.one("productSpecific/complexImageInfo")
     for tag, known in (("imageCoordinateType", "ZERODOPPLER"), ("imageDataStartWith", "EARLYAZNEARRG")):
         if image.text(tag) != known:
@@ -116,8 +112,7 @@ def _model(root: Fields, late: tuple[float, float]) -> RangeDoppler:
     vectors = root.all("platform/orbit/stateVec")
     times = np.array([seconds(vector.time("timeUTC"), epoch) for vector in vectors])
     position, velocity = (
-        np.reshape([[v.number(f"{part}{axis}") for axis in "XYZ"] for v in vectors], (-1, 3))
-        for part in ("pos", "vel")
+        np.reshape([[v.number(f"{part}{axis}") for axis in "XYZ"] for v in vectors], (-1, 3)) for part in ("pos", "vel")
     )
     try:
         orbit = fit_orbit(times, position, velocity, (0.0, spans[1]))

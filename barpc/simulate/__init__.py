@@ -214,8 +214,7 @@ def simulate_block(
     grid = _Grid.square(num_views, chosen, lon, lat)
     views, centers = _cameras(grid, num_views, chosen)
     corrections = tuple(
-        Correction(rng.normal(0, chosen.attitude, 3), rng.normal(0, chosen.position, 3), center)
-        for center in centers
+        Correction(rng.normal(0, chosen.attitude, 3), rng.normal(0, chosen.position, 3), center) for center in centers
     )
     drift = rng.normal(0, chosen.drift, (num_views, 3)) if chosen.drift else np.zeros((num_views, 3))
     rows = chosen.size[1]

@@ -74,8 +74,7 @@ def fly(target: Array, look: Look, size: tuple[int, int], gsd: float) -> Pushbro
     y /= np.linalg.norm(y, axis=1, keepdims=True)
     mount, vectors = about_middle(Rotation.from_matrix(np.stack([np.cross(y, z), y, z], axis=2)))
     orbit, attitude = (
-        Curve.polynomial(polyfit(times + stop, values, _DEGREE), -stop, stop)
-        for values in (position, vectors)
+        Curve.polynomial(polyfit(times + stop, values, _DEGREE), -stop, stop) for values in (position, vectors)
     )
     look_angles = np.array([[0.0, 0.0], [0.0, -gsd / look.altitude]])
     return Pushbroom(orbit, attitude, mount, look_angles, 0.5 * (size[0] - 1), period, -half)

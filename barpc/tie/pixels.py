@@ -98,9 +98,7 @@ class PixelReader(ExitStack):
     size: means of the file's.
     """
 
-    def __init__(
-        self, path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None
-    ) -> None:
+    def __init__(self, path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None) -> None:
         super().__init__()
         self._band, self._dataset = band, self.enter_context(open_raster(path))
         self._pixel = _pixel(self._dataset, size)
@@ -121,9 +119,7 @@ def _pixel(dataset: Any, size: tuple[int, int] | None) -> tuple[int, int]:
     return max(1, dataset.width // width), max(1, dataset.height // height)
 
 
-def _averaged(
-    dataset: Any, box: Box, band: int, pixel: tuple[int, int], level: int = 1
-) -> tuple[Pixels, BoolArray]:
+def _averaged(dataset: Any, box: Box, band: int, pixel: tuple[int, int], level: int = 1) -> tuple[Pixels, BoolArray]:
     """Return the pixels of a window whose sides hold so many of the file's, as means; valid where all of these are."""
     if pixel == (1, 1):
         return _read(dataset, box, band, level)
@@ -174,15 +170,11 @@ def _mask(dataset: Any, band: int, raw: npt.NDArray[Any]) -> BoolArray | None:
     flags = dataset.mask_flag_enums[band - 1]
     if getattr(dataset, "driver", None) is None or flags not in ([MaskFlags.nodata], [MaskFlags.all_valid]):
         return None
-    out: BoolArray = (
-        raw != dataset.nodatavals[band - 1] if MaskFlags.nodata in flags else np.ones(raw.shape, bool)
-    )
+    out: BoolArray = raw != dataset.nodatavals[band - 1] if MaskFlags.nodata in flags else np.ones(raw.shape, bool)
     return out
 
 
-def sample_stretch(
-    path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None
-) -> Stretch | None:
+def sample_stretch(path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None) -> Stretch | None:
     """Estimate the stretch from the 0.5 and 99.5 percentiles of blocks spread over a raster, or its picture
     of a size; None where nothing varies.
     """
@@ -279,9 +271,7 @@ def grow(box: Box, margin: int, size: tuple[int, int]) -> Box:
     return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
 
 
-def tiles(
-    size: tuple[int, int], options: TieOptions, zoom: int = 1, found: Survey | None = None
-) -> list[Box]:
+def tiles(size: tuple[int, int], options: TieOptions, zoom: int = 1, found: Survey | None = None) -> list[Box]:
     """Return the boxes that cover an image of `size` (width, height) without overlap, cut at whole cells.
 
     A side is `options.tile` times `zoom` px; strips are taken whole, and so are blocks that are dear to
@@ -291,10 +281,7 @@ def tiles(
     if found is not None and found.block[0] >= size[0]:
         sides[0] = max(sides[0], size[0])
     if found is not None and found.levels:
-        sides = [
-            max(2, side // (zoom * block)) * zoom * block
-            for side, block in zip(sides, found.block, strict=True)
-        ]
+        sides = [max(2, side // (zoom * block)) * zoom * block for side, block in zip(sides, found.block, strict=True)]
     edges = []
     for length, side in zip(size, sides, strict=True):
         step = side

@@ -136,9 +136,7 @@ def register(
         progress=progress,
     )
     votes = work.vote()
-    return work.search(
-        votes, max(0.5, 0.25 * max(pixels, default=0.0)) if sigma is None else sigma, height_sigma
-    )
+    return work.search(votes, max(0.5, 0.25 * max(pixels, default=0.0)) if sigma is None else sigma, height_sigma)
 
 
 # --- tasks ------------------------------------------------------------------------------------------------
@@ -225,14 +223,10 @@ class _Work:
         again = self._votes(near, max(self.step, coarse / 4.0), 4.0 * coarse, "reference: second vote")
         return [(z, shift) for (z, _), (_, shift) in zip(found, again, strict=True)]
 
-    def _votes(
-        self, moved: Sequence[Array], step: float, reach: float, stage: str
-    ) -> list[tuple[float, Array]]:
+    def _votes(self, moved: Sequence[Array], step: float, reach: float, stage: str) -> list[tuple[float, Array]]:
         px, tasks, ends = int(np.ceil(reach / step)), [], [0]
         for view, shift in zip(self.views, moved, strict=True):
-            tasks += [
-                (view, self.band, self.paths, patch, px) for patch in self._blocks(view, shift, step, px)
-            ]
+            tasks += [(view, self.band, self.paths, patch, px) for patch in self._blocks(view, shift, step, px)]
             ends.append(len(tasks))
         cast = ordered(self.executor, vote, tasks, stage, self.progress)
         peaks = [peak(cast[start:stop]) for start, stop in pairwise(ends)]
@@ -263,9 +257,7 @@ class _Work:
         self, votes: Sequence[tuple[float, Array]], sigma: float, height_sigma: tuple[float, float]
     ) -> Registration:
         """Return the points looked for in every view whose vote stands out, and what they make."""
-        places, heights = self._lattice(
-            [view for view, (z, _) in zip(self.views, votes, strict=True) if z >= PEAK]
-        )
+        places, heights = self._lattice([view for view, (z, _) in zip(self.views, votes, strict=True) if z >= PEAK])
         reach = int(np.ceil(_SEARCH[0] + _SEARCH[1] / self.step))
         tiles = [
             self._tiles(view, moved, places, heights, reach) if z >= PEAK else []
@@ -309,9 +301,7 @@ class _Work:
         origin = np.concatenate(rings).mean(axis=0)
         metres = metres_per_unit(np.append(origin, 0.0))[:2]
         local = [(ring - origin) * metres for ring in rings]
-        areas = [
-            0.5 * abs(float((x * np.roll(y, 1) - y * np.roll(x, 1)).sum())) for x, y in (r.T for r in local)
-        ]
+        areas = [0.5 * abs(float((x * np.roll(y, 1) - y * np.roll(x, 1)).sum())) for x, y in (r.T for r in local)]
         apart = self.step * max(HALF // 2, round((max(areas) / _QUOTA) ** 0.5 / self.step))
         every = np.concatenate(local)
         low, high = (
@@ -361,9 +351,7 @@ class _Work:
         sight, up = np.split(sight_enu(view.sensor, middle), [2])
         aside = max(float(np.linalg.norm(sight)), 1e-9)
         sight = sight / aside
-        turned = np.stack(
-            [[sight[1], -sight[0]], sight]
-        )  # across it; along it, where the terrain's errors move points
+        turned = np.stack([[sight[1], -sight[0]], sight])  # across it; along it, where the terrain's errors move points
         agreed = _affine(local, found.shift * [self.step, -self.step] @ turned.T, passed, self.step)
         if agreed is None:
             return report, None

@@ -75,9 +75,7 @@ def store_of(executor: Executor | None) -> Iterator[Store]:
         yield Store(folder, folder)
 
 
-def names_of(
-    executor: Executor | None, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]
-) -> list[str]:
+def names_of(executor: Executor | None, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> list[str]:
     """Return names for results, by the content of inputs where the executor knows it, so that a later run
     finds them.
     """

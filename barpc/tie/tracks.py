@@ -112,9 +112,7 @@ def find_tracks(
     pairs, reports = [pair for _, (pair, _, _) in tried], tuple(report for _, (_, _, report) in tried)
     require_matches(views, pairs, reports)
     tracks, bare = _registered(trials, area, given, options, work)
-    reports = tuple(
-        replace(r, unregistered=bare.get(p.views, 0)) for p, r in zip(pairs, reports, strict=True)
-    )
+    reports = tuple(replace(r, unregistered=bare.get(p.views, 0)) for p, r in zip(pairs, reports, strict=True))
     require_tracks(views, tracks, pairs, reports)
     return TieResult(tracks, reports, trials.keypoints)
 
@@ -149,9 +147,7 @@ def _needed(
 ) -> set[tuple[int, int]]:
     """Return the pairs of looks between views that no pair with enough registered tracks connects."""
     counts = pair_counts(tracks)
-    firm = [
-        (int(looks.of[i]), int(looks.of[j])) for i, j in pairs if counts.get((i, j), 0) >= options.min_matches
-    ]
+    firm = [(int(looks.of[i]), int(looks.of[j])) for i, j in pairs if counts.get((i, j), 0) >= options.min_matches]
     part = connected_labels(int(looks.of.max()) + 1, firm)[looks.of]
     return {(i, j) for i, j in pairs if part[i] != part[j]}
 
@@ -219,9 +215,7 @@ class _Trials:
 
     def _judged(self, pairs: Sequence[Pair]) -> list[Pair]:
         """Return the pairs with their quick scores, where keypoints can tell."""
-        new = [
-            p for p in pairs if self._compares and p.views not in self._given and p.views not in self._scores
-        ]
+        new = [p for p in pairs if self._compares and p.views not in self._given and p.views not in self._scores]
         tasks = [(*self._ends(pair), self._options) for pair in new]
         scores = ordered(self._work["executor"], quick_score, tasks, "compare", self._work["progress"])
         self._scores |= {pair.views: score for pair, score in zip(new, scores, strict=True)}
@@ -234,9 +228,7 @@ class _Trials:
 
     def _try(self, pairs: Sequence[Pair]) -> None:
         known, others = ([p for p in pairs if (p.views in self._given) is there] for there in (True, False))
-        before = [
-            (self._ends(pair)[0], found) for pair, found, report in self.tried.values() if enough(report)
-        ]
+        before = [(self._ends(pair)[0], found) for pair, found, report in self.tried.values() if enough(report)]
         looks, options = self.looks, self._options
         own = self._matched([looks.pair(pair) for pair in others], before)
         given = {
@@ -261,12 +253,8 @@ class _Trials:
             closer = locate(views, options, self._store, pairs=lacking, area=self._area, **self._work)
             self._closer += 1  # each numbers its keypoints, below 0, where no place is
             keypoints = [replace(files, start=-self._closer << 32) for files in closer]
-        known = [
-            ((views[p.views[0]], views[p.views[1]]), found[p.views][0]) for p in pairs if p.views in found
-        ]
-        again = match(
-            views, keypoints, lacking, options, terrain=self._terrain, before=[*before, *known], **self._work
-        )
+        known = [((views[p.views[0]], views[p.views[1]]), found[p.views][0]) for p in pairs if p.views in found]
+        again = match(views, keypoints, lacking, options, terrain=self._terrain, before=[*before, *known], **self._work)
         found |= {pair.views: one for pair, one in zip(lacking, again, strict=True)}
         return [found[pair.views] for pair in pairs]
 
@@ -277,18 +265,14 @@ def _unlike(
     """Return the given pairs whose grey values do not compare: too few of their matches could be registered
     by these.
     """
-    some = {
-        pair: m.select(np.linspace(0, len(m) - 1, min(len(m), THIN)).astype(int)) for pair, m in given.items()
-    }
+    some = {pair: m.select(np.linspace(0, len(m) - 1, min(len(m), THIN)).astype(int)) for pair, m in given.items()}
     linked = link([*some], [*some.values()])
     before, after = pair_counts(linked), pair_counts(refine(views, linked, {}, options, **work))
     shares = {pair: after.get(pair, 0) / max(before.get(pair, 0), 1) for pair in given}
     return [pair for pair, share in shares.items() if share < 0.5 and share * len(given[pair]) < THIN]
 
 
-def _with_unregistered(
-    views: Sequence[View], tracks: Tracks, given: GivenMatches, options: TieOptions
-) -> Tracks:
+def _with_unregistered(views: Sequence[View], tracks: Tracks, given: GivenMatches, options: TieOptions) -> Tracks:
     """Return the tracks, and the verified matches of those of some pairs of which too few could be registered."""
     counts = pair_counts(tracks)
     lost = [pair for pair in given if counts.get(pair, 0) < options.min_matches]
@@ -317,9 +301,7 @@ def _joined(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
     found = np.flatnonzero(anchor[others.point] >= 0)
     start = anchor[others.point[found]]
     number[found] = tracks.point[row[start]]
-    moved = (
-        tracks.xy[row[start]] - others.xy[start]
-    )  # registration moves a point, and all views of it with it
+    moved = tracks.xy[row[start]] - others.xy[start]  # registration moves a point, and all views of it with it
     for group in grouped(others.view[start], others.view[found]):
         first, second = (views[others.view[end[group[0]]]] for end in (start, found))
         linear = linear_map(first, second, others.xy[start[group]])

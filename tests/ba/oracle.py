@@ -64,8 +64,7 @@ class Plain:
 
     def __post_init__(self) -> None:
         middle = [
-            ecef_of(view.sensor.localize((np.array(view.size) - 1) / 2, sum(view.alt_range) / 2))
-            for view in self.views
+            ecef_of(view.sensor.localize((np.array(view.size) - 1) / 2, sum(view.alt_range) / 2)) for view in self.views
         ]
         self.distance = np.linalg.norm(self.centers - middle, axis=1)
 

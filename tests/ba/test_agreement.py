@@ -34,9 +34,7 @@ from tests.lanes import rest_slow
 SIGMA = 0.3
 
 
-def drawn(
-    count: int, seed: int, wrong: dict[int, tuple[float, float, float]] | None = None, **how: float
-) -> Offsets:
+def drawn(count: int, seed: int, wrong: dict[int, tuple[float, float, float]] | None = None, **how: float) -> Offsets:
     """Offsets of points [m over their sigma] under motions of 1.5 m at the edge, after a shift of tens of metres.
 
     `wrong` moves points [m]; errors are `times` as large as stated, motions `motions` as large.
@@ -114,9 +112,7 @@ def test_two_sets_of_equal_weight_are_both_said_and_none_is_used(count, moved) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("count", "moved"), rest_slow(starmap(pytest.param, [(9, 4), (5, 2), (12, 4), (30, 9)]))
-)
+@pytest.mark.parametrize(("count", "moved"), rest_slow(starmap(pytest.param, [(9, 4), (5, 2), (12, 4), (30, 9)])))
 def test_the_larger_set_is_used_and_the_others_are_told_to_agree(count, moved) -> None:
     alike, times = 0, 10 if count < 12 else 2
     for seed in range(times):
@@ -237,9 +233,7 @@ def test_control_of_a_world_is_used_where_it_is_right_and_never_bends_the_images
         assert {tuple(points) for points in tested.sets} == {tuple(wrong), tuple(~wrong)}
         assert (one.gauge.sigma > 4.0).all()
         assert any("GCPs contradict each other" in reason for reason in summary.reasons)
-        assert any(
-            "Without ground control that agrees its place is known" in line for line in summary.verdict
-        )
+        assert any("Without ground control that agrees its place is known" in line for line in summary.verdict)
         assert any("0 of" in line and "none outweighs" in line for line in decisions(summary))
     else:
         assert [word != "used" for word in status] == wrong.tolist()
@@ -272,9 +266,7 @@ def raised(block: Any, gcps: GroundPoints) -> tuple[Any, float]:
 
 def believing(patch: pytest.MonkeyPatch) -> None:
     """Let every control point pass as one that agrees with all others."""
-    patch.setattr(
-        "barpc.ba.judging.solution.agreement", lambda _, told: Agreement(np.ones(len(told), dtype=bool))
-    )
+    patch.setattr("barpc.ba.judging.solution.agreement", lambda _, told: Agreement(np.ones(len(told), dtype=bool)))
 
 
 @pytest.mark.slow
@@ -385,6 +377,4 @@ def test_no_wrong_control_raises_what_tie_points_are_left_with(kind, tracks, see
     metres = np.stack([111e3 * np.cos(np.radians(given[:, 1])), np.full(40, 111e3), np.ones(40)], axis=1)
     moved = replace(world.gcps, lonlatalt=given + 3.0 * enu / metres)
     _, rise = raised(world, moved)
-    assert (
-        rise < 0.07
-    )  # ties of a view are worth 0.02 px in all, a camera has nine unknowns: 3 x 0.02 px, and chance
+    assert rise < 0.07  # ties of a view are worth 0.02 px in all, a camera has nine unknowns: 3 x 0.02 px, and chance

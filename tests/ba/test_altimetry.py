@@ -261,9 +261,7 @@ def test_heights_and_a_terrain_hold_together(scene: Any):
 
     def terrain(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
         n = len(lon)
-        azimuth, _, distance = (
-            np.array(x) for x in GEOD.inv([LON] * n, [LAT] * n, lon.tolist(), lat.tolist())
-        )
+        azimuth, _, distance = (np.array(x) for x in GEOD.inv([LON] * n, [LAT] * n, lon.tolist(), lat.tolist()))
         east, north = distance * np.sin(np.radians(azimuth)), distance * np.cos(np.radians(azimuth))
         return 233.0 + relief(east, north)
 

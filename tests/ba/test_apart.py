@@ -70,9 +70,7 @@ def met(found: Adjustment, block: Block, view: int) -> float:
         pytest.param(raised, "height", id="another datum", marks=pytest.mark.slow),
     ],
 )
-def test_a_wrong_rpc_is_named_and_the_others_are_as_without_it(
-    monkeypatch, change: Change, look: str
-) -> None:
+def test_a_wrong_rpc_is_named_and_the_others_are_as_without_it(monkeypatch, change: Change, look: str) -> None:
     if look != "axes":  # a prior tells of one view where the others agree, which a pair always does
         other = block_with(2, change)
         assert adjust_tracks(other.views, other.tracks).apart is None
@@ -150,9 +148,7 @@ def scripted(monkeypatch, evidence: list[float], contradicted: list[float]) -> A
 
     def agreeing(views: Any, *_: Any) -> Any:
         for v in views:
-            one = apart._Left(
-                v, SimpleNamespace(views=(None,) * num), "solved", placed, contradicted[v], True
-            )  # type: ignore[arg-type]
+            one = apart._Left(v, SimpleNamespace(views=(None,) * num), "solved", placed, contradicted[v], True)  # type: ignore[arg-type]
             yield one
 
     monkeypatch.setattr(apart, "_agreeing", agreeing)

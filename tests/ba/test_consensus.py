@@ -23,9 +23,7 @@ from tests.ba.conftest import centers_of
 def groups(count: int, share: float, apart: float, sigma: float = 0.3) -> np.ndarray:
     """Offsets that two normal distributions would have, without chance, their mean 0."""
     few = round(share * count)
-    parts = [
-        c + sigma * stats.norm.ppf((np.arange(n) + 0.5) / n) for c, n in ((0.0, count - few), (apart, few))
-    ]
+    parts = [c + sigma * stats.norm.ppf((np.arange(n) + 0.5) / n) for c, n in ((0.0, count - few), (apart, few))]
     return np.random.default_rng(0).permutation(np.concatenate(parts)) - share * apart
 
 
@@ -34,15 +32,11 @@ def likeliest(z: np.ndarray, logits: tuple[float, ...] = (-2.0, 0.0, 2.0)) -> tu
 
     def cost(x: np.ndarray) -> float:
         part, width = 1 / (1 + np.exp(-x[0])), np.exp(x[3])
-        return -float(
-            np.log(part * stats.norm.pdf(z, x[1], width) + (1 - part) * stats.norm.pdf(z, x[2], width)).sum()
-        )
+        return -float(np.log(part * stats.norm.pdf(z, x[1], width) + (1 - part) * stats.norm.pdf(z, x[2], width)).sum())
 
     starts = ([logit, *np.quantile(z, [0.1, 0.9]), np.log(0.5 * z.std())] for logit in logits)
     few = {"maxiter": 2000, "xatol": 1e-6, "fatol": 1e-8}
-    found = min(
-        (minimize(cost, x, method="Nelder-Mead", options=few) for x in starts), key=lambda found: found.fun
-    )
+    found = min((minimize(cost, x, method="Nelder-Mead", options=few) for x in starts), key=lambda found: found.fun)
     part = 1 / (1 + np.exp(-found.x[0]))
     gain = -found.fun - stats.norm.logpdf(z, 0, z.std()).sum()
     return min(part, 1 - part), abs(found.x[2] - found.x[1]), float(gain)
@@ -118,9 +112,7 @@ def test_an_offset_across_is_what_no_move_of_the_point_explains(seen) -> None:
         assert abs(np.sign(found).sum()) == len(found)
 
 
-def residual_of(
-    problem: Problem, projected: Any, offset: np.ndarray, pair: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
+def residual_of(problem: Problem, projected: Any, offset: np.ndarray, pair: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (2, K) of which a pair's first ones are across the epipolar lines by so much; the rows in use."""
     first, second, normal = across(problem, projected, pair)
     residual, use = (
@@ -177,9 +169,7 @@ def test_what_looks_like_one_group_by_skewness_and_kurtosis_is_one(seen, monkeyp
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("count", "said"), [(120, False), (340, True)])
-def test_groups_are_told_where_two_are_likelier_by_a_factor_of_three_million(
-    seen, count: int, said: bool
-) -> None:
+def test_groups_are_told_where_two_are_likelier_by_a_factor_of_three_million(seen, count: int, said: bool) -> None:
     z = groups(count, 0.5, 0.6 * 1.4)
     gain = likeliest(z, (0.0,))[2]
     assert 5 < gain < 14 if not said else 16 < gain < 29
@@ -210,9 +200,7 @@ def test_a_plane_may_be_steep_in_either_direction() -> None:
     for slope in ([0.1, 0.0], [0.0, -0.1], [0.07, 0.07]):
         offset = slope @ place
         offset[:20] += 50.0
-        assert np.flatnonzero(~_on_one_plane(place, offset, np.full(60, 0.1), seed=1)).tolist() == list(
-            range(20)
-        )
+        assert np.flatnonzero(~_on_one_plane(place, offset, np.full(60, 0.1), seed=1)).tolist() == list(range(20))
 
 
 def test_offsets_of_one_place_in_the_image_are_compared_all_the_same() -> None:
@@ -265,9 +253,7 @@ def test_the_sigmas_of_both_ends_count(seen) -> None:
     residual = np.zeros(problem.xy.shape)
     residual[:, (structure.view == 0) & np.isin(structure.point, wrong)] = 30.0
     offset = np.abs(_across(residual, projected.by_point, structure.first, structure.second))
-    size = np.median(
-        offset[np.isin(structure.point[structure.first], wrong) & (structure.view[structure.second] == 1)]
-    )
+    size = np.median(offset[np.isin(structure.point[structure.first], wrong) & (structure.view[structure.second] == 1)])
     for end in (0, 1):
         for share, same in ((0.05, False), (0.15, True)):
             sigma = np.where(structure.view == end, share * size, 0.001)

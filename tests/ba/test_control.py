@@ -26,9 +26,7 @@ def case():
     xy = np.array([sensors[v].project(true[p]) for v, p in zip(view, point, strict=True)])
     order = np.array([3, 0, 7, 5, 1, 6, 2, 4])
     names = tuple("abcde")
-    points = GroundPoints(
-        names, given, np.ones((5, 3)), point[order], view[order], xy[order], np.full(8, 0.1)
-    )
+    points = GroundPoints(names, given, np.ones((5, 3)), point[order], view[order], xy[order], np.full(8, 0.1))
     return sensors, points
 
 

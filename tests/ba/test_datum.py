@@ -41,9 +41,7 @@ def test_without_control_the_cameras_as_delivered_hold_the_scene():
 
 @pytest.mark.slow
 def test_control_points_hold_it_by_their_accuracy():
-    shares = [
-        solved(replace(BLOCK.gcps, sigma=np.full((6, 3), sigma))).datum["gcps"] for sigma in (0.1, 10.0)
-    ]
+    shares = [solved(replace(BLOCK.gcps, sigma=np.full((6, 3), sigma))).datum["gcps"] for sigma in (0.1, 10.0)]
     assert (shares[0][PLACE] > 0.93).all()
     assert (shares[1][:2] < 0.9 * shares[0][:2]).all()  # heights the cameras hardly know
     assert (shares[1][PLACE] > 0.05).all()
@@ -108,9 +106,7 @@ def test_the_summary_has_it_in_a_table_without_the_sources_that_tell_nothing():
             level,
             "The DEM holds 400 of 400 tie points, each to 10.0 m and all together to 20.0 m.",
         ),
-        pytest.param(
-            {"min_convergence": 90.0}, level, "The DEM holds 400 of 400 tie points", marks=pytest.mark.slow
-        ),
+        pytest.param({"min_convergence": 90.0}, level, "The DEM holds 400 of 400 tie points", marks=pytest.mark.slow),
         (
             {},
             lambda lon, lat: np.full(len(lon), np.nan),
@@ -132,9 +128,7 @@ def test_what_a_terrain_did_is_said(options, dem, says):
     summary = summarize(Run("adjust", BLOCK.views, (), BLOCK.tracks, adjustment=found))
     assert any(says in line for line in summary.verdict), summary.verdict
     if dem is level:
-        assert any(
-            "It has a height for 100 % of the tie points; they lie " in line for line in summary.verdict
-        )
+        assert any("It has a height for 100 % of the tie points; they lie " in line for line in summary.verdict)
         assert summary.scene.dem.num_known == summary.scene.dem.num_tracks
         assert summary.scene.dem.offset_m == pytest.approx(found.terrain.offset)
         assert abs(summary.scene.dem.offset_m) < 60.0

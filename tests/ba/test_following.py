@@ -111,9 +111,7 @@ def followed(monkeypatch, tells: str, better: str, **options: Any) -> tuple[str,
         name = str(made.index(f"{count}") + 1) if count >= 0 else "0"
         return Tried(name, name, name in tells, SimpleNamespace(smooth=f"smooth of {name}"), {"drift": 1})
 
-    def with_waves(
-        found: Any, block: Any, outer: Any, options: Any, waves: Waves, once: bool = False
-    ) -> Tried:
+    def with_waves(found: Any, block: Any, outer: Any, options: Any, waves: Waves, once: bool = False) -> Tried:
         assert found.name == "0"  # always from where it ended without
         assert once == (not options.detectors)
         made.append(str(waves.count))
@@ -141,9 +139,7 @@ def followed(monkeypatch, tells: str, better: str, **options: Any) -> tuple[str,
         ("013", "13", "3", 4),
     ],
 )
-def test_knots_are_denser_until_nothing_is_left_or_two_are_no_better(
-    monkeypatch, tells, better, kept, tried
-) -> None:
+def test_knots_are_denser_until_nothing_is_left_or_two_are_no_better(monkeypatch, tells, better, kept, tried) -> None:
     found, made = followed(monkeypatch, tells, better)
     assert (found, len(made)) == (kept, tried)
     assert made == ["13", "23", "43", "83"][:tried]
@@ -203,9 +199,7 @@ def test_it_is_looked_for_detectors_twice_and_in_units_of_the_noise_seen(monkeyp
 # --- where detectors begin --------------------------------------------------------------------------------------------
 
 
-def columns(
-    cols: list[np.ndarray], sigma: float = 1.0, together: bool = False
-) -> tuple[_Columns, np.ndarray]:
+def columns(cols: list[np.ndarray], sigma: float = 1.0, together: bool = False) -> tuple[_Columns, np.ndarray]:
     """Views whose observations stand at these columns, all in use; the columns of all, one after the other."""
     bounds, col = np.cumsum([0, *map(len, cols)]), np.concatenate(cols)
     problem: Any = SimpleNamespace(structure=SimpleNamespace(bounds=bounds), xy=np.stack([col, 0 * col]))
@@ -226,9 +220,7 @@ def test_a_change_explains_as_much_as_two_means_explain_more_than_one(low, high)
     col = rng.uniform(0, 9000, 240)
     sigma, use = rng.uniform(0.5, 2, 240), rng.random(240) < 0.9
     residual = rng.normal(0, 1, (2, 240)) + np.where(col > 4000, [[1.0], [-0.5]], 0.0)
-    problem: Any = SimpleNamespace(
-        structure=SimpleNamespace(bounds=np.array([0, 240])), xy=np.stack([col, col])
-    )
+    problem: Any = SimpleNamespace(structure=SimpleNamespace(bounds=np.array([0, 240])), xy=np.stack([col, col]))
     gain, at = _Columns(problem, use, sigma, [[0]]).split(0, low, high, residual)
     inside = use & (col > low) & (col < high)
     best = (0.0, 0.0)
@@ -328,9 +320,7 @@ def exact() -> tuple[Problem, State]:
     block = join(made.views, made.tracks, None, options)
     problem = make_problem(block, options, centers_of(made), None)
     distance = problem.cameras.unknowns.distance
-    params = [
-        np.r_[c.rotation * d, c.translation] for c, d in zip(made.truth.corrections, distance, strict=True)
-    ]
+    params = [np.r_[c.rotation * d, c.translation] for c, d in zip(made.truth.corrections, distance, strict=True)]
     return problem, State(np.array(params), ecef_from_ground(made.truth.ground))
 
 
@@ -421,9 +411,7 @@ def test_an_error_that_neighbours_share_is_another_in_every_half_of_a_wave() -> 
     assert Waves(13, none, strips).stretches(9000.0) == Waves(13).size
     of_waves = 9000.0 / 200.0 + 9000.0 / 31.5
     assert Waves(0, none, strips, PERIODS).stretches(9000.0) == pytest.approx(4.0 * of_waves)
-    assert Waves(13, none, strips, PERIODS).stretches(9000.0) == pytest.approx(
-        Waves(13).size + 4.0 * of_waves
-    )
+    assert Waves(13, none, strips, PERIODS).stretches(9000.0) == pytest.approx(Waves(13).size + 4.0 * of_waves)
     assert Waves(0, none, strips, 1e9 * PERIODS).stretches(9000.0) == 8  # as many as there are unknowns
 
 

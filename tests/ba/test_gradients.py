@@ -120,9 +120,7 @@ def _point_priors():
     )
     return points, {
         "ground_control": ground_control(gcps, index),
-        "reference_control": reference_control(
-            Reference(gcps, np.array([0.4, 0.7, 2.0]), np.zeros((1, 2))), index
-        ),
+        "reference_control": reference_control(Reference(gcps, np.array([0.4, 0.7, 2.0]), np.zeros((1, 2))), index),
         "terrain_heights": terrain_heights(
             points, index, lambda lon, lat: 100.0 + 800.0 * (lon - 5.4) + 300.0 * (lat - 43), 3.0, 0.0
         ),
@@ -136,23 +134,17 @@ def test_heights_with_a_common_error_cost_what_their_joint_normal_distribution_s
     points, blocks = _point_priors()
     block = blocks["with a common error"]
     ground = ground_from_ecef(points[[0, 2]])
-    east_north = np.array(
-        [-1.0, 1.0]
-    )  # two points: each at the edge of both slopes, up to the curve of the earth
+    east_north = np.array([-1.0, 1.0])  # two points: each at the edge of both slopes, up to the curve of the earth
     design = np.column_stack([np.ones(2), east_north, east_north])
     covariance = 20.0**2 * np.eye(2) + 7.0**2 * design @ design.T
     offset = ground[:, 2] - 210.0
     assert block.cost(points) == pytest.approx(offset @ np.linalg.solve(covariance, offset), rel=1e-3)
-    for axis in range(
-        3
-    ):  # the gradient of half the cost is rows^T residual: the common errors are the best ones
+    for axis in range(3):  # the gradient of half the cost is rows^T residual: the common errors are the best ones
         for n, p in enumerate([0, 2]):
             step = np.zeros_like(points)
             step[p, axis] = 0.5
             numeric = (block.cost(points + step) - block.cost(points - step)) / 2
-            assert block.jacobian()[n, :, axis] @ block.residual(points)[n] == pytest.approx(
-                numeric, abs=1e-9
-            )
+            assert block.jacobian()[n, :, axis] @ block.residual(points)[n] == pytest.approx(numeric, abs=1e-9)
 
 
 BLOCKS = [
@@ -182,9 +174,7 @@ def test_a_terrain_prior_measures_the_distance_along_the_vertical():
     points, blocks = _point_priors()
     ground = ground_from_ecef(points[[0, 2]])
     alt = 100.0 + 800.0 * (ground[:, 0] - 5.4) + 300.0 * (ground[:, 1] - 43)
-    np.testing.assert_allclose(
-        blocks["terrain_heights"].apart(points)[:, 0] * 3.0, ground[:, 2] - alt, atol=1e-6
-    )
+    np.testing.assert_allclose(blocks["terrain_heights"].apart(points)[:, 0] * 3.0, ground[:, 2] - alt, atol=1e-6)
 
 
 def test_priors_on_cameras_have_the_derivatives_of_central_differences():

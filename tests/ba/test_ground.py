@@ -34,14 +34,10 @@ GEOD = pyproj.Geod(ellps="WGS84")
 
 def placed(east: Any, north: Any, alt: Any) -> np.ndarray:
     """Points so many metres east and north of a place, ECEF (n, 3) [m]; for distances of a few km."""
-    east, north, alt = np.broadcast_arrays(
-        *(np.atleast_1d(np.asarray(x, dtype=float)) for x in (east, north, alt))
-    )
+    east, north, alt = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, dtype=float)) for x in (east, north, alt)))
     n = len(east)
     azimuth, distance = np.degrees(np.arctan2(east, north)), np.hypot(east, north)
-    lon, lat, _ = GEOD.fwd(
-        [LON] * n, [LAT] * n, azimuth.tolist(), distance.tolist()
-    )  # one of each is not a number
+    lon, lat, _ = GEOD.fwd([LON] * n, [LAT] * n, azimuth.tolist(), distance.tolist())  # one of each is not a number
     return ecef_from_ground(np.column_stack([lon, lat, alt]))
 
 
@@ -57,9 +53,7 @@ def heights(n: int = 6, **given: Any) -> Heights:
     """Of n tracks the last two are weak."""
     weak = np.arange(n) >= n - 2
     options = AdjustOptions(**given.pop("options", {}))
-    return Heights(
-        (), weak, np.arange(n), (0.0, 500.0), options, given.pop("dem", hill), given.pop("reference", None)
-    )
+    return Heights((), weak, np.arange(n), (0.0, 500.0), options, given.pop("dem", hill), given.pop("reference", None))
 
 
 def test_a_terrain_is_met_along_its_normal() -> None:
@@ -168,9 +162,7 @@ def test_tracks_beside_a_reference_share_its_terrain(n: int, factor: float) -> N
     """All are held, as well as 25 alone would be, and by the reference's own bias and edges."""
     points = placed(np.linspace(-1500, 1500, n), np.linspace(-800, 800, n), 350.0)
     span = placed([-4000.0, 4000.0], [-2000.0, 2000.0], 300.0)
-    gcps = GroundPoints(
-        ("a", "b"), _ground(span), np.ones((2, 3)), [0, 1], [0, 0], np.zeros((2, 2)), np.ones(2)
-    )
+    gcps = GroundPoints(("a", "b"), _ground(span), np.ones((2, 3)), [0, 1], [0, 0], np.zeros((2, 2)), np.ones(2))
     reference = Reference(gcps, np.array([1.0, 1.0, 8.0]), np.zeros((1, 2)))
     made = heights(n, reference=reference, options={"dem_sigma": 4.0, "dem_bias_sigma": 99.0})
     made = replace(made, control=(ground_control(gcps, np.arange(2)),) * 2)
@@ -277,9 +269,7 @@ def test_heights_without_a_terrain_may_be_wrong_together_by_a_quarter_of_their_s
     assert held is not None
     np.testing.assert_allclose(held.common[:, 0, 0], 0.25)
     views: Any = (flown(),)
-    np.testing.assert_array_equal(
-        prior_sigmas(views, AdjustOptions(model="affine"), 0), np.full((1, 6), 20.0)
-    )
+    np.testing.assert_array_equal(prior_sigmas(views, AdjustOptions(model="affine"), 0), np.full((1, 6), 20.0))
 
 
 def test_each_axis_of_a_reference_shares_its_own_error_over_its_own_sigma() -> None:

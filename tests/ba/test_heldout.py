@@ -72,9 +72,7 @@ def test_what_rounding_does_to_positions_draws_hardly_another_track(made) -> Non
     block = block_of(made)
     rng = np.random.default_rng(0)
     out = keep_out(block)
-    near, far = (
-        keep_out(replace(block, xy=block.xy + rng.normal(0, size, block.xy.shape))) for size in (1e-9, 1.0)
-    )
+    near, far = (keep_out(replace(block, xy=block.xy + rng.normal(0, size, block.xy.shape))) for size in (1e-9, 1.0))
     assert (near == out).all()
     assert (far != out).mean() > 0.1
 
@@ -175,9 +173,7 @@ def test_a_view_of_fewer_than_twenty_says_nothing(made) -> None:
         assert np.isnan(found.noise[1]) == (left < 20)
         assert np.isfinite(found.noise[[0, 2, 3]]).all()
         assert np.isfinite(found.error)
-    assert np.isnan(
-        HeldOut(np.zeros((2, 0)), np.zeros(0, int), np.zeros((0, 3)), *np.full((2, 4), np.nan)).error
-    )
+    assert np.isnan(HeldOut(np.zeros((2, 0)), np.zeros(0, int), np.zeros((0, 3)), *np.full((2, 4), np.nan)).error)
 
 
 # --- which of two solutions is better -----------------------------------------------------------------------------
@@ -250,9 +246,7 @@ def test_errors_that_half_of_the_ties_share_are_no_wrong_matches() -> None:
     rng = np.random.default_rng(9)
     squared = (rng.normal(size=400) + np.repeat([0.0, 2.5], 200)) ** 2
     none, view = np.zeros(20), np.repeat([0, 1], [400, 20])
-    of_ties, of_nothing = scatter(
-        np.append(squared, none), np.ones(420), view
-    )  # views do not tell of each other
+    of_ties, of_nothing = scatter(np.append(squared, none), np.ones(420), view)  # views do not tell of each other
     assert of_ties > 1.6
     assert of_nothing < 1e-5
     assert of_ties == scatter(squared, np.ones(400), view[:400])[0]

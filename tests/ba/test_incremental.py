@@ -159,9 +159,7 @@ def test_a_prior_stands_at_its_views_wherever_they_are_now() -> None:
 )  # fmt: skip
 def test_a_prior_of_another_block_is_refused(prior, names, model, drift, message) -> None:
     with pytest.raises(InputError, match=message):
-        apply_prior(
-            prior, names, model, drift, CameraPrior(np.zeros((len(names), 3)), np.ones((len(names), 3)))
-        )
+        apply_prior(prior, names, model, drift, CameraPrior(np.zeros((len(names), 3)), np.ones((len(names), 3))))
 
 
 def test_a_block_leaves_what_it_knows_of_its_free_views() -> None:
@@ -254,9 +252,7 @@ def test_a_block_of_twenty_thousand_unknowns_is_gone_on_from(views: int, refused
         (0, np.zeros(2), False),
     ],
 )
-def test_a_layout_of_splines_that_no_block_has_is_refused(
-    tmp_path, splines: int, edges: Any, whole: bool
-) -> None:
+def test_a_layout_of_splines_that_no_block_has_is_refused(tmp_path, splines: int, edges: Any, whole: bool) -> None:
     given = replace(prior_of(size=5), splines=splines, edges=edges, radars=("c",))
     given.save(tmp_path / "prior.npz")
     if not whole:

@@ -30,9 +30,7 @@ def profile_of(tracks: Tracks, where: Displaced, size: tuple[int, int]) -> np.nd
     return (inside * faded * where["px"])[:, None] * np.array([np.cos(angle), np.sin(angle)])
 
 
-def flawed(
-    views: int, tracks: int, *all_of: Displaced, seed: int = 0, **options: Any
-) -> tuple[Block, Tracks]:
+def flawed(views: int, tracks: int, *all_of: Displaced, seed: int = 0, **options: Any) -> tuple[Block, Tracks]:
     block = simulate_block(views, tracks, seed=seed, attitude=10e-6, position=2.0, **options)
     xy = block.tracks.xy.copy()
     for where in all_of:
@@ -129,9 +127,7 @@ def test_all_images_that_settle_are_explained_together(first: float) -> None:
     assert not found.moving.any()
 
 
-def swung(
-    views: int, tracks: int, px: float, period: float, view: int = 1, seed: int = 0
-) -> tuple[Block, Tracks]:
+def swung(views: int, tracks: int, px: float, period: float, view: int = 1, seed: int = 0) -> tuple[Block, Tracks]:
     """Ties of a block of which the rows of a view swing."""
     block = simulate_block(views, tracks, seed=seed, attitude=10e-6, position=2.0)
     moved = px * np.sin(2.0 * np.pi * block.tracks.xy[:, 1] / period + 1.0) * (block.tracks.view == view)
@@ -139,9 +135,7 @@ def swung(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "size", rest_slow([(0.15, 200.0), (0.08, 200.0), (0.15, 60.0), (0.3, 600.0)]), ids=str
-)
+@pytest.mark.parametrize("size", rest_slow([(0.15, 200.0), (0.08, 200.0), (0.15, 60.0), (0.3, 600.0)]), ids=str)
 def test_rows_that_swing_are_named_with_their_period_and_followed(size: tuple[float, float]) -> None:
     px, period = size
     block, tracks = swung(3, 1500, px, period)
@@ -223,17 +217,14 @@ def test_rows_that_wander_are_not_taken_for_strips() -> None:
     assert not any(one.kind in LOCAL for one in found.findings)
     at = np.linspace(0.0, rows - 1.0, 300)
     size = [
-        s.correction.at(np.column_stack([at, at]))[:, 0].std() if isinstance(s, Splined) else 0.0
-        for s in found.sensors
+        s.correction.at(np.column_stack([at, at]))[:, 0].std() if isinstance(s, Splined) else 0.0 for s in found.sensors
     ]
     assert 0.4 < size[1] < 0.65  # 0.6, of which a drift takes some
     assert max(size[0], size[2]) < 0.4 * size[1]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "options", rest_slow([{"jitter": "off"}, {"drift": 0}], mark=pytest.mark.nightly), ids=str
-)
+@pytest.mark.parametrize("options", rest_slow([{"jitter": "off"}, {"drift": 0}], mark=pytest.mark.nightly), ids=str)
 def test_who_asked_for_no_such_unknowns_is_told_and_gets_none(options: dict[str, Any]) -> None:
     block, tracks = flawed(3, 1500, MIDDLE)
     found = adjusted(block, tracks, **options)

@@ -34,9 +34,7 @@ def made() -> Block:
     return simulate_block(3, 150, seed=5)
 
 
-def choose(
-    monkeypatch, skew: bool, trend: bool, error: float, rms: float, **given: Any
-) -> tuple[str, Any, list[str]]:
+def choose(monkeypatch, skew: bool, trend: bool, error: float, rms: float, **given: Any) -> tuple[str, Any, list[str]]:
     """The model chosen where the one in space leaves 1 (error) and 1 px (rms); what is known of it; models solved."""
     asked: list[str] = []
 
@@ -99,9 +97,7 @@ def test_a_model_that_is_asked_for_is_the_only_one(monkeypatch, given) -> None:
     ("left", "out", "judged"),
     [("", [], False), ("", ["an interval"], True), ("has_trend", [], True), ("has_waves", [], True)],
 )
-def test_what_an_affine_explains_wholly_no_parts_of_images_are_asked_to(
-    monkeypatch, left, out, judged
-) -> None:
+def test_what_an_affine_explains_wholly_no_parts_of_images_are_asked_to(monkeypatch, left, out, judged) -> None:
     """Strips and ties that move can be laid like steps along what grows evenly over an image."""
     asked: list[str] = []
 
@@ -204,9 +200,7 @@ def test_an_earlier_blocks_drift_goes_on(made) -> None:
         first = solve(made, drift=drift, **CALM)
         prior = block_prior(first)
         assert prior.drift == drift
-        found = adjust_tracks(
-            made.views, made.tracks, AdjustOptions(noise_floor=0.0), centers=centers, prior=prior
-        )
+        found = adjust_tracks(made.views, made.tracks, AdjustOptions(noise_floor=0.0), centers=centers, prior=prior)
         assert found.params.shape[1] == 6 + 3 * drift
     assert solve(made, **CALM).params.shape[1] in (9, 12)
     with pytest.raises(InputError, match="use the same"):
@@ -256,9 +250,7 @@ def test_points_start_where_the_delivered_cameras_see_them_by_their_sigmas(made)
     problem = make_problem(block, options, centers_of(made), None)
     state, _ = first_state(problem, block, options, None)
     sensors = [view.sensor for view in given.views]
-    weighted, equal = (
-        triangulated(sensors, given.tracks, given.tracks.xy, s) for s in (given.tracks.sigma, None)
-    )
+    weighted, equal = (triangulated(sensors, given.tracks, given.tracks.xy, s) for s in (given.tracks.sigma, None))
     off = [np.linalg.norm(state.points - there, axis=1) for there in (weighted, equal)]
     assert np.median(off[0]) < 0.02 < 0.3 < np.median(off[1])
 
@@ -268,9 +260,7 @@ def test_a_track_that_one_view_sees_is_weak_and_one_that_none_sees_is_none(made)
     first, second = (np.flatnonzero(made.tracks.point == point) for point in (3, 8))
     keep[first[1:]] = keep[second] = False
     options = AdjustOptions(drift=0)
-    block = join(made.views, made.tracks, None, options).without(
-        ~keep[np.argsort(made.tracks.view, kind="stable")]
-    )
+    block = join(made.views, made.tracks, None, options).without(~keep[np.argsort(made.tracks.view, kind="stable")])
     problem = make_problem(block, options, centers_of(made), None)
     _, heights = first_state(problem, block, options, None)
     assert heights.weak[[2, 3, 4, 8]].tolist() == [False, True, False, False]
@@ -298,9 +288,7 @@ def test_the_scenes_move_is_from_where_the_delivered_cameras_put_what_is_seen_no
     assert np.isnan(some[~few]).all()
     sensors = problem.cameras.unknowns.corrected(params, given.views)
     ground = ground_from_ecef(final.points)
-    seen = np.array(
-        [sensors[v].project(ground[p]) for v, p in zip(given.tracks.view, given.tracks.point, strict=True)]
-    )
+    seen = np.array([sensors[v].project(ground[p]) for v, p in zip(given.tracks.view, given.tracks.point, strict=True)])
     delivered = [view.sensor for view in given.views]
     weighted, equal = (triangulated(delivered, given.tracks, seen, s) for s in (given.tracks.sigma, None))
     off = [np.linalg.norm(found - there, axis=1) for there in (weighted, equal)]
@@ -381,9 +369,7 @@ def script(
         points: Any
 
     class Scripted:
-        def __init__(
-            self, problem: Any, block: Any, state: Any, options: Any, heights: Any, use: Any
-        ) -> None:
+        def __init__(self, problem: Any, block: Any, state: Any, options: Any, heights: Any, use: Any) -> None:
             starts.append((problem.cameras.unknowns.drift, use))
             self.number, self.residual, self.params = len(starts) - 1, "before", state.params
 
@@ -414,8 +400,7 @@ def script(
     options = AdjustOptions() if options is None else options
     made = solved.solve_block(block, None, options, None, None, prior)  # type: ignore[arg-type]
     named = [
-        (drift, "all" if given is use else "agreed" if isinstance(given, Agreed) else "kept")
-        for drift, given in starts
+        (drift, "all" if given is use else "agreed" if isinstance(given, Agreed) else "kept") for drift, given in starts
     ]
     return made, named
 
@@ -430,9 +415,7 @@ class Agreed:
         return self.count
 
 
-@pytest.mark.parametrize(
-    ("noise", "kept", "taken"), [(1.58, 41, 1), (1.62, 41, 0), (1.58, 39, 0), (0.1, 40, 0)]
-)
+@pytest.mark.parametrize(("noise", "kept", "taken"), [(1.58, 41, 1), (1.62, 41, 0), (1.58, 39, 0), (0.1, 40, 0)])
 def test_an_agreement_is_taken_that_leaves_a_fifth_less_noise_and_half_of_what_agrees(
     monkeypatch, noise: float, kept: int, taken: int
 ) -> None:

@@ -61,9 +61,7 @@ def drifting(
     views: int, tracks: int, part: float, metres: float, seed: int = 0, outliers: float = 0.0
 ) -> tuple[Block, Tracks, BoolArray]:
     """A block whose corner moves by `metres` from the first to the last view; which ties (K,) are there."""
-    block = simulate_block(
-        views, tracks, seed=seed, attitude=10e-6, position=2.0, per_site=views, outliers=outliers
-    )
+    block = simulate_block(views, tracks, seed=seed, attitude=10e-6, position=2.0, per_site=views, outliers=outliers)
     ties, moves = block.tracks, corner(block, part)[block.tracks.point]
     xy, direction = ties.xy.copy(), across(block)
     for v, (view, correction) in enumerate(zip(block.views, block.truth.corrections, strict=True)):
@@ -194,9 +192,7 @@ def test_vehicles_are_no_group(seed: int) -> None:
     block = simulate_block(2 + seed % 3, 900, seed=50 + seed, attitude=10e-6, position=2.0)
     rng, ties = np.random.default_rng(seed), block.tracks
     drives = rng.uniform(size=ties.num_points) < 0.05
-    speed = (drives * rng.uniform(2.0, 20.0, ties.num_points))[:, None] * rng.choice(
-        [-1, 1], (ties.num_points, 2)
-    )
+    speed = (drives * rng.uniform(2.0, 20.0, ties.num_points))[:, None] * rng.choice([-1, 1], (ties.num_points, 2))
     xy = ties.xy + speed[ties.point] * ties.view[:, None]
     found = adjust_tracks(block.views, replace(ties, xy=xy))
     assert not found.findings

@@ -40,9 +40,7 @@ def _sites(columns: int, rows: int, a_site: int = 3) -> tuple[np.ndarray, np.nda
 def _matrix(pairs: np.ndarray, n: int, q: int, seed: int = 0) -> Blocks:
     rng = np.random.default_rng(seed)
     diagonal = rng.normal(size=(n, q, q))
-    return Blocks(
-        diagonal + diagonal.swapaxes(1, 2) + 30 * q * np.eye(q), rng.normal(size=(len(pairs), q, q)), pairs
-    )
+    return Blocks(diagonal + diagonal.swapaxes(1, 2) + 30 * q * np.eye(q), rng.normal(size=(len(pairs), q, q)), pairs)
 
 
 def _numbers(order: Dissection) -> int:
@@ -59,9 +57,7 @@ def _work(order: Dissection) -> int:
     ("sites", "leaf", "kept"),
     diagonal([(4, 15, 1), (7, 6, 3), (60, 1, 2), (1, 1, 1)], [7, 1, 32, 1000], [0.0, 1e9]),
 )
-def test_solutions_and_blocks_of_the_inverse_are_those_of_the_dense_matrix(
-    monkeypatch, sites, leaf, kept
-) -> None:
+def test_solutions_and_blocks_of_the_inverse_are_those_of_the_dense_matrix(monkeypatch, sites, leaf, kept) -> None:
     monkeypatch.setattr(dissection, "LEAF", leaf)
     monkeypatch.setattr(multifrontal, "IN_MEMORY", kept)
     pairs, place = _sites(*sites)
@@ -138,9 +134,7 @@ def test_little_fills_in() -> None:
         pairs, place = _sites(length, 2)
         a_view.append(_numbers(dissect(pairs, place, np.ones(len(place), dtype=bool))) / len(place))
     assert 0.8 < a_view[1] / a_view[0] < 1.25
-    order = dissect(
-        pairs, place[np.random.default_rng(0).permutation(len(place))], np.ones(len(place), dtype=bool)
-    )
+    order = dissect(pairs, place[np.random.default_rng(0).permutation(len(place))], np.ones(len(place), dtype=bool))
     assert _numbers(order) < 1.1 * a_view[1] * len(place)  # places that lie cost nothing: ties tell
 
 

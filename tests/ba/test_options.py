@@ -221,9 +221,9 @@ def test_a_view_with_few_observations_gives_none_away(dirty):
 
 
 def test_every_option_has_a_row():
-    assert {row.field for row in ROWS} | set(ELSEWHERE) == {
-        field.name for field in fields(AdjustOptions)
-    } | set(CONSTANTS[AdjustOptions])
+    assert {row.field for row in ROWS} | set(ELSEWHERE) == {field.name for field in fields(AdjustOptions)} | set(
+        CONSTANTS[AdjustOptions]
+    )
     assert set(ELSEWHERE.values()) <= set(globals())
 
 
@@ -239,9 +239,7 @@ def test_every_option_has_a_row():
     ],
 )
 def test_an_option_changes_the_result_in_its_direction(dirty, ended, row):
-    few, many = (
-        row.observable(ended(dirty, row.dem, {**row.rest, row.field: value})) for value in (row.low, row.high)
-    )
+    few, many = (row.observable(ended(dirty, row.dem, {**row.rest, row.field: value})) for value in (row.low, row.high))
     ratio = many / few if row.sign > 0 else few / many
     assert ratio > row.factor, (few, many)
 
@@ -292,9 +290,7 @@ def test_auto_leaves_scipy_where_unknowns_are_many(caplog, monkeypatch):
         assert caplog.records[-1].getMessage().split(":")[0] == runs
 
 
-@pytest.mark.parametrize(
-    "name", ["sigma_attitude", "sigma_position", "sigma_drift", "dem_sigma", "dem_bias_sigma"]
-)
+@pytest.mark.parametrize("name", ["sigma_attitude", "sigma_position", "sigma_drift", "dem_sigma", "dem_bias_sigma"])
 def test_a_sigma_must_be_positive(name):
     AdjustOptions(**{name: 1e-9})
     for wrong in (0.0, -1.0, float("nan")):
@@ -302,9 +298,7 @@ def test_a_sigma_must_be_positive(name):
             AdjustOptions(**{name: wrong})
 
 
-@pytest.mark.parametrize(
-    ("name", "wrong"), [("loss", "l3"), ("solver", "ceres"), ("drift", 3), ("model", "")]
-)
+@pytest.mark.parametrize(("name", "wrong"), [("loss", "l3"), ("solver", "ceres"), ("drift", 3), ("model", "")])
 def test_a_choice_must_be_one_of_its_list(name, wrong):
     with pytest.raises(InputError, match=name):
         AdjustOptions(**{name: wrong})
@@ -323,9 +317,7 @@ def test_prior_sigmas_stand_at_their_unknowns(dirty):
         np.testing.assert_array_equal(sigma, np.full((4, size), 7.0))
 
 
-@pytest.mark.parametrize(
-    ("stated", "taken"), [(None, 7.5), (0.1, 7.5), (0.11, 0.11), (8.0, 8.0), (0.02, 7.5)]
-)
+@pytest.mark.parametrize(("stated", "taken"), [(None, 7.5), (0.1, 7.5), (0.11, 0.11), (8.0, 8.0), (0.02, 7.5)])
 def test_a_camera_is_as_accurate_as_it_states_in_metres(dirty, stated, taken):
     view = dirty.views[0]
     told = replace(view, sensor=replace(view.sensor, err_bias=stated))

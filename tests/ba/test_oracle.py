@@ -139,9 +139,7 @@ def _assert_close(found: np.ndarray, expected: np.ndarray, rtol: float = 1e-5) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dense_unknowns", [900, 0])
-def test_the_reduced_system_is_the_schur_complement_of_the_whole_differenced_problem(
-    case, monkeypatch, dense_unknowns
-):
+def test_the_reduced_system_is_the_schur_complement_of_the_whole_differenced_problem(case, monkeypatch, dense_unknowns):
     monkeypatch.setattr(normal, "DENSE_UNKNOWNS", dense_unknowns)
     matrix, gradient, cost = case.dense
     size = case.params.size
@@ -190,9 +188,7 @@ def test_what_scipy_sees_has_the_cost_the_gradient_and_the_matrix_of_the_reduced
         residual, jacobian = compressed.residual(x), compressed.jacobian(x)
         assert (residual.shape, jacobian.shape) == ((size + 1,), (size + 1, size))
         state = compressed.state
-        np.testing.assert_allclose(
-            (state.params - case.params).ravel(), np.linalg.solve(upper0, x), atol=1e-9
-        )
+        np.testing.assert_allclose((state.params - case.params).ravel(), np.linalg.solve(upper0, x), atol=1e-9)
         there = case.problem.reduce(state.params, state.points, case.weight)
         assert state.cost == pytest.approx(there.cost, rel=1e-9)
         assert residual @ residual == pytest.approx(there.cost - there.gain, rel=1e-9)
@@ -280,9 +276,7 @@ def test_a_residual_in_an_image_is_taken_in_units_of_its_own_deviation(case):
     whitened = case.plain.residual(case.params, case.points)
     places = 2 * rows[:, None] + [0, 1]
     assert (left[places] < 0.99).any()  # or all would be residuals over what is stated
-    np.testing.assert_allclose(
-        found, (np.abs(whitened[places]) / np.sqrt(left[places])).max(axis=1), rtol=1e-4
-    )
+    np.testing.assert_allclose(found, (np.abs(whitened[places]) / np.sqrt(left[places])).max(axis=1), rtol=1e-4)
 
 
 def test_modes_are_the_motions_the_weakest_first_and_what_goes_with_them():
@@ -296,12 +290,8 @@ def test_modes_are_the_motions_the_weakest_first_and_what_goes_with_them():
         m = MOTIONS.index(mode.meaning)
         assert mode.sigma == pytest.approx(np.sqrt(covariance[m, m]))
         assert mode.motion[m] == pytest.approx(mode.sigma)
-        off = (
-            np.abs(drawn[:, m] - mode.sigma) < 0.1 * mode.sigma
-        )  # what is seen of the others where it is off so
-        np.testing.assert_allclose(
-            drawn[off].mean(axis=0), mode.motion, atol=0.1 * np.sqrt(np.diag(covariance)).max()
-        )
+        off = np.abs(drawn[:, m] - mode.sigma) < 0.1 * mode.sigma  # what is seen of the others where it is off so
+        np.testing.assert_allclose(drawn[off].mean(axis=0), mode.motion, atol=0.1 * np.sqrt(np.diag(covariance)).max())
     still = _modes(np.zeros((7, 7)))  # nothing may move
     assert [mode.sigma for mode in still] == [0.0] * 7
     assert not any(mode.motion.any() for mode in still)
@@ -349,9 +339,7 @@ def test_the_gauge_is_the_least_squares_motion_of_all_points_and_its_covariance(
     radius = np.sqrt((local[:, :2] ** 2).sum(axis=1).mean())
     e, n = local[:, 0] / radius, local[:, 1] / radius
     zero, one = np.zeros(len(e)), np.ones(len(e))
-    plane = np.column_stack(
-        [one, e, n]
-    )  # is in none of what bends: the scene's place and tilts stay what they are
+    plane = np.column_stack([one, e, n])  # is in none of what bends: the scene's place and tilts stay what they are
     bends = [bend - plane @ (np.linalg.pinv(plane) @ bend) for bend in (e * n, e**2, n**2)]
     moves = np.stack([  # of every point, by one metre of each motion: counterclockwise turn, growth
         np.stack([one, zero, zero], 1), np.stack([zero, one, zero], 1), np.stack([zero, zero, one], 1),
@@ -373,9 +361,7 @@ def test_the_gauge_is_the_least_squares_motion_of_all_points_and_its_covariance(
     _assert_close(rebuilt, expected, 1e-4)
 
 
-def test_a_sample_of_many_points_stands_for_the_scene_and_their_own_noise_averages_over_all(
-    case, monkeypatch
-):
+def test_a_sample_of_many_points_stands_for_the_scene_and_their_own_noise_averages_over_all(case, monkeypatch):
     covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
     before, use = case.points - [3.0, 0.0, 1.0] * (np.arange(12) == 7)[:, None], np.ones(12, dtype=bool)
     whole = gauge_report(covariance, case.points, before, use)
@@ -388,9 +374,7 @@ def test_a_sample_of_many_points_stands_for_the_scene_and_their_own_noise_averag
     alone = gauge_report(covariance, case.points, before, sample)
     assert some.radius == pytest.approx(alone.radius)
     np.testing.assert_allclose(some.by_unknown, alone.by_unknown)
-    assert np.linalg.norm(some.shift) == pytest.approx(
-        np.linalg.norm(whole.shift), rel=1e-9
-    )  # the mean of all
+    assert np.linalg.norm(some.shift) == pytest.approx(np.linalg.norm(whole.shift), rel=1e-9)  # the mean of all
     assert np.linalg.norm(alone.shift) == pytest.approx(0.0, abs=1e-9)
     of_cameras = np.diag(some.by_unknown @ covariance.solve(some.by_unknown.T))
     own = [report.motion_sigma**2 - of_cameras for report in (some, alone)]
@@ -549,9 +533,7 @@ def test_residuals_of_gcps_point_from_the_given_to_the_adjusted_place():
     true = made.gcps
     offset = np.array([5.0, -3.0, -8.0])
     wrong = np.array([ground_of(ecef_of(g) + enu_of(*g[:2]).T @ offset) for g in true.lonlatalt])
-    gcps = GroundPoints(
-        true.names, wrong, np.full((4, 3), 1e3), true.point, true.view, true.xy, true.xy_sigma
-    )
+    gcps = GroundPoints(true.names, wrong, np.full((4, 3), 1e3), true.point, true.view, true.xy, true.xy_sigma)
     options = AdjustOptions(noise_floor=0.0, sigma_attitude=0.01, sigma_position=0.01, min_convergence=0.01)
     found = adjust_tracks(made.views, made.tracks, options, gcps, centers=centers_of(made))
     np.testing.assert_allclose(found.gcp_residuals, np.tile(-offset, (4, 1)), atol=1.0)
@@ -635,9 +617,7 @@ def test_only_observations_of_known_points_are_looked_at_again_for_the_datum(cas
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("known", "fixed"), diagonal([12, 11], [(), (1,)])
-)  # the last point: a GCP, a reference's
+@pytest.mark.parametrize(("known", "fixed"), diagonal([12, 11], [(), (1,)]))  # the last point: a GCP, a reference's
 def test_the_shares_of_the_datum_are_what_each_row_pays_of_the_cheapest_move(fixed, known):
     case = make_case(1, tuple(f"view_{v:04d}" for v in fixed))
     free = np.append(case.problem.free, np.ones(case.points.size, dtype=bool))

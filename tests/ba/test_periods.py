@@ -9,18 +9,14 @@ from barpc.ba.evidence.periods import swings
 from barpc.ba.evidence.scan import SURE
 
 
-def ties(
-    seed: int, rows: float = 9000.0, views: int = 2
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def ties(seed: int, rows: float = 9000.0, views: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     view = np.repeat(np.arange(views), 1500)
     row = rng.uniform(0.0, rows, len(view))
     return view, row, np.full((2, views), rows), rng.normal(size=(2, len(view)))
 
 
-@pytest.mark.parametrize(
-    ("period", "rows"), [(60.0, 1000.0), (200.0, 9000.0), (600.0, 1000.0), (600.0, 30000.0)]
-)
+@pytest.mark.parametrize(("period", "rows"), [(60.0, 1000.0), (200.0, 9000.0), (600.0, 1000.0), (600.0, 30000.0)])
 def test_a_swing_is_found_with_its_period_in_its_image(period: float, rows: float) -> None:
     view, row, size, off = ties(1, rows)
     phase = 2.0 * np.pi * row / period
@@ -58,9 +54,7 @@ def test_rows_that_wander_gain_far_less_as_a_swing_than_they_are_off(seed: int) 
     """A random walk has its largest wave at some frequency: those beside it are nearly as large."""
     view, row, size, off = ties(seed)
     walk = np.cumsum(np.random.default_rng(seed + 50).normal(size=300))
-    off[0] += (
-        (view == 1) * 0.5 * np.interp(row, np.linspace(0.0, 9000.0, 300), (walk - walk.mean()) / walk.std())
-    )
+    off[0] += (view == 1) * 0.5 * np.interp(row, np.linspace(0.0, 9000.0, 300), (walk - walk.mean()) / walk.std())
     found = swings(view, row, size, np.ones(len(view)), off)
     explained = 0.5 * 1500 * 0.25
     assert not found or found[0].gain < 0.4 * explained

@@ -67,9 +67,7 @@ def test_rows_and_columns_that_lie_off_are_named_with_their_size(axis, part, mov
 
 def test_a_cell_is_named_and_not_the_rows_that_it_is_in() -> None:
     unused, _ = observed(2, 900, 0.03)
-    hit = ((unused.xy / SIZE[:, :1] > [[0.5], [0.25]]) & (unused.xy / SIZE[:, :1] < [[0.75], [0.5]])).all(
-        axis=0
-    )
+    hit = ((unused.xy / SIZE[:, :1] > [[0.5], [0.25]]) & (unused.xy / SIZE[:, :1] < [[0.75], [0.5]])).all(axis=0)
     unused.residual[:, hit] += 0.5
     (one,) = worst(unused)
     assert one.columns == (10_000.0, 15_000.0)
@@ -123,9 +121,7 @@ def test_few_observations_and_exact_ones_say_nothing_wrong() -> None:
     unused, _ = observed(1, 300, 0.0)
     exact = Unused(unused.view, unused.xy, np.zeros((2, 300)), np.full(300, 1e-6))
     assert worst(exact) == []
-    far = Unused(
-        unused.view, unused.xy, unused.residual + 50.0, unused.deviation
-    )  # nothing is near: no place is worse
+    far = Unused(unused.view, unused.xy, unused.residual + 50.0, unused.deviation)  # nothing is near: no place is worse
     assert worst(far) == []
     outside = Unused(unused.view, unused.xy - 3e4, unused.residual, unused.deviation)
     assert worst(outside) == []

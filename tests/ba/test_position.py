@@ -129,9 +129,7 @@ def test_an_image_that_is_added_makes_no_motion_less_known(tmp_path) -> None:
     # a third run goes on with the same scene
     again = block_prior(both).scene
     assert again is not None
-    np.testing.assert_array_equal(
-        again.by_unknown[:, : first.params.size], block_prior(first).scene.by_unknown
-    )
+    np.testing.assert_array_equal(again.by_unknown[:, : first.params.size], block_prior(first).scene.by_unknown)
     assert not again.by_unknown[:, first.params.size :].any()
 
 
@@ -164,8 +162,7 @@ def test_accuracies_that_independent_errors_have_are_taken_as_they_are() -> None
     block = simulate_block(4, 100, seed=8, per_site=4, attitude=7.5 / 694e3, position=7.5)
     views = tuple(replace(view, sensor=replace(view.sensor, err_bias=7.5)) for view in block.views)
     stated, silent = (
-        adjust_tracks(given, block.tracks, AdjustOptions(), centers=centers_of(block))
-        for given in (views, block.views)
+        adjust_tracks(given, block.tracks, AdjustOptions(), centers=centers_of(block)) for given in (views, block.views)
     )
     assert stated.prior.shared == 1.0
     np.testing.assert_array_equal(stated.params, silent.params)
@@ -178,8 +175,7 @@ def test_what_the_user_states_of_the_cameras_is_taken_as_stated() -> None:
     views = tuple(replace(view, sensor=replace(view.sensor, err_bias=7.5)) for view in block.views)
     given = AdjustOptions(sigma_attitude=7.5, sigma_position=7.5)
     found, of_file = (
-        adjust_tracks(views, block.tracks, options, centers=centers_of(block))
-        for options in (given, AdjustOptions())
+        adjust_tracks(views, block.tracks, options, centers=centers_of(block)) for options in (given, AdjustOptions())
     )
     assert found.prior.shared == 1.0
     assert of_file.prior.shared > 1.2

@@ -117,9 +117,7 @@ def swung(camera: Pushbroom, rng: np.random.Generator) -> Pushbroom:
     attitude[:, 0] += rng.normal(0, 8e-6, 3)
     attitude[:, 1] += rng.normal(0, 1e-7, 3)
     orbit[:, 0] += rng.normal(0, 2.0, 3)
-    return replace(
-        camera, orbit=Curve(camera.orbit.knots, orbit), attitude=Curve(camera.attitude.knots, attitude)
-    )
+    return replace(camera, orbit=Curve(camera.orbit.knots, orbit), attitude=Curve(camera.attitude.knots, attitude))
 
 
 @dataclass(frozen=True)
@@ -140,9 +138,7 @@ def radars(kind: str, folder: Path, move: Move, far: float) -> tuple[Clocked, Cl
     """A radar as delivered and as it was: on another orbit, its ranges less by `far` [m]."""
     if kind == "slc":
         radar = Product().model()
-        frame = replace(
-            radar.frame, first_range_time=radar.frame.first_range_time - 2.0 * far / SPEED_OF_LIGHT
-        )
+        frame = replace(radar.frame, first_range_time=radar.frame.first_range_time - 2.0 * far / SPEED_OF_LIGHT)
         return radar, replace(radar, orbit=move(radar.orbit), frame=frame)
     (folder / "image.xml").write_text(document(kind, squint=0.1))
     image = open_sicd(folder / "image.xml")
@@ -189,8 +185,7 @@ def test_a_moved_orbit_is_followed_by_clocks_as_well_as_by_an_attitude(request, 
     clocks = request.getfixturevalue("found") if known else adjust_tracks(scene.views, scene.tracks())
     turned = adjust_tracks(scene.as_one_of(Opaque).views, scene.tracks())
     (before, _), (after, error), (there, other) = (
-        scene.misses(cameras)
-        for cameras in ([view.sensor for view in scene.views], clocks.sensors, turned.sensors)
+        scene.misses(cameras) for cameras in ([view.sensor for view in scene.views], clocks.sensors, turned.sensors)
     )
     assert before.max() > 2.0
     assert before[2].max() > 0.5
@@ -306,14 +301,10 @@ def test_the_summary_states_metres_and_milliseconds(slc: Scene, found: Adjustmen
     middle = slc.views[2].sensor.localize((np.array(slc.views[2].size) - 1) / 2, np.array(300.0))
     shift = found.sensors[2].project(middle) - slc.views[2].sensor.project(middle)
     np.testing.assert_allclose(radar.center_shift_px, shift, atol=1e-3)
-    np.testing.assert_allclose(
-        radar.center_sigma_px, np.array(radar.timing_sigma) * [0.4293, 0.4865], rtol=1e-3
-    )
+    np.testing.assert_allclose(radar.center_sigma_px, np.array(radar.timing_sigma) * [0.4293, 0.4865], rtol=1e-3)
     assert radar.rotation_urad is None
     assert first.range_m is None
     line = next(line for line in summary.verdict if "clocks" in line)
-    assert line.startswith(
-        f"Radar images are corrected by their clocks: radar: range {told.coeffs[0, 0]:+.2f} ± "
-    )
+    assert line.startswith(f"Radar images are corrected by their clocks: radar: range {told.coeffs[0, 0]:+.2f} ± ")
     assert line.endswith(" ms.")
     assert plain(summary)["views"][2]["correction"]["range_m"] == radar.range_m

@@ -108,9 +108,7 @@ def test_the_cost_is_optimal_wherever_on_earth_the_scene_lies(views, tracks, pla
 def test_plain_least_squares_takes_two_linearisations_from_metres_away(request, size, solver):
     block = request.getfixturevalue(size)
     found = solve(block, **L2, solver=solver)
-    assert (
-        found.steps <= {"scipy": 5, "sparse": 4}[solver]
-    )  # two passes: the second with priors that have learnt
+    assert found.steps <= {"scipy": 5, "sparse": 4}[solver]  # two passes: the second with priors that have learnt
     assert found.cost_history[0] > 100 * found.cost_history[-1]
     tight = solve(block, **L2, solver=solver, tolerance=1e-14)
     assert found.cost_history[-1] == pytest.approx(tight.cost_history[-1], rel=1e-9)
@@ -225,9 +223,7 @@ def test_check_points_stay_out_of_the_solve_and_measure_it():
     assert len(control.names) == len(check.names) == 6
     assert len(control.view) + len(check.view) == len(triplet.gcps.view)
     centers = centers_of(triplet)
-    found = adjust_tracks(
-        triplet.views, triplet.tracks, AdjustOptions(**INDEPENDENT), control, centers=centers
-    )
+    found = adjust_tracks(triplet.views, triplet.tracks, AdjustOptions(**INDEPENDENT), control, centers=centers)
     before = check_residuals([view.sensor for view in triplet.views], check).rms()
     after = check_residuals(found.sensors, check).rms()
     assert (before[0] > 1.0).all()
@@ -249,9 +245,7 @@ def test_a_check_point_in_one_view_has_no_place_on_the_ground():
 
 def test_a_single_view_is_refined_by_gcps_alone():
     one = simulate_block(1, 0, seed=3, num_gcps=12, num_checks=0)
-    found = adjust_tracks(
-        one.views, one.tracks, AdjustOptions(**INDEPENDENT), one.gcps, centers=centers_of(one)
-    )
+    found = adjust_tracks(one.views, one.tracks, AdjustOptions(**INDEPENDENT), one.gcps, centers=centers_of(one))
     truth = truth_sensors(one)[0]
     image = np.random.default_rng(0).uniform(0, 19999, (50, 2))
     ground = truth.localize(image, np.full(50, 300.0))

@@ -22,8 +22,7 @@ def hills(lon, lat):
     """Relief that needs no file: valleys and ridges of some hundred metres."""
     x, y = (lon - 5.45) * 79e3, (lat - 44.5) * 111e3
     waves = [
-        np.sin(x / s + p) * np.cos(y / (1.3 * s) - p) * s / 12.0
-        for s, p in ((4000, 0.3), (1500, 1.1), (400, 2.0))
+        np.sin(x / s + p) * np.cos(y / (1.3 * s) - p) * s / 12.0 for s, p in ((4000, 0.3), (1500, 1.1), (400, 2.0))
     ]
     return 900.0 + sum(waves)
 
@@ -68,15 +67,13 @@ def test_what_a_drifting_attitude_does_is_corrected_by_default(name, across, sha
     assert median(found, lambda v: v.before.across) > 5.0
     assert median(found, lambda v: v.after.across) < across
     assert median(found, lambda v: v.after.shape) < shape
-    assert median(found, lambda v: v.lost) <= (
-        0.015 if name.startswith("quadratic") else 0.01
-    )  # right tie points
+    assert median(found, lambda v: v.lost) <= (0.015 if name.startswith("quadratic") else 0.01)  # right tie points
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", rest_slow([SEEDS[:1], SEEDS], mark=pytest.mark.nightly))
 def test_without_a_drift_in_the_model_the_same_scene_is_not_met(seeds):
-    assert median(verdicts("drift 1", seeds, drift=0), lambda v: v.after.across) > 0.15
+    assert 0.1 < median(verdicts("drift 1", seeds, drift=0), lambda v: v.after.across) < 0.3
 
 
 @pytest.mark.slow
@@ -85,9 +82,7 @@ def test_the_drift_is_learnt_as_large_as_it_is():
              for name in ("no drift", "drift 1", "drift 3")}  # fmt: skip
     quiet, one, three = (float(np.median(sizes[name])) for name in sizes)
     assert quiet < 0.25
-    assert (
-        0.25 < one < 1.8
-    )  # 0.7 m is flown, of which half is seen; what is not expected is taken rather too wide
+    assert 0.25 < one < 1.8  # 0.7 m is flown, of which half is seen; what is not expected is taken rather too wide
     assert 1.5 < three < 6.0
 
 
@@ -118,9 +113,7 @@ def test_one_wrong_rpc_of_three_is_named_and_the_place_of_the_scene_still_covere
         named.append(found.prior.odd[wrong[0]])
         assert found.prior.scale[wrong[0]] == found.prior.scale.max() > 3
         assert after.across < 0.05
-        assert (
-            np.abs(after.move) <= 4 * found.gauge.sigma
-        ).all()  # the others are twice as far off as stated, too
+        assert (np.abs(after.move) <= 4 * found.gauge.sigma).all()  # the others are twice as far off as stated, too
 
 
 def test_two_views_that_contradict_each_other_are_both_widened_and_none_is_named():
@@ -136,13 +129,9 @@ def test_forty_percent_of_a_view_moved_together_is_left_out():
     assert median(found, lambda v: v.after.across) < 0.05
     assert median(found, lambda v: v.caught) > 0.99
     clean = verdicts("no drift")
-    for verdict, other in zip(
-        found, clean, strict=True
-    ):  # the same scene: how it moved is not what was moved in it
+    for verdict, other in zip(found, clean, strict=True):  # the same scene: how it moved is not what was moved in it
         offset = np.abs(np.subtract(verdict.shift, other.shift))
-        assert (
-            offset < [0.5, 0.5, 5.0]
-        ).all()  # 7 m without: pairs of delivered cameras meet at many heights
+        assert (offset < [0.5, 0.5, 5.0]).all()  # 7 m without: pairs of delivered cameras meet at many heights
 
 
 @pytest.mark.slow
@@ -175,7 +164,7 @@ def test_a_pair_whose_tie_points_are_of_one_kind_says_nothing(name, seeds):
         pytest.param(
             "jitter 0.5 at 1 Hz",
             "look",
-            "Jitter along the rows is followed by splines",
+            " swing by ",
             marks=pytest.mark.nightly,
         ),
         ("jitter 0.1 at 5 Hz", "look", "px every 27"),
@@ -220,9 +209,7 @@ def test_what_is_stated_of_weak_heights_is_as_large_as_it_is(angle):
     ("bias", "seeds"), rest_slow(starmap(pytest.param, product([30.0, 0.0], [range(1), range(1, 3)])))
 )
 def test_heights_of_a_dem_are_wrong_together(bias, seeds):
-    true, said = heights_of(
-        [weak_pair(0.6, seed) for seed in seeds], dem=lambda lon, lat: hills(lon, lat) + bias
-    )
+    true, said = heights_of([weak_pair(0.6, seed) for seed in seeds], dem=lambda lon, lat: hills(lon, lat) + bias)
     assert (np.abs(true) < 2 * said).all()
     np.testing.assert_allclose(true, bias, atol=2.0)  # nothing else tells: the scene stands on the DEM
     assert (said < 25.0).all()

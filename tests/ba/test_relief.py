@@ -159,9 +159,7 @@ def test_what_contradicts_the_cameras_is_let_go_and_the_rest_is_not() -> None:
     ground = points(200)
     tilted = lambda lon, lat: sum_of(HILLS)(lon, lat) + 40.0 * (lon - LON) * UNIT[0] / (SIDE / 2)  # noqa: E731
     made = Relief.of(tilted, ground, np.ones(200, dtype=bool), np.full(200, 0.3))
-    assert made.delivered[1] == pytest.approx(
-        -40.0 * 0.816, rel=0.05
-    )  # at the RMS distance of a square's points
+    assert made.delivered[1] == pytest.approx(-40.0 * 0.816, rel=0.05)  # at the RMS distance of a square's points
     assert np.abs(made.delivered[[0, 2]]).max() < 2.5
     assert np.isnan(made.beyond(2.0)).all()  # nothing is known of the cameras yet
     np.testing.assert_array_equal(made.common_sigma(2.0), np.full(NUM_BENDS, 2.0))
@@ -169,9 +167,7 @@ def test_what_contradicts_the_cameras_is_let_go_and_the_rest_is_not() -> None:
     sigma = made.common_sigma(2.0)
     assert sigma[1] == pytest.approx(-2.0 * made.delivered[1])
     np.testing.assert_array_equal(np.delete(sigma, 1), np.full(NUM_BENDS - 1, 2.0))
-    np.testing.assert_array_equal(
-        made.common_sigma(20.0), np.full(NUM_BENDS, 20.0)
-    )  # it may be as wrong as that
+    np.testing.assert_array_equal(made.common_sigma(20.0), np.full(NUM_BENDS, 20.0))  # it may be as wrong as that
 
 
 def test_a_dem_of_a_known_datum_is_wrong_together_by_less() -> None:
@@ -217,9 +213,7 @@ def test_a_dem_with_waves_places_a_scene_as_well_as_it_is_said_to(hills: bool) -
     assert (rms[:2] < 1.3).all()
     assert (rms[:2] > 0.4).all()
     assert rms[2] < 1.3
-    assert np.sqrt(np.mean(np.square(off))) < (0.7 if hills else 0.85) * np.sqrt(
-        np.mean(np.square(delivered))
-    )
+    assert np.sqrt(np.mean(np.square(off))) < (0.7 if hills else 0.85) * np.sqrt(np.mean(np.square(delivered)))
 
 
 @pytest.mark.slow

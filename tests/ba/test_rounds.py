@@ -232,9 +232,7 @@ def passes(
             self.goes_on = known
             self.heights: Any = SimpleNamespace(hold=lambda problem, points: problem)
             self.observations: Any = SimpleNamespace(sigma=np.ones(10_000))
-            self.variances: Any = SimpleNamespace(
-                learnt=lambda *_: (learnt(self.passes), SimpleNamespace(shared=1.0))
-            )
+            self.variances: Any = SimpleNamespace(learnt=lambda *_: (learnt(self.passes), SimpleNamespace(shared=1.0)))
             self.smooth: Any = SimpleNamespace(test_neighbours=lambda *_: "smooth")
             self.residual = self.weight = np.zeros(1)
             self.found = found
@@ -282,9 +280,7 @@ def passes(
         ([0], [1.0], [1.0, 1.3], {"loss": "linear"}, 2),
     ],
 )
-def test_rounds_end_where_cut_noise_and_priors_stand(
-    monkeypatch, cut, noise, prior, options, expected
-) -> None:
+def test_rounds_end_where_cut_noise_and_priors_stand(monkeypatch, cut, noise, prior, options, expected) -> None:
     assert passes(monkeypatch, cut, noise, prior, **options)[0] == expected
 
 

@@ -58,9 +58,7 @@ def scene() -> Scene:
     ground, check = (target + rng.uniform(-1, 1, (n, 3)) * spread for n in (300, 200))
     xy = np.stack([camera.project(ground) for camera in exact], axis=1)
     xy += rng.normal(size=xy.shape) * SIGMA[:, None]
-    tracks = Tracks(
-        np.tile(np.arange(3), 300), np.repeat(np.arange(300), 3), xy.reshape(-1, 2), np.tile(SIGMA, 300)
-    )
+    tracks = Tracks(np.tile(np.arange(3), 300), np.repeat(np.arange(300), 3), xy.reshape(-1, 2), np.tile(SIGMA, 300))
     return Scene(tuple(views), tuple(exact), np.array([*centers, middle]), tracks, ground, check)
 
 

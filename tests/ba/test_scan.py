@@ -100,9 +100,7 @@ def test_a_step_beside_what_the_camera_follows_is_found_where_it_is(at: float) -
     assert (found.start, found.stop) == pytest.approx(ends, abs=1.5 * SIZE[1, 0] / BINS)
     assert found.off == pytest.approx(2.0 * np.sqrt(2.0), rel=0.15)
     bend = (view == 0) * (3.0 - 5.0 * u + 4.0 * u**2)
-    again = next(
-        one for one in scanning.scan(view, place, SIZE, wrong, seen + bend, told) if not one.by_share
-    )
+    again = next(one for one in scanning.scan(view, place, SIZE, wrong, seen + bend, told) if not one.by_share)
     assert np.abs(np.array([again.start, again.stop]) - at * SIZE[1, 0]).min() < 1.5 * SIZE[1, 0] / BINS
 
 
@@ -143,13 +141,9 @@ def test_wrong_matches_lie_in_any_direction(counts: tuple[int, ...]) -> None:
             assert (neighbours_alike(view, place, off, 2) <= SURE).all()
             along = np.outer((0.6, -0.8), off[0])  # of two views they lie along one line
             assert (neighbours_alike(view, place, along, 2) <= SURE).all()
-            biased = np.stack(
-                [off[0], 0.1 + 0.002 * off[1]]
-            )  # a trace of the other direction, all the same way
+            biased = np.stack([off[0], 0.1 + 0.002 * off[1]])  # a trace of the other direction, all the same way
             assert (neighbours_alike(view, place, biased, 2) <= SURE).all()
-            curved = np.stack(
-                [off[0], off[0] ** 2 / 90.0]
-            )  # far along a ray relief bends the other, all the same way
+            curved = np.stack([off[0], off[0] ** 2 / 90.0])  # far along a ray relief bends the other, all the same way
             assert (neighbours_alike(view, place, curved, 2) <= SURE).all()
             bent = off[:, view == 0] - 15.0 * np.sign(off[:, view == 0])
             assert np.isneginf(neighbours_alike(view[view == 0], place[:, view == 0], bent, 2)[1])

@@ -123,9 +123,7 @@ def test_a_view_needs_ten_observations_a_term() -> None:
     few, enough = 18 * 10 - 1, 18 * 10
     smooth = made((few, enough, 400))
     assert sorted(smooth.fit(np.ones((2, few + enough + 400)), np.ones(few + enough + 400))) == [1, 2]
-    assert sorted(
-        smooth.fit(np.ones((2, few + enough + 400)), np.r_[np.ones(few + enough), np.zeros(400)])
-    ) == [1]
+    assert sorted(smooth.fit(np.ones((2, few + enough + 400)), np.r_[np.ones(few + enough), np.zeros(400)])) == [1]
     given = np.ones((2, few + enough + 400))
     part = smooth.part(given, given[0])
     assert not part[:, :few].any()

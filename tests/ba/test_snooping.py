@@ -45,9 +45,7 @@ def blundered(gcps: GroundPoints, wrong: dict[int, float], seed: int = 0) -> Gro
 
 def test_a_control_point_that_contradicts_is_said_to() -> None:
     assert 3.9 < CRITICAL < 4.1
-    tested = ControlTest(
-        np.array([True, True, False]), np.zeros((3, 3)), np.array([3.9, 4.1, 9.0]), np.ones(3)
-    )
+    tested = ControlTest(np.array([True, True, False]), np.zeros((3, 3)), np.array([3.9, 4.1, 9.0]), np.ones(3))
     assert [tested.status(g) for g in range(3)] == ["used", "contradicts", "rejected"]
 
 
@@ -63,9 +61,7 @@ def test_what_is_wrong_is_found_named_and_left_out(count, wrong, seed):
     assert np.flatnonzero(~tested.used).tolist() == sorted(wrong)
     for g, size in wrong.items():
         assert tested.status(g) == "rejected"
-        assert np.linalg.norm(tested.residual[g]) == pytest.approx(
-            size, abs=1.0
-        )  # 0.3 m, and 0.3 px seen from afar
+        assert np.linalg.norm(tested.residual[g]) == pytest.approx(size, abs=1.0)  # 0.3 m, and 0.3 px seen from afar
         assert tested.w[g] > CRITICAL
     assert np.nanmax(np.where(tested.used, tested.w, 0.0)) < CRITICAL
     moved = judge(scene, found.sensors).move
@@ -203,9 +199,7 @@ def test_the_summary_has_every_point_with_its_residual_in_the_images():
     offset = np.array(found.residual_enu_m)
     rays = [sight_enu(view.sensor, gcps.lonlatalt[1]) for view in scene.views if view.name in found.images]
     across = [np.linalg.norm(offset - offset @ ray * ray) for ray in rays]
-    assert found.residual_px == pytest.approx(
-        np.sqrt(np.mean(np.square(across))) / 0.5, rel=0.1
-    )  # pixels of 0.5 m
+    assert found.residual_px == pytest.approx(np.sqrt(np.mean(np.square(across))) / 0.5, rel=0.1)  # pixels of 0.5 m
     many = [replace(one, used=n != 40, w=float(n)) for n in range(60) for one in summary.gcps[:1]]
     shown = GcpEntry.worst(many)
     assert [int(one.w) for one in shown] == [*range(40, 60)]
@@ -228,9 +222,7 @@ def small() -> Block:
 def held(small: Block, gcps: GroundPoints, **options: Any) -> Adjustment:
     options = {"drift": 0, "jitter": "off", "learn_priors": False, **INDEPENDENT, **options}
     centers = centers_of(small)
-    return adjust_tracks(
-        small.views, small.tracks, AdjustOptions(**options), gcps, centers=centers, hold_out=False
-    )
+    return adjust_tracks(small.views, small.tracks, AdjustOptions(**options), gcps, centers=centers, hold_out=False)
 
 
 def some(gcps: GroundPoints, keep: np.ndarray) -> GroundPoints:
@@ -309,9 +301,7 @@ def test_a_point_alone_is_not_checked_and_two_that_differ_contradict(small) -> N
 
 
 @pytest.mark.parametrize("wrong", [0, 7])
-def test_an_observation_of_a_control_point_that_is_off_has_the_largest_w_in_the_order_given(
-    small, wrong
-) -> None:
+def test_an_observation_of_a_control_point_that_is_off_has_the_largest_w_in_the_order_given(small, wrong) -> None:
     gcps = small.gcps
     gcps = some(gcps, np.random.default_rng(3).permutation(len(gcps.view)))
     xy = gcps.xy.copy()
@@ -350,22 +340,16 @@ def test_a_point_is_checked_by_a_tenth_of_redundancy(redundancy, checked) -> Non
 
 
 @pytest.mark.parametrize(("count", "tested"), [(0, 0), (1000, 1000), (1001, 501), (2001, 667)])
-def test_of_a_reference_of_many_points_every_nth_is_tested_in_the_images(
-    monkeypatch, count: int, tested: int
-) -> None:
+def test_of_a_reference_of_many_points_every_nth_is_tested_in_the_images(monkeypatch, count: int, tested: int) -> None:
     """And all control points that are held and were kept; no tie points."""
     point = np.concatenate([np.arange(10), np.arange(10, 14), 14 + np.arange(count)])
     inlier = np.ones(len(point), dtype=bool)
     inlier[10] = False
     held = SimpleNamespace(index=np.concatenate([[3], np.arange(10, 13), 14 + np.arange(count)]))
-    outcome = SimpleNamespace(
-        problem=SimpleNamespace(point_prior=held), inlier=inlier, residual=None, weight=None
-    )
+    outcome = SimpleNamespace(problem=SimpleNamespace(point_prior=held), inlier=inlier, residual=None, weight=None)
     block: Any = SimpleNamespace(point=point, num_tracks=10, num_known=14)
     asked: list[np.ndarray] = []
-    monkeypatch.setattr(
-        adjustment, "image_test", lambda *given: asked.append(given[-1]) or np.ones(len(given[-1]))
-    )
+    monkeypatch.setattr(adjustment, "image_test", lambda *given: asked.append(given[-1]) or np.ones(len(given[-1])))
     found: Any = SimpleNamespace(outcome=outcome, final=None)
     w = adjustment._control_w(found, block, None)  # type: ignore[arg-type]
     assert np.flatnonzero(np.isfinite(w)).tolist() == asked[0].tolist()
@@ -386,7 +370,5 @@ def test_of_a_reference_of_many_points_every_nth_is_tested_in_the_images(
 )
 def test_control_agrees_where_no_point_and_not_all_together_contradict(used, w, fits, agrees) -> None:
     n = len(used)
-    tested = ControlTest(
-        np.array(used, dtype=bool), np.zeros((n, 3)), np.array(w), np.ones(n), scatter=1.0, fits=fits
-    )
+    tested = ControlTest(np.array(used, dtype=bool), np.zeros((n, 3)), np.array(w), np.ones(n), scatter=1.0, fits=fits)
     assert tested.agrees is agrees

@@ -103,9 +103,7 @@ def test_a_matrix_that_does_not_factorise_is_damped_from_less(monkeypatch) -> No
 
 @pytest.mark.parametrize("cost", [1.0, 1000.0])
 @pytest.mark.parametrize(("gain", "ends"), [(0.9e-9, True), (1.1e-9, False)])
-def test_a_cost_that_rises_by_its_rounding_is_the_least(
-    monkeypatch, gain: float, ends: bool, cost: float
-) -> None:
+def test_a_cost_that_rises_by_its_rounding_is_the_least(monkeypatch, gain: float, ends: bool, cost: float) -> None:
     """What a step gains is a fraction of the cost."""
     found, dampings = run(monkeypatch, [cost, cost * (1.0 + 1e-9)], [gain * cost], 1e-12)
     if ends:

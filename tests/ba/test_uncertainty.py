@@ -67,9 +67,7 @@ def run_trials(block: Block, count: int, options: AdjustOptions = OPTIONS) -> Tr
         nees.append(error @ (found.covariance.reduced.matrix @ error))
         scene.append(enu @ np.nanmean(found.points - truth, axis=0))
         stated.append(found.gauge.sigma)
-    return Trials(
-        np.array(nees), np.array(scene), np.sqrt(np.mean(np.square(stated), axis=0)), len(sigma) * n
-    )
+    return Trials(np.array(nees), np.array(scene), np.sqrt(np.mean(np.square(stated), axis=0)), len(sigma) * n)
 
 
 @pytest.mark.nightly

@@ -148,9 +148,7 @@ def test_two_views_are_widened_together() -> None:
 
 def test_of_a_few_views_the_evidence_is_asked_however_small_the_corrections_are() -> None:
     with pytest.raises(AttributeError):
-        variances(4)._widened(
-            FEW, params_of(variances(4), [11.0, 3.0, 3.0, 3.0]), np.ones((4, 3)), np.ones(0)
-        )
+        variances(4)._widened(FEW, params_of(variances(4), [11.0, 3.0, 3.0, 3.0]), np.ones((4, 3)), np.ones(0))
 
 
 @pytest.mark.parametrize(("usual", "wrong"), [(3.0, 300.0), (12.0, 900.0), (12.0, 14.0), (3.0, 11.0)])
@@ -193,14 +191,10 @@ def test_of_two_explanations_the_clearly_likelier_one_is_taken_and_else_both(mon
     np.testing.assert_allclose(scale, common)
 
 
-def forward(
-    monkeypatch, gains: dict[tuple[int, ...], float], n: int = 6
-) -> tuple[list[int], np.ndarray, float]:
+def forward(monkeypatch, gains: dict[tuple[int, ...], float], n: int = 6) -> tuple[list[int], np.ndarray, float]:
     """Views that are odd by evidences of sets of views; every one of them wants its number plus two as a factor."""
 
-    def alone(
-        self: Variances, around: Any, wide: np.ndarray, scale: np.ndarray, v: int
-    ) -> tuple[float, float]:
+    def alone(self: Variances, around: Any, wide: np.ndarray, scale: np.ndarray, v: int) -> tuple[float, float]:
         chosen = tuple(sorted([*np.flatnonzero(scale != 1.0).tolist(), v]))
         return gains.get(chosen, 0.0), v + 2.0
 
@@ -236,9 +230,7 @@ def test_what_is_determined_is_what_the_prior_alone_does_not_say() -> None:
     v = variances(2)
     full = np.diag([4.0, 2.0, 1.0, 0.0, 5.0, 4.0])
     free = np.array([1, 1, 1, 0, 1, 1], dtype=bool)
-    covariance: Any = SimpleNamespace(
-        free=free, is_large=False, variances=lambda: full.diagonal().reshape(2, 3)
-    )
+    covariance: Any = SimpleNamespace(free=free, is_large=False, variances=lambda: full.diagonal().reshape(2, 3))
     np.testing.assert_allclose(v._known(covariance, v.given), [[0.0, 0.5, 0.75], [0.0, 0.0, 0.0]])
     loose = CameraPrior(v.given.mean, np.where(np.arange(3) == 1, np.inf, v.given.sigma))
     np.testing.assert_allclose(v._known(covariance, loose), [[0.0, 0.0, 0.75], [0.0, 0.0, 0.0]])
@@ -258,9 +250,7 @@ def test_variances_of_a_large_block_are_exact_where_they_are_stated_and_probed_w
         monkeypatch.setattr("barpc.ba.solving.normal.DENSE_UNKNOWNS", 0)
         monkeypatch.setattr("barpc.ba.solving.covariance._LARGE", 0)
     options = AdjustOptions(**({"min_convergence": 60.0} if n < 300 else {}))
-    with pytest.warns(
-        BarpcWarning, match="held in height"
-    ):  # they share an error, taken off the sparse matrix
+    with pytest.warns(BarpcWarning, match="held in height"):  # they share an error, taken off the sparse matrix
         found = adjust_tracks(block.views, block.tracks, options, centers=centers_of(block))
     covariance = found.covariance
     assert covariance.is_large
@@ -347,9 +337,7 @@ def test_priors_that_are_too_narrow_are_widened_by_as_much(wrong: float, seeds: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("wrong", "by"), [(2, (200.0, -150.0)), pytest.param(1, (0.0, 300.0), marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("wrong", "by"), [(2, (200.0, -150.0)), pytest.param(1, (0.0, 300.0), marks=pytest.mark.slow)])
 def test_one_view_that_is_far_off_is_named_and_the_others_keep_their_priors(
     wrong: int, by: tuple[float, float]
 ) -> None:
@@ -463,9 +451,7 @@ def test_priors_that_are_too_narrow_are_widened_by_what_most_views_show(at_minim
     narrow = problem.camera_prior.sigma.copy()
     narrow[:, :6] /= 5.0
     known = determined(problem, minimum, problem.camera_prior.sigma)
-    v = Variances(
-        CameraPrior(problem.camera_prior.mean, narrow), problem.cameras.unknowns, True, False, False
-    )
+    v = Variances(CameraPrior(problem.camera_prior.mean, narrow), problem.cameras.unknowns, True, False, False)
     prior, tested = v.learnt(problem, minimum)
     total, freedom = (minimum.state.params[:, :6] / narrow[:, :6]) ** 2, known[:, :6]
     own = np.median(total.sum(axis=1) / freedom.sum(axis=1))
@@ -504,9 +490,7 @@ def test_a_small_block_learns_until_its_priors_stand(at_minimum) -> None:
     assert tested.freedom == pytest.approx(known[:, :6].sum(), rel=1e-3)
 
 
-def test_a_matrix_that_does_not_factorise_leaves_the_priors_as_they_are(
-    at_minimum, monkeypatch, caplog
-) -> None:
+def test_a_matrix_that_does_not_factorise_leaves_the_priors_as_they_are(at_minimum, monkeypatch, caplog) -> None:
     problem, minimum = at_minimum
 
     def fails(*_: Any) -> None:

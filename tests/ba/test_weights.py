@@ -48,9 +48,7 @@ def observations(noise_floor: float = 0.0, waves: Waves | None = None, num: int 
     point = np.tile(np.arange(num), 2)
     structure = make_structure(np.repeat([0, 1], num), point, 2, num)
     held = np.arange(TRACKS, num)
-    prior = PointPrior(
-        held, np.zeros((len(held), 3)), np.zeros((len(held), 3, 3)), np.zeros((len(held), 3, 0))
-    )
+    prior = PointPrior(held, np.zeros((len(held), 3)), np.zeros((len(held), 3, 3)), np.zeros((len(held), 3, 0)))
     unknowns = SimpleNamespace(unknowns=SimpleNamespace(waves=waves, half=np.full((2, 2), 500.0)))
     problem: Any = SimpleNamespace(structure=structure, cameras=unknowns, point_prior=prior)
     return Observations(problem, np.full(2 * num, 0.1), noise_floor, point < TRACKS, point >= KNOWN)
@@ -221,9 +219,7 @@ def test_far_off_is_farther_than_five_sigmas_of_the_noise(monkeypatch, sigmas, c
 
 
 @pytest.mark.parametrize(("ratio", "asked"), [(11.8, True), (12.2, False)])
-def test_what_is_smooth_is_asked_where_the_loss_is_no_wider_than_twelve_sigmas(
-    monkeypatch, ratio, asked
-) -> None:
+def test_what_is_smooth_is_asked_where_the_loss_is_no_wider_than_twelve_sigmas(monkeypatch, ratio, asked) -> None:
     _, smooth, *_ = robust(monkeypatch, [4.0 * ratio / 0.75, 4.0])
     assert smooth[:2] == [True, asked]
 

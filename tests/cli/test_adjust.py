@@ -82,9 +82,7 @@ def assert_refused(code, out, err, folder, *words, exit_code=1, kept=False):
     for word in words:
         assert word in err
     left = {path.name for path in folder.iterdir()} if folder.exists() else set()
-    assert not left or (
-        kept and left == {".barpc"}
-    )  # of a run that took long: what the next one need not do again
+    assert not left or (kept and left == {".barpc"})  # of a run that took long: what the next one need not do again
 
 
 def test_the_main_job_writes_what_other_tools_read(crops, tmp_path):
@@ -121,9 +119,7 @@ def test_check_shows_the_same_residuals_and_writes_nothing(crops, finished):
 def test_images_can_be_copied_or_left_out_and_formats_chosen(crops, finished, tmp_path):
     for name in "ab":
         shutil.copytree(finished[0] / ".barpc/cache", tmp_path / name / ".barpc/cache")
-    code, _, err = barpc(
-        "adjust", *crops, "-o", tmp_path / "a", "--images", "copy", "--rpc-format", "rpb,geom"
-    )
+    code, _, err = barpc("adjust", *crops, "-o", tmp_path / "a", "--images", "copy", "--rpc-format", "rpb,geom")
     assert code == 0, err
     names = {path.name for path in (tmp_path / "a").iterdir()}
     assert {"view_00.tif", "view_00.RPB", "view_00.geom"} <= names
@@ -168,9 +164,7 @@ def test_pixel_types_and_bands(tmp_path, kind):
 
 
 def test_one_image_alone(crops, tmp_path):
-    assert_refused(
-        *barpc("adjust", crops[0], "-o", tmp_path / "o"), tmp_path / "o", "view_00.tif", "at least 2"
-    )
+    assert_refused(*barpc("adjust", crops[0], "-o", tmp_path / "o"), tmp_path / "o", "view_00.tif", "at least 2")
 
 
 def test_no_image_at_all(tmp_path):
@@ -202,9 +196,7 @@ def test_images_that_do_not_overlap(crops, tmp_path):
     with rasterio.open(crops[1]) as image:
         pixels, camera = image.read(), image.rpcs
     camera.long_off += 1.0
-    with rasterio.open(
-        far, "w", driver="GTiff", width=SIDE, height=SIDE, count=1, dtype="uint16", rpcs=camera
-    ) as out:
+    with rasterio.open(far, "w", driver="GTiff", width=SIDE, height=SIDE, count=1, dtype="uint16", rpcs=camera) as out:
         out.write(pixels)
     result = barpc("adjust", crops[0], far, "-o", tmp_path / "o")
     assert_refused(*result, tmp_path / "o", "view_00", "far", "overlap")

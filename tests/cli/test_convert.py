@@ -306,9 +306,7 @@ def test_a_window_is_cut_and_told(image: Path, tmp_path: Path, capsys: pytest.Ca
     target = str(tmp_path / "w.tif")
     assert run("convert", str(image), target, *words) == 0
     assert capsys.readouterr().out == f"{target}: col 50, row 60, 100 x 80 px\n"
-    np.testing.assert_allclose(
-        read_rpc(target).image_offset, read_rpc(image).image_offset - [50, 60], atol=1e-9
-    )
+    np.testing.assert_allclose(read_rpc(target).image_offset, read_rpc(image).image_offset - [50, 60], atol=1e-9)
     assert run("convert", str(image), target, *words) == 1
     assert run("convert", str(image), target, *words, "--overwrite", "--json") == 0
     found = json.loads(capsys.readouterr().out.splitlines()[-1])

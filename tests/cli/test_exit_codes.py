@@ -50,9 +50,7 @@ def test_a_weak_view_ends_with_3(pristine, ties, tmp_path):  # noqa: F811
     few = [row for row in rows if not row.startswith("view_02")]
     few += [row for row in rows if row.startswith("view_02")][:20]
     (tmp_path / "few.csv").write_text("\n".join([head, *few]))
-    said = command(
-        "adjust", *pristine, "--matches", tmp_path / "few.csv", "--matches-only", "-o", tmp_path / "out"
-    )
+    said = command("adjust", *pristine, "--matches", tmp_path / "few.csv", "--matches-only", "-o", tmp_path / "out")
     assert_told(said, "1 needs a look", "view_02: weakly tied")
 
 
@@ -62,9 +60,7 @@ def test_doubtful_cameras_end_with_3_and_say_so_even_when_quiet(pristine):  # no
 
 def test_a_file_left_out_ends_with_3(pristine, tmp_path):  # noqa: F811
     (tmp_path / "bad.tif").write_bytes(b"nothing")
-    said = command(
-        "match", *pristine[:2], tmp_path / "bad.tif", "--keep-going", "-o", tmp_path / "out", "--json"
-    )
+    said = command("match", *pristine[:2], tmp_path / "bad.tif", "--keep-going", "-o", tmp_path / "out", "--json")
     assert_told(said, "bad.tif was left out")
     assert json.loads(said.out)["status"] == "bad"
 
@@ -115,14 +111,8 @@ def test_nothing_but_the_door_prints():
     for path in CLI.glob("*.py"):
         if path.name == "terminal.py":
             continue
-        calls = {
-            ast.unparse(node.func)
-            for node in ast.walk(ast.parse(path.read_text()))
-            if isinstance(node, ast.Call)
-        }
-        assert not calls & {"print", "click.echo", "click.secho", "sys.stdout.write", "sys.stderr.write"}, (
-            path
-        )
+        calls = {ast.unparse(node.func) for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)}
+        assert not calls & {"print", "click.echo", "click.secho", "sys.stdout.write", "sys.stderr.write"}, path
 
 
 @pytest.mark.parametrize("debug", [[], ["--debug"]])

@@ -186,9 +186,7 @@ def test_a_configuration_of_cars_is_read_and_written_back_as_it_came(kind, folde
     path = folder / f"inputs.{kind}"
     path.write_text(CARS if kind == "yaml" else json.dumps(given))
     config = read_config("cars", str(path))
-    assert config.images() == [
-        f"{folder}/images/img {n}.tif,camera={folder}/cams/rpc_{n}.RPB" for n in (1, 2)
-    ]
+    assert config.images() == [f"{folder}/images/img {n}.tif,camera={folder}/cams/rpc_{n}.RPB" for n in (1, 2)]
     (folder / "run").mkdir()
     (folder / "run" / "x.vrt").touch()
     views = [View(name, "", (60, 40), make_rpc(), (0.0, 1.0)) for name in ("x", "y")]
@@ -296,9 +294,7 @@ def bare(tmp_path_factory) -> Path:
     for path in part(folder / "with", SIDE).images:
         with open_raster(path) as image:
             pixels = image.read()
-        bare = write_image(
-            folder / path.name, shape=pixels.shape, transform=rasterio.Affine(1, 0, 0, 0, -1, 9)
-        )
+        bare = write_image(folder / path.name, shape=pixels.shape, transform=rasterio.Affine(1, 0, 0, 0, -1, 9))
         with rasterio.open(bare, "r+") as out:
             out.write(pixels)
         images.append({"img": path.name, "rpc": dictionary(read_rpc(path))})
@@ -320,9 +316,7 @@ def test_a_run_writes_the_corrected_configuration(bare, capsys):
         assert np.median(delivered) > 0.5
     assert len(found["images"]) == 3
     before = (out / "config.json").read_bytes()
-    assert (
-        run("-q", "adjust", "--from", "s2p", bare / "config.json", "-o", out) == 1
-    )  # the folder is not empty
+    assert run("-q", "adjust", "--from", "s2p", bare / "config.json", "-o", out) == 1  # the folder is not empty
     assert (out / "config.json").read_bytes() == before
     capsys.readouterr()
 
@@ -427,9 +421,7 @@ def test_an_error_of_a_file_that_a_configuration_names_keeps_its_words(folder):
     with pytest.raises(InputError) as error:
         listed("sat-bundleadjust", folder, {"geotiff_dir": "cams"})
     assert str(error.value).startswith(f"{folder / 'cams'}: a folder without images")
-    with pytest.raises(
-        InputError, match=r"config\.json: not a configuration of s2p \(KeyError\('images'\)\)"
-    ):
+    with pytest.raises(InputError, match=r"config\.json: not a configuration of s2p \(KeyError\('images'\)\)"):
         listed("s2p", folder, {})
     with pytest.raises(InputError, match="it lists no images"):
         listed("s2p", folder, {"images": []})
@@ -472,9 +464,7 @@ def test_a_configuration_is_at_most_forty_deep(depth, ok, folder):
             written_back(folder, data)
 
 
-@pytest.mark.parametrize(
-    ("end", "image"), [(".vrt", "v.vrt"), (".tif", "v.tif"), ("", "../../images/img 1.tif")]
-)
+@pytest.mark.parametrize(("end", "image"), [(".vrt", "v.vrt"), (".tif", "v.tif"), ("", "../../images/img 1.tif")])
 def test_cars_gets_the_image_that_the_run_wrote(end, image, folder):
     (folder / "a" / "run").mkdir(parents=True)
     if end:

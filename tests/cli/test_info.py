@@ -251,9 +251,7 @@ def test_outlines_name_their_images(pair: list[str], capsys: pytest.CaptureFixtu
     assert features[0]["geometry"] == describe(pair[0], 60.0)["footprint"]
 
 
-def test_the_page_has_an_image_s_name_and_its_lines_behind(
-    pair: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_page_has_an_image_s_name_and_its_lines_behind(pair: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run("info", *pair, "--alt", "60") == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line for line in lines if not line.startswith("  ")] == pair
@@ -289,9 +287,7 @@ def doctor(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return {"checks": checks, "missing": missing}
 
 
-def test_a_sound_installation_is_told_line_by_line(
-    doctor: dict[str, Any], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_sound_installation_is_told_line_by_line(doctor: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
     assert run("info", "--doctor") == 0
     said = capsys.readouterr()
     name, python, numpy, jinja, check = said.out.splitlines()

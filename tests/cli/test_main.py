@@ -93,9 +93,7 @@ def test_other_words_are_left_to_click(words: list[str]) -> None:
         ("info -vvv", "info -vvv", (0, False, False)),
     ],
 )
-def test_flags_of_every_verb_are_taken_out_of_its_words(
-    words: str, rest: str, params: tuple[int, bool, bool]
-) -> None:
+def test_flags_of_every_verb_are_taken_out_of_its_words(words: str, rest: str, params: tuple[int, bool, bool]) -> None:
     context = click.Context(cli, **cli.context_settings)
     context.params = {"verbose": 0, "quiet": False, "debug": False}
     assert isinstance(cli, Verbs)
@@ -177,9 +175,7 @@ def verb(monkeypatch: pytest.MonkeyPatch) -> Callable[[object], None]:
 
 
 @pytest.mark.parametrize(("value", "code"), [(0, 0), (3, 3), (None, 0), ("text", 0)])
-def test_what_a_verb_returns_is_the_exit_code(
-    value: object, code: int, verb: Callable[[object], None]
-) -> None:
+def test_what_a_verb_returns_is_the_exit_code(value: object, code: int, verb: Callable[[object], None]) -> None:
     verb(value)
     assert run("info") == code
 

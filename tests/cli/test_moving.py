@@ -41,9 +41,7 @@ def _similarity(at, scale):
     return matrix
 
 
-def test_the_cameras_show_points_after_a_move_where_they_showed_them_before(
-    image: Path, tmp_path: Path, capsys
-):
+def test_the_cameras_show_points_after_a_move_where_they_showed_them_before(image: Path, tmp_path: Path, capsys):
     before = open_camera(image)
     ground, xy = _seen(before)
     assert run("convert", str(image), "-o", str(tmp_path / "out"), "--move", "-30,40,90") == 0
@@ -52,9 +50,7 @@ def test_the_cameras_show_points_after_a_move_where_they_showed_them_before(
     at = ground_from_ecef(ecef_from_ground(ground).mean(axis=0))
     moved = ground_from_ecef(ecef_from_ground(ground) + enu_basis(at).T @ [-30.0, 40.0, 90.0])
     np.testing.assert_allclose((moved - ground)[:, 2], 90.0, atol=0.1)
-    np.testing.assert_allclose(
-        after.model.project(moved), xy, rtol=0, atol=2e-3
-    )  # the middle is the image's own
+    np.testing.assert_allclose(after.model.project(moved), xy, rtol=0, atol=2e-3)  # the middle is the image's own
     assert np.abs(after.model.project(ground) - xy).min() > 1.0
     assert after.alt_range[0] == pytest.approx(before.alt_range[0] + 90, abs=60)
     assert "-30.000 m east, +40.000 m north, +90.000 m up" in capsys.readouterr().err
@@ -156,9 +152,7 @@ def test_a_matrix_that_leaves_the_earth_writes_nothing(image: Path, tmp_path: Pa
         1.01 * np.eye(3),
     ):  # as of map coordinates in feet, or of a local frame
         np.savetxt(tmp_path / "t.txt", matrix)
-        assert (
-            run("convert", str(image), "-o", str(tmp_path / "o"), "--transform", str(tmp_path / "t.txt")) == 1
-        )
+        assert run("convert", str(image), "-o", str(tmp_path / "o"), "--transform", str(tmp_path / "t.txt")) == 1
         assert "a matrix of other coordinates than ECEF?" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
 

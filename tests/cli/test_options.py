@@ -210,9 +210,7 @@ def test_the_help_of_a_run_has_the_usual_flags_and_says_where_the_rest_is() -> N
     whole = [flag for flags in listed_in_help("adjust", "--help-all").values() for flag in flags]
     known = {flag for one in adjust.params for flag in one.opts if flag.startswith("--")}
     assert set(whole) == known | {"--help"}
-    assert {"--against", "--rpc"} <= {
-        flag for flags in listed_in_help("check", "--help").values() for flag in flags
-    }
+    assert {"--against", "--rpc"} <= {flag for flags in listed_in_help("check", "--help").values() for flag in flags}
 
 
 def test_the_whole_help_of_a_run_has_its_flags_under_what_they_are_about() -> None:

@@ -21,9 +21,7 @@ from tests.rpcio.conftest import make_rpc
 XYZ = ("lon", "lat", "alt")
 
 
-def table(
-    tmp_path: Path, text: str, fill: float | None = None, names: tuple[str, ...] = XYZ
-) -> list[list[float]]:
+def table(tmp_path: Path, text: str, fill: float | None = None, names: tuple[str, ...] = XYZ) -> list[list[float]]:
     (tmp_path / "t.csv").write_text(text)
     return given_points((), str(tmp_path / "t.csv"), names, fill).tolist()
 
@@ -95,9 +93,7 @@ def test_a_table_has_a_header_or_its_columns_in_order(
         ("lon,lat,alt\n1,2,\n", 7.0, "point 1: '' is no number"),
     ],
 )
-def test_a_table_that_lacks_something_says_what(
-    text: str, fill: float | None, told: str, tmp_path: Path
-) -> None:
+def test_a_table_that_lacks_something_says_what(text: str, fill: float | None, told: str, tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
         table(tmp_path, text, fill)
     assert str(error.value) == f"{tmp_path / 't.csv'}: {told}"
@@ -179,9 +175,7 @@ def test_a_dem_tells_the_altitudes_of_projected_points(
     rpc_file: tuple[Path, RPC], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, rpc = rpc_file
-    monkeypatch.setattr(
-        module, "opened_dem", lambda dem, geoid: lambda lon, lat: 100.0 + 10 * (lon - 5) - (lat - 43)
-    )
+    monkeypatch.setattr(module, "opened_dem", lambda dem, geoid: lambda lon, lat: 100.0 + 10 * (lon - 5) - (lat - 43))
     assert run("project", str(file), "5.4", "43.2", "--dem", "d.tif") == 0
     np.testing.assert_allclose(rows(capsys.readouterr().out)[0], rpc.project([5.4, 43.2, 103.8]), atol=6e-7)
 

@@ -135,9 +135,7 @@ def test_who_looks_sees_bars_and_a_log_gets_lines(
 ) -> None:
     monkeypatch.setattr(sys, "stderr", Window() if seen else io.StringIO())
     threads = list[SimpleNamespace]()
-    monkeypatch.setattr(
-        threading, "Thread", lambda **given: threads.append(SimpleNamespace(**given)) or Started()
-    )
+    monkeypatch.setattr(threading, "Thread", lambda **given: threads.append(SimpleNamespace(**given)) or Started())
     with progress_told(quiet, verbose) as told:
         assert isinstance(told, Lines) == (kind in ("lines", "groups"))
         for done in range(1, 11):
@@ -215,9 +213,7 @@ def test_several_processes_are_spawned_and_waited_for(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
-def test_after_an_error_nobody_waits_for_workers(
-    error: type[BaseException], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_after_an_error_nobody_waits_for_workers(error: type[BaseException], monkeypatch: pytest.MonkeyPatch) -> None:
     killed = list[int]()
     workers = [SimpleNamespace(kill=lambda n=n: killed.append(n)) for n in range(2)]
     monkeypatch.setattr(module, "ProcessPoolExecutor", Pool)

@@ -190,9 +190,7 @@ def test_what_is_empty_is_not_shown_and_lines_end_at_the_terminal_s_width(
     status: str, colour: str, spoken: list[tuple[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(terminal, "output_width", lambda: 12)
-    print_summary(
-        a_summary([], status=status, headline="All of it well.", verdict=("five tie-points of a view",))
-    )
+    print_summary(a_summary([], status=status, headline="All of it well.", verdict=("five tie-points of a view",)))
     assert spoken == [
         ("All of it well.", {"err": False, "bold": True, "fg": colour}),
         ("five\ntie-points\nof a view", {"err": False}),
@@ -211,9 +209,7 @@ COMPARISON: dict[str, Any] = {
 }  # fmt: skip
 
 
-def test_two_runs_stand_side_by_side(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_runs_stand_side_by_side(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(terminal, "output_width", lambda: None)
     print_comparison(COMPARISON)
     assert capsys.readouterr().out.split("\n") == [

@@ -50,9 +50,7 @@ def dem(tmp_path: Path) -> Path:
 def finished(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "run"
     found = run_of_block(3, 200, size=(900, 700))
-    written(
-        replace(found, views=tuple(replace(v, path=f"/images/{v.name}.tif") for v in found.views)), folder
-    )
+    written(replace(found, views=tuple(replace(v, path=f"/images/{v.name}.tif") for v in found.views)), folder)
     return folder
 
 

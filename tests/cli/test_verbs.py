@@ -56,9 +56,7 @@ def test_project_and_localize_are_each_other_s_inverse(image, capsys):
     np.testing.assert_allclose([float(v) for v in line.split(",")], expected, atol=1e-6)
     assert run("localize", image, *line.split(","), "--alt", "200", "--json") == 0
     (point,) = json.loads(capsys.readouterr().out)
-    np.testing.assert_allclose(
-        [point["lon"], point["lat"], point["alt"]], [float(v) for v in POINT], atol=1e-8
-    )
+    np.testing.assert_allclose([point["lon"], point["lat"], point["alt"]], [float(v) for v in POINT], atol=1e-8)
 
 
 def test_negative_numbers_are_numbers(image, capsys):
@@ -325,9 +323,7 @@ def test_convert_can_be_told_the_pixel_convention(tmp_path, capsys):
 def test_convert_cuts_by_window_and_by_box(image, tmp_path, capsys):
     assert run("convert", image, tmp_path / "w.tif", "--window", 50, 60, 100, 80) == 0
     rpc = read_rpc(image)
-    np.testing.assert_allclose(
-        read_rpc(tmp_path / "w.tif").image_offset, rpc.image_offset - [50, 60], atol=1e-9
-    )
+    np.testing.assert_allclose(read_rpc(tmp_path / "w.tif").image_offset, rpc.image_offset - [50, 60], atol=1e-9)
     corners = rpc.localize([[100.0, 100.0], [200.0, 150.0]], [200.0, 200.0])
     west, east = sorted(corners[:, 0])
     south, north = sorted(corners[:, 1])
@@ -386,9 +382,7 @@ def test_convert_names_what_hides_the_rpc_beside_the_input_and_in_the_new_folder
     write_rpc(rpc.crop(5, 5), image.with_suffix(".RPB"))
     write_rpc(rpc.crop(5, 5), tmp_path / "out" / "scene.RPB")
     write_rpc(rpc, tmp_path / "new.geom")
-    assert (
-        run("convert", image, "--rpc", tmp_path / "new.geom", "-o", tmp_path / "out", "--images", "copy") == 3
-    )
+    assert run("convert", image, "--rpc", tmp_path / "new.geom", "-o", tmp_path / "out", "--images", "copy") == 3
     error = capsys.readouterr().err
     assert "scene.RPB hides an RPC put into the image" in error
     assert f"{tmp_path / 'out' / 'scene.RPB'} hides the RPC of" in error
@@ -416,10 +410,7 @@ def test_convert_refuses_the_images_own_folder_and_missing_rpcs(image, tmp_path,
     (tmp_path / "empty").mkdir()
     assert run("convert", image, "--rpc", tmp_path / "empty", "-o", tmp_path / "out") == 1
     assert "no RPC of scene.tif there" in capsys.readouterr().err
-    assert (
-        run("convert", image, "--rpc", tmp_path / "a.geom", "-o", tmp_path / "out", "--rpc-format", "doc")
-        == 2
-    )
+    assert run("convert", image, "--rpc", tmp_path / "a.geom", "-o", tmp_path / "out", "--rpc-format", "doc") == 2
     assert not (tmp_path / "out").exists()
 
 

@@ -109,9 +109,7 @@ def test_a_fit_measures_writes_and_is_quiet_when_told(
     assert run("fit", source, "-o", str(tmp_path / "a.RPB"), "--overwrite") == 1
 
 
-def test_a_miss_writes_nothing_unless_told_to(
-    source: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_miss_writes_nothing_unless_told_to(source: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "b.geom"
     words = ("fit", source, "-o", str(out), "--tolerance", "1e-15")
     assert run(*words) == 3
@@ -164,9 +162,7 @@ def test_all_ground_on_earth_is_tried_first_where_a_camera_asks_for_it(
         asked.append((alts, options.grid))
         return a_fit(verdict=lambda tolerance: wide if alts == (-500.0, 9000.0) else "")
 
-    camera = SimpleNamespace(
-        model=SimpleNamespace(all_ground=(-500.0, 9000.0)), extent=(5, 5), alt_range=(1.0, 200.5)
-    )
+    camera = SimpleNamespace(model=SimpleNamespace(all_ground=(-500.0, 9000.0)), extent=(5, 5), alt_range=(1.0, 200.5))
     monkeypatch.setattr(fit, "fit_rpc", fit_rpc)
     monkeypatch.setattr(cameras, "open_camera", lambda _: camera)
     assert run("fit", source) == 0
@@ -309,9 +305,7 @@ def test_a_configuration_is_written_where_every_image_has_a_new_rpc(
         return SimpleNamespace(views=[1] * views, run=found, summary={}, record=a_summary([]), passed=True)
 
     monkeypatch.setattr(adjusting, "_result", result)
-    monkeypatch.setattr(
-        adjusting, "corrected", lambda config, folder, views: f"{config.tool} {folder.name} {views}"
-    )
+    monkeypatch.setattr(adjusting, "corrected", lambda config, folder, views: f"{config.tool} {folder.name} {views}")
     out = tmp_path / "out"
     words = ("adjust", "--from", tool, str(tmp_path / "c.json"), "-o", str(out))
     assert run(*words) == 0
@@ -341,9 +335,7 @@ def test_an_export_names_its_files_and_says_where_images_stay(
     if vrt:
         (tmp_path / "a.vrt").touch()
     asked = list[Any]()
-    monkeypatch.setattr(
-        "barpc.export.export_run", lambda *a, **k: asked.append((a, k)) or [Path("x"), Path("y")]
-    )
+    monkeypatch.setattr("barpc.export.export_run", lambda *a, **k: asked.append((a, k)) or [Path("x"), Path("y")])
     words = ("export", str(tmp_path), "out", "--to", target)
     assert run(*words) == 0
     said = capsys.readouterr()

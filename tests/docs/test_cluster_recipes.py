@@ -37,9 +37,7 @@ def test_the_job_script_is_a_script_and_its_commands_parse(tmp_path):
 
 def here(tmp_path: Path, run: str) -> str:
     """The job script on folders of this test, and on the loopback interface."""
-    script = block("slurm").replace(
-        "/shared/adjusted", f"{tmp_path}/{run} --images none --options {tmp_path}/o.toml"
-    )
+    script = block("slurm").replace("/shared/adjusted", f"{tmp_path}/{run} --images none --options {tmp_path}/o.toml")
     for program in ("scheduler", "worker"):
         script = script.replace(f"dask_{program}", f"dask_{program} --interface lo")
     return script.replace("/shared", str(tmp_path)).replace("images.txt", f"{tmp_path}/images.txt")
@@ -73,9 +71,7 @@ def test_slurm_runs_the_job_script_and_gives_the_same_bytes(tmp_path):
     (tmp_path / "images.txt").write_text("".join(f"{image}\n" for image in images))
     (tmp_path / "o.toml").write_text("[tie]\nkeypoints_per_image = 3000\n")
     assert sbatch(here(tmp_path, "run"), tmp_path) == 0, (tmp_path / "job.log").read_text()
-    barpc.adjust(
-        images, tmp_path / "alone", RunOptions(images="none", tie=TieOptions(keypoints_per_image=3000))
-    )
+    barpc.adjust(images, tmp_path / "alone", RunOptions(images="none", tie=TieOptions(keypoints_per_image=3000)))
     for name in ("tables/observations.csv", "tables/block.npz", "view_01_RPC.TXT"):
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes(), name
 
@@ -113,9 +109,7 @@ def test_the_job_script_of_dask_jobqueue_asks_for_what_the_page_says():
 @pytest.mark.parametrize("command", ["scheduler", "worker"])
 def test_the_programs_of_the_job_script_know_their_flags(command):
     module = pytest.importorskip(f"distributed.cli.dask_{command}")
-    known = {
-        option for parameter in module.main.params for option in (*parameter.opts, *parameter.secondary_opts)
-    }
+    known = {option for parameter in module.main.params for option in (*parameter.opts, *parameter.secondary_opts)}
     lines = [line for line in block("slurm").splitlines() if f"dask_{command}" in line]
     used = set(re.findall(r"(?<= )--[a-z-]+", " ".join(lines))) - {"--exact"}
     assert len(used) >= 2

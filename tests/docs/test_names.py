@@ -36,9 +36,7 @@ def inline(page: Path) -> list[str]:
 def flags() -> set[str]:
     """Flags of all verbs."""
     verbs = [cli.get_command(click.Context(cli), verb) for verb in COMMANDS]
-    return GENERAL | {
-        name for verb in verbs if verb for p in verb.params for name in (*p.opts, *p.secondary_opts)
-    }
+    return GENERAL | {name for verb in verbs if verb for p in verb.params for name in (*p.opts, *p.secondary_opts)}
 
 
 @cache
@@ -149,11 +147,7 @@ def value(name: str) -> bool:
 def test_every_value_of_the_summary_that_a_page_names_exists(page):
     if "truth.json" in page.read_text(encoding="utf-8"):
         return  # has views of its own
-    said = [
-        code
-        for code in inline(page)
-        if re.fullmatch(r"(views\[\]|pairs\[\]|gcps\[\]|scene)\.[\w.\[\]]+", code)
-    ]
+    said = [code for code in inline(page) if re.fullmatch(r"(views\[\]|pairs\[\]|gcps\[\]|scene)\.[\w.\[\]]+", code)]
     assert [name for name in said if not value(name)] == []
 
 

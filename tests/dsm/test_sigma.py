@@ -64,8 +64,7 @@ def test_what_is_shared_by_both_cameras_moves_all_heights_alike(views):
     """Of cameras that can only be moved together, the height has that motion's sigma and no more."""
     direction = np.tile(np.r_[np.zeros(3), ecef_up()], 3)  # all translated upwards
     information = (
-        1e12 * (np.eye(18) - np.outer(direction, direction) / 3.0)
-        + np.outer(direction, direction) / 9.0 / 4.0
+        1e12 * (np.eye(18) - np.outer(direction, direction) / 3.0) + np.outer(direction, direction) / 9.0 / 4.0
     )
     errors = CameraErrors.of(prior_of(views, information), views)
     rows = errors.rows((0, 1), np.array([[5.4, 43.3, 230.0], [5.4005, 43.3004, 250.0]]))
@@ -89,8 +88,7 @@ def test_rows_of_the_frame_are_epipolar_lines_and_disparity_tells_height(views):
     assert frame.across < 0.02
     other = np.array([[5.40021, 43.29991, 260.0], [5.39972, 43.30022, 215.0]])
     first, second = (
-        view.sensor.project(other) @ one[:, :2].T + one[:, 2]
-        for view, one in zip(views, frame.maps, strict=False)
+        view.sensor.project(other) @ one[:, :2].T + one[:, 2] for view, one in zip(views, frame.maps, strict=False)
     )
     assert np.abs(first[:, 1] - second[:, 1]).max() < 0.02
     disparity = first[:, 0] - second[:, 0]
@@ -122,9 +120,7 @@ def test_what_resampling_leaves_of_noise_is_what_sigma_takes_for_it():
         along = FINER * np.array([np.cos(turn), np.sin(turn)])
         to_frame = np.array([[*along, 500.3], [-along[1] / FINER, along[0] / FINER, 350.2]])
         moved = cv2.warpAffine(noise, to_frame, (1000, 700), flags=cv2.INTER_CUBIC)
-        inside = (
-            cv2.erode(cv2.warpAffine(np.ones_like(noise), to_frame, (1000, 700)), np.ones((9, 9))) > 0.999
-        )
+        inside = cv2.erode(cv2.warpAffine(np.ones_like(noise), to_frame, (1000, 700)), np.ones((9, 9))) > 0.999
         found.append([moved[inside].var(), _slope(moved)[inside].var()])
     np.testing.assert_allclose(np.mean(found, axis=0), [_LEFT, _SLOPE], rtol=0.03)
 

@@ -118,9 +118,7 @@ def test_a_start_has_the_derivative_that_was_seen(sign, times, shear, mirrored):
 
 def test_a_fit_starts_on_both_sides_at_up_to_three_times_the_distance(monkeypatch):
     given, start = [], approx._start
-    monkeypatch.setattr(
-        approx, "_start", lambda sign, *rest: given.append((sign, rest[-1])) or start(sign, *rest)
-    )
+    monkeypatch.setattr(approx, "_start", lambda sign, *rest: given.append((sign, rest[-1])) or start(sign, *rest))
     points = world()
     fit_pinhole(Sampled(points, TRUE.project(points)), **{**view_of(TRUE, points[0]), "far": 6000.0})
     assert given == [(sign, far) for far in (6000.0, 12000.0, 18000.0) for sign in (1.0, -1.0)]
@@ -153,9 +151,7 @@ def test_a_refinement_ends_where_the_squares_are_least():
 def test_of_the_refinements_the_one_with_the_smallest_largest_error_is_taken(monkeypatch):
     points = world()
     errors = iter([5.0, 3.0, 1.0, 2.0, 4.0, 6.0])
-    monkeypatch.setattr(
-        approx, "_refined", lambda *_: replace(TRUE, center=TRUE.center + [next(errors), 0.0])
-    )
+    monkeypatch.setattr(approx, "_refined", lambda *_: replace(TRUE, center=TRUE.center + [next(errors), 0.0]))
     found = fit_pinhole(Sampled(points, TRUE.project(points)), **view_of(TRUE, points[0]))
     assert found.center[0] == TRUE.center[0] + 1.0
 

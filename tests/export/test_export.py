@@ -55,9 +55,7 @@ def seen_by(frame: dict, world: np.ndarray) -> np.ndarray:
     """Pixels, from the corner of the first, as a reader of nerfstudio's files projects points of its world."""
     pose = np.linalg.inv(np.array(frame["transform_matrix"]))
     right, up, back = (np.column_stack([world, np.ones(len(world))]) @ pose.T)[:, :3].T
-    return np.column_stack(
-        [frame["fl_x"] * right / -back + frame["cx"], frame["fl_y"] * -up / -back + frame["cy"]]
-    )
+    return np.column_stack([frame["fl_x"] * right / -back + frame["cx"], frame["fl_y"] * -up / -back + frame["cy"]])
 
 
 @pytest.mark.slow
@@ -302,9 +300,7 @@ def test_stac_items_are_valid_without_a_date_and_across_the_date_line(run_dir, t
         item = pystac.Item.from_dict(content)
         from pystac.validation.stac_validator import JsonSchemaSTACValidator
 
-        validator = (
-            JsonSchemaSTACValidator()
-        )  # the core's schemas come with it; those of extensions lie on the net
+        validator = JsonSchemaSTACValidator()  # the core's schemas come with it; those of extensions lie on the net
         validator.validate_core(content, pystac.STACObjectType.ITEM, "1.1.0", href=None)
         assert item.properties["proj:shape"] == [700, 900]
         west, south, east, north = item.bbox
@@ -322,9 +318,7 @@ def test_stac_items_are_valid_without_a_date_and_across_the_date_line(run_dir, t
     assert (east - west) % turn < 1.0
     for item in items:
         assert south <= item.bbox[1] < item.bbox[3] <= north
-        assert (
-            0.0 <= (item.bbox[0] - west) % turn <= (item.bbox[2] - west) % turn <= (east - west) % turn + 1e-9
-        )
+        assert 0.0 <= (item.bbox[0] - west) % turn <= (item.bbox[2] - west) % turn <= (east - west) % turn + 1e-9
     assert read(out / f"{views[0]['name']}.json")["properties"]["datetime"] == "2013-04-17T10:32:15.5Z"
     assert read(out / f"{views[1]['name']}.json")["properties"]["datetime"] is None
 
@@ -336,9 +330,7 @@ def test_altitudes_may_be_given(southern, tmp_path):
         export_run(southern, "nerfstudio", tmp_path / "x", alt_range=(5.0, 5.0))
 
 
-@pytest.mark.parametrize(
-    "target", rest_slow(sorted(TARGETS, key=["s2p", "asp"].__contains__, reverse=True), 2)
-)
+@pytest.mark.parametrize("target", rest_slow(sorted(TARGETS, key=["s2p", "asp"].__contains__, reverse=True), 2))
 def test_nothing_is_replaced_that_is_not_an_earlier_export(target, southern, tmp_path):
     southern = in_one_folder(southern, tmp_path)
     out = exported(southern, target, tmp_path)

@@ -68,8 +68,7 @@ def test_altitudes_reach_a_margin_beyond_all_but_half_a_per_cent(south):
     assert south.alt_range == (np.floor(low - margin), np.ceil(high + margin))
     assert scene._altitudes(np.array([100.0, 100.0]), south.summary) == (80.0, 120.0)
     wide = tuple(
-        replace(view, alt_range_m=(10.0 * k - 50, 10.0 * k + 500))
-        for k, view in enumerate(south.summary.views)
+        replace(view, alt_range_m=(10.0 * k - 50, 10.0 * k + 500)) for k, view in enumerate(south.summary.views)
     )
     assert scene._altitudes(np.zeros(0), replace(south.summary, views=wide)) == (-50.0, 520.0)
 
@@ -309,13 +308,9 @@ def test_a_camera_that_no_pinhole_comes_near_is_refused(south, monkeypatch):
 @pytest.fixture(scope="module")
 def model(south) -> tuple[Scene, dict[str, list[str]], dict[str, Any]]:
     """COLMAP's texts of the scene, its lines by file."""
-    of = replace(
-        south, shots=tuple(replace(shot, file=f"/images/{k}.tif") for k, shot in enumerate(south.shots))
-    )
+    of = replace(south, shots=tuple(replace(shot, file=f"/images/{k}.tif") for k, shot in enumerate(south.shots)))
     files = neural.colmap(of, OUT)
-    assert set(files) == {f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D")} | {
-        "world.json"
-    }
+    assert set(files) == {f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D")} | {"world.json"}
     files = {name.removeprefix("sparse/0/"): data for name, data in files.items()}
     return (
         of,
@@ -432,9 +427,7 @@ def test_a_stac_item_says_where_when_and_how(south, southern):
     ]
     assert item["stac_extensions"][0] == "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
     ring = np.array(item["geometry"]["coordinates"][0])
-    assert item["bbox"] == pytest.approx(
-        [ring[:, 0].min(), ring[:, 1].min(), ring[:, 0].max(), ring[:, 1].max()]
-    )
+    assert item["bbox"] == pytest.approx([ring[:, 0].min(), ring[:, 1].min(), ring[:, 0].max(), ring[:, 1].max()])
     found, view = item["properties"], south.shots[0].entry
     assert (found["datetime"], found["proj:shape"], found["proj:code"]) == (
         "2013-04-17T10:32:15.5Z",
@@ -464,13 +457,8 @@ def test_a_stac_item_of_an_unknown_time_or_day(south, dateline):
     assert "view:sun_azimuth" not in unknown
     day = with_shot(south, light=Light(None, None, "2020-01-02"))
     name = south.shots[0].name
-    assert (
-        json.loads(catalogue.stac(day, OUT)[f"{name}.json"])["properties"]["datetime"]
-        == "2020-01-02T00:00:00Z"
-    )
-    west, south_lat, east, north = json.loads(
-        catalogue.stac(dateline, OUT)[f"{dateline.shots[0].name}.json"]
-    )["bbox"]
+    assert json.loads(catalogue.stac(day, OUT)[f"{name}.json"])["properties"]["datetime"] == "2020-01-02T00:00:00Z"
+    west, south_lat, east, north = json.loads(catalogue.stac(dateline, OUT)[f"{dateline.shots[0].name}.json"])["bbox"]
     assert 179 < west < 180
     assert -180 < east < -179
     assert south_lat < -16.8 < north
@@ -501,9 +489,7 @@ def test_a_point_s_covariance_is_the_inverse_of_what_its_rays_tell(south):
         for shot in south.shots:
             if point in shot.index:
                 at = ecef_from_ground(ground)
-                moved = [
-                    ground_from_ecef(at + sign * steps @ enu_basis(south.origin)) for sign in (1.0, -1.0)
-                ]
+                moved = [ground_from_ecef(at + sign * steps @ enu_basis(south.origin)) for sign in (1.0, -1.0)]
                 rows = (shot.rpc.project(moved[0]) - shot.rpc.project(moved[1])).T
                 normal += rows.T @ rows
         assert found[point] == pytest.approx(south.noise**2 * np.linalg.inv(normal), rel=1e-3, abs=1e-9)
@@ -543,8 +529,7 @@ def test_points_are_written_with_their_covariance(south):
     assert lines[2] == f"comment {comment[2:]}"
     lon, lat, alt = south.origin
     assert (
-        lines[3]
-        == f"comment x east, y north, z up [m] of lon {lon:.9f} lat {lat:.9f} alt {alt:.4f} (WGS84, ellipsoid)"
+        lines[3] == f"comment x east, y north, z up [m] of lon {lon:.9f} lat {lat:.9f} alt {alt:.4f} (WGS84, ellipsoid)"
     )
     assert lines[4] == f"element vertex {len(south.points)}"
     assert [line.split()[1:] for line in lines[5:]] == [

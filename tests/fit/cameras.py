@@ -55,9 +55,7 @@ def synthetic(seed: int = 0, lon: float = 5.4) -> Camera:
 
 def vendor(shared_data: Path) -> list[Camera]:
     """Every optical RPC file that is read, over its full image and altitude range."""
-    files = [
-        p for folder in ("optical", "rpc_formats", "physical") for p in (shared_data / folder).rglob("*")
-    ]
+    files = [p for folder in ("optical", "rpc_formats", "physical") for p in (shared_data / folder).rglob("*")]
     cameras = []
     for path in sorted(files):
         try:

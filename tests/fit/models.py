@@ -84,9 +84,7 @@ def whiskbroom(half_angle: float, size: tuple[int, int] = (2000, 2000)):
     return replace(plain, look=np.stack([0.0 * series, -series * scale]))
 
 
-def bump(
-    size: tuple[int, int], width: float, height: float, at: tuple[float, float]
-) -> Callable[[Array], Array]:
+def bump(size: tuple[int, int], width: float, height: float, at: tuple[float, float]) -> Callable[[Array], Array]:
     """A Gaussian bump of the columns: `width` (one sigma) and height in px, `at` as parts of the image."""
     middle = np.array(size) * at
 

@@ -39,9 +39,7 @@ def fitted(name: str) -> RpcFit:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [*rest_slow(EASY, keep=2), *rest_slow(HARD, keep=0, mark=pytest.mark.nightly)]
-)
+@pytest.mark.parametrize("name", [*rest_slow(EASY, keep=2), *rest_slow(HARD, keep=0, mark=pytest.mark.nightly)])
 def test_the_largest_error_certified_is_that_of_a_hundred_thousand_points(name):
     fit = fitted(name)
     ground, image = truth(name)
@@ -90,8 +88,7 @@ def test_one_bad_node_of_a_grid_of_positions_is_seen():
 
     def moves(image):
         hats = [
-            np.maximum(1 - np.abs(image[..., i] - knots[k]) / (knots[1] - knots[0]), 0)
-            for i, k in ((0, 7), (1, 17))
+            np.maximum(1 - np.abs(image[..., i] - knots[k]) / (knots[1] - knots[0]), 0) for i, k in ((0, 7), (1, 17))
         ]
         return np.stack([0.0 * hats[0], 2.0 * hats[0] * hats[1]], axis=-1)
 
@@ -202,9 +199,7 @@ class Holed:
 def test_what_is_missing_is_stated_by_area_and_five_percent_are_fitted():
     camera = synthetic()
     rows = camera.size[1]
-    with pytest.warns(
-        BarpcWarning, match=r"^(4\.[6-9]|5\.[0-4])% of the image has no ground point and is left out"
-    ):
+    with pytest.warns(BarpcWarning, match=r"^(4\.[6-9]|5\.[0-4])% of the image has no ground point and is left out"):
         fit = fit_rpc(Holed(camera.model, -1.0, 0.05 * rows), camera.size, camera.alt_range)
     assert fit.max_ckp.max() < 1e-6
     assert 0.93 * CELLS**2 < fit.num_ckp < 0.97 * CELLS**2
@@ -260,6 +255,4 @@ def test_what_was_seen_once_is_seen_again() -> None:
     errors, largest = sample.also(there).sought(off)
     np.testing.assert_allclose(largest, [0.09, 1e-6])
     np.testing.assert_allclose(errors.worst[0], there[0], atol=1e-9)
-    np.testing.assert_allclose(
-        errors.rmse, 1e-6
-    )  # of the points all over the image: the new one is none of them
+    np.testing.assert_allclose(errors.rmse, 1e-6)  # of the points all over the image: the new one is none of them

@@ -56,9 +56,7 @@ def test_every_image_point_of_every_camera_has_its_ground_point(vendors: list[Ca
     rng = np.random.default_rng(0)
     for camera in vendors:
         image = rng.uniform(0, 1, (2000, 2)) * camera.size - 0.5
-        assert np.isfinite(camera.model.localize(image, rng.uniform(*camera.alt_range, 2000))).all(), (
-            camera.name
-        )
+        assert np.isfinite(camera.model.localize(image, rng.uniform(*camera.alt_range, 2000))).all(), camera.name
 
 
 def test_the_certificate_holds_on_points_that_neither_grid_contains(camera: Camera) -> None:

@@ -64,9 +64,7 @@ def test_rpcm_localises_with_what_is_written(camera: Camera, tmp_path: Path) -> 
         assert np.abs(np.column_stack([lon, lat]) - ours[:, :2]).max() < 1e-12
 
 
-def test_files_that_hold_it_give_it_back_to_the_bit_and_others_leave_it_out(
-    camera: Camera, tmp_path: Path
-) -> None:
+def test_files_that_hold_it_give_it_back_to_the_bit_and_others_leave_it_out(camera: Camera, tmp_path: Path) -> None:
     rpc = fit_rpc(camera.model, camera.size, camera.alt_range, options=BOTH).rpc
     for name, kept in (
         ("a_RPC.TXT", True),
@@ -98,9 +96,7 @@ def test_a_crop_and_a_coarser_image_keep_it(camera: Camera) -> None:
 def test_one_that_misses_is_refused(frame: RpcFit) -> None:
     tolerance = 0.5 * (frame.max_ckp.max() + frame.localisation.max_px)
     assert frame.max_ckp.max() < tolerance < frame.localisation.max_px
-    with pytest.raises(
-        FitError, match=r"^the localisation RPC misses the ground by up to .* m \(0\.0.* px\)"
-    ):
+    with pytest.raises(FitError, match=r"^the localisation RPC misses the ground by up to .* m \(0\.0.* px\)"):
         fit_rpc(*hard()[FRAME], options=FitOptions(localisation=True, tolerance=tolerance))
 
 
@@ -115,9 +111,7 @@ def test_given_points_have_one_too_across_the_antimeridian_and_with_noise(lon: f
     checked = fit_rpc_points(ground, noisy, options=options, check=(ground, image))
     gsd = 0.8  # of 10,000 px in 0.12 and 0.09 degrees, about
     assert 0.2 * gsd < left_out.localisation.rmse_m < 0.4 * gsd
-    assert (
-        checked.localisation.rmse_m < 0.3 * left_out.localisation.rmse_m
-    )  # the truth is nearer than the noise
+    assert checked.localisation.rmse_m < 0.3 * left_out.localisation.rmse_m  # the truth is nearer than the noise
     fresh, at = random_points(camera, 500, rng)
     found = left_out.rpc.localize_direct(at, fresh[:, 2])
     assert np.linalg.norm(ecef_from_ground(found) - ecef_from_ground(fresh), axis=1).max() < 0.5

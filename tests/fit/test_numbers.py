@@ -75,9 +75,7 @@ def test_points_of_one_value_determine_no_image(column: int, name: str, value: f
 
 @pytest.mark.parametrize(("spread", "ok"), [(0.7e-12, False), (1.5e-12, True)])
 @pytest.mark.parametrize("value", [43.25, -43.25])
-def test_a_value_that_differs_by_parts_in_a_million_millions_is_one(
-    value: float, spread: float, ok: bool
-) -> None:
+def test_a_value_that_differs_by_parts_in_a_million_millions_is_one(value: float, spread: float, ok: bool) -> None:
     ground = GROUND.copy()
     ground[:, 1] = value * (1.0 - spread * (ground[:, 1] - ground[:, 1].min()) / np.ptp(ground[:, 1]))
     if ok:

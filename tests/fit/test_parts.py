@@ -31,9 +31,7 @@ from tests.fit.cameras import Camera, random_points, synthetic, synthetic_rpc
 # --- the least squares of a quotient -------------------------------------------------------------------------
 
 
-def wavy(
-    camera: Camera, count: int = 160, height: float = 2.0, seed: int = 3
-) -> tuple[Array, Array, Normalization]:
+def wavy(camera: Camera, count: int = 160, height: float = 2.0, seed: int = 3) -> tuple[Array, Array, Normalization]:
     """Points whose image swings by some pixels, as no RPC does."""
     ground, image = random_points(camera, count, np.random.default_rng(seed))
     bent = image + height * np.sin(image[:, ::-1] / 6000.0 + [0.3, 1.0])
@@ -96,9 +94,7 @@ def test_rows_with_a_numerator_are_the_quotient_and_its_derivatives(camera: Came
         np.testing.assert_allclose(rows[:, :-1] @ x - rows[:, -1], quotient(x) - y, atol=1e-12)
         for k in (0, 3, 11, 20, 25, 38):
             step = 1e-6 * np.eye(39)[k]
-            np.testing.assert_allclose(
-                rows[:, k], (quotient(x + step) - quotient(x - step)) / 2e-6, atol=1e-8
-            )
+            np.testing.assert_allclose(rows[:, k], (quotient(x + step) - quotient(x - step)) / 2e-6, atol=1e-8)
 
 
 def test_a_ridge_with_a_pole_makes_way_for_a_polynomial(camera: Camera, monkeypatch: Any) -> None:
@@ -225,9 +221,7 @@ def made(**changes: Any) -> RpcFit:
 
 
 @pytest.mark.parametrize(("largest", "methods"), [(0.9e-6, ["ridge"]), (1.1e-6, ["ridge", "gauss-newton"])])
-def test_the_least_squares_are_looked_for_where_a_ridge_leaves_a_millionth_of_a_pixel(
-    largest, methods
-) -> None:
+def test_the_least_squares_are_looked_for_where_a_ridge_leaves_a_millionth_of_a_pixel(largest, methods) -> None:
     tried: list[str] = []
 
     def attempt(method: str) -> RpcFit:
@@ -260,9 +254,7 @@ def test_of_accepted_fits_the_one_with_the_least_error_is_taken() -> None:
 @pytest.mark.parametrize(
     ("rmse", "least", "plain"), [(1.09, 0.5, True), (1.11, 0.5, False), (1.5, 0.0, True), (1.5, -1.0, True)]
 )
-def test_behind_a_spline_the_calmer_fit_is_taken_where_it_is_a_tenth_worse_at_most(
-    rmse, least, plain
-) -> None:
+def test_behind_a_spline_the_calmer_fit_is_taken_where_it_is_a_tenth_worse_at_most(rmse, least, plain) -> None:
     fit = made(rmse_ckp=np.array([0.6, 0.8]), min_denominator=least)
     other = made(rmse_ckp=np.array([0.8, 0.6]) * rmse, method="lcurve")
     assert (_plainer(fit, other) is other) == plain
@@ -336,9 +328,7 @@ def test_the_certificate_counts_what_it_says(camera: Camera) -> None:
     assert fit.beyond == pytest.approx(1 - 0.05 ** (1 / CELLS**2), rel=1e-9)
     ground, image = (
         p.reshape(-1, k)
-        for p, k in zip(
-            control_points(camera.model, camera.size, camera.alt_range, options), (3, 2), strict=True
-        )
+        for p, k in zip(control_points(camera.model, camera.size, camera.alt_range, options), (3, 2), strict=True)
     )
     error = fit.rpc.project(ground) - image
     np.testing.assert_allclose(fit.rmse_cnp, np.sqrt((error**2).mean(axis=0)), rtol=1e-6, atol=1e-12)
@@ -375,9 +365,7 @@ def test_around_the_worst_points_of_either_coordinate_more_are_looked_at_closer_
         shift = np.abs(points[:, None] - known) / reach
         nearest = shift.max(axis=-1).min(axis=1)
         assert nearest.max() <= 1.0 + 1e-9
-        worst = [
-            np.argsort(-np.abs(hills(known, known * scale + low))[:, k], kind="stable")[:16] for k in range(2)
-        ]
+        worst = [np.argsort(-np.abs(hills(known, known * scale + low))[:, k], kind="stable")[:16] for k in range(2)]
         asked.pop()
         of_worst = np.repeat(np.unique(np.concatenate(worst)), 8)
         moved = np.abs(points - known[of_worst]) / reach

@@ -181,9 +181,7 @@ def test_nodes_are_where_they_are_asked_for() -> None:
 @pytest.mark.slow
 def test_a_wider_margin_keeps_denominators_up_farther_out(camera: Camera) -> None:
     """The same misfit under two margins: the narrower, the better, and the smaller what is a step outside."""
-    bent = Bent(
-        camera.model, lambda at: np.stack([20.0 * np.exp(6e-4 * (at[..., 0] - 2e4)), 0.0 * at[..., 0]], -1)
-    )
+    bent = Bent(camera.model, lambda at: np.stack([20.0 * np.exp(6e-4 * (at[..., 0] - 2e4)), 0.0 * at[..., 0]], -1))
     narrow, wide = (
         fit_rpc(bent, camera.size, camera.alt_range, options=FitOptions(pole_margin=margin), strict=False)
         for margin in (0.0, 0.5)
@@ -202,9 +200,7 @@ def test_the_tolerance_decides_whether_a_fit_is_accepted(camera: Camera) -> None
     loose = FitOptions(method="ridge", tolerance=most * 1.01)
     assert fit_rpc(model, camera.size, camera.alt_range, options=loose).verdict(loose.tolerance) == ""
     with pytest.raises(FitError, match="misses its check points"):
-        fit_rpc(
-            model, camera.size, camera.alt_range, options=FitOptions(method="ridge", tolerance=most * 0.99)
-        )
+        fit_rpc(model, camera.size, camera.alt_range, options=FitOptions(method="ridge", tolerance=most * 0.99))
 
 
 def test_joint_fits_share_one_regularisation(camera: Camera) -> None:
@@ -559,9 +555,7 @@ def test_the_papers_solver_counts_its_passes_over_the_points(camera: Camera, mon
     norm = Normalization(rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
     calls = []
     compressed = Problem.compressed
-    monkeypatch.setattr(
-        Problem, "compressed", lambda self, *given: calls.append(1) or compressed(self, *given)
-    )
+    monkeypatch.setattr(Problem, "compressed", lambda self, *given: calls.append(1) or compressed(self, *given))
     *_, passes = solve_lcurve(Problem(ground, image, norm), [1])
     assert passes == len(calls)
     assert passes >= 5

@@ -48,9 +48,7 @@ def test_noise_neither_makes_poles_nor_costs_more_than_the_unknowns_do(
         fit = fit_rpc_points(ground, image + rng.normal(0, 0.3, image.shape), options=NOISY)
         truth_ground, truth_image = random_points(camera, 1000, rng)
         assert fit.min_denominator >= 0.5, camera.name
-        assert rms(fit.rpc.project(truth_ground) - truth_image) <= 0.3 * factor * np.sqrt(39 / count), (
-            camera.name
-        )
+        assert rms(fit.rpc.project(truth_ground) - truth_image) <= 0.3 * factor * np.sqrt(39 / count), camera.name
         assert abs(rms(fit.rmse_ckp) - 0.3) <= 0.3 * max(0.1, 12 / np.sqrt(count))
 
 
@@ -92,9 +90,7 @@ def test_the_papers_radar_points_are_met_as_well_as_by_its_own_code(shared_data:
 
 
 @pytest.mark.parametrize("highest", [1300.0, 5000.0])
-def test_a_physical_models_grid_is_fitted_better_than_by_its_vendor(
-    shared_data: Path, highest: float
-) -> None:
+def test_a_physical_models_grid_is_fitted_better_than_by_its_vendor(shared_data: Path, highest: float) -> None:
     points = read_correspondences(shared_data / "physical" / "GRID_P1BP--2017092838284574CP.tif")
     vendor = read_rpc(shared_data / "physical" / "RPC_P1BP--2017092838284574CP.XML")
     low = points.ground[:, 2] <= 1202.5

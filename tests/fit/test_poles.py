@@ -123,9 +123,7 @@ def test_a_region_is_the_images_own_ground_and_not_the_box_around_it():
     u[:8] = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     turn = np.array([[0.5, 0.5], [-0.5, 0.5]])
     ground = np.column_stack([u[:, :2] @ turn, u[:, 2]])
-    cubic = (
-        np.eye(20)[0] - 0.6 * np.eye(20)[4]
-    )  # 1 - 0.6 x y: 0.4 in a corner of the box, 0.85 at the image's edge
+    cubic = np.eye(20)[0] - 0.6 * np.eye(20)[4]  # 1 - 0.6 x y: 0.4 in a corner of the box, 0.85 at the image's edge
     for margin, least in ((0.0, 0.85), (0.25, 1 - 0.15 * 1.25**2), (1.0, 0.4)):
         assert Region.around(ground, u[:, :2], margin).least(cubic) == pytest.approx(least, abs=0.01)
     assert Region.box(np.array([[-1.0, 1.0]] * 3)).least(cubic) == pytest.approx(0.4)
@@ -165,6 +163,4 @@ def test_a_bounded_least_squares_is_that_of_another_solver():
     assert cost(found) >= other.fun - 1e-6  # which is held to every seventh bound only
     assert cost(found) <= 1.1 * other.fun + 1e-6
     free = Compressed(np.triu(np.linalg.qr(np.column_stack([rows, rows @ (0.1 * want)]))[1]), 80)
-    np.testing.assert_allclose(
-        bounded(free, region, ALL), 0.1 * want, atol=1e-9
-    )  # within the bound: as it is
+    np.testing.assert_allclose(bounded(free, region, ALL), 0.1 * want, atol=1e-9)  # within the bound: as it is

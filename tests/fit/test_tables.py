@@ -29,9 +29,7 @@ def check(path: Path) -> None:
         "\ufeffid,line,sample,lon,lat,h\n1,20.25,10.5,5.4,43.2,100\n2,21,11,5.5,43.3,120.5\n",
     ],
 )
-def test_a_text_table_is_read_by_its_header_or_in_the_order_of_the_convention(
-    tmp_path: Path, text: str
-) -> None:
+def test_a_text_table_is_read_by_its_header_or_in_the_order_of_the_convention(tmp_path: Path, text: str) -> None:
     path = tmp_path / "points.csv"
     path.write_text(text, encoding="utf-8")
     check(path)
@@ -39,9 +37,7 @@ def test_a_text_table_is_read_by_its_header_or_in_the_order_of_the_convention(
 
 def test_npz_holds_two_arrays_or_one_a_column(tmp_path: Path) -> None:
     np.savez(tmp_path / "two.npz", ground=ROWS[:, :3], image=ROWS[:, 3:])
-    np.savez(
-        tmp_path / "five.npz", lon=ROWS[:, 0], lat=ROWS[:, 1], alt=ROWS[:, 2], col=ROWS[:, 3], row=ROWS[:, 4]
-    )
+    np.savez(tmp_path / "five.npz", lon=ROWS[:, 0], lat=ROWS[:, 1], alt=ROWS[:, 2], col=ROWS[:, 3], row=ROWS[:, 4])
     check(tmp_path / "two.npz")
     check(tmp_path / "five.npz")
 
@@ -90,9 +86,7 @@ def test_a_localisation_grid_counts_from_the_corner_of_the_first_pixel(tmp_path:
         ("a.csv", b"", "neither a table"),
     ],
 )
-def test_what_is_no_table_is_refused_with_the_reason(
-    tmp_path: Path, name: str, content: bytes, message: str
-) -> None:
+def test_what_is_no_table_is_refused_with_the_reason(tmp_path: Path, name: str, content: bytes, message: str) -> None:
     path = tmp_path / name
     path.write_bytes(content)
     with pytest.raises(InputError, match=message):

@@ -107,9 +107,7 @@ def bent(value: np.ndarray, rng: Rng) -> np.ndarray:
                 mask, whole = _EXPONENT[kind]
                 words = np.ascontiguousarray(value).view(whole).reshape(-1)
                 words[at] = (
-                    words[at] | whole_type(whole, mask)
-                    if rng.integers(2)
-                    else words[at] & ~whole_type(whole, mask)
+                    words[at] | whole_type(whole, mask) if rng.integers(2) else words[at] & ~whole_type(whole, mask)
                 )
                 value = words.view(value.dtype).reshape(value.shape)
                 continue

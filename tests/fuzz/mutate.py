@@ -98,9 +98,9 @@ def mutate_text(data: bytes, rng: Rng) -> bytes:
                 other = int(rng.integers(len(lines)))
                 lines[at], lines[other] = lines[other], lines[at]
             case 3:
-                lines[at:at] = [
-                    str(pick(rng, ("", " ", "#", "[" * DEPTH, "a=" + "[" * DEPTH, "," * 50)))
-                ] * int(rng.integers(1, 50))
+                lines[at:at] = [str(pick(rng, ("", " ", "#", "[" * DEPTH, "a=" + "[" * DEPTH, "," * 50)))] * int(
+                    rng.integers(1, 50)
+                )
             case 4:
                 lines = lines[:1] if rng.integers(2) else lines[1:]
             case _:
@@ -159,9 +159,7 @@ def mutate_values(data: bytes, rng: Rng) -> bytes:
         elif rng.random() < 0.2:
             holder[key] = None
         elif isinstance(value, (int, float)):
-            holder[key] = pick(
-                rng, (0, -1, 1, 2, 1.0, 0.5, 1e-300, 5e-324, 1e15, 10**17, -1e99, 1e99, 90, -0.0, True)
-            )
+            holder[key] = pick(rng, (0, -1, 1, 2, 1.0, 0.5, 1e-300, 5e-324, 1e15, 10**17, -1e99, 1e99, 90, -0.0, True))
         elif isinstance(value, str):
             holder[key] = pick(rng, (*WORDS, "check", "adjust", "failed", "bad", "up", "view_0001"))
     return json.dumps(tree[0]).encode("utf-8", "surrogatepass")
@@ -223,9 +221,7 @@ def mutate_npz(data: bytes, rng: Rng) -> bytes:
                 kind = pick(rng, ("f4", "i1", "u8", "c16", "U7", "S3", "M8[s]", "?", "V8", ">f8", "f8"))
                 arrays[name] = np.zeros(value.shape, str(kind))
             case 5:
-                arrays[name] = np.array(
-                    pick(rng, ([], 0, -1, 2**63 - 1, 1e308, np.nan, "", "x" * 500, [[]], True))
-                )
+                arrays[name] = np.array(pick(rng, ([], 0, -1, 2**63 - 1, 1e308, np.nan, "", "x" * 500, [[]], True)))
             case 6:
                 arrays[str(pick(rng, ("a", "sigma", "col", "")))] = value
             case _:
@@ -236,22 +232,16 @@ def mutate_npz(data: bytes, rng: Rng) -> bytes:
                         if value.dtype.kind == "f"
                         else (-1, 0, 2**40, 2**63 - 1)
                     )
-                    value.flat[int(rng.integers(value.size))] = np.array(pick(rng, numbers)).astype(
-                        value.dtype
-                    )
+                    value.flat[int(rng.integers(value.size))] = np.array(pick(rng, numbers)).astype(value.dtype)
                     arrays[name] = value
     out = io.BytesIO()
-    with zipfile.ZipFile(
-        out, "w", zipfile.ZIP_DEFLATED if rng.integers(2) else zipfile.ZIP_STORED
-    ) as archive:
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED if rng.integers(2) else zipfile.ZIP_STORED) as archive:
         for name, value in arrays.items():
             member = io.BytesIO()
             np.save(member, value)
             content = member.getvalue()
             if rng.random() < 0.2:
-                shape = str(
-                    pick(rng, ("(100000000000,)", "(-1,)", "(2, 3", "(True,)", "()", "(0, 4)"))
-                ).encode()
+                shape = str(pick(rng, ("(100000000000,)", "(-1,)", "(2, 3", "(True,)", "()", "(0, 4)"))).encode()
                 content = re.sub(rb"\([\d, ]*\)", shape, content, count=1)
             archive.writestr(f"{name}.npy", content)
     packed = out.getvalue()

@@ -111,11 +111,7 @@ _XML = ("xml", "dimap", "enmap", "gdal")
 def _rpc_sample(kind: str) -> Sample:
     row = kind.split(" ", maxsplit=1)[0]
     mutations = (
-        (mutate_xml, mutate_text)
-        if row in _XML
-        else (mutate_json, mutate_text)
-        if row == "json"
-        else (mutate_text,)
+        (mutate_xml, mutate_text) if row in _XML else (mutate_json, mutate_text) if row == "json" else (mutate_text,)
     )
     name = f"scene.{row}"
     return Sample(name, partial(_read_format, kind=row), lambda: TEXTS[kind]().encode(), mutations)
@@ -133,9 +129,7 @@ def _nitf() -> bytes:
     from barpc.fit import FitOptions, fit_rpc
     from barpc.rpcio.text import nitf_record
 
-    fitted = fit_rpc(
-        make_rpc(), (2000, 1900), (50.0, 290.0), options=FitOptions(precision="nitf"), strict=False
-    ).rpc
+    fitted = fit_rpc(make_rpc(), (2000, 1900), (50.0, 290.0), options=FitOptions(precision="nitf"), strict=False).rpc
     return b"NITF02.10" + b" " * 100 + b"RPC00B01041" + nitf_record(fitted).encode() + b" " * 50
 
 
@@ -440,9 +434,7 @@ CSV_GCPS = (
     b"id,Longitude [deg],lat,h,image,px,py,sigma_xy,sigma_z,sigma_px\n1,5.4,43.2,120.5,left.tif,10.5,20.25,1,2,0.5\n"
     b'1,5.4,43.2,120.5,"right.tif",30,40,1,2,0.5\n2,5.5,43.3,99,left,5,6,,,\n'
 )
-MATCHES = (
-    b"image,col,row,track,sigma\nleft,1.5,2.5,0,0.5\nright,3,4,0,0.5\nleft,7,8,b,1\nright.tif,9,1e1,b,1\n"
-)
+MATCHES = b"image,col,row,track,sigma\nleft,1.5,2.5,0,0.5\nright,3,4,0,0.5\nleft,7,8,b,1\nright.tif,9,1e1,b,1\n"
 POINTS = (
     b'{"type": "FeatureCollection", "features": [{"geometry": {"coordinates": [5.4, 43.2, 1]},'
     b' "properties": {"ji": [1, 2]}}]}'
@@ -461,9 +453,7 @@ SAMPLES: dict[str, Sample] = {
     "matches npz": Sample(
         "t.npz",
         lambda path: read_matches(path, NAMES),
-        lambda: _npz(
-            names=np.array(NAMES), view=np.array([0, 1]), track=np.array([0, 0]), xy=np.ones((2, 2))
-        ),
+        lambda: _npz(names=np.array(NAMES), view=np.array([0, 1]), track=np.array([0, 0]), xy=np.ones((2, 2))),
         (mutate_npz, mutate_npz_ends),
     ),
     "matches asp": Sample(
@@ -478,9 +468,7 @@ SAMPLES: dict[str, Sample] = {
         lambda: binary(np.eye(2), 9 * np.eye(2), 2),
         (mutate_header,),
     ),
-    "matches colmap": Sample(
-        "t.db", lambda path: read_matches(path, ["a", "b"]), _database, (mutate_header,)
-    ),
+    "matches colmap": Sample("t.db", lambda path: read_matches(path, ["a", "b"]), _database, (mutate_header,)),
     "matches dictionary": Sample(
         "left__right.npz",
         lambda path: read_matches(path, NAMES),
@@ -542,9 +530,7 @@ SAMPLES: dict[str, Sample] = {
     "dem": Sample("dem.tif", _use_dem, _dem, (_mutate_transform(_dem), mutate_header), share=0.2),
     "dem hgt": Sample("N43E005.hgt", _use_dem, cache(lambda: bytes(2 * 1201**2)), (), share=0.02),
     "geoid gtx": Sample("geoid.gtx", _use_dem, _gtx, (mutate_header,)),
-    "grid": Sample(
-        "nodes.tif", _use_grid, _localisation, (_mutate_transform(_localisation), mutate_header), share=0.2
-    ),
+    "grid": Sample("nodes.tif", _use_grid, _localisation, (_mutate_transform(_localisation), mutate_header), share=0.2),
     "correction": Sample(
         "a_correction.tif",
         _use_correction,
@@ -576,9 +562,7 @@ SAMPLES: dict[str, Sample] = {
         share=0.2,
     ),
     "annotation": Sample(_BURSTS.name, _use_product, lambda: _annotation(_BURSTS), (mutate_xml,), share=0.2),
-    "annotation grd": Sample(
-        _GROUND.name, _use_product, lambda: _annotation(_GROUND), (mutate_xml,), share=0.2
-    ),
+    "annotation grd": Sample(_GROUND.name, _use_product, lambda: _annotation(_GROUND), (mutate_xml,), share=0.2),
     "sicd": Sample("image.xml", _use_sicd, _sicd, (mutate_xml,), share=0.2),
     "sicd nitf": Sample("image.ntf", _use_sicd, _sicd_nitf, (), share=0.2),
     "terrasar": Sample(

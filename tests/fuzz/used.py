@@ -199,18 +199,14 @@ def mutate_hdf5(data: bytes, rng: Rng) -> bytes:
             file.visit(names.append)
             if not names:
                 break
-            with suppress(
-                OSError, RuntimeError, ValueError, KeyError, TypeError
-            ):  # of what an edit before has left
+            with suppress(OSError, RuntimeError, ValueError, KeyError, TypeError):  # of what an edit before has left
                 _edit(file, str(pick(rng, names)), rng, h5py)
     return memory.getvalue()
 
 
 def _edit(file: Any, name: str, rng: Rng, h5py: Any) -> None:
     found = file[name]
-    small = (
-        isinstance(found, h5py.Dataset) and found.shape is not None and found.size < 1000
-    )  # others claim it
+    small = isinstance(found, h5py.Dataset) and found.shape is not None and found.size < 1000  # others claim it
     value = np.asarray(found[()] if small else np.eye(2))
     if value.dtype.kind not in "fiu":
         value = np.eye(2)
@@ -386,9 +382,7 @@ USED: dict[str, Sample] = {
     "options used": Sample(
         "run.toml",
         _use_options,
-        lambda: (
-            b'[adjust]\nmodel = "rotation"\nsigma_attitude = 3.0\nfixed = ["view_0000"]\nnoise_floor = 0.02\n'
-        ),
+        lambda: b'[adjust]\nmodel = "rotation"\nsigma_attitude = 3.0\nfixed = ["view_0000"]\nnoise_floor = 0.02\n',
         (mutate_options, mutate_options, mutate_options, mutate_text),
         share=0.5,
     ),

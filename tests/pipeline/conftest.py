@@ -52,9 +52,7 @@ def _ventoux(shared_data: Path, folder: Path, right_geom: str) -> tuple[AdjustRe
     for name in ("left_image.tif", "left_image.geom", "right_image.tif"):
         shutil.copy(source / name, folder / name)
     shutil.copy(source / right_geom, folder / "right_image.geom")
-    return adjust(
-        [folder / "left_image.tif", folder / "right_image.tif"], folder / "adjusted"
-    ), folder / "adjusted"
+    return adjust([folder / "left_image.tif", folder / "right_image.tif"], folder / "adjusted"), folder / "adjusted"
 
 
 @pytest.fixture(scope="session")

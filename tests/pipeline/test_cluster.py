@@ -168,9 +168,7 @@ def test_workers_close_and_come_during_a_run_and_the_bytes_are_the_same(
         ) as dask,
         distributed.Client(dask) as client,
     ):
-        barpc.adjust(
-            images, tmp_path / "dask_run", options, executor=client.get_executor(), progress=progress
-        )
+        barpc.adjust(images, tmp_path / "dask_run", options, executor=client.get_executor(), progress=progress)
     assert seen
     lines = [record.message for record in caplog.records if record.name == cluster.__name__]
     assert any("no worker" in line for line in lines)
@@ -211,9 +209,7 @@ class Clock:
 def test_what_is_said_of_workers_and_when(monkeypatch, caplog, numbers, waits, said) -> None:
     """Workers are counted every 5 s; the seconds without any count from when there was one for the last time."""
     cluster._watch(Counted(*numbers, waits=waits), Clock(monkeypatch, len(numbers)))
-    assert [record.getMessage().split(":")[0] for record in caplog.records] == [
-        f"the cluster {line}" for line in said
-    ]
+    assert [record.getMessage().split(":")[0] for record in caplog.records] == [f"the cluster {line}" for line in said]
     waiting = [record.getMessage() for record in caplog.records if ":" in record.getMessage()]
     assert all(line.endswith("Ctrl-C ends the run and the same command goes on with it") for line in waiting)
 
@@ -232,9 +228,7 @@ def test_an_end_of_work_ends_the_reminders(monkeypatch, caplog) -> None:
 
     clock.wait = wait  # type: ignore[method-assign]
     cluster._watch(client, clock)
-    assert [record.getMessage().split(":")[0] for record in caplog.records] == [
-        "the cluster has had no worker for 5 s"
-    ]
+    assert [record.getMessage().split(":")[0] for record in caplog.records] == ["the cluster has had no worker for 5 s"]
 
 
 def test_workers_of_a_scheduler_that_is_gone_are_not_known() -> None:

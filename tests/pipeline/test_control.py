@@ -19,9 +19,7 @@ from barpc.simulate import simulate_block
 
 BLOCK = simulate_block(3, 4, num_gcps=6, seed=3, lon=-58.4, lat=34.6)
 VIEWS = BLOCK.views
-POINTS = replace(
-    BLOCK.gcps, sigma=np.tile([0.1, 0.2, 0.3], (6, 1)), xy_sigma=np.full(len(BLOCK.gcps.view), 0.4)
-)
+POINTS = replace(BLOCK.gcps, sigma=np.tile([0.1, 0.2, 0.3], (6, 1)), xy_sigma=np.full(len(BLOCK.gcps.view), 0.4))
 
 
 def rows(points: GroundPoints):
@@ -83,9 +81,7 @@ def geojson(points: GroundPoints, **more) -> str:
 
 FULL = "id,lon,lat,h,image,col,row,sigma_e,sigma_n,sigma_u,sigma_px"
 SURVEY = "Filename,PX,PY,gcp_id,X,Y,Z,remark,sigma_x,sigma_y,sigma_z,sigma_col"
-WORDS = (
-    "name,Latitude [deg],Longitude [deg],Elevation,image,sample,line,sigma east,sigma north,sigma up,sigma_px"
-)
+WORDS = "name,Latitude [deg],Longitude [deg],Elevation,image,sample,line,sigma east,sigma north,sigma up,sigma_px"
 TEXTS = {
     "a.gcp": asp(POINTS),
     "a.geojson": geojson(POINTS, sigma_m=[0.1, 0.2, 0.3], sigma_px=0.4),
@@ -240,9 +236,7 @@ def test_images_that_are_not_in_the_run_are_refused_or_left_out(tmp_path, only):
 
 def test_of_a_file_of_one_image_no_image_is_asked(tmp_path):
     one = POINTS.select(np.bincount(POINTS.point[POINTS.view == 0], minlength=6) > 0)
-    one = replace(
-        one, **{name: getattr(one, name)[one.view == 0] for name in ("point", "view", "xy", "xy_sigma")}
-    )
+    one = replace(one, **{name: getattr(one, name)[one.view == 0] for name in ("point", "view", "xy", "xy_sigma")})
     path = tmp_path / "p.csv"
     path.write_text(table(one, "id,lon,lat,h,col,row"))
     found = load_gcps([str(path)], VIEWS[:1], RunOptions())
@@ -286,9 +280,7 @@ def test_several_files_are_one_and_each_is_left_out_alone(tmp_path):
     assert found.names == POINTS.names * 2
     assert len(found.left_out) == 1
     assert "b.csv" in found.left_out[0]
-    np.testing.assert_array_equal(
-        found.lonlatalt[found.point], np.tile(POINTS.lonlatalt, (2, 1))[found.point]
-    )
+    np.testing.assert_array_equal(found.lonlatalt[found.point], np.tile(POINTS.lonlatalt, (2, 1))[found.point])
 
 
 # --- its parts ---------------------------------------------------------------------------------------------
@@ -328,9 +320,7 @@ def flat(count: int = 2) -> tuple[View, ...]:
 @pytest.fixture
 def pixel(monkeypatch):
     """Ground sample distances of `Plain`: a metre."""
-    monkeypatch.setattr(
-        control, "ground_sample_distance", lambda sensor, ground: (None, np.ones(len(ground)))
-    )
+    monkeypatch.setattr(control, "ground_sample_distance", lambda sensor, ground: (None, np.ones(len(ground))))
 
 
 def told(points: GroundPoints, search: float = 1.0, views=None) -> list[tuple[list[int], str]]:
@@ -417,9 +407,7 @@ def test_each_image_is_asked_for_its_own_observations(monkeypatch) -> None:
     ground, pixel = control._shown(points, flat(), np.array([5.0, 6.0, 7.0]))
     np.testing.assert_allclose(ground, [[3.0, 0.01, 5.0], [1.0, 0.02, 6.0], [2.0, 0.03, 7.0]])
     np.testing.assert_allclose(pixel, [30.0, 10.0, 20.0])
-    monkeypatch.setattr(
-        control, "ground_sample_distance", lambda sensor, ground: (None, np.full(len(ground), np.nan))
-    )
+    monkeypatch.setattr(control, "ground_sample_distance", lambda sensor, ground: (None, np.full(len(ground), np.nan)))
     assert control._shown(points, flat(), np.zeros(3))[1].tolist() == [0.0] * 3
 
 
@@ -452,13 +440,8 @@ def test_of_several_files_each_observation_keeps_its_point_and_strangers_are_nam
     assert found.names == tuple(POINTS.names[g] for g in order)
     np.testing.assert_array_equal(found.lonlatalt, POINTS.lonlatalt[order])
     np.testing.assert_array_equal(found.sigma, POINTS.sigma[order])
-    seen = {
-        (POINTS.names[g], v, *xy)
-        for g, v, xy in zip(POINTS.point, POINTS.view, POINTS.xy.tolist(), strict=True)
-    }
-    kept = {
-        (found.names[g], v, *xy) for g, v, xy in zip(found.point, found.view, found.xy.tolist(), strict=True)
-    }
+    seen = {(POINTS.names[g], v, *xy) for g, v, xy in zip(POINTS.point, POINTS.view, POINTS.xy.tolist(), strict=True)}
+    kept = {(found.names[g], v, *xy) for g, v, xy in zip(found.point, found.view, found.xy.tolist(), strict=True)}
     assert kept == {row for row in seen if row[1] != 2}
     assert found.strangers == ("/some/where/else.tif",)
     assert [line.split(":")[0] for line in found.left_out] == list(map(str, paths))

@@ -68,9 +68,7 @@ def test_noisy_matches_of_real_images_become_as_exact_as_our_own(shared_data, tm
 
 
 @pytest.mark.parametrize("read", [given_matches, given_tracks])
-@pytest.mark.parametrize(
-    ("far", "fails"), [(0.4, False), (0.5, False), (0.6, True), (1.5, True), (-1e4, True)]
-)
+@pytest.mark.parametrize(("far", "fails"), [(0.4, False), (0.5, False), (0.6, True), (1.5, True), (-1e4, True)])
 def test_points_beyond_their_image_are_said_at_once(tmp_path, read, far, fails) -> None:
     """Those of the whole image where a crop is given; a pixel more is borne."""
     views = load_views(IMAGES).views
@@ -87,9 +85,7 @@ def test_points_beyond_their_image_are_said_at_once(tmp_path, read, far, fails) 
 
 @pytest.mark.parametrize("read", [given_matches, given_tracks])
 @pytest.mark.parametrize(("astray", "fails"), [(1, False), (15, False), (16, True)])
-def test_a_few_points_beyond_their_image_are_left_out_and_counted(
-    tmp_path, caplog, read, astray, fails
-) -> None:
+def test_a_few_points_beyond_their_image_are_left_out_and_counted(tmp_path, caplog, read, astray, fails) -> None:
     """One in twenty of 300 points; what else sees them keeps its own partners."""
     views = load_views(IMAGES).views
     (width, height), names = views[0].size, [view.name for view in views]
@@ -99,9 +95,7 @@ def test_a_few_points_beyond_their_image_are_left_out_and_counted(
         for i in range(3)
     ]
     (tmp_path / "m.csv").write_text("image,col,row,track\n" + "".join(rows))
-    said = (
-        f"m.csv: {astray} of 300 points lie outside their images, as .* in view_00, {width} x {height} pixels"
-    )
+    said = f"m.csv: {astray} of 300 points lie outside their images, as .* in view_00, {width} x {height} pixels"
     if fails:
         with pytest.raises(InputError, match=said):
             read([tmp_path / "m.csv"], views)
@@ -134,9 +128,7 @@ def test_several_files_are_one(tmp_path) -> None:
     views = load_views(IMAGES).views
     one, two, none = (tmp_path / name for name in ("one.csv", "two.csv", "none.csv"))
     names = [view.name for view in views]
-    rows = [
-        f"{names[i]},{5 + t},{7 + i},{t},{sigma}\n" for t in range(9) for i, sigma in ((0, 0.3), (1, 0.2))
-    ]
+    rows = [f"{names[i]},{5 + t},{7 + i},{t},{sigma}\n" for t in range(9) for i, sigma in ((0, 0.3), (1, 0.2))]
     one.write_text("image,col,row,track,sigma\n" + "".join(rows))
     rows = [f"{names[i]},{5 + t},{7 + i},x{t},0.25\n" for t in range(4, 12) for i in (1, 2)]
     two.write_text("image,col,row,track,sigma\n" + "".join(rows))
@@ -191,9 +183,7 @@ def test_a_matcher_by_name_works_in_worker_processes_with_the_same_bytes(tmp_pat
         ]
         places = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
         env = {**os.environ, "PYTHONPATH": places, "PYTHONDONTWRITEBYTECODE": "1"}
-        done = subprocess.run(
-            [*run, "--matcher", "mine:match"], env=env, capture_output=True, text=True, check=False
-        )
+        done = subprocess.run([*run, "--matcher", "mine:match"], env=env, capture_output=True, text=True, check=False)
         assert (done.returncode, done.stderr) == (0, "")
         written.append((out / "matches.csv").read_bytes())
         (tmp_path / "called").unlink()

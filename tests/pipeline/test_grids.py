@@ -70,9 +70,7 @@ def run_of(folder: Path, *given, **options) -> list[dict[str, dict[str, float | 
         return write_grids(run, given, RunOptions(**options))
 
 
-def test_grids_are_written_where_the_rpc_misses_the_camera_and_nowhere_else(
-    tmp_path, view, camera, fit, easy
-):
+def test_grids_are_written_where_the_rpc_misses_the_camera_and_nowhere_else(tmp_path, view, camera, fit, easy):
     assert 0.02 < fit.max_ckp.max() < 0.6
     other = replace(view, name="b")
     written = run_of(tmp_path / "out", (view, fit, camera), (other, easy, camera.sensor))
@@ -125,9 +123,7 @@ def test_an_rpc_of_a_tile_is_the_camera_in_its_own_pixels(tmp_path, view, camera
         origin, side = np.array([tile["col"], tile["row"]]), np.array([tile["width"], tile["height"]])
         assert tile["file"] == f"a_tiles/{tile['row']:05d}_{tile['col']:05d}_RPC.TXT"
         ground, image = seen_by(camera, 200, origin, origin + side)
-        off = np.linalg.norm(
-            read_rpc(tmp_path / tile["file"]).project(ground) - (image - origin), axis=1
-        ).max()
+        off = np.linalg.norm(read_rpc(tmp_path / tile["file"]).project(ground) - (image - origin), axis=1).max()
         assert off < LINEAR
         assert off < 1.2 * tile["max_px"] + 1e-6
     worst = max(tile["max_px"] for tile in table["tiles"])
@@ -152,8 +148,7 @@ def test_tiles_cover_an_image_once(size, side):
         count[row : row + height, col : col + width] += 1
         assert col % side == row % side == 0
         assert all(
-            2 * n >= min(side, whole) and n <= 1.5 * side
-            for n, whole in zip((width, height), size, strict=True)
+            2 * n >= min(side, whole) and n <= 1.5 * side for n, whole in zip((width, height), size, strict=True)
         )
     assert (count == 1).all()
 
@@ -278,9 +273,7 @@ def test_all_names_are_known_before_the_run(view):
 def test_tiles_go_row_by_row_from_multiples_of_their_side(size, side, cols, rows) -> None:
     right, low = [*cols[1:], size[0]], [*rows[1:], size[1]]
     wanted = [
-        (c, r, c2 - c, r2 - r)
-        for r, r2 in zip(rows, low, strict=True)
-        for c, c2 in zip(cols, right, strict=True)
+        (c, r, c2 - c, r2 - r) for r, r2 in zip(rows, low, strict=True) for c, c2 in zip(cols, right, strict=True)
     ]
     assert tile_boxes(size, side) == wanted
 
@@ -422,9 +415,7 @@ def test_the_larger_of_the_errors_written_and_read_is_told(
         ((0.5, 0.4, None), (0.3, 0.1, None), "vendor-denominators", 3),
     ],
 )
-def test_the_rpc_that_lacks_least_is_the_one_that_is_added_to(
-    monkeypatch, largest, rms, chosen, tried
-) -> None:
+def test_the_rpc_that_lacks_least_is_the_one_that_is_added_to(monkeypatch, largest, rms, chosen, tried) -> None:
     assert LINEAR == 0.005
     names = ("given", "vendor-denominators", "ridge")
     known = {name: (one, big) for name, one, big in zip(names, rms, largest, strict=True)}
@@ -483,9 +474,7 @@ def test_a_camera_is_off_by_root_mean_square_and_by_most(view) -> None:
 
 
 @pytest.mark.parametrize("worst", [0.005, 0.0051, np.nan])
-def test_tiles_are_fitted_eight_at_a_time_and_the_worst_is_told(
-    tmp_path, view, monkeypatch, caplog, worst
-) -> None:
+def test_tiles_are_fitted_eight_at_a_time_and_the_worst_is_told(tmp_path, view, monkeypatch, caplog, worst) -> None:
     """Ten tiles of 100 x 100 pixels; the fourth is the worst. Each states the errors of the image's RPC."""
     groups: list[int] = []
 
@@ -501,9 +490,7 @@ def test_tiles_are_fitted_eight_at_a_time_and_the_worst_is_told(
     monkeypatch.setattr(grids, "ordered", lambda pool, fn, tasks, stage: [fn(*task) for task in tasks])
     fit = SimpleNamespace(rpc=replace(make_rpc(), err_bias=2.5, err_rand=0.125))
     with Workspace(tmp_path) as run:
-        told = grids._write_tiles(
-            run, replace(view, size=(1000, 100)), fit, None, RunOptions(tiles=100), None
-        )  # type: ignore[arg-type]
+        told = grids._write_tiles(run, replace(view, size=(1000, 100)), fit, None, RunOptions(tiles=100), None)  # type: ignore[arg-type]
     assert groups == [8, 2]
     assert list(told) == ["a" + TILES]
     np.testing.assert_equal(told["a" + TILES], {"barpc": worst})
@@ -524,9 +511,7 @@ def test_tiles_are_fitted_eight_at_a_time_and_the_worst_is_told(
 
 
 @pytest.mark.parametrize(("asked", "resampled"), [(True, False), (False, True), (True, True)])
-def test_what_a_dead_run_left_in_the_room_is_written_again(
-    tmp_path, view, monkeypatch, asked, resampled
-) -> None:
+def test_what_a_dead_run_left_in_the_room_is_written_again(tmp_path, view, monkeypatch, asked, resampled) -> None:
     """Which file holds what, how far each is off, and that none of an earlier try is in the way."""
     where, written = np.zeros((1, 3)), {}
     alts = grids.widened(view.alt_range)
@@ -590,9 +575,7 @@ def test_a_run_with_everything_is_told_and_the_same_whatever_the_workers(block, 
         assert list(view.outputs) == [view.name + end for end in ends]
         for name in view.outputs:
             assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
-        assert all(
-            isinstance(px, float) and px < LINEAR for one in view.outputs.values() for px in one.values()
-        )
+        assert all(isinstance(px, float) and px < LINEAR for one in view.outputs.values() for px in one.values())
         for end in (GRID, CORRECTION, RESAMPLED):
             found = open_camera(tmp_path / "a" / (view.name + end)).model
             ground = found.localize(np.array([[10.0, 20.0], [200.0, 250.0]]), np.array([*view.alt_range_m]))
@@ -665,9 +648,7 @@ def test_a_grid_is_the_camera_of_an_image_and_no_image(block, tmp_path):
 
 def test_a_grid_that_no_rpc_holds_is_not_converted(tmp_path, once):
     path = once[0] / f"a{GRID}"
-    found = CliRunner().invoke(
-        cli, ["convert", str(path), str(tmp_path / "a_RPC.TXT")], standalone_mode=False
-    )
+    found = CliRunner().invoke(cli, ["convert", str(path), str(tmp_path / "a_RPC.TXT")], standalone_mode=False)
     assert str(path) in str(found.exception)
     assert "wanted 0.01" in str(found.exception)
     assert not (tmp_path / "a_RPC.TXT").exists()

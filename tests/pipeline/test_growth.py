@@ -38,9 +38,7 @@ def write_block(folder: Path, num: int) -> tuple[Block, list[Path]]:
         ramp = (np.add.outer(np.arange(SIDE), np.arange(SIDE)) + n).astype(np.uint16)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(
-                path, "w", "GTiff", SIDE, SIDE, 1, dtype="uint16", compress="deflate"
-            ) as image:
+            with rasterio.open(path, "w", "GTiff", SIDE, SIDE, 1, dtype="uint16", compress="deflate") as image:
                 image.write(ramp, 1)
         put_tag(path, view.sensor)
     write_matches(folder / "matches.npz", block.tracks, [view.name for view in block.views])

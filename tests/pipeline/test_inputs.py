@@ -45,9 +45,7 @@ def test_asp_text_matches_hold_the_same_tie_points(matched):
     back = read_matches(out / "asp", [view.name for view in result.views])
     # the format knows a keypoint by its place only: the few tracks that share one are ambiguous and left out
     assert result.tracks.num_points >= back.num_points > 0.97 * result.tracks.num_points
-    ours = {
-        (view, *xy) for view, xy in zip(result.tracks.view.tolist(), result.tracks.xy.tolist(), strict=True)
-    }
+    ours = {(view, *xy) for view, xy in zip(result.tracks.view.tolist(), result.tracks.xy.tolist(), strict=True)}
     theirs = {(view, *xy) for view, xy in zip(back.view.tolist(), back.xy.tolist(), strict=True)}
     assert theirs <= ours
 
@@ -56,9 +54,7 @@ def test_asp_text_matches_hold_the_same_tie_points(matched):
 def test_control_points_put_the_scene_in_its_place(known, matched, tmp_path):
     options = RunOptions(matches_only=True, matches=str(matched[1] / "matches.npz"), gcp=(str(known.gcps),))
     result = adjust(known.images, tmp_path / "out", options)
-    rms, offset = errors_at_check_points(
-        [read_rpc(tmp_path / f"out/{v.name}.vrt") for v in result.views], known.truth
-    )
+    rms, offset = errors_at_check_points([read_rpc(tmp_path / f"out/{v.name}.vrt") for v in result.views], known.truth)
     sigma = np.array(result.summary["scene"]["sigma_enu_m"])
     assert rms <= 0.02
     assert (sigma < 1.0).all()
@@ -135,9 +131,7 @@ def test_a_later_run_goes_on_from_an_earlier_block(known, matched, tmp_path):
     adjust(known.images[:2], tmp_path / "two", half)
     joint = adjust(known.images, tmp_path / "joint", replace(given, stop_after="adjustment"))
     result = adjust(known.images, tmp_path / "three", replace(given, fixed_run=str(tmp_path / "two")))
-    rms, _ = errors_at_check_points(
-        [read_rpc(tmp_path / f"three/{v.name}.vrt") for v in result.views], known.truth
-    )
+    rms, _ = errors_at_check_points([read_rpc(tmp_path / f"three/{v.name}.vrt") for v in result.views], known.truth)
     assert rms <= 0.03
     sigma = [np.sqrt(np.diag(run.adjustment.covariance.view(2))) for run in (joint, result)]
     np.testing.assert_allclose(sigma[1], sigma[0], rtol=0.2)

@@ -31,9 +31,7 @@ class Run:
         self.scene, self.out, self._shared = scene, out, shared
         self._kept: dict[str, AdjustResult] = {}
 
-    def __call__(
-        self, out: str = "out", matches: str | None = "first/matches.csv", **options: Any
-    ) -> AdjustResult:
+    def __call__(self, out: str = "out", matches: str | None = "first/matches.csv", **options: Any) -> AdjustResult:
         given = () if matches is None else str(self.scene / matches)
         images = options.pop("given", sorted(self.scene.glob("*.tif")))
         options = {"matches_only": matches is not None, **options}
@@ -115,9 +113,7 @@ def images(run: Run, out: Path, scene: Path) -> None:
 
 def grids(run: Run, out: Path, scene: Path) -> None:
     run("always", grids=True)
-    needed, always = (
-        {p.name[8:] for p in folder.glob("view_00_*.tif")} for folder in (run.folder, out / "always")
-    )
+    needed, always = ({p.name[8:] for p in folder.glob("view_00_*.tif")} for folder in (run.folder, out / "always"))
     assert (needed, always) == (set(), {"grid.tif", "correction.tif"})
 
 
@@ -130,9 +126,7 @@ def tiles(run: Run, out: Path, scene: Path) -> None:
 
 def resample(run: Run, out: Path, scene: Path) -> None:
     run("a", resample=True)
-    assert {p.name for p in (out / "a").glob("*_resampled.tif")} == {
-        f"view_0{k}_resampled.tif" for k in range(3)
-    }
+    assert {p.name for p in (out / "a").glob("*_resampled.tif")} == {f"view_0{k}_resampled.tif" for k in range(3)}
 
 
 def rpc_formats(run: Run, out: Path, scene: Path) -> None:

@@ -138,9 +138,7 @@ def test_a_file_that_cannot_be_read_back_ends_the_run(tmp_path, view, fit, monke
     ("consumer", "ends"),
     [("barpc", True), ("gdal", True), ("gdal, beside an image", True), ("other", False)],
 )
-def test_only_what_the_tool_itself_and_gdal_say_ends_the_run(
-    tmp_path, view, fit, monkeypatch, consumer, ends
-) -> None:
+def test_only_what_the_tool_itself_and_gdal_say_ends_the_run(tmp_path, view, fit, monkeypatch, consumer, ends) -> None:
     def says(paths, *_):
         names = dict.fromkeys(("barpc", "gdal", "other", consumer))
         return [Reading(path, name, 9.0 if name == consumer else 0.0) for path in paths for name in names]
@@ -304,13 +302,9 @@ def test_the_outputs_of_a_run_are_known_before_it_starts(tmp_path, view) -> None
 def test_a_folder_with_a_summary_is_complete(tmp_path, monkeypatch, page: bool) -> None:
     """Tables, the page where it can be drawn, and the summary, in this order."""
     written = []
-    monkeypatch.setattr(
-        outputs, "TABLES", {"a.csv": lambda run, summary: b"1", "b.csv": lambda run, summary: b"2"}
-    )
+    monkeypatch.setattr(outputs, "TABLES", {"a.csv": lambda run, summary: b"1", "b.csv": lambda run, summary: b"2"})
     monkeypatch.setattr(outputs, "can_render", lambda: page)
-    monkeypatch.setattr(
-        outputs, "report_html", lambda summary, folder: f"<p>{summary.of} in {folder.name}</p>"
-    )
+    monkeypatch.setattr(outputs, "report_html", lambda summary, folder: f"<p>{summary.of} in {folder.name}</p>")
     for method in ("write_text", "output"):
         real = getattr(Workspace, method)
         watched = lambda self, name, *given, real=real: (written.append(name), real(self, name, *given))[1]  # noqa: E731
@@ -326,8 +320,7 @@ def test_a_folder_with_a_summary_is_complete(tmp_path, monkeypatch, page: bool) 
         assert (folder / "report.html").read_text() == "<p>what was found in out</p>"
     summary = json.loads((folder / "summary.json").read_text())
     assert summary.pop("outputs") == [
-        {"file": name, "sha256": hashlib.sha256((folder / name).read_bytes()).hexdigest()}
-        for name in names[:2]
+        {"file": name, "sha256": hashlib.sha256((folder / name).read_bytes()).hexdigest()} for name in names[:2]
     ]
     assert summary == {"of": "what was found", "stages": [asdict(stage) for stage in told.stages]}
     assert [stage["stage"] for stage in summary["stages"]] == ["tables", "report"]
@@ -369,9 +362,7 @@ def test_json_has_an_item_of_a_list_a_line() -> None:
         (OutputError("it says itself"), "^it says itself$"), (OSError("of no number"), "^of no number$"),
     ],
 )  # fmt: skip
-def test_why_a_file_cannot_be_written_is_said_with_its_own_place(
-    tmp_path, view, monkeypatch, error, said
-) -> None:
+def test_why_a_file_cannot_be_written_is_said_with_its_own_place(tmp_path, view, monkeypatch, error, said) -> None:
     def write(*given, **how):
         raise error
 
@@ -390,9 +381,7 @@ def test_files_are_made_in_a_room_of_their_view_for_their_place(tmp_path, view, 
         lambda rpc, path, image, *, place, overwrite: seen.append((path, place, overwrite)),
     )
     for _ in range(2):
-        made = outputs.make_files(
-            view, make_rpc(), "vrt", ("txt",), str(tmp_path / "out"), str(tmp_path / "r")
-        )
+        made = outputs.make_files(view, make_rpc(), "vrt", ("txt",), str(tmp_path / "out"), str(tmp_path / "r"))
     names = ["scene.vrt", "scene_RPC.TXT"]
     assert made == tuple(names)
     assert seen == [(tmp_path / "r/scene" / name, tmp_path / "out" / name, True) for name in names] * 2
@@ -404,9 +393,7 @@ def test_files_are_made_in_a_room_of_their_view_for_their_place(tmp_path, view, 
     [((0.3, 0.4), 1.00002, True), ((0.3, 0.4), 1.00003, False), ((0.0, 0.0), 2e-5, True), ((0.0, 0.0), 2.1e-5, False),
      ((0.3, 0.4), np.nan, False)],
 )  # fmt: skip
-def test_a_reading_may_be_off_by_twice_the_fit_s_largest_error(
-    view, fit, monkeypatch, largest, error, fine
-) -> None:
+def test_a_reading_may_be_off_by_twice_the_fit_s_largest_error(view, fit, monkeypatch, largest, error, fine) -> None:
     loose = replace(fit, max_ckp=np.array(largest))
     readings = [Reading(Path("x/a.txt"), "barpc", error), Reading(Path("x/b.txt"), "other", 9.0, "not read")]
     monkeypatch.setattr(outputs, "verify", lambda *given: readings)
@@ -454,6 +441,4 @@ def test_the_stages_of_a_run_are_told_with_those_of_its_tables(tmp_path, monkeyp
         told = outputs.write_tables(workspace, run, said)  # type: ignore[arg-type]
     stages = ["before", "tables", "report"]
     assert [stage.stage for stage in told.stages] == stages
-    assert json.loads((tmp_path / "out/summary.json").read_text())["stages"] == [
-        asdict(one) for one in told.stages
-    ]
+    assert json.loads((tmp_path / "out/summary.json").read_text())["stages"] == [asdict(one) for one in told.stages]

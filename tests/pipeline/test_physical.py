@@ -72,9 +72,7 @@ def test_an_adjustment_on_physical_models(folder, tmp_path):
     ground = turned[1].localize(seen, rng.uniform(0, 300, 300))
     xy = np.stack([camera.project(ground) for camera in turned])
     ground = ground[((xy > 0) & (xy < np.array(SIZE) - 1)).all(axis=(0, 2))]
-    xy = np.stack([camera.project(ground) for camera in turned], axis=1) + rng.normal(
-        0, 0.02, (len(ground), 3, 2)
-    )
+    xy = np.stack([camera.project(ground) for camera in turned], axis=1) + rng.normal(0, 0.02, (len(ground), 3, 2))
     assert len(ground) > 150
     half = len(ground) // 2
     tracks = Tracks(
@@ -115,9 +113,7 @@ def test_the_rpc_stays_the_default(tmp_path):
     straight = open_camera(f"{image},model=physical,aberration=no,refraction=no").model
     assert (straight.light, camera.model.light) == (Light(), Light(True, True))
     point = camera.model.localize([100.0, 100.0], np.array(0.0))
-    off = np.linalg.norm(
-        ecef_from_ground(point) - ecef_from_ground(straight.localize([100.0, 100.0], np.array(0.0)))
-    )
+    off = np.linalg.norm(ecef_from_ground(point) - ecef_from_ground(straight.localize([100.0, 100.0], np.array(0.0))))
     assert 10 < off < 30
     elsewhere = tmp_path / "far" / "b.xml"
     elsewhere.parent.mkdir()
@@ -145,9 +141,7 @@ def test_pixels_of_another_size_are_refused(tmp_path):
     image = write_image(tmp_path / "a.tif", (1, 40, 60))
     (tmp_path / "a.XML").write_text(text)
     for spec in (f"{image},model=physical", f"{image},camera={tmp_path / 'a.XML'},model=physical"):
-        with pytest.raises(
-            InputError, match=r"\(60, 40\) px large, its physical model in .* of \(900, 6000\)"
-        ):
+        with pytest.raises(InputError, match=r"\(60, 40\) px large, its physical model in .* of \(900, 6000\)"):
             open_camera(spec)
     for wrong in ("100", "1:2:3", "900:100", "nan:5", "low:high"):
         with pytest.raises(InputError, match=f"altitudes={wrong} cannot be read"):
@@ -190,9 +184,7 @@ def test_a_run_on_swinging_platforms_ends_with_grids_that_hold_them(tmp_path):
     xy += rng.normal(0, 0.1, xy.shape)
     count = len(xy)
     assert count > 100
-    tracks = Tracks(
-        np.tile([0, 1], count), np.repeat(np.arange(count), 2), xy.reshape(-1, 2), np.full(2 * count, 0.1)
-    )
+    tracks = Tracks(np.tile([0, 1], count), np.repeat(np.arange(count), 2), xy.reshape(-1, 2), np.full(2 * count, 0.1))
     write_matches(tmp_path / "ties.csv", tracks, ["a", "b"])
     options = RunOptions(matches=str(tmp_path / "ties.csv"), matches_only=True)
     given = [f"{tmp_path / name}.tif,model=physical,altitudes=0:1000" for name in "ab"]

@@ -114,9 +114,7 @@ def test_a_camera_that_reads_as_certified_is_the_same(camera, tmp_path) -> None:
 
 
 @pytest.mark.parametrize(("off", "now"), [(0.9, SAME), (1.2, CHANGED)])
-def test_a_camera_may_be_off_by_what_is_stated_and_the_rounding_of_its_file(
-    camera, tmp_path, off, now
-) -> None:
+def test_a_camera_may_be_off_by_what_is_stated_and_the_rounding_of_its_file(camera, tmp_path, off, now) -> None:
     camera.outputs["a_RPC.TXT"]["barpc"] = 0.3
     camera.certified[1][3] += off * (0.3 + REOPENED)
     (found,) = prove(tmp_path / "out")

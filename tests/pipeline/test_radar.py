@@ -41,8 +41,7 @@ def test_a_radar_image_is_adjusted_by_its_clocks_and_said_to_be(tmp_path):
     (tmp_path / "radar.xml").write_text(document("PLANE", squint=0.1).replace("</SICD>", STATED))
     radar = open_sicd(tmp_path / "radar.xml")
     truth = [
-        fit_rpc(fly(TARGET, Look(12.0, azimuth), (1200, 1200), 0.5), (1200, 1200), ALT).rpc
-        for azimuth in (10.0, 190.0)
+        fit_rpc(fly(TARGET, Look(12.0, azimuth), (1200, 1200), 0.5), (1200, 1200), ALT).rpc for azimuth in (10.0, 190.0)
     ]
     truth.append(Timed(radar, Timing([[2.5, -4e-4]])))
     images = [blank(tmp_path / f"{name}.tif", (1200, 1200)) for name in "ab"]
@@ -55,17 +54,13 @@ def test_a_radar_image_is_adjusted_by_its_clocks_and_said_to_be(tmp_path):
     ties = xy[:count].reshape(-1, 2) + rng.normal(0, 0.05, (3 * count, 2))
     index = np.tile(np.arange(3), count), np.repeat(np.arange(count), 3)
     write_matches(tmp_path / "ties.csv", Tracks(*index, ties, np.full(3 * count, 0.05)), ["a", "b", "radar"])
-    options = RunOptions(
-        matches=str(tmp_path / "ties.csv"), matches_only=True, adjust=AdjustOptions(fixed=("a", "b"))
-    )
+    options = RunOptions(matches=str(tmp_path / "ties.csv"), matches_only=True, adjust=AdjustOptions(fixed=("a", "b")))
     result = adjust(images, tmp_path / "out", options)
     told = result.adjustment.corrections[2]
     fresh = read_rpc(tmp_path / "out" / "radar_RPC.TXT")
     pixels = rng.uniform(50, np.array(SIZE) - 50, (200, 2))
     across = result.adjustment.sensors[2].localize(pixels, rng.uniform(*ALT, 200))
-    np.testing.assert_allclose(
-        fresh.project(across), result.adjustment.sensors[2].project(across), rtol=0, atol=1e-3
-    )
+    np.testing.assert_allclose(fresh.project(across), result.adjustment.sensors[2].project(across), rtol=0, atol=1e-3)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     correction = summary["views"][2]["correction"]
     assert correction["range_m"] == pytest.approx(told.coeffs[0, 0])

@@ -31,9 +31,7 @@ def epipolar(rpc_a, rpc_b, points):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("pair", "delivered"), list(zip(PAIRS, (0.69, 1.20, 0.53), strict=True)))
-def test_the_triplets_check_points_meet_within_three_hundredths_of_a_pixel(
-    shared_data, triplet, pair, delivered
-):
+def test_the_triplets_check_points_meet_within_three_hundredths_of_a_pixel(shared_data, triplet, pair, delivered):
     _, out = triplet
     points = check_points(shared_data, *pair)
     before = [read_rpc(shared_data / f"optical/phr_triplet_north/{name}.tif") for name in pair]
@@ -42,8 +40,7 @@ def test_the_triplets_check_points_meet_within_three_hundredths_of_a_pixel(
     median, spread = epipolar(*after, points)
     assert abs(median) <= 0.02
     noise = {
-        entry["pair"]: entry["ncc"]["mad"]
-        for entry in json.loads((shared_data / "truth/ties_index.json").read_text())
+        entry["pair"]: entry["ncc"]["mad"] for entry in json.loads((shared_data / "truth/ties_index.json").read_text())
     }
     assert spread <= 1.1 * noise["-".join(pair)]
 
@@ -85,8 +82,7 @@ SPOILT = {
     "enlarged": lambda views: [views[0], spoilt(views[1], scale=1e-2), views[2]],
     "enlarged a little": lambda views: [views[0], spoilt(views[1], scale=2e-3), views[2]],
     "swapped": lambda views: [
-        replace(v, sensor=other.sensor)
-        for v, other in zip(views, (views[1], views[0], views[2]), strict=True)
+        replace(v, sensor=other.sensor) for v, other in zip(views, (views[1], views[0], views[2]), strict=True)
     ],
 }
 
@@ -134,9 +130,7 @@ def test_check_points_seen_in_three_images_are_met_to_a_tenth_of_a_pixel(shared_
     # one in a hundred of the chained check points is a gross mismatch (up to 2.4 px)
     assert np.sqrt(np.sort(adjusted)[: int(0.99 * len(adjusted))].mean()) <= 0.10
     # with them, nobody can do better than cameras adjusted to the check points themselves
-    views = [
-        View(f"img_0{i}", "", (1024, 560), rpc, (0.0, 1000.0)) for i, rpc in enumerate(delivered, start=1)
-    ]
+    views = [View(f"img_0{i}", "", (1024, 560), rpc, (0.0, 1000.0)) for i, rpc in enumerate(delivered, start=1)]
     own = Tracks(view, point, chained.reshape(-1, 2), np.full(len(view), 0.1))
     best = adjust_tracks(views, own, AdjustOptions(loss="linear"), hold_out=False)
     assert best.inlier.all()
@@ -145,9 +139,7 @@ def test_check_points_seen_in_three_images_are_met_to_a_tenth_of_a_pixel(shared_
 
 @pytest.mark.slow  # whole images; before a commit: the same pair's tie points, tests/tie/test_real_images.py
 @pytest.mark.parametrize(("which", "delivered"), [("ventoux_biased", 20.6), ("ventoux", 4.8)])
-def test_ventoux_with_little_overlap_is_met_within_five_hundredths_of_a_pixel(
-    request, shared_data, which, delivered
-):
+def test_ventoux_with_little_overlap_is_met_within_five_hundredths_of_a_pixel(request, shared_data, which, delivered):
     result, out = request.getfixturevalue(which)
     points = check_points(shared_data, "left_image", "right_image")
     before = [view.sensor for view in result.run.views]

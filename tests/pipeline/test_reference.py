@@ -160,9 +160,7 @@ def quickbird(shared_data, tmp_path_factory):
         options.setdefault("dem", str(folder / "dem.tif"))
         given = RunOptions(reference=tuple(map(str, paths)), overwrite=True, **options)
         result = adjust([image], out / "run", given)
-        error = (
-            read_rpc(out / "run" / f"{image.stem}.vrt").project(points.lonlatalt)[points.point] - points.xy
-        )
+        error = read_rpc(out / "run" / f"{image.stem}.vrt").project(points.lonlatalt)[points.point] - points.xy
         return result, np.sqrt((error**2).mean(axis=0))
 
     return run
@@ -236,9 +234,7 @@ def test_heights_of_another_terrain_under_a_reference_are_the_reason(quickbird, 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
 def test_one_image_that_a_reference_does_not_show_is_told_so_and_not_to_loosen_the_matching(quickbird):
-    with pytest.raises(
-        TiePointError, match=r"the reference does not show what the images show \(its highest peak"
-    ):
+    with pytest.raises(TiePointError, match=r"the reference does not show what the images show \(its highest peak"):
         quickbird(60.0)
 
 

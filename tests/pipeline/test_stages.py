@@ -121,9 +121,7 @@ def test_matches_of_a_pair_are_the_same_whatever_the_order_of_the_file(tmp_path)
         assert set(matches) <= {(0, 1), (1, 2), (0, 2)}
         found.append({pair: one.xy.tolist() for pair, one in matches.items()})
         for (i, j), one in matches.items():
-            np.testing.assert_array_equal(
-                one.xy[:, 1, 0] - one.xy[:, 0, 0], np.full(len(one.xy), 10.0 * (j - i))
-            )
+            np.testing.assert_array_equal(one.xy[:, 1, 0] - one.xy[:, 0, 0], np.full(len(one.xy), 10.0 * (j - i)))
             assert (one.score == 0).all()
     assert found[0] == found[1] == found[2]
 
@@ -222,15 +220,11 @@ def test_of_each_track_with_something_new_the_surest_old_observation_is_kept(see
 # --- what is read before any work -------------------------------------------------------------------------
 
 
-def test_ground_points_that_are_left_out_are_said_and_references_are_looked_at(
-    tmp_path, caplog, monkeypatch
-) -> None:
+def test_ground_points_that_are_left_out_are_said_and_references_are_looked_at(tmp_path, caplog, monkeypatch) -> None:
     """Of GCPs and of check points, in the order given; a reference that is none stops the run here."""
     for name in ("g.csv", "c.csv"):
         (tmp_path / name).write_text("nothing\n")
-    given = RunOptions(
-        gcp=(str(tmp_path / "g.csv"),), check_points=(str(tmp_path / "c.csv"),), keep_going=True
-    )
+    given = RunOptions(gcp=(str(tmp_path / "g.csv"),), check_points=(str(tmp_path / "c.csv"),), keep_going=True)
     assert side_inputs(given, views()) == (None, None)
     lines = [record.getMessage() for record in caplog.records]
     assert [Path(line.split(",")[0]).name for line in lines] == ["g.csv", "c.csv"]
@@ -252,9 +246,7 @@ def test_the_page_is_named_where_it_can_be_drawn(tmp_path, monkeypatch, drawn) -
     monkeypatch.setattr("barpc.pipeline.outputs.can_render", lambda: drawn)
     names = output_names(views(), RunOptions(), tmp_path)
     assert ("report.html" in names) is drawn
-    assert (
-        "tables/gcps.geojson" in output_names(views(), RunOptions(dem="d", reference=("r",)), tmp_path)
-    ) is True
+    assert ("tables/gcps.geojson" in output_names(views(), RunOptions(dem="d", reference=("r",)), tmp_path)) is True
     assert "tables/gcps.geojson" not in names
     assert names[-1] == f"tables/{PRIOR}"
 
@@ -337,9 +329,7 @@ def test_a_new_rpc_states_the_error_of_the_scene_and_the_noise_of_the_old_one(si
     block = SimpleNamespace(gauge=SimpleNamespace(sigma=np.array(sigma)), sensors=[rpc] * 9)
     told: list[tuple[str, int, int]] = []
     run = replace(Run("adjust", given, (), NONE), adjustment=block)  # type: ignore[arg-type]
-    found = stages._fitted(
-        run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), None, lambda *now: told.append(now)
-    )
+    found = stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), None, lambda *now: told.append(now))
     assert len(found.fits) == 9
     for fit in found.fits:
         assert fit.rpc.err_bias == (None if stated is None else pytest.approx(stated))
@@ -375,13 +365,9 @@ def test_a_stage_that_is_one_task_says_its_beginning_and_its_end(corner, tmp_pat
     """Also where it ends in an error its beginning; nobody need listen."""
     told: list[tuple[str, int, int]] = []
     options = RunOptions(stop_after="adjustment")
-    result = stages.adjust(
-        corner.images[:2], tmp_path / "out", options, progress=lambda *now: told.append(now)
-    )
+    result = stages.adjust(corner.images[:2], tmp_path / "out", options, progress=lambda *now: told.append(now))
     single = ("adjustment", "block", "summary", "report")
-    assert [now for now in told if now[0] in single] == [
-        (name, done, 1) for name in single for done in (0, 1)
-    ]
+    assert [now for now in told if now[0] in single] == [(name, done, 1) for name in single for done in (0, 1)]
     took = [stage["stage"] for stage in result.summary["stages"]]
     assert took[-6:] == ["tie points", "adjustment", "block", "summary", "tables", "report"]
     told.clear()

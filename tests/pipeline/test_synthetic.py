@@ -18,18 +18,14 @@ from .known import SAMPLES, errors_at_check_points
 def test_exact_image_points_are_met_to_a_tenth_of_a_pixel(adjusted, known):
     result, out = adjusted
     before, _ = errors_at_check_points([view.sensor for view in result.run.views], known.truth)
-    after, _ = errors_at_check_points(
-        [read_rpc(out / f"{view.name}.vrt") for view in result.run.views], known.truth
-    )
+    after, _ = errors_at_check_points([read_rpc(out / f"{view.name}.vrt") for view in result.run.views], known.truth)
     assert before > 3
     assert after <= 0.02
 
 
 def test_the_scene_is_where_the_summary_says_it_may_be(adjusted, known):
     result, out = adjusted
-    _, offset = errors_at_check_points(
-        [read_rpc(out / f"{view.name}.vrt") for view in result.run.views], known.truth
-    )
+    _, offset = errors_at_check_points([read_rpc(out / f"{view.name}.vrt") for view in result.run.views], known.truth)
     sigma = np.array(result.summary["scene"]["sigma_enu_m"])
     assert (np.abs(offset) <= 3 * sigma).all()
     assert (sigma < [20, 20, 100]).all()

@@ -64,16 +64,12 @@ def test_views_stand_in_the_order_of_their_names_with_size_date_and_camera(pair)
     assert (found.left_out, found.worker_seconds) == ((), 0.0)
 
 
-@pytest.mark.parametrize(
-    ("count", "least", "passes"), [(0, 1, False), (1, 2, False), (1, 1, True), (2, 2, True)]
-)
+@pytest.mark.parametrize(("count", "least", "passes"), [(0, 1, False), (1, 2, False), (1, 1, True), (2, 2, True)])
 def test_as_many_images_as_are_needed(pair, count, least, passes) -> None:
     if passes:
         assert len(load_views(pair[:count], min_views=least).views) == count
         return
-    said = (
-        rf"{count} image\(s\) given \({'none' if not count else '.*a.tif'}\): at least {least} that overlap"
-    )
+    said = rf"{count} image\(s\) given \({'none' if not count else '.*a.tif'}\): at least {least} that overlap"
     with pytest.raises(InputError, match=said):
         load_views(pair[:count], min_views=least)
 
@@ -106,9 +102,7 @@ def test_a_view_brings_its_own_camera_altitudes_and_date_and_its_size_is_that_of
     (found,) = load_views([given], min_views=1).views
     assert (found.name, found.alt_range, found.date) == ("a", (100.0, 400.0), "2020-01-02")
     assert found.sensor == given.sensor
-    with pytest.raises(
-        InputError, match=rf"is \({WIDE}, {HIGH}\) px large, but its view says \({WIDE}, 80\)"
-    ):
+    with pytest.raises(InputError, match=rf"is \({WIDE}, {HIGH}\) px large, but its view says \({WIDE}, 80\)"):
         load_views([replace(given, size=(WIDE, 80))], min_views=1)
 
 
@@ -188,9 +182,7 @@ def test_of_three_twins_the_first_is_kept(tmp_path) -> None:
     given = [placed(tmp_path, name, pixels_of(), shift) for shift, name in enumerate("abc")]
     found = load_views(given, keep_going=True, min_views=1)
     assert [view.name for view in found.views] == ["a"]
-    assert [reason.split(": ")[1].split(" as ")[0] for _, reason in found.left_out] == [
-        "shows the same pixels"
-    ] * 2
+    assert [reason.split(": ")[1].split(" as ")[0] for _, reason in found.left_out] == ["shows the same pixels"] * 2
 
 
 def test_one_pixel_makes_another_image_wherever_it_is(tmp_path) -> None:
@@ -275,9 +267,7 @@ def test_numbers_are_the_same_in_any_type() -> None:
     np.testing.assert_array_equal(of(np.array([1 + 2j, 3 - 1j], np.complex64)), [1.0, 2.0, 3.0, -1.0])
 
 
-def test_images_are_read_in_groups_and_by_other_workers_when_they_are_many(
-    pair, tmp_path, monkeypatch
-) -> None:
+def test_images_are_read_in_groups_and_by_other_workers_when_they_are_many(pair, tmp_path, monkeypatch) -> None:
     sizes: list[int] = []
     real = views.read_group
 

@@ -36,9 +36,7 @@ def colmap(folder: Path, geometries: bool = True, shift: float = 0.5, names: str
             ("matches", "pair_id"),
             ("two_view_geometries", "pair_id"),
         ):
-            db.execute(
-                f"CREATE TABLE {table} ({key} INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB)"
-            )
+            db.execute(f"CREATE TABLE {table} ({key} INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB)")
         ids = {"b": 3, "a": 5, "stranger": 6, "c": 8}
         for name, number in ids.items():
             xy = KEYPOINTS.get(name, np.zeros((1, 2)))
@@ -52,9 +50,7 @@ def colmap(folder: Path, geometries: bool = True, shift: float = 0.5, names: str
             raw = np.vstack([found, [[0, 0]]]).astype("<u4") if geometries else found
             db.execute("INSERT INTO matches VALUES (?, ?, 2, ?)", (pair, len(raw), raw.tobytes()))
             if geometries:
-                db.execute(
-                    "INSERT INTO two_view_geometries VALUES (?, ?, 2, ?)", (pair, len(found), found.tobytes())
-                )
+                db.execute("INSERT INTO two_view_geometries VALUES (?, ?, 2, ?)", (pair, len(found), found.tobytes()))
         db.commit()
     return path
 
@@ -99,9 +95,7 @@ def hloc(folder: Path, kind: str = "hloc") -> Path:
     with h5py.File(folder / ("feats.h5" if kind == "hloc" else "keypoints.h5"), "w") as features:
         for name, xy in KEYPOINTS.items():
             features[f"sub/{name}.tif/keypoints" if kind == "hloc" else f"{name}.tif"] = xy.astype(np.float32)
-        features["sub/a.tif/descriptors" if kind == "hloc" else "more/descriptors"] = np.ones(
-            (4, 3), np.float16
-        )
+        features["sub/a.tif/descriptors" if kind == "hloc" else "more/descriptors"] = np.ones((4, 3), np.float16)
     with h5py.File(path, "w") as file:
         for (first, second), rows in MATCHES.items():
             if kind == "hloc":
@@ -132,10 +126,7 @@ def test_whoever_wrote_them_the_matches_are_the_same(tmp_path: Path, kind: str) 
     path = WRITTEN[kind](tmp_path)
     links = read_links(path, NAMES)
     found = {
-        tuple(
-            (NAMES[links.view[row]], *links.xy[row].tolist())
-            for row in sorted(ends, key=lambda r: links.view[r])
-        )
+        tuple((NAMES[links.view[row]], *links.xy[row].tolist()) for row in sorted(ends, key=lambda r: links.view[r]))
         for ends in links.ends.tolist()
     }
     assert found == {
@@ -187,9 +178,7 @@ def unfinished(folder: Path) -> Path:
 
 def npz(**arrays: object):
     def prepare(folder: Path) -> Path:
-        np.savez(
-            folder / "a__b.npz", **{"keypoints0": np.ones((2, 2)), "keypoints1": np.ones((2, 2)), **arrays}
-        )
+        np.savez(folder / "a__b.npz", **{"keypoints0": np.ones((2, 2)), "keypoints1": np.ones((2, 2)), **arrays})
         return folder / "a__b.npz"
 
     return prepare
@@ -292,9 +281,7 @@ LIES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if "gigabyte" in n else n for n in LIES]
-)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if "gigabyte" in n else n for n in LIES])
 def test_a_file_that_lies_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
     prepare, says = LIES[name]
     path = prepare(tmp_path)
@@ -365,18 +352,14 @@ FEATURES = {
     "within": {f"{name}.tif/keypoints": xy for name, xy in KEYPOINTS.items()},
     "plain": {f"{name}.tif": xy for name, xy in KEYPOINTS.items()},
 }
-FEATURES["hloc"]["sub/a.tif/descriptors"] = FEATURES["plain"]["more/descriptors"] = np.ones(
-    (4, 3), np.float16
-)
+FEATURES["hloc"]["sub/a.tif/descriptors"] = FEATURES["plain"]["more/descriptors"] = np.ones((4, 3), np.float16)
 FEATURES["plain"]["scores"] = np.ones(4)
 
 
 @pytest.mark.parametrize(
     ("kind", "beside"), [("hloc", "feats.h5"), ("plain", "keypoints.h5"), ("plain", "features.h5")]
 )
-def test_keypoints_and_matches_of_two_files_are_found_by_their_places(
-    tmp_path, monkeypatch, kind, beside
-) -> None:
+def test_keypoints_and_matches_of_two_files_are_found_by_their_places(tmp_path, monkeypatch, kind, beside) -> None:
     matches: dict[str, np.ndarray] = {}
     for (first, second), rows in MATCHES.items():
         partner = np.full(len(KEYPOINTS[first]), -1)
@@ -397,9 +380,7 @@ def test_keypoints_and_matches_of_two_files_are_found_by_their_places(
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
     assert len(read_links(path, NAMES[:2]).ends) == 3
     (tmp_path / beside).unlink()
-    with pytest.raises(
-        InputError, match=r"holds no keypoints; they are looked for beside it as feats\.h5, features"
-    ):
+    with pytest.raises(InputError, match=r"holds no keypoints; they are looked for beside it as feats\.h5, features"):
         read_matches(path, NAMES)
 
 
@@ -456,9 +437,7 @@ def test_without_h5py_it_is_said_what_is_missing(tmp_path: Path, monkeypatch: py
         read_links(tmp_path / "m.h5", NAMES)
 
 
-def test_a_database_is_held_to_what_its_numbers_become(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_database_is_held_to_what_its_numbers_become(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Coordinates and numbers are kept in four bytes and worked on in eight."""
     path = colmap(tmp_path)
     keypoints = sum(4 * len(KEYPOINTS[name]) for name in "ab")

@@ -77,9 +77,7 @@ def test_a_table_names_its_columns_in_any_order_and_any_of_their_words(tmp_path,
         ("sigma,sigma_px", ",", (1, 1, 1), 0.5),
     ],
 )
-def test_accuracies_are_those_that_are_stated_the_nearest_word_first(
-    tmp_path, columns, cells, ground, pixels
-) -> None:
+def test_accuracies_are_those_that_are_stated_the_nearest_word_first(tmp_path, columns, cells, ground, pixels) -> None:
     found = gcps(tmp_path, f"image,lon,lat,alt,col,row,{columns}\nleft,5,43,100,1,2,{cells}\n")
     assert found.sigma.tolist() == [list(ground)]
     assert found.xy_sigma.tolist() == [pixels]
@@ -98,9 +96,7 @@ def test_of_one_image_a_table_need_not_name_it_of_two_it_must(tmp_path) -> None:
 
 @pytest.mark.parametrize("word", ["sigma_up_m", "stdev_z", "std", "accuracy_m", "error", "err_x"])
 def test_an_accuracy_by_a_word_that_is_not_read_is_refused(tmp_path, word) -> None:
-    with pytest.raises(
-        InputError, match=f"column '{word}' is none that is read; accuracies are called sigma,"
-    ):
+    with pytest.raises(InputError, match=f"column '{word}' is none that is read; accuracies are called sigma,"):
         gcps(tmp_path, f"image,lon,lat,alt,col,row,{word}\nleft,5,43,100,1,2,1\n")
     assert len(gcps(tmp_path, f"image,lon,lat,alt,col,row,my_{word}\nleft,5,43,100,1,2,1\n").names) == 1
 
@@ -148,9 +144,7 @@ def test_geojson_states_sigmas_and_strangers(tmp_path) -> None:
         return {"properties": {"ji": [1, 2], "filename": "left", **properties}, "geometry": place}
 
     path = tmp_path / "a.geojson"
-    path.write_text(
-        json.dumps({"features": [feature(sigma_m=[1, 2, 3], sigma_px=0.25), feature(filename="far")]})
-    )
+    path.write_text(json.dumps({"features": [feature(sigma_m=[1, 2, 3], sigma_px=0.25), feature(filename="far")]}))
     found = read_gcps(path, NAMES)
     assert found.sigma.tolist() == [[1, 2, 3]]
     assert found.xy_sigma.tolist() == [0.25]
@@ -178,9 +172,7 @@ def test_tags_without_an_altitude_or_a_name(tmp_path) -> None:
         ):
             pass
 
-    tagged(
-        *(GroundControlPoint(row=k, col=1, x=5.4, y=43.2, z=100.0, id=name) for k, name in enumerate("ab"))
-    )
+    tagged(*(GroundControlPoint(row=k, col=1, x=5.4, y=43.2, z=100.0, id=name) for k, name in enumerate("ab")))
     found = read_gcps(path, NAMES)
     assert found.xy.tolist() == [[1.0, 0.0], [1.0, 1.0]]
     assert (found.sigma == 1.0).all()
@@ -411,9 +403,7 @@ def test_a_view_is_found_by_its_name_its_file_or_its_stem() -> None:
 
 def test_a_table_of_matches_may_state_a_sigma_and_name_others(tmp_path) -> None:
     path = tmp_path / "m.csv"
-    path.write_text(
-        "Image,Col,Row,Track,Sigma\na,1,2,t,0.25\nb,3,4,t,0.5\nother,5,6,t,1\na,7,8,s,1\nb,9,9,s,1\n"
-    )
+    path.write_text("Image,Col,Row,Track,Sigma\na,1,2,t,0.25\nb,3,4,t,0.5\nother,5,6,t,1\na,7,8,s,1\nb,9,9,s,1\n")
     links = read_links(path, ["a", "b"])
     assert links.sigma.tolist() == [0.25, 0.5, 1.0, 1.0]
     found = read_matches(path, ["b", "a"])

@@ -117,9 +117,7 @@ def overviews_in_a_tiff(trap: Trap) -> bytes:
     path = trap.canary.with_name("tagged.tif")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        with rasterio.open(
-            path, "w", driver="GTiff", width=SIDE, height=SIDE, count=1, dtype="uint16"
-        ) as out:
+        with rasterio.open(path, "w", driver="GTiff", width=SIDE, height=SIDE, count=1, dtype="uint16") as out:
             out.write(np.arange(SIDE * SIDE, dtype=np.uint16).reshape(1, SIDE, SIDE))
             out.update_tags(ns="OVERVIEWS", OVERVIEW_FILE=trap.remote)
             out.update_tags(ns="MASK", MASK_FILE=trap.remote)
@@ -134,9 +132,7 @@ def boxes_of_a_jp2(trap: Trap) -> bytes:
     path = trap.canary.with_name("boxed.jp2")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        with rasterio.open(
-            path, "w", driver="JP2OpenJPEG", width=64, height=64, count=1, dtype="uint8"
-        ) as out:
+        with rasterio.open(path, "w", driver="JP2OpenJPEG", width=64, height=64, count=1, dtype="uint8") as out:
             out.write(np.zeros((1, 64, 64), np.uint8))
     data = path.read_bytes()
     path.unlink()
@@ -176,9 +172,7 @@ PANSHARPENED = (
     "</SourceFilename><SourceBand>1</SourceBand></PanchroBand><SpectralBand dstBand='1'><SourceFilename>{0}"
     "</SourceFilename><SourceBand>1</SourceBand></SpectralBand></PansharpeningOptions></VRTDataset>"
 )
-TILES = (
-    "<GDALTileIndexDataset><IndexDataset>{}</IndexDataset><IndexLayer>a</IndexLayer></GDALTileIndexDataset>"
-)
+TILES = "<GDALTileIndexDataset><IndexDataset>{}</IndexDataset><IndexLayer>a</IndexLayer></GDALTileIndexDataset>"
 GRID = "ncols 3\nnrows 3\nxllcorner 5\nyllcorner 44\ncellsize 0.1\n1 2 3\n4 5 6\n7 8 9\n"
 
 CONTENTS: dict[str, Callable[[Trap], str | bytes]] = {
@@ -195,17 +189,11 @@ CONTENTS: dict[str, Callable[[Trap], str | bytes]] = {
         "<Simple", "<!--> --><Simple"
     ),
     "source, behind an instruction": lambda t: attribute(t, t.url).replace("<Simple", "<?x y='>'?><Simple"),
-    "source, unquoted and unclosed": lambda t: (
-        attribute(t, t.url).replace('"160"', "160").replace("</VRTDataset>", "")
-    ),
+    "source, unquoted and unclosed": lambda t: attribute(t, t.url).replace('"160"', "160").replace("</VRTDataset>", ""),
     "source, a namespace": lambda t: (
-        attribute(t, t.url)
-        .replace("SimpleSource", "v:SimpleSource")
-        .replace("<VRTDataset", '<VRTDataset xmlns:v="v"')
+        attribute(t, t.url).replace("SimpleSource", "v:SimpleSource").replace("<VRTDataset", '<VRTDataset xmlns:v="v"')
     ),
-    "source, twice": lambda t: t.vrt(
-        f"{t.raster.with_name('good.tif')}</SourceFilename><SourceFilename>{t.url}"
-    ),
+    "source, twice": lambda t: t.vrt(f"{t.raster.with_name('good.tif')}</SourceFilename><SourceFilename>{t.url}"),
     "source, with options": lambda t: t.band(
         f"<SimpleSource><SourceFilename>{t.remote}</SourceFilename><OpenOptions><OOI key='a'>b</OOI></OpenOptions>"
         "</SimpleSource>"
@@ -230,9 +218,7 @@ CONTENTS: dict[str, Callable[[Trap], str | bytes]] = {
     "source, a service of tiles": indirect("WMTS:URL"),
     "source, a service of coverages": indirect("WCS:URL"),
     "source, Zarr": indirect('ZARR:"REMOTE"'),
-    "a mask, element": lambda t: mask(
-        t, f"<SimpleSource><SourceFilename>{t.url}</SourceFilename></SimpleSource>"
-    ),
+    "a mask, element": lambda t: mask(t, f"<SimpleSource><SourceFilename>{t.url}</SourceFilename></SimpleSource>"),
     "a mask, attribute": lambda t: mask(t, f'<SimpleSource SourceFilename="{t.url}" SourceBand="1"/>'),
     "an overview, element": lambda t: t.vrt(t.raster.with_name("good.tif")).replace(
         "</VRTRasterBand>",
@@ -279,16 +265,12 @@ CONTENTS: dict[str, Callable[[Trap], str | bytes]] = {
     "itself": lambda t: t.vrt("ITSELF"),
     "a web service": Trap.wms,
     "a web service with a VRT in it": lambda t: t.wms().replace("<DataWindow>", "<VRTDataset/><DataWindow>"),
-    "a service of tiles": lambda t: (
-        f"<GDAL_WMTS><GetCapabilitiesUrl>{t.url}</GetCapabilitiesUrl></GDAL_WMTS>"
-    ),
+    "a service of tiles": lambda t: f"<GDAL_WMTS><GetCapabilitiesUrl>{t.url}</GetCapabilitiesUrl></GDAL_WMTS>",
     "a service of coverages": lambda t: (
         f"<WCS_GDAL><ServiceURL>{t.url}?</ServiceURL><CoverageName>a</CoverageName></WCS_GDAL>"
     ),
     "an index of tiles": lambda t: TILES.format(t.url),
-    "a STAC item": lambda t: (
-        f'{{"type":"Feature","stac_version":"1.0.0","assets":{{"a":{{"href":"{t.url}"}}}}}}'
-    ),
+    "a STAC item": lambda t: f'{{"type":"Feature","stac_version":"1.0.0","assets":{{"a":{{"href":"{t.url}"}}}}}}',
     "a grid of text": lambda t: GRID,
     "a VRT in a NITF": lambda t: "NITF02.10 " + t.vrt(t.url),
     "a TIFF with overviews elsewhere": overviews_in_a_tiff,

@@ -111,9 +111,7 @@ def test_an_inverse_that_does_not_converge_is_no_crash(monkeypatch) -> None:
 def test_an_archive_counts_what_its_numbers_become(tmp_path: Path) -> None:
     """510 kB of bytes that are all alike would be 3.9 GB of doubles."""
     data = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        data, {"descr": "|u1", "fortran_order": False, "shape": (300_000_000,)}
-    )
+    np.lib.format.write_array_header_1_0(data, {"descr": "|u1", "fortran_order": False, "shape": (300_000_000,)})
     with (
         zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive,
         archive.open("xy.npy", "w") as file,
@@ -149,12 +147,8 @@ def test_hdf5_that_claims_more_than_it_holds_or_nests_without_end_is_refused(tmp
 def _colmap(path: Path) -> None:
     with sqlite3.connect(path) as database:
         database.execute("CREATE TABLE images (image_id INTEGER PRIMARY KEY, name TEXT)")
-        database.execute(
-            "CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB)"
-        )
-        database.execute(
-            "CREATE TABLE matches (pair_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB)"
-        )
+        database.execute("CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB)")
+        database.execute("CREATE TABLE matches (pair_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB)")
         xy = np.arange(20, dtype="<f4").reshape(10, 2)
         for number, name in enumerate(("a.tif", "b.tif"), start=1):
             database.execute("INSERT INTO images VALUES (?, ?)", (number, name))
@@ -176,9 +170,7 @@ def test_a_database_with_a_journal_that_counts_is_not_read(tmp_path: Path) -> No
     if not journal.exists():
         pytest.skip("this SQLite keeps its journal in memory")
     if any(journal.read_bytes()[:8]):
-        with pytest.raises(
-            InputError, match=r"another program has not finished writing it \(database\.db-journal\)"
-        ):
+        with pytest.raises(InputError, match=r"another program has not finished writing it \(database\.db-journal\)"):
             read_links(path, ["a", "b"])
     writer.execute("ROLLBACK")
     writer.close()
@@ -223,9 +215,7 @@ def test_no_reader_shows_lines_of_a_text_that_is_none_of_its_files(tmp_path, rea
     from barpc.pointio.correspondences import read_correspondences, read_gcps
 
     secret = tmp_path / "secret"
-    secret.write_text(
-        "the-key-of-the-house is under, the, stone, 42\nand the gate is open on mondays, 1, 2, 3\n"
-    )
+    secret.write_text("the-key-of-the-house is under, the, stone, 42\nand the gate is open on mondays, 1, 2, 3\n")
     name = {"matches": "m.csv", "gcp": "g.csv", "points": "p.csv", "asp": "g.gcp"}[reader]
     (tmp_path / name).symlink_to(secret)
     read = {

@@ -59,8 +59,7 @@ def given(*more: object, **files: str | bytes) -> Prepare:
 
     def prepare(scene: Scene) -> Args:
         paths = {
-            name.replace("__", "."): scene.file(name.replace("__", "."), content)
-            for name, content in files.items()
+            name.replace("__", "."): scene.file(name.replace("__", "."), content) for name, content in files.items()
         }
         return [scene.a, scene.b, *(paths.get(str(word), word) for word in more)]
 
@@ -137,9 +136,7 @@ def everywhere(**where: float) -> Prepare:
 def dem(path: Path, west: float, north: float, height: float, crs: str | None = "EPSG:4979") -> Path:
     grid = np.full((50, 50), height, np.float32)
     place = {"transform": rasterio.Affine(0.01, 0, west, 0, -0.01, north)} | ({"crs": crs} if crs else {})
-    with rasterio.open(
-        path, "w", driver="GTiff", width=50, height=50, count=1, dtype="float32", **place
-    ) as out:
+    with rasterio.open(path, "w", driver="GTiff", width=50, height=50, count=1, dtype="float32", **place) as out:
         out.write(grid, 1)
     return path
 
@@ -449,9 +446,7 @@ AT_WORK = (  # told or borne after much work or waiting, or after dask is import
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in AT_WORK)) for name in FAULTS]
-)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in AT_WORK)) for name in FAULTS])
 def test_a_fault_is_one_line_and_leaves_nothing(name, scene, tmp_path, monkeypatch):
     prepare, code, words = FAULTS[name]
     monkeypatch.chdir(scene.folder)

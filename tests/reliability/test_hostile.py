@@ -35,9 +35,7 @@ def trap(tmp_path: Path) -> Iterator[Trap]:
     canary, raster = outside / "canary.txt", outside / "canary.tif"
     canary.write_text(SECRET)
     for path in (raster, outside / "good.tif"):
-        with rasterio.open(
-            path, "w", driver="GTiff", width=SIDE, height=SIDE, count=1, dtype="uint16"
-        ) as out:
+        with rasterio.open(path, "w", driver="GTiff", width=SIDE, height=SIDE, count=1, dtype="uint16") as out:
             out.write(np.full((1, SIDE, SIDE), 4242, np.uint16))
     with served(canary, raster) as found:
         libc = ctypes.CDLL(None, use_errno=True)
@@ -70,11 +68,7 @@ class Evil:
 
 def evil_npz(path: Path, victim: Path, *names: str) -> Path:
     """An archive whose arrays are pickles."""
-    header = (
-        b"\x93NUMPY\x01\x00v\x00"
-        + b"{'descr': '|O', 'fortran_order': False, 'shape': (1,), }".ljust(117)
-        + b"\n"
-    )
+    header = b"\x93NUMPY\x01\x00v\x00" + b"{'descr': '|O', 'fortran_order': False, 'shape': (1,), }".ljust(117) + b"\n"
     with zipfile.ZipFile(path, "w") as archive:
         for name in names:
             archive.writestr(f"{name}.npy", header + pickle.dumps(Evil(victim)))

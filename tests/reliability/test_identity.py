@@ -103,9 +103,7 @@ def test_an_image_that_is_replaced_at_work_ends_the_run_and_leaves_nothing_wrong
             done.append(name)
             change(images[0], new)
 
-    with pytest.raises(
-        InputError, match=rf"{images[0].name}: was changed or replaced while the run was at work"
-    ):
+    with pytest.raises(InputError, match=rf"{images[0].name}: was changed or replaced while the run was at work"):
         adjust(images, tmp_path / "out", AGAIN, progress=progress)
     assert done
     assert not [path for path in (tmp_path / "out").rglob("*") if path.suffix in (".vrt", ".TXT", ".html")]

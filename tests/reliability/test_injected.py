@@ -36,9 +36,7 @@ def work(folder: Path) -> None:
 
 
 @contextmanager
-def failing(
-    monkeypatch: pytest.MonkeyPatch, where: Any, name: str, when: int, code: int
-) -> Iterator[list[int]]:
+def failing(monkeypatch: pytest.MonkeyPatch, where: Any, name: str, when: int, code: int) -> Iterator[list[int]]:
     """The `when`-th call of `where.name` raises; the list gets a number for each call."""
     real: Callable[..., Any] = getattr(where, name)
     seen: list[int] = []

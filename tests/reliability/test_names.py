@@ -68,9 +68,7 @@ def short(names: object) -> str:
 
 def placed(folder: Path, pristine: list[Path], names: list[str]) -> list[Path]:
     folder.mkdir(parents=True)
-    return [
-        Path(shutil.copy(path, folder / f"{name}.tif")) for path, name in zip(pristine, names, strict=False)
-    ]
+    return [Path(shutil.copy(path, folder / f"{name}.tif")) for path, name in zip(pristine, names, strict=False)]
 
 
 def assert_printable(said: Said) -> None:
@@ -135,8 +133,7 @@ def test_a_name_goes_through_every_file_and_back(names, pristine, tmp_path):
         with rasterio.open(out / f"{name}.vrt") as vrt, rasterio.open(view["path"]) as image:
             assert (vrt.read(1) == image.read(1)).all()
     assert [
-        f["properties"]["name"]
-        for f in json.loads((out / "tables/footprints.geojson").read_text())["features"]
+        f["properties"]["name"] for f in json.loads((out / "tables/footprints.geojson").read_text())["features"]
     ] == names
     for table, columns in (("observations.csv", 1), ("pairs.csv", 2)):
         with (out / "tables" / table).open(encoding="utf-8", newline="") as file:

@@ -120,9 +120,7 @@ def test_a_folder_of_a_release_without_hashes_is_left_as_it_is(crops, out, tmp_p
     state = json.loads((out / ".barpc/state.json").read_text())
     (out / ".barpc/state.json").write_text(json.dumps({**state, "outputs": sorted(state["outputs"])}))
     before = hashes([tmp_path])
-    assert_one_line(
-        barpc("adjust", *crops, "-o", out, "--overwrite"), 1, "not written by a run", "another -o"
-    )
+    assert_one_line(barpc("adjust", *crops, "-o", out, "--overwrite"), 1, "not written by a run", "another -o")
     assert hashes([tmp_path]) == before
 
 
@@ -147,9 +145,7 @@ def test_a_report_is_made_again_only_where_it_is_barpc_s(crops, out):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", rest_slow([9, 2]))
-def test_stopped_between_two_outputs_the_same_command_finishes(
-    crops, ran, out, tmp_path, monkeypatch, number
-):
+def test_stopped_between_two_outputs_the_same_command_finishes(crops, ran, out, tmp_path, monkeypatch, number):
     rename, seen = Path.replace, []
 
     def counted(path: Path, target: Path) -> Path:
@@ -197,8 +193,7 @@ def test_a_converted_rpc_is_written_beside_its_image_and_another_one_only_when_t
     assert said.code == 0
     assert "is read in place of the RPC that" in said.err
     assert (
-        read_rpc(image).project([[5.4, 43.3, 100]]).tolist()
-        == read_rpc(crops[1]).project([[5.4, 43.3, 100]]).tolist()
+        read_rpc(image).project([[5.4, 43.3, 100]]).tolist() == read_rpc(crops[1]).project([[5.4, 43.3, 100]]).tolist()
     )
 
 

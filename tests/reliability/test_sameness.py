@@ -62,9 +62,7 @@ def ways(scene: Path) -> dict[str, RunOptions]:
 
 
 SELDOM = {
-    **dict.fromkeys(
-        ("two passes", "a list of pairs", "an area", "an earlier run", "a bad file"), pytest.mark.slow
-    ),
+    **dict.fromkeys(("two passes", "a list of pairs", "an area", "an earlier run", "a bad file"), pytest.mark.slow),
     # in all orders below, or as with control points
     **dict.fromkeys(("the defaults", "given matches", "matches to be verified"), pytest.mark.nightly),
 }
@@ -132,9 +130,7 @@ def distance(first: AdjustResult, second: AdjustResult, names: dict[str, str] | 
 @pytest.mark.slow
 def test_the_order_of_rows_and_the_names_of_files_change_rounding_alone(scene, tmp_path):
     images = images_of(scene, "given matches")
-    given = RunOptions(
-        matches_only=True, matches=str(scene / "ties/matches.csv"), gcp=(str(scene / "gcps.geojson"),)
-    )
+    given = RunOptions(matches_only=True, matches=str(scene / "ties/matches.csv"), gcp=(str(scene / "gcps.geojson"),))
     result = adjust(images, tmp_path / "first", given)
     head, *rows = csv.reader((scene / "ties/matches.csv").read_text().splitlines())
     points = json.loads((scene / "gcps.geojson").read_text())
@@ -177,9 +173,7 @@ def test_the_same_pixels_in_other_dress_are_found(scene, tmp_path, how):
     images = images_of(scene, "")
     twin = copied(images[1], tmp_path / "twin.tif", **how)
     for order in ([*images, twin], [twin, *images]):
-        with pytest.raises(
-            InputError, match=r"view_01\.tif: shows the same pixels as .*twin\.tif under another"
-        ):
+        with pytest.raises(InputError, match=r"view_01\.tif: shows the same pixels as .*twin\.tif under another"):
             load_views(order)
 
 
@@ -239,9 +233,7 @@ def test_an_image_in_which_only_nan_differs_is_no_twin(scene, tmp_path):
         return change
 
     make = {"dtype": "float32", "camera": other_camera}
-    first = rewrite(
-        Path(shutil.copy(scene / "view_00.tif", tmp_path / "a.tif")), pixels=holes(3), dtype="float32"
-    )
+    first = rewrite(Path(shutil.copy(scene / "view_00.tif", tmp_path / "a.tif")), pixels=holes(3), dtype="float32")
     second = rewrite(Path(shutil.copy(scene / "view_00.tif", tmp_path / "b.tif")), pixels=holes(4), **make)
     third = rewrite(Path(shutil.copy(scene / "view_00.tif", tmp_path / "c.tif")), pixels=holes(3), **make)
     assert len(load_views([first, second]).views) == 2

@@ -33,9 +33,7 @@ def seen(folder: Path) -> dict[str, object]:
     found: dict[str, object] = {}
     for path in sorted(folder.glob("view_*.tif")):
         with open_raster(path) as image:
-            ground = open_camera(path).model.localize(
-                np.array([[0.0, 0.0], [99.0, 7.0]]), np.array([90.0, 99.0])
-            )
+            ground = open_camera(path).model.localize(np.array([[0.0, 0.0], [99.0, 7.0]]), np.array([90.0, 99.0]))
             found[path.name] = (path.read_bytes(), image.shape, ground.tobytes())
         with rasterio.open(path) as image:
             found[f"gdal {path.name}"] = str(image.rpcs)

@@ -213,9 +213,7 @@ def main() -> None:
     parser.add_argument("trials", type=int, nargs="?", default=50)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=1, help="worker processes of the killed runs")
-    parser.add_argument(
-        "--every-output", type=int, metavar="STEP", help="kill at every STEP-th output instead"
-    )
+    parser.add_argument("--every-output", type=int, metavar="STEP", help="kill at every STEP-th output instead")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         if given.every_output:

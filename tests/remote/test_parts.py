@@ -232,9 +232,7 @@ def test_a_part_is_what_was_asked_with_its_version():
     assert told(Answer(206, b"abcdef", ETag="t", **whole)) == Part(b"abcd", 20, "t")
     assert told(Answer(206, b"abcd", Last_Modified="d", **whole)) == Part(b"abcd", 20, "d")
     assert told(Answer(206, b"abcd", ETag="t", Last_Modified="d", **whole)).tag == "t"
-    assert told(Answer(206, b"ab", Content_Range="bytes 10-11/12")) == Part(
-        b"ab", 12, ""
-    )  # the end of the file
+    assert told(Answer(206, b"ab", Content_Range="bytes 10-11/12")) == Part(b"ab", 12, "")  # the end of the file
     with pytest.raises(web._PassingError, match="3 of 4 bytes"):
         told(Answer(206, b"abc", **whole))
 
@@ -372,9 +370,7 @@ def test_a_request_asks_for_the_bytes_as_they_are(made):
     assert type(made[1]).__name__ == "HTTPConnection"
 
 
-@pytest.mark.parametrize(
-    ("read", "ends", "kept"), [(True, False, True), (True, True, False), (False, False, False)]
-)
+@pytest.mark.parametrize(("read", "ends", "kept"), [(True, False, True), (True, True, False), (False, False, False)])
 def test_a_connection_is_kept_that_was_read_out_and_stays_open(made, monkeypatch, read, ends, kept):
     monkeypatch.setitem(globals(), "read_out", read)
     monkeypatch.setitem(globals(), "will_close", ends)
@@ -400,9 +396,7 @@ def test_all_that_is_kept_is_closed_at_the_end(made):
     assert [connection.closed for connection in made] == [True, True]
 
 
-@pytest.mark.parametrize(
-    "error", [HTTPException("x"), TimeoutError(), ConnectionResetError(), ssl.SSLError("x")]
-)
+@pytest.mark.parametrize("error", [HTTPException("x"), TimeoutError(), ConnectionResetError(), ssl.SSLError("x")])
 def test_a_host_that_breaks_off_may_do_better_next_time(made, monkeypatch, error):
     web._once("https://a.org/x", 10, 14)
     monkeypatch.setitem(globals(), "failure", error)

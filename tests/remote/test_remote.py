@@ -231,15 +231,11 @@ def test_an_empty_file_and_a_name_with_a_blank(server: Web) -> None:
     assert server.seen[-1] == "/my%20image.tif"
 
 
-@pytest.mark.parametrize(
-    "name", ["view_00.RPB", "view_00.rpb", "view_00_RPC.TXT", "view_00_rpc.txt", "view_00.geom"]
-)
+@pytest.mark.parametrize("name", ["view_00.RPB", "view_00.rpb", "view_00_RPC.TXT", "view_00_rpc.txt", "view_00.geom"])
 def test_a_file_beside_an_image_is_found_as_on_disk(samples: Web, tmp_path: Path, name: str) -> None:
     rpc = open_camera(SAMPLES / NAMES[1]).rpc
     shutil.copy(SAMPLES / NAMES[0], tmp_path / NAMES[0])
-    barpc.write_rpc(
-        rpc, tmp_path / name, format={".rpb": "rpb", ".txt": "txt"}.get(Path(name).suffix.lower(), "geom")
-    )
+    barpc.write_rpc(rpc, tmp_path / name, format={".rpb": "rpb", ".txt": "txt"}.get(Path(name).suffix.lower(), "geom"))
     shutil.copy(tmp_path / name, samples.folder / name)
     here = open_camera(tmp_path / NAMES[0])
     there = open_split(*split_spec(samples.url(NAMES[0]), (samples.host,)))
@@ -371,9 +367,7 @@ MOODS: dict[str, tuple[Mood, str, int]] = {  # what it does, what is said, how o
 
 
 @pytest.mark.parametrize("mood", MOODS)
-def test_a_host_that_misbehaves_costs_one_line(
-    samples: Web, monkeypatch: pytest.MonkeyPatch, mood: str
-) -> None:
+def test_a_host_that_misbehaves_costs_one_line(samples: Web, monkeypatch: pytest.MonkeyPatch, mood: str) -> None:
     monkeypatch.setattr(web, "TIMEOUT", 0.5 if mood == "drip" else 30.0)
     monkeypatch.setattr(web, "_SLOWEST", 1_000_000)
     samples.mood, said, times = MOODS[mood]
@@ -388,10 +382,7 @@ def test_a_host_that_misbehaves_costs_one_line(
 def test_what_passes_is_asked_again(samples: Web, failing: int) -> None:
     left = [500, 503, 429][:failing]
     samples.mood = lambda handler, *_: bool(left) and (handler.answer(left.pop()) or True)
-    assert (
-        read_bytes(located(samples.url(NAMES[0]), (samples.host,)), IMAGE)
-        == (SAMPLES / NAMES[0]).read_bytes()
-    )
+    assert read_bytes(located(samples.url(NAMES[0]), (samples.host,)), IMAGE) == (SAMPLES / NAMES[0]).read_bytes()
     assert not left
 
 
@@ -402,10 +393,7 @@ def test_a_move_within_the_host_is_followed(samples: Web) -> None:
         return moved
 
     samples.mood = mood
-    assert (
-        read_bytes(located(samples.url("old.tif"), (samples.host,)), IMAGE)
-        == (SAMPLES / NAMES[0]).read_bytes()
-    )
+    assert read_bytes(located(samples.url("old.tif"), (samples.host,)), IMAGE) == (SAMPLES / NAMES[0]).read_bytes()
 
 
 @pytest.mark.parametrize("kind", ["GTiff", "JPEG", "PNG", "JP2OpenJPEG"])
@@ -432,9 +420,7 @@ def test_no_pixels_are_made_of_a_file_whose_host_dies(server: Web, kind: str) ->
 
 def test_a_side_file_that_never_ends_is_refused_by_its_size(server: Web) -> None:
     def mood(handler: Any, part: bytes, start: int, _stop: int, _size: int) -> bool:
-        handler.answer(
-            206, b"x" * BLOCK, ETag="x", Content_Range=f"bytes {start}-{start + BLOCK - 1}/{10**15}"
-        )
+        handler.answer(206, b"x" * BLOCK, ETag="x", Content_Range=f"bytes {start}-{start + BLOCK - 1}/{10**15}")
         return True
 
     server.mood = mood

@@ -81,9 +81,7 @@ def store(server: str, monkeypatch: pytest.MonkeyPatch) -> Store:
 
 @pytest.mark.slow
 def test_a_bucket_is_read_by_itself_and_by_workers(store: Store, tmp_path: Path) -> None:
-    options = RunOptions(
-        images="copy", allow_remote=HOSTS, tie=TieOptions(keypoints_per_image=3000), stop_after="all"
-    )
+    options = RunOptions(images="copy", allow_remote=HOSTS, tie=TieOptions(keypoints_per_image=3000), stop_after="all")
     urls = [f"s3://scenes/a/{name}" for name in NAMES[:2]]
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         barpc.adjust(urls, tmp_path / "a", options, executor=pool)
@@ -120,9 +118,7 @@ def test_an_object_that_is_replaced_while_it_is_read_is_noticed(store: Store) ->
         ("s3://scenes/a", HOSTS, "folder|no such file"),
     ],
 )
-def test_what_cannot_be_read_costs_one_line(
-    store: Store, url: str, hosts: tuple[str, ...], said: str
-) -> None:
+def test_what_cannot_be_read_costs_one_line(store: Store, url: str, hosts: tuple[str, ...], said: str) -> None:
     with pytest.raises(ImageError, match=said) as caught, open_raster(located(url, hosts)):
         pass
     assert url in str(caught.value)

@@ -121,10 +121,7 @@ class Drawing:
     def texts(self, class_: str) -> list[tuple[str, float, float, str]]:
         """Texts: words, x, y, anchor."""
         found = self.all("text", class_)
-        return [
-            (e.text or "", float(e.get("x", "")), float(e.get("y", "")), e.get("text-anchor", ""))
-            for e in found
-        ]
+        return [(e.text or "", float(e.get("x", "")), float(e.get("y", "")), e.get("text-anchor", "")) for e in found]
 
     def titles(self, class_: str | None = None) -> list[str]:
         """What shapes say under the pointer, by the class of their group or of what stands in it."""

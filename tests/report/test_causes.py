@@ -50,9 +50,7 @@ def test_every_explanation_has_its_words() -> None:
     ],
 )  # fmt: skip
 def test_a_finding_is_said_with_its_place_and_size(kind, view, where, size, sentence, ends) -> None:
-    (found,) = explanations(
-        adjustment([Finding(kind, view, where, np.array(size), 42.0, 7.0, "", np.zeros(2))])
-    )
+    (found,) = explanations(adjustment([Finding(kind, view, where, np.array(size), 42.0, 7.0, "", np.zeros(2))]))
     assert found.sentence == sentence
     assert (found.name, found.image, found.gain, found.gap, found.runner_up) == (
         kind,
@@ -91,9 +89,7 @@ def test_images_that_settle_alike_are_said_once(rate: float, end: str) -> None:
     sizes = np.array([3.0, 4.0]), np.array([0.0, 1.0])
     each = [Finding(SETTLING, v, places[v], sizes[v], 90.0, 40.0, "moving", sizes[v]) for v in (0, 1)]
     (entry,) = explanations(adjustment(findings=each))
-    assert entry.sentence == (
-        f"rows at the {end} of all images lie off, by up to 5.00 px, which fades within 100 rows"
-    )
+    assert entry.sentence == (f"rows at the {end} of all images lie off, by up to 5.00 px, which fades within 100 rows")
     assert (entry.image, entry.gain, entry.runner_up, entry.size_px) == (None, 90.0, "moving", 5.0)
 
 

@@ -105,9 +105,7 @@ def test_how_much_is_shown_at_most():
 
 
 def test_an_axis_has_a_line_and_a_number_a_tick_and_its_title_below():
-    drawn = Drawing(
-        charts.sheet("k", "t", "d", 9, charts.x_axis(Scale(0.0, 2.0, 100.0, 200.0), 10.0, 50.0, "s [m]"))
-    )
+    drawn = Drawing(charts.sheet("k", "t", "d", 9, charts.x_axis(Scale(0.0, 2.0, 100.0, 200.0), 10.0, 50.0, "s [m]")))
     assert drawn.lines("grid")[::2] == [(100, 10, 100, 50), (150, 10, 150, 50), (200, 10, 200, 50)]
     assert drawn.texts("tick")[::2] == [
         ("0", 100, 63, "middle"),

@@ -29,9 +29,7 @@ FLAGS = [
     "--dump-dom",
 ]
 
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None, reason="no chromium on this machine (apt-get install chromium)"
-)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine (apt-get install chromium)")
 pytest.importorskip("jinja2")
 
 PROBE = Path(__file__).with_name("probe.js").read_text(encoding="utf-8")
@@ -46,9 +44,7 @@ def probe(html: str, width: int, folder, dark: bool = False) -> dict:
     )
     path = folder / f"probe_{width}_{dark}.html"
     path.write_text(wrapper, encoding="utf-8")
-    mode = (
-        ["--blink-settings=preferredColorScheme=0"] if dark else ["--blink-settings=preferredColorScheme=1"]
-    )
+    mode = ["--blink-settings=preferredColorScheme=0"] if dark else ["--blink-settings=preferredColorScheme=1"]
     command = [
         CHROMIUM,
         *FLAGS,

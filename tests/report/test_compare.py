@@ -137,9 +137,7 @@ def test_runs_of_other_images_of_the_same_names_are_not_compared(block_run, tmp_
         summary = json.loads((tmp_path / name / "summary.json").read_text())
         for view in summary["views"]:
             view["path"] = f"/{name}/{view['name']}.tif"
-        summary["inputs"] = [
-            {"path": view["path"], "bytes": 9, "sha256": digit * 64} for view in summary["views"]
-        ]
+        summary["inputs"] = [{"path": view["path"], "bytes": 9, "sha256": digit * 64} for view in summary["views"]]
         summary["inputs"][0]["sha256"] = "0" * 64  # but for the first
         (tmp_path / name / "summary.json").write_text(json.dumps(summary))
     found = compare_runs(tmp_path / "one", tmp_path / "two")
@@ -147,7 +145,5 @@ def test_runs_of_other_images_of_the_same_names_are_not_compared(block_run, tmp_
     assert found["only_a"] == found["only_b"] == [view.name for view in block_run.views[1:]]
     summary["inputs"][0]["sha256"] = "2" * 64
     (tmp_path / "two/summary.json").write_text(json.dumps(summary))
-    with pytest.raises(
-        InputError, match="are other files, so these runs have none in common: nothing to compare"
-    ):
+    with pytest.raises(InputError, match="are other files, so these runs have none in common: nothing to compare"):
         compare_runs(tmp_path / "one", tmp_path / "two")

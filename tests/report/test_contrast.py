@@ -10,9 +10,7 @@ import pytest
 
 from barpc import report
 
-CSS = re.search(
-    r"<style>(.*?)</style>", Path(report.__file__).with_name("template.html.j2").read_text(), re.DOTALL
-)[1]
+CSS = re.search(r"<style>(.*?)</style>", Path(report.__file__).with_name("template.html.j2").read_text(), re.DOTALL)[1]
 TEXT = ("fg", "muted", "after", "good", "look", "bad")
 DRAWN = ("before", "after", "good", "look", "bad", "third", "muted", "fg")
 PALE = ("line", "bg", "soft")  # what says nothing by itself: rules, grounds, outlines of letters
@@ -21,9 +19,7 @@ CHOSEN = 0.18  # of the colour `after` over a chosen row
 
 def palettes() -> dict[str, dict[str, str]]:
     """Colours by name; by day, by night and on paper."""
-    found = [
-        dict(re.findall(r"--(\w+): (#\w+)", part)) for part in re.findall(r":root \{( --bg[^}]*)\}", CSS)
-    ]
+    found = [dict(re.findall(r"--(\w+): (#\w+)", part)) for part in re.findall(r":root \{( --bg[^}]*)\}", CSS)]
     return dict(zip(("day", "night", "paper"), found, strict=True))
 
 
@@ -64,9 +60,7 @@ def test_text_can_be_read_and_lines_be_seen(light: str) -> None:
 
 def test_every_colour_in_use_is_one_that_is_judged() -> None:
     text = set(re.findall(r"[{ ;]color: var\(--(\w+)\)", CSS))
-    labels = set(
-        re.findall(r"\.(?:tick|axis|degrees|nodename, \.stack|matrix \.value) \{ fill: var\(--(\w+)\)", CSS)
-    )
+    labels = set(re.findall(r"\.(?:tick|axis|degrees|nodename, \.stack|matrix \.value) \{ fill: var\(--(\w+)\)", CSS))
     assert text | labels <= set(TEXT)
     assert len(text) > 4
     drawn = set(re.findall(r"(?:stroke|fill|background): var\(--(\w+)\)", CSS))

@@ -66,9 +66,7 @@ def test_the_page_shows_it_by_point_and_by_image(block_run):
     assert "w in images" in html
     assert 'id="t-control"' in html
     assert control_sentence(block_run.record) in html
-    without = replace(
-        block_run.record, views=tuple(replace(v, control_w=None) for v in block_run.record.views)
-    )
+    without = replace(block_run.record, views=tuple(replace(v, control_w=None) for v in block_run.record.views))
     assert 'id="t-control"' not in report_html(without, block_run.folder)
 
 

@@ -68,9 +68,7 @@ def test_check_points(num, seen, monkeypatch):
     run = run_of(check_points=gcps(num), after=())
     (line,) = [line for line in block_verdict(run, the_views(3, 9))["lines"] if "check point" in line]
     spoken([line])
-    assert line.startswith(
-        f"{num} check point{'s' * (num > 1)}, not used above, {'are' if num > 1 else 'is'} "
-    )
+    assert line.startswith(f"{num} check point{'s' * (num > 1)}, not used above, {'are' if num > 1 else 'is'} ")
     assert ("met to" in line) == seen
 
 
@@ -96,9 +94,7 @@ def test_the_answers_of_the_page(views, pairs, tracks):
     shown = the_views(views, tracks, correction=a_correction())
     found = [a_pair("A", "B", tracks)] * (pairs and views == 2)
     lengths = TracksEntry(tracks, 2 * tracks, {"2": tracks} if tracks else {})
-    summary = a_summary(
-        shown, found, tracks=lengths, gcps=tuple(a_gcp(f"g{k}", 5.0, 43.0) for k in range(tracks))
-    )
+    summary = a_summary(shown, found, tracks=lengths, gcps=tuple(a_gcp(f"g{k}", 5.0, 43.0) for k in range(tracks)))
     files = files_of(summary, [a_square(10.0, 0.0)] * views)
     made = [section for make in page.SECTIONS if (section := make(files)) is not None]
     assert len(made) >= 4

@@ -33,9 +33,7 @@ def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """The path of every field, of the first item of a list."""
     if at:
         yield at
-    items = (
-        value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
-    )
+    items = value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
     for key, item in items:
         yield from places(item, (*at, key))
 
@@ -122,9 +120,7 @@ def test_what_is_missing_is_named(block_run, tmp_path, key):
         assert key in str(result.exception)
 
 
-@pytest.mark.parametrize(
-    "name", ["../outside.json", "/outside.json", "inside/../../outside.json", "..", "link.json"]
-)
+@pytest.mark.parametrize("name", ["../outside.json", "/outside.json", "inside/../../outside.json", "..", "link.json"])
 def test_compare_opens_nothing_outside_the_folder(block_run, tmp_path, name, monkeypatch):
     folder = tmp_path / "run"
     shutil.copytree(block_run.folder, folder)

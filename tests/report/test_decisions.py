@@ -54,9 +54,7 @@ def test_what_tied_the_pairs_is_said_with_what_found_fewer(record):
     assert "tried again" not in plain
     assert second_attempts(matched(record).pairs) is None
     fewer = ("guided 12 of 100", "guided, loosened 20 of 100")
-    other = matched(
-        record, tied_by="structure", decoy_share=0.03, beaten=fewer, num_matches=240, chosen_by="same date"
-    )
+    other = matched(record, tied_by="structure", decoy_share=0.03, beaten=fewer, num_matches=240, chosen_by="same date")
     text = said(other)
     assert f"{count} pairs are tied: {count - 1} by guided, 1 by structure" in text
     assert "1 was tried again" in text
@@ -81,15 +79,9 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
     given = AskedEntry(image="B", smooth_px=0.31, smooth_p=3e-12, shared_px=0.12, num_images=3)
     assert record.options["adjust"]["drift"] is None
     plain = said(record, drift_degree=1, drift_sigma_m=(0.12,))
-    assert (
-        "with degree 1 (standard deviation at the first and last row: 12.0 cm): no F test asked for more"
-        in plain
-    )
+    assert "with degree 1 (standard deviation at the first and last row: 12.0 cm): no F test asked for more" in plain
     more = said(record, drift_degree=2, drift_sigma_m=(0.12, 0.3), drift_asked=given)
-    assert (
-        "with degree 2 (standard deviation at the first and last row: 12.0 cm, 30.0 cm): degree 1 left "
-        in more
-    )
+    assert "with degree 2 (standard deviation at the first and last row: 12.0 cm, 30.0 cm): degree 1 left " in more
     assert "0.31 px that was smooth in B (F test: p = 3e-12; below 1e-4 in 3 images)" in more
     assert "and neighbours shared 0.12 px" in more
     assert "no F test" not in more
@@ -116,14 +108,9 @@ def test_jitter_is_followed_looked_for_or_not_looked_for(record):
     assert "share 0.400 px" in said(with_views(calm, smooth))
     assert "share 0.000 px" in said(with_views(calm, {**smooth, "smooth_p": 0.2}))  # that is noise
     before = AskedEntry(image="B", smooth_px=0.5, smooth_p=1e-9, shared_px=0.0, num_images=2)
-    waving = with_views(
-        calm, {"jitter_px": 0.1, "jitter_rows": 500.0}, {"jitter_px": 0.3, "jitter_rows": 500.0}
-    )
+    waving = with_views(calm, {"jitter_px": 0.1, "jitter_rows": 500.0}, {"jitter_px": 0.3, "jitter_rows": 500.0})
     text = said(waving, jitter_asked=before)
-    assert (
-        f"Splines with a knot every 500 rows follow jitter in 2 images, up to 0.30 px RMS ({name}): without"
-        in text
-    )
+    assert f"Splines with a knot every 500 rows follow jitter in 2 images, up to 0.30 px RMS ({name}): without" in text
     assert "there was 0.50 px that was smooth in B (F test: p = 1e-09; below 1e-4 in 2 images)" in text
     assert "No jitter" not in text
     steps = said(with_views(calm, {"detectors": (100.0, 200.0), "detector_px": 0.1}))
@@ -136,9 +123,8 @@ def test_jitter_is_followed_looked_for_or_not_looked_for(record):
 
 def test_priors_hold_or_were_widened(record):
     held = with_views(record, *[{"prior_scale": 1.0}] * 9)
-    assert (
-        "Squared corrections are 0.7 times what the accuracies stated let expect: none was widened."
-        in said(held, prior_ratio=0.7)
+    assert "Squared corrections are 0.7 times what the accuracies stated let expect: none was widened." in said(
+        held, prior_ratio=0.7
     )
     text = said(with_views(held, {"prior_scale": 1.5}, {"prior_scale": 3.2}), prior_ratio=9.0)
     assert f"those of 2 images were widened, 3.2 times at most ({record.views[1].name})" in text
@@ -146,10 +132,7 @@ def test_priors_hold_or_were_widened(record):
     assert "Squared corrections" not in said(held, prior_ratio=None)
     assert "Taken as shared" not in text
     shared = said(held, prior_ratio=0.7, prior_shared=1.84)
-    assert (
-        "none was widened. Taken as shared by all images, the accuracies stated were widened 1.8 times."
-        in shared
-    )
+    assert "none was widened. Taken as shared by all images, the accuracies stated were widened 1.8 times." in shared
 
 
 def test_the_model_in_the_image_is_said_to_be_better(record):
@@ -215,9 +198,7 @@ def test_a_check_and_an_older_summary_say_what_they_know(check_run, record):
 
 
 def test_figures_that_decide_are_met_at_their_limits(record):
-    calm = with_views(
-        record, *[{"shared_px": 0.0, "smooth_px": 0.0, "smooth_p": 0.5, "prior_scale": 1.0}] * 9
-    )
+    calm = with_views(record, *[{"shared_px": 0.0, "smooth_px": 0.0, "smooth_p": 0.5, "prior_scale": 1.0}] * 9)
     assert "would be looked at" in said(with_views(calm, {"shared_px": 0.03}))
     assert "would be looked at" not in said(with_views(calm, {"shared_px": 0.031}))
     assert "share 0.000 px" in said(with_views(calm, {"smooth_px": 0.4, "smooth_p": 1e-4}))
@@ -237,21 +218,17 @@ def test_figures_that_decide_are_met_at_their_limits(record):
 def test_chance_is_said_to_put_none_below_a_tenth(record):
     test = ControlTestEntry(200, 3.29, 2, 0.1, 4.5, "B", "P3")
     assert "chance puts 0.1 (" in control_sentence(replace(record, control_test=test))
-    assert "chance puts none (" in control_sentence(
-        replace(record, control_test=replace(test, expected=0.099))
-    )
+    assert "chance puts none (" in control_sentence(replace(record, control_test=replace(test, expected=0.099)))
 
 
 def test_five_points_that_are_rejected_are_named(record):
     wrong = tuple(replace(record.gcps[0], name=f"P{k}", status="rejected", used=False) for k in range(7))
-    assert (
-        "0 of 7 GCPs that are seen hold the block; the images contradict P0, P1, P2, P3, P4 and 2 more."
-        in said(replace(record, gcps=wrong))
+    assert "0 of 7 GCPs that are seen hold the block; the images contradict P0, P1, P2, P3, P4 and 2 more." in said(
+        replace(record, gcps=wrong)
     )
     held = (*wrong[:6], replace(wrong[0], name="P6", status="used", used=True))
-    assert (
-        "1 of 7 GCPs that are seen hold the block; the rest contradicts P0, P1, P2, P3, P4 and 1 more."
-        in said(replace(record, gcps=held))
+    assert "1 of 7 GCPs that are seen hold the block; the rest contradicts P0, P1, P2, P3, P4 and 1 more." in said(
+        replace(record, gcps=held)
     )
 
 
@@ -317,9 +294,7 @@ def test_what_took_no_part_is_said_to_agree_or_where_it_does_not(record):
     agrees = "Tie points that took no part are met alike over rows, columns and cells of every image."
     assert agrees in said(record)
     assert agrees not in said(record, num_held_out=0)
-    one = HeldOutEntry(
-        "B", "Rows 0-99 of B: tie points there lie off", None, (0.0, 100.0), 20, 0.0, 0.2, 3e-7
-    )
+    one = HeldOutEntry("B", "Rows 0-99 of B: tie points there lie off", None, (0.0, 100.0), 20, 0.0, 0.2, 3e-7)
     text = said(record, held_out_places=(one,) * 4)
     assert text.count("Rows 0-99 of B: tie points there lie off (p < 3e-07).") == 3
     assert agrees not in text

@@ -133,9 +133,7 @@ def test_an_image_is_judged_by_tie_points_that_took_no_part(noise, said, block_r
     run = block_run.run
     of_views, rms = run.adjustment.held_out_noise.copy(), run.adjustment.held_out_rms.copy()
     of_views[3], rms[3] = noise, 0.31
-    summary = summarize(
-        replace(run, adjustment=replace(run.adjustment, held_out_noise=of_views, held_out_rms=rms))
-    )
+    summary = summarize(replace(run, adjustment=replace(run.adjustment, held_out_noise=of_views, held_out_rms=rms)))
     view = summary["views"][3]
     assert view["held_out_px"] == 0.31
     assert (view["status"] == "doubtful") == said
@@ -161,9 +159,7 @@ def test_images_held_by_control_points_alone_are_not_weak(block_run):
     run = block_run.run
     tracks = run.tracks.select(np.zeros(len(run.tracks), dtype=bool))
     none = np.zeros(0, dtype=bool)
-    adjustment = replace(
-        run.adjustment, inlier=none, held_out=none, moving=none, view=np.zeros(0, dtype=np.int64)
-    )
+    adjustment = replace(run.adjustment, inlier=none, held_out=none, moving=none, view=np.zeros(0, dtype=np.int64))
     summary = summarize(replace(run, tracks=tracks, adjustment=adjustment))
     assert {view["status"] for view in summary["views"] if view["num_gcps"] >= 3} == {"adjusted"}
     assert {view["status"] for view in summary["views"] if view["num_gcps"] < 3} <= {"weak"}

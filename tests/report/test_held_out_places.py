@@ -40,9 +40,7 @@ def test_a_good_block_says_that_they_agree(run: Run) -> None:
 
 
 @pytest.mark.parametrize("move", [(0.5, 0.0), (0.0, -4.0)])
-def test_rows_that_only_they_contradict_are_named_and_need_a_look(
-    run: Run, move: tuple[float, float]
-) -> None:
+def test_rows_that_only_they_contradict_are_named_and_need_a_look(run: Run, move: tuple[float, float]) -> None:
     summary = summarize(moved(run, 1, (0.0, 0.25), move))
     assert (summary.status, summary.passed) == ("look", False)  # exit code 3
     assert summary.scene is not None

@@ -117,9 +117,7 @@ def test_no_number_of_the_graticule_stands_at_the_sheet_s_edge():
         assert len(down) >= 1
 
 
-@pytest.mark.parametrize(
-    ("lon", "words"), [(180.0, "180° W"), (181.0, "179° W"), (179.0, "179° E"), (-1.0, "1° W")]
-)
+@pytest.mark.parametrize(("lon", "words"), [(180.0, "180° W"), (181.0, "179° W"), (179.0, "179° E"), (-1.0, "1° W")])
 def test_degrees_are_east_or_west_of_greenwich(lon, words):
     found = Plane(lon, 0.0, np.array([130.0, 130.0]), 300.0, 1e-3)
     assert words in [text for text, *_ in drawn_of(maps._graticule(found)[1]).texts("degrees")]
@@ -151,9 +149,7 @@ def test_the_ground_map_has_outlines_dots_lines_and_points():
     assert drawn.titles("outline adjusted") == ["A: 5 tie points"]
     (dots,) = drawn.all("path", "point")
     assert np.array(corners(dots.get("d"))) == pytest.approx(at(np.array(points)[:, :2]), abs=0.06)
-    assert drawn.titles("tie") == [
-        "A + 1 - C: 100 matches"
-    ]  # of all pairs between the stacks; none within one
+    assert drawn.titles("tie") == ["A + 1 - C: 100 matches"]  # of all pairs between the stacks; none within one
     middle = (at(outlines[0][0][:-1]).mean(axis=0), at(outlines[2][0][:-1]).mean(axis=0))
     assert drawn.lines("tie") == [pytest.approx(np.concatenate(middle), abs=0.006)]
     assert drawn.texts("stack") == [
@@ -231,10 +227,7 @@ def test_of_many_tie_points_and_images_some_are_drawn(monkeypatch):
     views, outlines, _ = scene()
     points = [(10.0 + 1e-6 * k, 0.0, 0.0, 0.0) for k in range(1501)]
     assert len(Drawing(ground_map(files_of(a_summary(views), outlines, points))).points("point")[0]) == 751
-    assert (
-        len(Drawing(ground_map(files_of(a_summary(views), outlines, points[:1500]))).points("point")[0])
-        == 1500
-    )
+    assert len(Drawing(ground_map(files_of(a_summary(views), outlines, points[:1500]))).points("point")[0]) == 1500
     monkeypatch.setattr(maps, "MAX_DRAWN", 2)
     drawn = Drawing(ground_map(files_of(a_summary(views), outlines)))
     assert [e.get("data-v") for e in drawn.all("g") if e.get("data-v")] == ["0", "2"]
@@ -286,12 +279,8 @@ def test_images_nearer_than_26_units_are_one_stack_whatever_cell_they_lie_in():
     outlines = [[np.array([[10 + (x - 210) / 100, (150 - y) / 200]] * 4)] for x, y in middles]
     found = maps._stacks(at, outlines, NAMES)
     assert [stack.views for stack in found] == [[0, 1], [2], [3], [4, 5]]
-    assert np.array([stack.place for stack in found]) == pytest.approx(
-        np.array([middles[k] for k in (0, 2, 3, 4)])
-    )
-    assert maps._stacks(at, [[], outlines[0]], NAMES)[0].views == [
-        1
-    ]  # an image that shows no ground has none
+    assert np.array([stack.place for stack in found]) == pytest.approx(np.array([middles[k] for k in (0, 2, 3, 4)]))
+    assert maps._stacks(at, [[], outlines[0]], NAMES)[0].views == [1]  # an image that shows no ground has none
 
 
 def test_of_two_stacks_as_near_the_earlier_takes_an_image():
@@ -333,9 +322,7 @@ def test_outlines_of_images_that_need_a_look_are_on_top_with_their_names():
     assert [text[0] for text in drawn.texts("stack failed")] == ["C"]
     assert not drawn.texts("stack")  # it would stand on that one
     many = [a_view(f"V{k}", **(bad if k in (100, 300) else {})) for k in range(500)]
-    drawn = Drawing(
-        ground_map(files_of(a_summary(many), [a_square(10.0 + 0.1 * k, 0.0) for k in range(500)]))
-    )
+    drawn = Drawing(ground_map(files_of(a_summary(many), [a_square(10.0 + 0.1 * k, 0.0) for k in range(500)])))
     assert [e.get("data-v") for e in drawn.all("g") if e.get("data-v")][-2:] == ["300", "100"]
     assert len(drawn.all("path", "outline doubtful")) == 2
     assert len(drawn.all("path", "outline adjusted")) <= 398
@@ -391,10 +378,7 @@ def test_a_panel_draws_residuals_cells_and_arrows_to_one_length():
     ]
     charts_of, shares, key = panels([*pushed, *one], views)
     longest = float(np.quantile([math.hypot(0.3, 0.02)] * 40 + [0.6], 0.95))
-    assert (
-        key
-        == f"A thin line of a 15th of a panel's width is {longest:.2g} px; bold arrows are drawn twice as long."
-    )
+    assert key == f"A thin line of a 15th of a panel's width is {longest:.2g} px; bold arrows are drawn twice as long."
     assert shares == [1.0, 0.0]
     assert [caption for _, caption in charts_of] == ["A: 100 % systematic", "B: 0 % systematic"]
     first, second = (Drawing(svg) for svg, _ in charts_of)
@@ -425,9 +409,7 @@ def test_a_panel_draws_residuals_cells_and_arrows_to_one_length():
     assert not second.all("path", "mean")
 
 
-@pytest.mark.parametrize(
-    ("size", "tall"), [((100, 100), 180), ((1000, 100), 72), ((100, 1000), 450), ((400, 200), 90)]
-)
+@pytest.mark.parametrize(("size", "tall"), [((100, 100), 180), ((1000, 100), 72), ((100, 1000), 450), ((400, 200), 90)])
 def test_a_panel_has_the_shape_of_its_image_within_reason(size, tall):
     charts_of, _, _ = panels([], [a_view(size=size)])
     drawn = Drawing(charts_of[0][0])
@@ -448,9 +430,7 @@ def test_a_very_large_error_is_no_darker_than_dark_and_its_arrow_no_longer_than_
     assert math.dist(*small) == pytest.approx(24.0, abs=0.02)
     tip, along = np.array(large[1]), np.array([3.0, 4.0])
     across = np.array([-4.0, 3.0]) * 0.6
-    assert np.array(barbs) == pytest.approx(
-        np.array([tip - along + across, tip, tip - along - across]), abs=0.011
-    )
+    assert np.array(barbs) == pytest.approx(np.array([tip - along + across, tip, tip - along - across]), abs=0.011)
 
 
 def test_a_short_arrow_has_a_short_head():
@@ -477,9 +457,7 @@ def test_of_many_residuals_every_few_th_is_drawn_and_of_many_images_the_most_sys
     assert found[0][1].startswith("V60: 100 %")
     flagged = maps.residual_panels(many, seen([*rows[:101], *pushed]), "after", [7, 3])
     assert [caption.split(":")[0] for _, caption in flagged[0][:3]] == ["V7", "V3", "V60"]
-    assert flagged[2].endswith(
-        "60 are shown: those that need a look, then those with the largest systematic part."
-    )
+    assert flagged[2].endswith("60 are shown: those that need a look, then those with the largest systematic part.")
     assert len(shares) == 61
     assert key.endswith(" Of 61 images 60 are shown: those with the largest systematic part.")
     assert "are shown" not in panels(rows, many[:60])[2]
@@ -496,18 +474,14 @@ def test_before_and_after_are_two_and_what_is_not_known_or_used_is_left_out():
     assert "is 1 px" in panels([(0, 1, (5, 5), (0, 0), (0.0, 0.0), True)], [a_view()])[2]
 
 
-@pytest.mark.parametrize(
-    ("x", "shown"), [(50.5, True), (49.5, False), (375.5, True), (376.5, False), (410.0, False)]
-)
+@pytest.mark.parametrize(("x", "shown"), [(50.5, True), (49.5, False), (375.5, True), (376.5, False), (410.0, False)])
 def test_a_meridian_has_room_for_its_number(x, shown):
     found = Plane(10.0 - (x - 210) / 200, 0.25, np.array([200.0, 200.0]), 300.0, 1e-3)
     lines = drawn_of(chain(*maps._graticule(found)[:2])).lines("grid")
     assert (any(line[0] == pytest.approx(x, abs=0.006) and line[0] == line[2] for line in lines)) == shown
 
 
-@pytest.mark.parametrize(
-    ("y", "shown"), [(16.5, True), (15.5, False), (255.5, True), (256.5, False), (270.0, False)]
-)
+@pytest.mark.parametrize(("y", "shown"), [(16.5, True), (15.5, False), (255.5, True), (256.5, False), (270.0, False)])
 def test_a_parallel_has_room_for_its_number(y, shown):
     found = Plane(10.25, (y - 150) / 200, np.array([200.0, 200.0]), 300.0, 1e-3)
     lines = drawn_of(chain(*maps._graticule(found)[:2])).lines("grid")

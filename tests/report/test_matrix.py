@@ -15,9 +15,7 @@ MATCHES, OFFSET, ANGLE = MEASURES
 
 
 def files(num: int, *pairs):
-    return files_of(
-        a_summary([a_view(name, num_observations=10 * k) for k, name in enumerate(names(num))], pairs)
-    )
+    return files_of(a_summary([a_view(name, num_observations=10 * k) for k, name in enumerate(names(num))], pairs))
 
 
 def names(num: int) -> list[str]:
@@ -113,8 +111,6 @@ def test_figures_stand_in_the_cells_of_twelve_images_at_most(num, written):
 
 
 def test_the_page_s_script_knows_names_and_figures():
-    found = facts(
-        files(3, a_pair("C", "B", 50, epipolar_after=None), a_pair("A", "B", 7, convergence_deg=12.34))
-    )
+    found = facts(files(3, a_pair("C", "B", 50, epipolar_after=None), a_pair("A", "B", 7, convergence_deg=12.34)))
     assert found["views"] == [["A", 0], ["B", 10], ["C", 20]]
     assert found["pairs"] == [[1, 2, "50", "", "20.0"], [0, 1, "7", "0.10", "12.3"]]

@@ -39,9 +39,7 @@ def tracks_of(*rows: tuple[int, int, float, float], sigma: float = 0.1) -> Track
 
 
 def test_pairs_have_the_observations_of_the_tracks_that_both_see():
-    tracks = tracks_of(
-        (0, 0, 1, 1), (0, 1, 2, 2), (0, 2, 3, 3), (1, 1, 4, 4), (1, 2, 5, 5), (2, 0, 6, 6), (2, 2, 7, 7)
-    )
+    tracks = tracks_of((0, 0, 1, 1), (0, 1, 2, 2), (0, 2, 3, 3), (1, 1, 4, 4), (1, 2, 5, 5), (2, 0, 6, 6), (2, 2, 7, 7))
     found = {ties.views: (ties.a.tolist(), ties.b.tolist()) for ties in pair_ties(tracks)}
     assert found == {(0, 1): ([0], [1]), (0, 2): ([0, 5], [2, 6]), (1, 2): ([1, 3], [2, 4])}
     assert list(found) == sorted(found)
@@ -308,9 +306,7 @@ def test_check_points_are_measured_with_the_new_cameras_or_the_old_ones(block_ru
         assert [entry.name for entry in entries] == list(points.names)
         for g, entry in enumerate(entries):
             rows = np.flatnonzero(points.point == g)
-            assert [seen.view for seen in entry.observations] == [
-                run.views[points.view[k]].name for k in rows
-            ]
+            assert [seen.view for seen in entry.observations] == [run.views[points.view[k]].name for k in rows]
             for k, seen in zip(rows, entry.observations, strict=True):
                 off = sensors[points.view[k]].project(points.lonlatalt[g]) - points.xy[k]
                 assert seen.residual_px == pytest.approx(off, abs=1e-9)
@@ -321,9 +317,7 @@ def test_check_points_are_measured_with_the_new_cameras_or_the_old_ones(block_ru
 
 
 def test_what_asked_for_more_is_the_image_with_the_largest_part_that_is_no_chance():
-    test = SmoothTest(
-        np.array([0.9, 0.4, 0.3]), np.array([1e-3, 1e-9, 1e-5]), np.zeros(3), np.array([0.1, 0.0, 0.35])
-    )
+    test = SmoothTest(np.array([0.9, 0.4, 0.3]), np.array([1e-3, 1e-9, 1e-5]), np.zeros(3), np.array([0.1, 0.0, 0.35]))
     adjustment = SimpleNamespace(asked={"drift": test}, names=("A", "B", "C"))
     found = _asked(adjustment, "drift")
     assert (found.image, found.smooth_px, found.smooth_p, found.shared_px, found.num_images) == (

@@ -52,7 +52,5 @@ def test_where_nothing_moves_or_nothing_was_adjusted_there_are_none() -> None:
     assert moving_cells(run_of(np.eye(4, 2), still, still)) == ()
     nothing: Any = SimpleNamespace(adjustment=None)
     assert moving_cells(nothing) == ()
-    (one,) = moving_cells(
-        run_of(np.array([(5.0, 43.0)] * 3), ~np.zeros(3, dtype=bool), np.zeros(3, dtype=bool))
-    )
+    (one,) = moving_cells(run_of(np.array([(5.0, 43.0)] * 3), ~np.zeros(3, dtype=bool), np.zeros(3, dtype=bool)))
     assert (one.count, one.share) == (3, 1.0)

@@ -41,9 +41,7 @@ def test_the_ellipse_and_the_shift_are_what_each_unknown_does(block_run, model):
             ahead, behind = (
                 replace(
                     sensor,
-                    correction=replace(
-                        sensor.correction, **{name: getattr(sensor.correction, name) + sign * step}
-                    ),
+                    correction=replace(sensor.correction, **{name: getattr(sensor.correction, name) + sign * step}),
                 )
                 for sign in (0.5, -0.5)
             )
@@ -98,15 +96,11 @@ def test_that_of_a_radar_is_what_its_clocks_do_to_a_place():
     """Against differences of the whole model, one clock after the other."""
     radar, pixel, alt = Product().model(), np.array([8000.0, 6000.0]), np.array(120.0)
     timed = Timed(radar, Timing([[3.0, 2e-4]]))
-    covariance = np.array(
-        [[0.5, 0.3, 9.0], [0.3, 1.2, 9.0], [9.0, 9.0, 9.0]]
-    )  # range and along the flight first
+    covariance = np.array([[0.5, 0.3, 9.0], [0.3, 1.2, 9.0], [9.0, 9.0, 9.0]])  # range and along the flight first
     at = timed.localize(pixel, alt)
     moved, sigma, found = clocks_in_image(timed, covariance, at)
     steps = [(0.5, 0.0), (0.0, 0.5 / radar.speed)]  # half a metre to each side
-    ahead, behind = (
-        [Timed(radar, Timing([[3.0 + s * m, 2e-4 + s * n]])) for m, n in steps] for s in (1.0, -1.0)
-    )
+    ahead, behind = ([Timed(radar, Timing([[3.0 + s * m, 2e-4 + s * n]])) for m, n in steps] for s in (1.0, -1.0))
     there, here = (np.array([one.localize(pixel, alt) for one in side]) for side in (ahead, behind))
     by_clock = ((there - here) * metres_per_unit(at))[:, :2].T
     values, axes = np.linalg.eigh(by_clock @ covariance[:2, :2] @ by_clock.T)

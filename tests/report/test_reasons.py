@@ -51,9 +51,7 @@ def test_an_option_in_a_remedy_is_one_of_its_table():
 
 @pytest.mark.slow
 def test_every_flag_that_any_message_names_exists_in_some_verb():
-    known = {"--help", "--version"}.union(
-        *(flags_of(cli.get_command(click.Context(cli), name)) for name in COMMANDS)
-    )
+    known = {"--help", "--version"}.union(*(flags_of(cli.get_command(click.Context(cli), name)) for name in COMMANDS))
     known |= {"--quiet", "--verbose", "--debug", "--json", "--file"}  # (the last of projsync)
     missing = set()
     for path in Path(barpc.__file__).parent.rglob("*.py"):
@@ -73,9 +71,7 @@ def reason(run: Any = None, **fields: Any) -> tuple[str | None, str]:
 def test_most_tie_points_rejected_is_a_contradiction_and_no_lack_of_overlap():
     cause, advice = reason(num_observations=3, num_rejected=290)
     assert cause == "contradicted"
-    assert advice.startswith(
-        "99 % of its tie points were rejected, as they contradict those of the other images: "
-    )
+    assert advice.startswith("99 % of its tie points were rejected, as they contradict those of the other images: ")
     assert "--rpc" in advice
     assert "overlap" not in advice
     assert reason(num_observations=0, num_rejected=30)[0] == "contradicted"
@@ -110,9 +106,7 @@ def test_where_tie_points_contradict_is_said_of_the_image_and_not_again_of_the_b
     name = names[interval(0, 0.8, 0.0).view]
     cause, advice = reason(run, name=name)
     assert cause == "place"
-    assert advice.startswith(
-        "rows 100-399 stand out, 80 % of their tie points contradict the others, half of these by"
-    )
+    assert advice.startswith("rows 100-399 stand out, 80 % of their tie points contradict the others, half of these by")
     cause, advice = reason(run, name=name, num_observations=60, num_rejected=90)
     assert cause == "rejected"  # it is a part of the image that is off, and so its RPC is its own
     assert "same direction; most in rows 100-399, where 80 % were" in advice

@@ -237,9 +237,7 @@ def test_an_image_shows_shares_in_percent():
     view = a_view(num_observations=30, num_rejected=10, tie_coverage=0.5, correction=a_correction())
     cells = table("k", "c", [view], ViewEntry, "verdict rejected covered").rows[0]
     assert [(cell.text, cell.key) for cell in cells] == [("adjusted", 0), ("25.0", 25.0), ("50", 50.0)]
-    none = table(
-        "k", "c", [a_view(num_observations=0)], ViewEntry, "rejected kilometres largest fitted about"
-    ).rows[0]
+    none = table("k", "c", [a_view(num_observations=0)], ViewEntry, "rejected kilometres largest fitted about").rows[0]
     assert [cell.text for cell in none] == ["-"] * 5
     every = f"{ViewEntry.PAGE} {ViewEntry.TERMINAL}"
     checked = table("k", "c", [view], ViewEntry, every, adjusted=False).columns

@@ -38,10 +38,7 @@ def test_images_without_reservation_are_counted():
     assert [row[0].text for row in table.rows] == ["A", "B", "C"]
     assert table.marks == ["0", "1", "2"]
     doubted = asked("images", [VIEWS[0], a_view("B", status="weak", advice="look")])
-    assert (
-        doubted.answer
-        == "1 of 2 without reservation. What to do about the others stands in the verdict above."
-    )
+    assert doubted.answer == "1 of 2 without reservation. What to do about the others stands in the verdict above."
     check = asked("images", [a_view(status="consistent", rmse_after=None)], kind="check")
     assert check.answer == "1 of 1 without reservation."
     assert "after [px]" not in check.tables[0].columns
@@ -302,9 +299,7 @@ def test_columns_of_what_tells_half_a_percent_of_any_motion_are_shown():
 
 
 def a_check(name: str, miss, *seen_in) -> CheckPointEntry:
-    return CheckPointEntry(
-        name, 0.0, 0.0, 0.0, miss, tuple(SeenEntry(f"V{k}", px) for k, px in enumerate(seen_in))
-    )
+    return CheckPointEntry(name, 0.0, 0.0, 0.0, miss, tuple(SeenEntry(f"V{k}", px) for k, px in enumerate(seen_in)))
 
 
 def test_check_points_are_met_to_an_rms():
@@ -347,8 +342,7 @@ def test_files_are_held_to_what_their_readers_found():
 
 def test_how_it_was_made_has_bars_of_its_stages():
     stages = tuple(
-        StageEntry(name, s, s, 100.4)
-        for name, s in (("matching", 8.0), ("adjustment", 2.0), ("report", 99.0))
+        StageEntry(name, s, s, 100.4) for name, s in (("matching", 8.0), ("adjustment", 2.0), ("report", 99.0))
     )
     section = asked("run", stages=stages, options={"tie": {"band": 1}, "dem": None})
     assert section.answer == "3 images, 5 tie points, 12 observations, 10.0 s."
@@ -358,8 +352,7 @@ def test_how_it_was_made_has_bars_of_its_stages():
     assert all(table.folded for table in section.tables)
     some = asked("run", tables=TablesEntry(900, 300, complete=False))
     assert (
-        some.answer
-        == "3 images, 5 tie points, 12 observations. Tables and charts hold 300 tie points, evenly taken."
+        some.answer == "3 images, 5 tie points, 12 observations. Tables and charts hold 300 tie points, evenly taken."
     )
     nought = asked("run", stages=(StageEntry("x", 0.0, 0.0, 0.0),))
     assert nought.bars == [("x", "0.00 s", 0.0)]

@@ -11,9 +11,7 @@ import pytest
 
 from .test_chromium import CHROMIUM, FLAGS
 
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None, reason="no chromium on this machine (apt-get install chromium)"
-)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine (apt-get install chromium)")
 pytest.importorskip("jinja2")
 
 DRIVER = Path(__file__).with_name("selection.js").read_text(encoding="utf-8")
@@ -56,9 +54,7 @@ def test_an_outline_that_is_clicked_is_chosen_in_the_tables_and_not_when_clicked
 
 
 def test_a_cell_of_the_matrix_says_its_pair_under_the_pointer_and_chooses_it(found, pair):
-    assert found["hover"].startswith(
-        f"view_0000 and view_0001: {pair['num_matches']} matches, epipolar offset 0."
-    )
+    assert found["hover"].startswith(f"view_0000 and view_0001: {pair['num_matches']} matches, epipolar offset 0.")
     assert found["hover"].endswith(f"{pair['convergence_deg']:.1f} degrees")
     assert found["diagonal"] == ""
     lit, rows, said = found["matrix"]

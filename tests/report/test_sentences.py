@@ -118,12 +118,8 @@ def test_wrong_matches_that_lie_anywhere_are_told_and_need_no_look():
     ]
     assert not any("in any direction" in line for line in said(run_of(adjusted(alike=np.full(3, 5.1)))))
     assert not any("in any direction" in line for line in said(run))  # few were rejected
-    untested = run_of(
-        adjusted(alike=np.full(3, -np.inf))
-    )  # as those of a view that the others were adjusted without
-    assert not any(
-        "in any direction" in line for line in said(untested, [a_view(name, **lost) for name in NAMES])
-    )
+    untested = run_of(adjusted(alike=np.full(3, -np.inf)))  # as those of a view that the others were adjusted without
+    assert not any("in any direction" in line for line in said(untested, [a_view(name, **lost) for name in NAMES]))
 
 
 def test_what_is_advised_has_its_figures():
@@ -206,9 +202,7 @@ def test_a_camera_that_follows_jitter_needs_more_than_one_rpc(more, left, most, 
     assert (f"leaves {left:.2f} px (RMS; {most:.2f} px at most): use its grids" in found["advice"]) == doubted
     assert view_status(replace(waving, fit=None), run)["advice"] == ""
     calm = replace(waving, correction=a_correction(**{more: 0.0}))
-    assert view_status(calm, run)["advice"].startswith(
-        "one RPC cannot hold" if not options.get("grids") else ""
-    )
+    assert view_status(calm, run)["advice"].startswith("one RPC cannot hold" if not options.get("grids") else "")
 
 
 def test_an_rpc_that_is_far_off_beside_the_others_is_asked_about():
@@ -275,9 +269,7 @@ def test_headlines_count_one_and_many():
     assert headline(well, kind="check", adjustment=None) == "The cameras of all 3 images agree."
 
 
-@pytest.mark.parametrize(
-    ("scales", "said_of"), [((2.0, 9.0, 9.0), False), ((2.1, 9.0, 9.0), True), ((), False)]
-)
+@pytest.mark.parametrize(("scales", "said_of"), [((2.0, 9.0, 9.0), False), ((2.1, 9.0, 9.0), True), ((), False)])
 def test_priors_are_doubted_where_every_camera_s_was_widened(scales, said_of):
     prior = SimpleNamespace(odd=np.zeros(3, bool), scale=np.array(scales), drift_sigma=())
     found = reasons(adjusted(prior=prior))
@@ -329,9 +321,7 @@ def moved(by: float, **fields: Any) -> Any:
 def test_a_scene_that_moved_far_is_said_to_where_nothing_but_the_cameras_holds_it():
     assert reasons(moved(6.0)) == []
     (line,) = reasons(moved(6.1))
-    assert line.startswith(
-        "The scene moved by +0.00 m east, -6.10 m north, +0.10 m up, more than 3 times what the"
-    )
+    assert line.startswith("The scene moved by +0.00 m east, -6.10 m north, +0.10 m up, more than 3 times what the")
     assert reasons(moved(6.1), options=SimpleNamespace(dem="x")) == []
     assert reasons(moved(6.1), options=SimpleNamespace(fixed_run="x")) == []
     assert len(reasons(moved(6.1), options=SimpleNamespace(dem=None, fixed_run=None))) == 1
@@ -360,18 +350,14 @@ def gcps(num: int = 3, view=(0, 1, 2, 0), point=(0, 1, 2, 1), left_out=()) -> An
 
 def test_control_that_is_wrong_is_named_with_how_far_it_is_off():
     residual, w = np.array([[3.0, 4.0, 0.0], [0, 0, 0], [0, 0, 0.02]]), np.array([6.0, 1.0, 4.5])
-    found = reasons(
-        adjusted(control=control(residual=residual, w=w, used=np.array([False, True, True]))), gcps=gcps()
-    )
+    found = reasons(adjusted(control=control(residual=residual, w=w, used=np.array([False, True, True]))), gcps=gcps())
     assert found == [
         "1 GCP rejected, contradicted by the rest: check coordinates, axes and image positions: P0 (+3.00 m east, "
         "+4.00 m north, +0.00 m up, w = 6.0).",
         "1 GCP off by more than 4 standard deviations, used all the same: the stated accuracies are too good, or more "
         "than one is wrong: P2 (+0.00 m east, +0.00 m north, +0.02 m up, w = 4.5).",
     ]
-    two = reasons(
-        adjusted(control=control(used=np.zeros(3, bool), w=np.array([9.0, np.nan, 9.0]))), gcps=gcps()
-    )
+    two = reasons(adjusted(control=control(used=np.zeros(3, bool), w=np.array([9.0, np.nan, 9.0]))), gcps=gcps())
     assert two[0].startswith("3 GCPs rejected")
     assert "P1 (too few images show it to tell by how much)" in two[0]
 
@@ -379,9 +365,7 @@ def test_control_that_is_wrong_is_named_with_how_far_it_is_off():
 def test_control_that_scatters_is_said_to_unless_one_is_named():
     (line,) = reasons(adjusted(control=control(fits=False, scatter=2.34)), gcps=gcps())
     assert line.startswith("3 GCPs scatter 2.3 times as much as stated")
-    named = reasons(
-        adjusted(control=control(fits=False, scatter=2.34, w=np.array([1.0, 4.5, 1.0]))), gcps=gcps()
-    )
+    named = reasons(adjusted(control=control(fits=False, scatter=2.34, w=np.array([1.0, 4.5, 1.0]))), gcps=gcps())
     assert [text.split()[1:3] for text in named] == [["GCP", "off"]]
     assert reasons(adjusted(control=control()), gcps=gcps()) == []
     assert reasons(adjusted(), gcps=gcps(left_out=("a: no such image",))) == ["a: no such image."]
@@ -402,8 +386,7 @@ def test_a_reference_that_shows_something_else_is_of_no_use():
 
 def test_what_tie_points_agree_to_is_the_median_over_the_images():
     of = [
-        a_view(name, rmse_before=b, rmse_after=a)
-        for name, b, a in (("A", 1.0, 0.3), ("B", 5.0, 0.1), ("C", 2.0, 0.2))
+        a_view(name, rmse_before=b, rmse_after=a) for name, b, a in (("A", 1.0, 0.3), ("B", 5.0, 0.1), ("C", 2.0, 0.2))
     ]
     lines = said(run_of(), of)
     assert lines[0] == "Tie points of 3 images agree to 0.200 px (before: 2.000 px)."
@@ -421,9 +404,7 @@ def test_what_tie_points_agree_to_is_the_median_over_the_images():
     assert check == ["Tie points of 3 images agree to 2.000 px as the cameras are."]
 
 
-@pytest.mark.parametrize(
-    ("sigmas", "words"), [((0.12, 3.0), "12.0 cm, 3.0 m"), ((), None), ((0.12, NO_NUMBER), None)]
-)
+@pytest.mark.parametrize(("sigmas", "words"), [((0.12, 3.0), "12.0 cm, 3.0 m"), ((), None), ((0.12, NO_NUMBER), None)])
 def test_a_drift_is_said_with_what_is_known_of_it(sigmas, words):
     prior = SimpleNamespace(odd=np.zeros(3, bool), scale=np.ones(3), drift_sigma=sigmas)
     found = [line for line in said(run_of(adjusted(prior=prior))) if line.startswith("Rotations")]
@@ -454,10 +435,7 @@ def test_jitter_is_said_of_five_images_by_name_and_of_more_with_dots():
 def test_the_clocks_of_radars_are_said():
     radar = a_correction(range_m=1.5, azimuth_ms=-0.25, timing_sigma=(0.1, 0.02))
     lines = said(run_of(), [a_view("A"), a_view("B", correction=radar)])
-    assert (
-        "Radar images are corrected by their clocks: B: range +1.50 ± 0.10 m, azimuth -0.250 ± 0.020 ms."
-        in lines
-    )
+    assert "Radar images are corrected by their clocks: B: range +1.50 ± 0.10 m, azimuth -0.250 ± 0.020 ms." in lines
     lines = said(run_of(), [a_view(f"B{k}", correction=radar) for k in range(7)])
     assert any(line.endswith("ms and 2 more.") for line in lines)
 
@@ -466,21 +444,16 @@ def test_control_is_said_to_hold_the_place_and_when_nothing_checks_it():
     def lines(test=None, points=None, of=None) -> str:
         return "\n".join(said(run_of(adjusted(control=test), gcps=points or gcps()), of))
 
-    assert "With 3 GCPs its place is known to 10.0 m, 20.0 m, 5.0 m (east, north, up; one sigma)." in lines(
-        control()
-    )
+    assert "With 3 GCPs its place is known to 10.0 m, 20.0 m, 5.0 m (east, north, up; one sigma)." in lines(control())
     assert "With 1 GCP its place" in lines(control(used=np.array([True, False, False])))
-    assert (
-        "With 0 GCPs its place is known to 10.0 m, 20.0 m, 5.0 m (east, north, up; one sigma) only."
-        in lines(control(used=np.zeros(3, bool)))
+    assert "With 0 GCPs its place is known to 10.0 m, 20.0 m, 5.0 m (east, north, up; one sigma) only." in lines(
+        control(used=np.zeros(3, bool))
     )
     assert "With 2 GCPs" in lines(None, gcps(view=(0, 1), point=(0, 2)))  # those that are seen
     assert "With 2 GCPs" in lines(control(), gcps(view=(0, 1), point=(0, 2)))
     blind = control(redundancy=np.full(3, 0.05))
     assert "Nothing checks them: an error in a GCP would not show." in lines(blind)
-    assert "Nothing checks it:" in lines(
-        control(redundancy=np.full(3, 0.05), used=np.array([False, True, False]))
-    )
+    assert "Nothing checks it:" in lines(control(redundancy=np.full(3, 0.05), used=np.array([False, True, False])))
     assert "Nothing checks" not in lines(control())
     assert "Nothing checks" not in lines(control(redundancy=np.full(3, 0.05), fits=False))
     assert "Nothing checks" not in lines(control(redundancy=np.full(3, 0.05), used=np.zeros(3, bool)))
@@ -504,8 +477,7 @@ def test_a_dem_is_said_to_hold_and_how_the_points_lie_to_it():
     assert lines(known=0, total=0, held=0)[1] == "The DEM holds nothing: there are no tie points."
     held = "The DEM holds 0 of 40 tie points: "
     assert (
-        lines(held=0)[0]
-        == f"{held}all rays meet under more than 1 degree; without --dem-for-weak it holds the scene."
+        lines(held=0)[0] == f"{held}all rays meet under more than 1 degree; without --dem-for-weak it holds the scene."
     )
     options = {"drift": None, "fixed": (), "dem_for_weak": True, "min_convergence": 2.5, "dem_sigma": 2.0}
     assert "more than 2.5 degrees;" in lines(held=0, options=SimpleNamespace(**options))[0]
@@ -535,9 +507,7 @@ def wrong(terrain: TerrainTest) -> list[str]:
 
 
 def test_what_is_wrong_with_a_dem_is_said_and_needs_a_look():
-    right = replace(
-        TerrainTest(30, 30, 40, 2.0, 3.0, 5.0), delivered=(-14.0, 9.0, -9.0), beyond=(2.9, 2.9, 2.9)
-    )
+    right = replace(TerrainTest(30, 30, 40, 2.0, 3.0, 5.0), delivered=(-14.0, 9.0, -9.0), beyond=(2.9, 2.9, 2.9))
     assert wrong(right) == []
     below = replace(right, delivered=(51.0, 9.0, -9.0), beyond=(3.4, 1.0, 1.0))
     (why,) = wrong(below)
@@ -615,13 +585,9 @@ def test_a_reference_on_heights_that_may_be_above_a_geoid_is_told_so_and_not_jit
     unstated = replace(TerrainTest(0, 0, 0, np.nan, np.nan, 20.0), is_known=False)
     held = {"terrain": unstated, "reference_inlier": np.array([True, True])}
     (why,) = reasons(adjusted(**held))
-    assert why.startswith(
-        "The reference stands on the DEM, and nothing says that its heights count from the ellipsoid"
-    )
+    assert why.startswith("The reference stands on the DEM, and nothing says that its heights count from the ellipsoid")
     assert "give --geoid" in why
-    assert not [
-        line for line in said(run_of(adjusted(**held))) if "The DEM holds" in line
-    ]  # there is no tie point
+    assert not [line for line in said(run_of(adjusted(**held))) if "The DEM holds" in line]  # there is no tie point
     for less in ({"terrain": replace(unstated, is_known=True)}, {"reference_inlier": np.zeros(2, bool)}):
         assert reasons(adjusted(**{**held, **less})) == []
     smooth = SmoothTest(np.array([0.2, 0.0, 0.0]), np.array([1e-9, 1, 1]), np.full(3, 0.9), np.zeros(3))
@@ -642,10 +608,7 @@ def test_a_reference_on_heights_of_another_place_is_told(along, told):
     found = reasons(reference=Registration(SimpleNamespace(), (seen, other), 10.0, 2.5))
     assert len(found) == told
     if told:
-        assert (
-            "points lie off each other by 20.0 m in A, as heights wrong by 99.5 m would make them (2.0 m"
-            in found[0]
-        )
+        assert "points lie off each other by 20.0 m in A, as heights wrong by 99.5 m would make them (2.0 m" in found[0]
         assert "B" not in found[0].split("in A")[1]
 
 
@@ -659,7 +622,4 @@ def test_a_reference_whose_points_lie_off_each_other_by_more_than_its_pixel_is_t
     found = reasons(reference=Registration(SimpleNamespace(), matches, 10.0, 2.5))
     assert len(found) == told
     if told:
-        assert (
-            "by more than the 10.0 m of a pixel that finding them may leave, in A (10.1 m): it bends"
-            in found[0]
-        )
+        assert "by more than the 10.0 m of a pixel that finding them may leave, in A (10.1 m): it bends" in found[0]

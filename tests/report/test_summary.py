@@ -173,9 +173,7 @@ def test_its_sigma_is_the_covariance_carried_over_by_the_derivative(block_run, m
                 ends = []
                 for sign in (-1.0, 1.0):
                     value = getattr(sensor.correction, name) + sign * step * axis
-                    ends.append(
-                        Corrected(sensor.sensor, replace(sensor.correction, **{name: value})).project(middle)
-                    )
+                    ends.append(Corrected(sensor.sensor, replace(sensor.correction, **{name: value})).project(middle))
                 columns.append((ends[1] - ends[0]) / 2)
     jacobian = np.array(columns).T
     expected = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
@@ -203,9 +201,7 @@ def test_two_steps_from_the_tie_points_altitudes_find_the_epipolar_offset(block_
             a, b = run.tracks.xy[ties.a], run.tracks.xy[ties.b]
             offset, _ = epipolar_offset(sensors[i], sensors[j], a, b, 0.0, steps=20)
             found = next(
-                p
-                for p in block_run.summary["pairs"]
-                if (p["a"], p["b"]) == tuple(run.views[k].name for k in (i, j))
+                p for p in block_run.summary["pairs"] if (p["a"], p["b"]) == tuple(run.views[k].name for k in (i, j))
             )
             assert found[f"epipolar_{when}"]["count"] == len(a)
             assert found[f"epipolar_{when}"]["rms"] == pytest.approx(np.sqrt(np.mean(offset**2)), rel=1e-6)

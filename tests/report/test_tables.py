@@ -95,17 +95,13 @@ def test_the_point_cloud_is_the_tie_points_about_the_origin_it_states(block_run)
     head, body = data.split(b"end_header\n", 1)
     words = next(line for line in head.decode().splitlines() if line.startswith("comment")).split()
     origin = np.array([float(words[words.index(key) + 1]) for key in ("lon", "lat", "alt")])
-    kind = np.dtype(
-        [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("mean_residual", "<f4"), ("num_observations", "<i4")]
-    )
+    kind = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("mean_residual", "<f4"), ("num_observations", "<i4")])
     cloud = np.frombuffer(body, dtype=kind)
     assert f"element vertex {len(cloud)}" in head.decode()
     local = np.stack([cloud["x"], cloud["y"], cloud["z"]], axis=-1)
     ecef = local @ enu_basis(origin) + ecef_from_ground(origin)
     usable = np.isfinite(block_run.run.ground).all(axis=1)
-    assert (
-        np.abs(ecef - ecef_from_ground(block_run.run.ground[usable])).max() < 1e-3
-    )  # the origin's 9 decimals
+    assert np.abs(ecef - ecef_from_ground(block_run.run.ground[usable])).max() < 1e-3  # the origin's 9 decimals
 
 
 def test_the_same_run_gives_the_same_bytes(block_run):
@@ -126,9 +122,7 @@ def test_a_huge_run_is_thinned_evenly_and_says_so(block_run, monkeypatch):
     assert 50 < found.num_written_tracks <= 100
     lines = TABLES["residuals.csv"](block_run.run, summary).decode().splitlines()
     assert len(lines) == found.num_written_tracks + 1
-    observed = {
-        line.split(",")[1] for line in TABLES["observations.csv"](block_run.run, summary).decode().split()[1:]
-    }
+    observed = {line.split(",")[1] for line in TABLES["observations.csv"](block_run.run, summary).decode().split()[1:]}
     assert len(observed) == found.num_written_tracks
     assert block_run.summary["tables"]["complete"]
 
@@ -248,9 +242,7 @@ def test_numbers_of_a_table():
 def test_as_many_outlines_as_images_are_needed(block_run, tmp_path):
     for name in TABLES:
         (tmp_path / name).write_bytes((block_run.folder / "tables" / name).read_bytes())
-    assert (
-        len(read_tables(block_run.record, tmp_path).outlines) == 9
-    )  # beside the summary, as runs before kept them
+    assert len(read_tables(block_run.record, tmp_path).outlines) == 9  # beside the summary, as runs before kept them
     collection = json.loads((tmp_path / "footprints.geojson").read_text())
     del collection["features"][0]
     (tmp_path / "tables").mkdir()

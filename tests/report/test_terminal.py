@@ -124,9 +124,7 @@ def a_large_run(bad: int, torn: int = 40, num: int = 300, **fields):
 @pytest.mark.parametrize("width", [None, 200, 80])
 @pytest.mark.parametrize("bad", [0, 3, 8, 299])
 def test_a_summary_is_sixty_lines_whatever_its_size(bad, width, monkeypatch):
-    many = tuple(
-        f"{n} is another reason of the block, with words enough to fill more than a line." for n in range(60)
-    )
+    many = tuple(f"{n} is another reason of the block, with words enough to fill more than a line." for n in range(60))
     files = tuple(LeftOutEntry(f"{n}.tif", f"{n}.tif: no RPC") for n in range(90))
     for fields in ({}, {"more": many}, {"left_out": files, "more": tuple(one.reason_text for one in files)}):
         text = shown(SimpleNamespace(record=a_large_run(bad, **fields)), width, monkeypatch)
@@ -140,9 +138,7 @@ def test_a_summary_is_sixty_lines_whatever_its_size(bad, width, monkeypatch):
 def test_of_three_hundred_images_the_worst_are_shown_and_the_rest_is_counted(monkeypatch):
     lines = shown(SimpleNamespace(record=a_large_run(299)), None, monkeypatch).splitlines()
     rows = [line.split()[0] for line in lines[2:12]]
-    assert rows == [
-        f"view_{k:04d}" for k in range(298, 268, -3)
-    ]  # those that contradict the others, by their error
+    assert rows == [f"view_{k:04d}" for k in range(298, 268, -3)]  # those that contradict the others, by their error
     assert "290 more in summary.json" in lines
     pairs = [line.split()[2] for line in lines if " - view_" in line]
     assert pairs == [f"view_{k + 1:04d}" for k in range(39, 29, -1)]

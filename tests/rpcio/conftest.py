@@ -22,9 +22,7 @@ def make_rpc(lon: float = 5.4, lat: float = 43.2, **changes: float | None) -> RP
     coeffs[2, :4] += [-2e-3, 0.03, -1.0, 0.07]
     coeffs[1::2, 0] = 1.0
     errors = {"err_bias": 3.1, "err_rand": 0.7} | changes
-    return RPC(
-        coeffs, [lon, lat, 166.6667], [0.0062, 0.0045, 142.8571], [999.1, 950.7], [1010.3, 980.9], **errors
-    )
+    return RPC(coeffs, [lon, lat, 166.6667], [0.0062, 0.0045, 142.8571], [999.1, 950.7], [1010.3, 980.9], **errors)
 
 
 @pytest.fixture

@@ -48,8 +48,7 @@ def outcome(data: bytes) -> str:
 def test_a_file_that_is_cut_off_anywhere_in_its_numbers_is_refused(sample):
     data = SAMPLES[sample].encode()
     last = max(
-        m.end()
-        for m in re.finditer(rb"SAMP_DEN|samp_den|sampDen|col_den|COL_DEN|SAMPDEN|</F_ROW|,\n  1(?=})", data)
+        m.end() for m in re.finditer(rb"SAMP_DEN|samp_den|sampDen|col_den|COL_DEN|SAMPDEN|</F_ROW|,\n  1(?=})", data)
     )
     for size in np.linspace(1, last, 60).astype(int):
         assert outcome(data[:size]) != "read", size
@@ -77,18 +76,14 @@ def test_a_coefficient_that_is_no_finite_number_is_refused(sample, value):
     assert outcome(text.replace(number, value, 1).encode()) != "read"
 
 
-@pytest.mark.parametrize(
-    "row", [r for r in FORMATS.values() if r.write is not None], ids=lambda row: row.name
-)
+@pytest.mark.parametrize("row", [r for r in FORMATS.values() if r.write is not None], ids=lambda row: row.name)
 @pytest.mark.parametrize("scale", [980.9, 1010.3, 0.0062, 0.0045])
 def test_a_scale_of_zero_is_refused(row, scale):
     text = re.sub(rf"(?<![\d.]){re.escape(str(scale))}(?!\d)", "0", row.write(RPC))
     assert "scale" in outcome(text.encode())
 
 
-@pytest.mark.parametrize(
-    "row", [r for r in FORMATS.values() if r.write is not None], ids=lambda row: row.name
-)
+@pytest.mark.parametrize("row", [r for r in FORMATS.values() if r.write is not None], ids=lambda row: row.name)
 def test_a_missing_field_is_named(row):
     lines = row.write(RPC).splitlines(keepends=True)
     needle = re.compile(r"height.?off|alt_offset", re.IGNORECASE)
@@ -102,9 +97,7 @@ def test_nineteen_and_twenty_one_coefficients_are_refused():
     assert "expected 20" in outcome((text + "LINE_NUM_COEFF_21: 1\n").encode())
     assert "expected 20" in outcome((text + f"LINE_NUM_COEFF_{'1' * 5000}: 1\n").encode())
     assert "given twice" in outcome((text + "LINE_NUM_COEFF_01: 3\n").encode())
-    assert "19 numbers" in outcome(
-        re.sub(r"lineNumCoef = \(\n[^\n]*\n", "lineNumCoef = (\n", SAMPLES["rpb"]).encode()
-    )
+    assert "19 numbers" in outcome(re.sub(r"lineNumCoef = \(\n[^\n]*\n", "lineNumCoef = (\n", SAMPLES["rpb"]).encode())
 
 
 def test_a_field_that_is_given_twice_with_two_values_is_refused():

@@ -59,7 +59,5 @@ def test_the_file_of_the_camera_is_asked_first(shared_data: Path, tmp_path: Path
 def test_a_file_that_cannot_be_read_or_says_nonsense_states_nothing(tmp_path: Path) -> None:
     image = tmp_path / "a.tif"
     os.mkfifo(tmp_path / "a.imd")
-    (tmp_path / "a.xml").write_bytes(
-        b"\xff\x00<IMAGING_DATE>2013-99-17</IMAGING_DATE>" + b"firstLineTime = " * 1000
-    )
+    (tmp_path / "a.xml").write_bytes(b"\xff\x00<IMAGING_DATE>2013-99-17</IMAGING_DATE>" + b"firstLineTime = " * 1000)
     assert date_taken(image, tmp_path, {"TIFFTAG_DATETIME": "2013:04:17 00:00:00"}) == "2013-04-17"

@@ -95,11 +95,7 @@ def test_a_value_of_sixteen_megabytes_is_the_largest(count: int, words: str) -> 
 @pytest.mark.parametrize("big", [False, True])
 def test_a_directory_has_one_to_4096_entries(count: int, ok: bool, order: str, big: bool) -> None:
     mark = {"<": b"II", ">": b"MM"}[order]
-    head = (
-        mark + struct.pack(f"{order}HHHQ", 43, 8, 0, 16)
-        if big
-        else mark + struct.pack(f"{order}HI8x", 42, 16)
-    )
+    head = mark + struct.pack(f"{order}HHHQ", 43, 8, 0, 16) if big else mark + struct.pack(f"{order}HI8x", 42, 16)
     number_, entry = ("Q", "HHQQ") if big else ("H", "HHII")
     body = struct.pack(order + number_, count)
     body += b"".join(struct.pack(order + entry, 256 + k, 4, 1, k) for k in range(count))
@@ -146,9 +142,7 @@ def test_a_geotransform_stays_where_the_image_is_placed(placed: bool, kept: bool
         assert (dataset.transform == transform) == kept
 
 
-@pytest.mark.parametrize(
-    ("size", "ok"), [(0xFFFFFFFF - (1 << 16) - 15, True), (0xFFFFFFFF - (1 << 16) + 17, False)]
-)
+@pytest.mark.parametrize(("size", "ok"), [(0xFFFFFFFF - (1 << 16) - 15, True), (0xFFFFFFFF - (1 << 16) + 17, False)])
 def test_a_classic_tiff_of_four_gigabytes_has_no_room_for_a_tag(size: int, ok: bool, tmp_path: Path) -> None:
     path = write_image(tmp_path / "a.tif")
     os.truncate(path, size)  # a hole
@@ -202,14 +196,10 @@ def test_coefficients_make_up_for_digits_that_are_not_printed(monkeypatch) -> No
         image_offset=rpc.image_offset + 4.4e-6,
         image_scale=rpc.image_scale * (1 + 2.2e-9),
     )
-    monkeypatch.setattr(
-        tiff, "_fifteen", lambda values: np.array([float(f"{v:.9g}") for v in values.tolist()])
-    )
+    monkeypatch.setattr(tiff, "_fifteen", lambda values: np.array([float(f"{v:.9g}") for v in values.tolist()]))
     short = printable(long)
     off = [
-        np.abs(
-            replace(short, **{name: getattr(long, name)}).project(grid(rpc)) - long.project(grid(rpc))
-        ).max()
+        np.abs(replace(short, **{name: getattr(long, name)}).project(grid(rpc)) - long.project(grid(rpc))).max()
         for name in ("ground_offset", "ground_scale", "image_offset", "image_scale")
     ]
     assert min(off) > 1e-7
@@ -268,9 +258,7 @@ def test_a_vrt_of_a_part_of_an_image_is_not_pointed_at(tmp_path: Path) -> None:
         ((0, 0, 61, 5), False), ((0, 0, 5, 41), False), ((10, 10, 0, 5), False), ((10, 10, 5, 0), False),
     ],
 )  # fmt: skip
-def test_a_window_lies_within_the_image_and_has_pixels(
-    window: tuple[int, ...], ok: bool, tmp_path: Path
-) -> None:
+def test_a_window_lies_within_the_image_and_has_pixels(window: tuple[int, ...], ok: bool, tmp_path: Path) -> None:
     image, rpc = write_image(tmp_path / "a.tif"), make_rpc()
     col, row, width, height = window
     if not ok:
@@ -279,9 +267,7 @@ def test_a_window_lies_within_the_image_and_has_pixels(
         assert not (tmp_path / "b.tif").exists()
         return
     crop = write_crop(rpc, image, tmp_path / "b.tif", window)
-    np.testing.assert_array_equal(
-        pixels(tmp_path / "b.tif"), pixels(image)[:, row : row + height, col : col + width]
-    )
+    np.testing.assert_array_equal(pixels(tmp_path / "b.tif"), pixels(image)[:, row : row + height, col : col + width])
     assert crop.off(rpc.crop(col, row)).max() < 1e-9
     assert read_rpc(tmp_path / "b.tif") == crop
 
@@ -293,9 +279,7 @@ def test_no_writer_replaces_a_file_unless_it_is_told_to(tmp_path: Path) -> None:
         ground_scale=[0.0062, 0.0045, 143.0],
     )  # fmt: skip
     none = CorrectionGrid([0.0, 59.0], [0.0, 39.0], np.zeros((2, 2, 2)))
-    nodes = DirectGrid(
-        [0.0, 1.0], [0.0, 1.0], [0.0, 50.0], np.random.default_rng(0).uniform(5, 6, (2, 2, 2, 2))
-    )
+    nodes = DirectGrid([0.0, 1.0], [0.0, 1.0], [0.0, 50.0], np.random.default_rng(0).uniform(5, 6, (2, 2, 2, 2)))
     path = tmp_path / "out"
     for write in (
         lambda **how: write_rpc(rpc, path, format="txt", **how),
@@ -323,9 +307,7 @@ def test_an_image_of_one_column_is_resampled(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("far", "ok"), [(4096, True), (4097, False)])
-def test_a_block_is_made_of_4096_pixels_a_side_at_most(
-    far: int, ok: bool, tmp_path: Path, monkeypatch
-) -> None:
+def test_a_block_is_made_of_4096_pixels_a_side_at_most(far: int, ok: bool, tmp_path: Path, monkeypatch) -> None:
     """Of a row that is stretched: the last column of the block, 16 px around it and itself."""
     monkeypatch.setattr(resample, "BLOCK", 16)
     image = write_image(tmp_path / "a.tif", (1, 16, 9000), dtype="uint8")
@@ -462,9 +444,7 @@ def test_the_origin_of_a_crop_has_a_step(tmp_path: Path) -> None:
         read_rpc(image)
 
 
-def test_a_folder_is_listed_again_when_it_changed_and_once_while_it_rests(
-    tmp_path: Path, monkeypatch
-) -> None:
+def test_a_folder_is_listed_again_when_it_changed_and_once_while_it_rests(tmp_path: Path, monkeypatch) -> None:
     """A change within two seconds may not show in the folder's time: it is listed anew until then."""
     listed: list[object] = []
     scan = os.scandir
@@ -514,9 +494,7 @@ def test_a_yaml_of_two_images_or_without_numbers() -> None:
     unknown = re.sub(r"err_rand: .*", "err_rand: ~", unknown)
     found, _ = parse(unknown.encode(), "m")
     assert (found.err_bias, found.err_rand) == (None, None)
-    dashes = re.sub(
-        r"\[([^\]]*)\]", lambda m: "".join(f"\n        - {v.strip()}" for v in m[1].split(",")), text
-    )
+    dashes = re.sub(r"\[([^\]]*)\]", lambda m: "".join(f"\n        - {v.strip()}" for v in m[1].split(",")), text)
     assert parse(dashes.encode(), "m")[0] == make_rpc()
 
 
@@ -580,9 +558,7 @@ def test_numbered_coefficients_are_gathered_from_their_first_index_on() -> None:
             collect_numbered([("LINE_OFF", 3.0), ("LINE_OFF", 4.0)], "a", first=first)
 
 
-@pytest.mark.parametrize(
-    ("name", "row"), [("a_RPC.TXT", "txt"), ("A.rpb", "rpb"), ("a.JSON", "json"), ("a.doc", None)]
-)
+@pytest.mark.parametrize(("name", "row"), [("a_RPC.TXT", "txt"), ("A.rpb", "rpb"), ("a.JSON", "json"), ("a.doc", None)])
 def test_the_end_of_a_name_tells_its_format(name: str, row: str | None) -> None:
     found = row_of(name)
     assert (found is None) if row is None else (found is FORMATS[row])
@@ -636,9 +612,7 @@ def test_a_correction_grid_reads_back_with_its_nodes_at_the_centres_of_its_pixel
 def test_nodes_are_even_to_a_millionth_of_a_step(off: float, ok: bool, tmp_path: Path) -> None:
     cols = np.linspace(-0.5, 999.5, 6)
     cols[2] += off * 200.0
-    grid_ = DirectGrid(
-        cols, [0.0, 1.0, 2.0], [0.0, 50.0, 100.0], np.random.default_rng(0).uniform(5, 6, (3, 3, 6, 2))
-    )
+    grid_ = DirectGrid(cols, [0.0, 1.0, 2.0], [0.0, 50.0, 100.0], np.random.default_rng(0).uniform(5, 6, (3, 3, 6, 2)))
     if ok:
         write_grid(grid_, tmp_path / "a_grid.tif")
         with rasterio.open(tmp_path / "a_grid.tif") as dataset:
@@ -687,9 +661,7 @@ def test_no_image_was_taken_before_there_were_satellites(day: str, stated: bool,
     assert light_of(str(tmp_path / "a.tif")).time == (f"{day}T00:00:00Z" if stated else None)
 
 
-def test_a_correction_grid_is_held_to_what_its_numbers_become(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_correction_grid_is_held_to_what_its_numbers_become(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nodes are kept in four bytes and worked on in eight."""
     path = tmp_path / "a_correction.tif"
     write_correction(correction(), make_rpc(), path)

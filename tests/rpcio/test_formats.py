@@ -17,9 +17,7 @@ from barpc.rpcio.text import nitf_record, write_rpb, write_txt
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, grid, make_rpc, yaml
 
 WRITABLE = [row for row in FORMATS.values() if row.write is not None]
-NAMES = [
-    f"scene{case}" for row in WRITABLE for end in row.suffixes for case in dict.fromkeys((end, end.lower()))
-]
+NAMES = [f"scene{case}" for row in WRITABLE for end in row.suffixes for case in dict.fromkeys((end, end.lower()))]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -105,9 +103,7 @@ def test_the_direct_model_and_the_fit_error_of_a_dimap_are_left_behind(rpc):
 
 def test_maxar_xml_reads_in_a_namespace_too(rpc):
     text = FORMATS["xml"].write(rpc)
-    spaced = re.sub(r"<(/?)([A-Za-z]+)", r"<\1lv1b:\2", text).replace(
-        "<lv1b:isd>", '<lv1b:isd xmlns:lv1b="http://x">'
-    )
+    spaced = re.sub(r"<(/?)([A-Za-z]+)", r"<\1lv1b:\2", text).replace("<lv1b:isd>", '<lv1b:isd xmlns:lv1b="http://x">')
     assert parse(spaced.encode(), "memory") == (rpc, "xml")
 
 
@@ -219,9 +215,7 @@ def test_a_number_is_read_with_its_unit_left_out(text, value):
     assert number(text, "file", "KEY") == value
 
 
-@pytest.mark.parametrize(
-    "text", ["", "nan", "inf", "-inf", "1e400", "0x10", "1_000", "12abc", "--1", "1.2.3"]
-)
+@pytest.mark.parametrize("text", ["", "nan", "inf", "-inf", "1e400", "0x10", "1_000", "12abc", "--1", "1.2.3"])
 def test_what_is_no_finite_number_is_refused_with_file_and_key(text):
     with pytest.raises(RpcFormatError, match="file: KEY is not"):
         number(text, "file", "KEY")
@@ -240,9 +234,7 @@ def _signed(text: str) -> str:
 
 def _units(text: str) -> str:
     units = {"LINE": "pixels", "SAMP": "pixels", "LAT": "degrees", "LONG": "degrees", "HEIGHT": "meters"}
-    return re.sub(
-        r"(?m)^((LINE|SAMP|LAT|LONG|HEIGHT)_(OFF|SCALE): \S+)$", lambda m: f"{m[1]} {units[m[2]]}", text
-    )
+    return re.sub(r"(?m)^((LINE|SAMP|LAT|LONG|HEIGHT)_(OFF|SCALE): \S+)$", lambda m: f"{m[1]} {units[m[2]]}", text)
 
 
 def _in_lines(text: str) -> str:

@@ -104,9 +104,7 @@ def test_gdal_sees_the_displacements_at_their_places_and_with_their_sign(tmp_pat
         assert "RPC in this file + (dcol, drow)" in found.tags()["CORRECTION"]
         assert set(found.dtypes) == {"float32"}
     rpc, grid = read_correction(tmp_path / f"a{CORRECTION}")
-    np.testing.assert_allclose(
-        grid.at(np.array([[99.5, 39.5], [99.5, 39.5 + 5]])), [[1, -0.25], [0.5, -0.125]]
-    )
+    np.testing.assert_allclose(grid.at(np.array([[99.5, 39.5], [99.5, 39.5 + 5]])), [[1, -0.25], [0.5, -0.125]])
     assert rpc.off(make_rpc()).max() < 1e-9
 
 
@@ -171,9 +169,7 @@ def test_a_file_that_cannot_be_read_is_named_with_its_reason(sample, tmp_path):
 def test_only_tools_that_are_not_installed_are_missed(folder, monkeypatch):
     monkeypatch.setattr("barpc.handoff._is_installed", lambda package: package != "shareloc")
     (sentence,) = unverified([folder / f"a{GRID}"])
-    assert sentence.endswith(
-        "a_grid.tif: only barpc itself has read it (.tif: shareloc would, and is not installed)"
-    )
+    assert sentence.endswith("a_grid.tif: only barpc itself has read it (.tif: shareloc would, and is not installed)")
     assert unverified([folder / f"a{CORRECTION}"]) == []  # GDAL has
 
 

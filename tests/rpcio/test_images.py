@@ -246,9 +246,7 @@ def test_a_raster_that_is_no_tiff_is_converted_and_leaves_nothing_beside(rpc, tm
 
 
 @pytest.mark.parametrize("write", [write_rpc_copy, write_rpc_nitf])
-def test_a_converted_copy_whose_pixels_are_not_the_image_s_is_an_error_and_leaves_nothing(
-    write, tmp_path, monkeypatch
-):
+def test_a_converted_copy_whose_pixels_are_not_the_image_s_is_an_error_and_leaves_nothing(write, tmp_path, monkeypatch):
     """As on a disk that is full when GDAL closes the file, of which it says nothing."""
     real = images.raster_copy
 

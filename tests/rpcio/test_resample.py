@@ -197,9 +197,7 @@ def test_a_mask_and_an_alpha_band_go_along(tmp_path):
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with rasterio.open(image, "r+") as out:
             out.write_mask(mask)
-    alpha = raster(
-        tmp_path / "c.tif", np.concatenate([data, mask[None]]), photometric="minisblack", alpha="yes"
-    )
+    alpha = raster(tmp_path / "c.tif", np.concatenate([data, mask[None]]), photometric="minisblack", alpha="yes")
     with open_raster(alpha) as dataset:
         assert dataset.colorinterp[1] == ColorInterp.alpha
     for source in (image, alpha):
@@ -285,8 +283,7 @@ def test_a_rendered_image_with_jitter_becomes_that_of_a_camera_without(tmp_path)
     terrain = make_terrain(rng, Plane(5.4, 43.3), (-200.0, -200.0, 200.0, 200.0), 230.0, 20.0, 5.0)
     surface = make_surfaces(rng, terrain, 0.25, [Date()])[0]
     taken, ideal = (
-        ndimage.gaussian_filter(render(camera, size, surface).brightness, 0.7)
-        for camera in (swinging, nominal)
+        ndimage.gaussian_filter(render(camera, size, surface).brightness, 0.7) for camera in (swinging, nominal)
     )
     image = raster(tmp_path / "a.tif", np.rint(taken * 30000).astype(np.uint16)[None])
     lacking = CorrectionGrid.between(rpc, swinging, size, 230.0)

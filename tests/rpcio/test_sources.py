@@ -131,9 +131,7 @@ def test_nothing_beside_a_vrt_hides_its_rpc_from_gdal(rpc, tagged):
 def test_a_sidecar_that_does_not_parse_is_an_error_not_a_fall_back_to_the_tag(kind, rpc, tagged):
     path = put(kind, tagged.parent, rpc)
     text = path.read_text()
-    path.write_text(
-        text.replace("LINE_SCALE", "LINE_SCALY").replace("lineScale", "x").replace("LINESCALE", "X")
-    )
+    path.write_text(text.replace("LINE_SCALE", "LINE_SCALY").replace("lineScale", "x").replace("LINESCALE", "X"))
     with pytest.raises(RpcFormatError, match=path.name.replace(".", r"\.")):
         read_rpc(tagged)
 

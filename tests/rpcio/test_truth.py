@@ -137,11 +137,7 @@ def test_number_against_number_the_vendor_s_own_file_reads_as_other_tools_read_i
         if tool == "gdal":
             found = CONSUMERS["gdal"].open(path)(ground)
         else:
-            model = (
-                rpcm.rpc_from_geotiff(str(path))
-                if EXPECTED[file] == "tag"
-                else rpcm.rpc_from_rpc_file(str(path))
-            )
+            model = rpcm.rpc_from_geotiff(str(path)) if EXPECTED[file] == "tag" else rpcm.rpc_from_rpc_file(str(path))
             found = np.column_stack(model.projection(*ground.T))
     image = rpc.project(ground)
     scale = np.maximum(1.0, np.abs(image) / 1e5)

@@ -54,9 +54,7 @@ from tests.scenes.images import ImageOptions
     metavar="DEG",
     help="Direction to the sun; give it several times for several dates.",
 )
-@click.option(
-    "--change", default=0.0, show_default=True, help="Change of the vegetation between dates, 0 to 1."
-)
+@click.option("--change", default=0.0, show_default=True, help="Change of the vegetation between dates, 0 to 1.")
 @click.option("--clouds", default=0.0, show_default=True, help="Part of every image under clouds, 0 to 1.")
 @click.option("--checks", default=200, show_default=True, help="Held-out check points.")
 @click.option("--gcps", default=0, show_default=True, help="Ground control points (gcps.geojson).")
@@ -81,9 +79,7 @@ def command(
     """
     lon, lat, alt = center
     try:
-        options = ImageOptions(
-            lon=lon, lat=lat, alt=alt, attitude=attitude * 1e-6, drift=drift * 1e-6, **scene
-        )
+        options = ImageOptions(lon=lon, lat=lat, alt=alt, attitude=attitude * 1e-6, drift=drift * 1e-6, **scene)
         paths = write_scene(out, options, overwrite=overwrite)
     except BarpcError as error:
         raise click.ClickException(str(error)) from error

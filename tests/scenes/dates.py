@@ -82,9 +82,7 @@ class Years:
         for i, (shot, date) in enumerate(zip(self.scene.shots, self.views, strict=True)):
             cloudy = dict(enumerate(self.clouds)).get(date, 0.0)
             light = render(shot.exact, self.size, season.surface(date)).brightness
-            numbers = expose(
-                light, replace(shot.radiometry, clouds=cloudy), np.random.default_rng([self.seed, 84, i])
-            )
+            numbers = expose(light, replace(shot.radiometry, clouds=cloudy), np.random.default_rng([self.seed, 84, i]))
             path = folder / f"{shot.name}.tif"
             _write_image(path, numbers, self.delivered[i])
             out.append(View(shot.name, str(path), self.size, self.delivered[i], self.scene.alt_range))
@@ -116,16 +114,13 @@ class _Seasons:
         self._albedo = ground / self._light
         wide = 2 * int(1.0 / step) + 1
         self._local = (
-            cv2.medianBlur(np.clip(self._albedo * 400, 0, 255).astype(np.uint8), wide).astype(np.float32)
-            / 400
+            cv2.medianBlur(np.clip(self._albedo * 400, 0, 255).astype(np.uint8), wide).astype(np.float32) / 400
         )
         edges = np.quantile(self._local[::7, ::7], np.linspace(0, 1, CLASSES + 1)[1:-1])
         self._kind = np.digitize(self._local, edges)
         tones = np.linspace(0.08, 0.5, CLASSES)
         self._tone = np.array([rng.permutation(tones) for _ in range(_ANCHORS)])
-        self._sign = np.array(
-            [rng.permutation(np.where(np.arange(CLASSES) % 2, -1.0, 1.0)) for _ in range(_ANCHORS)]
-        )
+        self._sign = np.array([rng.permutation(np.where(np.arange(CLASSES) % 2, -1.0, 1.0)) for _ in range(_ANCHORS)])
         self._roof = rng.uniform(0.1, 0.8, (_ANCHORS, len(self._base.roof)))
         self._grown = [_albedo(rng, shape, fractal(rng, shape, 0.9), step)[0] for _ in range(_ANCHORS)]
         self._drifts = fractal(rng, shape, 1.2)  # where snow stays longest

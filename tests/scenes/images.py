@@ -216,9 +216,7 @@ class Scene:
         corners[1:] = corners[1:] * options.size - 0.5
         low, high = self.alt_range
         levels = np.array([[low + _OPEN], [high - _OPEN]])
-        seen = np.concatenate(
-            [plane.xy(s.exact.localize(corners, levels)).reshape(-1, 2) for s in self.shots]
-        )
+        seen = np.concatenate([plane.xy(s.exact.localize(corners, levels)).reshape(-1, 2) for s in self.shots])
         edge = 20.0 * options.gsd
         bounds = (*(seen.min(axis=0) - edge).tolist(), *(seen.max(axis=0) + edge).tolist())
         terrain = make_terrain(rng, plane, bounds, options.alt, options.relief, options.buildings)
@@ -275,9 +273,7 @@ class Scene:
         look = looks(count, turn, ALTITUDES[date % len(ALTITUDES)])[within]
         exact = fly(self.target, look, options.size, options.gsd)
         center = exact.position(0.5 * (options.size[1] - 1))
-        correction = Correction(
-            rng.normal(0, options.attitude, 3), rng.normal(0, options.position, 3), center
-        )
+        correction = Correction(rng.normal(0, options.attitude, 3), rng.normal(0, options.position, 3), center)
         drift = rng.normal(0, options.drift, 3)
         wrong = Corrected(_drifting(exact, drift, options.size[1]), inverse(correction))
         accuracy = float(np.hypot(options.attitude * look.altitude, options.position))

@@ -134,9 +134,7 @@ def _clouded(light: Float32, part: float, rng: np.random.Generator) -> Float32:
     return out
 
 
-def _strips(
-    sensor: SensorModel, size: tuple[int, int], terrain: Terrain, samples: int
-) -> Iterator[tuple[int, Ray]]:
+def _strips(sensor: SensorModel, size: tuple[int, int], terrain: Terrain, samples: int) -> Iterator[tuple[int, Ray]]:
     """First row and lines of sight (rows x samples, width x samples) of strip after strip."""
     width, height = size
     low, high = terrain.alt_range()

@@ -26,9 +26,7 @@ def _lit(scene: Scene, date: Date, shape: tuple[int, int], step: float) -> Float
     return ndimage.gaussian_filter(lit.values, 0.7)
 
 
-def other_season(
-    scene: Scene, seed: int, *, inverted: float = 0.5, snow: float = 0.15, changed: float = 0.1
-) -> Grid:
+def other_season(scene: Scene, seed: int, *, inverted: float = 0.5, snow: float = 0.15, changed: float = 0.1) -> Grid:
     """Brightness of the scene from straight above on another date.
 
     Every class of grey has another grey, and `inverted` of the classes the contrast within turned over; the sun stands
@@ -86,15 +84,11 @@ def write_reference(
     """A season as a GeoTIFF in UTM, `gsd` [m], its own place off by `shift` [m]."""
     plane = scene.terrain.plane
     x, y = season.axes()
-    corners = plane.ground(
-        np.array([[x[0], y[0], 0.0], [x[-1], y[0], 0.0], [x[0], y[-1], 0.0], [x[-1], y[-1], 0.0]])
-    )
+    corners = plane.ground(np.array([[x[0], y[0], 0.0], [x[-1], y[0], 0.0], [x[0], y[-1], 0.0], [x[-1], y[-1], 0.0]]))
     east, north = (np.array(a) for a in warp_points("EPSG:4326", UTM, corners[:, 0], corners[:, 1]))
     left, top = gsd * np.floor(east.min() / gsd), gsd * np.ceil(north.max() / gsd)
     width, height = int((east.max() - left) / gsd), int((top - north.min()) / gsd)
-    blurred = Grid(
-        season.origin, season.step, ndimage.gaussian_filter(season.values, 0.5 * gsd / season.step)
-    )
+    blurred = Grid(season.origin, season.step, ndimage.gaussian_filter(season.values, 0.5 * gsd / season.step))
     out = np.zeros((height, width), np.uint16)
     for row in range(0, height, 256):
         grid = np.meshgrid(
@@ -103,9 +97,7 @@ def write_reference(
         lon, lat = warp_points(UTM, "EPSG:4326", grid[0].ravel(), grid[1].ravel())
         xy = plane.xy(np.column_stack([lon, lat, np.zeros(len(lon))])).reshape(*grid[0].shape, 2)
         at = [(xy[..., k] - season.origin[k]) / season.step for k in (0, 1)]
-        inside = (
-            (at[0] >= 0) & (at[1] >= 0) & (at[0] < season.values.shape[1]) & (at[1] < season.values.shape[0])
-        )
+        inside = (at[0] >= 0) & (at[1] >= 0) & (at[0] < season.values.shape[1]) & (at[1] < season.values.shape[0])
         out[row : row + 256] = np.where(inside, 1 + 900 * blurred(xy[..., 0], xy[..., 1]), 0)
     layout = {"tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate"}
     place = rasterio.Affine(gsd, 0.0, left + shift[0], 0.0, -gsd, top + shift[1])

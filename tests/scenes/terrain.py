@@ -237,9 +237,7 @@ class Terrain:
         return np.asarray(z1)
 
 
-def fractal(
-    rng: np.random.Generator, shape: tuple[int, int], exponent: float, shortest: float = 2.0
-) -> Float32:
+def fractal(rng: np.random.Generator, shape: tuple[int, int], exponent: float, shortest: float = 2.0) -> Float32:
     """Noise with the amplitude spectrum f^-exponent, mean 0 and standard deviation 1.
 
     Parameters

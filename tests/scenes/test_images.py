@@ -125,8 +125,7 @@ def test_gcps_are_given_as_geojson_with_noisy_image_points(scene, folder):
     features = json.loads((folder / "gcps.geojson").read_text())["features"]
     exact = {f"{shot.name}.tif": shot.exact for shot in scene.shots}
     error = [
-        exact[f["properties"]["filename"]].project(np.array(f["geometry"]["coordinates"]))
-        - f["properties"]["ji"]
+        exact[f["properties"]["filename"]].project(np.array(f["geometry"]["coordinates"])) - f["properties"]["ji"]
         for f in features
     ]
     assert len({f["properties"]["id"] for f in features}) == 3

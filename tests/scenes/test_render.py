@@ -65,9 +65,7 @@ def test_altitudes_are_those_of_brute_force_ray_casting(sensor, surface, count):
     """Where the tracer and 2 cm steps along the exact line of sight differ, it is on an edge of a building."""
     rng = np.random.default_rng(0)
     image = np.stack([rng.integers(0, n, count) for n in SIZE], axis=1).astype(float)
-    rendered = render(sensor, SIZE, surface, samples=1).altitude[
-        image[:, 1].astype(int), image[:, 0].astype(int)
-    ]
+    rendered = render(sensor, SIZE, surface, samples=1).altitude[image[:, 1].astype(int), image[:, 0].astype(int)]
     expected = cast(sensor, surface.terrain, image)
     off = np.abs(rendered - expected)
     assert np.mean(off < 0.025) > 0.99
@@ -102,9 +100,7 @@ def _spots(terrain, seed):
     rng = np.random.default_rng(seed)
     step = 0.125
     axis = np.arange(-110.0, 110.0, step)
-    places = np.stack(np.meshgrid(np.arange(-32.0, 40.0, 16.0), np.arange(-32.0, 40.0, 16.0)), -1).reshape(
-        -1, 2
-    )
+    places = np.stack(np.meshgrid(np.arange(-32.0, 40.0, 16.0), np.arange(-32.0, 40.0, 16.0)), -1).reshape(-1, 2)
     places = places + rng.uniform(-2.0, 2.0, places.shape)
     values = np.zeros((len(axis), len(axis)))
     for px, py in places:
@@ -147,9 +143,7 @@ def test_walls_show_on_the_side_of_the_camera_and_hide_the_ground_behind(surface
     east = fly(TARGET, Look(25.0, 90.0), SIZE, 0.5)
     altitude = render(east, SIZE, surface, samples=1).altitude
     tall = int(
-        np.argmax(
-            (terrain.buildings.top - terrain.buildings.foot) * (np.abs(terrain.buildings.center) < 30).all(1)
-        )
+        np.argmax((terrain.buildings.top - terrain.buildings.foot) * (np.abs(terrain.buildings.center) < 30).all(1))
     )
     u = np.linspace(-1.2, 1.2, 481) * np.hypot(*terrain.buildings.half[tall])
     x, y = terrain.buildings.center[tall, 0] + u, np.full(481, terrain.buildings.center[tall, 1])
@@ -174,9 +168,7 @@ def test_shadows_lie_away_from_the_sun(surface):
     x, y = low_sun.ground.axes()
     for i in np.flatnonzero((np.abs(buildings.center) < 60).all(axis=1)):
         reach = np.hypot(*buildings.half[i]) + 0.5
-        west = ratio[
-            np.searchsorted(y, buildings.center[i, 1]), np.searchsorted(x, buildings.center[i, 0] - reach)
-        ]
+        west = ratio[np.searchsorted(y, buildings.center[i, 1]), np.searchsorted(x, buildings.center[i, 0] - reach)]
         assert west < 0.9
 
 

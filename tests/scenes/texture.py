@@ -88,9 +88,7 @@ class Surface:
         return np.asarray(light * tone * np.clip(1.0 + 0.25 * detail, 0.3, 2.0), dtype=np.float32)
 
 
-def make_surfaces(
-    rng: np.random.Generator, terrain: Terrain, step: float, dates: list[Date]
-) -> list[Surface]:
+def make_surfaces(rng: np.random.Generator, terrain: Terrain, step: float, dates: list[Date]) -> list[Surface]:
     """Surfaces of one place on several dates.
 
     Parameters
@@ -135,9 +133,7 @@ def make_surfaces(
     return surfaces
 
 
-def _albedo(
-    rng: np.random.Generator, shape: tuple[int, int], detail: Float32, step: float
-) -> tuple[Float32, Float32]:
+def _albedo(rng: np.random.Generator, shape: tuple[int, int], detail: Float32, step: float) -> tuple[Float32, Float32]:
     """Reflectance of the ground and how green it is (0 to 1): fields, roads, trees, fine structure."""
     coarse = tuple(n // 4 + 2 for n in shape)
     waves = [_resampled(fractal(rng, (coarse[0], coarse[1]), 1.9, 4.0), 4.0, shape) for _ in range(3)]

@@ -151,20 +151,14 @@ MODELS: dict[str, Callable[[], Case]] = {
     ),
     "clocks of a Range-Doppler model": lambda: _timed(_range_doppler(5.4)),
     "clocks of a SICD image": lambda: _timed(_sicd("PLANE")),
-    "rpc and what it lacks": lambda: Case(
-        GridCorrected(make_rpc(), _lacking()), (20000, 19000), (0.0, 1000.0)
-    ),
+    "rpc and what it lacks": lambda: Case(GridCorrected(make_rpc(), _lacking()), (20000, 19000), (0.0, 1000.0)),
     "pushbroom": lambda: Case(_pushbroom(5.4), (20000, 19000), (0.0, 1000.0)),
     "pushbroom across the antimeridian": lambda: Case(_pushbroom(180.0), (20000, 19000), (0.0, 1000.0)),
     "pushbroom of a curved detector": lambda: Case(_curved(), (20000, 19000), (0.0, 1000.0)),
-    "pushbroom that sees bent light, turned over": lambda: Case(
-        _turned_over(), (20000, 19000), (0.0, 1000.0)
-    ),
+    "pushbroom that sees bent light, turned over": lambda: Case(_turned_over(), (20000, 19000), (0.0, 1000.0)),
     "localisation grid": lambda: Case(_grid(5.4), (20000, 19000), (0.0, 1000.0)),
     "localisation grid across the antimeridian": lambda: Case(_grid(180.0), (20000, 19000), (0.0, 1000.0)),
-    "corrected pushbroom": lambda: Case(
-        Corrected(_pushbroom(5.4), _correction()), (20000, 19000), (0.0, 1000.0)
-    ),
+    "corrected pushbroom": lambda: Case(Corrected(_pushbroom(5.4), _correction()), (20000, 19000), (0.0, 1000.0)),
     "range-doppler": lambda: _range_doppler(5.4),
     "range-doppler across the antimeridian": lambda: _range_doppler(180.0),
     "corrected range-doppler": _corrected_range_doppler,

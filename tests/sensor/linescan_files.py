@@ -124,9 +124,7 @@ def isd(
             f"<TIMEINTERVAL>{STEP}</TIMEINTERVAL><{tag}List>\n{lines}\n</{tag}List></{part}>"
         )
     last = flight.size[1]
-    quaternion = "".join(
-        f"<QCS{k + 1}>{v!r}</QCS{k + 1}>" for k, v in enumerate(map(float, camera.as_quat()))
-    )
+    quaternion = "".join(f"<QCS{k + 1}>{v!r}</QCS{k + 1}>" for k, v in enumerate(map(float, camera.as_quat())))
     text = f"""<?xml version="1.0" encoding="UTF-8"?>
 <isd><IMD><PRODUCTLEVEL>LV1B</PRODUCTLEVEL><BANDID>P</BANDID>
 <NUMROWS>{flight.size[1]}</NUMROWS><NUMCOLUMNS>{flight.size[0]}</NUMCOLUMNS>
@@ -165,8 +163,7 @@ def dimap(flight: Flight, first_col: int = 31, poly: bool = True, unit: float = 
     coeffs = np.polynomial.polynomial.polyfit((flight.times - lasts / 2) / lasts, q, 3)
     if poly:
         tables = "".join(
-            f"<Q{k}><DEGREE>3</DEGREE><COEFFICIENTS>{words(coeffs[:, k])}</COEFFICIENTS></Q{k}>"
-            for k in range(4)
+            f"<Q{k}><DEGREE>3</DEGREE><COEFFICIENTS>{words(coeffs[:, k])}</COEFFICIENTS></Q{k}>" for k in range(4)
         )
         attitude = (
             f"<Polynomial_Quaternions><OFFSET>{midnight + lasts / 2!r}</OFFSET><SCALE>{lasts!r}</SCALE>{tables}"

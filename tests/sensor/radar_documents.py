@@ -45,9 +45,7 @@ def ground_of(ecef: np.ndarray) -> tuple[float, float, float]:
 def _poly(tag: str, coeffs: np.ndarray) -> str:
     coeffs = np.asarray(coeffs, dtype=float)
     terms = "".join(
-        "<Coef "
-        + " ".join(f'exponent{k + 1}="{p}"' for k, p in enumerate(power))
-        + f">{float(value)!r}</Coef>"
+        "<Coef " + " ".join(f'exponent{k + 1}="{p}"' for k, p in enumerate(power)) + f">{float(value)!r}</Coef>"
         for power, value in np.ndenumerate(coeffs)
     )
     orders = " ".join(f'order{k + 1}="{n - 1}"' for k, n in enumerate(coeffs.shape))
@@ -55,16 +53,10 @@ def _poly(tag: str, coeffs: np.ndarray) -> str:
 
 
 def _xyz(tag: str, vector: np.ndarray) -> str:
-    return (
-        f"<{tag}>"
-        + "".join(f"<{a}>{float(v)!r}</{a}>" for a, v in zip("XYZ", vector, strict=True))
-        + f"</{tag}>"
-    )
+    return f"<{tag}>" + "".join(f"<{a}>{float(v)!r}</{a}>" for a, v in zip("XYZ", vector, strict=True)) + f"</{tag}>"
 
 
-def document(
-    kind: str, *, ground=(5.4, 43.3, 120.0), incidence=35.0, side="R", squint=0.4, first=(0, 0)
-) -> str:
+def document(kind: str, *, ground=(5.4, 43.3, 120.0), incidence=35.0, side="R", squint=0.4, first=(0, 0)) -> str:
     """A SICD document; `first` is the first row and column of a part of the full image."""
     scp = ecef_from_ground(np.array(ground))
     arp = pass_over(scp, incidence, side, squint)
@@ -146,8 +138,7 @@ def nitf(text: str, path: Path, images: int = 1, graphics: int = 0, texts: int =
         [],
     )
     counts = b"".join(
-        b"%03d" % len(kind) + b"".join(form % (len(head), len(body)) for head, body, form in kind)
-        for kind in kinds
+        b"%03d" % len(kind) + b"".join(form % (len(head), len(body)) for head, body, form in kind) for kind in kinds
     )
     header = b"NITF02.10".ljust(342) + b"%012d%06d" % (0, 360 + len(counts)) + counts
     segments = b"".join(head + body for kind in kinds for head, body, _ in kind)

@@ -131,10 +131,7 @@ class Product:
             time = self.states_from + self.step * k
             position, velocity = self.state(time)
             velocity = velocity + self.noise * rng.normal(size=3)
-            axes = [
-                "".join(f"<{a}>{v:.6f}</{a}>" for a, v in zip("xyz", w, strict=True))
-                for w in (position, velocity)
-            ]
+            axes = ["".join(f"<{a}>{v:.6f}</{a}>" for a, v in zip("xyz", w, strict=True)) for w in (position, velocity)]
             states += (
                 f"<orbit><time>{stamp(time)}</time><frame>Earth Fixed</frame>"
                 f"<position>{axes[0]}</position><velocity>{axes[1]}</velocity></orbit>"

@@ -50,9 +50,7 @@ def test_lines_beyond_the_bursts_go_on_by_the_nearest_one(annotation) -> None:
     ]
     assert (np.abs(found - np.array(expected)) <= np.timedelta64(1, "ns")).all()
     plain = replace(annotation, bursts=())
-    assert plain.line_time(np.array(10.0)) - plain.first_line_time == np.timedelta64(
-        round(10 * step * 1e9), "ns"
-    )
+    assert plain.line_time(np.array(10.0)) - plain.first_line_time == np.timedelta64(round(10 * step * 1e9), "ns")
 
 
 def test_of_an_orbit_file_the_vectors_around_the_image_are_taken(annotation, tmp_path) -> None:
@@ -90,10 +88,7 @@ def test_ground_range_polynomials_have_one_length_and_rising_times() -> None:
         longer = xml.replace(b"<%sCoefficients>" % tag, b"<%sCoefficients>1.0 " % tag, 1)
         with pytest.raises(RpcFormatError, match="ground range polynomials of different lengths"):
             read_annotation(longer)
-    stamps = [
-        b"<azimuthTime>%s</azimuthTime><sr0>" % part.split(b"<")[0]
-        for part in xml.split(b"<azimuthTime>")[1:]
-    ]
+    stamps = [b"<azimuthTime>%s</azimuthTime><sr0>" % part.split(b"<")[0] for part in xml.split(b"<azimuthTime>")[1:]]
     first, second = [one for one in stamps if one in xml][:2]
     for twice in (
         xml.replace(second, first),

@@ -39,9 +39,7 @@ class Pinhole:
         ray = np.concatenate([pixel / self.focal, np.ones((*pixel.shape[:-1], 1))], axis=-1) @ self.frame
         distance = np.full(ray.shape[:-1], self.focal * 0.5)
         for _ in range(30):
-            ground = np.stack(
-                TO_GROUND.transform(*np.moveaxis(self.center + distance[..., None] * ray, -1, 0)), -1
-            )
+            ground = np.stack(TO_GROUND.transform(*np.moveaxis(self.center + distance[..., None] * ray, -1, 0)), -1)
             distance = distance + (ground[..., 2] - alt) * 1.1
         ground[..., 2] = alt
         return np.where(image[..., :1] <= self.columns, ground, np.nan)
@@ -116,9 +114,7 @@ def test_a_projective_camera_of_a_perspective_one_stands_where_it_stands() -> No
 def test_a_projective_camera_over_a_pushbroom_image_stands_at_about_twice_its_distance() -> None:
     """Perspective across the track, affine along it: what Pleiades shows, 1420 to 1630 km for 694."""
     sensor = fly(np.array([5.4, 43.2, 0.0]), Look(10.0, 100.0), (20000, 20000), 0.5)
-    line, whole = (
-        camera_center(sensor, (20000, 20000), (0.0, 2000.0), how) for how in ("line", "projective")
-    )
+    line, whole = (camera_center(sensor, (20000, 20000), (0.0, 2000.0), how) for how in ("line", "projective"))
     assert whole.altitude / line.altitude == pytest.approx(2.1, abs=0.3)
     blind: Any = Pinhole(columns=100.0)
     with pytest.raises(RpcError):

@@ -56,9 +56,7 @@ def test_derivatives_by_point_rotation_and_translation_are_central_differences()
     rpc = make_rpc()
     rotation, translation = np.array([1e-3, -2e-3, 1.5e-3]), np.array([40.0, -60.0, 20.0])
     model = Corrected(rpc, Correction(rotation, translation, CENTER))
-    ecef = ecef_from_ground(
-        rpc.localize(np.array([[3000.0, 4000.0], [12000.0, 800.0]]), np.array([100.0, 700.0]))
-    )
+    ecef = ecef_from_ground(rpc.localize(np.array([[3000.0, 4000.0], [12000.0, 800.0]]), np.array([100.0, 700.0])))
     image, by_ecef, by_rotation, by_translation = model.project_ecef(ecef)
     np.testing.assert_allclose(image, model.project(ground_from_ecef(ecef)), rtol=0, atol=1e-7)
     for axis in range(3):

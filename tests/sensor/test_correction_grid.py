@@ -89,9 +89,7 @@ def test_a_localisation_grid_is_the_camera_for_those_who_interpolate_linearly(pe
     grid = DirectGrid.of(camera, SIZE, ALTS)
     ground, image = check_points(camera)
     linear = RegularGridInterpolator((grid.alts, grid.rows, grid.cols), grid.lonlat)
-    seen = camera.project(
-        np.column_stack([linear(np.column_stack([ground[:, 2], image[:, ::-1]])), ground[:, 2]])
-    )
+    seen = camera.project(np.column_stack([linear(np.column_stack([ground[:, 2], image[:, ::-1]])), ground[:, 2]]))
     off = np.linalg.norm(seen - image, axis=1).max()
     assert LINEAR / 10 < off < LINEAR
     assert np.linalg.norm(grid.project(ground) - image, axis=1).max() < 1e-4  # by splines

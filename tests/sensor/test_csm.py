@@ -59,9 +59,7 @@ def linescan(flipped: bool = False, direction: float = 1.0, **changes: object) -
     along *= np.linalg.norm(start) / np.linalg.norm(along)
     positions = np.cos(angle) * start + np.sin(angle) * along
     velocities = 1.08e-3 * (np.cos(angle) * along - np.sin(angle) * start)
-    swing = Rotation.from_rotvec(
-        np.outer(np.sin(times), [2e-4, 1e-4, -3e-4]) + np.outer(times, [1e-3, -1e-3, 2e-3])
-    )
+    swing = Rotation.from_rotvec(np.outer(np.sin(times), [2e-4, 1e-4, -3e-4]) + np.outer(times, [1e-3, -1e-3, 2e-3]))
     turned = Rotation.from_matrix(nadir(start, flipped)) * swing
     return (
         base(
@@ -137,9 +135,7 @@ def ray(state: State, col: float, row: float) -> tuple[np.ndarray, np.ndarray]:
     origin = (state["m_detectorSampleOrigin"], state["m_detectorLineOrigin"])
     look = -np.array([*(_place(state, 0.0, sample, origin) * state["m_zDirection"]), state["m_focalLength"]])
     center = _near(np.reshape(state["m_positions"], (-1, 3)), state["m_t0Ephem"], state["m_dtEphem"], time)
-    quaternion = _near(
-        np.reshape(state["m_quaternions"], (-1, 4)), state["m_t0Quat"], state["m_dtQuat"], time
-    )
+    quaternion = _near(np.reshape(state["m_quaternions"], (-1, 4)), state["m_t0Quat"], state["m_dtQuat"], time)
     return center, Rotation.from_quat(quaternion).apply(look)
 
 
@@ -267,9 +263,7 @@ def test_delivered_states_look_where_the_library_says(name, size, shared_data):
 
 def test_a_delivered_state_is_its_vendor_s_camera_adjusted_by_pixels(shared_data):
     camera, _ = delivered(shared_data, "1040010074793300.adjusted_state.json")
-    vendor = open_camera(
-        f"{shared_data / 'physical_maxar' / '1040010074793300.xml'},model=physical,refraction=no"
-    )
+    vendor = open_camera(f"{shared_data / 'physical_maxar' / '1040010074793300.xml'},model=physical,refraction=no")
     image = np.random.default_rng(0).uniform(0, camera.size, (300, 2))
     moved = camera.model.project(vendor.model.localize(image, np.full(300, 100.0))) - image
     assert np.abs(moved.mean(axis=0)).max() < 3.0  # px; another order of quaternions or lines: thousands
@@ -283,14 +277,10 @@ def corrected(model: object, rows: int) -> Corrected:
     """The camera turned by 10 urad, drifting, and moved by metres."""
     turn, move, drift = [8e-6, -5e-6, 3e-6], [5.0, -3.0, 2.0], [[2e-6, 3e-6, -1e-6]]
     middle = rows / 2
-    return Corrected(
-        model, Correction(turn, move, model.position(middle), drift, row_offset=middle, row_scale=middle)
-    )
+    return Corrected(model, Correction(turn, move, model.position(middle), drift, row_offset=middle, row_scale=middle))
 
 
-@pytest.mark.parametrize(
-    "changes", [{"m_opticalDistCoeffs": [0.0] * 3}, {"m_opticalDistCoeffs": [1e-3, 0.0, 0.0]}]
-)
+@pytest.mark.parametrize("changes", [{"m_opticalDistCoeffs": [0.0] * 3}, {"m_opticalDistCoeffs": [1e-3, 0.0, 0.0]}])
 @pytest.mark.parametrize("flipped", [False, True])
 def test_a_corrected_camera_is_written_as_a_state_that_the_library_reads_as_meant(changes, flipped, tmp_path):
     model, _ = open_state(write(linescan(flipped=flipped, **changes), tmp_path / "a.json"))

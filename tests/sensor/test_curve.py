@@ -51,16 +51,10 @@ def test_a_turn_is_the_exponential_of_its_vector_and_has_its_jacobian(together: 
             expected = series(size * way, 0), series(-size * way, 0), series(-size * way, 1)
             for one, other in zip(turn.back_and_rate(many), (turn.back(many), turn.rate(many)), strict=True):
                 np.testing.assert_allclose(one, other, rtol=1e-14)
-            for found, matrix in zip(
-                (turn.forth(many), turn.back(many), turn.rate(many)), expected, strict=True
-            ):
-                np.testing.assert_allclose(
-                    found[:, column], matrix @ given, rtol=0, atol=4e-16 * (2 + 10 * size)
-                )
+            for found, matrix in zip((turn.forth(many), turn.back(many), turn.rate(many)), expected, strict=True):
+                np.testing.assert_allclose(found[:, column], matrix @ given, rtol=0, atol=4e-16 * (2 + 10 * size))
     for size in SIZES[1:-1]:
-        np.testing.assert_allclose(
-            rotation_left_jacobian(size * way), series(size * way, 1), rtol=0, atol=2e-15
-        )
+        np.testing.assert_allclose(rotation_left_jacobian(size * way), series(size * way, 1), rtol=0, atol=2e-15)
 
 
 # --- orbits --------------------------------------------------------------------------------------------------

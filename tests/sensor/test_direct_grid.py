@@ -93,9 +93,7 @@ def test_off_the_grid_points_are_nan(grid):
 
 def test_the_grid_goes_on_for_a_cell_and_a_tenth_of_its_altitudes():
     """Nodes every 500 columns and 1000 rows up to 4000, altitudes 0 to 1000: the last cell's end belongs to it."""
-    small = sampled(
-        np.arange(0.0, 4001.0, 500.0), np.arange(0.0, 4001.0, 1000.0), np.array([0.0, 500.0, 1000.0])
-    )
+    small = sampled(np.arange(0.0, 4001.0, 500.0), np.arange(0.0, 4001.0, 1000.0), np.array([0.0, 500.0, 1000.0]))
     middle = np.array([2000.0, 2000.0, 500.0])
     for axis, (low, high) in enumerate(((-500.0, 4500.0), (-1000.0, 5000.0), (-100.0, 1100.0))):
         for value, known in ((low, True), (high, True), (low - 0.01, False), (high + 0.01, False)):

@@ -35,9 +35,7 @@ def tilted_rpc(toward: tuple[float, float]) -> RPC:
 def test_the_border_runs_clockwise_on_the_edges_of_the_outer_pixels():
     border = image_border((10, 20), per_side=4)
     assert len(border) == 16
-    np.testing.assert_array_equal(
-        border[[0, 4, 8, 12]], [[-0.5, -0.5], [9.5, -0.5], [9.5, 19.5], [-0.5, 19.5]]
-    )
+    np.testing.assert_array_equal(border[[0, 4, 8, 12]], [[-0.5, -0.5], [9.5, -0.5], [9.5, 19.5], [-0.5, 19.5]])
 
 
 def test_a_footprint_projects_onto_the_images_border():
@@ -91,9 +89,7 @@ def test_base_to_height_is_the_parallax_on_the_ground_of_a_metre_of_height():
 def test_the_ground_sample_distance_is_how_far_neighbouring_pixels_lie_apart():
     rpc = tilted_rpc((0.3, 0.2))
     image, alt = np.array([3000.0, 4000.0]), np.array(500.0)
-    here, right, below = (
-        ecef_from_ground(rpc.localize(image + step, alt)) for step in ((0, 0), (1, 0), (0, 1))
-    )
+    here, right, below = (ecef_from_ground(rpc.localize(image + step, alt)) for step in ((0, 0), (1, 0), (0, 1)))
     sides, mean = ground_sample_distance(rpc, rpc.localize(image, alt))
     assert sides == pytest.approx([np.linalg.norm(right - here), np.linalg.norm(below - here)], rel=1e-5)
     assert mean == pytest.approx(np.sqrt(np.linalg.norm(np.cross(right - here, below - here))), rel=1e-5)
@@ -121,9 +117,7 @@ def test_triangulation_is_the_least_squares_point_under_noise():
 
     def cost(ecef):
         ground = ground_from_ecef(ecef)
-        return sum(
-            (((m.project(ground) - x) / s) ** 2).sum() for m, x, s in zip(models, xy, sigma, strict=True)
-        )
+        return sum((((m.project(ground) - x) / s) ** 2).sum() for m, x, s in zip(models, xy, sigma, strict=True))
 
     best = cost(result.points[0])
     for step in 0.01 * np.vstack([np.eye(3), -np.eye(3)]):

@@ -110,15 +110,10 @@ def test_times_count_to_the_nanosecond(text: str, nanoseconds: int) -> None:
 
 @pytest.mark.parametrize("right", [True, False])
 @pytest.mark.parametrize("ahead", [0.0, 0.1, -0.2])
-def test_a_point_on_the_circle_has_its_range_its_angle_its_side_and_its_altitude(
-    right: bool, ahead: float
-) -> None:
+def test_a_point_on_the_circle_has_its_range_its_angle_its_side_and_its_altitude(right: bool, ahead: float) -> None:
     position = ecef_from_ground(np.array([[10.0, 45.0, 7e5], [-170.0, -60.0, 5.2e5]])).T
     velocity = (
-        np.stack(
-            [enu_basis(np.array([10.0, 45.0, 0.0]))[1], -enu_basis(np.array([-170.0, -60.0, 0.0]))[1]], 1
-        )
-        * 7500
+        np.stack([enu_basis(np.array([10.0, 45.0, 0.0]))[1], -enu_basis(np.array([-170.0, -60.0, 0.0]))[1]], 1) * 7500
     )
     distance, alt = np.array([9e5, 6.2e5]), np.array([1000.0, -50.0])
     ground, sight = on_circle(position, velocity, distance, alt, right, np.full(2, ahead))
@@ -155,9 +150,7 @@ def test_a_curve_of_one_piece_and_of_two_halves_are_one() -> None:
     """Values, rates and accelerations, also beyond both ends."""
     coeffs = np.random.default_rng(2).normal(size=(5, 3))
     whole, at = Curve.polynomial(coeffs, 2.0, 6.0), np.array([1.0, 2.0, 3.9, 4.0, 4.1, 6.0, 7.5])
-    moved = np.stack(
-        [polynomial.Polynomial(c)(polynomial.Polynomial([2.0, 1.0])).coef for c in coeffs.T], axis=1
-    )
+    moved = np.stack([polynomial.Polynomial(c)(polynomial.Polynomial([2.0, 1.0])).coef for c in coeffs.T], axis=1)
     halves = Curve(np.array([2.0, 4.0, 6.0]), np.stack([coeffs, moved]))
     for one, other, order in zip(whole.states(at), halves.states(at), range(3), strict=True):
         expected = polynomial.polyval(at - 2.0, polynomial.polyder(coeffs, order))
@@ -204,9 +197,7 @@ def test_a_drift_turns_a_point_on_by_the_row_at_which_it_is_seen() -> None:
 def test_derivatives_of_a_drifting_camera_are_central_differences(degree: int) -> None:
     rpc, correction = make_rpc(), drifting(degree)
     model = Corrected(rpc, correction)
-    ecef = ecef_from_ground(
-        model.localize(np.array([[3000.0, 1000.0], [12000.0, 17000.0]]), np.array([100.0, 800.0]))
-    )
+    ecef = ecef_from_ground(model.localize(np.array([[3000.0, 1000.0], [12000.0, 17000.0]]), np.array([100.0, 800.0])))
     image, *found = model.project_ecef(ecef)
     np.testing.assert_allclose(image, model.project(ground_from_ecef(ecef)), rtol=0, atol=1e-6)
     for axis, e in enumerate(np.eye(3)):
@@ -219,9 +210,7 @@ def test_derivatives_of_a_drifting_camera_are_central_differences(degree: int) -
 
         for analytic, name, step in zip(found, "xrt", (50.0, 1e-5, 50.0), strict=True):
             difference = (at(**{name: step}) - at(**{name: -step})) / (2 * step)
-            np.testing.assert_allclose(
-                analytic[..., axis], difference, rtol=0, atol=3e-6 * np.abs(analytic).max()
-            )
+            np.testing.assert_allclose(analytic[..., axis], difference, rtol=0, atol=3e-6 * np.abs(analytic).max())
 
 
 def test_motions_of_many_views_are_those_of_each() -> None:
@@ -244,9 +233,7 @@ def test_motions_of_many_views_are_those_of_each() -> None:
         for axis, e in enumerate(np.eye(3)):
             ends = []
             for sign in (step, -step):
-                x, r, d = (
-                    a + sign * e[:, None] * (k == j) for j, a in ((0, ecef), (1, rotation.T), (2, drift))
-                )
+                x, r, d = (a + sign * e[:, None] * (k == j) for j, a in ((0, ecef), (1, rotation.T), (2, drift)))
                 ends.append(Motion(x, r.T, translation, center, np.array([0, 2, 5]), d).ecef)
             rate = (ends[0] - ends[1]) / (2 * step)
             np.testing.assert_allclose(parts[k][:, axis], (by_moved * rate).sum(axis=1), rtol=1e-6, atol=1e-7)
@@ -336,9 +323,7 @@ def test_rows_of_a_spline_move_each_other_in_the_derivative() -> None:
 
 def test_a_timing_and_its_rate_are_polynomials_of_the_place_along_the_flight() -> None:
     timing = Timing([[3.0, 1e-4], [0.5, -2e-5], [0.25, 0.0]], 100.0, 50.0)
-    np.testing.assert_allclose(
-        timing.at(np.array([100.0, 150.0, 0.0])), [[3.0, 3.75, 3.0], [1e-4, 8e-5, 1.4e-4]]
-    )
+    np.testing.assert_allclose(timing.at(np.array([100.0, 150.0, 0.0])), [[3.0, 3.75, 3.0], [1e-4, 8e-5, 1.4e-4]])
     np.testing.assert_allclose(timing.rate(np.array([100.0, 150.0])), [[0.01, 0.02], [-4e-7, -4e-7]])
 
 
@@ -370,9 +355,7 @@ def test_many_cameras_are_asked_as_one() -> None:
             many.project_jacobian(ground)[1][n], sensors[v].project_jacobian(ground[n])[1], rtol=1e-9
         )
         np.testing.assert_allclose(sight_enu(many, ground)[n], sight_enu(sensors[v], ground[n]), atol=1e-9)
-        for found, expected in zip(
-            view_angles(many, ground), view_angles(sensors[v], ground[n]), strict=True
-        ):
+        for found, expected in zip(view_angles(many, ground), view_angles(sensors[v], ground[n]), strict=True):
             assert found[n] == pytest.approx(expected, abs=1e-7)
 
 
@@ -491,9 +474,7 @@ def test_each_formation_states_the_range_and_its_rate_by_its_formula() -> None:
     for kind, formation in FORMATIONS.items():
         found = formation.at(x, y, orbit)
         assert found.time == pytest.approx(time)
-        np.testing.assert_allclose(
-            [found.distance[0], found.rate[0]], expected[kind], rtol=1e-12, err_msg=kind
-        )
+        np.testing.assert_allclose([found.distance[0], found.rate[0]], expected[kind], rtol=1e-12, err_msg=kind)
         np.testing.assert_array_equal(found.position, position)
         np.testing.assert_array_equal(found.velocity, velocity)
 
@@ -507,9 +488,7 @@ def test_each_formation_states_the_range_and_its_rate_by_its_formula() -> None:
         ({"look": "R"}, False),
     ],
 )  # fmt: skip
-def test_a_radar_image_has_pixels_altitudes_spacing_and_a_side(
-    change: dict[str, Any], ok: bool, tmp_path
-) -> None:
+def test_a_radar_image_has_pixels_altitudes_spacing_and_a_side(change: dict[str, Any], ok: bool, tmp_path) -> None:
     model = sicd(tmp_path)
     if ok:
         assert replace(model, **change) != model
@@ -554,9 +533,7 @@ def test_the_altitudes_of_a_radar_image_are_a_kilometre_around_its_centre(tmp_pa
 
 
 @pytest.mark.parametrize(("off", "ok"), [(0.9, True), (-0.9, True), (1.1, False), (-1.1, False)])
-def test_the_centre_of_a_scene_is_seen_within_a_pixel_of_where_it_is_said_to_be(
-    off: float, ok: bool, tmp_path
-) -> None:
+def test_the_centre_of_a_scene_is_seen_within_a_pixel_of_where_it_is_said_to_be(off: float, ok: bool, tmp_path) -> None:
     """Of an image near closest approach, whose stated range (R_CA_SCP) is moved by a part of a pixel."""
     text = document("INCA")
     begin = text.index("<R_CA_SCP>") + 10
@@ -571,18 +548,14 @@ def test_the_centre_of_a_scene_is_seen_within_a_pixel_of_where_it_is_said_to_be(
             open_sicd(path)
 
 
-@pytest.mark.parametrize(
-    ("altitude", "ok"), [(-990.0, True), (-1010.0, False), (9990.0, True), (10010.0, False)]
-)
+@pytest.mark.parametrize(("altitude", "ok"), [(-990.0, True), (-1010.0, False), (9990.0, True), (10010.0, False)])
 def test_the_centre_of_a_scene_is_on_the_ground(altitude: float, ok: bool, tmp_path) -> None:
     path = tmp_path / "image.xml"
     path.write_text(document("PFA", ground=(5.4, 43.3, altitude)))
     if ok:
         assert np.mean(open_sicd(path).alt_range) == pytest.approx(altitude, abs=1e-3)
     else:
-        with pytest.raises(
-            RpcFormatError, match=f"is {altitude:.0f} m above the ellipsoid, not on the ground"
-        ):
+        with pytest.raises(RpcFormatError, match=f"is {altitude:.0f} m above the ellipsoid, not on the ground"):
             open_sicd(path)
 
 

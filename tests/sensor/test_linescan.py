@@ -22,9 +22,7 @@ from barpc.sensor.pushbroom import STRAIGHT, Light
 from tests.sensor.linescan_files import START, Flight, dimap, inertial_sight, isd, stamp
 
 FLIGHT = Flight()
-IMAGE = np.array(
-    [[0.0, 0.0], [3999.0, 0.0], [1234.5, 7000.25], [0.0, 19999.0], [3999.0, 19999.0], [2000.0, 333.0]]
-)
+IMAGE = np.array([[0.0, 0.0], [3999.0, 0.0], [1234.5, 7000.25], [0.0, 19999.0], [3999.0, 19999.0], [2000.0, 333.0]])
 
 
 def read(tmp_path, text, **choices):
@@ -74,9 +72,7 @@ def test_rows_that_were_turned_over_run_back_in_time(tmp_path):
 @pytest.mark.parametrize(("scan", "sign"), [("Forward", 1), ("Reverse", -1)])
 def test_one_entry_of_line_times_goes_by_the_rate_and_the_direction(tmp_path, scan, sign):
     text, _ = isd(FLIGHT)
-    text = re.sub(r"(<TLCLIST>0.0 0.0</TLCLIST>)<TLCLIST>.*?</TLCLIST>", r"\1", text).replace(
-        "<NUMTLC>2", "<NUMTLC>1"
-    )
+    text = re.sub(r"(<TLCLIST>0.0 0.0</TLCLIST>)<TLCLIST>.*?</TLCLIST>", r"\1", text).replace("<NUMTLC>2", "<NUMTLC>1")
     text = text.replace(">Forward<", f">{scan}<")
     if sign > 0:
         assert read(tmp_path, text).model.line_period == pytest.approx(FLIGHT.period, rel=1e-12)
@@ -93,9 +89,7 @@ def test_aberration_is_that_of_the_inertial_frame(tmp_path):
     origin, seen = model.line_of_sight(IMAGE)
     velocity = model.orbit(model.time(IMAGE[:, 1]))[1].T
     for k in range(len(IMAGE)):
-        np.testing.assert_allclose(
-            inertial_sight(ground[k], origin[k], velocity[k]), seen[k], rtol=0, atol=2e-10
-        )
+        np.testing.assert_allclose(inertial_sight(ground[k], origin[k], velocity[k]), seen[k], rtol=0, atol=2e-10)
     straight = replace(model, light=STRAIGHT).localize(IMAGE, np.full(len(IMAGE), 300.0))
     off = np.linalg.norm(ecef_from_ground(ground) - ecef_from_ground(straight), axis=1)
     assert ((off > 15) & (off < 25)).all()
@@ -122,9 +116,7 @@ def test_refraction_is_that_of_a_ray_through_the_air(tmp_path, alt):
 def test_stated_covariances_are_the_priors_of_the_view(tmp_path):
     found = read(tmp_path, isd(FLIGHT)[0])
     view = View("a", "", found.size, found.model, (0.0, 500.0))
-    far = np.linalg.norm(
-        found.model.position(10000) - ecef_from_ground(found.model.localize(IMAGE[2], np.array(0.0)))
-    )
+    far = np.linalg.norm(found.model.position(10000) - ecef_from_ground(found.model.localize(IMAGE[2], np.array(0.0))))
     wanted = [2 * np.sqrt(12e-12 / 3) * far] * 3 + [np.sqrt(0.02)] * 3
     np.testing.assert_allclose(prior_sigmas((view,), AdjustOptions(), 0), [wanted], rtol=1e-3)
     assert prior_sigmas((view,), AdjustOptions(sigma_attitude=3.0), 0)[0, 0] == 3.0
@@ -171,9 +163,7 @@ _CORNERS = np.array(
     ("aberration", "refraction", "low", "high"),
     [(True, True, 0.0, 0.06), (True, False, 1.0, 1.2), (False, True, 18, 19), (False, False, 19, 20)],
 )
-def test_the_vendor_s_own_corners_lie_where_bent_light_has_them(
-    shared_data, aberration, refraction, low, high
-):
+def test_the_vendor_s_own_corners_lie_where_bent_light_has_them(shared_data, aberration, refraction, low, high):
     path = shared_data / "physical_maxar" / "10200100A1865800.r100.xml"
     model = read_linescan(path, aberration=aberration, refraction=refraction).model
     off = np.abs(model.project(_CORNERS[:, :3]) - _CORNERS[:, 3:])
@@ -383,8 +373,7 @@ def test_bands_are_told_apart_by_name(tmp_path):
     second = ISD.replace("<BAND_P>", "<BAND_N>").replace("</BAND_P>", "</BAND_N>")
     both = ISD.replace(
         "</BAND_P>",
-        "</BAND_P>"
-        + re.search("(?s)<BAND_N>.*</BAND_N>", second)[0].replace("<DETORIGINX>0.0", "<DETORIGINX>0.8"),
+        "</BAND_P>" + re.search("(?s)<BAND_N>.*</BAND_N>", second)[0].replace("<DETORIGINX>0.0", "<DETORIGINX>0.8"),
     )
     with pytest.raises(InputError, match="band=NAME of P, N"):
         read(tmp_path, both)

@@ -27,9 +27,7 @@ from tests.sensor.s1_product import GRD, INTERVAL, IW, LATE, SAMPLING, START, ST
 
 XML = {name: product.xml() for name, product in IW.items()}
 SHORT = {
-    name: replace(
-        product, num_bursts=2, lines_per_burst=60, burst_cycle=50, first_burst=product.first_burst / 10
-    )
+    name: replace(product, num_bursts=2, lines_per_burst=60, burst_cycle=50, first_burst=product.first_burst / 10)
     for name, product in IW.items()
 }
 """The same with few lines: it is the names of their files that matter."""
@@ -128,9 +126,7 @@ def test_annotations_are_known_by_their_names(tmp_path, name, known):
     (folder / name).write_bytes(SHORT["IW1"].xml())
     with zipfile.ZipFile(tmp_path / "x.zip", "w") as archive:
         archive.writestr(f"x.SAFE/annotation/{name}", SHORT["IW1"].xml())
-        archive.writestr(
-            f"x.SAFE/other/{called('iw2', 'vv')}", SHORT["IW2"].xml()
-        )  # in no folder of annotations
+        archive.writestr(f"x.SAFE/other/{called('iw2', 'vv')}", SHORT["IW2"].xml())  # in no folder of annotations
     places = [tmp_path / "x.zip"] if name.endswith("XML") else [tmp_path / "x.zip", tmp_path / "x.SAFE"]
     for path in places:
         if known:
@@ -149,12 +145,7 @@ def test_an_empty_zip_is_one_without_annotations(tmp_path):
 
 def test_an_error_names_the_product_or_the_orbit_file_that_is_guilty(tmp_path):
     path = product_of(tmp_path / "x.SAFE", called("iw1", "vv"))
-    few = (
-        SHORT["IW1"]
-        .xml()
-        .replace(b"<orbitList>", b"<orbitList><!--")
-        .replace(b"</orbitList>", b"--></orbitList>")
-    )
+    few = SHORT["IW1"].xml().replace(b"<orbitList>", b"<orbitList><!--").replace(b"</orbitList>", b"--></orbitList>")
     (path / "annotation" / called("iw1", "vv")).write_bytes(few)
     with pytest.raises(RpcError, match=rf"^{path}: orbit: 0 state vectors"):
         open_product(path)

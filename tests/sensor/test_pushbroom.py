@@ -110,9 +110,7 @@ def test_what_cannot_be_seen_is_nan(sensor):
     assert np.array_equal(np.isnan(image).all(axis=1), bad)
     assert np.array_equal(np.isnan(jacobian).all(axis=(1, 2)), bad)
     far = np.array([[0.0, 1e9], [1e9, 0.0], [np.nan, 0.0], [0.0, 0.0]])
-    assert np.array_equal(
-        np.isnan(sensor.localize(far, np.array(0.0))).any(axis=1), [True, True, True, False]
-    )
+    assert np.array_equal(np.isnan(sensor.localize(far, np.array(0.0))).any(axis=1), [True, True, True, False])
 
 
 def test_it_is_frozen_compares_by_content_and_survives_a_pickle(sensor):
@@ -203,9 +201,7 @@ def test_a_camera_from_sampled_ephemeris_and_quaternions_is_the_camera_that_was_
     times, ticks = np.arange(start, stop, 0.1), np.arange(start, stop, 1 / 32)
     place, w = sensor.orbit(times)[0].T, sensor.attitude(ticks)[0].T
     turned = Rotation.from_matrix(np.array(sensor.mount)) * Rotation.from_rotvec(w)
-    quaternions = (
-        np.roll(turned.as_quat(), 1, axis=1) * np.where(np.arange(len(ticks)) % 3, 2.0, -0.5)[:, None]
-    )
+    quaternions = np.roll(turned.as_quat(), 1, axis=1) * np.where(np.arange(len(ticks)) % 3, 2.0, -0.5)[:, None]
     mount, attitude = attitude_through(ticks, quaternions)
     again = replace(sensor, orbit=Curve.through(times, place), attitude=attitude, mount=mount)
     image, alt = points
@@ -225,9 +221,7 @@ def test_a_shaking_attitude_still_inverts(sensor, points):
     _, jacobian = shaken.project_jacobian(ground[:100])
     for axis, step in enumerate((1e-6, 1e-6, 0.1)):
         delta = step * np.eye(3)[axis]
-        difference = (shaken.project(ground[:100] + delta) - shaken.project(ground[:100] - delta)) / (
-            2 * step
-        )
+        difference = (shaken.project(ground[:100] + delta) - shaken.project(ground[:100] - delta)) / (2 * step)
         assert np.abs(difference - jacobian[..., axis]).max() < 1e-5 * np.abs(jacobian[..., axis]).max()
 
 
@@ -291,18 +285,14 @@ def test_beyond_the_ephemeris_points_are_nan_after_a_second(sensor):
     heading=st.floats(0, 360),
 )
 @settings(max_examples=60, deadline=None)
-def test_any_satellite_anywhere_sees_its_target_in_the_middle(
-    lon, lat, incidence, azimuth, altitude, heading
-):
+def test_any_satellite_anywhere_sees_its_target_in_the_middle(lon, lat, incidence, azimuth, altitude, heading):
     look = Look(incidence, azimuth, altitude, heading)
     target = np.array([lon, lat, 150.0])
     sensor = fly(target, look, (2000, 1500), 0.5)
     assert np.abs(sensor.project(target) - (999.5, 749.5)).max() < 1e-6
     seen_incidence, seen_azimuth = view_angles(sensor, target)
     assert seen_incidence == pytest.approx(incidence, abs=1e-3)
-    assert incidence < 0.1 or abs((seen_azimuth - azimuth + 180) % 360 - 180) < 0.1 / np.sin(
-        np.radians(incidence)
-    )
+    assert incidence < 0.1 or abs((seen_azimuth - azimuth + 180) % 360 - 180) < 0.1 / np.sin(np.radians(incidence))
     image = np.array([[0.0, 0.0], [1999.0, 1499.0], [0.0, 1499.0]])
     assert np.abs(sensor.project(sensor.localize(image, np.array(2000.0))) - image).max() < 2e-8
 

@@ -101,15 +101,10 @@ def test_points_are_found_on_the_sheet_of_the_centre_and_nowhere_else(slope, cur
     if slope:  # beyond the pole the map goes on, on another sheet
         beyond = np.array([[-1.5 / slope], [0.2], [0.0]])
         _, ok = rational_map.solve(rational_map.value(beyond), beyond[2])
-        assert (
-            not ok.any()
-            or np.abs(rational_map.solve(rational_map.value(beyond), beyond[2])[0] - beyond).max() > 0.1
-        )
+        assert not ok.any() or np.abs(rational_map.solve(rational_map.value(beyond), beyond[2])[0] - beyond).max() > 0.1
 
 
-@pytest.mark.parametrize(
-    ("curve", "quick"), [(0.2, True), (-0.2, True), (0.9, True), (0.95, False), (-0.95, False)]
-)
+@pytest.mark.parametrize(("curve", "quick"), [(0.2, True), (-0.2, True), (0.9, True), (0.95, False), (-0.95, False)])
 def test_a_fold_of_a_map_that_is_turned_is_where_its_determinant_vanishes(curve: float, quick: bool) -> None:
     """(x + y + curve x^2, x - y): a fold at x = -1/curve."""
     coeffs = np.zeros((4, 20))

@@ -39,9 +39,7 @@ def camera(look: np.ndarray = LOOK, period: float = PERIOD, light: Light = STRAI
     orbit = np.array([over - since * speed, speed, -4.1 * vertical, 0.01 * east])
     mount = np.column_stack([flight, np.cross(-vertical, flight), -vertical])
     mount = mount @ Rotation.from_euler("xyz", [0.3, 0.15, -0.4]).as_matrix()
-    attitude = np.array(
-        [[0.004, -0.006, 0.01], [-0.009, 0.004, 0.012], [3e-3, 2e-3, -4e-3], [1e-3, -1e-3, 0.0]]
-    )
+    attitude = np.array([[0.004, -0.006, 0.01], [-0.009, 0.004, 0.012], [3e-3, 2e-3, -4e-3], [1e-3, -1e-3, 0.0]])
     return Pushbroom(
         Curve.polynomial(orbit, low, high),
         Curve.polynomial(attitude, low, high),
@@ -135,9 +133,7 @@ def test_bent_light_comes_back_to_its_pixel(light: str) -> None:
     model, (image, alt) = replace(CASES["curved"], light=BENT[light]), scatter(2, 60)
     ground = model.localize(image, alt)
     np.testing.assert_allclose(model.project(ground), image, rtol=0, atol=3e-8)
-    moved = np.linalg.norm(
-        ecef_from_ground(ground) - ecef_from_ground(CASES["curved"].localize(image, alt)), axis=1
-    )
+    moved = np.linalg.norm(ecef_from_ground(ground) - ecef_from_ground(CASES["curved"].localize(image, alt)), axis=1)
     low, high = {"aberration": (8, 40), "refraction": (0.2, 4), "both": (8, 40)}[light]
     assert low < moved.min()
     assert moved.max() < high

@@ -57,9 +57,7 @@ def box(rpc: RPC, reach: float, count: int = 20_000, seed: int = 0) -> tuple[np.
 def rounding(rpc: RPC, ground: np.ndarray) -> float:
     """What half a unit in the last place of lon and lat moves in the image [px]."""
     _, jacobian = rpc.project_jacobian(ground)
-    return float(
-        (np.abs(jacobian[:, :, :2]) * 0.5 * np.spacing(np.abs(ground[:, None, :2]))).sum(axis=2).max()
-    )
+    return float((np.abs(jacobian[:, :, :2]) * 0.5 * np.spacing(np.abs(ground[:, None, :2]))).sum(axis=2).max())
 
 
 @vendors
@@ -118,9 +116,7 @@ def test_a_chunk_border_shows_nowhere():
     rpc = make_rpc()
     image, alt = box(rpc, 1.0, 8192 * 2 + 5)
     ground = rpc.localize(image, alt)
-    pieces = np.concatenate(
-        [rpc.localize(image[i : i + 1000], alt[i : i + 1000]) for i in range(0, len(alt), 1000)]
-    )
+    pieces = np.concatenate([rpc.localize(image[i : i + 1000], alt[i : i + 1000]) for i in range(0, len(alt), 1000)])
     np.testing.assert_allclose(pieces, ground, rtol=0, atol=1e-13)
     np.testing.assert_allclose(
         rpc.project(ground),
@@ -215,9 +211,7 @@ def test_ground_lies_within_half_a_turn_of_the_offset_and_between_the_poles(offs
     ground = rpc.localize(np.array([image]), np.zeros(1))[0]
     assert np.isfinite(ground).all() == found
     if found:
-        np.testing.assert_allclose(
-            ground[:2], np.array(offset[:2]) + np.array(scale[:2]) * image / [100, -100]
-        )
+        np.testing.assert_allclose(ground[:2], np.array(offset[:2]) + np.array(scale[:2]) * image / [100, -100])
 
 
 def test_there_is_no_ground_beyond_a_pole():
@@ -298,9 +292,7 @@ def test_rpcs_are_off_by_what_their_image_points_are_apart_over_the_box():
     pole[0, 1] = pole[2, 2] = pole[1, 0] = pole[3, 0] = pole[1, 1] = 1.0
     poles = RPC(pole, [0.0] * 3, [1.0] * 3, [0.0] * 2, [1000.0] * 2)
     assert (poles.off(poles) == 0).all()
-    whole = replace(
-        poles, coeffs=poles.coeffs * (np.arange(20) != 1) + (np.arange(20) == 1) * [[1], [0], [0], [0]]
-    )
+    whole = replace(poles, coeffs=poles.coeffs * (np.arange(20) != 1) + (np.arange(20) == 1) * [[1], [0], [0], [0]])
     assert np.isnan(poles.off(whole)[:, 0]).sum() == 81  # the side of the box that is a pole for one alone
 
 

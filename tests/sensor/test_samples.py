@@ -136,9 +136,7 @@ def test_a_gap_outside_of_the_image_does_not_matter(times: list[float]) -> None:
 @pytest.mark.parametrize(
     ("span", "ok"), [((0.5, 4.0), True), ((0.5, 4.25), False), ((20.0, 22.5), True), ((19.75, 22.5), False)]
 )
-def test_a_gap_may_begin_where_the_image_ends_and_end_where_it_begins(
-    span: tuple[float, float], ok: bool
-) -> None:
+def test_a_gap_may_begin_where_the_image_ends_and_end_where_it_begins(span: tuple[float, float], ok: bool) -> None:
     """The samples on either side of it are enough then."""
     times = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 20.0, 21.0, 22.0, 23.0])
     with nullcontext() if ok else pytest.raises(RpcFormatError, match=r"no positions from 4.00 to 20.00 s"):
@@ -176,9 +174,7 @@ def test_a_stated_velocity_may_be_that_of_the_inertial_frame(off: float, ok: boo
     if ok:
         assert build(replace(s, velocities=velocities), detector()).size == SIZE
     else:
-        refused(
-            replace(s, velocities=velocities), "otherwise than their stated velocities; are the times right"
-        )
+        refused(replace(s, velocities=velocities), "otherwise than their stated velocities; are the times right")
     velocities = s.velocities.copy()
     velocities[[0, -1]] += 5000.0  # of differences to one side nothing is asked
     assert build(replace(s, velocities=velocities), detector()).size == SIZE
@@ -240,9 +236,7 @@ def test_an_orbit_takes_the_least_degree_whose_next_term_is_below_a_hundredth_of
     np.testing.assert_allclose(orbit(flight.times)[0].T, flight.positions, rtol=0, atol=2e-5)
     few = np.linspace(0, len(flight.times) - 1, degree + 1).astype(int)
     if len(few) >= 4:  # no more samples than unknowns: the curve goes through them
-        held = replace(
-            flown, times=flown.times[few], positions=flown.positions[few], velocities=flown.velocities[few]
-        )
+        held = replace(flown, times=flown.times[few], positions=flown.positions[few], velocities=flown.velocities[few])
         there = build(held, detector(flight)).model.orbit
         np.testing.assert_allclose(there(held.times)[0].T, held.positions, rtol=0, atol=1e-7)
         assert there != orbit
@@ -374,9 +368,7 @@ def test_the_camera_may_stand_off_the_place_that_is_listed(tmp_path) -> None:
     assert misses(read(tmp_path, isd(flight)[0]).model, truth) > 1.0
     other = re.sub(r"(<ATT><STARTTIME>)[^<]*", rf"\g<1>{stamp(FLIGHT.times[0] + 1e-3)}", text)
     assert other != text
-    with pytest.raises(
-        RpcFormatError, match="PERSPECTIVE_CENTER with positions and attitudes of other times"
-    ):
+    with pytest.raises(RpcFormatError, match="PERSPECTIVE_CENTER with positions and attitudes of other times"):
         read(tmp_path, other)
 
 
@@ -436,9 +428,7 @@ def test_the_first_column_is_one_where_none_is_said(tmp_path) -> None:
 
 def test_look_angles_may_be_of_any_degree(tmp_path) -> None:
     """Column c looks along (tan psi_y, -tan psi_x, 1): the powers of each axis are its own."""
-    more = PHR.replace(
-        "<YLOS_0>0.003</YLOS_0>", "<YLOS_0>0.003</YLOS_0><YLOS_1>2e-8</YLOS_1><XLOS_2>3e-13</XLOS_2>"
-    )
+    more = PHR.replace("<YLOS_0>0.003</YLOS_0>", "<YLOS_0>0.003</YLOS_0><YLOS_1>2e-8</YLOS_1><XLOS_2>3e-13</XLOS_2>")
     model = read(tmp_path, more).model
     straight = read(tmp_path, PHR).model
     expected = np.zeros((2, 3))
@@ -477,9 +467,7 @@ def test_a_line_period_is_of_the_unit_that_fits_the_time_of_the_last_row(tmp_pat
 
 
 @pytest.mark.parametrize(("share", "ok"), [(1.008, True), (0.992, True), (1.013, False), (0.987, False)])
-def test_a_line_period_agrees_to_a_hundredth_with_what_the_image_lasts(
-    tmp_path, share: float, ok: bool
-) -> None:
+def test_a_line_period_agrees_to_a_hundredth_with_what_the_image_lasts(tmp_path, share: float, ok: bool) -> None:
     period = FLIGHT.period * share
     text = re.sub(r"<LINE_PERIOD>.*?<", f"<LINE_PERIOD>{1e3 * period!r}<", PHR)
     if ok:

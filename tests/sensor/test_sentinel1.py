@@ -58,9 +58,7 @@ def quiet_model(path: Path) -> RangeDoppler:
         return RangeDoppler.from_annotation(path)
 
 
-def scatter(
-    model: RangeDoppler, alt: tuple[float, float], count: int = 2000
-) -> tuple[np.ndarray, np.ndarray]:
+def scatter(model: RangeDoppler, alt: tuple[float, float], count: int = 2000) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(5)
     return rng.uniform(0, 1, (count, 2)) * (np.array(model.size) - 1), rng.uniform(*alt, count)
 
@@ -116,12 +114,8 @@ def test_times_are_those_of_the_exact_orbit(product: Product) -> None:
     assert np.abs(range_time - truth[1]).max() * SAMPLING <= 1e-6
 
 
-@pytest.mark.parametrize(
-    "delays", [{}, {"atmosphere": True}, {"bistatic": "annotated"}, {"bistatic": "full"}]
-)
-def test_localisation_inverts_projection_from_the_dead_sea_to_everest(
-    iw1: Product, delays: dict[str, bool]
-) -> None:
+@pytest.mark.parametrize("delays", [{}, {"atmosphere": True}, {"bistatic": "annotated"}, {"bistatic": "full"}])
+def test_localisation_inverts_projection_from_the_dead_sea_to_everest(iw1: Product, delays: dict[str, bool]) -> None:
     built = RangeDoppler.from_annotation(read_annotation(iw1.xml()), **delays)
     image, alt = scatter(built, (-500.0, 9000.0))
     assert np.abs(built.project(built.localize(image, alt)) - image).max() <= 1e-8
@@ -516,9 +510,7 @@ def test_a_grid_of_another_scene_is_reported_and_not_followed(iw1: Product, mode
 
 def test_times_are_exact_to_the_microsecond() -> None:
     epoch = parse_time("2021-02-16T15:12:07.524369", "x")
-    assert seconds(parse_time("UTC=2021-02-16T15:12:32.665878", "x"), epoch) == pytest.approx(
-        25.141509, abs=1e-12
-    )
+    assert seconds(parse_time("UTC=2021-02-16T15:12:32.665878", "x"), epoch) == pytest.approx(25.141509, abs=1e-12)
     for text in ("yesterday", "NaT", "", "2021-13-01T00:00:00", "2021-02-16T15:12:07+01:00", "none"):
         with pytest.raises(RpcFormatError, match="not a UTC time"):
             parse_time(text, "x")
@@ -545,9 +537,7 @@ def test_an_rpc_of_a_moved_swath_is_fitted_by_the_same_function(model: RangeDopp
 
 
 @pytest.mark.slow
-def test_the_command_line_fits_swaths_bursts_and_mosaics(
-    safe: Path, tmp_path: Path, model: RangeDoppler
-) -> None:
+def test_the_command_line_fits_swaths_bursts_and_mosaics(safe: Path, tmp_path: Path, model: RangeDoppler) -> None:
     runner, out = CliRunner(), tmp_path / "iw1_RPC.TXT"
     for choices in ("swath=iw1,pol=vh", "swath=mosaic", "swath=iw3,burst=2"):
         command = ["fit", f"{safe},{choices}", "-o", str(out), "--overwrite"]
@@ -591,9 +581,7 @@ def _of_three(shared_data: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize("number", rest_slow(range(-1, 10), keep=2))
-def test_a_downlinked_orbit_meets_the_grid_by_the_velocities_it_states(
-    shared_data: Path, number: int
-) -> None:
+def test_a_downlinked_orbit_meets_the_grid_by_the_velocities_it_states(shared_data: Path, number: int) -> None:
     """They are not the derivatives of its positions, by which rows are 0.005 to 0.12 lines off."""
     path = annotation_path(shared_data, "20210401t052624") if number < 0 else _of_three(shared_data)[number]
     annotation = read_annotation(path)
@@ -650,9 +638,7 @@ def test_incidence_angles_are_those_of_the_grid(shared_data: Path, stamp: str) -
     points = parse_xml(path).iter("geolocationGridPoint")
     stated = np.array([float(point.findtext("incidenceAngle")) for point in points])
     built, ground = RangeDoppler.from_annotation(path), read_annotation(path).grid.ground
-    assert (
-        np.abs(view_angles(built, ground)[0] - stated).max() <= 0.04
-    )  # the grid counts from the Earth's centre
+    assert np.abs(view_angles(built, ground)[0] - stated).max() <= 0.04  # the grid counts from the Earth's centre
     ecef = ecef_from_ground(ground).T
     sight = built.orbit.states(built.azimuth_range(ground)[0])[0] - ecef
     cosine = (sight * ecef).sum(axis=0) / np.linalg.norm(sight, axis=0) / np.linalg.norm(ecef, axis=0)
@@ -678,9 +664,7 @@ def test_an_independent_tool_finds_the_same_image_points(shared_data: Path, stam
     if annotation.bursts:
         first = annotation.bursts[0].first_valid
         valid = first >= 0
-        origin = np.array(
-            [min(b.first_valid[b.first_valid >= 0].min() for b in annotation.bursts), valid.argmax()]
-        )
+        origin = np.array([min(b.first_valid[b.first_valid >= 0].min() for b in annotation.bursts), valid.argmax()])
     col = np.abs(image[:, 0] - origin[0] - table["eos_col"]).max()
     row = np.abs(image[:, 1] - origin[1] - table["eos_row"]).max()
     downlinked = annotation.states.source == "Downlink"

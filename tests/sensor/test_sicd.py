@@ -69,9 +69,7 @@ def test_range_and_rate_of_a_localised_point_are_those_that_the_document_states(
     plane = ((image[:, ::-1] - model.origin) * model.spacing).T
     stated = model.formation.at(*plane, model.orbit)
     time, step, point = polynomial.polyval2d(*plane, model.formation.time), 1e-3, ecef_from_ground(ground)
-    before, now, after = (
-        np.linalg.norm(model.orbit(time + d)[0].T - point, axis=1) for d in (-step, 0.0, step)
-    )
+    before, now, after = (np.linalg.norm(model.orbit(time + d)[0].T - point, axis=1) for d in (-step, 0.0, step))
     np.testing.assert_allclose(now, stated.distance, rtol=0, atol=1e-6)
     np.testing.assert_allclose((after - before) / (2 * step), stated.rate, rtol=0, atol=1e-5)
     np.testing.assert_allclose(model.project(ground), image, rtol=0, atol=1e-7)
@@ -133,9 +131,7 @@ def test_a_namespace_with_a_prefix_changes_nothing(kind, tmp_path, model_of):
     assert not any(map(is_sicd, (b"<SICDX>", b"<a:SICDS/>", b"SICD>")))
 
 
-@pytest.mark.parametrize(
-    ("images", "graphics", "texts"), [(0, 0, 0), (3, 0, 0), (1, 2, 0), (1, 0, 2), (2, 12, 11)]
-)
+@pytest.mark.parametrize(("images", "graphics", "texts"), [(0, 0, 0), (3, 0, 0), (1, 2, 0), (1, 0, 2), (2, 12, 11)])
 def test_a_document_stands_behind_all_that_a_nitf_holds(images, graphics, texts, tmp_path):
     path = nitf(document("PFA"), tmp_path / "image.ntf", images, graphics, texts)
     assert find_sicd(path) == document("PFA").encode()

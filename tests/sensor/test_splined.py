@@ -75,9 +75,7 @@ def test_what_fades_begins_at_its_origin_and_has_its_rate(rate: float) -> None:
     factor = np.exp(-np.maximum(away * rate, 0.0))
     np.testing.assert_allclose(spline.at(image), factor[:, None] * MOVED[2], rtol=1e-12)
     row = 9000.0 + away[2:]
-    slope = (
-        spline.at(np.column_stack([row, row + 0.01])) - spline.at(np.column_stack([row, row - 0.01]))
-    ) / 0.02
+    slope = (spline.at(np.column_stack([row, row + 0.01])) - spline.at(np.column_stack([row, row - 0.01]))) / 0.02
     np.testing.assert_allclose(spline.rate(row), slope, rtol=1e-6, atol=1e-12)
     assert (spline.rate(9000.0 + away[:1]) == 0).all()
 
@@ -102,9 +100,7 @@ def test_swings_repeat_themselves_and_have_their_slope() -> None:
     image = np.column_stack([row * 0.0 + 5.0, row])
     np.testing.assert_allclose(spline.at(image), spline.at(image + [0.0, 3600.0]), atol=1e-12)
     alone = RowSpline(np.zeros((0, 2)), periods=[400.0], swings=SWINGS[:1])
-    expected = np.column_stack(
-        [0.1 * np.cos(2 * np.pi * row / 400.0), -0.2 * np.sin(2 * np.pi * row / 400.0)]
-    )
+    expected = np.column_stack([0.1 * np.cos(2 * np.pi * row / 400.0), -0.2 * np.sin(2 * np.pi * row / 400.0)])
     np.testing.assert_allclose(alone.at(image), expected, atol=1e-12)
     slope = (spline.at(image + [0.0, 0.01]) - spline.at(image - [0.0, 0.01])) / 0.02
     np.testing.assert_allclose(spline.rate(row), slope, rtol=1e-6, atol=1e-9)

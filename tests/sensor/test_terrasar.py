@@ -67,9 +67,7 @@ def test_the_product_s_own_grid_is_a_witness(tmp_path):
     georef.write_text(re.sub(r"<t>([^<]*)</t>", lambda m: f"<t>{float(m[1]) + 6 * INTERVAL}</t>", text))
     with pytest.warns(BarpcWarning, match=r"off by 0\.0 columns, 6\.0 rows"):
         open_terrasar(path)
-    georef.write_text(
-        re.sub(r"<tau>([^<]*)</tau>", lambda m: f"<tau>{float(m[1]) - 7 * SPACING}</tau>", text)
-    )
+    georef.write_text(re.sub(r"<tau>([^<]*)</tau>", lambda m: f"<tau>{float(m[1]) - 7 * SPACING}</tau>", text))
     with pytest.warns(BarpcWarning, match=r"off by 7\.0 columns, 0\.0 rows"):
         open_terrasar(path)
 
@@ -183,9 +181,7 @@ def test_no_signal_is_late_by_more_than_a_millisecond(tmp_path, late, ok):
     path = product.write(tmp_path)
     if ok:
         ground = product.ground(5)
-        np.testing.assert_allclose(
-            open_terrasar(path).project(ground), product.image(ground), rtol=0, atol=2e-3
-        )
+        np.testing.assert_allclose(open_terrasar(path).project(ground), product.image(ground), rtol=0, atol=2e-3)
     else:
         with pytest.raises(RpcFormatError, match=r"azimuthShift is .* s, expected at most 0\.001"):
             open_terrasar(path)
@@ -197,9 +193,7 @@ def test_no_signal_is_late_by_more_than_a_millisecond(tmp_path, late, ok):
 def test_a_grid_five_pixels_off_belongs_to_another_orbit(tmp_path, rows, columns, warned):
     path = Terrasar().write(tmp_path)
     georef = tmp_path / "ANNOTATION" / "GEOREF.xml"
-    text = re.sub(
-        r"<t>([^<]*)</t>", lambda m: f"<t>{float(m[1]) + rows * INTERVAL!r}</t>", georef.read_text()
-    )
+    text = re.sub(r"<t>([^<]*)</t>", lambda m: f"<t>{float(m[1]) + rows * INTERVAL!r}</t>", georef.read_text())
     text = re.sub(r"<tau>([^<]*)</tau>", lambda m: f"<tau>{float(m[1]) + columns * SPACING!r}</tau>", text)
     georef.write_text(text)
     with warnings.catch_warnings(record=True) as told:
@@ -246,9 +240,5 @@ def test_the_corners_of_a_delivered_product_are_on_their_rows(shared_data):
     np.testing.assert_allclose(image[:, 0], col - 1, rtol=0, atol=1e-6)
     np.testing.assert_allclose(image[:, 1], row - 1, rtol=0, atol=0.03)  # px: 0.023 of all four
     assert np.ptp(image[:, 1] - row) < 0.002
-    np.testing.assert_allclose(
-        view_angles(model, np.column_stack([lon, lat, height]))[0], incidence, atol=0.02
-    )
-    assert (
-        np.abs(height[[1, 3]] + 28.0) < 3.0
-    ).all()  # m: the sea, 24 to 26 m below the ellipsoid, 2 m in range late
+    np.testing.assert_allclose(view_angles(model, np.column_stack([lon, lat, height]))[0], incidence, atol=0.02)
+    assert (np.abs(height[[1, 3]] + 28.0) < 3.0).all()  # m: the sea, 24 to 26 m below the ellipsoid, 2 m in range late

@@ -45,8 +45,7 @@ def test_derivatives_by_range_and_azimuth_time_are_central_differences(kind, tmp
             change = np.zeros((2, 2))
             change[degree, k] = step
             high, low = (
-                model.timed(replace(timing, coeffs=timing.coeffs + s * change)).project(ground)
-                for s in (1, -1)
+                model.timed(replace(timing, coeffs=timing.coeffs + s * change)).project(ground) for s in (1, -1)
             )
             numeric = (high - low) / (2 * step)
             np.testing.assert_allclose(
@@ -88,9 +87,7 @@ def test_a_sicd_image_moves_as_another_implementation_adjusts_it(side, tmp_path)
     )
     plane = (image[:, ::-1] - model.origin) * model.spacing
     for k in range(12):
-        sets = projection.apply_apos(
-            said, projection.compute_projection_sets(said, plane[k : k + 1]), offsets
-        )
+        sets = projection.apply_apos(said, projection.compute_projection_sets(said, plane[k : k + 1]), offsets)
         there, *_ = projection.r_rdot_to_constant_hae_surface(
             said.LOOK, said.SCP, sets, 200.0, delta_hae_max=1e-9, nlim=50
         )
@@ -125,9 +122,7 @@ def test_the_accuracy_of_a_range_doppler_model_is_that_of_its_orbit_and_of_what_
 ):
     path, product = tmp_path / "orbit.EOF", Product()
     mission = "<Mission>Sentinel-1A</Mission>"
-    path.write_bytes(
-        product.eof().replace(mission.encode(), f"{mission}<File_Type>{kind}</File_Type>".encode())
-    )
+    path.write_bytes(product.eof().replace(mission.encode(), f"{mission}<File_Type>{kind}</File_Type>".encode()))
     model = RangeDoppler.from_annotation(
         read_annotation(product.xml(), name="a"),
         orbit=path if kind else None,
@@ -184,12 +179,6 @@ def test_errors_of_an_orbit_are_taken_along_the_lines_that_they_act_on(frame, as
         sight = position - ecef_from_ground(np.array([5.4, 43.3, 120.0]))
         look = np.arccos(sight @ position / np.linalg.norm(sight) / np.linalg.norm(position))
         assert 0.5 < look < 0.6
-        assert far == pytest.approx(
-            np.hypot(2.0, np.hypot(radial * np.cos(look), across * np.sin(look))), rel=0.01
-        )
-        assert late == pytest.approx(
-            np.hypot(along * np.sqrt(1 - aside**2), aside * across), rel=0.01, abs=0.01
-        )
-    assert stated(errors_of_orbit("ECF", 3.0, 3.0, 3.0), folder=tmp_path) == pytest.approx(
-        (np.hypot(2, 3), 3.0)
-    )
+        assert far == pytest.approx(np.hypot(2.0, np.hypot(radial * np.cos(look), across * np.sin(look))), rel=0.01)
+        assert late == pytest.approx(np.hypot(along * np.sqrt(1 - aside**2), aside * across), rel=0.01, abs=0.01)
+    assert stated(errors_of_orbit("ECF", 3.0, 3.0, 3.0), folder=tmp_path) == pytest.approx((np.hypot(2, 3), 3.0))

@@ -35,18 +35,14 @@ def test_points_are_the_weighted_least_squares_ones(weighted) -> None:
 
         def residual(x: np.ndarray, rows: np.ndarray = rows, p: int = p) -> np.ndarray:
             ground = ground_from_ecef(ecef_from_ground(truth[p]) + x)
-            errors = [
-                (SENSORS[view[k]].project(ground) - xy[k]) / (sigma[k] if weighted else 1.0) for k in rows
-            ]
+            errors = [(SENSORS[view[k]].project(ground) - xy[k]) / (sigma[k] if weighted else 1.0) for k in rows]
             return np.concatenate(errors)
 
         expected = least_squares(residual, np.zeros(3), diff_step=1e-4, x_scale=10.0).x
         np.testing.assert_allclose(found.points[p] - ecef_from_ground(truth[p]), expected, atol=2e-3)
         ground = ground_from_ecef(found.points[p])
         for k in rows:
-            np.testing.assert_allclose(
-                found.residuals[k], SENSORS[view[k]].project(ground) - xy[k], atol=1e-6
-            )
+            np.testing.assert_allclose(found.residuals[k], SENSORS[view[k]].project(ground) - xy[k], atol=1e-6)
 
 
 def test_the_first_guess_is_where_it_is_asked_for_and_steps_are_counted() -> None:

@@ -156,9 +156,7 @@ def test_neighbouring_sites_are_an_image_less_the_overlap_apart():
     assert np.array(grid.step) * metres == pytest.approx([0.75 * 2000, 0.75 * 1500])
     lon, lat = grid.lonlat([0, 1, 0.5], [0, 1, 0.5])
     assert lon == pytest.approx([5.0 - 0.5 * grid.step[0], 5.0 + 0.5 * grid.step[0], 5.0])
-    assert lat == pytest.approx(
-        [43.0 + 0.5 * grid.step[1], 43.0 - 0.5 * grid.step[1], 43.0]
-    )  # rows run south
+    assert lat == pytest.approx([43.0 + 0.5 * grid.step[1], 43.0 - 0.5 * grid.step[1], 43.0])  # rows run south
     lon, _ = _Grid(2, 1, 180.0, 0.0, (0.2, 0.1)).lonlat(0, [0, 1])
     assert lon == pytest.approx([179.9, -179.9])
 
@@ -171,9 +169,7 @@ def test_a_block_ends_before_the_pole():
             _Grid.square(1, BlockOptions(), 0.0, sign * (lat + 2e-3))
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"num_views": 0}, {"num_tracks": -1}, {"num_checks": -1}, {"num_gcps": -1}], ids=str
-)
+@pytest.mark.parametrize("wrong", [{"num_views": 0}, {"num_tracks": -1}, {"num_checks": -1}, {"num_gcps": -1}], ids=str)
 def test_counts_are_not_negative_and_there_is_a_view(wrong):
     with pytest.raises(InputError, match="at least one view"):
         simulate_block(**wrong)
@@ -213,9 +209,7 @@ def test_points_lie_at_all_altitudes_that_were_asked_for_and_all_over_the_block(
 
 
 def test_fewer_observations_are_made_where_less_is_visible():
-    lengths = [
-        np.bincount(simulate_block(9, 400, seed=2, visible=share).tracks.point).mean() for share in (1.0, 0.6)
-    ]
+    lengths = [np.bincount(simulate_block(9, 400, seed=2, visible=share).tracks.point).mean() for share in (1.0, 0.6)]
     assert lengths[1] < 0.85 * lengths[0]
 
 

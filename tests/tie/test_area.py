@@ -69,9 +69,7 @@ def test_any_geojson_of_polygons_is_an_area(tmp_path, data) -> None:
     places = PLACES.copy()
     places[0] = 4.95, 43.0  # inside the bow tie, too
     places[1] = 364.95, 43.0
-    assert (
-        read_area(written(tmp_path / "a.json", data)).contains(places).tolist() == [True, True] + [False] * 3
-    )
+    assert read_area(written(tmp_path / "a.json", data)).contains(places).tolist() == [True, True] + [False] * 3
 
 
 def test_a_hole_is_outside(tmp_path) -> None:
@@ -148,11 +146,7 @@ POSITIONS = st.one_of(st.lists(NUMBERS, max_size=4), st.lists(st.floats(-90, 90)
 JSON = st.recursive(
     st.one_of(NUMBERS, POSITIONS, st.lists(st.lists(POSITIONS, max_size=6), max_size=3)),
     lambda inner: st.fixed_dictionaries(
-        {
-            "type": st.sampled_from(
-                ["Polygon", "MultiPolygon", "Feature", "FeatureCollection", "GeometryCollection"]
-            )
-        },
+        {"type": st.sampled_from(["Polygon", "MultiPolygon", "Feature", "FeatureCollection", "GeometryCollection"])},
         optional={
             "coordinates": inner,
             "geometry": inner,
@@ -225,9 +219,7 @@ def test_outlines_and_the_area_grow_by_as_much_as_the_cameras_may_be_wrong(tmp_p
             np.testing.assert_allclose(part.bounds[0], edge[0], atol=0.1)
             np.testing.assert_allclose(part.bounds[2:], corner + metres, rtol=0.01)
             assert part.bounds[3] - part.bounds[1] == pytest.approx(height, rel=0.01)
-            assert part.bounds[2] - part.bounds[0] == pytest.approx(
-                0.6 * (width - 2 * metres) + 2 * metres, rel=0.03
-            )
+            assert part.bounds[2] - part.bounds[0] == pytest.approx(0.6 * (width - 2 * metres) + 2 * metres, rel=0.03)
 
 
 def test_outlines_of_an_oblong_image_grow_by_whole_pixels_too() -> None:
@@ -264,9 +256,7 @@ def in_blocks(view: View, folder: Path) -> View:
 def all_inside(scene: Rendered, tracks: Tracks, everywhere: Tracks, area: Area) -> None:
     """Tracks are those of a scene that lie in an area."""
     sensors = [view.sensor for view in scene.views]
-    ground, whole = (
-        ground_from_ecef(triangulate(sensors, t.view, t.point, t.xy).points) for t in (tracks, everywhere)
-    )
+    ground, whole = (ground_from_ecef(triangulate(sensors, t.view, t.point, t.xy).points) for t in (tracks, everywhere))
     assert area.contains(ground[:, :2]).all()
     expected = area.contains(whole[:, :2]).sum()
     assert expected > 50
@@ -281,9 +271,7 @@ def test_all_tie_points_lie_in_the_area(render, tmp_path) -> None:
 
 
 @pytest.mark.slow
-def test_all_tie_points_lie_in_the_area_and_other_tiles_are_not_even_read(
-    render, tmp_path, monkeypatch
-) -> None:
+def test_all_tie_points_lie_in_the_area_and_other_tiles_are_not_even_read(render, tmp_path, monkeypatch) -> None:
     scene = render(views=2)
     views = [in_blocks(view, tmp_path) for view in scene.views]  # strips are read whole
     area = read_area(written(tmp_path / "a.json", corner(scene, 0.4)))

@@ -17,9 +17,7 @@ from barpc.tie.pairing.area import read_area
 def an_area(folder: Path, *rings: np.ndarray) -> Path:
     """A file of a polygon with these rings."""
     path = folder / "area.geojson"
-    path.write_text(
-        json.dumps({"type": "Polygon", "coordinates": [np.vstack([r, r[:1]]).tolist() for r in rings]})
-    )
+    path.write_text(json.dumps({"type": "Polygon", "coordinates": [np.vstack([r, r[:1]]).tolist() for r in rings]}))
     return path
 
 
@@ -36,9 +34,7 @@ def test_an_outline_is_untangled_of_as_many_crossings_as_allowed_and_no_more(tmp
     monkeypatch.setattr(area, "_MOST_CROSSED", 4)
     with pytest.raises(InputError, match="an outline crosses itself more than 4 times"):
         read_area(an_area(tmp_path, star))
-    monkeypatch.setattr(
-        area, "_TOGETHER", 1
-    )  # found from both sides of a side, whatever is looked at together
+    monkeypatch.setattr(area, "_TOGETHER", 1)  # found from both sides of a side, whatever is looked at together
     with pytest.raises(InputError, match="more than 4 times"):
         read_area(an_area(tmp_path, star))
     monkeypatch.setattr(area, "_MOST_CROSSED", 0)

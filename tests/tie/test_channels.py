@@ -50,9 +50,7 @@ def seen(picture: np.ndarray) -> np.ndarray:
     [
         pytest.param(lambda grey: grey, id="same", marks=pytest.mark.slow),
         pytest.param(lambda grey: 500 - 3 * grey, id="inverted", marks=pytest.mark.slow),
-        pytest.param(
-            lambda grey: np.where(np.indices(grey.shape)[1] > SIZE // 2, -grey, 0.2 * grey), id="partly"
-        ),
+        pytest.param(lambda grey: np.where(np.indices(grey.shape)[1] > SIZE // 2, -grey, 0.2 * grey), id="partly"),
     ],
 )
 def test_a_shift_is_found_whatever_the_grey_values(date):

@@ -185,9 +185,7 @@ class Looks:
     def __init__(self, monkeypatch, alike, neighbours: int = 3) -> None:
         self.alike, self.compared, self.tried = alike, [], []
         self._options = TieOptions(neighbours=neighbours)
-        monkeypatch.setattr(
-            tracks, "locate", lambda views, _, store, **rest: [KeypointFiles(store)] * len(views)
-        )
+        monkeypatch.setattr(tracks, "locate", lambda views, _, store, **rest: [KeypointFiles(store)] * len(views))
         monkeypatch.setattr(tracks, "match", self._match)
         monkeypatch.setattr(tracks, "quick_score", self._score)
 
@@ -198,9 +196,7 @@ class Looks:
         ends = [tuple(views[i].name for i in pair.views) for pair in pairs]
         if not once:  # of which each may have had a first look
             self.tried.append([pair.views for pair in pairs])
-        return [
-            (NO_MATCHES, PairReport(names, "ok" if self._ties(names) else "unlike", (9, 9))) for names in ends
-        ]
+        return [(NO_MATCHES, PairReport(names, "ok" if self._ties(names) else "unlike", (9, 9))) for names in ends]
 
     def _score(self, views, keypoints, options) -> int:
         self.compared.append(tuple(view.name for view in views))
@@ -208,9 +204,7 @@ class Looks:
 
     def run(self, row) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
         """The pairs that were tried, and those of them that tie."""
-        trials = tracks._Trials(
-            row, self._options, None, None, {}, None, {"executor": None, "progress": None}
-        )
+        trials = tracks._Trials(row, self._options, None, None, {}, None, {"executor": None, "progress": None})
         trials.run(pairs_in_a_row(len(row), self._options.neighbours), False)
         every = sorted(trials.tried)
         assert sorted(pair for some in self.tried for pair in some) == every  # none twice
@@ -263,9 +257,7 @@ def test_what_fails_is_replaced_though_no_date_tells(monkeypatch, said) -> None:
     first = [pair.views for pair in select_pairs(row, TieOptions(neighbours=3)) if looks.alike(*pair.views)]
     assert len(connected_groups(40, first)) > 5
     tried, tied = looks.run(row)
-    assert [sorted(pair) for pair in looks.tried[0]] == [
-        list(p.views) for p in select_pairs(row, looks._options)
-    ]
+    assert [sorted(pair) for pair in looks.tried[0]] == [list(p.views) for p in select_pairs(row, looks._options)]
     assert connected_groups(40, tied) == [list(range(40))]
     assert len(tried) < 40 * 39 / 4
 
@@ -342,9 +334,7 @@ def test_a_chain_of_seasons_is_found_where_overlap_and_angle_miss_it(chain, tmp_
         result = adjust(images, tmp_path / "out", options, executor=pool)
     known = [replace(view, date="") for view in result.run.views]
     alike = [
-        pair.views
-        for pair in select_pairs(known, options.tie)
-        if abs(ORDER[pair.views[0]] - ORDER[pair.views[1]]) <= 2
+        pair.views for pair in select_pairs(known, options.tie) if abs(ORDER[pair.views[0]] - ORDER[pair.views[1]]) <= 2
     ]
     assert len(connected_groups(7, alike)) > 1  # what would be tried without the dates
     assert len(result.run.matched) <= 12

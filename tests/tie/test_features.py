@@ -144,9 +144,7 @@ def test_keypoints_are_kept_for_a_later_pass_with_another_camera(tmp_path, textu
         (1990, 10_000, 2000, 1),
     ],
 )  # fmt: skip
-def test_an_image_is_looked_at_as_closely_as_the_keypoints_wanted_ask_for(
-    keypoints, points, tile, zoom
-) -> None:
+def test_an_image_is_looked_at_as_closely_as_the_keypoints_wanted_ask_for(keypoints, points, tile, zoom) -> None:
     options = TieOptions(keypoints_per_image=keypoints, points_per_image=points, tile=tile)
     share = Share.of((4000, 4000), options)
     assert share.zoom == zoom

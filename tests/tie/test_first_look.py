@@ -89,9 +89,7 @@ def test_what_a_first_look_shows_enough_of_is_looked_at_once(scene, looks, witho
 
 
 @pytest.mark.slow
-def test_what_it_shows_too_little_of_is_matched_as_if_it_had_not_been(
-    scene, looks, without, monkeypatch
-) -> None:
+def test_what_it_shows_too_little_of_is_matched_as_if_it_had_not_been(scene, looks, without, monkeypatch) -> None:
     monkeypatch.setattr(tracks, "ample", lambda *_: False)
     found = find_tracks(scene.views, FEW)
     assert looks == [True, False]

@@ -130,9 +130,7 @@ def test_what_cannot_be_registered_is_used_as_it_is_and_once(render, tmp_path, c
     path = write_image(tmp_path / "noise.tif", noise)
     given = true_matches(scene, (0, 1), noise=0.3, false=0.2)
     with caplog.at_level(logging.WARNING):
-        result = find_tracks(
-            [first, replace(second, path=str(path))], TieOptions(min_matches=100), given=given
-        )
+        result = find_tracks([first, replace(second, path=str(path))], TieOptions(min_matches=100), given=given)
     assert "used as found, good to 0." in caplog.text
     assert 0.7 * 400 <= result.tracks.num_points <= 450
     errors = np.abs(scene.errors(0, 1, *common_tracks(result.tracks, 0, 1))).max(axis=1)
@@ -146,9 +144,7 @@ def test_what_cannot_be_registered_is_used_as_it_is_and_once(render, tmp_path, c
 
 
 @pytest.mark.slow
-def test_a_view_that_cannot_be_registered_joins_the_points_that_the_others_are_registered_by(
-    render, tmp_path
-) -> None:
+def test_a_view_that_cannot_be_registered_joins_the_points_that_the_others_are_registered_by(render, tmp_path) -> None:
     """Each point is one track: that of the two views that register, and the third where it was matched."""
     scene = render(views=3, size=(300, 300))
     blank = np.full((300, 300), 900, np.uint16)

@@ -254,9 +254,7 @@ def test_a_box_grows_on_every_side_up_to_the_border(box, grown) -> None:
 
 @pytest.mark.parametrize("slope", [0.4, -0.4, 0.02, 0.0])
 @pytest.mark.parametrize("reach", [(-150.0, 20.0), (-20.0, 150.0), (30.0, 150.0), (-150.0, -30.0)])
-def test_all_points_of_slanted_bands_are_looked_at_and_few_others(
-    slope: float, reach: tuple[float, float]
-) -> None:
+def test_all_points_of_slanted_bands_are_looked_at_and_few_others(slope: float, reach: tuple[float, float]) -> None:
     """Bands that rise or fall by some strips along their length, to one side of the prediction or to both."""
     rng = np.random.default_rng(0)
     turned = rng.uniform(0, 2000, (4000, 2))

@@ -107,9 +107,7 @@ def test_what_is_wrong_with_it_is_said_in_one_line(render, module, name: str, er
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "name", ["", "guide", "os.system", "a:b:c", "a: b", "../x:y", "a:b()", ":b", "a:", "a\n:b"]
-)
+@pytest.mark.parametrize("name", ["", "guide", "os.system", "a:b:c", "a: b", "../x:y", "a:b()", ":b", "a:", "a\n:b"])
 def test_a_name_that_is_none_is_refused_before_anything_is_imported(name: str) -> None:
     with pytest.raises(InputError, match=r"one of guided.*or module:name"):
         TieOptions(matcher=name)
@@ -134,9 +132,7 @@ def test_rows_of_the_table_and_classes_are_what_they_are(module) -> None:
 
 
 @pytest.mark.slow
-def test_a_changed_module_is_run_again_an_unchanged_one_not(
-    render, module, tmp_path: Path, monkeypatch
-) -> None:
+def test_a_changed_module_is_run_again_an_unchanged_one_not(render, module, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     views = render(views=2, size=(300, 300)).views
     options = RunOptions(tie=TieOptions(matcher=f"{module()}:match"), stop_after="matching", overwrite=True)
@@ -144,9 +140,7 @@ def test_a_changed_module_is_run_again_an_unchanged_one_not(
     for returns in ("xy", "xy", "xy[::2]"):
         module(returns)
         result = adjust(views, tmp_path / "run", options)
-        counts.append(
-            (len(getattr(sys.modules.get("users_matcher"), "calls", [])), result.run.matched[0].verified)
-        )
+        counts.append((len(getattr(sys.modules.get("users_matcher"), "calls", [])), result.run.matched[0].verified))
     assert counts[0][0] > 0
     assert counts[1] == (0, counts[0][1])
     assert 0.4 < counts[2][1] / counts[0][1] < 0.6
@@ -202,9 +196,7 @@ def test_what_a_function_finds_counts_in_the_band_and_on_the_images() -> None:
 )  # fmt: skip
 def test_no_other_shape_and_nothing_that_is_not_finite_is_taken(given) -> None:
     first, second = (View(name, "", (100, 50), None, (0.0, 1.0)) for name in "ab")  # type: ignore[arg-type]
-    with pytest.raises(
-        TiePointError, match=r"matcher m:f, a - b: ValueError: (places \(M, 2, 2\)|a place or score)"
-    ):
+    with pytest.raises(TiePointError, match=r"matcher m:f, a - b: ValueError: (places \(M, 2, 2\)|a place or score)"):
         Hook("m:f", lambda *_: given).match(first, second, Prediction(everywhere, 2.0, list))
 
 
@@ -222,9 +214,7 @@ class Disk:
     def eval(self) -> Disk:
         return self
 
-    def __call__(
-        self, images: np.ndarray, n: int, *, pad_if_not_divisible: bool
-    ) -> list[types.SimpleNamespace]:
+    def __call__(self, images: np.ndarray, n: int, *, pad_if_not_divisible: bool) -> list[types.SimpleNamespace]:
         assert images.ndim == 4
         assert images.shape[:2] == (1, 3)
         assert images.dtype == np.float32

@@ -92,9 +92,7 @@ def matcher(request, monkeypatch) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("number", "side"), [(2, 300), pytest.param(3, 600, marks=pytest.mark.nightly)])
-def test_a_dense_matcher_gives_tracks_as_good_as_the_detectors(
-    render, matcher, number: int, side: int
-) -> None:
+def test_a_dense_matcher_gives_tracks_as_good_as_the_detectors(render, matcher, number: int, side: int) -> None:
     scene, share = render(views=number, size=(side, side)), (side / 600) ** 2
     result = find_tracks(scene.views, TieOptions(matcher=matcher))
     tracks = result.tracks

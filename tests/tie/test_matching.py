@@ -32,9 +32,7 @@ from tests.tie.test_pairs import camera, views
         ((360, 400), float("nan"), 99, False),
     ],
 )
-def test_a_pair_is_tried_again_where_it_has_fewer_matches_than_it_should(
-    keypoints, overlap, verified, stands
-) -> None:
+def test_a_pair_is_tried_again_where_it_has_fewer_matches_than_it_should(keypoints, overlap, verified, stands) -> None:
     report = PairReport(("v0", "v1"), "ok", keypoints, verified, verified, overlap=overlap)
     assert enough(report) == stands
     assert not enough(replace(report, status="too few matches"))
@@ -74,9 +72,7 @@ class Scripted:
 def search(monkeypatch) -> Callable[[Scripted], _Search]:
     def made(matcher: Scripted) -> _Search:
         monkeypatch.setitem(MATCHERS, "scripted", lambda *_: matcher)
-        return _Search(
-            tuple(views(camera(0.0), camera(0.0))), (join([]), join([])), TieOptions(matcher="scripted")
-        )
+        return _Search(tuple(views(camera(0.0), camera(0.0))), (join([]), join([])), TieOptions(matcher="scripted"))
 
     return made
 
@@ -247,9 +243,7 @@ def test_the_local_band_is_four_standard_deviations_wide_within_its_bounds(searc
 
 def test_the_best_come_first_and_each_place_once(search) -> None:
     matcher = Scripted([0.4, 0.3, 0.2, 0.1])
-    matcher.places = (
-        np.array([[0.0, 0.0], [0.3, 0.2], [50.0, 0.0], [90.0, 0.0]]).repeat(2, 0).reshape(4, 2, 2)
-    )
+    matcher.places = np.array([[0.0, 0.0], [0.3, 0.2], [50.0, 0.0], [90.0, 0.0]]).repeat(2, 0).reshape(4, 2, 2)
     found = search(matcher)._distinct(FLAT)
     assert found.xy[:, 0, 0].tolist() == [90.0, 50.0, 0.3]  # the first two are one place, the better stays
     assert found.score.tolist() == [0.1, 0.2, 0.3]

@@ -195,9 +195,7 @@ def test_a_point_that_is_registered_is_one_track_and_what_else_sees_it_goes_with
 def given_matches(count: int) -> Matches:
     places = np.random.default_rng(0).uniform(50, 900, (count, 2))
     numbers = -1 - np.arange(count)
-    return Matches(
-        np.stack([places, places + 1.0], axis=1), np.zeros(count), np.stack([numbers] * 2, axis=1), 0.3
-    )
+    return Matches(np.stack([places, places + 1.0], axis=1), np.zeros(count), np.stack([numbers] * 2, axis=1), 0.3)
 
 
 @pytest.mark.parametrize(
@@ -232,9 +230,7 @@ def test_given_matches_are_added_where_fewer_than_are_wanted_could_be_registered
     with caplog.at_level(logging.WARNING):
         more = _with_unregistered(two, registered, given, TieOptions(min_matches=21))
     assert more.num_points == 40  # those that are registered once
-    assert (
-        "20 of 40 matches could be registered: the others are used as found, good to 0.30 px" in caplog.text
-    )
+    assert "20 of 40 matches could be registered: the others are used as found, good to 0.30 px" in caplog.text
     assert (np.diff(more.point) >= 0).all()
     assert np.unique(more.sigma).tolist() == [0.1, 0.3]
     assert (np.bincount(more.point) == 2).all()

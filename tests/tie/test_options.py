@@ -170,9 +170,7 @@ def test_names_are_those_of_the_tables() -> None:
 
 def test_tiles_are_as_large_as_asked_for(scene: Rendered) -> None:
     boxes = tiles((1000, 700), TieOptions(tile=256))
-    assert {(c, r) for c, r, _, _ in boxes} == {
-        (c, r) for c in range(0, 1000, 256) for r in range(0, 700, 256)
-    }
+    assert {(c, r) for c, r, _, _ in boxes} == {(c, r) for c in range(0, 1000, 256) for r in range(0, 700, 256)}
     assert max(w for _, _, w, _ in boxes) == 256
     assert sum(w * h for _, _, w, h in boxes) == 700_000
     view = scene.views[0]

@@ -154,16 +154,12 @@ def test_bands_count_alike_and_where_one_is_unknown_nothing_is_known(tmp_path) -
 )
 def test_beside_a_raster_nothing_is_known(tmp_path, step, known) -> None:
     path = str(write_image(tmp_path / "a.tif", RAMP))
-    _, valid = picture(
-        path, (1,), SIZE, grid((130.0 if step == 1.0 else 130.5, 20.0), step, (20, 60)), (20, 60)
-    )
+    _, valid = picture(path, (1,), SIZE, grid((130.0 if step == 1.0 else 130.5, 20.0), step, (20, 60)), (20, 60))
     assert valid[:, known[0] : known[1]].all()
     assert not valid[:, known[1] :].any()
 
 
-@pytest.mark.parametrize(
-    "first", [(-60.0, 20.0), (20.0, -60.0), (161.0, 20.0), (20.0, 121.0), (np.nan, 20.0)]
-)
+@pytest.mark.parametrize("first", [(-60.0, 20.0), (20.0, -60.0), (161.0, 20.0), (20.0, 121.0), (np.nan, 20.0)])
 def test_a_grid_beside_a_raster_or_of_no_place_shows_nothing(tmp_path, first) -> None:
     path = str(write_image(tmp_path / "a.tif", RAMP))
     found, valid = picture(path, (1,), SIZE, grid(first, 1.0, (30, 40)), (30, 40))
@@ -217,9 +213,7 @@ def test_an_image_on_a_patch_is_what_its_camera_sees_there(tmp_path) -> None:
     data = textured(4)
     view = replace(view, path=str(write_image(tmp_path / "a.tif", data)), size=(160, 120))
     lon, lat, _ = view.sensor.localize(np.array([[30.0, 20.0]]), np.array([100.0]))[0]
-    patch = Patch.on(
-        lambda x, y: np.full(np.shape(x), 100.0), np.array([lon, lat]), 0.5, (40, 50), np.zeros(2)
-    )
+    patch = Patch.on(lambda x, y: np.full(np.shape(x), 100.0), np.array([lon, lat]), 0.5, (40, 50), np.zeros(2))
     shape = of_image(view, 1, patch)
     assert shape.shape == (CHANNELS, 40, 50)
     assert shown(shape) == 1.0

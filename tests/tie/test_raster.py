@@ -42,9 +42,7 @@ def test_every_real_type_is_read_and_stretched_over_the_whole_range(tmp_path, dt
         ("int16", 1, -20000),
     ],
 )
-def test_neither_the_picture_nor_the_registration_sees_scale_and_offset(
-    tmp_path, dtype, ratio, offset
-) -> None:
+def test_neither_the_picture_nor_the_registration_sees_scale_and_offset(tmp_path, dtype, ratio, offset) -> None:
     data = RNG.integers(10, 1000, (120, 90))
     plain = write_image(tmp_path / "plain.tif", data.astype(np.uint16))
     scaled = write_image(tmp_path / "scaled.tif", (data * ratio + offset).astype(dtype))

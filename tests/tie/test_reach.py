@@ -86,9 +86,7 @@ def test_no_width_is_searched_twice(monkeypatch, asked, passes) -> None:
         ("too few matches", 0.85, 2),
     ],
 )
-def test_where_clear_matches_show_no_offset_looser_thresholds_are_not_tried(
-    monkeypatch, status, ratio, times
-) -> None:
+def test_where_clear_matches_show_no_offset_looser_thresholds_are_not_tried(monkeypatch, status, ratio, times) -> None:
     """A stricter ratio than that of clear matches is loosened for these, too."""
     made = []
 
@@ -112,10 +110,7 @@ class Pinhole:
         return np.concatenate([lonlat, alt[..., None]], axis=-1)
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        steps = [
-            (self.project(ground + step) - self.project(ground - step))
-            for step in np.diag([METRE, METRE, 1.0])
-        ]
+        steps = [(self.project(ground + step) - self.project(ground - step)) for step in np.diag([METRE, METRE, 1.0])]
         return self.project(ground), np.stack(steps, axis=-1) / (2 * np.array([METRE, METRE, 1.0]))
 
 
@@ -136,10 +131,7 @@ def test_segments_around_an_epipole_stay_near_their_points() -> None:
         np.abs(
             replace(
                 where,
-                **{
-                    name: getattr(where, name)[near]
-                    for name in ("along", "across", "slope", "before", "after")
-                },
+                **{name: getattr(where, name)[near] for name in ("along", "across", "slope", "before", "after")},
             ).errors(top)[:, 1]
         ).max()
         < 1e-6
@@ -186,9 +178,7 @@ def heights(shared_data: Path, lonlat: Array) -> Array:
     """Of the terrain [m above the ellipsoid] at places (n, 2) [deg]."""
     with rasterio.open(shared_data / "cross_sensor/ngi_2015/dem.tif") as dem:
         x, y = transform("EPSG:4326", dem.crs, *lonlat.T)
-        row, col = (
-            np.clip(n, 0, size - 1) for n, size in zip(rowcol(dem.transform, x, y), dem.shape, strict=True)
-        )
+        row, col = (np.clip(n, 0, size - 1) for n, size in zip(rowcol(dem.transform, x, y), dem.shape, strict=True))
         return dem.read(1)[row, col].astype(float) + GEOID
 
 
@@ -222,18 +212,14 @@ finally:  # its own peak: what the kernel tells a parent counts the parent's, fr
 
 
 @pytest.mark.slow
-def test_a_refusal_ends_within_five_seconds_a_megapixel_and_six_hundred_megabytes(
-    shared_data, tmp_path
-) -> None:
+def test_a_refusal_ends_within_five_seconds_a_megapixel_and_six_hundred_megabytes(shared_data, tmp_path) -> None:
     """The satellite's image upside down under the same RPC: nothing is where it should be."""
     satellite, aerial = frames(shared_data)
     with rasterio.open(satellite) as image:
         pixels, rpc = image.read(1), image.rpcs
     path = write_image(tmp_path / "turned.tif", np.ascontiguousarray(pixels[::-1, ::-1]), rpcs=rpc)
     words = ["match", str(path), aerial[0], "-o", str(tmp_path / "run")]
-    run = subprocess.run(
-        [sys.executable, "-c", MEASURED, *words], capture_output=True, text=True, check=False
-    )
+    run = subprocess.run([sys.executable, "-c", MEASURED, *words], capture_output=True, text=True, check=False)
     assert run.returncode == 1
     assert re.search(r"too few tie points: .* no common offset within 1\d\d", run.stderr)
     seconds, kilobytes = map(float, run.stdout.splitlines()[-1].split())

@@ -99,9 +99,7 @@ def test_independent_check_points_lie_where_the_tie_points_say(
 
 
 @pytest.mark.slow
-def test_tracks_prefer_three_views_and_state_a_sigma_that_fits_their_errors(
-    triplet, triplet_ties, every_tie
-) -> None:
+def test_tracks_prefer_three_views_and_state_a_sigma_that_fits_their_errors(triplet, triplet_ties, every_tie) -> None:
     for tracks, least in ((every_tie.tracks, 1300), (triplet_ties.tracks, 600)):
         assert (np.bincount(tracks.point) == 3).sum() >= least
         for i, j in PAIRS:

@@ -85,9 +85,7 @@ def test_the_camera_is_off_by_what_was_done_to_it(px, views, reference, dem, tru
     assert match.points > 100
     east, north = np.abs(match.offset - off(view, truth))
     assert east < 0.2
-    assert (
-        north < 1.0
-    )  # along the line of sight: houses, and what of the terrain's error does not average out
+    assert north < 1.0  # along the line of sight: houses, and what of the terrain's error does not average out
     assert np.linalg.norm(off(view, truth)) > (5.0 if px == (0.0, 0.0) else 60.0)
     points = found.control.points
     exact = read_rpc_of(truth, view.name).project(points.lonlatalt[points.point])
@@ -138,9 +136,7 @@ def test_of_several_files_each_shows_its_part(views, reference, dem, tmp_path):
     paths, half = [], pixels.shape[1] // 2
     for name, part, left in (("west", pixels[:, :half], 0), ("east", pixels[:, half:], half)):
         paths.append(str(tmp_path / f"{name}.tif"))
-        profile.update(
-            width=part.shape[1], transform=rasterio.Affine(GSD, 0, place.c + GSD * left, 0, -GSD, place.f)
-        )
+        profile.update(width=part.shape[1], transform=rasterio.Affine(GSD, 0, place.c + GSD * left, 0, -GSD, place.f))
         with rasterio.open(paths[-1], "w", **profile) as file:
             file.write(part, 1)
     whole, parts = register(views, [reference], dem), register(views, paths, dem)
@@ -217,9 +213,7 @@ def wrong(view: View, px: tuple[float, float]) -> tuple[View, np.ndarray]:
     """A view whose camera is wrong by pixels, and how far off it shows the ground, east, north [m]."""
     there = shifted(view, px)
     place = np.array([[0.0, 0.0, LEVEL]])
-    off = (there.sensor.localize(view.sensor.project(place), np.array([LEVEL])) - place) * metres_per_unit(
-        place
-    )
+    off = (there.sensor.localize(view.sensor.project(place), np.array([LEVEL])) - place) * metres_per_unit(place)
     return there, off[0, :2]
 
 
@@ -239,9 +233,7 @@ def test_every_camera_of_a_plain_is_off_by_what_was_done_to_it(plains):
     assert found.step == pytest.approx(2.08, abs=0.03)
     assert found.sigma == pytest.approx(0.25 * 2.0, abs=0.01)
     points = found.control.points
-    assert points.sigma == pytest.approx(
-        np.tile([0.1 * found.step, 0.1 * found.step, 7.0], (len(points.lonlatalt), 1))
-    )
+    assert points.sigma == pytest.approx(np.tile([0.1 * found.step, 0.1 * found.step, 7.0], (len(points.lonlatalt), 1)))
     assert found.control.bias == pytest.approx([found.sigma, found.sigma, 3.0])
     assert found.control.width == pytest.approx(33 * found.step)  # of a template
     assert np.array(found.control.offset) == pytest.approx(np.array([m.offset for m in found.views]))
@@ -306,9 +298,7 @@ def test_in_the_north_points_are_looked_for_where_the_vote_says_that_they_are_se
     metres = metres_per_unit(np.array([10.0, 60.0, 0.0]))[:2]
     local = np.stack(np.meshgrid(*[np.arange(-300.0, 301.0, 20.0)] * 2), axis=-1).reshape(-1, 2)
     work = _Work((view,), [], flat, 1, step=2.0, pixel=2.0, executor=None, progress=None)
-    tiles = work._tiles(
-        view, np.array([100.0, 0.0]), [10.0, 60.0] + local / metres, np.full(len(local), LEVEL), 8
-    )
+    tiles = work._tiles(view, np.array([100.0, 0.0]), [10.0, 60.0] + local / metres, np.full(len(local), LEVEL), 8)
     found = np.isin(np.arange(len(local)), np.concatenate([tile.points for tile in tiles]))
     edge = scale[:2] * metres - 16.0  # half a template from the border
     away = (np.abs(local + [100.0, 0.0]) - edge).max(axis=1)
@@ -376,10 +366,7 @@ def test_what_is_refused_is_refused_for_what_it_lacks():
     found = (*low, ViewMatch("C", 14.4, (3.0, 0.0), tried=900, passed=9))
     why = Registration(None, found, 5.0, 1.25).refusal
     assert "are needed" not in why
-    assert (
-        "stands out by 14.4 standard deviations), but of 900 points looked for there no 12 of an image agree"
-        in why
-    )
+    assert "stands out by 14.4 standard deviations), but of 900 points looked for there no 12 of an image agree" in why
     assert "(9 found at most)" in why
     assert "by 0.0 standard" in Registration(None, (), 5.0, 1.25).refusal
 

@@ -283,9 +283,7 @@ def test_what_fails_at_a_border_is_tried_again_with_a_smaller_patch(texture) -> 
     ("apart", "sigma", "ok"),
     [(0.45, 0.01, True), (0.55, 0.01, False), (0.55, 0.12, True), (0.65, 0.12, False)],
 )
-def test_a_patch_whose_inner_part_goes_elsewhere_is_not_ok(
-    texture, reference, monkeypatch, apart, sigma, ok
-) -> None:
+def test_a_patch_whose_inner_part_goes_elsewhere_is_not_ok(texture, reference, monkeypatch, apart, sigma, ok) -> None:
     """By more than half a pixel, and more than five standard deviations: it lies across a step of the ground."""
     find = _Template.find
 

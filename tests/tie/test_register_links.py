@@ -99,9 +99,7 @@ def links_of(count: int, seen: int) -> _Links:
     """Tracks in a row of `seen` like views, referred to the first."""
     many = views(*(camera(0.0, lean=0.2 * v) for v in range(seen)))
     xy = np.repeat(np.random.default_rng(5).integers(100, 900, (count, 2)).astype(float), seen, axis=0)
-    tracks = Tracks(
-        np.tile(np.arange(seen), count), np.repeat(np.arange(count), seen), xy, np.full(seen * count, 0.1)
-    )
+    tracks = Tracks(np.tile(np.arange(seen), count), np.repeat(np.arange(count), seen), xy, np.full(seen * count, 0.1))
     rows = np.arange(seen * count)
     other = rows[rows % seen > 0]
     return _Links(many, tracks, other - other % seen, other)
@@ -194,9 +192,7 @@ def test_places_far_apart_are_found_as_in_one_window(tmp_path, monkeypatch, inte
     smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
     moved = np.ascontiguousarray(np.roll(smooth, (3, -2), axis=(0, 1)))
     data = [image.astype(np.uint16) if integers else image.astype(np.float64) for image in (smooth, moved)]
-    files = tuple(
-        (str(write_image(tmp_path / f"{k}.tif", image)), (600, 700)) for k, image in enumerate(data)
-    )
+    files = tuple((str(write_image(tmp_path / f"{k}.tif", image)), (600, 700)) for k, image in enumerate(data))
     reference = np.array([[100.0, 150.0], [9, 300], [400, 690], [300, 400], [585, 20], [50, 680], [250, 250]])
     start = reference + [-1.6, 3.3]
     linear = np.tile(np.eye(2), (len(start), 1, 1))
@@ -228,6 +224,4 @@ def test_patches_are_registered_tile_by_tile(monkeypatch) -> None:
         assert len(origin) == len(start) == len(linear)
     assert sum(len(task[2]) for task in seen) == 160
     assert len(seen) > 20
-    np.testing.assert_array_equal(
-        np.sort(found.xy, axis=0), np.sort(np.concatenate([t[3] for t in seen]), axis=0)
-    )
+    np.testing.assert_array_equal(np.sort(found.xy, axis=0), np.sort(np.concatenate([t[3] for t in seen]), axis=0))

@@ -99,10 +99,7 @@ def test_images_that_are_turned_are_compared_as_they_are_and_so_is_what_sees_no_
 
 def test_a_view_is_looked_at_as_often_as_its_partners_ask_for_and_tracks_return_to_it() -> None:
     sizes = (1, 1, 2, 4)
-    block = [
-        View(f"v{k}", "", (400, 400), camera(0.0).window(0, 0, s, s), (0.0, 500.0))
-        for k, s in enumerate(sizes)
-    ]
+    block = [View(f"v{k}", "", (400, 400), camera(0.0).window(0, 0, s, s), (0.0, 500.0)) for k, s in enumerate(sizes)]
     looks = Looks.at(block, [Pair(ends, 1.0, 0.0) for ends in ((0, 1), (0, 2), (0, 3), (2, 3))])
     assert looks.of.tolist() == [0, 0, 0, 1, 2, 2, 3]
     assert looks.pixel[:, 0].tolist() == [1, 2, 4, 1, 1, 2, 1]
@@ -149,9 +146,7 @@ def test_pixels_are_means_and_valid_where_all_that_they_hold_is(tmp_path, monkey
     assert found.pixel == (3, 4)
     shown, known = read_picture(path, box, found)
     np.testing.assert_array_equal(shown[known], found.stretch.apply(pixels, valid)[known])
-    twice, _ = read_picture(
-        path, (2, 2, 14, 16), found, 2
-    )  # few keypoints wanted of a large image: means of means
+    twice, _ = read_picture(path, (2, 2, 14, 16), found, 2)  # few keypoints wanted of a large image: means of means
     assert twice.shape == (8, 7)
 
 
@@ -172,17 +167,13 @@ def test_means_of_numbers_near_the_largest_are_numbers(tmp_path) -> None:
         for row in (((1, 1), (3, 2)), ((2, 3), (1, 1)), ((1, 3), (3, 1)), ((2, 2), (2, 2)), ((1, 1), (4, 4)))
     ),
 )
-def test_rendered_pairs_are_tied_within_a_part_of_the_coarser_pixel(
-    scene: Rendered, tmp_path, first, second
-) -> None:
+def test_rendered_pairs_are_tied_within_a_part_of_the_coarser_pixel(scene: Rendered, tmp_path, first, second) -> None:
     """A half pixel that is lost between the pixels is 0.25 to 0.38 of the coarser one: more than is allowed here."""
     both = [averaged(view, tmp_path, *by) for view, by in zip(scene.views, (first, second), strict=True)]
     result = find_tracks(both)
     assert result.tracks.num_points >= 15
     places = common_tracks(result.tracks, 0, 1)
-    errors = scene.errors(
-        0, 1, *((xy + 0.5) * by - 0.5 for xy, by in zip(places, (first, second), strict=True))
-    )
+    errors = scene.errors(0, 1, *((xy + 0.5) * by - 0.5 for xy, by in zip(places, (first, second), strict=True)))
     errors /= np.maximum(first, second)
     assert np.abs(np.median(errors, axis=0)).max() < 0.1
     assert 1.4826 * np.median(np.abs(errors)) < 0.3
@@ -192,9 +183,7 @@ def test_rendered_pairs_are_tied_within_a_part_of_the_coarser_pixel(
 
 
 @pytest.mark.slow
-def test_matches_of_others_between_two_resolutions_become_as_exact_as_our_own(
-    scene: Rendered, tmp_path
-) -> None:
+def test_matches_of_others_between_two_resolutions_become_as_exact_as_our_own(scene: Rendered, tmp_path) -> None:
     """Given in the pixels of the files: 0.5 px of the coarser one, and 1.5 of the finer, of noise; a fifth is false."""
     fine, coarse = scene.views[0], averaged(scene.views[1], tmp_path, 3, 3)
     rng = np.random.default_rng(8)
@@ -240,9 +229,7 @@ def shift_left(views: tuple[View, View], tracks: Tracks, where: tuple[np.ndarray
     """What checks and tracks say of the shift across the epipolar lines, apart [px of the second view]."""
     alt = sum(views[0].alt_range) / 2
     ends = views[0].sensor, views[1].sensor
-    ours, theirs = (
-        epipolar_offset(*ends, *places, alt)[0] for places in (common_tracks(tracks, 0, 1), where)
-    )
+    ours, theirs = (epipolar_offset(*ends, *places, alt)[0] for places in (common_tracks(tracks, 0, 1), where))
     return float(np.median(ours) - np.median(theirs))
 
 

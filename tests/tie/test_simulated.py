@@ -178,9 +178,7 @@ def test_a_linear_change_of_the_grey_values_moves_no_tie_point(render, tmp_path,
     found = find_tracks([first, altered(second, tmp_path, change)]).tracks
     ends = []
     for tracks in (expected, found):
-        first, second = (
-            tracks.xy[tracks.view == k][np.argsort(tracks.point[tracks.view == k])] for k in (0, 1)
-        )
+        first, second = (tracks.xy[tracks.view == k][np.argsort(tracks.point[tracks.view == k])] for k in (0, 1))
         whole = (first == np.rint(first)).all(axis=1)  # the reference patch stands in the first view
         ends.append({tuple(a): b for a, b in zip(first[whole], second[whole], strict=True)})
     common = ends[0].keys() & ends[1].keys()
@@ -204,9 +202,7 @@ def test_a_linear_change_of_the_grey_values_moves_no_tie_point(render, tmp_path,
     ],
     ids=["nodata", "constant", "nan", "noise", "turned"],
 )
-def test_what_does_not_match_is_refused_by_name_with_counts_and_advice(
-    pair, tmp_path, change, message
-) -> None:
+def test_what_does_not_match_is_refused_by_name_with_counts_and_advice(pair, tmp_path, change, message) -> None:
     views = [pair[0], altered(pair[1], tmp_path, change)]
     with pytest.raises(TiePointError, match=message.replace("(", r"\(", 1)) as caught:
         find_tracks(views)

@@ -81,9 +81,7 @@ def test_the_quiet_half_of_a_scene_has_its_share_however_few_keypoints_it_may_ho
     assert 0.3 <= left(tracks.xy[tracks.view == 0]) <= 0.7
 
 
-@pytest.mark.parametrize(
-    ("side", "zoom"), [(1000, 1), (3000, 1), (4000, 2), (13_000, 2), (15_000, 4), (40_000, 4)]
-)
+@pytest.mark.parametrize(("side", "zoom"), [(1000, 1), (3000, 1), (4000, 2), (13_000, 2), (15_000, 4), (40_000, 4)])
 def test_larger_images_are_looked_at_in_less_detail(side: int, zoom: int) -> None:
     assert Share.of((side, side), TieOptions()).zoom == zoom
     assert Share.of((side, side), TieOptions(points_per_image=10**6, keypoints_per_image=10**7)).zoom <= zoom
@@ -94,9 +92,7 @@ def test_a_sigma_is_judged_beside_those_about_it() -> None:
     sigma = np.where(places[:, 0] < 500, 0.04, 0.01)
     sigma[:20] *= 3
     inner = np.abs(places[:, 0] - 500) > 150
-    np.testing.assert_array_equal(
-        _usual(places, sigma)[inner], np.where(places[:, 0] < 500, 0.04, 0.01)[inner]
-    )
+    np.testing.assert_array_equal(_usual(places, sigma)[inner], np.where(places[:, 0] < 500, 0.04, 0.01)[inner])
     assert _usual(places[:1], sigma[:1]).tolist() == sigma[:1].tolist()
 
 
@@ -168,9 +164,7 @@ def test_a_damaged_tile_is_made_again_and_a_missing_one_is_named(pair, tmp_path,
 
 
 @pytest.mark.slow
-def test_a_finished_tile_is_not_searched_again_and_its_keys_do_not_name_the_folder(
-    pair, tmp_path, monkeypatch
-) -> None:
+def test_a_finished_tile_is_not_searched_again_and_its_keys_do_not_name_the_folder(pair, tmp_path, monkeypatch) -> None:
     options, keys = TieOptions(keypoints_per_image=300, tile=256), []
     for number in range(2):
         with Workspace(tmp_path / f"run{number}") as workspace, CachingExecutor(workspace, {}) as executor:
@@ -194,9 +188,7 @@ def test_a_finished_tile_is_not_searched_again_and_its_keys_do_not_name_the_fold
     ("zoom", "profile"),
     diagonal([1, 2, 4], [BLOCKS, {"blockysize": 7}, {"blockysize": 1000, "compress": "deflate"}]),
 )
-def test_a_picture_is_the_same_however_the_file_is_stored(
-    tmp_path, zoom: int, profile: dict[str, object]
-) -> None:
+def test_a_picture_is_the_same_however_the_file_is_stored(tmp_path, zoom: int, profile: dict[str, object]) -> None:
     data = quiet(10.0)[:702, :801].copy()
     data[100:130, 200:260] = 0
     path = write_image(tmp_path / "a.tif", data, nodata=0, **profile)
@@ -215,9 +207,7 @@ def test_a_picture_is_the_same_however_the_file_is_stored(
     assert np.abs(picture - mean)[valid].max() <= 1.01
 
 
-@pytest.mark.parametrize(
-    ("zoom", "side"), rest_slow(pytest.param(*row) for row in ((4, 512), (4, 960), (2, 960)))
-)
+@pytest.mark.parametrize(("zoom", "side"), rest_slow(pytest.param(*row) for row in ((4, 512), (4, 960), (2, 960))))
 def test_the_levels_of_a_jpeg_2000_show_the_same_places(tmp_path, zoom: int, side: int) -> None:
     rasterio = pytest.importorskip("rasterio")
     data = quiet(0.0)[:side, -side:]
@@ -251,9 +241,7 @@ def decoded(log: list[tuple[int, str, tuple[int, int], tuple[int, int, int, int]
     }
     shapes = {path: shape for _, path, shape, _, _ in log}
     whole = {path: -(-SIDE // shape[0]) * -(-SIDE // shape[1]) for path, shape in shapes.items()}
-    return {
-        path: sum(1 / zoom**2 for _, p, zoom, _, _ in blocks if p == path) / n for path, n in whole.items()
-    }
+    return {path: sum(1 / zoom**2 for _, p, zoom, _, _ in blocks if p == path) / n for path, n in whole.items()}
 
 
 def stored(view: View, folder: Path, layout: dict[str, Any]) -> View:
@@ -272,9 +260,7 @@ def stored(view: View, folder: Path, layout: dict[str, Any]) -> View:
     ("layout", "zoom", "surveyed", "found"),
     [
         ({"tiled": True, "blockxsize": 64, "blockysize": 64}, 2, 0.8, 1.6),
-        pytest.param(
-            {"tiled": True, "blockxsize": 64, "blockysize": 64}, 1, 0.8, 1.6, marks=pytest.mark.nightly
-        ),
+        pytest.param({"tiled": True, "blockxsize": 64, "blockysize": 64}, 1, 0.8, 1.6, marks=pytest.mark.nightly),
         pytest.param({"blockysize": 8, "compress": "deflate"}, 1, 0.75, 1.15, marks=pytest.mark.nightly),
         pytest.param(
             {"driver": "JP2OpenJPEG", "BLOCKXSIZE": 256, "BLOCKYSIZE": 256, "RESOLUTIONS": 4},
@@ -309,9 +295,7 @@ def test_blocks_are_decoded_once_a_stage(pair, tmp_path, monkeypatch, layout, zo
     if zoom > 1:  # enough for the fast lane
         return
     assert find_tracks(views, options).tracks.num_points > 500
-    registered = [
-        entry for entry in log if entry[0] == len(opened)
-    ]  # both files were opened before any was read
+    registered = [entry for entry in log if entry[0] == len(opened)]  # both files were opened before any was read
     assert len(registered) == 8  # windows: four tiles of either
     assert all(0.9 <= share <= 1.0 for share in decoded(registered).values())
 
@@ -327,9 +311,7 @@ def test_blocks_are_decoded_once_a_stage(pair, tmp_path, monkeypatch, layout, zo
         ((9000, 9000), 1, Survey(None, (640, 640), True), {1280, 40}, {1280, 40}),  # type: ignore[arg-type]
     ],
 )  # fmt: skip
-def test_tiles_are_whole_strips_and_whole_blocks_where_decoding_is_dear(
-    size, zoom, found, widths, heights
-) -> None:
+def test_tiles_are_whole_strips_and_whole_blocks_where_decoding_is_dear(size, zoom, found, widths, heights) -> None:
     boxes = tiles(size, TieOptions(), zoom, found)
     assert {w for _, _, w, _ in boxes} == widths
     assert {h for _, _, _, h in boxes} == heights
@@ -341,9 +323,7 @@ def test_a_wide_tile_is_searched_in_parts_without_a_seam(pair) -> None:
     found, options = survey(pair[0].path), TieOptions(tile=128)
     assert found is not None
     wide = detect_tile(pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, Share(0.1), options)
-    whole = detect_tile(
-        pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, Share(0.1), replace(options, tile=1024)
-    )
+    whole = detect_tile(pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, Share(0.1), replace(options, tile=1024))
     small = whole.scale < 8
     seen = {tuple(p) for p in np.round(wide.xy, 1)}
     assert np.mean([tuple(p) in seen for p in np.round(whole.xy[small], 1)]) > 0.95

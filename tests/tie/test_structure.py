@@ -90,9 +90,7 @@ def test_the_same_images_give_the_same_bytes(winter) -> None:
 def test_another_place_is_refused(render, winter) -> None:
     other = render(views=2, seed=5).views[1]
     with pytest.raises(TiePointError, match=r"no common offset|too few matches"):
-        find_tracks(
-            [winter[0], replace(winter[1], path=other.path)], TieOptions(matcher=STRUCTURE, search=90.0)
-        )
+        find_tracks([winter[0], replace(winter[1], path=other.path)], TieOptions(matcher=STRUCTURE, search=90.0))
 
 
 @pytest.mark.slow
@@ -135,9 +133,7 @@ def test_a_patch_is_registered_where_the_truth_says(render, side, axis, most) ->
 def test_two_dates_of_a_satellite_lie_where_they_lie(shared_data, step: float) -> None:
     """Fields ten days apart on one grid, a corner of one under clouds, another without data."""
     paths = sorted((shared_data / "optical/s2_two_dates").glob("*.tif"))
-    grid = np.stack(np.meshgrid(np.arange(200.0, 920.0, step), np.arange(200.0, 1160.0, step)), -1).reshape(
-        -1, 2
-    )
+    grid = np.stack(np.meshgrid(np.arange(200.0, 920.0, step), np.arange(200.0, 1160.0, step)), -1).reshape(-1, 2)
     files, linear = (
         [(str(path), (1200, 1200)) for path in paths],
         np.broadcast_to(np.eye(2), (len(grid), 2, 2)),
@@ -153,9 +149,7 @@ def test_two_dates_of_a_satellite_lie_where_they_lie(shared_data, step: float) -
 @pytest.fixture(scope="module")
 def small(render) -> tuple[View, View]:
     """Used for 320 m of altitude about the scene's."""
-    first, second = (
-        replace(view, alt_range=(80.0, 400.0)) for view in render(views=2, size=(300, 300)).views
-    )
+    first, second = (replace(view, alt_range=(80.0, 400.0)) for view in render(views=2, size=(300, 300)).views)
     return first, second
 
 
@@ -175,9 +169,7 @@ def test_terrain_or_other_ties_narrow_the_altitudes(render, small, matched) -> N
     assert flat[0].alt_range == flat[1].alt_range == (max(low, middle - 150), min(high, middle + 150))
     assert _within(pair, None, None) == pair
     assert _within(pair, None, (high + 1e4, high + 2e4)) == pair
-    assert _within(pair, lambda lon, lat: np.full(len(lon), np.nan), (low, low))[0].alt_range[1] == min(
-        high, low + 150
-    )
+    assert _within(pair, lambda lon, lat: np.full(len(lon), np.nan), (low, low))[0].alt_range[1] == min(high, low + 150)
     assert _within(pair, None, (middle, middle), 50.0)[0].alt_range == (
         max(low, middle - 50),
         min(high, middle + 50),
@@ -211,9 +203,7 @@ def test_only_terrain_that_both_may_see_counts(seen) -> None:
 
 def test_fewer_altitudes_are_tried_where_all_find_few(small, monkeypatch) -> None:
     asked = []
-    wide, narrow = (
-        (replace(small[0], alt_range=around), small[1]) for around in ((0.0, 300.0), (100.0, 200.0))
-    )
+    wide, narrow = ((replace(small[0], alt_range=around), small[1]) for around in ((0.0, 300.0), (100.0, 200.0)))
 
     def few(pair: tuple[View, View], *_: object) -> tuple[Matches, PairReport]:
         asked.append(pair[0].alt_range)
@@ -263,9 +253,7 @@ def test_a_lattice_holds_the_multiples_of_its_pitch_in_a_box() -> None:
     assert _lattice((11, 21, 10, 10), 10).tolist() == [[20, 30]]
 
 
-def level(
-    half: float, width: float, height: float, probes: int | None = None, band: float = 3.0, least: int = 1
-):
+def level(half: float, width: float, height: float, probes: int | None = None, band: float = 3.0, least: int = 1):
     """Step and number of points of a look at a window, and their pitch."""
     search = _Search.__new__(_Search)
     search._least, search._whole = least, False
@@ -274,9 +262,7 @@ def level(
     return step, np.diff(np.unique(points[:, 0]))[0]
 
 
-@pytest.mark.parametrize(
-    ("half", "step", "count"), [(47.9, 2, 1000), (48.1, 2, 500), (129.9, 2, 500), (130.1, 4, 500)]
-)
+@pytest.mark.parametrize(("half", "step", "count"), [(47.9, 2, 1000), (48.1, 2, 500), (129.9, 2, 500), (130.1, 4, 500)])
 def test_long_bands_are_looked_at_in_coarser_pictures_at_fewer_points(half, step, count) -> None:
     found, pitch = level(half, 2000, 2000)
     assert found == step
@@ -289,9 +275,7 @@ def test_long_bands_are_looked_at_in_coarser_pictures_at_fewer_points(half, step
     [(20.0, 10.0, 2), (39.0, 10.0, 2), (61.0, 10.0, 4), (90.0, 10.0, 4), (101.0, 10.0, 8), (20.0, 239.0, 2),
      (20.0, 241.0, 4), (20.0, 1e4, 4)],
 )  # fmt: skip
-def test_the_cameras_error_is_looked_for_in_pictures_as_coarse_as_the_search_is_wide(
-    band, half, step
-) -> None:
+def test_the_cameras_error_is_looked_for_in_pictures_as_coarse_as_the_search_is_wide(band, half, step) -> None:
     """A twentieth of its half width, or an eightieth of the altitudes' half length; powers of two."""
     found, pitch = level(half, 3000, 3000, probes=1500, band=band)
     assert found == step
@@ -410,9 +394,7 @@ def textured(tmp_path_factory) -> tuple[Files, np.ndarray]:
     return files, moved
 
 
-@pytest.mark.parametrize(
-    ("aside", "beyond", "seen"), [(0.0, 0.0, True), (24.0, 0.0, False), (0.0, 30.0, False)]
-)
+@pytest.mark.parametrize(("aside", "beyond", "seen"), [(0.0, 0.0, True), (24.0, 0.0, False), (0.0, 30.0, False)])
 def test_a_place_beyond_the_band_and_its_sides_is_not_found_however_alike(
     textured, monkeypatch, aside, beyond, seen
 ) -> None:
@@ -496,9 +478,7 @@ def test_a_peak_is_that_of_the_parabolas_through_its_neighbours_and_none_on_the_
     edge = 0.9 - 0.02 * (x - 4.4) ** 2 - 0.05 * (y + 0.6) ** 2
     place, score = tile.peaks(np.stack([inner, edge]).astype(np.float32))
     np.testing.assert_allclose(place - tile.whole, [[1.3, -0.6], [4.0, -1.0]], atol=1e-4)
-    np.testing.assert_allclose(
-        score, [0.9 - 0.02 * 0.09 - 0.05 * 0.16, 0.9 - 0.02 * 0.16 - 0.05 * 0.16], atol=1e-5
-    )
+    np.testing.assert_allclose(score, [0.9 - 0.02 * 0.09 - 0.05 * 0.16, 0.9 - 0.02 * 0.16 - 0.05 * 0.16], atol=1e-5)
 
 
 def test_a_template_is_a_picture_where_more_than_nine_tenths_of_it_are_known() -> None:

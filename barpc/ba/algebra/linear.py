@@ -22,9 +22,7 @@ class Factor:
 
     solve: Callable[[Array], Array]  # (n,) or (n, m) right-hand sides -> solutions
     method: str  # "dense" or "multifrontal"
-    inverse: Callable[[], Blocks] | None = (
-        None  # the inverse's blocks where the matrix has some, if it has blocks
-    )
+    inverse: Callable[[], Blocks] | None = None  # the inverse's blocks where the matrix has some, if it has blocks
     whole_inverse: Callable[[], Array] | None = None  # (n, n), of a dense one
     log_determinant: float = np.nan  # of the matrix, of a dense one
 
@@ -59,9 +57,7 @@ def factorize(matrix: Array, damping: float = 0.0) -> Factor:
     )
 
 
-def factorize_blocks(
-    matrix: Blocks, order: Dissection, damping: float = 0.0, less: Array | None = None
-) -> Factor:
+def factorize_blocks(matrix: Blocks, order: Dissection, damping: float = 0.0, less: Array | None = None) -> Factor:
     """Factorise S, of the views in an order of elimination, less B^T B of a few rows `less` (m, n)."""
     _check(matrix.diagonal)
     cholesky = Cholesky(matrix, order)
@@ -72,9 +68,7 @@ def factorize_blocks(
 
 def _check(diagonal: Array) -> None:
     if not np.isfinite(diagonal).all():
-        raise AdjustError(
-            "the normal equations are not finite: a camera cannot be evaluated at its tie points"
-        )
+        raise AdjustError("the normal equations are not finite: a camera cannot be evaluated at its tie points")
 
 
 def _updated(factor: Factor, less: Array, order: Dissection) -> Factor:

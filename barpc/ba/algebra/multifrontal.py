@@ -200,9 +200,7 @@ class Cholesky:
     def inverse(self) -> Blocks:
         """Return the inverse's blocks where the matrix has some; zero for views that are not eliminated."""
         fronts = self.order.fronts
-        out = Blocks(
-            np.zeros_like(self.blocks.diagonal), np.zeros_like(self.blocks.pairs), self.blocks.pair_view
-        )
+        out = Blocks(np.zeros_like(self.blocks.diagonal), np.zeros_like(self.blocks.pairs), self.blocks.pair_view)
         known: dict[int, Array] = {}
         children = np.bincount([f.parent for f in fronts if f.parent >= 0], minlength=len(fronts))
         for number in range(len(fronts) - 1, -1, -1):

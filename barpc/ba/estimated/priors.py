@@ -18,9 +18,7 @@ from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.timing import is_clocked
 
-DEFAULT_ACCURACY = (
-    7.5  # m, of rotation and of translation, 10.6 m of both: the harsh end of what is delivered
-)
+DEFAULT_ACCURACY = 7.5  # m, of rotation and of translation, 10.6 m of both: the harsh end of what is delivered
 DRIFT_SIGMA = 0.2  # m, at a view's first and last row: 0.3 microradian from 700 km, as good platforms have it
 USABLE_ACCURACY = 0.1  # m: less is stated in pixels of a fit (as Airbus does), not in metres of geolocation
 IMAGE_SIGMA = 20.0  # px, at the edge of the image: of every coefficient of models in the image

@@ -128,9 +128,7 @@ class Unknowns:
             added = (added + vectors[degree]) * row
         return added
 
-    def stack(
-        self, by_rotation: Array, by_drift: Array, by_point: Array, index: IntArray, row: Array | None
-    ) -> Array:
+    def stack(self, by_rotation: Array, by_drift: Array, by_point: Array, index: IntArray, row: Array | None) -> Array:
         """Return derivatives (2, q, n) by unknowns from those (2, 3, n) by rotations [px/rad] and point."""
         out = np.empty((2, self.size, len(index)))
         inverse = (1.0 / self.distance)[index]
@@ -160,9 +158,7 @@ class Unknowns:
         if by_unknown.shape[1]:
             self.waves.stack(by_unknown[:, self.in_waves], basis)
 
-    def in_image(
-        self, params: Array, index: IntArray, image: Array, by_point: Array
-    ) -> tuple[Array, Array, Array]:
+    def in_image(self, params: Array, index: IntArray, image: Array, by_point: Array) -> tuple[Array, Array, Array]:
         """Apply the models in the image: corrected image points (2, n), and the derivatives by point and by unknown."""
         basis = np.vstack([np.ones((1, image.shape[1])), self.normalized(image, index)])
         chosen = list(_IMAGE_TERMS[self.model])
@@ -179,14 +175,11 @@ class Unknowns:
     def corrected(self, params: Array, views: Sequence[View]) -> tuple[SensorModel, ...]:
         """Return every view's sensor behind the correction that its unknowns (N, q) stand for."""
         if not self.geometric:
-            return tuple(
-                ImageCorrected(view.sensor, self._affine(params[i], i)) for i, view in enumerate(views)
-            )
+            return tuple(ImageCorrected(view.sensor, self._affine(params[i], i)) for i, view in enumerate(views))
         vectors = self.rotation(params), self.translation(params), self.center, self.drift_vectors(params)
         rows = zip(self.middle[1].tolist(), self.half[1].tolist(), strict=True)
         corrections = [
-            Correction(*of_view, *(row if self.drift else ()))
-            for *of_view, row in zip(*vectors, rows, strict=True)
+            Correction(*of_view, *(row if self.drift else ())) for *of_view, row in zip(*vectors, rows, strict=True)
         ]
         found: list[SensorModel] = [Corrected(v.sensor, c) for v, c in zip(views, corrections, strict=True)]
         for i, radar in self.radars.items():
@@ -217,9 +210,7 @@ def make_unknowns(
     if model in _IMAGE_TERMS:
         centers = np.zeros((len(views), 3))
     elif centers is None:
-        found = camera_centers(
-            [v.sensor for v in views], [v.size for v in views], [v.alt_range for v in views]
-        )
+        found = camera_centers([v.sensor for v in views], [v.size for v in views], [v.alt_range for v in views])
         centers = np.array([center.ecef for center in found]).reshape(-1, 3)
     altitude, number = np.array([view.altitude for view in views]), np.arange(len(views) + 1)
     scene = ecef_from_ground(localize([v.sensor for v in views], (size - 1.0) / 2.0, altitude, number))

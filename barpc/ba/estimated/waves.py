@@ -61,9 +61,7 @@ class Waves:
     def _of_steps(self) -> Array:
         """(C + 1, s) the same of detectors, against a shift and, of three and more, a scale."""
         num = self.edges.shape[1] + 1
-        return (
-            _complement(np.vander(np.linspace(-1, 1, num), min(num - 1, 2))) if num > 1 else np.zeros((0, 0))
-        )
+        return _complement(np.vander(np.linspace(-1, 1, num), min(num - 1, 2))) if num > 1 else np.zeros((0, 0))
 
     @property
     def parts(self) -> tuple[int, int, int, int]:

@@ -19,9 +19,7 @@ from barpc.scene import BoolArray
 
 _LARGE = 40.0  # twice the logarithm of a likelihood ratio: the largest of 10,000 places by chance once in 100,000 views
 _A_VIEW = 4.0  # and so much more for every other view of a focal plane
-_AS_LARGE = (
-    0.5  # of the largest change: not what another view's step leaves here, a quarter of it with three views
-)
+_AS_LARGE = 0.5  # of the largest change: not what another view's step leaves here, a quarter of it with three views
 _ROUNDS = 12
 _BACKFITTING = 6
 _FEWEST = 30  # observations of a detector
@@ -103,9 +101,7 @@ def _without_steps(problem: Problem, state: State, residual: Array) -> Array:
     return residual - steps
 
 
-def _grown(
-    columns: _Columns, residual: Array, settled: Callable[[Array], Array], weight: Array
-) -> tuple[Edges, float]:
+def _grown(columns: _Columns, residual: Array, settled: Callable[[Array], Array], weight: Array) -> tuple[Edges, float]:
     """Return the edges one after the other, the largest first; then each where it is best between its
     neighbours. And what is left of the squared residuals, with as much for every edge as it has to explain.
     """
@@ -129,8 +125,7 @@ def _grown(
     left = settled(residual - part)
     cost = float(((left * weight) ** 2).sum())
     cost += sum(
-        len(one) * (_LARGE + _A_VIEW * (len(group) - 1))
-        for one, group in zip(edges, columns.groups, strict=True)
+        len(one) * (_LARGE + _A_VIEW * (len(group) - 1)) for one, group in zip(edges, columns.groups, strict=True)
     )
     return [_placed(columns, g, of_group, part + left) for g, of_group in enumerate(edges)], cost
 

@@ -185,9 +185,7 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
         tracks.append(Tracks(rows, view, subsets, follow, room - np.log(volume), of_cameras))
         ends = ground.reshape(len(rows), n, 2, 3)[:, [0, -1]].reshape(len(rows), 4, 3)
         bases.append(np.sqrt(np.maximum(np.linalg.det(np.swapaxes(ends, 1, 2) @ ends), 0.0)))
-    far = (
-        max(float(np.quantile(np.linalg.norm(residual[:, order], axis=0), 0.99)), 5.0) if len(order) else 5.0
-    )
+    far = max(float(np.quantile(np.linalg.norm(residual[:, order], axis=0), 0.99)), 5.0) if len(order) else 5.0
     parallax = float(np.median(np.concatenate(bases))) * volume / image if len(order) else 0.0
     prior = problem.camera_prior
     return Linear(

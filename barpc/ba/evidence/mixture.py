@@ -37,9 +37,7 @@ _CHUNK = 8192  # pairs of observations worked on at a time, so that temporaries 
 _CHANGED = 0.1  # of what an unknown rests on: its curvature is summed anew
 _LOOSE = 1e-6  # of what all observations of a track tell of its place
 _TWO = 1.5  # observations: half of the next
-NEAR_LIMIT = (
-    4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise is large wrong ones lie no nearer
-)
+NEAR_LIMIT = 4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise is large wrong ones lie no nearer
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,18 +118,14 @@ def off_from_right(linear: Linear, residual: Array, right: Array) -> tuple[Array
         by_row = np.linalg.solve(matrix, np.swapaxes(ground, 1, 2))  # (T, 3, 2n)
         values = tracks.of(residual)
         left = values - (np.swapaxes(by_row, 1, 2) @ (weighted @ values[..., None]))[..., 0]
-        spread = 1.0 + (1.0 - 2.0 * np.repeat(weight, 2, axis=1)) * (np.swapaxes(ground, 1, 2) * by_row).sum(
-            axis=1
-        )
+        spread = 1.0 + (1.0 - 2.0 * np.repeat(weight, 2, axis=1)) * (np.swapaxes(ground, 1, 2) * by_row).sum(axis=1)
         off = (left / np.sqrt(np.maximum(spread, 0.1))).reshape(count, n, 2)
         out[:, tracks.rows] = off.transpose(2, 0, 1)
         known[tracks.rows] = weight.sum(axis=1, keepdims=True) - weight > _TWO
     return out, known
 
 
-def first_guess(
-    linear: Linear, found: Fit, extra: Array, new: Array, precision: Array
-) -> tuple[Array, float, float]:
+def first_guess(linear: Linear, found: Fit, extra: Array, new: Array, precision: Array) -> tuple[Array, float, float]:
     """Estimate starting values (e,) of unknowns that move observations by `new` (2, e, K) [px], beside a fit
     with `extra` [px].
 
@@ -211,9 +205,7 @@ def _expect(
     both = [log]
     if moved is not None:
         share = moved.share[tracks.rows[:, 0], None]
-        log_moved, square_moved, values_moved, followed_moved = _of_subsets(
-            tracks, moved.residual, moved.noise, area
-        )
+        log_moved, square_moved, values_moved, followed_moved = _of_subsets(tracks, moved.residual, moved.noise, area)
         both = [log + np.log1p(-share), log_moved + np.log(share)]
     chance = right @ subsets.T + wrong @ (1.0 - subsets).T
     log = np.concatenate([one + chance for one in both], axis=1)
@@ -233,9 +225,7 @@ def _expect(
     return _Expected(all_log, still, right_of_all, square, values, followed, of_moved)
 
 
-def _of_subsets(
-    tracks: Tracks, residual: Array, noise: float, area: float
-) -> tuple[Array, Array, Array, Array]:
+def _of_subsets(tracks: Tracks, residual: Array, noise: float, area: float) -> tuple[Array, Array, Array, Array]:
     """Return the log-likelihoods (T, S) of residuals (2, K) if a subset is right, their squares, and what
     they are made of.
     """
@@ -352,9 +342,7 @@ class Mixture:
         found = max(float(np.sqrt(still.squares / max(still.freedom - known, 1.0))), _LEAST_NOISE)
         cold = self.noise <= found
         noise = found if cold else max(found, self.cooled * self.noise)
-        wrong = np.bincount(
-            self.linear.view[self.part], 1.0 - seen.right[self.part], minlength=self.linear.views
-        )
+        wrong = np.bincount(self.linear.view[self.part], 1.0 - seen.right[self.part], minlength=self.linear.views)
         self.eps = np.clip((wrong + WRONG[0]) / (self.count + WRONG[1]), *_EPS)
         if self.group is not None:
             self._group(seen, noise, noise <= found)
@@ -461,9 +449,7 @@ class Mixture:
             order = np.argsort(linear.view[rows], kind="stable")
             left = linear.by_row[rows[order]].reshape(-1, q)
             right = np.concatenate(turned)[order].reshape(-1, size)
-            for v, (a, b) in enumerate(
-                pairwise(2 * np.searchsorted(linear.view[rows[order]], np.arange(views + 1)))
-            ):
+            for v, (a, b) in enumerate(pairwise(2 * np.searchsorted(linear.view[rows[order]], np.arange(views + 1)))):
                 across[v] = left[a:b].T @ right[a:b]
         cameras = self._of_cameras(np.concatenate([one.reshape(-1, 2, 2) for one in of_pairs]))
         cross = across.reshape(views * q, size)
@@ -482,9 +468,7 @@ class Mixture:
             right = (weight[pairs.order[part]] @ linear.by_row[pairs.second[part]]).reshape(-1, q)
             kinds = slice(*np.searchsorted(at, [start, stop]).tolist())
             ends = 2 * (at[kinds.start : kinds.stop + 1] - start)
-            for (one, other), (a, b) in zip(
-                pairs.views[kinds].tolist(), pairwise(ends.tolist()), strict=True
-            ):
+            for (one, other), (a, b) in zip(pairs.views[kinds].tolist(), pairwise(ends.tolist()), strict=True):
                 sums = left[:, a:b] @ right[a:b]
                 out[one, :, other] = sums
                 out[other, :, one] = sums.T

@@ -43,9 +43,7 @@ def price(rows: float, views: int) -> float:
     return float(np.log(max(_INDEPENDENT * rows / _SHORTEST, 1.0) * views))
 
 
-def swings(
-    view: IntArray, row: Array, size: Array, right: Array, off: Array, least: float = SURE
-) -> list[Swing]:
+def swings(view: IntArray, row: Array, size: Array, right: Array, off: Array, least: float = SURE) -> list[Swing]:
     """Find the period that stands out most in every view, the best first; none that gains less than `least`
     [nats].
 
@@ -122,9 +120,7 @@ class _Rows:
         """Return the level of the spectrum beside a peak over that of noise, the peak taken away: at least 1."""
         basis = np.vstack([np.ones(len(self.row)), swing(self.row, np.array(period))])
         weighted = basis * self.right
-        gain = self._spectrum(
-            self.off - (np.linalg.solve(weighted @ basis.T, weighted @ self.off.T)).T @ basis
-        )
+        gain = self._spectrum(self.off - (np.linalg.solve(weighted @ basis.T, weighted @ self.off.T)).T @ basis)
         away = np.abs(self.waves - self.waves[k])
         beside = (away > _LOBE) & (away < max(_BESIDE, self.waves[k]))
         beside[: self.first] = False

@@ -106,17 +106,12 @@ def _displacements(
     count, *shifts = np.array(sums, dtype=np.float64).reshape(3, views, BINS)
     smooth = np.vander(np.linspace(-1.0, 1.0, BINS), _FOLLOWED, increasing=True)
     weighted = count[:, :, None] * smooth
-    normal = (
-        np.swapaxes(weighted, 1, 2) @ smooth
-        + 1e-9 * np.eye(_FOLLOWED) * (count.sum(axis=1) + 1.0)[:, None, None]
-    )
+    normal = np.swapaxes(weighted, 1, 2) @ smooth + 1e-9 * np.eye(_FOLLOWED) * (count.sum(axis=1) + 1.0)[:, None, None]
     shift = np.stack(shifts, axis=2)  # (N, bins, 2)
     followed = smooth @ np.linalg.solve(normal, smooth.T @ shift)
     left = (off.T - followed[view, bin_]).T * np.sqrt(told)
     scatter = [[np.bincount(view, a * b, views) for a in left] for b in left]
-    size, axes = np.linalg.eigh(
-        np.moveaxis(np.array(scatter), 2, 0) / (count.sum(axis=1) + 1.0)[:, None, None]
-    )
+    size, axes = np.linalg.eigh(np.moveaxis(np.array(scatter), 2, 0) / (count.sum(axis=1) + 1.0)[:, None, None])
     rest = np.swapaxes((shift - count[:, :, None] * followed) @ axes, 1, 2)
     across = np.linalg.solve(np.linalg.cholesky(normal), np.swapaxes(weighted, 1, 2))
     squares = (_intervals(bins) ** 2 for bins in (*np.moveaxis(rest, 1, 0), *np.moveaxis(across, 1, 0)))

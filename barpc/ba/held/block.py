@@ -33,9 +33,7 @@ class Block:
     point: IntArray  # (K,) those from `num_tracks` on are GCPs, those from `num_known` on a reference's
     xy: Array  # (2, K) observed col, row [px]
     sigma: Array  # (K,) [px], view weights applied
-    order: (
-        IntArray  # (K,) row of each observation in the tracks, then in the GCPs and the reference, as given
-    )
+    order: IntArray  # (K,) row of each observation in the tracks, then in the GCPs and the reference, as given
     use: BoolArray  # (K,) false for observations in views that are left out
     gcps: GroundPoints  # none where there are none
     reference: Reference | None
@@ -155,9 +153,7 @@ def _check_names(names: Sequence[str], options: AdjustOptions) -> None:
         raise InputError("two views have the same name")
     unknown = (set(options.fixed) | set(options.view_weights)) - set(names)
     if unknown:
-        raise InputError(
-            f"no view is named {', '.join(sorted(unknown))}; there are {', '.join(names[:_LISTED])}"
-        )
+        raise InputError(f"no view is named {', '.join(sorted(unknown))}; there are {', '.join(names[:_LISTED])}")
 
 
 def _left_out(

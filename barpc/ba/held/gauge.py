@@ -90,9 +90,7 @@ def gauge_report(
     return replace(found, delivered_sigma=np.sqrt(by_unknown[:3] ** 2 @ variance))
 
 
-def earlier_scene(
-    covariance: Covariance, prior: JointPrior, scene: EarlierScene, params: Array
-) -> GaugeReport:
+def earlier_scene(covariance: Covariance, prior: JointPrior, scene: EarlierScene, params: Array) -> GaugeReport:
     """Report the scene of an earlier block, by unknowns (N, q) of its cameras that were adjusted again.
 
     Whatever was added tells more of it: new points are another scene, and may know theirs less.
@@ -103,9 +101,7 @@ def earlier_scene(
     return _report(covariance, moved[:3], by_unknown, scene.own, scene.radius)
 
 
-def _report(
-    covariance: Covariance, shift: Array, by_unknown: Array, own: Array, radius: float
-) -> GaugeReport:
+def _report(covariance: Covariance, shift: Array, by_unknown: Array, own: Array, radius: float) -> GaugeReport:
     motion_covariance = by_unknown @ covariance.solve(by_unknown.T) + own
     sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
     return GaugeReport(shift, sigma[:3], sigma, _modes(motion_covariance), radius, by_unknown, own)

@@ -22,9 +22,7 @@ FIRST_PLACED = NUM_BENDS
 """Errors in common in front of altimetry's own: a terrain's bends, or a terrain's and a reference's."""
 DEM_BIAS = 20.0  # m, where none is stated
 KNOWN_BIAS = 5.0  # m: the same, where it is known what its heights count from
-ALIKE = (
-    25.0  # independent errors that those of a reference are worth together, at most: they resemble each other
-)
+ALIKE = 25.0  # independent errors that those of a reference are worth together, at most: they resemble each other
 _STAYS = 1.0  # m: rays of weak points tell heights to hundreds of metres (0.05 m under 0.01 degrees: 290 m)
 _FLAT_SIGMA = 50.0  # m: least spread of altitudes that tracks held without a DEM are given
 _TOGETHER = 0.25  # of it: what their mean may be wrong by (RPCs' ranges lie about the terrain, roughly)
@@ -37,9 +35,7 @@ def _join(priors: Sequence[PointPrior | None]) -> PointPrior | None:
         return None
     most = max(prior.common.shape[2] for prior in given)
     common = [np.pad(p.common, ((0, 0), (0, 0), (0, most - p.common.shape[2]))) for p in given]
-    index, mean, rows = (
-        np.concatenate([getattr(p, name) for p in given]) for name in ("index", "mean", "rows")
-    )
+    index, mean, rows = (np.concatenate([getattr(p, name) for p in given]) for name in ("index", "mean", "rows"))
     return PointPrior(index, mean, rows, np.concatenate(common))
 
 
@@ -174,9 +170,7 @@ class TerrainTest:
     offset: float  # median of the adjusted altitudes minus the terrain's [m]; NaN where it has none
     spread: float  # 1.4826 times their median absolute deviation [m]
     bias: float  # what its heights may be wrong by together [m]
-    sigma: float = (
-        np.nan
-    )  # standard deviation of single heights, as the tie points show it [m]; NaN: as stated
+    sigma: float = np.nan  # standard deviation of single heights, as the tie points show it [m]; NaN: as stated
     alike: float = 1.0  # as many single heights are worth one
     gains: tuple[float, ...] = ()  # how much of its relief is believed, scale by scale, the finest first
     relief: float = np.nan  # its relief as a multiple of the tie points'
@@ -222,9 +216,7 @@ class Heights:
     def _believed(self, points: Array) -> Believed | None:
         if self.relief is None:
             return None
-        return believe(
-            self.relief, self.tracks, ground_from_ecef(points[self.tracks]), self.options.dem_sigma
-        )
+        return believe(self.relief, self.tracks, ground_from_ecef(points[self.tracks]), self.options.dem_sigma)
 
     def _held(self, points: Array) -> PointPrior | None:
         weak, believed = self.weak[self.tracks], self._believed(points)

@@ -79,9 +79,7 @@ class BlockPrior:
             return None
         place = {name: i for i, name in enumerate(self.names)}
         old = np.array([place.get(name, len(place)) for name in names])
-        return Waves(
-            self.splines, *(np.concatenate([x, np.full((1, *x.shape[1:]), np.inf)])[old] for x in of_views)
-        )
+        return Waves(self.splines, *(np.concatenate([x, np.full((1, *x.shape[1:]), np.inf)])[old] for x in of_views))
 
     @property
     def _edges(self) -> Array:
@@ -219,9 +217,7 @@ def _csr(file: Mapping[str, Array], size: int) -> sp.csr_array:
 
 def _within(numbers: Array, most: int) -> bool:
     """Return whether all are whole, and from 0 to `most`."""
-    return bool(
-        numbers.ndim == 1 and numbers.dtype.kind in "iu" and ((numbers >= 0) & (numbers <= most)).all()
-    )
+    return bool(numbers.ndim == 1 and numbers.dtype.kind in "iu" and ((numbers >= 0) & (numbers <= most)).all())
 
 
 def block_prior(adjustment: Adjustment) -> BlockPrior:
@@ -246,9 +242,7 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
         adjustment.params[views],
         reduced.plain(free) if isinstance(matrix, np.ndarray) else matrix.sparse()[free][:, free],
         adjustment.cameras.unknowns.center[views],
-        None
-        if isinstance(matrix, np.ndarray) or reduced.common is None
-        else reduced.common.by_camera[:, free],
+        None if isinstance(matrix, np.ndarray) or reduced.common is None else reduced.common.by_camera[:, free],
         waves.count if waves else 0,
         waves.edges[views] if waves else None,
         tuple(adjustment.names[v] for v in adjustment.cameras.unknowns.radars if v in views),
@@ -277,9 +271,7 @@ def apply_prior(
         The old block's unknowns are others, or one of its views is missing.
     """
     if (prior.model, prior.drift) != (model, drift):
-        raise InputError(
-            f"the earlier block was adjusted with {prior.model} (drift {prior.drift}); use the same"
-        )
+        raise InputError(f"the earlier block was adjusted with {prior.model} (drift {prior.drift}); use the same")
     missing = sorted(set(prior.names) - set(names))
     if missing:
         raise InputError(f"views of the earlier block are missing: {', '.join(missing[:10])}")
@@ -300,6 +292,4 @@ def apply_prior(
     mean, sigma = cameras.mean.copy(), cameras.sigma.copy()
     mean[views], sigma[views] = prior.params, np.inf
     index = (views[:, None] * size + np.arange(size)).ravel()
-    return replace(cameras, mean=mean, sigma=sigma), JointPrior(
-        index, prior.params.ravel(), root, prior.scene
-    )
+    return replace(cameras, mean=mean, sigma=sigma), JointPrior(index, prior.params.ravel(), root, prior.scene)

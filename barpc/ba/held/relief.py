@@ -32,9 +32,7 @@ _ENOUGH = 60  # points: three for each number that is estimated
 _ROUNDS = 5  # gains, then what does not fit, in turn
 _FAR = 5.0  # robust standard deviations: heights farther off are holes that were filled, or what was built
 _CELLS = (6, 10, 16)  # along the scene's longer side: 36 sums tell a variance to a quarter
-_HILLS = (
-    45.0  # slopes that are alike count as one: 49-133 of them in the scenes that hold, 33 in 250 m by SRTM
-)
+_HILLS = 45.0  # slopes that are alike count as one: 49-133 of them in the scenes that hold, 33 in 250 m by SRTM
 _STATED = 4.0  # observations that the stated standard deviation of single heights is worth
 BEYOND = 3.0  # times what is allowed: a DEM and the cameras contradict each other
 _EDGE = 2.0  # the scene's edges lie at most about so many times as far out as its points' RMS distance
@@ -59,9 +57,7 @@ class Bands:
         from scipy.ndimage import gaussian_filter  # a tenth of a second, of blocks with a DEM alone
 
         lon = wrap_longitude(ground[:, 0], ground[0, 0])
-        low, high = np.percentile(
-            np.column_stack([lon, ground[:, 1]]), [1, 99], axis=0
-        )  # wrong matches lie far out
+        low, high = np.percentile(np.column_stack([lon, ground[:, 1]]), [1, 99], axis=0)  # wrong matches lie far out
         unit = metres_per_unit(np.append((low + high) / 2.0, np.median(ground[:, 2])))[:2]
         side = (high - low) * unit
         extent = float(side.max())
@@ -145,9 +141,7 @@ def _bend_slopes(at: Array) -> Array:
 class Believed:
     """Heights and slopes that are believed of a DEM at n points."""
 
-    alt: (
-        Array  # (n,) altitudes to hold the points to [m]; NaN where the DEM has none, or they are far from it
-    )
+    alt: Array  # (n,) altitudes to hold the points to [m]; NaN where the DEM has none, or they are far from it
     slopes: Array  # (n, 2) of the terrain towards east and north
     bends: Array  # (n, `NUM_BENDS`) at most about 1 at the scene's edges: what all heights may be wrong by
     gains: Array  # (K,) of the bands, the finest first
@@ -188,9 +182,7 @@ class Relief:
         return sigma
 
     @classmethod
-    def of(
-        cls, terrain: Terrain, ground: Array, strong: BoolArray, sharp: Array, stated: float = 0.0
-    ) -> Relief:
+    def of(cls, terrain: Terrain, ground: Array, strong: BoolArray, sharp: Array, stated: float = 0.0) -> Relief:
         """Compare a DEM with points (P, 3) by rays alone; heights of the `strong` (P,) ones are known to
         `sharp` (P,) [m].
 
@@ -273,9 +265,7 @@ class _Compared:
     unknowns: int
 
 
-def _compared(
-    at: Array, above: Array, bent: Array, slopes: Array, smooth: Array, tell: BoolArray
-) -> _Compared:
+def _compared(at: Array, above: Array, bent: Array, slopes: Array, smooth: Array, tell: BoolArray) -> _Compared:
     """Return the heights (n,) [m] of points that `tell` (n,) by bands (n, K) of slopes (K, n, 2), a motion
     and a bend (n, m).
 
@@ -286,9 +276,7 @@ def _compared(
     gains, fits, both, believes = np.ones(bent.shape[1]), tell, np.column_stack([above, bent]), True
     for _ in range(_ROUNDS):
         rising = np.einsum("k,knx->nx", gains, slopes)
-        believes = believes and fits.sum() > _HILLS * _summed(
-            at[fits], rising[fits] - rising[fits].mean(axis=0)
-        )
+        believes = believes and fits.sum() > _HILLS * _summed(at[fits], rising[fits] - rising[fits].mean(axis=0))
         moved = smooth
         if believes:  # a shift, a turn, a growth
             moved = np.column_stack([smooth, *(rising * smooth[:, k, None] for k in range(3))])

@@ -73,9 +73,7 @@ def _known_centers(block: Block, options: AdjustOptions, centers: Array | None, 
     return np.array([known.get(name, center) for name, center in zip(block.names, centers, strict=True)])
 
 
-def first_state(
-    problem: Problem, block: Block, options: AdjustOptions, dem: Terrain | None
-) -> tuple[State, Heights]:
+def first_state(problem: Problem, block: Block, options: AdjustOptions, dem: Terrain | None) -> tuple[State, Heights]:
     """Triangulate the points with the delivered cameras, and return priors for those that the rays do not fix."""
     params = problem.camera_prior.mean
     points = block.first_points()
@@ -120,7 +118,5 @@ def _relief(problem: Problem, heights: Heights, points: Array, weight: Array) ->
         pull = np.einsum("cxk,xk->ck", by_point, moved.take(structure.point, axis=1)) * weight
         by_unknown = structure.sum_views(np.einsum("ck,cqk->qk", pull, projected.by_unknown))
         free = problem.free.reshape(by_unknown.shape)
-        let[m] = (
-            np.sqrt(((by_unknown * sigma)[free] ** 2).sum()) if np.isfinite(sigma[free]).all() else np.nan
-        )
+        let[m] = np.sqrt(((by_unknown * sigma)[free] ** 2).sum()) if np.isfinite(sigma[free]).all() else np.nan
     return replace(found, cameras=let)

@@ -22,9 +22,7 @@ _TERMS = 6
 _FREEDOM = NEIGHBOURS - _TERMS
 _RIDGE = 1e-6  # of a neighbour's weight: neighbours on a line tell of no more than a line
 _SHARED_FREEDOM = 4.0  # degrees of freedom that the whole surface's scatter counts for in that of a patch
-_BROKEN = float(
-    chdtri(_FREEDOM, 1e-3)
-)  # of its squares over the usual variance: by chance, one in a thousand
+_BROKEN = float(chdtri(_FREEDOM, 1e-3))  # of its squares over the usual variance: by chance, one in a thousand
 _LEAST_SCATTER = 0.01  # m: no ground is flatter
 _SIDE = 25  # trials along each axis of the search
 _SEARCHED = 1000  # heights that the search looks at, at most
@@ -197,9 +195,7 @@ def _settled(
         rows = np.where(near, np.maximum(1.0 - (whitened / (_BIWEIGHT * noise)) ** 2, 0.0), 0.0)
         weight = (rows / seen.sigma) ** 2  # rows^2 is the biweight
         normal = (seen.rows * weight[:, None]).T @ seen.rows + free
-        change = np.linalg.solve(
-            normal, seen.rows.T @ (weight * np.where(near, seen.residual, 0.0)) - free @ motion
-        )
+        change = np.linalg.solve(normal, seen.rows.T @ (weight * np.where(near, seen.residual, 0.0)) - free @ motion)
         motion = motion + change
         if not is_known and step >= 2:
             among = np.abs(whitened[seen.near & (np.abs(whitened) < 2.0 * _BIWEIGHT * noise)])
@@ -209,9 +205,7 @@ def _settled(
     return motion, noise
 
 
-def _jackknife(
-    surface: Surface, given: Given, found: Registration, radius: float, noise: float, free: Array
-) -> Array:
+def _jackknife(surface: Surface, given: Given, found: Registration, radius: float, noise: float, free: Array) -> Array:
     """Return the factors (7,) of standard deviations: how the motion changes where the heights of one part
     are left out.
 
@@ -271,9 +265,7 @@ class _Seen:
         variance += (slope**2).sum(axis=1) * given.sigma_flat**2
         normal = np.column_stack([-slope, np.ones(len(slope))])
         rows = np.einsum("nc,ncm->nm", normal, moves)
-        return cls(
-            given.place[:, 2] - height - moved[:, 2], np.sqrt(variance), rows, near, nearest, moves, doubt
-        )
+        return cls(given.place[:, 2] - height - moved[:, 2], np.sqrt(variance), rows, near, nearest, moves, doubt)
 
 
 def _search(surface: Surface, given: Given, before: Array) -> Array:
@@ -302,9 +294,7 @@ def _search(surface: Surface, given: Given, before: Array) -> Array:
     return found
 
 
-def _told(
-    surface: Surface, given: Given, motion: Array, radius: float, noise: float, free: Array
-) -> Registration:
+def _told(surface: Surface, given: Given, motion: Array, radius: float, noise: float, free: Array) -> Registration:
     """Return the covariance at the end, and which heights agree."""
     seen = _Seen.of(surface, given, motion, radius)
     scale = min(max(noise, 1.0), _MOST_NOISE)

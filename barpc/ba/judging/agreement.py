@@ -36,9 +36,7 @@ _NEAR = 16.0  # squared deviation of a point that goes with a set: that of `snoo
 _ROOM = 20_000  # points of sets at a time: some 10 MB
 _SCALES = (1.0, 3.0, 2.0, 5.0)  # every set with the first two; more than five times is wrong, not optimistic
 _MOTIONS = (1.0, 3.0)
-_OPTIMISTIC = (
-    3.5  # nats for each factor of e in the accuracies. Measured, 60 draws each: with 3, 3.5, 4 one of five
-)
+_OPTIMISTIC = 3.5  # nats for each factor of e in the accuracies. Measured, 60 draws each: with 3, 3.5, 4 one of five
 # points 3 m off is found in 55, 57, 57; six with sigmas 3 x too small stay together in 59, 59, 59
 _FLOPPY = 2.0  # nats, the same for the motions
 _WRONG = 2.9  # nats that it costs to call a point wrong: one in twenty is

@@ -307,7 +307,6 @@ def _at_one_end(seen: Seen, intervals: list[Interval]) -> bool:
     all over.
     """
     at_end = [
-        (one.start <= 0.0, one.stop >= seen.size[1, one.view]) if one.axis == 1 else (False, False)
-        for one in intervals
+        (one.start <= 0.0, one.stop >= seen.size[1, one.view]) if one.axis == 1 else (False, False) for one in intervals
     ]
     return any(map(all, zip(*at_end, strict=True)))

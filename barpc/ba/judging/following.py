@@ -46,9 +46,7 @@ def follow(found: Solution, block: Block, outer: Block, options: AdjustOptions) 
     return best if best is found else replace(best, asked={**found.asked, "jitter": found.outcome.smooth})
 
 
-def without_strips(
-    found: Solution, judged: Judgement, block: Block, outer: Block, options: AdjustOptions
-) -> Solution:
+def without_strips(found: Solution, judged: Judgement, block: Block, outer: Block, options: AdjustOptions) -> Solution:
     """Solve the block with the strips, fades and swings that the judge found.
 
     Refused where it makes tracks worse that took no part, or no better than what follows an image as a whole.
@@ -66,9 +64,7 @@ def without_strips(
     shaken = len({one.view for one in parts}) == len(block.views)
     if not shaken and not any(one.where is not None and one.where[0] == 0 for one in parts):
         return tried
-    plain = follow(
-        found, block, outer, options
-    )  # splines and detectors may explain the same, and leave nothing
+    plain = follow(found, block, outer, options)  # splines and detectors may explain the same, and leave nothing
     calm = plain is not found and not standing_out(plain.outcome, block, options.noise_floor)
     if not calm or is_better(tried.after, plain.after, outer):
         return tried
@@ -81,9 +77,7 @@ def _judged(found: Solution, judged: Judgement, block: Block) -> Solution:
     inlier = np.where(is_tie, block.use & (judged.right > 0.5), outcome.inlier)
     ended = outcome.minimum.state
     moved = replace(ended, params=ended.params + judged.step)
-    return replace(
-        found, outcome=replace(outcome, inlier=inlier, minimum=replace(outcome.minimum, state=moved))
-    )
+    return replace(found, outcome=replace(outcome, inlier=inlier, minimum=replace(outcome.minimum, state=moved)))
 
 
 def _waves_of(parts: list[Finding], views: int) -> tuple[Waves, Array]:
@@ -166,9 +160,7 @@ def _with_waves(
     if start is not None:
         params[:, unknowns.in_waves.start :] = start
     elif unknowns.waves is not None:
-        params[:, unknowns.in_waves.start :] = waves.carried(
-            ended.params[:, unknowns.in_waves], unknowns.waves
-        )
+        params[:, unknowns.in_waves.start :] = waves.carried(ended.params[:, unknowns.in_waves], unknowns.waves)
     outcome, weight = found.outcome, block.use / block.sigma
     known = outcome.inlier
     if start is not None:  # the cameras have moved: every point is seen anew, where any are right by these

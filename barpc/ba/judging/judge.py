@@ -47,9 +47,7 @@ _PARTS = 3  # of images that may explain together what something else does alone
 _LOCAL = 2  # of each kind of part of an image whose ends are looked for, a round
 _SHARPENED = 6  # times
 _FEW = 2000  # observations with which explanations are chosen that are worth more
-_SEEN = (
-    2.5  # floors: swings and motions that are taken; sound crops show swings of 1.8, where ties share errors
-)
+_SEEN = 2.5  # floors: swings and motions that are taken; sound crops show swings of 1.8, where ties share errors
 _WORTH = 0.1 * SURE  # nats: less decides nothing
 _HELD_IN = 4  # images of which a part may hold what moves
 UNKNOWNS = 400  # of all views, up to which explanations are tried on all together
@@ -76,9 +74,7 @@ class Finding:
     runner_up: str  # its kind, or "" for none
     unknowns: Array  # (e,) as `barpc.ba.judging.explanations` has them [px]
     period: float | None = None  # after which it repeats itself [px]
-    or_of: tuple[
-        int, ...
-    ] = ()  # other views that may be meant: their evidence is within `SURE` of the view's
+    or_of: tuple[int, ...] = ()  # other views that may be meant: their evidence is within `SURE` of the view's
     moved: Found | None = field(default=None, repr=False)
     motion: Motion | None = None  # what is said of it at the end
 
@@ -89,9 +85,7 @@ class Judgement:
 
     findings: tuple[Finding, ...] = ()
     step: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (N, q) of the cameras' unknowns
-    right: Array = field(
-        default_factory=lambda: np.zeros(0)
-    )  # (K,) probability that an observation of a tie is
+    right: Array = field(default_factory=lambda: np.zeros(0))  # (K,) probability that an observation of a tie is
 
 
 def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
@@ -152,9 +146,7 @@ def _told(outcome: Outcome, block: Block) -> Array:
 def _whitened(outcome: Outcome, block: Block) -> tuple[BoolArray, Array]:
     """Return the observations of tracks (K,), and residuals (2, k) of these in standard deviations."""
     is_tie = (block.point < block.num_tracks) & block.use
-    freedom = Observations(outcome.problem, block.sigma, 0.0, is_tie).freedom(
-        outcome.inlier.astype(np.float64)
-    )
+    freedom = Observations(outcome.problem, block.sigma, 0.0, is_tie).freedom(outcome.inlier.astype(np.float64))
     spread = block.sigma * outcome.noise * np.sqrt(0.5 * freedom)
     rows = is_tie & np.isfinite(outcome.residual).all(axis=0)
     return rows, outcome.residual[:, rows] / spread[rows]
@@ -230,8 +222,7 @@ def _joined(all_of: Judgement, one: Judgement, views: IntArray, rows: IntArray) 
     step[views[new]] = one.step[new]
     right[rows] = one.right
     findings = (
-        replace(row, view=int(views[row.view]), or_of=tuple(int(views[v]) for v in row.or_of))
-        for row in one.findings
+        replace(row, view=int(views[row.view]), or_of=tuple(int(views[v]) for v in row.or_of)) for row in one.findings
     )
     return Judgement((*all_of.findings, *findings), step, right)
 
@@ -243,9 +234,7 @@ def around(outcome: Outcome, block: Block, views: IntArray) -> tuple[Linear, Sta
     unknowns = problem.free.size // len(block.views) * len(views)
     if unknowns > UNKNOWNS or numbers(np.bincount(block.point[use])) > _NUMBERS:
         return None
-    state, _ = revived(
-        problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
-    )
+    state, _ = revived(problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma)
     low, high = block.alt_range
     return linearise(problem, state, use, block.sigma, high - low), state
 
@@ -395,8 +384,7 @@ class _Search:
         """
         best = [row for row in made[:1] if row[2] > SURE and row[0].kind in FOLLOWED]
         beside = (
-            self._standing_out(found, np.concatenate([self.seen.extra, one.extra], axis=1))
-            for one, found, _ in best
+            self._standing_out(found, np.concatenate([self.seen.extra, one.extra], axis=1)) for one, found, _ in best
         )
         return any(not any(one) for one in beside)
 
@@ -450,9 +438,7 @@ class _Search:
         ground, too.
         """
         seen, none = self.seen, np.zeros((2, int(rows.sum())))
-        places = scan(
-            seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none, none[0]
-        )
+        places = scan(seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none, none[0])
         best = {one.view: one for one in reversed(places) if one.by_share and one.gain > SURE}
         intervals = sorted(best.values(), key=lambda one: -one.gain)[:_HELD_IN]
         return proposed(seen, intervals, [], (MOVING, WANDER))
@@ -463,16 +449,12 @@ class _Search:
 
     def _sorted(self, made: Iterable[tuple[Explanation, Fit]]) -> list[_Tried]:
         base = self.seen.base.evidence
-        return sorted(
-            ((*row, row[1].evidence - base - row[0].price) for row in made), key=lambda row: -row[2]
-        )
+        return sorted(((*row, row[1].evidence - base - row[0].price) for row in made), key=lambda row: -row[2])
 
     def _sharpened(self, one: Explanation, found: Fit) -> tuple[Explanation, Fit]:
         for _ in range(_SHARPENED):
             others = np.einsum("cek,e->ck", self.seen.extra, found.extra[: -len(one.sigma)])
-            tried = (
-                [one, faster(one, self._fit(bent(self.seen, one)))] if one.kind in (FADE, SETTLING) else [one]
-            )
+            tried = [one, faster(one, self._fit(bent(self.seen, one)))] if one.kind in (FADE, SETTLING) else [one]
             again = [sharpened(self.seen, shape, found, others) for shape in tried]
             better, made = max(
                 ((self._fit(shape, base=found), shape) for shape in again), key=lambda row: row[0].evidence

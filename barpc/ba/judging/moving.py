@@ -88,9 +88,7 @@ class Motion:
     metres: float  # by how much, from one of two views to the other, beside what may be its height
     between: tuple[int, int]
     share: float  # of the tracks
-    box: tuple[
-        float, float, float, float
-    ]  # west, south, east, north [deg], of nine in ten of its tracks each way
+    box: tuple[float, float, float, float]  # west, south, east, north [deg], of nine in ten of its tracks each way
     side: str  # of the middle of the block on which they lie, as "north-west"; "" where on both
 
 

@@ -184,9 +184,7 @@ def image_test(
     inverse = solve_transposed(lower, np.eye(3)[..., None]).transpose(2, 0, 1)  # L^-T
     place = {} if reduced.common is None else {int(p): n for n, p in enumerate(reduced.common.index)}
     left = np.empty((len(rows), 2))
-    waiting: list[
-        tuple[int, Array]
-    ] = []  # rows (2, N q) of the derivative by all cameras, solved for together
+    waiting: list[tuple[int, Array]] = []  # rows (2, N q) of the derivative by all cameras, solved for together
     for n, k in enumerate(rows.tolist()):
         p = int(structure.point[k])
         together = structure.by_point[structure.point_bounds[p] : structure.point_bounds[p + 1]]
@@ -199,9 +197,7 @@ def image_test(
             left[n] -= np.diag(flat @ covariance.joint(structure.view[together]) @ flat.T)
             continue
         assert reduced.common is not None
-        shared = (
-            own @ la.solve_triangular(reduced.common.upper, reduced.common.cross[place[p]].T, trans="T").T
-        )
+        shared = own @ la.solve_triangular(reduced.common.upper, reduced.common.cross[place[p]].T, trans="T").T
         whole = shared @ reduced.common.by_camera
         for view, move in zip(structure.view[together].tolist(), moves, strict=True):
             whole[:, view * q : (view + 1) * q] += move

@@ -127,9 +127,7 @@ def solve_block(
     start = measure(problem, state.params, outer)
     rounds = Rounds(problem, block, state, options, heights, block.use)
     before, agreed, free = rounds.residual, None, None
-    if (
-        block.gcps.names and not (block.point < block.num_tracks).any()
-    ):  # control is all that holds the cameras
+    if block.gcps.names and not (block.point < block.num_tracks).any():  # control is all that holds the cameras
         agreed, heights = _with_control(block, given, rounds.run(once=True))
         rounds = Rounds(problem, block, state, options, heights, block.use)
     outcome = rounds.run()
@@ -153,11 +151,7 @@ def solve_block(
         outcome = Rounds(problem, block, outcome.minimum.state, options, heights, block.use, outcome).run()
     first = Solution(problem, state, before, heights, outcome, start, start, None, asked, agreed=agreed)
     found = finished(first, problem, block, outer, options, outcome)
-    return (
-        found
-        if free is None or not found.heights.has_control
-        else _untorn(found, free, block, outer, options)
-    )
+    return found if free is None or not found.heights.has_control else _untorn(found, free, block, outer, options)
 
 
 def _untorn(found: Solution, free: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
@@ -179,9 +173,7 @@ def _with_control(block: Block, heights: Heights, outcome: Outcome) -> tuple[Agr
     """
     count, first = len(block.gcps.names), block.num_tracks
     mine = (block.point >= first) & (block.point < block.num_known)
-    lost = np.isin(
-        np.arange(count), block.point[mine & block.use & ~outcome.inlier] - first
-    )  # by hundreds of sigmas
+    lost = np.isin(np.arange(count), block.point[mine & block.use & ~outcome.inlier] - first)  # by hundreds of sigmas
     told = np.isin(np.arange(count), block.point[mine & outcome.inlier] - first) & ~lost
     covariance = outcome.minimum.covariance(outcome.problem.free)
     faint = faintness(block, heights.loose(LOOSE))

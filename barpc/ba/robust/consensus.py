@@ -41,9 +41,7 @@ class TwoGroups:
     apart: float  # across the epipolar lines [px]
 
 
-def two_groups(
-    structure: Structure, residual: Array, projected: Projected, use: BoolArray
-) -> tuple[TwoGroups, ...]:
+def two_groups(structure: Structure, residual: Array, projected: Projected, use: BoolArray) -> tuple[TwoGroups, ...]:
     """Find the pairs of views whose offsets across the epipolar lines (of observations in use) have two centres."""
     many = np.repeat(np.diff(structure.pair_bounds) >= _GROUPED, np.diff(structure.pair_bounds))
     rows = np.flatnonzero(many & use[structure.first] & use[structure.second])
@@ -99,9 +97,7 @@ def agreeing(
     spread = np.hypot(sigma[first], sigma[second])
     against = np.zeros(len(first), dtype=bool)
     usable = use[first] & use[second] & np.isfinite(offset)
-    for m, (start, stop) in enumerate(
-        zip(structure.pair_bounds[:-1], structure.pair_bounds[1:], strict=True)
-    ):
+    for m, (start, stop) in enumerate(zip(structure.pair_bounds[:-1], structure.pair_bounds[1:], strict=True)):
         rows = start + np.flatnonzero(usable[start:stop])
         if len(rows) >= _LEAST:
             place = xy[:, first[rows]]

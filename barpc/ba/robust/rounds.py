@@ -104,9 +104,7 @@ class Rounds:
         self.is_known = known is not None
         self.projected = projected  # of the state, until the first pass moves it
         self.passes, self.noise = 0, 1.0 if known is None else known.noise
-        self.misfit: Array | float = (
-            known.smooth.rms if known is not None and self.goes_on and self.robust else 0.0
-        )
+        self.misfit: Array | float = known.smooth.rms if known is not None and self.goes_on and self.robust else 0.0
         self.scatter: Array | None = None  # residuals without smooth parts, where they are known
         self.weight = self.counted
 
@@ -286,9 +284,7 @@ def _counted(observations: Observations, use: BoolArray, squared: Array, by_loss
     return np.where(observations.is_spared(squared), use.astype(np.float64), use * by_loss)
 
 
-def revived(
-    problem: Problem, state: State, residual: Array, use: BoolArray, weight: Array
-) -> tuple[State, Array]:
+def revived(problem: Problem, state: State, residual: Array, use: BoolArray, weight: Array) -> tuple[State, Array]:
     """Return the state with wholly cut tracks triangulated anew by the present cameras, and their residuals
     (2, K).
 

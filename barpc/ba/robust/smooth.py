@@ -106,9 +106,7 @@ class Smooth:
         weight = use.astype(np.float64)
         residual = np.where(use, residual, 0.0)
         share, precision = (
-            (weight, weight)
-            if self.alike is None
-            else (weight * self.alike.share, weight * self.alike.precision)
+            (weight, weight) if self.alike is None else (weight * self.alike.share, weight * self.alike.precision)
         )
         terms = 2.0 * TERMS
         for v, (rows, coefficients) in (self.fit(residual, weight) if fit is None else fit).items():

@@ -31,15 +31,11 @@ _LOG = logging.getLogger(__name__)
 _STRENGTH = 4.0  # degrees of freedom with which the given figure counts beside what the block shows
 _LEVEL = 0.05  # a sum of squares less probable than this is too large
 _SURE = 5.0  # of two explanations whose evidences differ by less (a factor of 150) none is ruled out
-_LIKELIER = -np.log(
-    _LEVEL
-)  # but one odd view is named where all being worse than stated is as improbable beside it
+_LIKELIER = -np.log(_LEVEL)  # but one odd view is named where all being worse than stated is as improbable beside it
 _FREE = 100.0  # times its prior: a view whose camera may be anywhere
 _SEARCH = 10.0  # times the drift's standard deviation while outliers are looked for
 _MOVING = 0.01  # of a rotation, as drift: the centre it turns about flies some km while an image is taken
-_UNEXPECTED = (
-    1e-3  # drifts less probable than this are another platform's, and what was given counts for nothing
-)
+_UNEXPECTED = 1e-3  # drifts less probable than this are another platform's, and what was given counts for nothing
 _LOW = 0.1  # then as much is let be as leaves what is seen this likely: a prior too narrow bends all heights alike
 _ITERATIONS = 10
 STANDS = 0.05  # change of a standard deviation, as a logarithm, below which it stands
@@ -62,9 +58,7 @@ class PriorTest:
     odd: BoolArray  # (N,) views whose camera alone explains the corrections. More than one: any of them would
     # standard deviation of the drift's coefficients in use, degree by degree [m]
     drift_sigma: tuple[float, ...]
-    shared: float = (
-        1.0  # by how much standard deviations that RPCs state were widened, as all views share what is off
-    )
+    shared: float = 1.0  # by how much standard deviations that RPCs state were widened, as all views share what is off
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,9 +126,7 @@ class Variances:
         """Return the wider priors used while outliers are looked for, so that unexpected drift is not cut."""
         return self._prior(np.ones(len(self.given.sigma)), np.full(self._degrees, _SEARCH))
 
-    def learnt(
-        self, problem: Problem, minimum: Minimum, exact: bool = False
-    ) -> tuple[CameraPrior, PriorTest]:
+    def learnt(self, problem: Problem, minimum: Minimum, exact: bool = False) -> tuple[CameraPrior, PriorTest]:
         """Estimate the priors that the block supports, in its linearisation at a minimum.
 
         A large block's variances are probed unless they are to be `exact`.
@@ -178,9 +170,7 @@ class Variances:
                 break
             _, params, covariance = around.under(prior)
             known = self._known(covariance, prior)
-        drift = tuple(
-            float(np.median(prior.sigma[:, self._drift_part(d).start])) for d in range(self._degrees)
-        )
+        drift = tuple(float(np.median(prior.sigma[:, self._drift_part(d).start])) for d in range(self._degrees))
         sigma = prior.sigma.copy()
         sigma[:, : self.constants] *= shared[:, None]
         tested = PriorTest(ratio, freedom, scale, odd, drift, float(shared.max()))

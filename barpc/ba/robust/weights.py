@@ -81,9 +81,7 @@ class Observations:
         self.is_tie = is_tie
         waves = problem.cameras.unknowns.waves
         # errors that neighbours share are others in every stretch of a spline, of columns and of rows
-        self.stretches = (
-            1.0 if waves is None else waves.stretches(2.0 * float(problem.cameras.unknowns.half[1].max()))
-        )
+        self.stretches = 1.0 if waves is None else waves.stretches(2.0 * float(problem.cameras.unknowns.half[1].max()))
         self.has_prior = np.zeros(self.structure.num_points, dtype=bool)
         if problem.point_prior is not None:
             self.has_prior[problem.point_prior.index] = True

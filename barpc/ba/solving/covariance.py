@@ -137,9 +137,7 @@ class Covariance:
         for n, p in enumerate(index):
             if int(p) not in place:
                 continue
-            shared = (
-                -inverse[n] @ la.solve_triangular(common.upper, common.cross[place[int(p)]].T, trans="T").T
-            )
+            shared = -inverse[n] @ la.solve_triangular(common.upper, common.cross[place[int(p)]].T, trans="T").T
             rows = structure.by_point[structure.point_bounds[p] : structure.point_bounds[p + 1]]
             sensitivity = -shared @ common.by_camera
             for k in rows:

@@ -145,9 +145,7 @@ def reduce_normal(
         gain += float(common.half @ common.half)
         if isinstance(matrix, np.ndarray):
             matrix = matrix - common.by_camera.T @ common.by_camera
-    return Reduced(
-        structure, matrix, slope_all, float((residual**2).sum()), gain, lower, half.T, cross, common
-    )
+    return Reduced(structure, matrix, slope_all, float((residual**2).sum()), gain, lower, half.T, cross, common)
 
 
 def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, cross: Array) -> Common:

@@ -73,9 +73,7 @@ class Problem:
         projected = self.linearise(params, points)
         return projected.image - self.xy, projected
 
-    def reduce(
-        self, params: Array, points: Array, weight: Array, projected: Projected | None = None
-    ) -> Reduced:
+    def reduce(self, params: Array, points: Array, weight: Array, projected: Projected | None = None) -> Reduced:
         """Linearise at a state and eliminate the points.
 
         `weight` (K,) is 1 / sigma of every observation [1/px], 0 for one that does not count; `projected` is

@@ -228,9 +228,7 @@ class _Compressed:
         return np.vstack([self.slope, np.zeros((1, len(x)))])
 
 
-def _scipy(
-    problem: Problem, state: State, weight: Array, tolerance: float, projected: Projected | None
-) -> Minimum:
+def _scipy(problem: Problem, state: State, weight: Array, tolerance: float, projected: Projected | None) -> Minimum:
     from scipy.optimize import least_squares  # a quarter of a second, and most runs end before they come here
 
     compressed = _Compressed(problem, state, weight, projected)

@@ -53,9 +53,7 @@ class InputEntry(Record):
 
     path: str = said("File; a matcher by its name goes by its module")
     bytes: Count = said("Its size")
-    sha256: str = said(
-        "SHA-256 of its bytes; of a file on another host of its URL and the version named there"
-    )
+    sha256: str = said("SHA-256 of its bytes; of a file on another host of its URL and the version named there")
 
 
 class OutputEntry(Record):
@@ -115,17 +113,13 @@ class Summary(Record):
     gcps: tuple[GcpEntry, ...] = said("Ground control")
     check_points: tuple[CheckPointEntry, ...] = said("Points that stayed out of the adjustment")
     stages: tuple[StageEntry, ...] = said("Stages of the run")
-    options: Mapping[str, _Value | Mapping[str, _Value | Mapping[str, _Value]]] | None = said(
-        "Options of the run"
-    )
+    options: Mapping[str, _Value | Mapping[str, _Value | Mapping[str, _Value]]] | None = said("Options of the run")
     versions: Mapping[str, str] = said("Versions of Python and packages")
     control_test: ControlTestEntry | None = said(
         "The residuals of control in the images, each tested; null without control", default=None
     )
     reference: ReferenceEntry | None = said("A reference orthoimage, where one was given", default=None)
-    inputs: tuple[InputEntry, ...] | None = said(
-        "Every file that was read, as `barpc verify` asks", default=None
-    )
+    inputs: tuple[InputEntry, ...] | None = said("Every file that was read, as `barpc verify` asks", default=None)
     outputs: tuple[OutputEntry, ...] | None = said(
         "Every file that was written but this one and the report", default=None
     )

@@ -113,9 +113,7 @@ CAUSES = {
         "its corrected camera follows {follows}, of which one RPC leaves {left:.2f} px (RMS; {most:.2f} px at most)",
         "use its grids ({image}_grid.tif), --tiles or --resample",
     ),
-    "disagrees": Cause(
-        "doubtful", "cameras disagree", "tie points disagree by {error:.2f} px", "adjust the cameras"
-    ),
+    "disagrees": Cause("doubtful", "cameras disagree", "tie points disagree by {error:.2f} px", "adjust the cameras"),
     "left": Cause(
         "doubtful",
         "large residuals",

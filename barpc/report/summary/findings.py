@@ -52,13 +52,9 @@ class ExplanationEntry(Record):
     last: Number = said("Its last row or column", "px", default=None)
     size_px: Number = said("RMS displacement of what it moves; the amplitude of a swing", "px", default=None)
     period: Number = said("Rows after which a swing repeats itself", "px", default=None)
-    or_of: tuple[str, ...] | None = said(
-        "Views that may be meant as well: ties do not tell which", default=None
-    )
+    or_of: tuple[str, ...] | None = said("Views that may be meant as well: ties do not tell which", default=None)
     share: Number = said("Tie points that move together: part of all of them", default=None)
-    moved_m: Number = said(
-        "How far they move on the ground, beside what may be their height", "m", default=None
-    )
+    moved_m: Number = said("How far they move on the ground, beside what may be their height", "m", default=None)
     between: tuple[str, ...] | None = said("From the first of these views to the second", default=None)
     box: tuple[float, ...] | None = said(
         "Where nine in ten of them lie, each way: west, south, east, north", "deg", default=None
@@ -98,9 +94,7 @@ def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
     if (apart := adjustment.apart) is not None and apart.clear and np.isfinite(apart.gain):
         other = None if apart.runner_up is None else f"{APART}: {adjustment.names[apart.runner_up]}"
         image = adjustment.names[apart.view]
-        what = (
-            "many tie points of {} are wrong, or its RPC is" if apart.look.as_stated else "the RPC of {} is"
-        )
+        what = "many tie points of {} are wrong, or its RPC is" if apart.look.as_stated else "the RPC of {} is"
         sentence = f"{what.format(image)} not its own: {strangeness(apart)}"
         found.append(ExplanationEntry(APART, sentence, image, apart.gain, apart.gap, other))
     settling = [one for one in adjustment.findings if one.kind == SETTLING]
@@ -153,9 +147,7 @@ def _settling(findings: Sequence[Finding]) -> ExplanationEntry:
     rate, size = one.where[4], max(float(np.hypot(*each.size)) for each in findings)
     end = "beginning" if rate > 0.0 else "end"
     sentence = _WORDS[SETTLING].format(end=end, size=size, length=1.0 / max(abs(rate), 1e-9))
-    return ExplanationEntry(
-        SETTLING, sentence, None, one.gain, one.gap, one.runner_up or None, AXES[1], size_px=size
-    )
+    return ExplanationEntry(SETTLING, sentence, None, one.gain, one.gap, one.runner_up or None, AXES[1], size_px=size)
 
 
 def _moving(one: Finding, motion: Motion, names: Sequence[str]) -> ExplanationEntry:

@@ -54,13 +54,9 @@ class GcpEntry(KnownPoint):
         default="used",
     )
     images: tuple[str, ...] = said("Views that show it", default=())
-    w: Number = said(
-        "Largest component of the residual over its standard deviation", "", "w", ".1f", default=None
-    )
+    w: Number = said("Largest component of the residual over its standard deviation", "", "w", ".1f", default=None)
     redundancy: Number = said("How far the others can tell, 0 to 1", default=None)
-    residual_px: Number = said(
-        "The residual in the images that show it, RMS", "px", "in images", ".2f", default=None
-    )
+    residual_px: Number = said("The residual in the images that show it, RMS", "px", "in images", ".2f", default=None)
 
     image_w: Number = said(
         "Largest of its residuals in the images over its own standard deviation (Baarda's w)",
@@ -234,9 +230,7 @@ def measure_reference(run: Run) -> ReferenceEntry | None:
     views = []
     for view, count in zip(found.views, kept.tolist(), strict=True):
         offset = view.offset if view.points else None
-        views.append(
-            ReferenceViewEntry(view.name, view.peak, offset, view.tried, view.passed, count, view.scatter)
-        )
+        views.append(ReferenceViewEntry(view.name, view.peak, offset, view.tried, view.passed, count, view.scatter))
     return ReferenceEntry(points > 0, found.step, found.sigma, points, tuple(views))
 
 
@@ -249,6 +243,4 @@ def measure_check_points(run: Run) -> tuple[CheckPointEntry, ...]:
     seen = [SeenEntry(run.views[i].name, r) for i, r in zip(points.view, left.image.tolist(), strict=True)]
     seen_of = [tuple(seen[row] for row in rows) for rows in _grouped(points.point, len(points.names))]
     rows = zip(points.names, points.lonlatalt.tolist(), left.ground.tolist(), seen_of, strict=True)
-    return tuple(
-        CheckPointEntry(name, lon, lat, alt, miss, found) for name, (lon, lat, alt), miss, found in rows
-    )
+    return tuple(CheckPointEntry(name, lon, lat, alt, miss, found) for name, (lon, lat, alt), miss, found in rows)

@@ -50,8 +50,7 @@ class PairEntry(Record):
         "after": Column("after [px]", lambda pair: _offset_cell(pair.epipolar_after), ".3f", adjusted=True),
     }
     PAGE: ClassVar = (
-        "pair num_matches tied_by decoy_share noise_px convergence_deg base_to_height height_m_per_px "
-        "before after"
+        "pair num_matches tied_by decoy_share noise_px convergence_deg base_to_height height_m_per_px before after"
     )
     AGAIN: ClassVar = "pair tied_by num_matches beaten"
     TERMINAL: ClassVar = "pair num_matches convergence_deg base_to_height before after"
@@ -123,9 +122,7 @@ def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
         report = reports.get(names)
         entry = PairEntry(*names, len(ties.a), angle, base, height, first, last, None)
         if report is not None:
-            entry = replace(
-                entry, decoy_share=report.control_share, noise_px=report.spread, tied_by=report.means
-            )
+            entry = replace(entry, decoy_share=report.control_share, noise_px=report.spread, tied_by=report.means)
             entry = replace(entry, matching=plain(report), chosen_by=report.reason, beaten=report.beaten)
         entries.append(entry)
     return tuple(entries)

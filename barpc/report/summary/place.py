@@ -77,9 +77,7 @@ def _drawn(variance: Array, by_level: Array) -> EllipseEntry:
     return EllipseEntry(major, minor, azimuth, ce90(major, minor))
 
 
-def _in_image(
-    model: Corrected, covariance: Array, unknowns: str, ground: Array
-) -> tuple[Array, Array, Array]:
+def _in_image(model: Corrected, covariance: Array, unknowns: str, ground: Array) -> tuple[Array, Array, Array]:
     """Return the image (2,) of a ground point, its covariance [px^2], its derivative (2, 3) by the point [px/m]."""
     ecef = ecef_from_ground(ground)
     image, by_point, by_rotation, by_translation = model.project_ecef(ecef)

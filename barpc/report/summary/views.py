@@ -57,9 +57,7 @@ class CorrectionEntry(Record):
     center_shift_px: Pixel | None = said(
         "Move of the ground point in the middle, col, row", "px", "shift col, row", "+.2f", adjusted=True
     )
-    center_sigma_px: Pixel | None = said(
-        "Its posterior standard deviation, with the scene's own uncertain place", "px"
-    )
+    center_sigma_px: Pixel | None = said("Its posterior standard deviation, with the scene's own uncertain place", "px")
     shift_px: Pixel | None = said("Models in the image: shift col, row", "px", default=None)
     slope: tuple[Pixel, ...] | None = said("Models in the image: by (col, row)", "px/px", default=None)
     rotation_urad: Vector | None = said("Rotation vector R, ECEF axes", "urad", default=None)
@@ -104,15 +102,11 @@ class FitEntry(Record):
     min_denominator: Number = said(
         "Over the image's ground and around it, relative to its centre", "", "smallest denominator", ".3f"
     )
-    roundtrip_px: Number = said(
-        "Largest move by projection and back; null where it fails", "px", "round trip", ".1e"
-    )
+    roundtrip_px: Number = said("Largest move by projection and back; null where it fails", "px", "round trip", ".1e")
     coverage: Number = said("Share of the image that the fit's points cover")
     method: str = said("Solver", head="solver")
     num_check_points: Count = said("Check points", head="check points")
-    localisation_m: Number = said(
-        "Largest distance on the ground of the localisation RPC from P_BA", "m", default=None
-    )
+    localisation_m: Number = said("Largest distance on the ground of the localisation RPC from P_BA", "m", default=None)
 
 
 def _verdict(view: ViewEntry) -> Cell:
@@ -139,26 +133,20 @@ class ViewEntry(Record):
 
     OWN: ClassVar = {
         "verdict": Column("verdict", _verdict),
-        "wrong": Column(
-            "what is wrong", lambda view: CAUSES[view.cause].label if view.cause in CAUSES else None
-        ),
+        "wrong": Column("what is wrong", lambda view: CAUSES[view.cause].label if view.cause in CAUSES else None),
         "rejected": Column("rejected [%]", _rejected, ".1f"),
         "covered": Column("covered [%]", lambda view: percent(view.tie_coverage), ".0f"),
         "moves": Column(("col [px]", "row [px]"), _moves, ".3f"),
         "kilometres": Column("camera centre [km]", _kilometres, ".0f"),
         "largest": Column("largest [px]", lambda view: largest(value_of(view, "fit.max_px")), ".1e"),
-        "about": Column(
-            "RPC fit [px]", lambda view: largest(value_of(view, "fit.max_px")), ".0e", adjusted=True
-        ),
+        "about": Column("RPC fit [px]", lambda view: largest(value_of(view, "fit.max_px")), ".0e", adjusted=True),
         "fitted": Column("covered [%]", lambda view: percent(value_of(view, "fit.coverage")), ".0f"),
     }
     PAGE: ClassVar = (
         "name verdict wrong num_observations rejected covered rmse_before rmse_after held_out_px "
         "correction.center_shift_px gsd_m incidence_deg rpc_source.format"
     )
-    TERMINAL: ClassVar = (
-        "name verdict num_observations rmse_before rmse_after correction.center_shift_px about"
-    )
+    TERMINAL: ClassVar = "name verdict num_observations rmse_before rmse_after correction.center_shift_px about"
     CORRECTIONS: ClassVar = (
         "name moves correction.angle_urad correction.translation_norm_m kilometres camera_center.method"
     )
@@ -198,13 +186,9 @@ class ViewEntry(Record):
     num_gcps: Count = said("Observations of ground control points")
     tie_coverage: Share = said("Share of the cells of an 8 x 8 grid that hold a tie point")
     rmse_before: Number = said("RMS reprojection error through the delivered cameras", "px", "before", ".3f")
-    rmse_after: Number = said(
-        "The same through the new cameras; null for a check", "px", "after", ".3f", adjusted=True
-    )
+    rmse_after: Number = said("The same through the new cameras; null for a check", "px", "after", ".3f", adjusted=True)
     smooth_px: Number = said("RMS of what is smooth in the residuals left, less noise", "px", "smooth", ".3f")
-    prior_scale: Number = said(
-        "By how much the camera's stated standard deviations were widened", "", "widened", ".1f"
-    )
+    prior_scale: Number = said("By how much the camera's stated standard deviations were widened", "", "widened", ".1f")
     correction: CorrectionEntry | None = said("The correction; null for a check")
     camera_center: CenterEntry | None = said("Centre about which the camera was turned")
     fit: FitEntry | None = said("Certificate of the refitted RPC; null where none was fitted")
@@ -212,9 +196,7 @@ class ViewEntry(Record):
         "File -> consumer that reopened it -> difference to P_BA in px, or why it does not read it",
         propertyNames={"pattern": "^[^/]+$"},
     )
-    status: Literal["adjusted", "consistent", "tied", "weak", "doubtful", "failed"] = said(
-        "Verdict on the image"
-    )
+    status: Literal["adjusted", "consistent", "tied", "weak", "doubtful", "failed"] = said("Verdict on the image")
     advice: str = said("What to do; empty when all is well")
     cause: str | None = said("Why, by its name; null when all is well", default=None, enum=[*CAUSES, None])
     num_moving: Count = said("Observations of tie points that move together, and took no part", default=0)
@@ -421,9 +403,7 @@ def _in_image(spline: RowSpline | None) -> dict[str, Any]:
     found: dict[str, Any] = {}
     if len(spline.coeffs):
         rows = spline.row_offset + spline.row_scale * np.linspace(-1, 1, _ROWS)
-        along = RowSpline(spline.coeffs, spline.row_offset, spline.row_scale).at(
-            np.column_stack([rows, rows])
-        )
+        along = RowSpline(spline.coeffs, spline.row_offset, spline.row_scale).at(np.column_stack([rows, rows]))
         found |= {"jitter_px": _size(along), "jitter_rows": spline.spacing}
     if len(spline.steps):
         found |= {"detector_px": _size(spline.steps), "detectors": tuple((spline.edges + 0.5).tolist())}

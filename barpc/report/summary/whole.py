@@ -112,9 +112,7 @@ class DemEntry(Record):
     num_tracks: Count = said("Tie points that count")
     offset_m: Number = said("Median of the tie points' altitudes minus the DEM's", "m")
     spread_m: Number = said("1.4826 times the median absolute deviation of these", "m")
-    sigma_m: Number = said(
-        "Standard deviation of single heights, where the tie points tell", "m", default=None
-    )
+    sigma_m: Number = said("Standard deviation of single heights, where the tie points tell", "m", default=None)
     alike: Number = said("As many heights are worth one, as their errors resemble each other", default=None)
     relief: Number = said(
         "The DEM's relief as a multiple of the tie points'; far from 1: another terrain", default=None
@@ -149,9 +147,7 @@ class SceneEntry(Record):
 
     shift_enu_m: Vector = said("Mean move of the tie points, east, north, up", "m")
     sigma_enu_m: Vector = said("Posterior standard deviation of the scene's place", "m")
-    radius_m: Number = said(
-        "RMS distance of the tie points from their middle: the edge of tilts, turn and scale", "m"
-    )
+    radius_m: Number = said("RMS distance of the tie points from their middle: the edge of tilts, turn and scale", "m")
     weakest_modes: tuple[ModeEntry, ...] = said("What the images cannot tell, the weakest first")
     noise: Number = said("Observed over stated standard deviation of the observations")
     drift_degree: Count = said("Degree of the rotation in the row")
@@ -173,17 +169,11 @@ class SceneEntry(Record):
     altimetry: AltimetryEntry | None = said(
         "What heights without image coordinates did; null without any", default=None
     )
-    gcp_scatter: Number = said(
-        "RMS residual of the GCPs used over what their accuracies let expect", default=None
-    )
+    gcp_scatter: Number = said("RMS residual of the GCPs used over what their accuracies let expect", default=None)
     num_held_out: Count = said("Observations that took no part, to be measured on", default=0)
     model: str = said("Unknowns of each view that were solved for", default="")
-    drift_asked: AskedEntry | None = said(
-        "What a drift of one degree less left, where one was added", default=None
-    )
-    jitter_asked: AskedEntry | None = said(
-        "What was left without splines and steps, where these follow", default=None
-    )
+    drift_asked: AskedEntry | None = said("What a drift of one degree less left, where one was added", default=None)
+    jitter_asked: AskedEntry | None = said("What was left without splines and steps, where these follow", default=None)
     in_space_px: Number = said(
         "Where an affine in the image was chosen: what a rotation and translation leave of the same tie points",
         "px",

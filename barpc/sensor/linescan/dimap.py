@@ -40,9 +40,7 @@ def light(root: Fields) -> Light:
 def read(root: Fields, band: str | None = None) -> Linescan:
     """Return the model of a DIMAP; RpcFormatError where it is damaged or has none, InputError for no such `band`."""
     if root.element.find("Geometric_Data/Refined_Model") is None:
-        raise RpcFormatError(
-            f"{root.name}: no Geometric_Data/Refined_Model: it holds no physical camera model"
-        )
+        raise RpcFormatError(f"{root.name}: no Geometric_Data/Refined_Model: it holds no physical camera model")
     model, raster = root.one("Geometric_Data/Refined_Model"), root.one("Raster_Data/Raster_Dimensions")
     size = (int(raster.positive("NCOLS", _MOST)), int(raster.positive("NROWS", _MOST)))
     first, period = _lines(model, size[1])
@@ -99,9 +97,7 @@ def _look(calibration: Fields, band: str | None) -> tuple[Array, float]:
     bands = calibration.all("Band_Calibration_List/Band_Calibration")
     names = [part.element.findtext("BAND_ID", "").strip() for part in bands]
     if band is not None and band not in names:
-        raise InputError(
-            f"{calibration.name}: no detector of band {band}; it has {', '.join(names) or 'one for all'}"
-        )
+        raise InputError(f"{calibration.name}: no detector of band {band}; it has {', '.join(names) or 'one for all'}")
     holder = calibration if not bands else bands[0 if band is None else names.index(band)]
     angles = holder.one("Polynomial_Look_Angles")
     tangents = [_tangents(angles, axis) for axis in "YX"]

@@ -39,9 +39,7 @@ def read(root: Fields, band: str | None = None) -> Linescan:
     """Return the model of an ISD; RpcFormatError where it is damaged, InputError where `band` is none of its bands."""
     level = root.text("IMD/PRODUCTLEVEL")
     if "1B" not in level.upper():
-        raise RpcFormatError(
-            f"{root.name}: a product of level {level}, resampled: only 1B has a physical model"
-        )
+        raise RpcFormatError(f"{root.name}: a product of level {level}, resampled: only 1B has a physical model")
     size = (int(root.positive("IMD/NUMCOLUMNS", _MOST)), int(root.positive("IMD/NUMROWS", _MOST)))
     period, first = _lines(root, size[1])
     (times, orbit), (ticks, attitude) = (_table(root, part, first) for part in _TABLES)
@@ -53,9 +51,7 @@ def read(root: Fields, band: str | None = None) -> Linescan:
     positions = orbit[:, 1:4]
     if arm.any():
         if not np.array_equal(times, ticks):
-            raise RpcFormatError(
-                f"{root.name}: PERSPECTIVE_CENTER with positions and attitudes of other times"
-            )
+            raise RpcFormatError(f"{root.name}: PERSPECTIVE_CENTER with positions and attitudes of other times")
         positions = positions + body.apply(arm)
     samples = Samples(root.name, times, positions, orbit[:, 4:7], ticks, quaternions)
     detector = Detector(_look(root, band), 0.0, period, size)
@@ -68,9 +64,7 @@ def _lines(root: Fields, rows: int) -> tuple[float, np.datetime64]:
     table = np.array([row.numbers(".", 2) for row in image.all("TLCLISTList/TLCLIST")]).reshape(-1, 2)
     stated = int(image.positive("NUMTLC"))
     if len(table) != stated:
-        raise RpcFormatError(
-            f"{root.name}: TLCLIST holds {len(table)} of {stated} entries; is the file complete?"
-        )
+        raise RpcFormatError(f"{root.name}: TLCLIST holds {len(table)} of {stated} entries; is the file complete?")
     if stated == 1:
         rate = abs(image.number("AVGLINERATE"))
         rate = -rate if image.text("SCANDIRECTION").lower() == "reverse" else rate
@@ -81,9 +75,7 @@ def _lines(root: Fields, rows: int) -> tuple[float, np.datetime64]:
         raise RpcFormatError(f"{root.name}: TLCLIST gives {period:g} s a row")
     bent = np.abs(start + period * (table[:, 0] - line) - table[:, 1]).max() / abs(period)
     if not bent <= _STRAIGHT:
-        raise RpcFormatError(
-            f"{root.name}: the line rate changes ({bent:.3g} rows in TLCLIST), which is not read"
-        )
+        raise RpcFormatError(f"{root.name}: the line rate changes ({bent:.3g} rows in TLCLIST), which is not read")
     begins = start - period * line
     first = image.time("TLCTIME") + np.timedelta64(round(begins * 1e9), "ns")
     late = seconds(image.time("FIRSTLINETIME"), first) / period
@@ -98,9 +90,7 @@ def _table(root: Fields, part: str, epoch: np.datetime64) -> tuple[Array, Array]
     stated = int(of.positive("NUMPOINTS"))
     rows = [row.numbers(".") for row in of.all(f"{tag}List/{tag}")]
     if len(rows) != stated:
-        raise RpcFormatError(
-            f"{root.name}: {tag} holds {len(rows)} of {stated} samples; is the file complete?"
-        )
+        raise RpcFormatError(f"{root.name}: {tag} holds {len(rows)} of {stated} samples; is the file complete?")
     widths = {len(row) for row in rows}
     if len(widths) != 1 or not widths <= set(_TABLES[part]):
         raise RpcFormatError(

@@ -81,9 +81,7 @@ def build(samples: Samples, detector: Detector, sigma: tuple[float, float] | Non
         raise RpcFormatError(f"{name}: {error}") from error
     middle = model.localize((np.array(detector.size) - 1) / 2, np.zeros(()))
     if not np.isfinite(middle).all():
-        raise RpcFormatError(
-            f"{name}: its camera does not look at the Earth; is the attitude that of the image?"
-        )
+        raise RpcFormatError(f"{name}: its camera does not look at the Earth; is the attitude that of the image?")
     if sigma is not None and min(sigma) > 0:
         place = model.position((detector.size[1] - 1) / 2)
         far = float(np.linalg.norm(ecef_from_ground(middle) - place))
@@ -107,27 +105,21 @@ def _track(times: Array, positions: Array) -> Curve:
     if not np.sqrt((left**2).mean()) <= _SCATTER:
         return Curve.through(times, positions)
     coeffs = [part.convert().coef for part in parts]
-    return Curve.polynomial(
-        np.stack([np.pad(c, (0, degree + 1 - len(c))) for c in coeffs], 1), times[0], times[-1]
-    )
+    return Curve.polynomial(np.stack([np.pad(c, (0, degree + 1 - len(c))) for c in coeffs], 1), times[0], times[-1])
 
 
 def unit(quaternions: Array, name: str) -> Array:
     """Return quaternions (N, 4) scaled to length 1; RpcFormatError where theirs is another."""
     length = np.linalg.norm(quaternions, axis=1)
     if not (np.abs(length - 1.0) < _UNIT).all():
-        raise RpcFormatError(
-            f"{name}: a quaternion of length {length[np.abs(length - 1).argmax()]:.4g}, not 1"
-        )
+        raise RpcFormatError(f"{name}: a quaternion of length {length[np.abs(length - 1).argmax()]:.4g}, not 1")
     return np.asarray(quaternions / length[:, None])
 
 
 def _check_times(times: Array, span: tuple[float, float], what: str, name: str) -> None:
     steps = np.diff(times)
     if len(times) < 4 or not (steps > 0).all():
-        raise RpcFormatError(
-            f"{name}: {len(times)} {what}, or their times do not rise; four or more are needed"
-        )
+        raise RpcFormatError(f"{name}: {len(times)} {what}, or their times do not rise; four or more are needed")
     usual = float(np.median(steps))
     margin = min(EXTRAPOLATION, _BEYOND * usual)
     if times[0] - margin > span[0] or times[-1] + margin < span[1]:

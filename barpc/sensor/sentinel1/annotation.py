@@ -205,8 +205,7 @@ def read_orbit_file(path: Path, annotation: Annotation) -> StateVectors:
     near = np.flatnonzero((times >= start - pad) & (times <= stop + pad))
     if not len(near):
         raise RpcFormatError(
-            f"{path}: covers {times.min()} to {times.max()}, the image is of {start}; "
-            "take the orbit file of that day"
+            f"{path}: covers {times.min()} to {times.max()}, the image is of {start}; take the orbit file of that day"
         )
     kind = root.findtext("Earth_Explorer_Header/Fixed_Header/File_Type", "").strip()
     return _states([vectors[i] for i in near], "UTC", ("X", "Y", "Z", "VX", "VY", "VZ"), kind)
@@ -234,9 +233,7 @@ def _annotated_states(root: Fields) -> StateVectors:
 def _burst(burst: Fields) -> Burst:
     first, last = (burst.numbers(tag).astype(np.int64) for tag in ("firstValidSample", "lastValidSample"))
     if first.shape != last.shape:
-        raise RpcFormatError(
-            f"{burst.name}: a burst lists {len(first)} first and {len(last)} last valid samples"
-        )
+        raise RpcFormatError(f"{burst.name}: a burst lists {len(first)} first and {len(last)} last valid samples")
     return Burst(burst.time("azimuthTime"), first, last)
 
 
@@ -244,9 +241,7 @@ def _ground_range(root: Fields) -> GroundRange | None:
     rows = root.all("coordinateConversion/coordinateConversionList/coordinateConversion")
     if not rows:
         return None
-    forward, backward = (
-        [row.numbers(tag) for row in rows] for tag in ("srgrCoefficients", "grsrCoefficients")
-    )
+    forward, backward = ([row.numbers(tag) for row in rows] for tag in ("srgrCoefficients", "grsrCoefficients"))
     if len({len(c) for c in forward}) > 1 or len({len(c) for c in backward}) > 1:
         raise RpcFormatError(f"{root.name}: ground range polynomials of different lengths")
     time = _times(rows, "azimuthTime")

@@ -140,9 +140,7 @@ class Delays:
             out += _as_times(self.timing.at(times[0]))
         return out
 
-    def shift_jacobian(
-        self, times: Array, by_ground: Array, ground: Array, sight: Array, by_sight: Array
-    ) -> Array:
+    def shift_jacobian(self, times: Array, by_ground: Array, ground: Array, sight: Array, by_sight: Array) -> Array:
         """Return the derivative of `shift` by (lon, lat, alt) (2, N, 3) [s/deg, s/deg, s/m].
 
         `by_ground` (2, N, 3) is that of the times, `by_sight` (N, 3, 3) that of the sight.
@@ -180,9 +178,7 @@ def bistatic_constant(annotation: Annotation, form: Bistatic) -> float:
     asked for a GRD.
     """
     if not annotation.bistatic_applied:
-        raise InputError(
-            f"{annotation.name}: no bistatic correction by the processor to complete; leave it out"
-        )
+        raise InputError(f"{annotation.name}: no bistatic correction by the processor to complete; leave it out")
     grid = annotation.grid
     late = seconds(annotation.line_time(grid.image[:, 1]), annotation.first_line_time)
     late = late - seconds(grid.time, annotation.first_line_time) + 0.5 * grid.range_time

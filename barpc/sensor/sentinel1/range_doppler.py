@@ -147,9 +147,7 @@ class RangeDoppler(Frozen):
     @property
     def advice(self) -> str:
         """What to do where no RPC follows this model; empty where nothing special."""
-        ground_range = (
-            "the ground range of a GRD changes every second, with the terrain: take the SLC of the scene"
-        )
+        ground_range = "the ground range of a GRD changes every second, with the terrain: take the SLC of the scene"
         return ground_range if isinstance(self.frame, GroundFrame) else ""
 
     @property
@@ -168,9 +166,7 @@ class RangeDoppler(Frozen):
         """Return image points and derivatives as `barpc.sensor.timing.Clocked` asks; the coordinate is the
         row of pure geometry.
         """
-        image, by_ground, by_timing, row = pointwise(
-            self._derivatives, CHUNK, [(2,), (2, 3), (2, 2), ()], ground
-        )
+        image, by_ground, by_timing, row = pointwise(self._derivatives, CHUNK, [(2,), (2, 3), (2, 2), ()], ground)
         return image, by_ground, by_timing, row
 
     def azimuth_range(self, ground: Array) -> tuple[Array, Array]:
@@ -327,9 +323,7 @@ def build(
     nearest = swaths[0]
     alt = np.concatenate([a.grid.ground[:, 2] for a in swaths])
     states = nearest.states if orbit is None else read_orbit_file(orbit, nearest)
-    left = [
-        CORRECTED[k] if done else NOT_CORRECTED[k] for k, done in enumerate((atmosphere, bistatic == "full"))
-    ]
+    left = [CORRECTED[k] if done else NOT_CORRECTED[k] for k, done in enumerate((atmosphere, bistatic == "full"))]
     of_orbit = ORBITS.get(states.source, ON_BOARD)
     model = RangeDoppler(
         orbit=_orbit(nearest, states, epoch),

@@ -52,9 +52,7 @@ def _extensions(file: BinaryIO) -> list[bytes]:
     place = _digits(file, 6)
     found = []
     for kind, (header, data) in enumerate(_SEGMENTS):
-        lengths = [
-            (_digits(file, header), _digits(file, data)) for _ in range(_digits(file, 3) if data else 0)
-        ]
+        lengths = [(_digits(file, header), _digits(file, data)) for _ in range(_digits(file, 3) if data else 0)]
         if not data:
             file.seek(3, 1)  # the number of reserved segments, always 0
         here = file.tell()
@@ -95,9 +93,7 @@ def open_sicd(path: Path) -> Monostatic:
     scp = _vector(root, "GeoData/SCP/ECF")
     altitude = float(ground_from_ecef(scp)[2])
     if not _GROUND[0] <= altitude <= _GROUND[1]:
-        raise RpcFormatError(
-            f"{path}: GeoData/SCP/ECF is {altitude:.0f} m above the ellipsoid, not on the ground"
-        )
+        raise RpcFormatError(f"{path}: GeoData/SCP/ECF is {altitude:.0f} m above the ellipsoid, not on the ground")
     first = [_whole(root, f"ImageData/First{axis}") for axis in ("Row", "Col")]
     center = [_whole(root, f"ImageData/SCPPixel/{axis}") for axis in ("Row", "Col")]
     model = Monostatic(
@@ -205,6 +201,4 @@ def _formation(root: Fields, scp: Array) -> Formation:
         )
     if kind in ("XRGYCR", "XCTYAT", "PLANE"):
         return ImagePlane(time, scp, _vector(root, "Grid/Row/UVectECF"), _vector(root, "Grid/Col/UVectECF"))
-    raise InputError(
-        f"{root.name}: an image of the kind {kind[:40]}, which the SICD standard does not project"
-    )
+    raise InputError(f"{root.name}: an image of the kind {kind[:40]}, which the SICD standard does not project")

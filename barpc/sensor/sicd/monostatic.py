@@ -72,9 +72,7 @@ class Monostatic(Frozen):
         """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN far off, or on the
         other side.
         """
-        return pointwise(
-            lambda part: [self._image(self._solve(ecef_from_ground(part).T)[0])], CHUNK, [(2,)], ground
-        )[0]
+        return pointwise(lambda part: [self._image(self._solve(ecef_from_ground(part).T)[0])], CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
@@ -111,9 +109,7 @@ class Monostatic(Frozen):
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
         """Return image points and derivatives as `barpc.sensor.timing.Clocked` asks; the coordinate is the column."""
-        image, by_ground, by_timing, col = pointwise(
-            self._derivatives, CHUNK, [(2,), (2, 3), (2, 2), ()], ground
-        )
+        image, by_ground, by_timing, col = pointwise(self._derivatives, CHUNK, [(2,), (2, 3), (2, 2), ()], ground)
         return image, by_ground, by_timing, col
 
     @cached_property

@@ -25,9 +25,7 @@ PER_CELL = 40
 CONTRAST = 0.01
 """SIFT's contrast threshold."""
 _DEFAULTS = TieOptions()
-_MARGIN = (
-    48  # px around what is searched at a time, so that keypoints at its border are those of the whole picture
-)
+_MARGIN = 48  # px around what is searched at a time, so that keypoints at its border are those of the whole picture
 _FEW = 8  # keypoints of a cell, about, where an image's are few: its cells are larger
 _AMPLE = 5  # keypoints for each tie point wanted
 _ZOOMS = ((1.25e-4, 4), (2e-3, 2))
@@ -130,9 +128,7 @@ class Share:
 
     def within(self, used: float) -> Share:
         """Return the share where only a part of the image is used, in powers of two, so that it seldom changes."""
-        return replace(
-            self, density=self.density * 2.0 ** float(np.floor(-np.log2(min(max(used, 1e-6), 1.0))))
-        )
+        return replace(self, density=self.density * 2.0 ** float(np.floor(-np.log2(min(max(used, 1e-6), 1.0)))))
 
     def most(self, box: Box) -> int:
         """Return the largest number of keypoints of a box."""
@@ -172,9 +168,7 @@ def detect_tile(
         for col in range(box[0], box[0] + box[2], side):
             part = (col, row, min(side, box[0] + box[2] - col), min(side, box[1] + box[3] - row))
             near = grow((col - window[0], row - window[1], *part[2:]), zoom * _MARGIN, window[2:])
-            left, top, right, below = (
-                n // zoom for n in (near[0], near[1], near[0] + near[2], near[1] + near[3])
-            )
+            left, top, right, below = (n // zoom for n in (near[0], near[1], near[0] + near[2], near[1] + near[3]))
             place = slice(top, below), slice(left, right)
             if valid[place].any():
                 origin = np.array([window[0] + zoom * left + middle, window[1] + zoom * top + middle])
@@ -267,9 +261,7 @@ class KeypointFiles:
         return join(parts), np.concatenate(numbers)
 
 
-def keep_tile(
-    store: Store, name: str, task: tuple[str, tuple[int, int], Box, Survey, Share, TieOptions]
-) -> int:
+def keep_tile(store: Store, name: str, task: tuple[str, tuple[int, int], Box, Survey, Share, TieOptions]) -> int:
     """Detect the keypoints of a tile by `detect_tile(*task)` and keep them in the store; return their number."""
     known = store.read(name)
     if known is not None and "xy" in known:
@@ -288,9 +280,7 @@ def _packed(keypoints: Keypoints, box: Box) -> dict[str, npt.NDArray[Any]]:
 
 def _unpacked(arrays: dict[str, npt.NDArray[Any]], box: Box) -> Keypoints:
     described = np.asarray(arrays["descriptors"], np.uint8)
-    xy, scale, angle, response = (
-        np.asarray(arrays[field.name], np.float64) for field in fields(Keypoints)[:4]
-    )
+    xy, scale, angle, response = (np.asarray(arrays[field.name], np.float64) for field in fields(Keypoints)[:4])
     return Keypoints(xy + np.array(box[:2]), scale, angle, response, described)
 
 
@@ -330,9 +320,7 @@ def locate(
     boxes = [tiles(v.size, options, share.zoom, known) if known else [] for v, known, share in each]
     if pairs is not None:
         boxes = shared_tiles(views, pairs, options, area, boxes)
-    used = [
-        sum(b[2] * b[3] for b in some) / (v.size[0] * v.size[1]) for v, some in zip(views, boxes, strict=True)
-    ]
+    used = [sum(b[2] * b[3] for b in some) / (v.size[0] * v.size[1]) for v, some in zip(views, boxes, strict=True)]
     shares = [share.within(part) for share, part in zip(shares, used, strict=True)]
     tasks = [
         (view.path, view.size, box, known, share, options)

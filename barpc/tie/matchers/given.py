@@ -61,9 +61,7 @@ def verify(
         points = (_keypoints(given[pair.views], 0), _keypoints(given[pair.views], 1))
         tasks.append((ends, points, pair, chosen))
     verified = []
-    for pair, (found, report) in zip(
-        pairs, ordered(executor, match_pair, tasks, "verify", progress), strict=True
-    ):
+    for pair, (found, report) in zip(pairs, ordered(executor, match_pair, tasks, "verify", progress), strict=True):
         if report.status == "too few keypoints":
             report = replace(report, status="too few matches given")
         if report.status != "ok":

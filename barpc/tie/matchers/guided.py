@@ -128,9 +128,7 @@ class _Best:
         return np.stack([found, self._of_a[found]], axis=1), distance, distance / rival
 
 
-def _near(
-    where: Frame, across: float, wanted: IntArray, turned: Array
-) -> Iterator[tuple[IntArray, IntArray]]:
+def _near(where: Frame, across: float, wanted: IntArray, turned: Array) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield points of A whose bands lie near each other, and the points of B, `turned` (N, 2) as the frame is, about
     all these bands; both ascending.
     """

@@ -72,9 +72,7 @@ def hooked(name: str) -> type[Matcher] | Hook:
         found = getattr(import_module(module), attribute)
     except Exception as error:
         said = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
-        raise InputError(
-            f"matcher {name}: cannot be imported ({said}); is its folder in PYTHONPATH?"
-        ) from error
+        raise InputError(f"matcher {name}: cannot be imported ({said}); is its folder in PYTHONPATH?") from error
     if not callable(found):
         raise InputError(f"matcher {name}: neither a function nor a class")
     return found if isinstance(found, type) else Hook(name, found)

@@ -101,9 +101,7 @@ class PairReport:
     reason: str = ""  # why the pair was tried
     beaten: tuple[str, ...] = ()
     """Attempts that found fewer: matcher, whether loosened, verified matches of those wanted, as "guided 12 of 100"."""
-    unregistered: int = (
-        0  # of its tracks stand where keypoints were found: their patches could not be registered
-    )
+    unregistered: int = 0  # of its tracks stand where keypoints were found: their patches could not be registered
 
     @property
     def means(self) -> str:
@@ -222,9 +220,7 @@ def _attempt(
     along, across = np.median(errors[keep], axis=0).tolist()
     report = replace(report, inlier_share=share, offset=(along, across), spread=spread)
     if kind.detects and numbers is not None:
-        index = np.stack(
-            [number[column] for number, column in zip(numbers, found.index.T, strict=True)], axis=-1
-        )
+        index = np.stack([number[column] for number, column in zip(numbers, found.index.T, strict=True)], axis=-1)
         found = replace(found, index=index)
     return replace(found.select(keep), sigma=max(spread, 0.05)), report
 
@@ -252,9 +248,7 @@ def _loaded(
     return (first[0], second[0]), (first[1], second[1])
 
 
-def quick_score(
-    views: tuple[View, View], keypoints: tuple[KeypointFiles, KeypointFiles], options: TieOptions
-) -> int:
+def quick_score(views: tuple[View, View], keypoints: tuple[KeypointFiles, KeypointFiles], options: TieOptions) -> int:
     """Estimate how many of a few keypoints match, with at most 5 % false ones: a cheap forecast for a pair."""
     few = (keypoints[0].strongest(_QUICK), keypoints[1].strongest(_QUICK))
     if not (len(few[0]) and len(few[1])):
@@ -380,9 +374,7 @@ class _Peak(NamedTuple):
 class _Search:
     """The passes over one pair of views."""
 
-    def __init__(
-        self, views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints], options: TieOptions
-    ) -> None:
+    def __init__(self, views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints], options: TieOptions) -> None:
         self._views, self._options = views, options
         self._offset: list[Prediction | None] = []
         self._matcher = matcher_named(options.matcher)(options, keypoints)

@@ -28,9 +28,7 @@ _SURFACE = 1 << 23  # places at which a tile's points are compared, all together
 _POINTS = 200, 500, 1000  # looked for: of the cameras' error, in long bands, in short ones
 _FINE_POINTS = 600, 1500  # of the cameras' error, in bands, where whole pixels are looked at
 _RING = 3.5  # pitches about a point whose neighbours speak for its places, together
-_SAY = (
-    4.0  # times as loud as it does itself. Of four pairs that were hardest 1 is tied by 1.5 and 1, 3 by this
-)
+_SAY = 4.0  # times as loud as it does itself. Of four pairs that were hardest 1 is tied by 1.5 and 1, 3 by this
 _SMALLEST = 60  # px of a side of the common part, in the coarsest picture
 _BENT = 2  # px by which their parallax may differ, and does not count
 _LONG, _LONGER = 48.0, 130.0  # px of half a band
@@ -121,9 +119,7 @@ class _Search:
         middle = 0.5 * (where.before + where.after)
         ends = np.stack([where.place(where.before), where.place(where.after)])
         with np.errstate(invalid="ignore"):
-            seen = (ends.max(axis=0) > 0).all(axis=1) & (
-                ends.min(axis=0) < np.array(self._views[1].size)
-            ).all(axis=1)
+            seen = (ends.max(axis=0) > 0).all(axis=1) & (ends.min(axis=0) < np.array(self._views[1].size)).all(axis=1)
         rows = np.flatnonzero(seen & np.isfinite(where.along + where.across + middle))
         parts = [
             self._tile(where, rows[group])
@@ -142,9 +138,7 @@ class _Search:
                 )
                 for group in grouped(*np.floor(at[:, ::-1] / (step * TILE)).T)
             ]
-            group, place, ok = (
-                np.concatenate(column) for column in zip(*[f[:3] for f in found], strict=True)
-            )
+            group, place, ok = (np.concatenate(column) for column in zip(*[f[:3] for f in found], strict=True))
             at, xy, score = at[group[ok]], place[ok], score[group[ok]]
         return Matches.of_places(np.stack([at, xy], axis=1), score)
 

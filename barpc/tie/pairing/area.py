@@ -81,9 +81,7 @@ def _valid(polygon: shapely.Polygon) -> shapely.Geometry:
     if polygon.is_valid:
         return polygon
     rings = [np.asarray(ring.coords) for ring in (polygon.exterior, *polygon.interiors)]
-    sides: Any = shapely.linestrings(
-        np.concatenate([np.stack([ring[:-1], ring[1:]], axis=1) for ring in rings])
-    )
+    sides: Any = shapely.linestrings(np.concatenate([np.stack([ring[:-1], ring[1:]], axis=1) for ring in rings]))
     tree, crossed = shapely.STRtree(sides), 0
     for first in range(0, len(sides), _TOGETHER):
         crossed += tree.query(sides[first : first + _TOGETHER], predicate="crosses").shape[1]

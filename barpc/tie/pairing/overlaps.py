@@ -21,9 +21,7 @@ from barpc.tie.pixels import Box, tiles
 
 logger = logging.getLogger(__name__)
 
-_BEST_ANGLE = (
-    15.0  # deg; matches are many and heights still well determined; so many more, and it is worth 1 / e
-)
+_BEST_ANGLE = 15.0  # deg; matches are many and heights still well determined; so many more, and it is worth 1 / e
 ASTRAY = 700.0
 """How far two cameras may be wrong about each other [m]: by 350 m each, as SPOT 1 to 4 state it, the worst of all."""
 _REACH = 20.0, 700.0  # px that are searched at least and at most, unless another number is asked for
@@ -233,9 +231,9 @@ def shared_tiles(
         prints = Footprints(views, alt, reaches, area)
         for i, of_view in enumerate(boxes):
             partly = shapely.union_all([prints.outlines[j] for j in partners[i]])
-            corners = np.array(
-                [[(c, r), (c + w, r), (c + w, r + h), (c, r + h)] for c, r, w, h in of_view]
-            ).reshape(-1, 4, 2)
+            corners = np.array([[(c, r), (c + w, r), (c + w, r + h), (c, r + h)] for c, r, w, h in of_view]).reshape(
+                -1, 4, 2
+            )
             ground = views[i].sensor.localize(corners - 0.5, np.array(alt))
             unknown = ~np.isfinite(ground).all(axis=(1, 2))
             ground[unknown] = 0.0

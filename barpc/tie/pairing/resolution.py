@@ -74,9 +74,7 @@ class Looks:
     def at(cls, views: Sequence[View], pairs: Sequence[Pair], apart: bool = True) -> Looks:
         """Return the looks that pairs need; with none of other resolutions (`apart`) the views themselves."""
         scale, whole = [_scale(view) for view in views], (1, 1)
-        most = [
-            (math.isqrt(v.size[0]), math.isqrt(v.size[1])) for v in views
-        ]  # a look is not smaller than its pixel
+        most = [(math.isqrt(v.size[0]), math.isqrt(v.size[1])) for v in views]  # a look is not smaller than its pixel
         wanted = {
             (i, j): _pixels((scale[i], scale[j]), (most[i], most[j])) if apart else (whole, whole)
             for i, j in (p.views for p in pairs)

@@ -65,9 +65,7 @@ def correlation(template: FloatImage, search: FloatImage) -> FloatImage:
     energy = (cv2.boxFilter(one, -1, (w, h), normalize=False)[inner] for one in (search**2).sum(axis=1))
     here = np.stack([*energy])
     own = (template.astype(np.float64) ** 2).sum(axis=(1, 2, 3))
-    scale = np.sqrt(
-        np.maximum(here, 0.02 * own[:, None, None]) * own[:, None, None]
-    )  # little there: no ratio
+    scale = np.sqrt(np.maximum(here, 0.02 * own[:, None, None]) * own[:, None, None])  # little there: no ratio
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.nan_to_num(product / scale), np.float32)
 
@@ -104,9 +102,7 @@ def find(first: FloatImage, second: FloatImage, at: Array, half: int, search: in
     the right and left in turn.
     """
     rows = np.asarray(at, np.int64)
-    return joined(
-        [_find(first, second, rows[i : i + BATCH], half, search) for i in range(0, len(rows), BATCH)]
-    )
+    return joined([_find(first, second, rows[i : i + BATCH], half, search) for i in range(0, len(rows), BATCH)])
 
 
 def joined(parts: Sequence[Found]) -> Found:
@@ -122,9 +118,7 @@ def margin(half: int, search: int) -> int:
 def _find(first: FloatImage, second: FloatImage, at: IntArray, half: int, search: int) -> Found:
     n, wide = len(at), 2 * search + 1
     template = cut(first, at, half, half)
-    right = (
-        np.arange(n) % 2 > 0
-    )  # where the decoy lies; areas to the left are turned about, so that all are alike
+    right = np.arange(n) % 2 > 0  # where the decoy lies; areas to the left are turned about, so that all are alike
     aside = np.where(right, 1, -1)[:, None] * [search + (_GAP + 1) // 2, 0]
     areas = cut(second, at + aside, half + 2 * search + (_GAP + 1) // 2, half + search)
     surface = correlation(template, areas)

@@ -16,9 +16,7 @@ from barpc.tie.pixels import Box, FloatImage, Stretch, levelled, read_pixels
 
 ACROSS = 0.02
 """A part in which an affine frame is farther off the epipolar lines [px] is too large for one."""
-FINER = (
-    2  # columns of the frame a pixel: of a Pleiades triplet heights differ by 0.62 m (NMAD), of one by 0.83 m
-)
+FINER = 2  # columns of the frame a pixel: of a Pleiades triplet heights differ by 0.62 m (NMAD), of one by 0.83 m
 WINDOW = 5
 """Pixels a side over which grey values are compared."""
 _SGBM = {
@@ -221,9 +219,7 @@ def _resampled(
     return np.asarray(moved, np.uint8), np.asarray(shown == 255)
 
 
-def _both_ways(
-    left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], num: int
-) -> tuple[FloatImage, BoolArray]:
+def _both_ways(left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], num: int) -> tuple[FloatImage, BoolArray]:
     """Match both ways: disparities of `left`, kept where the way back from `right` ends at most a pixel beside."""
     matcher = cv2.StereoSGBM.create(minDisparity=0, numDisparities=num, **_SGBM)
     there = matcher.compute(left, right).astype(np.float32) / 16.0

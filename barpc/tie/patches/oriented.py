@@ -158,9 +158,7 @@ class Tile:
         search, missed = 4, []
         for i in self._batches():
             there = cut(self.pictures[1], np.rint(place[i]).astype(np.int64), self.half, self.half)
-            back = correlation(
-                there, cut(self.pictures[0], self.at[i], self.half + search, self.half + search)
-            )
+            back = correlation(there, cut(self.pictures[0], self.at[i], self.half + search, self.half + search))
             y, x = np.divmod(back.reshape(len(back), -1).argmax(axis=1), back.shape[2])
             missed.append(np.hypot(x - search, y - search))
         return np.asarray(np.concatenate(missed) <= _BACK)

@@ -55,9 +55,7 @@ class Registration:
 
     xy: Array  # (N, 2) [px]
     correlation: Array  # (N,) of the patches after registration
-    sigma: (
-        Array  # (N,) standard deviation of a coordinate [px], from the residual noise and the patch's detail
-    )
+    sigma: Array  # (N,) standard deviation of a coordinate [px], from the residual noise and the patch's detail
     ok: BoolArray  # (N,) settled, near its start, on valid pixels
 
     @staticmethod
@@ -88,9 +86,7 @@ def register_places(
     cv2.setNumThreads(1)
     margin = patch + _TAPS + int(_REACH)
     sparse, every = _sparse(reference, margin), Registration.none(start)
-    read, groups = (
-        (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, min(tile, SPAN)))
-    )
+    read, groups = (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, min(tile, SPAN)))
     (path, size), (other, beyond) = files
     with PixelReader(path, band, size) as first, PixelReader(other, band, beyond) as second:
         for rows in groups:
@@ -102,9 +98,7 @@ def register_places(
     return every
 
 
-Read = tuple[
-    FloatImage, BoolArray, Array
-]  # pixels, which are valid, place of the image's origin (2,) or (N, 2) [px]
+Read = tuple[FloatImage, BoolArray, Array]  # pixels, which are valid, place of the image's origin (2,) or (N, 2) [px]
 
 
 def _sparse(xy: Array, margin: int) -> bool:
@@ -425,9 +419,7 @@ class _Links:
         """Return the indices of the links between the same two views, and of equal values of `more`."""
         return grouped(self.tracks.view[self.reference], self.tracks.view[self.other], *more)
 
-    def register(
-        self, options: TieOptions, executor: Executor | None, progress: Progress | None
-    ) -> Registration:
+    def register(self, options: TieOptions, executor: Executor | None, progress: Progress | None) -> Registration:
         """Register all, tile by tile of the reference view."""
         origin = self.origin
         linear = np.empty((len(self), 2, 2))
@@ -450,9 +442,7 @@ class _Links:
 
     def _is_structural(self, part: IntArray) -> bool:
         """Return whether links that have their views in common are of a structural pair."""
-        ends = sorted(
-            (int(self.tracks.view[self.reference[part[0]]]), int(self.tracks.view[self.other[part[0]]]))
-        )
+        ends = sorted((int(self.tracks.view[self.reference[part[0]]]), int(self.tracks.view[self.other[part[0]]])))
         return (ends[0], ends[1]) in self.structural
 
     def errors(self, found: Registration, group: IntArray) -> tuple[Array, Array]:

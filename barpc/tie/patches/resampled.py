@@ -104,9 +104,7 @@ class Sheet:
             crs, forward, size = dataset.crs, dataset.transform, (dataset.width, dataset.height)
             bands = (1, 2, 3) if dataset.count >= 3 else (1,)
         if crs is None or not abs(forward.determinant) > 0:
-            raise InputError(
-                f"{path}: a reference is an orthoimage, and this raster has no place on the ground"
-            )
+            raise InputError(f"{path}: a reference is an orthoimage, and this raster has no place on the ground")
         return cls(path, crs, ~forward, size, bands)
 
     def image(self, lonlat: Array) -> Array:
@@ -205,8 +203,6 @@ def _thinned(
         valid &= known
     picture[~valid] = picture[valid].mean() if valid.any() else 0.0
     small = box[2] // thin, box[3] // thin
-    parts = (
-        cv2.resize(part, small, interpolation=cv2.INTER_AREA) for part in (picture, valid.astype(np.float32))
-    )
+    parts = (cv2.resize(part, small, interpolation=cv2.INTER_AREA) for part in (picture, valid.astype(np.float32)))
     mean, share = (np.asarray(part, np.float32) for part in parts)
     return mean, share
