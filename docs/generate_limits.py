@@ -22,7 +22,7 @@ from barpc.rpcio import acquisition, grids, text, tiff
 from barpc.sensor import document as metadata
 from barpc.sensor import terrasar
 from barpc.sensor.linescan import dimap, maxar
-from barpc.sensor.sicd import document as sicd
+from barpc.sensor.sicd import metadata as sicd
 from barpc.tie.pairing import area
 
 PAGE = Path(__file__).with_name("reliability.md")

@@ -28,8 +28,8 @@ CONSTANTS: dict[type[Options], dict[str, tuple[str, ...]]] = {
         "min_observations": ("barpc.ba.held.block.MIN_OBSERVATIONS",),
     },
     FitOptions: {
-        "tau": ("barpc.fit.system.TAU", "barpc.fit.solve.TAU"),
-        "weighted": ("barpc.fit.solve.WEIGHTED",),
+        "tau": ("barpc.fit.system.TAU", "barpc.fit.methods.TAU"),
+        "weighted": ("barpc.fit.methods.WEIGHTED",),
     },
 }
 """Record -> name -> where the constant is read."""

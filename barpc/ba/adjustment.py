@@ -16,7 +16,7 @@ from barpc.ba.held.block import Block, join
 from barpc.ba.held.datum import datum_shares
 from barpc.ba.held.gauge import GaugeReport, earlier_scene, gauge_report
 from barpc.ba.held.incremental import BlockPrior
-from barpc.ba.held.relief import Terrain
+from barpc.ba.held.terrain import Terrain
 from barpc.ba.judging.following import follow, without_strips
 from barpc.ba.judging.judge import Finding, left_over, standing_out
 from barpc.ba.judging.snooping import MOST_TESTED, image_test

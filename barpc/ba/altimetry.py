@@ -1,7 +1,7 @@
 """Altimetry as control: heights without image coordinates hold the block where its surface lies on them.
 
 The block is solved without them first. The motion that brings the surface of its tie points onto the heights is found
-where most of them agree (`barpc.ba.held.surface`), and held, with its covariance, at the tie points. Tilts, turn,
+where most of them agree (`barpc.ba.held.registration`), and held, with its covariance, at the tie points. Tilts, turn,
 scale and bending that the heights do not tell stay as open as they were.
 """
 
@@ -15,7 +15,7 @@ from barpc.ba.estimated.priors import PointPrior
 from barpc.ba.held.block import Block
 from barpc.ba.held.gauge import SIMILAR, gauge_report
 from barpc.ba.held.ground import FIRST_PLACED
-from barpc.ba.held.surface import NEIGHBOURS, Given, Registration, Surface, displacement, register
+from barpc.ba.held.registration import NEIGHBOURS, Given, Registration, Surface, displacement, register
 from barpc.ba.judging.snooping import CRITICAL
 from barpc.ba.judging.solution import Solution, finished
 from barpc.ba.robust.heldout import is_better

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from barpc.ba.estimated.cameras import Projected
+from barpc.ba.estimated.projected import Projected
 from barpc.ba.held.block import Block
 from barpc.ba.judging.solution import MUCH_NOISE, Solution
 from barpc.ba.robust.smooth import SPLINES

@@ -9,7 +9,7 @@ import numpy as np
 
 from barpc.ba.altimetry import AltimetryTest
 from barpc.ba.apart import Apart
-from barpc.ba.estimated.cameras import Cameras
+from barpc.ba.estimated.projected import Cameras
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.held.gauge import GaugeReport
 from barpc.ba.held.ground import TerrainTest

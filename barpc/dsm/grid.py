@@ -20,8 +20,8 @@ from rasterio.warp import transform
 from rasterio.windows import Window
 
 from barpc import __version__
-from barpc.dsm.block import Block, NoSurfaceError, Pairs
 from barpc.dsm.cells import F32, SIDE, Tile, surface_tile
+from barpc.dsm.imagery import Block, NoSurfaceError, Pairs
 from barpc.errors import InputError
 from barpc.geodesy import Array
 from barpc.options import DsmOptions

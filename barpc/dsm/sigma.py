@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from barpc.ba import BlockPrior
-from barpc.ba.estimated.cameras import Cameras
+from barpc.ba.estimated.projected import Cameras
 from barpc.ba.estimated.unknowns import make_unknowns
 from barpc.ba.result import height_by_unknowns
 from barpc.errors import InputError

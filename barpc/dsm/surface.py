@@ -15,9 +15,9 @@ import rasterio
 import rasterio.shutil
 
 from barpc.atomic import replacing
-from barpc.dsm.block import NoSurfaceError, block_of_images, block_of_run
 from barpc.dsm.cells import MATCHED, SIDE
 from barpc.dsm.grid import Counts, Grid
+from barpc.dsm.imagery import NoSurfaceError, block_of_images, block_of_run
 from barpc.dsm.relief import show_in_report
 from barpc.errors import InputError, OutputError
 from barpc.options import DsmOptions

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.fit.certificate import Errors
+from barpc.fit.methods import Solution, solve_problem
 from barpc.fit.precision import Normalization
-from barpc.fit.solve import Solution, solve_problem
 from barpc.fit.system import Problem
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.options import FitOptions

@@ -19,7 +19,7 @@ from barpc.ba.held.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.dem import Dem
 from barpc.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
 from barpc.fit import RpcFit, fit_rpc
-from barpc.fit.rpc import innermost
+from barpc.fit.refit import innermost
 from barpc.handoff import unverified
 from barpc.identity import Input, Stamp, ask, guarded, recorded
 from barpc.options import FitOptions, RunOptions

@@ -6,7 +6,7 @@ import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.ba.held.ground import TerrainTest
-from barpc.ba.held.relief import BEYOND
+from barpc.ba.held.terrain import BEYOND
 from barpc.report.summary.words import metres
 
 _GEOID = 110.0  # m: no geoid lies farther from the ellipsoid

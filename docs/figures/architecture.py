@@ -21,7 +21,7 @@ JOURNEYS = {
         ("pipeline/loading.py", "load_views", "paths -> views with cameras"),
         ("tie/tracks.py", "find_tracks", "views -> tracks"),
         ("ba/adjustment.py", "adjust_tracks", "tracks -> cameras P_BA"),
-        ("fit/rpc.py", "fit_rpc", "P_BA -> RPC and its certificate"),
+        ("fit/refit.py", "fit_rpc", "P_BA -> RPC and its certificate"),
         ("pipeline/outputs.py", "write_views", "RPCs -> files, read again and compared"),
         ("pipeline/outputs.py", "write_tables", "the run -> summary, tables, report"),
     ),
@@ -37,11 +37,11 @@ JOURNEYS = {
         ("ba/held/gauge.py", "gauge_report", "where the scene went, how well that is known"),
     ),
     "model -> RPC": (
-        ("fit/rpc.py", "fit_rpc", "any sensor model"),
+        ("fit/refit.py", "fit_rpc", "any sensor model"),
         ("fit/points.py", "control_points", "-> a grid of ground and image points"),
-        ("fit/solve.py", "solve", "-> coefficients, ridge first"),
+        ("fit/methods.py", "solve", "-> coefficients, ridge first"),
         ("fit/system.py", "Problem", "-> the linearised system, its triangle"),
-        ("fit/solve.py", "region_of", "-> where no pole may be"),
+        ("fit/methods.py", "region_of", "-> where no pole may be"),
         ("fit/certificate.py", "roundtrip", "-> the certificate, on points that the fit has not seen"),
     ),
 }

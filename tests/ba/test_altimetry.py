@@ -15,7 +15,7 @@ import pyproj
 import pytest
 
 from barpc.ba import Adjustment, adjust_tracks
-from barpc.ba.held.surface import NEIGHBOURS, Given, Registration, Surface, displacement, register
+from barpc.ba.held.registration import NEIGHBOURS, Given, Registration, Surface, displacement, register
 from barpc.cameras import open_camera
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.scene import Altimetry, GroundPoints, Tracks, View

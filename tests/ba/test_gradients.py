@@ -11,8 +11,8 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pytest
 
-from barpc.ba.estimated.cameras import Cameras
 from barpc.ba.estimated.priors import CameraPrior, JointPrior, PointPrior
+from barpc.ba.estimated.projected import Cameras
 from barpc.ba.estimated.unknowns import make_unknowns
 from barpc.ba.estimated.waves import Waves
 from barpc.ba.held import ground as on_points

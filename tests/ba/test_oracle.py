@@ -11,7 +11,7 @@ import pytest
 import scipy.linalg as la
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
-from barpc.ba.estimated.cameras import Cameras
+from barpc.ba.estimated.projected import Cameras
 from barpc.ba.held.block import join
 from barpc.ba.held.datum import datum_shares
 from barpc.ba.held.gauge import MOTIONS, _modes, gauge_report
@@ -158,7 +158,7 @@ def test_the_reduced_system_is_the_schur_complement_of_the_whole_differenced_pro
 def test_pieces_of_any_size_make_the_same_system(case, monkeypatch):
     whole = case.reduced
     monkeypatch.setattr(normal, "CHUNK", 3)
-    monkeypatch.setattr("barpc.ba.estimated.cameras.CHUNK", 5)
+    monkeypatch.setattr("barpc.ba.estimated.projected.CHUNK", 5)
     pieces = case.reduced
     _assert_close(pieces.matrix, whole.matrix, 1e-12)
     _assert_close(pieces.gradient, whole.gradient, 1e-9)

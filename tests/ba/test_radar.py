@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, BlockPrior, adjust_tracks, block_prior
-from barpc.ba.estimated.cameras import Cameras
 from barpc.ba.estimated.priors import prior_sigmas
+from barpc.ba.estimated.projected import Cameras
 from barpc.ba.estimated.unknowns import make_unknowns
 from barpc.errors import InputError
 from barpc.geodesy import (

@@ -10,7 +10,7 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.held.ground import Heights
-from barpc.ba.held.relief import NUM_BENDS, Believed, Relief, believe, bends
+from barpc.ba.held.terrain import NUM_BENDS, Believed, Relief, believe, bends
 from barpc.dem import Dem
 from benchmarks.worlds import judge
 from benchmarks.worlds_families import make

@@ -14,7 +14,7 @@ from barpc.cli import adjust as adjusting
 from barpc.cli import fit as fitting
 from barpc.cli.adjust import _tell
 from barpc.cli.fit import _certificate
-from barpc.fit.result import Free
+from barpc.fit.certified import Free
 from barpc.rpcio import write_rpc
 from tests.cli.test_main import run
 from tests.report.made import a_summary

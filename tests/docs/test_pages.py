@@ -56,10 +56,10 @@ def test_the_picture_of_the_house_is_what_the_code_says():
     assert generator.OUT.read_text(encoding="utf-8") == generator.drawing()
     off = (
         ("ba/adjustment.py", "adjust_tracks", ""),
-        ("fit/rpc.py", "fit_rpc", ""),
-        ("fit/rpc.py", "no_such", ""),
+        ("fit/refit.py", "fit_rpc", ""),
+        ("fit/refit.py", "no_such", ""),
     )
-    assert generator.broken(off) == ["fit/rpc.py: fit_rpc", "fit/rpc.py: no_such"]
+    assert generator.broken(off) == ["fit/refit.py: fit_rpc", "fit/refit.py: no_such"]
 
 
 def test_every_room_of_barpc_stands_in_the_plan_of_the_house():

@@ -11,7 +11,7 @@ import rasterio
 from barpc.ba.result import pair_heights
 from barpc.cli import main
 from barpc.dsm import make_dsm
-from barpc.dsm.block import block_of_run
+from barpc.dsm.imagery import block_of_run
 from barpc.errors import InputError
 from barpc.geodesy import ground_from_ecef
 from barpc.options import DsmOptions

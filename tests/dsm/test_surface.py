@@ -12,8 +12,8 @@ import rasterio
 from barpc.cli import main
 from barpc.dsm import NoSurfaceError, make_dsm
 from barpc.dsm import grid as surface_module
-from barpc.dsm.block import _best
 from barpc.dsm.cells import Tile
+from barpc.dsm.imagery import _best
 from barpc.dsm.relief import draped
 from barpc.errors import InputError, OutputError
 from barpc.options import DsmOptions
@@ -210,7 +210,7 @@ def test_other_ground_is_refused_with_exit_code_3_and_leaves_nothing(rendered, t
 
 
 def test_too_large_an_angle_and_radar_are_refused_with_exit_code_3(rendered, tmp_path, monkeypatch, capsys):
-    import barpc.dsm.block as block
+    import barpc.dsm.imagery as block
 
     monkeypatch.setattr(block, "ANGLES", (2.0, 3.0))
     assert run("dsm", *rendered.paths[:2], "-o", tmp_path / "dsm.tif") == 3

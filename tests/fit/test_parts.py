@@ -13,15 +13,15 @@ from scipy.optimize import least_squares
 
 from barpc.errors import BarpcWarning, FitError
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
-from barpc.fit import rpc as fit_module
-from barpc.fit import solve as solve_module
+from barpc.fit import methods as solve_module
+from barpc.fit import refit as fit_module
 from barpc.fit.certificate import CELLS, Errors, Sample
 from barpc.fit.localisation import Localisation, inverse, off
+from barpc.fit.methods import normalization, solve, tidy
 from barpc.fit.points import control_points
 from barpc.fit.poles import Region, least_value, smallest_value
 from barpc.fit.precision import PRECISIONS
-from barpc.fit.rpc import _plainer, underlying_rpc
-from barpc.fit.solve import normalization, solve, tidy
+from barpc.fit.refit import _plainer, underlying_rpc
 from barpc.fit.system import Problem, solution
 from barpc.geodesy import Array, ecef_from_ground
 from barpc.sensor.rational import monomials

@@ -13,8 +13,9 @@ import pytest
 
 from barpc.errors import FitError, InputError, RpcError
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
-from barpc.fit import rpc as fit_module
+from barpc.fit import refit as fit_module
 from barpc.fit.certificate import Errors, coverage, roundtrip
+from barpc.fit.methods import _curvature, solve_lcurve
 from barpc.fit.points import (
     _check_order,
     control_points,
@@ -24,8 +25,7 @@ from barpc.fit.points import (
     widened,
 )
 from barpc.fit.poles import smallest_denominator
-from barpc.fit.rpc import relative_weight, underlying_rpc
-from barpc.fit.solve import _curvature, solve_lcurve
+from barpc.fit.refit import relative_weight, underlying_rpc
 from barpc.fit.system import ALL, Problem, expected_size, noise_scaled, solution
 from barpc.sensor.rpc import RPC
 from tests.constants import CONSTANTS, chosen

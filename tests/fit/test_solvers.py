@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from barpc.fit import Normalization
+from barpc.fit.methods import _reweighted, corner
 from barpc.fit.precision import PRECISIONS
-from barpc.fit.solve import _reweighted, corner
 from barpc.fit.system import ALL, Compressed, Problem, expected_size, noise_scaled, solution
 from barpc.geodesy import Array
 from tests.fit.cameras import Camera, random_points

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.ba.algebra.structure import Structure
-from barpc.ba.estimated.cameras import Projected
 from barpc.ba.estimated.priors import PointPrior
-from barpc.ba.held.relief import NUM_BENDS, Believed, Relief, Terrain, believe, terrain_slopes
+from barpc.ba.estimated.projected import Projected
+from barpc.ba.held.terrain import NUM_BENDS, Believed, Relief, Terrain, believe, terrain_slopes
 from barpc.ba.solving.problem import Problem
 from barpc.errors import BarpcWarning
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from barpc.ba.algebra.structure import make_structure
-from barpc.ba.estimated.cameras import Cameras
 from barpc.ba.estimated.priors import CameraPrior, prior_sigmas
+from barpc.ba.estimated.projected import Cameras
 from barpc.ba.estimated.unknowns import make_unknowns
 from barpc.ba.estimated.waves import Waves
 from barpc.ba.held.block import Block
 from barpc.ba.held.ground import Heights, convergence_angles, ground_control, reference_control
 from barpc.ba.held.incremental import BlockPrior, apply_prior
-from barpc.ba.held.relief import Relief, Terrain
+from barpc.ba.held.terrain import Relief, Terrain
 from barpc.ba.solving.normal import cholesky3, point_products, solve_lower, solve_transposed
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State

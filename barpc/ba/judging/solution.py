@@ -12,8 +12,8 @@ from barpc.ba.estimated.priors import DRIFT_SIGMA
 from barpc.ba.held.block import Block
 from barpc.ba.held.ground import Heights, staying
 from barpc.ba.held.incremental import BlockPrior
-from barpc.ba.held.relief import Terrain
 from barpc.ba.held.starting import first_state, make_problem
+from barpc.ba.held.terrain import Terrain
 from barpc.ba.judging.agreement import LOOSE, Agreement, agreement, offsets_of
 from barpc.ba.judging.judge import Finding
 from barpc.ba.judging.snooping import ControlTest, control_test

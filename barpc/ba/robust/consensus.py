@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from barpc.ba.algebra.structure import Structure, parts
-from barpc.ba.estimated.cameras import Projected
+from barpc.ba.estimated.projected import Projected
 from barpc.ba.solving.normal import CHUNK
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray

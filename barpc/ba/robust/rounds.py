@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from barpc.ba.estimated.cameras import Projected
+from barpc.ba.estimated.projected import Projected
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.held.block import Block
 from barpc.ba.held.ground import Heights

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from barpc.ba.algebra.structure import Structure
-from barpc.ba.estimated.cameras import Cameras, Projected
 from barpc.ba.estimated.priors import CameraPrior, JointPrior, PointPrior
+from barpc.ba.estimated.projected import Cameras, Projected
 from barpc.ba.solving.normal import (
     TRIANGLE,
     Reduced,

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.linalg as la
 
 from barpc.ba.algebra.linear import Factor
-from barpc.ba.estimated.cameras import Projected
+from barpc.ba.estimated.projected import Projected
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import Reduced
 from barpc.ba.solving.problem import Problem

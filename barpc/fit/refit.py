@@ -12,12 +12,12 @@ import numpy.typing as npt
 
 from barpc.errors import BarpcWarning, FitError
 from barpc.fit.certificate import Errors, Sample, coverage, roundtrip
+from barpc.fit.certified import EXACT, Free, RpcFit
 from barpc.fit.localisation import Seen, inverse, off, with_localisation
+from barpc.fit.methods import BOUNDED, Solution, solve
 from barpc.fit.points import control_points, extent, numbers, screened, widened
 from barpc.fit.poles import Region
 from barpc.fit.reasons import reason
-from barpc.fit.result import EXACT, Free, RpcFit
-from barpc.fit.solve import BOUNDED, Solution, solve
 from barpc.fit.system import Problem
 from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
