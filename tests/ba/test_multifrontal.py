@@ -278,8 +278,9 @@ def test_a_block_is_adjusted_as_in_dense_form(monkeypatch, options, n) -> None:
     one, other = found
     assert [f.covariance.factor.method for f in found] == ["multifrontal", "dense"]
     assert (one.covariance.reduced.common is not None) == bool(options)
-    np.testing.assert_allclose(one.params, other.params, atol=1e-7)
-    assert one.cost_history[-1] == pytest.approx(other.cost_history[-1], rel=1e-9)
+    # either ends where a step promises a millionth of the cost: first points that differ by rounding end 1e-9 apart
+    np.testing.assert_allclose(one.params, other.params, atol=3e-7)
+    assert one.cost_history[-1] == pytest.approx(other.cost_history[-1], rel=3e-9)
     np.testing.assert_allclose(one.gauge.sigma, other.gauge.sigma, rtol=1e-7)
     views = np.arange(n)
     sigma = [np.sqrt(np.diag(f.covariance.view(4))) for f in found]
