@@ -247,3 +247,10 @@ def test_a_map_without_metres_is_refused(crs, said, rendered, tmp_path):
     with pytest.raises(InputError, match=said):
         make_dsm(rendered.paths[:2], tmp_path / "dsm.tif", replace(OPTIONS, crs=crs))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_cell_is_larger_than_nothing_and_no_larger_than_a_kilometre():
+    assert [DsmOptions(gsd=side).gsd for side in (0.25, 1000.0)] == [0.25, 1000.0]
+    for side in (0.0, -1.0, 1000.5):
+        with pytest.raises(InputError, match="gsd"):
+            DsmOptions(gsd=side)

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+from rasterio import Affine
+from rasterio.control import GroundControlPoint
 from rasterio.errors import NotGeoreferencedWarning
 
 from barpc.errors import ImageError, OutputError, RpcFormatError
@@ -24,7 +26,7 @@ from barpc.rpcio import (
     write_rpc_nitf,
     write_rpc_vrt,
 )
-from barpc.rpcio.tiff import read_tag, survives
+from barpc.rpcio.tiff import put_tag, read_tag, survives
 from tests.rpcio.conftest import grid, make_rpc, write_image
 
 
@@ -271,3 +273,19 @@ def test_the_tag_of_a_tiff_that_is_cut_off_is_an_error_in_one_line(rpc, image, t
         (tmp_path / "cut.tif").write_bytes(data[:size])
         with pytest.raises(RpcFormatError, match=r"cut\.tif"):
             read_tag(tmp_path / "cut.tif")
+
+
+@pytest.mark.parametrize("placed", [True, False])
+@pytest.mark.parametrize("how", ["tie points", "transform"])
+def test_a_tag_is_put_beside_the_place_of_an_image_or_in_its_stead(tmp_path, how, placed):
+    path, corners = tmp_path / "a.tif", [(0, 0), (0, 9), (9, 0), (9, 9)]
+    gcps = [GroundControlPoint(row, col, 5 + col / 10, 43 - row / 10, 0.0) for row, col in corners]
+    place = {"gcps": gcps} if how == "tie points" else {"transform": Affine(0.1, 0.02, 5, 0.02, -0.1, 43)}
+    with rasterio.open(path, "w", driver="GTiff", width=9, height=9, count=1, dtype="uint8", crs=4326, **place) as out:
+        out.write(np.zeros((1, 9, 9), np.uint8))
+    put_tag(path, make_rpc(), placed)
+    with warnings.catch_warnings(), rasterio.open(path) as found:
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        assert found.rpcs is not None
+        assert bool(found.gcps[0]) is (placed and how == "tie points")
+        assert found.transform.is_identity is not (placed and how == "transform")
