@@ -6,7 +6,8 @@
 
 Every mutant changes one place of one module in a copy of the tree; the fast tests of the module's part (its folder;
 `top`: the modules beside the folders) are run there and stop at the first failure. Before that they must pass without a
-mutant. Texts, messages, annotations, logging and sizes of chunks are left alone. Mutants that no test can tell from
+mutant. What survives has `--slow` seconds of the slow tests of its part, which the landing check runs. Texts, messages,
+annotations, logging and sizes of chunks are left alone. Mutants that no test can tell from
 the original are named in mutation.toml, with the reason.
 """
 
@@ -19,6 +20,7 @@ import json
 import multiprocessing
 import os
 import random
+import re
 import shutil
 import signal
 import sys
@@ -247,18 +249,29 @@ class Tree:
         self.root = folder
         shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(*SKIPPED), dirs_exist_ok=True)
 
-    def caught(self, mutant: Mutant, tests: list[str], limit: float) -> tuple[bool, str, float]:
-        """Whether tests fail with the mutant in the tree; the test that did; seconds."""
+    def caught(self, mutant: Mutant, tests: list[str], limit: float, slow: float = 0.0) -> tuple[bool, str, float]:
+        """Whether tests fail with the mutant in the tree; the test that did; seconds.
+
+        Where the fast ones do not, the slow ones of the landing check have `slow` seconds; one of them that fails
+        without the mutant, too, does not count.
+        """
         target = self.root / mutant.file
         before, after = mutant.source()
         target.write_text(after)
         named = target.stem.removeprefix("_")
+        order = sorted(tests, key=lambda path: named not in Path(path).name)
         try:
-            return self.failing(sorted(tests, key=lambda path: named not in Path(path).name), limit)
+            found, test, seconds = self.failing(order, limit)
+            if found or not slow:
+                return found, test, seconds
+            found, test, more = self.failing(order, slow, "slow and not nightly")
         finally:
             target.write_text(before)
+        place = re.match(r"(?:FAILED|ERROR) (\S+?)(?:\[| - |$)", test)
+        real = found and place is not None and not self.failing([place[1]], LONGEST, "slow and not nightly")[0]
+        return real, test if real else "", seconds + more
 
-    def failing(self, tests: list[str], limit: float) -> tuple[bool, str, float]:
+    def failing(self, tests: list[str], limit: float, marks: str = "not slow") -> tuple[bool, str, float]:
         """Run tests in a process of their own, file by file as given, up to the first that fails.
 
         It is forked from one that has done nothing yet: numba ends what is forked from a process with its threads.
@@ -267,7 +280,7 @@ class Tree:
         log.write_text("")
         clean = multiprocessing.get_context("forkserver")
         clean.set_forkserver_preload(LOADED)
-        child = clean.Process(target=self._run, args=(log, tests))
+        child = clean.Process(target=self._run, args=(log, tests, marks))
         child.start()
         child.join(limit)
         if child.is_alive():
@@ -279,7 +292,7 @@ class Tree:
         told = named[0][:160] if named else f"no test is named: exit code {code}" if code else ""
         return code != 0, told, time.monotonic() - start
 
-    def _run(self, log: Path, tests: list[str]) -> None:
+    def _run(self, log: Path, tests: list[str], marks: str) -> None:
         """The forked process: pytest on the tree's own modules, none of which is imported yet."""
         os.setsid()
         os.chdir(self.root)
@@ -291,7 +304,7 @@ class Tree:
         shared = os.environ.get("BARPC_SHARED", str(ROOT.parent / "shared"))
         os.environ.update(PYTHONPATH=str(self.root), BARPC_SHARED=shared, PYTHONDONTWRITEBYTECODE="1")
         clock = Clock(self.root / "seconds.json")
-        arguments = ["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", *tests]
+        arguments = ["-x", "-q", "-m", marks, "-p", "no:cacheprovider", *tests]
         with log.open("w") as file:
             os.dup2(file.fileno(), 1)
             os.dup2(file.fileno(), 2)
@@ -317,7 +330,7 @@ class Clock:
         self.path.write_text(json.dumps(self.seconds))
 
 
-def run(picked: list[Mutant], jobs: int) -> Iterator[dict[str, object]]:
+def run(picked: list[Mutant], jobs: int, slow: float = 0.0) -> Iterator[dict[str, object]]:
     """Every mutant's fate, one after the other, as rows of the score."""
     with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(jobs) as pool:
         trees: SimpleQueue[Tree] = SimpleQueue()
@@ -341,7 +354,7 @@ def run(picked: list[Mutant], jobs: int) -> Iterator[dict[str, object]]:
         def one(mutant: Mutant) -> dict[str, object]:
             why = equivalents().get((mutant.file, changed(mutant)))
             tree, part = trees.get(), mutant.part
-            found, test, seconds = (False, "", 0.0) if why else tree.caught(mutant, tests[part], limit[part])
+            found, test, seconds = (False, "", 0.0) if why else tree.caught(mutant, tests[part], limit[part], slow)
             trees.put(tree)
             fate = "equivalent" if why else "caught" if found else "SURVIVED"
             print(f"{fate} {seconds:.0f} s {test or why or ''}\n{mutant.diff()}", flush=True)
@@ -375,6 +388,7 @@ def main() -> None:
     parser.add_argument("--chosen", action="store_true", help="the listed mutants instead of a sample")
     parser.add_argument("--survivors", type=Path, help="only the survivors of this score, again")
     parser.add_argument("--skip", type=int, default=0, help="leave out so many of the sample's first mutants")
+    parser.add_argument("--slow", type=float, default=0.0, help="seconds of slow tests for what fast ones do not catch")
     parser.add_argument("--json", type=Path, help="where the score is written")
     parser.add_argument("--bar", type=float, default=0.0, help="least share that must be caught")
     parser.add_argument("-j", type=int, default=1, dest="jobs")
@@ -388,7 +402,7 @@ def main() -> None:
         picked = random.Random(args.seed).sample(picked, min(args.sample, len(picked)))[args.skip :]
     rows: list[dict[str, object]] = []
     found = score(rows)
-    for row in run([m for m in picked if m.part in wanted], args.jobs):
+    for row in run([m for m in picked if m.part in wanted], args.jobs, args.slow):
         rows.append(row)
         found = score(rows)
         if args.json:
