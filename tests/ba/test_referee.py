@@ -73,8 +73,7 @@ def test_what_a_drifting_attitude_does_is_corrected_by_default(name, across, sha
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", rest_slow([SEEDS[:1], SEEDS], mark=pytest.mark.nightly))
 def test_without_a_drift_in_the_model_the_same_scene_is_not_met(seeds):
-    # ten times what the drift leaves, and more
-    assert median(verdicts("drift 1", seeds, drift=0), lambda v: v.after.across) > 0.1
+    assert median(verdicts("drift 1", seeds, drift=0), lambda v: v.after.across) > 0.15
 
 
 @pytest.mark.slow
