@@ -61,7 +61,7 @@ def without_strips(found: Solution, judged: Judgement, block: Block, outer: Bloc
         return plainly
     # one image's rows that wander have competed with these already; what all images have in common has not: detectors,
     # or a platform that shakes
-    shaken = len({one.view for one in parts}) == len(block.views)
+    shaken = len({one.view for one in parts}) >= max(len(block.views) - 1, 2)  # the last is what they are seen against
     if not shaken and not any(one.where is not None and one.where[0] == 0 for one in parts):
         return tried
     plain = follow(found, block, outer, options)  # splines and detectors may explain the same, and leave nothing
