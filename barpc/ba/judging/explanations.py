@@ -17,7 +17,7 @@ from barpc.ba.judging import moving
 from barpc.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import profile
-from barpc.sensor.splined import swing as waves_of
+from barpc.sensor.splined import sine_and_cosine as waves_of
 
 STRIP = "strip"
 FADE = "fade"
