@@ -22,7 +22,7 @@ from barpc.pointio.correspondences import (
     read_grid,
 )
 from barpc.raster import driver_of, open_raster
-from barpc.remote import Place, located, place
+from barpc.remote import Place, located, location
 from barpc.rpcio import read_rpc_source
 from barpc.rpcio.grids import SIGN, read_correction
 from barpc.rpcio.sources import described, metadata_beside, only_physical
@@ -121,7 +121,7 @@ def open_split(path: Place, texts: Mapping[str, str], **choices: Any) -> Camera:
     """Open the camera of a file with the choices behind its name (see `open_camera`, `split_spec`)."""
     texts = dict(texts)
     size, holder = (choices.pop(key, texts.pop(key, None)) for key in ("size", "camera"))
-    file = path if holder is None else place(holder)
+    file = path if holder is None else location(holder)
     head = b"" if file.is_dir() else read_head(file, IMAGE, _HEAD)
     name, opener = next((n, o) for n, o in reversed(OPENERS.items()) if o.sniff(file, head, {**texts, **choices}))
     for key in (*texts, *choices):

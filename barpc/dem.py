@@ -25,7 +25,7 @@ from barpc.errors import BarpcWarning, ImageError, InputError
 from barpc.geodesy import Array
 from barpc.geoids import geoid_file
 from barpc.raster import open_raster
-from barpc.remote import Place, place
+from barpc.remote import Place, location
 from barpc.sensor import SensorModel
 from barpc.sidefile import GRID, opened
 
@@ -56,7 +56,7 @@ class HeightGrid:
     @classmethod
     def open(cls, path: Path | str) -> HeightGrid:
         """Return a grid from ``.hgt`` (SRTM), ``.gtx`` (NOAA's geoid grids) or any raster with a CRS; or InputError."""
-        path = place(path)
+        path = location(path)
         with opened(path, GRID) as file:
             length = file.seek(0, 2)
         driver, reference = HEIGHTS.get(path.suffix.lower(), (None, None))
@@ -203,11 +203,11 @@ class Dem:
             raise InputError(f"{path}: its heights are ellipsoidal already; leave out the geoid {geoid}")
         done, advice = "ellipsoidal", ""
         if geoid is not None:
-            done = f"made ellipsoidal with {place(geoid).name}"
+            done = f"made ellipsoidal with {location(geoid).name}"
         elif known != "ellipsoid":
             done = "TAKEN AS ELLIPSOIDAL"
             advice = "; give a geoid grid, or expect errors up to 100 m in height"
-        description = f"{place(path).name}: vertical reference {known}, {done}"
+        description = f"{location(path).name}: vertical reference {known}, {done}"
         if advice or known == "unknown":
             warnings.warn(f"DEM {description}{advice}", BarpcWarning, stacklevel=2)
         return cls(grid, None if geoid is None else HeightGrid.open(geoid), description, not advice)

@@ -31,7 +31,7 @@ from rasterio.windows import Window
 from barpc import identity
 from barpc.errors import ImageError
 from barpc.identity import Input
-from barpc.remote import Place, Remote, RemoteFile, place
+from barpc.remote import Place, Remote, RemoteFile, location
 from barpc.scene import BoolArray
 from barpc.sidefile import IMAGE, read_head
 from barpc.vrt import INDIRECT, MAGIC, Band, Rect, Source, Vrt, read_vrt
@@ -181,7 +181,7 @@ def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[P
     if driver is None:
         known = ", ".join(sorted(set(DRIVERS.values())))
         raise ImageError(f"{name}: not a raster that is read here (kinds known: {known})")
-    return place(path).absolute(), driver
+    return location(path).absolute(), driver
 
 
 def driver_of(head: bytes) -> str | None:

@@ -26,7 +26,7 @@ from xml.etree import ElementTree
 
 from barpc import identity
 from barpc.errors import BarpcError, ImageError, InputError, RpcFormatError, visible
-from barpc.remote import BLOCK, Place, Remote, RemoteFile, pinned, place
+from barpc.remote import BLOCK, Place, Remote, RemoteFile, location, pinned
 
 logger = logging.getLogger(__name__)
 
@@ -227,7 +227,7 @@ def plain_path(path: str | os.PathLike[str]) -> Place:
                 f"{visible(name)}: its path holds {what}, which not every file and tool takes;"
                 " rename it, or give a link to it"
             )
-    return place(path)
+    return location(path)
 
 
 # --- JSON -------------------------------------------------------------------------------------------------

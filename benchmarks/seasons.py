@@ -41,10 +41,10 @@ from barpc.rpcio import read_rpc  # noqa: E402
 from barpc.scene import View  # noqa: E402
 from barpc.sensor.geometry import altitude_range, epipolar_offset  # noqa: E402
 from barpc.simulate import orbit  # noqa: E402
-from barpc.tie import common_tracks, find_tracks, match, select_pairs  # noqa: E402
-from barpc.tie.matchers.features import join  # noqa: E402
+from barpc.tie import common_tracks, find_tracks, match_pairs, select_pairs  # noqa: E402
+from barpc.tie.matchers.features import join_keypoints  # noqa: E402
 from barpc.tie.pairing.epipolar import frame, robust_affine  # noqa: E402
-from barpc.tie.patches.oriented import PATCH, register_places  # noqa: E402
+from barpc.tie.patches.oriented import PATCH, register_oriented  # noqa: E402
 from barpc.tie.pixels import read_pixels  # noqa: E402
 from tests.scenes import ImageOptions  # noqa: E402
 from tests.scenes.redrawn import redrawn  # noqa: E402
@@ -166,13 +166,13 @@ def sentinel2(data: Path) -> None:
         for path in sorted((data / "optical/s2_two_dates").glob("*.tif"))
     ]
     options = TieOptions(matcher="structure")
-    found, report = match(views, [join([])] * 2, select_pairs(views, options), options)[0]
+    found, report = match_pairs(views, [join_keypoints([])] * 2, select_pairs(views, options), options)[0]
     at, shift = found.xy[:, 0], found.xy[:, 1] - found.xy[:, 0]
     common = [robust_affine(at, shift[:, k]) for k in (0, 1)]
     grid = np.stack(np.meshgrid(*[np.arange(40.0, 1160.0, 40.0)] * 2), axis=-1).reshape(-1, 2)
     start = grid + np.stack([fit(grid) for fit in common], axis=1)
     files = [(view.path, view.size) for view in views]
-    xy, ok, _ = register_places(files, 1, grid, start, np.broadcast_to(np.eye(2), (len(grid), 2, 2)))
+    xy, ok, _ = register_oriented(files, 1, grid, start, np.broadcast_to(np.eye(2), (len(grid), 2, 2)))
     fine = [robust_affine(grid[ok], (xy - grid)[ok, k]) for k in (0, 1)]
     rest = np.hypot(*((xy - grid)[:, k] - fit(grid) for k, fit in enumerate(fine)))
     print(f"Sentinel-2: {report.status}, {len(found)} matches, shift {np.median(shift, axis=0).round(2)} px;")

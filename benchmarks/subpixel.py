@@ -38,7 +38,7 @@ from barpc.options import TieOptions  # noqa: E402
 from barpc.pipeline.loading import load_views  # noqa: E402
 from barpc.tie import common_tracks, find_tracks  # noqa: E402
 from barpc.tie.pairing.epipolar import frame, linear_map  # noqa: E402
-from barpc.tie.patches.register import MIN_CORRELATION, PATCH, register  # noqa: E402
+from barpc.tie.patches.register import MIN_CORRELATION, PATCH, register_patches  # noqa: E402
 
 warnings.simplefilter("ignore")
 PAIRS = (
@@ -173,7 +173,7 @@ def errors(
         off = by_parabolas(images, grid, np.rint(truth)) - truth
         return off[np.isfinite(off).all(axis=1)]
     valid = np.ones(first.shape, bool), np.ones(second.shape, bool)
-    found = register(images, valid, grid, np.rint(truth), np.rint(linear), PATCH)
+    found = register_patches(images, valid, grid, np.rint(truth), np.rint(linear), PATCH)
     good = found.ok & (found.correlation >= MIN_CORRELATION)
     return np.asarray((found.xy - truth)[good])
 
@@ -355,7 +355,7 @@ def registered(images: list[Array], at: Array, start: Array, linear: Array) -> t
     """Places (N, 2) by registration, and whether it takes them."""
     valid = tuple(np.ones(image.shape, bool) for image in images)
     pictures = tuple(image.astype(np.float32) for image in images)
-    found = register(pictures, valid, at, start, linear, PATCH)  # type: ignore[arg-type]
+    found = register_patches(pictures, valid, at, start, linear, PATCH)  # type: ignore[arg-type]
     return found.xy, found.ok & (found.correlation >= MIN_CORRELATION)
 
 

@@ -44,12 +44,12 @@ from barpc.tie import (  # noqa: E402
     detect,
     find_tracks,
     link,
-    match,
+    match_pairs,
     read_area,
     refine,
     select_pairs,
 )
-from barpc.tie.pairing.epipolar import agreeing, frame, robust_spread  # noqa: E402
+from barpc.tie.pairing.epipolar import affine_inliers, frame, robust_spread  # noqa: E402
 from barpc.tie.pixels import read_pixels, sample_stretch  # noqa: E402
 from barpc.workspace import Workspace  # noqa: E402
 
@@ -69,7 +69,7 @@ def stages(views: list[View]) -> float:
     lap("detect", start, f"{[len(k) for k in keypoints]} keypoints")
     start = time.process_time()
     pairs = select_pairs(views, options)
-    matched = match(views, keypoints, pairs, options)
+    matched = match_pairs(views, keypoints, pairs, options)
     lap("match", start, f"{[r.verified for _, r in matched]} verified")
     start = time.process_time()
     linked = link([pair.views for pair in pairs], [found for found, _ in matched])
@@ -98,7 +98,7 @@ def stages(views: list[View]) -> float:
 def spread(first: View, second: View, xy_first: np.ndarray, xy_second: np.ndarray) -> float:
     """Robust standard deviation across the epipolar line after an affine fit [px]."""
     across = frame(first, second, xy_first).errors(xy_second)[:, 1]
-    return robust_spread(agreeing(xy_first, across)[1])
+    return robust_spread(affine_inliers(xy_first, across)[1])
 
 
 def opencv(views: list[View]) -> float:

@@ -256,6 +256,8 @@ REFUSED = {
         "Overview",
     ),
     "resampling": (band(source("a.tif", rects((0, 0, 20, 15), (0, 0, 40, 30)))), "resamples"),
+    "resampling of rows": (band(source("a.tif", rects((0, 0, 20, 15), (0, 0, 20, 30)))), "resamples"),
+    "resampling of columns": (band(source("a.tif", rects((0, 0, 20, 15), (0, 0, 10, 15)))), "resamples"),
     "half a pixel": (band(source("a.tif", rects((0, 0, 20, 15), (0.5, 0, 20, 15)))), "resamples"),
     "no bands": ("", "without bands"),
     "bands out of order": (band(source("a.tif"), number=2), "band 1 says that it is band 2"),

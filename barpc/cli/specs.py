@@ -268,7 +268,7 @@ def corrected(config: Config, folder: Path, views: Sequence[Any]) -> str:
     What names files relative to where it lay names them from there.
     """
     from barpc.export.neural import as_json
-    from barpc.export.shots import link
+    from barpc.export.shots import relative_link
     from barpc.export.stereo import yaml
     from barpc.rpcio import WRITABLE
 
@@ -278,7 +278,7 @@ def corrected(config: Config, folder: Path, views: Sequence[Any]) -> str:
     holders = [item.holder for item in CONFIGS[config.tool](data, folder)]
     for item, holder, view in zip(config.items, holders, views, strict=True):
         if config.tool == "s2p":
-            holder |= {"img": link(item.image, folder), "rpc": json.loads(write(view.sensor))["rpc"]}
+            holder |= {"img": relative_link(item.image, folder), "rpc": json.loads(write(view.sensor))["rpc"]}
         else:
             holder["geomodel"] = {"path": f"{view.name}.geom", "model_type": "RPC"}
             written = [view.name + end for end in (".vrt", ".tif") if (folder / (view.name + end)).is_file()]
@@ -299,8 +299,8 @@ def _moved(value: Any, before: Path, now: Path, depth: int = 0) -> Any:
     if isinstance(value, date):
         return value.isoformat()
     if isinstance(value, str) and value.strip(".") and "\0" not in value and not Path(value).is_absolute():
-        from barpc.export.shots import link
+        from barpc.export.shots import relative_link
 
         with suppress(OSError):
-            return link(before / value, now) if os.path.lexists(before / value) else value
+            return relative_link(before / value, now) if os.path.lexists(before / value) else value
     return value

@@ -18,8 +18,8 @@ from barpc.tie.patches.dense import (
     ACROSS,
     FINER,
     WINDOW,
+    DenseMatches,
     EpipolarFrame,
-    Matches,
     dense_matches,
     epipolar_frame,
 )
@@ -205,7 +205,7 @@ def _frame(pair: tuple[View, View], tile: Tile, zoom: int = 1) -> EpipolarFrame 
     return epipolar_frame(a, b, levels) if np.isfinite(a + b).all() else None
 
 
-def _intersected(pair: tuple[View, View], found: Matches, zoom: int) -> Array:
+def _intersected(pair: tuple[View, View], found: DenseMatches, zoom: int) -> Array:
     """Return the ground points (n, 3) of matches; NaN where the rays do not meet."""
     ground = np.empty((len(found.a), 3))
     places = (np.stack([found.a, found.b], axis=1) + 0.5) * zoom - 0.5

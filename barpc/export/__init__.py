@@ -12,7 +12,7 @@ from pathlib import Path
 from barpc.errors import InputError, OutputError
 from barpc.export.catalogue import CATALOGUE
 from barpc.export.neural import NEURAL, Files, image_links
-from barpc.export.shots import Scene, link, read_scene
+from barpc.export.shots import Scene, read_scene, relative_link
 from barpc.export.stereo import STEREO
 from barpc.sidefile import plain_path
 from barpc.workspace import Workspace
@@ -71,7 +71,7 @@ def export_run(
                 partial.write_bytes(data)
         workspace.remove_stale()
     for name, image in (image_links(scene) if target == "colmap" else {}).items():
-        _link(out / name, link(image, (out / name).parent))
+        _link(out / name, relative_link(image, (out / name).parent))
     return [out / name for name in files]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from barpc.errors import InputError
 from barpc.export.neural import Files, as_json, rpc_of
-from barpc.export.shots import Scene, Shot, link
+from barpc.export.shots import Scene, Shot, relative_link
 from barpc.geodesy import Array, enu_basis, metres_per_unit, utm, wrap_longitude
 from barpc.geojson import polygon
 from barpc.report.tables import ply
@@ -103,14 +103,14 @@ def _item(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
             for rel in ("root", "parent", "collection")
         ],
         "assets": {name: _asset(scene.folder / name, out) for name in view.outputs}
-        | {"image": {"href": link(shot.file, out), "roles": ["source"]}},
+        | {"image": {"href": relative_link(shot.file, out), "roles": ["source"]}},
     }
 
 
 def _asset(path: Path, out: Path) -> dict[str, Any]:
     of_pixels = path.suffix.lower() in (".vrt", ".tif", ".ntf")
     kind = _TYPES.get(path.suffix.lower(), "text/plain")
-    return {"href": link(path, out), "type": kind, "roles": ["data" if of_pixels else "metadata"]}
+    return {"href": relative_link(path, out), "type": kind, "roles": ["data" if of_pixels else "metadata"]}
 
 
 def points(scene: Scene, _out: Path) -> Files:
@@ -173,11 +173,11 @@ def ortho(scene: Scene, out: Path) -> Files:
     lines, heights = [], f"RPC_HEIGHT={scene.origin[2]:.0f}"
     about = "all ground at one altitude; give a DEM to adjust"
     if dem:
-        heights, about = f"RPC_DEM={link(dem, out)}", f"heights of {Path(dem).name}"
+        heights, about = f"RPC_DEM={relative_link(dem, out)}", f"heights of {Path(dem).name}"
     if dem and geoid:
         heights = "RPC_DEM=dem_ellipsoidal.tif"
         above = f"+proj=longlat +datum=WGS84 +geoidgrids={os.path.abspath(geoid)} +vto_meter=1"  # noqa: PTH100
-        lines.append(_gdalwarp("-s_srs", above, "-t_srs", "EPSG:4979", link(dem, out), "dem_ellipsoidal.tif"))
+        lines.append(_gdalwarp("-s_srs", above, "-t_srs", "EPSG:4979", relative_link(dem, out), "dem_ellipsoidal.tif"))
     crs = utm(*scene.origin[:2])[1]
     lines += [_warp(shot, heights, crs, out) for shot in scene.shots]
     return {"ortho.sh": (_HEAD.format(about=about) + "\n".join(lines) + "\n").encode()}
@@ -186,7 +186,7 @@ def ortho(scene: Scene, out: Path) -> Files:
 def _warp(shot: Shot, heights: str, crs: str, out: Path) -> str:
     side = f"{shot.entry.gsd_m:.2g}" if shot.entry.gsd_m else None
     pixel = ("-tr", side, side) if side else ()
-    image = link(shot.carrier or shot.file, out)
+    image = relative_link(shot.carrier or shot.file, out)
     return _gdalwarp("-rpc", "-to", heights, "-t_srs", crs, *pixel, image, f"{shot.name}.tif")
 
 

@@ -21,7 +21,7 @@ from barpc.export.approx import (
     project_affine,
     project_projective,
 )
-from barpc.export.shots import Scene, Shot, link
+from barpc.export.shots import Scene, Shot, relative_link
 from barpc.geodesy import Array, ecef_from_ground, utm, wrap_longitude
 from barpc.geojson import polygon
 from barpc.remote import is_url
@@ -192,7 +192,7 @@ def _frame(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
     matrix, affine = fit_projective(fitted), fit_affine(fitted)
     calibration, rotation, translation = factored(matrix)
     return {
-        "file_path": link(shot.file, out),
+        "file_path": relative_link(shot.file, out),
         "w": shot.size[0],
         "h": shot.size[1],
         "fl_x": pinhole.focal[0],
@@ -255,7 +255,7 @@ def colmap(scene: Scene, out: Path) -> Files:
         points.append(_line(point + 1, *world[point].tolist(), 128, 128, 128, mean, *track))
     about = {"world_to_ecef": scene.world_to_ecef, "alt_range": scene.alt_range, "pinhole_error_px": errors}
     named = zip(scene.shots, _called(scene), strict=True)
-    about["images"] = {name: link(shot.file, out) for shot, name in named}
+    about["images"] = {name: relative_link(shot.file, out) for shot, name in named}
     texts = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": points}
     return {f"sparse/0/{name}": ("\n".join(lines) + "\n").encode() for name, lines in texts.items()} | {
         "world.json": as_json(about)

@@ -21,7 +21,7 @@ from barpc.report.summary import Summary
 from barpc.report.summary.views import ViewEntry
 from barpc.report.tables import RunFiles, read_summary, read_tables
 from barpc.rpcio import CARRIERS
-from barpc.rpcio.acquisition import Light, light_of
+from barpc.rpcio.acquisition import Sunlight, light_of
 from barpc.scene import IntArray
 from barpc.sensor.geometry import camera_center, footprint, image_grid, sight_enu
 from barpc.sensor.rpc import RPC
@@ -46,7 +46,7 @@ class Shot:
     rpc: RPC
     file: str
     carrier: Path | None
-    light: Light
+    light: Sunlight
     index: IntArray
     xy: Array
 
@@ -125,10 +125,10 @@ class Scene:
         """Return the images' names for files in `out`: file names where all lie in one folder, else relative paths."""
         if len({PurePath(shot.file).parent for shot in self.shots}) == 1:
             return [PurePath(shot.file).name for shot in self.shots]
-        return [link(shot.file, out) for shot in self.shots]
+        return [relative_link(shot.file, out) for shot in self.shots]
 
 
-def link(target: Path | str, folder: Path) -> str:
+def relative_link(target: Path | str, folder: Path) -> str:
     """Return the path of a file relative to a folder, with slashes, so that both may move; a URL as it is."""
     if is_url(str(target)):
         return str(target)

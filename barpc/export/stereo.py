@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from barpc.export.neural import Files, as_json, rpc_of
-from barpc.export.shots import Scene, Shot, link, pairs_of
+from barpc.export.shots import Scene, Shot, pairs_of, relative_link
 from barpc.rpcio import WRITABLE
 
 
 def _image(shot: Shot, out: Path) -> str:
     """Return the image as a configuration in `out` names it: the run's VRT or copy where there is one."""
-    return link(shot.carrier or shot.file, out)
+    return relative_link(shot.carrier or shot.file, out)
 
 
 def _text(shot: Shot, name: str) -> bytes:

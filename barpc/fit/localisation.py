@@ -8,16 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.fit.certificate import Errors
-from barpc.fit.methods import Solution, solve_problem
+from barpc.fit.methods import FitSolution, solve_problem
 from barpc.fit.precision import Normalization
-from barpc.fit.system import Problem
+from barpc.fit.system import FitProblem
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor.rpc import RPC
 
 _EXACT = 1e-6  # px: what no other method is tried on
 
-Seen = Callable[[RPC, Solution], tuple[Errors, Array]]
+Seen = Callable[[RPC, FitSolution], tuple[Errors, Array]]
 """What a localisation RPC is off by on points that it has not seen [m, px], and the largest (2,)."""
 
 
@@ -65,7 +65,7 @@ def off(rpc: RPC, found: Array, ground: Array, image: Array) -> Array:
     return np.column_stack([metres, np.linalg.norm(rpc.project(found) - image, axis=1)])
 
 
-def inverse(rpc: RPC, ground: Array, image: Array, weight: Array | None = None) -> Problem:
+def inverse(rpc: RPC, ground: Array, image: Array, weight: Array | None = None) -> FitProblem:
     """Return the problem of the localisation RPC that goes with an RPC: its normalisation, its points, roles
     exchanged.
     """
@@ -76,11 +76,11 @@ def inverse(rpc: RPC, ground: Array, image: Array, weight: Array | None = None) 
         rpc.ground_scale[:2],
     )
     lonlat = np.column_stack([wrap_longitude(ground[:, 0], rpc.ground_offset[0]), ground[:, 1]])
-    return Problem(np.column_stack([image, ground[:, 2]]), lonlat, norm, weight=weight).screened()
+    return FitProblem(np.column_stack([image, ground[:, 2]]), lonlat, norm, weight=weight).screened()
 
 
 def with_localisation(
-    rpc: RPC, problem: Callable[[str], Problem], seen: Seen, options: FitOptions, exact: bool
+    rpc: RPC, problem: Callable[[str], FitProblem], seen: Seen, options: FitOptions, exact: bool
 ) -> tuple[RPC, Localisation]:
     """Return an RPC and its localisation RPC, by a ridge; of a model (`exact`) also by Gauss-Newton, where
     that is better.

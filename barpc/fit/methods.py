@@ -25,14 +25,14 @@ from functools import cached_property, partial
 import numpy as np
 
 from barpc.errors import FitError
-from barpc.fit.points import extent
+from barpc.fit.points import column_ranges
 from barpc.fit.poles import FLOOR, Region, bounded
 from barpc.fit.precision import ALTITUDE_FLOOR, PRECISIONS, Normalization
 from barpc.fit.system import (
     EPS,
     TAU,
     Compressed,
-    Problem,
+    FitProblem,
     Rounding,
     expected_size,
     noise_scaled,
@@ -97,7 +97,7 @@ def _curvature(h: Array, s: Array, beta: Array, rest: float) -> Array:
     return np.asarray((rho1 * eta22 - rho22 * eta1) / (rho1**2 + eta1**2) ** 1.5)
 
 
-def solve_lcurve(problem: Problem, axes: Sequence[int]) -> tuple[Array, list[Compressed], float, int]:
+def solve_lcurve(problem: FitProblem, axes: Sequence[int]) -> tuple[Array, list[Compressed], float, int]:
     """Fit the coordinates `axes` (0 col, 1 row) with one h; both at once is the paper's joint problem of 78 unknowns.
 
     Gives coefficients (2 len(axes), 20), the final systems with their penalties, h, and the passes over the points:
@@ -121,7 +121,7 @@ def solve_lcurve(problem: Problem, axes: Sequence[int]) -> tuple[Array, list[Com
     return *best, h, passes
 
 
-def _coefficients(problem: Problem, systems: list[Compressed], quantize: Rounding | None = None) -> Array:
+def _coefficients(problem: FitProblem, systems: list[Compressed], quantize: Rounding | None = None) -> Array:
     return _quotients([problem.expanded(solution(system, quantize)) for system in systems])
 
 
@@ -131,7 +131,7 @@ def _quotients(parts: Sequence[Array]) -> Array:
 
 
 def _reweighted(
-    problem: Problem, axes: Sequence[int], coeffs: Array, penalty: Array, corrected: bool
+    problem: FitProblem, axes: Sequence[int], coeffs: Array, penalty: Array, corrected: bool
 ) -> tuple[float, list[Compressed]]:
     """Return RMSE [px] of coefficients, and the systems that their denominators weight."""
     squares, following = 0.0, []
@@ -146,11 +146,11 @@ def _reweighted(
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class FitSolution:
     """Coefficients and how they were found: the problem, and the final systems of its parts with their penalties."""
 
     coeffs: Array  # (4, 20)
-    problem: Problem
+    problem: FitProblem
     solved: list[Compressed]
     h: Array
     iterations: int
@@ -199,7 +199,7 @@ class Solution:
         return [np.asarray(np.linalg.pinv(system.matrix)) for system in self.solved]
 
 
-def region_of(problem: Problem) -> Region:
+def region_of(problem: FitProblem) -> Region:
     """Return the hull of a problem's own points and its margin."""
     norm = problem.norm
     ground = (problem.ground - norm.ground_offset) / norm.ground_scale
@@ -216,7 +216,7 @@ def normalization(ground: Array, image: Array, options: FitOptions, vendor: RPC 
 
     Those of the ground are the vendor's where one is given.
     """
-    (low, high), (left, right) = extent(ground), extent(image)
+    (low, high), (left, right) = column_ranges(ground), column_ranges(image)
     if vendor is not None:
         offset, scale = vendor.ground_offset, vendor.ground_scale
     else:
@@ -235,7 +235,7 @@ def solve(
     *,
     weight: Array | None = None,
     vendor: RPC | None = None,
-) -> Solution:
+) -> FitSolution:
     """Fit the coefficients of an RPC to points (N, 3) lon (continuous), lat [deg], alt [m] and (N, 2) [px].
 
     `method` is a row of `METHODS`, weights (N,) are 1 / standard deviation, `vendor` is whose denominators
@@ -247,7 +247,7 @@ def solve(
     norm = normalization(ground, image, options, vendor if keeps else None)
     if keeps:  # its offset may lie a whole turn away
         ground = np.column_stack([wrap_longitude(ground[:, 0], norm.ground_offset[0]), ground[:, 1:]])
-    problem = Problem(ground, image, norm, weight=weight, margin=options.pole_margin).screened()
+    problem = FitProblem(ground, image, norm, weight=weight, margin=options.pole_margin).screened()
     unknowns = len(problem.active) * (1 if keeps else 2) - (0 if keeps else 1)
     if len(ground) <= unknowns:
         raise FitError(
@@ -257,14 +257,14 @@ def solve(
     return solve_problem(problem, options, method, vendor)
 
 
-def solve_problem(problem: Problem, options: FitOptions, method: str, vendor: RPC | None = None) -> Solution:
+def solve_problem(problem: FitProblem, options: FitOptions, method: str, vendor: RPC | None = None) -> FitSolution:
     """Return the solution of a problem by a method, its numbers rounded to the options' precision."""
     quantize = None if options.precision is None else PRECISIONS[options.precision].coeffs
     coeffs, systems, h, passes = METHODS[method](problem, quantize, vendor)
-    return Solution(coeffs, problem, systems, h, passes, method)
+    return FitSolution(coeffs, problem, systems, h, passes, method)
 
 
-def _ridge(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
+def _ridge(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> Found:
     solved, h, passes = [], np.zeros(2), 1
     expected = expected_size(problem.active)
     for axis in range(2):
@@ -280,7 +280,7 @@ def _ridge(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> F
     return _coefficients(problem, solved, quantize), solved, h, passes
 
 
-def _gauss_newton(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
+def _gauss_newton(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> Found:
     start, _, _, passes = _ridge(problem, None, vendor)
     parts, solved, region = [], [], region_of(problem)
     for axis in range(2):
@@ -295,7 +295,7 @@ def _gauss_newton(problem: Problem, quantize: Rounding | None, vendor: RPC | Non
     return _quotients(parts), solved, np.zeros(2), passes
 
 
-def _minimised(problem: Problem, axis: int, x: Array, region: Region) -> tuple[Array, Compressed, int]:
+def _minimised(problem: FitProblem, axis: int, x: Array, region: Region) -> tuple[Array, Compressed, int]:
     """Return the least squares of y - a / b from unknowns x (k,), the system there, and the passes over the points."""
 
     def linearised(x: Array) -> Compressed:
@@ -317,7 +317,7 @@ def _minimised(problem: Problem, axis: int, x: Array, region: Region) -> tuple[A
     return x, system, passes
 
 
-def _ahead(problem: Problem, system: Compressed, x: Array, penalty: Array, size: Array, region: Region) -> Array:
+def _ahead(problem: FitProblem, system: Compressed, x: Array, penalty: Array, size: Array, region: Region) -> Array:
     """Return the solution of a system damped towards x, its denominator kept up over a region; x where there
     is none.
     """
@@ -335,7 +335,7 @@ def _ahead(problem: Problem, system: Compressed, x: Array, penalty: Array, size:
     return x
 
 
-def _minimax(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
+def _minimax(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> Found:
     coeffs, solved, h, passes = _gauss_newton(problem, None, vendor)
     given, parts, region = 1.0 if problem.weight is None else problem.weight, [], region_of(problem)
     for axis in range(2):
@@ -357,7 +357,7 @@ def _minimax(problem: Problem, quantize: Rounding | None, vendor: RPC | None) ->
     return _quotients(parts), solved, h, passes
 
 
-def _lcurve(problem: Problem, quantize: Rounding | None, vendor: RPC | None, joint: bool = False) -> Found:
+def _lcurve(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None, joint: bool = False) -> Found:
     results = [solve_lcurve(problem, axes) for axes in ([[0, 1]] if joint else [[0], [1]])]
     parts, systems, sizes, passes = zip(*results, strict=True)
     solved = [system for of_axes in systems for system in of_axes]
@@ -365,7 +365,7 @@ def _lcurve(problem: Problem, quantize: Rounding | None, vendor: RPC | None, joi
     return coeffs, solved, np.broadcast_to(sizes, 2).copy(), max(passes)
 
 
-def _vendor_denominators(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
+def _vendor_denominators(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> Found:
     assert vendor is not None
     parts, solved = [], []
     for axis, denominator in enumerate(vendor.coeffs[1::2]):
@@ -379,7 +379,7 @@ def _vendor_denominators(problem: Problem, quantize: Rounding | None, vendor: RP
     return np.concatenate(parts), solved, np.zeros(2), 1
 
 
-METHODS: dict[str, Callable[[Problem, Rounding | None, RPC | None], Found]] = {
+METHODS: dict[str, Callable[[FitProblem, Rounding | None, RPC | None], Found]] = {
     "ridge": _ridge,
     "gauss-newton": _gauss_newton,
     "minimax": _minimax,

@@ -99,17 +99,17 @@ def _ground_box(
     return (float(lon.min()), float(lon.max())), (float(lat.min()), float(lat.max()))
 
 
-def extent(points: Array) -> tuple[Array, Array]:
+def column_ranges(points: Array) -> tuple[Array, Array]:
     """Return the smallest and largest value of each column of (N, k); columns one by one are faster than rows."""
     columns = points.T
     return np.array([c.min() for c in columns]), np.array([c.max() for c in columns])
 
 
 def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) -> tuple[Array, Array]:
-    """Return checked points as `numbers` does; FitError where columns look swapped (unless `allow_mirrored`)
+    """Return checked points as `checked_points` does; FitError where columns look swapped (unless `allow_mirrored`)
     or points determine no RPC.
     """
-    ground, image = numbers(ground, image)
+    ground, image = checked_points(ground, image)
     _check_geometry(ground, image, allow_mirrored)
     distinct = len(np.unique(ground, axis=0)) if len(ground) < 400 else len(ground)
     if distinct < min(len(ground), 40):
@@ -120,7 +120,7 @@ def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) 
 _FARTHEST = 1e9  # px: no image is as wide
 
 
-def numbers(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
+def checked_points(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
     """Return points (N, 3) lon, lat [deg], alt [m] and (N, 2) [px] as finite arrays, longitudes made
     continuous.
 
@@ -146,7 +146,7 @@ def numbers(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
 
 
 def _check_geometry(ground: Array, image: Array, allow_mirrored: bool) -> None:
-    (low, left), (high, right) = zip(extent(ground), extent(image), strict=True)
+    (low, left), (high, right) = zip(column_ranges(ground), column_ranges(image), strict=True)
     low, high = np.concatenate([low, left]), np.concatenate([high, right])
     span = high - low
     for i, name in ((0, "lon"), (1, "lat"), (3, "col"), (4, "row")):

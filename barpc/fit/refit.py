@@ -14,11 +14,11 @@ from barpc.errors import BarpcWarning, FitError
 from barpc.fit.certificate import Errors, Sample, coverage, roundtrip
 from barpc.fit.certified import EXACT, Free, RpcFit
 from barpc.fit.localisation import Seen, inverse, off, with_localisation
-from barpc.fit.methods import BOUNDED, Solution, solve
-from barpc.fit.points import control_points, extent, numbers, screened, widened
+from barpc.fit.methods import BOUNDED, FitSolution, solve
+from barpc.fit.points import checked_points, column_ranges, control_points, screened, widened
 from barpc.fit.poles import Region
 from barpc.fit.reasons import reason
-from barpc.fit.system import Problem
+from barpc.fit.system import FitProblem
 from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor import SensorModel
@@ -191,7 +191,7 @@ def fit_rpc_points(
     options = options or FitOptions()
     given = cnp, cnp_image = screened(ground, image, options.allow_mirrored)
     weight = relative_weight(sigma, len(cnp))
-    held_out = None if check is None else numbers(*check)
+    held_out = None if check is None else checked_points(*check)
 
     def attempt(method: str) -> RpcFit:
         solution = solve(cnp, cnp_image, options, method, weight=weight, vendor=vendor)
@@ -209,13 +209,13 @@ def fit_rpc_points(
     return _localised(fit, lambda rpc, _: inverse(rpc, *given, weight), seen, options, strict, exact=False)
 
 
-def _missed(sample: Sample, rpc: RPC, _: Solution) -> tuple[Errors, Array]:
+def _missed(sample: Sample, rpc: RPC, _: FitSolution) -> tuple[Errors, Array]:
     """Return the errors of a localisation RPC on the check points of a model."""
     return sample.sought(lambda ground, at: off(rpc, rpc.localize_direct(at[:, :2], at[:, 2]), ground, at[:, :2]))
 
 
 def _left_out(
-    held_out: tuple[Array, Array] | None, ground: Array, image: Array, rpc: RPC, found: Solution
+    held_out: tuple[Array, Array] | None, ground: Array, image: Array, rpc: RPC, found: FitSolution
 ) -> tuple[Errors, Array]:
     """Return the errors of a localisation RPC on given check points, or its leave-one-out errors."""
     errors, start = Errors(), 0
@@ -232,7 +232,7 @@ def _left_out(
 
 def _localised(
     fit: RpcFit,
-    problem: Callable[[RPC, str], Problem],
+    problem: Callable[[RPC, str], FitProblem],
     seen: Seen,
     options: FitOptions,
     strict: bool,
@@ -275,7 +275,7 @@ def relative_weight(sigma: npt.ArrayLike | None, count: int) -> Array | None:
 
 
 def _certified(
-    solution: Solution,
+    solution: FitSolution,
     seen: Errors,
     largest: Array,
     loop: float,
@@ -289,7 +289,7 @@ def _certified(
     for start in range(0, len(ground), _CHUNK):
         part = slice(start, start + _CHUNK)
         used.add(rpc.project(ground[part]) - image[part])
-    left, right = extent(image)
+    left, right = column_ranges(image)
     if size is not None:
         left, right = np.full(2, -0.5), np.asarray(size) - 0.5
     return RpcFit(

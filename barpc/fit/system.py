@@ -95,7 +95,7 @@ def _take_in(triangle: Array, rows: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class FitProblem:
     """Points, and the offsets and scales of the RPC that is to be fitted to them."""
 
     ground: Array  # (N, 3) lon, lat [deg], alt [m]
@@ -107,7 +107,7 @@ class Problem:
     margin: float = 0.1
     first: Compressed | None = None  # of col without a denominator, where it is known already
 
-    def screened(self) -> Problem:
+    def screened(self) -> FitProblem:
         """Return the problem without the monomials that its points cannot tell from those of lower degree.
 
         All twenty stay where altitudes abound; of points at one altitude those without H, of two altitudes those of

@@ -23,7 +23,7 @@ from barpc.pointio.links import Links
 from barpc.pointio.matches import read_links, tracks_of
 from barpc.pointio.names import ViewNames
 from barpc.raster import hashed
-from barpc.remote import here, located, place
+from barpc.remote import here, located, location
 from barpc.report import Run
 from barpc.scene import BoolArray, Tracks, View
 from barpc.sensor.geometry import footprint
@@ -88,7 +88,7 @@ def with_located(options: RunOptions) -> RunOptions:
 
 def reference_names(options: RunOptions) -> list[str]:
     """Return the references by the names that tasks use."""
-    return [os.fspath(place(path).absolute()) for path in options.reference]
+    return [os.fspath(location(path).absolute()) for path in options.reference]
 
 
 def input_files(options: RunOptions) -> list[Path]:
@@ -146,7 +146,7 @@ def _finder(folder: Path, views: Sequence[View], left_out: Sequence[str | Path])
 
 
 def _resolved(path: str | Path) -> object:
-    return place(path).resolve()
+    return location(path).resolve()
 
 
 def only_new(tracks: Tracks, old: BoolArray) -> Tracks:

@@ -56,7 +56,7 @@ from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import plain_path
 from barpc.tie import find_tracks, read_area
-from barpc.tie.reference import Registration, register
+from barpc.tie.reference import ReferenceControl, register_views
 from barpc.tie.tasks import Progress, ordered
 from barpc.workspace import TABLES, Workspace, timed
 
@@ -294,11 +294,13 @@ def _solve(
         return _adjusted(run, options, *given)
 
 
-def _registered(run: Run, options: RunOptions, dem: Dem, executor: Executor, progress: Progress | None) -> Registration:
+def _registered(
+    run: Run, options: RunOptions, dem: Dem, executor: Executor, progress: Progress | None
+) -> ReferenceControl:
     """Register the views, with the cameras as delivered, to the reference."""
     given = options.adjust.dem_bias_sigma
     bias = (KNOWN_BIAS if dem.known else DEM_BIAS) if given is None else given
-    return register(
+    return register_views(
         run.views,
         reference_names(options),
         dem,

@@ -92,7 +92,7 @@ def is_url(text: str | os.PathLike[str]) -> bool:
     return found is not None and not os.path.lexists(text)
 
 
-def place(path: str | os.PathLike[str]) -> Place:
+def location(path: str | os.PathLike[str]) -> Place:
     """Return a file's location: a Remote as it is, any other text as a path of this machine."""
     return path if isinstance(path, Remote) else Path(path)
 
@@ -108,7 +108,7 @@ def pure(file: Place) -> PurePath:
 
 
 def located(path: str | os.PathLike[str], hosts: Iterable[str]) -> Place:
-    """Return a name that the user gave as `place` does; a URL of a host among `hosts` becomes a Remote.
+    """Return a name that the user gave as `location` does; a URL of a host among `hosts` becomes a Remote.
 
     ImageError for a URL that is refused: its host is not among them, or it holds a user, a query or a fragment.
     """
@@ -116,7 +116,7 @@ def located(path: str | os.PathLike[str], hosts: Iterable[str]) -> Place:
     if _FLAT.match(text) and not os.path.lexists(text):
         raise ImageError(f"{text}: a URL that went through a Path has lost a slash; give it as text")
     if isinstance(path, Remote) or not is_url(text):
-        return place(path)
+        return location(path)
     found = _URL.fullmatch(text)
     if found is None or not HOST.fullmatch(found[2]) or not _is_host(found[2]):
         raise ImageError(

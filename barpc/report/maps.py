@@ -29,7 +29,7 @@ from barpc.report.digest import SHOWN, flagged
 from barpc.report.summary import Summary
 from barpc.report.summary.known import CheckPointEntry, GcpEntry
 from barpc.report.summary.views import CELLS, ViewEntry, cell_numbers
-from barpc.report.tables import Observations, RunFiles
+from barpc.report.tables import ObservationTable, RunFiles
 
 _MOST_LINKS = 1500
 _MARGIN = 34.0
@@ -297,7 +297,7 @@ def residual_cells(xy: Array, residuals: Array, size: Sequence[int]) -> Cells:
 
 
 def residual_panels(
-    views: Sequence[ViewEntry], observations: Observations, when: str, first: Sequence[int] = ()
+    views: Sequence[ViewEntry], observations: ObservationTable, when: str, first: Sequence[int] = ()
 ) -> tuple[list[tuple[str, str]], list[float], str]:
     """Draw small maps of the residuals "before" or "after", with captions: `first`, then by their systematic part.
 

@@ -18,7 +18,7 @@ from barpc.geodesy import Array, ground_from_ecef
 from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View, middle_altitude
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, Several, Triangulation, triangulate
-from barpc.tie import PairReport, Registration
+from barpc.tie import PairReport, ReferenceControl
 
 MAX_TRACKS = 200_000
 """Of more tracks, every n-th is written, so that the files of a huge run can still be opened."""
@@ -72,7 +72,7 @@ class Run:
     out_dir: str = ""
     gcps: GroundPoints | None = None
     check_points: GroundPoints | None = None
-    reference: Registration | None = None
+    reference: ReferenceControl | None = None
 
     @cached_property
     def before(self) -> tuple[SensorModel, ...]:

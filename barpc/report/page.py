@@ -31,7 +31,7 @@ from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.whole import DATUM, DatumEntry
 from barpc.report.summary.words import STATUS_WORDS, counted, largest, listed, metres
-from barpc.report.tables import Draped, Relief, RunFiles, read_summary, read_tables
+from barpc.report.tables import Draped, ReliefWindow, RunFiles, read_summary, read_tables
 from barpc.scene import connected_groups
 from barpc.workspace import Workspace
 
@@ -249,7 +249,7 @@ def _surface(files: RunFiles) -> Section | None:
     return Section("surface", "What do they make of the ground?", answer, shown)
 
 
-def _relief(one: Relief) -> tuple[str, str]:
+def _relief(one: ReliefWindow) -> tuple[str, str]:
     words = f"The ground by the {one.cameras} cameras, lit from the north-west; black: no height"
     return _svg(one.size, words, _jpeg(one)), f"{words}."
 
@@ -266,7 +266,7 @@ def _svg(size: tuple[int, int], words: str, *children: str, **attributes: object
     return charts.tag("svg", *children, viewBox=box, role="img", aria_label=words, **attributes)
 
 
-def _jpeg(one: Relief | Draped, **attributes: object) -> str:
+def _jpeg(one: ReliefWindow | Draped, **attributes: object) -> str:
     href, (width, height) = f"data:image/jpeg;base64,{one.picture}", one.size
     return charts.tag("image", href=href, width=width, height=height, **attributes)
 

@@ -174,7 +174,7 @@ SURFACE = "surface.json"
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
+class ObservationTable:
     """observations.csv: index of the view, number of the track (K,), col, row (K, 2) [px], whether it was kept (K,).
 
     `before`, `after` (K, 2): projected - observed [px]; NaN where there is none.
@@ -188,7 +188,7 @@ class Observations:
     used: BoolArray
 
 
-class Relief(Record):
+class ReliefWindow(Record):
     """A window of the ground, as one of two kinds of cameras give it."""
 
     MORE: ClassVar = Any
@@ -219,11 +219,11 @@ class RunFiles:
     """
 
     summary: Summary
-    observations: Observations
+    observations: ObservationTable
     points: Array
     tracks: IntArray
     outlines: Sequence[Sequence[Array]]
-    reliefs: Sequence[Relief] = ()
+    reliefs: Sequence[ReliefWindow] = ()
     draped: Sequence[Draped] = ()
 
     @property
@@ -290,13 +290,13 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
     return RunFiles(summary, observations, points, tracks, outlines, *shown)
 
 
-def _surface(text: str) -> tuple[tuple[Relief, ...], tuple[Draped, ...]]:
+def _surface(text: str) -> tuple[tuple[ReliefWindow, ...], tuple[Draped, ...]]:
     import fastjsonschema
 
     rows = parse_json(text)
-    shown = {"type": "array", "items": [*2 * [Relief.json_schema()], *2 * [Draped.json_schema()]]}
+    shown = {"type": "array", "items": [*2 * [ReliefWindow.json_schema()], *2 * [Draped.json_schema()]]}
     fastjsonschema.validate({**shown, "additionalItems": False}, rows)
-    reliefs, draped = tuple(map(Relief.read, rows[:2])), tuple(map(Draped.read, rows[2:]))
+    reliefs, draped = tuple(map(ReliefWindow.read, rows[:2])), tuple(map(Draped.read, rows[2:]))
     if [one.cameras for one in reliefs] != ["delivered", "corrected"] or len(draped) not in (0, 2):
         raise ValueError("reliefs that are not one before and one after, images that are not two")
     return reliefs, draped
@@ -328,13 +328,13 @@ def _floats(columns: Sequence[Sequence[str]], known: int) -> Array:
     return table
 
 
-def _observations(text: str, names: Sequence[str]) -> Observations:
+def _observations(text: str, names: Sequence[str]) -> ObservationTable:
     columns = _columns(text, OBSERVATIONS)
     index = {name: i for i, name in enumerate(names)}
     view = np.array([index[from_cell(name)] for name in columns[0]], dtype=np.int64)
     numbers = _floats(columns[2:8], 2)
     used = np.array([cell == "1" for cell in columns[8]], dtype=bool)
-    return Observations(view, _numbers(columns[1]), numbers[:, :2], numbers[:, 2:4], numbers[:, 4:], used)
+    return ObservationTable(view, _numbers(columns[1]), numbers[:, :2], numbers[:, 2:4], numbers[:, 4:], used)
 
 
 def _points(text: str) -> tuple[Array, IntArray]:

@@ -38,7 +38,7 @@ _TIME = re.compile(rb"<IMAGING_TIME>" + _CLOCK)
 
 
 @dataclass(frozen=True)
-class Light:
+class Sunlight:
     """The sun's elevation and azimuth [deg], and the time (UTC, ISO 8601; the day alone where no more is known)."""
 
     elevation: float | None = None
@@ -46,7 +46,7 @@ class Light:
     time: str | None = None
 
 
-def light_of(image: str, camera: str | None = None) -> Light:
+def light_of(image: str, camera: str | None = None) -> Sunlight:
     """Read sun angles and time from the file of an image's camera and the metadata beside the image: Maxar's
     IMD and XML, Airbus' DIM file.
 
@@ -55,14 +55,14 @@ def light_of(image: str, camera: str | None = None) -> Light:
     found: dict[str, float] = {}
     time = None
     if not image or any(name and (is_url(name) or "\0" in name) for name in (image, camera)):
-        return Light()
+        return Sunlight()
     for text in _texts(Path(image), Path(camera or image)):
         for name, pattern in _SUN.items():
             values = [float(value) for value in pattern.findall(text)]
             if values and abs(values[0]) <= 360 and name not in found:
                 found[name] = float(np.median(values))
         time = time or _time(text)
-    return Light(found.get("elevation"), found.get("azimuth"), time or None)
+    return Sunlight(found.get("elevation"), found.get("azimuth"), time or None)
 
 
 def date_taken(image: Place, camera: Place, tags: Mapping[str, str]) -> str:

@@ -63,7 +63,7 @@ def number(text: str, name: str, key: str) -> float:
     return value
 
 
-def numbers(text: str, name: str, key: str) -> list[float]:
+def listed_numbers(text: str, name: str, key: str) -> list[float]:
     """Return the numbers of a list separated by blanks or commas."""
     return [number(part, name, key) for part in re.split(r"[\s,]+", text.strip()) if part]
 

@@ -59,7 +59,7 @@ _SYNTAXES = (
     Format("rpb", (".RPB",), _RPB, text.read_rpb, text.write_rpb, ".RPB", (_BESIDE,)),
     Format("geom", (".geom",), _GEOM, text.read_geom, text.write_geom, ".geom", ("keywords", "shareloc")),
     Format("xml", (".XML",), _MAXAR, xml.read_maxar, xml.write_maxar, ".rpc.xml", (_BESIDE,)),
-    Format("json", (".json",), _JSON, text.read_json, text.write_json, ".rpc.json", ("rpcm",)),
+    Format("json", (".json",), _JSON, text.read_rpc_json, text.write_json, ".rpc.json", ("rpcm",)),
     Format("dimap", (), _has(r"<(\w+:)?Global_RFM"), xml.read_dimap),  # a Dimap_Document, or the model alone
     Format("enmap", (), _has(r"<bandID\s", r"(?i)<ROW_NUM_0?1>"), xml.read_enmap),
     Format("gdal", (), _has(r"<(VRTDataset|PAMDataset)\b", r'domain="RPC"'), xml.read_gdal),
@@ -126,7 +126,7 @@ def write_camera(
     place = Path(path if place is None else place)
     row = row_of(place)
     if isinstance(row, Carrier):
-        row.write(rpc, remote.place(image), Path(path), place, overwrite)
+        row.write(rpc, remote.location(image), Path(path), place, overwrite)
     else:
         write_text(path, _writer(place, None)(rpc), overwrite=overwrite)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from barpc.errors import BarpcError, ImageError, MissingRpcError, RpcError, RpcFormatError
 from barpc.raster import driver_of, identify, open_raster
-from barpc.remote import Place, beside, place
+from barpc.remote import Place, beside, location
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.formats import FORMATS, files_of, holds_physical, parse
 from barpc.rpcio.text import decode, read_nitf
@@ -48,7 +48,7 @@ def sidecars(image: Path | str) -> list[Sidecar]:
 
     Names are compared without regard to case, as GDAL does. XML files count only where their content is an RPC.
     """
-    image = place(image)
+    image = location(image)
     present = _present(image)
     found: list[Sidecar] = []
     metadata_only = f"{image.stem}.imd".lower() in present  # with it GDAL takes the image for Maxar's
@@ -141,7 +141,7 @@ def shadows(image: Path | str) -> list[Sidecar]:
     A VRT answers for itself in GDAL; what is beside a TIFF goes before its tag. A ``.geom`` is what OTB and CARS are
     given. GDAL's own ``.aux.xml`` counts where the image has no RPC.
     """
-    image = place(image)
+    image = location(image)
     head = read_head(image, IMAGE, 64)
     vrt = _is_vrt(head)
     own = vrt or _own_rpc(image, head) is not None
@@ -195,7 +195,7 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
     ImageError
         No such file, or an image without an RPC.
     """
-    path = place(path)
+    path = location(path)
     options = ReadOptions(first_pixel, band)
     head = read_head(path, IMAGE, 64)
     text = encoding_of(head)[:6] == "utf-16" or b"\0" not in head  # no other text holds a zero byte near its start

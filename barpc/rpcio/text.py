@@ -27,8 +27,8 @@ from barpc.rpcio.fields import (
     collect_numbered,
     fields_from_rpc,
     format_number,
+    listed_numbers,
     number,
-    numbers,
     rpc_from_fields,
 )
 from barpc.sensor.rpc import RPC
@@ -69,7 +69,9 @@ def read_txt(text: str, name: str, options: ReadOptions) -> RPC:
     """
     found = [(key.upper(), value) for key, value in _pairs(text)]
     pairs = [(k, number(v, name, k)) for k, v in found if k in SINGLE or k.rpartition("_")[0] in LISTS]
-    pairs += [(f"{k}_{i}", value) for k, v in found if k in LISTS for i, value in enumerate(numbers(v, name, k), 1)]
+    pairs += [
+        (f"{k}_{i}", value) for k, v in found if k in LISTS for i, value in enumerate(listed_numbers(v, name, k), 1)
+    ]
     return rpc_from_fields(collect_numbered(pairs, name), name, options)
 
 
@@ -89,7 +91,7 @@ def read_rpb(text: str, name: str, options: ReadOptions) -> RPC:
     fields: Fields = {}
     for word, value in _RPB_PAIR.findall(text):
         if (key := keys.get(word.lower())) is not None:
-            fields[key] = numbers(value.strip("()"), name, word)
+            fields[key] = listed_numbers(value.strip("()"), name, word)
     if re.search(r'SpecId\s*+=\s*+"RPC00A"', text, re.IGNORECASE):
         raise RpcFormatError(f"{name}: coefficients in RPC00A order; only RPC00B is written to .RPB files")
     return rpc_from_fields(fields, name, options)
@@ -141,7 +143,7 @@ _ENVI = re.compile(r"^[ \t]*+rpc info\s*+=\s*+\{([^{}]*+)\}", re.MULTILINE | re.
 def read_envi(text: str, name: str, options: ReadOptions) -> RPC:
     """Read ENVI's header: offsets, scales, four times twenty coefficients; three more numbers may follow."""
     match = _ENVI.search(text)
-    values = numbers(match.group(1), name, "rpc info") if match else []
+    values = listed_numbers(match.group(1), name, "rpc info") if match else []
     return _in_order(values, "rpc info", name, options)
 
 
@@ -190,7 +192,7 @@ _RPCM |= {key: key.removesuffix("_COEFF").lower() for key in DIRECT}
 _PLAIN = {key: key.lower() for key in KEYS}
 
 
-def read_json(text: str, name: str, options: ReadOptions) -> RPC:
+def read_rpc_json(text: str, name: str, options: ReadOptions) -> RPC:
     """Read ``{"rpc": {"row_offset": ...}}`` (rpcm, s2p) or ``{"line_off": ...}`` (rasterio), nested or not."""
     try:
         document = parse_json(text)
@@ -218,11 +220,11 @@ def _find(document: Any, mark: str, depth: int = 3) -> dict[str, Any] | None:
 def _values(value: Any, name: str, key: str) -> list[float]:
     """Return the numbers of a JSON value: a number, a list of numbers, or a text of numbers (GDAL's)."""
     if isinstance(value, str):
-        return numbers(value, name, key)
+        return listed_numbers(value, name, key)
     items = value if isinstance(value, list) else [value]
     if any(isinstance(item, bool) or not isinstance(item, int | float | str) for item in items):
         raise RpcFormatError(f"{name}: {key} is not a number or a list of numbers")
-    return [v for item in items for v in numbers(str(item), name, key)]
+    return [v for item in items for v in listed_numbers(str(item), name, key)]
 
 
 def write_json(rpc: RPC) -> str:
@@ -248,7 +250,7 @@ def read_yaml(text: str, name: str, options: ReadOptions) -> RPC:
         if key in fields:
             raise RpcFormatError(f"{name}: the RPCs of several images; give a file of one image")
         if value.strip() not in ("null", "~"):
-            fields[key] = numbers(value.strip("[], \t\n").replace("\n", " "), name, word)
+            fields[key] = listed_numbers(value.strip("[], \t\n").replace("\n", " "), name, word)
     return rpc_from_fields(fields, name, options)
 
 

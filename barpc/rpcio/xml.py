@@ -20,8 +20,8 @@ from barpc.rpcio.fields import (
     ReadOptions,
     fields_from_rpc,
     format_number,
+    listed_numbers,
     number,
-    numbers,
     rpc_from_fields,
 )
 from barpc.sensor.rpc import RPC
@@ -63,7 +63,7 @@ def read_maxar(text: str, name: str, options: ReadOptions) -> RPC:
         tag = word.upper()
         path = f"{tag}List/{tag}" if key in COEFFICIENTS else tag
         if key not in ERRORS or image.find(path) is not None:
-            fields[key] = numbers(_text(image, path, name), name, tag)
+            fields[key] = listed_numbers(_text(image, path, name), name, tag)
     return rpc_from_fields(fields, name, options)
 
 
@@ -106,7 +106,7 @@ def _read_dimap_v1(model: Element, name: str, options: ReadOptions) -> RPC:
     """Read DIMAP v1: forty numbers an element, scales A and offsets B by axis."""
     fields: Fields = {}
     for axis, field in (("ROW", "LINE"), ("COL", "SAMP")):
-        values = numbers(_text(_element(model, (f"F_{axis}",), name), ".", name), name, f"F_{axis}")
+        values = listed_numbers(_text(_element(model, (f"F_{axis}",), name), ".", name), name, f"F_{axis}")
         if len(values) != 40:
             raise RpcFormatError(f"{name}: F_{axis} has {len(values)} coefficients, expected 40")
         fields[f"{field}_NUM_COEFF"], fields[f"{field}_DEN_COEFF"] = values[:20], values[20:]
@@ -158,7 +158,7 @@ def read_gdal(text: str, name: str, options: ReadOptions) -> RPC:
 
 def rpc_from_domain(items: Mapping[str, str], name: str, options: ReadOptions) -> RPC:
     """Return the RPC in GDAL's metadata domain; other keys are passed over."""
-    fields = {key: numbers(value, name, key) for key, value in items.items() if key in KEYS + DIRECT}
+    fields = {key: listed_numbers(value, name, key) for key, value in items.items() if key in KEYS + DIRECT}
     return rpc_from_fields(fields, name, options)
 
 

@@ -2,7 +2,7 @@
 
 The paper's corrected projection is P_BA(X) = P(R (X - T - C) + C) with X in ECEF (eq. 7 of Akiki et al.
 2021, "Robust Rational Polynomial Camera Modelling for SAR and Pushbroom Imaging"). A second rotation, a
-polynomial of the image row, may follow R: the drift of the attitude along the strip. `Motion` is all of it with
+polynomial of the image row, may follow R: the drift of the attitude along the strip. `RigidMotion` is all of it with
 its derivatives, for one view here and for blocks of views in the adjustment.
 """
 
@@ -36,7 +36,7 @@ _DIGITS = 1e-8  # of derivatives: the solver's steps ask for no more
 _TOLERANCE = 1e-7  # px: a localised point must project this near to where it was asked (plus rounding)
 
 
-class Motion:
+class RigidMotion:
     """The motion exp(d) R (X - T - C) + C of ground points of one or many views, with its derivatives.
 
     Arrays are component-major, columns sorted by view; R, T, C are each view's, the drift d is each point's.
@@ -128,7 +128,7 @@ class Correction(Frozen):
         grown = f", scale {self.scale:.12g}" if self.scale != 1 else ""
         return f"rotation {1e6 * turn:.3g} urad, translation {move:.3g} m{bent}{grown}"
 
-    def motion(self, ecef: Array, row: Array | None = None) -> Motion:
+    def motion(self, ecef: Array, row: Array | None = None) -> RigidMotion:
         """Return the motion of points (3, n) [m], ECEF, seen at the rows (n,) [px]."""
         drift = None
         if row is not None:
@@ -136,7 +136,7 @@ class Correction(Frozen):
             drift = self.drift.T @ u ** np.arange(1, len(self.drift) + 1)[:, None]
         bounds = np.array([0, ecef.shape[1]])
         shift = self.scale * self.translation + (self.scale - 1.0) * self.center  # T of the points s X
-        return Motion(self.scale * ecef, self.rotation[None], shift[None], self.center[None], bounds, drift)
+        return RigidMotion(self.scale * ecef, self.rotation[None], shift[None], self.center[None], bounds, drift)
 
     def drift_rate(self, row: Array) -> Array:
         """Return the derivative of the drift by the row (3, n) [rad/px] at rows (n,) [px]."""

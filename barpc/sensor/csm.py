@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from barpc.errors import InputError, RpcFormatError
 from barpc.geodesy import WGS84_A, WGS84_B, Array
 from barpc.sensor.frame import Frame
-from barpc.sensor.linescan.samples import Detector, Samples, build, unit
+from barpc.sensor.linescan.samples import Detector, Samples, camera_of_samples, unit
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sidefile import STATE, parse_json, read_text
 
@@ -143,7 +143,7 @@ def _linescan(state: _State) -> Pushbroom:
     if rotation[middle].as_matrix()[:, 2] @ positions[len(positions) // 2] > 0:  # away from the Earth
         rotation, look = rotation * Rotation.from_matrix(FLIP), look * [[-1.0], [1.0]]
     samples = Samples(name, times, positions, velocities, ticks, rotation.as_quat(scalar_first=True))
-    return build(samples, Detector(look, origin, period, size)).model
+    return camera_of_samples(samples, Detector(look, origin, period, size)).model
 
 
 def _lines(state: _State) -> tuple[float, float]:

@@ -114,7 +114,7 @@ class Frame(Frozen):
             if not (np.abs(step) > _SETTLED).any():
                 break
         found = np.where(np.abs(step) < np.sqrt(_SETTLED), found, np.nan)
-        return np.where(radius > 0, found / np.where(radius > 0, radius, 1.0), 1.0 / (1.0 - self.distortion[:1].sum()))
+        return np.asarray(found / np.where(radius > 0, radius, 1.0))  # in the middle any factor is right
 
     def _derivatives(self, ground: Array) -> list[Array]:
         image, at, p = self._seen(ecef_from_ground(ground).T)

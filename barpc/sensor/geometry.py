@@ -20,7 +20,7 @@ from barpc.geodesy import (
 )
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
-from barpc.sensor.stack import localize
+from barpc.sensor.stack import localize_stack
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
@@ -308,7 +308,7 @@ def _centers_of_lines(
     image[..., 0] = side[:, :1, None] * np.linspace(0.0, 1.0, m)
     image[..., 1] = side[:, 1:, None] / 2.0
     alt = np.repeat(np.column_stack([ends[:, 0], np.maximum(ends[:, 1], ends[:, 0] + _LEAST_APART)]), m)
-    ground = localize(sensors, image.reshape(-1, 2), alt, 2 * m * np.arange(n + 1))
+    ground = localize_stack(sensors, image.reshape(-1, 2), alt, 2 * m * np.arange(n + 1))
     origin, end = ecef_from_ground(ground).reshape(n, 2, m, 3).swapaxes(0, 1)
     direction = end - origin
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)

@@ -55,7 +55,7 @@ def profile(place: Array, start: Array, stop: Array, origin: Array, rate: Array)
         return np.asarray(np.where(inside, np.exp(-np.maximum((place - origin) * rate, 0.0)), 0.0))
 
 
-def swing(row: Array, period: Array) -> Array:
+def sine_and_cosine(row: Array, period: Array) -> Array:
     """Return the cosine and sine (2, ...) of one period [px] at rows (...) [px]; zero where the period is infinite."""
     phase = 2.0 * np.pi * np.asarray(row) / period
     return np.where(np.isfinite(period), np.stack([np.cos(phase), np.sin(phase)]), 0.0)
@@ -126,7 +126,7 @@ class RowSpline(Frozen):
         for strip, moved in zip(self.strips, self.moved, strict=True):
             out += profile(image[..., int(strip[0])], *strip[1:])[..., None] * moved
         for period, moves in zip(self.periods, self.swings, strict=True):
-            out += np.moveaxis(swing(image[..., 1], period), 0, -1) @ moves
+            out += np.moveaxis(sine_and_cosine(image[..., 1], period), 0, -1) @ moves
         return np.where(np.isfinite(image).all(axis=-1, keepdims=True), out, np.nan)
 
     def rate(self, row: Array) -> Array:
@@ -137,7 +137,7 @@ class RowSpline(Frozen):
                 fading = ((row - origin) * rate > 0.0) * rate
                 out -= (profile(row, start, stop, origin, rate) * fading)[..., None] * moved
         for period, (by_cos, by_sin) in zip(self.periods, self.swings, strict=True):
-            cos, sin = swing(row, period)[..., None] * (2.0 * np.pi / period)
+            cos, sin = sine_and_cosine(row, period)[..., None] * (2.0 * np.pi / period)
             out += cos * by_sin - sin * by_cos
         return out
 

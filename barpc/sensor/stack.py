@@ -81,7 +81,7 @@ def _polynomials(coeffs: Array, basis: Array, bounds: IntArray) -> Array:
     return out
 
 
-def localize(sensors: Sequence[SensorModel], image: Array, alt: Array, bounds: IntArray) -> Array:
+def localize_stack(sensors: Sequence[SensorModel], image: Array, alt: Array, bounds: IntArray) -> Array:
     """Localise image points (n, 2) [px] at altitudes (n,) [m]: ground points (n, 3), as each camera's `localize`.
 
     Those of camera v are bounds[v] : bounds[v + 1].

@@ -21,7 +21,7 @@ _NODES = 9  # times at which the guided motion is sampled for them
 
 @dataclass(frozen=True)
 class Look:
-    """Viewing direction, orbit and scan of a satellite."""
+    """Look direction, orbit and scan of a satellite."""
 
     incidence: float = 0.0  # angle between the vertical at the target and the satellite [deg]
     azimuth: float = 90.0  # of the satellite seen from the target, clockwise from north [deg]

@@ -1,17 +1,17 @@
 """Images to tracks: windowed reading, detection, matching, linking.
 
-`find_tracks` runs all stages: `select_pairs`, `detect`, `match`, `link`, `thin`, `refine`.
+`find_tracks` runs all stages: `select_pairs`, `detect`, `match_pairs`, `link`, `thin`, `refine`.
 """
 
 from barpc.options import TieOptions
 from barpc.tie.matchers.features import Keypoints, detect
 from barpc.tie.matchers.matcher import Matches
-from barpc.tie.matchers.matching import PairReport, match, match_pair
+from barpc.tie.matchers.matching import PairReport, match_pair, match_pairs
 from barpc.tie.pairing.area import Area, read_area
 from barpc.tie.pairing.choice import select_pairs
 from barpc.tie.pairing.overlaps import Pair
 from barpc.tie.patches.register import refine
-from barpc.tie.reference import Registration
+from barpc.tie.reference import ReferenceControl
 from barpc.tie.tracks import TieResult, common_tracks, find_tracks, link, require_matches, thin
 
 __all__ = [
@@ -20,15 +20,15 @@ __all__ = [
     "Matches",
     "Pair",
     "PairReport",
-    "Registration",
+    "ReferenceControl",
     "TieOptions",
     "TieResult",
     "common_tracks",
     "detect",
     "find_tracks",
     "link",
-    "match",
     "match_pair",
+    "match_pairs",
     "read_area",
     "refine",
     "require_matches",

@@ -18,7 +18,7 @@ import numpy as np
 from barpc.geodesy import Array, metres_per_unit
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
-from barpc.tie.patches.channels import Found, correlation, find, joined, margin
+from barpc.tie.patches.channels import FoundTemplates, correlation, find, joined, margin
 from barpc.tie.patches.oriented import HALF
 from barpc.tie.patches.resampled import Patch, Sheet, Terrain, of_image, of_reference, shown
 from barpc.tie.pixels import FloatImage
@@ -73,7 +73,7 @@ class ViewMatch:
 
 
 @dataclass(frozen=True, eq=False)
-class Registration:
+class ReferenceControl:
     """Control from a reference, where any view was matched, and the result of each view."""
 
     control: Reference | None
@@ -97,7 +97,7 @@ class Registration:
         )
 
 
-def register(
+def register_views(
     views: Sequence[View],
     paths: Sequence[str],
     terrain: Terrain,
@@ -107,7 +107,7 @@ def register(
     height_sigma: tuple[float, float] = (10.0, 5.0),
     executor: Executor | None = None,
     progress: Progress | None = None,
-) -> Registration:
+) -> ReferenceControl:
     """Register views to orthoimages and a terrain.
 
     Parameters
@@ -154,7 +154,7 @@ def vote(view: View, band: int, paths: tuple[str, ...], patch: Patch, reach: int
     return None if shown(area) < _SHOWN[1] else correlation(template[None], area[None])[0]
 
 
-def search(view: View, band: int, paths: tuple[str, ...], patch: Patch, points: Array, reach: int) -> Found:
+def search(view: View, band: int, paths: tuple[str, ...], patch: Patch, points: Array, reach: int) -> FoundTemplates:
     """Find points x, y (n, 2) [px] of the reference on a patch in an image."""
     return find(of_reference(paths, patch), of_image(view, band, patch), points, HALF, reach)
 
@@ -255,7 +255,7 @@ class _Work:
 
     def search(
         self, votes: Sequence[tuple[float, Array]], sigma: float, height_sigma: tuple[float, float]
-    ) -> Registration:
+    ) -> ReferenceControl:
         """Return the points looked for in every view whose vote stands out, and what they make."""
         places, heights = self._lattice([view for view, (z, _) in zip(self.views, votes, strict=True) if z >= PEAK])
         reach = int(np.ceil(_SEARCH[0] + _SEARCH[1] / self.step))
@@ -289,7 +289,7 @@ class _Work:
             offset = np.array([r.offset if r.points else (np.nan, np.nan) for r in reports])
             bias = np.array([sigma, sigma, height_sigma[1]])
             control = Reference(points, bias, offset, (2 * HALF + 1) * self.step)
-        return Registration(control, tuple(reports), self.step, sigma)
+        return ReferenceControl(control, tuple(reports), self.step, sigma)
 
     def _lattice(self, views: Sequence[View]) -> tuple[Array, Array]:
         """Return the places (n, 2) [deg] on a regular grid over views, where the reference shows them, and
@@ -336,7 +336,7 @@ class _Work:
         return tiles
 
     def _agreeing(
-        self, view: View, report: ViewMatch, parts: Sequence[tuple[_Tile, Found]], places: Array
+        self, view: View, report: ViewMatch, parts: Sequence[tuple[_Tile, FoundTemplates]], places: Array
     ) -> tuple[ViewMatch, tuple[IntArray, Array, Array] | None]:
         """Return a view's points that agree with an affine: report; their index, image points, standard
         deviations [px].

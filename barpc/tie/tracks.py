@@ -18,7 +18,7 @@ from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
 from barpc.tie.matchers.features import KeypointFiles, locate, worth_a_first_look
-from barpc.tie.matchers.given import GivenMatches, verify
+from barpc.tie.matchers.given import GivenMatches, verify_given
 from barpc.tie.matchers.matcher import Matches
 from barpc.tie.matchers.matching import (
     FINE,
@@ -28,7 +28,7 @@ from barpc.tie.matchers.matching import (
     PairReport,
     ample,
     enough,
-    match,
+    match_pairs,
     matcher_named,
     quick_score,
 )
@@ -235,7 +235,7 @@ class _Trials:
             looks.ends[pair]: replace(self._given[pair], xy=looks.places(pair, self._given[pair].xy))
             for pair in (pair.views for pair in known)
         }
-        theirs = verify(looks.views, given, [looks.pair(pair) for pair in known], options, **self._work)
+        theirs = verify_given(looks.views, given, [looks.pair(pair) for pair in known], options, **self._work)
         for pair, (found, report) in zip([*others, *known], [*own, *theirs], strict=True):
             self.tried[pair.views] = pair, found, report
 
@@ -246,7 +246,7 @@ class _Trials:
         shows too little.
         """
         views, options, keypoints = self.looks.views, self._options, self._keypoints
-        first = match(views, keypoints, pairs, options, once=True, **self._work) if self._coarse else []
+        first = match_pairs(views, keypoints, pairs, options, once=True, **self._work) if self._coarse else []
         found = {p.views: one for p, one in zip(pairs, first, strict=False) if ample(one[1], options)}
         lacking = [pair for pair in pairs if pair.views not in found]
         if self._coarse and lacking:
@@ -254,7 +254,9 @@ class _Trials:
             self._closer += 1  # each numbers its keypoints, below 0, where no place is
             keypoints = [replace(files, start=-self._closer << 32) for files in closer]
         known = [((views[p.views[0]], views[p.views[1]]), found[p.views][0]) for p in pairs if p.views in found]
-        again = match(views, keypoints, lacking, options, terrain=self._terrain, before=[*before, *known], **self._work)
+        again = match_pairs(
+            views, keypoints, lacking, options, terrain=self._terrain, before=[*before, *known], **self._work
+        )
         found |= {pair.views: one for pair, one in zip(lacking, again, strict=True)}
         return [found[pair.views] for pair in pairs]
 

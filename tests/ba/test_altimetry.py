@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from itertools import product, starmap
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ import pyproj
 import pytest
 
 from barpc.ba import Adjustment, adjust_tracks
+from barpc.ba.held import registration
 from barpc.ba.held.registration import NEIGHBOURS, Given, Registration, Surface, displacement, register
 from barpc.cameras import open_camera
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
@@ -278,3 +280,59 @@ def test_fewer_tie_points_than_a_patch_needs_are_said(scene: Any):
     after = adjust_tracks(views, few, altimetry=heights(3), hold_out=False)
     assert after.altimetry is not None
     assert "are needed" in after.altimetry.why_not
+
+
+def plane_of(slope: tuple[float, float], sigma: float) -> Any:
+    """A surface that is known but for a scatter."""
+    east, north = slope
+
+    def at(place: Any) -> Any:
+        n = len(place)
+        return place @ [east, north], np.zeros(n, dtype=int), np.abs(place).max(axis=1) <= 300.0
+
+    return SimpleNamespace(
+        at=at,
+        slope=lambda place, nearest: (np.tile([east, north], (len(place), 1)), np.zeros((len(place), 2, 2))),
+        variance=lambda place, nearest: np.full(len(place), sigma**2),
+        reach=np.full(3, 500.0),
+    )
+
+
+@pytest.mark.parametrize("noise", [0.7, 1.5])
+def test_what_a_plane_is_told_is_the_covariance_of_an_m_estimate(noise: float):
+    """Huber's: by Tukey's weights, whose cut is 4.685 sigmas; nothing shared, as all lie within one patch."""
+    rng = np.random.default_rng(3)
+    place = np.column_stack([rng.uniform(0.0, 400.0, (80, 2)), np.zeros(80)])
+    place[:, 2] = place[:, :2] @ [0.3, -0.2] + rng.normal(0.0, 0.8, 80)
+    place[:9, 2] += rng.uniform(2.0, 30.0, 9)
+    heights = Given(place, np.full(80, 0.5), np.full(80, 0.9))
+    surface: Any = plane_of((0.3, -0.2), 0.4)
+    free = np.diag(np.arange(1.0, 8.0) ** -2.0)
+    found = registration._told(surface, heights, np.zeros(7), 200.0, noise, free)
+    scale, cut = max(noise, 1.0), registration._BIWEIGHT
+    sigma = np.sqrt(0.4**2 + 0.5**2 + (0.3**2 + 0.2**2) * 0.9**2)
+    near = place[:, :2].max(axis=1) <= 300.0
+    off = place[:, 2] - place[:, :2] @ [0.3, -0.2]
+    np.testing.assert_allclose(found.residual, np.where(near, off, np.nan))
+    np.testing.assert_allclose(found.sigma, sigma)
+    np.testing.assert_array_equal(found.near, near)
+    np.testing.assert_array_equal(found.agree, near & (np.abs(off) < registration._NEAR * scale * sigma))
+    rows = np.einsum("c,ncm->nm", [-0.3, 0.2, 1.0], displacement(place[:, :2] / 200.0))
+    z = off / (scale * sigma)
+    inside = near & (np.abs(z) < cut)
+    assert near.sum() > inside.sum() > 40
+
+    def psi(x: np.ndarray) -> np.ndarray:
+        return x * (1.0 - (x / cut) ** 2) ** 2
+
+    step = 1e-6
+    rate = ((psi(z + step) - psi(z - step)) / (2 * step))[inside].mean()
+    bread = (rows[inside].T @ rows[inside]) * rate / (scale * sigma) ** 2 + free
+    forms = rows[inside] * (psi(z[inside]) / (scale * sigma))[:, None]
+    inverse = np.linalg.inv(bread)
+    told = inverse @ (forms.T @ forms + free) @ inverse
+    expected = np.linalg.inv(np.linalg.inv(told) + free)
+    np.testing.assert_allclose(found.covariance, expected, rtol=2e-3, atol=1e-6)
+    rest = np.sort(off[near & ~found.agree])
+    width = 2.0 * registration._NEAR * scale * sigma
+    assert found.rivals == max((rest <= low + width).sum() - n for n, low in enumerate(rest))

@@ -8,12 +8,27 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.special import gammaln
+from scipy.stats import gamma
 
 from barpc.ba import AdjustOptions
 from barpc.ba.held.block import Block, join
 from barpc.ba.held.starting import make_problem
-from barpc.ba.robust.heldout import HeldOut, _scrambled, is_better, keep_out, measure, scatter
-from barpc.geodesy import ecef_from_ground
+from barpc.ba.robust.heldout import (
+    HeldOut,
+    _scrambled,
+    check_residuals,
+    is_better,
+    keep_out,
+    measure,
+    scatter,
+    split_points,
+)
+from barpc.errors import InputError
+from barpc.geodesy import ecef_from_ground, enu_basis
+from barpc.scene import GroundPoints
+from barpc.sensor.corrected import Corrected
+from barpc.sensor.geometry import triangulate
 from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of
 from tests.constants import chosen
@@ -250,3 +265,59 @@ def test_errors_that_half_of_the_ties_share_are_no_wrong_matches() -> None:
     assert of_ties > 1.6
     assert of_nothing < 1e-5
     assert of_ties == scatter(squared, np.ones(400), view[:400])[0]
+
+
+def test_the_scatter_is_where_expectation_and_maximisation_end() -> None:
+    """Step by step for one view after the other: a chi-square of right ones, wrong ones uniform up to the farthest."""
+    rng = np.random.default_rng(4)
+    counts, free = [30, 41, 25], [1.0, 2.0, 0.5]
+    view, freedom = np.repeat([0, 1, 2], counts), np.repeat(free, counts)
+    squared = rng.chisquare(np.maximum(freedom, 1.0)) * 2.5
+    squared[rng.random(len(view)) < 0.3] *= 90.0
+    expected = []
+    for v, n in enumerate(counts):
+        rows, half = np.sort(squared[view == v]), 0.5 * max(free[v], 1.0)
+        variance, wrong = np.quantile(rows, 0.2) / 0.2, 0.1
+        for _ in range(100):
+            far = rows.max()
+            density = gamma.logpdf(
+                rows, half, scale=variance / half
+            )  # of |r|^2, whose uniform one is flat in |r|^2 half
+            flat = np.log(half) + (half - 1.0) * np.log(rows) - half * np.log(far)
+            peak = half * np.log(half * far / variance) - gammaln(half + 1.0)
+            odds = (1.0 - wrong) / wrong * np.exp(density - flat) * np.exp(max(peak, 4.5) - peak)
+            right = odds / (1.0 + odds)
+            last, variance = variance, (right * rows).sum() / right.sum()
+            wrong = (1.0 + (1.0 - right).sum()) / (10.0 + n)
+            if abs(variance - last) < 1e-4 * last:
+                break
+        expected.append(np.sqrt(variance))
+    order = np.lexsort((rng.random(len(view)), view))
+    np.testing.assert_allclose(scatter(squared[order], freedom[order], view[order]), expected, rtol=1e-9)
+
+
+def test_known_points_are_where_they_project_and_where_rays_meet() -> None:
+    """Of a point in three views, one in two and one in one; all seen 2 px and 1 px beside it."""
+    made = simulate_block(3, 4, seed=3)
+    sensors = [Corrected(view.sensor, one) for view, one in zip(made.views, made.truth.corrections, strict=True)]
+    known = made.truth.ground[:3]
+    view, point = np.array([0, 1, 2, 2, 0, 1]), np.array([0, 0, 0, 1, 1, 2])
+    exact = np.array([sensors[v].project(known[p]) for v, p in zip(view, point, strict=True)])
+    points = GroundPoints(("a", "b", "c"), known, np.ones((3, 3)), point, view, exact - [2.0, -1.0], np.ones(6))
+    found = check_residuals(sensors, points)
+    np.testing.assert_allclose(found.image, np.tile([2.0, -1.0], (6, 1)), atol=1e-6)
+    met = triangulate(sensors, view[:5], point[:5], exact[:5] - [2.0, -1.0]).points
+    for p in (0, 1):
+        np.testing.assert_allclose(
+            found.ground[p], enu_basis(known[p]) @ (met[p] - ecef_from_ground(known[p])), atol=1e-6
+        )
+    assert np.isnan(found.ground[2]).all()
+    image, ground = found.rms()
+    np.testing.assert_allclose(image, [2.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(ground, np.sqrt((found.ground[:2] ** 2).mean(axis=0)))
+    alone = check_residuals(sensors, points.select(np.array([False, False, True])))
+    assert np.isnan(alone.rms()[1]).all()
+    control, checks = split_points(points, ["b"])
+    assert (control.names, checks.names) == (("a", "c"), ("b",))
+    with pytest.raises(InputError, match="named x, y"):
+        split_points(points, ["b", "y", "x"])

@@ -154,3 +154,60 @@ def test_what_is_wrong_is_seen_from_where_the_right_ones_put_the_point(linear: L
     spread = np.sqrt(np.maximum(np.diagonal(project, axis1=1, axis2=2), 0.1))
     whole, _ = off_from_right(linear, noise, np.ones_like(right))
     np.testing.assert_allclose(with_point.of(whole), left / spread, atol=1e-4)
+
+
+@pytest.mark.parametrize("most", [1, 2, 4, 60])
+def test_the_evidence_is_of_the_curvature_at_the_end(linear: Linear, monkeypatch, most: int) -> None:
+    """However many iterations: the last sum is that of the last expectations, and few are summed in all."""
+    seen, summed = [], []
+    expected, curvature = mixture.Mixture._expected, mixture.Mixture._curvature
+    monkeypatch.setattr(mixture.Mixture, "_expected", lambda self: seen.append(expected(self)) or seen[-1])
+    monkeypatch.setattr(
+        mixture.Mixture,
+        "_curvature",
+        lambda self, weight, beside: summed.append(weight) or curvature(self, weight, beside),
+    )
+    one = mixture.Mixture(linear, None, None, None)
+    found = one.run(most)
+    assert summed[-1] is seen[-1].kinds[0].weight
+    assert len(seen) <= most
+    if most == 60:
+        assert len(summed) < len(seen)
+    matrix = one.curvature[0] / found.noise**2 + np.diag(linear.precision)
+    away = linear.offset + found.step.ravel()
+    if most == 60:  # the noise stands
+        room = np.linalg.slogdet(matrix)[1] - np.log(linear.precision).sum()
+        said = seen[-1].log - 0.5 * linear.precision @ away**2 - 0.5 * room
+        assert found.evidence == pytest.approx(said, abs=0.5)
+
+
+def test_a_first_guess_has_the_least_sum_of_distances(linear: Linear) -> None:
+    """Of what all tracks are off by, points following, against the same steps written track by track."""
+    rng = np.random.default_rng(2)
+    moved = replace(linear, residual=linear.residual + rng.normal(0.0, 3.0, linear.residual.shape))
+    base = replace(fit(linear), noise=1.5)
+    old, new = rng.normal(size=(2, 1, len(linear.view))), np.zeros((2, 2, len(linear.view)))
+    new[0, 0] = new[1, 1] = (linear.view == 1) & (np.arange(len(linear.view)) % 2 == 0)
+    base = replace(base, extra=np.array([0.2]))
+    precision = np.array([7.0, 0.5, 0.25])
+    left = moved.left(base.step) + old[:, 0] * 0.2 / linear.sigma
+    parts = []
+    for tracks in linear.tracks:
+        project = projector(tracks)
+        for row, one in zip(tracks.rows, project, strict=True):
+            columns = (new / linear.sigma)[:, :, row].transpose(2, 0, 1).reshape(-1, 2)
+            if columns.any():
+                parts.append((one @ left[:, row].T.ravel(), one @ columns))
+    found = np.zeros(2)
+    for _ in range(6):
+        far = [np.sqrt(((off + by @ found) ** 2).sum() + 1.5**2) for off, by in parts]
+        matrix = np.diag(precision[1:])
+        gradient = precision[1:] * found
+        for (off, by), d in zip(parts, far, strict=True):
+            matrix = matrix + by.T @ by / d
+            gradient = gradient + by.T @ (off + by @ found) / d
+        found = found - np.linalg.solve(matrix, gradient)
+    guess, middle, total = mixture.first_guess(moved, base, old, new, precision)
+    np.testing.assert_allclose(guess, found, rtol=1e-6)
+    assert middle == pytest.approx(np.median(far), rel=1e-6)
+    assert total == pytest.approx(sum(far) / 1.5, rel=1e-6)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from barpc.ba import Adjustment, pair_heights
+from barpc.ba import Adjustment, adjustment, pair_heights
 from barpc.geodesy import enu_basis, ground_from_ecef
 from barpc.sensor.geometry import triangulate
 from barpc.simulate import Block, simulate_block
@@ -95,3 +97,20 @@ def test_heights_are_measured_at_some_of_many_points_and_at_none_of_none(made, f
     nothing = pair_heights(lost, 0, 1)
     assert nothing.count == 0
     assert np.isnan([nothing.absolute, nothing.relative]).all()
+
+
+def test_neighbours_are_asked_of_tie_points_that_were_cut(monkeypatch) -> None:
+    """Not of what is used, was never, holds no residual, or is of control."""
+    asked: list[Any] = []
+    monkeypatch.setattr(adjustment, "neighbours_alike", lambda *given: asked.append(given) or "said")
+    view, xy = np.arange(5), np.arange(10.0).reshape(2, 5)
+    block: Any = SimpleNamespace(view=view, xy=xy, use=np.array([1, 1, 1, 0, 1], dtype=bool), views="abc")
+    residual = xy + 20.0
+    residual[1, 2] = np.nan
+    outcome: Any = SimpleNamespace(inlier=np.array([0, 1, 0, 0, 0], dtype=bool), residual=residual)
+    assert adjustment._alike(block, outcome, np.array([1, 1, 1, 1, 0], dtype=bool)) == "said"
+    ((of_view, place, off, views),) = asked
+    assert of_view.tolist() == [0]
+    np.testing.assert_array_equal(place, xy[:, :1])
+    np.testing.assert_array_equal(off, residual[:, :1])
+    assert views == 3

@@ -312,3 +312,37 @@ def test_rounds_that_go_on_from_an_outcome_end_at_once_where_nothing_changes(
 )
 def test_tracks_are_revived_where_more_than_a_hundredth_was_cut(monkeypatch, cut, options, revived) -> None:
     assert passes(monkeypatch, cut, [1.0], [1.0], **options)[1] == revived
+
+
+@pytest.mark.parametrize("loss", ["linear", "huber"])
+@pytest.mark.parametrize("same", [True, False])
+def test_what_was_known_is_gone_on_with_where_the_unknowns_are_the_same(clean, same: bool, loss: str) -> None:
+    """Cut, accuracies and misfit; with further unknowns what was cut may come back, but counts for nothing at first."""
+    options = AdjustOptions(drift=0, loss=loss)
+    block = join(clean.views, clean.tracks, None, options)
+    problem = make_problem(block, options, centers_of(clean), None)
+    state, heights = first_state(problem, block, options, None)
+    rng = np.random.default_rng(0)
+    inlier, use = (rng.random((2, len(block.view))) < 0.9).astype(bool)
+    wider = CameraPrior(problem.camera_prior.mean, 2.0 * problem.camera_prior.sigma)
+    unknowns = problem.cameras.unknowns if same else object()
+    known: Any = SimpleNamespace(
+        problem=SimpleNamespace(cameras=SimpleNamespace(unknowns=unknowns), camera_prior=wider),
+        inlier=inlier, noise=1.7, smooth=SimpleNamespace(rms=np.array([0.1, 0.2, 0.3])),
+    )  # fmt: skip
+    each = rounds.Rounds(problem, block, state, options, heights, use, known)
+    assert each.goes_on == same
+    assert each.is_known
+    assert each.noise == 1.7
+    assert each.robust == (loss != "linear")
+    assert (each.problem.camera_prior is wider) == same
+    tied = each.observations.tied
+    np.testing.assert_array_equal(each.everything, tied(block.use))
+    np.testing.assert_array_equal(each.use, tied(use & inlier & block.use if same else use & block.use))
+    np.testing.assert_array_equal(each.counted, each.use & inlier)
+    np.testing.assert_array_equal(each.misfit, [0.1, 0.2, 0.3] if same and loss != "linear" else 0.0)
+    first = rounds.Rounds(problem, block, state, options, heights, use)
+    assert (first.goes_on, first.is_known, first.noise, first.misfit, first.passes) == (False, False, 1.0, 0.0, 0)
+    np.testing.assert_array_equal(first.counted, tied(use & block.use))
+    assert first.problem.camera_prior is problem.camera_prior
+    assert first.smooth._tells.all()

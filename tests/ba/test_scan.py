@@ -37,6 +37,8 @@ def test_a_stretch_with_more_wrong_ties_is_found_where_it_is(axis: int) -> None:
     assert (found.start, found.stop) == pytest.approx((0.5 * SIZE[axis, 1], 0.6 * SIZE[axis, 1]))
     assert found.share == pytest.approx(0.6)
     assert found.gain > 5.0 * SURE
+    assert not found.moves
+    assert found.apart == 0.0  # not measured yet
 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (0.0, -1.0), (0.7, 0.7)])
@@ -160,3 +162,47 @@ def test_what_shakes_or_moves_goes_the_same_way_as_its_neighbours(axis: int, com
     first, second = neighbours_alike(view, place, off, 2)
     assert first <= SURE
     assert 20.0 < second < 300 * np.log(2.0)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_the_gain_of_a_displacement_is_that_of_least_squares(axis: int) -> None:
+    """With a parabola beside it, of bins each: half the squares that it takes away, over what scatters there."""
+    rng = np.random.default_rng(7)
+    view, place, wrong, off = ties(7, wrong=0.0)
+    told = rng.uniform(0.2, 1.0, len(view))
+    inside = (view == 0) & (place[axis] >= 0.4 * SIZE[axis, 0]) & (place[axis] < 0.6 * SIZE[axis, 0])
+    off = (off + inside * np.array([[2.0], [1.0]])).clip(-8.0, 8.0)
+    found = [one for one in scanning.scan(view, place, SIZE, wrong, off, told, 0.3) if not one.by_share]
+    one = next(one for one in found if (one.view, one.axis) == (0, axis))
+    assert (one.start, one.stop) == pytest.approx((0.4 * SIZE[axis, 0], 0.6 * SIZE[axis, 0]))
+    rows = view == 0
+    u = np.floor(place[axis, rows] / SIZE[axis, 0] * BINS) / (BINS - 1) * 2.0 - 1.0
+    smooth, weight, step = np.vander(u, 3), told[rows], inside[rows].astype(float)
+    root = np.sqrt(weight)[:, None]
+    followed = np.linalg.lstsq(root * smooth, root * np.column_stack([off[:, rows].T, step]), rcond=None)[0]
+    left, own = off[:, rows].T - smooth @ followed[:, :2], step - smooth @ followed[:, 2]
+    known = weight @ own**2
+    score = (weight * own) @ left
+    scatter = (left * weight[:, None]).T @ left / (weight.sum() + 1.0)
+    size, axes = np.linalg.eigh(scatter)
+    gain = 0.5 * ((score @ axes) ** 2 / known / (np.maximum(size, 1.0) + known * 0.3**2)).sum()
+    assert one.gain + price(2) == pytest.approx(gain, rel=1e-6)
+    assert one.off == pytest.approx(np.hypot(*score) / known, rel=1e-6)
+
+
+def test_evidence_of_neighbours_is_the_entropy_of_their_signs() -> None:
+    """Of one line of residuals: 30 in the order of rows, whose sign changes six times."""
+    off = np.zeros((2, 31))
+    off[0] = np.repeat([1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0], [5, 5, 5, 5, 5, 5, 1]) * 3.0
+    place = np.stack([np.zeros(31), np.arange(31.0)])
+    order = np.random.default_rng(0).permutation(31)
+    share = 24 / 30
+    expected = 30 * (np.log(2) + share * np.log(share) + (1 - share) * np.log(1 - share)) - np.log(4 * 3)
+    found = neighbours_alike(np.full(31, 1), place[:, order], off[:, order], 3)
+    rows_in_order = (off[0][order][1:] * off[0][order][:-1] > 0).mean()
+    assert rows_in_order < share
+    assert found[1] == pytest.approx(expected)
+    assert np.isneginf(found[[0, 2]]).all()
+    single = neighbours_alike(np.array([0]), place[:, :1], off[:, :1], 1)
+    assert np.isneginf(single).all()
+    assert np.isfinite(neighbours_alike(np.zeros(2, int), place[:, :2], off[:, :2], 1)).all()

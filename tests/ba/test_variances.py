@@ -16,7 +16,7 @@ from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.estimated.waves import Waves
 from barpc.ba.held.block import join
 from barpc.ba.held.starting import make_problem
-from barpc.ba.robust.variances import Variances, _Around, same_prior
+from barpc.ba.robust.variances import PriorTest, Variances, _Around, same_prior
 from barpc.ba.solving.solve import State, minimise
 from barpc.errors import BarpcWarning
 from barpc.geodesy import ecef_from_ground
@@ -512,3 +512,25 @@ def test_every_view_is_tried_up_to_four_hundred_unknowns(unknowns: int, small: b
     problem: Any = SimpleNamespace(free=np.zeros(unknowns, dtype=bool))  # fixed ones, too
     around: Any = _Around(problem, None)  # type: ignore[arg-type]
     assert around.small == small
+
+
+@pytest.mark.parametrize(("model", "unknowns"), [("rotation", 3), ("rotation+translation", 6)])
+@pytest.mark.parametrize("size", [0.0, 2.0, 3.0, 90.0])
+def test_views_that_state_an_accuracy_share_what_they_are_off_by(model: str, unknowns: int, size: float) -> None:
+    """As far as their corrections leave room: what is independent is as large as a thousandth's chance lets it."""
+    v = replace(variances(4, model), stated=np.array([True, False, True, True]))
+    params, known = v.given.mean.copy(), np.full((4, unknowns), 0.5)
+    params[0, 1] += size * 2.0  # of a standard deviation of 2
+    params[1] += 99.0
+    known[3] = 0.0  # of this view nothing is determined
+    freedom = 0.5 * 2 * unknowns
+    alone = min(size**2 / chi2.ppf(1e-3, freedom), 1.0)
+    expected = np.sqrt(max(alone + (1 - alone) * 2 * 3 / unknowns, 1.0))
+    np.testing.assert_allclose(v._shared(params, known), [expected, 1.0, expected, expected])
+    np.testing.assert_array_equal(v._shared(params, 0.49 / freedom * known), 1.0)  # nothing is determined
+    np.testing.assert_array_equal(replace(v, learn_constant=False)._shared(params, known), 1.0)
+    np.testing.assert_array_equal(replace(v, stated=None)._shared(params, known), 1.0)
+
+
+def test_what_is_not_said_to_be_shared_is_not() -> None:
+    assert PriorTest(1.0, 2.0, np.ones(1), np.zeros(1, dtype=bool), ()).shared == 1.0

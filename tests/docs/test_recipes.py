@@ -28,6 +28,7 @@ LATE = (
     "absolute",
     "dates",
     "drift",
+    "dsm",
     "export",
     "matches",
 )  # five seconds or more each, and more of the same kind

@@ -18,6 +18,7 @@ from barpc.pipeline import adjust
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import triangulate
 from barpc.simulate import simulate_block
+from tests.lanes import rest_slow
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.files import _write_image
 
@@ -51,8 +52,9 @@ def one_block(seed):
 
 
 @pytest.mark.slow
-def test_the_sigma_of_a_difference_is_honest_and_a_third_of_the_naive_sum_at_most():
-    found = [one_block(seed) for seed in range(60)]
+@pytest.mark.parametrize("blocks", rest_slow([12, 60], mark=pytest.mark.nightly))
+def test_the_sigma_of_a_difference_is_honest_and_a_third_of_the_naive_sum_at_most(blocks: int):
+    found = [one_block(seed) for seed in range(blocks)]
     off, sigma, naive, absolute = (np.array(part) for part in zip(*found, strict=True))
     nees = (off / sigma) ** 2
     assert 0.8 < nees.mean() < 1.25

@@ -17,10 +17,10 @@ from barpc.errors import InputError
 from barpc.export import catalogue, neural, stereo
 from barpc.export import shots as scene
 from barpc.export.approx import Sampled
-from barpc.export.shots import Scene, link, pairs_of, read_scene
+from barpc.export.shots import Scene, pairs_of, read_scene, relative_link
 from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.rpcio import read_rpc
-from barpc.rpcio.acquisition import Light
+from barpc.rpcio.acquisition import Sunlight
 from barpc.sensor.geometry import camera_center, image_grid
 
 OUT = Path("/elsewhere/out")
@@ -131,9 +131,9 @@ def test_samples_lie_on_a_grid_over_image_and_altitudes(south):
 
 
 def test_files_are_named_relative_to_where_they_are_named(tmp_path):
-    assert link("https://a.org/b/x.tif", OUT) == "https://a.org/b/x.tif"
-    assert link("/elsewhere/images/x.tif", OUT) == "../images/x.tif"
-    assert link("/elsewhere/out/x.tif", OUT) == "x.tif"
+    assert relative_link("https://a.org/b/x.tif", OUT) == "https://a.org/b/x.tif"
+    assert relative_link("/elsewhere/images/x.tif", OUT) == "../images/x.tif"
+    assert relative_link("/elsewhere/out/x.tif", OUT) == "x.tif"
 
 
 def test_images_of_one_folder_go_by_their_names_and_others_relative(south):
@@ -266,7 +266,7 @@ def test_an_affine_camera_of_eogs_goes_from_minus_one_to_one_over_the_image(sout
 
 def test_the_sun_sees_a_point_and_its_shadow_in_one_place(south):
     frame = neural._Utm(south)
-    shot = replace(south.shots[0], light=Light(52.25, 150.5, None))
+    shot = replace(south.shots[0], light=Sunlight(52.25, 150.5, None))
     found = frame.models(south, shot)
     linear, sun = found["model"]["coef_"], found["sun_model"]
     up, around = np.radians([52.25, 150.5])
@@ -277,7 +277,7 @@ def test_the_sun_sees_a_point_and_its_shadow_in_one_place(south):
     assert sun["coef_"] == pytest.approx(sun["camera_to_sun"] @ linear)
     assert sun["camera_to_sun"][2].tolist() == [0, 0, 1]
     assert sun["intercept_"] == pytest.approx(found["model"]["intercept_"])
-    for light in (Light(None, 150.5, None), Light(52.25, None, None)):
+    for light in (Sunlight(None, 150.5, None), Sunlight(52.25, None, None)):
         assert frame.models(south, replace(shot, light=light))["sun_model"] is None
 
 
@@ -376,12 +376,12 @@ def test_stereo_pipelines_get_images_and_cameras(south, southern):
     config = json.loads(stereo.s2p(carried, southern)["config.json"])
     assert (config["out_dir"], config["full_img"]) == ("s2p_out", True)
     assert config["images"][0]["img"] == "a.vrt"  # the run's raster goes before the image
-    assert config["images"][1]["img"] == link(south.shots[1].file, southern)
+    assert config["images"][1]["img"] == relative_link(south.shots[1].file, southern)
     assert read_rpc_of(config["images"][1]["rpc"]).off(south.shots[1].rpc).max() < 1e-6
     files = stereo.asp(carried, southern)
     names = [shot.name for shot in south.shots]
     assert files["cameras.txt"].decode() == "".join(f"{name}.xml\n" for name in names)
-    assert files["images.txt"].decode().split("\n")[:2] == ["a.vrt", link(south.shots[1].file, southern)]
+    assert files["images.txt"].decode().split("\n")[:2] == ["a.vrt", relative_link(south.shots[1].file, southern)]
     assert files["images.txt"].endswith(b"\n")
     assert set(files) == {*(f"{name}.xml" for name in names), "cameras.txt", "images.txt"}
     for end, made in (("xml", files), ("geom", stereo.cars(south, southern))):
@@ -396,7 +396,7 @@ def test_the_yaml_of_cars(south):
     assert lines[:2] == ['"input":', '  "sensors":']
     at = lines.index(f'    "{first.name}":')
     assert lines[at + 1 : at + 5] == [
-        f'      "image": {json.dumps(link(first.file, OUT), ensure_ascii=False)}',
+        f'      "image": {json.dumps(relative_link(first.file, OUT), ensure_ascii=False)}',
         '      "geomodel":',
         f'        "path": "{first.name}.geom"',
         '        "model_type": "RPC"',
@@ -442,9 +442,9 @@ def test_a_stac_item_says_where_when_and_how(south, southern):
     )
     assert (found["view:sun_azimuth"], found["view:sun_elevation"]) == (150.5, 52.25)
     assert found["processing:software"] == {"barpc": south.summary.barpc}
-    assert item["assets"]["image"] == {"href": link(south.shots[0].file, OUT), "roles": ["source"]}
+    assert item["assets"]["image"] == {"href": relative_link(south.shots[0].file, OUT), "roles": ["source"]}
     (output,) = view.outputs
-    assert item["assets"][output]["href"] == link(southern / output, OUT)
+    assert item["assets"][output]["href"] == relative_link(southern / output, OUT)
 
 
 def test_a_stac_item_of_an_unknown_time_or_day(south, dateline):
@@ -455,7 +455,7 @@ def test_a_stac_item_of_an_unknown_time_or_day(south, dateline):
         "9999-12-31T23:59:59Z",
     )
     assert "view:sun_azimuth" not in unknown
-    day = with_shot(south, light=Light(None, None, "2020-01-02"))
+    day = with_shot(south, light=Sunlight(None, None, "2020-01-02"))
     name = south.shots[0].name
     assert json.loads(catalogue.stac(day, OUT)[f"{name}.json"])["properties"]["datetime"] == "2020-01-02T00:00:00Z"
     west, south_lat, east, north = json.loads(catalogue.stac(dateline, OUT)[f"{dateline.shots[0].name}.json"])["bbox"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.errors import FitError
-from barpc.fit.points import extent, numbers, screened, spaced, widened
+from barpc.fit.points import checked_points, column_ranges, screened, spaced, widened
 
 RNG = np.random.default_rng(0)
 GROUND = np.column_stack([RNG.uniform(5, 6, 60), RNG.uniform(43, 44, 60), RNG.uniform(0, 900, 60)])
@@ -25,10 +25,10 @@ def test_numbers_are_longitudes_latitudes_and_altitudes(column: int, value: floa
     ground = GROUND.copy()
     ground[7, column] = value
     if name is None:
-        np.testing.assert_array_equal(numbers(ground, IMAGE)[0][:, 1:], ground[:, 1:])
+        np.testing.assert_array_equal(checked_points(ground, IMAGE)[0][:, 1:], ground[:, 1:])
     else:
         with pytest.raises(FitError, match=f"^points: {value:g} is not a {name}: are the columns swapped"):
-            numbers(ground, IMAGE)
+            checked_points(ground, IMAGE)
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def test_numbers_are_longitudes_latitudes_and_altitudes(column: int, value: floa
 )  # fmt: skip
 def test_arrays_of_other_shapes_are_refused(ground: np.ndarray, image: np.ndarray) -> None:
     with pytest.raises(FitError, match=r"expected \(N, 3\) and \(N, 2\)"):
-        numbers(ground, image)
+        checked_points(ground, image)
 
 
 def test_the_first_point_that_is_not_finite_is_named() -> None:
@@ -49,18 +49,18 @@ def test_the_first_point_that_is_not_finite_is_named() -> None:
             given = [GROUND.copy(), IMAGE.copy()]
             given[array][[3, 9], column] = wrong
             with pytest.raises(FitError, match=r"2 of 60 are not finite \(the first is point 3\)"):
-                numbers(*given)
+                checked_points(*given)
     with pytest.raises(FitError, match="none at all"):
-        numbers(GROUND[:0], IMAGE[:0])
+        checked_points(GROUND[:0], IMAGE[:0])
 
 
 def test_longitudes_across_the_antimeridian_run_on() -> None:
     ground = GROUND.copy()
     ground[:, 0] = np.where(np.arange(60) % 2, 179.9, -179.9)
-    found = numbers(ground, IMAGE)[0]
+    found = checked_points(ground, IMAGE)[0]
     assert np.ptp(found[:, 0]) == pytest.approx(0.2)
-    assert np.ptp(numbers(GROUND, IMAGE)[0][:, 0]) < 1.0
-    np.testing.assert_array_equal(numbers(GROUND, IMAGE)[0], GROUND)
+    assert np.ptp(checked_points(GROUND, IMAGE)[0][:, 0]) < 1.0
+    np.testing.assert_array_equal(checked_points(GROUND, IMAGE)[0], GROUND)
 
 
 @pytest.mark.parametrize(("column", "name"), [(0, "lon"), (1, "lat"), (2, "col"), (3, "row")])
@@ -164,4 +164,4 @@ def test_an_altitude_range_is_an_interval_of_a_hundred_metres_or_more() -> None:
     for wrong in ((1.0, 0.0), (np.nan, 1.0), (0.0, np.nan), (0.0, np.inf), (-np.inf, 0.0)):
         with pytest.raises(FitError, match="is not an interval"):
             widened(wrong)
-    np.testing.assert_array_equal(extent(GROUND), [GROUND.min(axis=0), GROUND.max(axis=0)])
+    np.testing.assert_array_equal(column_ranges(GROUND), [GROUND.min(axis=0), GROUND.max(axis=0)])

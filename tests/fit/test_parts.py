@@ -22,7 +22,7 @@ from barpc.fit.points import control_points
 from barpc.fit.poles import Region, least_value, smallest_value
 from barpc.fit.precision import PRECISIONS
 from barpc.fit.refit import _plainer, underlying_rpc
-from barpc.fit.system import Problem, solution
+from barpc.fit.system import FitProblem, solution
 from barpc.geodesy import Array, ecef_from_ground
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
@@ -39,7 +39,7 @@ def wavy(camera: Camera, count: int = 160, height: float = 2.0, seed: int = 3) -
     return ground, bent, Normalization(rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
 
 
-def left(problem: Problem, coeffs: Array) -> Array:
+def left(problem: FitProblem, coeffs: Array) -> Array:
     """What coefficients (4, 20) leave of the points (N, 2) [px], weighted."""
     norm = problem.norm
     rpc = RPC(coeffs, norm.ground_offset, norm.ground_scale, norm.image_offset, norm.image_scale)
@@ -47,7 +47,7 @@ def left(problem: Problem, coeffs: Array) -> Array:
     return (rpc.project(problem.ground) - problem.image) * weight
 
 
-def best(problem: Problem, axis: int, start: Array) -> float:
+def best(problem: FitProblem, axis: int, start: Array) -> float:
     """Sum of squares of the best numerator and denominator of a coordinate, by scipy, from coefficients (4, 20)."""
     norm = problem.norm
     basis = monomials(((problem.ground - norm.ground_offset) / norm.ground_scale).T)
@@ -65,7 +65,7 @@ def best(problem: Problem, axis: int, start: Array) -> float:
 def test_gauss_newton_ends_where_no_neighbour_is_better(camera: Camera, weighted: bool) -> None:
     ground, image, norm = wavy(camera)
     weight = np.random.default_rng(1).uniform(0.2, 1.0, len(ground)) if weighted else None
-    problem = Problem(ground, image, norm, weight=weight)
+    problem = FitProblem(ground, image, norm, weight=weight)
     coeffs, solved, h, passes = solve_module._gauss_newton(problem, None, None)
     squares = (left(problem, coeffs) ** 2).sum(axis=0)
     for axis in range(2):
@@ -80,7 +80,7 @@ def test_gauss_newton_ends_where_no_neighbour_is_better(camera: Camera, weighted
 def test_rows_with_a_numerator_are_the_quotient_and_its_derivatives(camera: Camera) -> None:
     """M x - y is what is left at x, and M how it changes."""
     ground, image, norm = wavy(camera, 60)
-    problem, scale = Problem(ground, image, norm), norm.image_scale
+    problem, scale = FitProblem(ground, image, norm), norm.image_scale
     for axis in range(2):
         numerator, denominator = camera.rpc.coeffs[2 * axis : 2 * axis + 2]
         rows = np.concatenate([r for _, r in problem.rows(axis, denominator, True, numerator)])
@@ -100,10 +100,10 @@ def test_rows_with_a_numerator_are_the_quotient_and_its_derivatives(camera: Came
 def test_a_ridge_with_a_pole_makes_way_for_a_polynomial(camera: Camera, monkeypatch: Any) -> None:
     """Gauss-Newton begins with the best polynomials of the points, each coordinate with its own."""
     ground, image, norm = wavy(camera)
-    problem, starts = Problem(ground, image, norm), []
+    problem, starts = FitProblem(ground, image, norm), []
     whole = solve_module._minimised
 
-    def seen(problem: Problem, axis: int, x: Array, region: Region) -> Any:
+    def seen(problem: FitProblem, axis: int, x: Array, region: Region) -> Any:
         starts.append(x)
         return whole(problem, axis, x, region)
 
@@ -133,7 +133,7 @@ def test_a_ridge_with_a_pole_makes_way_for_a_polynomial(camera: Camera, monkeypa
 def test_a_step_that_makes_things_worse_is_not_taken(camera: Camera) -> None:
     """From a start far off: the sum of squares never rises, and no denominator comes near zero."""
     ground, image, norm = wavy(camera, 120, 20.0)
-    problem = Problem(ground, image, norm)
+    problem = FitProblem(ground, image, norm)
     rng, around = np.random.default_rng(0), np.full((3, 2), [-1.25, 1.25])
     for axis in range(2):
         start = np.concatenate([rng.normal(0, 1, 20), rng.normal(0, 0.02, 19)])
@@ -149,7 +149,7 @@ def test_a_step_that_makes_things_worse_is_not_taken(camera: Camera) -> None:
 
 def test_minimax_keeps_the_round_with_the_least_largest_error(camera: Camera) -> None:
     ground, image, norm = wavy(camera, 200)
-    problem = Problem(ground, image, norm)
+    problem = FitProblem(ground, image, norm)
     plain, *_, few = solve_module._gauss_newton(problem, None, None)
     even, *_, passes = solve_module._minimax(problem, None, None)
     largest = [np.abs(left(problem, coeffs)).max(axis=0) for coeffs in (plain, even)]
@@ -163,7 +163,7 @@ def test_minimax_keeps_the_round_with_the_least_largest_error(camera: Camera) ->
 
 def test_coefficients_rounded_for_a_format_are_what_the_format_holds(camera: Camera) -> None:
     ground, image, norm = wavy(camera)
-    problem, rounding = Problem(ground, image, norm), PRECISIONS["nitf"].coeffs
+    problem, rounding = FitProblem(ground, image, norm), PRECISIONS["nitf"].coeffs
     for method in ("ridge", "gauss-newton", "minimax", "lcurve", "vendor-denominators"):
         coeffs, *_ = solve_module.METHODS[method](problem, rounding, camera.rpc)
         np.testing.assert_array_equal(rounding(coeffs), coeffs)

@@ -26,7 +26,7 @@ from barpc.fit.points import (
 )
 from barpc.fit.poles import smallest_denominator
 from barpc.fit.refit import relative_weight, underlying_rpc
-from barpc.fit.system import ALL, Problem, expected_size, noise_scaled, solution
+from barpc.fit.system import ALL, FitProblem, expected_size, noise_scaled, solution
 from barpc.sensor.rpc import RPC
 from tests.constants import CONSTANTS, chosen
 from tests.fit.cameras import Camera, random_points, synthetic, synthetic_rpc
@@ -457,7 +457,7 @@ def test_points_count_by_the_inverse_of_their_sigma(camera: Camera) -> None:
             relative_weight(wrong, 200)
     rpc = camera.rpc
     norm = Normalization(rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
-    equal, weighted = Problem(ground, image, norm), Problem(ground, image, norm, weight=weight)
+    equal, weighted = FitProblem(ground, image, norm), FitProblem(ground, image, norm, weight=weight)
     for axis in (0, 1):
         whole = np.concatenate([rows for _, rows in equal.rows(axis)])
         expected = np.linalg.lstsq(whole[:, :-1] / sigma[:, None], whole[:, -1] / sigma, rcond=None)[0]
@@ -486,7 +486,7 @@ def test_the_noise_is_found_whatever_the_number_of_points(camera: Camera) -> Non
         sigmas = []
         for _ in range(5):
             ground, image = random_points(camera, count, rng)
-            problem = Problem(ground, image + rng.normal(0, 0.4, image.shape), norm)
+            problem = FitProblem(ground, image + rng.normal(0, 0.4, image.shape), norm)
             sigmas.append(noise_scaled(problem.compressed(0), expected_size(ALL))[1] * 10100.0)
         assert np.sqrt(np.mean(np.square(sigmas))) == pytest.approx(0.4, rel=0.15)
 
@@ -554,8 +554,8 @@ def test_the_papers_solver_counts_its_passes_over_the_points(camera: Camera, mon
     rpc = camera.rpc
     norm = Normalization(rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
     calls = []
-    compressed = Problem.compressed
-    monkeypatch.setattr(Problem, "compressed", lambda self, *given: calls.append(1) or compressed(self, *given))
-    *_, passes = solve_lcurve(Problem(ground, image, norm), [1])
+    compressed = FitProblem.compressed
+    monkeypatch.setattr(FitProblem, "compressed", lambda self, *given: calls.append(1) or compressed(self, *given))
+    *_, passes = solve_lcurve(FitProblem(ground, image, norm), [1])
     assert passes == len(calls)
     assert passes >= 5

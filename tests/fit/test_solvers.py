@@ -8,27 +8,27 @@ import pytest
 from barpc.fit import Normalization
 from barpc.fit.methods import _reweighted, corner
 from barpc.fit.precision import PRECISIONS
-from barpc.fit.system import ALL, Compressed, Problem, expected_size, noise_scaled, solution
+from barpc.fit.system import ALL, Compressed, FitProblem, expected_size, noise_scaled, solution
 from barpc.geodesy import Array
 from tests.fit.cameras import Camera, random_points
 
 
 @pytest.fixture(scope="module")
-def problem(camera: Camera) -> Problem:
+def problem(camera: Camera) -> FitProblem:
     rng = np.random.default_rng(1)
     ground, image = random_points(camera, 1300, rng)
     rpc = camera.rpc
     norm = Normalization(rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
-    return Problem(ground, image + rng.normal(0, 0.3, image.shape), norm)
+    return FitProblem(ground, image + rng.normal(0, 0.3, image.shape), norm)
 
 
-def dense(problem: Problem, axis: int, denominator: Array | None = None) -> Array:
+def dense(problem: FitProblem, axis: int, denominator: Array | None = None) -> Array:
     """The whole system (M | y) at once."""
     return np.concatenate([rows for _, rows in problem.rows(axis, denominator)])
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_the_compressed_system_is_the_system(camera: Camera, problem: Problem, axis: int) -> None:
+def test_the_compressed_system_is_the_system(camera: Camera, problem: FitProblem, axis: int) -> None:
     whole = dense(problem, axis, camera.rpc.coeffs[2 * axis + 1])
     system = problem.compressed(axis, camera.rpc.coeffs[2 * axis + 1])
     assert system.triangle.T @ system.triangle == pytest.approx(whole.T @ whole, abs=1e-9)
@@ -38,9 +38,9 @@ def test_the_compressed_system_is_the_system(camera: Camera, problem: Problem, a
     assert system.sigma == pytest.approx(np.sqrt(free[1][0] / (1300 - 39)))
 
 
-def test_rows_are_the_papers_equation(camera: Camera, problem: Problem) -> None:
+def test_rows_are_the_papers_equation(camera: Camera, problem: FitProblem) -> None:
     """w (m(x), -y m'(x)) (a, b') = w y holds for the coefficients of the RPC that made the points."""
-    exact = Problem(problem.ground, camera.rpc.project(problem.ground), problem.norm)
+    exact = FitProblem(problem.ground, camera.rpc.project(problem.ground), problem.norm)
     for axis in (0, 1):
         numerator, denominator = camera.rpc.coeffs[2 * axis : 2 * axis + 2]
         for weight in (None, denominator):
@@ -48,7 +48,7 @@ def test_rows_are_the_papers_equation(camera: Camera, problem: Problem) -> None:
             assert rows[:, :-1] @ np.r_[numerator, denominator[1:]] == pytest.approx(rows[:, -1], abs=1e-12)
 
 
-def test_the_penalised_solution_is_that_of_the_normal_equations(problem: Problem) -> None:
+def test_the_penalised_solution_is_that_of_the_normal_equations(problem: FitProblem) -> None:
     whole = dense(problem, 0)
     penalty = np.r_[np.zeros(4), np.linspace(0.1, 3, 35)]
     matrix = whole[:, :-1]
@@ -56,7 +56,7 @@ def test_the_penalised_solution_is_that_of_the_normal_equations(problem: Problem
     assert solution(problem.compressed(0).penalized(penalty)) == pytest.approx(expected, abs=1e-9)
 
 
-def test_the_penalty_follows_the_noise(camera: Camera, problem: Problem) -> None:
+def test_the_penalty_follows_the_noise(camera: Camera, problem: FitProblem) -> None:
     system = problem.compressed(0, camera.rpc.coeffs[1])
     expected = expected_size(ALL)
     assert expected[:4].tolist() == [np.inf] * 4
@@ -66,7 +66,7 @@ def test_the_penalty_follows_the_noise(camera: Camera, problem: Problem) -> None
     assert np.sqrt(np.diag(more)[20:23]) == pytest.approx(sigma / 0.003, rel=0.05)
 
 
-def test_the_corner_of_the_l_curve_has_the_largest_curvature(problem: Problem) -> None:
+def test_the_corner_of_the_l_curve_has_the_largest_curvature(problem: FitProblem) -> None:
     """Against the curvature of the sampled curve (log |M x - y|, log |x|)."""
     system = problem.compressed(0)
     h = corner([system])
@@ -107,9 +107,9 @@ def test_without_a_corner_the_regularisation_is_the_least() -> None:
     assert corner([Compressed(triangle, 10)]) == pytest.approx(0.1)
 
 
-def test_one_point_more_than_unknowns_tells_the_noise(problem: Problem) -> None:
+def test_one_point_more_than_unknowns_tells_the_noise(problem: FitProblem) -> None:
     """The residual of 40 points and 39 unknowns has one degree of freedom, as that of fewer is taken to have."""
-    few = Problem(problem.ground[:40], problem.image[:40], problem.norm)
+    few = FitProblem(problem.ground[:40], problem.image[:40], problem.norm)
     whole = dense(few, 0)
     residual = np.linalg.lstsq(whole[:, :-1], whole[:, -1], rcond=None)[1]
     assert few.compressed(0).sigma == pytest.approx(float(np.sqrt(residual[0])), rel=1e-3)
@@ -117,7 +117,7 @@ def test_one_point_more_than_unknowns_tells_the_noise(problem: Problem) -> None:
 
 @pytest.mark.parametrize("axes", [[0], [1], [0, 1]])
 def test_weighted_by_its_own_denominator_the_residual_is_that_of_the_image(
-    camera: Camera, problem: Problem, axes: list[int]
+    camera: Camera, problem: FitProblem, axes: list[int]
 ) -> None:
     rpc = camera.rpc
     coeffs = np.concatenate([rpc.coeffs[2 * axis : 2 * axis + 2] for axis in axes])
@@ -126,7 +126,7 @@ def test_weighted_by_its_own_denominator_the_residual_is_that_of_the_image(
     assert rmse == pytest.approx(np.sqrt((residual**2).mean()))
 
 
-def test_coefficients_rounded_in_turn_make_up_for_each_other(problem: Problem) -> None:
+def test_coefficients_rounded_in_turn_make_up_for_each_other(problem: FitProblem) -> None:
     system, _ = noise_scaled(problem.compressed(0), expected_size(ALL))
     exact = solution(system)
     coarse = lambda x: np.round(x, 4)  # noqa: E731

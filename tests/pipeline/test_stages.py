@@ -272,7 +272,7 @@ def test_a_run_without_some_of_its_views_keeps_what_belongs_to_the_others() -> N
 )
 def test_heights_of_a_reference_are_as_sure_as_what_they_count_from(monkeypatch, stated, known, used) -> None:
     seen = {}
-    monkeypatch.setattr(stages, "register", lambda *given, **how: seen.update(how))
+    monkeypatch.setattr(stages, "register_views", lambda *given, **how: seen.update(how))
     options = RunOptions(
         dem="d.tif", reference=("r.tif",), reference_sigma=7.0,
         adjust=AdjustOptions(dem_bias_sigma=stated, dem_sigma=4.0),

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from barpc import remote
-from barpc.remote import BLOCK, Part, Remote, RemoteFile, _Blocks, _runs, beside, is_url, place, stores, web
+from barpc.remote import BLOCK, Part, Remote, RemoteFile, _Blocks, _runs, beside, is_url, location, stores, web
 
 AT = Remote("https://a.org/b/x.tif", 20 * BLOCK + 5, "one")
 
@@ -38,8 +38,8 @@ def test_a_name_that_lies_here_is_no_url(tmp_path, monkeypatch):
     (tmp_path / "s3:/b").mkdir(parents=True)
     (tmp_path / "s3:/b/x").write_text("x")
     assert not is_url("s3://b/x")
-    assert not isinstance(place("s3://b/x"), Remote)
-    assert place(AT) is AT
+    assert not isinstance(location("s3://b/x"), Remote)
+    assert location(AT) is AT
 
 
 def test_a_file_has_the_version_that_it_is_found_to_have(monkeypatch):

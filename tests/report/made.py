@@ -13,7 +13,7 @@ from barpc.report.summary import SCHEMA, Summary, TablesEntry, TracksEntry
 from barpc.report.summary.known import GcpEntry
 from barpc.report.summary.pairs import OffsetEntry, PairEntry
 from barpc.report.summary.views import CorrectionEntry, ViewEntry
-from barpc.report.tables import Observations, RunFiles
+from barpc.report.tables import ObservationTable, RunFiles
 
 _VIEW: dict[str, Any] = {
     "path": "", "size": (1000, 800), "alt_range_m": (0.0, 500.0), "rpc_source": None, "gsd_m": 0.5,
@@ -60,18 +60,18 @@ def a_summary(views: Sequence[ViewEntry], pairs: Sequence[PairEntry] = (), **fie
     return Summary(views=tuple(views), pairs=tuple(pairs), **{**usual, **fields})
 
 
-def seen(rows: Sequence[tuple[Any, ...]]) -> Observations:
+def seen(rows: Sequence[tuple[Any, ...]]) -> ObservationTable:
     """Observations: view, track, xy, before, after, and whether each was used."""
     view, track, *numbers, used = zip(*rows, strict=True) if rows else ((),) * 6
     xy, before, after = (np.array(column, dtype=float).reshape(-1, 2) for column in numbers)
-    return Observations(np.array(view, int), np.array(track, int), xy, before, after, np.array(used, bool))
+    return ObservationTable(np.array(view, int), np.array(track, int), xy, before, after, np.array(used, bool))
 
 
 def files_of(
     summary: Summary,
     outlines: Sequence[Sequence[Array]] = (),
     points: Sequence[tuple[float, ...]] = (),
-    observed: Observations | None = None,
+    observed: ObservationTable | None = None,
 ) -> RunFiles:
     """A run's files."""
     table = np.array(points, dtype=float).reshape(-1, 4)

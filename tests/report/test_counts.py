@@ -14,7 +14,7 @@ from barpc.ba.held.ground import TerrainTest
 from barpc.report import decisions, page
 from barpc.report.summary import TracksEntry
 from barpc.report.verdict import block_verdict
-from barpc.tie.reference import Registration, ViewMatch
+from barpc.tie.reference import ReferenceControl, ViewMatch
 
 from .made import a_correction, a_gcp, a_pair, a_square, a_summary, a_view, files_of
 from .test_sentences import adjusted, control, gcps, run_of
@@ -80,7 +80,7 @@ def test_control_a_dem_and_a_reference(num):
     for fields in (
         {"adjustment": adjusted(terrain=terrain)},
         {"adjustment": adjusted(control=control(used=used)), "gcps": gcps()},
-        {"adjustment": adjusted(), "reference": Registration(SimpleNamespace(), matches, 0.5, 1.0)},
+        {"adjustment": adjusted(), "reference": ReferenceControl(SimpleNamespace(), matches, 0.5, 1.0)},
         {"left_out": (("a.tif", "a.tif: no RPC"),) * num},
     ):
         found = block_verdict(run_of(**fields), the_views(3, 40))

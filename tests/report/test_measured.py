@@ -24,7 +24,7 @@ from barpc.report.summary.whole import _asked
 from barpc.scene import Tracks
 from barpc.sensor.geometry import epipolar_offset
 from barpc.sensor.splined import RowSpline
-from barpc.tie.reference import Registration, ViewMatch
+from barpc.tie.reference import ReferenceControl, ViewMatch
 
 from .made import a_gcp
 
@@ -271,7 +271,7 @@ def test_a_reference_is_said_to_hold_the_points_that_were_kept():
         ViewMatch("B", 2.0, (7.0, 7.0), 40),
         ViewMatch("C", 8.0, (0.5, 0.0), 9, 8, 1, 0.3),
     )
-    found = Registration(SimpleNamespace(points=points), matches, 0.5, 1.25)
+    found = ReferenceControl(SimpleNamespace(points=points), matches, 0.5, 1.25)
     adjustment = SimpleNamespace(reference_inlier=np.array([True, True, True, False]))
     run = SimpleNamespace(reference=found, adjustment=adjustment, views=[0, 0, 0])
     entry = measure_reference(run)

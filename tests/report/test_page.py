@@ -18,7 +18,7 @@ from barpc.errors import BarpcError, InputError
 from barpc.pipeline import outputs
 from barpc.report import Run, maps, page, records, summarize
 from barpc.report.summary.words import metres
-from barpc.report.tables import TABLES, Observations, RunFiles
+from barpc.report.tables import TABLES, ObservationTable, RunFiles
 from barpc.scene import Tracks
 from tests.lanes import rest_slow
 from tests.report.conftest import run_of_block, written
@@ -149,7 +149,7 @@ def many_times(found: RunFiles, copies: int) -> RunFiles:
         tracks.append(found.tracks)
     lines = [f"{view.name}: doubtful: look for clouds, water, change, or wrong matches." for view in views]
     columns = (seen.track, seen.xy, seen.before, seen.after, seen.used)
-    observations = Observations(
+    observations = ObservationTable(
         np.concatenate([seen.view + copy * num for copy in range(copies)]),
         *(np.concatenate([column] * copies) for column in columns),
     )

@@ -17,7 +17,7 @@ from barpc.report import reservations
 from barpc.report import verdict as verdicts
 from barpc.report.summary.views import FitEntry
 from barpc.report.verdict import block_verdict, view_status
-from barpc.tie.reference import PEAK, Registration, ViewMatch
+from barpc.tie.reference import PEAK, ReferenceControl, ViewMatch
 from tests.rpcio.conftest import make_rpc
 
 from .made import a_correction, a_view
@@ -151,7 +151,7 @@ def test_what_is_advised_has_its_figures():
 
 def test_few_tie_points_do_where_a_reference_holds_the_very_image():
     def status(points: int, name: str = "A") -> str:
-        found = Registration(None, (ViewMatch(name, 9.0, (0.0, 0.0), points=points),), 1.0, 1.0)
+        found = ReferenceControl(None, (ViewMatch(name, 9.0, (0.0, 0.0), points=points),), 1.0, 1.0)
         return view_status(a_view(num_observations=3), run_of(reference=found))["status"]
 
     assert (status(4), status(0), status(4, "B")) == ("adjusted", "weak", "weak")
@@ -373,12 +373,12 @@ def test_control_that_scatters_is_said_to_unless_one_is_named():
 
 def test_a_reference_that_shows_something_else_is_of_no_use():
     matches = tuple(ViewMatch(name, peak, (0.0, 0.0)) for name, peak in (("A", 3.2), ("B", 5.1)))
-    (line,) = reasons(reference=Registration(None, matches, 1.0, 1.0))
+    (line,) = reasons(reference=ReferenceControl(None, matches, 1.0, 1.0))
     assert f"(its highest peak stands out by 5.1 standard deviations, {PEAK:g} are needed)" in line
-    (line,) = reasons(reference=Registration(None, (), 1.0, 1.0))
+    (line,) = reasons(reference=ReferenceControl(None, (), 1.0, 1.0))
     assert "by 0.0 standard" in line
     of_use = (ViewMatch("A", 9.0, (0.0, 0.0), tried=9, points=4),)
-    assert reasons(reference=Registration(SimpleNamespace(), of_use, 1.0, 1.0)) == []
+    assert reasons(reference=ReferenceControl(SimpleNamespace(), of_use, 1.0, 1.0)) == []
 
 
 # --- what was reached -------------------------------------------------------------------------------------
@@ -535,7 +535,7 @@ def test_what_is_wrong_with_a_dem_is_said_and_needs_a_look():
 
 def test_a_reference_is_said_to_hold_what_and_how_far_off_the_cameras_were():
     def lines(*matches: ViewMatch) -> str:
-        return "\n".join(said(run_of(reference=Registration(SimpleNamespace(), matches, 0.5, 1.0))))
+        return "\n".join(said(run_of(reference=ReferenceControl(SimpleNamespace(), matches, 0.5, 1.0))))
 
     one = ViewMatch("A", 9.5, (3.0, -4.0), tried=50, points=20)
     two = ViewMatch("B", 8.25, (0.0, 1.0), tried=30, points=10)
@@ -553,13 +553,13 @@ def test_a_reference_is_said_to_hold_what_and_how_far_off_the_cameras_were():
     assert "in 1 image," in lines(one)
     many = lines(*(ViewMatch(f"V{k}", 9.0, (3.0, 4.0), tried=1, points=1) for k in range(7)))
     assert "5.0 m (V4) and 2 more." in many
-    useless = said(run_of(reference=Registration(None, (none,), 0.5, 1.0)))
+    useless = said(run_of(reference=ReferenceControl(None, (none,), 0.5, 1.0)))
     assert any(line.startswith("Without ground control") and line.endswith("only.") for line in useless)
     with_gcps = said(
         run_of(
             adjusted(control=control()),
             gcps=gcps(),
-            reference=Registration(SimpleNamespace(), (one,), 0.5, 1.0),
+            reference=ReferenceControl(SimpleNamespace(), (one,), 0.5, 1.0),
         )
     )
     assert any(line.startswith("With 3 GCPs") for line in with_gcps)
@@ -605,7 +605,7 @@ def test_a_reference_on_heights_that_may_be_above_a_geoid_is_told_so_and_not_jit
 def test_a_reference_on_heights_of_another_place_is_told(along, told):
     seen = ViewMatch("A", 9.0, (1.0, 0.0), 90, 50, 40, 2.0, along, 0.2, 5.0)
     other = replace(seen, name="B", along=2.0)
-    found = reasons(reference=Registration(SimpleNamespace(), (seen, other), 10.0, 2.5))
+    found = reasons(reference=ReferenceControl(SimpleNamespace(), (seen, other), 10.0, 2.5))
     assert len(found) == told
     if told:
         assert "points lie off each other by 20.0 m in A, as heights wrong by 99.5 m would make them (2.0 m" in found[0]
@@ -619,7 +619,7 @@ def test_a_reference_whose_points_lie_off_each_other_by_more_than_its_pixel_is_t
         ViewMatch("B", 9.0, (1.0, 0.0), 90, 50, 40, 2.0),
         ViewMatch("C", 3.0, (0.0, 0.0)),
     )
-    found = reasons(reference=Registration(SimpleNamespace(), matches, 10.0, 2.5))
+    found = reasons(reference=ReferenceControl(SimpleNamespace(), matches, 10.0, 2.5))
     assert len(found) == told
     if told:
         assert "by more than the 10.0 m of a pixel that finding them may leave, in A (10.1 m): it bends" in found[0]

@@ -20,8 +20,8 @@ from barpc.errors import ImageError, InputError, OutputError, RpcError, RpcForma
 from barpc.raster import open_raster
 from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, resample, write_rpc, write_rpc_copy, write_rpc_vrt
 from barpc.rpcio import formats as formats_module
-from barpc.rpcio.acquisition import Light, light_of
-from barpc.rpcio.fields import collect_numbered, number, numbers
+from barpc.rpcio.acquisition import Sunlight, light_of
+from barpc.rpcio.fields import collect_numbered, listed_numbers, number
 from barpc.rpcio.formats import files_of, find_rpc, parse, row_of, write_camera
 from barpc.rpcio.grids import read_correction, write_correction, write_grid
 from barpc.rpcio.images import write_crop, write_rpc_nitf
@@ -540,7 +540,7 @@ def test_what_is_no_number_is_refused_by_name(text: str) -> None:
 
 
 def test_lists_are_parted_by_blanks_and_commas() -> None:
-    assert numbers(" 1, 2  3,4,\n5 ,", "a", "K") == [1, 2, 3, 4, 5]
+    assert listed_numbers(" 1, 2  3,4,\n5 ,", "a", "K") == [1, 2, 3, 4, 5]
 
 
 def test_numbered_coefficients_are_gathered_from_their_first_index_on() -> None:
@@ -638,21 +638,21 @@ def test_nodes_are_even_to_a_millionth_of_a_step(off: float, ok: bool, tmp_path:
 
 def test_the_sun_of_an_image_is_the_median_of_what_its_files_say(tmp_path: Path) -> None:
     image = tmp_path / "IMG_x_R1C1.TIF"
-    assert light_of(str(image)) == Light()
+    assert light_of(str(image)) == Sunlight()
     (tmp_path / "DIM_x.XML").write_text(
         "<IMAGING_DATE>2013-04-17</IMAGING_DATE><IMAGING_TIME>10:36:02.1Z</IMAGING_TIME>"
         + "".join(f'<SUN_ELEVATION unit="deg">{e}</SUN_ELEVATION><SUN_AZIMUTH unit="deg">{a}</SUN_AZIMUTH>'
                   for e, a in ((50.0, 140.0), (51.0, 150.0), (59.0, 141.0)))
     )  # fmt: skip
-    assert light_of(str(image)) == Light(51.0, 141.0, "2013-04-17T10:36:02.1Z")
+    assert light_of(str(image)) == Sunlight(51.0, 141.0, "2013-04-17T10:36:02.1Z")
     (tmp_path / "IMG_x_R1C1.IMD").write_text(
         "meanSunEl = 33.5;\nmeanSunAz = 361.0;\nfirstLineTime = 2014-01-02T03:04:05Z;"
     )
-    assert light_of(str(image)) == Light(33.5, 141.0, "2014-01-02T03:04:05Z")  # no azimuth is beyond a turn
+    assert light_of(str(image)) == Sunlight(33.5, 141.0, "2014-01-02T03:04:05Z")  # no azimuth is beyond a turn
     (tmp_path / "IMG_x_R1C1.IMD").write_text("meanSunAz = -360;")
     assert light_of(str(image)).azimuth == -360.0
-    assert light_of("https://host/IMG_x_R1C1.TIF") == Light()
-    assert light_of("") == Light()
+    assert light_of("https://host/IMG_x_R1C1.TIF") == Sunlight()
+    assert light_of("") == Sunlight()
 
 
 @pytest.mark.parametrize(("day", "stated"), [("1957-01-01", True), ("1956-12-31", False)])

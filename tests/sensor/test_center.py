@@ -10,6 +10,7 @@ import pytest
 
 from barpc.cameras import open_camera
 from barpc.errors import RpcError
+from barpc.sensor import geometry
 from barpc.sensor.geometry import NOMINAL_ALTITUDE, PLAUSIBLE_ALTITUDE, camera_center
 from barpc.simulate.orbit import Look, fly
 from tests.sensor.conftest import make_rpc
@@ -119,3 +120,31 @@ def test_a_projective_camera_over_a_pushbroom_image_stands_at_about_twice_its_di
     blind: Any = Pinhole(columns=100.0)
     with pytest.raises(RpcError):
         camera_center(blind, SIZE, ALTITUDES, "projective")
+
+
+def test_the_rays_that_meet_are_those_of_the_middle_row(monkeypatch) -> None:
+    """Of a camera that flies on while its rows are seen; from end to end of the row, at both ends of its heights."""
+    fly, seen = np.array([0.0, 700.0, 0.0]), []
+
+    def localize(sensors: Any, image: np.ndarray, alt: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+        seen.append((image.copy(), alt.copy(), np.asarray(bounds).copy()))
+        camera = Pinhole()
+        start, out = camera.center.copy(), np.empty((len(image), 3))
+        for row in np.unique(image[:, 1]):
+            camera.center = start + row * fly
+            rows = image[:, 1] == row
+            out[rows] = camera.localize(image[rows], alt[rows])
+        return out
+
+    monkeypatch.setattr(geometry, "localize", localize)
+    camera: Any = Pinhole()
+    found = camera_center(camera, SIZE, ALTITUDES)
+    middle = camera.center + (SIZE[1] - 1) / 2 * fly
+    assert np.linalg.norm(found.ecef - middle) < 1e-3 * 7e5
+    ((image, alt, bounds),) = seen
+    half = len(image) // 2
+    np.testing.assert_allclose(image[:half, 0], np.linspace(0.0, SIZE[0] - 1, half))
+    np.testing.assert_array_equal(image[half:], image[:half])
+    np.testing.assert_array_equal(image[:, 1], (SIZE[1] - 1) / 2)
+    np.testing.assert_array_equal(alt, np.repeat(ALTITUDES, half))
+    np.testing.assert_array_equal(bounds, [0, 2 * half])

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from barpc.errors import InputError, RpcError, RpcFormatError
 from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.sensor.circle import aside, dot, on_circle
-from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected, Motion
+from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected, RigidMotion
 from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
 from barpc.sensor.curve import Curve, about_middle, cross, rotation_matrix
 from barpc.sensor.document import Fields, parse_time, seconds
@@ -221,7 +221,7 @@ def test_motions_of_many_views_are_those_of_each() -> None:
         rng.normal(0, 9, (2, 3)),
     )
     ecef, drift = rng.normal(0, 50, (3, 5)), rng.normal(0, 0.1, (3, 5))
-    whole = Motion(ecef, rotation, translation, center, np.array([0, 2, 5]), drift)
+    whole = RigidMotion(ecef, rotation, translation, center, np.array([0, 2, 5]), drift)
     for n in range(5):
         v = int(n >= 2)
         turn = Rotation.from_rotvec(drift[:, n]) * Rotation.from_rotvec(rotation[v])
@@ -234,10 +234,10 @@ def test_motions_of_many_views_are_those_of_each() -> None:
             ends = []
             for sign in (step, -step):
                 x, r, d = (a + sign * e[:, None] * (k == j) for j, a in ((0, ecef), (1, rotation.T), (2, drift)))
-                ends.append(Motion(x, r.T, translation, center, np.array([0, 2, 5]), d).ecef)
+                ends.append(RigidMotion(x, r.T, translation, center, np.array([0, 2, 5]), d).ecef)
             rate = (ends[0] - ends[1]) / (2 * step)
             np.testing.assert_allclose(parts[k][:, axis], (by_moved * rate).sum(axis=1), rtol=1e-6, atol=1e-7)
-    still = Motion(ecef, rotation, translation, center, np.array([0, 2, 5])).by_turns(by_moved)
+    still = RigidMotion(ecef, rotation, translation, center, np.array([0, 2, 5])).by_turns(by_moved)
     np.testing.assert_array_equal(*still)
 
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from barpc.errors import InputError, RpcFormatError
 from barpc.geodesy import ecef_from_ground, enu_basis
 from barpc.sensor.linescan import read_linescan
-from barpc.sensor.linescan.samples import Detector, Samples, _check_times, build, unit
+from barpc.sensor.linescan.samples import Detector, Samples, _check_times, camera_of_samples, unit
 from tests.sensor.linescan_files import SIZE, Flight, Truth, dimap, isd, stamp
 
 FLIGHT = Flight(swing=0.0)
@@ -47,12 +47,12 @@ def kept(rows: np.ndarray, only: str = "both") -> Samples:
 
 def refused(given: Samples, words: str, **how: object) -> None:
     with pytest.raises(RpcFormatError, match=f"a.xml: .*{words}") as told:
-        build(given, detector(**how))
+        camera_of_samples(given, detector(**how))
     assert "\n" not in str(told.value)
 
 
 def test_the_camera_of_samples_is_the_one_that_was_flown() -> None:
-    found = build(samples(), detector())
+    found = camera_of_samples(samples(), detector())
     assert found.size == SIZE
     assert found.model.accuracy is None
     ground = FLIGHT.sensor.localize(IMAGE, np.full(4, 300.0))
@@ -60,12 +60,12 @@ def test_the_camera_of_samples_is_the_one_that_was_flown() -> None:
 
 
 def test_stated_deviations_are_metres_on_the_ground_and_metres_of_the_place() -> None:
-    model = build(samples(), detector(), sigma=(2e-6, 0.3)).model
+    model = camera_of_samples(samples(), detector(), sigma=(2e-6, 0.3)).model
     middle = (np.array(SIZE) - 1) / 2
     far = np.linalg.norm(ecef_from_ground(model.localize(middle, np.zeros(()))) - model.position(middle[1]))
     assert model.accuracy == pytest.approx((2e-6 * far, 0.3), rel=1e-9)
     for nothing in ((0.0, 0.3), (2e-6, 0.0), None):
-        assert build(samples(), detector(), sigma=nothing).model.accuracy is None
+        assert camera_of_samples(samples(), detector(), sigma=nothing).model.accuracy is None
 
 
 @pytest.mark.parametrize("what", ["positions", "attitudes"])
@@ -73,10 +73,10 @@ def test_samples_may_end_two_steps_within_the_image_and_no_more(what: str) -> No
     """Row 0 is at the third sample, the last row between the last but four and the last but three."""
     rows = np.arange(len(FLIGHT.times))
     step = 0.02
-    assert build(kept(rows[4:], what), detector()).size == SIZE
+    assert camera_of_samples(kept(rows[4:], what), detector()).size == SIZE
     refused(kept(rows[5:], what), f"its {what} from 0.06 to")
     late = np.flatnonzero(FLIGHT.times >= LAST - 2 * step)[0]
-    assert build(kept(rows[: late + 1], what), detector()).size == SIZE
+    assert camera_of_samples(kept(rows[: late + 1], what), detector()).size == SIZE
     refused(kept(rows[:late], what), f"its {what} from -0.04 to")
 
 
@@ -92,7 +92,7 @@ def test_beyond_slow_samples_a_camera_is_believed_for_a_second() -> None:
     for shift, ok in ((0.95, True), (1.05, False)):  # the samples come late by so much
         late = replace(flown, times=flown.times + shift, ticks=flown.ticks + shift)
         if ok:
-            assert build(late, detector(slow)).size == slow.size
+            assert camera_of_samples(late, detector(slow)).size == slow.size
         else:
             refused(late, "the image lasts from 0.00", flight=slow)
 
@@ -100,7 +100,7 @@ def test_beyond_slow_samples_a_camera_is_believed_for_a_second() -> None:
 @pytest.mark.parametrize("what", ["positions", "attitudes"])
 def test_a_gap_within_the_image_is_one_of_more_than_four_steps(what: str) -> None:
     rows = np.arange(len(FLIGHT.times))
-    assert build(kept(np.delete(rows, range(30, 33)), what), detector()).size == SIZE
+    assert camera_of_samples(kept(np.delete(rows, range(30, 33)), what), detector()).size == SIZE
     refused(kept(np.delete(rows, range(30, 34)), what), f"no {what} from 0.54 to 0.64 s, within the image")
 
 
@@ -122,7 +122,7 @@ def with_more(times: np.ndarray) -> Samples:
 
 @pytest.mark.parametrize("times", [[-0.5, -0.48], [LAST + 0.5, LAST + 0.52]])
 def test_a_gap_outside_of_the_image_does_not_matter(times: list[float]) -> None:
-    assert build(with_more(np.array(times)), detector()).size == SIZE
+    assert camera_of_samples(with_more(np.array(times)), detector()).size == SIZE
     first, *_, last = FLIGHT.times
     late = Detector(FLIGHT.sensor.look, FLIGHT.sensor.look_origin, FLIGHT.period, SIZE)
     shifted = with_more(np.array(times))
@@ -130,7 +130,7 @@ def test_a_gap_outside_of_the_image_does_not_matter(times: list[float]) -> None:
     shifted = replace(shifted, times=shifted.times + into, ticks=shifted.ticks + into)
     assert first < 0 < last
     with pytest.raises(RpcFormatError, match=r"no positions from .*, within the image"):
-        build(shifted, late)
+        camera_of_samples(shifted, late)
 
 
 @pytest.mark.parametrize(
@@ -146,7 +146,7 @@ def test_a_gap_may_begin_where_the_image_ends_and_end_where_it_begins(span: tupl
 @pytest.mark.parametrize("what", ["positions", "attitudes"])
 def test_three_samples_or_times_that_do_not_rise_are_none(what: str) -> None:
     some = np.linspace(0, len(FLIGHT.times) - 1, 4).astype(int)
-    assert build(kept(some, what), detector()).size == SIZE
+    assert camera_of_samples(kept(some, what), detector()).size == SIZE
     refused(kept(some[:3], what), f"3 {what}, or their times do not rise; four or more are needed")
     name = "times" if what == "positions" else "ticks"
     times = FLIGHT.times.copy()
@@ -160,7 +160,7 @@ def test_satellites_fly_between_6500_and_8000_km_from_the_earth_s_centre(radius:
     scale = radius / np.linalg.norm(s.positions, axis=1).mean()
     moved = replace(s, positions=s.positions * scale, velocities=s.velocities * scale)
     if ok:
-        assert build(moved, detector()).size == SIZE
+        assert camera_of_samples(moved, detector()).size == SIZE
     else:
         refused(moved, "no satellite's orbit; metres and ECEF are expected")
 
@@ -172,12 +172,12 @@ def test_a_stated_velocity_may_be_that_of_the_inertial_frame(off: float, ok: boo
     velocities = s.velocities.copy()
     velocities[9] += off * np.array([0.6, 0.0, -0.8])
     if ok:
-        assert build(replace(s, velocities=velocities), detector()).size == SIZE
+        assert camera_of_samples(replace(s, velocities=velocities), detector()).size == SIZE
     else:
         refused(replace(s, velocities=velocities), "otherwise than their stated velocities; are the times right")
     velocities = s.velocities.copy()
     velocities[[0, -1]] += 5000.0  # of differences to one side nothing is asked
-    assert build(replace(s, velocities=velocities), detector()).size == SIZE
+    assert camera_of_samples(replace(s, velocities=velocities), detector()).size == SIZE
 
 
 @pytest.mark.parametrize(("rate", "ok"), [(0.28, True), (0.32, False)])
@@ -188,7 +188,7 @@ def test_no_satellite_turns_by_a_third_of_a_radian_a_second(rate: float, ok: boo
     body = FLIGHT.body * Rotation.from_rotvec(jump)
     q = body.as_quat(scalar_first=True) * np.where(np.arange(len(s.ticks)) % 2, 1.0, -1.0)[:, None]
     if ok:
-        assert build(replace(s, quaternions=q), detector()).size == SIZE
+        assert camera_of_samples(replace(s, quaternions=q), detector()).size == SIZE
     else:
         refused(replace(s, quaternions=q), r"turns by 0.3\d* rad/s at 0.74 s, as no satellite does")
 
@@ -210,7 +210,7 @@ def test_positions_that_scatter_by_millimetres_are_smoothed_by_centimetres_not(n
     s = samples()
     rng = np.random.default_rng(0)
     shaken = s.positions + rng.normal(0, noise, s.positions.shape)
-    orbit = build(replace(s, positions=shaken), detector()).model.orbit
+    orbit = camera_of_samples(replace(s, positions=shaken), detector()).model.orbit
     off = np.abs(orbit(s.times)[0].T - shaken)[3:-3].max()
     assert (off > noise) == smoothed
     assert (len(orbit.coeffs) == 1) == smoothed
@@ -231,13 +231,13 @@ def test_an_orbit_takes_the_least_degree_whose_next_term_is_below_a_hundredth_of
     half = 0.5 * np.ptp(flight.times)
     terms = {d: 7e6 * (1.2e-3 * half) ** (d + 1) / np.prod(np.arange(1.0, d + 2)) for d in range(2, 7)}
     assert next(d for d in terms if terms[d] < 1e-5) == degree
-    orbit = build(flown, detector(flight)).model.orbit
+    orbit = camera_of_samples(flown, detector(flight)).model.orbit
     assert orbit.coeffs.shape == (1, degree + 1, 3)
     np.testing.assert_allclose(orbit(flight.times)[0].T, flight.positions, rtol=0, atol=2e-5)
     few = np.linspace(0, len(flight.times) - 1, degree + 1).astype(int)
     if len(few) >= 4:  # no more samples than unknowns: the curve goes through them
         held = replace(flown, times=flown.times[few], positions=flown.positions[few], velocities=flown.velocities[few])
-        there = build(held, detector(flight)).model.orbit
+        there = camera_of_samples(held, detector(flight)).model.orbit
         np.testing.assert_allclose(there(held.times)[0].T, held.positions, rtol=0, atol=1e-7)
         assert there != orbit
 
@@ -249,7 +249,7 @@ def test_a_camera_that_looks_into_space_is_refused() -> None:
 
 def test_an_image_that_was_turned_over_lasts_from_its_last_row_to_its_first() -> None:
     back = replace(samples(), times=FLIGHT.times - LAST, ticks=FLIGHT.times - LAST)
-    found = build(back, detector(period=-FLIGHT.period)).model
+    found = camera_of_samples(back, detector(period=-FLIGHT.period)).model
     ground = FLIGHT.sensor.localize(IMAGE, np.full(4, 300.0))
     last = SIZE[1] - 1
     np.testing.assert_allclose(
@@ -492,7 +492,7 @@ def test_a_short_image_may_miss_by_two_rows(tmp_path) -> None:
 
 def test_the_camera_is_above_its_image() -> None:
     """Of the helper: the flight looks down by 25 degrees."""
-    model = build(samples(), detector()).model
+    model = camera_of_samples(samples(), detector()).model
     ground = model.localize((np.array(SIZE) - 1) / 2, np.zeros(()))
     up = enu_basis(ground)[2]
     sight = model.position((SIZE[1] - 1) / 2) - ecef_from_ground(ground)

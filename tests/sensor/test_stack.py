@@ -10,7 +10,7 @@ import pytest
 from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center, camera_centers
-from barpc.sensor.stack import localize
+from barpc.sensor.stack import localize_stack
 from barpc.simulate import simulate_block
 from tests.sensor.test_rpc import VENDORS, box
 
@@ -36,14 +36,14 @@ def test_ground_points_are_those_of_each_camera(sensors, counts, reach):
         rng.uniform(0, 900, bounds[-1]),
     )
     with np.errstate(all="ignore"):
-        found = localize(sensors, image, alt, bounds)
+        found = localize_stack(sensors, image, alt, bounds)
         parts = [slice(*ends) for ends in pairwise(bounds)]
         alone = [one.localize(image[part], alt[part]) for one, part in zip(sensors, parts, strict=True)]
     np.testing.assert_allclose(found, np.concatenate(alone), rtol=0, atol=2e-12)
 
 
 def test_nothing_is_asked_of_no_camera():
-    assert localize([], np.zeros((0, 2)), np.zeros(0), np.zeros(1, dtype=np.int64)).shape == (0, 3)
+    assert localize_stack([], np.zeros((0, 2)), np.zeros(0), np.zeros(1, dtype=np.int64)).shape == (0, 3)
     assert camera_centers([], [], []) == []
 
 
@@ -60,6 +60,6 @@ def test_vendors_cameras_are_met_far_from_their_boxes(shared_data):
     rpcs = [read_rpc(shared_data / file) for file in VENDORS]
     image, alt = map(np.concatenate, zip(*(box(rpc, 3.0, 200) for rpc in rpcs), strict=True))
     with np.errstate(all="ignore"):
-        found = localize(rpcs, image, alt, 200 * np.arange(len(rpcs) + 1))
+        found = localize_stack(rpcs, image, alt, 200 * np.arange(len(rpcs) + 1))
         alone = [rpc.localize(image[200 * n :][:200], alt[200 * n :][:200]) for n, rpc in enumerate(rpcs)]
     np.testing.assert_allclose(found, np.concatenate(alone), rtol=0, atol=1e-12)

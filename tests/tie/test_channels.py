@@ -10,7 +10,7 @@ from scipy import ndimage
 from barpc.tie.patches.channels import (
     COARSE,
     FINE,
-    Found,
+    FoundTemplates,
     _registered,
     _shifted,
     channels,
@@ -171,7 +171,7 @@ def test_where_little_is_a_correlation_is_of_a_fiftieth_of_the_template_at_least
 
 def test_what_passes_beats_its_decoy_by_the_margin_comes_back_and_is_a_picture():
     score = np.array([0.5, 0.5, 0.5, 0.5, 0.5])
-    found = Found(
+    found = FoundTemplates(
         np.zeros((5, 2)),
         score,
         np.array([0.39, 0.41, 0.39, 0.39, 0.45]),

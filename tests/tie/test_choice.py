@@ -186,7 +186,7 @@ class Looks:
         self.alike, self.compared, self.tried = alike, [], []
         self._options = TieOptions(neighbours=neighbours)
         monkeypatch.setattr(tracks, "locate", lambda views, _, store, **rest: [KeypointFiles(store)] * len(views))
-        monkeypatch.setattr(tracks, "match", self._match)
+        monkeypatch.setattr(tracks, "match_pairs", self._match)
         monkeypatch.setattr(tracks, "quick_score", self._score)
 
     def _ties(self, names) -> bool:

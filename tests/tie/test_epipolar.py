@@ -7,7 +7,7 @@ import pytest
 
 from barpc.tie.pairing.epipolar import (
     Affine,
-    agreeing,
+    affine_inliers,
     common_range,
     frame,
     grouped,
@@ -108,15 +108,15 @@ def test_what_agrees_lies_within_three_deviations_or_the_floor_window_by_window(
     noise = rng.uniform(-0.1, 0.1, 400)
     values = noise + np.where(xy[:, 0] > 3000, 40.0, 0.0)
     values[5], values[6], values[205] = 0.32, 0.28, 40.0 + 0.32
-    keep, residual = agreeing(xy, values, floor=0.3)
+    keep, residual = affine_inliers(xy, values, floor=0.3)
     assert np.flatnonzero(~keep).tolist() == [5, 205]
     np.testing.assert_allclose(residual[:5], values[:5], atol=0.05)
     wide = rng.normal(0, 1.0, 400)
     wide[7], wide[8] = 4.5, 2.3
-    keep, _ = agreeing(xy[:200], wide[:200], floor=0.3)
+    keep, _ = affine_inliers(xy[:200], wide[:200], floor=0.3)
     assert not keep[7]
     assert keep[8]
-    assert agreeing(xy[:0], values[:0])[0].shape == (0,)
+    assert affine_inliers(xy[:0], values[:0])[0].shape == (0,)
 
 
 def test_a_frames_linear_map_is_that_of_the_middle_of_the_points_that_are_seen(scene: Rendered) -> None:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from barpc.tie import TieOptions
-from barpc.tie.matchers.features import Keypoints, Share, Sift, allotted, detect_tile, join, quota, ranked
+from barpc.tie.matchers.features import Keypoints, Share, Sift, allotted, detect_tile, join_keypoints, quota, ranked
 from barpc.tie.matchers.guided import _ROWS, Guided, _near
 from barpc.tie.matchers.matcher import Matches, Prediction
-from barpc.tie.pairing.epipolar import Frame
+from barpc.tie.pairing.epipolar import EpipolarSegments
 from barpc.tie.pixels import Stretch, grow, read_pixels, sample_stretch, survey, tiles
 from tests.constants import chosen
 from tests.tie.conftest import write_image
@@ -26,7 +26,7 @@ def keypoints(rng: np.random.Generator, xy: np.ndarray, descriptors: np.ndarray)
 
 
 @pytest.fixture(scope="module")
-def pair() -> tuple[Keypoints, Keypoints, Frame]:
+def pair() -> tuple[Keypoints, Keypoints, EpipolarSegments]:
     """Five hundred points a side in 300 px; half of B shows what A shows, some twice, a few pixels apart."""
     rng = np.random.default_rng(3)
     described = rng.integers(0, 120, (500, 128)).astype(np.uint8)
@@ -43,10 +43,10 @@ def pair() -> tuple[Keypoints, Keypoints, Frame]:
     slope = rng.uniform(-0.05, 0.05, 500)
     slope[::50] = np.nan
     before, after = rng.uniform(-16, -8, 500), rng.uniform(8, 16, 500)
-    return a, b, Frame(np.array([1.0, 0.0]), *predicted.T, slope, before, after, LINEAR)
+    return a, b, EpipolarSegments(np.array([1.0, 0.0]), *predicted.T, slope, before, after, LINEAR)
 
 
-def brute(a: Keypoints, b: Keypoints, where: Frame) -> dict[tuple[int, int], tuple[float, float]]:
+def brute(a: Keypoints, b: Keypoints, where: EpipolarSegments) -> dict[tuple[int, int], tuple[float, float]]:
     """Mutual best pairs: (distance, ambiguity), one point after the other."""
     unit = [k.descriptors / np.linalg.norm(k.descriptors.astype(float), axis=1)[:, None] for k in (a, b)]
     likeness = np.full((len(a), len(b)), -np.inf)
@@ -75,7 +75,7 @@ def brute(a: Keypoints, b: Keypoints, where: Frame) -> dict[tuple[int, int], tup
     return found
 
 
-def guided(a: Keypoints, b: Keypoints, where: Frame, ratio: float, probes: int | None = None) -> Matches:
+def guided(a: Keypoints, b: Keypoints, where: EpipolarSegments, ratio: float, probes: int | None = None) -> Matches:
     prediction = Prediction(lambda xy: where, ACROSS, list, probes)
     return Guided(TieOptions(ratio=ratio), (a, b)).match(None, None, prediction)  # type: ignore[arg-type]
 
@@ -104,7 +104,7 @@ def test_where_the_cameras_error_is_looked_for_some_points_and_clear_matches_are
         assert len(expected) > 10
 
 
-def where_of(where: Frame, rows: np.ndarray) -> Frame:
+def where_of(where: EpipolarSegments, rows: np.ndarray) -> EpipolarSegments:
     names = ("along", "across", "slope", "before", "after")
     return replace(where, **{name: getattr(where, name)[rows] for name in names})
 
@@ -181,7 +181,7 @@ def test_descriptors_are_square_roots_of_shares_and_angles_are_radians(tmp_path)
     assert everything.angle.max() > 1.0
     nothing = Sift().detect(picture, lambda xy, scale, response: np.arange(0))
     assert len(nothing) == 0
-    assert join([]).descriptors.shape == (0, 128)
+    assert join_keypoints([]).descriptors.shape == (0, 128)
 
 
 def test_a_tile_holds_the_keypoints_between_its_edges_away_from_nodata(tmp_path) -> None:
@@ -197,7 +197,7 @@ def test_a_tile_holds_the_keypoints_between_its_edges_away_from_nodata(tmp_path)
     for (col, row, width, height), part in zip(boxes, found, strict=True):
         assert (part.xy >= [col - 0.5, row - 0.5]).all()
         assert (part.xy < [col + width - 0.5, row + height - 0.5]).all()
-    every = join(found)
+    every = join_keypoints(found)
     assert (250 - every.xy[:, 0] > 2.9).all()
     assert (250 - every.xy[:, 0] > every.scale - 1.5).all()
     assert (every.xy > 2.0).all()
@@ -259,7 +259,7 @@ def test_all_points_of_slanted_bands_are_looked_at_and_few_others(slope: float, 
     rng = np.random.default_rng(0)
     turned = rng.uniform(0, 2000, (4000, 2))
     place = rng.uniform(-100, 2100, (500, 2))
-    where = Frame(np.array([1.0, 0.0]), *place.T, *(np.full(500, x) for x in (slope, *reach)), np.eye(2))
+    where = EpipolarSegments(np.array([1.0, 0.0]), *place.T, *(np.full(500, x) for x in (slope, *reach)), np.eye(2))
     asked, seen = np.arange(0, 500, 3), []
     for rows, cols in _near(where, 3.0, asked, turned):
         seen.append(rows)

@@ -20,7 +20,7 @@ from barpc.tie import Matches, common_tracks, find_tracks
 from barpc.tie.matchers.hook import Hook, hook_files, hooked
 from barpc.tie.matchers.matcher import Prediction
 from barpc.tie.matchers.matching import MATCHERS, matcher_named
-from barpc.tie.pairing.epipolar import Frame
+from barpc.tie.pairing.epipolar import EpipolarSegments
 from tests.lanes import rest_slow
 from tests.tie.test_pairs import METRE, camera, views
 
@@ -146,11 +146,11 @@ def test_a_changed_module_is_run_again_an_unchanged_one_not(render, module, tmp_
     assert 0.4 < counts[2][1] / counts[0][1] < 0.6
 
 
-def everywhere(xy: np.ndarray) -> Frame:
+def everywhere(xy: np.ndarray) -> EpipolarSegments:
     """Predictions of a place in B that is that of A, ten pixels along the rows either way."""
     x, y = xy.T
     zero, ten = np.zeros(len(xy)), np.full(len(xy), 10.0)
-    return Frame(np.array([1.0, 0.0]), x, y, zero, -ten, ten, np.eye(2))
+    return EpipolarSegments(np.array([1.0, 0.0]), x, y, zero, -ten, ten, np.eye(2))
 
 
 def test_a_matcher_of_ones_own_sees_the_images_as_their_files_are(monkeypatch) -> None:

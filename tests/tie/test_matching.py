@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from barpc.tie import TieOptions
-from barpc.tie.matchers.features import join
+from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
 from barpc.tie.matchers.matching import MATCHERS, PairReport, _better, _latest, _Search, enough
 from barpc.tie.pairing.epipolar import (
-    Frame,
+    EpipolarSegments,
 )
 from tests.tie.test_pairs import camera, views
 
@@ -72,12 +72,16 @@ class Scripted:
 def search(monkeypatch) -> Callable[[Scripted], _Search]:
     def made(matcher: Scripted) -> _Search:
         monkeypatch.setitem(MATCHERS, "scripted", lambda *_: matcher)
-        return _Search(tuple(views(camera(0.0), camera(0.0))), (join([]), join([])), TieOptions(matcher="scripted"))
+        return _Search(
+            tuple(views(camera(0.0), camera(0.0))),
+            (join_keypoints([]), join_keypoints([])),
+            TieOptions(matcher="scripted"),
+        )
 
     return made
 
 
-FLAT = Prediction(lambda xy: Frame(np.array([1.0, 0.0]), *(np.zeros(len(xy)),) * 5, np.eye(2)), 3.0, list)
+FLAT = Prediction(lambda xy: EpipolarSegments(np.array([1.0, 0.0]), *(np.zeros(len(xy)),) * 5, np.eye(2)), 3.0, list)
 
 
 @pytest.mark.parametrize(

@@ -12,16 +12,16 @@ import pytest
 from barpc.scene import Tracks
 from barpc.tie import Matches, TieOptions, tracks
 from barpc.tie.matchers import matching
-from barpc.tie.matchers.features import join
+from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES
-from barpc.tie.matchers.matching import PairReport, _altitudes, match, match_pair
+from barpc.tie.matchers.matching import PairReport, _altitudes, match_pair, match_pairs
 from barpc.tie.pairing.overlaps import Pair
 from barpc.tie.tracks import _joined, _unlike, _with_unregistered
 
 from .test_pairs import camera, views
 
 PAIR = Pair((0, 1), 1.0, 5.0)
-NOBODY = join([]), join([])
+NOBODY = join_keypoints([]), join_keypoints([])
 
 
 @pytest.fixture
@@ -124,7 +124,7 @@ def second_look(monkeypatch):
         monkeypatch.setattr(matching, "_match_within", within)
         many = views(*(camera(0.0, lean=0.1 * k) for k in range(len(reports) + 1)))
         pairs = [Pair((k, k + 1), 1.0, 5.0) for k in range(len(reports))]
-        found = match(many, [join([])] * len(many), pairs, options, **given)
+        found = match_pairs(many, [join_keypoints([])] * len(many), pairs, options, **given)
         return again, [one.matcher for _, one in found]
 
     return asked

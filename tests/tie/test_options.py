@@ -21,6 +21,7 @@ from barpc.tie.pairing.epipolar import (
     frame,
 )
 from barpc.tie.pairing.overlaps import Pair
+from barpc.tie.patches import dense
 from barpc.tie.patches.register import refine
 from barpc.tie.pixels import survey, tiles
 from tests.constants import CONSTANTS, chosen
@@ -285,3 +286,10 @@ def test_common_altitudes_are_those_that_both_ranges_hold() -> None:
         given = (replace(two[0], alt_range=first), replace(two[1], alt_range=second))
         assert common_range(*given) == common
         assert common_range(*given[::-1]) == common
+
+
+def test_the_penalties_of_dense_matching_are_opencv_s_for_disparities_twice_as_fine() -> None:
+    """8 and 32 times the pixels of a window, by the manual of StereoSGBM; of one channel."""
+    assert dense.FINER == 2
+    assert dense._SGBM["P1"] == dense.FINER * 8 * dense._SGBM["blockSize"] ** 2 == 400
+    assert dense._SGBM["P2"] == dense.FINER * 32 * dense._SGBM["blockSize"] ** 2 == 1600

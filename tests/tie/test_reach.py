@@ -19,13 +19,13 @@ from barpc.pipeline.loading import load_views
 from barpc.scene import View
 from barpc.tie import PairReport, TieOptions, common_tracks, find_tracks
 from barpc.tie.matchers import matching, structural
-from barpc.tie.matchers.features import join
+from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Prediction
 from barpc.tie.matchers.matching import _Search, match_pair
 from barpc.tie.pairing.epipolar import frame
 from barpc.tie.pairing.overlaps import Pair, reach_of
 from barpc.tie.patches import oriented
-from barpc.tie.patches.oriented import Tile
+from barpc.tie.patches.oriented import PatchTile
 
 from .conftest import write_image
 from .test_pairs import METRE, camera, views
@@ -73,7 +73,7 @@ def test_no_width_is_searched_twice(monkeypatch, asked, passes) -> None:
 
     monkeypatch.setitem(matching.MATCHERS, "nothing", Nothing)
     two = (*views(camera(0.0), camera(METRE)),)
-    search = _Search(two, (join([]), join([])), TieOptions(matcher="nothing", search=asked))  # type: ignore[arg-type]
+    search = _Search(two, (join_keypoints([]), join_keypoints([])), TieOptions(matcher="nothing", search=asked))  # type: ignore[arg-type]
     assert search.offset() is None
     assert made == passes
 
@@ -95,7 +95,7 @@ def test_where_clear_matches_show_no_offset_looser_thresholds_are_not_tried(monk
         return NO_MATCHES, PairReport(("a", "b"), status, (900, 900), overlap=1.0)
 
     monkeypatch.setattr(matching, "_attempt", attempt)
-    match_pair((None, None), (join([]),) * 2, Pair((0, 1), 1.0, 5.0), TieOptions(ratio=ratio))  # type: ignore[arg-type]
+    match_pair((None, None), (join_keypoints([]),) * 2, Pair((0, 1), 1.0, 5.0), TieOptions(ratio=ratio))  # type: ignore[arg-type]
     assert len(made) == times
 
 
@@ -142,18 +142,18 @@ def test_segments_around_an_epipole_stay_near_their_points() -> None:
 def test_a_search_in_parts_finds_what_a_search_in_one_finds(monkeypatch, scene) -> None:
     """Bands without votes: every point is looked for alone; how many are correlated together changes nothing."""
     options = TieOptions(matcher="structure", search=20.0)
-    search = _Search(tuple(scene.views), (join([]), join([])), options)
+    search = _Search(tuple(scene.views), (join_keypoints([]), join_keypoints([])), options)
     coarse = search.offset()
     assert coarse is not None
     whole = structural._Search(*scene.views, 1, coarse).matches()
-    sizes, of = [], Tile.surfaces
+    sizes, of = [], PatchTile.surfaces
 
     def watched(self):
         found = of(self)
         sizes.append(found.size)
         return found
 
-    monkeypatch.setattr(Tile, "surfaces", watched)
+    monkeypatch.setattr(PatchTile, "surfaces", watched)
     monkeypatch.setattr(structural, "_SURFACE", 60_000)
     monkeypatch.setattr(oriented, "_AREA", 20_000)
     parts = structural._Search(*scene.views, 1, coarse).matches()

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from barpc.scene import Tracks, View
-from barpc.tie import TieOptions, TieResult, common_tracks, detect, find_tracks, match, select_pairs
-from barpc.tie.pairing.epipolar import Affine, agreeing, frame, robust_affine, robust_spread
+from barpc.tie import TieOptions, TieResult, common_tracks, detect, find_tracks, match_pairs, select_pairs
+from barpc.tie.pairing.epipolar import Affine, affine_inliers, frame, robust_affine, robust_spread
 
 PAIRS = [(0, 1), (0, 2), (1, 2)]
 
@@ -31,9 +31,9 @@ def raw_spread(views: list[View]) -> dict[tuple[int, int], float]:
     """Spread of the detector's own positions [px]."""
     found, options = {}, TieOptions()
     pairs = select_pairs(views, options)
-    for pair, (matches, _) in zip(pairs, match(views, detect(views, options), pairs, options), strict=True):
+    for pair, (matches, _) in zip(pairs, match_pairs(views, detect(views, options), pairs, options), strict=True):
         errors = across(views, *pair.views, matches.xy[:, 0], matches.xy[:, 1])
-        found[pair.views] = robust_spread(agreeing(matches.xy[:, 0], errors)[1])
+        found[pair.views] = robust_spread(affine_inliers(matches.xy[:, 0], errors)[1])
     return found
 
 

@@ -18,7 +18,7 @@ from barpc.pipeline.loading import load_views
 from barpc.rpcio import read_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
-from barpc.tie.reference import PEAK, Registration, ViewMatch, _affine, _Work, peak, register
+from barpc.tie.reference import PEAK, ReferenceControl, ViewMatch, _affine, _Work, peak, register_views
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.season import other_season, write_dem, write_reference
 from tests.scenes.terrain import Grid
@@ -79,7 +79,7 @@ def shifted(view: View, px: tuple[float, float]) -> View:
 @pytest.mark.parametrize("px", [(0.0, 0.0), (120.0, -90.0)])
 def test_the_camera_is_off_by_what_was_done_to_it(px, views, reference, dem, truth):
     view = shifted(views[0], px)
-    found = register([view], [reference], dem)
+    found = register_views([view], [reference], dem)
     (match,) = found.views
     assert match.peak > PEAK
     assert match.points > 100
@@ -103,7 +103,7 @@ def read_rpc_of(truth, name: str) -> RPC:
 @pytest.mark.slow
 def test_a_reference_that_lies_off_moves_what_it_finds(views, scene, season, dem, reference, truth, tmp_path):
     there = str(write_reference(tmp_path / "ref.tif", scene, season, GSD, shift=(6.0, -4.0)))
-    first, second = (register(views, [path], dem, sigma=5.0) for path in (reference, there))
+    first, second = (register_views(views, [path], dem, sigma=5.0) for path in (reference, there))
     moved = np.subtract(second.views[0].offset, first.views[0].offset)
     assert moved == pytest.approx([-6.0, 4.0], abs=0.2)
     assert second.control.bias[:2] == pytest.approx([5.0, 5.0])
@@ -115,7 +115,7 @@ def test_other_places_and_no_texture_are_refused(views, scene, season, dem, tmp_
     plain = Grid(season.origin, season.step, np.full_like(season.values, 0.3))
     for name, grid in (("mirrored", mirrored), ("plain", plain)):
         path = str(write_reference(tmp_path / f"{name}.tif", scene, grid, GSD))
-        found = register(views, [path], dem)
+        found = register_views(views, [path], dem)
         assert found.control is None, name
         assert found.views[0].peak < PEAK - 1.0
         assert found.views[0].points == 0
@@ -124,7 +124,7 @@ def test_other_places_and_no_texture_are_refused(views, scene, season, dem, tmp_
 @pytest.mark.slow
 def test_a_reference_that_does_not_reach_the_image_is_no_error(views, scene, season, dem, tmp_path):
     path = str(write_reference(tmp_path / "far.tif", scene, season, GSD, shift=(5000.0, 0.0)))
-    found = register(views, [path], dem)
+    found = register_views(views, [path], dem)
     assert found.control is None
     assert found.views[0].peak == 0.0
 
@@ -139,10 +139,10 @@ def test_of_several_files_each_shows_its_part(views, reference, dem, tmp_path):
         profile.update(width=part.shape[1], transform=rasterio.Affine(GSD, 0, place.c + GSD * left, 0, -GSD, place.f))
         with rasterio.open(paths[-1], "w", **profile) as file:
             file.write(part, 1)
-    whole, parts = register(views, [reference], dem), register(views, paths, dem)
+    whole, parts = register_views(views, [reference], dem), register_views(views, paths, dem)
     assert parts.views[0].points > 0.6 * whole.views[0].points
     assert np.subtract(parts.views[0].offset, whole.views[0].offset) == pytest.approx([0, 0], abs=0.2)
-    east = register(views, paths[1:], dem).control.points
+    east = register_views(views, paths[1:], dem).control.points
     whole_east = whole.control.points.lonlatalt[:, 0].max()
     assert east.lonlatalt[:, 0].max() == pytest.approx(whole_east, abs=1e-3)
     assert east.lonlatalt[:, 0].min() > whole.control.points.lonlatalt[:, 0].min() + 1e-3
@@ -150,7 +150,7 @@ def test_of_several_files_each_shows_its_part(views, reference, dem, tmp_path):
 
 def test_a_raster_without_a_place_is_refused(views):
     with pytest.raises(InputError, match="no place on the ground"):
-        register(views, [views[0].path], flat)
+        register_views(views, [views[0].path], flat)
     assert read_rpc(views[0].path) is not None
 
 
@@ -222,7 +222,7 @@ def test_every_camera_of_a_plain_is_off_by_what_was_done_to_it(plains):
     seen, _, reference, _ = plains
     (first, one), (second, two) = wrong(seen[0], (20.0, -11.0)), wrong(seen[1], (-7.5, 4.25))
     assert one == pytest.approx([-41.7, -23.0], abs=0.5)  # of 2.08 m; rows run south
-    found = register([first, second], [reference], flat, height_sigma=(7.0, 3.0))
+    found = register_views([first, second], [reference], flat, height_sigma=(7.0, 3.0))
     for match, off in zip(found.views, (one, two), strict=True):
         assert match.offset == pytest.approx(off, abs=0.2)
         assert match.peak > 3 * PEAK
@@ -252,7 +252,7 @@ def test_what_a_plain_does_not_show_is_not_found_and_what_two_files_share_is(pla
     seen, grey, _, folder = plains
     other, far = plain(folder / "other.tif", ground(2)), plain(folder / "far.tif", grey, left=3000)
     for path in (other, far):
-        found = register(seen[:1], [path], flat)
+        found = register_views(seen[:1], [path], flat)
         assert found.control is None
         assert found.views[0].peak < PEAK - 1.0
         assert (found.views[0].tried, found.views[0].points) == (0, 0)
@@ -260,7 +260,7 @@ def test_what_a_plain_does_not_show_is_not_found_and_what_two_files_share_is(pla
         plain(folder / "w.tif", grey[:, : WIDE // 2]),
         plain(folder / "e.tif", grey[:, WIDE // 2 :], WIDE // 2),
     ]
-    mixed = register(seen[:1], [far, *halves], flat, sigma=5.0)
+    mixed = register_views(seen[:1], [far, *halves], flat, sigma=5.0)
     assert 150 < mixed.views[0].points < 260
     assert mixed.views[0].offset == pytest.approx([0.0, 0.0], abs=0.1)
     east = mixed.control.points.lonlatalt[:, 0] / DEGREES
@@ -282,8 +282,8 @@ def test_a_reference_is_good_to_a_quarter_of_its_pixel_and_to_half_a_metre_at_be
         file.write(np.ones((50, 50), np.uint8), 1)
     monkeypatch.setattr(_Work, "vote", lambda self: [(0.0, np.zeros(2))])  # it shows nothing
     view = View("a", "", (SIDE, SIDE), camera(0.0), (0.0, 200.0))
-    assert register([view], [str(path)], flat).sigma == pytest.approx(sigma, rel=0.02)
-    assert register([view], [str(path)], flat, sigma=7.0).sigma == 7.0
+    assert register_views([view], [str(path)], flat).sigma == pytest.approx(sigma, rel=0.02)
+    assert register_views([view], [str(path)], flat, sigma=7.0).sigma == 7.0
 
 
 # --- pieces -------------------------------------------------------------------------------------------------
@@ -361,14 +361,14 @@ def test_what_is_refused_is_refused_for_what_it_lacks():
     low = (ViewMatch("A", 3.2, (0.0, 0.0)), ViewMatch("B", 5.1, (0.0, 0.0)))
     assert (
         "highest peak stands out by 5.1 standard deviations, 6.5 are needed"
-        in Registration(None, low, 5.0, 1.25).refusal
+        in ReferenceControl(None, low, 5.0, 1.25).refusal
     )
     found = (*low, ViewMatch("C", 14.4, (3.0, 0.0), tried=900, passed=9))
-    why = Registration(None, found, 5.0, 1.25).refusal
+    why = ReferenceControl(None, found, 5.0, 1.25).refusal
     assert "are needed" not in why
     assert "stands out by 14.4 standard deviations), but of 900 points looked for there no 12 of an image agree" in why
     assert "(9 found at most)" in why
-    assert "by 0.0 standard" in Registration(None, (), 5.0, 1.25).refusal
+    assert "by 0.0 standard" in ReferenceControl(None, (), 5.0, 1.25).refusal
 
 
 def test_fewer_than_twelve_that_agree_are_none():

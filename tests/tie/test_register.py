@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from barpc.tie.patches.register import _Template, _upsampled, _with_derivatives, register, register_places
+from barpc.tie.patches.register import _Template, _upsampled, _with_derivatives, register_patches, register_places
 from tests.lanes import diagonal
 from tests.tie.conftest import write_image
 
@@ -38,7 +38,7 @@ def warped(image: np.ndarray, linear: np.ndarray, shift: np.ndarray) -> np.ndarr
 def run(first, second, reference, start, linear, patch: int = 21, valid=None):
     valid = valid if valid is not None else np.ones((SIZE, SIZE), bool)
     many = np.broadcast_to(linear, (len(reference), 2, 2)).copy()
-    return register((first, second), (valid, valid), reference, start, many, patch)
+    return register_patches((first, second), (valid, valid), reference, start, many, patch)
 
 
 @pytest.fixture(scope="module")

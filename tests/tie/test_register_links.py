@@ -14,7 +14,7 @@ from barpc.tie.pairing.epipolar import (
     frame,
 )
 from barpc.tie.patches.register import (
-    Registration,
+    PatchRegistration,
     _at,
     _joined,
     _Links,
@@ -89,7 +89,7 @@ def test_sigmas_are_those_of_the_epipolar_lines_where_these_say_more(count, nois
     tracks = Tracks(np.tile([0, 1], count), np.repeat(np.arange(count), 2), xy, np.full(2 * count, 0.1))
     links = _Links(two, tracks, np.arange(0, 2 * count, 2), np.arange(1, 2 * count, 2))
     across = rng.normal(0, noise, count)
-    found = Registration.none(xy[1::2] + np.column_stack([rng.uniform(-5, 5, count), across]))
+    found = PatchRegistration.none(xy[1::2] + np.column_stack([rng.uniform(-5, 5, count), across]))
     found.sigma[:] = 0.1
     sigma = links.scaled(found, np.ones(count, dtype=bool))
     np.testing.assert_allclose(sigma, scaled, rtol=0.3 if scaled > 0.1 else 1e-12)
@@ -145,13 +145,13 @@ def test_what_is_verified_is_on_its_line_at_its_altitude_and_no_less_certain_tha
         xy[group] = where.place(altitude[group] * where.after)
         assert 15.0 < np.median(where.after) < 45.0
         aside = np.array([-where.axis[1], where.axis[0]])
-    found = Registration(xy, np.ones(120), np.full(120, 0.1), np.ones(120, dtype=bool))
+    found = PatchRegistration(xy, np.ones(120), np.full(120, 0.1), np.ones(120, dtype=bool))
     every = np.ones(120, dtype=bool)
     assert links.verified(found, every).all()
     few = every.copy()
     few[::3] = False
     np.testing.assert_array_equal(links.verified(found, few), few)
-    off = Registration(xy.copy(), found.correlation, found.sigma.copy(), found.ok)
+    off = PatchRegistration(xy.copy(), found.correlation, found.sigma.copy(), found.ok)
     off.xy[20] += 0.15 * aside  # off its line
     off.xy[51] += 3.0 * np.array([aside[1], -aside[0]])  # along it: at another altitude than its neighbour
     off.sigma[80], off.sigma[90] = 0.21, 0.19  # of the median 0.1 twice is tolerated
@@ -209,9 +209,9 @@ def test_places_far_apart_are_found_as_in_one_window(tmp_path, monkeypatch, inte
 def test_patches_are_registered_tile_by_tile(monkeypatch) -> None:
     links, seen = links_of(80, 3), []
 
-    def ordered(executor: Any, function: Any, tasks: Any, name: str, progress: Any) -> list[Registration]:
+    def ordered(executor: Any, function: Any, tasks: Any, name: str, progress: Any) -> list[PatchRegistration]:
         seen.extend(tasks)
-        return [Registration.none(task[3]) for task in tasks]
+        return [PatchRegistration.none(task[3]) for task in tasks]
 
     monkeypatch.setattr("barpc.tie.patches.register.ordered", ordered)
     monkeypatch.setattr("barpc.tie.patches.register._sparse", lambda *_: False)

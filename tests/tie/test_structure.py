@@ -23,7 +23,7 @@ from barpc.tie import (
     select_pairs,
 )
 from barpc.tie.matchers import matching, structural
-from barpc.tie.matchers.features import join
+from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Prediction
 from barpc.tie.matchers.matching import (
     FINE,
@@ -40,8 +40,8 @@ from barpc.tie.matchers.structural import (
     _Search,
     _supported,
 )
-from barpc.tie.pairing.epipolar import Frame, frame, robust_affine
-from barpc.tie.patches.oriented import Files, Sampling, Tile, register_places, resolution
+from barpc.tie.pairing.epipolar import EpipolarSegments, frame, robust_affine
+from barpc.tie.patches.oriented import Files, PatchTile, Sampling, register_oriented, resolution
 from barpc.tie.pixels import read_pixels
 from tests.scenes.redrawn import redrawn
 from tests.scenes.season import SEASONS, disguised
@@ -121,7 +121,7 @@ def test_a_patch_is_registered_where_the_truth_says(render, side, axis, most) ->
     truth = np.concatenate(known)
     assert len(at) > 50
     linear = np.broadcast_to(np.eye(2), (len(at), 2, 2))
-    xy, ok, score = register_places([(v.path, v.size) for v in (a, b)], 1, at, truth + [1.0, -1.0], linear)
+    xy, ok, score = register_oriented([(v.path, v.size) for v in (a, b)], 1, at, truth + [1.0, -1.0], linear)
     assert ok.mean() > 0.8
     assert (np.abs(np.median((xy - truth)[ok], axis=0)) < 0.05).all()
     assert (1.4826 * np.median(np.abs((xy - truth)[ok]), axis=0) < most).all()
@@ -138,7 +138,7 @@ def test_two_dates_of_a_satellite_lie_where_they_lie(shared_data, step: float) -
         [(str(path), (1200, 1200)) for path in paths],
         np.broadcast_to(np.eye(2), (len(grid), 2, 2)),
     )
-    xy, ok, _ = register_places(files, 1, grid, grid + [-0.6, 1.9], linear)
+    xy, ok, _ = register_oriented(files, 1, grid, grid + [-0.6, 1.9], linear)
     common = [robust_affine(grid[ok], (xy - grid)[ok, k]) for k in (0, 1)]
     apart = np.hypot(*((xy - grid)[:, k] - fit(grid) for k, fit in enumerate(common)))
     assert (ok & (apart < 1.0)).mean() >= 0.95
@@ -157,7 +157,7 @@ def small(render) -> tuple[View, View]:
 def matched(small) -> tuple[Matches, PairReport]:
     """What structure finds of a pair."""
     pair = select_pairs(small, TieOptions())[0]
-    return match_pair(small, (join([]), join([])), pair, TieOptions(matcher=STRUCTURE))
+    return match_pair(small, (join_keypoints([]), join_keypoints([])), pair, TieOptions(matcher=STRUCTURE))
 
 
 @pytest.mark.slow
@@ -213,7 +213,7 @@ def test_fewer_altitudes_are_tried_where_all_find_few(small, monkeypatch) -> Non
     for most, tries in ((99, 2), (100, 1)):
         asked.clear()
         report = _match_within(
-            [wide, narrow], (join([]), join([])), select_pairs(small, TieOptions())[0], TieOptions()
+            [wide, narrow], (join_keypoints([]), join_keypoints([])), select_pairs(small, TieOptions())[0], TieOptions()
         )[1]
         assert report.verified == most
         assert asked == [(0.0, 300.0), (100.0, 200.0)][:tries]
@@ -286,10 +286,10 @@ def test_the_cameras_error_is_looked_for_in_pictures_as_coarse_as_the_search_is_
 def test_how_long_bands_are_is_measured_in_the_middles_of_the_windows(half, step) -> None:
     """Half of the length; a window that B does not see says nothing."""
 
-    def where(at: np.ndarray) -> Frame:
+    def where(at: np.ndarray) -> EpipolarSegments:
         length = np.where(at[:, 0] < 2000.0, half, np.nan)
         nothing = np.zeros(len(at))
-        return Frame(np.array([1.0, 0.0]), nothing, nothing, nothing, -0.5 * length, 1.5 * length, np.eye(2))
+        return EpipolarSegments(np.array([1.0, 0.0]), nothing, nothing, nothing, -0.5 * length, 1.5 * length, np.eye(2))
 
     view: View = SimpleNamespace(path="", size=(4000, 2000))  # type: ignore[assignment]
     for windows, found in (([(0, 0, 2000, 2000), (3000, 0, 900, 900)], step), ([(3000, 0, 900, 900)], 2)):
@@ -323,7 +323,7 @@ def test_a_segment_is_looked_at_as_far_as_it_lies_in_the_image(start, axis, most
     search._files = (("a", (1, 1)), ("b", (1000, 800)))
     (x, y), half = axis, np.full(1, most)
     along, across = start[0] * x + start[1] * y, start[1] * x - start[0] * y
-    where = Frame(np.array(axis), np.array([along]), np.array([across]), np.zeros(1), -half, half, np.eye(2))
+    where = EpipolarSegments(np.array(axis), np.array([along]), np.array([across]), np.zeros(1), -half, half, np.eye(2))
     found = search._part_in_b(where, np.zeros(1), np.array([0]), 10.0)
     assert found == pytest.approx(expected)
 
@@ -404,7 +404,7 @@ def test_a_place_beyond_the_band_and_its_sides_is_not_found_however_alike(
     axis = np.array([0.6, 0.8])
     along, across = (at + moved) @ axis + beyond, (at + moved) @ [-0.8, 0.6] + aside
     half = np.full(3, 25.0)
-    where = Frame(axis, along, across, np.zeros(3), -half, half, np.eye(2))
+    where = EpipolarSegments(axis, along, across, np.zeros(3), -half, half, np.eye(2))
     monkeypatch.setattr(structural, "linear_map", lambda *_: np.eye(2))
     search = _Search.__new__(_Search)
     search._views, search._files, search._band, search._whole = (), files, 1, False  # type: ignore[assignment]
@@ -425,18 +425,18 @@ def test_patches_that_lie_together_share_a_picture(textured, monkeypatch) -> Non
     axis = np.arange(80.0, 241.0, 40.0)
     at = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     turn = np.broadcast_to(np.eye(2), (len(at), 2, 2))
-    xy, ok, _ = register_places(files, 1, at, at + moved, turn)
+    xy, ok, _ = register_oriented(files, 1, at, at + moved, turn)
     assert ok.all()
     np.testing.assert_allclose(xy, at + moved, atol=0.05)
     assert len(made) == 4  # of both images, whole pixels and halves
 
 
-def plain_tile(reach: tuple[int, int] = (4, 3), half: int = 5) -> Tile:
+def plain_tile(reach: tuple[int, int] = (4, 3), half: int = 5) -> PatchTile:
     """Two points of a picture that is A and B; a pixel of it is two of B, turned by a right angle."""
     noise = np.random.default_rng(0).normal(size=(2, 40, 50)).astype(np.float32)
     at = np.array([[15, 12], [30, 25]])
     matrix = np.array([[0.0, -2.0], [2.0, 0.0]])
-    return Tile(
+    return PatchTile(
         (noise, noise),
         at,
         at.copy(),

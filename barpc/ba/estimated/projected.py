@@ -18,7 +18,7 @@ from barpc.ba.algebra.structure import parts
 from barpc.ba.estimated.unknowns import Unknowns
 from barpc.geodesy import Array, ground_from_ecef, ground_rows_from_ecef
 from barpc.scene import IntArray, View
-from barpc.sensor.corrected import Motion
+from barpc.sensor.corrected import RigidMotion
 from barpc.sensor.rpc import RPC
 from barpc.sensor.stack import RpcStack
 
@@ -141,7 +141,7 @@ class Cameras:
             row = (seen[1] - unknowns.middle[1, index]) / unknowns.half[1, index]
             drift = unknowns.drift_rotation(params, index, row)
         rotation, translation = unknowns.rotation(of_views, views), unknowns.translation(of_views)
-        motion = Motion(ecef, rotation, translation, unknowns.center[views], bounds, drift)
+        motion = RigidMotion(ecef, rotation, translation, unknowns.center[views], bounds, drift)
         if wanted == "image":
             none = np.empty((2, 0, len(index)))
             return Projected(self._image(motion.ecef, views, bounds), none, none)

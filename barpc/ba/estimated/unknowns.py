@@ -20,7 +20,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
 from barpc.sensor.geometry import camera_centers
 from barpc.sensor.splined import Splined
-from barpc.sensor.stack import localize
+from barpc.sensor.stack import localize_stack
 from barpc.sensor.timing import Clocked, Timed, Timing, is_clocked
 
 _IMAGE_TERMS = {"shift": (0,), "shift-drift": (0, 2), "affine": (0, 1, 2)}
@@ -213,7 +213,7 @@ def make_unknowns(
         found = camera_centers([v.sensor for v in views], [v.size for v in views], [v.alt_range for v in views])
         centers = np.array([center.ecef for center in found]).reshape(-1, 3)
     altitude, number = np.array([view.altitude for view in views]), np.arange(len(views) + 1)
-    scene = ecef_from_ground(localize([v.sensor for v in views], (size - 1.0) / 2.0, altitude, number))
+    scene = ecef_from_ground(localize_stack([v.sensor for v in views], (size - 1.0) / 2.0, altitude, number))
     distance = np.linalg.norm(centers - scene, axis=1)
     middle = scene.mean(axis=0)
     place = (scene - middle) @ enu_basis(ground_from_ecef(middle))[:2].T

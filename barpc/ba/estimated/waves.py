@@ -18,7 +18,7 @@ import scipy.linalg as la
 
 from barpc.geodesy import Array
 from barpc.scene import IntArray
-from barpc.sensor.splined import RowSpline, bsplines, profile, swing
+from barpc.sensor.splined import RowSpline, bsplines, profile, sine_and_cosine
 
 PER_SPLINE = 30  # observations of a view
 FEWEST = 7  # splines
@@ -127,7 +127,7 @@ class Waves:
             axis, *shape = np.moveaxis(self.strips, -1, 0)[:, index]  # (n, M) each
             found.append(profile(np.where(axis == 0.0, seen[0][:, None], seen[1][:, None]), *shape).T)
         if self.periods.shape[1]:
-            found.append(np.concatenate(list(swing(seen[1][:, None], self.periods[index])), axis=1).T)
+            found.append(np.concatenate(list(sine_and_cosine(seen[1][:, None], self.periods[index])), axis=1).T)
         return found
 
     def displaced(self, params: Array, index: IntArray, basis: list[Array]) -> Array:

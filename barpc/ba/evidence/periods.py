@@ -15,7 +15,7 @@ import numpy as np
 from barpc.ba.evidence.scan import CLIPPED, SURE
 from barpc.geodesy import Array
 from barpc.scene import IntArray
-from barpc.sensor.splined import swing
+from barpc.sensor.splined import sine_and_cosine
 
 _SHORTEST = 32.0  # rows: of what is shorter a matcher's window shows the mean
 _BIN = _SHORTEST / 8.0  # rows summed: 2 % of the shortest are lost
@@ -118,7 +118,7 @@ class _Rows:
 
     def _level(self, k: int, period: float) -> float:
         """Return the level of the spectrum beside a peak over that of noise, the peak taken away: at least 1."""
-        basis = np.vstack([np.ones(len(self.row)), swing(self.row, np.array(period))])
+        basis = np.vstack([np.ones(len(self.row)), sine_and_cosine(self.row, np.array(period))])
         weighted = basis * self.right
         gain = self._spectrum(self.off - (np.linalg.solve(weighted @ basis.T, weighted @ self.off.T)).T @ basis)
         away = np.abs(self.waves - self.waves[k])

@@ -16,7 +16,7 @@ from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointEr
 from barpc.geodesy import Array, ecef_from_ground
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, Tracks, View, connected_groups
-from barpc.sensor.stack import localize
+from barpc.sensor.stack import localize_stack
 
 MIN_OBSERVATIONS = 4  # of a view, or it stops: six unknowns need three points, and one to check them
 _LISTED = 10  # views named in a message
@@ -86,7 +86,7 @@ class Block:
         first, seen = first[order], seen[order]
         bounds = np.searchsorted(self.view[first], np.arange(len(self.views) + 1))
         alt = np.array([view.altitude for view in self.views])[self.view[first]]
-        ground = localize([view.sensor for view in self.views], self.xy[:, first].T, alt, bounds)
+        ground = localize_stack([view.sensor for view in self.views], self.xy[:, first].T, alt, bounds)
         points[seen] = ecef_from_ground(ground)
         points[self.num_tracks : self.num_known] = ecef_from_ground(self.gcps.lonlatalt)
         if self.reference is not None:

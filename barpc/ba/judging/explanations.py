@@ -17,7 +17,7 @@ from barpc.ba.judging import moving
 from barpc.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import profile
-from barpc.sensor.splined import swing as waves_of
+from barpc.sensor.splined import sine_and_cosine as waves_of
 
 STRIP = "strip"
 FADE = "fade"
@@ -171,7 +171,7 @@ def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explan
     if one.parts:
         return _settling(seen, one.where[4], sigma)
     axis = one.where[0]
-    rows = np.flatnonzero((seen.linear.view == one.view) & (found.right + 1.0 > 0.0))
+    rows = np.flatnonzero(seen.linear.view == one.view)
     rows = rows[np.argsort(seen.place[axis, rows], kind="stable")]
     left = seen.linear.left(found.step) + others / seen.linear.sigma
     displaced = left.copy()

@@ -17,7 +17,7 @@ from barpc.sidefile import parse_xml
 
 __all__ = ["Linescan", "read_linescan"]
 
-_VENDORS = {vendor.ROOT: vendor for vendor in (maxar, dimap)}
+_VENDORS = {maxar.ROOT: (maxar.camera_of_isd, maxar.KIND), dimap.ROOT: (dimap.camera_of_dimap, dimap.KIND)}
 
 
 def read_linescan(
@@ -48,10 +48,10 @@ def read_linescan(
         raise RpcFormatError(
             f"{path}: no physical camera model; its root is <{root.element.tag}>, expected one of {known}"
         )
-    found: Linescan = vendor.read(root, band)
-    usual: Light = vendor.light(root)
+    read, kind = vendor
+    found, usual = read(root, band)
     light = Light(
         usual.aberration if aberration is None else aberration,
         usual.refraction if refraction is None else refraction,
     )
-    return replace(found, model=replace(found.model, light=light), kind=vendor.KIND)
+    return replace(found, model=replace(found.model, light=light), kind=kind)

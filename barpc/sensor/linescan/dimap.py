@@ -18,7 +18,7 @@ from barpc.errors import InputError, RpcFormatError
 from barpc.geodesy import Array
 from barpc.sensor.curve import EXTRAPOLATION
 from barpc.sensor.document import Fields, seconds
-from barpc.sensor.linescan.samples import Detector, Linescan, Samples, build
+from barpc.sensor.linescan.samples import Detector, Linescan, Samples, camera_of_samples
 from barpc.sensor.pushbroom import Light
 
 ROOT, KIND = "Dimap_Document", "dimap physical model"
@@ -30,15 +30,17 @@ _DAY = 86400.0  # s: OFFSET counts from midnight
 _STEP = 0.05  # s: at which a polynomial attitude is sampled
 
 
-def light(root: Fields) -> Light:
+def _light(root: Fields) -> Light:
     """Return the light bending that the product's settings state: none (Pleiades), refraction (Neo)."""
     stated = "Processing_Information/Product_Settings/Geometric_Settings/{}_SETTING"
     said = (root.element.findtext(stated.format(w), "") for w in ("LIGHT_SPEED", "ATMOSPHERIC_REFRACTION"))
     return Light(*(text.strip().lower() == "true" for text in said))
 
 
-def read(root: Fields, band: str | None = None) -> Linescan:
-    """Return the model of a DIMAP; RpcFormatError where it is damaged or has none, InputError for no such `band`."""
+def camera_of_dimap(root: Fields, band: str | None = None) -> tuple[Linescan, Light]:
+    """Return the model of a DIMAP, and how light bends; RpcFormatError where it is damaged or has none, InputError
+    for no such `band`.
+    """
     if root.element.find("Geometric_Data/Refined_Model") is None:
         raise RpcFormatError(f"{root.name}: no Geometric_Data/Refined_Model: it holds no physical camera model")
     model, raster = root.one("Geometric_Data/Refined_Model"), root.one("Raster_Data/Raster_Dimensions")
@@ -53,7 +55,7 @@ def read(root: Fields, band: str | None = None) -> Linescan:
     ticks, quaternions = _attitude(model.one("Attitudes"), first, (size[1] - 1) * period)
     samples = Samples(root.name, times, positions, velocities, ticks, quaternions)
     look, origin = _look(model.one("Geometric_Calibration/Instrument_Calibration"), band)
-    return build(samples, Detector(look, origin, period, size))
+    return camera_of_samples(samples, Detector(look, origin, period, size)), _light(root)
 
 
 def _times(parts: list[Fields], epoch: np.datetime64) -> Array:

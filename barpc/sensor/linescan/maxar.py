@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from barpc.errors import InputError, RpcFormatError
 from barpc.geodesy import Array
 from barpc.sensor.document import Fields, seconds
-from barpc.sensor.linescan.samples import Detector, Linescan, Samples, build, unit
+from barpc.sensor.linescan.samples import Detector, Linescan, Samples, camera_of_samples, unit
 from barpc.sensor.pushbroom import Light
 
 ROOT, KIND = "isd", "maxar physical model"
@@ -26,17 +26,13 @@ ROOT, KIND = "isd", "maxar physical model"
 _MOST = 1_000_000  # rows or columns
 _STRAIGHT = 0.01  # rows by which line times may leave a straight line
 _TABLES = {"EPH": (13, 7), "ATT": (15, 5)}  # numbers of a row: with covariances, without
+_LIGHT = Light(aberration=True, refraction=True)  # star trackers tell where the body points
 
 
-def light(_root: Fields) -> Light:
-    """Return the light bending of Maxar's cameras: aberration and refraction, as star trackers tell where the
-    body points.
+def camera_of_isd(root: Fields, band: str | None = None) -> tuple[Linescan, Light]:
+    """Return the model of an ISD, and how light bends; RpcFormatError where it is damaged, InputError where `band` is
+    none of its bands.
     """
-    return Light(aberration=True, refraction=True)
-
-
-def read(root: Fields, band: str | None = None) -> Linescan:
-    """Return the model of an ISD; RpcFormatError where it is damaged, InputError where `band` is none of its bands."""
     level = root.text("IMD/PRODUCTLEVEL")
     if "1B" not in level.upper():
         raise RpcFormatError(f"{root.name}: a product of level {level}, resampled: only 1B has a physical model")
@@ -55,7 +51,7 @@ def read(root: Fields, band: str | None = None) -> Linescan:
         positions = positions + body.apply(arm)
     samples = Samples(root.name, times, positions, orbit[:, 4:7], ticks, quaternions)
     detector = Detector(_look(root, band), 0.0, period, size)
-    return build(samples, detector, _sigma(orbit, attitude))
+    return camera_of_samples(samples, detector, _sigma(orbit, attitude)), _LIGHT
 
 
 def _lines(root: Fields, rows: int) -> tuple[float, np.datetime64]:

@@ -55,7 +55,7 @@ class Linescan:
     kind: str = ""  # whose
 
 
-def build(samples: Samples, detector: Detector, sigma: tuple[float, float] | None = None) -> Linescan:
+def camera_of_samples(samples: Samples, detector: Detector, sigma: tuple[float, float] | None = None) -> Linescan:
     """Return the camera of some samples; `sigma` are stated standard deviations of attitude [rad] and
     position [m].
 

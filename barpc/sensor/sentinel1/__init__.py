@@ -22,7 +22,7 @@ from barpc.sensor.curve import Orbit, fit_orbit
 from barpc.sensor.document import seconds
 from barpc.sensor.sentinel1.annotation import Annotation, BurstRows, burst_rows, read_annotation
 from barpc.sensor.sentinel1.frames import Bistatic, Delays, GroundFrame, SlantFrame
-from barpc.sensor.sentinel1.range_doppler import RangeDoppler, build, extent, grid_residuals
+from barpc.sensor.sentinel1.range_doppler import RangeDoppler, grid_residuals, line_extent, swaths_model
 from barpc.sidefile import MAX_XML, PRODUCT, opened, read_head
 
 __all__ = [
@@ -68,10 +68,10 @@ def mosaic(
     if bistatic == "full":
         raise InputError("the full bistatic correction jumps between swaths: take one swath, or 'annotated'")
     offsets = mosaic_offsets(swaths)
-    size = np.rint((offsets + [[a.samples, extent(a)[1]] for a in swaths]).max(axis=0))
+    size = np.rint((offsets + [[a.samples, line_extent(a)[1]] for a in swaths]).max(axis=0))
     epoch = min(a.first_line_time for a in swaths)
     nearest_first = sorted(swaths, key=lambda a: a.slant_range_time)
-    return build(nearest_first, epoch, (int(size[0]), int(size[1])), orbit, atmosphere, bistatic)
+    return swaths_model(nearest_first, epoch, (int(size[0]), int(size[1])), orbit, atmosphere, bistatic)
 
 
 def mosaic_offsets(swaths: Sequence[Annotation]) -> Array:

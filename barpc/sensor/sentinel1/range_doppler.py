@@ -136,8 +136,8 @@ class RangeDoppler(Frozen):
             No such burst, or a correction that this product does not take.
         """
         annotation = source if isinstance(source, Annotation) else read_annotation(source)
-        epoch, lines = extent(annotation, burst)
-        return build([annotation], epoch, (annotation.samples, lines), orbit, atmosphere, bistatic)
+        epoch, lines = line_extent(annotation, burst)
+        return swaths_model([annotation], epoch, (annotation.samples, lines), orbit, atmosphere, bistatic)
 
     @property
     def all_ground(self) -> tuple[float, float] | None:
@@ -299,7 +299,7 @@ class _Seen:
         return np.asarray(moved / self.distance[:, None, None])
 
 
-def extent(annotation: Annotation, burst: int | None = None) -> tuple[np.datetime64, int]:
+def line_extent(annotation: Annotation, burst: int | None = None) -> tuple[np.datetime64, int]:
     """Return the time of row 0 and the number of rows: of one burst, or of all bursts stitched."""
     if burst is not None:
         if not 0 <= burst < len(annotation.bursts):
@@ -311,7 +311,7 @@ def extent(annotation: Annotation, burst: int | None = None) -> tuple[np.datetim
     return annotation.first_line_time, last + annotation.lines_per_burst
 
 
-def build(
+def swaths_model(
     swaths: Sequence[Annotation],
     epoch: np.datetime64,
     size: tuple[int, int],

@@ -57,7 +57,7 @@ class Keypoints:
         return Keypoints(*(getattr(self, field.name)[which] for field in fields(self)))
 
 
-def join(parts: Sequence[Keypoints]) -> Keypoints:
+def join_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
     """Join the keypoints of several tiles; an empty set of none."""
     none = np.empty(0)
     parts = parts or [Keypoints(np.empty((0, 2)), none, none, none, np.empty((0, 128), np.uint8))]
@@ -75,11 +75,11 @@ class Sift:
         """Detect keypoints, of which `keep(xy, scale, response)` gives the indices; only those are described."""
         found = self._sift.detect(picture, None)
         if not found:  # OpenCV fails where there is nothing to describe
-            return join([])
+            return join_keypoints([])
         kept = keep(*_table(found))
         described, raw = self._sift.compute(picture, [_an_octave_up(found[i]) for i in kept])
         if raw is None:
-            return join([])
+            return join_keypoints([])
         xy, scale, response = _table(described)
         root = np.sqrt(raw / np.maximum(np.abs(raw).sum(axis=1, keepdims=True), 1e-9))
         angle = np.radians([k.angle for k in described])
@@ -173,7 +173,7 @@ def detect_tile(
             if valid[place].any():
                 origin = np.array([window[0] + zoom * left + middle, window[1] + zoom * top + middle])
                 parts.append(_detect_part(picture[place], valid[place], part, origin, share))
-    every = join(parts)
+    every = join_keypoints(parts)
     return every.select(ranked(every.xy, every.response, share.cell, len(every)))
 
 
@@ -258,7 +258,7 @@ class KeypointFiles:
                 parts.append(kept.select(order))
                 numbers.append(first + order)
             first += count
-        return join(parts), np.concatenate(numbers)
+        return join_keypoints(parts), np.concatenate(numbers)
 
 
 def keep_tile(store: Store, name: str, task: tuple[str, tuple[int, int], Box, Survey, Share, TieOptions]) -> int:

@@ -24,7 +24,7 @@ GivenMatches = Mapping[tuple[int, int], Matches]
 """Two views, ascending -> their matches, numbered so that equal numbers of a view are one point, below 0."""
 
 
-class Given:
+class GivenMatcher:
     """Matches given by others: row i of the first view's points belongs to row i of the second's."""
 
     detects: ClassVar[bool] = True
@@ -41,10 +41,10 @@ class Given:
         return Matches(xy, score, np.stack([rows, rows], axis=1)).select(inside)
 
 
-_GIVEN = f"{__name__}:{Given.__name__}"
+_GIVEN = f"{__name__}:{GivenMatcher.__name__}"
 
 
-def verify(
+def verify_given(
     views: Sequence[View],
     given: GivenMatches,
     pairs: Sequence[Pair],

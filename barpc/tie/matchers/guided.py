@@ -14,7 +14,7 @@ from barpc.options import TieOptions
 from barpc.scene import IntArray, View
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
-from barpc.tie.pairing.epipolar import Frame
+from barpc.tie.pairing.epipolar import EpipolarSegments
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -128,7 +128,9 @@ class _Best:
         return np.stack([found, self._of_a[found]], axis=1), distance, distance / rival
 
 
-def _near(where: Frame, across: float, wanted: IntArray, turned: Array) -> Iterator[tuple[IntArray, IntArray]]:
+def _near(
+    where: EpipolarSegments, across: float, wanted: IntArray, turned: Array
+) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield points of A whose bands lie near each other, and the points of B, `turned` (N, 2) as the frame is, about
     all these bands; both ascending.
     """

@@ -19,7 +19,7 @@ from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.matchers.features import Keypoints
-from barpc.tie.pairing.epipolar import Frame
+from barpc.tie.pairing.epipolar import EpipolarSegments
 from barpc.tie.pixels import Box
 
 
@@ -27,14 +27,14 @@ from barpc.tie.pixels import Box
 class Prediction:
     """Bands in B in which points of A may lie."""
 
-    where: Callable[[Array], Frame]  # of points of A (N, 2) [px]; one axis for all predictions of a pair
+    where: Callable[[Array], EpipolarSegments]  # of points of A (N, 2) [px]; one axis for all predictions of a pair
     half_width: float  # how far across the epipolar lines to look [px]
     windows: Callable[[], Sequence[Box]]  # those of A that B may see, as far as the cameras may be wrong
     probes: int | None = None
     """So many points, spread evenly, are enough and only clear matches count: the cameras' error is looked for."""
     aside: float = 0.0  # how far the bands are moved across the epipolar lines [px]
 
-    def at(self, xy: Array) -> Frame:
+    def at(self, xy: Array) -> EpipolarSegments:
         """Return the epipolar frame of points of A (N, 2) [px]; NaN: nowhere."""
         return self.where(xy).moved(self.aside)
 

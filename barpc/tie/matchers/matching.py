@@ -22,15 +22,15 @@ from scipy.spatial import cKDTree
 from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import IntArray, View
-from barpc.tie.matchers.features import KeypointFiles, Keypoints, ample_matches, join
+from barpc.tie.matchers.features import KeypointFiles, Keypoints, ample_matches, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
 from barpc.tie.matchers.hook import Hook, hooked
 from barpc.tie.matchers.matcher import NO_MATCHES, Matcher, Matches, Prediction
-from barpc.tie.matchers.structural import FineStructure, Structure
+from barpc.tie.matchers.structural import FineStructure, GradientStructure
 from barpc.tie.pairing.epipolar import (
     LEAST_REACH,
-    Frame,
-    agreeing,
+    EpipolarSegments,
+    affine_inliers,
     common_range,
     frame,
     robust_affine,
@@ -44,7 +44,7 @@ STRUCTURE = "structure"
 """What tries again where another matcher finds few."""
 FINE = "fine-structure"
 """And where that finds nothing."""
-MATCHERS: dict[str, type[Matcher]] = {"guided": Guided, STRUCTURE: Structure, FINE: FineStructure}
+MATCHERS: dict[str, type[Matcher]] = {"guided": Guided, STRUCTURE: GradientStructure, FINE: FineStructure}
 """Name -> matcher."""
 
 
@@ -212,7 +212,7 @@ def _attempt(
         return NO_MATCHES, replace(report, status="too few matches")
     found, control = search.trusted(search.local(tight), options.false_share)
     errors = search.errors(found)
-    keep, residual = agreeing(found.xy[:, 0], errors[:, 1])
+    keep, residual = affine_inliers(found.xy[:, 0], errors[:, 1])
     report = replace(report, matches=len(found), verified=int(keep.sum()), control_share=control)
     if _apart(found.xy[keep, 0], search.patch) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches on common epipolar lines")
@@ -258,7 +258,7 @@ def quick_score(views: tuple[View, View], keypoints: tuple[KeypointFiles, Keypoi
     return 0 if coarse is None else len(search.trusted(coarse, _LOOSE[1])[0])
 
 
-def match(
+def match_pairs(
     views: Sequence[View],
     keypoints: Sequence[Keypoints | KeypointFiles],
     pairs: Sequence[Pair],
@@ -288,7 +288,7 @@ def match(
         return found
     good = [(tasks[k][0], matches) for k, (matches, report) in enumerate(found) if enough(report)]
     known = _altitudes([*before, *good])
-    none, other = join([]), replace(options, matcher=STRUCTURE)
+    none, other = join_keypoints([]), replace(options, matcher=STRUCTURE)
     again = [
         ([_within(tasks[k][0], terrain, known, margin) for margin in _MARGINS], (none, none), pairs[k], other)
         for k in thin
@@ -351,11 +351,11 @@ def _within(
     return replace(views[0], alt_range=within), replace(views[1], alt_range=within)
 
 
-def _latest(where: Callable[[Array], Frame]) -> Callable[[Array], Frame]:
+def _latest(where: Callable[[Array], EpipolarSegments]) -> Callable[[Array], EpipolarSegments]:
     """Return a function of points that remembers its last value: a matcher asks about the same array again."""
-    known: list[tuple[Array, Frame]] = []
+    known: list[tuple[Array, EpipolarSegments]] = []
 
-    def remembered(xy: Array) -> Frame:
+    def remembered(xy: Array) -> EpipolarSegments:
         if not known or known[0][0] is not xy:
             known[:] = [(xy, where(xy))]
         return known[0][1]
@@ -406,7 +406,7 @@ class _Search:
         """Return the distance along and across (M, 2) [px] of matches from where the cameras say."""
         return frame(*self._views, found.xy[:, 0], self._axis).errors(found.xy[:, 1])
 
-    def _predicted(self, where: Callable[[Array], Frame], half_width: float) -> Prediction:
+    def _predicted(self, where: Callable[[Array], EpipolarSegments], half_width: float) -> Prediction:
         return Prediction(_latest(where), half_width, self._windows)
 
     def _distinct(self, prediction: Prediction) -> Matches:
@@ -455,7 +455,7 @@ class _Search:
         """Return one pass: a peak among the errors across the epipolar lines of some points, if there is one."""
         every = self._frame  # and not this search: what it found would keep it, and it what it found
 
-        def everywhere(xy: Array) -> Frame:
+        def everywhere(xy: Array) -> EpipolarSegments:
             where = every(xy)
             return replace(where, before=where.before - width, after=where.after + width)
 
@@ -478,7 +478,7 @@ class _Search:
         margin = 0.5 * (high - low) + 10.0
         first, last = low - margin, high + margin
 
-        def corrected(xy: Array) -> Frame:
+        def corrected(xy: Array) -> EpipolarSegments:
             where, same = every(xy).moved(across(xy)), np.ones(len(xy))
             return replace(where, before=first * same, after=last * same)
 
@@ -489,7 +489,7 @@ class _Search:
         errors, places = self.errors(tight), tight.xy[:, 0]
         across, tree, every = robust_affine(places, errors[:, 1]), cKDTree(places), self._frame
 
-        def nearby(xy: Array) -> Frame:
+        def nearby(xy: Array) -> EpipolarSegments:
             along = errors[tree.query(xy, k=min(_NEIGHBOURS, len(tight)))[1], 0]
             middle = np.median(along, axis=1)
             half = 4.0 + 3.0 * robust_spread(along, middle[:, None])

@@ -20,8 +20,8 @@ from barpc.options import TieOptions
 from barpc.scene import IntArray, View
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
-from barpc.tie.pairing.epipolar import Frame, grouped, linear_map
-from barpc.tie.patches.oriented import HALF, TILE, Sampling, Tile, found_about, resolution
+from barpc.tie.pairing.epipolar import EpipolarSegments, grouped, linear_map
+from barpc.tie.patches.oriented import HALF, TILE, PatchTile, Sampling, found_about, resolution
 from barpc.tie.pixels import Box, FloatImage
 
 _SURFACE = 1 << 23  # places at which a tile's points are compared, all together: 30 bytes each
@@ -34,7 +34,7 @@ _BENT = 2  # px by which their parallax may differ, and does not count
 _LONG, _LONGER = 48.0, 130.0  # px of half a band
 
 
-class Structure:
+class GradientStructure:
     """A matcher of gradient structure: the most alike place in each point's band, where no decoy is more alike."""
 
     detects: ClassVar[bool] = False
@@ -46,7 +46,7 @@ class Structure:
 
     def __init__(self, options: TieOptions, keypoints: tuple[Keypoints, Keypoints]) -> None:
         self._band = options.band
-        self._known: dict[Callable[[Array], Frame], Matches] = {}
+        self._known: dict[Callable[[Array], EpipolarSegments], Matches] = {}
 
     def match(self, a: View, b: View, prediction: Prediction) -> Matches:
         """Match a grid of points: those whose best place, in the band and in decoys to both sides, lies in
@@ -66,7 +66,7 @@ class Structure:
         return found.select(np.abs(across) <= max(prediction.half_width, 1.5))
 
 
-class FineStructure(Structure):
+class FineStructure(GradientStructure):
     """The same on whole pixels, about cameras that are not far off: lines that coarser pictures have lost.
 
     Where half of what is left has grown anew, few places are the best of their bands by themselves: neighbours speak
@@ -146,7 +146,7 @@ class _Search:
         """Return how both images are seen about some points of A."""
         return Sampling(self._files, self._band, step, linear_map(*self._views, at.mean(axis=0)))
 
-    def _tile(self, where: Frame, rows: IntArray) -> tuple[Array, Array, Array]:
+    def _tile(self, where: EpipolarSegments, rows: IntArray) -> tuple[Array, Array, Array]:
         """Return the points of A, their best places in B and how unlike these look, of some rows."""
         at, asked = self._points[rows], self._prediction
         reach_along, slope = 0.5 * (where.after - where.before)[rows], where.slope[rows]
@@ -167,7 +167,7 @@ class _Search:
             first, second, third = (np.concatenate(column) for column in zip(*halves, strict=True))
             return first, second, third
         centers = where.place(middle + shift)[rows]
-        tile = Tile.of(sampling, at, centers, reach, HALF)
+        tile = PatchTile.of(sampling, at, centers, reach, HALF)
         surface = tile.surfaces()
         if self._whole:
             surface = _supported(surface, _near(at, _RING * self.pitch), _SAY)
@@ -185,7 +185,7 @@ class _Search:
             ok &= tile.returns(place)
         return at[ok], tile.in_b(place)[ok], 1.0 - score[ok]
 
-    def _part_in_b(self, where: Frame, middle: Array, rows: IntArray, wide: float) -> tuple[float, float]:
+    def _part_in_b(self, where: EpipolarSegments, middle: Array, rows: IntArray, wide: float) -> tuple[float, float]:
         """Return the middle and half the length [px] of what a tile's segments have in B, from their middles:
         one for all.
         """

@@ -19,7 +19,7 @@ _WINDOW = 2048.0  # px, side of the windows of the verification
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class EpipolarSegments:
     """Epipolar segments in image B of points of image A: axes along and across, between two altitudes."""
 
     axis: Array  # (2,) unit vector in B along which a point moves when its altitude grows
@@ -35,7 +35,7 @@ class Frame:
         turned: Array = xy @ _rotation(self.axis)
         return turned
 
-    def moved(self, across: Array | float) -> Frame:
+    def moved(self, across: Array | float) -> EpipolarSegments:
         """Return the frame with its points moved across the epipolar lines [px]."""
         return replace(self, across=self.across + across)
 
@@ -62,7 +62,7 @@ def common_range(*views: View) -> tuple[float, float]:
     return min(low, high), max(low, high)
 
 
-def frame(first: View, second: View, xy: Array, axis: Array | None = None) -> Frame:
+def frame(first: View, second: View, xy: Array, axis: Array | None = None) -> EpipolarSegments:
     """Predict points of one view (N, 2) [px] in another, at the altitudes that both are used for.
 
     The axis is by default the mean direction of the points' epipolar segments. NaN where a camera fails.
@@ -81,7 +81,7 @@ def frame(first: View, second: View, xy: Array, axis: Array | None = None) -> Fr
         slope = np.where(np.abs(u1 - u0) > 1e-3, ((w1 - w0) / (u1 - u0)).clip(-1.0, 1.0), 0.0)
     slope[~usable] = np.nan
     along, across, reach = 0.5 * (u0 + u1), 0.5 * (w0 + w1), 0.5 * np.abs(u1 - u0)
-    return Frame(axis, along, across, slope, -reach, reach, linear_map(first, second, middle))
+    return EpipolarSegments(axis, along, across, slope, -reach, reach, linear_map(first, second, middle))
 
 
 def linear_map(first: View, second: View, xy: Array) -> Array:
@@ -148,7 +148,7 @@ def robust_spread(values: Array, center: float | Array = 0.0) -> Any:
     return spread if spread.ndim else float(spread)
 
 
-def agreeing(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:
+def affine_inliers(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:
     """Return the values (N,) [px] that agree with an affine function of position (N, 2) [px], and their
     distances from it (N,).
 

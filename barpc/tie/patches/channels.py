@@ -71,7 +71,7 @@ def correlation(template: FloatImage, search: FloatImage) -> FloatImage:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class FoundTemplates:
     """Places at which templates were found.
 
     Parameters
@@ -94,7 +94,7 @@ class Found:
         return np.asarray(self.known & (self.score > self.decoy + margin) & (self.back <= back))
 
 
-def find(first: FloatImage, second: FloatImage, at: Array, half: int, search: int) -> Found:
+def find(first: FloatImage, second: FloatImage, at: Array, half: int, search: int) -> FoundTemplates:
     """Find templates of one picture's channels (C, H, W) in another's, on the same grid.
 
     `at` (n, 2), n > 0, holds their centres x, y as whole px, at least `margin(half, search)` from the edge; they reach
@@ -105,9 +105,11 @@ def find(first: FloatImage, second: FloatImage, at: Array, half: int, search: in
     return joined([_find(first, second, rows[i : i + BATCH], half, search) for i in range(0, len(rows), BATCH)])
 
 
-def joined(parts: Sequence[Found]) -> Found:
+def joined(parts: Sequence[FoundTemplates]) -> FoundTemplates:
     """Join matches found in several places, one after the other."""
-    return Found(*(np.concatenate([getattr(part, name) for part in parts]) for name in Found.__annotations__))
+    return FoundTemplates(
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in FoundTemplates.__annotations__)
+    )
 
 
 def margin(half: int, search: int) -> int:
@@ -115,7 +117,7 @@ def margin(half: int, search: int) -> int:
     return half + 3 * search + _GAP + 3
 
 
-def _find(first: FloatImage, second: FloatImage, at: IntArray, half: int, search: int) -> Found:
+def _find(first: FloatImage, second: FloatImage, at: IntArray, half: int, search: int) -> FoundTemplates:
     n, wide = len(at), 2 * search + 1
     template = cut(first, at, half, half)
     right = np.arange(n) % 2 > 0  # where the decoy lies; areas to the left are turned about, so that all are alike
@@ -134,7 +136,7 @@ def _find(first: FloatImage, second: FloatImage, at: IntArray, half: int, search
     back = correlation(found, cut(first, at, half + search, half + search)).reshape(n, -1)
     back_y, back_x = np.divmod(back.argmax(axis=1), wide)
     part, still = _registered(template, around)
-    return Found(
+    return FoundTemplates(
         whole + part,
         true.max(axis=1).astype(np.float64),
         decoy.max(axis=1).astype(np.float64),

@@ -61,7 +61,7 @@ class EpipolarFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class Matches:
+class DenseMatches:
     """Dense matches: places (n, 2) in both images [px], starting altitude [m], standard deviation along the
     line [px].
 
@@ -114,7 +114,7 @@ def epipolar_frame(a: Array, b: Array, alt: Array) -> EpipolarFrame:
 
 def dense_matches(
     images: Sequence[str], sizes: Sequence[tuple[int, int]], frame: EpipolarFrame, band: int = 1
-) -> Matches | None:
+) -> DenseMatches | None:
     """Match a part of two images; None where they do not show enough of it.
 
     Parameters
@@ -144,7 +144,7 @@ def dense_matches(
     moved = place - np.column_stack([disparity[row, col], np.zeros(len(row))])
     known = np.column_stack([place, disparity[row, col], np.ones(len(row))])
     both = int(np.count_nonzero(shown_left & _shifted(shown_right, frame.num // 2)))
-    return Matches(
+    return DenseMatches(
         _back(frame.maps[0], place),
         _back(frame.maps[1], moved),
         known @ frame.altitude,

@@ -56,14 +56,14 @@ def found_about(sampling: Sampling, at: Array, xy: Array, half: int = HALF) -> t
     """Return the places (n, 2) near those given, whether they stand out and the way back ends at its start;
     correlations.
     """
-    tile = Tile.of(sampling, at, xy, np.full(2, _FINER), half)
+    tile = PatchTile.of(sampling, at, xy, np.full(2, _FINER), half)
     surface = tile.surfaces()
     place, score = tile.peaks(surface)
     edge = np.abs(np.rint(place) - tile.whole).max(axis=1) < _FINER
     return tile.in_b(place), edge & tile.shown() & tile.returns(place), score
 
 
-def register_places(
+def register_oriented(
     files: Files, band: int, reference: Array, start: Array, linear: Array
 ) -> tuple[Array, BoolArray, Array]:
     """Register patches of A at `reference` about `start` (n, 2) [px] of B: places, success, correlations.
@@ -77,7 +77,7 @@ def register_places(
         at, turn = reference[rows], np.median(linear[rows], axis=0)
         near, found, _ = found_about(Sampling(files, band, step, turn), at, start[rows], PATCH)
         closer = Sampling(files, band, 0.5 * step, turn, FINE)
-        tile = Tile.of(closer, at, near, np.full(2, _FINER), 2 * HALF)
+        tile = PatchTile.of(closer, at, near, np.full(2, _FINER), 2 * HALF)
         best, score[rows] = tile.peaks(tile.surfaces())
         inside = np.abs(np.rint(best) - tile.whole).max(axis=1) < _FINER
         place[rows], ok[rows] = tile.in_b(best), found & inside
@@ -85,7 +85,7 @@ def register_places(
 
 
 @dataclass(frozen=True, eq=False)
-class Tile:
+class PatchTile:
     """Pictures around points of A and their search areas in B, of the same resolution and orientation."""
 
     pictures: tuple[FloatImage, FloatImage]  # channels (C, H, W) of A and of B
@@ -98,7 +98,7 @@ class Tile:
     origin: Array  # (2,) of the second picture, in B
 
     @classmethod
-    def of(cls, sampling: Sampling, at: Array, xy: Array, reach: IntArray, half: int) -> Tile:
+    def of(cls, sampling: Sampling, at: Array, xy: Array, reach: IntArray, half: int) -> PatchTile:
         """Return the pictures of two images about points of A and B (n, 2) [px]."""
         step, matrix = sampling.step, sampling.step * sampling.linear
         pad = half + EDGE + 2  # beside it, channels do not know what lies beyond

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View
-from barpc.tie.pairing.epipolar import LEAST_REACH, agreeing, frame, grouped, linear_map, robust_spread
+from barpc.tie.pairing.epipolar import LEAST_REACH, affine_inliers, frame, grouped, linear_map, robust_spread
 from barpc.tie.patches import oriented
 from barpc.tie.patches.channels import SETTLED
 from barpc.tie.pixels import SPAN, FloatImage, PixelReader, grow, levelled
@@ -50,7 +50,7 @@ _FEW = 20  # observations of a pair of views below which their sigmas are not sc
 
 
 @dataclass(frozen=True, eq=False)
-class Registration:
+class PatchRegistration:
     """Places at which reference patches were found in the other image."""
 
     xy: Array  # (N, 2) [px]
@@ -59,12 +59,12 @@ class Registration:
     ok: BoolArray  # (N,) settled, near its start, on valid pixels
 
     @staticmethod
-    def none(start: Array) -> Registration:
+    def none(start: Array) -> PatchRegistration:
         """Return an empty registration of points (N, 2)."""
         zero = np.zeros(len(start))
-        return Registration(start.copy(), zero, zero + np.inf, zero > 0)
+        return PatchRegistration(start.copy(), zero, zero + np.inf, zero > 0)
 
-    def put(self, rows: IntArray, found: Registration) -> None:
+    def put(self, rows: IntArray, found: PatchRegistration) -> None:
         """Add the registration of some rows."""
         for field in fields(self):
             getattr(self, field.name)[rows] = getattr(found, field.name)
@@ -78,14 +78,14 @@ def register_places(
     linear: Array,
     patch: int,
     tile: int = 1024,
-) -> Registration:
-    """Read what is needed of two images, each a path and its size, and register as `register` does, tile by tile.
+) -> PatchRegistration:
+    """Read what is needed of two images, each a path and its size, and register as `register_patches`, tile by tile.
 
     Where a size is a part of the file's, pixels are means of the file's (`PixelReader`).
     """
     cv2.setNumThreads(1)
     margin = patch + _TAPS + int(_REACH)
-    sparse, every = _sparse(reference, margin), Registration.none(start)
+    sparse, every = _sparse(reference, margin), PatchRegistration.none(start)
     read, groups = (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, min(tile, SPAN)))
     (path, size), (other, beyond) = files
     with PixelReader(path, band, size) as first, PixelReader(other, band, beyond) as second:
@@ -93,7 +93,7 @@ def register_places(
             a, valid_a, shift_a = read(first, size, reference[rows], margin)
             b, valid_b, shift_b = read(second, beyond, start[rows], margin)
             places = reference[rows] - shift_a, start[rows] - shift_b
-            found = register((a, b), (valid_a, valid_b), *places, linear[rows], patch)
+            found = register_patches((a, b), (valid_a, valid_b), *places, linear[rows], patch)
             every.put(rows, replace(found, xy=found.xy + shift_b))
     return every
 
@@ -172,11 +172,11 @@ def register_part(
     linear: Array,
     structural: bool,
     tile: int,
-) -> Registration:
+) -> PatchRegistration:
     """Register patches by their grey values, or by channels of oriented gradients; `ok` where they are alike."""
     if structural:
-        xy, ok, correlation = oriented.register_places(files, band, reference, start, linear)
-        return Registration(xy, correlation, np.full(len(xy), oriented.SIGMA), ok)
+        xy, ok, correlation = oriented.register_oriented(files, band, reference, start, linear)
+        return PatchRegistration(xy, correlation, np.full(len(xy), oriented.SIGMA), ok)
     found = register_places(files, band, reference, start, linear, PATCH, tile)
     return replace(found, ok=found.ok & (found.correlation >= MIN_CORRELATION))
 
@@ -188,21 +188,21 @@ def _usable(valid: BoolArray, patch: int) -> BoolArray:
     return usable
 
 
-def register(
+def register_patches(
     images: tuple[FloatImage, FloatImage],
     valid: tuple[BoolArray, BoolArray],
     reference: Array,
     start: Array,
     linear: Array,
     patch: int,
-) -> Registration:
+) -> PatchRegistration:
     """Register patches of the second image to patches of the first; a patch, `patch` [px] a side (odd), is all valid.
 
     They are centred at `reference` (N, 2), whole pixels, and at about `start` (N, 2) [px] in the second image, with
     `linear` (N, 2, 2) a first guess of d(second)/d(first). What fails (at a border, on a steep slope) is tried again
     with a smaller patch; what succeeds must be confirmed by it.
     """
-    fine, best = _upsampled(images[1]), Registration.none(start)
+    fine, best = _upsampled(images[1]), PatchRegistration.none(start)
     pictures = _with_derivatives(images[0])
     smaller = int(_SMALLER * patch) | 1
     for side in (patch, smaller):
@@ -296,7 +296,7 @@ class _Template:
         start: Array,
         linear: Array,
         settled: float = SETTLED,
-    ) -> Registration:
+    ) -> PatchRegistration:
         """Register the patches about `reference` (N, 2), begun at `start` with the distortion `linear`."""
         offset = self._row * self._width + self._col
         place = reference[:, 1:] * self._width + reference[:, :1] + offset
@@ -316,7 +316,7 @@ class _Template:
         sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_LEAST_SIGMA)
         moved = np.hypot(*(xy - start).T)
         ok = (step <= 10 * settled) & (moved <= _REACH) & np.isfinite(sigma)
-        return Registration(xy, correlation, sigma, ok)
+        return PatchRegistration(xy, correlation, sigma, ok)
 
     def _iterate(
         self,
@@ -419,7 +419,7 @@ class _Links:
         """Return the indices of the links between the same two views, and of equal values of `more`."""
         return grouped(self.tracks.view[self.reference], self.tracks.view[self.other], *more)
 
-    def register(self, options: TieOptions, executor: Executor | None, progress: Progress | None) -> Registration:
+    def register(self, options: TieOptions, executor: Executor | None, progress: Progress | None) -> PatchRegistration:
         """Register all, tile by tile of the reference view."""
         origin = self.origin
         linear = np.empty((len(self), 2, 2))
@@ -434,8 +434,8 @@ class _Links:
             images = ((first.path, first.size), (second.path, second.size))
             places = origin[part], start[part], linear[part]
             tasks.append((images, options.band, *places, self._is_structural(part), options.tile))
-        done: list[Registration] = ordered(executor, register_part, tasks, "refine", progress)
-        found = Registration.none(start)
+        done: list[PatchRegistration] = ordered(executor, register_part, tasks, "refine", progress)
+        found = PatchRegistration.none(start)
         for part, one in zip(parts, done, strict=True):
             found.put(part, one)
         return found
@@ -445,14 +445,14 @@ class _Links:
         ends = sorted((int(self.tracks.view[self.reference[part[0]]]), int(self.tracks.view[self.other[part[0]]])))
         return (ends[0], ends[1]) in self.structural
 
-    def errors(self, found: Registration, group: IntArray) -> tuple[Array, Array]:
+    def errors(self, found: PatchRegistration, group: IntArray) -> tuple[Array, Array]:
         """Return the distances along and across the epipolar lines (M, 2) [px] between two views, and half
         the segments' length (M,).
         """
         where = frame(*self.of(group), self.origin[group])
         return where.errors(found.xy[group]), where.after
 
-    def verified(self, found: Registration, good: BoolArray) -> BoolArray:
+    def verified(self, found: PatchRegistration, good: BoolArray) -> BoolArray:
         """Return the observations near their epipolar line, as certain as others, and at one altitude with
         their track.
         """
@@ -464,7 +464,7 @@ class _Links:
                 usual = _usual(self.origin[group], found.sigma[group])
                 group = group[found.sigma[group] <= _DISTORTED * usual]
                 errors, reach[group] = self.errors(found, group)
-                verified[group] = agreeing(self.origin[group], errors[:, 1], _FLOOR)[0]
+                verified[group] = affine_inliers(self.origin[group], errors[:, 1], _FLOOR)[0]
                 altitude[group] = errors[:, 0] / np.maximum(reach[group], 1e-9)
         return verified & ~self._torn(verified, altitude, reach)
 
@@ -481,21 +481,21 @@ class _Links:
         views = self.tracks.view
         three = views[self.reference[first]], views[self.other[first]], views[self.other[second]]
         for group in grouped(*three):
-            agree = agreeing(self.origin[first[group]], apart[group], 2 * _FLOOR)[0]
+            agree = affine_inliers(self.origin[first[group]], apart[group], 2 * _FLOOR)[0]
             for end in (first[group], second[group]):
                 compared[end] = True
                 agreed[end[agree]] = True
         torn: BoolArray = compared & ~agreed
         return torn
 
-    def scaled(self, found: Registration, good: BoolArray) -> Array:
+    def scaled(self, found: PatchRegistration, good: BoolArray) -> Array:
         """Return the sigmas [px] made larger where the distances from the epipolar lines are."""
         sigma = found.sigma.copy()
         for group in self.groups():
             group = group[good[group]]
             if len(group) >= _FEW:
                 across = self.errors(found, group)[0][:, 1]
-                residual = agreeing(self.origin[group], across, _FLOOR)[1]
+                residual = affine_inliers(self.origin[group], across, _FLOOR)[1]
                 sigma[group] *= max(1.0, robust_spread(residual / sigma[group]))
         return sigma
 

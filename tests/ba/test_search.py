@@ -1,0 +1,518 @@
+"""The search for explanations: what are rivals, what is the same, what ends it, by made-up gains."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barpc.ba.evidence.mixture import Fit
+from barpc.ba.evidence.scan import SURE, Interval
+from barpc.ba.judging import judge as judging
+from barpc.ba.judging.explanations import FADE, MOVING, SETTLING, STRIP, SWING, WANDER, Explanation, Seen
+from barpc.ba.judging.judge import (
+    _amplitude,
+    _differs,
+    _distinct,
+    _joined,
+    _near,
+    _of_one_image,
+    _part,
+    _rivals,
+    _same,
+    _Search,
+    _State,
+    _Taken,
+)
+
+VIEW = np.array([0, 0, 0, 0, 1, 1])
+
+
+def interval(start: float, stop: float, view: int = 0, axis: int = 1, by_share: bool = False) -> Interval:
+    return Interval(view, axis, start, stop, 9.0, 0.1, 0.5, by_share)
+
+
+def explained(kind: str, view: int = 0, start: float = 0.0, stop: float = 9.0, **given: Any) -> Explanation:
+    """An explanation of two unknowns that moves the observations 0, 1, .. of `rows`, the first by default."""
+    extra = np.zeros((2, 2, len(VIEW)))
+    extra[1, 1, given.pop("rows", [0])] = 1.0
+    where = None if kind in (SWING, MOVING) else (given.pop("axis", 1), start, stop, 0.0, 0.0)
+    return Explanation(kind, view, extra, np.full(2, 0.5), given.pop("price", 0.0), where, **given)
+
+
+def fitted(evidence: float = 0.0, extra: Any = (), **given: Any) -> Fit:
+    n = len(VIEW)
+    return replace(Fit(evidence, np.zeros((2, 3)), np.array(extra), 1.0, np.zeros(2), np.ones(n)), **given)
+
+
+def seen() -> Seen:
+    linear: Any = SimpleNamespace(view=VIEW, sigma=np.ones(len(VIEW)))
+    other: Any = SimpleNamespace(view=VIEW)
+    nothing: Any = None
+    return Seen(linear, other, nothing, np.zeros((2, 6)), np.ones((2, 2)), fitted(), np.zeros((2, 0, 6)), np.zeros(0))
+
+
+def taken(gain: float, kind: str = STRIP, view: int = 0, gap: float = 1.0) -> _Taken:
+    return _Taken(explained(kind, view), gain, gap, "", ())
+
+
+# --- intervals and explanations that are the same ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ((0, 10), (0, 19), True),  # more than half of both together is common
+        ((0, 10), (0, 20), False),
+        ((3, 13), (0, 10), True),
+        ((4, 14), (0, 10), False),
+        ((0, 10), (11, 12), False),
+    ],
+)
+def test_intervals_are_the_same_whose_most_is_common(one, other, same) -> None:
+    assert _same(interval(*one), interval(*other)) == _same(interval(*other), interval(*one)) == same
+    assert not _same(interval(*one), interval(*other, view=1))
+    assert not _same(interval(*one), interval(*other, axis=0))
+
+
+def test_of_intervals_that_are_the_same_the_first_stays() -> None:
+    rows = [interval(0, 10), interval(0, 12), interval(50, 60), interval(1, 10), interval(49, 61)]
+    assert _distinct(rows) == [rows[0], rows[2]]
+
+
+def test_explanations_differ_by_kind_view_axis_and_rows_that_do_not_overlap() -> None:
+    one = explained(STRIP, 0, 2.0, 5.0)
+    assert not _differs(one, explained(STRIP, 0, 4.9, 9.0))
+    assert not _differs(explained(STRIP, 0, 4.9, 9.0), one)
+    assert _differs(one, explained(STRIP, 0, 5.0, 9.0))
+    assert _differs(explained(STRIP, 0, 5.0, 9.0), one)
+    assert _differs(one, explained(STRIP, 0, 2.0, 5.0, axis=0))
+    assert _differs(one, explained(STRIP, 1, 2.0, 5.0))
+    assert _differs(one, explained(FADE, 0, 2.0, 5.0))
+    assert not _differs(explained(SWING), explained(SWING))
+    assert _differs(explained(SWING), explained(SWING, 1))
+    assert not _differs(replace(one, where=None), one)
+    assert not _differs(one, replace(one, where=None))
+
+
+def test_a_part_and_its_complement_are_of_one_image() -> None:
+    strip, fade, swing = explained(STRIP), explained(FADE), explained(SWING)
+    assert _of_one_image(strip, fade)
+    assert _of_one_image(fade, explained(STRIP))
+    assert _of_one_image(swing, swing)
+    assert not _of_one_image(swing, explained(SWING))
+    assert not _of_one_image(strip, swing)
+    assert not _of_one_image(swing, strip)
+    assert not _of_one_image(strip, explained(FADE, 1))
+
+
+def test_a_part_is_counted_in_observations_of_its_image_or_of_all() -> None:
+    assert _part(explained(STRIP, 0, rows=[0, 1, 2, 4]), seen()) == pytest.approx(3 / 4)
+    assert _part(explained(STRIP, 1, rows=[0, 4]), seen()) == pytest.approx(1 / 2)
+    assert _part(explained(SETTLING, -1, rows=[0, 4]), seen()) == pytest.approx(2 / 6)
+    assert _part(explained(STRIP, 7, rows=[0]), seen()) == 0.0
+
+
+def test_a_swing_s_amplitude_is_that_of_a_cosine_and_a_sine_each_in_columns_and_rows() -> None:
+    np.testing.assert_allclose(_amplitude(np.array([3.0, -4.0, 5.0, 12.0])), [5.0, 13.0])
+
+
+def test_rivals_are_the_best_of_other_kinds_or_images_with_more_than_a_third_of_the_gain() -> None:
+    def of(*rows: tuple[Explanation, float]) -> list[int]:
+        return _rivals([(one, fitted(), gain) for one, gain in rows])
+
+    first = (explained(STRIP, 0, 0.0, 5.0), 30.0)
+    assert of(first) == []
+    assert of(first, (explained(FADE), 10.0)) == []
+    assert of(first, (explained(FADE), 10.1)) == [1]
+    assert of(first, (explained(STRIP, 0, 1.0, 6.0), 29.0), (explained(STRIP, 0, 5.0, 6.0), 28.0)) == [2]
+    assert of(first, (explained(MOVING, -1), 29.0), (explained(WANDER), 28.0), (explained(SETTLING, -1), 27.0)) == [3]
+    assert of(first, (explained(FADE), 20.0), (explained(FADE), 19.0), (explained(FADE, 1), 18.0)) == [1, 3]
+    assert of(first, (explained(FADE), 20.0), (explained(SWING), 19.0), (explained(FADE, 1), 18.0)) == [1, 2]
+
+
+# --- states -----------------------------------------------------------------------------------------------------------
+
+
+def state(*gains: float, **given: Any) -> _State:
+    return _State(seen(), fitted(), tuple(taken(gain) for gain in gains), **given)
+
+
+def test_a_state_may_pass_another_with_as_many_more_as_that_has_and_two() -> None:
+    assert state(50.0, 20.0).gain == 70.0
+    assert state().gain == 0.0
+    for best, may in (((60.0, 59.0), True), ((60.0, 60.0), False)):  # 30 and three of 30
+        assert state(30.0).may_pass(state(*best)) == may
+    for best, may in (((79.0,), True), ((80.0,), False)):  # 40 + 20 and one of 20
+        assert state(40.0, 20.0).may_pass(state(*best)) == may
+
+
+def test_what_gains_as_much_beside_the_best_is_no_other_way() -> None:
+    best = _State(seen(), fitted(), (taken(60.0, SWING, 1),))
+    other = _State(seen(), fitted(), (taken(30.0, FADE),))
+    same = explained(FADE)
+    assert other.adds_to(best, [(same, fitted(), 30.0 - SURE + 0.1)])
+    assert not other.adds_to(best, [(same, fitted(), 30.0 - SURE)])
+    assert not other.adds_to(best, [(explained(FADE, 1), fitted(), 40.0)])
+    assert not other.adds_to(best, [(explained(STRIP), fitted(), 40.0)])
+    assert not other.adds_to(best, [])
+    assert other.adds_to(best, [(explained(STRIP), fitted(), 90.0), (same, fitted(), 29.0), (same, fitted(), 2.0)])
+    behind = replace(other, taken=(taken(50.0, SWING), *other.taken))
+    assert not behind.adds_to(best, [(same, fitted(), 30.0)])  # what went before is another
+    beside = replace(best, taken=(taken(50.0, SWING), *best.taken))
+    assert behind.adds_to(beside, [(same, fitted(), 30.0)])
+    small = replace(other, taken=(taken(4.0, FADE),))
+    assert small.adds_to(best, [])  # of less than is sure there is always as much
+
+
+@pytest.mark.parametrize(("second", "smaller"), [(25.1, True), (25.0, False)])
+def test_of_two_parts_of_an_image_that_are_as_good_the_smaller_one_is_taken(second: float, smaller: bool) -> None:
+    large, small = explained(STRIP, rows=[0, 1, 2]), explained(FADE, rows=[3])
+    made, other = fitted(1.0), fitted(2.0)
+    found = state().added([(large, made, 30.0), (small, other, second), (explained(SWING, 1), fitted(), 12.0)])
+    last = found.taken[-1]
+    assert last.one is (small if smaller else large)
+    assert last.gain == (second if smaller else 30.0)
+    assert last.gap == pytest.approx(second - 30.0 if smaller else 30.0 - second)
+    assert last.runner_up == (STRIP if smaller else FADE)
+    assert found.seen.base is found.followed is (other if smaller else made)
+    np.testing.assert_array_equal(found.seen.extra, last.one.extra)
+    np.testing.assert_array_equal(found.seen.sigma, [0.5, 0.5])
+    assert not found.ended
+
+
+def test_what_is_taken_stands_behind_what_was_and_the_rest_are_its_rivals() -> None:
+    before = state(40.0)
+    before = replace(before, seen=replace(before.seen, extra=np.ones((2, 1, 6)), sigma=np.array([0.3])))
+    one = explained(STRIP, 1, rows=[4])
+    found = before.added([(one, fitted(), 20.0), (replace(one), fitted(), 18.0)])
+    assert (found.taken[0], found.taken[1].one) == (before.taken[0], one)
+    assert (found.taken[1].gap, found.taken[1].runner_up) == (20.0, "")  # the same rows again are no rival
+    np.testing.assert_array_equal(found.seen.extra, np.concatenate([np.ones((2, 1, 6)), one.extra], axis=1))
+    np.testing.assert_array_equal(found.seen.sigma, [0.3, 0.5, 0.5])
+    beaten = before.added([(one, fitted(), 20.0), (explained(SWING), fitted(), -3.0)])
+    assert beaten.taken[1].gap == 20.0  # over nothing, where the runner-up is worse than it
+    pairs = before.added([(one, fitted(), 20.0), (explained(SWING), fitted(), 7.0), (explained(FADE), fitted(), 8.0)])
+    assert (pairs.taken[1].gap, pairs.taken[1].runner_up) == (12.0, FADE)
+
+
+def test_swings_that_are_as_good_in_other_images_are_named() -> None:
+    tried = [
+        (explained(SWING, 5), fitted(), 30.0),
+        (explained(SWING, 3), fitted(), 26.0),
+        (explained(SWING, 2), fitted(), 25.1),
+        (explained(SWING, 1), fitted(), 25.0),
+        (explained(STRIP, 0), fitted(), 29.0),
+    ]
+    assert state().added(tried).taken[0].or_of == (2, 3)
+    assert state().added(tried[-1:] + tried[:1]).taken[0].or_of == ()
+
+
+@pytest.mark.parametrize(("kind", "before", "ended"), [(STRIP, 4, False), (STRIP, 5, True), (MOVING, 0, True)])
+def test_a_search_ends_with_six_or_with_what_is_not_followed(kind: str, before: int, ended: bool) -> None:
+    first, made = state(*[9.0] * before), fitted(1.0)
+    found = first.added([(explained(kind), made, 20.0)])
+    assert found.ended == ended
+    assert found.seen.base is made
+    assert found.followed is (first.followed if kind == MOVING else made)
+
+
+# --- the search -------------------------------------------------------------------------------------------------------
+
+
+def search(**given: Any) -> _Search:
+    return _Search(given.pop("seen", seen()), given.pop("first", []), given.pop("floor", 0.1), 0.1)
+
+
+def test_what_ends_as_best_is_sure_by_what_the_next_ones_lack(monkeypatch) -> None:
+    """Where it was not the best by itself; all that are followed have their cameras and probabilities."""
+
+    def ran(*states: _State) -> tuple[list[_Taken], Any]:
+        monkeypatch.setattr(_Search, "_grown", lambda self, before: (list(states), True))
+        monkeypatch.setattr(judging, "_said", lambda rows, n, seen: [rows[n]])
+        found = search().run()
+        return list(found.findings), found  # type: ignore[arg-type]
+
+    last, earlier = fitted(right=np.zeros(6)), fitted(step=np.ones((2, 3)))
+    one = _State(replace(seen(), base=last), earlier, (taken(30.0, gap=-2.0), taken(12.0, FADE, gap=3.0)))
+    rows, found = ran(one, state(35.0))
+    assert [row.gap for row in rows] == [7.0, 3.0]
+    assert found.right is last.right
+    assert found.step is last.step
+    assert [row.gap for row in ran(one)[0]] == [42.0, 3.0]
+    assert [row.gap for row in ran(replace(one, taken=(taken(30.0, gap=0.0),)))[0]] == [30.0]
+    moves, found = ran(replace(one, taken=(taken(30.0), taken(12.0, MOVING, -1))))
+    assert len(moves) == 2
+    assert found.step is earlier.step
+    assert found.right is earlier.right
+
+
+def grown(monkeypatch, states: list[_State], *tried: list[tuple[Explanation, float]]) -> tuple[list[_State], bool]:
+    """States with one more each, where so much is tried, in turn."""
+    left = [[(one, fitted(), gain) for one, gain in rows] for rows in tried]
+    monkeypatch.setattr(_Search, "_tried", lambda self: left.pop(0))
+    found = search()._grown(states)
+    assert not left
+    return found
+
+
+def whats(states: list[_State]) -> list[list[tuple[str, int]]]:
+    return [[row.what for row in one.taken] for one in states]
+
+
+def test_a_search_goes_on_with_the_best_and_its_rivals(monkeypatch) -> None:
+    rows = [(explained(STRIP), 30.0), (explained(SWING, 1), 11.0), (explained(FADE, 1), 9.0), (explained(WANDER), 20.0)]
+    found, ended = grown(monkeypatch, [state()], rows)
+    assert whats(found) == [[(STRIP, 0)], [(SWING, 1)]]
+    assert not ended
+    assert found[1].taken[0].gap == pytest.approx(11.0 - 30.0)
+    many = [(explained(kind, view), 30.0 - view) for view in range(3) for kind in (STRIP, SWING)]
+    assert whats(grown(monkeypatch, [state()], many)[0]) == [[(STRIP, 0)], [(SWING, 0)], [(STRIP, 1)]]
+
+
+def test_a_search_ends_where_nothing_gains_enough(monkeypatch) -> None:
+    best = state(30.0)
+    found, ended = grown(monkeypatch, [best, state(12.0)], [(explained(SWING), SURE)])
+    assert ended
+    assert found[0] is best
+    again, ended = grown(monkeypatch, [best], [(explained(SWING), SURE + 0.1)])
+    assert not ended
+    assert whats(again) == [[(STRIP, 0), (SWING, 0)]]
+
+
+def test_another_way_that_finds_nothing_more_has_ended(monkeypatch) -> None:
+    best, other = state(30.0), _State(seen(), fitted(), (taken(12.0, SWING, 1),))
+    found, ended = grown(monkeypatch, [best, other], [(explained(FADE, 1), 10.0)], [])
+    assert whats(found) == [[(STRIP, 0), (FADE, 1)], [(SWING, 1)]]
+    assert [one.ended for one in found] == [False, True]
+    assert not ended
+
+
+def test_what_has_ended_stays_and_what_may_not_pass_it_is_let_be(monkeypatch) -> None:
+    best, slow = state(90.0, ended=True), _State(seen(), fitted(), (taken(20.0, SWING, 1),))
+    found, ended = grown(monkeypatch, [best, slow])  # 20 and two of 20
+    assert found == [best, slow]
+    assert ended
+    fast = _State(seen(), fitted(), (taken(40.0, SWING, 1),))
+    found, ended = grown(monkeypatch, [best, fast], [(explained(FADE, 1), 60.0)])
+    assert whats(found) == [[(SWING, 1), (FADE, 1)], [(STRIP, 0)]]
+    assert not ended
+
+
+def test_two_ways_with_the_same_parts_are_one_the_better(monkeypatch) -> None:
+    one, other = state(30.0), _State(seen(), fitted(), (taken(25.0, SWING, 1),))
+    found, _ = grown(monkeypatch, [one, other], [(explained(SWING, 1), 12.0)], [(explained(STRIP), 19.0)])
+    assert whats(found) == [[(SWING, 1), (STRIP, 0)]]
+    assert found[0].gain == 44.0
+
+
+def test_a_swing_or_a_motion_below_the_floor_is_nothing() -> None:
+    each = search(floor=0.1)  # of which two and a half are asked
+    for size, nothing in ((0.99, True), (1.01, False)):
+        parts = size * 0.25 * np.array([0.36, 0.48, 0.48, 0.64])
+        assert each._is_nothing(four(), fitted(extra=[7.0, *parts])) == nothing
+        moving = np.array([0.6, 0.4, 0.9, 0.0, 0.0, 0.0])
+        by_move = np.zeros((2, 1, 6))
+        by_move[0, 0, [0, 1]], by_move[1, 0, 2] = [1.0, 50.0], 7.0  # a mean square of 25
+        group: Any = SimpleNamespace(by_move=by_move)
+        found = fitted(moving=moving, move=np.array([0.05 * size]))
+        assert each._is_nothing(explained(MOVING, -1, group=group), found) == nothing
+        still = replace(found, moving=0.5 * np.ones(6))
+        assert not each._is_nothing(explained(MOVING, -1, group=group), still)
+    assert not each._is_nothing(explained(STRIP), fitted(extra=[0.0, 0.0]))
+
+
+def four() -> Explanation:
+    """A swing of four unknowns."""
+    return replace(explained(SWING), extra=np.zeros((2, 4, 6)), sigma=np.full(4, 0.5))
+
+
+def test_ends_are_looked_for_where_they_may_gain_most(monkeypatch) -> None:
+    """Of two a kind, and only of what is not far behind what is sure already."""
+    sharp: list[Explanation] = []
+
+    def sharpened(self: _Search, one: Explanation, found: Fit) -> tuple[Explanation, Fit]:
+        sharp.append(one)
+        return one, replace(found, evidence=found.evidence + 1.0)
+
+    monkeypatch.setattr(_Search, "_sharpened", sharpened)
+
+    def of(*gains: float) -> list[int]:
+        kinds = (STRIP, STRIP, STRIP, FADE, SETTLING, SWING, WANDER, MOVING)
+        rows = [(explained(kind), fitted(gain), gain) for kind, gain in zip(kinds, gains, strict=False)]
+        sharp.clear()
+        made = search()._sharp(rows)
+        assert [row[2] for row in made] == sorted((row[2] for row in made), reverse=True)
+        assert sum(row[2] for row in made) == pytest.approx(sum(gains) + len(sharp))
+        return [next(n for n, row in enumerate(rows) if row[0] is one) for one in sharp]
+
+    assert of(30.0, 29.0, 28.0, 27.0, 26.0, 25.0, 24.0, 23.0) == [0, 1, 3, 4, 5, 6]
+    assert of(30.0, 10.0, 9.0, 10.1) == [0, 3]
+    assert of(12.0, 5.0, 4.0, 5.1) == [0, 3]
+    assert of(5.0, 4.0, 3.0, -2.0) == [0, 1, 3]  # where nothing is sure all may be
+    assert search()._sharp([]) == []
+
+
+def test_of_many_explanations_those_are_fitted_that_few_tracks_let_hope(monkeypatch) -> None:
+    monkeypatch.setattr(judging, "fit", lambda *_: fitted(100.0))
+    monkeypatch.setattr(_Search, "_fit", lambda self, one, linear=None, base=None: fitted(100.0 + one.view + one.price))
+
+    def of(*gains: int, few: bool = True) -> list[int]:
+        each = search()
+        each.seen = each.seen if few else replace(each.seen, few=each.seen.linear)
+        return [one.view for one in each._worth_more([explained(SWING, gain, price=2.0) for gain in gains])]
+
+    assert of(30, 10, 9) == [30, 10]
+    assert of(5, 4, 1, -9) == [5, 4, 1, -9]  # none is sure: all are
+    assert of(6, 2, 1) == [6, 2]
+    assert of(30, 1) == [30, 1]
+    assert of(30, 2, 1, few=False) == [30, 2, 1]
+
+
+@pytest.mark.parametrize("left", [([], []), ([1], []), ([], [1])])
+def test_nothing_is_left_beside_the_best_where_neither_rows_nor_periods_stand_out(monkeypatch, left) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(_Search, "_standing_out", lambda self, found, extra: asked.append(extra) or left)
+    one, found = explained(STRIP), fitted()
+    assert search()._leaves_nothing([(one, found, SURE + 0.1)]) == (left == ([], []))
+    np.testing.assert_array_equal(asked[0], one.extra)
+    assert not search()._leaves_nothing([(one, found, SURE)])
+    assert not search()._leaves_nothing([(explained(WANDER), found, 99.0), (one, found, 98.0)])
+    assert not search()._leaves_nothing([])
+    assert len(asked) == 1
+
+
+def test_gains_are_over_what_is_known_less_the_price_of_a_choice() -> None:
+    each = search(seen=replace(seen(), base=fitted(100.0)))
+    rows = [(explained(STRIP, price=4.0), fitted(110.0)), (explained(FADE, price=1.0), fitted(109.0))]
+    assert [(row[0].kind, row[2]) for row in each._sorted(rows)] == [(FADE, 8.0), (STRIP, 6.0)]
+
+
+# --- which parts of a block are judged --------------------------------------------------------------------------------
+
+
+def tied(pairs: list[tuple[int, int]], views: int) -> Any:
+    """A block of tracks of two views each."""
+    point = np.repeat(np.arange(len(pairs)), 2)
+    return SimpleNamespace(
+        views=[SimpleNamespace(size=(100, 200))] * views, view=np.array(pairs).ravel(), point=point,
+        num_points=len(pairs), num_tracks=len(pairs), use=np.ones(len(point), dtype=bool),
+    )  # fmt: skip
+
+
+def test_a_view_is_judged_among_those_that_share_most_tracks_with_it() -> None:
+    block = tied([(0, v) for v in range(1, 15) for _ in range(v)], 16)
+    assert _near(block, 0).tolist() == [0, *range(4, 15)]
+    assert _near(block, 3).tolist() == [0, 3]
+    unused = tied([(0, 1), (0, 1), (0, 2), (1, 2)], 4)
+    assert _near(unused, 0).tolist() == [0, 1, 2]
+    unused.use[[4, 5]] = False  # its track with view 2
+    assert _near(unused, 0).tolist() == [0, 1]
+    control = tied([(0, 1), (0, 2)], 3)
+    control.num_tracks = 1
+    assert _near(control, 0).tolist() == [0, 1]
+
+
+def test_findings_among_some_views_are_those_of_the_block() -> None:
+    step = np.zeros((5, 2))
+    step[3] = 7.0
+    all_of = judging.Judgement(("first",), step, np.ones(6))  # type: ignore[arg-type]
+    found = judging.Finding(SWING, 1, None, np.zeros(2), 9.0, 1.0, "", np.zeros(4), 30.0, (0, 2))
+    own = judging.Judgement((found,), np.arange(6.0).reshape(3, 2) + 1.0, np.array([0.1, 0.2]))
+    both = _joined(all_of, own, np.array([1, 3, 4]), np.array([2, 5]))
+    assert both.findings[0] == "first"
+    assert (both.findings[1].view, both.findings[1].or_of) == (3, (1, 4))
+    # of a view that was judged before the first is kept
+    np.testing.assert_array_equal(both.step, [[0, 0], [1, 2], [0, 0], [7, 7], [5, 6]])
+    np.testing.assert_array_equal(both.right, [1, 1, 0.1, 1, 1, 0.2])
+    np.testing.assert_array_equal(all_of.right, 1.0)
+    assert (all_of.step[[1, 4]] == 0).all()
+
+
+def judged(monkeypatch, size: int, rows: list[int], periods: list[int], views: int = 14, ties: int = 8) -> Any:
+    """Which views are judged together in a block of so many unknowns; whether periods were looked for."""
+    asked: list[list[int]] = []
+
+    def among(outcome: Any, block: Any, floor: float, chosen: np.ndarray) -> judging.Judgement:
+        asked.append(chosen.tolist())
+        found = judging.Finding(STRIP, 0, None, np.zeros(2), 9.0, 1.0, "", np.zeros(2))
+        n = len(chosen)
+        rows = np.isin(block.view, chosen)
+        return judging.Judgement((found,), np.ones((n, size // views)), np.zeros(int(rows.sum())))
+
+    looked: list[int] = []
+    monkeypatch.setattr(judging, "_judged_among", among)
+    monkeypatch.setattr(judging, "standing_out", lambda *_: [interval(0, 1, view) for view in rows])
+    swings = [SimpleNamespace(view=view) for view in periods]
+    monkeypatch.setattr(judging, "swinging", lambda *_: looked.append(1) or swings)
+    block = tied([(v, v + 1) for v in range(0, views, 2) for _ in range(ties // 2)], views)
+    outcome: Any = SimpleNamespace(problem=SimpleNamespace(free=np.ones(size)), inlier=np.ones(len(block.view), bool))
+    found = judging.judge(outcome, block, 0.0)
+    return asked, bool(looked), found
+
+
+def test_a_small_block_is_judged_whole_where_rows_stand_out_or_else_a_period(monkeypatch) -> None:
+    every = [[*range(14)]]
+    assert judged(monkeypatch, 14 * 9, [3], [])[:2] == (every, False)
+    assert judged(monkeypatch, 14 * 9, [], [3])[:2] == (every, True)
+    asked, looked, found = judged(monkeypatch, 14 * 9, [], [])
+    assert (asked, looked, found.findings) == ([], True, ())
+    assert judged(monkeypatch, 400, [3], [])[0] == every
+    assert judged(monkeypatch, 401, [3], [])[0] == [[2, 3]]
+
+
+def test_a_large_block_is_judged_around_each_view_that_stands_out(monkeypatch) -> None:
+    asked, looked, found = judged(monkeypatch, 14 * 40, [3, 9, 2, 3], [12, 8])
+    assert asked == [[2, 3], [8, 9], [12, 13]]
+    assert looked
+    assert [one.view for one in found.findings] == [2, 8, 12]
+    np.testing.assert_array_equal(found.step.any(axis=1), np.isin(np.arange(14), [2, 3, 8, 9, 12, 13]))
+    assert found.step.shape == (14, 40)
+    assert (found.right == 0.0).sum() == 3 * 8
+    assert judged(monkeypatch, 12_000, [3], [], 12)[0] == [[2, 3]]
+    asked, _, found = judged(monkeypatch, 12_001, [3], [3], 12)
+    assert (asked, found.findings, found.step.shape) == ([], (), (0, 0))
+    monkeypatch.setattr(judging, "OBSERVATIONS", 4 * 14)
+    assert judged(monkeypatch, 14 * 9, [3], [])[0] == [[*range(14)]]
+    monkeypatch.setattr(judging, "OBSERVATIONS", 4 * 14 - 1)
+    assert judged(monkeypatch, 14 * 9, [3], [])[0] == []
+
+
+def test_what_was_cut_in_an_interval_is_said_with_its_distance(monkeypatch) -> None:
+    """The median of ties that are used, and finite, from the start of the interval up to its stop."""
+    block = tied([(0, 1)] * 8, 2)
+    n = 16
+    block.xy = np.stack([np.zeros(n), np.repeat(np.arange(8.0) * 10.0, 2)])
+    block.sigma, block.num_tracks = np.ones(n), 7
+    inlier = np.zeros(n, dtype=bool)
+    inlier[6] = True  # view 0, row 30
+    block.use[8] = False  # row 40
+    away = np.zeros((2, n))
+    away[0, ::2], away[1, ::2] = 3.0 * np.arange(8), 4.0 * np.arange(8)  # 5 times the number
+    away[0, 4] = np.nan  # row 20
+    away[:, 1::2] = 1e3
+    monkeypatch.setattr(judging, "revived", lambda *_: (None, away))
+    outcome: Any = SimpleNamespace(
+        minimum=SimpleNamespace(state=None), problem=None, residual=None, inlier=inlier, standing_out={}
+    )
+
+    def apart(*rows: Interval) -> list[float]:
+        outcome.standing_out[0.25] = list(rows)
+        return [one.apart for one in judging.left_over(outcome, block, 0.25)]
+
+    one = replace(interval(10.0, 60.0), by_share=True)
+    assert apart(one) == [15.0]  # rows 10 and 50: the one at 60 is beyond
+    assert apart(one, replace(one, start=10.1), replace(one, stop=60.1), replace(one, stop=100.0)) == [15, 25, 25, 25]
+    assert apart(replace(one, start=65.0, stop=90.0), replace(one, start=20.0, stop=50.0)) == [0.0, 0.0]
+    assert apart(replace(one, view=1)) == [pytest.approx(np.hypot(1e3, 1e3))]
+    assert apart(interval(10.0, 60.0)) == [0.0]  # none by its share: nothing is measured
+    assert apart(interval(10.0, 60.0), one) == [15.0, 15.0]
+
+
+def test_what_was_cut_is_seen_where_two_others_tell_its_point() -> None:
+    block: Any = SimpleNamespace(point=np.array([0, 0, 0, 1, 1, 2]), num_points=4)
+    outcome: Any = SimpleNamespace(inlier=np.array([True, True, False, True, False, True]))
+    np.testing.assert_array_equal(judging._told(outcome, block), [1, 1, 1, 0, 0, 0])
