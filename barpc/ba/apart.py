@@ -18,11 +18,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.ba.evidence.mixture import fit
-from barpc.ba.evidence.scan import SURE
 from barpc.ba.held.block import Block
-from barpc.ba.judging.judge import LARGEST, UNKNOWNS, around
-from barpc.ba.judging.solution import MUCH_NOISE, Solution
+from barpc.ba.judging.judge import LARGEST, around
+from barpc.ba.judging.solution import Solution
 from barpc.ba.placing import Look, Placed, look, place
+from barpc.ba.usual import MUCH_NOISE, SMALL, SURE
 from barpc.errors import AdjustError
 from barpc.geodesy import Array
 from barpc.options import GEOMETRIC, AdjustOptions
@@ -127,7 +127,7 @@ def find_apart(
         if agrees(first):
             odd = _odd(first, block) if num > _TELLING else None
             asked = asked[gone[asked]] if odd is None else np.array([odd])
-        if num * _UNKNOWNS_A_VIEW > UNKNOWNS:
+        if num * _UNKNOWNS_A_VIEW > SMALL:
             asked = asked[gone[asked]][:_TRIED_OF_MANY]
     views = [v for v in asked.tolist() if block.names[v] not in options.fixed]
     left: list[_Left] = []

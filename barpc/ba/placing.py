@@ -9,21 +9,17 @@ from scipy.spatial import cKDTree
 
 from barpc.ba.estimated.projected import Projected
 from barpc.ba.held.block import Block
-from barpc.ba.judging.solution import MUCH_NOISE, Solution
+from barpc.ba.judging.solution import Solution
 from barpc.ba.robust.smooth import SPLINES
 from barpc.ba.robust.weights import geman_mcclure
 from barpc.ba.solving.normal import cholesky3, point_products, whiten
+from barpc.ba.usual import FEW, GROSS, MUCH_NOISE, SHRINK, SURELY
 from barpc.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray
 from barpc.sensor.splined import bsplines
 
-_FEWEST = 30  # points: fewer are no view (`barpc.ba.robust.consensus`)
-_SPLINE = 15.0  # px: a row may be anywhere near, as what wanders may (`barpc.ba.judging.explanations`)
-_STATED = 3.0  # standard deviations
-_WIDE = 100.0  # times its prior: a camera that may be anywhere
 _STEPS = 25
-_SHRINK = 0.25  # of the loss's scale in one step, at most
-_NEAR = 3.0  # standard deviations: the loss's scale at the end
+_SPLINE = 15.0  # px: a row may be anywhere near, as what wanders may (`barpc.ba.judging.explanations`)
 _MEDIAN = float(2.0 * np.log(2.0))  # of chi-square with two degrees of freedom
 _SURFACES = 110.0  # m: no geoid lies farther from the ellipsoid, so no mistaken height surface either
 
@@ -63,7 +59,7 @@ class Placed:
         if seen.mean() < 0.5:  # it does not see the place at all
             return True
         far = self._far(limit) & seen
-        if far.sum() < _FEWEST:
+        if far.sum() < FEW:
             return False
         left = self.left[:, far].T
         nearest = np.asarray(cKDTree(self.xy[:, far].T).query(self.xy[:, far].T, k=2)[1])[:, 1]
@@ -103,7 +99,7 @@ def place(found: Solution, others: Block, block: Block, view: int) -> Placed | N
     """
     rows = (block.view == view) & known_points(found, others)[block.point]
     unknowns = found.problem.cameras.unknowns
-    if rows.sum() < _FEWEST:
+    if rows.sum() < FEW:
         return None
     sight = _Sight(found, others, block, view, rows)
     u = (block.xy[1, rows] - unknowns.middle[1, view]) / unknowns.half[1, view]
@@ -148,7 +144,7 @@ class _Sight:
         params = self.problem.camera_prior.mean.copy()
         beside = np.zeros((0, self.xy.shape[1])) if splines is None else splines
         size, m = params.shape[1], len(beside)
-        sigma = np.append(_WIDE * self.problem.camera_prior.sigma[self.view], np.full(2 * m, _SPLINE))
+        sigma = np.append(GROSS * self.problem.camera_prior.sigma[self.view], np.full(2 * m, _SPLINE))
         moved, residual, scale = np.zeros(size + 2 * m), np.zeros((0, 2)), np.inf
         matrix = np.diag(sigma**-2.0)
         root = np.linalg.inv(np.linalg.cholesky(self.covariance))
@@ -165,7 +161,7 @@ class _Sight:
             middle = median_noise(squared)
             if not np.isfinite(middle):
                 break
-            scale = _NEAR * max(middle, 1.0) if np.isinf(scale) else max(_NEAR, _SHRINK * scale)
+            scale = SURELY * max(middle, 1.0) if np.isinf(scale) else max(SURELY, SHRINK * scale)
             near = np.flatnonzero(np.isfinite(squared))
             counted = geman_mcclure(squared[near] / (2.0 * scale**2))[1]
             rows = np.einsum("ncd,dqn->ncq", root[near], along[:, :, near])
@@ -195,10 +191,10 @@ def look(found: Solution, block: Block, placed: Placed, view: int) -> Look:
     constants = problem.cameras.unknowns.constants
     metres = float(np.sqrt((problem.camera_prior.sigma[view, :constants:3] ** 2).sum()))
     stated = metres * float(np.nanmedian(np.linalg.norm(projected.by_point, axis=1)))
-    if not placed.meets and _half(off) < _STATED * stated:
+    if not placed.meets and _half(off) < SURELY * stated:
         return Look(as_stated=True)
     swapped = projected.image[::-1] - xy
-    if _half(swapped) < _STATED * stated < _half(off):
+    if _half(swapped) < SURELY * stated < _half(off):
         return Look(swapped=True)
     offset = np.nanmedian(off, axis=1)
     if not (_half(off - offset[:, None]) < stated):

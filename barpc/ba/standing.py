@@ -8,18 +8,18 @@ from functools import cached_property
 
 import numpy as np
 
-from barpc.ba.evidence.scan import SURE, Interval, scan
+from barpc.ba.evidence.scan import Interval, scan
 from barpc.ba.held.block import MIN_OBSERVATIONS, Block
 from barpc.ba.judging.judge import Finding, Judgement, judge
 from barpc.ba.judging.moving import Found, Motion, members
-from barpc.ba.judging.solution import MUCH_NOISE, Solution
+from barpc.ba.judging.solution import Solution
 from barpc.ba.robust.heldout import is_better, measure
+from barpc.ba.usual import LEVEL, MUCH_NOISE, SURE
 from barpc.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray, connected_groups
 
 _GROUPS = 2  # that move, at most
-_MOST = 0.05, 0.95  # quantiles between which the place of a group is said to lie
 _NAMES = ("west", "east"), ("south", "north")
 
 
@@ -91,8 +91,8 @@ class Parts:
         ground, all_of = ground_from_ecef(points[of_group]), ground_from_ecef(points[every])
         center = float(all_of[0, 0])
         place, whole = (np.column_stack([wrap_longitude(g[:, 0], center), g[:, 1]]) for g in (ground, all_of))
-        low, high = np.quantile(place, _MOST, axis=0)
-        middle = np.quantile(whole, _MOST, axis=0).mean(axis=0)  # a wrong match may lie anywhere
+        low, high = np.quantile(place, (LEVEL, 1.0 - LEVEL), axis=0)
+        middle = np.quantile(whole, (LEVEL, 1.0 - LEVEL), axis=0).mean(axis=0)  # a wrong match may lie anywhere
         sides = [
             names[0] if high[axis] < middle[axis] else names[1] if low[axis] > middle[axis] else ""
             for axis, names in enumerate(_NAMES)

@@ -6,7 +6,7 @@ import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.ba.held.ground import TerrainTest
-from barpc.ba.held.terrain import BEYOND
+from barpc.ba.usual import SURELY
 from barpc.report.summary.words import metres
 
 _GEOID = 110.0  # m: no geoid lies farther from the ellipsoid
@@ -75,7 +75,7 @@ def _against(terrain: TerrainTest) -> list[str]:
     """Return how the DEM contradicts the cameras as delivered."""
     level, *rises = terrain.beyond
     out = []
-    if level > BEYOND:
+    if level > SURELY:
         off = terrain.delivered[0]
         why = "its heights, the datum that they count from, or the cameras are not as stated"
         if not terrain.is_known and abs(off) < _GEOID:
@@ -87,11 +87,11 @@ def _against(terrain: TerrainTest) -> list[str]:
     tilts = [
         f"{abs(off):.1f} m to the {'east' if axis == 0 else 'north'}"
         for axis, (off, times) in enumerate(zip(terrain.delivered[1:], rises, strict=True))
-        if times > BEYOND
+        if times > SURELY
     ]
     if tilts:
         out.append(
             f"The DEM is tilted against the tie points as delivered, by {' and '.join(tilts)} at the scene's edge, "
-            f"more than {BEYOND:g} times what the accuracies of it and of the cameras let expect."
+            f"more than {SURELY:g} times what the accuracies of it and of the cameras let expect."
         )
     return out

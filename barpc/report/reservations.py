@@ -8,7 +8,7 @@ import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.ba.apart import Apart
-from barpc.ba.evidence.scan import SURE
+from barpc.ba.usual import SURE
 from barpc.report.dem_lines import holds_reference
 from barpc.report.outcome import MANY_REJECTED, SMOOTH_LEFT, Run
 from barpc.report.summary.causes import CAUSES, Reservation

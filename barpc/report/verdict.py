@@ -10,8 +10,8 @@ import numpy as np
 
 from barpc.ba import Adjustment, check_residuals
 from barpc.ba.apart import APART
-from barpc.ba.evidence.scan import SURE
 from barpc.ba.judging.snooping import ControlTest
+from barpc.ba.usual import SURE
 from barpc.geodesy import Array
 from barpc.report.dem_lines import dem_lines, dem_reasons
 from barpc.report.outcome import MANY_REJECTED, Run

@@ -316,7 +316,7 @@ def test_what_a_plane_is_told_is_the_covariance_of_an_m_estimate(noise: float):
     np.testing.assert_allclose(found.residual, np.where(near, off, np.nan))
     np.testing.assert_allclose(found.sigma, sigma)
     np.testing.assert_array_equal(found.near, near)
-    np.testing.assert_array_equal(found.agree, near & (np.abs(off) < registration._NEAR * scale * sigma))
+    np.testing.assert_array_equal(found.agree, near & (np.abs(off) < registration.SURELY * scale * sigma))
     rows = np.einsum("c,ncm->nm", [-0.3, 0.2, 1.0], displacement(place[:, :2] / 200.0))
     z = off / (scale * sigma)
     inside = near & (np.abs(z) < cut)
@@ -334,5 +334,5 @@ def test_what_a_plane_is_told_is_the_covariance_of_an_m_estimate(noise: float):
     expected = np.linalg.inv(np.linalg.inv(told) + free)
     np.testing.assert_allclose(found.covariance, expected, rtol=2e-3, atol=1e-6)
     rest = np.sort(off[near & ~found.agree])
-    width = 2.0 * registration._NEAR * scale * sigma
+    width = 2.0 * registration.SURELY * scale * sigma
     assert found.rivals == max((rest <= low + width).sum() - n for n, low in enumerate(rest))

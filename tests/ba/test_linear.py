@@ -63,8 +63,8 @@ def test_a_large_block_is_solved_in_sparse_form_as_in_dense_form(block, adjusted
 
 def test_what_a_large_block_does_not_keep_it_works_out_again(block, adjusted, monkeypatch):
     """Derivatives from one step to the next, and the terms of the smooth parts."""
-    monkeypatch.setattr("barpc.ba.solving.problem._KEPT", 0)
-    monkeypatch.setattr("barpc.ba.robust.smooth._KEPT", 0)
+    monkeypatch.setattr("barpc.ba.solving.problem.KEPT", 0)
+    monkeypatch.setattr("barpc.ba.robust.smooth.KEPT", 0)
     found = adjust(block)
     np.testing.assert_allclose(found.params, adjusted.params, atol=1e-7)
     np.testing.assert_allclose(found.smooth.rms, adjusted.smooth.rms, atol=1e-9)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.ba.evidence.periods import swings
-from barpc.ba.evidence.scan import SURE
+from barpc.ba.usual import SURE
 
 
 def ties(seed: int, rows: float = 9000.0, views: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

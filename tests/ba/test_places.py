@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.ba.evidence.places import CHANCE, Place, Unused, met_worse
+from barpc.ba.evidence.places import Place, Unused, met_worse
+from barpc.ba.usual import CHANCE
 from tests.lanes import diagonal
 
 SIZE = np.array([[20_000.0, 9_000.0], [15_000.0, 12_000.0]])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from barpc.ba.evidence.mixture import Fit
-from barpc.ba.evidence.scan import SURE, Interval
+from barpc.ba.evidence.scan import Interval
 from barpc.ba.judging import judge as judging
 from barpc.ba.judging.explanations import FADE, MOVING, SETTLING, STRIP, SWING, WANDER, Explanation, Seen
 from barpc.ba.judging.judge import (
@@ -27,6 +27,7 @@ from barpc.ba.judging.judge import (
     _State,
     _Taken,
 )
+from barpc.ba.usual import SURE
 
 VIEW = np.array([0, 0, 0, 0, 1, 1])
 

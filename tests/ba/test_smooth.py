@@ -207,7 +207,7 @@ def test_what_neighbours_share_is_found_though_it_is_no_smooth_function(axis: in
 
 @pytest.mark.parametrize(("most", "once"), [(599, False), (600, True)])
 def test_terms_of_a_block_that_is_not_large_are_worked_out_once(monkeypatch, most: int, once: bool) -> None:
-    monkeypatch.setattr("barpc.ba.robust.smooth._KEPT", most)
+    monkeypatch.setattr("barpc.ba.robust.smooth.KEPT", most)
     asked: list[slice] = []
     terms = Smooth._terms
     monkeypatch.setattr(Smooth, "_terms", lambda self, rows: asked.append(rows) or terms(self, rows))

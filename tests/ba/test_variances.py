@@ -425,7 +425,7 @@ def determined(problem: Any, minimum: Any, sigma: np.ndarray) -> np.ndarray:
 def test_a_large_block_learns_once_a_solve(at_minimum, monkeypatch) -> None:
     """By the covariance at hand: the drift of all views by its squares, the constants by those of most."""
     problem, minimum = at_minimum
-    monkeypatch.setattr("barpc.ba.robust.variances._SMALL", 0)
+    monkeypatch.setattr("barpc.ba.robust.variances.SMALL", 0)
     sigma, params = problem.camera_prior.sigma, minimum.state.params
     known = determined(problem, minimum, sigma)
     squares = (params / sigma) ** 2
@@ -447,7 +447,7 @@ def test_a_large_block_learns_once_a_solve(at_minimum, monkeypatch) -> None:
 
 def test_priors_that_are_too_narrow_are_widened_by_what_most_views_show(at_minimum, monkeypatch) -> None:
     problem, minimum = at_minimum
-    monkeypatch.setattr("barpc.ba.robust.variances._SMALL", 0)
+    monkeypatch.setattr("barpc.ba.robust.variances.SMALL", 0)
     narrow = problem.camera_prior.sigma.copy()
     narrow[:, :6] /= 5.0
     known = determined(problem, minimum, problem.camera_prior.sigma)

@@ -16,13 +16,12 @@ import numpy as np
 
 from barpc.ba.algebra.structure import parts
 from barpc.ba.estimated.unknowns import Unknowns
+from barpc.ba.usual import CHUNK
 from barpc.geodesy import Array, ground_from_ecef, ground_rows_from_ecef
 from barpc.scene import IntArray, View
 from barpc.sensor.corrected import RigidMotion
 from barpc.sensor.rpc import RPC
 from barpc.sensor.stack import RpcStack
-
-CHUNK = 8192  # observations worked on at a time, so that temporaries stay in cache
 
 Wanted = Literal["image", "points", "unknowns"]
 

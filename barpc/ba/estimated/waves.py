@@ -20,7 +20,6 @@ from barpc.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import RowSpline, bsplines, profile, sine_and_cosine
 
-PER_SPLINE = 30  # observations of a view
 FEWEST = 7  # splines
 FIRST_SIGMA = 0.3  # px: a prior's standard deviation before anything is known
 _DEGREE = 2  # of the polynomials of the row that are the drift's

@@ -14,6 +14,7 @@ import numpy as np
 
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
+from barpc.ba.usual import BACKFITTING, FEW
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
@@ -21,8 +22,6 @@ _LARGE = 40.0  # twice the logarithm of a likelihood ratio: the largest of 10,00
 _A_VIEW = 4.0  # and so much more for every other view of a focal plane
 _AS_LARGE = 0.5  # of the largest change: not what another view's step leaves here, a quarter of it with three views
 _ROUNDS = 12
-_BACKFITTING = 6
-_FEWEST = 30  # observations of a detector
 
 Edges = list[list[float]]  # of every group of views, ascending
 
@@ -70,7 +69,7 @@ class _Columns:
         left, right = np.maximum(total[at], 1e-30), np.maximum(total[-1] - total[at], 1e-30)
         apart = sums[:, at] / left - (sums[:, -1:] - sums[:, at]) / right
         gain = (apart**2).sum(axis=0) * left * right / max(total[-1], 1e-30)
-        return np.where((at >= _FEWEST) & (b - a - at >= _FEWEST), gain, 0.0)
+        return np.where((at >= FEW) & (b - a - at >= FEW), gain, 0.0)
 
 
 def find_edges(problem: Problem, state: State, residual: Array, use: BoolArray, sigma: Array) -> Array:
@@ -120,7 +119,7 @@ def _grown(columns: _Columns, residual: Array, settled: Callable[[Array], Array]
         for g, gain, col in found:
             if gain >= max(_LARGE, _AS_LARGE * largest):
                 edges[g] = sorted([*edges[g], col])
-        for _ in range(_BACKFITTING):
+        for _ in range(BACKFITTING):
             part += columns.means(settled(residual - part), edges)
     left = settled(residual - part)
     cost = float(((left * weight) ** 2).sum())

@@ -22,6 +22,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dtrtri
 
 from barpc.ba.evidence.linearised import Linear, Tracks
+from barpc.ba.usual import BACKFITTING, CHUNK, RIDGE
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
@@ -29,13 +30,10 @@ _HOTTEST = 200.0  # times the noise stated, where it is cooled from: 20 px of 0.
 _COOLED = 0.6  # from one iteration to the next, at most
 _LEAST_NOISE = 0.2  # of what is stated
 _ITERATIONS = 60
-_BEGINNINGS = 6  # reweightings of a first guess
 _STANDS = 2e-3, 0.3  # change of the noise (logarithm) and of the log-likelihood at the end
 WRONG = 1.0, 10.0  # of so many observations of a view so many are wrong, before any is seen
 _EPS = 1e-3, 0.98
-_CHUNK = 8192  # pairs of observations worked on at a time, so that temporaries stay in cache
 _CHANGED = 0.1  # of what an unknown rests on: its curvature is summed anew
-_LOOSE = 1e-6  # of what all observations of a track tell of its place
 _TWO = 1.5  # observations: half of the next
 NEAR_LIMIT = 4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise is large wrong ones lie no nearer
 
@@ -114,7 +112,7 @@ def off_from_right(linear: Linear, residual: Array, right: Array) -> tuple[Array
         ground = np.swapaxes(tracks.follow[:, :3], 1, 2)  # in units in which all observations know it alike
         weight = right[tracks.rows]
         weighted = np.swapaxes(ground * np.repeat(weight, 2, axis=1)[..., None], 1, 2)
-        matrix = weighted @ ground + _LOOSE * np.eye(3)
+        matrix = weighted @ ground + RIDGE * np.eye(3)
         by_row = np.linalg.solve(matrix, np.swapaxes(ground, 1, 2))  # (T, 3, 2n)
         values = tracks.of(residual)
         left = values - (np.swapaxes(by_row, 1, 2) @ (weighted @ values[..., None]))[..., 0]
@@ -144,7 +142,7 @@ def first_guess(linear: Linear, found: Fit, extra: Array, new: Array, precision:
         follow = tracks.follow[some, :3]
         parts.append(tuple(one - np.swapaxes(follow, 1, 2) @ (follow @ one) for one in (off, columns)))
     moved, far = np.zeros(new.shape[1]), [np.zeros(0)]
-    for _ in range(_BEGINNINGS):
+    for _ in range(BACKFITTING):
         matrix, gradient, far = prior.copy(), prior @ moved, []
         for off, turned in parts:
             now = off + turned @ moved[:, None]
@@ -461,7 +459,7 @@ class Mixture:
         """
         linear, (views, q), pairs = self.linear, self.linear.shape, self.linear.pairs
         out, at = np.zeros((views, q, views, q)), pairs.bounds
-        starts = at[np.searchsorted(at, np.arange(0, at[-1] + _CHUNK, _CHUNK), side="right").clip(1) - 1]
+        starts = at[np.searchsorted(at, np.arange(0, at[-1] + CHUNK, CHUNK), side="right").clip(1) - 1]
         for start, stop in pairwise(np.unique([*starts.tolist(), at[-1]]).tolist()):
             part = slice(start, stop)
             left = linear.by_row[pairs.first[part]].reshape(-1, q).T

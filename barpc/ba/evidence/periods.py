@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barpc.ba.evidence.scan import CLIPPED, SURE
+from barpc.ba.evidence.scan import CLIPPED
+from barpc.ba.usual import FEW, SURE
 from barpc.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import sine_and_cosine
 
 _SHORTEST = 32.0  # rows: of what is shorter a matcher's window shows the mean
 _BIN = _SHORTEST / 8.0  # rows summed: 2 % of the shortest are lost
-_FEWEST_SEEN = 30  # observations of a view
 _FEWEST = 1.5  # waves of an image: fewer are no swing yet
 _COARSE, _FINE = 2, 8  # frequencies a wave more, to see whether there is a peak and where it is
 _SEEN = 0.8  # of a peak, where it lies amid two coarse ones: sinc^2(1/4)
@@ -60,7 +60,7 @@ def swings(view: IntArray, row: Array, size: Array, right: Array, off: Array, le
     for v, mine in enumerate(np.split(by_view, np.searchsorted(view[by_view], np.arange(1, views)))):
         rows = float(size[1, v])
         costs = price(rows, views)
-        if len(mine) >= _FEWEST_SEEN and rows > 2.0 * _FEWEST * _SHORTEST:
+        if len(mine) >= FEW and rows > 2.0 * _FEWEST * _SHORTEST:
             clipped = np.clip(off[:, mine], -CLIPPED, CLIPPED)
             best = _Rows(row[mine], rows, right[mine], clipped).largest(costs + least)
             if best is not None:

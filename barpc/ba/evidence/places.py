@@ -15,17 +15,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtrc, gammaln
 
+from barpc.ba.usual import CHANCE, FEW
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
-CHANCE = 1e-3  # that any place of a block is named where all are alike
 _FINEST = 32  # parts of rows or columns, and a side of the parts of which one observation is taken
 _CELLS = 8  # a side of the finest cells
 _PARTS, _TELLING = (
     4,
     12.0,
 )  # a side of the parts that may scatter by themselves, and observations that tell of one
-_FEWEST = 20  # observations of an image that tell nothing by themselves
 _LINE = 0.5  # of the larger spread: a smaller one is that of epipolar lines, which turn over an image
 
 
@@ -69,7 +68,7 @@ def met_worse(unused: Unused, size: Array, limit: float, least: float, share: fl
         Tolerances: displacement that near ones may have in common [px], share of a place that may be far off.
     """
     whole = [_thinned(unused.part(unused.view == v), size[:, v]) for v in range(size.shape[1])]
-    whole = [one for one in whole if len(one.view) >= _FEWEST]
+    whole = [one for one in whole if len(one.view) >= FEW]
     tests = 2.0 * len(whole) * _PLACES.shape[1]  # of each place the far ones and the near ones
     found = [_worst(one, size[:, one.view[0]], limit, least, share) for one in whole]
     sure = [replace(one, chance=one.chance * tests) for one in found if one and one.chance * tests < CHANCE]

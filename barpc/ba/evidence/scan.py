@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import entr, xlogy
 
+from barpc.ba.usual import SURE
 from barpc.geodesy import Array
 from barpc.scene import IntArray
 
 BINS = 40  # stretches of an image's rows or columns
 _STARTS, _STOPS = np.triu_indices(BINS + 1, 1)  # all intervals of these
 _WHOLE = BINS - 1  # which of them is all of an image, and no interval
-SURE = 5.0  # nats: an explanation that gains less is none
 _LINE = 0.05  # of the larger extent of residuals: a smaller one is none
 _FOLLOWED = 3  # a constant, a slope and a bend: what a camera follows along an axis
 CLIPPED = 8.0

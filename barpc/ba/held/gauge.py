@@ -14,6 +14,7 @@ import scipy.linalg as la
 from barpc.ba.estimated.priors import EarlierScene, JointPrior
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import solve_lower
+from barpc.ba.usual import SAMPLE
 from barpc.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray
 
@@ -34,8 +35,6 @@ that go with the product of east and north and with the square of each, beside a
 place of the scene. A rotation that changes with the row does the last: rows follow each other along the flight."""
 SIMILAR = MOTIONS.index("twist")
 """The first of these that bend the scene: those before keep its shape."""
-
-_SAMPLE = 2000  # points that stand for the scene's shape
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ def gauge_report(
     shift, count = (points[use] - before[use]).mean(axis=0), use.sum()
     index = np.flatnonzero(use)
     use = np.zeros_like(use)
-    use[index[:: len(index) // _SAMPLE + 1]] = True
+    use[index[:: len(index) // SAMPLE + 1]] = True
     middle = points[use].mean(axis=0)
     enu = enu_basis(ground_from_ecef(middle))
     local = (points[use] - middle) @ enu.T

@@ -14,23 +14,20 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
+from barpc.ba.usual import ITERATIONS, RIDGE, SURELY
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 NEIGHBOURS = 15  # tie points of a patch: its six unknowns are checked by nine
 _TERMS = 6
 _FREEDOM = NEIGHBOURS - _TERMS
-_RIDGE = 1e-6  # of a neighbour's weight: neighbours on a line tell of no more than a line
 _SHARED_FREEDOM = 4.0  # degrees of freedom that the whole surface's scatter counts for in that of a patch
 _BROKEN = float(chdtri(_FREEDOM, 1e-3))  # of its squares over the usual variance: by chance, one in a thousand
 _LEAST_SCATTER = 0.01  # m: no ground is flatter
 _SIDE = 25  # trials along each axis of the search
 _SEARCHED = 1000  # heights that the search looks at, at most
-_STEPS = 40
 _SETTLED = 1e-3  # m
 _BIWEIGHT = 4.685  # Tukey's: 95 % as efficient as least squares where all is normal
-_NEAR = 3.0  # standard deviations within which a height agrees
-_MOST_NOISE = 3.0  # times what is stated: more is not agreement
 _KNOWN = 0.2  # of the information that slopes claim: below, they are their own noise
 _PARTS = 20  # of a scene, left out one by one
 _FEWEST_GROUPS = 14  # of neighbours, that a variance is told by: twice the unknowns
@@ -60,7 +57,7 @@ class Surface:
         delta = points[near] - points[:, None]
         design = _powers(delta[..., :2] / reach[:, None, None])
         normal = np.swapaxes(design, 1, 2) @ design
-        inverse = np.linalg.inv(normal + _RIDGE * np.eye(_TERMS))
+        inverse = np.linalg.inv(normal + RIDGE * np.eye(_TERMS))
         patch = np.einsum("pij,pkj,pk->pi", inverse, design, delta[..., 2])
         squares = ((delta[..., 2] - np.einsum("pkj,pj->pk", design, patch)) ** 2).sum(axis=1)
         usual = max(float(np.sqrt(np.median(squares) / _FREEDOM)), _LEAST_SCATTER)
@@ -185,8 +182,8 @@ def _settled(
     """Return the motion (7,) that reweighted steps end at, and the noise over what is stated; learnt where it
     is not known.
     """
-    is_known, noise = noise is not None, _MOST_NOISE if noise is None else noise
-    for step in range(_STEPS):
+    is_known, noise = noise is not None, SURELY if noise is None else noise
+    for step in range(ITERATIONS):
         seen = _Seen.of(surface, given, motion, radius)
         whitened = seen.residual / seen.sigma
         near = seen.near & (np.abs(whitened) < _BIWEIGHT * noise)
@@ -297,8 +294,8 @@ def _search(surface: Surface, given: Given, before: Array) -> Array:
 def _told(surface: Surface, given: Given, motion: Array, radius: float, noise: float, free: Array) -> Registration:
     """Return the covariance at the end, and which heights agree."""
     seen = _Seen.of(surface, given, motion, radius)
-    scale = min(max(noise, 1.0), _MOST_NOISE)
-    agree = seen.near & (np.abs(seen.residual) < _NEAR * scale * seen.sigma)
+    scale = min(max(noise, 1.0), SURELY)
+    agree = seen.near & (np.abs(seen.residual) < SURELY * scale * seen.sigma)
     residual = np.where(seen.near, seen.residual, np.nan)
     # of an M-estimate (Huber, "Robust statistics", 1981, 7.6): what wrong heights among the right ones cost is in it
     part = np.where(seen.near, seen.residual / (_BIWEIGHT * scale * seen.sigma), 1.0) ** 2
@@ -338,7 +335,7 @@ def _rivals(seen: _Seen, agree: BoolArray, scale: float) -> int:
     off = np.sort(seen.residual[others])
     if not len(off):
         return 0
-    width = 2.0 * _NEAR * scale * float(np.median(seen.sigma[others]))
+    width = 2.0 * SURELY * scale * float(np.median(seen.sigma[others]))
     return int((np.searchsorted(off, off + width) - np.arange(len(off))).max())
 
 

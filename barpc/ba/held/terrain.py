@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from barpc.ba.usual import FAR, SURELY
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.scene import BoolArray, IntArray
 
@@ -30,11 +31,9 @@ _WIDEST = 16  # the widest smoothing is the scene's longer side over this, as a 
 _MARGIN, _LEAST_MARGIN = 0.1, 300.0  # of the scene and m around it: cameras may be off
 _ENOUGH = 60  # points: three for each number that is estimated
 _ROUNDS = 5  # gains, then what does not fit, in turn
-_FAR = 5.0  # robust standard deviations: heights farther off are holes that were filled, or what was built
 _CELLS = (6, 10, 16)  # along the scene's longer side: 36 sums tell a variance to a quarter
 _HILLS = 45.0  # slopes that are alike count as one: 49-133 of them in the scenes that hold, 33 in 250 m by SRTM
 _STATED = 4.0  # observations that the stated standard deviation of single heights is worth
-BEYOND = 3.0  # times what is allowed: a DEM and the cameras contradict each other
 _EDGE = 2.0  # the scene's edges lie at most about so many times as far out as its points' RMS distance
 _SHOWN = 0.5  # DEMs whose relief is farther from once that of the tie points than this, in
 _SURE = 4.0  # standard deviations, too, and
@@ -177,7 +176,7 @@ class Relief:
         where the points contradict it.
         """
         sigma = np.full(NUM_BENDS, bias)
-        contradicts = self.beyond(bias) > BEYOND
+        contradicts = self.beyond(bias) > SURELY
         sigma[:3][contradicts] = _EDGE * np.abs(self.delivered)[contradicts]
         return sigma
 
@@ -203,7 +202,7 @@ class Relief:
         for _ in range(_ROUNDS):
             delivered = _coefficients(flat[near], off[near])
             left = np.abs(off - flat @ delivered)
-            near = left <= _FAR * 1.4826 * np.median(left)
+            near = left <= FAR * 1.4826 * np.median(left)
         tell[index[sharp[index] < max(1.4826 * float(np.median(left)), stated)]] = True
         fit[:, index] = np.linalg.pinv(flat)
         return cls(bands, tell, delivered, fit, unknown)
@@ -288,14 +287,14 @@ def _compared(at: Array, above: Array, bent: Array, slopes: Array, smooth: Array
         part = moved @ _coefficients(moved[fits], rest[fits])
         left = rest - part
         spread = 1.4826 * float(np.median(np.abs(left[fits])))
-        fits = tell & (np.abs(left) <= max(_FAR * spread, 1e-6))
+        fits = tell & (np.abs(left) <= max(FAR * spread, 1e-6))
     return _Compared(gains, rising, part, left, fits, moved.shape[1] + len(gains))
 
 
 def _middling(values: Array) -> BoolArray:
     """Return the mask of n values about their median."""
     off = np.abs(values - np.median(values))
-    return np.asarray(off <= _FAR * 1.4826 * np.median(off))
+    return np.asarray(off <= FAR * 1.4826 * np.median(off))
 
 
 def _coefficients(design: Array, values: Array) -> Array:

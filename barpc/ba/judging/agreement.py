@@ -21,6 +21,7 @@ from barpc.ba.held.block import Block
 from barpc.ba.robust.heldout import enu_offsets
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import solve_transposed
+from barpc.ba.usual import LEVEL
 from barpc.geodesy import Array, enu_basis
 from barpc.scene import BoolArray, IntArray
 
@@ -30,7 +31,6 @@ _SEEN = 0.01  # of a point's own variance: motions that are smaller cannot be to
 _EVERY = 12  # points of which every set is looked at
 _TRIALS = 100  # sets of three drawn of more: 2e-6 to miss three right ones where half are
 _TRIPLE = 3  # points that tell shift, tilts, turn and scale
-_USUAL = 0.05  # of chance: sets are looked at where all points together are farther off
 _KEPT = 64  # of the sets looked at, those that are looked at again with every scale
 _NEAR = 16.0  # squared deviation of a point that goes with a set: that of `snooping.CRITICAL`
 _ROOM = 20_000  # points of sets at a time: some 10 MB
@@ -39,9 +39,10 @@ _MOTIONS = (1.0, 3.0)
 _OPTIMISTIC = 3.5  # nats for each factor of e in the accuracies. Measured, 60 draws each: with 3, 3.5, 4 one of five
 # points 3 m off is found in 55, 57, 57; six with sigmas 3 x too small stay together in 59, 59, 59
 _FLOPPY = 2.0  # nats, the same for the motions
-_WRONG = 2.9  # nats that it costs to call a point wrong: one in twenty is
-_ANYWHERE = 4.8  # nats: the density at one sigma of an error between one and 10,000, alike in its logarithm
-_CLEAR = 3.0  # nats by which a set must beat any other that contradicts it: one in twenty
+_WRONG = float(np.log(1.0 / LEVEL - 1.0))  # nats that it costs to call a point wrong: one in twenty is
+# nats: the density at one sigma of an error between one and 10,000, alike in its logarithm
+_ANYWHERE = float(np.log(4.0 * np.pi * np.log(1e4)))
+_CLEAR = float(-np.log(LEVEL))  # nats by which a set must beat any other that contradicts it: one in twenty
 _AS_MANY = 10.0  # nats, where that other has as many points: how well points happen to fit is no vote
 
 
@@ -166,7 +167,7 @@ def _fits_as_stated(offsets: Offsets) -> bool:
     one_less = np.concatenate([np.ones((1, count), dtype=bool), ~np.eye(count, dtype=bool)])
     score, _, squares = _evidence(offsets, one_less, 1.0)
     freedom = 3.0 * (count - 1)  # a shift is free
-    return bool(squares[0] < chdtri(freedom, _USUAL) and score[0] >= score.max())
+    return bool(squares[0] < chdtri(freedom, LEVEL) and score[0] >= score.max())
 
 
 class _Search:

@@ -7,13 +7,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from barpc.ba.estimated.waves import DRIFTS, FEWEST, PER_SPLINE, Waves
+from barpc.ba.estimated.waves import DRIFTS, FEWEST, Waves
 from barpc.ba.evidence.linearised import Linear
 from barpc.ba.evidence.mixture import Fit, Group, first_guess, log_likelihoods
 from barpc.ba.evidence.periods import Swing
 from barpc.ba.evidence.periods import price as price_of_period
 from barpc.ba.evidence.scan import BINS, Interval, price
 from barpc.ba.judging import moving
+from barpc.ba.usual import FEW
 from barpc.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import profile
@@ -218,7 +219,7 @@ def wander(seen: Seen, interval: Interval) -> list[Explanation]:
     view = interval.view
     rows = np.flatnonzero(seen.linear.view == view)
     u = 2.0 * seen.place[1, rows] / seen.size[1, view] - 1.0
-    each = int(np.median(np.bincount(seen.linear.view[seen.linear.taking_part]))) // PER_SPLINE
+    each = int(np.median(np.bincount(seen.linear.view[seen.linear.taking_part]))) // FEW
     one = _on_both(seen, WANDER, view, rows, Waves(min(max(each, FEWEST), _SPLINES)).splines(u), _WANDER)
     return [replace(one, price=one.price + SCALE)]
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from barpc.ba.estimated.waves import FEWEST, PER_SPLINE, Waves
+from barpc.ba.estimated.waves import FEWEST, Waves
 from barpc.ba.evidence.detectors import find_edges
 from barpc.ba.held.block import Block
 from barpc.ba.held.starting import make_problem
@@ -15,6 +15,7 @@ from barpc.ba.judging.judge import Finding, Judgement, standing_out
 from barpc.ba.judging.solution import Solution, finished
 from barpc.ba.robust.heldout import is_better
 from barpc.ba.robust.rounds import Rounds, revived
+from barpc.ba.usual import FEW
 from barpc.geodesy import Array
 from barpc.options import AUTO, OFF, AdjustOptions
 
@@ -128,7 +129,7 @@ def _spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> lis
     rows = max(view.size[1] for view in block.views)
     if options.jitter == OFF or options.is_plain:
         return [0] if options.detectors else []
-    most = int(np.median(np.bincount(block.view[block.use], minlength=len(block.views)))) // PER_SPLINE
+    most = int(np.median(np.bincount(block.view[block.use], minlength=len(block.views)))) // FEW
     if options.spacing:
         return [max(min(int(np.ceil(rows / options.spacing)) + 3, most), FEWEST)]
     most = min(most, _MOST_SPLINES // len(block.views))

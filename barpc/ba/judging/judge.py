@@ -11,7 +11,7 @@ import numpy as np
 from barpc.ba.evidence.linearised import Linear, linearise, numbers
 from barpc.ba.evidence.mixture import Fit, fit, off_from_right
 from barpc.ba.evidence.periods import Swing, swings
-from barpc.ba.evidence.scan import SURE, Interval, scan
+from barpc.ba.evidence.scan import Interval, scan
 from barpc.ba.held.block import Block
 from barpc.ba.judging.explanations import (
     EXPLANATIONS,
@@ -35,6 +35,7 @@ from barpc.ba.judging.moving import Found, Ground, Motion, group_of
 from barpc.ba.robust.rounds import Outcome, revived
 from barpc.ba.robust.weights import Observations
 from barpc.ba.solving.solve import State
+from barpc.ba.usual import SAMPLE, SMALL, SURE
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
@@ -46,11 +47,9 @@ _STATES = 3  # ways to explain a block that are gone on with
 _PARTS = 3  # of images that may explain together what something else does alone
 _LOCAL = 2  # of each kind of part of an image whose ends are looked for, a round
 _SHARPENED = 6  # times
-_FEW = 2000  # observations with which explanations are chosen that are worth more
 _SEEN = 2.5  # floors: swings and motions that are taken; sound crops show swings of 1.8, where ties share errors
 _WORTH = 0.1 * SURE  # nats: less decides nothing
 _HELD_IN = 4  # images of which a part may hold what moves
-UNKNOWNS = 400  # of all views, up to which explanations are tried on all together
 LARGEST, OBSERVATIONS = (
     12_000,
     1_000_000,
@@ -160,16 +159,16 @@ def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
     """Find what explains the ties of a block beside its cameras, the first taken first; empty where nothing
     stands out.
 
-    Of more unknowns than `UNKNOWNS` each image that stands out is judged among those that it shares most tracks with:
+    Of more unknowns than `SMALL` each image that stands out is judged among those that it shares most tracks with:
     what moves on the ground competes there, but is not followed.
     """
     size, views = outcome.problem.free.size, np.arange(len(block.views))
     if size > LARGEST or len(block.view) > OBSERVATIONS:
         return Judgement()
     asks = [one.view for one in standing_out(outcome, block, floor)]
-    if not asks or size > UNKNOWNS:
+    if not asks or size > SMALL:
         asks += [one.view for one in swinging(outcome, block)]
-    if size <= UNKNOWNS:
+    if size <= SMALL:
         return _judged_among(outcome, block, floor, views) if asks else Judgement()
     found = Judgement((), np.zeros((len(views), size // len(views))), outcome.inlier.astype(np.float64))
     done: set[int] = set()
@@ -195,7 +194,7 @@ def _judged_among(outcome: Outcome, block: Block, floor: float, views: IntArray)
     number, outs = np.full(len(block.views), -1), standing_out(outcome, block, floor)
     number[views] = np.arange(len(views))
     try:
-        base, few = fit(linear), linear.thinned(_FEW)
+        base, few = fit(linear), linear.thinned(SAMPLE)
         seen = Seen(linear, few, ground, place, _sizes(block)[:, views], base, nothing, np.zeros(0))
         first = [replace(one, view=int(number[one.view])) for one in outs if number[one.view] >= 0]
         return _Search(seen, first, floor, float(np.median(block.sigma))).run()
@@ -232,7 +231,7 @@ def around(outcome: Outcome, block: Block, views: IntArray) -> tuple[Linear, Sta
     problem = outcome.problem
     use = block.use & (block.point < block.num_tracks) & np.isin(block.view, views)
     unknowns = problem.free.size // len(block.views) * len(views)
-    if unknowns > UNKNOWNS or numbers(np.bincount(block.point[use])) > _NUMBERS:
+    if unknowns > SMALL or numbers(np.bincount(block.point[use])) > _NUMBERS:
         return None
     state, _ = revived(problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma)
     low, high = block.alt_range

@@ -20,12 +20,13 @@ from barpc.ba.held.block import Block
 from barpc.ba.robust.heldout import seen_in
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
+from barpc.ba.usual import LEVEL
 from barpc.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray, IntArray
 
 CELLS = 6  # a side of the ground: the group's share is free in each
 _STARTS = 3  # a side of the ground, of which each moves in turn
-_LIKELY = 0.95  # that a track moves where the group is looked for, and that it stands far from there
+_LIKELY = 1.0 - LEVEL  # that a track moves where the group is looked for, and that it stands far from there
 _FEW = 1500  # observations that are looked at from every start
 _LOOK, _QUICK = 8, 0.36  # steps of every start, cooled so much in each; only the best go on
 _KEPT = 3

@@ -22,15 +22,14 @@ from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import solve_transposed
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
+from barpc.ba.usual import CHANCE, RIDGE
 from barpc.geodesy import Array, enu_basis
 from barpc.scene import BoolArray, GroundPoints, IntArray
 
 CRITICAL = 4.0
 """A normalised residual that is larger is no chance: 6e-5 for a component, a thousandth for five points."""
-_LEAST = 1e-6  # redundancy of a direction that nothing else tells about: along the ray of a point seen once
 CHECKED = 0.1  # redundancy of a point that something beside the cameras' priors tells about
 _TOGETHER = 60  # observations whose cameras are solved for at a time
-_CHANCE = 1e-3  # that points which are as good as stated scatter by more
 MOST_TESTED = 1000
 """Observations of a reference that are tested in the images: of more, every n-th."""
 
@@ -132,13 +131,13 @@ def control_test(
         left = stated - adjusted[g] if used[g] else stated + adjusted[g]
         redundancy[g] = min(float((np.diag(left) / np.diag(stated)).mean()), 1.0)
         told, axes = np.linalg.eigh(left / np.outer(sigmas[g], sigmas[g]))
-        if told[-1] < _LEAST:
+        if told[-1] < RIDGE:
             continue
-        axes = axes[:, told > _LEAST]
+        axes = axes[:, told > RIDGE]
         whitened = offset[g] / sigmas[g] @ axes
-        shown = axes @ (whitened / told[told > _LEAST]) if used[g] else axes @ whitened
+        shown = axes @ (whitened / told[told > RIDGE]) if used[g] else axes @ whitened
         residual[g] = sigmas[g] * shown
-        spread = np.sqrt(np.maximum(np.diag(left) / sigmas[g] ** 2, _LEAST))
+        spread = np.sqrt(np.maximum(np.diag(left) / sigmas[g] ** 2, RIDGE))
         w[g] = (np.abs(offset[g] / sigmas[g]) / spread).max()
     scatter, fits = _together(offset / sigmas, redundancy, used)
     fits &= agreed.scale == 1.0
@@ -154,7 +153,7 @@ def _together(whitened: Array, redundancy: Array, used: BoolArray) -> tuple[floa
     if freedom < 1.0:
         return np.nan, True
     squares = float((whitened[used & (redundancy > 0)] ** 2).sum())
-    return float(np.sqrt(squares / freedom)), bool(squares <= chdtri(freedom, _CHANCE))
+    return float(np.sqrt(squares / freedom)), bool(squares <= chdtri(freedom, CHANCE))
 
 
 def image_test(
@@ -207,7 +206,7 @@ def image_test(
             _take_off(left, waiting, covariance)
     _take_off(left, waiting, covariance)
     with np.errstate(invalid="ignore", divide="ignore"):
-        w = np.abs(residual[:, rows].T * weight[rows, None]) / np.sqrt(np.where(left > _LEAST, left, np.nan))
+        w = np.abs(residual[:, rows].T * weight[rows, None]) / np.sqrt(np.where(left > RIDGE, left, np.nan))
     return np.asarray(np.fmax(*w.T))
 
 

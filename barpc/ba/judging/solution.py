@@ -23,13 +23,13 @@ from barpc.ba.robust.rounds import Outcome, Rounds, faintness, revived
 from barpc.ba.robust.smooth import SmoothTest
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
+from barpc.ba.usual import MUCH_NOISE
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray
 
 SMOOTH_LEAST = 0.06  # smooth residuals below this [px] are left alone: two views share what one is wrong by
 _TREND = 0.03  # px: another model is tried
-MUCH_NOISE = 1.5  # times what is stated
 _MUCH_LOST = 0.85  # of a view's observations are to be left
 _SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
 _STEPS_BACK = 3  # to the delivered cameras, at most: kilometres away, what is left is below a micrometre

@@ -15,13 +15,12 @@ import scipy.sparse as sp
 
 from barpc.ba.algebra.structure import Structure, parts
 from barpc.ba.estimated.projected import Projected
-from barpc.ba.solving.normal import CHUNK
+from barpc.ba.usual import CHUNK, FEW
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.curve import cross
 
 _TRIALS = 150
-_LEAST = 30  # matches of a pair that is looked at
 _NEAR = 10.0  # sigmas: what a plane cannot follow of a drift and of relief
 _STEPS = 3
 
@@ -99,7 +98,7 @@ def agreeing(
     usable = use[first] & use[second] & np.isfinite(offset)
     for m, (start, stop) in enumerate(zip(structure.pair_bounds[:-1], structure.pair_bounds[1:], strict=True)):
         rows = start + np.flatnonzero(usable[start:stop])
-        if len(rows) >= _LEAST:
+        if len(rows) >= FEW:
             place = xy[:, first[rows]]
             against[rows] = ~_on_one_plane(place, offset[rows], spread[rows], seed=m)
     keep = use.copy()

@@ -19,6 +19,7 @@ from barpc.ba.evidence.mixture import NEAR_LIMIT, WRONG
 from barpc.ba.held.block import Block
 from barpc.ba.robust.weights import Observations, geman_mcclure
 from barpc.ba.solving.problem import Problem
+from barpc.ba.usual import FEW, ITERATIONS, SURELY
 from barpc.errors import InputError
 from barpc.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.scene import BoolArray, GroundPoints, IntArray
@@ -32,12 +33,9 @@ _LEAST = 100  # observations of a view, or its tracks are all needed
 _ROBUST_STEPS = 3
 _WIDE = 4.0  # sigmas
 _LESS = 0.99  # of the error, at most
-_SURELY = 3.0  # standard deviations
 _START = 0.2  # of the observations, the nearest: where even of many wrong ones right ones are
-_ITERATIONS = 100
 _SAME = 1e-4
 _NOTHING = 1e-12  # of a variance: residuals may be exactly zero
-_FEW = 20  # observations of a view that tell nothing by themselves
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +128,7 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
     squared = observations.squared(residual, counted)
     expected = block.sigma**2 * observations.freedom(counted)
     count, noise = np.bincount(block.view, minlength=views), np.full(views, np.nan)
-    many = count >= _FEW
+    many = count >= FEW
     told = many[block.view]
     number = (np.cumsum(many) - 1)[block.view[told]]
     noise[many] = scatter(squared[told], expected[told] / block.sigma[told] ** 2, number)
@@ -163,7 +161,7 @@ def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
     variance, wrong = np.maximum(middle / _START, _NOTHING), np.full(len(count), WRONG[0] / WRONG[1])
     farthest, constant = half * np.log(half * far[view]) - gammaln(half + 1.0), half * squared
     moves = np.ones(len(count), dtype=bool)  # of a view that stands nothing changes any more
-    for _ in range(_ITERATIONS):
+    for _ in range(ITERATIONS):
         peak = np.maximum(farthest - half * np.log(variance)[view], NEAR_LIMIT)
         right = expit(peak - constant / variance[view] - np.log(wrong / (1.0 - wrong))[view])
         of_right, squares = (np.add.reduceat(rows, starts) for rows in (right, right * squared))
@@ -187,7 +185,7 @@ def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:
     index, point = np.unique(block.point, return_inverse=True)
     cost = [(h.residual**2).sum(axis=0) / (other.error * block.sigma) ** 2 for h in (one, other)]
     less = np.bincount(point, (cost[1] / (1.0 + cost[1] / _WIDE**2)) - (cost[0] / (1.0 + cost[0] / _WIDE**2)))
-    return bool(less.mean() > _SURELY * less.std() / np.sqrt(len(index)))
+    return bool(less.mean() > SURELY * less.std() / np.sqrt(len(index)))
 
 
 @dataclass(frozen=True, eq=False)

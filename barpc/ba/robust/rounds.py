@@ -17,6 +17,7 @@ from barpc.ba.robust.variances import SAME_PRIOR, STANDS, PriorTest, Variances, 
 from barpc.ba.robust.weights import LOSSES, MEDIAN, Observations
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
+from barpc.ba.usual import BACKFITTING, FAR, GROSS, MUCH_NOISE, SHRINK, SURELY
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray
@@ -27,17 +28,12 @@ _LOW = 0.2  # part of the observations, and the |r|^2 over its expectation that 
 _LEAST_NOISE = 0.5  # of the stated sigmas, while outliers are about
 _SAME = 1e-3  # a cut that changes less than this part of the observations is not solved again
 _SAME_NOISE = 0.02  # nor is a change of the noise by less than this part
-FAINT = 100.0  # times their noise have observations of control points that hold nothing, in images with tie points
 _SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each view by itself
-_BACKFITTING = 6
 _MANY_CUT = 0.01  # of the observations: more are looked at again
 _REVIVING = 2
 _ROBUST_ROUNDS = 20
-_AS_STATED = 1.5  # times the noise stated, and
-_CLEAN = 5.0  # sigmas
 _FEW = 0.002  # of the observations farther away than that: there is nothing to be careful about
 _NEAR = 12.0  # sigmas: a loss that is no wider asks what is smooth
-_SHRINK = 0.25  # of the loss's scale in one round, at most
 MAX_PASSES = 5  # rounds of cutting and solving, at most: they end when nothing changes
 _FIRST_TOLERANCE = 0.1  # of the first pass after robust rounds: the second, which follows always, is exact
 
@@ -222,7 +218,7 @@ class Rounds:
         projected = self.problem.project_points(self.state.params, self.state.points)
         weight = counted**0.5 / sigma
         settled = self.problem.settling(projected, weight)
-        for _ in range(_BACKFITTING):
+        for _ in range(BACKFITTING):
             part += self.smooth.part(settled(residual - part), counted)
         return settled(residual - part)
 
@@ -240,7 +236,7 @@ def faintness(block: Block, heights: Heights) -> Array:
     faint[block.point[alone[block.view]]] = False
     if heights.has_control:
         faint[heights.control[0].index] = False
-    return np.where(faint, FAINT, 1.0)
+    return np.where(faint, GROSS, 1.0)
 
 
 def _robust(
@@ -268,8 +264,8 @@ def _robust(
         noise = max(float(np.sqrt(_median(s, counted) / MEDIAN)), least, _LEAST_NOISE)
         if scale <= 3.6 * noise:
             break
-        clean = noise < _AS_STATED and float((s[use] > (_CLEAN * noise) ** 2).mean()) < _FEW
-        scale = 3.0 * noise if np.isinf(scale) or clean else max(3.0 * noise, _SHRINK * scale)
+        clean = noise < MUCH_NOISE and float((s[use] > (FAR * noise) ** 2).mean()) < _FEW
+        scale = SURELY * noise if np.isinf(scale) or clean else max(SURELY * noise, SHRINK * scale)
         counted = _counted(observations, use, s, loss(s / scale**2)[1])
         state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)
         residual, projected = problem.prepare(state.params, state.points)

@@ -16,6 +16,7 @@ from scipy.special import fdtrc
 from barpc.ba.algebra.structure import Structure
 from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.robust.resembling import Resemblance
+from barpc.ba.usual import FAR, KEPT, RIDGE
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.splined import bsplines
@@ -27,10 +28,7 @@ SPLINES = 14
 """Cubic B-splines over the rows of an image: what changes over a tenth of it, or more slowly, is smooth."""
 
 TERMS = SPLINES + 4  # and col, col^2, col^3, row col
-_KEPT = 1_000_000  # observations whose terms are kept: they are worked out once, and take 144 bytes each
 _PER_TERM = 10  # observations a term, or the view is left as it is
-_SIGMAS = 5.0  # a mean product of neighbours that is smaller may be chance
-_RIDGE = 1e-6  # of a term's own weight
 _BEND = 1e-2  # of a spline's weight: rows without observations continue what their neighbours show
 _BENDING = np.diff(np.eye(SPLINES), n=2, axis=0).T @ np.diff(np.eye(SPLINES), n=2, axis=0)
 
@@ -75,7 +73,7 @@ class Smooth:
         col, row = unknowns.normalized(xy, structure.view).clip(-1.0, 1.0)
         self._place = xy
         self._col, self._row = col, row
-        self._kept = self._terms(slice(None)) if len(col) <= _KEPT else None
+        self._kept = self._terms(slice(None)) if len(col) <= KEPT else None
 
     def _basis(self, rows: slice) -> Array:
         """Return the terms (TERMS, n) at some observations."""
@@ -141,7 +139,7 @@ class Smooth:
             product, count = (ordered[:, 1:] * ordered[:, :-1]).sum(axis=0), len(order) - 1.0
             if self.alike is not None:
                 product, count = self._beyond_noise(product, (ordered**2).sum(axis=0), order)
-            if product.mean() > _SIGMAS * product.std() / np.sqrt(max(count, 1.0)):
+            if product.mean() > FAR * product.std() / np.sqrt(max(count, 1.0)):
                 most = max(most, float(np.sqrt(product.mean())))
         return most
 
@@ -174,7 +172,7 @@ class Smooth:
             np.matmul(weighted, target[:, rows].T, out=right[n])
         every = np.arange(TERMS)
         diagonal = matrix[:, every, every]
-        matrix[:, every, every] += _RIDGE * (diagonal + diagonal.mean(axis=1, keepdims=True))
+        matrix[:, every, every] += RIDGE * (diagonal + diagonal.mean(axis=1, keepdims=True))
         bend = _BEND * diagonal[:, :SPLINES].mean(axis=1)
         matrix[:, :SPLINES, :SPLINES] += bend[:, None, None] * _BENDING
         found = np.swapaxes(np.linalg.solve(matrix, right), 1, 2)

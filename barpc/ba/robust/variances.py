@@ -22,6 +22,7 @@ from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum
+from barpc.ba.usual import CHANCE, GROSS, LEVEL, SMALL, SURE
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, View
@@ -29,18 +30,13 @@ from barpc.scene import BoolArray, View
 _LOG = logging.getLogger(__name__)
 
 _STRENGTH = 4.0  # degrees of freedom with which the given figure counts beside what the block shows
-_LEVEL = 0.05  # a sum of squares less probable than this is too large
-_SURE = 5.0  # of two explanations whose evidences differ by less (a factor of 150) none is ruled out
-_LIKELIER = -np.log(_LEVEL)  # but one odd view is named where all being worse than stated is as improbable beside it
-_FREE = 100.0  # times its prior: a view whose camera may be anywhere
+_LIKELIER = -np.log(LEVEL)  # but one odd view is named where all being worse than stated is as improbable beside it
 _SEARCH = 10.0  # times the drift's standard deviation while outliers are looked for
 _MOVING = 0.01  # of a rotation, as drift: the centre it turns about flies some km while an image is taken
-_UNEXPECTED = 1e-3  # drifts less probable than this are another platform's, and what was given counts for nothing
 _LOW = 0.1  # then as much is let be as leaves what is seen this likely: a prior too narrow bends all heights alike
 _ITERATIONS = 10
 STANDS = 0.05  # change of a standard deviation, as a logarithm, below which it stands
 SAME_PRIOR = 0.2  # the same, below which a block is not solved again
-_SMALL = 400  # unknowns up to which every view is tried
 LEAST_WAVES = 0.01  # px: of splines and steps, counting as one observation
 _OWN = 2.0  # as many degrees of freedom has the size of all views beside that of one
 _LEAST = 0.5  # degrees of freedom below which nothing is said
@@ -71,7 +67,7 @@ class _Around:
     @property
     def small(self) -> bool:
         """Whether it can be solved many times."""
-        return len(self.problem.free) <= _SMALL
+        return len(self.problem.free) <= SMALL
 
     def under(self, prior: CameraPrior) -> tuple[float, Array, Covariance]:
         """Return the evidence (logarithm, but for a constant), unknowns (N, q) and covariance under other priors."""
@@ -189,7 +185,7 @@ class Variances:
             return wider
         squares, freedom = (part[self.stated].sum() for part in self._squares(params, known))
         if freedom > _LEAST:
-            alone = min(float(squares / (2.0 * gammaincinv(0.5 * freedom, _UNEXPECTED))), 1.0)
+            alone = min(float(squares / (2.0 * gammaincinv(0.5 * freedom, CHANCE))), 1.0)
             count = np.count_nonzero(known[self.stated, : self.constants].any(axis=1))
             wider[self.stated] = np.sqrt(max(alone + (1.0 - alone) * count * 3.0 / self.constants, 1.0))
         return wider
@@ -264,7 +260,7 @@ class Variances:
     def _too_large(self, params: Array, known: Array, scale: Array) -> bool:
         """Return whether the corrections are larger than chance allows."""
         total, freedom = (float(part.sum()) for part in self._squares(params, known, scale))
-        return freedom > _LEAST and float(chdtrc(freedom, total)) < _LEVEL
+        return freedom > _LEAST and float(chdtrc(freedom, total)) < LEVEL
 
     def _widened(self, around: _Around, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
         """Return the factors (N,) by which each view's prior is widened, and the views that are odd."""
@@ -281,12 +277,12 @@ class Variances:
             evidence -= float(np.log(n))  # of the choice among the views
             if evidence >= together + _LIKELIER:
                 return scale, alone
-            both_may_be = evidence >= together - _SURE  # the priors cover both
+            both_may_be = evidence >= together - SURE  # the priors cover both
             return (np.maximum(scale, common) if both_may_be else common), odd
         if n > 2 and not around.small:  # one view of many is seen at once
             own = np.median(total[freedom > _LEAST] / freedom[freedom > _LEAST])
             factor = max((_STRENGTH + own * freedom.sum()) / (_STRENGTH + freedom.sum()), 1.0)
-            odd = np.asarray(chdtrc(np.maximum(freedom, _LEAST), total / factor) < _LEVEL / n)
+            odd = np.asarray(chdtrc(np.maximum(freedom, _LEAST), total / factor) < LEVEL / n)
         alone = (_STRENGTH * factor + total) / (_STRENGTH + freedom)
         return np.sqrt(np.where(odd, np.maximum(alone, factor), factor)), odd
 
@@ -298,11 +294,11 @@ class Variances:
         for _ in range(max(1, n // 3)):
             tried = {v: self._alone(around, wide, chosen, v) for v in np.flatnonzero(chosen == 1.0).tolist()}
             best = max(tried, key=lambda v: tried[v][0])
-            if tried[best][0] < last + _SURE:
+            if tried[best][0] < last + SURE:
                 break
             last = tried[best][0]
             for v, (evidence, size) in tried.items():
-                if evidence > last - _SURE:  # as good an explanation as the best
+                if evidence > last - SURE:  # as good an explanation as the best
                     odd[v], scale[v] = True, size
             chosen[best] = tried[best][1]
         return scale, odd, last
@@ -310,7 +306,7 @@ class Variances:
     def _alone(self, around: _Around, wide: Array, scale: Array, v: int) -> tuple[float, float]:
         """Return the evidence for view v being odd as well, and the factor that its prior then needs."""
         trial = scale.copy()
-        trial[v] = _FREE
+        trial[v] = GROSS
         prior = self._prior(trial, wide)
         try:
             _, params, covariance = around.under(prior)
@@ -329,7 +325,7 @@ class Variances:
         for degree in range(self._degrees):
             total, freedom = (x.sum() for x in self._squares(params, known, part=self._drift_part(degree)))
             factors[degree] = (_STRENGTH + total) / (_STRENGTH + freedom)
-            if careful and freedom > _LEAST and chdtrc(freedom, total) < _UNEXPECTED:
+            if careful and freedom > _LEAST and chdtrc(freedom, total) < CHANCE:
                 factors[degree] = max(factors[degree], _possible(total, freedom))
         return np.sqrt(factors)
 

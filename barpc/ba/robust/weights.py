@@ -14,14 +14,12 @@ import numpy as np
 from barpc.ba.held.ground import ALIKE
 from barpc.ba.robust.smooth import SPLINES
 from barpc.ba.solving.problem import Problem
+from barpc.ba.usual import FAR, FEW, GROSS
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
 MEDIAN = 0.55  # of |r|^2 over its expectation: chi-square with 1 (two views) to 2 (many) degrees of freedom
 _LARGEST_MISFIT = 3.0  # px: or a misfit would loosen the view that causes it
-_LEAST_FREEDOM = 20
-_GROSS = 100.0  # sigmas: a control point of another place would take the block with it
-_CUT = 5.0  # sigmas: of a reference's points, which were compared with each other before
 
 Loss = Callable[[Array], tuple[Array, Array]]
 """s (...) -> rho(s), rho'(s); rho(0) = 0, rho'(0) = 1."""
@@ -95,12 +93,12 @@ class Observations:
 
         Those of a reference agree with each other: how far the cameras are off says nothing of them.
         """
-        return np.asarray((self.is_control & (squared < _GROSS**2)) | self.of_reference)
+        return np.asarray((self.is_control & (squared < GROSS**2)) | self.of_reference)
 
     def is_near(self, squared: Array, scale: float) -> BoolArray:
         """Return the observations (K,) within a number of standard deviations; a reference's by their own limit."""
-        near = np.where(self.of_reference, squared <= _CUT**2, squared <= scale * scale)
-        return np.asarray(near | (self.is_control & (squared < _GROSS**2)))
+        near = np.where(self.of_reference, squared <= FAR**2, squared <= scale * scale)
+        return np.asarray(near | (self.is_control & (squared < GROSS**2)))
 
     def freedom(self, counted: Array) -> Array:
         """Return the degrees of freedom (K,) left of an observation once its point is estimated, 1/2 (two
@@ -149,7 +147,7 @@ class Observations:
         seen = np.zeros(self.structure.num_points, dtype=bool)
         seen[self.structure.point[use]] = True
         freedom = whitened.size - 3 * int((seen & ~self.has_prior).sum()) - int(problem.free.sum()) - fitted
-        if freedom < _LEAST_FREEDOM:
+        if freedom < FEW:
             return 1.0
         return max(float(np.sqrt((whitened**2).sum() / freedom)), 1e-6)
 

@@ -17,10 +17,10 @@ from barpc.ba.algebra.linear import Factor, Matrix, factorize, factorize_blocks
 from barpc.ba.algebra.multifrontal import Blocks
 from barpc.ba.algebra.structure import Structure, parts
 from barpc.ba.estimated.priors import PointPrior
+from barpc.ba.usual import CHUNK
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
-CHUNK = 8192  # observations, or pairs of them, multiplied at a time
 DENSE_UNKNOWNS = 900  # up to so many camera unknowns the reduced matrix is a plain array
 
 TRIANGLE = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))  # order of the elements of symmetric 3x3 matrices

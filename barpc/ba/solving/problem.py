@@ -20,10 +20,9 @@ from barpc.ba.solving.normal import (
     solve_transposed,
     whiten,
 )
+from barpc.ba.usual import KEPT
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
-
-_KEPT = 1_000_000  # observations whose derivatives are kept from one step to the next: 208 bytes each
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ class Problem:
     def linearise(self, params: Array, points: Array) -> Projected:
         """Project all points with derivatives, for `reduce`; the next call may write over them."""
         structure, out = self.structure, None
-        if self.xy.shape[1] <= _KEPT:
+        if self.xy.shape[1] <= KEPT:
             if not self._room:
                 self._room.append(self.cameras.room(self.xy.shape[1]))
             out = self._room[0]
@@ -68,7 +67,7 @@ class Problem:
 
     def prepare(self, params: Array, points: Array) -> tuple[Array, Projected | None]:
         """Return the residuals (2, K) [px], and what `linearise` gives unless it is too large to keep for `reduce`."""
-        if self.xy.shape[1] > _KEPT:
+        if self.xy.shape[1] > KEPT:
             return self.residuals(params, points), None
         projected = self.linearise(params, points)
         return projected.image - self.xy, projected

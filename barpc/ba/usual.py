@@ -1,0 +1,55 @@
+"""Numbers that mean the same wherever the adjustment decides or computes, each in one place."""
+
+# --- what is sure -----------------------------------------------------------------------------------------
+
+LEVEL = 0.05
+"""Usual level of a test: what is less probable by chance is asked about."""
+
+CHANCE = 1e-3
+"""Level of a test that names something in a block: one sound block in a thousand."""
+
+SURE = 5.0
+"""Nats: an explanation that gains less is none, and of two that differ by less (a factor of 150) none is ruled out."""
+
+SURELY = 3.0
+"""Standard deviations: normal errors are larger once in 370."""
+
+FAR = 5.0
+"""Standard deviations: of a million normal errors not one is larger. What is farther off is something else."""
+
+MUCH_NOISE = 1.5
+"""Times what is stated: more noise than that is no noise."""
+
+GROSS = 100.0
+"""Standard deviations of what holds nothing: of another place, or open."""
+
+# --- what is enough ---------------------------------------------------------------------------------------
+
+FEW = 30
+"""Observations that tell a standard deviation to an eighth, 1 / sqrt(2 n): fewer tell nothing by themselves."""
+
+SAMPLE = 2000
+"""Observations or points that stand for all."""
+
+BACKFITTING = 6
+"""Turns of parts that are fitted in turn: what is left of a guess is below a thousandth of it."""
+
+ITERATIONS = 100
+"""Of what ends by itself when it stands, at most."""
+
+SHRINK = 0.25
+"""Of a loss's scale that is left in one step, at least: it follows what is right out of what is wrong."""
+
+# --- arithmetic -------------------------------------------------------------------------------------------
+
+CHUNK = 8192
+"""Observations, or pairs of them, worked on at a time: temporaries stay in cache."""
+
+KEPT = 1_000_000
+"""Observations whose derivatives are kept from one step to the next, some 200 bytes each."""
+
+RIDGE = 1e-6
+"""Of the weight of what is known: what nothing tells stays where it is."""
+
+SMALL = 400
+"""Unknowns up to which a block is solved again for every explanation that is tried."""
