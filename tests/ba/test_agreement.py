@@ -345,7 +345,7 @@ def controlled(seed: int, points: int, views: int, sigma: float, tracks: int) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("worlds", "most"), rest_slow([(12, 1), (40, 2)], mark=pytest.mark.nightly))
+@pytest.mark.parametrize(("worlds", "most"), [(12, 1), pytest.param(40, 2, marks=pytest.mark.nightly)])
 def test_of_forty_worlds_with_control_as_stated_none_loses_it(worlds: int, most: int) -> None:
     unused = 0
     for seed in range(worlds):

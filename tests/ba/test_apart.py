@@ -227,8 +227,11 @@ def test_a_foreign_rpc_leaves_the_others_as_without_it(seed: int) -> None:
 @pytest.mark.parametrize(
     ("family", "seed"),
     [
-        *(("cloud", 1), ("clean", 9), ("wander", 3), ("priors", 0)),
-        pytest.param("local", 4, marks=pytest.mark.nightly),
+        ("cloud", 1),
+        *(
+            pytest.param(*one, marks=pytest.mark.nightly)
+            for one in (("clean", 9), ("wander", 3), ("priors", 0), ("local", 4))
+        ),
     ],
 )
 def test_what_is_wrong_otherwise_is_no_foreign_rpc(family: str, seed: int) -> None:
