@@ -86,7 +86,6 @@ def test_cameras_farther_off_than_stated_blame_no_point() -> None:
             pytest.param,
             [(6, 3, 8.0, 14), (9, 4, 100.0, 19), (5, 1, 3.0, 16), (5, 1, 30.0, 19), (6, 3, 30.0, 19)],
         ),
-        keep=3,
     ),
 )
 def test_the_right_points_are_used_and_no_other(count, wrong, size, least) -> None:

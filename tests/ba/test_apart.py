@@ -66,7 +66,7 @@ def met(found: Adjustment, block: Block, view: int) -> float:
     ("change", "look"),
     [
         pytest.param(swapped, "axes", id="axes swapped"),
-        pytest.param(shifted, "offset", id="another tile"),
+        pytest.param(shifted, "offset", id="another tile", marks=pytest.mark.slow),
         pytest.param(raised, "height", id="another datum", marks=pytest.mark.slow),
     ],
 )

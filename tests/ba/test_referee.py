@@ -48,8 +48,8 @@ def median(found, value):
             pytest.param,
             [
                 ("drift 1", 0.03, 2.0, SEEDS[1:2]),
-                ("drift 1", 0.03, 2.0, SEEDS),
                 ("no drift", 0.015, 0.2, SEEDS),
+                ("drift 1", 0.03, 2.0, SEEDS),
                 ("drift 0.3", 0.03, 0.7, SEEDS),
                 ("drift 3", 0.03, 5.0, SEEDS),
                 ("quadratic 1", 0.05, 2.0, SEEDS),
@@ -59,7 +59,9 @@ def median(found, value):
                 ("drift 1, 40k rows", 0.03, 2.0, SEEDS),
                 ("3 x the prior", 0.03, 0.5, SEEDS),
             ],
-        )
+        ),
+        2,
+        pytest.mark.nightly,
     ),
 )
 def test_what_a_drifting_attitude_does_is_corrected_by_default(name, across, shape, seeds):
