@@ -15,7 +15,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from barpc.ba import Adjustment, adjust_tracks
+from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, altimetry
 from barpc.ba.held import registration
 from barpc.ba.held.registration import NEIGHBOURS, Given, Registration, Surface, displacement, register
 from barpc.cameras import open_camera
@@ -336,3 +336,38 @@ def test_what_a_plane_is_told_is_the_covariance_of_an_m_estimate(noise: float):
     rest = np.sort(off[near & ~found.agree])
     width = 2.0 * registration.SURELY * scale * sigma
     assert found.rivals == max((rest <= low + width).sum() - n for n, low in enumerate(rest))
+
+
+@pytest.mark.parametrize(("whole", "most", "every"), [(False, 100, 1), (True, 100, 2), (False, 10, 5), (True, 40, 2)])
+def test_a_motion_is_held_at_every_second_tie_point_beside_a_terrain(monkeypatch, whole, most, every):
+    """And at no more than so many: of 47 with a height near them, whose surface is the only one that is asked."""
+    rng = np.random.default_rng(0)
+    middle = ecef_from_ground(np.array([5.0, 44.0, 300.0]))
+    points = middle + rng.uniform(-400.0, 400.0, (60, 3))
+    seen = np.arange(60) < 47
+    heights = Altimetry(ground_from_ecef(points), np.full(60, 0.5), np.full(60, 2.0))
+    held: list[Any] = []
+    monkeypatch.setattr(altimetry, "_HELD", most)
+    monkeypatch.setattr(altimetry, "_known", lambda covariance, found, ties: np.eye(7))
+    monkeypatch.setattr(altimetry, "Surface", SimpleNamespace(of=lambda local: local))
+    monkeypatch.setattr(altimetry, "register", lambda surface, *_: surface)
+    monkeypatch.setattr(altimetry, "_tested", lambda registered, many: f"{len(registered)} of {many}")
+    monkeypatch.setattr(altimetry, "_why_not", lambda *_: "")
+    monkeypatch.setattr(altimetry, "_is_held", lambda *_: False)
+    monkeypatch.setattr(altimetry, "_placed", lambda *given: held.append(given))
+    monkeypatch.setattr(altimetry, "_solved", lambda *_: SimpleNamespace(after="after"))
+    monkeypatch.setattr(altimetry, "is_better", lambda one, other, outer: False)
+    outcome = SimpleNamespace(minimum=SimpleNamespace(covariance=lambda free: None))
+    found: Any = SimpleNamespace(
+        seen=seen, final=SimpleNamespace(points=points), outcome=outcome, problem=SimpleNamespace(free=None),
+        heights=SimpleNamespace(is_whole=whole), after="before",
+    )  # fmt: skip
+    block: Any = SimpleNamespace(num_tracks=60)
+    tried, said = altimetry.hold_by_altimetry(found, block, block, AdjustOptions(), heights)
+    assert said == "47 of 60"
+    assert tried.after == "after"
+    ((_, ties, local, *_),) = held
+    np.testing.assert_array_equal(ties, np.arange(0, 47, every))
+    np.testing.assert_allclose(
+        np.linalg.norm(local, axis=1), np.linalg.norm(points[ties] - points[:47].mean(axis=0), axis=1)
+    )

@@ -66,7 +66,7 @@ def met(found: Adjustment, block: Block, view: int) -> float:
     ("change", "look"),
     [
         pytest.param(swapped, "axes", id="axes swapped"),
-        pytest.param(shifted, "offset", id="another tile"),
+        pytest.param(shifted, "offset", id="another tile", marks=pytest.mark.slow),
         pytest.param(raised, "height", id="another datum", marks=pytest.mark.slow),
     ],
 )
@@ -227,8 +227,11 @@ def test_a_foreign_rpc_leaves_the_others_as_without_it(seed: int) -> None:
 @pytest.mark.parametrize(
     ("family", "seed"),
     [
-        *(("cloud", 1), ("clean", 9), ("wander", 3), ("priors", 0)),
-        pytest.param("local", 4, marks=pytest.mark.nightly),
+        ("cloud", 1),
+        *(
+            pytest.param(*one, marks=pytest.mark.nightly)
+            for one in (("clean", 9), ("wander", 3), ("priors", 0), ("local", 4))
+        ),
     ],
 )
 def test_what_is_wrong_otherwise_is_no_foreign_rpc(family: str, seed: int) -> None:

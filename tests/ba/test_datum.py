@@ -107,10 +107,11 @@ def test_the_summary_has_it_in_a_table_without_the_sources_that_tell_nothing():
             "The DEM holds 400 of 400 tie points, each to 10.0 m and all together to 20.0 m.",
         ),
         pytest.param({"min_convergence": 90.0}, level, "The DEM holds 400 of 400 tie points", marks=pytest.mark.slow),
-        (
+        pytest.param(
             {},
             lambda lon, lat: np.full(len(lon), np.nan),
             "it has no height where it is needed",
+            marks=pytest.mark.slow,
         ),
     ],
 )

@@ -188,11 +188,14 @@ def _square(views: int) -> Block:
         (48, "hardly held", "none", 8),
         (48, "in the image", "all", 32),
         *(
-            pytest.param(200, *row, marks=pytest.mark.slow)
-            for row in (
-                *((case, "all", 32) for case in CASES),
-                *((case, ties, 32) for case in ("as it is", "hardly held") for ties in ("weak", "none")),
-                ("as it is", "all", 4),
+            pytest.param(200, *row, marks=pytest.mark.nightly if n > 1 else pytest.mark.slow)
+            for n, row in enumerate(
+                (
+                    *(("fixed", "all", 32), ("hardly held", "none", 32)),
+                    *((case, "all", 32) for case in CASES if case != "fixed"),
+                    *(("as it is", "weak", 32), ("as it is", "none", 32), ("hardly held", "weak", 32)),
+                    ("as it is", "all", 4),
+                )
             )
         ),
     ],

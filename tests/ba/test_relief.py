@@ -218,7 +218,11 @@ def test_a_dem_with_waves_places_a_scene_as_well_as_it_is_said_to(hills: bool) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("seed", "kind"), [(2, "tilt"), (10, "tilt"), (7, "level"), (15, "level"), (4, "shows"), (5, "shows")]
+    ("seed", "kind"),
+    [
+        *((2, "tilt"), (7, "level"), (4, "shows")),
+        *(pytest.param(*row, marks=pytest.mark.nightly) for row in ((10, "tilt"), (15, "level"), (5, "shows"))),
+    ],
 )
 def test_a_wrong_dem_neither_bends_nor_moves_a_scene(seed: int, kind: str) -> None:
     world = make("wrong_dem", seed)

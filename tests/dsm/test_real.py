@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -30,14 +31,26 @@ def run(shared_data, tmp_path_factory):
     return images, out
 
 
-def test_pairs_of_the_triplet_agree_to_a_third_of_a_metre_and_delivered_cameras_do_not(run, tmp_path):
-    images, folder = run
-    after = make_dsm(folder, tmp_path / "after.tif")
+@pytest.fixture(scope="module")
+def surface(run, tmp_path_factory):
+    """That of the run with all its pairs, which its report shows."""
+    path = tmp_path_factory.mktemp("surface") / "dsm.tif"
+    return make_dsm(run[1], path), path
+
+
+@pytest.fixture
+def copied(run, tmp_path):
+    """A run folder of one's own."""
+    return shutil.copytree(run[1], tmp_path / "run")
+
+
+def test_pairs_of_the_triplet_agree_to_a_third_of_a_metre_and_delivered_cameras_do_not(run, surface, tmp_path):
+    images, after = run[0], surface[0]
     before = make_dsm([str(path) for path in images], tmp_path / "before.tif", DsmOptions(alt=(37.0, 355.0)))
     assert after.pairs[0] == "img_01 - img_03"  # the largest angle
     assert after.nmad < 0.40
     assert after.nmad < 0.5 * before.nmad
-    with rasterio.open(tmp_path / "after.tif") as file:
+    with rasterio.open(surface[1]) as file:
         bands, tags = file.read(), file.tags()
     known = np.isfinite(bands[0])
     assert known.sum() > 125_000  # m^2 of the 140,000 that any two images show
@@ -49,13 +62,13 @@ def test_pairs_of_the_triplet_agree_to_a_third_of_a_metre_and_delivered_cameras_
     assert 10.0 < float(tags["SIGMA_SHARED_BY_ALL_CELLS_M"]) < 100.0  # which ties do not tell
 
 
-def test_the_command_says_what_it_made(run, tmp_path, capsys):
+def test_the_command_says_what_it_made(copied, tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         main(
             [
                 "-q",
                 "dsm",
-                str(run[1]),
+                str(copied),
                 "-o",
                 str(tmp_path / "dsm.tif"),
                 "--pairs",
@@ -84,18 +97,17 @@ def test_what_the_cameras_leave_of_a_height_is_what_their_adjustment_says(run):
     assert np.sqrt(np.mean(stated**2)) == pytest.approx(pair_heights(adjustment, 0, 2).absolute, rel=0.01)
 
 
-def test_the_report_shows_the_same_window_before_and_after(run, tmp_path):
-    make_dsm(run[1], tmp_path / "dsm.tif")
-    before, after = read_tables(read_summary(run[1]), run[1]).reliefs
+def test_the_report_shows_the_same_window_before_and_after(surface, copied):
+    before, after = read_tables(read_summary(copied), copied).reliefs
     assert before.nmad_m > 2.0 * after.nmad_m
     assert after.share > 0.4
-    page = (run[1] / "report.html").read_text(encoding="utf-8")
+    page = (copied / "report.html").read_text(encoding="utf-8")
     assert "What do they make of the ground?" in page
     assert page.count("by the delivered cameras, lit") == page.count("by the corrected cameras, lit") == 2
     assert f"disagree by {metres(before.nmad_m)} and by {metres(after.nmad_m)}" in page
     assert page.count('class="swipe"') == 1
     assert "img_01 (left) and img_03 (right) on the surface by the corrected cameras" in page
     assert len(page) < 2_000_000
-    (run[1] / "tables/surface.json").write_text("[]")
+    (copied / "tables/surface.json").write_text("[]")
     with pytest.raises(InputError, match=r"surface\.json: damaged"):
-        read_tables(read_summary(run[1]), run[1])
+        read_tables(read_summary(copied), copied)

@@ -22,6 +22,7 @@ from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import ImageAffine, ImageCorrected
 from barpc.workspace import own_files
 from tests.dsm.conftest import ALTS, SMALL
+from tests.lanes import rest_slow
 from tests.scenes import Scene
 from tests.scenes.files import _write_image
 
@@ -122,14 +123,18 @@ def test_three_views_are_better_than_two_and_say_so(rendered, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "scene",
-    [
-        {"snr": 30.0},
-        {"snr": 300.0},
-        {"relief": 4.0, "buildings": 1.0},
-        {"relief": 200.0, "buildings": 0.0},
-        {"sun_azimuth": (150.0, 190.0), "change": 0.3},
-    ],
-    ids=["noisy", "clean", "flat", "steep", "two dates"],
+    rest_slow(
+        [
+            {"snr": 30.0},
+            {"sun_azimuth": (150.0, 190.0), "change": 0.3},
+            {"snr": 300.0},
+            {"relief": 4.0, "buildings": 1.0},
+            {"relief": 200.0, "buildings": 0.0},
+        ],
+        2,
+        pytest.mark.nightly,
+    ),
+    ids=["noisy", "two dates", "clean", "flat", "steep"],
 )
 def test_sigma_follows_noise_slopes_and_change(scene, tmp_path):
     from tests.dsm.conftest import Rendered

@@ -80,7 +80,10 @@ def test_a_smooth_detector_is_followed_as_least_squares_follow_it(rate, before, 
     assert fit.free is None  # nothing is held back, and nothing is said
 
 
-@pytest.mark.parametrize(("rate", "margin"), [(12.0, 0.25), (12.0, 0.0), (8.0, 0.6)])
+@pytest.mark.parametrize(
+    ("rate", "margin"),
+    [(12.0, 0.0), *(pytest.param(*row, marks=pytest.mark.slow) for row in ((12.0, 0.25), (8.0, 0.6)))],
+)
 def test_no_denominator_is_small_over_the_image_and_its_margin(rate, margin):
     fit = fitted(rate, margin)
     x = spread(detector(rate), 20_000, margin, fit.rpc)

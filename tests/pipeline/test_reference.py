@@ -15,6 +15,7 @@ from barpc.options import RunOptions
 from barpc.pipeline import adjust
 from barpc.pointio.correspondences import read_gcps
 from barpc.rpcio import read_rpc
+from tests.lanes import rest_slow
 from tests.pipeline.known import FOLDER, SAMPLES, errors_at_check_points
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.season import other_season, write_dem, write_reference
@@ -187,7 +188,13 @@ def coarser(path, step: float, folder):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
-@pytest.mark.parametrize(("step", "most"), [(5.0, (0.16, 0.12)), (10.0, (0.25, 0.15)), (20.0, (0.65, 0.25))])
+@pytest.mark.parametrize(
+    ("step", "most"),
+    [
+        (10.0, (0.25, 0.15)),
+        *(pytest.param(*row, marks=pytest.mark.nightly) for row in ((5.0, (0.16, 0.12)), (20.0, (0.65, 0.25)))),
+    ],
+)
 def test_a_real_image_comes_to_its_place_by_finer_and_coarser_references(quickbird, shared_data, step, most):
     """2.98, 2.09 px as delivered; what a reference of 20 m leaves (0.5 px of 6.5 m) is its noise, and no jitter."""
     result, rms = quickbird(step, geoid=str(shared_data / "dem" / "egm96_15.gtx"))
@@ -209,7 +216,7 @@ def test_a_geoid_that_was_left_out_is_the_reason(quickbird):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
-@pytest.mark.parametrize("wrong", ["of another place", "mirrored", "one height"])
+@pytest.mark.parametrize("wrong", rest_slow(["mirrored", "of another place", "one height"], mark=pytest.mark.nightly))
 def test_heights_of_another_terrain_under_a_reference_are_the_reason(quickbird, shared_data, tmp_path, wrong):
     """The image was placed 12-75 m off by them, at 1.25 m stated, exit code 0 or for jitter."""
     path = tmp_path / "dem.tif"

@@ -53,7 +53,8 @@ def moved_in(path: Path, data: bytes) -> None:
     new.replace(path)
 
 
-FAST, SLOW = (in_place, "detect"), (moved_in, "cameras")
+NIGHTLY = pytest.mark.nightly
+FAST, SLOW = (in_place, "detect"), ((moved_in, "cameras"), (in_place, "hash"), (in_place, "fit"))
 
 
 @pytest.mark.slow
@@ -85,9 +86,13 @@ def test_a_vrt_whose_image_was_replaced_is_another_input(images, tmp_path) -> No
         pytest.param(
             change,
             stage,
-            marks=() if (change, stage) == FAST else pytest.mark.slow if (change, stage) == SLOW else mark,
+            marks=()
+            if (change, stage) == FAST
+            else pytest.mark.slow
+            if (change, stage) in SLOW
+            else pytest.mark.nightly,
         )
-        for change, mark in ((in_place, pytest.mark.slow), (moved_in, pytest.mark.nightly))
+        for change in (in_place, moved_in)
         for stage in ("cameras", "hash", "read", "detect", "match", "fit")
     ],
 )

@@ -26,6 +26,7 @@ from barpc.tie.pairing.epipolar import frame
 from barpc.tie.pairing.overlaps import Pair, reach_of
 from barpc.tie.patches import oriented
 from barpc.tie.patches.oriented import PatchTile
+from tests.lanes import rest_slow
 
 from .conftest import write_image
 from .test_pairs import METRE, camera, views
@@ -183,7 +184,7 @@ def heights(shared_data: Path, lonlat: Array) -> Array:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", range(4))
+@pytest.mark.parametrize("number", rest_slow(range(4), mark=pytest.mark.nightly))
 def test_a_satellite_and_an_aerial_camera_are_tied_over_twelve_years(shared_data, number) -> None:
     """Without a DEM. The frames' cameras are exact; the satellite's is 3.0, 2.1 px off, as surveyed points say."""
     satellite, aerial = frames(shared_data)

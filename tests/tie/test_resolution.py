@@ -234,7 +234,13 @@ def shift_left(views: tuple[View, View], tracks: Tracks, where: tuple[np.ndarray
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("left", "right"), [(1, 4), (4, 1), (4, 4), (2, 4), (2, 1), ((1, 4), (4, 1))])
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        *((1, 4), ((1, 4), (4, 1))),
+        *(pytest.param(*row, marks=pytest.mark.nightly) for row in ((4, 1), (4, 4), (2, 4), (2, 1))),
+    ],
+)
 def test_real_crops_of_a_few_hundred_pixels_are_tied_at_any_two_resolutions(
     ventoux, shared_data: Path, tmp_path, left, right
 ) -> None:

@@ -63,8 +63,8 @@ def left(xy: np.ndarray) -> float:
     ("most", "zoom"),
     [
         (300, 4),
-        *(pytest.param(*row, marks=pytest.mark.slow) for row in ((900, 2), (150, 4))),
-        pytest.param(4000, 1, marks=pytest.mark.nightly),
+        pytest.param(150, 4, marks=pytest.mark.slow),
+        *(pytest.param(*row, marks=pytest.mark.nightly) for row in ((900, 2), (4000, 1))),
     ],
 )
 def test_the_quiet_half_of_a_scene_has_its_share_however_few_keypoints_it_may_hold(
