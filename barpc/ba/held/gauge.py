@@ -122,11 +122,11 @@ def _motion_by_unknowns(
     whitened = np.zeros((len(use), 3, count))  # L^-1 of each motion's weights: dX = -L^-T Y dp
     whitened[index] = solve_lower(lower, pick.transpose(2, 0, 1)).transpose(2, 0, 1)
     rows = np.flatnonzero(use[structure.point])
-    by_camera = np.empty((count, structure.num_views, q))
+    by_view = np.empty((count, structure.num_views, q))
     for v, of_view in enumerate(np.split(rows, np.searchsorted(rows, structure.bounds[1:-1]))):
         of_points = whitened[structure.point[of_view]].reshape(-1, count)
-        by_camera[:, v] = -of_points.T @ reduced.cross[of_view].reshape(-1, q)
-    by_camera = by_camera.reshape(count, -1)
+        by_view[:, v] = -of_points.T @ reduced.cross[of_view].reshape(-1, q)
+    by_camera = by_view.reshape(count, -1)
     flat = whitened[index].reshape(-1, count)
     own = share * flat.T @ flat
     if reduced.common is not None:
