@@ -245,7 +245,6 @@ def _adjustment(
     delivered = found.problem.camera_prior.mean
     moved = [measure(found.problem, params, apart) for params in (delivered, final.params)]
     covariance = outcome.minimum.covariance(found.problem.free)
-    projected = found.problem.project_points(final.params, final.points)
     cameras = found.problem.cameras
     points = np.where(seen[:, None], final.points, np.nan)
     for one in (found.after, moved[1]):
@@ -292,7 +291,7 @@ def _adjustment(
         left=(*left_over(outcome, block, options.noise_floor), *parts.mostly_moving(outcome.inlier)),
         alike=_alike(block, outcome, is_tie),
         in_space_rms=in_space,
-        two_groups=two_groups(found.problem.structure, outcome.residual, projected, outcome.inlier & is_tie),
+        two_groups=two_groups(found.problem.structure, outcome.residual, outcome.by_point, outcome.inlier & is_tie),
         held=found.heights.weak[: block.num_tracks],
         terrain=found.heights.test(final.points, seen),
         left_out=block.left_out,

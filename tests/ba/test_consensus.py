@@ -138,7 +138,7 @@ def test_two_groups_are_told_by_their_pair_share_and_distance(seen) -> None:
 
 def _given(seen, offset: np.ndarray, pair: int = 0) -> tuple[np.ndarray, Any, np.ndarray]:
     residual, use = residual_of(*seen, offset, pair)
-    return residual, seen[1], use
+    return residual, seen[1].by_point, use
 
 
 @pytest.mark.parametrize(

@@ -245,6 +245,7 @@ def passes(
                 self.use = np.arange(10_000) >= cut[min(self.passes - 1, len(cut) - 1)]
 
         def _solve(self) -> Any:
+            self.projected: Any = SimpleNamespace(by_point=np.zeros(0))
             return self.found
 
         def _estimate_noise(self) -> Any:

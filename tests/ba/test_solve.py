@@ -17,11 +17,16 @@ FACTOR = object()
 
 
 def run(
-    monkeypatch: pytest.MonkeyPatch, costs: list[float], gains: list[float], tolerance: float = 1e-6
+    monkeypatch: pytest.MonkeyPatch,
+    costs: list[float],
+    gains: list[float],
+    tolerance: float = 1e-6,
+    kept: float | None = None,
 ) -> tuple[Minimum | str, list[float]]:
     """The minimum, or the error's text, and the damping of every step; a gain of NaN: the matrix does not factorise.
 
-    Costs are those of the linearisations; the last of them and the last gain go on for ever.
+    Costs are those of the linearisations; the last of them and the last gain go on for ever. `kept` is the cost that is
+    found after every step, before it is linearised.
     """
     dampings: list[float] = []
     given = iter(costs)
@@ -41,7 +46,9 @@ def run(
         return np.full((1, 2), 0.5), gain, FACTOR
 
     monkeypatch.setattr(solve, "camera_step", camera_step)
-    problem: Any = SimpleNamespace(reduce=reduce)
+    # a cost far from what a step promised: none is the last for having kept its promise
+    seen: Any = {"prepare": lambda *_: (np.zeros(1), None), "cost": lambda *_: float("inf")}
+    problem: Any = SimpleNamespace(reduce=reduce, **(seen if kept is None else seen | {"cost": lambda *_: kept}))
     try:
         return solve._levenberg_marquardt(problem, STATE, np.ones(1), tolerance, None), dampings
     except AdjustError as error:
@@ -61,6 +68,19 @@ def test_steps_are_taken_until_one_gains_too_little(monkeypatch) -> None:
     assert "4 evaluations in all: the next step gains too little" in found.status
     _, dampings = run(monkeypatch, [100.0, 40.0, 30.0], [60.0, 10.0, 1e-2, 1e-9])
     assert len(dampings) == 4
+
+
+@pytest.mark.parametrize(("off", "last"), [(1.9e-7, True), (-1.9e-7, True), (2.1e-7, False), (-2.1e-7, False)])
+def test_a_step_that_gains_what_it_should_is_the_last(monkeypatch, off: float, last: bool) -> None:
+    found, dampings = run(monkeypatch, [100.0, 40.0, 30.0], [60.0, 10.0, 1e-9], kept=40.0 + off)  # 5e-9 of the cost
+    assert isinstance(found, Minimum)
+    assert len(dampings) == (1 if last else 3)
+    if last:
+        assert found.state.history == (7.0, 100.0)
+        assert found.state.cost == 40.0 + off
+        assert found.factor is FACTOR
+        assert found.ahead is not None
+        assert "gained what it should" in found.status
 
 
 @pytest.mark.parametrize(

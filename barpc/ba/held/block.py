@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from barpc.ba.algebra.structure import counting_sort
+from barpc.ba.algebra.structure import Structure, counting_sort, make_structure
 from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.geodesy import Array, ecef_from_ground
 from barpc.options import AdjustOptions
@@ -77,6 +77,12 @@ class Block:
     def first_points(self) -> Array:
         """Return the points (P, 3), ECEF [m], on the first observing view's rays at its middle altitude."""
         return self._first_points.copy()
+
+    @cached_property
+    def own_points(self) -> tuple[IntArray, Structure]:
+        """The points (Q,) that are observed, and who sees them, counted by these."""
+        index, point = np.unique(self.point, return_inverse=True)
+        return index, make_structure(self.view, point, len(self.views), len(index))
 
     @cached_property
     def _first_points(self) -> Array:

@@ -121,13 +121,12 @@ def _motion_by_unknowns(
     whitened = np.zeros((len(use), 3, count))  # L^-1 of each motion's weights: dX = -L^-T Y dp
     whitened[index] = solve_lower(lower, pick.transpose(2, 0, 1)).transpose(2, 0, 1)
     rows = np.flatnonzero(use[structure.point])
-    products = np.swapaxes(reduced.cross[rows], 1, 2) @ whitened[structure.point[rows]]
-    by_unknown = np.zeros((structure.num_views, q * count))
-    bounds = np.searchsorted(rows, structure.bounds)
-    filled = np.flatnonzero(np.diff(bounds))
-    by_unknown[filled] = -np.add.reduceat(products.reshape(-1, q * count), bounds[filled], axis=0)
+    by_view = np.empty((count, structure.num_views, q))
+    for v, of_view in enumerate(np.split(rows, np.searchsorted(rows, structure.bounds[1:-1]))):
+        of_points = whitened[structure.point[of_view]].reshape(-1, count)
+        by_view[:, v] = -of_points.T @ reduced.cross[of_view].reshape(-1, q)
+    by_camera = by_view.reshape(count, -1)
     flat = whitened[index].reshape(-1, count)
-    by_camera = by_unknown.reshape(-1, q, count).transpose(2, 0, 1).reshape(count, -1)
     own = share * flat.T @ flat
     if reduced.common is not None:
         moved = np.einsum("qic,qim->cm", whitened[reduced.common.index], reduced.common.cross)

@@ -76,6 +76,8 @@ class Solution:
         held = staying(points, np.flatnonzero(some & self.heights.weak))
         mended = replace(self.problem, xy=shown, point_prior=held)
         delivered = self.problem.camera_prior.mean
+        if not self.heights.weak.any():  # else their heights are to stay where the adjustment put them
+            points = self.state.points
         for _ in range(_STEPS_BACK):
             projected, before = mended.project_points(delivered, points), points
             points = mended.triangulate(points, projected, block.use / block.sigma)

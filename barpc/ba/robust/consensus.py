@@ -40,11 +40,11 @@ class TwoGroups:
     apart: float  # across the epipolar lines [px]
 
 
-def two_groups(structure: Structure, residual: Array, projected: Projected, use: BoolArray) -> tuple[TwoGroups, ...]:
+def two_groups(structure: Structure, residual: Array, by_point: Array, use: BoolArray) -> tuple[TwoGroups, ...]:
     """Find the pairs of views whose offsets across the epipolar lines (of observations in use) have two centres."""
     many = np.repeat(np.diff(structure.pair_bounds) >= _GROUPED, np.diff(structure.pair_bounds))
     rows = np.flatnonzero(many & use[structure.first] & use[structure.second])
-    offset = _across(residual, projected.by_point, structure.first[rows], structure.second[rows])
+    offset = _across(residual, by_point, structure.first[rows], structure.second[rows])
     bounds = np.searchsorted(rows, structure.pair_bounds)
     count = np.diff(bounds)
     by_pair = sp.csr_array((np.ones(len(rows)), np.arange(len(rows)), bounds), (len(count), len(rows)))

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import expit, gammaln
 
-from barpc.ba.algebra.structure import make_structure
 from barpc.ba.evidence.mixture import NEAR_LIMIT, WRONG
 from barpc.ba.held.block import Block
 from barpc.ba.robust.weights import Observations, geman_mcclure
@@ -87,30 +86,18 @@ def _scrambled(numbers: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
     return numbers ^ (numbers >> np.uint64(31))
 
 
-def of_part(problem: Problem, view: IntArray, point: IntArray, xy: Array) -> Problem:
-    """Return a problem's cameras with other observations (K,), sorted by view, of other points, seen at (2, K) [px]."""
-    points = int(point.max(initial=-1)) + 1
-    return replace(
-        problem,
-        cameras=problem.cameras.seeing(xy),
-        structure=make_structure(view, point, problem.structure.num_views, points),
-        xy=xy,
-        point_prior=None,
-        _room=[],
-    )
-
-
 def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Array]:
     """Return a problem with other observations, and the points (Q, 3) that cameras of unknowns (N, q) give them."""
-    index, point = np.unique(block.point, return_inverse=True)
-    part = of_part(problem, block.view, point, block.xy)
+    index, structure = block.own_points
+    cameras = problem.cameras.seeing(block.xy)
+    part = replace(problem, cameras=cameras, structure=structure, xy=block.xy, point_prior=None, _room=[])
     first = block.first_points()[index]
     return part, part.triangulate(first, part.project_points(params, first), 1.0 / block.sigma)
 
 
 def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
     """Measure the observations of a block that took no part in a problem, under cameras of unknowns (N, q)."""
-    views, index = len(block.views), np.unique(block.point)
+    views, index = len(block.views), block.own_points[0]
     if not len(index):
         unknown = np.full(views, np.nan)
         return HeldOut(np.zeros((2, 0)), index, np.zeros((0, 3)), unknown, unknown)

@@ -51,6 +51,7 @@ class Outcome:
     passes: int  # rounds of cutting
     prior: PriorTest  # how the corrections compare with the priors given, and what the priors became
     smooth: SmoothTest  # what is smooth in the residuals that are left
+    by_point: Array  # (2, 3, K) derivatives of the image points by the points at the end [px/m]
     # floor [px] -> intervals of images that stand out there, once they were looked for
     standing_out: dict[float, list[Interval]] = field(default_factory=dict, init=False, repr=False)
 
@@ -135,7 +136,7 @@ class Rounds:
         if self.robust and self.passes and many_cut:
             weight = self.everything / self.observations.sigma
             self.state, self.residual = revived(self.problem, self.state, self.residual, self.use, weight)
-            self.scatter = None
+            self.scatter = self.projected = None
         self.problem = self.heights.hold(self.problem, self.state.points)
         self.passes += 1
         self._cut()
@@ -154,6 +155,7 @@ class Rounds:
             smooth = self.smooth.test_neighbours(smooth, self.residual, self.use)
             if found.covariance(self.problem.free).is_large:
                 tested = self.variances.learnt(self.problem, found, exact=True)[1]
+            by_point = self._by_points().by_point.copy()  # the next projection overwrites it
             return Outcome(
                 self.problem,
                 found,
@@ -164,6 +166,7 @@ class Rounds:
                 self.passes,
                 tested,
                 smooth,
+                by_point,
             )
         self.problem = replace(self.problem, camera_prior=prior)
         return None
@@ -184,12 +187,12 @@ class Rounds:
         noise = self.noise if self.options.estimate_noise else 1.0
         self.weight = weight = self.observations.weight(self.use, noise, self.misfit)
         found = minimise(self.problem, self.state, weight, solver, tolerance, self.projected)
-        state, self.projected = found.state, None
-        self.residual = self.problem.residuals(state.params, state.points)
+        state = found.state
+        self.residual, self.projected = found.ahead or self.problem.prepare(state.params, state.points)
         cost = self.problem.cost(state.params, state.points, self.residual * weight)
         self.state = replace(state, cost=cost, history=(*state.history, cost))
         self.counted = self.use.astype(np.float64)
-        return replace(found, state=self.state)
+        return replace(found, state=self.state, ahead=None)
 
     def _estimate_noise(self) -> SmoothTest:
         """Return the noise, and what no camera can follow, by the residuals of the observations in use."""
@@ -204,6 +207,10 @@ class Rounds:
             self.noise = self.observations.noise(self.residual, self.use, self.problem)
         return tested
 
+    def _by_points(self) -> Projected:
+        """Return the projection of the state with derivatives by the points at least."""
+        return self.projected or self.problem.project_points(self.state.params, self.state.points)
+
     def _scatter(self, fit: Fit | None = None) -> Array:
         """Return the residuals (2, K) [px] without the smooth parts of all views that see a point.
 
@@ -215,9 +222,7 @@ class Rounds:
         size = float(np.sqrt((counted * (part / sigma) ** 2).sum() / max(counted.sum(), 1.0)))
         if size < _SMOOTH_SEEN:
             return residual - part
-        projected = self.problem.project_points(self.state.params, self.state.points)
-        weight = counted**0.5 / sigma
-        settled = self.problem.settling(projected, weight)
+        settled = self.problem.settling(self._by_points(), counted**0.5 / sigma)
         for _ in range(BACKFITTING):
             part += self.smooth.part(settled(residual - part), counted)
         return settled(residual - part)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
+from barpc.ba.algebra.dissection import LEAF
 from barpc.ba.algebra.linear import Factor, Matrix, factorize, factorize_blocks
 from barpc.ba.algebra.multifrontal import Blocks
 from barpc.ba.algebra.structure import Structure, parts
@@ -21,7 +22,7 @@ from barpc.ba.usual import CHUNK
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
-DENSE_UNKNOWNS = 900  # up to so many camera unknowns the reduced matrix is a plain array
+DENSE_UNKNOWNS = 9 * LEAF  # up to so many camera unknowns (a front) the reduced matrix is a plain array
 
 TRIANGLE = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))  # order of the elements of symmetric 3x3 matrices
 

@@ -57,6 +57,7 @@ class Minimum:
     reduced: Reduced  # the last linearisation: at the minimum (scipy), or one small step before it
     factor: Factor | None = None  # of its matrix, free unknowns only, where it was factorised
     status: str = ""  # which solver ran, and why it stopped
+    ahead: tuple[Array, Projected | None] | None = None  # `Problem.prepare` of the state, where that was asked
     _known: list[Covariance] = field(default_factory=list, repr=False)
 
     def covariance(self, free: BoolArray) -> Covariance:
@@ -123,6 +124,15 @@ def _settled(gain: float, before: float, cost: float, tolerance: float) -> bool:
     return gain <= tolerance * cost or gain * gain <= 1e-3 * tolerance * cost * before < np.inf
 
 
+def _is_as_told(cost: float, told: float, tolerance: float) -> bool:
+    """Return whether a step that leaves `cost` is the last, after which `told` should be left.
+
+    What the residuals bend beyond their linearisation is all that a next step could mend, and it gains no more than
+    about twice what that adds to the cost: a hundredth of what is tolerated.
+    """
+    return abs(cost - told) <= 5e-3 * tolerance * told
+
+
 def gauss_newton(problem: Problem, state: State, weight: Array, projected: Projected | None = None) -> State:
     """Take one undamped Gauss-Newton step, for rounds whose weights change anyway; `projected` as in `minimise`."""
     reduced = problem.reduce(state.params, state.points, weight, projected)
@@ -159,8 +169,13 @@ def _levenberg_marquardt(
         if _settled(gain, before, state.cost, tolerance):
             status = _status(state, "the next step gains too little")
             return Minimum(ahead, reduced, None if damping else factor, status)
+        residual, projected = problem.prepare(ahead.params, ahead.points)
+        cost = problem.cost(ahead.params, ahead.points, residual * weight)
+        if not damping and _is_as_told(cost, ahead.cost, tolerance):
+            status = _status(state, "the last step gained what it should")
+            return Minimum(replace(ahead, cost=cost), reduced, factor, status, (residual, projected))
         del reduced, factor  # of a large block no two fit
-        reduced = problem.reduce(ahead.params, ahead.points, weight)
+        reduced = problem.reduce(ahead.params, ahead.points, weight, projected)
         if reduced.cost <= state.cost * (1.0 + 1e-12):
             state = replace(ahead, cost=reduced.cost, history=(*state.history, reduced.cost))
             before = gain if not damping else np.inf
