@@ -22,7 +22,7 @@ from rasterio.warp import transform as warp_points
 from rasterio.windows import Window
 
 from barpc.errors import BarpcWarning, ImageError, InputError
-from barpc.geodesy import Array
+from barpc.geodesy import FAR, Array
 from barpc.geoids import geoid_file
 from barpc.raster import open_raster
 from barpc.remote import Place, location
@@ -36,7 +36,6 @@ _EXACT = 1e-4  # m: of a place on the terrain
 _A_POST = 4.0  # steps: with 60 m of noise a post, under 27 degrees, 1.7 % of lines pass a corner, of two steps 3.2 %
 _STEPS = 64  # of a line of sight over a terrain whose posts are not known
 _AT_ONCE = 500_000  # heights
-_FAR = 1e12  # no coordinate [m or deg] comes near
 _VERTICAL = re.compile(r'(?:VERTCRS|VERT_CS|VERTICALCRS)\s*\[\s*"([^"]+)"')
 
 
@@ -166,7 +165,7 @@ def _inverse(forward: Affine, path: Place) -> Affine:
     """Return the inverse transformation, from coordinates to pixels, where there is one."""
     numbers = np.array(forward[:6])
     area = abs(forward.determinant)
-    if np.isfinite(numbers).all() and np.abs(numbers).max() <= _FAR and area >= _FAR**-2:
+    if np.isfinite(numbers).all() and np.abs(numbers).max() <= FAR and area >= FAR**-2:
         return ~forward
     raise InputError(f"{path}: its geotransform {tuple(forward[:6])} maps no grid of nodes")
 

@@ -176,8 +176,8 @@ def _decode(frame: Any, arrays: Mapping[str, npt.NDArray[Any]], sent: bool = Fal
     return kind(**{k: _decode(v, arrays, sent) for k, v in frame["fields"].items()})
 
 
-_DEFLATE = 1032  # bytes at most that one byte of a deflated stream stands for
-_HEADER = 1 << 12
+DEFLATED = 1032  # bytes at most that one byte of a deflated stream stands for
+HEADER = 1 << 12
 
 
 def load_npz(path: Path | str, kind: Kind = ARRAYS) -> Arrays:
@@ -206,8 +206,8 @@ def _unpack(file: IO[bytes], path: Path | str, kind: Kind) -> Arrays:
 
 def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> tuple[int, int]:
     """Return the elements and bytes of a member that the archive claims; ValueError where it cannot hold them."""
-    packed = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: _DEFLATE}.get(member.compress_type)
-    if packed is None or member.file_size > packed * member.compress_size + _HEADER:
+    packed = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: DEFLATED}.get(member.compress_type)
+    if packed is None or member.file_size > packed * member.compress_size + HEADER:
         raise ValueError(f"{member.filename} claims more bytes than it can hold")
     with archive.open(member) as file:
         version = npy.read_magic(file)

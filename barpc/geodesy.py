@@ -21,19 +21,27 @@ EARTH_RATE = 7.292115e-5  # rotation of the Earth [rad/s]
 SPEED_OF_LIGHT = 299792458.0  # in vacuum [m/s]
 
 _EP2 = WGS84_E2 / (1.0 - WGS84_E2)  # second eccentricity, squared
-_CHUNK = 8192  # points worked on at a time, so that temporaries stay in cache
+ALTITUDES = (-1000.0, 9500.0)
+"""The Earth's ground stays inside this [m], with a margin; RPCs that state more are cut to it."""
+FAR = 1e9
+"""No place, size or other number of a file comes near, be it in px, deg or m."""
+NEWTON_STEPS = 12
+"""Steps of a Newton method that gains digits with every one, at most: it ends where it has settled."""
+SETTLED = 1e-4
+"""Of the last of these steps [px or m], where they are quadratic: what it leaves is below rounding."""
+CHUNK = 8192
+"""Points worked on at a time, so that temporaries stay in cache."""
 _RAD = np.pi / 180.0
 
 
 def pointwise(
     function: Callable[..., Iterable[Array]],
-    chunk: int,
     shapes: Sequence[tuple[int, ...]],
     points: npt.ArrayLike,
     alt: npt.ArrayLike | None = None,
     rows: int = 0,
 ) -> list[Array]:
-    """Apply a function of points (..., k) and altitudes (...), broadcast, to `chunk` of them at a time.
+    """Apply a function of points (..., k) and altitudes (...), broadcast, to `CHUNK` of them at a time.
 
     The function takes (n, k) points, (n,) altitudes if there are any, and (rows, n) memory to overwrite if it asks for
     `rows` (fresh memory costs more than sums), and gives arrays (n, *shape); what is not finite is no news.
@@ -47,10 +55,10 @@ def pointwise(
         flat = [np.broadcast_to(points, (*lead, k)).reshape(-1, k), np.broadcast_to(alt, lead).reshape(-1)]
     count = len(flat[0])
     out = [np.empty((count, *shape)) for shape in shapes]
-    memory = np.empty((rows, min(count, chunk)))
+    memory = np.empty((rows, min(count, CHUNK)))
     with np.errstate(all="ignore"):
-        for start in range(0, count, chunk):
-            part = slice(start, start + chunk)
+        for start in range(0, count, CHUNK):
+            part = slice(start, start + CHUNK)
             given = [array[part] for array in flat]
             if rows:
                 given.append(memory[:, : len(given[0])])
@@ -78,7 +86,7 @@ def ground_from_ecef(ecef: npt.ArrayLike) -> Array:
 
     Within 5e-9 m from -10 km to 900 km of altitude, and to the rounding of the coordinates far beyond.
     """
-    (ground,) = pointwise(lambda part: [_geodetic(*np.ascontiguousarray(part.T))[0].T], _CHUNK, [(3,)], ecef)
+    (ground,) = pointwise(lambda part: [_geodetic(*np.ascontiguousarray(part.T))[0].T], [(3,)], ecef)
     return ground
 
 

@@ -193,7 +193,7 @@ def driver_of(head: bytes) -> str | None:
 
 Pixels = npt.NDArray[Any]
 
-_BLOCK = 512  # px
+BLOCK = 512  # px a side, read and written at a time
 _MOST_OPEN = 64
 _WIDE = ("int32", "uint32", "int64", "uint64", "float64")  # GDAL scales them as float64, others as float32
 
@@ -210,7 +210,7 @@ class Mosaic:
         self.dtypes = tuple(band.dtype for band in vrt.bands)
         self.nodatavals = tuple(band.nodata for band in vrt.bands)
         self.nodata = self.nodatavals[0]
-        self.block_shapes = [(min(_BLOCK, self.height), min(_BLOCK, self.width))] * self.count
+        self.block_shapes = [(min(BLOCK, self.height), min(BLOCK, self.width))] * self.count
         names = ColorInterp.__members__
         self.colorinterp = tuple(names.get(band.color, ColorInterp.undefined) for band in vrt.bands)
         self.crs = self._crs(vrt.srs)

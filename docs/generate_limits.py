@@ -10,18 +10,14 @@ import argparse
 import re
 from pathlib import Path
 
-from barpc import dem, frozen, options, raster, scene, sidefile, vrt, workspace
+from barpc import dem, frozen, geodesy, options, raster, scene, sidefile, vrt, workspace
 from barpc.ba.held import incremental
-from barpc.fit import points
-from barpc.pointio import colmap, correspondences, hloc, names
+from barpc.pointio import colmap, hloc, names
 from barpc.remote import _KEPT as HELD
 from barpc.remote import _LONGEST as REQUEST
 from barpc.remote import BLOCK, web
-from barpc.report import tables
-from barpc.rpcio import acquisition, grids, text, tiff
+from barpc.rpcio import acquisition, text, tiff
 from barpc.sensor import document as metadata
-from barpc.sensor import terrasar
-from barpc.sensor.linescan import dimap, maxar
 from barpc.sensor.sicd import metadata as sicd
 from barpc.tie.pairing import area
 
@@ -52,7 +48,6 @@ def _numbers(kind: sidefile.Kind) -> str:
 def rows() -> list[tuple[str, str]]:
     """What is read, and what of it is refused beyond."""
     bounded = (sidefile.RPC_FILE, sidefile.GEOJSON, sidefile.OPTIONS, sidefile.SUMMARY)
-    sides = {terrasar._MOST, dimap._MOST, maxar._MOST}
     unpacked = f"packed, unpacked, and as numbers of {sidefile.NUMBER} bytes"
     return [
         *((kind.words, size(kind.most) + _numbers(kind)) for kind in bounded),
@@ -64,12 +59,12 @@ def rows() -> list[tuple[str, str]]:
         ("JSON", f"{sidefile._MAX_DEPTH} levels"),
         (
             f"{sidefile.ARRAYS.words} (`.npz`)",
-            f"{size(sidefile.ARRAYS.most)} {unpacked}; a member {many(frozen._DEFLATE)} times its stored bytes",
+            f"{size(sidefile.ARRAYS.most)} {unpacked}; a member {many(frozen.DEFLATED)} times its stored bytes",
         ),
         (
             hloc._CONTENT.words,
             f"{size(hloc._CONTENT.most)} as numbers of {sidefile.NUMBER} bytes; {many(hloc._MOST)} objects, groups "
-            f"{hloc._DEEPEST} deep; an array {many(hloc._DEFLATE)} times its stored bytes",
+            f"{hloc._DEEPEST} deep; an array {many(frozen.DEFLATED)} times its stored bytes",
         ),
         (
             f"{colmap._CONTENT.words} (COLMAP)",
@@ -96,7 +91,7 @@ def rows() -> list[tuple[str, str]]:
             f"{web.TIMEOUT:g} s, and 1 s for {web._SLOWEST:,} bytes; {web._MOVES} redirects",
         ),
         ("rasters open at a time", many(raster._MOST_OPEN)),
-        ("an image of a product's metadata", f"{many(*sides)} rows or columns"),
+        ("an image of a product's metadata", f"{many(metadata.MOST_PIXELS)} rows or columns"),
         ("a polynomial of a SICD", f"degree {sicd._ORDER}"),
         ("a name of an image", f"{names.MAX_NAME} bytes"),
         ("control points of a fit", many(options.MOST_POINTS)),
@@ -110,13 +105,13 @@ def rows() -> list[tuple[str, str]]:
             "numbers of options",
             f"{many(1 / options._REAL)} to {many(options._REAL)}, and 0; whole ones below {many(options._MOST)}",
         ),
-        ("numbers of metadata of a camera", many(metadata.LARGEST)),
+        ("numbers of metadata of a camera", many(geodesy.FAR)),
         (
             "points of a fit, of a table, of a grid",
-            " and ".join(sorted({f"{many(far)} px" for far in (points._FARTHEST, correspondences._FAR, grids._FAR)})),
+            f"{many(geodesy.FAR)} px",
         ),
-        ("numbers of a run's tables", many(tables._FAR)),
-        ("coordinates of a DEM", many(dem._FAR)),
+        ("numbers of a run's tables", many(geodesy.FAR)),
+        ("coordinates of a DEM", many(geodesy.FAR)),
         ("standard deviations of ground points", " to ".join(map(many, scene.SIGMA_RANGE))),
     ]
 

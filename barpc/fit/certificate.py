@@ -13,18 +13,18 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import FitError
-from barpc.geodesy import Array, wrap_longitude
+from barpc.geodesy import CHUNK, Array, wrap_longitude
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
 
 BoolArray = npt.NDArray[np.bool_]
 
+EXACT = 1e-6  # px: what no other method is tried on, and no round trip is held to
 CELLS = 45
 """Along each side of the image: 2025 points of the whole."""
 _EDGE = 12  # points along each edge of the image, at either end of the altitudes
 _WORST, _AROUND, _ROUNDS = 16, 8, 5  # points that are looked around at, new ones around each, how often
 _NEARER = 0.5  # each time
-_CHUNK = 8192
 
 
 @dataclass
@@ -174,8 +174,8 @@ def coverage(image: Array, low: Array, high: Array) -> float:
     angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
     direction = np.column_stack([np.cos(angle), np.sin(angle)])  # outside is beyond all in one direction
     reach = np.full(len(angle), -np.inf)
-    for start in range(0, len(image), _CHUNK):
-        part = (image[start : start + _CHUNK] - low) / (high - low)
+    for start in range(0, len(image), CHUNK):
+        part = (image[start : start + CHUNK] - low) / (high - low)
         reach = np.maximum(reach, (direction @ part.T).max(axis=1))
     t = (np.arange(20) + 0.5) / 20
     cells = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)

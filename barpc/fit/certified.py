@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from barpc.fit.certificate import EXACT
 from barpc.fit.localisation import Localisation
 from barpc.fit.reasons import Reason
 from barpc.geodesy import Array
 from barpc.sensor.rpc import RPC
 
 _HOPE = 3.0  # times the tolerance: what ``minimax`` may bring below it
-EXACT = 1e-6  # px: what no other method is tried on, and no round trip is held to
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barpc.fit.certificate import Errors
+from barpc.fit.certificate import EXACT, Errors
 from barpc.fit.methods import FitSolution, solve_problem
 from barpc.fit.precision import Normalization
 from barpc.fit.system import FitProblem
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor.rpc import RPC
-
-_EXACT = 1e-6  # px: what no other method is tried on
 
 Seen = Callable[[RPC, FitSolution], tuple[Errors, Array]]
 """What a localisation RPC is off by on points that it has not seen [m, px], and the largest (2,)."""
@@ -93,6 +91,6 @@ def with_localisation(
         least = solution.region.smallest(solution.coeffs[1::2])
         (rmse_m, rmse_px), (max_m, max_px) = errors.rmse.tolist(), largest.tolist()
         found.append((direct, Localisation(rmse_m, max_m, rmse_px, max_px, least, method)))
-        if max_px <= _EXACT:
+        if max_px <= EXACT:
             break
     return min(found, key=lambda each: (not each[1].min_denominator > 0, each[1].rmse_m))

@@ -48,12 +48,12 @@ Found = tuple[Array, list["Compressed"], Array, int]
 WEIGHTED = 1
 """Further passes of ``ridge`` with the residuals weighted by 1 / denominator, where that varies."""
 MAX_PASSES = 20
+"""Of what is iterated, ``minimax``'s weights, too."""
 TOLERANCE = 1e-10
 """Change of the RMSE [px] at which the iterations stop."""
 _SAMPLES = 200  # of the L-curve
 _LEAST_DAMPED, _FIRST_DAMPED, _MOST_DAMPED = 1e-12, 1e-6, 1e3  # of the size of a column
 _POWER = 1.5  # of the errors that weights grow with, and 20 rounds: 0.94 px for 1.21 at 89.9 N, 60 rounds 0.89
-_REWEIGHTED = 20  # times, of ``minimax``
 _SLACK = 1e-6  # of the least denominator: rounding
 _GAIN = 1e-3  # of the sum of squares: less in a step, and it stands
 _EVEN = 0.05  # a denominator within 1 -/+ this weights nothing
@@ -344,7 +344,7 @@ def _minimax(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None)
             np.inf,
             np.ones(len(problem.image)),
         )
-        for _ in range(_REWEIGHTED):
+        for _ in range(MAX_PASSES):
             errors = problem.errors(axis, x)
             if errors.max() < least:
                 least, best = float(errors.max()), x

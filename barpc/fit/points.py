@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from barpc.errors import FitError
 from barpc.fit.precision import ALTITUDE_FLOOR
-from barpc.geodesy import Array, metres_per_unit, wrap_longitude
+from barpc.geodesy import CHUNK, FAR, Array, metres_per_unit, wrap_longitude
 from barpc.options import FitOptions, Nodes
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import footprint
@@ -17,7 +17,6 @@ from barpc.sensor.geometry import footprint
 _SAMPLES = 400  # of a DEM along each side of the image
 _RANGES = (("longitude", -360.0, 720.0), ("latitude", -90.0, 90.0), ("altitude", -12e3, 100e3))
 _ONE_ALTITUDE = 1e-3  # metres
-_CHUNK = 8192
 
 
 def spaced(low: float, high: float, count: int, nodes: Nodes) -> Array:
@@ -117,9 +116,6 @@ def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) 
     return ground, image
 
 
-_FARTHEST = 1e9  # px: no image is as wide
-
-
 def checked_points(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
     """Return points (N, 3) lon, lat [deg], alt [m] and (N, 2) [px] as finite arrays, longitudes made
     continuous.
@@ -138,7 +134,7 @@ def checked_points(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, 
         if value.min() < low or value.max() > high:
             wrong = value.min() if value.min() < low else value.max()
             raise FitError(f"points: {wrong:g} is not a {name}: are the columns swapped? Give lon, lat [deg], alt [m]")
-    if not (np.abs(image) <= _FARTHEST).all():
+    if not (np.abs(image) <= FAR).all():
         raise FitError(f"points: {np.abs(image).max():g} px is no place in an image")
     if np.ptp(ground[:, 0]) > 180.0:
         ground = np.column_stack([wrap_longitude(ground[:, 0], ground[0, 0]), ground[:, 1:]])
@@ -170,8 +166,8 @@ def _check_geometry(ground: Array, image: Array, allow_mirrored: bool) -> None:
 def _covariance(ground: Array, image: Array, center: Array, span: Array) -> Array:
     """Return the covariance (5, 5) of lon, lat, alt, col, row, each in units of its span."""
     total, squares = np.zeros(5), np.zeros((5, 5))
-    for start in range(0, len(ground), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    for start in range(0, len(ground), CHUNK):
+        part = slice(start, start + CHUNK)
         z = np.concatenate([ground[part].T, image[part].T])
         z -= center[:, None]
         z /= span[:, None]

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.linalg import solve_triangular
 
 from barpc.fit.system import EPS, Compressed, IntArray, solution
-from barpc.geodesy import Array
+from barpc.geodesy import CHUNK, Array
 from barpc.sensor.rational import MONOMIALS, monomials
 from barpc.sensor.rpc import RPC
 
@@ -31,7 +31,6 @@ _LEVEL = 32  # directions that a hull is cut in, level with the ground; up and d
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, _LEVEL, endpoint=False)
 _DIRECTIONS = np.vstack([np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES), 0 * _ANGLES]), [[0, 0, 1], [0, 0, -1]]])
 _AXES = np.array([[0, _LEVEL // 4, -2], [_LEVEL // 2, 3 * _LEVEL // 4, -1]])  # of them, and their opposites
-_SOME = 4096  # points that the sides of a hull are told from; worked on at a time
 _ROUNDS, _CUTS = 20, 40  # of a bounded least squares; inequalities that are taken in in one
 _SLACK = 1e-9  # of a bound: rounding
 _STEPS, _FARTHEST = 400, 20.0  # along a ray that a pole is looked for on; half widths
@@ -81,13 +80,13 @@ class Region:
         The sides stand as those of the image do: lon, lat = `image` M + altitude k, M and k by least squares of points
         (N, 2) in the image.
         """
-        some = slice(None, None, 1 + len(ground) // _SOME)
+        some = slice(None, None, 1 + len(ground) // CHUNK)
         design = np.hstack([image[some], ground[some, 2:], np.ones((len(ground[some]), 1))])
         slope = np.linalg.lstsq(design - np.append(design[:, :3].mean(axis=0), 0.0), ground[some, :2], rcond=None)[0]
         skew = np.zeros((3, 3))
         skew[:2, :2], skew[2] = slope[:2], [*slope[2], 1.0]
         inverse = np.linalg.pinv(skew) @ _DIRECTIONS.T
-        reach = np.max([(ground[i : i + _SOME] @ inverse).max(axis=0) for i in range(0, len(ground), _SOME)], axis=0)
+        reach = np.max([(ground[i : i + CHUNK] @ inverse).max(axis=0) for i in range(0, len(ground), CHUNK)], axis=0)
         ends = reach[_AXES]
         middle, half = 0.5 * (ends[0] - ends[1]), 0.5 * (ends[0] + ends[1])
         inside = _inside(reach - _DIRECTIONS @ middle, half[:2])

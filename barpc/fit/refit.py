@@ -11,22 +11,21 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import BarpcWarning, FitError
-from barpc.fit.certificate import Errors, Sample, coverage, roundtrip
-from barpc.fit.certified import EXACT, Free, RpcFit
+from barpc.fit.certificate import EXACT, Errors, Sample, coverage, roundtrip
+from barpc.fit.certified import Free, RpcFit
 from barpc.fit.localisation import Seen, inverse, off, with_localisation
 from barpc.fit.methods import BOUNDED, FitSolution, solve
 from barpc.fit.points import checked_points, column_ranges, control_points, screened, widened
 from barpc.fit.poles import Region
 from barpc.fit.reasons import reason
 from barpc.fit.system import FitProblem
-from barpc.geodesy import Array, wrap_longitude
+from barpc.geodesy import CHUNK, Array, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import is_radar
 from barpc.sensor.rpc import RPC
 from barpc.sensor.splined import Splined
 
-_CHUNK = 8192
 _LOOPS = 4096  # round trips that a table of points is tried on, about
 _ABOUT = 1.1  # times the error
 _MISSING = 0.1  # part of the image without a ground point, at most
@@ -286,8 +285,8 @@ def _certified(
     problem, rpc = solution.problem, solution.rpc
     ground, image = problem.ground, problem.image
     used = Errors()
-    for start in range(0, len(ground), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    for start in range(0, len(ground), CHUNK):
+        part = slice(start, start + CHUNK)
         used.add(rpc.project(ground[part]) - image[part])
     left, right = column_ranges(image)
     if size is not None:

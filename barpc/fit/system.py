@@ -19,14 +19,13 @@ from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dtpqrt
 
 from barpc.fit.precision import Normalization
-from barpc.geodesy import Array
+from barpc.geodesy import CHUNK, Array
 from barpc.sensor.rational import MONOMIALS, monomials
 
 IntArray = npt.NDArray[np.int64]
 Rounding = Callable[[Array], Array]
 """Coefficients (...) to the nearest ones that a file can hold."""
 
-CHUNK = 1024
 """Rows taken into the triangle at a time: what is worked on stays in cache."""
 _BLOCK = 8  # columns of a Householder block
 ALL = np.arange(20)

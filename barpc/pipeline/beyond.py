@@ -23,7 +23,7 @@ from barpc.fit.points import widened
 from barpc.geodesy import Array
 from barpc.handoff import verify_grid
 from barpc.options import FitOptions, RunOptions
-from barpc.pipeline.executor import CachingExecutor
+from barpc.pipeline.executor import GROUP, CachingExecutor
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid
 from barpc.rpcio.resample import write_resampled
@@ -44,9 +44,8 @@ logger = logging.getLogger(__name__)
 MISFIT = 0.02
 """A camera that its RPC misses by more [px] gets grids, too."""
 RESAMPLED, TILES = "_resampled.tif", "_tiles.json"
-REOPENED = 1e-5  # px: what a reopened file may differ by from what was written
+REOPENED = 1e-5  # px: what a reopened file may differ by from what was written (15-digit printing)
 
-_GROUP = 8  # tiles that are fitted in one task, whose result is kept
 _BOX = "col", "row", "width", "height"
 
 Written = dict[str, dict[str, float | str]]
@@ -265,7 +264,7 @@ def _write_tiles(
     """Return an RPC for each tile, in the tile's own pixels, and a list of them."""
     assert options.tiles is not None
     boxes, alts = tile_boxes(view.size, options.tiles), widened(view.alt_range)
-    tasks = [(model, tuple(boxes[at : at + _GROUP]), alts, options.fit) for at in range(0, len(boxes), _GROUP)]
+    tasks = [(model, tuple(boxes[at : at + GROUP]), alts, options.fit) for at in range(0, len(boxes), GROUP)]
     try:
         with CachingExecutor(run, {}, executor) as caching:
             fits = [one for group in ordered(caching, fit_tiles, tasks, "tiles") for one in group]

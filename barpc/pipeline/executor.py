@@ -36,6 +36,7 @@ from barpc.workspace import Workspace, key_of
 logger = logging.getLogger(__name__)
 
 BATCH_SECONDS = 0.5  # work that is handed in at a time [s], as far as there are tasks for all workers
+GROUP = 8  # images, or tiles of one, of a task whose result is kept
 LARGE = 1 << 20  # arrays of so many bytes are sent as paths
 _PER_WORKER = 3  # batches in flight for each worker: enough that none waits
 _CLUSTER = 32  # workers of a cluster, at least: it may grow when there is work

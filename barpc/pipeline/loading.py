@@ -20,7 +20,9 @@ from rasterio.windows import Window
 
 from barpc.cameras import Camera, open_split, split_spec
 from barpc.errors import BarpcError, ImageError, InputError, MissingRpcError, RpcError
+from barpc.geodesy import ALTITUDES
 from barpc.identity import Stamp, also_seen, recorded
+from barpc.pipeline.executor import GROUP
 from barpc.pointio.names import unique_names
 from barpc.raster import open_raster
 from barpc.remote import Place, here, located
@@ -34,15 +36,11 @@ logger = logging.getLogger(__name__)
 
 MIN_ALTITUDE_SPAN = 100.0
 """Altitude ranges narrower than this [m] are widened to it: an RPC with a zero height scale is usable."""
-ALTITUDE_LIMITS = (-1000.0, 9500.0)
-"""The Earth's ground stays inside this [m], with a margin; RPCs that state more are cut to it."""
-
 
 _SAMPLES = ((0.5, 0.5), (0.25, 0.25), (0.75, 0.75))  # of width and height: where the sampled windows lie
 _MORE = tuple((x / 5, y / 5) for x in range(6) for y in range(6))  # where nothing varies there
 _SAMPLE_SIDE = (256, 16)  # px: many columns and few rows, so that few strips are decoded
 _CHUNK = 1 << 20  # px that are hashed at a time
-_GROUP = 16  # images that are read in one task
 _GIVE_RPC = "name its file with --rpc {}=FILE, or leave the image out (--keep-going of adjust and match)"
 _MANY = 64  # images from which on they are read by other processes
 
@@ -150,8 +148,8 @@ def _read_all(
     progress: Progress | None,
 ) -> tuple[list[_Read], float]:
     """Return every image as it was read, and CPU seconds of other processes."""
-    tasks = [(given[at : at + _GROUP], *how) for at in range(0, len(given), _GROUP)]
-    told = progress and (lambda stage, done, _: progress(stage, min(done * _GROUP, len(given)), len(given)))
+    tasks = [(given[at : at + GROUP], *how) for at in range(0, len(given), GROUP)]
+    told = progress and (lambda stage, done, _: progress(stage, min(done * GROUP, len(given)), len(given)))
     groups = ordered(executor, read_group, tasks, "cameras", told)
     spent = 0.0 if executor is None else sum(seconds for _, seconds in groups)
     return [read for group, _ in groups for read in group], spent
@@ -198,9 +196,9 @@ def _load(name: str, file: Place, image: Image, band: int, hosts: Sequence[str])
 
 def _altitudes(camera: Camera) -> tuple[float, float]:
     """Return the altitudes that a camera is used for [m]."""
-    low, high = max(camera.alt_range[0], ALTITUDE_LIMITS[0]), min(camera.alt_range[1], ALTITUDE_LIMITS[1])
+    low, high = max(camera.alt_range[0], ALTITUDES[0]), min(camera.alt_range[1], ALTITUDES[1])
     if high - low < MIN_ALTITUDE_SPAN:
-        middle = min(max((low + high) / 2, ALTITUDE_LIMITS[0]), ALTITUDE_LIMITS[1])
+        middle = min(max((low + high) / 2, ALTITUDES[0]), ALTITUDES[1])
         low, high = middle - MIN_ALTITUDE_SPAN / 2, middle + MIN_ALTITUDE_SPAN / 2
     return low, high
 

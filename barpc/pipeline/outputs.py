@@ -15,7 +15,7 @@ from barpc.errors import OutputError
 from barpc.fit import RpcFit
 from barpc.handoff import verify
 from barpc.options import RunOptions
-from barpc.pipeline.beyond import grid_names, made_in_room
+from barpc.pipeline.beyond import REOPENED, grid_names, made_in_room
 from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.inputs import PRIOR
 from barpc.report import Run, Summary
@@ -33,9 +33,6 @@ from barpc.workspace import TABLES as TABLES_FOLDER
 
 MATCHES = ("matches.csv", "matches.npz")
 GCPS = f"{TABLES_FOLDER}/gcps.geojson"  # of a reference
-
-REOPENED = 1e-5
-"""A reopened file may differ from P_BA by the error of the fit and this [px] more (15-digit printing)."""
 
 
 Fitted = tuple[View, RpcFit, SensorModel]  # a view, its refitted RPC and P_BA

@@ -26,7 +26,7 @@ from barpc.options import FitOptions, RunOptions
 from barpc.pipeline.beyond import write_grids
 from barpc.pipeline.cluster import watched
 from barpc.pipeline.control import load_altimetry, load_gcps
-from barpc.pipeline.executor import CachingExecutor
+from barpc.pipeline.executor import GROUP, CachingExecutor
 from barpc.pipeline.inputs import (
     PRIOR,
     given_matches,
@@ -61,8 +61,6 @@ from barpc.tie.tasks import Progress, ordered
 from barpc.workspace import TABLES, Workspace, timed
 
 logger = logging.getLogger(__name__)
-
-_GROUP = 8  # views that are fitted in one task, whose result is kept
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -412,8 +410,8 @@ def _fitted(run: Run, options: RunOptions, executor: Executor, progress: Progres
     corrected = zip(run.views, run.adjustment.sensors, strict=True)
     cameras = [(model, view.size, view.alt_range) for view, model in corrected]
     strict, num = not (options.keep_going or options.grids), len(cameras)
-    tasks = [(tuple(cameras[at : at + _GROUP]), options.fit, strict) for at in range(0, num, _GROUP)]
-    told = progress and (lambda stage, done, _: progress(stage, min(done * _GROUP, num), num))
+    tasks = [(tuple(cameras[at : at + GROUP]), options.fit, strict) for at in range(0, num, GROUP)]
+    told = progress and (lambda stage, done, _: progress(stage, min(done * GROUP, num), num))
     found = [one for group in ordered(executor, fit_group, tasks, "fit", told) for one in group]
     fits: list[RpcFit] = []
     for view, (fit, error, warned) in zip(run.views, found, strict=True):

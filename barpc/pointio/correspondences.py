@@ -17,7 +17,7 @@ import numpy as np
 
 from barpc.errors import InputError
 from barpc.frozen import load_npz
-from barpc.geodesy import Array
+from barpc.geodesy import FAR, Array
 from barpc.pointio.names import ViewNames, from_cell
 from barpc.raster import driver_of, open_raster
 from barpc.remote import Place
@@ -25,7 +25,7 @@ from barpc.scene import GroundPoints
 from barpc.sidefile import GEOJSON, NUMBER, TABLE, Kind, read_head, read_json, read_text
 
 GROUND_SIGMA = 1.0  # east, north, up standard deviation [m] of a GCP whose file states none
-IMAGE_SIGMA = 0.5  # standard deviation of each image coordinate [px] where the file states none
+IMAGE_SIGMA = 0.5  # standard deviation of each image coordinate [px], of GCPs and tie points whose file states none
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ def _assembled(found: list[_Point]) -> GroundPoints:
     points = list(first.values())
     names = tuple(point.name or f"gcp_{n}" for n, point in enumerate(points, 1))
     numbers = np.array([point.lonlatalt for point in points])
-    wrong = ~(np.abs(numbers) <= (_TURNS, _TURNS, _FAR)).all(axis=1)  # NaN fails, too
+    wrong = ~(np.abs(numbers) <= (TURNS, TURNS, FAR)).all(axis=1)  # NaN fails, too
     if wrong.any():
         raise InputError(
             f"GCP {names[int(wrong.argmax())]}: a coordinate is not finite, or no longitude and latitude in degrees; "
@@ -206,8 +206,7 @@ def _assembled(found: list[_Point]) -> GroundPoints:
 
 # --- correspondences --------------------------------------------------------------------------------------
 
-_FAR = 1e9  # px and m: no node comes near
-_TURNS = 540.0  # deg: longitudes are taken by whole turns
+TURNS = 540.0  # deg: longitudes are taken by whole turns
 
 _COLUMNS = {
     "lon": ("lon", "long", "longitude", "lng"),
@@ -427,6 +426,6 @@ def read_grid(path: Place, altitudes: Sequence[float] | None = None) -> Correspo
     alt = np.broadcast_to(np.asarray(altitudes, dtype=np.float64)[:, None, None], (layers, *col.shape))
     ground = np.stack([bands[::2], bands[1::2], alt], axis=-1).reshape(-1, 3)
     ok = np.isfinite(ground).all(axis=1)
-    if (np.abs(ground[ok]) > (_TURNS, 90.0, _FAR)).any() or not (np.abs(image) <= _FAR).all():
+    if (np.abs(ground[ok]) > (TURNS, 90.0, FAR)).any() or not (np.abs(image) <= FAR).all():
         raise InputError(f"{path}: a node of it is no longitude, latitude and altitude, or no image point")
     return Correspondences(ground[ok], image[ok])

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from barpc.errors import BarpcError, InputError
+from barpc.frozen import DEFLATED, HEADER
 from barpc.geodesy import Array
 from barpc.pointio.links import PairPoints, index_pairs
 from barpc.pointio.names import ViewNames
@@ -23,7 +24,6 @@ MAGIC = b"\x89HDF\r\n\x1a\n"
 _FILE = Kind("an HDF5 file", None)  # most of it are descriptors, which are not read
 _CONTENT = Kind("the keypoints and matches of an HDF5 file", 1024 * MB)
 _KEYPOINTS, _MATCHES = "keypoints", "matches0"
-_DEFLATE, _HEADER = 1032, 1 << 12  # as of `barpc.frozen`
 _MOST, _DEEPEST = 2_000_000, 32  # objects, and groups in each other
 _FEATURES = ("features.h5", "keypoints.h5")
 
@@ -95,7 +95,7 @@ class _Datasets:
         """Return the content of a dataset that lies in the file itself."""
         if found.is_virtual or found.external:
             raise ValueError(f"{found.name} lies in another file")
-        if found.nbytes > _DEFLATE * found.id.get_storage_size() + _HEADER:
+        if found.nbytes > DEFLATED * found.id.get_storage_size() + HEADER:
             raise ValueError(f"{found.name} claims more bytes than it can hold")
         self._bytes += found.size * max(NUMBER, found.dtype.itemsize)
         _CONTENT.check(self._path, self._bytes)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from barpc.errors import InputError
-from barpc.pointio.correspondences import cells_of, header_of, numbers_of, require_columns
+from barpc.pointio.correspondences import TURNS, cells_of, header_of, numbers_of, require_columns
 from barpc.scene import Altimetry
 from barpc.sidefile import TABLE, read_text
 
@@ -17,7 +17,6 @@ HEIGHT_SIGMA = 0.5  # m, of a height whose file states none: ICESat-2 and GEDI o
 FLAT_SIGMA = 1.0  # m, of its place along an axis, each point's own
 _HIGHEST = 12e3  # m: what is higher or lower stands for "no height" (-9999 is so low, and is no place on land)
 _FILL = -9999.0  # m: of GEDI and many others
-_TURNS = 540.0  # deg: longitudes are taken by whole turns
 
 COLUMNS = {
     "lon": ("lon", "long", "longitude", "lng", "lon_lowestmode"),
@@ -80,7 +79,7 @@ def _checked(path: Path, columns: dict[str, int], rows: Sequence[Sequence[float]
     if not len(values) or not len(given["alt"]):
         raise InputError(f"{path}: holds no height")
     place = np.column_stack([given["lon"], given["lat"]])
-    wrong = ~(np.abs(place) <= (_TURNS, 90.0)).all(axis=1)  # NaN fails, too
+    wrong = ~(np.abs(place) <= (TURNS, 90.0)).all(axis=1)  # NaN fails, too
     if wrong.any():
         lon, lat = place[wrong.argmax()]
         raise InputError(

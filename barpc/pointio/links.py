@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.geodesy import Array
+from barpc.pointio.correspondences import IMAGE_SIGMA
 from barpc.scene import IntArray, connected_labels
 
-SIGMA = 0.5  # standard deviation of each coordinate [px] where the file states none
 _STEPS = 16  # observations of a track are linked to so many after them: all of a usual track
 
 PairPoints = tuple[int, int, Array, Array]
@@ -41,7 +41,7 @@ class Links:
             for start, (_, _, first, _) in zip(starts, given, strict=False)
         ]
         joined = np.concatenate(ends) if given else np.zeros((0, 2), dtype=np.int64)
-        return Links(view.astype(np.int64), xy, np.full(len(xy), SIGMA), joined).merged()
+        return Links(view.astype(np.int64), xy, np.full(len(xy), IMAGE_SIGMA), joined).merged()
 
     @staticmethod
     def joined(parts: Sequence[Links]) -> Links:

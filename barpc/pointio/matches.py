@@ -18,10 +18,10 @@ from barpc.frozen import Arrays, load_npz
 from barpc.geodesy import Array
 from barpc.pointio.colmap import MAGIC as COLMAP
 from barpc.pointio.colmap import read_colmap
-from barpc.pointio.correspondences import require_columns
+from barpc.pointio.correspondences import IMAGE_SIGMA, require_columns
 from barpc.pointio.hloc import MAGIC as HDF5
 from barpc.pointio.hloc import read_hloc
-from barpc.pointio.links import SIGMA, Links
+from barpc.pointio.links import Links
 from barpc.pointio.names import ViewNames, cell, from_cell
 from barpc.pointio.pairfiles import (
     ENDINGS,
@@ -134,7 +134,7 @@ def _read_csv(path: Path, views: ViewNames) -> Links:
             try:
                 view = views.find(from_cell(line[image]))
                 col, row = (float(line[i]) for i in numbers[:2])
-                own = SIGMA if spread is None else float(line[spread])
+                own = IMAGE_SIGMA if spread is None else float(line[spread])
                 track = line[numbers[2]].strip()
             except (ValueError, IndexError) as error:
                 line_at = f"{path}: line {lines.line_num}"  # whatever it holds
@@ -153,7 +153,7 @@ def _table(path: Path, file: Arrays, views: ViewNames) -> Links:
         own = np.array([-1 if (i := views.find(str(name))) is None else i for name in file["names"]])
         index, point = (np.asarray(file[key], dtype=np.int64) for key in ("view", "track"))
         xy = np.asarray(file["xy"], dtype=np.float64)
-        spread = np.asarray(file.get("sigma", np.full(len(index), SIGMA)), dtype=np.float64)
+        spread = np.asarray(file.get("sigma", np.full(len(index), IMAGE_SIGMA)), dtype=np.float64)
         if {(*index.shape, 2), (*point.shape, 2), (*spread.shape, 2), xy.shape} != {(len(xy), 2)}:
             raise ValueError(f"shapes {index.shape}, {point.shape}, {xy.shape}, {spread.shape}")
         if len(index) and not 0 <= index.min() <= index.max() < len(own):

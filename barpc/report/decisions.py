@@ -16,10 +16,9 @@ from barpc.report.summary.known import GcpEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.whole import AskedEntry, SceneEntry
-from barpc.report.summary.words import known, listed, metres
+from barpc.report.summary.words import NAMED, known, listed, metres
 
 SHARED = 0.03  # px: what neighbours share and is less is not followed
-_NAMED = 5  # of many points
 _LEFT = 3  # places
 
 
@@ -224,7 +223,7 @@ def _control(gcps: Sequence[GcpEntry]) -> list[str]:
     if undecided:
         return [f"{words}: they fall into sets that contradict each other, and none outweighs the others."]
     by = "the images contradict" if len(rejected) == len(seen) else "the rest contradicts"
-    return [f"{words}; {by} {listed(rejected, _NAMED)}." if rejected else f"{words}."]
+    return [f"{words}; {by} {listed(rejected, NAMED)}." if rejected else f"{words}."]
 
 
 def _counts(words: Iterable[str | None], by: str = "") -> str:

@@ -9,11 +9,10 @@ from barpc.report.summary import LeftOutEntry, Summary
 from barpc.report.summary.causes import CAUSES
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import STATUS_WORDS, listed
+from barpc.report.summary.words import NAMED, STATUS_WORDS, listed
 
 SHOWN = 10  # rows of a table on the terminal, images and pairs alike
 ALONE = 3  # images of one cause that have a sentence each; more share one
-_NAMED = 5  # of these
 _ORDER = list(STATUS_WORDS)[::-1]
 _CAUSES = list(CAUSES)
 
@@ -72,7 +71,7 @@ def _of_views(views: Sequence[ViewEntry]) -> list[str]:
         if len(alike) <= ALONE or cause not in CAUSES:
             out += [view.reservation for view in alike]
             continue
-        names, words = listed([view.name for view in alike], _NAMED), CAUSES[cause]
+        names, words = listed([view.name for view in alike], NAMED), CAUSES[cause]
         start = f"{len(alike)} images are {STATUS_WORDS[status]}, {words.label}: {names}"
         remedy = words.remedy.format(image="IMAGE")
         out.append(". ".join(filter(None, (start, remedy[:1].upper() + remedy[1:]))) + ".")
@@ -89,6 +88,6 @@ def _of_files(files: Sequence[LeftOutEntry]) -> list[str]:
         if len(alike) <= ALONE:
             out += [one.reason_text for one in alike]
         else:
-            names = listed([one.path for one in alike], _NAMED)
+            names = listed([one.path for one in alike], NAMED)
             out.append(f"{len(alike)} files were left out, {names}: {reason}")
     return out

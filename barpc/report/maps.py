@@ -38,8 +38,7 @@ _AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
 _MOST = 60  # images on the page: those with the largest systematic part
 _VECTORS = 6000
 _PANEL = 180.0
-_MANY = 30  # stacks of images: of more there are fewer names, and thinner lines
-_NAMED = 30  # images that need a look: of more the worst have their names on the map
+_MANY = 30  # stacks of images, or those that need a look: of more there are fewer names, and thinner lines
 _LONGEST = 16  # characters of a name there
 _REACH = 12.0  # units of a long residual
 _DARKEST = 0.7  # opacity where all tie points move
@@ -119,7 +118,7 @@ def ground_map(files: RunFiles) -> str:
     parts += _pair_lines(stacks, files)
     marked, number = _marked(plane, files), files.number
     bad = [Stack([number[view.name]], middle, view.name, view.status) for view, middle in marked]
-    named = [*bad[:_NAMED], *(stacks if len(stacks) <= 100 else ())]
+    named = [*bad[:_MANY], *(stacks if len(stacks) <= 100 else ())]
     parts += _stack_names(named, len(stacks) > _MANY, taken)
     for kind, places in known.items():
         up = 1 if kind == "gcps" else -1

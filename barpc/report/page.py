@@ -40,7 +40,6 @@ _MOST_LINES = 200  # sentences of the verdict
 _SHOWN_LINES = 16  # of these, before the rest is unfolded
 _LENGTHS = "How many images see a tie point"
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
-_FEW_PANELS = 10  # residual maps of as many, before the rest is unfolded
 REPORT = "report"  # the stage that makes the page, which cannot tell how long it took
 
 
@@ -224,9 +223,9 @@ def _randomness(files: RunFiles) -> Section | None:
         " A cell is darker where its error is larger; thin lines are single residuals; a bold arrow is the mean of a"
         f" cell that is larger than chance allows. {key}"
     )
-    if len(panels) > _FEW_PANELS:
-        folds.append((f"{len(panels) - _FEW_PANELS} more images", panels[_FEW_PANELS:]))
-        panels = panels[:_FEW_PANELS]
+    if len(panels) > SHOWN:
+        folds.append((f"{len(panels) - SHOWN} more images", panels[SHOWN:]))
+        panels = panels[:SHOWN]
     if adjusted:
         before, _, key = residual_panels(views, files.observations, "before", first)
         folds.append((f"Before the adjustment. {key}", before))

@@ -20,12 +20,11 @@ from barpc.report.reservations import NOISE_LIMIT, anywhere, is_smooth, lost, st
 from barpc.report.summary import LeftOutEntry, Summary, measure_run
 from barpc.report.summary.findings import RIVALS, explanations, held_out_place, left_entries
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import counted, listed, median, metres
+from barpc.report.summary.words import NAMED, counted, listed, median, metres
 from barpc.scene import GroundPoints
 from barpc.tie.reference import PEAK
 
 PRIOR_WIDENED = 2.0  # Cameras that are farther off than stated by more than this factor need a look
-_MOST_NAMED = 5  # images in a sentence
 MOVED = 3.0  # A scene that moved by more than so many times what its cameras' accuracies let expect needs a look
 _SAY_REJECTED = (
     "contradicted",
@@ -221,7 +220,7 @@ def _wrong_heights(run: Run) -> list[str]:
         return []
     stated = run.adjustment.options.dem_sigma
     wrong = [view for view in run.reference.views if view.points and view.shows_heights(stated)]
-    named = listed([f"{metres(view.along)} in {view.name}" for view in wrong], _MOST_NAMED)
+    named = listed([f"{metres(view.along)} in {view.name}" for view in wrong], NAMED)
     words = (
         f"The heights of the DEM under the reference are not the terrain's: along the lines of sight its points lie "
         f"off each other by {named}, as heights wrong by {metres(max((v.heights for v in wrong), default=0.0))} would "
@@ -237,7 +236,7 @@ def _bends(run: Run) -> list[str]:
         return []
     step = run.reference.step
     wide = [view for view in run.reference.views if view.points and view.scatter > step]
-    named = listed([f"{view.name} ({metres(view.scatter)})" for view in wide], _MOST_NAMED)
+    named = listed([f"{view.name} ({metres(view.scatter)})" for view in wide], NAMED)
     words = (
         f"Points of the reference lie off each other, across the lines of sight, by more than the {metres(step)} of a "
         f"pixel that finding them may leave, in {named}: it bends, or the images do."
@@ -250,7 +249,7 @@ def _undecided(names: Sequence[str], tested: ControlTest) -> list[str]:
     if not tested.sets:
         return []
     both = (np.flatnonzero(points).tolist() for points in tested.sets)
-    one, other = (listed([names[g] for g in points], _MOST_NAMED) for points in both)
+    one, other = (listed([names[g] for g in points], NAMED) for points in both)
     middle = [tested.residual[points & np.isfinite(tested.w)] for points in tested.sets]
     apart = ""
     if all(len(residual) for residual in middle):
@@ -358,11 +357,11 @@ def _jitter_lines(views: Sequence[ViewEntry]) -> list[str]:
     lines = []
     found = [view.correction for view in views if view.correction is not None]
     if waving := [one for one in found if one.jitter_px is not None]:
-        sizes = ", ".join(f"{one.jitter_px:.2f}" for one in waving[:_MOST_NAMED])
+        sizes = ", ".join(f"{one.jitter_px:.2f}" for one in waving[:NAMED])
         rows = median([one.jitter_rows for one in waving])
         lines.append(
             f"Jitter along the rows is followed by splines, a knot every {rows:.0f} rows: {sizes} px RMS"
-            f"{', ...' if len(waving) > _MOST_NAMED else ''}. Tie points do not see what all images have in common "
+            f"{', ...' if len(waving) > NAMED else ''}. Tie points do not see what all images have in common "
             "along the epipolar lines: control points, a DEM or a reference do."
         )
     if stepping := [one for one in found if one.detectors]:
@@ -379,7 +378,7 @@ def _radar_lines(views: Sequence[ViewEntry]) -> list[str]:
         for view in views
         if (one := view.correction) is not None and (sigma := one.timing_sigma) is not None
     ]
-    return [f"Radar images are corrected by their clocks: {listed(found, _MOST_NAMED)}."] if found else []
+    return [f"Radar images are corrected by their clocks: {listed(found, NAMED)}."] if found else []
 
 
 def _altimetry_lines(adjustment: Adjustment) -> list[str]:
@@ -403,8 +402,8 @@ def _reference_lines(run: Run) -> list[str]:
     if not matched:
         return [f"The reference holds no point of {rest}."] if rest else []
     used, tried = sum(view.points for view in matched), sum(view.tried for view in matched)
-    off = ", ".join(f"{np.hypot(*view.offset):.1f} m ({view.name})" for view in matched[:_MOST_NAMED])
-    more = f" and {len(matched) - _MOST_NAMED} more" if len(matched) > _MOST_NAMED else ""
+    off = ", ".join(f"{np.hypot(*view.offset):.1f} m ({view.name})" for view in matched[:NAMED])
+    more = f" and {len(matched) - NAMED} more" if len(matched) > NAMED else ""
     text = (
         f"Reference: {used} of {counted(tried, 'point')} matched at {metres(found.step)} in "
         f"{counted(len(matched), 'image')}, peak {min(view.peak for view in matched):.1f} or more; as delivered they "

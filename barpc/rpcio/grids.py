@@ -19,7 +19,7 @@ from rasterio.errors import NotGeoreferencedWarning
 
 from barpc.atomic import replacing
 from barpc.errors import RpcError, RpcFormatError
-from barpc.geodesy import Array
+from barpc.geodesy import FAR, Array
 from barpc.raster import open_raster
 from barpc.remote import Place
 from barpc.rpcio.tiff import printable, put_tag, read_tag
@@ -33,7 +33,6 @@ GRID, CORRECTION = "_grid.tif", "_correction.tif"
 
 SIGN = "image point = that of the RPC in this file + (dcol, drow)"
 _TIFF: dict[str, Any] = {"driver": "GTiff", "COMPRESS": "DEFLATE", "PREDICTOR": 3}
-_FAR = 1e9  # px
 _EVEN = 1e-6  # of a step: how far nodes may be off
 _TABLE = Kind("a correction grid", 1 << 30, RpcFormatError)
 
@@ -74,7 +73,7 @@ def read_correction(path: Place) -> tuple[RPC, CorrectionGrid]:
     with np.errstate(all="ignore"):
         cols = c + a * (np.arange(shape[1]) + 0.5) - 0.5
         rows = f + e * (np.arange(shape[0]) + 0.5) - 0.5
-    if not all((np.abs(axis) <= _FAR).all() for axis in (cols, rows, shift)):
+    if not all((np.abs(axis) <= FAR).all() for axis in (cols, rows, shift)):
         raise RpcFormatError(f"{path}: a node of it is no image point, or has no displacement")
     try:
         return rpc, CorrectionGrid(cols, rows, shift)

@@ -20,7 +20,7 @@ from rasterio.windows import Window
 
 from barpc.errors import ImageError
 from barpc.geodesy import Array
-from barpc.raster import open_raster
+from barpc.raster import BLOCK, open_raster
 from barpc.rpcio.images import TIFF, copying, has_mask, unwritten
 from barpc.rpcio.tiff import printable, put_tag
 from barpc.scene import BoolArray
@@ -29,7 +29,6 @@ from barpc.sensor.rpc import RPC
 
 Pixels = npt.NDArray[Any]
 
-BLOCK = 512  # px, written at a time
 _MARGIN = 16  # px around a block: a spline has forgotten what is farther away to 1e-9
 _MOST = 4096  # px a side of what a block is made of
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from barpc.geodesy import Array, ground_from_ecef, up
+from barpc.geodesy import NEWTON_STEPS, Array, ground_from_ecef, up
 from barpc.sensor.curve import cross
 
-_STEPS = 12
 _SETTLED = 1e-9  # rad, about a millimetre: what is left after such a step is below rounding
 
 
@@ -55,7 +54,7 @@ def on_circle(
         away = span * (across * np.sin(angle) - above * np.cos(angle)) + forward
         return away, ground_from_ecef((position + distance * away).T)
 
-    for _ in range(_STEPS):
+    for _ in range(NEWTON_STEPS):
         _, ground = at(angle)
         turned = span * (across * np.cos(angle) + above * np.sin(angle))
         step = (alt - ground[:, 2]) / (distance * dot(up(ground), turned))

@@ -17,6 +17,8 @@ from scipy.spatial.transform import Rotation
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import (
+    NEWTON_STEPS,
+    SETTLED,
     Array,
     ecef_from_ground,
     ecef_from_ground_jacobian,
@@ -30,8 +32,6 @@ IntArray = npt.NDArray[np.int64]
 
 _ROW_STEPS = 60  # a drift of thousandths of a pixel a row gains three digits a step; wild ones need more
 _ROW_SETTLED = 1e-6  # px: what is left is a thousandth of it
-_STEPS = 12
-_SETTLED = 1e-4  # px: what is left after a step from there is below rounding
 _DIGITS = 1e-8  # of derivatives: the solver's steps ask for no more
 _TOLERANCE = 1e-7  # px: a localised point must project this near to where it was asked (plus rounding)
 
@@ -235,14 +235,14 @@ class Corrected:
         rounding = 8 * np.finfo(float).eps * np.abs(image).max(axis=-1)
         settled = False
         with np.errstate(all="ignore"):
-            for _ in range(_STEPS):
+            for _ in range(NEWTON_STEPS):
                 moved = ground_from_ecef(self.correction.apply(ecef_from_ground(ground), row))
                 value, jacobian = self.sensor.project_jacobian(moved)
                 residual = image - value
                 miss = np.abs(residual).max(axis=-1)
                 if settled:
                     break
-                settled = not (miss > _SETTLED).any()
+                settled = not (miss > SETTLED).any()
                 a, b, c, d = (jacobian[..., i, j] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
                 det = a * d - b * c
                 ground[..., 0] += (d * residual[..., 0] - b * residual[..., 1]) / det

@@ -9,7 +9,7 @@ import numpy as np
 
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
-from barpc.geodesy import Array
+from barpc.geodesy import NEWTON_STEPS, Array
 from barpc.sensor import SensorModel
 from barpc.sensor.direct_grid import LINEAR, linear_axes
 
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from scipy.interpolate import RegularGridInterpolator
 
 _LONGEST = 1024.0  # px, from node to node
-_STEPS = 12  # displacements change by thousandths of a pixel a pixel: each step gains two digits
 _SETTLED = 1e-9  # px
 
 
@@ -108,7 +107,7 @@ class GridCorrected:
         """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
         image = np.asarray(image, dtype=np.float64)
         of_rpc = image
-        for _ in range(_STEPS):
+        for _ in range(NEWTON_STEPS):
             before, of_rpc = of_rpc, image - self.correction.at(of_rpc)
             change = np.abs(of_rpc - before)
             if not (change.max(initial=0.0, where=np.isfinite(change)) > _SETTLED):

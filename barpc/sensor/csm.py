@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from barpc.errors import InputError, RpcFormatError
 from barpc.geodesy import WGS84_A, WGS84_B, Array
+from barpc.sensor.document import MOST_PIXELS, STRAIGHT
 from barpc.sensor.frame import Frame
 from barpc.sensor.linescan.samples import Detector, Samples, camera_of_samples, unit
 from barpc.sensor.pushbroom import Pushbroom
@@ -29,9 +30,7 @@ STATE_END = ".adjusted_state.json"
 """End of the name of a state, as ASP writes it."""
 LINESCAN, FRAME = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL", "USGS_ASTRO_FRAME_SENSOR_MODEL"
 
-_MOST = 1_000_000  # rows or columns
 _EARTH = 100.0  # m: by which the axes of an Earth's ellipsoid may differ from WGS84's
-_STRAIGHT = 0.01  # rows by which line times may leave a straight line
 _RADIAL = 0  # m_distortionType: 1 - k0 - k1 r^2 - k2 r^4 times the place
 FLIP = np.diag([1.0, -1.0, -1.0])
 
@@ -100,7 +99,7 @@ class _State:
     @property
     def size(self) -> tuple[int, int]:
         """Width and height [px]."""
-        return int(self.positive("m_nSamples", _MOST)), int(self.positive("m_nLines", _MOST))
+        return int(self.positive("m_nSamples", MOST_PIXELS)), int(self.positive("m_nLines", MOST_PIXELS))
 
     def plane(self, origin: tuple[float, float]) -> Array:
         """Return (2, 3): detector's sample and line of CSM's (sample, line, 1) to the place in the focal plane."""
@@ -158,7 +157,7 @@ def _lines(state: _State) -> tuple[float, float]:
     first = float(start[0] - period * rows[0])
     here = rows < state.size[1]
     bent = np.abs(start - first - period * rows)[here].max(initial=0.0)
-    if not (period and bent <= _STRAIGHT * abs(period) and (np.abs(step[here] / period - 1) < 1e-6).all()):
+    if not (period and bent <= STRAIGHT * abs(period) and (np.abs(step[here] / period - 1) < 1e-6).all()):
         raise RpcFormatError(f"{state.name}: the line rate changes, or is none, which is not read")
     return first, period
 

@@ -16,18 +16,15 @@ import numpy.typing as npt
 
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
-from barpc.geodesy import Array, pointwise, wrap_longitude
+from barpc.geodesy import FAR, NEWTON_STEPS, Array, pointwise, wrap_longitude
 from barpc.sensor import SensorModel
 from barpc.sensor.rational import DERIVATIVE, monomials
 
 if TYPE_CHECKING:
     from scipy.interpolate import NdBSpline
 
-CHUNK = 2048  # points worked on at a time: what belongs to them stays in cache
 LINEAR = 0.005  # px: what linear interpolation in a grid made here may miss by
 
-_FAR = 1e9  # px and m: beyond it no node lies
-_STEPS = 8
 _SETTLED = 1e-5  # px: what is left after a step of this size is below rounding
 _SHRINK = 1e-4  # of a step to the next: more asks for new derivatives
 
@@ -79,7 +76,7 @@ class DirectGrid(Frozen):
         shape = (*(len(np.atleast_1d(axis)) for axis in axes), 2)
         if self.lonlat.shape != shape or min(shape) < 2:
             raise RpcError(f"localisation grid: lon, lat {self.lonlat.shape} on {shape[:3]} nodes")
-        if not all((np.abs(axis) <= _FAR).all() and (np.diff(axis) > 0).all() for axis in axes):
+        if not all((np.abs(axis) <= FAR).all() and (np.diff(axis) > 0).all() for axis in axes):
             raise RpcError("localisation grid: columns, rows and altitudes must ascend")
         if not (np.abs(self.lonlat) <= (540.0, 90.0)).all():  # NaN neither
             raise RpcError("localisation grid: a node has no ground point")
@@ -146,16 +143,16 @@ class DirectGrid(Frozen):
 
     def project(self, ground: Array) -> Array:
         """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN off the grid."""
-        return pointwise(lambda part: [self._solve(part)], CHUNK, [(2,)], ground)[0]
+        return pointwise(lambda part: [self._solve(part)], [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground)
+        image, jacobian = pointwise(self._jacobian, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3); NaN off the grid."""
-        return pointwise(self._localize, CHUNK, [(3,)], image, alt)[0]
+        return pointwise(self._localize, [(3,)], image, alt)[0]
 
     def _localize(self, image: Array, alt: Array) -> list[Array]:
         return [np.column_stack([self._value(image, alt) + np.array([self._lon, 0.0]), alt])]
@@ -176,7 +173,7 @@ class DirectGrid(Frozen):
         with np.errstate(all="ignore"):
             image, by_lon, by_lat = self._guess(target, alt)
             before = np.full(len(target), np.inf)
-            for _ in range(_STEPS):
+            for _ in range(NEWTON_STEPS):
                 miss = target - self._value(image, alt)
                 step = by_lon * miss[:, :1] + by_lat * miss[:, 1:]
                 image = image + step

@@ -9,10 +9,16 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from barpc.errors import RpcFormatError
-from barpc.geodesy import Array
+from barpc.geodesy import FAR, Array
 
-LARGEST = 1e9
-"""No number of a document comes near."""
+RELIEF_AROUND = 1000.0
+"""Altitudes about that of a scene [m] that it is used for, where its document says nothing."""
+MOST_PIXELS = 1_000_000
+"""No image has more rows, or columns."""
+STRAIGHT = 0.01
+"""Rows by which line times may leave a straight line."""
+GRID_TOLERANCE = 5.0
+"""A grid that misses by more [px] does not belong to the orbit."""
 
 _TIME = re.compile(r"(UTC=)?(?P<time>20\d\d-\d\d-\d\d[T ]\d\d:\d\d:\d\d(\.\d{1,9})?)Z?")
 
@@ -69,7 +75,7 @@ class Fields:
             numbers = np.array(self.text(path).replace(between, " ").split(), dtype=np.float64)
         except ValueError as error:
             raise RpcFormatError(f"{self.name}: {path} is not a list of numbers ({error})") from error
-        if not (np.abs(numbers) <= LARGEST).all():
+        if not (np.abs(numbers) <= FAR).all():
             raise RpcFormatError(f"{self.name}: {path} holds a number that is not finite or absurdly large")
         if count not in (None, len(numbers)):
             raise RpcFormatError(f"{self.name}: {path} holds {len(numbers)} numbers, expected {count}")
@@ -79,7 +85,7 @@ class Fields:
         """Return the only number of a field."""
         return float(self.numbers(path, 1)[0])
 
-    def positive(self, path: str, most: float = LARGEST) -> float:
+    def positive(self, path: str, most: float = FAR) -> float:
         """Return the first number of a field; RpcFormatError where it is not above 0 and at most `most`."""
         value = float(self.numbers(path)[0])
         if not 0 < value <= most:

@@ -15,6 +15,7 @@ from numpy.polynomial.polynomial import polyder, polyval
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import (
+    NEWTON_STEPS,
     Array,
     ecef_from_ground,
     ecef_from_ground_jacobian,
@@ -24,8 +25,6 @@ from barpc.geodesy import (
     wrap_longitude,
 )
 
-_CHUNK = 4096  # points worked on at a time
-_STEPS = 12  # of Newton's method on the distance from the axis: four are enough
 _SETTLED = 1e-13  # focal lengths
 
 
@@ -66,11 +65,11 @@ class Frame(Frozen):
 
     def project(self, ground: Array) -> Array:
         """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN behind the camera."""
-        return pointwise(lambda part: [self._seen(ecef_from_ground(part).T)[0].T], _CHUNK, [(2,)], ground)[0]
+        return pointwise(lambda part: [self._seen(ecef_from_ground(part).T)[0].T], [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = pointwise(self._derivatives, _CHUNK, [(2,), (2, 3)], ground)
+        image, jacobian = pointwise(self._derivatives, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
@@ -79,7 +78,7 @@ class Frame(Frozen):
 
         Longitudes run on across the antimeridian.
         """
-        return pointwise(lambda *part: [self._meet(*part)], _CHUNK, [(3,)], image, alt)[0]
+        return pointwise(lambda *part: [self._meet(*part)], [(3,)], image, alt)[0]
 
     def _meet(self, image: Array, alt: Array) -> Array:
         at = self.plane @ np.vstack([image.T, np.ones(len(image))])
@@ -105,7 +104,7 @@ class Frame(Frozen):
         """
         slope, found = polyder(self.distortion), radius
         step = np.zeros_like(radius)
-        for _ in range(_STEPS):
+        for _ in range(NEWTON_STEPS):
             square = found**2
             left = found * (1.0 - polyval(square, self.distortion)) - radius
             rate = 1.0 - polyval(square, self.distortion) - 2.0 * square * polyval(square, slope)

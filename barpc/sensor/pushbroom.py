@@ -22,6 +22,8 @@ from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import (
     EARTH_RATE,
+    NEWTON_STEPS,
+    SETTLED,
     SPEED_OF_LIGHT,
     Array,
     ecef_from_ground,
@@ -34,14 +36,10 @@ from barpc.geodesy import (
 )
 from barpc.sensor.curve import EXTRAPOLATION, Curve, Turn, cross
 
-CHUNK = 4096  # points worked on at a time, so that what Newton's method needs stays in cache
-
 _AIR = 2.316  # m: of refraction at sea level, times tan z / cos^2 z of the zenith distance z (Noerdlinger 1999)
 _AIR_HEIGHT = 8000.0  # m: in which the air thins to 1/e
-_STEPS = 12
 _BENDS = 3  # light is bent by 3e-5: each step gains four digits
 _GRAZING = 0.1  # cosine of the zenith distance below which refraction is not this simple
-_SETTLED = 1e-4  # px: Newton is quadratic, what is left after a step of this size is below rounding
 
 
 @dataclass(frozen=True)
@@ -188,11 +186,11 @@ class Pushbroom(Frozen):
         """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN behind the camera,
         off the orbit.
         """
-        return pointwise(lambda part: [self._solve(ecef_from_ground(part).T).T], CHUNK, [(2,)], ground)[0]
+        return pointwise(lambda part: [self._solve(ecef_from_ground(part).T).T], [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground)
+        image, jacobian = pointwise(self._jacobian, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
@@ -202,7 +200,7 @@ class Pushbroom(Frozen):
         method on the distance brings it to the altitude itself. Longitudes run on across the antimeridian; NaN where
         the line of sight misses the Earth, or more than `curve.EXTRAPOLATION` beyond the orbit or attitude.
         """
-        return pointwise(lambda *part: [self._meet(*part)], CHUNK, [(3,)], image, alt)[0]
+        return pointwise(lambda *part: [self._meet(*part)], [(3,)], image, alt)[0]
 
     def line_of_sight(self, image: Array) -> tuple[Array, Array]:
         """Return the camera centres [m] and unit directions of sight, (..., 3) in ECEF, of image points (...,
@@ -262,7 +260,7 @@ class Pushbroom(Frozen):
         time = np.full(ecef.shape[1], (start + stop) / 2)
         col = np.full(ecef.shape[1], self.look_origin)
         settled = np.zeros(ecef.shape[1], dtype=bool)
-        for _ in range(_STEPS):
+        for _ in range(NEWTON_STEPS):
             tangents, rate, depth = self._seen(ecef, time)
             look, slope = self._look(col)
             miss = look - tangents
@@ -271,7 +269,7 @@ class Pushbroom(Frozen):
             d_col = (rate[0] * miss[1] - rate[1] * miss[0]) / det
             time = np.clip(time + d_time, start, stop)
             col = col + d_col
-            settled = (np.abs(d_time) < _SETTLED * abs(self.line_period)) & (np.abs(d_col) < _SETTLED) & (depth > 0)
+            settled = (np.abs(d_time) < SETTLED * abs(self.line_period)) & (np.abs(d_col) < SETTLED) & (depth > 0)
             if not (~settled & np.isfinite(col) & np.isfinite(time)).any():
                 break
         out = np.stack([col, (time - self.first_line) / self.line_period])

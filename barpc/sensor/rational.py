@@ -17,7 +17,6 @@ from barpc.geodesy import Array
 
 BoolArray = npt.NDArray[np.bool_]
 
-CHUNK = 8192  # points worked on at a time
 
 MONOMIALS = (
     "1", "L", "P", "H", "LP", "LH", "PH", "LL", "PP", "HH",

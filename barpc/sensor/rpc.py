@@ -13,7 +13,7 @@ import numpy as np
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import Array, pointwise, wrap_longitude
-from barpc.sensor.rational import CHUNK, REACH, BoolArray, Rational, monomials
+from barpc.sensor.rational import REACH, BoolArray, Rational, monomials
 
 _ACCURACY = 1e-9  # px: a localised point must project this near to where it was asked (plus rounding)
 
@@ -91,11 +91,11 @@ class RPC(Frozen):
         """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN where a denominator
         vanishes.
         """
-        return pointwise(self._project, CHUNK, [(2,)], ground, rows=27)[0]
+        return pointwise(self._project, [(2,)], ground, rows=27)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground, rows=20)
+        image, jacobian = pointwise(self._jacobian, [(2,), (2, 3)], ground, rows=20)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
@@ -105,7 +105,7 @@ class RPC(Frozen):
         proven to be enough. Longitudes lie within 180 degrees of the RPC's offset; NaN where no point was found
         that projects to `image`.
         """
-        return pointwise(self._localize, CHUNK, [(3,)], image, alt, rows=20)[0]
+        return pointwise(self._localize, [(3,)], image, alt, rows=20)[0]
 
     def off(self, other: RPC) -> Array:
         """Return the differences (729, 2) [px] of another RPC's image points over the box; 0 where neither has any."""
@@ -115,7 +115,7 @@ class RPC(Frozen):
 
     def localize_direct(self, image: Array, alt: Array) -> Array:
         """Localise image points by the localisation RPC: without iteration, as exact as that was fitted."""
-        return pointwise(self._localize_direct, CHUNK, [(3,)], image, alt, rows=20)[0]
+        return pointwise(self._localize_direct, [(3,)], image, alt, rows=20)[0]
 
     def _localize_direct(self, image: Array, alt: Array, work: Array) -> list[Array]:
         if self.direct is None:

@@ -14,12 +14,11 @@ import numpy.typing as npt
 
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
-from barpc.geodesy import Array
+from barpc.geodesy import NEWTON_STEPS, Array
 from barpc.sensor import SensorModel
 
 IntArray = npt.NDArray[np.int64]
 
-_STEPS = 8  # a spline changes by thousandths of a pixel a row: each step gains three digits
 _SETTLED = 1e-7  # px
 
 
@@ -177,7 +176,7 @@ class Splined:
     def _displaced(self, projected: Array) -> Array:
         """Return the displaced image points of points projected to (..., 2) [px]."""
         image = projected
-        for _ in range(_STEPS):
+        for _ in range(NEWTON_STEPS):
             before, image = image, projected + self.correction.at(image)
             change = np.abs(image - before)
             if not (change.max(initial=0.0, where=np.isfinite(change)) > _SETTLED):

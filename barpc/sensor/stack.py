@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from barpc.geodesy import Array, wrap_longitude
+from barpc.geodesy import CHUNK, Array, wrap_longitude
 from barpc.sensor import SensorModel
-from barpc.sensor.rational import CHUNK, DERIVATIVE, REACH, BoolArray, monomials
+from barpc.sensor.rational import DERIVATIVE, REACH, BoolArray, monomials
 from barpc.sensor.rpc import RPC
 
 IntArray = npt.NDArray[np.int64]

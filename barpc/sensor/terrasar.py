@@ -18,7 +18,7 @@ from numpy.polynomial.polynomial import polyval
 
 from barpc.errors import BarpcWarning, InputError, RpcError, RpcFormatError
 from barpc.sensor.curve import fit_orbit
-from barpc.sensor.document import Fields, seconds
+from barpc.sensor.document import GRID_TOLERANCE, MOST_PIXELS, RELIEF_AROUND, Fields, seconds
 from barpc.sensor.sentinel1.frames import SlantFrame
 from barpc.sensor.sentinel1.range_doppler import RELIEF, RangeDoppler
 from barpc.sidefile import parse_xml
@@ -27,13 +27,10 @@ ROOT = "level1Product"
 
 _NAME = "*1_SAR__*.xml"  # TSX1, TDX1, PAZ1
 _MODES = ("SM", "SL", "HS", "HS300", "ST")  # ScanSAR stores its bursts apart
-_HEIGHTS = 1000.0  # m about the scene's average height, where no grid says which it is used for
 _FRAME = re.compile(r"(WGS-?84|ITRF|IG[Sb])[-_ ()G\d]*")  # of any year: they agree to centimetres
-_MOST = 1_000_000  # rows or columns
 _AGREE = 2.0  # rows or columns that first and last may be off their number times their interval
 _LATEST = 1e-3  # s: no stated delay is longer
 _TRIED = 400  # points of the grid, about, that the model is compared with
-_GRID_TOLERANCE = 5.0  # px: a grid farther off does not belong to the orbit
 
 
 def find_annotation(folder: Path) -> Path | None:
@@ -96,7 +93,7 @@ def _refuse(root: Fields) -> None:
 def _model(root: Fields, late: tuple[float, float]) -> RangeDoppler:
     """Return the model whose times of range and azimuth are later [s] than geometry has them."""
     scene, raster = root.one("productInfo/sceneInfo"), root.one("productInfo/imageDataInfo/imageRaster")
-    size = (int(raster.positive("numberOfColumns", _MOST)), int(raster.positive("numberOfRows", _MOST)))
+    size = (int(raster.positive("numberOfColumns", MOST_PIXELS)), int(raster.positive("numberOfRows", MOST_PIXELS)))
     start, near = scene.time("start/timeUTC"), scene.positive("rangeTime/firstPixel", 1.0)
     spans = (scene.positive("rangeTime/lastPixel", 1.0) - near, seconds(scene.time("stop/timeUTC"), start))
     steps = [raster.positive(f"{along}Spacing", 1.0) for along in ("row", "column")]  # from column to column
@@ -124,7 +121,7 @@ def _model(root: Fields, late: tuple[float, float]) -> RangeDoppler:
         epoch=epoch,
         frame=SlantFrame(near - late[0], 1.0 / steps[0], steps[1]),
         size=size,
-        alt_range=(height - _HEIGHTS, height + _HEIGHTS),
+        alt_range=(height - RELIEF_AROUND, height + RELIEF_AROUND),
         look=_look(root),
     )
 
@@ -160,7 +157,7 @@ def _held(model: RangeDoppler, georef: Fields, late: tuple[float, float]) -> Ran
     table = np.array([[point.number(tag) for tag in tags] for point in points]).T
     image, _ = model.frame.image(np.stack([table[1] + since, table[0] + near]))
     worst = np.abs(model.project(table[2:].T) - image.T).max(axis=0)
-    if not (worst <= _GRID_TOLERANCE).all():
+    if not (worst <= GRID_TOLERANCE).all():
         warnings.warn(
             f"{georef.name}: the geolocation grid does not belong to the orbit (off by {worst[0]:.1f} columns, "
             f"{worst[1]:.1f} rows); the model follows the orbit",

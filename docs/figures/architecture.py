@@ -40,7 +40,7 @@ JOURNEYS = {
         ("fit/refit.py", "fit_rpc", "any sensor model"),
         ("fit/points.py", "control_points", "-> a grid of ground and image points"),
         ("fit/methods.py", "solve", "-> coefficients, ridge first"),
-        ("fit/system.py", "Problem", "-> the linearised system, its triangle"),
+        ("fit/system.py", "FitProblem", "-> the linearised system, its triangle"),
         ("fit/methods.py", "region_of", "-> where no pole may be"),
         ("fit/certificate.py", "roundtrip", "-> the certificate, on points that the fit has not seen"),
     ),

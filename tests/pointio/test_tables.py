@@ -19,7 +19,7 @@ from barpc.pointio.correspondences import (
     read_gcps,
     read_grid,
 )
-from barpc.pointio.links import SIGMA, Links, index_pairs
+from barpc.pointio.links import Links, index_pairs
 from barpc.pointio.matches import asp_text, read_links, read_matches, tracks_of
 from barpc.pointio.names import (
     MAX_NAME,
@@ -421,7 +421,7 @@ def test_a_table_of_matches_may_state_a_sigma_and_name_others(tmp_path) -> None:
         path.write_text(text)
         with pytest.raises(InputError, match=words):
             read_matches(path, ["a", "b"])
-    assert SIGMA == 0.5
+    assert IMAGE_SIGMA == 0.5
 
 
 def test_an_npz_of_matches_has_arrays_of_one_length_and_views_with_names(tmp_path) -> None:
@@ -434,7 +434,7 @@ def test_an_npz_of_matches_has_arrays_of_one_length_and_views_with_names(tmp_pat
     }
     np.savez(path, **good)
     assert read_matches(path, ["a", "b"]).xy.tolist() == [[0, 1], [2, 3]]
-    assert (read_links(path, ["a", "b"]).sigma == SIGMA).all()
+    assert (read_links(path, ["a", "b"]).sigma == IMAGE_SIGMA).all()
     np.savez(path, **good, sigma=[1.0, 2.0, 3.0])
     assert read_links(path, ["a", "b"]).sigma.tolist() == [1.0, 2.0, 3.0]
     assert read_links(path, ["b", "a"]).view.tolist() == [1, 0, 0]

@@ -32,6 +32,10 @@ def largest(values: Sequence[float | None] | None) -> float | None:
     return None if not values or None in values else max(value for value in values if value is not None)
 
 
+NAMED = 5
+"""Images, points or reasons that one sentence names."""
+
+
 def listed(names: Sequence[str], most: int = 10) -> str:
     """Return the names in a sentence."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

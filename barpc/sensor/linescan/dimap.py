@@ -17,13 +17,12 @@ from numpy.polynomial.polynomial import polyval
 from barpc.errors import InputError, RpcFormatError
 from barpc.geodesy import Array
 from barpc.sensor.curve import EXTRAPOLATION
-from barpc.sensor.document import Fields, seconds
+from barpc.sensor.document import MOST_PIXELS, Fields, seconds
 from barpc.sensor.linescan.samples import Detector, Linescan, Samples, camera_of_samples
 from barpc.sensor.pushbroom import Light
 
 ROOT, KIND = "Dimap_Document", "dimap physical model"
 
-_MOST = 1_000_000  # rows or columns
 _UNITS = (1.0, 1e-3, 1e-6)  # s: that LINE_PERIOD may be in
 _AGREE = 0.01  # relative: by how much LINE_PERIOD may miss what START and END say
 _DAY = 86400.0  # s: OFFSET counts from midnight
@@ -44,7 +43,7 @@ def camera_of_dimap(root: Fields, band: str | None = None) -> tuple[Linescan, Li
     if root.element.find("Geometric_Data/Refined_Model") is None:
         raise RpcFormatError(f"{root.name}: no Geometric_Data/Refined_Model: it holds no physical camera model")
     model, raster = root.one("Geometric_Data/Refined_Model"), root.one("Raster_Data/Raster_Dimensions")
-    size = (int(raster.positive("NCOLS", _MOST)), int(raster.positive("NROWS", _MOST)))
+    size = (int(raster.positive("NCOLS", MOST_PIXELS)), int(raster.positive("NROWS", MOST_PIXELS)))
     first, period = _lines(model, size[1])
     points = model.all("Ephemeris/Point_List/Point")
     times = _times(points, first)

@@ -17,14 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from barpc.errors import InputError, RpcFormatError
 from barpc.geodesy import Array
-from barpc.sensor.document import Fields, seconds
+from barpc.sensor.document import MOST_PIXELS, STRAIGHT, Fields, seconds
 from barpc.sensor.linescan.samples import Detector, Linescan, Samples, camera_of_samples, unit
 from barpc.sensor.pushbroom import Light
 
 ROOT, KIND = "isd", "maxar physical model"
 
-_MOST = 1_000_000  # rows or columns
-_STRAIGHT = 0.01  # rows by which line times may leave a straight line
 _TABLES = {"EPH": (13, 7), "ATT": (15, 5)}  # numbers of a row: with covariances, without
 _LIGHT = Light(aberration=True, refraction=True)  # star trackers tell where the body points
 
@@ -36,7 +34,7 @@ def camera_of_isd(root: Fields, band: str | None = None) -> tuple[Linescan, Ligh
     level = root.text("IMD/PRODUCTLEVEL")
     if "1B" not in level.upper():
         raise RpcFormatError(f"{root.name}: a product of level {level}, resampled: only 1B has a physical model")
-    size = (int(root.positive("IMD/NUMCOLUMNS", _MOST)), int(root.positive("IMD/NUMROWS", _MOST)))
+    size = (int(root.positive("IMD/NUMCOLUMNS", MOST_PIXELS)), int(root.positive("IMD/NUMROWS", MOST_PIXELS)))
     period, first = _lines(root, size[1])
     (times, orbit), (ticks, attitude) = (_table(root, part, first) for part in _TABLES)
     body = Rotation.from_quat(unit(attitude[:, 1:5], root.name))
@@ -70,7 +68,7 @@ def _lines(root: Fields, rows: int) -> tuple[float, np.datetime64]:
     if not 0 < abs(period) < 1:
         raise RpcFormatError(f"{root.name}: TLCLIST gives {period:g} s a row")
     bent = np.abs(start + period * (table[:, 0] - line) - table[:, 1]).max() / abs(period)
-    if not bent <= _STRAIGHT:
+    if not bent <= STRAIGHT:
         raise RpcFormatError(f"{root.name}: the line rate changes ({bent:.3g} rows in TLCLIST), which is not read")
     begins = start - period * line
     first = image.time("TLCTIME") + np.timedelta64(round(begins * 1e9), "ns")

@@ -15,12 +15,11 @@ import numpy as np
 
 from barpc.errors import InputError
 from barpc.frozen import Frozen
-from barpc.geodesy import SPEED_OF_LIGHT, Array, enu_basis, up
+from barpc.geodesy import NEWTON_STEPS, SPEED_OF_LIGHT, Array, enu_basis, up
 from barpc.sensor.document import seconds
 from barpc.sensor.sentinel1.annotation import Annotation
 from barpc.sensor.timing import Timing
 
-_INVERSION_STEPS = 8
 Bistatic = Literal["annotated", "full"]  # which bistatic correction; see `bistatic_constant`
 _RAD = np.pi / 180.0
 _SPREAD = 1e-5  # s: what lines and azimuth times of a grid may scatter
@@ -77,7 +76,7 @@ class GroundFrame(Frozen):
         """Return the times (2, N) [s] of image points (2, N) [px]: Newton on the polynomial."""
         time, target = image[1] * self.interval, image[0] * self.spacing
         slant = self.origin.mean() + target * self.slope
-        for _ in range(_INVERSION_STEPS):
+        for _ in range(NEWTON_STEPS):
             ground, by_slant, _ = self._ground_range(time, slant)
             step = (target - ground) / by_slant
             slant = slant + step

@@ -18,6 +18,7 @@ import numpy as np
 from barpc.errors import BarpcWarning, InputError, RpcError, RpcFormatError
 from barpc.frozen import Frozen
 from barpc.geodesy import (
+    NEWTON_STEPS,
     SPEED_OF_LIGHT,
     Array,
     ecef_from_ground,
@@ -27,7 +28,7 @@ from barpc.geodesy import (
 )
 from barpc.sensor.circle import aside, dot, on_circle
 from barpc.sensor.curve import Curve, Orbit, fit_orbit
-from barpc.sensor.document import seconds
+from barpc.sensor.document import GRID_TOLERANCE, seconds
 from barpc.sensor.sentinel1.annotation import (
     Annotation,
     StateVectors,
@@ -45,7 +46,6 @@ from barpc.sensor.sentinel1.frames import (
 )
 from barpc.sensor.timing import Timing
 
-CHUNK = 8192  # points worked on at a time
 RELIEF = (200.0, 500.0)
 """How far the terrain may lie below the lowest and above the highest point of the geolocation grid [m]."""
 NO_DELAYS = Delays()  # pure geometry
@@ -59,8 +59,6 @@ NOT_CORRECTED = (3.5, 4.0)
 CORRECTED = (0.5, 0.5)
 """What is left of both [m]: ionosphere and water vapour; the Doppler rate at another height than was assumed."""
 
-_GRID_TOLERANCE = 5.0  # px and lines: a grid farther off does not belong to the orbit
-_STEPS = 12  # at most; three are enough near the image
 _SLACK = 10.0  # s: how far beyond the orbit the search for zero Doppler may wander
 _SETTLED = 1e-5  # s: quadratic convergence leaves less than 1e-12 s after a step so small
 
@@ -166,7 +164,7 @@ class RangeDoppler(Frozen):
         """Return image points and derivatives as `barpc.sensor.timing.Clocked` asks; the coordinate is the
         row of pure geometry.
         """
-        image, by_ground, by_timing, row = pointwise(self._derivatives, CHUNK, [(2,), (2, 3), (2, 2), ()], ground)
+        image, by_ground, by_timing, row = pointwise(self._derivatives, [(2,), (2, 3), (2, 2), ()], ground)
         return image, by_ground, by_timing, row
 
     def azimuth_range(self, ground: Array) -> tuple[Array, Array]:
@@ -176,7 +174,7 @@ class RangeDoppler(Frozen):
         Pure geometry, without `delays`; NaN off the orbit's time span or on the other side.
         """
         azimuth_time, range_time = pointwise(
-            lambda part: self._geometry(ecef_from_ground(part)).times, CHUNK, [(), ()], ground
+            lambda part: self._geometry(ecef_from_ground(part)).times, [(), ()], ground
         )
         return azimuth_time, range_time
 
@@ -184,15 +182,15 @@ class RangeDoppler(Frozen):
         """Return the vectors (..., 3) [m], ECEF, from ground points (..., 3) to the satellite; NaN where
         `azimuth_range` is.
         """
-        return pointwise(self._to_radar, CHUNK, [(3,)], ground)[0]
+        return pointwise(self._to_radar, [(3,)], ground)[0]
 
     def project(self, ground: Array) -> Array:
         """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN where `azimuth_range` is."""
-        return pointwise(self._project, CHUNK, [(2,)], ground)[0]
+        return pointwise(self._project, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = pointwise(lambda part: self._derivatives(part)[:2], CHUNK, [(2,), (2, 3)], ground)
+        image, jacobian = pointwise(lambda part: self._derivatives(part)[:2], [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
@@ -201,7 +199,7 @@ class RangeDoppler(Frozen):
         On the circle of zero Doppler and given slant range, Newton on the look angle until the point has the altitude.
         Longitudes run on across the antimeridian; NaN off the orbit's time span or where the range does not reach.
         """
-        ground = pointwise(lambda part, alt: [self._localize(part.T, alt)], CHUNK, [(3,)], image, alt)[0]
+        ground = pointwise(lambda part, alt: [self._localize(part.T, alt)], [(3,)], image, alt)[0]
         with np.errstate(all="ignore"):
             ground[..., 0] = wrap_longitude(ground[..., 0], self._middle)
         return ground
@@ -216,7 +214,7 @@ class RangeDoppler(Frozen):
         point = ecef.T
         low, high = self.orbit.span
         time = np.where(np.isfinite(point[0]), (low + high) / 2, np.nan)
-        for _ in range(_STEPS):
+        for _ in range(NEWTON_STEPS):
             position, velocity, acceleration = self.orbit.states(time)
             sight = position - point
             rate = -dot(acceleration, sight) - dot(velocity, velocity)
@@ -336,7 +334,7 @@ def swaths_model(
     )
     for annotation in swaths:
         worst = np.abs(grid_residuals(annotation, model)).max(axis=0)
-        if not (worst <= _GRID_TOLERANCE).all():
+        if not (worst <= GRID_TOLERANCE).all():
             warnings.warn(
                 f"{annotation.name}: the geolocation grid does not belong to the orbit (off by {worst[0]:.1f} "
                 f"samples, {worst[1]:.1f} lines); the model follows the orbit, the grid is not used",

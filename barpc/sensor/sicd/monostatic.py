@@ -11,6 +11,8 @@ import numpy as np
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import (
+    NEWTON_STEPS,
+    SETTLED,
     Array,
     ecef_from_ground,
     ecef_from_ground_jacobian,
@@ -22,9 +24,6 @@ from barpc.sensor.curve import Curve
 from barpc.sensor.sicd.formation import Aperture, Formation
 from barpc.sensor.timing import Timing
 
-CHUNK = 4096  # points worked on at a time
-_STEPS = 12  # at most; four are enough
-_SETTLED = 1e-4  # m: what is left after a step so small is below rounding
 _STEP = 1.0  # m: central differences over so much are exact to 1e-9
 _BEYOND = 1.0  # sides of the image around it that its polynomials are believed for
 
@@ -72,11 +71,11 @@ class Monostatic(Frozen):
         """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN far off, or on the
         other side.
         """
-        return pointwise(lambda part: [self._image(self._solve(ecef_from_ground(part).T)[0])], CHUNK, [(2,)], ground)[0]
+        return pointwise(lambda part: [self._image(self._solve(ecef_from_ground(part).T)[0])], [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = pointwise(lambda part: self._derivatives(part)[:2], CHUNK, [(2,), (2, 3)], ground)
+        image, jacobian = pointwise(lambda part: self._derivatives(part)[:2], [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
@@ -84,7 +83,7 @@ class Monostatic(Frozen):
 
         Longitudes run on across the antimeridian; NaN far off the image or where the range does not reach.
         """
-        ground = pointwise(self._localize, CHUNK, [(3,)], image, alt)[0]
+        ground = pointwise(self._localize, [(3,)], image, alt)[0]
         with np.errstate(all="ignore"):
             ground[..., 0] = wrap_longitude(ground[..., 0], self._middle)
         return ground
@@ -93,7 +92,7 @@ class Monostatic(Frozen):
         """Return the vectors (..., 3) [m], ECEF, from ground points (..., 3) to the antenna that sees them;
         NaN as `project`.
         """
-        return pointwise(lambda part: [self._to_radar(part)], CHUNK, [(3,)], ground)[0]
+        return pointwise(lambda part: [self._to_radar(part)], [(3,)], ground)[0]
 
     @property
     def speed(self) -> float:
@@ -109,7 +108,7 @@ class Monostatic(Frozen):
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
         """Return image points and derivatives as `barpc.sensor.timing.Clocked` asks; the coordinate is the column."""
-        image, by_ground, by_timing, col = pointwise(self._derivatives, CHUNK, [(2,), (2, 3), (2, 2), ()], ground)
+        image, by_ground, by_timing, col = pointwise(self._derivatives, [(2,), (2, 3), (2, 2), ()], ground)
         return image, by_ground, by_timing, col
 
     @cached_property
@@ -165,16 +164,16 @@ class Monostatic(Frozen):
         """
         low, high = self._bounds
         plane = np.where(np.isfinite(point[:2]), 0.0, np.nan)
-        for _ in range(_STEPS):
+        for _ in range(NEWTON_STEPS):
             slope = self._by_plane(plane, point)
             moved = np.clip(plane - _solve(slope, self._miss(plane, point)[0]), low, high)
             step, plane = np.abs(moved - plane).max(axis=0), moved
-            if not (step.max(initial=0.0, where=np.isfinite(step)) > _SETTLED):
+            if not (step.max(initial=0.0, where=np.isfinite(step)) > SETTLED):
                 break
         _, seen, sight, _ = self._miss(plane, point)
         side = dot(aside(seen.position, seen.velocity, self.look == "right"), sight)
         inside = ((plane > low) & (plane < high)).all(axis=0)
-        plane[:, ~(inside & (side < 0) & (step <= _SETTLED))] = np.nan
+        plane[:, ~(inside & (side < 0) & (step <= SETTLED))] = np.nan
         return plane, slope
 
     def _to_radar(self, ground: Array) -> Array:
