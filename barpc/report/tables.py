@@ -295,7 +295,7 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
 
 def run_key(summary: Summary) -> str:
     """Return what a run is known by, a hash of its results: what was made of other results is not shown beside them."""
-    results = [(one.file, one.sha256) for one in summary.outputs]
+    results = [(one.file, one.sha256) for one in summary.outputs or ()]
     return hashlib.sha256(repr(results).encode()).hexdigest()
 
 
