@@ -36,7 +36,7 @@ def replacing(
     room : Path, optional, where the temporary folder is made, on the same disk; None: beside `path`
     """
     path = Path(path)
-    _refuse_existing(path, overwrite)
+    refuse_existing(path, overwrite)
     durable = durable and f"/{STATE}/{PARTIAL}/" not in path.as_posix()
     place = (room or path.parent) / f"{_MARK}{uuid.uuid4().hex[:12]}"
     partial = place / path.name
@@ -46,7 +46,7 @@ def replacing(
         yield partial
         if durable:
             _sync(partial)
-        _refuse_existing(path, overwrite)  # it may have come while the block was at work
+        refuse_existing(path, overwrite)  # it may have come while the block was at work
         partial.replace(path)
         if durable:
             _sync(path.parent)
@@ -58,7 +58,8 @@ def replacing(
         shutil.rmtree(place, ignore_errors=True)
 
 
-def _refuse_existing(path: Path, overwrite: bool) -> None:
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Raise an OutputError where a file would be replaced that may not be."""
     if not overwrite and os.path.lexists(path):
         raise OutputError(f"{path}: exists already; choose another name or allow overwriting")
 

@@ -174,6 +174,8 @@ class Workspace:
             raise OutputError(f"{self.folder}: cannot be written ({error.strerror or error})") from error
         shutil.rmtree(self.partial, ignore_errors=True)  # of a run that was killed
         self._earlier = _read_own(self.folder)  # again: another run may have ended in between
+        # what is added to a finished run, or fails to be, leaves it finished: nothing else may replace its files
+        self._finished = adds and _read_state(self.folder).get("status") == "done"
         try:
             self._save_state("running")
         except BaseException:  # a full disk
@@ -330,7 +332,8 @@ class Workspace:
         """
         earlier = {} if status == "done" and not self._adds else self._earlier
         outputs = dict(sorted((earlier | self.outputs).items()))
-        state = {"barpc": __version__, "status": status, "stages": self.stages, "outputs": outputs}
+        told = "done" if self._finished else status
+        state = {"barpc": __version__, "status": told, "stages": self.stages, "outputs": outputs}
         with replacing(self.folder / STATE / STATE_FILE, overwrite=True, room=self.partial) as partial:
             partial.write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
         if status != "failed":

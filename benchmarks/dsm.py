@@ -27,11 +27,17 @@ from pathlib import Path
 import numpy as np
 import rasterio
 from rasterio.warp import Resampling, reproject
+from rasterio.windows import Window
 
 from barpc.dsm import NoSurfaceError, make_dsm
+from barpc.dsm.cells import Tile, _gathered
 from barpc.export.shots import read_scene
 from barpc.options import DsmOptions
+from tests.scenes import ImageOptions, Scene
+from tests.scenes.files import image_file
 
+LOOKED_AT = 40
+"""Tiles of a rendered surface that are compared with the ground, at most."""
 KINDS: dict[str, dict[str, object]] = {
     "usual": {},
     "flat": {"relief": 12.0, "buildings": 2.0, "seed": 3},
@@ -76,16 +82,47 @@ def measure(source: str | list[str], alt: tuple[float, float] | None, other: Pat
     return found | {"peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
 
 
-def rendered(side: int, kind: str = "usual") -> dict[str, object]:
-    """A pair of rendered images of a kind with exact cameras, against the ground that they show."""
-    from tests.dsm.conftest import Rendered
-    from tests.scenes import ImageOptions, Scene
+def written(scene: Scene, index: int, path: Path) -> np.ndarray:
+    """Render a view into a file, part by part; the altitudes that it shows, on the disk, too."""
+    size, rpc = scene.options.size, scene.shots[index].exact_rpc
+    shown = np.lib.format.open_memmap(path.with_suffix(".npy"), "w+", np.float32, size[::-1])
+    with image_file(path, size, rpc) as file:
+        for top, part in scene.strips(index):
+            file.write(part.numbers, 1, window=Window(0, top, *part.numbers.shape[::-1]))
+            shown[top : top + len(part.altitude)] = part.altitude
+    return shown
 
+
+class Ground:
+    """A pair of rendered images of a kind with exact cameras, in a folder, and the ground that they show."""
+
+    def __init__(self, side: int, kind: str, folder: Path) -> None:
+        scene = Scene(ImageOptions(views=2, size=(side, side), **KINDS[kind]))
+        self.shots, self.paths = scene.shots, [str(folder / f"{shot.name}.tif") for shot in scene.shots]
+        self.shown = [written(scene, i, Path(path)) for i, path in enumerate(self.paths)]
+        edges = [(np.nanmin(part), np.nanmax(part)) for one in self.shown for part in np.array_split(one, 8)]
+        self.alt = float(np.min(edges)) - 10.0, float(np.max(edges)) + 10.0
+
+    def truth(self, tile: Tile) -> np.ndarray:
+        """Median altitude of what the images show in each cell; through the exact pushbroom cameras."""
+        corners = np.vstack([np.column_stack([tile.nodes(), np.full(25, alt)]) for alt in self.alt])
+        ground = []
+        for shot, shown in zip(self.shots, self.shown, strict=True):
+            at = shot.exact.project(corners)
+            low, high = (np.clip(edge, 0, len(shown)).astype(int) for edge in (at.min(axis=0), at.max(axis=0) + 2))
+            part = np.array(shown[low[1] : high[1], low[0] : high[0]])
+            row, col = np.nonzero(np.isfinite(part))
+            place = np.column_stack([col, row]) + low.astype(np.float64)
+            ground.append(shot.exact.localize(place, part[row, col].astype(np.float64)))
+        every = np.concatenate(ground)
+        return _gathered(tile, every, np.ones(len(every)))[0]
+
+
+def rendered(side: int, kind: str = "usual") -> dict[str, object]:
+    """The surface of a pair of rendered images against the ground that they show, in up to `LOOKED_AT` tiles of it."""
     with tempfile.TemporaryDirectory() as folder:
-        made = Rendered(Scene(ImageOptions(views=2, size=(side, side), **KINDS[kind])), Path(folder)).write()
-        shown = [picture.altitude for picture in made.pictures]
-        alt = min(map(np.nanmin, shown)) - 10.0, max(map(np.nanmax, shown)) + 10.0
-        out, call = Path(folder) / "dsm.tif", json.dumps([made.paths, [float(one) for one in alt]])
+        made = Ground(side, kind, Path(folder))
+        out, call = Path(folder) / "dsm.tif", json.dumps([made.paths, made.alt])
         code = (
             "import json,sys,time; from barpc.dsm import make_dsm; from barpc.options import DsmOptions\n"
             "paths, alt = json.loads(sys.argv[1]); start = time.process_time()\n"
@@ -95,17 +132,19 @@ def rendered(side: int, kind: str = "usual") -> dict[str, object]:
         done = subprocess.run([sys.executable, "-c", code, call, str(out)], capture_output=True, text=True, check=True)
         cpu, peak = map(float, done.stdout.split())  # (what getrusage says is the parent's, where that was larger)
         with rasterio.open(out) as file:
-            height, sigma = file.read(1), file.read(4)
-        error = height - made.truth(out)
-        known = np.isfinite(error)
-        within = float(np.mean(np.abs(error[known]) < sigma[known]))
-        return {
-            "cells": int(known.sum()),
-            "nmad": nmad(error),
-            "within": within,
-            "cpu": cpu,
-            "peak": peak / 1024,
-        }
+            windows = [window for _, window in file.block_windows(1)]
+            known, errors, sigmas = int(np.isfinite(file.read(1)).sum()), [], []
+            for window in windows[:: -(-len(windows) // LOOKED_AT)]:
+                place, size = file.window_transform(window), (window.width, window.height)
+                tile = Tile(file.crs.to_wkt(), place.c, place.f, place.a, size, (0.0, 1.0))
+                height, sigma = file.read([1, 4], window=window)
+                error = height - made.truth(tile)
+                errors.append(error[np.isfinite(error)])
+                sigmas.append(sigma[np.isfinite(error)])
+        error = np.concatenate(errors)
+        within = float(np.mean(np.abs(error) < np.concatenate(sigmas)))
+        found = {"cells": known, "nmad": nmad(error), "within": within, "cpu": cpu}
+        return found | {"peak": peak / 1024, "tiles": len(windows)}
 
 
 def main() -> None:
@@ -138,8 +177,9 @@ def main() -> None:
     for kind in (KINDS if arguments.kinds else ["usual"]) if arguments.rendered else ():
         row, area = rendered(arguments.rendered, kind), arguments.rendered**2 / 1e6
         print(
-            f"rendered {arguments.rendered} px, {kind}: {row['cells']} cells, nmad {row['nmad']:.2f} m, within sigma "
-            f"{row['within']:.1%}, {row['cpu'] / area:.1f} CPU s/Mpx, {row['peak']:.0f} MB",
+            f"rendered {arguments.rendered} px, {kind}: {row['tiles']} tiles, {row['cells']} cells, "
+            f"nmad {row['nmad']:.2f} m, within sigma {row['within']:.1%}, {row['cpu'] / area:.1f} CPU s/Mpx, "
+            f"{row['peak']:.0f} MB",
             flush=True,
         )
 

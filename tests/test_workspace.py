@@ -463,6 +463,23 @@ def test_an_added_file_joins_what_is_there_and_replaces_its_own_only(tmp_path):
     }
 
 
+@pytest.mark.parametrize("ended", ["running", "failed", "done"])
+def test_what_is_added_to_a_finished_run_leaves_it_finished(tmp_path, ended):
+    """Killed or failed in between: no other command may take the folder for an unfinished one of its own."""
+    folder = finished(tmp_path / "run", a="a")
+    run = Workspace(folder, adds=True)
+    if ended == "failed":
+        with pytest.raises(RuntimeError), run:
+            raise RuntimeError
+    elif ended == "done":
+        with run:
+            run.write_text("b", "b")
+    else:
+        run._lock.release()
+    with pytest.raises(OutputError, match="exists and is not empty; give --overwrite"):
+        Workspace(folder)
+
+
 KILLED = """
 import os, pathlib, signal, sys
 from barpc.workspace import Workspace

@@ -14,7 +14,7 @@ SURE = 5.0
 SURELY = 3.0
 """Standard deviations: normal errors are larger once in 370."""
 
-FAR = 5.0
+OUTLIER = 5.0
 """Standard deviations: of a million normal errors not one is larger. What is farther off is something else."""
 
 MUCH_NOISE = 1.5
@@ -41,9 +41,6 @@ SHRINK = 0.25
 """Of a loss's scale that is left in one step, at least: it follows what is right out of what is wrong."""
 
 # --- arithmetic -------------------------------------------------------------------------------------------
-
-CHUNK = 8192
-"""Observations, or pairs of them, worked on at a time: temporaries stay in cache."""
 
 KEPT = 1_000_000
 """Observations whose derivatives are kept from one step to the next, some 200 bytes each."""

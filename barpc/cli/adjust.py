@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.cli.dsm import made
+from barpc.cli.dsm import BESIDE, interrupted, made
 from barpc.cli.flags import ADJUSTMENT, MATCH, RUN, TIE, Grouped, image_paths, paper, run_options, with_flags
 from barpc.cli.progress import executor_for, progress_told
 from barpc.cli.specs import Config, corrected, expanded, read_config, with_cameras
@@ -69,13 +69,18 @@ def adjust(
     """
     from barpc import pipeline
 
-    if source is None:
+    config = None if source is None else read_config(*source)
+    if surface:
+        given = _given(images, flags) if config is None else [item.image for item in config.items]
+        if interrupted(Path(out_dir), given):
+            flags["flag_overwrite"] = True
+    if config is None:
         code = _run(obj, pipeline.adjust, images, flags, out_dir=out_dir)
     else:
-        code = _run_from(obj, read_config(*source), images, flags, out_dir)
+        code = _run_from(obj, config, images, flags, out_dir)
     if surface:
         options, place = DsmOptions(overwrite=True), Path(out_dir)
-        if made(obj, place, place / "dsm.tif", options, flags["jobs"]) is None:
+        if made(obj, place, place / BESIDE, options, flags["jobs"]) is None:
             return 3
     return code
 

@@ -31,13 +31,13 @@ def expanded(specs: Sequence[str]) -> list[str]:
             raise InputError("an empty name among the images; give '.' for the current folder")
         name, choices = spec, ""
         if not os.path.lexists(spec) and not is_url(spec):
-            name = os.fspath(_name_of(spec))
+            name = os.fspath(name_of(spec))
             choices = spec[len(name) :]
         found += [one + choices for one in _files(name)]
     return found
 
 
-def _name_of(spec: str) -> str:
+def name_of(spec: str) -> str:
     """Return the file's part of a name with choices behind it, as it was typed."""
     from barpc.cameras import split_spec
 
@@ -87,7 +87,7 @@ def with_cameras(images: Sequence[str], named: Sequence[str]) -> list[str]:
     InputError for a text that names none of the images, several of them, or one for the second time.
     """
     out, taken = list(images), set[int]()
-    bare = [_name_of(image) for image in images]
+    bare = [name_of(image) for image in images]
     for text in named:
         fits = [
             (len(key), number)

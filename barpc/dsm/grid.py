@@ -20,12 +20,12 @@ from rasterio.warp import transform
 from rasterio.windows import Window
 
 from barpc import __version__
-from barpc.dsm.cells import F32, SIDE, Tile, surface_tile
+from barpc.dsm.cells import F32, MATCHED, SIDE, Tile, surface_tile
 from barpc.dsm.imagery import Block, NoSurfaceError, Pairs
 from barpc.errors import InputError
 from barpc.geodesy import Array
 from barpc.options import DsmOptions
-from barpc.pipeline.executor import CachingExecutor
+from barpc.pipeline.executor import CachingExecutor, worker_count
 from barpc.pipeline.inputs import hash_files
 from barpc.scene import View
 from barpc.sensor.geometry import footprint, ground_sample_distance
@@ -44,6 +44,8 @@ SHARED = "SIGMA_SHARED_BY_ALL_CELLS_M"
 _NODES = 3  # a side of a tile, at which the cameras' errors are asked
 _DATUM_NODES = 200  # tiles at which what all cells share is measured, at most
 _BITS = 16  # of a pattern of pairs
+_WIDER = 1.1  # times the pixels of a usual tile that one has at most: the rounding of a cell's side
+_SOME = 1 << 20  # cells, of all tiles, of which medians are told
 
 
 @dataclass
@@ -67,6 +69,7 @@ class Grid:
     north: float
     step: float
     size: tuple[int, int]
+    side: int  # cells a side of a tile
     outlines: tuple[tuple[Any, ...], ...]  # of what each pair of each group sees in common, on the map
 
     @classmethod
@@ -75,8 +78,9 @@ class Grid:
         views = block.views
         middles = [v.sensor.localize((np.array(v.size) - 1) / 2, np.array(v.altitude)) for v in views]
         crs = _crs(options.crs, middles[block.groups[0][0][0]])
-        pixels = [ground_sample_distance(v.sensor, at)[1] for v, at in zip(views, middles, strict=True)]
+        pixels = [float(ground_sample_distance(v.sensor, at)[1]) for v, at in zip(views, middles, strict=True)]
         step = options.gsd or float(f"{2 * max(pixels):.2g}")
+        _refuse_side(step, min(pixels), max(pixels))
         outlines = tuple(tuple(_common(views[i], views[j], crs) for i, j in group) for group in block.groups)
         whole = shapely.intersection_all([shapely.union_all(group) for group in outlines])
         if whole.is_empty:
@@ -84,13 +88,16 @@ class Grid:
         low, high = np.array(whole.bounds).reshape(2, 2)
         west, north = float(np.floor(low[0] / step) * step), float(np.ceil(high[1] / step) * step)
         size = int(np.ceil((high[0] - west) / step)), int(np.ceil((north - low[1]) / step))
-        return cls(block, options, crs, west, north, step, size, outlines)
+        side = SIDE
+        while side > 1 and side * step > _WIDER * SIDE * 2 * max(pixels):
+            side //= 2
+        return cls(block, options, crs, west, north, step, size, side, outlines)
 
     def tiles(self) -> list[tuple[tuple[int, int], tuple[Pairs, ...]]]:
         """Yield the first col, row of every tile that is seen, and the best pairs of each group that see it."""
         found = []
-        for row in range(0, self.size[1], SIDE):
-            for col in range(0, self.size[0], SIDE):
+        for row in range(0, self.size[1], self.side):
+            for col in range(0, self.size[0], self.side):
                 box = self.box(col, row)
                 groups = tuple(
                     tuple(pair for pair, outline in zip(*one, strict=True) if outline.intersects(box))
@@ -107,7 +114,7 @@ class Grid:
 
     def tile(self, col: int, row: int) -> Tile:
         """Return the tile that begins at a cell."""
-        size = min(SIDE, self.size[0] - col), min(SIDE, self.size[1] - row)
+        size = min(self.side, self.size[0] - col), min(self.side, self.size[1] - row)
         views = self.block.views
         alts = max(v.alt_range[0] for v in views), min(v.alt_range[1] for v in views)
         corner = self.west + self.step * col, self.north - self.step * row
@@ -127,7 +134,8 @@ class Grid:
         if self.block.errors is not None:
             counts.datum = float(self.block.errors.sigma(shared[None])[0])
         with self._opened(path, counts.datum) as file, CachingExecutor(run, inputs, executor) as caching:
-            results = one_by_one(caching, surface_tile, tasks, "surface", progress)
+            ahead = 4 * worker_count(executor)
+            results = one_by_one(caching, surface_tile, tasks, "surface", progress, ahead)
             for at, groups in seen:
                 tile, found = self.tile(*at), [next(results) for _ in groups]
                 bands = self._bands(tile, groups, found, shared)
@@ -136,7 +144,7 @@ class Grid:
                 counts.known += int(known.sum())
                 shares = [share for one in found for share in one[4]]
                 counts.share = float(np.nanmax([counts.share, *shares, -1.0]))
-                counts.some.append(bands[2:, known][:, :: max(1, known.sum() // 10_000)])
+                counts.some.append(bands[2:, known][:, :: 1 + int(known.sum()) * len(seen) // _SOME])
         return counts
 
     def _shared(self, seen: Sequence[tuple[tuple[int, int], tuple[Pairs, ...]]]) -> Array:
@@ -212,6 +220,17 @@ def _spread(values: Array, size: tuple[int, int]) -> Array:
     return np.stack([np.interp(at[1], nodes, col) for col in along.T], axis=1)
 
 
+def _refuse_side(step: float, smallest: float, largest: float) -> None:
+    """Raise an InputError for cells of which hardly one has a match, or one is more than is matched at once."""
+    if (step / smallest) ** 2 < MATCHED:
+        raise InputError(
+            f"--gsd {step:g}: a pixel of {smallest:.2g} m has one match, so fewer than {100 * MATCHED:.0f} % of such "
+            "cells would have a height"
+        )
+    if step > 2 * SIDE * largest:
+        raise InputError(f"--gsd {step:g}: a cell of more than {2 * SIDE} pixels of {largest:.2g} m")
+
+
 def _crs(given: str | None, middle: Array) -> CRS:
     """Return the CRS that was asked for, in metres, or the UTM zone of a place."""
     if given is None:
@@ -219,7 +238,7 @@ def _crs(given: str | None, middle: Array) -> CRS:
         return CRS.from_epsg((32600 if middle[1] >= 0 else 32700) + zone)
     try:
         found = CRS.from_user_input(given)
-    except CRSError as error:
+    except (CRSError, ValueError) as error:
         raise InputError(f"--crs {given}: no reference system that PROJ knows ({error})") from error
     if not found.is_projected or found.linear_units_factor[1] != 1.0:
         raise InputError(f"--crs {given}: cells need a projected reference system in metres, such as EPSG:32631")

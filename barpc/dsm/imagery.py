@@ -18,6 +18,7 @@ from barpc.options import TieOptions
 from barpc.pipeline import load_views
 from barpc.pipeline.inputs import PRIOR
 from barpc.remote import is_url
+from barpc.report.summary import Summary
 from barpc.report.tables import read_summary
 from barpc.rpcio.grids import CORRECTION
 from barpc.scene import View
@@ -45,13 +46,15 @@ class NoSurfaceError(BarpcError):
 class Block:
     """Views with the cameras that are believed, their pairs, and the covariance of the cameras where known.
 
-    `groups`: the pairs of which a surface is made; of a difference those of the surface that is taken away, too.
+    `groups`: the pairs of which a surface is made; of a difference those of the surface that is taken away, too;
+    `run`: what was said of the run that they are of.
     """
 
     views: tuple[View, ...]
     groups: tuple[Pairs, ...]
     errors: CameraErrors | None
     source: str
+    run: Summary | None = None
 
 
 def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: Path | None = None) -> Block:
@@ -86,7 +89,8 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: P
     parts = [range(len(views))] if minus is None else _split(folder, names, minus)
     flagged = frozenset(i for i, shot in enumerate(scene.shots) if shot.entry.advice)
     groups = tuple(_best(views, worth, part, flagged) for part in parts)
-    return Block(tuple(views), groups, errors, str(folder) + ("" if minus is None else f" minus {minus}"))
+    name = str(folder) + ("" if minus is None else f" minus {minus}")
+    return Block(tuple(views), groups, errors, name, scene.summary)
 
 
 def _split(folder: Path, names: Sequence[str], minus: Path) -> list[list[int]]:

@@ -16,10 +16,11 @@ from scipy.ndimage import map_coordinates
 from barpc.cameras import open_camera
 from barpc.dsm.cells import F32, Tile, surface_tile
 from barpc.dsm.grid import Grid
+from barpc.dsm.imagery import Block
 from barpc.errors import BarpcError
 from barpc.raster import open_raster
 from barpc.report.page import can_render, remake_report
-from barpc.report.tables import SURFACE, read_summary
+from barpc.report.tables import SURFACE, run_key
 from barpc.scene import View
 from barpc.tie.pixels import jpeg, read_pixels, sample_stretch
 from barpc.workspace import TABLES, Workspace
@@ -32,7 +33,9 @@ _LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])  # from the north-west, 45 degrees 
 def show_in_report(folder: Path, grid: Grid, out: Path) -> None:
     """Show both reliefs, and two images on the surface, in a run's report; where that fails a line says why."""
     try:
-        text, name = json.dumps(_reliefs(folder, grid, out)), f"{TABLES}/{SURFACE}"
+        assert grid.block.run is not None
+        made = {"run": run_key(grid.block.run), "shown": _reliefs(grid, out)}
+        text, name = json.dumps(made), f"{TABLES}/{SURFACE}"
         with Workspace(folder, overwrite=True, names=[name], adds=True) as run:
             run.write_text(name, text)
         if can_render():
@@ -41,14 +44,14 @@ def show_in_report(folder: Path, grid: Grid, out: Path) -> None:
         logger.warning("the report does not show the surface: %s", error)
 
 
-def _reliefs(folder: Path, grid: Grid, out: Path) -> list[dict[str, object]]:
+def _reliefs(grid: Grid, out: Path) -> list[dict[str, object]]:
     """Return the pictures, as `barpc.report.tables` reads them, of the tile that has most heights."""
     with open_raster(out) as file:
         read = (
             (at, groups[0], file.read([1, 3], window=Window(*at, *grid.tile(*at).size))) for at, groups in grid.tiles()
         )
         at, pairs, after = max(read, key=lambda row: np.isfinite(row[2][0]).sum())
-    views = _delivered(folder, grid.block.views)
+    views = _delivered(grid.block)
     before = surface_tile([(views[i], views[j]) for i, j in pairs], grid.tile(*at), grid.options.band)
     found: list[dict[str, object]] = []
     for cameras, (height, nmad) in (("delivered", before[:2]), ("corrected", after)):
@@ -62,11 +65,12 @@ def _reliefs(folder: Path, grid: Grid, out: Path) -> list[dict[str, object]]:
     return found
 
 
-def _delivered(folder: Path, views: tuple[View, ...]) -> list[View]:
+def _delivered(block: Block) -> list[View]:
     """Return the views with the cameras that came with their images."""
-    sources = {view.name: view.rpc_source for view in read_summary(folder).views}
+    assert block.run is not None
+    sources = {view.name: view.rpc_source for view in block.run.views}
     found = []
-    for view in views:
+    for view in block.views:
         source = sources[view.name]
         if source is None:
             raise BarpcError(f"{view.name}: no file holds its delivered camera")

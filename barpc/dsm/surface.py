@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import shutil
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import numpy as np
 import rasterio
 import rasterio.shutil
 
-from barpc.atomic import replacing
+from barpc.atomic import refuse_existing, replacing
 from barpc.dsm.cells import MATCHED, SIDE
 from barpc.dsm.grid import Counts, Grid
 from barpc.dsm.imagery import NoSurfaceError, block_of_images, block_of_run
@@ -81,35 +80,49 @@ def make_dsm(
     if out.is_dir() or out.resolve() in {Path(view.path).resolve() for view in block.views}:
         raise OutputError(f"{out}: is a folder or one of the images; give -o the name of a new file")
     grid, folder = Grid.of(block, options), Path(source) if isinstance(source, str | Path) else None
+    _place(out, folder, options.overwrite)
     room = out.parent / f"{out.name}.unfinished"  # results of tiles, until the file is whole
-    with _placed(out, folder, options.overwrite) as partial, Workspace(room) as run:
-        rough = run.partial / "tiles.tif"
-        with run.stage("surface"):
-            counts = grid.fill(rough, run, executor, progress)
-        if not counts.known:
-            raise NoSurfaceError(
-                f"of the pixels that both images show {100 * max(counts.share, 0):.0f} % are found back at most, "
-                f"fewer than {100 * MATCHED:.0f} %: other seasons, water, clouds or wrong cameras; nothing is written"
-            )
-        how = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "BLOCKSIZE": str(SIDE), "BIGTIFF": "IF_SAFER"}
-        with run.stage("write"), rasterio.Env(GDAL_NUM_THREADS="1"):
-            rasterio.shutil.copy(rough, partial, driver="COG", **how)
-    if folder is not None and options.minus is None:
-        show_in_report(folder, grid, out)
+    try:
+        with Workspace(room) as run:
+            counts, made = _made(run, grid, executor, progress)
+            if folder is not None and options.minus is None:
+                show_in_report(folder, grid, made)
+            _place(out, folder, options.overwrite, made)
+    except NoSurfaceError:
+        shutil.rmtree(room, ignore_errors=True)
+        raise
     shutil.rmtree(room, ignore_errors=True)
     return _told(out, grid, counts)
 
 
-@contextmanager
-def _placed(out: Path, folder: Path | None, overwrite: bool) -> Iterator[Path]:
-    """Yield a temporary path for the file; in the folder of its run it becomes one of the run's own."""
+def _made(run: Workspace, grid: Grid, executor: Executor | None, progress: Progress | None) -> tuple[Counts, Path]:
+    """Return what was counted, and the path of the file in the room where it is made."""
+    rough, made = run.partial / "tiles.tif", run.partial / "dsm.tif"
+    with run.stage("surface"):
+        counts = grid.fill(rough, run, executor, progress)
+    if not counts.known:
+        raise NoSurfaceError(
+            f"of the pixels that both images show {100 * max(counts.share, 0):.0f} % are found back at most, "
+            f"fewer than {100 * MATCHED:.0f} %: other seasons, water, clouds or wrong cameras; nothing is written"
+        )
+    how = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "BLOCKSIZE": str(SIDE), "BIGTIFF": "IF_SAFER"}
+    with run.stage("write"), rasterio.Env(GDAL_NUM_THREADS="1"):
+        rasterio.shutil.copy(rough, made, driver="COG", **how)
+    return counts, made
+
+
+def _place(out: Path, folder: Path | None, overwrite: bool, made: Path | None = None) -> None:
+    """Give a file its place, in the folder of its run as one of the run's own; without a file ask whether it may."""
     if folder is None or out.parent.resolve() != folder.resolve():
-        with replacing(out, overwrite=overwrite) as partial:
-            yield partial
-    else:
-        own = Workspace(folder, overwrite=overwrite, names=[out.name], adds=True)
-        with own as run, run.output(out.name) as partial:
-            yield partial
+        refuse_existing(out, overwrite)
+        if made is not None:
+            with replacing(out, overwrite=overwrite, room=made.parent) as partial:
+                made.replace(partial)
+        return
+    with Workspace(folder, overwrite=overwrite, names=[out.name], adds=True) as own:
+        if made is not None:
+            with own.output(out.name) as partial:
+                made.replace(partial)
 
 
 def _told(out: Path, grid: Grid, counts: Counts) -> Surface:

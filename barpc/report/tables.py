@@ -7,6 +7,7 @@ the same run gives the same bytes.
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
 import os
@@ -166,7 +167,8 @@ TABLES: dict[str, Callable[[Run, Summary], bytes]] = {
 }
 """File name -> its bytes, of a run and its summary."""
 SURFACE = "surface.json"
-"""Two reliefs and two images on the surface for the report, of a run of which one was made."""
+"""Two reliefs and two images on the surface for the report, of a run of which one was made, and which run (`run_key`).
+"""
 
 
 # --- read back --------------------------------------------------------------------------------------------
@@ -285,14 +287,24 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
     observations = _read(table_path(folder, "observations.csv"), TABLE, of_names)
     points, tracks = _read(table_path(folder, "residuals.csv"), TABLE, _points)
     surface = table_path(folder, SURFACE)
-    shown = _read(surface, SUMMARY, _surface) if os.path.lexists(surface) else ((), ())
+    made = summary.outputs and os.path.lexists(surface)  # none of a run that is at work: an earlier one's
+    shown = _read(surface, SUMMARY, partial(_surface, run=run_key(summary))) if made else ((), ())
     return RunFiles(summary, observations, points, tracks, outlines, *shown)
 
 
-def _surface(text: str) -> tuple[tuple[ReliefWindow, ...], tuple[Draped, ...]]:
+def run_key(summary: Summary) -> str:
+    """Return what a run is known by, a hash of its results: what was made of other results is not shown beside them."""
+    results = [(one.file, one.sha256) for one in summary.outputs or ()]
+    return hashlib.sha256(repr(results).encode()).hexdigest()
+
+
+def _surface(text: str, run: str) -> tuple[tuple[ReliefWindow, ...], tuple[Draped, ...]]:
     import fastjsonschema
 
-    rows = parse_json(text)
+    found = parse_json(text)
+    rows = found["shown"]
+    if found["run"] != run:
+        return (), ()
     shown = {"type": "array", "items": [*2 * [ReliefWindow.json_schema()], *2 * [Draped.json_schema()]]}
     fastjsonschema.validate({**shown, "additionalItems": False}, rows)
     reliefs, draped = tuple(map(ReliefWindow.read, rows[:2])), tuple(map(Draped.read, rows[2:]))

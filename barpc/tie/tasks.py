@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
+from itertools import islice
 from typing import Any
 
 Progress = Callable[[str, int, int], None]
@@ -39,11 +40,17 @@ def one_by_one(
     tasks: Sequence[tuple[Any, ...]],
     stage: str,
     progress: Progress | None = None,
+    ahead: int | None = None,
 ) -> Iterator[Any]:
-    """Run tasks as `ordered`, but yield each result as it comes and keep none."""
-    futures = deque(executor.submit(function, *task) for task in tasks) if executor is not None else deque()
+    """Run tasks as `ordered`, but yield each result as it comes and keep none; at most `ahead` are handed in at a
+    time, so that kept results of all others are not in memory, too.
+    """
+    waiting, futures = iter(tasks), deque[Future[Any]]()
     try:
         for done, task in enumerate(tasks, start=1):
+            if executor is not None:
+                more = len(tasks) if ahead is None else ahead - len(futures)
+                futures.extend(executor.submit(function, *one) for one in islice(waiting, more))
             yield futures.popleft().result() if executor is not None else function(*task)
             if progress is not None:
                 progress(stage, done, len(tasks))

@@ -11,9 +11,10 @@ import rasterio
 
 from barpc.cli import main
 from barpc.dsm import NoSurfaceError, make_dsm
+from barpc.dsm import cells as cells_module
 from barpc.dsm import grid as surface_module
 from barpc.dsm.cells import Tile
-from barpc.dsm.imagery import _best
+from barpc.dsm.imagery import _best, block_of_images
 from barpc.dsm.relief import draped
 from barpc.errors import InputError, OutputError
 from barpc.options import DsmOptions
@@ -246,11 +247,59 @@ def test_an_existing_file_stays_and_an_image_is_never_written(rendered, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("crs", "said"), [("EPSG:4326", "projected reference system in metres"), ("EPSG:99999999", "PROJ knows")]
+    ("crs", "said"),
+    [
+        ("EPSG:4326", "projected reference system in metres"),
+        ("EPSG:99999999", "PROJ knows"),
+        ("EPSG:2154x", "PROJ knows"),
+        ("nonsense", "PROJ knows"),
+    ],
 )
 def test_a_map_without_metres_is_refused(crs, said, rendered, tmp_path):
     with pytest.raises(InputError, match=said):
         make_dsm(rendered.paths[:2], tmp_path / "dsm.tif", replace(OPTIONS, crs=crs))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("side", "said"),
+    [(0.2, "a pixel of 0.5[0-9]* m has one match, so fewer than 20 %"), (600.0, "a cell of more than 1024 pixels")],
+)
+def test_cells_that_hardly_a_match_falls_in_or_too_many_are_refused(side, said, rendered, tmp_path):
+    with pytest.raises(InputError, match=said):
+        make_dsm(rendered.paths[:2], tmp_path / "missing" / "dsm.tif", replace(OPTIONS, gsd=side))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_tile_shows_as_many_pixels_whatever_the_cells(rendered):
+    block = block_of_images(rendered.paths[:2])
+    usual, coarse = (surface_module.Grid.of(block, replace(OPTIONS, gsd=side)) for side in (None, 8.0))
+    assert usual.side == 512
+    assert coarse.side * coarse.step <= 1.1 * usual.side * usual.step
+    parts = coarse.tile(0, 0).parts()
+    assert {part.size for part in parts} == {coarse.tile(0, 0).size}
+    corners = np.array([[part.west, part.north, part.step] for part in parts])
+    west, north, step = corners.T
+    whole = coarse.tile(0, 0)
+    assert (west.min(), north.max()) == (whole.west, whole.north)
+    assert west.max() + step[0] * whole.size[0] == pytest.approx(whole.west + whole.step * whole.size[0])
+    assert north.min() - step[0] * whole.size[1] == pytest.approx(whole.north - whole.step * whole.size[1])
+
+
+def test_coarse_cells_have_the_median_of_their_ground(rendered, tmp_path):
+    make_dsm(rendered.paths[:2], tmp_path / "dsm.tif", replace(OPTIONS, gsd=8.0))
+    with rasterio.open(tmp_path / "dsm.tif") as file:
+        error = file.read(1) - rendered.truth(tmp_path / "dsm.tif")
+    assert np.isfinite(error).mean() > 0.6
+    assert nmad(error[np.isfinite(error)]) < 0.5
+
+
+def test_a_refusal_after_long_work_leaves_nothing_either(rendered, tmp_path, monkeypatch):
+    """Not even what a run that is gone on with would need: it is refused each time."""
+    monkeypatch.setattr("barpc.workspace.KEEP_AFTER", 0.0)
+    monkeypatch.setattr(cells_module, "MATCHED", 1.1)
+    with pytest.raises(NoSurfaceError, match="nothing is written"):
+        make_dsm(rendered.paths[:2], tmp_path / "dsm.tif", OPTIONS)
     assert not list(tmp_path.iterdir())
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -30,6 +31,7 @@ from barpc.report.tables import (
     _points,
     gcps_geojson,
     read_tables,
+    run_key,
 )
 
 
@@ -318,3 +320,24 @@ def test_points_of_a_reference_are_written_as_control_is_read():
     }
     assert first["geometry"] == {"type": "Point", "coordinates": [10.0, 20.0, 30.0]}
     assert (second["properties"]["id"], second["properties"]["ji"]) == ("Q", [5.0, 6.0])
+
+
+RELIEF = {"size": [2, 2], "share": 0.9, "nmad_m": 0.3, "picture": "QUJD"}
+
+
+def test_a_surface_is_shown_beside_the_results_that_it_was_made_of_alone(block_run, tmp_path):
+    shutil.copytree(block_run.folder / "tables", tmp_path / "tables")
+    summary = block_run.record
+    shown = [{"cameras": cameras, **RELIEF} for cameras in ("delivered", "corrected")]
+    path = tmp_path / "tables/surface.json"
+    path.write_text(json.dumps({"run": run_key(summary), "shown": shown}))
+    assert [one.cameras for one in read_tables(summary, tmp_path).reliefs] == ["delivered", "corrected"]
+    first, *others = summary.outputs
+    later = replace(summary, outputs=(replace(first, sha256="0" * 64), *others))
+    assert read_tables(later, tmp_path).reliefs == ()  # of an earlier run in the same folder
+    path.write_text("[]")
+    assert read_tables(replace(summary, outputs=()), tmp_path).reliefs == ()  # a run at work looks at none
+    for text in ("[]", "{}", json.dumps({"run": run_key(summary), "shown": shown[:1]})):
+        path.write_text(text)
+        with pytest.raises(InputError, match=r"surface\.json: damaged"):
+            read_tables(summary, tmp_path)

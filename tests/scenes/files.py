@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -94,16 +96,19 @@ def _write_scene(workspace: Workspace, scene: Scene, options: ImageOptions) -> N
 
 
 def _write_image(path: Path, numbers: npt.NDArray[np.uint16], rpc: RPC) -> None:
-    """A deflated, tiled GeoTIFF with the RPC in its tag."""
-    height, width = numbers.shape
+    with image_file(path, numbers.shape[::-1], rpc) as file:
+        file.write(numbers, 1)
+
+
+@contextmanager
+def image_file(path: Path, size: tuple[int, ...], rpc: RPC) -> Iterator[Any]:
+    """Open a deflated, tiled GeoTIFF of a size to be written; with the RPC in its tag when it is closed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         layout: dict[str, Any] = {"tiled": True, "blockxsize": 256, "blockysize": 256}
         packing = {"compress": "deflate", "predictor": 2, "zlevel": 9}
-        with rasterio.open(
-            path, "w", "GTiff", width, height, 1, dtype="uint16", nodata=0, **layout, **packing
-        ) as dataset:
-            dataset.write(numbers, 1)
+        with rasterio.open(path, "w", "GTiff", *size, 1, dtype="uint16", nodata=0, **layout, **packing) as dataset:
+            yield dataset
     put_tag(path, rpc)
 
 

@@ -7,6 +7,7 @@ inverse of a correction (R, T, C), so that P(R (X - T - C) + C) with the deliver
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -28,6 +29,10 @@ from tests.scenes.texture import Date, Surface, make_surfaces
 
 ALTITUDES = (694e3, 617e3, 770e3)
 """Satellites of the first, second and third date [m above the ellipsoid]; then again from the first."""
+MIRRORED = 2500
+"""Images of more pixels a side show ground that is made for so many, again and again, mirrored: memory is bounded."""
+_ROWS, _BLUR = 2048, 8
+"""Rows of a picture made at a time, and beside them for the blur."""
 _OPEN = 250.0  # m below and above the ground for which a delivered RPC is fitted: its error moves heights
 
 
@@ -103,8 +108,8 @@ class ImageOptions:
     gcp_noise: float = 0.2
 
     def __post_init__(self) -> None:
-        if self.views < 1 or min(self.size) < 64 or max(self.size) > 8000:
-            raise InputError("simulate: at least one view, and images of 64 to 8000 px a side")
+        if self.views < 1 or min(self.size) < 64 or max(self.size) > 40000:
+            raise InputError("simulate: at least one view, and images of 64 to 40000 px a side")
         if not (0.05 <= self.gsd <= 50.0 and abs(self.lat) <= 85.0 and -500.0 <= self.alt <= 9000.0):
             raise InputError("simulate: gsd 0.05 to 50 m, latitude up to 85 deg, altitude -500 to 9000 m")
         if not 0.0 <= self.clouds < 1.0:
@@ -218,13 +223,17 @@ class Scene:
         levels = np.array([[low + _OPEN], [high - _OPEN]])
         seen = np.concatenate([plane.xy(s.exact.localize(corners, levels)).reshape(-1, 2) for s in self.shots])
         edge = 20.0 * options.gsd
-        bounds = (*(seen.min(axis=0) - edge).tolist(), *(seen.max(axis=0) + edge).tolist())
+        low, high = seen.min(axis=0) - edge, seen.max(axis=0) + edge
+        wide, reach = max(options.size) > MIRRORED, 0.5 * MIRRORED * options.gsd
+        part = (np.maximum(low, -reach), np.minimum(high, reach)) if wide else (low, high)  # the plane's origin: middle
+        bounds = (*part[0].tolist(), *part[1].tolist())
         terrain = make_terrain(rng, plane, bounds, options.alt, options.relief, options.buildings)
         dates = [
             Date(azimuth, max(options.sun_elevation - 8.0 * (k % 2), 10.0), options.change if k else 0.0)
             for k, azimuth in enumerate(options.sun_azimuth)
         ]
-        return make_surfaces(rng, terrain, 0.5 * options.gsd, dates)
+        made = make_surfaces(rng, terrain, 0.5 * options.gsd, dates)
+        return [one.mirrored(low, high) for one in made] if wide else made
 
     @property
     def terrain(self) -> Terrain:
@@ -237,6 +246,16 @@ class Scene:
         rendering = render(shot.exact, self.options.size, self.surfaces[shot.date])
         numbers = expose(rendering.brightness, shot.radiometry, self._rng(index, 1))
         return Picture(numbers, rendering.altitude)
+
+    def strips(self, index: int) -> Iterator[tuple[int, Picture]]:
+        """Render view `index` in parts, each with its first row: memory grows with the width alone."""
+        shot, rng, (_, height) = self.shots[index], self._rng(index, 1), self.options.size
+        for top in range(0, height, _ROWS):
+            end = min(top + _ROWS, height)
+            first, last = max(top - _BLUR, 0), min(end + _BLUR, height)
+            rendering = render(shot.exact, self.options.size, self.surfaces[shot.date], rows=(first, last))
+            kept = slice(top - first, end - first)
+            yield top, Picture(expose(rendering.brightness, shot.radiometry, rng)[kept], rendering.altitude[kept])
 
     def candidates(self, count: int) -> Array:
         """Ground points (count, 3) on the relief and on roofs, before anyone asked who sees them."""

@@ -73,7 +73,13 @@ class Rendering:
     altitude: Float32
 
 
-def render(sensor: SensorModel, size: tuple[int, int], surface: Surface, samples: int = 2) -> Rendering:
+def render(
+    sensor: SensorModel,
+    size: tuple[int, int],
+    surface: Surface,
+    samples: int = 2,
+    rows: tuple[int, int] | None = None,
+) -> Rendering:
     """The exact image of a surface: means over samples x samples lines of sight a pixel.
 
     Parameters
@@ -86,24 +92,26 @@ def render(sensor: SensorModel, size: tuple[int, int], surface: Surface, samples
         What is there.
     samples : int
         Lines of sight a pixel and axis.
+    rows : tuple of int, optional
+        First row and the one after the last of what is rendered; all without.
 
     Returns
     -------
-    rendering : Rendering
+    rendering : Rendering, of these rows
 
     Raises
     ------
     InputError
         The camera does not see the ground everywhere.
     """
-    width, height = size
-    brightness, altitude = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    width, (first, end) = size[0], rows or (0, size[1])
+    brightness, altitude = np.empty((end - first, width), np.float32), np.empty((end - first, width), np.float32)
     boxes = _boxes(sensor, surface.terrain)
-    for top, rays in _strips(sensor, size, surface.terrain, samples):
-        rows = rays.x.shape[0] // samples
+    for top, rays in _strips(sensor, size, surface.terrain, samples, (first, end)):
+        count = rays.x.shape[0] // samples
         shown, alt = _seen(surface, rays, boxes, top, samples)
-        blocks = (rows, samples, width, samples)
-        part = slice(top, top + rows)
+        blocks = (count, samples, width, samples)
+        part = slice(top - first, top - first + count)
         brightness[part] = shown.reshape(blocks).mean(axis=(1, 3))
         cells = alt.reshape(blocks)
         mean = cells.mean(axis=(1, 3))
@@ -134,9 +142,11 @@ def _clouded(light: Float32, part: float, rng: np.random.Generator) -> Float32:
     return out
 
 
-def _strips(sensor: SensorModel, size: tuple[int, int], terrain: Terrain, samples: int) -> Iterator[tuple[int, Ray]]:
-    """First row and lines of sight (rows x samples, width x samples) of strip after strip."""
-    width, height = size
+def _strips(
+    sensor: SensorModel, size: tuple[int, int], terrain: Terrain, samples: int, part: tuple[int, int]
+) -> Iterator[tuple[int, Ray]]:
+    """First row and lines of sight (rows x samples, width x samples) of strip after strip of a part of the rows."""
+    width = size[0]
     low, high = terrain.alt_range()
     high = max(high, low + 10.0)
     cols, rows = (np.linspace(-0.5, n - 0.5, max(4, -(-n // _NODE) + 1)) for n in size)
@@ -149,8 +159,8 @@ def _strips(sensor: SensorModel, size: tuple[int, int], terrain: Terrain, sample
     fine = (np.arange(width * samples) + 0.5) / samples - 0.5
     across = CubicSpline(cols, np.eye(len(cols)))(fine).T
     values = values @ across
-    for top in range(0, height, STRIP):
-        count = min(STRIP, height - top)
+    for top in range(*part, STRIP):
+        count = min(STRIP, part[1] - top)
         fine = top + (np.arange(count * samples) + 0.5) / samples - 0.5
         along = CubicSpline(rows, np.eye(len(rows)))(fine)
         x, y, dx, dy = along @ values

@@ -66,17 +66,20 @@ class Grid:
         [m]
     values : (H, W)
         float32.
+    beyond : str
+        What is beyond the edge: "nearest", the edge's; "mirror", all of it again and again.
     """
 
     origin: Array
     step: float
     values: Float32
+    beyond: str = "nearest"
 
     def __call__(self, x: Array, y: Array) -> Float32:
-        """Values (...) at places x, y (...) [m]; beyond the edge the edge's."""
+        """Values (...) at places x, y (...) [m]."""
         place = np.stack([(y - self.origin[1]) / self.step, (x - self.origin[0]) / self.step])
         out: Float32 = ndimage.map_coordinates(
-            self.values, place, output=np.float32, order=1, mode="nearest", prefilter=False
+            self.values, place, output=np.float32, order=1, mode=self.beyond, prefilter=False
         )
         return out
 
@@ -113,6 +116,18 @@ class Buildings:
     def __len__(self) -> int:
         """Number of buildings B."""
         return len(self.top)
+
+    def repeated(self, low: Array, side: Array, first: Array, last: Array) -> Buildings:
+        """The same on a ground that is mirrored: of the part from `low` with `side` (2,) [m] the copies `first` to
+        `last` (2,) each way; copy 0 is the part itself.
+        """
+        copies = [(k, n) for n in range(first[1], last[1] + 1) for k in range(first[0], last[0] + 1)]
+        at = np.array(copies)[:, None, :]
+        place = self.center - low
+        center = low + side * at + np.where(at % 2, side - place, place)
+        turned = np.where(at.sum(axis=2) % 2, -self.angle, self.angle).ravel()
+        half, top, foot = (np.concatenate([one] * len(copies)) for one in (self.half, self.top, self.foot))
+        return Buildings(center.reshape(-1, 2), half, turned, top, foot)
 
     def sides(self, index: int, x: Array, y: Array) -> tuple[Array, Array]:
         """Coordinates (...) of places along the two sides of one building, from its centre [m]."""

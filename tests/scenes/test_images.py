@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center, convergence_angle, triangulate
 from barpc.sensor.rpc import RPC
-from tests.scenes import ImageOptions, Scene, write_scene
+from tests.scenes import ImageOptions, Scene, images, write_scene
 from tests.scenes.__main__ import command
 from tests.scenes.images import inverse
 
@@ -212,3 +213,42 @@ def test_three_views_of_600_pixels_take_seconds(tmp_path):
     start = time.process_time()
     write_scene(tmp_path / "scene", ImageOptions(size=(600, 600)))
     assert time.process_time() - start < 15.0  # CPU s; some 2 on a machine of its own
+
+
+def test_a_picture_made_in_strips_is_the_picture(monkeypatch):
+    scene = Scene(replace(SMALL, snr=0.0))
+    whole = scene.picture(1)
+    monkeypatch.setattr(images, "_ROWS", 64)
+    tops, parts = zip(*scene.strips(1), strict=True)
+    assert tops == (0, 64, 128)
+    np.testing.assert_array_equal(np.concatenate([part.numbers for part in parts]), whole.numbers)
+    np.testing.assert_array_equal(np.concatenate([part.altitude for part in parts]), whole.altitude)
+    monkeypatch.setattr(images, "_ROWS", 160)
+    ((_, noisy),) = Scene(SMALL).strips(1)
+    np.testing.assert_array_equal(noisy.numbers, Scene(SMALL).picture(1).numbers)
+
+
+def test_ground_beyond_what_is_made_is_its_mirror_image_with_all_that_stands_on_it(monkeypatch):
+    monkeypatch.setattr(images, "MIRRORED", 60)
+    surface = Scene(replace(SMALL, buildings=60.0)).surfaces[0]
+    x, y = surface.terrain.relief.axes()
+    low, side = np.array([x[0], y[0]]), np.array([x[-1] - x[0], y[-1] - y[0]])
+    rng = np.random.default_rng(1)
+    inside = low + rng.uniform(0.0, 1.0, (400, 2)) * side
+    buildings = surface.terrain.buildings
+    assert len(buildings) > 9
+
+    def seen(at):
+        roof = np.full(len(at), -np.inf)
+        for i in range(len(buildings)):
+            u, v = buildings.sides(i, *at.T)
+            on = (np.abs(u) < buildings.half[i, 0]) & (np.abs(v) < buildings.half[i, 1])
+            roof[on] = np.maximum(roof[on], buildings.top[i])
+        return np.maximum(roof, surface.terrain.relief(*at.T)), surface.ground(*at.T)
+
+    for turn in ([1, 0], [0, -1], [1, 1]):
+        edge = low + side * (np.array(turn) > 0)
+        mirrored = np.where(np.array(turn) != 0, 2 * edge - inside, inside)
+        for there, here in zip(seen(mirrored), seen(inside), strict=True):
+            np.testing.assert_allclose(there, here, rtol=1e-3)
+    assert (seen(inside)[0] > surface.terrain.relief(*inside.T) + 1.0).mean() > 0.02

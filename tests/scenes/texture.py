@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -66,6 +66,18 @@ class Surface:
     roof: Array
     wall: Array
     date: Date
+
+    def mirrored(self, low: Array, high: Array) -> Surface:
+        """The same with all of it again and again, mirrored, as far as `low` and `high` (2,) [m]."""
+        relief = self.terrain.relief
+        start = relief.origin
+        side = relief.step * (np.array(relief.values.shape[::-1]) - 1)
+        first, last = (np.floor((edge - start) / side).astype(int) for edge in (low, high))
+        buildings = self.terrain.buildings.repeated(start, side, first, last)
+        times = int(np.prod(last - first + 1))
+        terrain = replace(self.terrain, relief=replace(relief, beyond="mirror"), buildings=buildings)
+        grids = replace(self.ground, beyond="mirror"), replace(self.detail, beyond="mirror")
+        return Surface(terrain, *grids, np.tile(self.roof, times), np.tile(self.wall, times), self.date)
 
     def building(self, index: IntIndex, wall: IntIndex, x: Array, y: Array, alt: Array) -> Float32:
         """Brightness (N,) of places x, y, alt (N,) [m] on buildings, on the roof or a wall."""

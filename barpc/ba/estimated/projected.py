@@ -16,8 +16,7 @@ import numpy as np
 
 from barpc.ba.algebra.structure import parts
 from barpc.ba.estimated.unknowns import Unknowns
-from barpc.ba.usual import CHUNK
-from barpc.geodesy import Array, ground_from_ecef, ground_rows_from_ecef
+from barpc.geodesy import CHUNK, Array, ground_from_ecef, ground_rows_from_ecef
 from barpc.scene import IntArray, View
 from barpc.sensor.corrected import RigidMotion
 from barpc.sensor.rpc import RPC

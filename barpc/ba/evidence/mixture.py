@@ -22,8 +22,8 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dtrtri
 
 from barpc.ba.evidence.linearised import Linear, Tracks
-from barpc.ba.usual import BACKFITTING, CHUNK, RIDGE
-from barpc.geodesy import Array
+from barpc.ba.usual import BACKFITTING, RIDGE
+from barpc.geodesy import CHUNK, Array
 from barpc.scene import BoolArray, IntArray
 
 _HOTTEST = 200.0  # times the noise stated, where it is cooled from: 20 px of 0.1

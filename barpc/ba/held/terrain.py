@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barpc.ba.usual import FAR, SURELY
+from barpc.ba.usual import OUTLIER, SURELY
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.scene import BoolArray, IntArray
 
@@ -202,7 +202,7 @@ class Relief:
         for _ in range(_ROUNDS):
             delivered = _coefficients(flat[near], off[near])
             left = np.abs(off - flat @ delivered)
-            near = left <= FAR * 1.4826 * np.median(left)
+            near = left <= OUTLIER * 1.4826 * np.median(left)
         tell[index[sharp[index] < max(1.4826 * float(np.median(left)), stated)]] = True
         fit[:, index] = np.linalg.pinv(flat)
         return cls(bands, tell, delivered, fit, unknown)
@@ -287,14 +287,14 @@ def _compared(at: Array, above: Array, bent: Array, slopes: Array, smooth: Array
         part = moved @ _coefficients(moved[fits], rest[fits])
         left = rest - part
         spread = 1.4826 * float(np.median(np.abs(left[fits])))
-        fits = tell & (np.abs(left) <= max(FAR * spread, 1e-6))
+        fits = tell & (np.abs(left) <= max(OUTLIER * spread, 1e-6))
     return _Compared(gains, rising, part, left, fits, moved.shape[1] + len(gains))
 
 
 def _middling(values: Array) -> BoolArray:
     """Return the mask of n values about their median."""
     off = np.abs(values - np.median(values))
-    return np.asarray(off <= FAR * 1.4826 * np.median(off))
+    return np.asarray(off <= OUTLIER * 1.4826 * np.median(off))
 
 
 def _coefficients(design: Array, values: Array) -> Array:

@@ -15,8 +15,8 @@ import scipy.sparse as sp
 
 from barpc.ba.algebra.structure import Structure, parts
 from barpc.ba.estimated.projected import Projected
-from barpc.ba.usual import CHUNK, FEW
-from barpc.geodesy import Array
+from barpc.ba.usual import FEW
+from barpc.geodesy import CHUNK, Array
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.curve import cross
 

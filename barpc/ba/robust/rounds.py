@@ -17,7 +17,7 @@ from barpc.ba.robust.variances import SAME_PRIOR, STANDS, PriorTest, Variances, 
 from barpc.ba.robust.weights import LOSSES, MEDIAN, Observations
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
-from barpc.ba.usual import BACKFITTING, FAR, GROSS, MUCH_NOISE, SHRINK, SURELY
+from barpc.ba.usual import BACKFITTING, GROSS, MUCH_NOISE, OUTLIER, SHRINK, SURELY
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray
@@ -269,7 +269,7 @@ def _robust(
         noise = max(float(np.sqrt(_median(s, counted) / MEDIAN)), least, _LEAST_NOISE)
         if scale <= 3.6 * noise:
             break
-        clean = noise < MUCH_NOISE and float((s[use] > (FAR * noise) ** 2).mean()) < _FEW
+        clean = noise < MUCH_NOISE and float((s[use] > (OUTLIER * noise) ** 2).mean()) < _FEW
         scale = SURELY * noise if np.isinf(scale) or clean else max(SURELY * noise, SHRINK * scale)
         counted = _counted(observations, use, s, loss(s / scale**2)[1])
         state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)

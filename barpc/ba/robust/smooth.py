@@ -16,7 +16,7 @@ from scipy.special import fdtrc
 from barpc.ba.algebra.structure import Structure
 from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.robust.resembling import Resemblance
-from barpc.ba.usual import FAR, KEPT, RIDGE
+from barpc.ba.usual import KEPT, OUTLIER, RIDGE
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.splined import bsplines
@@ -139,7 +139,7 @@ class Smooth:
             product, count = (ordered[:, 1:] * ordered[:, :-1]).sum(axis=0), len(order) - 1.0
             if self.alike is not None:
                 product, count = self._beyond_noise(product, (ordered**2).sum(axis=0), order)
-            if product.mean() > FAR * product.std() / np.sqrt(max(count, 1.0)):
+            if product.mean() > OUTLIER * product.std() / np.sqrt(max(count, 1.0)):
                 most = max(most, float(np.sqrt(product.mean())))
         return most
 

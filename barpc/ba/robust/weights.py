@@ -14,7 +14,7 @@ import numpy as np
 from barpc.ba.held.ground import ALIKE
 from barpc.ba.robust.smooth import SPLINES
 from barpc.ba.solving.problem import Problem
-from barpc.ba.usual import FAR, FEW, GROSS
+from barpc.ba.usual import FEW, GROSS, OUTLIER
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
@@ -97,7 +97,7 @@ class Observations:
 
     def is_near(self, squared: Array, scale: float) -> BoolArray:
         """Return the observations (K,) within a number of standard deviations; a reference's by their own limit."""
-        near = np.where(self.of_reference, squared <= FAR**2, squared <= scale * scale)
+        near = np.where(self.of_reference, squared <= OUTLIER**2, squared <= scale * scale)
         return np.asarray(near | (self.is_control & (squared < GROSS**2)))
 
     def freedom(self, counted: Array) -> Array:

@@ -1,0 +1,121 @@
+"""A surface that was killed: the same command goes on, does no tile twice, and gives the same bytes."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barpc.cli import main
+from barpc.dsm import make_dsm
+from barpc.options import DsmOptions
+from barpc.pipeline import adjust
+from barpc.report.tables import SURFACE, read_summary, read_tables
+from tests.dsm.conftest import ALTS
+
+FINE = DsmOptions(alt=ALTS, gsd=0.25)  # four tiles
+pytestmark = pytest.mark.slow
+
+
+def kept(folder: Path) -> dict[Path, int]:
+    """The results of tiles, and when each was written [ns]."""
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*.unfinished/.barpc/cache/surface_tile/*.npz")}
+
+
+def killed(call: list[str], when) -> bool:
+    """Run a command and kill it as soon as `when` holds; whether it was in time."""
+    work = subprocess.Popen([sys.executable, "-m", "barpc", "-q", *call])
+    try:
+        while work.poll() is None and not when():
+            time.sleep(0.002)
+    finally:
+        if work.poll() is None:
+            os.kill(work.pid, signal.SIGKILL)
+        work.wait()
+    return work.returncode == -signal.SIGKILL
+
+
+def run(*args: object) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main(["-q", *map(str, args)])
+    return int(stop.value.code or 0)
+
+
+def test_a_killed_command_goes_on_and_gives_the_same_bytes(rendered, tmp_path):
+    whole = tmp_path / "whole" / "dsm.tif"
+    make_dsm(rendered.paths[:2], whole, FINE)
+    folder = tmp_path / "again"
+    options = ["--gsd", "0.25", "--alt", *map(str, ALTS)]
+    call = ["dsm", *rendered.paths[:2], "-o", str(folder / "dsm.tif"), *options]
+    rng, before = np.random.default_rng(int.from_bytes(os.urandom(4))), dict[Path, int]()
+    for tiles in (0, 1, 2, 4):
+        waits = rng.uniform(0.0, 0.3)
+        since: list[float] = []
+
+        def now(tiles=tiles, waits=waits, since=since):
+            if len(kept(folder)) >= tiles and (folder / "dsm.tif.unfinished").exists():
+                since.append(time.monotonic())
+            return since and time.monotonic() > since[0] + waits
+
+        in_time = killed(call, now)
+        if not in_time:
+            break
+        found = kept(folder)
+        assert before.items() <= found.items()  # nothing was done again
+        assert sorted(path.name for path in folder.iterdir()) in (
+            ["dsm.tif.unfinished"],
+            ["dsm.tif", "dsm.tif.unfinished"],
+        )
+        before = found
+    if not (folder / "dsm.tif").exists():
+        assert run(*call) == 0
+    assert (folder / "dsm.tif").read_bytes() == whole.read_bytes()
+
+
+def test_a_surface_of_a_run_that_was_killed_is_made_by_the_same_command(rendered, tmp_path):
+    folder = tmp_path / "run"
+    call = ["adjust", *rendered.paths, "--surface", "-o", str(folder)]
+    assert run(*call) in (0, 3)
+    whole = (folder / "dsm.tif").read_bytes()
+    shutil.rmtree(folder)
+    assert killed(call, (folder / "dsm.tif.unfinished").exists)
+    assert not (folder / "dsm.tif").exists()
+    assert run("adjust", *rendered.paths[1:], "--surface", "-o", folder) == 1  # another command
+    assert run(*call) in (0, 3)
+    assert (folder / "dsm.tif").read_bytes() == whole
+    assert read_tables(read_summary(folder), folder).reliefs
+    assert not list(folder.glob("*.unfinished"))
+
+
+def test_a_finished_run_whose_surface_was_killed_stays_finished(rendered, tmp_path, capsys):
+    folder = tmp_path / "run"
+    adjust(rendered.paths[:2], folder)
+    page = (folder / "report.html").read_bytes()
+    call = ["dsm", str(folder), "-o", str(folder / "dsm.tif")]
+    assert killed(call, (folder / "dsm.tif.unfinished").exists)
+    assert not (folder / "dsm.tif").exists()
+    assert (folder / "report.html").read_bytes() == page
+    assert run("adjust", *rendered.paths[1:], "-o", folder) == 1
+    assert "exists and is not empty; give --overwrite" in capsys.readouterr().err
+    assert run(*call) == 0
+    assert not (folder / "dsm.tif.unfinished").exists()
+    # another run in the same folder does not show it
+    old = (folder / "tables" / SURFACE).read_bytes()
+    adjust(rendered.paths[1:], folder, overwritten())
+    assert "What do they make of the ground?" not in (folder / "report.html").read_text(encoding="utf-8")
+    (folder / "tables" / SURFACE).write_bytes(old)
+    assert run("report", folder) == 0
+    assert "What do they make of the ground?" not in (folder / "report.html").read_text(encoding="utf-8")
+
+
+def overwritten():
+    from barpc.options import RunOptions
+
+    return RunOptions(overwrite=True)
