@@ -211,3 +211,35 @@ def test_a_first_guess_has_the_least_sum_of_distances(linear: Linear) -> None:
     np.testing.assert_allclose(guess, found, rtol=1e-6)
     assert middle == pytest.approx(np.median(far), rel=1e-6)
     assert total == pytest.approx(sum(far) / 1.5, rel=1e-6)
+
+
+def test_a_wrong_match_lies_in_an_image_or_along_an_epipolar_line() -> None:
+    """Its area in units of the noise: as wide as residuals are far, as long as heights of the span shift the ends."""
+    made = simulate_block(4, 60, seed=1)
+    block = join(made.views, made.tracks, None, AdjustOptions())
+    problem = make_problem(block, AdjustOptions(), None, None)
+    state, _ = first_state(problem, block, AdjustOptions(), None)
+    projected = problem.project_points(state.params, state.points)
+    by_point, left = projected.by_point / block.sigma, (projected.image - problem.xy) / block.sigma
+    size = np.array([view.size for view in made.views])
+    image = np.median(size.prod(axis=1)) / np.median(block.sigma) ** 2
+    metre = np.median(np.sqrt((by_point**2).sum(axis=1)))
+    shifts = []
+    for point in range(block.num_points):
+        rows = np.flatnonzero(block.point == point)
+        rows = rows[np.argsort(block.view[rows])][[0, -1]]
+        ends = by_point[:, :, rows].transpose(2, 0, 1).reshape(4, 3)
+        shifts.append(np.linalg.svd(ends, compute_uv=False).prod() / metre**2)
+    far = max(np.quantile(np.hypot(*left), 0.99), 5.0)
+    for span in (800.0, 0.5):
+        found = linearise(problem, state, block.use, block.sigma, span)
+        assert found.image == pytest.approx(image, rel=1e-3)
+        assert found.area == pytest.approx(2 * far * max(2 * far, np.median(shifts) * max(span, 1.0)), rel=1e-3)
+        assert found.choices == 4
+        np.testing.assert_allclose(found.precision, problem.camera_prior.sigma.ravel() ** -2.0)
+
+
+def test_numbers_of_a_mixture_are_those_of_its_subsets() -> None:
+    """Six of each view of every subset; of more than four views of all, all but one, and none."""
+    assert linearised.numbers(np.array([2, 3, 4])) == 6 * (4 * 2 + 8 * 3 + 16 * 4)
+    assert linearised.numbers(np.array([5, 12])) == 6 * (6 * 5 + 13 * 12)

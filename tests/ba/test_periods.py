@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.ba.evidence.periods import swings
+from barpc.ba.evidence import periods
+from barpc.ba.evidence.periods import price, swings
 from barpc.ba.usual import SURE
 
 
@@ -58,3 +59,42 @@ def test_rows_that_wander_gain_far_less_as_a_swing_than_they_are_off(seed: int) 
     found = swings(view, row, size, np.ones(len(view)), off)
     explained = 0.5 * 1500 * 0.25
     assert not found or found[0].gain < 0.4 * explained
+
+
+# --- piece by piece -------------------------------------------------------------------------------------------------
+
+
+def test_a_period_costs_the_choice_among_four_a_shortest_wave_and_all_views() -> None:
+    assert price(3200.0, 3) == pytest.approx(np.log(400 * 3))
+    assert price(5.0, 3) == pytest.approx(np.log(3))
+
+
+def test_the_vertex_is_that_of_the_parabola() -> None:
+    at = np.arange(7.0)
+    for vertex in (2.7, 3.0, 3.4):
+        gain = 5.0 - 2.0 * (at - vertex) ** 2
+        assert 3 + periods._vertex(gain, 3) == pytest.approx(vertex)
+    assert periods._vertex(5.0 - (at - 9.0) ** 2, 3) == 0.5  # no farther than half a step
+    assert periods._vertex(-gain, 3) == 0.0
+    assert periods._vertex(gain, 0) == periods._vertex(gain, 6) == 0.0
+
+
+def test_the_spectrum_is_half_of_what_least_squares_take_away() -> None:
+    """A cosine and a sine in both coordinates, in units in which noise scatters alike, at places of whole bins."""
+    rng = np.random.default_rng(3)
+    rows, n = 1200.0, 400
+    row = rng.integers(0, 300, n) * 4.0 + 1.0
+    right, off = rng.uniform(0.3, 1.0, n), rng.normal(size=(2, n)) * [[1.0], [2.0]]
+    off[1] += 0.5 * off[0] + 0.8 * np.sin(row / 30.0)
+    one = periods._Rows(row, rows, right, off)
+    found = one._spectrum(off, 2)
+    assert len(found) == 75  # of 37.5 waves
+    centred = off - (off @ right / right.sum())[:, None]
+    noise = (centred * right) @ (centred * right).T / right.sum()
+    white = np.linalg.solve(np.linalg.cholesky(noise), centred)
+    for k in (5, 12, 31):
+        phase = 2.0 * np.pi * (k / 2) * np.floor(row / 4.0) / 300
+        basis = np.stack([np.cos(phase), np.sin(phase)])
+        pull = (basis * right) @ white.T
+        taken = np.einsum("ic,ij,jc->", pull, np.linalg.inv((basis * right) @ basis.T), pull)
+        assert found[k] == pytest.approx(0.5 * taken, rel=1e-6)

@@ -517,3 +517,96 @@ def test_what_was_cut_is_seen_where_two_others_tell_its_point() -> None:
     block: Any = SimpleNamespace(point=np.array([0, 0, 0, 1, 1, 2]), num_points=4)
     outcome: Any = SimpleNamespace(inlier=np.array([True, True, False, True, False, True]))
     np.testing.assert_array_equal(judging._told(outcome, block), [1, 1, 1, 0, 0, 0])
+
+
+def test_what_stands_out_is_asked_and_said_in_pixels(monkeypatch) -> None:
+    """A floor in standard deviations of the median tie; of what is found what gains enough."""
+    asked: list[Any] = []
+    found = [replace(interval(0, 1), gain=gain, off=3.0) for gain in (SURE, SURE + 0.1)]
+    monkeypatch.setattr(judging, "scan", lambda *given: asked.append(given) or found)
+    monkeypatch.setattr(judging, "swings", lambda *given: asked.append(given) or "swings")
+    rows, off = np.array([0, 1, 1, 1], dtype=bool), np.arange(6.0).reshape(2, 3)
+    monkeypatch.setattr(judging, "_whitened", lambda outcome, block: (rows if outcome and block else None, off))
+    block: Any = SimpleNamespace(
+        view=np.array([5, 0, 1, 1]), xy=np.arange(8.0).reshape(2, 4), sigma=np.array([9.0, 0.1, 0.25, 0.4]),
+        views=[SimpleNamespace(size=(100, 200)), SimpleNamespace(size=(300, 400))],
+        point=np.array([0, 1, 1, 1]), num_points=2,
+    )  # fmt: skip
+    outcome: Any = SimpleNamespace(inlier=np.array([1, 1, 0, 1], dtype=bool), noise=2.0, standing_out={})
+    (one,) = judging.standing_out(outcome, block, 0.3)
+    assert one.gain > SURE
+    assert one.off == pytest.approx(3.0 * 0.5)
+    view, place, size, wrong, seen_off, told, floor = asked[0]
+    assert floor == pytest.approx(0.3 / 0.5)
+    np.testing.assert_array_equal(view, [0, 1, 1])
+    np.testing.assert_array_equal(place, block.xy[:, 1:])
+    np.testing.assert_array_equal(size, [[100, 300], [200, 400]])
+    np.testing.assert_array_equal(wrong, [0, 1, 0])
+    np.testing.assert_array_equal(told, [1, 0, 1])
+    assert seen_off is off
+    assert judging.standing_out(outcome, block, 0.3)[0] is one  # looked for once
+    assert len(asked) == 1
+    assert judging.swinging(outcome, block) == "swings"
+    view, row, size, right, seen_off = asked[1]
+    np.testing.assert_array_equal(row, block.xy[1, 1:])
+    np.testing.assert_array_equal(right, [1, 1, 1])
+    rows[:] = False
+    asked.clear()
+    judging.standing_out(outcome, block, 0.7)
+    assert asked[0][-1] == pytest.approx(0.7)  # of no ties a deviation is a pixel
+
+
+def test_ties_among_some_views_are_linearised_where_they_are_not_too_many(monkeypatch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(judging, "revived", lambda *given: asked.append(given) or ("revived", None))
+    monkeypatch.setattr(judging, "linearise", lambda *given: asked.append(given) or "linear")
+    block = tied([(0, 1), (1, 2), (0, 2), (0, 1)], 3)
+    block.num_tracks, block.sigma, block.alt_range = 3, np.full(8, 0.5), (100.0, 450.0)
+    block.use[0] = False
+    problem = SimpleNamespace(free=np.ones(3 * 200))
+    outcome: Any = SimpleNamespace(problem=problem, minimum=SimpleNamespace(state="s"), residual="r", inlier="i")
+    assert judging.around(outcome, block, np.array([0, 1])) == ("linear", "revived")
+    np.testing.assert_array_equal(asked[0][4], [0, 2, 2, 2, 2, 2, 2, 2])
+    given, state, use, sigma, span = asked[1]
+    assert (given is problem, state, sigma is block.sigma, span) == (True, "revived", True, 350.0)
+    np.testing.assert_array_equal(use, [0, 1, 1, 0, 1, 0, 0, 0])
+    assert judging.around(outcome, block, np.arange(3)) is None  # 600 unknowns
+    counted = list[Any]()
+    monkeypatch.setattr(judging, "numbers", lambda count: counted.append(count.tolist()) or 3e7)
+    assert judging.around(outcome, block, np.array([0, 1])) is not None
+    assert counted == [[1, 1, 1]]
+    monkeypatch.setattr(judging, "numbers", lambda count: 3.1e7)
+    assert judging.around(outcome, block, np.array([0, 1])) is None
+
+
+def test_some_views_are_judged_under_numbers_of_their_own(monkeypatch, caplog) -> None:
+    """What stands out in the others is left out; a fit that fails is no judgement."""
+    block = tied([(0, 1), (1, 3), (3, 2)], 4)
+    block.xy, block.sigma = np.arange(12.0).reshape(2, 6), np.array([0.1, 0.2, 0.3, 0.3, 0.4, 0.5])
+    linear = SimpleNamespace(among=lambda views: SimpleNamespace(views=views, thinned=lambda most: ("few", most)))
+    monkeypatch.setattr(judging, "around", lambda *_: (linear, "state"))
+    parts = SimpleNamespace(of=lambda problem, state: SimpleNamespace(part=lambda rows: rows))
+    monkeypatch.setattr(judging, "Ground", parts)
+    monkeypatch.setattr(judging, "standing_out", lambda *_: [interval(0, 1, view) for view in (3, 0, 1)])
+    monkeypatch.setattr(judging, "fit", lambda linear: "base")
+    asked: list[Any] = []
+    monkeypatch.setattr(judging, "_Search", lambda *given: asked.append(given) or SimpleNamespace(run=lambda: "said"))
+    outcome: Any = SimpleNamespace(problem=None)
+    assert judging._judged_among(outcome, block, 0.07, np.array([1, 3])) == "said"
+    ((found, first, floor, sigma),) = asked
+    assert [one.view for one in first] == [1, 0]
+    assert (floor, sigma, found.base, found.few) == (0.07, pytest.approx(0.3), "base", ("few", 2000))
+    np.testing.assert_array_equal(found.ground, [1, 2, 3, 4])
+    np.testing.assert_array_equal(found.place, block.xy[:, 1:5])
+    np.testing.assert_array_equal(found.size, [[100, 100], [200, 200]])
+    assert found.extra.shape == (2, 0, 4)
+    assert found.sigma.shape == (0,)
+
+    def fails(_: Any) -> None:
+        raise np.linalg.LinAlgError("not positive definite")
+
+    monkeypatch.setattr(judging, "fit", fails)
+    assert judging._judged_among(outcome, block, 0.07, np.array([1, 3])).findings == ()
+    assert "not judged" in caplog.text
+    monkeypatch.setattr(judging, "around", lambda *_: None)
+    assert judging._judged_among(outcome, block, 0.07, np.array([1, 3])).findings == ()
