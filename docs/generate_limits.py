@@ -16,6 +16,7 @@ from barpc.pointio import colmap, hloc, names
 from barpc.remote import _KEPT as HELD
 from barpc.remote import _LONGEST as REQUEST
 from barpc.remote import BLOCK, web
+from barpc.report import tables
 from barpc.rpcio import acquisition, text, tiff
 from barpc.sensor import document as metadata
 from barpc.sensor.sicd import metadata as sicd
@@ -110,7 +111,7 @@ def rows() -> list[tuple[str, str]]:
             "points of a fit, of a table, of a grid",
             f"{many(geodesy.FAR)} px",
         ),
-        ("numbers of a run's tables", many(geodesy.FAR)),
+        ("numbers of a run's tables", many(tables._FAR)),
         ("coordinates of a DEM", many(geodesy.FAR)),
         ("standard deviations of ground points", " to ".join(map(many, scene.SIGMA_RANGE))),
     ]

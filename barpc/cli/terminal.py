@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from barpc.errors import visible
-from barpc.report.summary.words import NAMED
 
 if TYPE_CHECKING:
     from barpc.report import Summary
@@ -33,6 +32,7 @@ _LIMITS = {
     "pairs": "{:,} pairs, none with an epipolar offset of more than 0.5 px (RMS): all {}",
 }
 GAP = "  "
+_REASONS = 5  # in the line that says why a run does not pass
 NARROWEST = 12  # The first column of a table is not folded below so many characters
 _COLORS = {"good": "green", "look": "yellow", "bad": "red"}
 
@@ -55,8 +55,8 @@ def say(message: str) -> None:
 
 def tell_gate(headline: str, reasons: list[str]) -> int:
     """Say why a command that finished does not pass; its exit code."""
-    more = [f"and {len(reasons) - NAMED} more"] if len(reasons) > NAMED else []
-    say(" ".join([f"exit code {EXIT_GATE}:", headline, *reasons[:NAMED], *more]))
+    more = [f"and {len(reasons) - _REASONS} more"] if len(reasons) > _REASONS else []
+    say(" ".join([f"exit code {EXIT_GATE}:", headline, *reasons[:_REASONS], *more]))
     return EXIT_GATE
 
 

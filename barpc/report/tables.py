@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from barpc import __version__
 from barpc.errors import InputError
-from barpc.geodesy import FAR, Array, ecef_from_ground, enu_basis
+from barpc.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.geojson import collection, feature
 from barpc.pointio.names import cell, from_cell
 from barpc.report.outcome import Run
@@ -172,6 +172,7 @@ SURFACE = "surface.json"
 
 
 # --- read back --------------------------------------------------------------------------------------------
+_FAR = 1e12  # px, deg and m: no number of a table comes near
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,7 +335,7 @@ def _columns(text: str, header: Sequence[str]) -> list[list[str]]:
 def _floats(columns: Sequence[Sequence[str]], known: int) -> Array:
     """Return the columns (n, len(columns)) of numbers, of which only those from `known` on may be empty (NaN)."""
     table = np.array([[float(cell or "nan") for cell in column] for column in columns], dtype=np.float64).T
-    if np.isnan(table[:, :known]).any() or (np.abs(table) > FAR).any():
+    if np.isnan(table[:, :known]).any() or (np.abs(table) > _FAR).any():
         raise ValueError("a number is missing or absurdly large")
     return table
 

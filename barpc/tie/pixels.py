@@ -30,6 +30,8 @@ CELL = 64
 """Side of the cells that each hold a quota of keypoints [px]; tiles are whole cells."""
 SPAN = 512
 """Rows that are read at a time (at least one row of blocks), and what else is done in parts of so many."""
+MEMORY = 1 << 28
+"""Bytes of what a task works on at a time, about; they decide on no figure."""
 _SAMPLES = 5  # blocks a side whose pixels make the stretch
 _LEVEL = 4  # px a side of a pixel of the samples, where decoding is dear
 _NEGLIGIBLE = 8.0  # a range below so many steps of a float type is a constant image

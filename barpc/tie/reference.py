@@ -19,7 +19,7 @@ from barpc.geodesy import Array, metres_per_unit
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
 from barpc.tie.patches.channels import FoundTemplates, correlation, find, joined, margin
-from barpc.tie.patches.oriented import HALF
+from barpc.tie.patches.oriented import BACK, HALF
 from barpc.tie.patches.resampled import Patch, Sheet, Terrain, of_image, of_reference, shown
 from barpc.tie.pixels import FloatImage
 from barpc.tie.tasks import Progress, ordered
@@ -38,7 +38,7 @@ _TILE = 192, 48  # px: points of a tile are looked for together; where the raste
 _PIXELS = 20e6  # of a tile in a raster, at most, about
 _LEAST = 12  # points that agree in a view
 _BEYOND = 3.0  # times what is expected. Measured: the terrain's 0.5-1.3, of another place, mirrored, flat 6-9
-_MARGIN, _BACK = 0.1, 1.5  # by which a correlation beats its decoy's; px that the way back may miss by
+_MARGIN = 0.1  # by which a correlation beats its decoy's
 _NEAR, _FAR, _ROUNDS = (
     3.0,
     3.0,
@@ -344,7 +344,7 @@ class _Work:
         if not parts:
             return report, None
         point, found = np.concatenate([tile.points for tile, _ in parts]), joined([part for _, part in parts])
-        passed = found.passed(_MARGIN, _BACK)
+        passed = found.passed(_MARGIN, BACK)
         report = replace(report, tried=len(point), passed=int(passed.sum()))
         middle = np.append(places[point].mean(axis=0), view.altitude)
         local = (places[point] - middle[:2]) * metres_per_unit(middle)[:2]

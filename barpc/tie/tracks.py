@@ -17,14 +17,13 @@ from barpc.geodesy import Array, ground_from_ecef
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
-from barpc.tie.matchers.features import KeypointFiles, locate, worth_a_first_look
+from barpc.tie.matchers.features import THIN, KeypointFiles, locate, worth_a_first_look
 from barpc.tie.matchers.given import GivenMatches, verify_given
 from barpc.tie.matchers.matcher import Matches
 from barpc.tie.matchers.matching import (
     FINE,
     MATCHERS,
     STRUCTURE,
-    THIN,
     PairReport,
     ample,
     enough,
@@ -37,7 +36,7 @@ from barpc.tie.pairing.choice import COMPARED, TRIES, best_pairs, further_pairs,
 from barpc.tie.pairing.epipolar import grouped, linear_map
 from barpc.tie.pairing.overlaps import Pair, possible_pairs, require_connected
 from barpc.tie.pairing.resolution import Looks
-from barpc.tie.patches.register import refine
+from barpc.tie.patches.register import REACH, refine
 from barpc.tie.patches.resampled import Terrain
 from barpc.tie.store import Store, store_of
 from barpc.tie.tasks import Progress, ordered
@@ -49,7 +48,7 @@ NEEDED = 4
 _DEFAULTS = TieOptions()
 _NOTHING: GivenMatches = MappingProxyType({})
 _SPARE = 1.3  # tracks registered for each one kept
-_SAME = 2.2  # px that registration may move a point by, rounding included
+_SAME = REACH + 0.5**0.5  # px that registration, and rounding, may move a point by
 _QUOTAS = (4, 8, 16)
 """Tracks that a cell takes, round by round; with the first an image of full cells holds what is asked for."""
 

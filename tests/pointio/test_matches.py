@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.errors import InputError
-from barpc.pointio.matches import SIGMA, read_matches, write_matches
+from barpc.pointio.matches import IMAGE_SIGMA, read_matches, write_matches
 from barpc.scene import Tracks
 
 NAMES = ["a", "b", "c"]
@@ -42,7 +42,7 @@ def test_a_csv_by_hand_needs_four_columns_in_any_order(tmp_path):
     path.write_text("# mine\ntrack, row, col, image\nx7, 2.5, 1.5, /data/a.tif\nx7, 4, 3, b.tif\n")
     found = read_matches(path, NAMES)
     np.testing.assert_array_equal(found.xy, [[1.5, 2.5], [3, 4]])
-    assert (found.sigma == SIGMA).all()
+    assert (found.sigma == IMAGE_SIGMA).all()
 
 
 def _asp(path, left, right):

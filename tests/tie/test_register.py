@@ -212,7 +212,7 @@ def test_the_result_does_not_depend_on_opencv_threads(texture, reference) -> Non
 def test_what_has_not_settled_is_not_ok(texture, reference, monkeypatch) -> None:
     """After one step from half a pixel away the last step is far longer than one that settles."""
     assert run(texture, texture, reference, reference + 0.5, np.eye(2)).ok.all()
-    monkeypatch.setattr("barpc.tie.patches.register._STEPS", 1)
+    monkeypatch.setattr("barpc.tie.patches.register.NEWTON_STEPS", 1)
     assert not run(texture, texture, reference, reference + 0.5, np.eye(2)).ok.any()
     assert run(texture, texture, reference, reference + 0.001, np.eye(2)).ok.all()
 

@@ -215,7 +215,7 @@ def test_patches_are_registered_tile_by_tile(monkeypatch) -> None:
 
     monkeypatch.setattr("barpc.tie.patches.register.ordered", ordered)
     monkeypatch.setattr("barpc.tie.patches.register._sparse", lambda *_: False)
-    monkeypatch.setattr("barpc.tie.patches.register._ALL_OF_A_PAIR", 1)
+    monkeypatch.setattr("barpc.tie.patches.register.CHUNK", 1)
     found = links.register(TieOptions(tile=256), None, None)
     assert len(found.xy) == 160
     for _, band, origin, start, linear, structural, tile in seen:

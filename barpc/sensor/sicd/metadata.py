@@ -9,13 +9,14 @@ from typing import BinaryIO, Literal
 import numpy as np
 
 from barpc.errors import InputError, RpcFormatError
-from barpc.geodesy import ALTITUDES, EARTH_RATE, Array, ground_from_ecef
+from barpc.geodesy import EARTH_RATE, Array, ground_from_ecef
 from barpc.sensor.curve import Curve
 from barpc.sensor.document import RELIEF_AROUND, Fields
 from barpc.sensor.sicd.formation import Formation, ImagePlane, PolarFormat, RangeAzimuth, ZeroDoppler
 from barpc.sensor.sicd.monostatic import Monostatic
 from barpc.sidefile import MAX_XML, PRODUCT, opened, parse_xml
 
+_GROUND = (-1000.0, 10000.0)  # m: where a scene's centre can be
 _ORDER = 30  # no polynomial of a document has so high a power
 _SCP_TOLERANCE = 1.0  # px: where the stated centre point must project
 _NITF = b"NITF02.10"
@@ -90,7 +91,7 @@ def open_sicd(path: Path) -> Monostatic:
         raise InputError(f"{path}: a bistatic image; only monostatic ones are read")
     scp = _vector(root, "GeoData/SCP/ECF")
     altitude = float(ground_from_ecef(scp)[2])
-    if not ALTITUDES[0] <= altitude <= ALTITUDES[1]:
+    if not _GROUND[0] <= altitude <= _GROUND[1]:
         raise RpcFormatError(f"{path}: GeoData/SCP/ECF is {altitude:.0f} m above the ellipsoid, not on the ground")
     first = [_whole(root, f"ImageData/First{axis}") for axis in ("Row", "Col")]
     center = [_whole(root, f"ImageData/SCPPixel/{axis}") for axis in ("Row", "Col")]

@@ -22,12 +22,13 @@ from scipy.spatial import cKDTree
 from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import IntArray, View
-from barpc.tie.matchers.features import KeypointFiles, Keypoints, ample_matches, join_keypoints
+from barpc.tie.matchers.features import THIN, KeypointFiles, Keypoints, ample_matches, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
 from barpc.tie.matchers.hook import Hook, hooked
 from barpc.tie.matchers.matcher import NO_MATCHES, Matcher, Matches, Prediction
 from barpc.tie.matchers.structural import FineStructure, GradientStructure
 from barpc.tie.pairing.epipolar import (
+    FEW,
     LEAST_REACH,
     EpipolarSegments,
     affine_inliers,
@@ -53,10 +54,9 @@ def matcher_named(name: str) -> type[Matcher] | Hook:
     return MATCHERS[name] if name in MATCHERS else hooked(name)
 
 
-THIN = 100
-"""Verified matches of a pair below which it is tried again,"""
-SHARE, FEW = 0.3, 30
-"""unless they are this share of the keypoints in its common area, and so many: small images have no more to give."""
+SHARE = 0.3
+"""A pair of fewer than `THIN` is not tried again where they are this share of the keypoints in its common area, and
+`FEW`: small images have no more to give."""
 TOLERANCE = 3.0
 """Half the width of the band about the corrected epipolar line, at most [px]."""
 _DEFAULTS = TieOptions()

@@ -22,9 +22,9 @@ from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments, grouped, linear_map
 from barpc.tie.patches.oriented import HALF, TILE, PatchTile, Sampling, found_about, resolution
-from barpc.tie.pixels import Box, FloatImage
+from barpc.tie.pixels import MEMORY, Box, FloatImage
 
-_SURFACE = 1 << 23  # places at which a tile's points are compared, all together: 30 bytes each
+_SURFACE = MEMORY // 30  # places at which a tile's points are compared, all together, in bytes each
 _POINTS = 200, 500, 1000  # looked for: of the cameras' error, in long bands, in short ones
 _FINE_POINTS = 600, 1500  # of the cameras' error, in bands, where whole pixels are looked at
 _RING = 3.5  # pitches about a point whose neighbours speak for its places, together

@@ -11,7 +11,8 @@ import numpy.typing as npt
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray, View
 
-_FEW = 30  # points below which an affine error is not told from a constant one
+FEW = 30
+"""Points below which an affine error is not told from a constant one, and a spread is none."""
 _TUKEY = 4.685
 LEAST_REACH = 5.0
 """Half a segment [px] below which places along it say nothing of altitudes."""
@@ -122,7 +123,7 @@ def robust_affine(xy: Array, values: Array, steps: int = 12) -> Affine:
     """
     middle, scale = np.median(xy, axis=0), np.maximum(np.ptp(xy, axis=0), 1.0)
     design = _design(xy, middle, scale)
-    columns = 3 if len(xy) >= _FEW else 1
+    columns = 3 if len(xy) >= FEW else 1
     coefficients = np.array([np.median(values), 0.0, 0.0])
     for _ in range(steps):
         residual = values - design @ coefficients
@@ -159,7 +160,7 @@ def affine_inliers(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolAr
         return keep, values
     residual = values - robust_affine(xy, values)(xy)
     for rows in grouped(*np.floor(xy[:, ::-1] / _WINDOW).T):
-        if len(rows) >= 2 * _FEW:
+        if len(rows) >= 2 * FEW:
             residual[rows] = values[rows] - robust_affine(xy[rows], values[rows])(xy[rows])
         keep[rows] = np.abs(residual[rows]) <= max(3.0 * robust_spread(residual[rows]), floor)
     return keep, residual

@@ -12,7 +12,7 @@ from barpc.scene import BoolArray, IntArray
 from barpc.tie.pairing.epipolar import grouped
 from barpc.tie.patches.channels import BATCH, COARSE, EDGE, FINE, SHOWN, channels, correlation, cut
 from barpc.tie.patches.resampled import picture, ticks
-from barpc.tie.pixels import FloatImage
+from barpc.tie.pixels import MEMORY, FloatImage
 
 Files = Sequence[tuple[str, tuple[int, int]]]
 """Path and size (width, height) of two images."""
@@ -25,8 +25,8 @@ HALF = 16
 """How far a template reaches to each side [px]."""
 TILE = 256
 """Points of a tile of so many px a side share a picture."""
-_AREA = 1 << 21  # px of areas that templates are correlated with at a time, together: 60 bytes a px
-_BACK = 1.5  # px that the way back may miss by
+_AREA = MEMORY // 60  # px of areas that templates are correlated with at a time, together, in bytes a px
+BACK = 1.5  # px that the way back may miss by
 _FINER = 3  # px to each side that a finer picture is searched, and the last one, of half its step
 
 
@@ -161,7 +161,7 @@ class PatchTile:
             back = correlation(there, cut(self.pictures[0], self.at[i], self.half + search, self.half + search))
             y, x = np.divmod(back.reshape(len(back), -1).argmax(axis=1), back.shape[2])
             missed.append(np.hypot(x - search, y - search))
-        return np.asarray(np.concatenate(missed) <= _BACK)
+        return np.asarray(np.concatenate(missed) <= BACK)
 
     def shown(self) -> BoolArray:
         """Return the templates that hold structure."""

@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from barpc.geodesy import Array
+from barpc.geodesy import CHUNK, NEWTON_STEPS, Array
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View
-from barpc.tie.pairing.epipolar import LEAST_REACH, affine_inliers, frame, grouped, linear_map, robust_spread
+from barpc.tie.pairing.epipolar import FEW, LEAST_REACH, affine_inliers, frame, grouped, linear_map, robust_spread
 from barpc.tie.patches import oriented
 from barpc.tie.patches.channels import SETTLED
 from barpc.tie.pixels import SPAN, FloatImage, PixelReader, grow, levelled
@@ -30,23 +30,20 @@ MIN_CORRELATION = 0.8
 """Of two registered patches, or the match is left out."""
 PATCH = 21
 """Side of the patches that are registered [px], odd."""
-_STEPS = 12
 _CHUNK = 256  # patches worked on at a time: they stay in cache
-_ALL_OF_A_PAIR = 8192  # points of a task where they are many: its tiles share what is decoded
 _SMALLER = 0.7  # side of the patch of the second try and of the check
 _TORN = 0.5  # px that the smaller patch may lie apart
 _FINE = 4  # samples a pixel and axis
 _GRID = 1.0 / (32 * _FINE)  # px; positions that the sampler tells apart
-_REACH = 1.5  # px; a patch that moves farther has left its point
-_WEIGHT = 0.7  # standard deviation of the patch's Gaussian weight, in half sides
 _LEAST_SIGMA = 1e-3  # px, of a registration
+REACH = 1.5  # px; a patch that moves farther has left its point
+_WEIGHT = 0.7  # standard deviation of the patch's Gaussian weight, in half sides
 _TAPS = 6  # samples on either side in the interpolation
 _RIDGE = 1e-6  # of what a normal matrix holds; relative deviation below which a patch is flat
 _FLOOR = 0.1  # px across the epipolar line that are always tolerated, and in a place only compared
 _DISTORTED = 2.0  # times the median sigma about it: the patch lies across a step of the ground
-_ABOUT = 64  # nearest points that tell it: contrast and noise are not alike all over a scene
-_LEAST_END_SIGMA = 0.02  # px, of an observation
 _FEW = 20  # observations of a pair of views below which their sigmas are not scaled by their errors
+_LEAST_END_SIGMA = 0.02  # px, of an observation
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +81,7 @@ def register_places(
     Where a size is a part of the file's, pixels are means of the file's (`PixelReader`).
     """
     cv2.setNumThreads(1)
-    margin = patch + _TAPS + int(_REACH)
+    margin = patch + _TAPS + int(REACH)
     sparse, every = _sparse(reference, margin), PatchRegistration.none(start)
     read, groups = (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, min(tile, SPAN)))
     (path, size), (other, beyond) = files
@@ -138,8 +135,8 @@ def _parts(origin: Array, links: IntArray, tile: int) -> list[IntArray]:
     """Return the links that are registered in one task: of whole tiles, or, where they are few, of whole
     bands of rows, swept by columns: strips and blocks are decoded once.
     """
-    if not _sparse(origin, PATCH + _TAPS + int(_REACH)):
-        return [links[rows] for rows in _joined(_by_tile(origin, tile), _ALL_OF_A_PAIR)]
+    if not _sparse(origin, PATCH + _TAPS + int(REACH)):
+        return [links[rows] for rows in _joined(_by_tile(origin, tile), CHUNK)]
     order = np.lexsort((origin[:, 0], origin[:, 1] // SPAN))
     bands = np.split(order, np.flatnonzero(np.diff(origin[order, 1] // SPAN)) + 1)
     pieces = [band[at : at + SPAN] for band in bands for at in range(0, len(band), SPAN)]
@@ -315,7 +312,7 @@ class _Template:
         noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - 8.0)
         sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_LEAST_SIGMA)
         moved = np.hypot(*(xy - start).T)
-        ok = (step <= 10 * settled) & (moved <= _REACH) & np.isfinite(sigma)
+        ok = (step <= 10 * settled) & (moved <= REACH) & np.isfinite(sigma)
         return PatchRegistration(xy, correlation, sigma, ok)
 
     def _iterate(
@@ -334,7 +331,7 @@ class _Template:
         length, gain = np.full(len(centre), np.inf), np.zeros(len(centre))
         active = np.arange(len(centre))
         jacobian, inverse = solver
-        for _ in range(_STEPS):
+        for _ in range(NEWTON_STEPS):
             sampled = np.rint(centre[active] / _GRID) * _GRID  # else the sampler would round, and we not know
             patches = self._normalized(self._sample(fine, sampled, linear[active]))[0]
             right = (jacobian @ (self._root * patches)[:, :, None]).astype(np.float64)
@@ -502,7 +499,7 @@ class _Links:
 
 def _usual(places: Array, sigma: Array) -> Array:
     """Return the median of the sigmas (N,) of the nearest places (N, 2)."""
-    near = cKDTree(places).query(places, k=min(_ABOUT, len(places)))[1]
+    near = cKDTree(places).query(places, k=min(FEW, len(places)))[1]
     out: Array = np.median(sigma[near.reshape(len(places), -1)], axis=1)
     return out
 

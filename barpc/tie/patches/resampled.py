@@ -19,13 +19,13 @@ from barpc.geodesy import Array, metres_per_unit
 from barpc.raster import open_raster
 from barpc.scene import BoolArray, View
 from barpc.tie.patches.channels import CHANNELS, channels
-from barpc.tie.pixels import Box, FloatImage, grow, levelled, read_pixels
+from barpc.tie.pixels import MEMORY, Box, FloatImage, grow, levelled, read_pixels
 
 Terrain = Callable[[Array, Array], Array]
 """lon, lat (...) [deg] -> altitude (...) [m above the ellipsoid], NaN where it is unknown."""
 
 _NODE = 8  # px between exact projections; straight lines between them
-_MOST = 1 << 24  # px that are averaged at a time: 16 bytes each
+_MOST = MEMORY // 16  # px that are averaged at a time, in bytes each
 _KNOWN = 0.99  # of what a pixel is made of must be valid
 
 
