@@ -23,12 +23,13 @@ from barpc import __version__
 from barpc.dsm.cells import F32, MATCHED, SIDE, Tile, surface_tile
 from barpc.dsm.imagery import Block, NoSurfaceError, Pairs
 from barpc.errors import InputError
-from barpc.geodesy import Array
+from barpc.geodesy import Array, utm
 from barpc.options import DsmOptions
 from barpc.pipeline.executor import CachingExecutor, worker_count
 from barpc.pipeline.inputs import hash_files
 from barpc.scene import View
 from barpc.sensor.geometry import footprint, ground_sample_distance
+from barpc.tie.pairing.epipolar import common_range
 from barpc.tie.tasks import Progress, one_by_one
 from barpc.workspace import Workspace
 
@@ -115,10 +116,8 @@ class Grid:
     def tile(self, col: int, row: int) -> Tile:
         """Return the tile that begins at a cell."""
         size = min(self.side, self.size[0] - col), min(self.side, self.size[1] - row)
-        views = self.block.views
-        alts = max(v.alt_range[0] for v in views), min(v.alt_range[1] for v in views)
         corner = self.west + self.step * col, self.north - self.step * row
-        return Tile(self.crs.to_wkt(), *corner, self.step, size, (min(alts), max(alts)))
+        return Tile(self.crs.to_wkt(), *corner, self.step, size, common_range(*self.block.views))
 
     def fill(self, path: Path, run: Workspace, executor: Executor | None, progress: Progress | None) -> Counts:
         """Write all tiles into a plain GeoTIFF; each is made by a worker and forgotten once it is written."""
@@ -234,8 +233,7 @@ def _refuse_side(step: float, smallest: float, largest: float) -> None:
 def _crs(given: str | None, middle: Array) -> CRS:
     """Return the CRS that was asked for, in metres, or the UTM zone of a place."""
     if given is None:
-        zone = int((middle[0] + 180.0) // 6.0) % 60 + 1
-        return CRS.from_epsg((32600 if middle[1] >= 0 else 32700) + zone)
+        return CRS.from_string(utm(*middle[:2])[1])
     try:
         found = CRS.from_user_input(given)
     except (CRSError, ValueError) as error:
@@ -247,9 +245,8 @@ def _crs(given: str | None, middle: Array) -> CRS:
 
 def _common(first: View, second: View, crs: CRS) -> Any:
     """Return the ground that two views see at their lowest or highest altitude, on the map."""
-    low, high = max(first.alt_range[0], second.alt_range[0]), min(first.alt_range[1], second.alt_range[1])
     parts = []
-    for alt in (low, high):
+    for alt in common_range(first, second):
         rings = []
         for view in (first, second):
             ring = footprint(view.sensor, view.size, alt)
