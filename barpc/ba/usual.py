@@ -28,6 +28,9 @@ GROSS = 100.0
 FEW = 30
 """Observations that tell a standard deviation to an eighth, 1 / sqrt(2 n): fewer tell nothing by themselves."""
 
+FEWEST = 20
+"""Observations, or degrees of freedom, that tell a variance to a third, sqrt(2 / n): of fewer nothing is said."""
+
 SAMPLE = 2000
 """Observations or points that stand for all."""
 

@@ -136,7 +136,7 @@ def test_the_rays_that_meet_are_those_of_the_middle_row(monkeypatch) -> None:
             out[rows] = camera.localize(image[rows], alt[rows])
         return out
 
-    monkeypatch.setattr(geometry, "localize", localize)
+    monkeypatch.setattr(geometry, "localize_stack", localize)
     camera: Any = Pinhole()
     found = camera_center(camera, SIZE, ALTITUDES)
     middle = camera.center + (SIZE[1] - 1) / 2 * fly

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtrc, gammaln
 
-from barpc.ba.usual import CHANCE, FEW
+from barpc.ba.usual import CHANCE, FEWEST
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
@@ -68,7 +68,7 @@ def met_worse(unused: Unused, size: Array, limit: float, least: float, share: fl
         Tolerances: displacement that near ones may have in common [px], share of a place that may be far off.
     """
     whole = [_thinned(unused.part(unused.view == v), size[:, v]) for v in range(size.shape[1])]
-    whole = [one for one in whole if len(one.view) >= FEW]
+    whole = [one for one in whole if len(one.view) >= FEWEST]
     tests = 2.0 * len(whole) * _PLACES.shape[1]  # of each place the far ones and the near ones
     found = [_worst(one, size[:, one.view[0]], limit, least, share) for one in whole]
     sure = [replace(one, chance=one.chance * tests) for one in found if one and one.chance * tests < CHANCE]

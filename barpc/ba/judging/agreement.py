@@ -40,8 +40,8 @@ _OPTIMISTIC = 3.5  # nats for each factor of e in the accuracies. Measured, 60 d
 # points 3 m off is found in 55, 57, 57; six with sigmas 3 x too small stay together in 59, 59, 59
 _FLOPPY = 2.0  # nats, the same for the motions
 _WRONG = float(np.log(1.0 / LEVEL - 1.0))  # nats that it costs to call a point wrong: one in twenty is
-# nats: the density at one sigma of an error between one and 10,000, alike in its logarithm
-_ANYWHERE = float(np.log(4.0 * np.pi * np.log(1e4)))
+# nats: the density at one sigma of an error below 10,000, alike in its logarithm from one on
+_ANYWHERE = float(np.log(4.0 * np.pi * (1.0 / 3.0 + np.log(1e4))))
 _CLEAR = float(-np.log(LEVEL))  # nats by which a set must beat any other that contradicts it: one in twenty
 _AS_MANY = 10.0  # nats, where that other has as many points: how well points happen to fit is no vote
 

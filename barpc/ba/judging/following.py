@@ -67,7 +67,9 @@ def without_strips(found: Solution, judged: Judgement, block: Block, outer: Bloc
         return tried
     plain = follow(found, block, outer, options)  # splines and detectors may explain the same, and leave nothing
     calm = plain is not found and not standing_out(plain.outcome, block, options.noise_floor)
-    if not calm or is_better(tried.after, plain.after, outer):
+    # of swings and splines the fewer unknowns stay, where the others are not surely better
+    stays = not is_better(plain.after, tried.after, outer) if shaken else is_better(tried.after, plain.after, outer)
+    if not calm or stays:
         return tried
     return plainly if shaken else found
 

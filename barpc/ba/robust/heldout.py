@@ -18,7 +18,7 @@ from barpc.ba.evidence.mixture import NEAR_LIMIT, WRONG
 from barpc.ba.held.block import Block
 from barpc.ba.robust.weights import Observations, geman_mcclure
 from barpc.ba.solving.problem import Problem
-from barpc.ba.usual import FEW, ITERATIONS, SURELY
+from barpc.ba.usual import FEWEST, ITERATIONS, SURELY
 from barpc.errors import InputError
 from barpc.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.scene import BoolArray, GroundPoints, IntArray
@@ -115,7 +115,7 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
     squared = observations.squared(residual, counted)
     expected = block.sigma**2 * observations.freedom(counted)
     count, noise = np.bincount(block.view, minlength=views), np.full(views, np.nan)
-    many = count >= FEW
+    many = count >= FEWEST
     told = many[block.view]
     number = (np.cumsum(many) - 1)[block.view[told]]
     noise[many] = scatter(squared[told], expected[told] / block.sigma[told] ** 2, number)

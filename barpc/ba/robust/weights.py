@@ -14,7 +14,7 @@ import numpy as np
 from barpc.ba.held.ground import ALIKE
 from barpc.ba.robust.smooth import SPLINES
 from barpc.ba.solving.problem import Problem
-from barpc.ba.usual import FEW, GROSS, OUTLIER
+from barpc.ba.usual import FEWEST, GROSS, OUTLIER
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
@@ -147,7 +147,7 @@ class Observations:
         seen = np.zeros(self.structure.num_points, dtype=bool)
         seen[self.structure.point[use]] = True
         freedom = whitened.size - 3 * int((seen & ~self.has_prior).sum()) - int(problem.free.sum()) - fitted
-        if freedom < FEW:
+        if freedom < FEWEST:
             return 1.0
         return max(float(np.sqrt((whitened**2).sum() / freedom)), 1e-6)
 

@@ -63,24 +63,25 @@ class Guided:
 
 @dataclass(frozen=True, eq=False)
 class _Described:
-    """Descriptors as unit vectors, with orientation and scale as they should be in B."""
+    """Descriptors and their lengths, with orientation and scale as they should be in B."""
 
-    unit: FloatArray
+    values: FloatArray  # whole numbers: their products are exact in any order of summing, on any machine
+    length: FloatArray
     direction: FloatArray
     zoom: FloatArray
 
     @staticmethod
     def of(keypoints: Keypoints, linear: Array) -> _Described:
         values = keypoints.descriptors.astype(np.float32)
-        values /= np.maximum(np.linalg.norm(values, axis=1, keepdims=True), np.float32(1e-6))
+        length = np.maximum(np.linalg.norm(values, axis=1), np.float32(1e-6))
         turned = np.stack([np.cos(keypoints.angle), np.sin(keypoints.angle)], axis=-1) @ linear.T
         turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-9)
         zoom = np.log(keypoints.scale * np.sqrt(np.abs(np.linalg.det(linear))))
-        return _Described(values, turned.astype(np.float32), zoom.astype(np.float32))
+        return _Described(values, length, turned.astype(np.float32), zoom.astype(np.float32))
 
     def select(self, which: IntArray) -> _Described:
         """Return those of some keypoints."""
-        return _Described(self.unit[which], self.direction[which], self.zoom[which])
+        return _Described(self.values[which], self.length[which], self.direction[which], self.zoom[which])
 
     def likeness(self, other: _Described, allowed: npt.NDArray[np.bool_]) -> FloatArray:
         """Return the cosines (n, m) of the descriptors that are allowed, where orientation and scale are as
@@ -88,7 +89,8 @@ class _Described:
         """
         allowed &= self.direction @ other.direction.T >= np.float32(np.cos(_MAX_TURN))
         allowed &= np.abs(other.zoom - self.zoom[:, None]) <= np.float32(_MAX_ZOOM)
-        return np.where(allowed, self.unit @ other.unit.T, _NONE)
+        cosine = self.values @ other.values.T / (self.length[:, None] * other.length)
+        return np.where(allowed, cosine, _NONE)
 
 
 class _Best:
