@@ -63,7 +63,10 @@ def dsm(obj: dict[str, Any], /, source: tuple[str, ...], out: str, jobs: int | s
       barpc dsm both_dates -o change.tif --minus first_date
       barpc dsm adjusted -o dsm.tif --gsd 2 --crs EPSG:2154 -j 4
     """
-    run = Path(source[0]) if len(source) == 1 and (Path(source[0]) / "summary.json").is_file() else None
+    runs = [Path(one) for one in source if (Path(one) / "summary.json").is_file()]
+    if runs and len(source) > 1:
+        raise click.UsageError(f"{runs[0]} is a finished run: give it alone (--minus OTHER_RUN is for two dates)")
+    run = runs[0] if runs else None
     options = DsmOptions(**{name: value for name, value in flags.items() if value is not None})
     if run is None and options.minus is not None:
         raise click.UsageError("--minus goes with a RUN: what two dates share is not known of images")

@@ -308,3 +308,15 @@ def test_a_cell_is_larger_than_nothing_and_no_larger_than_a_kilometre():
     for side in (0.0, -1.0, 1000.5):
         with pytest.raises(InputError, match="gsd"):
             DsmOptions(gsd=side)
+
+
+def test_two_runs_or_a_run_and_images_are_not_one_source(tmp_path, capsys):
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "summary.json").write_text("{}")
+    for source in ([run, run], [run, "image.tif"], ["image.tif", run]):
+        with pytest.raises(SystemExit) as ended:
+            main(["dsm", *map(str, source), "-o", str(tmp_path / "x.tif")])
+        assert ended.value.code == 2
+        assert f"{run} is a finished run: give it alone (--minus OTHER_RUN" in " ".join(capsys.readouterr().err.split())
+    assert [one.name for one in tmp_path.iterdir()] == ["run"]
