@@ -19,14 +19,14 @@ from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dtpqrt
 
 from barpc.fit.precision import Normalization
-from barpc.geodesy import CHUNK, Array
+from barpc.geodesy import Array
 from barpc.sensor.rational import MONOMIALS, monomials
 
 IntArray = npt.NDArray[np.int64]
 Rounding = Callable[[Array], Array]
 """Coefficients (...) to the nearest ones that a file can hold."""
 
-"""Rows taken into the triangle at a time: what is worked on stays in cache."""
+_ROWS = 1024  # taken into the triangle at a time: what is worked on stays in cache
 _BLOCK = 8  # columns of a Householder block
 ALL = np.arange(20)
 _DEPENDENT = 1e-9  # rms of what a monomial adds to those of lower degree, on these points
@@ -130,8 +130,8 @@ class FitProblem:
         """
         m, norm = len(self.active), self.norm
         k = 2 * m - 1 if free else m
-        for start in range(0, len(self.image), CHUNK):
-            part = slice(start, start + CHUNK)
+        for start in range(0, len(self.image), _ROWS):
+            part = slice(start, start + _ROWS)
             x = np.subtract(self.ground[part].T, norm.ground_offset[:, None], order="C")
             basis = monomials(x / norm.ground_scale[:, None])
             y = (self.image[part, axis] - norm.image_offset[axis]) / norm.image_scale[axis]

@@ -62,16 +62,18 @@ def without_strips(found: Solution, judged: Judgement, block: Block, outer: Bloc
         return plainly
     # one image's rows that wander have competed with these already; what all images have in common has not: detectors,
     # or a platform that shakes
-    shaken = len({one.view for one in parts}) >= max(len(block.views) - 1, 2)  # the last is what they are seen against
-    if not shaken and not any(one.where is not None and one.where[0] == 0 for one in parts):
+    shaken = len({one.view for one in parts}) == len(block.views)
+    # of swings the last image may be what the others are seen against
+    swing = len({one.view for one in parts if one.kind == SWING}) >= max(len(block.views) - 1, 2)
+    if not (shaken or swing) and not any(one.where is not None and one.where[0] == 0 for one in parts):
         return tried
     plain = follow(found, block, outer, options)  # splines and detectors may explain the same, and leave nothing
     calm = plain is not found and not standing_out(plain.outcome, block, options.noise_floor)
-    # of swings and splines the fewer unknowns stay, where the others are not surely better
-    stays = not is_better(plain.after, tried.after, outer) if shaken else is_better(tried.after, plain.after, outer)
+    least = swing and not shaken  # the fewer unknowns stay, where the others are not surely better
+    stays = not is_better(plain.after, tried.after, outer) if least else is_better(tried.after, plain.after, outer)
     if not calm or stays:
         return tried
-    return plainly if shaken else found
+    return plainly if shaken or swing else found
 
 
 def _judged(found: Solution, judged: Judgement, block: Block) -> Solution:
