@@ -235,6 +235,8 @@ def _crs(given: str | None, middle: Array) -> CRS:
     if given is None:
         return CRS.from_string(utm(*middle[:2])[1])
     try:
+        if given.upper().startswith("EPSG:"):
+            int(given[5:])  # older GDAL reads a code up to what is no digit
         found = CRS.from_user_input(given)
     except (CRSError, ValueError) as error:
         raise InputError(f"--crs {given}: no reference system that PROJ knows ({error})") from error
