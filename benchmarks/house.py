@@ -1,0 +1,131 @@
+"""The size of the house: lines, modules, numbers that decide, long functions, names that stand twice, flags, options.
+
+python benchmarks/house.py            # a table of the package and its folders
+python benchmarks/house.py --numbers  # every module constant that is a number, with where it stands
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "barpc"
+LONG, MANY = 55, 6
+"""Lines of a function, and its parameters: more are counted."""
+
+
+def modules() -> dict[Path, ast.Module]:
+    """Every module of the package, parsed."""
+    return {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
+
+
+def is_number(node: ast.expr | None) -> bool:
+    """A number, or arithmetic, a tuple or a call of numbers alone: 5, -2.0, 10 * MB, (1, 2), np.log(2)."""
+    match node:
+        case ast.Constant(value=value):
+            return isinstance(value, int | float) and not isinstance(value, bool)
+        case ast.UnaryOp(operand=operand):
+            return is_number(operand)
+        case ast.BinOp(left=left, right=right):
+            return is_number(left) or is_number(right)
+        case ast.Tuple(elts=elements) | ast.List(elts=elements):
+            return bool(elements) and all(map(is_number, elements))
+        case ast.Call(args=arguments, keywords=[]):
+            return bool(arguments) and all(map(is_number, arguments))
+    return False
+
+
+def numbers(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Line and name of each constant of a module whose value is a number."""
+    for node in tree.body:
+        match node:
+            case ast.Assign(targets=[ast.Tuple(elts=names)], value=ast.Tuple(elts=values)):
+                pairs = list(zip(names, values, strict=True)) if len(names) == len(values) else []
+            case ast.Assign(targets=[target], value=value) | ast.AnnAssign(target=target, value=value):
+                pairs = [(target, value)]
+            case _:
+                continue
+        yield from ((node.lineno, name.id) for name, value in pairs if isinstance(name, ast.Name) and is_number(value))
+
+
+def functions(tree: ast.Module) -> Iterator[ast.FunctionDef]:
+    return (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+
+
+def parameters(function: ast.FunctionDef) -> int:
+    args = function.args
+    return sum(arg.arg not in ("self", "cls") for arg in (*args.posonlyargs, *args.args, *args.kwonlyargs))
+
+
+def twice(trees: dict[Path, ast.Module]) -> list[str]:
+    """Public functions and classes of one name in two modules, and modules of one name."""
+    defined = Counter(
+        node.name
+        for tree in trees.values()
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_")
+    )
+    files = Counter(path.stem for path in trees if path.stem not in ("__init__", "__main__"))
+    return sorted(name for names in (defined, files) for name, count in names.items() if count > 1)
+
+
+def measured(trees: dict[Path, ast.Module]) -> tuple[int, ...]:
+    lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in trees)
+    found = [function for tree in trees.values() for function in functions(tree)]
+    return (
+        lines,
+        len(trees),
+        sum(1 for tree in trees.values() for _ in numbers(tree)),
+        sum(f.end_lineno - f.lineno + 1 > LONG for f in found if f.end_lineno),
+        sum(parameters(f) > MANY for f in found),
+        len(twice(trees)),
+    )
+
+
+def surface() -> tuple[int, int]:
+    """Flags over all verbs, and fields of options."""
+    import click
+
+    from barpc.cli.main import COMMANDS, Verbs
+    from barpc.options import AdjustOptions, FitOptions, RunOptions, TieOptions, declared
+
+    verbs = Verbs()
+    context = click.Context(verbs)
+    commands = {verb: verbs.get_command(context, verb) for verb in COMMANDS}
+    flags = {
+        (verb, flag)
+        for verb, command in commands.items()
+        for parameter in (command.params if command else ())
+        for flag in parameter.opts
+        if flag.startswith("--")
+    }
+    tables = RunOptions, TieOptions, AdjustOptions, FitOptions
+    fields = [name for table in tables for name, one in declared(table).items() if one.kind not in tables]
+    return len(flags), len(fields)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--numbers", action="store_true")
+    args = parser.parse_args()
+    trees = modules()
+    if args.numbers:
+        for path, tree in trees.items():
+            for line, name in numbers(tree):
+                print(f"{path.relative_to(ROOT)}:{line} {name}")
+        return
+    heads = "", "lines", "modules", "numbers", f"> {LONG} lines", f"> {MANY} parameters", "names twice"
+    print(f"| {' | '.join(heads)} |\n{'|---' * len(heads)}|")
+    places = {"barpc": PACKAGE, **{path.name: path for path in sorted(PACKAGE.iterdir()) if path.is_dir()}}
+    for name, place in places.items():
+        if inside := {path: tree for path, tree in trees.items() if place in path.parents}:
+            print(f"| {name} |", " | ".join(map(str, measured(inside))), "|")
+    print("\n{} flags over all verbs, {} fields of options".format(*surface()))
+
+
+if __name__ == "__main__":
+    main()
