@@ -567,15 +567,6 @@ PAPER: Mapping[str, Mapping[str, Any]] = {
 """The method of Akiki et al. (2021), beyond which the defaults go: ``with_values(RunOptions(), PAPER)``."""
 
 
-FORMER = {
-    "num_passes": "a second pass is a run of its own, with the RPCs that the first one wrote",
-    "pictures": "the report shows no pixels; open the images beside observations.csv",
-    "dem_for_all": "a dem holds all tie points; dem_for_weak = true: those under a small angle only",
-    "store": "the run folder is on a disk that all workers see",
-}
-"""Former option -> how it is said now."""
-
-
 @dataclass(frozen=True, repr=False)
 class DsmOptions(Options):
     """Options of `barpc.dsm.make_dsm`."""
@@ -624,8 +615,6 @@ def with_values(options: Record, values: Mapping[str, Any], where: str = "option
     """
     known, changed = declared(type(options)), dict(values)
     for name, value in values.items():
-        if name in FORMER:
-            raise InputError(f"{where}: {name} is said otherwise now: {FORMER[name]}")
         if name not in known:
             raise InputError(f"{where}: unknown option {name!r}; known are {', '.join(known)}")
         nested = getattr(options, name)

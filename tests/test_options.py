@@ -242,10 +242,6 @@ def test_records_print_what_differs_from_the_defaults() -> None:
             r"here \[fit\]: nodes 'chebychev' is not one of uniform, chebyshev",
         ),
         ({"adjust": {"robust_threshold": -1}}, r"here \[adjust\]: robust_threshold must be a number above 0"),
-        (
-            {"adjust": {"dem_for_all": True}},
-            r"here \[adjust\]: dem_for_all is said otherwise now: a dem holds all",
-        ),
         ({"adjust": {"center_method": "foo"}}, r"here \[adjust\]: unknown option 'center_method'"),
         ({"adjust": {"model": "shift", "drift": 1}}, "drift 1 needs a model with a rotation"),
         ({"adjust": {"jitter": "5e-324"}}, "jitter '5e-324' is not auto, off or a number of rows"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,15 +12,12 @@ import click
 
 from barpc.cli.flags import Function, jobs_option
 from barpc.cli.progress import executor_for, progress_told
-from barpc.cli.specs import expanded, name_of
+from barpc.cli.specs import expanded
 from barpc.cli.terminal import echo, tell_gate, wants_json
 from barpc.options import DsmOptions, declared
 
 if TYPE_CHECKING:
     from barpc.dsm import Surface
-
-BESIDE = "dsm.tif"
-"""The surface of a run in its own folder."""
 
 
 def _flag(name: str, kind: Any, metavar: str | None = None) -> Callable[[Function], Function]:
@@ -91,15 +88,6 @@ def made(
     if not (wants_json() or obj["quiet"]):
         _tell(surface)
     return surface
-
-
-def interrupted(folder: Path, images: Sequence[str]) -> bool:
-    """Return whether the surface of a run of these images was not ended in its folder: both commands are one then."""
-    if not (folder / f"{BESIDE}.unfinished").is_dir() or not (folder / "summary.json").is_file():
-        return False
-    from barpc.report.tables import read_summary
-
-    return {view.path for view in read_summary(folder).views} == {name_of(image) for image in images}
 
 
 def _plain(value: Any) -> Any:

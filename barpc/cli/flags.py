@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, TypeVar, get_origin
 
 import click
 
-from barpc.cli.terminal import echo
 from barpc.errors import InputError
 from barpc.options import PAPER, Declared, RunOptions, checked, declared, read_options, with_values
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 REMOTE = "allow_remote"
-_ALL = "barpc.help_all"  # key of a context whose help shows every flag
 TIE = ("tie.band", "tie.matcher", "matches", "matches_only", "overlap_list", "aoi")
 CAMERA = ("adjust.model", "adjust.drift", "adjust.jitter", "adjust.fixed")
 GROUND = ("gcp", "altimetry", "check_points", "fixed_run", "dem", "adjust.dem_for_weak", "geoid", "reference")
@@ -38,52 +35,6 @@ def field_of(target: str) -> Declared:
     *table, name = target.split(".")
     record = type(declared(RunOptions)[table[0]].default) if table else RunOptions
     return declared(record)[name]
-
-
-_USUAL = {
-    "--out-dir", "--overwrite", "--keep-going", "--images", "--rpc", "--image-list", "--options", "--jobs", "--against",
-    "--help", "--help-all", "--matches", "--aoi", "--gcp", "--check-points", "--dem", "--geoid", "--reference",
-}  # fmt: skip
-"""Flags that `--help` lists; `--help-all` has the rest."""
-
-
-class Grouped(click.Command):
-    """A verb of a run: its help lists the usual flags by what they are about, `--help-all` every one."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        shown = click.Option(
-            ["--help-all"],
-            is_flag=True,
-            is_eager=True,
-            expose_value=False,
-            callback=_help_all,
-            help="Show every flag, those for cameras and matching too, and exit.",
-        )
-        self.params.append(shown)
-
-    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List what the user gives, then tie points, cameras and ground."""
-        groups = {"Tie points": TIE, "Cameras": CAMERA, "Ground": GROUND}
-        of = {_parameter(target): words for words, targets in groups.items() for target in targets}
-        rows: dict[str, list[tuple[str, str]]] = {"Files and the run": [], **{words: [] for words in groups}}
-        for option in self.get_params(ctx):
-            usual = not isinstance(option, click.Option) or not _USUAL.isdisjoint(option.opts)
-            row = option.get_help_record(ctx) if usual or ctx.meta.get(_ALL) else None
-            if row is not None:
-                rows[of.get(option.name or "", "Files and the run")].append(row)
-        for words, listed in rows.items():
-            if listed:
-                with formatter.section(words):
-                    formatter.write_dl(listed)
-
-
-def _help_all(context: click.Context, _parameter: click.Parameter, value: bool) -> None:
-    """Print the whole help and end."""
-    if value and not context.resilient_parsing:
-        context.meta[_ALL] = True
-        echo(context.get_help())
-        context.exit()
 
 
 def _parameter(target: str) -> str:
@@ -171,30 +122,10 @@ jobs_option = click.option(
     help="Worker processes, or a dask.distributed cluster (tcp://host:8786).  [default: 1]",
 )
 _RUN_OPTIONS = (
-    click.option(
-        "--rpc",
-        "rpcs",
-        multiple=True,
-        metavar="IMAGE=FILE",
-        help="The camera of an image, whatever its name and place (repeatable).",
-    ),
     click.option("--image-list", metavar="FILE", help="More image paths from a file, one a line."),
     click.option("--options", "options_file", metavar="FILE", help="Options from a TOML file; flags win."),
     jobs_option,
 )
-
-
-def image_paths(images: tuple[str, ...], image_list: str | None) -> list[str]:
-    """Return images of the command line, then those of a list file (blank lines and # comments are skipped)."""
-    from barpc.remote import is_url
-    from barpc.sidefile import read_names
-
-    paths = list(images)
-    if image_list is not None:
-        folder, lines = Path(image_list).parent, read_names(image_list, "a list of images")
-        named = [line.strip() for line in lines if line.strip() and not line.startswith("#")]
-        paths += [name if is_url(name) else str(folder / name) for name in named]
-    return paths
 
 
 def run_options(flags: Mapping[str, Any], options_file: str | None) -> RunOptions:

@@ -53,38 +53,6 @@ _MODULES = {
     **dict.fromkeys(("localize", "triangulate"), "project"),
 }
 
-MOVED = {
-    "angle": "info IMAGE IMAGE",
-    "footprint": "info --footprint IMAGE",
-    "doctor": "info --doctor",
-    "crop": "convert IMAGE TARGET --window ...",
-    "apply": "convert IMAGE... --rpc PATH -o DIR",
-    "compare": "report RUN RUN",
-    "--size": "FILE,size=WIDTH:HEIGHT",
-    "--pixel-convention": "FILE,first_pixel=0.5",
-    "--swath": "PRODUCT,swath=iw1",
-    "--pol": "PRODUCT,pol=vv",
-    "--burst": "PRODUCT,burst=3",
-    "--orbit": "PRODUCT,orbit=FILE",
-    "--atmosphere": "PRODUCT,atmosphere=yes",
-    "--bistatic": "PRODUCT,bistatic=full",
-    "--grid-altitudes": "GRID,altitudes=0:500",
-    "--image": "IMAGE,camera=FILE as SOURCE",
-    "--dask": "-j ADDRESS",
-    "--force": "--keep-going",
-    "--keep-largest": "--keep-going",
-    "--format": "--rpc-format",
-    "--stop-after": "barpc match, or stop_after in a file given with --options",
-    "--max-pairwise-matches": "[tie] points_per_image of a file given with --options",
-    "--min-triangulation-angle": "[tie] angles of a file given with --options",
-    "--joint": "[fit] method of a file given with --options",
-    "--dem-for-all": "--dem, which holds all tie points (--dem-for-weak: those under a small angle only)",
-    "--ip-per-image": "[tie] keypoints_per_image of a file given with --options",
-    "--store": "the run folder (-o) is on a disk that all workers see",
-    "--for-format": "[fit] precision of a file given with --options",
-}
-"""Former verb or flag -> how it is said now; options that have no flag are found in `barpc.options`."""
-
 _GENERAL = {
     **{"-q": "quiet", "--quiet": "quiet", "-v": "verbose", "--verbose": "verbose"},
     **{"--debug": "debug", "--json": "as_json"},
@@ -94,18 +62,6 @@ _GENERAL = {
 def _kept_lines(text: str | None) -> str | None:
     r"""Turn the written ``\b`` of a raw docstring into the character by which click keeps lines apart."""
     return text and text.replace("\\b\n", "\b\n")
-
-
-def _in_file(flag: str) -> str:
-    """Return where an options file says what a flag would, if it is an option."""
-    from barpc.options import Options, RunOptions, declared
-
-    name = flag[2:].replace("-", "_")
-    defaults = {key: one.default for key, one in declared(RunOptions).items()}
-    tables: dict[str, Options] = {"": RunOptions()}
-    tables |= {f"[{key}] ": table for key, table in defaults.items() if isinstance(table, Options)}
-    places = [table for table, options in tables.items() if name in declared(type(options))]
-    return f"{places[0]}{name} of a file given with --options" if places else ""
 
 
 class Verbs(click.Group):
@@ -129,21 +85,11 @@ class Verbs(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Refuse an unknown verb with the nearest known one."""
         args = self._general(ctx, args)
-        if args and args[0] in MOVED:
-            raise click.UsageError(f"'{args[0]}' is said otherwise now: barpc {MOVED[args[0]]}")
         if args and not args[0].startswith("-") and args[0] not in COMMANDS:
             near = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f" Did you mean '{near[0]}'?" if near else f" One of: {', '.join(COMMANDS)}."
             raise click.UsageError(f"No such verb '{args[0]}'.{hint}")
-        name, command, rest = super().resolve_command(ctx, args)
-        known = {flag for parameter in command.params for flag in parameter.opts} if command else set()
-        for word in rest[: rest.index("--") if "--" in rest else None]:
-            flag = word.split("=")[0]
-            if flag.startswith("--") and flag not in known:
-                now = MOVED.get(flag) or ("--options" in known and _in_file(flag))
-                if now:
-                    raise click.UsageError(f"{flag} is said otherwise now: {now}")
-        return name, command, rest
+        return super().resolve_command(ctx, args)
 
     def _general(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Take out of a verb's arguments those that every verb has: they may stand before and after it."""

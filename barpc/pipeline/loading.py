@@ -41,7 +41,7 @@ _SAMPLES = ((0.5, 0.5), (0.25, 0.25), (0.75, 0.75))  # of width and height: wher
 _MORE = tuple((x / 5, y / 5) for x in range(6) for y in range(6))  # where nothing varies there
 _SAMPLE_SIDE = (256, 16)  # px: many columns and few rows, so that few strips are decoded
 _CHUNK = 1 << 20  # px that are hashed at a time
-_GIVE_RPC = "name its file with --rpc {}=FILE, or leave the image out (--keep-going of adjust and match)"
+_GIVE_RPC = "name its file behind it, {},camera=FILE, or leave the image out (--keep-going of adjust and match)"
 _MANY = 64  # images from which on they are read by other processes
 
 Image = str | Path | View

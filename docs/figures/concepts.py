@@ -134,9 +134,7 @@ def held_out(count: int, noise: float, outliers: float, loss: str = "geman_mcclu
 
 def main() -> None:
     """Draw all of them."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("adjusted", type=Path)
     parser.add_argument("adjusted_gcp", type=Path)
     arguments = parser.parse_args()

@@ -46,8 +46,7 @@ def main(adjusted: str) -> None:
     inside = [
         p
         for p in three
-        if all((abs(tracks.xy[rows[p]] - 500) < 380).all(axis=1))
-        and np.ptp(tracks.xy[rows[p]], axis=0).max() < 60
+        if all((abs(tracks.xy[rows[p]] - 500) < 380).all(axis=1)) and np.ptp(tracks.xy[rows[p]], axis=0).max() < 60
     ]
     strong = sorted(inside, key=lambda p: -np.std(patch(images[a], *tracks.xy[rows[p][a]])[0]))
     picks = [strong[i] for i in (0, 40, 90, 150)]

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import click
 import pytest
 
-from barpc.cli.main import COMMANDS, MOVED, Verbs, _interruptible, _log_warning, _told, cli, main
+from barpc.cli.main import COMMANDS, Verbs, _interruptible, _log_warning, _told, cli, main
 from barpc.cli.terminal import THREADS
 from barpc.errors import BarpcWarning, InputError
 
@@ -43,14 +43,6 @@ def refused(*args: str) -> str:
     [
         (["projct"], "No such verb 'projct'. Did you mean 'project'?"),
         (["xyz"], f"No such verb 'xyz'. One of: {', '.join(COMMANDS)}."),
-        (["crop", "a.tif"], f"'crop' is said otherwise now: barpc {MOVED['crop']}"),
-        (["info", "a.tif", "--size=3"], "--size is said otherwise now: FILE,size=WIDTH:HEIGHT"),
-        (["info", "--swath", "iw1"], "--swath is said otherwise now: PRODUCT,swath=iw1"),
-        (["adjust", "--loss", "huber"], "--loss is said otherwise now: [adjust] loss of a file given with --options"),
-        (["adjust", "--tile", "9"], "--tile is said otherwise now: [tie] tile of a file given with --options"),
-        (["fit", "--method=lcurve"], "--method is said otherwise now: [fit] method of a file given with --options"),
-        (["match", "--stop-after", "x"],
-         "--stop-after is said otherwise now: barpc match, or stop_after in a file given with --options"),
     ],
 )  # fmt: skip
 def test_a_word_that_is_not_known_is_met_with_the_one_that_is(words: list[str], told: str) -> None:

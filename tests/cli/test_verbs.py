@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from barpc.cli import main
-from barpc.cli.main import MOVED
 from barpc.cli.progress import Lines, progress_told
 from barpc.raster import open_raster
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
@@ -179,16 +178,6 @@ def test_an_rpc_file_has_no_size_and_asks_for_it(tmp_path, capsys):
 def test_the_installation_is_examined(capsys):
     assert run("info", "--doctor", "--json") == 0
     assert json.loads(capsys.readouterr().out)["ok"]
-
-
-@pytest.mark.parametrize("former", MOVED)
-def test_what_was_said_otherwise_says_how_now_and_does_nothing_else(former, image, capsys):
-    verb = [former, image] if not former.startswith("-") else ["triangulate", image, former]
-    assert run(*verb) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert MOVED[former] in captured.err
-    assert len(captured.err.splitlines()) == 1
 
 
 class Terminal(io.StringIO):

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from barpc.cli import adjust as adjusting
 from barpc.cli import fit as fitting
 from barpc.cli.adjust import _tell
 from barpc.cli.fit import _certificate
@@ -278,48 +277,6 @@ def test_match_stops_after_matching_and_check_asks_another_entry(monkeypatch: py
         ("adjust", ["a.tif"], "matching", {"out_dir": "out"}),
         ("check", ["a.tif"], usual, {}),
     ]
-
-
-@pytest.mark.parametrize(
-    ("tool", "views", "fits", "text"),
-    [("s2p", 1, 1, True), ("s2p", 1, 0, False), ("s2p", 0, 1, False), ("cars", 1, 1, True),
-     ("sat-bundleadjust", 1, 1, False)],
-)  # fmt: skip
-def test_a_configuration_is_written_where_every_image_has_a_new_rpc(
-    tool: str, views: int, fits: int, text: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    (tmp_path / "images").mkdir()
-    write_image(tmp_path / "images" / "a.tif")
-    data = {
-        "s2p": {"images": [{"img": "images/a.tif"}]},
-        "cars": {"input": {"sensors": {"a": "images/a.tif"}}},
-        "sat-bundleadjust": {"geotiff_dir": "images"},
-    }[tool]
-    (tmp_path / "c.json").write_text(json.dumps(data))
-    asked = list[Any]()
-
-    def result(obj: Any, work: Any, images: Any, options: Any, flags: Any, where: Any) -> Any:
-        asked.append((images, options.rpc_formats, where))
-        found = SimpleNamespace(fits=[1] * fits)
-        return SimpleNamespace(views=[1] * views, run=found, summary={}, record=a_summary([]), passed=True)
-
-    monkeypatch.setattr(adjusting, "_result", result)
-    monkeypatch.setattr(adjusting, "corrected", lambda config, folder, views: f"{config.tool} {folder.name} {views}")
-    out = tmp_path / "out"
-    words = ("adjust", "--from", tool, str(tmp_path / "c.json"), "-o", str(out))
-    assert run(*words) == 0
-    assert asked == [
-        ([f"{tmp_path}/images/a.tif"], ("txt", "geom") if tool == "cars" else ("txt",), {"out_dir": str(out)})
-    ]
-    assert (out / "c.json").exists() == text
-    if text:
-        assert (out / "c.json").read_text() == f"{tool} out [1]"
-    missing = "c.json is not written: not every image that it lists has a new RPC" in capsys.readouterr().err
-    assert missing == (not (views and fits))
-    assert run(*words, "a.tif") == 2
-    assert run(*words, "--image-list", "l.txt") == 2
-    assert len(asked) == 1
 
 
 # --- export -----------------------------------------------------------------------------------------------

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +16,7 @@ from barpc.cli import main
 from barpc.dsm import make_dsm
 from barpc.options import DsmOptions
 from barpc.pipeline import adjust
-from barpc.report.tables import SURFACE, read_summary, read_tables
+from barpc.report.tables import SURFACE
 from tests.dsm.conftest import ALTS
 
 FINE = DsmOptions(alt=ALTS, gsd=0.25)  # four tiles
@@ -77,21 +76,6 @@ def test_a_killed_command_goes_on_and_gives_the_same_bytes(rendered, tmp_path):
     if not (folder / "dsm.tif").exists():
         assert run(*call) == 0
     assert (folder / "dsm.tif").read_bytes() == whole.read_bytes()
-
-
-def test_a_surface_of_a_run_that_was_killed_is_made_by_the_same_command(rendered, tmp_path):
-    folder = tmp_path / "run"
-    call = ["adjust", *rendered.paths, "--surface", "-o", str(folder)]
-    assert run(*call) in (0, 3)
-    whole = (folder / "dsm.tif").read_bytes()
-    shutil.rmtree(folder)
-    assert killed(call, (folder / "dsm.tif.unfinished").exists)
-    assert not (folder / "dsm.tif").exists()
-    assert run("adjust", *rendered.paths[1:], "--surface", "-o", folder) == 1  # another command
-    assert run(*call) in (0, 3)
-    assert (folder / "dsm.tif").read_bytes() == whole
-    assert read_tables(read_summary(folder), folder).reliefs
-    assert not list(folder.glob("*.unfinished"))
 
 
 def test_a_finished_run_whose_surface_was_killed_stays_finished(rendered, tmp_path, capsys):

@@ -19,9 +19,8 @@ from barpc.ba import BlockPrior
 from barpc.ba.estimated.priors import CameraPrior
 from barpc.ba.held.incremental import apply_prior
 from barpc.cameras import open_camera
-from barpc.cli.flags import image_paths
 from barpc.cli.project import given_points
-from barpc.cli.specs import read_config
+from barpc.cli.specs import image_paths
 from barpc.cli.terminal import print_comparison
 from barpc.dem import Dem
 from barpc.errors import RpcError
@@ -505,20 +504,6 @@ SAMPLES: dict[str, Sample] = {
         lambda path: image_paths((), str(path)),
         lambda: b"left.tif\n# x\nright.tif\n",
         (mutate_text,),
-    ),
-    "configuration s2p": Sample(
-        "config.json",
-        lambda path: read_config("s2p", str(path)),
-        lambda: b'{"images": [{"img": "a.tif", "rpc": {"x": 1}}, {"img": "b.tif", "rpc": "b.rpc"}]}',
-        (mutate_json,),
-    ),
-    "configuration cars": Sample(
-        "inputs.json",
-        lambda path: read_config("cars", str(path)),
-        lambda: (
-            b'{"input": {"sensors": {"a": {"image": "a.tif", "geomodel": {"path": "a.geom"}}, "b": {"image": "b"}}}}'
-        ),
-        (mutate_json,),
     ),
     "metadata": Sample(
         "product.xml",

@@ -19,7 +19,7 @@ def test_an_image_without_an_rpc_is_told_how_to_get_one_or_be_left_out(tmp_path)
     with pytest.raises(MissingRpcError) as told:
         load_views([*good, plain])
     assert str(told.value).startswith(f"{plain}: no RPC in the image and none beside it")
-    assert "--rpc plain.tif=FILE" in str(told.value)
+    assert "plain.tif,camera=FILE" in str(told.value)
     assert "--keep-going" in str(told.value)
     assert isinstance(told.value, ImageError)
     found = load_views([*good, plain], keep_going=True)

@@ -55,8 +55,6 @@ def test_every_flag_that_any_message_names_exists_in_some_verb():
     known |= {"--quiet", "--verbose", "--debug", "--json", "--file"}  # (the last of projsync)
     missing = set()
     for path in Path(barpc.__file__).parent.rglob("*.py"):
-        if path.name == "main.py":  # names former flags, with what they are called now
-            continue
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 missing |= {(path.name, flag) for flag in FLAG.findall(node.value) if flag not in known}
@@ -72,7 +70,7 @@ def test_most_tie_points_rejected_is_a_contradiction_and_no_lack_of_overlap():
     cause, advice = reason(num_observations=3, num_rejected=290)
     assert cause == "contradicted"
     assert advice.startswith("99 % of its tie points were rejected, as they contradict those of the other images: ")
-    assert "--rpc" in advice
+    assert "IMAGE,camera=FILE" in advice
     assert "overlap" not in advice
     assert reason(num_observations=0, num_rejected=30)[0] == "contradicted"
     assert reason(num_observations=0, num_rejected=29)[0] == "none"  # too few to say so

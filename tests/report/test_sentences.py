@@ -213,7 +213,7 @@ def test_an_rpc_that_is_far_off_beside_the_others_is_asked_about():
 
     assert advice([0]) == (
         "its RPC is 7 times farther off than stated, beside the other images: check that it belongs to this image "
-        "(--rpc names another)"
+        "(IMAGE,camera=FILE names another)"
     )
     assert "(or that of A, C: the tie points cannot tell)" in advice([0, 1, 2], "B")
     assert "is 8 times" in advice([0, 1, 2], "B")

@@ -23,7 +23,7 @@ CAUSES = {
         "failed",
         "overlaps no other image",
         "it overlaps no other image as asked, and its camera was left as it was",
-        f"check its RPC (--rpc names another), or lower {OVERLAP}",
+        f"check its RPC (IMAGE,camera=FILE names another), or lower {OVERLAP}",
     ),
     "untied": Cause(
         "failed",
@@ -35,13 +35,13 @@ CAUSES = {
         "failed",
         "RPC not its own",
         "its RPC is not its own: {strangeness}. They were adjusted without it, and its camera was left as it was",
-        "check that the RPC belongs to this image (--rpc names another)",
+        "check that the RPC belongs to this image (IMAGE,camera=FILE names another)",
     ),
     "contradicts_all": Cause(
         "failed",
         "contradicts the others",
         "{strangeness}. They were adjusted without it, and its camera was left as it was",
-        "check clouds, water and change, and that the RPC belongs to this image (--rpc names another)",
+        "check clouds, water and change, and that the RPC belongs to this image (IMAGE,camera=FILE names another)",
     ),
     "one_rpc_misses": Cause(
         "failed",
@@ -53,7 +53,8 @@ CAUSES = {
         "doubtful",
         "contradicts the others",
         "{share:.0f} % of its tie points were rejected, as they contradict those of the other images",
-        "check that the RPC belongs to this image (--rpc names another), then look for clouds, water, change",
+        "check that the RPC belongs to this image (IMAGE,camera=FILE names another), then look for clouds, water, "
+        "change",
     ),
     "few": Cause("weak", "few tie points", "only {few} tie points", "check overlap, clouds and dates"),
     "none": Cause("weak", "no tie points", "no tie points", "check overlap, clouds and dates"),
@@ -62,13 +63,13 @@ CAUSES = {
         "doubtful",
         "RPC not its own",
         "its RPC is {stated}: {strangeness}. It was adjusted alone, against points of the other images",
-        "check that the RPC belongs to this image (--rpc names another)",
+        "check that the RPC belongs to this image (IMAGE,camera=FILE names another)",
     ),
     "odd": Cause(
         "doubtful",
         "RPC farther off than stated",
         "its RPC is {scale:.0f} times farther off than stated, beside the other images{either}",
-        "check that it belongs to this image (--rpc names another)",
+        "check that it belongs to this image (IMAGE,camera=FILE names another)",
     ),
     "smooth": Cause(
         "doubtful",
@@ -124,7 +125,7 @@ CAUSES = {
         "doubtful",
         "does not see its tie points",
         "its camera does not see its own tie points where they are",
-        "check that the RPC belongs to this image (--rpc names another)",
+        "check that the RPC belongs to this image (IMAGE,camera=FILE names another)",
     ),
     "moving": Cause(
         "doubtful",
