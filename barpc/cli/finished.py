@@ -11,7 +11,7 @@ import click
 
 from barpc.cli.terminal import echo, print_comparison, say, tell_gate, wants_json
 
-_TARGETS = ("satnerf", "eogs", "nerfstudio", "colmap", "s2p", "cars", "asp", "ortho", "stac", "points")
+_TARGETS = ("satnerf", "colmap", "s2p", "cars", "asp", "ortho", "stac", "points")
 
 
 @click.command("report")
@@ -59,15 +59,15 @@ def report(run_dir: str, other: str | None) -> int:
 def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | None, overwrite: bool) -> int:
     r"""Hand a finished run to another tool: its images, corrected cameras and tie points in files that it reads.
 
-    satnerf, eogs: JSON an image with the RPC; nerfstudio, colmap: pinhole cameras that come near the RPCs, with the
-    largest error of each; s2p, cars, asp: a configuration that is ready to run; ortho: GDAL's
+    satnerf: JSON an image with the RPC; colmap: pinhole cameras that come near the RPCs, with the largest error of
+    each; s2p, cars, asp: a configuration that is ready to run; ortho: GDAL's
     commands for orthoimages; stac: a collection for catalogues; points: tie points with their covariance. Images are
     pointed at, relative to OUT_DIR, and never copied.
 
     \b
     Examples:
       barpc export adjusted nerf --to satnerf
-      barpc export adjusted splats --to nerfstudio --alt 80 320
+      barpc export adjusted sparse --to colmap --alt 80 320
       barpc export adjusted stereo --to s2p && s2p stereo/config.json
     """
     from barpc.export import export_run

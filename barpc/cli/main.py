@@ -41,7 +41,7 @@ COMMANDS = {
     "localize": "Image points to ground points, at an altitude or on a DEM.",
     "triangulate": "Corresponding image points to ground points.",
     "convert": "Write RPCs in other formats, cut out windows, hand images over.",
-    "export": "Hand a finished run to renderers, COLMAP, s2p, CARS, ASP or a catalogue.",
+    "export": "Hand a finished run to Sat-NeRF, COLMAP, s2p, CARS, ASP or a catalogue.",
     "dsm": "A first surface model, with its uncertainty.",
     "verify": "Whether a finished run is still what it was: inputs, outputs, cameras.",
     "report": "Make report.html of a finished run again, or compare two runs.",

@@ -1,4 +1,4 @@
-"""Finished runs in the words of other tools: neural renderers, COLMAP, stereo pipelines, catalogues.
+"""Finished runs in the words of other tools: Sat-NeRF, COLMAP, stereo pipelines, catalogues.
 
 `TARGETS` is the table: a row makes the files of an export, of a `Scene` that was read from the folder of a run.
 """
@@ -10,10 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from barpc.errors import InputError, OutputError
-from barpc.export.catalogue import CATALOGUE
-from barpc.export.neural import NEURAL, Files, image_links
+from barpc.export.files import Files, asp, cars, ortho, points, s2p, satnerf, stac
+from barpc.export.pinholes import colmap, image_links
 from barpc.export.shots import Scene, read_scene, relative_link
-from barpc.export.stereo import STEREO
 from barpc.sidefile import plain_path
 from barpc.workspace import Workspace
 
@@ -21,7 +20,9 @@ __all__ = ["TARGETS", "export_run"]
 
 _LOG = logging.getLogger(__name__)
 
-TARGETS: dict[str, Callable[[Scene, Path], Files]] = {**NEURAL, **STEREO, **CATALOGUE}
+TARGETS: dict[str, Callable[[Scene, Path], Files]] = {
+    make.__name__: make for make in (satnerf, colmap, s2p, cars, asp, ortho, stac, points)
+}
 """Tool -> the files made for it, by name, of a scene and the folder where they will lie."""
 
 

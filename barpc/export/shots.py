@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from barpc.errors import InputError
-from barpc.export.approx import Sampled
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, wrap_longitude
 from barpc.remote import is_url
 from barpc.report.compare import written_rpc
@@ -31,6 +30,18 @@ MARGIN = 20.0
 """m that the altitudes of a scene reach beyond its tie points, besides a tenth of their range."""
 _SHARE = 0.5  # per cent of the tie points at either end that do not count for it
 _NODES, _CHECKED = (11, 5), (21, 9)  # of the grids on which cameras are fitted, and their errors measured
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """Points (N, 3) of the scene [m] and where an image shows them (N, 2) [px]."""
+
+    world: Array
+    image: Array
+
+    def error(self, projected: Array) -> float:
+        """Return the largest distance [px] of projections (N, 2) from where the image shows the points."""
+        return float(np.linalg.norm(projected - self.image, axis=1).max())
 
 
 @dataclass(frozen=True, eq=False)

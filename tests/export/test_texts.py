@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from barpc.errors import InputError
-from barpc.export import catalogue, neural, stereo
+from barpc.export import files as made_of
+from barpc.export import pinholes
 from barpc.export import shots as scene
-from barpc.export.approx import Sampled
-from barpc.export.shots import Scene, pairs_of, read_scene, relative_link
+from barpc.export.shots import Sampled, Scene, pairs_of, read_scene, relative_link
 from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.rpcio import read_rpc
 from barpc.rpcio.acquisition import Sunlight
@@ -186,7 +186,7 @@ def test_places_of_numbers_in_a_list():
 
 
 def test_a_record_of_sat_nerf(south):
-    files = neural.satnerf(south, OUT)
+    files = made_of.satnerf(south, OUT)
     shot = south.shots[0]
     one = json.loads(files[f"{shot.name}.json"])
     assert (one["height"], one["width"], one["min_alt"], one["max_alt"]) == (700, 900, *south.alt_range)
@@ -219,97 +219,22 @@ def read_rpc_of(found: dict[str, Any]):
         return read_rpc(path)
 
 
-def test_the_frame_of_eogs_is_a_unit_ball_of_utm_metres(south, dateline):
-    for of in (south, dateline):
-        frame = neural._Utm(of)
-        corners = np.concatenate([frame.metres(neural._grid(of, shot, (2, 2))[0]) for shot in of.shots])
-        assert len(corners) == 3 * 8
-        assert frame.center == pytest.approx([*corners[:, :2].mean(axis=0), of.alt_range[0]])
-        away = (corners - frame.center) / frame.scale
-        assert np.linalg.norm(away, axis=1).max() == pytest.approx(1.0)
-        model = frame.models(of, of.shots[0])["model"]
-        assert model["min_world"] == pytest.approx(away.min(axis=0))
-        assert model["max_world"] == pytest.approx(away.max(axis=0))
-        assert (model["scale"], model["n"], model["l"]) == (frame.scale, frame.zone, frame.band)
-
-
-@pytest.mark.parametrize(
-    ("lon", "lat", "zone", "band", "crs"),
-    [
-        (-180.0, 0.0, 1, "N", "EPSG:32601"), (-174.1, -0.1, 1, "M", "EPSG:32701"), (-173.9, 71.9, 2, "W", "EPSG:32602"),
-        (179.9, 72.0, 60, "X", "EPSG:32660"), (180.0, 84.0, 1, "X", "EPSG:32601"), (3.0, -80.0, 31, "C", "EPSG:32731"),
-        (3.0, -89.0, 31, "C", "EPSG:32731"), (3.0, 89.0, 31, "X", "EPSG:32631"), (2.0, 48.9, 31, "U", "EPSG:32631"),
-    ],
-)  # fmt: skip
-def test_a_utm_zone_has_its_number_and_letter(monkeypatch, lon, lat, zone, band, crs):
-    monkeypatch.setattr(neural, "_grid", lambda *_: (np.array([[lon, lat, 0.0], [lon, lat, 9.0]]), None))
-    monkeypatch.setattr(neural._Utm, "metres", lambda _, ground: ground)
-    of = type("Made", (), {"origin": np.array([lon, lat, 0.0]), "shots": [0], "alt_range": (0.0, 9.0)})()
-    frame = neural._Utm(of)
-    assert (frame.zone, frame.band, frame._crs) == (zone, band, crs)
-
-
-def test_an_affine_camera_of_eogs_goes_from_minus_one_to_one_over_the_image(south):
-    shot, frame = south.shots[2], neural._Utm(south)
-    found = frame.models(south, shot)
-    linear, shift = found["model"]["coef_"], found["model"]["intercept_"]
-    ground, image = neural._grid(south, shot, (21, 9))
-    assert len(image) == 21 * 21 * 9
-    seen = (frame.metres(ground) - frame.center) / frame.scale @ linear.T + shift
-    off = (seen[:, :2] + 1.0) / 2.0 * [900, 700] - 0.5 - image
-    assert found["affine_error_px"] == pytest.approx(np.hypot(*off.T).max(), rel=1e-6)
-    assert found["affine_error_px"] < 0.3
-    assert np.abs(off.mean(axis=0)).max() < 1e-6
-    assert seen[:, 2] == pytest.approx(ground[:, 2], abs=1e-6)
-    assert found["sun_model"] is None  # nothing says where the sun stood
-
-
-def test_the_sun_sees_a_point_and_its_shadow_in_one_place(south):
-    frame = neural._Utm(south)
-    shot = replace(south.shots[0], light=Sunlight(52.25, 150.5, None))
-    found = frame.models(south, shot)
-    linear, sun = found["model"]["coef_"], found["sun_model"]
-    up, around = np.radians([52.25, 150.5])
-    ray = np.array([np.sin(around) * np.cos(up), np.cos(around) * np.cos(up), np.sin(up)])
-    assert np.cross(sun["sun_dir_ecef"], ray) == pytest.approx(np.zeros(3), abs=1e-9)
-    assert (linear @ sun["sun_dir_ecef"])[2] == pytest.approx(1.0)
-    assert (sun["coef_"] @ ray)[:2] == pytest.approx([0, 0], abs=1e-9)
-    assert sun["coef_"] == pytest.approx(sun["camera_to_sun"] @ linear)
-    assert sun["camera_to_sun"][2].tolist() == [0, 0, 1]
-    assert sun["intercept_"] == pytest.approx(found["model"]["intercept_"])
-    for light in (Sunlight(None, 150.5, None), Sunlight(52.25, None, None)):
-        assert frame.models(south, replace(shot, light=light))["sun_model"] is None
-
-
-def test_a_cloud_of_renderers_is_float_and_grey(south):
-    head, body = neural._cloud(south).split(b"end_header\n", 1)
-    kind = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    cloud = np.frombuffer(body, dtype=kind)
-    assert cloud["xyz"] == pytest.approx(south.world(south.points), abs=1e-2)
-    assert set(cloud["rgb"].ravel().tolist()) == {128}
-    lines = head.decode().splitlines()
-    assert lines[:3] == ["ply", "format binary_little_endian 1.0", f"element vertex {len(south.points)}"]
-    assert [line.split()[1:] for line in lines[3:]] == [["float", axis] for axis in "xyz"] + [
-        ["uchar", c] for c in ("red", "green", "blue")
-    ]
-
-
 def test_a_camera_that_no_pinhole_comes_near_is_refused(south, monkeypatch):
-    good = neural.fit_pinhole(south.samples(south.shots[0]), **south.view_of(south.shots[0]))
+    good = pinholes.fit_pinhole(south.samples(south.shots[0]), **south.view_of(south.shots[0]))
     for wrong in (
         replace(good, focal=good.focal * [1, -1]),
         replace(good, translation=good.translation * np.nan),
     ):
-        monkeypatch.setattr(neural, "fit_pinhole", lambda *_, found=wrong, **__: found)
+        monkeypatch.setattr(pinholes, "fit_pinhole", lambda *_, found=wrong, **__: found)
         with pytest.raises(InputError, match="mirrored, or no pinhole"):
-            neural.pinhole_of(south, south.shots[0])
+            pinholes.pinhole_of(south, south.shots[0])
 
 
 @pytest.fixture(scope="module")
 def model(south) -> tuple[Scene, dict[str, list[str]], dict[str, Any]]:
     """COLMAP's texts of the scene, its lines by file."""
     of = replace(south, shots=tuple(replace(shot, file=f"/images/{k}.tif") for k, shot in enumerate(south.shots)))
-    files = neural.colmap(of, OUT)
+    files = pinholes.colmap(of, OUT)
     assert set(files) == {f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D")} | {"world.json"}
     files = {name.removeprefix("sparse/0/"): data for name, data in files.items()}
     return (
@@ -373,46 +298,34 @@ def test_colmap_s_texts_hold_the_scene(model):
 
 def test_stereo_pipelines_get_images_and_cameras(south, southern):
     carried = with_shot(south, carrier=southern / "a.vrt")
-    config = json.loads(stereo.s2p(carried, southern)["config.json"])
+    config = json.loads(made_of.s2p(carried, southern)["config.json"])
     assert (config["out_dir"], config["full_img"]) == ("s2p_out", True)
     assert config["images"][0]["img"] == "a.vrt"  # the run's raster goes before the image
     assert config["images"][1]["img"] == relative_link(south.shots[1].file, southern)
     assert read_rpc_of(config["images"][1]["rpc"]).off(south.shots[1].rpc).max() < 1e-6
-    files = stereo.asp(carried, southern)
+    files = made_of.asp(carried, southern)
     names = [shot.name for shot in south.shots]
     assert files["cameras.txt"].decode() == "".join(f"{name}.xml\n" for name in names)
     assert files["images.txt"].decode().split("\n")[:2] == ["a.vrt", relative_link(south.shots[1].file, southern)]
     assert files["images.txt"].endswith(b"\n")
     assert set(files) == {*(f"{name}.xml" for name in names), "cameras.txt", "images.txt"}
-    for end, made in (("xml", files), ("geom", stereo.cars(south, southern))):
+    for end, made in (("xml", files), ("geom", made_of.cars(south, southern))):
         path = southern.parent / f"check.{end}"
         path.write_bytes(made[f"{names[0]}.{end}"])
         assert read_rpc(path).off(south.shots[0].rpc).max() < 1e-5
 
 
 def test_the_yaml_of_cars(south):
-    lines = stereo.cars(south, OUT)["inputs.yaml"].decode().splitlines()
+    text = made_of.cars(south, OUT)["inputs.yaml"].decode()
+    found = json.loads(text)
+    assert pytest.importorskip("yaml").safe_load(text) == found  # as CARS reads it
     first = south.shots[0]
-    assert lines[:2] == ['"input":', '  "sensors":']
-    at = lines.index(f'    "{first.name}":')
-    assert lines[at + 1 : at + 5] == [
-        f'      "image": {json.dumps(relative_link(first.file, OUT), ensure_ascii=False)}',
-        '      "geomodel":',
-        f'        "path": "{first.name}.geom"',
-        '        "model_type": "RPC"',
-    ]
-    at = lines.index('  "pairing":')
-    pairs = [json.loads(line.strip().removeprefix("- ")) for line in lines[at + 1 : -2]]
-    assert [tuple(pair) for pair in pairs] == list(pairs_of(south))
-    assert all(line.startswith("    - [") for line in lines[at + 1 : -2])
-    assert lines[-2:] == ['"output":', '  "directory": "cars_out"']
-    assert stereo.yaml({"a": {}, "b": [], "c": 1, "é": {"x": None}}) == [
-        '"a": {}',
-        '"b": []',
-        '"c": 1',
-        '"é":',
-        '  "x": null',
-    ]
+    assert found["input"]["sensors"][first.name] == {
+        "image": relative_link(first.file, OUT),
+        "geomodel": {"path": f"{first.name}.geom", "model_type": "RPC"},
+    }
+    assert [tuple(pair) for pair in found["input"]["pairing"]] == list(pairs_of(south))
+    assert found["output"] == {"directory": "cars_out"}
 
 
 # --- for catalogues ---------------------------------------------------------------------------------------
@@ -420,7 +333,7 @@ def test_the_yaml_of_cars(south):
 
 def test_a_stac_item_says_where_when_and_how(south, southern):
     name = south.shots[0].name
-    item = json.loads(catalogue.stac(south, OUT)[f"{name}.json"])
+    item = json.loads(made_of.stac(south, OUT)[f"{name}.json"])
     assert (item["type"], item["stac_version"], item["id"]) == ("Feature", "1.1.0", name)
     assert [(one["rel"], one["href"]) for one in item["links"]] == [
         (rel, "./collection.json") for rel in ("root", "parent", "collection")
@@ -448,7 +361,7 @@ def test_a_stac_item_says_where_when_and_how(south, southern):
 
 
 def test_a_stac_item_of_an_unknown_time_or_day(south, dateline):
-    unknown = json.loads(catalogue.stac(south, OUT)[f"{south.shots[1].name}.json"])["properties"]
+    unknown = json.loads(made_of.stac(south, OUT)[f"{south.shots[1].name}.json"])["properties"]
     assert unknown["datetime"] is None
     assert (unknown["start_datetime"], unknown["end_datetime"]) == (
         "1957-10-04T00:00:00Z",
@@ -457,8 +370,8 @@ def test_a_stac_item_of_an_unknown_time_or_day(south, dateline):
     assert "view:sun_azimuth" not in unknown
     day = with_shot(south, light=Sunlight(None, None, "2020-01-02"))
     name = south.shots[0].name
-    assert json.loads(catalogue.stac(day, OUT)[f"{name}.json"])["properties"]["datetime"] == "2020-01-02T00:00:00Z"
-    west, south_lat, east, north = json.loads(catalogue.stac(dateline, OUT)[f"{dateline.shots[0].name}.json"])["bbox"]
+    assert json.loads(made_of.stac(day, OUT)[f"{name}.json"])["properties"]["datetime"] == "2020-01-02T00:00:00Z"
+    west, south_lat, east, north = json.loads(made_of.stac(dateline, OUT)[f"{dateline.shots[0].name}.json"])["bbox"]
     assert 179 < west < 180
     assert -180 < east < -179
     assert south_lat < -16.8 < north
@@ -473,7 +386,7 @@ def test_a_stac_item_of_an_unknown_time_or_day(south, dateline):
     ],
 )  # fmt: skip
 def test_a_file_of_a_run_has_its_kind(name, kind, role):
-    assert catalogue._asset(Path("/elsewhere") / name, OUT) == {
+    assert made_of._asset(Path("/elsewhere") / name, OUT) == {
         "href": f"../{name}",
         "type": kind,
         "roles": [role],
@@ -481,7 +394,7 @@ def test_a_file_of_a_run_has_its_kind(name, kind, role):
 
 
 def test_a_point_s_covariance_is_the_inverse_of_what_its_rays_tell(south):
-    found = catalogue._covariances(south)
+    found = made_of._covariances(south)
     steps = np.eye(3) * 0.5
     for point in (0, 7, 40):
         ground = south.points[point]
@@ -497,13 +410,13 @@ def test_a_point_s_covariance_is_the_inverse_of_what_its_rays_tell(south):
 
 def test_a_point_that_one_image_shows_is_not_known(south):
     alone = replace(south, shots=south.shots[:1])
-    assert np.isnan(catalogue._covariances(alone)).all()
-    files = catalogue.points(alone, OUT)
+    assert np.isnan(made_of._covariances(alone)).all()
+    files = made_of.points(alone, OUT)
     assert files["points.csv"].decode().splitlines()[2].endswith(",,,,,,")
 
 
 def test_points_are_written_with_their_covariance(south):
-    files = catalogue.points(south, OUT)
+    files = made_of.points(south, OUT)
     comment, header, *rows = files["points.csv"].decode().splitlines()
     place = ", ".join(f"{value:.4g}" for value in south.summary.scene.sigma_enu_m)
     assert comment == (
@@ -511,7 +424,7 @@ def test_points_are_written_with_their_covariance(south):
         f"up is known to [m]: {place}"
     )
     assert header == "track,lon,lat,alt,var_ee,var_en,var_eu,var_nn,var_nu,var_uu"
-    covariance = catalogue._covariances(south)
+    covariance = made_of._covariances(south)
     table = np.array([row.split(",") for row in rows], float)
     assert table[:, 0].astype(int).tolist() == south.tracks.tolist()
     assert np.abs(table[:, 1:3] - south.points[:, :2]).max() < 1e-9
@@ -535,7 +448,7 @@ def test_points_are_written_with_their_covariance(south):
     assert [line.split()[1:] for line in lines[5:]] == [
         *(["double", axis] for axis in "xyz"), ["int", "track"], *(["float", name] for name in header.split(",")[4:]),
     ]  # fmt: skip
-    unknown = catalogue.points(replace(south, summary=replace(south.summary, scene=None)), OUT)["points.csv"]
+    unknown = made_of.points(replace(south, summary=replace(south.summary, scene=None)), OUT)["points.csv"]
     assert unknown.decode().splitlines()[0].endswith("is known to [m]: unknown")
     assert isinstance(south.samples(south.shots[0]), Sampled)
 

@@ -54,10 +54,7 @@ VERBS = {
 }
 
 
-FITTED = (
-    "export nerfstudio",
-    "export colmap",
-)  # beside the images as the others; pinholes are fitted: tests/export
+FITTED = ("export colmap",)  # beside the images as the others; pinholes are fitted: tests/export
 
 
 @pytest.mark.parametrize("verb", rest_slow(sorted(VERBS, key=lambda verb: verb in FITTED), len(TARGETS) + 1))

@@ -1,4 +1,4 @@
-"""Simple cameras near an RPC: found exactly where they hold, by derivatives and starts that are right."""
+"""Pinhole cameras near an RPC: found exactly where they hold, by derivatives and starts that are right."""
 
 from __future__ import annotations
 
@@ -7,17 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.export import approx
-from barpc.export.approx import (
-    Pinhole,
-    Sampled,
-    factored,
-    fit_affine,
-    fit_pinhole,
-    fit_projective,
-    project_affine,
-    project_projective,
-)
+from barpc.export import pinholes
+from barpc.export.pinholes import Pinhole, fit_pinhole
+from barpc.export.shots import Sampled
 from barpc.sensor.curve import rotation_matrix
 
 TURN = rotation_matrix(np.array([np.pi - 0.2, 0.1, 0.05]))  # looks down
@@ -60,15 +52,15 @@ def test_the_error_is_the_largest_distance():
 
 def test_the_derivative_by_the_unknowns_is_that_of_differences():
     points, size = world(5), np.array([1e-6] * 3 + [1e-2] * 3 + [1e-6] * 2 + [1e-3] * 2)
-    found = approx._jacobian(TRUE, points)
+    found = pinholes._jacobian(TRUE, points)
     assert found.shape == (10, 10)
     for k, step in enumerate(size[:, None] * np.eye(10)):
-        both = [approx._moved(TRUE, sign * step).project(points).ravel() for sign in (1.0, -1.0)]
+        both = [pinholes._moved(TRUE, sign * step).project(points).ravel() for sign in (1.0, -1.0)]
         assert found[:, k] == pytest.approx((both[0] - both[1]) / (2 * size[k]), rel=1e-5, abs=1e-4)
 
 
 def test_a_step_turns_moves_and_stretches():
-    moved = approx._moved(TRUE, np.array([0.0, 0.0, np.pi / 2, 1.0, 2.0, 3.0, np.log(2.0), 0.0, 4.0, -5.0]))
+    moved = pinholes._moved(TRUE, np.array([0.0, 0.0, np.pi / 2, 1.0, 2.0, 3.0, np.log(2.0), 0.0, 4.0, -5.0]))
     assert moved.focal == pytest.approx([18000.0, 8500.0])
     assert moved.center == pytest.approx([484.0, 295.0])
     assert moved.translation == pytest.approx([21.0, -8.0, 6003.0])
@@ -79,12 +71,12 @@ def test_a_step_turns_moves_and_stretches():
 def test_what_is_left_is_seen_minus_projected_and_infinite_behind_the_camera():
     points = world()
     samples = Sampled(points, TRUE.project(points) + [3.0, -4.0])
-    cost, left = approx._cost(TRUE, samples)
+    cost, left = pinholes._cost(TRUE, samples)
     assert cost == pytest.approx(25.0 * len(points))
     assert left[:2] == pytest.approx([3.0, -4.0])
     with np.errstate(all="ignore"):
         beside = replace(TRUE, translation=np.array([0.0, 0.0, 0.0]))
-        assert approx._cost(beside, Sampled(np.zeros((1, 3)), np.zeros((1, 2))))[0] == np.inf
+        assert pinholes._cost(beside, Sampled(np.zeros((1, 3)), np.zeros((1, 2))))[0] == np.inf
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -99,7 +91,7 @@ def test_a_start_has_the_derivative_that_was_seen(sign, times, shear, mirrored):
     down = -np.cross(sight, right)
     rows = np.array([2.0 * right, mirrored * 1.5 * (down + shear * right)])
     pixel, far = np.array([400.0, 300.0]), times * 5000.0
-    found = approx._start(sign, at, pixel, rows, sight, far)
+    found = pinholes._start(sign, at, pixel, rows, sight, far)
     assert found.rotation @ found.rotation.T == pytest.approx(np.eye(3), abs=1e-12)
     assert found.project(at[None])[0] == pytest.approx(pixel, abs=1e-6)
     assert derivative(found, at) == pytest.approx(rows, abs=1e-6)
@@ -117,8 +109,8 @@ def test_a_start_has_the_derivative_that_was_seen(sign, times, shear, mirrored):
 
 
 def test_a_fit_starts_on_both_sides_at_up_to_three_times_the_distance(monkeypatch):
-    given, start = [], approx._start
-    monkeypatch.setattr(approx, "_start", lambda sign, *rest: given.append((sign, rest[-1])) or start(sign, *rest))
+    given, start = [], pinholes._start
+    monkeypatch.setattr(pinholes, "_start", lambda sign, *rest: given.append((sign, rest[-1])) or start(sign, *rest))
     points = world()
     fit_pinhole(Sampled(points, TRUE.project(points)), **{**view_of(TRUE, points[0]), "far": 6000.0})
     assert given == [(sign, far) for far in (6000.0, 12000.0, 18000.0) for sign in (1.0, -1.0)]
@@ -140,9 +132,9 @@ def test_a_refinement_ends_where_the_squares_are_least():
     points = world(200)
     noise = np.random.default_rng(1).normal(0, 0.5, (200, 2))
     samples = Sampled(points, TRUE.project(points) + noise)
-    start = approx._moved(TRUE, np.array([2e-3, -1e-3, 3e-3, 2.0, 3.0, 40.0, 0.01, -0.01, 5.0, -4.0]))
-    found = approx._refined(start, samples)
-    jacobian, (cost, left) = approx._jacobian(found, points), approx._cost(found, samples)
+    start = pinholes._moved(TRUE, np.array([2e-3, -1e-3, 3e-3, 2.0, 3.0, 40.0, 0.01, -0.01, 5.0, -4.0]))
+    found = pinholes._refined(start, samples)
+    jacobian, (cost, left) = pinholes._jacobian(found, points), pinholes._cost(found, samples)
     step = np.linalg.lstsq(jacobian, left)[0]
     assert cost - float(np.sum((left - jacobian @ step) ** 2)) < 1e-6 * cost
     assert cost < float((noise**2).sum())
@@ -151,7 +143,7 @@ def test_a_refinement_ends_where_the_squares_are_least():
 def test_of_the_refinements_the_one_with_the_smallest_largest_error_is_taken(monkeypatch):
     points = world()
     errors = iter([5.0, 3.0, 1.0, 2.0, 4.0, 6.0])
-    monkeypatch.setattr(approx, "_refined", lambda *_: replace(TRUE, center=TRUE.center + [next(errors), 0.0]))
+    monkeypatch.setattr(pinholes, "_refined", lambda *_: replace(TRUE, center=TRUE.center + [next(errors), 0.0]))
     found = fit_pinhole(Sampled(points, TRUE.project(points)), **view_of(TRUE, points[0]))
     assert found.center[0] == TRUE.center[0] + 1.0
 
@@ -159,50 +151,5 @@ def test_of_the_refinements_the_one_with_the_smallest_largest_error_is_taken(mon
 def test_a_step_that_makes_it_worse_is_not_taken(monkeypatch):
     points = world()
     samples = Sampled(points, TRUE.project(points) + 1.0)
-    monkeypatch.setattr(approx, "_moved", lambda pinhole, _: replace(pinhole, center=pinhole.center - 1.0))
-    assert approx._refined(TRUE, samples) is TRUE
-
-
-def test_an_affine_camera_of_noise_is_that_of_least_squares():
-    points = world()
-    image = np.random.default_rng(3).normal(size=(60, 2)) * 100
-    found = fit_affine(Sampled(points, image))
-    rows = np.column_stack([points, np.ones(60)])
-    assert found == pytest.approx(np.linalg.solve(rows.T @ rows, rows.T @ image).T, abs=1e-9)
-    assert project_affine(found, points) == pytest.approx(rows @ found.T)
-
-
-def test_a_projective_camera_of_noise_weighs_points_as_the_image_does():
-    """Strong perspective: an algebraic error alone would weigh far points more."""
-    points = world(300)
-    close = replace(TRUE, translation=np.array([20.0, -10.0, 900.0]))
-    seen = close.project(points)
-    noise = np.random.default_rng(4).normal(0, 1.0, seen.shape)
-    found = fit_projective(Sampled(points, seen + noise))
-    assert found[2, 3] == 1.0
-    left = (seen + noise - project_projective(found, points)).ravel()
-    jacobian = []
-    for k in range(11):
-        step = np.zeros(12)
-        step[k] = 1e-6 * max(abs(found.flat[k]), 1e-3)
-        both = [project_projective(found + sign * step.reshape(3, 4), points).ravel() for sign in (1, -1)]
-        jacobian.append((both[0] - both[1]) / (2 * step[k]))
-    columns = np.array(jacobian).T
-    scale = np.linalg.norm(columns, axis=0)
-    gain = columns / scale @ np.linalg.lstsq(columns / scale, left, rcond=1e-12)[0]
-    assert float(gain @ gain) < 0.2 * 300 / 600  # of squares that are 600 in all, and 11 by chance
-
-
-@pytest.mark.parametrize("scale", [1.0, -2.5])
-def test_a_projective_matrix_is_taken_apart_whatever_its_scale(scale):
-    calibration = np.array([[3000.0, 40.0, 500.0], [0.0, 2900.0, 300.0], [0.0, 0.0, 1.0]])
-    shift = np.array([10.0, -20.0, 6000.0])
-    matrix = scale * calibration @ np.column_stack([TURN, shift])
-    found = factored(matrix)
-    assert found[0] == pytest.approx(calibration, rel=1e-9)
-    assert found[1] == pytest.approx(TURN, abs=1e-9)
-    assert found[2] == pytest.approx(shift, rel=1e-9)
-    assert np.linalg.det(found[1]) == pytest.approx(1.0)
-    seen = project_projective(matrix, world())
-    again = (world() @ found[1].T + found[2]) @ found[0].T
-    assert again[:, :2] / again[:, 2:] == pytest.approx(seen, rel=1e-9)
+    monkeypatch.setattr(pinholes, "_moved", lambda pinhole, _: replace(pinhole, center=pinhole.center - 1.0))
+    assert pinholes._refined(TRUE, samples) is TRUE

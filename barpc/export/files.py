@@ -1,7 +1,9 @@
-"""For catalogues and maps: a STAC item an image, tie points with their covariance, GDAL's commands for orthoimages."""
+"""What other tools read, as bytes: Sat-NeRF, stereo pipelines, catalogues, tables of points, GDAL's commands."""
 
 from __future__ import annotations
 
+import io
+import json
 import os
 import shlex
 from collections.abc import Mapping
@@ -12,12 +14,15 @@ from urllib.parse import quote
 import numpy as np
 
 from barpc.errors import InputError
-from barpc.export.neural import Files, as_json, rpc_of
-from barpc.export.shots import Scene, Shot, relative_link
-from barpc.geodesy import Array, enu_basis, metres_per_unit, utm, wrap_longitude
+from barpc.export.shots import Scene, Shot, pairs_of, relative_link
+from barpc.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, utm, wrap_longitude
 from barpc.geojson import polygon
+from barpc.report.records import plain
 from barpc.report.tables import ply
+from barpc.rpcio import WRITABLE
 from barpc.sensor.geometry import footprint
+
+Files = dict[str, bytes]
 
 _COLLECTION = "collection.json"
 _EXTENSIONS = ("projection/v2.0.0", "view/v1.0.0")
@@ -32,6 +37,98 @@ _TYPES = {
 }
 _AXES = [(i, j) for i in range(3) for j in range(i, 3)]
 _VARIANCES = tuple(f"var_{'enu'[i]}{'enu'[j]}" for i, j in _AXES)
+
+
+def as_json(value: Any) -> bytes:
+    """Return a JSON text; what is not finite is null."""
+    return (json.dumps(plain(value), indent=1, ensure_ascii=False) + "\n").encode()
+
+
+def rpc_of(shot: Shot) -> dict[str, Any]:
+    """Return the corrected RPC in the names of rpcm."""
+    write = WRITABLE["json"].write
+    assert write is not None
+    found: dict[str, Any] = json.loads(write(shot.rpc))["rpc"]
+    return found
+
+
+# --- Sat-NeRF ---------------------------------------------------------------------------------------------
+
+
+def _record(scene: Scene, shot: Shot, img: str) -> dict[str, Any]:
+    """Return the record of an image that Sat-NeRF and its relatives read."""
+    low, high = scene.alt_range
+    ring = footprint(shot.rpc, shot.size, scene.origin[2])
+    middle = shot.rpc.localize((np.array(shot.size) - 1.0) / 2, np.array(scene.origin[2]))
+    top = shot.rpc.localize(shot.xy, np.full(len(shot.xy), high))
+    depth = np.linalg.norm(ecef_from_ground(top) - ecef_from_ground(scene.points[shot.index]), axis=1)
+    return {
+        "img": img,
+        "height": shot.size[1],
+        "width": shot.size[0],
+        "sun_elevation": shot.light.elevation,
+        "sun_azimuth": shot.light.azimuth,
+        "acquisition_date": shot.light.time,
+        "geojson": {**(polygon(ring) or {}), "center": [float(wrap_longitude(middle[0])), float(middle[1])]},
+        "min_alt": low,
+        "max_alt": high,
+        "rpc": rpc_of(shot),
+        "keypoints": {"2d_coordinates": shot.xy, "pts3d_indices": shot.index, "depths": depth},
+    }
+
+
+def satnerf(scene: Scene, out: Path) -> Files:
+    """Write ``<image>.json`` each, the points in ``pts3d.npy`` (ECEF), ``train.txt`` and ``test.txt``."""
+    rows = zip(scene.shots, scene.file_names(out), strict=True)
+    files = {f"{shot.name}.json": as_json(_record(scene, shot, img)) for shot, img in rows}
+    names = list(files)
+    points = io.BytesIO()
+    np.save(points, ecef_from_ground(scene.points), allow_pickle=False)
+    # no end of line after the last
+    lists = {"train.txt": "\n".join(names).encode(), "test.txt": names[-1].encode()}
+    return {**files, **lists, "pts3d.npy": points.getvalue()}
+
+
+# --- stereo pipelines -------------------------------------------------------------------------------------
+
+
+def _image(shot: Shot, out: Path) -> str:
+    """Return the image as a configuration in `out` names it: the run's VRT or copy where there is one."""
+    return relative_link(shot.carrier or shot.file, out)
+
+
+def _text(shot: Shot, name: str) -> bytes:
+    write = WRITABLE[name].write
+    assert write is not None
+    return write(shot.rpc).encode()
+
+
+def s2p(scene: Scene, out: Path) -> Files:
+    """Write ``config.json``: the images, the first as reference, each with its corrected RPC."""
+    images = [{"img": _image(shot, out), "rpc": rpc_of(shot)} for shot in scene.shots]
+    return {"config.json": as_json({"out_dir": "s2p_out", "images": images, "full_img": True})}
+
+
+def cars(scene: Scene, out: Path) -> Files:
+    """Write ``inputs.yaml``, with the pairs whose angle shows heights, and a ``.geom`` an image."""
+    sensors = {}
+    for shot in scene.shots:
+        camera = {"path": f"{shot.name}.geom", "model_type": "RPC"}
+        sensors[shot.name] = {"image": _image(shot, out), "geomodel": camera}
+    pairing = [list(pair) for pair in pairs_of(scene)]
+    found = {"input": {"sensors": sensors, "pairing": pairing}, "output": {"directory": "cars_out"}}
+    files = {f"{shot.name}.geom": _text(shot, "geom") for shot in scene.shots}
+    return {**files, "inputs.yaml": as_json(found)}  # (JSON is YAML)
+
+
+def asp(scene: Scene, out: Path) -> Files:
+    """Write ``<image>.xml`` each (in Maxar's form), and lists of images and cameras for its tools, run in `out`."""
+    files = {f"{shot.name}.xml": _text(shot, "xml") for shot in scene.shots}
+    lists = {"images.txt": [_image(shot, out) for shot in scene.shots], "cameras.txt": list(files)}
+    return files | {name: ("\n".join(lines) + "\n").encode() for name, lines in lists.items()}
+
+
+# --- catalogues and points --------------------------------------------------------------------------------
 
 
 def stac(scene: Scene, out: Path) -> Files:
@@ -198,6 +295,3 @@ def _option(scene: Scene, name: str) -> str | None:
     """A file of the run's options."""
     found = (scene.summary.options or {}).get(name)
     return found if isinstance(found, str) else None
-
-
-CATALOGUE: Mapping[str, Any] = {"ortho": ortho, "stac": stac, "points": points}

@@ -1,32 +1,26 @@
-"""Simpler cameras near an RPC: affine, a projective matrix, a pinhole without skew; each with its largest error.
+"""For COLMAP: the pinhole camera nearest to each RPC, without skew, with its largest error.
 
-All of them see points in metres east, north, up of the scene's origin, and image points as barpc counts them.
+A pinhole sees points in metres east, north, up of the scene's origin, and image points as barpc counts them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path, PurePath
 
 import numpy as np
-from scipy.linalg import rq
+from scipy.spatial.transform import Rotation
 
+from barpc.errors import InputError
+from barpc.export.files import Files, as_json
+from barpc.export.shots import Sampled, Scene, Shot, relative_link
 from barpc.geodesy import Array
+from barpc.remote import is_url
+from barpc.sensor.curve import rotation_matrix
 
 _STEPS = 40  # of Levenberg's method
-_REWEIGHTED = 8
 _TIMES = 1.0, 2.0, 3.0  # an image that is affine along its flight is best seen from farther away than it was
-
-
-@dataclass(frozen=True, eq=False)
-class Sampled:
-    """Points (N, 3) of the scene [m] and where an image shows them (N, 2) [px]."""
-
-    world: Array
-    image: Array
-
-    def error(self, projected: Array) -> float:
-        """Return the largest distance [px] of projections (N, 2) from where the image shows the points."""
-        return float(np.linalg.norm(projected - self.image, axis=1).max())
+_CORNER = 0.5  # px from the corner of the first pixel, where COLMAP counts from, to its centre
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,54 +36,6 @@ class Pinhole:
         """Return the image points (N, 2) [px] of points (N, 3) [m]."""
         seen = world @ self.rotation.T + self.translation
         return np.asarray(seen[:, :2] / seen[:, 2:] * self.focal + self.center)
-
-
-def fit_affine(samples: Sampled) -> Array:
-    """Return the matrix (2, 4) of (X, Y, Z, 1), by least squares."""
-    scale = np.abs(samples.world).max()
-    rows = np.column_stack([samples.world / scale, np.ones(len(samples.world))])
-    found = np.linalg.lstsq(rows, samples.image)[0].T
-    return np.asarray(found / [scale, scale, scale, 1.0])
-
-
-def project_affine(matrix: Array, world: Array) -> Array:
-    """Return the image points (N, 2) [px]."""
-    return np.asarray(world @ matrix[:, :3].T + matrix[:, 3])
-
-
-def fit_projective(samples: Sampled) -> Array:
-    """Return the matrix (3, 4) of a pinhole with skew, 1 in its last place: least squares, weighted with its depths."""
-    scale, middle = np.abs(samples.world).max(), samples.image.mean(axis=0)
-    reach = np.abs(samples.image - middle).max()
-    world, image = samples.world / scale, (samples.image - middle) / reach
-    rows = np.zeros((2, len(world), 11))
-    for axis in (0, 1):
-        rows[axis, :, 4 * axis : 4 * axis + 3], rows[axis, :, 4 * axis + 3] = world, 1.0
-        rows[axis, :, 8:] = -image[:, axis, None] * world
-    goal, depth = image.T, np.ones(len(world))
-    for _ in range(_REWEIGHTED):
-        weighted = (rows / depth[:, None]).reshape(-1, 11)
-        found = np.linalg.lstsq(weighted, (goal / depth).ravel(), rcond=1e-15)[0]
-        depth = 1.0 + world @ found[8:]
-    matrix = np.append(found, 1.0).reshape(3, 4) / [scale, scale, scale, 1.0]
-    back = np.array([[reach, 0.0, middle[0]], [0.0, reach, middle[1]], [0.0, 0.0, 1.0]])
-    return np.asarray(back @ matrix)
-
-
-def project_projective(matrix: Array, world: Array) -> Array:
-    """Return the image points (N, 2) [px]."""
-    seen = world @ matrix[:, :3].T + matrix[:, 3]
-    return np.asarray(seen[:, :2] / seen[:, 2:])
-
-
-def factored(matrix: Array) -> tuple[Array, Array, Array]:
-    """Return K (3, 3) with its skew, rotation, translation of a projective matrix: K [R | t] in proportion to it."""
-    calibration, rotation = rq(matrix[:, :3])
-    signs = np.where(np.diag(calibration) < 0, -1.0, 1.0)
-    calibration, rotation = calibration * signs, signs[:, None] * rotation
-    turn = np.sign(np.linalg.det(rotation))
-    translation = np.linalg.solve(calibration, matrix[:, 3]) * turn
-    return calibration / calibration[2, 2], turn * rotation, translation
 
 
 def fit_pinhole(samples: Sampled, at: Array, pixel: Array, rows: Array, sight: Array, far: float) -> Pinhole:
@@ -168,8 +114,6 @@ def _jacobian(pinhole: Pinhole, world: Array) -> Array:
 
 
 def _moved(pinhole: Pinhole, step: Array) -> Pinhole:
-    from barpc.sensor.curve import rotation_matrix
-
     turn = rotation_matrix(step[:3])
     return Pinhole(
         pinhole.focal * np.exp(step[6:8]),
@@ -177,3 +121,78 @@ def _moved(pinhole: Pinhole, step: Array) -> Pinhole:
         turn @ pinhole.rotation,
         pinhole.translation + step[3:6],
     )
+
+
+# --- the model ----------------------------------------------------------------------------------------------
+
+
+def pinhole_of(scene: Scene, shot: Shot) -> tuple[Pinhole, float]:
+    """Return the nearest pinhole of a shot, and its largest error over the scene [px]."""
+    pinhole = fit_pinhole(scene.samples(shot), **scene.view_of(shot))
+    checked = scene.samples(shot, checked=True)
+    error = checked.error(pinhole.project(checked.world))
+    if not (np.isfinite(error) and (pinhole.focal > 0).all()):
+        raise InputError(f"{shot.name}: shows the ground mirrored, or no pinhole camera comes near its RPC")
+    return pinhole, error
+
+
+def colmap(scene: Scene, out: Path) -> Files:
+    """Write a text model of pinhole cameras, tie points and their places; ``world.json`` places it on Earth.
+
+    Images are called by their names in the folder ``images`` (`image_links`).
+    """
+    world = scene.world(scene.points)
+    cameras, images, errors = [], [], {}
+    seen: dict[int, list[tuple[int, int, float]]] = {}
+    for number, (shot, name) in enumerate(zip(scene.shots, _called(scene), strict=True), start=1):
+        if any(char.isspace() for char in name):
+            raise InputError(
+                f"{shot.file}: COLMAP ends the name of an image at a space; rename it, or give a link without one"
+            )
+        pinhole, errors[name] = pinhole_of(scene, shot)
+        center = pinhole.center + _CORNER
+        numbers = [*shot.size, *pinhole.focal.tolist(), *center.tolist()]
+        cameras.append(_line(number, "PINHOLE", *numbers))
+        turn = _quaternion(pinhole.rotation).tolist()
+        images.append(_line(number, *turn, *pinhole.translation.tolist(), number, name))
+        places = zip((shot.xy + _CORNER).tolist(), (shot.index + 1).tolist(), strict=True)
+        images.append(" ".join(_line(*xy, point) for xy, point in places))
+        miss = np.linalg.norm(pinhole.project(world[shot.index]) - shot.xy, axis=1)
+        for place, (point, error) in enumerate(zip(shot.index.tolist(), miss.tolist(), strict=True)):
+            seen.setdefault(point, []).append((number, place, error))
+    points = []
+    for point in sorted(seen):
+        track = [value for image, place, _ in seen[point] for value in (image, place)]
+        mean = float(np.mean([error for *_, error in seen[point]]))
+        points.append(_line(point + 1, *world[point].tolist(), 128, 128, 128, mean, *track))
+    about = {"world_to_ecef": scene.world_to_ecef, "alt_range": scene.alt_range, "pinhole_error_px": errors}
+    named = zip(scene.shots, _called(scene), strict=True)
+    about["images"] = {name: relative_link(shot.file, out) for shot, name in named}
+    texts = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": points}
+    return {f"sparse/0/{name}": ("\n".join(lines) + "\n").encode() for name, lines in texts.items()} | {
+        "world.json": as_json(about)
+    }
+
+
+def _called(scene: Scene) -> list[str]:
+    """Return what the model calls the images: as their files where these names differ, else as the run."""
+    names = [PurePath(shot.file).name for shot in scene.shots]
+    if len(set(names)) == len(names):
+        return names
+    return [shot.name + PurePath(shot.file).suffix for shot in scene.shots]
+
+
+def image_links(scene: Scene) -> dict[str, str]:
+    """Return the links in the folder of a COLMAP model and the local images that they point at: nothing is copied."""
+    rows = zip(scene.shots, _called(scene), strict=True)
+    return {f"images/{name}": shot.file for shot, name in rows if not is_url(shot.file)}
+
+
+def _line(*values: float | str) -> str:
+    return " ".join(value if isinstance(value, str) else repr(value) for value in values)
+
+
+def _quaternion(rotation: Array) -> Array:
+    """Return the w, x, y, z of a rotation (3, 3), w not negative."""
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    return np.array([w, x, y, z])
