@@ -460,9 +460,6 @@ class RunOptions(Options):
         """Write a localisation grid and a correction grid of every image; without, of those whose RPC misses the
         corrected camera by more than 0.02 px. RPCs that miss the fit's tolerance are no failure then.""",
     )
-    tiles: int | None = option(
-        None, "Write an RPC of every tile of this side, too, for tools that crop.", unit="px", least=64
-    )
     resample: bool = option(
         False, "Write every image resampled, too, so that one RPC holds its camera; and its correction grid."
     )

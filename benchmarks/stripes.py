@@ -34,8 +34,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # tests, where bar
 from barpc.cameras import open_camera
 from barpc.fit import fit_rpc
 from barpc.options import RunOptions
-from barpc.pipeline.beyond import tile_boxes, write_grids
-from barpc.rpcio import WRITABLE, read_rpc
+from barpc.pipeline.beyond import write_grids
+from barpc.rpcio import WRITABLE
 from barpc.scene import View
 from barpc.simulate.orbit import Look, fly
 from barpc.workspace import Workspace
@@ -53,26 +53,6 @@ GSD, ANGLE, WINDOW, EDGE, GAIN = (
 )  # grey values of white: CARS's SIFT asks for contrast
 TARGET = np.array([5.4, 43.3, 230.0])
 ALTS = (180.0, 280.0)
-TILE = 200
-
-
-class Tiled:
-    """The RPC of its tile for every point, found by another camera."""
-
-    def __init__(self, folder: Path, name: str, size, guide) -> None:
-        self.guide = guide
-        self.tiles = [
-            (box, read_rpc(folder / f"{name}_tiles/{box[1]:05d}_{box[0]:05d}_RPC.TXT"))
-            for box in tile_boxes(size, TILE)
-        ]
-
-    def project(self, ground):
-        """Image points (..., 2) [px]."""
-        at, out = self.guide.project(ground), np.full((*ground.shape[:-1], 2), np.nan)
-        for (col, row, width, height), rpc in self.tiles:
-            inside = ((at >= [col, row]) & (at < [col + width, row + height])).all(axis=-1)
-            out[inside] = rpc.project(ground[inside]) + np.array([col, row])
-        return out
 
 
 def scene(size: tuple[int, int], period: float, pixels: float):
@@ -165,7 +145,7 @@ def kinds(place: Path, shots, arguments):
         fitted.append((view, fit_rpc(camera, size, ALTS, strict=False), camera))
     wide, out = arguments.dense, place / "out"
     with Workspace(out) as run:
-        write_grids(run, fitted, RunOptions(grids=True, tiles=None if wide else TILE, resample=not wide))
+        write_grids(run, fitted, RunOptions(grids=True, resample=not wide))
     if arguments.cars:
         for_cars(place, fitted)
     images = [image for *_, image in shots]
@@ -184,7 +164,6 @@ def kinds(place: Path, shots, arguments):
         for name, *_ in shots:
             with rasterio.open(out / f"{name}_resampled.tif") as dataset:
                 resampled.append(dataset.read(1) / GAIN)
-        found["tiles"] = (images, [Tiled(out, name, size, camera) for name, camera, _ in shots])
         found["_resampled.tif"] = (resampled, files("_resampled.tif"))
     return found | {"truth": (images, [camera for _, camera, _ in shots])}
 
@@ -196,7 +175,7 @@ def main() -> None:
     parser.add_argument("--cols", type=int, default=240)
     parser.add_argument("--period", type=float, default=1200.0, help="of the swing [rows]")
     parser.add_argument("--pixels", type=float, default=0.5, help="of the swing")
-    parser.add_argument("--dense", action="store_true", help="every pixel's disparity; no tiles, none resampled")
+    parser.add_argument("--dense", action="store_true", help="every pixel's disparity; none resampled")
     parser.add_argument("--cars", type=Path, help="leave files for CARS in this new folder")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")

@@ -20,7 +20,7 @@ CAMERA = ("adjust.model", "adjust.drift", "adjust.jitter", "adjust.fixed")
 GROUND = ("gcp", "altimetry", "check_points", "fixed_run", "dem", "adjust.dem_for_weak", "geoid", "reference")
 ADJUSTMENT = (*CAMERA, *GROUND)
 MATCH = ("overwrite", "keep_going")
-RUN = (*MATCH, "images", "rpc_formats", "grids", "tiles", "resample")
+RUN = (*MATCH, "images", "rpc_formats", "grids", "resample")
 """Fields of RunOptions that have flags, by what their verbs do, with their table before a dot."""
 _NAMES = {"rpc_formats": "--rpc-format"}
 

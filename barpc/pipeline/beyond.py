@@ -1,15 +1,13 @@
-"""Cameras that one RPC does not hold: grids, RPCs of tiles and resampled images, reopened like every output."""
+"""Cameras that one RPC does not hold: grids and resampled images, reopened like every output."""
 
 from __future__ import annotations
 
-import json
 import logging
 import shutil
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,13 +21,11 @@ from barpc.fit.points import widened
 from barpc.geodesy import Array
 from barpc.handoff import verify_grid
 from barpc.options import FitOptions, RunOptions
-from barpc.pipeline.executor import GROUP, CachingExecutor
-from barpc.rpcio import read_rpc, write_rpc
+from barpc.pipeline.executor import CachingExecutor
 from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid
 from barpc.rpcio.resample import write_resampled
 from barpc.scene import View
 from barpc.sensor import SensorModel
-from barpc.sensor.corrected import ImageAffine, ImageCorrected
 from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
 from barpc.sensor.csm import STATE_END as STATE
 from barpc.sensor.csm import open_state
@@ -43,16 +39,13 @@ logger = logging.getLogger(__name__)
 
 MISFIT = 0.02
 """A camera that its RPC misses by more [px] gets grids, too."""
-RESAMPLED, TILES = "_resampled.tif", "_tiles.json"
+RESAMPLED = "_resampled.tif"
 REOPENED = 1e-5  # px: what a reopened file may differ by from what was written (15-digit printing)
-
-_BOX = "col", "row", "width", "height"
 
 Written = dict[str, dict[str, float | str]]
 Miss = tuple[float, float, Array]
 """RMS and largest distance to a camera [px], and where that is: (M, 3) col, row [px], altitude [m]."""
 Misses = dict[str, Miss]  # file -> how far it is off the camera that it holds
-Box = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
@@ -71,10 +64,7 @@ class Files:
 
 def grid_names(view: View, options: RunOptions) -> list[str]:
     """Return the files that `write_grids` may write for a view, before it is known whether its RPC holds it."""
-    boxes = [] if options.tiles is None else tile_boxes(view.size, options.tiles)
-    tiles = [*(tile_name(view, box) for box in boxes), *[view.name + TILES] * bool(boxes)]
-    files = Files(grids=True, resampled=options.resample, state=is_writable(view.sensor))
-    return [*files.names(view), *tiles]
+    return Files(grids=True, resampled=options.resample, state=is_writable(view.sensor)).names(view)
 
 
 def write_grids(
@@ -84,7 +74,7 @@ def write_grids(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[Written]:
-    """Write the grids, tile RPCs and resampled images that are asked for, and reopen every file.
+    """Write the grids and resampled images that are asked for, and reopen every file.
 
     OutputError where a file cannot be written, or does not hold what was written.
     """
@@ -99,10 +89,6 @@ def write_grids(
             tasks = [(fitted[i][0], fitted[i][1].rpc, fitted[i][2], files[i]) for i in some]
             for i, found in zip(some, _write(run, tasks, executor, progress), strict=True):
                 written[i] |= found
-    if options.tiles is not None:
-        with run.stage("tiles"):
-            for found, one in zip(written, fitted, strict=True):
-                found |= _write_tiles(run, *one, options, executor)
     return written
 
 
@@ -237,68 +223,3 @@ def verify_grids(view: View, model: SensorModel, errors: Misses, folder: str) ->
                 )
         written[name] = {one.consumer: one.note or one.max_error for one in readings}
     return written
-
-
-# --- tiles ------------------------------------------------------------------------------------------------
-
-
-def tile_boxes(size: tuple[int, int], side: int) -> list[Box]:
-    """Return the tiles (col, row, width, height); a rest of up to half a `side` joins its neighbour."""
-    edges = [[*range(0, max(1, length - side // 2), side), length] for length in size]
-    return [(c, r, right - c, low - r) for r, low in pairwise(edges[1]) for c, right in pairwise(edges[0])]
-
-
-def tile_name(view: View, box: Box) -> str:
-    """Return the file with the RPC of a tile: its first row and column."""
-    return f"{view.name}_tiles/{box[1]:05d}_{box[0]:05d}_RPC.TXT"
-
-
-def _write_tiles(
-    run: Workspace,
-    view: View,
-    fit: RpcFit,
-    model: SensorModel,
-    options: RunOptions,
-    executor: Executor | None,
-) -> Written:
-    """Return an RPC for each tile, in the tile's own pixels, and a list of them."""
-    assert options.tiles is not None
-    boxes, alts = tile_boxes(view.size, options.tiles), widened(view.alt_range)
-    tasks = [(model, tuple(boxes[at : at + GROUP]), alts, options.fit) for at in range(0, len(boxes), GROUP)]
-    try:
-        with CachingExecutor(run, {}, executor) as caching:
-            fits = [one for group in ordered(caching, fit_tiles, tasks, "tiles") for one in group]
-    except FitError as error:
-        raise FitError(f"{view.name}, {error}") from error
-    errors, rows = [], []
-    for box, tile in zip(boxes, fits, strict=True):
-        name = tile_name(view, box)
-        known = replace(tile.rpc, err_bias=fit.rpc.err_bias, err_rand=fit.rpc.err_rand)
-        with run.output(name) as partial:
-            write_rpc(known, partial, format="txt", overwrite=True)
-            errors.append(float(np.linalg.norm(tile.as_written(read_rpc(partial)).max_ckp)))
-        told = errors[-1] if np.isfinite(errors[-1]) else None
-        rows.append(json.dumps({"file": name, **dict(zip(_BOX, box, strict=True)), "max_px": told}))
-    worst = float(np.max(errors))
-    if not worst <= LINEAR:
-        logger.warning("%s: tiles of %d px miss the camera by up to %.3g px", view.name, options.tiles, worst)
-    head = json.dumps({"image": view.name, "size": view.size, "alt_range_m": alts})[1:-1]
-    listed = ",\n".join(rows)
-    run.write_text(view.name + TILES, f'{{{head}, "tiles": [\n{listed}\n]}}\n')
-    return {view.name + TILES: {"barpc": worst}}
-
-
-def fit_tiles(
-    model: SensorModel, boxes: Sequence[Box], alt_range: tuple[float, float], options: FitOptions
-) -> list[RpcFit]:
-    """Return the RPCs of some tiles of a camera, whose images begin at their first pixels."""
-    fits = []
-    for col, row, *size in boxes:
-        tile = ImageCorrected(model, ImageAffine(-np.array([col, row], dtype=np.float64), np.zeros((2, 2))))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", BarpcWarning)  # the fit of the RPC has said it
-            try:
-                fits.append(fit_rpc(tile, (size[0], size[1]), alt_range, options=options, strict=False))
-            except FitError as error:
-                raise FitError(f"tile from column {col}, row {row} on: {error}") from error
-    return fits

@@ -11,7 +11,7 @@ import numpy as np
 from barpc.cameras import open_camera
 from barpc.errors import BarpcError, InputError
 from barpc.identity import take
-from barpc.pipeline.beyond import REOPENED, RESAMPLED, TILES
+from barpc.pipeline.beyond import REOPENED, RESAMPLED
 from barpc.remote import is_url
 from barpc.report import Summary
 from barpc.report.summary.views import ViewEntry
@@ -81,8 +81,8 @@ def _cameras(summary: Summary, folder: Path) -> Iterator[Proved]:
 
 
 def _holds_camera(path: Path) -> bool:
-    """Return whether a file holds the camera of its whole image: tiles and resampled images have their own."""
-    if path.name.endswith((TILES, RESAMPLED)):
+    """Return whether a file holds the camera of its whole image: a resampled image has its own."""
+    if path.name.endswith(RESAMPLED):
         return False
     return path.name.endswith((GRID, CORRECTION)) or row_of(path) is not None
 

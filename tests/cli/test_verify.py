@@ -20,7 +20,7 @@ def finished(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("verify")
     (folder / "in").mkdir()
     images = [crop(source, folder / "in" / source.name) for source in SAMPLES[:2]]
-    adjust(images, folder / "out", RunOptions(grids=True, tiles=128, resample=True, rpc_formats=("txt", "rpb")))
+    adjust(images, folder / "out", RunOptions(grids=True, resample=True, rpc_formats=("txt", "rpb")))
     return folder
 
 

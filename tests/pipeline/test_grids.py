@@ -22,7 +22,7 @@ from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.options import RunOptions
 from barpc.pipeline import adjust, check
 from barpc.pipeline import beyond as grids
-from barpc.pipeline.beyond import CORRECTION, GRID, RESAMPLED, TILES, grid_names, tile_boxes, write_grids
+from barpc.pipeline.beyond import CORRECTION, GRID, RESAMPLED, grid_names, write_grids
 from barpc.rpcio import read_rpc
 from barpc.rpcio.grids import read_correction
 from barpc.scene import View
@@ -34,7 +34,7 @@ from tests.rpcio.conftest import make_rpc, write_image
 from .test_growth import write_block
 
 SIZE, ALTS = (1500, 2200), (0.0, 600.0)
-ENDS = (GRID, CORRECTION, RESAMPLED, TILES)
+ENDS = (GRID, CORRECTION, RESAMPLED)
 
 
 @pytest.fixture(scope="module")
@@ -113,46 +113,6 @@ def test_no_altitude_changes_what_is_added_to_the_rpc_of_a_correction(once, came
     assert rpc.err_bias == fit.rpc.err_bias
 
 
-@pytest.mark.slow
-def test_an_rpc_of_a_tile_is_the_camera_in_its_own_pixels(tmp_path, view, camera, fit):
-    (written,) = run_of(tmp_path, (view, fit, camera), tiles=500)
-    table = json.loads((tmp_path / ("a" + TILES)).read_text())
-    assert (table["image"], table["size"]) == ("a", list(SIZE))
-    assert len(table["tiles"]) == 12
-    for tile in table["tiles"]:
-        origin, side = np.array([tile["col"], tile["row"]]), np.array([tile["width"], tile["height"]])
-        assert tile["file"] == f"a_tiles/{tile['row']:05d}_{tile['col']:05d}_RPC.TXT"
-        ground, image = seen_by(camera, 200, origin, origin + side)
-        off = np.linalg.norm(read_rpc(tmp_path / tile["file"]).project(ground) - (image - origin), axis=1).max()
-        assert off < LINEAR
-        assert off < 1.2 * tile["max_px"] + 1e-6
-    worst = max(tile["max_px"] for tile in table["tiles"])
-    assert written["a" + TILES] == {"barpc": worst}
-    assert worst < LINEAR < 0.02 < fit.max_ckp.max()
-
-
-@pytest.mark.slow
-def test_tiles_that_are_too_large_are_told(tmp_path, view, camera, fit, caplog):
-    with caplog.at_level(logging.WARNING):
-        (written,) = run_of(tmp_path, (view, fit, camera), tiles=2000)
-    assert written["a" + TILES]["barpc"] > LINEAR
-    assert "tiles of 2000 px miss the camera" in caplog.text
-
-
-@pytest.mark.parametrize("size", [(100, 100), (64, 4000), (149, 150), (1000, 333)])
-@pytest.mark.parametrize("side", [64, 100, 1000])
-def test_tiles_cover_an_image_once(size, side):
-    boxes = tile_boxes(size, side)
-    count = np.zeros(size[::-1], int)
-    for col, row, width, height in boxes:
-        count[row : row + height, col : col + width] += 1
-        assert col % side == row % side == 0
-        assert all(
-            2 * n >= min(side, whole) and n <= 1.5 * side for n, whole in zip((width, height), size, strict=True)
-        )
-    assert (count == 1).all()
-
-
 @pytest.mark.slow  # before a commit: the option
 def test_a_resampled_image_has_one_rpc_that_holds(tmp_path, view, camera, fit):
     """Its pixels are those of the image, taken where the camera sees what its RPC sees."""
@@ -191,24 +151,6 @@ def test_a_run_that_dies_half_way_leaves_nothing_half_written(tmp_path, view, ca
     assert own_files(tmp_path / "out") == {"a" + GRID, "a" + CORRECTION, "a" + RESAMPLED}
 
 
-def test_tiles_that_were_fitted_are_not_fitted_again(tmp_path, view, camera, fit, monkeypatch):
-    model = fit.rpc  # of barpc, so that results of it are kept
-    real = Workspace.write_text
-
-    def dying(self, name, text):
-        if name.endswith(TILES):
-            raise KeyboardInterrupt
-        return real(self, name, text)
-
-    monkeypatch.setattr(Workspace, "write_text", dying)
-    with pytest.raises(KeyboardInterrupt):
-        run_of(tmp_path / "out", (view, fit, model), tiles=750)
-    monkeypatch.undo()
-    monkeypatch.setattr(grids, "fit_rpc", None)
-    run_of(tmp_path / "out", (view, fit, model), tiles=750)
-    assert len(own_files(tmp_path / "out")) == 6 + 1 + 2  # tiles, their list, grids
-
-
 def test_a_camera_without_ground_in_a_part_of_its_image_is_one_line(tmp_path, view, camera, fit):
     @dataclass(frozen=True)
     class Blind:
@@ -218,8 +160,6 @@ def test_a_camera_without_ground_in_a_part_of_its_image_is_one_line(tmp_path, vi
         def localize(self, image, alt):
             return np.where(np.asarray(image)[..., :1] > 1400, np.nan, camera.localize(image, alt))
 
-    with pytest.raises(FitError, match=r"^a, tile from column 1000, row 0 on: .*no ground point"):
-        run_of(tmp_path / "tiles", (view, replace(fit, max_ckp=np.zeros(2)), Blind()), tiles=500)
     with pytest.raises(OutputError, match=r"^a: no grid can be made of its camera") as caught:
         run_of(tmp_path / "out", (view, fit, Blind()), grids=True)
     assert "\n" not in str(caught.value)
@@ -249,33 +189,11 @@ def test_what_steps_leave_is_told(tmp_path, view, camera, fit, caplog):
 
 def test_all_names_are_known_before_the_run(view):
     assert grid_names(view, RunOptions()) == ["a" + GRID, "a" + CORRECTION]
-    names = grid_names(view, RunOptions(tiles=800, resample=True))
-    assert names[:3] == ["a" + GRID, "a" + CORRECTION, "a" + RESAMPLED]
-    assert names[3:] == [
-        *(f"a_tiles/{r:05d}_{c:05d}_RPC.TXT" for r in (0, 800, 1600) for c in (0, 800)),
-        "a" + TILES,
-    ]
+    names = grid_names(view, RunOptions(resample=True))
+    assert names == ["a" + GRID, "a" + CORRECTION, "a" + RESAMPLED]
 
 
 # --- its parts ---------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("size", "side", "cols", "rows"),
-    [
-        ((100, 30), 40, [0, 40], [0]),  # a rest of half a side joins its neighbour
-        ((101, 61), 40, [0, 40, 80], [0, 40]),
-        ((40, 20), 40, [0], [0]),
-        ((1, 2), 64, [0], [0]),
-        ((120, 80), 40, [0, 40, 80], [0, 40]),
-    ],
-)
-def test_tiles_go_row_by_row_from_multiples_of_their_side(size, side, cols, rows) -> None:
-    right, low = [*cols[1:], size[0]], [*rows[1:], size[1]]
-    wanted = [
-        (c, r, c2 - c, r2 - r) for r, r2 in zip(rows, low, strict=True) for c, c2 in zip(cols, right, strict=True)
-    ]
-    assert tile_boxes(size, side) == wanted
 
 
 @pytest.mark.parametrize(
@@ -322,13 +240,11 @@ def test_grids_are_for_cameras_that_their_rpc_misses_by_a_fiftieth_of_a_pixel(tm
     assert tasks == [(name, "rpc", True, False) for name in "abcd"]
 
 
-def test_stages_of_grids_and_tiles_are_only_those_there_are(tmp_path, view, tasks, monkeypatch) -> None:
-    monkeypatch.setattr(grids, "_write_tiles", lambda run, view, *given: {view.name + TILES: {"barpc": 2.0}})
-    for options, stages in (({}, []), ({"grids": True}, ["grids"]), ({"tiles": 500}, ["tiles"])):
+def test_a_stage_of_grids_is_only_where_there_are_some(tmp_path, view, tasks) -> None:
+    for options, stages in (({}, []), ({"grids": True}, ["grids"])):
         with Workspace(tmp_path / "-".join(["run", *stages])) as run:
-            written = write_grids(run, [(view, plane(), None)], RunOptions(**options))
+            write_grids(run, [(view, plane(), None)], RunOptions(**options))
             assert [stage["stage"] for stage in run.stages] == stages
-    assert written == [{"a" + TILES: {"barpc": 2.0}}]
 
 
 def read_as(monkeypatch, **rms: float) -> list:
@@ -473,43 +389,6 @@ def test_a_camera_is_off_by_root_mean_square_and_by_most(view) -> None:
     assert where.shape[1] == 3
 
 
-@pytest.mark.parametrize("worst", [0.005, 0.0051, np.nan])
-def test_tiles_are_fitted_eight_at_a_time_and_the_worst_is_told(tmp_path, view, monkeypatch, caplog, worst) -> None:
-    """Ten tiles of 100 x 100 pixels; the fourth is the worst. Each states the errors of the image's RPC."""
-    groups: list[int] = []
-
-    def fits(model, boxes, alts, options):
-        groups.append(len(boxes))
-        assert alts == grids.widened(view.alt_range)
-        return [SimpleNamespace(rpc=make_rpc(), as_written=lambda rpc, box=box: left(box)) for box in boxes]
-
-    def left(box):
-        return plane(worst if box == (300, 0, 100, 100) else 0.001)
-
-    monkeypatch.setattr(grids, "fit_tiles", fits)
-    monkeypatch.setattr(grids, "ordered", lambda pool, fn, tasks, stage: [fn(*task) for task in tasks])
-    fit = SimpleNamespace(rpc=replace(make_rpc(), err_bias=2.5, err_rand=0.125))
-    with Workspace(tmp_path) as run:
-        told = grids._write_tiles(run, replace(view, size=(1000, 100)), fit, None, RunOptions(tiles=100), None)  # type: ignore[arg-type]
-    assert groups == [8, 2]
-    assert list(told) == ["a" + TILES]
-    np.testing.assert_equal(told["a" + TILES], {"barpc": worst})
-    table = json.loads((tmp_path / ("a" + TILES)).read_text())
-    assert [tile["max_px"] for tile in table["tiles"]] == [
-        (None if np.isnan(worst) else worst) if n == 3 else 0.001 for n in range(10)
-    ]
-    assert table["tiles"][3] == {
-        "file": "a_tiles/00000_00300_RPC.TXT", "col": 300, "row": 0, "width": 100, "height": 100,
-        "max_px": table["tiles"][3]["max_px"],
-    }  # fmt: skip
-    assert table["alt_range_m"] == list(grids.widened(view.alt_range))
-    written = read_rpc(tmp_path / "a_tiles/00000_00900_RPC.TXT")
-    assert (written.err_bias, written.err_rand) == (2.5, 0.125)
-    lines = [record.getMessage() for record in caplog.records]
-    wrong = [f"a: tiles of 100 px miss the camera by up to {worst:.3g} px"]
-    assert lines == ([] if worst == 0.005 else wrong)
-
-
 @pytest.mark.parametrize(("asked", "resampled"), [(True, False), (False, True), (True, True)])
 def test_what_a_dead_run_left_in_the_room_is_written_again(tmp_path, view, monkeypatch, asked, resampled) -> None:
     """Which file holds what, how far each is off, and that none of an earlier try is in the way."""
@@ -566,7 +445,7 @@ def block(tmp_path_factory):
 @pytest.mark.slow
 def test_a_run_with_everything_is_told_and_the_same_whatever_the_workers(block, tmp_path):
     images, matches = block
-    options = RunOptions(matches=matches, matches_only=True, grids=True, tiles=128, resample=True)
+    options = RunOptions(matches=matches, matches_only=True, grids=True, resample=True)
     result = adjust(images, tmp_path / "a", options)
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as executor:
         adjust(images, tmp_path / "b", options, executor=executor)
@@ -581,10 +460,9 @@ def test_a_run_with_everything_is_told_and_the_same_whatever_the_workers(block, 
             ground = found.localize(np.array([[10.0, 20.0], [200.0, 250.0]]), np.array([*view.alt_range_m]))
             rpc = read_rpc(tmp_path / "a" / f"{view.name}_RPC.TXT")
             assert np.abs(rpc.project(ground) - [[10.0, 20.0], [200.0, 250.0]]).max() < 1e-3
-    adjust(images, tmp_path / "a", replace(options, grids=False, tiles=None, resample=False, overwrite=True))
+    adjust(images, tmp_path / "a", replace(options, grids=False, resample=False, overwrite=True))
     left = {path.name for path in (tmp_path / "a").iterdir()}
     assert not [name for name in left if name.endswith(ENDS)]
-    assert not list((tmp_path / "a").glob("*_tiles/*"))
 
 
 def test_a_file_of_the_user_is_never_replaced(block, tmp_path):

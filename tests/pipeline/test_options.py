@@ -117,13 +117,6 @@ def grids(run: Run, out: Path, scene: Path) -> None:
     assert (needed, always) == (set(), {"grid.tif", "correction.tif"})
 
 
-def tiles(run: Run, out: Path, scene: Path) -> None:
-    run("a", tiles=64)
-    names = sorted(p.name for p in (out / "a/view_00_tiles").iterdir())
-    assert len(names) == 4  # of an image of 160 px: the last half tile joins its neighbour
-    assert all(name.endswith("_RPC.TXT") for name in names)
-
-
 def resample(run: Run, out: Path, scene: Path) -> None:
     run("a", resample=True)
     assert {p.name for p in (out / "a").glob("*_resampled.tif")} == {f"view_0{k}_resampled.tif" for k in range(3)}
@@ -331,7 +324,7 @@ def allow_remote(run: Run, out: Path, scene: Path) -> None:  # what is read so: 
 
 ROWS = {
     "images": images, "rpc_formats": rpc_formats, "stop_after": stop_after,
-    "grids": grids, "tiles": tiles, "resample": resample,
+    "grids": grids, "resample": resample,
     "keep_going": keep_going, "overwrite": overwrite, "matches": matches, "matches_only": matches_only,
     "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "altimetry": altimetry, "check_points": check_points,
     "fixed_run": fixed_run, "dem": dem, "geoid": geoid,
@@ -345,7 +338,7 @@ def test_every_option_has_a_row() -> None:
 
 
 ELSEWHERE = (
-    "overlap_list", "aoi", "gcp", "check_points", "geoid", "grids", "tiles", "allow_remote", "dem",
+    "overlap_list", "aoi", "gcp", "check_points", "geoid", "grids", "allow_remote", "dem",
     "keep_going", "images",
 )  # fmt: skip
 """Options whose fast tests stand in test_pairs_and_area, test_inputs, test_grids, tests/test_dem,
@@ -367,7 +360,6 @@ def test_an_option_does_what_it_says(name: str, run: Run, tmp_path: Path, scene:
     [
         ({"images": "jpeg"}, "images"),
         ({"stop_after": "lunch"}, "stop_after"),
-        ({"tiles": 0}, "tiles"),
         ({"matches": "a", "matches_only": True, "aoi": "b"}, "aoi is given with matches_only"),
         (
             {"matches": "a", "matches_only": True, "overlap_list": "b"},

@@ -146,7 +146,6 @@ def test_a_camera_that_cannot_be_opened_says_why(camera, tmp_path) -> None:
         ("a_RPC.TXT", None, True),
         ("a_RPC.TXT", 1e-9, False),
         ("a.csv", 1e-9, True),
-        ("a_tiles.json", 1e-9, True),
     ],
 )
 def test_what_holds_no_certified_camera_is_not_opened(camera, tmp_path, name, stated, certified) -> None:
@@ -155,14 +154,13 @@ def test_what_holds_no_certified_camera_is_not_opened(camera, tmp_path, name, st
     assert prove(tmp_path / "out") == []
 
 
-def test_a_grid_holds_the_camera_of_its_image_and_tiles_do_not() -> None:
-    from barpc.pipeline.beyond import RESAMPLED, TILES
+def test_a_grid_holds_the_camera_of_its_image_and_a_resampled_one_does_not() -> None:
+    from barpc.pipeline.beyond import RESAMPLED
     from barpc.rpcio.grids import CORRECTION, GRID
 
     for end, holds in (
         (GRID, True),
         (CORRECTION, True),
-        (TILES, False),
         (RESAMPLED, False),
         ("_RPC.TXT", True),
     ):
