@@ -26,7 +26,6 @@ from barpc.sidefile import NUMBER, OPTIONS, TABLE, read_text
 T = TypeVar("T")
 Record = TypeVar("Record", bound="Options")
 
-Nodes = Literal["uniform", "chebyshev"]
 AUTO, OFF, GEOMETRIC = "auto", "off", "rotation+translation"
 Model = Literal["auto", "rotation+translation", "rotation", "translation", "shift", "shift-drift", "affine"]
 
@@ -88,8 +87,7 @@ _FREE = Rule("")
 def option(default: T, help: str, **rule: Any) -> T:
     """Declare a field of an option record: its default, its meaning, and the rest of its `Rule`."""
     metadata = {"rule": Rule(" ".join(help.split()), **rule)}
-    given: dict[str, Any] = {"default_factory": default.copy} if isinstance(default, dict) else {"default": default}
-    made: T = field(**given, metadata=metadata)
+    made: T = field(default=default, metadata=metadata)
     return made
 
 
@@ -142,8 +140,6 @@ class Options:
 def wanted(kind: Any, rule: Rule) -> str:
     """Return the values that a field may hold, in words."""
     parts = get_args(kind)
-    if get_origin(kind) is Mapping:
-        return f"a table, each value {wanted(parts[1], rule)}"
     if get_origin(kind) is tuple:
         count = "a list" if parts[-1] is ... else f"{len(parts)} values"
         return f"{count}, each {wanted(parts[0], rule)}"
@@ -163,10 +159,7 @@ def checked(name: str, kind: Any, rule: Rule, value: Any) -> Any:
     parts, found = get_args(kind), None
     if get_origin(kind) is tuple and rule.unit == "file" and isinstance(value, (str, os.PathLike)):
         value = (value,)  # of files one is as good as a list of one
-    if get_origin(kind) is Mapping:
-        if isinstance(value, Mapping):
-            return {str(key): checked(f"{name}.{key}", parts[1], rule, item) for key, item in value.items()}
-    elif get_origin(kind) is tuple:
+    if get_origin(kind) is tuple:
         if isinstance(value, (list, tuple)) and (parts[-1] is ... or len(parts) == len(value)):
             return tuple(checked(name, parts[0], rule, item) for item in value)
     elif rule.hook and isinstance(value, str) and re.fullmatch(HOOK, value):
@@ -220,9 +213,6 @@ class TieOptions(Options):
         hook=True,
     )
     tile: int = option(1024, "Side of the tiles that are read and searched for keypoints.", unit="px", least=128)
-    keypoints_per_image: int = option(
-        100_000, "Keypoints an image, at most; its cells hold fewer where more would be found.", least=1
-    )
     min_overlap: float = option(
         0.05, "Share of the smaller footprint that a pair of views must have in common.", least=0, most=1
     )
@@ -241,9 +231,6 @@ class TieOptions(Options):
         "Largest descriptor distance of the best candidate over that of the second best.",
         above=0,
         most=1,
-    )
-    false_share: float = option(
-        0.01, "Share of false matches that is accepted, as control bands estimate it.", above=0, most=1
     )
     min_matches: int = option(
         12, "Verified matches that a pair needs to count; two thirds where thresholds are loosened.", least=4
@@ -308,13 +295,6 @@ class AdjustOptions(Options):
         unit="m",
         above=0,
     )
-    sigma_drift: float | None = option(
-        None,
-        """Prior standard deviation of the drift at the first and last row, on the ground. Without: learnt from the
-        block, 0.2 m counting as a few observations of it.""",
-        unit="m",
-        above=0,
-    )
     learn_priors: bool = option(
         True,
         """Widen the priors of rotation and translation where the corrections contradict them, of all views or of an
@@ -332,14 +312,8 @@ class AdjustOptions(Options):
         "Robust loss of the first rounds; `linear` skips them.",
         rows="barpc.ba.robust.weights.LOSSES",
     )
-    robust_threshold: float = option(
-        4.0, "Observations beyond so many standard deviations are cut after the robust rounds.", above=0
-    )
     estimate_noise: bool = option(True, "Scale the observations' sigmas by what the residuals show.")
     fixed: tuple[str, ...] = option((), "A view that keeps the camera it came with.", unit="name")
-    view_weights: Mapping[str, float] = option(
-        {}, "Weight of a view's observations (1 where absent): their sigmas are divided by it.", above=0
-    )
     dem_sigma: float = option(
         10.0,
         """Standard deviation of single heights of the DEM, until the tie points show it.""",
@@ -411,9 +385,10 @@ class FitOptions(Options):
         (12, 12, 7), "Control points along col (or lon), row (or lat) and altitude.", least=4
     )
     space: Literal["image", "ground"] = option(
-        "image", "Whether the grid is regular in (col, row, alt), or in (lon, lat, alt) as in the paper."
+        "image",
+        """Whether the grid goes by (col, row, alt), on Chebyshev-Lobatto nodes, or as in the paper by (lon, lat, alt),
+        in even steps.""",
     )
-    nodes: Nodes = option("chebyshev", "Spacing of the control points; Chebyshev-Lobatto nodes crowd towards the ends.")
     tolerance: float = option(
         0.01, "A fit whose check points miss by more in one coordinate is refused.", unit="px", above=0
     )
@@ -559,7 +534,7 @@ PAPER: Mapping[str, Mapping[str, Any]] = {
         "learn_priors": False,
         "solver": "scipy",
     },
-    "fit": {"method": "lcurve-joint", "space": "ground", "nodes": "uniform", "grid": (20, 20, 10)},
+    "fit": {"method": "lcurve-joint", "space": "ground", "grid": (20, 20, 10)},
 }
 """The method of Akiki et al. (2021), beyond which the defaults go: ``with_values(RunOptions(), PAPER)``."""
 

@@ -62,7 +62,7 @@ class Peer:
 
 def grid_of(camera: Camera, grid: tuple[int, int, int], space: Space = "image") -> tuple[Array, Array, Array, Array]:
     """Control and check points of a uniform grid over an image, or a box around it: ground and image of each."""
-    options = FitOptions(grid=grid, nodes="uniform", space=space)
+    options = FitOptions(grid=grid, space=space)
     ground, image = control_points(camera.model, camera.size, camera.alt_range, options)
     check = ground
     for axis in range(3):

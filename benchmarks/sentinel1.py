@@ -106,7 +106,7 @@ def measure(path: Path, eos: str | None, rpcfit: str | None) -> None:
     rng = np.random.default_rng(0)
     image, alt = rng.uniform(0, 1, (POINTS, 2)) * model.size, rng.uniform(*model.alt_range, POINTS)
     ground = model.localize(image, alt)
-    options = FitOptions(space="ground", grid=(50, 50, 10), nodes="uniform", tolerance=100.0)
+    options = FitOptions(space="ground", grid=(50, 50, 10), tolerance=100.0)
     control, control_image = control_points(model, model.size, model.alt_range, options)
     data = {"grid": annotation.grid.ground, "ground": ground, "control": control.reshape(-1, 3)}
     peer = ask(eos, "eos", path, data) if eos else None
@@ -175,10 +175,10 @@ def check_data(model, control) -> dict[str, np.ndarray]:
 
 def measure_rpc(model, ground, image, options, other) -> None:
     """RPCs on points that they have not seen."""
-    from barpc.fit import FitOptions, fit_rpc
+    from barpc.fit import fit_rpc
 
     box = fit_rpc(model, model.size, model.alt_range, options=options)
-    fit = fit_rpc(model, model.size, model.alt_range, options=FitOptions(nodes="uniform"), strict=False)
+    fit = fit_rpc(model, model.size, model.alt_range, strict=False)
     error = fit.rpc.project(ground) - image
     print(f"  {'':44s}{'barpc':>12s}{'rpcfit' if other else '':>12s}")
     line("RPC, 50x50x10 box, columns, check RMSE [px]", box.rmse_ckp[0], other and float(other["rmse_True"][0]))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import inspect
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
@@ -67,8 +66,6 @@ def short(kind: Any, rule: Rule) -> str:
     of, bounds = get_args(kind), rule.bounds().strip()
     if get_origin(kind) is tuple:
         return f"{'list' if of[-1] is ... else len(of)} of {short(of[0], rule)}"
-    if get_origin(kind) is Mapping:
-        return f"table of {short(of[1], rule)}"
     if choices := rule.choices(kind):
         return ", ".join(map(str, choices)) + (", module:name" if rule.hook else "")
     if kind is bool:

@@ -15,12 +15,16 @@ CONSTANTS: dict[type[Options], dict[str, tuple[str, ...]]] = {
     TieOptions: {
         "cell": ("barpc.tie.pixels.CELL", "barpc.tie.matchers.features.CELL"),
         "keypoints_per_cell": ("barpc.tie.matchers.features.PER_CELL",),
+        "keypoints_per_image": ("barpc.tie.matchers.features.PER_IMAGE",),
+        "false_share": ("barpc.tie.matchers.matching.FALSE_SHARE",),
         "contrast": ("barpc.tie.matchers.features.CONTRAST",),
         "tolerance": ("barpc.tie.matchers.matching.TOLERANCE",),
         "patch": ("barpc.tie.patches.register.PATCH",),
         "min_correlation": ("barpc.tie.patches.register.MIN_CORRELATION",),
     },
     AdjustOptions: {
+        "robust_threshold": ("barpc.ba.robust.rounds.CRITICAL",),
+        "sigma_drift": ("barpc.ba.estimated.priors.DRIFT_SIGMA",),
         "sigma_shift": ("barpc.ba.estimated.priors.IMAGE_SIGMA",),
         "num_passes": ("barpc.ba.robust.rounds.MAX_PASSES",),
         "max_steps": ("barpc.ba.solving.solve.MAX_STEPS",),

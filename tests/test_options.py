@@ -222,11 +222,11 @@ def test_records_print_what_differs_from_the_defaults() -> None:
     for record in TABLES.values():
         assert repr(record()) == f"{record.__name__}()"
     many = RunOptions(
-        adjust=AdjustOptions(robust_threshold=3),
+        adjust=AdjustOptions(dem_sigma=3),
         gcp=tuple(f"points_{i}.gcp" for i in range(99)),
         keep_going=True,
     )
-    assert repr(many).startswith("RunOptions(adjust=AdjustOptions(robust_threshold=3.0), keep_going=True, gcp=(")
+    assert repr(many).startswith("RunOptions(adjust=AdjustOptions(dem_sigma=3.0), keep_going=True, gcp=(")
     assert len(repr(many)) < 250
     assert eval(repr(AdjustOptions(drift=0, fixed=("a",)))) == AdjustOptions(drift=0, fixed=("a",))
 
@@ -238,10 +238,10 @@ def test_records_print_what_differs_from_the_defaults() -> None:
         ({"tie": {"colour": 3}}, r"here \[tie\]: unknown option 'colour'; known are band"),
         ({"tie": 3}, r"here: \[tie\] must be a table, found 3"),
         (
-            {"fit": {"nodes": "chebychev"}},
-            r"here \[fit\]: nodes 'chebychev' is not one of uniform, chebyshev",
+            {"fit": {"space": "images"}},
+            r"here \[fit\]: space 'images' is not one of image, ground",
         ),
-        ({"adjust": {"robust_threshold": -1}}, r"here \[adjust\]: robust_threshold must be a number above 0"),
+        ({"adjust": {"dem_sigma": -1}}, r"here \[adjust\]: dem_sigma must be a number above 0"),
         ({"adjust": {"center_method": "foo"}}, r"here \[adjust\]: unknown option 'center_method'"),
         ({"adjust": {"model": "shift", "drift": 1}}, "drift 1 needs a model with a rotation"),
         ({"adjust": {"jitter": "5e-324"}}, "jitter '5e-324' is not auto, off or a number of rows"),

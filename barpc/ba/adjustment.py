@@ -28,6 +28,7 @@ from barpc.ba.robust.heldout import enu_offsets, keep_out, measure
 from barpc.ba.robust.rounds import Outcome
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.standing import Parts, without_moving
+from barpc.ba.usual import CRITICAL
 from barpc.errors import AdjustError
 from barpc.geodesy import Array, ground_from_ecef
 from barpc.options import AUTO, AdjustOptions
@@ -107,7 +108,7 @@ def adjust_tracks(
         whole = replace(_adjustment(found, parts, options, in_space, start), altimetry=heights)
         if apart is None or not apart.clear:
             return replace(whole, apart=apart)
-        return _with_apart(whole, apart, found, parts.inner, given, options.robust_threshold)
+        return _with_apart(whole, apart, found, parts.inner, given, CRITICAL)
     except np.linalg.LinAlgError as error:
         raise AdjustError(
             f"the normal equations cannot be solved ({error}): is a standard deviation among the options, or of a "

@@ -22,7 +22,7 @@ from barpc.ba.held.block import Block
 from barpc.ba.judging.judge import LARGEST, around
 from barpc.ba.judging.solution import Solution
 from barpc.ba.placing import Look, Placed, look, place
-from barpc.ba.usual import MUCH_NOISE, SMALL, SURE
+from barpc.ba.usual import CRITICAL, MUCH_NOISE, SMALL, SURE
 from barpc.errors import AdjustError
 from barpc.geodesy import Array
 from barpc.options import GEOMETRIC, AdjustOptions
@@ -182,8 +182,7 @@ def _agreeing(
         measured = np.isfinite(found.after.error) or np.delete(_lost(found, others), v).max() < _MOST
         placed = place(found, others, block, v) if measured and agrees(found) else None
         if placed is not None:
-            limit = options.robust_threshold
-            yield _Left(v, others, found, placed, placed.contradicted(limit), placed.is_coherent(limit))
+            yield _Left(v, others, found, placed, placed.contradicted(CRITICAL), placed.is_coherent(CRITICAL))
 
 
 def _is_tied(block: Block, without: int) -> bool:

@@ -17,6 +17,10 @@ SURELY = 3.0
 OUTLIER = 5.0
 """Standard deviations: of a million normal errors not one is larger. What is farther off is something else."""
 
+CRITICAL = 4.0
+"""Standard deviations of what many are tested by: a component is larger by chance once in 16,000, one of five points
+once in a thousand."""
+
 MUCH_NOISE = 1.5
 """Times what is stated: more noise than that is no noise."""
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from barpc.errors import FitError
 from barpc.fit.precision import ALTITUDE_FLOOR
 from barpc.geodesy import CHUNK, FAR, Array, metres_per_unit, wrap_longitude
-from barpc.options import FitOptions, Nodes
+from barpc.options import FitOptions
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import footprint
 
@@ -19,10 +19,10 @@ _RANGES = (("longitude", -360.0, 720.0), ("latitude", -90.0, 90.0), ("altitude",
 _ONE_ALTITUDE = 1e-3  # metres
 
 
-def spaced(low: float, high: float, count: int, nodes: Nodes) -> Array:
-    """Return the positions (count,) from `low` to `high`, both ends included."""
+def spaced(low: float, high: float, count: int, even: bool = False) -> Array:
+    """Return the positions (count,) from `low` to `high`, ends included: Chebyshev-Lobatto nodes, or `even` steps."""
     t = np.linspace(-1.0, 1.0, count)
-    if nodes == "chebyshev":
+    if not even:
         t = np.sin(0.5 * np.pi * t)
     return 0.5 * (low + high) + 0.5 * (high - low) * t
 
@@ -74,7 +74,9 @@ def control_points(
         x, y = _ground_box(model, size, alt_range)
     else:
         x, y = (-0.5, size[0] - 0.5), (-0.5, size[1] - 0.5)
-    axes = (spaced(*ends, n, options.nodes) for ends, n in zip((x, y, alt_range), options.grid, strict=True))
+    axes = (
+        spaced(*ends, n, options.space == "ground") for ends, n in zip((x, y, alt_range), options.grid, strict=True)
+    )
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     if options.space == "ground":
         return points, model.project(points)

@@ -12,6 +12,7 @@ import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.ba.evidence.places import Place, Unused, met_worse
+from barpc.ba.usual import CRITICAL
 from barpc.cameras import Camera
 from barpc.fit import RpcFit
 from barpc.geodesy import Array, ground_from_ecef
@@ -108,11 +109,10 @@ class Run:
         # who asks for plain least squares has no tie point that may be wrong
         if found is None or not found.held_out.any() or found.options.loss == "linear":
             return []
-        stated = np.array([found.options.view_weights.get(name, 1.0) for name in found.names])
         known = np.isfinite(found.held_out_noise)
         if found.apart is not None and found.apart.clear:
             known[found.apart.view] = False
-        noise = np.where(known, found.held_out_noise / stated, np.nan)
+        noise = np.where(known, found.held_out_noise, np.nan)
         rows = found.held_out & known[tracks.view] & np.isfinite(found.residuals).all(axis=1)
         seen = np.bincount(tracks.point[found.held_out], minlength=tracks.num_points)[tracks.point[rows]]
         # of a track's coordinates three go into its point
@@ -120,7 +120,7 @@ class Run:
         deviation = noise[tracks.view[rows]] * tracks.sigma[rows] * np.sqrt(free)
         unused = Unused(tracks.view[rows], tracks.xy[rows].T, found.residuals[rows].T, deviation)
         size = np.array([view.size for view in self.views], dtype=np.float64).T
-        return met_worse(unused, size, found.options.robust_threshold, SMOOTH_LEFT, MANY_REJECTED)
+        return met_worse(unused, size, CRITICAL, SMOOTH_LEFT, MANY_REJECTED)
 
     @cached_property
     def beside(self) -> dict[int, int]:

@@ -14,7 +14,6 @@ import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.ba.estimated.priors import prior_sigmas, stated_accuracy
-from barpc.ba.held.block import join
 from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
 from barpc.scene import Tracks
@@ -63,10 +62,6 @@ def off_dem(found: Adjustment) -> float:
     return float(np.abs(ground_from_ecef(found.points[np.isfinite(found.points[:, 0])])[:, 2] - 400.0).mean())
 
 
-def first_residual(found: Adjustment) -> float:
-    return float(found.rmse()[0])
-
-
 def steps(found: Adjustment) -> float:
     return float(found.steps)
 
@@ -95,7 +90,6 @@ ROWS = [
     ),
     Row("estimate_noise", False, True, variance, 1, 1.5, rest={"robust_threshold": 9.0}),
     Row("fixed", (), ("view_0000",), lambda found: 1e-9 + np.abs(found.params[0]).max(), -1, 1e6),
-    Row("view_weights", {}, {"view_0000": 20.0}, first_residual, -1, 1.05, rest={"loss": "linear"}),
     Row("dem_sigma", 0.5, 500.0, off_dem, 1, rest={"dem_bias_sigma": 0.5, "learn_priors": False}, dem=400.0),
     Row(
         "dem_bias_sigma",
@@ -290,7 +284,7 @@ def test_auto_leaves_scipy_where_unknowns_are_many(caplog, monkeypatch):
         assert caplog.records[-1].getMessage().split(":")[0] == runs
 
 
-@pytest.mark.parametrize("name", ["sigma_attitude", "sigma_position", "sigma_drift", "dem_sigma", "dem_bias_sigma"])
+@pytest.mark.parametrize("name", ["sigma_attitude", "sigma_position", "dem_sigma", "dem_bias_sigma"])
 def test_a_sigma_must_be_positive(name):
     AdjustOptions(**{name: 1e-9})
     for wrong in (0.0, -1.0, float("nan")):
@@ -309,8 +303,9 @@ def test_every_option_has_a_default():
 
 
 def test_prior_sigmas_stand_at_their_unknowns(dirty):
-    options = AdjustOptions(drift=2, sigma_attitude=2.0, sigma_position=3.0, sigma_drift=5.0)
-    np.testing.assert_array_equal(prior_sigmas(dirty.views, options, 2), [np.repeat([2, 3, 5, 5], 3)] * 4)
+    with chosen(AdjustOptions, drift=2, sigma_attitude=2.0, sigma_position=3.0, sigma_drift=5.0) as options:
+        found = prior_sigmas(dirty.views, options, 2)
+    np.testing.assert_array_equal(found, [np.repeat([2, 3, 5, 5], 3)] * 4)
     for model, size in (("shift", 2), ("shift-drift", 4), ("affine", 6)):
         with chosen(AdjustOptions, model=model, sigma_shift=7.0) as given:
             sigma = prior_sigmas(dirty.views, given, 0)
@@ -323,12 +318,6 @@ def test_a_camera_is_as_accurate_as_it_states_in_metres(dirty, stated, taken):
     told = replace(view, sensor=replace(view.sensor, err_bias=stated))
     assert stated_accuracy(told) == taken
     np.testing.assert_array_equal(prior_sigmas((told,), AdjustOptions(), 0), np.full((1, 6), taken))
-
-
-def test_a_view_that_counts_more_has_smaller_sigmas(dirty):
-    block = join(dirty.views, dirty.tracks, None, AdjustOptions(view_weights={"view_0002": 4.0}))
-    np.testing.assert_allclose(block.sigma[block.view == 2], 0.025)
-    np.testing.assert_allclose(block.sigma[block.view != 2], 0.1)
 
 
 def test_views_turn_about_the_centre_that_is_asked_for(dirty):

@@ -30,7 +30,7 @@ from tests.ba.oracle import Plain, ecef_of, enu_of, ground_of
 from tests.constants import chosen
 from tests.lanes import diagonal, rest_slow
 
-SIGMAS = {"sigma_attitude": 7.0, "sigma_position": 2.0, "sigma_drift": 3.0}
+SIGMAS = {"sigma_attitude": 7.0, "sigma_position": 2.0}
 EAST, NORTH = 0.3, -0.2  # slopes of the terrain
 
 
@@ -66,13 +66,14 @@ def _terrain(origin: np.ndarray, alt: float):
 
 def make_case(drift: int = 0, fixed: tuple[str, ...] = ()) -> Case:
     made = simulate_block(4, 10, seed=7, num_gcps=2, noise=0.3)
+    sharp = {name: np.where(one.view == 1, 3.0, 1.0) for name, one in (("ties", made.tracks), ("gcps", made.gcps))}
     gcps = replace(made.gcps, sigma=np.array([[0.1, 0.5, 2.0], [3.0, 0.2, 0.7]]))
-    weights = {made.views[1].name: 3.0}
-    options = AdjustOptions(drift=drift, view_weights=weights, fixed=fixed, **SIGMAS)
-    centers, tracks = centers_of(made), made.tracks
-    with chosen(AdjustOptions, min_observations=1):
+    gcps = replace(gcps, xy_sigma=gcps.xy_sigma / sharp["gcps"])
+    options = AdjustOptions(drift=drift, fixed=fixed, **SIGMAS)
+    centers, tracks = centers_of(made), replace(made.tracks, sigma=made.tracks.sigma / sharp["ties"])
+    with chosen(AdjustOptions, min_observations=1, sigma_drift=3.0):
         block = join(made.views, tracks, gcps, options)
-    problem = make_problem(block, options, centers, None)
+        problem = make_problem(block, options, centers, None)
     rng = np.random.default_rng(1)
     params = rng.normal(0, 3, (4, problem.cameras.unknowns.size))
     points = ecef_of(np.vstack([made.truth.ground, gcps.lonlatalt])) + rng.normal(0, 2, (12, 3))
@@ -104,7 +105,7 @@ def make_case(drift: int = 0, fixed: tuple[str, ...] = ()) -> Case:
     design = 6.0 * np.column_stack([np.ones(3), east_north / np.abs(east_north).max(axis=0)])
     order = np.argsort(np.concatenate([tracks.view, gcps.view]), kind="stable")
     view = np.concatenate([tracks.view, gcps.view])[order]
-    sigma = np.concatenate([tracks.sigma, gcps.xy_sigma])[order] / np.where(view == 1, 3.0, 1.0)
+    sigma = np.concatenate([tracks.sigma, gcps.xy_sigma])[order]
     camera_sigma = np.repeat([7.0, 2.0, *[3.0] * drift], 3) * np.ones((4, 1))
     plain = Plain(
         made.views,

@@ -269,8 +269,8 @@ def test_priors_of_clocks_stand_at_their_unknowns(slc: Scene) -> None:
     for views, wanted in ((slc.views, slc.views[2].sensor.accuracy), (silent, (7.5, 7.5))):
         np.testing.assert_allclose(prior_sigmas(views, AdjustOptions(), 1)[2, :2], wanted)
         np.testing.assert_allclose(prior_sigmas(views, AdjustOptions(model="translation"), 0)[2, :2], wanted)
-        given = prior_sigmas(views, AdjustOptions(sigma_position=2.0, sigma_attitude=9.0, sigma_drift=0.4), 1)
-        np.testing.assert_array_equal(given[2, [0, 1, 6, 7]], [2.0, 2.0, 0.4, 0.4])
+        given = prior_sigmas(views, AdjustOptions(sigma_position=2.0, sigma_attitude=9.0), 1)
+        np.testing.assert_array_equal(given[2, [0, 1, 6, 7]], [2.0, 2.0, 0.2, 0.2])
     assert (prior_sigmas(slc.views, AdjustOptions(sigma_attitude=9.0), 1)[0, :3] == 9.0).all()
     off = np.array([0.0, 0.0, 30.0])
     np.testing.assert_array_equal(prior_sigmas(slc.views, AdjustOptions(), 0, off)[2, :2], 30.0)

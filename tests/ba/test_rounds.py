@@ -20,6 +20,7 @@ from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import centers_of, solve
+from tests.constants import chosen
 
 CALM = {"drift": 0, "learn_priors": False, "hold_out": False}
 
@@ -200,7 +201,8 @@ def test_a_cut_that_changes_little_is_not_solved_again(monkeypatch) -> None:
     passes = []
     for share in (0.0, 0.2):
         monkeypatch.setattr(rounds, "_SAME", share)
-        found = solve(dirty, **CALM, robust_threshold=1.2, estimate_noise=False)
+        with chosen(AdjustOptions, robust_threshold=1.2):
+            found = solve(dirty, **CALM, estimate_noise=False)
         passes.append(int(found.status.split()[0]))
     assert passes == [6, 2]  # no more than six, and never less than two
 

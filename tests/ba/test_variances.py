@@ -44,7 +44,6 @@ def params_of(v: Variances, totals: list[float]) -> np.ndarray:
 def test_what_is_learnt_is_what_the_options_leave_open() -> None:
     for model, options, learns in (
         ("rotation", {}, (True, True)),
-        ("rotation", {"sigma_drift": 1.0}, (True, False)),
         ("rotation", {"learn_priors": False}, (False, False)),
         ("affine", {}, (False, False)),
     ):

@@ -69,9 +69,9 @@ def sbatch(script: str, tmp_path: Path, *words: str) -> int:
 def test_slurm_runs_the_job_script_and_gives_the_same_bytes(tmp_path):
     images = sorted((DOCS.parent / "data_samples").glob("*.tif"))[:2]
     (tmp_path / "images.txt").write_text("".join(f"{image}\n" for image in images))
-    (tmp_path / "o.toml").write_text("[tie]\nkeypoints_per_image = 3000\n")
+    (tmp_path / "o.toml").write_text("[tie]\npoints_per_image = 600\n")
     assert sbatch(here(tmp_path, "run"), tmp_path) == 0, (tmp_path / "job.log").read_text()
-    barpc.adjust(images, tmp_path / "alone", RunOptions(images="none", tie=TieOptions(keypoints_per_image=3000)))
+    barpc.adjust(images, tmp_path / "alone", RunOptions(images="none", tie=TieOptions(points_per_image=600)))
     for name in ("tables/observations.csv", "tables/block.npz", "view_01_RPC.TXT"):
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes(), name
 

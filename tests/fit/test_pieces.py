@@ -64,7 +64,6 @@ ROWS = [
 ELSEWHERE = {
     "weighted": "test_weighted_passes_are_made_where_the_denominator_varies",
     "space": "test_the_grid_is_regular_where_it_is_asked_for",
-    "nodes": "test_nodes_are_where_they_are_asked_for",
     "localisation": "test_a_localisation_rpc_comes_only_where_it_is_asked_for",
     "tolerance": "test_the_tolerance_decides_whether_a_fit_is_accepted",
     "pole_margin": "test_a_wider_margin_keeps_denominators_up_farther_out",
@@ -159,23 +158,26 @@ def _image_points(camera: Camera, count: int) -> tuple[Any, Any]:
 
 def test_the_grid_is_regular_where_it_is_asked_for(camera: Camera) -> None:
     for space in ("image", "ground"):
-        options = FitOptions(grid=(5, 6, 4), space=space, nodes="uniform")
+        options = FitOptions(grid=(5, 6, 4), space=space)
         ground, image = control_points(camera.model, camera.size, (100.0, 400.0), options)
         assert ground.shape == (5, 6, 4, 3)
         np.testing.assert_allclose(camera.model.project(ground), image, atol=1e-6)
         regular = image if space == "image" else ground
-        np.testing.assert_allclose(np.diff(regular[..., 0], 2, axis=0), 0, atol=1e-6)
-        np.testing.assert_allclose(np.diff(regular[..., 1], 2, axis=1), 0, atol=1e-6)
-        np.testing.assert_allclose(ground[0, 0, :, 2], [100, 200, 300, 400])
+        for axis, count in ((0, 5), (1, 6)):
+            ends = regular[..., axis].min(), regular[..., axis].max()
+            nodes = spaced(*ends, count, even=space == "ground")
+            along = np.moveaxis(regular[..., axis], axis, -1)
+            np.testing.assert_allclose(along, np.broadcast_to(nodes, along.shape), atol=1e-6)
+        np.testing.assert_allclose(ground[0, 0, :, 2], spaced(100, 400, 4, even=space == "ground"))
         if space == "image":
             assert image[0, 0, 0].tolist() == [-0.5, -0.5]
             assert image[-1, -1, -1].tolist() == [camera.size[0] - 0.5, camera.size[1] - 0.5]
 
 
 def test_nodes_are_where_they_are_asked_for() -> None:
-    np.testing.assert_allclose(spaced(2.0, 10.0, 5, "uniform"), [2, 4, 6, 8, 10])
+    np.testing.assert_allclose(spaced(2.0, 10.0, 5, even=True), [2, 4, 6, 8, 10])
     expected = 6.0 - 4.0 * np.cos(np.pi * np.arange(5) / 4)
-    np.testing.assert_allclose(spaced(2.0, 10.0, 5, "chebyshev"), expected)
+    np.testing.assert_allclose(spaced(2.0, 10.0, 5), expected)
 
 
 @pytest.mark.slow

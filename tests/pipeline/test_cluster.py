@@ -147,7 +147,7 @@ def test_workers_close_and_come_during_a_run_and_the_bytes_are_the_same(
     monkeypatch.setattr(cluster, "POLL", 0.2)
     caplog.set_level(logging.WARNING)
     images = sorted(SAMPLES.glob("*.tif"))[:2]
-    options = RunOptions(images="none", tie=TieOptions(tile=256, keypoints_per_image=3000))
+    options = RunOptions(images="none", tie=TieOptions(tile=256, points_per_image=600))
     barpc.adjust(images, tmp_path / "alone", options)
     seen: list[str] = []
 

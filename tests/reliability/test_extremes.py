@@ -59,8 +59,8 @@ def test_options_at_their_ends_give_a_result_or_one_line(block, seed, draws) -> 
 
 @pytest.mark.parametrize("number", [1e31, 1e308, 5e-324, -1e-31])
 def test_no_option_is_a_number_whose_square_is_none(number) -> None:
-    with pytest.raises(InputError, match=r"noise_floor|robust_threshold"):
-        AdjustOptions(noise_floor=abs(number), robust_threshold=number)
+    with pytest.raises(InputError, match=r"noise_floor|dem_sigma"):
+        AdjustOptions(noise_floor=abs(number), dem_sigma=number)
 
 
 def test_equations_that_cannot_be_solved_are_one_line(block, monkeypatch) -> None:

@@ -159,7 +159,7 @@ def test_a_vrt_a_kept_result_and_a_text_open_nothing_even_where_the_host_is_allo
 
 @pytest.mark.slow
 def test_the_same_files_come_out_and_every_byte_is_asked_once(samples: Web, tmp_path: Path) -> None:
-    given, names = {"stop_after": "matching", "tie": TieOptions(keypoints_per_image=800)}, NAMES[:2]
+    given, names = {"stop_after": "matching", "tie": TieOptions(points_per_image=160)}, NAMES[:2]
     urls = [samples.url(name) for name in names]
     remote = barpc.adjust(urls, tmp_path / "a", RunOptions(allow_remote=(samples.host,), **given))  # type: ignore[arg-type]
     barpc.adjust([SAMPLES / name for name in names], tmp_path / "b", RunOptions(**given))  # type: ignore[arg-type]

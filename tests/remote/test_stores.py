@@ -81,7 +81,7 @@ def store(server: str, monkeypatch: pytest.MonkeyPatch) -> Store:
 
 @pytest.mark.slow
 def test_a_bucket_is_read_by_itself_and_by_workers(store: Store, tmp_path: Path) -> None:
-    options = RunOptions(images="copy", allow_remote=HOSTS, tie=TieOptions(keypoints_per_image=3000), stop_after="all")
+    options = RunOptions(images="copy", allow_remote=HOSTS, tie=TieOptions(points_per_image=600), stop_after="all")
     urls = [f"s3://scenes/a/{name}" for name in NAMES[:2]]
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         barpc.adjust(urls, tmp_path / "a", options, executor=pool)

@@ -677,9 +677,9 @@ def test_rpcs_of_real_swaths_reach_the_stated_accuracy(shared_data: Path) -> Non
     box, inside, rows = [], [], []
     for stamp in SLC:
         built = quiet_model(annotation_path(shared_data, stamp))
-        options = FitOptions(space="ground", grid=(50, 50, 10), nodes="uniform")
+        options = FitOptions(space="ground", grid=(50, 50, 10))
         box.append(fit_rpc(built, built.size, built.alt_range, options=options).rmse_ckp[0])
-        rpc = fit_rpc(built, built.size, built.alt_range, options=FitOptions(nodes="uniform")).rpc
+        rpc = fit_rpc(built, built.size, built.alt_range).rpc
         image, alt = scatter(built, built.alt_range, 5000)
         error = rpc.project(built.localize(image, alt)) - image
         inside.append(np.sqrt((error[:, 0] ** 2).mean()))
@@ -700,7 +700,7 @@ def test_an_rpc_of_three_swaths_reaches_two_thousandths_of_a_pixel(shared_data: 
             whole,
             whole.size,
             whole.alt_range,
-            options=FitOptions(grid=(20, 20, 10), nodes="uniform", tolerance=0.02),  # in the corners
+            options=FitOptions(grid=(20, 20, 10), tolerance=0.02),  # in the corners
         )
         image, alt = scatter(whole, whole.alt_range, 5000)
         error = fit.rpc.project(whole.localize(image, alt)) - image

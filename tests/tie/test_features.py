@@ -12,6 +12,7 @@ import pytest
 from barpc.pipeline.executor import CachingExecutor
 from barpc.scene import View
 from barpc.tie import TieOptions, detect
+from barpc.tie.matchers import features
 from barpc.tie.matchers.features import KeypointFiles, Share, _an_octave_up, detect_tile, quota
 from barpc.tie.pixels import survey, tiles
 from barpc.workspace import Workspace
@@ -63,9 +64,10 @@ def test_no_cell_holds_more_than_its_quota_and_the_strongest_stay(tmp_path, text
     assert quota(np.zeros((10, 2)), response, 64, 3).tolist() == [7, 8, 9]
 
 
-def test_the_bound_on_an_image_thins_all_cells_alike(tmp_path, texture) -> None:
+def test_the_bound_on_an_image_thins_all_cells_alike(tmp_path, texture, monkeypatch) -> None:
     path = write_image(tmp_path / "a.tif", texture)
-    found = detect([view(path)], TieOptions(keypoints_per_image=300))[0]
+    monkeypatch.setattr(features, "PER_IMAGE", 300)
+    found = detect([view(path)])[0]
     assert 150 <= len(found) <= 300
     counts = np.unique(np.floor((found.xy + 0.5) / 64).astype(int), axis=0, return_counts=True)[1]
     assert counts.max() <= 8
@@ -144,12 +146,16 @@ def test_keypoints_are_kept_for_a_later_pass_with_another_camera(tmp_path, textu
         (1990, 10_000, 2000, 1),
     ],
 )  # fmt: skip
-def test_an_image_is_looked_at_as_closely_as_the_keypoints_wanted_ask_for(keypoints, points, tile, zoom) -> None:
-    options = TieOptions(keypoints_per_image=keypoints, points_per_image=points, tile=tile)
+def test_an_image_is_looked_at_as_closely_as_the_keypoints_wanted_ask_for(
+    keypoints, points, tile, zoom, monkeypatch
+) -> None:
+    monkeypatch.setattr(features, "PER_IMAGE", keypoints)
+    options = TieOptions(points_per_image=points, tile=tile)
     share = Share.of((4000, 4000), options)
     assert share.zoom == zoom
     assert share.density == keypoints / 16e6
-    assert Share.of((4000, 40_000), replace(options, keypoints_per_image=10 * keypoints)).zoom in (zoom, 1, 2)
+    monkeypatch.setattr(features, "PER_IMAGE", 10 * keypoints)
+    assert Share.of((4000, 40_000), options).zoom in (zoom, 1, 2)
 
 
 def test_a_box_may_hold_a_fifth_more_than_its_share() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from barpc.tie import TieOptions, TieResult, common_tracks, find_tracks, tracks
+from barpc.tie.matchers import features
 from barpc.tie.matchers.features import Share, worth_a_first_look
 from barpc.tie.matchers.matching import PairReport, ample
 
@@ -61,7 +62,7 @@ def test_a_first_look_takes_half_the_detail_and_what_is_wanted_alone(side, point
     options = TieOptions(points_per_image=points)
     share = Share.of((side, side), options, coarse=True)
     assert share.zoom == zoom
-    assert share.density == pytest.approx(min(5 * points, options.keypoints_per_image) / side**2)
+    assert share.density == pytest.approx(min(5 * points, features.PER_IMAGE) / side**2)
     assert worth_a_first_look([(side, side)], options) == worth
     assert not worth_a_first_look([(side, side), (100, 100)], options)
 

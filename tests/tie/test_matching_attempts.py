@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,15 +26,22 @@ NOBODY = join_keypoints([]), join_keypoints([])
 
 
 @pytest.fixture
-def attempts(monkeypatch):
+def shares() -> list[float | None]:
+    """The shares of false matches that attempts may accept."""
+    return []
+
+
+@pytest.fixture
+def attempts(monkeypatch, shares):
     """`attempts(first, second)`: what the attempts report, one after the other; the options of those made."""
     made: list[TieOptions] = []
 
     def scripted(*reports: PairReport) -> list[TieOptions]:
         script = iter(reports)
 
-        def attempt(_views, _keypoints, _pair, options: TieOptions, *_) -> tuple[Matches, PairReport]:
+        def attempt(_views, _keypoints, _pair, options: TieOptions, _looked=None, share=None) -> Any:
             made.append(options)
+            shares.append(share)
             return NO_MATCHES, replace(next(script), matcher=options.matcher)
 
         monkeypatch.setattr(matching, "_attempt", attempt)
@@ -65,11 +73,12 @@ def test_a_pair_with_enough_is_tried_once(attempts) -> None:
         ({"min_matches": 100}, (0.95, 0.05, 67)),
     ],
 )
-def test_a_pair_with_fewer_is_tried_again_with_looser_thresholds(attempts, given, loosened) -> None:
+def test_a_pair_with_fewer_is_tried_again_with_looser_thresholds(attempts, shares, given, loosened) -> None:
     made = attempts(report(99), report(120))
     found = match_pair((None, None), NOBODY, PAIR, TieOptions(**given))[1]  # type: ignore[arg-type]
     assert found == replace(report(120), loosened=True, beaten=("guided 99 of 100",))
-    assert (made[1].ratio, made[1].false_share, made[1].min_matches) == loosened
+    assert (made[1].ratio, shares[1], made[1].min_matches) == loosened
+    assert shares[0] is None  # the usual one
     assert len(made) == 2
 
 
@@ -89,13 +98,15 @@ def test_what_looser_thresholds_cannot_change_is_not_tried_again(attempts, monke
         assert [one.matcher for one in made] == [matching.STRUCTURE, second]
 
 
-def test_whole_pixels_are_looked_at_where_structure_finds_nothing_and_only_there(attempts) -> None:
+def test_whole_pixels_are_looked_at_where_structure_finds_nothing_and_only_there(attempts, shares) -> None:
     """Once, with looser thresholds; what it does not find either is refused for the first reason."""
     structure, nothing = TieOptions(matcher=matching.STRUCTURE), report(0, "no common offset within 700 px")
     made = attempts(nothing, replace(report(30), matcher=matching.FINE))
     found = match_pair((None, None), NOBODY, PAIR, structure)[1]  # type: ignore[arg-type]
     assert found.means == "fine-structure, loosened"
-    assert [(one.matcher, one.false_share, one.min_matches) for one in made[1:]] == [(matching.FINE, 0.05, 8)]
+    assert [(one.matcher, share, one.min_matches) for one, share in zip(made, shares, strict=True)][1:] == [
+        (matching.FINE, 0.05, 8)
+    ]
     made.clear()
     attempts(nothing, report(0, "too few matches"))
     assert match_pair((None, None), NOBODY, PAIR, structure)[1].status == nothing.status  # type: ignore[arg-type]

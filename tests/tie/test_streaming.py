@@ -72,7 +72,8 @@ def test_the_quiet_half_of_a_scene_has_its_share_however_few_keypoints_it_may_ho
 ) -> None:
     """16 to 0.6 keypoints a cell of 64 px, as images of 2,000 to 13,000 px a side have; each looked at in its way."""
     monkeypatch.setattr(features, "_ZOOMS", ((np.inf, zoom),))
-    options = TieOptions(keypoints_per_image=most, tile=128)
+    monkeypatch.setattr(features, "PER_IMAGE", most)
+    options = TieOptions(tile=128)
     for found in features.detect(pair, options):
         assert 0.9 * most <= len(found) <= most
         assert 0.4 <= left(found.xy) <= 0.6
@@ -82,9 +83,10 @@ def test_the_quiet_half_of_a_scene_has_its_share_however_few_keypoints_it_may_ho
 
 
 @pytest.mark.parametrize(("side", "zoom"), [(1000, 1), (3000, 1), (4000, 2), (13_000, 2), (15_000, 4), (40_000, 4)])
-def test_larger_images_are_looked_at_in_less_detail(side: int, zoom: int) -> None:
+def test_larger_images_are_looked_at_in_less_detail(side: int, zoom: int, monkeypatch) -> None:
     assert Share.of((side, side), TieOptions()).zoom == zoom
-    assert Share.of((side, side), TieOptions(points_per_image=10**6, keypoints_per_image=10**7)).zoom <= zoom
+    monkeypatch.setattr(features, "PER_IMAGE", 10**7)
+    assert Share.of((side, side), TieOptions(points_per_image=10**6)).zoom <= zoom
 
 
 def test_a_sigma_is_judged_beside_those_about_it() -> None:
@@ -97,11 +99,12 @@ def test_a_sigma_is_judged_beside_those_about_it() -> None:
 
 
 @pytest.mark.slow
-def test_what_a_poor_tile_leaves_goes_to_the_others(tmp_path) -> None:
+def test_what_a_poor_tile_leaves_goes_to_the_others(tmp_path, monkeypatch) -> None:
     data = quiet(10.0).copy()
     data[:560, :560] = 900  # nothing is found in the first of four tiles
     view = View("a", str(write_image(tmp_path / "a.tif", data, **BLOCKS)), (SIDE, SIDE), None, (0.0, 1.0))  # type: ignore[arg-type]
-    found = features.detect([view], TieOptions(keypoints_per_image=400, points_per_image=200, tile=256))[0]
+    monkeypatch.setattr(features, "PER_IMAGE", 400)
+    found = features.detect([view], TieOptions(points_per_image=200, tile=256))[0]
     assert not (found.xy < 511).all(axis=1).any()
     assert 340 < len(found) <= 360  # three quarters of it, and a fifth more
 
@@ -129,9 +132,10 @@ def test_the_caller_never_loads_keypoints(render, monkeypatch) -> None:
     assert inside == [False, False]
 
 
-def test_a_pair_reads_the_tiles_that_it_needs(pair, tmp_path) -> None:
+def test_a_pair_reads_the_tiles_that_it_needs(pair, tmp_path, monkeypatch) -> None:
     store = Store(str(tmp_path), str(tmp_path))
-    files = locate(pair[:1], TieOptions(keypoints_per_image=900, tile=256), store)[0]
+    monkeypatch.setattr(features, "PER_IMAGE", 900)
+    files = locate(pair[:1], TieOptions(tile=256), store)[0]
     assert 890 < len(files) <= 900
     every, numbers = files.load()
     assert sorted(numbers) == list(range(len(files)))
@@ -165,7 +169,8 @@ def test_a_damaged_tile_is_made_again_and_a_missing_one_is_named(pair, tmp_path,
 
 @pytest.mark.slow
 def test_a_finished_tile_is_not_searched_again_and_its_keys_do_not_name_the_folder(pair, tmp_path, monkeypatch) -> None:
-    options, keys = TieOptions(keypoints_per_image=300, tile=256), []
+    monkeypatch.setattr(features, "PER_IMAGE", 300)
+    options, keys = TieOptions(tile=256), []
     for number in range(2):
         with Workspace(tmp_path / f"run{number}") as workspace, CachingExecutor(workspace, {}) as executor:
             files = locate(pair, options, executor.store, executor=executor)

@@ -156,6 +156,6 @@ def prior_sigmas(
         return np.full((count, size), IMAGE_SIGMA)
     radars = [is_clocked(view.sensor) for view in views]
     parts[0][radars, :2] = stated[radars] if options.sigma_position is None else options.sigma_position
-    parts += [np.full((count, 3), options.sigma_drift or DRIFT_SIGMA)] * drift
+    parts += [np.full((count, 3), DRIFT_SIGMA)] * drift
     parts.append(np.full((count, waves), FIRST_SIGMA))
     return np.hstack(parts)

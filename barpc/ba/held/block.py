@@ -134,14 +134,13 @@ def join(
         )
     left_out = _left_out(names, view[rows], point[rows], tracks.num_points, keep_largest)
     order, _ = counting_sort(view, len(views))
-    weight = np.array([options.view_weights.get(name, 1.0) for name in names])
     use = ~np.isin(view, np.flatnonzero(np.isin(names, left_out)))
     return Block(
         views,
         view[order],
         point[order],
         np.ascontiguousarray(xy[order].T),
-        (sigma / weight[view])[order],
+        sigma[order],
         order,
         use[order],
         gcps,
@@ -157,8 +156,7 @@ def join(
 def _check_names(names: Sequence[str], options: AdjustOptions) -> None:
     if len(set(names)) < len(names):
         raise InputError("two views have the same name")
-    unknown = (set(options.fixed) | set(options.view_weights)) - set(names)
-    if unknown:
+    if unknown := set(options.fixed) - set(names):
         raise InputError(f"no view is named {', '.join(sorted(unknown))}; there are {', '.join(names[:_LISTED])}")
 
 

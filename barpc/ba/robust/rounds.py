@@ -17,7 +17,7 @@ from barpc.ba.robust.variances import SAME_PRIOR, STANDS, PriorTest, Variances, 
 from barpc.ba.robust.weights import LOSSES, MEDIAN, Observations
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
-from barpc.ba.usual import BACKFITTING, GROSS, MUCH_NOISE, OUTLIER, SHRINK, SURELY
+from barpc.ba.usual import BACKFITTING, CRITICAL, GROSS, MUCH_NOISE, OUTLIER, SHRINK, SURELY
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray
@@ -176,7 +176,7 @@ class Rounds:
         if self.robust:
             scatter = self._scatter() if self.scatter is None else self.scatter
             s = self.observations.squared(scatter, self.use.astype(np.float64))
-            near = self.observations.is_near(s, self.options.robust_threshold * self.noise)
+            near = self.observations.is_near(s, CRITICAL * self.noise)
             self.use = self.observations.tied(self.everything & near)
 
     def _solve(self) -> Minimum:

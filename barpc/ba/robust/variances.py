@@ -111,7 +111,7 @@ class Variances:
         geometric = unknowns.geometric and options.learn_priors
         own = options.sigma_attitude is None and options.sigma_position is None and len(views) > 0
         stated = np.array([states_accuracy(view) for view in views]) if own else None
-        return cls(given, unknowns, geometric, geometric and options.sigma_drift is None, not control, stated)
+        return cls(given, unknowns, geometric, geometric, not control, stated)
 
     @property
     def constants(self) -> int:

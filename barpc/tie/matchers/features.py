@@ -22,6 +22,8 @@ from barpc.tie.tasks import Progress, ordered
 
 PER_CELL = 40
 """Strongest keypoints kept in a cell."""
+PER_IMAGE = 100_000
+"""Keypoints an image, at most; its cells hold fewer where more would be found."""
 CONTRAST = 0.01
 """SIFT's contrast threshold."""
 _DEFAULTS = TieOptions()
@@ -115,12 +117,12 @@ class Share:
     def of(size: tuple[int, int], options: TieOptions, coarse: bool = False) -> Share:
         """Return the share of a whole image of `size` (width, height); `coarse`: of a first look."""
         area = size[0] * size[1]
-        wanted = min(options.keypoints_per_image, _AMPLE * options.points_per_image) / area
+        wanted = min(PER_IMAGE, _AMPLE * options.points_per_image) / area
         zooms = (zoom for below, zoom in _ZOOMS if wanted < below and min(size) > zoom * options.tile)
         zoom = next(zooms, 1)
         if coarse:
             return Share(wanted, min(2 * zoom, max(_HOLDS)))
-        return Share(options.keypoints_per_image / area, zoom)
+        return Share(PER_IMAGE / area, zoom)
 
     def expected(self, size: tuple[int, int]) -> float:
         """Estimate the number of keypoints of an image of `size` (width, height) with detail all over, at

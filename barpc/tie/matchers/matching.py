@@ -67,6 +67,8 @@ _LEAST_PEAK = 8  # matches
 _SIGNIFICANT = 6.0  # standard deviations
 _NOWHERE = "no common offset"
 _CLEAR = 0.4  # share of the matches that makes wider passes needless
+FALSE_SHARE = 0.01
+"""Share of false matches that is accepted, as control bands estimate it."""
 _FALSE_SHARE_TIGHT = 0.05  # of the tight pass, which only serves the local one
 _NEIGHBOURS = 12
 _LOOSE = (
@@ -129,7 +131,6 @@ def match_pair(
     loose = replace(
         options,
         ratio=max(options.ratio, _LOOSE[0]),
-        false_share=max(options.false_share, _LOOSE[1]),
         min_matches=max(4, math.ceil(options.min_matches * _LOOSE[2])),
     )
     tried, structural = [first], options.matcher == STRUCTURE
@@ -137,10 +138,10 @@ def match_pair(
         (structural and first[1].matches < loose.min_matches)  # thresholds do not say where it looks
         or (first[1].status.startswith(_NOWHERE) and options.ratio >= CLEAR_RATIO)
     ):  # nor do looser ones let more through where only clear matches count
-        found, report = _attempt(views, keypoints, pair, loose, looked)
+        found, report = _attempt(views, keypoints, pair, loose, looked, _LOOSE[1])
         tried.append((found, replace(report, loosened=True)))
     if structural and all(report.status != "ok" for _, report in tried):
-        found, report = _attempt(views, keypoints, pair, replace(loose, matcher=FINE))
+        found, report = _attempt(views, keypoints, pair, replace(loose, matcher=FINE), None, _LOOSE[1])
         tried.append((found, replace(report, loosened=True)))
     return _better(*tried)
 
@@ -181,6 +182,7 @@ def _attempt(
     pair: Pair,
     options: TieOptions,
     looked: dict[str, _Search] | None = None,
+    false_share: float | None = None,
 ) -> tuple[Matches, PairReport]:
     """Return all passes over a pair with one matcher and its thresholds; by its name, what was `looked` at is
     known to the next attempt.
@@ -210,7 +212,7 @@ def _attempt(
     report = replace(report, matches=len(tight))
     if len(tight) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches")
-    found, control = search.trusted(search.local(tight), options.false_share)
+    found, control = search.trusted(search.local(tight), false_share or FALSE_SHARE)
     errors = search.errors(found)
     keep, residual = affine_inliers(found.xy[:, 0], errors[:, 1])
     report = replace(report, matches=len(found), verified=int(keep.sum()), control_share=control)
