@@ -35,9 +35,8 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc import __version__
-from barpc.atomic import PARTIAL, STATE, replacing
 from barpc.errors import BarpcError, OutputError
-from barpc.frozen import Arrays, load_npz
+from barpc.frozen import PARTIAL, STATE, Arrays, load_npz, replacing
 from barpc.rpcio import hidden_by
 
 logger = logging.getLogger(__name__)

@@ -82,7 +82,7 @@ def main() -> None:
     from barpc.fit import fit_rpc
     from barpc.pointio.correspondences import read_grid
     from barpc.sensor.direct_grid import DirectGrid
-    from barpc.simulate.orbit import Look, fly
+    from barpc.simulate import Look, fly
 
     camera = fly(np.array([5.4, 43.3, 500.0]), Look(22.0, 140.0), SIZE, 0.5)
     cols, rows = (np.arange(0.0, n + 600.0, 600.0) for n in SIZE)

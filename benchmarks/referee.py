@@ -61,7 +61,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.curve import Curve
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.pushbroom import Pushbroom
-from barpc.simulate.orbit import Look, fly
+from barpc.simulate import Look, fly
 
 SHARED = Path(os.environ.get("BARPC_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 PLACE = (5.45, 44.5)

@@ -37,7 +37,7 @@ from barpc.options import RunOptions
 from barpc.pipeline.beyond import write_grids
 from barpc.rpcio import WRITABLE
 from barpc.scene import View
-from barpc.simulate.orbit import Look, fly
+from barpc.simulate import Look, fly
 from barpc.workspace import Workspace
 from tests.jitter import Delivered, jittered
 from tests.scenes.render import render

@@ -11,7 +11,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.curve import Curve
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
-from barpc.simulate.orbit import Look, fly
+from barpc.simulate import Look, fly
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from barpc.atomic import replacing, write_text
 from barpc.errors import OutputError
+from barpc.frozen import replacing, write_text
 
 
 def test_a_block_that_fails_leaves_the_old_file_and_no_other(tmp_path):
@@ -54,7 +54,7 @@ def test_the_temporary_name_keeps_the_suffix(tmp_path):
 
 _WRITER = """
 import sys
-from barpc.atomic import write_text
+from barpc.frozen import write_text
 while True:
     for fill in ("a", "b"):
         write_text(sys.argv[1], fill * 3_000_000, overwrite=True)

@@ -9,7 +9,7 @@ from shapely.geometry import shape
 
 from barpc.geojson import collection, feature, polygon
 from barpc.sensor.geometry import footprint
-from barpc.simulate.orbit import Look, fly
+from barpc.simulate import Look, fly
 from tests.sensor.conftest import make_rpc
 
 

@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.cli.flags import ADJUSTMENT, MATCH, RUN, TIE, paper, run_options, with_flags
-from barpc.cli.progress import executor_for, progress_told
-from barpc.cli.specs import expanded, image_paths
-from barpc.cli.terminal import echo, output_width, print_summary, tell_gate, wants_json
+from barpc.cli.flags import ADJUSTMENT, MATCH, RUN, TIE, expanded, image_paths, paper, run_options, with_flags
+from barpc.cli.terminal import echo, executor_for, output_width, print_summary, progress_told, tell_gate, wants_json
 
 if TYPE_CHECKING:
     from barpc.pipeline import AdjustResult

@@ -16,8 +16,8 @@ import shapely
 
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.alignment import moved, read_move
-from barpc.cli.heights import Altitudes, altitude_of, exchanged, with_heights
-from barpc.cli.specs import expanded
+from barpc.cli.flags import expanded
+from barpc.cli.project import Altitudes, altitude_of, exchanged, with_heights
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
 from barpc.dem import Dem
 from barpc.errors import FitError, InputError, OutputError

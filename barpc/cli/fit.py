@@ -128,7 +128,7 @@ class _Missed(Exception):  # noqa: N818 - it never leaves this page
 
 def _write(fit: RpcFit, source: str, output: str, overwrite: bool, tolerance: float | None) -> tuple[RpcFit, bool]:
     """Write the RPC and read it back: the fit as its file holds it, and whether it stays there (within a tolerance)."""
-    from barpc.atomic import replacing
+    from barpc.frozen import replacing
     from barpc.rpcio import read_rpc, write_camera
 
     try:

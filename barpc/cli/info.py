@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-import platform
-import sys
-import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import click
 import numpy as np
 
-from barpc import __version__
 from barpc.cameras import Camera, open_camera, split_spec
-from barpc.cli.heights import Altitudes, altitude_of, exchanged, ground_at, with_heights
-from barpc.cli.specs import expanded
+from barpc.cli.flags import expanded
+from barpc.cli.project import Altitudes, altitude_of, exchanged, ground_at, with_heights
 from barpc.cli.terminal import echo, wants_json
 from barpc.dem import Dem
 from barpc.errors import InputError, RpcError
@@ -35,13 +28,11 @@ from barpc.sensor.rpc import RPC
 )
 @with_heights("Altitude of the ground [m].  [default: of the run's tie points, else the middle of the camera's]")
 @click.option("--footprint", "outlines", is_flag=True, help="Print outlines on the ground as GeoJSON instead.")
-@click.option("--doctor", is_flag=True, help="Print versions and try the installation instead.")
 def info(
     images: tuple[str, ...],
     at: tuple[float, float, float] | None,
     heights: Altitudes,
     outlines: bool,
-    doctor: bool,
 ) -> int:
     r"""Say where a camera comes from, what it covers and how it looks at the ground; of several, each pair's angle.
 
@@ -59,10 +50,7 @@ def info(
       barpc info left.tif right.tif
       barpc info vendor.RPB,size=20000:19000
       barpc info --footprint scene/*.tif > footprints.geojson
-      barpc info --doctor
     """
-    if doctor:
-        return _examine()
     if not images:
         raise click.UsageError("give at least one IMAGE")
     images, terrain, alt = tuple(expanded(images)), heights.terrain(), heights.alt
@@ -228,77 +216,3 @@ def _geometry(camera: Camera, size: tuple[int, int], alt: float, at: tuple[float
         "camera_altitude_m": {"value": stand.altitude, "method": stand.method},
         "footprint": polygon(geometry.footprint(model, size, alt)),
     }
-
-
-# --- the installation -------------------------------------------------------------------------------------
-
-_REQUIRED = "numpy scipy opencv-python-headless rasterio shapely click filelock fastjsonschema"
-_OPTIONAL = {"jinja2": "report", "distributed": "cluster"}
-
-
-def _fit_an_rpc() -> str:
-    from barpc.fit import fit_rpc
-    from barpc.simulate import Look, fly
-
-    camera = fly(np.array([5.4, 43.3, 250.0]), Look(10.0, 30.0), (500, 400), 0.5)
-    fit = fit_rpc(camera, (500, 400), (0.0, 500.0))
-    return f"{float(fit.max_ckp.max()):.0e} px"
-
-
-def _write_and_read_a_raster() -> str:
-    import rasterio
-
-    from barpc.raster import open_raster
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "pixels.tif"
-        transform = rasterio.Affine(1, 0, 0, 0, -1, 8)
-        shape = {"width": 8, "height": 8, "count": 1, "dtype": "uint16", "transform": transform}
-        with rasterio.open(path, "w", driver="GTiff", **shape) as out:
-            out.write(np.arange(64, dtype=np.uint16).reshape(1, 8, 8))
-        with open_raster(path) as image:
-            total = int(image.read(1).sum())
-    if total != 2016:
-        raise RuntimeError(f"read back {total}, expected 2016")
-    return f"GDAL {rasterio.__gdal_version__}"
-
-
-def _detect_keypoints() -> str:
-    cv2: Any = importlib.import_module("cv2")
-    noise = np.random.default_rng(0).integers(0, 255, (64, 64)).astype(np.uint8)
-    found = cv2.SIFT_create().detect(cv2.GaussianBlur(noise, (0, 0), 2.0), None)
-    return f"{len(found)} SIFT keypoints in noise"
-
-
-_CHECKS: dict[str, Callable[[], str]] = {
-    "read and write a raster": _write_and_read_a_raster,
-    "detect keypoints": _detect_keypoints,
-    "fit an RPC to a simulated camera": _fit_an_rpc,
-}
-
-
-def _examine() -> int:
-    """Print the versions of what barpc stands on, try each part once, and give the exit code."""
-    versions = {"barpc": __version__, "python": platform.python_version()}
-    missing = {name: f"not installed (pip install 'barpc[{extra}]')" for name, extra in _OPTIONAL.items()}
-    for name in (*_REQUIRED.split(), *_OPTIONAL):
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            versions[name] = missing.get(name, "MISSING")
-    results = {}
-    for name, check in _CHECKS.items():
-        try:
-            results[name] = {"ok": True, "found": check()}
-        except Exception as error:  # noqa: BLE001  whatever is broken is what this is there to show
-            results[name] = {"ok": False, "found": f"{type(error).__name__}: {error}"}
-    good = all(result["ok"] for result in results.values()) and "MISSING" not in versions.values()
-    if wants_json():
-        echo(json.dumps({"versions": versions, "checks": results, "ok": good}, indent=1))
-        return 0 if good else 1
-    for name, found in versions.items():
-        echo(f"{name:<24} {found}")
-    for name, result in results.items():
-        echo(f"{'ok  ' if result['ok'] else 'FAIL'} {name}: {result['found']}")
-    echo(f"platform: {platform.platform()}, {sys.executable}", err=True)
-    return 0 if good else 1

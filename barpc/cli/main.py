@@ -49,7 +49,7 @@ COMMANDS = {
 """Verb -> its line in `barpc --help`; the code is the function `<verb>` of `barpc.cli.<verb>`, or of these:"""
 _MODULES = {
     **dict.fromkeys(("match", "check"), "adjust"),
-    **dict.fromkeys(("report", "export", "verify"), "finished"),
+    **dict.fromkeys(("report", "export", "verify", "dsm"), "finished"),
     **dict.fromkeys(("localize", "triangulate"), "project"),
 }
 

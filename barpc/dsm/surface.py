@@ -13,12 +13,12 @@ import numpy as np
 import rasterio
 import rasterio.shutil
 
-from barpc.atomic import refuse_existing, replacing
 from barpc.dsm.cells import MATCHED, SIDE
 from barpc.dsm.grid import Counts, Grid
 from barpc.dsm.imagery import NoSurfaceError, block_of_images, block_of_run
 from barpc.dsm.relief import show_in_report
 from barpc.errors import InputError, OutputError
+from barpc.frozen import refuse_existing, replacing
 from barpc.options import DsmOptions
 from barpc.sidefile import plain_path
 from barpc.tie.tasks import Progress

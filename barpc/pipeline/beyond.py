@@ -13,11 +13,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from barpc.atomic import write_text
 from barpc.errors import BarpcError, BarpcWarning, FitError, OutputError, RpcError
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.certificate import Sample
 from barpc.fit.points import widened
+from barpc.frozen import write_text
 from barpc.geodesy import Array
 from barpc.handoff import verify_grid
 from barpc.options import FitOptions, RunOptions

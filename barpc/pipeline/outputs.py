@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence, Set
+from collections.abc import Iterable, Iterator, Sequence, Set
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from barpc.errors import OutputError
+from barpc.cameras import open_camera
+from barpc.errors import BarpcError, InputError, OutputError
 from barpc.fit import RpcFit
 from barpc.handoff import verify
+from barpc.identity import take
 from barpc.options import RunOptions
-from barpc.pipeline.beyond import REOPENED, grid_names, made_in_room
+from barpc.pipeline.beyond import REOPENED, RESAMPLED, grid_names, made_in_room
 from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.inputs import PRIOR
+from barpc.remote import is_url
 from barpc.report import Run, Summary
 from barpc.report.page import REPORT, can_render, report_html
 from barpc.report.records import plain
 from barpc.report.summary import OutputEntry, StageEntry
-from barpc.report.tables import TABLES, gcps_geojson
-from barpc.rpcio import CARRIERS, WRITABLE, sidecars, write_camera
+from barpc.report.summary.views import ViewEntry
+from barpc.report.tables import TABLES, gcps_geojson, read_summary
+from barpc.rpcio import CARRIERS, WRITABLE, row_of, sidecars, write_camera
+from barpc.rpcio.grids import CORRECTION, GRID
 from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
@@ -168,3 +173,94 @@ def _json(value: Any) -> str:
     if not isinstance(value, list):
         return json.dumps(value)
     return "[\n" + ",\n".join(map(json.dumps, value)) + "\n]" if value else "[]"
+
+
+# --- whether a finished run is still what it was ----------------------------------------------------------
+
+
+SAME, MOVED, CHANGED, MISSING, UNKNOWN = "same", "moved", "changed", "missing", "not asked"
+GOOD = (SAME, MOVED)
+
+
+@dataclass(frozen=True)
+class Proved:
+    """What became of a file: its `kind` (input, output or camera), a word for its state, and details."""
+
+    kind: str
+    file: str
+    now: str
+    note: str = ""
+
+
+def prove(folder: Path, places: Sequence[Path] = ()) -> list[Proved]:
+    """Compare a run with what its summary says of it; inputs that are gone are looked for by name in `places`.
+
+    InputError where the folder holds no finished run, or one of a release that hashed nothing.
+    """
+    summary = read_summary(folder)
+    if summary.inputs is None or summary.outputs is None:
+        raise InputError(f"{folder}: its summary holds no hashes: an older release wrote it; run the adjustment again")
+    return [
+        *_inputs(summary, (folder, folder.parent, *places)),
+        *_outputs(summary, folder),
+        *_cameras(summary, folder),
+    ]
+
+
+def _inputs(summary: Summary, places: Iterable[Path]) -> Iterator[Proved]:
+    for one in summary.inputs or ():
+        if is_url(one.path):
+            yield Proved("input", one.path, UNKNOWN, "on another host")
+            continue
+        found = _digest(Path(one.path))
+        if found == one.sha256:
+            yield Proved("input", one.path, SAME)
+            continue
+        elsewhere = (place / Path(one.path).name for place in places)
+        moved = next((str(path) for path in elsewhere if _digest(path) == one.sha256), None)
+        if moved is not None:
+            yield Proved("input", one.path, MOVED, f"it is {moved}")
+        else:
+            yield Proved("input", one.path, MISSING if found is None else CHANGED)
+
+
+def _outputs(summary: Summary, folder: Path) -> Iterator[Proved]:
+    for one in summary.outputs or ():
+        found = _digest(folder / one.file)
+        now = SAME if found == one.sha256 else MISSING if found is None else CHANGED
+        yield Proved("output", one.file, now)
+
+
+def _cameras(summary: Summary, folder: Path) -> Iterator[Proved]:
+    for view in summary.views:
+        for name, consumers in view.outputs.items():
+            stated = consumers.get("barpc")
+            if view.certified and isinstance(stated, float) and _holds_camera(folder / name):
+                yield _camera(view, folder / name, name, stated)
+
+
+def _holds_camera(path: Path) -> bool:
+    """Return whether a file holds the camera of its whole image: a resampled image has its own."""
+    if path.name.endswith(RESAMPLED):
+        return False
+    return path.name.endswith((GRID, CORRECTION)) or row_of(path) is not None
+
+
+def _camera(view: ViewEntry, path: Path, name: str, stated: float) -> Proved:
+    """Read the camera of a file as a reader finds it: another file beside it may go before."""
+    points = np.array(view.certified)
+    try:
+        off = np.linalg.norm(open_camera(path).model.project(points[:, :3]) - points[:, 3:], axis=1)
+    except (BarpcError, OSError) as error:
+        return Proved("camera", name, MISSING if not path.exists() else CHANGED, str(error))
+    if off.max() <= stated + REOPENED:
+        return Proved("camera", name, SAME)
+    far = f"reads {off.max():.3g} px off the certified camera, {stated:.1g} stated"
+    return Proved("camera", name, CHANGED, far)
+
+
+def _digest(path: Path) -> str | None:
+    try:
+        return take(path).sha256 if path.is_file() else None
+    except OSError:
+        return None

@@ -24,15 +24,15 @@ from barpc.handoff import unverified
 from barpc.identity import Input, Stamp, ask, guarded, recorded
 from barpc.options import FitOptions, RunOptions
 from barpc.pipeline.beyond import write_grids
-from barpc.pipeline.cluster import watched
-from barpc.pipeline.control import load_altimetry, load_gcps
-from barpc.pipeline.executor import GROUP, CachingExecutor
+from barpc.pipeline.executor import GROUP, CachingExecutor, watched
 from barpc.pipeline.inputs import (
     PRIOR,
     given_matches,
     given_tracks,
     hash_inputs,
     input_files,
+    load_altimetry,
+    load_gcps,
     only_new,
     read_pairs,
     reference_names,

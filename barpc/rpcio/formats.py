@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Literal
 
 from barpc import remote
-from barpc.atomic import write_text
 from barpc.errors import InputError, RpcFormatError
+from barpc.frozen import write_text
 from barpc.remote import Place
 from barpc.rpcio import text, xml
 from barpc.rpcio.fields import ReadOptions

@@ -17,8 +17,8 @@ import numpy.typing as npt
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from barpc.atomic import replacing
 from barpc.errors import RpcError, RpcFormatError
+from barpc.frozen import replacing
 from barpc.geodesy import FAR, Array
 from barpc.raster import open_raster
 from barpc.remote import Place

@@ -19,8 +19,8 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.shutil import copy as raster_copy
 from rasterio.windows import Window
 
-from barpc.atomic import replacing, write_text
 from barpc.errors import ImageError, OutputError
+from barpc.frozen import replacing, write_text
 from barpc.raster import Mosaic, identify, open_raster
 from barpc.remote import Place, here
 from barpc.rpcio.text import nitf_record

@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 
 from barpc import identity
-from barpc.atomic import replacing
 from barpc.errors import InputError
-from barpc.frozen import Arrays, load_npz
+from barpc.frozen import Arrays, load_npz, replacing
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.sicd import open_sicd
 from barpc.sensor.sicd.formation import Aperture, Formation
 from barpc.sensor.timing import Clocked, Timing
-from barpc.simulate.orbit import Look, fly
+from barpc.simulate import Look, fly
 from tests.lanes import diagonal, rest_slow
 from tests.sensor.radar_documents import document
 from tests.sensor.s1_product import Product

@@ -14,7 +14,7 @@ from barpc.scene import Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center, triangulate
-from barpc.simulate.orbit import Look, fly
+from barpc.simulate import Look, fly
 from tests.sensor.s1_product import Product
 
 SIZE = (20000, 19000)

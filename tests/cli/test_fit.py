@@ -102,7 +102,7 @@ def test_a_source_that_cannot_be_fitted_is_one_line_and_exit_1(
 
 def test_real_sources(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image = shared_data / "optical" / "phr_triplet_north" / "img_01.tif"
-    (tmp_path / "fit.toml").write_text('[fit]\nspace = "ground"\nnodes = "uniform"\n')
+    (tmp_path / "fit.toml").write_text('[fit]\nspace = "ground"\n')
     assert run("fit", image, "-o", tmp_path / "img.vrt", "--options", tmp_path / "fit.toml") == 0
     assert run("fit", shared_data / "physical" / "GRID_P1BP--2017092838284574CP.tif") == 0
     radar = sorted((shared_data / "sar").glob("s1a-iw1-slc-vv-20210216*.xml"))[0]

@@ -5,14 +5,12 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from barpc import __version__
 from barpc.cameras import open_camera
 from barpc.cli import info as module
 from barpc.cli.info import _altitude, _describe, _lines, _outlines, _pairs
@@ -264,92 +262,3 @@ def test_the_page_has_an_image_s_name_and_its_lines_behind(pair: list[str], caps
     (report,) = json.loads(capsys.readouterr().out)
     assert "pairs" not in report
     assert report["center_alt_m"] == 60.0
-
-
-# --- the installation -------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def doctor(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """An installation of made-up versions and checks."""
-    checks: dict[str, Any] = {"add": lambda: "2"}
-    monkeypatch.setattr(module, "_CHECKS", checks)
-    monkeypatch.setattr(module, "_REQUIRED", "numpy")
-    monkeypatch.setattr(module, "_OPTIONAL", {"jinja2": "report"})
-    missing: set[str] = set()
-
-    def version(name: str) -> str:
-        if name in missing:
-            raise PackageNotFoundError(name)
-        return "9.9"
-
-    monkeypatch.setattr(module, "version", version)
-    return {"checks": checks, "missing": missing}
-
-
-def test_a_sound_installation_is_told_line_by_line(doctor: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("info", "--doctor") == 0
-    said = capsys.readouterr()
-    name, python, numpy, jinja, check = said.out.splitlines()
-    assert name == f"barpc                    {__version__}"
-    assert python.startswith("python                   3.")
-    assert (numpy, jinja) == ("numpy                    9.9", "jinja2                   9.9")
-    assert check == "ok   add: 2"
-    assert said.err.startswith("platform: ")
-    assert run("info", "--doctor", "--json") == 0
-    said = capsys.readouterr()
-    found = json.loads(said.out)
-    assert said.err == ""
-    assert found["ok"] is True
-    assert found["checks"] == {"add": {"ok": True, "found": "2"}}
-    assert said.out.splitlines()[1].startswith(' "versions"')
-
-
-def test_what_is_optional_may_be_missing_and_says_how_to_get_it(
-    doctor: dict[str, Any], capsys: pytest.CaptureFixture[str]
-) -> None:
-    doctor["missing"].add("jinja2")
-    assert run("info", "--doctor") == 0
-    assert "jinja2                   not installed (pip install 'barpc[report]')\n" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("words", [(), ("--json",)])
-@pytest.mark.parametrize("fault", ["required", "check"])
-def test_what_is_broken_ends_with_1(
-    fault: str, words: tuple[str, ...], doctor: dict[str, Any], capsys: pytest.CaptureFixture[str]
-) -> None:
-    if fault == "required":
-        doctor["missing"].add("numpy")
-    else:
-        doctor["checks"]["divide"] = lambda: 1 / 0
-    assert run("info", "--doctor", *words) == 1
-    text = capsys.readouterr().out
-    if words:
-        assert json.loads(text)["ok"] is False
-    elif fault == "required":
-        assert "numpy                    MISSING\n" in text
-    else:
-        assert "ok   add: 2\nFAIL divide: ZeroDivisionError: division by zero\n" in text
-
-
-def test_the_raster_that_is_tried_must_come_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert module._write_and_read_a_raster().startswith("GDAL ")
-
-    class Wrong:
-        def __enter__(self) -> Any:
-            return self
-
-        def __exit__(self, *_: object) -> None: ...
-
-        def read(self, band: int) -> np.ndarray:
-            return np.arange(65)
-
-    monkeypatch.setattr("barpc.raster.open_raster", lambda _: Wrong())
-    with pytest.raises(RuntimeError, match="read back 2080, expected 2016"):
-        module._write_and_read_a_raster()
-
-
-def test_the_other_trials_say_what_they_found() -> None:
-    assert int(module._detect_keypoints().split()[0]) > 0
-    assert module._detect_keypoints().endswith(" SIFT keypoints in noise")
-    assert float(module._fit_an_rpc().split()[0]) < 1e-3

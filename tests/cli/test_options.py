@@ -11,9 +11,8 @@ import pytest
 from click.testing import CliRunner
 
 from barpc.cli.adjust import adjust
-from barpc.cli.flags import _jobs, field_of, flag, flag_name, run_options
+from barpc.cli.flags import _jobs, field_of, flag, flag_name, image_paths, run_options
 from barpc.cli.main import cli
-from barpc.cli.specs import image_paths
 from barpc.errors import InputError
 from barpc.options import AdjustOptions, FitOptions, RunOptions, TieOptions
 

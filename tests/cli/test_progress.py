@@ -13,9 +13,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from barpc.cli import progress as module
-from barpc.cli.progress import MINUTE, Lines, executor_for, progress_told
-from barpc.cli.terminal import THREADS
+from barpc.cli import terminal as module
+from barpc.cli.terminal import MINUTE, THREADS, Lines, executor_for, progress_told
 from barpc.errors import InputError
 
 

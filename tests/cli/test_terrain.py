@@ -12,7 +12,7 @@ import pytest
 import rasterio
 
 from barpc.cameras import Camera, open_camera
-from barpc.cli.heights import altitude_of, exchanged
+from barpc.cli.project import altitude_of, exchanged
 from barpc.rpcio import read_rpc, write_rpc_copy
 from tests.cli.test_images import run
 from tests.report.conftest import run_of_block, written

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.simulate.orbit import Look, fly
+from barpc.simulate import Look, fly
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from barpc.fit.precision import PRECISIONS
 from barpc.geodesy import Array
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.sensor.rpc import RPC
-from barpc.simulate.orbit import Look, fly
+from barpc.simulate import Look, fly
 from tests.fit.cameras import Camera, random_points, synthetic
 from tests.lanes import rest_slow
 

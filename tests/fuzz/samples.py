@@ -19,8 +19,8 @@ from barpc.ba import BlockPrior
 from barpc.ba.estimated.priors import CameraPrior
 from barpc.ba.held.incremental import apply_prior
 from barpc.cameras import open_camera
+from barpc.cli.flags import image_paths
 from barpc.cli.project import given_points
-from barpc.cli.specs import image_paths
 from barpc.cli.terminal import print_comparison
 from barpc.dem import Dem
 from barpc.errors import RpcError

@@ -17,7 +17,7 @@ import pytest
 import barpc
 from barpc.errors import InputError
 from barpc.options import RunOptions, TieOptions
-from barpc.pipeline import cluster
+from barpc.pipeline import executor as cluster
 from barpc.pipeline.executor import run_batch
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"

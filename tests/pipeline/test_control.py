@@ -10,8 +10,8 @@ import pytest
 
 from barpc.errors import InputError
 from barpc.options import RunOptions, TieOptions
-from barpc.pipeline import control
-from barpc.pipeline.control import load_gcps
+from barpc.pipeline import inputs as control
+from barpc.pipeline.inputs import load_gcps
 from barpc.pointio.correspondences import GROUND_SIGMA, IMAGE_SIGMA
 from barpc.scene import GroundPoints, View
 from barpc.sensor.corrected import Corrected, Correction

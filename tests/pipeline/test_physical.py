@@ -23,7 +23,7 @@ from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.linescan import read_linescan
 from barpc.sensor.pushbroom import Light
-from barpc.simulate.orbit import Look
+from barpc.simulate import Look
 from tests.lanes import rest_slow
 from tests.rpcio.conftest import make_rpc, write_image
 from tests.sensor.linescan_files import Flight, dimap, isd

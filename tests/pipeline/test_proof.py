@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from barpc.errors import InputError
-from barpc.pipeline import proof
+from barpc.pipeline import outputs as proof
 from barpc.pipeline.beyond import REOPENED
-from barpc.pipeline.proof import CHANGED, GOOD, MISSING, MOVED, SAME, UNKNOWN, Proved, prove
+from barpc.pipeline.outputs import CHANGED, GOOD, MISSING, MOVED, SAME, UNKNOWN, Proved, prove
 from barpc.rpcio import write_rpc
 from tests.rpcio.conftest import make_rpc
 

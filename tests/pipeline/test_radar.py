@@ -18,7 +18,7 @@ from barpc.rpcio import read_rpc, write_rpc
 from barpc.scene import Tracks
 from barpc.sensor.sicd import open_sicd
 from barpc.sensor.timing import Timed, Timing
-from barpc.simulate.orbit import Look, fly
+from barpc.simulate import Look, fly
 from tests.sensor.radar_documents import SIZE, document
 
 TARGET, ALT = np.array([5.4, 43.3, 120.0]), (-100.0, 400.0)

@@ -19,7 +19,7 @@ from barpc.raster import open_raster
 from barpc.rpcio import read_rpc, resample, write_rpc_vrt
 from barpc.rpcio.resample import write_resampled
 from barpc.sensor.correction_grid import CorrectionGrid
-from barpc.simulate.orbit import fly, looks
+from barpc.simulate import fly, looks
 from tests.jitter import jittered
 from tests.lanes import rest_slow
 from tests.rpcio.conftest import make_rpc

@@ -22,7 +22,7 @@ from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.curve import Curve, rotation_matrix
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
-from barpc.simulate.orbit import Look, fly, looks
+from barpc.simulate import Look, fly, looks
 from tests.scenes.render import Radiometry, expose, render
 from tests.scenes.terrain import TALLEST, Float32, Plane, Terrain, make_terrain
 from tests.scenes.texture import Date, Surface, make_surfaces

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barpc.errors import InputError
-from barpc.simulate.orbit import Look, fly, looks
+from barpc.simulate import Look, fly, looks
 from tests.lanes import rest_slow
 from tests.scenes.render import Radiometry, expose, render
 from tests.scenes.terrain import Grid, Plane, Ray, make_terrain

@@ -21,7 +21,7 @@ from barpc.sensor.sicd import open_sicd
 from barpc.sensor.splined import RowSpline, Splined
 from barpc.sensor.terrasar import open_terrasar
 from barpc.sensor.timing import Timed, Timing
-from barpc.simulate.orbit import Look, fly
+from barpc.simulate import Look, fly
 from tests.sensor.radar_documents import document
 from tests.sensor.s1_product import Product
 from tests.sensor.terrasar_files import Terrasar

@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from barpc.geodesy import Array, ecef_from_ground, ground_from_ecef
-from barpc.simulate.orbit import Look, fly
+from barpc.simulate import Look, fly
 
 START = np.datetime64("2026-05-07T23:59:59.250000", "ns")
 """Time of row 0: the image goes on into the next day."""

@@ -12,7 +12,7 @@ from barpc.cameras import open_camera
 from barpc.errors import RpcError
 from barpc.sensor import geometry
 from barpc.sensor.geometry import NOMINAL_ALTITUDE, PLAUSIBLE_ALTITUDE, camera_center
-from barpc.simulate.orbit import Look, fly
+from barpc.simulate import Look, fly
 from tests.sensor.conftest import make_rpc
 
 TO_ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)

@@ -10,7 +10,7 @@ from barpc.fit import fit_rpc
 from barpc.pointio.correspondences import read_grid
 from barpc.rpcio import read_rpc
 from barpc.sensor.direct_grid import DirectGrid, linear_axes
-from barpc.simulate.orbit import Look, fly
+from barpc.simulate import Look, fly
 from tests.lanes import rest_slow
 
 SIZE = (20000, 20000)

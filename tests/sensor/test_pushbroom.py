@@ -17,7 +17,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.curve import Curve, attitude_through
 from barpc.sensor.geometry import view_angles
 from barpc.sensor.pushbroom import Pushbroom
-from barpc.simulate.orbit import GM, Look, fly
+from barpc.simulate import GM, Look, fly
 
 TARGET = np.array([5.4, 43.3, 200.0])
 SIZE = (20000, 20000)

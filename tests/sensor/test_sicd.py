@@ -18,7 +18,7 @@ from barpc.scene import Tracks, View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center, triangulate, view_angles
 from barpc.sensor.sicd import find_sicd, is_sicd, open_sicd
-from barpc.simulate.orbit import Look, fly
+from barpc.simulate import Look, fly
 from tests.sensor.radar_documents import DURATION, KINDS, SIZE, document, nitf
 
 CASES = [(kind, side) for kind in KINDS for side in "RL"]

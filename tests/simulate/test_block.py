@@ -9,8 +9,7 @@ from barpc.errors import InputError
 from barpc.geodesy import ecef_from_ground, metres_per_unit
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import camera_center, convergence_angle, triangulate
-from barpc.simulate import BlockOptions, _Grid, _turned, fly, recentred, simulate_block
-from barpc.simulate.orbit import looks
+from barpc.simulate import BlockOptions, _Grid, _turned, fly, looks, recentred, simulate_block
 
 
 @pytest.fixture(scope="module")

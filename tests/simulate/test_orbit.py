@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.geodesy import EARTH_RATE, ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.simulate.orbit import GM, Look, _circle, fly, looks
+from barpc.simulate import GM, Look, _circle, fly, looks
 
 TARGET = np.array([5.4, 43.3, 230.0])
 SIZE, GSD = (401, 301), 0.5
