@@ -12,7 +12,7 @@ from pathlib import Path
 
 from barpc import dem, frozen, geodesy, options, raster, scene, sidefile, vrt, workspace
 from barpc.ba.held import incremental
-from barpc.pointio import colmap, hloc, names
+from barpc.pointio import foreign, names
 from barpc.remote import _KEPT as HELD
 from barpc.remote import _LONGEST as REQUEST
 from barpc.remote import BLOCK, web
@@ -63,14 +63,14 @@ def rows() -> list[tuple[str, str]]:
             f"{size(sidefile.ARRAYS.most)} {unpacked}; a member {many(frozen.DEFLATED)} times its stored bytes",
         ),
         (
-            hloc._CONTENT.words,
-            f"{size(hloc._CONTENT.most)} as numbers of {sidefile.NUMBER} bytes; {many(hloc._MOST)} objects, groups "
-            f"{hloc._DEEPEST} deep; an array {many(frozen.DEFLATED)} times its stored bytes",
+            foreign._CONTENT.words,
+            f"{size(foreign._CONTENT.most)} as numbers of {sidefile.NUMBER} bytes",
         ),
+        ("a COLMAP database", f"{many(foreign._STEPS)} times 100,000 instructions of SQLite"),
         (
-            f"{colmap._CONTENT.words} (COLMAP)",
-            f"{size(colmap._CONTENT.most)} as numbers of {sidefile.NUMBER} bytes; {many(colmap._STEPS)} times "
-            "100,000 instructions of SQLite",
+            "an HDF5 file",
+            f"{many(foreign._MOST)} objects, groups {foreign._DEEPEST} deep; an array {many(frozen.DEFLATED)} times "
+            "its stored bytes",
         ),
         (
             "a localisation or correction grid",

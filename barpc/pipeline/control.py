@@ -10,8 +10,7 @@ import numpy as np
 from barpc.errors import InputError
 from barpc.geodesy import Array, ecef_from_ground, metres_per_unit, wrap_longitude
 from barpc.options import RunOptions
-from barpc.pointio.correspondences import read_gcps
-from barpc.pointio.laser import read_altimetry
+from barpc.pointio.correspondences import read_altimetry, read_gcps
 from barpc.report.summary.words import listed
 from barpc.scene import Altimetry, BoolArray, GroundPoints, View
 from barpc.sensor.geometry import footprint, ground_sample_distance

@@ -19,8 +19,7 @@ from barpc.geoids import geoid_file
 from barpc.identity import Input, Stamp, changed, take
 from barpc.options import RunOptions, declared
 from barpc.pipeline.control import load_altimetry, load_gcps
-from barpc.pointio.links import Links
-from barpc.pointio.matches import read_links, tracks_of
+from barpc.pointio.matches import Links, read_links, tracks_of
 from barpc.pointio.names import ViewNames
 from barpc.raster import hashed
 from barpc.remote import here, located, location

@@ -478,7 +478,7 @@ SAMPLES: dict[str, Sample] = {
     "points csv": Sample(
         "p.csv",
         read_correspondences,
-        lambda: b"lon,lat,alt,col,row\n5.4,43.2,100,1,2\n5.5;43.3;101;3;4\n",
+        lambda: b"lon,lat,alt,col,row\n5.4,43.2,100,1,2\n5.5,43.3,101,3,4\n",
         (mutate_text,),
     ),
     "points json": Sample("p.json", read_correspondences, lambda: POINTS, (mutate_json,)),
