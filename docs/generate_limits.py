@@ -17,7 +17,7 @@ from barpc.remote import _KEPT as HELD
 from barpc.remote import _LONGEST as REQUEST
 from barpc.remote import BLOCK, web
 from barpc.report import tables
-from barpc.rpcio import acquisition, text, tiff
+from barpc.rpcio import carried, sources
 from barpc.sensor import document as metadata
 from barpc.sensor.sicd import metadata as sicd
 from barpc.tie.pairing import area
@@ -79,9 +79,9 @@ def rows() -> list[tuple[str, str]]:
         (sidefile.NAMES.words, f"{size(sidefile.NAMES.most)}, {many(sidefile._LINE)} characters a line"),
         ("a VRT", size(vrt._MAX_BYTES)),
         ("a raster read as a DEM or geoid", f"{many(dem._MAX_CELLS)} cells"),
-        ("RPC tags of a TIFF", f"{many(tiff._MAX_ENTRIES)} entries, {size(tiff._MAX_VALUES)} of values"),
-        ("an RPC in a NITF", f"the first {size(text._SCAN_LIMIT)}"),
-        ("a file of acquisition metadata", f"the first {size(acquisition._HEAD)}"),
+        ("RPC tags of a TIFF", f"{many(carried._MAX_ENTRIES)} entries, {size(carried._MAX_VALUES)} of values"),
+        ("an RPC in a NITF", f"the first {size(carried._SCAN_LIMIT)}"),
+        ("a file of acquisition metadata", f"the first {size(sources._HEAD)}"),
         ("a run's state", f"{size(workspace._MAX_STATE)}; larger ones count as missing"),
         (
             "a file of a web server or store",

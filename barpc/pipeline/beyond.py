@@ -25,8 +25,7 @@ from barpc.handoff import verify_grid
 from barpc.options import FitOptions, RunOptions
 from barpc.pipeline.executor import GROUP, CachingExecutor
 from barpc.rpcio import read_rpc, write_rpc
-from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid
-from barpc.rpcio.resample import write_resampled
+from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid, write_resampled
 from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import ImageAffine, ImageCorrected

@@ -19,7 +19,7 @@ from barpc.errors import InputError, OutputError
 from barpc.export import TARGETS, export_run, neural
 from barpc.export.approx import Sampled, factored, fit_affine, fit_projective, project_affine
 from barpc.rpcio import read_rpc, write_rpc_copy
-from barpc.rpcio.acquisition import light_of
+from barpc.rpcio.sources import light_of
 from barpc.sensor.geometry import image_grid
 from tests.lanes import rest_slow
 from tests.rpcio.conftest import write_image
