@@ -15,7 +15,7 @@ from barpc.ba.held import incremental
 from barpc.pointio import foreign, names
 from barpc.remote import _KEPT as HELD
 from barpc.remote import _LONGEST as REQUEST
-from barpc.remote import BLOCK, web
+from barpc.remote import BLOCK, hosts
 from barpc.report import tables
 from barpc.rpcio import carried, sources
 from barpc.sensor import document as metadata
@@ -89,7 +89,7 @@ def rows() -> list[tuple[str, str]]:
         ),
         (
             "an answer of a web server",
-            f"{web.TIMEOUT:g} s, and 1 s for {web._SLOWEST:,} bytes; {web._MOVES} redirects",
+            f"{hosts.TIMEOUT:g} s, and 1 s for {hosts._SLOWEST:,} bytes; {hosts._MOVES} redirects",
         ),
         ("rasters open at a time", many(raster._MOST_OPEN)),
         ("an image of a product's metadata", f"{many(metadata.MOST_PIXELS)} rows or columns"),

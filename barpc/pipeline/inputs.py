@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from barpc.ba import BlockPrior
-from barpc.dem import Dem
+from barpc.dem import Dem, geoid_file
 from barpc.errors import InputError
-from barpc.geoids import geoid_file
 from barpc.identity import Input, Stamp, changed, take
 from barpc.options import RunOptions, declared
 from barpc.pipeline.control import load_altimetry, load_gcps

@@ -187,9 +187,14 @@ def printable(rpc: RPC) -> RPC:
     coeffs[:, :10] += np.einsum("k,kij,pi->pj", shift, DERIVATIVE, rpc.coeffs)
     moved = ((rpc.image_offset - image_offset) / image_scale)[:, None]
     coeffs[::2] = coeffs[::2] * (rpc.image_scale / image_scale)[:, None] + moved * coeffs[1::2]
-    arrays = coeffs, ground_offset, ground_scale, image_offset, image_scale
-    names = "coeffs", "ground_offset", "ground_scale", "image_offset", "image_scale"
-    return replace(rpc, **dict(zip(names, arrays, strict=True)))
+    return replace(
+        rpc,
+        coeffs=coeffs,
+        ground_offset=ground_offset,
+        ground_scale=ground_scale,
+        image_offset=image_offset,
+        image_scale=image_scale,
+    )
 
 
 # --- NITF -------------------------------------------------------------------------------------------------
