@@ -6,10 +6,13 @@ heights of unknown reference, or taken as they are, raise a loud warning.
 
 from __future__ import annotations
 
+import os
 import re
+import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +23,10 @@ from rasterio.crs import CRS
 from rasterio.errors import CRSError
 from rasterio.warp import transform as warp_points
 from rasterio.windows import Window
+from scipy.ndimage import map_coordinates
 
 from barpc.errors import BarpcWarning, ImageError, InputError
 from barpc.geodesy import FAR, Array
-from barpc.geoids import geoid_file
 from barpc.raster import open_raster
 from barpc.remote import Place, location
 from barpc.sensor import SensorModel
@@ -131,12 +134,8 @@ class HeightGrid:
         return (float(heights.min()), float(heights.max())) if len(heights) else (-np.inf, np.inf)
 
     def _bilinear(self, row: Array, col: Array) -> Array:
-        r0 = np.minimum(np.floor(row).astype(np.int64), max(self.shape[0] - 2, 0))
-        c0 = np.floor(col).astype(np.int64)
-        if not self.period:
-            c0 = np.minimum(c0, max(self.shape[1] - 2, 0))
-        top, left = int(r0.min()), int(c0.min())
-        bottom, right = int(r0.max()) + 2, int(c0.max()) + 2
+        top, left = int(row.min()), int(col.min())
+        bottom, right = int(row.max()) + 2, int(col.max()) + 2
         if (bottom - top) * (right - left) > _MAX_CELLS:
             raise InputError(f"{self.path}: the points spread over {(bottom - top) * (right - left)} cells")
         bottom, turn = min(bottom, self.shape[0]), int(self.period)
@@ -145,14 +144,10 @@ class HeightGrid:
             cells = np.concatenate([self.read(top, bottom, *part) for part in parts], axis=1)
         else:
             cells = self.read(top, bottom, left, min(right, self.shape[1]))
-        height = np.zeros(len(row))
-        for i, row_weight in enumerate((r0 + 1 - row, row - r0)):
-            for j, col_weight in enumerate((c0 + 1 - col, col - c0)):
-                weight = row_weight * col_weight
-                rows = (r0 + i - top).clip(max=len(cells) - 1)
-                cols = (c0 + j - left).clip(max=cells.shape[1] - 1)
-                height += np.where(weight > 0, weight * cells[rows, cols], 0.0)
-        return height
+        void, at = np.isnan(cells), np.stack([row - top, col - left])
+        height = map_coordinates(np.where(void, 0.0, cells), at, order=1, mode="nearest")
+        height[map_coordinates(void.astype(np.float64), at, order=1, mode="nearest") > 0] = np.nan
+        return np.asarray(height)
 
 
 def _snapped(index: Array) -> Array:
@@ -303,3 +298,56 @@ def _met(sensor: SensorModel, image: Array, terrain: Callable[[Array, Array], Ar
         under = above(middle) < 0
         lower, upper = np.where(under, middle, lower), np.where(under, upper, middle)
     return sensor.localize(image, (upper + lower) / 2)
+
+
+# --- geoids by name ---------------------------------------------------------------------------------------
+
+_OWN = {"egm96": Path(__file__).with_name("egm96_15.tif")}
+"""15 arc minutes, rounded to 1/128 m: of the US National Geospatial-Intelligence Agency, in the public domain."""
+_IN_PROJ = {"egm2008": ("us_nga_egm08_25.tif", "egm08_25.gtx")}
+GEOIDS = (*_OWN, *_IN_PROJ)
+
+
+def geoid_file(given: str | os.PathLike[str]) -> str:
+    """Return the file of a geoid grid, given by its path or as one of `GEOIDS`.
+
+    Raises
+    ------
+    InputError
+        It is a name, and none of PROJ's folders holds its grid: the message says where to get it.
+    """
+    text = os.fspath(given)
+    name = text.lower()
+    if name not in GEOIDS or Path(text).exists():
+        return text
+    if name in _OWN:
+        return str(_OWN[name])
+    folders = proj_folders()
+    for folder in folders:
+        for file in _IN_PROJ[name]:
+            if (folder / file).is_file():
+                return str(folder / file)
+    first = _IN_PROJ[name][0]
+    raise InputError(
+        f"geoid {name}: no {' or '.join(_IN_PROJ[name])} in PROJ's folders ({', '.join(map(str, folders)) or 'none'}); "
+        f"get it by 'projsync --file {first}' or from https://cdn.proj.org/{first} and give its path, or take egm96"
+    )
+
+
+def proj_folders() -> list[Path]:
+    """Return the folders in which PROJ looks for grids: of its variables, the user, Python packages, the system."""
+    said = [part for name in ("PROJ_DATA", "PROJ_LIB") for part in os.environ.get(name, "").split(os.pathsep)]
+    folders = [Path(part) for part in said if part] + [_of_user()]
+    for package, place in (("rasterio", "proj_data"), ("pyproj", "proj_dir/share/proj")):
+        spec = find_spec(package)
+        folders += [Path(spec.origin).parent / place] if spec is not None and spec.origin else []
+    folders += [Path(root) / "share/proj" for root in (sys.prefix, "/usr/local", "/usr")]
+    return [folder for folder in dict.fromkeys(folders) if folder.is_dir()]
+
+
+def _of_user() -> Path:
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", Path.home())) / "proj"
+    if sys.platform == "darwin":
+        return Path.home() / "Library/Application Support/proj"
+    return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share") / "proj"

@@ -12,12 +12,12 @@ from pathlib import Path
 
 from barpc import dem, frozen, geodesy, options, raster, scene, sidefile, vrt, workspace
 from barpc.ba.held import incremental
-from barpc.pointio import colmap, hloc, names
+from barpc.pointio import foreign, names
 from barpc.remote import _KEPT as HELD
 from barpc.remote import _LONGEST as REQUEST
-from barpc.remote import BLOCK, web
+from barpc.remote import BLOCK, hosts
 from barpc.report import tables
-from barpc.rpcio import acquisition, text, tiff
+from barpc.rpcio import carried, sources
 from barpc.sensor import document as metadata
 from barpc.sensor.sicd import metadata as sicd
 from barpc.tie.pairing import area
@@ -63,14 +63,14 @@ def rows() -> list[tuple[str, str]]:
             f"{size(sidefile.ARRAYS.most)} {unpacked}; a member {many(frozen.DEFLATED)} times its stored bytes",
         ),
         (
-            hloc._CONTENT.words,
-            f"{size(hloc._CONTENT.most)} as numbers of {sidefile.NUMBER} bytes; {many(hloc._MOST)} objects, groups "
-            f"{hloc._DEEPEST} deep; an array {many(frozen.DEFLATED)} times its stored bytes",
+            foreign._CONTENT.words,
+            f"{size(foreign._CONTENT.most)} as numbers of {sidefile.NUMBER} bytes",
         ),
+        ("a COLMAP database", f"{many(foreign._STEPS)} times 100,000 instructions of SQLite"),
         (
-            f"{colmap._CONTENT.words} (COLMAP)",
-            f"{size(colmap._CONTENT.most)} as numbers of {sidefile.NUMBER} bytes; {many(colmap._STEPS)} times "
-            "100,000 instructions of SQLite",
+            "an HDF5 file",
+            f"{many(foreign._MOST)} objects, groups {foreign._DEEPEST} deep; an array {many(frozen.DEFLATED)} times "
+            "its stored bytes",
         ),
         (
             "a localisation or correction grid",
@@ -79,9 +79,9 @@ def rows() -> list[tuple[str, str]]:
         (sidefile.NAMES.words, f"{size(sidefile.NAMES.most)}, {many(sidefile._LINE)} characters a line"),
         ("a VRT", size(vrt._MAX_BYTES)),
         ("a raster read as a DEM or geoid", f"{many(dem._MAX_CELLS)} cells"),
-        ("RPC tags of a TIFF", f"{many(tiff._MAX_ENTRIES)} entries, {size(tiff._MAX_VALUES)} of values"),
-        ("an RPC in a NITF", f"the first {size(text._SCAN_LIMIT)}"),
-        ("a file of acquisition metadata", f"the first {size(acquisition._HEAD)}"),
+        ("RPC tags of a TIFF", f"{many(carried._MAX_ENTRIES)} entries, {size(carried._MAX_VALUES)} of values"),
+        ("an RPC in a NITF", f"the first {size(carried._SCAN_LIMIT)}"),
+        ("a file of acquisition metadata", f"the first {size(sources._HEAD)}"),
         ("a run's state", f"{size(workspace._MAX_STATE)}; larger ones count as missing"),
         (
             "a file of a web server or store",
@@ -89,7 +89,7 @@ def rows() -> list[tuple[str, str]]:
         ),
         (
             "an answer of a web server",
-            f"{web.TIMEOUT:g} s, and 1 s for {web._SLOWEST:,} bytes; {web._MOVES} redirects",
+            f"{hosts.TIMEOUT:g} s, and 1 s for {hosts._SLOWEST:,} bytes; {hosts._MOVES} redirects",
         ),
         ("rasters open at a time", many(raster._MOST_OPEN)),
         ("an image of a product's metadata", f"{many(metadata.MOST_PIXELS)} rows or columns"),

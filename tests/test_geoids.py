@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc import geoids
-from barpc.dem import Dem, HeightGrid
+from barpc import dem as geoids
+from barpc.dem import Dem, HeightGrid, geoid_file
 from barpc.errors import InputError
-from barpc.geoids import geoid_file
 from barpc.options import RunOptions
 from barpc.pipeline.inputs import with_located
 

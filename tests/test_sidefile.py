@@ -22,8 +22,8 @@ import barpc
 from barpc.errors import BarpcError, InputError
 from barpc.frozen import load_npz
 from barpc.rpcio import FORMATS
-from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.formats import parse
+from barpc.rpcio.text import ReadOptions
 from barpc.sidefile import (
     ARRAYS,
     GEOJSON,

@@ -13,7 +13,7 @@ from barpc.cli.terminal import say
 from barpc.errors import FitError, InputError
 from barpc.fit import FitOptions, fit_rpc
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.pointio.transform import read_transform
+from barpc.pointio.tables import read_transform
 from barpc.rpcio import CARRIERS
 from barpc.sensor.corrected import Corrected, correction_of
 from barpc.sensor.geometry import image_border

@@ -20,7 +20,7 @@ from barpc.report.summary import Summary
 from barpc.report.summary.views import ViewEntry
 from barpc.report.tables import RunFiles, read_summary, read_tables
 from barpc.rpcio import CARRIERS
-from barpc.rpcio.acquisition import Sunlight, light_of
+from barpc.rpcio.sources import Sunlight, light_of
 from barpc.scene import IntArray
 from barpc.sensor.geometry import camera_center, footprint, image_grid, sight_enu
 from barpc.sensor.rpc import RPC

@@ -22,8 +22,7 @@ from barpc.geodesy import Array
 from barpc.handoff import verify_grid
 from barpc.options import FitOptions, RunOptions
 from barpc.pipeline.executor import CachingExecutor
-from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid
-from barpc.rpcio.resample import write_resampled
+from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid, write_resampled
 from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected

@@ -13,16 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from barpc.ba import BlockPrior
-from barpc.dem import Dem
+from barpc.dem import Dem, geoid_file
 from barpc.errors import InputError
 from barpc.geodesy import Array, ecef_from_ground, metres_per_unit, wrap_longitude
-from barpc.geoids import geoid_file
 from barpc.identity import Input, Stamp, changed, take
 from barpc.options import RunOptions, declared
-from barpc.pointio.correspondences import read_gcps
-from barpc.pointio.laser import read_altimetry
-from barpc.pointio.links import Links
-from barpc.pointio.matches import read_links, tracks_of
+from barpc.pointio.correspondences import read_altimetry, read_gcps
+from barpc.pointio.matches import Links, read_links, tracks_of
 from barpc.pointio.names import ViewNames
 from barpc.raster import hashed
 from barpc.remote import here, located, location

@@ -26,7 +26,7 @@ from barpc.pipeline.executor import GROUP
 from barpc.pointio.names import unique_names
 from barpc.raster import open_raster
 from barpc.remote import Place, here, located
-from barpc.rpcio.acquisition import date_taken
+from barpc.rpcio.sources import date_taken
 from barpc.scene import View
 from barpc.sensor.geometry import footprint
 from barpc.sidefile import IMAGE, plain_path, versioned

@@ -1,4 +1,4 @@
-"""Ground points and where images show them: the GCPs of a run, and the correspondences that an RPC is fitted to.
+"""Ground points and where images show them: GCPs, correspondences that an RPC is fitted to, heights by a laser.
 
 Image coordinates have (0, 0) at the centre of the top-left pixel. Those of GCPs are taken as they stand, as ASP and
 orthority mean them; GDAL leaves the meaning of its tags to the application. Altitudes are ellipsoidal.
@@ -6,9 +6,8 @@ orthority mean them; GDAL leaves the meaning of its tags to the application. Alt
 
 from __future__ import annotations
 
-import csv
 import re
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,15 +16,46 @@ import numpy as np
 
 from barpc.errors import InputError
 from barpc.frozen import load_npz
-from barpc.geodesy import FAR, Array
-from barpc.pointio.names import ViewNames, from_cell
+from barpc.geodesy import ALTITUDES, FAR, Array
+from barpc.pointio.names import ViewNames
+from barpc.pointio.tables import COLUMNS, Names, first_words, header_of, numbers_of, read_table
 from barpc.raster import driver_of, open_raster
 from barpc.remote import Place
-from barpc.scene import GroundPoints
+from barpc.scene import Altimetry, GroundPoints
 from barpc.sidefile import GEOJSON, NUMBER, TABLE, Kind, read_head, read_json, read_text
 
 GROUND_SIGMA = 1.0  # east, north, up standard deviation [m] of a GCP whose file states none
 IMAGE_SIGMA = 0.5  # standard deviation of each image coordinate [px], of GCPs and tie points whose file states none
+HEIGHT_SIGMA = 0.5  # m, of a height whose file states none: ICESat-2 and GEDI over gentle ground
+FLAT_SIGMA = 1.0  # m, of its place along an axis, each point's own
+TURNS = 540.0  # deg: longitudes are taken by whole turns
+
+_NAMES: Names = {
+    "id": ("id", "name", "gcp", "gcp_id", "point", "point_id", "label"),
+    "image": ("image", "file", "filename", "image_name", "img", "view"),
+}
+_SIGMAS: Names = {
+    "sigma": ("sigma", "sigma_m", "accuracy"),  # east, north and up
+    "sigma_xy": ("sigma_xy", "sigma_en", "sigma_horizontal", "accuracy_xy"),
+    "sigma_x": ("sigma_x", "sigma_e", "sigma_east", "sigma_lon", "sx"),
+    "sigma_y": ("sigma_y", "sigma_n", "sigma_north", "sigma_lat", "sy"),
+    "sigma_z": ("sigma_z", "sigma_u", "sigma_up", "sigma_alt", "sigma_height", "sz", "accuracy_z"),
+    "sigma_px": ("sigma_px", "sigma_image", "sigma_pixel"),
+    "sigma_col": ("sigma_col", "scol"),
+    "sigma_row": ("sigma_row", "srow"),
+}
+_POINTS: Names = {**COLUMNS, "sigma": ("sigma", "sigma_px")}
+_HEIGHTS: Names = {
+    "lon": (*COLUMNS["lon"], "lon_lowestmode"),
+    "lat": (*COLUMNS["lat"], "lat_lowestmode"),
+    "alt": (
+        *("alt", "altitude", "height", "h", "z", "elevation", "elev"),
+        *("h_ph", "h_li", "h_te_best_fit", "h_mean", "elev_lowestmode"),
+    ),
+    "sigma": ("sigma", "sigma_m", "sigma_z", "sigma_alt", "accuracy", "h_li_sigma", "h_te_uncertainty"),
+    "sigma_flat": ("sigma_flat", "sigma_xy", "sigma_horizontal", "accuracy_xy"),
+}
+"""As ICESat-2's ATL03, ATL06 and ATL08 and GEDI's L2A call it, too."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +84,12 @@ def read_gcps(path: Path | str, names: Sequence[str]) -> GroundPoints:
     elif driver_of(head) is not None or b"\0" in head:
         found = list(_read_tags(path, views))
     else:
-        found = list((_read_csv if _names_columns(head) else _read_asp)(path, views))
+        words = first_words(head)
+        named = not any(numbers_of([word]) for word in words[1:4]) and header_of(words, _POINTS)
+        found = list((_read_csv if named else _read_asp)(path, views))
     if not found:
-        named = f"; it names {', '.join(list(views.strangers)[:10])}" if views.strangers else ""
-        raise InputError(f"{path}: no GCP of {', '.join(names[:10])}{named}")
+        others = f"; it names {', '.join(list(views.strangers)[:10])}" if views.strangers else ""
+        raise InputError(f"{path}: no GCP of {', '.join(names[:10])}{others}")
     try:
         return replace(_assembled(found), strangers=tuple(views.strangers))
     except InputError as error:
@@ -91,63 +123,31 @@ def _read_asp(path: Path, views: ViewNames) -> Iterator[_Point]:
 
 def _read_csv(path: Path, views: ViewNames) -> Iterator[_Point]:
     """Read a header of column names, then a line for each point and image; sigmas not stated are the default."""
-    columns: dict[str, int] = {}
-    for number, raw in enumerate(read_text(path, TABLE).splitlines(), start=1):
-        if not raw.strip() or raw.lstrip().startswith("#"):
-            continue
-        if not columns:
-            delimiter = next((sign for sign in "\t;," if sign in raw), " ")
-            columns = _gcp_columns(path, cells_of(raw, delimiter), views)
-            continue
-        try:
-            row = cells_of(raw, delimiter)
-            cells = {name: row[i] for name, i in columns.items()}
-            image = cells.pop("image", "")
-            name = cells.pop("id", "")
-            if delimiter == ";":  # where numbers have decimal commas
-                cells = {key: cell.replace(",", ".") for key, cell in cells.items()}
-            numbers = {key: float(cell) for key, cell in cells.items() if cell}
-            view = views.find(image) if "image" in columns else 0
-            point = _csv_point(name, -1 if view is None else view, numbers)
-        except (ValueError, KeyError, IndexError, csv.Error) as error:
-            raise InputError(f"{path}, line {number}: expected {', '.join(columns)} ({error})") from error
-        if view is not None:
-            yield point
-
-
-def _csv_point(name: str, view: int, of: Mapping[str, float]) -> _Point:
-    """Return the point of a line: its numbers by the names of `_COLUMNS` and `_SIGMAS`."""
-    every = of.get("sigma", GROUND_SIGMA)
-    level = of.get("sigma_xy", every)
-    sigma = (of.get("sigma_x", level), of.get("sigma_y", level), of.get("sigma_z", every))
-    pixels = [of[key] for key in ("sigma_px", "sigma_col", "sigma_row") if key in of] or [IMAGE_SIGMA]
-    return _Point(name, (of["lon"], of["lat"], of["alt"]), sigma, view, (of["col"], of["row"]), max(pixels))
-
-
-def _gcp_columns(path: Path, words: Sequence[str], views: ViewNames) -> dict[str, int]:
-    """Return the column of each quantity; a file of one image need not name it."""
-    found = header_of(words, {**_COLUMNS, **_NAMES, **_SIGMAS})
-    require_columns(path, [*_COLUMNS, "image"][: len(_COLUMNS) + (len(views.names) > 1)], found, words)
-    for i, word in enumerate(words):
-        if i not in found.values() and re.match("sigma|std|stdev|acc|err", word.lower()):
+    needed = [*COLUMNS, "image"][: len(COLUMNS) + (len(views.names) > 1)]
+    columns = {**COLUMNS, **_NAMES, **_SIGMAS}
+    words, table = read_table(path, columns, needed, texts=_NAMES, blank=_SIGMAS)
+    for word in (word for i, word in enumerate(words) if i not in header_of(words, columns).values()):
+        if re.match("sigma|std|stdev|acc|err", word.lower()):
             raise InputError(
                 f"{path}: column {word[:40]!r} is none that is read; accuracies are called {', '.join(_SIGMAS)}"
             )
-    return found
+    count = len(table["lon"])
 
+    def stated(key: str, otherwise: Array) -> Array:
+        given = np.array(table.get(key, [np.nan] * count))
+        return np.where(np.isnan(given), otherwise, given)
 
-def cells_of(line: str, delimiter: str) -> list[str]:
-    """Return the cells of a line of a table, those that are empty too unless blanks part them."""
-    row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
-    return [from_cell(cell.strip()) for cell in row if delimiter != " " or cell]
-
-
-def _names_columns(head: bytes) -> bool:
-    """Return whether a text begins with a line of column names."""
-    lines = head.decode("utf-8-sig", errors="replace").splitlines()
-    first = next((line for line in lines if line.strip() and not line.lstrip().startswith("#")), "")
-    words = _split(first)
-    return not any(numbers_of([word]) for word in words[1:4]) and bool(header_of(words))
+    every = stated("sigma", np.full(count, GROUND_SIGMA))
+    level, unknown = stated("sigma_xy", every), np.full(count, np.nan)
+    sigma = np.stack([stated("sigma_x", level), stated("sigma_y", level), stated("sigma_z", every)], axis=-1)
+    pixels = np.fmax.reduce([stated(key, unknown) for key in ("sigma_px", "sigma_col", "sigma_row")])
+    pixels = np.where(np.isnan(pixels), IMAGE_SIGMA, pixels)
+    names, images = (table.get(key, [""] * count) for key in _NAMES)
+    for i, (lon, lat, alt, col, row) in enumerate(zip(*(table[key] for key in COLUMNS), strict=True)):
+        view = views.find(images[i]) if "image" in table else 0
+        if view is not None:
+            east, north, up = sigma[i].tolist()
+            yield _Point(names[i].strip(), (lon, lat, alt), (east, north, up), view, (col, row), float(pixels[i]))
 
 
 def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Point]:
@@ -206,32 +206,6 @@ def _assembled(found: list[_Point]) -> GroundPoints:
 
 # --- correspondences --------------------------------------------------------------------------------------
 
-TURNS = 540.0  # deg: longitudes are taken by whole turns
-
-_COLUMNS = {
-    "lon": ("lon", "long", "longitude", "lng"),
-    "lat": ("lat", "latitude"),
-    "alt": ("alt", "altitude", "height", "h", "z", "elevation", "elev", "height_above_datum"),
-    "col": ("col", "column", "samp", "sample", "pixel", "px", "pixel_x", "image_x"),
-    "row": ("row", "line", "py", "pixel_y", "image_y"),
-}
-_NAMES = {
-    "id": ("id", "name", "gcp", "gcp_id", "point", "point_id", "label"),
-    "image": ("image", "file", "filename", "image_name", "img", "view"),
-}
-_SIGMAS = {
-    "sigma": ("sigma", "sigma_m", "accuracy"),  # east, north and up
-    "sigma_xy": ("sigma_xy", "sigma_en", "sigma_horizontal", "accuracy_xy"),
-    "sigma_x": ("sigma_x", "sigma_e", "sigma_east", "sigma_lon", "sx"),
-    "sigma_y": ("sigma_y", "sigma_n", "sigma_north", "sigma_lat", "sy"),
-    "sigma_z": ("sigma_z", "sigma_u", "sigma_up", "sigma_alt", "sigma_height", "sz", "accuracy_z"),
-    "sigma_px": ("sigma_px", "sigma_image", "sigma_pixel"),
-    "sigma_col": ("sigma_col", "scol"),
-    "sigma_row": ("sigma_row", "srow"),
-}
-_EITHER = ("lon", "lat"), ("col", "row")
-"""What x and y are: the pair that no other column is named for."""
-
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
@@ -277,65 +251,16 @@ def correspondence_kind(path: Place, altitudes: Sequence[float] | None = None) -
 
 def _is_table(head: bytes) -> bool:
     """Return whether a text begins with a header that names columns, or with a line of five numbers."""
-    try:
-        lines = head.decode("utf-8-sig", errors="strict" if len(head) < 65536 else "ignore").splitlines()
-    except UnicodeDecodeError:
-        return False
-    first = next((line for line in lines if line.strip() and not line.lstrip().startswith("#")), "")
-    words = _split(first)
-    return (numbers_of(words) is not None and len(words) >= 5) or {"lon", "lat"} <= set(header_of(words))
-
-
-def _split(line: str) -> list[str]:
-    return [word.strip().strip('"') for word in re.split(r"[,;\t]|\s+", line.strip()) if word.strip()]
-
-
-def numbers_of(words: Sequence[str]) -> list[float] | None:
-    """Return the words as numbers; None where one is none."""
-    try:
-        return [float(word) for word in words]
-    except ValueError:
-        return None
-
-
-def header_of(words: Sequence[str], names: Mapping[str, Sequence[str]] | None = None) -> dict[str, int]:
-    """Return the column of each quantity that a header names, by default of `_COLUMNS` and the points' sigma [px]."""
-    lower = [re.sub(r"[\[(].*", "", word.lower()).strip().replace(" ", "_") for word in words]
-    names = {**_COLUMNS, "sigma": ("sigma", "sigma_px")} if names is None else names
-    hits = {key: [lower.index(a) for a in aliases if a in lower] for key, aliases in names.items()}
-    found = {key: places[0] for key, places in hits.items() if places}
-    left = [pair for pair in _EITHER if not set(pair) <= set(found)]
-    if len(left) == 1:
-        either = {key: lower.index(word) for key, word in zip(left[0], "xy", strict=True) if word in lower}
-        found = {**either, **found}
-    return found
-
-
-def require_columns(path: Path, needed: Iterable[str], found: Container[str], words: Sequence[str]) -> None:
-    """Raise InputError unless all columns needed were found among the words of a table's first line."""
-    if missing := [name for name in needed if name not in found]:
-        raise InputError(f"{path}: no column {', '.join(missing)} among the {len(words)} of its first line")
+    words = first_words(head)
+    return (numbers_of(words) is not None and len(words) >= 5) or {"lon", "lat"} <= set(header_of(words, _POINTS))
 
 
 def _read_table(path: Path) -> Correspondences:
-    """Read a text table: columns by commas, semicolons, tabs or blanks; ``#`` begins a comment."""
-    rows: list[list[float]] = []
-    columns: dict[str, int] = {}
-    for number, raw in enumerate(read_text(path, TABLE).splitlines(), start=1):
-        words = _split(raw.split("#", 1)[0])
-        values = numbers_of(words)
-        if not columns and words:
-            columns = dict(zip(_COLUMNS, range(5), strict=True)) if values else header_of(words)
-            require_columns(path, _COLUMNS, columns, words)
-        elif words and values is None:
-            raise InputError(f"{path}, line {number}: expected numbers")
-        if values:
-            if len(values) <= max(columns.values()):
-                raise InputError(f"{path}, line {number}: expected {max(columns.values()) + 1} columns")
-            rows.append([values[i] for i in columns.values()])
-    if not rows:
+    """Read a text table; without a header its columns are lon, lat, alt, col, row."""
+    _, table = read_table(path, _POINTS, list(COLUMNS), unnamed=list(COLUMNS))
+    if not table["lon"]:
         raise InputError(f"{path}: no points in it")
-    return _correspondences(path, dict(zip(columns, np.array(rows).T, strict=True)))
+    return _correspondences(path, {name: np.array(column) for name, column in table.items()})
 
 
 def _read_npz(path: Path) -> Correspondences:
@@ -347,8 +272,8 @@ def _read_npz(path: Path) -> Correspondences:
         raise InputError(f"{path}: not an npz of numbers ({error})") from error
     if "ground" in arrays and "image" in arrays:
         return _checked(path, arrays["ground"], arrays["image"], arrays.get("sigma"))
-    columns = {key: arrays[list(arrays)[i]] for key, i in header_of(list(arrays)).items()}
-    if missing := [name for name in _COLUMNS if name not in columns]:
+    columns = {key: arrays[list(arrays)[i]] for key, i in header_of(list(arrays), _POINTS).items()}
+    if missing := [name for name in COLUMNS if name not in columns]:
         raise InputError(f"{path}: neither ground and image nor {', '.join(missing)}; has {', '.join(arrays)}")
     return _correspondences(path, columns)
 
@@ -429,3 +354,34 @@ def read_grid(path: Place, altitudes: Sequence[float] | None = None) -> Correspo
     if (np.abs(ground[ok]) > (TURNS, 90.0, FAR)).any() or not (np.abs(image) <= FAR).all():
         raise InputError(f"{path}: a node of it is no longitude, latitude and altitude, or no image point")
     return Correspondences(ground[ok], image[ok])
+
+
+# --- altimetry --------------------------------------------------------------------------------------------
+
+
+def read_altimetry(path: Path | str) -> Altimetry:
+    """Read the heights of a text: a header that names columns, or lines of lon, lat, alt, perhaps sigma, sigma_flat.
+
+    Lines whose height is blank or none on Earth, as fill values are, are left out. InputError where a line does not
+    parse, a place is none in degrees, or no height is left.
+    """
+    path = Path(path)
+    order = list(_HEIGHTS)
+    _, table = read_table(path, _HEIGHTS, order[:3], unnamed=order, blank=order)
+    lon, lat, alt = (np.array(table[name]) for name in order[:3])
+    known = (alt >= ALTITUDES[0]) & (alt <= ALTITUDES[1])
+    if not known.any():
+        raise InputError(f"{path}: holds no height")
+    ground = np.column_stack([lon, lat, alt])[known]
+    wrong = ~(np.abs(ground[:, :2]) <= (TURNS, 90.0)).all(axis=1)  # NaN fails, too
+    if wrong.any():
+        lon, lat = ground[wrong.argmax(), :2]
+        raise InputError(
+            f"{path}: {lon:g}, {lat:g} is no longitude and latitude in degrees; map coordinates are not read"
+        )
+    sigma, flat = (np.array(table.get(name, [np.nan] * len(known)))[known] for name in order[3:])
+    sigma[np.isnan(sigma)], flat[np.isnan(flat)] = HEIGHT_SIGMA, FLAT_SIGMA
+    try:
+        return Altimetry(ground, sigma, flat)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error

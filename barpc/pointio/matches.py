@@ -2,13 +2,13 @@
 
 (0, 0) is the centre of the top-left pixel. CSV: a header with the columns `image, col, row, track` and, where it is
 known, `sigma` [px], in any order. npz: arrays `names`, `view`, `track`, `xy` (K, 2) and `sigma`. Files of one pair
-(ASP, LightGlue), or a folder of them: `barpc.pointio.pairfiles`; also COLMAP's databases and hloc's HDF5.
+(ASP, LightGlue), or a folder of them, COLMAP's databases and hloc's HDF5: `barpc.pointio.foreign`.
 """
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,25 +16,78 @@ import numpy as np
 from barpc.errors import InputError
 from barpc.frozen import Arrays, load_npz
 from barpc.geodesy import Array
-from barpc.pointio.colmap import MAGIC as COLMAP
-from barpc.pointio.colmap import read_colmap
-from barpc.pointio.correspondences import IMAGE_SIGMA, require_columns
-from barpc.pointio.hloc import MAGIC as HDF5
-from barpc.pointio.hloc import read_hloc
-from barpc.pointio.links import Links
-from barpc.pointio.names import ViewNames, cell, from_cell
-from barpc.pointio.pairfiles import (
-    ENDINGS,
-    in_folder,
-    is_dictionary,
-    matched_keypoints,
-    pair_of,
-    read_pair_files,
-)
-from barpc.scene import Tracks
-from barpc.sidefile import TABLE, opened_text, read_head
+from barpc.pointio.correspondences import IMAGE_SIGMA
+from barpc.pointio.foreign import COLMAP, ENDINGS, HDF5, PairPoints, in_folder, read_colmap, read_hloc, read_pair_files
+from barpc.pointio.names import ViewNames, cell
+from barpc.pointio.tables import read_table
+from barpc.scene import IntArray, Tracks, connected_labels
+from barpc.sidefile import TABLE, read_head
 
 _COLUMNS = ("image", "col", "row", "track")
+_STEPS = 16  # observations of a track are linked to so many after them: all of a usual track
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """Points (K,) of views, and pairs of them (M, 2), as rows, that were matched."""
+
+    view: IntArray  # (K,)
+    xy: Array  # (K, 2) [px]
+    sigma: Array  # (K,) standard deviation of each coordinate [px]
+    ends: IntArray  # (M, 2)
+
+    @staticmethod
+    def of_pairs(pairs: Iterable[PairPoints]) -> Links:
+        """Return the matches of pairs of views: points of a view at the very same place are one."""
+        given = list(pairs)
+        view = np.concatenate(
+            [np.full(len(xy), i) for a, b, *ends in given for i, xy in zip((a, b), ends, strict=True)] or [np.zeros(0)]
+        )
+        xy = np.concatenate([xy for _, _, *ends in given for xy in ends] or [np.zeros((0, 2))])
+        starts = np.cumsum([0, *(2 * len(first) for _, _, first, _ in given)])
+        ends = [
+            start + np.arange(2 * len(first)).reshape(2, -1).T
+            for start, (_, _, first, _) in zip(starts, given, strict=False)
+        ]
+        joined = np.concatenate(ends) if given else np.zeros((0, 2), dtype=np.int64)
+        return Links(view.astype(np.int64), xy, np.full(len(xy), IMAGE_SIGMA), joined).merged()
+
+    @staticmethod
+    def joined(parts: Sequence[Links]) -> Links:
+        """Return the matches of several files."""
+        starts = np.cumsum([0, *(len(part.view) for part in parts)])
+        columns = ([getattr(part, name) for part in parts] for name in ("view", "xy", "sigma"))
+        view, xy, sigma = map(np.concatenate, columns)
+        ends = [start + part.ends for start, part in zip(starts, parts, strict=False)]
+        whole = Links(view, xy, sigma, np.concatenate(ends))
+        return whole.merged() if len(parts) > 1 else parts[0]
+
+    def merged(self) -> Links:
+        """Return the points of a view at the very same place as one, the most certain."""
+        table = np.column_stack([self.view, self.xy])
+        order = np.lexsort((self.sigma, *table.T[::-1]))
+        new = np.ones(len(table), dtype=bool)
+        new[1:] = (np.diff(table[order], axis=0) != 0).any(axis=1)
+        number = np.empty(len(table), dtype=np.int64)
+        number[order] = np.cumsum(new) - 1
+        kept = order[new]
+        return Links(self.view[kept], self.xy[kept], self.sigma[kept], number[self.ends])
+
+    @staticmethod
+    def of_tracks(view: IntArray, track: IntArray, xy: Array, sigma: Array) -> Links:
+        """Return the observations of tracks: each is linked to the next ones of its track."""
+        order = np.lexsort((view, track))
+        label, ends = track[order], [np.zeros((0, 2), dtype=np.int64)]
+        for step in range(1, min(_STEPS, len(view) - 1) + 1):
+            same = np.flatnonzero(label[step:] == label[:-step])
+            if not len(same):
+                break
+            ends.append(np.column_stack([order[same], order[same + step]]))
+        return Links(view, xy, sigma, np.concatenate(ends))
+
+    def tracks(self) -> IntArray:
+        """Return the track (K,) of every point: points that are linked belong to one."""
+        return connected_labels(len(self.view), self.ends)
 
 
 def read_links(path: Path | str, names: Sequence[str]) -> Links:
@@ -47,7 +100,7 @@ def read_links(path: Path | str, names: Sequence[str]) -> Links:
     views = ViewNames(names, str(path))
     try:
         links = _read(path, views)
-    except (OSError, csv.Error) as error:
+    except OSError as error:
         raise InputError(f"{path}: cannot be read as tie points ({error})") from error
     if not (np.isfinite(links.xy).all() and np.isfinite(links.sigma).all() and (links.sigma > 0).all()):
         raise InputError(f"{path}: a coordinate is not finite, or a sigma not positive")
@@ -112,57 +165,43 @@ def _read(path: Path, views: ViewNames) -> Links:
     for magic, read in ((COLMAP, read_colmap), (HDF5, read_hloc)):
         if head.startswith(magic):
             return Links.of_pairs(read(path, views))
-    if ending == ".npz" and not is_dictionary(arrays := load_npz(path)):
-        return _table(path, arrays, views)
-    if ending == ".npz":
-        pair = pair_of(path, views)
-        return Links.of_pairs([] if pair is None else [(*pair, *matched_keypoints(path, arrays))])
-    if "__" in path.name and ending in ENDINGS:
+    if ending == ".npz" and "keypoints0" not in (arrays := load_npz(path)):
+        return _read_npz(path, arrays, views)
+    if ending == ".npz" or ("__" in path.name and ending in ENDINGS):
         return Links.of_pairs(read_pair_files([path], views))
     return _read_csv(path, views)
 
 
 def _read_csv(path: Path, views: ViewNames) -> Links:
-    with opened_text(path, TABLE, newline="") as text:
-        lines = csv.reader(line for line in text if line.strip() and not line.startswith("#"))
-        header = [word.strip().lower() for word in next(lines, [])]
-        require_columns(path, _COLUMNS, header, header)
-        image, *numbers = (header.index(name) for name in _COLUMNS)
-        spread = header.index("sigma") if "sigma" in header else None
-        rows, tracks = [], []
-        for line in lines:
-            try:
-                view = views.find(from_cell(line[image]))
-                col, row = (float(line[i]) for i in numbers[:2])
-                own = IMAGE_SIGMA if spread is None else float(line[spread])
-                track = line[numbers[2]].strip()
-            except (ValueError, IndexError) as error:
-                line_at = f"{path}: line {lines.line_num}"  # whatever it holds
-                raise InputError(f"{line_at} does not hold image, col, row, track") from error
-            if view is not None:
-                rows.append((view, col, row, own))
-                tracks.append(track)
-    table = np.array(rows, dtype=np.float64).reshape(-1, 4)
-    _, first, inverse = np.unique(np.array(tracks, dtype=str), return_index=True, return_inverse=True)
-    point = np.argsort(np.argsort(first))[inverse.ravel()] if len(rows) else np.zeros(0, dtype=np.int64)
-    return Links.of_tracks(table[:, 0].astype(np.int64), point, table[:, 1:3], table[:, 3])
+    _, table = read_table(path, {key: (key,) for key in (*_COLUMNS, "sigma")}, _COLUMNS, texts=("image", "track"))
+    labels = np.array([label.strip() for label in table["track"]], dtype=str)
+    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
+    point = np.argsort(np.argsort(first))[inverse.ravel()] if len(labels) else np.zeros(0, dtype=np.int64)
+    spread = table.get("sigma", [IMAGE_SIGMA] * len(labels))
+    return _tracks(views, table["image"], point, np.column_stack([table["col"], table["row"]]), np.array(spread))
 
 
-def _table(path: Path, file: Arrays, views: ViewNames) -> Links:
+def _read_npz(path: Path, file: Arrays, views: ViewNames) -> Links:
     try:
-        own = np.array([-1 if (i := views.find(str(name))) is None else i for name in file["names"]])
         index, point = (np.asarray(file[key], dtype=np.int64) for key in ("view", "track"))
         xy = np.asarray(file["xy"], dtype=np.float64)
         spread = np.asarray(file.get("sigma", np.full(len(index), IMAGE_SIGMA)), dtype=np.float64)
         if {(*index.shape, 2), (*point.shape, 2), (*spread.shape, 2), xy.shape} != {(len(xy), 2)}:
             raise ValueError(f"shapes {index.shape}, {point.shape}, {xy.shape}, {spread.shape}")
-        if len(index) and not 0 <= index.min() <= index.max() < len(own):
+        if len(index) and index.min() < 0:
             raise ValueError("a view that has no name")
-        view = own[index]
-    except (KeyError, ValueError, TypeError) as error:
+        names = np.array([str(name) for name in file["names"]])[index]
+    except (KeyError, ValueError, TypeError, IndexError) as error:
         raise InputError(f"{path}: not an npz of names, view, track, xy (K, 2) ({error})") from error
+    return _tracks(views, names.tolist(), point, xy, spread)
+
+
+def _tracks(views: ViewNames, names: Sequence[str], point: IntArray, xy: Array, sigma: Array) -> Links:
+    """Return the observations of tracks in images of these names, of those that are views."""
+    found = [views.find(name) for name in names]
+    view = np.array([-1 if one is None else one for one in found], dtype=np.int64)
     keep = view >= 0
-    return Links.of_tracks(view[keep], point[keep], xy[keep], spread[keep])
+    return Links.of_tracks(view[keep], point[keep], xy[keep], sigma[keep])
 
 
 def tracks_of(links: Links, path: Path | str) -> Tracks:

@@ -155,10 +155,8 @@ class Part:
 
 
 def _fetch(at: Remote, start: int, stop: int) -> Part:
-    if at.startswith("http"):
-        from barpc.remote.web import fetch
-    else:
-        from barpc.remote.stores import fetch
+    from barpc.remote.hosts import fetch
+
     return fetch(at, start, stop)
 
 
@@ -271,13 +269,7 @@ def _runs(blocks: list[int]) -> Iterator[range]:
 
 
 def beside(image: Remote, names: Iterable[str]) -> dict[str, str]:
-    """Return the names of those of these files that are in an image's folder, by name in lower case.
+    """See `barpc.remote.hosts.beside`."""
+    from barpc.remote.hosts import beside as look
 
-    A store lists the folder, and case does not count; a web server is asked for each name as it is and with its ending
-    in lower case.
-    """
-    if image.startswith("http"):
-        from barpc.remote.web import beside as look
-    else:
-        from barpc.remote.stores import beside as look
     return look(image, names)

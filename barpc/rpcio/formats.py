@@ -16,8 +16,8 @@ from barpc.errors import InputError, RpcFormatError
 from barpc.frozen import write_text
 from barpc.remote import Place
 from barpc.rpcio import text, xml
-from barpc.rpcio.fields import ReadOptions
-from barpc.rpcio.images import rpc_vrt, write_rpc_copy, write_rpc_nitf
+from barpc.rpcio.images import write_rpc_copy, write_rpc_nitf, write_rpc_vrt
+from barpc.rpcio.text import ReadOptions
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import RPC_FILE
 
@@ -85,22 +85,19 @@ class Carrier:
     precision: Literal["nitf"] | None = None  # whose digits it holds (`barpc.fit.precision`); None: all of them
 
 
-def _vrt(rpc: RPC, image: Place, path: Path, place: Path, overwrite: bool) -> None:
-    write_text(path, rpc_vrt(rpc, image, place), overwrite=overwrite)
-
-
-def _copy(rpc: RPC, image: Place, path: Path, _place: Path, overwrite: bool) -> None:
-    write_rpc_copy(rpc, image, path, overwrite=overwrite)
-
-
-def _nitf(rpc: RPC, image: Place, path: Path, _place: Path, overwrite: bool) -> None:
-    write_rpc_nitf(rpc, image, path, overwrite=overwrite)
-
-
 CARRIERS: dict[str, Carrier] = {
-    "vrt": Carrier((".vrt",), _vrt),
-    "copy": Carrier((".tif", ".tiff"), _copy),
-    "nitf": Carrier((".ntf",), _nitf, precision="nitf"),
+    "vrt": Carrier(
+        (".vrt",),
+        lambda rpc, image, path, place, over: write_rpc_vrt(rpc, image, path, place=place, overwrite=over),
+    ),
+    "copy": Carrier(
+        (".tif", ".tiff"), lambda rpc, image, path, _, over: write_rpc_copy(rpc, image, path, overwrite=over)
+    ),
+    "nitf": Carrier(
+        (".ntf",),
+        lambda rpc, image, path, _, over: write_rpc_nitf(rpc, image, path, overwrite=over),
+        precision="nitf",
+    ),
 }
 """Name -> raster that carries an RPC."""
 
@@ -177,26 +174,11 @@ def parse(data: bytes, name: str, options: ReadOptions | None = None) -> tuple[R
     for row in FORMATS.values():
         if row.sniff(content):
             return row.read(content, name, options or ReadOptions()), row.name
-    raise RpcFormatError(f"{name}: no RPC format recognised (known: {', '.join(FORMATS)}); {_contents(content)}")
+    hint = "; it holds a physical camera model: give FILE,model=physical" if holds_physical(content) else ""
+    raise RpcFormatError(f"{name}: no RPC format recognised (known: {', '.join(FORMATS)}){hint}")
 
 
-_NAMED = re.compile(
-    r'^[ \t]*+([A-Za-z][\w.]{0,40}+)[ \t]*+[:=]|<([A-Za-z][\w.]{0,40}+)|"(\w{1,40}+)"[ \t]*+:', re.MULTILINE
-)
-_TELLING = re.compile(r"(?i)coef|off|scale|num|den|rpc|rfm|lat|lon|samp|line")
-_LOOKED, _SHOWN = 1 << 20, 8
 holds_physical = _has(r"<(\w+:)?(ATTLIST|Refined_Model)\b")
-
-
-def _contents(content: str) -> str:
-    """Return the names of the fields in a text, those first that an RPC may have; of a list its name."""
-    if holds_physical(content):
-        return "it holds a physical camera model: give FILE,model=physical"
-    words = ("".join(found).rstrip("0123456789_") for found in _NAMED.findall(content[:_LOOKED]))
-    names = list(dict.fromkeys(filter(None, words)))
-    shown = sorted(names, key=lambda word: _TELLING.search(word) is None)[:_SHOWN]
-    more = f" and {len(names) - len(shown)} more" if len(names) > len(shown) else ""
-    return f"fields found: {', '.join(shown)}{more}" if names else "no field with a name is in it"
 
 
 def write_rpc(rpc: RPC, path: Path | str, *, format: str | None = None, overwrite: bool = False) -> None:

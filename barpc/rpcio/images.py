@@ -6,11 +6,12 @@ import errno
 import os
 import shutil
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from html import escape
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import rasterio
 from rasterio._err import CPLE_BaseError
@@ -22,21 +23,25 @@ from rasterio.windows import Window
 from barpc.errors import ImageError, OutputError
 from barpc.frozen import replacing, write_text
 from barpc.raster import Mosaic, identify, open_raster
-from barpc.remote import Place, here
-from barpc.rpcio.text import nitf_record
-from barpc.rpcio.tiff import printable, put_tag
+from barpc.remote import Place
+from barpc.rpcio.carried import nitf_record, printable, put_tag
 from barpc.rpcio.xml import rpc_domain
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import IMAGE, opened, plain_path
 from barpc.vrt import GDAL_TYPES
 
 TIFF = {"driver": "GTiff", "BIGTIFF": "IF_SAFER", "TILED": "YES", "COMPRESS": "DEFLATE"}
-_COPIED = 4 << 20  # bytes at a time
 _FULL = 1 << 16  # bytes: with less free space GDAL's error is taken for that of a full disk
 
 
 def write_rpc_vrt(
-    rpc: RPC, image_path: Path | str, vrt_path: Path | str, *, relative: bool = True, overwrite: bool = False
+    rpc: RPC,
+    image_path: Path | str,
+    vrt_path: Path | str,
+    *,
+    relative: bool = True,
+    overwrite: bool = False,
+    place: Path | str | None = None,
 ) -> None:
     """Write a VRT that carries an RPC and takes its pixels from an image that stays as it is.
 
@@ -47,18 +52,14 @@ def write_rpc_vrt(
     ----------
     rpc, image_path, vrt_path, overwrite : as of `write_rpc_copy`
     relative : bool, point at the image relative to the VRT, so that both may move; else by absolute path
+    place : Path or str, optional, where the VRT will stand in the end, if not at `vrt_path`
 
     Raises
     ------
     ImageError, OutputError
         The image cannot be read; the VRT exists or cannot be written.
     """
-    write_text(vrt_path, rpc_vrt(rpc, image_path, vrt_path, relative=relative), overwrite=overwrite)
-
-
-def rpc_vrt(rpc: RPC, image_path: Path | str, vrt_path: Path | str, *, relative: bool = True) -> str:
-    """Return the text that `write_rpc_vrt` writes."""
-    source, target = plain_source(image_path), Path(vrt_path).absolute()
+    source, target = plain_source(image_path), Path(place or vrt_path).absolute()
     plain_path(source)
     plain_path(target)
     _refuse_same(source, target)
@@ -76,7 +77,7 @@ def rpc_vrt(rpc: RPC, image_path: Path | str, vrt_path: Path | str, *, relative:
             mask = (f"  {line}" for line in _vrt_source(dataset, name, relative, "mask,1"))
             band = ['    <VRTRasterBand dataType="Byte">', *mask, "    </VRTRasterBand>"]
             lines += ["  <MaskBand>", *band, "  </MaskBand>"]
-    return "\n".join([*lines, "</VRTDataset>"]) + "\n"
+    write_text(vrt_path, "\n".join([*lines, "</VRTDataset>"]) + "\n", overwrite=overwrite)
 
 
 def _vrt_band(dataset: Any, index: int, source: list[str]) -> list[str]:
@@ -146,18 +147,11 @@ def write_rpc_copy(rpc: RPC, image_path: Path | str, copy_path: Path | str, *, o
     """
     with copying(image_path, copy_path, overwrite) as (dataset, partial):
         if not isinstance(dataset, Mosaic) and dataset.driver == "GTiff":
-            _copy_bytes(image_path, partial)
+            with opened(image_path, IMAGE) as file, partial.open("wb") as copy:
+                shutil.copyfileobj(file, copy)
         else:
             _convert(dataset, partial, Path(copy_path), **TIFF)
         put_tag(partial, printable(rpc), placed=dataset.crs is not None)
-
-
-def _copy_bytes(source: Path | str, target: Path) -> None:
-    if here([source]):
-        shutil.copyfile(source, target)
-        return
-    with opened(source, IMAGE) as file, target.open("wb") as copy:
-        shutil.copyfileobj(file, copy, _COPIED)
 
 
 def write_rpc_nitf(rpc: RPC, image_path: Path | str, nitf_path: Path | str, *, overwrite: bool = False) -> None:
@@ -200,9 +194,7 @@ def write_crop(
             raise ImageError(
                 f"{image_path}: window {window} is not inside the image of {dataset.width} x {dataset.height}"
             )
-        place = Window(col, row, width, height)
-        _copy_window(dataset, partial, place, **TIFF)
-        _require_same(dataset, place, partial, Path(crop_path))
+        _copy_window(dataset, partial, Path(crop_path), Window(col, row, width, height), **TIFF)
         put_tag(partial, cropped, placed=dataset.crs is not None)
     return cropped
 
@@ -224,45 +216,53 @@ def _convert(dataset: Any, partial: Path, target: Path, **options: str) -> None:
     """Copy an image by another driver; a VRT's pixels are GDAL's only when they stand in a file."""
     whole = Window(0, 0, dataset.width, dataset.height)
     if isinstance(dataset, Mosaic):
-        _copy_window(dataset, partial, whole, **options)
+        _copy_window(dataset, partial, target, whole, **options)
     else:
         raster_copy(dataset, str(partial), **options)
-    _require_same(dataset, whole, partial, target)
+        require_pixels(partial, target, lambda block: _sum(dataset, block))
 
 
-def _copy_window(dataset: Any, target: Path, window: Window, **options: str) -> None:
+def _copy_window(dataset: Any, partial: Path, target: Path, window: Window, **options: str) -> None:
     profile = {"width": window.width, "height": window.height, "count": dataset.count, **options}
     profile |= {"dtype": dataset.dtypes[0], "nodata": dataset.nodata}
     if dataset.crs is not None:
-        a, b, x, d, e, y = dataset.transform[:6]
-        col, row = window.col_off, window.row_off
-        moved = rasterio.Affine(a, b, x + a * col + b * row, d, e, y + d * col + e * row)
+        moved = dataset.transform * rasterio.Affine.translation(window.col_off, window.row_off)
         profile |= {"crs": dataset.crs, "transform": moved}
+
+    def part(block: Window) -> Window:
+        return Window(window.col_off + block.col_off, window.row_off + block.row_off, block.width, block.height)
+
+    with created(partial, profile) as crop:
+        crop.colorinterp = dataset.colorinterp
+        for _, block in crop.block_windows(1):
+            crop.write(dataset.read(window=part(block)), window=block)
+            if has_mask(dataset) and options["driver"] == "GTiff":
+                crop.write_mask(dataset.read_masks(1, window=part(block)), window=block)
+    require_pixels(partial, target, lambda block: _sum(dataset, part(block)))
+
+
+@contextmanager
+def created(path: Path, profile: Mapping[str, Any]) -> Iterator[Any]:
+    """Yield a new raster, for writing; a mask becomes part of it."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(target, "w", **profile) as crop:
-            crop.colorinterp = dataset.colorinterp
-            for block, part in _blocks(crop, window):
-                crop.write(dataset.read(window=part), window=block)
-                if has_mask(dataset) and options["driver"] == "GTiff":
-                    crop.write_mask(dataset.read_masks(1, window=part), window=block)
+        with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(path, "w", **profile) as dataset:
+            yield dataset
 
 
-def _blocks(copy: Any, window: Window) -> Iterator[tuple[Window, Window]]:
-    for _, block in copy.block_windows(1):
-        col, row = window.col_off + block.col_off, window.row_off + block.row_off
-        yield block, Window(col, row, block.width, block.height)
+def _sum(dataset: Any, window: Window) -> int:
+    return crc32(dataset.read(window=window).tobytes())
 
 
-def _require_same(dataset: Any, window: Window, partial: Path, target: Path) -> None:
-    """Raise unless a copy holds the pixels of a window: GDAL closes a file on a full disk without a word."""
+def require_pixels(partial: Path, target: Path, sums: Callable[[Window], int]) -> None:
+    """Raise unless the blocks of a file have these checksums: GDAL closes a file on a full disk without a word."""
     try:
-        with open_raster(partial) as copy:
-            for block, part in _blocks(copy, window):
-                if dataset.read(window=part).tobytes() != copy.read(window=block).tobytes():
-                    raise unwritten(target, "it holds other pixels than were written")
+        with open_raster(partial) as made:
+            same = all(_sum(made, block) == sums(block) for _, block in made.block_windows(1))
     except ImageError as error:
         raise unwritten(target, "it cannot be read back") from error
+    if not same:
+        raise unwritten(target, "it holds other pixels than were written")
 
 
 def unwritten(target: Path, reason: str) -> OutputError:

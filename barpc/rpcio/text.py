@@ -1,38 +1,169 @@
-"""RPCs: ``_RPC.TXT``, ``.RPB``, OSSIM's ``.geom``, ENVI, rpcm's JSON, orthority's YAML, NITF's and ALOS' columns."""
+"""RPCs as text: ``_RPC.TXT``, ``.RPB``, OSSIM's ``.geom``, ENVI, rpcm's JSON, orthority's YAML, ALOS' columns.
+
+Every reader, here and in XML and rasters, gathers `Fields`, numbers by the names that GDAL gives them; one function
+makes the RPC of them and checks that nothing is missing.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from barpc.errors import RpcFormatError
-from barpc.remote import Place
-from barpc.rpcio.fields import (
-    COEFFICIENTS,
-    DIRECT,
-    ERRORS,
-    KEYS,
-    LISTS,
-    MAXAR,
-    NUMBER,
-    OFFSETS,
-    SCALES,
-    SINGLE,
-    Fields,
-    ReadOptions,
-    collect_numbered,
-    fields_from_rpc,
-    format_number,
-    listed_numbers,
-    number,
-    rpc_from_fields,
-)
+from barpc.errors import RpcError, RpcFormatError
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import IMAGE, encoding_of, parse_json, read_head
+from barpc.sidefile import encoding_of, parse_json
+
+OFFSETS = ("LINE_OFF", "SAMP_OFF", "LAT_OFF", "LONG_OFF", "HEIGHT_OFF")
+SCALES = ("LINE_SCALE", "SAMP_SCALE", "LAT_SCALE", "LONG_SCALE", "HEIGHT_SCALE")
+COEFFICIENTS = ("LINE_NUM_COEFF", "LINE_DEN_COEFF", "SAMP_NUM_COEFF", "SAMP_DEN_COEFF")
+DIRECT = ("LON_NUM_COEFF", "LON_DEN_COEFF", "LAT_NUM_COEFF", "LAT_DEN_COEFF")  # rpcm's: of a localisation RPC
+LISTS = COEFFICIENTS + DIRECT
+ERRORS = ("ERR_BIAS", "ERR_RAND")
+SINGLE = ERRORS + OFFSETS + SCALES
+KEYS = SINGLE + COEFFICIENTS  # GDAL's names of all fields, in the order of the GeoTIFF tag
+
+_MAXAR = (
+    "errBias errRand lineOffset sampOffset latOffset longOffset heightOffset lineScale sampScale latScale longScale "
+    "heightScale lineNumCoef lineDenCoef sampNumCoef sampDenCoef"
+)
+MAXAR = dict(zip(KEYS, _MAXAR.split(), strict=True))
+"""GDAL's name of a field -> Maxar's in an ``.RPB`` file; its XML has them in capitals."""
+
+Fields = dict[str, list[float]]
+"""Field name -> its numbers: one, or twenty for the four lists of coefficients (RPC00B order)."""
+
+_INDEXED = re.compile(rf"({'|'.join(LISTS)})_(\d+)")
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([EeDd][+-]?\d+)?")
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """Choices that the reader of an RPC cannot take from the file."""
+
+    first_pixel: float | None = None
+    """The file's coordinate of the first pixel's centre: 0, 0.5 or 1; None: the format's rule (``docs/formats.md``)."""
+    band: int = 1
+    """Which band's RPC, from 1, where a file holds one for each."""
+
+
+def number(text: str, name: str, key: str) -> float:
+    """Return the number at the start of `text` (or RpcFormatError); a unit may follow, the exponent may be
+    Fortran's D.
+    """
+    text = text.strip()
+    match = NUMBER.match(text)
+    rest = text[match.end() :] if match else text
+    if match is None or (rest and not rest[0].isspace() and rest[0] not in "°%"):
+        raise RpcFormatError(f"{name}: {key} is not a number ({text[:40]!r})")
+    value = float(match.group().upper().replace("D", "E"))
+    if not math.isfinite(value):
+        raise RpcFormatError(f"{name}: {key} is not finite ({text[:40]!r})")
+    return value
+
+
+def listed_numbers(text: str, name: str, key: str) -> list[float]:
+    """Return the numbers of a list separated by blanks or commas."""
+    return [number(part, name, key) for part in re.split(r"[\s,]+", text.strip()) if part]
+
+
+def format_number(value: float) -> str:
+    """Return the shortest text that reads back as the same double."""
+    return repr(float(value)).removesuffix(".0")
+
+
+def collect_numbered(pairs: Iterable[tuple[str, float]], name: str, first: int = 1) -> Fields:
+    """Gather ``LINE_NUM_COEFF_1 .. _20`` (the first index is `first`) into lists, in whatever order they come."""
+    single: dict[str | int, float] = {}
+    lists: dict[str, dict[str | int, float]] = {}
+    for key, value in pairs:
+        found = _INDEXED.fullmatch(key)
+        slot = int(found[2][:9]) - first if found else key
+        known = (lists.setdefault(found[1], {}) if found else single).setdefault(slot, value)
+        if known != value:
+            raise RpcFormatError(f"{name}: {key} is given twice, {known} and {value}")
+    for stem, values in lists.items():
+        if set(values) != set(range(20)):
+            raise RpcFormatError(f"{name}: {stem} has {len(values)} coefficients, expected 20")
+    one = {str(key): [value] for key, value in single.items()}
+    return one | {stem: [values[i] for i in range(20)] for stem, values in lists.items()}
+
+
+def fields_in_order(values: Sequence[float], keys: Sequence[str]) -> Fields:
+    """Return the fields of numbers without names: single ones `keys`, then four times twenty coefficients."""
+    fields: Fields = {key: [value] for key, value in zip(keys, values, strict=False)}
+    return fields | {key: list(values[len(keys) + 20 * i :][:20]) for i, key in enumerate(COEFFICIENTS)}
+
+
+def rpc_from_fields(
+    fields: Mapping[str, Sequence[float]],
+    name: str,
+    options: ReadOptions | None = None,
+    first_pixel: float = 0.0,
+) -> RPC:
+    """Return the RPC of the fields of a file called `name`.
+
+    The format's coordinate of the centre of the first pixel, or the options', is subtracted from the image offsets.
+    RpcFormatError where a field (but ERR_BIAS and ERR_RAND) is missing, has the wrong length, is not finite, or a
+    scale is zero.
+    """
+    if options is not None and options.first_pixel is not None:
+        first_pixel = options.first_pixel
+    lists = LISTS if any(key in fields for key in DIRECT) else COEFFICIENTS
+    for key, count in [*((k, 1) for k in OFFSETS + SCALES), *((k, 20) for k in lists)]:
+        found = len(fields.get(key, ()))
+        if found != count:
+            what = "is missing" if not found else f"has {found} numbers, expected {count}"
+            raise RpcFormatError(f"{name}: {key} {what}")
+    ground, image = ("LONG", "LAT", "HEIGHT"), ("SAMP", "LINE")
+    try:
+        return RPC(
+            coeffs=np.array([fields[f"{axis}_{part}_COEFF"] for axis in image for part in ("NUM", "DEN")]),
+            ground_offset=np.array([fields[f"{axis}_OFF"][0] for axis in ground]),
+            ground_scale=np.array([fields[f"{axis}_SCALE"][0] for axis in ground]),
+            image_offset=np.array([fields[f"{axis}_OFF"][0] for axis in image]) - first_pixel,
+            image_scale=np.array([fields[f"{axis}_SCALE"][0] for axis in image]),
+            err_bias=_accuracy(fields.get("ERR_BIAS")),
+            err_rand=_accuracy(fields.get("ERR_RAND")),
+            direct=np.array([fields[key] for key in DIRECT]) if lists is LISTS else None,
+        )
+    except RpcFormatError:
+        raise
+    except RpcError as error:
+        raise RpcFormatError(f"{name}: {error}") from error
+
+
+def _accuracy(value: Sequence[float] | None) -> float | None:
+    """Return a stated accuracy [m]; zero and below mean that nobody knows, not that it is perfect."""
+    if not value or not math.isfinite(value[0]) or value[0] <= 0:
+        return None
+    return float(value[0])
+
+
+def fields_from_rpc(rpc: RPC, direct: bool = False) -> Fields:
+    """Return the fields of an RPC, in the order that files give them; unknown accuracies are left out.
+
+    Those of its localisation RPC come last, in files that hold them (`direct`).
+    """
+    fields = {key: [value] for key, value in zip(ERRORS, (rpc.err_bias, rpc.err_rand), strict=True) if value}
+    for keys, image, ground in (
+        (OFFSETS, rpc.image_offset, rpc.ground_offset),
+        (SCALES, rpc.image_scale, rpc.ground_scale),
+    ):
+        (col, row), (lon, lat, alt) = image.tolist(), ground.tolist()
+        fields |= {key: [value] for key, value in zip(keys, (row, col, lat, lon, alt), strict=True)}
+    col_num, col_den, row_num, row_den = rpc.coeffs.tolist()
+    fields |= dict(zip(COEFFICIENTS, (row_num, row_den, col_num, col_den), strict=True))
+    held = rpc.direct.tolist() if direct and rpc.direct is not None else []
+    return fields | dict(zip(DIRECT, held, strict=False))
+
+
+# --- names and numbers, a line each ----------------------------------------------------------------------
 
 # Patterns here take time in proportion to the text, whatever it holds: no two repetitions can share a character,
 # and one that may run far begins where a line or a word begins.
@@ -48,11 +179,6 @@ def decode(data: bytes) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _pairs(text: str) -> Iterator[tuple[str, str]]:
-    for match in _LINE.finditer(text):
-        yield match[1], match[2].strip().removesuffix(";").rstrip()
-
-
 def _numbered(fields: Fields, separator: str, indices: Sequence[str]) -> list[str]:
     """Return a line for every number; the coefficients of a list have these indices."""
     lines = []
@@ -62,17 +188,24 @@ def _numbered(fields: Fields, separator: str, indices: Sequence[str]) -> list[st
     return lines
 
 
-def read_txt(text: str, name: str, options: ReadOptions) -> RPC:
-    """Read ``KEY: value``, with or without a unit behind (GDAL, Planet, IKONOS, GeoEye, OrbView, KOMPSAT).
+def _read_lines(
+    text: str, name: str, options: ReadOptions, first: int = 1, words: Mapping[str, str] | None = None
+) -> RPC:
+    """Read a key and a value a line; coefficients are numbered from `first`, or twenty in a line, as GDAL has them."""
+    pairs: list[tuple[str, float]] = []
+    for match in _LINE.finditer(text):
+        key, value = match[1].upper(), match[2].strip().removesuffix(";")
+        key = (words or {}).get(key, key)
+        if key in LISTS:
+            pairs += [(f"{key}_{i}", one) for i, one in enumerate(listed_numbers(value, name, key), first)]
+        elif key in SINGLE or key.rpartition("_")[0] in LISTS:
+            pairs.append((key, number(value, name, key)))
+    return rpc_from_fields(collect_numbered(pairs, name, first), name, options)
 
-    Coefficients are numbered or, as GDAL shows them, twenty in a line.
-    """
-    found = [(key.upper(), value) for key, value in _pairs(text)]
-    pairs = [(k, number(v, name, k)) for k, v in found if k in SINGLE or k.rpartition("_")[0] in LISTS]
-    pairs += [
-        (f"{k}_{i}", value) for k, v in found if k in LISTS for i, value in enumerate(listed_numbers(v, name, k), 1)
-    ]
-    return rpc_from_fields(collect_numbered(pairs, name), name, options)
+
+def read_txt(text: str, name: str, options: ReadOptions) -> RPC:
+    """Read ``KEY: value``, with or without a unit behind (GDAL, Planet, IKONOS, GeoEye, OrbView, KOMPSAT)."""
+    return _read_lines(text, name, options)
 
 
 def write_txt(rpc: RPC) -> str:
@@ -85,16 +218,26 @@ def write_txt(rpc: RPC) -> str:
 _RPB_PAIR = re.compile(r"\b(\w++)\s*+=\s*+(\([^()]*+\)|[^;\n()]*+);?")
 
 
+def _read_words(pairs: Iterable[tuple[str, str]], words: Mapping[str, str], name: str, options: ReadOptions) -> RPC:
+    """Return the RPC of words, of a field each, and values: numbers, or lists of them in parentheses or brackets."""
+    keys = {word.lower(): key for key, word in words.items()}
+    fields: Fields = {}
+    for word, value in pairs:
+        key, bare_value = keys.get(word.lower()), value.strip("()[], \t\n")
+        if key is None or not bare_value:
+            continue
+        if key in fields:
+            raise RpcFormatError(f"{name}: {word} is given twice; give a file of one image")
+        if bare_value not in ("null", "~"):
+            fields[key] = listed_numbers(bare_value, name, word)
+    return rpc_from_fields(fields, name, options)
+
+
 def read_rpb(text: str, name: str, options: ReadOptions) -> RPC:
     """Read Maxar's ``key = value;`` with lists in parentheses."""
-    keys = {word.lower(): key for key, word in MAXAR.items()}
-    fields: Fields = {}
-    for word, value in _RPB_PAIR.findall(text):
-        if (key := keys.get(word.lower())) is not None:
-            fields[key] = listed_numbers(value.strip("()"), name, word)
     if re.search(r'SpecId\s*+=\s*+"RPC00A"', text, re.IGNORECASE):
         raise RpcFormatError(f"{name}: coefficients in RPC00A order; only RPC00B is written to .RPB files")
-    return rpc_from_fields(fields, name, options)
+    return _read_words(_RPB_PAIR.findall(text), MAXAR, name, options)
 
 
 def write_rpb(rpc: RPC) -> str:
@@ -111,8 +254,7 @@ def write_rpb(rpc: RPC) -> str:
 
 # --- .geom ------------------------------------------------------------------------------------------------
 
-_GEOM_ERRORS = {"bias_error": "ERR_BIAS", "rand_error": "ERR_RAND"}
-_GEOM_COEFF = re.compile(r"(line|samp)_(num|den)_coeff_(\d\d)")
+_GEOM_ERRORS = {"BIAS_ERROR": "ERR_BIAS", "RAND_ERROR": "ERR_RAND"}
 
 
 def read_geom(text: str, name: str, options: ReadOptions) -> RPC:
@@ -120,12 +262,7 @@ def read_geom(text: str, name: str, options: ReadOptions) -> RPC:
     kind = re.search(r"^[ \t]*+polynomial_format:[ \t]*+(\w*+)", text, re.MULTILINE)
     if kind and kind.group(1) != "B":
         raise RpcFormatError(f"{name}: polynomial_format {kind.group(1)!r}, only B (RPC00B) is read")
-    pairs = []
-    for key, value in _pairs(text):
-        field = _GEOM_ERRORS.get(key, key.upper())
-        if field in SINGLE or _GEOM_COEFF.fullmatch(key):
-            pairs.append((field, number(value, name, key)))
-    return rpc_from_fields(collect_numbered(pairs, name, first=0), name, options)
+    return _read_lines(text, name, options, 0, _GEOM_ERRORS)
 
 
 def write_geom(rpc: RPC) -> str:
@@ -147,13 +284,10 @@ def read_envi(text: str, name: str, options: ReadOptions) -> RPC:
     return _in_order(values, "rpc info", name, options)
 
 
-def _in_order(values: list[float], what: str, name: str, options: ReadOptions) -> RPC:
-    """Return the RPC of offsets, scales and four times twenty coefficients."""
+def _in_order(values: Sequence[float], what: str, name: str, options: ReadOptions) -> RPC:
     if len(values) not in _COUNTS:
         raise RpcFormatError(f"{name}: {what} has {len(values)} numbers, expected 90 or 93")
-    fields: Fields = {key: [value] for key, value in zip(OFFSETS + SCALES, values, strict=False)}
-    fields |= {key: values[10 + 20 * i : 30 + 20 * i] for i, key in enumerate(COEFFICIENTS)}
-    return rpc_from_fields(fields, name, options)
+    return rpc_from_fields(fields_in_order(values, OFFSETS + SCALES), name, options)
 
 
 _COUNTS = (90, 93)  # numbers of an RPC; three more may follow
@@ -241,96 +375,25 @@ _PAIR = re.compile(r"^[ \t-]*+(\w++):[ \t]*+(\[[^\[\]]*+\]|[^\n\[{]*+)", re.MULT
 def read_yaml(text: str, name: str, options: ReadOptions) -> RPC:
     """Read a parameter file of orthority with one image: names as rasterio's, lists in brackets or as dashes."""
     text = re.sub(r"\n[ \t]*+-[ \t]++(?=[+-.\d])", ", ", text)  # a block list into one line
-    keys = {word: key for key, word in _PLAIN.items()}
-    fields: Fields = {}
-    for word, value in _PAIR.findall(text):
-        key = keys.get(word)
-        if key is None or not value.strip("[], \t\n"):
-            continue
-        if key in fields:
-            raise RpcFormatError(f"{name}: the RPCs of several images; give a file of one image")
-        if value.strip() not in ("null", "~"):
-            fields[key] = listed_numbers(value.strip("[], \t\n").replace("\n", " "), name, word)
-    return rpc_from_fields(fields, name, options)
+    return _read_words(_PAIR.findall(text), _PLAIN, name, options)
 
 
 # --- columns of fixed width -------------------------------------------------------------------------------
 
-_WIDTHS = 2 * (6, 5, 8, 9, 5)
-_NITF = dict(zip(SINGLE, (7, 7, *_WIDTHS), strict=True))
-_ALOS = dict(zip(OFFSETS + SCALES, _WIDTHS, strict=True))
-_COEFFICIENT_WIDTH = 12
-_TRE_LENGTH = 1041
-_SCAN_LIMIT = 1 << 24  # bytes searched for the extension
-
-# Position in RPC00A of each of RPC00B's twenty monomials.
-_B_FROM_A = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 7, 11, 14, 17, 12, 15, 18, 13, 16, 19)
+WIDTHS = 2 * (6, 5, 8, 9, 5)
+"""Characters of offsets and scales, as NITF and ALOS have them."""
 
 
-def _columns(text: str, widths: dict[str, int], name: str) -> Fields:
-    """Return the fields of one record: single numbers of these widths, then four times twenty coefficients."""
-    cells = [(key, key, width) for key, width in widths.items()]
-    cells += [(key, f"{key}_{i}", _COEFFICIENT_WIDTH) for key in COEFFICIENTS for i in range(1, 21)]
-    needed = sum(width for _, _, width in cells)
-    if len(text) < needed:
-        raise RpcFormatError(f"{name}: an RPC record of {len(text)} characters, expected {needed}")
-    fields: Fields = {}
-    position = 0
-    for key, label, width in cells:
-        fields.setdefault(key, []).append(number(text[position : position + width], name, label))
-        position += width
-    return fields
-
-
-def read_nitf(path: Place) -> RPC | None:
-    """Read the RPC in a NITF's RPC00B (or RPC00A) extension, None without one; RpcFormatError where it is not valid."""
-    data = read_head(path, IMAGE, _SCAN_LIMIT)
-    match = re.search(rb"RPC00([AB])01041", data)
-    if match is None:
-        return None
-    record = data[match.end() : match.end() + _TRE_LENGTH].decode("latin-1")
-    name = f"{path} (RPC00{match.group(1).decode()})"
-    if not record.startswith("1"):
-        raise RpcFormatError(f"{name}: its SUCCESS flag is {record[:1]!r}, not 1: the vendor's fit failed")
-    fields = _columns(record[1:], _NITF, name)
-    if match.group(1) == b"A":
-        fields |= {key: [fields[key][i] for i in _B_FROM_A] for key in COEFFICIENTS}
-    return rpc_from_fields(fields, name)
-
-
-def nitf_record(rpc: RPC) -> str:
-    """Return the 1041 characters of an RPC00B extension; RpcFormatError where a number does not fit its
-    field.
-
-    Image and height offsets and scales are integers, degrees have four decimals, coefficients seven digits: an
-    RPC that was not fitted for it (`barpc.fit`, precision "nitf") loses tenths of a pixel. An unknown accuracy
-    is written as zero, as the format asks.
-    """
-    fields = fields_from_rpc(rpc)
-    decimals = {"ERR": 2, "LAT": 4, "LONG": 4}
-    cells = ["1"]
-    for key, width in _NITF.items():
-        value = fields.get(key, [0.0])[0]
-        axis = key.split("_")[0]
-        sign = "+" if axis in ("LAT", "LONG", "HEIGHT") else ""
-        cell = format(value, f"{sign}0{width}.{decimals.get(axis, 0)}f")
-        if len(cell) != width or (not sign and value < 0):
-            raise RpcFormatError(f"NITF RPC00B: {key} = {value:g} does not fit {width} characters")
-        cells.append(cell)
-    cells += [_nitf_coefficient(value, key) for key in COEFFICIENTS for value in fields[key]]
-    return "".join(cells)
-
-
-def _nitf_coefficient(value: float, key: str) -> str:
-    mantissa, exponent = f"{value:+.6E}".split("E")
-    power = int(exponent)
-    if power < -9:
-        return "+0.000000E+0"
-    if power > 9:
-        raise RpcFormatError(f"NITF RPC00B: a coefficient of {key} is {value:g}, beyond the format")
-    return f"{mantissa}E{power:+d}"
+def cells_of(text: str, widths: Sequence[int], keys: Sequence[str], name: str) -> Fields:
+    """Return the fields of one record: single numbers `keys` of these widths, then four times twenty coefficients."""
+    ends = np.cumsum([*widths, *[12] * 80]).tolist()
+    if len(text) < ends[-1]:
+        raise RpcFormatError(f"{name}: an RPC record of {len(text)} characters, expected {ends[-1]}")
+    labels = [*keys, *(f"{key}_{i}" for key in COEFFICIENTS for i in range(1, 21))]
+    places = zip(labels, [0, *ends[:-1]], ends, strict=True)
+    return fields_in_order([number(text[start:end], name, label) for label, start, end in places], keys)
 
 
 def read_alos(text: str, name: str, options: ReadOptions) -> RPC:
     """Read ALOS PRISM's and AVNIR's ``RPC-*.txt``: offsets, scales, four times twenty coefficients."""
-    return rpc_from_fields(_columns(text.split("\n", 1)[0], _ALOS, name), name, options)
+    return rpc_from_fields(cells_of(text.split("\n", 1)[0], WIDTHS, OFFSETS + SCALES, name), name, options)

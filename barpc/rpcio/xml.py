@@ -8,7 +8,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from barpc.errors import ImageError, RpcFormatError
-from barpc.rpcio.fields import (
+from barpc.rpcio.text import (
     COEFFICIENTS,
     DIRECT,
     ERRORS,

@@ -17,7 +17,7 @@ from barpc.cli import main
 from barpc.errors import InputError, OutputError
 from barpc.export import TARGETS, export_run, pinholes
 from barpc.rpcio import read_rpc, write_rpc_copy
-from barpc.rpcio.acquisition import light_of
+from barpc.rpcio.sources import light_of
 from barpc.sensor.geometry import image_grid
 from tests.lanes import rest_slow
 from tests.rpcio.conftest import write_image

@@ -20,7 +20,7 @@ from barpc.export import shots as scene
 from barpc.export.shots import Sampled, Scene, pairs_of, read_scene, relative_link
 from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.rpcio import read_rpc
-from barpc.rpcio.acquisition import Sunlight
+from barpc.rpcio.sources import Sunlight
 from barpc.sensor.geometry import camera_center, image_grid
 
 OUT = Path("/elsewhere/out")

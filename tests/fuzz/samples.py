@@ -34,11 +34,10 @@ from barpc.report.compare import compare_runs
 from barpc.report.page import report_html
 from barpc.report.tables import read_summary
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
-from barpc.rpcio.acquisition import light_of
-from barpc.rpcio.fields import ReadOptions
+from barpc.rpcio.carried import put_tag
 from barpc.rpcio.grids import SIGN, read_correction
-from barpc.rpcio.text import decode
-from barpc.rpcio.tiff import put_tag
+from barpc.rpcio.sources import light_of
+from barpc.rpcio.text import ReadOptions, decode
 from barpc.scene import View
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.linescan import read_linescan
@@ -126,7 +125,7 @@ def _tiff() -> bytes:
 
 def _nitf() -> bytes:
     from barpc.fit import FitOptions, fit_rpc
-    from barpc.rpcio.text import nitf_record
+    from barpc.rpcio.carried import nitf_record
 
     fitted = fit_rpc(make_rpc(), (2000, 1900), (50.0, 290.0), options=FitOptions(precision="nitf"), strict=False).rpc
     return b"NITF02.10" + b" " * 100 + b"RPC00B01041" + nitf_record(fitted).encode() + b" " * 50
@@ -477,7 +476,7 @@ SAMPLES: dict[str, Sample] = {
     "points csv": Sample(
         "p.csv",
         read_correspondences,
-        lambda: b"lon,lat,alt,col,row\n5.4,43.2,100,1,2\n5.5;43.3;101;3;4\n",
+        lambda: b"lon,lat,alt,col,row\n5.4,43.2,100,1,2\n5.5,43.3,101,3,4\n",
         (mutate_text,),
     ),
     "points json": Sample("p.json", read_correspondences, lambda: POINTS, (mutate_json,)),

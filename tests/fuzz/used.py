@@ -24,7 +24,7 @@ from barpc.fit import fit_rpc
 from barpc.options import AdjustOptions, FitOptions, Rule, declared, read_options
 from barpc.pointio.matches import read_matches
 from barpc.raster import open_raster
-from barpc.remote import Remote, web
+from barpc.remote import Remote, hosts
 from barpc.sidefile import IMAGE, RPC_FILE, read_bytes, read_head, versioned
 from barpc.simulate import Block, simulate_block
 from tests.pointio.test_foreign import hloc
@@ -352,8 +352,8 @@ def _use_answer(path: Path) -> object:
     server.data = path.read_bytes()
     at = Remote(f"{server.host}/{path.name}")
     with (
-        mock.patch.object(web, "WAITS", (0.0,)),
-        mock.patch.object(web, "TIMEOUT", 2.0),
+        mock.patch.object(hosts, "WAITS", (0.0,)),
+        mock.patch.object(hosts, "TIMEOUT", 2.0),
         mock.patch.object(remote, "_blocks", remote._Blocks()),
     ):
         pinned = versioned(at, IMAGE)

@@ -15,7 +15,7 @@ from barpc.pipeline import RunOptions, adjust
 from barpc.pipeline.inputs import only_new
 from barpc.pointio.matches import read_matches
 from barpc.rpcio import read_rpc
-from barpc.rpcio.tiff import put_tag
+from barpc.rpcio.carried import put_tag
 from barpc.scene import Tracks
 
 from .known import WHOLE_AT_NIGHT, errors_at_check_points

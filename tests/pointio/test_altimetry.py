@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barpc.errors import InputError
-from barpc.pointio.laser import FLAT_SIGMA, HEIGHT_SIGMA, read_altimetry
+from barpc.pointio.correspondences import FLAT_SIGMA, HEIGHT_SIGMA, read_altimetry
 
 WANTED = [[5.44, 43.25, 120.5], [5.45, 43.26, 130.0]]
 
@@ -48,7 +48,7 @@ def test_accuracies_are_taken_where_they_are_stated(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("", "holds no height"),
+        ("", "no column lon, lat, alt among the 0 of its first line"),
         ("lon,lat,alt\n", "holds no height"),
         ("lon,lat,alt\n5.44,43.25,-9999\n", "holds no height"),
         ("lon,lat\n5.44,43.25\n", "no column alt"),

@@ -400,7 +400,7 @@ def test_keypoints_may_lie_beside_their_matches_in_one_file(tmp_path, monkeypatc
     for field, value, words in (
         ("is_virtual", True, "lies in another file"),
         ("external", [("other", 0, 8)], "lies in another file"),
-        ("size", 1 << 28, "too large for the keypoints and matches of an HDF5 file"),  # of 8 bytes each
+        ("size", 1 << 28, "too large for the keypoints and matches of a COLMAP or HDF5 file"),  # of 8 bytes each
     ):
         shelf(monkeypatch, {"all.h5": {**FEATURES["within"], "a.tif/b.tif": elsewhere.array}})
         monkeypatch.setattr(Stored, "__init__", _lying(field, value))
@@ -443,7 +443,7 @@ def test_a_database_is_held_to_what_its_numbers_become(tmp_path: Path, monkeypat
     keypoints = sum(4 * len(KEYPOINTS[name]) for name in "ab")
     most = 8 * (keypoints + 2 * len(MATCHES["a", "b"]))
     for limit, refused in ((most, False), (most - 1, True)):
-        monkeypatch.setattr("barpc.pointio.colmap._CONTENT", Kind("what it holds", limit))
+        monkeypatch.setattr("barpc.pointio.foreign._CONTENT", Kind("what it holds", limit))
         if refused:
             with pytest.raises(InputError, match=f"{most} bytes, too large for what it holds"):
                 read_matches(path, ["a", "b"])

@@ -19,8 +19,8 @@ from barpc.pointio.correspondences import (
     read_gcps,
     read_grid,
 )
-from barpc.pointio.links import Links, index_pairs
-from barpc.pointio.matches import asp_text, read_links, read_matches, tracks_of
+from barpc.pointio.foreign import in_folder, index_pairs, pair_of
+from barpc.pointio.matches import Links, asp_text, read_links, read_matches, tracks_of
 from barpc.pointio.names import (
     MAX_NAME,
     ViewNames,
@@ -30,7 +30,6 @@ from barpc.pointio.names import (
     require_pair_names,
     unique_names,
 )
-from barpc.pointio.pairfiles import in_folder, pair_of
 
 NAMES = ["left", "right"]
 
@@ -210,7 +209,7 @@ def test_a_table_may_state_sigmas_and_call_its_ground_x_and_y(tmp_path) -> None:
     assert found.image.tolist() == [[10.0, 20.0]]
     assert found.sigma is None
     path.write_text("5.4 43.2 100 10 20\n1 2 3 4\n")
-    with pytest.raises(InputError, match="line 2: expected 5 columns"):
+    with pytest.raises(InputError, match="line 2: expected lon, lat, alt, col, row"):
         read_correspondences(path)
     path.write_text("lon lat alt col row\n# 5.4 43.2 100 10 20\n")
     with pytest.raises(InputError, match=r"a\.txt: no points in it$"):
@@ -416,7 +415,7 @@ def test_a_table_of_matches_may_state_a_sigma_and_name_others(tmp_path) -> None:
             "image,col,row,track\nx,1,2,t\ny,1,2,t\n",
             "seen in two of the views; it names x, y, and the images are a, b",
         ),
-        ("image,col,row,track\na,1,2\n", "does not hold image, col, row, track"),
+        ("image,col,row,track\na,1,2\n", "line 2: expected image, col, row, track"),
     ):
         path.write_text(text)
         with pytest.raises(InputError, match=words):

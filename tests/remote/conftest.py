@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import pytest
 
-from barpc.remote import web
+from barpc.remote import hosts
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -75,8 +75,8 @@ class Web:
 
 @pytest.fixture
 def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Web]:
-    monkeypatch.setattr(web, "WAITS", (0.0, 0.01, 0.01))
-    monkeypatch.setattr(web, "TIMEOUT", 2.0)
+    monkeypatch.setattr(hosts, "WAITS", (0.0, 0.01, 0.01))
+    monkeypatch.setattr(hosts, "TIMEOUT", 2.0)
     folder = tmp_path / "served"
     folder.mkdir()
     found = Web(folder)

@@ -16,7 +16,7 @@ import pytest
 from barpc.cameras import open_camera
 from barpc.errors import ImageError
 from barpc.pipeline import load_views
-from barpc.remote import BLOCK, RemoteFile, located, stores
+from barpc.remote import BLOCK, RemoteFile, hosts, located
 from barpc.sidefile import IMAGE, read_bytes, versioned
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
@@ -26,7 +26,7 @@ KEY = "Eby8vdM02xNOcqFlqUwJPLlmEtlCDXJ1OUzFT50uSRZ6IFsuFq2UVErCz4I6tq/K1SZFPTOtr
 
 
 def forget() -> None:
-    for cached in (stores._store, stores._pinned, stores._listed):
+    for cached in (hosts._store, hosts._pinned, hosts._listed):
         cached.cache_clear()
     for module, name in (("gcsfs", "GCSFileSystem"), ("adlfs", "AzureBlobFileSystem")):
         if module in sys.modules:
@@ -173,16 +173,16 @@ def test_a_version_is_looked_at_after_each_read_where_the_store_does_not_hold_it
     scheme: str, noticed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stub = Stub("1", "1", "1", "1", "2")
-    monkeypatch.setattr(stores, "_store", lambda _scheme: stub)
+    monkeypatch.setattr(hosts, "_store", lambda _scheme: stub)
     at = located(f"{scheme}://b/stub-{scheme}.tif", [f"{scheme}://b"])
-    assert stores.fetch(at, 0, 10).tag == "1"
+    assert hosts.fetch(at, 0, 10).tag == "1"
     pinned = type(at)(str(at), 4 * BLOCK, "1")
-    assert stores.fetch(pinned, 0, 10).data == bytes(10)
+    assert hosts.fetch(pinned, 0, 10).data == bytes(10)
     if noticed:
         with pytest.raises(OSError, match="changed in its store"):
-            stores.fetch(pinned, 10, 20)
+            hosts.fetch(pinned, 10, 20)
     else:
-        assert stores.fetch(pinned, 10, 20).data == bytes(10)
+        assert hosts.fetch(pinned, 10, 20).data == bytes(10)
 
 
 def test_a_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -201,4 +201,4 @@ def test_what_a_store_says_is_cut_to_its_first_line() -> None:
         raise ValueError("\nrefused\n<xml>\n  <RequestId>1</RequestId>")
 
     with pytest.raises(OSError, match=r"^its store answers ValueError: refused$"):
-        stores._told(ask)
+        hosts._told(ask)

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from barpc import remote
-from barpc.remote import BLOCK, Part, Remote, RemoteFile, _Blocks, _runs, beside, is_url, location, stores, web
+from barpc.remote import BLOCK, Part, Remote, RemoteFile, _Blocks, _runs, beside, hosts, is_url, location
 
 AT = Remote("https://a.org/b/x.tif", 20 * BLOCK + 5, "one")
 
@@ -164,15 +164,15 @@ def test_the_blocks_that_were_used_last_are_kept(monkeypatch):
 
 
 def test_web_servers_and_stores_are_asked_in_their_own_ways(monkeypatch):
-    monkeypatch.setattr(web, "fetch", lambda *args: ("web", *args))
-    monkeypatch.setattr(stores, "fetch", lambda *args: ("store", *args))
-    monkeypatch.setattr(web, "beside", lambda *args: ("web", *args))
-    monkeypatch.setattr(stores, "beside", lambda *args: ("store", *args))
+    monkeypatch.setattr(hosts, "_from_server", lambda *args: ("web", *args))
+    monkeypatch.setattr(hosts, "_from_store", lambda *args: ("store", *args))
+    monkeypatch.setattr(hosts, "_there", lambda at: at.endswith("a"))
+    monkeypatch.setattr(hosts, "_listed", lambda folder, _: ("A", "b"))
     store = Remote("s3://b/x")
     assert remote._fetch(AT, 1, 2) == ("web", AT, 1, 2)
     assert remote._fetch(store, 1, 2) == ("store", store, 1, 2)
-    assert beside(AT, ["a"]) == ("web", AT, ["a"])
-    assert beside(store, ["a"]) == ("store", store, ["a"])
+    assert beside(AT, ["a"]) == {"a": "a"}
+    assert beside(store, ["a"]) == {"a": "A"}
 
 
 # --- answers of web servers -------------------------------------------------------------------------------
@@ -193,17 +193,16 @@ class Answer:
 
 
 def told(answer: Answer, start: int = 10, stop: int = 14) -> Any:
-    return web._answered(answer, start, stop)  # type: ignore[arg-type]
+    return hosts._answered(answer, start, stop)  # type: ignore[arg-type]
 
 
 def test_the_figures_of_patience():
-    assert (web.WAITS, web.TIMEOUT, web._SLOWEST, web._MOVES) == ((0.0, 0.5, 2.0), 30.0, 10_000, 3)
-    assert (web._PIECE, web._TOGETHER) == (1 << 16, 8)
+    assert (hosts.WAITS, hosts.TIMEOUT, hosts._SLOWEST, hosts._MOVES) == ((0.0, 0.5, 2.0), 30.0, 10_000, 3)
 
 
 @pytest.mark.parametrize("status", [408, 425, 429, 500, 502, 503, 504])
 def test_what_may_pass_is_said_to(status):
-    with pytest.raises(web._PassingError, match=str(status)):
+    with pytest.raises(hosts._PassingError, match=str(status)):
         told(Answer(status))
 
 
@@ -211,7 +210,7 @@ def test_what_may_pass_is_said_to(status):
 def test_what_will_not_pass_is_no_such_error(status):
     with pytest.raises(OSError, match=f"answers {status}") as caught:
         told(Answer(status, Content_Range="bytes */9"))
-    assert not isinstance(caught.value, web._PassingError)
+    assert not isinstance(caught.value, hosts._PassingError)
 
 
 @pytest.mark.parametrize("status", [301, 302, 303, 307, 308])
@@ -233,7 +232,7 @@ def test_a_part_is_what_was_asked_with_its_version():
     assert told(Answer(206, b"abcd", Last_Modified="d", **whole)) == Part(b"abcd", 20, "d")
     assert told(Answer(206, b"abcd", ETag="t", Last_Modified="d", **whole)).tag == "t"
     assert told(Answer(206, b"ab", Content_Range="bytes 10-11/12")) == Part(b"ab", 12, "")  # the end of the file
-    with pytest.raises(web._PassingError, match="3 of 4 bytes"):
+    with pytest.raises(hosts._PassingError, match="3 of 4 bytes"):
         told(Answer(206, b"abc", **whole))
 
 
@@ -275,10 +274,10 @@ def test_what_is_compressed_is_refused():
 
 def test_it_is_asked_four_times_with_longer_waits(monkeypatch):
     waited: list[float] = []
-    monkeypatch.setattr(web.time, "sleep", waited.append)
-    monkeypatch.setattr(web, "_moved", lambda *_: (_ for _ in ()).throw(web._PassingError("no")))
+    monkeypatch.setattr(hosts.time, "sleep", waited.append)
+    monkeypatch.setattr(hosts, "_moved", lambda *_: (_ for _ in ()).throw(hosts._PassingError("no")))
     with pytest.raises(OSError, match="no; asked 4 times"):
-        web.fetch(AT, 0, 1)
+        hosts.fetch(AT, 0, 1)
     assert waited == [0.0, 0.5, 2.0]
 
 
@@ -289,21 +288,21 @@ def test_three_moves_are_too_many_and_none_leads_to_another_host(monkeypatch):
         seen.append(url)
         return answers.pop(0)
 
-    monkeypatch.setattr(web, "_once", once)
+    monkeypatch.setattr(hosts, "_once", once)
     part = Part(b"", 0, "")
     answers: list[Any] = ["/1", "2", part]
-    assert web._moved(AT, 0, 1) is part
+    assert hosts._moved(AT, 0, 1) is part
     assert seen == ["https://a.org/b/x.tif", "https://a.org/1", "https://a.org/2"]
     answers = ["/1", "/2", "/3", part]
     with pytest.raises(OSError, match="on and on"):
-        web._moved(AT, 0, 1)
+        hosts._moved(AT, 0, 1)
     for address in ("http://a.org/x", "https://b.org/x", "//b.org/x"):
         answers = [address, part]
         with pytest.raises(OSError, match="not followed"):
-            web._moved(AT, 0, 1)
+            hosts._moved(AT, 0, 1)
     answers = ["https://b.org/" + "x" * 900]
     with pytest.raises(OSError, match="not followed") as caught:
-        web._moved(AT, 0, 1)
+        hosts._moved(AT, 0, 1)
     assert len(str(caught.value)) < 300
 
 
@@ -350,13 +349,13 @@ def made(monkeypatch) -> list[Connection]:
     monkeypatch.setitem(here, "will_close", False)
     Connection.made = []
     for name in ("HTTPConnection", "HTTPSConnection"):
-        monkeypatch.setattr(web, name, type(name, (Connection,), {"made": Connection.made}))
-    monkeypatch.setattr(web, "_idle", {})
+        monkeypatch.setattr(hosts, name, type(name, (Connection,), {"made": Connection.made}))
+    monkeypatch.setattr(hosts, "_idle", {})
     return Connection.made
 
 
 def test_a_request_asks_for_the_bytes_as_they_are(made):
-    assert web._once("https://a.org/b/my x(1).tif", 10, 14) == Part(b"abcd", 20, "")
+    assert hosts._once("https://a.org/b/my x(1).tif", 10, 14) == Part(b"abcd", 20, "")
     (connection,) = made
     assert (connection.host, connection.timeout, type(connection).__name__) == (
         "a.org",
@@ -366,7 +365,7 @@ def test_a_request_asks_for_the_bytes_as_they_are(made):
     method, path, headers = connection.asked[0]
     assert (method, path) == ("GET", "/b/my%20x(1).tif")
     assert headers == {"Range": "bytes=10-13", "Accept-Encoding": "identity"}
-    web._once("http://a.org/x", 10, 14)
+    hosts._once("http://a.org/x", 10, 14)
     assert type(made[1]).__name__ == "HTTPConnection"
 
 
@@ -375,35 +374,35 @@ def test_a_connection_is_kept_that_was_read_out_and_stays_open(made, monkeypatch
     monkeypatch.setitem(globals(), "read_out", read)
     monkeypatch.setitem(globals(), "will_close", ends)
     for _ in range(2):
-        web._once("https://a.org/x", 10, 14)
+        hosts._once("https://a.org/x", 10, 14)
     assert len(made) == (1 if kept else 2)
     assert made[0].closed == (not kept)
-    assert list(web._idle) == ([(os.getpid(), "https", "a.org")] if kept else [])
+    assert list(hosts._idle) == ([(os.getpid(), "https", "a.org")] if kept else [])
 
 
 def test_nothing_of_another_process_is_used(made, monkeypatch):
-    web._once("https://a.org/x", 10, 14)
+    hosts._once("https://a.org/x", 10, 14)
     pid = os.getpid()
-    monkeypatch.setattr(web.os, "getpid", lambda: pid + 1)
-    web._once("https://a.org/x", 10, 14)
+    monkeypatch.setattr(hosts.os, "getpid", lambda: pid + 1)
+    hosts._once("https://a.org/x", 10, 14)
     assert len(made) == 2
 
 
 def test_all_that_is_kept_is_closed_at_the_end(made):
-    web._once("https://a.org/x", 10, 14)
-    web._once("https://b.org/x", 10, 14)
-    web._close()
+    hosts._once("https://a.org/x", 10, 14)
+    hosts._once("https://b.org/x", 10, 14)
+    hosts._close()
     assert [connection.closed for connection in made] == [True, True]
 
 
 @pytest.mark.parametrize("error", [HTTPException("x"), TimeoutError(), ConnectionResetError(), ssl.SSLError("x")])
 def test_a_host_that_breaks_off_may_do_better_next_time(made, monkeypatch, error):
-    web._once("https://a.org/x", 10, 14)
+    hosts._once("https://a.org/x", 10, 14)
     monkeypatch.setitem(globals(), "failure", error)
-    with pytest.raises(web._PassingError, match="broke off"):
-        web._once("https://a.org/x", 10, 14)
+    with pytest.raises(hosts._PassingError, match="broke off"):
+        hosts._once("https://a.org/x", 10, 14)
     assert made[0].closed
-    assert web._idle == {(os.getpid(), "https", "a.org"): []}
+    assert hosts._idle == {(os.getpid(), "https", "a.org"): []}
 
 
 def test_a_wrong_certificate_does_not_pass(made, monkeypatch):
@@ -411,11 +410,11 @@ def test_a_wrong_certificate_does_not_pass(made, monkeypatch):
     wrong.verify_message = "self-signed"
     monkeypatch.setitem(globals(), "failure", wrong)
     with pytest.raises(OSError, match="no certificate that holds") as caught:
-        web._connection("https", "a.org")
-    assert not isinstance(caught.value, web._PassingError)
+        hosts._connection("https", "a.org")
+    assert not isinstance(caught.value, hosts._PassingError)
     monkeypatch.setitem(globals(), "failure", OSError(111, "Connection refused"))
-    with pytest.raises(web._PassingError, match="no answer from its host"):
-        web._connection("https", "a.org")
+    with pytest.raises(hosts._PassingError, match="no answer from its host"):
+        hosts._connection("https", "a.org")
 
 
 def test_a_request_has_a_time_that_grows_with_its_bytes(made, monkeypatch):
@@ -431,10 +430,10 @@ def test_a_request_has_a_time_that_grows_with_its_bytes(made, monkeypatch):
         def cancel(self):
             given.append("cancel")
 
-    monkeypatch.setattr(web.threading, "Timer", Timer)
-    web._once("https://a.org/x", 10, 14)
+    monkeypatch.setattr(hosts.threading, "Timer", Timer)
+    hosts._once("https://a.org/x", 10, 14)
     assert [given[0][0], *given[1:]] == [30.0 + 4 / 10_000, "start", "cancel"]
-    assert given[0][1] is web._cut
+    assert given[0][1] is hosts._cut
     assert given[0][2][0] is None
 
 
@@ -451,12 +450,12 @@ def test_a_request_that_is_cut_is_said_to_be_late_however_the_cut_shows(made, mo
             pass
 
     def answered(answer, start, stop):
-        raise shown or web._PassingError("its host sent 0 of 4 bytes")
+        raise shown or hosts._PassingError("its host sent 0 of 4 bytes")
 
-    monkeypatch.setattr(web.threading, "Timer", Timer)
-    monkeypatch.setattr(web, "_answered", answered)
-    with pytest.raises(web._PassingError, match="takes more than 30 s for 4 bytes"):
-        web._once("https://a.org/x", 10, 14)
+    monkeypatch.setattr(hosts.threading, "Timer", Timer)
+    monkeypatch.setattr(hosts, "_answered", answered)
+    with pytest.raises(hosts._PassingError, match="takes more than 30 s for 4 bytes"):
+        hosts._once("https://a.org/x", 10, 14)
 
 
 def test_side_files_are_asked_for_as_named_and_with_their_ending_in_lower_case(monkeypatch):
@@ -470,8 +469,8 @@ def test_side_files_are_asked_for_as_named_and_with_their_ending_in_lower_case(m
             raise FileNotFoundError
         return Part(b"", 0, "")
 
-    monkeypatch.setattr(web, "fetch", fetch)
-    found = web.beside(AT, ["img_RPC.TXT", "img.RPB", "img.xml", "img_RPC.geom"])
+    monkeypatch.setattr(hosts, "fetch", fetch)
+    found = hosts.beside(AT, ["img_RPC.TXT", "img.RPB", "img.xml", "img_RPC.geom"])
     assert sorted(tried) == [
         "img.RPB",
         "img.rpb",
@@ -483,7 +482,7 @@ def test_side_files_are_asked_for_as_named_and_with_their_ending_in_lower_case(m
     ]
     assert found == {"img_rpc.txt": "img_rpc.txt", "img.rpb": "img.RPB", "img_rpc.geom": "img_RPC.geom"}
     present.add("img.rpb")
-    assert web.beside(AT, ["img.RPB"]) == {"img.rpb": "img.RPB"}  # the name as it is goes first
+    assert hosts.beside(AT, ["img.RPB"]) == {"img.rpb": "img.RPB"}  # the name as it is goes first
 
 
 # --- object stores ----------------------------------------------------------------------------------------
@@ -533,36 +532,36 @@ class Shelf:
 @pytest.fixture
 def shelf(monkeypatch) -> Shelf:
     found = Shelf(x=b"0123456789", Y_RPC=b"", Z=b"")
-    monkeypatch.setattr(stores, "_store", lambda _: found)
-    for cached in (stores._pinned, stores._listed):
+    monkeypatch.setattr(hosts, "_store", lambda _: found)
+    for cached in (hosts._pinned, hosts._listed):
         cached.cache_clear()
     return found
 
 
 def test_a_part_of_an_object_ends_where_it_does(shelf):
     at = Remote("s3://b/x")
-    assert stores.fetch(at, 2, 5) == Part(b"234", 10, "e")
-    assert stores.fetch(at, 8, 99) == Part(b"89", 10, "e")
-    assert stores.fetch(at, 10, 99) == stores.fetch(at, 12, 99) == Part(b"", 10, "e")
+    assert hosts.fetch(at, 2, 5) == Part(b"234", 10, "e")
+    assert hosts.fetch(at, 8, 99) == Part(b"89", 10, "e")
+    assert hosts.fetch(at, 10, 99) == hosts.fetch(at, 12, 99) == Part(b"", 10, "e")
     shelf.asked.clear()
     known = Remote("s3://b/x", 10, "e")
     for _ in range(3):
-        assert stores.fetch(known, 0, 4).data == b"0123"
+        assert hosts.fetch(known, 0, 4).data == b"0123"
     assert shelf.asked == [("open", "s3://b/x"), ("info", "s3://b/x")]  # opened once
     for size, tag in ((11, "e"), (10, "f")):
         with pytest.raises(OSError, match="changed in its store"):
-            stores.fetch(Remote("s3://b/x", size, tag), 0, 4)
+            hosts.fetch(Remote("s3://b/x", size, tag), 0, 4)
     with pytest.raises(FileNotFoundError, match="no such object or bucket"):
-        stores.fetch(Remote("s3://b/none"), 0, 4)
+        hosts.fetch(Remote("s3://b/none"), 0, 4)
     shelf.kind = "directory"
     with pytest.raises(OSError, match="a folder"):
-        stores.fetch(at, 0, 4)
+        hosts.fetch(at, 0, 4)
 
 
 def test_an_object_that_is_cut_short_is_noticed(shelf, monkeypatch):
     monkeypatch.setattr(shelf, "info", lambda _: {"size": 99, "ETag": "e"})
     with pytest.raises(OSError, match="its store sent 8 of 18 bytes"):
-        stores.fetch(Remote("s3://b/x"), 2, 20)
+        hosts.fetch(Remote("s3://b/x"), 2, 20)
 
 
 @pytest.mark.parametrize(
@@ -575,40 +574,40 @@ def test_an_object_that_is_cut_short_is_noticed(shelf, monkeypatch):
     ],
 )  # fmt: skip
 def test_a_version_has_many_names(found, version):
-    assert stores._version(found) == version
+    assert hosts._version(found) == version
 
 
 def test_the_files_beside_an_object_are_listed_once_a_minute(shelf, monkeypatch):
     now = [0.0]
-    monkeypatch.setattr(stores.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(hosts.time, "monotonic", lambda: now[0])
     at = Remote("s3://b/x")
-    assert stores.beside(at, ["y_rpc", "X", "other"]) == {"y_rpc": "Y_RPC", "x": "x"}
+    assert hosts.beside(at, ["y_rpc", "X", "other"]) == {"y_rpc": "Y_RPC", "x": "x"}
     now[0] = 59.0
-    stores.beside(at, ["z"])
+    hosts.beside(at, ["z"])
     assert shelf.asked == [("ls", "s3://b", False)]
     now[0] = 61.0
-    assert stores.beside(at, ["z"]) == {"z": "Z"}
+    assert hosts.beside(at, ["z"]) == {"z": "Z"}
     assert len(shelf.asked) == 2
 
 
 def test_what_a_store_says_has_300_letters_at_most_and_may_be_nothing():
-    assert str(stores._one_line(ValueError("x" * 999))) == f"its store answers ValueError: {'x' * 300}"
-    assert str(stores._one_line(ValueError(""))) == "its store answers ValueError: "
+    assert str(hosts._one_line(ValueError("x" * 999))) == f"its store answers ValueError: {'x' * 300}"
+    assert str(hosts._one_line(ValueError(""))) == "its store answers ValueError: "
 
 
 def test_a_store_is_made_with_limits_of_time_and_without_a_list_of_its_own(monkeypatch):
     made: list[Any] = []
     fake = SimpleNamespace(filesystem=lambda scheme, **given: made.append((scheme, given)))
     monkeypatch.setitem(sys.modules, "fsspec", fake)
-    stores._store.cache_clear()
+    hosts._store.cache_clear()
     try:
-        stores._store("s3")
-        stores._store("gs")
+        hosts._store("s3")
+        hosts._store("gs")
         fake.filesystem = lambda *_, **__: (_ for _ in ()).throw(RuntimeError("no credentials\nat all"))
         with pytest.raises(OSError, match=r"its store answers RuntimeError: no credentials$"):
-            stores._store("az")
+            hosts._store("az")
     finally:
-        stores._store.cache_clear()
+        hosts._store.cache_clear()
     limits = {"connect_timeout": 10, "read_timeout": 30, "retries": {"max_attempts": 3}}
     assert made == [
         ("s3", {"use_listings_cache": False, "config_kwargs": limits}),
@@ -629,17 +628,17 @@ def test_who_is_sent_on_within_a_host_takes_the_query_along(monkeypatch) -> None
 
     def once(url: str, _start: int, _stop: int) -> object:
         asked.append(url)
-        return "/b.tif?key=a/b&n=1" if len(asked) == 1 else web.Part(b"1", 1, "tag")
+        return "/b.tif?key=a/b&n=1" if len(asked) == 1 else hosts.Part(b"1", 1, "tag")
 
-    monkeypatch.setattr(web, "_once", once)
-    assert web.fetch(Remote("https://a.org/a.tif"), 0, 1).data == b"1"
+    monkeypatch.setattr(hosts, "_once", once)
+    assert hosts.fetch(Remote("https://a.org/a.tif"), 0, 1).data == b"1"
     assert asked == ["https://a.org/a.tif", "https://a.org/b.tif?key=a/b&n=1"]
 
 
 def test_an_address_that_is_none_is_one_line(monkeypatch) -> None:
-    monkeypatch.setattr(web, "_once", lambda *_: "http://[bad/")
+    monkeypatch.setattr(hosts, "_once", lambda *_: "http://[bad/")
     with pytest.raises(OSError, match=r"sends us on to what is no address \(http://\[bad/\)"):
-        web.fetch(Remote("https://a.org/a.tif"), 0, 1)
+        hosts.fetch(Remote("https://a.org/a.tif"), 0, 1)
 
 
 def test_a_query_is_part_of_what_is_asked(monkeypatch) -> None:
@@ -654,8 +653,8 @@ def test_a_query_is_part_of_what_is_asked(monkeypatch) -> None:
 
         def close(self) -> None: ...
 
-    monkeypatch.setattr(web, "_connection", lambda *_: Connection())
+    monkeypatch.setattr(hosts, "_connection", lambda *_: Connection())
     for url in ("https://a.org/x y.tif?k=a/b&n=ü", "https://a.org/x.tif"):
         with pytest.raises(OSError, match="broke off"):
-            web._once(url, 0, 1)
+            hosts._once(url, 0, 1)
     assert asked == ["/x%20y.tif?k=a/b&n=%C3%BC", "/x.tif"]

@@ -29,7 +29,7 @@ from barpc.options import RunOptions, TieOptions, read_options, schema
 from barpc.pipeline import load_views
 from barpc.pipeline.inputs import input_files, with_located
 from barpc.raster import open_raster
-from barpc.remote import BLOCK, Remote, RemoteFile, located, pinned, web
+from barpc.remote import BLOCK, Remote, RemoteFile, hosts, located, pinned
 from barpc.sidefile import IMAGE, RPC_FILE, read_bytes, read_head, versioned
 from barpc.tie.patches.resampled import Sheet
 from tests.remote.conftest import Web, drip
@@ -119,9 +119,9 @@ def test_an_options_file_opens_no_network(tmp_path: Path) -> None:
 
 def test_without_leave_nothing_is_asked(samples: Web, tmp_path: Path) -> None:
     urls = [samples.url(name) for name in NAMES]
-    for hosts in ((), ("http://127.0.0.1", "localhost")):
+    for allowed in ((), ("http://127.0.0.1", "localhost")):
         with pytest.raises(ImageError, match="--allow-remote") as caught:
-            barpc.adjust(urls, tmp_path / "out", RunOptions(allow_remote=hosts))
+            barpc.adjust(urls, tmp_path / "out", RunOptions(allow_remote=allowed))
         one_line(caught.value)
     with pytest.raises(ImageError, match="remote"):
         open_camera(urls[0])
@@ -279,9 +279,9 @@ def test_heights_and_a_reference_are_read_where_they_are_wanted(server: Web) -> 
         with rasterio.open(server.folder / name, "w", transform=forward, **profile, **tiled) as file:
             file.write(heights, 1)
     urls = {"dem": server.url("dem.tif"), "reference": (server.url("ortho.tif"),)}
-    for hosts in ((), ("http://127.0.0.1:1",)):
+    for allowed in ((), ("http://127.0.0.1:1",)):
         with pytest.raises(BarpcError):
-            Dem.open(with_located(RunOptions(allow_remote=hosts, **urls)).dem or "")
+            Dem.open(with_located(RunOptions(allow_remote=allowed, **urls)).dem or "")
     assert server.counts["requests"] == 0
     options = with_located(RunOptions(allow_remote=(server.host,), **urls))
     lon, lat = np.random.default_rng(5).uniform((5.7, 44.3), (5.75, 44.35), (50, 2)).T
@@ -306,16 +306,16 @@ def test_names_come_from_the_last_parts_of_urls(samples: Web) -> None:
 
 
 def test_copies_are_written_and_a_vrt_is_refused_before_any_work(samples: Web, tmp_path: Path) -> None:
-    urls, hosts = [samples.url(name) for name in NAMES[:2]], (samples.host,)
+    urls, allowed = [samples.url(name) for name in NAMES[:2]], (samples.host,)
     with pytest.raises(ImageError, match="--images copy") as caught:
-        barpc.adjust(urls, tmp_path / "a", RunOptions(allow_remote=hosts))
+        barpc.adjust(urls, tmp_path / "a", RunOptions(allow_remote=allowed))
     one_line(caught.value, urls[0])
     assert not (tmp_path / "a").exists()
     ties = SAMPLES.parent / "none"
     assert not ties.exists()
     from barpc.rpcio import write_rpc_copy
 
-    at = located(urls[0], hosts)
+    at = located(urls[0], allowed)
     write_rpc_copy(open_camera(SAMPLES / NAMES[1]).rpc, at, tmp_path / "copy.tif")  # type: ignore[arg-type]
     with rasterio.open(tmp_path / "copy.tif") as copy, rasterio.open(SAMPLES / NAMES[0]) as image:
         assert (copy.read() == image.read()).all()
@@ -368,8 +368,8 @@ MOODS: dict[str, tuple[Mood, str, int]] = {  # what it does, what is said, how o
 
 @pytest.mark.parametrize("mood", MOODS)
 def test_a_host_that_misbehaves_costs_one_line(samples: Web, monkeypatch: pytest.MonkeyPatch, mood: str) -> None:
-    monkeypatch.setattr(web, "TIMEOUT", 0.5 if mood == "drip" else 30.0)
-    monkeypatch.setattr(web, "_SLOWEST", 1_000_000)
+    monkeypatch.setattr(hosts, "TIMEOUT", 0.5 if mood == "drip" else 30.0)
+    monkeypatch.setattr(hosts, "_SLOWEST", 1_000_000)
     samples.mood, said, times = MOODS[mood]
     at = located(samples.url(NAMES[0]), (samples.host,))
     with pytest.raises(ImageError) as caught, open_raster(at):
@@ -442,7 +442,7 @@ def test_a_host_that_does_not_say_what_lies_beside_an_image_is_not_guessed_about
 
 
 def test_nobody_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(web, "WAITS", (0.0, 0.0, 0.0))
+    monkeypatch.setattr(hosts, "WAITS", (0.0, 0.0, 0.0))
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         host = f"http://127.0.0.1:{taken.getsockname()[1]}"

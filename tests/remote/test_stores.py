@@ -18,7 +18,7 @@ from barpc.errors import ImageError
 from barpc.options import RunOptions, TieOptions
 from barpc.pipeline import load_views
 from barpc.raster import open_raster
-from barpc.remote import located, stores
+from barpc.remote import hosts, located
 from barpc.sidefile import IMAGE, read_bytes, versioned
 
 pytest.importorskip("moto.server")
@@ -56,7 +56,7 @@ def store(server: str, monkeypatch: pytest.MonkeyPatch) -> Store:
     names = {"AWS_ENDPOINT_URL": server, "AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "y"}
     for name, value in {**names, "AWS_DEFAULT_REGION": "us-east-1"}.items():
         monkeypatch.setenv(name, value)
-    for cached in (stores._store, stores._pinned, stores._listed):
+    for cached in (hosts._store, hosts._pinned, hosts._listed):
         cached.cache_clear()
     client = boto3.client("s3")
     if not any(bucket["Name"] == "scenes" for bucket in client.list_buckets()["Buckets"]):
@@ -64,7 +64,7 @@ def store(server: str, monkeypatch: pytest.MonkeyPatch) -> Store:
     for item in client.list_objects_v2(Bucket="scenes").get("Contents", ()):
         client.delete_object(Bucket="scenes", Key=item["Key"])
     counts: Counter[str] = Counter()
-    fetch = stores.fetch
+    fetch = hosts.fetch
 
     def counted(*args: Any) -> Any:
         part = fetch(*args)
@@ -72,7 +72,7 @@ def store(server: str, monkeypatch: pytest.MonkeyPatch) -> Store:
         counts["bytes"] += len(part.data)
         return part
 
-    monkeypatch.setattr(stores, "fetch", counted)
+    monkeypatch.setattr(hosts, "fetch", counted)
     found = Store(client, counts)
     for name in NAMES:
         found.put(f"a/{name}", (SAMPLES / name).read_bytes())
@@ -127,12 +127,12 @@ def test_what_cannot_be_read_costs_one_line(store: Store, url: str, hosts: tuple
 
 def test_a_store_that_does_not_answer_costs_one_line(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
-    stores._store.cache_clear()
+    hosts._store.cache_clear()
     import s3fs
 
     s3fs.S3FileSystem.clear_instance_cache()
     with pytest.raises(ImageError, match="its store answers") as caught:
         read_bytes(located("s3://scenes/a/x.tif", HOSTS), IMAGE)
     assert "\n" not in str(caught.value)
-    stores._store.cache_clear()
+    hosts._store.cache_clear()
     s3fs.S3FileSystem.clear_instance_cache()

@@ -10,7 +10,7 @@ import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from barpc.rpcio.fields import COEFFICIENTS, OFFSETS, SCALES, fields_from_rpc
+from barpc.rpcio.text import COEFFICIENTS, OFFSETS, SCALES, fields_from_rpc
 from barpc.sensor.rpc import RPC
 
 

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from barpc.errors import BarpcError, ImageError, RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
+from barpc.rpcio.carried import RPC_TAG, Directory, Entry, read_directory, read_values, tag_values
 from barpc.rpcio.formats import parse
-from barpc.rpcio.tiff import RPC_TAG, Directory, Entry, read_directory, read_values, tag_values
 from barpc.sidefile import RPC_FILE
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from barpc.rpcio.acquisition import date_taken
+from barpc.rpcio.sources import date_taken
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ import pytest
 
 from barpc.errors import ImageError, OutputError, RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, write_rpc
-from barpc.rpcio.fields import COEFFICIENTS, OFFSETS, SCALES, fields_from_rpc, number
+from barpc.rpcio.carried import nitf_record
 from barpc.rpcio.formats import parse
-from barpc.rpcio.text import nitf_record, write_rpb, write_txt
+from barpc.rpcio.text import COEFFICIENTS, OFFSETS, SCALES, fields_from_rpc, number, write_rpb, write_txt
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, grid, make_rpc, yaml
 
 WRITABLE = [row for row in FORMATS.values() if row.write is not None]
@@ -180,7 +180,7 @@ def test_an_rpc_may_lie_three_objects_deep_in_json_and_no_deeper(rpc):
 
 
 def _fields(rpc):
-    from barpc.rpcio.fields import fields_from_rpc
+    from barpc.rpcio.text import fields_from_rpc
 
     return fields_from_rpc(rpc)
 
@@ -276,14 +276,10 @@ def test_a_constellation_s_way_of_writing_is_read(constellation, rpc):
 @pytest.mark.parametrize(
     ("text", "found"),
     [
-        ("rowOff: 1\ncolOff: 2\nrowNum_1: 3\nrowNum_2: 4\n", "fields found: rowOff, colOff, rowNum$"),
-        (
-            "<Doc><Date>x</Date><RFM><LineNum>1 2</LineNum></RFM></Doc>",
-            "fields found: RFM, LineNum, Doc, Date$",
-        ),
-        ('{"date": 1, "camera": {"rpcCoeffs": [1, 2]}}', "fields found: rpcCoeffs, date, camera$"),
-        ("\n".join(f"{c}ame: 1" for c in "abcdefghijk"), "fields found: aame, .*, hame and 3 more$"),
-        ("1 2 3 4", "no field with a name is in it$"),
+        ("rowOff: 1\ncolOff: 2\nrowNum_1: 3\nrowNum_2: 4\n", "alos\\)$"),
+        ("<Doc><Date>x</Date><RFM><LineNum>1 2</LineNum></RFM></Doc>", "alos\\)$"),
+        ('{"date": 1, "camera": {"rpcCoeffs": [1, 2]}}', "alos\\)$"),
+        ("1 2 3 4", "alos\\)$"),
         ("<isd><ATT><ATTLISTList><ATTLIST>1</ATTLIST></ATTLISTList></ATT></isd>", "model=physical$"),
         (
             "<Dimap_Document><Geometric_Data><Refined_Model/></Geometric_Data></Dimap_Document>",
@@ -291,7 +287,7 @@ def test_a_constellation_s_way_of_writing_is_read(constellation, rpc):
         ),
     ],
 )
-def test_an_unknown_file_is_refused_with_the_names_of_its_fields(text, found):
+def test_an_unknown_file_is_refused_with_what_is_known(text, found):
     with pytest.raises(RpcFormatError, match=found) as told:
         parse(text.encode(), "memory")
     assert "known: txt, rpb" in str(told.value)

@@ -16,8 +16,8 @@ from scipy import ndimage
 from barpc.errors import ImageError, OutputError
 from barpc.fit import fit_rpc
 from barpc.raster import open_raster
-from barpc.rpcio import read_rpc, resample, write_rpc_vrt
-from barpc.rpcio.resample import write_resampled
+from barpc.rpcio import grids, read_rpc, write_rpc_vrt
+from barpc.rpcio.grids import write_resampled
 from barpc.sensor.correction_grid import CorrectionGrid
 from barpc.simulate import fly, looks
 from tests.jitter import jittered
@@ -32,7 +32,7 @@ SIZE = (420, 360)  # two blocks each way
 
 @pytest.fixture(autouse=True)
 def _small_blocks(monkeypatch):
-    monkeypatch.setattr(resample, "BLOCK", 256)
+    monkeypatch.setattr(grids, "BLOCK", 256)
 
 
 def scenery(col, row):
@@ -137,7 +137,7 @@ def test_blocks_leave_no_seams(tmp_path, monkeypatch):
     write_resampled(make_rpc(), grid(), image, tmp_path / "b.tif")
     write_resampled(make_rpc(), grid(), image, tmp_path / "c.tif")
     assert (tmp_path / "b.tif").read_bytes() == (tmp_path / "c.tif").read_bytes()
-    monkeypatch.setattr(resample, "BLOCK", 512)
+    monkeypatch.setattr(grids, "BLOCK", 512)
     write_resampled(make_rpc(), grid(), image, tmp_path / "c.tif", overwrite=True)
     assert np.abs(np.subtract(*(pixels(tmp_path / f"{name}.tif").astype(int) for name in "bc"))).max() <= 1
 
@@ -243,7 +243,7 @@ def test_what_cannot_be_resampled_is_one_line_and_leaves_nothing(tmp_path, monke
     with pytest.raises(OutputError, match="input image"):
         write_resampled(make_rpc(), grid(), image, image, overwrite=True)
     sums = iter(range(99))
-    monkeypatch.setattr(resample, "crc32", lambda data: next(sums))
+    monkeypatch.setattr(grids, "crc32", lambda data: next(sums))
     with pytest.raises(OutputError, match="other pixels"):
         write_resampled(make_rpc(), grid(), image, target)
     assert not list(target.parent.iterdir())
@@ -251,14 +251,14 @@ def test_what_cannot_be_resampled_is_one_line_and_leaves_nothing(tmp_path, monke
 
 def test_a_run_that_dies_half_way_leaves_nothing(tmp_path, monkeypatch):
     image = raster(tmp_path / "a.tif", seen(4000.0, "uint16"))
-    real, count = resample._fill, iter(range(10))
+    real, count = grids._fill, iter(range(10))
 
     def dying(*given):
         if next(count) == 2:
             raise KeyboardInterrupt
         return real(*given)
 
-    monkeypatch.setattr(resample, "_fill", dying)
+    monkeypatch.setattr(grids, "_fill", dying)
     (tmp_path / "out").mkdir()
     with pytest.raises(KeyboardInterrupt):
         write_resampled(make_rpc(), grid(), image, tmp_path / "out" / "b.tif")

@@ -1,6 +1,7 @@
-"""Parts of files from web servers, by range requests of the standard library.
+"""Parts of files from web servers, by range requests of the standard library, and from object stores, by fsspec.
 
-The server is not trusted: it answers for the bytes that were asked or not at all, within a time, and sends nobody on.
+A server is not trusted: it answers for the bytes that were asked or not at all, within a time, and sends nobody on.
+fsspec knows the stores' credentials and addresses as every tool does.
 """
 
 from __future__ import annotations
@@ -12,15 +13,52 @@ import socket
 import ssl
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
+from functools import cache, lru_cache
 from http.client import HTTPConnection, HTTPException, HTTPResponse, HTTPSConnection
 from itertools import chain
+from typing import Any
 from urllib.parse import quote, urljoin, urlsplit
 
 from barpc.errors import visible
-from barpc.remote import Part, Remote
+from barpc.remote import BLOCK, Part, Remote
+
+
+def fetch(at: Remote, start: int, stop: int) -> Part:
+    """Return the bytes `start` to `stop` of a file, or to its end; OSError where its host does not hand them out."""
+    return (_from_server if at.startswith("http") else _from_store)(at, start, stop)
+
+
+def beside(image: Remote, names: Iterable[str]) -> dict[str, str]:
+    """Return the names of those of these files that are in an image's folder, by name in lower case.
+
+    A store lists the folder, and case does not count; a web server is asked for each name as it is and with its ending
+    in lower case.
+    """
+    if not image.startswith("http"):
+        wanted = {name.lower() for name in names}
+        present = _listed(image.parent, int(time.monotonic() / _LISTED))
+        return {name.lower(): name for name in present if name.lower() in wanted}
+    tried: dict[str, str] = {}
+    for name in dict.fromkeys(names):
+        cut = name.rfind("_RPC.") if "_RPC." in name else name.rfind(".")
+        tried |= dict.fromkeys((name, name[:cut] + name[cut:].lower()), name.lower())
+    with ThreadPoolExecutor() as pool:
+        found = dict(zip(tried, pool.map(lambda name: _there(image.parent / name), tried), strict=True))
+    return {tried[name]: name for name, there in reversed(found.items()) if there}
+
+
+def _there(at: Remote) -> bool:
+    try:
+        fetch(at, 0, 1)
+    except FileNotFoundError:
+        return False
+    return True
+
+
+# --- web servers ------------------------------------------------------------------------------------------
 
 WAITS = (0.0, 0.5, 2.0)
 """Before each new attempt [s]."""
@@ -29,9 +67,7 @@ _SLOWEST = 10_000  # bytes a second, on top of TIMEOUT
 _AGAIN = (408, 425, 429, 500, 502, 503, 504)
 _ELSEWHERE = (301, 302, 303, 307, 308)
 _MOVES = 3
-_PIECE = 1 << 16
 _KEPT = "/%:@!$&'()*+,;=~"  # characters that stand in an address as they are
-_TOGETHER = 8  # requests for side files at a time
 
 _idle: dict[tuple[int, str, str], list[HTTPConnection]] = {}  # process (a fork shares no socket), scheme, host
 _lock = threading.Lock()
@@ -41,8 +77,7 @@ class _PassingError(OSError):
     """An error that may be over at the next attempt."""
 
 
-def fetch(at: Remote, start: int, stop: int) -> Part:
-    """Return the bytes `start` to `stop` of a file, or to its end; OSError where the server does not hand them out."""
+def _from_server(at: Remote, start: int, stop: int) -> Part:
     for wait in (*WAITS, None):
         try:
             return _moved(at, start, stop)
@@ -54,7 +89,7 @@ def fetch(at: Remote, start: int, stop: int) -> Part:
 
 
 def _moved(at: str, start: int, stop: int) -> Part:
-    """Fetch as `fetch` does, once; a server may redirect within itself."""
+    """Fetch once; a server may redirect within itself."""
     url = at
     for _ in range(_MOVES):
         found = _once(url, start, stop)
@@ -140,7 +175,7 @@ def _answered(answer: HTTPResponse, start: int, stop: int) -> Part | str | None:
     if status in _ELSEWHERE:
         return answer.headers.get("Location", "")
     if status in (404, 410):
-        answer.read(_PIECE)  # so that the connection can be used again
+        answer.read(BLOCK)  # so that the connection can be used again
         return None
     if answer.headers.get("Content-Encoding", "identity") != "identity":
         raise OSError("its host sends it compressed, though that was not asked")
@@ -168,20 +203,91 @@ def _body(answer: HTTPResponse, wanted: int) -> bytes:
     return data
 
 
-def beside(image: Remote, names: Iterable[str]) -> dict[str, str]:
-    """See `barpc.remote.beside`."""
-    tried: dict[str, str] = {}
-    for name in dict.fromkeys(names):
-        cut = name.rfind("_RPC.") if "_RPC." in name else name.rfind(".")
-        tried |= dict.fromkeys((name, name[:cut] + name[cut:].lower()), name.lower())
-    with ThreadPoolExecutor(_TOGETHER) as pool:
-        found = dict(zip(tried, pool.map(lambda name: _there(image.parent / name), tried), strict=True))
-    return {tried[name]: name for name, there in reversed(found.items()) if there}
+# --- stores -----------------------------------------------------------------------------------------------
+
+_NAMES = {"s3": "s3fs", "gs": "gcsfs", "az": "adlfs"}
+_S3 = {"connect_timeout": 10, "read_timeout": 30, "retries": {"max_attempts": 3}}
+_LISTED = 60  # s that the list of a folder is used for: the images in it are loaded one after the other
 
 
-def _there(at: Remote) -> bool:
+@cache
+def _store(scheme: str) -> Any:
     try:
-        fetch(at, 0, 1)
-    except FileNotFoundError:
-        return False
-    return True
+        import fsspec
+
+        given = {"config_kwargs": _S3} if scheme == "s3" else {}
+        return fsspec.filesystem(scheme, use_listings_cache=False, **given)
+    except ImportError as error:
+        raise OSError(
+            f"{scheme}:// needs the extra: pip install 'barpc[remote]' ({_NAMES[scheme]} is missing)"
+        ) from error
+    except Exception as error:  # no credentials
+        raise _one_line(error) from error
+
+
+class _Opened:
+    """An object of one version, as its store opens it."""
+
+    def __init__(self, at: Remote) -> None:
+        store = _store(at.partition(":")[0])
+        self._lock, self._store, self._url = threading.Lock(), store, str(at)
+        self._file = _told(store.open, str(at), "rb", cache_type="none")
+        found = _told(store.info, str(at))
+        if found.get("type") == "directory":
+            raise OSError("a folder")
+        self.version = _version(found)
+
+    def read(self, start: int, stop: int) -> bytes:
+        with self._lock:
+            _told(self._file.seek, start)
+            data = bytes(_told(self._file.read, stop - start))
+            if not self._url.startswith("s3:"):  # s3fs asks for bytes of the version that it opened
+                self.require(*_version(_told(self._store.info, self._url)))
+            return data
+
+    def require(self, size: int, tag: str) -> None:
+        if self.version != (size, tag):
+            raise OSError("it was changed in its store while it was read; run the same command again")
+
+
+def _version(found: Mapping[str, Any]) -> tuple[int, str]:
+    tags = (found.get(key) for key in ("ETag", "etag", "generation", "mtime", "LastModified", "last_modified"))
+    return int(found["size"]), str(next(filter(None, tags), ""))
+
+
+@lru_cache
+def _pinned(url: str, size: int, tag: str) -> _Opened:
+    found = _Opened(Remote(url))
+    found.require(size, tag)
+    return found
+
+
+def _from_store(at: Remote, start: int, stop: int) -> Part:
+    file = _Opened(at) if at.size is None else _pinned(str(at), at.size, at.tag)
+    size, tag = file.version
+    wanted = max(0, min(stop, size) - start)
+    data = file.read(start, start + wanted) if wanted else b""
+    if len(data) != wanted:
+        raise OSError(f"its store sent {len(data)} of {wanted} bytes")
+    return Part(data, size, tag)
+
+
+@lru_cache(8)
+def _listed(folder: str, _minute: int) -> tuple[str, ...]:
+    found = _told(_store(folder.partition(":")[0]).ls, folder, detail=False)
+    return tuple(sorted(str(path).rpartition("/")[2] for path in found))
+
+
+def _told(ask: Any, *args: Any, **given: Any) -> Any:
+    """Return a store's answer; errors of its many classes become an OSError of one line."""
+    try:
+        return ask(*args, **given)
+    except FileNotFoundError as error:
+        raise FileNotFoundError("its store has no such object or bucket") from error
+    except Exception as error:
+        raise _one_line(error) from error
+
+
+def _one_line(error: Exception) -> OSError:
+    first = next(iter(str(error).strip().splitlines()), "")  # Azure adds the whole answer
+    return OSError(f"its store answers {type(error).__name__}: {first[:300]}")

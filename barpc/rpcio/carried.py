@@ -1,13 +1,14 @@
-"""The GeoTIFF RPCCoefficientTag (50844): read to the bit, and put into a copy whose pixels stay untouched.
+"""RPCs that rasters carry: a GeoTIFF's RPCCoefficientTag (50844) and a NITF's RPC00B extension.
 
-The tag is read from the file's directory itself: GDAL prints its numbers with 15 digits on the way. A copy is made
-of the source's bytes; only its first directory is written anew, behind the pixels, so that compression, tiles,
+The tag is read from the file's directory itself, to the bit: GDAL prints its numbers with 15 digits on the way. A copy
+is made of the source's bytes; only its first directory is written anew, behind the pixels, so that compression, tiles,
 overviews and masks stay as they are, in TIFF and BigTIFF alike.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,10 +19,10 @@ import numpy as np
 from barpc.errors import ImageError, RpcFormatError
 from barpc.geodesy import Array
 from barpc.remote import Place
-from barpc.rpcio.fields import COEFFICIENTS, SINGLE, fields_from_rpc, rpc_from_fields
+from barpc.rpcio.text import COEFFICIENTS, SINGLE, WIDTHS, cells_of, fields_from_rpc, fields_in_order, rpc_from_fields
 from barpc.sensor.rational import DERIVATIVE, MONOMIALS
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import IMAGE, opened
+from barpc.sidefile import IMAGE, opened, read_head
 
 RPC_TAG = 50844
 _GEOREFERENCE_TAGS = (33550, 33922, 34264)  # ModelPixelScale, ModelTiepoint, ModelTransformation
@@ -118,9 +119,7 @@ def read_tag(path: Place) -> RPC | None:
         values = struct.unpack(f"{directory.order}92d", read_values(file, directory, entry, str(path)))
     if not all(math.isfinite(value) for value in values[2:]):
         raise RpcFormatError(f"{path}: the RPC tag holds a number that is not finite")
-    fields = {key: [value] for key, value in zip(SINGLE, values, strict=False)}
-    fields |= {key: list(values[12 + 20 * i : 32 + 20 * i]) for i, key in enumerate(COEFFICIENTS)}
-    return rpc_from_fields(fields, f"{path} (RPC tag)")
+    return rpc_from_fields(fields_in_order(values, SINGLE), f"{path} (RPC tag)")
 
 
 def tag_values(rpc: RPC) -> list[float]:
@@ -165,19 +164,11 @@ def _unmark_cog(file: BinaryIO) -> None:
         file.write(b"KNOWN_INCOMPATIBLE_EDITION=YES\n")
 
 
-# --- fifteen digits ---------------------------------------------------------------------------------------
-
 _POWERS = np.array([[monomial.count(letter) for monomial in MONOMIALS] for letter in "LPH"], dtype=np.float64)
 
 
 def _fifteen(values: Array) -> Array:
     return np.array([float(f"{value:.15g}") for value in values.tolist()])
-
-
-def survives(rpc: RPC) -> bool:
-    """Return whether offsets and scales are the same after being printed with fifteen digits."""
-    arrays = (rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
-    return all(np.array_equal(_fifteen(array), array) for array in arrays)
 
 
 def printable(rpc: RPC) -> RPC:
@@ -188,19 +179,14 @@ def printable(rpc: RPC) -> RPC:
     difference: a normalised coordinate x becomes a x + b with b and a - 1 of 1e-13, the polynomials change by
     b dp/dx + (a - 1) x dp/dx, and what is left of second order is 1e-26.
     """
-    if survives(rpc):
-        return rpc
     ground_offset, ground_scale = _fifteen(rpc.ground_offset), _fifteen(rpc.ground_scale)
     image_offset, image_scale = _fifteen(rpc.image_offset), _fifteen(rpc.image_scale)
     shift = (ground_offset - rpc.ground_offset) / rpc.ground_scale
     stretch = (ground_scale - rpc.ground_scale) / rpc.ground_scale
-    coeffs = np.array(rpc.coeffs)
-    change = coeffs * (stretch @ _POWERS)
-    change[:, :10] += np.einsum("k,kij,pi->pj", shift, DERIVATIVE, coeffs)
-    coeffs += change
-    numerator, denominator = coeffs[::2], coeffs[1::2]
-    offset = ((rpc.image_offset - image_offset) / image_scale)[:, None]
-    coeffs[::2] = numerator * (rpc.image_scale / image_scale)[:, None] + offset * denominator
+    coeffs = rpc.coeffs + rpc.coeffs * (stretch @ _POWERS)
+    coeffs[:, :10] += np.einsum("k,kij,pi->pj", shift, DERIVATIVE, rpc.coeffs)
+    moved = ((rpc.image_offset - image_offset) / image_scale)[:, None]
+    coeffs[::2] = coeffs[::2] * (rpc.image_scale / image_scale)[:, None] + moved * coeffs[1::2]
     return replace(
         rpc,
         coeffs=coeffs,
@@ -209,3 +195,61 @@ def printable(rpc: RPC) -> RPC:
         image_offset=image_offset,
         image_scale=image_scale,
     )
+
+
+# --- NITF -------------------------------------------------------------------------------------------------
+
+_SCAN_LIMIT = 1 << 24  # bytes searched for the extension
+_WIDTHS = (7, 7, *WIDTHS)
+
+# Position in RPC00A of each of RPC00B's twenty monomials.
+_B_FROM_A = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 7, 11, 14, 17, 12, 15, 18, 13, 16, 19)
+
+
+def read_nitf(path: Place) -> RPC | None:
+    """Read the RPC in a NITF's RPC00B (or RPC00A) extension, None without one; RpcFormatError where it is not valid."""
+    data = read_head(path, IMAGE, _SCAN_LIMIT)
+    match = re.search(rb"RPC00([AB])01041", data)
+    if match is None:
+        return None
+    record = data[match.end() :][:1041].decode("latin-1")
+    name = f"{path} (RPC00{match.group(1).decode()})"
+    if not record.startswith("1"):
+        raise RpcFormatError(f"{name}: its SUCCESS flag is {record[:1]!r}, not 1: the vendor's fit failed")
+    fields = cells_of(record[1:], _WIDTHS, SINGLE, name)
+    if match.group(1) == b"A":
+        fields |= {key: [fields[key][i] for i in _B_FROM_A] for key in COEFFICIENTS}
+    return rpc_from_fields(fields, name)
+
+
+def nitf_record(rpc: RPC) -> str:
+    """Return the 1041 characters of an RPC00B extension; RpcFormatError where a number does not fit its
+    field.
+
+    Image and height offsets and scales are integers, degrees have four decimals, coefficients seven digits: an
+    RPC that was not fitted for it (`barpc.fit`, precision "nitf") loses tenths of a pixel. An unknown accuracy
+    is written as zero, as the format asks.
+    """
+    fields = fields_from_rpc(rpc)
+    decimals = {"ERR": 2, "LAT": 4, "LONG": 4}
+    cells = ["1"]
+    for key, width in zip(SINGLE, _WIDTHS, strict=True):
+        value = fields.get(key, [0.0])[0]
+        axis = key.split("_")[0]
+        sign = "+" if axis in ("LAT", "LONG", "HEIGHT") else ""
+        cell = format(value, f"{sign}0{width}.{decimals.get(axis, 0)}f")
+        if len(cell) != width or (not sign and value < 0):
+            raise RpcFormatError(f"NITF RPC00B: {key} = {value:g} does not fit {width} characters")
+        cells.append(cell)
+    cells += [_nitf_coefficient(value, key) for key in COEFFICIENTS for value in fields[key]]
+    return "".join(cells)
+
+
+def _nitf_coefficient(value: float, key: str) -> str:
+    mantissa, exponent = f"{value:+.6E}".split("E")
+    power = int(exponent)
+    if power < -9:
+        return "+0.000000E+0"
+    if power > 9:
+        raise RpcFormatError(f"NITF RPC00B: a coefficient of {key} is {value:g}, beyond the format")
+    return f"{mantissa}E{power:+d}"
