@@ -30,7 +30,7 @@ from barpc.errors import AdjustError, BarpcError
 from barpc.frozen import Arrays, from_arrays, to_arrays
 from barpc.identity import Input, guarded
 from barpc.pipeline.cluster import other_version
-from barpc.tie.store import Store
+from barpc.tie.tasks import Store
 from barpc.workspace import Workspace, key_of
 
 logger = logging.getLogger(__name__)

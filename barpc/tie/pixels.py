@@ -177,9 +177,7 @@ def _mask(dataset: Any, band: int, raw: npt.NDArray[Any]) -> BoolArray | None:
 
 
 def sample_stretch(path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None) -> Stretch | None:
-    """Estimate the stretch from the 0.5 and 99.5 percentiles of blocks spread over a raster, or its picture
-    of a size; None where nothing varies.
-    """
+    """Estimate the stretch, 0.5 to 99.5 %, of a raster (or its picture); None where nothing varies."""
     found: list[Array] = []
     with open_raster(path) as dataset:
         _check_band(dataset, path, band)

@@ -84,9 +84,7 @@ class _Described:
         return _Described(self.values[which], self.length[which], self.direction[which], self.zoom[which])
 
     def likeness(self, other: _Described, allowed: npt.NDArray[np.bool_]) -> FloatArray:
-        """Return the cosines (n, m) of the descriptors that are allowed, where orientation and scale are as
-        expected; else `_NONE`.
-        """
+        """Return the cosines (n, m) of descriptors whose orientation and scale are as expected; else `_NONE`."""
         allowed &= self.direction @ other.direction.T >= np.float32(np.cos(_MAX_TURN))
         allowed &= np.abs(other.zoom - self.zoom[:, None]) <= np.float32(_MAX_ZOOM)
         cosine = self.values @ other.values.T / (self.length[:, None] * other.length)
@@ -103,9 +101,7 @@ class _Best:
         self._top_b = np.full(size_b, _NONE)
 
     def update(self, rows: IntArray, cols: IntArray, likeness: FloatArray, du: Array, dw: Array) -> None:
-        """Take in the cosines (n, m) of all candidates of some points of A, and their places about the predicted
-        ones.
-        """
+        """Take in the cosines (n, m) of candidates of some points of A, and their places about the predicted ones."""
         back = likeness.argmax(axis=0)
         top = likeness[back, np.arange(len(cols))]
         more = top > self._top_b[cols]
@@ -133,9 +129,7 @@ class _Best:
 def _near(
     where: EpipolarSegments, across: float, wanted: IntArray, turned: Array
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield points of A whose bands lie near each other, and the points of B, `turned` (N, 2) as the frame is, about
-    all these bands; both ascending.
-    """
+    """Yield points of A whose bands lie near each other, and the points of B, `turned`, about these; ascending."""
     rows = wanted[np.isfinite(where.along + where.across + where.slope)[wanted]]
     if not len(rows):
         return

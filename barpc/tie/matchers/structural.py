@@ -186,9 +186,7 @@ class _Search:
         return at[ok], tile.in_b(place)[ok], 1.0 - score[ok]
 
     def _part_in_b(self, where: EpipolarSegments, middle: Array, rows: IntArray, wide: float) -> tuple[float, float]:
-        """Return the middle and half the length [px] of what a tile's segments have in B, from their middles:
-        one for all.
-        """
+        """Return the middle and half the length [px] of what a tile's segments have in B, from their middles."""
         start = where.place(middle)[rows]
         step = where.place(middle + 1.0)[rows] - start
         size = np.array(self._files[1][1], dtype=np.float64)

@@ -154,9 +154,7 @@ def dense_matches(
 
 
 def _window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Array, tuple[int, int]] | None:
-    """Return the first pixel (2,) and width, height of what is resampled: the part as far as both images
-    reach, with margins.
-    """
+    """Return the first pixel (2,) and width, height of the part as far as both images reach, with margins."""
     low, high = frame.places.min(axis=0) - _MARGIN, frame.places.max(axis=0) + _MARGIN
     reach = np.array([frame.num, 0.0])
     for size, one, more in zip(sizes, frame.maps, (np.zeros(2), reach), strict=True):

@@ -10,8 +10,7 @@ import numpy as np
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 from barpc.tie.pairing.epipolar import grouped
-from barpc.tie.patches.channels import BATCH, COARSE, EDGE, FINE, SHOWN, channels, correlation, cut
-from barpc.tie.patches.resampled import picture, ticks
+from barpc.tie.patches.channels import BATCH, COARSE, EDGE, FINE, SHOWN, channels, correlation, cut, picture, ticks
 from barpc.tie.pixels import MEMORY, FloatImage
 
 Files = Sequence[tuple[str, tuple[int, int]]]
@@ -53,9 +52,7 @@ class Sampling:
 
 
 def found_about(sampling: Sampling, at: Array, xy: Array, half: int = HALF) -> tuple[Array, BoolArray, Array]:
-    """Return the places (n, 2) near those given, whether they stand out and the way back ends at its start;
-    correlations.
-    """
+    """Return the places (n, 2) near those given, whether they stand out and the way back returns; correlations."""
     tile = PatchTile.of(sampling, at, xy, np.full(2, _FINER), half)
     surface = tile.surfaces()
     place, score = tile.peaks(surface)

@@ -10,7 +10,6 @@ one small pseudo-inverse a match serves all iterations.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 
 import cv2
@@ -24,7 +23,7 @@ from barpc.tie.pairing.epipolar import FEW, LEAST_REACH, affine_inliers, frame, 
 from barpc.tie.patches import oriented
 from barpc.tie.patches.channels import SETTLED
 from barpc.tie.pixels import SPAN, FloatImage, PixelReader, grow, levelled
-from barpc.tie.tasks import Progress, ordered
+from barpc.tie.tasks import HERE, Work
 
 MIN_CORRELATION = 0.8
 """Of two registered patches, or the match is left out."""
@@ -74,7 +73,6 @@ def register_places(
     start: Array,
     linear: Array,
     patch: int,
-    tile: int = 1024,
 ) -> PatchRegistration:
     """Read what is needed of two images, each a path and its size, and register as `register_patches`, tile by tile.
 
@@ -83,7 +81,7 @@ def register_places(
     cv2.setNumThreads(1)
     margin = patch + _TAPS + int(REACH)
     sparse, every = _sparse(reference, margin), PatchRegistration.none(start)
-    read, groups = (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, min(tile, SPAN)))
+    read, groups = (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, SPAN))
     (path, size), (other, beyond) = files
     with PixelReader(path, band, size) as first, PixelReader(other, band, beyond) as second:
         for rows in groups:
@@ -132,9 +130,7 @@ def _mosaics(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int)
 
 
 def _parts(origin: Array, links: IntArray, tile: int) -> list[IntArray]:
-    """Return the links that are registered in one task: of whole tiles, or, where they are few, of whole
-    bands of rows, swept by columns: strips and blocks are decoded once.
-    """
+    """Return the links of each task: of whole tiles, or, where few, of bands of rows: blocks decode once."""
     if not _sparse(origin, PATCH + _TAPS + int(REACH)):
         return [links[rows] for rows in _joined(_by_tile(origin, tile), CHUNK)]
     order = np.lexsort((origin[:, 0], origin[:, 1] // SPAN))
@@ -168,13 +164,12 @@ def register_part(
     start: Array,
     linear: Array,
     structural: bool,
-    tile: int,
 ) -> PatchRegistration:
     """Register patches by their grey values, or by channels of oriented gradients; `ok` where they are alike."""
     if structural:
         xy, ok, correlation = oriented.register_oriented(files, band, reference, start, linear)
         return PatchRegistration(xy, correlation, np.full(len(xy), oriented.SIGMA), ok)
-    found = register_places(files, band, reference, start, linear, PATCH, tile)
+    found = register_places(files, band, reference, start, linear, PATCH)
     return replace(found, ok=found.ok & (found.correlation >= MIN_CORRELATION))
 
 
@@ -367,8 +362,7 @@ def refine(
     options: TieOptions,
     *,
     structural: Collection[tuple[int, int]] = (),
-    executor: Executor | None = None,
-    progress: Progress | None = None,
+    work: Work = HERE,
 ) -> Tracks:
     """Register every observation to its track's reference patch, and verify the result.
 
@@ -383,7 +377,7 @@ def refine(
     of_track = references(tracks, spreads, len(views))
     other = np.flatnonzero(np.arange(len(tracks)) != of_track[tracks.point])
     links = _Links(views, tracks, of_track[tracks.point[other]], other, frozenset(structural))
-    found = links.register(options, executor, progress)
+    found = links.register(options, work)
     good = links.verified(found, found.ok)
     sigma = links.scaled(found, good)
     return _shared(tracks, of_track, other[good], found.xy[good], sigma[good])
@@ -416,7 +410,7 @@ class _Links:
         """Return the indices of the links between the same two views, and of equal values of `more`."""
         return grouped(self.tracks.view[self.reference], self.tracks.view[self.other], *more)
 
-    def register(self, options: TieOptions, executor: Executor | None, progress: Progress | None) -> PatchRegistration:
+    def register(self, options: TieOptions, work: Work) -> PatchRegistration:
         """Register all, tile by tile of the reference view."""
         origin = self.origin
         linear = np.empty((len(self), 2, 2))
@@ -430,8 +424,8 @@ class _Links:
             first, second = self.of(part)
             images = ((first.path, first.size), (second.path, second.size))
             places = origin[part], start[part], linear[part]
-            tasks.append((images, options.band, *places, self._is_structural(part), options.tile))
-        done: list[PatchRegistration] = ordered(executor, register_part, tasks, "refine", progress)
+            tasks.append((images, options.band, *places, self._is_structural(part)))
+        done: list[PatchRegistration] = work.ordered(register_part, tasks, "refine")
         found = PatchRegistration.none(start)
         for part, one in zip(parts, done, strict=True):
             found.put(part, one)
@@ -443,16 +437,12 @@ class _Links:
         return (ends[0], ends[1]) in self.structural
 
     def errors(self, found: PatchRegistration, group: IntArray) -> tuple[Array, Array]:
-        """Return the distances along and across the epipolar lines (M, 2) [px] between two views, and half
-        the segments' length (M,).
-        """
+        """Return distances along and across epipolar lines (M, 2) [px] of two views, and half the segments (M,)."""
         where = frame(*self.of(group), self.origin[group])
         return where.errors(found.xy[group]), where.after
 
     def verified(self, found: PatchRegistration, good: BoolArray) -> BoolArray:
-        """Return the observations near their epipolar line, as certain as others, and at one altitude with
-        their track.
-        """
+        """Return the observations near their epipolar line, as certain as others, at one altitude with their track."""
         verified = np.zeros(len(self), dtype=bool)
         altitude, reach = np.zeros((2, len(self)))  # from the middle of the range, in its halves
         for group in self.groups():
@@ -466,9 +456,7 @@ class _Links:
         return verified & ~self._torn(verified, altitude, reach)
 
     def _torn(self, good: BoolArray, altitude: Array, reach: Array) -> BoolArray:
-        """Return the links that disagree in altitude with all their neighbours in the track, up to an affine
-        function.
-        """
+        """Return the links that disagree in altitude with all neighbours in the track, up to an affine function."""
         rows = np.flatnonzero(good & (reach >= LEAST_REACH))
         first, second = rows[:-1], rows[1:]
         same = self.reference[first] == self.reference[second]
