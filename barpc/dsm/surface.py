@@ -87,17 +87,7 @@ def make_dsm(
     try:
         with Workspace(room) as run:
             rough, made = run.partial / "tiles.tif", run.partial / "dsm.tif"
-            with run.stage("surface"):
-                known, share = grid.fill(rough, run, executor, progress)
-            if not known:
-                raise NoSurfaceError(
-                    f"of the pixels that both images show {100 * max(share, 0):.0f} % are found back at most, "
-                    f"fewer than {100 * MATCHED:.0f} %: other seasons, water, clouds or wrong cameras; nothing is "
-                    "written"
-                )
-            layout = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "BLOCKSIZE": str(SIDE), "BIGTIFF": "IF_SAFER"}
-            with run.stage("write"), rasterio.Env(GDAL_NUM_THREADS="1"):
-                rasterio.shutil.copy(rough, made, driver="COG", **layout)
+            known, share = _made(run, grid, executor, progress)
             if folder is not None and block.run is not None and options.minus is None:
                 show_in_report(folder, block.run, grid, made)
             found = _told(out, grid, rough, known, share)
@@ -107,6 +97,22 @@ def make_dsm(
         raise
     shutil.rmtree(room, ignore_errors=True)
     return found
+
+
+def _made(run: Workspace, grid: Grid, executor: Executor | None, progress: Progress | None) -> tuple[int, float]:
+    """Make the files `tiles.tif` and `dsm.tif` in a room; return the cells with a height and the share matched."""
+    rough, made = run.partial / "tiles.tif", run.partial / "dsm.tif"
+    with run.stage("surface"):
+        known, share = grid.fill(rough, run, executor, progress)
+    if not known:
+        raise NoSurfaceError(
+            f"of the pixels that both images show {100 * max(share, 0):.0f} % are found back at most, "
+            f"fewer than {100 * MATCHED:.0f} %: other seasons, water, clouds or wrong cameras; nothing is written"
+        )
+    layout = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "BLOCKSIZE": str(SIDE), "BIGTIFF": "IF_SAFER"}
+    with run.stage("write"), rasterio.Env(GDAL_NUM_THREADS="1"):
+        rasterio.shutil.copy(rough, made, driver="COG", **layout)
+    return known, share
 
 
 def _place(out: Path, folder: Path | None, overwrite: bool, made: Path | None = None) -> None:

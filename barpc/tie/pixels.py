@@ -32,6 +32,8 @@ SPAN = 512
 """Rows that are read at a time (at least one row of blocks), and what else is done in parts of so many."""
 MEMORY = 1 << 28
 """Bytes of what a task works on at a time, about; they decide on no figure."""
+PIECE = MEMORY // 60
+"""Pixels of pictures, or places of templates in them, that are worked on together."""
 _SAMPLES = 5  # blocks a side whose pixels make the stretch
 _LEVEL = 4  # px a side of a pixel of the samples, where decoding is dear
 _NEGLIGIBLE = 8.0  # a range below so many steps of a float type is a constant image

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from barpc.geodesy import Array, metres_per_unit
+from barpc.geodesy import NEWTON_STEPS, Array, metres_per_unit
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
 from barpc.tie.pairing.overlaps import Terrain
@@ -30,7 +30,7 @@ from barpc.tie.patches.channels import (
     of_reference,
     shown,
 )
-from barpc.tie.patches.oriented import BACK, HALF
+from barpc.tie.patches.oriented import BACK, HALF, TILE
 from barpc.tie.pixels import FloatImage
 from barpc.tie.tasks import HERE, Work
 
@@ -38,22 +38,12 @@ REACH = 150.0  # m: how far a camera may be off
 PEAK = 6.5  # a vote that stands out by fewer standard deviations is none: other places reach 5.1
 _QUOTA = 1000  # points in a view, about
 _SEARCH = 6, 5.0  # px and m: what the vote and the terrain leave, together
-_FINE, _SIDE, _BLOCKS = (
-    2.0,
-    64,
-    8,
-)  # of the first vote: m a pixel, at least; px of a block; blocks along a side
+_FINE, _SIDE, _BLOCKS = 2.0, 64, 8  # of the first vote: m a pixel, at least; px of a block; blocks along a side
 _SHOWN = 0.5, 0.3  # of a block and of the reference around it
-_TILE = 192, 48  # px: points of a tile are looked for together; where the rasters are much finer
-_PIXELS = 20e6  # of a tile in a raster, at most, about
 _LEAST = 12  # points that agree in a view
 _BEYOND = 3.0  # times what is expected. Measured: the terrain's 0.5-1.3, of another place, mirrored, flat 6-9
 _MARGIN = 0.1  # by which a correlation beats its decoy's
-_NEAR, _FAR, _ROUNDS = (
-    3.0,
-    3.0,
-    8,
-)  # px: shifts that agree, to begin with; robust standard deviations; of the affine
+_NEAR = 3.0  # px: shifts that agree, to begin with; then robust standard deviations about the affine
 
 
 @dataclass(frozen=True)
@@ -148,7 +138,7 @@ def register_views(
     known = [middle[:2] for middle in middles if np.isfinite(middle).all()]
     pixels = [min(sheet.step(place) for sheet in sheets) for place in known]
     own = [float(ground_sample_distance(view.sensor, _middle(view))[1]) for view in views]
-    found = _Work(tuple(views), sheets, terrain, band, max(pixels + own), min(pixels + own), work)
+    found = _Work(tuple(views), sheets, terrain, band, max(pixels + own), work)
     place = max(0.5, 0.25 * max(pixels, default=0.0)) if accuracy.place is None else accuracy.place
     return found.search(found.vote(), replace(accuracy, place=place))
 
@@ -219,7 +209,6 @@ class _Work:
     terrain: Terrain
     band: int
     step: float  # of the grids [m]
-    pixel: float  # the smallest of any raster [m]
     work: Work
 
     @property
@@ -330,8 +319,7 @@ class _Work:
         with np.errstate(invalid="ignore"):
             inside = np.flatnonzero(((at >= edge) & (at <= np.array(view.size) - 1.0 - edge)).all(axis=1))
         pad = margin(HALF, reach) + 1
-        fits = (_TILE[0] + 2 * pad) ** 2 * (self.step / self.pixel) ** 2 < _PIXELS
-        cell = np.floor(places[inside] * metres / self.step / _TILE[0 if fits else 1]).astype(np.int64)
+        cell = np.floor(places[inside] * metres / self.step / TILE).astype(np.int64)
         _, group = np.unique(cell, axis=0, return_inverse=True)
         tiles = []
         for points in (inside[group.ravel() == g] for g in range(int(group.max(initial=-1)) + 1)):
@@ -383,9 +371,9 @@ def _affine(
     design = np.column_stack([np.ones(len(local)), local / max(float(np.abs(local).max()), 1.0)])
     apart = np.linalg.norm(shift[passed, None] - shift[None, passed], axis=2)
     fitted = np.broadcast_to(shift[passed][(apart < _NEAR * step).sum(axis=1).argmax()], shift.shape)
-    scale, keep = np.full(2, _NEAR * step / _FAR), passed
-    for _ in range(_ROUNDS):
-        keep = passed & (np.abs(shift - fitted) < _FAR * scale).all(axis=1)
+    scale, keep = np.full(2, step), passed
+    for _ in range(NEWTON_STEPS):
+        keep = passed & (np.abs(shift - fitted) < _NEAR * scale).all(axis=1)
         if keep.sum() < _LEAST:
             return None
         fitted = design @ np.linalg.lstsq(design[keep], shift[keep], rcond=None)[0]

@@ -56,8 +56,6 @@ logger = logging.getLogger(__name__)
 NEEDED = 4
 """Tracks of a pair: across the epipolar lines they are a shift and three that could contradict it."""
 _DEFAULTS = TieOptions()
-_SPARE = 1.3  # tracks registered for each one kept
-_SAME = REACH + 0.5**0.5  # px that registration, and rounding, may move a point by
 _QUOTAS = (4, 8, 16)
 """Tracks that a cell takes, round by round; with the first an image of full cells holds what is asked for."""
 
@@ -122,7 +120,7 @@ def _registered(
     linked = inside(looks.views, link([ends for ends, _, _ in tried], [found for _, found, _ in tried]), area)
     spreads = {ends: report.spread for ends, _, report in tried if report.status == "ok"}
     sizes = [view.size for view in looks.views]
-    linked = thin(linked, sizes, int(_SPARE * most))
+    linked = thin(linked, sizes, most)
     structural = [ends for ends, _, report in tried if report.matcher in (STRUCTURE, FINE)]
     theirs = {looks.ends[views] for views in scope.given}
     verified = {ends: found for ends, found, _ in tried if len(found)}
@@ -270,8 +268,8 @@ def _with_unregistered(views: Sequence[View], tracks: Tracks, given: GivenMatche
 
 def _joined(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
     """Return the registered tracks and others: those that stand beside a registered one are the same point."""
-    known, asked = (np.array([2 * _SAME * part.view, *part.xy.T]).T for part in (tracks, others))
-    near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=_SAME))
+    known, asked = (np.array([2 * REACH * part.view, *part.xy.T]).T for part in (tracks, others))
+    near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=REACH))
     same = np.flatnonzero(np.isfinite(near))
     point, which = np.unique(others.point[same], return_index=True)
     anchor = np.full(others.num_points, -1)  # the row of each track that says where it stands, if one does

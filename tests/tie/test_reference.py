@@ -298,7 +298,7 @@ def test_in_the_north_points_are_looked_for_where_the_vote_says_that_they_are_se
     view = View("north", "", (SIDE, SIDE), sensor, (0.0, 200.0))
     metres = metres_per_unit(np.array([10.0, 60.0, 0.0]))[:2]
     local = np.stack(np.meshgrid(*[np.arange(-300.0, 301.0, 20.0)] * 2), axis=-1).reshape(-1, 2)
-    work = _Work((view,), [], flat, 1, step=2.0, pixel=2.0, work=HERE)
+    work = _Work((view,), [], flat, 1, step=2.0, work=HERE)
     tiles = work._tiles(view, np.array([100.0, 0.0]), [10.0, 60.0] + local / metres, np.full(len(local), LEVEL), 8)
     found = np.isin(np.arange(len(local)), np.concatenate([tile.points for tile in tiles]))
     edge = scale[:2] * metres - 16.0  # half a template from the border

@@ -60,11 +60,9 @@ _DEFAULTS = TieOptions()
 _PASSES = ((20.0, 1500), (80.0, 2000), (float("inf"), 3000))
 """Blind passes: half width [px] (the last: `search`), points of A that are tried."""
 _PEAK = 4.0  # px, width of the window in which true matches of a blind pass fall
-_LEAST_PEAK = 8  # matches
 _SIGNIFICANT = 6.0  # standard deviations
 _NOWHERE = "no common offset"
 _CLEAR = 0.4  # share of the matches that makes wider passes needless
-_FALSE_SHARE_TIGHT = 0.05  # of the tight pass, which only serves the local one
 _NEIGHBOURS = 12
 _LOOSE = (
     0.95,
@@ -238,7 +236,7 @@ def _attempt(
     coarse = search.offset()
     if coarse is None:
         return NO_MATCHES, replace(report, status=f"{_NOWHERE} within {search.reach:.4g} px")
-    tight, _ = search.trusted(coarse, _FALSE_SHARE_TIGHT)
+    tight, _ = search.trusted(coarse, _LOOSE[1])
     report = replace(report, matches=len(tight))
     if len(tight) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches")
@@ -456,7 +454,7 @@ class _Search:
 
         prediction = replace(self._predicted(everywhere, width), probes=probes)
         found = self._matcher.match(*self._views, prediction)
-        if len(found) < _LEAST_PEAK:
+        if not len(found):
             return None
         errors = self.errors(found)
         values = np.sort(errors[:, 1])
@@ -465,7 +463,7 @@ class _Search:
         middle = float(np.median(values[start : start + most]))
         chance = (len(values) - most) * _PEAK / (2 * width)
         significance = (most - chance) / np.sqrt(chance + 1.0)
-        if most < _LEAST_PEAK or significance < _SIGNIFICANT or abs(middle) > width - _PEAK:
+        if significance < _SIGNIFICANT or abs(middle) > width - _PEAK:
             return None
         inside = np.abs(errors[:, 1] - middle) <= _PEAK
         across = robust_affine(found.xy[inside, 0], errors[inside, 1])

@@ -23,24 +23,22 @@ from rasterio.warp import transform as warp_points
 
 from barpc.errors import InputError
 from barpc.frozen import Frozen
-from barpc.geodesy import Array, metres_per_unit
+from barpc.geodesy import NEWTON_STEPS, Array, metres_per_unit
 from barpc.raster import open_raster
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.overlaps import Terrain
-from barpc.tie.pixels import MEMORY, Box, FloatImage, grow, levelled, read_pixels
+from barpc.tie.pixels import PIECE, Box, FloatImage, grow, levelled, read_pixels
 
 CHANNELS = 2
 COARSE, FINE = (0.8, 0.8), (1.0, 0.7)
 """How far pictures are blurred [px] before the gradients, and the channels: to be found, and to be found exactly."""
 _WEAK = 0.5  # of the median gradient: what is weaker is noise
 EDGE = 6
-"""Pixels so near to invalid ones know of them [px]."""
+"""Pixels so near to invalid ones know of them [px]; so far beside a search area, where true peaks end, decoys lie."""
 BATCH = 32
 """Templates that are correlated at a time."""
-_STEPS = 5
 SETTLED = 0.003
 """A step below it is the last [px]."""
-_GAP = 5  # px between a search area and its decoy: where a true peak ends
 SHOWN = 0.9
 """Part of a template that must be a picture."""
 
@@ -121,15 +119,15 @@ def joined(parts: Sequence[FoundTemplates]) -> FoundTemplates:
 
 def margin(half: int, search: int) -> int:
     """Return the least distance [px] of templates from the edge of a picture."""
-    return half + 3 * search + _GAP + 3
+    return half + 3 * search + EDGE + 3
 
 
 def _find(first: FloatImage, second: FloatImage, at: IntArray, half: int, search: int) -> FoundTemplates:
     n, wide = len(at), 2 * search + 1
     template = cut(first, at, half, half)
     right = np.arange(n) % 2 > 0  # where the decoy lies; areas to the left are turned about, so that all are alike
-    aside = np.where(right, 1, -1)[:, None] * [search + (_GAP + 1) // 2, 0]
-    areas = cut(second, at + aside, half + 2 * search + (_GAP + 1) // 2, half + search)
+    aside = np.where(right, 1, -1)[:, None] * [search + EDGE // 2, 0]
+    areas = cut(second, at + aside, half + 2 * search + EDGE // 2, half + search)
     surface = correlation(template, areas)
     surface[~right] = surface[~right, :, ::-1]
     true, decoy = surface[:, :, :wide].reshape(n, -1), surface[:, :, -wide:].reshape(n, -1)
@@ -167,7 +165,7 @@ def _registered(template: FloatImage, around: FloatImage) -> tuple[Array, BoolAr
     wanted = _unit(template)
     shift = np.zeros((len(template), 2))
     step = np.full_like(shift, np.inf)
-    for _ in range(_STEPS):
+    for _ in range(NEWTON_STEPS):
         there = _shifted(_shifted(around, shift[:, 0], 3), shift[:, 1], 2)
         size = np.sqrt((there**2).sum(axis=(1, 2, 3), keepdims=True)) + np.float32(1e-12)
         there = there / size
@@ -203,7 +201,6 @@ def _shifted(patches: FloatImage, shift: Array, axis: int) -> FloatImage:
 
 
 _NODE = 8  # px between exact projections; straight lines between them
-_MOST = MEMORY // 16  # px that are averaged at a time, in bytes each
 _KNOWN = 0.99  # of what a pixel is made of must be valid
 
 
@@ -366,7 +363,7 @@ def _thinned(
     file: tuple[str, tuple[int, int]], bands: Sequence[int], box: Box, thin: int
 ) -> tuple[FloatImage, FloatImage]:
     """Return the mean of bands of a window, averaged over `thin` x `thin` px, and how much of each is known."""
-    if box[2] * box[3] > _MOST and box[3] >= 2 * thin:
+    if box[2] * box[3] > PIECE and box[3] >= 2 * thin:
         first = box[3] // thin // 2 * thin
         halves = (box[0], box[1], box[2], first), (box[0], box[1] + first, box[2], box[3] - first)
         means, shares = zip(*(_thinned(file, bands, half, thin) for half in halves), strict=True)

@@ -11,7 +11,7 @@ from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 from barpc.tie.pairing.epipolar import grouped
 from barpc.tie.patches.channels import BATCH, COARSE, EDGE, FINE, SHOWN, channels, correlation, cut, picture, ticks
-from barpc.tie.pixels import MEMORY, FloatImage
+from barpc.tie.pixels import PIECE, FloatImage
 
 Files = Sequence[tuple[str, tuple[int, int]]]
 """Path and size (width, height) of two images."""
@@ -24,7 +24,6 @@ HALF = 16
 """How far a template reaches to each side [px]."""
 TILE = 256
 """Points of a tile of so many px a side share a picture."""
-_AREA = MEMORY // 60  # px of areas that templates are correlated with at a time, together, in bytes a px
 BACK = 1.5  # px that the way back may miss by
 _FINER = 3  # px to each side that a finer picture is searched, and the last one, of half its step
 
@@ -127,7 +126,7 @@ class PatchTile:
 
     def _batches(self) -> list[slice]:
         area = int((2 * (self.half + self.reach) + 1).prod())
-        batch = max(1, min(BATCH, _AREA // area))
+        batch = max(1, min(BATCH, PIECE // area))
         return [slice(i, i + batch) for i in range(0, len(self.at), batch)]
 
     def offsets(self) -> Array:

@@ -34,15 +34,15 @@ _SMALLER = 0.7  # side of the patch of the second try and of the check
 _TORN = 0.5  # px that the smaller patch may lie apart
 _FINE = 4  # samples a pixel and axis
 _GRID = 1.0 / (32 * _FINE)  # px; positions that the sampler tells apart
-_LEAST_SIGMA = 1e-3  # px, of a registration
 REACH = 1.5  # px; a patch that moves farther has left its point
 _WEIGHT = 0.7  # standard deviation of the patch's Gaussian weight, in half sides
 _TAPS = 6  # samples on either side in the interpolation
-_RIDGE = 1e-6  # of what a normal matrix holds; relative deviation below which a patch is flat
-_FLOOR = 0.1  # px across the epipolar line that are always tolerated, and in a place only compared
+_FLOOR = 0.1  # px across the epipolar line that are always tolerated
 _DISTORTED = 2.0  # times the median sigma about it: the patch lies across a step of the ground
-_FEW = 20  # observations of a pair of views below which their sigmas are not scaled by their errors
 _LEAST_END_SIGMA = 0.02  # px, of an observation
+
+
+_EPS = float(np.finfo(np.float32).eps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +205,7 @@ def register_patches(
             found = template.find(fine, reference[rows].astype(np.int64), start[rows], linear[rows])
             best.put(rows, replace(found, ok=found.ok & _at(usable[1], found.xy)))
     for rows in _chunks(np.flatnonzero(best.ok)):  # on a step of the ground the inner part goes elsewhere
-        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], _FLOOR)
+        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], 10 * SETTLED)
         apart = np.hypot(*(inner.xy - best.xy[rows]).T)
         best.ok[rows] = apart <= np.maximum(_TORN, 5.0 * inner.sigma)
     return best
@@ -277,7 +277,7 @@ class _Template:
         mean = (patches @ self._weight)[:, None]
         centred = patches - mean
         deviation = np.sqrt((centred * centred) @ self._weight)[:, None]
-        flat = deviation**2 <= _RIDGE**2 * (1.0 + mean * mean)
+        flat = deviation**2 <= _EPS**2 * (1.0 + mean * mean)
         deviation = np.where(flat, np.float32(np.inf), deviation)
         return centred / deviation, deviation
 
@@ -301,11 +301,11 @@ class _Template:
             np.multiply(jacobian[:, by], lever, out=jacobian[:, row])
         jacobian[:, 6], jacobian[:, 7] = values * self._root, self._root
         normal = (jacobian @ jacobian.transpose(0, 2, 1)).astype(np.float64)
-        normal += _RIDGE * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)
+        normal += _EPS * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)
         inverse = np.asarray(np.linalg.inv(normal), np.float64)
         xy, step, correlation = self._iterate(fine, (jacobian, inverse), start.copy(), linear.copy(), settled)
         noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - 8.0)
-        sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_LEAST_SIGMA)
+        sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_EPS)
         moved = np.hypot(*(xy - start).T)
         ok = (step <= 10 * settled) & (moved <= REACH) & np.isfinite(sigma)
         return PatchRegistration(xy, correlation, sigma, ok)
@@ -478,7 +478,7 @@ class _Links:
         sigma = found.sigma.copy()
         for group in self.groups():
             group = group[good[group]]
-            if len(group) >= _FEW:
+            if len(group) >= FEW:
                 across = self.errors(found, group)[0][:, 1]
                 residual = affine_inliers(self.origin[group], across, _FLOOR)[1]
                 sigma[group] *= max(1.0, robust_spread(residual / sigma[group]))
