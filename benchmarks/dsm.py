@@ -30,7 +30,7 @@ from rasterio.warp import Resampling, reproject
 from rasterio.windows import Window
 
 from barpc.dsm import NoSurfaceError, make_dsm
-from barpc.dsm.cells import Tile, _gathered
+from barpc.dsm.cells import Tile, gathered
 from barpc.export.shots import read_scene
 from barpc.options import DsmOptions
 from tests.scenes import ImageOptions, Scene
@@ -115,7 +115,7 @@ class Ground:
             place = np.column_stack([col, row]) + low.astype(np.float64)
             ground.append(shot.exact.localize(place, part[row, col].astype(np.float64)))
         every = np.concatenate(ground)
-        return _gathered(tile, every, np.ones(len(every)))[0]
+        return gathered(tile, every, np.ones(len(every)))[0]
 
 
 def rendered(side: int, kind: str = "usual") -> dict[str, object]:

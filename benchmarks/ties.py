@@ -39,6 +39,7 @@ from barpc.scene import View  # noqa: E402
 from barpc.sensor.rpc import RPC  # noqa: E402
 from barpc.tie import (  # noqa: E402
     Area,
+    Scope,
     TieOptions,
     common_tracks,
     detect,
@@ -253,7 +254,7 @@ def size(side: int, share: float | None, layout: str) -> None:
         fresh = resident()
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             with CachingExecutor(workspace, {}, pool) as caching:
-                result = find_tracks(views, area=area, executor=caching)
+                result = find_tracks(views, scope=Scope(area=area), executor=caching)
             worker = peak(next(iter(pool._processes)))
         seconds = [u.ru_utime + u.ru_stime for u in (resource.getrusage(kind) for kind in kinds)]
         seconds = [now - was.ru_utime - was.ru_stime for now, was in zip(seconds, start, strict=True)]

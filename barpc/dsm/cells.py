@@ -7,21 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from numpy.polynomial.polynomial import polyval2d, polyvander2d
 from rasterio.crs import CRS
 from rasterio.warp import transform
 
 from barpc.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.scene import View
 from barpc.sensor.geometry import triangulate
-from barpc.tie.patches.dense import (
-    ACROSS,
-    FINER,
-    WINDOW,
-    DenseMatches,
-    EpipolarFrame,
-    dense_matches,
-    epipolar_frame,
-)
+from barpc.tie.patches.dense import ACROSS, FINER, WINDOW, DenseMatches, EpipolarFrame, dense_matches, epipolar_frame
 
 SIDE = 512
 """Cells a side of a tile: the blocks of the file."""
@@ -30,18 +23,18 @@ MATCHED = 0.2
 
 Of pictures of different ground 2 to 11 % are (22 trials, rendered, and real ones turned over), of pairs 92 to 97 %.
 """
-_NODES = 5  # a side of a tile, at which cameras and maps are asked
+NODES = 5
+"""Places a side of a tile, at which cameras and maps are asked."""
 _LEVELS = 3  # altitudes
 _SPAN = 128.0  # px of disparity that are searched at once, else a coarser picture says where
 _COARSE = 8  # times a pixel at most of the coarser picture
 _ROOM = 4.0  # px of the coarser picture that heights may lie beyond what it shows
-_ENDS = 1.0  # per cent of its heights at either end that do not count
 _AT_ONCE = 1 << 17  # matches intersected at a time
-_BITS, _EXACT = 32, 1e-4  # heights are ranked within cells as whole numbers of so many metres
-_QUARTERS = (0, 0), (0, 1), (1, 0), (1, 1)
 _SPLIT = 3  # times that a part is halved at most
 
 F32 = npt.NDArray[np.float32]
+Found = tuple[Array, Array, float]
+"""Ground points (n, 3), their standard deviations in height (n,) [m], and the share of the pixels matched."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +51,20 @@ class Tile:
     size: tuple[int, int]
     alts: tuple[float, float]
 
-    def nodes(self, cols: int = _NODES, rows: int | None = None) -> Array:
+    def part(self, col: int, row: int, size: tuple[int, int]) -> Tile:
+        """Return the cells from a col, row on, so many each way or as many as there are."""
+        size = min(size[0], self.size[0] - col), min(size[1], self.size[1] - row)
+        return replace(self, west=self.west + self.step * col, north=self.north - self.step * row, size=size)
+
+    def quarters(self) -> list[Tile]:
+        """Return the tile's quarters, of as many cells of half the side."""
+        fine = replace(self, step=self.step / 2, size=(2 * self.size[0], 2 * self.size[1]))
+        return [fine.part(col, row, self.size) for row in (0, self.size[1]) for col in (0, self.size[0])]
+
+    def nodes(self, cols: int = NODES, rows: int = NODES) -> Array:
         """Return the longitude, latitude (rows cols, 2) [deg] on a grid from corner to corner, the north first."""
         x = self.west + self.step * np.linspace(0, self.size[0], cols)
-        y = self.north - self.step * np.linspace(0, self.size[1], rows or cols)
+        y = self.north - self.step * np.linspace(0, self.size[1], rows)
         east, north = (part.ravel() for part in np.meshgrid(x, y))
         return np.column_stack(transform(CRS.from_wkt(self.crs), CRS.from_epsg(4326), east, north))
 
@@ -71,34 +74,18 @@ class Tile:
         inner = replace(self, west=self.west + half, north=self.north - half, size=(cols - 1, rows - 1))
         return inner.nodes(cols, rows)
 
-    def parts(self) -> list[Tile]:
-        """Return the tile's quarters, of as many cells of half the side."""
-        half = replace(self, step=self.step / 2)
-        width, height = (half.step * side for side in self.size)
-        return [replace(half, west=self.west + c * width, north=self.north - r * height) for r, c in _QUARTERS]
-
     def places(self) -> Callable[[Array], Array]:
-        """Return a function from lon, lat (n, 2) [deg] to col, row (n, 2) of the tile's cells (cubics: 0.1 mm
-        over 10 km).
-        """
+        """Return a function from lon, lat (n, 2) [deg] to col, row (n, 2) of the cells (cubics: 0.1 mm over 10 km)."""
         nodes = self.nodes()
-        col, row = np.meshgrid(np.linspace(0, self.size[0], _NODES), np.linspace(0, self.size[1], _NODES))
-        middle = nodes.mean(axis=0) if np.ptp(nodes[:, 0]) < 180.0 else nodes[0]
-        spread = np.abs(self._near(nodes, middle)).max(axis=0)
-        rows = _cubic(self._near(nodes, middle) / spread)
-        coefficients = np.linalg.lstsq(rows, np.column_stack([col.ravel(), row.ravel()]), rcond=None)[0]
-        return lambda lonlat: np.asarray(_cubic(self._near(lonlat, middle) / spread) @ coefficients)
+        middle = nodes[len(nodes) // 2]
 
-    @staticmethod
-    def _near(lonlat: Array, middle: Array) -> Array:
-        return np.column_stack([wrap_longitude(lonlat[:, 0], middle[0]), lonlat[:, 1]]) - middle
+        def near(lonlat: Array) -> Array:
+            return np.stack([wrap_longitude(lonlat[:, 0], middle[0]), lonlat[:, 1]]) - middle[:, None]
 
-
-def _cubic(at: Array) -> Array:
-    """Return the monomials (n, 10) up to the third degree."""
-    x, y = at.T
-    xx, yy = x * x, y * y
-    return np.column_stack([np.ones(len(x)), x, y, xx, x * y, yy, xx * x, xx * y, x * yy, yy * y])
+        spread = np.abs(near(nodes)).max(axis=1, keepdims=True)
+        goal = np.stack(np.meshgrid(*(np.linspace(0, count, NODES) for count in self.size)), axis=-1).reshape(-1, 2)
+        cubics = np.linalg.lstsq(polyvander2d(*near(nodes) / spread, [3, 3]), goal, rcond=None)[0].reshape(4, 4, 2)
+        return lambda lonlat: np.asarray(polyval2d(*near(lonlat) / spread, cubics)).T
 
 
 def surface_tile(pairs: Sequence[tuple[View, View]], tile: Tile, band: int) -> tuple[F32, ...]:
@@ -111,29 +98,20 @@ def surface_tile(pairs: Sequence[tuple[View, View]], tile: Tile, band: int) -> t
     seen : (rows, cols), as float32: bit k is set where pair k has a height
     shares : (pairs,), of the pixels that both images show so many were matched; NaN: they show nothing of it
     """
-    shape = (len(pairs), tile.size[1], tile.size[0])
-    heights, sigmas = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
+    cells = np.full((2, len(pairs), tile.size[1], tile.size[0]), np.nan, np.float32)
     shares = np.full(len(pairs), np.nan, np.float32)
     for k, pair in enumerate(pairs):
-        found = _points(pair, tile, band)
-        if found is None:
-            continue
-        ground, sigma, shares[k] = found
-        if shares[k] >= MATCHED:
-            heights[k], sigmas[k] = _gathered(tile, ground, sigma)
-    return (*_merged(heights, sigmas), shares)
-
-
-def _merged(heights: F32, sigmas: F32) -> tuple[F32, ...]:
-    """Return the median height of the pairs, their NMAD (NaN of one pair), RMS sigma, and which pairs have one."""
-    known = np.isfinite(heights)
-    height = _median(heights)
-    nmad = 1.4826 * _median(np.abs(heights - height))
-    nmad[known.sum(axis=0) < 2] = np.nan
+        if (found := _points(pair, tile, band)) is not None:
+            shares[k] = found[2]
+            if found[2] >= MATCHED:
+                cells[:, k] = gathered(tile, *found[:2])
+    known = np.isfinite(cells[0])
+    height = _median(cells[0])
+    nmad = np.where(known.sum(axis=0) < 2, np.float32(np.nan), 1.4826 * _median(np.abs(cells[0] - height)))
     with np.errstate(invalid="ignore"):
-        sigma = np.sqrt(np.where(known, sigmas**2, 0.0).sum(axis=0) / known.sum(axis=0))
-    bits = (known * (1 << np.arange(len(known)))[:, None, None]).sum(axis=0)
-    return height, nmad, sigma.astype(np.float32), bits.astype(np.float32)
+        sigma = np.sqrt(np.where(known, cells[1] ** 2, 0.0).sum(axis=0) / known.sum(axis=0))
+    seen = np.tensordot(1 << np.arange(len(pairs)), known, axes=1)
+    return (height, *(np.asarray(one, np.float32) for one in (nmad, sigma, seen)), shares)
 
 
 def _median(values: F32) -> F32:
@@ -143,33 +121,30 @@ def _median(values: F32) -> F32:
     return np.asarray(np.take_along_axis(ordered, at, axis=0).mean(axis=0), np.float32)
 
 
-def _points(pair: tuple[View, View], tile: Tile, band: int, halved: int = 0) -> tuple[Array, Array, float] | None:
-    """Return the ground points (n, 3), their standard deviation in height (n,) [m] and the share matched;
-    None where unseen.
-    """
-    frame = _frame(pair, tile)
-    zoom = 1 if frame is None else _zoom(frame)
-    while zoom > 1 and frame is not None:
+def _points(pair: tuple[View, View], tile: Tile, band: int, halved: int = 0) -> Found | None:
+    """Return what is found of a tile; None where it is unseen. Coarser pictures narrow the altitudes first."""
+    zoom = _COARSE
+    while (frame := _frame(pair, tile)) is not None:
+        zoom = min(zoom, 1 << max(0, int(np.ceil(np.log2(frame.num / (FINER * _SPAN))))))
+        if zoom == 1 and frame.across > ACROSS and halved < _SPLIT:
+            every = (_points(pair, part, band, halved + 1) for part in tile.quarters())
+            parts = [part for part in every if part is not None]
+            return _joined(parts) if parts else None
         found = _matched(pair, tile, band, zoom)
-        if found is None or found[2] < MATCHED or not len(found[0]):
+        if zoom == 1 or found is None or found[2] < MATCHED or not len(found[0]):
             return found
-        low, high = np.percentile(found[0][:, 2], [_ENDS, 100.0 - _ENDS])
-        room = _ROOM * zoom * frame.metres
-        tile = replace(tile, alts=(max(tile.alts[0], float(low) - room), min(tile.alts[1], float(high) + room)))
-        frame = _frame(pair, tile)
-        zoom = 1 if frame is None else min(zoom // 2, _zoom(frame))
-    if frame is not None and frame.across > ACROSS and halved < _SPLIT:
-        parts = [_points(pair, part, band, halved + 1) for part in tile.parts()]
-        return _joined([part for part in parts if part is not None])
-    return _matched(pair, tile, band)
+        low, high = np.percentile(found[0][:, 2], [1.0, 99.0]) + np.array([-1.0, 1.0]) * _ROOM * zoom * frame.metres
+        tile = replace(tile, alts=(max(tile.alts[0], float(low)), min(tile.alts[1], float(high))))
+        zoom //= 2
+    return None
 
 
-def _zoom(frame: EpipolarFrame) -> int:
-    """Return the pixels a side that are one of a picture in which all disparities are searched at once."""
-    return min(_COARSE, 1 << max(0, int(np.ceil(np.log2(frame.num / (FINER * _SPAN))))))
+def _joined(parts: Sequence[Found]) -> Found:
+    ground, sigma, share = zip(*parts, strict=True)
+    return np.concatenate(ground), np.concatenate(sigma), float(np.mean(share))
 
 
-def _matched(pair: tuple[View, View], tile: Tile, band: int, zoom: int = 1) -> tuple[Array, Array, float] | None:
+def _matched(pair: tuple[View, View], tile: Tile, band: int, zoom: int) -> Found | None:
     """Match as `_points`, on pictures whose pixels are means of `zoom` px a side."""
     frame = _frame(pair, tile, zoom)
     sizes = [(view.size[0] // zoom, view.size[1] // zoom) for view in pair]
@@ -179,13 +154,6 @@ def _matched(pair: tuple[View, View], tile: Tile, band: int, zoom: int = 1) -> t
     ground = _intersected(pair, found, zoom)
     known = np.isfinite(ground[:, 2])
     return ground[known], found.sigma[known] * frame.metres, found.share
-
-
-def _joined(parts: Sequence[tuple[Array, Array, float]]) -> tuple[Array, Array, float] | None:
-    if not parts:
-        return None
-    ground, sigma = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
-    return ground, sigma, float(np.mean([part[2] for part in parts]))
 
 
 def _frame(pair: tuple[View, View], tile: Tile, zoom: int = 1) -> EpipolarFrame | None:
@@ -199,38 +167,31 @@ def _frame(pair: tuple[View, View], tile: Tile, zoom: int = 1) -> EpipolarFrame 
 
 def _intersected(pair: tuple[View, View], found: DenseMatches, zoom: int) -> Array:
     """Return the ground points (n, 3) of matches; NaN where the rays do not meet."""
-    ground = np.empty((len(found.a), 3))
-    places = (np.stack([found.a, found.b], axis=1) + 0.5) * zoom - 0.5
+    places, ground = (np.stack([found.a, found.b], axis=1) + 0.5) * zoom - 0.5, np.empty((len(found.a), 3))
     for start in range(0, len(ground), _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
-        num = len(places[part])
-        view, point = np.tile([0, 1], num), np.repeat(np.arange(num), 2)
-        sensors = [one.sensor for one in pair]
-        meeting = triangulate(sensors, view, point, places[part].reshape(-1, 2), alt=found.alt[part])
-        ground[part] = ground_from_ecef(meeting.points)
+        view, point = np.tile([0, 1], len(places[part])), np.repeat(np.arange(len(places[part])), 2)
+        sensors, xy = [one.sensor for one in pair], places[part].reshape(-1, 2)
+        ground[part] = ground_from_ecef(triangulate(sensors, view, point, xy, alt=found.alt[part]).points)
     return ground
 
 
-def _gathered(tile: Tile, ground: Array, sigma: Array) -> tuple[F32, F32]:
-    """Return the median height of the points in each cell (rows, cols) and its sigma; NaN where there is none."""
+def gathered(tile: Tile, ground: Array, sigma: Array) -> F32:
+    """Return the median height of the points in each cell and its sigma (2, rows, cols); NaN where there is none."""
     width, height = tile.size
     col, row = np.floor(tile.places()(ground[:, :2])).astype(np.int64).T
-    inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
-    cell = row[inside] * width + col[inside]
-    low = ground[inside, 2].min(initial=np.inf)
-    ranked = np.sort((cell << _BITS) + np.rint((ground[inside, 2] - low) / _EXACT).astype(np.int64))
-    of = ranked >> _BITS
-    start = np.flatnonzero(np.diff(of, prepend=-1))
-    count = np.diff(np.append(start, len(of)))
-    cells = np.full((2, width * height), np.nan, np.float32)
-    middle = ((ranked[start + (count - 1) // 2] + ranked[start + count // 2]) / 2) - (of[start] << _BITS)
-    cells[0, of[start]] = low + _EXACT * middle
-    total = np.bincount(cell, sigma[inside] ** 2, width * height)[of[start]]
-    cells[1, of[start]] = np.sqrt(total / count) * _averaged(np.sqrt(count))
-    return cells[0].reshape(height, width), cells[1].reshape(height, width)
+    inside = np.flatnonzero((col >= 0) & (col < width) & (row >= 0) & (row < height))
+    cell, alt = row[inside] * width + col[inside], ground[inside, 2]
+    order = np.lexsort((alt, cell))
+    of, start, count = np.unique(cell[order], return_index=True, return_counts=True)
+    cells = np.full((2, height * width), np.nan, np.float32)
+    cells[0, of] = (alt[order[start + (count - 1) // 2]] + alt[order[start + count // 2]]) / 2
+    total = np.bincount(cell, sigma[inside] ** 2, height * width)[of]
+    cells[1, of] = np.sqrt(total / count) * averaged(np.sqrt(count))
+    return cells.reshape(2, height, width)
 
 
-def _averaged(side: Array) -> Array:
+def averaged(side: Array) -> Array:
     """Return what is left of sigma in the mean of `side` x `side` matches, whose windows overlap.
 
     Of matches k px apart 1 - k / WINDOW of the grey values are the same: a sum over all pairs, an axis at a time.

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,12 @@ import shapely
 from rasterio import Affine
 from rasterio.crs import CRS
 from rasterio.errors import CRSError, NotGeoreferencedWarning
-from rasterio.warp import transform
+from rasterio.warp import transform as warped
 from rasterio.windows import Window
+from scipy.ndimage import map_coordinates
 
 from barpc import __version__
-from barpc.dsm.cells import F32, MATCHED, SIDE, Tile, surface_tile
+from barpc.dsm.cells import F32, MATCHED, NODES, SIDE, Tile, surface_tile
 from barpc.dsm.imagery import Block, NoSurfaceError, Pairs
 from barpc.errors import InputError
 from barpc.geodesy import Array, utm
@@ -28,8 +28,9 @@ from barpc.options import DsmOptions
 from barpc.pipeline.executor import CachingExecutor, worker_count
 from barpc.pipeline.inputs import hash_files
 from barpc.scene import View
-from barpc.sensor.geometry import footprint, ground_sample_distance
+from barpc.sensor.geometry import ground_sample_distance
 from barpc.tie.pairing.epipolar import common_range
+from barpc.tie.pairing.overlaps import Footprints
 from barpc.tie.tasks import Progress, one_by_one
 from barpc.workspace import Workspace
 
@@ -42,21 +43,8 @@ BANDS = (
 )
 CHANGE = "height minus that of the other images [m]"
 SHARED = "SIGMA_SHARED_BY_ALL_CELLS_M"
-_NODES = 3  # a side of a tile, at which the cameras' errors are asked
-_DATUM_NODES = 200  # tiles at which what all cells share is measured, at most
-_BITS = 16  # of a pattern of pairs
-_WIDER = 1.1  # times the pixels of a usual tile that one has at most: the rounding of a cell's side
-_SOME = 1 << 20  # cells, of all tiles, of which medians are told
-
-
-@dataclass
-class Counts:
-    """Statistics gathered over tiles: cells with a height, largest share matched, some cells' bands, the datum."""
-
-    known: int = 0
-    share: float = float("nan")
-    some: list[F32] = field(default_factory=list)
-    datum: float = float("nan")
+Groups = tuple[Pairs, ...]
+"""Pairs of a surface; of a difference those of the surface that is taken away, too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +53,7 @@ class Grid:
 
     block: Block
     options: DsmOptions
-    crs: CRS
-    west: float
-    north: float
-    step: float
-    size: tuple[int, int]
+    whole: Tile
     side: int  # cells a side of a tile
     outlines: tuple[tuple[Any, ...], ...]  # of what each pair of each group sees in common, on the map
 
@@ -83,140 +67,122 @@ class Grid:
         step = options.gsd or float(f"{2 * max(pixels):.2g}")
         _refuse_side(step, min(pixels), max(pixels))
         outlines = tuple(tuple(_common(views[i], views[j], crs) for i, j in group) for group in block.groups)
-        whole = shapely.intersection_all([shapely.union_all(group) for group in outlines])
-        if whole.is_empty:
+        seen = shapely.intersection_all([shapely.union_all(group) for group in outlines])
+        if seen.is_empty:
             raise NoSurfaceError("the images do not overlap at the altitudes that they are used for")
-        low, high = np.array(whole.bounds).reshape(2, 2)
-        west, north = float(np.floor(low[0] / step) * step), float(np.ceil(high[1] / step) * step)
-        size = int(np.ceil((high[0] - west) / step)), int(np.ceil((north - low[1]) / step))
-        side = SIDE
-        while side > 1 and side * step > _WIDER * SIDE * 2 * max(pixels):
-            side //= 2
-        return cls(block, options, crs, west, north, step, size, side, outlines)
+        west, south, east, north = np.array(seen.bounds) / step
+        west, north = np.floor(west), np.ceil(north)
+        size = int(np.ceil(east - west)), int(np.ceil(north - south))
+        whole = Tile(crs.to_wkt(), float(west * step), float(north * step), step, size, common_range(*views))
+        # a tile shows about as many pixels, however large its cells are
+        return cls(block, options, whole, SIDE >> max(0, round(np.log2(step / (2 * max(pixels))))), outlines)
 
-    def tiles(self) -> list[tuple[tuple[int, int], tuple[Pairs, ...]]]:
-        """Yield the first col, row of every tile that is seen, and the best pairs of each group that see it."""
+    def tiles(self) -> list[tuple[tuple[int, int], Tile, Groups]]:
+        """Return the first col, row of every tile that is seen, the tile, and the best pairs of each group there."""
         found = []
-        for row in range(0, self.size[1], self.side):
-            for col in range(0, self.size[0], self.side):
-                box = self.box(col, row)
+        for row in range(0, self.whole.size[1], self.side):
+            for col in range(0, self.whole.size[0], self.side):
+                tile = self.whole.part(col, row, (self.side, self.side))
+                width, height = (tile.step * count for count in tile.size)
+                box = shapely.box(tile.west, tile.north - height, tile.west + width, tile.north)
                 groups = tuple(
                     tuple(pair for pair, outline in zip(*one, strict=True) if outline.intersects(box))
                     for one in zip(self.block.groups, self.outlines, strict=True)
                 )
                 if all(groups):
-                    found.append(((col, row), tuple(group[: self.options.pairs] for group in groups)))
+                    found.append(((col, row), tile, tuple(group[: self.options.pairs] for group in groups)))
         return found
 
-    def box(self, col: int, row: int) -> Any:
-        """Return the outline of a tile on the map."""
-        at = self.tile(col, row)
-        return shapely.box(at.west, at.north - at.step * at.size[1], at.west + at.step * at.size[0], at.north)
+    def fill(
+        self, path: Path, run: Workspace, executor: Executor | None, progress: Progress | None
+    ) -> tuple[int, float]:
+        """Write all tiles into a plain GeoTIFF, each made by a worker and forgotten once it is written.
 
-    def tile(self, col: int, row: int) -> Tile:
-        """Return the tile that begins at a cell."""
-        size = min(self.side, self.size[0] - col), min(self.side, self.size[1] - row)
-        corner = self.west + self.step * col, self.north - self.step * row
-        return Tile(self.crs.to_wkt(), *corner, self.step, size, common_range(*self.block.views))
-
-    def fill(self, path: Path, run: Workspace, executor: Executor | None, progress: Progress | None) -> Counts:
-        """Write all tiles into a plain GeoTIFF; each is made by a worker and forgotten once it is written."""
-        views, seen = self.block.views, self.tiles()
+        Returns
+        -------
+        known, share : cells with a height, and the largest share matched of the pixels that both images of a pair show
+        """
+        views, seen, known, best = self.block.views, self.tiles(), 0, -1.0
         tasks = [
-            (tuple((views[i], views[j]) for i, j in group), self.tile(*at), self.options.band)
-            for at, groups in seen
+            (tuple((views[i], views[j]) for i, j in group), tile, self.options.band)
+            for _, tile, groups in seen
             for group in groups
         ]
-        paths = [view.path for view in views]
+        paths, shared = [view.path for view in views], self.shared(seen)
         inputs = dict(zip(paths, hash_files(paths), strict=True))
-        shared, counts = self._shared(seen), Counts()
-        if self.block.errors is not None:
-            counts.datum = float(self.block.errors.sigma(shared[None])[0])
-        with self._opened(path, counts.datum) as file, CachingExecutor(run, inputs, executor) as caching:
+        with self._opened(path, shared) as file, CachingExecutor(run, inputs, executor) as caching:
             ahead = 4 * worker_count(executor)
             results = one_by_one(caching, surface_tile, tasks, "surface", progress, ahead)
-            for at, groups in seen:
-                tile, found = self.tile(*at), [next(results) for _ in groups]
+            for at, tile, groups in seen:
+                found = [next(results) for _ in groups]
                 bands = self._bands(tile, groups, found, shared)
                 file.write(bands, window=Window(*at, *tile.size))
-                known = np.isfinite(bands[0])
-                counts.known += int(known.sum())
-                shares = [share for one in found for share in one[4]]
-                counts.share = float(np.nanmax([counts.share, *shares, -1.0]))
-                counts.some.append(bands[2:, known][:, :: 1 + int(known.sum()) * len(seen) // _SOME])
-        return counts
+                known += int(np.isfinite(bands[0]).sum())
+                best = float(np.nanmax([best, *(share for one in found for share in one[4])]))
+        return known, best
 
-    def _shared(self, seen: Sequence[tuple[tuple[int, int], tuple[Pairs, ...]]]) -> Array:
-        """Return the derivative (V q,) of the mean height of all cells, or difference of it, by the cameras'
-        unknowns.
+    def shared(self, seen: Sequence[tuple[tuple[int, int], Tile, Groups]]) -> Array:
+        """Return the derivative (V q,) of the mean height of all tiles, or difference of it, by the cameras' unknowns;
+        of images without a run none.
         """
-        errors, rows = self.block.errors, []
-        if errors is None:
-            return np.zeros(0)
-        for at, groups in seen[:: 1 + len(seen) // _DATUM_NODES]:
-            nodes = _nodes(self.tile(*at))
-            means = [np.mean([errors.rows(pair, nodes).mean(axis=0) for pair in one], axis=0) for one in groups]
-            rows.append(means[0] - sum(means[1:]))
-        return np.asarray(np.mean(rows, axis=0))
+        rows = [_difference(self._rows(tile, groups), groups).mean(axis=0) for _, tile, groups in seen]
+        return np.zeros(0) if self.block.errors is None else np.asarray(np.mean(rows, axis=0))
 
-    def _bands(self, tile: Tile, groups: Sequence[Pairs], results: Sequence[Sequence[F32]], shared: Array) -> F32:
+    def _rows(self, tile: Tile, groups: Groups) -> dict[tuple[int, int], Array]:
+        """Return the derivative (nodes, V q) of the heights of a tile's pairs by the cameras' unknowns."""
+        nodes, errors = tile.nodes(), self.block.errors
+        ground = np.column_stack([nodes, np.full(len(nodes), sum(tile.alts) / 2)])
+        pairs = {pair for group in groups for pair in group}
+        return {pair: np.zeros((len(nodes), 0)) if errors is None else errors.rows(pair, ground) for pair in pairs}
+
+    def _bands(self, tile: Tile, groups: Groups, results: Sequence[Sequence[F32]], shared: Array) -> F32:
         """Return the bands (5, rows, cols) of a tile: of one group of pairs, or of the first minus the second."""
-        errors, shape = self.block.errors, results[0][0].shape
-        height = results[0][0] - sum(one[0] for one in results[1:])
-        parts = [np.nan_to_num(one[3]).astype(np.int64) << _BITS * g for g, one in enumerate(results)]
-        bits = np.sum(parts, axis=0)
-        nmad = np.sqrt(sum(one[1] ** 2 for one in results))
-        count, noise, cameras = np.zeros(shape), np.full(shape, np.nan), np.full(shape, np.nan)
-        nodes = _nodes(tile)
-        by_pair = {} if errors is None else {p: errors.rows(p, nodes) for group in groups for p in group}
-        known = np.isfinite(height)
+        height, *minus = (one[0] for one in results)
+        bands = np.full((len(BANDS), *height.shape), np.nan, np.float32)
+        bands[0], bands[1], bands[2] = height - sum(minus), 0.0, np.sqrt(sum(one[1] ** 2 for one in results))
+        firsts = np.cumsum([0, *map(len, groups)])  # bit of a group's first pair
+        bits = sum(np.nan_to_num(one[3]).astype(np.int64) << first for one, first in zip(results, firsts, strict=False))
+        rows, known = self._rows(tile, groups), np.isfinite(bands[0])
         for pattern in np.unique(bits[known]):
             cells = known & (bits == pattern)
             chosen = [
-                [pair for k, pair in enumerate(group) if pattern >> _BITS * g + k & 1] for g, group in enumerate(groups)
+                [pair for k, pair in enumerate(group, start=first) if pattern >> k & 1]
+                for group, first in zip(groups, firsts, strict=False)
             ]
-            count[cells] = min(map(len, chosen))
+            bands[1, cells] = min(map(len, chosen))
             # pairs of n images have n - 1 independent parallaxes
             free = [min(len(one), len({view for pair in one for view in pair}) - 1) for one in chosen]
-            square = [found[2] ** 2 / n for found, n in zip(results, free, strict=True)]
-            noise[cells] = np.sqrt(np.sum(square, axis=0))[cells]
-            if errors is not None:
-                means = [np.mean([by_pair[pair] for pair in one], axis=0) for one in chosen]
-                rows = means[0] - sum(means[1:]) - shared
-                cameras[cells] = _spread(errors.sigma(rows), tile.size)[cells]
-        return np.stack([height, count, nmad, noise, cameras]).astype(np.float32)
+            bands[3, cells] = np.sqrt(sum(one[2][cells] ** 2 / n for one, n in zip(results, free, strict=True)))
+            if self.block.errors is not None:
+                sigma = self.block.errors.sigma(_difference(rows, chosen) - shared).reshape(NODES, NODES)
+                at = [(np.arange(count) + 0.5) / count * (NODES - 1) for count in height.shape]
+                every = map_coordinates(sigma, np.meshgrid(*at, indexing="ij"), order=1)
+                bands[4, cells] = every[cells]
+        return bands
 
-    @contextmanager
-    def _opened(self, path: Path, datum: float) -> Iterator[Any]:
-        profile = {"width": self.size[0], "height": self.size[1], "count": len(BANDS), "crs": self.crs}
-        profile |= {"dtype": "float32", "nodata": float("nan"), "compress": "deflate", "BIGTIFF": "IF_SAFER"}
-        profile |= {"tiled": True, "blockxsize": SIDE, "blockysize": SIDE, "SPARSE_OK": True}
-        profile["transform"] = Affine(self.step, 0.0, self.west, 0.0, -self.step, self.north)
-        tags = {"BARPC": __version__, "VERTICAL_REFERENCE": "WGS84 ellipsoid", "IMAGES": self.block.source}
-        if np.isfinite(datum):
-            tags[SHARED] = f"{datum:.4f}"
-        first = BANDS[0] if len(self.block.groups) == 1 else CHANGE
+    def _opened(self, path: Path, shared: Array) -> Any:
+        """Open the file to be written, with the words and tags that it is to have."""
+        cells = self.whole
+        layout = {"tiled": True, "blockxsize": SIDE, "blockysize": SIDE, "SPARSE_OK": True, "BIGTIFF": "IF_SAFER"}
+        place = {
+            "crs": CRS.from_wkt(cells.crs),
+            "transform": Affine(cells.step, 0, cells.west, 0, -cells.step, cells.north),
+        }
+        kind = {"dtype": "float32", "nodata": float("nan"), "compress": "deflate"}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path, "w", driver="GTiff", **profile) as file:
-                file.update_tags(**tags)
-                for number, words in enumerate((first, *BANDS[1:]), start=1):
-                    file.set_band_description(number, words)
-                yield file
+            file = rasterio.open(path, "w", "GTiff", *cells.size, len(BANDS), **place, **kind, **layout)
+        file.update_tags(BARPC=__version__, VERTICAL_REFERENCE="WGS84 ellipsoid", IMAGES=self.block.source)
+        if self.block.errors is not None:
+            file.update_tags(**{SHARED: f"{self.block.errors.sigma(shared[None])[0]:.4f}"})
+        file.descriptions = (BANDS[0] if len(self.block.groups) == 1 else CHANGE, *BANDS[1:])
+        return file
 
 
-def _nodes(tile: Tile) -> Array:
-    """Return the ground points of a tile at its middle altitude."""
-    nodes = tile.nodes(_NODES)
-    return np.column_stack([nodes, np.full(len(nodes), sum(tile.alts) / 2)])
-
-
-def _spread(values: Array, size: tuple[int, int]) -> Array:
-    """Interpolate values at a tile's nodes over its cells (rows, cols), linearly."""
-    at = [(np.arange(side) + 0.5) / side * (_NODES - 1) for side in size]
-    grid, nodes = values.reshape(_NODES, _NODES), np.arange(_NODES)
-    along = np.stack([np.interp(at[0], nodes, row) for row in grid])
-    return np.stack([np.interp(at[1], nodes, col) for col in along.T], axis=1)
+def _difference(rows: dict[tuple[int, int], Array], groups: Sequence[Sequence[tuple[int, int]]]) -> Array:
+    """Return the mean of the rows of the first group's pairs, minus those of the others."""
+    first, *others = (np.mean([rows[pair] for pair in group], axis=0) for group in groups)
+    return np.asarray(first - sum(others))
 
 
 def _refuse_side(step: float, smallest: float, largest: float) -> None:
@@ -249,11 +215,9 @@ def _common(first: View, second: View, crs: CRS) -> Any:
     """Return the ground that two views see at their lowest or highest altitude, on the map."""
     parts = []
     for alt in common_range(first, second):
-        rings = []
-        for view in (first, second):
-            ring = footprint(view.sensor, view.size, alt)
-            ring = ring[np.isfinite(ring).all(axis=1)]
-            x, y = transform(CRS.from_epsg(4326), crs, ring[:, 0], ring[:, 1])
-            rings.append(shapely.make_valid(shapely.Polygon(np.column_stack([x, y]))))
-        parts.append(shapely.intersection(rings[0], rings[1]))
+        prints = Footprints((first, second), alt)
+        common = shapely.intersection(*prints.outlines)
+        ground = prints.ground(shapely.get_coordinates(common))
+        x, y = warped(CRS.from_epsg(4326), crs, *ground[:, :2].T)
+        parts.append(shapely.set_coordinates(common, np.column_stack([x, y])))
     return shapely.union_all(parts)

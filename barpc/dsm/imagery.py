@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from barpc.ba import BlockPrior
 from barpc.cameras import open_camera
 from barpc.dsm.sigma import CameraErrors
 from barpc.errors import BarpcError, InputError
-from barpc.export.shots import Shot, read_scene
+from barpc.export.shots import read_scene
 from barpc.options import TieOptions
 from barpc.pipeline import load_views
 from barpc.pipeline.inputs import PRIOR
@@ -22,7 +23,6 @@ from barpc.report.summary import Summary
 from barpc.report.tables import read_summary
 from barpc.rpcio.grids import CORRECTION
 from barpc.scene import View
-from barpc.sensor import SensorModel
 from barpc.sensor.geometry import base_to_height, is_radar
 from barpc.tie.pairing.overlaps import overlapping_pairs
 from barpc.workspace import table_path
@@ -58,8 +58,7 @@ class Block:
 
 
 def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: Path | None = None) -> Block:
-    """Return the images of a finished run behind its corrected cameras; altitudes by its tie points unless
-    given.
+    """Return the images of a finished run behind its corrected cameras; altitudes by its tie points unless given.
 
     `minus`: a run of some of these images (an earlier one, that this one went on from); they are another group then.
 
@@ -80,12 +79,13 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: P
             raise InputError(f"{shot.file}: is on another host; a surface is made of images on this one")
         if not shot.file:
             raise InputError(f"{folder}: {shot.name} has no pixels")
-        date = (shot.light.time or "")[:10]
-        views.append(View(shot.name, shot.file, shot.size, _camera(folder, shot), scene.alt_range, date))
+        grid, date = shot.name + CORRECTION, (shot.light.time or "")[:10]
+        camera = open_camera(folder / grid).model if grid in shot.entry.outputs else shot.rpc
+        views.append(View(shot.name, shot.file, shot.size, camera, scene.alt_range, date))
     ties = {frozenset((pair.a, pair.b)): float(pair.num_matches) for pair in scene.summary.pairs}
     names = [view.name for view in views]
     errors = CameraErrors.of(BlockPrior.load(table_path(folder, PRIOR)), views)
-    worth = {(i, j): ties.get(frozenset((names[i], names[j])), 0.0) for i, j in _numbered(len(views))}
+    worth = {(i, j): ties.get(frozenset((names[i], names[j])), 0.0) for i, j in combinations(range(len(views)), 2)}
     parts = [range(len(views))] if minus is None else _split(folder, names, minus)
     flagged = frozenset(i for i, shot in enumerate(scene.shots) if shot.entry.advice)
     groups = tuple(_best(views, worth, part, flagged) for part in parts)
@@ -114,18 +114,8 @@ def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = No
     return Block(tuple(views), (_best(views),), None, ", ".join(view.name for view in views))
 
 
-def _camera(folder: Path, shot: Shot) -> SensorModel:
-    """Read a camera from a run: its RPC with the correction grid, where it wrote one."""
-    grid = shot.name + CORRECTION
-    return open_camera(folder / grid).model if grid in shot.entry.outputs else shot.rpc
-
-
 def _radar(name: str) -> str:
     return f"{name}: a radar image: its speckle and layover are nothing that SGBM matches"
-
-
-def _numbered(count: int) -> list[tuple[int, int]]:
-    return [(i, j) for i in range(count) for j in range(i + 1, count)]
 
 
 def _best(
@@ -142,27 +132,25 @@ def _best(
     """
     found = overlapping_pairs(views, TieOptions(angles=(0.0, 180.0)))
     found = [pair for pair in found if among is None or set(pair.views) <= set(among)]
-    usable = [pair for pair in found if ANGLES[0] <= pair.angle <= ANGLES[1]]
-    if not usable:
+    rows = []
+    for pair in found:
+        if not ANGLES[0] <= pair.angle <= ANGLES[1]:
+            continue
+        first, second = (views[i] for i in pair.views)
+        middle = first.sensor.localize((np.array(first.size) - 1.0) / 2.0, np.array(first.altitude))
+        worth = pair.score if ties is None else ties[pair.views]
+        worth *= float(base_to_height(first.sensor, second.sensor, middle)) ** 2
+        rows.append((first.date != second.date, not flagged.isdisjoint(pair.views), -worth, pair.views))
+    if not found:
+        raise NoSurfaceError("no two images overlap at the altitudes that they are used for")
+    if not rows:
         said = [f"{views[p.views[0]].name} and {views[p.views[1]].name} {p.angle:.1f} deg" for p in found[:3]]
-        if not said:
-            raise NoSurfaceError("no two images overlap at the altitudes that they are used for")
         raise NoSurfaceError(
             f"no pair meets under {ANGLES[0]:g} to {ANGLES[1]:g} degrees, where SGBM can match ({'; '.join(said)})"
         )
-    rows = []
-    for pair in usable:
-        first, second = (views[i] for i in pair.views)
-        middle = first.sensor.localize((np.array(first.size) - 1.0) / 2.0, np.array(first.altitude))
-        base = float(base_to_height(first.sensor, second.sensor, middle))
-        worth = pair.score if ties is None else ties[pair.views]
-        doubted = not flagged.isdisjoint(pair.views)
-        rows.append((first.date != second.date, doubted, -worth * base**2, pair.views))
     rows = sorted([row for row in rows if not row[0]] or rows)
     late = sorted({views[i].name for row in rows if row[1] for i in flagged.intersection(row[3])})
     if late and not rows[0][1]:
-        logger.warning(
-            "%s: the verdict of the run has a reservation, so pairs with it come after the others",
-            ", ".join(late),
-        )
+        words = "%s: the verdict of the run has a reservation, so pairs with it come after the others"
+        logger.warning(words, ", ".join(late))
     return tuple(row[3] for row in rows)

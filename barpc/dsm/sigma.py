@@ -26,33 +26,27 @@ class CameraErrors:
 
     @classmethod
     def of(cls, prior: BlockPrior, views: Sequence[View]) -> CameraErrors:
-        """Return the errors that an adjustment left in the cameras of these views; those that it held fixed
-        have none.
+        """Return the errors that an adjustment left in the cameras of these views; those that it held fixed have none.
 
         The derivatives are those at the corrected cameras: corrections are so small that they change none of them.
         """
         names, q = tuple(view.name for view in views), prior.params.shape[1]
-        centers = np.zeros((len(views), 3))
         place = {name: n for n, name in enumerate(prior.names)}
-        free = [i for i, name in enumerate(names) if name in place]
-        if not free:
+        free = np.array([i for i, name in enumerate(names) if name in place], dtype=np.int64)
+        if not len(free):
             raise InputError("the block's covariance names none of the run's images: run the adjustment again")
-        at = np.array([place[names[i]] for i in free])
+        at, centers = np.array([place[names[i]] for i in free]), np.zeros((len(views), 3))
         centers[free] = prior.center[at]
-        fixed = [i for i in range(len(views)) if i not in free]
-        waves = prior.waves(names)
-        unknowns = make_unknowns(views, prior.model, prior.drift, None if fixed else centers, waves)
+        all_free = len(free) == len(views)
+        unknowns = make_unknowns(views, prior.model, prior.drift, centers if all_free else None, prior.waves(names))
         if unknowns.size != q:
             raise InputError(f"the block's covariance is of {q} unknowns an image, its cameras have {unknowns.size}")
-        columns = (at[:, None] * q + np.arange(q)).ravel()
-        unit = np.zeros((prior.params.size, len(columns)))
-        unit[columns, np.arange(len(columns))] = 1.0
-        covariance = np.zeros((len(views) * q, len(views) * q))
-        own = (np.array(free)[:, None] * q + np.arange(q)).ravel()
+        theirs, own = ((index[:, None] * q + np.arange(q)).ravel() for index in (at, free))
         try:
-            found = la.cho_solve(la.cho_factor(prior.dense()), unit)[columns]
+            found = la.cho_solve(la.cho_factor(prior.dense()), np.eye(prior.params.size)[:, theirs])[theirs]
         except la.LinAlgError as error:
             raise InputError(f"the block's information is damaged ({error})") from error
+        covariance = np.zeros((len(views) * q, len(views) * q))
         covariance[np.ix_(own, own)] = 0.5 * (found + found.T)
         return cls(Cameras(views, unknowns), covariance)
 
@@ -67,8 +61,6 @@ class CameraErrors:
         return out
 
     def sigma(self, rows: Array) -> Array:
-        """Return the standard deviation (n,) [m] of heights, or differences of them, with these derivatives
-        (n, V q).
-        """
+        """Return the standard deviation (n,) [m] of heights, or differences of them, of these derivatives (n, V q)."""
         square: Array = np.einsum("ni,ij,nj->n", rows, self.covariance, rows)
         return np.asarray(np.sqrt(np.maximum(square, 0.0)))

@@ -14,12 +14,13 @@ import rasterio
 import rasterio.shutil
 
 from barpc.dsm.cells import MATCHED, SIDE
-from barpc.dsm.grid import Counts, Grid
+from barpc.dsm.grid import SHARED, Grid
 from barpc.dsm.imagery import NoSurfaceError, block_of_images, block_of_run
 from barpc.dsm.relief import show_in_report
 from barpc.errors import InputError, OutputError
 from barpc.frozen import refuse_existing, replacing
 from barpc.options import DsmOptions
+from barpc.raster import open_raster
 from barpc.sidefile import plain_path
 from barpc.tie.tasks import Progress
 from barpc.workspace import Workspace
@@ -71,44 +72,47 @@ def make_dsm(
     """
     options, out = options or DsmOptions(), Path(out)
     plain_path(out.absolute())
-    if isinstance(source, str | Path):
-        block = block_of_run(Path(source), options.alt, None if options.minus is None else Path(options.minus))
+    folder = Path(source) if isinstance(source, str | Path) else None
+    if folder is not None:
+        block = block_of_run(folder, options.alt, None if options.minus is None else Path(options.minus))
     elif options.minus is not None:
         raise InputError("minus: what two dates share is known of a run alone, not of images")
     else:
         block = block_of_images(source, options.alt, options.band)
     if out.is_dir() or out.resolve() in {Path(view.path).resolve() for view in block.views}:
         raise OutputError(f"{out}: is a folder or one of the images; give -o the name of a new file")
-    grid, folder = Grid.of(block, options), Path(source) if isinstance(source, str | Path) else None
+    grid = Grid.of(block, options)
     _place(out, folder, options.overwrite)
     room = out.parent / f"{out.name}.unfinished"  # results of tiles, until the file is whole
     try:
         with Workspace(room) as run:
-            counts, made = _made(run, grid, executor, progress)
-            if folder is not None and options.minus is None:
-                show_in_report(folder, grid, made)
+            rough, made = run.partial / "tiles.tif", run.partial / "dsm.tif"
+            known, share = _made(run, grid, executor, progress)
+            if folder is not None and block.run is not None and options.minus is None:
+                show_in_report(folder, block.run, grid, made)
+            found = _told(out, grid, rough, known, share)
             _place(out, folder, options.overwrite, made)
     except NoSurfaceError:
         shutil.rmtree(room, ignore_errors=True)
         raise
     shutil.rmtree(room, ignore_errors=True)
-    return _told(out, grid, counts)
+    return found
 
 
-def _made(run: Workspace, grid: Grid, executor: Executor | None, progress: Progress | None) -> tuple[Counts, Path]:
-    """Return what was counted, and the path of the file in the room where it is made."""
+def _made(run: Workspace, grid: Grid, executor: Executor | None, progress: Progress | None) -> tuple[int, float]:
+    """Make the files `tiles.tif` and `dsm.tif` in a room; return the cells with a height and the share matched."""
     rough, made = run.partial / "tiles.tif", run.partial / "dsm.tif"
     with run.stage("surface"):
-        counts = grid.fill(rough, run, executor, progress)
-    if not counts.known:
+        known, share = grid.fill(rough, run, executor, progress)
+    if not known:
         raise NoSurfaceError(
-            f"of the pixels that both images show {100 * max(counts.share, 0):.0f} % are found back at most, "
+            f"of the pixels that both images show {100 * max(share, 0):.0f} % are found back at most, "
             f"fewer than {100 * MATCHED:.0f} %: other seasons, water, clouds or wrong cameras; nothing is written"
         )
-    how = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "BLOCKSIZE": str(SIDE), "BIGTIFF": "IF_SAFER"}
+    layout = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "BLOCKSIZE": str(SIDE), "BIGTIFF": "IF_SAFER"}
     with run.stage("write"), rasterio.Env(GDAL_NUM_THREADS="1"):
-        rasterio.shutil.copy(rough, made, driver="COG", **how)
-    return counts, made
+        rasterio.shutil.copy(rough, made, driver="COG", **layout)
+    return known, share
 
 
 def _place(out: Path, folder: Path | None, overwrite: bool, made: Path | None = None) -> None:
@@ -125,12 +129,14 @@ def _place(out: Path, folder: Path | None, overwrite: bool, made: Path | None = 
                 made.replace(partial)
 
 
-def _told(out: Path, grid: Grid, counts: Counts) -> Surface:
+def _told(out: Path, grid: Grid, cells: Path, known: int, share: float) -> Surface:
+    """Return what is said of a surface: its pairs, and medians over its cells or, of many, some of them."""
     names = [view.name for view in grid.block.views]
-    used = dict.fromkeys(pair for _, groups in grid.tiles() for group in groups for pair in group)
+    used = dict.fromkeys(pair for _, _, groups in grid.tiles() for group in groups for pair in group)
     pairs = tuple(f"{names[i]} - {names[j]}" for i, j in used)
-    with warnings.catch_warnings():
+    with open_raster(cells) as file, warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        nmad, sigma, cameras = (float(np.nanmedian(row)) for row in np.concatenate(counts.some, axis=1))
-    found = counts.known, counts.share, nmad, sigma, cameras, counts.datum
-    return Surface(str(out), pairs, grid.step, grid.size, *found)
+        some = file.read([3, 4, 5], out_shape=(3, *(min(side, 2 * SIDE) for side in file.shape)))
+        medians = [float(one) for one in np.nanmedian(some, axis=(1, 2))]
+        datum = float(file.tags().get(SHARED, "nan"))
+    return Surface(str(out), pairs, grid.whole.step, grid.whole.size, known, share, *medians, datum)

@@ -31,7 +31,7 @@ from barpc import __version__
 from barpc.errors import AdjustError, BarpcError, InputError
 from barpc.frozen import Arrays, from_arrays, to_arrays
 from barpc.identity import Input, guarded
-from barpc.tie.store import Store
+from barpc.tie.tasks import Store
 from barpc.workspace import Workspace, key_of
 
 logger = logging.getLogger(__name__)

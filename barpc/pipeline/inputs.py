@@ -29,10 +29,10 @@ from barpc.scene import Altimetry, BoolArray, GroundPoints, Tracks, View
 from barpc.sensor.geometry import footprint, ground_sample_distance
 from barpc.sidefile import IMAGE, read_names, versioned
 from barpc.tie import Matches
-from barpc.tie.matchers.hook import hook_files
+from barpc.tie.matchers.matcher import hook_files
 from barpc.tie.pairing.epipolar import grouped
 from barpc.tie.pairing.overlaps import reach_of
-from barpc.tie.patches.resampled import Sheet
+from barpc.tie.patches.channels import Sheet
 from barpc.tie.tasks import Progress, ordered
 from barpc.workspace import table_path
 

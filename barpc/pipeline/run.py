@@ -55,9 +55,9 @@ from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import plain_path
-from barpc.tie import find_tracks, read_area
-from barpc.tie.reference import ReferenceControl, register_views
-from barpc.tie.tasks import Progress, ordered
+from barpc.tie import Scope, find_tracks, read_area
+from barpc.tie.reference import Accuracy, ReferenceControl, register_views
+from barpc.tie.tasks import Progress, Work, ordered
 from barpc.workspace import TABLES, Workspace, timed
 
 logger = logging.getLogger(__name__)
@@ -303,10 +303,8 @@ def _registered(
         reference_names(options),
         dem,
         options.tie.band,
-        sigma=options.reference_sigma,
-        height_sigma=(options.adjust.dem_sigma, bias),
-        executor=executor,
-        progress=progress,
+        Accuracy(options.reference_sigma, options.adjust.dem_sigma, bias),
+        Work(executor, progress),
     )
 
 
@@ -350,15 +348,15 @@ def _with_ties(
         return replace(run, tracks=given_tracks(options.matches, views))
     if len(views) < 2:
         return run
-    given: dict[str, Any] = {"executor": executor, "progress": progress, "terrain": terrain}
+    scope = Scope(terrain=terrain)
     if options.overlap_list is not None:
-        given["only"] = read_pairs(options.overlap_list, views, [path for path, _ in run.left_out])
+        scope = replace(scope, only=read_pairs(options.overlap_list, views, [path for path, _ in run.left_out]))
     if options.aoi is not None:
-        given["area"] = read_area(options.aoi)
+        scope = replace(scope, area=read_area(options.aoi))
     if options.matches:
-        given["given"] = given_matches(options.matches, views, partly=bool(run.left_out))
+        scope = replace(scope, given=given_matches(options.matches, views, partly=bool(run.left_out)))
     try:
-        ties = find_tracks(views, options.tie, **given)
+        ties = find_tracks(views, options.tie, scope, executor=executor, progress=progress)
     except DisconnectedError as error:
         if not options.keep_going or len(error.groups[0]) < 2:
             raise

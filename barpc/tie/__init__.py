@@ -8,8 +8,7 @@ from barpc.tie.matchers.features import Keypoints, detect
 from barpc.tie.matchers.matcher import Matches
 from barpc.tie.matchers.matching import PairReport, match_pair, match_pairs
 from barpc.tie.pairing.area import Area, read_area
-from barpc.tie.pairing.choice import select_pairs
-from barpc.tie.pairing.overlaps import Pair
+from barpc.tie.pairing.overlaps import Pair, Scope, select_pairs
 from barpc.tie.patches.register import refine
 from barpc.tie.reference import ReferenceControl
 from barpc.tie.tracks import TieResult, common_tracks, find_tracks, link, require_matches, thin
@@ -21,6 +20,7 @@ __all__ = [
     "Pair",
     "PairReport",
     "ReferenceControl",
+    "Scope",
     "TieOptions",
     "TieResult",
     "common_tracks",

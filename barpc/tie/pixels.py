@@ -32,6 +32,8 @@ SPAN = 512
 """Rows that are read at a time (at least one row of blocks), and what else is done in parts of so many."""
 MEMORY = 1 << 28
 """Bytes of what a task works on at a time, about; they decide on no figure."""
+PIECE = MEMORY // 60
+"""Pixels of pictures, or places of templates in them, that are worked on together."""
 _SAMPLES = 5  # blocks a side whose pixels make the stretch
 _LEVEL = 4  # px a side of a pixel of the samples, where decoding is dear
 _NEGLIGIBLE = 8.0  # a range below so many steps of a float type is a constant image
@@ -177,9 +179,7 @@ def _mask(dataset: Any, band: int, raw: npt.NDArray[Any]) -> BoolArray | None:
 
 
 def sample_stretch(path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None) -> Stretch | None:
-    """Estimate the stretch from the 0.5 and 99.5 percentiles of blocks spread over a raster, or its picture
-    of a size; None where nothing varies.
-    """
+    """Estimate the stretch, 0.5 to 99.5 %, of a raster (or its picture); None where nothing varies."""
     found: list[Array] = []
     with open_raster(path) as dataset:
         _check_band(dataset, path, band)

@@ -9,41 +9,41 @@ the same for all views, are looked for one by one (`barpc.tie.patches.channels`)
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
-from barpc.geodesy import Array, metres_per_unit
+from barpc.geodesy import NEWTON_STEPS, Array, metres_per_unit
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
-from barpc.tie.patches.channels import FoundTemplates, correlation, find, joined, margin
-from barpc.tie.patches.oriented import BACK, HALF
-from barpc.tie.patches.resampled import Patch, Sheet, Terrain, of_image, of_reference, shown
+from barpc.tie.pairing.overlaps import Terrain
+from barpc.tie.patches.channels import (
+    FoundTemplates,
+    Patch,
+    Sheet,
+    correlation,
+    find,
+    joined,
+    margin,
+    of_image,
+    of_reference,
+    shown,
+)
+from barpc.tie.patches.oriented import BACK, HALF, TILE
 from barpc.tie.pixels import FloatImage
-from barpc.tie.tasks import Progress, ordered
+from barpc.tie.tasks import HERE, Work
 
 REACH = 150.0  # m: how far a camera may be off
 PEAK = 6.5  # a vote that stands out by fewer standard deviations is none: other places reach 5.1
 _QUOTA = 1000  # points in a view, about
 _SEARCH = 6, 5.0  # px and m: what the vote and the terrain leave, together
-_FINE, _SIDE, _BLOCKS = (
-    2.0,
-    64,
-    8,
-)  # of the first vote: m a pixel, at least; px of a block; blocks along a side
+_FINE, _SIDE, _BLOCKS = 2.0, 64, 8  # of the first vote: m a pixel, at least; px of a block; blocks along a side
 _SHOWN = 0.5, 0.3  # of a block and of the reference around it
-_TILE = 192, 48  # px: points of a tile are looked for together; where the rasters are much finer
-_PIXELS = 20e6  # of a tile in a raster, at most, about
 _LEAST = 12  # points that agree in a view
 _BEYOND = 3.0  # times what is expected. Measured: the terrain's 0.5-1.3, of another place, mirrored, flat 6-9
 _MARGIN = 0.1  # by which a correlation beats its decoy's
-_NEAR, _FAR, _ROUNDS = (
-    3.0,
-    3.0,
-    8,
-)  # px: shifts that agree, to begin with; robust standard deviations; of the affine
+_NEAR = 3.0  # px: shifts that agree, to begin with; then robust standard deviations about the affine
 
 
 @dataclass(frozen=True)
@@ -97,16 +97,31 @@ class ReferenceControl:
         )
 
 
+@dataclass(frozen=True)
+class Accuracy:
+    """Standard deviations of a reference [m].
+
+    Parameters
+    ----------
+    place : float, optional, of the orthoimages' own place; None: a quarter of their pixel, but at least half a metre
+    height, heights : float, of single heights of the terrain, and of all together
+    """
+
+    place: float | None = None
+    height: float = 10.0
+    heights: float = 5.0
+
+
+USUAL = Accuracy()
+
+
 def register_views(
     views: Sequence[View],
     paths: Sequence[str],
     terrain: Terrain,
     band: int = 1,
-    *,
-    sigma: float | None = None,
-    height_sigma: tuple[float, float] = (10.0, 5.0),
-    executor: Executor | None = None,
-    progress: Progress | None = None,
+    accuracy: Accuracy = USUAL,
+    work: Work = HERE,
 ) -> ReferenceControl:
     """Register views to orthoimages and a terrain.
 
@@ -115,28 +130,17 @@ def register_views(
     views, band : sequence of View, int, images, and which band of them
     paths : sequence of str, orthoimages with a CRS; where several show a place, the first
     terrain : callable, lon, lat (n,) [deg] -> altitude [m above the ellipsoid], NaN outside
-    sigma : float, optional, standard deviation of the orthoimages' own place [m]; None: a quarter of their pixel, but
-        at least half a metre
-    height_sigma : (float, float), of single heights of the terrain and of all together [m]
-    executor, progress : as elsewhere
+    accuracy : Accuracy, of the orthoimages and the terrain
+    work : Work, who works on it
     """
     sheets = [Sheet.read(path) for path in paths]
     middles = [_on_terrain(view, terrain, (np.array([view.size]) - 1.0) / 2.0)[0] for view in views]
     known = [middle[:2] for middle in middles if np.isfinite(middle).all()]
     pixels = [min(sheet.step(place) for sheet in sheets) for place in known]
     own = [float(ground_sample_distance(view.sensor, _middle(view))[1]) for view in views]
-    work = _Work(
-        tuple(views),
-        sheets,
-        terrain,
-        band,
-        step=max(pixels + own),
-        pixel=min(pixels + own),
-        executor=executor,
-        progress=progress,
-    )
-    votes = work.vote()
-    return work.search(votes, max(0.5, 0.25 * max(pixels, default=0.0)) if sigma is None else sigma, height_sigma)
+    found = _Work(tuple(views), sheets, terrain, band, max(pixels + own), work)
+    place = max(0.5, 0.25 * max(pixels, default=0.0)) if accuracy.place is None else accuracy.place
+    return found.search(found.vote(), replace(accuracy, place=place))
 
 
 # --- tasks ------------------------------------------------------------------------------------------------
@@ -205,9 +209,7 @@ class _Work:
     terrain: Terrain
     band: int
     step: float  # of the grids [m]
-    pixel: float  # the smallest of any raster [m]
-    executor: Executor | None
-    progress: Progress | None
+    work: Work
 
     @property
     def paths(self) -> tuple[str, ...]:
@@ -228,7 +230,7 @@ class _Work:
         for view, shift in zip(self.views, moved, strict=True):
             tasks += [(view, self.band, self.paths, patch, px) for patch in self._blocks(view, shift, step, px)]
             ends.append(len(tasks))
-        cast = ordered(self.executor, vote, tasks, stage, self.progress)
+        cast = self.work.ordered(vote, tasks, stage)
         peaks = [peak(cast[start:stop]) for start, stop in pairwise(ends)]
         # a block of the image that the reference shows `at` px away: the camera is off by the rest
         return [(z, shift - at * [step, -step]) for (z, at), shift in zip(peaks, moved, strict=True)]
@@ -253,9 +255,7 @@ class _Work:
             if here
         ]
 
-    def search(
-        self, votes: Sequence[tuple[float, Array]], sigma: float, height_sigma: tuple[float, float]
-    ) -> ReferenceControl:
+    def search(self, votes: Sequence[tuple[float, Array]], accuracy: Accuracy) -> ReferenceControl:
         """Return the points looked for in every view whose vote stands out, and what they make."""
         places, heights = self._lattice([view for view, (z, _) in zip(self.views, votes, strict=True) if z >= PEAK])
         reach = int(np.ceil(_SEARCH[0] + _SEARCH[1] / self.step))
@@ -268,7 +268,7 @@ class _Work:
             for view, own in zip(self.views, tiles, strict=True)
             for tile in own
         ]
-        done = iter(ordered(self.executor, search, tasks, "reference: points", self.progress))
+        done = iter(self.work.ordered(search, tasks, "reference: points"))
         reports, rows = [], []
         for i, (view, (z, moved), own) in enumerate(zip(self.views, votes, tiles, strict=True)):
             none = ViewMatch(view.name, z, (float(moved[0]), float(moved[1])))
@@ -276,25 +276,22 @@ class _Work:
             reports.append(report)
             if kept is not None:
                 rows.append((np.full(len(kept[0]), i), *kept))
-        control = None
+        control, sigma = None, float(accuracy.place or 0.0)
         if rows:
             view_of, point, xy, xy_sigma = (np.concatenate(column) for column in zip(*rows, strict=True))
             used, closed = np.unique(point, return_inverse=True)
-            shown = [r.heights for r in reports if r.points and r.shows_heights(height_sigma[0])]
-            height_sigma = max(height_sigma[0], *shown, 0.0), max(height_sigma[1], *shown, 0.0)
-            single = np.tile([0.1 * self.step, 0.1 * self.step, height_sigma[0]], (len(used), 1))
+            shown = [r.heights for r in reports if r.points and r.shows_heights(accuracy.height)]
+            height, bias = max(accuracy.height, *shown, 0.0), max(accuracy.heights, *shown, 0.0)
+            single = np.tile([0.1 * self.step, 0.1 * self.step, height], (len(used), 1))
             ground = np.column_stack([places[used], heights[used]])
             names = tuple(f"reference_{n}" for n in used)
             points = GroundPoints(names, ground, single, closed, view_of, xy, xy_sigma)
             offset = np.array([r.offset if r.points else (np.nan, np.nan) for r in reports])
-            bias = np.array([sigma, sigma, height_sigma[1]])
-            control = Reference(points, bias, offset, (2 * HALF + 1) * self.step)
+            control = Reference(points, np.array([sigma, sigma, bias]), offset, (2 * HALF + 1) * self.step)
         return ReferenceControl(control, tuple(reports), self.step, sigma)
 
     def _lattice(self, views: Sequence[View]) -> tuple[Array, Array]:
-        """Return the places (n, 2) [deg] on a regular grid over views, where the reference shows them, and
-        their heights (n,).
-        """
+        """Return the places (n, 2) [deg] on a grid over views, where the reference is, and their heights (n,)."""
         if not views:
             return np.zeros((0, 2)), np.zeros(0)
         rings = [footprint(view.sensor, view.size, view.altitude) for view in views]
@@ -322,8 +319,7 @@ class _Work:
         with np.errstate(invalid="ignore"):
             inside = np.flatnonzero(((at >= edge) & (at <= np.array(view.size) - 1.0 - edge)).all(axis=1))
         pad = margin(HALF, reach) + 1
-        fits = (_TILE[0] + 2 * pad) ** 2 * (self.step / self.pixel) ** 2 < _PIXELS
-        cell = np.floor(places[inside] * metres / self.step / _TILE[0 if fits else 1]).astype(np.int64)
+        cell = np.floor(places[inside] * metres / self.step / TILE).astype(np.int64)
         _, group = np.unique(cell, axis=0, return_inverse=True)
         tiles = []
         for points in (inside[group.ravel() == g] for g in range(int(group.max(initial=-1)) + 1)):
@@ -338,9 +334,7 @@ class _Work:
     def _agreeing(
         self, view: View, report: ViewMatch, parts: Sequence[tuple[_Tile, FoundTemplates]], places: Array
     ) -> tuple[ViewMatch, tuple[IntArray, Array, Array] | None]:
-        """Return a view's points that agree with an affine: report; their index, image points, standard
-        deviations [px].
-        """
+        """Return a view's points that agree with an affine: report; their index, image points, sigmas [px]."""
         if not parts:
             return report, None
         point, found = np.concatenate([tile.points for tile, _ in parts]), joined([part for _, part in parts])
@@ -377,9 +371,9 @@ def _affine(
     design = np.column_stack([np.ones(len(local)), local / max(float(np.abs(local).max()), 1.0)])
     apart = np.linalg.norm(shift[passed, None] - shift[None, passed], axis=2)
     fitted = np.broadcast_to(shift[passed][(apart < _NEAR * step).sum(axis=1).argmax()], shift.shape)
-    scale, keep = np.full(2, _NEAR * step / _FAR), passed
-    for _ in range(_ROUNDS):
-        keep = passed & (np.abs(shift - fitted) < _FAR * scale).all(axis=1)
+    scale, keep = np.full(2, step), passed
+    for _ in range(NEWTON_STEPS):
+        keep = passed & (np.abs(shift - fitted) < _NEAR * scale).all(axis=1)
         if keep.sum() < _LEAST:
             return None
         fitted = design @ np.linalg.lstsq(design[keep], shift[keep], rcond=None)[0]

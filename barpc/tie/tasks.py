@@ -1,12 +1,23 @@
-"""How the tasks of a stage are handed to whoever works on them."""
+"""How the tasks of a stage are handed to whoever works on them, and where results lie that travel by reference."""
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future
+from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 from typing import Any
+
+import numpy as np
+
+from barpc import identity
+from barpc.errors import InputError
+from barpc.frozen import Arrays, load_npz, replacing
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage, how much is done, of how much."""
@@ -42,9 +53,7 @@ def one_by_one(
     progress: Progress | None = None,
     ahead: int | None = None,
 ) -> Iterator[Any]:
-    """Run tasks as `ordered`, but yield each result as it comes and keep none; at most `ahead` are handed in at a
-    time, so that kept results of all others are not in memory, too.
-    """
+    """Run tasks as `ordered`, but yield each result as it comes; at most `ahead` are handed in at a time."""
     waiting, futures = iter(tasks), deque[Future[Any]]()
     try:
         for done, task in enumerate(tasks, start=1):
@@ -57,3 +66,80 @@ def one_by_one(
     finally:
         for future in futures:
             future.cancel()
+
+
+@dataclass(frozen=True)
+class Store:
+    """A folder that every worker sees under the same path: workers write results, the caller knows names."""
+
+    folder: str
+    room: str  # for files on their way, on the same disk
+
+    scratch = "arrays"  # where names of a run that need not outlive it begin
+
+    def write(self, name: str, arrays: Arrays) -> None:
+        """Write named arrays, whole or not at all; not if a file that they were made of has changed."""
+        identity.ask()
+        path = Path(self.folder) / f"{name}.npz"
+        with (
+            replacing(path, overwrite=True, durable=False, room=Path(self.room)) as partial,
+            partial.open("wb") as file,
+        ):
+            np.savez(file, **arrays)  # type: ignore[arg-type]
+
+    def read(self, name: str) -> Arrays | None:
+        """Read the arrays of a name; None where it is missing or damaged."""
+        path = Path(self.folder) / f"{name}.npz"
+        try:
+            return None if path.is_symlink() or not path.is_file() else load_npz(path)
+        except (OSError, ValueError, InputError):
+            return None
+
+    def need(self, name: str) -> Arrays:
+        """Return the arrays of a name that was written before; InputError where this worker does not find it."""
+        found = self.read(name)
+        if found is None:
+            raise InputError(
+                f"{self.folder}/{name}.npz: a worker cannot read it; images and run folder must be on a disk that all "
+                "workers see under the same path"
+            )
+        return found
+
+    def clear(self) -> None:
+        """Remove what lies under `scratch`."""
+        shutil.rmtree(Path(self.folder) / self.scratch, ignore_errors=True)
+
+
+@contextmanager
+def store_of(executor: Executor | None) -> Iterator[Store]:
+    """Yield the executor's store (`barpc.pipeline.executor`), or a temporary one."""
+    given: Store | None = getattr(executor, "store", None)
+    if given is not None:
+        yield given
+        return
+    with tempfile.TemporaryDirectory(prefix="barpc-") as folder:
+        yield Store(folder, folder)
+
+
+def names_of(executor: Executor | None, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> list[str]:
+    """Return names for results, by the content of inputs where the executor knows it: a later run finds them."""
+    key = getattr(executor, "key", None)
+    names = (key(function, task) if key else number for number, task in enumerate(tasks))
+    return [f"{function.__name__}/{name}" for name in names]
+
+
+@dataclass(frozen=True)
+class Work:
+    """Who works on tasks (None: this process), who is told, and where results lie that travel by reference."""
+
+    executor: Executor | None = None
+    progress: Progress | None = None
+    store: Store | None = None
+
+    def ordered(self, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], stage: str) -> list[Any]:
+        """Run tasks as `ordered`."""
+        return ordered(self.executor, function, tasks, stage, self.progress)
+
+
+HERE = Work()
+"""This process, silently."""

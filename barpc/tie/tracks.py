@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -24,31 +23,39 @@ from barpc.tie.matchers.matching import (
     FINE,
     MATCHERS,
     STRUCTURE,
+    Ground,
     PairReport,
     ample,
     enough,
+    first_look,
     match_pairs,
     matcher_named,
     quick_score,
 )
 from barpc.tie.pairing.area import Area
-from barpc.tie.pairing.choice import COMPARED, TRIES, best_pairs, further_pairs, judged, several_dates
 from barpc.tie.pairing.epipolar import grouped, linear_map
-from barpc.tie.pairing.overlaps import Pair, possible_pairs, require_connected
+from barpc.tie.pairing.overlaps import (
+    COMPARED,
+    EVERYWHERE,
+    TRIES,
+    Pair,
+    Scope,
+    best_pairs,
+    further_pairs,
+    judged,
+    possible_pairs,
+    require_connected,
+    several_dates,
+)
 from barpc.tie.pairing.resolution import Looks
 from barpc.tie.patches.register import REACH, refine
-from barpc.tie.patches.resampled import Terrain
-from barpc.tie.store import Store, store_of
-from barpc.tie.tasks import Progress, ordered
+from barpc.tie.tasks import Progress, Work, store_of
 
 logger = logging.getLogger(__name__)
 
 NEEDED = 4
 """Tracks of a pair: across the epipolar lines they are a shift and three that could contradict it."""
 _DEFAULTS = TieOptions()
-_NOTHING: GivenMatches = MappingProxyType({})
-_SPARE = 1.3  # tracks registered for each one kept
-_SAME = REACH + 0.5**0.5  # px that registration, and rounding, may move a point by
 _QUOTAS = (4, 8, 16)
 """Tracks that a cell takes, round by round; with the first an image of full cells holds what is asked for."""
 
@@ -65,13 +72,10 @@ class TieResult:
 def find_tracks(
     views: Sequence[View],
     options: TieOptions = _DEFAULTS,
+    scope: Scope = EVERYWHERE,
     *,
     executor: Executor | None = None,
     progress: Progress | None = None,
-    only: Sequence[tuple[int, int]] = (),
-    area: Area | None = None,
-    given: GivenMatches = _NOTHING,
-    terrain: Terrain | None = None,
 ) -> TieResult:
     """Find the tie points of overlapping images.
 
@@ -81,17 +85,10 @@ def find_tracks(
         At least two; in a second pass with their corrected cameras, `replace(view, sensor=...)`.
     options : TieOptions
         Options of the search.
+    scope : Scope
+        Pairs, area, matches and terrain that are known beside the images.
     executor, progress : optional
         Executor of the tasks, and callable for progress: see `ordered`. The result does not depend on them.
-    only : sequence of (int, int)
-        Match these pairs and no others.
-    area : Area, optional
-        Area in which tie points are looked for, as the cameras see it; None: everywhere.
-    given : mapping of (int, int), ascending, to Matches
-        Matches given for some pairs: verified and registered like those of the other pairs, which are matched
-        here. Where too few can be registered, they keep their places with the measured standard deviation.
-    terrain : callable, optional
-        lon, lat (n,) [deg] -> altitude [m above the ellipsoid], NaN outside: narrows the search for structure.
 
     Raises
     ------
@@ -102,35 +99,33 @@ def find_tracks(
     ImageError
         An image cannot be read.
     """
-    work: dict[str, Any] = {"executor": executor, "progress": progress}
     with store_of(executor) as store:
-        trials = _Trials(views, options, store, area, given, terrain, work)
-        pool = possible_pairs(views, options, only=only, area=area, given=given)
-        trials.run(pool, all_of_them=bool(only))
+        trials = _Trials(views, options, scope, Work(executor, progress, store))
+        trials.run(possible_pairs(views, options, scope), all_of_them=bool(scope.only))
     tried = sorted(trials.tried.items())
     pairs, reports = [pair for _, (pair, _, _) in tried], tuple(report for _, (_, _, report) in tried)
     require_matches(views, pairs, reports)
-    tracks, bare = _registered(trials, area, given, options, work)
+    tracks, bare = _registered(trials, scope, options, Work(executor, progress))
     reports = tuple(replace(r, unregistered=bare.get(p.views, 0)) for p, r in zip(pairs, reports, strict=True))
     require_tracks(views, tracks, pairs, reports)
     return TieResult(tracks, reports, trials.keypoints)
 
 
 def _registered(
-    trials: _Trials, area: Area | None, given: GivenMatches, options: TieOptions, work: dict[str, Any]
+    trials: _Trials, scope: Scope, options: TieOptions, work: Work
 ) -> tuple[Tracks, dict[tuple[int, int], int]]:
     """Link, thin and register the matches of the pairs tried; return also how many could not be registered."""
-    looks, most = trials.looks, options.points_per_image
+    looks, area, most = trials.looks, scope.area, options.points_per_image
     tried = [(looks.ends[views], *trials.tried[views][1:]) for views in sorted(trials.tried)]
     linked = inside(looks.views, link([ends for ends, _, _ in tried], [found for _, found, _ in tried]), area)
     spreads = {ends: report.spread for ends, _, report in tried if report.status == "ok"}
     sizes = [view.size for view in looks.views]
-    linked = thin(linked, sizes, int(_SPARE * most))
+    linked = thin(linked, sizes, most)
     structural = [ends for ends, _, report in tried if report.matcher in (STRUCTURE, FINE)]
-    theirs = {looks.ends[views] for views in given}
+    theirs = {looks.ends[views] for views in scope.given}
     verified = {ends: found for ends, found, _ in tried if len(found)}
     structural += _unlike(looks.views, {p: verified[p] for p in theirs & set(verified)}, options, work)
-    tracks = refine(looks.views, linked, spreads, options, structural=structural, **work)
+    tracks = refine(looks.views, linked, spreads, options, structural=structural, work=work)
     needed = theirs | _needed(looks, tracks, list(verified), options)
     known = {ends: found for ends, found in verified.items() if ends in needed}
     exact, tracks = pair_counts(tracks), _with_unregistered(looks.views, tracks, known, options)
@@ -154,18 +149,9 @@ def _needed(
 class _Trials:
     """Pairs that are tried, round by round, until the views are tied or nothing is left to try."""
 
-    def __init__(
-        self,
-        views: Sequence[View],
-        options: TieOptions,
-        store: Store,
-        area: Area | None,
-        given: GivenMatches,
-        terrain: Terrain | None,
-        work: dict[str, Any],
-    ) -> None:
-        self._views, self._options, self._store, self._area = views, options, store, area
-        self._given, self._terrain, self._work = given, terrain, work
+    def __init__(self, views: Sequence[View], options: TieOptions, scope: Scope, work: Work) -> None:
+        self._views, self._options, self._work = views, options, work
+        self._given, self._scope = scope.given, scope
         self._compares = options.matcher == _DEFAULTS.matcher  # by keypoints
         self.looks = Looks.at(views, [])
         self._coarse, self._closer = False, 0
@@ -177,7 +163,7 @@ class _Trials:
         """Match the best pairs of a pool, or all, and others in place of those that fail."""
         own = self._options.matcher in MATCHERS  # another one reads the files itself
         self.looks = Looks.at(self._views, pool, apart=own)
-        self._keypoints = [KeypointFiles(self._store)] * len(self.looks.views)
+        self._keypoints = [KeypointFiles(self._work.store)] * len(self.looks.views)
         sizes = [view.size for view in self.looks.views]
         dates = several_dates(self._views)
         self._coarse = self._compares and not dates and worth_a_first_look(sizes, self._options)
@@ -202,9 +188,8 @@ class _Trials:
         """Find the keypoints that pairs need."""
         others = [self.looks.pair(pair) for pair in pairs if pair.views not in self._given]
         if others and matcher_named(self._options.matcher).detects:
-            views, options = self.looks.views, self._options
-            where: dict[str, Any] = {"pairs": others, "area": self._area, "coarse": self._coarse}
-            self._keypoints = locate(views, options, self._store, **where, **self._work)
+            where: dict[str, Any] = {"pairs": others, "area": self._scope.area, "coarse": self._coarse}
+            self._keypoints = locate(self.looks.views, self._options, self._work, **where)
 
     @property
     def keypoints(self) -> tuple[int, ...]:
@@ -216,7 +201,7 @@ class _Trials:
         """Return the pairs with their quick scores, where keypoints can tell."""
         new = [p for p in pairs if self._compares and p.views not in self._given and p.views not in self._scores]
         tasks = [(*self._ends(pair), self._options) for pair in new]
-        scores = ordered(self._work["executor"], quick_score, tasks, "compare", self._work["progress"])
+        scores = self._work.ordered(quick_score, tasks, "compare")
         self._scores |= {pair.views: score for pair, score in zip(new, scores, strict=True)}
         known = self._scores
         return [judged(self._views, p, known[p.views]) if p.views in known else p for p in pairs]
@@ -234,41 +219,34 @@ class _Trials:
             looks.ends[pair]: replace(self._given[pair], xy=looks.places(pair, self._given[pair].xy))
             for pair in (pair.views for pair in known)
         }
-        theirs = verify_given(looks.views, given, [looks.pair(pair) for pair in known], options, **self._work)
+        theirs = verify_given(looks.views, given, [looks.pair(pair) for pair in known], options, self._work)
         for pair, (found, report) in zip([*others, *known], [*own, *theirs], strict=True):
             self.tried[pair.views] = pair, found, report
 
     def _matched(
         self, pairs: Sequence[Pair], before: Sequence[tuple[tuple[View, View], Matches]]
     ) -> list[tuple[Matches, PairReport]]:
-        """Return the matches of pairs of looks by a first look, and by a closer one at those of which that
-        shows too little.
-        """
+        """Return matches of pairs of looks by a first look, and by a closer one where that shows too little."""
         views, options, keypoints = self.looks.views, self._options, self._keypoints
-        first = match_pairs(views, keypoints, pairs, options, once=True, **self._work) if self._coarse else []
+        first = first_look(views, keypoints, pairs, options, self._work) if self._coarse else []
         found = {p.views: one for p, one in zip(pairs, first, strict=False) if ample(one[1], options)}
         lacking = [pair for pair in pairs if pair.views not in found]
         if self._coarse and lacking:
-            closer = locate(views, options, self._store, pairs=lacking, area=self._area, **self._work)
+            closer = locate(views, options, self._work, pairs=lacking, area=self._scope.area)
             self._closer += 1  # each numbers its keypoints, below 0, where no place is
             keypoints = [replace(files, start=-self._closer << 32) for files in closer]
         known = [((views[p.views[0]], views[p.views[1]]), found[p.views][0]) for p in pairs if p.views in found]
-        again = match_pairs(
-            views, keypoints, lacking, options, terrain=self._terrain, before=[*before, *known], **self._work
-        )
+        ground = Ground(self._scope.terrain, (*before, *known))
+        again = match_pairs(views, keypoints, lacking, options, ground, self._work)
         found |= {pair.views: one for pair, one in zip(lacking, again, strict=True)}
         return [found[pair.views] for pair in pairs]
 
 
-def _unlike(
-    views: Sequence[View], given: GivenMatches, options: TieOptions, work: Mapping[str, Any]
-) -> list[tuple[int, int]]:
-    """Return the given pairs whose grey values do not compare: too few of their matches could be registered
-    by these.
-    """
+def _unlike(views: Sequence[View], given: GivenMatches, options: TieOptions, work: Work) -> list[tuple[int, int]]:
+    """Return the given pairs whose grey values do not compare: too few matches could be registered by these."""
     some = {pair: m.select(np.linspace(0, len(m) - 1, min(len(m), THIN)).astype(int)) for pair, m in given.items()}
     linked = link([*some], [*some.values()])
-    before, after = pair_counts(linked), pair_counts(refine(views, linked, {}, options, **work))
+    before, after = pair_counts(linked), pair_counts(refine(views, linked, {}, options, work=work))
     shares = {pair: after.get(pair, 0) / max(before.get(pair, 0), 1) for pair in given}
     return [pair for pair, share in shares.items() if share < 0.5 and share * len(given[pair]) < THIN]
 
@@ -289,11 +267,9 @@ def _with_unregistered(views: Sequence[View], tracks: Tracks, given: GivenMatche
 
 
 def _joined(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
-    """Return the registered tracks and others: one that stands beside a registered one is the same point,
-    seen by more views.
-    """
-    known, asked = (np.array([2 * _SAME * part.view, *part.xy.T]).T for part in (tracks, others))
-    near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=_SAME))
+    """Return the registered tracks and others: those that stand beside a registered one are the same point."""
+    known, asked = (np.array([2 * REACH * part.view, *part.xy.T]).T for part in (tracks, others))
+    near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=REACH))
     same = np.flatnonzero(np.isfinite(near))
     point, which = np.unique(others.point[same], return_index=True)
     anchor = np.full(others.num_points, -1)  # the row of each track that says where it stands, if one does
@@ -415,9 +391,7 @@ def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], most: int) -> Tracks:
 
 
 def _fill(tracks: Tracks, cell: list[int], num_cells: int, most: int, num_views: int) -> BoolArray:
-    """Return the mask of the tracks that are taken, greedily, in rounds of growing quota where images have
-    empty parts.
-    """
+    """Return the mask of tracks that are taken, greedily, in rounds of growing quota where images have empty parts."""
     starts = np.searchsorted(tracks.point, np.arange(tracks.num_points + 1))
     worst = np.maximum.reduceat(tracks.sigma, starts[:-1])
     # Knuth's multiplicative hash: an order without direction among equals

@@ -20,7 +20,7 @@ sys.path.insert(0, str(HERE.parents[1]))
 from barpc.dem import Dem  # noqa: E402
 from barpc.options import RunOptions  # noqa: E402
 from barpc.pipeline import adjust  # noqa: E402
-from barpc.tie.patches.resampled import Patch, Sheet, _picture  # noqa: E402
+from barpc.tie.patches.channels import Patch, Sheet, _picture  # noqa: E402
 from tests.scenes import ImageOptions, Scene, write_scene  # noqa: E402
 from tests.scenes.season import other_season, write_dem, write_reference  # noqa: E402
 

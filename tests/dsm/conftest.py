@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.dsm.cells import Tile, _gathered
+from barpc.dsm.cells import Tile, gathered
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.files import _write_image
 
@@ -49,7 +49,7 @@ class Rendered:
             at = np.column_stack([col, row]).astype(np.float64)
             ground.append(shot.exact.localize(at, picture.altitude[row, col].astype(np.float64)))
         every = np.concatenate(ground)
-        return _gathered(tile, every, np.ones(len(every)))[0]
+        return gathered(tile, every, np.ones(len(every)))[0]
 
 
 @pytest.fixture(scope="session")

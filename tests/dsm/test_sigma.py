@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from barpc.ba import BlockPrior
-from barpc.dsm.cells import _averaged
+from barpc.dsm.cells import averaged
 from barpc.dsm.relief import shaded
 from barpc.dsm.sigma import CameraErrors
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.scene import View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center, triangulate
-from barpc.tie.patches.dense import _LEFT, _SLOPE, FINER, WINDOW, _slope, epipolar_frame
+from barpc.tie.patches.dense import _LEFT, _SLOPE, FINER, WINDOW, epipolar_frame
 from tests.dsm.conftest import ALTS
 
 
@@ -121,11 +121,11 @@ def test_what_resampling_leaves_of_noise_is_what_sigma_takes_for_it():
         to_frame = np.array([[*along, 500.3], [-along[1] / FINER, along[0] / FINER, 350.2]])
         moved = cv2.warpAffine(noise, to_frame, (1000, 700), flags=cv2.INTER_CUBIC)
         inside = cv2.erode(cv2.warpAffine(np.ones_like(noise), to_frame, (1000, 700)), np.ones((9, 9))) > 0.999
-        found.append([moved[inside].var(), _slope(moved)[inside].var()])
+        found.append([moved[inside].var(), np.gradient(moved, axis=1)[inside].var()])
     np.testing.assert_allclose(np.mean(found, axis=0), [_LEFT, _SLOPE], rtol=0.03)
 
 
 @pytest.mark.parametrize("side", [1, 2, 3, 5, 8])
 def test_the_mean_of_matches_is_known_as_well_as_their_windows_overlap(side):
     lag = np.abs(np.subtract.outer(np.arange(side), np.arange(side)))
-    assert _averaged(np.array(float(side))) == pytest.approx(np.maximum(0.0, 1.0 - lag / WINDOW).mean())
+    assert averaged(np.array(float(side))) == pytest.approx(np.maximum(0.0, 1.0 - lag / WINDOW).mean())

@@ -276,12 +276,12 @@ def test_a_tile_shows_as_many_pixels_whatever_the_cells(rendered):
     block = block_of_images(rendered.paths[:2])
     usual, coarse = (surface_module.Grid.of(block, replace(OPTIONS, gsd=side)) for side in (None, 8.0))
     assert usual.side == 512
-    assert coarse.side * coarse.step <= 1.1 * usual.side * usual.step
-    parts = coarse.tile(0, 0).parts()
-    assert {part.size for part in parts} == {coarse.tile(0, 0).size}
+    assert coarse.side * coarse.whole.step <= 1.1 * usual.side * usual.whole.step
+    whole = coarse.tiles()[0][1]
+    parts = whole.quarters()
+    assert {part.size for part in parts} == {whole.size}
     corners = np.array([[part.west, part.north, part.step] for part in parts])
     west, north, step = corners.T
-    whole = coarse.tile(0, 0)
     assert (west.min(), north.max()) == (whole.west, whole.north)
     assert west.max() + step[0] * whole.size[0] == pytest.approx(whole.west + whole.step * whole.size[0])
     assert north.min() - step[0] * whole.size[1] == pytest.approx(whole.north - whole.step * whole.size[1])

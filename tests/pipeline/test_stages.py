@@ -31,6 +31,7 @@ from barpc.pipeline.outputs import output_names
 from barpc.report import Run
 from barpc.scene import Tracks, View
 from barpc.simulate import simulate_block
+from barpc.tie.reference import Accuracy
 from tests.rpcio.conftest import make_rpc
 from tests.test_dem import write_dem
 
@@ -272,14 +273,13 @@ def test_a_run_without_some_of_its_views_keeps_what_belongs_to_the_others() -> N
 )
 def test_heights_of_a_reference_are_as_sure_as_what_they_count_from(monkeypatch, stated, known, used) -> None:
     seen = {}
-    monkeypatch.setattr(stages, "register_views", lambda *given, **how: seen.update(how))
+    monkeypatch.setattr(stages, "register_views", lambda *given: seen.update(accuracy=given[4]))
     options = RunOptions(
         dem="d.tif", reference=("r.tif",), reference_sigma=7.0,
         adjust=AdjustOptions(dem_bias_sigma=stated, dem_sigma=4.0),
     )  # fmt: skip
     stages._registered(SimpleNamespace(views=views()), options, SimpleNamespace(known=known), None, None)  # type: ignore[arg-type]
-    assert seen["height_sigma"] == (4.0, used)
-    assert seen["sigma"] == 7.0
+    assert seen["accuracy"] == Accuracy(7.0, 4.0, used)
 
 
 def test_cameras_are_fitted_each_and_what_fails_says_why() -> None:

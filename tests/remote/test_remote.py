@@ -31,7 +31,7 @@ from barpc.pipeline.inputs import input_files, with_located
 from barpc.raster import open_raster
 from barpc.remote import BLOCK, Remote, RemoteFile, hosts, located, pinned
 from barpc.sidefile import IMAGE, RPC_FILE, read_bytes, read_head, versioned
-from barpc.tie.patches.resampled import Sheet
+from barpc.tie.patches.channels import Sheet
 from tests.remote.conftest import Web, drip
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"

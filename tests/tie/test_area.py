@@ -17,7 +17,7 @@ from barpc.geodesy import ground_from_ecef
 from barpc.raster import open_raster
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import triangulate
-from barpc.tie import TieOptions, find_tracks, read_area, select_pairs
+from barpc.tie import Scope, TieOptions, find_tracks, read_area, select_pairs
 from barpc.tie.matchers import features
 from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.overlaps import Footprints, shared_tiles
@@ -196,7 +196,7 @@ def test_only_windows_in_the_area_are_read(tmp_path, lon) -> None:
     west, south, east, north = side + [lon, 0.0, lon, 0.0]
     area = read_area(written(tmp_path / "a.json", box(west, south, east, north)))
     with chosen(TieOptions, search=10, tile=250, cell=50) as options:
-        (pair,) = select_pairs(two, options, area=area)
+        (pair,) = select_pairs(two, options, Scope(area=area))
         boxes, shared = tiles((1000, 1000), options), shared_tiles(two, [pair], options, area)
     assert pair.overlap == pytest.approx(1.0)
     for kept in shared:
@@ -234,7 +234,7 @@ def test_views_that_do_not_see_the_area_are_named(tmp_path) -> None:
     area = read_area(written(tmp_path / "a.json", box(-200 * METRE, -0.001, -100 * METRE, 0.001)))
     assert len(select_pairs(three, TieOptions())) == 3
     with pytest.raises(DisconnectedError, match=r"v0, v1; v2.*inside the area of interest"):
-        select_pairs(three, TieOptions(search=10), area=area)
+        select_pairs(three, TieOptions(search=10), Scope(area=area))
 
 
 def corner(scene, share: float) -> dict[str, object]:
@@ -267,7 +267,7 @@ def all_inside(scene: Rendered, tracks: Tracks, everywhere: Tracks, area: Area) 
 def test_all_tie_points_lie_in_the_area(render, tmp_path) -> None:
     scene = render(views=2, size=(300, 300))
     area = read_area(written(tmp_path / "a.json", corner(scene, 0.5)))
-    all_inside(scene, find_tracks(scene.views, area=area).tracks, scene.tied.tracks, area)
+    all_inside(scene, find_tracks(scene.views, scope=Scope(area=area)).tracks, scene.tied.tracks, area)
 
 
 @pytest.mark.slow
@@ -283,7 +283,7 @@ def test_all_tie_points_lie_in_the_area_and_other_tiles_are_not_even_read(render
         lambda path, size, box, *rest: read.append((path, box)) or original(path, size, box, *rest),
     )
     options = TieOptions(tile=150, search=30)
-    result = find_tracks(views, options, area=area)
+    result = find_tracks(views, options, Scope(area=area))
     limited = len(read)
     everywhere = find_tracks(views, options)
     assert limited < 0.7 * (len(read) - limited)
@@ -295,4 +295,4 @@ def test_an_area_without_tie_points_is_said(render, tmp_path) -> None:
     scene = render(views=2, size=(300, 300))
     area = read_area(written(tmp_path / "a.json", corner(scene, 0.004)))
     with pytest.raises(TiePointError, match=r"none of [0-9]+ tie points lies in the area of interest"):
-        find_tracks(scene.views, area=area)
+        find_tracks(scene.views, scope=Scope(area=area))

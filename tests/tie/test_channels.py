@@ -189,7 +189,7 @@ def test_what_passes_beats_its_decoy_by_the_margin_comes_back_and_is_a_picture()
 def test_nothing_that_is_looked_at_lies_beyond_the_margin():
     """The decoy's far end: the template, three searches, and what is between."""
     edge = margin(8, 4)
-    assert edge == 8 + 12 + 8
+    assert edge == 8 + 12 + 9
     picture = seen(texture(1, 2 * edge + 1))
     corner = np.array([[edge, edge]])
     whole = find(picture, picture, corner, 8, 4)

@@ -14,12 +14,21 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from barpc.options import RunOptions
 from barpc.pipeline import adjust
 from barpc.scene import connected_groups
-from barpc.tie import TieOptions, find_tracks, select_pairs, tracks
+from barpc.tie import Scope, TieOptions, find_tracks, select_pairs, tracks
 from barpc.tie.matchers.features import KeypointFiles
 from barpc.tie.matchers.matcher import NO_MATCHES
 from barpc.tie.matchers.matching import PairReport
-from barpc.tie.pairing.choice import best_pairs, forests, further_pairs, judged, several_dates, twice_tied
-from barpc.tie.pairing.overlaps import Pair, possible_pairs
+from barpc.tie.pairing.overlaps import (
+    Pair,
+    best_pairs,
+    forests,
+    further_pairs,
+    judged,
+    possible_pairs,
+    several_dates,
+    twice_tied,
+)
+from barpc.tie.tasks import Work
 from tests.lanes import diagonal, rest_slow
 from tests.scenes.dates import Years
 
@@ -171,7 +180,7 @@ def test_half_of_the_partners_are_left_for_other_dates() -> None:
 def test_what_is_given_is_kept_and_takes_no_place() -> None:
     row = views(*(camera(10 * METRE * k, lean=0.0) for k in range(12)))
     plain = {pair.views for pair in select_pairs(row, TieOptions(neighbours=2))}
-    more = select_pairs(row, TieOptions(neighbours=2), given=[(0, 11)])
+    more = select_pairs(row, TieOptions(neighbours=2), Scope(given={(0, 11): NO_MATCHES}))
     assert {pair.views for pair in more} == plain | {(0, 11)}
     assert [pair.reason for pair in more if pair.views == (0, 11)] == ["given"]
 
@@ -185,7 +194,7 @@ class Looks:
     def __init__(self, monkeypatch, alike, neighbours: int = 3) -> None:
         self.alike, self.compared, self.tried = alike, [], []
         self._options = TieOptions(neighbours=neighbours)
-        monkeypatch.setattr(tracks, "locate", lambda views, _, store, **rest: [KeypointFiles(store)] * len(views))
+        monkeypatch.setattr(tracks, "locate", lambda views, _, work, **rest: [KeypointFiles(work.store)] * len(views))
         monkeypatch.setattr(tracks, "match_pairs", self._match)
         monkeypatch.setattr(tracks, "quick_score", self._score)
 
@@ -204,7 +213,7 @@ class Looks:
 
     def run(self, row) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
         """The pairs that were tried, and those of them that tie."""
-        trials = tracks._Trials(row, self._options, None, None, {}, None, {"executor": None, "progress": None})
+        trials = tracks._Trials(row, self._options, Scope(), Work())
         trials.run(pairs_in_a_row(len(row), self._options.neighbours), False)
         every = sorted(trials.tried)
         assert sorted(pair for some in self.tried for pair in some) == every  # none twice

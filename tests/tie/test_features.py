@@ -164,8 +164,8 @@ def test_a_box_may_hold_a_fifth_more_than_its_share() -> None:
 
 
 @pytest.mark.parametrize(("side", "cell"), [(10.0, 64), (95.0, 64), (97.0, 128), (159.0, 128), (161.0, 192)])
-def test_cells_hold_about_eight_keypoints_and_are_whole_multiples(side, cell) -> None:
-    assert Share(8.0 / side**2).cell == cell
+def test_cells_hold_about_a_keypoint_and_are_whole_multiples(side, cell) -> None:
+    assert Share(1.0 / side**2).cell == cell
 
 
 def test_the_strongest_of_files_are_the_same_share_of_every_tile() -> None:

@@ -13,7 +13,7 @@ import barpc.tie.pixels as reading
 from barpc.errors import DisconnectedError
 from barpc.raster import open_raster
 from barpc.scene import Tracks
-from barpc.tie import Matches, TieOptions, common_tracks, find_tracks
+from barpc.tie import Matches, Scope, TieOptions, common_tracks, find_tracks
 from barpc.tie.tracks import pair_counts
 from tests.lanes import rest_slow
 
@@ -56,7 +56,7 @@ def test_half_a_pixel_becomes_a_tenth_and_false_matches_go(
 ) -> None:
     scene, pairs = render(views=views, size=(side, side)), PAIRS if views == 3 else PAIRS[:1]
     given = true_matches(scene, *pairs, noise=noise, false=false)
-    result = find_tracks(scene.views, given=given)
+    result = find_tracks(scene.views, scope=Scope(given=given))
     assert result.keypoints == (0,) * views  # nothing else is looked for
     for pair, report in zip(pairs, result.pairs, strict=True):
         true = (1 - false) * len(given[pair])
@@ -72,16 +72,16 @@ def test_half_a_pixel_becomes_a_tenth_and_false_matches_go(
 def test_false_matches_alone_are_refused_and_said(render, caplog) -> None:
     scene = render(views=2, size=(300, 300))
     with pytest.raises(Exception, match=r"(no common offset|too few matches).* \(500 and 500"):
-        find_tracks(scene.views, given=true_matches(scene, (0, 1), false=1.0))
+        find_tracks(scene.views, scope=Scope(given=true_matches(scene, (0, 1), false=1.0)))
     assert "the matches given are not used" in caplog.text
     with pytest.raises(Exception, match="too few matches given"):
-        find_tracks(scene.views, given=true_matches(scene, (0, 1), count=11))
+        find_tracks(scene.views, scope=Scope(given=true_matches(scene, (0, 1), count=11)))
 
 
 @pytest.mark.slow
 def test_pairs_that_are_not_given_are_matched_and_points_in_common_are_one_track(render) -> None:
     scene = render(views=3, size=(300, 300))
-    result = find_tracks(scene.views, given=true_matches(scene, (0, 1), (0, 2)))
+    result = find_tracks(scene.views, scope=Scope(given=true_matches(scene, (0, 1), (0, 2))))
     assert [report.keypoints[0] == 500 for report in result.pairs] == [True, True, False]
     assert result.pairs[2].verified > 500
     lengths = np.bincount(result.tracks.point)
@@ -94,7 +94,7 @@ def test_a_camera_that_is_wrong_by_hundreds_of_pixels_does_not_refuse_them(rende
     scene = render(views=2, size=(300, 300))
     first, second = scene.views
     moved = replace(second, sensor=second.sensor.crop(-300.0, -200.0))
-    result = find_tracks([first, moved], given=true_matches(scene, (0, 1)))
+    result = find_tracks([first, moved], scope=Scope(given=true_matches(scene, (0, 1))))
     assert result.pairs[0].verified > 400
     assert np.hypot(*result.pairs[0].offset) > 150
     assert typical(scene, result.tracks, 0, 1) <= 0.1
@@ -109,7 +109,7 @@ def test_a_negative_is_registered_on_channels(render, tmp_path, caplog) -> None:
         path = write_image(tmp_path / "negative.tif", 4000 - image.read(1).clip(0, 3999))
     views = [first, replace(second, path=str(path)), third]
     with caplog.at_level(logging.WARNING):
-        tracks = find_tracks(views, given=true_matches(scene, *PAIRS, noise=0.4, false=0.2)).tracks
+        tracks = find_tracks(views, scope=Scope(given=true_matches(scene, *PAIRS, noise=0.4, false=0.2))).tracks
     assert "used as found" not in caplog.text
     for pair in PAIRS:
         assert pair_counts(tracks)[pair] >= 150
@@ -130,7 +130,7 @@ def test_what_cannot_be_registered_is_used_as_it_is_and_once(render, tmp_path, c
     path = write_image(tmp_path / "noise.tif", noise)
     given = true_matches(scene, (0, 1), noise=0.3, false=0.2)
     with caplog.at_level(logging.WARNING):
-        result = find_tracks([first, replace(second, path=str(path))], TieOptions(min_matches=100), given=given)
+        result = find_tracks([first, replace(second, path=str(path))], TieOptions(min_matches=100), Scope(given=given))
     assert "used as found, good to 0." in caplog.text
     assert 0.7 * 400 <= result.tracks.num_points <= 450
     errors = np.abs(scene.errors(0, 1, *common_tracks(result.tracks, 0, 1))).max(axis=1)
@@ -150,7 +150,7 @@ def test_a_view_that_cannot_be_registered_joins_the_points_that_the_others_are_r
     blank = np.full((300, 300), 900, np.uint16)
     third = replace(scene.views[2], path=str(write_image(tmp_path / "blank.tif", blank)))
     given = true_matches(scene, *PAIRS, noise=0.3)
-    result = find_tracks([*scene.views[:2], third], TieOptions(min_matches=100), given=given)
+    result = find_tracks([*scene.views[:2], third], TieOptions(min_matches=100), Scope(given=given))
     tracks = result.tracks
     assert [report.unregistered > 100 for report in result.pairs] == [False, True, True]
     assert "by keypoints" in result.pairs[1].means
@@ -178,7 +178,7 @@ def test_no_more_is_read_for_matches_of_others_than_patches_about_them(render, t
 
     monkeypatch.setattr(reading, "_read", watched)
     given = true_matches(scene, (0, 1), count=200)
-    assert find_tracks(large, given=given).tracks.num_points > 100
+    assert find_tracks(large, scope=Scope(given=given)).tracks.num_points > 100
     assert sum(pixels) <= 2 * 2 * 356**2  # 300 and a margin of 28 px
 
 
@@ -187,7 +187,7 @@ def test_given_pairs_connect_what_the_cameras_say_is_apart(render) -> None:
     options = TieOptions(angles=(50.0, 60.0))
     with pytest.raises(DisconnectedError, match="no overlap"):
         find_tracks(scene.views, options)
-    assert find_tracks(scene.views, options, given=true_matches(scene, (0, 1))).tracks.num_points > 300
+    assert find_tracks(scene.views, options, Scope(given=true_matches(scene, (0, 1)))).tracks.num_points > 300
 
 
 def test_pairs_are_counted_in_one_go() -> None:

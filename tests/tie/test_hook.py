@@ -17,8 +17,7 @@ from barpc.options import TieOptions, read_options
 from barpc.pipeline import RunOptions, adjust
 from barpc.scene import View
 from barpc.tie import Matches, common_tracks, find_tracks
-from barpc.tie.matchers.hook import Hook, hook_files, hooked
-from barpc.tie.matchers.matcher import Prediction
+from barpc.tie.matchers.matcher import Hook, Prediction, hook_files, hooked
 from barpc.tie.matchers.matching import MATCHERS, matcher_named
 from barpc.tie.pairing.epipolar import EpipolarSegments
 from tests.lanes import rest_slow

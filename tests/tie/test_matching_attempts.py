@@ -15,7 +15,7 @@ from barpc.tie import Matches, TieOptions, tracks
 from barpc.tie.matchers import matching
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES
-from barpc.tie.matchers.matching import PairReport, _altitudes, match_pair, match_pairs
+from barpc.tie.matchers.matching import Ground, PairReport, match_pair, match_pairs
 from barpc.tie.pairing.overlaps import Pair
 from barpc.tie.tracks import _joined, _unlike, _with_unregistered
 
@@ -156,12 +156,12 @@ def test_a_matcher_that_is_named_is_what_is_wanted_unless_the_terrain_tells_stru
     second_look,
 ) -> None:
     few = [report(40)]
-    assert second_look(few, TieOptions(matcher="somewhere:match"), terrain=flat)[0] == []
+    assert second_look(few, TieOptions(matcher="somewhere:match"), ground=Ground(flat))[0] == []
     assert second_look(few, TieOptions(matcher="structure"))[0] == []
-    ((_, name, ranges),) = second_look(few, TieOptions(matcher="structure"), terrain=flat)[0]
+    ((_, name, ranges),) = second_look(few, TieOptions(matcher="structure"), ground=Ground(flat))[0]
     assert name == "structure"
     assert ranges == [(0.0, 200.0), (30.0, 130.0)]  # 150 m about the terrain, and 50
-    assert second_look([report(100)], TieOptions(matcher="structure"), terrain=flat)[0] == []
+    assert second_look([report(100)], TieOptions(matcher="structure"), ground=Ground(flat))[0] == []
 
 
 def test_altitudes_are_known_from_pairs_whose_segments_are_five_pixels_to_either_side() -> None:
@@ -170,7 +170,7 @@ def test_altitudes_are_known_from_pairs_whose_segments_are_five_pixels_to_either
         two = tuple(views(camera(0.0, lean=0.0), camera(0.0, lean=lean)))
         ground = np.column_stack([np.linspace(-1e-3, 1e-3, 201), np.zeros(201), np.linspace(0.0, 200.0, 201)])
         xy = np.stack([view.sensor.project(ground) for view in two], axis=1)
-        known = _altitudes([(two, Matches.of_places(xy, np.zeros(201)))])
+        known = Ground(None, [(two, Matches.of_places(xy, np.zeros(201)))]).altitudes()
         assert (known is not None) == tells
         if known is not None:
             assert known == pytest.approx((4.0, 196.0), abs=0.5)  # percentiles 2 and 98
@@ -249,12 +249,12 @@ def test_given_matches_are_added_where_fewer_than_are_wanted_could_be_registered
 
 def test_the_quick_score_is_of_the_strongest_and_nought_where_there_are_none(render) -> None:
     from barpc.tie.matchers.features import locate
-    from barpc.tie.store import Store, store_of
+    from barpc.tie.tasks import Store, Work, store_of
 
     scene = render(views=2, size=(300, 300))
     pair = tuple(scene.views)
     with store_of(SimpleNamespace(store=None)) as store:  # type: ignore[arg-type]
-        files = locate(pair, TieOptions(), store)
+        files = locate(pair, TieOptions(), Work(store=store))
         assert min(map(len, files)) > 500
         asked = [found.strongest(500) for found in files]
         assert all(500 <= len(few) <= 500 + len(few.boxes) for few in asked)

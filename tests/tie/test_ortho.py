@@ -11,8 +11,7 @@ from rasterio import Affine
 
 from barpc.errors import InputError
 from barpc.geodesy import metres_per_unit
-from barpc.tie.patches.channels import CHANNELS
-from barpc.tie.patches.resampled import Patch, Sheet, of_image, of_reference, picture, shown, ticks
+from barpc.tie.patches.channels import CHANNELS, Patch, Sheet, of_image, of_reference, picture, shown, ticks
 
 from .conftest import write_image
 from .test_pairs import camera, views

@@ -10,7 +10,7 @@ import pytest
 from barpc.errors import DisconnectedError, TiePointError
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
-from barpc.tie import TieOptions, select_pairs
+from barpc.tie import Scope, TieOptions, select_pairs
 from barpc.tie.pairing.overlaps import shared_tiles
 from barpc.tie.pixels import tiles
 from tests.constants import chosen
@@ -81,14 +81,14 @@ def test_one_image_is_refused() -> None:
 
 def test_the_listed_pairs_only_are_chosen_where_a_list_is_given() -> None:
     three = views(camera(0.0), camera(50 * METRE), camera(100 * METRE))
-    pairs = select_pairs(three, TieOptions(), only=[(1, 0), (2, 1)])
+    pairs = select_pairs(three, TieOptions(), Scope(only=[(1, 0), (2, 1)]))
     assert [p.views for p in pairs] == [(0, 1), (1, 2)]
 
 
 def test_listed_pairs_are_tried_where_cameras_may_be_wrong_and_others_are_not() -> None:
     """The third view lies 20 m beside the second one and 120 m beside the first."""
     three = views(camera(0.0), camera(100 * METRE), camera(620 * METRE))
-    pairs = select_pairs(three, TieOptions(search=500), only=[(0, 1), (1, 2)])
+    pairs = select_pairs(three, TieOptions(search=500), Scope(only=[(0, 1), (1, 2)]))
     assert [p.views for p in pairs] == [(0, 1), (1, 2)]
     pairs = select_pairs(three, TieOptions(search=500))
     assert [p.views for p in pairs] == [(0, 1), (0, 2), (1, 2)]
@@ -97,7 +97,7 @@ def test_listed_pairs_are_tried_where_cameras_may_be_wrong_and_others_are_not() 
 def test_all_listed_pairs_are_chosen_however_many_partners_a_view_then_has() -> None:
     many = views(*(camera(10 * METRE * k) for k in range(6)))
     listed = [(0, k) for k in range(1, 6)] + [(1, 2)]
-    pairs = select_pairs(many, TieOptions(neighbours=1), only=listed)
+    pairs = select_pairs(many, TieOptions(neighbours=1), Scope(only=listed))
     assert [p.views for p in pairs] == sorted(listed)
 
 
@@ -106,14 +106,14 @@ def test_a_listed_pair_is_tried_where_the_cameras_may_be_wrong_and_named_where_i
 ) -> None:
     four = views(*(camera(400 * METRE * k) for k in range(4)))
     listed = [(0, 1), (1, 2), (2, 3), (0, 2), (0, 3)]
-    pairs = select_pairs(four, TieOptions(search=400), only=listed)
+    pairs = select_pairs(four, TieOptions(search=400), Scope(only=listed))
     assert [p.views for p in pairs] == [(0, 1), (0, 2), (1, 2), (2, 3)]
     assert [r.message for r in caplog.records] == ["v0 - v3: listed, but they do not overlap as asked"]
 
 
 def test_listed_pairs_that_leave_groups_are_refused() -> None:
     with pytest.raises(DisconnectedError, match=r"v0, v1; v2\).*among the listed pairs"):
-        select_pairs(views(camera(0.0), camera(50 * METRE), camera(100 * METRE)), TieOptions(), only=[(0, 1)])
+        select_pairs(views(camera(0.0), camera(50 * METRE), camera(100 * METRE)), TieOptions(), Scope(only=[(0, 1)]))
 
 
 def test_too_small_an_angle_and_too_small_an_overlap_are_left_out() -> None:

@@ -18,7 +18,8 @@ from barpc.pipeline.loading import load_views
 from barpc.rpcio import read_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
-from barpc.tie.reference import PEAK, ReferenceControl, ViewMatch, _affine, _Work, peak, register_views
+from barpc.tie.reference import PEAK, Accuracy, ReferenceControl, ViewMatch, _affine, _Work, peak, register_views
+from barpc.tie.tasks import HERE
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.season import other_season, write_dem, write_reference
 from tests.scenes.terrain import Grid
@@ -103,7 +104,7 @@ def read_rpc_of(truth, name: str) -> RPC:
 @pytest.mark.slow
 def test_a_reference_that_lies_off_moves_what_it_finds(views, scene, season, dem, reference, truth, tmp_path):
     there = str(write_reference(tmp_path / "ref.tif", scene, season, GSD, shift=(6.0, -4.0)))
-    first, second = (register_views(views, [path], dem, sigma=5.0) for path in (reference, there))
+    first, second = (register_views(views, [path], dem, accuracy=Accuracy(5.0)) for path in (reference, there))
     moved = np.subtract(second.views[0].offset, first.views[0].offset)
     assert moved == pytest.approx([-6.0, 4.0], abs=0.2)
     assert second.control.bias[:2] == pytest.approx([5.0, 5.0])
@@ -222,7 +223,7 @@ def test_every_camera_of_a_plain_is_off_by_what_was_done_to_it(plains):
     seen, _, reference, _ = plains
     (first, one), (second, two) = wrong(seen[0], (20.0, -11.0)), wrong(seen[1], (-7.5, 4.25))
     assert one == pytest.approx([-41.7, -23.0], abs=0.5)  # of 2.08 m; rows run south
-    found = register_views([first, second], [reference], flat, height_sigma=(7.0, 3.0))
+    found = register_views([first, second], [reference], flat, accuracy=Accuracy(None, 7.0, 3.0))
     for match, off in zip(found.views, (one, two), strict=True):
         assert match.offset == pytest.approx(off, abs=0.2)
         assert match.peak > 3 * PEAK
@@ -260,7 +261,7 @@ def test_what_a_plain_does_not_show_is_not_found_and_what_two_files_share_is(pla
         plain(folder / "w.tif", grey[:, : WIDE // 2]),
         plain(folder / "e.tif", grey[:, WIDE // 2 :], WIDE // 2),
     ]
-    mixed = register_views(seen[:1], [far, *halves], flat, sigma=5.0)
+    mixed = register_views(seen[:1], [far, *halves], flat, accuracy=Accuracy(5.0))
     assert 150 < mixed.views[0].points < 260
     assert mixed.views[0].offset == pytest.approx([0.0, 0.0], abs=0.1)
     east = mixed.control.points.lonlatalt[:, 0] / DEGREES
@@ -283,7 +284,7 @@ def test_a_reference_is_good_to_a_quarter_of_its_pixel_and_to_half_a_metre_at_be
     monkeypatch.setattr(_Work, "vote", lambda self: [(0.0, np.zeros(2))])  # it shows nothing
     view = View("a", "", (SIDE, SIDE), camera(0.0), (0.0, 200.0))
     assert register_views([view], [str(path)], flat).sigma == pytest.approx(sigma, rel=0.02)
-    assert register_views([view], [str(path)], flat, sigma=7.0).sigma == 7.0
+    assert register_views([view], [str(path)], flat, accuracy=Accuracy(7.0)).sigma == 7.0
 
 
 # --- pieces -------------------------------------------------------------------------------------------------
@@ -297,7 +298,7 @@ def test_in_the_north_points_are_looked_for_where_the_vote_says_that_they_are_se
     view = View("north", "", (SIDE, SIDE), sensor, (0.0, 200.0))
     metres = metres_per_unit(np.array([10.0, 60.0, 0.0]))[:2]
     local = np.stack(np.meshgrid(*[np.arange(-300.0, 301.0, 20.0)] * 2), axis=-1).reshape(-1, 2)
-    work = _Work((view,), [], flat, 1, step=2.0, pixel=2.0, executor=None, progress=None)
+    work = _Work((view,), [], flat, 1, step=2.0, work=HERE)
     tiles = work._tiles(view, np.array([100.0, 0.0]), [10.0, 60.0] + local / metres, np.full(len(local), LEVEL), 8)
     found = np.isin(np.arange(len(local)), np.concatenate([tile.points for tile in tiles]))
     edge = scale[:2] * metres - 16.0  # half a template from the border

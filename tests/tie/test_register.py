@@ -256,9 +256,9 @@ def test_the_derivative_of_a_ramp_is_its_slope() -> None:
     np.testing.assert_allclose(weight, weight[::-1, ::-1], rtol=1e-6)
 
 
-@pytest.mark.parametrize(("detail", "flat"), [(0.0005, True), (0.003, False)])
-def test_a_patch_is_flat_below_a_millionth_of_its_level(detail: float, flat: bool) -> None:
-    """Of level 1000 a millionth is 0.001, some steps of float32."""
+@pytest.mark.parametrize(("detail", "flat"), [(0.00005, True), (0.003, False)])
+def test_a_patch_is_flat_below_what_float32_tells_of_its_level(detail: float, flat: bool) -> None:
+    """Of level 1000 two steps of float32 are 0.00012."""
     template = _Template(_with_derivatives(np.zeros((60, 60), np.float32)), 60, 21)
     noise = np.random.default_rng(9).normal(0, detail, (1, 21 * 21))
     patch, deviation = template._normalized((1000.0 + noise).astype(np.float32))

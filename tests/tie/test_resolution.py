@@ -13,7 +13,7 @@ from barpc.raster import open_raster
 from barpc.rpcio import read_rpc
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import altitude_range, epipolar_offset
-from barpc.tie import Matches, Pair, TieOptions, common_tracks, find_tracks
+from barpc.tie import Matches, Pair, Scope, TieOptions, common_tracks, find_tracks
 from barpc.tie.pairing.resolution import Coarser, Looks
 from barpc.tie.pixels import PixelReader, read_picture, read_pixels, survey
 from barpc.tie.tracks import _needed
@@ -197,7 +197,7 @@ def test_matches_of_others_between_two_resolutions_become_as_exact_as_our_own(sc
     wrong = rng.random(len(rows)) < 0.2
     xy[wrong, 1] = rng.uniform(7, 92, (wrong.sum(), 2))
     index = -1 - np.stack([np.arange(len(rows))] * 2, axis=1)
-    result = find_tracks([fine, coarse], given={(0, 1): Matches(xy, np.zeros(len(xy)), index)})
+    result = find_tracks([fine, coarse], scope=Scope(given={(0, 1): Matches(xy, np.zeros(len(xy)), index)}))
     assert result.tracks.num_points > 100
     one, two = common_tracks(result.tracks, 0, 1)
     errors = scene.errors(0, 1, one, 3 * two + 1.0) / 3

@@ -23,7 +23,7 @@ from barpc.tie.matchers import features
 from barpc.tie.matchers.features import KeypointFiles, Share, detect_tile, keep_tile, locate
 from barpc.tie.patches.register import _usual
 from barpc.tie.pixels import Survey, read_picture, survey, tiles
-from barpc.tie.store import Store
+from barpc.tie.tasks import Store, Work
 from barpc.workspace import Workspace
 from tests.lanes import diagonal, rest_slow
 
@@ -135,7 +135,7 @@ def test_the_caller_never_loads_keypoints(render, monkeypatch) -> None:
 def test_a_pair_reads_the_tiles_that_it_needs(pair, tmp_path, monkeypatch) -> None:
     store = Store(str(tmp_path), str(tmp_path))
     monkeypatch.setattr(features, "PER_IMAGE", 900)
-    files = locate(pair[:1], TieOptions(tile=256), store)[0]
+    files = locate(pair[:1], TieOptions(tile=256), Work(store=store))[0]
     assert 890 < len(files) <= 900
     every, numbers = files.load()
     assert sorted(numbers) == list(range(len(files)))
@@ -173,12 +173,12 @@ def test_a_finished_tile_is_not_searched_again_and_its_keys_do_not_name_the_fold
     options, keys = TieOptions(tile=256), []
     for number in range(2):
         with Workspace(tmp_path / f"run{number}") as workspace, CachingExecutor(workspace, {}) as executor:
-            files = locate(pair, options, executor.store, executor=executor)
+            files = locate(pair, options, Work(executor, store=executor.store))
             keys.append(executor.key(find_tracks, (files[0], files[1])))
             count = len(list(workspace.cache.rglob("*.npz")))
             with monkeypatch.context() as patch:
                 patch.setattr(features, "Sift", None)
-                assert locate(pair, options, executor.store, executor=executor) == files
+                assert locate(pair, options, Work(executor, store=executor.store)) == files
             tiles_of = [box for of_view in files for box in of_view.boxes]
             assert len(list(workspace.cache.glob("detect_tile/*.npz"))) == len(tiles_of) == 8
             assert len(list(workspace.cache.rglob("*.npz"))) == count  # and nothing is kept twice

@@ -28,10 +28,9 @@ from barpc.tie.matchers.matcher import NO_MATCHES, Prediction
 from barpc.tie.matchers.matching import (
     FINE,
     STRUCTURE,
-    _altitudes,
+    Ground,
     _better,
     _match_within,
-    _within,
     match_pair,
 )
 from barpc.tie.matchers.structural import (
@@ -165,21 +164,22 @@ def test_terrain_or_other_ties_narrow_the_altitudes(render, small, matched) -> N
     pair, (found, report) = small, matched
     low, high = pair[0].alt_range
     middle = 0.5 * (low + high)
-    flat = _within(pair, lambda lon, lat: np.full(len(lon), middle), (low, low))
+    flat = Ground(lambda lon, lat: np.full(len(lon), middle)).within(pair, (low, low), 150.0)
     assert flat[0].alt_range == flat[1].alt_range == (max(low, middle - 150), min(high, middle + 150))
-    assert _within(pair, None, None) == pair
-    assert _within(pair, None, (high + 1e4, high + 2e4)) == pair
-    assert _within(pair, lambda lon, lat: np.full(len(lon), np.nan), (low, low))[0].alt_range[1] == min(high, low + 150)
-    assert _within(pair, None, (middle, middle), 50.0)[0].alt_range == (
+    assert Ground().within(pair, None, 150.0) == pair
+    assert Ground().within(pair, (high + 1e4, high + 2e4), 150.0) == pair
+    nowhere = Ground(lambda lon, lat: np.full(len(lon), np.nan))
+    assert nowhere.within(pair, (low, low), 150.0)[0].alt_range[1] == min(high, low + 150)
+    assert Ground().within(pair, (middle, middle), 50.0)[0].alt_range == (
         max(low, middle - 50),
         min(high, middle + 50),
     )
-    known = _altitudes([(pair, found)])
+    known = Ground(None, [(pair, found)]).altitudes()
     seen = render(views=2, size=(300, 300)).altitude[0]
     assert known is not None
     assert abs(known[0] - np.nanpercentile(seen, 2)) < 40  # cameras as delivered
     assert abs(known[1] - np.nanpercentile(seen, 98)) < 40
-    assert _altitudes([]) is None
+    assert Ground().altitudes() is None
     assert report.matcher == STRUCTURE
 
 
@@ -197,7 +197,7 @@ def test_only_terrain_that_both_may_see_counts(seen) -> None:
         away = np.hypot((lon - flat[0, 0]) * np.cos(np.radians(lat)), lat - flat[0, 1]) * 111e3
         return np.where(away < 60.0, middle + 20.0, middle)
 
-    found = _within((first, half), hilly, None, 50.0)[0].alt_range[1]
+    found = Ground(hilly).within((first, half), None, 50.0)[0].alt_range[1]
     assert found == min(first.alt_range[1], middle + (70.0 if seen else 50.0))
 
 

@@ -17,8 +17,7 @@ from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.overlaps import Pair, shared_tiles
 from barpc.tie.pixels import CELL, Box, ByteImage, Survey, grow, read_picture, survey, tiles
-from barpc.tie.store import Store, names_of, store_of
-from barpc.tie.tasks import Progress, ordered
+from barpc.tie.tasks import Progress, Store, Work, names_of, store_of
 
 PER_CELL = 40
 """Strongest keypoints kept in a cell."""
@@ -27,8 +26,6 @@ PER_IMAGE = 100_000
 CONTRAST = 0.01
 """SIFT's contrast threshold."""
 _DEFAULTS = TieOptions()
-_MARGIN = 48  # px around what is searched at a time, so that keypoints at its border are those of the whole picture
-_FEW = 8  # keypoints of a cell, about, where an image's are few: its cells are larger
 _AMPLE = 5  # keypoints for each tie point wanted
 _ZOOMS = ((1.25e-4, 4), (2e-3, 2))
 """Keypoints wanted a px, below which so many pixels a side are looked at as one: real images hold 1200e-6, 4500e-6."""
@@ -125,9 +122,7 @@ class Share:
         return Share(PER_IMAGE / area, zoom)
 
     def expected(self, size: tuple[int, int]) -> float:
-        """Estimate the number of keypoints of an image of `size` (width, height) with detail all over, at
-        this share.
-        """
+        """Estimate the number of keypoints of an image of `size` (width, height) with detail all over."""
         return min(self.density, _HOLDS.get(self.zoom, np.inf)) * size[0] * size[1]
 
     def within(self, used: float) -> Share:
@@ -140,8 +135,8 @@ class Share:
 
     @property
     def cell(self) -> int:
-        """Side of the quota's cells [px]."""
-        return CELL * max(1, round(float(np.sqrt(_FEW / self.density)) / CELL))
+        """Side of the quota's cells [px]: each holds one keypoint, about, where they are few."""
+        return CELL * max(1, round(float(np.sqrt(1.0 / self.density)) / CELL))
 
 
 def ample_matches(options: TieOptions) -> int:
@@ -164,14 +159,14 @@ def detect_tile(
     """
     cv2.setNumThreads(1)
     zoom = share.zoom
-    window = box if found.levels else grow(box, zoom * _MARGIN, size)
+    window = box if found.levels else grow(box, zoom * CELL, size)
     picture, valid = read_picture(path, window, found, zoom, options.band)
     middle = 0.0 if found.levels else 0.5 * (zoom - 1)  # a wavelet's level holds the even pixels
     parts, side = [], zoom * options.tile
     for row in range(box[1], box[1] + box[3], side):
         for col in range(box[0], box[0] + box[2], side):
             part = (col, row, min(side, box[0] + box[2] - col), min(side, box[1] + box[3] - row))
-            near = grow((col - window[0], row - window[1], *part[2:]), zoom * _MARGIN, window[2:])
+            near = grow((col - window[0], row - window[1], *part[2:]), zoom * CELL, window[2:])
             left, top, right, below = (n // zoom for n in (near[0], near[1], near[0] + near[2], near[1] + near[3]))
             place = slice(top, below), slice(left, right)
             if valid[place].any():
@@ -223,9 +218,7 @@ def quota(xy: Array, response: Array, cell: float, most: int) -> IntArray:
 
 
 def ranked(xy: Array, response: Array, cell: float, most: int) -> IntArray:
-    """Return the indices of at most so many points (N, 2) [px]: the strongest of every cell, then the second
-    ones, and so on.
-    """
+    """Return the indices of so many points (N, 2) [px]: of every cell the strongest, then the second, and so on."""
     order = np.lexsort((xy[:, 0], xy[:, 1], -response, _cell_ranks(xy, response, cell)))
     return order[:most]
 
@@ -250,9 +243,7 @@ class KeypointFiles:
         return replace(self, counts=tuple(int(np.ceil(share * count)) for count in self.counts))
 
     def load(self, wanted: Sequence[Box] | None = None) -> tuple[Keypoints, IntArray]:
-        """Return the keypoints of some tiles (None: of all), by row and column in a tile, and their numbers
-        within the view.
-        """
+        """Return the keypoints of some tiles (None: of all), by row and column in a tile, and their numbers."""
         parts, numbers, first = [], [np.empty(0, dtype=np.int64)], self.start
         chosen = set(self.boxes if wanted is None else wanted)
         for box, name, count in zip(self.boxes, self.names, self.counts, strict=True):
@@ -289,9 +280,7 @@ def _unpacked(arrays: dict[str, npt.NDArray[Any]], box: Box) -> Keypoints:
 
 
 def allotted(found: IntArray, area: Array, most: int) -> IntArray:
-    """Return the numbers of keypoints (T,) of the tiles, `most` together: by area; poor tiles leave theirs to
-    the rest.
-    """
+    """Return the numbers of keypoints (T,) of tiles, `most` together: by area; poor tiles leave theirs to the rest."""
     if found.sum() <= most:
         return found
     order = np.argsort(found / area, kind="stable")
@@ -305,20 +294,19 @@ def allotted(found: IntArray, area: Array, most: int) -> IntArray:
 def locate(
     views: Sequence[View],
     options: TieOptions,
-    store: Store,
+    work: Work,
     *,
     pairs: Sequence[Pair] | None = None,
     area: Area | None = None,
     coarse: bool = False,
-    executor: Executor | None = None,
-    progress: Progress | None = None,
 ) -> list[KeypointFiles]:
-    """Detect the keypoints of every view into files of a store; none in an image in which nothing varies.
+    """Detect the keypoints of every view into files of the store; none in an image in which nothing varies.
 
     With `pairs`, tiles that no partner may see are not read, nor those outside `area`; with `coarse` images are looked
-    at in less detail, and for fewer keypoints; the rest as for `find_tracks`.
+    at in less detail, and for fewer keypoints.
     """
-    found = ordered(executor, survey, [(v.path, options.band, v.size) for v in views], "read", progress)
+    assert work.store is not None
+    found = work.ordered(survey, [(v.path, options.band, v.size) for v in views], "read")
     shares = [Share.of(view.size, options, coarse) for view in views]
     each = zip(views, found, shares, strict=True)
     boxes = [tiles(v.size, options, share.zoom, known) if known else [] for v, known, share in each]
@@ -331,15 +319,15 @@ def locate(
         for view, known, share, of_view in zip(views, found, shares, boxes, strict=True)
         for box in of_view
     ]
-    names = [f"{name}{'-coarse' * coarse}" for name in names_of(executor, detect_tile, tasks)]
-    keeping = [(store, name, task) for name, task in zip(names, tasks, strict=True)]
-    counts = np.array(ordered(executor, keep_tile, keeping, "detect", progress), dtype=np.int64)
+    names = [f"{name}{'-coarse' * coarse}" for name in names_of(work.executor, detect_tile, tasks)]
+    keeping = [(work.store, name, task) for name, task in zip(names, tasks, strict=True)]
+    counts = np.array(work.ordered(keep_tile, keeping, "detect"), dtype=np.int64)
     files, first = [], 0
     for of_view, share in zip(boxes, shares, strict=True):
         part = slice(first, first := first + len(of_view))
         areas = np.array([float(box[2] * box[3]) for box in of_view])
         kept = allotted(counts[part], areas, int(share.density * areas.sum() + 1e-6))
-        files.append(KeypointFiles(store, tuple(of_view), tuple(names[part]), tuple(kept.tolist())))
+        files.append(KeypointFiles(work.store, tuple(of_view), tuple(names[part]), tuple(kept.tolist())))
     return files
 
 
@@ -354,5 +342,5 @@ def detect(
 ) -> list[Keypoints]:
     """Detect the keypoints of every view in memory; the rest as for `locate`."""
     with store_of(executor) as store:
-        files = locate(views, options, store, pairs=pairs, area=area, executor=executor, progress=progress)
+        files = locate(views, options, Work(executor, progress, store), pairs=pairs, area=area)
         return [of_view.load()[0] for of_view in files]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import replace
 from typing import ClassVar
 
@@ -16,7 +15,7 @@ from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import Matches, Prediction
 from barpc.tie.matchers.matching import PairReport, match_pair
 from barpc.tie.pairing.overlaps import Pair
-from barpc.tie.tasks import Progress, ordered
+from barpc.tie.tasks import Work
 
 logger = logging.getLogger(__name__)
 
@@ -49,9 +48,7 @@ def verify_given(
     given: GivenMatches,
     pairs: Sequence[Pair],
     options: TieOptions,
-    *,
-    executor: Executor | None = None,
-    progress: Progress | None = None,
+    work: Work,
 ) -> list[tuple[Matches, PairReport]]:
     """Verify given matches of each pair against the cameras, with its report: `match_pair` with what is given."""
     chosen = replace(options, matcher=_GIVEN)
@@ -61,7 +58,7 @@ def verify_given(
         points = (_keypoints(given[pair.views], 0), _keypoints(given[pair.views], 1))
         tasks.append((ends, points, pair, chosen))
     verified = []
-    for pair, (found, report) in zip(pairs, ordered(executor, match_pair, tasks, "verify", progress), strict=True):
+    for pair, (found, report) in zip(pairs, work.ordered(match_pair, tasks, "verify"), strict=True):
         if report.status == "too few keypoints":
             report = replace(report, status="too few matches given")
         if report.status != "ok":

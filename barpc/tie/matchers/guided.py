@@ -21,7 +21,6 @@ FloatArray = npt.NDArray[np.float32]
 CLEAR_RATIO = 0.8
 """Largest ratio where only clear matches count."""
 _MAX_TURN = np.radians(30.0)  # between the orientation seen and the one expected
-_MAX_ZOOM = np.log(1.8)  # the same for the scale
 _APART = 2.0  # px; nearer candidates are the same point
 _NONE = np.float32(-2.0)  # below every cosine
 _ROWS = 64  # points of A, near each other, that are compared with all their candidates at a time,
@@ -29,7 +28,7 @@ _CANDIDATES = 1 << 18  # as long as these products stay in cache
 
 
 class Guided:
-    """Mutual best descriptors of like scale and orientation among the candidates inside the bands."""
+    """Mutual best descriptors of like orientation among the candidates inside the bands."""
 
     detects: ClassVar[bool] = True
 
@@ -63,12 +62,11 @@ class Guided:
 
 @dataclass(frozen=True, eq=False)
 class _Described:
-    """Descriptors and their lengths, with orientation and scale as they should be in B."""
+    """Descriptors and their lengths, with the orientation that they should have in B."""
 
     values: FloatArray  # whole numbers: their products are exact in any order of summing, on any machine
     length: FloatArray
     direction: FloatArray
-    zoom: FloatArray
 
     @staticmethod
     def of(keypoints: Keypoints, linear: Array) -> _Described:
@@ -76,19 +74,15 @@ class _Described:
         length = np.maximum(np.linalg.norm(values, axis=1), np.float32(1e-6))
         turned = np.stack([np.cos(keypoints.angle), np.sin(keypoints.angle)], axis=-1) @ linear.T
         turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-9)
-        zoom = np.log(keypoints.scale * np.sqrt(np.abs(np.linalg.det(linear))))
-        return _Described(values, length, turned.astype(np.float32), zoom.astype(np.float32))
+        return _Described(values, length, turned.astype(np.float32))
 
     def select(self, which: IntArray) -> _Described:
         """Return those of some keypoints."""
-        return _Described(self.values[which], self.length[which], self.direction[which], self.zoom[which])
+        return _Described(self.values[which], self.length[which], self.direction[which])
 
     def likeness(self, other: _Described, allowed: npt.NDArray[np.bool_]) -> FloatArray:
-        """Return the cosines (n, m) of the descriptors that are allowed, where orientation and scale are as
-        expected; else `_NONE`.
-        """
+        """Return the cosines (n, m) of descriptors whose orientation is as expected; else `_NONE`."""
         allowed &= self.direction @ other.direction.T >= np.float32(np.cos(_MAX_TURN))
-        allowed &= np.abs(other.zoom - self.zoom[:, None]) <= np.float32(_MAX_ZOOM)
         cosine = self.values @ other.values.T / (self.length[:, None] * other.length)
         return np.where(allowed, cosine, _NONE)
 
@@ -103,9 +97,7 @@ class _Best:
         self._top_b = np.full(size_b, _NONE)
 
     def update(self, rows: IntArray, cols: IntArray, likeness: FloatArray, du: Array, dw: Array) -> None:
-        """Take in the cosines (n, m) of all candidates of some points of A, and their places about the predicted
-        ones.
-        """
+        """Take in the cosines (n, m) of candidates of some points of A, and their places about the predicted ones."""
         back = likeness.argmax(axis=0)
         top = likeness[back, np.arange(len(cols))]
         more = top > self._top_b[cols]
@@ -133,9 +125,7 @@ class _Best:
 def _near(
     where: EpipolarSegments, across: float, wanted: IntArray, turned: Array
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield points of A whose bands lie near each other, and the points of B, `turned` (N, 2) as the frame is, about
-    all these bands; both ascending.
-    """
+    """Yield points of A whose bands lie near each other, and the points of B, `turned`, about these; ascending."""
     rows = wanted[np.isfinite(where.along + where.across + where.slope)[wanted]]
     if not len(rows):
         return

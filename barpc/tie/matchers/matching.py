@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -24,8 +23,7 @@ from barpc.options import TieOptions
 from barpc.scene import IntArray, View
 from barpc.tie.matchers.features import THIN, KeypointFiles, Keypoints, ample_matches, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
-from barpc.tie.matchers.hook import Hook, hooked
-from barpc.tie.matchers.matcher import NO_MATCHES, Matcher, Matches, Prediction
+from barpc.tie.matchers.matcher import NO_MATCHES, Hook, Matcher, Matches, Prediction, hooked
 from barpc.tie.matchers.structural import FineStructure, GradientStructure
 from barpc.tie.pairing.epipolar import (
     FEW,
@@ -37,9 +35,8 @@ from barpc.tie.pairing.epipolar import (
     robust_affine,
     robust_spread,
 )
-from barpc.tie.pairing.overlaps import Pair, reach_of, shared_tiles
-from barpc.tie.patches.resampled import Terrain
-from barpc.tie.tasks import Progress, ordered
+from barpc.tie.pairing.overlaps import Pair, Terrain, reach_of, shared_tiles
+from barpc.tie.tasks import HERE, Work
 
 STRUCTURE = "structure"
 """What tries again where another matcher finds few."""
@@ -63,13 +60,11 @@ _DEFAULTS = TieOptions()
 _PASSES = ((20.0, 1500), (80.0, 2000), (float("inf"), 3000))
 """Blind passes: half width [px] (the last: `search`), points of A that are tried."""
 _PEAK = 4.0  # px, width of the window in which true matches of a blind pass fall
-_LEAST_PEAK = 8  # matches
 _SIGNIFICANT = 6.0  # standard deviations
 _NOWHERE = "no common offset"
 _CLEAR = 0.4  # share of the matches that makes wider passes needless
 FALSE_SHARE = 0.01
 """Share of false matches that is accepted, as control bands estimate it."""
-_FALSE_SHARE_TIGHT = 0.05  # of the tight pass, which only serves the local one
 _NEIGHBOURS = 12
 _LOOSE = (
     0.95,
@@ -107,10 +102,47 @@ class PairReport:
 
     @property
     def means(self) -> str:
-        """Method that found the matches, whether with loosened thresholds, and whether keypoints tie the pair
-        themselves.
-        """
+        """Method that found the matches, whether with loosened thresholds, and whether keypoints tie the pair."""
         return self.matcher + ", loosened" * self.loosened + ", by keypoints" * bool(self.unregistered)
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """What is known of the altitudes of the ground: a terrain, and the matches of pairs that have enough."""
+
+    terrain: Terrain | None = None
+    ties: Sequence[tuple[tuple[View, View], Matches]] = ()
+
+    def altitudes(self) -> tuple[float, float] | None:
+        """Return the lowest and the highest altitude [m] that most matches lie at."""
+        found = []
+        for views, matches in self.ties:
+            where, (low, high) = frame(*views, matches.xy[:, 0]), common_range(*views)
+            if np.median(where.after) >= LEAST_REACH:
+                along = where.errors(matches.xy[:, 1])[:, 0] / where.after
+                found.append(0.5 * (low + high) + 0.5 * (high - low) * np.percentile(along, [2, 98]))
+        return (float(np.min(found)), float(np.max(found))) if found else None
+
+    def within(self, views: tuple[View, View], known: tuple[float, float] | None, margin: float) -> tuple[View, View]:
+        """Return two views with fewer altitudes: those of the terrain, or else `known` ones, with a margin [m]."""
+        low, high = common_range(*views)
+        if self.terrain is not None:
+            axes = (np.linspace(0.0, length - 1.0, _PROBES) for length in views[0].size)
+            xy = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+            ground = views[0].sensor.localize(xy, np.full(len(xy), 0.5 * (low + high)))
+            heights = self.terrain(ground[:, 0], ground[:, 1])
+            other = views[1].sensor.project(np.column_stack([ground[:, :2], heights]))
+            with np.errstate(invalid="ignore"):
+                seen = ((other > -_BESIDE) & (other < np.add(views[1].size, _BESIDE))).all(axis=1)
+            heights = heights[seen & np.isfinite(heights)]
+            known = (float(heights.min()), float(heights.max())) if len(heights) else known
+        if known is None or known[0] - margin > high or known[1] + margin < low:
+            return views
+        within = max(low, known[0] - margin), min(high, known[1] + margin)
+        return replace(views[0], alt_range=within), replace(views[1], alt_range=within)
+
+
+_UNKNOWN = Ground()
 
 
 def match_pair(
@@ -184,9 +216,7 @@ def _attempt(
     looked: dict[str, _Search] | None = None,
     false_share: float | None = None,
 ) -> tuple[Matches, PairReport]:
-    """Return all passes over a pair with one matcher and its thresholds; by its name, what was `looked` at is
-    known to the next attempt.
-    """
+    """Return all passes over a pair with one matcher; what it `looked` at is known to the next attempt."""
     names, counts = (views[0].name, views[1].name), (len(keypoints[0]), len(keypoints[1]))
     report = PairReport(
         names,
@@ -208,7 +238,7 @@ def _attempt(
     coarse = search.offset()
     if coarse is None:
         return NO_MATCHES, replace(report, status=f"{_NOWHERE} within {search.reach:.4g} px")
-    tight, _ = search.trusted(coarse, _FALSE_SHARE_TIGHT)
+    tight, _ = search.trusted(coarse, _LOOSE[1])
     report = replace(report, matches=len(tight))
     if len(tight) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches")
@@ -237,9 +267,7 @@ def _loaded(
     keypoints: tuple[Keypoints | KeypointFiles, Keypoints | KeypointFiles],
     options: TieOptions,
 ) -> tuple[tuple[Keypoints, Keypoints], tuple[IntArray, IntArray] | None]:
-    """Return the keypoints of the tiles that both views may see, and their numbers within the views; None: as
-    they stand.
-    """
+    """Return the keypoints of the tiles that both views may see, and their numbers; None: as they stand."""
     a, b = keypoints
     if isinstance(a, Keypoints) or isinstance(b, Keypoints):
         assert isinstance(a, Keypoints)
@@ -260,48 +288,48 @@ def quick_score(views: tuple[View, View], keypoints: tuple[KeypointFiles, Keypoi
     return 0 if coarse is None else len(search.trusted(coarse, _LOOSE[1])[0])
 
 
+def first_look(
+    views: Sequence[View], keypoints: Sequence[KeypointFiles], pairs: Sequence[Pair], options: TieOptions, work: Work
+) -> list[tuple[Matches, PairReport]]:
+    """Try each pair's keypoints of a first look once: `ample` says of which pairs that is all that they need."""
+    return work.ordered(_attempt, _tasks(views, keypoints, pairs, options), "match")
+
+
+def _tasks(
+    views: Sequence[View], keypoints: Sequence[Keypoints | KeypointFiles], pairs: Sequence[Pair], options: TieOptions
+) -> list[tuple[tuple[View, View], tuple[Any, Any], Pair, TieOptions]]:
+    ends = [(pair, *pair.views) for pair in pairs]
+    return [((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options) for pair, i, j in ends]
+
+
 def match_pairs(
     views: Sequence[View],
     keypoints: Sequence[Keypoints | KeypointFiles],
     pairs: Sequence[Pair],
     options: TieOptions = _DEFAULTS,
-    *,
-    terrain: Terrain | None = None,
-    before: Sequence[tuple[tuple[View, View], Matches]] = (),
-    once: bool = False,
-    executor: Executor | None = None,
-    progress: Progress | None = None,
+    ground: Ground = _UNKNOWN,
+    work: Work = HERE,
 ) -> list[tuple[Matches, PairReport]]:
-    """Match every pair, each with its report: `match_pair` over all pairs, and `STRUCTURE` where it finds
-    few.
+    """Match every pair, each with its report: `match_pair` over all, and `STRUCTURE` where it finds few.
 
-    `terrain`, or else the matches of other pairs, some of them found `before`, tell the altitudes at which that looks.
-    With `once` a first look's keypoints are tried once: `ample` says of which pairs that is all that they need.
+    `ground`, or else the matches of other pairs, tells the altitudes at which that looks.
     """
-    ends = [(pair, *pair.views) for pair in pairs]
-    tasks = [((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options) for pair, i, j in ends]
-    work = _attempt if once else match_pair
-    found: list[tuple[Matches, PairReport]] = ordered(executor, work, tasks, "match", progress)
-    if once:
-        return found
-    thin = [k for k, (_, report) in enumerate(found) if not enough(report)]
+    tasks = _tasks(views, keypoints, pairs, options)
+    found: list[tuple[Matches, PairReport]] = work.ordered(match_pair, tasks, "match")
     named = options.matcher != _DEFAULTS.matcher
-    if not thin or (named and (options.matcher != STRUCTURE or terrain is None)):  # a name is what is wanted
+    if named and (options.matcher != STRUCTURE or ground.terrain is None):  # a name is what is wanted
         return found
-    good = [(tasks[k][0], matches) for k, (matches, report) in enumerate(found) if enough(report)]
-    known = _altitudes([*before, *good])
+    thin = [k for k, (_, report) in enumerate(found) if not enough(report) and "keypoints" not in report.status]
+    good = [(task[0], one[0]) for task, one in zip(tasks, found, strict=True) if thin and enough(one[1])]
+    known = Ground(ground.terrain, (*ground.ties, *good)).altitudes() if thin else None
     none, other = join_keypoints([]), replace(options, matcher=STRUCTURE)
     again = [
-        ([_within(tasks[k][0], terrain, known, margin) for margin in _MARGINS], (none, none), pairs[k], other)
+        ([ground.within(tasks[k][0], known, margin) for margin in _MARGINS], (none, none), pairs[k], other)
         for k in thin
-        if "keypoints" not in found[k][1].status
     ]
-    tried: list[tuple[Matches, PairReport]] = ordered(executor, _match_within, again, STRUCTURE, progress)
-    of_pair = dict(zip((task[2].views for task in again), tried, strict=True))
-    return [
-        _better(one, of_pair[pair.views]) if pair.views in of_pair else one
-        for pair, one in zip(pairs, found, strict=True)
-    ]
+    for k, one in zip(thin, work.ordered(_match_within, again, STRUCTURE), strict=True):
+        found[k] = _better(found[k], one)
+    return found
 
 
 def _match_within(
@@ -316,41 +344,6 @@ def _match_within(
         if not enough(tried[-1][1]) and views[0].alt_range != several[0][0].alt_range:
             tried.append(match_pair(views, keypoints, pair, options))
     return _better(*tried)
-
-
-def _altitudes(ties: Sequence[tuple[tuple[View, View], Matches]]) -> tuple[float, float] | None:
-    """Return the lowest and the highest altitude [m] that most matches of some pairs lie at."""
-    found = []
-    for views, matches in ties:
-        where, (low, high) = frame(*views, matches.xy[:, 0]), common_range(*views)
-        if np.median(where.after) >= LEAST_REACH:
-            along = where.errors(matches.xy[:, 1])[:, 0] / where.after
-            found.append(0.5 * (low + high) + 0.5 * (high - low) * np.percentile(along, [2, 98]))
-    return (float(np.min(found)), float(np.max(found))) if found else None
-
-
-def _within(
-    views: tuple[View, View],
-    terrain: Terrain | None,
-    known: tuple[float, float] | None,
-    margin: float = _MARGINS[0],
-) -> tuple[View, View]:
-    """Return two views with fewer altitudes: those of the terrain, or else known ones, with a margin."""
-    low, high = common_range(*views)
-    if terrain is not None:
-        axes = (np.linspace(0.0, length - 1.0, _PROBES) for length in views[0].size)
-        xy = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-        ground = views[0].sensor.localize(xy, np.full(len(xy), 0.5 * (low + high)))
-        heights = terrain(ground[:, 0], ground[:, 1])
-        other = views[1].sensor.project(np.column_stack([ground[:, :2], heights]))
-        with np.errstate(invalid="ignore"):
-            seen = ((other > -_BESIDE) & (other < np.add(views[1].size, _BESIDE))).all(axis=1)
-        heights = heights[seen & np.isfinite(heights)]
-        known = (float(heights.min()), float(heights.max())) if len(heights) else known
-    if known is None or known[0] - margin > high or known[1] + margin < low:
-        return views
-    within = max(low, known[0] - margin), min(high, known[1] + margin)
-    return replace(views[0], alt_range=within), replace(views[1], alt_range=within)
 
 
 def _latest(where: Callable[[Array], EpipolarSegments]) -> Callable[[Array], EpipolarSegments]:
@@ -463,7 +456,7 @@ class _Search:
 
         prediction = replace(self._predicted(everywhere, width), probes=probes)
         found = self._matcher.match(*self._views, prediction)
-        if len(found) < _LEAST_PEAK:
+        if not len(found):
             return None
         errors = self.errors(found)
         values = np.sort(errors[:, 1])
@@ -472,7 +465,7 @@ class _Search:
         middle = float(np.median(values[start : start + most]))
         chance = (len(values) - most) * _PEAK / (2 * width)
         significance = (most - chance) / np.sqrt(chance + 1.0)
-        if most < _LEAST_PEAK or significance < _SIGNIFICANT or abs(middle) > width - _PEAK:
+        if significance < _SIGNIFICANT or abs(middle) > width - _PEAK:
             return None
         inside = np.abs(errors[:, 1] - middle) <= _PEAK
         across = robust_affine(found.xy[inside, 0], errors[inside, 1])

@@ -22,16 +22,15 @@ from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments, grouped, linear_map
 from barpc.tie.patches.oriented import HALF, TILE, PatchTile, Sampling, found_about, resolution
-from barpc.tie.pixels import MEMORY, Box, FloatImage
+from barpc.tie.pixels import PIECE, Box, FloatImage
 
-_SURFACE = MEMORY // 30  # places at which a tile's points are compared, all together, in bytes each
 _POINTS = 200, 500, 1000  # looked for: of the cameras' error, in long bands, in short ones
 _FINE_POINTS = 600, 1500  # of the cameras' error, in bands, where whole pixels are looked at
 _RING = 3.5  # pitches about a point whose neighbours speak for its places, together
 _SAY = 4.0  # times as loud as it does itself. Of four pairs that were hardest 1 is tied by 1.5 and 1, 3 by this
 _SMALLEST = 60  # px of a side of the common part, in the coarsest picture
 _BENT = 2  # px by which their parallax may differ, and does not count
-_LONG, _LONGER = 48.0, 130.0  # px of half a band
+_LONG = 130.0  # px of half a band
 
 
 class GradientStructure:
@@ -99,7 +98,7 @@ class _Search:
         if self._whole:
             wanted, count = 1, _FINE_POINTS[self._prediction.probes is None]
         elif self._prediction.probes is None:
-            wanted, count = (4, _POINTS[1]) if half > _LONGER else (2, _POINTS[1 + (half < _LONG)])
+            wanted, count = (4, _POINTS[1]) if half > _LONG else (2, _POINTS[2])
         else:
             width = self._prediction.half_width  # a twentieth of the image, or the altitudes, may be wide
             wanted, count = int(max(width / 20.0, min(half / 80.0, 4.0), 2.0)), _POINTS[0]
@@ -161,7 +160,7 @@ class _Search:
         turned = np.abs(np.linalg.inv(self._step * linear) @ axes.T)
         whole = np.abs(np.linalg.inv(self._step * linear)) @ self._files[1][1]
         reach = np.ceil(np.minimum(turned @ [longest, wide], whole)).astype(np.int64) + 1
-        if len(rows) > 1 and len(rows) * (2 * reach + 1).prod() > _SURFACE:
+        if len(rows) > 1 and len(rows) * (2 * reach + 1).prod() > 2 * PIECE:
             order = rows[np.argsort(at[:, np.ptp(at, axis=0).argmax()], kind="stable")]
             halves = [self._tile(where, np.sort(half)) for half in np.array_split(order, 2)]
             first, second, third = (np.concatenate(column) for column in zip(*halves, strict=True))
@@ -186,9 +185,7 @@ class _Search:
         return at[ok], tile.in_b(place)[ok], 1.0 - score[ok]
 
     def _part_in_b(self, where: EpipolarSegments, middle: Array, rows: IntArray, wide: float) -> tuple[float, float]:
-        """Return the middle and half the length [px] of what a tile's segments have in B, from their middles:
-        one for all.
-        """
+        """Return the middle and half the length [px] of what a tile's segments have in B, from their middles."""
         start = where.place(middle)[rows]
         step = where.place(middle + 1.0)[rows] - start
         size = np.array(self._files[1][1], dtype=np.float64)

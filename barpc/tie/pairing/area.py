@@ -75,9 +75,7 @@ def read_area(path: str | os.PathLike[str]) -> Area:
 
 
 def _valid(polygon: shapely.Polygon) -> shapely.Geometry:
-    """Return a polygon whose outline does not cross itself; ValueError where it does more often than can be
-    untangled.
-    """
+    """Return a polygon whose outline does not cross itself; ValueError where it does too often to be untangled."""
     if polygon.is_valid:
         return polygon
     rings = [np.asarray(ring.coords) for ring in (polygon.exterior, *polygon.interiors)]

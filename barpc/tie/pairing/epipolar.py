@@ -86,9 +86,7 @@ def frame(first: View, second: View, xy: Array, axis: Array | None = None) -> Ep
 
 
 def linear_map(first: View, second: View, xy: Array) -> Array:
-    """Return the derivative (..., 2, 2) of the place in B by that in A (..., 2) [px] at mid altitude;
-    identity if one fails.
-    """
+    """Return d(B)/d(A) (..., 2, 2) at places of A (..., 2) [px], at mid altitude; identity where a camera fails."""
     alt = 0.5 * sum(common_range(first, second))
     ground = first.sensor.localize(xy, np.full(xy.shape[:-1], alt))
     by_a, by_b = (view.sensor.project_jacobian(ground)[1][..., :2] for view in (first, second))

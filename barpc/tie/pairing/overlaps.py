@@ -1,11 +1,18 @@
-"""Which views can be matched: footprints that overlap under a useful angle, in an area."""
+"""Which views can be matched, footprints that overlap under a useful angle, and which pairs are tried.
+
+Without dates, overlap and angle decide, and pairs that fail are replaced as long as views are not connected. Two dates
+may share no grey value: where the views are of several, pairs are compared by a few keypoints first
+(`quick_score` of the matchers), those most alike are tried, and two paths lead to every view where there are two.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import compress
+from math import isfinite
+from typing import Any
 
 import numpy as np
 import shapely
@@ -13,7 +20,7 @@ import shapely
 from barpc.errors import DisconnectedError, TiePointError
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.options import TieOptions
-from barpc.scene import View, connected_groups
+from barpc.scene import View, connected_groups, connected_labels
 from barpc.sensor.geometry import Several, convergence_angle, footprint, ground_sample_distance
 from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.epipolar import common_range
@@ -21,12 +28,39 @@ from barpc.tie.pixels import Box, tiles
 
 logger = logging.getLogger(__name__)
 
+Link = tuple[int, int]
+Terrain = Callable[[Array, Array], Array]
+"""lon, lat (...) [deg] -> altitude (...) [m above the ellipsoid], NaN where it is unknown."""
+
 _BEST_ANGLE = 15.0  # deg; matches are many and heights still well determined; so many more, and it is worth 1 / e
 ASTRAY = 700.0
 """How far two cameras may be wrong about each other [m]: by 350 m each, as SPOT 1 to 4 state it, the worst of all."""
 _REACH = 20.0, 700.0  # px that are searched at least and at most, unless another number is asked for
 GIVEN = "given"
 """Why a pair is tried that others have matched."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scope:
+    """What of a block is looked at, and what is known of it beside its cameras.
+
+    Parameters
+    ----------
+    only : sequence of (int, int), these pairs, all that overlap, and no others; empty: the best
+    area : Area, optional, in which tie points are looked for, as the cameras see it; None: everywhere
+    given : mapping of (int, int), ascending, to Matches: verified and registered as those of the other pairs, which are
+        matched here. Where too few can be registered, they keep their places with the measured standard deviation
+    terrain : callable, optional, lon, lat (n,) [deg] -> altitude [m above the ellipsoid], NaN outside: narrows the
+        search for structure
+    """
+
+    only: Sequence[Link] = ()
+    area: Area | None = None
+    given: Mapping[Link, Any] = field(default_factory=dict)
+    terrain: Terrain | None = None
+
+
+EVERYWHERE = Scope()
 
 
 @dataclass(frozen=True)
@@ -122,28 +156,8 @@ def _overlapping_at(prints: Footprints, views: Sequence[View], options: TieOptio
     return [Pair((i, j), share, turn) for i, j, share, turn in zip(*found, strict=True)]
 
 
-def possible_pairs(
-    views: Sequence[View],
-    options: TieOptions,
-    *,
-    only: Sequence[tuple[int, int]] = (),
-    area: Area | None = None,
-    given: Collection[tuple[int, int]] = (),
-) -> list[Pair]:
-    """Return the pairs of views that can be matched, ascending.
-
-    Parameters
-    ----------
-    views : sequence of View
-        At least two.
-    options : TieOptions
-        `min_overlap`, `angles`.
-    only : sequence of (int, int)
-        These pairs, all that overlap, and no others.
-    area : Area, optional
-        Area in which the overlap counts; None: everywhere.
-    given : collection of (int, int)
-        Pairs, ascending, that are matched already: they are among those returned, overlap or not.
+def possible_pairs(views: Sequence[View], options: TieOptions, scope: Scope = EVERYWHERE) -> list[Pair]:
+    """Return the pairs of views that can be matched, ascending; those that are given, overlap or not.
 
     Raises
     ------
@@ -154,22 +168,22 @@ def possible_pairs(
     """
     if len(views) < 2:
         raise TiePointError(f"{len(views)} image given: tie points need at least two that overlap")
-    wanted = {(min(pair), max(pair)) for pair in only}
-    pairs = _candidates(views, options, wanted, area)
+    wanted = {(min(pair), max(pair)) for pair in scope.only}
+    pairs = _candidates(views, options, wanted, scope.area)
     where = "between them" + (" among the listed pairs" if wanted else "")
-    where += " inside the area of interest" if area is not None else ""
+    where += " inside the area of interest" if scope.area is not None else ""
     require_connected(
         views,
-        [*(pair.views for pair in pairs), *given],
+        [*(pair.views for pair in pairs), *scope.given],
         f"no overlap of at least {options.min_overlap:.0%} under {options.angles[0]:g} to "
         f"{options.angles[1]:g} deg {where}; remove the stray images (--keep-going keeps the largest group), or lower "
         "min_overlap ([tie] of a file given with --options)",
     )
     for i, j in sorted(wanted - {pair.views for pair in pairs}):
         logger.warning("%s - %s: listed, but they do not overlap as asked", views[i].name, views[j].name)
-    found = {pair: Pair(pair, *(float("nan"),) * 2) for pair in given}
+    found = {pair: Pair(pair, *(float("nan"),) * 2) for pair in scope.given}
     found |= {pair.views: pair for pair in pairs}
-    said = {**dict.fromkeys(wanted, "listed"), **dict.fromkeys(given, GIVEN)}
+    said = {**dict.fromkeys(wanted, "listed"), **dict.fromkeys(scope.given, GIVEN)}
     return [replace(p, reason=said.get(views, p.reason)) for views, p in sorted(found.items())]
 
 
@@ -179,9 +193,7 @@ def _candidates(
     wanted: set[tuple[int, int]],
     area: Area | None,
 ) -> list[Pair]:
-    """Return the pairs that overlap, of those wanted (none: all); with grown outlines where that leaves
-    something out.
-    """
+    """Return the pairs that overlap, of those wanted (none: all); outlines grow where something is left out."""
     pairs = overlapping_pairs(views, options, area=area)
     pairs = [pair for pair in pairs if not wanted or pair.views in wanted]
     known = {pair.views for pair in pairs}
@@ -216,9 +228,7 @@ def shared_tiles(
     area: Area | None = None,
     boxes: Sequence[Sequence[Box]] | None = None,
 ) -> list[list[Box]]:
-    """Return the tiles (or `boxes`) of every view that a partner may see in the area, with cameras wrong by
-    `reach_of`.
-    """
+    """Return the tiles (or `boxes`) of every view that a partner may see in the area, cameras wrong by `reach_of`."""
     boxes = boxes or [tiles(view.size, options) for view in views]
     seen = [np.zeros(len(of_view), dtype=bool) for of_view in boxes]
     partners: list[list[int]] = [[] for _ in views]
@@ -240,3 +250,148 @@ def shared_tiles(
             windows = shapely.polygons(prints.plane(ground[..., :2]))
             seen[i] |= unknown | np.asarray(shapely.intersects(windows, partly))
     return [list(compress(*both)) for both in zip(boxes, seen, strict=True)]
+
+
+SAME_DATE, CONNECTS, PATH, BEYOND = "same date", "connects all", "second path", "between groups"
+"""Why a pair is tried."""
+COMPARED = 48
+"""Partners of a view, the best by overlap and angle, that are compared with it."""
+TRIES = (2, 4, 8)
+"""Round by round: so many pairs lead to what is not tied yet, where there are so many."""
+_BEYOND = 4  # partners of a view, for each of which one more is of another group
+
+
+def select_pairs(views: Sequence[View], options: TieOptions, scope: Scope = EVERYWHERE) -> list[Pair]:
+    """Choose the pairs of views to match, ascending, by overlap and angle: the best partners of every view (as many as
+    `options.neighbours`), and a spanning tree; errors as of `possible_pairs`.
+    """
+    pairs = possible_pairs(views, options, scope)
+    return pairs if scope.only else best_pairs(pairs, len(views), options.neighbours)
+
+
+def several_dates(views: Sequence[View]) -> bool:
+    """Return whether the views are known to be of more than one date."""
+    return len({view.date for view in views if view.date}) > 1
+
+
+def judged(views: Sequence[View], pair: Pair, likeness: int) -> Pair:
+    """Return a pair with its quick score and the reason for choosing it."""
+    dates = {views[i].date for i in pair.views}
+    same = len(dates) == 1 and dates != {""} and likeness
+    return replace(pair, likeness=likeness, reason=SAME_DATE if same else f"quick score {likeness}")
+
+
+def _order(pair: Pair) -> tuple[int, int, float, Link]:
+    """Return the order: one date, then by what is in common, then by overlap and angle; last who have nothing."""
+    if not isfinite(pair.score):
+        return 3, 0, 0.0, pair.views
+    if pair.reason == SAME_DATE:
+        return 0, 0, -pair.score, pair.views
+    return 1 + (pair.likeness == 0), -(pair.likeness or 0), -pair.score, pair.views
+
+
+def best_pairs(pairs: Sequence[Pair], num_views: int, neighbours: int, twice: bool = False) -> list[Pair]:
+    """Choose the best partners of every view, and pairs that connect all views, `twice` by two paths,
+    ascending.
+
+    Pairs of one date take half of a view's partners at first, then what others leave. Pairs that are given are kept.
+    """
+    ranked = sorted(pairs, key=_order)
+    tree = {ranked[k].views for k in forests([pair.views for pair in ranked], num_views, 1)}
+    chosen = {pair.views: pair for pair in ranked if pair.reason == GIVEN}
+    taken, half = [0] * num_views, (neighbours + 1) // 2
+    seen: set[Link] = set()
+    for again in (False, True):
+        for pair in ranked:
+            i, j = pair.views
+            most = half if pair.reason == SAME_DATE and not again else neighbours
+            wanted = min(taken[i], taken[j]) < most
+            if pair.views not in seen and (wanted or pair.views in tree):
+                seen.add(pair.views)
+                chosen.setdefault(pair.views, pair if wanted else replace(pair, reason=CONNECTS))
+                taken[i] += 1
+                taken[j] += 1
+    left = [pair for pair in ranked if pair.views not in chosen]
+    more = _beyond(left, num_views, list(chosen), neighbours // _BEYOND) if twice else []
+    links = [*chosen, *(pair.views for pair in more)]
+    known = set(links)
+    left = [pair for pair in left if pair.views not in known]
+    more += further_pairs(left, num_views, links, TRIES[0], twice=True) if twice else []
+    return sorted([*chosen.values(), *more], key=lambda pair: pair.views)
+
+
+def _beyond(left: Sequence[Pair], num_views: int, links: Sequence[Link], count: int) -> list[Pair]:
+    """Return the best pairs of each view with views that have no partner in common with it, `count` at most.
+
+    The partners most alike are of one season. Two views of a season and two of another tie the seasons by one pair's
+    epipolar lines, along which both may slide.
+    """
+    near = [{v} for v in range(num_views)]
+    for i, j in links:
+        near[i].add(j)
+        near[j].add(i)
+    taken, found = [0] * num_views, []
+    for pair in left:
+        i, j = pair.views
+        if min(taken[i], taken[j]) < count and pair.likeness and not near[i] & near[j]:
+            taken[i] += 1
+            taken[j] += 1
+            found.append(replace(pair, reason=BEYOND))
+    return found
+
+
+def further_pairs(
+    pairs: Sequence[Pair], num_views: int, links: Sequence[Link], tries: int, twice: bool = False
+) -> list[Pair]:
+    """Return the best pairs not tried yet, to add `tries` paths between views that no path ties, or (`twice`)
+    only one.
+
+    Pairs that have nothing in common are only worth it where there is no path at all.
+    """
+    group = connected_labels(num_views, list(links)).tolist()
+    part = twice_tied(num_views, links) if twice else group
+    if len(set(part)) < 2:
+        return []
+    crossing = []
+    for pair in sorted(pairs, key=_order):
+        i, j = pair.views
+        if group[i] != group[j] or (part[i] != part[j] and pair.likeness != 0):
+            crossing.append(pair)
+    ends = [(part[i], part[j]) for i, j in [*links, *(pair.views for pair in crossing)]]
+    kept = (k - len(links) for k in forests(ends, num_views, tries))
+    return [replace(crossing[k], reason=PATH if twice else CONNECTS) for k in kept if k >= 0]
+
+
+def _root(tree: list[int], node: int) -> int:
+    while tree[node] != node:
+        tree[node] = tree[tree[node]]
+        node = tree[node]
+    return node
+
+
+def forests(links: Sequence[Link], num: int, count: int) -> list[int]:
+    """Return the numbers of the links, the best first, of `count` spanning forests: each link goes to the
+    first in which it joins two trees.
+
+    Together they keep what paths there are between two nodes, up to `count` (Nagamochi and Ibaraki 1992).
+    """
+    kept, trees = [], [list(range(num)) for _ in range(count)]
+    for number, (i, j) in enumerate(links):
+        for tree in trees:
+            first, second = _root(tree, i), _root(tree, j)
+            if first != second:
+                tree[second] = first
+                kept.append(number)
+                break
+    return kept
+
+
+def twice_tied(num: int, links: Sequence[Link]) -> list[int]:
+    """Return a label (num,) shared by nodes between which there are two paths without a link in common."""
+    every, bridges = np.array(links, dtype=np.int64).reshape(-1, 2), []
+    for k in forests(links, num, 1):  # a link that is no part of a ring is one of any spanning tree
+        label = connected_labels(num, np.delete(every, k, axis=0))
+        if label[every[k, 0]] != label[every[k, 1]]:
+            bridges.append(k)
+    out: list[int] = connected_labels(num, np.delete(every, bridges, axis=0)).tolist()
+    return out

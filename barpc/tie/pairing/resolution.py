@@ -104,9 +104,7 @@ class Looks:
 
 
 def _scale(view: View) -> Array:
-    """Return the derivative (2, 2) of the place in an image by that on the ground, in its middle [px/m east,
-    px/m north].
-    """
+    """Return the derivative (2, 2) of the place in an image by that on the ground, in its middle [px/m east, north]."""
     ground = view.sensor.localize((np.array(view.size) - 1.0) / 2.0, np.array(view.altitude))
     return view.sensor.project_jacobian(ground)[1][:, :2] / metres_per_unit(ground)[:2]
 

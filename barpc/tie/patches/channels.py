@@ -15,23 +15,30 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from rasterio import Affine
+from rasterio._err import CPLE_BaseError
+from rasterio.crs import CRS
+from rasterio.errors import CRSError
+from rasterio.warp import transform as warp_points
 
-from barpc.geodesy import Array
-from barpc.scene import BoolArray, IntArray
-from barpc.tie.pixels import FloatImage
+from barpc.errors import InputError
+from barpc.frozen import Frozen
+from barpc.geodesy import NEWTON_STEPS, Array, metres_per_unit
+from barpc.raster import open_raster
+from barpc.scene import BoolArray, IntArray, View
+from barpc.tie.pairing.overlaps import Terrain
+from barpc.tie.pixels import PIECE, Box, FloatImage, grow, levelled, read_pixels
 
 CHANNELS = 2
 COARSE, FINE = (0.8, 0.8), (1.0, 0.7)
 """How far pictures are blurred [px] before the gradients, and the channels: to be found, and to be found exactly."""
 _WEAK = 0.5  # of the median gradient: what is weaker is noise
 EDGE = 6
-"""Pixels so near to invalid ones know of them [px]."""
+"""Pixels so near to invalid ones know of them [px]; so far beside a search area, where true peaks end, decoys lie."""
 BATCH = 32
 """Templates that are correlated at a time."""
-_STEPS = 5
 SETTLED = 0.003
 """A step below it is the last [px]."""
-_GAP = 5  # px between a search area and its decoy: where a true peak ends
 SHOWN = 0.9
 """Part of a template that must be a picture."""
 
@@ -52,9 +59,7 @@ def channels(pixels: FloatImage, valid: BoolArray, blurs: tuple[float, float] = 
 
 
 def correlation(template: FloatImage, search: FloatImage) -> FloatImage:
-    """Return the correlation coefficients (B, H - h + 1, W - w + 1) of templates (B, C, h, w) within areas
-    (B, C, H, W).
-    """
+    """Return the correlations (B, H - h + 1, W - w + 1) of templates (B, C, h, w) within areas (B, C, H, W)."""
     (h, w), (height, width) = template.shape[2:], search.shape[2:]
     from scipy import fft  # of structure alone
 
@@ -114,15 +119,15 @@ def joined(parts: Sequence[FoundTemplates]) -> FoundTemplates:
 
 def margin(half: int, search: int) -> int:
     """Return the least distance [px] of templates from the edge of a picture."""
-    return half + 3 * search + _GAP + 3
+    return half + 3 * search + EDGE + 3
 
 
 def _find(first: FloatImage, second: FloatImage, at: IntArray, half: int, search: int) -> FoundTemplates:
     n, wide = len(at), 2 * search + 1
     template = cut(first, at, half, half)
     right = np.arange(n) % 2 > 0  # where the decoy lies; areas to the left are turned about, so that all are alike
-    aside = np.where(right, 1, -1)[:, None] * [search + (_GAP + 1) // 2, 0]
-    areas = cut(second, at + aside, half + 2 * search + (_GAP + 1) // 2, half + search)
+    aside = np.where(right, 1, -1)[:, None] * [search + EDGE // 2, 0]
+    areas = cut(second, at + aside, half + 2 * search + EDGE // 2, half + search)
     surface = correlation(template, areas)
     surface[~right] = surface[~right, :, ::-1]
     true, decoy = surface[:, :, :wide].reshape(n, -1), surface[:, :, -wide:].reshape(n, -1)
@@ -160,7 +165,7 @@ def _registered(template: FloatImage, around: FloatImage) -> tuple[Array, BoolAr
     wanted = _unit(template)
     shift = np.zeros((len(template), 2))
     step = np.full_like(shift, np.inf)
-    for _ in range(_STEPS):
+    for _ in range(NEWTON_STEPS):
         there = _shifted(_shifted(around, shift[:, 0], 3), shift[:, 1], 2)
         size = np.sqrt((there**2).sum(axis=(1, 2, 3), keepdims=True)) + np.float32(1e-12)
         there = there / size
@@ -182,9 +187,7 @@ def _unit(patches: FloatImage) -> FloatImage:
 
 
 def _shifted(patches: FloatImage, shift: Array, axis: int) -> FloatImage:
-    """Return the patches between their pixels, by cubic convolution along an axis (2 or 3), which loses 2 px
-    at each end.
-    """
+    """Return patches between their pixels, cubic along an axis (2 or 3), which loses 2 px at each end."""
     length = patches.shape[axis] - 4
     out = np.zeros([n - 4 * (i == axis) for i, n in enumerate(patches.shape)], np.float32)
     for k in range(-2, 3):
@@ -195,3 +198,184 @@ def _shifted(patches: FloatImage, shift: Array, axis: int) -> FloatImage:
         part[axis] = slice(k + 2, k + 2 + length)
         out += weight[:, None, None, None] * patches[tuple(part)]
     return out
+
+
+_NODE = 8  # px between exact projections; straight lines between them
+_KNOWN = 0.99  # of what a pixel is made of must be valid
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Patch(Frozen):
+    """A grid on the ground, rows to the south.
+
+    Parameters
+    ----------
+    lonlat : (2,), of its first pixel [deg]
+    step : float [m]
+    shape : (int, int), rows, columns
+    heights : (m, n), of the terrain at its nodes [m above the ellipsoid]
+    moved : (2,), how far a camera shows everything from its place, east, north [m]
+    """
+
+    lonlat: Array
+    step: float
+    shape: tuple[int, int]
+    heights: Array
+    moved: Array
+
+    @classmethod
+    def on(cls, terrain: Terrain, lonlat: Array, step: float, shape: tuple[int, int], moved: Array) -> Patch:
+        """Return a patch with the heights of a terrain."""
+        nodes = _nodes(lonlat, step, shape)
+        return cls(lonlat, step, shape, terrain(nodes[..., 0], nodes[..., 1]), moved)
+
+    def nodes(self) -> Array:
+        """Return the lon, lat (m, n, 2) [deg] of the nodes."""
+        return _nodes(self.lonlat, self.step, self.shape)
+
+    def image(self, view: View) -> Array:
+        """Return the image points (m, n, 2) [px] of the nodes by a view whose camera is off by `moved`."""
+        lonlat = self.nodes() + self.moved / metres_per_unit(np.append(self.lonlat, 0.0))[:2]
+        return view.sensor.project(np.concatenate([lonlat, self.heights[..., None]], axis=2))
+
+    def seen(self, view: View, at: Array) -> Array:
+        """Return the image points (n, 2) [px] of places x, y (n, 2) [px] of the grid."""
+        rows, cols = _between(at[:, 1], self.shape[0]), _between(at[:, 0], self.shape[1])
+        return np.asarray(np.einsum("nr,rck,nc->nk", rows, self.image(view), cols))
+
+
+def ticks(count: int) -> Array:
+    """Return the positions of the nodes of an axis of `count` px [px]."""
+    return np.linspace(0.0, count - 1.0, -(-(count - 1) // _NODE) + 1)
+
+
+def _between(at: Array, count: int) -> Array:
+    """Return the weights (n, nodes) of the nodes along an axis of `count` px for places (n,)."""
+    nodes = ticks(count)
+    return np.stack([np.interp(at, nodes, row) for row in np.eye(len(nodes))], axis=1)
+
+
+def _nodes(lonlat: Array, step: float, shape: tuple[int, int]) -> Array:
+    metres = metres_per_unit(np.append(lonlat, 0.0))[:2]
+    lon = lonlat[0] + step * ticks(shape[1]) / metres[0]
+    lat = lonlat[1] - step * ticks(shape[0]) / metres[1]
+    return np.stack(np.meshgrid(lon, lat), axis=2)
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """An orthoimage and its map projection."""
+
+    path: str
+    crs: CRS
+    to_pixel: Affine
+    size: tuple[int, int]
+    bands: tuple[int, ...]  # that are averaged
+
+    @classmethod
+    def read(cls, path: str) -> Sheet:
+        """Read an orthoimage from any raster with a CRS; else an InputError."""
+        with open_raster(path) as dataset:
+            crs, forward, size = dataset.crs, dataset.transform, (dataset.width, dataset.height)
+            bands = (1, 2, 3) if dataset.count >= 3 else (1,)
+        if crs is None or not abs(forward.determinant) > 0:
+            raise InputError(f"{path}: a reference is an orthoimage, and this raster has no place on the ground")
+        return cls(path, crs, ~forward, size, bands)
+
+    def image(self, lonlat: Array) -> Array:
+        """Return the col, row (..., 2) [px] of lon, lat (..., 2) [deg]."""
+        lon, lat = lonlat.reshape(-1, 2).T
+        try:
+            x, y = np.array(warp_points("EPSG:4326", self.crs, lon, lat))
+        except (CRSError, CPLE_BaseError) as error:
+            raise InputError(f"{self.path}: lon, lat cannot be brought into its CRS ({error})") from error
+        a, b, c, d, e, f = self.to_pixel[:6]
+        return np.stack([a * x + b * y + c, d * x + e * y + f], axis=1).reshape(lonlat.shape) - 0.5
+
+    def shows(self, lonlat: Array) -> BoolArray:
+        """Return whether places (..., 2) [deg] lie on the orthoimage."""
+        at = self.image(lonlat)
+        return np.asarray(((at >= 0) & (at <= np.array(self.size) - 1.0)).all(axis=-1))
+
+    def step(self, lonlat: Array) -> float:
+        """Return the pixel size at a place (2,) [m]."""
+        metres = metres_per_unit(np.append(lonlat, 0.0))[:2]
+        at = self.image(lonlat + np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]]) / metres)
+        return float(10.0 / np.sqrt(abs(np.linalg.det(at[1:] - at[0]))))
+
+
+def of_image(view: View, band: int, patch: Patch) -> FloatImage:
+    """Return the channels (C, H, W) of an image on a patch, through its camera."""
+    return channels(*picture(view.path, (band,), view.size, patch.image(view), patch.shape))
+
+
+def of_reference(paths: Sequence[str], patch: Patch) -> FloatImage:
+    """Return the channels (C, H, W) of a patch, of the first of several orthoimages that shows a place."""
+    nodes, whole = patch.nodes(), np.zeros((CHANNELS, *patch.shape), np.float32)
+    for path in paths:
+        sheet = Sheet.read(path)
+        seen, valid = picture(path, sheet.bands, sheet.size, sheet.image(nodes), patch.shape)
+        if valid.any():
+            whole = np.where(np.abs(whole).sum(axis=0) > 0, whole, channels(seen, valid))
+    return whole
+
+
+def shown(picture: FloatImage) -> float:
+    """Return the share of the pixels of channels (C, H, W) that are not empty."""
+    return float((np.abs(picture).sum(axis=0) > 0).mean())
+
+
+def picture(
+    path: str, bands: Sequence[int], size: tuple[int, int], nodes: Array, shape: tuple[int, int]
+) -> tuple[FloatImage, BoolArray]:
+    """Resample a raster to a grid (H, W) whose nodes (m, n, 2) lie at its col, row [px]; return also the
+    valid pixels.
+
+    Where it is finer than the grid, it is averaged first.
+    """
+    nothing = np.zeros(shape, np.float32), np.zeros(shape, dtype=bool)
+    if not np.isfinite(nodes).all():
+        return nothing
+    low, high = np.floor(nodes.min(axis=(0, 1))).astype(int), np.ceil(nodes.max(axis=(0, 1))).astype(int)
+    if (high < 0).any() or (low >= size).any():
+        return nothing
+    sides = (nodes[-1, 0] - nodes[0, 0]) / (shape[0] - 1), (nodes[0, -1] - nodes[0, 0]) / (shape[1] - 1)
+    apart = float(np.sqrt(abs(np.linalg.det(np.stack(sides)))))
+    thin = max(1, int(apart))
+    box = grow((int(low[0]), int(low[1]), *(high - low + 1).tolist()), 2 * thin + 2, size)
+    if min(box[2:]) < thin:
+        return nothing
+    box = box[0], box[1], box[2] // thin * thin, box[3] // thin * thin
+    picture, valid = _thinned((path, size), bands, box, thin)
+    if not (valid > 0).any():
+        return nothing
+    if (left := apart / thin) > 1.1:
+        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.5 * (left**2 - 1.0) ** 0.5), np.float32)
+    rows, cols = (_between(np.arange(n, dtype=np.float64), n) for n in shape)
+    nodes = (nodes - box[:2] + 0.5) / thin - 0.5
+    x, y = ((rows @ nodes[..., i] @ cols.T).astype(np.float32) for i in (0, 1))
+    found = cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    inside = cv2.remap(valid, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
+    return np.asarray(found, np.float32), np.asarray(inside > _KNOWN)
+
+
+def _thinned(
+    file: tuple[str, tuple[int, int]], bands: Sequence[int], box: Box, thin: int
+) -> tuple[FloatImage, FloatImage]:
+    """Return the mean of bands of a window, averaged over `thin` x `thin` px, and how much of each is known."""
+    if box[2] * box[3] > PIECE and box[3] >= 2 * thin:
+        first = box[3] // thin // 2 * thin
+        halves = (box[0], box[1], box[2], first), (box[0], box[1] + first, box[2], box[3] - first)
+        means, shares = zip(*(_thinned(file, bands, half, thin) for half in halves), strict=True)
+        return np.vstack(means), np.vstack(shares)
+    cv2.setNumThreads(1)
+    picture, valid = np.zeros((box[3], box[2]), np.float32), np.ones((box[3], box[2]), dtype=bool)
+    for band in bands:
+        pixels, known = read_pixels(file[0], box, band, file[1])
+        picture += levelled(pixels, known)
+        valid &= known
+    picture[~valid] = picture[valid].mean() if valid.any() else 0.0
+    small = box[2] // thin, box[3] // thin
+    parts = (cv2.resize(part, small, interpolation=cv2.INTER_AREA) for part in (picture, valid.astype(np.float32)))
+    mean, share = (np.asarray(part, np.float32) for part in parts)
+    return mean, share

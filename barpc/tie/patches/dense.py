@@ -31,13 +31,8 @@ _SGBM = {
     "mode": cv2.STEREO_SGBM_MODE_SGBM_3WAY,  # 0.64 m, of five ways 0.62 m at half as much time again
 }
 _MARGIN = 16  # px about a part that are matched, too: paths of SGBM begin at the ends
-_LEFT, _SLOPE = (
-    0.741,
-    0.305,
-)  # of white noise of variance 1, in the frame: its variance, and that of its slope
-_ROUNDED = 2 / 12  # variance of two pictures' rounding to whole numbers
-_COLUMN = 1 / 6  # columns^2: variance of what SGBM says, a column either way with the weights of a hat
-_FEW = 32  # px a side of what is matched at all
+_LEFT, _SLOPE = 0.741, 0.305  # of white noise of variance 1, in the frame: its variance, and that of its slope
+_HAT = 2 / 12  # variance of two roundings: of two pictures' grey values, and of what SGBM says [columns^2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +123,7 @@ def dense_matches(
         return None
     low, shape = window
     parts = [
-        _resampled(path, size, _moved(one, -low), shape, band)
+        _resampled(path, size, np.column_stack([one[:, :2], one[:, 2] - low]), shape, band)
         for path, size, one in zip(images, sizes, frame.maps, strict=True)
     ]
     if any(part is None for part in parts):
@@ -143,7 +138,8 @@ def dense_matches(
     place = np.column_stack([col, row]) + low
     moved = place - np.column_stack([disparity[row, col], np.zeros(len(row))])
     known = np.column_stack([place, disparity[row, col], np.ones(len(row))])
-    both = int(np.count_nonzero(shown_left & _shifted(shown_right, frame.num // 2)))
+    middle = frame.num // 2  # disparity at which both are taken to show the same
+    both = int(np.count_nonzero(shown_left[:, middle:] & shown_right[:, : shape[0] - middle]))
     return DenseMatches(
         _back(frame.maps[0], place),
         _back(frame.maps[1], moved),
@@ -154,9 +150,7 @@ def dense_matches(
 
 
 def _window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Array, tuple[int, int]] | None:
-    """Return the first pixel (2,) and width, height of what is resampled: the part as far as both images
-    reach, with margins.
-    """
+    """Return the first pixel (2,) and width, height of the part as far as both images reach, with margins."""
     low, high = frame.places.min(axis=0) - _MARGIN, frame.places.max(axis=0) + _MARGIN
     reach = np.array([frame.num, 0.0])
     for size, one, more in zip(sizes, frame.maps, (np.zeros(2), reach), strict=True):
@@ -175,20 +169,9 @@ def _inside(shape: tuple[int, int], low: Array, frame: EpipolarFrame) -> BoolArr
     return np.asarray(mask > 0)
 
 
-def _moved(one: Array, by: Array) -> Array:
-    return np.column_stack([one[:, :2], one[:, 2] + by])
-
-
 def _back(one: Array, place: Array) -> Array:
     """Return the image points (n, 2) of places (n, 2) in the frame."""
     out: Array = (place - one[:, 2]) @ np.linalg.inv(one[:, :2]).T
-    return out
-
-
-def _shifted(shown: BoolArray, by: int) -> BoolArray:
-    """Return a mask moved to the right, as matches of the middle disparity are."""
-    out = np.zeros_like(shown)
-    out[:, by:] = shown[:, : shown.shape[1] - by]
     return out
 
 
@@ -252,7 +235,7 @@ def _refined(
     start = np.where(good & even, level, disparity).astype(np.float32)
     a, other = left.astype(np.float32), right.astype(np.float32)
     b = _warped(other, start, cv2.INTER_CUBIC)
-    slope = (_slope(a) + _warped(_slope(other), start, cv2.INTER_LINEAR)) / 2
+    slope = (np.gradient(a, axis=1) + _warped(np.gradient(other, axis=1), start, cv2.INTER_LINEAR)) / 2
     level_a, level_b, level_s = mean(a), mean(b), mean(slope)
     aa, bb, ss = mean(a * a) - level_a**2, mean(b * b) - level_b**2, mean(slope * slope) - level_s**2
     ab, bs = mean(a * b) - level_a * level_b, mean(b * slope) - level_b * level_s
@@ -262,9 +245,9 @@ def _refined(
     shift = (a_s - ab * bs / bb) / told
     pixels = WINDOW**2 * total
     left_over = np.maximum(aa - ab**2 / bb - told * shift**2, 0.0)
-    noise = np.maximum(left_over * pixels / np.maximum(pixels - 3, 1) / _LEFT, _ROUNDED)  # 3: the unknowns
+    noise = np.maximum(left_over * pixels / np.maximum(pixels - 3, 1) / _LEFT, _HAT)  # 3: the unknowns
     variance = noise / pixels / np.maximum(told - noise * _SLOPE / 4, 0.1 * told)
-    found = start - shift * _COLUMN / (_COLUMN + variance)
+    found = start - shift * _HAT / (_HAT + variance)
     kept = np.clip(found, disparity - 1.0, disparity + 1.0)
     return np.asarray(kept, np.float32), np.asarray(np.sqrt(variance) / FINER, np.float32)
 
@@ -273,10 +256,3 @@ def _warped(values: npt.NDArray[Any], disparity: FloatImage, how: int) -> npt.ND
     """Return what the right picture has where the left one's pixels are found."""
     cols, rows = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in disparity.shape[::-1]))
     return np.asarray(cv2.remap(values, np.asarray(cols - disparity, np.float32), rows, how))
-
-
-def _slope(values: FloatImage) -> FloatImage:
-    """Return the central difference along the line, by column."""
-    out = np.zeros_like(values)
-    out[:, 1:-1] = (values[:, 2:] - values[:, :-2]) / 2
-    return out

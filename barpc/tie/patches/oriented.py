@@ -10,9 +10,8 @@ import numpy as np
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 from barpc.tie.pairing.epipolar import grouped
-from barpc.tie.patches.channels import BATCH, COARSE, EDGE, FINE, SHOWN, channels, correlation, cut
-from barpc.tie.patches.resampled import picture, ticks
-from barpc.tie.pixels import MEMORY, FloatImage
+from barpc.tie.patches.channels import BATCH, COARSE, EDGE, FINE, SHOWN, channels, correlation, cut, picture, ticks
+from barpc.tie.pixels import PIECE, FloatImage
 
 Files = Sequence[tuple[str, tuple[int, int]]]
 """Path and size (width, height) of two images."""
@@ -25,7 +24,6 @@ HALF = 16
 """How far a template reaches to each side [px]."""
 TILE = 256
 """Points of a tile of so many px a side share a picture."""
-_AREA = MEMORY // 60  # px of areas that templates are correlated with at a time, together, in bytes a px
 BACK = 1.5  # px that the way back may miss by
 _FINER = 3  # px to each side that a finer picture is searched, and the last one, of half its step
 
@@ -53,9 +51,7 @@ class Sampling:
 
 
 def found_about(sampling: Sampling, at: Array, xy: Array, half: int = HALF) -> tuple[Array, BoolArray, Array]:
-    """Return the places (n, 2) near those given, whether they stand out and the way back ends at its start;
-    correlations.
-    """
+    """Return the places (n, 2) near those given, whether they stand out and the way back returns; correlations."""
     tile = PatchTile.of(sampling, at, xy, np.full(2, _FINER), half)
     surface = tile.surfaces()
     place, score = tile.peaks(surface)
@@ -130,7 +126,7 @@ class PatchTile:
 
     def _batches(self) -> list[slice]:
         area = int((2 * (self.half + self.reach) + 1).prod())
-        batch = max(1, min(BATCH, _AREA // area))
+        batch = max(1, min(BATCH, PIECE // area))
         return [slice(i, i + batch) for i in range(0, len(self.at), batch)]
 
     def offsets(self) -> Array:

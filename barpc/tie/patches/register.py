@@ -10,7 +10,6 @@ one small pseudo-inverse a match serves all iterations.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 
 import cv2
@@ -24,7 +23,7 @@ from barpc.tie.pairing.epipolar import FEW, LEAST_REACH, affine_inliers, frame, 
 from barpc.tie.patches import oriented
 from barpc.tie.patches.channels import SETTLED
 from barpc.tie.pixels import SPAN, FloatImage, PixelReader, grow, levelled
-from barpc.tie.tasks import Progress, ordered
+from barpc.tie.tasks import HERE, Work
 
 MIN_CORRELATION = 0.8
 """Of two registered patches, or the match is left out."""
@@ -35,15 +34,15 @@ _SMALLER = 0.7  # side of the patch of the second try and of the check
 _TORN = 0.5  # px that the smaller patch may lie apart
 _FINE = 4  # samples a pixel and axis
 _GRID = 1.0 / (32 * _FINE)  # px; positions that the sampler tells apart
-_LEAST_SIGMA = 1e-3  # px, of a registration
 REACH = 1.5  # px; a patch that moves farther has left its point
 _WEIGHT = 0.7  # standard deviation of the patch's Gaussian weight, in half sides
 _TAPS = 6  # samples on either side in the interpolation
-_RIDGE = 1e-6  # of what a normal matrix holds; relative deviation below which a patch is flat
-_FLOOR = 0.1  # px across the epipolar line that are always tolerated, and in a place only compared
+_FLOOR = 0.1  # px across the epipolar line that are always tolerated
 _DISTORTED = 2.0  # times the median sigma about it: the patch lies across a step of the ground
-_FEW = 20  # observations of a pair of views below which their sigmas are not scaled by their errors
 _LEAST_END_SIGMA = 0.02  # px, of an observation
+
+
+_EPS = float(np.finfo(np.float32).eps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +73,6 @@ def register_places(
     start: Array,
     linear: Array,
     patch: int,
-    tile: int = 1024,
 ) -> PatchRegistration:
     """Read what is needed of two images, each a path and its size, and register as `register_patches`, tile by tile.
 
@@ -83,7 +81,7 @@ def register_places(
     cv2.setNumThreads(1)
     margin = patch + _TAPS + int(REACH)
     sparse, every = _sparse(reference, margin), PatchRegistration.none(start)
-    read, groups = (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, min(tile, SPAN)))
+    read, groups = (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, SPAN))
     (path, size), (other, beyond) = files
     with PixelReader(path, band, size) as first, PixelReader(other, band, beyond) as second:
         for rows in groups:
@@ -132,9 +130,7 @@ def _mosaics(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int)
 
 
 def _parts(origin: Array, links: IntArray, tile: int) -> list[IntArray]:
-    """Return the links that are registered in one task: of whole tiles, or, where they are few, of whole
-    bands of rows, swept by columns: strips and blocks are decoded once.
-    """
+    """Return the links of each task: of whole tiles, or, where few, of bands of rows: blocks decode once."""
     if not _sparse(origin, PATCH + _TAPS + int(REACH)):
         return [links[rows] for rows in _joined(_by_tile(origin, tile), CHUNK)]
     order = np.lexsort((origin[:, 0], origin[:, 1] // SPAN))
@@ -168,13 +164,12 @@ def register_part(
     start: Array,
     linear: Array,
     structural: bool,
-    tile: int,
 ) -> PatchRegistration:
     """Register patches by their grey values, or by channels of oriented gradients; `ok` where they are alike."""
     if structural:
         xy, ok, correlation = oriented.register_oriented(files, band, reference, start, linear)
         return PatchRegistration(xy, correlation, np.full(len(xy), oriented.SIGMA), ok)
-    found = register_places(files, band, reference, start, linear, PATCH, tile)
+    found = register_places(files, band, reference, start, linear, PATCH)
     return replace(found, ok=found.ok & (found.correlation >= MIN_CORRELATION))
 
 
@@ -210,7 +205,7 @@ def register_patches(
             found = template.find(fine, reference[rows].astype(np.int64), start[rows], linear[rows])
             best.put(rows, replace(found, ok=found.ok & _at(usable[1], found.xy)))
     for rows in _chunks(np.flatnonzero(best.ok)):  # on a step of the ground the inner part goes elsewhere
-        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], _FLOOR)
+        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], 10 * SETTLED)
         apart = np.hypot(*(inner.xy - best.xy[rows]).T)
         best.ok[rows] = apart <= np.maximum(_TORN, 5.0 * inner.sigma)
     return best
@@ -282,7 +277,7 @@ class _Template:
         mean = (patches @ self._weight)[:, None]
         centred = patches - mean
         deviation = np.sqrt((centred * centred) @ self._weight)[:, None]
-        flat = deviation**2 <= _RIDGE**2 * (1.0 + mean * mean)
+        flat = deviation**2 <= _EPS**2 * (1.0 + mean * mean)
         deviation = np.where(flat, np.float32(np.inf), deviation)
         return centred / deviation, deviation
 
@@ -306,11 +301,11 @@ class _Template:
             np.multiply(jacobian[:, by], lever, out=jacobian[:, row])
         jacobian[:, 6], jacobian[:, 7] = values * self._root, self._root
         normal = (jacobian @ jacobian.transpose(0, 2, 1)).astype(np.float64)
-        normal += _RIDGE * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)
+        normal += _EPS * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)
         inverse = np.asarray(np.linalg.inv(normal), np.float64)
         xy, step, correlation = self._iterate(fine, (jacobian, inverse), start.copy(), linear.copy(), settled)
         noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - 8.0)
-        sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_LEAST_SIGMA)
+        sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_EPS)
         moved = np.hypot(*(xy - start).T)
         ok = (step <= 10 * settled) & (moved <= REACH) & np.isfinite(sigma)
         return PatchRegistration(xy, correlation, sigma, ok)
@@ -367,8 +362,7 @@ def refine(
     options: TieOptions,
     *,
     structural: Collection[tuple[int, int]] = (),
-    executor: Executor | None = None,
-    progress: Progress | None = None,
+    work: Work = HERE,
 ) -> Tracks:
     """Register every observation to its track's reference patch, and verify the result.
 
@@ -383,7 +377,7 @@ def refine(
     of_track = references(tracks, spreads, len(views))
     other = np.flatnonzero(np.arange(len(tracks)) != of_track[tracks.point])
     links = _Links(views, tracks, of_track[tracks.point[other]], other, frozenset(structural))
-    found = links.register(options, executor, progress)
+    found = links.register(options, work)
     good = links.verified(found, found.ok)
     sigma = links.scaled(found, good)
     return _shared(tracks, of_track, other[good], found.xy[good], sigma[good])
@@ -416,7 +410,7 @@ class _Links:
         """Return the indices of the links between the same two views, and of equal values of `more`."""
         return grouped(self.tracks.view[self.reference], self.tracks.view[self.other], *more)
 
-    def register(self, options: TieOptions, executor: Executor | None, progress: Progress | None) -> PatchRegistration:
+    def register(self, options: TieOptions, work: Work) -> PatchRegistration:
         """Register all, tile by tile of the reference view."""
         origin = self.origin
         linear = np.empty((len(self), 2, 2))
@@ -430,8 +424,8 @@ class _Links:
             first, second = self.of(part)
             images = ((first.path, first.size), (second.path, second.size))
             places = origin[part], start[part], linear[part]
-            tasks.append((images, options.band, *places, self._is_structural(part), options.tile))
-        done: list[PatchRegistration] = ordered(executor, register_part, tasks, "refine", progress)
+            tasks.append((images, options.band, *places, self._is_structural(part)))
+        done: list[PatchRegistration] = work.ordered(register_part, tasks, "refine")
         found = PatchRegistration.none(start)
         for part, one in zip(parts, done, strict=True):
             found.put(part, one)
@@ -443,16 +437,12 @@ class _Links:
         return (ends[0], ends[1]) in self.structural
 
     def errors(self, found: PatchRegistration, group: IntArray) -> tuple[Array, Array]:
-        """Return the distances along and across the epipolar lines (M, 2) [px] between two views, and half
-        the segments' length (M,).
-        """
+        """Return distances along and across epipolar lines (M, 2) [px] of two views, and half the segments (M,)."""
         where = frame(*self.of(group), self.origin[group])
         return where.errors(found.xy[group]), where.after
 
     def verified(self, found: PatchRegistration, good: BoolArray) -> BoolArray:
-        """Return the observations near their epipolar line, as certain as others, and at one altitude with
-        their track.
-        """
+        """Return the observations near their epipolar line, as certain as others, at one altitude with their track."""
         verified = np.zeros(len(self), dtype=bool)
         altitude, reach = np.zeros((2, len(self)))  # from the middle of the range, in its halves
         for group in self.groups():
@@ -466,9 +456,7 @@ class _Links:
         return verified & ~self._torn(verified, altitude, reach)
 
     def _torn(self, good: BoolArray, altitude: Array, reach: Array) -> BoolArray:
-        """Return the links that disagree in altitude with all their neighbours in the track, up to an affine
-        function.
-        """
+        """Return the links that disagree in altitude with all neighbours in the track, up to an affine function."""
         rows = np.flatnonzero(good & (reach >= LEAST_REACH))
         first, second = rows[:-1], rows[1:]
         same = self.reference[first] == self.reference[second]
@@ -490,7 +478,7 @@ class _Links:
         sigma = found.sigma.copy()
         for group in self.groups():
             group = group[good[group]]
-            if len(group) >= _FEW:
+            if len(group) >= FEW:
                 across = self.errors(found, group)[0][:, 1]
                 residual = affine_inliers(self.origin[group], across, _FLOOR)[1]
                 sigma[group] *= max(1.0, robust_spread(residual / sigma[group]))
