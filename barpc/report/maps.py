@@ -1,66 +1,115 @@
-"""Maps of the report, each one SVG text: the images on the ground, residuals over an image."""
+"""Maps of the report, each one SVG text: the images on the ground, residuals over an image.
+
+Colours are CSS variables of the page. A map is drawn on a sheet `WIDTH` units wide, so that its text stays readable
+on a phone, where a unit is about 0.85 pixels, and is not blown up on a desk, where the page caps the width.
+"""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from operator import itemgetter
+from html import escape
+from typing import Any
 
 import numpy as np
 
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
-from barpc.report.charts import (
-    MAX_DOTS,
-    MAX_DRAWN,
-    WIDTH,
-    evenly,
-    label,
-    line,
-    path,
-    round_ticks,
-    sheet,
-    shortened,
-    tag,
-    titled,
-)
-from barpc.report.digest import SHOWN, flagged
-from barpc.report.summary import Summary
+from barpc.report.digest import SHOWN, flagged, worst_first
 from barpc.report.summary.known import CheckPointEntry, GcpEntry
 from barpc.report.summary.views import CELLS, ViewEntry, cell_numbers
 from barpc.report.tables import ObservationTable, RunFiles
 
-_MOST_LINKS = 1500
+WIDTH = 420.0  # Units of a map from left to right
+MAX_DRAWN = 400  # Images, and ground points, on the map
+MAX_MARKS = 1500  # Tie points there, and lines between images
 _MARGIN = 34.0
-_APART = 26.0
-_AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
 _MOST = 60  # images on the page: those with the largest systematic part
 _VECTORS = 6000
 _PANEL = 180.0
-_MANY = 30  # stacks of images, or those that need a look: of more there are fewer names, and thinner lines
-_LONGEST = 16  # characters of a name there
+_LONGEST = 16  # characters of a name on the map
 _REACH = 12.0  # units of a long residual
-_DARKEST = 0.7  # opacity where all tie points move
-
-Link = tuple[Sequence[float] | Array, Sequence[float] | Array, int, str]
-"""Two places (x, y), the matches between them, a title."""
 Known = GcpEntry | CheckPointEntry
 
 
-def _ties(links: Sequence[Link], width: tuple[float, float], opacity: tuple[float, float]) -> list[str]:
-    """Return lines of least width and opacity, and what the link with the most matches has beyond these."""
-    most, parts = max([count for *_, count, _ in links], default=1), []
-    for (x1, y1), (x2, y2), count, title in sorted(links, key=itemgetter(2))[-_MOST_LINKS:]:
-        share = math.sqrt(count / most)
-        ends = {"x1": x1, "y1": y1, "x2": x2, "y2": y2}
-        style = {
-            "stroke_width": width[0] + width[1] * share,
-            "stroke_opacity": opacity[0] + opacity[1] * share,
-        }
-        shape = tag("line", **ends, class_="tie", **style)
-        parts.append(titled(shape, f"{title}: {count} matches"))
-    return parts
+def tag(name: str, *children: str, **attributes: object) -> str:
+    """Return an SVG element; `class_` is class, underscores are hyphens, numbers have two decimals at most.
+
+    Examples
+    --------
+    >>> tag("text", "a &lt; b", x=1.0, text_anchor="end", class_="tick")
+    '<text x="1" text-anchor="end" class="tick">a &lt; b</text>'
+    >>> tag("path", d="M0 0")
+    '<path d="M0 0"/>'
+    """
+    words = "".join(f' {key.rstrip("_").replace("_", "-")}="{_value(value)}"' for key, value in attributes.items())
+    return f"<{name}{words}>{''.join(children)}</{name}>" if children else f"<{name}{words}/>"
+
+
+def _value(value: object) -> str:
+    return coordinate(value) if isinstance(value, (int, float)) else escape(str(value))
+
+
+def coordinate(value: float) -> str:
+    """Return a coordinate in as few characters as two decimals take."""
+    text = f"{value:.2f}".rstrip("0").rstrip(".")
+    return "0" if text == "-0" else text
+
+
+def label(x: float, y: float, text: str, anchor: str = "start", class_: str = "tick") -> str:
+    """Return the text at a place."""
+    return tag("text", escape(text), x=x, y=y, text_anchor=anchor, class_=class_)
+
+
+def line(x1: float, y1: float, x2: float, y2: float, class_: str) -> str:
+    """Return a straight line."""
+    return tag("line", x1=x1, y1=y1, x2=x2, y2=y2, class_=class_)
+
+
+def path(points: Iterable[Sequence[float] | Array], class_: str, closed: bool = False) -> str:
+    """Return a line through points."""
+    text = "L".join(f"{coordinate(x)} {coordinate(y)}" for x, y in points)
+    return tag("path", d=f"M{text}{'Z' if closed else ''}", class_=class_)
+
+
+def titled(shape: str, title: str, **attributes: object) -> str:
+    """Return a shape that says `title` under the pointer and to screen readers."""
+    return tag("g", tag("title", escape(title)), shape, **attributes)
+
+
+def sheet(key: str, title: str, description: str, height: float, body: Sequence[str], **more: object) -> str:
+    """Return a whole chart: a key unique on the page, what it is, what it shows for those who do not see it."""
+    width = more.pop("width", WIDTH)
+    return tag(
+        "svg",
+        tag("title", escape(title), id=f"{key}-t"),
+        tag("desc", escape(description), id=f"{key}-d"),
+        *body,
+        viewBox=f"0 0 {_value(width)} {coordinate(height)}",
+        role="img",
+        aria_labelledby=f"{key}-t {key}-d",
+        **more,
+    )
+
+
+def round_ticks(low: float, high: float, most: int = 6) -> list[float]:
+    """Return at most `most` values of a step of 1, 2 or 5 times a power of ten in an interval.
+
+    Examples
+    --------
+    >>> round_ticks(-0.3, 1.1)
+    [0.0, 0.5, 1.0]
+    """
+    raw = (high - low) / most
+    power = 10.0 ** math.floor(math.log10(raw))
+    step = next(power * s for s in (1, 2, 5, 10) if power * s >= raw * 0.999)
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [round(k * step, 12) + 0.0 for k in range(first, last + 1)]
+
+
+def evenly(rows: Any, most: int) -> Any:
+    """Return all rows, or a number of them at even steps."""
+    return rows[:: max(1, -(-len(rows) // most))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,21 +154,30 @@ def ground_map(files: RunFiles) -> str:
     }
     plane = _plane_of(np.concatenate([*rings, files.points[:, :2], *known.values()]))
     grid, degrees, taken = _graticule(plane)
-    points = plane(evenly(files.points, MAX_DOTS)[:, :2])
+    points = plane(evenly(files.points, MAX_MARKS)[:, :2])
     parts = [
         *grid,
-        *_moving_ground(plane, summary),
         tag("path", d="".join(f"M{x:.1f} {y:.1f}h0" for x, y in points.tolist()) or "M0 0", class_="point"),
     ]
-    for k, view, outline in _drawn(files):
+    groups = () if summary.scene is None else summary.scene.explanations
+    for one in groups:
+        if one.box is not None:
+            west, south, east, north = one.box
+            (x, y), (right, bottom) = plane(np.array([(west, north), (east, south)])).tolist()
+            shape = tag("rect", x=x, y=y, width=right - x, height=bottom - y, class_="group")
+            parts.append(titled(shape, one.sentence))
+    drawn = _drawn(files)
+    for k, view, outline in drawn:
         shape = "".join(path(plane(ring[:-1]), f"outline {view.status}", closed=True) for ring in outline)
         parts.append(titled(shape, f"{view.name}: {view.num_observations} tie points", data_v=k))
-    stacks = _stacks(plane, files.outlines, list(files.number))
-    parts += _pair_lines(stacks, files)
-    marked, number = _marked(plane, files), files.number
-    bad = [Stack([number[view.name]], middle, view.name, view.status) for view, middle in marked]
-    named = [*bad[:_MANY], *(stacks if len(stacks) <= 100 else ())]
-    parts += _stack_names(named, len(stacks) > _MANY, taken)
+    middles = {
+        view.name: plane(np.concatenate([ring[:-1] for ring in outline])).mean(axis=0)
+        for view, outline in zip(summary.views, files.outlines, strict=True)
+        if outline
+    }
+    parts += _pair_lines(middles, files)
+    named = worst_first([view for _, view, _ in drawn if view.name in middles])
+    parts += _names([(view, middles[view.name]) for view in named], taken)
     for kind, places in known.items():
         up = 1 if kind == "gcps" else -1
         for point, (x, y) in evenly(list(zip(points_of[kind], plane(places), strict=True)), MAX_DRAWN):
@@ -129,45 +187,7 @@ def ground_map(files: RunFiles) -> str:
         f"{len(summary.views)} outlines, {len(summary.pairs)} pairs, {len(known['gcps'])} GCPs, "
         f"{len(known['check_points'])} check points."
     )
-    many = {"class_": "many"} if len(stacks) > _MANY else {}
-    return sheet("ground", "Map of the images", described, plane.height, [*parts, *degrees], **many)
-
-
-def _moving_ground(plane: Plane, summary: Summary) -> list[str]:
-    """Return cells of the ground in which tie points move together, darker with more, and where each group lies."""
-    scene = summary.scene
-    if scene is None:
-        return []
-    parts = []
-    for one in scene.moving:
-        shape = _box(plane, one.box, "moves", fill_opacity=_DARKEST * one.share)
-        parts.append(titled(shape, f"{100 * one.share:.0f} % of {one.count} tie points move together"))
-    groups = [one for one in scene.explanations if one.box is not None]
-    return parts + [titled(_box(plane, one.box or (), "group"), one.sentence) for one in groups]
-
-
-def _box(plane: Plane, box: Sequence[float], class_: str, **style: float) -> str:
-    west, south, east, north = box
-    (x, y), (right, bottom) = plane(np.array([(west, north), (east, south)])).tolist()
-    return tag("rect", x=x, y=y, width=right - x, height=bottom - y, class_=class_, **style)
-
-
-@dataclass(frozen=True, eq=False)
-class Stack:
-    """Images that lie over each other on the map.
-
-    Their indices, the place (2,) of the first one's middle and its name; of one that needs a look its status.
-    """
-
-    views: list[int]
-    place: Array
-    name: str
-    status: str = ""
-
-    @property
-    def text(self) -> str:
-        """The name of the first, and how many more."""
-        return shortened(self.name, _LONGEST) + f" + {len(self.views) - 1}" * (len(self.views) > 1)
+    return sheet("ground", "Map of the images", described, plane.height, [*parts, *degrees])
 
 
 def _drawn(files: RunFiles) -> list[tuple[int, ViewEntry, Sequence[Array]]]:
@@ -179,60 +199,31 @@ def _drawn(files: RunFiles) -> list[tuple[int, ViewEntry, Sequence[Array]]]:
     return [*(evenly(good, room) if room else ()), *(whole[view.name] for view in bad[::-1])]
 
 
-def _marked(plane: Plane, files: RunFiles) -> list[tuple[ViewEntry, Array]]:
-    """Return images that need a look and the places (2,) of their middles, the worst first."""
-    found = [(view, files.outlines[files.number[view.name]]) for view in flagged(files.summary.views)]
-    return [(view, _middle(plane, outline)) for view, outline in found if outline]
-
-
-def _middle(plane: Plane, outline: Sequence[Array]) -> Array:
-    middle: Array = plane(np.concatenate([ring[:-1] for ring in outline])).mean(axis=0)
-    return middle
-
-
-def _stacks(plane: Plane, outlines: Sequence[Sequence[Array]], names: Sequence[str]) -> list[Stack]:
-    """Return images whose middles stand nearer than a name is tall."""
-    stacks: list[Stack] = []
-    cells: dict[tuple[int, int], list[int]] = {}  # of a width of _APART: their stacks
-    for k, outline in ((k, outline) for k, outline in enumerate(outlines) if outline):
-        place = _middle(plane, outline)
-        col, row = (place // _APART).astype(int).tolist()
-        around = [n for i, j in _AROUND for n in cells.get((col + i, row + j), ())]
-        near = min((n for n in around if math.dist(stacks[n].place, place) < _APART), default=None)
-        if near is None:
-            cells.setdefault((col, row), []).append(len(stacks))
-            stacks.append(Stack([k], place, names[k]))
-        else:
-            stacks[near].views.append(k)
-    return stacks
-
-
-def _stack_names(stacks: Sequence[Stack], many: bool, taken: Sequence[tuple[float, float, float]] = ()) -> list[str]:
-    """Return the names of stacks, without those that would stand on others or on what is taken: x, y, half width."""
-    taken, names, gap = list(taken), [], 14 if many else 0
-    for stack in stacks:
-        (x, y), half = stack.place.tolist(), 3.6 * len(stack.text)
+def _names(places: Sequence[tuple[ViewEntry, Array]], taken: Sequence[tuple[float, float, float]]) -> list[str]:
+    """Return names of images at places (2,), but those that would stand on others or on what is taken: x, y, half."""
+    taken, names = list(taken), []
+    for view, place in places:
+        name = view.name if len(view.name) <= _LONGEST else f"…{view.name[1 - _LONGEST :]}"  # its end tells of a series
+        (x, y), half = place.tolist(), 3.6 * len(name)
         x = min(max(x, half), WIDTH - half)
-        if all(abs(x - u) > half + other + gap or abs(y - v) > 14 + gap for u, v, other in taken):
+        if all(abs(x - u) > half + other or abs(y - v) > 14 for u, v, other in taken):
             taken.append((x, y, half))
-            names.append(label(x, y + 4, stack.text, "middle", f"stack {stack.status}".strip()))
+            names.append(label(x, y + 4, name, "middle", f"name {view.status if view.advice else ''}".strip()))
     return names
 
 
-def _pair_lines(stacks: Sequence[Stack], files: RunFiles) -> list[str]:
-    """Draw lines from stack to stack, stronger with more matches between them."""
-    index = files.number
-    stack_of = {k: number for number, stack in enumerate(stacks) for k in stack.views}
-    matches: Counter[tuple[int, ...]] = Counter()
-    for pair in files.summary.pairs:
-        ends = sorted({stack_of[k] for k in (index[pair.a], index[pair.b]) if k in stack_of})
-        if len(ends) == 2:
-            matches[tuple(ends)] += pair.num_matches
-    links = [
-        (a.place, b.place, count, f"{a.text} - {b.text}")
-        for (a, b), count in (((stacks[i], stacks[j]), count) for (i, j), count in matches.items())
-    ]
-    return _ties(links, (0.6, 2.4), (0.2, 0.7))
+def _pair_lines(middles: Mapping[str, Array], files: RunFiles) -> list[str]:
+    """Draw lines between images, stronger with more matches, the strongest on top."""
+    pairs = [pair for pair in files.summary.pairs if pair.a in middles and pair.b in middles]
+    pairs = sorted(pairs, key=lambda pair: pair.num_matches)[-MAX_MARKS:]
+    parts = []
+    for pair in pairs:
+        share = math.sqrt(pair.num_matches / max(pairs[-1].num_matches, 1))
+        (x1, y1), (x2, y2) = middles[pair.a], middles[pair.b]
+        style = {"class_": "tie", "stroke_width": 0.6 + 2.4 * share, "stroke_opacity": 0.2 + 0.7 * share}
+        shape = tag("line", x1=x1, y1=y1, x2=x2, y2=y2, **style)
+        parts.append(titled(shape, f"{pair.a} - {pair.b}: {pair.num_matches} matches"))
+    return parts
 
 
 def _graticule(plane: Plane) -> tuple[list[str], list[str], list[tuple[float, float, float]]]:

@@ -2,19 +2,16 @@
 const unfold = sections => { for (const section of sections) for (const e of section.querySelectorAll(":scope > .whole")) e.open = true; };
 const asked = () => unfold([...document.querySelectorAll("section")].filter(section => "#" + section.id === location.hash));
 addEventListener("hashchange", asked); addEventListener("beforeprint", () => unfold(document.querySelectorAll("section"))); asked();
-// The page is whole without this: tables that sort and filter, one selection in map, matrix, tables and panels,
-// and residual maps in large.
+// The page is whole without this: tables that sort and filter, one selection in map, tables and panels, and residual
+// maps in large.
 const make = (name, set, ...children) => { const e = Object.assign(document.createElement(name), set); e.append(...children); return e; };
-const facts = JSON.parse(document.getElementById("facts").textContent);
-const pairs = new Map(facts.pairs.map(([a, b, ...rest]) => [a + "-" + b, rest]));
-const bar = document.querySelector(".chosen"), matrix = document.querySelector(".matrix");
+const bar = document.querySelector(".chosen");
 let chosen = [];
 
-const image = k => facts.views[k][0];
-const say = ([a, b]) => {
-  if (b === undefined) return `${image(a)}: ${facts.views[a][1]} tie points`;
-  const found = pairs.get(a + "-" + b);
-  return `${image(a)} and ${image(b)}: ` + (found ? `${found[0]} matches, epipolar offset ${found[1] || "?"} px, ${found[2] || "?"} degrees` : "no matches");
+const say = views => {
+  const row = document.querySelector(`tr[data-views="${views.join("-")}"]`), title = document.querySelector(`[data-v="${views[0]}"] title`);
+  if (views.length === 1) return title ? title.textContent : row.cells[0].textContent;
+  return `${row.cells[0].textContent}: ${row.cells[1].textContent} matches`;
 };
 const same = views => views.length === chosen.length && views.every((v, i) => v === chosen[i]);
 
@@ -30,43 +27,11 @@ function choose(views, from) {
     const box = row.closest(".scroll");
     if (box && !box.contains(from) && !box.querySelector(".on ~ .on")) box.scrollTop = row.offsetTop - box.clientHeight / 2;
   }
-  cursor(chosen.length === 2 ? chosen : null);
   bar.hidden = !chosen.length;
   bar.replaceChildren(...(chosen.length ? [say(chosen), make("button", { type: "button", textContent: "clear", onclick: () => choose([]) })] : []));
 }
 
-function cursor(views) {
-  const mark = matrix && matrix.querySelector(".cursor");
-  if (!mark) return;
-  mark.classList.toggle("seen", !!views);
-  if (!views) return;
-  const { side, left, top } = matrix.dataset;
-  mark.setAttribute("x", +left + Math.max(...views) * side);
-  mark.setAttribute("y", +top + Math.min(...views) * side);
-}
-
 for (const e of document.querySelectorAll("svg [data-v]")) e.addEventListener("click", event => choose([+e.dataset.v], event.target));
-
-if (matrix) {
-  const note = make("span", { className: "note", ariaLive: "polite" });
-  const tools = make("div", { className: "tools" });
-  [...matrix.querySelectorAll(".layer")].forEach((layer, k) => {
-    const radio = make("input", { type: "radio", name: "measure", checked: !k, onchange: () => { matrix.classList.remove("m1", "m2"); if (k) matrix.classList.add("m" + k); } });
-    tools.append(make("label", {}, radio, " " + layer.dataset.words));
-  });
-  matrix.before(tools);
-  matrix.after(note);
-  const at = event => {
-    const box = matrix.getBoundingClientRect(), unit = matrix.viewBox.baseVal.width / box.width;
-    const { side, left, top } = matrix.dataset;
-    const [b, a] = [((event.clientX - box.left) * unit - left) / side, ((event.clientY - box.top) * unit - top) / side].map(Math.floor);
-    const views = [Math.min(a, b), Math.max(a, b)];
-    return a !== b && views[0] >= 0 && views[1] < facts.views.length ? views : null;
-  };
-  matrix.addEventListener("pointermove", event => { const views = at(event); note.textContent = views ? say(views) : ""; cursor(views); });
-  matrix.addEventListener("pointerleave", () => { note.textContent = ""; cursor(chosen.length === 2 ? chosen : null); });
-  matrix.addEventListener("click", event => { const views = at(event); if (views) choose(views, matrix); });
-}
 
 for (const table of document.querySelectorAll("table")) {
   const heads = [...table.tHead.rows[0].cells], body = table.tBodies[0], rows = [...body.rows];
@@ -78,7 +43,7 @@ for (const table of document.querySelectorAll("table")) {
     const compare = (a, b) => a !== "" && b !== "" && !isNaN(a) && !isNaN(b) ? a - b : a.localeCompare(b, undefined, { numeric: true });
     body.append(...[...body.rows].sort((a, b) => compare(key(a), key(b)) * (down ? -1 : 1)));
   }));
-  if (rows.length && rows[0].dataset.views && facts.views.length) {
+  if (rows.length && rows[0].dataset.views) {
     table.classList.add("live");
     rows.forEach((row, k) => {
       const views = row.dataset.views.split("-").map(Number);

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from functools import cache, partial
 from types import NoneType, UnionType
 from typing import Any, ClassVar, Self, Union, dataclass_transform, get_args, get_origin, get_type_hints
@@ -149,40 +149,16 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """A table with its caption and the heads of its columns, units in them; `folded` ones open on demand."""
+    """A table with its caption and the heads of its columns, units in them.
+
+    `marks`: the indices of each row's images, for the page's script: one, or two with a hyphen.
+    """
 
     key: str
     caption: str
     columns: Sequence[str]
     rows: Sequence[Sequence[Cell]]
-    folded: bool = False
     marks: Sequence[str] = ()
-
-    def marked(self, marks: Sequence[str]) -> Table:
-        """Return the same with the indices of each row's images, for the page's script: one, or two with a hyphen."""
-        return replace(self, marks=list(marks))
-
-    def fold(self) -> Table:
-        """Return the same, to be opened on demand."""
-        return replace(self, folded=True)
-
-    @property
-    def shown(self) -> Sequence[Sequence[Cell]]:
-        """The rows on the page."""
-        return self.rows[:MAX_TABLE_ROWS]
-
-    @property
-    def heading(self) -> str:
-        """The caption, which says where rows are missing."""
-        if len(self.rows) <= MAX_TABLE_ROWS:
-            return self.caption
-        return f"{self.caption}; the first {MAX_TABLE_ROWS} of {len(self.rows)}, all in the files beside this page"
-
-    @property
-    def kinds(self) -> list[str]:
-        """How each column is set: "text" on the left, "number" on the right."""
-        first = self.rows[0] if self.rows else [Cell("", "", "name")] * len(self.columns)
-        return ["number" if cell.kind == "number" else "text" for cell in first]
 
     @property
     def texts(self) -> list[list[str]]:
@@ -248,7 +224,7 @@ def cell_of(value: Any, form: str = "") -> Cell:
     if value is None or (isinstance(value, tuple) and None in value):
         return Cell("-", 1e300) if form else Cell("-", "-", "name")
     if isinstance(value, str):
-        return Cell(value, value, "name")
+        return Cell(value, 1e301) if form else Cell(value, value, "name")  # why there is no number
     if isinstance(value, tuple):
         return Cell(", ".join(format(item, form) for item in value), _key(max(map(abs, value))))
     return Cell(format(value, form) if value else "0", _key(value))

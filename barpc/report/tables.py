@@ -118,10 +118,7 @@ def _points_ply(run: Run, _: Summary) -> bytes:
         origin[0] = rows[0, 0]  # a mean of longitudes may fall on the other side of the Earth
     local = (ecef_from_ground(rows[:, :3]) - ecef_from_ground(origin)) @ enu_basis(origin).T
     columns: dict[str, Any] = dict(zip("xyz", local.T, strict=True))
-    columns |= {
-        "mean_residual": rows[:, 3].astype(np.float32),
-        "num_observations": rows[:, 4].astype(np.int32),
-    }
+    columns |= {"mean_residual": rows[:, 3].astype(np.float32), "num_observations": rows[:, 4].astype(np.int32)}
     place = f"lon {origin[0]:.9f} lat {origin[1]:.9f} alt {origin[2]:.4f} (WGS84, above the ellipsoid)"
     return ply(columns, f"barpc {__version__}: x east, y north, z up [m] of {place}")
 

@@ -174,12 +174,12 @@ def test_what_holds_the_scene_is_a_table_where_several_sources_do(
     print_summary(a_summary([], scene=SimpleNamespace(datum=(entry,))))
     title, head, row, *_ = capsys.readouterr().out.splitlines()
     assert title == DATUM
-    assert [word in head for word in ("motion", "cameras [%]", "earlier run")] == [
+    assert [word in head for word in ("motion", "cameras", "earlier run")] == [
         True,
         True,
         False,
     ]
-    assert row.split() == ["east", "0.50", "70", "30"]
+    assert row.split() == ["east", "0.50", "70%", "30%"]
     for alone in ((), (DatumEntry("east", 0.5, 0.996, 0.0, 0.0, 0.004, 0.0),)):  # the verdict says it
         print_summary(a_summary([], scene=SimpleNamespace(datum=alone)))
         assert capsys.readouterr().out == "All well.\n"

@@ -12,7 +12,6 @@ frame.addEventListener("load", () => {
   for (const svg of page.querySelectorAll("svg")) {
     const view = svg.viewBox.baseVal, boxes = [];
     for (const text of svg.querySelectorAll("text")) {
-      if (!text.getClientRects().length) continue;  // of a measure that is not chosen
       const box = text.getBBox(), words = svg.getAttribute("aria-labelledby") + ": " + text.textContent;
       if (box.x < -2 || box.y < -2 || box.x + box.width > view.width + 2 || box.y + box.height > view.height + 2) found.outside.push(words);
       for (const [other, name] of boxes) {
@@ -25,8 +24,6 @@ frame.addEventListener("load", () => {
   }
   found.wide = [...page.querySelectorAll("h1, h2, p, li, figure, figcaption, .scroll, summary")]
     .filter(e => e.getBoundingClientRect().right > page.documentElement.clientWidth + 1).map(e => e.textContent.slice(0, 60));
-  found.squeezed = [...page.querySelectorAll(".bars li > span:first-child")]
-    .filter(e => e.getBoundingClientRect().width < 120).map(e => e.textContent);
   found.unnamed = [...page.querySelectorAll("svg")].filter(svg => !page.getElementById(svg.getAttribute("aria-labelledby").split(" ")[0])).length;
   const table = page.querySelector("#t-images"), heads = [...table.tHead.rows[0].cells];
   const column = name => heads.findIndex(head => head.textContent.startsWith(name));

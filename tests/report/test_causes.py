@@ -16,7 +16,7 @@ from barpc.ba.judging.judge import Finding
 from barpc.ba.judging.moving import Motion
 from barpc.ba.placing import Look
 from barpc.report import verdict
-from barpc.report.summary.findings import _WORDS, _place, explanations, left_entries, strangeness
+from barpc.report.summary.whole import _WORDS, explanations, left_entries, strangeness
 
 NAMES = "west", "east"
 
@@ -25,6 +25,12 @@ def adjustment(findings: Any = (), left: Any = (), apart: Any = None) -> Any:
     half = np.array([[4000.0, 2000.0], [6000.0, 3000.0]])
     cameras = SimpleNamespace(unknowns=SimpleNamespace(half=half))
     return SimpleNamespace(names=NAMES, findings=findings, left=left, cameras=cameras, apart=apart)
+
+
+def reasons(found: Any) -> list[str]:
+    """What is said of places that stand out and of what else a group may be."""
+    run: Any = SimpleNamespace(adjustment=found, met_worse=[])
+    return list(verdict._of_places(run, found, ()))
 
 
 def test_every_explanation_has_its_words() -> None:
@@ -98,9 +104,9 @@ def test_images_that_settle_alike_are_said_once(rate: float, end: str) -> None:
     [
         (
             "north-west",
-            "35 % of the tie points, in the north-west of the block (5.000-5.100 E, 43.000-43.200 N), move together",
+            "35 % of the tie points, in the north-west of the block, move together",
         ),
-        ("", "35 % of the tie points, at 5.000-5.100 E, 43.000-43.200 N, move together"),
+        ("", "35 % of the tie points, about 5.0500, 43.1000 deg, move together"),
     ],
 )
 def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: str) -> None:
@@ -117,25 +123,11 @@ def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: st
     assert type(found).read({**vars(found), "box": [5.0, 43.0, 5.1, 43.2]}) == found
 
 
-@pytest.mark.parametrize(
-    ("box", "said"),
-    [
-        ((-5.2, -43.2, -5.1, -43.0), "5.100-5.200 W, 43.000-43.200 S"),
-        ((179.9, 0.5, -179.9, 0.7), "179.900 E to 179.900 W, 0.500-0.700 N"),  # over the 180th meridian
-        ((-0.2, -0.1, 0.1, 0.1), "0.200 W to 0.100 E, 0.100 S to 0.100 N"),
-        ((5.0, 43.0, 5.0002, 43.0001), "5.000000-5.000200 E, 43.000000-43.000100 N"),  # some metres
-        ((5.0, 43.0, 5.0, 43.0), "5.000000-5.000000 E, 43.000000-43.000000 N"),
-    ],
-)
-def test_longitudes_and_latitudes_are_said_with_their_side_and_as_many_digits_as_tell(box, said) -> None:
-    assert _place(Motion(1.0, (0, 1), 0.2, box, "")) == f"at {said}"
-
-
 @pytest.mark.parametrize(("gap", "told"), [(4.9, True), (5.1, False)])
 def test_what_else_a_group_may_be_is_a_reason_where_ties_cannot_tell(gap: float, told: bool) -> None:
     motion = Motion(1.0, (0, 1), 0.2, (5.0, 43.0, 5.1, 43.2), "")
     finding = Finding(MOVING, -1, None, np.zeros(2), 42.0, gap, STRIP, np.zeros(0), motion=motion)
-    said = verdict._ambiguous(adjustment([finding]))
+    said = reasons(adjustment([finding]))
     assert bool(said) == told
     if told:
         assert said == [
@@ -150,24 +142,23 @@ def interval(view: int, share: float, off: float) -> Interval:
 
 def test_what_is_left_is_a_reason_where_it_is_much() -> None:
     left = [interval(0, 0.8, 0.0), interval(0, 0.4, 0.0), interval(1, 0.02, 0.09)]
-    run: Any = SimpleNamespace(adjustment=adjustment(left=left), met_worse=[])
-    first, second = verdict._left_reasons(run)
+    found = adjustment(left=left)
+    first, second = reasons(found)
     assert first == (
         "Rows 100-399 of west stand out: 80 % of their tie points contradict the others, half of these by more than "
         "2.50 px."
     )
     assert second == "Rows 100-399 of east stand out: their tie points are left with 0.09 px in common."
-    assert [one.last for one in left_entries(run.adjustment)] == [399.0] * 3
-    quiet: Any = SimpleNamespace(adjustment=adjustment(left=[interval(0, 0.1, 0.05)]), met_worse=[])
-    assert verdict._left_reasons(quiet) == []
+    assert [one.last for one in left_entries(found)] == [399.0] * 3
+    assert reasons(adjustment(left=[interval(0, 0.1, 0.05)])) == []
 
 
 def test_rows_of_which_most_ties_move_may_be_what_is_off() -> None:
     left = [replace(interval(view, 0.8, 0.0), moves=True) for view in (0, 1, 0, 1)]
-    (said,) = verdict._left_reasons(SimpleNamespace(adjustment=adjustment(left=left), met_worse=[]))
+    (said,) = reasons(adjustment(left=left))
     assert said == (
-        "Most tie points of rows 100-399 of west, rows 100-399 of east, rows 100-399 of west and 1 more are of what "
-        "moves: it may as well be these rows that lie off, and no camera follows them."
+        "Most tie points of rows 100-399 of west, rows 100-399 of east, rows 100-399 of west, rows 100-399 of east "
+        "are of what moves: it may as well be these rows that lie off, and no camera follows them."
     )
 
 

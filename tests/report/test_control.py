@@ -10,7 +10,7 @@ import pytest
 from barpc import report
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.report import Run
-from barpc.report.decisions import control_sentence
+from barpc.report.digest import decisions
 from barpc.report.page import report_html
 
 
@@ -56,8 +56,8 @@ def test_a_wrong_position_in_one_image_is_found_there_and_said(block_run):
     test = summary.control_test
     assert test.num_beyond >= 1
     assert (test.image, test.point) == (name, point)
-    sentence = control_sentence(summary)
-    assert sentence.startswith(f"{test.num_beyond} of {test.num} residuals of control")
+    sentence = decisions(summary)[-1]
+    assert sentence.startswith(f"{test.num_beyond} of {test.num} residuals of control in the images beyond")
     assert sentence.endswith(f"(the largest: w = {test.largest_w:.1f}, {point} in {name}).")
 
 
@@ -65,7 +65,7 @@ def test_the_page_shows_it_by_point_and_by_image(block_run):
     html = report_html(block_run.record, block_run.folder)
     assert "w in images" in html
     assert 'id="t-control"' in html
-    assert control_sentence(block_run.record) in html
+    assert decisions(block_run.record)[-1] in html
     without = replace(block_run.record, views=tuple(replace(v, control_w=None) for v in block_run.record.views))
     assert 'id="t-control"' not in report_html(without, block_run.folder)
 

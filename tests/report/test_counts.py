@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from barpc.ba.held.ground import TerrainTest
-from barpc.report import decisions, page
+from barpc.report import page
+from barpc.report.digest import decisions
 from barpc.report.summary import TracksEntry
 from barpc.report.verdict import block_verdict
 from barpc.tie.reference import ReferenceControl, ViewMatch
@@ -49,7 +50,7 @@ def the_views(num: int, seen: int, **fields: Any) -> list[Any]:
 @pytest.mark.parametrize(("num", "seen"), list(product((1, 2, 3), (0, 1, 2))))
 def test_images_and_tie_points(kind, num, seen):
     found = block_verdict(run_of(kind=kind, tracks=Ties(seen)), the_views(num, seen))
-    spoken([found["headline"], *found["lines"]])
+    spoken([found["headline"], *found["verdict"]])
     if kind == "adjust":
         assert found["headline"].split(" are")[0].split(" is")[0] == {1: "The image", 2: "Both images"}.get(
             num, "All 3 images"
@@ -66,7 +67,7 @@ def unknown_residuals(num: int, seen: bool) -> Any:
 def test_check_points(num, seen, monkeypatch):
     monkeypatch.setattr("barpc.report.verdict.check_residuals", lambda *_: unknown_residuals(num, seen))
     run = run_of(check_points=gcps(num), after=())
-    (line,) = [line for line in block_verdict(run, the_views(3, 9))["lines"] if "check point" in line]
+    (line,) = [line for line in block_verdict(run, the_views(3, 9))["verdict"] if "check point" in line]
     spoken([line])
     assert line.startswith(f"{num} check point{'s' * (num > 1)}, not used above, {'are' if num > 1 else 'is'} ")
     assert ("met to" in line) == seen
@@ -84,8 +85,8 @@ def test_control_a_dem_and_a_reference(num):
         {"left_out": (("a.tif", "a.tif: no RPC"),) * num},
     ):
         found = block_verdict(run_of(**fields), the_views(3, 40))
-        spoken([found["headline"], *found["lines"]])
-        left = [line for line in found["lines"] if "a.tif" in line]
+        spoken([found["headline"], *found["verdict"]])
+        left = [line for line in found["verdict"] if "a.tif" in line]
         assert len(left) == (num if "left_out" in fields else 0)
 
 
@@ -100,4 +101,4 @@ def test_the_answers_of_the_page(views, pairs, tracks):
     assert len(made) >= 4
     for section in made:
         spoken([section.answer, *section.points, *(words for _, words in section.charts)])
-    spoken(["decisions:", *decisions.decisions(summary)])  # of nothing none
+    spoken(["decisions:", *decisions(summary)])  # of nothing none

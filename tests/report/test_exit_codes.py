@@ -37,7 +37,7 @@ def test_every_status_of_an_image_decides_the_whole(status, kind, verdict):
     found = verdict(status, kind)
     assert found["status"] == OVERALL.get(status, "good")
     assert bool(found["reasons"]) == (status in OVERALL)
-    assert set(found["reasons"]) <= set(found["lines"])
+    assert set(found["reasons"]) <= set(found["verdict"])
     if status in OVERALL:
         assert ADVICE[status] in found["reasons"][0]
         assert "(of 9)" in found["headline"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from itertools import chain
 from types import SimpleNamespace
 
@@ -12,9 +13,8 @@ import pytest
 
 from barpc.report import maps
 from barpc.report.maps import Plane, ground_map, residual_cells, residual_panels
-from barpc.report.summary.findings import ExplanationEntry
 from barpc.report.summary.known import CheckPointEntry
-from barpc.report.summary.whole import MovingEntry
+from barpc.report.summary.whole import ExplanationEntry
 
 from .made import (
     Drawing,
@@ -149,17 +149,16 @@ def test_the_ground_map_has_outlines_dots_lines_and_points():
     assert drawn.titles("outline adjusted") == ["A: 5 tie points"]
     (dots,) = drawn.all("path", "point")
     assert np.array(corners(dots.get("d"))) == pytest.approx(at(np.array(points)[:, :2]), abs=0.06)
-    assert drawn.titles("tie") == ["A + 1 - C: 100 matches"]  # of all pairs between the stacks; none within one
-    middle = (at(outlines[0][0][:-1]).mean(axis=0), at(outlines[2][0][:-1]).mean(axis=0))
-    assert drawn.lines("tie") == [pytest.approx(np.concatenate(middle), abs=0.006)]
-    assert drawn.texts("stack") == [
-        (
-            "A + 1",
-            pytest.approx(middle[0][0], abs=0.006),
-            pytest.approx(middle[0][1] + 4, abs=0.006),
-            "middle",
-        ),
-        ("C", pytest.approx(middle[1][0], abs=0.006), pytest.approx(middle[1][1] + 4, abs=0.006), "middle"),
+    assert drawn.titles("tie") == ["A - C: 30 matches", "B - C: 70 matches", "A - B: 900 matches"]  # strongest on top
+    middle = [at(outline[0][:-1]).mean(axis=0) for outline in outlines]
+    assert drawn.lines("tie")[0] == pytest.approx(np.concatenate([middle[0], middle[2]]), abs=0.006)
+    (*_, widest) = drawn.of("line", "tie", "stroke-width", "stroke-opacity")
+    assert widest == (3.0, 0.9)
+    weakest, *_ = drawn.of("line", "tie", "stroke-width", "stroke-opacity")
+    assert weakest == pytest.approx((0.6 + 2.4 * math.sqrt(30 / 900), 0.2 + 0.7 * math.sqrt(30 / 900)), abs=0.006)
+    assert drawn.texts("name") == [  # that of B would stand on it
+        (name, pytest.approx(x, abs=0.006), pytest.approx(y + 4, abs=0.006), "middle")
+        for name, (x, y) in (("A", middle[0]), ("C", middle[2]))
     ]
     x, y = at(np.array([10.05, 0.005]))
     assert np.array(drawn.points("gcps")[0]) == pytest.approx(
@@ -171,49 +170,44 @@ def test_the_ground_map_has_outlines_dots_lines_and_points():
     )
     assert (drawn.titles("gcps"), drawn.titles("check_points")) == (["P"], ["Q"])
     assert drawn.described == "3 outlines, 3 pairs, 1 GCPs, 1 check points."
-    assert drawn.root.get("class") is None
 
 
-def test_what_moves_is_shaded_by_its_share_and_outlined_and_says_so():
+def test_where_tie_points_move_is_outlined_and_says_so():
     views, outlines, pairs = scene()
-    cells = (
-        MovingEntry((9.995, -0.005, 10.0, 0.0), 20, 0.25),
-        MovingEntry((10.0, -0.005, 10.005, 0.0), 4, 1.0),
-    )
     box = (9.996, -0.004, 10.004, -0.001)
     groups = (
         ExplanationEntry("moving", "a <group> & more", None, 50.0, 40.0, box=box),
         ExplanationEntry("strip", "rows lie off", "A", 9.0, 9.0),
     )
-    found = SimpleNamespace(moving=cells, explanations=groups)
-    drawn = Drawing(ground_map(files_of(a_summary(views, pairs, scene=found), outlines)))
+    drawn = Drawing(ground_map(files_of(a_summary(views, pairs, scene=SimpleNamespace(explanations=groups)), outlines)))
     at = maps._plane_of(np.concatenate([*chain(*outlines)]))
-    shown = drawn.rects("moves")
-    for (x, y, width, height), cell in zip(shown, cells, strict=True):
-        west, south, east, north = cell.box
-        corners_of = at(np.array([(west, north), (east, south)]))
-        assert np.array([(x, y), (x + width, y + height)]) == pytest.approx(corners_of, abs=0.02)
-    opacity = [float(e.get("fill-opacity")) for e in drawn.all("rect", "moves")]
-    assert opacity[0] == pytest.approx(0.25 * opacity[1], abs=0.006)
-    assert drawn.titles("moves") == [
-        "25 % of 20 tie points move together",
-        "100 % of 4 tie points move together",
-    ]
     assert drawn.titles("group") == ["a <group> & more"]
     (outline,) = drawn.rects("group")
     assert outline[:2] == pytest.approx(at(np.array([box[0], box[3]])), abs=0.006)
-    still = Drawing(ground_map(files_of(a_summary(views, pairs), outlines)))
-    assert not still.all("rect", "moves")
-
-
-def test_what_moves_over_the_180th_meridian_is_drawn_there():
-    outlines = [a_square(180.0, 0.0)]
-    cell = MovingEntry((179.998, 0.0, -179.998, 0.002), 5, 0.5)
-    found = SimpleNamespace(moving=(cell,), explanations=())
-    drawn = Drawing(ground_map(files_of(a_summary([a_view()], scene=found), outlines)))
-    ((x, _, width, height),) = drawn.rects("moves")
+    assert np.add(outline[:2], outline[2:]) == pytest.approx(at(np.array([box[2], box[1]])), abs=0.02)
+    wide = SimpleNamespace(explanations=(replace(groups[0], box=(179.998, 0.0, -179.998, 0.002)),))
+    drawn = Drawing(ground_map(files_of(a_summary([a_view()], scene=wide), [a_square(180.0, 0.0)])))
+    ((x, _, width, height),) = drawn.rects("group")
     assert x + width / 2 == pytest.approx(210.0, abs=0.5)
     assert 1.5 * height < width < 2.5 * height
+
+
+def test_names_stand_in_the_sheet_and_on_nothing_and_long_ones_are_cut_to_their_ends():
+    places = [(a_view("view_0137"), np.array([2.0, 100.0])), (a_view("B"), np.array([419.0, 50.0]))]
+    drawn = drawn_of(maps._names(places, []))
+    assert drawn.texts("name") == [("view_0137", 32.4, 104.0, "middle"), ("B", 416.4, 54.0, "middle")]
+    assert len(maps._names(places, [(30.0, 90.0, 20.0)])) == 1
+    (long,) = drawn_of(maps._names([(a_view(f"{'x' * 60}_0137"), np.array([210.0, 50.0]))], [])).texts("name")
+    assert (long[0][0], long[0][-5:], len(long[0])) == ("…", "_0137", 16)
+    for dx, dy, shown in ((7.3, 0.0, 2), (7.1, 0.0, 1), (0.0, 14.1, 2), (0.0, 13.9, 1)):
+        assert (
+            len(
+                maps._names(
+                    [(a_view("V"), np.array([50.0, 50.0])), (a_view("V"), np.array([50.0 + dx, 50.0 + dy]))], []
+                )
+            )
+            == shown
+        )
 
 
 def test_a_point_outside_of_all_images_is_on_the_map_too():
@@ -233,85 +227,6 @@ def test_of_many_tie_points_and_images_some_are_drawn(monkeypatch):
     assert [e.get("data-v") for e in drawn.all("g") if e.get("data-v")] == ["0", "2"]
 
 
-@pytest.mark.parametrize(
-    ("num", "many", "named"), [(30, False, True), (31, True, True), (100, True, True), (101, True, False)]
-)
-def test_a_map_of_many_stacks_has_thinner_lines_and_fewer_numbers(num, many, named):
-    views = [a_view(f"V{k}") for k in range(num)]
-    outlines = [a_square(10.0 + 0.4 * (k % 11), 0.4 * (k // 11)) for k in range(num)]
-    drawn = Drawing(ground_map(files_of(a_summary(views), outlines)))
-    assert drawn.root.get("class") == ("many" if many else None)
-    assert bool(drawn.texts("stack")) == named
-
-
-def test_lines_between_images_grow_with_the_root_of_their_matches(monkeypatch):
-    links = [((0, 0), (1, 1), 25, "a - b"), ((2, 0), (3, 1), 100, "c - d"), ((4, 0), (5, 1), 4, "e - f")]
-    drawn = drawn_of(maps._ties(links, (0.6, 2.4), (0.2, 0.7)))
-    assert drawn.titles() == [
-        "e - f: 4 matches",
-        "a - b: 25 matches",
-        "c - d: 100 matches",
-    ]  # the strongest on top
-    found = drawn.of("line", "tie", "x1", "y1", "x2", "y2", "stroke-width", "stroke-opacity")
-    assert found == [(4, 0, 5, 1, 1.08, 0.34), (0, 0, 1, 1, 1.8, 0.55), (2, 0, 3, 1, 3.0, 0.9)]
-    monkeypatch.setattr(maps, "_MOST_LINKS", 2)
-    assert drawn_of(maps._ties(links, (0.6, 2.4), (0.2, 0.7))).titles()[0] == "a - b: 25 matches"
-    assert maps._ties([], (0.6, 2.4), (0.2, 0.7)) == []
-
-
-@pytest.mark.parametrize(
-    ("views", "text"),
-    [
-        ([0], "view_0137"), ([0, 1], "view_0137 + 1"), ([0, 2, 4, 6], "view_0137 + 3"),
-    ],
-)  # fmt: skip
-def test_a_stack_is_called_by_the_name_of_its_first_image(views, text):
-    assert maps.Stack(views, np.zeros(2), "view_0137").text == text
-    long = maps.Stack(views, np.zeros(2), f"{'x' * 60}_0137").text
-    assert long.startswith("…")
-    assert "_0137" in long
-    assert len(long) <= 16 + len(" + 3")
-
-
-def test_images_nearer_than_26_units_are_one_stack_whatever_cell_they_lie_in():
-    middles = [(100.0, 100.0), (125.9, 100.0), (126.1, 100.0), (100.0, 126.1), (300.0, 20.0), (318.0, 38.0)]
-    at = plane()
-    outlines = [[np.array([[10 + (x - 210) / 100, (150 - y) / 200]] * 4)] for x, y in middles]
-    found = maps._stacks(at, outlines, NAMES)
-    assert [stack.views for stack in found] == [[0, 1], [2], [3], [4, 5]]
-    assert np.array([stack.place for stack in found]) == pytest.approx(np.array([middles[k] for k in (0, 2, 3, 4)]))
-    assert maps._stacks(at, [[], outlines[0]], NAMES)[0].views == [1]  # an image that shows no ground has none
-
-
-def test_of_two_stacks_as_near_the_earlier_takes_an_image():
-    outlines = [[np.array([[10 + (x - 210) / 100, 0.0]] * 4)] for x in (100.0, 140.0, 120.0)]
-    assert [stack.views for stack in maps._stacks(plane(), outlines, NAMES)] == [[0, 2], [1]]
-
-
-@pytest.mark.parametrize(
-    ("dx", "dy", "num", "shown"),
-    [
-        (7.3, 0.0, 2, True), (7.1, 0.0, 2, False), (0.0, 14.1, 2, True), (0.0, 13.9, 2, False),
-        (7.3, 0.0, 31, False), (21.3, 0.0, 31, True), (0.0, 28.1, 31, True), (0.0, 27.9, 31, False),
-    ],
-)  # fmt: skip
-def test_numbers_do_not_stand_on_each_other_and_farther_apart_where_there_are_many(dx, dy, num, shown):
-    first = np.array([50.0, 50.0])
-    places = [first, first + [dx, dy], *(np.array([200.0, 500.0 * k]) for k in range(1, num - 1))]
-    stacks = [maps.Stack([0], place, "V") for place in places]
-    assert len(maps._stack_names(stacks, num > 30)) == num - (not shown)
-
-
-def test_a_name_stands_on_no_degree_and_in_the_sheet():
-    stacks = [
-        maps.Stack([0], np.array([2.0, 100.0]), "view_0137"),
-        maps.Stack([1], np.array([419.0, 50.0]), "B"),
-    ]
-    drawn = drawn_of(maps._stack_names(stacks, False))
-    assert drawn.texts("stack") == [("view_0137", 32.4, 104.0, "middle"), ("B", 416.4, 54.0, "middle")]
-    assert len(maps._stack_names(stacks, False, [(30.0, 90.0, 20.0)])) == 1
-
-
 def test_outlines_of_images_that_need_a_look_are_on_top_with_their_names():
     bad = {"status": "doubtful", "advice": "look", "cause": "held_out"}
     worst = {"status": "failed", "advice": "look", "cause": "untied"}
@@ -319,22 +234,13 @@ def test_outlines_of_images_that_need_a_look_are_on_top_with_their_names():
     outlines = [a_square(10.0 + 0.001 * k, 0.0) for k in range(4)]
     drawn = Drawing(ground_map(files_of(a_summary(views), outlines)))
     assert [e.get("data-v") for e in drawn.all("g") if e.get("data-v")] == ["1", "3", "0", "2"]
-    assert [text[0] for text in drawn.texts("stack failed")] == ["C"]
-    assert not drawn.texts("stack")  # it would stand on that one
+    assert [text[0] for text in drawn.texts("name failed")] == ["C"]
+    assert [text[0] for text in drawn.texts("name")] == ["B", "D"]
     many = [a_view(f"V{k}", **(bad if k in (100, 300) else {})) for k in range(500)]
     drawn = Drawing(ground_map(files_of(a_summary(many), [a_square(10.0 + 0.1 * k, 0.0) for k in range(500)])))
     assert [e.get("data-v") for e in drawn.all("g") if e.get("data-v")][-2:] == ["300", "100"]
     assert len(drawn.all("path", "outline doubtful")) == 2
     assert len(drawn.all("path", "outline adjusted")) <= 398
-
-
-# --- error ellipses ---------------------------------------------------------------------------------------
-
-
-def shapes_of(svg: str):
-    names = "".join(rf' {name}="([\d.]+)"' for name in ("cx", "cy", "rx", "ry"))
-    pattern = rf'<ellipse{names} transform="rotate\(([-\d.]+) ([\d.]+) ([\d.]+)\)"'
-    return [tuple(map(float, found)) for found in re.findall(pattern, svg)]
 
 
 # --- residuals over an image ------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from barpc.cli.main import cli
 from barpc.errors import BarpcError, InputError
 from barpc.pipeline import outputs
-from barpc.report import Run, maps, page, records, summarize
+from barpc.report import Run, maps, page, summarize
 from barpc.report.summary.words import metres
 from barpc.report.tables import TABLES, ObservationTable, RunFiles
 from barpc.scene import Tracks
@@ -78,7 +78,6 @@ def test_every_question_is_asked_of_a_full_run(block_run):
     assert questions == [
         "Which images can I use?",
         "Where are the images, and which hold together?",
-        "Did the adjustment help?",
         "Are the residuals random?",
         "Do the pairs fit for stereo, and can heights be measured?",
         "What was changed in each camera?",
@@ -96,7 +95,6 @@ def test_every_question_is_asked_of_a_full_run(block_run):
 
 def test_a_check_asks_only_what_it_can_answer(check_run):
     html = html_of(check_run)
-    assert "How large are the errors?" in html
     assert "What was changed" not in html
     assert "new RPC files" not in html
 
@@ -106,15 +104,16 @@ def test_check_points_answer_how_accurate_it_is_on_the_ground(block_run, tmp_pat
     summary = written(replace(run, gcps=None, check_points=run.gcps), tmp_path / "run")
     html = (tmp_path / "run/report.html").read_text()
     assert "How accurate is it on the ground?" in html
+    assert 'id="t-check-points"' in html
     left = np.array([point["residual_enu_m"] for point in summary["check_points"]], dtype=float)
     up = metres(np.sqrt((left[:, 2] ** 2).mean()))
-    assert f"{up} east, north, up on the ground" in html
+    assert f"{up} on the ground (east, north, up)" in html
     assert 'class="check_points"' in html
 
 
 def test_a_page_of_many_images_shows_the_worst_and_says_so(block_run, monkeypatch):
     monkeypatch.setattr(maps, "_MOST", 4)
-    monkeypatch.setattr(records, "MAX_TABLE_ROWS", 5)
+    monkeypatch.setattr(page, "MAX_TABLE_ROWS", 5)
     html = page.report_html(block_run.record, block_run.folder)
     assert "Of 9 images 4 are shown: those with the largest systematic part." in html
     assert "the first 5 of 9, all in the files beside this page" in html

@@ -10,7 +10,7 @@ import pytest
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.geodesy import ecef_from_ground, metres_per_unit
 from barpc.report import Run
-from barpc.report.summary.place import ce90, clocks_in_image, ellipse, shift_in_image, stated_ce90
+from barpc.report.summary.place import ce90, moved_by_clocks, moved_in_space, stated_ce90
 from barpc.report.tables import read_tables
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
@@ -51,11 +51,11 @@ def test_the_ellipse_and_the_shift_are_what_each_unknown_does(block_run, model):
     root = np.random.default_rng(4).normal(size=(6, 6))[: len(by_ground)] * [1.0, 0.2, 0.5, 2.0, 0.1, 0.7]
     covariance = np.full((9, 9), 77.0)  # a drift's rows stand behind, and do not count in the middle row
     covariance[: len(root), : len(root)] = root @ root.T
-    shift, sigma = shift_in_image(sensor, covariance, model, middle)
+    shift, sigma, found = moved_in_space(sensor, covariance, model, middle)
     in_image = np.array(by_image).T @ root
     assert sigma == pytest.approx(np.sqrt((in_image**2).sum(axis=1)), rel=2e-3)
     assert shift == pytest.approx(pixel - sensor.sensor.project(middle), abs=1e-5)
-    found = ellipse(sensor, covariance, model, middle)
+    _, _, found = moved_in_space(sensor, covariance, model, middle)
     values, axes = np.linalg.eigh(np.array(by_ground).T @ root @ root.T @ np.array(by_ground))
     assert [found.minor_m, found.major_m] == pytest.approx(np.sqrt(values), rel=2e-3)
     azimuth = np.degrees(np.arctan2(*axes[:, 1])) % 180.0
@@ -72,7 +72,7 @@ def test_the_ellipse_is_that_of_cameras_drawn_from_the_covariance(block_run, mod
     sensor, covariance = adjustment.sensors[2], adjustment.covariance.view(2)
     pixel = (np.array(run.views[2].size) - 1) / 2
     middle = sensor.sensor.localize(pixel, np.array(run.altitude))
-    found = ellipse(sensor, covariance, model, middle)
+    _, _, found = moved_in_space(sensor, covariance, model, middle)
     at = sensor.localize(pixel, np.array(run.altitude))
     distance = adjustment.cameras.unknowns.distance[2]
     drawn = np.random.default_rng(1).multivariate_normal(np.zeros(len(covariance)), covariance, 3000)
@@ -98,7 +98,7 @@ def test_that_of_a_radar_is_what_its_clocks_do_to_a_place():
     timed = Timed(radar, Timing([[3.0, 2e-4]]))
     covariance = np.array([[0.5, 0.3, 9.0], [0.3, 1.2, 9.0], [9.0, 9.0, 9.0]])  # range and along the flight first
     at = timed.localize(pixel, alt)
-    moved, sigma, found = clocks_in_image(timed, covariance, at)
+    moved, sigma, found = moved_by_clocks(timed, covariance, at)
     steps = [(0.5, 0.0), (0.0, 0.5 / radar.speed)]  # half a metre to each side
     ahead, behind = ([Timed(radar, Timing([[3.0 + s * m, 2e-4 + s * n]])) for m, n in steps] for s in (1.0, -1.0))
     there, here = (np.array([one.localize(pixel, alt) for one in side]) for side in (ahead, behind))

@@ -53,16 +53,12 @@ def test_an_outline_that_is_clicked_is_chosen_in_the_tables_and_not_when_clicked
     assert found["again"] == [[], [], ""]
 
 
-def test_a_cell_of_the_matrix_says_its_pair_under_the_pointer_and_chooses_it(found, pair):
-    assert found["hover"].startswith(f"view_0000 and view_0001: {pair['num_matches']} matches, epipolar offset 0.")
-    assert found["hover"].endswith(f"{pair['convergence_deg']:.1f} degrees")
-    assert found["diagonal"] == ""
-    lit, rows, said = found["matrix"]
+def test_a_row_of_a_pair_chooses_both_its_images(found, pair):
+    lit, rows, said = found["pair"]
     assert sorted(lit) == ["0", "1"]
     assert [row for row in rows if row.startswith("t-images")] == ["t-images view_0000", "t-images view_0001"]
     assert [row for row in rows if row.startswith("t-pairs")] == ["t-pairs view_0000 - view_0001"]
-    assert said == found["hover"]
-    assert found["cursor"] == [True, 1, 0]
+    assert said == f"view_0000 - view_0001: {pair['num_matches']} matches"
     assert found["cleared"] == [[], [], ""]
 
 
@@ -70,10 +66,6 @@ def test_keys_walk_and_choose(found):
     assert found["focus"] == "view_0001"
     assert found["keyed"][0] == ["1"]
     assert found["keyed"][1].startswith("view_0001")
-
-
-def test_one_measure_is_shown_at_a_time(found):
-    assert found["layers"] == [[True, False, False], [False, True, False], [False, False, True]]
 
 
 def test_a_filter_keeps_the_rows_that_have_its_words(found):

@@ -12,11 +12,11 @@ import pytest
 from barpc import report
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.report import Run
-from barpc.report.decisions import decisions
+from barpc.report.digest import decisions
 from barpc.report.outcome import pair_ties, triangulate_tracks
 from barpc.report.records import Number, plain, said, table
 from barpc.report.summary import published_schema
-from barpc.report.summary.place import shift_in_image
+from barpc.report.summary.place import moved_in_space
 from barpc.report.summary.views import ViewEntry
 from barpc.report.tables import read_summary
 from barpc.scene import middle_altitude
@@ -162,7 +162,7 @@ def test_its_sigma_is_the_covariance_carried_over_by_the_derivative(block_run, m
     sensor = adjustment.sensors[2]
     middle = sensor.sensor.localize((np.array(run.views[2].size) - 1) / 2, np.array(run.altitude))
     covariance = adjustment.covariance.view(2)
-    _, sigma = shift_in_image(sensor, covariance, model, middle)
+    _, sigma, _ = moved_in_space(sensor, covariance, model, middle)
     from barpc.geodesy import ecef_from_ground
 
     distance = np.linalg.norm(ecef_from_ground(middle) - sensor.correction.center)

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from barpc.cli import terminal
 from barpc.cli.terminal import layout, print_summary
 from barpc.report.summary import LeftOutEntry
-from barpc.report.summary.causes import CAUSES, Reservation
 from barpc.report.summary.pairs import OffsetEntry
+from barpc.report.summary.words import CAUSES
 
 from .made import a_pair, a_summary, a_view
 
@@ -104,7 +104,7 @@ def a_large_run(bad: int, torn: int = 40, num: int = 300, **fields):
     views = []
     for k in range(num):
         cause = causes[k % 3]
-        advice = Reservation.of(cause, error=1.0 + k, noise=9.0, share=90.0, few=k).advice
+        advice = CAUSES[cause].advice(error=1.0 + k, noise=9.0, share=90.0, few=k)
         of_bad = {"status": CAUSES[cause].status, "advice": advice, "cause": cause, "rmse_after": 1.0 + k}
         views.append(a_view(f"view_{k:04d}", **(of_bad if k < bad else {})))
     pairs = [

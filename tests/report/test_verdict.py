@@ -10,13 +10,13 @@ import pytest
 
 from barpc.ba import adjust_tracks
 from barpc.ba.apart import Apart
-from barpc.ba.held.gauge import MOTIONS, Mode
+from barpc.ba.held.gauge import MOTIONS
 from barpc.ba.placing import Look
 from barpc.errors import BarpcWarning
 from barpc.fit import FitOptions
 from barpc.options import RunOptions
 from barpc.report import Run
-from barpc.report.summary.whole import mode_in_words
+from barpc.report.summary.whole import MODES
 from barpc.report.summary.words import metres
 from tests.report.conftest import summarize
 
@@ -132,7 +132,7 @@ def test_ground_control_changes_what_is_said_about_the_place(block_run):
 
 @pytest.mark.parametrize("meaning", MOTIONS)
 def test_every_weak_mode_has_its_sentence(meaning):
-    words = mode_in_words(Mode(0.25, np.zeros(7), meaning))
+    words = MODES[meaning].format(metres(0.25))
     assert "25.0 cm" in words
     assert len(words) > 30
 

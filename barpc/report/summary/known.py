@@ -93,16 +93,10 @@ class ReferenceViewEntry(Record):
 
     name: str = said("View", head="image")
     peak: Number = said(
-        "By how many standard deviations the vote for one shift stands out; below 6.5 it is none",
-        "",
-        "peak",
-        ".1f",
+        "By how many standard deviations the vote for one shift stands out; below 6.5 it is none", "", "peak", ".1f"
     )
     offset_en_m: Pixel | None = said(
-        "How far off the camera as delivered shows everything, east, north",
-        "m",
-        ("off east", "north"),
-        "+.2f",
+        "How far off the camera as delivered shows everything, east, north", "m", ("off east", "north"), "+.2f"
     )
     num_tried: Count = said("Points looked for", head="points tried")
     num_passed: Count = said("That beat their decoy and came back", head="found")

@@ -14,13 +14,7 @@ from barpc.report.records import Cell, Column, Number, Record, plain, said
 from barpc.report.summary.words import Count
 from barpc.scene import IntArray
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import (
-    Several,
-    base_to_height,
-    convergence_angle,
-    epipolar_offset,
-    ground_sample_distance,
-)
+from barpc.sensor.geometry import Several, base_to_height, convergence_angle, epipolar_offset, ground_sample_distance
 
 MAX_PER_PAIR = 1000  # Matches of a pair that its epipolar offset is measured on, evenly taken
 

@@ -12,23 +12,12 @@ import numpy as np
 from barpc.ba import Adjustment
 from barpc.fit import RpcFit
 from barpc.geodesy import Array
-from barpc.report.outcome import ControlResidual, Run
+from barpc.report.outcome import Run
 from barpc.report.records import Cell, Column, Number, Record, said, value_of
-from barpc.report.summary.causes import CAUSES
-from barpc.report.summary.place import EllipseEntry, clocks_in_image, ellipse, shift_in_image, stated_ce90
-from barpc.report.summary.words import (
-    ABOVE,
-    STATUS_WORDS,
-    Count,
-    Pixel,
-    Share,
-    Side,
-    Vector,
-    largest,
-    percent,
-)
+from barpc.report.summary.place import EllipseEntry, moved_by_clocks, moved_in_space, stated_ce90
+from barpc.report.summary.words import ABOVE, CAUSES, STATUS_WORDS, Count, Pixel, Share, Side, Vector, largest
 from barpc.scene import IntArray
-from barpc.sensor.corrected import Corrected, Correction, ImageCorrected
+from barpc.sensor.corrected import Corrected, ImageCorrected
 from barpc.sensor.geometry import Several, ground_sample_distance, image_grid, view_angles
 from barpc.sensor.splined import RowSpline, Splined
 from barpc.sensor.timing import Timed
@@ -80,8 +69,7 @@ class CorrectionEntry(Record):
     swing_px: Number = said("Amplitude of the swings of the rows", "px", "swing", ".2f", default=None)
     swing_rows: tuple[float, ...] | None = said("Their periods", "px", default=None)
     ellipse: EllipseEntry | None = said(
-        "How well it tells where the middle of its image is, the scene's own uncertain place in it",
-        default=None,
+        "How well it tells where the middle of its image is, the scene's own uncertain place in it", default=None
     )
     detectors: tuple[float, ...] | None = said("Columns where another detector begins", "px", default=None)
 
@@ -90,7 +78,7 @@ class CenterEntry(Record):
     """Where a camera stands."""
 
     ecef_m: Vector = said("Place, ECEF", "m")
-    altitude_m: Number = said("Above the ellipsoid", "m")
+    altitude_m: Number = said("Above the ellipsoid", "m", "camera centre", ",.0f")
     method: str = said("line, or nominal where that was not plausible", head="found by")
 
 
@@ -103,29 +91,19 @@ class FitEntry(Record):
         "Over the image's ground and around it, relative to its centre", "", "smallest denominator", ".3f"
     )
     roundtrip_px: Number = said("Largest move by projection and back; null where it fails", "px", "round trip", ".1e")
-    coverage: Number = said("Share of the image that the fit's points cover")
+    coverage: Number = said("Share of the image that the fit's points cover", head="covered", form=".0%")
     method: str = said("Solver", head="solver")
     num_check_points: Count = said("Check points", head="check points")
     localisation_m: Number = said("Largest distance on the ground of the localisation RPC from P_BA", "m", default=None)
 
 
-def _verdict(view: ViewEntry) -> Cell:
-    return Cell(STATUS_WORDS[view.status], list(STATUS_WORDS).index(view.status), f"status {view.status}")
-
-
-def _rejected(view: ViewEntry) -> float | None:
-    every = view.num_observations + view.num_rejected
-    return percent(view.num_rejected / every) if every else None
-
-
-def _kilometres(view: ViewEntry) -> float | None:
-    altitude = value_of(view, "camera_center.altitude_m")
-    return None if altitude is None else float(altitude) / 1e3
-
-
 def _moves(view: ViewEntry) -> list[Cell]:
     shift, sigma = (value_of(view, f"correction.center_{what}_px") for what in ("shift", "sigma"))
     return [Cell(f"{value:+.3f} ± {error:.2f}", value) for value, error in zip(shift, sigma, strict=True)]
+
+
+def _verdict(view: ViewEntry) -> Cell:
+    return Cell(STATUS_WORDS[view.status], list(STATUS_WORDS).index(view.status), f"status {view.status}")
 
 
 class ViewEntry(Record):
@@ -134,35 +112,36 @@ class ViewEntry(Record):
     OWN: ClassVar = {
         "verdict": Column("verdict", _verdict),
         "wrong": Column("what is wrong", lambda view: CAUSES[view.cause].label if view.cause in CAUSES else None),
-        "rejected": Column("rejected [%]", _rejected, ".1f"),
-        "covered": Column("covered [%]", lambda view: percent(view.tie_coverage), ".0f"),
+        "lost": Column("rejected", lambda view: view.lost, ".1%"),
         "moves": Column(("col [px]", "row [px]"), _moves, ".3f"),
-        "kilometres": Column("camera centre [km]", _kilometres, ".0f"),
-        "largest": Column("largest [px]", lambda view: largest(value_of(view, "fit.max_px")), ".1e"),
-        "about": Column("RPC fit [px]", lambda view: largest(value_of(view, "fit.max_px")), ".0e", adjusted=True),
-        "fitted": Column("covered [%]", lambda view: percent(value_of(view, "fit.coverage")), ".0f"),
+        "largest": Column("RPC fit [px]", lambda view: largest(value_of(view, "fit.max_px")), ".1e", adjusted=True),
     }
     PAGE: ClassVar = (
-        "name verdict wrong num_observations rejected covered rmse_before rmse_after held_out_px "
+        "name verdict wrong num_observations lost tie_coverage rmse_before rmse_after held_out_px "
         "correction.center_shift_px gsd_m incidence_deg rpc_source.format"
     )
-    TERMINAL: ClassVar = "name verdict num_observations rmse_before rmse_after correction.center_shift_px about"
+    TERMINAL: ClassVar = "name verdict num_observations rmse_before rmse_after correction.center_shift_px largest"
     CORRECTIONS: ClassVar = (
-        "name moves correction.angle_urad correction.translation_norm_m kilometres camera_center.method"
+        "name moves correction.angle_urad correction.translation_norm_m camera_center.altitude_m camera_center.method"
     )
     PLACES: ClassVar = (
         "name correction.ellipse.major_m correction.ellipse.minor_m correction.ellipse.azimuth_deg "
         "correction.ellipse.ce90_m stated_ce90_m"
     )
     DECISIONS: ClassVar = (
-        "name prior_scale num_rejected rejected smooth_px smooth_p shared_px correction.jitter_px "
+        "name prior_scale num_rejected lost smooth_px smooth_p shared_px correction.jitter_px "
         "correction.detector_px correction.strip_px correction.swing_px"
     )
     CONTROL: ClassVar = "name control_w control_w_point"
     CLOCKS: ClassVar = " correction.range_m correction.azimuth_ms"
     FITS: ClassVar = (
-        "name fit.rmse_px largest fit.min_denominator fit.roundtrip_px fitted fit.num_check_points fit.method"
+        "name fit.rmse_px largest fit.min_denominator fit.roundtrip_px fit.coverage fit.num_check_points fit.method"
     )
+
+    @property
+    def lost(self) -> float:
+        """Share of its tie points that was rejected."""
+        return self.num_rejected / max(self.num_rejected + self.num_observations, 1)
 
     @property
     def reservation(self) -> str:
@@ -184,7 +163,7 @@ class ViewEntry(Record):
     num_observations: Count = said("Tie-point observations that count", head="tie points")
     num_rejected: Count = said("Observations that the adjustment cut as wrong", head="cut")
     num_gcps: Count = said("Observations of ground control points")
-    tie_coverage: Share = said("Share of the cells of an 8 x 8 grid that hold a tie point")
+    tie_coverage: Share = said("Share of the cells of an 8 x 8 grid that hold a tie point", head="covered", form=".0%")
     rmse_before: Number = said("RMS reprojection error through the delivered cameras", "px", "before", ".3f")
     rmse_after: Number = said("The same through the new cameras; null for a check", "px", "after", ".3f", adjusted=True)
     smooth_px: Number = said("RMS of what is smooth in the residuals left, less noise", "px", "smooth", ".3f")
@@ -215,18 +194,10 @@ class ViewEntry(Record):
         default=None,
     )
     smooth_p: Number = said(
-        "Probability that noise alone leaves as much as smooth_px (F test)",
-        "",
-        "F test p",
-        ".0e",
-        default=None,
+        "Probability that noise alone leaves as much as smooth_px (F test)", "", "F test p", ".0e", default=None
     )
     shared_px: Number = said(
-        "Error that an observation shares with its neighbour in the row or column",
-        "px",
-        "shared",
-        ".3f",
-        default=None,
+        "Error that an observation shares with its neighbour in the row or column", "px", "shared", ".3f", default=None
     )
     control_w: Number = said(
         "Largest residual of its control in the image over its own standard deviation (Baarda's w)",
@@ -238,8 +209,7 @@ class ViewEntry(Record):
     control_w_point: str | None = said("Control point that it is of", head="largest at", default=None)
     date: str | None = said("Day it was taken, where its metadata say so", default=None)
     certified: tuple[tuple[float, float, float, float, float], ...] | None = said(
-        "Ground points (lon, lat, alt) over the image and where the new camera sees them (col, row)",
-        default=None,
+        "Ground points (lon, lat, alt) over the image and where the new camera sees them (col, row)", default=None
     )
 
 
@@ -250,29 +220,24 @@ _CENTER = attrgetter("ecef", "altitude", "method")
 _FIT = attrgetter("rmse_ckp", "max_ckp", "min_denominator", "roundtrip", "coverage", "method", "num_ckp")
 
 
-def _fit_entry(fit: RpcFit) -> FitEntry:
-    place = fit.localisation
-    return replace(FitEntry(*_FIT(fit)), localisation_m=None if place is None else place.max_m)
-
-
 def measure_views(run: Run) -> tuple[ViewEntry, ...]:
     """Return every image of a run; the verdict on it is still to come."""
-    num, tracks, keep, adjustment = len(run.views), run.tracks, run.keep, run.adjustment
-    after = run.ties_after
+    num, tracks, keep, after = len(run.views), run.tracks, run.keep, run.ties_after
     first = rmse_by_view(run.ties_before.residuals[keep], tracks.view[keep], num)
-    last = None if after is None else rmse_by_view(after.residuals[keep], tracks.view[keep], num)
+    last = [None] * num if after is None else rmse_by_view(after.residuals[keep], tracks.view[keep], num)
     parts = keep, ~(keep | run.held_out | run.moving), run.moving
-    count, lost, moving = (np.bincount(tracks.view[rows], minlength=num) for rows in parts)
+    count, cut, moving = (np.bincount(tracks.view[rows], minlength=num).tolist() for rows in parts)
     gcps = np.zeros(num, np.int64) if run.gcps is None else np.bincount(run.gcps.view, minlength=num)
-    covered, middle = _coverage(run), _middles(run)
-    incidence, azimuth = view_angles(Several(run.before, np.arange(num)), middle)
-    pixel = ground_sample_distance(Several(run.before, np.arange(num)), middle)[1]
-    tests: dict[int, ControlResidual] = {}
-    for test in sorted(run.control_tests, key=lambda test: test.w):
-        tests[test.view] = test
-    entries = []
-    for i, view in enumerate(run.views):
-        entry = ViewEntry(
+    cells = cell_numbers(tracks.xy[keep], np.array([view.size for view in run.views])[tracks.view[keep]])
+    filled = np.unique(cells + tracks.view[keep] * CELLS**2) // CELLS**2
+    covered = np.bincount(filled, minlength=num) / CELLS**2
+    before = Several(run.before, np.arange(num))
+    middle = before.localize((np.array([view.size for view in run.views]) - 1) / 2, np.full(num, run.altitude))
+    incidence, azimuth = view_angles(before, middle)
+    pixel = ground_sample_distance(before, middle)[1]
+    control = {test.view: test for test in sorted(run.control_tests, key=lambda test: test.w)}  # the largest is last
+    return tuple(
+        ViewEntry(
             name=view.name,
             path=view.path,
             size=view.size,
@@ -281,57 +246,50 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
             gsd_m=float(pixel[i]),
             incidence_deg=float(incidence[i]),
             azimuth_deg=float(azimuth[i]),
-            num_observations=int(count[i]),
-            num_rejected=int(lost[i]),
-            num_moving=int(moving[i]),
+            num_observations=count[i],
+            num_rejected=cut[i],
+            num_moving=moving[i],
             num_gcps=int(gcps[i]),
             tie_coverage=float(covered[i]),
             rmse_before=first[i],
-            rmse_after=None if last is None else last[i],
-            held_out_px=None if adjustment is None else adjustment.held_out_rms[i],
-            smooth_px=None if adjustment is None else adjustment.smooth.rms[i],
-            prior_scale=None if adjustment is None else adjustment.prior.scale[i],
-            correction=None if adjustment is None else _correction(adjustment, i, middle[i]),
+            rmse_after=last[i],
             camera_center=CenterEntry(*_CENTER(run.centers[i])) if run.centers else None,
-            fit=_fit_entry(run.fits[i]) if run.fits else None,
+            fit=_fit(run.fits[i]) if run.fits else None,
             outputs=dict(run.written[i]) if run.written else {},
-            certified=_certified(run, i) if run.written and run.adjustment is not None else None,
             date=view.date or None,
             stated_ce90_m=stated_ce90(view),
-            **_control(tests.get(i)),
-            smooth_p=None if adjustment is None else adjustment.smooth.significance[i],
-            shared_px=None if adjustment is None else adjustment.smooth.shared[i],
+            control_w=control[i].w if i in control else None,
+            control_w_point=control[i].point if i in control else None,
             status="adjusted",
             advice="",
+            **_adjusted(run, i, middle[i]),
         )
-        entries.append(entry)
-    return tuple(entries)
+        for i, view in enumerate(run.views)
+    )
 
 
-def _certified(run: Run, number: int) -> tuple[Any, ...]:
-    """Return the ground points at the ends of an image and its altitudes, and where its new camera sees them."""
-    assert run.adjustment is not None
-    view, model = run.views[number], run.adjustment.sensors[number]
-    ground = model.localize(*image_grid(view.size, view.alt_range, (3, 2)))
-    ground = ground[np.isfinite(ground).all(axis=1)]
-    return tuple(map(tuple, np.hstack([ground, model.project(ground)]).tolist()))
+def _fit(fit: RpcFit) -> FitEntry:
+    return replace(FitEntry(*_FIT(fit)), localisation_m=None if fit.localisation is None else fit.localisation.max_m)
 
 
-def _control(worst: ControlResidual | None) -> dict[str, Any]:
-    return {} if worst is None else {"control_w": worst.w, "control_w_point": worst.point}
-
-
-def _middles(run: Run) -> Array:
-    """Return the ground (N, 3) in the middle of each image, at the altitude of the scene."""
-    at = (np.array([view.size for view in run.views]) - 1) / 2
-    return Several(run.before, np.arange(len(at))).localize(at, np.full(len(at), run.altitude))
-
-
-def _coverage(run: Run) -> Array:
-    """Return the share (N,) of the cells of each image that hold a tie point."""
-    view, size = run.tracks.view[run.keep], np.array([view.size for view in run.views])
-    cells = cell_numbers(run.tracks.xy[run.keep], size[view]) + view * CELLS**2
-    return np.bincount(np.unique(cells) // CELLS**2, minlength=len(size)) / CELLS**2
+def _adjusted(run: Run, i: int, middle: Array) -> dict[str, Any]:
+    """Return what an adjustment found of image i; `certified`: ground at its ends, and where its new camera sees it."""
+    found, view = run.adjustment, run.views[i]
+    if found is None:
+        return {"smooth_px": None, "prior_scale": None, "correction": None}
+    of_view = {
+        "smooth_px": found.smooth.rms[i],
+        "smooth_p": found.smooth.significance[i],
+        "shared_px": found.smooth.shared[i],
+        "held_out_px": found.held_out_rms[i],
+        "prior_scale": found.prior.scale[i],
+        "correction": _correction(found, i, middle),
+    }
+    if run.written:
+        ground = found.sensors[i].localize(*image_grid(view.size, view.alt_range, (3, 2)))
+        ground = ground[np.isfinite(ground).all(axis=1)]
+        of_view["certified"] = tuple(map(tuple, np.hstack([ground, found.sensors[i].project(ground)]).tolist()))
+    return of_view
 
 
 def rmse_by_view(residuals: Array, view: IntArray, num_views: int) -> Array:
@@ -360,47 +318,33 @@ def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntr
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     common = (model, adjustment.params[i].tolist(), sigma)
     if isinstance(sensor, Timed):
-        moved, uncertain, place = clocks_in_image(sensor, covariance, middle)
-        known = np.sqrt(np.maximum(np.diag(covariance[:2, :2]), 0.0)) / [1.0, sensor.sensor.speed / 1e3]
+        moved, uncertain, place = moved_by_clocks(sensor, covariance, middle)
         offset, *slopes = (sensor.correction.coeffs * [1.0, 1e3]).tolist()
-        return CorrectionEntry(
-            *common,
-            moved.tolist(),
-            uncertain.tolist(),
-            range_m=offset[0],
-            azimuth_ms=offset[1],
-            timing_sigma=known.tolist(),
-            timing_slopes=slopes,
-            ellipse=place,
-            **_in_image(spline),
-        )
-    assert isinstance(sensor, Corrected | ImageCorrected)
-    correction = sensor.correction
-    if not isinstance(correction, Correction):
-        shift, slope = correction.shift.tolist(), correction.slope.tolist()
+        known: dict[str, Any] = {"range_m": offset[0], "azimuth_ms": offset[1], "timing_slopes": slopes}
+        known["timing_sigma"] = (np.array(sigma[:2]) / [1.0, sensor.sensor.speed / 1e3]).tolist()
+    elif isinstance(sensor, Corrected):
+        moved, uncertain, place = moved_in_space(sensor, covariance, model, middle)
+        known = {
+            "rotation_urad": (sensor.correction.rotation * 1e6).tolist(),
+            "angle_urad": float(np.linalg.norm(sensor.correction.rotation)) * 1e6,
+            "translation_m": sensor.correction.translation.tolist(),
+            "translation_norm_m": float(np.linalg.norm(sensor.correction.translation)),
+            "drift_urad": (sensor.correction.drift * 1e6).tolist(),
+        }
+    else:
+        assert isinstance(sensor, ImageCorrected)
+        shift, slope = sensor.correction.shift.tolist(), sensor.correction.slope.tolist()
         return CorrectionEntry(*common, None, None, shift_px=shift, slope=slope)
-    assert isinstance(sensor, Corrected)
-    moved, uncertain = shift_in_image(sensor, covariance, model, middle)
-    known_to = None if strange else ellipse(sensor, covariance, model, middle)
-    return CorrectionEntry(
-        *common,
-        moved.tolist(),
-        None if strange else uncertain.tolist(),
-        rotation_urad=(correction.rotation * 1e6).tolist(),
-        angle_urad=float(np.linalg.norm(correction.rotation)) * 1e6,
-        translation_m=correction.translation.tolist(),
-        translation_norm_m=float(np.linalg.norm(correction.translation)),
-        drift_urad=(correction.drift * 1e6).tolist(),
-        ellipse=known_to,
-        **_in_image(spline),
-    )
+    if not strange or isinstance(sensor, Timed):
+        known |= {"center_sigma_px": uncertain.tolist(), "ellipse": place}
+    return CorrectionEntry(*common, moved.tolist(), **{"center_sigma_px": None, **known, **_in_image(spline)})
 
 
 def _in_image(spline: RowSpline | None) -> dict[str, Any]:
     """Return what follows the correction in the image."""
-    if spline is None:
-        return {}
     found: dict[str, Any] = {}
+    if spline is None:
+        return found
     if len(spline.coeffs):
         rows = spline.row_offset + spline.row_scale * np.linspace(-1, 1, _ROWS)
         along = RowSpline(spline.coeffs, spline.row_offset, spline.row_scale).at(np.column_stack([rows, rows]))

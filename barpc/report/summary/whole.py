@@ -1,31 +1,29 @@
-"""The block as a whole: where it went, what holds it, what its images cannot tell."""
+"""The block as a whole: where it went, what holds it, what its images cannot tell, what else explains tie points."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from operator import attrgetter
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.ba.altimetry import AltimetryTest
-from barpc.ba.held.gauge import MOTIONS, Mode
-from barpc.geodesy import ground_from_ecef, wrap_longitude
+from barpc.ba.apart import APART, Apart
+from barpc.ba.evidence.places import Place
+from barpc.ba.held.gauge import MOTIONS
+from barpc.ba.judging.explanations import FADE, MOVING, SETTLING, STRIP, SWING, WANDER
+from barpc.ba.judging.judge import Finding
+from barpc.geodesy import wrap_longitude
 from barpc.report.outcome import Run
-from barpc.report.records import Column, Number, Record, said
-from barpc.report.summary.findings import (
-    ExplanationEntry,
-    HeldOutEntry,
-    LeftEntry,
-    explanations,
-    held_out_places,
-    left_entries,
-)
-from barpc.report.summary.words import Count, Share, Vector, metres, percent_of
+from barpc.report.records import Number, Record, said
+from barpc.report.summary.words import Count, Vector, metres
 
+AXES = "columns", "rows"
 _LEVEL = 1e-4  # probability of the F test below which something is called smooth
-_MODE_WORDS = {
+DATUM = "What holds the scene: how well its motions are known, and what share of that comes from where"
+MODES = {
     "east": "the whole scene may lie {0} farther east or west",
     "north": "the whole scene may lie {0} farther north or south",
     "up": "all heights may be {0} too high or too low",
@@ -37,33 +35,32 @@ _MODE_WORDS = {
     "bend east": "heights may be bent: by {0} from the middle of the scene to its eastern and western edges",
     "bend north": "heights may be bent: by {0} from the middle of the scene to its northern and southern edges",
 }
-
-_DATUM_HEADS = {
-    "cameras": "cameras",
-    "earlier_run": "earlier run",
-    "fixed_views": "fixed views",
-    "gcps": "GCPs",
-    "heights": "heights",
-    "reference": "reference",
-    "altimetry": "altimetry",
+"""Motion of the scene -> in words."""
+_WORDS = {
+    STRIP: "{axis} {first:.0f}-{last:.0f} of {image} lie {size:.2f} px off the rest of it",
+    FADE: "rows of {image} lie {size:.2f} px off at row {origin:.0f}, which fades within {length:.0f} rows",
+    SETTLING: "rows at the {end} of all images lie off, by up to {size:.2f} px, which fades within {length:.0f} rows",
+    WANDER: "rows of {image} wander by {size:.2f} px",
+    SWING: "rows of {image} swing by {least}{size:.2f} px every {period:.0f} rows",
+    MOVING: "{share:.0f} % of the tie points{side} move together (a cloud, water or shadows?), by {metres:.2g} m from "
+    "{between[0]} to {between[1]} beside what may be their height, and took no part",
 }
-DATUM = "What holds the scene: how well its motions are known, and what share of that comes from where"
-_CELLS = 12  # of the ground, each way: of 3,000 tie points twenty lie in each
-
-
-class MovingEntry(Record):
-    """A cell of the ground in which tie points move together."""
-
-    box: tuple[float, ...] = said("Its ends: west, south, east, north", "deg", minItems=4, maxItems=4)
-    count: Count = said("Tie points in it, those that move among them")
-    share: Share = said("Part of them that moves")
+RIVALS = {
+    STRIP: "rows or columns of an image lie off",
+    FADE: "rows of an image lie off and less and less",
+    SETTLING: "rows at an end of all images lie off and less and less",
+    WANDER: "rows of an image wander",
+    SWING: "rows of an image swing",
+    MOVING: "tie points move together",
+}
+"""Explanation -> what it is, in words."""
 
 
 class ModeEntry(Record):
     """A motion of the scene that the images cannot tell."""
 
     sigma_m: Number = said("Posterior standard deviation", "m")
-    meaning: str = said("Which motion", enum=list(_MODE_WORDS))
+    meaning: str = said("Which motion", enum=list(MODES))
     motion_m: tuple[Number, ...] = said(
         "All motions where this one is off by that: east, north, up; tilts, turn, scale at the edge; twist and "
         "bending, from the lowest to the highest place",
@@ -77,11 +74,7 @@ class ModeEntry(Record):
 class DatumEntry(Record):
     """What holds a motion of the scene: shares of what is known of it. Tie points have none."""
 
-    OWN: ClassVar = {"part": Column("motion", lambda one: one.part)} | {
-        name: Column(f"{head} [%]", percent_of(name), ".0f") for name, head in _DATUM_HEADS.items()
-    }
-
-    part: str = said("Motion of the scene", enum=list(_MODE_WORDS))
+    part: str = said("Motion of the scene", head="motion", enum=list(MODES))
     sigma_m: Number = said(
         "Posterior standard deviation; at the edge for tilts, turn and scale, from the lowest to the highest place for "
         "twist and bending",
@@ -89,19 +82,22 @@ class DatumEntry(Record):
         "known to",
         ".2f",
     )
-    cameras: Number = said("Accuracies of the cameras as delivered")
-    earlier_run: Number = said("The earlier run")
-    fixed_views: Number = said("Views that are fixed")
-    gcps: Number = said("Ground control points")
-    heights: Number = said("The DEM, or altitudes assumed for tie points seen under too small an angle")
-    reference: Number = said("A reference orthoimage", default=None)
-    altimetry: Number = said("Heights without image coordinates", default=None)
+    cameras: Number = said("Accuracies of the cameras as delivered", head="cameras", form=".0%")
+    earlier_run: Number = said("The earlier run", head="earlier run", form=".0%")
+    fixed_views: Number = said("Views that are fixed", head="fixed views", form=".0%")
+    gcps: Number = said("Ground control points", head="GCPs", form=".0%")
+    heights: Number = said(
+        "The DEM, or altitudes assumed for tie points seen under too small an angle", head="heights", form=".0%"
+    )
+    reference: Number = said("A reference orthoimage", head="reference", form=".0%", default=None)
+    altimetry: Number = said("Heights without image coordinates", head="altimetry", form=".0%", default=None)
 
     @classmethod
     def columns(cls, entries: Sequence[DatumEntry]) -> str:
         """Return the columns of a table: sources that tell nothing of any motion are left out."""
-        told = [name for name in _DATUM_HEADS if any((getattr(one, name) or 0.0) >= 0.005 for one in entries)]
-        return " ".join(["part", "sigma_m", *told])
+        part, sigma, *sources = cls.__dataclass_fields__
+        told = [name for name in sources if any((getattr(one, name) or 0.0) >= 0.005 for one in entries)]
+        return " ".join([part, sigma, *told])
 
 
 class DemEntry(Record):
@@ -142,8 +138,68 @@ class AskedEntry(Record):
     num_images: Count = said("Views in which the F test's probability was below 1e-4")
 
 
+class ExplanationEntry(Record):
+    """Something that explains tie points, those that were cut among them, better than its rivals."""
+
+    PAGE: ClassVar = "sentence gain gap runner_up"
+
+    name: str = said("What it is", enum=[*_WORDS, APART])
+    sentence: str = said("The same in words", head="what explains tie points", minLength=1)
+    image: str | None = said("View; null for what is of no single one")
+    gain: float = said("Logarithm of the evidence, over that without it", "nats", "gain", ".0f")
+    gap: float = said("The same, over the runner-up", "nats", "over the next", ".0f")
+    runner_up: str | None = said("What explains next as much; null for nothing", head="next", default=None)
+    axis: str | None = said("Whether it is of rows or of columns", default=None, enum=[*AXES, None])
+    first: Number = said("Its first row or column", "px", default=None)
+    last: Number = said("Its last row or column", "px", default=None)
+    size_px: Number = said("RMS displacement of what it moves; the amplitude of a swing", "px", default=None)
+    period: Number = said("Rows after which a swing repeats itself", "px", default=None)
+    or_of: tuple[str, ...] | None = said("Views that may be meant as well: ties do not tell which", default=None)
+    share: Number = said("Tie points that move together: part of all of them", default=None)
+    moved_m: Number = said("How far they move on the ground, beside what may be their height", "m", default=None)
+    between: tuple[str, ...] | None = said("From the first of these views to the second", default=None)
+    box: tuple[float, ...] | None = said(
+        "Where nine in ten of them lie, each way: west, south, east, north", "deg", default=None
+    )
+
+
+class LeftEntry(Record):
+    """Rows or columns of an image in which tie points were cut, or are off, more than elsewhere and chance allow."""
+
+    PAGE: ClassVar = "image axis first last rejected off_px apart_px gain"
+
+    image: str = said("View", head="image")
+    axis: str = said("Rows or columns", head="axis", enum=list(AXES))
+    first: float = said("The first", "px", "first", ".0f")
+    last: float = said("The last", "px", "last", ".0f")
+    rejected: float = said("Share of their tie points that was cut", head="rejected", form=".0%")
+    off_px: float = said("What the others have in common", "px", "off", ".2f")
+    apart_px: float = said("Half of those that were cut contradict the others by more than this", "px", "by", ".2f")
+    gain: float = said("Logarithm of the likelihood, over that of a whole image alike", "nats", "gain", ".0f")
+    moving: bool = said("Whether the share is not of what was cut, but of a group that moves", default=False)
+
+
+class HeldOutEntry(Record):
+    """Rows, columns or a cell of an image in which tie points that took no part are met worse than elsewhere in it."""
+
+    PAGE: ClassVar = "sentence count chance"
+
+    image: str = said("View")
+    sentence: str = said("The same in words", head="where tie points that took no part are met worse", minLength=1)
+    columns: tuple[float, float] | None = said("From, to; null for all", "px")
+    rows: tuple[float, float] | None = said("From, to; null for all", "px")
+    count: Count = said("Observations there that were looked at", head="looked at")
+    far: float = said("Share of them that lies far off by the same")
+    off_px: float = said("What the far ones are off by, by their median; else what the near ones share", "px")
+    chance: float = said(
+        "Probability of as much anywhere where all places are alike, at most", head="p below", form=".0e"
+    )
+
+
 class SceneEntry(Record):
     """The block as a whole."""
+
+    MORE: ClassVar = Any  # of earlier releases
 
     shift_enu_m: Vector = said("Mean move of the tie points, east, north, up", "m")
     sigma_enu_m: Vector = said("Posterior standard deviation of the scene's place", "m")
@@ -152,8 +208,7 @@ class SceneEntry(Record):
     noise: Number = said("Observed over stated standard deviation of the observations")
     drift_degree: Count = said("Degree of the rotation in the row")
     drift_sigma_m: tuple[Number, ...] = said(
-        "Standard deviation of the drift at the first and last row, by degree; null where an earlier run tells",
-        "m",
+        "Standard deviation of the drift at the first and last row, by degree; null where an earlier run tells", "m"
     )
     prior_ratio: Number = said("Squared corrections over stated variances and degrees of freedom")
     cost_history: tuple[Number, ...] = said("Sum of squared whitened residuals, by linearisation")
@@ -182,16 +237,14 @@ class SceneEntry(Record):
     explanations: tuple[ExplanationEntry, ...] = said(
         "What explains tie points beside the cameras' errors as stated, the first taken first", default=()
     )
-    moving: tuple[MovingEntry, ...] = said(
-        "Where tie points move together: cells of the ground, as many each way, that hold any", default=()
-    )
     left: tuple[LeftEntry, ...] = said("Rows and columns that stand out at the end", default=())
     held_out_places: tuple[HeldOutEntry, ...] | None = said(
-        "Where tie points that took no part are met worse than in the rest of an image; null: not tested",
-        default=None,
+        "Where tie points that took no part are met worse than in the rest of an image; null: not tested", default=None
     )
 
 
+_LEFT = attrgetter("view", "axis", "start", "stop", "share", "off", "apart", "gain", "moves")
+_HELD_OUT = attrgetter("columns", "rows", "count", "far", "off", "chance")
 _DEM = attrgetter("held", "known", "total", "offset", "spread", "sigma", "alike", "relief")
 
 
@@ -205,7 +258,8 @@ def measure_scene(run: Run) -> SceneEntry | None:
     for m, part in enumerate(MOTIONS):
         shares = {key: float(row[m]) for key, row in adjustment.datum.items()}
         datum.append(DatumEntry(part, float(gauge.motion_sigma[m]), **shares))
-    modes = [ModeEntry(m.sigma, m.meaning, m.motion.tolist(), mode_in_words(m)) for m in gauge.modes]
+    words = [MODES[mode.meaning].format(metres(mode.sigma)) for mode in gauge.modes]
+    modes = [ModeEntry(m.sigma, m.meaning, m.motion.tolist(), text) for m, text in zip(gauge.modes, words, strict=True)]
     return SceneEntry(
         shift_enu_m=gauge.shift.tolist(),
         sigma_enu_m=gauge.sigma.tolist(),
@@ -230,7 +284,6 @@ def measure_scene(run: Run) -> SceneEntry | None:
         gcp_residuals_enu_m=adjustment.gcp_residuals.tolist(),
         solver=adjustment.status,
         explanations=explanations(adjustment),
-        moving=moving_cells(run),
         left=left_entries(adjustment),
         held_out_places=held_out_places(run.met_worse, adjustment.names),
     )
@@ -253,34 +306,91 @@ def _asked(adjustment: Adjustment, what: str) -> AskedEntry | None:
     return AskedEntry(adjustment.names[i], rms, significance, shared, int(found.sum()))
 
 
-def mode_in_words(mode: Mode) -> str:
-    """Return one weak mode of the scene as a sentence without its full stop."""
-    return _MODE_WORDS[mode.meaning].format(metres(mode.sigma))
+def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
+    """Return what was taken, the first first."""
+    found, names = [], adjustment.names
+    if (apart := adjustment.apart) is not None and apart.clear and np.isfinite(apart.gain):
+        other = None if apart.runner_up is None else f"{APART}: {names[apart.runner_up]}"
+        image = names[apart.view]
+        what = "many tie points of {} are wrong, or its RPC is" if apart.look.as_stated else "the RPC of {} is"
+        sentence = f"{what.format(image)} not its own: {strangeness(apart)}"
+        found.append(ExplanationEntry(APART, sentence, image, apart.gain, apart.gap, other))
+    settling = [one for one in adjustment.findings if one.kind == SETTLING]
+    found += [_explained(one, adjustment) for one in adjustment.findings if one not in settling[1:]]
+    return tuple(found)
 
 
-def moving_cells(run: Run) -> tuple[MovingEntry, ...]:
-    """Return the cells of the ground whose tie points move, south to north, west to east; all groups together."""
-    found = run.adjustment
-    if found is None or not found.moving.any():
-        return ()
-    moves, stays = np.zeros((2, run.tracks.num_points), dtype=bool)
-    moves[run.tracks.point[found.moving]] = stays[run.tracks.point[found.inlier]] = True
-    known = np.isfinite(found.points[:, 0])
-    every = np.flatnonzero((moves | stays) & known)
-    lonlat = ground_from_ecef(found.points[every])[:, :2]
-    lonlat[:, 0] = wrap_longitude(lonlat[:, 0], lonlat[0, 0])
-    of_ground = np.flatnonzero(stays[every]) if (stays & known).any() else np.arange(len(every))
-    low, high = lonlat[of_ground].min(axis=0), lonlat[of_ground].max(axis=0)
-    step = np.maximum(high - low, 1e-9) / _CELLS
-    # what flies is seen beside the ground that it is over, beyond its ends at times
-    col, row = np.clip((lonlat - low) / step, 0, _CELLS - 1).astype(np.int64).T
-    cell, gone = row * _CELLS + col, moves[every]
-    count = np.bincount(cell, minlength=_CELLS**2)
-    share = np.bincount(cell, gone, _CELLS**2) / np.maximum(count, 1)
-    entries = []
-    for k in np.flatnonzero(share):
-        corner = low + step * [k % _CELLS, k // _CELLS]
-        west, east = (float(wrap_longitude(lon)) for lon in (corner[0], corner[0] + step[0]))
-        box = west, float(corner[1]), east, float(corner[1] + step[1])
-        entries.append(MovingEntry(box, int(count[k]), float(share[k])))
-    return tuple(entries)
+def _explained(one: Finding, adjustment: Adjustment) -> ExplanationEntry:
+    """Return an explanation; of a settling of all images, the largest is told of."""
+    names = adjustment.names
+    image, others = names[one.view], tuple(names[v] for v in one.or_of)
+    alike = [each for each in adjustment.findings if each.kind == SETTLING] if one.kind == SETTLING else [one]
+    size = max(float(np.hypot(*each.size)) for each in alike)
+    fields: dict[str, Any] = {"size_px": size, "period": one.period, "or_of": others or None}
+    # two images do not tell what there is along their epipolar lines
+    words: dict[str, Any] = {"size": size, "least": "at least " if len(names) == 2 else "", **fields}
+    words["image"] = " or ".join([image, *others])
+    if one.motion is not None:
+        box = one.motion.box
+        middle = wrap_longitude(box[0] + (box[2] - box[0]) % 360.0 / 2.0), (box[1] + box[3]) / 2.0
+        side = (
+            f"in the {one.motion.side} of the block" if one.motion.side else "about {:.4f}, {:.4f} deg".format(*middle)
+        )
+        between = names[one.motion.between[0]], names[one.motion.between[1]]
+        words |= {"share": 100.0 * one.motion.share, "side": f", {side},", "metres": one.motion.metres}
+        words["between"] = between
+        fields = {"share": one.motion.share, "moved_m": one.motion.metres, "between": between, "box": box}
+    elif one.where is not None:
+        axis, start, stop, origin, rate = one.where
+        words |= {"origin": origin, "length": 1.0 / max(abs(rate), 1e-9), "end": "beginning" if rate > 0.0 else "end"}
+        fields["axis"] = words["axis"] = AXES[axis]
+        if one.kind == SETTLING:
+            fields = {"axis": AXES[1], "size_px": size}
+        else:
+            last = 2.0 * adjustment.cameras.unknowns.half[axis, one.view] - 1.0
+            fields["first"], fields["last"] = np.clip((np.ceil(start), np.ceil(stop) - 1.0), 0.0, last).tolist()
+            words |= fields
+    of_all = one.motion is not None or one.kind == SETTLING
+    numbers = one.gain, one.gap, one.runner_up or None
+    return ExplanationEntry(one.kind, _WORDS[one.kind].format(**words), None if of_all else image, *numbers, **fields)
+
+
+def strangeness(apart: Apart) -> str:
+    """Return what is known of a view whose RPC is not its own."""
+    look, met = apart.look, "it would agree with the other images as well as is stated of it"
+    if look.swapped:
+        return f"with its axes swapped, samples taken for lines, {met}"
+    if look.offset is not None:
+        col, row = 0.0 - look.offset
+        height = "" if look.height is None else f", or with its heights moved by {-look.height:+.0f} m,"
+        return f"moved by {col:+.1f} columns and {row:+.1f} rows{height} {met}"
+    part = "all" if apart.contradicted == 1.0 else f"more than {int(100 * apart.contradicted)} %"
+    where = "; as delivered it meets them to what is stated of it" if look.as_stated else ""
+    return (
+        f"{part} of its tie points contradict those of the other images, wherever it is moved or turned to, and these "
+        f"agree without it{where}"
+    )
+
+
+def left_entries(adjustment: Adjustment) -> tuple[LeftEntry, ...]:
+    """Return where something stands out at the end, the most first."""
+    found = [(adjustment.names[v], AXES[axis], *rest) for v, axis, *rest in map(_LEFT, adjustment.left)]
+    return tuple(LeftEntry(image, axis, start, stop - 1.0, *rest) for image, axis, start, stop, *rest in found)
+
+
+def held_out_places(places: Sequence[Place], names: Sequence[str]) -> tuple[HeldOutEntry, ...]:
+    """Return where tie points that took no part are met worse, the surest first."""
+    found = []
+    for one in places:
+        ends = [
+            f"{axis} {side[0]:.0f}-{side[1] - 1.0:.0f}"
+            for axis, side in (("rows", one.rows), ("columns", one.columns))
+            if side is not None
+        ]
+        what = f"lie {one.off:.2f} px off in common"
+        if one.far:
+            what = f"contradict the cameras, {100 * one.far:.0f} % by the same {one.off:.2f} px"
+        place = f"{', '.join(ends)} of {names[one.view]}"
+        sentence = f"{place[0].upper()}{place[1:]}: tie points there that took no part {what}"
+        found.append(HeldOutEntry(names[one.view], sentence, *_HELD_OUT(one)))
+    return tuple(found)

@@ -1,9 +1,10 @@
-"""Types and words that the records of summary.json share."""
+"""Types and words that the records of summary.json share, and the one table of what is wrong with an image."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import Annotated, Any
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -64,16 +65,6 @@ def known(value: float | None) -> float:
     return float("nan") if value is None else value
 
 
-def percent(share: float | None) -> float | None:
-    """Return a share in percent."""
-    return None if share is None else 100 * share
-
-
-def percent_of(name: str) -> Callable[[Any], float | None]:
-    """Return what makes percent of a field of a record."""
-    return lambda record: percent(getattr(record, name))
-
-
 def metres(value: float) -> str:
     """Return a length with a unit that keeps it readable.
 
@@ -86,3 +77,130 @@ def metres(value: float) -> str:
         if abs(value) * factor >= 1.0:
             return f"{value * factor:.1f} {unit}"
     return f"{value * 1e3:.1f} mm"
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A cause: the verdict it leads to, its name in a few words, its sentence and advice, with figures in braces."""
+
+    status: Literal["failed", "weak", "doubtful"]
+    label: str
+    sentence: str
+    remedy: str = ""
+
+    def advice(self, **figures: object) -> str:
+        """Return the sentence with its figures, and what to do."""
+        return ": ".join(filter(None, (self.sentence, self.remedy))).format_map(figures)
+
+
+CAUSES = {
+    "no_overlap": Cause(
+        "failed",
+        "overlaps no other image",
+        "it overlaps no other image as asked, and its camera was left as it was",
+        "check its RPC (IMAGE,camera=FILE names another), or lower [tie] min_overlap of a file given with --options",
+    ),
+    "untied": Cause(
+        "failed",
+        "not tied to the others",
+        "not tied to the other images{tried}, its camera was left as it was",
+        "look for clouds, water and other dates, or give matches of your own (--matches)",
+    ),
+    "other_rpc": Cause(
+        "failed",
+        "RPC not its own",
+        "its RPC is not its own: {strangeness}. They were adjusted without it, and its camera was left as it was",
+        "check that the RPC belongs to this image (IMAGE,camera=FILE names another)",
+    ),
+    "contradicts_all": Cause(
+        "failed",
+        "contradicts the others",
+        "{strangeness}. They were adjusted without it, and its camera was left as it was",
+        "check clouds, water and change, and that the RPC belongs to this image (IMAGE,camera=FILE names another)",
+    ),
+    "one_rpc_misses": Cause(
+        "failed",
+        "RPC fit misses its tolerance",
+        "one RPC cannot hold the corrected camera to {tolerance:g} px",
+        "lower --drift, or hand its grid on (--grids)",
+    ),
+    "contradicted": Cause(
+        "doubtful",
+        "contradicts the others",
+        "{share:.0f} % of its tie points were rejected, as they contradict those of the other images",
+        "check that the RPC belongs to this image (IMAGE,camera=FILE names another), then look for clouds, water, change",
+    ),
+    "few": Cause("weak", "few tie points", "only {few} tie points", "check overlap, clouds and dates"),
+    "none": Cause("weak", "no tie points", "no tie points", "check overlap, clouds and dates"),
+    "copy": Cause("doubtful", "shown twice", "shows the same pixels as {other}", "give each image once"),
+    "apart": Cause(
+        "doubtful",
+        "RPC not its own",
+        "its RPC is {stated}: {strangeness}. It was adjusted alone, against points of the other images",
+        "check that the RPC belongs to this image (IMAGE,camera=FILE names another)",
+    ),
+    "odd": Cause(
+        "doubtful",
+        "RPC farther off than stated",
+        "its RPC is {scale:.0f} times farther off than stated, beside the other images{either}",
+        "check that it belongs to this image (IMAGE,camera=FILE names another)",
+    ),
+    "smooth": Cause(
+        "doubtful", "an error that changes over it", "an error of {size:.2f} px that changes {along} is left: {why}"
+    ),
+    "rejected": Cause(
+        "doubtful",
+        "many tie points rejected",
+        "{share:.0f} % of its tie points were rejected, neighbours in the same direction{place}",
+        "look for clouds, water, change",
+    ),
+    "wrong_matches": Cause(
+        "doubtful",
+        "wrong matches",
+        "{share:.0f} % of its tie points were rejected, neighbours in any direction, as wrong matches are, and those "
+        "that took no part are left with {error:.2f} px",
+        "look for repeated patterns and noise, or give matches of your own (--matches)",
+    ),
+    "place": Cause(
+        "doubtful", "a part of it lies off", "{place} stand out, {what}", "look for clouds, water, change there"
+    ),
+    "beside": Cause(
+        "doubtful",
+        "beside an image that contradicts",
+        "tie points that took no part are left with {error:.2f} px, and most of these are seen in {other} too, whose "
+        "tie points contradict the others",
+        "look at that image first",
+    ),
+    "held_out": Cause(
+        "doubtful",
+        "tie points that took no part lie off",
+        "tie points that took no part are left with {error:.2f} px, {noise:.1f} times what the matcher states",
+        "look for wrong matches, moving things, or errors that these unknowns cannot follow",
+    ),
+    "follows_more": Cause(
+        "doubtful",
+        "more than one RPC holds",
+        "its corrected camera follows {follows}, of which one RPC leaves {left:.2f} px (RMS; {most:.2f} px at most)",
+        "use its grids ({image}_grid.tif), --tiles or --resample",
+    ),
+    "disagrees": Cause("doubtful", "cameras disagree", "tie points disagree by {error:.2f} px", "adjust the cameras"),
+    "left": Cause(
+        "doubtful",
+        "large residuals",
+        "tie points are left with {error:.2f} px",
+        "look for wrong matches and moving things",
+    ),
+    "unseen": Cause(
+        "doubtful",
+        "does not see its tie points",
+        "its camera does not see its own tie points where they are",
+        "check that the RPC belongs to this image (IMAGE,camera=FILE names another)",
+    ),
+    "moving": Cause(
+        "doubtful",
+        "tie points move",
+        "{share:.0f} % of its tie points move together and took no part",
+        "check that the others are the ground that stands still",
+    ),
+}
+"""Cause -> its words, the worst first. A flag in a remedy is one of `barpc adjust`, as a test asks its command line."""
