@@ -19,7 +19,7 @@ from barpc.remote import BLOCK, hosts
 from barpc.report import tables
 from barpc.rpcio import carried, sources
 from barpc.sensor import document as metadata
-from barpc.sensor.sicd import metadata as sicd
+from barpc.sensor import sicd
 from barpc.tie.pairing import area
 
 PAGE = Path(__file__).with_name("reliability.md")

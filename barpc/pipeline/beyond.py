@@ -27,8 +27,7 @@ from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
 from barpc.sensor.csm import STATE_END as STATE
-from barpc.sensor.csm import open_state
-from barpc.sensor.csm_write import is_writable, state_text
+from barpc.sensor.csm import is_writable, open_state, state_text
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
 from barpc.sensor.rpc import RPC
 from barpc.tie.tasks import Progress, ordered

@@ -1,7 +1,8 @@
 """Sensor models: ground to image and back.
 
-A sensor model is anything with the three methods of `SensorModel`. Models do not inherit from each
-other and do not know each other; they are frozen, picklable and compare by content.
+A sensor model is anything with the three methods of `SensorModel`. Models do not know each other; they are frozen,
+picklable and compare by content. Those that stand on their own are `Pointwise`, corrections of image points in front of
+any model `Displaced`.
 
 `ground` is (lon [deg], lat [deg], alt [m above the WGS84 ellipsoid]); `image` is (col, row) [px] with
 (0, 0) at the CENTRE of the top-left pixel. Both stand on the last axis; leading axes broadcast. A point
@@ -10,9 +11,17 @@ that fails is NaN: one bad point of a million is never an exception.
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
-from barpc.geodesy import Array
+import numpy as np
+
+from barpc.frozen import Frozen
+from barpc.geodesy import Array, pointwise
+
+_STEPS = 60  # of a fixed point: a correction gains two or three digits a step, wild ones need more
+_SETTLED = 1e-7  # px: what is left is a hundredth of it
 
 
 @runtime_checkable
@@ -32,4 +41,94 @@ class SensorModel(Protocol):
         ...
 
 
-__all__ = ["SensorModel"]
+class Pointwise(Frozen):
+    """Base of the models that stand on their own: itself a `SensorModel`.
+
+    Of n points they give `_project` (n, 3) -> image (n, 2); `_derivatives` (n, 3) -> image, jacobian (n, 2, 3) and
+    perhaps more; `_localize` (n, 2), (n,) -> ground (n, 3). Each takes memory (`_memory`, n) to overwrite, too, if any.
+    """
+
+    _memory: ClassVar[int] = 0
+    _project: Callable[..., Array]
+    _derivatives: Callable[..., tuple[Array, ...]]
+    _localize: Callable[..., Array]
+
+    def project(self, ground: Array) -> Array:
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN where they are not seen."""
+        return pointwise(lambda *part: [self._project(*part)], [(2,)], ground, rows=self._memory)[0]
+
+    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
+        shapes = [(2,), (2, 3)]
+        image, jacobian = pointwise(lambda *part: self._derivatives(*part)[:2], shapes, ground, rows=self._memory)
+        return image, jacobian
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
+
+        Longitudes run on across the antimeridian; NaN off what the model is believed for, or where it sees no ground.
+        """
+        return pointwise(lambda *part: [self._localize(*part)], [(3,)], image, alt, rows=self._memory)[0]
+
+
+@dataclass(frozen=True)
+class Behind:
+    """Base of models that are another one, `sensor`, behind a correction."""
+
+    sensor: Any
+
+    @property
+    def advice(self) -> str:
+        """What to do where no RPC follows the model; empty where it does not know."""
+        return str(getattr(self.sensor, "advice", ""))
+
+
+class Displacement(Protocol):
+    """A correction of image points: from where a model without it has them to where they are seen, and back."""
+
+    def apply(self, image: Array) -> Array:
+        """Return where points that a model has at (..., 2) [px] are seen."""
+        ...
+
+    def linearised(self, image: Array) -> tuple[Array, Array]:
+        """Return the same, and its derivative (..., 2, 2) by the model's image points."""
+        ...
+
+    def undo(self, image: Array) -> Array:
+        """Return where the model has points that are seen at (..., 2) [px]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Displaced(Behind):
+    """`sensor` with its image points corrected by `correction`; itself a `SensorModel`."""
+
+    sensor: SensorModel
+    correction: Displacement
+
+    def project(self, ground: Array) -> Array:
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
+        return self.correction.apply(self.sensor.project(ground))
+
+    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
+        image, jacobian = self.sensor.project_jacobian(ground)
+        image, slope = self.correction.linearised(image)
+        return image, slope @ jacobian
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
+        return self.sensor.localize(self.correction.undo(np.asarray(image, dtype=np.float64)), alt)
+
+
+def fixed_point(follow: Callable[[Array], Array], image: Array) -> Array:
+    """Return the image points (..., 2) [px] that `follow` leaves where they are, from a first guess."""
+    for _ in range(_STEPS):
+        before, image = image, follow(image)
+        change = np.abs(image - before)
+        if not (change.max(initial=0.0, where=np.isfinite(change)) > _SETTLED):
+            break
+    return image
+
+
+__all__ = ["Behind", "Displaced", "Displacement", "Pointwise", "SensorModel", "fixed_point"]

@@ -25,13 +25,11 @@ from barpc.geodesy import (
     ground_from_ecef,
     ground_from_ecef_jacobian,
 )
-from barpc.sensor import SensorModel
+from barpc.sensor import Behind, Displaced, SensorModel, fixed_point
 from barpc.sensor.curve import Turn, cross, rotation_left_jacobian, rotation_matrix
 
 IntArray = npt.NDArray[np.int64]
 
-_ROW_STEPS = 60  # a drift of thousandths of a pixel a row gains three digits a step; wild ones need more
-_ROW_SETTLED = 1e-6  # px: what is left is a thousandth of it
 _DIGITS = 1e-8  # of derivatives: the solver's steps ask for no more
 _TOLERANCE = 1e-7  # px: a localised point must project this near to where it was asked (plus rounding)
 
@@ -130,10 +128,7 @@ class Correction(Frozen):
 
     def motion(self, ecef: Array, row: Array | None = None) -> RigidMotion:
         """Return the motion of points (3, n) [m], ECEF, seen at the rows (n,) [px]."""
-        drift = None
-        if row is not None:
-            u = (row - self.row_offset) / self.row_scale
-            drift = self.drift.T @ u ** np.arange(1, len(self.drift) + 1)[:, None]
+        drift = None if row is None else self._turns(row)
         bounds = np.array([0, ecef.shape[1]])
         shift = self.scale * self.translation + (self.scale - 1.0) * self.center  # T of the points s X
         return RigidMotion(self.scale * ecef, self.rotation[None], shift[None], self.center[None], bounds, drift)
@@ -150,6 +145,17 @@ class Correction(Frozen):
         ecef = np.asarray(ecef, dtype=np.float64)
         rows = None if row is None else np.broadcast_to(row, ecef.shape[:-1]).reshape(-1)
         return self.motion(ecef.reshape(-1, 3).T, rows).ecef.T.reshape(ecef.shape)
+
+    def undo(self, ecef: Array, row: Array) -> Array:
+        """Return the points X (N, 3) [m] that `apply` takes to ECEF points (N, 3) at rows (N,)."""
+        drift = Turn(self._turns(row))
+        back = rotation_matrix(self.rotation).T @ drift.back((ecef - self.center).T)
+        return np.asarray(back.T / self.scale + self.translation + self.center)
+
+    def _turns(self, row: Array) -> Array:
+        """Return the drift's rotation vectors (3, n) [rad] at rows (n,) [px]."""
+        u = (row - self.row_offset) / self.row_scale
+        return np.asarray(self.drift.T @ u ** np.arange(1, len(self.drift) + 1)[:, None])
 
 
 def correction_of(matrix: Array, at: Array) -> Correction:
@@ -168,30 +174,22 @@ def correction_of(matrix: Array, at: Array) -> Correction:
 
 
 @dataclass(frozen=True)
-class Corrected:
+class Corrected(Behind):
     """P_BA: `sensor` behind `correction`; itself a `SensorModel`."""
 
     sensor: SensorModel  # the model as delivered, P
     correction: Correction  # R, T and C
-
-    @property
-    def advice(self) -> str:
-        """What to do where no RPC follows the model; empty where it does not know."""
-        return str(getattr(self.sensor, "advice", ""))
 
     def project(self, ground: Array) -> Array:
         """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
         ecef = ecef_from_ground(ground)
         if not len(self.correction.drift):
             return self.sensor.project(ground_from_ecef(self.correction.apply(ecef)))
-        image = self.sensor.project(ground)
-        for _ in range(_ROW_STEPS):
-            row = image[..., 1]
-            image = self.sensor.project(ground_from_ecef(self.correction.apply(ecef, row)))
-            change = np.abs(image[..., 1] - row)
-            if not (change.max(initial=0.0, where=np.isfinite(change)) > _ROW_SETTLED):
-                break
-        return image
+
+        def seen(image: Array) -> Array:
+            return self.sensor.project(ground_from_ecef(self.correction.apply(ecef, image[..., 1])))
+
+        return fixed_point(seen, self.sensor.project(ground))
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
@@ -262,33 +260,26 @@ class ImageAffine(Frozen):
         self._array("shift", (2,), RpcError)
         self._array("slope", (2, 2), RpcError)
 
+    def apply(self, image: Array) -> Array:
+        """Return the corrected image points (..., 2) [px]."""
+        return image @ (np.eye(2) + self.slope).T + self.shift
+
+    def linearised(self, image: Array) -> tuple[Array, Array]:
+        """Return the same, and the derivative (2, 2)."""
+        return self.apply(image), np.eye(2) + self.slope
+
+    def undo(self, image: Array) -> Array:
+        """Return the image points (..., 2) [px] without the correction."""
+        return (image - self.shift) @ np.linalg.inv(np.eye(2) + self.slope).T
+
 
 @dataclass(frozen=True)
-class ImageCorrected:
-    """`sensor` with its image points corrected by `correction`; itself a `SensorModel`.
+class ImageCorrected(Displaced):
+    """`sensor` with its image points corrected by an affine map; itself a `SensorModel`.
 
     The bias corrections (shift, drift, affine) of Fraser and Hanley ("Bias compensation in rational functions for
     Ikonos satellite imagery", 2003) and Grodecki and Dial ("Block adjustment of high-resolution satellite images
     described by rational polynomials", 2003), for comparison with the correction in space.
     """
 
-    sensor: SensorModel  # the model as delivered
     correction: ImageAffine  # what is added to its image points
-
-    def project(self, ground: Array) -> Array:
-        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
-        return self.sensor.project(ground) @ self._matrix.T + self.correction.shift
-
-    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = self.sensor.project_jacobian(ground)
-        return image @ self._matrix.T + self.correction.shift, self._matrix @ jacobian
-
-    def localize(self, image: Array, alt: Array) -> Array:
-        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
-        image = np.asarray(image, dtype=np.float64) - self.correction.shift
-        return self.sensor.localize(image @ np.linalg.inv(self._matrix).T, alt)
-
-    @property
-    def _matrix(self) -> Array:
-        return np.eye(2) + self.correction.slope

@@ -9,15 +9,14 @@ import numpy as np
 
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
-from barpc.geodesy import NEWTON_STEPS, Array
-from barpc.sensor import SensorModel
+from barpc.geodesy import Array
+from barpc.sensor import Displaced, SensorModel, fixed_point
 from barpc.sensor.direct_grid import LINEAR, linear_axes
 
 if TYPE_CHECKING:
     from scipy.interpolate import RegularGridInterpolator
 
 _LONGEST = 1024.0  # px, from node to node
-_SETTLED = 1e-9  # px
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -74,42 +73,23 @@ class CorrectionGrid(Frozen):
         inside = np.clip(image, low, high)[..., ::-1]
         return np.asarray(self._linear(inside)).reshape(inside.shape)
 
-    def slope(self, image: Array) -> Array:
-        """Return the derivative (..., 2, 2) of the displacements by col, row, over a tenth of a cell around
-        image points.
-        """
-        reach = 0.05 * np.array([self.cols[1] - self.cols[0], self.rows[1] - self.rows[0]])
-        by_axis = [(self.at(image + step) - self.at(image - step)) / step.sum() for step in 2 * np.diag(reach)]
-        return np.stack(by_axis, axis=-1) / 2
-
     def apply(self, image: Array) -> Array:
         """Return the true image points (..., 2) [px] of those of the RPC (..., 2) [px]."""
         return np.asarray(image + self.at(image))
 
+    def linearised(self, image: Array) -> tuple[Array, Array]:
+        """Return the same, and its derivative (..., 2, 2), over a tenth of a cell around the image points."""
+        reach = 0.05 * np.array([self.cols[1] - self.cols[0], self.rows[1] - self.rows[0]])
+        by_axis = [(self.apply(image + step) - self.apply(image - step)) / (2 * step.sum()) for step in np.diag(reach)]
+        return self.apply(image), np.stack(by_axis, axis=-1)
+
+    def undo(self, image: Array) -> Array:
+        """Return the image points (..., 2) [px] of the RPC that belong to true ones."""
+        return fixed_point(lambda of_rpc: image - self.at(of_rpc), image)
+
 
 @dataclass(frozen=True)
-class GridCorrected:
+class GridCorrected(Displaced):
     """`sensor`, an RPC, and what it lacks; itself a `SensorModel`."""
 
-    sensor: SensorModel
     correction: CorrectionGrid  # what is added to its image points
-
-    def project(self, ground: Array) -> Array:
-        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
-        return self.correction.apply(self.sensor.project(ground))
-
-    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = self.sensor.project_jacobian(ground)
-        return self.correction.apply(image), (np.eye(2) + self.correction.slope(image)) @ jacobian
-
-    def localize(self, image: Array, alt: Array) -> Array:
-        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
-        image = np.asarray(image, dtype=np.float64)
-        of_rpc = image
-        for _ in range(NEWTON_STEPS):
-            before, of_rpc = of_rpc, image - self.correction.at(of_rpc)
-            change = np.abs(of_rpc - before)
-            if not (change.max(initial=0.0, where=np.isfinite(change)) > _SETTLED):
-                break
-        return self.sensor.localize(of_rpc, alt)

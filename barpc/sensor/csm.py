@@ -1,14 +1,16 @@
-"""States of the Community Sensor Model, as USGS' library and the Ames Stereo Pipeline keep them: linescan and frame.
+"""States of the Community Sensor Model, as USGS' library and the Ames Stereo Pipeline keep them.
 
 A state is JSON, ``image.json`` or ``image.adjusted_state.json``, mostly behind a line with the model's name. Line l and
 sample s of CSM have the first pixel's centre at (0.5, 0.5). The place in the focal plane is where iTransS and iTransL
 (offset, by x, by y) give the detector's sample and line; a pixel looks along -(x z, y z, f) with z = m_zDirection
 (linescan), (x, y, f) (frame), or the other way if that is towards the ground. Line r is taken at m_intTimeStartTimes +
-m_intTimes (l - m_intTimeLines + 0.5). Quaternions are ecef_from_camera, scalar last.
+m_intTimes (l - m_intTimeLines + 0.5). Quaternions are ecef_from_camera, scalar last. Linescan and frame states are
+read; pushbroom cameras, corrected or not, are written.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -18,9 +20,11 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from scipy.spatial.transform import Rotation
 
-from barpc.errors import InputError, RpcFormatError
-from barpc.geodesy import WGS84_A, WGS84_B, Array
-from barpc.sensor.document import MOST_PIXELS, STRAIGHT
+from barpc.errors import InputError, RpcError, RpcFormatError
+from barpc.geodesy import WGS84_A, WGS84_B, Array, ecef_from_ground, ground_from_ecef
+from barpc.sensor import SensorModel
+from barpc.sensor.corrected import Corrected
+from barpc.sensor.document import MOST_PIXELS, STRAIGHT, Fields
 from barpc.sensor.frame import Frame
 from barpc.sensor.linescan.samples import Detector, Samples, camera_of_samples, unit
 from barpc.sensor.pushbroom import Pushbroom
@@ -31,8 +35,40 @@ STATE_END = ".adjusted_state.json"
 LINESCAN, FRAME = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL", "USGS_ASTRO_FRAME_SENSOR_MODEL"
 
 _EARTH = 100.0  # m: by which the axes of an Earth's ellipsoid may differ from WGS84's
-_RADIAL = 0  # m_distortionType: 1 - k0 - k1 r^2 - k2 r^4 times the place
 FLIP = np.diag([1.0, -1.0, -1.0])
+_STEP = 0.02  # s, from sample to sample, at most
+_BEYOND = 4  # samples before and after the image: readers interpolate through eight
+_COLUMNS = 9  # of a row, through which its attitude goes
+
+_PLAIN: dict[str, Any] = {
+    "m_centerEphemerisTime": 0.0,
+    "m_covariance": [0.0] * 256,
+    "m_currentParameterValue": [0.0] * 16,
+    "m_detectorLineOrigin": 0.0,
+    "m_detectorLineSumming": 1.0,
+    "m_detectorSampleOrigin": 0.0,
+    "m_detectorSampleSumming": 1.0,
+    "m_distortionType": 0,
+    "m_ikCode": 0,
+    "m_imageIdentifier": "",
+    "m_majorAxis": WGS84_A,
+    "m_minorAxis": WGS84_B,
+    "m_maxElevation": 10000.0,
+    "m_minElevation": -10000.0,
+    "m_modelName": LINESCAN,
+    "m_opticalDistCoeffs": [0.0] * 3,
+    "m_parameterType": [2] * 16,
+    "m_platformFlag": 1,
+    "m_platformIdentifier": "",
+    "m_sensorIdentifier": "barpc",
+    "m_sensorName": "USGSAstroLineScanner",
+    "m_startingDetectorLine": 0.0,
+    "m_startingDetectorSample": 0.0,
+    "m_startingEphemerisTime": 0.0,
+    "m_sunPosition": [0.0] * 3,
+    "m_sunVelocity": [0.0] * 3,
+    "m_zDirection": 1.0,
+}
 
 
 def is_state(head: bytes) -> bool:
@@ -67,34 +103,18 @@ def open_state(path: Path) -> tuple[Pushbroom | Frame, tuple[int, int]]:
     return _READERS[model](state), state.size
 
 
-class _State:
+class _State(Fields):
     """The fields of a state; what is missing or malformed is refused by name."""
 
     def __init__(self, content: Mapping[str, Any], name: str) -> None:
         self.content, self.name = content, name
 
-    def numbers(self, key: str, count: int | None = None) -> Array:
-        """Return a list of finite numbers, perhaps of a stated length."""
-        value = self.content.get(key)
-        if not isinstance(value, list) or not all(type(v) in (int, float) for v in value):
-            raise RpcFormatError(f"{self.name}: {key} is missing or no list of numbers; is the file complete?")
-        if count not in (None, len(value)):
-            raise RpcFormatError(f"{self.name}: {key} holds {len(value)} numbers, expected {count}")
+    def _listed(self, path: str, between: str) -> Array:
+        found = self.content.get(path)
+        value = found if isinstance(found, list) else [found]
+        if not all(type(v) in (int, float) for v in value):
+            raise RpcFormatError(f"{self.name}: {path} is missing or no number; is the file complete?")
         return np.array(value, dtype=np.float64)
-
-    def number(self, key: str) -> float:
-        """Return a finite number."""
-        value = self.content.get(key)
-        if type(value) not in (int, float):
-            raise RpcFormatError(f"{self.name}: {key} is missing or no number; is the file complete?")
-        return float(value)  # type: ignore[arg-type]  # looked at
-
-    def positive(self, key: str, most: float = 1e9) -> float:
-        """Return a number above 0 and at most `most`."""
-        value = self.number(key)
-        if not 0 < value <= most:
-            raise RpcFormatError(f"{self.name}: {key} is {value:g}, expected above 0 and at most {most:g}")
-        return value
 
     @property
     def size(self) -> tuple[int, int]:
@@ -119,7 +139,8 @@ class _State:
     def distortion(self) -> Array:
         """Return the coefficients (3,) by powers of the squared distance from the axis, in focal lengths."""
         given = np.trim_zeros(self.numbers("m_opticalDistCoeffs"), "b")
-        if len(given) and (self.number("m_distortionType") != _RADIAL or len(given) > 3):
+        # type 0, radial: 1 - k0 - k1 r^2 - k2 r^4 times the place
+        if len(given) and (self.number("m_distortionType") or len(given) > 3):
             raise InputError(
                 f"{self.name}: a distortion of type {self.number('m_distortionType'):g}, only radial (0) is read"
             )
@@ -150,10 +171,7 @@ def _lines(state: _State) -> tuple[float, float]:
     line, start, step = (state.numbers(f"m_intTime{what}") for what in ("Lines", "StartTimes", "s"))
     if not 0 < len(line) == len(start) == len(step):
         raise RpcFormatError(f"{state.name}: {len(line)} m_intTimeLines, {len(start)} times, {len(step)} steps")
-    rows, period = (
-        line - 1.0,
-        float(step[0]),
-    )  # the centre of row r is line r + 0.5, half a line after its start
+    rows, period = line - 1.0, float(step[0])  # the centre of row r is line r + 0.5, half a line after its start
     first = float(start[0] - period * rows[0])
     here = rows < state.size[1]
     bent = np.abs(start - first - period * rows)[here].max(initial=0.0)
@@ -204,3 +222,110 @@ def _frame(state: _State) -> Frame:
 
 
 _READERS: dict[str, Callable[[_State], Pushbroom | Frame]] = {LINESCAN: _linescan, FRAME: _frame}
+
+
+# --- writing -----------------------------------------------------------------------------------------------------
+
+
+def is_writable(model: SensorModel) -> bool:
+    """Return whether a camera is a pushbroom one of a straight detector, behind corrections in space only."""
+    while isinstance(model, Corrected):
+        model = model.sensor
+    return isinstance(model, Pushbroom) and model.look.shape[1] == 2 and bool(model.line_period > 0)
+
+
+def state_text(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> str:
+    """Return the state of a camera that `is_writable`, of an image of `size` (width, height) [px].
+
+    Orbit and attitude are sampled with the corrections in them. What bends light is a turn of the camera that changes
+    with the row, true in the middle of the altitudes; what that lacks is measured by opening the state again.
+    RpcError for another camera, or one that does not see the ground over its image.
+    """
+    base = _base(model)
+    count = int(np.ceil((size[1] - 1) * base.line_period / _step(base))) + 1
+    step = (size[1] - 1) * base.line_period / (count - 1)
+    late = step * np.arange(-_BEYOND, count + _BEYOND)
+    rows: Array = np.asarray(late / base.line_period, dtype=np.float64)
+    positions = _positions(model, rows)
+    attitude = _attitude(model, base, rows, positions, (size[0], float(np.mean(alt_range))))
+    velocities = np.gradient(positions, step, axis=0)
+    middle = model.localize((np.array(size) - 1.0) / 2, np.array(np.mean(alt_range)))
+    last = base.line_period * (size[1] - 1)
+    sides = np.array([[0.0, 0.0], [1.0, 0.0], [size[0] - 1.0, 0.0]])
+    near = ecef_from_ground(model.localize(sides, np.full(3, float(np.mean(alt_range)))))
+    state = {
+        **_PLAIN,
+        **_detector(base),
+        "m_nSamples": size[0],
+        "m_nLines": size[1],
+        "m_intTimeLines": [1.0, float(size[1])],
+        "m_intTimeStartTimes": [0.0, last],
+        "m_intTimes": [base.line_period] * 2,
+        "m_t0Ephem": float(late[0]),
+        "m_dtEphem": step,
+        "m_t0Quat": float(late[0]),
+        "m_dtQuat": step,
+        "m_numPositions": positions.size,
+        "m_positions": positions.ravel().tolist(),
+        "m_velocities": velocities.ravel().tolist(),
+        "m_numQuaternions": 4 * len(rows),
+        "m_quaternions": attitude.as_quat().ravel().tolist(),
+        "m_referencePointXyz": ecef_from_ground(middle).tolist(),
+        "m_flyingHeight": float(ground_from_ecef(positions[len(rows) // 2])[2]),
+        "m_gsd": float(np.linalg.norm(near[1] - near[0])),
+        "m_halfSwath": float(np.linalg.norm(near[2] - near[0])) / 2,
+        "m_halfTime": last / 2,
+    }
+    return f"{LINESCAN}\n{json.dumps(dict(sorted(state.items())), indent=1)}\n"
+
+
+def _base(model: SensorModel) -> Pushbroom:
+    if not is_writable(model):
+        raise RpcError("only pushbroom cameras of a straight detector are written as a CSM state")
+    while isinstance(model, Corrected):
+        model = model.sensor
+    assert isinstance(model, Pushbroom)
+    return model
+
+
+def _step(base: Pushbroom) -> float:
+    """Return the sampling step [s]: half of the camera's own."""
+    own = np.diff(base.attitude.knots)
+    return min(_STEP, float(np.median(own)) / 2) if len(own) > 1 else _STEP
+
+
+def _positions(model: SensorModel, rows: Array) -> Array:
+    """Return the camera positions (N, 3) [m], ECEF, at rows (N,), corrections included."""
+    if not isinstance(model, Corrected):
+        return np.asarray(_base(model).position(rows))
+    return model.correction.undo(_positions(model.sensor, rows), rows)
+
+
+def _attitude(model: SensorModel, base: Pushbroom, rows: Array, positions: Array, seen: tuple[int, float]) -> Rotation:
+    """Return the rotation ecef_from_camera, z away from the ground, nearest to the lines of sight of each row."""
+    cols = np.linspace(0.0, seen[0] - 1.0, _COLUMNS)
+    image = np.stack(np.broadcast_arrays(cols, rows[:, None]), axis=-1)
+    away = ecef_from_ground(model.localize(image, np.full(image.shape[:2], seen[1]))) - positions[:, None]
+    if not np.isfinite(away).all():
+        raise RpcError("a camera that does not see the ground over its image is not written as a CSM state")
+    away /= np.linalg.norm(away, axis=-1, keepdims=True)
+    tangents = base.look @ np.stack([np.ones(_COLUMNS), cols - base.look_origin])
+    inside = np.vstack([tangents, np.ones(_COLUMNS)]).T
+    inside /= np.linalg.norm(inside, axis=1, keepdims=True)
+    left, _, right = np.linalg.svd(np.einsum("nki,kj->nij", away, inside))  # Wahba's problem
+    turn = np.ones((len(rows), 3))
+    turn[:, 2] = np.linalg.det(left @ right)
+    return Rotation.from_matrix((left * turn[:, None]) @ right @ FLIP)
+
+
+def _detector(base: Pushbroom) -> dict[str, Any]:
+    """Return the focal length [px] and where iTransS and iTransL put the detector: line 0, sample = column + 0.5."""
+    slope = base.look[:, 1]
+    focal = 1.0 / float(np.linalg.norm(slope))
+    first = base.look @ np.array([1.0, -0.5 - base.look_origin])
+    (x, y), (u, v) = focal * first * [-1.0, 1.0], focal * slope * [-1.0, 1.0]
+    return {
+        "m_focalLength": focal,
+        "m_iTransS": [-(u * x + v * y), u, v],
+        "m_iTransL": [v * x - u * y, -v, u],
+    }

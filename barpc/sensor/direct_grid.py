@@ -15,9 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import RpcError
-from barpc.frozen import Frozen
-from barpc.geodesy import FAR, NEWTON_STEPS, Array, pointwise, wrap_longitude
-from barpc.sensor import SensorModel
+from barpc.geodesy import FAR, NEWTON_STEPS, Array, wrap_longitude
+from barpc.sensor import Pointwise, SensorModel
 from barpc.sensor.rational import DERIVATIVE, monomials
 
 if TYPE_CHECKING:
@@ -32,15 +31,10 @@ _LONGEST = 1024.0, 1024.0, 1000.0  # px, px, m: from node to node of a grid made
 _FEWEST, _CELLS = 3, 1024  # cells along an axis; splines are cubic from three on
 _NODES = 4_000_000  # of a grid made here, at most
 _TRIED = 1000  # cells
-_SHARE = 0.1  # of the tolerance, that nodes may be off
-_FEW = 5, 9  # altitudes, columns of which the first polynomials are made
-_LOOKED, _HALF = 16, 0.5  # rows that they are tried at; share of all nodes from which on they save nothing
-
-_VALUE, _BY_COL, _BY_ROW, _BY_ALT = (0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class DirectGrid(Frozen):
+class DirectGrid(Pointwise):
     """A camera given by the ground points of a grid of image points: itself a `SensorModel`.
 
     The spline is continued by one cell around the grid and by a tenth of its altitudes; beyond, points are NaN.
@@ -101,9 +95,6 @@ class DirectGrid(Frozen):
         ground = np.asarray(ground, dtype=np.float64)
         image = np.asarray(image, dtype=np.float64)
         values = (ground[:, 2], image[:, 1], image[:, 0])
-        if (listed := _listed(values)) is not None:
-            alts, rows, cols = listed
-            return cls(cols, rows, alts, ground[:, :2].reshape(len(alts), len(rows), len(cols), 2))
         axes, places = zip(*(np.unique(value, return_inverse=True) for value in values), strict=True)
         shape = tuple(len(axis) for axis in axes)
         if len(ground) != np.prod(shape):
@@ -138,33 +129,21 @@ class DirectGrid(Frozen):
             return np.asarray((wrap_longitude(lonlat, center[:2]) - center[:2]) @ to_px)
 
         cols, rows, alts = linear_axes(seen, low, high, np.array(_LONGEST), tolerance)
-        found = _nodes(seen, (alts, rows, cols), _SHARE * tolerance)
-        return cls(cols, rows, alts, found @ np.linalg.inv(to_px) + center[:2])
+        plane = np.stack(np.meshgrid(cols, rows), axis=-1)
+        layers = [model.localize(plane, np.full(plane.shape[:2], alt))[..., :2] for alt in alts]
+        return cls(cols, rows, alts, np.stack(layers))
 
-    def project(self, ground: Array) -> Array:
-        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN off the grid."""
-        return pointwise(lambda part: [self._solve(part)], [(2,)], ground)[0]
+    def _localize(self, image: Array, alt: Array) -> Array:
+        return np.column_stack([self._value(image, alt) + np.array([self._lon, 0.0]), alt])
 
-    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = pointwise(self._jacobian, [(2,), (2, 3)], ground)
-        return image, jacobian
-
-    def localize(self, image: Array, alt: Array) -> Array:
-        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3); NaN off the grid."""
-        return pointwise(self._localize, [(3,)], image, alt)[0]
-
-    def _localize(self, image: Array, alt: Array) -> list[Array]:
-        return [np.column_stack([self._value(image, alt) + np.array([self._lon, 0.0]), alt])]
-
-    def _jacobian(self, ground: Array) -> tuple[Array, Array]:
-        image, alt = self._solve(ground), ground[:, 2]
+    def _derivatives(self, ground: Array) -> tuple[Array, ...]:
+        image, alt = self._project(ground), ground[:, 2]
         by_lon, by_lat = self._inverse_2x2(image, alt)
-        rise = self._value(image, alt, _BY_ALT)
+        rise = self._value(image, alt, (1, 0, 0))
         by_alt = -by_lon * rise[:, :1] - by_lat * rise[:, 1:]
         return image, np.stack([by_lon, by_lat, by_alt], axis=2)
 
-    def _solve(self, ground: Array) -> Array:
+    def _project(self, ground: Array) -> Array:
         """Return the image points (N, 2) of ground points (N, 3): Newton from an inverse cubic, whose
         derivatives mostly serve.
         """
@@ -200,7 +179,7 @@ class DirectGrid(Frozen):
         by_lon, by_lat = (basis[:10].T @ (DERIVATIVE[k].T @ coeffs) / scale[k] for k in (0, 1))
         return image, by_lon, by_lat
 
-    def _value(self, image: Array, alt: Array, derivative: tuple[int, int, int] = _VALUE) -> Array:
+    def _value(self, image: Array, alt: Array, derivative: tuple[int, int, int] = (0, 0, 0)) -> Array:
         """Return degrees east of the centre and lat (N, 2) [deg], or a derivative of them; NaN off the grid."""
         place = np.column_stack([alt, image[:, 1], image[:, 0]])
         margin = [0.1 * np.ptp(self.alts), self.rows[1] - self.rows[0], self.cols[1] - self.cols[0]]
@@ -213,7 +192,7 @@ class DirectGrid(Frozen):
 
     def _inverse_2x2(self, image: Array, alt: Array) -> tuple[Array, Array]:
         """Return d(col, row)/dlon and d(col, row)/dlat (N, 2)."""
-        (a, b), (c, d) = self._value(image, alt, _BY_COL).T, self._value(image, alt, _BY_ROW).T
+        (a, b), (c, d) = self._value(image, alt, (0, 0, 1)).T, self._value(image, alt, (0, 1, 0)).T
         det = a * d - b * c
         return np.stack([d / det, -b / det], axis=1), np.stack([-c / det, a / det], axis=1)
 
@@ -230,79 +209,11 @@ def _inverse_cubic(axes: tuple[Array, Array, Array], lonlat: Array) -> Array:
     return np.vstack([offset, scale, np.linalg.lstsq(basis, image, rcond=None)[0]])
 
 
-def _nodes(seen: Callable[[Array], Array], axes: tuple[Array, Array, Array], tolerance: float) -> Array:
-    """Return the ground seen (L, H, W, 2) at the nodes of three axes, altitudes, rows, columns.
-
-    Along altitudes and columns most cameras are smooth, whatever their attitude does along the rows: polynomials
-    through a few of them serve where, at some rows, they miss by no more than `tolerance` [px].
-    """
-    alts, rows, cols = axes
-    some = rows[np.unique(np.linspace(0, len(rows) - 1, _LOOKED).astype(np.int64))]
-    for more in (1, 2, 4):
-        few = [_chebyshev(axis, more * count) for axis, count in ((alts, _FEW[0]), (cols, _FEW[1]))]
-        if len(few[0]) * len(few[1]) > _HALF * len(alts) * len(cols):
-            break
-        between = [_lagrange(part, axis) for part, axis in zip(few, (alts, cols), strict=True)]
-        tried = _spread(_on(seen, (few[0], some, few[1])), *between)
-        if np.linalg.norm(tried - _on(seen, (alts, some, cols)), axis=-1).max() <= tolerance:
-            return _spread(_on(seen, (few[0], rows, few[1])), *between)
-    return _on(seen, axes)
-
-
-def _on(seen: Callable[[Array], Array], axes: tuple[Array, Array, Array]) -> Array:
-    """Return the ground seen (L, H, W, 2) at all nodes, layer by layer."""
-    alts, rows, cols = axes
-    plane = np.stack(np.meshgrid(cols, rows), axis=-1)
-    return np.stack([seen(np.dstack([plane, np.full(plane.shape[:2], alt)])) for alt in alts])
-
-
-def _spread(values: Array, by_alt: Array, by_col: Array) -> Array:
-    """Return the values (l, H, w, 2) of a few nodes at all of them (L, H, W, 2)."""
-    wide = np.matmul(by_col, values)
-    return np.asarray(np.tensordot(by_alt, wide, axes=1))
-
-
-def _chebyshev(axis: Array, count: int) -> Array:
-    """Return the places between which a polynomial is at its best, its ends among them."""
-    if count >= len(axis):
-        return axis
-    return np.asarray((axis[0] + axis[-1] - np.ptp(axis) * np.cos(np.pi * np.arange(count) / (count - 1))) / 2)
-
-
-def _lagrange(nodes: Array, at: Array) -> Array:
-    """Return the matrix (M, N) from values at nodes (N,) to those of their polynomial at places (M,)."""
-    away = at[:, None] - nodes
-    apart = nodes[:, None] - nodes + np.eye(len(nodes)) * np.ptp(nodes)
-    weight = 1.0 / np.prod(apart / np.ptp(nodes), axis=1)
-    same = away == 0.0
-    share = weight / np.where(same, 1.0, away)
-    share[same.any(axis=1)] = same[same.any(axis=1)]
-    return np.asarray(share / share.sum(axis=1, keepdims=True))
-
-
 def _slopes(model: SensorModel, at: Array) -> Array:
     """Return the derivative (2, 2) [deg/px] of lon, lat by col, row at a point (3,) col, row, altitude."""
     steps = np.concatenate([np.eye(2), -np.eye(2)])
     ground = model.localize(at[:2] + steps, np.full(4, at[2]))[:, :2]
     return np.asarray((wrap_longitude(ground[:2] - ground[2:]) / 2).T)
-
-
-def _listed(values: tuple[Array, Array, Array]) -> list[Array] | None:
-    """Return the axes of nodes that are listed layer by layer, row by row, as files have them; None of others."""
-    axes, left = list[Array](), [value for value in values if len(value)]
-    while left:
-        slowest, *faster = left
-        step = int(np.argmax(slowest != slowest[0])) or len(slowest)
-        axis = slowest[::step]
-        even = len(slowest) == len(axis) * step and (np.diff(axis) > 0).all()
-        if not even or any(
-            (value.reshape(len(axis), -1) != part).any()
-            for value, part in ((slowest, axis[:, None]), *((value, value[:step]) for value in faster))
-        ):
-            return None
-        axes.append(axis)
-        left = [value[:step] for value in faster]
-    return axes if len(axes) == len(values) else None
 
 
 def linear_axes(

@@ -65,16 +65,19 @@ class Fields:
         """Return a UTC time; RpcFormatError where it is missing or none."""
         return parse_time(self.text(path), self.name)
 
+    def _listed(self, path: str, between: str) -> Array:
+        try:
+            return np.array(self.text(path).replace(between, " ").split(), dtype=np.float64)
+        except ValueError as error:
+            raise RpcFormatError(f"{self.name}: {path} is not a list of numbers ({error})") from error
+
     def numbers(self, path: str, count: int | None = None, between: str = " ") -> Array:
         """Return the finite numbers (N,) of a field; RpcFormatError where it is missing, holds others, or not
         `count`.
 
         `between` is a character that may separate them, beside blanks.
         """
-        try:
-            numbers = np.array(self.text(path).replace(between, " ").split(), dtype=np.float64)
-        except ValueError as error:
-            raise RpcFormatError(f"{self.name}: {path} is not a list of numbers ({error})") from error
+        numbers = self._listed(path, between)
         if not (np.abs(numbers) <= FAR).all():
             raise RpcFormatError(f"{self.name}: {path} holds a number that is not finite or absurdly large")
         if count not in (None, len(numbers)):

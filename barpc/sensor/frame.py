@@ -13,23 +13,21 @@ import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval
 
 from barpc.errors import RpcError
-from barpc.frozen import Frozen
 from barpc.geodesy import (
     NEWTON_STEPS,
+    SETTLED,
     Array,
     ecef_from_ground,
     ecef_from_ground_jacobian,
     ground_from_ecef,
-    pointwise,
     reach,
     wrap_longitude,
 )
-
-_SETTLED = 1e-13  # focal lengths
+from barpc.sensor import Pointwise
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Frame(Frozen):
+class Frame(Pointwise):
     """A frame camera: itself a `SensorModel`.
 
     Parameters
@@ -63,24 +61,10 @@ class Frame(Frozen):
         if not abs(np.linalg.det(self.plane[:, :2])) > 0:
             raise RpcError("frame camera: plane has no area")
 
-    def project(self, ground: Array) -> Array:
-        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN behind the camera."""
-        return pointwise(lambda part: [self._seen(ecef_from_ground(part).T)[0].T], [(2,)], ground)[0]
+    def _project(self, ground: Array) -> Array:
+        return self._seen(ecef_from_ground(ground).T)[0].T
 
-    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = pointwise(self._derivatives, [(2,), (2, 3)], ground)
-        return image, jacobian
-
-    def localize(self, image: Array, alt: Array) -> Array:
-        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3); NaN off the
-        Earth.
-
-        Longitudes run on across the antimeridian.
-        """
-        return pointwise(lambda *part: [self._meet(*part)], [(3,)], image, alt)[0]
-
-    def _meet(self, image: Array, alt: Array) -> Array:
+    def _localize(self, image: Array, alt: Array) -> Array:
         at = self.plane @ np.vstack([image.T, np.ones(len(image))])
         tangents = at * (1.0 - polyval((at**2).sum(axis=0), self.distortion))
         ray = self.rotation @ np.vstack([tangents, np.ones(len(image))])
@@ -103,6 +87,7 @@ class Frame(Frozen):
         nowhere.
         """
         slope, found = polyder(self.distortion), radius
+        settled = SETTLED * float(np.abs(self.plane[:, :2]).max())  # focal lengths
         step = np.zeros_like(radius)
         for _ in range(NEWTON_STEPS):
             square = found**2
@@ -110,12 +95,12 @@ class Frame(Frozen):
             rate = 1.0 - polyval(square, self.distortion) - 2.0 * square * polyval(square, slope)
             step = left / np.where(rate > 0, rate, np.nan)
             found = found - step
-            if not (np.abs(step) > _SETTLED).any():
+            if not (np.abs(step) > settled).any():
                 break
-        found = np.where(np.abs(step) < np.sqrt(_SETTLED), found, np.nan)
+        found = np.where(np.abs(step) <= settled, found, np.nan)
         return np.asarray(found / np.where(radius > 0, radius, 1.0))  # in the middle any factor is right
 
-    def _derivatives(self, ground: Array) -> list[Array]:
+    def _derivatives(self, ground: Array) -> tuple[Array, ...]:
         image, at, p = self._seen(ecef_from_ground(ground).T)
         square = (at**2).sum(axis=0)
         size = 1.0 - polyval(square, self.distortion)
@@ -125,4 +110,4 @@ class Frame(Frozen):
         rows = np.stack([self.rotation[:, k, None] - tangents[k] * self.rotation[:, 2, None] for k in range(2)]) / p[2]
         by_image = np.einsum("ijn,jk->nik", by_place, self.plane[:, :2])
         jacobian = np.linalg.solve(by_image, np.moveaxis(rows, 2, 0)) @ ecef_from_ground_jacobian(ground)
-        return [image.T, jacobian]
+        return image.T, jacobian

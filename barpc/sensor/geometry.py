@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeGuard
+from typing import Literal, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,7 @@ from barpc.geodesy import (
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
 from barpc.sensor.stack import localize_stack
+from barpc.sensor.timing import Clocked
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
@@ -34,15 +35,7 @@ NOMINAL_ALTITUDE = 650e3  # orbit altitude [m] assumed where a model does not te
 PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this range [m] is not believed
 
 
-class Radar(SensorModel, Protocol):
-    """A radar model, which knows the direction of its beam: it is not that of a pixel's ground points over altitude."""
-
-    def to_radar(self, ground: Array) -> Array:
-        """Return the vectors (..., 3) [m], ECEF, from ground points (..., 3) to the radar that sees them."""
-        ...
-
-
-def is_radar(sensor: object) -> TypeGuard[Radar]:
+def is_radar(sensor: object) -> TypeGuard[Clocked]:
     """Return whether a model knows where its beam comes from: asking the protocol itself costs 70 us a view."""
     return hasattr(sensor, "to_radar")
 
@@ -288,7 +281,7 @@ def camera_centers(
     return found
 
 
-def _center_stated(sensor: Radar, size: tuple[int, int], alt_range: tuple[float, float]) -> CameraCenter:
+def _center_stated(sensor: Clocked, size: tuple[int, int], alt_range: tuple[float, float]) -> CameraCenter:
     point = sensor.localize((np.array(size) - 1) / 2.0, np.array(np.mean(alt_range)))
     ecef = ecef_from_ground(point) + sensor.to_radar(point)
     if not np.isfinite(ecef).all():

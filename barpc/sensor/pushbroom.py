@@ -19,7 +19,6 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import RpcError
-from barpc.frozen import Frozen
 from barpc.geodesy import (
     EARTH_RATE,
     NEWTON_STEPS,
@@ -29,11 +28,11 @@ from barpc.geodesy import (
     ecef_from_ground,
     ecef_from_ground_jacobian,
     ground_from_ecef,
-    pointwise,
     reach,
     up,
     wrap_longitude,
 )
+from barpc.sensor import Pointwise
 from barpc.sensor.curve import EXTRAPOLATION, Curve, Turn, cross
 
 _AIR = 2.316  # m: of refraction at sea level, times tan z / cos^2 z of the zenith distance z (Noerdlinger 1999)
@@ -99,8 +98,8 @@ STRAIGHT = Light()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Pushbroom(Frozen):
-    """A rigorous pushbroom camera: itself a `SensorModel`.
+class Pushbroom(Pointwise):
+    """A rigorous pushbroom camera: itself a `SensorModel`, believed a second (`EXTRAPOLATION`) beyond its samples.
 
     Parameters
     ----------
@@ -137,7 +136,7 @@ class Pushbroom(Frozen):
         self._check()
         middle = [self.look_origin, (sum(self._span) / 2 - self.first_line) / self.line_period]
         with np.errstate(all="ignore"):
-            center = self._meet(np.array([middle]), np.zeros(1))
+            center = self._localize(np.array([middle]), np.zeros(1))
         self._keep("_lon", float(np.nan_to_num(center[0, 0])))
 
     def _check(self) -> None:
@@ -182,25 +181,8 @@ class Pushbroom(Frozen):
         time = self.time(row)
         return np.moveaxis(self.orbit(time.reshape(-1))[0], 0, -1).reshape(*time.shape, 3)
 
-    def project(self, ground: Array) -> Array:
-        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN behind the camera,
-        off the orbit.
-        """
-        return pointwise(lambda part: [self._solve(ecef_from_ground(part).T).T], [(2,)], ground)[0]
-
-    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = pointwise(self._jacobian, [(2,), (2, 3)], ground)
-        return image, jacobian
-
-    def localize(self, image: Array, alt: Array) -> Array:
-        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
-
-        The line of sight meets the ellipsoid whose axes are longer by the altitude in closed form; Newton's
-        method on the distance brings it to the altitude itself. Longitudes run on across the antimeridian; NaN where
-        the line of sight misses the Earth, or more than `curve.EXTRAPOLATION` beyond the orbit or attitude.
-        """
-        return pointwise(lambda *part: [self._meet(*part)], [(3,)], image, alt)[0]
+    def _project(self, ground: Array) -> Array:
+        return self._solve(ecef_from_ground(ground).T).T
 
     def line_of_sight(self, image: Array) -> tuple[Array, Array]:
         """Return the camera centres [m] and unit directions of sight, (..., 3) in ECEF, of image points (...,
@@ -219,8 +201,12 @@ class Pushbroom(Frozen):
         direction /= np.sqrt((direction * direction).sum(axis=0))
         return self.orbit(time)[0], direction
 
-    def _meet(self, image: Array, alt: Array) -> Array:
-        """Return the ground points (N, 3) where lines of sight (N, 2) reach altitudes (N,)."""
+    def _localize(self, image: Array, alt: Array) -> Array:
+        """Return the ground points (N, 3) where lines of sight (N, 2) reach altitudes (N,).
+
+        They meet the ellipsoid whose axes are longer by the altitude in closed form; Newton's method on the distance
+        brings that to the altitude itself.
+        """
         origin, seen = self._rays(image)
         time, (start, stop) = self.time(image[:, 1]), self._span
         ground = reach(origin, seen, alt)
@@ -276,7 +262,7 @@ class Pushbroom(Frozen):
         out[:, ~settled] = np.nan
         return out
 
-    def _jacobian(self, ground: Array) -> tuple[Array, Array]:
+    def _derivatives(self, ground: Array) -> tuple[Array, ...]:
         ecef = ecef_from_ground(ground).T
         found = self._solve(ecef)
         return found.T, self._by_ecef(ecef, found) @ ecef_from_ground_jacobian(ground)

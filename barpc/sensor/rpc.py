@@ -7,19 +7,20 @@ normalised by an offset and a scale.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 
 from barpc.errors import RpcError
-from barpc.frozen import Frozen
 from barpc.geodesy import Array, pointwise, wrap_longitude
+from barpc.sensor import Pointwise
 from barpc.sensor.rational import REACH, BoolArray, Rational, monomials
 
 _ACCURACY = 1e-9  # px: a localised point must project this near to where it was asked (plus rounding)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RPC(Frozen):
+class RPC(Pointwise):
     """A rational polynomial camera: itself a `SensorModel`.
 
     Longitudes are taken by whole turns to within 180 degrees of the offset: across the antimeridian, and as 0..360.
@@ -50,6 +51,7 @@ class RPC(Frozen):
     err_rand: float | None = None
     direct: Array | None = None
     _map: Rational = field(init=False, repr=False)
+    _memory: ClassVar[int] = 27  # monomials, normalised coordinates, polynomials
 
     def __post_init__(self) -> None:
         shapes = {"ground_offset": (3,), "ground_scale": (3,), "image_offset": (2,), "image_scale": (2,)}
@@ -87,26 +89,6 @@ class RPC(Frozen):
         out /= self.ground_scale[:, None]
         return out
 
-    def project(self, ground: Array) -> Array:
-        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN where a denominator
-        vanishes.
-        """
-        return pointwise(self._project, [(2,)], ground, rows=27)[0]
-
-    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = pointwise(self._jacobian, [(2,), (2, 3)], ground, rows=20)
-        return image, jacobian
-
-    def localize(self, image: Array, alt: Array) -> Array:
-        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
-
-        A cubic inverse, fitted once per RPC, and one Newton step; more, and damped, where that is not
-        proven to be enough. Longitudes lie within 180 degrees of the RPC's offset; NaN where no point was found
-        that projects to `image`.
-        """
-        return pointwise(self._localize, [(3,)], image, alt, rows=20)[0]
-
     def off(self, other: RPC) -> Array:
         """Return the differences (729, 2) [px] of another RPC's image points over the box; 0 where neither has any."""
         places = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 9)] * 3), axis=-1).reshape(-1, 3)
@@ -126,28 +108,34 @@ class RPC(Frozen):
         lonlat = poly[::2] / poly[1::2] * self.ground_scale[:2, None] + self.ground_offset[:2, None]
         return [np.vstack([lonlat, alt]).T]
 
-    def _project(self, ground: Array, work: Array) -> list[Array]:
+    def _project(self, ground: Array, work: Array) -> Array:
         value = self._map.value(self.normalize(ground, work[20:23]), work[:20], work[23:])
+        return self._in_pixels(value).T
+
+    def _derivatives(self, ground: Array, work: Array) -> tuple[Array, ...]:
+        value, gradient = self._map.value_and_gradient(self.normalize(ground), work=work[:20])
+        gradient *= (self.image_scale / self.ground_scale[:, None])[..., None]
+        image = self._in_pixels(value)
+        if not np.isfinite(image.sum()):
+            gradient[..., np.isnan(image[0])] = np.nan
+        return image.T, gradient.T
+
+    def _in_pixels(self, value: Array) -> Array:
+        """Return the image points (2, N) of normalised ones, in place; NaN where a denominator vanishes."""
         value *= self.image_scale[:, None]
         value += self.image_offset[:, None]
         if not np.isfinite(value.sum()):
             value[:, ~np.isfinite(value).all(axis=0)] = np.nan
-        return [value.T]
+        return value
 
-    def _jacobian(self, ground: Array, work: Array) -> tuple[Array, Array]:
-        value, gradient = self._map.value_and_gradient(self.normalize(ground), work=work)
-        value *= self.image_scale[:, None]
-        value += self.image_offset[:, None]
-        gradient *= (self.image_scale / self.ground_scale[:, None])[..., None]
-        if not np.isfinite(value.sum()):
-            bad = ~np.isfinite(value).all(axis=0)
-            value[:, bad], gradient[..., bad] = np.nan, np.nan
-        return value.T, gradient.T
+    def _localize(self, image: Array, alt: Array, work: Array) -> Array:
+        """Return the ground points (N, 3) by a cubic inverse, fitted once per RPC, and one Newton step.
 
-    def _localize(self, image: Array, alt: Array, work: Array) -> list[Array]:
+        More, and damped, where that is not proven to be enough; NaN where no point was found that projects to `image`.
+        """
         target = np.subtract(image.T, self.image_offset[:, None], order="C")
         target /= self.image_scale[:, None]
-        x, ok = self._map.solve(target, (alt - self.ground_offset[2]) / self.ground_scale[2], work)
+        x, ok = self._map.solve(target, (alt - self.ground_offset[2]) / self.ground_scale[2], work[:20])
         reach = max(x.max(initial=0.0), -x.min(initial=0.0))
         x *= self.ground_scale[:, None]
         x += self.ground_offset[:, None]
@@ -157,7 +145,7 @@ class RPC(Frozen):
         if not (reach <= REACH and span[0] < 180.0 and np.abs(self.ground_offset[1]) + span[1] < 90.0):
             ok &= self._holds(ground, image)
         ground[~ok] = np.nan
-        return [ground]
+        return ground
 
     def _holds(self, ground: Array, image: Array) -> BoolArray:
         """Return whether ground points (N, 3) are on Earth and project to `image`: far out an ulp can be pixels."""

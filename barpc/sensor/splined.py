@@ -14,12 +14,10 @@ import numpy.typing as npt
 
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
-from barpc.geodesy import NEWTON_STEPS, Array
-from barpc.sensor import SensorModel
+from barpc.geodesy import Array
+from barpc.sensor import Displaced, fixed_point
 
 IntArray = npt.NDArray[np.int64]
-
-_SETTLED = 1e-7  # px
 
 
 def bspline_pieces(u: Array, count: int, rate: bool = False) -> tuple[IntArray, Array]:
@@ -128,6 +126,22 @@ class RowSpline(Frozen):
             out += np.moveaxis(sine_and_cosine(image[..., 1], period), 0, -1) @ moves
         return np.where(np.isfinite(image).all(axis=-1, keepdims=True), out, np.nan)
 
+    def apply(self, image: Array) -> Array:
+        """Return where points that a model without it has at (..., 2) [px] are seen."""
+        return fixed_point(lambda seen: image + self.at(seen), image)
+
+    def linearised(self, image: Array) -> tuple[Array, Array]:
+        """Return the same, and its derivative (..., 2, 2): the row moves the spline, and the spline the row."""
+        seen = self.apply(image)
+        rate = self.rate(seen[..., 1])
+        slope = np.broadcast_to(np.eye(2), (*image.shape, 2)).copy()
+        slope[..., 1] += rate / (1.0 - rate[..., 1:])
+        return seen, slope
+
+    def undo(self, image: Array) -> Array:
+        """Return where a model without it has points that are seen at (..., 2) [px]."""
+        return image - self.at(image)
+
     def rate(self, row: Array) -> Array:
         """Return its derivative by the row (..., 2) [px/px] at rows (...) [px]."""
         out = self._along(row, rate=True) / self.row_scale
@@ -150,35 +164,7 @@ class RowSpline(Frozen):
 
 
 @dataclass(frozen=True)
-class Splined:
-    """`sensor` with its image points displaced by `correction`; itself a `SensorModel`."""
+class Splined(Displaced):
+    """`sensor`, usually P_BA, with its image points displaced by a spline, steps and swings; itself a `SensorModel`."""
 
-    sensor: SensorModel  # usually P_BA
     correction: RowSpline  # what is added to its image points
-
-    def project(self, ground: Array) -> Array:
-        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
-        return self._displaced(self.sensor.project(ground))
-
-    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = self.sensor.project_jacobian(ground)
-        image = self._displaced(image)
-        rate = self.correction.rate(image[..., 1])  # the row moves the spline, and the spline the row
-        by_row = jacobian[..., 1, :] / (1.0 - rate[..., 1, None])
-        return image, jacobian + rate[..., None] * by_row[..., None, :]
-
-    def localize(self, image: Array, alt: Array) -> Array:
-        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
-        image = np.asarray(image, dtype=np.float64)
-        return self.sensor.localize(image - self.correction.at(image), alt)
-
-    def _displaced(self, projected: Array) -> Array:
-        """Return the displaced image points of points projected to (..., 2) [px]."""
-        image = projected
-        for _ in range(NEWTON_STEPS):
-            before, image = image, projected + self.correction.at(image)
-            change = np.abs(image - before)
-            if not (change.max(initial=0.0, where=np.isfinite(change)) > _SETTLED):
-                break
-        return image

@@ -1,18 +1,80 @@
-"""A radar's clocks: range and azimuth time are off by an amount and a slope along the flight, not by an attitude."""
+"""What radars share: the circle on which a pixel's points lie, the side they look to, and clocks that are off.
+
+The points of one range and one Doppler lie on a circle about the line of flight. Range and azimuth time are off by an
+amount and a slope along the flight, not by an attitude.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, Self, TypeGuard
+from typing import Any, ClassVar, Literal, Self, TypeGuard
 
 import numpy as np
 from numpy.polynomial import polynomial
 
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
-from barpc.geodesy import Array
-from barpc.sensor import SensorModel
+from barpc.geodesy import NEWTON_STEPS, SETTLED, Array, ground_from_ecef, pointwise, up, wrap_longitude
+from barpc.sensor import Behind, Pointwise, SensorModel
+from barpc.sensor.curve import Curve, cross
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Return the dot products (N,) of vectors (3, N)."""
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+def aside(position: Array, velocity: Array, right: bool) -> Array:
+    """Return the vectors (3, N) across the track, to its right or left."""
+    across = cross(velocity, position)
+    return across if right else -across
+
+
+def on_circle(
+    position: Array, velocity: Array, distance: Array, alt: Array, right: bool, ahead: Array | float = 0.0
+) -> tuple[Array, Array]:
+    """Return the points of a circle that have a given altitude: Newton on the look angle.
+
+    Parameters
+    ----------
+    position, velocity : (3, N), of the radar [m, m/s], ECEF
+    distance : (N,), from the radar [m]
+    alt : (N,), [m above the ellipsoid]
+    right : the side of the track
+    ahead : (N,), cosine of the angle between flight and line of sight; 0 at zero Doppler
+
+    Returns
+    -------
+    ground : (N, 3), lon, lat [deg], alt [m]; NaN where the range does not reach
+    sight : (3, N), unit vectors to the radar
+    """
+    forward = ahead * velocity / np.sqrt(dot(velocity, velocity))
+    span = np.sqrt(1.0 - np.square(ahead))
+    across = aside(position, velocity, right)
+    across /= np.sqrt(dot(across, across))
+    above = position * dot(velocity, velocity) - velocity * dot(velocity, position)
+    above /= np.sqrt(dot(above, above))
+    height = ground_from_ecef(position.T)[:, 2]
+    radius = np.sqrt(dot(position, position)) - height + alt
+    cosine = dot(position, position) + distance**2 - radius**2 + 2 * distance * dot(position, forward)
+    angle = np.arccos(cosine / (2 * distance * span * dot(position, above)))
+
+    def at(angle: Array) -> tuple[Array, Array]:
+        away = span * (across * np.sin(angle) - above * np.cos(angle)) + forward
+        return away, ground_from_ecef((position + distance * away).T)
+
+    for _ in range(NEWTON_STEPS):
+        _, ground = at(angle)
+        turned = span * (across * np.cos(angle) + above * np.sin(angle))
+        moved = (alt - ground[:, 2]) / dot(up(ground), turned)
+        angle = angle + moved / distance
+        if not (np.abs(moved).max(initial=0.0, where=np.isfinite(moved)) > SETTLED):
+            break
+    away, ground = at(angle)
+    ground[~(np.abs(ground[:, 2] - alt) <= SETTLED)] = np.nan
+    ground[:, 2] = alt
+    return ground, -away
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,25 +107,56 @@ class Timing(Frozen):
         return np.asarray(polynomial.polyval((along - self.offset) / self.scale, slopes))
 
 
-class Clocked(SensorModel, Protocol):
-    """A radar model whose clocks can be corrected."""
+class Clocked(Pointwise):
+    """Base of the radar models: they know where their beam comes from, and their clocks can be corrected.
 
-    azimuth_axis: int
+    Their `_derivatives` are image points (n, 2) and d(image)/d(ground) (n, 2, 3), d(image)/d(range, azimuth time)
+    (n, 2, 2), the coordinate along the flight (n,).
+    """
+
+    azimuth_axis: ClassVar[int]
     """The image coordinate that goes along the flight: 0 (col) or 1 (row)."""
+    orbit: Curve
+    size: tuple[int, int]
+    alt_range: tuple[float, float]
+    look: Literal["right", "left"]
+    accuracy: tuple[float, float] | None
+    """Stated standard deviations of range and of the position along the flight [m]."""
+    _kind: ClassVar[str]
+    _to_radar: Any
 
-    @property
-    def accuracy(self) -> tuple[float, float] | None:
-        """Stated standard deviations of range and of the position along the flight [m]."""
-        ...
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if min(self.size) < 1 or not self.alt_range[0] <= self.alt_range[1]:
+            raise RpcError(f"{self._kind}: size {self.size}, altitudes {self.alt_range}")
+        if self.look not in ("right", "left"):
+            raise RpcError(f"{self._kind}: look {self.look!r}, expected 'right' or 'left'")
 
     @property
     def speed(self) -> float:
-        """Speed of the flight [m/s]."""
-        ...
+        """Speed of the flight in the middle of the image [m/s]."""
+        raise NotImplementedError
 
     def timed(self, timing: Timing) -> Self:
         """Return the model with a timing, its coordinate in pixels, in place of its own."""
-        ...
+        raise NotImplementedError
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
+
+        On the circle of a pixel, Newton on the look angle until the point has the altitude. Longitudes run on across
+        the antimeridian; NaN off the orbit's time span, far off the image, or where the range does not reach.
+        """
+        ground = super().localize(image, alt)
+        with np.errstate(all="ignore"):
+            ground[..., 0] = wrap_longitude(ground[..., 0], self._middle)
+        return ground
+
+    def to_radar(self, ground: Array) -> Array:
+        """Return the vectors (..., 3) [m], ECEF, from ground points (..., 3) to the radar that sees them; NaN as
+        `project`.
+        """
+        return pointwise(lambda part: [self._to_radar(part)], [(3,)], ground)[0]
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
         """Return image points (..., 2) [px] of ground points (..., 3), their derivatives by range and azimuth
@@ -71,7 +164,14 @@ class Clocked(SensorModel, Protocol):
 
         d(image)/d(ground) (..., 2, 3), d(image)/d(range, azimuth time) (..., 2, 2) [px/m, px/s], and (...) [px].
         """
-        ...
+        image, by_ground, by_timing, along = pointwise(self._derivatives, [(2,), (2, 3), (2, 2), ()], ground)
+        return image, by_ground, by_timing, along
+
+    @cached_property
+    def _middle(self) -> float:
+        """Longitude of the image's middle [deg]."""
+        lon = float(super().localize(0.5 * np.array(self.size), np.array(np.mean(self.alt_range)))[0])
+        return lon if np.isfinite(lon) else 0.0
 
 
 def is_clocked(sensor: SensorModel) -> TypeGuard[Clocked]:
@@ -82,7 +182,7 @@ def is_clocked(sensor: SensorModel) -> TypeGuard[Clocked]:
 
 
 @dataclass(frozen=True)
-class Timed:
+class Timed(Behind):
     """A radar model behind the correction of its clocks; itself a `SensorModel`."""
 
     sensor: Clocked  # the model as delivered
@@ -91,11 +191,6 @@ class Timed:
     @cached_property
     def _model(self) -> Clocked:
         return self.sensor.timed(self.correction)
-
-    @property
-    def advice(self) -> str:
-        """What to do where no RPC follows the model; empty where it does not know."""
-        return str(getattr(self.sensor, "advice", ""))
 
     def project(self, ground: Array) -> Array:
         """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""

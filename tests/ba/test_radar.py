@@ -31,7 +31,7 @@ from barpc.sensor.curve import Curve
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.sicd import open_sicd
-from barpc.sensor.sicd.formation import Aperture, Formation
+from barpc.sensor.sicd.monostatic import Aperture, Formation
 from barpc.sensor.timing import Clocked, Timing
 from barpc.simulate import Look, fly
 from tests.lanes import diagonal, rest_slow

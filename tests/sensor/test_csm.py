@@ -14,8 +14,7 @@ from barpc.cameras import open_camera
 from barpc.errors import BarpcError, InputError, RpcError, RpcFormatError
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.csm import FRAME, LINESCAN, open_state
-from barpc.sensor.csm_write import is_writable, state_text
+from barpc.sensor.csm import FRAME, LINESCAN, is_writable, open_state, state_text
 
 State = dict[str, object]
 SIZE = (3000, 4000)

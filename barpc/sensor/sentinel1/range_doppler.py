@@ -9,24 +9,21 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
 
-from barpc.errors import BarpcWarning, InputError, RpcError, RpcFormatError
-from barpc.frozen import Frozen
+from barpc.errors import BarpcWarning, InputError, RpcFormatError
 from barpc.geodesy import (
     NEWTON_STEPS,
+    SETTLED,
     SPEED_OF_LIGHT,
     Array,
     ecef_from_ground,
     ecef_from_ground_jacobian,
     pointwise,
-    wrap_longitude,
 )
-from barpc.sensor.circle import aside, dot, on_circle
 from barpc.sensor.curve import Curve, Orbit, fit_orbit
 from barpc.sensor.document import GRID_TOLERANCE, seconds
 from barpc.sensor.sentinel1.annotation import (
@@ -44,7 +41,7 @@ from barpc.sensor.sentinel1.frames import (
     SlantFrame,
     bistatic_constant,
 )
-from barpc.sensor.timing import Timing
+from barpc.sensor.timing import Clocked, Timing, aside, dot, on_circle
 
 RELIEF = (200.0, 500.0)
 """How far the terrain may lie below the lowest and above the highest point of the geolocation grid [m]."""
@@ -59,12 +56,9 @@ NOT_CORRECTED = (3.5, 4.0)
 CORRECTED = (0.5, 0.5)
 """What is left of both [m]: ionosphere and water vapour; the Doppler rate at another height than was assumed."""
 
-_SLACK = 10.0  # s: how far beyond the orbit the search for zero Doppler may wander
-_SETTLED = 1e-5  # s: quadratic convergence leaves less than 1e-12 s after a step so small
-
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RangeDoppler(Frozen):
+class RangeDoppler(Clocked):
     """A radar image in zero-Doppler geometry (Sentinel-1, TerraSAR-X): itself a `SensorModel`.
 
     Parameters
@@ -80,6 +74,7 @@ class RangeDoppler(Frozen):
     """
 
     azimuth_axis: ClassVar[int] = 1
+    _kind: ClassVar[str] = "Range-Doppler model"
 
     orbit: Curve
     epoch: np.datetime64
@@ -89,13 +84,6 @@ class RangeDoppler(Frozen):
     look: Literal["right", "left"] = "right"
     delays: Delays = NO_DELAYS
     accuracy: tuple[float, float] | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if min(self.size) < 1 or not self.alt_range[0] <= self.alt_range[1]:
-            raise RpcError(f"Range-Doppler model: size {self.size}, altitudes {self.alt_range}")
-        if self.look not in ("right", "left"):
-            raise RpcError(f"Range-Doppler model: look {self.look!r}, expected 'right' or 'left'")
 
     def _told(self) -> str:
         (width, height), (low, high) = self.size, self.alt_range
@@ -160,13 +148,6 @@ class RangeDoppler(Frozen):
         timing = replace(timing, offset=timing.offset * interval, scale=timing.scale * interval)
         return replace(self, delays=replace(self.delays, timing=timing))
 
-    def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """Return image points and derivatives as `barpc.sensor.timing.Clocked` asks; the coordinate is the
-        row of pure geometry.
-        """
-        image, by_ground, by_timing, row = pointwise(self._derivatives, [(2,), (2, 3), (2, 2), ()], ground)
-        return image, by_ground, by_timing, row
-
     def azimuth_range(self, ground: Array) -> tuple[Array, Array]:
         """Return the zero-Doppler [s from `epoch`] and two-way slant range times (...) [s] of ground points
         (..., 3).
@@ -178,49 +159,17 @@ class RangeDoppler(Frozen):
         )
         return azimuth_time, range_time
 
-    def to_radar(self, ground: Array) -> Array:
-        """Return the vectors (..., 3) [m], ECEF, from ground points (..., 3) to the satellite; NaN where
-        `azimuth_range` is.
-        """
-        return pointwise(self._to_radar, [(3,)], ground)[0]
-
-    def project(self, ground: Array) -> Array:
-        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN where `azimuth_range` is."""
-        return pointwise(self._project, [(2,)], ground)[0]
-
-    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = pointwise(lambda part: self._derivatives(part)[:2], [(2,), (2, 3)], ground)
-        return image, jacobian
-
-    def localize(self, image: Array, alt: Array) -> Array:
-        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
-
-        On the circle of zero Doppler and given slant range, Newton on the look angle until the point has the altitude.
-        Longitudes run on across the antimeridian; NaN off the orbit's time span or where the range does not reach.
-        """
-        ground = pointwise(lambda part, alt: [self._localize(part.T, alt)], [(3,)], image, alt)[0]
-        with np.errstate(all="ignore"):
-            ground[..., 0] = wrap_longitude(ground[..., 0], self._middle)
-        return ground
-
-    @cached_property
-    def _middle(self) -> float:
-        image = 0.5 * np.array(self.size, dtype=np.float64)[:, None]
-        lon = float(self._localize(image, np.array([np.mean(self.alt_range)]))[0, 0])
-        return lon if np.isfinite(lon) else 0.0
-
     def _geometry(self, ecef: Array) -> _Seen:
         point = ecef.T
         low, high = self.orbit.span
-        time = np.where(np.isfinite(point[0]), (low + high) / 2, np.nan)
+        time, settled = np.where(np.isfinite(point[0]), (low + high) / 2, np.nan), SETTLED * self.frame.interval
         for _ in range(NEWTON_STEPS):
             position, velocity, acceleration = self.orbit.states(time)
             sight = position - point
             rate = -dot(acceleration, sight) - dot(velocity, velocity)
-            moved = np.clip(time + dot(velocity, sight) / rate, low - _SLACK, high + _SLACK)
+            moved = np.clip(time + dot(velocity, sight) / rate, low, high)
             step, time = np.abs(moved - time), moved
-            if not (step.max(initial=0.0, where=np.isfinite(step)) > _SETTLED):
+            if not (step.max(initial=0.0, where=np.isfinite(step)) > settled):
                 break
         position, velocity, acceleration = self.orbit.states(time)
         sight = position - point
@@ -228,25 +177,24 @@ class RangeDoppler(Frozen):
         sight /= distance
         rate = -distance * dot(acceleration, sight) - dot(velocity, velocity)
         side = dot(aside(position, velocity, self.look == "right"), sight)
-        time[~((time >= low) & (time <= high) & (side < 0) & (step <= _SETTLED))] = np.nan
+        time[~((time > low) & (time < high) & (side < 0) & (step <= settled))] = np.nan
         times = np.stack([time, distance * (2.0 / SPEED_OF_LIGHT)])
         return _Seen(times, sight, distance, velocity, -velocity / rate)
 
-    def _to_radar(self, ground: Array) -> list[Array]:
+    def _to_radar(self, ground: Array) -> Array:
         seen = self._geometry(ecef_from_ground(ground))
-        return [np.where(np.isnan(seen.times[0]), np.nan, seen.distance * seen.sight).T]
+        return np.where(np.isnan(seen.times[0]), np.nan, seen.distance * seen.sight).T
 
-    def _project(self, ground: Array) -> list[Array]:
+    def _project(self, ground: Array) -> Array:
         seen = self._geometry(ecef_from_ground(ground))
         times = seen.times
         if self.delays:
             times = times + self.delays.shift(times, ground, seen.sight)
         image = self.frame.image(times)[0]
         image[:, ~np.isfinite(image).all(axis=0)] = np.nan
-        return [image.T]
+        return image.T
 
     def _derivatives(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """Return image points and derivatives for `timing_jacobian`."""
         seen = self._geometry(ecef_from_ground(ground))
         by_ecef = np.stack([seen.time_by_ecef.T, seen.sight.T * (-2.0 / SPEED_OF_LIGHT)])  # (2, N, 3)
         ecef_by_ground = ecef_from_ground_jacobian(ground)
@@ -264,7 +212,7 @@ class RangeDoppler(Frozen):
         return image.T, jacobian, np.moveaxis(by_timing, -1, 0), seen.times[0] / self.frame.interval
 
     def _localize(self, image: Array, alt: Array) -> Array:
-        measured = times = self.frame.times(image)
+        measured = times = self.frame.times(image.T)
         ground, sight = self._on_circle(times, alt)
         for _ in range(3 if self.delays else 0):  # delays change by 1e-5 of a step: three rounds are exact
             times = measured - self.delays.shift(times, ground, sight)

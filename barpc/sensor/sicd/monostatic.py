@@ -1,35 +1,163 @@
-"""A monostatic radar image as a camera: a ground point is seen where range and range rate are those of the pixel."""
+"""A monostatic radar image as a camera: a ground point is seen where range and range rate are those of the pixel.
+
+What a pixel states, range and range rate at the centre of its aperture, is the image's `Formation`. (x, y) [m] are the
+image's own coordinates, along its rows' and its columns' numbers, from the scene centre point (SCP). Equations: SICD
+volume 3, "Image Projections Description", sections 4 and 5; names are the document's.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval, polyval2d
 
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
-from barpc.geodesy import (
-    NEWTON_STEPS,
-    SETTLED,
-    Array,
-    ecef_from_ground,
-    ecef_from_ground_jacobian,
-    pointwise,
-    wrap_longitude,
-)
-from barpc.sensor.circle import aside, dot, on_circle
+from barpc.geodesy import NEWTON_STEPS, SETTLED, Array, ecef_from_ground, ecef_from_ground_jacobian
 from barpc.sensor.curve import Curve
-from barpc.sensor.sicd.formation import Aperture, Formation
-from barpc.sensor.timing import Timing
+from barpc.sensor.timing import Clocked, Timing, aside, dot, on_circle
 
 _STEP = 1.0  # m: central differences over so much are exact to 1e-9
 _BEYOND = 1.0  # sides of the image around it that its polynomials are believed for
 
 
+class Aperture(NamedTuple):
+    """Position and velocity of the radar for N pixels, and the range and range rate measured there."""
+
+    position: Array  # (3, N): ECEF [m]
+    velocity: Array  # (3, N): [m/s]
+    distance: Array  # (N,): R [m]
+    rate: Array  # (N,): dR/dt [m/s]
+    time: Array  # (N,): of the centre of the aperture [s]
+
+    @classmethod
+    def of(cls, point: Array, flight: tuple[Array, Array], time: Array) -> Aperture:
+        """Return that of points (3, N) or (3, 1): the range and its rate are their own."""
+        position, velocity = flight
+        sight = position - point
+        distance = np.sqrt(dot(sight, sight))
+        return cls(position, velocity, distance, dot(velocity, sight) / distance, time)
+
+
+@dataclass(frozen=True, eq=False)
+class Formation(Frozen, ABC):
+    """Image formation: from pixels to range and range rate.
+
+    Parameters
+    ----------
+    time : (K, L), TimeCOAPoly: coefficients of x^k y^l [s]
+    """
+
+    time: Array
+
+    _SHAPES: ClassVar[tuple[tuple[str, tuple[int | None, ...]], ...]] = ()
+
+    def __post_init__(self) -> None:
+        for name, shape in (("time", (None, None)), *self._SHAPES):
+            self._array(name, shape, RpcError)
+
+    def at(self, x: Array, y: Array, orbit: Curve) -> Aperture:
+        """Return the apertures of N pixels at x, y (N,) [m]."""
+        return self._at(x, y, orbit, np.asarray(polyval2d(x, y, self.time), dtype=np.float64))
+
+    @abstractmethod
+    def _at(self, x: Array, y: Array, orbit: Curve, time: Array) -> Aperture: ...
+
+
+@dataclass(frozen=True, eq=False)
+class PolarFormat(Formation):
+    """Grid RGAZIM made by the polar format algorithm (PFA).
+
+    Parameters
+    ----------
+    scp : (3,), ECEF [m]
+    angle : (K,), PolarAngPoly: coefficients by time [rad]
+    scale : (K,), SpatialFreqSFPoly: coefficients by that angle
+    """
+
+    scp: Array
+    angle: Array
+    scale: Array
+
+    _SHAPES = ("scp", (3,)), ("angle", (None,)), ("scale", (None,))
+
+    def _at(self, x: Array, y: Array, orbit: Curve, time: Array) -> Aperture:
+        center = Aperture.of(self.scp[:, None], orbit(time), time)
+        angle, turning = polyval(time, self.angle), polyval(time, polyder(self.angle))
+        scale, by_angle = polyval(angle, self.scale), polyval(angle, polyder(self.scale))
+        along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+        rate = center.rate + (by_angle * along + scale * across) * turning
+        return center._replace(distance=center.distance + scale * along, rate=rate)
+
+
+@dataclass(frozen=True, eq=False)
+class RangeAzimuth(Formation):
+    """Grid RGAZIM made by range-azimuth compression (RGAZCOMP); `factor` is AzSF [1/m]."""
+
+    scp: Array
+    factor: float
+
+    _SHAPES = (("scp", (3,)),)
+
+    def _at(self, x: Array, y: Array, orbit: Curve, time: Array) -> Aperture:
+        center = Aperture.of(self.scp[:, None], orbit(time), time)
+        rate = center.rate - np.sqrt(dot(center.velocity, center.velocity)) * self.factor * y
+        return center._replace(distance=center.distance + x, rate=rate)
+
+
+@dataclass(frozen=True, eq=False)
+class ZeroDoppler(Formation):
+    """Grid RGZERO made by range migration with imaging near closest approach (RMA, INCA).
+
+    Parameters
+    ----------
+    closest_time : (K,), TimeCAPoly: time of closest approach by y [s]
+    closest : R_CA_SCP, range of closest approach of the SCP [m]
+    scale : (K, L), DRateSFPoly
+    """
+
+    closest_time: Array
+    closest: float
+    scale: Array
+
+    _SHAPES = ("closest_time", (None,)), ("scale", (None, None))
+
+    def _at(self, x: Array, y: Array, orbit: Curve, time: Array) -> Aperture:
+        closest_time = np.asarray(polyval(y, self.closest_time), dtype=np.float64)
+        _, speed = orbit(closest_time)
+        late, closest = time - closest_time, self.closest + x
+        bend = polyval2d(x, y, self.scale) * dot(speed, speed)
+        distance = np.sqrt(closest**2 + bend * late**2)
+        return Aperture(*orbit(time), distance, bend * late / distance, time)
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePlane(Formation):
+    """Grids XRGYCR, XCTYAT and PLANE: a pixel is a point of a plane.
+
+    Parameters
+    ----------
+    scp : (3,), ECEF [m]
+    along_x, along_y : (3,), unit vectors of the rows' and the columns' numbers (Row and Col UVectECF)
+    """
+
+    scp: Array
+    along_x: Array
+    along_y: Array
+
+    _SHAPES = ("scp", (3,)), ("along_x", (3,)), ("along_y", (3,))
+
+    def _at(self, x: Array, y: Array, orbit: Curve, time: Array) -> Aperture:
+        point = self.scp[:, None] + self.along_x[:, None] * x + self.along_y[:, None] * y
+        return Aperture.of(point, orbit(time), time)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Monostatic(Frozen):
+class Monostatic(Clocked):
     """A SICD image: itself a `SensorModel`.
 
     Rows of the image go on in range (x), columns along the flight (y), so that `image` is (column, row) as ever.
@@ -57,42 +185,13 @@ class Monostatic(Frozen):
     timing: Timing | None = None
     accuracy: tuple[float, float] | None = None
 
-    advice: ClassVar[str] = ""
     azimuth_axis: ClassVar[int] = 0
+    _kind: ClassVar[str] = "SICD"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if min(self.size) < 1 or not self.alt_range[0] <= self.alt_range[1] or not min(self.spacing) > 0:
-            raise RpcError(f"SICD: size {self.size}, spacing {self.spacing} m, altitudes {self.alt_range}")
-        if self.look not in ("right", "left"):
-            raise RpcError(f"SICD: look {self.look!r}, expected 'right' or 'left'")
-
-    def project(self, ground: Array) -> Array:
-        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN far off, or on the
-        other side.
-        """
-        return pointwise(lambda part: [self._image(self._solve(ecef_from_ground(part).T)[0])], [(2,)], ground)[0]
-
-    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = pointwise(lambda part: self._derivatives(part)[:2], [(2,), (2, 3)], ground)
-        return image, jacobian
-
-    def localize(self, image: Array, alt: Array) -> Array:
-        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
-
-        Longitudes run on across the antimeridian; NaN far off the image or where the range does not reach.
-        """
-        ground = pointwise(self._localize, [(3,)], image, alt)[0]
-        with np.errstate(all="ignore"):
-            ground[..., 0] = wrap_longitude(ground[..., 0], self._middle)
-        return ground
-
-    def to_radar(self, ground: Array) -> Array:
-        """Return the vectors (..., 3) [m], ECEF, from ground points (..., 3) to the antenna that sees them;
-        NaN as `project`.
-        """
-        return pointwise(lambda part: [self._to_radar(part)], [(3,)], ground)[0]
+        if not min(self.spacing) > 0:
+            raise RpcError(f"SICD: spacing {self.spacing} m")
 
     @property
     def speed(self) -> float:
@@ -105,18 +204,6 @@ class Monostatic(Frozen):
         pixel, zero = self.spacing[1], self.origin[1]
         timing = replace(timing, offset=(timing.offset - zero) * pixel, scale=timing.scale * pixel)
         return replace(self, timing=timing)
-
-    def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """Return image points and derivatives as `barpc.sensor.timing.Clocked` asks; the coordinate is the column."""
-        image, by_ground, by_timing, col = pointwise(self._derivatives, [(2,), (2, 3), (2, 2), ()], ground)
-        return image, by_ground, by_timing, col
-
-    @cached_property
-    def _middle(self) -> float:
-        image = 0.5 * np.array(self.size, dtype=np.float64)[None, :]
-        with np.errstate(all="ignore"):
-            lon = float(self._localize(image, np.array([np.mean(self.alt_range)]))[0][0, 0])
-        return lon if np.isfinite(lon) else 0.0
 
     @cached_property
     def _bounds(self) -> tuple[Array, Array]:
@@ -158,6 +245,9 @@ class Monostatic(Frozen):
         columns = [self._miss(plane + s, point)[0] - self._miss(plane - s, point)[0] for s in steps]
         return np.stack(columns, axis=1) / (2 * _STEP)
 
+    def _project(self, ground: Array) -> Array:
+        return self._image(self._solve(ecef_from_ground(ground).T)[0])
+
     def _solve(self, point: Array) -> tuple[Array, Array]:
         """Return (x, y) (2, N) of points (3, N), ECEF, by Newton from the scene centre; and the last
         derivative (2, 2, N).
@@ -182,7 +272,6 @@ class Monostatic(Frozen):
         return (sight * distance).T
 
     def _derivatives(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """Return image points and derivatives for `timing_jacobian`."""
         point = ecef_from_ground(ground).T
         plane, slope = self._solve(point)
         _, seen, sight, distance = self._miss(plane, point)
@@ -199,14 +288,14 @@ class Monostatic(Frozen):
         timing = np.moveaxis(by_timing, -1, 0) / pixel
         return image, (by_ground / pixel)[:, ::-1], timing[:, ::-1], image[:, 0]
 
-    def _localize(self, image: Array, alt: Array) -> list[Array]:
+    def _localize(self, image: Array, alt: Array) -> Array:
         low, high = self._bounds
         plane = ((image[:, ::-1] - np.array(self.origin)) * np.array(self.spacing)).T
         plane[:, ~((plane > low) & (plane < high)).all(axis=0)] = np.nan
         seen = self._seen(plane)
         ahead = -seen.rate / np.sqrt(dot(seen.velocity, seen.velocity))
         ground, _ = on_circle(seen.position, seen.velocity, seen.distance, alt, self.look == "right", ahead)
-        return [ground]
+        return ground
 
 
 def _solve(matrix: Array, right: Array) -> Array:
