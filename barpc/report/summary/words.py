@@ -128,7 +128,7 @@ CAUSES = {
         "doubtful",
         "contradicts the others",
         "{share:.0f} % of its tie points were rejected, as they contradict those of the other images",
-        "check that the RPC belongs to this image (IMAGE,camera=FILE names another), then look for clouds, water, change",
+        "check that the RPC belongs to this image (IMAGE,camera=FILE names another); look for clouds, water, change",
     ),
     "few": Cause("weak", "few tie points", "only {few} tie points", "check overlap, clouds and dates"),
     "none": Cause("weak", "no tie points", "no tie points", "check overlap, clouds and dates"),
