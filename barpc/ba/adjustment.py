@@ -19,7 +19,7 @@ from barpc.ba.held.incremental import BlockPrior
 from barpc.ba.held.terrain import Terrain
 from barpc.ba.judging.following import follow, without_strips
 from barpc.ba.judging.judge import Finding, left_over, standing_out
-from barpc.ba.judging.snooping import MOST_TESTED, image_test
+from barpc.ba.judging.snooping import image_test
 from barpc.ba.judging.solution import Solution, solve_block
 from barpc.ba.placing import place
 from barpc.ba.result import Adjustment
@@ -28,6 +28,7 @@ from barpc.ba.robust.heldout import enu_offsets, keep_out, measure
 from barpc.ba.robust.rounds import Outcome
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.standing import Parts, without_moving
+from barpc.ba.usual import SAMPLE
 from barpc.errors import AdjustError
 from barpc.geodesy import Array, ground_from_ecef
 from barpc.options import AUTO, AdjustOptions
@@ -339,7 +340,7 @@ def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
     is_held = outcome.inlier & (False if held is None else np.isin(block.point, held.index))
     of_gcps = np.flatnonzero(is_held & (block.point >= block.num_tracks) & (block.point < block.num_known))
     others = np.flatnonzero(is_held & (block.point >= block.num_known))
-    rows = np.union1d(of_gcps, others[:: -(-len(others) // MOST_TESTED)] if len(others) else others)
+    rows = np.union1d(of_gcps, others[:: -(-len(others) // SAMPLE)] if len(others) else others)
     if len(rows):
         at_end = (found.final, outcome.residual, outcome.weight)
         w[rows] = image_test(covariance, outcome.problem, *at_end, rows)

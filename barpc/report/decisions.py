@@ -7,8 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from barpc.ba.apart import APART
-from barpc.ba.judging.judge import LARGEST
-from barpc.ba.usual import SURE
+from barpc.ba.usual import LARGEST, SURE
 from barpc.report.records import Table, table
 from barpc.report.summary import Summary
 from barpc.report.summary.findings import RIVALS, ExplanationEntry

@@ -14,14 +14,13 @@ import numpy as np
 
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import BACKFITTING, FEW
+from barpc.ba.usual import BACKFITTING, FEW, ITERATIONS
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
 _LARGE = 40.0  # twice the logarithm of a likelihood ratio: the largest of 10,000 places by chance once in 100,000 views
 _A_VIEW = 4.0  # and so much more for every other view of a focal plane
 _AS_LARGE = 0.5  # of the largest change: not what another view's step leaves here, a quarter of it with three views
-_ROUNDS = 12
 
 Edges = list[list[float]]  # of every group of views, ascending
 
@@ -106,7 +105,7 @@ def _grown(columns: _Columns, residual: Array, settled: Callable[[Array], Array]
     """
     edges: Edges = [[] for _ in columns.groups]
     part = np.zeros_like(residual)
-    for _ in range(_ROUNDS):
+    for _ in range(ITERATIONS):
         left = settled(residual - part)
         found = [
             (g, *columns.split(g, *stretch, left))

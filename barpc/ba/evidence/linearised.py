@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from barpc.ba.solving.normal import cholesky3, whiten
+from barpc.ba.solving.normal import TRIANGLE, cholesky3, whiten
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.geodesy import Array
@@ -16,7 +16,6 @@ from barpc.scene import BoolArray, IntArray
 
 # views of a track up to which every subset may be right; of more, all of them or all but one
 _MOST_SUBSETS = 4
-_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +225,7 @@ def _followed(ground: Array, subsets: BoolArray, held: Array) -> tuple[Array, Ar
     for k, subset in enumerate(subsets):
         part = ground * np.repeat(subset, 2).astype(np.float64)[:, None]
         matrix = np.swapaxes(part, 1, 2) @ part
-        lower = cholesky3(np.stack([matrix[:, i, j] for i, j in _TRIANGLE]) + held)
+        lower = cholesky3(np.stack([matrix[:, i, j] for i, j in TRIANGLE]) + held)
         follow[:, k] = whiten(part.transpose(1, 2, 0), lower).transpose(2, 1, 0)
         room[:, k] = -np.log(lower[[0, 3, 5]]).sum(axis=0)
     return follow.reshape(count, -1, size), room
