@@ -257,10 +257,7 @@ def _adjustment(
     view = parts.block.in_order(parts.block.view)[ties]
     before, after = (
         (block.in_order(inside.T) + outer.in_order(outside.residual.T) + apart.in_order(gone.residual.T))[ties]
-        for inside, outside, gone in (
-            (found.before, found.start, moved[0]),
-            (outcome.residual, found.after, moved[1]),
-        )
+        for inside, outside, gone in ((found.before, found.start, moved[0]), (outcome.residual, found.after, moved[1]))
     )
     gauge, shares = _place(found, block, covariance)
     status = f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {covariance.factor.method} factorisation"

@@ -45,9 +45,7 @@ class AltimetryTest:
 def hold_by_altimetry(
     found: Solution, block: Block, outer: Block, options: AdjustOptions, given: Altimetry
 ) -> tuple[Solution, AltimetryTest]:
-    """Return the block held by heights too, or as it was where they do not agree with each other or with
-    other control.
-    """
+    """Return the block held by heights too, or as it was where these contradict each other or other control."""
     ties = np.flatnonzero(found.seen[: block.num_tracks])
     points = found.final.points
     near, many = np.zeros(0, dtype=np.int64), len(given.sigma)
@@ -113,17 +111,9 @@ def _why_not(registered: Registration, known: Array, is_held: bool) -> str:
 
 
 def _placed(
-    points: Array,
-    index: IntArray,
-    local: Array,
-    enu: Array,
-    radius: float,
-    registered: Registration,
-    before: Array,
+    points: Array, index: IntArray, local: Array, enu: Array, radius: float, registered: Registration, before: Array
 ) -> PointPrior:
-    """Return the tie points held where the motion takes them, with its errors in common and ways to bend that
-    stay open.
-    """
+    """Return the tie points held where the motion takes them, with its errors in common and bends that stay open."""
     at = local[:, :2] / radius
     moves = displacement(at)
     # what the points' own errors add to the motion's variance is a twentieth of it

@@ -145,9 +145,7 @@ def agrees(found: Solution) -> bool:
 
 
 def _odd(found: Solution, block: Block) -> int | None:
-    """Return the one view that is farther off than stated by the priors, with no control point in it; None
-    without one.
-    """
+    """Return the one view that is farther off than stated by the priors, no control point in it; else None."""
     odd = np.flatnonzero(found.outcome.prior.odd)
     if len(odd) != 1 or (block.view[block.point >= block.num_tracks] == odd[0]).any():
         return None
@@ -206,9 +204,7 @@ def _by_prior(left: list[_Left], scale: float, block: Block) -> tuple[Apart | No
 def _likeliest(
     chosen: list[_Left], left: list[_Left], lost: Array, block: Block
 ) -> tuple[Apart | None, Solution | None]:
-    """Return the likeliest of the views `chosen`, by the evidence of all ties; `left` are those without which
-    the rest agrees.
-    """
+    """Return the likeliest of the views `chosen`; `left` are those without which the rest agrees."""
     evidence = {one.view: _evidence(one, block) for one in left} if len(left) > 1 else {chosen[0].view: 0.0}
     chosen = sorted(chosen, key=lambda one: -evidence[one.view])
     best = chosen[0]

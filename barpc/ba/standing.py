@@ -67,9 +67,7 @@ class Parts:
         return enough and _groups(inner) == _groups(block)
 
     def mostly_moving(self, inlier: BoolArray) -> list[Interval]:
-        """Return the rows of images, of the kept (K,) of `inner`, of which more ties move than stand: the
-        camera may be wrong there.
-        """
+        """Return the rows of images, of the kept (K,) of `inner`, of which more ties move than stand."""
         block, gone = self.block, self.group > 0
         if not gone.any():
             return []

@@ -85,9 +85,7 @@ def moving(linear: Linear, extra: Array, group: Group, found: Fit) -> Array:
 
 
 def log_likelihoods(linear: Linear, residual: Array, found: Fit) -> Array:
-    """Return the log-likelihood (K,) of the track of every observation, at residuals (2, K) in stated
-    standard deviations.
-    """
+    """Return the log-likelihood (K,) of every observation's track, at residuals (2, K) in stated deviations."""
     out = np.zeros(len(linear.view))
     for tracks in linear.tracks:
         weight = _expect(linear, tracks, residual, found.noise, found.eps)
@@ -218,9 +216,7 @@ def _expect(
 
 
 def _of_subsets(tracks: Tracks, residual: Array, noise: float, area: float) -> tuple[Array, Array, Array, Array]:
-    """Return the log-likelihoods (T, S) of residuals (2, K) if a subset is right, their squares, and what
-    they are made of.
-    """
+    """Return the log-likelihoods (T, S) if a subset is right, their squares, and what they are made of."""
     n = tracks.rows.shape[1]
     values = tracks.of(residual)
     followed = tracks.followed(values)
@@ -261,12 +257,7 @@ class Mixture:
     """
 
     def __init__(
-        self,
-        linear: Linear,
-        extra: Array | None,
-        sigma: Array | None,
-        warm: Fit | None,
-        group: Group | None = None,
+        self, linear: Linear, extra: Array | None, sigma: Array | None, warm: Fit | None, group: Group | None = None
     ) -> None:
         self.linear, self.group = linear, group
         self.extra = np.zeros((2, 0, len(linear.sigma))) if extra is None else extra / linear.sigma
@@ -297,9 +288,7 @@ class Mixture:
         self.summed: list[Array] = []
 
     def run(self, most: int = ITERATIONS, cooled: float = COOLED) -> Fit:
-        """Iterate expectation and maximisation until nothing changes, or a number of times; goes on where the
-        last run ended.
-        """
+        """Iterate until nothing changes, or a number of times; goes on where the last run ended."""
         linear, last, known, ends = self.linear, -np.inf, 0.0, False
         self.cooled = cooled
         for left in range(most, 0, -1):
@@ -448,9 +437,7 @@ class Mixture:
         return np.block([[cameras, cross], [cross.T, of_beside]])
 
     def _of_cameras(self, weight: Array) -> Array:
-        """Return the normal matrix (N q, N q) of the cameras' unknowns, of the weights (M, 2, 2) of pairs of
-        observations.
-        """
+        """Return the normal matrix (N q, N q) of the cameras' unknowns, of weights (M, 2, 2) of pairs."""
         linear, (views, q), pairs = self.linear, self.linear.shape, self.linear.pairs
         out, at = np.zeros((views, q, views, q)), pairs.bounds
         starts = at[np.searchsorted(at, np.arange(0, at[-1] + CHUNK, CHUNK), side="right").clip(1) - 1]

@@ -76,9 +76,7 @@ class _Rows:
         self.first = int(np.ceil(_FINE * _FEWEST))
 
     def largest(self, costs: float) -> tuple[float, float] | None:
-        """Return the period, and minus the logarithm of how probable such a peak is at one frequency; None
-        where it is `costs`.
-        """
+        """Return the period, and minus the logarithm of its chance at one frequency; None below `costs`."""
         gain = self._spectrum(self.off)
         band = np.floor(2.0 * np.log2(self.waves[self.first :]))
         best = None

@@ -104,9 +104,7 @@ def _thinned(unused: Unused, size: Array) -> Unused:
 
 
 def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -> Place | None:
-    """Return the place of one image of which chance leaves least, not yet times the places; None where none
-    stands out.
-    """
+    """Return the place of one image of which chance leaves least, not yet times the places; None without any."""
     col, row = _part(one, size)
     inside = _HELD[:, row * _FINEST + col]
     count = inside.sum(axis=1)
@@ -151,9 +149,7 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
 
 
 def _at_least(found: int, count: int, alike: int, whole: int) -> float:
-    """Return the probability that of so many that are alike in a whole at least the found are among a count
-    (hypergeometric).
-    """
+    """Return the hypergeometric probability of at least so many found among a count, of all that are alike."""
     k = np.arange(found, min(count, alike) + 1)
 
     def ways(n: int, m: IntArray | int) -> Array:
@@ -163,9 +159,7 @@ def _at_least(found: int, count: int, alike: int, whole: int) -> float:
 
 
 def _axes(standard: Array) -> tuple[Array, Array]:
-    """Return the axes along which residuals (2, K) scatter most and least, as columns, and their scatter; of
-    two views along one line.
-    """
+    """Return the axes along which residuals (2, K) scatter most and least, as columns, and their scatter."""
     off = standard - standard.mean(axis=1, keepdims=True)
     variance, axes = np.linalg.eigh(off @ off.T / standard.shape[1])
     return axes[:, ::-1], np.sqrt(np.maximum(variance[::-1], 0.0))

@@ -83,9 +83,7 @@ def scan(
 
 
 def _intervals(bins: Array) -> Array:
-    """Return the sums (intervals, ...) of all intervals of bins (..., `BINS`): rows of one array, which are
-    copied fast.
-    """
+    """Return the sums (intervals, ...) of all intervals of bins (..., `BINS`): rows, which are copied fast."""
     edges = np.zeros((BINS + 1, *bins.shape[:-1]))
     np.moveaxis(bins, -1, 0).cumsum(axis=0, out=edges[1:])
     return np.asarray(edges[_STOPS] - edges[_STARTS])

@@ -67,9 +67,7 @@ class Surface:
         )
 
     def at(self, place: Array) -> tuple[Array, IntArray, BoolArray]:
-        """Return the height (n,) at places (n, 2), the tie point (n,) of the patch used, and whether the
-        patch reaches there.
-        """
+        """Return the height (n,) at places (n, 2), the tie point (n,) of its patch, and whether that reaches there."""
         distance, nearest = (np.asarray(part) for part in self.tree.query(place))
         design = _powers(self._from(place, nearest))
         near = (distance <= self.reach[nearest]) & self.whole[nearest]
@@ -144,9 +142,7 @@ class Registration:
 
 
 def displacement(local: Array) -> Array:
-    """Return the derivatives (n, 3, 7) of points at `local` (n, 2) radii, east, north, up, by the seven
-    motions of a scene.
-    """
+    """Return the derivatives (n, 3, 7) of points at `local` (n, 2) radii by the seven motions of a scene."""
     e, o = local.T
     moves = np.zeros((len(e), 3, 7))
     moves[:, (0, 1, 2), (0, 1, 2)] = 1.0
@@ -172,9 +168,7 @@ def register(surface: Surface, given: Given, radius: float, before: Array) -> Re
 def _settled(
     surface: Surface, given: Given, motion: Array, radius: float, free: Array, noise: float | None = None
 ) -> tuple[Array, float]:
-    """Return the motion (7,) that reweighted steps end at, and the noise over what is stated; learnt where it
-    is not known.
-    """
+    """Return the motion (7,) that reweighted steps end at, and the noise over what is stated, learnt if None."""
     is_known, noise = noise is not None, SURELY if noise is None else noise
     for step in range(ITERATIONS):
         seen = _Seen.of(surface, given, motion, radius)

@@ -81,9 +81,7 @@ class Bands:
         return np.asarray((np.column_stack([lon, ground[:, 1]]) - self.origin) * self.unit)
 
     def at(self, ground: Array) -> tuple[Array, Array]:
-        """Return the heights (K, n) [m] of the bands at ground points (n, 3), which add up to the DEM's;
-        slopes (K, n, 2).
-        """
+        """Return the heights (K, n) [m] of the bands at ground points (n, 3), in all the DEM's; slopes (K, n, 2)."""
         heights = [np.asarray(self.terrain(ground[:, 0], ground[:, 1]), dtype=np.float64)]
         slopes = [np.nan_to_num(terrain_slopes(self.terrain, ground))]
         at = self.local(ground).T[::-1] / self.step
@@ -158,15 +156,11 @@ class Relief:
     cameras: Array  # (3,) what the cameras' accuracies let expect of that [m]; NaN where they do not say
 
     def beyond(self, bias: float) -> Array:
-        """Return level and slopes (3,) of the points above the DEM as delivered, over what cameras and a DEM
-        wrong by `bias` [m] allow.
-        """
+        """Return level and slopes (3,) above the DEM as delivered, over what cameras and a `bias` [m] allow."""
         return np.asarray(np.abs(self.delivered) / np.hypot(self.cameras, bias))
 
     def common_sigma(self, bias: float) -> Array:
-        """Return the standard deviations (`NUM_BENDS`,) [m] of errors that all heights share: `bias`, or more
-        where the points contradict it.
-        """
+        """Return the sigmas (`NUM_BENDS`,) [m] of errors in common: `bias`, or more where points contradict it."""
         sigma = np.full(NUM_BENDS, bias)
         contradicts = self.beyond(bias) > SURELY
         sigma[:3][contradicts] = _EDGE * np.abs(self.delivered)[contradicts]

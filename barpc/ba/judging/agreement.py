@@ -147,9 +147,7 @@ def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
 
 
 def _fits_as_stated(offsets: Offsets) -> bool:
-    """Return whether all points together are as near as nineteen times of twenty, and without none of them it
-    is better.
-    """
+    """Return whether all points are as near as nineteen times of twenty, and no better without one."""
     count = len(offsets.own)
     one_less = np.concatenate([np.ones((1, count), dtype=bool), ~np.eye(count, dtype=bool)])
     score, _, squares = _evidence(offsets, one_less, 1.0)
@@ -181,9 +179,7 @@ class _Search:
         return self.masks[n], float(self.score[n]), float(self.scale[n])
 
     def against(self, best: BoolArray, score: float) -> BoolArray | None:
-        """Return the set that contradicts the best and weighs as much; the rest where the best is none; None
-        where it wins.
-        """
+        """Return the set that contradicts the best and weighs as much, the rest without a majority, or None."""
         size, common = self.masks.sum(axis=1), (self.masks & best).sum(axis=1)
         other = np.flatnonzero((size > common) & (2 * common <= best.sum()))
         if len(other):
@@ -236,9 +232,7 @@ class _Search:
 
 
 def _evidence(offsets: Offsets, masks: BoolArray, scale: float) -> tuple[Array, Array, Array]:
-    """Return the logarithmic evidence (B,) of sets (B, G), squared deviation (B, G) of every point from what
-    a set says, and that of all points of a set together (B,).
-    """
+    """Return the log evidence (B,) of sets (B, G), squared deviations of points (B, G), and of all in a set (B,)."""
     own, motions, variance = offsets.own, offsets.motions, scale**2
     if len(masks) > (room := max(_ROOM // len(own), 1)):
         parts = [_evidence(offsets, masks[n : n + room], scale) for n in range(0, len(masks), room)]

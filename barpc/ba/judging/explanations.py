@@ -302,9 +302,7 @@ def proposed(
 
 
 def _at_one_end(seen: Seen, intervals: list[Interval]) -> bool:
-    """Return whether all that stands out is where images begin, or all where they end: what wanders is seen
-    all over.
-    """
+    """Return whether all that stands out is where images begin, or all where they end, as no wandering is."""
     at_end = [
         (one.start <= 0.0, one.stop >= seen.size[1, one.view]) if one.axis == 1 else (False, False) for one in intervals
     ]

@@ -125,9 +125,7 @@ def swinging(outcome: Outcome, block: Block) -> list[Swing]:
 
 
 def _told(outcome: Outcome, block: Block) -> Array:
-    """Return 1 for observations (K,) of points that are known: what was cut is seen as well as the rest where
-    others tell.
-    """
+    """Return 1 for observations (K,) of points that others tell: what was cut is seen as well as the rest."""
     right = np.bincount(block.point[outcome.inlier], minlength=block.num_points)
     return (right[block.point] >= 2).astype(np.float64)
 
@@ -260,16 +258,12 @@ class _State:
         return sum(row.gain for row in self.taken)
 
     def may_pass(self, best: _State) -> bool:
-        """Return whether some more, each of which gains less than the last, may explain more than another
-        that ended.
-        """
+        """Return whether some more, each gaining less than the last, may explain more than another that ended."""
         left = RIVALS + len(best.taken) - 1 - len(self.taken)
         return self.gain + left * self.taken[-1].gain > best.gain
 
     def adds_to(self, best: _State, beside: list[_Tried]) -> bool:
-        """Return whether what was taken last gains as much beside the best, of what was taken before: it is
-        no other way.
-        """
+        """Return whether what was taken last gains as much beside the best: it is no other way then."""
         last, one = self.taken[-1], self.taken[-1].one
         same = [row.what for row in self.taken[:-1]] == [row.what for row in best.taken[:-1]]
         gains = [row[2] for row in beside if row[0].kind == one.kind and not _differs(row[0], one)]
@@ -340,9 +334,7 @@ class _Search:
         return kept, all(one.ended or (kept[0].ended and not one.may_pass(kept[0])) for one in kept)
 
     def _tried(self) -> list[_Tried]:
-        """Return the explanations of what stands out now, fitted beside those taken, with their gains; the
-        best first.
-        """
+        """Return the explanations of what stands out beside those taken, with their gains; the best first."""
         seen = self.seen
         out, periods = self._standing_out(seen.base, seen.extra)
         # in a pair more wrong matches at an end explain what was cut there as well, and nothing stands out beside them
@@ -368,9 +360,7 @@ class _Search:
         return _distinct(out)[:RIVALS], swings(view, place[1], seen.size, told, off)[:RIVALS]
 
     def _leaves_nothing(self, made: list[_Tried]) -> bool:
-        """Return whether nothing stands out beside the best of few unknowns: no rival of a cell's each is
-        needed then.
-        """
+        """Return whether nothing stands out beside the best of few unknowns: no rival is needed then."""
         best = [row for row in made[:1] if row[2] > SURE and row[0].kind in FOLLOWED]
         beside = (
             self._standing_out(found, np.concatenate([self.seen.extra, one.extra], axis=1)) for one, found, _ in best
@@ -389,9 +379,7 @@ class _Search:
         return self._sharp(self._with(found, [one for row in sure for one in self._members(row[1], rows)]))
 
     def _sharp(self, made: list[_Tried]) -> list[_Tried]:
-        """Return the explanations with ends, periods and lengths searched for, where these may gain most; the
-        best first.
-        """
+        """Return the explanations, best first, with ends, periods and lengths searched where these may gain most."""
         local = [one for kind in LOCAL for one in [row[0] for row in made if row[0].kind == kind][:RIVALS]]
         # where something is sure already, what is not waits for the next round
         blunt = max(SURE, made[0][2] / RIVALS) if made and made[0][2] > SURE else -np.inf
@@ -423,9 +411,7 @@ class _Search:
         return bool(size < self.floor * _SEEN)
 
     def _members(self, found: Fit, rows: BoolArray) -> Iterator[Explanation]:
-        """Yield the parts of images that hold what a group does: rows of one image that lie off move on the
-        ground, too.
-        """
+        """Yield the parts of images that hold what a group does: rows that lie off move on the ground, too."""
         seen, none = self.seen, np.zeros((2, int(rows.sum())))
         places = scan(seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none, none[0])
         best = {one.view: one for one in reversed(places) if one.by_share and one.gain > SURE}
@@ -488,9 +474,7 @@ def _said(rows: list[_Taken], n: int, seen: Seen) -> Iterator[Finding]:
 
 
 def _rivals(tried: list[_Tried]) -> list[int]:
-    """Return the best of other kinds or views than the first that are followed, and may be its betters with
-    some beside.
-    """
+    """Return the best of other kinds or views that are followed, and may win with some beside."""
     found: dict[tuple[str, int], int] = {}
     for n, (one, _, gain) in enumerate(tried):
         if one.kind in FOLLOWED and _differs(one, tried[0][0]) and gain > tried[0][2] / RIVALS:

@@ -67,9 +67,7 @@ class Ground:
         return np.asarray(row * number + col)
 
     def by_moves(self, view: IntArray, views: int) -> Array:
-        """Return the image displacements (2, 2 N - 2, K) [px] of observations by a pixel's move east and
-        north in every view but the first.
-        """
+        """Return the displacements (2, 2 N - 2, K) [px] by a pixel's move east and north in all views but the first."""
         out = np.zeros((2, 2 * (views - 1), len(view)))
         for v in range(1, views):
             rows = np.flatnonzero(view == v)

@@ -73,9 +73,7 @@ class ControlTest:
 
     @property
     def sets(self) -> tuple[BoolArray, ...]:
-        """Two sets of points (G,) that contradict each other with equal weight, so that none is used; empty
-        where one is.
-        """
+        """Two sets of points (G,) that contradict each other with equal weight; empty where one is used."""
         return () if self.agreed is None else self.agreed.sets
 
     @property

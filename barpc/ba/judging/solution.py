@@ -163,9 +163,7 @@ def _untorn(found: Solution, free: Solution, block: Block, outer: Block, options
 
 
 def _with_control(block: Block, heights: Heights, outcome: Outcome) -> tuple[Agreement, Heights]:
-    """Return the control points that agree with each other at an outcome that none of them holds, and what
-    holds them.
-    """
+    """Return the control points that agree at an outcome that none of them holds, and what holds points."""
     count, first = len(block.gcps.names), block.num_tracks
     mine = (block.point >= first) & (block.point < block.num_known)
     lost = np.isin(np.arange(count), block.point[mine & block.use & ~outcome.inlier] - first)  # by hundreds of sigmas

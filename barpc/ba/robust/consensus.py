@@ -53,9 +53,7 @@ def two_groups(structure: Structure, residual: Array, by_point: Array, use: Bool
 
 
 def _mixture(z: Array) -> tuple[float, float, float]:
-    """Fit two normal distributions of one width to values of mean 0: share of the smaller, distance of the
-    centres (0 if they are not apart), gain in log-likelihood over one.
-    """
+    """Return the smaller share, distance (0: not apart) and gain [nats] of two normals of one width over one."""
     centers, sigma, part = np.quantile(z, [0.1, 0.9]), 0.5 * z.std(), 0.5
     likelihood = np.ones_like(z)
     for _ in range(ITERATIONS):
@@ -105,9 +103,7 @@ def agreeing(
 
 
 def _across(residual: Array, by_point: Array, first: IntArray, second: IntArray) -> Array:
-    """Return the offset across the epipolar line (Q,) [px]: what no move of the point takes away from two
-    observations.
-    """
+    """Return the offset across the epipolar line (Q,) [px]: what no move of the point takes away."""
     offset = np.empty(len(first))
     for part in parts(len(first), CHUNK):
         one, two = by_point.take(first[part], axis=2), by_point.take(second[part], axis=2)

@@ -184,9 +184,7 @@ class CheckResiduals:
     ground: Array
 
     def rms(self) -> tuple[Array, Array]:
-        """Return the root mean squares: col, row (2,) [px]; east, north, up (3,) [m], NaN without a
-        triangulated point.
-        """
+        """Return the RMS col, row (2,) [px]; east, north, up (3,) [m], NaN without a triangulated point."""
         known = np.isfinite(self.ground).all(axis=1)
         ground = np.full(3, np.nan)
         if known.any():

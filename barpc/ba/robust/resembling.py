@@ -29,9 +29,7 @@ class Resemblance:
 
     @classmethod
     def of(cls, block: Block, terms: int) -> Resemblance | None:
-        """Return the noise correlation of a block's observations, with `terms` of smooth errors; None without
-        a reference.
-        """
+        """Return the noise correlation of observations, beside `terms` of smooth errors; None without reference."""
         given = block.reference
         if given is None:
             return None

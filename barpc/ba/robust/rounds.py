@@ -95,10 +95,7 @@ class Rounds:
         # what the same unknowns ended with is gone on with: cut, accuracies, misfit
         self.goes_on = known is not None and known.problem.cameras.unknowns is unknowns
         if known is not None and self.goes_on:
-            self.problem, use = (
-                replace(self.problem, camera_prior=known.problem.camera_prior),
-                use & known.inlier,
-            )
+            self.problem, use = (replace(self.problem, camera_prior=known.problem.camera_prior), use & known.inlier)
         self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
         self.use = self.observations.tied(use & self.everything)
         self.counted = (self.use if known is None else self.use & known.inlier).astype(np.float64)
@@ -122,14 +119,7 @@ class Rounds:
         """Run the robust rounds, under priors wide enough for what is not expected."""
         start = replace(self.problem, camera_prior=self.variances.for_search())
         self.state, self.residual, self.counted, self.noise, self.projected = _robust(
-            start,
-            self.observations,
-            self.state,
-            self.residual,
-            self.projected,
-            self.use,
-            self.options,
-            self.smooth,
+            start, self.observations, self.state, self.residual, self.projected, self.use, self.options, self.smooth
         )
         self.misfit = self.smooth.test(self.residual, self.use).rms
 

@@ -94,12 +94,7 @@ class Variances:
 
     @classmethod
     def of(
-        cls,
-        given: CameraPrior,
-        unknowns: Unknowns,
-        options: AdjustOptions,
-        control: bool,
-        views: Sequence[View] = (),
+        cls, given: CameraPrior, unknowns: Unknowns, options: AdjustOptions, control: bool, views: Sequence[View] = ()
     ) -> Variances:
         """Return the priors to be learnt by the options, with control points or without."""
         geometric = unknowns.geometric and options.learn_priors
@@ -243,9 +238,7 @@ class Variances:
     def _squares(
         self, params: Array, known: Array, scale: Array | float = 1.0, part: slice | None = None
     ) -> tuple[Array, Array]:
-        """Return the squared unknowns of every view (the constants, or a part) over their variances, and
-        their freedom (N,).
-        """
+        """Return the squared unknowns (constants, or a part) of every view over their variances, their freedom (N,)."""
         part = slice(self.constants) if part is None else part
         sigma = self.given.sigma[:, part] * np.reshape(scale, (-1, 1))
         squared = ((params - self.given.mean)[:, part] / sigma) ** 2

@@ -47,9 +47,7 @@ def cauchy(s: Array) -> tuple[Array, Array]:
 
 
 def geman_mcclure(s: Array) -> tuple[Array, Array]:
-    """Return rho(s) = s / (1 + s) and its derivative: an outlier's pull vanishes; for scales that shrink
-    round by round.
-    """
+    """Return rho(s) = s / (1 + s) and its derivative: an outlier's pull vanishes."""
     return s / (1.0 + s), 1.0 / (1.0 + s) ** 2
 
 
