@@ -19,7 +19,7 @@ from barpc.ba.held.incremental import BlockPrior
 from barpc.ba.held.terrain import Terrain
 from barpc.ba.judging.following import follow, without_strips
 from barpc.ba.judging.judge import Finding, left_over, standing_out
-from barpc.ba.judging.snooping import MOST_TESTED, image_test
+from barpc.ba.judging.snooping import image_test
 from barpc.ba.judging.solution import Solution, solve_block
 from barpc.ba.placing import place
 from barpc.ba.result import Adjustment
@@ -28,7 +28,7 @@ from barpc.ba.robust.heldout import enu_offsets, keep_out, measure
 from barpc.ba.robust.rounds import Outcome
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.standing import Parts, without_moving
-from barpc.ba.usual import CRITICAL
+from barpc.ba.usual import CRITICAL, SAMPLE
 from barpc.errors import AdjustError
 from barpc.geodesy import Array, ground_from_ecef
 from barpc.options import AUTO, AdjustOptions
@@ -257,10 +257,7 @@ def _adjustment(
     view = parts.block.in_order(parts.block.view)[ties]
     before, after = (
         (block.in_order(inside.T) + outer.in_order(outside.residual.T) + apart.in_order(gone.residual.T))[ties]
-        for inside, outside, gone in (
-            (found.before, found.start, moved[0]),
-            (outcome.residual, found.after, moved[1]),
-        )
+        for inside, outside, gone in ((found.before, found.start, moved[0]), (outcome.residual, found.after, moved[1]))
     )
     gauge, shares = _place(found, block, covariance)
     status = f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {covariance.factor.method} factorisation"
@@ -340,7 +337,7 @@ def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
     is_held = outcome.inlier & (False if held is None else np.isin(block.point, held.index))
     of_gcps = np.flatnonzero(is_held & (block.point >= block.num_tracks) & (block.point < block.num_known))
     others = np.flatnonzero(is_held & (block.point >= block.num_known))
-    rows = np.union1d(of_gcps, others[:: -(-len(others) // MOST_TESTED)] if len(others) else others)
+    rows = np.union1d(of_gcps, others[:: -(-len(others) // SAMPLE)] if len(others) else others)
     if len(rows):
         at_end = (found.final, outcome.residual, outcome.weight)
         w[rows] = image_test(covariance, outcome.problem, *at_end, rows)

@@ -13,25 +13,19 @@ import numpy as np
 
 from barpc.ba.estimated.priors import PointPrior
 from barpc.ba.held.block import Block
-from barpc.ba.held.gauge import SIMILAR, gauge_report
+from barpc.ba.held.gauge import MOTIONS, SIMILAR, gauge_report
 from barpc.ba.held.ground import FIRST_PLACED
 from barpc.ba.held.registration import NEIGHBOURS, Given, Registration, Surface, displacement, register
-from barpc.ba.judging.snooping import CRITICAL
 from barpc.ba.judging.solution import Solution, finished
 from barpc.ba.robust.heldout import is_better
 from barpc.ba.robust.rounds import Rounds
 from barpc.ba.solving.covariance import Covariance
+from barpc.ba.usual import CRITICAL, FEWEST, GROSS, LEVEL
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.options import AdjustOptions
 from barpc.scene import Altimetry, IntArray
 
-FEWEST = 2 * SIMILAR
-"""Heights on the surface that are needed: of fewer, most may agree by chance."""
-_MOST = 5000  # heights used: of more, every n-th; their neighbours tell the same
-_HELD = 10_000  # tie points at which the motion is held, at most: the noise of each counts among so many
-_OWN = 0.3  # of the motion's standard deviation: what the points' own add to it is 4 % of it
-_OPEN = 10.0  # times what is known without: what the heights do not tell
-_BENT = 3  # ways in which the scene bends that stay open
+_MOST = 5000  # heights used, and tie points held: of more, every n-th; their neighbours tell the same
 
 
 @dataclass(frozen=True)
@@ -51,9 +45,7 @@ class AltimetryTest:
 def hold_by_altimetry(
     found: Solution, block: Block, outer: Block, options: AdjustOptions, given: Altimetry
 ) -> tuple[Solution, AltimetryTest]:
-    """Return the block held by heights too, or as it was where they do not agree with each other or with
-    other control.
-    """
+    """Return the block held by heights too, or as it was where these contradict each other or other control."""
     ties = np.flatnonzero(found.seen[: block.num_tracks])
     points = found.final.points
     near, many = np.zeros(0, dtype=np.int64), len(given.sigma)
@@ -65,7 +57,7 @@ def hold_by_altimetry(
         radius = max(float(np.sqrt((local[:, :2] ** 2).sum(axis=1).mean())), 1e-6)
         covariance = found.outcome.minimum.covariance(found.problem.free)
         known = _known(covariance, found, ties)
-        margin = 4.0 * np.sqrt(np.diag(known)[:2])
+        margin = CRITICAL * np.sqrt(np.diag(known)[:2])
         low, high = local[:, :2].min(axis=0) - margin, local[:, :2].max(axis=0) + margin
         near = np.flatnonzero(((place[:, :2] >= low) & (place[:, :2] <= high)).all(axis=1))
         near = near[:: -(-len(near) // _MOST) or 1]
@@ -79,7 +71,7 @@ def hold_by_altimetry(
     if why_not:
         return found, replace(test, why_not=why_not)
     least = 2 if found.heights.is_whole else 1  # a terrain keeps every second one
-    chosen = np.arange(0, len(ties), max(-(-len(ties) // _HELD), least))
+    chosen = np.arange(0, len(ties), max(-(-len(ties) // _MOST), least))
     placed = _placed(points, ties[chosen], local[chosen], enu, radius, registered, np.sqrt(np.diag(known)))
     tried = _solved(found, block, outer, options, placed)
     if is_better(found.after, tried.after, outer):
@@ -119,23 +111,16 @@ def _why_not(registered: Registration, known: Array, is_held: bool) -> str:
 
 
 def _placed(
-    points: Array,
-    index: IntArray,
-    local: Array,
-    enu: Array,
-    radius: float,
-    registered: Registration,
-    before: Array,
+    points: Array, index: IntArray, local: Array, enu: Array, radius: float, registered: Registration, before: Array
 ) -> PointPrior:
-    """Return the tie points held where the motion takes them, with its errors in common and ways to bend that
-    stay open.
-    """
+    """Return the tie points held where the motion takes them, with its errors in common and bends that stay open."""
     at = local[:, :2] / radius
     moves = displacement(at)
-    own = _OWN * float(np.sqrt(np.diag(registered.covariance)[:3].min() * len(index)))
-    bent = np.zeros((len(index), 3, _BENT))
+    # what the points' own errors add to the motion's variance is a twentieth of it
+    own = float(np.sqrt(LEVEL * np.diag(registered.covariance)[:3].min() * len(index)))
+    bent = np.zeros((len(index), 3, len(MOTIONS) - SIMILAR))
     bent[:, 2] = np.stack([at[:, 0] ** 2, at[:, 0] * at[:, 1], at[:, 1] ** 2], axis=1)
-    wide = _OPEN * float(before[3:5].max())
+    wide = GROSS * float(before[3:5].max())
     shared = np.concatenate([moves @ np.linalg.cholesky(registered.covariance), wide * bent], axis=2) / own
     common = np.concatenate([np.zeros((len(index), 3, FIRST_PLACED)), shared], axis=2)
     mean = points[index] + (moves @ registered.motion) @ enu

@@ -19,10 +19,10 @@ import numpy as np
 
 from barpc.ba.evidence.mixture import fit
 from barpc.ba.held.block import Block
-from barpc.ba.judging.judge import LARGEST, around
+from barpc.ba.judging.judge import around
 from barpc.ba.judging.solution import Solution
 from barpc.ba.placing import Look, Placed, look, place
-from barpc.ba.usual import CRITICAL, MUCH_NOISE, SMALL, SURE
+from barpc.ba.usual import CRITICAL, LARGEST, MUCH_NOISE, SMALL, SURE, TRIED
 from barpc.errors import AdjustError
 from barpc.geodesy import Array
 from barpc.options import GEOMETRIC, AdjustOptions
@@ -31,11 +31,7 @@ from barpc.scene import connected_groups
 _LOG = logging.getLogger(__name__)
 
 APART = "apart"
-_MOST = 0.5  # of a view's tie points
 _TELLING = 3  # views: without one a pair is left, which agrees about much; so each of three is left out
-_TRIED = 6  # views of a block, those that lost most
-_TRIED_OF_MANY = 2  # where solving it takes long, of those that are gone
-_UNKNOWNS_A_VIEW = 9  # with a drift
 
 Solver = Callable[[Block, Block], Solution]
 
@@ -95,7 +91,7 @@ class _Left:
 
         If the others lie anywhere, it is the matches that are wrong, and they are cut.
         """
-        return self.coherent and 1.0 - self.contradicted < _MOST * (1.0 - self.usual)
+        return self.coherent and 1.0 - self.contradicted < 0.5 * (1.0 - self.usual)
 
     def gain(self, lost: float) -> float:
         """Return the log-likelihood gain [nats] of the view's own lost share over that of the others; the
@@ -116,19 +112,20 @@ def find_apart(
     tells of one view. Measured on the observations of `outer`.
     """
     num, odd = len(block.views), None
+    unknowns = num if first is None else first.problem.free.size  # at least
     asked_for_less = options.first_model != GEOMETRIC or options.drift == 0 or options.loss == "linear"
-    if num < 3 or num * _UNKNOWNS_A_VIEW > LARGEST or asked_for_less:
+    if num < 3 or unknowns > LARGEST or asked_for_less:
         return None, None
     lost = np.ones(num) if first is None else _lost(first, block)
-    gone = 1.0 - lost <= _MOST * (1.0 - np.median(lost))
+    gone = 1.0 - lost <= 0.5 * (1.0 - np.median(lost))
     asked = np.argsort(-lost, kind="stable")
     if first is not None:
-        asked = asked[:_TRIED]
+        asked = asked[:TRIED]
         if agrees(first):
             odd = _odd(first, block) if num > _TELLING else None
             asked = asked[gone[asked]] if odd is None else np.array([odd])
-        if num * _UNKNOWNS_A_VIEW > SMALL:
-            asked = asked[gone[asked]][:_TRIED_OF_MANY]
+        if unknowns > SMALL:
+            asked = asked[gone[asked]]
     views = [v for v in asked.tolist() if block.names[v] not in options.fixed]
     left: list[_Left] = []
     for one in _agreeing(views, block, outer, options, solve):
@@ -148,9 +145,7 @@ def agrees(found: Solution) -> bool:
 
 
 def _odd(found: Solution, block: Block) -> int | None:
-    """Return the one view that is farther off than stated by the priors, with no control point in it; None
-    without one.
-    """
+    """Return the one view that is farther off than stated by the priors, no control point in it; else None."""
     odd = np.flatnonzero(found.outcome.prior.odd)
     if len(odd) != 1 or (block.view[block.point >= block.num_tracks] == odd[0]).any():
         return None
@@ -179,7 +174,7 @@ def _agreeing(
         except (AdjustError, np.linalg.LinAlgError) as error:
             _LOG.info("without %s: %s", block.names[v], error)
             continue
-        measured = np.isfinite(found.after.error) or np.delete(_lost(found, others), v).max() < _MOST
+        measured = np.isfinite(found.after.error) or np.delete(_lost(found, others), v).max() < 0.5
         placed = place(found, others, block, v) if measured and agrees(found) else None
         if placed is not None:
             yield _Left(v, others, found, placed, placed.contradicted(CRITICAL), placed.is_coherent(CRITICAL))
@@ -208,9 +203,7 @@ def _by_prior(left: list[_Left], scale: float, block: Block) -> tuple[Apart | No
 def _likeliest(
     chosen: list[_Left], left: list[_Left], lost: Array, block: Block
 ) -> tuple[Apart | None, Solution | None]:
-    """Return the likeliest of the views `chosen`, by the evidence of all ties; `left` are those without which
-    the rest agrees.
-    """
+    """Return the likeliest of the views `chosen`; `left` are those without which the rest agrees."""
     evidence = {one.view: _evidence(one, block) for one in left} if len(left) > 1 else {chosen[0].view: 0.0}
     chosen = sorted(chosen, key=lambda one: -evidence[one.view])
     best = chosen[0]

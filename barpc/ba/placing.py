@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import chdtri
 
 from barpc.ba.estimated.projected import Projected
 from barpc.ba.held.block import Block
@@ -13,14 +14,11 @@ from barpc.ba.judging.solution import Solution
 from barpc.ba.robust.smooth import SPLINES
 from barpc.ba.robust.weights import geman_mcclure
 from barpc.ba.solving.normal import cholesky3, point_products, whiten
-from barpc.ba.usual import FEW, GROSS, MUCH_NOISE, SHRINK, SURELY
+from barpc.ba.usual import FEW, GROSS, MUCH_NOISE, SHRINK, SURELY, TIMES
 from barpc.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray
 from barpc.sensor.splined import bsplines
 
-_STEPS = 25
-_SPLINE = 15.0  # px: a row may be anywhere near, as what wanders may (`barpc.ba.judging.explanations`)
-_MEDIAN = float(2.0 * np.log(2.0))  # of chi-square with two degrees of freedom
 _SURFACES = 110.0  # m: no geoid lies farther from the ellipsoid, so no mistaken height surface either
 
 
@@ -111,7 +109,7 @@ def place(found: Solution, others: Block, block: Block, view: int) -> Placed | N
 
 def median_noise(squared: Array) -> float:
     """Return the observed over expected standard deviation, by the median of squares (n,) of two coordinates each."""
-    return float(np.sqrt(np.median(squared) / _MEDIAN))
+    return float(np.sqrt(np.median(squared) / chdtri(2.0, 0.5)))
 
 
 class _Sight:
@@ -144,11 +142,12 @@ class _Sight:
         params = self.problem.camera_prior.mean.copy()
         beside = np.zeros((0, self.xy.shape[1])) if splines is None else splines
         size, m = params.shape[1], len(beside)
-        sigma = np.append(GROSS * self.problem.camera_prior.sigma[self.view], np.full(2 * m, _SPLINE))
+        # a row may be anywhere near, in px
+        sigma = np.append(GROSS * self.problem.camera_prior.sigma[self.view], np.full(2 * m, TIMES))
         moved, residual, scale = np.zeros(size + 2 * m), np.zeros((0, 2)), np.inf
         matrix = np.diag(sigma**-2.0)
         root = np.linalg.inv(np.linalg.cholesky(self.covariance))
-        for _ in range(_STEPS):
+        for _ in range(FEW):
             params[self.view] = moved[:size]
             projected = self.project(params)
             along = np.zeros((2, size + 2 * m, self.xy.shape[1]))

@@ -19,6 +19,7 @@ from barpc.ba.robust.consensus import TwoGroups
 from barpc.ba.robust.smooth import SmoothTest
 from barpc.ba.robust.variances import PriorTest
 from barpc.ba.solving.covariance import Covariance
+from barpc.ba.usual import MANY
 from barpc.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray
@@ -26,8 +27,6 @@ from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
 from barpc.sensor.splined import RowSpline, Splined
 from barpc.sensor.timing import Timed, Timing
-
-_SAMPLE = 200  # of a pair's tie points
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,7 +250,7 @@ def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights
     seen = seen[np.isfinite(adjustment.points[seen, 0])]
     if not len(seen):
         return PairHeights((first, second), np.nan, np.nan, 0)
-    points = adjustment.points[seen[:: len(seen) // _SAMPLE + 1]]
+    points = adjustment.points[seen[:: len(seen) // MANY + 1]]
     n, pair = len(points), (min(first, second), max(first, second))
     cameras, params = adjustment.cameras, adjustment.params
     by_camera = height_by_unknowns(cameras, params, pair, points).reshape(n, -1)

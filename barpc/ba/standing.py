@@ -14,12 +14,11 @@ from barpc.ba.judging.judge import Finding, Judgement, judge
 from barpc.ba.judging.moving import Found, Motion, members
 from barpc.ba.judging.solution import Solution
 from barpc.ba.robust.heldout import is_better, measure
-from barpc.ba.usual import LEVEL, MUCH_NOISE, SURE
+from barpc.ba.usual import LEVEL, MUCH_NOISE, RIVALS, SURE
 from barpc.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray, connected_groups
 
-_GROUPS = 2  # that move, at most
 _NAMES = ("west", "east"), ("south", "north")
 
 
@@ -68,9 +67,7 @@ class Parts:
         return enough and _groups(inner) == _groups(block)
 
     def mostly_moving(self, inlier: BoolArray) -> list[Interval]:
-        """Return the rows of images, of the kept (K,) of `inner`, of which more ties move than stand: the
-        camera may be wrong there.
-        """
+        """Return the rows of images, of the kept (K,) of `inner`, of which more ties move than stand."""
         block, gone = self.block, self.group > 0
         if not gone.any():
             return []
@@ -138,7 +135,7 @@ def without_moving(
         if options.is_plain or any(row.gain > one.gain for row in findings):
             break
         less = parts.less(found, one.moved)
-        if len(groups) == _GROUPS or not less.is_tied():
+        if len(groups) == RIVALS or not less.is_tied():
             break
         tried = solve(less)
         if is_better(measure(found.problem, found.final.params, less.outer), tried.after, less.outer):

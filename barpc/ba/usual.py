@@ -1,5 +1,7 @@
 """Numbers that mean the same wherever the adjustment decides or computes, each in one place."""
 
+from barpc.options import AdjustOptions
+
 # --- what is sure -----------------------------------------------------------------------------------------
 
 LEVEL = 0.05
@@ -24,8 +26,17 @@ once in a thousand."""
 MUCH_NOISE = 1.5
 """Times what is stated: more noise than that is no noise."""
 
+LEAST_NOISE = 0.25
+"""Times what is stated: less noise than that is a few that fit by chance."""
+
+TIMES = 30.0
+"""What is learnt lies within so many times of what is guessed, either way."""
+
 GROSS = 100.0
 """Standard deviations of what holds nothing: of another place, or open."""
+
+FLOOR = AdjustOptions().noise_floor
+"""Pixels: what all ties of a view share the error of; no camera is known better, and less is let be."""
 
 # --- what is enough ---------------------------------------------------------------------------------------
 
@@ -35,14 +46,41 @@ FEW = 30
 FEWEST = 20
 """Observations, or degrees of freedom, that tell a variance to a third, sqrt(2 / n): of fewer nothing is said."""
 
+MANY = 100
+"""Observations that can be told apart into two kinds, or of which some can be spared."""
+
 SAMPLE = 2000
 """Observations or points that stand for all."""
+
+BEST = 0.2
+"""Part of the observations, the nearest: even where many are wrong right ones are among them."""
+
+TRIALS = 150
+"""Draws of three: where half are right, all of them miss three right ones once in 5e8."""
+
+STATED = 4.0
+"""Observations, or degrees of freedom, that a figure stated counts for beside what is seen."""
+
+RIVALS = 3
+"""Ways to explain the same, the best and those after it, that are gone on with."""
+
+TRIED = 6
+"""What is tried, or taken, one by one where each is a solve of its own, at most."""
+
+STEPS = 3
+"""Of what is nearly linear: kilometres away, what is left is below a micrometre."""
 
 BACKFITTING = 6
 """Turns of parts that are fitted in turn: what is left of a guess is below a thousandth of it."""
 
 ITERATIONS = 100
 """Of what ends by itself when it stands, at most."""
+
+STANDS = 0.05
+"""Change of a size, as part of it, below which it stands."""
+
+SLIGHT = 1e-3
+"""Part of the observations that decides nothing."""
 
 SHRINK = 0.25
 """Of a loss's scale that is left in one step, at least: it follows what is right out of what is wrong."""
@@ -54,6 +92,9 @@ KEPT = 1_000_000
 
 RIDGE = 1e-6
 """Of the weight of what is known: what nothing tells stays where it is."""
+
+LARGEST = 12_000
+"""Unknowns of a block up to which parts of it are solved again for what may explain them."""
 
 SMALL = 400
 """Unknowns up to which a block is solved again for every explanation that is tried."""

@@ -169,7 +169,7 @@ def test_the_evidence_of_a_set_is_the_density_of_what_it_shows(scale) -> None:
         assert squared[g] == pytest.approx(far**2, rel=1e-4)
         # alike at all sizes from one sigma to 10,000: 1 / (4 pi r^3) over ln 10,000 and the ball within
         density = -np.log(4 * np.pi * (1 / 3 + np.log(1e4))) - 3 * np.log(max(far, 1.0))
-        expected += density - 0.5 * np.linalg.slogdet(spread)[1] - sets._WRONG
+        expected += density - 0.5 * np.linalg.slogdet(spread)[1] - sets._ODDS
     assert score == pytest.approx(expected, abs=0.05)
 
 
@@ -201,7 +201,7 @@ def test_what_a_block_says_of_points_has_the_covariance_that_it_states_of_them()
     whole = stated + gcps.sigma[:, :, None] ** 2 * np.eye(3)
     for g in range(4):  # in the units of the offsets the variance of a point is that of its motions, and one
         moved = offsets.motions[g, :, :-3]
-        shift = offsets.motions[g, :, -3:] / 1e3  # whitening, turned
+        shift = offsets.motions[g, :, -3:] / 1e4  # whitening, turned
         whitened = shift @ enu[g].T @ whole[g] @ enu[g] @ shift.T
         np.testing.assert_allclose(whitened, moved @ moved.T + np.eye(3), rtol=0.05, atol=0.05)
 

@@ -119,15 +119,15 @@ def test_what_fades_is_tried_on_both_sides_of_both_ends_over_halved_lengths(monk
     assert len(explanations.fade(s, interval(0.0, 2000.0))) == 2
 
 
-def test_what_settles_is_tried_from_either_end_over_a_half_to_a_hundredth_of_an_image(monkeypatch) -> None:
+def test_what_settles_is_tried_from_either_end_over_all_to_a_hundredth_of_an_image(monkeypatch) -> None:
     s, rates = seen(), list[float]()
     made = explanations._settling
     monkeypatch.setattr(explanations, "_settling", lambda *given: rates.append(given[1]) or made(*given))
-    costs = [5.0] * 24
+    costs = [5.0] * 32
     costs[6], costs[7] = 1.0, 9.0  # of the fourth, with and without it
     monkeypatch.setattr(explanations, "first_guess", lambda *_: (None, None, costs.pop(0)))
     (one,) = explanations.settling(s, interval(0.0, 1.0))
-    lengths = 1500.0 * 2.0 ** np.arange(-7.0, -1.0)
+    lengths = 1500.0 * 2.0 ** np.arange(-7.0, 1.0)
     np.testing.assert_allclose(rates, np.concatenate([1.0 / lengths, -1.0 / lengths]))
     assert one.where == (1, -np.inf, np.inf, 0.0, pytest.approx(1.0 / lengths[3]))
 
@@ -189,7 +189,7 @@ def test_rows_that_wander_have_splines_as_many_as_ties_hold() -> None:
         assert not one.extra[0, half:].any()
         assert not one.extra[1, :half].any()
         np.testing.assert_array_equal(one.extra[0, :half], one.extra[1, half:])
-        np.testing.assert_array_equal(one.sigma, 0.5)
+        np.testing.assert_array_equal(one.sigma, 1.0)
         assert one.price == pytest.approx(np.log(5.0) + SCALE)
         assert (one.kind, one.view, one.where) == (WANDER, 1, None)
 

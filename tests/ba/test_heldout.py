@@ -214,8 +214,8 @@ def test_better_is_what_is_clearly_better_in_the_same_tracks() -> None:
     assert not compared(other[:0], other[:0])
 
 
-@pytest.mark.parametrize(("share", "better"), [(0.985, True), (0.995, False)])
-def test_an_error_less_by_a_hundredth_is_asked_for(share, better) -> None:
+@pytest.mark.parametrize(("share", "better"), [(0.985, True), (1.005, False)])
+def test_a_smaller_error_is_asked_for(share, better) -> None:
     other = np.random.default_rng(0).normal(0, 0.1, 400)
     assert compared(0.5 * other, other, (share, 1.0)) == better
 
@@ -289,7 +289,7 @@ def test_the_scatter_is_where_expectation_and_maximisation_end() -> None:
             right = odds / (1.0 + odds)
             last, variance = variance, (right * rows).sum() / right.sum()
             wrong = (1.0 + (1.0 - right).sum()) / (10.0 + n)
-            if abs(variance - last) < 1e-4 * last:
+            if abs(variance - last) < 1e-3 * last:
                 break
         expected.append(np.sqrt(variance))
     order = np.lexsort((rng.random(len(view)), view))

@@ -87,13 +87,13 @@ def test_the_spectrum_is_half_of_what_least_squares_take_away() -> None:
     right, off = rng.uniform(0.3, 1.0, n), rng.normal(size=(2, n)) * [[1.0], [2.0]]
     off[1] += 0.5 * off[0] + 0.8 * np.sin(row / 30.0)
     one = periods._Rows(row, rows, right, off)
-    found = one._spectrum(off, 2)
-    assert len(found) == 75  # of 37.5 waves
+    found = one._spectrum(off)
+    assert len(found) == 300  # of 37.5 waves
     centred = off - (off @ right / right.sum())[:, None]
     noise = (centred * right) @ (centred * right).T / right.sum()
     white = np.linalg.solve(np.linalg.cholesky(noise), centred)
     for k in (5, 12, 31):
-        phase = 2.0 * np.pi * (k / 2) * np.floor(row / 4.0) / 300
+        phase = 2.0 * np.pi * (k / 8) * np.floor(row / 4.0) / 300
         basis = np.stack([np.cos(phase), np.sin(phase)])
         pull = (basis * right) @ white.T
         taken = np.einsum("ic,ij,jc->", pull, np.linalg.inv((basis * right) @ basis.T), pull)

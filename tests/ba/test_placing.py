@@ -99,11 +99,11 @@ def test_a_view_s_unknowns_are_those_of_robust_steps(count: int) -> None:
     beside = np.zeros((2, 2 * count, 80))
     beside[0, :count] = beside[1, count:] = splines
     every = np.concatenate([along, beside], axis=1)
-    precision = np.r_[np.full(3, (100 * 0.7) ** -2.0), np.full(2 * count, 15.0**-2)]
+    precision = np.r_[np.full(3, (100 * 0.7) ** -2.0), np.full(2 * count, 30.0**-2)]
     root = np.linalg.inv(np.linalg.cholesky(one.covariance))
     rows = np.einsum("ncd,dqn->ncq", root, every)
     x, scale = np.zeros(3 + 2 * count), np.inf
-    for _ in range(25):
+    for _ in range(30):
         left = rows @ x - np.einsum("ncd,dn->nc", root, off)
         squared = (left**2).sum(axis=1)
         last = left

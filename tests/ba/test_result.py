@@ -89,7 +89,7 @@ def test_heights_of_a_pair_move_as_its_cameras_do(made, found, pair) -> None:
 
 def test_heights_are_measured_at_some_of_many_points_and_at_none_of_none(made, found, monkeypatch) -> None:
     whole = pair_heights(found, 0, 1)
-    monkeypatch.setattr("barpc.ba.result._SAMPLE", 20)
+    monkeypatch.setattr("barpc.ba.result.MANY", 20)
     some = pair_heights(found, 0, 1)
     assert 10 <= some.count <= 20
     assert some.absolute == pytest.approx(whole.absolute, rel=0.05)

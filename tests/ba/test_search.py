@@ -332,7 +332,7 @@ def four() -> Explanation:
 
 
 def test_ends_are_looked_for_where_they_may_gain_most(monkeypatch) -> None:
-    """Of two a kind, and only of what is not far behind what is sure already."""
+    """Of three a kind, and only of what is not far behind what is sure already."""
     sharp: list[Explanation] = []
 
     def sharpened(self: _Search, one: Explanation, found: Fit) -> tuple[Explanation, Fit]:
@@ -342,7 +342,7 @@ def test_ends_are_looked_for_where_they_may_gain_most(monkeypatch) -> None:
     monkeypatch.setattr(_Search, "_sharpened", sharpened)
 
     def of(*gains: float) -> list[int]:
-        kinds = (STRIP, STRIP, STRIP, FADE, SETTLING, SWING, WANDER, MOVING)
+        kinds = (STRIP, STRIP, STRIP, STRIP, FADE, SETTLING, SWING, WANDER, MOVING)
         rows = [(explained(kind), fitted(gain), gain) for kind, gain in zip(kinds, gains, strict=False)]
         sharp.clear()
         made = search()._sharp(rows)
@@ -350,10 +350,10 @@ def test_ends_are_looked_for_where_they_may_gain_most(monkeypatch) -> None:
         assert sum(row[2] for row in made) == pytest.approx(sum(gains) + len(sharp))
         return [next(n for n, row in enumerate(rows) if row[0] is one) for one in sharp]
 
-    assert of(30.0, 29.0, 28.0, 27.0, 26.0, 25.0, 24.0, 23.0) == [0, 1, 3, 4, 5, 6]
-    assert of(30.0, 10.0, 9.0, 10.1) == [0, 3]
-    assert of(12.0, 5.0, 4.0, 5.1) == [0, 3]
-    assert of(5.0, 4.0, 3.0, -2.0) == [0, 1, 3]  # where nothing is sure all may be
+    assert of(30.0, 29.0, 28.5, 28.0, 27.0, 26.0, 25.0, 24.0, 23.0) == [0, 1, 2, 4, 5, 6, 7]
+    assert of(30.0, 10.0, 9.0, 8.0, 10.1) == [0, 4]
+    assert of(12.0, 5.0, 4.0, 3.0, 5.1) == [0, 4]
+    assert of(5.0, 4.0, 3.0, 2.0, -2.0) == [0, 1, 2, 4]  # where nothing is sure all may be
     assert search()._sharp([]) == []
 
 

@@ -68,8 +68,8 @@ def test_priors_are_widened_view_by_view_and_drifts_degree_by_degree() -> None:
     np.testing.assert_allclose(told.sigma[:, 6:9], 2.0)
     search = v.for_search()
     np.testing.assert_allclose(search.sigma[:, :6], 2.0)
-    np.testing.assert_allclose(search.sigma[:, 6:9], np.hypot(10.0, 0.02))
-    np.testing.assert_allclose(search.sigma[:, 9:], 10.0)
+    np.testing.assert_allclose(search.sigma[:, 6:9], np.hypot(30.0, 0.02))
+    np.testing.assert_allclose(search.sigma[:, 9:], 30.0)
 
 
 def test_squares_and_freedom_are_those_of_the_unknowns_that_are_determined() -> None:
@@ -99,12 +99,12 @@ def test_drifts_are_as_large_as_they_show_with_the_given_ones_counting_for_four(
 @pytest.mark.parametrize("cautious", [False, True])
 @pytest.mark.parametrize(("share", "unexpected"), [(0.95, False), (1.05, True)])
 def test_drifts_of_another_platform_are_let_be_as_large_as_they_may_be(cautious, share, unexpected) -> None:
-    """As large as leaves a tenth of chance to something smaller; those of a thousandth's chance only."""
+    """As large as leaves a twentieth of chance to something smaller; those of a thousandth's chance only."""
     v = variances(2, "rotation", 1, cautious)
     total = share * chi2.isf(1e-3, 6)
     params, known = v.given.mean.copy(), np.ones((2, 6))
     params[0, 4] += np.sqrt(total)
-    likely, possible = (4 + total) / (4 + 6), total / chi2.ppf(0.1, 6)
+    likely, possible = (4 + total) / (4 + 6), total / chi2.ppf(0.05, 6)
     assert possible > likely
     expected = possible if cautious and unexpected else likely
     np.testing.assert_allclose(v._drift(params, known), np.sqrt([expected]))
@@ -115,7 +115,7 @@ def test_without_control_priors_are_rather_too_wide_than_too_narrow() -> None:
     v = variances(2, cautious=True)
     for totals in ([18.0, 6.0], [1.5, 1.0], [0.5, 0.4]):
         scale, odd = v._widened(FEW, params_of(v, totals), np.ones((2, 3)), np.ones(0))
-        expected = max((4 + sum(totals)) / (4 + 6), sum(totals) / chi2.ppf(0.1, 6), 1.0)
+        expected = max((4 + sum(totals)) / (4 + 6), sum(totals) / chi2.ppf(0.05, 6), 1.0)
         np.testing.assert_allclose(scale, np.sqrt(expected))
         assert not odd.any()
 
@@ -366,7 +366,7 @@ def waved(n: int = 3) -> Variances:
 
 
 def test_splines_and_steps_are_as_large_as_each_view_shows_and_all_do() -> None:
-    """Band by band; that of all views counts as two observations beside a view's own, 0.01 px as one beside all."""
+    """Band by band; that of all views counts as four observations beside a view's own, 0.01 px as one beside all."""
     v, rng = waved(), np.random.default_rng(0)
     first, bands = v.unknowns.in_waves.start, v.unknowns.waves.bands
     sigma, shape = v.given.sigma.copy(), v.given.sigma.shape
@@ -381,7 +381,7 @@ def test_splines_and_steps_are_as_large_as_each_view_shows_and_all_do() -> None:
         freedom = [sum(known[view, k] for k in rows) for view in (0, 1)]
         common = (0.01**2 + sum(squares)) / (1 + sum(freedom))
         for view in (0, 1):
-            expected = np.sqrt((2 * common + squares[view]) / (2 + freedom[view]))
+            expected = np.sqrt((4 * common + squares[view]) / (4 + freedom[view]))
             np.testing.assert_allclose(found[view, rows], expected)
 
 

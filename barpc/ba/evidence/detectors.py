@@ -14,14 +14,13 @@ import numpy as np
 
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import BACKFITTING, FEW
+from barpc.ba.usual import BACKFITTING, FEW, ITERATIONS
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
 _LARGE = 40.0  # twice the logarithm of a likelihood ratio: the largest of 10,000 places by chance once in 100,000 views
 _A_VIEW = 4.0  # and so much more for every other view of a focal plane
 _AS_LARGE = 0.5  # of the largest change: not what another view's step leaves here, a quarter of it with three views
-_ROUNDS = 12
 
 Edges = list[list[float]]  # of every group of views, ascending
 
@@ -50,9 +49,7 @@ class _Columns:
         return out
 
     def split(self, g: int, low: float, high: float, residual: Array) -> tuple[float, float]:
-        """Return the largest change between two columns of a group: how much it explains beyond chance, and
-        where it is.
-        """
+        """Return the largest change between two columns of a group: what it explains beyond chance, and where."""
         places = self.places[g][np.searchsorted(self.places[g], low) : np.searchsorted(self.places[g], high)]
         if not len(places):
             return 0.0, low
@@ -73,9 +70,7 @@ class _Columns:
 
 
 def find_edges(problem: Problem, state: State, residual: Array, use: BoolArray, sigma: Array) -> Array:
-    """Find the columns (N, C) [px] at which residuals (2, K) [px] with standard deviations `sigma` (K,) step
-    from one detector to the next; infinite where a view has fewer.
-    """
+    """Find the columns (N, C) [px] at which residuals (2, K) [px] step; infinite where a view has fewer."""
     weight, widths = use / sigma, problem.cameras.unknowns.half[0]
     settled = problem.settling(problem.project_points(state.params, state.points), weight)
     residual, views = settled(_without_steps(problem, state, residual)), list(range(len(widths)))
@@ -101,12 +96,10 @@ def _without_steps(problem: Problem, state: State, residual: Array) -> Array:
 
 
 def _grown(columns: _Columns, residual: Array, settled: Callable[[Array], Array], weight: Array) -> tuple[Edges, float]:
-    """Return the edges one after the other, the largest first; then each where it is best between its
-    neighbours. And what is left of the squared residuals, with as much for every edge as it has to explain.
-    """
+    """Return the edges of every group, the largest first and then placed, and the cost of what is left."""
     edges: Edges = [[] for _ in columns.groups]
     part = np.zeros_like(residual)
-    for _ in range(_ROUNDS):
+    for _ in range(ITERATIONS):
         left = settled(residual - part)
         found = [
             (g, *columns.split(g, *stretch, left))
@@ -130,9 +123,7 @@ def _grown(columns: _Columns, residual: Array, settled: Callable[[Array], Array]
 
 
 def _placed(columns: _Columns, g: int, edges: list[float], residual: Array) -> list[float]:
-    """Return the edges of a group, each where it is best between its neighbours; without those that explain
-    too little.
-    """
+    """Return the edges of a group, each where it is best between its neighbours, that explain enough."""
     found: list[float] = []
     for at in range(len(edges)):
         low = found[-1] if found else -np.inf

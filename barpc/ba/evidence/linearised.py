@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from barpc.ba.solving.normal import cholesky3, whiten
+from barpc.ba.solving.normal import TRIANGLE, cholesky3, whiten
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.geodesy import Array
@@ -16,7 +16,6 @@ from barpc.scene import BoolArray, IntArray
 
 # views of a track up to which every subset may be right; of more, all of them or all but one
 _MOST_SUBSETS = 4
-_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,17 +51,13 @@ class Tracks:
         return found.reshape(len(values), len(self.subsets), 3)
 
     def weighed(self, values: Array, followed: Array, weight: Array) -> Array:
-        """Return the values (T, 2n) without the part that ground points absorb, summed over subsets with
-        their weights (T, S).
-        """
+        """Return the values (T, 2n) less what ground points absorb, summed over subsets by their weights (T, S)."""
         parts = (weight[..., None] * followed).reshape(len(values), 1, -1) @ self.follow
         seen: Array = np.repeat(weight @ self.subsets.astype(np.float64), 2, axis=1)
         return np.asarray(seen * values - parts[:, 0])
 
     def weight(self, weight: Array) -> Array:
-        """Return the projectors (T, 2n, 2n) that take away what ground points absorb, summed over subsets
-        with their weights (T, S).
-        """
+        """Return the projectors (T, 2n, 2n) off what ground points absorb, summed by weights (T, S) of subsets."""
         of_rows = np.repeat(weight, 3, axis=1)[..., None] * self.follow
         out: Array = -(np.swapaxes(self.follow, 1, 2) @ of_rows)
         diagonal = np.einsum("tii->ti", out)
@@ -226,7 +221,7 @@ def _followed(ground: Array, subsets: BoolArray, held: Array) -> tuple[Array, Ar
     for k, subset in enumerate(subsets):
         part = ground * np.repeat(subset, 2).astype(np.float64)[:, None]
         matrix = np.swapaxes(part, 1, 2) @ part
-        lower = cholesky3(np.stack([matrix[:, i, j] for i, j in _TRIANGLE]) + held)
+        lower = cholesky3(np.stack([matrix[:, i, j] for i, j in TRIANGLE]) + held)
         follow[:, k] = whiten(part.transpose(1, 2, 0), lower).transpose(2, 1, 0)
         room[:, k] = -np.log(lower[[0, 3, 5]]).sum(axis=0)
     return follow.reshape(count, -1, size), room

@@ -22,20 +22,14 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dtrtri
 
 from barpc.ba.evidence.linearised import Linear, Tracks
-from barpc.ba.usual import BACKFITTING, RIDGE
+from barpc.ba.usual import BACKFITTING, GROSS, ITERATIONS, LEAST_NOISE, RIDGE, SLIGHT, STANDS
 from barpc.geodesy import CHUNK, Array
 from barpc.scene import BoolArray, IntArray
 
-_HOTTEST = 200.0  # times the noise stated, where it is cooled from: 20 px of 0.1
-_COOLED = 0.6  # from one iteration to the next, at most
-_LEAST_NOISE = 0.2  # of what is stated
-_ITERATIONS = 60
-_STANDS = 2e-3, 0.3  # change of the noise (logarithm) and of the log-likelihood at the end
-WRONG = 1.0, 10.0  # of so many observations of a view so many are wrong, before any is seen
-_EPS = 1e-3, 0.98
-_CHANGED = 0.1  # of what an unknown rests on: its curvature is summed anew
-_TWO = 1.5  # observations: half of the next
 NEAR_LIMIT = 4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise is large wrong ones lie no nearer
+COOLED = 0.6  # the noise, from one iteration to the next, at most
+SETTLED = 0.3  # change of the log-likelihood at the end
+WRONG = 1.0, 10.0  # of so many observations of a view so many are wrong, before any is seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +85,7 @@ def moving(linear: Linear, extra: Array, group: Group, found: Fit) -> Array:
 
 
 def log_likelihoods(linear: Linear, residual: Array, found: Fit) -> Array:
-    """Return the log-likelihood (K,) of the track of every observation, at residuals (2, K) in stated
-    standard deviations.
-    """
+    """Return the log-likelihood (K,) of every observation's track, at residuals (2, K) in stated deviations."""
     out = np.zeros(len(linear.view))
     for tracks in linear.tracks:
         weight = _expect(linear, tracks, residual, found.noise, found.eps)
@@ -119,7 +111,7 @@ def off_from_right(linear: Linear, residual: Array, right: Array) -> tuple[Array
         spread = 1.0 + (1.0 - 2.0 * np.repeat(weight, 2, axis=1)) * (np.swapaxes(ground, 1, 2) * by_row).sum(axis=1)
         off = (left / np.sqrt(np.maximum(spread, 0.1))).reshape(count, n, 2)
         out[:, tracks.rows] = off.transpose(2, 0, 1)
-        known[tracks.rows] = weight.sum(axis=1, keepdims=True) - weight > _TWO
+        known[tracks.rows] = weight.sum(axis=1, keepdims=True) - weight > 1.5  # so many or more, rounded
     return out, known
 
 
@@ -224,9 +216,7 @@ def _expect(
 
 
 def _of_subsets(tracks: Tracks, residual: Array, noise: float, area: float) -> tuple[Array, Array, Array, Array]:
-    """Return the log-likelihoods (T, S) of residuals (2, K) if a subset is right, their squares, and what
-    they are made of.
-    """
+    """Return the log-likelihoods (T, S) if a subset is right, their squares, and what they are made of."""
     n = tracks.rows.shape[1]
     values = tracks.of(residual)
     followed = tracks.followed(values)
@@ -267,12 +257,7 @@ class Mixture:
     """
 
     def __init__(
-        self,
-        linear: Linear,
-        extra: Array | None,
-        sigma: Array | None,
-        warm: Fit | None,
-        group: Group | None = None,
+        self, linear: Linear, extra: Array | None, sigma: Array | None, warm: Fit | None, group: Group | None = None
     ) -> None:
         self.linear, self.group = linear, group
         self.extra = np.zeros((2, 0, len(linear.sigma))) if extra is None else extra / linear.sigma
@@ -281,7 +266,7 @@ class Mixture:
         self.precision = np.concatenate([linear.precision, further])
         self.offset = np.concatenate([linear.offset, np.zeros(len(further))])
         self.x = np.zeros(len(self.precision))
-        self.noise, self.eps = _HOTTEST, np.full(linear.views, WRONG[0] / WRONG[1])
+        self.noise, self.eps = GROSS, np.full(linear.views, WRONG[0] / WRONG[1])
         if warm is not None:
             known = warm.step.size + len(warm.extra)
             self.x[:known] = *warm.step.ravel(), *warm.extra
@@ -292,7 +277,7 @@ class Mixture:
                 self.noise = max(self.noise, far)
         self.beside = [self.extra]  # of what stands still, and of what moves
         if group is not None:
-            self.noise, self.eps = _HOTTEST, np.full(linear.views, WRONG[0] / WRONG[1])
+            self.noise, self.eps = GROSS, np.full(linear.views, WRONG[0] / WRONG[1])
             self.beside.append(np.concatenate([self.extra, group.by_move / linear.sigma], axis=1))
             self.moved = _Moved(linear.residual, group.share, self.noise)
         self.squared = [(beside**2).sum(axis=0) for beside in self.beside]
@@ -302,10 +287,8 @@ class Mixture:
         self.curvature: list[Array] = []
         self.summed: list[Array] = []
 
-    def run(self, most: int = _ITERATIONS, cooled: float = _COOLED) -> Fit:
-        """Iterate expectation and maximisation until nothing changes, or a number of times; goes on where the
-        last run ended.
-        """
+    def run(self, most: int = ITERATIONS, cooled: float = COOLED) -> Fit:
+        """Iterate until nothing changes, or a number of times; goes on where the last run ended."""
         linear, last, known, ends = self.linear, -np.inf, 0.0, False
         self.cooled = cooled
         for left in range(most, 0, -1):
@@ -320,7 +303,7 @@ class Mixture:
                 inverse = np.tril(dtrtri(factor[0], lower=1)[0])
                 known = len(matrix) - float((inverse**2).sum(axis=0) @ self.precision)
             self.x = self.x - cho_solve(factor, self._gradient(seen), check_finite=False)
-            settled = self._noise(seen, known) and abs(seen.log - last) < _STANDS[1]
+            settled = self._noise(seen, known) and abs(seen.log - last) < SETTLED
             last = seen.log
             if settled and is_new:
                 break
@@ -337,14 +320,14 @@ class Mixture:
     def _noise(self, seen: _Seen, known: float) -> bool:
         """Return the noise, and what is wrong, as they are seen; whether the noise stands."""
         still = seen.kinds[0]
-        found = max(float(np.sqrt(still.squares / max(still.freedom - known, 1.0))), _LEAST_NOISE)
+        found = max(float(np.sqrt(still.squares / max(still.freedom - known, 1.0))), LEAST_NOISE)
         cold = self.noise <= found
         noise = found if cold else max(found, self.cooled * self.noise)
         wrong = np.bincount(self.linear.view[self.part], 1.0 - seen.right[self.part], minlength=self.linear.views)
-        self.eps = np.clip((wrong + WRONG[0]) / (self.count + WRONG[1]), *_EPS)
+        self.eps = np.clip((wrong + WRONG[0]) / (self.count + WRONG[1]), SLIGHT, 1.0 - SLIGHT)
         if self.group is not None:
             self._group(seen, noise, noise <= found)
-        stands = abs(np.log(noise / self.noise)) < _STANDS[0]
+        stands = abs(np.log(noise / self.noise)) < SLIGHT
         self.noise = noise
         return bool(stands)
 
@@ -402,7 +385,7 @@ class Mixture:
             of_views = np.bincount(self.linear.view, kind.right, minlength=self.linear.views)
             sums += [of_views + 1.0, squared @ kind.right + further[: len(squared)] * noise**2]
         new = np.log(np.concatenate(sums))
-        if len(self.summed) and bool((np.abs(new - self.summed) < _CHANGED).all()):
+        if len(self.summed) and bool((np.abs(new - self.summed) < STANDS).all()):
             return False
         self.summed = new
         return True
@@ -454,9 +437,7 @@ class Mixture:
         return np.block([[cameras, cross], [cross.T, of_beside]])
 
     def _of_cameras(self, weight: Array) -> Array:
-        """Return the normal matrix (N q, N q) of the cameras' unknowns, of the weights (M, 2, 2) of pairs of
-        observations.
-        """
+        """Return the normal matrix (N q, N q) of the cameras' unknowns, of weights (M, 2, 2) of pairs."""
         linear, (views, q), pairs = self.linear, self.linear.shape, self.linear.pairs
         out, at = np.zeros((views, q, views, q)), pairs.bounds
         starts = at[np.searchsorted(at, np.arange(0, at[-1] + CHUNK, CHUNK), side="right").clip(1) - 1]

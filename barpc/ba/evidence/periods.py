@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtri
 
 from barpc.ba.evidence.scan import CLIPPED
 from barpc.ba.usual import FEW, SURE
@@ -19,14 +20,9 @@ from barpc.scene import IntArray
 from barpc.sensor.splined import sine_and_cosine
 
 _SHORTEST = 32.0  # rows: of what is shorter a matcher's window shows the mean
-_BIN = _SHORTEST / 8.0  # rows summed: 2 % of the shortest are lost
-_FEWEST = 1.5  # waves of an image: fewer are no swing yet
-_COARSE, _FINE = 2, 8  # frequencies a wave more, to see whether there is a peak and where it is
-_SEEN = 0.8  # of a peak, where it lies amid two coarse ones: sinc^2(1/4)
-_INDEPENDENT = 4  # as many of these count as tests: Baluev 2008's bound, near the levels asked for
-_LOBE = 1.5  # waves: what is nearer to a peak is its own
-_BESIDE = 5.0  # waves at least, and as many as the peak has
-_MIDDLE = 1.6783  # median of half a chi-square of 4 degrees of freedom
+_FEWEST = 1.5  # waves of an image: fewer are no swing yet, and what is nearer to a peak is its own
+_FINE = 8  # frequencies a wave more
+_BIN = _SHORTEST / _FINE  # rows summed: 2 % of the shortest are lost
 
 
 @dataclass(frozen=True)
@@ -40,7 +36,8 @@ class Swing:
 
 def price(rows: float, views: int) -> float:
     """Return the cost of choosing a period, in images of so many rows, and a view [nats]."""
-    return float(np.log(max(_INDEPENDENT * rows / _SHORTEST, 1.0) * views))
+    # as many as half the frequencies count as tests (Baluev 2008, near the levels asked for)
+    return float(np.log(max(0.5 * _FINE * rows / _SHORTEST, 1.0) * views))
 
 
 def swings(view: IntArray, row: Array, size: Array, right: Array, off: Array, least: float = SURE) -> list[Swing]:
@@ -79,12 +76,7 @@ class _Rows:
         self.first = int(np.ceil(_FINE * _FEWEST))
 
     def largest(self, costs: float) -> tuple[float, float] | None:
-        """Return the period, and minus the logarithm of how probable such a peak is at one frequency; None
-        where it is `costs`.
-        """
-        coarse = self._spectrum(self.off, _COARSE)[int(_COARSE * _FEWEST) :]
-        if not len(coarse) or _worth(coarse.max() / _SEEN) <= costs:
-            return None
+        """Return the period, and minus the logarithm of its chance at one frequency; None below `costs`."""
         gain = self._spectrum(self.off)
         band = np.floor(2.0 * np.log2(self.waves[self.first :]))
         best = None
@@ -97,15 +89,15 @@ class _Rows:
                     best = float(period), worth
         return best
 
-    def _spectrum(self, off: Array, fine: int = _FINE) -> Array:
+    def _spectrum(self, off: Array) -> Array:
         """Return the half the chi-square that a cosine and a sine of both coordinates take away, by frequency."""
-        right, last = self.right, int(fine * self.last)
+        right, last = self.right, int(_FINE * self.last)
         centred = (off - (off @ right / right.sum())[:, None]) * right
         spread = centred @ centred.T / right.sum()  # what noise leaves of it once points have followed
         spread[np.diag_indices(2)] += 1e-9 * np.trace(spread) + 1e-30
         at = (self.row / _BIN).astype(np.int64).clip(0, self.bins - 1)
         sums = np.array([np.bincount(at, weight, self.bins) for weight in (*centred, right)])
-        col, along, count = np.fft.rfft(sums, fine * self.bins, axis=1)
+        col, along, count = np.fft.rfft(sums, _FINE * self.bins, axis=1)
         half, twice = 0.5 * right.sum(), 0.5 * count[: 2 * last : 2]
         cos, sin, both = half + twice.real, half - twice.real, twice.imag
         determinant = np.maximum(cos * sin - both**2, 1e-12 * half**2)
@@ -122,9 +114,10 @@ class _Rows:
         weighted = basis * self.right
         gain = self._spectrum(self.off - (np.linalg.solve(weighted @ basis.T, weighted @ self.off.T)).T @ basis)
         away = np.abs(self.waves - self.waves[k])
-        beside = (away > _LOBE) & (away < max(_BESIDE, self.waves[k]))
+        beside = (away > _FEWEST) & (away < SURE + self.waves[k])
         beside[: self.first] = False
-        return max(float(np.median(gain[beside])) / _MIDDLE, 1.0) if beside.any() else 1.0
+        of_noise = 0.5 * chdtri(4.0, 0.5)  # the median of half a chi-square
+        return max(float(np.median(gain[beside]) / of_noise), 1.0) if beside.any() else 1.0
 
 
 def _worth(gain: float) -> float:

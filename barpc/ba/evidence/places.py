@@ -15,17 +15,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtrc, gammaln
 
+from barpc.ba.evidence.scan import LINE
 from barpc.ba.usual import CHANCE, FEWEST
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 _FINEST = 32  # parts of rows or columns, and a side of the parts of which one observation is taken
 _CELLS = 8  # a side of the finest cells
-_PARTS, _TELLING = (
-    4,
-    12.0,
-)  # a side of the parts that may scatter by themselves, and observations that tell of one
-_LINE = 0.5  # of the larger spread: a smaller one is that of epipolar lines, which turn over an image
 
 
 @dataclass(frozen=True)
@@ -108,9 +104,7 @@ def _thinned(unused: Unused, size: Array) -> Unused:
 
 
 def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -> Place | None:
-    """Return the place of one image of which chance leaves least, not yet times the places; None where none
-    stands out.
-    """
+    """Return the place of one image of which chance leaves least, not yet times the places; None without any."""
     col, row = _part(one, size)
     inside = _HELD[:, row * _FINEST + col]
     count = inside.sum(axis=1)
@@ -138,7 +132,7 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
     along = along - along[:, near].mean(axis=1, keepdims=True)
     rest = of_near @ along.T / np.maximum(here, 1.0)[:, None]
     told = (here > 1) & (here < near.sum()) & (common > least)
-    known = spread > _LINE * spread.max()
+    known = spread > LINE * spread.max()
     variance = _variances(along * near, of_near, rest, _cells(near, col, row))
     squared = (rest[told][:, known] ** 2 / variance[told][:, known]).sum(axis=1)
     free, others = int(known.sum()), max(float(near.sum() - known.sum() - 1), 1.0)
@@ -155,9 +149,7 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
 
 
 def _at_least(found: int, count: int, alike: int, whole: int) -> float:
-    """Return the probability that of so many that are alike in a whole at least the found are among a count
-    (hypergeometric).
-    """
+    """Return the hypergeometric probability of at least so many found among a count, of all that are alike."""
     k = np.arange(found, min(count, alike) + 1)
 
     def ways(n: int, m: IntArray | int) -> Array:
@@ -167,9 +159,7 @@ def _at_least(found: int, count: int, alike: int, whole: int) -> float:
 
 
 def _axes(standard: Array) -> tuple[Array, Array]:
-    """Return the axes along which residuals (2, K) scatter most and least, as columns, and their scatter; of
-    two views along one line.
-    """
+    """Return the axes along which residuals (2, K) scatter most and least, as columns, and their scatter."""
     off = standard - standard.mean(axis=1, keepdims=True)
     variance, axes = np.linalg.eigh(off @ off.T / standard.shape[1])
     return axes[:, ::-1], np.sqrt(np.maximum(variance[::-1], 0.0))
@@ -177,7 +167,7 @@ def _axes(standard: Array) -> tuple[Array, Array]:
 
 def _cells(near: BoolArray, col: IntArray, row: IntArray) -> Array:
     """Return the part of the image in which each near observation lies (K, C), 1 or 0."""
-    parts = int(np.clip(np.sqrt(near.sum() / _TELLING), 1, _PARTS))
+    parts = max(int(np.sqrt(near.sum() / FEWEST)), 1)
     cell = row * parts // _FINEST * parts + col * parts // _FINEST
     return np.asarray((cell[:, None] == np.arange(parts**2)) * near[:, None].astype(np.float64))
 

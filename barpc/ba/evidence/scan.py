@@ -11,15 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import entr, xlogy
 
+from barpc.ba.estimated.waves import DRIFTS
 from barpc.ba.usual import SURE
 from barpc.geodesy import Array
 from barpc.scene import IntArray
 
 BINS = 40  # stretches of an image's rows or columns
 _STARTS, _STOPS = np.triu_indices(BINS + 1, 1)  # all intervals of these
-_WHOLE = BINS - 1  # which of them is all of an image, and no interval
-_LINE = 0.05  # of the larger extent of residuals: a smaller one is none
-_FOLLOWED = 3  # a constant, a slope and a bend: what a camera follows along an axis
+LINE = 0.05  # of the larger extent of residuals: a smaller one is that of epipolar lines, which turn over an image
 CLIPPED = 8.0
 """Standard deviations: one residual tells no more."""
 
@@ -70,7 +69,7 @@ def scan(
         shares = _shares(*_intervals(whole).swapaxes(0, 1), *whole.sum(axis=2))
         gains, displaced = _displacements(view, bin_, off, told, views, floor)
         for by_share, gain in zip((True, False), (shares, gains), strict=True):
-            gain[_WHOLE] = 0.0
+            gain[BINS - 1] = 0.0  # all of an image is no interval
             for v, at in enumerate(gain.argmax(axis=0).tolist()):
                 worth, common = float(gain[at, v]) - costs, float(displaced[at, v])
                 i, j = int(_STARTS[at]), int(_STOPS[at])
@@ -84,9 +83,7 @@ def scan(
 
 
 def _intervals(bins: Array) -> Array:
-    """Return the sums (intervals, ...) of all intervals of bins (..., `BINS`): rows of one array, which are
-    copied fast.
-    """
+    """Return the sums (intervals, ...) of all intervals of bins (..., `BINS`): rows, which are copied fast."""
     edges = np.zeros((BINS + 1, *bins.shape[:-1]))
     np.moveaxis(bins, -1, 0).cumsum(axis=0, out=edges[1:])
     return np.asarray(edges[_STOPS] - edges[_STARTS])
@@ -104,9 +101,9 @@ def _displacements(
     at = view * BINS + bin_
     sums = [np.bincount(at, told * row, views * BINS) for row in (np.ones(len(view)), *off)]
     count, *shifts = np.array(sums, dtype=np.float64).reshape(3, views, BINS)
-    smooth = np.vander(np.linspace(-1.0, 1.0, BINS), _FOLLOWED, increasing=True)
+    smooth = np.vander(np.linspace(-1.0, 1.0, BINS), DRIFTS, increasing=True)
     weighted = count[:, :, None] * smooth
-    normal = np.swapaxes(weighted, 1, 2) @ smooth + 1e-9 * np.eye(_FOLLOWED) * (count.sum(axis=1) + 1.0)[:, None, None]
+    normal = np.swapaxes(weighted, 1, 2) @ smooth + 1e-9 * np.eye(DRIFTS) * (count.sum(axis=1) + 1.0)[:, None, None]
     shift = np.stack(shifts, axis=2)  # (N, bins, 2)
     followed = smooth @ np.linalg.solve(normal, smooth.T @ shift)
     left = (off.T - followed[view, bin_]).T * np.sqrt(told)
@@ -140,7 +137,7 @@ def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) 
             continue
         axes, size = np.linalg.svd(residual[:, rows], full_matrices=False)[:2]
         # of two views all lie along one line: what is left across it is no direction, or what large ones bend alike
-        along = axes.T[size > _LINE * size[0]] @ residual[:, rows]
+        along = axes.T[size > LINE * size[0]] @ residual[:, rows]
         along[1:] -= np.median(along[1:], axis=1, keepdims=True)
         for axis in (0, 1):
             signs = along[:, np.argsort(place[axis, rows], kind="stable")] > 0.0

@@ -67,9 +67,7 @@ class Block:
         )
 
     def in_order(self, rows: npt.NDArray[Scalar]) -> npt.NDArray[Scalar]:
-        """Return rows (K, ...) in the order in which observations were given; zeros for those that the block
-        is without.
-        """
+        """Return rows (K, ...) in the order in which observations were given; zeros where the block has none."""
         out = np.zeros((self.num_rows, *rows.shape[1:]), rows.dtype)
         out[self.order] = rows
         return out
@@ -163,9 +161,7 @@ def _check_names(names: Sequence[str], options: AdjustOptions) -> None:
 def _left_out(
     names: Sequence[str], view: IntArray, point: IntArray, num_tracks: int, keep_largest: bool
 ) -> tuple[str, ...]:
-    """Return the views outside the largest connected group, rows sorted by point; GCPs tie their views to
-    each other.
-    """
+    """Return the views outside the largest group, rows sorted by point; GCPs tie their views to each other."""
     point = np.where(point >= num_tracks, num_tracks, point)
     same = point[1:] == point[:-1]
     keys = np.unique((view[:-1] * len(names) + view[1:])[same])

@@ -18,18 +18,7 @@ from barpc.ba.usual import SAMPLE
 from barpc.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray
 
-MOTIONS = (
-    "east",
-    "north",
-    "up",
-    "tilt east",
-    "tilt north",
-    "turn",
-    "scale",
-    "twist",
-    "bend east",
-    "bend north",
-)
+MOTIONS = ("east", "north", "up", "tilt east", "tilt north", "turn", "scale", "twist", "bend east", "bend north")
 """The scene's motions [m]: shift; then rise to the east and north, turn and scale, at the scene's edge; what heights do
 that go with the product of east and north and with the square of each, beside a plane, from the lowest to the highest
 place of the scene. A rotation that changes with the row does the last: rows follow each other along the flight."""
@@ -109,9 +98,7 @@ def _report(covariance: Covariance, shift: Array, by_unknown: Array, own: Array,
 def _motion_by_unknowns(
     covariance: Covariance, local: Array, enu: Array, use: BoolArray, share: float
 ) -> tuple[Array, Array]:
-    """Return the scene's motions by the camera unknowns (10, N q), their covariance (10, 10) where the
-    cameras are known.
-    """
+    """Return the motions by the cameras' unknowns (10, N q), their covariance (10, 10) with cameras known."""
     reduced = covariance.reduced
     structure = reduced.structure
     count, q = len(MOTIONS), covariance.num_unknowns
@@ -150,9 +137,7 @@ def _motion_of_points(local: Array) -> Array:
 
 
 def _bends(east: Array, north: Array) -> Array:
-    """Return the heights (3, n) of a twist and of bending to the east and north without the plane in them,
-    each a metre in all.
-    """
+    """Return the heights (3, n) of a twist and two bends without the plane in them, each a metre in all."""
     plane = np.stack([np.ones_like(east), east, north])
     curved = np.stack([east * north, east**2, north**2])
     if not len(east):

@@ -102,9 +102,7 @@ def _believed_heights(ground: Array, index: IntArray, believed: Believed, common
 
 
 def flat_heights(points: Array, index: IntArray, alt: float, sigma: float, common_sigma: float) -> PointPrior:
-    """Return priors that hold points `index` to one altitude [m]: each within `sigma` [m], all together
-    within `common_sigma` [m].
-    """
+    """Return priors that hold points to one altitude [m]: each within `sigma`, all within `common_sigma` [m]."""
     ground = ground_from_ecef(points[index])
     n = len(index)
     return _heights(ground, index, np.full(n, alt), np.tile([0.0, 0.0, 1.0], (n, 1)), sigma, common_sigma)
@@ -271,9 +269,7 @@ class Heights:
         return getattr(self.dem, "known", None)
 
     def test(self, points: Array, seen: BoolArray) -> TerrainTest | None:
-        """Compare the terrain with the tracks that are `seen` (P,), at their adjusted places; None without a
-        terrain.
-        """
+        """Compare the terrain with the tracks `seen` (P,), at their adjusted places; None without a terrain."""
         if self.dem is None:
             return None
         index = self.tracks[seen[self.tracks]]

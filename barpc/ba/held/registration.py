@@ -14,23 +14,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
-from barpc.ba.usual import ITERATIONS, RIDGE, SURELY
+from barpc.ba.usual import CHANCE, CRITICAL, FEWEST, GROSS, ITERATIONS, RIDGE, SAMPLE, STATED, SURELY
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 NEIGHBOURS = 15  # tie points of a patch: its six unknowns are checked by nine
-_TERMS = 6
-_FREEDOM = NEIGHBOURS - _TERMS
-_SHARED_FREEDOM = 4.0  # degrees of freedom that the whole surface's scatter counts for in that of a patch
-_BROKEN = float(chdtri(_FREEDOM, 1e-3))  # of its squares over the usual variance: by chance, one in a thousand
-_LEAST_SCATTER = 0.01  # m: no ground is flatter
+_FLAT = 0.01  # m: no ground is flatter, and no motion that is smaller is any
 _SIDE = 25  # trials along each axis of the search
-_SEARCHED = 1000  # heights that the search looks at, at most
-_SETTLED = 1e-3  # m
 _BIWEIGHT = 4.685  # Tukey's: 95 % as efficient as least squares where all is normal
 _KNOWN = 0.2  # of the information that slopes claim: below, they are their own noise
-_PARTS = 20  # of a scene, left out one by one
-_FEWEST_GROUPS = 14  # of neighbours, that a variance is told by: twice the unknowns
 
 
 @dataclass(frozen=True)
@@ -56,12 +48,13 @@ class Surface:
         reach = np.maximum(distance[:, -1], 1e-3)
         delta = points[near] - points[:, None]
         design = _powers(delta[..., :2] / reach[:, None, None])
-        normal = np.swapaxes(design, 1, 2) @ design
-        inverse = np.linalg.inv(normal + RIDGE * np.eye(_TERMS))
+        normal, terms = np.swapaxes(design, 1, 2) @ design, design.shape[-1]
+        freedom = NEIGHBOURS - terms
+        inverse = np.linalg.inv(normal + RIDGE * np.eye(terms))
         patch = np.einsum("pij,pkj,pk->pi", inverse, design, delta[..., 2])
         squares = ((delta[..., 2] - np.einsum("pkj,pj->pk", design, patch)) ** 2).sum(axis=1)
-        usual = max(float(np.sqrt(np.median(squares) / _FREEDOM)), _LEAST_SCATTER)
-        variance = (squares + _SHARED_FREEDOM * usual**2) / (_FREEDOM + _SHARED_FREEDOM)
+        usual = max(float(np.sqrt(np.median(squares) / freedom)), _FLAT)
+        variance = (squares + STATED * usual**2) / (freedom + STATED)
         patch[:, 0] += points[:, 2]
         return cls(
             points,
@@ -69,14 +62,12 @@ class Surface:
             variance[:, None, None] * inverse,
             np.sqrt(variance),
             reach,
-            squares <= _BROKEN * usual**2,
+            squares <= chdtri(freedom, CHANCE) * usual**2,
             tree,
         )
 
     def at(self, place: Array) -> tuple[Array, IntArray, BoolArray]:
-        """Return the height (n,) at places (n, 2), the tie point (n,) of the patch used, and whether the
-        patch reaches there.
-        """
+        """Return the height (n,) at places (n, 2), the tie point (n,) of its patch, and whether that reaches there."""
         distance, nearest = (np.asarray(part) for part in self.tree.query(place))
         design = _powers(self._from(place, nearest))
         near = (distance <= self.reach[nearest]) & self.whole[nearest]
@@ -126,7 +117,7 @@ class Registration:
     """The motion of a surface that brings it onto the heights given, and how well these agree on it."""
 
     motion: Array  # (7,) east, north, up, tilts, turn, scale [m], as `barpc.ba.held.gauge.MOTIONS`
-    covariance: Array  # (7, 7) of it, what was known before left out but for a hundredth
+    covariance: Array  # (7, 7) of it, what was known before left out but for a ten-thousandth
     near: BoolArray  # (n,) heights on patches of the surface
     agree: BoolArray  # (n,) those of them that agree with the motion
     residual: Array  # (n,) given minus surface, moved [m]; NaN where there is no surface
@@ -151,9 +142,7 @@ class Registration:
 
 
 def displacement(local: Array) -> Array:
-    """Return the derivatives (n, 3, 7) of points at `local` (n, 2) radii, east, north, up, by the seven
-    motions of a scene.
-    """
+    """Return the derivatives (n, 3, 7) of points at `local` (n, 2) radii by the seven motions of a scene."""
     e, o = local.T
     moves = np.zeros((len(e), 3, 7))
     moves[:, (0, 1, 2), (0, 1, 2)] = 1.0
@@ -169,7 +158,7 @@ def register(surface: Surface, given: Given, radius: float, before: Array) -> Re
     `before` (7,) are the standard deviations of the motions without these heights [m]: how far is looked, and where
     the heights tell nothing, that stays open.
     """
-    free = np.diag((10.0 * before) ** -2)
+    free = np.diag((GROSS * before) ** -2)
     motion, noise = _settled(surface, given, _search(surface, given, before), radius, free)
     found = _told(surface, given, motion, radius, noise, free)
     wider = _jackknife(surface, given, found, radius, noise, free)
@@ -179,9 +168,7 @@ def register(surface: Surface, given: Given, radius: float, before: Array) -> Re
 def _settled(
     surface: Surface, given: Given, motion: Array, radius: float, free: Array, noise: float | None = None
 ) -> tuple[Array, float]:
-    """Return the motion (7,) that reweighted steps end at, and the noise over what is stated; learnt where it
-    is not known.
-    """
+    """Return the motion (7,) that reweighted steps end at, and the noise over what is stated, learnt if None."""
     is_known, noise = noise is not None, SURELY if noise is None else noise
     for step in range(ITERATIONS):
         seen = _Seen.of(surface, given, motion, radius)
@@ -197,7 +184,7 @@ def _settled(
         if not is_known and step >= 2:
             among = np.abs(whitened[seen.near & (np.abs(whitened) < 2.0 * _BIWEIGHT * noise)])
             noise = float(np.clip(1.4826 * np.median(among), 0.5, max(noise, 1.0)))
-        if (is_known or step > 5) and np.abs(change).max() < _SETTLED:
+        if (is_known or step > 5) and np.abs(change).max() < _FLAT:
             break
     return motion, noise
 
@@ -211,7 +198,7 @@ def _jackknife(surface: Surface, given: Given, found: Registration, radius: floa
     """
     group, wider = _parts(given.place[:, :2], found.near), np.ones(len(free))
     count = int(group.max(initial=-1)) + 1
-    if count < _FEWEST_GROUPS:
+    if count < FEWEST:
         return wider
     without = np.array(
         [
@@ -231,7 +218,7 @@ def _parts(place: Array, near: BoolArray) -> IntArray:
     group, number = np.full(len(place), -1), np.zeros(0, dtype=np.int64)
     at = place[near]
     size = float(np.ptp(at, axis=0).max()) if len(at) else 0.0
-    while size > 0.0 and number.max(initial=0) + 1 < min(_PARTS, len(at)):  # of tracks most are empty
+    while size > 0.0 and number.max(initial=0) + 1 < min(FEWEST, len(at)):  # of tracks most are empty
         size /= np.sqrt(2.0)
         cell = np.floor((at - at.min(axis=0)) / size).astype(np.int64)
         number = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
@@ -267,11 +254,11 @@ class _Seen:
 
 def _search(surface: Surface, given: Given, before: Array) -> Array:
     """Return the shift (7,; tilts, turn and scale 0) on which the most heights agree, east and north within 4 sigma."""
-    few = given.select(np.arange(len(given.sigma)) % -(-len(given.sigma) // _SEARCHED) == 0)
+    few = given.select(np.arange(len(given.sigma)) % -(-len(given.sigma) // SAMPLE) == 0)
     first = _Seen.of(surface, few, np.zeros(7), 1.0)
     steep = float(np.sqrt(((surface.patch[:, 1:3] / surface.reach[:, None]) ** 2).mean()))
     wide = float(np.median(first.sigma))
-    reach = 4.0 * before[:2]
+    reach = CRITICAL * before[:2]
     step = np.maximum(1.5 * wide / max(steep, 1e-6), 2.0 * reach / (_SIDE - 1))
     sides = [np.arange(-(r // s), r // s + 1) * s for r, s in zip(reach, step, strict=True)]
     half = 2.0 * float(np.hypot(wide, 0.5 * steep * np.hypot(*np.minimum(step, reach))))
@@ -351,7 +338,7 @@ def _inflation(place: Array, forms: Array, alone: Array, surface: Surface) -> Ar
         cell = np.floor(place[:, :2] / size).astype(np.int64)
         _, group = np.unique(cell, axis=0, return_inverse=True)
         count = int(group.max(initial=-1)) + 1
-        if count < _FEWEST_GROUPS:
+        if count < FEWEST:
             return most
         sums = np.stack([np.bincount(group.ravel(), column, minlength=count) for column in forms.T], axis=1)
         ratio = (sums**2).sum(axis=0) / np.maximum(alone, 1e-300) * count / (count - 7.0)  # seven are fitted

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barpc.ba.usual import OUTLIER, SURELY
+from barpc.ba.usual import BACKFITTING, CRITICAL, MANY, MUCH_NOISE, OUTLIER, STATED, SURELY
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.scene import BoolArray, IntArray
 
@@ -24,20 +24,15 @@ Terrain = Callable[[Array, Array], Array]
 
 SLOPE_STEP = 15.0  # m: slopes of the DEM itself are taken over twice this distance
 DEGREE = 3  # of the surfaces of which a DEM's are taken whole, wrong by what all its heights are
-NUM_BENDS = (DEGREE + 1) * (DEGREE + 2) // 2
+_TERMS = [(n - j, j) for n in range(DEGREE + 1) for j in range(n + 1)]  # powers: level, x, y, x^2, ...
+NUM_BENDS = len(_TERMS)
 _NODES = 300  # of the grid on which a DEM is smoothed, along the scene's longer side: 30 m of 10 km
-_FINEST = 5.0  # m between them, at least
 _WIDEST = 16  # the widest smoothing is the scene's longer side over this, as a standard deviation
-_MARGIN, _LEAST_MARGIN = 0.1, 300.0  # of the scene and m around it: cameras may be off
-_ENOUGH = 60  # points: three for each number that is estimated
-_ROUNDS = 5  # gains, then what does not fit, in turn
+_MARGIN = 300.0  # m around the scene at least, or as much as that: cameras may be off
 _CELLS = (6, 10, 16)  # along the scene's longer side: 36 sums tell a variance to a quarter
 _HILLS = 45.0  # slopes that are alike count as one: 49-133 of them in the scenes that hold, 33 in 250 m by SRTM
-_STATED = 4.0  # observations that the stated standard deviation of single heights is worth
 _EDGE = 2.0  # the scene's edges lie at most about so many times as far out as its points' RMS distance
-_SHOWN = 0.5  # DEMs whose relief is farther from once that of the tie points than this, in
-_SURE = 4.0  # standard deviations, too, and
-_GROSS = 2.0  # times what is stated for single heights, are of another terrain
+_SHOWN = 0.5  # DEMs whose relief is farther from once that of the tie points are of another terrain
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,14 +55,14 @@ class Bands:
         unit = metres_per_unit(np.append((low + high) / 2.0, np.median(ground[:, 2])))[:2]
         side = (high - low) * unit
         extent = float(side.max())
-        margin = max(_MARGIN * extent, _LEAST_MARGIN)
-        step = max((extent + 2.0 * margin) / _NODES, _FINEST)
+        margin = max(extent / _WIDEST, _MARGIN)
+        step = max((extent + 2.0 * margin) / _NODES, SLOPE_STEP)
         origin = low - margin / unit
         cols, rows = (np.arange(int((s + 2.0 * margin) / step) + 2) * step for s in side)
         lon, lat = np.meshgrid(origin[0] + cols / unit[0], origin[1] + rows / unit[1])
         heights = np.asarray(terrain(lon.ravel(), lat.ravel()), dtype=np.float64).reshape(lon.shape)
         least, most = np.percentile(ground[:, 2], [1, 99])
-        room = most - least + _LEAST_MARGIN
+        room = most - least + _MARGIN
         known = (heights > least - room) & (heights < most + room)  # a hole may be filled with any number
         middle = float(np.median(heights[known])) if known.any() else 0.0
         filled, smoothed, width = np.where(known, heights - middle, 0.0), [], step
@@ -86,9 +81,7 @@ class Bands:
         return np.asarray((np.column_stack([lon, ground[:, 1]]) - self.origin) * self.unit)
 
     def at(self, ground: Array) -> tuple[Array, Array]:
-        """Return the heights (K, n) [m] of the bands at ground points (n, 3), which add up to the DEM's;
-        slopes (K, n, 2).
-        """
+        """Return the heights (K, n) [m] of the bands at ground points (n, 3), in all the DEM's; slopes (K, n, 2)."""
         heights = [np.asarray(self.terrain(ground[:, 0], ground[:, 1]), dtype=np.float64)]
         slopes = [np.nan_to_num(terrain_slopes(self.terrain, ground))]
         at = self.local(ground).T[::-1] / self.step
@@ -122,17 +115,14 @@ def _differences(layers: Array) -> Array:
 def bends(at: Array) -> Array:
     """Return the level, slopes and bends (n, `NUM_BENDS`) of a surface at places (n, 2)."""
     x, y = at.T
-    return np.column_stack(
-        [x ** (n - j) * y**j for n in range(DEGREE + 1) for j in range(n + 1)]  # level, x, y, x^2, ...
-    )
+    return np.column_stack([x**i * y**j for i, j in _TERMS])
 
 
 def _bend_slopes(at: Array) -> Array:
     """Return the derivatives (n, `NUM_BENDS`, 2) of `bends` by the places."""
     x, y = at.T
-    terms = [(n - j, j) for n in range(DEGREE + 1) for j in range(n + 1)]
-    by_x = [i * x ** max(i - 1, 0) * y**j for i, j in terms]
-    by_y = [j * x**i * y ** max(j - 1, 0) for i, j in terms]
+    by_x = [i * x ** max(i - 1, 0) * y**j for i, j in _TERMS]
+    by_y = [j * x**i * y ** max(j - 1, 0) for i, j in _TERMS]
     return np.stack([np.column_stack(by_x), np.column_stack(by_y)], axis=-1)
 
 
@@ -166,15 +156,11 @@ class Relief:
     cameras: Array  # (3,) what the cameras' accuracies let expect of that [m]; NaN where they do not say
 
     def beyond(self, bias: float) -> Array:
-        """Return level and slopes (3,) of the points above the DEM as delivered, over what cameras and a DEM
-        wrong by `bias` [m] allow.
-        """
+        """Return level and slopes (3,) above the DEM as delivered, over what cameras and a `bias` [m] allow."""
         return np.asarray(np.abs(self.delivered) / np.hypot(self.cameras, bias))
 
     def common_sigma(self, bias: float) -> Array:
-        """Return the standard deviations (`NUM_BENDS`,) [m] of errors that all heights share: `bias`, or more
-        where the points contradict it.
-        """
+        """Return the sigmas (`NUM_BENDS`,) [m] of errors in common: `bias`, or more where points contradict it."""
         sigma = np.full(NUM_BENDS, bias)
         contradicts = self.beyond(bias) > SURELY
         sigma[:3][contradicts] = _EDGE * np.abs(self.delivered)[contradicts]
@@ -192,14 +178,14 @@ class Relief:
         off = ground[index, 2] - np.asarray(terrain(ground[index, 0], ground[index, 1]))
         index, off = index[np.isfinite(off)], off[np.isfinite(off)]
         tell, fit, unknown = np.zeros(len(strong), dtype=bool), np.zeros((3, len(strong))), np.full(3, np.nan)
-        if len(index) < _ENOUGH:
+        if len(index) < MANY:
             return cls(None, tell, unknown, fit, unknown)
         bands = Bands.of(terrain, ground[index])
         at = bands.local(ground[index])
         at -= at.mean(axis=0)
         flat = np.column_stack([np.ones(len(at)), at / np.sqrt((at**2).sum(axis=1).mean())])
         near = _middling(off)
-        for _ in range(_ROUNDS):
+        for _ in range(BACKFITTING):
             delivered = _coefficients(flat[near], off[near])
             left = np.abs(off - flat @ delivered)
             near = left <= OUTLIER * 1.4826 * np.median(left)
@@ -223,7 +209,7 @@ def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Be
     tell = relief.tell[index] & known
     if tell.any():
         tell[tell] = _middling((ground[:, 2] - heights.sum(axis=0))[tell])
-    if tell.sum() < _ENOUGH:
+    if tell.sum() < MANY:
         return None
     at = relief.bands.local(ground)
     at = at - at[tell].mean(axis=0)
@@ -245,7 +231,7 @@ def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Be
         rising + np.einsum("nmx,mk->nx", by_place, trend),
         smooth,
         found.gains,
-        float(np.sqrt((_STATED * stated**2 + (left[fits] ** 2).sum()) / (_STATED + freedom))),
+        float(np.sqrt((STATED * stated**2 + (left[fits] ** 2).sum()) / (STATED + freedom))),
         _summed(at[fits], pull * left[fits, None]),
         times,
         shows,
@@ -273,7 +259,7 @@ def _compared(at: Array, above: Array, bent: Array, slopes: Array, smooth: Array
     from scipy.optimize import lsq_linear  # a fifth of a second, of blocks with a DEM alone
 
     gains, fits, both, believes = np.ones(bent.shape[1]), tell, np.column_stack([above, bent]), True
-    for _ in range(_ROUNDS):
+    for _ in range(BACKFITTING):
         rising = np.einsum("k,knx->nx", gains, slopes)
         believes = believes and fits.sum() > _HILLS * _summed(at[fits], rising[fits] - rising[fits].mean(axis=0))
         moved = smooth
@@ -324,5 +310,5 @@ def _shown(relief: Array, above: Array, smooth: Array, stated: float) -> tuple[f
     off, rest = relief - seen, relief - times * seen
     sigma = float(np.sqrt(rest @ rest / size / len(seen)) if len(seen) else np.inf)
     far = abs(times - 1.0)
-    wrong = far > _SHOWN and far > _SURE * sigma and float(off @ off) > len(off) * (_GROSS * stated) ** 2
+    wrong = far > _SHOWN and far > CRITICAL * sigma and float(off @ off) > len(off) * (MUCH_NOISE * stated) ** 2
     return times, not wrong

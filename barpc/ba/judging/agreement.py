@@ -21,29 +21,16 @@ from barpc.ba.held.block import Block
 from barpc.ba.robust.heldout import enu_offsets
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import solve_transposed
-from barpc.ba.usual import LEVEL
+from barpc.ba.usual import CRITICAL, GROSS, LEVEL, SURE, TRIALS
 from barpc.geodesy import Array, enu_basis
-from barpc.scene import BoolArray, IntArray
+from barpc.scene import BoolArray
 
 LOOSE = 1e4  # m: a place so uncertain holds nothing, and keeps a point that one ray shows from running away
-_SHIFT = 1e3  # m: of the scene, farther than any delivered camera is off
-_SEEN = 0.01  # of a point's own variance: motions that are smaller cannot be told from it
-_EVERY = 12  # points of which every set is looked at
-_TRIALS = 100  # sets of three drawn of more: 2e-6 to miss three right ones where half are
-_TRIPLE = 3  # points that tell shift, tilts, turn and scale
-_KEPT = 64  # of the sets looked at, those that are looked at again with every scale
-_NEAR = 16.0  # squared deviation of a point that goes with a set: that of `snooping.CRITICAL`
-_ROOM = 20_000  # points of sets at a time: some 10 MB
-_SCALES = (1.0, 3.0, 2.0, 5.0)  # every set with the first two; more than five times is wrong, not optimistic
-_MOTIONS = (1.0, 3.0)
-_OPTIMISTIC = 3.5  # nats for each factor of e in the accuracies. Measured, 60 draws each: with 3, 3.5, 4 one of five
-# points 3 m off is found in 55, 57, 57; six with sigmas 3 x too small stay together in 59, 59, 59
-_FLOPPY = 2.0  # nats, the same for the motions
-_WRONG = float(np.log(1.0 / LEVEL - 1.0))  # nats that it costs to call a point wrong: one in twenty is
-# nats: the density at one sigma of an error below 10,000, alike in its logarithm from one on
-_ANYWHERE = float(np.log(4.0 * np.pi * (1.0 / 3.0 + np.log(1e4))))
-_CLEAR = float(-np.log(LEVEL))  # nats by which a set must beat any other that contradicts it: one in twenty
-_AS_MANY = 10.0  # nats, where that other has as many points: how well points happen to fit is no vote
+_ROOM = 50_000  # points of sets at a time: some 25 MB
+_SCALES = (1.0, 2.0, 3.0, 5.0)  # more than five times is wrong, not optimistic
+_ODDS = float(-np.log(LEVEL))
+"""Nats that it costs to call a point wrong, and each factor of e in accuracies or motions; and by which a set must
+beat any other that contradicts it: one in twenty."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +113,8 @@ def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array
     flat = (whitening @ of_cameras).reshape(3 * count, -1)
     size, root = np.linalg.eigh(covariance.joint(views))
     modes, size, _ = np.linalg.svd(flat @ (root * np.sqrt(np.maximum(size, 0.0))), full_matrices=False)
-    modes = (modes * size)[:, size**2 > _SEEN].reshape(count, 3, -1)
-    motions = np.concatenate([modes, _SHIFT * whitening @ enu], axis=2)
+    modes = (modes * size)[:, size > LEVEL].reshape(count, 3, -1)
+    motions = np.concatenate([modes, LOOSE * whitening @ enu], axis=2)
     offset = enu_offsets(points[index], gcps.lonlatalt)
     return Offsets((whitening @ offset[..., None])[..., 0], motions)
 
@@ -136,7 +123,7 @@ def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
     """Find the control points that hold a block, among those that can be judged, `told` (G,); the others go
     with them.
 
-    Every set of up to twelve points is looked at; of more, those that agree with three drawn at random.
+    Every set is looked at where they are few (twelve); of more, those that agree with three drawn at random.
     """
     given = np.flatnonzero(told)
     if len(given) < 2:
@@ -160,9 +147,7 @@ def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
 
 
 def _fits_as_stated(offsets: Offsets) -> bool:
-    """Return whether all points together are as near as nineteen times of twenty, and without none of them it
-    is better.
-    """
+    """Return whether all points are as near as nineteen times of twenty, and no better without one."""
     count = len(offsets.own)
     one_less = np.concatenate([np.ones((1, count), dtype=bool), ~np.eye(count, dtype=bool)])
     score, _, squares = _evidence(offsets, one_less, 1.0)
@@ -175,16 +160,17 @@ class _Search:
 
     def __init__(self, offsets: Offsets) -> None:
         self.offsets, self.count = offsets, len(offsets.own)
-        if self.count <= _EVERY:
+        every = self.count * 2**self.count <= _ROOM
+        if every:
             numbers = np.arange(1, 2**self.count)
             self.masks = ((numbers[:, None] >> np.arange(self.count)) & 1).astype(bool)
         else:
             self.masks = np.unique(np.array(list(self._drawn(np.ones(self.count, dtype=bool)))), axis=0)
         self.score, self.scale = self._scored(self.masks)
-        if self.count > _EVERY:
+        if not every:
             self._refine(int(self.score.argmax()))
             rest = ~self.masks[self.score.argmax()]
-            if rest.sum() >= _TRIPLE:
+            if rest.sum() >= 3:
                 self._add(np.unique(np.array(list(self._drawn(rest))) & rest, axis=0))
 
     def best(self) -> tuple[BoolArray, float, float]:
@@ -193,31 +179,28 @@ class _Search:
         return self.masks[n], float(self.score[n]), float(self.scale[n])
 
     def against(self, best: BoolArray, score: float) -> BoolArray | None:
-        """Return the set that contradicts the best and weighs as much; the rest where the best is none; None
-        where it wins.
-        """
+        """Return the set that contradicts the best and weighs as much, the rest without a majority, or None."""
         size, common = self.masks.sum(axis=1), (self.masks & best).sum(axis=1)
         other = np.flatnonzero((size > common) & (2 * common <= best.sum()))
-        other = other[np.argsort(-self.score[other], kind="stable")[:_KEPT]]
         if len(other):
-            masks, found = self.masks[other], self._scored(self.masks[other])[0]
-            least = np.where(size[other] >= best.sum(), _AS_MANY, _CLEAR)
-            rival = np.where(found > score - least, found, -np.inf)
+            # how well as many points happen to fit is no vote
+            least = np.where(size[other] >= best.sum(), 2.0 * SURE, _ODDS)
+            rival = np.where(self.score[other] > score - least, self.score[other], -np.inf)
             if np.isfinite(rival).any():
-                return np.asarray(masks[rival.argmax()])
+                return np.asarray(self.masks[other[rival.argmax()]])
         return None if 2 * best.sum() >= self.count else ~best
 
     def _drawn(self, among: BoolArray) -> Iterator[BoolArray]:
         """Yield the sets that agree with three points drawn from some; the same whenever they are drawn."""
         rng, places = np.random.default_rng(0), np.flatnonzero(among)
         yield among.copy()
-        for trial in range(_TRIALS):
+        for trial in range(TRIALS):
             mask = np.zeros(self.count, dtype=bool)
-            mask[rng.choice(places, _TRIPLE, replace=False)] = True
+            mask[rng.choice(places, 3, replace=False)] = True
             scale = (1.0, 3.0)[trial % 2]
             for _ in range(2):
                 squared = _evidence(self.offsets, mask[None], scale)[1][0]
-                mask = among & (squared < _NEAR)
+                mask = among & (squared < CRITICAL**2)
             if mask.any():
                 yield mask
 
@@ -225,7 +208,7 @@ class _Search:
         """Move single points into or out of a set as long as that raises its evidence."""
         for _ in range(self.count):
             squared = _evidence(self.offsets, self.masks[n][None], self.scale[n])[1][0]
-            doubtful = np.flatnonzero((squared > 0.5 * _NEAR) & (squared < 2.0 * _NEAR))
+            doubtful = np.flatnonzero((squared > 0.5 * CRITICAL**2) & (squared < 2.0 * CRITICAL**2))
             before = self.score[n]
             self._add(self.masks[n] ^ np.eye(self.count, dtype=bool)[doubtful])
             n = int(self.score.argmax())
@@ -241,27 +224,15 @@ class _Search:
     def _scored(self, masks: BoolArray) -> tuple[Array, Array]:
         """Return the evidence (B,) of sets (B, G), and the scale of the accuracies that it has it with."""
         score, scale = np.full(len(masks), -np.inf), np.ones(len(masks))
-        rows = np.arange(len(masks))
-        for n, (motions, times) in enumerate(product(_MOTIONS, _SCALES)):
-            if n == 2:
-                rows = np.sort(np.argsort(-score, kind="stable")[:_KEPT])
-            self._better(masks, rows, times, motions, score, scale)
+        for motions, times in product(_SCALES, _SCALES):
+            found = _evidence(self.offsets.moving(motions), masks, times)[0] - _ODDS * np.log(times * motions)
+            better = found > score
+            score[better], scale[better] = found[better], times
         return score, scale
-
-    def _better(
-        self, masks: BoolArray, rows: IntArray, times: float, motions: float, score: Array, scale: Array
-    ) -> None:
-        offsets = self.offsets if motions == 1.0 else self.offsets.moving(motions)
-        found = _evidence(offsets, masks[rows], times)[0]
-        found -= _OPTIMISTIC * np.log(times) + _FLOPPY * np.log(motions)
-        better = found > score[rows]
-        score[rows[better]], scale[rows[better]] = found[better], times
 
 
 def _evidence(offsets: Offsets, masks: BoolArray, scale: float) -> tuple[Array, Array, Array]:
-    """Return the logarithmic evidence (B,) of sets (B, G), squared deviation (B, G) of every point from what
-    a set says, and that of all points of a set together (B,).
-    """
+    """Return the log evidence (B,) of sets (B, G), squared deviations of points (B, G), and of all in a set (B,)."""
     own, motions, variance = offsets.own, offsets.motions, scale**2
     if len(masks) > (room := max(_ROOM // len(own), 1)):
         parts = [_evidence(offsets, masks[n : n + room], scale) for n in range(0, len(masks), room)]
@@ -281,5 +252,7 @@ def _evidence(offsets: Offsets, masks: BoolArray, scale: float) -> tuple[Array, 
     spread = np.einsum("gir,brs,gjs->bgij", motions, inverse, motions, optimize=True)
     spread = spread + variance * np.eye(3)
     squared = np.einsum("bgi,bgi->bg", left, np.linalg.solve(spread, left[..., None])[..., 0])
-    anywhere = 1.5 * np.log(np.maximum(squared, 1.0)) + _ANYWHERE + 0.5 * np.linalg.slogdet(spread)[1]
-    return inside - ((1.0 - chosen) * (anywhere + _WRONG)).sum(axis=1), squared, squares
+    # an error of a wrong point is alike in its logarithm from one standard deviation on, to 10,000
+    volume = np.log(4.0 * np.pi * (1.0 / 3.0 + np.log(GROSS**2)))
+    anywhere = 1.5 * np.log(np.maximum(squared, 1.0)) + volume + 0.5 * np.linalg.slogdet(spread)[1]
+    return inside - ((1.0 - chosen) * (anywhere + _ODDS)).sum(axis=1), squared, squares

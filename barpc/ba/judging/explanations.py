@@ -14,7 +14,8 @@ from barpc.ba.evidence.periods import Swing
 from barpc.ba.evidence.periods import price as price_of_period
 from barpc.ba.evidence.scan import BINS, Interval, price
 from barpc.ba.judging import moving
-from barpc.ba.usual import FEW
+from barpc.ba.robust.smooth import SPLINES
+from barpc.ba.usual import FEW, TIMES
 from barpc.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import profile
@@ -30,13 +31,10 @@ LOCAL = STRIP, FADE
 """Those of a part of an image."""
 FOLLOWED = *LOCAL, SETTLING, SWING
 """Those that the adjustment follows; others may be beside them."""
-_LENGTHS = 2.0 ** np.arange(-4.0, 1.0)  # of an interval: over what it may fade
-_SETTLING = 2.0 ** np.arange(-7.0, -1.0)  # of an image, the same at its end
-_A_BIN = 5  # places of a bin at which a curve is looked at
-_SPLINES = 14  # over the rows of an image, where it holds so many
-_WANDER = 0.5  # px
-_STRIP = 1.0  # px, before it is known; then its own size, for which a scale of x 30 is paid
-SCALE = float(np.log(2.0 * np.log(30.0)))
+_LENGTHS = 2.0 ** np.arange(-7.0, 1.0)  # of an image: over what it may fade
+_SIZE = 1.0  # px, before it is known; then its own
+SCALE = float(np.log(2.0 * np.log(TIMES)))
+"""Nats that are paid for a size, alike in its logarithm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +70,7 @@ class Seen:
     sigma: Array  # (e,) its prior [px]
 
 
-def strip(seen: Seen, interval: Interval, sigma: float = _STRIP) -> list[Explanation]:
+def strip(seen: Seen, interval: Interval, sigma: float = _SIZE) -> list[Explanation]:
     """Return the explanation that a stretch of rows or columns of one image is displaced as a whole."""
     start, stop = _open_ended(interval.start, interval.stop, float(seen.size[interval.axis, interval.view]))
     return [_local(STRIP, seen, interval.view, (interval.axis, start, stop, 0.0, 0.0), sigma)]
@@ -95,7 +93,7 @@ def fade(seen: Seen, interval: Interval) -> list[Explanation]:
             # over what is seen to lie off and half of that at least, over the rest of the image at most
             halved = np.arange(np.ceil(np.log2(max(2.0 * (stop - start) / own, 1.0))) + 1.0)
             for length in (stop - start) * 0.5**halved if stop > start else ():
-                one = _local(FADE, seen, interval.view, (1, *ends, origin, sign / float(length)), _STRIP)
+                one = _local(FADE, seen, interval.view, (1, *ends, origin, sign / float(length)), _SIZE)
                 cost = first_guess(seen.few, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2]
                 tried.append((cost - _untouched(seen, one), one))
         found += [min(tried, key=lambda row: row[0])[1]] if tried else []
@@ -123,8 +121,8 @@ def settling(seen: Seen, _interval: Interval) -> list[Explanation]:
 
     So does a satellite that settles after it has turned, before every image.
     """
-    shapes = [sign / length for sign in (1.0, -1.0) for length in _SETTLING * float(np.median(seen.size[1]))]
-    tried = [_settling(seen, rate, _STRIP) for rate in shapes]
+    shapes = [sign / length for sign in (1.0, -1.0) for length in _LENGTHS * float(np.median(seen.size[1]))]
+    tried = [_settling(seen, rate, _SIZE) for rate in shapes]
     costs = [
         first_guess(seen.few, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2] - _untouched(seen, one)
         for one in tried
@@ -166,7 +164,7 @@ def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explan
     `found` is a fit with it, its own unknowns the last; `others` (2, K) is what those before it move [px].
     """
     moved = found.extra[-len(one.sigma) :]
-    sigma = float(np.clip(np.sqrt((moved**2).mean()), _STRIP / 30.0, _STRIP * 30.0))
+    sigma = float(np.clip(np.sqrt((moved**2).mean()), _SIZE / TIMES, _SIZE * TIMES))
     if one.where is None:
         return replace(one, sigma=np.full(len(moved), sigma))
     if one.parts:
@@ -220,7 +218,7 @@ def wander(seen: Seen, interval: Interval) -> list[Explanation]:
     rows = np.flatnonzero(seen.linear.view == view)
     u = 2.0 * seen.place[1, rows] / seen.size[1, view] - 1.0
     each = int(np.median(np.bincount(seen.linear.view[seen.linear.taking_part]))) // FEW
-    one = _on_both(seen, WANDER, view, rows, Waves(min(max(each, FEWEST), _SPLINES)).splines(u), _WANDER)
+    one = _on_both(seen, WANDER, view, rows, Waves(min(max(each, FEWEST), SPLINES)).splines(u), _SIZE)
     return [replace(one, price=one.price + SCALE)]
 
 
@@ -228,7 +226,7 @@ def swing(seen: Seen, found: Swing) -> Explanation:
     """Return the explanation that all rows of an image swing with one period."""
     rows = np.flatnonzero(seen.linear.view == found.view)
     basis = waves_of(seen.place[1, rows], np.array(found.period))
-    one = _on_both(seen, SWING, found.view, rows, basis, _WANDER)
+    one = _on_both(seen, SWING, found.view, rows, basis, _SIZE)
     costs = price_of_period(float(seen.size[1, found.view]), seen.linear.choices) + SCALE
     return replace(one, price=costs, period=found.period)
 
@@ -236,7 +234,7 @@ def swing(seen: Seen, found: Swing) -> Explanation:
 def alike(seen: Seen, one: Explanation, found: Fit) -> list[Explanation]:
     """Return the strip and the fade that a view's wandering rows resemble most, drift aside."""
     size, view = float(seen.size[1, one.view]), one.view
-    rows = (np.arange(BINS * _A_BIN) + 0.5) / (BINS * _A_BIN) * size
+    rows = (np.arange(BINS) + 0.5) / BINS * size
     unknowns = found.extra[-len(one.sigma) :]
     curve = unknowns.reshape(2, -1) @ Waves(len(unknowns) // 2 + DRIFTS).splines(2.0 * rows / size - 1.0)
     drift = np.linalg.qr(np.vander(rows / size - 0.5, 3))[0]
@@ -252,7 +250,7 @@ def alike(seen: Seen, one: Explanation, found: Fit) -> list[Explanation]:
         parts -= drift @ (drift.T @ parts)
         explained = ((curve @ parts) ** 2).sum(axis=0) / np.maximum((parts**2).sum(axis=0), 0.1)
         first, last, *rest = (float(shape[int(explained.argmax())]) for shape in shapes)
-        told.append(_local(kind, seen, view, (1, *_open_ended(first, last, size), rest[0], rest[1]), _STRIP))
+        told.append(_local(kind, seen, view, (1, *_open_ended(first, last, size), rest[0], rest[1]), _SIZE))
     return told
 
 
@@ -304,9 +302,7 @@ def proposed(
 
 
 def _at_one_end(seen: Seen, intervals: list[Interval]) -> bool:
-    """Return whether all that stands out is where images begin, or all where they end: what wanders is seen
-    all over.
-    """
+    """Return whether all that stands out is where images begin, or all where they end, as no wandering is."""
     at_end = [
         (one.start <= 0.0, one.stop >= seen.size[1, one.view]) if one.axis == 1 else (False, False) for one in intervals
     ]

@@ -15,14 +15,12 @@ from barpc.ba.judging.judge import Finding, Judgement, standing_out
 from barpc.ba.judging.solution import Solution, finished
 from barpc.ba.robust.heldout import is_better
 from barpc.ba.robust.rounds import Rounds, revived
-from barpc.ba.usual import FEW
+from barpc.ba.usual import FEW, LARGEST
 from barpc.geodesy import Array
 from barpc.options import AUTO, OFF, AdjustOptions
 
 _SPACING, _DENSER = 2000.0, 4  # rows between knots at first, and how often they are halved
-_LOOKS = 2  # for detectors
-_MISSES = 2  # one after the other
-_MOST_SPLINES = 4000  # of all views: what a block of 300 takes is 2.6 times as long
+_TWICE = 2  # detectors are looked for, and splines may be no better, one after the other
 
 
 def follow(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
@@ -35,7 +33,7 @@ def follow(found: Solution, block: Block, outer: Block, options: AdjustOptions) 
     given, asked = options.jitter != AUTO, bool(options.spacing or options.detectors)
     best, misses = found, 0
     for count in _spline_counts(block, options, found.has_waves):
-        if misses == _MISSES or not (best.has_waves or (asked and best is found)):
+        if misses == _TWICE or not (best.has_waves or (asked and best is found)):
             break
         waves = Waves(count, _given_edges(block, options))
         if options.detectors:
@@ -113,7 +111,7 @@ def _with_edges(found: Solution, block: Block, outer: Block, options: AdjustOpti
     """
     waves = found.problem.cameras.unknowns.waves
     assert waves is not None
-    for _ in range(_LOOKS if found.has_waves else 0):
+    for _ in range(_TWICE if found.has_waves else 0):
         outcome = found.outcome
         sigma = block.sigma * outcome.noise
         edges = find_edges(outcome.problem, found.final, outcome.residual, outcome.inlier, sigma)
@@ -136,7 +134,7 @@ def _spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> lis
     most = int(np.median(np.bincount(block.view[block.use], minlength=len(block.views)))) // FEW
     if options.spacing:
         return [max(min(int(np.ceil(rows / options.spacing)) + 3, most), FEWEST)]
-    most = min(most, _MOST_SPLINES // len(block.views))
+    most = min(most, LARGEST // (2 * len(block.views)))
     wanted = [int(np.ceil(rows / (_SPACING / 2**n))) + 3 for n in range(_DENSER)]
     dense = np.unique(np.clip(wanted, FEWEST, most)).tolist() if has_waves and most >= FEWEST else []
     return dense or [0] * bool(options.detectors)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from barpc.ba.evidence.linearised import Linear, linearise, numbers
-from barpc.ba.evidence.mixture import Fit, fit, off_from_right
+from barpc.ba.evidence.mixture import SETTLED, Fit, fit, off_from_right
 from barpc.ba.evidence.periods import Swing, swings
 from barpc.ba.evidence.scan import Interval, scan
 from barpc.ba.held.block import Block
@@ -35,25 +35,15 @@ from barpc.ba.judging.moving import Found, Ground, Motion, group_of
 from barpc.ba.robust.rounds import Outcome, revived
 from barpc.ba.robust.weights import Observations
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import SAMPLE, SMALL, SURE
+from barpc.ba.usual import BACKFITTING, KEPT, LARGEST, RIVALS, SAMPLE, SMALL, SURE, TRIED
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 _LOG = logging.getLogger(__name__)
 
-_MOST = 6  # explanations of one block
-_TRIED = 3  # intervals a round, and periods
-_STATES = 3  # ways to explain a block that are gone on with
-_PARTS = 3  # of images that may explain together what something else does alone
-_LOCAL = 2  # of each kind of part of an image whose ends are looked for, a round
-_SHARPENED = 6  # times
 _SEEN = 2.5  # floors: swings and motions that are taken; sound crops show swings of 1.8, where ties share errors
-_WORTH = 0.1 * SURE  # nats: less decides nothing
-_HELD_IN = 4  # images of which a part may hold what moves
-LARGEST, OBSERVATIONS = (
-    12_000,
-    1_000_000,
-)  # unknowns and observations of a block, up to which they are on parts of it
+OBSERVATIONS = KEPT
+"""Of a block, up to which parts of it are judged."""
 _NEAREST = 12  # views of a part
 _NUMBERS = 3e7  # of a mixture, at most: 240 MB
 
@@ -135,9 +125,7 @@ def swinging(outcome: Outcome, block: Block) -> list[Swing]:
 
 
 def _told(outcome: Outcome, block: Block) -> Array:
-    """Return 1 for observations (K,) of points that are known: what was cut is seen as well as the rest where
-    others tell.
-    """
+    """Return 1 for observations (K,) of points that others tell: what was cut is seen as well as the rest."""
     right = np.bincount(block.point[outcome.inlier], minlength=block.num_points)
     return (right[block.point] >= 2).astype(np.float64)
 
@@ -270,16 +258,12 @@ class _State:
         return sum(row.gain for row in self.taken)
 
     def may_pass(self, best: _State) -> bool:
-        """Return whether some more, each of which gains less than the last, may explain more than another
-        that ended.
-        """
-        left = _PARTS + len(best.taken) - 1 - len(self.taken)
+        """Return whether some more, each gaining less than the last, may explain more than another that ended."""
+        left = RIVALS + len(best.taken) - 1 - len(self.taken)
         return self.gain + left * self.taken[-1].gain > best.gain
 
     def adds_to(self, best: _State, beside: list[_Tried]) -> bool:
-        """Return whether what was taken last gains as much beside the best, of what was taken before: it is
-        no other way.
-        """
+        """Return whether what was taken last gains as much beside the best: it is no other way then."""
         last, one = self.taken[-1], self.taken[-1].one
         same = [row.what for row in self.taken[:-1]] == [row.what for row in best.taken[:-1]]
         gains = [row[2] for row in beside if row[0].kind == one.kind and not _differs(row[0], one)]
@@ -300,7 +284,7 @@ class _State:
         sigma = np.append(self.seen.sigma, one.sigma)
         seen = replace(self.seen, base=made, extra=extra, sigma=sigma)
         follows = one.kind in FOLLOWED
-        return _State(seen, made if follows else self.followed, taken, not follows or len(taken) == _MOST)
+        return _State(seen, made if follows else self.followed, taken, not follows or len(taken) == TRIED)
 
 
 class _Search:
@@ -346,13 +330,11 @@ class _Search:
         for state in sorted(grown, key=lambda state: -state.gain):
             if not any({row.what for row in state.taken} == {row.what for row in one.taken} for one in kept):
                 kept.append(state)
-        kept = kept[:_STATES]
+        kept = kept[:RIVALS]
         return kept, all(one.ended or (kept[0].ended and not one.may_pass(kept[0])) for one in kept)
 
     def _tried(self) -> list[_Tried]:
-        """Return the explanations of what stands out now, fitted beside those taken, with their gains; the
-        best first.
-        """
+        """Return the explanations of what stands out beside those taken, with their gains; the best first."""
         seen = self.seen
         out, periods = self._standing_out(seen.base, seen.extra)
         # in a pair more wrong matches at an end explain what was cut there as well, and nothing stands out beside them
@@ -375,12 +357,10 @@ class _Search:
         off, told = all_off[:, rows] / found.noise, (known[rows] | (wrong < 0.5)).astype(np.float64)
         floor = self.floor / self.sigma / found.noise
         out = [one for one in scan(view, place, seen.size, wrong, off, told, floor) if one.gain > SURE]
-        return _distinct(out)[:_TRIED], swings(view, place[1], seen.size, told, off)[:_TRIED]
+        return _distinct(out)[:RIVALS], swings(view, place[1], seen.size, told, off)[:RIVALS]
 
     def _leaves_nothing(self, made: list[_Tried]) -> bool:
-        """Return whether nothing stands out beside the best of few unknowns: no rival of a cell's each is
-        needed then.
-        """
+        """Return whether nothing stands out beside the best of few unknowns: no rival is needed then."""
         best = [row for row in made[:1] if row[2] > SURE and row[0].kind in FOLLOWED]
         beside = (
             self._standing_out(found, np.concatenate([self.seen.extra, one.extra], axis=1)) for one, found, _ in best
@@ -399,12 +379,10 @@ class _Search:
         return self._sharp(self._with(found, [one for row in sure for one in self._members(row[1], rows)]))
 
     def _sharp(self, made: list[_Tried]) -> list[_Tried]:
-        """Return the explanations with ends, periods and lengths searched for, where these may gain most; the
-        best first.
-        """
-        local = [one for kind in LOCAL for one in [row[0] for row in made if row[0].kind == kind][:_LOCAL]]
+        """Return the explanations, best first, with ends, periods and lengths searched where these may gain most."""
+        local = [one for kind in LOCAL for one in [row[0] for row in made if row[0].kind == kind][:RIVALS]]
         # where something is sure already, what is not waits for the next round
-        blunt = max(SURE, made[0][2] / _PARTS) if made and made[0][2] > SURE else -np.inf
+        blunt = max(SURE, made[0][2] / RIVALS) if made and made[0][2] > SURE else -np.inf
         return self._sorted(
             self._sharpened(one, found)
             if gain > blunt and (one in local or one.kind in (SETTLING, SWING, WANDER))
@@ -419,7 +397,7 @@ class _Search:
             return offered
         base = fit(few, self.seen.extra, self.seen.sigma, self.seen.base)
         gains = [self._fit(one, few, base).evidence - base.evidence - one.price for one in offered]
-        least = max(gains) / _PARTS if max(gains) > SURE else -np.inf
+        least = max(gains) / RIVALS if max(gains) > SURE else -np.inf
         return [one for one, gain in zip(offered, gains, strict=True) if gain >= least]
 
     def _is_nothing(self, one: Explanation, found: Fit) -> bool:
@@ -433,13 +411,11 @@ class _Search:
         return bool(size < self.floor * _SEEN)
 
     def _members(self, found: Fit, rows: BoolArray) -> Iterator[Explanation]:
-        """Yield the parts of images that hold what a group does: rows of one image that lie off move on the
-        ground, too.
-        """
+        """Yield the parts of images that hold what a group does: rows that lie off move on the ground, too."""
         seen, none = self.seen, np.zeros((2, int(rows.sum())))
         places = scan(seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none, none[0])
         best = {one.view: one for one in reversed(places) if one.by_share and one.gain > SURE}
-        intervals = sorted(best.values(), key=lambda one: -one.gain)[:_HELD_IN]
+        intervals = sorted(best.values(), key=lambda one: -one.gain)[:RIVALS]
         return proposed(seen, intervals, [], (MOVING, WANDER))
 
     def _with(self, made: list[_Tried], more: list[Explanation]) -> list[_Tried]:
@@ -451,7 +427,7 @@ class _Search:
         return sorted(((*row, row[1].evidence - base - row[0].price) for row in made), key=lambda row: -row[2])
 
     def _sharpened(self, one: Explanation, found: Fit) -> tuple[Explanation, Fit]:
-        for _ in range(_SHARPENED):
+        for _ in range(BACKFITTING):
             others = np.einsum("cek,e->ck", self.seen.extra, found.extra[: -len(one.sigma)])
             tried = [one, faster(one, self._fit(bent(self.seen, one)))] if one.kind in (FADE, SETTLING) else [one]
             again = [sharpened(self.seen, shape, found, others) for shape in tried]
@@ -461,7 +437,7 @@ class _Search:
             more = better.evidence - found.evidence
             if more > 0.0:
                 one, found = made, better
-            if more < _WORTH:
+            if more < SETTLED:
                 break
         return one, found
 
@@ -498,14 +474,12 @@ def _said(rows: list[_Taken], n: int, seen: Seen) -> Iterator[Finding]:
 
 
 def _rivals(tried: list[_Tried]) -> list[int]:
-    """Return the best of other kinds or views than the first that are followed, and may be its betters with
-    some beside.
-    """
+    """Return the best of other kinds or views that are followed, and may win with some beside."""
     found: dict[tuple[str, int], int] = {}
     for n, (one, _, gain) in enumerate(tried):
-        if one.kind in FOLLOWED and _differs(one, tried[0][0]) and gain > tried[0][2] / _PARTS:
+        if one.kind in FOLLOWED and _differs(one, tried[0][0]) and gain > tried[0][2] / RIVALS:
             found.setdefault((one.kind, one.view), n)
-    return list(found.values())[: _STATES - 1]
+    return list(found.values())[: RIVALS - 1]
 
 
 def _distinct(intervals: list[Interval]) -> list[Interval]:

@@ -15,22 +15,17 @@ from functools import cached_property
 import numpy as np
 
 from barpc.ba.evidence.linearised import Linear, linearise
-from barpc.ba.evidence.mixture import Fit, Group, Mixture, moving
+from barpc.ba.evidence.mixture import COOLED, Fit, Group, Mixture, moving
 from barpc.ba.held.block import Block
 from barpc.ba.robust.heldout import seen_in
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import LEVEL
+from barpc.ba.usual import LEVEL, RIVALS, SAMPLE, TIMES
 from barpc.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray, IntArray
 
 CELLS = 6  # a side of the ground: the group's share is free in each
-_STARTS = 3  # a side of the ground, of which each moves in turn
-_LIKELY = 1.0 - LEVEL  # that a track moves where the group is looked for, and that it stands far from there
-_FEW = 1500  # observations that are looked at from every start
-_LOOK, _QUICK = 8, 0.36  # steps of every start, cooled so much in each; only the best go on
-_KEPT = 3
-_SIGMA = 30.0  # px on the ground: a displacement from view to view, before it is known
+_LOOK = 8  # steps of every start, cooled twice as fast; only the best go on
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +67,7 @@ class Ground:
         return np.asarray(row * number + col)
 
     def by_moves(self, view: IntArray, views: int) -> Array:
-        """Return the image displacements (2, 2 N - 2, K) [px] of observations by a pixel's move east and
-        north in every view but the first.
-        """
+        """Return the displacements (2, 2 N - 2, K) [px] by a pixel's move east and north in all views but the first."""
         out = np.zeros((2, 2 * (views - 1), len(view)))
         for v in range(1, views):
             rows = np.flatnonzero(view == v)
@@ -107,9 +100,9 @@ class Found:
 
 def proposal(linear: Linear, ground: Ground, base: Fit, extra: Array, sigma: Array) -> Group | None:
     """Return the moving group to start with, beside other explanations, with its unknowns' prior."""
-    few = linear.thinned(_FEW)
+    few = linear.thinned(SAMPLE)
     by_move, cell = ground.by_moves(linear.view, linear.views), ground.cells(CELLS)
-    group = Group(by_move, np.full(by_move.shape[1], _SIGMA), cell, np.full(len(cell), 0.5))
+    group = Group(by_move, np.full(by_move.shape[1], TIMES), cell, np.full(len(cell), 0.5))
     rows = np.zeros(len(cell), dtype=bool)
     for tracks in few.tracks:
         rows[tracks.rows] = True
@@ -117,15 +110,15 @@ def proposal(linear: Linear, ground: Ground, base: Fit, extra: Array, sigma: Arr
         return None
     starts = [replace(group, share=share) for share in _first_shares(ground, rows, base.right)]
     begun = [Mixture(few, extra, sigma, base, start) for start in starts]
-    looks = [one.run(_LOOK, _QUICK) for one in begun]
-    best = sorted(range(len(looks)), key=lambda n: -looks[n].evidence)[:_KEPT]
+    looks = [one.run(_LOOK, COOLED**2) for one in begun]
+    best = sorted(range(len(looks)), key=lambda n: -looks[n].evidence)[:RIVALS]
     ended = [(begun[n].run(), starts[n]) for n in best]
     found, start = max(ended, key=lambda row: row[0].evidence)
     shares = _shares(found.moving, cell, rows)[cell]
     member = moving(linear, extra, replace(start, share=shares), found)
     if np.mean(member[rows] > 0.5) > 0.5:  # of two groups the larger stands
         member = 1.0 - member
-    return replace(group, share=np.clip(member, 1.0 - _LIKELY, _LIKELY))
+    return replace(group, share=member.clip(LEVEL, 1.0 - LEVEL))
 
 
 def price(linear: Linear, cell: IntArray) -> float:
@@ -137,16 +130,16 @@ def price(linear: Linear, cell: IntArray) -> float:
 
 def _first_shares(ground: Ground, rows: BoolArray, right: Array) -> Iterator[Array]:
     """Yield the probabilities (K,) that tracks move, to start from."""
-    cut = np.where(right < 0.5, _LIKELY, 1.0 - _LIKELY)
+    cut = np.where(right < 0.5, 1.0 - LEVEL, LEVEL)
     if (cut[rows] > 0.5).any():
         yield cut
-    cell, place = ground.cells(_STARTS), ground.place
+    cell, place = ground.cells(CELLS // 2), ground.place
     for one in np.unique(cell[rows]):
         inside = cell == one
         middle = np.median(place[:, inside & rows], axis=1, keepdims=True)
         far = np.nan_to_num(np.linalg.norm(place - middle, axis=0))
-        share = np.where(far > np.median(far[rows]), 1.0 - _LIKELY, 0.5)
-        share[inside] = _LIKELY
+        share = np.where(far > np.median(far[rows]), LEVEL, 0.5)
+        share[inside] = 1.0 - LEVEL
         yield share
 
 
@@ -188,7 +181,7 @@ def members(problem: Problem, params: Array, one: Found, block: Block) -> BoolAr
     linear = linearise(part, state, np.ones(len(block.view), dtype=bool), block.sigma, high - low)
     ground = Ground.of(part, state, one.ground)
     by_move, cell = ground.by_moves(block.view, len(block.views)), ground.cells(CELLS)
-    group = Group(by_move, np.full(by_move.shape[1], _SIGMA), cell, one.shares[cell])
+    group = Group(by_move, np.full(by_move.shape[1], TIMES), cell, one.shares[cell])
     found = replace(one.fit, extra=np.zeros(0))
     none = np.zeros((2, 0, len(block.view)))
     return moving(linear, none, group, found) > 0.5

@@ -22,16 +22,11 @@ from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import solve_transposed
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import CHANCE, RIDGE
+from barpc.ba.usual import CHANCE, CRITICAL, KEPT, RIDGE
 from barpc.geodesy import Array, enu_basis
 from barpc.scene import BoolArray, GroundPoints, IntArray
 
-CRITICAL = 4.0
-"""A normalised residual that is larger is no chance: 6e-5 for a component, a thousandth for five points."""
 CHECKED = 0.1  # redundancy of a point that something beside the cameras' priors tells about
-_TOGETHER = 60  # observations whose cameras are solved for at a time
-MOST_TESTED = 1000
-"""Observations of a reference that are tested in the images: of more, every n-th."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +73,7 @@ class ControlTest:
 
     @property
     def sets(self) -> tuple[BoolArray, ...]:
-        """Two sets of points (G,) that contradict each other with equal weight, so that none is used; empty
-        where one is.
-        """
+        """Two sets of points (G,) that contradict each other with equal weight; empty where one is used."""
         return () if self.agreed is None else self.agreed.sets
 
     @property
@@ -202,7 +195,7 @@ def image_test(
             whole[:, view * q : (view + 1) * q] += move
         left[n] -= (shared**2).sum(axis=1)
         waiting.append((n, whole))
-        if len(waiting) == _TOGETHER:
+        if len(waiting) * whole.size > KEPT:
             _take_off(left, waiting, covariance)
     _take_off(left, waiting, covariance)
     with np.errstate(invalid="ignore", divide="ignore"):

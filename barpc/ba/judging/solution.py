@@ -23,18 +23,14 @@ from barpc.ba.robust.rounds import Outcome, Rounds, faintness, revived
 from barpc.ba.robust.smooth import SmoothTest
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import MUCH_NOISE
+from barpc.ba.usual import FLOOR, MUCH_NOISE, STEPS, SURELY
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray
 
-SMOOTH_LEAST = 0.06  # smooth residuals below this [px] are left alone: two views share what one is wrong by
-_TREND = 0.03  # px: another model is tried
-_MUCH_LOST = 0.85  # of a view's observations are to be left
+_TREND = MUCH_NOISE * FLOOR  # px: another model is tried
 _SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
-_STEPS_BACK = 3  # to the delivered cameras, at most: kilometres away, what is left is below a micrometre
-_STANDS = 30.0  # m: what is left after a step from so near is below a millimetre
-_BETTER = 0.8  # of the noise
+_CLEARLY = 0.8  # of the noise, that another start is to leave at most, or of a view's observations at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +74,8 @@ class Solution:
         delivered = self.problem.camera_prior.mean
         if not self.heights.weak.any():  # else their heights are to stay where the adjustment put them
             points = self.state.points
-        for _ in range(_STEPS_BACK):
-            projected, before = mended.project_points(delivered, points), points
-            points = mended.triangulate(points, projected, block.use / block.sigma)
-            if np.nanmax(np.abs(points - before)[some], initial=0.0) < _STANDS:
-                break
+        for _ in range(STEPS):
+            points = mended.triangulate(points, mended.project_points(delivered, points), block.use / block.sigma)
         return np.where(some[:, None], points, np.nan)
 
     @property
@@ -137,10 +130,10 @@ def solve_block(
         projected = problem.project_points(state.params, state.points)
         agree = agreeing(problem.structure, problem.xy, before, projected, block.sigma, block.use)
         again = Rounds(problem, block, state, options, heights, agree).run()
-        if again.noise < _BETTER * outcome.noise and again.inlier.sum() > 0.5 * agree.sum():
+        if again.noise < _CLEARLY * outcome.noise and again.inlier.sum() > 0.5 * agree.sum():
             outcome = again
     drift, asked = problem.cameras.unknowns.drift, dict[str, SmoothTest]()
-    if options.drift is None and prior is None and drift and outcome.smooth.found(SMOOTH_LEAST).any():
+    if options.drift is None and prior is None and drift and outcome.smooth.found(SURELY * FLOOR).any():
         bent = make_problem(block, options, problem.cameras.unknowns.center, None, drift + 1)
         ended, weight = outcome.minimum.state, block.use / block.sigma
         there, _ = revived(problem, ended, outcome.residual, outcome.inlier, weight)
@@ -170,9 +163,7 @@ def _untorn(found: Solution, free: Solution, block: Block, outer: Block, options
 
 
 def _with_control(block: Block, heights: Heights, outcome: Outcome) -> tuple[Agreement, Heights]:
-    """Return the control points that agree with each other at an outcome that none of them holds, and what
-    holds them.
-    """
+    """Return the control points that agree at an outcome that none of them holds, and what holds points."""
     count, first = len(block.gcps.names), block.num_tracks
     mine = (block.point >= first) & (block.point < block.num_known)
     lost = np.isin(np.arange(count), block.point[mine & block.use & ~outcome.inlier] - first)  # by hundreds of sigmas
@@ -202,4 +193,4 @@ def finished(
 def _is_suspect(outcome: Outcome, structure: Structure, use: BoolArray) -> bool:
     """Return whether the rounds may have ended between two solutions: much noise, or a view that lost much."""
     had, kept = (structure.sum_views(rows.astype(np.float64)[None])[:, 0] for rows in (use, outcome.inlier))
-    return outcome.noise > MUCH_NOISE or bool((kept < _MUCH_LOST * had).any())
+    return outcome.noise > MUCH_NOISE or bool((kept < _CLEARLY * had).any())

@@ -15,20 +15,10 @@ import scipy.sparse as sp
 
 from barpc.ba.algebra.structure import Structure, parts
 from barpc.ba.estimated.projected import Projected
-from barpc.ba.usual import FEW
+from barpc.ba.usual import FEW, ITERATIONS, LEVEL, MANY, OUTLIER, STEPS, SURE, TRIALS
 from barpc.geodesy import CHUNK, Array
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.curve import cross
-
-_TRIALS = 150
-_NEAR = 10.0  # sigmas: what a plane cannot follow of a drift and of relief
-_STEPS = 3
-
-_GROUPED = 100  # matches of a pair that may fall into two groups
-_BIMODAL = 0.45  # Sarle's coefficient: 1/3 for a normal distribution, 5/9 for a uniform one
-_APART = 2.0  # standard deviations between two groups
-_SMALLER = 0.05  # part of the smaller one
-_EVIDENT = 15.0  # gain in log-likelihood over one group
 
 
 @dataclass(frozen=True)
@@ -42,7 +32,7 @@ class TwoGroups:
 
 def two_groups(structure: Structure, residual: Array, by_point: Array, use: BoolArray) -> tuple[TwoGroups, ...]:
     """Find the pairs of views whose offsets across the epipolar lines (of observations in use) have two centres."""
-    many = np.repeat(np.diff(structure.pair_bounds) >= _GROUPED, np.diff(structure.pair_bounds))
+    many = np.repeat(np.diff(structure.pair_bounds) >= MANY, np.diff(structure.pair_bounds))
     rows = np.flatnonzero(many & use[structure.first] & use[structure.second])
     offset = _across(residual, by_point, structure.first[rows], structure.second[rows])
     bounds = np.searchsorted(rows, structure.pair_bounds)
@@ -52,22 +42,21 @@ def two_groups(structure: Structure, residual: Array, by_point: Array, use: Bool
     with np.errstate(all="ignore"):
         z = offset - np.repeat(by_pair @ offset / count, count)
         square, cube, fourth = (by_pair @ (z * z * more) / count for more in (1.0, z, z * z))
-        maybe = (cube**2 / square**3 + 1.0) >= _BIMODAL * fourth / square**2
-    for pair in np.flatnonzero(maybe & (count >= _GROUPED)):
+        # Sarle's coefficient is 1/3 for a normal distribution, 5/9 for a uniform one: beyond the middle
+        maybe = (cube**2 / square**3 + 1.0) >= 4.0 / 9.0 * fourth / square**2
+    for pair in np.flatnonzero(maybe & (count >= MANY)):
         share, apart, gain = _mixture(z[bounds[pair] : bounds[pair + 1]])
-        if share > _SMALLER and gain > _EVIDENT:
+        if share > LEVEL and gain > SURE:
             first, second = structure.pair_view[pair].tolist()
             found.append(TwoGroups((first, second), share, apart))
     return tuple(found)
 
 
 def _mixture(z: Array) -> tuple[float, float, float]:
-    """Fit two normal distributions of one width to values of mean 0: share of the smaller, distance of the
-    centres (0 if they are not apart), gain in log-likelihood over one.
-    """
+    """Return the smaller share, distance (0: not apart) and gain [nats] of two normals of one width over one."""
     centers, sigma, part = np.quantile(z, [0.1, 0.9]), 0.5 * z.std(), 0.5
     likelihood = np.ones_like(z)
-    for _ in range(50):
+    for _ in range(ITERATIONS):
         density = np.array([part, 1.0 - part])[:, None] * np.exp(-0.5 * ((z - centers[:, None]) / sigma) ** 2)
         likelihood = density.sum(axis=0) + 1e-300
         first, second = density / likelihood
@@ -79,7 +68,7 @@ def _mixture(z: Array) -> tuple[float, float, float]:
     one = -0.5 * len(z) - len(z) * np.log(z.std())
     gain = float(np.log(likelihood).sum() - len(z) * np.log(sigma) - one)
     apart = float(centers[1] - centers[0])
-    if apart < _APART * sigma:
+    if apart < 2.0 * sigma:  # nearer centres make one mode
         return 0.0, 0.0, gain
     return min(part, 1.0 - part), apart, gain
 
@@ -114,9 +103,7 @@ def agreeing(
 
 
 def _across(residual: Array, by_point: Array, first: IntArray, second: IntArray) -> Array:
-    """Return the offset across the epipolar line (Q,) [px]: what no move of the point takes away from two
-    observations.
-    """
+    """Return the offset across the epipolar line (Q,) [px]: what no move of the point takes away."""
     offset = np.empty(len(first))
     for part in parts(len(first), CHUNK):
         one, two = by_point.take(first[part], axis=2), by_point.take(second[part], axis=2)
@@ -134,17 +121,18 @@ def _on_one_plane(place: Array, offset: Array, spread: Array, seed: int) -> Bool
     low, high = place.min(axis=1, keepdims=True), place.max(axis=1, keepdims=True)
     design = np.vstack([np.ones(len(offset)), 2.0 * (place - low) / np.maximum(high - low, 1.0) - 1.0])
     rng = np.random.default_rng(seed)
-    triples = rng.integers(0, len(offset), (_TRIALS, 3))
+    triples = rng.integers(0, len(offset), (TRIALS, 3))
     matrices = design[:, triples].transpose(1, 2, 0)
     good = np.abs(np.linalg.det(matrices)) > 1e-2
     planes = np.linalg.solve(matrices[good], offset[triples[good]][..., None])[..., 0]
-    flat = np.column_stack([offset[triples[:, 0]], np.zeros((_TRIALS, 2))])
+    flat = np.column_stack([offset[triples[:, 0]], np.zeros((TRIALS, 2))])
     planes = np.concatenate([flat, planes])
-    near = np.abs(planes @ design - offset) < _NEAR * spread
+    spread = 2.0 * OUTLIER * spread  # a plane cannot follow all of a drift and of relief
+    near = np.abs(planes @ design - offset) < spread
     best: BoolArray = near[int(near.sum(axis=1).argmax())]
-    for _ in range(_STEPS):
+    for _ in range(STEPS):
         if best.sum() < 3:
             break
         plane = np.linalg.lstsq(design[:, best].T, offset[best], rcond=None)[0]
-        best = np.abs(plane @ design - offset) < _NEAR * spread
+        best = np.abs(plane @ design - offset) < spread
     return best

@@ -18,7 +18,7 @@ from barpc.ba.evidence.mixture import NEAR_LIMIT, WRONG
 from barpc.ba.held.block import Block
 from barpc.ba.robust.weights import Observations, geman_mcclure
 from barpc.ba.solving.problem import Problem
-from barpc.ba.usual import FEWEST, ITERATIONS, SURELY
+from barpc.ba.usual import BEST, CRITICAL, FEWEST, ITERATIONS, MANY, SLIGHT, STEPS, SURELY
 from barpc.errors import InputError
 from barpc.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.scene import BoolArray, GroundPoints, IntArray
@@ -27,14 +27,7 @@ from barpc.sensor.geometry import triangulate
 
 _SHARE = 0.1
 _STEPS_A_PIXEL = 4.0  # so coarse that rounding draws hardly another track
-_ODD = np.uint64(0x9E3779B97F4A7C15)
-_LEAST = 100  # observations of a view, or its tracks are all needed
-_ROBUST_STEPS = 3
-_WIDE = 4.0  # sigmas
-_LESS = 0.99  # of the error, at most
-_START = 0.2  # of the observations, the nearest: where even of many wrong ones right ones are
-_SAME = 1e-4
-_NOTHING = 1e-12  # of a variance: residuals may be exactly zero
+_NOTHING = float(np.finfo(np.float64).tiny)  # of a variance: residuals may be exactly zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +61,12 @@ def keep_out(block: Block) -> BoolArray:
 
     They are drawn by their image positions alone, so that neither the order of rows nor the names of views matter.
     """
-    few = np.bincount(block.view[block.use], minlength=len(block.views)) < _LEAST
+    few = np.bincount(block.view[block.use], minlength=len(block.views)) < MANY
     needed = np.bincount(block.point[few[block.view] | ~block.use], minlength=block.num_points)
     count = np.bincount(block.point, minlength=block.num_points)
     drawn = np.zeros(block.num_points, dtype=np.uint64)
     col, row = np.rint(block.xy * _STEPS_A_PIXEL).astype(np.int64).astype(np.uint64)
-    np.add.at(drawn, block.point, _scrambled(col * _ODD + row))
+    np.add.at(drawn, block.point, _scrambled(col * np.uint64(0x9E3779B97F4A7C15) + row))
     chosen = _scrambled(drawn) < np.uint64(_SHARE * 2.0**64)
     chosen &= (count >= 2) & (needed == 0) & (np.arange(block.num_points) < block.num_tracks)
     return chosen[block.point]
@@ -106,10 +99,10 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
     counted = np.ones(len(block.view))
     projected = part.project_points(params, first)  # near the end: from here it is linear
     points = part.triangulate(first, projected, 1.0 / block.sigma)
-    for _ in range(_ROBUST_STEPS):  # of three views that do not agree two may
+    for _ in range(STEPS):  # of three views that do not agree two may
         residual = projected.image - block.xy
         residual += (projected.by_point * part.structure.of_points(points - first)).sum(axis=1)
-        counted = geman_mcclure((residual**2).sum(axis=0) / (_WIDE * block.sigma) ** 2)[1]
+        counted = geman_mcclure((residual**2).sum(axis=0) / (CRITICAL * block.sigma) ** 2)[1]
         points = part.triangulate(first, projected, np.sqrt(counted) / block.sigma)
     residual = part.residuals(params, points)
     squared = observations.squared(residual, counted)
@@ -141,11 +134,11 @@ def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
     starts = np.flatnonzero(np.diff(view, prepend=-1))
     count = np.diff(starts, append=len(view)).astype(np.float64)
     ordered = squared[np.lexsort((squared, view))]
-    at = _START * (count - 1.0)
+    at = BEST * (count - 1.0)
     low = ordered[starts + np.floor(at).astype(np.int64)]
     middle = low + (at % 1.0) * (ordered[starts + np.ceil(at).astype(np.int64)] - low)
     far = np.maximum(ordered[starts + count.astype(np.int64) - 1], _NOTHING)
-    variance, wrong = np.maximum(middle / _START, _NOTHING), np.full(len(count), WRONG[0] / WRONG[1])
+    variance, wrong = np.maximum(middle / BEST, _NOTHING), np.full(len(count), WRONG[0] / WRONG[1])
     farthest, constant = half * np.log(half * far[view]) - gammaln(half + 1.0), half * squared
     moves = np.ones(len(count), dtype=bool)  # of a view that stands nothing changes any more
     for _ in range(ITERATIONS):
@@ -153,7 +146,7 @@ def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
         right = expit(peak - constant / variance[view] - np.log(wrong / (1.0 - wrong))[view])
         of_right, squares = (np.add.reduceat(rows, starts) for rows in (right, right * squared))
         found = np.maximum(squares / np.maximum(of_right, 1e-300), _NOTHING)
-        stands = np.abs(found - variance) < _SAME * variance
+        stands = np.abs(found - variance) < SLIGHT * variance
         variance = np.where(moves, found, variance)
         wrong = np.where(moves, (WRONG[0] + count - of_right) / (WRONG[1] + count), wrong)
         moves &= ~stands
@@ -167,11 +160,11 @@ def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:
 
     Track by track, as the same noise is in both; where one is wrong, by no more than so much.
     """
-    if not len(block.point) or not one.error < _LESS * other.error:
+    if not len(block.point) or not one.error < other.error:
         return False
     index, point = np.unique(block.point, return_inverse=True)
     cost = [(h.residual**2).sum(axis=0) / (other.error * block.sigma) ** 2 for h in (one, other)]
-    less = np.bincount(point, (cost[1] / (1.0 + cost[1] / _WIDE**2)) - (cost[0] / (1.0 + cost[0] / _WIDE**2)))
+    less = np.bincount(point, geman_mcclure(cost[1] / CRITICAL**2)[0] - geman_mcclure(cost[0] / CRITICAL**2)[0])
     return bool(less.mean() > SURELY * less.std() / np.sqrt(len(index)))
 
 
@@ -191,9 +184,7 @@ class CheckResiduals:
     ground: Array
 
     def rms(self) -> tuple[Array, Array]:
-        """Return the root mean squares: col, row (2,) [px]; east, north, up (3,) [m], NaN without a
-        triangulated point.
-        """
+        """Return the RMS col, row (2,) [px]; east, north, up (3,) [m], NaN without a triangulated point."""
         known = np.isfinite(self.ground).all(axis=1)
         ground = np.full(3, np.nan)
         if known.any():

@@ -12,10 +12,9 @@ import numpy as np
 
 from barpc.ba.held.block import Block
 from barpc.ba.held.ground import ALIKE
+from barpc.ba.usual import MANY
 from barpc.geodesy import Array, metres_per_unit
 from barpc.scene import BoolArray, IntArray
-
-_ASKED = 400  # points of a view whose neighbours are counted, at most: they lie on a grid
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +29,7 @@ class Resemblance:
 
     @classmethod
     def of(cls, block: Block, terms: int) -> Resemblance | None:
-        """Return the noise correlation of a block's observations, with `terms` of smooth errors; None without
-        a reference.
-        """
+        """Return the noise correlation of observations, beside `terms` of smooth errors; None without reference."""
         given = block.reference
         if given is None:
             return None
@@ -46,7 +43,7 @@ class Resemblance:
         for view in np.unique(block.view[rows]):
             own = np.flatnonzero(rows & (block.view == view))
             ties = ~rows & (block.view == view)
-            asked = own[:: -(-len(own) // _ASKED)]
+            asked = own[:: -(-len(own) // MANY)]  # they lie on a grid
             alike = found.overlap(asked[:, None], own[None]).sum(axis=1).mean()
             share[own] = 1.0 / (alike + len(own) / (terms * ALIKE))
             usual = np.median(block.sigma[ties] if ties.any() else block.sigma[own])

@@ -13,29 +13,34 @@ from barpc.ba.held.block import Block
 from barpc.ba.held.ground import Heights
 from barpc.ba.robust.resembling import Resemblance
 from barpc.ba.robust.smooth import TERMS, Fit, Smooth, SmoothTest
-from barpc.ba.robust.variances import SAME_PRIOR, STANDS, PriorTest, Variances, same_prior
+from barpc.ba.robust.variances import SAME_PRIOR, PriorTest, Variances, same_prior
 from barpc.ba.robust.weights import LOSSES, MEDIAN, Observations
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
-from barpc.ba.usual import BACKFITTING, CRITICAL, GROSS, MUCH_NOISE, OUTLIER, SHRINK, SURELY
+from barpc.ba.usual import (
+    BACKFITTING,
+    BEST,
+    CRITICAL,
+    GROSS,
+    ITERATIONS,
+    LEAST_NOISE,
+    MUCH_NOISE,
+    OUTLIER,
+    SHRINK,
+    SLIGHT,
+    STANDS,
+    STEPS,
+    SURELY,
+)
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)
 
-_LOW = 0.2  # part of the observations, and the |r|^2 over its expectation that they stay below, about
-_LEAST_NOISE = 0.5  # of the stated sigmas, while outliers are about
-_SAME = 1e-3  # a cut that changes less than this part of the observations is not solved again
-_SAME_NOISE = 0.02  # nor is a change of the noise by less than this part
 _SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each view by itself
 _MANY_CUT = 0.01  # of the observations: more are looked at again
-_REVIVING = 2
-_ROBUST_ROUNDS = 20
-_FEW = 0.002  # of the observations farther away than that: there is nothing to be careful about
-_NEAR = 12.0  # sigmas: a loss that is no wider asks what is smooth
 MAX_PASSES = 5  # rounds of cutting and solving, at most: they end when nothing changes
-_FIRST_TOLERANCE = 0.1  # of the first pass after robust rounds: the second, which follows always, is exact
 
 
 @dataclass(frozen=True)
@@ -91,10 +96,7 @@ class Rounds:
         # what the same unknowns ended with is gone on with: cut, accuracies, misfit
         self.goes_on = known is not None and known.problem.cameras.unknowns is unknowns
         if known is not None and self.goes_on:
-            self.problem, use = (
-                replace(self.problem, camera_prior=known.problem.camera_prior),
-                use & known.inlier,
-            )
+            self.problem, use = (replace(self.problem, camera_prior=known.problem.camera_prior), use & known.inlier)
         self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
         self.use = self.observations.tied(use & self.everything)
         self.counted = (self.use if known is None else self.use & known.inlier).astype(np.float64)
@@ -118,14 +120,7 @@ class Rounds:
         """Run the robust rounds, under priors wide enough for what is not expected."""
         start = replace(self.problem, camera_prior=self.variances.for_search())
         self.state, self.residual, self.counted, self.noise, self.projected = _robust(
-            start,
-            self.observations,
-            self.state,
-            self.residual,
-            self.projected,
-            self.use,
-            self.options,
-            self.smooth,
+            start, self.observations, self.state, self.residual, self.projected, self.use, self.options, self.smooth
         )
         self.misfit = self.smooth.test(self.residual, self.use).rms
 
@@ -146,8 +141,8 @@ class Rounds:
         numbers = self.passes, self.use.sum(), len(self.use), self.noise
         _LOG.info("pass %d: %d of %d observations, noise %.3f", *numbers)
         again = self.passes > 1 or self.goes_on
-        same = again and int((self.use != was_in_use).sum()) <= _SAME * len(self.use)
-        settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < _SAME_NOISE
+        same = again and int((self.use != was_in_use).sum()) <= SLIGHT * len(self.use)
+        settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < STANDS
         # what is known of the place goes with what is shared, and nothing else learns of it
         share = STANDS if tested.shared > 1.0 else SAME_PRIOR
         settled &= same_prior(prior, self.problem.camera_prior, share)
@@ -183,7 +178,7 @@ class Rounds:
         """Return the least squares of what is used; a second pass follows the first robust one always, and is exact."""
         again = self.passes > 1 or self.goes_on
         solver = "sparse" if self.options.solver == "auto" and self.passes == 1 else self.options.solver
-        tolerance = TOLERANCE if again or not self.robust else _FIRST_TOLERANCE
+        tolerance = TOLERANCE if again or not self.robust else STANDS
         noise = self.noise if self.options.estimate_noise else 1.0
         self.weight = weight = self.observations.weight(self.use, noise, self.misfit)
         found = minimise(self.problem, self.state, weight, solver, tolerance, self.projected)
@@ -264,17 +259,17 @@ def _robust(
     loss = LOSSES[options.loss]
     counted, scale, noise = use.astype(np.float64), np.inf, 1.0
     s = observations.squared(residual, counted)
-    for _ in range(_ROBUST_ROUNDS):
-        least = float(np.sqrt(np.quantile(s[use], _LOW) / _LOW)) if use.any() else 1.0
-        noise = max(float(np.sqrt(_median(s, counted) / MEDIAN)), least, _LEAST_NOISE)
+    for _ in range(ITERATIONS):
+        least = float(np.sqrt(np.quantile(s[use], BEST) / BEST)) if use.any() else 1.0
+        noise = max(float(np.sqrt(_median(s, counted) / MEDIAN)), least, LEAST_NOISE)
         if scale <= 3.6 * noise:
             break
-        clean = noise < MUCH_NOISE and float((s[use] > (OUTLIER * noise) ** 2).mean()) < _FEW
+        clean = noise < MUCH_NOISE and float((s[use] > (OUTLIER * noise) ** 2).mean()) < SLIGHT
         scale = SURELY * noise if np.isinf(scale) or clean else max(SURELY * noise, SHRINK * scale)
         counted = _counted(observations, use, s, loss(s / scale**2)[1])
         state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)
         residual, projected = problem.prepare(state.params, state.points)
-        near = scale <= _NEAR * noise
+        near = scale <= SURELY / SHRINK * noise  # a step from the end
         s = observations.squared(residual - smooth.part(residual, counted) if near else residual, counted)
         counted = _counted(observations, use, s, loss(s / scale**2)[1])
     return state, residual, counted, noise, projected
@@ -294,7 +289,7 @@ def revived(problem: Problem, state: State, residual: Array, use: BoolArray, wei
     structure = problem.structure
     dead = structure.sum_points(use[None].astype(np.float64))[0] == 0
     points = state.points.copy()
-    for _ in range(_REVIVING):
+    for _ in range(STEPS):
         moved = problem.triangulate(points, problem.project_points(state.params, points), weight)
         points[dead] = moved[dead]
     again = problem.residuals(state.params, points)

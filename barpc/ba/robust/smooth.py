@@ -144,9 +144,7 @@ class Smooth:
         return most
 
     def _beyond_noise(self, product: Array, square: Array, order: IntArray) -> tuple[Array, float]:
-        """Return the products (n - 1,) of neighbours (n,) without what the noise that they share makes of
-        them; their number.
-        """
+        """Return the products (n - 1,) of neighbours (n,) beyond the noise that they share; their number."""
         assert self.alike is not None
         first, second = order[:-1], order[1:]
         same = self.alike.correlation(first, second)

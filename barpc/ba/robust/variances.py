@@ -22,23 +22,17 @@ from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum
-from barpc.ba.usual import CHANCE, GROSS, LEVEL, SMALL, SURE
+from barpc.ba.usual import CHANCE, GROSS, ITERATIONS, LEVEL, SMALL, STANDS, STATED, SURE, TIMES
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, View
 
 _LOG = logging.getLogger(__name__)
 
-_STRENGTH = 4.0  # degrees of freedom with which the given figure counts beside what the block shows
 _LIKELIER = -np.log(LEVEL)  # but one odd view is named where all being worse than stated is as improbable beside it
-_SEARCH = 10.0  # times the drift's standard deviation while outliers are looked for
 _MOVING = 0.01  # of a rotation, as drift: the centre it turns about flies some km while an image is taken
-_LOW = 0.1  # then as much is let be as leaves what is seen this likely: a prior too narrow bends all heights alike
-_ITERATIONS = 10
-STANDS = 0.05  # change of a standard deviation, as a logarithm, below which it stands
-SAME_PRIOR = 0.2  # the same, below which a block is not solved again
+SAME_PRIOR = 0.2  # change of a standard deviation, as a logarithm, below which a block is not solved again
 LEAST_WAVES = 0.01  # px: of splines and steps, counting as one observation
-_OWN = 2.0  # as many degrees of freedom has the size of all views beside that of one
 _LEAST = 0.5  # degrees of freedom below which nothing is said
 
 
@@ -100,12 +94,7 @@ class Variances:
 
     @classmethod
     def of(
-        cls,
-        given: CameraPrior,
-        unknowns: Unknowns,
-        options: AdjustOptions,
-        control: bool,
-        views: Sequence[View] = (),
+        cls, given: CameraPrior, unknowns: Unknowns, options: AdjustOptions, control: bool, views: Sequence[View] = ()
     ) -> Variances:
         """Return the priors to be learnt by the options, with control points or without."""
         geometric = unknowns.geometric and options.learn_priors
@@ -120,7 +109,7 @@ class Variances:
 
     def for_search(self) -> CameraPrior:
         """Return the wider priors used while outliers are looked for, so that unexpected drift is not cut."""
-        return self._prior(np.ones(len(self.given.sigma)), np.full(self._degrees, _SEARCH))
+        return self._prior(np.ones(len(self.given.sigma)), np.full(self._degrees, TIMES))
 
     def learnt(self, problem: Problem, minimum: Minimum, exact: bool = False) -> tuple[CameraPrior, PriorTest]:
         """Estimate the priors that the block supports, in its linearisation at a minimum.
@@ -150,7 +139,7 @@ class Variances:
         ratio = total / freedom if freedom > _LEAST else float("nan")
         shared = self._shared(params, known)
         stands = not self.learn_drift
-        for _ in range(2 * _ITERATIONS):
+        for _ in range(ITERATIONS):
             before = prior
             if self.learn_waves:
                 self = self._going_on(self._waves(params, known, prior.sigma))
@@ -211,7 +200,7 @@ class Variances:
             learnt = np.isfinite(sigma[:, rows[0]])  # those of an earlier block are in its matrix
             squares, freedom = (learnt * part.sum(axis=1) for part in (params[:, rows] ** 2, known[:, rows]))
             common = (LEAST_WAVES**2 + squares.sum()) / (1.0 + freedom.sum())
-            size = np.sqrt((_OWN * common + squares) / (_OWN + freedom))
+            size = np.sqrt((STATED * common + squares) / (STATED + freedom))
             out[:, rows] = np.where(learnt, size, np.inf)[:, None]
         return out
 
@@ -249,9 +238,7 @@ class Variances:
     def _squares(
         self, params: Array, known: Array, scale: Array | float = 1.0, part: slice | None = None
     ) -> tuple[Array, Array]:
-        """Return the squared unknowns of every view (the constants, or a part) over their variances, and
-        their freedom (N,).
-        """
+        """Return the squared unknowns (constants, or a part) of every view over their variances, their freedom (N,)."""
         part = slice(self.constants) if part is None else part
         sigma = self.given.sigma[:, part] * np.reshape(scale, (-1, 1))
         squared = ((params - self.given.mean)[:, part] / sigma) ** 2
@@ -266,7 +253,7 @@ class Variances:
         """Return the factors (N,) by which each view's prior is widened, and the views that are odd."""
         n = len(params)
         total, freedom = self._squares(params, known)
-        factor = max((_STRENGTH + total.sum()) / (_STRENGTH + freedom.sum()), 1.0)
+        factor = max((STATED + total.sum()) / (STATED + freedom.sum()), 1.0)
         if self.cautious:
             factor = max(factor, _possible(total.sum(), freedom.sum()))
         odd = np.zeros(n, dtype=bool)
@@ -281,9 +268,9 @@ class Variances:
             return (np.maximum(scale, common) if both_may_be else common), odd
         if n > 2 and not around.small:  # one view of many is seen at once
             own = np.median(total[freedom > _LEAST] / freedom[freedom > _LEAST])
-            factor = max((_STRENGTH + own * freedom.sum()) / (_STRENGTH + freedom.sum()), 1.0)
+            factor = max((STATED + own * freedom.sum()) / (STATED + freedom.sum()), 1.0)
             odd = np.asarray(chdtrc(np.maximum(freedom, _LEAST), total / factor) < LEVEL / n)
-        alone = (_STRENGTH * factor + total) / (_STRENGTH + freedom)
+        alone = (STATED * factor + total) / (STATED + freedom)
         return np.sqrt(np.where(odd, np.maximum(alone, factor), factor)), odd
 
     def _odd(self, around: _Around, wide: Array) -> tuple[Array, BoolArray, float]:
@@ -314,7 +301,7 @@ class Variances:
             return -np.inf, 1.0
         known = self._known(covariance, prior)
         total, freedom = (part[v] for part in self._squares(params, known))
-        trial[v] = max(np.sqrt((_STRENGTH + total) / (_STRENGTH + freedom)), 1.0)
+        trial[v] = max(np.sqrt((STATED + total) / (STATED + freedom)), 1.0)
         return around.under(self._prior(trial, wide))[0], float(trial[v])
 
     def _drift(self, params: Array, known: Array) -> Array:
@@ -324,7 +311,7 @@ class Variances:
         factors = np.ones(self._degrees)
         for degree in range(self._degrees):
             total, freedom = (x.sum() for x in self._squares(params, known, part=self._drift_part(degree)))
-            factors[degree] = (_STRENGTH + total) / (_STRENGTH + freedom)
+            factors[degree] = (STATED + total) / (STATED + freedom)
             if careful and freedom > _LEAST and chdtrc(freedom, total) < CHANCE:
                 factors[degree] = max(factors[degree], _possible(total, freedom))
         return np.sqrt(factors)
@@ -332,7 +319,7 @@ class Variances:
 
 def _possible(total: float, freedom: float) -> float:
     """Return a variance, in units of the one given, that still makes such a sum of squares likely enough."""
-    return float(total / (2.0 * gammaincinv(0.5 * freedom, _LOW)))
+    return float(total / (2.0 * gammaincinv(0.5 * freedom, LEVEL)))
 
 
 def same_prior(a: CameraPrior, b: CameraPrior, share: float, part: slice | None = None) -> bool:
