@@ -31,6 +31,7 @@ SETTLED = 1e-4
 """Of the last of these steps [px or m], where they are quadratic: what it leaves is below rounding."""
 CHUNK = 8192
 """Points worked on at a time, so that temporaries stay in cache."""
+np.empty(32 * 2**20 - 2**16, dtype=np.uint8)  # its end tells glibc to keep what is freed: pages taken again cost faults
 _RAD = np.pi / 180.0
 
 

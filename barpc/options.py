@@ -335,8 +335,7 @@ class AdjustOptions(Options):
     )
     solver: Literal["auto", "scipy", "sparse"] = option(
         "auto",
-        """scipy's `least_squares` on the compressed problem, or a sparse Levenberg-Marquardt; `auto` goes by the
-        number of unknowns.""",
+        """scipy's `least_squares` on the compressed problem, or a sparse Levenberg-Marquardt, which `auto` takes.""",
     )
 
     def __post_init__(self) -> None:

@@ -177,11 +177,10 @@ class Rounds:
     def _solve(self) -> Minimum:
         """Return the least squares of what is used; a second pass follows the first robust one always, and is exact."""
         again = self.passes > 1 or self.goes_on
-        solver = "sparse" if self.options.solver == "auto" and self.passes == 1 else self.options.solver
         tolerance = TOLERANCE if again or not self.robust else STANDS
         noise = self.noise if self.options.estimate_noise else 1.0
         self.weight = weight = self.observations.weight(self.use, noise, self.misfit)
-        found = minimise(self.problem, self.state, weight, solver, tolerance, self.projected)
+        found = minimise(self.problem, self.state, weight, self.options.solver, tolerance, self.projected)
         state = found.state
         self.residual, self.projected = found.ahead or self.problem.prepare(state.params, state.points)
         cost = self.problem.cost(state.params, state.points, self.residual * weight)

@@ -28,7 +28,6 @@ _LOG = logging.getLogger(__name__)
 
 MAX_STEPS = 30  # linearisations of one solve, at most
 TOLERANCE = 1e-6  # a solve ends when a step would lower the cost by less than this fraction
-SCIPY_UNKNOWNS = 200  # (22 views of 9) up to which "auto" takes scipy, whose dense work grows as their cube
 _XTOL = 1e-12
 _ROUNDING = 1e-9  # a cost does not fall any more where the step promises less than this fraction
 _LOST = 1e-6  # nor where it promises less than this one, and no damping however strong makes it fall
@@ -83,7 +82,7 @@ def minimise(
     problem: Problem,
     state: State,
     weight: Array,
-    solver: str = "auto",
+    solver: str = "sparse",
     tolerance: float = TOLERANCE,
     projected: Projected | None = None,
 ) -> Minimum:
@@ -99,9 +98,6 @@ def minimise(
         The cost is not finite, or no step lowers it.
     """
     start = time.process_time()
-    unknowns = int(problem.free.sum())
-    if solver == "auto":
-        solver = "scipy" if 0 < unknowns <= SCIPY_UNKNOWNS else "sparse"
     result = None
     if solver == "scipy":
         try:
@@ -112,7 +108,8 @@ def minimise(
     if result is None:
         result = _levenberg_marquardt(problem, state, weight, tolerance, projected)
     seconds = time.process_time() - start
-    _LOG.info("%s: %d unknowns, cost %.6g, %.2f s", solver, unknowns, result.state.cost, seconds)
+    numbers = problem.free.sum(), result.state.cost, seconds
+    _LOG.info("%s: %d unknowns, cost %.6g, %.2f s", "scipy" if solver == "scipy" else "sparse", *numbers)
     return result
 
 
