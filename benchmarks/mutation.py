@@ -41,7 +41,7 @@ ROOT = Path(__file__).resolve().parents[1]
 TOML = Path(__file__).with_suffix(".toml")
 TOP = "top"
 LONGEST = 1200.0  # seconds of a part's tests without a mutant
-LOADED = ["cv2", "pyproj", "pytest", "rasterio", "shapely"]  # once: every run would take seconds to do so
+LOADED = ["cv2", "hypothesis", "pyproj", "pytest", "rasterio", "scipy.ndimage", "scipy.stats", "shapely"]  # once: every run would take seconds
 SKIPPED = (".git", "__pycache__", ".venv", "site", "dist", ".*_cache")  # of a tree that is copied
 
 COMPARISONS = {
@@ -246,7 +246,7 @@ class Tree:
     """A copy of the working tree, in which tests are run."""
 
     def __init__(self, folder: Path) -> None:
-        self.root = folder
+        self.root, self.versions = folder, 0
         shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(*SKIPPED), dirs_exist_ok=True)
 
     def caught(self, mutant: Mutant, tests: list[str], limit: float, slow: float = 0.0) -> tuple[bool, str, float]:
@@ -257,7 +257,11 @@ class Tree:
         """
         target = self.root / mutant.file
         before, after = mutant.source()
+        written = target.stat().st_mtime
+        self.versions += 1
         target.write_text(after)
+        # compiled code is kept by the time and length of its source: no two versions of a file have the same
+        os.utime(target, (written, written + 10.0 * self.versions))
         named = target.stem.removeprefix("_")
         order = sorted(tests, key=lambda path: named not in Path(path).name)
         try:
@@ -267,6 +271,7 @@ class Tree:
             found, test, more = self.failing(order, slow, "slow and not nightly")
         finally:
             target.write_text(before)
+            os.utime(target, (written, written))
         place = re.match(r"(?:FAILED|ERROR) (\S+?)(?:\[| - |$)", test)
         real = found and place is not None and not self.failing([place[1]], LONGEST, "slow and not nightly")[0]
         return real, test if real else "", seconds + more
@@ -299,10 +304,10 @@ class Tree:
         sys.path.insert(0, str(self.root))
         for name in [name for name in sys.modules if name.split(".")[0] in ("barpc", "benchmarks", "tests")]:
             del sys.modules[name]
-        # code kept of a mutant could be taken for that of the next one: same second, same length
-        sys.dont_write_bytecode = True
+        sys.dont_write_bytecode = False  # compiled once, not for every mutant
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
         shared = os.environ.get("BARPC_SHARED", str(ROOT.parent / "shared"))
-        os.environ.update(PYTHONPATH=str(self.root), BARPC_SHARED=shared, PYTHONDONTWRITEBYTECODE="1")
+        os.environ.update(PYTHONPATH=str(self.root), BARPC_SHARED=shared)
         clock = Clock(self.root / "seconds.json")
         arguments = ["-x", "-q", "-m", marks, "-p", "no:cacheprovider", *tests]
         with log.open("w") as file:
