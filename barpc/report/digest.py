@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from barpc.ba.judging.judge import LARGEST
+from barpc.ba.usual import LARGEST
 from barpc.report.reservations import GOOD_RMSE
 from barpc.report.summary import Summary
 from barpc.report.summary.known import ControlTestEntry
