@@ -350,7 +350,7 @@ def _place(found: Solution, block: Block, covariance: Covariance) -> tuple[Gauge
     """
     known, outcome = (block.num_tracks, block.num_known), found.outcome
     gauge = _gauge(found, block, covariance)
-    shares = datum_shares(covariance, gauge.by_unknown, outcome.problem, found.final, outcome.weight, *known)
+    shares = datum_shares(covariance, gauge.by_unknown, outcome.problem, found.final, outcome.weight, known)
     return gauge, shares
 
 

@@ -72,7 +72,7 @@ def hold_by_altimetry(
         return found, replace(test, why_not=why_not)
     least = 2 if found.heights.is_whole else 1  # a terrain keeps every second one
     chosen = np.arange(0, len(ties), max(-(-len(ties) // _MOST), least))
-    placed = _placed(points, ties[chosen], local[chosen], enu, radius, registered, np.sqrt(np.diag(known)))
+    placed = _placed(points, ties[chosen], local[chosen, :2] / radius, enu, registered, np.sqrt(np.diag(known)))
     tried = _solved(found, block, outer, options, placed)
     if is_better(found.after, tried.after, outer):
         return found, replace(test, why_not="held by them, the images would agree less with each other")
@@ -111,10 +111,12 @@ def _why_not(registered: Registration, known: Array, is_held: bool) -> str:
 
 
 def _placed(
-    points: Array, index: IntArray, local: Array, enu: Array, radius: float, registered: Registration, before: Array
+    points: Array, index: IntArray, at: Array, enu: Array, registered: Registration, before: Array
 ) -> PointPrior:
-    """Return the tie points held where the motion takes them, with its errors in common and bends that stay open."""
-    at = local[:, :2] / radius
+    """Return the tie points held where the motion takes them, with its errors in common and bends that stay open.
+
+    They lie `at` (n, 2) radii of the scene.
+    """
     moves = displacement(at)
     # what the points' own errors add to the motion's variance is a twentieth of it
     own = float(np.sqrt(LEVEL * np.diag(registered.covariance)[:3].min() * len(index)))
@@ -131,7 +133,7 @@ def _solved(found: Solution, block: Block, outer: Block, options: AdjustOptions,
     """Return the block solved again from where it ended, held at some tie points."""
     held = replace(found, heights=replace(found.heights, placed=placed))
     state = found.final
-    rounds = Rounds(found.problem, block, state, options, held.heights, block.use, found.outcome)
+    rounds = Rounds(found.problem, block, state, held.heights, block.use, found.outcome)
     return finished(held, found.problem, block, outer, options, rounds.run())
 
 

@@ -609,11 +609,11 @@ def test_only_observations_of_known_points_are_looked_at_again_for_the_datum(cas
 
     monkeypatch.setattr(Cameras, "project", counted)
     given = covariance, report.by_unknown, case.problem, _state(case), case.weight
-    shares = datum_shares(*given, 12, 12)
+    shares = datum_shares(*given, (12, 12))
     assert not asked
     assert shares["gcps"].max() == shares["fixed_views"].max() == shares["reference"].max() == 0.0
     np.testing.assert_allclose(shares["cameras"] + shares["heights"], 1.0)
-    datum_shares(*given, 11, 12)
+    datum_shares(*given, (11, 12))
     assert asked == [np.count_nonzero((case.problem.structure.point == 11) & (case.weight > 0))]
 
 
@@ -629,7 +629,7 @@ def test_the_shares_of_the_datum_are_what_each_row_pays_of_the_cheapest_move(fix
     use = np.ones(12, dtype=bool)
     covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
     report = gauge_report(covariance, case.points, case.points, use)
-    found = datum_shares(covariance, report.by_unknown, case.problem, _state(case), case.weight, 10, known)
+    found = datum_shares(covariance, report.by_unknown, case.problem, _state(case), case.weight, (10, known))
 
     middle = case.points.mean(axis=0)
     enu = enu_of(*ground_of(middle)[:2])

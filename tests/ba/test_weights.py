@@ -159,14 +159,7 @@ def robust(
     problem: Any = SimpleNamespace(prepare=lambda params, points: (np.zeros(1), "projected"))
     state: Any = SimpleNamespace(params=None, points=None)
     _, _, counted, noise, _ = _robust(
-        problem,
-        made,
-        state,
-        np.zeros(1),
-        None,
-        np.ones(n, dtype=bool),
-        AdjustOptions(),
-        SimpleNamespace(part=part),
+        problem, made, (state, np.zeros(1), None), np.ones(n, dtype=bool), AdjustOptions(), SimpleNamespace(part=part)
     )  # type: ignore[arg-type]
     return scales[::2], smooth[::2], noise, counted
 

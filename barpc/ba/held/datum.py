@@ -28,13 +28,7 @@ _OF_HEIGHTS = 3  # with a reference: errors in common that are a terrain's, in f
 
 
 def datum_shares(
-    covariance: Covariance,
-    by_unknown: Array,
-    problem: Problem,
-    state: State,
-    weight: Array,
-    num_tracks: int,
-    num_known: int,
+    covariance: Covariance, by_unknown: Array, problem: Problem, state: State, weight: Array, known: tuple[int, int]
 ) -> Mapping[str, Array]:
     """Return the share (10,) that each source has in what is known of the scene's motions; NaN where no free
     camera tells.
@@ -44,7 +38,7 @@ def datum_shares(
     covariance : Covariance, at the solution
     by_unknown : (10, N q), motions by the unknowns of the cameras
     problem, state, weight : as solved last, and 1 / sigma of every observation (K,)
-    num_tracks, num_known : int, points from the first on are GCPs, from the second on a reference's
+    known : (int, int), points from the first on are GCPs, from the second on a reference's
     """
     moves = covariance.solve(by_unknown.T)
     variance = np.einsum("mn,nm->m", by_unknown, moves)
@@ -60,9 +54,9 @@ def datum_shares(
         reduced = _at_rest(covariance.reduced)
         points = np.stack([reduced.point_step(unknowns[..., m]) for m in range(len(variance))], axis=-1)
         number = np.arange(problem.structure.num_points)
-        kinds = {"gcps": (number >= num_tracks) & (number < num_known), "reference": number >= num_known}
+        kinds = {"gcps": (number >= known[0]) & (number < known[1]), "reference": number >= known[1]}
         held = _known_points(paid, problem, reduced, unknowns, points, kinds)
-        _observations(paid, problem, state, weight, unknowns, points, held)
+        _observations(paid, problem, state, weight, (unknowns, points), held)
     with np.errstate(invalid="ignore"):
         return {source: cost / sum(paid.values()) for source, cost in paid.items()}
 
@@ -112,12 +106,11 @@ def _observations(
     problem: Problem,
     state: State,
     weight: Array,
-    unknowns: Array,
-    points: Array,
+    moves: tuple[Array, Array],
     held: Mapping[str, BoolArray],
 ) -> None:
-    """Add what the observations of known points pay, and those of tie points in fixed views."""
-    structure = problem.structure
+    """Add what the observations of known points pay, and those of tie points in fixed views, by moves of both."""
+    structure, (unknowns, points) = problem.structure, moves
     is_free = problem.free[:: len(problem.free) // structure.num_views]  # views are free or fixed as a whole
     known = np.any(list(held.values()), axis=0)
     if is_free.all() and not known.any():

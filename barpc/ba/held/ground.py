@@ -85,7 +85,7 @@ def terrain_heights(
     if level is not None:
         slopes[level] = 0.0
     normal = np.column_stack([-slopes, np.ones(len(alt))])
-    return _heights(ground, index, alt, normal, sigma, common_sigma, span)
+    return _heights(np.column_stack([ground[:, :2], alt]), index, normal, sigma, common_sigma, span)
 
 
 def _believed_heights(ground: Array, index: IntArray, believed: Believed, common_sigma: Array) -> PointPrior:
@@ -95,7 +95,7 @@ def _believed_heights(ground: Array, index: IntArray, believed: Believed, common
     scene's edges.
     """
     normal, sigma = np.column_stack([-believed.slopes, np.ones(len(ground))]), believed.effective_sigma
-    held = _heights(ground, index, believed.alt, normal, sigma, 0.0)
+    held = _heights(np.column_stack([ground[:, :2], believed.alt]), index, normal, sigma, 0.0)
     common = np.zeros((len(held.index), 3, NUM_BENDS))
     common[:, 0] = believed.bends[np.isfinite(believed.alt)] * (common_sigma / sigma)
     return replace(held, common=common)
@@ -104,27 +104,21 @@ def _believed_heights(ground: Array, index: IntArray, believed: Believed, common
 def flat_heights(points: Array, index: IntArray, alt: float, sigma: float, common_sigma: float) -> PointPrior:
     """Return priors that hold points to one altitude [m]: each within `sigma`, all within `common_sigma` [m]."""
     ground = ground_from_ecef(points[index])
-    n = len(index)
-    return _heights(ground, index, np.full(n, alt), np.tile([0.0, 0.0, 1.0], (n, 1)), sigma, common_sigma)
+    ground[:, 2] = alt
+    return _heights(ground, index, np.tile([0.0, 0.0, 1.0], (len(index), 1)), sigma, common_sigma)
 
 
 def staying(points: Array, index: IntArray) -> PointPrior:
     """Return priors that hold points `index` (Q,) of (P, 3), ECEF [m], each to its present altitude."""
     ground = ground_from_ecef(points[index])
-    return _heights(ground, index, ground[:, 2], np.tile([0.0, 0.0, 1.0], (len(index), 1)), _STAYS, 0.0)
+    return _heights(ground, index, np.tile([0.0, 0.0, 1.0], (len(index), 1)), _STAYS, 0.0)
 
 
 def _heights(
-    ground: Array,
-    index: IntArray,
-    alt: Array,
-    normal: Array,
-    sigma: float,
-    common_sigma: float,
-    span: Array | None = None,
+    foot: Array, index: IntArray, normal: Array, sigma: float, common_sigma: float, span: Array | None = None
 ) -> PointPrior:
-    known = np.isfinite(alt)
-    foot = np.column_stack([ground[known, :2], alt[known]])
+    known = np.isfinite(foot[:, 2])
+    foot = foot[known]
     rows, common = np.zeros((len(foot), 3, 3)), np.zeros((len(foot), 3, 3))
     rows[:, 0] = np.einsum("qe,qex->qx", normal[known], enu_basis(foot)) / sigma
     common[:, 0, 0] = common_sigma / sigma

@@ -170,5 +170,5 @@ def _with_waves(
         count = np.bincount(block.point[known], minlength=bent.structure.num_points)
         weight, known = weight * (known | (count < 2)[block.point]), np.zeros_like(known)
     there, _ = revived(bent, replace(ended, params=params), outcome.residual, known, weight)
-    outcome = Rounds(bent, block, there, options, found.heights, block.use, outcome).run(once)
+    outcome = Rounds(bent, block, there, found.heights, block.use, outcome).run(once)
     return finished(found, bent, block, outer, options, outcome)

@@ -120,16 +120,16 @@ def solve_block(
     state, given = first_state(problem, block, options, dem)
     heights = given.loose(LOOSE) if block.gcps.names else given
     start = measure(problem, state.params, outer)
-    rounds = Rounds(problem, block, state, options, heights, block.use)
+    rounds = Rounds(problem, block, state, heights, block.use)
     before, agreed, free = rounds.residual, None, None
     if block.gcps.names and not (block.point < block.num_tracks).any():  # control is all that holds the cameras
         agreed, heights = _with_control(block, given, rounds.run(once=True))
-        rounds = Rounds(problem, block, state, options, heights, block.use)
+        rounds = Rounds(problem, block, state, heights, block.use)
     outcome = rounds.run()
     if options.loss != "linear" and _is_suspect(outcome, problem.structure, block.use):
         projected = problem.project_points(state.params, state.points)
         agree = agreeing(problem.structure, problem.xy, before, projected, block.sigma, block.use)
-        again = Rounds(problem, block, state, options, heights, agree).run()
+        again = Rounds(problem, block, state, heights, agree).run()
         if again.noise < _CLEARLY * outcome.noise and again.inlier.sum() > 0.5 * agree.sum():
             outcome = again
     drift, asked = problem.cameras.unknowns.drift, dict[str, SmoothTest]()
@@ -139,11 +139,11 @@ def solve_block(
         there, _ = revived(problem, ended, outcome.residual, outcome.inlier, weight)
         there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
         asked = {"drift": outcome.smooth}
-        problem, outcome = bent, Rounds(bent, block, there, options, heights, outcome.inlier).run()
+        problem, outcome = bent, Rounds(bent, block, there, heights, outcome.inlier).run()
     if block.gcps.names and agreed is None:
         free = Solution(problem, state, before, heights, outcome, start, start, None, asked)
         agreed, heights = _with_control(block, given, outcome)
-        outcome = Rounds(problem, block, outcome.minimum.state, options, heights, block.use, outcome).run()
+        outcome = Rounds(problem, block, outcome.minimum.state, heights, block.use, outcome).run()
     first = Solution(problem, state, before, heights, outcome, start, start, None, asked, agreed=agreed)
     found = finished(first, problem, block, outer, options, outcome)
     return found if free is None or not found.heights.has_control else _untorn(found, free, block, outer, options)

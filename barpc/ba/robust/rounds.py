@@ -39,6 +39,7 @@ from barpc.scene import BoolArray
 _LOG = logging.getLogger(__name__)
 
 _SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each view by itself
+_SAME_NOISE = 0.02  # a change of the noise by less than this part is not solved again
 _MANY_CUT = 0.01  # of the observations: more are looked at again
 MAX_PASSES = 5  # rounds of cutting and solving, at most: they end when nothing changes
 
@@ -74,12 +75,11 @@ class Rounds:
         problem: Problem,
         block: Block,
         state: State,
-        options: AdjustOptions,
         heights: Heights,
         use: BoolArray,
         known: Outcome | None = None,
     ) -> None:
-        unknowns = problem.cameras.unknowns
+        unknowns, options = problem.cameras.unknowns, heights.options
         residual, projected = problem.prepare(state.params, state.points)
         self.problem = heights.hold(problem, state.points)
         self.state, self.options, self.heights, self.residual = state, options, heights, residual
@@ -119,8 +119,9 @@ class Rounds:
     def _search(self) -> None:
         """Run the robust rounds, under priors wide enough for what is not expected."""
         start = replace(self.problem, camera_prior=self.variances.for_search())
+        given = self.state, self.residual, self.projected
         self.state, self.residual, self.counted, self.noise, self.projected = _robust(
-            start, self.observations, self.state, self.residual, self.projected, self.use, self.options, self.smooth
+            start, self.observations, given, self.use, self.options, self.smooth
         )
         self.misfit = self.smooth.test(self.residual, self.use).rms
 
@@ -142,7 +143,7 @@ class Rounds:
         _LOG.info("pass %d: %d of %d observations, noise %.3f", *numbers)
         again = self.passes > 1 or self.goes_on
         same = again and int((self.use != was_in_use).sum()) <= SLIGHT * len(self.use)
-        settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < STANDS
+        settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < _SAME_NOISE
         # what is known of the place goes with what is shared, and nothing else learns of it
         share = STANDS if tested.shared > 1.0 else SAME_PRIOR
         settled &= same_prior(prior, self.problem.camera_prior, share)
@@ -241,9 +242,7 @@ def faintness(block: Block, heights: Heights) -> Array:
 def _robust(
     problem: Problem,
     observations: Observations,
-    state: State,
-    residual: Array,
-    projected: Projected | None,
+    start: tuple[State, Array, Projected | None],
     use: BoolArray,
     options: AdjustOptions,
     smooth: Smooth,
@@ -255,7 +254,7 @@ def _robust(
     their weights and so leaves the wrong ones behind, but not below what the best fifth of all shows, nor below half of
     what is stated, or a few that fit by chance would be left.
     """
-    loss = LOSSES[options.loss]
+    loss, (state, residual, projected) = LOSSES[options.loss], start
     counted, scale, noise = use.astype(np.float64), np.inf, 1.0
     s = observations.squared(residual, counted)
     for _ in range(ITERATIONS):
