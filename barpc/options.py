@@ -371,14 +371,12 @@ class AdjustOptions(Options):
 class FitOptions(Options):
     """Options of fitting an RPC to a sensor model or to points."""
 
-    method: Literal["auto", "ridge", "gauss-newton", "minimax", "lcurve", "lcurve-joint", "vendor-denominators"] = (
-        option(
-            "auto",
-            """`ridge`: QR compression and a noise-scaled ridge. `lcurve-joint`: the paper's solver, one h for col and
-        row (78 unknowns); `lcurve`: with one each (39 + 39). `gauss-newton`: the least squares of the error
+    method: Literal["auto", "ridge", "gauss-newton", "minimax", "lcurve-joint", "vendor-denominators"] = option(
+        "auto",
+        """`ridge`: QR compression and a noise-scaled ridge. `lcurve-joint`: the paper's solver, one h for col and
+        row (78 unknowns). `gauss-newton`: the least squares of the error
         itself, for models without noise; `minimax`: the least largest error instead. `vendor-denominators`: numerators
         only. `auto`: `ridge`, and another one where the certificate says that it is better.""",
-        )
     )
     grid: tuple[int, int, int] = option(
         (12, 12, 7), "Control points along col (or lon), row (or lat) and altitude.", least=4

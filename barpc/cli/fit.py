@@ -153,7 +153,6 @@ def _certificate(fit: RpcFit, verdict: str) -> str:
         *(f"{name:14s}{col:<13.3g}{row:.3g}" for name, (col, row) in rows.items()),
         *([more] if fit.beyond < 1 else []),  # given points say nothing of the rest
         f"denominators  at least {fit.min_denominator:.3g} over the image's ground and around it",
-        *([] if fit.free is None else [f"              {fit.free}"]),
         f"round trip    {fit.roundtrip:.1g} px" + f"; the camera's own {fit.contradiction:.1g}" * (fit.beyond < 1),
         *([] if fit.localisation is None else [_localisation(fit.localisation)]),
         f"verdict       {verdict or 'within tolerance'}",

@@ -1,21 +1,26 @@
 """What an RPC is worth over a whole image: points that the fit has not seen, poles, round trips.
 
 The points are drawn one a cell of the image and at an altitude of its own each, with more along its edges; where the
-error is largest more are drawn around the worst, closer and closer.
+error is largest more are drawn around the worst, closer and closer. `RpcFit` is a fit
+with its certificate, and says in words what is wrong with it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import FitError
-from barpc.geodesy import CHUNK, Array, wrap_longitude
+from barpc.geodesy import CHUNK, Array, metres_per_unit, wrap_longitude
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
+
+if TYPE_CHECKING:
+    from barpc.fit.reasons import Reason
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -23,8 +28,7 @@ EXACT = 1e-6  # px: what no other method is tried on, and no round trip is held 
 CELLS = 45
 """Along each side of the image: 2025 points of the whole."""
 _EDGE = 12  # points along each edge of the image, at either end of the altitudes
-_WORST, _AROUND, _ROUNDS = 16, 8, 5  # points that are looked around at, new ones around each, how often
-_NEARER = 0.5  # each time
+_WORST, _AROUND, _ROUNDS = 16, 8, 5  # points that are looked around at, new ones around each, rounds, ever nearer
 
 
 @dataclass
@@ -87,16 +91,11 @@ class Sample:
         return cls(model, size, alt_range, points[known], ground[known], int(known[: len(inside)].sum()), 1.0 - share)
 
     def also(self, points: Array) -> Sample:
-        """Return the sample with more points (M, 3) col, row [px], altitude [m] around which the largest
-        error is searched.
-        """
+        """Return the sample with more points (M, 3) col, row [px], altitude [m] to look for the worst around."""
         ground = self.model.localize(points[:, :2], points[:, 2])
         known = np.isfinite(ground).all(axis=1)
-        return replace(
-            self,
-            points=np.concatenate([self.points, points[known]]),
-            ground=np.concatenate([self.ground, ground[known]]),
-        )
+        more = np.concatenate([self.points, points[known]]), np.concatenate([self.ground, ground[known]])
+        return replace(self, points=more[0], ground=more[1])
 
     def contradiction(self) -> float:
         """Return the largest distance [px] of the points from where the model projects their ground; infinite
@@ -124,7 +123,7 @@ class Sample:
         errors.add(miss[: self.count])
         rng, reach = np.random.default_rng(1), np.array([1.0 / CELLS, 1.0 / CELLS, 0.25])
         unit = (points - _scaled(np.zeros(3), self.size, self.alt_range)) / self._span
-        for _ in range(_ROUNDS if float(miss.max(initial=0.0)) > _TINY else 0):
+        for _ in range(_ROUNDS if float(miss.max(initial=0.0)) > EXACT else 0):
             worst = np.unique(np.concatenate([np.argsort(-miss[:, axis], kind="stable")[:_WORST] for axis in range(2)]))
             near = unit[np.repeat(worst, _AROUND)] + reach * rng.uniform(-1.0, 1.0, (len(worst) * _AROUND, 3))
             near = near.clip(0.0, 1.0)
@@ -132,11 +131,7 @@ class Sample:
             ground = self.model.localize(at[:, :2], at[:, 2])
             known = np.isfinite(ground).all(axis=1)
             found = _size(off(ground[known], at[known]))
-            unit, miss, reach = (
-                np.concatenate([unit, near[known]]),
-                np.concatenate([miss, found]),
-                reach * _NEARER,
-            )
+            unit, miss, reach = np.concatenate([unit, near[known]]), np.concatenate([miss, found]), reach / 2
         if len(miss):
             errors.worst = _scaled(unit[miss.argmax(axis=0)], self.size, self.alt_range)
         return errors, miss.max(axis=0, initial=0.0)
@@ -144,9 +139,6 @@ class Sample:
     @property
     def _span(self) -> Array:
         return np.array([*self.size, max(self.alt_range[1] - self.alt_range[0], 1e-9)], dtype=np.float64)
-
-
-_TINY = 1e-7  # px: errors that are no larger are rounding, and alike everywhere
 
 
 def _size(values: Array) -> Array:
@@ -180,3 +172,154 @@ def coverage(image: Array, low: Array, high: Array) -> float:
     t = (np.arange(20) + 0.5) / 20
     cells = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
     return float((cells @ direction.T <= reach + 1e-9).all(axis=1).mean())
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """The certificate of a localisation RPC, on the check points of the fit.
+
+    Parameters
+    ----------
+    rmse_m, max_m : float
+        Root mean square and largest distance on the ground from where the camera localises them [m].
+    rmse_px, max_px : float
+        The same from where the fitted RPC projects the places found [px].
+    min_denominator : float
+        As for the RPC, over image and altitudes.
+    method : str
+        The solver whose result this is.
+    """
+
+    rmse_m: float
+    max_m: float
+    rmse_px: float
+    max_px: float
+    min_denominator: float
+    method: str
+
+    def verdict(self, tolerance: float) -> str:
+        """Return the faults at a tolerance [px], in words; empty if there are none."""
+        if not self.max_px <= tolerance:
+            return (
+                f"the localisation RPC misses the ground by up to {self.max_m:.3g} m ({self.max_px:.3g} px), wanted "
+                f"{tolerance:g} px: fit a smaller altitude range or a smaller image, raise the tolerance, or do "
+                "without it"
+            )
+        return "" if self.min_denominator > 0 else "the localisation RPC has a pole near the scene: do without it"
+
+
+def off(rpc: RPC, found: Array, ground: Array, image: Array) -> Array:
+    """Return the distances (N, 2) [m, px] of places `found` (N, 3) from ground points (N, 3), and of their
+    projections.
+    """
+    miss = found - ground
+    miss[:, 0] = wrap_longitude(miss[:, 0])
+    metres = np.linalg.norm((miss * metres_per_unit(ground))[:, :2], axis=1)
+    return np.column_stack([metres, np.linalg.norm(rpc.project(found) - image, axis=1)])
+
+
+@dataclass(frozen=True, eq=False)
+class RpcFit:
+    """A fitted RPC and its certificate.
+
+    Parameters
+    ----------
+    rpc : RPC
+        The result.
+    rmse_cnp, max_cnp : (2,)
+        Root mean square and largest error of col, row on the control points [px].
+    rmse_ckp, max_ckp : (2,)
+        The same on check points all over image and altitudes, which the fit has not seen [px]; the largest error was
+        also looked for around the worst of them.
+    beyond : float
+        Largest share of image and altitudes, with 95 % confidence, that misses by more than `max_ckp`. 1 for
+        given points, which may lie anywhere.
+    min_denominator : float
+        Lower bound of the denominators over the hull of the image's own ground and a margin (`FitOptions.pole_margin`)
+        around it, over what they are at its centre; above 0 there is no pole.
+    roundtrip : float
+        Largest distance of a check point from where its projection is localised [px]; infinite where that fails.
+    coverage : float
+        Share of the image inside the convex hull of the control points.
+    h : (2,)
+        Regularisation used for col, row.
+    iterations : int
+        Passes over the points.
+    num_cnp, num_ckp : int
+        Number of points.
+    method : str
+        The solver whose result this is.
+    localisation : Localisation or None
+        The certificate of `rpc.direct`, where it was asked for.
+    contradiction : float
+        Largest distance of a check point from where the model, not the RPC, projects the ground that it localises
+        there [px]; 0 for given points. What else projects with the model may be off by as much more.
+    reason : Reason or None
+        Cause of a miss of the tolerance, of a model.
+    """
+
+    rpc: RPC
+    rmse_cnp: Array
+    max_cnp: Array
+    rmse_ckp: Array
+    max_ckp: Array
+    beyond: float
+    min_denominator: float
+    roundtrip: float
+    coverage: float
+    h: Array
+    iterations: int
+    num_cnp: int
+    num_ckp: int
+    method: str
+    localisation: Localisation | None = None
+    contradiction: float = 0.0
+    reason: Reason | None = None
+
+    def __repr__(self) -> str:
+        return f"RpcFit({self.method}, at most {self.max_ckp.max():.2g} px at {self.num_ckp} check points, {self.rpc})"
+
+    def summary(self) -> dict[str, Any]:
+        """Return the certificate as plain numbers and lists, col before row, lengths in px."""
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rpc"}
+        for name in ("localisation", "reason"):
+            part = values.pop(name)
+            values |= {} if part is None else {name: asdict(part)}
+        return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
+
+    def as_written(self, rpc: RPC) -> RpcFit:
+        """Return the fit of the RPC as read back from its file: the differences over its box are added to the
+        errors.
+        """
+        lost = self.rpc.off(rpc)
+        return replace(
+            self,
+            rpc=rpc,
+            rmse_ckp=self.rmse_ckp + np.sqrt((lost**2).mean(axis=0)),
+            max_ckp=self.max_ckp + lost.max(axis=0),
+            localisation=None if rpc.direct is None else self.localisation,
+        )
+
+    def verdict(self, tolerance: float) -> str:
+        """Return the faults of this fit at a tolerance [px], in words; empty if there are none."""
+        worst = float(self.max_ckp.max())
+        if not self.contradiction <= max(tolerance, EXACT):
+            return (
+                f"the model contradicts itself: ground that it localises it projects up to {self.contradiction:.3g} px "
+                f"away, wanted {tolerance:g}: `project` and `localize` are not of one camera (an altitude left out of "
+                "one, coordinates exchanged, half a pixel)"
+            )
+        if not worst <= tolerance:
+            return (
+                f"the RPC misses its check points by up to {worst:.3g} px (RMSE col {self.rmse_ckp[0]:.3g}, "
+                f"row {self.rmse_ckp[1]:.3g}), wanted {tolerance:g}: "
+                + (f"{self.reason}" if self.reason else "fit a smaller altitude range or a smaller image")
+                + ", or raise the tolerance"
+                + ", or fit by the method minimax"
+                * (self.method == "gauss-newton" and bool(self.rmse_ckp.max() <= tolerance))
+            )
+        if not self.min_denominator > 0:
+            return "the RPC has a pole near the scene: use more control points, or a smaller pole_margin"
+        if not self.roundtrip <= max(tolerance, EXACT):
+            return f"the RPC cannot be inverted over the scene (round trip {self.roundtrip:.3g} px)"
+        return "" if self.localisation is None else self.localisation.verdict(tolerance)

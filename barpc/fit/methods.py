@@ -12,8 +12,8 @@ takes for noise. Denominators stay above a tenth over the hull of the points and
 "Contributions to the theory of linear least maximum approximation", 1961).
 
 ``lcurve-joint``, the paper's solver (Akiki et al. 2021, section 3): one h from the corner of the L-curve, then weighted
-and ICCV iterations; ``lcurve``: the same for col and row apart. All unknowns are penalised alike, as in the paper; its
-singular value decompositions are taken of the compressed system, which has the same singular values.
+and ICCV iterations. All unknowns are penalised alike, as in the paper; its singular value decompositions are taken of
+the compressed system, which has the same singular values.
 """
 
 from __future__ import annotations
@@ -26,13 +26,16 @@ import numpy as np
 
 from barpc.errors import FitError
 from barpc.fit.points import column_ranges
-from barpc.fit.poles import FLOOR, Region, bounded
-from barpc.fit.precision import ALTITUDE_FLOOR, PRECISIONS, Normalization
+from barpc.fit.poles import Region, bounded
 from barpc.fit.system import (
+    ALTITUDE_FLOOR,
     EPS,
+    MAX_PASSES,
+    PRECISIONS,
     TAU,
     Compressed,
     FitProblem,
+    Normalization,
     Rounding,
     expected_size,
     noise_scaled,
@@ -47,14 +50,10 @@ Found = tuple[Array, list["Compressed"], Array, int]
 
 WEIGHTED = 1
 """Further passes of ``ridge`` with the residuals weighted by 1 / denominator, where that varies."""
-MAX_PASSES = 20
-"""Of what is iterated, ``minimax``'s weights, too."""
 TOLERANCE = 1e-10
 """Change of the RMSE [px] at which the iterations stop."""
-_SAMPLES = 200  # of the L-curve
-_LEAST_DAMPED, _FIRST_DAMPED, _MOST_DAMPED = 1e-12, 1e-6, 1e3  # of the size of a column
+_DAMPED = 1e-6  # of the size of a column, at first
 _POWER = 1.5  # of the errors that weights grow with, and 20 rounds: 0.94 px for 1.21 at 89.9 N, 60 rounds 0.89
-_SLACK = 1e-6  # of the least denominator: rounding
 _GAIN = 1e-3  # of the sum of squares: less in a step, and it stands
 _EVEN = 0.05  # a denominator within 1 -/+ this weights nothing
 
@@ -72,13 +71,13 @@ def corner(systems: Sequence[Compressed]) -> float:
     rest = sum(float(system.triangle[-1, -1]) ** 2 for system in systems)
     low = max(float(s.min()), float(s.max()) * 16 * EPS)
     high = float(s.max())
-    for _ in range(4):
-        h = np.geomspace(low, high, _SAMPLES)
+    for _ in range(5):  # each narrows it by 25
+        h = np.geomspace(low, high)
         curvature = _curvature(h[:, None], s, beta, rest)
         best = int(np.argmax(curvature))
         if not curvature[best] > 0:  # concave throughout: the least regularisation
             return low
-        low, high = h[max(best - 1, 0)], h[min(best + 1, _SAMPLES - 1)]
+        low, high = h[max(best - 1, 0)], h[min(best + 1, len(h) - 1)]
     return float(h[best])
 
 
@@ -97,13 +96,13 @@ def _curvature(h: Array, s: Array, beta: Array, rest: float) -> Array:
     return np.asarray((rho1 * eta22 - rho22 * eta1) / (rho1**2 + eta1**2) ** 1.5)
 
 
-def solve_lcurve(problem: FitProblem, axes: Sequence[int]) -> tuple[Array, list[Compressed], float, int]:
-    """Fit the coordinates `axes` (0 col, 1 row) with one h; both at once is the paper's joint problem of 78 unknowns.
+def solve_lcurve(problem: FitProblem) -> tuple[Array, list[Compressed], float, int]:
+    """Fit col and row with one h: the paper's joint problem of 78 unknowns.
 
-    Gives coefficients (2 len(axes), 20), the final systems with their penalties, h, and the passes over the points:
-    weighted ones until the RMSE stands still, then from the best such ones of the ICCV kind (eq. 6).
+    Gives coefficients (4, 20), the final systems with their penalties, h, and the passes over the points: weighted ones
+    until the RMSE stands still, then from the best such ones of the ICCV kind (eq. 6).
     """
-    systems = [problem.compressed(axis) for axis in axes]
+    systems = [problem.compressed(axis) for axis in range(2)]
     h = corner(systems)
     ridge = np.full(len(systems[0].target), h)
     solved, passes, least = [system.penalized(ridge) for system in systems], 1, np.inf
@@ -112,7 +111,7 @@ def solve_lcurve(problem: FitProblem, axes: Sequence[int]) -> tuple[Array, list[
         (coeffs, solved), last = best, np.inf
         for _ in range(MAX_PASSES + 1):
             passes += 1
-            rmse, following = _reweighted(problem, axes, coeffs, penalty, corrected)
+            rmse, following = _reweighted(problem, coeffs, penalty, corrected)
             if rmse < least:
                 least, best = rmse, (coeffs, solved)
             if not abs(last - rmse) >= TOLERANCE:  # nor a number, where a denominator is 0 at a point
@@ -122,27 +121,21 @@ def solve_lcurve(problem: FitProblem, axes: Sequence[int]) -> tuple[Array, list[
 
 
 def _coefficients(problem: FitProblem, systems: list[Compressed], quantize: Rounding | None = None) -> Array:
-    return _quotients([problem.expanded(solution(system, quantize)) for system in systems])
+    """Return the coefficients (4, 20) that solve the systems of col and row."""
+    return np.concatenate([problem.expanded(solution(system, quantize)) for system in systems])
 
 
-def _quotients(parts: Sequence[Array]) -> Array:
-    """Return the coefficients (4, 20) of col and row, each its numerator and its denominator."""
-    return np.concatenate(parts)
-
-
-def _reweighted(
-    problem: FitProblem, axes: Sequence[int], coeffs: Array, penalty: Array, corrected: bool
-) -> tuple[float, list[Compressed]]:
+def _reweighted(problem: FitProblem, coeffs: Array, penalty: Array, corrected: bool) -> tuple[float, list[Compressed]]:
     """Return RMSE [px] of coefficients, and the systems that their denominators weight."""
     squares, following = 0.0, []
-    for i, axis in enumerate(axes):
+    for axis in range(2):
         with np.errstate(all="ignore"):  # a denominator that is 0 at a point: no number comes of it, and the passes end
-            system = problem.compressed(axis, coeffs[2 * i + 1])
-        x = problem.packed(coeffs[2 * i : 2 * i + 2])
+            system = problem.compressed(axis, coeffs[2 * axis + 1])
+        x = problem.packed(coeffs[2 * axis : 2 * axis + 2])
         squares += system.squares(x) * float(problem.norm.image_scale[axis]) ** 2
         # corrected: |M x - y|^2 + |x - x_previous|^2
         following.append(system.penalized(penalty, x if corrected else 0.0))
-    return float(np.sqrt(squares / (len(axes) * len(problem.image)))), following
+    return float(np.sqrt(squares / (2 * len(problem.image)))), following
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,11 +159,6 @@ class FitSolution:
     def region(self) -> Region:
         """Region of the ground over which denominators are bounded."""
         return region_of(self.problem)
-
-    @property
-    def held(self) -> bool:
-        """Whether the bound holds a denominator: without it, it would be smaller."""
-        return self.method in BOUNDED and self.region.smallest(self.coeffs[1::2]) < FLOOR + _SLACK
 
     def leave_one_out(self) -> Iterator[Array]:
         """Yield the leave-one-out residuals (n, 2) of the points, some hundred at a time.
@@ -292,7 +280,7 @@ def _gauss_newton(problem: FitProblem, quantize: Rounding | None, vendor: RPC | 
         parts.append(problem.expanded(x if quantize is None else solution(system.solved_by(x), quantize)))
         solved.append(system)
         passes = max(passes, steps)
-    return _quotients(parts), solved, np.zeros(2), passes
+    return np.concatenate(parts), solved, np.zeros(2), passes
 
 
 def _minimised(problem: FitProblem, axis: int, x: Array, region: Region) -> tuple[Array, Compressed, int]:
@@ -304,16 +292,16 @@ def _minimised(problem: FitProblem, axis: int, x: Array, region: Region) -> tupl
 
     system, damping, passes = linearised(x), 0.0, 1
     size = np.linalg.norm(system.matrix, axis=0)
-    while passes < MAX_PASSES and damping < _MOST_DAMPED:
+    while passes < MAX_PASSES:
         ahead = _ahead(problem, system, x, damping * size, size, region)
         following, passes = linearised(ahead), passes + 1
         before, after = system.squares(x), following.squares(ahead)
         if after < before:
-            x, system, damping = ahead, following, 0.1 * damping if damping > _FIRST_DAMPED else 0.0
+            x, system, damping = ahead, following, 0.1 * damping if damping > _DAMPED else 0.0
             if before - after < _GAIN * before:
                 break
         else:
-            damping = max(10.0 * damping, _FIRST_DAMPED)
+            damping = max(10.0 * damping, _DAMPED)
     return x, system, passes
 
 
@@ -322,11 +310,8 @@ def _ahead(problem: FitProblem, system: Compressed, x: Array, penalty: Array, si
     is none.
     """
     for least, solver in (
-        (_LEAST_DAMPED, solution),
-        (
-            _FIRST_DAMPED,
-            partial(bounded, region=region, active=problem.active),
-        ),  # which wants it well conditioned
+        (EPS, solution),
+        (_DAMPED, partial(bounded, region=region, active=problem.active)),  # which wants it well conditioned
     ):
         damped = np.maximum(penalty, least * size)
         ahead = solver(system.penalized(damped, damped * x))
@@ -354,15 +339,12 @@ def _minimax(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None)
             x, solved[axis], steps = _minimised(heavy, axis, x, region)
             passes += steps
         parts.append(problem.expanded(best if quantize is None else solution(solved[axis].solved_by(best), quantize)))
-    return _quotients(parts), solved, h, passes
+    return np.concatenate(parts), solved, h, passes
 
 
-def _lcurve(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None, joint: bool = False) -> Found:
-    results = [solve_lcurve(problem, axes) for axes in ([[0, 1]] if joint else [[0], [1]])]
-    parts, systems, sizes, passes = zip(*results, strict=True)
-    solved = [system for of_axes in systems for system in of_axes]
-    coeffs = np.concatenate(parts) if quantize is None else _coefficients(problem, solved, quantize)
-    return coeffs, solved, np.broadcast_to(sizes, 2).copy(), max(passes)
+def _lcurve(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> Found:
+    coeffs, solved, h, passes = solve_lcurve(problem)
+    return coeffs if quantize is None else _coefficients(problem, solved, quantize), solved, np.full(2, h), passes
 
 
 def _vendor_denominators(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> Found:
@@ -383,8 +365,7 @@ METHODS: dict[str, Callable[[FitProblem, Rounding | None, RPC | None], Found]] =
     "ridge": _ridge,
     "gauss-newton": _gauss_newton,
     "minimax": _minimax,
-    "lcurve": _lcurve,
-    "lcurve-joint": partial(_lcurve, joint=True),
+    "lcurve-joint": _lcurve,
     "vendor-denominators": _vendor_denominators,
 }
 """Name -> solver of a problem; ``vendor-denominators`` keeps those of the vendor's RPC."""

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import FitError
-from barpc.fit.precision import ALTITUDE_FLOOR
+from barpc.fit.system import ALTITUDE_FLOOR
 from barpc.geodesy import CHUNK, FAR, Array, metres_per_unit, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor import SensorModel

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import solve_triangular
 
-from barpc.fit.system import EPS, Compressed, IntArray, solution
+from barpc.fit.system import EPS, MAX_PASSES, Compressed, IntArray, solution
 from barpc.geodesy import CHUNK, Array
 from barpc.sensor.rational import MONOMIALS, monomials
 from barpc.sensor.rpc import RPC
@@ -24,23 +24,18 @@ FLOOR = 0.1
 """Least value of a denominator over what it is at the centre."""
 BOX = 0.25  # share of the half width, around a box: of an RPC whose image is not known
 _PIECES = 8  # of a side
-_NODES = 3 * _PIECES + 1  # of its control net
 _POWERS = np.array([[monomial.count(letter) for letter in "LPH"] for monomial in MONOMIALS])
 _BERNSTEIN = np.array([[comb(i, k) / comb(3, k) for k in range(4)] for i in range(4)])
-_LEVEL = 32  # directions that a hull is cut in, level with the ground; up and down are two more
+_LEVEL = 32  # directions that a hull is cut in, level with the ground
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, _LEVEL, endpoint=False)
-_DIRECTIONS = np.vstack([np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES), 0 * _ANGLES]), [[0, 0, 1], [0, 0, -1]]])
-_AXES = np.array([[0, _LEVEL // 4, -2], [_LEVEL // 2, 3 * _LEVEL // 4, -1]])  # of them, and their opposites
-_ROUNDS, _CUTS = 20, 40  # of a bounded least squares; inequalities that are taken in in one
+_DIRECTIONS = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+_CUTS = 40  # inequalities that are taken in in a pass of a bounded least squares
 _SLACK = 1e-9  # of a bound: rounding
-_STEPS, _FARTHEST = 400, 20.0  # along a ray that a pole is looked for on; half widths
 
 
 @cache
 def _net() -> Array:
-    """Return Bernstein coefficients (n, n, n, 20) of the monomials over the pieces of the cube -1 .. 1, n =
-    `_NODES`.
-    """
+    """Return Bernstein coefficients (n, n, n, 20) of the monomials over the pieces of the cube -1 .. 1."""
     width, rows = 2.0 / _PIECES, []
     for start in -1.0 + width * np.arange(_PIECES):
         shifted = np.zeros((4, 4))  # x^p as a polynomial of the place in the piece
@@ -71,7 +66,7 @@ class Region:
     @classmethod
     def box(cls, box: Array) -> Region:
         """Return a region that is a box (3, 2) in normalised coordinates."""
-        return cls(box.mean(axis=1), np.diag(0.5 * (box[:, 1] - box[:, 0])), np.ones((_NODES, _NODES), dtype=bool))
+        return cls(box.mean(axis=1), np.diag(0.5 * (box[:, 1] - box[:, 0])), np.ones(_net().shape[:2], dtype=bool))
 
     @classmethod
     def around(cls, ground: Array, image: Array, margin: float) -> Region:
@@ -85,11 +80,11 @@ class Region:
         slope = np.linalg.lstsq(design - np.append(design[:, :3].mean(axis=0), 0.0), ground[some, :2], rcond=None)[0]
         skew = np.zeros((3, 3))
         skew[:2, :2], skew[2] = slope[:2], [*slope[2], 1.0]
-        inverse = np.linalg.pinv(skew) @ _DIRECTIONS.T
-        reach = np.max([(ground[i : i + CHUNK] @ inverse).max(axis=0) for i in range(0, len(ground), CHUNK)], axis=0)
-        ends = reach[_AXES]
-        middle, half = 0.5 * (ends[0] - ends[1]), 0.5 * (ends[0] + ends[1])
-        inside = _inside(reach - _DIRECTIONS @ middle, half[:2])
+        sides = np.hstack([np.eye(3), -np.eye(3), np.pad(_DIRECTIONS, ((0, 0), (0, 1))).T])
+        away = np.linalg.pinv(skew) @ sides
+        reach = np.max([(ground[i : i + CHUNK] @ away).max(axis=0) for i in range(0, len(ground), CHUNK)], axis=0)
+        middle, half = 0.5 * (reach[:3] - reach[3:6]), 0.5 * (reach[:3] + reach[3:6])
+        inside = _inside(reach[6:] - _DIRECTIONS @ middle[:2], half[:2])
         return cls(middle @ skew, (1.0 + margin) * half[:, None] * skew, inside)
 
     @cached_property
@@ -106,7 +101,7 @@ class Region:
 
     def rows(self, index: IntArray) -> Array:
         """Return the rows (len(index), 20) that take a cubic's coefficients to some of its Bernstein coefficients."""
-        nodes = np.flatnonzero(np.broadcast_to(self.inside[..., None], (_NODES,) * 3))
+        nodes = np.flatnonzero(np.broadcast_to(self.inside[..., None], _net().shape[:3]))
         return np.asarray(_net().reshape(-1, 20)[nodes[index]] @ self.there)
 
     def least(self, cubic: Array) -> float:
@@ -122,56 +117,28 @@ class Region:
         with np.errstate(all="ignore"):
             return float(min(self.least(cubic / (self.there[0] @ cubic)) for cubic in cubics))
 
-    def nearest_pole(self, cubics: Array, margin: float) -> tuple[Array, float]:
-        """Return the place (3,) nearest to the centre at which one of cubics (k, 20) is 0, and its distance
-        (1: the end of the points).
-
-        Of a region with a `margin`, along rays from its centre to every side; NaN and infinite where there is none.
-        """
-        places = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 9)] * 3), axis=-1).reshape(-1, 3)
-        rays = places[np.abs(places).max(axis=1) == 1.0] @ self.axes / (1.0 + margin)
-        far = np.linspace(0.0, _FARTHEST, _STEPS + 1)
-        ground = self.offset + far[:, None, None] * rays
-        value = cubics @ monomials(ground.reshape(-1, 3).T) / (cubics @ self.there[0])[:, None]
-        poles = (value <= 0).any(axis=0).reshape(ground.shape[:2])
-        if not poles.any():
-            return np.full(3, np.nan), np.inf
-        step = int(poles.any(axis=1).argmax())
-        return ground[step, poles[step].argmax()], float(far[step])
-
 
 def _inside(reach: Array, half: Array) -> npt.NDArray[np.bool_]:
     """Return the nodes (n, n) of the net of the pieces that a hull touches: its `reach` in all directions,
     half widths (2,).
     """
-    width, level = 2.0 / _PIECES, _DIRECTIONS[:, :2] * half
+    width, level = 2.0 / _PIECES, _DIRECTIONS * half
     start = -1.0 + width * np.arange(_PIECES)
     corner = np.stack(np.meshgrid(start, start, indexing="ij"), axis=-1)
     nearest = corner @ level.T + width * np.minimum(level, 0.0).sum(axis=1)
-    inside = np.zeros((_NODES, _NODES), dtype=bool)
-    for i, j in np.argwhere((nearest[..., :_LEVEL] <= reach[:_LEVEL] + _SLACK).all(axis=-1)):
+    inside = np.zeros(_net().shape[:2], dtype=bool)
+    for i, j in np.argwhere((nearest <= reach + _SLACK).all(axis=-1)):
         inside[3 * i : 3 * i + 4, 3 * j : 3 * j + 4] = True
     return inside
 
 
-def least_value(cubic: Array, box: Array) -> float:
-    """Return a lower bound, near the least value, of a cubic (20,) over a `box` (3, 2)."""
-    return Region.box(box).least(cubic)
-
-
 def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:
     """Return a lower bound of the denominators over a box `low`, `high` (3,) [deg, deg, m] and 25 % around
-    it.
-
-    Over what they are at its centre.
+    it, over what they are at its centre.
     """
-    return smallest_value(rpc.coeffs[1::2], rpc.normalize(np.stack([low, high])))
-
-
-def smallest_value(cubics: Array, box: Array) -> float:
-    """Return a lower bound of cubics (k, 20) over a box (3, 2) and 25 % around it, over what they are at its centre."""
-    middle, half = box.mean(axis=1), 0.5 * np.abs(box[:, 1] - box[:, 0])
-    return Region.box(middle[:, None] + (1.0 + BOX) * half[:, None] * np.array([-1.0, 1.0])).smallest(cubics)
+    box = np.sort(rpc.normalize(np.stack([low, high])), axis=1)
+    around = BOX * 0.5 * (box[:, 1] - box[:, 0])
+    return Region.box(box + around[:, None] * np.array([-1.0, 1.0])).smallest(rpc.coeffs[1::2])
 
 
 def bounded(system: Compressed, region: Region, active: IntArray) -> Array | None:
@@ -186,7 +153,7 @@ def bounded(system: Compressed, region: Region, active: IntArray) -> Array | Non
 
     floor = FLOOR + 10.0 * _SLACK
     x, used, cubic, m = solution(system), np.empty(0, dtype=np.int64), np.eye(20)[0], len(active) - 1
-    for _ in range(_ROUNDS):
+    for _ in range(MAX_PASSES):
         cubic[active[1:]] = x[-m:]
         short = region.bernstein(cubic) - floor * (region.there[0] @ cubic)
         short[used] = 0.0

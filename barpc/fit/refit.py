@@ -11,14 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import BarpcWarning, FitError
-from barpc.fit.certificate import EXACT, Errors, Sample, coverage, roundtrip
-from barpc.fit.certified import Free, RpcFit
-from barpc.fit.localisation import Seen, inverse, off, with_localisation
-from barpc.fit.methods import BOUNDED, FitSolution, solve
+from barpc.fit.certificate import EXACT, Errors, Localisation, RpcFit, Sample, coverage, off, roundtrip
+from barpc.fit.methods import BOUNDED, FitSolution, solve, solve_problem
 from barpc.fit.points import checked_points, column_ranges, control_points, screened, widened
-from barpc.fit.poles import Region
 from barpc.fit.reasons import reason
-from barpc.fit.system import FitProblem
+from barpc.fit.system import FitProblem, Normalization
 from barpc.geodesy import CHUNK, Array, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor import SensorModel
@@ -26,10 +23,12 @@ from barpc.sensor.geometry import is_radar
 from barpc.sensor.rpc import RPC
 from barpc.sensor.splined import Splined
 
+Seen = Callable[[RPC, FitSolution], tuple[Errors, Array]]
+"""What a localisation RPC is off by on points that it has not seen [m, px], and the largest (2,)."""
+
 _LOOPS = 4096  # round trips that a table of points is tried on, about
 _ABOUT = 1.1  # times the error
 _MISSING = 0.1  # part of the image without a ground point, at most
-_WORTH = 2.0  # times the RMSE: where a bound on the denominators costs as much, it is said
 _CELLS = 72  # of ``gauss-newton``, along each side of the image
 
 
@@ -65,32 +64,19 @@ def fit_rpc(
     BarpcWarning
         Part of the image has no ground point.
     """
-    options, alt_range = options or FitOptions(), widened(alt_range)
-    sample = Sample.of(model, size, alt_range)
-    if sample.missing > _MISSING:
-        raise FitError(
-            f"the model has no ground point for {sample.missing:.0%} of the image over altitudes "
-            f"{alt_range[0]:g} to {alt_range[1]:g} m: give an altitude range that it is made for"
-        )
-    if sample.missing > 0:
-        message = f"{sample.missing:.1%} of the image has no ground point and is left out: the RPC extrapolates there"
-        warnings.warn(message, BarpcWarning, stacklevel=2)
-    vendor = underlying_rpc(model)
-    mirrored = options.allow_mirrored or vendor is not None or is_radar(innermost(model))
-    screened(sample.ground, sample.points[:, :2], mirrored)
+    options, alt_range, vendor = options or FitOptions(), widened(alt_range), underlying_rpc(model)
+    sample = _sampled(model, size, alt_range)
+    screened(
+        sample.ground, sample.points[:, :2], options.allow_mirrored or vendor is not None or is_radar(innermost(model))
+    )
     contradiction = sample.contradiction()
-
     given = partial(_given, model, size, alt_range, options)
 
-    def attempt(method: str, source: SensorModel = model, options: FitOptions = options) -> RpcFit:
+    def attempt(method: str, source: SensorModel = model) -> RpcFit:
         solution = solve(*_given(source, size, alt_range, options, method), options, method, vendor=vendor)
         loop, beyond = roundtrip(solution.rpc, sample.ground), 1.0 - 0.05 ** (1.0 / sample.count)
-        fit = _certified(solution, *sample.errors(solution.rpc), loop, size, beyond)
-        fit = replace(fit, contradiction=contradiction)
-        if not (options.pole_margin and solution.held):
-            return fit
-        free = attempt(method, source, replace(options, pole_margin=0.0))
-        return _compared(fit, free, solution.region, options.pole_margin)
+        errors = sample.errors(solution.rpc)
+        return replace(_certified(solution, *errors, loop, size, beyond), contradiction=contradiction)
 
     try:
         fit = _best(attempt, options, vendor, False, exact=True)
@@ -100,23 +86,25 @@ def fit_rpc(
             fit = replace(fit, reason=reason(fit.rpc, sample))
         _accepted(fit, options, strict and not isinstance(model, Splined))
         return _localised(
-            fit, lambda rpc, method: inverse(rpc, *given(method)), partial(_missed, sample), options, strict
+            fit, lambda rpc, method: inverse(rpc, *given(method)), partial(_missed, sample), options, strict, exact=True
         )
     except FitError as error:
         advice = getattr(model, "advice", "")  # of a model that knows why
         raise FitError("; ".join(filter(None, (str(error), advice)))) from error
 
 
-def _compared(fit: RpcFit, free: RpcFit, region: Region, margin: float) -> RpcFit:
-    """Return a fit that knows what `free`, whose denominators are kept up over the image's own ground only,
-    makes better.
-    """
-    if not np.linalg.norm(fit.rmse_ckp) > _WORTH * np.linalg.norm(free.rmse_ckp):
-        return fit
-    place, far = region.nearest_pole(free.rpc.coeffs[1::2], margin)
-    pole = free.rpc.ground_offset + place * free.rpc.ground_scale
-    found = Free(float(free.rmse_ckp.max()), float(free.max_ckp.max()), tuple(pole.tolist()), far)
-    return replace(fit, free=found)
+def _sampled(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Sample:
+    """Return the check points of a model; FitError where it has no ground for too much of its image."""
+    sample = Sample.of(model, size, alt_range)
+    if sample.missing > _MISSING:
+        raise FitError(
+            f"the model has no ground point for {sample.missing:.0%} of the image over altitudes "
+            f"{alt_range[0]:g} to {alt_range[1]:g} m: give an altitude range that it is made for"
+        )
+    if sample.missing > 0:
+        message = f"{sample.missing:.1%} of the image has no ground point and is left out: the RPC extrapolates there"
+        warnings.warn(message, BarpcWarning, stacklevel=3)
+    return sample
 
 
 def _plainer(fit: RpcFit, plain: RpcFit) -> RpcFit:
@@ -170,7 +158,7 @@ def fit_rpc_points(
     image : (N, 2)
         col, row [px].
     sigma : (N,), optional
-        Relative standard deviations of the image points; equal if not given.
+        Relative standard deviations of the image points; else equal.
     check : (ground, image), optional
         Check points (M, 3) and (M, 2). Without them the certificate holds leave-one-out residuals.
     size : (width, height), optional
@@ -206,46 +194,6 @@ def fit_rpc_points(
     fit = _best(attempt, options, vendor, strict, exact=False)
     seen = partial(_left_out, held_out, *given)
     return _localised(fit, lambda rpc, _: inverse(rpc, *given, weight), seen, options, strict, exact=False)
-
-
-def _missed(sample: Sample, rpc: RPC, _: FitSolution) -> tuple[Errors, Array]:
-    """Return the errors of a localisation RPC on the check points of a model."""
-    return sample.sought(lambda ground, at: off(rpc, rpc.localize_direct(at[:, :2], at[:, 2]), ground, at[:, :2]))
-
-
-def _left_out(
-    held_out: tuple[Array, Array] | None, ground: Array, image: Array, rpc: RPC, found: FitSolution
-) -> tuple[Errors, Array]:
-    """Return the errors of a localisation RPC on given check points, or its leave-one-out errors."""
-    errors, start = Errors(), 0
-    if held_out is not None:
-        errors.add(off(rpc, rpc.localize_direct(held_out[1], held_out[0][:, 2]), *held_out))
-        return errors, errors.largest
-    for residual in found.leave_one_out():
-        part = slice(start, start + len(residual))
-        start = part.stop
-        places = ground[part] + np.pad(residual, ((0, 0), (0, 1)))
-        errors.add(off(rpc, places, ground[part], image[part]))
-    return errors, errors.largest
-
-
-def _localised(
-    fit: RpcFit,
-    problem: Callable[[RPC, str], FitProblem],
-    seen: Seen,
-    options: FitOptions,
-    strict: bool,
-    exact: bool = True,
-) -> RpcFit:
-    """Return the fit, where asked for with a localisation RPC and its certificate; FitError where `strict`
-    and it misses.
-    """
-    if not options.localisation:
-        return fit
-    rpc, certificate = with_localisation(fit.rpc, partial(problem, fit.rpc), seen, options, exact)
-    if strict and (wrong := certificate.verdict(options.tolerance)):
-        raise FitError(wrong)
-    return replace(fit, rpc=rpc, localisation=certificate)
 
 
 def underlying_rpc(model: object) -> RPC | None:
@@ -329,12 +277,75 @@ def _best(
     fits = [attempt("ridge")]
     if exact and not float(fits[0].max_ckp.max()) <= EXACT:
         fits.append(attempt("gauss-newton"))
-    others = ["lcurve"] + (["vendor-denominators"] if vendor is not None else [])
-    while others and all(fit.verdict(options.tolerance) for fit in fits):
-        fits.append(attempt(others.pop(0)))
+    if vendor is not None and all(fit.verdict(options.tolerance) for fit in fits):
+        fits.append(attempt("vendor-denominators"))
     wrong = [fit.verdict(options.tolerance) for fit in fits]
     rank = [
         (bool(said), not fit.min_denominator > 0, float(np.linalg.norm(fit.rmse_ckp)))
         for said, fit in zip(wrong, fits, strict=True)
     ]
     return _accepted(fits[rank.index(min(rank))], options, strict)
+
+
+# --- the localisation RPC, from image and altitude to the ground: the same solvers, roles exchanged ------------------
+
+
+def inverse(rpc: RPC, ground: Array, image: Array, weight: Array | None = None) -> FitProblem:
+    """Return the problem of the localisation RPC that goes with an RPC: its normalisation, its points, roles
+    exchanged.
+    """
+    norm = Normalization(
+        np.append(rpc.image_offset, rpc.ground_offset[2]),
+        np.append(rpc.image_scale, rpc.ground_scale[2]),
+        rpc.ground_offset[:2],
+        rpc.ground_scale[:2],
+    )
+    lonlat = np.column_stack([wrap_longitude(ground[:, 0], rpc.ground_offset[0]), ground[:, 1]])
+    return FitProblem(np.column_stack([image, ground[:, 2]]), lonlat, norm, weight=weight).screened()
+
+
+def _missed(sample: Sample, rpc: RPC, _: FitSolution) -> tuple[Errors, Array]:
+    """Return the errors of a localisation RPC on the check points of a model."""
+    return sample.sought(lambda ground, at: off(rpc, rpc.localize_direct(at[:, :2], at[:, 2]), ground, at[:, :2]))
+
+
+def _left_out(
+    held_out: tuple[Array, Array] | None, ground: Array, image: Array, rpc: RPC, found: FitSolution
+) -> tuple[Errors, Array]:
+    """Return the errors of a localisation RPC on given check points, or its leave-one-out errors."""
+    errors, start = Errors(), 0
+    if held_out is not None:
+        errors.add(off(rpc, rpc.localize_direct(held_out[1], held_out[0][:, 2]), *held_out))
+        return errors, errors.largest
+    for residual in found.leave_one_out():
+        part = slice(start, start + len(residual))
+        start = part.stop
+        places = ground[part] + np.pad(residual, ((0, 0), (0, 1)))
+        errors.add(off(rpc, places, ground[part], image[part]))
+    return errors, errors.largest
+
+
+def _localised(
+    fit: RpcFit, problem: Callable[[RPC, str], FitProblem], seen: Seen, options: FitOptions, strict: bool, exact: bool
+) -> RpcFit:
+    """Return the fit, where asked for with a localisation RPC and its certificate; FitError where `strict`
+    and it misses.
+
+    By a ridge; of a model (`exact`) also by Gauss-Newton, where that is better.
+    """
+    if not options.localisation:
+        return fit
+    found: list[tuple[RPC, Localisation]] = []
+    for method in ("ridge", "gauss-newton") if exact else ("ridge",):
+        solution = solve_problem(problem(fit.rpc, method), options, method)
+        direct = replace(fit.rpc, direct=solution.coeffs)
+        errors, largest = seen(direct, solution)
+        least = solution.region.smallest(solution.coeffs[1::2])
+        (rmse_m, rmse_px), (max_m, max_px) = errors.rmse.tolist(), largest.tolist()
+        found.append((direct, Localisation(rmse_m, max_m, rmse_px, max_px, least, method)))
+        if max_px <= EXACT:
+            break
+    rpc, certificate = min(found, key=lambda each: (not each[1].min_denominator > 0, each[1].rmse_m))
+    if strict and (wrong := certificate.verdict(options.tolerance)):
+        raise FitError(wrong)
+    return replace(fit, rpc=rpc, localisation=certificate)

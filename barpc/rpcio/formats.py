@@ -82,7 +82,7 @@ class Carrier:
     suffixes: tuple[str, ...]
     write: Callable[[RPC, Place, Path, Path, bool], None]  # rpc, image, path, where it will stand, overwrite
     consumers: tuple[str, ...] = ("gdal", "rpcm", "shareloc", "orthority")
-    precision: Literal["nitf"] | None = None  # whose digits it holds (`barpc.fit.precision`); None: all of them
+    precision: Literal["nitf"] | None = None  # whose digits it holds (`barpc.fit.system`); None: all of them
 
 
 CARRIERS: dict[str, Carrier] = {

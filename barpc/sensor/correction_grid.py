@@ -11,12 +11,10 @@ from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import Array
 from barpc.sensor import Displaced, SensorModel, fixed_point
-from barpc.sensor.direct_grid import LINEAR, linear_axes
+from barpc.sensor.direct_grid import LINEAR, LONGEST, linear_axes
 
 if TYPE_CHECKING:
     from scipy.interpolate import RegularGridInterpolator
-
-_LONGEST = 1024.0  # px, from node to node
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,7 +61,7 @@ class CorrectionGrid(Frozen):
             return model.project(rpc.localize(points, np.full(points.shape[:-1], alt))) - points
 
         low, high = np.full(2, -0.5), np.asarray(size) - 0.5
-        cols, rows = linear_axes(lacking, low, high, np.full(2, _LONGEST), tolerance)
+        cols, rows = linear_axes(lacking, low, high, np.array(LONGEST[:2]), tolerance)
         nodes = np.stack(np.meshgrid(cols, rows), axis=-1)
         return cls(cols, rows, lacking(nodes).astype(np.float32).astype(np.float64))
 

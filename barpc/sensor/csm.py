@@ -26,7 +26,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.document import MOST_PIXELS, STRAIGHT, Fields
 from barpc.sensor.frame import Frame
-from barpc.sensor.linescan.samples import Detector, Samples, camera_of_samples, unit
+from barpc.sensor.linescan.samples import STEP, Detector, Samples, camera_of_samples, unit
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sidefile import STATE, parse_json, read_text
 
@@ -36,7 +36,6 @@ LINESCAN, FRAME = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL", "USGS_ASTRO_FRAME_SENS
 
 _EARTH = 100.0  # m: by which the axes of an Earth's ellipsoid may differ from WGS84's
 FLIP = np.diag([1.0, -1.0, -1.0])
-_STEP = 0.02  # s, from sample to sample, at most
 _BEYOND = 4  # samples before and after the image: readers interpolate through eight
 _COLUMNS = 9  # of a row, through which its attitude goes
 
@@ -291,7 +290,7 @@ def _base(model: SensorModel) -> Pushbroom:
 def _step(base: Pushbroom) -> float:
     """Return the sampling step [s]: half of the camera's own."""
     own = np.diff(base.attitude.knots)
-    return min(_STEP, float(np.median(own)) / 2) if len(own) > 1 else _STEP
+    return min(STEP, float(np.median(own)) / 2) if len(own) > 1 else STEP
 
 
 def _positions(model: SensorModel, rows: Array) -> Array:

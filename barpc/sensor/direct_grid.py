@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import RpcError
-from barpc.geodesy import FAR, NEWTON_STEPS, Array, wrap_longitude
+from barpc.geodesy import FAR, NEWTON_STEPS, SETTLED, Array, wrap_longitude
 from barpc.sensor import Pointwise, SensorModel
 from barpc.sensor.rational import DERIVATIVE, monomials
 
@@ -24,10 +24,9 @@ if TYPE_CHECKING:
 
 LINEAR = 0.005  # px: what linear interpolation in a grid made here may miss by
 
-_SETTLED = 1e-5  # px: what is left after a step of this size is below rounding
 _SHRINK = 1e-4  # of a step to the next: more asks for new derivatives
 
-_LONGEST = 1024.0, 1024.0, 1000.0  # px, px, m: from node to node of a grid made here
+LONGEST = 1024.0, 1024.0, 1000.0  # px, px, m: from node to node of a grid made here
 _FEWEST, _CELLS = 3, 1024  # cells along an axis; splines are cubic from three on
 _NODES = 4_000_000  # of a grid made here, at most
 _TRIED = 1000  # cells
@@ -128,7 +127,7 @@ class DirectGrid(Pointwise):
             lonlat = model.localize(points[..., :2], points[..., 2])[..., :2]
             return np.asarray((wrap_longitude(lonlat, center[:2]) - center[:2]) @ to_px)
 
-        cols, rows, alts = linear_axes(seen, low, high, np.array(_LONGEST), tolerance)
+        cols, rows, alts = linear_axes(seen, low, high, np.array(LONGEST), tolerance)
         plane = np.stack(np.meshgrid(cols, rows), axis=-1)
         layers = [model.localize(plane, np.full(plane.shape[:2], alt))[..., :2] for alt in alts]
         return cls(cols, rows, alts, np.stack(layers))
@@ -157,13 +156,13 @@ class DirectGrid(Pointwise):
                 step = by_lon * miss[:, :1] + by_lat * miss[:, 1:]
                 image = image + step
                 length = np.abs(step).max(axis=1)
-                todo = ~(length < _SETTLED) & np.isfinite(length)
+                todo = ~(length < SETTLED) & np.isfinite(length)
                 if not todo.any():
                     break
                 if (length > _SHRINK * before)[todo].any():
                     by_lon, by_lat = self._inverse_2x2(image, alt)
                 before = length
-            image[~(length < _SETTLED)] = np.nan
+            image[~(length < SETTLED)] = np.nan
         return image
 
     def _guess(self, lonlat: Array, alt: Array) -> tuple[Array, Array, Array]:

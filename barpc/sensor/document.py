@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import re
-from typing import Any, Self
+import warnings
+from collections.abc import Mapping
+from typing import Any, Self, TypeVar
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from barpc.errors import RpcFormatError
+from barpc.errors import BarpcWarning, RpcFormatError
 from barpc.geodesy import FAR, Array
 
+T = TypeVar("T")
 RELIEF_AROUND = 1000.0
 """Altitudes about that of a scene [m] that it is used for, where its document says nothing."""
 MOST_PIXELS = 1_000_000
@@ -35,6 +38,18 @@ def parse_time(text: str, name: str) -> np.datetime64:
         return np.datetime64(match["time"] if match else "none", "ns")
     except ValueError as error:
         raise RpcFormatError(f"{name}: {text[:40]!r} is not a UTC time") from error
+
+
+def warn_off_grid(name: str, off: Array) -> None:
+    """Warn where a product's geolocation grid misses its orbit: `off` (N, 2), columns and rows [px]."""
+    worst = np.abs(off).max(axis=0)
+    if not (worst <= GRID_TOLERANCE).all():
+        warnings.warn(
+            f"{name}: the geolocation grid does not belong to the orbit (off by {worst[0]:.1f} columns, "
+            f"{worst[1]:.1f} rows); the model follows the orbit",
+            BarpcWarning,
+            stacklevel=4,
+        )
 
 
 class Fields:
@@ -83,6 +98,13 @@ class Fields:
         if count not in (None, len(numbers)):
             raise RpcFormatError(f"{self.name}: {path} holds {len(numbers)} numbers, expected {count}")
         return numbers
+
+    def chosen(self, path: str, choices: Mapping[str, T]) -> T:
+        """Return what a field's word stands for; RpcFormatError where it is none of the `choices`."""
+        word = self.text(path)
+        if word not in choices:
+            raise RpcFormatError(f"{self.name}: {path} is {word[:20]!r}, expected {' or '.join(choices)}")
+        return choices[word]
 
     def number(self, path: str) -> float:
         """Return the only number of a field."""

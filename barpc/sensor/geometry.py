@@ -197,24 +197,24 @@ class Several:
 
     def project(self, ground: Array) -> Array:
         """Project ground points (N, 3) [deg, deg, m] to image points (N, 2) [px]."""
-        image = np.empty((len(ground), 2))
-        for sensor, rows in self._parts:
-            image[rows] = sensor.project(ground[rows])
-        return image
+        return self._of("project", [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Return image points (N, 2) [px] and their derivatives (N, 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = np.empty((len(ground), 2)), np.empty((len(ground), 2, 3))
-        for sensor, rows in self._parts:
-            image[rows], jacobian[rows] = sensor.project_jacobian(ground[rows])
+        image, jacobian = self._of("project_jacobian", [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Localise image points (N, 2) [px] at altitudes (N,) [m]: ground points (N, 3)."""
-        ground = np.empty((len(image), 3))
+        return self._of("localize", [(3,)], image, alt)[0]
+
+    def _of(self, name: str, shapes: list[tuple[int, ...]], *given: Array) -> list[Array]:
+        out = [np.empty((len(given[0]), *shape)) for shape in shapes]
         for sensor, rows in self._parts:
-            ground[rows] = sensor.localize(image[rows], alt[rows])
-        return ground
+            found = getattr(sensor, name)(*(array[rows] for array in given))
+            for whole, part in zip(out, found if len(out) > 1 else [found], strict=True):
+                whole[rows] = part
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -472,7 +472,7 @@ def _intersect(
 
 
 def _normal_step(jacobian: Array, residual: Array, point: IntArray, scale: Array) -> tuple[Array, BoolArray]:
-    """Return Gauss-Newton steps (3, num) [m] by cofactors, and for which points the rays determine one.
+    """Return Gauss-Newton steps (3, num) [m] and for which points the rays determine one.
 
     `jacobian` (3, 2, K) and `residual` (2, K) are weighted; `scale` (3, num): metres of a unit of lon, lat, alt.
     """
@@ -482,15 +482,12 @@ def _normal_step(jacobian: Array, residual: Array, point: IntArray, scale: Array
         weights: Array = u[0] * v[0] + u[1] * v[1]
         return np.asarray(np.bincount(point, weights, minlength=num), dtype=np.float64)
 
-    a, b, c = jacobian
-    (e, n, u) = scale
-    aa, bb, cc = total(a, a) / (e * e), total(b, b) / (n * n), total(c, c) / (u * u)
-    ab, ac, bc = total(a, b) / (e * n), total(a, c) / (e * u), total(b, c) / (n * u)
-    ra, rb, rc = total(a, residual) / e, total(b, residual) / n, total(c, residual) / u
-    paa, pab, pac = bb * cc - bc * bc, ac * bc - ab * cc, ab * bc - ac * bb
-    pbb, pbc, pcc = aa * cc - ac * ac, ab * ac - aa * bc, aa * bb - ab * ab
-    det = aa * paa + ab * pab + ac * pac
+    normal = np.empty((num, 3, 3))
+    for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
+        normal[:, i, j] = normal[:, j, i] = total(jacobian[i], jacobian[j]) / (scale[i] * scale[j])
+    right = np.stack([total(by_axis, residual) / metres for by_axis, metres in zip(jacobian, scale, strict=True)], 1)
+    det, mean = np.linalg.det(normal), np.trace(normal, axis1=1, axis2=2) / 3
     # parallel rays: the determinant against the trace; 1e-10 is 0.0006 degrees
-    ok = np.isfinite(det) & (det > 1e-10 * (aa + bb + cc) ** 3 / 27)
-    step = np.stack([paa * ra + pab * rb + pac * rc, pab * ra + pbb * rb + pbc * rc, pac * ra + pbc * rb + pcc * rc])
-    return step / det, ok
+    ok = np.isfinite(det) & (det > 1e-10 * mean**3)
+    normal[~ok] = np.eye(3)
+    return np.linalg.solve(normal, right[..., None])[..., 0].T, ok

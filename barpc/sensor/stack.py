@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from barpc.geodesy import CHUNK, Array, wrap_longitude
+from barpc.geodesy import CHUNK, NEWTON_STEPS, Array, wrap_longitude
 from barpc.sensor import SensorModel
 from barpc.sensor.rational import DERIVATIVE, REACH, BoolArray, monomials
 from barpc.sensor.rpc import RPC
@@ -15,7 +15,6 @@ from barpc.sensor.rpc import RPC
 IntArray = npt.NDArray[np.int64]
 
 _MANY = 1024  # points of a view: its own inverse is sooner made
-_STEPS = 6
 _SHRINK = 0.25  # of the step before: nothing singular is near (Kantorovich: a half)
 _ARRIVED = 1e-6  # of the box's half width: a step is squared, and what it leaves is below rounding
 
@@ -116,7 +115,7 @@ def _newton(stack: RpcStack, image: Array, alt: Array, views: slice, bounds: Int
     ground, before = offset.copy(), np.full(len(alt), np.inf)
     ground[2] = alt
     certain = np.ones(len(alt), dtype=bool)
-    for _ in range(_STEPS):
+    for _ in range(NEWTON_STEPS):
         value, ((a, b, _), (c, d, _)) = stack.project(ground, views, bounds)
         with np.errstate(all="ignore"):
             col, row = image - value

@@ -11,14 +11,13 @@ import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 
 from barpc.errors import BarpcWarning, InputError, RpcError, RpcFormatError
 from barpc.sensor.curve import fit_orbit
-from barpc.sensor.document import GRID_TOLERANCE, MOST_PIXELS, RELIEF_AROUND, Fields, seconds
+from barpc.sensor.document import MOST_PIXELS, RELIEF_AROUND, Fields, seconds, warn_off_grid
 from barpc.sensor.sentinel1.frames import SlantFrame
 from barpc.sensor.sentinel1.range_doppler import RELIEF, RangeDoppler
 from barpc.sidefile import parse_xml
@@ -30,7 +29,6 @@ _MODES = ("SM", "SL", "HS", "HS300", "ST")  # ScanSAR stores its bursts apart
 _FRAME = re.compile(r"(WGS-?84|ITRF|IG[Sb])[-_ ()G\d]*")  # of any year: they agree to centimetres
 _AGREE = 2.0  # rows or columns that first and last may be off their number times their interval
 _LATEST = 1e-3  # s: no stated delay is longer
-_TRIED = 400  # points of the grid, about, that the model is compared with
 
 
 def find_annotation(folder: Path) -> Path | None:
@@ -122,15 +120,8 @@ def _model(root: Fields, late: tuple[float, float]) -> RangeDoppler:
         frame=SlantFrame(near - late[0], 1.0 / steps[0], steps[1]),
         size=size,
         alt_range=(height - RELIEF_AROUND, height + RELIEF_AROUND),
-        look=_look(root),
+        look=root.chosen("productInfo/acquisitionInfo/lookDirection", {"RIGHT": "right", "LEFT": "left"}),
     )
-
-
-def _look(root: Fields) -> Literal["right", "left"]:
-    side = root.text("productInfo/acquisitionInfo/lookDirection")
-    if side not in ("RIGHT", "LEFT"):
-        raise RpcFormatError(f"{root.name}: lookDirection is {side[:20]!r}, expected RIGHT or LEFT")
-    return "right" if side == "RIGHT" else "left"
 
 
 def _stated(georef: Fields, kind: str, root: Fields) -> float:
@@ -151,18 +142,10 @@ def _held(model: RangeDoppler, georef: Fields, late: tuple[float, float]) -> Ran
     since = seconds(origin.time("tReferenceTimeUTC"), model.epoch) - late[1]
     near = origin.positive("tauReferenceTime", 1.0) - late[0]
     points, tags = georef.all("geolocationGrid/gridPoint"), ("tau", "t", "lon", "lat", "height")
-    points = points[:: len(points) // _TRIED + 1]
     if not points:
         raise RpcFormatError(f"{georef.name}: no gridPoint; is the file complete?")
     table = np.array([[point.number(tag) for tag in tags] for point in points]).T
     image, _ = model.frame.image(np.stack([table[1] + since, table[0] + near]))
-    worst = np.abs(model.project(table[2:].T) - image.T).max(axis=0)
-    if not (worst <= GRID_TOLERANCE).all():
-        warnings.warn(
-            f"{georef.name}: the geolocation grid does not belong to the orbit (off by {worst[0]:.1f} columns, "
-            f"{worst[1]:.1f} rows); the model follows the orbit",
-            BarpcWarning,
-            stacklevel=3,
-        )
+    warn_off_grid(georef.name, model.project(table[2:].T) - image.T)
     low, high = float(np.floor(table[4].min())), float(np.ceil(table[4].max()))
     return replace(model, alt_range=(low - RELIEF[0], high + RELIEF[1]))

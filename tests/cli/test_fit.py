@@ -106,7 +106,7 @@ def test_real_sources(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert run("fit", image, "-o", tmp_path / "img.vrt", "--options", tmp_path / "fit.toml") == 0
     assert run("fit", shared_data / "physical" / "GRID_P1BP--2017092838284574CP.tif") == 0
     radar = sorted((shared_data / "sar").glob("s1a-iw1-slc-vv-20210216*.xml"))[0]
-    (tmp_path / "fit.toml").write_text('[fit]\nmethod = "lcurve"\n')
+    (tmp_path / "fit.toml").write_text('[fit]\nmethod = "lcurve-joint"\n')
     assert run("fit", radar, "-o", tmp_path / "iw1_RPC.TXT", "--options", tmp_path / "fit.toml") == 0
     capsys.readouterr()
     (tmp_path / "fit.toml").write_text('[fit]\nprecision = "nitf"\n')

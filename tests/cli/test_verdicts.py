@@ -13,7 +13,6 @@ import pytest
 from barpc.cli import fit as fitting
 from barpc.cli.adjust import _tell
 from barpc.cli.fit import _certificate
-from barpc.fit.certified import Free
 from barpc.rpcio import write_rpc
 from tests.cli.test_main import run
 from tests.report.made import a_summary
@@ -24,17 +23,17 @@ from tests.rpcio.conftest import make_rpc, write_image
 
 def a_fit(**changes: Any) -> Any:
     usual = {
-        "method": "lcurve", "iterations": 4, "h": (1e-6, 0.25), "num_cnp": 1000, "num_ckp": 500, "coverage": 0.985,
+        "method": "ridge", "iterations": 4, "h": (1e-6, 0.25), "num_cnp": 1000, "num_ckp": 500, "coverage": 0.985,
         "rmse_cnp": (1e-3, 2e-3), "max_cnp": (3e-3, 4e-3), "rmse_ckp": (5e-3, 6e-3), "max_ckp": (7e-3, 8e-3),
         "beyond": 0.0123, "min_denominator": 0.9, "roundtrip": 1e-9, "localisation": None,
-        "contradiction": 3e-9, "free": None,
+        "contradiction": 3e-9,
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **changes})
 
 
 def test_a_certificate_has_a_figure_in_every_line() -> None:
     assert _certificate(a_fit(), "").split("\n") == [
-        "method        lcurve, 4 passes, h 1e-06 0.25",
+        "method        ridge, 4 passes, h 1e-06 0.25",
         "points        1000 control, 500 check, 98% of the image covered",
         "              col [px]     row [px]",
         "control rmse  0.001        0.002",
@@ -46,11 +45,6 @@ def test_a_certificate_has_a_figure_in_every_line() -> None:
         "round trip    1e-09 px; the camera's own 3e-09",
         "verdict       within tolerance",
     ]
-    free = Free(0.01, 0.02, (5.4, 43.2, 900.0), 1.7)
-    assert _certificate(a_fit(free=free), "").split("\n")[9] == (
-        "              without a margin around the image (pole_margin 0) up to 0.02 px, with a pole at lon 5.4000, "
-        "lat 43.2000, 900 m, 1.7 times as far from the middle as the image's end"
-    )
     given = _certificate(a_fit(beyond=1.0), "it misses").split("\n")
     assert not any(line.startswith("beyond") for line in given)
     assert given[-1] == "verdict       it misses"

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from barpc.errors import BarpcWarning, FitError
 from barpc.fit import FitOptions, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit.certificate import CELLS, Sample
-from barpc.fit.poles import least_value, smallest_denominator
+from barpc.fit.poles import Region, smallest_denominator
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 from tests.fit.cameras import synthetic
@@ -129,7 +129,7 @@ def best_possible(name: str, axis: int, start: RPC) -> float:
     for x in (near, plain, plain + 1e-3 * rng.normal(size=39)):
         end = least_squares(residual, x, jacobian, method="lm", xtol=1e-12, ftol=1e-10, max_nfev=100).x
         below = np.append(1.0, end[20:])
-        if least_value(below, np.full((3, 2), [-1.25, 1.25])) > 0.1:
+        if Region.box(np.full((3, 2), [-1.25, 1.25])).least(below) > 0.1:
             value = (end[:20] @ fresh) / (below @ fresh)
             error = start.image_scale[axis] * value + start.image_offset[axis] - image[:, axis]
             found.append(float(np.sqrt((error**2).mean())))
@@ -168,7 +168,7 @@ def test_a_least_value_is_never_above_and_hardly_below_what_a_dense_lattice_find
         box = np.stack([low, low + rng.uniform(0.1, 2.5, 3)], axis=1)
         axes = [a + t * (b - a) for a, b in box]
         value = cubic @ monomials(np.stack(np.meshgrid(*axes, indexing="ij")).reshape(3, -1))
-        found = least_value(cubic, box)
+        found = Region.box(box).least(cubic)
         assert value.min() - 0.02 * np.ptp(value) <= found <= value.min() + 1e-12
 
 

@@ -12,7 +12,7 @@ import pytest
 from barpc.errors import BarpcWarning, FitError
 from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
 from barpc.fit.points import control_points
-from barpc.fit.precision import PRECISIONS
+from barpc.fit.system import PRECISIONS
 from barpc.geodesy import Array
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.sensor.rpc import RPC
@@ -130,12 +130,10 @@ def test_the_vendors_denominators_may_be_kept(camera: Camera) -> None:
     assert fit.max_ckp.max() <= 1e-2
 
 
-@pytest.mark.parametrize("joint", [False, True])
-def test_the_papers_solver_fits_a_ten_thousandth_of_a_pixel(camera: Camera, joint: bool) -> None:
-    options = FitOptions(method="lcurve-joint" if joint else "lcurve")
-    fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=options)
+def test_the_papers_solver_fits_a_ten_thousandth_of_a_pixel(camera: Camera) -> None:
+    fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=FitOptions(method="lcurve-joint"))
     assert fit.rmse_ckp.max() <= 2e-4
-    assert (fit.h[0] == fit.h[1]) == joint
+    assert fit.h[0] == fit.h[1]
 
 
 @pytest.mark.slow

@@ -27,7 +27,7 @@ from barpc.errors import InputError, RpcFormatError
 from barpc.geodesy import Array
 from barpc.sensor.curve import EXTRAPOLATION
 from barpc.sensor.document import MOST_PIXELS, STRAIGHT, Fields, seconds
-from barpc.sensor.linescan.samples import Detector, Linescan, Samples, camera_of_samples, unit
+from barpc.sensor.linescan.samples import STEP, Detector, Linescan, Samples, camera_of_samples, unit
 from barpc.sensor.pushbroom import Light
 from barpc.sidefile import parse_xml
 
@@ -37,8 +37,6 @@ _TABLES = {"EPH": (13, 7), "ATT": (15, 5)}  # numbers of a row: with covariances
 _LIGHT = Light(aberration=True, refraction=True)  # star trackers tell where the body points
 _UNITS = (1.0, 1e-3, 1e-6)  # s: that LINE_PERIOD may be in
 _AGREE = 0.01  # relative: by how much LINE_PERIOD may miss what START and END say
-_DAY = 86400.0  # s: OFFSET counts from midnight
-_STEP = 0.05  # s: at which a polynomial attitude is sampled
 
 
 def read_linescan(
@@ -224,10 +222,9 @@ def _attitude(attitudes: Fields, first: np.datetime64, lasts: float) -> tuple[Ar
     if listed:
         return _times(listed, first), np.array([[q.number(f"Q{k}") for k in range(4)] for q in listed])
     poly = attitudes.one("Polynomial_Quaternions")
-    ticks = np.arange(-EXTRAPOLATION, lasts + EXTRAPOLATION + _STEP, _STEP)
-    midnight = first.astype("datetime64[D]").astype("datetime64[ns]")
-    since = seconds(first, midnight) - poly.number("OFFSET")
-    since -= _DAY * round(since / _DAY)  # of an image taken at midnight
+    ticks = np.arange(-EXTRAPOLATION, lasts + EXTRAPOLATION + STEP, STEP)
+    days = first.astype("datetime64[D]") + np.arange(-1, 2)  # OFFSET counts from a midnight
+    since = min(seconds(first, days.astype("datetime64[ns]")) - poly.number("OFFSET"), key=abs)
     scaled = (ticks + since) / poly.positive("SCALE")
     values = []
     for k in range(4):

@@ -13,6 +13,8 @@ from barpc.geodesy import Array, ecef_from_ground
 from barpc.sensor.curve import EXTRAPOLATION, Curve, attitude_through
 from barpc.sensor.pushbroom import Pushbroom
 
+STEP = 0.02  # s: at which an attitude is sampled that is given otherwise
+
 _GAP = 4.0  # times the usual step: a longer one is a gap that nothing bridges
 _BEYOND = 2.0  # steps that an image may reach beyond the samples
 _FASTEST = 0.3  # rad/s: no imaging satellite turns so fast

@@ -15,13 +15,12 @@ import numpy as np
 
 from barpc.errors import InputError
 from barpc.frozen import Frozen
-from barpc.geodesy import NEWTON_STEPS, SPEED_OF_LIGHT, Array, enu_basis, up
+from barpc.geodesy import NEWTON_STEPS, SETTLED, SPEED_OF_LIGHT, Array, enu_basis, up
 from barpc.sensor.document import seconds
 from barpc.sensor.sentinel1.annotation import Annotation
 from barpc.sensor.timing import Timing
 
 Bistatic = Literal["annotated", "full"]  # which bistatic correction; see `bistatic_constant`
-_RAD = np.pi / 180.0
 _SPREAD = 1e-5  # s: what lines and azimuth times of a grid may scatter
 _ZENITH = (2.41, -1.0 / 3411.0, 1.0 / 8.55e7)  # m, per m, per m^2 of altitude
 
@@ -80,8 +79,8 @@ class GroundFrame(Frozen):
             ground, by_slant, _ = self._ground_range(time, slant)
             step = (target - ground) / by_slant
             slant = slant + step
-            if not (np.abs(step).max(initial=0.0, where=np.isfinite(step)) > 1e-3):
-                break  # quadratic: the next step is below rounding
+            if not (np.abs(step).max(initial=0.0, where=np.isfinite(step)) > SETTLED):
+                break
         return np.stack([time, slant * (2.0 / SPEED_OF_LIGHT)])
 
     def _ground_range(self, time: Array, slant: Array) -> tuple[Array, Array, Array]:
@@ -151,8 +150,8 @@ class Delays:
             enu = enu_basis(ground)
             east, north, cosine = np.einsum("nij,jn->in", enu, sight)
             by_cosine = np.einsum("nj,njk->nk", enu[:, 2, :], by_sight)
-            by_cosine[:, 0] += east * np.cos(ground[:, 1] * _RAD) * _RAD
-            by_cosine[:, 1] += north * _RAD
+            by_cosine[:, 0] += np.radians(east * np.cos(np.radians(ground[:, 1])))
+            by_cosine[:, 1] += np.radians(north)
             zenith, slope = _zenith(ground[:, 2])
             out[1] = -(zenith / cosine**2)[:, None] * by_cosine
             out[1, :, 2] += slope / cosine

@@ -6,7 +6,6 @@ The satellite's orbit is O(t) with velocity V(t). The azimuth time t of a ground
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from barpc.errors import BarpcWarning, InputError, RpcFormatError
+from barpc.errors import InputError, RpcFormatError
 from barpc.geodesy import (
     NEWTON_STEPS,
     SETTLED,
@@ -25,7 +24,7 @@ from barpc.geodesy import (
     pointwise,
 )
 from barpc.sensor.curve import Curve, Orbit, fit_orbit
-from barpc.sensor.document import GRID_TOLERANCE, seconds
+from barpc.sensor.document import seconds, warn_off_grid
 from barpc.sensor.sentinel1.annotation import (
     Annotation,
     StateVectors,
@@ -281,14 +280,7 @@ def swaths_model(
         accuracy=(float(np.hypot(of_orbit, left[0])), float(np.hypot(of_orbit, left[1]))),
     )
     for annotation in swaths:
-        worst = np.abs(grid_residuals(annotation, model)).max(axis=0)
-        if not (worst <= GRID_TOLERANCE).all():
-            warnings.warn(
-                f"{annotation.name}: the geolocation grid does not belong to the orbit (off by {worst[0]:.1f} "
-                f"samples, {worst[1]:.1f} lines); the model follows the orbit, the grid is not used",
-                BarpcWarning,
-                stacklevel=3,
-            )
+        warn_off_grid(annotation.name, grid_residuals(annotation, model))
     return model
 
 

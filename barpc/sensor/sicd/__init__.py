@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import BinaryIO
 
 import numpy as np
 
@@ -115,7 +115,7 @@ def open_sicd(path: Path) -> Monostatic:
         origin=(center[0] - first[0], center[1] - first[1]),
         size=(int(root.positive("ImageData/NumCols")), int(root.positive("ImageData/NumRows"))),
         alt_range=(altitude - RELIEF_AROUND, altitude + RELIEF_AROUND),
-        look=_look(root),
+        look=root.chosen("SCPCOA/SideOfTrack", {"R": "right", "L": "left"}),
         accuracy=_accuracy(root, scp),
     )
     seen = model.project(ground_from_ecef(scp))
@@ -133,13 +133,6 @@ def _whole(root: Fields, path: str) -> int:
 
 def _vector(root: Fields, path: str) -> Array:
     return np.array([root.numbers(f"{path}/{axis}")[0] for axis in "XYZ"])
-
-
-def _look(root: Fields) -> Literal["right", "left"]:
-    side = root.text("SCPCOA/SideOfTrack")
-    if side not in ("R", "L"):
-        raise RpcFormatError(f"{root.name}: SCPCOA/SideOfTrack is {side[:20]!r}, expected R or L")
-    return "right" if side == "R" else "left"
 
 
 def _accuracy(root: Fields, scp: Array) -> tuple[float, float] | None:
