@@ -12,10 +12,10 @@ import json
 import shutil
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import cache, lru_cache, partial
+from functools import cache
 from html import escape
 from importlib import import_module
 from importlib.util import find_spec
@@ -110,7 +110,11 @@ def verify(
     ground, image = control_grid(model, size, alt_range)
     if not len(ground):
         raise OutputError("hand-off: the model sees no ground point inside its own image")
-    return [reading for path in map(Path, paths) for reading in _readings(path, ground, image)]
+
+    def measured(_: Consumer, read: Projection) -> tuple[float, float]:
+        return _largest(read, ground, image), float("nan")
+
+    return [reading for path in map(Path, paths) for reading in _readings(path, _consumers(path), measured)]
 
 
 def verify_grid(path: Path, sample: Sample, correction: CorrectionGrid | None = None) -> list[Reading]:
@@ -123,38 +127,17 @@ def verify_grid(path: Path, sample: Sample, correction: CorrectionGrid | None = 
     sample : Sample
         Of the model that it should hold.
     """
-    consumers = {name: one for name, one in _grid_consumers(path).items() if one.installed}
-    try:
-        with _lent(path) as lent:
-            found = [_grid_reading(path, lent, *one, sample, correction) for one in consumers.items()]
-    except Exception as failure:  # noqa: BLE001 - what cannot be lent is read by none
-        found = [_lost(path, name, failure) for name in consumers]
-    _opened.cache_clear()
-    return found
-
-
-def _grid_reading(
-    path: Path, lent: Path, name: str, consumer: Consumer, sample: Sample, correction: CorrectionGrid | None
-) -> Reading:
     model = sample.model
 
-    def off(read: Projection, ground: Array, at: Array) -> Array:
-        image = model.project(read(at)) if consumer.locates else read(ground)
-        return (image if correction is None else correction.apply(image)) - at[:, :2]
+    def measured(consumer: Consumer, read: Projection) -> tuple[float, float]:
+        def off(ground: Array, at: Array) -> Array:
+            image = model.project(read(at)) if consumer.locates else read(ground)
+            return (image if correction is None else correction.apply(image)) - at[:, :2]
 
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            errors, largest = sample.sought(partial(off, consumer.open(lent)))
-    except Exception as failure:  # noqa: BLE001 - a foreign reader may raise anything; that is the finding
-        return _lost(path, name, failure)
-    error = float(np.linalg.norm(largest))
-    note = "" if np.isfinite(error) else "it has no finite point"
-    return Reading(path, name, error, note, float(np.linalg.norm(errors.rmse)))
+        errors, largest = sample.sought(off)
+        return float(np.linalg.norm(largest)), float(np.linalg.norm(errors.rmse))
 
-
-def _lost(path: Path, name: str, failure: Exception) -> Reading:
-    return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
+    return _readings(path, _grid_consumers(path), measured)
 
 
 def unverified(paths: Sequence[Path | str]) -> list[str]:
@@ -174,42 +157,42 @@ _MACHINE = frozenset(
 )
 
 
+def _consumers(path: Path) -> dict[str, Consumer]:
+    """Return the tools that read a file of an RPC, those that are not installed too; barpc last."""
+    row = row_of(path)
+    return {name: CONSUMERS[name] for name in (*(() if row is None else row.consumers), "barpc")}
+
+
 def _readers(path: Path) -> dict[str, bool]:
     """Return the tools besides barpc that read a file, and whether they are installed."""
-    if path.name.endswith((GRID, CORRECTION, STATE_END)):
-        return {name: one.installed for name, one in _grid_consumers(path).items() if one.package != "barpc"}
-    row = row_of(path)
-    return {} if row is None else {name: CONSUMERS[name].installed for name in row.consumers}
+    of_grid = path.name.endswith((GRID, CORRECTION, STATE_END))
+    found = _grid_consumers(path) if of_grid else _consumers(path)
+    return {name: one.installed for name, one in found.items() if one.package != "barpc"}
 
 
-def _readings(path: Path, ground: Array, image: Array) -> list[Reading]:
-    """Read a file with all consumers; those that are not barpc get it in a folder of its own."""
-    names = [name for name, installed in _readers(path).items() if installed]
-    try:
-        with _lent(path) as lent:
-            found = [_reading(path, lent, name, ground, image) for name in names]
-    except OutputError:  # of `_unread`
-        raise
-    except Exception as failure:  # noqa: BLE001 - what cannot be lent is read by none
-        found = [_unread(path, name, failure) for name in names]
-    return [*found, _reading(path, path, "barpc", ground, image)]
+def _readings(
+    path: Path, consumers: Mapping[str, Consumer], measure: Callable[[Consumer, Projection], tuple[float, float]]
+) -> list[Reading]:
+    """Read a file with all consumers; those that are not barpc get it in a folder of its own.
 
-
-def _reading(path: Path, lent: Path, name: str, ground: Array, image: Array) -> Reading:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            error = _largest(CONSUMERS[name].open(lent), ground, image)
-    except Exception as failure:  # noqa: BLE001 - a foreign reader may raise anything; that is the finding
-        return _unread(path, name, failure)
-    return Reading(path, name, error, "" if np.isfinite(error) else "it projects to no finite point")
-
-
-def _unread(path: Path, name: str, failure: Exception) -> Reading:
-    """Return a reader's message; OutputError where the machine and not the file is to blame."""
-    if isinstance(failure, OSError) and failure.errno in _MACHINE:
-        raise OutputError(f"{path}: cannot be opened as {name} does ({failure.strerror})") from failure
-    return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
+    OutputError where the machine and not the file is to blame; whatever else a reader raises is its finding.
+    """
+    found = []
+    for name, consumer in consumers.items():
+        if not consumer.installed:
+            continue
+        error, rms = float("nan"), float("nan")
+        try:
+            with warnings.catch_warnings(), nullcontext(path) if name == "barpc" else _lent(path) as place:
+                warnings.simplefilter("ignore")
+                error, rms = measure(consumer, consumer.open(place))
+            note = "" if np.isfinite(error) else "it projects to no finite point"
+        except Exception as failure:
+            if isinstance(failure, OSError) and failure.errno in _MACHINE:
+                raise OutputError(f"{path}: cannot be opened as {name} does ({failure.strerror})") from failure
+            note = " ".join(f"{type(failure).__name__}: {failure}".split())
+        found.append(Reading(path, name, error, note, rms))
+    return found
 
 
 @contextmanager
@@ -362,20 +345,14 @@ def _shareloc_grid(path: Path) -> Projection:
     return localize
 
 
-@lru_cache(maxsize=1)
-def _opened(path: Path) -> SensorModel:
-    """Return the camera of a file, which two consumers ask for one after the other."""
-    return open_camera(path).model
-
-
 def _own_grid(path: Path) -> Projection:
-    return _opened(path).project
+    return open_camera(path).model.project
 
 
 def _linear_grid(path: Path) -> Projection:
     from scipy.interpolate import RegularGridInterpolator  # a quarter of a second, of grids alone
 
-    grid = _opened(path)
+    grid = open_camera(path).model
     assert isinstance(grid, DirectGrid)
     lonlat = RegularGridInterpolator((grid.alts, grid.rows, grid.cols), grid.lonlat, bounds_error=False)
     return lambda at: np.column_stack([lonlat(at[:, ::-1]), at[:, 2]])

@@ -280,7 +280,8 @@ def test_shareloc_counts_from_the_corner_of_the_first_pixel_and_row_before_col(l
 def test_what_shareloc_leaves_out_beyond_180_degrees_is_told(lon, takes, note, monkeypatch, tmp_path):
     rpc = make_rpc(lon=lon)
     monkeypatch.setattr("barpc.handoff.import_module", lambda _: shareloc(rpc, takes))
-    monkeypatch.setattr("barpc.handoff._readers", lambda _: {"shareloc": True})
+    named = {"shareloc": replace(CONSUMERS["shareloc"], package="numpy"), "barpc": CONSUMERS["barpc"]}
+    monkeypatch.setattr("barpc.handoff._consumers", lambda _: named)
     write_rpc(rpc, tmp_path / "a.geom")
     reading, own = verify([tmp_path / "a.geom"], rpc, SIZE, ALTITUDES)
     assert own.passed

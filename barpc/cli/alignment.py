@@ -15,6 +15,7 @@ from barpc.fit import FitOptions, fit_rpc
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.pointio.tables import read_transform
 from barpc.rpcio import CARRIERS
+from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, correction_of
 from barpc.sensor.geometry import image_border
 from barpc.sensor.rpc import RPC
@@ -64,7 +65,9 @@ def moved(cameras: Sequence[Camera], move: Array | None, transform: str | None, 
             file, ends = transform or "--move", f"{low:.0f} to {high:.0f} m"
             raise InputError(f"{file}: takes the ground of {camera.path} to altitudes of {ends}: {what}")
         moving = Corrected(camera.model, correction_of(matrix, middle))
-        out.append(_refitted(camera, moving, (low, high), carrier))
+        direct = isinstance(camera.model, RPC) and camera.model.direct is not None
+        options = replace(FitOptions(), precision=CARRIERS[carrier].precision, localisation=direct)
+        out.append(refitted(camera, moving, (low, high), options, "moved and refitted"))
     _tell(matrix, middle)
     return out
 
@@ -91,13 +94,14 @@ def _check_position(move: Array, ground: Array) -> None:
             )
 
 
-def _refitted(camera: Camera, model: Corrected, alt_range: tuple[float, float], carrier: str) -> Camera:
-    direct = isinstance(camera.model, RPC) and camera.model.direct is not None
-    options = replace(FitOptions(), precision=CARRIERS[carrier].precision, localisation=direct)
+def refitted(
+    camera: Camera, model: SensorModel, alt_range: tuple[float, float], options: FitOptions, done: str
+) -> Camera:
+    """Return a camera with the RPC of a model, and say how near it comes; FitError where none holds it."""
     fit = fit_rpc(model, camera.extent, alt_range, options=options, strict=False)
     if wrong := fit.verdict(options.tolerance):
-        raise FitError(f"{camera.path}: moved, {wrong}")
-    say(f"{camera.path}: moved and refitted to {float(fit.max_ckp.max()):.1g} px")
+        raise FitError(f"{camera.path}: {wrong} ('barpc fit --keep-going' writes it all the same)")
+    say(f"{camera.path}: {done} to {float(fit.max_ckp.max()):.1g} px")
     return replace(camera, model=fit.rpc, alt_range=alt_range)
 
 

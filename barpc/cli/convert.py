@@ -15,13 +15,13 @@ import numpy as np
 import shapely
 
 from barpc.cameras import Camera, open_camera, split_spec
-from barpc.cli.alignment import moved, read_move
+from barpc.cli.alignment import moved, read_move, refitted
 from barpc.cli.flags import expanded
 from barpc.cli.project import Altitudes, altitude_of, exchanged, with_heights
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
 from barpc.dem import Dem
-from barpc.errors import FitError, InputError, OutputError
-from barpc.fit import FitOptions, fit_rpc
+from barpc.errors import InputError, OutputError
+from barpc.fit import FitOptions
 from barpc.fit.certificate import Sample
 from barpc.fit.points import widened
 from barpc.handoff import TOLERANCE, Reading, unverified, verify, verify_grid
@@ -158,12 +158,7 @@ def _to_target(files: tuple[str, ...], flags: Mapping[str, Any]) -> int:
 
 def _refitted(camera: Camera) -> Camera:
     """Fit an RPC to a grid; FitError where none holds it."""
-    options = FitOptions()
-    fit = fit_rpc(camera.model, camera.extent, camera.alt_range, options=options, strict=False)
-    if wrong := fit.verdict(options.tolerance):
-        raise FitError(f"{camera.path}: {wrong} ('barpc fit --keep-going' writes it all the same)")
-    say(f"{camera.path}: {camera.format}, fitted to {float(fit.max_ckp.max()):.1g} px")
-    return replace(camera, model=fit.rpc)
+    return refitted(camera, camera.model, camera.alt_range, FitOptions(), camera.format + ", fitted")
 
 
 def _copy(camera: Camera, image: Path, target: str, formats: str | None, overwrite: bool) -> int:

@@ -22,7 +22,6 @@ from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
-from importlib import metadata
 from typing import Any
 
 import numpy as np
@@ -341,15 +340,11 @@ POLL, REMIND = 5.0, 60.0
 
 @contextmanager
 def watched(executor: Executor | None) -> Iterator[None]:
-    """Log when a dask cluster has no worker, once a minute while the run waits, and when work goes on.
-
-    InputError where a worker has another version of barpc.
-    """
+    """Log when a dask cluster has no worker, once a minute while the run waits, and when work goes on."""
     client = getattr(executor, "_client", None)
     if client is None:
         yield
         return
-    _require_own_version(client)
     end = threading.Event()
     threading.Thread(target=_watch, args=(client, end), daemon=True).start()
     try:
@@ -358,23 +353,11 @@ def watched(executor: Executor | None) -> Iterator[None]:
         end.set()
 
 
-def other_version(theirs: str, own: str, where: str = "a worker") -> InputError:
-    """Return why a worker would give other bytes (its version), or nothing."""
+def other_version(theirs: str, own: str) -> InputError:
+    """Return what to say of a worker whose version would give other bytes."""
     return InputError(
-        f"{where} has barpc {theirs}, this process {own}: results would differ; install the same version everywhere"
+        f"a worker has barpc {theirs}, this process {own}: results would differ; install the same version everywhere"
     )
-
-
-def _require_own_version(client: Any) -> None:
-    try:
-        own = metadata.version("barpc")
-    except metadata.PackageNotFoundError:  # from a folder: nothing to compare with
-        return
-    found = client.run(metadata.version, "barpc", on_error="return")
-    for worker, theirs in sorted(found.items()):
-        if theirs != own:
-            none = isinstance(theirs, Exception)
-            raise other_version("of no version" if none else theirs, own, f"the worker {worker}")
 
 
 def _watch(client: Any, end: threading.Event) -> None:

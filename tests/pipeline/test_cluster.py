@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import logging
-import re
 import threading
 import time
-from collections.abc import Callable
-from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +12,6 @@ from typing import Any
 import pytest
 
 import barpc
-from barpc.errors import InputError
 from barpc.options import RunOptions, TieOptions
 from barpc.pipeline import executor as cluster
 from barpc.pipeline.executor import run_batch
@@ -43,10 +39,6 @@ class Counted:
         if number is None:
             raise OSError("Timed out")
         return {f"tcp://127.0.0.1:{i}": 1 for i in range(number)}
-
-    def run(self, function: Callable[[str], str], package: str, on_error: str) -> dict[str, str]:
-        assert on_error == "return"
-        return {"tcp://127.0.0.1:0": function(package)}
 
 
 class Works:
@@ -84,26 +76,6 @@ def test_a_cluster_with_workers_and_an_executor_that_is_none_are_not_spoken_of(
         assert not [t for t in threading.enumerate() if t.name == cluster.__name__]
 
 
-class Mixed(Counted):
-    """A client with one worker of this version and another one."""
-
-    def __init__(self, other: str | Exception) -> None:
-        super().__init__(2)
-        self.other = other
-
-    def run(self, function: Callable[[str], str], package: str, on_error: str) -> dict[str, object]:
-        return {"tcp://b:1": self.other, **super().run(function, package, on_error)}
-
-
-@pytest.mark.parametrize(
-    ("other", "said"), [("0.0.9", "0.0.9"), (metadata.PackageNotFoundError("barpc"), "of no version")]
-)
-def test_a_worker_of_another_version_is_named_before_any_work(other: str | Exception, said: str) -> None:
-    line = f"the worker tcp://b:1 has barpc {said}, this process {metadata.version('barpc')}: results would differ"
-    with pytest.raises(InputError, match=re.escape(line)), cluster.watched(Works(Mixed(other))):  # type: ignore[arg-type]
-        pytest.fail("the run began")
-
-
 def test_a_worker_that_comes_later_with_another_version_works_on_nothing() -> None:
     done: list[int] = []
     outcomes, seconds = run_batch(done.append, [(1,), (2,)], "0.0.9")
@@ -114,24 +86,6 @@ def test_a_worker_that_comes_later_with_another_version_works_on_nothing() -> No
     ] * 2
     assert run_batch(done.append, [(1,), (2,)], barpc.__version__)[0][0][2] is None
     assert done == [1, 2]
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_the_version_of_real_workers_is_asked_for(distributed: Any, tmp_path: Path) -> None:
-    folder = tmp_path / "barpc-9.9.dist-info"
-    folder.mkdir()
-    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: barpc\nVersion: 9.9\n")
-    local = {"n_workers": 1, "threads_per_worker": 1, "local_directory": str(tmp_path / "dask")}
-    with (
-        distributed.LocalCluster(dashboard_address=None, **local) as dask,
-        distributed.Client(dask) as client,
-    ):
-        client.wait_for_workers(1)
-        with cluster.watched(client.get_executor()):
-            client.run(exec, f"import sys; sys.path.insert(0, {str(tmp_path)!r})")
-        with pytest.raises(InputError, match=r"has barpc 9\.9"), cluster.watched(client.get_executor()):
-            pytest.fail("the run began")
 
 
 def test_the_last_worker_is_said_within_ten_seconds_and_then_once_a_minute() -> None:
@@ -258,17 +212,3 @@ def test_the_watch_begins_with_the_work_and_ends_with_it(monkeypatch) -> None:
         raise KeyError
     assert ends[0].is_set()
     assert len(ends) == 1
-
-
-def test_where_barpc_is_not_installed_there_is_nothing_to_compare_with(monkeypatch) -> None:
-    def missing(name: str) -> str:
-        raise metadata.PackageNotFoundError(name)
-
-    client = Mixed("0.0.9")
-    with monkeypatch.context() as patch:
-        known = {"version": missing, "PackageNotFoundError": metadata.PackageNotFoundError}
-        patch.setattr(cluster, "metadata", SimpleNamespace(**known))
-        cluster._require_own_version(client)
-    with pytest.raises(InputError, match=r"has barpc 0\.0\.9"):
-        cluster._require_own_version(client)
-    cluster._require_own_version(Mixed(metadata.version("barpc")))

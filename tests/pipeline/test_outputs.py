@@ -213,8 +213,7 @@ def test_the_largest_error_of_all_points_is_what_counts(tmp_path, monkeypatch) -
         "absent": Consumer("no_such_package", no_number),
         "barpc": CONSUMERS["barpc"],
     }
-    monkeypatch.setattr(handoff, "CONSUMERS", consumers)
-    monkeypatch.setattr(handoff, "_readers", lambda path: {"corner": True, "nan": True, "absent": False})
+    monkeypatch.setattr(handoff, "_consumers", lambda path: consumers)
     write_rpc(rpc, tmp_path / "A_RPC.TXT")
     corner, nan, own = verify([tmp_path / "A_RPC.TXT"], rpc, SIZE, ALTITUDES)
     assert own.passed
