@@ -14,8 +14,7 @@ import numpy as np
 from barpc.errors import InputError
 from barpc.export.neural import Files, as_json, rpc_of
 from barpc.export.shots import Scene, Shot, relative_link
-from barpc.geodesy import Array, enu_basis, metres_per_unit, utm, wrap_longitude
-from barpc.geojson import polygon
+from barpc.geodesy import Array, enu_basis, metres_per_unit, polygon, utm, wrap_longitude
 from barpc.report.tables import ply
 from barpc.sensor.geometry import footprint
 

@@ -22,8 +22,7 @@ from barpc.export.approx import (
     project_projective,
 )
 from barpc.export.shots import Scene, Shot, relative_link
-from barpc.geodesy import Array, ecef_from_ground, utm, wrap_longitude
-from barpc.geojson import polygon
+from barpc.geodesy import Array, ecef_from_ground, polygon, utm, wrap_longitude
 from barpc.remote import is_url
 from barpc.report.records import plain
 from barpc.report.tables import ply

@@ -18,7 +18,7 @@ import numpy as np
 from barpc.errors import BarpcError, ImageError, MissingRpcError, RpcError, RpcFormatError
 from barpc.raster import driver_of, identify, open_raster
 from barpc.remote import Place, beside, is_url, location
-from barpc.rpcio.carried import read_nitf, read_tag
+from barpc.rpcio.carried import SCANNED, read_nitf, read_tag
 from barpc.rpcio.formats import FORMATS, files_of, holds_physical, parse
 from barpc.rpcio.text import ReadOptions, decode
 from barpc.rpcio.xml import rpc_from_domain
@@ -298,7 +298,6 @@ def _tile_origin(image: Place, path: Place) -> tuple[_Window, str]:
 _TAGS = ("ACQUISITIONDATETIME", "NITF_IDATIM", "TIFFTAG_DATETIME")  # the last is often that of the file
 _TAG = re.compile(r"(\d{4})[-:/]?(\d\d)[-:/]?(\d\d)")
 _FIRST = 1957  # no satellite took an image before
-_HEAD = 4 << 20  # bytes of a file that are looked at
 _NUMBER = rb"([+-]?\d{1,3}(?:\.\d{1,20})?(?:e[+-]?\d{1,2})?)"
 _SUN = {
     name: re.compile(
@@ -387,6 +386,6 @@ def _texts(image: Place, camera: Place) -> Iterator[bytes]:
         *(image.parent / present[name.lower()] for name in wanted if name.lower() in present),
     ]:
         try:
-            yield read_head(file, RPC_FILE, _HEAD)
+            yield read_head(file, RPC_FILE, SCANNED)
         except BarpcError:
             continue
