@@ -337,17 +337,13 @@ def geoid_file(given: str | os.PathLike[str]) -> str:
 def proj_folders() -> list[Path]:
     """Return the folders in which PROJ looks for grids: of its variables, the user, Python packages, the system."""
     said = [part for name in ("PROJ_DATA", "PROJ_LIB") for part in os.environ.get(name, "").split(os.pathsep)]
-    folders = [Path(part) for part in said if part] + [_of_user()]
+    data = {
+        "win32": os.environ.get("LOCALAPPDATA", Path.home()),
+        "darwin": Path.home() / "Library/Application Support",
+    }.get(sys.platform, os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share")
+    folders = [Path(part) for part in said if part] + [Path(data) / "proj"]
     for package, place in (("rasterio", "proj_data"), ("pyproj", "proj_dir/share/proj")):
         spec = find_spec(package)
         folders += [Path(spec.origin).parent / place] if spec is not None and spec.origin else []
     folders += [Path(root) / "share/proj" for root in (sys.prefix, "/usr/local", "/usr")]
     return [folder for folder in dict.fromkeys(folders) if folder.is_dir()]
-
-
-def _of_user() -> Path:
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", Path.home())) / "proj"
-    if sys.platform == "darwin":
-        return Path.home() / "Library/Application Support/proj"
-    return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share") / "proj"

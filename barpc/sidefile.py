@@ -9,10 +9,8 @@ from __future__ import annotations
 import codecs
 import io
 import json
-import logging
 import math
 import os
-import re
 import stat
 import unicodedata
 from array import array
@@ -28,8 +26,6 @@ from barpc import identity
 from barpc.errors import BarpcError, ImageError, InputError, RpcFormatError, visible
 from barpc.remote import BLOCK, Place, Remote, RemoteFile, location, pinned
 
-logger = logging.getLogger(__name__)
-
 MB = 1 << 20
 NUMBER = 8
 """Bytes of what an element of a file becomes in memory, however small it is kept there."""
@@ -39,7 +35,6 @@ for _flag in ("O_NONBLOCK", "O_CLOEXEC", "O_NOCTTY", "O_BINARY"):  # not every s
     _FLAGS |= getattr(os, _flag, 0)
 _KINDS = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
 _TOLD, _LETTERS = 16, 4  # bytes that tell an encoding; letters of them, at least
-_LONG = 64 * MB  # what takes longer than two seconds to read and parse says so
 
 
 @dataclass(frozen=True)
@@ -69,13 +64,13 @@ class Kind:
 
 
 def _count(text: bytes, between: bytes) -> int:
-    """Count the values of a text: by the signs between them, of blanks one a row."""
-    one_each = sum(text.count(sign) for sign in between if sign != _BLANK)
-    return one_each + (len(re.findall(rb" (?! )", text)) if _BLANK in between else 0)
+    """Count the values of a text: by the signs between them, and by words where blanks are among these."""
+    words = len(text.split()) if _BLANK in between else 0
+    return words + sum(text.count(sign) for sign in between if sign != _BLANK)
 
 
 _BLANK = ord(" ")
-_OF_JSON, _OF_TABLE = b",:", b",;\t\n "
+_OF_JSON, _OF_TABLE = b",:", b",; "
 
 IMAGE = Kind("an image", None, ImageError)
 PRODUCT = Kind("a product", None, RpcFormatError)
@@ -136,8 +131,6 @@ def _regular(path: Path | str, kind: Kind) -> BinaryIO:
             raise kind.error(f"{path}: {what}, not a file; {kind.words} is needed")
         kind.check(path, found.st_size)
         identity.note(path, found)
-        if kind.most is not None and found.st_size > _LONG:
-            logger.warning("%s: reading %d MB, which takes a while", path, found.st_size >> 20)
     except BaseException:
         os.close(descriptor)
         raise
@@ -236,7 +229,8 @@ _DIGITS = 18  # of a whole number: more do not fit 64 bits
 LARGEST = 1e100
 """No number of a side file comes near, and its square is finite."""
 
-_MAX_DEPTH = 100  # levels of JSON and of XML
+MAX_DEPTH = 100
+"""Levels of JSON, XML and HDF5."""
 _NO_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
 _STEPS = bytes.maketrans(b"[]{}", b"\x01\xff\x01\xff")  # one level down or up, as signed bytes
 
@@ -252,15 +246,15 @@ def read_json(path: Path | str, kind: Kind) -> Any:
 
 def parse_json(text: str) -> Any:
     """Parse a JSON text; ValueError for numbers that are not finite or beyond 64 bits, or nested too deep."""
-    if _depth(text) > _MAX_DEPTH:  # how deep json itself goes differs between versions of Python
-        raise ValueError(f"nested too deep, at most {_MAX_DEPTH} levels are read")
+    if _depth(text) > MAX_DEPTH:  # how deep json itself goes differs between versions of Python
+        raise ValueError(f"nested too deep, at most {MAX_DEPTH} levels are read")
     return json.loads(text, parse_constant=_refuse, parse_int=_whole, parse_float=_finite)
 
 
 def _depth(text: str) -> int:
     """Return the nesting depth of a JSON text, strings left out; an upper bound where it is small."""
     few = text.count("[") + text.count("{")
-    if few <= _MAX_DEPTH:
+    if few <= MAX_DEPTH:
         return few
     plain = text.replace(r"\\", "").replace(r"\"", "")
     outside = "".join(plain.split('"')[::2]).encode("ascii", "ignore")
@@ -286,7 +280,8 @@ def _finite(text: str) -> float:
 
 # --- XML --------------------------------------------------------------------------------------------------
 
-_MAX_ELEMENTS = 2_000_000
+MAX_ELEMENTS = 2_000_000
+"""Of an XML or HDF5 file."""
 
 
 class _Builder(ElementTree.TreeBuilder):
@@ -298,7 +293,7 @@ class _Builder(ElementTree.TreeBuilder):
 
     def start(self, tag: str, attrs: dict[str, str]) -> ElementTree.Element:
         self._depth, self._count = self._depth + 1, self._count + 1
-        if self._depth > _MAX_DEPTH or self._count > _MAX_ELEMENTS:
+        if self._depth > MAX_DEPTH or self._count > MAX_ELEMENTS:
             raise ElementTree.ParseError(f"{self._count} elements, {self._depth} deep: too many")
         return super().start(tag, attrs)
 

@@ -17,7 +17,7 @@ from barpc.remote import _KEPT as HELD
 from barpc.remote import _LONGEST as REQUEST
 from barpc.remote import BLOCK, hosts
 from barpc.report import tables
-from barpc.rpcio import carried, sources
+from barpc.rpcio import carried
 from barpc.sensor import document as metadata
 from barpc.sensor import sicd
 from barpc.tie.pairing import area
@@ -54,10 +54,10 @@ def rows() -> list[tuple[str, str]]:
         *((kind.words, size(kind.most) + _numbers(kind)) for kind in bounded),
         (
             sidefile.XML.words,
-            f"{size(sidefile.XML.most)}, {sidefile._MAX_DEPTH} levels, {many(sidefile._MAX_ELEMENTS)} elements",
+            f"{size(sidefile.XML.most)}, {sidefile.MAX_DEPTH} levels, {many(sidefile.MAX_ELEMENTS)} elements",
         ),
         (sidefile.TABLE.words, size(sidefile.TABLE.most) + _numbers(sidefile.TABLE)),
-        ("JSON", f"{sidefile._MAX_DEPTH} levels"),
+        ("JSON", f"{sidefile.MAX_DEPTH} levels"),
         (
             f"{sidefile.ARRAYS.words} (`.npz`)",
             f"{size(sidefile.ARRAYS.most)} {unpacked}; a member {many(frozen.DEFLATED)} times its stored bytes",
@@ -69,8 +69,8 @@ def rows() -> list[tuple[str, str]]:
         ("a COLMAP database", f"{many(foreign._STEPS)} times 100,000 instructions of SQLite"),
         (
             "an HDF5 file",
-            f"{many(foreign._MOST)} objects, groups {foreign._DEEPEST} deep; an array {many(frozen.DEFLATED)} times "
-            "its stored bytes",
+            f"{many(sidefile.MAX_ELEMENTS)} objects, groups {sidefile.MAX_DEPTH} deep; an array "
+            f"{many(frozen.DEFLATED)} times its stored bytes",
         ),
         (
             "a localisation or correction grid",
@@ -80,8 +80,8 @@ def rows() -> list[tuple[str, str]]:
         ("a VRT", size(vrt._MAX_BYTES)),
         ("a raster read as a DEM or geoid", f"{many(dem._MAX_CELLS)} cells"),
         ("RPC tags of a TIFF", f"{many(carried._MAX_ENTRIES)} entries, {size(carried._MAX_VALUES)} of values"),
-        ("an RPC in a NITF", f"the first {size(carried._SCAN_LIMIT)}"),
-        ("a file of acquisition metadata", f"the first {size(sources._HEAD)}"),
+        ("an RPC in a NITF", f"the first {size(carried.SCANNED)}"),
+        ("a file of acquisition metadata", f"the first {size(carried.SCANNED)}"),
         ("a run's state", f"{size(workspace._MAX_STATE)}; larger ones count as missing"),
         (
             "a file of a web server or store",

@@ -16,7 +16,7 @@ from barpc.cli.terminal import echo, wants_json
 from barpc.dem import Dem
 from barpc.errors import InputError, RpcError
 from barpc.fit.poles import smallest_denominator
-from barpc.geojson import collection, feature, polygon
+from barpc.geodesy import collection, feature, polygon
 from barpc.sensor import geometry
 from barpc.sensor.rpc import RPC
 

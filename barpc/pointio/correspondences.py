@@ -24,10 +24,9 @@ from barpc.remote import Place
 from barpc.scene import Altimetry, GroundPoints
 from barpc.sidefile import GEOJSON, NUMBER, TABLE, Kind, read_head, read_json, read_text
 
-GROUND_SIGMA = 1.0  # east, north, up standard deviation [m] of a GCP whose file states none
+GROUND_SIGMA = 1.0  # standard deviation [m] along an axis of a GCP, or of the place of a height, whose file states none
 IMAGE_SIGMA = 0.5  # standard deviation of each image coordinate [px], of GCPs and tie points whose file states none
 HEIGHT_SIGMA = 0.5  # m, of a height whose file states none: ICESat-2 and GEDI over gentle ground
-FLAT_SIGMA = 1.0  # m, of its place along an axis, each point's own
 TURNS = 540.0  # deg: longitudes are taken by whole turns
 
 _NAMES: Names = {
@@ -380,7 +379,7 @@ def read_altimetry(path: Path | str) -> Altimetry:
             f"{path}: {lon:g}, {lat:g} is no longitude and latitude in degrees; map coordinates are not read"
         )
     sigma, flat = (np.array(table.get(name, [np.nan] * len(known)))[known] for name in order[3:])
-    sigma[np.isnan(sigma)], flat[np.isnan(flat)] = HEIGHT_SIGMA, FLAT_SIGMA
+    sigma[np.isnan(sigma)], flat[np.isnan(flat)] = HEIGHT_SIGMA, GROUND_SIGMA
     try:
         return Altimetry(ground, sigma, flat)
     except InputError as error:

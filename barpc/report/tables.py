@@ -22,8 +22,7 @@ import numpy.typing as npt
 
 from barpc import __version__
 from barpc.errors import InputError
-from barpc.geodesy import Array, ecef_from_ground, enu_basis
-from barpc.geojson import collection, feature
+from barpc.geodesy import Array, collection, ecef_from_ground, enu_basis, feature
 from barpc.pointio.names import cell, from_cell
 from barpc.report.outcome import Run
 from barpc.report.records import Number, Record, said, value_of

@@ -199,7 +199,8 @@ def printable(rpc: RPC) -> RPC:
 
 # --- NITF -------------------------------------------------------------------------------------------------
 
-_SCAN_LIMIT = 1 << 24  # bytes searched for the extension
+SCANNED = 1 << 24
+"""Bytes of a file that are searched, for this extension, for a date."""
 _WIDTHS = (7, 7, *WIDTHS)
 
 # Position in RPC00A of each of RPC00B's twenty monomials.
@@ -208,7 +209,7 @@ _B_FROM_A = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 7, 11, 14, 17, 12, 15, 18, 13, 16, 1
 
 def read_nitf(path: Place) -> RPC | None:
     """Read the RPC in a NITF's RPC00B (or RPC00A) extension, None without one; RpcFormatError where it is not valid."""
-    data = read_head(path, IMAGE, _SCAN_LIMIT)
+    data = read_head(path, IMAGE, SCANNED)
     match = re.search(rb"RPC00([AB])01041", data)
     if match is None:
         return None

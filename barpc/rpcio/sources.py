@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
@@ -18,7 +19,7 @@ import numpy as np
 from barpc.errors import BarpcError, ImageError, MissingRpcError, RpcError, RpcFormatError
 from barpc.raster import driver_of, identify, open_raster
 from barpc.remote import Place, beside, is_url, location
-from barpc.rpcio.carried import read_nitf, read_tag
+from barpc.rpcio.carried import SCANNED, read_nitf, read_tag
 from barpc.rpcio.formats import FORMATS, files_of, holds_physical, parse
 from barpc.rpcio.text import ReadOptions, decode
 from barpc.rpcio.xml import rpc_from_domain
@@ -60,7 +61,7 @@ def sidecars(image: Path | str) -> list[Sidecar]:
         path = image.parent / (found_name or "")
         if found_name in (None, image.name) or not path.is_file():
             continue
-        if kind in ("xml", "dimap", "pam") and not _holds_rpc(path, kind):
+        if kind in ("xml", "dimap", "pam") and not FORMATS["gdal" if kind == "pam" else kind].sniff(_readable(path)):
             continue
         if path not in [sidecar.path for sidecar in found]:
             found.append(Sidecar(kind, path, before_tag and (kind in ("rpb", "xml") or not metadata_only)))
@@ -91,10 +92,7 @@ def described(path: Place) -> tuple[tuple[int, int] | None, bool]:
 
 def only_physical(path: Path) -> bool:
     """Return whether an XML holds a physical camera model and no RPC; not of one that cannot be read."""
-    try:
-        text = decode(read_bytes(path, RPC_FILE))
-    except BarpcError:
-        return False
+    text = _readable(path)
     return holds_physical(text) and not any(row.sniff(text) for row in FORMATS.values())
 
 
@@ -130,12 +128,12 @@ def _names(name: str) -> Iterator[tuple[str, str, bool]]:
     yield "txt", f"{stem}-RPC.txt", False
 
 
-def _holds_rpc(path: Place, kind: str) -> bool:
-    row = FORMATS["gdal" if kind == "pam" else kind]
+def _readable(path: Place) -> str:
+    """Return the text of a file; empty where it cannot be read."""
     try:
-        return row.sniff(decode(read_bytes(path, RPC_FILE)))
+        return decode(read_bytes(path, RPC_FILE))
     except BarpcError:
-        return False
+        return ""
 
 
 def shadows(image: Path | str) -> list[Sidecar]:
@@ -162,17 +160,10 @@ def hidden_by(paths: Iterable[Path]) -> Iterator[tuple[Path, Path, RPC]]:
         for image in sorted(folder.iterdir()) if folder.is_dir() else ():
             beside = (files.get(name.lower()) for _, name, _ in _names(image.name))
             found = next((path for path in beside if path is not None and path.name != image.name), None)
-            rpc = None if found is None else _rpc_of_image(image)
-            if found is not None and rpc is not None:
-                yield found, image, rpc
-
-
-def _rpc_of_image(path: Path) -> RPC | None:
-    try:
-        identify(path)
-        return read_rpc(path)
-    except (ImageError, RpcError):
-        return None
+            if found is not None:
+                with suppress(ImageError, RpcError):
+                    identify(image)
+                    yield found, image, read_rpc(image)
 
 
 def read_rpc(path: Path | str, *, first_pixel: float | None = None, band: int = 1) -> RPC:
@@ -250,37 +241,38 @@ def _own_rpc(path: Place, head: bytes) -> RPC | None:
 def _sidecar_source(image: Place, sidecar: Sidecar, options: ReadOptions) -> RpcSource:
     rpc, name = parse(read_bytes(sidecar.path, RPC_FILE), str(sidecar.path), options)
     origin = {"geom": _crop_origin, "dimap": _tile_origin}.get(sidecar.kind)
-    window, note = origin(image, sidecar.path) if origin else (_WHOLE, "")
-    if window == _WHOLE:
+    moved = origin(image, sidecar.path) if origin else None
+    if moved is None:
         return RpcSource(rpc, name, sidecar.path)
-    return RpcSource(rpc.window(*window), name, sidecar.path, (note,))
+    window, note = moved
+    return RpcSource(rpc.window(*window), name, sidecar.path, (f"{note} applied",))
 
 
 _HDF5 = b"\x89HDF"
-_Window = tuple[float, float, float, float]
-_WHOLE: _Window = (0.0, 0.0, 1.0, 1.0)  # corner, steps
+_Moved = tuple[tuple[float, float, float, float], str] | None
+"""Corner and steps of a window of the image that an RPC speaks of, and what it is; None for the whole."""
 
 
-def _crop_origin(image: Place, _path: Place) -> tuple[_Window, str]:
-    """Return a ``.geom`` speaks of the full image; a geotransform without CRS says where the crop is."""
+def _crop_origin(image: Place, _path: Place) -> _Moved:
+    """Return where a crop is by its geotransform without CRS: a ``.geom`` speaks of the full image."""
     with open_raster(image) as dataset:
         step_x, _, x, _, step_y, y = dataset.transform[:6]
         has_crs = dataset.crs is not None
     if has_crs or (abs(step_x), abs(step_y), x, y) == (1.0, 1.0, 0.0, 0.0):
-        return _WHOLE, ""
+        return None
     if step_x <= 0 or step_y == 0:
         raise RpcFormatError(f"{image}: a geotransform that is no crop origin (steps {step_x}, {step_y})")
     row = y if step_y > 0 else -y  # a negative row step: y = -row
-    return (x, row, step_x, abs(step_y)), f"crop origin ({x:g}, {row:g}) of the geotransform applied"
+    return (x, row, step_x, abs(step_y)), f"crop origin ({x:g}, {row:g}) of the geotransform"
 
 
-def _tile_origin(image: Place, path: Place) -> tuple[_Window, str]:
+def _tile_origin(image: Place, path: Place) -> _Moved:
     """Return the origin of a tile of a DIMAP product: the RPC is the whole image's, ``DIM_*.XML`` gives the
     size of a tile.
     """
     tile = re.search(r"_R(\d+)C(\d+)$", image.stem.upper())
     if tile is None or tile.groups() == ("1", "1"):
-        return _WHOLE, ""
+        return None
     product = path.name[4:]
     near = files_of(image.parent) if isinstance(image, Path) else beside(image, [f"DIM_{product}"])
     dim = near.get(f"dim_{product}".lower())
@@ -290,7 +282,7 @@ def _tile_origin(image: Place, path: Place) -> tuple[_Window, str]:
         raise RpcFormatError(f"{path}: the tile size of {image.name} is unknown (no DIM_{product} with NTILES_SIZE)")
     row, col = (int(index) - 1 for index in tile.groups())
     x, y = col * int(width.group(1)), row * int(height.group(1))
-    return (x, y, 1.0, 1.0), f"tile origin ({x}, {y}) applied"
+    return (x, y, 1.0, 1.0), f"tile origin ({x}, {y})"
 
 
 # --- sun and date -----------------------------------------------------------------------------------------
@@ -298,7 +290,6 @@ def _tile_origin(image: Place, path: Place) -> tuple[_Window, str]:
 _TAGS = ("ACQUISITIONDATETIME", "NITF_IDATIM", "TIFFTAG_DATETIME")  # the last is often that of the file
 _TAG = re.compile(r"(\d{4})[-:/]?(\d\d)[-:/]?(\d\d)")
 _FIRST = 1957  # no satellite took an image before
-_HEAD = 4 << 20  # bytes of a file that are looked at
 _NUMBER = rb"([+-]?\d{1,3}(?:\.\d{1,20})?(?:e[+-]?\d{1,2})?)"
 _SUN = {
     name: re.compile(
@@ -377,16 +368,10 @@ def _texts(image: Place, camera: Place) -> Iterator[bytes]:
     """Yield how the file of the camera and the metadata beside an image begin; nothing of images elsewhere."""
     if not (isinstance(image, Path) and isinstance(camera, Path)):
         return
-    product = image.stem[4:]
+    product, present = image.stem[4:], files_of(image.parent)
     wanted = [f"{image.stem}.imd", f"{image.stem}.xml", f"{image.stem}_metadata.json"]
     wanted += [f"dim_{part}.xml" for part in (product, product.rpartition("_")[0]) if part]
-    present = files_of(image.parent)
     files = [camera] if camera != image and camera.is_file() else []
-    for file in [
-        *files,
-        *(image.parent / present[name.lower()] for name in wanted if name.lower() in present),
-    ]:
-        try:
-            yield read_head(file, RPC_FILE, _HEAD)
-        except BarpcError:
-            continue
+    for file in [*files, *(image.parent / present[name.lower()] for name in wanted if name.lower() in present)]:
+        with suppress(BarpcError):
+            yield read_head(file, RPC_FILE, SCANNED)

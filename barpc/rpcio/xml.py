@@ -34,11 +34,12 @@ def _root(text: str, name: str, *, strip_namespaces: bool = True) -> Element:
     return parse_xml(body.encode(), name=name, strip_namespaces=strip_namespaces)
 
 
-def _text(parent: Element, path: str, name: str) -> str:
-    found = parent.find(path)
-    if found is None or not (found.text or "").strip():
+def _numbers(parent: Element, path: str, name: str) -> list[float]:
+    """Return the numbers in an element."""
+    text = parent.findtext(path, "").strip()
+    if not text:
         raise RpcFormatError(f"{name}: <{path}> is missing or empty")
-    return str(found.text)
+    return listed_numbers(text, name, path)
 
 
 def _element(parent: Element, paths: Iterable[str], name: str) -> Element:
@@ -63,7 +64,7 @@ def read_maxar(text: str, name: str, options: ReadOptions) -> RPC:
         tag = word.upper()
         path = f"{tag}List/{tag}" if key in COEFFICIENTS else tag
         if key not in ERRORS or image.find(path) is not None:
-            fields[key] = listed_numbers(_text(image, path, name), name, tag)
+            fields[key] = _numbers(image, path, name)
     return rpc_from_fields(fields, name, options)
 
 
@@ -95,10 +96,9 @@ def read_dimap(text: str, name: str, options: ReadOptions) -> RPC:
         return _read_dimap_v1(model, name, options)
     inverse = _element(model, ("Inverse_Model", "GroundtoImage_Values"), name)
     validity = _element(model, ("RFM_Validity",), name)
-    fields: Fields = {key: [number(_text(validity, key, name), name, key)] for key in OFFSETS + SCALES}
+    fields: Fields = {key: _numbers(validity, key, name) for key in OFFSETS + SCALES}
     for key in COEFFICIENTS:
-        indexed = [f"{key}_{i}" for i in range(1, 21)]
-        fields[key] = [number(_text(inverse, k, name), name, k) for k in indexed]
+        fields[key] = [value for i in range(1, 21) for value in _numbers(inverse, f"{key}_{i}", name)]
     return rpc_from_fields(fields, name, options, 0.0 if inverse.tag == "GroundtoImage_Values" else 1.0)
 
 
@@ -106,7 +106,7 @@ def _read_dimap_v1(model: Element, name: str, options: ReadOptions) -> RPC:
     """Read DIMAP v1: forty numbers an element, scales A and offsets B by axis."""
     fields: Fields = {}
     for axis, field in (("ROW", "LINE"), ("COL", "SAMP")):
-        values = listed_numbers(_text(_element(model, (f"F_{axis}",), name), ".", name), name, f"F_{axis}")
+        values = _numbers(model, f".//F_{axis}", name)
         if len(values) != 40:
             raise RpcFormatError(f"{name}: F_{axis} has {len(values)} coefficients, expected 40")
         fields[f"{field}_NUM_COEFF"], fields[f"{field}_DEN_COEFF"] = values[:20], values[20:]
@@ -114,8 +114,7 @@ def _read_dimap_v1(model: Element, name: str, options: ReadOptions) -> RPC:
     validity = _element(model, ("RFM_Validity",), name)
     for axis, field in axes.items():
         element = _element(validity, (axis,), name)
-        fields[f"{field}_SCALE"] = [number(_text(element, "A", name), name, f"{axis}/A")]
-        fields[f"{field}_OFF"] = [number(_text(element, "B", name), name, f"{axis}/B")]
+        fields[f"{field}_SCALE"], fields[f"{field}_OFF"] = (_numbers(element, part, name) for part in "AB")
     return rpc_from_fields(fields, name, options, first_pixel=1.0)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barpc.errors import InputError
-from barpc.pointio.correspondences import FLAT_SIGMA, HEIGHT_SIGMA, read_altimetry
+from barpc.pointio.correspondences import GROUND_SIGMA, HEIGHT_SIGMA, read_altimetry
 
 WANTED = [[5.44, 43.25, 120.5], [5.45, 43.26, 130.0]]
 
@@ -32,7 +32,7 @@ def test_every_spelling_gives_the_same_heights(tmp_path: Path, text: str):
     found = read_altimetry(file)
     np.testing.assert_array_equal(found.lonlatalt, WANTED)
     np.testing.assert_array_equal(found.sigma, HEIGHT_SIGMA)
-    np.testing.assert_array_equal(found.sigma_flat, FLAT_SIGMA)
+    np.testing.assert_array_equal(found.sigma_flat, GROUND_SIGMA)
 
 
 def test_accuracies_are_taken_where_they_are_stated(tmp_path: Path):
