@@ -9,6 +9,7 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.ba.held.datum import SOURCES
+from barpc.geodesy import enu_basis, ground_from_ecef
 from barpc.report import Run, summarize
 from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block
@@ -37,6 +38,17 @@ def test_without_control_the_cameras_as_delivered_hold_the_scene():
     assert (found.datum["cameras"][PLACE] > 0.99).all()
     for other in ("earlier_run", "fixed_views", "gcps", "heights"):
         assert (found.datum[other] == 0.0).all()
+
+
+def test_control_points_hold_the_scene_which_is_the_tie_points():
+    found = solved(replace(BLOCK.gcps, sigma=np.full((6, 3), 0.1)))
+    assert (found.datum["gcps"][PLACE] > 0.93).all()
+    for other in ("heights", "reference", "altimetry", "fixed_views", "earlier_run"):
+        assert (found.datum[other] == 0.0).all()
+    ties = found.points[np.isfinite(found.points[:, 0])]
+    middle = ties.mean(axis=0)
+    flat = (ties - middle) @ enu_basis(ground_from_ecef(middle))[:2].T
+    assert found.gauge.radius == pytest.approx(np.sqrt((flat**2).sum(axis=1).mean()), rel=0.02)  # of those in use
 
 
 @pytest.mark.slow
@@ -133,6 +145,7 @@ def test_what_a_terrain_did_is_said(options, dem, says):
         assert summary.scene.dem.num_known == summary.scene.dem.num_tracks
         assert summary.scene.dem.offset_m == pytest.approx(found.terrain.offset)
         assert abs(summary.scene.dem.offset_m) < 60.0
+        assert (found.datum["heights"][2] > 0.5) == ("dem_for_weak" not in options)
 
 
 def test_the_scene_lies_above_a_terrain_that_is_too_low():

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import hypergeom
 
 from barpc.ba.evidence import places
 from barpc.ba.evidence.places import Place, Unused, met_worse
 from barpc.ba.usual import CHANCE
+from tests.distributions import hypergeom
 from tests.lanes import diagonal
 
 SIZE = np.array([[20_000.0, 9_000.0], [15_000.0, 12_000.0]])
