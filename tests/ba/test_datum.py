@@ -70,6 +70,15 @@ def test_a_terrain_holds_heights_and_no_more_than_its_common_error_lets_it():
     assert (solved(dem=level, dem_for_weak=True).datum["heights"] == 0.0).all()
 
 
+def test_heights_hold_as_much_as_they_take_from_the_variance_of_the_place():
+    """Of 300 m each, and hardly any in common: together they know the height about as well as the cameras do."""
+    alone = solved(learn_priors=False)
+    found = solved(dem=level, learn_priors=False, dem_sigma=300.0, dem_bias_sigma=0.1)
+    taken = 1.0 - (found.gauge.sigma[2] / alone.gauge.sigma[2]) ** 2
+    assert 0.3 < taken < 0.9
+    assert found.datum["heights"][2] == pytest.approx(taken, abs=0.02)
+
+
 @pytest.mark.slow
 def test_views_that_are_fixed_hold_it():
     names = [view.name for view in BLOCK.views]
