@@ -41,7 +41,15 @@ ROOT = Path(__file__).resolve().parents[1]
 TOML = Path(__file__).with_suffix(".toml")
 TOP = "top"
 LONGEST = 1200.0  # seconds of a part's tests without a mutant
-LOADED = ["cv2", "hypothesis", "pyproj", "pytest", "rasterio", "scipy.ndimage", "scipy.stats", "shapely"]  # once: every run would take seconds
+LOADED = [
+    "cv2",
+    "pyproj",
+    "pytest",
+    "rasterio",
+    "scipy.ndimage",
+    "scipy.stats",
+    "shapely",
+]  # once: every run would take seconds
 SKIPPED = (".git", "__pycache__", ".venv", "site", "dist", ".*_cache")  # of a tree that is copied
 
 COMPARISONS = {

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.judging import agreement as sets
@@ -28,6 +27,7 @@ from barpc.simulate import simulate_block
 from benchmarks import worlds_families as families
 from benchmarks.worlds import judge
 from benchmarks.worlds_families import CONTROL, make
+from tests import distributions as stats
 from tests.ba.conftest import INDEPENDENT, centers_of
 from tests.lanes import diagonal, rest_slow
 
@@ -157,7 +157,7 @@ def test_the_evidence_of_a_set_is_the_density_of_what_it_shows(scale) -> None:
     motions = offsets.motions.reshape(15, -1)
     whole = motions @ motions.T + scale**2 * np.eye(15)
     rows = np.repeat(chosen, 3)
-    inside = stats.multivariate_normal(np.zeros(9), whole[np.ix_(rows, rows)], allow_singular=True)
+    inside = stats.multivariate_normal(np.zeros(9), whole[np.ix_(rows, rows)])
     y = offsets.own.ravel()
     expected = inside.logpdf(y[rows])
     assert together == pytest.approx(y[rows] @ np.linalg.solve(whole[np.ix_(rows, rows)], y[rows]), rel=1e-5)

@@ -9,6 +9,7 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.ba.held.datum import SOURCES
+from barpc.geodesy import enu_basis, ground_from_ecef
 from barpc.report import Run, summarize
 from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block
@@ -39,6 +40,17 @@ def test_without_control_the_cameras_as_delivered_hold_the_scene():
         assert (found.datum[other] == 0.0).all()
 
 
+def test_control_points_hold_the_scene_which_is_the_tie_points():
+    found = solved(replace(BLOCK.gcps, sigma=np.full((6, 3), 0.1)))
+    assert (found.datum["gcps"][PLACE] > 0.93).all()
+    for other in ("heights", "reference", "altimetry", "fixed_views", "earlier_run"):
+        assert (found.datum[other] == 0.0).all()
+    ties = found.points[np.isfinite(found.points[:, 0])]
+    middle = ties.mean(axis=0)
+    flat = (ties - middle) @ enu_basis(ground_from_ecef(middle))[:2].T
+    assert found.gauge.radius == pytest.approx(np.sqrt((flat**2).sum(axis=1).mean()), rel=0.02)  # of those in use
+
+
 @pytest.mark.slow
 def test_control_points_hold_it_by_their_accuracy():
     shares = [solved(replace(BLOCK.gcps, sigma=np.full((6, 3), sigma))).datum["gcps"] for sigma in (0.1, 10.0)]
@@ -56,6 +68,15 @@ def test_a_terrain_holds_heights_and_no_more_than_its_common_error_lets_it():
     assert 0.02 < loose[2] < 0.9
     assert tight[:2].max() < tight[2]
     assert (solved(dem=level, dem_for_weak=True).datum["heights"] == 0.0).all()
+
+
+def test_heights_hold_as_much_as_they_take_from_the_variance_of_the_place():
+    """Of 300 m each, and hardly any in common: together they know the height about as well as the cameras do."""
+    alone = solved(learn_priors=False)
+    found = solved(dem=level, learn_priors=False, dem_sigma=300.0, dem_bias_sigma=0.1)
+    taken = 1.0 - (found.gauge.sigma[2] / alone.gauge.sigma[2]) ** 2
+    assert 0.3 < taken < 0.9
+    assert found.datum["heights"][2] == pytest.approx(taken, abs=0.02)
 
 
 @pytest.mark.slow
@@ -133,6 +154,7 @@ def test_what_a_terrain_did_is_said(options, dem, says):
         assert summary.scene.dem.num_known == summary.scene.dem.num_tracks
         assert summary.scene.dem.offset_m == pytest.approx(found.terrain.offset)
         assert abs(summary.scene.dem.offset_m) < 60.0
+        assert (found.datum["heights"][2] > 0.5) == ("dem_for_weak" not in options)
 
 
 def test_the_scene_lies_above_a_terrain_that_is_too_low():

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.special import gammaln
-from scipy.stats import gamma
 
 from barpc.ba import AdjustOptions
 from barpc.ba.held.block import Block, join
@@ -32,6 +31,7 @@ from barpc.sensor.geometry import triangulate
 from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of
 from tests.constants import chosen
+from tests.distributions import gamma
 
 OPTIONS = AdjustOptions(drift=0)
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
 
 from barpc.ba.evidence import linearised, mixture
 from barpc.ba.evidence.linearised import Linear, Tracks, linearise
@@ -16,6 +15,7 @@ from barpc.ba.held.starting import first_state, make_problem
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
 from barpc.simulate import simulate_block
+from tests.distributions import multivariate_normal
 
 SPAN = 800.0
 

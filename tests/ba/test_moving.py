@@ -16,7 +16,7 @@ from barpc.ba.held.block import Block as Joined
 from barpc.ba.held.block import join
 from barpc.ba.held.starting import first_state, make_problem
 from barpc.ba.judging.explanations import MOVING, STRIP
-from barpc.ba.judging.moving import CELLS, Ground, group_of
+from barpc.ba.judging.moving import CELLS, Ground, group_of, proposal
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.ba.standing import Parts
@@ -116,6 +116,20 @@ def test_a_group_is_told_from_what_stands_still() -> None:
     few = linear.thinned(300)
     assert 240 <= sum(part.rows.size for part in few.tracks) <= 330
     assert fit(few, group=group).noise == pytest.approx(found.noise, rel=0.15)
+
+
+def test_a_group_is_proposed_where_its_ties_lie() -> None:
+    """With every move within what is likely of a start, and no tie sure to move or to stand."""
+    made, tracks, moves = drifting(3, 150, 0.3, 3.0 * GSD)
+    block, problem, state = started(made, tracks)
+    linear = linearise(problem, state, block.use, block.sigma, 800.0)
+    nothing = np.zeros((2, 0, len(block.view)))
+    group = proposal(linear, Ground.of(problem, state), fit(linear), nothing, np.zeros(0))
+    assert group is not None
+    assert group.sigma.tolist() == [30.0] * 4  # of two moves in each view but the first
+    assert ((group.share > 0.5) == moves[block.order]).mean() > 0.95
+    assert 0.0 < group.share.min() < 0.1
+    assert 0.9 < group.share.max() < 1.0
 
 
 def test_the_place_of_a_group_is_said_and_no_view_is_left_alone() -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import hypergeom
 
 from barpc.ba.evidence import places
 from barpc.ba.evidence.places import Place, Unused, met_worse
 from barpc.ba.usual import CHANCE
+from tests.distributions import hypergeom
 from tests.lanes import diagonal
 
 SIZE = np.array([[20_000.0, 9_000.0], [15_000.0, 12_000.0]])
@@ -139,6 +139,26 @@ def test_few_observations_and_exact_ones_say_nothing_wrong() -> None:
 def test_as_many_alike_in_a_place_have_the_hypergeometric_chance(found, count, alike, whole) -> None:
     chance = hypergeom(whole, alike, count).sf(found - 1)
     assert places._at_least(found, count, alike, whole) == pytest.approx(chance, rel=1e-9)
+
+
+def test_a_place_has_the_chance_of_as_many_alike_times_the_tests() -> None:
+    """One of the far ones is where the others are looked for; each of the place might be it."""
+    rng = np.random.default_rng(3)
+    cell = rng.permutation(32 * 32)[:400]  # no two in a part
+    xy = (np.stack([cell % 32, cell // 32]) + 0.5) / 32 * SIZE[:, :1]
+    residual, deviation = rng.normal(0, NOISE, (2, 400)), np.full(400, NOISE)
+    inside = np.flatnonzero(xy[1] < SIZE[1, 0] / 8)
+    elsewhere = np.setdiff1d(np.arange(400), inside)
+    alike = np.append(inside[::2], elsewhere[:20])
+    residual[:, alike] += [[3.0], [2.0]]
+    residual[:, inside[1:7:2]] += rng.uniform(5.0, 15.0, (2, 3))  # far off, each by itself
+    (one,) = worst(Unused(np.zeros(400, dtype=int), xy, residual, deviation))
+    assert (one.columns, one.rows) == (None, (0.0, SIZE[1, 0] / 8))
+    among = len(inside[::2])
+    assert one.far == pytest.approx(among / len(inside))
+    chance = hypergeom(399, among + 20 - 1, len(inside) - 1).sf(among - 2)
+    tests = 2 * places._PLACES.shape[1]
+    assert one.chance == pytest.approx(chance * (among + 3) * tests, rel=1e-9)
 
 
 def test_places_are_halves_of_rows_columns_both_and_cells() -> None:

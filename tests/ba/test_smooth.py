@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from barpc.ba.algebra.structure import make_structure
 from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.robust.smooth import SPLINES, Smooth, SmoothTest
 from barpc.sensor.splined import bsplines
+from tests import distributions as stats
 
 SIZE = (10000, 20000)
 

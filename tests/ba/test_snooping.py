@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, adjustment
 from barpc.ba.judging.snooping import CRITICAL, ControlTest, _together
@@ -21,6 +20,7 @@ from barpc.scene import GroundPoints
 from barpc.sensor.geometry import sight_enu, triangulate
 from barpc.simulate import Block, simulate_block
 from benchmarks.referee import cases, judge, make
+from tests import distributions as stats
 from tests.ba.conftest import INDEPENDENT, centers_of
 from tests.ba.test_referee import hills
 from tests.lanes import rest_slow

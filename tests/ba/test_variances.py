@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.ba.estimated.priors import CameraPrior, prior_sigmas
@@ -22,6 +21,7 @@ from barpc.errors import BarpcWarning
 from barpc.geodesy import ecef_from_ground
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import centers_of, solve
+from tests.distributions import chi2
 from tests.lanes import rest_slow
 
 

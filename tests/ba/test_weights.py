@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from barpc.ba.algebra.structure import make_structure
 from barpc.ba.estimated.priors import PointPrior
@@ -18,6 +17,7 @@ from barpc.ba.robust.rounds import _robust
 from barpc.ba.robust.smooth import SPLINES
 from barpc.ba.robust.weights import LOSSES, MEDIAN, Observations
 from barpc.options import AdjustOptions
+from tests import distributions as stats
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from tests.lanes import rest_slow
 from tests.reliability.conftest import barpc as command
 from tests.reliability.trials import SAMPLES as VIEWS
 from tests.reliability.trials import SIDE
@@ -65,12 +64,24 @@ def crops(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def finished(crops, tmp_path_factory):
-    """A run on the crops: its folder, and what it printed as JSON."""
+def hashes(crops):
+    """Of the crops before any run."""
+    return [sha256(path.read_bytes()).hexdigest() for path in crops]
+
+
+@pytest.fixture(scope="module")
+def ran(crops, hashes, tmp_path_factory):
+    """A run on the crops: its folder, and what it printed."""
     out = tmp_path_factory.mktemp("finished") / "out"
-    code, told, err = barpc("adjust", *crops, "-o", out, "--json")
+    code, told, err = barpc("adjust", *crops, "-o", out)
     assert (code, err) == (0, "")
-    return out, json.loads(told)
+    return out, told
+
+
+@pytest.fixture(scope="module")
+def finished(ran):
+    """The folder of that run, and its summary."""
+    return ran[0], json.loads((ran[0] / "summary.json").read_text())
 
 
 def assert_refused(code, out, err, folder, *words, exit_code=1, kept=False):
@@ -85,16 +96,14 @@ def assert_refused(code, out, err, folder, *words, exit_code=1, kept=False):
     assert not left or (kept and left == {".barpc"})  # of a run that took long: what the next one need not do again
 
 
-def test_the_main_job_writes_what_other_tools_read(crops, tmp_path):
-    hashes = [sha256(path.read_bytes()).hexdigest() for path in crops]
-    code, out, err = alone("adjust", *crops, "-o", tmp_path / "out")
-    assert (code, err) == (0, "")
+def test_the_main_job_writes_what_other_tools_read(crops, hashes, ran):
+    folder, out = ran
     for word in ("before [px]", "after [px]", "view_00", "The scene as a whole moved by"):
         assert word in out
-    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    names = sorted(path.name for path in folder.iterdir())
     for name in ("view_00.vrt", "view_00_RPC.TXT", "view_01.vrt", "view_01_RPC.TXT", "summary.json"):
         assert name in names
-    with rasterio.open(tmp_path / "out/view_00.vrt") as new, rasterio.open(crops[0]) as old:
+    with rasterio.open(folder / "view_00.vrt") as new, rasterio.open(crops[0]) as old:
         assert new.rpcs is not None
         assert new.rpcs.to_dict() != old.rpcs.to_dict()
         np.testing.assert_array_equal(new.read(), old.read())
@@ -144,7 +153,8 @@ def test_an_existing_folder_needs_overwrite(crops, tmp_path):
     assert (tmp_path / "out/notes.txt").read_text() == "mine"
 
 
-@pytest.mark.parametrize("kind", rest_slow(["float32", "uint8", "int16", "uint16 with nan bands"]))
+@pytest.mark.slow  # before a commit: what is matched in them, in tests/tie/test_simulated
+@pytest.mark.parametrize("kind", ["float32", "uint8", "int16", "uint16 with nan bands"])
 def test_pixel_types_and_bands(tmp_path, kind):
     if kind == "uint16 with nan bands":
         images = [crop(p, tmp_path / p.name, count=3) for p in VIEWS[:2]]

@@ -39,6 +39,7 @@ def ties(pristine, tmp_path_factory):  # noqa: F811
     return folder / "matches.csv"
 
 
+@pytest.mark.slow  # before a commit: the main job in test_adjust
 def test_a_good_run_ends_with_0_and_no_word_on_stderr(pristine, ties, tmp_path):  # noqa: F811
     said = command("adjust", *pristine, "--matches", ties, "--matches-only", "-o", tmp_path / "out")
     assert said.code == 0, said

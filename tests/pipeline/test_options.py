@@ -130,9 +130,9 @@ def rpc_formats(run: Run, out: Path, scene: Path) -> None:
 
 
 def stop_after(run: Run, out: Path, scene: Path) -> None:
-    run("m", stop_after="matching")
-    assert (out / "m/matches.csv").exists()
-    assert not (out / "m/tables/block.npz").exists()
+    matched = Path(run.matched.run.out_dir)
+    assert (matched / "matches.csv").exists()
+    assert not (matched / "tables/block.npz").exists()
     run("a", stop_after="adjustment")
     assert (out / "a/tables/block.npz").exists()
     assert not list((out / "a").glob("*.vrt"))
@@ -339,10 +339,10 @@ def test_every_option_has_a_row() -> None:
 
 ELSEWHERE = (
     "overlap_list", "aoi", "gcp", "check_points", "geoid", "grids", "allow_remote", "dem",
-    "keep_going", "images",
+    "keep_going", "images", "matches", "reference", "tie",
 )  # fmt: skip
-"""Options whose fast tests stand in test_pairs_and_area, test_inputs, test_grids, tests/test_dem,
-tests/remote and tests/reliability."""
+"""Options whose fast tests stand in test_pairs_and_area, test_inputs, test_grids, tests/test_dem, tests/tie,
+tests/remote and tests/reliability, or beside them: matches_only, reference_sigma."""
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 from barpc.ba.robust.smooth import SmoothTest
 from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
@@ -25,6 +24,7 @@ from barpc.scene import Tracks
 from barpc.sensor.geometry import epipolar_offset
 from barpc.sensor.splined import RowSpline
 from barpc.tie.reference import ReferenceControl, ViewMatch
+from tests.distributions import norm
 
 from .made import a_gcp
 

@@ -11,7 +11,10 @@ import pytest
 
 from .test_chromium import CHROMIUM, FLAGS
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine (apt-get install chromium)")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine (apt-get install chromium)"),
+]
 pytest.importorskip("jinja2")
 
 DRIVER = Path(__file__).with_name("selection.js").read_text(encoding="utf-8")
@@ -38,7 +41,6 @@ def pair(block_run) -> dict:
     return next(p for p in block_run.summary["pairs"] if {p["a"], p["b"]} == {"view_0000", "view_0001"})
 
 
-@pytest.mark.slow
 def test_nothing_goes_wrong(found):
     assert found["errors"] == []
 

@@ -157,7 +157,7 @@ def test_an_unexpected_encoding_is_refused_or_read_the_same(sample, encoding):
 
 
 @each_sample
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
 def test_any_edit_of_a_file_is_read_or_refused(sample, data):
     text = SAMPLES[sample]
@@ -166,7 +166,7 @@ def test_any_edit_of_a_file_is_read_or_refused(sample, data):
     outcome((text[:start] + data.draw(st.text(max_size=30)) + text[end:]).encode("utf-8", "surrogatepass"))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=400))
 def test_any_bytes_are_refused(data):
     assert outcome(data) != "read"  # 400 bytes hold no 80 coefficients

@@ -57,6 +57,7 @@ def test_a_localisation_grid_reads_back_as_the_camera(folder, camera):
     assert np.linalg.norm(found.model.project(ground) - image, axis=1).max() < 1e-4
 
 
+@pytest.mark.slow  # before a commit: every node, below, and rasterio's reading of it
 def test_shareloc_localises_with_the_grid(folder, camera):
     """As CARS does: linear, from its own origin half a pixel aside; to a millimetre of what the grid is and 0.005 px of
     the camera."""
