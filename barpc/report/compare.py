@@ -12,14 +12,13 @@ import numpy as np
 from barpc.errors import BarpcError, InputError
 from barpc.report.records import plain
 from barpc.report.summary import Summary
-from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.views import CELLS, ViewEntry
 from barpc.report.summary.words import median
 from barpc.report.tables import read_summary
 from barpc.rpcio import read_rpc
 from barpc.sensor.geometry import image_grid
 from barpc.sensor.rpc import RPC
 
-_NODES = 7
 _NO_EFFECT = ("overwrite", "keep_going")  # Options that do not change a finished run
 
 
@@ -47,17 +46,13 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
     folders = (Path(folder_a), Path(folder_b))
     runs = (read_summary(folders[0]), read_summary(folders[1]))
     a, b = ({view.name: view for view in run.views} for run in runs)
-    if not a.keys() & b.keys():
-        first, second = (run.views[0].name for run in runs)
-        raise InputError(
-            f"{folder_a} and {folder_b}: the runs have no image in common ({first} and others there, {second} here): "
-            "nothing to compare"
-        )
-    if not (same := [name for name in a if name in b and not _other_file(name, runs)]):
-        raise InputError(
-            f"{folder_a} and {folder_b}: images of the same names are other files, so these runs have none in common: "
-            "nothing to compare"
-        )
+    same = [name for name in a if name in b and not _other_file(a[name].path, b[name].path, runs)]
+    if not same:
+        why = "images of the same names are other files, so these runs have none in common"
+        if not a.keys() & b.keys():
+            first, second = (run.views[0].name for run in runs)
+            why = f"the runs have no image in common ({first} and others there, {second} here)"
+        raise InputError(f"{folder_a} and {folder_b}: {why}: nothing to compare")
     given = [flat_options(run.options or {}) for run in runs]
     comparison = {
         "a": str(folder_a),
@@ -77,12 +72,12 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
     return found
 
 
-def _other_file(name: str, runs: tuple[Summary, Summary]) -> bool:
-    """Whether an image of this name is known to be another file in either run, by what was read of it."""
-    content = []
-    for run in runs:
-        path = next(view.path for view in run.views if view.name == name)
-        content.append({one.path: one.sha256 for one in run.inputs or ()}.get(path))
+def _other_file(path_a: str, path_b: str, runs: tuple[Summary, Summary]) -> bool:
+    """Whether images of one name are known to be other files, by what was read of them."""
+    content = [
+        {one.path: one.sha256 for one in run.inputs or ()}.get(path)
+        for path, run in zip((path_a, path_b), runs, strict=True)
+    ]
     return None not in content and content[0] != content[1]
 
 
@@ -105,13 +100,13 @@ def _rpc_difference(
     if first is None or second is None:
         return None, None
     with np.errstate(all="ignore"):  # where the second has no value there is no difference
-        ground = first.localize(*image_grid(views[0].size, views[0].alt_range_m, (_NODES, _NODES)))
+        ground = first.localize(*image_grid(views[0].size, views[0].alt_range_m, (CELLS, CELLS)))
         difference = second.project(ground) - first.project(ground)
     difference = difference[np.isfinite(difference).all(axis=1)]
     if not len(difference):
         return None, None
-    relative = difference - difference.mean(axis=0)
-    return float(np.hypot(*difference.T).max()), float(np.hypot(*relative.T).max())
+    whole, relative = (float(np.hypot(*one.T).max()) for one in (difference, difference - difference.mean(axis=0)))
+    return whole, relative
 
 
 def written_rpc(folder: Path, view: ViewEntry) -> RPC | None:
@@ -127,14 +122,12 @@ def written_rpc(folder: Path, view: ViewEntry) -> RPC | None:
 
 
 def _pairs(run_a: Summary, run_b: Summary) -> list[dict[str, Any]]:
-    of_b = {(pair.a, pair.b): pair for pair in run_b.pairs}
-    rows = []
-    for pair in run_a.pairs:
-        if (pair.a, pair.b) in of_b:
-            both = (pair, of_b[pair.a, pair.b])
-            rms = [one.offset_rms[one.epipolar_after is not None] for one in both]
-            matches = [one.num_matches for one in both]
-            rows.append({"a": pair.a, "b": pair.b, "num_matches": matches, "epipolar_rms": rms})
+    of_b, rows = {(pair.a, pair.b): pair for pair in run_b.pairs}, []
+    for both in ((pair, of_b.get((pair.a, pair.b))) for pair in run_a.pairs):
+        if both[1] is not None:
+            rms = [one.offset_rms[one.epipolar_after is not None] for one in both if one]
+            matches = [one.num_matches for one in both if one]
+            rows.append({"a": both[0].a, "b": both[0].b, "num_matches": matches, "epipolar_rms": rms})
     return rows
 
 

@@ -16,20 +16,19 @@ import numpy as np
 
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.report.digest import SHOWN, flagged, worst_first
+from barpc.report.records import MAX_SHOWN
 from barpc.report.summary.known import CheckPointEntry, GcpEntry
 from barpc.report.summary.views import CELLS, ViewEntry, cell_numbers
 from barpc.report.tables import ObservationTable, RunFiles
 
 WIDTH = 420.0  # Units of a map from left to right
-MAX_DRAWN = 400  # Images, and ground points, on the map
-MAX_MARKS = 1500  # Tie points there, and lines between images
+MAX_MARKS = 1500  # Tie points on the map, and lines between images
 _MARGIN = 34.0
 _MOST = 60  # images on the page: those with the largest systematic part
 _VECTORS = 6000
 _PANEL = 180.0
 _LONGEST = 16  # characters of a name on the map
 _REACH = 12.0  # units of a long residual
-Known = GcpEntry | CheckPointEntry
 
 
 def tag(name: str, *children: str, **attributes: object) -> str:
@@ -147,7 +146,8 @@ def ground_map(files: RunFiles) -> str:
     """Draw footprints, pairs by their matches, tie points, GCPs, on a graticule with a scale bar."""
     summary = files.summary
     rings = [ring for outline in files.outlines for ring in outline]
-    points_of: dict[str, Sequence[Known]] = {"gcps": summary.gcps, "check_points": summary.check_points}
+    points_of: dict[str, Sequence[GcpEntry | CheckPointEntry]]
+    points_of = {"gcps": summary.gcps, "check_points": summary.check_points}
     known = {
         kind: np.array([(point.lon, point.lat) for point in places], dtype=np.float64).reshape(-1, 2)
         for kind, places in points_of.items()
@@ -159,8 +159,7 @@ def ground_map(files: RunFiles) -> str:
         *grid,
         tag("path", d="".join(f"M{x:.1f} {y:.1f}h0" for x, y in points.tolist()) or "M0 0", class_="point"),
     ]
-    groups = () if summary.scene is None else summary.scene.explanations
-    for one in groups:
+    for one in () if summary.scene is None else summary.scene.explanations:
         if one.box is not None:
             west, south, east, north = one.box
             (x, y), (right, bottom) = plane(np.array([(west, north), (east, south)])).tolist()
@@ -180,22 +179,20 @@ def ground_map(files: RunFiles) -> str:
     parts += _names([(view, middles[view.name]) for view in named], taken)
     for kind, places in known.items():
         up = 1 if kind == "gcps" else -1
-        for point, (x, y) in evenly(list(zip(points_of[kind], plane(places), strict=True)), MAX_DRAWN):
+        for point, (x, y) in evenly(list(zip(points_of[kind], plane(places), strict=True)), MAX_SHOWN):
             ends = [(x, y - 6 * up), (x + 5, y + 4 * up), (x - 5, y + 4 * up)]
             parts.append(titled(path(ends, kind, closed=True), point.name))
-    described = (
-        f"{len(summary.views)} outlines, {len(summary.pairs)} pairs, {len(known['gcps'])} GCPs, "
-        f"{len(known['check_points'])} check points."
-    )
+    described = f"{len(summary.views)} outlines, {len(summary.pairs)} pairs, {len(summary.gcps)} GCPs, "
+    described += f"{len(summary.check_points)} check points."
     return sheet("ground", "Map of the images", described, plane.height, [*parts, *degrees])
 
 
 def _drawn(files: RunFiles) -> list[tuple[int, ViewEntry, Sequence[Array]]]:
     """Return images whose outlines are drawn, with their indices: those that need a look last, so on top."""
     whole = {view.name: (k, view, files.outlines[k]) for k, view in enumerate(files.summary.views)}
-    bad = flagged(files.summary.views)[:MAX_DRAWN]
+    bad = flagged(files.summary.views)[:MAX_SHOWN]
     good = [row for name, row in whole.items() if name not in {view.name for view in bad}]
-    room = MAX_DRAWN - len(bad)
+    room = MAX_SHOWN - len(bad)
     return [*(evenly(good, room) if room else ()), *(whole[view.name] for view in bad[::-1])]
 
 
@@ -232,18 +229,17 @@ def _graticule(plane: Plane) -> tuple[list[str], list[str], list[tuple[float, fl
     reach = np.array([WIDTH / 2, plane.height / 2]) / plane.unit
     lines, texts, taken = [], [], []
     for lon in round_ticks(plane.lon - reach[0], plane.lon + reach[0], 4):
-        x, _ = plane(np.array([lon, plane.lat]))
+        x, words = float(plane(np.array([lon, plane.lat]))[0]), _degrees((lon + 180.0) % 360.0 - 180.0, "EW")
         if 50 < x < right - 40:
-            words = _degrees((lon + 180.0) % 360.0 - 180.0, "EW")
             lines.append(line(x, 4, x, bottom, "grid"))
             texts.append(label(x, bottom - 4, words, "middle", "degrees"))
-            taken.append((float(x), bottom - 8, 3.6 * len(words)))
+            taken.append((x, bottom - 8, 3.6 * len(words)))
     for lat in round_ticks(plane.lat - reach[1], plane.lat + reach[1], 4):
-        _, y = plane(np.array([plane.lon, lat]))
+        y, words = float(plane(np.array([plane.lon, lat]))[1]), _degrees(lat, "NS")
         if 16 < y < bottom - 20:
             lines.append(line(4, y, right, y, "grid"))
-            texts.append(label(4, y - 3, words := _degrees(lat, "NS"), class_="degrees"))
-            taken.append((4 + 3.6 * len(words), float(y) - 7, 3.6 * len(words)))
+            texts.append(label(4, y - 3, words, class_="degrees"))
+            taken.append((4 + 3.6 * len(words), y - 7, 3.6 * len(words)))
     length = max(round_ticks(0.0, 110.0 / plane.scale, 3))
     words = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
     x = right - length * plane.scale

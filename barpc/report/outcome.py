@@ -87,20 +87,24 @@ class Run:
             return tuple(fit.rpc for fit in self.fits)
         return None if self.adjustment is None else self.adjustment.sensors
 
+    def _rows(self, name: str, none: bool = False) -> BoolArray:
+        """Observations (K,) by what an adjustment says of them; without one all of them alike."""
+        return np.full(len(self.tracks), none) if self.adjustment is None else getattr(self.adjustment, name)
+
     @cached_property
     def keep(self) -> BoolArray:
         """The observations (K,) that count: all of them, or those that the adjustment kept."""
-        return np.ones(len(self.tracks), dtype=bool) if self.adjustment is None else self.adjustment.inlier
+        return self._rows("inlier", none=True)
 
     @cached_property
     def held_out(self) -> BoolArray:
         """The observations (K,) that took no part in the adjustment, to be measured on."""
-        return np.zeros(len(self.tracks), dtype=bool) if self.adjustment is None else self.adjustment.held_out
+        return self._rows("held_out")
 
     @cached_property
     def moving(self) -> BoolArray:
         """The observations (K,) of tie points that move together: they took no part either."""
-        return np.zeros(len(self.tracks), dtype=bool) if self.adjustment is None else self.adjustment.moving
+        return self._rows("moving")
 
     @cached_property
     def met_worse(self) -> list[Place]:
@@ -143,14 +147,13 @@ class Run:
     @cached_property
     def control_tests(self) -> list[ControlResidual]:
         """The residuals of control and of a reference's points in the images that could be tested."""
-        if self.adjustment is None:
+        found, reference = self.adjustment, None if self.reference is None else self.reference.control
+        if found is None:
             return []
-        reference = None if self.reference is None else self.reference.control
         of_reference = None if reference is None else reference.points
-        tested = ((self.gcps, self.adjustment.gcp_w), (of_reference, self.adjustment.reference_w))
         return [
             ControlResidual(int(points.view[k]), points.names[points.point[k]], float(w[k]))
-            for points, w in tested
+            for points, w in ((self.gcps, found.gcp_w), (of_reference, found.reference_w))
             if points is not None
             for k in np.flatnonzero(np.isfinite(w)).tolist()
         ]
@@ -167,13 +170,18 @@ class Run:
 
     @cached_property
     def copies(self) -> dict[str, str]:
-        """Views that show the very pixels of another one, and in words whose, and how far moved."""
+        """Views that show the very pixels of another one, and in words whose, and how far moved.
+
+        Two images of one scene never match by whole pixels: only one that is a part, or a copy, of the other.
+        """
         found: dict[str, str] = {}
         for ties in self.pairs:
-            shift = _whole_shift(ties, self.tracks)
-            if shift is not None:
+            shift = self.tracks.xy[ties.b] - self.tracks.xy[ties.a]
+            whole = np.rint(np.median(shift, axis=0))
+            same = np.mean((np.abs(shift - whole) <= WHOLE).all(axis=1))
+            if len(shift) >= LEAST and same >= MOST:
                 names = [self.views[i].name for i in ties.views]
-                for name, other, (col, row) in zip(names, names[::-1], (shift, 0.0 - shift), strict=True):
+                for name, other, (col, row) in zip(names, names[::-1], (whole, 0.0 - whole), strict=True):
                     found.setdefault(name, f"{other}, moved by {col:.0f} columns and {row:.0f} rows")
         return found
 
@@ -181,11 +189,6 @@ class Run:
     def ties_before(self) -> Triangulation:
         """The tie points through the delivered cameras."""
         return triangulate_tracks(self.tracks, self.before, middle_altitude(self.views), self.keep)
-
-    @cached_property
-    def altitudes_before(self) -> Array:
-        """Altitudes of the tie points (P,) through the delivered cameras [m]."""
-        return ground_from_ecef(self.ties_before.points)[:, 2]
 
     @cached_property
     def ties_after(self) -> Triangulation | None:
@@ -229,17 +232,6 @@ def pair_ties(tracks: Tracks, keep: BoolArray | None = None) -> list[PairTies]:
     return [
         PairTies((int(views[0, s]), int(views[1, s])), a[s:e], b[s:e]) for s, e in pairwise([*starts.tolist(), len(a)])
     ]
-
-
-def _whole_shift(ties: PairTies, tracks: Tracks) -> Array | None:
-    """Return the shift (2,) [px] by whole pixels that the matches of a pair share; None where there is none.
-
-    Two images of one scene never match so: only one that is a part, or a copy, of the other.
-    """
-    shift = tracks.xy[ties.b] - tracks.xy[ties.a]
-    whole: Array = np.rint(np.median(shift, axis=0))
-    same = np.mean((np.abs(shift - whole) <= WHOLE).all(axis=1))
-    return whole if len(shift) >= LEAST and same >= MOST else None
 
 
 def triangulate_tracks(tracks: Tracks, sensors: Sequence[SensorModel], alt: float, keep: BoolArray) -> Triangulation:

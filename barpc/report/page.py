@@ -17,8 +17,8 @@ import numpy as np
 from barpc.errors import BarpcError, visible
 from barpc.report.compare import flat_options
 from barpc.report.digest import SHOWN, decisions, flagged, offset_of, sentences, worst_first, worst_pairs
-from barpc.report.maps import MAX_DRAWN, ground_map, residual_panels, tag
-from barpc.report.records import MAX_TABLE_ROWS, Record, Table, cell_of, table, value_of
+from barpc.report.maps import ground_map, residual_panels, tag
+from barpc.report.records import MAX_SHOWN, Record, Table, cell_of, table, value_of
 from barpc.report.reservations import FEW_OBSERVATIONS, GOOD_RMSE
 from barpc.report.summary import StageEntry, Summary
 from barpc.report.summary.known import GCPS, CheckPointEntry, GcpEntry, ReferenceViewEntry
@@ -31,8 +31,7 @@ from barpc.scene import connected_groups
 from barpc.workspace import Workspace
 
 NAME = "report.html"
-_MOST_LINES = 200  # sentences of the verdict
-_SHOWN_LINES = 16  # of these, before the rest is unfolded
+_SHOWN_LINES = 16  # sentences of the verdict, before the rest is unfolded
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
 REPORT = "report"  # the stage that makes the page, which cannot tell how long it took
 
@@ -62,8 +61,7 @@ def report_html(summary: Summary, folder: Path | str) -> str:
             large=len(summary.views) > SHOWN,
             shown_lines=_SHOWN_LINES,
             folded=_FOLDED,
-            most_rows=MAX_TABLE_ROWS,
-            most_lines=_MOST_LINES,
+            most=MAX_SHOWN,
         )
     )
 
@@ -124,53 +122,24 @@ class Section:
 
 
 _TABLES: dict[str, tuple[str, type[Record], str]] = {
-    "images": (
-        "Images: reprojection error (RMS) of the tie points that count; those that need a look first",
-        ViewEntry,
-        ViewEntry.PAGE,
-    ),
-    "pairs": (
-        "Pairs: distance of matches from the epipolar line, median ± spread (1.4826 MAD)",
-        PairEntry,
-        PairEntry.PAGE,
-    ),
-    "corrections": (
-        "Corrections: shift in the middle of the image ± one sigma, size of rotation and translation",
-        ViewEntry,
-        ViewEntry.CORRECTIONS,
-    ),
+    "images": ("Images: errors (RMS) of the tie points that count; worst first", ViewEntry, ViewEntry.PAGE),
+    "pairs": ("Pairs: offset from the epipolar line, median ± spread (1.4826 MAD)", PairEntry, PairEntry.PAGE),
+    "corrections": ("Corrections: shift in the middle of the image ± one sigma", ViewEntry, ViewEntry.CORRECTIONS),
     "places": (
-        "Place on the ground of the middle of each image, its altitude given: one-sigma ellipse, CE90, and CE90 as "
-        "stated with the camera as delivered (-: nothing is)",
+        "Ground in the middle of each image: one-sigma ellipse, CE90 and CE90 stated",
         ViewEntry,
         ViewEntry.PLACES,
     ),
     "gcps": (GCPS, GcpEntry, GcpEntry.PAGE),
-    "control": (
-        "Control in each image: the largest residual in units of its own deviation (Baarda's w)",
-        ViewEntry,
-        ViewEntry.CONTROL,
-    ),
-    "reference": ("Reference: what it says of each camera as delivered", ReferenceViewEntry, ReferenceViewEntry.PAGE),
-    "decided": (
-        "What was decided by of each image: its prior widened, what was cut, what is left that is smooth",
-        ViewEntry,
-        ViewEntry.DECISIONS,
-    ),
-    "explained": (
-        "What explains tie points beside the cameras' errors as stated",
-        ExplanationEntry,
-        ExplanationEntry.PAGE,
-    ),
+    "control": ("Control in each image: the largest residual (Baarda's w)", ViewEntry, ViewEntry.CONTROL),
+    "reference": ("Reference: what it says of each delivered camera", ReferenceViewEntry, ReferenceViewEntry.PAGE),
+    "decided": ("Figures of each image: its prior widened, what was cut, what is left", ViewEntry, ViewEntry.DECISIONS),
+    "explained": ("What explains tie points beside the cameras' errors", ExplanationEntry, ExplanationEntry.PAGE),
     "left": ("What still stands out", LeftEntry, LeftEntry.PAGE),
     "worse": ("Tie points that took no part", HeldOutEntry, HeldOutEntry.PAGE),
-    "again": ("Pairs that were tried again, and what found fewer matches than were wanted", PairEntry, PairEntry.AGAIN),
+    "again": ("Pairs that were tried again, and what found too few matches", PairEntry, PairEntry.AGAIN),
     "check-points": ("Check points: found minus given place", CheckPointEntry, CheckPointEntry.PAGE),
-    "fits": (
-        "Refitted RPCs against the corrected cameras, on points that the fit has not seen",
-        ViewEntry,
-        ViewEntry.FITS,
-    ),
+    "fits": ("Refitted RPCs against the corrected cameras, on points new to the fit", ViewEntry, ViewEntry.FITS),
     "stages": ("Stages of the run", StageEntry, StageEntry.PAGE),
 }
 """Key of a table -> its caption, and the columns of its records."""
@@ -209,8 +178,8 @@ def _map(files: RunFiles) -> Section:
         "Outlines at the altitude of the scene, those that need a look on top; dots are tie points, triangles GCPs, "
         "those on their tip check points; a stronger line stands for more matches; dashed: where tie points move."
     )
-    if num > MAX_DRAWN:
-        caption += f" At most {MAX_DRAWN} of {num} outlines are drawn; all are in footprints.geojson."
+    if num > MAX_SHOWN:
+        caption += f" At most {MAX_SHOWN} of {num} outlines are drawn; all are in footprints.geojson."
     shown = [(ground_map(files), caption)] if any(files.outlines) else []
     return Section("map", "Where are the images, and which hold together?", answer, shown)
 

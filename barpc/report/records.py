@@ -45,7 +45,7 @@ def said(
         None for an optional value; more words of its JSON schema.
     """
     end = f" [{unit}]" if unit else ""
-    heads = tuple(f"{words}{end}" for words in ((head,) if isinstance(head, str) else head))
+    heads = f"{head}{end}" if isinstance(head, str) else tuple(f"{words}{end}" for words in head)
     more = {**schema, "description": f"{text}{end}."}
     return field(default=default, metadata={"schema": more, "column": (heads, form, adjusted)})
 
@@ -135,7 +135,7 @@ def _held(kind: Any) -> list[tuple[str, bool]]:
 
 # --- tables -----------------------------------------------------------------------------------------------
 
-MAX_TABLE_ROWS = 400  # A table of the page shows so many rows; the files beside it have all
+MAX_SHOWN = 400  # Rows of a table of the page, sentences, images and ground points on its map; files have all
 
 
 @dataclass(frozen=True)
@@ -175,15 +175,10 @@ class Column:
     form: str = ""
     adjusted: bool = False
 
-    @property
-    def heads(self) -> tuple[str, ...]:
-        """Its heads."""
-        return (self.head,) if isinstance(self.head, str) else self.head
-
     def cells(self, row: Record) -> list[Cell]:
         """Return its cells in a row."""
-        value, num = self.value(row), len(self.heads)
-        values = [value] if num == 1 else [None] * num if value is None else value
+        value = self.value(row)
+        values = [value] if isinstance(self.head, str) else [None] * len(self.head) if value is None else value
         return [cell_of(item, self.form) for item in values]
 
 
@@ -194,7 +189,8 @@ def table(
     found = [column_of(kind, name) for name in columns.split()]  # type: ignore[arg-type]
     found = [column for column in found if adjusted or not column.adjusted]
     cells = [[cell for column in found for cell in column.cells(row)] for row in rows]
-    return Table(key, caption, [head for column in found for head in column.heads], cells)
+    heads = [[column.head] if isinstance(column.head, str) else column.head for column in found]
+    return Table(key, caption, [head for some in heads for head in some], cells)
 
 
 @cache

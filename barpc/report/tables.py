@@ -60,32 +60,32 @@ def _per_track(run: Run) -> Array:
 
 
 def _residuals_csv(run: Run, _: Summary) -> bytes:
-    lines = [",".join(RESIDUALS)]
-    for lon, lat, alt, mean, count, before, track in _per_track(run).tolist():
-        lines.append(f"{lon:.9f},{lat:.9f},{alt:.4f},{mean:.4f},{count:.0f},{_number(before, 4)},{track:.0f}")
-    return ("\n".join(lines) + "\n").encode()
+    rows = [
+        f"{lon:.9f},{lat:.9f},{alt:.4f},{mean:.4f},{count:.0f},{_number(before, 4)},{track:.0f}"
+        for lon, lat, alt, mean, count, before, track in _per_track(run).tolist()
+    ]
+    return "\n".join([",".join(RESIDUALS), *rows, ""]).encode()
 
 
 def _observations_csv(run: Run, _: Summary) -> bytes:
-    tracks, wanted = run.tracks, np.zeros(run.tracks.num_points, dtype=bool)
-    wanted[run.written_tracks] = True
-    rows = np.flatnonzero(wanted[tracks.point])
+    tracks = run.tracks
+    rows = np.flatnonzero(np.isin(tracks.point, run.written_tracks))
     before = run.ties_before.residuals[rows]
     after = np.full_like(before, np.nan) if run.ties_after is None else run.ties_after.residuals[rows]
     numbers = np.column_stack([tracks.xy[rows], before, after])
-    names = [cell(view.name) for view in run.views]
-    whole = np.isfinite(numbers).all(axis=1)
+    names, whole = [cell(view.name) for view in run.views], np.isfinite(numbers).all(axis=1)
     columns = (tracks.view[rows], tracks.point[rows], numbers, run.keep[rows], whole)
     lines = [",".join(OBSERVATIONS)]
     for view, track, row, used, full in zip(*(column.tolist() for column in columns), strict=True):
         text = _RESIDUAL_CELLS(*row) if full else ",".join(_number(value, 4) for value in row)
         lines.append(f"{names[view]},{track},{text},{used:d}")
-    return ("\n".join(lines) + "\n").encode()
+    return "\n".join([*lines, ""]).encode()
 
 
 def _pairs_csv(_: Run, summary: Summary) -> bytes:
-    lines = [[path.replace(".", "_") + "_px" * ("." in path) for path in PairEntry.CSV.split()]]
-    lines += [[_cell(value_of(pair, path)) for path in PairEntry.CSV.split()] for pair in summary.pairs]
+    paths = PairEntry.CSV.split()
+    lines = [[path.replace(".", "_") + "_px" * ("." in path) for path in paths]]
+    lines += [[_cell(value_of(pair, path)) for path in paths] for pair in summary.pairs]
     return "".join(",".join(line) + "\n" for line in lines).encode()
 
 

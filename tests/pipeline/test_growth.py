@@ -15,6 +15,7 @@ from rasterio.errors import NotGeoreferencedWarning
 
 from barpc import report
 from barpc.errors import BarpcError
+from barpc.geodesy import ground_from_ecef
 from barpc.options import RunOptions
 from barpc.pipeline import adjust, load_views, outputs, run
 from barpc.pipeline import loading as views
@@ -121,7 +122,7 @@ def test_pairs_measured_together_are_as_measured_alone(block):
     xy, point = found.tracks.xy, found.tracks.point
     for ties in found.pairs:
         i, j = ties.views
-        alt = found.altitudes_before[point[ties.a]]
+        alt = ground_from_ecef(found.ties_before.points)[point[ties.a], 2]
         pair = entries[found.views[i].name, found.views[j].name]
         alone, _ = epipolar_offset(found.before[i], found.before[j], xy[ties.a], xy[ties.b], alt, steps=2)
         alone = alone[np.isfinite(alone)]

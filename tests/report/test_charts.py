@@ -69,4 +69,4 @@ def test_of_many_rows_some_are_shown_evenly():
 
 
 def test_how_much_is_shown_at_most():
-    assert (maps.MAX_DRAWN, maps.MAX_MARKS) == (400, 1500)
+    assert (maps.MAX_SHOWN, maps.MAX_MARKS) == (400, 1500)

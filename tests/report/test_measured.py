@@ -14,7 +14,7 @@ from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report import Run
 from barpc.report import outcome as runs
 from barpc.report.digest import decisions
-from barpc.report.outcome import ControlResidual, PairTies, pair_ties, triangulate_tracks
+from barpc.report.outcome import ControlResidual, pair_ties, triangulate_tracks
 from barpc.report.summary import measure_run
 from barpc.report.summary.known import GcpEntry, measure_control, measure_gcps, measure_reference
 from barpc.report.summary.place import ce90
@@ -78,12 +78,6 @@ def test_a_copy_is_an_image_whose_matches_have_one_whole_shift():
     assert copies(others=2)  # nine of ten
     assert not copies(others=3)
     assert (runs.WHOLE, runs.MOST, runs.LEAST) == (0.05, 0.9, 20)
-
-
-def test_a_pair_s_shift_is_that_of_the_second_minus_the_first():
-    tracks = tracks_of(*((k // 2, k % 2, 10.0 * k + 3.0 * (k % 2), 1.0) for k in range(40)))
-    index = np.arange(0, 40, 2)
-    assert runs._whole_shift(PairTies((0, 1), index, index + 1), tracks).tolist() == [13.0, 0.0]
 
 
 def test_errors_of_a_view_are_the_root_of_the_mean_square_distance():

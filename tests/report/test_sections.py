@@ -78,7 +78,7 @@ def test_a_map_needs_an_outline_and_says_where_some_are_left_out(monkeypatch):
     assert asked("map", pairs=[a_pair()]).charts == []
     ((_, whole),) = asked("map", outlines=outlines).charts
     assert whole.startswith("Outlines at the altitude of the scene")
-    monkeypatch.setattr(page, "MAX_DRAWN", 2)
+    monkeypatch.setattr(page, "MAX_SHOWN", 2)
     ((_, some),) = asked("map", outlines=outlines).charts
     assert some == f"{whole} At most 2 of 3 outlines are drawn; all are in footprints.geojson."
 
@@ -311,14 +311,14 @@ def test_decisions_have_a_table_of_images_where_cameras_were_adjusted():
     assert [table.key for table in again.tables] == ["again"]
 
 
-@pytest.mark.parametrize(("num", "more"), [(200, False), (201, True)])
-def test_a_verdict_of_two_hundred_sentences_is_shown_whole(monkeypatch, num, more):
+@pytest.mark.parametrize(("num", "more"), [(400, False), (401, True)])
+def test_a_verdict_of_four_hundred_sentences_is_shown_whole(monkeypatch, num, more):
     pytest.importorskip("jinja2")
     files = files_of(a_summary(VIEWS, verdict=tuple(f"s{k}." for k in range(num))))
     monkeypatch.setattr(page, "read_tables", lambda *_: files)
     monkeypatch.setattr(page, "SECTIONS", ())
     html = page.report_html(files.summary, "")
-    assert "<li>s199.</li>" in html
+    assert "<li>s399.</li>" in html
     assert ("And 1 more; all are in summary.json." in html) == more
 
 

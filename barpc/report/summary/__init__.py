@@ -16,16 +16,8 @@ import numpy as np
 from barpc import __version__
 from barpc.report.outcome import Run
 from barpc.report.records import Number, Record, plain, said
-from barpc.report.summary.known import (
-    CheckPointEntry,
-    ControlTestEntry,
-    GcpEntry,
-    ReferenceEntry,
-    measure_check_points,
-    measure_control,
-    measure_gcps,
-    measure_reference,
-)
+from barpc.report.summary import known
+from barpc.report.summary.known import CheckPointEntry, ControlTestEntry, GcpEntry, ReferenceEntry
 from barpc.report.summary.pairs import PairEntry, measure_pairs
 from barpc.report.summary.views import ViewEntry, measure_views
 from barpc.report.summary.whole import SceneEntry, measure_scene
@@ -115,14 +107,10 @@ class Summary(Record):
     stages: tuple[StageEntry, ...] = said("Stages of the run")
     options: Mapping[str, _Value | Mapping[str, _Value | Mapping[str, _Value]]] | None = said("Options of the run")
     versions: Mapping[str, str] = said("Versions of Python and packages")
-    control_test: ControlTestEntry | None = said(
-        "The residuals of control in the images, each tested; null without control", default=None
-    )
+    control_test: ControlTestEntry | None = said("The residuals of control, each tested", default=None)
     reference: ReferenceEntry | None = said("A reference orthoimage, where one was given", default=None)
     inputs: tuple[InputEntry, ...] | None = said("Every file that was read, as `barpc verify` asks", default=None)
-    outputs: tuple[OutputEntry, ...] | None = said(
-        "Every file that was written but this one and the report", default=None
-    )
+    outputs: tuple[OutputEntry, ...] | None = said("Every file written but this and the report", default=None)
 
     def __repr__(self) -> str:
         return f"Summary({self.kind} of {len(self.views)} views, {self.status}: {self.headline})"
@@ -169,10 +157,10 @@ def measure_run(run: Run) -> Summary:
         ),
         tables=TablesEntry(usable, written, complete=written == usable),
         scene=measure_scene(run),
-        gcps=measure_gcps(run),
-        control_test=measure_control(run),
-        check_points=measure_check_points(run),
-        reference=measure_reference(run),
+        gcps=known.measure_gcps(run),
+        control_test=known.measure_control(run),
+        check_points=known.measure_check_points(run),
+        reference=known.measure_reference(run),
         stages=tuple(StageEntry.read(stage) for stage in run.stages),
         options=plain(run.options),
         versions={"python": platform.python_version(), **{name: package_version(name) for name in names}},

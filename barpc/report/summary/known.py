@@ -10,7 +10,7 @@ from scipy.special import ndtr
 
 from barpc.ba import check_residuals
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.report.outcome import ControlResidual, Run
+from barpc.report.outcome import Run
 from barpc.report.records import Column, Number, Record, said
 from barpc.report.summary.words import ABOVE, Count, Pixel, Vector
 from barpc.scene import IntArray
@@ -41,15 +41,11 @@ class GcpEntry(KnownPoint):
 
     sigma_m: tuple[float, float, float] = said("Stated", "m", "sigma east, north, up", ".2g")
     residual_enu_m: Vector = said(
-        "What all the others say of it minus its given place, east, north, up; null where nothing tells",
-        "m",
-        ("east", "north", "up"),
-        "+.3f",
+        "What all the others say of it minus its given place", "m", ("east", "north", "up"), "+.3f"
     )
     used: bool = said("Whether it holds the block", default=True)
     status: Literal["used", "contradicts", "rejected", "undecided", "not seen"] = said(
-        "used; contradicts: used, and off by more than 4 standard deviations; rejected: not used, the others "
-        "or the images agree without it; undecided: not used, others contradict it and weigh as much",
+        "contradicts: used, off by more than 4 sigma; rejected: the others agree without it; undecided: weighs as much",
         head="verdict",
         default="used",
     )
@@ -58,13 +54,7 @@ class GcpEntry(KnownPoint):
     redundancy: Number = said("How far the others can tell, 0 to 1", default=None)
     residual_px: Number = said("The residual in the images that show it, RMS", "px", "in images", ".2f", default=None)
 
-    image_w: Number = said(
-        "Largest of its residuals in the images over its own standard deviation (Baarda's w)",
-        "",
-        "w in images",
-        ".1f",
-        default=None,
-    )
+    image_w: Number = said("Largest w in the images (Baarda)", "", "w in images", ".1f", default=None)
     image_w_view: str | None = said("View that it is in", head="largest in", default=None)
 
     @classmethod
@@ -92,12 +82,8 @@ class ReferenceViewEntry(Record):
     PAGE: ClassVar = "name peak offset_en_m num_tried num_passed num_points scatter_m"
 
     name: str = said("View", head="image")
-    peak: Number = said(
-        "By how many standard deviations the vote for one shift stands out; below 6.5 it is none", "", "peak", ".1f"
-    )
-    offset_en_m: Pixel | None = said(
-        "How far off the camera as delivered shows everything, east, north", "m", ("off east", "north"), "+.2f"
-    )
+    peak: Number = said("Standard deviations by which one shift stands out", "", "peak", ".1f")
+    offset_en_m: Pixel | None = said("Offset of the delivered camera, east, north", "m", ("off east", "north"), "+.2f")
     num_tried: Count = said("Points looked for", head="points tried")
     num_passed: Count = said("That beat their decoy and came back", head="found")
     num_points: Count = said("That agree with each other and held the block", head="used")
@@ -154,32 +140,25 @@ def measure_gcps(run: Run) -> tuple[GcpEntry, ...]:
         return ()
     tested = None if run.adjustment is None else run.adjustment.control
     left = np.full_like(points.sigma, np.nan) if tested is None else tested.residual
-    entries, tests = [], run.control_tests
-    seen = _grouped(points.point, len(points.names))
-    places, sigmas = points.lonlatalt.tolist(), points.sigma.tolist()
-    for g, (name, (lon, lat, alt), sigma) in enumerate(zip(points.names, places, sigmas, strict=True)):
-        images = tuple(run.views[i].name for i in points.view[seen[g]])
-        status = "not seen" if not images else "used" if tested is None else tested.status(g)
-        entries.append(
-            GcpEntry(
-                *(name, lon, lat, alt, sigma, left[g].tolist()),
-                used=status in ("used", "contradicts"),
-                status=status,  # type: ignore[arg-type]  # one of these words
-                images=images,
-                w=None if tested is None else tested.w[g],
-                redundancy=None if tested is None else tested.redundancy[g],
-                residual_px=_in_images(run, points.lonlatalt[g], points.view[seen[g]], left[g]),
-                **_worst_in_images(run, [test for test in tests if test.point == name]),
-            )
+    worst = {test.point: test for test in sorted(run.control_tests, key=lambda test: test.w)}  # the largest is last
+    entries = []
+    for g, (name, rows) in enumerate(zip(points.names, _grouped(points.point, len(points.names)), strict=True)):
+        views, test = points.view[rows], worst.get(name)
+        lon, lat, alt = points.lonlatalt[g].tolist()
+        status = "not seen" if not len(views) else "used" if tested is None else tested.status(g)
+        entry = GcpEntry(
+            *(name, lon, lat, alt, points.sigma[g].tolist(), left[g].tolist()),
+            used=status in ("used", "contradicts"),
+            status=status,  # type: ignore[arg-type]  # one of these words
+            images=tuple(run.views[i].name for i in views),
+            w=None if tested is None else tested.w[g],
+            redundancy=None if tested is None else tested.redundancy[g],
+            residual_px=_in_images(run, points.lonlatalt[g], views, left[g]),
+            image_w=None if test is None else test.w,
+            image_w_view=None if test is None else run.views[test.view].name,
         )
+        entries.append(entry)
     return tuple(entries)
-
-
-def _worst_in_images(run: Run, tests: Sequence[ControlResidual]) -> dict[str, Any]:
-    if not tests:
-        return {}
-    worst = max(tests, key=lambda test: test.w)
-    return {"image_w": worst.w, "image_w_view": run.views[worst.view].name}
 
 
 def measure_control(run: Run) -> ControlTestEntry | None:
@@ -214,18 +193,18 @@ def measure_reference(run: Run) -> ReferenceEntry | None:
     found, adjustment = run.reference, run.adjustment
     if found is None:
         return None
-    control = None if adjustment is None else found.control
-    kept = np.zeros(len(run.views), np.int64)
-    points = 0
-    if control is not None and adjustment is not None:
-        rows = adjustment.reference_inlier
-        kept = np.bincount(control.points.view[rows], minlength=len(run.views))
-        points = len(np.unique(control.points.point[rows]))
-    views = []
-    for view, count in zip(found.views, kept.tolist(), strict=True):
-        offset = view.offset if view.points else None
-        views.append(ReferenceViewEntry(view.name, view.peak, offset, view.tried, view.passed, count, view.scatter))
-    return ReferenceEntry(points > 0, found.step, found.sigma, points, tuple(views))
+    kept, points = [0] * len(run.views), 0
+    if found.control is not None and adjustment is not None:
+        held, rows = found.control.points, adjustment.reference_inlier
+        kept = np.bincount(held.view[rows], minlength=len(run.views)).tolist()
+        points = len(np.unique(held.point[rows]))
+    views = tuple(
+        ReferenceViewEntry(
+            *(view.name, view.peak, view.offset if view.points else None, view.tried, view.passed, count, view.scatter)
+        )
+        for view, count in zip(found.views, kept, strict=True)
+    )
+    return ReferenceEntry(points > 0, found.step, found.sigma, points, views)
 
 
 def measure_check_points(run: Run) -> tuple[CheckPointEntry, ...]:

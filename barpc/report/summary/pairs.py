@@ -7,8 +7,9 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
+from scipy import ndimage
 
-from barpc.geodesy import Array
+from barpc.geodesy import Array, ground_from_ecef
 from barpc.report.outcome import Run
 from barpc.report.records import Cell, Column, Number, Record, plain, said
 from barpc.report.summary.words import Count
@@ -59,39 +60,19 @@ class PairEntry(Record):
     num_matches: Count = said("Tie points that both see", head="matches")
     convergence_deg: Number = said("Angle between the lines of sight", "deg", "angle", ".1f")
     base_to_height: Number = said("B/H along the lines of sight", head="B/H", form=".2f")
-    height_m_per_px: Number = said(
-        "Height whose parallax is a pixel; null for parallel rays", "m", "height per px", ".3g"
-    )
+    height_m_per_px: Number = said("Height whose parallax is a pixel", "m", "height per px", ".3g")
     epipolar_before: OffsetEntry | None = said("Through the delivered cameras")
     epipolar_after: OffsetEntry | None = said("Through the new cameras")
-    matching: Mapping[str, Any] | None = said(
-        "What became of it in matching; null for tie points taken as given (matches_only)"
-    )
+    matching: Mapping[str, Any] | None = said("What became of it in matching; null: not matched")
     tied_by: str | None = said(
-        "Matcher that tied it, whether with loosened thresholds, and by keypoints not registered; null as there",
-        head="tied by",
-        default=None,
+        "Matcher that tied it, and whether loosened; null as there", head="tied by", default=None
     )
     decoy_share: Number = said(
-        "Share of its matches that bands which hold no true one say is false",
-        head="false [share]",
-        form=".3f",
-        default=None,
+        "Share that bands without true matches say is false", head="false", form=".1%", default=None
     )
-    noise_px: Number = said(
-        "Robust spread of its matches across the epipolar lines, before registration",
-        "px",
-        "noise",
-        ".2f",
-        default=None,
-    )
-    beaten: tuple[str, ...] = said(
-        "Attempts that found fewer: matcher, whether loosened, verified matches of those wanted", default=()
-    )
-    chosen_by: str | None = said(
-        "Why it was tried: overlap and angle, same date, quick score, connects all, second path, listed, given",
-        default=None,
-    )
+    noise_px: Number = said("Robust spread of its matches across epipolar lines", "px", "noise", ".2f", default=None)
+    beaten: tuple[str, ...] = said("Attempts that found fewer: matcher, matches of those wanted", default=())
+    chosen_by: str | None = said("Why it was tried", default=None)
 
     @property
     def offset_rms(self) -> tuple[float | None, float | None]:
@@ -106,7 +87,10 @@ class PairEntry(Record):
 def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
     """Return every two images with tie points in common."""
     reports = {report.names: report for report in run.matched}
-    geometry, before = _pair_geometry(run), _pair_offsets(run, run.before, run.altitudes_before)
+    geometry, before = (
+        _pair_geometry(run),
+        _pair_offsets(run, run.before, ground_from_ecef(run.ties_before.points)[:, 2]),
+    )
     after: list[OffsetEntry | None] = [None] * len(before)
     if run.after is not None:
         after = _pair_offsets(run, run.after, run.ground[:, 2])
@@ -116,8 +100,12 @@ def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
         report = reports.get(names)
         entry = PairEntry(*names, len(ties.a), angle, base, height, first, last, None)
         if report is not None:
-            entry = replace(entry, decoy_share=report.control_share, noise_px=report.spread, tied_by=report.means)
-            entry = replace(entry, matching=plain(report), chosen_by=report.reason, beaten=report.beaten)
+            found: dict[str, Any] = {
+                "decoy_share": report.control_share,
+                "noise_px": report.spread,
+                "tied_by": report.means,
+            }
+            entry = replace(entry, **found, matching=plain(report), chosen_by=report.reason, beaten=report.beaten)
         entries.append(entry)
     return tuple(entries)
 
@@ -165,21 +153,14 @@ def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> list[
 def _rows(run: Run, picks: Sequence[slice | IntArray]) -> tuple[IntArray, IntArray, IntArray]:
     """Of all pairs together, those matches that are picked: their observations in both views, and which pair it is."""
     none = np.empty(0, dtype=np.int64)
-    a = [ties.a[pick] for ties, pick in zip(run.pairs, picks, strict=True)]
-    b = [ties.b[pick] for ties, pick in zip(run.pairs, picks, strict=True)]
-    return (
-        np.concatenate([none, *a]),
-        np.concatenate([none, *b]),
-        np.repeat(np.arange(len(a)), [len(rows) for rows in a]),
-    )
+    a, b = ([getattr(t, of)[pick] for t, pick in zip(run.pairs, picks, strict=True)] for of in ("a", "b"))
+    pair = np.repeat(np.arange(len(a)), [len(rows) for rows in a])
+    return np.concatenate([none, *a]), np.concatenate([none, *b]), pair
 
 
 def medians(values: Array, group: IntArray, num: int) -> Array:
     """Return the median (num,) of each group of values (n,); NaN without any."""
-    ordered = values[np.lexsort((values, group))]
-    count = np.bincount(group, minlength=num)
-    start, some = np.cumsum(count) - count, count > 0
-    out = np.full(num, np.nan)
-    low, high = ((start + (count - odd) // 2)[some] for odd in (1, 0))
-    out[some] = 0.5 * (ordered[low] + ordered[high])
+    out, some = np.full(num, np.nan), np.unique(group)
+    if len(some):
+        out[some] = ndimage.median(values, group, some)
     return out

@@ -39,13 +39,8 @@ class CorrectionEntry(Record):
 
     model: str = said("Unknowns of the adjustment")
     unknowns: tuple[float, ...] = said("In metres (rotation: angle x distance), or px in the image")
-    sigma: tuple[float, ...] = said(
-        "Their posterior standard deviations, in the same units; of an image that was adjusted alone, with the others' "
-        "points as they are"
-    )
-    center_shift_px: Pixel | None = said(
-        "Move of the ground point in the middle, col, row", "px", "shift col, row", "+.2f", adjusted=True
-    )
+    sigma: tuple[float, ...] = said("Their posterior standard deviations, in the same units")
+    center_shift_px: Pixel | None = said("Move of the middle", "px", "shift col, row", "+.2f", adjusted=True)
     center_sigma_px: Pixel | None = said("Its posterior standard deviation, with the scene's own uncertain place", "px")
     shift_px: Pixel | None = said("Models in the image: shift col, row", "px", default=None)
     slope: tuple[Pixel, ...] | None = said("Models in the image: by (col, row)", "px/px", default=None)
@@ -58,19 +53,15 @@ class CorrectionEntry(Record):
     azimuth_ms: Number = said("Radar: added to the azimuth time", "ms", "azimuth", "+.4f", default=None)
     timing_sigma: Pixel | None = said("Their posterior standard deviations, m and ms", default=None)
     timing_slopes: tuple[Pixel, ...] | None = said(
-        "Radar: what is added at the end of the flight over the image, m and ms, for each power", default=None
+        "Radar: added at the end of the flight, m and ms, by power", default=None
     )
-    jitter_px: Number = said(
-        "RMS over the rows of the spline that follows in the image", "px", "jitter", ".2f", default=None
-    )
+    jitter_px: Number = said("RMS of the spline over the rows", "px", "jitter", ".2f", default=None)
     jitter_rows: Number = said("Rows between its knots", "px", default=None)
     detector_px: Number = said("RMS of the steps between detectors", "px", "detectors", ".2f", default=None)
     strip_px: Number = said("RMS of the strips that lie off", "px", "strips", ".2f", default=None)
     swing_px: Number = said("Amplitude of the swings of the rows", "px", "swing", ".2f", default=None)
     swing_rows: tuple[float, ...] | None = said("Their periods", "px", default=None)
-    ellipse: EllipseEntry | None = said(
-        "How well it tells where the middle of its image is, the scene's own uncertain place in it", default=None
-    )
+    ellipse: EllipseEntry | None = said("Where its middle is, one sigma, the scene's place in it", default=None)
     detectors: tuple[float, ...] | None = said("Columns where another detector begins", "px", default=None)
 
 
@@ -87,9 +78,7 @@ class FitEntry(Record):
 
     rmse_px: Pixel = said("Error col, row on check points", "px", "RMSE col, row", ".1e")
     max_px: Pixel = said("Largest error col, row on check points", "px")
-    min_denominator: Number = said(
-        "Over the image's ground and around it, relative to its centre", "", "smallest denominator", ".3f"
-    )
+    min_denominator: Number = said("Relative to the centre's", "", "smallest denominator", ".3f")
     roundtrip_px: Number = said("Largest move by projection and back; null where it fails", "px", "round trip", ".1e")
     coverage: Number = said("Share of the image that the fit's points cover", head="covered", form=".0%")
     method: str = said("Solver", head="solver")
@@ -156,9 +145,7 @@ class ViewEntry(Record):
     alt_range_m: tuple[float, float] = said("Altitudes that the camera is used for", ABOVE)
     rpc_source: SourceEntry | None = said("Where the camera came from; null: not from a file")
     gsd_m: Number = said("Ground sampling distance in the middle of the image", "m", "GSD", ".2f")
-    incidence_deg: Number = said(
-        "Angle between the vertical and the direction to the sensor", "deg", "incidence", ".1f"
-    )
+    incidence_deg: Number = said("From the vertical to the sensor", "deg", "incidence", ".1f")
     azimuth_deg: Number = said("Direction to the sensor, clockwise from north", "deg")
     num_observations: Count = said("Tie-point observations that count", head="tie points")
     num_rejected: Count = said("Observations that the adjustment cut as wrong", head="cut")
@@ -180,36 +167,18 @@ class ViewEntry(Record):
     cause: str | None = said("Why, by its name; null when all is well", default=None, enum=[*CAUSES, None])
     num_moving: Count = said("Observations of tie points that move together, and took no part", default=0)
     held_out_px: Number = said(
-        "RMS reprojection error of tie points that took no part in the adjustment, by their median",
-        "px",
-        "not used",
-        ".3f",
-        default=None,
+        "RMS of tie points that took no part, by their median", "px", "not used", ".3f", default=None
     )
     stated_ce90_m: Number = said(
-        "CE90 of the camera as delivered, of the accuracies along an axis that its metadata state",
-        "m",
-        "CE90 stated",
-        ".1f",
-        default=None,
+        "CE90 of the delivered camera by its metadata", "m", "CE90 stated", ".1f", default=None
     )
-    smooth_p: Number = said(
-        "Probability that noise alone leaves as much as smooth_px (F test)", "", "F test p", ".0e", default=None
-    )
-    shared_px: Number = said(
-        "Error that an observation shares with its neighbour in the row or column", "px", "shared", ".3f", default=None
-    )
-    control_w: Number = said(
-        "Largest residual of its control in the image over its own standard deviation (Baarda's w)",
-        "",
-        "w",
-        ".1f",
-        default=None,
-    )
+    smooth_p: Number = said("Chance that noise leaves smooth_px (F test)", "", "F test p", ".0e", default=None)
+    shared_px: Number = said("Error shared with the neighbour in row or column", "px", "shared", ".3f", default=None)
+    control_w: Number = said("Largest w of its control (Baarda)", "", "w", ".1f", default=None)
     control_w_point: str | None = said("Control point that it is of", head="largest at", default=None)
     date: str | None = said("Day it was taken, where its metadata say so", default=None)
     certified: tuple[tuple[float, float, float, float, float], ...] | None = said(
-        "Ground points (lon, lat, alt) over the image and where the new camera sees them (col, row)", default=None
+        "Ground (lon, lat, alt) and where it is seen (col, row)", default=None
     )
 
 

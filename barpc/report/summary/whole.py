@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.ba.altimetry import AltimetryTest
 from barpc.ba.apart import APART, Apart
 from barpc.ba.evidence.places import Place
 from barpc.ba.held.gauge import MOTIONS
@@ -62,8 +61,7 @@ class ModeEntry(Record):
     sigma_m: Number = said("Posterior standard deviation", "m")
     meaning: str = said("Which motion", enum=list(MODES))
     motion_m: tuple[Number, ...] = said(
-        "All motions where this one is off by that: east, north, up; tilts, turn, scale at the edge; twist and "
-        "bending, from the lowest to the highest place",
+        "All motions where this one is off by that: east, north, up, tilts, turn, scale, twist, bending",
         "m",
         minItems=7,
         maxItems=len(MOTIONS),
@@ -75,20 +73,12 @@ class DatumEntry(Record):
     """What holds a motion of the scene: shares of what is known of it. Tie points have none."""
 
     part: str = said("Motion of the scene", head="motion", enum=list(MODES))
-    sigma_m: Number = said(
-        "Posterior standard deviation; at the edge for tilts, turn and scale, from the lowest to the highest place for "
-        "twist and bending",
-        "m",
-        "known to",
-        ".2f",
-    )
+    sigma_m: Number = said("Posterior standard deviation (of turns: at the edge)", "m", "known to", ".2f")
     cameras: Number = said("Accuracies of the cameras as delivered", head="cameras", form=".0%")
     earlier_run: Number = said("The earlier run", head="earlier run", form=".0%")
     fixed_views: Number = said("Views that are fixed", head="fixed views", form=".0%")
     gcps: Number = said("Ground control points", head="GCPs", form=".0%")
-    heights: Number = said(
-        "The DEM, or altitudes assumed for tie points seen under too small an angle", head="heights", form=".0%"
-    )
+    heights: Number = said("The DEM, or altitudes assumed", head="heights", form=".0%")
     reference: Number = said("A reference orthoimage", head="reference", form=".0%", default=None)
     altimetry: Number = said("Heights without image coordinates", head="altimetry", form=".0%", default=None)
 
@@ -110,9 +100,7 @@ class DemEntry(Record):
     spread_m: Number = said("1.4826 times the median absolute deviation of these", "m")
     sigma_m: Number = said("Standard deviation of single heights, where the tie points tell", "m", default=None)
     alike: Number = said("As many heights are worth one, as their errors resemble each other", default=None)
-    relief: Number = said(
-        "The DEM's relief as a multiple of the tie points'; far from 1: another terrain", default=None
-    )
+    relief: Number = said("The DEM's relief over the tie points'", default=None)
 
 
 class AltimetryEntry(Record):
@@ -158,9 +146,7 @@ class ExplanationEntry(Record):
     share: Number = said("Tie points that move together: part of all of them", default=None)
     moved_m: Number = said("How far they move on the ground, beside what may be their height", "m", default=None)
     between: tuple[str, ...] | None = said("From the first of these views to the second", default=None)
-    box: tuple[float, ...] | None = said(
-        "Where nine in ten of them lie, each way: west, south, east, north", "deg", default=None
-    )
+    box: tuple[float, ...] | None = said("West, south, east, north of nine in ten", "deg", default=None)
 
 
 class LeftEntry(Record):
@@ -191,9 +177,7 @@ class HeldOutEntry(Record):
     count: Count = said("Observations there that were looked at", head="looked at")
     far: float = said("Share of them that lies far off by the same")
     off_px: float = said("What the far ones are off by, by their median; else what the near ones share", "px")
-    chance: float = said(
-        "Probability of as much anywhere where all places are alike, at most", head="p below", form=".0e"
-    )
+    chance: float = said("Chance of as much anywhere, at most", head="p below", form=".0e")
 
 
 class SceneEntry(Record):
@@ -207,33 +191,22 @@ class SceneEntry(Record):
     weakest_modes: tuple[ModeEntry, ...] = said("What the images cannot tell, the weakest first")
     noise: Number = said("Observed over stated standard deviation of the observations")
     drift_degree: Count = said("Degree of the rotation in the row")
-    drift_sigma_m: tuple[Number, ...] = said(
-        "Standard deviation of the drift at the first and last row, by degree; null where an earlier run tells", "m"
-    )
+    drift_sigma_m: tuple[Number, ...] = said("Its standard deviation at the first and last row, by degree", "m")
     prior_ratio: Number = said("Squared corrections over stated variances and degrees of freedom")
     cost_history: tuple[Number, ...] = said("Sum of squared whitened residuals, by linearisation")
     num_held_in_height: Count = said("Tie points seen under too small an angle, held in height")
     gcp_residuals_enu_m: tuple[Vector, ...] = said("Adjusted GCPs minus their given place", "m")
     solver: str = said("What the solver did")
-    prior_shared: Number = said(
-        "Times by which accuracies that RPCs state were widened, as images share what they are off by; 1: not at all",
-        default=1.0,
-    )
+    prior_shared: Number = said("Times by which stated accuracies were widened, as shared", default=1.0)
     datum: tuple[DatumEntry, ...] = said("What holds the scene", default=())
     dem: DemEntry | None = said("What the DEM did; null without one", default=None)
-    altimetry: AltimetryEntry | None = said(
-        "What heights without image coordinates did; null without any", default=None
-    )
+    altimetry: AltimetryEntry | None = said("What heights alone did", default=None)
     gcp_scatter: Number = said("RMS residual of the GCPs used over what their accuracies let expect", default=None)
     num_held_out: Count = said("Observations that took no part, to be measured on", default=0)
     model: str = said("Unknowns of each view that were solved for", default="")
     drift_asked: AskedEntry | None = said("What a drift of one degree less left, where one was added", default=None)
     jitter_asked: AskedEntry | None = said("What was left without splines and steps, where these follow", default=None)
-    in_space_px: Number = said(
-        "Where an affine in the image was chosen: what a rotation and translation leave of the same tie points",
-        "px",
-        default=None,
-    )
+    in_space_px: Number = said("What a rotation and translation left where an affine was taken", "px", default=None)
     explanations: tuple[ExplanationEntry, ...] = said(
         "What explains tie points beside the cameras' errors as stated, the first taken first", default=()
     )
@@ -245,6 +218,7 @@ class SceneEntry(Record):
 
 _LEFT = attrgetter("view", "axis", "start", "stop", "share", "off", "apart", "gain", "moves")
 _HELD_OUT = attrgetter("columns", "rows", "count", "far", "off", "chance")
+_ALTIMETRY = attrgetter("given", "near", "agree", "spread", "expected", "motion", "sigma", "why_not")
 _DEM = attrgetter("held", "known", "total", "offset", "spread", "sigma", "alike", "relief")
 
 
@@ -254,10 +228,10 @@ def measure_scene(run: Run) -> SceneEntry | None:
     if adjustment is None:
         return None
     gauge, prior, terrain = adjustment.gauge, adjustment.prior, adjustment.terrain
-    datum = []
-    for m, part in enumerate(MOTIONS):
-        shares = {key: float(row[m]) for key, row in adjustment.datum.items()}
-        datum.append(DatumEntry(part, float(gauge.motion_sigma[m]), **shares))
+    datum = [
+        DatumEntry(part, float(sigma), **{key: float(row[m]) for key, row in adjustment.datum.items()})
+        for m, (part, sigma) in enumerate(zip(MOTIONS, gauge.motion_sigma, strict=True))
+    ]
     words = [MODES[mode.meaning].format(metres(mode.sigma)) for mode in gauge.modes]
     modes = [ModeEntry(m.sigma, m.meaning, m.motion.tolist(), text) for m, text in zip(gauge.modes, words, strict=True)]
     return SceneEntry(
@@ -268,7 +242,7 @@ def measure_scene(run: Run) -> SceneEntry | None:
         datum=tuple(datum),
         gcp_scatter=None if adjustment.control is None else adjustment.control.scatter,
         dem=None if terrain is None else DemEntry(*_DEM(terrain)),
-        altimetry=_altimetry(adjustment.altimetry),
+        altimetry=None if adjustment.altimetry is None else AltimetryEntry(*_ALTIMETRY(adjustment.altimetry)),
         noise=adjustment.noise,
         num_held_out=int(np.count_nonzero(adjustment.held_out)),
         model=adjustment.cameras.unknowns.model,
@@ -287,13 +261,6 @@ def measure_scene(run: Run) -> SceneEntry | None:
         left=left_entries(adjustment),
         held_out_places=held_out_places(run.met_worse, adjustment.names),
     )
-
-
-def _altimetry(test: AltimetryTest | None) -> AltimetryEntry | None:
-    if test is None:
-        return None
-    counts, spreads = (test.given, test.near, test.agree), (test.spread, test.expected)
-    return AltimetryEntry(*counts, *spreads, tuple(test.motion), tuple(test.sigma), test.why_not)
 
 
 def _asked(adjustment: Adjustment, what: str) -> AskedEntry | None:
