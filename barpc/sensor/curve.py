@@ -256,6 +256,11 @@ class Turn:
         x = (w * w).sum(axis=-2, keepdims=True)  # the angles, squared
         self._w = w
         self._largest = float(x.max(initial=0.0))
+        self._a: Array | float = 1.0
+        self._b: Array | float = 0.5
+        self._c: Array | float = 1.0 / 6.0
+        if self._largest < 1e-10:  # to the rounding of what is turned
+            return
         if self._largest < 1e-4:  # sin(a)/a, (1 - cos a)/a^2, (a - sin a)/a^3: to 3e-16
             self._a, self._b, self._c = 1 - x / 6 * (1 - x / 20), 0.5 - x / 24 * (1 - x / 30), 1 / 6 - x / 120
             return

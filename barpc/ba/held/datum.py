@@ -8,7 +8,6 @@ and points to each other, and what bends between them is paid for those who hold
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -51,22 +50,17 @@ def datum_shares(
         paid["earlier_run"] += ((joint.jacobian() @ flat) ** 2).sum(axis=0)
     prior = problem.point_prior
     if (prior is not None and len(prior.index)) or not problem.free.all():
-        reduced = _at_rest(covariance.reduced)
-        points = np.stack([reduced.point_step(unknowns[..., m]) for m in range(len(variance))], axis=-1)
-        number = np.arange(problem.structure.num_points)
+        reduced, structure = covariance.reduced, problem.structure
+        number, fixed = np.arange(structure.num_points), ~problem.free.reshape(structure.num_views, -1)[:, 0]
         kinds = {"gcps": (number >= known[0]) & (number < known[1]), "reference": number >= known[1]}
+        asked = np.isin(number, structure.point[fixed[structure.view]])
+        asked[[] if prior is None else prior.index] = True
+        points = np.zeros((len(number), 3, len(variance)))
+        points[asked] = reduced.carried(unknowns, np.flatnonzero(asked))
         held = _known_points(paid, problem, reduced, unknowns, points, kinds)
         _observations(paid, problem, state, weight, (unknowns, points), held)
     with np.errstate(invalid="ignore"):
         return {source: cost / sum(paid.values()) for source, cost in paid.items()}
-
-
-def _at_rest(reduced: Reduced) -> Reduced:
-    """Return the linearisation as if it stood at its minimum: steps are those of the cameras alone."""
-    common = reduced.common
-    if common is not None:
-        common = replace(common, half=np.zeros_like(common.half))
-    return replace(reduced, half=np.zeros_like(reduced.half), common=common)
 
 
 def _known_points(
@@ -85,8 +79,7 @@ def _known_points(
     rest = np.ones(len(prior.index), dtype=bool)
     shared = np.zeros((prior.common.shape[2], count))
     if reduced.common is not None:
-        flat = unknowns.reshape(-1, count)
-        shared = np.stack([reduced.common.step(flat[:, m]) for m in range(count)], axis=-1)
+        shared = reduced.common.step(unknowns.reshape(-1, count))
     left = ((prior.rows @ points[prior.index] - prior.common @ shared) ** 2).sum(axis=1)
     for kind, rows in kinds.items():
         own = rows[prior.index]

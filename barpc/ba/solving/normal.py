@@ -37,8 +37,8 @@ class Common:
     half: Array  # (m,) U^-T times their gradient
 
     def step(self, step: Array) -> Array:
-        """Return the move of the errors (m,) that goes with a step (N q,) of the camera unknowns."""
-        return -la.solve_triangular(self.upper, self.half + self.by_camera @ step)
+        """Return the move of the errors (m, s) that goes with steps (N q, s) of the camera unknowns alone."""
+        return -la.solve_triangular(self.upper, self.by_camera @ step)
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,23 @@ class Reduced:
             moved[:, start:stop] = (rows @ step[v]).reshape(-1, 3).T
         half = self.half.T + structure.sum_points(moved)
         if self.common is not None:
-            half[:, self.common.index] += (self.common.cross @ self.common.step(step.ravel())).T
+            common = self.common.step(step.ravel()) - la.solve_triangular(self.common.upper, self.common.half)
+            half[:, self.common.index] += (self.common.cross @ common).T
         return -solve_transposed(self.lower, half).T
+
+    def carried(self, step: Array, index: IntArray) -> Array:
+        """Return the moves (n, 3, s) [m] of points `index` (n,) that go with steps (N, q, s) of the cameras alone."""
+        structure = self.structure
+        place = np.full(structure.num_points, -1)
+        place[index] = np.arange(len(index))
+        rows = np.flatnonzero(place[structure.point] >= 0)
+        half = np.zeros((3, len(index), step.shape[2]))
+        np.add.at(half.swapaxes(0, 1), place[structure.point[rows]], self.cross[rows] @ step[structure.view[rows]])
+        if self.common is not None:
+            common = self.common.cross @ self.common.step(step.reshape(-1, step.shape[2]))
+            known = place[self.common.index] >= 0
+            half[:, place[self.common.index[known]]] += common[known].swapaxes(0, 1)
+        return np.moveaxis(-solve_transposed(self.lower[:, index, None], half), 0, 1)
 
 
 def reduce_normal(
