@@ -268,8 +268,9 @@ def _with_unregistered(views: Sequence[View], tracks: Tracks, given: GivenMatche
 
 def _joined(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
     """Return the registered tracks and others: those that stand beside a registered one are the same point."""
-    known, asked = (np.array([2 * REACH * part.view, *part.xy.T]).T for part in (tracks, others))
-    near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=REACH))
+    reach = REACH + float(np.hypot(0.5, 0.5))  # registration, and rounding, may move a point by so much
+    known, asked = (np.array([2 * reach * part.view, *part.xy.T]).T for part in (tracks, others))
+    near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=reach))
     same = np.flatnonzero(np.isfinite(near))
     point, which = np.unique(others.point[same], return_index=True)
     anchor = np.full(others.num_points, -1)  # the row of each track that says where it stands, if one does

@@ -56,9 +56,8 @@ def brute(a: Keypoints, b: Keypoints, where: EpipolarSegments) -> dict[tuple[int
         du = b.xy[:, 0] - where.along[i]
         dw = b.xy[:, 1] - where.across[i] - where.slope[i] * du
         turn = np.angle(np.exp(1j * (b.angle - expected)))
-        zoom = np.log(b.scale / a.scale[i]) - 0.5 * np.log(np.linalg.det(LINEAR))
         near = (where.before[i] <= du) & (du <= where.after[i]) & (np.abs(dw) <= ACROSS)
-        for j in np.flatnonzero(near & (np.abs(turn) <= np.radians(30)) & (np.abs(zoom) <= np.log(1.8))):
+        for j in np.flatnonzero(near & (np.abs(turn) <= np.radians(30))):
             likeness[i, j] = unit[0][i] @ unit[1][j]
     found = {}
     for i in range(len(a)):
