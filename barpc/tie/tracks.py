@@ -163,6 +163,7 @@ class _Trials:
         """Match the best pairs of a pool, or all, and others in place of those that fail."""
         own = self._options.matcher in MATCHERS  # another one reads the files itself
         self.looks = Looks.at(self._views, pool, apart=own)
+        assert self._work.store is not None
         self._keypoints = [KeypointFiles(self._work.store)] * len(self.looks.views)
         sizes = [view.size for view in self.looks.views]
         dates = several_dates(self._views)
@@ -324,12 +325,7 @@ def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Seque
     require_connected(views, links, f"no tie points between them: {listed}: {advice}")
 
 
-def require_tracks(
-    views: Sequence[View],
-    tracks: Tracks,
-    pairs: Sequence[Pair],
-    reports: Sequence[PairReport],
-) -> None:
+def require_tracks(views: Sequence[View], tracks: Tracks, pairs: Sequence[Pair], reports: Sequence[PairReport]) -> None:
     """Raise as `require_matches`, for the pairs that keep `NEEDED` tracks or more."""
     left, counts = [], pair_counts(tracks)
     for pair, report in zip(pairs, reports, strict=True):
