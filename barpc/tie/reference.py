@@ -301,10 +301,7 @@ class _Work:
         areas = [0.5 * abs(float((x * np.roll(y, 1) - y * np.roll(x, 1)).sum())) for x, y in (r.T for r in local)]
         apart = self.step * max(HALF // 2, round((max(areas) / _QUOTA) ** 0.5 / self.step))
         every = np.concatenate(local)
-        low, high = (
-            np.floor((every.min(axis=0) - REACH) / apart),
-            np.ceil((every.max(axis=0) + REACH) / apart),
-        )
+        low, high = (np.floor((every.min(axis=0) - REACH) / apart), np.ceil((every.max(axis=0) + REACH) / apart))
         grid = np.meshgrid(*(apart * np.arange(a, b + 1) for a, b in zip(low, high, strict=True)))
         places = origin + np.stack(grid, axis=-1).reshape(-1, 2) / metres
         places = places[np.any([sheet.shows(places) for sheet in self.sheets], axis=0)]

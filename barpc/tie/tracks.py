@@ -163,6 +163,7 @@ class _Trials:
         """Match the best pairs of a pool, or all, and others in place of those that fail."""
         own = self._options.matcher in MATCHERS  # another one reads the files itself
         self.looks = Looks.at(self._views, pool, apart=own)
+        assert self._work.store is not None
         self._keypoints = [KeypointFiles(self._work.store)] * len(self.looks.views)
         sizes = [view.size for view in self.looks.views]
         dates = several_dates(self._views)
@@ -268,8 +269,9 @@ def _with_unregistered(views: Sequence[View], tracks: Tracks, given: GivenMatche
 
 def _joined(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
     """Return the registered tracks and others: those that stand beside a registered one are the same point."""
-    known, asked = (np.array([2 * REACH * part.view, *part.xy.T]).T for part in (tracks, others))
-    near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=REACH))
+    reach = REACH + float(np.hypot(0.5, 0.5))  # registration, and rounding, may move a point by so much
+    known, asked = (np.array([2 * reach * part.view, *part.xy.T]).T for part in (tracks, others))
+    near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=reach))
     same = np.flatnonzero(np.isfinite(near))
     point, which = np.unique(others.point[same], return_index=True)
     anchor = np.full(others.num_points, -1)  # the row of each track that says where it stands, if one does
@@ -323,12 +325,7 @@ def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Seque
     require_connected(views, links, f"no tie points between them: {listed}: {advice}")
 
 
-def require_tracks(
-    views: Sequence[View],
-    tracks: Tracks,
-    pairs: Sequence[Pair],
-    reports: Sequence[PairReport],
-) -> None:
+def require_tracks(views: Sequence[View], tracks: Tracks, pairs: Sequence[Pair], reports: Sequence[PairReport]) -> None:
     """Raise as `require_matches`, for the pairs that keep `NEEDED` tracks or more."""
     left, counts = [], pair_counts(tracks)
     for pair, report in zip(pairs, reports, strict=True):

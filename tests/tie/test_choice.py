@@ -28,7 +28,7 @@ from barpc.tie.pairing.overlaps import (
     several_dates,
     twice_tied,
 )
-from barpc.tie.tasks import Work
+from barpc.tie.tasks import Store, Work
 from tests.lanes import diagonal, rest_slow
 from tests.scenes.dates import Years
 
@@ -213,7 +213,7 @@ class Looks:
 
     def run(self, row) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
         """The pairs that were tried, and those of them that tie."""
-        trials = tracks._Trials(row, self._options, Scope(), Work())
+        trials = tracks._Trials(row, self._options, Scope(), Work(store=Store("", "")))
         trials.run(pairs_in_a_row(len(row), self._options.neighbours), False)
         every = sorted(trials.tried)
         assert sorted(pair for some in self.tried for pair in some) == every  # none twice

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barpc.tie import TieOptions
-from barpc.tie.matchers.features import Keypoints, Share, Sift, allotted, detect_tile, join_keypoints, quota, ranked
+from barpc.tie.matchers.features import Keypoints, Share, Sift, detect_tile, join_keypoints, quota, ranked
 from barpc.tie.matchers.guided import _ROWS, Guided, _near
 from barpc.tie.matchers.matcher import Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments
@@ -56,9 +56,8 @@ def brute(a: Keypoints, b: Keypoints, where: EpipolarSegments) -> dict[tuple[int
         du = b.xy[:, 0] - where.along[i]
         dw = b.xy[:, 1] - where.across[i] - where.slope[i] * du
         turn = np.angle(np.exp(1j * (b.angle - expected)))
-        zoom = np.log(b.scale / a.scale[i]) - 0.5 * np.log(np.linalg.det(LINEAR))
         near = (where.before[i] <= du) & (du <= where.after[i]) & (np.abs(dw) <= ACROSS)
-        for j in np.flatnonzero(near & (np.abs(turn) <= np.radians(30)) & (np.abs(zoom) <= np.log(1.8))):
+        for j in np.flatnonzero(near & (np.abs(turn) <= np.radians(30))):
             likeness[i, j] = unit[0][i] @ unit[1][j]
     found = {}
     for i in range(len(a)):
@@ -129,22 +128,6 @@ def test_a_cell_keeps_its_strongest_and_cells_begin_at_the_corner_of_a_pixel() -
     assert len(quota(xy[:0], response[:0], 10.0, 1)) == 0
     tied = np.array([[5.0, 7.0], [4.0, 7.0], [6.0, 3.0]])
     assert quota(tied, np.ones(3), 10.0, 2).tolist() == [1, 2]
-
-
-@pytest.mark.parametrize(
-    ("found", "most", "kept"),
-    [
-        ([10, 10, 10], 30, [10, 10, 10]), ([10, 10, 10], 29, [9, 9, 9]), ([10, 0, 2], 8, [6, 0, 2]),
-        ([100, 100, 5], 105, [50, 50, 5]), ([40, 40], 30, [15, 15]), ([0, 0], 3, [0, 0]),
-    ],
-)  # fmt: skip
-def test_tiles_share_what_an_image_may_hold_and_poor_ones_leave_theirs(found, most, kept) -> None:
-    assert allotted(np.array(found), np.ones(len(found)), most).tolist() == kept
-
-
-def test_a_larger_tile_has_a_larger_share() -> None:
-    assert allotted(np.array([100, 100, 100]), np.array([1.0, 2.0, 3.0]), 60).tolist() == [10, 20, 30]
-    assert allotted(np.array([100, 100, 6]), np.array([1.0, 2.0, 3.0]), 60).tolist() == [18, 36, 6]
 
 
 def test_cells_take_their_strongest_in_turns() -> None:

@@ -98,17 +98,6 @@ def test_a_sigma_is_judged_beside_those_about_it() -> None:
     assert _usual(places[:1], sigma[:1]).tolist() == sigma[:1].tolist()
 
 
-@pytest.mark.slow
-def test_what_a_poor_tile_leaves_goes_to_the_others(tmp_path, monkeypatch) -> None:
-    data = quiet(10.0).copy()
-    data[:560, :560] = 900  # nothing is found in the first of four tiles
-    view = View("a", str(write_image(tmp_path / "a.tif", data, **BLOCKS)), (SIDE, SIDE), None, (0.0, 1.0))  # type: ignore[arg-type]
-    monkeypatch.setattr(features, "PER_IMAGE", 400)
-    found = features.detect([view], TieOptions(points_per_image=200, tile=256))[0]
-    assert not (found.xy < 511).all(axis=1).any()
-    assert 340 < len(found) <= 360  # three quarters of it, and a fifth more
-
-
 def test_a_share_lasts_when_the_cameras_move_a_little() -> None:
     share = Share.of((4000, 4000), TieOptions())
     assert share.within(0.9) == share.within(0.6) == share.within(1.0)

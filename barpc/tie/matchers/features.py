@@ -36,7 +36,6 @@ _PART = 0.1
 """Verified matches of a pair that make a closer look needless, as a part of the points wanted of an image, at least
 `THIN`: with 250 tracks in place of 3664 three real pairs meet check points alike, to 0.139, 0.154, 0.129 px."""
 _HELD = 4.0  # keypoints that images are to hold for each of these, or nothing is gained; the triplet has 2.1 to 2.5
-_SPARE = 1.2  # of a tile's share: what poor tiles leave goes to the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +130,7 @@ class Share:
 
     def most(self, box: Box) -> int:
         """Return the largest number of keypoints of a box."""
-        return int(np.ceil(_SPARE * self.density * box[2] * box[3]))
+        return int(self.density * box[2] * box[3] + 1e-6)
 
     @property
     def cell(self) -> int:
@@ -279,18 +278,6 @@ def _unpacked(arrays: dict[str, npt.NDArray[Any]], box: Box) -> Keypoints:
     return Keypoints(xy + np.array(box[:2]), scale, angle, response, described)
 
 
-def allotted(found: IntArray, area: Array, most: int) -> IntArray:
-    """Return the numbers of keypoints (T,) of tiles, `most` together: by area; poor tiles leave theirs to the rest."""
-    if found.sum() <= most:
-        return found
-    order = np.argsort(found / area, kind="stable")
-    poorer = np.cumsum(found[order]) - found[order]
-    level = (most - poorer) / np.cumsum(area[order][::-1])[::-1]  # if all from this tile on are cut alike
-    first = int(np.flatnonzero(level * area[order] <= found[order])[0])
-    kept: IntArray = np.minimum(found, np.floor(level[first] * area).astype(np.int64))
-    return kept
-
-
 def locate(
     views: Sequence[View],
     options: TieOptions,
@@ -321,13 +308,11 @@ def locate(
     ]
     names = [f"{name}{'-coarse' * coarse}" for name in names_of(work.executor, detect_tile, tasks)]
     keeping = [(work.store, name, task) for name, task in zip(names, tasks, strict=True)]
-    counts = np.array(work.ordered(keep_tile, keeping, "detect"), dtype=np.int64)
+    counts: list[int] = work.ordered(keep_tile, keeping, "detect")
     files, first = [], 0
-    for of_view, share in zip(boxes, shares, strict=True):
+    for of_view in boxes:
         part = slice(first, first := first + len(of_view))
-        areas = np.array([float(box[2] * box[3]) for box in of_view])
-        kept = allotted(counts[part], areas, int(share.density * areas.sum() + 1e-6))
-        files.append(KeypointFiles(work.store, tuple(of_view), tuple(names[part]), tuple(kept.tolist())))
+        files.append(KeypointFiles(work.store, tuple(of_view), tuple(names[part]), tuple(counts[part])))
     return files
 
 

@@ -44,11 +44,7 @@ _GIVEN = f"{__name__}:{GivenMatcher.__name__}"
 
 
 def verify_given(
-    views: Sequence[View],
-    given: GivenMatches,
-    pairs: Sequence[Pair],
-    options: TieOptions,
-    work: Work,
+    views: Sequence[View], given: GivenMatches, pairs: Sequence[Pair], options: TieOptions, work: Work
 ) -> list[tuple[Matches, PairReport]]:
     """Verify given matches of each pair against the cameras, with its report: `match_pair` with what is given."""
     chosen = replace(options, matcher=_GIVEN)

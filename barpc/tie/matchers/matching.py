@@ -66,11 +66,7 @@ _CLEAR = 0.4  # share of the matches that makes wider passes needless
 FALSE_SHARE = 0.01
 """Share of false matches that is accepted, as control bands estimate it."""
 _NEIGHBOURS = 12
-_LOOSE = (
-    0.95,
-    0.05,
-    2 / 3,
-)  # ratio and false share of the second attempt; its part of the matches that a pair needs
+_LOOSE = (0.95, 0.05, 2 / 3)  # ratio and false share of the second attempt; its part of the matches that a pair needs
 _QUICK = 500  # keypoints of a view that tell what a pair promises
 _MARGINS = 150.0, 50.0  # m beyond known altitudes: how wrong cameras make them, and seldom do
 _BESIDE = 100.0  # px beyond the other image at which terrain counts
@@ -219,13 +215,7 @@ def _attempt(
     """Return all passes over a pair with one matcher; what it `looked` at is known to the next attempt."""
     names, counts = (views[0].name, views[1].name), (len(keypoints[0]), len(keypoints[1]))
     report = PairReport(
-        names,
-        "ok",
-        counts,
-        angle=pair.angle,
-        overlap=pair.overlap,
-        matcher=options.matcher,
-        reason=pair.reason,
+        names, "ok", counts, angle=pair.angle, overlap=pair.overlap, matcher=options.matcher, reason=pair.reason
     )
     kind = matcher_named(options.matcher)
     if kind.detects and min(counts) < options.min_matches:
@@ -333,10 +323,7 @@ def match_pairs(
 
 
 def _match_within(
-    several: Sequence[tuple[View, View]],
-    keypoints: tuple[Keypoints, Keypoints],
-    pair: Pair,
-    options: TieOptions,
+    several: Sequence[tuple[View, View]], keypoints: tuple[Keypoints, Keypoints], pair: Pair, options: TieOptions
 ) -> tuple[Matches, PairReport]:
     """Match two views at some altitudes, and at fewer where that finds few: with less to confuse."""
     tried = [match_pair(several[0], keypoints, pair, options)]

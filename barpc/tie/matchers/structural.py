@@ -131,10 +131,7 @@ class _Search:
         while len(at) and step > 2 * self._least:
             step //= 2
             found = [
-                (
-                    group,
-                    *found_about(self._sampling(step, at[group]), at[group], xy[group]),
-                )
+                (group, *found_about(self._sampling(step, at[group]), at[group], xy[group]))
                 for group in grouped(*np.floor(at[:, ::-1] / (step * TILE)).T)
             ]
             group, place, ok = (np.concatenate(column) for column in zip(*[f[:3] for f in found], strict=True))

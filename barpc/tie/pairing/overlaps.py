@@ -188,10 +188,7 @@ def possible_pairs(views: Sequence[View], options: TieOptions, scope: Scope = EV
 
 
 def _candidates(
-    views: Sequence[View],
-    options: TieOptions,
-    wanted: set[tuple[int, int]],
-    area: Area | None,
+    views: Sequence[View], options: TieOptions, wanted: set[tuple[int, int]], area: Area | None
 ) -> list[Pair]:
     """Return the pairs that overlap, of those wanted (none: all); outlines grow where something is left out."""
     pairs = overlapping_pairs(views, options, area=area)

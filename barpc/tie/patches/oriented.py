@@ -117,8 +117,7 @@ class PatchTile:
         x, y = (self.half + self.reach).tolist()
         parts = [
             correlation(
-                cut(self.pictures[0], self.at[i], self.half, self.half),
-                cut(self.pictures[1], self.whole[i], x, y),
+                cut(self.pictures[0], self.at[i], self.half, self.half), cut(self.pictures[1], self.whole[i], x, y)
             )
             for i in self._batches()
         ]

@@ -29,7 +29,6 @@ MIN_CORRELATION = 0.8
 """Of two registered patches, or the match is left out."""
 PATCH = 21
 """Side of the patches that are registered [px], odd."""
-_CHUNK = 256  # patches worked on at a time: they stay in cache
 _SMALLER = 0.7  # side of the patch of the second try and of the check
 _TORN = 0.5  # px that the smaller patch may lie apart
 _FINE = 4  # samples a pixel and axis
@@ -212,7 +211,7 @@ def register_patches(
 
 
 def _chunks(rows: IntArray) -> list[IntArray]:
-    return [rows[first : first + _CHUNK] for first in range(0, len(rows), _CHUNK)]
+    return [rows[first : first + SPAN] for first in range(0, len(rows), SPAN)]
 
 
 def _at(mask: BoolArray, xy: Array) -> BoolArray:
@@ -282,12 +281,7 @@ class _Template:
         return centred / deviation, deviation
 
     def find(
-        self,
-        fine: FloatImage,
-        reference: IntArray,
-        start: Array,
-        linear: Array,
-        settled: float = SETTLED,
+        self, fine: FloatImage, reference: IntArray, start: Array, linear: Array, settled: float = SETTLED
     ) -> PatchRegistration:
         """Register the patches about `reference` (N, 2), begun at `start` with the distortion `linear`."""
         offset = self._row * self._width + self._col
@@ -311,12 +305,7 @@ class _Template:
         return PatchRegistration(xy, correlation, sigma, ok)
 
     def _iterate(
-        self,
-        fine: FloatImage,
-        solver: tuple[FloatImage, Array],
-        centre: Array,
-        linear: Array,
-        settled: float,
+        self, fine: FloatImage, solver: tuple[FloatImage, Array], centre: Array, linear: Array, settled: float
     ) -> tuple[Array, Array, Array]:
         """Return the centres after the iterations, the length of each one's last step [px], and the
         correlation there.
