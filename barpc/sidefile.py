@@ -230,7 +230,7 @@ LARGEST = 1e100
 """No number of a side file comes near, and its square is finite."""
 
 MAX_DEPTH = 100
-"""Levels of JSON, XML and HDF5."""
+"""Levels of JSON and XML."""
 _NO_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
 _STEPS = bytes.maketrans(b"[]{}", b"\x01\xff\x01\xff")  # one level down or up, as signed bytes
 

@@ -69,7 +69,7 @@ def rows() -> list[tuple[str, str]]:
         ("a COLMAP database", f"{many(foreign._STEPS)} times 100,000 instructions of SQLite"),
         (
             "an HDF5 file",
-            f"{many(sidefile.MAX_ELEMENTS)} objects, groups {sidefile.MAX_DEPTH} deep; an array "
+            f"{many(sidefile.MAX_ELEMENTS)} objects, groups {foreign._DEEPEST} deep; an array "
             f"{many(frozen.DEFLATED)} times its stored bytes",
         ),
         (

@@ -130,23 +130,18 @@ def _read_csv(path: Path, views: ViewNames) -> Iterator[_Point]:
             raise InputError(
                 f"{path}: column {word[:40]!r} is none that is read; accuracies are called {', '.join(_SIGMAS)}"
             )
-    count = len(table["lon"])
-
-    def stated(key: str, otherwise: Array) -> Array:
-        given = np.array(table.get(key, [np.nan] * count))
-        return np.where(np.isnan(given), otherwise, given)
-
-    every = stated("sigma", np.full(count, GROUND_SIGMA))
-    level, unknown = stated("sigma_xy", every), np.full(count, np.nan)
-    sigma = np.stack([stated("sigma_x", level), stated("sigma_y", level), stated("sigma_z", every)], axis=-1)
-    pixels = np.fmax.reduce([stated(key, unknown) for key in ("sigma_px", "sigma_col", "sigma_row")])
-    pixels = np.where(np.isnan(pixels), IMAGE_SIGMA, pixels)
-    names, images = (table.get(key, [""] * count) for key in _NAMES)
-    for i, (lon, lat, alt, col, row) in enumerate(zip(*(table[key] for key in COLUMNS), strict=True)):
-        view = views.find(images[i]) if "image" in table else 0
+    named = "image" in table
+    names, images = (table.pop(key, [""] * len(table["lon"])) for key in _NAMES)
+    for name, image, *cells in zip(names, images, *table.values(), strict=True):
+        of = {key: value for key, value in zip(table, cells, strict=True) if value is not None}
+        every = of.get("sigma", GROUND_SIGMA)
+        level = of.get("sigma_xy", every)
+        sigma = (of.get("sigma_x", level), of.get("sigma_y", level), of.get("sigma_z", every))
+        pixels = [of[key] for key in ("sigma_px", "sigma_col", "sigma_row") if key in of] or [IMAGE_SIGMA]
+        view = views.find(image) if named else 0
         if view is not None:
-            east, north, up = sigma[i].tolist()
-            yield _Point(names[i].strip(), (lon, lat, alt), (east, north, up), view, (col, row), float(pixels[i]))
+            place = (of["lon"], of["lat"], of["alt"])
+            yield _Point(name.strip(), place, sigma, view, (of["col"], of["row"]), max(pixels))
 
 
 def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Point]:
@@ -367,7 +362,7 @@ def read_altimetry(path: Path | str) -> Altimetry:
     path = Path(path)
     order = list(_HEIGHTS)
     _, table = read_table(path, _HEIGHTS, order[:3], unnamed=order, blank=order)
-    lon, lat, alt = (np.array(table[name]) for name in order[:3])
+    lon, lat, alt = (np.array(table[name], dtype=np.float64) for name in order[:3])
     known = (alt >= ALTITUDES[0]) & (alt <= ALTITUDES[1])
     if not known.any():
         raise InputError(f"{path}: holds no height")
@@ -378,7 +373,7 @@ def read_altimetry(path: Path | str) -> Altimetry:
         raise InputError(
             f"{path}: {lon:g}, {lat:g} is no longitude and latitude in degrees; map coordinates are not read"
         )
-    sigma, flat = (np.array(table.get(name, [np.nan] * len(known)))[known] for name in order[3:])
+    sigma, flat = (np.array(table.get(name, [None] * len(known)), dtype=np.float64)[known] for name in order[3:])
     sigma[np.isnan(sigma)], flat[np.isnan(flat)] = HEIGHT_SIGMA, GROUND_SIGMA
     try:
         return Altimetry(ground, sigma, flat)

@@ -29,7 +29,7 @@ from barpc.frozen import DEFLATED, HEADER, Arrays, load_npz
 from barpc.geodesy import Array
 from barpc.pointio.names import ViewNames
 from barpc.scene import IntArray
-from barpc.sidefile import MAX_DEPTH, MAX_ELEMENTS, NUMBER, TABLE, Kind, opened, read_bytes, read_head, read_text
+from barpc.sidefile import MAX_ELEMENTS, NUMBER, TABLE, Kind, opened, read_bytes, read_head, read_text
 
 PairPoints = tuple[int, int, Array, Array]
 """Two views, and points (M, 2), (M, 2) [px] of them that show the same ground."""
@@ -264,6 +264,7 @@ def _allowed(action: int, first: str | None, _second: str | None, _base: str | N
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
 _KEYPOINTS, _MATCHES = "keypoints", "matches0"
+_DEEPEST = 32  # groups in each other
 _FEATURES = ("features.h5", "keypoints.h5")
 
 
@@ -301,8 +302,8 @@ def _datasets(file: Any, h5py: Any) -> Iterator[tuple[str, Any]]:
         group, place, depth = waiting.pop()
         for name in group:
             count += 1
-            if count > MAX_ELEMENTS or depth > MAX_DEPTH:
-                raise ValueError(f"more than {MAX_ELEMENTS} objects, or groups nested more than {MAX_DEPTH} deep")
+            if count > MAX_ELEMENTS or depth > _DEEPEST:
+                raise ValueError(f"more than {MAX_ELEMENTS} objects, or groups nested more than {_DEEPEST} deep")
             if group.get(name, getlink=True).__class__ is not h5py.HardLink:
                 continue
             found = group[name]

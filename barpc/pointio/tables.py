@@ -38,7 +38,7 @@ def read_table(
     texts: Collection[str] = (),
     blank: Collection[str] = (),
 ) -> tuple[list[str], dict[str, list[Any]]]:
-    """Return the words of a table's first line, and its columns: numbers, NaN where a cell is blank, or texts.
+    """Return the words of a table's first line, and its columns: numbers, None where a cell is blank, or texts.
 
     Cells stand between tabs, semicolons (then with decimal commas), commas or blanks, whichever the first line has;
     ``#`` begins a comment. InputError for a line that lacks a number, or a first line without the columns needed.
@@ -84,9 +84,9 @@ def _cells(line: str, delimiter: str) -> list[str]:
     return [cell for cell in row if delimiter != " " or cell]
 
 
-def _number(cell: str, delimiter: str, blank: bool) -> float:
+def _number(cell: str, delimiter: str, blank: bool) -> float | None:
     if blank and not cell.strip():
-        return np.nan
+        return None
     return float(cell.replace(",", ".") if delimiter == ";" else cell)
 
 

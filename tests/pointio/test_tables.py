@@ -82,6 +82,13 @@ def test_accuracies_are_those_that_are_stated_the_nearest_word_first(tmp_path, c
     assert found.xy_sigma.tolist() == [pixels]
 
 
+@pytest.mark.parametrize("column", ["sigma", "sigma_z", "sigma_px"])
+@pytest.mark.parametrize("stated", ["nan", "inf", "0", "-1"])
+def test_an_accuracy_that_is_none_is_not_taken_for_a_blank(tmp_path, column, stated) -> None:
+    with pytest.raises(InputError, match="sigmas positive"):
+        gcps(tmp_path, f"image,lon,lat,alt,col,row,{column}\nleft,5,43,100,1,2,{stated}\n")
+
+
 def test_of_one_image_a_table_need_not_name_it_of_two_it_must(tmp_path) -> None:
     text = "lon,lat,alt,col,row\n5,43,100,1,2\n6,43,100,3,4\n"
     found = gcps(tmp_path, text, ["left"])
