@@ -164,10 +164,9 @@ def test_the_page_of_many_images_is_bounded_and_says_what_it_leaves_out(block_ru
     html = page.report_html(files.summary, "")
     views = len(files.summary.views)
     assert 1e6 < len(html.encode()) < 3e6
-    assert f"And {views - 200} more; all are in summary.json." in html
+    assert (f"And {views - 400} more; all are in summary.json." in html) == (num == 1000)
     assert html.count('class="outline doubtful"') == (views if num == 300 else views // 3)
-    assert ("At most 400 of 1008 outlines are drawn, good ones evenly taken" in html) == (num == 1000)
-    assert ('id="matrix-chart-t"' in html) == (num == 300)
+    assert ("At most 400 of 1008 outlines are drawn" in html) == (num == 1000)
 
 
 def test_a_run_without_a_single_tie_point_still_has_a_page(block_run, tmp_path):

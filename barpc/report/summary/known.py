@@ -40,9 +40,7 @@ class GcpEntry(KnownPoint):
     TERMINAL: ClassVar = "GCP status residual_enu_m residual_px w"
 
     sigma_m: tuple[float, float, float] = said("Stated", "m", "sigma east, north, up", ".2g")
-    residual_enu_m: Vector = said(
-        "What all the others say of it minus its given place", "m", ("east", "north", "up"), "+.3f"
-    )
+    residual_enu_m: Vector = said("Place by the others minus given", "m", ("east", "north", "up"), "+.3f")
     used: bool = said("Whether it holds the block", default=True)
     status: Literal["used", "contradicts", "rejected", "undecided", "not seen"] = said(
         "contradicts: used, off by more than 4 sigma; rejected: the others agree without it; undecided: weighs as much",

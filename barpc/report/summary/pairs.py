@@ -64,15 +64,11 @@ class PairEntry(Record):
     epipolar_before: OffsetEntry | None = said("Through the delivered cameras")
     epipolar_after: OffsetEntry | None = said("Through the new cameras")
     matching: Mapping[str, Any] | None = said("What became of it in matching; null: not matched")
-    tied_by: str | None = said(
-        "Matcher that tied it, and whether loosened; null as there", head="tied by", default=None
-    )
-    decoy_share: Number = said(
-        "Share that bands without true matches say is false", head="false", form=".1%", default=None
-    )
+    tied_by: str | None = said("Matcher that tied it, whether loosened", head="tied by", default=None)
+    decoy_share: Number = said("Share false, by bands without true matches", head="false", form=".1%", default=None)
     noise_px: Number = said("Robust spread of its matches across epipolar lines", "px", "noise", ".2f", default=None)
     beaten: tuple[str, ...] = said("Attempts that found fewer: matcher, matches of those wanted", default=())
-    chosen_by: str | None = said("Why it was tried", default=None)
+    chosen_by: str | None = said("Why it was tried: overlap and angle, same date, listed, ...", default=None)
 
     @property
     def offset_rms(self) -> tuple[float | None, float | None]:

@@ -52,9 +52,7 @@ class CorrectionEntry(Record):
     range_m: Number = said("Radar: added to the range", "m", "range", "+.3f", default=None)
     azimuth_ms: Number = said("Radar: added to the azimuth time", "ms", "azimuth", "+.4f", default=None)
     timing_sigma: Pixel | None = said("Their posterior standard deviations, m and ms", default=None)
-    timing_slopes: tuple[Pixel, ...] | None = said(
-        "Radar: added at the end of the flight, m and ms, by power", default=None
-    )
+    timing_slopes: tuple[Pixel, ...] | None = said("Radar: added at the end, m and ms, by power", default=None)
     jitter_px: Number = said("RMS of the spline over the rows", "px", "jitter", ".2f", default=None)
     jitter_rows: Number = said("Rows between its knots", "px", default=None)
     detector_px: Number = said("RMS of the steps between detectors", "px", "detectors", ".2f", default=None)
@@ -159,19 +157,15 @@ class ViewEntry(Record):
     camera_center: CenterEntry | None = said("Centre about which the camera was turned")
     fit: FitEntry | None = said("Certificate of the refitted RPC; null where none was fitted")
     outputs: Mapping[str, Mapping[str, float | str | None]] = said(
-        "File -> consumer that reopened it -> difference to P_BA in px, or why it does not read it",
+        "File -> consumer -> difference to P_BA in px, or why none",
         propertyNames={"pattern": "^[^/]+$"},
     )
     status: Literal["adjusted", "consistent", "tied", "weak", "doubtful", "failed"] = said("Verdict on the image")
     advice: str = said("What to do; empty when all is well")
     cause: str | None = said("Why, by its name; null when all is well", default=None, enum=[*CAUSES, None])
     num_moving: Count = said("Observations of tie points that move together, and took no part", default=0)
-    held_out_px: Number = said(
-        "RMS of tie points that took no part, by their median", "px", "not used", ".3f", default=None
-    )
-    stated_ce90_m: Number = said(
-        "CE90 of the delivered camera by its metadata", "m", "CE90 stated", ".1f", default=None
-    )
+    held_out_px: Number = said("RMS of tie points that took no part", "px", "not used", ".3f", default=None)
+    stated_ce90_m: Number = said("CE90 of the delivered camera", "m", "CE90 stated", ".1f", default=None)
     smooth_p: Number = said("Chance that noise leaves smooth_px (F test)", "", "F test p", ".0e", default=None)
     shared_px: Number = said("Error shared with the neighbour in row or column", "px", "shared", ".3f", default=None)
     control_w: Number = said("Largest w of its control (Baarda)", "", "w", ".1f", default=None)

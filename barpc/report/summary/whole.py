@@ -208,11 +208,11 @@ class SceneEntry(Record):
     jitter_asked: AskedEntry | None = said("What was left without splines and steps, where these follow", default=None)
     in_space_px: Number = said("What a rotation and translation left where an affine was taken", "px", default=None)
     explanations: tuple[ExplanationEntry, ...] = said(
-        "What explains tie points beside the cameras' errors as stated, the first taken first", default=()
+        "What explains tie points beside the cameras, the first first", default=()
     )
     left: tuple[LeftEntry, ...] = said("Rows and columns that stand out at the end", default=())
     held_out_places: tuple[HeldOutEntry, ...] | None = said(
-        "Where tie points that took no part are met worse than in the rest of an image; null: not tested", default=None
+        "Where tie points that took no part are met worse; null: not tested", default=None
     )
 
 
