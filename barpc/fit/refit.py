@@ -26,7 +26,6 @@ from barpc.sensor.splined import Splined
 Seen = Callable[[RPC, FitSolution], tuple[Errors, Array]]
 """What a localisation RPC is off by on points that it has not seen [m, px], and the largest (2,)."""
 
-_LOOPS = 4096  # round trips that a table of points is tried on, about
 _ABOUT = 1.1  # times the error
 _MISSING = 0.1  # part of the image without a ground point, at most
 _CELLS = 72  # of ``gauss-newton``, along each side of the image
@@ -188,7 +187,7 @@ def fit_rpc_points(
         errors = Errors()
         for residual in left:
             errors.add(residual)
-        loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // _LOOPS)])
+        loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // CHUNK)])
         return _certified(solution, errors, errors.largest, loop, size)
 
     fit = _best(attempt, options, vendor, strict, exact=False)
