@@ -165,7 +165,9 @@ class FitSolution:
 
         r / (1 - leverage), the leverage from the final system: exact for a linear problem.
         """
-        problem, inverses = self.problem, self._inverses()
+        problem = self.problem
+        # from the rows of (M | y) to the unknowns' standard deviations (k, n)
+        inverses = [np.asarray(np.linalg.pinv(system.matrix)) for system in self.solved]
         free = [len(inverse) > len(problem.active) for inverse in inverses]
         rows = [problem.rows(axis, self.coeffs[2 * axis + 1], free[axis]) for axis in range(2)]
         for both in zip(*rows, strict=True):
@@ -179,12 +181,6 @@ class FitSolution:
                 if problem.weight is not None:
                     residual[:, axis] /= problem.weight[part]
             yield residual
-
-    def _inverses(self) -> list[Array]:
-        """Return, for col and row, the matrices (k, n) from the rows of (M | y) to the unknowns' standard
-        deviations.
-        """
-        return [np.asarray(np.linalg.pinv(system.matrix)) for system in self.solved]
 
 
 def region_of(problem: FitProblem) -> Region:

@@ -26,7 +26,6 @@ from barpc.sensor.splined import Splined
 Seen = Callable[[RPC, FitSolution], tuple[Errors, Array]]
 """What a localisation RPC is off by on points that it has not seen [m, px], and the largest (2,)."""
 
-_LOOPS = 4096  # round trips that a table of points is tried on, about
 _ABOUT = 1.1  # times the error
 _MISSING = 0.1  # part of the image without a ground point, at most
 _CELLS = 72  # of ``gauss-newton``, along each side of the image
@@ -44,8 +43,7 @@ def fit_rpc(
 
     Parameters
     ----------
-    model : SensorModel
-        Any camera: an RPC behind a correction, a pushbroom or radar model.
+    model : SensorModel, any camera: an RPC behind a correction, a pushbroom or radar model
     size : (width, height), image that the RPC is for [px]
     alt_range : (low, high), altitudes [m above the ellipsoid]; at least 100 m are taken around a flat scene
     options : FitOptions, optional, grid, solver, tolerance
@@ -61,16 +59,14 @@ def fit_rpc(
 
     Warns
     -----
-    BarpcWarning
-        Part of the image has no ground point.
+    BarpcWarning : part of the image has no ground point
     """
     options, alt_range, vendor = options or FitOptions(), widened(alt_range), underlying_rpc(model)
     sample = _sampled(model, size, alt_range)
-    screened(
-        sample.ground, sample.points[:, :2], options.allow_mirrored or vendor is not None or is_radar(innermost(model))
-    )
+    mirrored = options.allow_mirrored or vendor is not None or is_radar(innermost(model))
+    screened(sample.ground, sample.points[:, :2], mirrored)
     contradiction = sample.contradiction()
-    given = partial(_given, model, size, alt_range, options)
+    given, seen = partial(_given, model, size, alt_range, options), partial(_missed, sample)
 
     def attempt(method: str, source: SensorModel = model) -> RpcFit:
         solution = solve(*_given(source, size, alt_range, options, method), options, method, vendor=vendor)
@@ -85,9 +81,7 @@ def fit_rpc(
         if not float(fit.max_ckp.max()) <= options.tolerance:
             fit = replace(fit, reason=reason(fit.rpc, sample))
         _accepted(fit, options, strict and not isinstance(model, Splined))
-        return _localised(
-            fit, lambda rpc, method: inverse(rpc, *given(method)), partial(_missed, sample), options, strict, exact=True
-        )
+        return _localised(fit, lambda rpc, method: inverse(rpc, *given(method)), seen, options, strict, exact=True)
     except FitError as error:
         advice = getattr(model, "advice", "")  # of a model that knows why
         raise FitError("; ".join(filter(None, (str(error), advice)))) from error
@@ -162,13 +156,11 @@ def fit_rpc_points(
     check : (ground, image), optional
         Check points (M, 3) and (M, 2). Without them the certificate holds leave-one-out residuals.
     size : (width, height), optional
-        Image whose coverage is stated [px]; the points' own extent if not given.
-    vendor : RPC, optional
-        Whose denominators may be kept.
+        Image whose coverage is stated [px]; else the points' own extent.
+    vendor : RPC, optional, whose denominators may be kept
     options : FitOptions, optional
         Solver, tolerance. Points that are noisy want a ``tolerance`` of three or four times their noise.
-    strict : bool
-        As for `fit_rpc`.
+    strict : bool, as for `fit_rpc`
 
     Raises
     ------
@@ -188,7 +180,7 @@ def fit_rpc_points(
         errors = Errors()
         for residual in left:
             errors.add(residual)
-        loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // _LOOPS)])
+        loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // CHUNK)])
         return _certified(solution, errors, errors.largest, loop, size)
 
     fit = _best(attempt, options, vendor, strict, exact=False)

@@ -21,7 +21,8 @@ from barpc.frozen import Frozen
 from barpc.geodesy import Array, pointwise
 
 _STEPS = 60  # of a fixed point: a correction gains two or three digits a step, wild ones need more
-_SETTLED = 1e-7  # px: what is left is a hundredth of it
+STANDS = 1e-7
+"""Of image points that are iterated [px]: what is left after so small a step is a hundredth of it."""
 
 
 @runtime_checkable
@@ -126,9 +127,9 @@ def fixed_point(follow: Callable[[Array], Array], image: Array) -> Array:
     for _ in range(_STEPS):
         before, image = image, follow(image)
         change = np.abs(image - before)
-        if not (change.max(initial=0.0, where=np.isfinite(change)) > _SETTLED):
+        if not (change.max(initial=0.0, where=np.isfinite(change)) > STANDS):
             break
     return image
 
 
-__all__ = ["Behind", "Displaced", "Displacement", "Pointwise", "SensorModel", "fixed_point"]
+__all__ = ["STANDS", "Behind", "Displaced", "Displacement", "Pointwise", "SensorModel", "fixed_point"]

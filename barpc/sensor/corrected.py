@@ -25,13 +25,12 @@ from barpc.geodesy import (
     ground_from_ecef,
     ground_from_ecef_jacobian,
 )
-from barpc.sensor import Behind, Displaced, SensorModel, fixed_point
+from barpc.sensor import STANDS, Behind, Displaced, SensorModel, fixed_point
 from barpc.sensor.curve import Turn, cross, rotation_left_jacobian, rotation_matrix
 
 IntArray = npt.NDArray[np.int64]
 
 _DIGITS = 1e-8  # of derivatives: the solver's steps ask for no more
-_TOLERANCE = 1e-7  # px: a localised point must project this near to where it was asked (plus rounding)
 
 
 class RigidMotion:
@@ -245,7 +244,7 @@ class Corrected(Behind):
                 det = a * d - b * c
                 ground[..., 0] += (d * residual[..., 0] - b * residual[..., 1]) / det
                 ground[..., 1] += (a * residual[..., 1] - c * residual[..., 0]) / det
-            ground[~(miss <= _TOLERANCE + rounding)] = np.nan
+            ground[~(miss <= STANDS + rounding)] = np.nan
         return ground
 
 

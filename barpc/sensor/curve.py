@@ -12,7 +12,7 @@ from numpy.polynomial import chebyshev
 
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
-from barpc.geodesy import Array
+from barpc.geodesy import NEWTON_STEPS, Array
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -24,9 +24,7 @@ MIN_DEGREE, MAX_DEGREE = 5, 11
 
 _TOLERANCE = 1.0  # m: state vectors that scatter more are not one orbit
 _UNSEEN = 1e-4  # m/s: at 900 km 1.6 us, the rounding of times and a thousandth of a line
-_FLOOR = 2e-5  # m: a residual across the track that no pixel sees
 _DIGITS = np.array([1e-5, 1e-5, 1e-6])  # m, m, m/s: no standard deviation is smaller
-_ROUNDS = 5  # of estimating them: they settle in three
 _GAIN = 1.5  # a higher degree must lower the residual across the track by this factor
 
 
@@ -203,7 +201,7 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
         )
     degrees = range(min(MIN_DEGREE, len(time)), min(MAX_DEGREE, len(time)) + 1)
     fits = [_fit_orbit(time, position, velocity, degree) for degree in degrees]
-    limit = _GAIN * max(_FLOOR, min(float(fit.sigma[1]) for fit in fits))
+    limit = _GAIN * min(float(fit.sigma[1]) for fit in fits)
     orbit = next(fit for fit in fits if fit.sigma[1] <= limit)
     if not orbit.sigma[:2].max() <= _TOLERANCE:
         raise RpcError(f"orbit: the state vectors scatter by {orbit.sigma.max():.3g} m about any smooth orbit")
@@ -229,7 +227,7 @@ def _fit_orbit(time: Array, position: Array, velocity: Array, degree: int) -> Or
     share = 1.0 - 0.5 * (degree + 1) / len(time)  # of the observations that the unknowns leave over
     count = len(time) * np.array([1.0, 2.0, 3.0]) * share
     sigma = np.ones(3)
-    for _ in range(_ROUNDS):
+    for _ in range(NEWTON_STEPS):
         matrix = np.concatenate([a / s for (a, _), s in zip(groups, sigma, strict=True)])
         target = np.concatenate([y / s for (_, y), s in zip(groups, sigma, strict=True)])
         scale = np.linalg.norm(matrix, axis=0)

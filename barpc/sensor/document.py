@@ -41,12 +41,12 @@ def parse_time(text: str, name: str) -> np.datetime64:
 
 
 def warn_off_grid(name: str, off: Array) -> None:
-    """Warn where a product's geolocation grid misses its orbit: `off` (N, 2), columns and rows [px]."""
+    """Warn where a product's geolocation grid misses its orbit: `off` (N, 2), samples and lines [px]."""
     worst = np.abs(off).max(axis=0)
     if not (worst <= GRID_TOLERANCE).all():
         warnings.warn(
-            f"{name}: the geolocation grid does not belong to the orbit (off by {worst[0]:.1f} columns, "
-            f"{worst[1]:.1f} rows); the model follows the orbit",
+            f"{name}: the geolocation grid does not belong to the orbit (off by {worst[0]:.1f} samples, "
+            f"{worst[1]:.1f} lines); the model follows the orbit",
             BarpcWarning,
             stacklevel=4,
         )
