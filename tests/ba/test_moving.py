@@ -141,6 +141,12 @@ def test_a_group_is_proposed_where_its_ties_lie() -> None:
     assert 0.9 < group.share.max() < 1.0
 
 
+def test_where_no_track_takes_part_no_group_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("barpc.ba.judging.moving.proposal", lambda *_: None)
+    seen: Any = SimpleNamespace(linear=SimpleNamespace(view=np.zeros(3, dtype=int)), ground=0, base=0, extra=0, sigma=0)
+    assert explanations.group(seen, Interval(0, 0, 0.0, 1.0, 9.0, 0.5, 0.0, True)) == []
+
+
 def test_the_place_of_a_group_is_said_and_no_view_is_left_alone() -> None:
     made, tracks, moves = drifting(3, 300, 0.1, 1.0)
     block = join(made.views, tracks, None, AdjustOptions())
