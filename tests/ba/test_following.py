@@ -16,6 +16,7 @@ from barpc.ba.evidence.detectors import _Columns, find_edges
 from barpc.ba.held.block import join
 from barpc.ba.held.starting import make_problem
 from barpc.ba.judging import following
+from barpc.ba.judging.explanations import FADE, STRIP, SWING
 from barpc.ba.judging.following import _given_edges, _spline_counts, _with_edges, follow
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
@@ -151,6 +152,41 @@ def test_what_is_asked_for_is_taken_once(monkeypatch) -> None:
     assert followed(monkeypatch, "01", "", detectors=(9.0,)) == ("1", ["13", "23", "43"])
     assert followed(monkeypatch, "0", "1", jitter="off") == ("0", [])
     assert followed(monkeypatch, "0", "1", jitter="off", detectors=(9.0,)) == ("1", ["0"])
+
+
+@dataclass
+class Ended:
+    """A solution by its name, and how well held-out tracks are met."""
+
+    name: str
+    after: int
+    findings: tuple[Any, ...] = ()
+    outcome: Any = None
+
+
+@pytest.mark.parametrize(
+    ("parts", "plain", "kept"),
+    [
+        ({0: STRIP, 1: STRIP}, 1, "tried"),  # one image stands still: it is seen against that
+        ({0: STRIP, 1: STRIP, 2: FADE}, 1, "found"),  # all do: what follows images as a whole, where it is better
+        ({0: STRIP, 1: STRIP, 2: FADE}, 3, "tried"),
+        ({0: SWING, 1: SWING}, 1, "found"),
+        ({0: SWING}, 1, "tried"),
+    ],
+)
+def test_strips_of_all_images_compete_with_what_follows_them_as_a_whole(monkeypatch, parts, plain, kept) -> None:
+    """Of three images; the fewer, the better are held-out tracks met: 9 without strips, 2 with them."""
+    findings = tuple(SimpleNamespace(kind=kind, view=v, where=(1,), moved=None) for v, kind in parts.items())
+    found, whole = Ended("found", 9), Ended("whole", plain)
+    monkeypatch.setattr(following, "_waves_of", lambda *_: (None, None))
+    monkeypatch.setattr(following, "_judged", lambda found, *_: found)
+    monkeypatch.setattr(following, "_with_waves", lambda *_, **__: Ended("tried", 2))
+    monkeypatch.setattr(following, "follow", lambda *_: whole)
+    monkeypatch.setattr(following, "standing_out", lambda *_: [])
+    monkeypatch.setattr(following, "is_better", lambda one, other, outer: one < other)
+    judged: Any = SimpleNamespace(findings=findings)
+    ended = following.without_strips(found, judged, views_of(300, 300, 300), None, AdjustOptions())  # type: ignore[arg-type]
+    assert ended.name == kept
 
 
 def steps(monkeypatch, counts: list[int], tells: list[bool], given: int = 0) -> tuple[list[int], list[float]]:

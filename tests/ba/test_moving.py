@@ -12,11 +12,13 @@ import pytest
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.evidence.linearised import linearise
 from barpc.ba.evidence.mixture import Group, fit
+from barpc.ba.evidence.scan import Interval
 from barpc.ba.held.block import Block as Joined
 from barpc.ba.held.block import join
 from barpc.ba.held.starting import first_state, make_problem
+from barpc.ba.judging import explanations
 from barpc.ba.judging.explanations import MOVING, STRIP
-from barpc.ba.judging.moving import CELLS, Ground, group_of, proposal
+from barpc.ba.judging.moving import CELLS, Ground, group_of
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.ba.standing import Parts
@@ -124,12 +126,25 @@ def test_a_group_is_proposed_where_its_ties_lie() -> None:
     block, problem, state = started(made, tracks)
     linear = linearise(problem, state, block.use, block.sigma, 800.0)
     nothing = np.zeros((2, 0, len(block.view)))
-    group = proposal(linear, Ground.of(problem, state), fit(linear), nothing, np.zeros(0))
+    ground = Ground.of(problem, state)
+    seen: Any = SimpleNamespace(linear=linear, ground=ground, base=fit(linear), extra=nothing, sigma=np.zeros(0))
+    (one,) = explanations.group(seen, Interval(0, 0, 0.0, 1.0, 9.0, 0.5, 0.0, True))
+    group = one.group
     assert group is not None
+    assert (one.kind, one.view, one.extra.shape[1], len(one.sigma)) == (MOVING, -1, 0, 0)  # no unknowns of a camera
+    tracks_of = {(cell, point) for cell, point in zip(group.cell.tolist(), block.point.tolist(), strict=True)}
+    counts = np.unique([cell for cell, _ in tracks_of], return_counts=True)[1]
+    assert one.price == pytest.approx(0.5 * np.log(counts).sum(), rel=0.05)  # but for tracks that take no part
     assert group.sigma.tolist() == [30.0] * 4  # of two moves in each view but the first
     assert ((group.share > 0.5) == moves[block.order]).mean() > 0.95
     assert 0.0 < group.share.min() < 0.1
     assert 0.9 < group.share.max() < 1.0
+
+
+def test_where_no_track_takes_part_no_group_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("barpc.ba.judging.moving.proposal", lambda *_: None)
+    seen: Any = SimpleNamespace(linear=SimpleNamespace(view=np.zeros(3, dtype=int)), ground=0, base=0, extra=0, sigma=0)
+    assert explanations.group(seen, Interval(0, 0, 0.0, 1.0, 9.0, 0.5, 0.0, True)) == []
 
 
 def test_the_place_of_a_group_is_said_and_no_view_is_left_alone() -> None:
@@ -154,6 +169,21 @@ def test_the_place_of_a_group_is_said_and_no_view_is_left_alone() -> None:
     assert not lost.is_tied()
     alone = replace(parts, group=np.isin(block.point, block.point[block.view == 0]) & (block.view > 0))
     assert not alone.is_tied()
+
+
+def test_groups_that_move_are_taken_out_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, tracks, _ = drifting(3, 60, 0.1, 1.0)
+    block = join(made.views, tracks, None, AdjustOptions())
+    parts = Parts(block, block.point % 5 == 0, np.zeros(len(block.view), dtype=np.int64))
+    found: Any = SimpleNamespace(problem=None, final=SimpleNamespace(params=None))
+    for number, share in ((1, 3), (2, 2)):
+        inner, outer = parts.inner.point % share == 0, parts.outer.point % share == 0
+        monkeypatch.setattr("barpc.ba.standing.members", lambda *_, outer=outer: outer)
+        gone = (parts.group == 0) & (block.point % share == 0)
+        one: Any = SimpleNamespace(member=inner)
+        less = parts.less(found, one)
+        np.testing.assert_array_equal(less.group, np.where(gone, number, parts.group))
+        parts = less
 
 
 def test_rows_of_which_more_ties_move_than_stand_are_told() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.held.ground import Heights
-from barpc.ba.held.terrain import NUM_BENDS, Believed, Relief, believe, bends
+from barpc.ba.held.terrain import NUM_BENDS, Bands, Believed, Relief, believe, bends
 from barpc.dem import Dem
 from benchmarks.worlds import judge
 from benchmarks.worlds_families import make
@@ -250,3 +250,21 @@ def test_a_small_block_is_held_by_the_terrain_and_points_by_their_rays() -> None
     assert 1.0 < found.gauge.sigma[0] < 4.0
     assert found.datum["heights"][0] > 0.5
     assert found.inlier[found.view >= 0].mean() > 0.8
+
+
+def test_a_slope_is_all_in_the_coarsest_band() -> None:
+    """A plane, 40 m higher a kilometre east and 20 m lower a kilometre north: smoothed it is what it was."""
+    rng = np.random.default_rng(4)
+    ground = np.column_stack([5.4 + rng.uniform(-0.02, 0.02, 300), 43.3 + rng.uniform(-0.02, 0.02, 300), np.zeros(300)])
+
+    def plane(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+        east, north = 111.32 * np.cos(np.radians(43.3)) * (lon - 5.4), 111.1 * (lat - 43.3)
+        return 40.0 * east - 20.0 * north
+
+    ground[:, 2] = plane(*ground[:, :2].T)
+    heights, slopes = Bands.of(plane, ground).at(ground)
+    np.testing.assert_allclose(heights.sum(axis=0), ground[:, 2], atol=1e-6)
+    middle = np.abs(ground[:, :2] - [5.4, 43.3]).max(axis=1) < 0.01
+    np.testing.assert_allclose(heights[-1, middle], ground[middle, 2], atol=5.0)
+    assert np.abs(heights[:-1, middle]).max() < 2.0
+    np.testing.assert_allclose(slopes.sum(axis=0)[middle], np.tile([0.04, -0.02], (middle.sum(), 1)), atol=2e-3)

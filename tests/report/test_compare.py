@@ -60,7 +60,9 @@ def test_runs_without_files_are_compared_by_their_errors(block_run, check_run):
 
 
 def test_runs_of_other_images_are_refused(block_run, antimeridian_run):
-    with pytest.raises(InputError, match="no image in common"):
+    first, second = (run.views[0].name for run in (block_run, antimeridian_run))
+    said = rf"no image in common \({first} and others there, {second} here\)"
+    with pytest.raises(InputError, match=said):
         compare_runs(block_run.folder, antimeridian_run.folder)
 
 

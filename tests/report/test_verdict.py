@@ -21,6 +21,8 @@ from barpc.report.summary.words import metres
 from barpc.simulate import simulate_block
 from tests.report.conftest import summarize
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*held in height")
+
 
 def test_a_block_that_came_out_well_needs_no_advice(block_run):
     summary = block_run.summary
@@ -52,7 +54,6 @@ def test_a_view_with_few_tie_points_is_weakly_tied():
     assert any(line.startswith(f"{view['name']}: weakly tied: only") for line in summary["verdict"])
 
 
-@pytest.mark.filterwarnings("ignore:.*held in height")
 def test_a_view_without_tie_points_to_the_others_is_not_adjusted():
     made = simulate_block(4, 200, seed=5, attitude=3e-6)
     tracks = made.tracks.select(made.tracks.view != 3)
