@@ -366,7 +366,7 @@ def waved(n: int = 3) -> Variances:
 
 
 def test_splines_and_steps_are_as_large_as_each_view_shows_and_all_do() -> None:
-    """Band by band; that of all views counts as four observations beside a view's own, 0.01 px as one beside all."""
+    """Band by band; that of all views counts as four observations beside a view's own, 0.02 px as one beside all."""
     v, rng = waved(), np.random.default_rng(0)
     first, bands = v.unknowns.in_waves.start, v.unknowns.waves.bands
     sigma, shape = v.given.sigma.copy(), v.given.sigma.shape
@@ -379,7 +379,7 @@ def test_splines_and_steps_are_as_large_as_each_view_shows_and_all_do() -> None:
         rows = first + np.flatnonzero(bands == band)
         squares = [sum(params[view, k] ** 2 for k in rows) for view in (0, 1)]
         freedom = [sum(known[view, k] for k in rows) for view in (0, 1)]
-        common = (0.01**2 + sum(squares)) / (1 + sum(freedom))
+        common = (0.02**2 + sum(squares)) / (1 + sum(freedom))
         for view in (0, 1):
             expected = np.sqrt((4 * common + squares[view]) / (4 + freedom[view]))
             np.testing.assert_allclose(found[view, rows], expected)

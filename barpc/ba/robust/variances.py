@@ -22,7 +22,7 @@ from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum
-from barpc.ba.usual import CHANCE, GROSS, ITERATIONS, LEVEL, SMALL, STANDS, STATED, SURE, TIMES
+from barpc.ba.usual import CHANCE, FLOOR, GROSS, ITERATIONS, LEVEL, SMALL, STANDS, STATED, SURE, TIMES
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, View
@@ -32,7 +32,6 @@ _LOG = logging.getLogger(__name__)
 _LIKELIER = -np.log(LEVEL)  # but one odd view is named where all being worse than stated is as improbable beside it
 _MOVING = 0.01  # of a rotation, as drift: the centre it turns about flies some km while an image is taken
 SAME_PRIOR = 0.2  # change of a standard deviation, as a logarithm, below which a block is not solved again
-LEAST_WAVES = 0.01  # px: of splines and steps, counting as one observation
 _LEAST = 0.5  # degrees of freedom below which nothing is said
 
 
@@ -199,7 +198,7 @@ class Variances:
             rows = first + np.flatnonzero(bands == band)
             learnt = np.isfinite(sigma[:, rows[0]])  # those of an earlier block are in its matrix
             squares, freedom = (learnt * part.sum(axis=1) for part in (params[:, rows] ** 2, known[:, rows]))
-            common = (LEAST_WAVES**2 + squares.sum()) / (1.0 + freedom.sum())
+            common = (FLOOR**2 + squares.sum()) / (1.0 + freedom.sum())
             size = np.sqrt((STATED * common + squares) / (STATED + freedom))
             out[:, rows] = np.where(learnt, size, np.inf)[:, None]
         return out
