@@ -80,12 +80,19 @@ class Tile:
         middle = nodes[len(nodes) // 2]
 
         def near(lonlat: Array) -> Array:
-            return np.stack([wrap_longitude(lonlat[:, 0], middle[0]), lonlat[:, 1]]) - middle[:, None]
+            off: Array = np.stack([wrap_longitude(lonlat[:, 0], middle[0]), lonlat[:, 1]]) - middle[:, None]
+            return off
 
         spread = np.abs(near(nodes)).max(axis=1, keepdims=True)
+        x, y = near(nodes) / spread
         goal = np.stack(np.meshgrid(*(np.linspace(0, count, NODES) for count in self.size)), axis=-1).reshape(-1, 2)
-        cubics = np.linalg.lstsq(polyvander2d(*near(nodes) / spread, [3, 3]), goal, rcond=None)[0].reshape(4, 4, 2)
-        return lambda lonlat: np.asarray(polyval2d(*near(lonlat) / spread, cubics)).T
+        cubics = np.linalg.lstsq(polyvander2d(x, y, [3, 3]), goal, rcond=None)[0].reshape(4, 4, 2)
+
+        def places(lonlat: Array) -> Array:
+            x, y = near(lonlat) / spread
+            return np.asarray(polyval2d(x, y, cubics)).T
+
+        return places
 
 
 def surface_tile(pairs: Sequence[tuple[View, View]], tile: Tile, band: int) -> tuple[F32, ...]:

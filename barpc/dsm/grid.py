@@ -216,7 +216,7 @@ def _common(first: View, second: View, crs: CRS) -> Any:
     parts = []
     for alt in common_range(first, second):
         prints = Footprints((first, second), alt)
-        common = shapely.intersection(*prints.outlines)
+        common = shapely.intersection(prints.outlines[0], prints.outlines[1])
         ground = prints.ground(shapely.get_coordinates(common))
         x, y = warped(CRS.from_epsg(4326), crs, *ground[:, :2].T)
         parts.append(shapely.set_coordinates(common, np.column_stack([x, y])))

@@ -73,8 +73,8 @@ def make_dsm(
     options, out = options or DsmOptions(), Path(out)
     plain_path(out.absolute())
     folder = Path(source) if isinstance(source, str | Path) else None
-    if folder is not None:
-        block = block_of_run(folder, options.alt, None if options.minus is None else Path(options.minus))
+    if isinstance(source, str | Path):
+        block = block_of_run(Path(source), options.alt, None if options.minus is None else Path(options.minus))
     elif options.minus is not None:
         raise InputError("minus: what two dates share is known of a run alone, not of images")
     else:
@@ -137,6 +137,6 @@ def _told(out: Path, grid: Grid, cells: Path, known: int, share: float) -> Surfa
     with open_raster(cells) as file, warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         some = file.read([3, 4, 5], out_shape=(3, *(min(side, 2 * SIDE) for side in file.shape)))
-        medians = [float(one) for one in np.nanmedian(some, axis=(1, 2))]
+        nmad, sigma, cameras = map(float, np.nanmedian(some, axis=(1, 2)))
         datum = float(file.tags().get(SHARED, "nan"))
-    return Surface(str(out), pairs, grid.whole.step, grid.whole.size, known, share, *medians, datum)
+    return Surface(str(out), pairs, grid.whole.step, grid.whole.size, known, share, nmad, sigma, cameras, datum)

@@ -155,8 +155,8 @@ def test_a_search_in_parts_finds_what_a_search_in_one_finds(monkeypatch, scene) 
         return found
 
     monkeypatch.setattr(PatchTile, "surfaces", watched)
-    monkeypatch.setattr(structural, "_SURFACE", 60_000)
-    monkeypatch.setattr(oriented, "_AREA", 20_000)
+    monkeypatch.setattr(structural, "PIECE", 30_000)
+    monkeypatch.setattr(oriented, "PIECE", 20_000)
     parts = structural._Search(*scene.views, 1, coarse).matches()
     assert len(sizes) >= 8
     assert max(sizes) <= 60_000

@@ -30,7 +30,7 @@ _RING = 3.5  # pitches about a point whose neighbours speak for its places, toge
 _SAY = 4.0  # times as loud as it does itself. Of four pairs that were hardest 1 is tied by 1.5 and 1, 3 by this
 _SMALLEST = 60  # px of a side of the common part, in the coarsest picture
 _BENT = 2  # px by which their parallax may differ, and does not count
-_LONG = 130.0  # px of half a band
+_LONG, _LONGER = 48.0, 130.0  # px of half a band
 
 
 class GradientStructure:
@@ -98,7 +98,7 @@ class _Search:
         if self._whole:
             wanted, count = 1, _FINE_POINTS[self._prediction.probes is None]
         elif self._prediction.probes is None:
-            wanted, count = (4, _POINTS[1]) if half > _LONG else (2, _POINTS[2])
+            wanted, count = (4, _POINTS[1]) if half > _LONGER else (2, _POINTS[1 + (half < _LONG)])
         else:
             width = self._prediction.half_width  # a twentieth of the image, or the altitudes, may be wide
             wanted, count = int(max(width / 20.0, min(half / 80.0, 4.0), 2.0)), _POINTS[0]
