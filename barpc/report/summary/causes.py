@@ -112,7 +112,7 @@ CAUSES = {
         "doubtful",
         "more than one RPC holds",
         "its corrected camera follows {follows}, of which one RPC leaves {left:.2f} px (RMS; {most:.2f} px at most)",
-        "use its grids ({image}_grid.tif), --tiles or --resample",
+        "use its grids ({image}_grid.tif), or --resample",
     ),
     "disagrees": Cause("doubtful", "cameras disagree", "tie points disagree by {error:.2f} px", "adjust the cameras"),
     "left": Cause(
