@@ -140,7 +140,7 @@ CAUSES = {
         "look for wrong matches, moving things, or errors that these unknowns cannot follow"),
     "follows_more": Cause("doubtful", "more than one RPC holds",
         "its corrected camera follows {follows}, of which one RPC leaves {left:.2f} px (RMS; {most:.2f} px at most)",
-        "use its grids ({image}_grid.tif), --tiles or --resample"),
+        "use its grids ({image}_grid.tif), or --resample"),
     "disagrees": Cause("doubtful", "cameras disagree", "tie points disagree by {error:.2f} px", "adjust the cameras"),
     "left": Cause("doubtful", "large residuals",
         "tie points are left with {error:.2f} px", "look for wrong matches and moving things"),
