@@ -101,7 +101,7 @@ def surface() -> tuple[int, int]:
         for verb, command in commands.items()
         for parameter in (command.params if command else ())
         for flag in parameter.opts
-        if flag.startswith("--")
+        if flag.startswith("--") and not flag.startswith("--help")
     }
     tables = RunOptions, TieOptions, AdjustOptions, FitOptions
     fields = [name for table in tables for name, one in declared(table).items() if one.kind not in tables]

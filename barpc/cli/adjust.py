@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.cli.flags import ADJUSTMENT, MATCH, RUN, TIE, expanded, image_paths, paper, run_options, with_flags
+from barpc.cli.flags import ADJUSTMENT, MATCH, RUN, TIE, Grouped, expanded, image_paths, paper, run_options, with_flags
 from barpc.cli.terminal import echo, executor_for, output_width, print_summary, progress_told, tell_gate, wants_json
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ _images = click.argument("images", nargs=-1, required=False, metavar="IMAGE...")
 _out_dir = click.option("-o", "--out-dir", required=True, metavar="DIR", help="Folder for the results.")
 
 
-@click.command("adjust")
+@click.command("adjust", cls=Grouped)
 @_images
 @_out_dir
 @paper
@@ -55,7 +55,7 @@ def adjust(
     return _run(obj, pipeline.adjust, images, flags, out_dir=out_dir)
 
 
-@click.command("match")
+@click.command("match", cls=Grouped)
 @_images
 @_out_dir
 @with_flags(*MATCH, *TIE)
@@ -75,7 +75,7 @@ def match(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags
     return _run(obj, pipeline.adjust, images, flags, {"stop_after": "matching"}, out_dir=out_dir)
 
 
-@click.command("check")
+@click.command("check", cls=Grouped)
 @_images
 @click.option("--against", metavar="PATH", help="Compare with this RPC (one image), or those of this folder.")
 @with_flags(*TIE)

@@ -12,6 +12,7 @@ from typing import Any, TypeVar, get_origin
 
 import click
 
+from barpc.cli.terminal import echo
 from barpc.errors import BarpcError, InputError
 from barpc.options import PAPER, Declared, RunOptions, checked, declared, read_options, with_values
 from barpc.remote import is_url
@@ -20,6 +21,7 @@ from barpc.sidefile import IMAGE, read_head, read_names
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 REMOTE = "allow_remote"
+_ALL = "barpc.help_all"  # key of a context whose help shows every flag
 TIE = ("tie.band", "tie.matcher", "matches", "matches_only", "overlap_list", "aoi")
 CAMERA = ("adjust.model", "adjust.drift", "adjust.jitter", "adjust.fixed")
 GROUND = ("gcp", "altimetry", "check_points", "fixed_run", "dem", "adjust.dem_for_weak", "geoid", "reference")
@@ -40,6 +42,46 @@ def field_of(target: str) -> Declared:
     *table, name = target.split(".")
     record = type(declared(RunOptions)[table[0]].default) if table else RunOptions
     return declared(record)[name]
+
+
+_USUAL = {
+    "--out-dir", "--overwrite", "--keep-going", "--images", "--image-list", "--options", "--jobs", "--against",
+    "--help", "--help-all", "--matches", "--aoi", "--gcp", "--check-points", "--dem", "--geoid", "--reference",
+}  # fmt: skip
+"""Flags that `--help` lists; `--help-all` has the rest."""
+_GROUPS = {"Tie points": TIE, "Cameras": CAMERA, "Ground": GROUND}
+
+
+class Grouped(click.Command):
+    """A verb of a run: its help lists the usual flags by what they are about, `--help-all` every one."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        words = "Show every flag, those for cameras and matching too, and exit."
+        how: dict[str, Any] = {"is_flag": True, "is_eager": True, "expose_value": False, "callback": _help_all}
+        self.params.append(click.Option(["--help-all"], help=words, **how))
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List what the user gives, then tie points, cameras and ground."""
+        of = {_parameter(target): words for words, targets in _GROUPS.items() for target in targets}
+        rows: dict[str, list[tuple[str, str]]] = {"Files and the run": [], **{words: [] for words in _GROUPS}}
+        for option in self.get_params(ctx):
+            usual = not isinstance(option, click.Option) or not _USUAL.isdisjoint(option.opts)
+            row = option.get_help_record(ctx) if usual or ctx.meta.get(_ALL) else None
+            if row is not None:
+                rows[of.get(option.name or "", "Files and the run")].append(row)
+        for words, listed in rows.items():
+            if listed:
+                with formatter.section(words):
+                    formatter.write_dl(listed)
+
+
+def _help_all(context: click.Context, _parameter: click.Parameter, value: bool) -> None:
+    """Print the whole help and end."""
+    if value and not context.resilient_parsing:
+        context.meta[_ALL] = True
+        echo(context.get_help())
+        context.exit()
 
 
 def _parameter(target: str) -> str:

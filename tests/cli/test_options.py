@@ -190,8 +190,34 @@ def test_one_word_gives_the_paper_s_method_and_the_file_and_flags_win_over_it(tm
     assert run_options({}, None) == RunOptions()
 
 
-def test_the_help_of_a_run_has_every_flag() -> None:
-    text = CliRunner().invoke(cli, ["adjust", "--help"], prog_name="barpc").output
-    listed = {word.strip(",") for line in text.splitlines() if line.startswith("  -") for word in line.split()[:2]}
-    known = {flag for one in adjust.params for flag in one.opts if flag.startswith("-")}
-    assert {flag for flag in listed if flag.startswith("-")} == known | {"-h", "--help"}
+def listed_in_help(verb: str, flag: str) -> dict[str, list[str]]:
+    """Words of a section of the help -> the long flags in it."""
+    text = CliRunner().invoke(cli, [verb, flag], prog_name="barpc").output
+    found: dict[str, list[str]] = {}
+    for line in text.splitlines():
+        if line.endswith(":") and not line.startswith(" "):
+            found[line[:-1]] = flags = []
+        elif line.startswith("  -"):
+            flags += [word.strip(",") for word in line.split()[:2] if word.startswith("--")]
+    return found
+
+
+def test_the_help_of_a_run_has_the_usual_flags_and_says_where_the_rest_is() -> None:
+    usual = [flag for flags in listed_in_help("adjust", "--help").values() for flag in flags]
+    assert len(set(usual) - {"--help", "--help-all"}) == 14
+    assert {"--help", "--help-all", "--out-dir", "--gcp", "--dem", "--keep-going"} <= set(usual)
+    assert "--jitter" not in usual
+    whole = [flag for flags in listed_in_help("adjust", "--help-all").values() for flag in flags]
+    known = {flag for one in adjust.params for flag in one.opts if flag.startswith("--")}
+    assert set(whole) == known | {"--help"}
+    assert {"--against"} <= {flag for flags in listed_in_help("check", "--help").values() for flag in flags}
+
+
+def test_the_whole_help_of_a_run_has_its_flags_under_what_they_are_about() -> None:
+    found = {words: set(flags) for words, flags in listed_in_help("adjust", "--help-all").items()}
+    assert list(found) == ["Files and the run", "Tie points", "Cameras", "Ground"]
+    assert {"--out-dir", "--overwrite", "--jobs", "--help"} <= found["Files and the run"]
+    assert {"--matcher", "--aoi"} <= found["Tie points"]
+    assert {"--model", "--fixed"} <= found["Cameras"]
+    assert {"--gcp", "--dem", "--geoid"} <= found["Ground"]
+    assert "Tie points:" not in CliRunner().invoke(cli, ["info", "--help"]).output
