@@ -22,22 +22,22 @@ _MODULES = {
     "barpc.rpcio": "read_rpc write_rpc",
     "barpc.fit": "fit_rpc fit_rpc_points",
     "barpc.pipeline": "adjust check AdjustResult",
-    "barpc.options": "RunOptions TieOptions AdjustOptions FitOptions",
+    "barpc.base.options": "RunOptions TieOptions AdjustOptions FitOptions",
     "barpc.cameras": "open_camera",
-    "barpc.errors": "BarpcError BarpcWarning",
+    "barpc.base.errors": "BarpcError BarpcWarning",
 }
 _PUBLIC = {name: module for module, names in _MODULES.items() for name in names.split()}
 
 if TYPE_CHECKING:
+    from barpc.base.errors import BarpcError as BarpcError
+    from barpc.base.errors import BarpcWarning as BarpcWarning
+    from barpc.base.options import AdjustOptions as AdjustOptions
+    from barpc.base.options import FitOptions as FitOptions
+    from barpc.base.options import RunOptions as RunOptions
+    from barpc.base.options import TieOptions as TieOptions
     from barpc.cameras import open_camera as open_camera
-    from barpc.errors import BarpcError as BarpcError
-    from barpc.errors import BarpcWarning as BarpcWarning
     from barpc.fit import fit_rpc as fit_rpc
     from barpc.fit import fit_rpc_points as fit_rpc_points
-    from barpc.options import AdjustOptions as AdjustOptions
-    from barpc.options import FitOptions as FitOptions
-    from barpc.options import RunOptions as RunOptions
-    from barpc.options import TieOptions as TieOptions
     from barpc.pipeline import AdjustResult as AdjustResult
     from barpc.pipeline import adjust as adjust
     from barpc.pipeline import check as check

@@ -14,15 +14,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from barpc.errors import ImageError, InputError, RpcError
+from barpc.base.errors import ImageError, InputError, RpcError
+from barpc.base.remote import Place, located, location
+from barpc.base.sidefile import IMAGE, read_head
 from barpc.pointio.correspondences import (
     Correspondences,
     correspondence_kind,
     read_correspondences,
     read_grid,
 )
-from barpc.raster import driver_of, open_raster
-from barpc.remote import Place, located, location
+from barpc.rasters.raster import driver_of, open_raster
 from barpc.rpcio import read_rpc_source
 from barpc.rpcio.grids import SIGN, read_correction
 from barpc.rpcio.sources import described, metadata_beside, only_physical
@@ -31,7 +32,6 @@ from barpc.sensor.correction_grid import GridCorrected
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.geometry import altitude_range
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import IMAGE, read_head
 
 _HEAD = 4096
 _ON_EARTH = (-500.0, 9000.0)  # m: all ground

@@ -13,9 +13,9 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from barpc.errors import InputError
-from barpc.frozen import Frozen
-from barpc.geodesy import Array
+from barpc.base.errors import InputError
+from barpc.base.frozen import Frozen
+from barpc.base.geodesy import Array
 from barpc.sensor import SensorModel
 
 SIGMA_RANGE = 1e-6, 1e9

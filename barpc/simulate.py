@@ -15,9 +15,9 @@ import numpy.typing as npt
 from numpy.polynomial.polynomial import polyfit
 from scipy.spatial.transform import Rotation
 
-from barpc.errors import InputError
+from barpc.base.errors import InputError
+from barpc.base.geodesy import EARTH_RATE, Array, ecef_from_ground, enu_basis, metres_per_unit, wrap_longitude
 from barpc.fit import fit_rpc
-from barpc.geodesy import EARTH_RATE, Array, ecef_from_ground, enu_basis, metres_per_unit, wrap_longitude
 from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction

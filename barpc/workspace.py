@@ -35,8 +35,9 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc import __version__
-from barpc.errors import BarpcError, OutputError
-from barpc.frozen import PARTIAL, STATE, Arrays, load_npz, replacing
+from barpc.base.atomic import PARTIAL, STATE, replacing
+from barpc.base.errors import BarpcError, OutputError
+from barpc.base.frozen import Arrays, load_npz
 from barpc.rpcio import hidden_by
 
 logger = logging.getLogger(__name__)

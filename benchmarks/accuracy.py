@@ -35,7 +35,7 @@ from concepts import SAMPLES, cameras, errors_of_place
 
 import barpc
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.errors import BarpcError, BarpcWarning
+from barpc.base.errors import BarpcError, BarpcWarning
 from barpc.pipeline import RunOptions
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import altitude_range, camera_center

@@ -51,7 +51,7 @@ from barpc.ba.judging import solution
 from barpc.ba.robust.smooth import Smooth
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State, camera_step, minimise
-from barpc.geodesy import ecef_from_ground, ground_from_ecef
+from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.sensor.curve import rotation_matrix
 from barpc.sensor.geometry import triangulate
 from barpc.simulate import Block, simulate_block

@@ -28,8 +28,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np  # noqa: E402  (the thread counts come first)
 
-from barpc.errors import BarpcError  # noqa: E402
-from barpc.options import RunOptions, TieOptions  # noqa: E402
+from barpc.base.errors import BarpcError  # noqa: E402
+from barpc.base.options import RunOptions, TieOptions  # noqa: E402
 from barpc.pipeline import adjust  # noqa: E402
 from barpc.scene import View  # noqa: E402
 from barpc.tie import tracks  # noqa: E402

@@ -29,10 +29,10 @@ import rasterio
 from rasterio.warp import Resampling, reproject
 from rasterio.windows import Window
 
+from barpc.base.options import DsmOptions
 from barpc.dsm import NoSurfaceError, make_dsm
 from barpc.dsm.cells import Tile, gathered
 from barpc.export.shots import read_scene
-from barpc.options import DsmOptions
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.files import image_file
 
@@ -124,7 +124,7 @@ def rendered(side: int, kind: str = "usual") -> dict[str, object]:
         made = Ground(side, kind, Path(folder))
         out, call = Path(folder) / "dsm.tif", json.dumps([made.paths, made.alt])
         code = (
-            "import json,sys,time; from barpc.dsm import make_dsm; from barpc.options import DsmOptions\n"
+            "import json,sys,time; from barpc.dsm import make_dsm; from barpc.base.options import DsmOptions\n"
             "paths, alt = json.loads(sys.argv[1]); start = time.process_time()\n"
             "make_dsm(paths, sys.argv[2], DsmOptions(alt=tuple(alt))); cpu = time.process_time() - start\n"
             "print(cpu, open('/proc/self/status').read().split('VmHWM:')[1].split()[0])"

@@ -26,10 +26,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from barpc.base.geodesy import Array
 from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
 from barpc.fit.points import control_points
 from barpc.fit.poles import smallest_denominator
-from barpc.geodesy import Array
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.sensor.rpc import RPC
 from tests.fit.cameras import Camera, random_points, synthetic, vendor

@@ -90,8 +90,8 @@ def surface() -> tuple[int, int]:
     """Flags over all verbs, and fields of options."""
     import click
 
+    from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions, declared
     from barpc.cli.main import COMMANDS, Verbs
-    from barpc.options import AdjustOptions, FitOptions, RunOptions, TieOptions, declared
 
     verbs = Verbs()
     context = click.Context(verbs)

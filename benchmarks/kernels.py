@@ -24,7 +24,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from barpc.geodesy import ecef_from_ground, ground_from_ecef
+from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import triangulate

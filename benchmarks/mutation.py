@@ -201,8 +201,8 @@ class Places:
 
 
 def part_of(path: Path) -> str:
-    """The part of a file barpc/part/... or barpc/module.py."""
-    return path.parts[1] if len(path.parts) > 2 else TOP
+    """The part of a file: the innermost of its folders that has tests."""
+    return next((name for name in path.parts[-2:0:-1] if (ROOT / "tests" / name).is_dir()), TOP)
 
 
 def parts() -> dict[str, list[str]]:

@@ -26,9 +26,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from barpc.errors import FitError
+from barpc.base.errors import FitError
+from barpc.base.geodesy import Array
 from barpc.fit import FitOptions, fit_rpc_points
-from barpc.geodesy import Array
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
 from barpc.sensor.sentinel1 import Annotation, mosaic, read_annotation

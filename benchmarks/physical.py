@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares
 
+from barpc.base.geodesy import Array
 from barpc.fit import fit_rpc
-from barpc.geodesy import Array
 from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import altitude_range

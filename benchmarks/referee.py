@@ -53,9 +53,9 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.dem import Dem
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit
 from barpc.fit import fit_rpc
-from barpc.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit
+from barpc.rasters.dem import Dem
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.curve import Curve
@@ -491,7 +491,7 @@ def solve(scene: Scene, options: AdjustOptions | None = None) -> tuple[tuple[Sen
 def run(scene: Scene, **options: Any) -> tuple[tuple[SensorModel, ...], Any]:
     """Refitted cameras and the summary of the whole command, tie points given; options as in a TOML file."""
     import barpc
-    from barpc.options import RunOptions, with_values
+    from barpc.base.options import RunOptions, with_values
     from barpc.pointio.matches import write_matches
     from barpc.rpcio import write_rpc
 

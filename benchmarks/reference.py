@@ -26,10 +26,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np  # noqa: E402  (the thread counts come first)
 
-from barpc.dem import Dem  # noqa: E402
-from barpc.geodesy import ecef_from_ground, enu_basis  # noqa: E402
-from barpc.options import RunOptions  # noqa: E402
+from barpc.base.geodesy import ecef_from_ground, enu_basis  # noqa: E402
+from barpc.base.options import RunOptions  # noqa: E402
 from barpc.pipeline import adjust  # noqa: E402
+from barpc.rasters.dem import Dem  # noqa: E402
 from barpc.rpcio import read_rpc  # noqa: E402
 from barpc.sensor.geometry import triangulate  # noqa: E402
 from tests.scenes import ImageOptions, Scene, write_scene  # noqa: E402

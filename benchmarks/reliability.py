@@ -101,8 +101,8 @@ def identity_of_a_run(side: int = 1000) -> None:
     import rasterio
 
     import barpc
-    from barpc import identity
-    from barpc.options import RunOptions
+    from barpc.base import identity
+    from barpc.base.options import RunOptions
     from barpc.pipeline import inputs
 
     hashing, asking = Spent(), Spent()
@@ -136,7 +136,7 @@ def identity_of_sparse_images(count: int = 100, side: int = 4000) -> None:
     """What hashing costs of files that are nearly all holes, which read as zeros, beside reading their pixels."""
     import rasterio
 
-    from barpc.raster import hashed
+    from barpc.rasters.raster import hashed
 
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder) / f"{number}.tif" for number in range(count)]

@@ -34,8 +34,8 @@ import cv2  # noqa: E402  (the thread counts come first)
 import numpy as np  # noqa: E402
 import rasterio  # noqa: E402
 
-from barpc.errors import BarpcError  # noqa: E402
-from barpc.options import RunOptions, TieOptions  # noqa: E402
+from barpc.base.errors import BarpcError  # noqa: E402
+from barpc.base.options import RunOptions, TieOptions  # noqa: E402
 from barpc.pipeline import adjust  # noqa: E402
 from barpc.rpcio import read_rpc  # noqa: E402
 from barpc.scene import View  # noqa: E402

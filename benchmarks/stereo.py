@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from barpc import read_rpc
-from barpc.raster import open_raster
+from barpc.rasters.raster import open_raster
 
 MARGIN = 20.0
 PATCH = 10

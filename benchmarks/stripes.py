@@ -31,9 +31,9 @@ from scipy import ndimage
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # tests, where barpc is installed as a package
 
+from barpc.base.options import RunOptions
 from barpc.cameras import open_camera
 from barpc.fit import fit_rpc
-from barpc.options import RunOptions
 from barpc.pipeline.beyond import write_grids
 from barpc.rpcio import WRITABLE
 from barpc.scene import View

@@ -34,7 +34,7 @@ import numpy as np  # noqa: E402
 import rasterio  # noqa: E402
 from scipy import ndimage  # noqa: E402
 
-from barpc.options import TieOptions  # noqa: E402
+from barpc.base.options import TieOptions  # noqa: E402
 from barpc.pipeline.loading import load_views  # noqa: E402
 from barpc.tie import common_tracks, find_tracks  # noqa: E402
 from barpc.tie.pairing.epipolar import frame, linear_map  # noqa: E402

@@ -30,7 +30,7 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 from scipy.interpolate import RectBivariateSpline
 
-from barpc.geodesy import metres_per_unit
+from barpc.base.geodesy import metres_per_unit
 from barpc.pointio.matches import read_matches, write_matches
 from barpc.rpcio import read_rpc
 from barpc.rpcio.carried import put_tag

@@ -33,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np  # noqa: E402  (the thread counts come first)
 
 import barpc.tie  # noqa: E402
-from barpc.errors import BarpcError  # noqa: E402
+from barpc.base.errors import BarpcError  # noqa: E402
 from barpc.pipeline.loading import load_views  # noqa: E402
 from barpc.scene import View  # noqa: E402
 from barpc.tie import TieOptions, common_tracks, find_tracks  # noqa: E402

@@ -32,7 +32,7 @@ import numpy as np  # noqa: E402
 import rasterio  # noqa: E402
 from rasterio.windows import Window  # noqa: E402
 
-from barpc.errors import BarpcError  # noqa: E402
+from barpc.base.errors import BarpcError  # noqa: E402
 from barpc.pipeline.executor import CachingExecutor  # noqa: E402
 from barpc.pipeline.loading import load_views  # noqa: E402
 from barpc.scene import View  # noqa: E402

@@ -10,12 +10,14 @@ import argparse
 import re
 from pathlib import Path
 
-from barpc import dem, frozen, geodesy, options, raster, scene, sidefile, vrt, workspace
+from barpc import scene, workspace
 from barpc.ba.held import incremental
+from barpc.base import frozen, geodesy, options, sidefile
+from barpc.base.remote import _KEPT as HELD
+from barpc.base.remote import _LONGEST as REQUEST
+from barpc.base.remote import BLOCK, hosts
 from barpc.pointio import foreign, names
-from barpc.remote import _KEPT as HELD
-from barpc.remote import _LONGEST as REQUEST
-from barpc.remote import BLOCK, hosts
+from barpc.rasters import dem, raster, vrt
 from barpc.report import tables
 from barpc.rpcio import carried
 from barpc.sensor import document as metadata

@@ -12,7 +12,7 @@ from functools import cache, lru_cache
 import numpy as np
 from rasterio.windows import Window
 
-from barpc.raster import open_raster
+from barpc.rasters.raster import open_raster
 
 KEYPOINTS = 2048  # of a tile
 REACH = 100  # px that a tile of the second view is larger on every side: the cameras may be wrong

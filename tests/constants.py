@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, TypeVar
 from unittest import mock
 
-from barpc.options import AdjustOptions, FitOptions, Options, TieOptions
+from barpc.base.options import AdjustOptions, FitOptions, Options, TieOptions
 
 Record = TypeVar("Record", bound=Options)
 

@@ -12,18 +12,18 @@ import pytest
 
 import barpc
 from barpc import cameras
-from barpc.cameras import OPENERS, Camera, Opener, open_camera
-from barpc.cli import main
-from barpc.cli.main import cli
-from barpc.errors import ImageError, InputError
-from barpc.geodesy import (
+from barpc.base.errors import ImageError, InputError
+from barpc.base.geodesy import (
     Array,
     ecef_from_ground,
     ecef_from_ground_jacobian,
     enu_basis,
     ground_from_ecef,
 )
-from barpc.remote import Remote
+from barpc.base.remote import Remote
+from barpc.cameras import OPENERS, Camera, Opener, open_camera
+from barpc.cli import main
+from barpc.cli.main import cli
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import altitude_range

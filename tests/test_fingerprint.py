@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from barpc.errors import ImageError, InputError
-from barpc.raster import hashed
+from barpc.base.errors import ImageError, InputError
+from barpc.rasters.raster import hashed
 
 
 def refused(path: Path) -> str:

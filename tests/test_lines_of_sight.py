@@ -9,8 +9,8 @@ import pytest
 import rasterio
 from rasterio import Affine
 
-from barpc.dem import Dem, localize_on_terrain
-from barpc.errors import BarpcWarning
+from barpc.base.errors import BarpcWarning
+from barpc.rasters.dem import Dem, localize_on_terrain
 from tests.lanes import rest_slow
 
 STEP = 30.0 / 111_195.0  # deg: posts of some 30 m

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from barpc.frozen import from_arrays, to_arrays
+from barpc.base.frozen import from_arrays, to_arrays
 from barpc.scene import Tracks
 
 from .sensor.conftest import make_rpc

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.errors import InputError
+from barpc.base.errors import InputError
 from barpc.scene import (
     GroundPoints,
     Reference,

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.errors import OutputError, TiePointError
-from barpc.identity import take
+from barpc.base.errors import OutputError, TiePointError
+from barpc.base.identity import take
 from barpc.workspace import Workspace, code_version, key_of, peak_memory, table_path, timed
 
 

@@ -9,7 +9,7 @@ from barpc.ba.adjustment import adjust_tracks
 from barpc.ba.held.incremental import BlockPrior, block_prior
 from barpc.ba.result import Adjustment, PairHeights, pair_heights
 from barpc.ba.robust.heldout import CheckResiduals, check_residuals, split_points
-from barpc.options import AdjustOptions
+from barpc.base.options import AdjustOptions
 
 __all__ = [
     "AdjustOptions",

@@ -29,9 +29,9 @@ from barpc.ba.robust.rounds import Outcome
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.standing import Parts, without_moving
 from barpc.ba.usual import CRITICAL, SAMPLE
-from barpc.errors import AdjustError
-from barpc.geodesy import Array, ground_from_ecef
-from barpc.options import AUTO, AdjustOptions
+from barpc.base.errors import AdjustError
+from barpc.base.geodesy import Array, ground_from_ecef
+from barpc.base.options import AUTO, AdjustOptions
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Reference, Tracks, View
 from barpc.sensor.geometry import camera_center
 

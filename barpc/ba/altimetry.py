@@ -21,8 +21,8 @@ from barpc.ba.robust.heldout import is_better
 from barpc.ba.robust.rounds import Rounds
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.usual import CRITICAL, FEWEST, GROSS, LEVEL
-from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.options import AdjustOptions
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.base.options import AdjustOptions
 from barpc.scene import Altimetry, IntArray
 
 _MOST = 5000  # heights used, and tie points held: of more, every n-th; their neighbours tell the same

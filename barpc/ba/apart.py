@@ -23,9 +23,9 @@ from barpc.ba.judging.judge import around
 from barpc.ba.judging.solution import Solution
 from barpc.ba.placing import Look, Placed, look, place
 from barpc.ba.usual import CRITICAL, LARGEST, MUCH_NOISE, SMALL, SURE, TRIED
-from barpc.errors import AdjustError
-from barpc.geodesy import Array
-from barpc.options import GEOMETRIC, AdjustOptions
+from barpc.base.errors import AdjustError
+from barpc.base.geodesy import Array
+from barpc.base.options import GEOMETRIC, AdjustOptions
 from barpc.scene import connected_groups
 
 _LOG = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ from barpc.ba.robust.smooth import SPLINES
 from barpc.ba.robust.weights import geman_mcclure
 from barpc.ba.solving.normal import cholesky3, point_products, whiten
 from barpc.ba.usual import FEW, GROSS, MUCH_NOISE, SHRINK, SURELY, TIMES
-from barpc.geodesy import Array, enu_basis, ground_from_ecef
+from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray
 from barpc.sensor.splined import bsplines
 

@@ -20,8 +20,8 @@ from barpc.ba.robust.smooth import SmoothTest
 from barpc.ba.robust.variances import PriorTest
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.usual import MANY
-from barpc.geodesy import Array, enu_basis, ground_from_ecef
-from barpc.options import AdjustOptions
+from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
+from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected

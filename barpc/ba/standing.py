@@ -15,8 +15,8 @@ from barpc.ba.judging.moving import Found, Motion, members
 from barpc.ba.judging.solution import Solution
 from barpc.ba.robust.heldout import is_better, measure
 from barpc.ba.usual import LEVEL, MUCH_NOISE, RIVALS, SURE
-from barpc.geodesy import Array, ground_from_ecef, wrap_longitude
-from barpc.options import AdjustOptions
+from barpc.base.geodesy import Array, ground_from_ecef, wrap_longitude
+from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray, connected_groups
 
 _NAMES = ("west", "east"), ("south", "north")

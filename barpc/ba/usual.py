@@ -1,6 +1,6 @@
 """Numbers that mean the same wherever the adjustment decides or computes, each in one place."""
 
-from barpc.options import AdjustOptions
+from barpc.base.options import AdjustOptions
 
 # --- what is sure -----------------------------------------------------------------------------------------
 

@@ -131,8 +131,8 @@ def _tell(obj: Mapping[str, Any], result: AdjustResult) -> int:
 
 def _compare(images: list[str], against: Path) -> int:
     from barpc.cameras import open_camera
-    from barpc.handoff import TOLERANCE, difference
     from barpc.pipeline import load_views
+    from barpc.pipeline.handoff import TOLERANCE, difference
     from barpc.rpcio import find_rpc
 
     found = []

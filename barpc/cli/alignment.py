@@ -8,11 +8,11 @@ from dataclasses import replace
 import click
 import numpy as np
 
+from barpc.base.errors import FitError, InputError
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.cameras import Camera
 from barpc.cli.terminal import say
-from barpc.errors import FitError, InputError
 from barpc.fit import FitOptions, fit_rpc
-from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.pointio.tables import read_transform
 from barpc.rpcio import CARRIERS
 from barpc.sensor import SensorModel

@@ -14,18 +14,19 @@ import click
 import numpy as np
 import shapely
 
+from barpc.base.errors import InputError, OutputError
+from barpc.base.sidefile import plain_path
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.alignment import moved, read_move, refitted
 from barpc.cli.flags import expanded
 from barpc.cli.project import Altitudes, altitude_of, exchanged, with_heights
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
-from barpc.dem import Dem
-from barpc.errors import InputError, OutputError
 from barpc.fit import FitOptions
 from barpc.fit.certificate import Sample
 from barpc.fit.points import widened
-from barpc.handoff import TOLERANCE, Reading, unverified, verify, verify_grid
-from barpc.raster import open_raster
+from barpc.pipeline.handoff import TOLERANCE, Reading, unverified, verify, verify_grid
+from barpc.rasters.dem import Dem
+from barpc.rasters.raster import open_raster
 from barpc.rpcio import (
     CARRIERS,
     FORMATS,
@@ -43,7 +44,6 @@ from barpc.rpcio.grids import GRID, write_grid
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
 from barpc.sensor.geometry import image_border
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import plain_path
 from barpc.tie import read_area
 from barpc.workspace import Workspace
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from barpc.base.options import DsmOptions, declared
 from barpc.cli.flags import Function, expanded, jobs_option
 from barpc.cli.terminal import echo, executor_for, print_comparison, progress_told, say, tell_gate, wants_json
-from barpc.options import DsmOptions, declared
 
 if TYPE_CHECKING:
     from barpc.dsm import Surface

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from barpc.base.options import GEOID_HELP
 from barpc.cli.flags import flag, paper, run_options
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
-from barpc.options import GEOID_HELP
 
 if TYPE_CHECKING:
     from barpc.fit import Localisation, RpcFit
@@ -91,9 +91,9 @@ def fit(
 def _fit(source: str, output: str | None, flags: dict[str, Any]) -> tuple[RpcFit, float]:
     """Return the fit and the tolerance [px] that it is to meet."""
     from barpc.cameras import open_camera, read_points, split_spec
-    from barpc.dem import Dem
     from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
     from barpc.fit.points import terrain_range
+    from barpc.rasters.dem import Dem
     from barpc.rpcio import Carrier, row_of
 
     options = run_options(flags, flags["options_file"]).fit
@@ -128,7 +128,7 @@ class _Missed(Exception):  # noqa: N818 - it never leaves this page
 
 def _write(fit: RpcFit, source: str, output: str, overwrite: bool, tolerance: float | None) -> tuple[RpcFit, bool]:
     """Write the RPC and read it back: the fit as its file holds it, and whether it stays there (within a tolerance)."""
-    from barpc.frozen import replacing
+    from barpc.base.atomic import replacing
     from barpc.rpcio import read_rpc, write_camera
 
     try:

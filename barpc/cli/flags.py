@@ -1,4 +1,4 @@
-"""The flags that set options, made of the declarations in `barpc.options`, and those of every run."""
+"""The flags that set options, made of the declarations in `barpc.base.options`, and those of every run."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from typing import Any, TypeVar, get_origin
 
 import click
 
+from barpc.base.errors import BarpcError, InputError
+from barpc.base.options import PAPER, Declared, RunOptions, checked, declared, read_options, with_values
+from barpc.base.remote import is_url
+from barpc.base.sidefile import IMAGE, read_head, read_names
 from barpc.cli.terminal import echo
-from barpc.errors import BarpcError, InputError
-from barpc.options import PAPER, Declared, RunOptions, checked, declared, read_options, with_values
-from barpc.remote import is_url
-from barpc.sidefile import IMAGE, read_head, read_names
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -259,7 +259,7 @@ def _files(name: str) -> list[str]:
 
 
 def _is_raster(path: Path) -> bool:
-    from barpc.raster import driver_of
+    from barpc.rasters.raster import driver_of
 
     with suppress(BarpcError):
         return driver_of(read_head(path, IMAGE, 64)) is not None

@@ -9,14 +9,14 @@ from typing import Any
 import click
 import numpy as np
 
+from barpc.base.errors import InputError, RpcError
+from barpc.base.geodesy import collection, feature, polygon
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.flags import expanded
 from barpc.cli.project import Altitudes, altitude_of, exchanged, ground_at, with_heights
 from barpc.cli.terminal import echo, wants_json
-from barpc.dem import Dem
-from barpc.errors import InputError, RpcError
 from barpc.fit.poles import smallest_denominator
-from barpc.geodesy import collection, feature, polygon
+from barpc.rasters.dem import Dem
 from barpc.sensor import geometry
 from barpc.sensor.rpc import RPC
 

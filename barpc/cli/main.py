@@ -19,9 +19,9 @@ from typing import Any
 import click
 
 from barpc import __version__
+from barpc.base.errors import BarpcError, BarpcWarning
 from barpc.cli.terminal import EXIT_GATE as EXIT_GATE
 from barpc.cli.terminal import THREADS, Formatter, echo, say
-from barpc.errors import BarpcError, BarpcWarning
 
 _OBJECTS = 50_000  # made between two looks for cycles
 

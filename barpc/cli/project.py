@@ -14,16 +14,16 @@ from typing import Any, NamedTuple, TypeVar, cast
 import click
 import numpy as np
 
+from barpc.base.errors import BarpcError, InputError
+from barpc.base.geodesy import Array, ground_from_ecef
+from barpc.base.options import GEOID_HELP
+from barpc.base.remote import Place
+from barpc.base.sidefile import TABLE, opened_text
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
-from barpc.dem import Dem, localize_on_terrain
-from barpc.errors import BarpcError, InputError
-from barpc.geodesy import Array, ground_from_ecef
-from barpc.options import GEOID_HELP
-from barpc.remote import Place
+from barpc.rasters.dem import Dem, localize_on_terrain
 from barpc.scene import BoolArray
 from barpc.sensor import geometry
-from barpc.sidefile import TABLE, opened_text
 
 _APART = 1.0  # px: lines of sight that a point's places miss by as much (RMS) do not meet
 _NUMBERS = {"ignore_unknown_options": True}  # -3.5 is a number, not an option

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.errors import InputError, visible
+from barpc.base.errors import InputError, visible
 
 if TYPE_CHECKING:
     from click._termui_impl import ProgressBar

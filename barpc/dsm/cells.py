@@ -11,7 +11,7 @@ from numpy.polynomial.polynomial import polyval2d, polyvander2d
 from rasterio.crs import CRS
 from rasterio.warp import transform
 
-from barpc.geodesy import Array, ground_from_ecef, wrap_longitude
+from barpc.base.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.scene import View
 from barpc.sensor.geometry import triangulate
 from barpc.tie.patches.dense import ACROSS, FINER, WINDOW, DenseMatches, EpipolarFrame, dense_matches, epipolar_frame

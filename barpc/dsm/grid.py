@@ -20,11 +20,11 @@ from rasterio.windows import Window
 from scipy.ndimage import map_coordinates
 
 from barpc import __version__
+from barpc.base.errors import InputError
+from barpc.base.geodesy import Array, utm
+from barpc.base.options import DsmOptions
 from barpc.dsm.cells import F32, MATCHED, NODES, SIDE, Tile, surface_tile
 from barpc.dsm.imagery import Block, NoSurfaceError, Pairs
-from barpc.errors import InputError
-from barpc.geodesy import Array, utm
-from barpc.options import DsmOptions
 from barpc.pipeline.executor import CachingExecutor, worker_count
 from barpc.pipeline.inputs import hash_files
 from barpc.scene import View

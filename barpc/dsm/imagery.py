@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from barpc.ba import BlockPrior
+from barpc.base.errors import BarpcError, InputError
+from barpc.base.options import TieOptions
+from barpc.base.remote import is_url
 from barpc.cameras import open_camera
 from barpc.dsm.sigma import CameraErrors
-from barpc.errors import BarpcError, InputError
 from barpc.export.shots import read_scene
-from barpc.options import TieOptions
 from barpc.pipeline import load_views
 from barpc.pipeline.inputs import PRIOR
-from barpc.remote import is_url
 from barpc.report.summary import Summary
 from barpc.report.tables import read_summary
 from barpc.rpcio.grids import CORRECTION

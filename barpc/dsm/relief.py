@@ -13,11 +13,11 @@ import numpy.typing as npt
 from rasterio.windows import Window
 from scipy.ndimage import map_coordinates
 
+from barpc.base.errors import BarpcError
 from barpc.cameras import open_camera
 from barpc.dsm.cells import F32, Tile, surface_tile
 from barpc.dsm.grid import Grid
-from barpc.errors import BarpcError
-from barpc.raster import open_raster
+from barpc.rasters.raster import open_raster
 from barpc.report.page import can_render, remake_report
 from barpc.report.summary import Summary
 from barpc.report.tables import SURFACE, run_key

@@ -12,8 +12,8 @@ from barpc.ba import BlockPrior
 from barpc.ba.estimated.projected import Cameras
 from barpc.ba.estimated.unknowns import make_unknowns
 from barpc.ba.result import height_by_unknowns
-from barpc.errors import InputError
-from barpc.geodesy import Array, ecef_from_ground
+from barpc.base.errors import InputError
+from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.scene import View
 
 

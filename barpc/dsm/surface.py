@@ -13,15 +13,15 @@ import numpy as np
 import rasterio
 import rasterio.shutil
 
+from barpc.base.atomic import refuse_existing, replacing
+from barpc.base.errors import InputError, OutputError
+from barpc.base.options import DsmOptions
+from barpc.base.sidefile import plain_path
 from barpc.dsm.cells import MATCHED, SIDE
 from barpc.dsm.grid import SHARED, Grid
 from barpc.dsm.imagery import NoSurfaceError, block_of_images, block_of_run
 from barpc.dsm.relief import show_in_report
-from barpc.errors import InputError, OutputError
-from barpc.frozen import refuse_existing, replacing
-from barpc.options import DsmOptions
-from barpc.raster import open_raster
-from barpc.sidefile import plain_path
+from barpc.rasters.raster import open_raster
 from barpc.tie.tasks import Progress
 from barpc.workspace import Workspace
 
@@ -68,7 +68,7 @@ def make_dsm(
     NoSurfaceError
         Images that SGBM cannot match: radar, too large an angle, hardly a pixel that is found back.
     InputError, OutputError
-        See `barpc.errors`; nothing is written then.
+        See `barpc.base.errors`; nothing is written then.
     """
     options, out = options or DsmOptions(), Path(out)
     plain_path(out.absolute())

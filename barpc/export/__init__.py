@@ -9,11 +9,11 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
-from barpc.errors import InputError, OutputError
+from barpc.base.errors import InputError, OutputError
+from barpc.base.sidefile import plain_path
 from barpc.export.files import Files, asp, cars, ortho, points, s2p, satnerf, stac
 from barpc.export.pinholes import colmap, image_links
 from barpc.export.shots import Scene, read_scene, relative_link
-from barpc.sidefile import plain_path
 from barpc.workspace import Workspace
 
 __all__ = ["TARGETS", "export_run"]

@@ -13,9 +13,9 @@ from urllib.parse import quote
 
 import numpy as np
 
-from barpc.errors import InputError
+from barpc.base.errors import InputError
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, polygon, utm, wrap_longitude
 from barpc.export.shots import Scene, Shot, pairs_of, relative_link
-from barpc.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, polygon, utm, wrap_longitude
 from barpc.report.records import plain
 from barpc.report.tables import ply
 from barpc.rpcio import WRITABLE

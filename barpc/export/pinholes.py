@@ -11,11 +11,11 @@ from pathlib import Path, PurePath
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from barpc.errors import InputError
+from barpc.base.errors import InputError
+from barpc.base.geodesy import Array
+from barpc.base.remote import is_url
 from barpc.export.files import Files, as_json
 from barpc.export.shots import Sampled, Scene, Shot, relative_link
-from barpc.geodesy import Array
-from barpc.remote import is_url
 from barpc.sensor.curve import rotation_matrix
 
 _STEPS = 40  # of Levenberg's method

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from barpc.errors import InputError
-from barpc.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, wrap_longitude
-from barpc.remote import is_url
+from barpc.base.errors import InputError
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, wrap_longitude
+from barpc.base.remote import is_url
+from barpc.base.sidefile import plain_path
 from barpc.report.compare import written_rpc
 from barpc.report.reservations import FEW_OBSERVATIONS
 from barpc.report.summary import Summary
@@ -24,7 +25,6 @@ from barpc.rpcio.sources import Sunlight, light_of
 from barpc.scene import IntArray
 from barpc.sensor.geometry import camera_center, footprint, image_grid, sight_enu
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import plain_path
 
 MARGIN = 20.0
 """m that the altitudes of a scene reach beyond its tie points, besides a tenth of their range."""

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from barpc.errors import FitError
-from barpc.geodesy import CHUNK, Array, metres_per_unit, wrap_longitude
+from barpc.base.errors import FitError
+from barpc.base.geodesy import CHUNK, Array, metres_per_unit, wrap_longitude
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
 

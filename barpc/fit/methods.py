@@ -24,7 +24,9 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from barpc.errors import FitError
+from barpc.base.errors import FitError
+from barpc.base.geodesy import Array, wrap_longitude
+from barpc.base.options import FitOptions
 from barpc.fit.points import column_ranges
 from barpc.fit.poles import Region, bounded
 from barpc.fit.system import (
@@ -41,8 +43,6 @@ from barpc.fit.system import (
     noise_scaled,
     solution,
 )
-from barpc.geodesy import Array, wrap_longitude
-from barpc.options import FitOptions
 from barpc.sensor.rpc import RPC
 
 Found = tuple[Array, list["Compressed"], Array, int]

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from barpc.errors import FitError
+from barpc.base.errors import FitError
+from barpc.base.geodesy import CHUNK, FAR, Array, metres_per_unit, wrap_longitude
+from barpc.base.options import FitOptions
 from barpc.fit.system import ALTITUDE_FLOOR
-from barpc.geodesy import CHUNK, FAR, Array, metres_per_unit, wrap_longitude
-from barpc.options import FitOptions
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import footprint
 

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import solve_triangular
 
+from barpc.base.geodesy import CHUNK, Array
 from barpc.fit.system import EPS, MAX_PASSES, Compressed, IntArray, solution
-from barpc.geodesy import CHUNK, Array
 from barpc.sensor.rational import MONOMIALS, monomials
 from barpc.sensor.rpc import RPC
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from barpc.base.geodesy import Array
 from barpc.fit.certificate import Sample
-from barpc.geodesy import Array
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 

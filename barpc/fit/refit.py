@@ -10,14 +10,14 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from barpc.errors import BarpcWarning, FitError
+from barpc.base.errors import BarpcWarning, FitError
+from barpc.base.geodesy import CHUNK, Array, wrap_longitude
+from barpc.base.options import FitOptions
 from barpc.fit.certificate import EXACT, Errors, Localisation, RpcFit, Sample, coverage, off, roundtrip
 from barpc.fit.methods import BOUNDED, FitSolution, solve, solve_problem
 from barpc.fit.points import checked_points, column_ranges, control_points, screened, widened
 from barpc.fit.reasons import reason
 from barpc.fit.system import FitProblem, Normalization
-from barpc.geodesy import CHUNK, Array, wrap_longitude
-from barpc.options import FitOptions
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import is_radar
 from barpc.sensor.rpc import RPC

@@ -22,9 +22,9 @@ import numpy.typing as npt
 from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dtpqrt
 
-from barpc.errors import FitError
-from barpc.frozen import Frozen
-from barpc.geodesy import Array
+from barpc.base.errors import FitError
+from barpc.base.frozen import Frozen
+from barpc.base.geodesy import Array
 from barpc.sensor.rational import MONOMIALS, monomials
 
 IntArray = npt.NDArray[np.int64]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from barpc.options import RunOptions
+from barpc.base.options import RunOptions
 from barpc.pipeline.loading import LoadedViews, load_views
 from barpc.pipeline.run import AdjustResult, adjust, check
 

@@ -13,15 +13,15 @@ from typing import Any, Literal
 
 import numpy as np
 
-from barpc.errors import BarpcError, BarpcWarning, FitError, OutputError, RpcError
+from barpc.base.atomic import write_text
+from barpc.base.errors import BarpcError, BarpcWarning, FitError, OutputError, RpcError
+from barpc.base.geodesy import Array
+from barpc.base.options import FitOptions, RunOptions
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.certificate import Sample
 from barpc.fit.points import widened
-from barpc.frozen import write_text
-from barpc.geodesy import Array
-from barpc.handoff import verify_grid
-from barpc.options import FitOptions, RunOptions
 from barpc.pipeline.executor import CachingExecutor
+from barpc.pipeline.handoff import verify_grid
 from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid, write_resampled
 from barpc.scene import View
 from barpc.sensor import SensorModel

@@ -27,9 +27,9 @@ from typing import Any
 import numpy as np
 
 from barpc import __version__
-from barpc.errors import AdjustError, BarpcError, InputError
-from barpc.frozen import Arrays, from_arrays, to_arrays
-from barpc.identity import Input, guarded
+from barpc.base.errors import AdjustError, BarpcError, InputError
+from barpc.base.frozen import Arrays, from_arrays, to_arrays
+from barpc.base.identity import Input, guarded
 from barpc.tie.tasks import Store
 from barpc.workspace import Workspace, key_of
 

@@ -13,21 +13,21 @@ from pathlib import Path
 import numpy as np
 
 from barpc.ba import BlockPrior
-from barpc.dem import Dem, geoid_file
-from barpc.errors import InputError
-from barpc.geodesy import Array, ecef_from_ground, metres_per_unit, wrap_longitude
-from barpc.identity import Input, Stamp, changed, take
-from barpc.options import RunOptions, declared
+from barpc.base.errors import InputError
+from barpc.base.geodesy import Array, ecef_from_ground, metres_per_unit, wrap_longitude
+from barpc.base.identity import Input, Stamp, changed, take
+from barpc.base.options import RunOptions, declared
+from barpc.base.remote import here, located, location
+from barpc.base.sidefile import IMAGE, read_names, versioned
 from barpc.pointio.correspondences import read_altimetry, read_gcps
 from barpc.pointio.matches import Links, read_links, tracks_of
 from barpc.pointio.names import ViewNames
-from barpc.raster import hashed
-from barpc.remote import here, located, location
+from barpc.rasters.dem import Dem, geoid_file
+from barpc.rasters.raster import hashed
 from barpc.report import Run
 from barpc.report.summary.words import listed
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Tracks, View
 from barpc.sensor.geometry import footprint, ground_sample_distance
-from barpc.sidefile import IMAGE, read_names, versioned
 from barpc.tie import Matches
 from barpc.tie.matchers.matcher import hook_files
 from barpc.tie.pairing.epipolar import grouped

@@ -18,18 +18,18 @@ from typing import Any
 import numpy as np
 from rasterio.windows import Window
 
+from barpc.base.errors import BarpcError, ImageError, InputError, MissingRpcError, RpcError
+from barpc.base.geodesy import ALTITUDES
+from barpc.base.identity import Stamp, also_seen, recorded
+from barpc.base.remote import Place, here, located
+from barpc.base.sidefile import IMAGE, plain_path, versioned
 from barpc.cameras import Camera, open_split, split_spec
-from barpc.errors import BarpcError, ImageError, InputError, MissingRpcError, RpcError
-from barpc.geodesy import ALTITUDES
-from barpc.identity import Stamp, also_seen, recorded
 from barpc.pipeline.executor import GROUP
 from barpc.pointio.names import unique_names
-from barpc.raster import open_raster
-from barpc.remote import Place, here, located
+from barpc.rasters.raster import open_raster
 from barpc.rpcio.sources import date_taken
 from barpc.scene import View
 from barpc.sensor.geometry import footprint
-from barpc.sidefile import IMAGE, plain_path, versioned
 from barpc.tie.tasks import Progress, ordered
 
 logger = logging.getLogger(__name__)

@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
+from barpc.base.errors import BarpcError, InputError, OutputError
+from barpc.base.identity import take
+from barpc.base.options import RunOptions
+from barpc.base.remote import is_url
 from barpc.cameras import open_camera
-from barpc.errors import BarpcError, InputError, OutputError
 from barpc.fit import RpcFit
-from barpc.handoff import verify
-from barpc.identity import take
-from barpc.options import RunOptions
 from barpc.pipeline.beyond import REOPENED, RESAMPLED, grid_names, made_in_room
 from barpc.pipeline.executor import CachingExecutor
+from barpc.pipeline.handoff import verify
 from barpc.pipeline.inputs import PRIOR
-from barpc.remote import is_url
 from barpc.report import Run, Summary
 from barpc.report.page import REPORT, can_render, report_html
 from barpc.report.records import plain

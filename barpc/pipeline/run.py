@@ -16,15 +16,16 @@ import numpy as np
 
 from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior
 from barpc.ba.held.ground import DEM_BIAS, KNOWN_BIAS
-from barpc.dem import Dem
-from barpc.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
+from barpc.base.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
+from barpc.base.identity import Input, Stamp, ask, guarded, recorded
+from barpc.base.options import FitOptions, RunOptions
+from barpc.base.remote import here
+from barpc.base.sidefile import plain_path
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
-from barpc.handoff import unverified
-from barpc.identity import Input, Stamp, ask, guarded, recorded
-from barpc.options import FitOptions, RunOptions
 from barpc.pipeline.beyond import write_grids
 from barpc.pipeline.executor import GROUP, CachingExecutor, watched
+from barpc.pipeline.handoff import unverified
 from barpc.pipeline.inputs import (
     PRIOR,
     given_matches,
@@ -43,7 +44,7 @@ from barpc.pipeline.loading import Image, image_path, load_views
 from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_views
 from barpc.pointio.matches import asp_text, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
-from barpc.remote import here
+from barpc.rasters.dem import Dem
 from barpc.report import Run, Summary, summarize
 from barpc.report.outcome import pair_ties
 from barpc.report.page import REPORT, remake_report
@@ -54,7 +55,6 @@ from barpc.scene import Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import plain_path
 from barpc.tie import Scope, find_tracks, read_area
 from barpc.tie.reference import Accuracy, ReferenceControl, register_views
 from barpc.tie.tasks import Progress, Work, ordered
@@ -142,7 +142,7 @@ def adjust(
     Raises
     ------
     BarpcError
-        See `barpc.errors`; nothing is written then.
+        See `barpc.base.errors`; nothing is written then.
     """
     options, folder = with_located(options or RunOptions()), Path(out_dir)
     plain_path(folder.absolute())

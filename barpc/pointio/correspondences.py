@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from barpc.errors import InputError
-from barpc.frozen import load_npz
-from barpc.geodesy import ALTITUDES, FAR, Array
+from barpc.base.errors import InputError
+from barpc.base.frozen import load_npz
+from barpc.base.geodesy import ALTITUDES, FAR, Array
+from barpc.base.remote import Place
+from barpc.base.sidefile import GEOJSON, NUMBER, TABLE, Kind, read_head, read_json, read_text
 from barpc.pointio.names import ViewNames
 from barpc.pointio.tables import COLUMNS, Names, first_words, header_of, numbers_of, read_table
-from barpc.raster import driver_of, open_raster
-from barpc.remote import Place
+from barpc.rasters.raster import driver_of, open_raster
 from barpc.scene import Altimetry, GroundPoints
-from barpc.sidefile import GEOJSON, NUMBER, TABLE, Kind, read_head, read_json, read_text
 
 GROUND_SIGMA = 1.0  # standard deviation [m] along an axis of a GCP, or of the place of a height, whose file states none
 IMAGE_SIGMA = 0.5  # standard deviation of each image coordinate [px], of GCPs and tie points whose file states none

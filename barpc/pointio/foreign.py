@@ -24,12 +24,12 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from barpc.errors import BarpcError, InputError
-from barpc.frozen import DEFLATED, HEADER, Arrays, load_npz
-from barpc.geodesy import Array
+from barpc.base.errors import BarpcError, InputError
+from barpc.base.frozen import DEFLATED, HEADER, Arrays, load_npz
+from barpc.base.geodesy import Array
+from barpc.base.sidefile import MAX_ELEMENTS, NUMBER, TABLE, Kind, opened, read_bytes, read_head, read_text
 from barpc.pointio.names import ViewNames
 from barpc.scene import IntArray
-from barpc.sidefile import MAX_ELEMENTS, NUMBER, TABLE, Kind, opened, read_bytes, read_head, read_text
 
 PairPoints = tuple[int, int, Array, Array]
 """Two views, and points (M, 2), (M, 2) [px] of them that show the same ground."""

@@ -13,15 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from barpc.errors import InputError
-from barpc.frozen import Arrays, load_npz
-from barpc.geodesy import Array
+from barpc.base.errors import InputError
+from barpc.base.frozen import Arrays, load_npz
+from barpc.base.geodesy import Array
+from barpc.base.sidefile import TABLE, read_head
 from barpc.pointio.correspondences import IMAGE_SIGMA
 from barpc.pointio.foreign import COLMAP, ENDINGS, HDF5, PairPoints, in_folder, read_colmap, read_hloc, read_pair_files
 from barpc.pointio.names import ViewNames, cell
 from barpc.pointio.tables import read_table
 from barpc.scene import IntArray, Tracks, connected_labels
-from barpc.sidefile import TABLE, read_head
 
 _COLUMNS = ("image", "col", "row", "track")
 _STEPS = 16  # observations of a track are linked to so many after them: all of a usual track

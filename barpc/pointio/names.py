@@ -12,8 +12,8 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import PurePath
 
-from barpc.errors import InputError
-from barpc.remote import Place, pure
+from barpc.base.errors import InputError
+from barpc.base.remote import Place, pure
 
 MAX_NAME = 120
 """Bytes of a view's name: the file of a pair's matches carries two, and 255 are what a file system takes."""

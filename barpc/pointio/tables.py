@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from barpc.errors import InputError
-from barpc.geodesy import Array
+from barpc.base.errors import InputError
+from barpc.base.geodesy import Array
+from barpc.base.sidefile import LARGEST, OPTIONS, TABLE, opened_text, read_text
 from barpc.pointio.names import from_cell
-from barpc.sidefile import LARGEST, OPTIONS, TABLE, opened_text, read_text
 
 Names = Mapping[str, Sequence[str]]
 """Quantity -> what files call it."""

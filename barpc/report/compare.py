@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from barpc.errors import BarpcError, InputError
+from barpc.base.errors import BarpcError, InputError
 from barpc.report.records import plain
 from barpc.report.summary import Summary
 from barpc.report.summary.views import CELLS, ViewEntry

@@ -9,7 +9,7 @@ import numpy as np
 from barpc.ba import Adjustment
 from barpc.ba.judging.snooping import ControlTest
 from barpc.ba.usual import SURELY
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.report.outcome import Run
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import NAMED, counted, listed, metres

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from barpc.geodesy import Array, metres_per_unit, wrap_longitude
+from barpc.base.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.report.digest import SHOWN, flagged, worst_first
 from barpc.report.records import MAX_SHOWN
 from barpc.report.summary.known import CheckPointEntry, GcpEntry

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from barpc.errors import BarpcError, visible
+from barpc.base.errors import BarpcError, visible
 from barpc.report.compare import flat_options
 from barpc.report.digest import SHOWN, decisions, flagged, offset_of, sentences, worst_first, worst_pairs
 from barpc.report.maps import ground_map, residual_panels, tag

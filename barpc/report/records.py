@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Self, Union, dataclass_transform, get_args, ge
 
 import numpy as np
 
-from barpc.options import schema_of
+from barpc.base.options import schema_of
 
 Number = float | None  # A number; None (null) stands for what is not finite
 

@@ -21,8 +21,9 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc import __version__
-from barpc.errors import InputError
-from barpc.geodesy import Array, collection, ecef_from_ground, enu_basis, feature
+from barpc.base.errors import InputError
+from barpc.base.geodesy import Array, collection, ecef_from_ground, enu_basis, feature
+from barpc.base.sidefile import GEOJSON, SUMMARY, TABLE, Kind, parse_json, read_json, read_text
 from barpc.pointio.names import cell, from_cell
 from barpc.report.outcome import Run
 from barpc.report.records import Number, Record, said, value_of
@@ -32,7 +33,6 @@ from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import Share, Side
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.geometry import footprint
-from barpc.sidefile import GEOJSON, SUMMARY, TABLE, Kind, parse_json, read_json, read_text
 from barpc.workspace import table_path
 
 _PLACE = "lon", "lat", "height_above_datum"

@@ -11,7 +11,7 @@ import numpy as np
 from barpc.ba import Adjustment, check_residuals
 from barpc.ba.apart import APART
 from barpc.ba.usual import SURE
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.report.holding import (
     control_reasons,
     dem_lines,

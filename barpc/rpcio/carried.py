@@ -16,13 +16,13 @@ from typing import BinaryIO
 
 import numpy as np
 
-from barpc.errors import ImageError, RpcFormatError
-from barpc.geodesy import Array
-from barpc.remote import Place
+from barpc.base.errors import ImageError, RpcFormatError
+from barpc.base.geodesy import Array
+from barpc.base.remote import Place
+from barpc.base.sidefile import IMAGE, opened, read_head
 from barpc.rpcio.text import COEFFICIENTS, SINGLE, WIDTHS, cells_of, fields_from_rpc, fields_in_order, rpc_from_fields
 from barpc.sensor.rational import DERIVATIVE, MONOMIALS
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import IMAGE, opened, read_head
 
 RPC_TAG = 50844
 _GEOREFERENCE_TAGS = (33550, 33922, 34264)  # ModelPixelScale, ModelTiepoint, ModelTransformation

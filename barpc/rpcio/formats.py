@@ -11,15 +11,15 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
-from barpc import remote
-from barpc.errors import InputError, RpcFormatError
-from barpc.frozen import write_text
-from barpc.remote import Place
+from barpc.base import remote
+from barpc.base.atomic import write_text
+from barpc.base.errors import InputError, RpcFormatError
+from barpc.base.remote import Place
+from barpc.base.sidefile import RPC_FILE
 from barpc.rpcio import text, xml
 from barpc.rpcio.images import write_rpc_copy, write_rpc_nitf, write_rpc_vrt
 from barpc.rpcio.text import ReadOptions
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import RPC_FILE
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Format:
     read: Callable[[str, str, ReadOptions], RPC]  # of text, file name for messages, options
     write: Callable[[RPC], str] | None = None
     beside: str = ""  # end of the name of the file that a run writes for an image, after the image's name
-    consumers: tuple[str, ...] = ()  # that read what is written (`barpc.handoff.CONSUMERS`), besides barpc
+    consumers: tuple[str, ...] = ()  # that read what is written (`barpc.pipeline.handoff.CONSUMERS`), besides barpc
 
 
 def _has(*patterns: str) -> Callable[[str], bool]:

@@ -22,18 +22,18 @@ import rasterio
 from rasterio.enums import ColorInterp
 from rasterio.windows import Window
 
-from barpc.errors import ImageError, RpcError, RpcFormatError
-from barpc.frozen import replacing
-from barpc.geodesy import FAR, Array
-from barpc.raster import BLOCK, open_raster
-from barpc.remote import Place
+from barpc.base.atomic import replacing
+from barpc.base.errors import ImageError, RpcError, RpcFormatError
+from barpc.base.geodesy import FAR, Array
+from barpc.base.remote import Place
+from barpc.base.sidefile import NUMBER, Kind
+from barpc.rasters.raster import BLOCK, open_raster
 from barpc.rpcio.carried import printable, put_tag, read_tag
 from barpc.rpcio.images import TIFF, copying, created, has_mask, require_pixels
 from barpc.scene import BoolArray
 from barpc.sensor.correction_grid import CorrectionGrid
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import NUMBER, Kind
 
 GRID, CORRECTION = "_grid.tif", "_correction.tif"
 """Ends of the names of localisation and correction grids."""

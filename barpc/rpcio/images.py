@@ -20,15 +20,15 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.shutil import copy as raster_copy
 from rasterio.windows import Window
 
-from barpc.errors import ImageError, OutputError
-from barpc.frozen import replacing, write_text
-from barpc.raster import Mosaic, identify, open_raster
-from barpc.remote import Place
+from barpc.base.atomic import replacing, write_text
+from barpc.base.errors import ImageError, OutputError
+from barpc.base.remote import Place
+from barpc.base.sidefile import IMAGE, opened, plain_path
+from barpc.rasters.raster import Mosaic, identify, open_raster
+from barpc.rasters.vrt import GDAL_TYPES
 from barpc.rpcio.carried import nitf_record, printable, put_tag
 from barpc.rpcio.xml import rpc_domain
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import IMAGE, opened, plain_path
-from barpc.vrt import GDAL_TYPES
 
 TIFF = {"driver": "GTiff", "BIGTIFF": "IF_SAFER", "TILED": "YES", "COMPRESS": "DEFLATE"}
 _FULL = 1 << 16  # bytes: with less free space GDAL's error is taken for that of a full disk

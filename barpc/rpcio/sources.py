@@ -16,16 +16,16 @@ from pathlib import Path
 
 import numpy as np
 
-from barpc.errors import BarpcError, ImageError, MissingRpcError, RpcError, RpcFormatError
-from barpc.raster import driver_of, identify, open_raster
-from barpc.remote import Place, beside, is_url, location
+from barpc.base.errors import BarpcError, ImageError, MissingRpcError, RpcError, RpcFormatError
+from barpc.base.remote import Place, beside, is_url, location
+from barpc.base.sidefile import IMAGE, RPC_FILE, encoding_of, read_bytes, read_head
+from barpc.rasters.raster import driver_of, identify, open_raster
+from barpc.rasters.vrt import MAGIC, read_vrt
 from barpc.rpcio.carried import SCANNED, read_nitf, read_tag
 from barpc.rpcio.formats import FORMATS, files_of, holds_physical, parse
 from barpc.rpcio.text import ReadOptions, decode
 from barpc.rpcio.xml import rpc_from_domain
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import IMAGE, RPC_FILE, encoding_of, read_bytes, read_head
-from barpc.vrt import MAGIC, read_vrt
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from barpc.errors import RpcError, RpcFormatError
+from barpc.base.errors import RpcError, RpcFormatError
+from barpc.base.sidefile import encoding_of, parse_json
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import encoding_of, parse_json
 
 OFFSETS = ("LINE_OFF", "SAMP_OFF", "LAT_OFF", "LONG_OFF", "HEIGHT_OFF")
 SCALES = ("LINE_SCALE", "SAMP_SCALE", "LAT_SCALE", "LONG_SCALE", "HEIGHT_SCALE")

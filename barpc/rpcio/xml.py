@@ -7,7 +7,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
-from barpc.errors import ImageError, RpcFormatError
+from barpc.base.errors import ImageError, RpcFormatError
+from barpc.base.sidefile import parse_xml
+from barpc.rasters.vrt import vrt_from_xml
 from barpc.rpcio.text import (
     COEFFICIENTS,
     DIRECT,
@@ -25,8 +27,6 @@ from barpc.rpcio.text import (
     rpc_from_fields,
 )
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import parse_xml
-from barpc.vrt import vrt_from_xml
 
 
 def _root(text: str, name: str, *, strip_namespaces: bool = True) -> Element:
@@ -140,7 +140,7 @@ def read_enmap(text: str, name: str, options: ReadOptions) -> RPC:
 
 
 def read_gdal(text: str, name: str, options: ReadOptions) -> RPC:
-    """Read GDAL's RPC metadata domain; a VRT is read by the grammar by which it is opened (`barpc.vrt`)."""
+    """Read GDAL's RPC metadata domain; a VRT is read by the grammar by which it is opened (`barpc.rasters.vrt`)."""
     root = _root(text, name, strip_namespaces=False)
     found = root.find("Metadata[@domain='RPC']")
     if root.tag == "VRTDataset":

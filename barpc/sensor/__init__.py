@@ -17,8 +17,8 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
-from barpc.frozen import Frozen
-from barpc.geodesy import Array, pointwise
+from barpc.base.frozen import Frozen
+from barpc.base.geodesy import Array, pointwise
 
 _STEPS = 60  # of a fixed point: a correction gains two or three digits a step, wild ones need more
 STANDS = 1e-7

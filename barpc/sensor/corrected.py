@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from barpc.errors import RpcError
-from barpc.frozen import Frozen
-from barpc.geodesy import (
+from barpc.base.errors import RpcError
+from barpc.base.frozen import Frozen
+from barpc.base.geodesy import (
     NEWTON_STEPS,
     SETTLED,
     Array,

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from barpc.errors import RpcError
-from barpc.frozen import Frozen
-from barpc.geodesy import Array
+from barpc.base.errors import RpcError
+from barpc.base.frozen import Frozen
+from barpc.base.geodesy import Array
 from barpc.sensor import Displaced, SensorModel, fixed_point
 from barpc.sensor.direct_grid import LINEAR, LONGEST, linear_axes
 

@@ -20,15 +20,15 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from scipy.spatial.transform import Rotation
 
-from barpc.errors import InputError, RpcError, RpcFormatError
-from barpc.geodesy import WGS84_A, WGS84_B, Array, ecef_from_ground, ground_from_ecef
+from barpc.base.errors import InputError, RpcError, RpcFormatError
+from barpc.base.geodesy import WGS84_A, WGS84_B, Array, ecef_from_ground, ground_from_ecef
+from barpc.base.sidefile import STATE, parse_json, read_text
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.document import MOST_PIXELS, STRAIGHT, Fields
 from barpc.sensor.frame import Frame
 from barpc.sensor.linescan.samples import STEP, Detector, Samples, camera_of_samples, unit
 from barpc.sensor.pushbroom import Pushbroom
-from barpc.sidefile import STATE, parse_json, read_text
 
 STATE_END = ".adjusted_state.json"
 """End of the name of a state, as ASP writes it."""

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import chebyshev
 
-from barpc.errors import RpcError
-from barpc.frozen import Frozen
-from barpc.geodesy import NEWTON_STEPS, Array
+from barpc.base.errors import RpcError
+from barpc.base.frozen import Frozen
+from barpc.base.geodesy import NEWTON_STEPS, Array
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from barpc.errors import RpcError
-from barpc.geodesy import FAR, NEWTON_STEPS, SETTLED, Array, wrap_longitude
+from barpc.base.errors import RpcError
+from barpc.base.geodesy import FAR, NEWTON_STEPS, SETTLED, Array, wrap_longitude
 from barpc.sensor import Pointwise, SensorModel
 from barpc.sensor.rational import DERIVATIVE, monomials
 

@@ -10,8 +10,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from barpc.errors import BarpcWarning, RpcFormatError
-from barpc.geodesy import FAR, Array
+from barpc.base.errors import BarpcWarning, RpcFormatError
+from barpc.base.geodesy import FAR, Array
 
 T = TypeVar("T")
 RELIEF_AROUND = 1000.0

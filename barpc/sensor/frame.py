@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval
 
-from barpc.errors import RpcError
-from barpc.geodesy import (
+from barpc.base.errors import RpcError
+from barpc.base.geodesy import (
     NEWTON_STEPS,
     SETTLED,
     Array,

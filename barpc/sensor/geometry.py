@@ -9,8 +9,8 @@ from typing import Literal, TypeGuard
 import numpy as np
 import numpy.typing as npt
 
-from barpc.errors import RpcError
-from barpc.geodesy import (
+from barpc.base.errors import RpcError
+from barpc.base.geodesy import (
     Array,
     ecef_from_ground,
     enu_basis,

@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from barpc.errors import RpcError
-from barpc.geodesy import (
+from barpc.base.errors import RpcError
+from barpc.base.geodesy import (
     EARTH_RATE,
     NEWTON_STEPS,
     SETTLED,

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 
 BoolArray = npt.NDArray[np.bool_]
 

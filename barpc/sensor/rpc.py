@@ -11,8 +11,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from barpc.errors import RpcError
-from barpc.geodesy import Array, pointwise, wrap_longitude
+from barpc.base.errors import RpcError
+from barpc.base.geodesy import Array, pointwise, wrap_longitude
 from barpc.sensor import Pointwise
 from barpc.sensor.rational import REACH, BoolArray, Rational, monomials
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from barpc.errors import RpcError
-from barpc.frozen import Frozen
-from barpc.geodesy import Array
+from barpc.base.errors import RpcError
+from barpc.base.frozen import Frozen
+from barpc.base.geodesy import Array
 from barpc.sensor import Displaced, fixed_point
 
 IntArray = npt.NDArray[np.int64]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from barpc.geodesy import CHUNK, NEWTON_STEPS, Array, wrap_longitude
+from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array, wrap_longitude
 from barpc.sensor import SensorModel
 from barpc.sensor.rational import DERIVATIVE, REACH, BoolArray, monomials
 from barpc.sensor.rpc import RPC

@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 
-from barpc.errors import BarpcWarning, InputError, RpcError, RpcFormatError
+from barpc.base.errors import BarpcWarning, InputError, RpcError, RpcFormatError
+from barpc.base.sidefile import parse_xml
 from barpc.sensor.curve import fit_orbit
 from barpc.sensor.document import MOST_PIXELS, RELIEF_AROUND, Fields, seconds, warn_off_grid
 from barpc.sensor.sentinel1.frames import SlantFrame
 from barpc.sensor.sentinel1.range_doppler import RELIEF, RangeDoppler
-from barpc.sidefile import parse_xml
 
 ROOT = "level1Product"
 

@@ -13,9 +13,9 @@ from typing import Any, ClassVar, Literal, Self, TypeGuard
 import numpy as np
 from numpy.polynomial import polynomial
 
-from barpc.errors import RpcError
-from barpc.frozen import Frozen
-from barpc.geodesy import NEWTON_STEPS, SETTLED, Array, ground_from_ecef, pointwise, up, wrap_longitude
+from barpc.base.errors import RpcError
+from barpc.base.frozen import Frozen
+from barpc.base.geodesy import NEWTON_STEPS, SETTLED, Array, ground_from_ecef, pointwise, up, wrap_longitude
 from barpc.sensor import Behind, Pointwise, SensorModel
 from barpc.sensor.curve import Curve, cross
 

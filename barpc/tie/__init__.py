@@ -3,7 +3,7 @@
 `find_tracks` runs all stages: `select_pairs`, `detect`, `match_pairs`, `link`, `thin`, `refine`.
 """
 
-from barpc.options import TieOptions
+from barpc.base.options import TieOptions
 from barpc.tie.matchers.features import Keypoints, detect
 from barpc.tie.matchers.matcher import Matches
 from barpc.tie.matchers.matching import PairReport, match_pair, match_pairs

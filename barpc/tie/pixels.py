@@ -13,10 +13,10 @@ import numpy.typing as npt
 from rasterio.enums import MaskFlags
 from rasterio.windows import Window
 
-from barpc.errors import ImageError
-from barpc.geodesy import Array
-from barpc.options import TieOptions
-from barpc.raster import open_raster
+from barpc.base.errors import ImageError
+from barpc.base.geodesy import Array
+from barpc.base.options import TieOptions
+from barpc.rasters.raster import open_raster
 from barpc.scene import BoolArray
 
 FloatImage = npt.NDArray[np.float32]

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from barpc.geodesy import NEWTON_STEPS, Array, metres_per_unit
+from barpc.base.geodesy import NEWTON_STEPS, Array, metres_per_unit
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
 from barpc.tie.pairing.overlaps import Terrain

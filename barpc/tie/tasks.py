@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from barpc import identity
-from barpc.errors import InputError
-from barpc.frozen import Arrays, load_npz, replacing
+from barpc.base import identity
+from barpc.base.atomic import replacing
+from barpc.base.errors import InputError
+from barpc.base.frozen import Arrays, load_npz
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage, how much is done, of how much."""

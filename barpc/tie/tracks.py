@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from barpc.errors import TiePointError
-from barpc.geodesy import Array, ground_from_ecef
-from barpc.options import TieOptions
+from barpc.base.errors import TiePointError
+from barpc.base.geodesy import Array, ground_from_ecef
+from barpc.base.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
 from barpc.tie.matchers.features import THIN, KeypointFiles, locate, worth_a_first_look

@@ -17,9 +17,9 @@ import numpy as np
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parents[1]))
 
-from barpc.dem import Dem  # noqa: E402
-from barpc.options import RunOptions  # noqa: E402
+from barpc.base.options import RunOptions  # noqa: E402
 from barpc.pipeline import adjust  # noqa: E402
+from barpc.rasters.dem import Dem  # noqa: E402
 from barpc.tie.patches.channels import Patch, Sheet, _picture  # noqa: E402
 from tests.scenes import ImageOptions, Scene, write_scene  # noqa: E402
 from tests.scenes.season import other_season, write_dem, write_reference  # noqa: E402

@@ -18,8 +18,8 @@ from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.judging import agreement as sets
 from barpc.ba.judging.agreement import Agreement, Offsets, agreement, offsets_of
 from barpc.ba.judging.snooping import ControlTest
-from barpc.geodesy import enu_basis
-from barpc.options import RunOptions
+from barpc.base.geodesy import enu_basis
+from barpc.base.options import RunOptions
 from barpc.report import Run, summarize
 from barpc.report.digest import decisions
 from barpc.scene import GroundPoints

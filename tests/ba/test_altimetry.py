@@ -18,8 +18,8 @@ import pytest
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, altimetry
 from barpc.ba.held import registration
 from barpc.ba.held.registration import NEIGHBOURS, Given, Registration, Surface, displacement, register
+from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.cameras import open_camera
-from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import Altimetry, GroundPoints, Tracks, View
 from barpc.sensor.corrected import Corrected, Correction
 from tests.lanes import rest_slow
@@ -271,7 +271,7 @@ def test_heights_that_contradict_control_points_are_not_used(scene: Any):
 @pytest.mark.slow
 def test_heights_and_a_terrain_hold_together(scene: Any):
     """A terrain 3 m too high with 5 m stated does not move what the heights know."""
-    from barpc.options import AdjustOptions
+    from barpc.base.options import AdjustOptions
 
     views, tracks, true = scene
 

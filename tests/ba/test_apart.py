@@ -12,7 +12,7 @@ import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, adjustment, apart
 from barpc.ba.apart import find_apart
-from barpc.errors import AdjustError
+from barpc.base.errors import AdjustError
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.rpc import RPC

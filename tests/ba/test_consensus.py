@@ -14,7 +14,7 @@ from barpc.ba.held.block import join
 from barpc.ba.held.starting import make_problem
 from barpc.ba.robust.consensus import TwoGroups, _across, _mixture, _on_one_plane, agreeing, two_groups
 from barpc.ba.solving.problem import Problem
-from barpc.geodesy import ecef_from_ground
+from barpc.base.geodesy import ecef_from_ground
 from barpc.simulate import simulate_block
 from tests import distributions as stats
 from tests.ba.conftest import centers_of

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.ba import check_residuals, split_points
-from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import GroundPoints
 from barpc.sensor.corrected import Corrected
 from barpc.simulate import simulate_block

@@ -9,7 +9,7 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.ba.held.datum import SOURCES
-from barpc.geodesy import enu_basis, ground_from_ecef
+from barpc.base.geodesy import enu_basis, ground_from_ecef
 from barpc.report import Run, summarize
 from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block

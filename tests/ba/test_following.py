@@ -20,7 +20,7 @@ from barpc.ba.judging.explanations import FADE, STRIP, SWING
 from barpc.ba.judging.following import _given_edges, _spline_counts, _with_edges, follow
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.geodesy import ecef_from_ground
+from barpc.base.geodesy import ecef_from_ground
 from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of
 

@@ -18,8 +18,8 @@ from barpc.ba.estimated.waves import Waves
 from barpc.ba.held import ground as on_points
 from barpc.ba.held.ground import flat_heights, ground_control, reference_control, staying, terrain_heights
 from barpc.ba.robust.weights import LOSSES
-from barpc.geodesy import ecef_from_ground, ground_from_ecef
-from barpc.options import AUTO, Model
+from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
+from barpc.base.options import AUTO, Model
 from barpc.scene import GroundPoints, Reference, View
 from barpc.sensor.corrected import Corrected
 from barpc.simulate import simulate_block

@@ -22,9 +22,9 @@ from barpc.ba.held.ground import (
     reference_control,
     terrain_heights,
 )
-from barpc.errors import BarpcWarning
-from barpc.geodesy import ecef_from_ground
-from barpc.options import AdjustOptions
+from barpc.base.errors import BarpcWarning
+from barpc.base.geodesy import ecef_from_ground
+from barpc.base.options import AdjustOptions
 from barpc.scene import GroundPoints, Reference
 from barpc.sensor.pushbroom import Pushbroom
 

@@ -23,8 +23,8 @@ from barpc.ba.robust.heldout import (
     scatter,
     split_points,
 )
-from barpc.errors import InputError
-from barpc.geodesy import ecef_from_ground, enu_basis
+from barpc.base.errors import InputError
+from barpc.base.geodesy import ecef_from_ground, enu_basis
 from barpc.scene import GroundPoints
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import triangulate

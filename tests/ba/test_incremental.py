@@ -12,7 +12,7 @@ import scipy.sparse as sp
 
 from barpc.ba.estimated.priors import CameraPrior, EarlierScene
 from barpc.ba.held.incremental import BlockPrior, apply_prior, block_prior
-from barpc.errors import InputError
+from barpc.base.errors import InputError
 from barpc.simulate import simulate_block
 from tests.ba.conftest import solve
 

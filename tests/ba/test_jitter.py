@@ -11,7 +11,7 @@ import pytest
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.estimated.waves import Waves
 from barpc.ba.held.incremental import BlockPrior, block_prior
-from barpc.errors import InputError
+from barpc.base.errors import InputError
 from barpc.fit import fit_rpc
 from barpc.sensor.splined import Splined
 from benchmarks.referee import cases, judge, make, solve

@@ -12,7 +12,7 @@ from barpc.ba.algebra.dissection import dissect
 from barpc.ba.algebra.multifrontal import Blocks
 from barpc.ba.algebra.structure import counting_sort
 from barpc.ba.solving import normal
-from barpc.errors import AdjustError
+from barpc.base.errors import AdjustError
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import solve as adjust
 

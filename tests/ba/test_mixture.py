@@ -12,8 +12,8 @@ from barpc.ba.evidence.linearised import Linear, Tracks, linearise
 from barpc.ba.evidence.mixture import Fit, fit, log_likelihoods, off_from_right
 from barpc.ba.held.block import join
 from barpc.ba.held.starting import first_state, make_problem
-from barpc.geodesy import Array
-from barpc.options import AdjustOptions
+from barpc.base.geodesy import Array
+from barpc.base.options import AdjustOptions
 from barpc.simulate import simulate_block
 from tests.distributions import multivariate_normal
 

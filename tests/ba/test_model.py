@@ -17,8 +17,8 @@ from barpc.ba.judging import solution as solved
 from barpc.ba.judging.judge import Judgement
 from barpc.ba.judging.solution import Solution
 from barpc.ba.robust.rounds import Outcome
-from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
-from barpc.geodesy import ground_from_ecef
+from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
+from barpc.base.geodesy import ground_from_ecef
 from barpc.scene import GroundPoints, Tracks
 from barpc.sensor.corrected import ImageAffine, ImageCorrected
 from barpc.sensor.geometry import triangulate

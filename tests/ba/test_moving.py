@@ -22,7 +22,7 @@ from barpc.ba.judging.moving import CELLS, Ground, group_of
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.ba.standing import Parts
-from barpc.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
+from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
 from barpc.scene import BoolArray, Tracks
 from barpc.sensor.corrected import Corrected
 from barpc.simulate import Block, simulate_block

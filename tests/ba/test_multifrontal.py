@@ -20,8 +20,8 @@ from barpc.ba.held.incremental import BlockPrior
 from barpc.ba.held.starting import make_problem
 from barpc.ba.solving import normal
 from barpc.ba.solving.solve import camera_step
-from barpc.geodesy import ecef_from_ground
-from barpc.options import AdjustOptions
+from barpc.base.geodesy import ecef_from_ground
+from barpc.base.options import AdjustOptions
 from barpc.scene import GroundPoints, Tracks
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import INDEPENDENT, centers_of

@@ -14,8 +14,8 @@ import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.ba.estimated.priors import prior_sigmas, stated_accuracy
-from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
-from barpc.geodesy import ground_from_ecef
+from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
+from barpc.base.geodesy import ground_from_ecef
 from barpc.scene import Tracks
 from barpc.sensor.geometry import camera_center
 from barpc.simulate import Block, simulate_block

@@ -10,7 +10,7 @@ import pytest
 
 from barpc.ba import placing
 from barpc.ba.placing import Placed, _half, _Sight, known_points, look, median_noise
-from barpc.geodesy import ecef_from_ground, enu_basis
+from barpc.base.geodesy import ecef_from_ground, enu_basis
 from tests.distributions import chi2
 
 XY = np.random.default_rng(1).uniform(0.0, 900.0, (2, 80))

@@ -10,9 +10,9 @@ import pytest
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.ba.held.gauge import MOTIONS
 from barpc.ba.held.incremental import BlockPrior
+from barpc.base.geodesy import enu_basis, metres_per_unit
+from barpc.base.options import RunOptions
 from barpc.fit import fit_rpc
-from barpc.geodesy import enu_basis, metres_per_unit
-from barpc.options import RunOptions
 from barpc.report import Run, summarize
 from barpc.report.records import plain
 from barpc.scene import GroundPoints, Tracks

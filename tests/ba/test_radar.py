@@ -13,8 +13,8 @@ from barpc.ba import Adjustment, AdjustOptions, BlockPrior, adjust_tracks, block
 from barpc.ba.estimated.priors import prior_sigmas
 from barpc.ba.estimated.projected import Cameras
 from barpc.ba.estimated.unknowns import make_unknowns
-from barpc.errors import InputError
-from barpc.geodesy import (
+from barpc.base.errors import InputError
+from barpc.base.geodesy import (
     SPEED_OF_LIGHT,
     Array,
     ecef_from_ground,

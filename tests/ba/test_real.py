@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
-from barpc.dem import Dem
-from barpc.errors import BarpcWarning
-from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.base.errors import BarpcWarning
+from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.pointio.correspondences import read_gcps
+from barpc.rasters.dem import Dem
 from barpc.rpcio import read_rpc
 from barpc.scene import GroundPoints, Tracks, View
 from barpc.sensor.geometry import altitude_range, epipolar_offset, triangulate

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, check_residuals, split_points
-from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
-from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
+from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import Tracks
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import triangulate

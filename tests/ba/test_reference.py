@@ -10,7 +10,7 @@ import pytest
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.estimated.priors import prior_sigmas
 from barpc.ba.held.ground import ALIKE, reference_control
-from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
+from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.scene import GroundPoints, Reference
 from barpc.simulate import simulate_block
 from tests.lanes import rest_slow

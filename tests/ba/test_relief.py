@@ -11,7 +11,7 @@ import pytest
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.held.ground import Heights
 from barpc.ba.held.terrain import NUM_BENDS, Bands, Believed, Relief, believe, bends
-from barpc.dem import Dem
+from barpc.rasters.dem import Dem
 from benchmarks.worlds import judge
 from benchmarks.worlds_families import make
 from tests.lanes import rest_slow

@@ -14,8 +14,8 @@ from barpc.ba.held.block import join
 from barpc.ba.held.ground import ALIKE
 from barpc.ba.robust.resembling import Resemblance
 from barpc.ba.robust.smooth import TERMS, Smooth
-from barpc.geodesy import metres_per_unit
-from barpc.options import AdjustOptions
+from barpc.base.geodesy import metres_per_unit
+from barpc.base.options import AdjustOptions
 from barpc.scene import GroundPoints, Reference, Tracks
 from barpc.simulate import simulate_block
 from tests.lanes import rest_slow

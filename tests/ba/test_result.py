@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, adjustment, pair_heights
-from barpc.geodesy import enu_basis, ground_from_ecef
+from barpc.base.geodesy import enu_basis, ground_from_ecef
 from barpc.sensor.geometry import triangulate
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import solve

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
+from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
 from barpc.fit import fit_rpc
-from barpc.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
 from barpc.scene import Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction

@@ -12,8 +12,8 @@ import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, adjustment
 from barpc.ba.judging.snooping import CRITICAL, ControlTest, _together
-from barpc.geodesy import ecef_from_ground, enu_basis, metres_per_unit
-from barpc.options import RunOptions
+from barpc.base.geodesy import ecef_from_ground, enu_basis, metres_per_unit
+from barpc.base.options import RunOptions
 from barpc.report import Run, summarize
 from barpc.report.summary.known import GcpEntry
 from barpc.scene import GroundPoints

@@ -10,7 +10,7 @@ import pytest
 
 from barpc.ba.solving import solve
 from barpc.ba.solving.solve import Minimum, State, _settled
-from barpc.errors import AdjustError
+from barpc.base.errors import AdjustError
 
 STATE = State(np.zeros((1, 2)), np.zeros((1, 3)), history=(7.0,))
 FACTOR = object()

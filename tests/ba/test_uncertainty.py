@@ -11,8 +11,8 @@ from scipy.special import chdtri, ndtr
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior, pair_heights
 from barpc.ba.estimated.priors import DRIFT_SIGMA
 from barpc.ba.held.incremental import BlockPrior
-from barpc.errors import InputError
-from barpc.geodesy import ecef_from_ground, enu_basis
+from barpc.base.errors import InputError
+from barpc.base.geodesy import ecef_from_ground, enu_basis
 from barpc.scene import Tracks
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import centers_of, solve

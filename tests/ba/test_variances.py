@@ -17,8 +17,8 @@ from barpc.ba.held.block import join
 from barpc.ba.held.starting import make_problem
 from barpc.ba.robust.variances import PriorTest, Variances, _Around, same_prior
 from barpc.ba.solving.solve import State, minimise
-from barpc.errors import BarpcWarning
-from barpc.geodesy import ecef_from_ground
+from barpc.base.errors import BarpcWarning
+from barpc.base.geodesy import ecef_from_ground
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import centers_of, solve
 from tests.distributions import chi2

@@ -16,7 +16,7 @@ from barpc.ba.robust import rounds
 from barpc.ba.robust.rounds import _robust
 from barpc.ba.robust.smooth import SPLINES
 from barpc.ba.robust.weights import LOSSES, MEDIAN, Observations
-from barpc.options import AdjustOptions
+from barpc.base.options import AdjustOptions
 from tests import distributions as stats
 
 

@@ -13,12 +13,12 @@ import pytest
 import rasterio
 from rasterio.windows import Window
 
+from barpc.base.errors import InputError, OutputError
 from barpc.cameras import Camera, open_camera
 from barpc.cli import convert as module
 from barpc.cli.convert import _check, _shadow_reasons, _tell, _window, box_of, check_target, window_of
-from barpc.errors import InputError, OutputError
 from barpc.fit.certificate import Sample
-from barpc.handoff import Reading
+from barpc.pipeline.handoff import Reading
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from tests.cli.test_main import run
 from tests.rpcio.conftest import make_rpc, write_image

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from barpc.base.errors import InputError
 from barpc.cli import main
 from barpc.cli.flags import expanded
-from barpc.errors import InputError
 from barpc.rpcio import write_rpc, write_rpc_copy
 from tests.rpcio.conftest import make_rpc, write_image
 

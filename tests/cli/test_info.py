@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from barpc.base.errors import InputError, RpcError
 from barpc.cameras import open_camera
 from barpc.cli import info as module
 from barpc.cli.info import _altitude, _describe, _lines, _outlines, _pairs
-from barpc.errors import InputError, RpcError
 from barpc.rpcio import write_rpc
 from barpc.sensor.rpc import RPC
 from tests.cli.test_main import run

@@ -14,9 +14,9 @@ from collections.abc import Callable
 import click
 import pytest
 
+from barpc.base.errors import BarpcWarning, InputError
 from barpc.cli.main import COMMANDS, Verbs, _interruptible, _log_warning, _told, cli, main
 from barpc.cli.terminal import THREADS
-from barpc.errors import BarpcWarning, InputError
 
 
 def run(*args: str) -> int:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.cameras import open_camera
-from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.rpcio import read_rpc, write_rpc_copy
 from barpc.sensor.geometry import triangulate
 from tests.cli.test_main import run

@@ -10,11 +10,11 @@ import click
 import pytest
 from click.testing import CliRunner
 
+from barpc.base.errors import InputError
+from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions
 from barpc.cli.adjust import adjust
 from barpc.cli.flags import _jobs, field_of, flag, flag_name, image_paths, run_options
 from barpc.cli.main import cli
-from barpc.errors import InputError
-from barpc.options import AdjustOptions, FitOptions, RunOptions, TieOptions
 
 
 def given(target: str, *words: str) -> Any:

@@ -10,9 +10,9 @@ import click
 import numpy as np
 import pytest
 
+from barpc.base.errors import InputError
 from barpc.cli import project as module
 from barpc.cli.project import _print_points, _tell_failures, given_points
-from barpc.errors import InputError
 from barpc.rpcio import write_rpc
 from barpc.sensor.rpc import RPC
 from tests.cli.test_main import run

@@ -13,9 +13,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from barpc.base.errors import InputError
 from barpc.cli import terminal as module
 from barpc.cli.terminal import MINUTE, THREADS, Lines, executor_for, progress_told
-from barpc.errors import InputError
 
 
 class Told:

@@ -15,7 +15,7 @@ import pytest
 
 from barpc.cli import main
 from barpc.cli.terminal import Lines, progress_told
-from barpc.raster import open_raster
+from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.sensor.geometry import base_to_height, triangulate
 from tests.rpcio.conftest import dimap_v2, make_rpc, write_image
@@ -373,7 +373,7 @@ def test_convert_names_what_hides_the_rpc_beside_the_input_and_in_the_new_folder
 
 
 def test_convert_reports_a_file_that_a_tool_cannot_read_as_valid_json(image, tmp_path, capsys, monkeypatch):
-    from barpc import handoff
+    from barpc.pipeline import handoff
 
     def broken(path):
         raise RuntimeError("no such\nfield")

@@ -123,7 +123,7 @@ def test_a_miss_writes_nothing_unless_told_to(source: str, tmp_path: Path, capsy
 def test_altitudes_come_from_a_dem_and_its_margin_unless_they_are_given(
     source: str, fitted: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from barpc.dem import Dem
+    from barpc.rasters.dem import Dem
 
     asked = list[Any]()
 
@@ -202,7 +202,7 @@ def test_a_millionth_of_a_pixel_is_the_bound(
 ) -> None:
     image = write_image(tmp_path / "i.tif", shape=(1, 40, 60))
     write_rpc(make_rpc().crop(900, 900), tmp_path / "i.RPB")
-    monkeypatch.setattr("barpc.handoff.difference", lambda *_: far)
+    monkeypatch.setattr("barpc.pipeline.handoff.difference", lambda *_: far)
     assert run("check", str(image), "--against", str(tmp_path / "i.RPB")) == code
 
 

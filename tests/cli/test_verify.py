@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from barpc import adjust
-from barpc.options import RunOptions
+from barpc.base.options import RunOptions
 from barpc.rpcio import read_rpc, write_rpc
 from tests.reliability.conftest import barpc
 from tests.reliability.trials import SAMPLES, crop

@@ -13,8 +13,8 @@ import pytest
 from click.testing import CliRunner
 
 import barpc
+from barpc.base.options import RunOptions, TieOptions
 from barpc.cli.main import cli
-from barpc.options import RunOptions, TieOptions
 from tests.docs.pages import DOCS
 
 PAGE = (DOCS / "recipes/cluster.md").read_text(encoding="utf-8")

@@ -9,8 +9,8 @@ from pathlib import Path
 import click
 import pytest
 
+from barpc.base.options import read_options
 from barpc.cli.main import COMMANDS, cli
-from barpc.options import read_options
 from tests.docs.pages import DOCS, PAGES, ROOT, blocks
 
 PRESENT = [page for page in PAGES if page.name != "CHANGELOG.md"]

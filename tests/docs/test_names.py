@@ -11,8 +11,8 @@ from typing import Any
 import click
 import pytest
 
+from barpc.base.options import RunOptions, declared
 from barpc.cli.main import COMMANDS, cli
-from barpc.options import RunOptions, declared
 from barpc.report.summary import published_schema
 from tests.docs.pages import DOCS, PAGES, ROOT, blocks
 

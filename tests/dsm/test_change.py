@@ -9,11 +9,11 @@ import pytest
 import rasterio
 
 from barpc.ba import adjust_tracks, block_prior
+from barpc.base.geodesy import ground_from_ecef
+from barpc.base.options import AdjustOptions, DsmOptions
 from barpc.cli import main
 from barpc.dsm import make_dsm
 from barpc.dsm.sigma import CameraErrors
-from barpc.geodesy import ground_from_ecef
-from barpc.options import AdjustOptions, DsmOptions
 from barpc.pipeline import adjust
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import triangulate

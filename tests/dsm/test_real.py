@@ -10,12 +10,12 @@ import pytest
 import rasterio
 
 from barpc.ba.result import pair_heights
+from barpc.base.errors import InputError
+from barpc.base.geodesy import ground_from_ecef
+from barpc.base.options import DsmOptions
 from barpc.cli import main
 from barpc.dsm import make_dsm
 from barpc.dsm.imagery import block_of_run
-from barpc.errors import InputError
-from barpc.geodesy import ground_from_ecef
-from barpc.options import DsmOptions
 from barpc.pipeline import adjust
 from barpc.report.summary.words import metres
 from barpc.report.tables import read_summary, read_tables

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from barpc.base.options import DsmOptions
 from barpc.cli import main
 from barpc.dsm import make_dsm
-from barpc.options import DsmOptions
 from barpc.pipeline import adjust
 from barpc.report.tables import SURFACE
 from tests.dsm.conftest import ALTS
@@ -100,6 +100,6 @@ def test_a_finished_run_whose_surface_was_killed_stays_finished(rendered, tmp_pa
 
 
 def overwritten():
-    from barpc.options import RunOptions
+    from barpc.base.options import RunOptions
 
     return RunOptions(overwrite=True)

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import rasterio
 
+from barpc.base.errors import InputError, OutputError
+from barpc.base.options import DsmOptions
 from barpc.cli import main
 from barpc.dsm import NoSurfaceError, make_dsm
 from barpc.dsm import cells as cells_module
@@ -16,8 +18,6 @@ from barpc.dsm import grid as surface_module
 from barpc.dsm.cells import Tile
 from barpc.dsm.imagery import _best, block_of_images
 from barpc.dsm.relief import draped
-from barpc.errors import InputError, OutputError
-from barpc.options import DsmOptions
 from barpc.pipeline import load_views
 from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import ImageAffine, ImageCorrected

@@ -13,8 +13,8 @@ import pytest
 import rasterio
 from scipy.spatial.transform import Rotation
 
+from barpc.base.errors import InputError, OutputError
 from barpc.cli import main
-from barpc.errors import InputError, OutputError
 from barpc.export import TARGETS, export_run, pinholes
 from barpc.rpcio import read_rpc, write_rpc_copy
 from barpc.rpcio.sources import light_of
@@ -216,7 +216,7 @@ def test_points_come_with_the_covariance_of_their_rays(southern, tmp_path):
     rng, track = np.random.default_rng(3), rows[7]["track"]
     seen = [r for r in rows_of(southern / "tables/observations.csv") if r["track"] == track]
     noise = float(comment.split("noise ")[1].split(" px")[0])
-    from barpc.geodesy import ecef_from_ground, enu_basis
+    from barpc.base.geodesy import ecef_from_ground, enu_basis
     from barpc.sensor.geometry import triangulate
 
     models = [read_rpc(southern / f"{r['view']}_RPC.TXT") for r in seen if r["used"] == "1"]

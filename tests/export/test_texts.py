@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.errors import InputError
+from barpc.base.errors import InputError
+from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.export import files as made_of
 from barpc.export import pinholes
 from barpc.export import shots as scene
 from barpc.export.shots import Sampled, Scene, pairs_of, read_scene, relative_link
-from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.rpcio import read_rpc
 from barpc.rpcio.sources import Sunlight
 from barpc.sensor.geometry import camera_center, image_grid

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from barpc.errors import BarpcError
-from barpc.geodesy import Array, ecef_from_ground
-from barpc.raster import open_raster
+from barpc.base.errors import BarpcError
+from barpc.base.geodesy import Array, ecef_from_ground
+from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import altitude_range, camera_center

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.simulate import Look, fly
 
 

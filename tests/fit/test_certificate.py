@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from barpc.errors import BarpcWarning, FitError
+from barpc.base.errors import BarpcWarning, FitError
 from barpc.fit import FitOptions, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit.certificate import CELLS, Sample
 from barpc.fit.poles import Region, smallest_denominator

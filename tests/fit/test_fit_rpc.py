@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.errors import BarpcWarning, FitError
+from barpc.base.errors import BarpcWarning, FitError
+from barpc.base.geodesy import Array
 from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
 from barpc.fit.points import control_points
 from barpc.fit.system import PRECISIONS
-from barpc.geodesy import Array
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.sensor.rpc import RPC
 from barpc.simulate import Look, fly

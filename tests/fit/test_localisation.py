@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.errors import FitError, RpcFormatError
+from barpc.base.errors import FitError, RpcFormatError
+from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.fit import FitOptions, RpcFit, fit_rpc, fit_rpc_points
-from barpc.geodesy import Array, ecef_from_ground
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.sensor.rpc import RPC
 from tests.fit.cameras import Camera, random_points, synthetic

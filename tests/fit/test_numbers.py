@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.errors import FitError
+from barpc.base.errors import FitError
 from barpc.fit.points import checked_points, column_ranges, screened, spaced, widened
 
 RNG = np.random.default_rng(0)

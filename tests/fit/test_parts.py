@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from barpc.errors import BarpcWarning, FitError
+from barpc.base.errors import BarpcWarning, FitError
+from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit import methods as solve_module
 from barpc.fit import refit as fit_module
@@ -21,7 +22,6 @@ from barpc.fit.points import control_points
 from barpc.fit.poles import Region, smallest_denominator
 from barpc.fit.refit import _plainer, inverse, underlying_rpc
 from barpc.fit.system import PRECISIONS, FitProblem, solution
-from barpc.geodesy import Array, ecef_from_ground
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 from tests.fit.cameras import Camera, random_points, synthetic, synthetic_rpc

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from barpc.errors import FitError, InputError, RpcError
+from barpc.base.errors import FitError, InputError, RpcError
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit import refit as fit_module
 from barpc.fit.certificate import Errors, coverage, roundtrip

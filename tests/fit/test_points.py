@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.errors import FitError
+from barpc.base.errors import FitError
+from barpc.base.geodesy import Array
 from barpc.fit import FitOptions, fit_rpc_points
-from barpc.geodesy import Array
 from barpc.pointio.correspondences import read_correspondences
 from barpc.rpcio import read_rpc
 from tests.fit.cameras import Camera, random_points, synthetic

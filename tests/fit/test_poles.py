@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, minimize
 
+from barpc.base.geodesy import Array
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.fit.poles import FLOOR, Region, bounded
 from barpc.fit.system import ALL, Compressed
-from barpc.geodesy import Array
 from barpc.sensor.rpc import RPC
 from tests.fit.models import Bent, pushbroom
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barpc import open_camera
-from barpc.errors import FitError
+from barpc.base.errors import FitError
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from tests.fit.models import Bent, Frame, bump, pushbroom, waves
 from tests.lanes import rest_slow

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from barpc.base.geodesy import Array
 from barpc.fit import Normalization
 from barpc.fit.methods import _reweighted, corner
 from barpc.fit.system import ALL, PRECISIONS, Compressed, FitProblem, expected_size, noise_scaled, solution
-from barpc.geodesy import Array
 from tests.fit.cameras import Camera, random_points
 
 

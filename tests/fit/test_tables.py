@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.errors import InputError
+from barpc.base.errors import InputError
 from barpc.pointio.correspondences import correspondence_kind, read_correspondences
 
 ROWS = np.array([[5.4, 43.2, 100.0, 10.5, 20.25], [5.5, 43.3, 120.5, 11.0, 21.0]])

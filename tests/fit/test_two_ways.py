@@ -10,7 +10,7 @@ import pytest
 import rasterio
 from rasterio.transform import RPCTransformer
 
-from barpc.errors import FitError
+from barpc.base.errors import FitError
 from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
 from barpc.rpcio import read_rpc
 from tests.fit.cameras import synthetic_rpc

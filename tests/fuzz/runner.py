@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from barpc.errors import BarpcError
+from barpc.base.errors import BarpcError
 
 from .ends import mutate_ends
 from .mutate import mutate_bytes

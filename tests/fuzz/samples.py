@@ -18,18 +18,18 @@ import rasterio
 from barpc.ba import BlockPrior
 from barpc.ba.estimated.priors import CameraPrior
 from barpc.ba.held.incremental import apply_prior
+from barpc.base.errors import RpcError
+from barpc.base.frozen import from_arrays, load_npz, to_arrays
+from barpc.base.options import read_options
 from barpc.cameras import open_camera
 from barpc.cli.flags import image_paths
 from barpc.cli.project import given_points
 from barpc.cli.terminal import print_comparison
-from barpc.dem import Dem
-from barpc.errors import RpcError
 from barpc.export import export_run
-from barpc.frozen import from_arrays, load_npz, to_arrays
-from barpc.options import read_options
 from barpc.pipeline.inputs import read_pairs
 from barpc.pointio.correspondences import read_correspondences, read_gcps
 from barpc.pointio.matches import read_matches
+from barpc.rasters.dem import Dem
 from barpc.report.compare import compare_runs
 from barpc.report.page import report_html
 from barpc.report.tables import read_summary
@@ -422,7 +422,7 @@ AREA = (
 OPTIONS = (
     b'images = "none"\nrpc_formats = ["txt", "rpb"]\ntiles = 512\nkeep_going = true\ngcp = ["a.gcp"]\n'
     b'[tie]\nband = 2\nangles = [1, 40.5]\nmatcher = "guided"\n[adjust]\nmodel = "rotation"\nfixed = ["left"]\n'
-    b"sigma_attitude = 3.0\nview_weights = {left = 0.5}\n[fit]\ngrid = [12, 12, 7]\ntolerance = 1e-3\n"
+    b"sigma_attitude = 3.0\nfixed = [\"left\"]\n[fit]\ngrid = [12, 12, 7]\ntolerance = 1e-3\n"
 )
 ASP_GCPS = (
     b"# WGS84\n1 43.2 5.4 120.5 1 1 1 left.tif 10.5 20.25 0.5 0.5 right.tif 30 40 0.5 0.5\n"

@@ -19,13 +19,13 @@ from unittest import mock
 import numpy as np
 
 from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior
-from barpc.errors import BarpcError
+from barpc.base.errors import BarpcError
+from barpc.base.options import AdjustOptions, FitOptions, Rule, declared, read_options
+from barpc.base.remote import Remote, hosts
+from barpc.base.sidefile import IMAGE, RPC_FILE, read_bytes, read_head, versioned
 from barpc.fit import fit_rpc
-from barpc.options import AdjustOptions, FitOptions, Rule, declared, read_options
 from barpc.pointio.matches import read_matches
-from barpc.raster import open_raster
-from barpc.remote import Remote, hosts
-from barpc.sidefile import IMAGE, RPC_FILE, read_bytes, read_head, versioned
+from barpc.rasters.raster import open_raster
 from barpc.simulate import Block, simulate_block
 from tests.pointio.test_foreign import hloc
 from tests.rpcio.conftest import make_rpc, write_image
@@ -346,7 +346,7 @@ def mutate_answer(data: bytes, rng: Rng) -> bytes:
 def _use_answer(path: Path) -> object:
     import os
 
-    from barpc import remote
+    from barpc.base import remote
 
     server = _server(os.getpid())
     server.data = path.read_bytes()

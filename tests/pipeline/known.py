@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.geodesy import ecef_from_ground, enu_basis
+from barpc.base.geodesy import ecef_from_ground, enu_basis
 from barpc.sensor.geometry import triangulate
 from tests.reliability.trials import SAMPLES, crop
 

@@ -10,8 +10,8 @@ import pytest
 import rasterio
 
 from barpc.ba import adjust_tracks
-from barpc.geodesy import enu_basis, ground_from_ecef, metres_per_unit
-from barpc.options import RunOptions
+from barpc.base.geodesy import enu_basis, ground_from_ecef, metres_per_unit
+from barpc.base.options import RunOptions
 from barpc.pipeline import adjust
 from barpc.scene import Altimetry
 
@@ -81,7 +81,7 @@ def along_tracks(swept: Any, seed: int) -> Altimetry:
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
+@pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")
 def test_real_images_are_placed_by_heights_within_what_is_said(swept):
     """About a metre flat and 0.1 m up; without leaving parts out what was said was half of that."""
     run = swept[0]

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import barpc
-from barpc.options import RunOptions, TieOptions
+from barpc.base.options import RunOptions, TieOptions
 from barpc.pipeline import executor as cluster
 from barpc.pipeline.executor import run_batch
 

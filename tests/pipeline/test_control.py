@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.errors import InputError
-from barpc.options import RunOptions, TieOptions
+from barpc.base.errors import InputError
+from barpc.base.options import RunOptions, TieOptions
 from barpc.pipeline import inputs as control
 from barpc.pipeline.inputs import load_gcps
 from barpc.pointio.correspondences import GROUND_SIGMA, IMAGE_SIGMA

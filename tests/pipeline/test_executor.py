@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from barpc import __version__
-from barpc.errors import AdjustError, ImageError, OutputError
-from barpc.identity import Input
+from barpc.base.errors import AdjustError, ImageError, OutputError
+from barpc.base.identity import Input
 from barpc.pipeline.executor import LARGE, CachingExecutor, Spilled, run_batch, worker_count
 from barpc.workspace import Workspace
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.errors import InputError
+from barpc.base.errors import InputError
 from barpc.pipeline import RunOptions, adjust, check
 from barpc.pipeline.inputs import given_matches, given_tracks
 from barpc.pipeline.loading import load_views
@@ -150,7 +150,7 @@ def test_several_files_are_one(tmp_path) -> None:
 MODULE = """
 import cv2, numpy as np
 from pathlib import Path
-from barpc.raster import open_raster
+from barpc.rasters.raster import open_raster
 def match(a, b, prediction):
     Path(__file__).with_name("called").write_text("yes")
     found = []

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from barpc.base.errors import FitError, ImageError, OutputError
+from barpc.base.options import RunOptions
 from barpc.cameras import open_camera
 from barpc.cli.main import cli
-from barpc.errors import FitError, ImageError, OutputError
 from barpc.fit import FitOptions, RpcFit, fit_rpc
-from barpc.options import RunOptions
 from barpc.pipeline import adjust, check
 from barpc.pipeline import beyond as grids
 from barpc.pipeline.beyond import CORRECTION, GRID, RESAMPLED, grid_names, write_grids

@@ -14,9 +14,9 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
 from barpc import report
-from barpc.errors import BarpcError
-from barpc.geodesy import ground_from_ecef
-from barpc.options import RunOptions
+from barpc.base.errors import BarpcError
+from barpc.base.geodesy import ground_from_ecef
+from barpc.base.options import RunOptions
 from barpc.pipeline import adjust, load_views, outputs, run
 from barpc.pipeline import loading as views
 from barpc.pointio.matches import write_matches

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from barpc.errors import InputError
-from barpc.identity import Stamp, take
-from barpc.options import RunOptions, TieOptions
+from barpc.base.errors import InputError
+from barpc.base.identity import Stamp, take
+from barpc.base.options import RunOptions, TieOptions
+from barpc.base.remote import Remote
 from barpc.pipeline import inputs as hashed
 from barpc.pipeline.inputs import hash_files, hash_inputs
-from barpc.remote import Remote
 from tests.rpcio.conftest import write_image
 
 AT = Remote("https://a.org/x.tif", 10, "one")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.errors import DisconnectedError, InputError
+from barpc.base.errors import DisconnectedError, InputError
 from barpc.pipeline import RunOptions, adjust
 from barpc.pipeline.inputs import only_new
 from barpc.pointio.matches import read_matches

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from barpc.errors import ImageError, MissingRpcError
+from barpc.base.errors import ImageError, MissingRpcError
 from barpc.pipeline import load_views
 from barpc.rpcio import write_rpc_copy
 from tests.rpcio.conftest import make_rpc, write_image

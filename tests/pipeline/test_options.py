@@ -13,13 +13,13 @@ from rasterio import Affine
 from scipy.interpolate import NearestNDInterpolator
 
 from barpc.ba import AdjustOptions
-from barpc.errors import BarpcError, BarpcWarning, FitError, InputError, OutputError
+from barpc.base.errors import BarpcError, BarpcWarning, FitError, InputError, OutputError
+from barpc.base.geodesy import ground_from_ecef
 from barpc.fit import FitOptions
-from barpc.geodesy import ground_from_ecef
 from barpc.pipeline import AdjustResult, RunOptions, adjust
 from barpc.tie import TieOptions
 from tests.pipeline.known import part
-from tests.test_dem import write_dem, write_geoid
+from tests.rasters.test_dem import write_dem, write_geoid
 
 SIDE = 160  # px of an image
 
@@ -260,7 +260,7 @@ def dem(run: Run, out: Path, scene: Path) -> None:
         run("d", adjust=AdjustOptions(dem_for_weak=True))
 
 
-@pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
+@pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")
 def geoid(run: Run, out: Path, scene: Path) -> None:
     with_geoid = _held(run)
     with pytest.warns(BarpcWarning, match="geoid"):
@@ -341,7 +341,7 @@ ELSEWHERE = (
     "overlap_list", "aoi", "gcp", "check_points", "geoid", "grids", "allow_remote", "dem",
     "keep_going", "images", "matches", "reference", "tie",
 )  # fmt: skip
-"""Options whose fast tests stand in test_pairs_and_area, test_inputs, test_grids, tests/test_dem, tests/tie,
+"""Options whose fast tests stand in test_pairs_and_area, test_inputs, test_grids, tests/rasters/test_dem, tests/tie,
 tests/remote and tests/reliability, or beside them: matches_only, reference_sigma."""
 
 

@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc import handoff
-from barpc.errors import OutputError
+from barpc.base.errors import OutputError
+from barpc.base.options import RunOptions, TieOptions
 from barpc.fit import FitOptions, RpcFit, fit_rpc
-from barpc.handoff import CONSUMERS, Consumer, Reading, control_grid, difference, verify
-from barpc.options import RunOptions, TieOptions
-from barpc.pipeline import outputs
+from barpc.pipeline import handoff, outputs
+from barpc.pipeline.handoff import CONSUMERS, Consumer, Reading, control_grid, difference, verify
 from barpc.pipeline.inputs import PRIOR
 from barpc.pipeline.outputs import REOPENED, file_names, output_names, refuse_shadows, write_views
 from barpc.report.page import can_render

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.errors import DisconnectedError, InputError
-from barpc.geodesy import ground_from_ecef
+from barpc.base.errors import DisconnectedError, InputError
+from barpc.base.geodesy import ground_from_ecef
 from barpc.pipeline import RunOptions, adjust
 from barpc.pipeline.inputs import input_files, read_pairs
 from barpc.pipeline.loading import load_views

@@ -10,10 +10,10 @@ import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
+from barpc.base.errors import ImageError, InputError
+from barpc.base.geodesy import ecef_from_ground
+from barpc.base.options import RunOptions
 from barpc.cameras import open_camera
-from barpc.errors import ImageError, InputError
-from barpc.geodesy import ecef_from_ground
-from barpc.options import RunOptions
 from barpc.pipeline import adjust
 from barpc.pointio.matches import write_matches
 from barpc.rpcio import read_rpc, write_rpc

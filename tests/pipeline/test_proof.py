@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.errors import InputError
+from barpc.base.errors import InputError
 from barpc.pipeline import outputs as proof
 from barpc.pipeline.beyond import REOPENED
 from barpc.pipeline.outputs import CHANGED, GOOD, MISSING, MOVED, SAME, UNKNOWN, Proved, prove

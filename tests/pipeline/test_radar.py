@@ -10,8 +10,8 @@ import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
+from barpc.base.options import AdjustOptions, RunOptions
 from barpc.fit import fit_rpc
-from barpc.options import AdjustOptions, RunOptions
 from barpc.pipeline import adjust
 from barpc.pointio.matches import write_matches
 from barpc.rpcio import read_rpc, write_rpc

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.base.geodesy import ground_from_ecef
 from barpc.fit import fit_rpc
-from barpc.geodesy import ground_from_ecef
-from barpc.handoff import control_grid
+from barpc.pipeline.handoff import control_grid
 from barpc.rpcio import read_rpc
 from barpc.scene import Tracks, View
 from barpc.sensor.corrected import ImageAffine, ImageCorrected

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import rasterio
 
+from barpc.base.errors import InputError, TiePointError
+from barpc.base.options import RunOptions
 from barpc.cli import main
-from barpc.errors import InputError, TiePointError
-from barpc.options import RunOptions
 from barpc.pipeline import adjust
 from barpc.pointio.correspondences import read_gcps
 from barpc.rpcio import read_rpc
@@ -187,7 +187,7 @@ def coarser(path, step: float, folder):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
+@pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")
 @pytest.mark.parametrize(
     ("step", "most"),
     [
@@ -205,7 +205,7 @@ def test_a_real_image_comes_to_its_place_by_finer_and_coarser_references(quickbi
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
+@pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")
 def test_a_geoid_that_was_left_out_is_the_reason(quickbird):
     result, rms = quickbird(5.0)
     assert np.hypot(*rms) > 0.6
@@ -215,7 +215,7 @@ def test_a_geoid_that_was_left_out_is_the_reason(quickbird):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
+@pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")
 @pytest.mark.parametrize("wrong", rest_slow(["mirrored", "of another place", "one height"], mark=pytest.mark.nightly))
 def test_heights_of_another_terrain_under_a_reference_are_the_reason(quickbird, shared_data, tmp_path, wrong):
     """The image was placed 12-75 m off by them, at 1.25 m stated, exit code 0 or for jitter."""
@@ -239,7 +239,7 @@ def test_heights_of_another_terrain_under_a_reference_are_the_reason(quickbird, 
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
+@pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")
 def test_one_image_that_a_reference_does_not_show_is_told_so_and_not_to_loosen_the_matching(quickbird):
     with pytest.raises(TiePointError, match=r"the reference does not show what the images show \(its highest peak"):
         quickbird(60.0)

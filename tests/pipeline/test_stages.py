@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from rasterio import Affine
 
-from barpc.errors import BarpcWarning, FitError, InputError
+from barpc.base.errors import BarpcWarning, FitError, InputError
+from barpc.base.options import AdjustOptions, RunOptions
 from barpc.fit import FitOptions, fit_rpc
-from barpc.options import AdjustOptions, RunOptions
 from barpc.pipeline import inputs
 from barpc.pipeline import run as stages
 from barpc.pipeline.inputs import (
@@ -32,8 +32,8 @@ from barpc.report import Run
 from barpc.scene import Tracks, View
 from barpc.simulate import simulate_block
 from barpc.tie.reference import Accuracy
+from tests.rasters.test_dem import write_dem
 from tests.rpcio.conftest import make_rpc
-from tests.test_dem import write_dem
 
 NONE = Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.errors import ImageError, InputError, RpcError
+from barpc.base.errors import ImageError, InputError, RpcError
 from barpc.pipeline import load_views
 from barpc.pipeline import loading as views
 from barpc.pipeline.loading import image_path

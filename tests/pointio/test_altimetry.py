@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.errors import InputError
+from barpc.base.errors import InputError
 from barpc.pointio.correspondences import GROUND_SIGMA, HEIGHT_SIGMA, read_altimetry
 
 WANTED = [[5.44, 43.25, 120.5], [5.45, 43.26, 130.0]]

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.errors import InputError
+from barpc.base.errors import InputError
+from barpc.base.sidefile import Kind
 from barpc.pointio.matches import read_links, read_matches
-from barpc.sidefile import Kind
 
 NAMES = ["a", "b", "c"]
 KEYPOINTS = {

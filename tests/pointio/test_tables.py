@@ -10,7 +10,7 @@ import pytest
 import rasterio
 from rasterio.control import GroundControlPoint
 
-from barpc.errors import InputError
+from barpc.base.errors import InputError
 from barpc.pointio.correspondences import (
     GROUND_SIGMA,
     IMAGE_SIGMA,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barpc.errors import InputError
+from barpc.base.errors import InputError
 from barpc.pointio.tables import read_transform
 
 MATRIX = np.eye(4)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.test_dem import write_dem
+from tests.rasters.test_dem import write_dem
 
 from .conftest import barpc
 

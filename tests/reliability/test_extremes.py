@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.errors import AdjustError, BarpcError, FitError, ImageError, InputError
+from barpc.base.errors import AdjustError, BarpcError, FitError, ImageError, InputError
+from barpc.base.frozen import load_npz
+from barpc.base.options import declared
+from barpc.base.remote import Remote, is_url, located
 from barpc.fit import fit_rpc_points
-from barpc.frozen import load_npz
-from barpc.options import declared
 from barpc.pointio.matches import read_links
 from barpc.pointio.names import unique_names
-from barpc.remote import Remote, is_url, located
 from barpc.simulate import simulate_block
 from tests.fit.cameras import synthetic
 

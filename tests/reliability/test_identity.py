@@ -13,8 +13,8 @@ import pytest
 import rasterio
 
 from barpc import adjust
-from barpc.errors import InputError
-from barpc.options import RunOptions
+from barpc.base.errors import InputError
+from barpc.base.options import RunOptions
 from barpc.rpcio import write_rpc_vrt
 from tests.reliability.trials import SAMPLES, crop, outputs
 

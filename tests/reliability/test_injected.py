@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.errors import OutputError
+from barpc.base.errors import OutputError
 from barpc.workspace import Workspace
 from tests.lanes import rest_slow
 

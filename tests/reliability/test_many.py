@@ -46,7 +46,7 @@ from pathlib import Path
 resource.setrlimit(resource.RLIMIT_NOFILE, (int(sys.argv[1]),) * 2)
 from barpc.pipeline import load_views
 from barpc.tie import TieOptions, detect
-from barpc.raster import hashed
+from barpc.rasters.raster import hashed
 most, over = 0, threading.Event()
 def watch():
     global most

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.errors import BarpcWarning, InputError
+from barpc.base.errors import BarpcWarning, InputError
 from barpc.pipeline import AdjustResult, RunOptions, adjust, load_views
 from barpc.pipeline import loading as views
 from barpc.pipeline.loading import unique_names

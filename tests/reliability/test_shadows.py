@@ -10,10 +10,10 @@ import pytest
 import rasterio
 
 from barpc import adjust
+from barpc.base.options import RunOptions
 from barpc.cameras import open_camera
 from barpc.export import TARGETS
-from barpc.options import RunOptions
-from barpc.raster import open_raster
+from barpc.rasters.raster import open_raster
 from tests.lanes import rest_slow
 from tests.reliability.conftest import barpc
 from tests.reliability.trials import SAMPLES, crop

@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import pytest
 
-from barpc.remote import hosts
+from barpc.base.remote import hosts
 
 
 class _Handler(BaseHTTPRequestHandler):

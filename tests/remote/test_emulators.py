@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
+from barpc.base.errors import ImageError
+from barpc.base.remote import BLOCK, RemoteFile, hosts, located
+from barpc.base.sidefile import IMAGE, read_bytes, versioned
 from barpc.cameras import open_camera
-from barpc.errors import ImageError
 from barpc.pipeline import load_views
-from barpc.remote import BLOCK, RemoteFile, hosts, located
-from barpc.sidefile import IMAGE, read_bytes, versioned
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
 DATA = (SAMPLES / "view_00.tif").read_bytes()

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from barpc import remote
-from barpc.remote import BLOCK, Part, Remote, RemoteFile, _Blocks, _runs, beside, hosts, is_url, location
+from barpc.base import remote
+from barpc.base.remote import BLOCK, Part, Remote, RemoteFile, _Blocks, _runs, beside, hosts, is_url, location
 
 AT = Remote("https://a.org/b/x.tif", 20 * BLOCK + 5, "one")
 

@@ -20,17 +20,17 @@ import rasterio
 from rasterio.windows import Window
 
 import barpc
+from barpc.base.errors import BarpcError, ImageError, InputError, RpcError
+from barpc.base.frozen import from_arrays, to_arrays
+from barpc.base.identity import take
+from barpc.base.options import RunOptions, TieOptions, read_options, schema
+from barpc.base.remote import BLOCK, Remote, RemoteFile, hosts, located, pinned
+from barpc.base.sidefile import IMAGE, RPC_FILE, read_bytes, read_head, versioned
 from barpc.cameras import open_camera, open_split, split_spec
-from barpc.dem import Dem
-from barpc.errors import BarpcError, ImageError, InputError, RpcError
-from barpc.frozen import from_arrays, to_arrays
-from barpc.identity import take
-from barpc.options import RunOptions, TieOptions, read_options, schema
 from barpc.pipeline import load_views
 from barpc.pipeline.inputs import input_files, with_located
-from barpc.raster import open_raster
-from barpc.remote import BLOCK, Remote, RemoteFile, hosts, located, pinned
-from barpc.sidefile import IMAGE, RPC_FILE, read_bytes, read_head, versioned
+from barpc.rasters.dem import Dem
+from barpc.rasters.raster import open_raster
 from barpc.tie.patches.channels import Sheet
 from tests.remote.conftest import Web, drip
 
@@ -262,7 +262,7 @@ def test_results_belong_to_the_version_that_a_host_names(samples: Web) -> None:
         read_head(located(samples.url(NAMES[0]), (samples.host,)), IMAGE, 9)
 
 
-@pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
+@pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")
 def test_heights_and_a_reference_are_read_where_they_are_wanted(server: Web) -> None:
     heights = np.random.default_rng(4).normal(500, 100, (1500, 1600)).astype(np.float32)
     forward = rasterio.Affine(1e-3, 0, 5.0, 0, -1e-3, 45.0)

@@ -13,13 +13,13 @@ from typing import Any
 import pytest
 
 import barpc
+from barpc.base.errors import ImageError
+from barpc.base.options import RunOptions, TieOptions
+from barpc.base.remote import hosts, located
+from barpc.base.sidefile import IMAGE, read_bytes, versioned
 from barpc.cameras import open_camera
-from barpc.errors import ImageError
-from barpc.options import RunOptions, TieOptions
 from barpc.pipeline import load_views
-from barpc.raster import open_raster
-from barpc.remote import hosts, located
-from barpc.sidefile import IMAGE, read_bytes, versioned
+from barpc.rasters.raster import open_raster
 
 pytest.importorskip("moto.server")
 pytest.importorskip("s3fs")

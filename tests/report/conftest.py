@@ -10,8 +10,8 @@ import pytest
 
 from barpc import report
 from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.base.options import RunOptions
 from barpc.fit import fit_rpc
-from barpc.options import RunOptions
 from barpc.pipeline.outputs import write_tables
 from barpc.report import Run, Summary
 from barpc.report.records import plain

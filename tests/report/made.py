@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.report.summary import SCHEMA, Summary, TablesEntry, TracksEntry
 from barpc.report.summary.known import GcpEntry
 from barpc.report.summary.pairs import OffsetEntry, PairEntry

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from barpc.base.errors import InputError
 from barpc.cli.main import cli
-from barpc.errors import InputError
 from barpc.report.compare import _lines, _pairs, _view, compare_runs, flat_options
 from barpc.report.records import plain
 from barpc.rpcio import read_rpc, write_rpc

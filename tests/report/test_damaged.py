@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
+from barpc.base.errors import InputError
 from barpc.cli.main import cli
-from barpc.errors import InputError
 from barpc.report import Run
 from barpc.report.compare import compare_runs
 from barpc.report.page import remake_report, report_html

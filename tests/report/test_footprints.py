@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from shapely.geometry import LinearRing, shape
 
-from barpc.geodesy import polygon
+from barpc.base.geodesy import polygon
 
 
 def outlines(finished):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from barpc.ba.robust.smooth import SmoothTest
-from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report import Run
 from barpc.report import outcome as runs
 from barpc.report.digest import decisions

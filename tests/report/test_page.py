@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from barpc.base.errors import BarpcError, InputError
 from barpc.cli.main import cli
-from barpc.errors import BarpcError, InputError
 from barpc.pipeline import outputs
 from barpc.report import Run, maps, page, summarize
 from barpc.report.summary.words import metres

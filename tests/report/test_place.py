@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.geodesy import ecef_from_ground, metres_per_unit
+from barpc.base.geodesy import ecef_from_ground, metres_per_unit
 from barpc.report import Run
 from barpc.report.summary.place import ce90, moved_by_clocks, moved_in_space, stated_ce90
 from barpc.report.tables import read_tables

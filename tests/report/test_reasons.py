@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import barpc
+from barpc.base.options import TieOptions, declared
 from barpc.cli.adjust import adjust
 from barpc.cli.main import COMMANDS, cli
-from barpc.options import TieOptions, declared
 from barpc.report.outcome import Run
 from barpc.report.reservations import view_status
 from barpc.report.summary.words import CAUSES, STATUS_WORDS

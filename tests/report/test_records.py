@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import pytest
 
-from barpc.options import schema_of
+from barpc.base.options import schema_of
 from barpc.report.records import (
     Cell,
     Column,

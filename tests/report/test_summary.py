@@ -163,7 +163,7 @@ def test_its_sigma_is_the_covariance_carried_over_by_the_derivative(block_run, m
     middle = sensor.sensor.localize((np.array(run.views[2].size) - 1) / 2, np.array(run.altitude))
     covariance = adjustment.covariance.view(2)
     _, sigma, _ = moved_in_space(sensor, covariance, model, middle)
-    from barpc.geodesy import ecef_from_ground
+    from barpc.base.geodesy import ecef_from_ground
 
     distance = np.linalg.norm(ecef_from_ground(middle) - sensor.correction.center)
     columns = []

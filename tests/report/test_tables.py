@@ -11,8 +11,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from barpc.errors import InputError
-from barpc.geodesy import ecef_from_ground, enu_basis
+from barpc.base.errors import InputError
+from barpc.base.geodesy import ecef_from_ground, enu_basis
 from barpc.report import outcome as runs
 from barpc.report import summarize
 from barpc.report import tables as modules

@@ -12,9 +12,9 @@ from barpc.ba import adjust_tracks
 from barpc.ba.apart import Apart
 from barpc.ba.held.gauge import MOTIONS
 from barpc.ba.placing import Look
-from barpc.errors import BarpcWarning
+from barpc.base.errors import BarpcWarning
+from barpc.base.options import RunOptions
 from barpc.fit import FitOptions
-from barpc.options import RunOptions
 from barpc.report import Run
 from barpc.report.summary.whole import MODES
 from barpc.report.summary.words import metres

@@ -16,8 +16,9 @@ import pytest
 import rasterio
 from rasterio.windows import Window
 
-from barpc.errors import ImageError, InputError, OutputError, RpcError, RpcFormatError
-from barpc.raster import open_raster
+from barpc.base.errors import ImageError, InputError, OutputError, RpcError, RpcFormatError
+from barpc.base.sidefile import Kind
+from barpc.rasters.raster import open_raster
 from barpc.rpcio import FORMATS, grids, read_rpc, read_rpc_source, write_rpc, write_rpc_copy, write_rpc_vrt
 from barpc.rpcio import formats as formats_module
 from barpc.rpcio.carried import (
@@ -38,7 +39,6 @@ from barpc.rpcio.text import collect_numbered, listed_numbers, number
 from barpc.sensor.correction_grid import CorrectionGrid
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import Kind
 from tests.rpcio.conftest import dimap_v2, grid, make_rpc, write_image, yaml
 
 # --- TIFF ------------------------------------------------------------------------------------------------------

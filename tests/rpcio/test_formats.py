@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.errors import ImageError, OutputError, RpcFormatError
+from barpc.base.errors import ImageError, OutputError, RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, write_rpc
 from barpc.rpcio.carried import nitf_record
 from barpc.rpcio.formats import parse

@@ -10,11 +10,11 @@ import pytest
 import rasterio
 from scipy.interpolate import RegularGridInterpolator
 
+from barpc.base.errors import BarpcError, OutputError, RpcError, RpcFormatError
+from barpc.base.geodesy import metres_per_unit
 from barpc.cameras import open_camera
-from barpc.errors import BarpcError, OutputError, RpcError, RpcFormatError
 from barpc.fit.certificate import Sample
-from barpc.geodesy import metres_per_unit
-from barpc.handoff import unverified, verify_grid
+from barpc.pipeline.handoff import unverified, verify_grid
 from barpc.rpcio import read_rpc
 from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid
 from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
@@ -168,7 +168,7 @@ def test_a_file_that_cannot_be_read_is_named_with_its_reason(sample, tmp_path):
 
 
 def test_only_tools_that_are_not_installed_are_missed(folder, monkeypatch):
-    monkeypatch.setattr("barpc.handoff._is_installed", lambda package: package != "shareloc")
+    monkeypatch.setattr("barpc.pipeline.handoff._is_installed", lambda package: package != "shareloc")
     (sentence,) = unverified([folder / f"a{GRID}"])
     assert sentence.endswith("a_grid.tif: only barpc itself has read it (.tif: shareloc would, and is not installed)")
     assert unverified([folder / f"a{CORRECTION}"]) == []  # GDAL has

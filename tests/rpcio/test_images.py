@@ -14,9 +14,9 @@ from rasterio import Affine
 from rasterio.control import GroundControlPoint
 from rasterio.errors import NotGeoreferencedWarning
 
-from barpc.errors import ImageError, OutputError, RpcFormatError
-from barpc.handoff import CONSUMERS
-from barpc.raster import open_raster
+from barpc.base.errors import ImageError, OutputError, RpcFormatError
+from barpc.pipeline.handoff import CONSUMERS
+from barpc.rasters.raster import open_raster
 from barpc.rpcio import (
     images,
     read_rpc,

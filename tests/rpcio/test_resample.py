@@ -13,9 +13,9 @@ from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning
 from scipy import ndimage
 
-from barpc.errors import ImageError, OutputError
+from barpc.base.errors import ImageError, OutputError
 from barpc.fit import fit_rpc
-from barpc.raster import open_raster
+from barpc.rasters.raster import open_raster
 from barpc.rpcio import grids, read_rpc, write_rpc_vrt
 from barpc.rpcio.grids import write_resampled
 from barpc.sensor.correction_grid import CorrectionGrid

@@ -12,7 +12,7 @@ import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from barpc.errors import ImageError, RpcError, RpcFormatError
+from barpc.base.errors import ImageError, RpcError, RpcFormatError
 from barpc.rpcio import (
     FORMATS,
     read_rpc,

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.errors import ImageError, RpcFormatError
-from barpc.geodesy import Array
-from barpc.handoff import CONSUMERS, verify
+from barpc.base.errors import ImageError, RpcFormatError
+from barpc.base.geodesy import Array
+from barpc.pipeline.handoff import CONSUMERS, verify
 from barpc.rpcio import read_rpc, read_rpc_source, write_rpc, write_rpc_copy, write_rpc_vrt
 from barpc.sensor.geometry import altitude_range
 from barpc.sensor.rpc import RPC

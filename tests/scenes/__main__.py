@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from barpc.errors import BarpcError
+from barpc.base.errors import BarpcError
 from tests.scenes.files import write_scene
 from tests.scenes.images import ImageOptions
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, View
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.rpc import RPC

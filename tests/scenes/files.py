@@ -16,7 +16,7 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
 from barpc import __version__
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.rpcio.carried import put_tag
 from barpc.scene import BoolArray
 from barpc.sensor.rpc import RPC

@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from barpc.errors import InputError
+from barpc.base.errors import InputError
+from barpc.base.geodesy import Array
 from barpc.fit import fit_rpc
-from barpc.geodesy import Array
 from barpc.scene import BoolArray
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.curve import Curve, rotation_matrix

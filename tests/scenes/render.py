@@ -15,8 +15,8 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.interpolate import CubicSpline
 
-from barpc.errors import InputError
-from barpc.geodesy import Array
+from barpc.base.errors import InputError
+from barpc.base.geodesy import Array
 from barpc.sensor import SensorModel
 from tests.scenes.terrain import Float32, Ray, Terrain, fractal
 from tests.scenes.texture import Surface

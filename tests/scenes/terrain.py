@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import fft, ndimage
 
-from barpc.errors import InputError
-from barpc.geodesy import Array, metres_per_unit, wrap_longitude
+from barpc.base.errors import InputError
+from barpc.base.geodesy import Array, metres_per_unit, wrap_longitude
 
 Float32 = npt.NDArray[np.float32]
 

@@ -11,7 +11,7 @@ import pytest
 import rasterio
 from click.testing import CliRunner
 
-from barpc.errors import InputError, OutputError
+from barpc.base.errors import InputError, OutputError
 from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center, convergence_angle, triangulate

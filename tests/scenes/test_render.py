@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.errors import InputError
+from barpc.base.errors import InputError
 from barpc.simulate import Look, fly, looks
 from tests.lanes import rest_slow
 from tests.scenes.render import Radiometry, expose, render

@@ -6,7 +6,7 @@ import numpy as np
 import rasterio
 from scipy import ndimage
 
-from barpc.dem import Dem
+from barpc.rasters.dem import Dem
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.redrawn import redrawn
 from tests.scenes.season import other_season, write_dem, write_reference

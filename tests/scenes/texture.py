@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from tests.scenes.terrain import Float32, Grid, Ray, Terrain, fractal
 
 IntIndex = npt.NDArray[np.signedinteger[Any]]

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
-from barpc.geodesy import ecef_from_ground
+from barpc.base.geodesy import ecef_from_ground
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
 from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected

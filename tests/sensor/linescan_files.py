@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from barpc.geodesy import Array, ecef_from_ground, ground_from_ecef
+from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef
 from barpc.simulate import Look, fly
 
 START = np.datetime64("2026-05-07T23:59:59.250000", "ns")

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 from scipy.optimize import brentq
 
-from barpc.geodesy import ecef_from_ground
+from barpc.base.geodesy import ecef_from_ground
 from barpc.sensor.sentinel1 import RangeDoppler, read_annotation
 
 RADIUS = 7_071_000.0

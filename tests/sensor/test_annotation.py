@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.errors import RpcFormatError
+from barpc.base.errors import RpcFormatError
 from barpc.sensor.sentinel1 import burst_rows, read_annotation
 from barpc.sensor.sentinel1.annotation import read_orbit_file
 from tests.sensor.s1_product import GRD, IW, START

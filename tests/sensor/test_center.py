@@ -8,8 +8,8 @@ import numpy as np
 import pyproj
 import pytest
 
+from barpc.base.errors import RpcError
 from barpc.cameras import open_camera
-from barpc.errors import RpcError
 from barpc.sensor import geometry
 from barpc.sensor.geometry import NOMINAL_ALTITUDE, PLAUSIBLE_ALTITUDE, camera_center
 from barpc.simulate import Look, fly

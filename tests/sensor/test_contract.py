@@ -8,7 +8,7 @@ from dataclasses import FrozenInstanceError
 import numpy as np
 import pytest
 
-from barpc.geodesy import metres_per_unit, wrap_longitude
+from barpc.base.geodesy import metres_per_unit, wrap_longitude
 from barpc.sensor import SensorModel
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barpc.errors import RpcError
-from barpc.geodesy import ecef_from_ground, ground_from_ecef
+from barpc.base.errors import RpcError
+from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.sensor.corrected import Corrected, Correction, correction_of
 from barpc.sensor.curve import rotation_left_jacobian, rotation_matrix
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.errors import RpcError
+from barpc.base.errors import RpcError
 from barpc.fit import fit_rpc
 from barpc.sensor.corrected import ImageAffine, ImageCorrected
 from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected

@@ -10,9 +10,9 @@ import pytest
 from scipy.interpolate import BarycentricInterpolator
 from scipy.spatial.transform import Rotation
 
+from barpc.base.errors import BarpcError, InputError, RpcError, RpcFormatError
+from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.cameras import open_camera
-from barpc.errors import BarpcError, InputError, RpcError, RpcFormatError
-from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.csm import FRAME, LINESCAN, is_writable, open_state, state_text
 

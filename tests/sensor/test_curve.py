@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import polynomial
 
-from barpc.errors import RpcError
+from barpc.base.errors import RpcError
 from barpc.sensor.curve import (
     EXTRAPOLATION,
     MARGIN,

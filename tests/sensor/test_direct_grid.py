@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.errors import RpcError
+from barpc.base.errors import RpcError
 from barpc.fit import fit_rpc
 from barpc.pointio.correspondences import read_grid
 from barpc.rpcio import read_rpc

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.sensor.geometry import (
     base_to_height,
     camera_center,

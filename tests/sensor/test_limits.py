@@ -12,8 +12,8 @@ from numpy.polynomial import polynomial
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from barpc.errors import InputError, RpcError, RpcFormatError
-from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
+from barpc.base.errors import InputError, RpcError, RpcFormatError
+from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected, RigidMotion
 from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
 from barpc.sensor.curve import Curve, about_middle, cross, rotation_matrix

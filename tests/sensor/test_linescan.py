@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from barpc.ba.estimated.priors import prior_sigmas
-from barpc.errors import BarpcError, FitError, InputError, RpcFormatError
+from barpc.base.errors import BarpcError, FitError, InputError, RpcFormatError
+from barpc.base.geodesy import ecef_from_ground, enu_basis
+from barpc.base.options import AdjustOptions
 from barpc.fit import fit_rpc
-from barpc.geodesy import ecef_from_ground, enu_basis
-from barpc.options import AdjustOptions
 from barpc.rpcio import read_rpc
 from barpc.scene import View
 from barpc.sensor.corrected import Corrected, Correction

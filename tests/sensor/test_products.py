@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from barpc.base.errors import BarpcWarning, InputError, RpcError, RpcFormatError
+from barpc.base.geodesy import SPEED_OF_LIGHT
 from barpc.cameras import open_camera
-from barpc.errors import BarpcWarning, InputError, RpcError, RpcFormatError
-from barpc.geodesy import SPEED_OF_LIGHT
 from barpc.sensor.sentinel1 import (
     Annotation,
     RangeDoppler,

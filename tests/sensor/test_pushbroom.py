@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from barpc.errors import RpcError
-from barpc.geodesy import EARTH_RATE, ecef_from_ground, ground_from_ecef, metres_per_unit
+from barpc.base.errors import RpcError
+from barpc.base.geodesy import EARTH_RATE, ecef_from_ground, ground_from_ecef, metres_per_unit
 from barpc.sensor import SensorModel
 from barpc.sensor.curve import Curve, attitude_through
 from barpc.sensor.geometry import view_angles

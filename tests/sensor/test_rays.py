@@ -10,8 +10,8 @@ from numpy.polynomial.polynomial import polyval
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from barpc.errors import RpcError
-from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit, up
+from barpc.base.errors import RpcError
+from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit, up
 from barpc.sensor.curve import Curve
 from barpc.sensor.pushbroom import STRAIGHT, Light, Pushbroom
 

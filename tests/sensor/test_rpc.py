@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from barpc.errors import RpcError
+from barpc.base.errors import RpcError
 from barpc.rpcio import read_rpc
 from barpc.sensor.rational import MONOMIALS, monomials
 from barpc.sensor.rpc import RPC

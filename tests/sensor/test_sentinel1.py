@@ -20,10 +20,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from barpc.base.errors import BarpcError, BarpcWarning, FitError, InputError, RpcError, RpcFormatError
+from barpc.base.geodesy import ecef_from_ground
+from barpc.base.sidefile import parse_xml
 from barpc.cli.main import cli
-from barpc.errors import BarpcError, BarpcWarning, FitError, InputError, RpcError, RpcFormatError
 from barpc.fit import FitOptions, fit_rpc
-from barpc.geodesy import ecef_from_ground
 from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.curve import Curve
@@ -39,7 +40,6 @@ from barpc.sensor.sentinel1 import (
     open_product,
     read_annotation,
 )
-from barpc.sidefile import parse_xml
 from tests.lanes import diagonal, rest_slow
 from tests.sensor.s1_product import GRD, INTERVAL, IW, SAMPLING, START, STRIPMAP, Product
 

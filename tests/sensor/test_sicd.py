@@ -10,10 +10,10 @@ import pytest
 from numpy.polynomial import polynomial
 
 from barpc.ba import adjust_tracks
+from barpc.base.errors import InputError, RpcError, RpcFormatError
+from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.cameras import open_camera
-from barpc.errors import InputError, RpcError, RpcFormatError
 from barpc.fit import fit_rpc
-from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.scene import Tracks, View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center, triangulate, view_angles

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from barpc.errors import RpcError
+from barpc.base.errors import RpcError
 from barpc.sensor.splined import RowSpline, Splined
 
 from .conftest import make_rpc

@@ -8,13 +8,13 @@ import warnings
 import numpy as np
 import pytest
 
+from barpc.base.errors import BarpcError, BarpcWarning, InputError, RpcFormatError
+from barpc.base.sidefile import parse_xml
 from barpc.cameras import open_camera
-from barpc.errors import BarpcError, BarpcWarning, InputError, RpcFormatError
 from barpc.fit import fit_rpc
 from barpc.sensor.document import Fields
 from barpc.sensor.geometry import view_angles
 from barpc.sensor.terrasar import open_terrasar
-from barpc.sidefile import parse_xml
 from tests.sensor.terrasar_files import INTERVAL, NAME, SIZE, SPACING, START, Terrasar
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.errors import RpcError, RpcFormatError
-from barpc.geodesy import SPEED_OF_LIGHT, ecef_from_ground
+from barpc.base.errors import RpcError, RpcFormatError
+from barpc.base.geodesy import SPEED_OF_LIGHT, ecef_from_ground
 from barpc.sensor.sentinel1 import RangeDoppler, read_annotation
 from barpc.sensor.sicd import open_sicd
 from barpc.sensor.timing import Clocked, Timed, Timing, is_clocked

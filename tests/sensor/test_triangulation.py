@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from barpc.geodesy import ecef_from_ground, ground_from_ecef
+from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.sensor.geometry import triangulate
 from tests.sensor.test_geometry import tilted_rpc
 

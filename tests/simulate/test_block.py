@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.errors import InputError
-from barpc.geodesy import ecef_from_ground, metres_per_unit
+from barpc.base.errors import InputError
+from barpc.base.geodesy import ecef_from_ground, metres_per_unit
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import camera_center, convergence_angle, triangulate
 from barpc.simulate import BlockOptions, _Grid, _turned, fly, looks, recentred, simulate_block

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.geodesy import EARTH_RATE, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.base.geodesy import EARTH_RATE, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.simulate import GM, Look, _circle, fly, looks
 
 TARGET = np.array([5.4, 43.3, 230.0])

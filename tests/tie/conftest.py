@@ -12,7 +12,7 @@ import pytest
 import rasterio
 from scipy import ndimage
 
-from barpc.raster import open_raster
+from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc
 from barpc.scene import View
 from barpc.sensor.geometry import altitude_range

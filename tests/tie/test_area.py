@@ -12,9 +12,9 @@ import shapely
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from barpc.errors import DisconnectedError, InputError, TiePointError
-from barpc.geodesy import ground_from_ecef
-from barpc.raster import open_raster
+from barpc.base.errors import DisconnectedError, InputError, TiePointError
+from barpc.base.geodesy import ground_from_ecef
+from barpc.rasters.raster import open_raster
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import triangulate
 from barpc.tie import Scope, TieOptions, find_tracks, read_area, select_pairs

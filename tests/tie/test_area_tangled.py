@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.errors import InputError
+from barpc.base.errors import InputError
 from barpc.tie.pairing import area
 from barpc.tie.pairing.area import read_area
 

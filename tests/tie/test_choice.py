@@ -11,7 +11,7 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from barpc.options import RunOptions
+from barpc.base.options import RunOptions
 from barpc.pipeline import adjust
 from barpc.scene import connected_groups
 from barpc.tie import Scope, TieOptions, find_tracks, select_pairs, tracks

@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 import barpc.tie.pixels as reading
-from barpc.errors import DisconnectedError
-from barpc.raster import open_raster
+from barpc.base.errors import DisconnectedError
+from barpc.rasters.raster import open_raster
 from barpc.scene import Tracks
 from barpc.tie import Matches, Scope, TieOptions, common_tracks, find_tracks
 from barpc.tie.tracks import pair_counts

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from barpc.errors import InputError, TiePointError
-from barpc.options import TieOptions, read_options
+from barpc.base.errors import InputError, TiePointError
+from barpc.base.options import TieOptions, read_options
 from barpc.pipeline import RunOptions, adjust
 from barpc.scene import View
 from barpc.tie import Matches, common_tracks, find_tracks
@@ -26,7 +26,7 @@ from tests.tie.test_pairs import METRE, camera, views
 ROOT = Path(__file__).parents[2]
 TEXT = '''
 import cv2, numpy as np
-from barpc.raster import open_raster
+from barpc.rasters.raster import open_raster
 calls, known = [], []
 def match(a, b, prediction):
     """SIFT of both images, matched everywhere."""

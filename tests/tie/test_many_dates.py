@@ -11,7 +11,7 @@ from datetime import date, timedelta
 import numpy as np
 import pytest
 
-from barpc.options import RunOptions, TieOptions
+from barpc.base.options import RunOptions, TieOptions
 from barpc.pipeline import adjust
 from benchmarks.dates import block
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from barpc.errors import TiePointError
+from barpc.base.errors import TiePointError
 from barpc.tie import Keypoints, Matches, TieOptions, common_tracks, find_tracks
 from barpc.tie.matchers.matcher import Prediction
 from barpc.tie.matchers.matching import MATCHERS

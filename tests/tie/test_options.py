@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from barpc.errors import InputError
-from barpc.raster import open_raster
+from barpc.base.errors import InputError
+from barpc.rasters.raster import open_raster
 from barpc.scene import Tracks
 from barpc.tie import TieOptions, detect, find_tracks, link, select_pairs
 from barpc.tie.matchers.features import Keypoints, Share, detect_tile

@@ -9,8 +9,8 @@ import pytest
 import rasterio
 from rasterio import Affine
 
-from barpc.errors import InputError
-from barpc.geodesy import metres_per_unit
+from barpc.base.errors import InputError
+from barpc.base.geodesy import metres_per_unit
 from barpc.tie.patches.channels import CHANNELS, Patch, Sheet, of_image, of_reference, picture, shown, ticks
 
 from .conftest import write_image

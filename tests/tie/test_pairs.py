@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.errors import DisconnectedError, TiePointError
+from barpc.base.errors import DisconnectedError, TiePointError
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
 from barpc.tie import Scope, TieOptions, select_pairs

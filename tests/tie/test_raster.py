@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.errors import ImageError
+from barpc.base.errors import ImageError
 from barpc.tie.pixels import Stretch, grow, levelled, read_pixels, sample_stretch
 
 from .conftest import write_image

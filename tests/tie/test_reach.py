@@ -14,7 +14,7 @@ import rasterio
 from rasterio.transform import rowcol
 from rasterio.warp import transform
 
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.pipeline.loading import load_views
 from barpc.scene import View
 from barpc.tie import PairReport, TieOptions, common_tracks, find_tracks

@@ -11,10 +11,10 @@ import pytest
 import rasterio
 from scipy import ndimage
 
-from barpc.dem import Dem
-from barpc.errors import InputError
-from barpc.geodesy import metres_per_unit
+from barpc.base.errors import InputError
+from barpc.base.geodesy import metres_per_unit
 from barpc.pipeline.loading import load_views
+from barpc.rasters.dem import Dem
 from barpc.rpcio import read_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC

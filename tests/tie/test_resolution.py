@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import barpc.tie.pixels as reading
-from barpc.raster import open_raster
+from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import altitude_range, epipolar_offset

@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.errors import DisconnectedError, ImageError, TiePointError
-from barpc.raster import open_raster
+from barpc.base.errors import DisconnectedError, ImageError, TiePointError
+from barpc.rasters.raster import open_raster
 from barpc.scene import Tracks, View
 from barpc.sensor.corrected import Corrected
 from barpc.tie import TieOptions, common_tracks, find_tracks

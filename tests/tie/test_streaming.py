@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import barpc.tie.pixels as reading
-from barpc.errors import ImageError, InputError
+from barpc.base.errors import ImageError, InputError
 from barpc.pipeline.executor import CachingExecutor
 from barpc.scene import View
 from barpc.tie import TieOptions, find_tracks

@@ -11,7 +11,7 @@ import pytest
 import rasterio
 from scipy import ndimage
 
-from barpc.errors import TiePointError
+from barpc.base.errors import TiePointError
 from barpc.pipeline.loading import load_views
 from barpc.scene import View
 from barpc.tie import (

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 LEAF = 32  # views that are not cut any further

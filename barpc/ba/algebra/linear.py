@@ -10,8 +10,8 @@ import scipy.linalg as la
 
 from barpc.ba.algebra.dissection import Dissection
 from barpc.ba.algebra.multifrontal import Blocks, Cholesky
-from barpc.errors import AdjustError
-from barpc.geodesy import Array
+from barpc.base.errors import AdjustError
+from barpc.base.geodesy import Array
 
 Matrix = Array | Blocks
 

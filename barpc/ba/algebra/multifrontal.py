@@ -20,7 +20,7 @@ from scipy.linalg.blas import dsyrk, dtrsm
 from scipy.linalg.lapack import dpotrf, dpotri
 
 from barpc.ba.algebra.dissection import Dissection, Front
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 IN_MEMORY = 1.5e9  # bytes of a factor; the rest goes to a temporary file

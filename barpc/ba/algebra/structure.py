@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from barpc.ba.algebra.dissection import Dissection, dissect
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from barpc.ba.estimated.waves import FIRST_SIGMA
-from barpc.geodesy import Array
-from barpc.options import AdjustOptions
+from barpc.base.geodesy import Array
+from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray, View
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC

@@ -16,7 +16,7 @@ import numpy as np
 
 from barpc.ba.algebra.structure import parts
 from barpc.ba.estimated.unknowns import Unknowns
-from barpc.geodesy import CHUNK, Array, ground_from_ecef, ground_rows_from_ecef
+from barpc.base.geodesy import CHUNK, Array, ground_from_ecef, ground_rows_from_ecef
 from barpc.scene import IntArray, View
 from barpc.sensor.corrected import RigidMotion
 from barpc.sensor.rpc import RPC

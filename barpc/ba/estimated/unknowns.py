@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from barpc.ba.estimated.waves import Waves
-from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import IntArray, View
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected

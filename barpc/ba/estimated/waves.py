@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg as la
 
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import RowSpline, bsplines, profile, sine_and_cosine
 

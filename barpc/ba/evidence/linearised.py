@@ -11,7 +11,7 @@ import numpy as np
 from barpc.ba.solving.normal import TRIANGLE, cholesky3, whiten
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 # views of a track up to which every subset may be right; of more, all of them or all but one

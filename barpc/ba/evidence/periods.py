@@ -15,7 +15,7 @@ from scipy.special import chdtri
 
 from barpc.ba.evidence.scan import CLIPPED
 from barpc.ba.usual import FEW, SURE
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import sine_and_cosine
 

@@ -17,7 +17,7 @@ from scipy.special import fdtrc, gammaln
 
 from barpc.ba.evidence.scan import LINE
 from barpc.ba.usual import CHANCE, FEWEST
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 _FINEST = 32  # parts of rows or columns, and a side of the parts of which one observation is taken

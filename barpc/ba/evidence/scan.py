@@ -13,7 +13,7 @@ from scipy.special import entr, xlogy
 
 from barpc.ba.estimated.waves import DRIFTS
 from barpc.ba.usual import SURE
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import IntArray
 
 BINS = 40  # stretches of an image's rows or columns

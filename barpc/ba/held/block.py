@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.ba.algebra.structure import Structure, counting_sort, make_structure
-from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
-from barpc.geodesy import Array, ecef_from_ground
-from barpc.options import AdjustOptions
+from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
+from barpc.base.geodesy import Array, ecef_from_ground
+from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, Tracks, View, connected_groups
 from barpc.sensor.stack import localize_stack
 

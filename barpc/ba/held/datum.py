@@ -16,7 +16,7 @@ from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import Reduced
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import BoolArray
 
 SOURCES = ("cameras", "earlier_run", "fixed_views", "gcps", "heights", "reference", "altimetry")

@@ -15,7 +15,7 @@ from barpc.ba.estimated.priors import EarlierScene, JointPrior
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import solve_lower
 from barpc.ba.usual import SAMPLE
-from barpc.geodesy import Array, enu_basis, ground_from_ecef
+from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray
 
 MOTIONS = ("east", "north", "up", "tilt east", "tilt north", "turn", "scale", "twist", "bend east", "bend north")

@@ -13,9 +13,9 @@ from barpc.ba.estimated.priors import PointPrior
 from barpc.ba.estimated.projected import Projected
 from barpc.ba.held.terrain import NUM_BENDS, Believed, Relief, Terrain, believe, terrain_slopes
 from barpc.ba.solving.problem import Problem
-from barpc.errors import BarpcWarning
-from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.options import AdjustOptions
+from barpc.base.errors import BarpcWarning
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference
 
 FIRST_PLACED = NUM_BENDS

@@ -18,10 +18,10 @@ import scipy.sparse as sp
 from barpc.ba.estimated.priors import CameraPrior, EarlierScene, JointPrior
 from barpc.ba.estimated.waves import Waves
 from barpc.ba.held.gauge import MOTIONS
-from barpc.errors import InputError
-from barpc.frozen import load_npz
-from barpc.geodesy import Array
-from barpc.sidefile import ARRAYS, LARGEST
+from barpc.base.errors import InputError
+from barpc.base.frozen import load_npz
+from barpc.base.geodesy import Array
+from barpc.base.sidefile import ARRAYS, LARGEST
 
 if TYPE_CHECKING:
     from barpc.ba.result import Adjustment

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from barpc.ba.usual import CHANCE, CRITICAL, FEWEST, GROSS, ITERATIONS, RIDGE, SAMPLE, STATED, SURELY
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 NEIGHBOURS = 15  # tie points of a patch: its six unknowns are checked by nine

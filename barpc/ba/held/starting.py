@@ -19,8 +19,8 @@ from barpc.ba.solving.normal import cholesky3, point_products, solve_lower, solv
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.ba.usual import STEPS
-from barpc.geodesy import Array, enu_basis, ground_from_ecef
-from barpc.options import AdjustOptions
+from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
+from barpc.base.options import AdjustOptions
 
 
 def make_problem(

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barpc.ba.usual import BACKFITTING, CRITICAL, MANY, MUCH_NOISE, OUTLIER, STATED, SURELY
-from barpc.geodesy import Array, metres_per_unit, wrap_longitude
+from barpc.base.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.scene import BoolArray, IntArray
 
 Terrain = Callable[[Array, Array], Array]

@@ -16,7 +16,7 @@ from barpc.ba.evidence.scan import BINS, Interval, price
 from barpc.ba.judging import moving
 from barpc.ba.robust.smooth import SPLINES
 from barpc.ba.usual import FEW, TIMES
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import profile
 from barpc.sensor.splined import sine_and_cosine as waves_of

@@ -16,8 +16,8 @@ from barpc.ba.judging.solution import Solution, finished
 from barpc.ba.robust.heldout import is_better
 from barpc.ba.robust.rounds import Rounds, revived
 from barpc.ba.usual import FEW, LARGEST
-from barpc.geodesy import Array
-from barpc.options import AUTO, OFF, AdjustOptions
+from barpc.base.geodesy import Array
+from barpc.base.options import AUTO, OFF, AdjustOptions
 
 _SPACING, _DENSER = 2000.0, 4  # rows between knots at first, and how often they are halved
 _TWICE = 2  # detectors are looked for, and splines may be no better, one after the other

@@ -36,7 +36,7 @@ from barpc.ba.robust.rounds import Outcome, revived
 from barpc.ba.robust.weights import Observations
 from barpc.ba.solving.solve import State
 from barpc.ba.usual import BACKFITTING, KEPT, LARGEST, RIVALS, SAMPLE, SMALL, SURE, TRIED
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 _LOG = logging.getLogger(__name__)

@@ -24,8 +24,8 @@ from barpc.ba.robust.smooth import SmoothTest
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.ba.usual import FLOOR, MUCH_NOISE, STEPS, SURELY
-from barpc.geodesy import Array
-from barpc.options import AdjustOptions
+from barpc.base.geodesy import Array
+from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray
 
 _TREND = MUCH_NOISE * FLOOR  # px: another model is tried

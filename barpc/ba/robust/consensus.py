@@ -16,7 +16,7 @@ import scipy.sparse as sp
 from barpc.ba.algebra.structure import Structure, parts
 from barpc.ba.estimated.projected import Projected
 from barpc.ba.usual import FEW, ITERATIONS, LEVEL, MANY, OUTLIER, STEPS, SURE, TRIALS
-from barpc.geodesy import CHUNK, Array
+from barpc.base.geodesy import CHUNK, Array
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.curve import cross
 

@@ -13,7 +13,7 @@ import numpy as np
 from barpc.ba.held.block import Block
 from barpc.ba.held.ground import ALIKE
 from barpc.ba.usual import MANY
-from barpc.geodesy import Array, metres_per_unit
+from barpc.base.geodesy import Array, metres_per_unit
 from barpc.scene import BoolArray, IntArray
 
 

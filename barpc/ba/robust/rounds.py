@@ -32,8 +32,8 @@ from barpc.ba.usual import (
     STEPS,
     SURELY,
 )
-from barpc.geodesy import Array
-from barpc.options import AdjustOptions
+from barpc.base.geodesy import Array
+from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)

@@ -17,7 +17,7 @@ from barpc.ba.algebra.structure import Structure
 from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.robust.resembling import Resemblance
 from barpc.ba.usual import KEPT, OUTLIER, RIDGE
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.splined import bsplines
 

@@ -23,8 +23,8 @@ from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum
 from barpc.ba.usual import CHANCE, FLOOR, GROSS, ITERATIONS, LEVEL, SMALL, STANDS, STATED, SURE, TIMES
-from barpc.geodesy import Array
-from barpc.options import AdjustOptions
+from barpc.base.geodesy import Array
+from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray, View
 
 _LOG = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ from barpc.ba.algebra.linear import Factor
 from barpc.ba.algebra.multifrontal import Blocks
 from barpc.ba.algebra.structure import parts
 from barpc.ba.solving.normal import Reduced, solve_transposed
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 _COLUMNS = 240  # unit vectors solved for at a time

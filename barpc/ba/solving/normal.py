@@ -18,7 +18,7 @@ from barpc.ba.algebra.linear import Factor, Matrix, factorize, factorize_blocks
 from barpc.ba.algebra.multifrontal import Blocks
 from barpc.ba.algebra.structure import Structure, parts
 from barpc.ba.estimated.priors import PointPrior
-from barpc.geodesy import CHUNK, Array
+from barpc.base.geodesy import CHUNK, Array
 from barpc.scene import BoolArray, IntArray
 
 DENSE_UNKNOWNS = 9 * LEAF  # up to so many camera unknowns (a front) the reduced matrix is a plain array

@@ -21,7 +21,7 @@ from barpc.ba.solving.normal import (
     whiten,
 )
 from barpc.ba.usual import KEPT
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import BoolArray
 
 

@@ -20,8 +20,8 @@ from barpc.ba.estimated.projected import Projected
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import Reduced
 from barpc.ba.solving.problem import Problem
-from barpc.errors import AdjustError
-from barpc.geodesy import Array
+from barpc.base.errors import AdjustError
+from barpc.base.geodesy import Array
 from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)

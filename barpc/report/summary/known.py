@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from barpc.ba import check_residuals
-from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report.outcome import Run
 from barpc.report.records import Column, Number, Record, said
 from barpc.report.summary.words import ABOVE, Count, Pixel, Vector

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy import ndimage
 
-from barpc.geodesy import Array, ground_from_ecef
+from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.report.outcome import Run
 from barpc.report.records import Cell, Column, Number, Record, plain, said
 from barpc.report.summary.words import Count

@@ -7,7 +7,7 @@ from scipy.optimize import brentq
 from scipy.special import erf
 
 from barpc.ba.estimated.priors import USABLE_ACCURACY
-from barpc.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit
 from barpc.report.records import Number, Record, said
 from barpc.scene import View
 from barpc.sensor.corrected import Corrected

@@ -10,8 +10,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from barpc.ba import Adjustment
+from barpc.base.geodesy import Array
 from barpc.fit import RpcFit
-from barpc.geodesy import Array
 from barpc.report.outcome import Run
 from barpc.report.records import Cell, Column, Number, Record, said, value_of
 from barpc.report.summary.place import EllipseEntry, moved_by_clocks, moved_in_space, stated_ce90

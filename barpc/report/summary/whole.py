@@ -14,7 +14,7 @@ from barpc.ba.evidence.places import Place
 from barpc.ba.held.gauge import MOTIONS
 from barpc.ba.judging.explanations import FADE, MOVING, SETTLING, STRIP, SWING, WANDER
 from barpc.ba.judging.judge import Finding
-from barpc.geodesy import wrap_longitude
+from barpc.base.geodesy import wrap_longitude
 from barpc.report.outcome import Run
 from barpc.report.records import Number, Record, said
 from barpc.report.summary.words import Count, Vector, metres

@@ -23,13 +23,13 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 from scipy.spatial.transform import Rotation
 
-from barpc.errors import InputError, RpcFormatError
-from barpc.geodesy import Array
+from barpc.base.errors import InputError, RpcFormatError
+from barpc.base.geodesy import Array
+from barpc.base.sidefile import parse_xml
 from barpc.sensor.curve import EXTRAPOLATION
 from barpc.sensor.document import MOST_PIXELS, STRAIGHT, Fields, seconds
 from barpc.sensor.linescan.samples import STEP, Detector, Linescan, Samples, camera_of_samples, unit
 from barpc.sensor.pushbroom import Light
-from barpc.sidefile import parse_xml
 
 __all__ = ["Linescan", "read_linescan"]
 

@@ -8,8 +8,8 @@ from math import factorial
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from barpc.errors import RpcError, RpcFormatError
-from barpc.geodesy import Array, ecef_from_ground
+from barpc.base.errors import RpcError, RpcFormatError
+from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.sensor.curve import EXTRAPOLATION, Curve, attitude_through
 from barpc.sensor.pushbroom import Pushbroom
 

@@ -16,14 +16,14 @@ from typing import TypeVar
 
 import numpy as np
 
-from barpc.errors import BarpcError, InputError, RpcError, RpcFormatError, visible
-from barpc.geodesy import Array
+from barpc.base.errors import BarpcError, InputError, RpcError, RpcFormatError, visible
+from barpc.base.geodesy import Array
+from barpc.base.sidefile import MAX_XML, PRODUCT, opened, read_head
 from barpc.sensor.curve import Orbit, fit_orbit
 from barpc.sensor.document import seconds
 from barpc.sensor.sentinel1.annotation import Annotation, BurstRows, burst_rows, read_annotation
 from barpc.sensor.sentinel1.frames import Bistatic, Delays, GroundFrame, SlantFrame
 from barpc.sensor.sentinel1.range_doppler import RangeDoppler, grid_residuals, line_extent, swaths_model
-from barpc.sidefile import MAX_XML, PRODUCT, opened, read_head
 
 __all__ = [
     "Annotation",

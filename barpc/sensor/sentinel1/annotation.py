@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from barpc.errors import RpcFormatError
-from barpc.geodesy import Array
+from barpc.base.errors import RpcFormatError
+from barpc.base.geodesy import Array
+from barpc.base.sidefile import parse_xml
 from barpc.sensor.curve import MARGIN
 from barpc.sensor.document import Fields, seconds
-from barpc.sidefile import parse_xml
 
 TimeArray = npt.NDArray[np.datetime64]
 

@@ -13,9 +13,9 @@ from typing import Literal
 
 import numpy as np
 
-from barpc.errors import InputError
-from barpc.frozen import Frozen
-from barpc.geodesy import NEWTON_STEPS, SETTLED, SPEED_OF_LIGHT, Array, enu_basis, up
+from barpc.base.errors import InputError
+from barpc.base.frozen import Frozen
+from barpc.base.geodesy import NEWTON_STEPS, SETTLED, SPEED_OF_LIGHT, Array, enu_basis, up
 from barpc.sensor.document import seconds
 from barpc.sensor.sentinel1.annotation import Annotation
 from barpc.sensor.timing import Timing

@@ -13,8 +13,8 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from barpc.errors import InputError, RpcFormatError
-from barpc.geodesy import (
+from barpc.base.errors import InputError, RpcFormatError
+from barpc.base.geodesy import (
     NEWTON_STEPS,
     SETTLED,
     SPEED_OF_LIGHT,

@@ -11,12 +11,12 @@ from typing import BinaryIO
 
 import numpy as np
 
-from barpc.errors import InputError, RpcFormatError
-from barpc.geodesy import ALTITUDES, EARTH_RATE, Array, ground_from_ecef
+from barpc.base.errors import InputError, RpcFormatError
+from barpc.base.geodesy import ALTITUDES, EARTH_RATE, Array, ground_from_ecef
+from barpc.base.sidefile import MAX_XML, PRODUCT, opened, parse_xml
 from barpc.sensor.curve import Curve
 from barpc.sensor.document import RELIEF_AROUND, Fields
 from barpc.sensor.sicd.monostatic import Formation, ImagePlane, Monostatic, PolarFormat, RangeAzimuth, ZeroDoppler
-from barpc.sidefile import MAX_XML, PRODUCT, opened, parse_xml
 
 __all__ = [
     "Formation",

@@ -15,9 +15,9 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval, polyval2d
 
-from barpc.errors import RpcError
-from barpc.frozen import Frozen
-from barpc.geodesy import NEWTON_STEPS, SETTLED, Array, ecef_from_ground, ecef_from_ground_jacobian
+from barpc.base.errors import RpcError
+from barpc.base.frozen import Frozen
+from barpc.base.geodesy import NEWTON_STEPS, SETTLED, Array, ecef_from_ground, ecef_from_ground_jacobian
 from barpc.sensor.curve import Curve
 from barpc.sensor.timing import Clocked, Timing, aside, dot, on_circle
 

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from barpc.geodesy import Array
-from barpc.options import TieOptions
+from barpc.base.geodesy import Array
+from barpc.base.options import TieOptions
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.overlaps import Pair, shared_tiles

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from barpc.options import TieOptions
+from barpc.base.options import TieOptions
 from barpc.scene import View
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import Matches, Prediction

@@ -19,9 +19,9 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from barpc.errors import BarpcError, InputError, TiePointError
-from barpc.geodesy import Array
-from barpc.options import TieOptions
+from barpc.base.errors import BarpcError, InputError, TiePointError
+from barpc.base.geodesy import Array
+from barpc.base.options import TieOptions
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.pairing.epipolar import EpipolarSegments

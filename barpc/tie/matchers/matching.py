@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from barpc.geodesy import Array
-from barpc.options import TieOptions
+from barpc.base.geodesy import Array
+from barpc.base.options import TieOptions
 from barpc.scene import IntArray, View
 from barpc.tie.matchers.features import THIN, KeypointFiles, Keypoints, ample_matches, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided

@@ -12,10 +12,10 @@ import numpy as np
 import shapely
 from shapely import affinity
 
-from barpc.errors import InputError
-from barpc.geodesy import Array, wrap_longitude
+from barpc.base.errors import InputError
+from barpc.base.geodesy import Array, wrap_longitude
+from barpc.base.sidefile import GEOJSON, read_json
 from barpc.scene import BoolArray
-from barpc.sidefile import GEOJSON, read_json
 
 _MALFORMED = (
     ValueError, LookupError, TypeError, AttributeError, OverflowError, shapely.GEOSException,

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import shapely
 
-from barpc.errors import DisconnectedError, TiePointError
-from barpc.geodesy import Array, metres_per_unit, wrap_longitude
-from barpc.options import TieOptions
+from barpc.base.errors import DisconnectedError, TiePointError
+from barpc.base.geodesy import Array, metres_per_unit, wrap_longitude
+from barpc.base.options import TieOptions
 from barpc.scene import View, connected_groups, connected_labels
 from barpc.sensor.geometry import Several, convergence_angle, footprint, ground_sample_distance
 from barpc.tie.pairing.area import Area

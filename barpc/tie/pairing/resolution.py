@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barpc.frozen import Frozen
-from barpc.geodesy import Array, metres_per_unit
+from barpc.base.frozen import Frozen
+from barpc.base.geodesy import Array, metres_per_unit
 from barpc.scene import IntArray, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.tie.pairing.overlaps import Pair

@@ -21,10 +21,10 @@ from rasterio.crs import CRS
 from rasterio.errors import CRSError
 from rasterio.warp import transform as warp_points
 
-from barpc.errors import InputError
-from barpc.frozen import Frozen
-from barpc.geodesy import NEWTON_STEPS, Array, metres_per_unit
-from barpc.raster import open_raster
+from barpc.base.errors import InputError
+from barpc.base.frozen import Frozen
+from barpc.base.geodesy import NEWTON_STEPS, Array, metres_per_unit
+from barpc.rasters.raster import open_raster
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.overlaps import Terrain
 from barpc.tie.pixels import PIECE, Box, FloatImage, grow, levelled, read_pixels

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import BoolArray
 from barpc.tie.pixels import Box, FloatImage, Stretch, levelled, read_pixels
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barpc.geodesy import Array
+from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 from barpc.tie.pairing.epipolar import grouped
 from barpc.tie.patches.channels import BATCH, COARSE, EDGE, FINE, SHOWN, channels, correlation, cut, picture, ticks

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from barpc.geodesy import CHUNK, NEWTON_STEPS, Array
-from barpc.options import TieOptions
+from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array
+from barpc.base.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View
 from barpc.tie.pairing.epipolar import FEW, LEAST_REACH, affine_inliers, frame, grouped, linear_map, robust_spread
 from barpc.tie.patches import oriented

@@ -25,12 +25,12 @@ from rasterio.warp import transform as warp_points
 from rasterio.windows import Window
 from scipy.ndimage import map_coordinates
 
-from barpc.errors import BarpcWarning, ImageError, InputError
-from barpc.geodesy import FAR, Array
-from barpc.raster import open_raster
-from barpc.remote import Place, location
+from barpc.base.errors import BarpcWarning, ImageError, InputError
+from barpc.base.geodesy import FAR, Array
+from barpc.base.remote import Place, location
+from barpc.base.sidefile import GRID, opened
+from barpc.rasters.raster import open_raster
 from barpc.sensor import SensorModel
-from barpc.sidefile import GRID, opened
 
 HEIGHTS = {".hgt": ("SRTMHGT", "EGM96 height"), ".gtx": ("GTX", "ellipsoid")}
 """Suffix -> the driver that may open it (its first bytes say nothing), and what its heights count from."""

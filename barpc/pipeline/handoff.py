@@ -27,11 +27,12 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.transform import RPCTransformer
 
+from barpc.base.errors import OutputError
+from barpc.base.geodesy import Array, wrap_longitude
 from barpc.cameras import open_camera
-from barpc.errors import OutputError
 from barpc.fit.certificate import Sample
-from barpc.geodesy import Array, wrap_longitude
-from barpc.raster import GDAL_OPTIONS
+from barpc.rasters.raster import GDAL_OPTIONS
+from barpc.rasters.vrt import Vrt, read_vrt
 from barpc.rpcio import Carrier, read_rpc, row_of, sidecars
 from barpc.rpcio.grids import CORRECTION, GRID
 from barpc.sensor import SensorModel
@@ -39,7 +40,6 @@ from barpc.sensor.correction_grid import CorrectionGrid
 from barpc.sensor.csm import STATE_END
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.geometry import image_grid
-from barpc.vrt import Vrt, read_vrt
 
 TOLERANCE = 1e-6  # Largest difference [px] between a file and its model that passes
 

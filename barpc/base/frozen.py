@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import shutil
 import sys
-import uuid
 import zipfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -19,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib import format as npy
 
-from barpc.errors import BarpcError, InputError, OutputError
-from barpc.remote import Remote
-from barpc.sidefile import ARRAYS, NUMBER, Kind, opened
+from barpc.base.errors import BarpcError, InputError
+from barpc.base.remote import Remote
+from barpc.base.sidefile import ARRAYS, NUMBER, Kind, opened
 
 
 class Frozen:
@@ -231,67 +227,3 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any
 
 
 # --- files that are written whole or not at all -----------------------------------------------------------
-
-
-_MARK = ".barpc-partial-"
-STATE, PARTIAL = ".barpc", "partial"
-"""Where a run folder keeps what is on its way, and is emptied at the next start: nothing there need last."""
-
-
-@contextmanager
-def replacing(
-    path: Path | str, *, overwrite: bool = False, durable: bool = True, room: Path | None = None
-) -> Iterator[Path]:
-    """Yield a temporary path for `path`, renamed to it when the block ends without an error.
-
-    It has the target's own name, in a folder of its own: what a writer takes from a name stays right, however long.
-
-    Parameters
-    ----------
-    path : Path or str, the file to be written; its folder is made where it is missing
-    overwrite : bool, replace an existing file, else an OutputError
-    durable : bool, wait until the file is on the disk; not needed for what can be made again, never for what is on
-        its way through a run folder's room
-    room : Path, optional, where the temporary folder is made, on the same disk; None: beside `path`
-    """
-    path = Path(path)
-    refuse_existing(path, overwrite)
-    durable = durable and f"/{STATE}/{PARTIAL}/" not in path.as_posix()
-    place = (room or path.parent) / f"{_MARK}{uuid.uuid4().hex[:12]}"
-    partial = place / path.name
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        place.mkdir(parents=True)
-        yield partial
-        if durable:
-            _sync(partial)
-        refuse_existing(path, overwrite)  # it may have come while the block was at work
-        partial.replace(path)
-        if durable:
-            _sync(path.parent)
-    except OSError as error:
-        if isinstance(error, OutputError) or error.errno is None:
-            raise
-        raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
-    finally:
-        shutil.rmtree(place, ignore_errors=True)
-
-
-def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Raise an OutputError where a file would be replaced that may not be."""
-    if not overwrite and os.path.lexists(path):
-        raise OutputError(f"{path}: exists already; choose another name or allow overwriting")
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def write_text(path: Path | str, text: str, *, overwrite: bool = False) -> None:
-    """Write `text` to `path` as UTF-8 with the line ends it has, whole or not at all (`replacing`)."""
-    with replacing(path, overwrite=overwrite) as partial:
-        partial.write_bytes(text.encode())

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from barpc.errors import OutputError
-from barpc.frozen import replacing, write_text
+from barpc.base.atomic import replacing, write_text
+from barpc.base.errors import OutputError
 
 
 def test_a_block_that_fails_leaves_the_old_file_and_no_other(tmp_path):
@@ -54,7 +54,7 @@ def test_the_temporary_name_keeps_the_suffix(tmp_path):
 
 _WRITER = """
 import sys
-from barpc.frozen import write_text
+from barpc.base.atomic import write_text
 while True:
     for fill in ("a", "b"):
         write_text(sys.argv[1], fill * 3_000_000, overwrite=True)
@@ -80,5 +80,5 @@ def test_a_killed_writer_never_leaves_half_a_file(tmp_path):
 
 
 def _environment() -> dict[str, str]:
-    root = Path(__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     return os.environ | {"PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}

@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any, BinaryIO, NoReturn, TextIO
 from xml.etree import ElementTree
 
-from barpc import identity
-from barpc.errors import BarpcError, ImageError, InputError, RpcFormatError, visible
-from barpc.remote import BLOCK, Place, Remote, RemoteFile, location, pinned
+from barpc.base import identity
+from barpc.base.errors import BarpcError, ImageError, InputError, RpcFormatError, visible
+from barpc.base.remote import BLOCK, Place, Remote, RemoteFile, location, pinned
 
 MB = 1 << 20
 NUMBER = 8

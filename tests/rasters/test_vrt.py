@@ -12,8 +12,9 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.windows import Window
 
-from barpc.errors import ImageError
-from barpc.raster import open_raster
+from barpc.base.errors import ImageError
+from barpc.rasters.raster import open_raster
+from barpc.rasters.vrt import GDAL_TYPES
 from barpc.rpcio import (
     plain_source,
     read_rpc_source,
@@ -23,7 +24,6 @@ from barpc.rpcio import (
     write_rpc_vrt,
 )
 from barpc.rpcio.xml import rpc_domain
-from barpc.vrt import GDAL_TYPES
 from tests.rpcio.conftest import make_rpc
 
 SIZE = (40, 30)

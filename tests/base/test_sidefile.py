@@ -19,12 +19,9 @@ import numpy as np
 import pytest
 
 import barpc
-from barpc.errors import BarpcError, InputError
-from barpc.frozen import load_npz
-from barpc.rpcio import FORMATS
-from barpc.rpcio.formats import parse
-from barpc.rpcio.text import ReadOptions
-from barpc.sidefile import (
+from barpc.base.errors import BarpcError, InputError
+from barpc.base.frozen import load_npz
+from barpc.base.sidefile import (
     ARRAYS,
     GEOJSON,
     NAMES,
@@ -38,6 +35,9 @@ from barpc.sidefile import (
     read_json,
     read_text,
 )
+from barpc.rpcio import FORMATS
+from barpc.rpcio.formats import parse
+from barpc.rpcio.text import ReadOptions
 from tests.fuzz.samples import SAMPLES
 from tests.lanes import diagonal, rest_slow
 
@@ -250,11 +250,11 @@ def test_readers_take_time_in_proportion_to_the_file(kind, fill, tmp_path):
 # --- no way around ----------------------------------------------------------------------------------------
 
 DIRECT = {
-    "sidefile.py": "the one place",
-    "atomic.py": "syncs what was written",
-    "handoff.py": "reopens what barpc has just written, as its consumers do",
-    "raster.py": "images, checked there",
-    "identity.py": "any input, to hash it: below sidefile, which asks it; regular files only",
+    "base/sidefile.py": "the one place",
+    "base/atomic.py": "syncs what was written",
+    "pipeline/handoff.py": "reopens what barpc has just written, as its consumers do",
+    "rasters/raster.py": "images, checked there",
+    "base/identity.py": "any input, to hash it: below sidefile, which asks it; regular files only",
     "workspace.py": "barpc's own source, the state",
     "pipeline/executor.py": "arrays that the caller has put down for its workers",
     "cameras.py": "no file: a row of the table of openers",

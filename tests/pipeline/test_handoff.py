@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.errors import OutputError
-from barpc.geodesy import Array
-from barpc.handoff import (
+from barpc.base.errors import OutputError
+from barpc.base.geodesy import Array
+from barpc.pipeline.handoff import (
     CONSUMERS,
     TOLERANCE,
     control_grid,
@@ -113,7 +113,7 @@ def test_a_fault_of_the_machine_is_no_finding_about_a_file(image, tmp_path, monk
     def copy(*_: object) -> None:
         raise OSError(code, "so it is")
 
-    monkeypatch.setattr("barpc.handoff.shutil.copy", copy)
+    monkeypatch.setattr("barpc.pipeline.handoff.shutil.copy", copy)
     if refused:
         with pytest.raises(OutputError, match=r"a_RPC\.TXT: cannot be opened as gdal.* does \(so it is\)"):
             verify([path], make_rpc(), SIZE, ALTITUDES)
@@ -221,7 +221,7 @@ def test_rpcm_is_asked_in_the_way_that_suits_the_file(name, reader, image, tmp_p
     path = write(rpc, image, tmp_path / "out", name)
     rpcm = Other(rpc)
     rpcm.projection = lambda lon, lat, alt: rpc.project(np.column_stack([lon, lat, alt])).T
-    monkeypatch.setattr("barpc.handoff.import_module", lambda module: {"rpcm.rpc_model": rpcm}[module])
+    monkeypatch.setattr("barpc.pipeline.handoff.import_module", lambda module: {"rpcm.rpc_model": rpcm}[module])
     project = CONSUMERS["rpcm"].open(path)
     ground, _ = control_grid(rpc, SIZE, ALTITUDES)
     np.testing.assert_array_equal(project(ground), rpc.project(ground))
@@ -251,7 +251,7 @@ def shareloc(rpc: RPC, takes: Callable[[Array], BoolArray] = lambda lon: np.abs(
 def test_shareloc_counts_from_the_corner_of_the_first_pixel_and_row_before_col(lon, turn, monkeypatch, tmp_path):
     rpc = make_rpc(lon=lon)
     model = shareloc(rpc)
-    monkeypatch.setattr("barpc.handoff.import_module", lambda _: model)
+    monkeypatch.setattr("barpc.pipeline.handoff.import_module", lambda _: model)
     ground, _ = control_grid(rpc, SIZE, ALTITUDES)
     found = CONSUMERS["shareloc"].open(tmp_path / "a.tif")(ground + [turn, 0.0, 0.0])
     np.testing.assert_allclose(found, rpc.project(ground), atol=1e-6 if turn else 1e-9)
@@ -279,9 +279,9 @@ def test_shareloc_counts_from_the_corner_of_the_first_pixel_and_row_before_col(l
 )
 def test_what_shareloc_leaves_out_beyond_180_degrees_is_told(lon, takes, note, monkeypatch, tmp_path):
     rpc = make_rpc(lon=lon)
-    monkeypatch.setattr("barpc.handoff.import_module", lambda _: shareloc(rpc, takes))
+    monkeypatch.setattr("barpc.pipeline.handoff.import_module", lambda _: shareloc(rpc, takes))
     named = {"shareloc": replace(CONSUMERS["shareloc"], package="numpy"), "barpc": CONSUMERS["barpc"]}
-    monkeypatch.setattr("barpc.handoff._consumers", lambda _: named)
+    monkeypatch.setattr("barpc.pipeline.handoff._consumers", lambda _: named)
     write_rpc(rpc, tmp_path / "a.geom")
     reading, own = verify([tmp_path / "a.geom"], rpc, SIZE, ALTITUDES)
     assert own.passed
@@ -294,7 +294,7 @@ def test_orthority_counts_as_barpc_does(monkeypatch, tmp_path):
     rpc = make_rpc()
     model = Other(rpc)
     model.world_to_pixel = lambda columns: rpc.project(columns.T).T
-    monkeypatch.setattr("barpc.handoff.import_module", lambda _: model)
+    monkeypatch.setattr("barpc.pipeline.handoff.import_module", lambda _: model)
     ground, _ = control_grid(rpc, SIZE, ALTITUDES)
     found = CONSUMERS["orthority"].open(tmp_path / "a.tif")(ground)
     np.testing.assert_array_equal(found, rpc.project(ground))

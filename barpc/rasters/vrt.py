@@ -1,7 +1,7 @@
 """Reading a VRT: a closed grammar of tags, attributes and text; what is not in it is refused.
 
 GDAL's own reader takes attributes for elements, tags in any case, and half-closed documents. So GDAL is never
-shown a VRT: what this module reads is all there is, and `barpc.raster` puts the pixels together.
+shown a VRT: what this module reads is all there is, and `barpc.rasters.raster` puts the pixels together.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
-from barpc.errors import ImageError, RpcFormatError
-from barpc.sidefile import parse_xml
+from barpc.base.errors import ImageError, RpcFormatError
+from barpc.base.sidefile import parse_xml
 
 _INTEGERS = {f"{u}int{n}": f"{u.upper()}Int{n}" for n in (16, 32, 64) for u in ("u", "")}
 _COMPLEX = {"complex_int16": "CInt16", "complex64": "CFloat32", "complex128": "CFloat64"}

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.errors import ImageError
-from barpc.raster import open_raster
+from barpc.base.errors import ImageError
+from barpc.rasters.raster import open_raster
 
 
 @pytest.fixture

@@ -16,8 +16,8 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 
-from barpc.errors import InputError
-from barpc.remote import Remote
+from barpc.base.errors import InputError
+from barpc.base.remote import Remote
 
 _HOST = platform.node()
 
@@ -156,7 +156,7 @@ _seen: ContextVar[dict[str, Stamp] | None] = ContextVar("seen", default=None)
 
 @contextmanager
 def recorded(seen: dict[str, Stamp]) -> Iterator[dict[str, Stamp]]:
-    """Record every file that `barpc.sidefile` opens in the block, as it was the first time."""
+    """Record every file that `barpc.base.sidefile` opens in the block, as it was the first time."""
     token = _seen.set(seen)
     try:
         yield seen

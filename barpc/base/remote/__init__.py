@@ -18,7 +18,7 @@ from ipaddress import IPv6Address
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
-from barpc.errors import ImageError
+from barpc.base.errors import ImageError
 
 HOST = re.compile(r"(?:(?:https?|s3|gs|az)://)?(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:]+\])(?::\d{1,5})?")
 """An entry of the list of hosts: a host is that of https; http, and the buckets of object stores, say so."""
@@ -155,7 +155,7 @@ class Part:
 
 
 def _fetch(at: Remote, start: int, stop: int) -> Part:
-    from barpc.remote.hosts import fetch
+    from barpc.base.remote.hosts import fetch
 
     return fetch(at, start, stop)
 
@@ -269,7 +269,7 @@ def _runs(blocks: list[int]) -> Iterator[range]:
 
 
 def beside(image: Remote, names: Iterable[str]) -> dict[str, str]:
-    """See `barpc.remote.hosts.beside`."""
-    from barpc.remote.hosts import beside as look
+    """See `barpc.base.remote.hosts.beside`."""
+    from barpc.base.remote.hosts import beside as look
 
     return look(image, names)

@@ -7,7 +7,7 @@ import pytest
 import shapely
 from shapely.geometry import shape
 
-from barpc.geodesy import collection, feature, polygon
+from barpc.base.geodesy import collection, feature, polygon
 from barpc.sensor.geometry import footprint
 from barpc.simulate import Look, fly
 from tests.sensor.conftest import make_rpc

@@ -22,8 +22,8 @@ from itertools import chain
 from typing import Any
 from urllib.parse import quote, urljoin, urlsplit
 
-from barpc.errors import visible
-from barpc.remote import BLOCK, Part, Remote
+from barpc.base.errors import visible
+from barpc.base.remote import BLOCK, Part, Remote
 
 
 def fetch(at: Remote, start: int, stop: int) -> Part:

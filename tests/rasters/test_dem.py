@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.dem import Dem, HeightGrid, localize_on_terrain
-from barpc.errors import BarpcWarning, InputError
-from barpc.geodesy import ecef_from_ground
+from barpc.base.errors import BarpcWarning, InputError
+from barpc.base.geodesy import ecef_from_ground
+from barpc.rasters.dem import Dem, HeightGrid, localize_on_terrain
 from barpc.rpcio import read_rpc
 from barpc.sensor.geometry import altitude_range
 from tests.sensor.conftest import make_rpc
@@ -225,8 +225,8 @@ def test_a_warning_is_only_given_where_it_is_due(tmp_path):
 def test_points_that_spread_over_too_many_cells_are_refused_at_once(tmp_path, monkeypatch):
     dem = Dem.open(write_dem(tmp_path / "a.tif", 4979))
     lon, lat = 5 + STEP * np.array([0.0, 2.5]), 44 - STEP * np.array([0.0, 3.5])  # nodes 0 .. 3 by 0 .. 4
-    monkeypatch.setattr("barpc.dem._MAX_CELLS", 20)
+    monkeypatch.setattr("barpc.rasters.dem._MAX_CELLS", 20)
     assert np.isfinite(dem(lon, lat)).all()
-    monkeypatch.setattr("barpc.dem._MAX_CELLS", 19)
+    monkeypatch.setattr("barpc.rasters.dem._MAX_CELLS", 19)
     with pytest.raises(InputError, match="spread over 20 cells"):
         dem(lon, lat)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc import geodesy
+from barpc.base import geodesy
 
 
 @pytest.fixture

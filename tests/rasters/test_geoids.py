@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc import dem as geoids
-from barpc.dem import Dem, HeightGrid, geoid_file
-from barpc.errors import InputError
-from barpc.options import RunOptions
+from barpc.base.errors import InputError
+from barpc.base.options import RunOptions
 from barpc.pipeline.inputs import with_located
+from barpc.rasters import dem as geoids
+from barpc.rasters.dem import Dem, HeightGrid, geoid_file
 
 
 @pytest.fixture

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from barpc.base.errors import FitError, InputError, RpcError
+from barpc.base.frozen import Frozen
 from barpc.cameras import Camera
-from barpc.errors import FitError, InputError, RpcError
 from barpc.fit import Normalization, fit_rpc
-from barpc.frozen import Frozen
 from barpc.scene import GroundPoints, Tracks, View
 from barpc.sensor.corrected import Corrected, Correction, ImageAffine
 from barpc.sensor.curve import Curve

@@ -17,10 +17,8 @@ import pytest
 from click.testing import CliRunner
 
 import barpc
-from barpc.cli.flags import ADJUSTMENT, RUN, TIE, flag, flag_name, run_options
-from barpc.cli.main import cli
-from barpc.errors import InputError
-from barpc.options import (
+from barpc.base.errors import InputError
+from barpc.base.options import (
     AdjustOptions,
     Declared,
     FitOptions,
@@ -32,6 +30,8 @@ from barpc.options import (
     schema,
     with_values,
 )
+from barpc.cli.flags import ADJUSTMENT, RUN, TIE, flag, flag_name, run_options
+from barpc.cli.main import cli
 
 TABLES: dict[str, type[Options]] = {
     "": RunOptions, "tie": TieOptions, "adjust": AdjustOptions, "fit": FitOptions

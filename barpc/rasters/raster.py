@@ -2,8 +2,8 @@
 
 GDAL decides by content what a file is, and some contents (a VRT, a web service description) make it read other
 files or the network. So the first bytes choose the one driver that may open a file, GDAL does not look at the files
-beside it, and a VRT is never shown to it: `barpc.vrt` reads it, and `Mosaic` puts the pixels together. Of a file on
-another host GDAL asks this process for bytes, and it alone speaks with the host.
+beside it, and a VRT is never shown to it: `barpc.rasters.vrt` reads it, and `Mosaic` puts the pixels together. Of a
+file on another host GDAL asks this process for bytes, and it alone speaks with the host.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioError
 from rasterio.transform import array_bounds
 from rasterio.windows import Window
 
-from barpc import identity
-from barpc.errors import ImageError
-from barpc.identity import Input
-from barpc.remote import Place, Remote, RemoteFile, location
+from barpc.base import identity
+from barpc.base.errors import ImageError
+from barpc.base.identity import Input
+from barpc.base.remote import Place, Remote, RemoteFile, location
+from barpc.base.sidefile import IMAGE, read_head
+from barpc.rasters.vrt import INDIRECT, MAGIC, Band, Rect, Source, Vrt, read_vrt
 from barpc.scene import BoolArray
-from barpc.sidefile import IMAGE, read_head
-from barpc.vrt import INDIRECT, MAGIC, Band, Rect, Source, Vrt, read_vrt
 
 DRIVERS: dict[bytes, str] = {
     b"II*\x00": "GTiff",
@@ -70,9 +70,9 @@ _WARNINGS = threading.Lock()  # catch_warnings is process-wide
 def open_raster(path: str | os.PathLike[str], driver: str | None = None) -> Iterator[Any]:
     """Open a raster read-only, as a rasterio.DatasetReader or a Mosaic; an error while it is open names the file, too.
 
-    `driver` may open a file whose first bytes do not tell its kind (`barpc.dem.HEIGHTS`). ImageError for a file that
-    is missing, a folder, empty, of no kind that barpc reads, damaged, remote, or a VRT that is not of the grammar of
-    `barpc.vrt` or points at anything else than plain local rasters.
+    `driver` may open a file whose first bytes do not tell its kind (`barpc.rasters.dem.HEIGHTS`). ImageError for a file
+    that is missing, a folder, empty, of no kind that barpc reads, damaged, remote, or a VRT that is not of the grammar
+    of `barpc.rasters.vrt` or points at anything else than plain local rasters.
     """
     name = os.fspath(path)
     identity.ask(path)

@@ -7,9 +7,9 @@ import os
 
 import pytest
 
-from barpc import identity
-from barpc.errors import InputError
-from barpc.remote import Remote
+from barpc.base import identity
+from barpc.base.errors import InputError
+from barpc.base.remote import Remote
 
 
 def test_a_file_whose_number_changes_and_whose_bytes_do_not_is_the_same(tmp_path) -> None:

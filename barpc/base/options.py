@@ -19,9 +19,9 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from barpc.errors import InputError
-from barpc.remote import HOST
-from barpc.sidefile import NUMBER, OPTIONS, TABLE, read_text
+from barpc.base.errors import InputError
+from barpc.base.remote import HOST
+from barpc.base.sidefile import NUMBER, OPTIONS, TABLE, read_text
 
 T = TypeVar("T")
 Record = TypeVar("Record", bound="Options")

@@ -1,0 +1,1 @@
+"""Rasters opened safely; terrain heights and geoids."""
