@@ -420,9 +420,9 @@ AREA = (
     b' [{"type": "Polygon", "coordinates": [[[179, 0], [-179, 0], [-179, 1], [179, 0]]]}]}}]}'
 )
 OPTIONS = (
-    b'images = "none"\nrpc_formats = ["txt", "rpb"]\ntiles = 512\nkeep_going = true\ngcp = ["a.gcp"]\n'
+    b'images = "none"\nrpc_formats = ["txt", "rpb"]\nkeep_going = true\ngcp = ["a.gcp"]\n'
     b'[tie]\nband = 2\nangles = [1, 40.5]\nmatcher = "guided"\n[adjust]\nmodel = "rotation"\nfixed = ["left"]\n'
-    b"sigma_attitude = 3.0\nfixed = [\"left\"]\n[fit]\ngrid = [12, 12, 7]\ntolerance = 1e-3\n"
+    b"sigma_attitude = 3.0\n[fit]\ngrid = [12, 12, 7]\ntolerance = 1e-3\n"
 )
 ASP_GCPS = (
     b"# WGS84\n1 43.2 5.4 120.5 1 1 1 left.tif 10.5 20.25 0.5 0.5 right.tif 30 40 0.5 0.5\n"
