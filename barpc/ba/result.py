@@ -1,4 +1,4 @@
-"""What an adjustment hands back, and how well a pair of its views knows heights."""
+"""What an adjustment hands back, what a later run starts from, and how well a pair of its views knows heights."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ import numpy as np
 
 from barpc.ba.altimetry import AltimetryTest
 from barpc.ba.apart import Apart
+from barpc.ba.estimated.priors import EarlierScene
 from barpc.ba.estimated.projected import Cameras
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.held.gauge import GaugeReport
 from barpc.ba.held.ground import TerrainTest
+from barpc.ba.held.incremental import BlockPrior
 from barpc.ba.judging.judge import Finding
 from barpc.ba.judging.snooping import ControlTest
 from barpc.ba.robust.consensus import TwoGroups
@@ -285,3 +287,35 @@ def height_by_unknowns(cameras: Cameras, params: Array, pair: tuple[int, int], p
 
 def _rms(rows: Array, covariance: Array) -> float:
     return float(np.sqrt(np.einsum("ni,ij,nj->n", rows, covariance, rows).mean()))
+
+
+def block_prior(adjustment: Adjustment) -> BlockPrior:
+    """Return the prior that a later run starts from.
+
+    Parameters
+    ----------
+    adjustment : Adjustment
+        A finished block.
+
+    Returns
+    -------
+    BlockPrior
+    """
+    reduced, free, n = adjustment.covariance.reduced, adjustment.covariance.free, len(adjustment.names)
+    waves = adjustment.cameras.unknowns.waves
+    views, matrix = np.flatnonzero(free.reshape(n, -1)[:, 0]), reduced.matrix
+    return BlockPrior(
+        tuple(adjustment.names[v] for v in views),
+        adjustment.cameras.unknowns.model,
+        adjustment.cameras.unknowns.drift,
+        adjustment.params[views],
+        reduced.plain(free) if isinstance(matrix, np.ndarray) else matrix.sparse()[free][:, free],
+        adjustment.cameras.unknowns.center[views],
+        None if isinstance(matrix, np.ndarray) or reduced.common is None else reduced.common.by_camera[:, free],
+        waves.count if waves else 0,
+        waves.edges[views] if waves else None,
+        tuple(adjustment.names[v] for v in adjustment.cameras.unknowns.radars if v in views),
+        waves.strips[views] if waves and waves.strips.size else None,
+        waves.periods[views] if waves and waves.periods.size else None,
+        EarlierScene(adjustment.gauge.by_unknown[:, free], adjustment.gauge.own, adjustment.gauge.radius),
+    )

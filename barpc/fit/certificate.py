@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,9 +19,6 @@ from barpc.base.geodesy import CHUNK, Array, metres_per_unit, wrap_longitude
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
 
-if TYPE_CHECKING:
-    from barpc.fit.reasons import Reason
-
 BoolArray = npt.NDArray[np.bool_]
 
 EXACT = 1e-6  # px: what no other method is tried on, and no round trip is held to
@@ -29,6 +26,44 @@ CELLS = 45
 """Along each side of the image: 2025 points of the whole."""
 _EDGE = 12  # points along each edge of the image, at either end of the altitudes
 _WORST, _AROUND, _ROUNDS = 16, 8, 5  # points that are looked around at, new ones around each, rounds, ever nearer
+
+
+_WORDS = {
+    "row": "go by the row (a swing of the attitude, bursts, a long pass): a grid of the camera follows it",
+    "column": "go by the column (a lens, detectors, a scan): fit fewer columns, or take a grid",
+    "altitude": "go by the altitude: fit a smaller altitude range",
+    "place": "are in one place, about col {col:.0f}, row {row:.0f}: look at the camera there",
+    "corner": "are in the corner at col {col:.0f}, row {row:.0f}: leave it out, or fit a smaller image",
+    "pole": "are what the bound on denominators around the image costs: lower pole_margin, or fit a smaller image",
+    "all": "are all over the image and its altitudes: not an RPC's shape, fit a smaller image, or take a grid",
+}
+
+
+@dataclass(frozen=True)
+class Reason:
+    """What most of an RPC's errors depend on: row, column, altitude, a place.
+
+    Parameters
+    ----------
+    cause : str
+        "row", "column", "altitude", "place", "corner", "pole" or "all".
+    share : float
+        Part of the squared errors that is due to it; of "all", what is left by the best of the others.
+    size_px : float
+        Root mean square of that part.
+    col, row : float
+        Position of a place [px].
+    """
+
+    cause: str
+    share: float
+    size_px: float
+    col: float = float("nan")
+    row: float = float("nan")
+
+    def __str__(self) -> str:
+        words = _WORDS[self.cause].format(col=self.col, row=self.row)
+        return f"{self.share:.0%} of its squares, {self.size_px:.3g} px RMS, {words}"
 
 
 @dataclass

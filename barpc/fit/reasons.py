@@ -8,54 +8,16 @@ shape is assumed, so that swings, bursts and steps count alike.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from barpc.base.geodesy import Array
-from barpc.fit.certificate import Sample
+from barpc.fit.certificate import Reason, Sample
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 
 _POWERS = np.arange(1, 8)  # of altitudes
 _CELLS = 4  # along each side: where all errors are in one of them, they are in one place
 _MOST = 0.5  # of the squares: a cause of more is named
-_WORDS = {
-    "row": "go by the row (a swing of the attitude, bursts, a long pass): a grid of the camera follows it",
-    "column": "go by the column (a lens, detectors, a scan): fit fewer columns, or take a grid",
-    "altitude": "go by the altitude: fit a smaller altitude range",
-    "place": "are in one place, about col {col:.0f}, row {row:.0f}: look at the camera there",
-    "corner": "are in the corner at col {col:.0f}, row {row:.0f}: leave it out, or fit a smaller image",
-    "pole": "are what the bound on denominators around the image costs: lower pole_margin, or fit a smaller image",
-    "all": "are all over the image and its altitudes: not an RPC's shape, fit a smaller image, or take a grid",
-}
-
-
-@dataclass(frozen=True)
-class Reason:
-    """What most of an RPC's errors depend on: row, column, altitude, a place.
-
-    Parameters
-    ----------
-    cause : str
-        "row", "column", "altitude", "place", "corner", "pole" or "all".
-    share : float
-        Part of the squared errors that is due to it; of "all", what is left by the best of the others.
-    size_px : float
-        Root mean square of that part.
-    col, row : float
-        Position of a place [px].
-    """
-
-    cause: str
-    share: float
-    size_px: float
-    col: float = float("nan")
-    row: float = float("nan")
-
-    def __str__(self) -> str:
-        words = _WORDS[self.cause].format(col=self.col, row=self.row)
-        return f"{self.share:.0%} of its squares, {self.size_px:.3g} px RMS, {words}"
 
 
 def reason(rpc: RPC, sample: Sample) -> Reason | None:

@@ -11,7 +11,8 @@ import pytest
 import scipy.sparse as sp
 
 from barpc.ba.estimated.priors import CameraPrior, EarlierScene
-from barpc.ba.held.incremental import BlockPrior, apply_prior, block_prior
+from barpc.ba.held.incremental import BlockPrior, apply_prior
+from barpc.ba.result import block_prior
 from barpc.base.errors import InputError
 from barpc.simulate import simulate_block
 from tests.ba.conftest import solve

@@ -10,7 +10,8 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.estimated.waves import Waves
-from barpc.ba.held.incremental import BlockPrior, block_prior
+from barpc.ba.held.incremental import BlockPrior
+from barpc.ba.result import block_prior
 from barpc.base.errors import InputError
 from barpc.fit import fit_rpc
 from barpc.sensor.splined import Splined

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg as la
@@ -22,9 +21,6 @@ from barpc.base.errors import InputError
 from barpc.base.frozen import load_npz
 from barpc.base.geodesy import Array
 from barpc.base.sidefile import ARRAYS, LARGEST
-
-if TYPE_CHECKING:
-    from barpc.ba.result import Adjustment
 
 PRIOR = replace(ARRAYS, words="the prior of an adjusted block")
 _SPARSE = ("data", "indices", "indptr")
@@ -218,38 +214,6 @@ def _csr(file: Mapping[str, Array], size: int) -> sp.csr_array:
 def _within(numbers: Array, most: int) -> bool:
     """Return whether all are whole, and from 0 to `most`."""
     return bool(numbers.ndim == 1 and numbers.dtype.kind in "iu" and ((numbers >= 0) & (numbers <= most)).all())
-
-
-def block_prior(adjustment: Adjustment) -> BlockPrior:
-    """Return the prior that a later run starts from.
-
-    Parameters
-    ----------
-    adjustment : Adjustment
-        A finished block.
-
-    Returns
-    -------
-    BlockPrior
-    """
-    reduced, free, n = adjustment.covariance.reduced, adjustment.covariance.free, len(adjustment.names)
-    waves = adjustment.cameras.unknowns.waves
-    views, matrix = np.flatnonzero(free.reshape(n, -1)[:, 0]), reduced.matrix
-    return BlockPrior(
-        tuple(adjustment.names[v] for v in views),
-        adjustment.cameras.unknowns.model,
-        adjustment.cameras.unknowns.drift,
-        adjustment.params[views],
-        reduced.plain(free) if isinstance(matrix, np.ndarray) else matrix.sparse()[free][:, free],
-        adjustment.cameras.unknowns.center[views],
-        None if isinstance(matrix, np.ndarray) or reduced.common is None else reduced.common.by_camera[:, free],
-        waves.count if waves else 0,
-        waves.edges[views] if waves else None,
-        tuple(adjustment.names[v] for v in adjustment.cameras.unknowns.radars if v in views),
-        waves.strips[views] if waves and waves.strips.size else None,
-        waves.periods[views] if waves and waves.periods.size else None,
-        EarlierScene(adjustment.gauge.by_unknown[:, free], adjustment.gauge.own, adjustment.gauge.radius),
-    )
 
 
 def apply_prior(
