@@ -199,7 +199,7 @@ def test_a_cut_that_changes_little_is_not_solved_again(monkeypatch) -> None:
     dirty = simulate_block(3, 400, seed=5, outliers=0.1)
     passes = []
     for share in (0.0, 0.2):
-        monkeypatch.setattr(rounds, "_SAME", share)
+        monkeypatch.setattr(rounds, "SLIGHT", share)
         with chosen(AdjustOptions, robust_threshold=1.2):
             found = solve(dirty, **CALM, estimate_noise=False)
         passes.append(int(found.status.split()[0]))

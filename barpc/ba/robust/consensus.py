@@ -15,10 +15,12 @@ import scipy.sparse as sp
 
 from barpc.ba.algebra.structure import Structure, parts
 from barpc.ba.estimated.projected import Projected
-from barpc.ba.usual import FEW, ITERATIONS, LEVEL, MANY, OUTLIER, STEPS, SURE, TRIALS
+from barpc.ba.usual import FEW, ITERATIONS, LEVEL, MANY, OUTLIER, STEPS, TRIALS
 from barpc.base.geodesy import CHUNK, Array
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.curve import cross
+
+_EVIDENT = 15.0  # nats over one group: two are likelier by a factor of three million
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ def two_groups(structure: Structure, residual: Array, by_point: Array, use: Bool
         maybe = (cube**2 / square**3 + 1.0) >= 4.0 / 9.0 * fourth / square**2
     for pair in np.flatnonzero(maybe & (count >= MANY)):
         share, apart, gain = _mixture(z[bounds[pair] : bounds[pair + 1]])
-        if share > LEVEL and gain > SURE:
+        if share > LEVEL and gain > _EVIDENT:
             first, second = structure.pair_view[pair].tolist()
             found.append(TwoGroups((first, second), share, apart))
     return tuple(found)

@@ -23,7 +23,6 @@ from barpc.ba.usual import (
     CRITICAL,
     GROSS,
     ITERATIONS,
-    LEAST_NOISE,
     MUCH_NOISE,
     OUTLIER,
     SHRINK,
@@ -39,6 +38,7 @@ from barpc.scene import BoolArray
 _LOG = logging.getLogger(__name__)
 
 _SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each view by itself
+_LEAST_NOISE = 0.5  # of the stated sigmas, while outliers are about
 _SAME_NOISE = 0.02  # a change of the noise by less than this part is not solved again
 _MANY_CUT = 0.01  # of the observations: more are looked at again
 MAX_PASSES = 5  # rounds of cutting and solving, at most: they end when nothing changes
@@ -259,7 +259,7 @@ def _robust(
     s = observations.squared(residual, counted)
     for _ in range(ITERATIONS):
         least = float(np.sqrt(np.quantile(s[use], BEST) / BEST)) if use.any() else 1.0
-        noise = max(float(np.sqrt(_median(s, counted) / MEDIAN)), least, LEAST_NOISE)
+        noise = max(float(np.sqrt(_median(s, counted) / MEDIAN)), least, _LEAST_NOISE)
         if scale <= 3.6 * noise:
             break
         clean = noise < MUCH_NOISE and float((s[use] > (OUTLIER * noise) ** 2).mean()) < SLIGHT

@@ -31,6 +31,7 @@ _LOG = logging.getLogger(__name__)
 
 _LIKELIER = -np.log(LEVEL)  # but one odd view is named where all being worse than stated is as improbable beside it
 _MOVING = 0.01  # of a rotation, as drift: the centre it turns about flies some km while an image is taken
+_LOW = 0.1  # then as much is let be as leaves what is seen this likely: a prior too narrow bends all heights alike
 SAME_PRIOR = 0.2  # change of a standard deviation, as a logarithm, below which a block is not solved again
 _LEAST = 0.5  # degrees of freedom below which nothing is said
 
@@ -318,7 +319,7 @@ class Variances:
 
 def _possible(total: float, freedom: float) -> float:
     """Return a variance, in units of the one given, that still makes such a sum of squares likely enough."""
-    return float(total / (2.0 * gammaincinv(0.5 * freedom, LEVEL)))
+    return float(total / (2.0 * gammaincinv(0.5 * freedom, _LOW)))
 
 
 def same_prior(a: CameraPrior, b: CameraPrior, share: float, part: slice | None = None) -> bool:

@@ -19,6 +19,7 @@ from barpc.base.geodesy import Array
 from barpc.scene import BoolArray
 
 MEDIAN = 0.55  # of |r|^2 over its expectation: chi-square with 1 (two views) to 2 (many) degrees of freedom
+_LARGEST_MISFIT = 3.0  # px: or a misfit would loosen the view that causes it
 
 Loss = Callable[[Array], tuple[Array, Array]]
 """s (...) -> rho(s), rho'(s); rho(0) = 0, rho'(0) = 1."""
@@ -126,7 +127,7 @@ class Observations:
         """
         weight: Array = use / (self.sigma * noise)
         information = self.structure.sum_views((weight * self.is_tie)[None] ** 2)[:, 0]
-        floor = self.noise_floor**2 / self.stretches + np.square(misfit) / SPLINES
+        floor = self.noise_floor**2 / self.stretches + np.minimum(misfit, _LARGEST_MISFIT) ** 2 / SPLINES
         cap = 1.0 / np.sqrt(np.maximum(information * floor, 1.0))
         count = self.structure.sum_views((use & self.of_reference).astype(np.float64)[None])[:, 0]
         alike = np.sqrt(np.minimum(ALIKE / np.maximum(count, 1.0), 1.0))
