@@ -226,7 +226,9 @@ def _copy_window(dataset: Any, partial: Path, target: Path, window: Window, **op
     profile = {"width": window.width, "height": window.height, "count": dataset.count, **options}
     profile |= {"dtype": dataset.dtypes[0], "nodata": dataset.nodata}
     if dataset.crs is not None:
-        moved = dataset.transform * rasterio.Affine.translation(window.col_off, window.row_off)
+        a, b, x, d, e, y = dataset.transform[:6]
+        col, row = window.col_off, window.row_off
+        moved = rasterio.Affine(a, b, x + a * col + b * row, d, e, y + d * col + e * row)
         profile |= {"crs": dataset.crs, "transform": moved}
 
     def part(block: Window) -> Window:
