@@ -86,6 +86,24 @@ def measured(trees: dict[Path, ast.Module]) -> tuple[int, ...]:
     )
 
 
+def arrows(trees: dict[Path, ast.Module]) -> int:
+    """Pairs of rooms (folders of the package, and modules beside them) of which one imports from the other."""
+
+    def room(dotted: str) -> str:
+        return dotted.split(".")[1] if "." in dotted else ""
+
+    found = set()
+    for path, tree in trees.items():
+        own = room(".".join(path.relative_to(ROOT).with_suffix("").parts))
+        for node in ast.walk(tree):
+            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module == "barpc":
+                names = [f"barpc.{alias.name}" for alias in node.names]
+            found |= {(own, room(name)) for name in names if name.startswith("barpc.") and room(name) != own}
+    return len(found)
+
+
 def surface() -> tuple[int, int]:
     """Flags over all verbs, and fields of options."""
     import click
@@ -124,7 +142,8 @@ def main() -> None:
     for name, place in places.items():
         if inside := {path: tree for path, tree in trees.items() if place in path.parents}:
             print(f"| {name} |", " | ".join(map(str, measured(inside))), "|")
-    print("\n{} flags over all verbs, {} fields of options".format(*surface()))
+    print(f"\n{arrows(trees)} arrows between rooms")
+    print("{} flags over all verbs, {} fields of options".format(*surface()))
 
 
 if __name__ == "__main__":

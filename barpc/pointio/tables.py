@@ -80,7 +80,11 @@ def read_table(
 
 def _cells(line: str, delimiter: str) -> list[str]:
     """Return the cells of a line, those that are empty too unless blanks part them."""
-    row = next(csv.reader([line.rstrip("\r\n")], delimiter=delimiter, skipinitialspace=True))
+    line = line.rstrip("\r\n")
+    if '"' in line:
+        row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+    else:
+        row = [cell.lstrip(" ") for cell in line.split(delimiter)]
     return [cell for cell in row if delimiter != " " or cell]
 
 

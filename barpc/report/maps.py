@@ -28,6 +28,7 @@ _MOST = 60  # images on the page: those with the largest systematic part
 _VECTORS = 6000
 _PANEL = 180.0
 _LONGEST = 16  # characters of a name on the map
+_SAME = 7  # px on the map: half a line of names
 _REACH = 12.0  # units of a long residual
 
 
@@ -197,10 +198,15 @@ def _drawn(files: RunFiles) -> list[tuple[int, ViewEntry, Sequence[Array]]]:
 
 
 def _names(places: Sequence[tuple[ViewEntry, Array]], taken: Sequence[tuple[float, float, float]]) -> list[str]:
-    """Return names of images at places (2,), but those that would stand on others or on what is taken: x, y, half."""
+    """Return names of images at places (2,), but those that would stand on others or on what is taken: x, y, half.
+
+    A name tells how many images have their middle in the same place.
+    """
     taken, names = list(taken), []
     for view, place in places:
+        alike = sum(bool(np.abs(other - place).max() < _SAME) for _, other in places) - 1
         name = view.name if len(view.name) <= _LONGEST else f"…{view.name[1 - _LONGEST :]}"  # its end tells of a series
+        name += f" + {alike}" * bool(alike)
         (x, y), half = place.tolist(), 3.6 * len(name)
         x = min(max(x, half), WIDTH - half)
         if all(abs(x - u) > half + other or abs(y - v) > 14 for u, v, other in taken):

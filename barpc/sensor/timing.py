@@ -6,6 +6,7 @@ amount and a slope along the flight, not by an attitude.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Literal, Self, TypeGuard
@@ -107,7 +108,7 @@ class Timing(Frozen):
         return np.asarray(polynomial.polyval((along - self.offset) / self.scale, slopes))
 
 
-class Clocked(Pointwise):
+class Clocked(Pointwise, ABC):
     """Base of the radar models: they know where their beam comes from, and their clocks can be corrected.
 
     Their `_derivatives` are image points (n, 2) and d(image)/d(ground) (n, 2, 3), d(image)/d(range, azimuth time)
@@ -133,13 +134,13 @@ class Clocked(Pointwise):
             raise RpcError(f"{self._kind}: look {self.look!r}, expected 'right' or 'left'")
 
     @property
+    @abstractmethod
     def speed(self) -> float:
         """Speed of the flight in the middle of the image [m/s]."""
-        raise NotImplementedError
 
+    @abstractmethod
     def timed(self, timing: Timing) -> Self:
         """Return the model with a timing, its coordinate in pixels, in place of its own."""
-        raise NotImplementedError
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).

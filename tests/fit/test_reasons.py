@@ -57,7 +57,7 @@ CASES = {
     "two steps": (
         lambda: bent(along(0, lambda u: 0.7 * (u > -0.6) + 1.0 * (u > 0.5))),
         "column",
-        (0.05, 0.5),
+        (0.11, 0.18),
         None,
     ),
     "a lens": (lambda: Frame(5.4, 43.2, 9000.0, 15000.0, SIZE, -0.05), "column", (1e-3, 0.05), None),
@@ -76,11 +76,11 @@ CASES = {
         (0.1, 0.3),
         None,
     ),
-    "one step": (lambda: bent(along(0, lambda u: 1.0 * (u > -0.27))), "column", (0.05, 0.5), None),
+    "one step": (lambda: bent(along(0, lambda u: 1.0 * (u > -0.27))), "column", (0.05, 0.09), None),
     "a step of the rows": (
         lambda: bent(along(0, lambda u: 0.4 * (u > 0.1), out=1)),
         "column",
-        (0.02, 0.2),
+        (0.055, 0.09),
         None,
     ),
     "a bent detector": (lambda: bent(along(0, lambda u: 0.5 * np.sin(9 * u))), "column", (0.05, 0.5), None),
@@ -114,6 +114,7 @@ def test_each_cause_is_named_with_its_size_and_its_place(name):
     assert 0.5 < fit.reason.share <= 1.0
     assert low < fit.reason.size_px < high
     assert fit.reason.size_px <= 1.5 * fit.max_ckp.max()
+    assert fit.reason.size_px == pytest.approx(np.sqrt(fit.reason.share) * np.hypot(*fit.rmse_ckp), rel=0.05)
     if place is not None:
         assert fit.reason.col == pytest.approx(place[0], abs=300)
         assert place[1] is None or fit.reason.row == pytest.approx(place[1], abs=300)

@@ -156,9 +156,9 @@ def test_the_ground_map_has_outlines_dots_lines_and_points():
     assert widest == (3.0, 0.9)
     weakest, *_ = drawn.of("line", "tie", "stroke-width", "stroke-opacity")
     assert weakest == pytest.approx((0.6 + 2.4 * math.sqrt(30 / 900), 0.2 + 0.7 * math.sqrt(30 / 900)), abs=0.006)
-    assert drawn.texts("name") == [  # that of B would stand on it
+    assert drawn.texts("name") == [  # B has its middle in the same place as A
         (name, pytest.approx(x, abs=0.006), pytest.approx(y + 4, abs=0.006), "middle")
-        for name, (x, y) in (("A", middle[0]), ("C", middle[2]))
+        for name, (x, y) in (("A + 1", middle[0]), ("C", middle[2]))
     ]
     x, y = at(np.array([10.05, 0.005]))
     assert np.array(drawn.points("gcps")[0]) == pytest.approx(
@@ -208,6 +208,13 @@ def test_names_stand_in_the_sheet_and_on_nothing_and_long_ones_are_cut_to_their_
             )
             == shown
         )
+
+
+def test_a_name_tells_how_many_images_have_their_middle_in_the_same_place():
+    # seven pixels are half a line of names; what is farther is another place, whose name finds no room or finds some
+    for away, shown in ((6.9, ["A + 2"]), (7.1, ["A"]), (14.1, ["A", "B + 1"])):
+        places = [(a_view(name), np.array([60.0, 50.0 + away * (name != "A")])) for name in "ABC"]
+        assert [text for text, *_ in drawn_of(maps._names(places, [])).texts("name")] == shown
 
 
 def test_a_point_outside_of_all_images_is_on_the_map_too():
