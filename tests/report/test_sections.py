@@ -70,7 +70,7 @@ def test_a_row_of_the_table_of_images_is_in_percent_and_pixels():
     assert [cell.key for cell in table.rows[0]][1:5] == [4, 60, 0.25, 0.254]
     assert table.rows[0][1].kind == "status doubtful"
     (nothing,) = asked("images", [a_view(num_observations=0, num_rejected=0)]).tables
-    assert nothing.rows[0][3].text == "0"
+    assert nothing.rows[0][3].text == "-"
 
 
 def test_a_map_needs_an_outline_and_says_where_some_are_left_out(monkeypatch):

@@ -99,7 +99,9 @@ class ViewEntry(Record):
     OWN: ClassVar = {
         "verdict": Column("verdict", _verdict),
         "wrong": Column("what is wrong", lambda view: CAUSES[view.cause].label if view.cause in CAUSES else None),
-        "lost": Column("rejected", lambda view: view.lost, ".1%"),
+        "lost": Column(
+            "rejected", lambda view: view.lost if view.num_observations + view.num_rejected else None, ".1%"
+        ),
         "moves": Column(("col [px]", "row [px]"), _moves, ".3f"),
         "largest": Column("RPC fit [px]", lambda view: largest(value_of(view, "fit.max_px")), ".1e", adjusted=True),
     }
