@@ -66,7 +66,8 @@ def without_strips(found: Solution, judged: Judgement, block: Block, outer: Bloc
     if not (shaken or swing) and not any(one.where is not None and one.where[0] == 0 for one in parts):
         return tried
     plain = follow(found, block, outer, options)  # splines and detectors may explain the same, and leave nothing
-    calm = plain is not found and not standing_out(plain.outcome, block, options.noise_floor)
+    left = [sum(one.gain for one in standing_out(of.outcome, block, options.noise_floor)) for of in (plain, tried)]
+    calm = plain is not found and left[0] <= left[1]
     least = swing and not shaken  # the fewer unknowns stay, where the others are not surely better
     stays = not is_better(plain.after, tried.after, outer) if least else is_better(tried.after, plain.after, outer)
     if not calm or stays:

@@ -119,8 +119,6 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
 def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
     """Return the observed over stated standard deviation of observations, half of which may be wrong.
 
-    Half of which may be wrong.
-
     Parameters
     ----------
     squared : (K,), |r|^2 over its expectation under the stated deviations
