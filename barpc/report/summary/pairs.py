@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy import ndimage
 
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.report.outcome import Run
@@ -156,7 +155,9 @@ def _rows(run: Run, picks: Sequence[slice | IntArray]) -> tuple[IntArray, IntArr
 
 def medians(values: Array, group: IntArray, num: int) -> Array:
     """Return the median (num,) of each group of values (n,); NaN without any."""
-    out, some = np.full(num, np.nan), np.unique(group)
-    if len(some):
-        out[some] = ndimage.median(values, group, some)
+    count, ordered = np.bincount(group, minlength=num), values[np.lexsort((values, group))]
+    first, some = np.cumsum(count) - count, np.flatnonzero(count)
+    middle = first[some, None] + (count[some, None] - np.array([1, 0])) // 2  # the two of an even number
+    out = np.full(num, np.nan)
+    out[some] = ordered[middle].mean(axis=1)
     return out

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import erf
 
 from barpc.ba.estimated.priors import USABLE_ACCURACY
@@ -96,13 +95,9 @@ def ce90(major: float, minor: float) -> float:
     if not major > 0.0:
         return major
     nodes, weights = np.polynomial.legendre.leggauss(64)
-    angle = 0.25 * np.pi * (nodes + 1.0)
-
-    def beyond(radius: float) -> float:
-        """What the circle holds, less 0.9: the integral over x of what y holds."""
-        with np.errstate(divide="ignore"):
-            held = erf(radius * np.cos(angle) / (np.sqrt(2.0) * np.float64(minor / major)))
-        density = np.exp(-0.5 * (radius * np.sin(angle)) ** 2) * held * radius * np.cos(angle)
-        return float(np.sqrt(2.0 / np.pi) * 0.25 * np.pi * (density @ weights)) - 0.9
-
-    return major * float(brentq(beyond, 1.6, 2.2))
+    angle, radius = 0.25 * np.pi * (nodes + 1.0), np.linspace(1.6, 2.2, 200)[:, None]  # major axes
+    with np.errstate(divide="ignore"):
+        held = erf(radius * np.cos(angle) / (np.sqrt(2.0) * np.float64(minor / major)))
+    density = np.exp(-0.5 * (radius * np.sin(angle)) ** 2) * held * radius * np.cos(angle)
+    share = np.sqrt(2.0 / np.pi) * 0.25 * np.pi * (density @ weights)  # the integral over x of what y holds
+    return major * float(np.interp(0.9, share, radius[:, 0]))  # to some 1e-6
