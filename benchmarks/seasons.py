@@ -34,13 +34,13 @@ import cv2  # noqa: E402  (the thread counts come first)
 import numpy as np  # noqa: E402
 import rasterio  # noqa: E402
 
+from barpc import simulate  # noqa: E402
 from barpc.base.errors import BarpcError  # noqa: E402
 from barpc.base.options import RunOptions, TieOptions  # noqa: E402
 from barpc.pipeline import adjust  # noqa: E402
 from barpc.rpcio import read_rpc  # noqa: E402
 from barpc.scene import View  # noqa: E402
 from barpc.sensor.geometry import altitude_range, epipolar_offset  # noqa: E402
-from barpc.simulate import orbit  # noqa: E402
 from barpc.tie import common_tracks, find_tracks, match_pairs, select_pairs  # noqa: E402
 from barpc.tie.matchers.features import join_keypoints  # noqa: E402
 from barpc.tie.pairing.epipolar import frame, robust_affine  # noqa: E402
@@ -202,7 +202,7 @@ def angles(seeds: int) -> None:
     print("| rays apart [deg] | case | seed | tracks | across, along [px] | more than 1, 2 px off across | tied by |")
     print("|---|---|---|---|---|---|---|")
     for apart, seed in itertools.product((15, 30, 45, 58), range(seeds)):
-        orbit.PITCH = 0.5 * apart
+        simulate.PITCH = 0.5 * apart
         with tempfile.TemporaryDirectory() as name:
             scene = Rendered(Path(name), ImageOptions(views=2, size=(700, 700), seed=seed))
             first, second = scene.views
