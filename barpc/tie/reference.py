@@ -18,19 +18,8 @@ from barpc.base.geodesy import NEWTON_STEPS, Array, metres_per_unit
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
 from barpc.tie.pairing.overlaps import Terrain
-from barpc.tie.patches.channels import (
-    FoundTemplates,
-    Patch,
-    Sheet,
-    correlation,
-    find,
-    joined,
-    margin,
-    of_image,
-    of_reference,
-    shown,
-)
-from barpc.tie.patches.oriented import BACK, HALF, TILE
+from barpc.tie.patches.channels import EDGE, Patch, Sheet, correlation, of_image, of_reference, shown
+from barpc.tie.patches.oriented import HALF, TILE, PatchTile
 from barpc.tie.pixels import FloatImage
 from barpc.tie.tasks import HERE, Work
 
@@ -158,9 +147,13 @@ def vote(view: View, band: int, paths: tuple[str, ...], patch: Patch, reach: int
     return None if shown(area) < _SHOWN[1] else correlation(template[None], area[None])[0]
 
 
-def search(view: View, band: int, paths: tuple[str, ...], patch: Patch, points: Array, reach: int) -> FoundTemplates:
-    """Find points x, y (n, 2) [px] of the reference on a patch in an image."""
-    return find(of_reference(paths, patch), of_image(view, band, patch), points, HALF, reach)
+def search(
+    view: View, band: int, paths: tuple[str, ...], patch: Patch, points: Array, reach: int
+) -> tuple[Array, BoolArray]:
+    """Find points x, y (n, 2) [px] of the reference on a patch in an image: shifts, and whether they beat decoys."""
+    tile = PatchTile.same((of_reference(paths, patch), of_image(view, band, patch)), points, reach, HALF)
+    place, ok, score = tile.found()
+    return place - tile.at, ok & (score > tile.decoys() + _MARGIN) & tile.shown(1, place) & tile.returns(place)
 
 
 # --- all of it --------------------------------------------------------------------------------------------
@@ -315,7 +308,7 @@ class _Work:
         edge = 0.5 * HALF * self.step / float(ground_sample_distance(view.sensor, _middle(view))[1])
         with np.errstate(invalid="ignore"):
             inside = np.flatnonzero(((at >= edge) & (at <= np.array(view.size) - 1.0 - edge)).all(axis=1))
-        pad = margin(HALF, reach) + 1
+        pad = HALF + 3 * reach + 2 * EDGE  # where decoys end
         cell = np.floor(places[inside] * metres / self.step / TILE).astype(np.int64)
         _, group = np.unique(cell, axis=0, return_inverse=True)
         tiles = []
@@ -329,13 +322,13 @@ class _Work:
         return tiles
 
     def _agreeing(
-        self, view: View, report: ViewMatch, parts: Sequence[tuple[_Tile, FoundTemplates]], places: Array
+        self, view: View, report: ViewMatch, parts: Sequence[tuple[_Tile, tuple[Array, BoolArray]]], places: Array
     ) -> tuple[ViewMatch, tuple[IntArray, Array, Array] | None]:
         """Return a view's points that agree with an affine: report; their index, image points, sigmas [px]."""
         if not parts:
             return report, None
-        point, found = np.concatenate([tile.points for tile, _ in parts]), joined([part for _, part in parts])
-        passed = found.passed(_MARGIN, BACK)
+        point = np.concatenate([tile.points for tile, _ in parts])
+        shift, passed = (np.concatenate(column) for column in zip(*(found for _, found in parts), strict=True))
         report = replace(report, tried=len(point), passed=int(passed.sum()))
         middle = np.append(places[point].mean(axis=0), view.altitude)
         local = (places[point] - middle[:2]) * metres_per_unit(middle)[:2]
@@ -343,11 +336,11 @@ class _Work:
         aside = max(float(np.linalg.norm(sight)), 1e-9)
         sight = sight / aside
         turned = np.stack([[sight[1], -sight[0]], sight])  # across it; along it, where the terrain's errors move points
-        agreed = _affine(local, found.shift * [self.step, -self.step] @ turned.T, passed, self.step)
+        agreed = _affine(local, shift * [self.step, -self.step] @ turned.T, passed, self.step)
         if agreed is None:
             return report, None
         fitted, keep, (scatter, along) = agreed
-        xy = np.concatenate([tile.patch.seen(view, tile.at + part.shift) for tile, part in parts])
+        xy = np.concatenate([tile.patch.seen(view, tile.at + part) for tile, (part, _) in parts])
         east, north = ((fitted @ turned)[keep].mean(axis=0) + report.offset).tolist()
         report = replace(report, offset=(east, north), points=int(keep.sum()), scatter=scatter)
         gsd = float(ground_sample_distance(view.sensor, middle)[1])

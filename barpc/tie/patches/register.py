@@ -21,7 +21,6 @@ from barpc.base.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View
 from barpc.tie.pairing.epipolar import FEW, LEAST_REACH, affine_inliers, frame, grouped, linear_map, robust_spread
 from barpc.tie.patches import oriented
-from barpc.tie.patches.channels import SETTLED
 from barpc.tie.pixels import SPAN, FloatImage, PixelReader, grow, levelled
 from barpc.tie.tasks import HERE, Work
 
@@ -33,6 +32,7 @@ _SMALLER = 0.7  # side of the patch of the second try and of the check
 _TORN = 0.5  # px that the smaller patch may lie apart
 _FINE = 4  # samples a pixel and axis
 _GRID = 1.0 / (32 * _FINE)  # px; positions that the sampler tells apart
+_SETTLED = 0.003  # px: a step below it is the last
 REACH = 1.5  # px; a patch that moves farther has left its point
 _WEIGHT = 0.7  # standard deviation of the patch's Gaussian weight, in half sides
 _TAPS = 6  # samples on either side in the interpolation
@@ -204,7 +204,7 @@ def register_patches(
             found = template.find(fine, reference[rows].astype(np.int64), start[rows], linear[rows])
             best.put(rows, replace(found, ok=found.ok & _at(usable[1], found.xy)))
     for rows in _chunks(np.flatnonzero(best.ok)):  # on a step of the ground the inner part goes elsewhere
-        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], 10 * SETTLED)
+        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], 10 * _SETTLED)
         apart = np.hypot(*(inner.xy - best.xy[rows]).T)
         best.ok[rows] = apart <= np.maximum(_TORN, 5.0 * inner.sigma)
     return best
@@ -281,7 +281,7 @@ class _Template:
         return centred / deviation, deviation
 
     def find(
-        self, fine: FloatImage, reference: IntArray, start: Array, linear: Array, settled: float = SETTLED
+        self, fine: FloatImage, reference: IntArray, start: Array, linear: Array, settled: float = _SETTLED
     ) -> PatchRegistration:
         """Register the patches about `reference` (N, 2), begun at `start` with the distortion `linear`."""
         offset = self._row * self._width + self._col
