@@ -15,21 +15,22 @@ from itertools import pairwise
 import numpy as np
 
 from barpc.base.geodesy import NEWTON_STEPS, Array, metres_per_unit
+from barpc.base.options import TieOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
 from barpc.tie.pairing.overlaps import Terrain
 from barpc.tie.patches.channels import EDGE, Patch, Sheet, correlation, of_image, of_reference, shown
-from barpc.tie.patches.oriented import HALF, TILE, PatchTile
-from barpc.tie.pixels import FloatImage
+from barpc.tie.patches.oriented import HALF, PatchTile
+from barpc.tie.pixels import CELL, SPAN, FloatImage
 from barpc.tie.tasks import HERE, Work
 
 REACH = 150.0  # m: how far a camera may be off
 PEAK = 6.5  # a vote that stands out by fewer standard deviations is none: other places reach 5.1
 _QUOTA = 1000  # points in a view, about
 _SEARCH = 6, 5.0  # px and m: what the vote and the terrain leave, together
-_FINE, _SIDE, _BLOCKS = 2.0, 64, 8  # of the first vote: m a pixel, at least; px of a block; blocks along a side
+_FINE, _BLOCKS = 2.0, 8  # of the first vote: m a pixel, at least; blocks along a side
 _SHOWN = 0.5, 0.3  # of a block and of the reference around it
-_LEAST = 12  # points that agree in a view
+_LEAST = TieOptions().min_matches  # points that agree in a view
 _BEYOND = 3.0  # times what is expected. Measured: the terrain's 0.5-1.3, of another place, mirrored, flat 6-9
 _MARGIN = 0.1  # by which a correlation beats its decoy's
 _NEAR = 3.0  # px: shifts that agree, to begin with; then robust standard deviations about the affine
@@ -230,7 +231,7 @@ class _Work:
 
     def _blocks(self, view: View, moved: Array, step: float, reach: int) -> list[Patch]:
         """Return the patches around blocks of an image, evenly spread, that the reference may show."""
-        wide = _SIDE * step / float(ground_sample_distance(view.sensor, _middle(view))[1])
+        wide = CELL * step / float(ground_sample_distance(view.sensor, _middle(view))[1])
         axes = []
         for length in view.size:
             edge = 0.5 * min(wide, length)
@@ -239,7 +240,7 @@ class _Work:
         ground = ground[np.isfinite(ground).all(axis=1)]
         metres = metres_per_unit(ground)[:, :2]
         places = ground[:, :2] - moved / metres
-        count = _SIDE + 2 * reach
+        count = CELL + 2 * reach
         corner = np.array([-0.5, 0.5]) * count * step
         seen = np.any([sheet.shows(places) for sheet in self.sheets], axis=0) if len(places) else []
         return [
@@ -309,7 +310,7 @@ class _Work:
         with np.errstate(invalid="ignore"):
             inside = np.flatnonzero(((at >= edge) & (at <= np.array(view.size) - 1.0 - edge)).all(axis=1))
         pad = HALF + 3 * reach + 2 * EDGE  # where decoys end
-        cell = np.floor(places[inside] * metres / self.step / TILE).astype(np.int64)
+        cell = np.floor(places[inside] * metres / self.step / SPAN).astype(np.int64)
         _, group = np.unique(cell, axis=0, return_inverse=True)
         tiles = []
         for points in (inside[group.ravel() == g] for g in range(int(group.max(initial=-1)) + 1)):

@@ -8,9 +8,7 @@ import pytest
 from scipy import ndimage
 
 from barpc.tie.patches.channels import (
-    COARSE,
     EDGE,
-    FINE,
     channels,
     correlation,
 )
@@ -163,15 +161,6 @@ def test_six_pixels_beside_what_is_not_valid_say_nothing_and_the_next_does():
     np.testing.assert_array_equal(np.abs(found).sum(axis=0) == 0, near)
     np.testing.assert_allclose(found[:, 20, 20], whole[:, 20, 20], atol=0.02)
     assert np.abs(found[:, :, :6]).sum() > 0  # the picture's own edge is none
-
-
-def test_blurs_are_those_asked_for():
-    picture = texture(1, 120)
-    sharp, soft = (channels(picture, np.ones((120, 120), bool), (s, s)) for s in (0.7, 3.0))
-    assert np.abs(np.diff(sharp, axis=2)).mean() > 1.5 * np.abs(np.diff(soft, axis=2)).mean()
-    first, second = (channels(picture, np.ones((120, 120), bool), blurs) for blurs in (COARSE, FINE))
-    assert np.abs(first - second).max() > 0.05
-    np.testing.assert_array_equal(first, seen(picture))
 
 
 def test_where_little_is_a_correlation_is_of_a_fiftieth_of_the_template_at_least():

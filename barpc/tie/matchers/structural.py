@@ -21,8 +21,8 @@ from barpc.scene import IntArray, View
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments, grouped, linear_map
-from barpc.tie.patches.oriented import HALF, TILE, PatchTile, Sampling, found_about, resolution
-from barpc.tie.pixels import PIECE, Box, FloatImage
+from barpc.tie.patches.oriented import HALF, PatchTile, Sampling, found_about, resolution
+from barpc.tie.pixels import PIECE, SPAN, Box, FloatImage
 
 _POINTS = 200, 500, 1000  # looked for: of the cameras' error, in long bands, in short ones
 _FINE_POINTS = 600, 1500  # of the cameras' error, in bands, where whole pixels are looked at
@@ -122,7 +122,7 @@ class _Search:
         rows = np.flatnonzero(seen & np.isfinite(where.along + where.across + middle))
         parts = [
             self._tile(where, rows[group])
-            for group in grouped(*np.floor(self._points[rows][:, ::-1] / (self._step * TILE)).T)
+            for group in grouped(*np.floor(self._points[rows][:, ::-1] / (self._step * SPAN)).T)
         ]
         if not parts:
             return NO_MATCHES
@@ -132,7 +132,7 @@ class _Search:
             step //= 2
             found = [
                 (group, *found_about(self._sampling(step, at[group]), at[group], xy[group]))
-                for group in grouped(*np.floor(at[:, ::-1] / (step * TILE)).T)
+                for group in grouped(*np.floor(at[:, ::-1] / (step * SPAN)).T)
             ]
             group, place, ok = (np.concatenate(column) for column in zip(*[f[:3] for f in found], strict=True))
             at, xy, score = at[group[ok]], place[ok], score[group[ok]]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -25,26 +26,24 @@ from barpc.base.geodesy import Array, metres_per_unit
 from barpc.rasters.raster import open_raster
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.overlaps import Terrain
-from barpc.tie.pixels import PIECE, Box, FloatImage, grow, levelled, read_pixels
+from barpc.tie.pixels import FloatImage, PixelReader, grow, levelled
 
-CHANNELS = 2
-COARSE, FINE = (0.8, 0.8), (1.0, 0.7)
-"""How far pictures are blurred [px] before the gradients, and the channels: to be found, and to be found exactly."""
+_BLUR = 0.65  # px: of pictures before the gradients, and of channels
 _WEAK = 0.5  # of the median gradient: what is weaker is noise
 EDGE = 6
 """Pixels so near to invalid ones know of them [px]; so far beside a search area, where true peaks end, decoys lie."""
 
 
-def channels(pixels: FloatImage, valid: BoolArray, blurs: tuple[float, float] = COARSE) -> FloatImage:
-    """Return the channels (CHANNELS, H, W) of a picture (H, W), blurred twice [px]; zeros beside what is not valid."""
+def channels(pixels: FloatImage, valid: BoolArray) -> FloatImage:
+    """Return the channels (2, H, W) of a picture (H, W); zeros beside what is not valid."""
     cv2.setNumThreads(1)
     filled = np.where(valid, pixels, np.float32(pixels[valid].mean() if valid.any() else 0.0))
-    smooth = cv2.GaussianBlur(filled.astype(np.float32), (0, 0), blurs[0])
+    smooth = cv2.GaussianBlur(filled.astype(np.float32), (0, 0), _BLUR)
     east, south = cv2.Scharr(smooth, cv2.CV_32F, 1, 0), cv2.Scharr(smooth, cv2.CV_32F, 0, 1)
     length = np.sqrt(east**2 + south**2)
     doubled = np.stack([east**2 - south**2, 2.0 * east * south]) / (length + np.float32(1e-12))
-    found = np.stack([cv2.GaussianBlur(part, (0, 0), blurs[1]) for part in doubled])
-    size = cv2.GaussianBlur(length, (0, 0), blurs[1])
+    found = np.stack([cv2.GaussianBlur(part, (0, 0), _BLUR) for part in doubled])
+    size = cv2.GaussianBlur(length, (0, 0), _BLUR)
     known = cv2.erode(valid.astype(np.uint8), np.ones((2 * EDGE + 1,) * 2, np.uint8), borderValue=1) > 0
     weak = _WEAK * float(np.median(size[known])) if known.any() else 0.0
     return np.asarray(found * (known / (size + np.float32(weak + 1e-12))), np.float32)
@@ -74,7 +73,6 @@ def cut(picture: FloatImage, at: IntArray, wide: int, high: int) -> FloatImage:
 
 
 _NODE = 8  # px between exact projections; straight lines between them
-_KNOWN = 0.99  # of what a pixel is made of must be valid
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -184,13 +182,12 @@ def of_image(view: View, band: int, patch: Patch) -> FloatImage:
 
 def of_reference(paths: Sequence[str], patch: Patch) -> FloatImage:
     """Return the channels (C, H, W) of a patch, of the first of several orthoimages that shows a place."""
-    nodes, whole = patch.nodes(), np.zeros((CHANNELS, *patch.shape), np.float32)
-    for path in paths:
-        sheet = Sheet.read(path)
-        seen, valid = picture(path, sheet.bands, sheet.size, sheet.image(nodes), patch.shape)
-        if valid.any():
-            whole = np.where(np.abs(whole).sum(axis=0) > 0, whole, channels(seen, valid))
-    return whole
+    nodes = patch.nodes()
+    each = (
+        channels(*picture(sheet.path, sheet.bands, sheet.size, sheet.image(nodes), patch.shape))
+        for sheet in map(Sheet.read, paths)
+    )
+    return reduce(lambda first, other: np.where(first.any(axis=0), first, other), each)
 
 
 def shown(picture: FloatImage) -> float:
@@ -215,40 +212,27 @@ def picture(
     sides = (nodes[-1, 0] - nodes[0, 0]) / (shape[0] - 1), (nodes[0, -1] - nodes[0, 0]) / (shape[1] - 1)
     apart = float(np.sqrt(abs(np.linalg.det(np.stack(sides)))))
     thin = max(1, int(apart))
-    box = grow((int(low[0]), int(low[1]), *(high - low + 1).tolist()), 2 * thin + 2, size)
-    if min(box[2:]) < thin:
+    if min(size) < thin:
         return nothing
-    box = box[0], box[1], box[2] // thin * thin, box[3] // thin * thin
-    picture, valid = _thinned((path, size), bands, box, thin)
-    if not (valid > 0).any():
+    low, high = low // thin, high // thin
+    box = grow((int(low[0]), int(low[1]), *(high - low + 1).tolist()), 4, (size[0] // thin, size[1] // thin))
+    each = []
+    for band in bands:
+        with PixelReader(path, band, size, thin) as reader:
+            each.append(reader.read(box))
+    valid = np.all([known for _, known in each], axis=0)
+    if not valid.any():
         return nothing
+    picture = np.asarray(sum(levelled(pixels, known) for pixels, known in each), np.float32)
+    picture[~valid] = picture[valid].mean()
+    cv2.setNumThreads(1)
     if (left := apart / thin) > 1.1:
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.5 * (left**2 - 1.0) ** 0.5), np.float32)
     rows, cols = (_between(np.arange(n, dtype=np.float64), n) for n in shape)
-    nodes = (nodes - box[:2] + 0.5) / thin - 0.5
+    nodes = (nodes + 0.5) / thin - 0.5 - box[:2]
     x, y = ((rows @ nodes[..., i] @ cols.T).astype(np.float32) for i in (0, 1))
     found = cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    inside = cv2.remap(valid, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
-    return np.asarray(found, np.float32), np.asarray(inside > _KNOWN)
-
-
-def _thinned(
-    file: tuple[str, tuple[int, int]], bands: Sequence[int], box: Box, thin: int
-) -> tuple[FloatImage, FloatImage]:
-    """Return the mean of bands of a window, averaged over `thin` x `thin` px, and how much of each is known."""
-    if box[2] * box[3] > PIECE and box[3] >= 2 * thin:
-        first = box[3] // thin // 2 * thin
-        halves = (box[0], box[1], box[2], first), (box[0], box[1] + first, box[2], box[3] - first)
-        means, shares = zip(*(_thinned(file, bands, half, thin) for half in halves), strict=True)
-        return np.vstack(means), np.vstack(shares)
-    cv2.setNumThreads(1)
-    picture, valid = np.zeros((box[3], box[2]), np.float32), np.ones((box[3], box[2]), dtype=bool)
-    for band in bands:
-        pixels, known = read_pixels(file[0], box, band, file[1])
-        picture += levelled(pixels, known)
-        valid &= known
-    picture[~valid] = picture[valid].mean() if valid.any() else 0.0
-    small = box[2] // thin, box[3] // thin
-    parts = (cv2.resize(part, small, interpolation=cv2.INTER_AREA) for part in (picture, valid.astype(np.float32)))
-    mean, share = (np.asarray(part, np.float32) for part in parts)
-    return mean, share
+    lacking = cv2.remap(
+        (~valid).astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0
+    )
+    return np.asarray(found, np.float32), np.asarray(lacking == 0.0)

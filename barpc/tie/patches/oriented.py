@@ -14,8 +14,8 @@ import numpy as np
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 from barpc.tie.pairing.epipolar import grouped
-from barpc.tie.patches.channels import COARSE, EDGE, FINE, channels, correlation, cut, picture, ticks
-from barpc.tie.pixels import PIECE, FloatImage
+from barpc.tie.patches.channels import EDGE, channels, correlation, cut, picture, ticks
+from barpc.tie.pixels import CELL, PIECE, SPAN, FloatImage
 
 Files = Sequence[tuple[str, tuple[int, int]]]
 """Path and size (width, height) of two images."""
@@ -26,12 +26,10 @@ SIGMA = 0.1
 """Standard deviation of a coordinate after that, at least [px]."""
 HALF = 16
 """How far a template reaches to each side [px]."""
-TILE = 256
-"""Points of a tile of so many px a side share a picture."""
 SHOWN = 0.9
 """Part of a template that must be a picture."""
-_BATCH = 32  # templates that are correlated at a time
-_BACK = 1.5  # px that the way back may miss by
+REACH = 1.5
+"""What a registered patch may move [px], and the way back from a template miss by: beyond, it is another point."""
 _FINER = 3  # px to each side that a finer picture is searched, and the last one, of half its step
 
 
@@ -48,13 +46,12 @@ class Sampling:
     band: int
     step: float  # px of A that a pixel of the grids holds
     linear: Array  # (2, 2) d(B)/d(A)
-    blurs: tuple[float, float] = COARSE
 
     def seen(self, which: int, origin: Array, matrix: Array, size: IntArray) -> FloatImage:
         """Return the channels (C, H, W) of an image on a grid: pixel k at `origin` + `matrix` k."""
         (path, whole), shape = self.files[which], (int(size[1]), int(size[0]))
         nodes = np.stack(np.meshgrid(ticks(shape[1]), ticks(shape[0])), axis=-1)
-        return channels(*picture(path, (self.band,), whole, origin + nodes @ matrix.T, shape), self.blurs)
+        return channels(*picture(path, (self.band,), whole, origin + nodes @ matrix.T, shape))
 
 
 def found_about(sampling: Sampling, at: Array, xy: Array, half: int = HALF) -> tuple[Array, BoolArray, Array]:
@@ -74,10 +71,10 @@ def register_oriented(
     """
     place, ok, score = start.copy(), np.zeros(len(start), dtype=bool), np.zeros(len(start))
     step = resolution(np.median(linear, axis=0))
-    for rows in grouped(*np.floor(reference[:, ::-1] / (step * TILE)).T):
+    for rows in grouped(*np.floor(reference[:, ::-1] / (step * SPAN)).T):
         at, turn = reference[rows], np.median(linear[rows], axis=0)
         near, found, _ = found_about(Sampling(files, band, step, turn), at, start[rows], PATCH)
-        closer = Sampling(files, band, 0.5 * step, turn, FINE)
+        closer = Sampling(files, band, 0.5 * step, turn)
         tile = PatchTile.of(closer, at, near, np.full(2, _FINER), 2 * HALF)
         best, inside, score[rows] = tile.found()
         place[rows], ok[rows] = tile.in_b(best), found & inside
@@ -150,7 +147,7 @@ class PatchTile:
 
     def _batches(self) -> list[slice]:
         area = int((2 * (self.half + self.reach) + 1).prod())
-        batch = max(1, min(_BATCH, PIECE // area))
+        batch = max(1, min(CELL, PIECE // area))
         return [slice(i, i + batch) for i in range(0, len(self.at), batch)]
 
     def offsets(self) -> Array:
@@ -181,7 +178,7 @@ class PatchTile:
             back = correlation(there, cut(self.pictures[0], self.at[i], self.half + search, self.half + search))
             y, x = np.divmod(back.reshape(len(back), -1).argmax(axis=1), back.shape[2])
             missed.append(np.hypot(x - search, y - search))
-        return np.asarray(np.concatenate(missed) <= _BACK)
+        return np.asarray(np.concatenate(missed) <= REACH)
 
     def shown(self, which: int = 0, place: Array | None = None) -> BoolArray:
         """Return the places (n, 2) in a picture about which it holds structure: of templates those that do."""

@@ -31,9 +31,8 @@ PATCH = 21
 _SMALLER = 0.7  # side of the patch of the second try and of the check
 _TORN = 0.5  # px that the smaller patch may lie apart
 _FINE = 4  # samples a pixel and axis
-_GRID = 1.0 / (32 * _FINE)  # px; positions that the sampler tells apart
+_STEPS = cv2.INTER_TAB_SIZE * _FINE  # a pixel and axis: positions that the sampler tells apart
 _SETTLED = 0.003  # px: a step below it is the last
-REACH = 1.5  # px; a patch that moves farther has left its point
 _WEIGHT = 0.7  # standard deviation of the patch's Gaussian weight, in half sides
 _TAPS = 6  # samples on either side in the interpolation
 _FLOOR = 0.1  # px across the epipolar line that are always tolerated
@@ -78,7 +77,7 @@ def register_places(
     Where a size is a part of the file's, pixels are means of the file's (`PixelReader`).
     """
     cv2.setNumThreads(1)
-    margin = patch + _TAPS + int(REACH)
+    margin = patch + _TAPS + int(oriented.REACH)
     sparse, every = _sparse(reference, margin), PatchRegistration.none(start)
     read, groups = (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, SPAN))
     (path, size), (other, beyond) = files
@@ -130,7 +129,7 @@ def _mosaics(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int)
 
 def _parts(origin: Array, links: IntArray, tile: int) -> list[IntArray]:
     """Return the links of each task: of whole tiles, or, where few, of bands of rows: blocks decode once."""
-    if not _sparse(origin, PATCH + _TAPS + int(REACH)):
+    if not _sparse(origin, PATCH + _TAPS + int(oriented.REACH)):
         return [links[rows] for rows in _joined(_by_tile(origin, tile), CHUNK)]
     order = np.lexsort((origin[:, 0], origin[:, 1] // SPAN))
     bands = np.split(order, np.flatnonzero(np.diff(origin[order, 1] // SPAN)) + 1)
@@ -301,7 +300,7 @@ class _Template:
         noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - 8.0)
         sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_EPS)
         moved = np.hypot(*(xy - start).T)
-        ok = (step <= 10 * settled) & (moved <= REACH) & np.isfinite(sigma)
+        ok = (step <= 10 * settled) & (moved <= oriented.REACH) & np.isfinite(sigma)
         return PatchRegistration(xy, correlation, sigma, ok)
 
     def _iterate(
@@ -316,7 +315,7 @@ class _Template:
         active = np.arange(len(centre))
         jacobian, inverse = solver
         for _ in range(NEWTON_STEPS):
-            sampled = np.rint(centre[active] / _GRID) * _GRID  # else the sampler would round, and we not know
+            sampled = np.rint(centre[active] * _STEPS) / _STEPS  # else the sampler would round, and we not know
             patches = self._normalized(self._sample(fine, sampled, linear[active]))[0]
             right = (jacobian @ (self._root * patches)[:, :, None]).astype(np.float64)
             solution = (inverse @ right)[:, :, 0]
