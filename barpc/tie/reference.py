@@ -18,6 +18,7 @@ from barpc.base.geodesy import NEWTON_STEPS, Array, metres_per_unit
 from barpc.base.options import TieOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
+from barpc.tie.pairing.epipolar import OUTLYING
 from barpc.tie.pairing.overlaps import Terrain
 from barpc.tie.patches.channels import EDGE, Patch, Sheet, correlation, of_image, of_reference, shown
 from barpc.tie.patches.oriented import HALF, PatchTile
@@ -31,9 +32,7 @@ _SEARCH = 6, 5.0  # px and m: what the vote and the terrain leave, together
 _FINE, _BLOCKS = 2.0, 8  # of the first vote: m a pixel, at least; blocks along a side
 _SHOWN = 0.5, 0.3  # of a block and of the reference around it
 _LEAST = TieOptions().min_matches  # points that agree in a view
-_BEYOND = 3.0  # times what is expected. Measured: the terrain's 0.5-1.3, of another place, mirrored, flat 6-9
 _MARGIN = 0.1  # by which a correlation beats its decoy's
-_NEAR = 3.0  # px: shifts that agree, to begin with; then robust standard deviations about the affine
 
 
 @dataclass(frozen=True)
@@ -58,8 +57,11 @@ class ViewMatch:
         return float(np.sqrt(more) / self.slope) if self.slope > 0 else 0.0
 
     def shows_heights(self, sigma: float) -> bool:
-        """Return whether points scatter along the line of sight more than a terrain known to `sigma` [m] allows."""
-        return bool(self.along > _BEYOND * np.hypot(self.scatter, self.slope * sigma))
+        """Return whether points scatter along the line of sight more than a terrain known to `sigma` [m] allows.
+
+        Measured: 0.5 to 1.3 times what is expected, over a terrain of another place, mirrored or flat 6 to 9 times.
+        """
+        return bool(self.along > OUTLYING * np.hypot(self.scatter, self.slope * sigma))
 
 
 @dataclass(frozen=True, eq=False)
@@ -355,16 +357,16 @@ def _affine(
     """Return an affine (n, 2) through most of the shifts (n, 2), those near it, their standard deviations
     along both axes.
 
-    The search starts where most shifts lie together. None where too few agree.
+    The search starts where most shifts lie together, within `OUTLYING` px. None where too few agree.
     """
     if passed.sum() < _LEAST:
         return None
     design = np.column_stack([np.ones(len(local)), local / max(float(np.abs(local).max()), 1.0)])
     apart = np.linalg.norm(shift[passed, None] - shift[None, passed], axis=2)
-    fitted = np.broadcast_to(shift[passed][(apart < _NEAR * step).sum(axis=1).argmax()], shift.shape)
+    fitted = np.broadcast_to(shift[passed][(apart < OUTLYING * step).sum(axis=1).argmax()], shift.shape)
     scale, keep = np.full(2, step), passed
     for _ in range(NEWTON_STEPS):
-        keep = passed & (np.abs(shift - fitted) < _NEAR * scale).all(axis=1)
+        keep = passed & (np.abs(shift - fitted) < OUTLYING * scale).all(axis=1)
         if keep.sum() < _LEAST:
             return None
         fitted = design @ np.linalg.lstsq(design[keep], shift[keep], rcond=None)[0]

@@ -22,8 +22,7 @@ CLEAR_RATIO = 0.8
 """Largest ratio where only clear matches count."""
 _MAX_TURN = np.radians(30.0)  # between the orientation seen and the one expected
 _APART = 2.0  # px; nearer candidates are the same point
-_ROWS = 64  # points of A, near each other, that are compared with all their candidates at a time,
-_CANDIDATES = 1 << 18  # as long as these products stay in cache
+_ROWS = 64  # points of A, near each other, that are compared with all their candidates at a time
 
 
 class Guided:
@@ -46,13 +45,11 @@ class Guided:
         turned, first, second = self._prepared
         best = _Best(len(self._a), len(self._b))
         for rows, cols in _near(where, prediction.half_width, prediction.chosen(len(self._a)), turned):
-            others = second.select(cols)
-            for some in np.array_split(rows, min(len(rows), -(-len(rows) * len(cols) // _CANDIDATES))):
-                du = turned[cols, 0] - where.along[some, None]
-                dw = turned[cols, 1] - where.across[some, None] - where.slope[some, None] * du
-                allowed = (np.abs(dw) <= prediction.half_width) & (du <= where.after[some, None])
-                allowed &= du >= where.before[some, None]
-                best.update(some, cols, first.select(some).likeness(others, allowed), du, dw)
+            du = turned[cols, 0] - where.along[rows, None]
+            dw = turned[cols, 1] - where.across[rows, None] - where.slope[rows, None] * du
+            allowed = (np.abs(dw) <= prediction.half_width) & (du <= where.after[rows, None])
+            allowed &= du >= where.before[rows, None]
+            best.update(rows, cols, first.select(rows).likeness(second.select(cols), allowed), du, dw)
         index, distance, ambiguity = best.mutual()
         clear = ambiguity <= (self._ratio if prediction.probes is None else min(self._ratio, CLEAR_RATIO))
         xy = np.stack([self._a.xy[index[:, 0]], self._b.xy[index[:, 1]]], axis=1)
