@@ -412,17 +412,13 @@ class _Links:
             first, second = self.of(part)
             images = ((first.path, first.size), (second.path, second.size))
             places = origin[part], start[part], linear[part]
-            tasks.append((images, options.band, *places, self._is_structural(part)))
+            ends = sorted(int(self.tracks.view[row[part[0]]]) for row in (self.reference, self.other))
+            tasks.append((images, options.band, *places, tuple(ends) in self.structural))
         done: list[PatchRegistration] = work.ordered(register_part, tasks, "refine")
         found = PatchRegistration.none(start)
         for part, one in zip(parts, done, strict=True):
             found.put(part, one)
         return found
-
-    def _is_structural(self, part: IntArray) -> bool:
-        """Return whether links that have their views in common are of a structural pair."""
-        ends = sorted((int(self.tracks.view[self.reference[part[0]]]), int(self.tracks.view[self.other[part[0]]])))
-        return (ends[0], ends[1]) in self.structural
 
     def errors(self, found: PatchRegistration, group: IntArray) -> tuple[Array, Array]:
         """Return distances along and across epipolar lines (M, 2) [px] of two views, and half the segments (M,)."""
