@@ -18,6 +18,7 @@ from barpc.base.geodesy import NEWTON_STEPS, Array, metres_per_unit
 from barpc.base.options import TieOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
+from barpc.tie.matchers.structural import POINTS
 from barpc.tie.pairing.epipolar import OUTLYING
 from barpc.tie.pairing.overlaps import Terrain
 from barpc.tie.patches.channels import EDGE, Patch, Sheet, correlation, of_image, of_reference, shown
@@ -27,7 +28,6 @@ from barpc.tie.tasks import HERE, Work
 
 REACH = 150.0  # m: how far a camera may be off
 PEAK = 6.5  # a vote that stands out by fewer standard deviations is none: other places reach 5.1
-_QUOTA = 1000  # points in a view, about
 _SEARCH = 6, 5.0  # px and m: what the vote and the terrain leave, together
 _FINE, _BLOCKS = 2.0, 8  # of the first vote: m a pixel, at least; blocks along a side
 _SHOWN = 0.5, 0.3  # of a block and of the reference around it
@@ -295,7 +295,7 @@ class _Work:
         metres = metres_per_unit(np.append(origin, 0.0))[:2]
         local = [(ring - origin) * metres for ring in rings]
         areas = [0.5 * abs(float((x * np.roll(y, 1) - y * np.roll(x, 1)).sum())) for x, y in (r.T for r in local)]
-        apart = self.step * max(HALF // 2, round((max(areas) / _QUOTA) ** 0.5 / self.step))
+        apart = self.step * max(HALF // 2, round((max(areas) / POINTS[-1]) ** 0.5 / self.step))
         every = np.concatenate(local)
         low, high = (np.floor((every.min(axis=0) - REACH) / apart), np.ceil((every.max(axis=0) + REACH) / apart))
         grid = np.meshgrid(*(apart * np.arange(a, b + 1) for a, b in zip(low, high, strict=True)))

@@ -21,7 +21,7 @@ Files = Sequence[tuple[str, tuple[int, int]]]
 """Path and size (width, height) of two images."""
 
 SIGMA = 0.1
-"""Standard deviation of a coordinate after that, at least [px]."""
+"""Standard deviation of a place registered by structure [px]; as much across an epipolar line is always tolerated."""
 HALF = 16
 """How far a template reaches to each side [px], when matches are registered as far again at half the step."""
 SHOWN = 0.9

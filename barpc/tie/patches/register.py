@@ -35,7 +35,6 @@ _STEPS = cv2.INTER_TAB_SIZE * _FINE  # a pixel and axis: positions that the samp
 _SETTLED = 0.003  # px: a step below it is the last
 _WEIGHT = 0.7  # standard deviation of the patch's Gaussian weight, in half sides
 _TAPS = 6  # samples on either side in the interpolation
-_FLOOR = 0.1  # px across the epipolar line that are always tolerated
 _DISTORTED = 2.0  # times the median sigma about it: the patch lies across a step of the ground
 _LEAST_END_SIGMA = 0.02  # px, of an observation
 
@@ -435,7 +434,7 @@ class _Links:
                 usual = _usual(self.origin[group], found.sigma[group])
                 group = group[found.sigma[group] <= _DISTORTED * usual]
                 errors, reach[group] = self.errors(found, group)
-                verified[group] = affine_inliers(self.origin[group], errors[:, 1], _FLOOR)[0]
+                verified[group] = affine_inliers(self.origin[group], errors[:, 1], oriented.SIGMA)[0]
                 altitude[group] = errors[:, 0] / np.maximum(reach[group], 1e-9)
         return verified & ~self._torn(verified, altitude, reach)
 
@@ -450,7 +449,7 @@ class _Links:
         views = self.tracks.view
         three = views[self.reference[first]], views[self.other[first]], views[self.other[second]]
         for group in grouped(*three):
-            agree = affine_inliers(self.origin[first[group]], apart[group], 2 * _FLOOR)[0]
+            agree = affine_inliers(self.origin[first[group]], apart[group], 2 * oriented.SIGMA)[0]
             for end in (first[group], second[group]):
                 compared[end] = True
                 agreed[end[agree]] = True
@@ -464,7 +463,7 @@ class _Links:
             group = group[good[group]]
             if len(group) >= FEW:
                 across = self.errors(found, group)[0][:, 1]
-                residual = affine_inliers(self.origin[group], across, _FLOOR)[1]
+                residual = affine_inliers(self.origin[group], across, oriented.SIGMA)[1]
                 sigma[group] *= max(1.0, robust_spread(residual / sigma[group]))
         return sigma
 
