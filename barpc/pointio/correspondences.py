@@ -253,13 +253,9 @@ def correspondence_kind(path: Place, altitudes: Sequence[float] | None = None) -
         return "npz"
     if head.lstrip()[:1] == b"{":
         return "geojson" if b'"FeatureCollection"' in head else None
-    return "csv" if _is_table(head) else None
-
-
-def _is_table(head: bytes) -> bool:
-    """Return whether a text begins with a header that names columns, or with a line of five numbers."""
-    words = first_words(head)
-    return (numbers_of(words) is not None and len(words) >= 5) or {"lon", "lat"} <= set(header_of(words, _POINTS))
+    words = first_words(head)  # a header that names columns, or a line of five numbers
+    table = (numbers_of(words) is not None and len(words) >= 5) or {"lon", "lat"} <= set(header_of(words, _POINTS))
+    return "csv" if table else None
 
 
 def _columns_of_npz(path: Path) -> dict[str, Array]:

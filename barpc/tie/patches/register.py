@@ -170,13 +170,6 @@ def register_part(
     return replace(found, ok=found.ok & (found.correlation >= MIN_CORRELATION))
 
 
-def _usable(valid: BoolArray, patch: int) -> BoolArray:
-    """Return the pixels about which a whole patch is valid and inside."""
-    whole, kernel = valid.astype(np.uint8), np.ones((patch, patch), np.uint8)
-    usable: BoolArray = cv2.erode(whole, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
-    return usable
-
-
 def register_patches(
     images: tuple[FloatImage, FloatImage],
     valid: tuple[BoolArray, BoolArray],
@@ -196,7 +189,8 @@ def register_patches(
     smaller = int(_SMALLER * patch) | 1
     for side in (patch, smaller):
         template = _Template(pictures, images[0].shape[1], side)
-        usable = [_usable(mask, side) for mask in valid]
+        whole = np.ones((side, side), np.uint8)
+        usable = [cv2.erode(np.pad(mask, 1).astype(np.uint8), whole)[1:-1, 1:-1] > 0 for mask in valid]
         possible = np.flatnonzero(~best.ok & _at(usable[0], reference) & _at(usable[1], start))
         for rows in _chunks(possible):
             found = template.find(fine, reference[rows].astype(np.int64), start[rows], linear[rows])
