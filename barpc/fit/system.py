@@ -267,24 +267,15 @@ def solution(system: Compressed, quantize: Rounding | None = None) -> Array:
 # --- digits ------------------------------------------------------------------------------------------------------
 
 
-def _rounded(norm: Normalization, ground_step: Array, image_step: Array) -> Normalization:
-    return Normalization(
-        np.rint(norm.ground_offset / ground_step) * ground_step,
-        np.sign(norm.ground_scale) * np.ceil(np.abs(norm.ground_scale) / ground_step) * ground_step,
-        np.rint(norm.image_offset / image_step) * image_step,
-        np.sign(norm.image_scale) * np.ceil(np.abs(norm.image_scale) / image_step) * image_step,
-    )
-
-
 def _nitf_normalization(norm: Normalization) -> Normalization:
-    """Return 1e-4 degrees, metres, pixels."""
-    rounded = _rounded(norm, np.array([1e-4, 1e-4, 1.0]), np.ones(2))
-    return Normalization(  # 1e-4 is no binary number: take what the printed digits read back as
-        np.round(rounded.ground_offset, 4),
-        np.round(rounded.ground_scale, 4),
-        rounded.image_offset,
-        rounded.image_scale,
-    )
+    """Return 1e-4 degrees, metres, pixels; 1e-4 is no binary number: what the printed digits read back as."""
+    step = np.array([1e-4, 1e-4, 1.0])
+
+    def up(scale: Array, step: Array | float) -> Array:
+        return np.asarray(np.round(np.sign(scale) * np.ceil(np.abs(scale) / step) * step, 4))
+
+    place = np.round(np.rint(norm.ground_offset / step) * step, 4)
+    return Normalization(place, up(norm.ground_scale, step), np.rint(norm.image_offset), up(norm.image_scale, 1.0))
 
 
 def _nitf_coeffs(coeffs: Array) -> Array:

@@ -227,7 +227,20 @@ def read_correspondences(path: Path | str, *, altitudes: Sequence[float] | None 
         raise InputError(f"{path}: neither a table of points (CSV, npz, GeoJSON) nor a localisation grid")
     if kind == "grid":
         return read_grid(path, altitudes)
-    return {"csv": _read_table, "npz": _read_npz, "geojson": _read_features}[kind](path)
+    columns: dict[str, Any] = dict.fromkeys(COLUMNS, ())
+    if kind == "npz":
+        columns = _columns_of_npz(path)
+    elif kind == "csv":  # without a header: lon, lat, alt, col, row
+        _, columns = read_table(path, _POINTS, list(COLUMNS), unnamed=list(COLUMNS))
+    elif points := geojson_points(path):
+        columns = dict(zip(COLUMNS, zip(*(numbers for numbers, _ in points), strict=True), strict=True))
+    arrays = {name: np.array(column, dtype=np.float64) for name, column in columns.items()}
+    if not arrays["lon"].size:
+        raise InputError(f"{path}: no points in it")
+    if {array.shape for array in arrays.values()} != {(arrays["lon"].size,)}:
+        raise InputError(f"{path}: columns of different lengths")
+    ground, image = (np.column_stack([arrays[key] for key in keys]) for keys in (("lon", "lat", "alt"), ("col", "row")))
+    return Correspondences(ground, image, arrays.get("sigma"))
 
 
 def correspondence_kind(path: Place, altitudes: Sequence[float] | None = None) -> str | None:
@@ -240,24 +253,12 @@ def correspondence_kind(path: Place, altitudes: Sequence[float] | None = None) -
         return "npz"
     if head.lstrip()[:1] == b"{":
         return "geojson" if b'"FeatureCollection"' in head else None
-    return "csv" if _is_table(head) else None
+    words = first_words(head)  # a header that names columns, or a line of five numbers
+    table = (numbers_of(words) is not None and len(words) >= 5) or {"lon", "lat"} <= set(header_of(words, _POINTS))
+    return "csv" if table else None
 
 
-def _is_table(head: bytes) -> bool:
-    """Return whether a text begins with a header that names columns, or with a line of five numbers."""
-    words = first_words(head)
-    return (numbers_of(words) is not None and len(words) >= 5) or {"lon", "lat"} <= set(header_of(words, _POINTS))
-
-
-def _read_table(path: Path) -> Correspondences:
-    """Read a text table; without a header its columns are lon, lat, alt, col, row."""
-    _, table = read_table(path, _POINTS, list(COLUMNS), unnamed=list(COLUMNS))
-    if not table["lon"]:
-        raise InputError(f"{path}: no points in it")
-    return _correspondences(path, {name: np.array(column) for name, column in table.items()})
-
-
-def _read_npz(path: Path) -> Correspondences:
+def _columns_of_npz(path: Path) -> dict[str, Array]:
     """Return the arrays ``ground`` (N, 3) and ``image`` (N, 2), or one array a column; ``sigma`` (N,) if known."""
     found = load_npz(path)
     try:
@@ -265,34 +266,16 @@ def _read_npz(path: Path) -> Correspondences:
     except (ValueError, TypeError) as error:
         raise InputError(f"{path}: not an npz of numbers ({error})") from error
     if "ground" in arrays and "image" in arrays:
-        return _checked(path, arrays["ground"], arrays["image"], arrays.get("sigma"))
+        shapes = [arrays[key].shape for key in ("ground", "image", "sigma") if key in arrays]
+        n = shapes[0][0] if shapes[0] else 0
+        if shapes != [(n, 3), (n, 2), (n,)][: len(shapes)]:
+            raise InputError(f"{path}: arrays of shapes {shapes}, not (N, 3), (N, 2), (N,)")
+        columns = dict(zip(COLUMNS, (*arrays["ground"].T, *arrays["image"].T), strict=True))
+        return columns | {key: arrays[key] for key in ("sigma",) if key in arrays}
     columns = {key: arrays[list(arrays)[i]] for key, i in header_of(list(arrays), _POINTS).items()}
     if missing := [name for name in COLUMNS if name not in columns]:
         raise InputError(f"{path}: neither ground and image nor {', '.join(missing)}; has {', '.join(arrays)}")
-    return _correspondences(path, columns)
-
-
-def _correspondences(path: Path, columns: dict[str, Array]) -> Correspondences:
-    if len({column.shape for column in columns.values()}) > 1:
-        raise InputError(f"{path}: columns of different lengths")
-    ground = np.stack([columns[name] for name in ("lon", "lat", "alt")], axis=-1)
-    return _checked(path, ground, np.stack([columns["col"], columns["row"]], axis=-1), columns.get("sigma"))
-
-
-def _checked(path: Path, ground: Array, image: Array, sigma: Array | None) -> Correspondences:
-    """Return the points, whose arrays must have one length."""
-    shapes = [array.shape for array in (ground, image, sigma) if array is not None]
-    n = len(ground) if ground.ndim else 0
-    if shapes != [(n, 3), (n, 2), (n,)][: len(shapes)]:
-        raise InputError(f"{path}: arrays of shapes {shapes}, not (N, 3), (N, 2), (N,)")
-    return Correspondences(ground, image, sigma)
-
-
-def _read_features(path: Path) -> Correspondences:
-    table = np.array([numbers for numbers, _ in geojson_points(path)])
-    if not len(table):
-        raise InputError(f"{path}: no points in it")
-    return Correspondences(table[:, :3], table[:, 3:])
+    return columns
 
 
 def geojson_points(path: Path, *needed: str) -> list[tuple[list[float], dict[str, Any]]]:

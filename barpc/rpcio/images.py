@@ -65,42 +65,27 @@ def write_rpc_vrt(
     _refuse_same(source, target)
     name = os.path.relpath(source.resolve(), target.parent.resolve()) if relative else str(source)
     with open_raster(source) as dataset:
-        lines = [f'<VRTDataset rasterXSize="{dataset.width}" rasterYSize="{dataset.height}">']
+        width, height = dataset.width, dataset.height
+        file = f'<SourceFilename relativeToVRT="{int(relative)}">{escape(name, quote=False)}</SourceFilename>'
+        frame = f'xOff="0" yOff="0" xSize="{width}" ySize="{height}"'
+        rects = f"<SrcRect {frame} /><DstRect {frame} />"
+        lines = [f'<VRTDataset rasterXSize="{width}" rasterYSize="{height}">']
         if dataset.crs is not None:
             numbers = ", ".join(repr(v) for v in dataset.transform.to_gdal())
             lines.append(f"  <SRS>{escape(dataset.crs.to_wkt(), quote=False)}</SRS>")
             lines.append(f"  <GeoTransform>{numbers}</GeoTransform>")
         lines.append(rpc_domain(rpc))
-        for index in dataset.indexes:
-            lines += _vrt_band(dataset, index, _vrt_source(dataset, name, relative, str(index)))
+        bands = zip(dataset.indexes, dataset.dtypes, dataset.nodatavals, dataset.colorinterp, strict=True)
+        for index, dtype, nodata, color in bands:
+            lines += [f'  <VRTRasterBand dataType="{GDAL_TYPES.get(dtype, dtype.capitalize())}" band="{index}">']
+            lines += [] if nodata is None else [f"    <NoDataValue>{nodata!r}</NoDataValue>"]
+            lines += [f"    <ColorInterp>{color.name.capitalize()}</ColorInterp>"]
+            lines += [f"    <SimpleSource>{file}<SourceBand>{index}</SourceBand>{rects}</SimpleSource>"]
+            lines += ["  </VRTRasterBand>"]
         if has_mask(dataset):
-            mask = (f"  {line}" for line in _vrt_source(dataset, name, relative, "mask,1"))
-            band = ['    <VRTRasterBand dataType="Byte">', *mask, "    </VRTRasterBand>"]
-            lines += ["  <MaskBand>", *band, "  </MaskBand>"]
+            mask = f"<SimpleSource>{file}<SourceBand>mask,1</SourceBand>{rects}</SimpleSource>"
+            lines += [f'  <MaskBand><VRTRasterBand dataType="Byte">{mask}</VRTRasterBand></MaskBand>']
     write_text(vrt_path, "\n".join([*lines, "</VRTDataset>"]) + "\n", overwrite=overwrite)
-
-
-def _vrt_band(dataset: Any, index: int, source: list[str]) -> list[str]:
-    dtype, nodata = dataset.dtypes[index - 1], dataset.nodatavals[index - 1]
-    return [
-        f'  <VRTRasterBand dataType="{GDAL_TYPES.get(dtype, dtype.capitalize())}" band="{index}">',
-        *([] if nodata is None else [f"    <NoDataValue>{nodata!r}</NoDataValue>"]),
-        f"    <ColorInterp>{dataset.colorinterp[index - 1].name.capitalize()}</ColorInterp>",
-        *source,
-        "  </VRTRasterBand>",
-    ]
-
-
-def _vrt_source(dataset: Any, name: str, relative: bool, band: str) -> list[str]:
-    frame = f'xOff="0" yOff="0" xSize="{dataset.width}" ySize="{dataset.height}"'
-    return [
-        "    <SimpleSource>",
-        f'      <SourceFilename relativeToVRT="{int(relative)}">{escape(name, quote=False)}</SourceFilename>',
-        f"      <SourceBand>{band}</SourceBand>",
-        f"      <SrcRect {frame} />",
-        f"      <DstRect {frame} />",
-        "    </SimpleSource>",
-    ]
 
 
 def plain_source(image_path: Path | str) -> Path:

@@ -30,14 +30,12 @@ CELL = 64
 """Side of the cells that each hold a quota of keypoints [px]; tiles are whole cells."""
 SPAN = 512
 """Rows that are read at a time (at least one row of blocks), and what else is done in parts of so many."""
-MEMORY = 1 << 28
-"""Bytes of what a task works on at a time, about; they decide on no figure."""
-PIECE = MEMORY // 60
-"""Pixels of pictures, or places of templates in them, that are worked on together."""
+PIECE = 1 << 22
+"""Pixels of pictures, or places of templates in them, that are worked on together; decides on no figure."""
 _SAMPLES = 5  # blocks a side whose pixels make the stretch
 _LEVEL = 4  # px a side of a pixel of the samples, where decoding is dear
 _NEGLIGIBLE = 8.0  # a range below so many steps of a float type is a constant image
-_LEVELS = 1000.0  # grey values that most of a window is spread over
+_WHITE = 255.0  # grey value of the brightest
 
 
 @dataclass(frozen=True)
@@ -50,21 +48,21 @@ class Stretch:
     def apply(self, pixels: Pixels, valid: BoolArray) -> ByteImage:
         """Return an 8-bit picture; invalid pixels take the mean of the valid ones, so that they make few edges."""
         if pixels.dtype == np.float32:
-            scaled = (pixels - np.float32(self.low)) * np.float32(255.0 / (self.high - self.low))
+            scaled = (pixels - np.float32(self.low)) * np.float32(_WHITE / (self.high - self.low))
         else:
-            scaled = _levelled(pixels, self.low, self.high, 255.0)
+            scaled = _levelled(pixels, self.low, self.high)
         if not valid.all():
             scaled = np.where(valid, scaled, scaled[valid].mean() if valid.any() else np.float32(0.0))
         picture: ByteImage = np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
         return picture
 
 
-def _levelled(pixels: Pixels, low: float, high: float, levels: float) -> FloatImage:
-    """Return `low` and `high` as 0 and `levels`; whatever the scale, nothing overflows."""
+def _levelled(pixels: Pixels, low: float, high: float) -> FloatImage:
+    """Return `low` and `high` as black and white; whatever the scale, nothing overflows."""
     with np.errstate(over="ignore"):
         share = (pixels / 2 - low / 2) / (high / 2 - low / 2)  # halves: a difference may have no number
-    most = _LEVELS**2  # beyond it a pixel would drown its surroundings
-    return np.clip(share * levels, -most, most).astype(np.float32)
+    most = _WHITE**2  # beyond it a pixel would drown its surroundings
+    return np.clip(share * _WHITE, -most, most).astype(np.float32)
 
 
 def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
@@ -80,7 +78,7 @@ def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
         low, high = known.min(), known.max()
     if not high > low:
         return np.zeros(pixels.shape, np.float32)
-    return np.where(valid, _levelled(pixels, float(low), float(high), _LEVELS), np.float32(0.0))
+    return np.where(valid, _levelled(pixels, float(low), float(high)), np.float32(0.0))
 
 
 def read_pixels(
@@ -99,13 +97,16 @@ class PixelReader(ExitStack):
     """`read_pixels` for many windows: a block that two of them share is decoded once.
 
     With a `size` (width, height) that the file holds several times, boxes and pixels are those of the picture of that
-    size: means of the file's.
+    size: means of the file's; of `thin` a side of these.
     """
 
-    def __init__(self, path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None) -> None:
+    def __init__(
+        self, path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None, thin: int = 1
+    ) -> None:
         super().__init__()
         self._band, self._dataset = band, self.enter_context(open_raster(path))
-        self._pixel = _pixel(self._dataset, size)
+        wide, high = _pixel(self._dataset, size)
+        self._pixel = thin * wide, thin * high
         try:
             _check_band(self._dataset, path, band)
         except ImageError:

@@ -15,35 +15,24 @@ from itertools import pairwise
 import numpy as np
 
 from barpc.base.geodesy import NEWTON_STEPS, Array, metres_per_unit
+from barpc.base.options import TieOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
+from barpc.tie.matchers.structural import POINTS
+from barpc.tie.pairing.epipolar import OUTLYING
 from barpc.tie.pairing.overlaps import Terrain
-from barpc.tie.patches.channels import (
-    FoundTemplates,
-    Patch,
-    Sheet,
-    correlation,
-    find,
-    joined,
-    margin,
-    of_image,
-    of_reference,
-    shown,
-)
-from barpc.tie.patches.oriented import BACK, HALF, TILE
-from barpc.tie.pixels import FloatImage
+from barpc.tie.patches.channels import EDGE, Patch, Sheet, correlation, of_image, of_reference, shown
+from barpc.tie.patches.oriented import HALF, PatchTile
+from barpc.tie.pixels import CELL, SPAN, FloatImage
 from barpc.tie.tasks import HERE, Work
 
 REACH = 150.0  # m: how far a camera may be off
 PEAK = 6.5  # a vote that stands out by fewer standard deviations is none: other places reach 5.1
-_QUOTA = 1000  # points in a view, about
 _SEARCH = 6, 5.0  # px and m: what the vote and the terrain leave, together
-_FINE, _SIDE, _BLOCKS = 2.0, 64, 8  # of the first vote: m a pixel, at least; px of a block; blocks along a side
+_FINE, _BLOCKS = 2.0, 8  # of the first vote: m a pixel, at least; blocks along a side
 _SHOWN = 0.5, 0.3  # of a block and of the reference around it
-_LEAST = 12  # points that agree in a view
-_BEYOND = 3.0  # times what is expected. Measured: the terrain's 0.5-1.3, of another place, mirrored, flat 6-9
+_LEAST = TieOptions().min_matches  # points that agree in a view
 _MARGIN = 0.1  # by which a correlation beats its decoy's
-_NEAR = 3.0  # px: shifts that agree, to begin with; then robust standard deviations about the affine
 
 
 @dataclass(frozen=True)
@@ -68,8 +57,11 @@ class ViewMatch:
         return float(np.sqrt(more) / self.slope) if self.slope > 0 else 0.0
 
     def shows_heights(self, sigma: float) -> bool:
-        """Return whether points scatter along the line of sight more than a terrain known to `sigma` [m] allows."""
-        return bool(self.along > _BEYOND * np.hypot(self.scatter, self.slope * sigma))
+        """Return whether points scatter along the line of sight more than a terrain known to `sigma` [m] allows.
+
+        Measured: 0.5 to 1.3 times what is expected, over a terrain of another place, mirrored or flat 6 to 9 times.
+        """
+        return bool(self.along > OUTLYING * np.hypot(self.scatter, self.slope * sigma))
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,9 +150,13 @@ def vote(view: View, band: int, paths: tuple[str, ...], patch: Patch, reach: int
     return None if shown(area) < _SHOWN[1] else correlation(template[None], area[None])[0]
 
 
-def search(view: View, band: int, paths: tuple[str, ...], patch: Patch, points: Array, reach: int) -> FoundTemplates:
-    """Find points x, y (n, 2) [px] of the reference on a patch in an image."""
-    return find(of_reference(paths, patch), of_image(view, band, patch), points, HALF, reach)
+def search(
+    view: View, band: int, paths: tuple[str, ...], patch: Patch, points: Array, reach: int
+) -> tuple[Array, BoolArray]:
+    """Find points x, y (n, 2) [px] of the reference on a patch in an image: shifts, and whether they beat decoys."""
+    tile = PatchTile.same((of_reference(paths, patch), of_image(view, band, patch)), points, reach, HALF)
+    place, ok, score = tile.found()
+    return place - tile.at, ok & (score > tile.decoys() + _MARGIN) & tile.shown(1, place) & tile.returns(place)
 
 
 # --- all of it --------------------------------------------------------------------------------------------
@@ -237,7 +233,7 @@ class _Work:
 
     def _blocks(self, view: View, moved: Array, step: float, reach: int) -> list[Patch]:
         """Return the patches around blocks of an image, evenly spread, that the reference may show."""
-        wide = _SIDE * step / float(ground_sample_distance(view.sensor, _middle(view))[1])
+        wide = CELL * step / float(ground_sample_distance(view.sensor, _middle(view))[1])
         axes = []
         for length in view.size:
             edge = 0.5 * min(wide, length)
@@ -246,7 +242,7 @@ class _Work:
         ground = ground[np.isfinite(ground).all(axis=1)]
         metres = metres_per_unit(ground)[:, :2]
         places = ground[:, :2] - moved / metres
-        count = _SIDE + 2 * reach
+        count = CELL + 2 * reach
         corner = np.array([-0.5, 0.5]) * count * step
         seen = np.any([sheet.shows(places) for sheet in self.sheets], axis=0) if len(places) else []
         return [
@@ -299,7 +295,7 @@ class _Work:
         metres = metres_per_unit(np.append(origin, 0.0))[:2]
         local = [(ring - origin) * metres for ring in rings]
         areas = [0.5 * abs(float((x * np.roll(y, 1) - y * np.roll(x, 1)).sum())) for x, y in (r.T for r in local)]
-        apart = self.step * max(HALF // 2, round((max(areas) / _QUOTA) ** 0.5 / self.step))
+        apart = self.step * max(HALF // 2, round((max(areas) / POINTS[-1]) ** 0.5 / self.step))
         every = np.concatenate(local)
         low, high = (np.floor((every.min(axis=0) - REACH) / apart), np.ceil((every.max(axis=0) + REACH) / apart))
         grid = np.meshgrid(*(apart * np.arange(a, b + 1) for a, b in zip(low, high, strict=True)))
@@ -315,8 +311,8 @@ class _Work:
         edge = 0.5 * HALF * self.step / float(ground_sample_distance(view.sensor, _middle(view))[1])
         with np.errstate(invalid="ignore"):
             inside = np.flatnonzero(((at >= edge) & (at <= np.array(view.size) - 1.0 - edge)).all(axis=1))
-        pad = margin(HALF, reach) + 1
-        cell = np.floor(places[inside] * metres / self.step / TILE).astype(np.int64)
+        pad = HALF + 3 * reach + 2 * EDGE  # where decoys end
+        cell = np.floor(places[inside] * metres / self.step / SPAN).astype(np.int64)
         _, group = np.unique(cell, axis=0, return_inverse=True)
         tiles = []
         for points in (inside[group.ravel() == g] for g in range(int(group.max(initial=-1)) + 1)):
@@ -329,13 +325,13 @@ class _Work:
         return tiles
 
     def _agreeing(
-        self, view: View, report: ViewMatch, parts: Sequence[tuple[_Tile, FoundTemplates]], places: Array
+        self, view: View, report: ViewMatch, parts: Sequence[tuple[_Tile, tuple[Array, BoolArray]]], places: Array
     ) -> tuple[ViewMatch, tuple[IntArray, Array, Array] | None]:
         """Return a view's points that agree with an affine: report; their index, image points, sigmas [px]."""
         if not parts:
             return report, None
-        point, found = np.concatenate([tile.points for tile, _ in parts]), joined([part for _, part in parts])
-        passed = found.passed(_MARGIN, BACK)
+        point = np.concatenate([tile.points for tile, _ in parts])
+        shift, passed = (np.concatenate(column) for column in zip(*(found for _, found in parts), strict=True))
         report = replace(report, tried=len(point), passed=int(passed.sum()))
         middle = np.append(places[point].mean(axis=0), view.altitude)
         local = (places[point] - middle[:2]) * metres_per_unit(middle)[:2]
@@ -343,11 +339,11 @@ class _Work:
         aside = max(float(np.linalg.norm(sight)), 1e-9)
         sight = sight / aside
         turned = np.stack([[sight[1], -sight[0]], sight])  # across it; along it, where the terrain's errors move points
-        agreed = _affine(local, found.shift * [self.step, -self.step] @ turned.T, passed, self.step)
+        agreed = _affine(local, shift * [self.step, -self.step] @ turned.T, passed, self.step)
         if agreed is None:
             return report, None
         fitted, keep, (scatter, along) = agreed
-        xy = np.concatenate([tile.patch.seen(view, tile.at + part.shift) for tile, part in parts])
+        xy = np.concatenate([tile.patch.seen(view, tile.at + part) for tile, (part, _) in parts])
         east, north = ((fitted @ turned)[keep].mean(axis=0) + report.offset).tolist()
         report = replace(report, offset=(east, north), points=int(keep.sum()), scatter=scatter)
         gsd = float(ground_sample_distance(view.sensor, middle)[1])
@@ -361,16 +357,16 @@ def _affine(
     """Return an affine (n, 2) through most of the shifts (n, 2), those near it, their standard deviations
     along both axes.
 
-    The search starts where most shifts lie together. None where too few agree.
+    The search starts where most shifts lie together, within `OUTLYING` px. None where too few agree.
     """
     if passed.sum() < _LEAST:
         return None
     design = np.column_stack([np.ones(len(local)), local / max(float(np.abs(local).max()), 1.0)])
     apart = np.linalg.norm(shift[passed, None] - shift[None, passed], axis=2)
-    fitted = np.broadcast_to(shift[passed][(apart < _NEAR * step).sum(axis=1).argmax()], shift.shape)
+    fitted = np.broadcast_to(shift[passed][(apart < OUTLYING * step).sum(axis=1).argmax()], shift.shape)
     scale, keep = np.full(2, step), passed
     for _ in range(NEWTON_STEPS):
-        keep = passed & (np.abs(shift - fitted) < _NEAR * scale).all(axis=1)
+        keep = passed & (np.abs(shift - fitted) < OUTLYING * scale).all(axis=1)
         if keep.sum() < _LEAST:
             return None
         fitted = design @ np.linalg.lstsq(design[keep], shift[keep], rcond=None)[0]

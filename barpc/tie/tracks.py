@@ -48,7 +48,8 @@ from barpc.tie.pairing.overlaps import (
     several_dates,
 )
 from barpc.tie.pairing.resolution import Looks
-from barpc.tie.patches.register import REACH, refine
+from barpc.tie.patches.oriented import REACH
+from barpc.tie.patches.register import refine
 from barpc.tie.tasks import Progress, Work, store_of
 
 logger = logging.getLogger(__name__)

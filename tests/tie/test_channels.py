@@ -8,21 +8,35 @@ import pytest
 from scipy import ndimage
 
 from barpc.tie.patches.channels import (
-    COARSE,
-    FINE,
-    FoundTemplates,
-    _registered,
-    _shifted,
+    EDGE,
     channels,
     correlation,
-    find,
-    joined,
-    margin,
 )
+from barpc.tie.patches.oriented import PatchTile
 
 SIZE = 256
 SHIFT = np.array([3.3, -2.6])
 HALF, SEARCH = 16, 10
+
+
+class Found:
+    """What a template is found by, written out as a caller asks for it."""
+
+    def __init__(self, first: np.ndarray, second: np.ndarray, at: np.ndarray, half: int, search: int) -> None:
+        tile = PatchTile.same((first, second), at, search, half)
+        place, self.known, self.score = tile.found()
+        self.shift, self.decoy, self.back = place - at, tile.decoys(), tile.returns(place)
+
+    def passed(self, margin: float) -> np.ndarray:
+        return self.known & self.back & (self.score > self.decoy + margin)
+
+
+find = Found
+
+
+def margin(half: int, search: int) -> int:
+    """Where decoys end."""
+    return half + 3 * search + EDGE
 
 
 def texture(seed: int, size: int = SIZE) -> np.ndarray:
@@ -149,15 +163,6 @@ def test_six_pixels_beside_what_is_not_valid_say_nothing_and_the_next_does():
     assert np.abs(found[:, :, :6]).sum() > 0  # the picture's own edge is none
 
 
-def test_blurs_are_those_asked_for():
-    picture = texture(1, 120)
-    sharp, soft = (channels(picture, np.ones((120, 120), bool), (s, s)) for s in (0.7, 3.0))
-    assert np.abs(np.diff(sharp, axis=2)).mean() > 1.5 * np.abs(np.diff(soft, axis=2)).mean()
-    first, second = (channels(picture, np.ones((120, 120), bool), blurs) for blurs in (COARSE, FINE))
-    assert np.abs(first - second).max() > 0.05
-    np.testing.assert_array_equal(first, seen(picture))
-
-
 def test_where_little_is_a_correlation_is_of_a_fiftieth_of_the_template_at_least():
     template = np.ones((1, 1, 3, 3), np.float32)
     area = np.zeros((1, 1, 3, 5), np.float32)
@@ -169,33 +174,15 @@ def test_where_little_is_a_correlation_is_of_a_fiftieth_of_the_template_at_least
     np.testing.assert_allclose(correlation(template, area)[0, 0], [expected, expected, 0.0], atol=1e-6)
 
 
-def test_what_passes_beats_its_decoy_by_the_margin_comes_back_and_is_a_picture():
-    score = np.array([0.5, 0.5, 0.5, 0.5, 0.5])
-    found = FoundTemplates(
-        np.zeros((5, 2)),
-        score,
-        np.array([0.39, 0.41, 0.39, 0.39, 0.45]),
-        np.array([0.0, 0.0, 1.1, 1.0, 0.0]),
-        np.array([True, True, True, True, False]),
-    )
-    assert found.passed(0.1).tolist() == [True, False, False, True, False]
-    assert found.passed(0.1, 1.5).tolist() == [True, False, True, True, False]
-    assert found.passed().tolist() == [True, True, False, True, False]
-    both = joined([found, found])
-    np.testing.assert_array_equal(both.decoy, np.tile(found.decoy, 2))
-    assert both.shift.shape == (10, 2)
-
-
 def test_nothing_that_is_looked_at_lies_beyond_the_margin():
     """The decoy's far end: the template, three searches, and what is between."""
     edge = margin(8, 4)
-    assert edge == 8 + 12 + 9
     picture = seen(texture(1, 2 * edge + 1))
     corner = np.array([[edge, edge]])
     whole = find(picture, picture, corner, 8, 4)
     np.testing.assert_allclose(whole.shift, 0.0, atol=0.02)
     assert whole.score[0] == pytest.approx(1.0, abs=1e-5)
-    assert whole.back[0] == 0.0
+    assert whole.back.all()
     assert whole.known.all()
 
 
@@ -205,35 +192,9 @@ def test_whole_pixels_are_found_to_either_side_on_either_decoys_side(shift):
     picture = texture(1, 140)
     there = np.roll(picture, shift[::-1], axis=(0, 1))
     at = np.array([[60, 60], [75, 60], [60, 77], [81, 70]])
-    found = find(seen(picture), seen(there), at, 10, 5)
+    found = find(seen(picture), seen(there), at, HALF, 5)
     np.testing.assert_allclose(found.shift, np.tile(shift, (4, 1)), atol=0.01)
     assert found.passed(0.1).all()
     assert (found.decoy < 0.7).all()
-    edge = find(seen(picture), seen(there), at, 10, max(map(abs, shift)))
+    edge = find(seen(picture), seen(there), at, HALF, max(map(abs, shift)))
     assert not edge.known.any()
-
-
-def test_a_slope_and_a_bend_are_moved_exactly_by_a_part_of_a_pixel():
-    """Cubic convolution keeps polynomials of second order."""
-    x = np.arange(12.0)
-    values = np.stack([0.3 * x**2 - x + 2, 0.1 * x**2 + 3 * x])[:, None, None, :].astype(np.float32)
-    shift = np.array([0.37, -0.8])
-    found = _shifted(np.tile(values, (1, 2, 3, 1)), shift, 3)
-    assert found.shape == (2, 2, 3, 8)
-    t = x[2:-2] + shift[:, None]
-    expected = np.stack([0.3 * t[0] ** 2 - t[0] + 2, 0.1 * t[1] ** 2 + 3 * t[1]])
-    np.testing.assert_allclose(found[:, 0, 0], expected, atol=1e-4)
-    turned = _shifted(np.moveaxis(np.tile(values, (1, 2, 3, 1)), 3, 2), shift, 2)
-    np.testing.assert_allclose(turned[:, 0, :, 0], expected, atol=1e-4)
-
-
-@pytest.mark.parametrize(("shift", "still"), [((0.4, -0.3), True), ((-0.85, 0.6), True), ((1.6, 0.0), False)])
-def test_least_squares_ends_within_a_pixel_or_says_that_it_did_not(shift, still):
-    picture = texture(2, 80)
-    one = seen(picture)[None, :, 20:61, 20:61]
-    other = seen(ndimage.shift(picture, shift[::-1], order=5, mode="grid-wrap"))[None, :, 18:63, 18:63]
-    found, ended = _registered(one, other)
-    assert ended.tolist() == [still]
-    if still:
-        np.testing.assert_allclose(found[0], shift, atol=0.03)
-    assert (np.abs(found) <= 1.0).all()

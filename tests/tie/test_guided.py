@@ -262,7 +262,7 @@ def test_all_points_of_slanted_bands_are_looked_at_and_few_others(slope: float, 
 def test_candidates_come_in_portions_that_hold_all_of_a_point(pair, monkeypatch) -> None:
     a, b, where = pair
     whole = guided(a, b, where, 0.85)
-    monkeypatch.setattr("barpc.tie.matchers.guided._CANDIDATES", 50)
+    monkeypatch.setattr("barpc.tie.matchers.guided._ROWS", 7)
     parts = guided(a, b, where, 0.85)
     np.testing.assert_array_equal(whole.index, parts.index)
     assert len(whole) > 40

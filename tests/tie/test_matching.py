@@ -212,10 +212,10 @@ def test_a_peak_at_the_end_of_the_band_may_go_on_beyond_it(search, at: float, fo
 
 
 def test_passes_grow_wider_until_one_is_clear(search) -> None:
-    clear = Listed(spread_out(70, 50))  # more than two fifths
+    clear = Listed(spread_out(70, 50))  # more than three tenths
     assert search(clear).offset() is not None
     assert clear.asked == [(20.0, 1500)]
-    unclear = Listed(spread_out(80, 50))
+    unclear = Listed(spread_out(130, 50))
     found = search(unclear).offset()
     assert [width for width, _ in unclear.asked] == [20.0, 80.0, 700.0]
     assert [probes for _, probes in unclear.asked] == [1500, 2000, 3000]

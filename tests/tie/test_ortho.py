@@ -11,7 +11,7 @@ from rasterio import Affine
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import metres_per_unit
-from barpc.tie.patches.channels import CHANNELS, Patch, Sheet, of_image, of_reference, picture, shown, ticks
+from barpc.tie.patches.channels import Patch, Sheet, of_image, of_reference, picture, shown, ticks
 
 from .conftest import write_image
 from .test_pairs import camera, views
@@ -197,7 +197,7 @@ def test_of_several_orthoimages_the_first_that_shows_a_place_is_seen(tmp_path) -
     corner = HERE + np.array([20.0, -20.0]) / METRES
     patch = Patch.on(hill, corner, 2.0, (60, 100), np.zeros(2))
     one, two, both = (of_reference(part, patch) for part in ([paths[0]], [paths[1]], [far, *paths]))
-    assert both.shape == (CHANNELS, 60, 100)
+    assert both.shape == (2, 60, 100)
     west, east = np.s_[:, :, :50], np.s_[:, :, 95:]
     np.testing.assert_array_equal(both[west], one[west])
     np.testing.assert_array_equal(both[east], two[east])
@@ -214,7 +214,7 @@ def test_an_image_on_a_patch_is_what_its_camera_sees_there(tmp_path) -> None:
     lon, lat, _ = view.sensor.localize(np.array([[30.0, 20.0]]), np.array([100.0]))[0]
     patch = Patch.on(lambda x, y: np.full(np.shape(x), 100.0), np.array([lon, lat]), 0.5, (40, 50), np.zeros(2))
     shape = of_image(view, 1, patch)
-    assert shape.shape == (CHANNELS, 40, 50)
+    assert shape.shape == (2, 40, 50)
     assert shown(shape) == 1.0
     moved = replace(patch, lonlat=patch.lonlat - np.array([1.0, 2.0]) / METRES, moved=np.array([1.0, 2.0]))
     np.testing.assert_allclose(of_image(view, 1, moved), shape, atol=0.02)

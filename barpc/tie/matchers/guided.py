@@ -22,9 +22,7 @@ CLEAR_RATIO = 0.8
 """Largest ratio where only clear matches count."""
 _MAX_TURN = np.radians(30.0)  # between the orientation seen and the one expected
 _APART = 2.0  # px; nearer candidates are the same point
-_NONE = np.float32(-2.0)  # below every cosine
-_ROWS = 64  # points of A, near each other, that are compared with all their candidates at a time,
-_CANDIDATES = 1 << 18  # as long as these products stay in cache
+_ROWS = 64  # points of A, near each other, that are compared with all their candidates at a time
 
 
 class Guided:
@@ -47,13 +45,11 @@ class Guided:
         turned, first, second = self._prepared
         best = _Best(len(self._a), len(self._b))
         for rows, cols in _near(where, prediction.half_width, prediction.chosen(len(self._a)), turned):
-            others = second.select(cols)
-            for some in np.array_split(rows, min(len(rows), -(-len(rows) * len(cols) // _CANDIDATES))):
-                du = turned[cols, 0] - where.along[some, None]
-                dw = turned[cols, 1] - where.across[some, None] - where.slope[some, None] * du
-                allowed = (np.abs(dw) <= prediction.half_width) & (du <= where.after[some, None])
-                allowed &= du >= where.before[some, None]
-                best.update(some, cols, first.select(some).likeness(others, allowed), du, dw)
+            du = turned[cols, 0] - where.along[rows, None]
+            dw = turned[cols, 1] - where.across[rows, None] - where.slope[rows, None] * du
+            allowed = (np.abs(dw) <= prediction.half_width) & (du <= where.after[rows, None])
+            allowed &= du >= where.before[rows, None]
+            best.update(rows, cols, first.select(rows).likeness(second.select(cols), allowed), du, dw)
         index, distance, ambiguity = best.mutual()
         clear = ambiguity <= (self._ratio if prediction.probes is None else min(self._ratio, CLEAR_RATIO))
         xy = np.stack([self._a.xy[index[:, 0]], self._b.xy[index[:, 1]]], axis=1)
@@ -81,10 +77,10 @@ class _Described:
         return _Described(self.values[which], self.length[which], self.direction[which])
 
     def likeness(self, other: _Described, allowed: npt.NDArray[np.bool_]) -> FloatArray:
-        """Return the cosines (n, m) of descriptors whose orientation is as expected; else `_NONE`."""
+        """Return the cosines (n, m) of descriptors whose orientation is as expected; else -inf."""
         allowed &= self.direction @ other.direction.T >= np.float32(np.cos(_MAX_TURN))
         cosine = self.values @ other.values.T / (self.length[:, None] * other.length)
-        return np.where(allowed, cosine, _NONE)
+        return np.where(allowed, cosine, np.float32(-np.inf))
 
 
 class _Best:
@@ -92,9 +88,9 @@ class _Best:
 
     def __init__(self, size_a: int, size_b: int) -> None:
         self._of_a = np.full(size_a, -1)
-        self._top, self._second = np.full((2, size_a), _NONE)
+        self._top, self._second = np.full((2, size_a), -np.inf, np.float32)
         self._of_b = np.full(size_b, -1)
-        self._top_b = np.full(size_b, _NONE)
+        self._top_b = np.full(size_b, -np.inf, np.float32)
 
     def update(self, rows: IntArray, cols: IntArray, likeness: FloatArray, du: Array, dw: Array) -> None:
         """Take in the cosines (n, m) of candidates of some points of A, and their places about the predicted ones."""
@@ -107,18 +103,18 @@ class _Best:
         self._top[rows] = np.take_along_axis(likeness, pick, axis=1)[:, 0]
         same = np.abs(du - np.take_along_axis(du, pick, axis=1)) <= _APART
         same &= np.abs(dw - np.take_along_axis(dw, pick, axis=1)) <= _APART
-        self._second[rows] = np.where(same, _NONE, likeness).max(axis=1)
+        self._second[rows] = np.where(same, np.float32(-np.inf), likeness).max(axis=1)
 
     def mutual(self) -> tuple[IntArray, Array, Array]:
         """Return the mutual best pairs (M, 2), their distances, and these over those to the second best (M,).
 
         Distances of descriptors are 0 to 2; where there is no second best, its distance counts as 1.
         """
-        found = np.flatnonzero(self._top > -1)
+        found = np.flatnonzero(self._top > -np.inf)
         found = found[self._of_b[self._of_a[found]] == found]
         top, second = self._top[found].astype(np.float64), self._second[found].astype(np.float64)
         distance = np.sqrt(np.maximum(2.0 - 2.0 * top, 0.0))
-        rival = np.where(second < -1, 1.0, np.sqrt(np.maximum(2.0 - 2.0 * second, 1e-12)))
+        rival = np.where(second == -np.inf, 1.0, np.sqrt(np.maximum(2.0 - 2.0 * second, 1e-12)))
         return np.stack([found, self._of_a[found]], axis=1), distance, distance / rival
 
 

@@ -53,7 +53,7 @@ def matcher_named(name: str) -> type[Matcher] | Hook:
 
 SHARE = 0.3
 """A pair of fewer than `THIN` is not tried again where they are this share of the keypoints in its common area, and
-`FEW`: small images have no more to give."""
+`FEW`: small images have no more to give; nor is a wider pass where this share of the matches stands in the peak."""
 TOLERANCE = 3.0
 """Half the width of the band about the corrected epipolar line, at most [px]."""
 _DEFAULTS = TieOptions()
@@ -62,14 +62,12 @@ _PASSES = ((20.0, 1500), (80.0, 2000), (float("inf"), 3000))
 _PEAK = 4.0  # px, width of the window in which true matches of a blind pass fall
 _SIGNIFICANT = 6.0  # standard deviations
 _NOWHERE = "no common offset"
-_CLEAR = 0.4  # share of the matches that makes wider passes needless
 FALSE_SHARE = 0.01
 """Share of false matches that is accepted, as control bands estimate it."""
 _NEIGHBOURS = 12
 _LOOSE = (0.95, 0.05, 2 / 3)  # ratio and false share of the second attempt; its part of the matches that a pair needs
 _QUICK = 500  # keypoints of a view that tell what a pair promises
 _MARGINS = 150.0, 50.0  # m beyond known altitudes: how wrong cameras make them, and seldom do
-_BESIDE = 100.0  # px beyond the other image at which terrain counts
 _PROBES = 12  # pixels along a side at which the terrain is asked
 
 
@@ -129,7 +127,7 @@ class Ground:
             heights = self.terrain(ground[:, 0], ground[:, 1])
             other = views[1].sensor.project(np.column_stack([ground[:, :2], heights]))
             with np.errstate(invalid="ignore"):
-                seen = ((other > -_BESIDE) & (other < np.add(views[1].size, _BESIDE))).all(axis=1)
+                seen = ((other > 0.0) & (other < views[1].size)).all(axis=1)
             heights = heights[seen & np.isfinite(heights)]
             known = (float(heights.min()), float(heights.max())) if len(heights) else known
         if known is None or known[0] - margin > high or known[1] + margin < low:
@@ -429,7 +427,7 @@ class _Search:
             found = self._blind(width, probes)
             if found is not None and (best is None or found.significance > best.significance):
                 best = found
-            if best is not None and best.share >= _CLEAR:
+            if best is not None and best.share >= SHARE:
                 break
         return None if best is None else best.prediction
 

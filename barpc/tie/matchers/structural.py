@@ -21,10 +21,11 @@ from barpc.scene import IntArray, View
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments, grouped, linear_map
-from barpc.tie.patches.oriented import HALF, TILE, PatchTile, Sampling, found_about, resolution
-from barpc.tie.pixels import PIECE, Box, FloatImage
+from barpc.tie.patches.oriented import HALF, PatchTile, Sampling, found_about, resolution
+from barpc.tie.pixels import PIECE, SPAN, Box, FloatImage
 
-_POINTS = 200, 500, 1000  # looked for: of the cameras' error, in long bands, in short ones
+POINTS = 200, 500, 1000
+"""Points that are looked for: of the cameras' error, in long bands, in short ones."""
 _FINE_POINTS = 600, 1500  # of the cameras' error, in bands, where whole pixels are looked at
 _RING = 3.5  # pitches about a point whose neighbours speak for its places, together
 _SAY = 4.0  # times as loud as it does itself. Of four pairs that were hardest 1 is tied by 1.5 and 1, 3 by this
@@ -98,10 +99,10 @@ class _Search:
         if self._whole:
             wanted, count = 1, _FINE_POINTS[self._prediction.probes is None]
         elif self._prediction.probes is None:
-            wanted, count = (4, _POINTS[1]) if half > _LONGER else (2, _POINTS[1 + (half < _LONG)])
+            wanted, count = (4, POINTS[1]) if half > _LONGER else (2, POINTS[1 + (half < _LONG)])
         else:
             width = self._prediction.half_width  # a twentieth of the image, or the altitudes, may be wide
-            wanted, count = int(max(width / 20.0, min(half / 80.0, 4.0), 2.0)), _POINTS[0]
+            wanted, count = int(max(width / 20.0, min(half / 80.0, 4.0), 2.0)), POINTS[0]
         boxes = np.array(windows)
         side = (boxes[:, :2] + boxes[:, 2:]).max(axis=0) - boxes[:, :2].min(axis=0)
         step = 1 << int(np.ceil(np.log2(wanted)))
@@ -122,7 +123,7 @@ class _Search:
         rows = np.flatnonzero(seen & np.isfinite(where.along + where.across + middle))
         parts = [
             self._tile(where, rows[group])
-            for group in grouped(*np.floor(self._points[rows][:, ::-1] / (self._step * TILE)).T)
+            for group in grouped(*np.floor(self._points[rows][:, ::-1] / (self._step * SPAN)).T)
         ]
         if not parts:
             return NO_MATCHES
@@ -132,7 +133,7 @@ class _Search:
             step //= 2
             found = [
                 (group, *found_about(self._sampling(step, at[group]), at[group], xy[group]))
-                for group in grouped(*np.floor(at[:, ::-1] / (step * TILE)).T)
+                for group in grouped(*np.floor(at[:, ::-1] / (step * SPAN)).T)
             ]
             group, place, ok = (np.concatenate(column) for column in zip(*[f[:3] for f in found], strict=True))
             at, xy, score = at[group[ok]], place[ok], score[group[ok]]

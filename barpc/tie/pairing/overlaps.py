@@ -255,7 +255,6 @@ COMPARED = 48
 """Partners of a view, the best by overlap and angle, that are compared with it."""
 TRIES = (2, 4, 8)
 """Round by round: so many pairs lead to what is not tied yet, where there are so many."""
-_BEYOND = 4  # partners of a view, for each of which one more is of another group
 
 
 def select_pairs(views: Sequence[View], options: TieOptions, scope: Scope = EVERYWHERE) -> list[Pair]:
@@ -309,7 +308,7 @@ def best_pairs(pairs: Sequence[Pair], num_views: int, neighbours: int, twice: bo
                 taken[i] += 1
                 taken[j] += 1
     left = [pair for pair in ranked if pair.views not in chosen]
-    more = _beyond(left, num_views, list(chosen), neighbours // _BEYOND) if twice else []
+    more = _beyond(left, num_views, list(chosen), TRIES[0]) if twice else []
     links = [*chosen, *(pair.views for pair in more)]
     known = set(links)
     left = [pair for pair in left if pair.views not in known]

@@ -3,15 +3,14 @@
 Where a season, a sun or a sensor changes grey values, edges keep their place and their direction, not their sign. Every
 pixel becomes its gradient with twice its angle, which is the same for both signs, blurred over neighbours and
 normalised: what has no direction says nothing. These are two numbers; more orientations (CFOG, Ye et al. 2019) say
-no more. Templates are
-correlated densely within a search area; beside it lies a decoy area of the same size, where nothing true can be: a
-peak counts where it is higher than the decoy's, and where the way back ends where it began.
+no more.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -23,36 +22,28 @@ from rasterio.warp import transform as warp_points
 
 from barpc.base.errors import InputError
 from barpc.base.frozen import Frozen
-from barpc.base.geodesy import NEWTON_STEPS, Array, metres_per_unit
+from barpc.base.geodesy import Array, metres_per_unit
 from barpc.rasters.raster import open_raster
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.overlaps import Terrain
-from barpc.tie.pixels import PIECE, Box, FloatImage, grow, levelled, read_pixels
+from barpc.tie.pixels import FloatImage, PixelReader, grow, levelled
 
-CHANNELS = 2
-COARSE, FINE = (0.8, 0.8), (1.0, 0.7)
-"""How far pictures are blurred [px] before the gradients, and the channels: to be found, and to be found exactly."""
+_BLUR = 0.7  # px: of pictures before the gradients, and of channels
 _WEAK = 0.5  # of the median gradient: what is weaker is noise
 EDGE = 6
 """Pixels so near to invalid ones know of them [px]; so far beside a search area, where true peaks end, decoys lie."""
-BATCH = 32
-"""Templates that are correlated at a time."""
-SETTLED = 0.003
-"""A step below it is the last [px]."""
-SHOWN = 0.9
-"""Part of a template that must be a picture."""
 
 
-def channels(pixels: FloatImage, valid: BoolArray, blurs: tuple[float, float] = COARSE) -> FloatImage:
-    """Return the channels (CHANNELS, H, W) of a picture (H, W), blurred twice [px]; zeros beside what is not valid."""
+def channels(pixels: FloatImage, valid: BoolArray) -> FloatImage:
+    """Return the channels (2, H, W) of a picture (H, W); zeros beside what is not valid."""
     cv2.setNumThreads(1)
     filled = np.where(valid, pixels, np.float32(pixels[valid].mean() if valid.any() else 0.0))
-    smooth = cv2.GaussianBlur(filled.astype(np.float32), (0, 0), blurs[0])
+    smooth = cv2.GaussianBlur(filled.astype(np.float32), (0, 0), _BLUR)
     east, south = cv2.Scharr(smooth, cv2.CV_32F, 1, 0), cv2.Scharr(smooth, cv2.CV_32F, 0, 1)
     length = np.sqrt(east**2 + south**2)
     doubled = np.stack([east**2 - south**2, 2.0 * east * south]) / (length + np.float32(1e-12))
-    found = np.stack([cv2.GaussianBlur(part, (0, 0), blurs[1]) for part in doubled])
-    size = cv2.GaussianBlur(length, (0, 0), blurs[1])
+    found = np.stack([cv2.GaussianBlur(part, (0, 0), _BLUR) for part in doubled])
+    size = cv2.GaussianBlur(length, (0, 0), _BLUR)
     known = cv2.erode(valid.astype(np.uint8), np.ones((2 * EDGE + 1,) * 2, np.uint8), borderValue=1) > 0
     weak = _WEAK * float(np.median(size[known])) if known.any() else 0.0
     return np.asarray(found * (known / (size + np.float32(weak + 1e-12))), np.float32)
@@ -75,133 +66,13 @@ def correlation(template: FloatImage, search: FloatImage) -> FloatImage:
         return np.asarray(np.nan_to_num(product / scale), np.float32)
 
 
-@dataclass(frozen=True, eq=False)
-class FoundTemplates:
-    """Places at which templates were found.
-
-    Parameters
-    ----------
-    shift : (n, 2), from the place predicted [px], x, y
-    score : (n,), correlation there
-    decoy : (n,), the highest correlation in the decoy area
-    back : (n,), how far from its start the way back ends [px]
-    known : (n,), whether the template, and what it was found on, are pictures
-    """
-
-    shift: Array
-    score: Array
-    decoy: Array
-    back: Array
-    known: BoolArray
-
-    def passed(self, margin: float = 0.0, back: float = 1.0) -> BoolArray:
-        """Return the matches (n,) that beat their decoy by a margin and come back to within a distance [px]."""
-        return np.asarray(self.known & (self.score > self.decoy + margin) & (self.back <= back))
-
-
-def find(first: FloatImage, second: FloatImage, at: Array, half: int, search: int) -> FoundTemplates:
-    """Find templates of one picture's channels (C, H, W) in another's, on the same grid.
-
-    `at` (n, 2), n > 0, holds their centres x, y as whole px, at least `margin(half, search)` from the edge; they reach
-    `half` px to each side, and are looked for up to `search` px away. The decoy area of the same size lies beside, to
-    the right and left in turn.
-    """
-    rows = np.asarray(at, np.int64)
-    return joined([_find(first, second, rows[i : i + BATCH], half, search) for i in range(0, len(rows), BATCH)])
-
-
-def joined(parts: Sequence[FoundTemplates]) -> FoundTemplates:
-    """Join matches found in several places, one after the other."""
-    return FoundTemplates(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in FoundTemplates.__annotations__)
-    )
-
-
-def margin(half: int, search: int) -> int:
-    """Return the least distance [px] of templates from the edge of a picture."""
-    return half + 3 * search + EDGE + 3
-
-
-def _find(first: FloatImage, second: FloatImage, at: IntArray, half: int, search: int) -> FoundTemplates:
-    n, wide = len(at), 2 * search + 1
-    template = cut(first, at, half, half)
-    right = np.arange(n) % 2 > 0  # where the decoy lies; areas to the left are turned about, so that all are alike
-    aside = np.where(right, 1, -1)[:, None] * [search + EDGE // 2, 0]
-    areas = cut(second, at + aside, half + 2 * search + EDGE // 2, half + search)
-    surface = correlation(template, areas)
-    surface[~right] = surface[~right, :, ::-1]
-    true, decoy = surface[:, :, :wide].reshape(n, -1), surface[:, :, -wide:].reshape(n, -1)
-    y, x = np.divmod(true.argmax(axis=1), wide)
-    inside = (x > 0) & (x < wide - 1) & (y > 0) & (y < wide - 1)
-    whole = np.stack([np.where(right, x - search, search - x), y - search], axis=1)
-    there = at + whole
-    around = cut(second, there, half + 2, half + 2)
-    found = around[:, :, 2:-2, 2:-2]
-    pictures = [(np.abs(part).sum(axis=1) > 0).mean(axis=(1, 2)) > SHOWN for part in (template, found)]
-    back = correlation(found, cut(first, at, half + search, half + search)).reshape(n, -1)
-    back_y, back_x = np.divmod(back.argmax(axis=1), wide)
-    part, still = _registered(template, around)
-    return FoundTemplates(
-        whole + part,
-        true.max(axis=1).astype(np.float64),
-        decoy.max(axis=1).astype(np.float64),
-        np.hypot(back_x - search, back_y - search),
-        inside & pictures[0] & pictures[1] & still,
-    )
-
-
 def cut(picture: FloatImage, at: IntArray, wide: int, high: int) -> FloatImage:
     """Return the windows (n, C, 2 high + 1, 2 wide + 1) around whole px x, y (n, 2)."""
     view = np.lib.stride_tricks.sliding_window_view(picture, (2 * high + 1, 2 * wide + 1), axis=(1, 2))
     return np.moveaxis(view[:, at[:, 1] - high, at[:, 0] - wide], 0, 1)
 
 
-def _registered(template: FloatImage, around: FloatImage) -> tuple[Array, BoolArray]:
-    """Return the least squares on the channels: how far (n, 2), at most a pixel, templates (n, C, h, w) lie
-    beside the middle.
-
-    Of patches that are 2 px larger all around; and whether that ended.
-    """
-    wanted = _unit(template)
-    shift = np.zeros((len(template), 2))
-    step = np.full_like(shift, np.inf)
-    for _ in range(NEWTON_STEPS):
-        there = _shifted(_shifted(around, shift[:, 0], 3), shift[:, 1], 2)
-        size = np.sqrt((there**2).sum(axis=(1, 2, 3), keepdims=True)) + np.float32(1e-12)
-        there = there / size
-        slopes = np.stack([np.gradient(there, axis=axis) for axis in (3, 2)], axis=1)
-        flat, slopes = there.reshape(len(there), -1), slopes.reshape(len(there), 2, -1)
-        slopes = slopes - (slopes @ flat[..., None]) * flat[:, None]
-        normal = (slopes @ np.swapaxes(slopes, 1, 2)).astype(np.float64) + 1e-9 * np.eye(2)
-        right = (slopes @ (wanted.reshape(flat.shape) - flat)[..., None]).astype(np.float64)
-        step = np.linalg.solve(normal, right)[..., 0].clip(-0.5, 0.5)
-        shift = (shift + step).clip(-1.0, 1.0)
-        if np.abs(step).max() < SETTLED:
-            break
-    return shift, np.asarray((np.abs(step).max(axis=1) < 10 * SETTLED) & (np.abs(shift) < 1.0).all(axis=1))
-
-
-def _unit(patches: FloatImage) -> FloatImage:
-    size = np.sqrt((patches**2).sum(axis=(1, 2, 3), keepdims=True))
-    return np.asarray(patches / (size + np.float32(1e-12)), np.float32)
-
-
-def _shifted(patches: FloatImage, shift: Array, axis: int) -> FloatImage:
-    """Return patches between their pixels, cubic along an axis (2 or 3), which loses 2 px at each end."""
-    length = patches.shape[axis] - 4
-    out = np.zeros([n - 4 * (i == axis) for i, n in enumerate(patches.shape)], np.float32)
-    for k in range(-2, 3):
-        t = np.abs(k - shift)
-        near, far = 1.5 * t**3 - 2.5 * t**2 + 1.0, -0.5 * t**3 + 2.5 * t**2 - 4.0 * t + 2.0
-        weight = np.where(t <= 1.0, near, np.where(t < 2.0, far, 0.0)).astype(np.float32)
-        part = [slice(None)] * 4
-        part[axis] = slice(k + 2, k + 2 + length)
-        out += weight[:, None, None, None] * patches[tuple(part)]
-    return out
-
-
 _NODE = 8  # px between exact projections; straight lines between them
-_KNOWN = 0.99  # of what a pixel is made of must be valid
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -311,13 +182,12 @@ def of_image(view: View, band: int, patch: Patch) -> FloatImage:
 
 def of_reference(paths: Sequence[str], patch: Patch) -> FloatImage:
     """Return the channels (C, H, W) of a patch, of the first of several orthoimages that shows a place."""
-    nodes, whole = patch.nodes(), np.zeros((CHANNELS, *patch.shape), np.float32)
-    for path in paths:
-        sheet = Sheet.read(path)
-        seen, valid = picture(path, sheet.bands, sheet.size, sheet.image(nodes), patch.shape)
-        if valid.any():
-            whole = np.where(np.abs(whole).sum(axis=0) > 0, whole, channels(seen, valid))
-    return whole
+    nodes = patch.nodes()
+    each = (
+        channels(*picture(sheet.path, sheet.bands, sheet.size, sheet.image(nodes), patch.shape))
+        for sheet in map(Sheet.read, paths)
+    )
+    return reduce(lambda first, other: np.where(first.any(axis=0), first, other), each)
 
 
 def shown(picture: FloatImage) -> float:
@@ -342,40 +212,27 @@ def picture(
     sides = (nodes[-1, 0] - nodes[0, 0]) / (shape[0] - 1), (nodes[0, -1] - nodes[0, 0]) / (shape[1] - 1)
     apart = float(np.sqrt(abs(np.linalg.det(np.stack(sides)))))
     thin = max(1, int(apart))
-    box = grow((int(low[0]), int(low[1]), *(high - low + 1).tolist()), 2 * thin + 2, size)
-    if min(box[2:]) < thin:
+    if min(size) < thin:
         return nothing
-    box = box[0], box[1], box[2] // thin * thin, box[3] // thin * thin
-    picture, valid = _thinned((path, size), bands, box, thin)
-    if not (valid > 0).any():
+    low, high = low // thin, high // thin
+    box = grow((int(low[0]), int(low[1]), *(high - low + 1).tolist()), 4, (size[0] // thin, size[1] // thin))
+    each = []
+    for band in bands:
+        with PixelReader(path, band, size, thin) as reader:
+            each.append(reader.read(box))
+    valid = np.all([known for _, known in each], axis=0)
+    if not valid.any():
         return nothing
+    picture = np.asarray(sum(levelled(pixels, known) for pixels, known in each), np.float32)
+    picture[~valid] = picture[valid].mean()
+    cv2.setNumThreads(1)
     if (left := apart / thin) > 1.1:
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.5 * (left**2 - 1.0) ** 0.5), np.float32)
     rows, cols = (_between(np.arange(n, dtype=np.float64), n) for n in shape)
-    nodes = (nodes - box[:2] + 0.5) / thin - 0.5
+    nodes = (nodes + 0.5) / thin - 0.5 - box[:2]
     x, y = ((rows @ nodes[..., i] @ cols.T).astype(np.float32) for i in (0, 1))
     found = cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    inside = cv2.remap(valid, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
-    return np.asarray(found, np.float32), np.asarray(inside > _KNOWN)
-
-
-def _thinned(
-    file: tuple[str, tuple[int, int]], bands: Sequence[int], box: Box, thin: int
-) -> tuple[FloatImage, FloatImage]:
-    """Return the mean of bands of a window, averaged over `thin` x `thin` px, and how much of each is known."""
-    if box[2] * box[3] > PIECE and box[3] >= 2 * thin:
-        first = box[3] // thin // 2 * thin
-        halves = (box[0], box[1], box[2], first), (box[0], box[1] + first, box[2], box[3] - first)
-        means, shares = zip(*(_thinned(file, bands, half, thin) for half in halves), strict=True)
-        return np.vstack(means), np.vstack(shares)
-    cv2.setNumThreads(1)
-    picture, valid = np.zeros((box[3], box[2]), np.float32), np.ones((box[3], box[2]), dtype=bool)
-    for band in bands:
-        pixels, known = read_pixels(file[0], box, band, file[1])
-        picture += levelled(pixels, known)
-        valid &= known
-    picture[~valid] = picture[valid].mean() if valid.any() else 0.0
-    small = box[2] // thin, box[3] // thin
-    parts = (cv2.resize(part, small, interpolation=cv2.INTER_AREA) for part in (picture, valid.astype(np.float32)))
-    mean, share = (np.asarray(part, np.float32) for part in parts)
-    return mean, share
+    lacking = cv2.remap(
+        (~valid).astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0
+    )
+    return np.asarray(found, np.float32), np.asarray(lacking == 0.0)

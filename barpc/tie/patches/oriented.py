@@ -1,30 +1,33 @@
-"""Pictures of the same resolution and orientation about points of two images, as channels that are correlated."""
+"""Templates of one picture's channels found in another's: brought to one resolution and orientation, and correlated.
+
+A place counts where its surroundings are a picture, where it is no edge of the search, and where the way back ends
+where it began. Matching by structure, registration by structure and control from a reference all look so.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 from barpc.tie.pairing.epipolar import grouped
-from barpc.tie.patches.channels import BATCH, COARSE, EDGE, FINE, SHOWN, channels, correlation, cut, picture, ticks
-from barpc.tie.pixels import PIECE, FloatImage
+from barpc.tie.patches.channels import EDGE, channels, correlation, cut, picture, ticks
+from barpc.tie.pixels import CELL, PIECE, SPAN, FloatImage
 
 Files = Sequence[tuple[str, tuple[int, int]]]
 """Path and size (width, height) of two images."""
 
-PATCH = 24
-"""How far a patch reaches to each side when matches are registered [px]."""
 SIGMA = 0.1
-"""Standard deviation of a coordinate after that, at least [px]."""
+"""Standard deviation of a place registered by structure [px]; as much across an epipolar line is always tolerated."""
 HALF = 16
-"""How far a template reaches to each side [px]."""
-TILE = 256
-"""Points of a tile of so many px a side share a picture."""
-BACK = 1.5  # px that the way back may miss by
+"""How far a template reaches to each side [px], when matches are registered as far again at half the step."""
+SHOWN = 0.9
+"""Part of a template that must be a picture."""
+REACH = 1.5
+"""What a registered patch may move [px], and the way back from a template miss by: beyond, it is another point."""
 _FINER = 3  # px to each side that a finer picture is searched, and the last one, of half its step
 
 
@@ -41,22 +44,19 @@ class Sampling:
     band: int
     step: float  # px of A that a pixel of the grids holds
     linear: Array  # (2, 2) d(B)/d(A)
-    blurs: tuple[float, float] = COARSE
 
     def seen(self, which: int, origin: Array, matrix: Array, size: IntArray) -> FloatImage:
         """Return the channels (C, H, W) of an image on a grid: pixel k at `origin` + `matrix` k."""
         (path, whole), shape = self.files[which], (int(size[1]), int(size[0]))
         nodes = np.stack(np.meshgrid(ticks(shape[1]), ticks(shape[0])), axis=-1)
-        return channels(*picture(path, (self.band,), whole, origin + nodes @ matrix.T, shape), self.blurs)
+        return channels(*picture(path, (self.band,), whole, origin + nodes @ matrix.T, shape))
 
 
-def found_about(sampling: Sampling, at: Array, xy: Array, half: int = HALF) -> tuple[Array, BoolArray, Array]:
+def found_about(sampling: Sampling, at: Array, xy: Array) -> tuple[Array, BoolArray, Array]:
     """Return the places (n, 2) near those given, whether they stand out and the way back returns; correlations."""
-    tile = PatchTile.of(sampling, at, xy, np.full(2, _FINER), half)
-    surface = tile.surfaces()
-    place, score = tile.peaks(surface)
-    edge = np.abs(np.rint(place) - tile.whole).max(axis=1) < _FINER
-    return tile.in_b(place), edge & tile.shown() & tile.returns(place), score
+    tile = PatchTile.of(sampling, at, xy, np.full(2, _FINER), HALF)
+    place, ok, score = tile.found()
+    return tile.in_b(place), ok & tile.returns(place), score
 
 
 def register_oriented(
@@ -69,13 +69,12 @@ def register_oriented(
     """
     place, ok, score = start.copy(), np.zeros(len(start), dtype=bool), np.zeros(len(start))
     step = resolution(np.median(linear, axis=0))
-    for rows in grouped(*np.floor(reference[:, ::-1] / (step * TILE)).T):
+    for rows in grouped(*np.floor(reference[:, ::-1] / (step * SPAN)).T):
         at, turn = reference[rows], np.median(linear[rows], axis=0)
-        near, found, _ = found_about(Sampling(files, band, step, turn), at, start[rows], PATCH)
-        closer = Sampling(files, band, 0.5 * step, turn, FINE)
+        near, found, _ = found_about(Sampling(files, band, step, turn), at, start[rows])
+        closer = Sampling(files, band, 0.5 * step, turn)
         tile = PatchTile.of(closer, at, near, np.full(2, _FINER), 2 * HALF)
-        best, score[rows] = tile.peaks(tile.surfaces())
-        inside = np.abs(np.rint(best) - tile.whole).max(axis=1) < _FINER
+        best, inside, score[rows] = tile.found()
         place[rows], ok[rows] = tile.in_b(best), found & inside
     return place, ok, score
 
@@ -112,6 +111,12 @@ class PatchTile:
         )
         return cls(pictures, first, whole, place - whole, reach, half, matrix, origin)
 
+    @classmethod
+    def same(cls, pictures: tuple[FloatImage, FloatImage], at: Array, reach: int, half: int) -> PatchTile:
+        """Return pictures on one grid, points of which (n, 2) [whole px] are looked for about the same places."""
+        whole, none = np.asarray(at, np.int64), np.zeros((len(at), 2))
+        return cls(pictures, whole, whole, none, np.full(2, reach), half, np.eye(2), np.zeros(2))
+
     def surfaces(self) -> FloatImage:
         """Return the correlations (n, y, x) at all places within reach."""
         x, y = (self.half + self.reach).tolist()
@@ -123,9 +128,24 @@ class PatchTile:
         ]
         return np.concatenate(parts)
 
+    def found(self) -> tuple[Array, BoolArray, Array]:
+        """Return the best places (n, 2) in the second picture, whether they are no edge of the search and the template
+        is a picture, and correlations.
+        """
+        place, score = self.peaks(self.surfaces())
+        inside = (np.abs(np.rint(place) - self.whole) < self.reach).all(axis=1)
+        return place, inside & self.shown(), score
+
+    def decoys(self) -> Array:
+        """Return the best correlations (n,) beside the search, where nothing true can be, to the right and left in
+        turn.
+        """
+        aside = np.where(np.arange(len(self.at)) % 2, 1, -1)[:, None] * [2 * self.reach[0] + EDGE, 0]
+        return np.asarray(replace(self, whole=self.whole + aside).surfaces().max(axis=(1, 2)), np.float64)
+
     def _batches(self) -> list[slice]:
         area = int((2 * (self.half + self.reach) + 1).prod())
-        batch = max(1, min(BATCH, PIECE // area))
+        batch = max(1, min(CELL, PIECE // area))
         return [slice(i, i + batch) for i in range(0, len(self.at), batch)]
 
     def offsets(self) -> Array:
@@ -156,12 +176,13 @@ class PatchTile:
             back = correlation(there, cut(self.pictures[0], self.at[i], self.half + search, self.half + search))
             y, x = np.divmod(back.reshape(len(back), -1).argmax(axis=1), back.shape[2])
             missed.append(np.hypot(x - search, y - search))
-        return np.asarray(np.concatenate(missed) <= BACK)
+        return np.asarray(np.concatenate(missed) <= REACH)
 
-    def shown(self) -> BoolArray:
-        """Return the templates that hold structure."""
-        known = (np.abs(self.pictures[0]).sum(axis=0, keepdims=True) > 0).astype(np.float32)
-        return np.asarray(cut(known, self.at, self.half, self.half).mean(axis=(1, 2, 3)) > SHOWN)
+    def shown(self, which: int = 0, place: Array | None = None) -> BoolArray:
+        """Return the places (n, 2) in a picture about which it holds structure: of templates those that do."""
+        at = self.at if place is None else np.rint(place).astype(np.int64)
+        known = (np.abs(self.pictures[which]).sum(axis=0, keepdims=True) > 0).astype(np.float32)
+        return np.asarray(cut(known, at, self.half, self.half).mean(axis=(1, 2, 3)) > SHOWN)
 
     def in_b(self, place: Array) -> Array:
         """Return the places (n, 2) of the second picture in B [px]."""

@@ -21,7 +21,6 @@ from barpc.base.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View
 from barpc.tie.pairing.epipolar import FEW, LEAST_REACH, affine_inliers, frame, grouped, linear_map, robust_spread
 from barpc.tie.patches import oriented
-from barpc.tie.patches.channels import SETTLED
 from barpc.tie.pixels import SPAN, FloatImage, PixelReader, grow, levelled
 from barpc.tie.tasks import HERE, Work
 
@@ -32,11 +31,10 @@ PATCH = 21
 _SMALLER = 0.7  # side of the patch of the second try and of the check
 _TORN = 0.5  # px that the smaller patch may lie apart
 _FINE = 4  # samples a pixel and axis
-_GRID = 1.0 / (32 * _FINE)  # px; positions that the sampler tells apart
-REACH = 1.5  # px; a patch that moves farther has left its point
+_STEPS = cv2.INTER_TAB_SIZE * _FINE  # a pixel and axis: positions that the sampler tells apart
+_SETTLED = 0.003  # px: a step below it is the last
 _WEIGHT = 0.7  # standard deviation of the patch's Gaussian weight, in half sides
 _TAPS = 6  # samples on either side in the interpolation
-_FLOOR = 0.1  # px across the epipolar line that are always tolerated
 _DISTORTED = 2.0  # times the median sigma about it: the patch lies across a step of the ground
 _LEAST_END_SIGMA = 0.02  # px, of an observation
 
@@ -78,7 +76,7 @@ def register_places(
     Where a size is a part of the file's, pixels are means of the file's (`PixelReader`).
     """
     cv2.setNumThreads(1)
-    margin = patch + _TAPS + int(REACH)
+    margin = patch + _TAPS + int(oriented.REACH)
     sparse, every = _sparse(reference, margin), PatchRegistration.none(start)
     read, groups = (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, SPAN))
     (path, size), (other, beyond) = files
@@ -130,7 +128,7 @@ def _mosaics(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int)
 
 def _parts(origin: Array, links: IntArray, tile: int) -> list[IntArray]:
     """Return the links of each task: of whole tiles, or, where few, of bands of rows: blocks decode once."""
-    if not _sparse(origin, PATCH + _TAPS + int(REACH)):
+    if not _sparse(origin, PATCH + _TAPS + int(oriented.REACH)):
         return [links[rows] for rows in _joined(_by_tile(origin, tile), CHUNK)]
     order = np.lexsort((origin[:, 0], origin[:, 1] // SPAN))
     bands = np.split(order, np.flatnonzero(np.diff(origin[order, 1] // SPAN)) + 1)
@@ -172,13 +170,6 @@ def register_part(
     return replace(found, ok=found.ok & (found.correlation >= MIN_CORRELATION))
 
 
-def _usable(valid: BoolArray, patch: int) -> BoolArray:
-    """Return the pixels about which a whole patch is valid and inside."""
-    whole, kernel = valid.astype(np.uint8), np.ones((patch, patch), np.uint8)
-    usable: BoolArray = cv2.erode(whole, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
-    return usable
-
-
 def register_patches(
     images: tuple[FloatImage, FloatImage],
     valid: tuple[BoolArray, BoolArray],
@@ -198,13 +189,14 @@ def register_patches(
     smaller = int(_SMALLER * patch) | 1
     for side in (patch, smaller):
         template = _Template(pictures, images[0].shape[1], side)
-        usable = [_usable(mask, side) for mask in valid]
+        whole = np.ones((side, side), np.uint8)
+        usable = [cv2.erode(np.pad(mask, 1).astype(np.uint8), whole)[1:-1, 1:-1] > 0 for mask in valid]
         possible = np.flatnonzero(~best.ok & _at(usable[0], reference) & _at(usable[1], start))
         for rows in _chunks(possible):
             found = template.find(fine, reference[rows].astype(np.int64), start[rows], linear[rows])
             best.put(rows, replace(found, ok=found.ok & _at(usable[1], found.xy)))
     for rows in _chunks(np.flatnonzero(best.ok)):  # on a step of the ground the inner part goes elsewhere
-        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], 10 * SETTLED)
+        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], 10 * _SETTLED)
         apart = np.hypot(*(inner.xy - best.xy[rows]).T)
         best.ok[rows] = apart <= np.maximum(_TORN, 5.0 * inner.sigma)
     return best
@@ -281,7 +273,7 @@ class _Template:
         return centred / deviation, deviation
 
     def find(
-        self, fine: FloatImage, reference: IntArray, start: Array, linear: Array, settled: float = SETTLED
+        self, fine: FloatImage, reference: IntArray, start: Array, linear: Array, settled: float = _SETTLED
     ) -> PatchRegistration:
         """Register the patches about `reference` (N, 2), begun at `start` with the distortion `linear`."""
         offset = self._row * self._width + self._col
@@ -301,7 +293,7 @@ class _Template:
         noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - 8.0)
         sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_EPS)
         moved = np.hypot(*(xy - start).T)
-        ok = (step <= 10 * settled) & (moved <= REACH) & np.isfinite(sigma)
+        ok = (step <= 10 * settled) & (moved <= oriented.REACH) & np.isfinite(sigma)
         return PatchRegistration(xy, correlation, sigma, ok)
 
     def _iterate(
@@ -316,7 +308,7 @@ class _Template:
         active = np.arange(len(centre))
         jacobian, inverse = solver
         for _ in range(NEWTON_STEPS):
-            sampled = np.rint(centre[active] / _GRID) * _GRID  # else the sampler would round, and we not know
+            sampled = np.rint(centre[active] * _STEPS) / _STEPS  # else the sampler would round, and we not know
             patches = self._normalized(self._sample(fine, sampled, linear[active]))[0]
             right = (jacobian @ (self._root * patches)[:, :, None]).astype(np.float64)
             solution = (inverse @ right)[:, :, 0]
@@ -413,17 +405,13 @@ class _Links:
             first, second = self.of(part)
             images = ((first.path, first.size), (second.path, second.size))
             places = origin[part], start[part], linear[part]
-            tasks.append((images, options.band, *places, self._is_structural(part)))
+            ends = sorted(int(self.tracks.view[row[part[0]]]) for row in (self.reference, self.other))
+            tasks.append((images, options.band, *places, tuple(ends) in self.structural))
         done: list[PatchRegistration] = work.ordered(register_part, tasks, "refine")
         found = PatchRegistration.none(start)
         for part, one in zip(parts, done, strict=True):
             found.put(part, one)
         return found
-
-    def _is_structural(self, part: IntArray) -> bool:
-        """Return whether links that have their views in common are of a structural pair."""
-        ends = sorted((int(self.tracks.view[self.reference[part[0]]]), int(self.tracks.view[self.other[part[0]]])))
-        return (ends[0], ends[1]) in self.structural
 
     def errors(self, found: PatchRegistration, group: IntArray) -> tuple[Array, Array]:
         """Return distances along and across epipolar lines (M, 2) [px] of two views, and half the segments (M,)."""
@@ -440,7 +428,7 @@ class _Links:
                 usual = _usual(self.origin[group], found.sigma[group])
                 group = group[found.sigma[group] <= _DISTORTED * usual]
                 errors, reach[group] = self.errors(found, group)
-                verified[group] = affine_inliers(self.origin[group], errors[:, 1], _FLOOR)[0]
+                verified[group] = affine_inliers(self.origin[group], errors[:, 1], oriented.SIGMA)[0]
                 altitude[group] = errors[:, 0] / np.maximum(reach[group], 1e-9)
         return verified & ~self._torn(verified, altitude, reach)
 
@@ -455,7 +443,7 @@ class _Links:
         views = self.tracks.view
         three = views[self.reference[first]], views[self.other[first]], views[self.other[second]]
         for group in grouped(*three):
-            agree = affine_inliers(self.origin[first[group]], apart[group], 2 * _FLOOR)[0]
+            agree = affine_inliers(self.origin[first[group]], apart[group], 2 * oriented.SIGMA)[0]
             for end in (first[group], second[group]):
                 compared[end] = True
                 agreed[end[agree]] = True
@@ -469,7 +457,7 @@ class _Links:
             group = group[good[group]]
             if len(group) >= FEW:
                 across = self.errors(found, group)[0][:, 1]
-                residual = affine_inliers(self.origin[group], across, _FLOOR)[1]
+                residual = affine_inliers(self.origin[group], across, oriented.SIGMA)[1]
                 sigma[group] *= max(1.0, robust_spread(residual / sigma[group]))
         return sigma
 
