@@ -24,7 +24,7 @@ from barpc.base.sidefile import plain_path
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
 from barpc.pipeline.beyond import write_grids
-from barpc.pipeline.executor import GROUP, CachingExecutor, watched
+from barpc.pipeline.executor import GROUP, CachingExecutor
 from barpc.pipeline.handoff import unverified
 from barpc.pipeline.inputs import (
     PRIOR,
@@ -147,12 +147,12 @@ def adjust(
     options, folder = with_located(options or RunOptions()), Path(out_dir)
     plain_path(folder.absolute())
     stages, seen = list[dict[str, Any]](), dict[str, Stamp]()
-    with watched(executor), timed("inputs", stages) as workers:
+    with timed("inputs", stages) as workers:
         with recorded(seen):
             run = _loaded("adjust", images, options, executor, progress, workers)
         names, keep = _files(run, options, folder)
         workspace = Workspace(out_dir, overwrite=options.overwrite, keep=keep, names=names)
-    with watched(executor), workspace:
+    with workspace:
         workspace.stages += stages
         with workspace.stage("fingerprints"), recorded(seen):
             given = side_inputs(options, run.views)

@@ -10,8 +10,7 @@ import pytest
 from barpc import report
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.report import Run
-from barpc.report.digest import decisions
-from barpc.report.page import report_html
+from barpc.report.page import decisions, report_html
 
 
 def summary_of(run: Run, gcps, **options):

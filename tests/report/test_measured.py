@@ -13,8 +13,8 @@ from barpc.ba.robust.smooth import SmoothTest
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report import Run
 from barpc.report import outcome as runs
-from barpc.report.digest import decisions
 from barpc.report.outcome import ControlResidual, pair_ties, triangulate_tracks
+from barpc.report.page import decisions
 from barpc.report.summary import measure_run
 from barpc.report.summary.known import GcpEntry, measure_control, measure_gcps, measure_reference
 from barpc.report.summary.place import ce90

@@ -12,8 +12,8 @@ import pytest
 from barpc import report
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.report import Run
-from barpc.report.digest import decisions
 from barpc.report.outcome import pair_ties, triangulate_tracks
+from barpc.report.page import decisions
 from barpc.report.records import Number, plain, said, table
 from barpc.report.summary import published_schema
 from barpc.report.summary.place import moved_in_space
