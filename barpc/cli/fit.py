@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -131,15 +132,14 @@ def _write(fit: RpcFit, source: str, output: str, overwrite: bool, tolerance: fl
     from barpc.base.atomic import replacing
     from barpc.rpcio import read_rpc, write_camera
 
-    try:
-        with replacing(output, overwrite=overwrite) as partial:
-            write_camera(fit.rpc, partial, source, place=output, overwrite=True)
-            fit = fit.as_written(read_rpc(partial))
-            if tolerance is not None and fit.verdict(tolerance):
-                raise _Missed
-    except _Missed:
-        return fit, False
-    return fit, True
+    stays = False
+    with suppress(_Missed), replacing(output, overwrite=overwrite) as partial:
+        write_camera(fit.rpc, partial, source, place=output, overwrite=True)
+        fit = fit.as_written(read_rpc(partial))
+        if tolerance is not None and fit.verdict(tolerance):
+            raise _Missed
+        stays = True
+    return fit, stays
 
 
 def _certificate(fit: RpcFit, verdict: str) -> str:

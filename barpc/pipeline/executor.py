@@ -49,7 +49,7 @@ def worker_count(executor: Executor | None) -> int:
     """Return the number of tasks that an executor works on at a time; of a dask cluster what it may grow to."""
     client = getattr(executor, "_client", None)
     if client is not None:
-        threads = list(client.nthreads().values())
+        threads = [int(number) for number in client.nthreads().values()]
         if not threads:
             logger.warning("the cluster has no worker: the run waits for one; Ctrl-C ends it, and what is done is kept")
         return max(_CLUSTER, sum(threads))

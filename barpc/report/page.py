@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from barpc.ba.usual import LARGEST
+from barpc.ba.usual import FEW, LARGEST
 from barpc.base.errors import BarpcError, visible
 from barpc.report.compare import flat_options
-from barpc.report.digest import SHOWN, flagged, offset_of, sentences, worst_first, worst_pairs
 from barpc.report.maps import ground_map, residual_panels, template
 from barpc.report.records import MAX_SHOWN, Record, Table, cell_of, table, value_of
-from barpc.report.reservations import FEW_OBSERVATIONS, GOOD_RMSE
+from barpc.report.reservations import GOOD_RMSE
 from barpc.report.summary import StageEntry, Summary
 from barpc.report.summary.known import GCPS, CheckPointEntry, GcpEntry, ReferenceViewEntry
 from barpc.report.summary.pairs import PairEntry
@@ -28,11 +27,11 @@ from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.whole import DATUM, DatumEntry, ExplanationEntry, HeldOutEntry, LeftEntry
 from barpc.report.summary.words import NAMED, largest
 from barpc.report.tables import RunFiles, read_summary, read_tables
+from barpc.report.verdict import LINES, SHOWN, flagged, offset_of, sentences, worst_first, worst_pairs
 from barpc.scene import connected_groups
 from barpc.workspace import Workspace
 
 NAME = "report.html"
-_SHOWN_LINES = 16  # sentences of the verdict, before the rest is unfolded
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
 REPORT = "report"  # the stage that makes the page, which cannot tell how long it took
 
@@ -60,7 +59,7 @@ def report_html(summary: Summary, folder: Path | str) -> str:
             sections=shown,
             verdict=sentences(summary),
             large=len(summary.views) > SHOWN,
-            shown_lines=_SHOWN_LINES,
+            shown_lines=LINES,
             folded=_FOLDED,
             most=MAX_SHOWN,
         )
@@ -227,10 +226,10 @@ def _pairs(files: RunFiles) -> Section | None:
         return None
     worst = max(pairs, key=offset_of)
     doubted = {view.name for view in files.summary.views if view.advice}
-    sure = [p for p in pairs if p.num_matches >= FEW_OBSERVATIONS and not {p.a, p.b} & doubted]
+    sure = [p for p in pairs if p.num_matches >= FEW and not {p.a, p.b} & doubted]
     heights = [pair for pair in sure if pair.height_m_per_px and pair.convergence_deg]
     facts = {
-        **{"worst": worst, "offset": offset_of(worst), "wanted": GOOD_RMSE, "enough": FEW_OBSERVATIONS},
+        **{"worst": worst, "offset": offset_of(worst), "wanted": GOOD_RMSE, "enough": FEW},
         "best": min(heights, key=lambda pair: pair.height_m_per_px or 0.0, default=None),
     }
     (shown,) = _table("pairs", pairs, files.summary.adjusted)

@@ -49,9 +49,7 @@ def test_a_worker_that_comes_later_with_another_version_works_on_nothing() -> No
 
 @pytest.mark.nightly
 @pytest.mark.filterwarnings("ignore")
-def test_workers_close_and_come_during_a_run_and_the_bytes_are_the_same(
-    distributed: Any, tmp_path: Path
-) -> None:
+def test_workers_close_and_come_during_a_run_and_the_bytes_are_the_same(distributed: Any, tmp_path: Path) -> None:
     images = sorted(SAMPLES.glob("*.tif"))[:2]
     options = RunOptions(images="none", tie=TieOptions(tile=256, points_per_image=600))
     barpc.adjust(images, tmp_path / "alone", options)
