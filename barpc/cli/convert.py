@@ -145,7 +145,7 @@ def _to_target(files: tuple[str, ...], flags: Mapping[str, Any]) -> int:
         check_target(target, [image, camera.path], overwrite)
         return _as_grid(camera, target, overwrite)
     if camera.format in ("grid", "correction"):
-        camera = _refitted(camera)
+        camera = refitted(camera, camera.model, camera.alt_range, FitOptions(), camera.format + ", fitted")
     check_target(target, [image, camera.path], overwrite, None if cut else camera.rpc)
     if not cut:
         return _copy(camera, image, target, flags["formats"], overwrite)
@@ -154,11 +154,6 @@ def _to_target(files: tuple[str, ...], flags: Mapping[str, Any]) -> int:
     text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
     echo(json.dumps({"path": target, "window": window}) if wants_json() else text)
     return 0
-
-
-def _refitted(camera: Camera) -> Camera:
-    """Fit an RPC to a grid; FitError where none holds it."""
-    return refitted(camera, camera.model, camera.alt_range, FitOptions(), camera.format + ", fitted")
 
 
 def _copy(camera: Camera, image: Path, target: str, formats: str | None, overwrite: bool) -> int:

@@ -102,7 +102,7 @@ def _unknown(camera: Camera) -> str:
 @cache
 def _written_in(folder: Path) -> dict[str, float]:
     """Return the files that a run wrote for its images into a folder, and the median altitude of its tie points [m]."""
-    from barpc.report.tables import read_summary
+    from barpc.report.runfiles import read_summary
 
     if not (folder / "summary.json").is_file():
         return {}

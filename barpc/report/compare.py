@@ -11,10 +11,10 @@ import numpy as np
 
 from barpc.base.errors import BarpcError, InputError
 from barpc.report.records import plain
+from barpc.report.runfiles import read_summary
 from barpc.report.summary import Summary
 from barpc.report.summary.views import CELLS, ViewEntry
 from barpc.report.summary.words import median
-from barpc.report.tables import read_summary
 from barpc.rpcio import read_rpc
 from barpc.sensor.geometry import image_grid
 from barpc.sensor.rpc import RPC

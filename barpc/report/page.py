@@ -20,13 +20,13 @@ from barpc.report.compare import flat_options
 from barpc.report.maps import ground_map, residual_panels, template
 from barpc.report.records import MAX_SHOWN, Record, Table, cell_of, table, value_of
 from barpc.report.reservations import GOOD_RMSE
+from barpc.report.runfiles import RunFiles, read_summary, read_tables
 from barpc.report.summary import StageEntry, Summary
 from barpc.report.summary.known import GCPS, CheckPointEntry, GcpEntry, ReferenceViewEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.whole import DATUM, DatumEntry, ExplanationEntry, HeldOutEntry, LeftEntry
 from barpc.report.summary.words import NAMED, largest
-from barpc.report.tables import RunFiles, read_summary, read_tables
 from barpc.report.verdict import LINES, SHOWN, flagged, offset_of, sentences, worst_first, worst_pairs
 from barpc.scene import connected_groups
 from barpc.workspace import Workspace
