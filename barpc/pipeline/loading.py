@@ -10,7 +10,7 @@ import os
 import time
 from collections.abc import Hashable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -55,28 +55,8 @@ class LoadedViews:
     worker_seconds: float = 0.0  # of CPU, spent in other processes
 
 
-@dataclass(frozen=True, eq=False)
-class _Read:
-    """An image that was opened, or why it was not; the mark of its sampled pixels (see `Twins`)."""
-
-    view: View | None = None
-    camera: Camera | None = None
-    sampled: bytes | None = None
-    error: BarpcError | None = None
-    files: Mapping[str, Stamp] = field(default_factory=dict)  # all that was opened for it
-
-    def usable(self, twins: Twins | None) -> tuple[View, Camera]:
-        """Return the image and its camera; what was found wrong with it, or that it is there twice, is raised."""
-        if self.error is not None:
-            raise self.error
-        also_seen(self.files)
-        assert self.view is not None
-        assert self.camera is not None
-        if twins is not None:
-            twins.add(self.view, self.sampled)
-        return self.view, self.camera
-
-
+_Read = tuple[View, Camera, bytes | None, Mapping[str, Stamp]]
+"""An image that was opened: the mark of its sampled pixels (see `Twins`), and all files that were opened for it."""
 _Given = tuple[str, Place, Image]  # name, file, and what was given
 
 
@@ -115,7 +95,13 @@ def load_views(
     used: list[tuple[View, Camera]] = []
     for (_, file, _), read in zip(given, opened, strict=True):
         try:
-            used.append(read.usable(twins if distinct else None))
+            if isinstance(read, BarpcError):
+                raise read
+            view, camera, sampled, seen = read
+            also_seen(seen)
+            if distinct:
+                twins.add(view, sampled)
+            used.append((view, camera))
         except BarpcError as error:
             if not keep_going:
                 if isinstance(error, MissingRpcError):
@@ -134,7 +120,7 @@ def _read_all(
     how: tuple[int, bool, tuple[str, ...]],
     executor: Executor | None,
     progress: Progress | None,
-) -> tuple[list[_Read], float]:
+) -> tuple[list[_Read | BarpcError], float]:
     """Return every image as it was read, and CPU seconds of other processes."""
     tasks = [(given[at : at + GROUP], *how) for at in range(0, len(given), GROUP)]
     told = progress and (lambda stage, done, _: progress(stage, min(done * GROUP, len(given)), len(given)))
@@ -145,16 +131,16 @@ def _read_all(
 
 def read_group(
     given: Sequence[_Given], band: int, distinct: bool, hosts: Sequence[str] = ()
-) -> tuple[list[_Read], float]:
+) -> tuple[list[_Read | BarpcError], float]:
     """Read some images in a worker; an error of one leaves the others theirs. Returns CPU seconds, too."""
-    start, out = time.thread_time(), []
+    start, out = time.thread_time(), list[_Read | BarpcError]()
     for name, file, image in given:
         try:
             with recorded({}) as files:
                 view, camera = _load(name, file, image, band, hosts)
-                out.append(_Read(view, camera, _sampled(view, band) if distinct else None, files=files))
+                out.append((view, camera, _sampled(view, band) if distinct else None, files))
         except BarpcError as error:
-            out.append(_Read(error=error))
+            out.append(error)
     return out, time.thread_time() - start
 
 
