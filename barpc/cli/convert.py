@@ -19,7 +19,7 @@ from barpc.base.sidefile import plain_path
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.alignment import moved, read_move, refitted
 from barpc.cli.flags import expanded
-from barpc.cli.project import Altitudes, altitude_of, exchanged, with_heights
+from barpc.cli.project import altitude_of, exchanged, with_heights
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
 from barpc.fit import FitOptions
 from barpc.fit.certificate import Sample
@@ -220,9 +220,8 @@ def _window(flags: Mapping[str, Any]) -> Callable[[Camera, Path], Window]:
     window: Window | None = flags["window"]
     if window is not None:
         return lambda *_: window
-    heights: Altitudes = flags["heights"]
-    bbox, dem = box_of(flags["aoi"]) if flags["aoi"] else flags["bbox"], heights.terrain()
-    return lambda camera, path: window_of(camera, path, bbox, heights.alt, dem)
+    bbox = box_of(flags["aoi"]) if flags["aoi"] else flags["bbox"]
+    return lambda camera, path: window_of(camera, path, bbox, flags["alt"], flags["terrain"])
 
 
 def box_of(path: str) -> Box:
