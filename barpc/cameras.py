@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -197,26 +198,12 @@ def _open_rpc(path: Place, first_pixel: float | None = None, band: int = 1) -> C
 
 
 def _is_sentinel1(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
-    """Return a product folder or zip, its manifest, or an annotation."""
+    """Return whether it is a product folder or zip, its manifest, or an annotation."""
     return path.is_dir() or path.suffix.lower() in (".safe", ".zip") or b"<adsHeader>" in head
 
 
-def _open_sentinel1(path: Place, pol: str | None = None, **choices: Any) -> Camera:
-    from barpc.sensor.sentinel1 import open_product
-
-    return _radar("sentinel-1", path, partial(open_product, polarisation=pol, **choices))
-
-
-def _radar(key: str, path: Place, opened: Callable[[Path], Any]) -> Camera:
-    """Open a radar's own model; ImageError on another host, as it consists of many files."""
-    if not isinstance(path, Path):
-        raise ImageError(f"{path}: a radar product is read from disk only")
-    model = opened(path)
-    return Camera(model, path, key, model.size, model.alt_range)
-
-
 def _is_terrasar(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
-    """Return a product folder, or its annotation."""
+    """Return whether it is a product folder, or its annotation."""
     if not (path.is_dir() and isinstance(path, Path)):
         return b"<level1Product" in head
     from barpc.sensor.terrasar import find_annotation
@@ -224,25 +211,13 @@ def _is_terrasar(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
     return find_annotation(path) is not None
 
 
-def _open_terrasar(path: Place) -> Camera:
-    from barpc.sensor.terrasar import open_terrasar
-
-    return _radar("terrasar-x", path, open_terrasar)
-
-
 def _is_sicd(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
-    """Return the XML of a SICD image, or a NITF that holds it."""
+    """Return whether it is the XML of a SICD image, or a NITF that holds it."""
     if b"SICD" not in head and not head.startswith(b"NITF02.10"):
         return False
     from barpc.sensor.sicd import find_sicd, is_sicd
 
     return is_sicd(head) or (head.startswith(b"NITF02.10") and isinstance(path, Path) and find_sicd(path) is not None)
-
-
-def _open_sicd(path: Place) -> Camera:
-    from barpc.sensor.sicd import open_sicd
-
-    return _radar("sicd", path, open_sicd)
 
 
 def _is_csm(_path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
@@ -253,12 +228,25 @@ def _is_csm(_path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
     return is_state(head)
 
 
+def _open_radar(path: Place, key: str, reader: str, **choices: Any) -> Camera:
+    """Open a radar's own model by a reader, ``module:function``, that is imported when it is needed."""
+    module, _, function = reader.partition(":")
+    choices |= {"polarisation": choices.pop("pol")} if "pol" in choices else {}
+    model = getattr(import_module(f"barpc.sensor.{module}"), function)(_on_disk(path, "a radar product"), **choices)
+    return Camera(model, path, key, model.size, model.alt_range)
+
+
+def _on_disk(path: Place, what: str) -> Path:
+    """Return a file of this machine; ImageError on another host, as such a camera lies in many files."""
+    if not isinstance(path, Path):
+        raise ImageError(f"{path}: {what} is read from disk only")
+    return path
+
+
 def _open_csm(path: Place, altitudes: tuple[float, float] = _ON_EARTH) -> Camera:
     from barpc.sensor.csm import open_state
 
-    if not isinstance(path, Path):
-        raise ImageError(f"{path}: a camera's state is read from disk only")
-    model, size = open_state(path)
+    model, size = open_state(_on_disk(path, "a camera's state"))
     return Camera(model, path, "csm", size, altitudes)
 
 
@@ -275,10 +263,7 @@ def _open_grid(path: Place, altitudes: list[float] | None = None) -> Camera:
 
 def _open_correction(path: Place) -> Camera:
     rpc, lacking = read_correction(path)
-    size = (
-        int(lacking.cols[-1]) + 1,
-        int(lacking.rows[-1]) + 1,
-    )  # its nodes go from corner to corner of the image
+    size = int(lacking.cols[-1]) + 1, int(lacking.rows[-1]) + 1  # its nodes go from corner to corner of the image
     return Camera(GridCorrected(rpc, lacking), path, "correction", size, altitude_range(rpc))
 
 
@@ -305,8 +290,7 @@ def _open_physical(
 ) -> Camera:
     from barpc.sensor.linescan import read_linescan
 
-    if not isinstance(path, Path):
-        raise ImageError(f"{path}: a {model} model is read from disk only")
+    path = _on_disk(path, f"a {model} model")
     file = path if driver_of(read_head(path, IMAGE, _HEAD)) is None else metadata_beside(path)
     found = read_linescan(file, **choices)
     low, high = _stated_altitudes(file) if altitudes is None else altitudes
@@ -332,7 +316,7 @@ OPENERS: dict[str, Opener] = {
         _open_rpc,
         {"first_pixel": {"auto": None, "0": 0.0, "0.5": 0.5, "1": 1.0}.__getitem__, "band": int},
     ),
-    "sicd": Opener(_is_sicd, _open_sicd),
+    "sicd": Opener(_is_sicd, partial(_open_radar, key="sicd", reader="sicd:open_sicd")),
     "grid": Opener(_is_grid, _open_grid, {"altitudes": _numbers}),
     "correction": Opener(
         lambda _path, head, _choices: driver_of(head) == "GTiff" and SIGN.encode() in head, _open_correction
@@ -350,7 +334,7 @@ OPENERS: dict[str, Opener] = {
     ),
     "sentinel-1": Opener(
         _is_sentinel1,
-        _open_sentinel1,
+        partial(_open_radar, key="sentinel-1", reader="sentinel1:open_product"),
         {
             **dict.fromkeys(("swath", "pol", "orbit"), str),
             "burst": int,
@@ -359,6 +343,6 @@ OPENERS: dict[str, Opener] = {
         },
     ),
     "csm": Opener(_is_csm, _open_csm, {"altitudes": _interval}, whole=True),
-    "terrasar-x": Opener(_is_terrasar, _open_terrasar),
+    "terrasar-x": Opener(_is_terrasar, partial(_open_radar, key="terrasar-x", reader="terrasar:open_terrasar")),
 }
 """Kind -> how it is told from others and opened. The last row that knows a file has it; the first takes any."""

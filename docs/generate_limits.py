@@ -18,7 +18,7 @@ from barpc.base.remote import _LONGEST as REQUEST
 from barpc.base.remote import BLOCK, hosts
 from barpc.pointio import foreign, names
 from barpc.rasters import dem, raster, vrt
-from barpc.report import tables
+from barpc.report import runfiles
 from barpc.rpcio import carried
 from barpc.sensor import document as metadata
 from barpc.sensor import sicd
@@ -113,7 +113,7 @@ def rows() -> list[tuple[str, str]]:
             "points of a fit, of a table, of a grid",
             f"{many(geodesy.FAR)} px",
         ),
-        ("numbers of a run's tables", many(tables._FAR)),
+        ("numbers of a run's tables", many(runfiles._FAR)),
         ("coordinates of a DEM", many(geodesy.FAR)),
         ("standard deviations of ground points", " to ".join(map(many, scene.SIGMA_RANGE))),
     ]

@@ -19,7 +19,7 @@ from barpc.base.sidefile import plain_path
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.alignment import moved, read_move, refitted
 from barpc.cli.flags import expanded
-from barpc.cli.project import Altitudes, altitude_of, exchanged, with_heights
+from barpc.cli.project import altitude_of, exchanged, with_heights
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
 from barpc.fit import FitOptions
 from barpc.fit.certificate import Sample
@@ -145,7 +145,7 @@ def _to_target(files: tuple[str, ...], flags: Mapping[str, Any]) -> int:
         check_target(target, [image, camera.path], overwrite)
         return _as_grid(camera, target, overwrite)
     if camera.format in ("grid", "correction"):
-        camera = _refitted(camera)
+        camera = refitted(camera, camera.model, camera.alt_range, FitOptions(), camera.format + ", fitted")
     check_target(target, [image, camera.path], overwrite, None if cut else camera.rpc)
     if not cut:
         return _copy(camera, image, target, flags["formats"], overwrite)
@@ -154,11 +154,6 @@ def _to_target(files: tuple[str, ...], flags: Mapping[str, Any]) -> int:
     text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
     echo(json.dumps({"path": target, "window": window}) if wants_json() else text)
     return 0
-
-
-def _refitted(camera: Camera) -> Camera:
-    """Fit an RPC to a grid; FitError where none holds it."""
-    return refitted(camera, camera.model, camera.alt_range, FitOptions(), camera.format + ", fitted")
 
 
 def _copy(camera: Camera, image: Path, target: str, formats: str | None, overwrite: bool) -> int:
@@ -225,9 +220,8 @@ def _window(flags: Mapping[str, Any]) -> Callable[[Camera, Path], Window]:
     window: Window | None = flags["window"]
     if window is not None:
         return lambda *_: window
-    heights: Altitudes = flags["heights"]
-    bbox, dem = box_of(flags["aoi"]) if flags["aoi"] else flags["bbox"], heights.terrain()
-    return lambda camera, path: window_of(camera, path, bbox, heights.alt, dem)
+    bbox = box_of(flags["aoi"]) if flags["aoi"] else flags["bbox"]
+    return lambda camera, path: window_of(camera, path, bbox, flags["alt"], flags["terrain"])
 
 
 def box_of(path: str) -> Box:

@@ -176,7 +176,9 @@ def dsm(obj: dict[str, Any], /, source: tuple[str, ...], out: str, jobs: int | s
         raise click.UsageError("--minus goes with a RUN: what two dates share is not known of images")
     surface = made(obj, run or expanded(source), out, options, jobs)
     if surface is not None and wants_json():
-        echo(json.dumps({key: _plain(value) for key, value in asdict(surface).items()}, indent=1))
+        from barpc.report.records import plain
+
+        echo(json.dumps(plain(surface), indent=1))
     return 3 if surface is None else 0
 
 
@@ -195,10 +197,6 @@ def made(
     if not (wants_json() or obj["quiet"]):
         _tell(surface)
     return surface
-
-
-def _plain(value: Any) -> Any:
-    return None if isinstance(value, float) and value != value else value
 
 
 def _tell(surface: Surface) -> None:

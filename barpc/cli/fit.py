@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ from barpc.cli.flags import flag, paper, run_options
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
 
 if TYPE_CHECKING:
-    from barpc.fit import Localisation, RpcFit
+    from barpc.fit import RpcFit
 
 _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third of the accuracy
 
@@ -131,37 +132,34 @@ def _write(fit: RpcFit, source: str, output: str, overwrite: bool, tolerance: fl
     from barpc.base.atomic import replacing
     from barpc.rpcio import read_rpc, write_camera
 
-    try:
-        with replacing(output, overwrite=overwrite) as partial:
-            write_camera(fit.rpc, partial, source, place=output, overwrite=True)
-            fit = fit.as_written(read_rpc(partial))
-            if tolerance is not None and fit.verdict(tolerance):
-                raise _Missed
-    except _Missed:
-        return fit, False
-    return fit, True
+    stays = False
+    with suppress(_Missed), replacing(output, overwrite=overwrite) as partial:
+        write_camera(fit.rpc, partial, source, place=output, overwrite=True)
+        fit = fit.as_written(read_rpc(partial))
+        if tolerance is not None and fit.verdict(tolerance):
+            raise _Missed
+        stays = True
+    return fit, stays
 
 
 def _certificate(fit: RpcFit, verdict: str) -> str:
     rows = {"control rmse": fit.rmse_cnp, "control max": fit.max_cnp}
     rows |= {"check rmse": fit.rmse_ckp, "check max": fit.max_ckp}
-    more = f"beyond        {fit.beyond:.2%} of the image may miss by more, at most (95 % confidence)"
+    beyond = f"beyond        {fit.beyond:.2%} of the image may miss by more, at most (95 % confidence)"
+    more = []
+    if (found := fit.localisation) is not None:
+        again = f"projected again {found.rmse_px:.3g} and {found.max_px:.3g} px"
+        least = f"denominators at least {found.min_denominator:.3g}"
+        more = [f"localisation  rmse {found.rmse_m:.3g} m, max {found.max_m:.3g} m; {again}; {least}"]
     lines = [
         f"method        {fit.method}, {fit.iterations} passes, h {fit.h[0]:.2g} {fit.h[1]:.2g}",
         f"points        {fit.num_cnp} control, {fit.num_ckp} check, {fit.coverage:.0%} of the image covered",
         "              col [px]     row [px]",
         *(f"{name:14s}{col:<13.3g}{row:.3g}" for name, (col, row) in rows.items()),
-        *([more] if fit.beyond < 1 else []),  # given points say nothing of the rest
+        *([beyond] if fit.beyond < 1 else []),  # given points say nothing of the rest
         f"denominators  at least {fit.min_denominator:.3g} over the image's ground and around it",
         f"round trip    {fit.roundtrip:.1g} px" + f"; the camera's own {fit.contradiction:.1g}" * (fit.beyond < 1),
-        *([] if fit.localisation is None else [_localisation(fit.localisation)]),
+        *more,
         f"verdict       {verdict or 'within tolerance'}",
     ]
     return "\n".join(lines)
-
-
-def _localisation(found: Localisation) -> str:
-    return (
-        f"localisation  rmse {found.rmse_m:.3g} m, max {found.max_m:.3g} m; projected again {found.rmse_px:.3g} and "
-        f"{found.max_px:.3g} px; denominators at least {found.min_denominator:.3g}"
-    )

@@ -119,17 +119,14 @@ def flag(target: str) -> Callable[[Function], Function]:
     metavar = f"[{listed}]" if listed else (rule.unit or kind.__name__).upper()
     if rule.rows:
         metavar = "NAMES" if several else "NAME"
-    notes = [f"default: {_shown(one.default)}"] if one.default not in (None, ()) else []
+    default = ",".join(one.default) if isinstance(one.default, tuple) else one.default
+    notes = [f"default: {default}"] if default not in (None, "") else []
     if kind in (int, float) and (bounds := replace(rule, unit="").bounds()):
         notes.append(bounds.strip())
     how = " Names of 'barpc convert --help', commas between." if rule.rows else " (repeatable)"
     text = rule.help + (how if several else "") + (f"  [{'; '.join(notes)}]" if notes else "")
     how_given: dict[str, Any] = {"multiple": several and not rule.rows, "shell_complete": complete}
     return click.option(name, parameter, help=text, metavar=metavar, callback=convert, **how_given)
-
-
-def _shown(default: Any) -> str:
-    return ",".join(default) if isinstance(default, tuple) else str(default)
 
 
 paper = click.option(

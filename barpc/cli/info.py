@@ -13,7 +13,7 @@ from barpc.base.errors import InputError, RpcError
 from barpc.base.geodesy import collection, feature, polygon
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.flags import expanded
-from barpc.cli.project import Altitudes, altitude_of, exchanged, ground_at, with_heights
+from barpc.cli.project import altitude_of, exchanged, ground_at, with_heights
 from barpc.cli.terminal import echo, wants_json
 from barpc.fit.poles import smallest_denominator
 from barpc.rasters.dem import Dem
@@ -31,7 +31,8 @@ from barpc.sensor.rpc import RPC
 def info(
     images: tuple[str, ...],
     at: tuple[float, float, float] | None,
-    heights: Altitudes,
+    alt: float | None,
+    terrain: Dem | None,
     outlines: bool,
 ) -> int:
     r"""Say where a camera comes from, what it covers and how it looks at the ground; of several, each pair's angle.
@@ -53,7 +54,7 @@ def info(
     """
     if not images:
         raise click.UsageError("give at least one IMAGE")
-    images, terrain, alt = tuple(expanded(images)), heights.terrain(), heights.alt
+    images = tuple(expanded(images))
     cameras = [open_camera(image) for image in images]
     if outlines:
         echo(json.dumps(_outlines(images, cameras, alt, terrain)))

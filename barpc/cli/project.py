@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from functools import cache, wraps
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import click
 import numpy as np
@@ -35,20 +35,11 @@ _NUMBERS = {"ignore_unknown_options": True}  # -3.5 is a number, not an option
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-class Altitudes(NamedTuple):
-    """Where a verb takes altitudes from: --alt [m], or --dem and its --geoid."""
+def with_heights(alt: str, both: bool = False) -> Callable[[Function], Function]:
+    """Return the flags --alt, with this help, --dem and --geoid of a verb, which gets `alt` [m] and `terrain`, a DEM.
 
-    alt: float | None
-    dem: str | None
-    geoid: str | None
-
-    def terrain(self) -> Dem | None:
-        """Return the DEM, if one is given; a usage error beside --alt, or for a geoid alone."""
-        return opened_dem(self.dem, self.geoid, self.alt)
-
-
-def with_heights(alt: str) -> Callable[[Function], Function]:
-    """Return the flags --alt, with this help, --dem and --geoid of a verb, which gets them as its `heights`."""
+    A usage error for a geoid alone, and for --alt beside --dem unless a verb takes `both`.
+    """
 
     def added(verb: Function) -> Function:
         @click.option("--alt", type=float, help=alt)
@@ -56,22 +47,15 @@ def with_heights(alt: str) -> Callable[[Function], Function]:
         @click.option("--geoid", metavar="NAME|FILE", help=GEOID_HELP)
         @wraps(verb)
         def told(*, alt: float | None, dem: str | None, geoid: str | None, **given: Any) -> Any:
-            return verb(heights=Altitudes(alt, dem, geoid), **given)
+            if dem is None and geoid is not None:
+                raise click.UsageError("--geoid goes with --dem")
+            if dem is not None and alt is not None and not both:
+                raise click.UsageError("give either --alt or --dem")
+            return verb(alt=alt, terrain=None if dem is None else Dem.open(dem, geoid), **given)
 
         return cast(Function, told)
 
     return added
-
-
-def opened_dem(dem: str | None, geoid: str | None, alt: float | None = None) -> Dem | None:
-    """Return the DEM of a command line, if it gives one; a usage error beside --alt, or for a geoid alone."""
-    if dem is None:
-        if geoid is not None:
-            raise click.UsageError("--geoid goes with --dem")
-        return None
-    if alt is not None:
-        raise click.UsageError("give either --alt or --dem")
-    return Dem.open(dem, geoid)
 
 
 def altitude_of(camera: Camera, image: Place, given: float | None = None) -> float:
@@ -102,7 +86,7 @@ def _unknown(camera: Camera) -> str:
 @cache
 def _written_in(folder: Path) -> dict[str, float]:
     """Return the files that a run wrote for its images into a folder, and the median altitude of its tie points [m]."""
-    from barpc.report.tables import read_summary
+    from barpc.report.runfiles import read_summary
 
     if not (folder / "summary.json").is_file():
         return {}
@@ -151,8 +135,8 @@ def _points(columns: str) -> Callable[..., Any]:
 @click.argument("image")
 @click.argument("numbers", nargs=-1, type=float, metavar="[LON LAT ALT]...")
 @_points("lon, lat, alt")
-@with_heights("Altitude of points without one [m above the ellipsoid].")
-def project(image: str, numbers: tuple[float, ...], points: str | None, heights: Altitudes) -> int:
+@with_heights("Altitude of points without one [m above the ellipsoid].", both=True)
+def project(image: str, numbers: tuple[float, ...], points: str | None, alt: float | None, terrain: Dem | None) -> int:
     r"""Print the image points (col, row; the first pixel's centre is 0, 0) of ground points.
 
     \b
@@ -160,9 +144,8 @@ def project(image: str, numbers: tuple[float, ...], points: str | None, heights:
       barpc project image.tif 5.44 43.26 180
       barpc project image.tif --points ground.csv --json
     """
-    terrain = opened_dem(heights.dem, heights.geoid)
     camera = open_camera(image)
-    ground = given_points(numbers, points, ("lon", "lat", "alt"), fill=np.nan if terrain else heights.alt)
+    ground = given_points(numbers, points, ("lon", "lat", "alt"), fill=np.nan if terrain else alt)
     if terrain is not None:
         ground[:, 2] = terrain(ground[:, 0], ground[:, 1])
     found = camera.model.project(ground)
@@ -177,9 +160,10 @@ def project(image: str, numbers: tuple[float, ...], points: str | None, heights:
 @click.argument("numbers", nargs=-1, type=float, metavar="[COL ROW]...")
 @_points("col, row and perhaps alt")
 @with_heights(
-    "Altitude of points without one [m].  [default: of the run's tie points, else the middle of the camera's]"
+    "Altitude of points without one [m].  [default: of the run's tie points, else the middle of the camera's]",
+    both=True,
 )
-def localize(image: str, numbers: tuple[float, ...], points: str | None, heights: Altitudes) -> int:
+def localize(image: str, numbers: tuple[float, ...], points: str | None, alt: float | None, terrain: Dem | None) -> int:
     r"""Print the ground points (lon, lat, alt) seen at image points.
 
     \b
@@ -187,11 +171,10 @@ def localize(image: str, numbers: tuple[float, ...], points: str | None, heights
       barpc localize image.tif 512.5 300 --alt 180
       barpc localize image.tif 512.5 300 --dem N44E005.hgt --geoid egm96
     """
-    terrain = opened_dem(heights.dem, heights.geoid)
     camera = open_camera(image)
     at = given_points(numbers, points, ("col", "row", "alt"), fill=np.nan)
     if terrain is None and (without := np.isnan(at[:, 2])).any():
-        at[without, 2] = altitude_of(camera, split_spec(image)[0], heights.alt)
+        at[without, 2] = altitude_of(camera, split_spec(image)[0], alt)
     ground = ground_at(camera, at[:, :2], at[:, 2], terrain)
     _print_points(("lon", "lat", "alt"), ground, (10, 10, 4))
     return _tell_failures(ground, "have no ground point")

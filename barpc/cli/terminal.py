@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 EXIT_GATE = 3
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 MOST_LINES = 60  # of a summary, whatever its size
-_SENTENCES = 20  # for which rows of tables make room
 _USUAL = 80  # columns of a terminal
 _LIMITS = {
     "views": "{:,} images, none with a reservation: all {}",
@@ -86,14 +85,14 @@ class Formatter(logging.Formatter):
 
 def print_summary(summary: Summary) -> None:
     """Print tables of views, pairs and control, and the verdict: `MOST_LINES` in a pipe, or 80 columns wide."""
-    from barpc.report.digest import SHOWN, sentences
+    from barpc.report.verdict import LINES, SHOWN, sentences
 
     width, lines = output_width(), sentences(summary)
     counted = width and max(width, _USUAL)  # nothing is dropped because a terminal is narrow
     for rows in range(SHOWN, 0, -1):
         tables = _tables(summary, rows)
         room = MOST_LINES - 3 - sum(_height(table, counted) for table in tables)
-        if room >= min(len(lines), _SENTENCES):
+        if room >= min(len(lines), LINES):
             break
     for title, texts, more in tables:
         _echo_table(title, texts, width, more)
@@ -108,7 +107,7 @@ def print_summary(summary: Summary) -> None:
 
 def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str]]:
     """Return titles, cells and what is said of the rest: of more rows the worst of those that pass a limit."""
-    from barpc.report import digest
+    from barpc.report import verdict
     from barpc.report.records import table
     from barpc.report.summary.known import GCPS, GcpEntry
     from barpc.report.summary.pairs import PairEntry
@@ -116,19 +115,19 @@ def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str
     from barpc.report.summary.whole import DATUM, DatumEntry
 
     views, pairs, adjusted = summary.views, summary.pairs, summary.adjusted
-    some_views = views if len(views) <= rows else digest.flagged(views)[:rows]
-    some_pairs = pairs if len(pairs) <= rows else digest.torn(pairs)[:rows]
+    some_views = views if len(views) <= rows else verdict.flagged(views)[:rows]
+    some_pairs = pairs if len(pairs) <= rows else verdict.torn(pairs)[:rows]
     datum = () if summary.scene is None else summary.scene.datum
     if len(DatumEntry.columns(datum).split()) <= 3:  # one source holds all: the verdict says so
         datum = ()
     errors = "Reprojection error of the tie points"
     offsets = "Epipolar offset: median ± spread (1.4826 MAD) across the epipolar line"
-    gcps = GcpEntry.worst(summary.gcps)
+    gcps = GcpEntry.worst(summary.gcps, rows)
     places = ("in summary.json", "in tables/pairs.csv") if summary.out_dir else ("with --json",) * 2
     wanted = (
         (table("views", errors, some_views, ViewEntry, ViewEntry.TERMINAL, adjusted), len(views), places[0]),
         (table("pairs", offsets, some_pairs, PairEntry, PairEntry.TERMINAL, adjusted), len(pairs), places[1]),
-        (table("gcps", GCPS, gcps, GcpEntry, GcpEntry.TERMINAL), len(gcps), ""),
+        (table("gcps", GCPS, gcps, GcpEntry, GcpEntry.TERMINAL), len(summary.gcps), places[0]),
         (table("datum", DATUM, datum, DatumEntry, DatumEntry.columns(datum)), len(datum), ""),
     )
     found = []

@@ -26,7 +26,7 @@ from barpc.base.options import DsmOptions
 from barpc.dsm.cells import F32, MATCHED, NODES, SIDE, Tile, surface_tile
 from barpc.dsm.imagery import Block, NoSurfaceError, Pairs
 from barpc.pipeline.executor import CachingExecutor, worker_count
-from barpc.pipeline.inputs import hash_files
+from barpc.rasters.raster import hashed
 from barpc.scene import View
 from barpc.sensor.geometry import ground_sample_distance
 from barpc.tie.pairing.epipolar import common_range
@@ -109,7 +109,7 @@ class Grid:
             for group in groups
         ]
         paths, shared = [view.path for view in views], self.shared(seen)
-        inputs = dict(zip(paths, hash_files(paths), strict=True))
+        inputs = {path: hashed(path) for path in paths}
         with self._opened(path, shared) as file, CachingExecutor(run, inputs, executor) as caching:
             ahead = 4 * worker_count(executor)
             results = one_by_one(caching, surface_tile, tasks, "surface", progress, ahead)

@@ -19,8 +19,8 @@ from barpc.dsm.sigma import CameraErrors
 from barpc.export.shots import read_scene
 from barpc.pipeline import load_views
 from barpc.pipeline.inputs import PRIOR
+from barpc.report.runfiles import read_summary
 from barpc.report.summary import Summary
-from barpc.report.tables import read_summary
 from barpc.rpcio.grids import CORRECTION
 from barpc.scene import View
 from barpc.sensor.geometry import base_to_height, is_radar

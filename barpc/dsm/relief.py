@@ -19,8 +19,8 @@ from barpc.dsm.cells import F32, Tile, surface_tile
 from barpc.dsm.grid import Grid
 from barpc.rasters.raster import open_raster
 from barpc.report.page import can_render, remake_report
+from barpc.report.runfiles import SURFACE, run_key
 from barpc.report.summary import Summary
-from barpc.report.tables import SURFACE, run_key
 from barpc.scene import View
 from barpc.tie.pixels import jpeg, read_pixels, sample_stretch
 from barpc.workspace import TABLES, Workspace
@@ -43,7 +43,7 @@ def show_in_report(folder: Path, run: Summary, grid: Grid, out: Path) -> None:
 
 
 def _reliefs(run: Summary, grid: Grid, out: Path) -> list[dict[str, object]]:
-    """Return the pictures, as `barpc.report.tables` reads them, of the tile that has most heights."""
+    """Return the pictures, as `barpc.report.runfiles` reads them, of the tile that has most heights."""
     with open_raster(out) as file:
         read = ((t, groups[0], file.read([1, 3], window=Window(*at, *t.size))) for at, t, groups in grid.tiles())
         tile, pairs, after = max(read, key=lambda row: np.isfinite(row[2][0]).sum())

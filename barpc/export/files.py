@@ -17,7 +17,7 @@ from barpc.base.errors import InputError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, polygon, utm, wrap_longitude
 from barpc.export.shots import Scene, Shot, pairs_of, relative_link
 from barpc.report.records import plain
-from barpc.report.tables import ply
+from barpc.report.runfiles import ply
 from barpc.rpcio import WRITABLE
 from barpc.sensor.geometry import footprint
 
@@ -265,7 +265,8 @@ def ortho(scene: Scene, out: Path) -> Files:
 
     On the run's DEM, made ellipsoidal where it had a geoid; without one at the altitude of the tie points.
     """
-    dem, geoid = (_option(scene, name) for name in ("dem", "geoid"))
+    given: Any = scene.summary.options or {}
+    dem, geoid = (name if isinstance(name := given.get(key), str) else None for key in ("dem", "geoid"))
     lines, heights = [], f"RPC_HEIGHT={scene.origin[2]:.0f}"
     about = "all ground at one altitude; give a DEM to adjust"
     if dem:
@@ -282,15 +283,8 @@ def ortho(scene: Scene, out: Path) -> Files:
 def _warp(shot: Shot, heights: str, crs: str, out: Path) -> str:
     side = f"{shot.entry.gsd_m:.2g}" if shot.entry.gsd_m else None
     pixel = ("-tr", side, side) if side else ()
-    image = relative_link(shot.carrier or shot.file, out)
-    return _gdalwarp("-rpc", "-to", heights, "-t_srs", crs, *pixel, image, f"{shot.name}.tif")
+    return _gdalwarp("-rpc", "-to", heights, "-t_srs", crs, *pixel, _image(shot, out), f"{shot.name}.tif")
 
 
 def _gdalwarp(*words: str) -> str:
     return shlex.join(("gdalwarp", *words))
-
-
-def _option(scene: Scene, name: str) -> str | None:
-    """A file of the run's options."""
-    found = (scene.summary.options or {}).get(name)
-    return found if isinstance(found, str) else None

@@ -17,9 +17,8 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
-from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from typing import Any
@@ -50,7 +49,10 @@ def worker_count(executor: Executor | None) -> int:
     """Return the number of tasks that an executor works on at a time; of a dask cluster what it may grow to."""
     client = getattr(executor, "_client", None)
     if client is not None:
-        return max(_CLUSTER, sum(int(n) for n in client.nthreads().values()))
+        threads = [int(number) for number in client.nthreads().values()]
+        if not threads:
+            logger.warning("the cluster has no worker: the run waits for one; Ctrl-C ends it, and what is done is kept")
+        return max(_CLUSTER, sum(threads))
     return int(getattr(executor, "_max_workers", None) or os.cpu_count() or 1)
 
 
@@ -299,21 +301,23 @@ def run_batch(
     `guards`: the inputs that each task names. One that came to a cluster with another `version` works on nothing.
     """
     if version != __version__:
-        return [(0.0, None, other_version(__version__, version))] * len(tasks), 0.0
+        error = InputError(
+            f"a worker has barpc {__version__}, this process {version}: results would differ; install the same version "
+            "everywhere"
+        )
+        return [(0.0, None, error)] * len(tasks), 0.0
     outcomes: list[Outcome] = []
     cpu = time.thread_time()
     for task, inputs in zip(tasks, guards or [()] * len(tasks), strict=True):
         start = time.perf_counter()
-        value: Any = None
-        error: Exception | None = None
         try:
             with guarded(inputs):
                 value = fn(*(task.load() if isinstance(task, Spilled) else task))
-        except Exception as caught:  # noqa: BLE001  (raised again where the result is asked for)
-            error = caught
-            if not isinstance(caught, BarpcError):
-                caught.add_note("in a worker:\n" + traceback.format_exc())
-        outcomes.append((time.perf_counter() - start, value, error))
+            outcomes.append((time.perf_counter() - start, value, None))
+        except Exception as error:  # noqa: BLE001  (raised again where the result is asked for)
+            if not isinstance(error, BarpcError):
+                error.add_note("in a worker:\n" + traceback.format_exc())
+            outcomes.append((time.perf_counter() - start, None, error))
     return outcomes, time.thread_time() - cpu
 
 
@@ -327,67 +331,3 @@ def _explained(error: BaseException) -> BaseException:
     )
     died.__cause__ = error
     return died
-
-
-# --- a cluster --------------------------------------------------------------------------------------------
-
-
-logger = logging.getLogger(__name__)
-
-POLL, REMIND = 5.0, 60.0
-"""How often the workers are counted, and how often it is said that there is none [s]."""
-
-
-@contextmanager
-def watched(executor: Executor | None) -> Iterator[None]:
-    """Log when a dask cluster has no worker, once a minute while the run waits, and when work goes on."""
-    client = getattr(executor, "_client", None)
-    if client is None:
-        yield
-        return
-    end = threading.Event()
-    threading.Thread(target=_watch, args=(client, end), daemon=True).start()
-    try:
-        yield
-    finally:
-        end.set()
-
-
-def other_version(theirs: str, own: str) -> InputError:
-    """Return what to say of a worker whose version would give other bytes."""
-    return InputError(
-        f"a worker has barpc {theirs}, this process {own}: results would differ; install the same version everywhere"
-    )
-
-
-def _watch(client: Any, end: threading.Event) -> None:
-    seen, said = time.monotonic(), None
-    while not end.wait(POLL):
-        number, now = _workers(client), time.monotonic()
-        if number or (number == 0 and not _waits(client)):
-            if number and said is not None:
-                logger.warning("the cluster has %d worker(s), after %.0f s without", number, now - seen)
-            seen, said = now, None
-        elif said is None or now - said >= REMIND:
-            said = now
-            logger.warning(
-                "the cluster %s for %.0f s: waiting; what is finished is kept, Ctrl-C ends the run and the "
-                "same command goes on with it",
-                "has had no worker" if number == 0 else "has not answered",
-                now - seen,
-            )
-
-
-def _waits(client: Any) -> bool:
-    """Return whether a task is under way: a cluster that adapts may do without workers while there is none."""
-    return any(state.status == "pending" for state in list(client.futures.values()))
-
-
-def _workers(client: Any) -> int | None:
-    """Return the number of workers; None where the scheduler does not say."""
-    if client.status != "running":
-        return None
-    try:
-        return len(client.nthreads())
-    except Exception:  # noqa: BLE001  (of many classes; the run's own calls tell what it was)
-        return None

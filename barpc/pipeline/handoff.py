@@ -87,25 +87,11 @@ def _largest(project: Projection, ground: Array, image: Array) -> float:
 def verify(
     paths: Sequence[Path | str], model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]
 ) -> list[Reading]:
-    """Open files as their consumers do and compare what they project with the model.
+    """Open files written for one image as their consumers do and compare what they project with the model.
 
-    Parameters
-    ----------
-    paths : sequence of path
-        Files written for one image: rasters, text files, ``.geom``, JSON.
-    model : SensorModel
-        The camera that they should hold, over an image of `size` (width, height) [px] and `alt_range` [m above
-        the ellipsoid].
-
-    Returns
-    -------
-    readings : list of Reading
-        One for each file and each consumer that reads its kind and is installed.
-
-    Raises
-    ------
-    OutputError
-        The model sees no point of its own image.
+    `model` is the camera that they should hold, over an image of `size` (width, height) [px] and `alt_range` [m above
+    the ellipsoid]. Returns a reading for each file and each consumer that reads its kind and is installed; OutputError
+    where the model sees no point of its own image.
     """
     ground, image = control_grid(model, size, alt_range)
     if not len(ground):
@@ -118,14 +104,9 @@ def verify(
 
 
 def verify_grid(path: Path, sample: Sample, correction: CorrectionGrid | None = None) -> list[Reading]:
-    """Open a file of more than an RPC as its consumers do and look for its largest error.
+    """Open a file of more than an RPC as its consumers do and look for its largest error against a model's sample.
 
-    Parameters
-    ----------
-    path : Path
-        A localisation or correction grid, by the end of its name; else the image, resampled by `correction`.
-    sample : Sample
-        Of the model that it should hold.
+    It is a localisation or correction grid, by the end of its name; else the image, resampled by `correction`.
     """
     model = sample.model
 

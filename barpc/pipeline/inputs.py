@@ -39,7 +39,6 @@ from barpc.workspace import table_path
 logger = logging.getLogger(__name__)
 
 PRIOR = "block.npz"  # the file in a run folder that a later run starts from
-_TOGETHER = 64 << 20  # bytes that are hashed in one task, at least
 _MARGIN = 1.5  # px beyond the centres of the outermost pixels that a matcher may still mean
 _ASTRAY = 0.05  # of the points may lie farther off, where a matcher looks over borders; of other crops more
 
@@ -182,8 +181,7 @@ def hash_inputs(
     given = (os.fspath(path.absolute()) for path in input_files(options) if path.is_file())
     others = dict.fromkeys([*seen, *given])
     names = [*rasters, *(name for name in others if name not in rasters)]
-    groups = _groups(names)
-    found = [one for group in ordered(executor, hash_files, groups, "hash", progress) for one in group]
+    found: list[Input] = ordered(executor, hashed, [(name,) for name in names], "hash", progress)
     inputs: dict[str, Input] = dict(zip(names, found, strict=True))
     for one in [part for whole in found for part in whole.every()]:
         known = seen.get(one.path)
@@ -193,24 +191,6 @@ def hash_inputs(
         first, *rest = map(take, code)
         inputs[options.tie.matcher] = Input(first.path, first.size, first.sha256, first.stamp, tuple(rest))
     return inputs
-
-
-def _groups(names: Sequence[str]) -> list[tuple[tuple[str, ...]]]:
-    """Group files into tasks, small ones together."""
-    groups: list[list[str]] = [[]]
-    size = 0
-    for name in names:
-        groups[-1].append(name)
-        size += sum(path.stat().st_size for path in here([name]))
-        if size >= _TOGETHER:
-            groups.append([])
-            size = 0
-    return [(tuple(group),) for group in groups if group]
-
-
-def hash_files(names: Sequence[str]) -> list[Input]:
-    """Hash some files, in a worker."""
-    return [hashed(name) for name in names]
 
 
 def given_tracks(paths: Sequence[str | Path], views: Sequence[View]) -> Tracks:

@@ -10,7 +10,7 @@ import os
 import time
 from collections.abc import Hashable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -40,9 +40,7 @@ MIN_ALTITUDE_SPAN = 100.0
 _SAMPLES = ((0.5, 0.5), (0.25, 0.25), (0.75, 0.75))  # of width and height: where the sampled windows lie
 _MORE = tuple((x / 5, y / 5) for x in range(6) for y in range(6))  # where nothing varies there
 _SAMPLE_SIDE = (256, 16)  # px: many columns and few rows, so that few strips are decoded
-_CHUNK = 1 << 20  # px that are hashed at a time
 _GIVE_RPC = "name its file behind it, {},camera=FILE, or leave the image out (--keep-going of adjust and match)"
-_MANY = 64  # images from which on they are read by other processes
 
 Image = str | Path | View
 
@@ -57,28 +55,8 @@ class LoadedViews:
     worker_seconds: float = 0.0  # of CPU, spent in other processes
 
 
-@dataclass(frozen=True, eq=False)
-class _Read:
-    """An image that was opened, or why it was not; the mark of its sampled pixels (see `Twins`)."""
-
-    view: View | None = None
-    camera: Camera | None = None
-    sampled: bytes | None = None
-    error: BarpcError | None = None
-    files: Mapping[str, Stamp] = field(default_factory=dict)  # all that was opened for it
-
-    def usable(self, twins: Twins | None) -> tuple[View, Camera]:
-        """Return the image and its camera; what was found wrong with it, or that it is there twice, is raised."""
-        if self.error is not None:
-            raise self.error
-        also_seen(self.files)
-        assert self.view is not None
-        assert self.camera is not None
-        if twins is not None:
-            twins.add(self.view, self.sampled)
-        return self.view, self.camera
-
-
+_Read = tuple[View, Camera, bytes | None, Mapping[str, Stamp]]
+"""An image that was opened: the mark of its sampled pixels (see `Twins`), and all files that were opened for it."""
 _Given = tuple[str, Place, Image]  # name, file, and what was given
 
 
@@ -99,22 +77,12 @@ def load_views(
     progress: Progress | None = None,
     hosts: Sequence[str] = (),
 ) -> LoadedViews:
-    """Read the camera of every image, in the order of their names.
+    """Read the camera of every image, in the order of their names: files, perhaps with choices behind them, or views.
 
-    Parameters
-    ----------
-    images : sequence of path or View, files, perhaps with choices behind them (`open_camera`), or views of them
-    min_views : int, least number of views
-    keep_going : bool, leave a bad file (ImageError, RpcError) out instead of stopping
-    band : int, the band that will be read, from 1
-    distinct : bool, refuse an image that is there twice, also as other files or under another RPC (see `Twins`)
-    executor, progress : as of `barpc.adjust`
-    hosts : sequence of str, other hosts from which files may be read (`RunOptions.allow_remote`)
-
-    Raises
-    ------
-    InputError
-        Too few images, the same image twice, or a name that the files of a run cannot carry.
+    With `keep_going` a bad file (ImageError, RpcError) is left out instead of stopping; `band` will be read, from 1;
+    `distinct`: an image that is there twice, also as other files or under another RPC (see `Twins`), is refused;
+    `hosts`: others than this machine from which files may be read (`RunOptions.allow_remote`). InputError for too few
+    images, the same image twice, or a name that the files of a run cannot carry.
     """
     files = [plain_path(image_path(image, hosts)) for image in images]
     if len(files) < min_views:
@@ -122,12 +90,18 @@ def load_views(
         raise InputError(f"{len(files)} image(s) given ({found}): at least {min_views} that overlap are needed")
     given = sorted(zip(unique_names(files), files, images, strict=True), key=lambda row: row[:2])
     how = (band, distinct, tuple(hosts))
-    opened, spent = _read_all(given, how, executor if len(given) >= _MANY else None, progress)
+    opened, spent = _read_all(given, how, executor if len(given) > GROUP else None, progress)
     twins, left_out = Twins(band), list[tuple[str, str]]()
     used: list[tuple[View, Camera]] = []
     for (_, file, _), read in zip(given, opened, strict=True):
         try:
-            used.append(read.usable(twins if distinct else None))
+            if isinstance(read, BarpcError):
+                raise read
+            view, camera, sampled, seen = read
+            also_seen(seen)
+            if distinct:
+                twins.add(view, sampled)
+            used.append((view, camera))
         except BarpcError as error:
             if not keep_going:
                 if isinstance(error, MissingRpcError):
@@ -146,7 +120,7 @@ def _read_all(
     how: tuple[int, bool, tuple[str, ...]],
     executor: Executor | None,
     progress: Progress | None,
-) -> tuple[list[_Read], float]:
+) -> tuple[list[_Read | BarpcError], float]:
     """Return every image as it was read, and CPU seconds of other processes."""
     tasks = [(given[at : at + GROUP], *how) for at in range(0, len(given), GROUP)]
     told = progress and (lambda stage, done, _: progress(stage, min(done * GROUP, len(given)), len(given)))
@@ -157,16 +131,16 @@ def _read_all(
 
 def read_group(
     given: Sequence[_Given], band: int, distinct: bool, hosts: Sequence[str] = ()
-) -> tuple[list[_Read], float]:
+) -> tuple[list[_Read | BarpcError], float]:
     """Read some images in a worker; an error of one leaves the others theirs. Returns CPU seconds, too."""
-    start, out = time.thread_time(), []
+    start, out = time.thread_time(), list[_Read | BarpcError]()
     for name, file, image in given:
         try:
             with recorded({}) as files:
                 view, camera = _load(name, file, image, band, hosts)
-                out.append(_Read(view, camera, _sampled(view, band) if distinct else None, files=files))
+                out.append((view, camera, _sampled(view, band) if distinct else None, files))
         except BarpcError as error:
-            out.append(_Read(error=error))
+            out.append(error)
     return out, time.thread_time() - start
 
 
@@ -272,8 +246,7 @@ def _samples(width: int, height: int, at: Sequence[tuple[float, float]] = _SAMPL
 
 def _whole(image: Any, band: int) -> bytes | None:
     """Return a hash of all pixels, row by row; None for an image in which nothing varies: it shows nothing."""
-    block = image.block_shapes[band - 1][0]
-    rows = max(1, _CHUNK // (image.width * block)) * block  # whole blocks, so that each is decoded once
+    rows = image.block_shapes[band - 1][0]  # whole blocks, so that each is decoded once
     tops = range(0, image.height, rows)
     return _digest(image, band, [Window(0, top, image.width, min(rows, image.height - top)) for top in tops])
 

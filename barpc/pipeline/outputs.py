@@ -24,9 +24,9 @@ from barpc.pipeline.inputs import PRIOR
 from barpc.report import Run, Summary
 from barpc.report.page import REPORT, can_render, report_html
 from barpc.report.records import plain
+from barpc.report.runfiles import TABLES, gcps_geojson, read_summary
 from barpc.report.summary import OutputEntry, StageEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.tables import TABLES, gcps_geojson, read_summary
 from barpc.rpcio import CARRIERS, WRITABLE, row_of, sidecars, write_camera
 from barpc.rpcio.grids import CORRECTION, GRID
 from barpc.scene import View

@@ -24,7 +24,7 @@ from barpc.base.sidefile import plain_path
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
 from barpc.pipeline.beyond import write_grids
-from barpc.pipeline.executor import GROUP, CachingExecutor, watched
+from barpc.pipeline.executor import GROUP, CachingExecutor
 from barpc.pipeline.handoff import unverified
 from barpc.pipeline.inputs import (
     PRIOR,
@@ -146,27 +146,27 @@ def adjust(
     """
     options, folder = with_located(options or RunOptions()), Path(out_dir)
     plain_path(folder.absolute())
-    stages, seen = list[dict[str, Any]](), dict[str, Stamp]()
-    with watched(executor), timed("inputs", stages) as workers:
+    stages, seen, work = list[dict[str, Any]](), dict[str, Stamp](), Work(executor, progress)
+    with timed("inputs", stages) as workers:
         with recorded(seen):
-            run = _loaded("adjust", images, options, executor, progress, workers)
+            run = _loaded("adjust", images, options, work, workers)
         names, keep = _files(run, options, folder)
         workspace = Workspace(out_dir, overwrite=options.overwrite, keep=keep, names=names)
-    with watched(executor), workspace:
+    with workspace:
         workspace.stages += stages
         with workspace.stage("fingerprints"), recorded(seen):
             given = side_inputs(options, run.views)
             inputs = hash_inputs(run, options, seen, executor, progress)
         with CachingExecutor(workspace, inputs, executor) as caching:
             with guarded(inputs.values()):
-                run = _solve(run, options, given, workspace, caching, progress)
+                run = _solve(run, options, given, workspace, Work(caching, progress))
             if run.adjustment is not None and options.stop_after == "all":
                 with workspace.stage("fit"):
-                    run = _fitted(run, options, caching, progress)
+                    run = _fitted(run, options, Work(caching, progress))
         with guarded(inputs.values()):  # asked again before outputs appear, and before the last one
             ask()
             if run.fits:
-                run = _written(run, options, workspace, executor, progress)
+                run = _written(run, options, workspace, work)
         run = replace(run, out_dir=str(out_dir), stages=workspace.stages)
         summary = _summed_up(run, inputs.values(), workspace, progress)
         workspace.remove_stale()
@@ -220,8 +220,8 @@ def check(
 
     Parameters and errors are those of `adjust`, without a folder; the result has no adjustment.
     """
-    options = with_located(options or RunOptions())
-    run = _with_ties(_loaded("check", images, options, executor, progress), options, executor, progress)
+    options, work = with_located(options or RunOptions()), Work(executor, progress)
+    run = _with_ties(_loaded("check", images, options, work), options, work)
     return AdjustResult(_as_given(run.views, images, options), run, summarize(run))
 
 
@@ -234,8 +234,7 @@ def _loaded(
     kind: Literal["adjust", "check"],
     images: Sequence[Image],
     options: RunOptions,
-    executor: Executor | None,
-    progress: Progress | None,
+    work: Work,
     workers: list[float] | None = None,
 ) -> Run:
     """Return the run with its views; CPU seconds of other processes go to `workers`."""
@@ -248,8 +247,8 @@ def _loaded(
         keep_going=options.keep_going,
         band=options.tie.band,
         hosts=options.allow_remote,
-        executor=executor,
-        progress=progress,
+        executor=work.executor,
+        progress=work.progress,
     )
     if workers is not None:
         workers.append(loaded.worker_seconds)
@@ -273,39 +272,26 @@ def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[
 
 
 def _solve(
-    run: Run,
-    options: RunOptions,
-    given: tuple[Dem | None, BlockPrior | None],
-    workspace: Workspace,
-    executor: Executor,
-    progress: Progress | None,
+    run: Run, options: RunOptions, given: tuple[Dem | None, BlockPrior | None], workspace: Workspace, work: Work
 ) -> Run:
     with workspace.stage("tie points"):
-        run = _with_ties(run, options, executor, progress, given[0])
+        run = _with_ties(run, options, work, given[0])
     if options.stop_after == "matching":
         _write_matches(run, workspace)
         return replace(run, kind="match")
     if given[0] is not None and options.reference:
         with workspace.stage("reference"):
-            run = replace(run, reference=_registered(run, options, given[0], executor, progress))
-    with _told(workspace, "adjustment", progress):
+            run = replace(run, reference=_registered(run, options, given[0], work))
+    with _told(workspace, "adjustment", work.progress):
         return _adjusted(run, options, *given)
 
 
-def _registered(
-    run: Run, options: RunOptions, dem: Dem, executor: Executor, progress: Progress | None
-) -> ReferenceControl:
+def _registered(run: Run, options: RunOptions, dem: Dem, work: Work) -> ReferenceControl:
     """Register the views, with the cameras as delivered, to the reference."""
     given = options.adjust.dem_bias_sigma
     bias = (KNOWN_BIAS if dem.known else DEM_BIAS) if given is None else given
-    return register_views(
-        run.views,
-        reference_names(options),
-        dem,
-        options.tie.band,
-        Accuracy(options.reference_sigma, options.adjust.dem_sigma, bias),
-        Work(executor, progress),
-    )
+    accuracy = Accuracy(options.reference_sigma, options.adjust.dem_sigma, bias)
+    return register_views(run.views, reference_names(options), dem, options.tie.band, accuracy, work)
 
 
 def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior | None) -> Run:
@@ -335,13 +321,7 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
     return replace(run, centers=centers, gcps=gcps, check_points=checks, adjustment=adjustment)
 
 
-def _with_ties(
-    run: Run,
-    options: RunOptions,
-    executor: Executor | None,
-    progress: Progress | None,
-    terrain: Dem | None = None,
-) -> Run:
+def _with_ties(run: Run, options: RunOptions, work: Work, terrain: Dem | None = None) -> Run:
     """Return the run with tie points: from a file, or matched."""
     views = run.views
     if options.matches and options.matches_only:
@@ -356,13 +336,13 @@ def _with_ties(
     if options.matches:
         scope = replace(scope, given=given_matches(options.matches, views, partly=bool(run.left_out)))
     try:
-        ties = find_tracks(views, options.tie, scope, executor=executor, progress=progress)
+        ties = find_tracks(views, options.tie, scope, executor=work.executor, progress=work.progress)
     except DisconnectedError as error:
         if not options.keep_going or len(error.groups[0]) < 2:
             raise
         kept = _only(run, frozenset(error.groups[0]))
         logger.warning("%d of %d images are tied together and kept", len(kept.views), len(views))
-        return _with_ties(kept, options, executor, progress, terrain)
+        return _with_ties(kept, options, work, terrain)
     return replace(run, tracks=ties.tracks, matched=ties.pairs)
 
 
@@ -399,7 +379,7 @@ def _center(view: View, how: Literal["line", "projective"] = "line") -> CameraCe
     return center
 
 
-def _fitted(run: Run, options: RunOptions, executor: Executor, progress: Progress | None) -> Run:
+def _fitted(run: Run, options: RunOptions, work: Work) -> Run:
     """Refit every P_BA: only when all can be written is any."""
     assert run.adjustment is not None
     # what is known of the place afterwards is the error common to the image; the noise of a point is the vendor's
@@ -409,8 +389,9 @@ def _fitted(run: Run, options: RunOptions, executor: Executor, progress: Progres
     cameras = [(model, view.size, view.alt_range) for view, model in corrected]
     strict, num = not (options.keep_going or options.grids), len(cameras)
     tasks = [(tuple(cameras[at : at + GROUP]), options.fit, strict) for at in range(0, num, GROUP)]
+    progress = work.progress
     told = progress and (lambda stage, done, _: progress(stage, min(done * GROUP, num), num))
-    found = [one for group in ordered(executor, fit_group, tasks, "fit", told) for one in group]
+    found = [one for group in ordered(work.executor, fit_group, tasks, "fit", told) for one in group]
     fits: list[RpcFit] = []
     for view, (fit, error, warned) in zip(run.views, found, strict=True):
         if fit is None:
@@ -443,14 +424,12 @@ def fit_group(
     return out
 
 
-def _written(
-    run: Run, options: RunOptions, workspace: Workspace, executor: Executor | None, progress: Progress | None
-) -> Run:
+def _written(run: Run, options: RunOptions, workspace: Workspace, work: Work) -> Run:
     """Write the refitted RPCs, and open them again."""
     assert run.adjustment is not None
     fitted = list(zip(run.views, run.fits, run.adjustment.sensors, strict=True))
-    written = write_views(workspace, fitted, options.images, options.rpc_formats, executor, progress)
-    beyond = write_grids(workspace, fitted, options, executor, progress)
+    written = write_views(workspace, fitted, options.images, options.rpc_formats, work.executor, work.progress)
+    beyond = write_grids(workspace, fitted, options, work.executor, work.progress)
     names = [*written[0], *(name for one in beyond for name in one)]
     for sentence in unverified([workspace.folder / name for name in names]):
         logger.warning(sentence)

@@ -11,10 +11,10 @@ import numpy as np
 
 from barpc.base.errors import BarpcError, InputError
 from barpc.report.records import plain
+from barpc.report.runfiles import read_summary
 from barpc.report.summary import Summary
 from barpc.report.summary.views import CELLS, ViewEntry
 from barpc.report.summary.words import median
-from barpc.report.tables import read_summary
 from barpc.rpcio import read_rpc
 from barpc.sensor.geometry import image_grid
 from barpc.sensor.rpc import RPC
@@ -23,25 +23,12 @@ _NO_EFFECT = ("overwrite", "keep_going")  # Options that do not change a finishe
 
 
 def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
-    """Compare the results of two runs of the same images.
+    """Compare the results of two runs of the same images, by their folders.
 
-    Parameters
-    ----------
-    folder_a, folder_b : path
-        Folders of finished runs.
-
-    Returns
-    -------
-    comparison : dict
-        ``views`` in both: errors, and ``rpc_difference_px``, the largest distance between where the two runs' RPC
-        files put the same ground points, as a whole and without each image's mean shift (null where one wrote none);
-        ``pairs`` in both; ``only_a``, ``only_b``: images of one run alone; ``options`` that differ; ``lines``:
-        sentences.
-
-    Raises
-    ------
-    InputError
-        A folder holds no finished run, or they have no image in common.
+    Returns ``views`` in both: errors, and ``rpc_difference_px``, the largest distance between where the two runs' RPC
+    files put the same ground points, as a whole and without each image's mean shift (null where one wrote none);
+    ``pairs`` in both; ``only_a``, ``only_b``: images of one run alone; ``options`` that differ; ``lines``: sentences.
+    InputError where a folder holds no finished run, or they have no image in common.
     """
     folders = (Path(folder_a), Path(folder_b))
     runs = (read_summary(folders[0]), read_summary(folders[1]))

@@ -12,7 +12,7 @@ import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.ba.evidence.places import Place, Unused, met_worse
-from barpc.ba.usual import CRITICAL
+from barpc.ba.usual import CRITICAL, FEWEST
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.cameras import Camera
 from barpc.fit import RpcFit
@@ -23,8 +23,8 @@ from barpc.tie import PairReport, ReferenceControl
 
 MAX_TRACKS = 200_000
 """Of more tracks, every n-th is written, so that the files of a huge run can still be opened."""
-WHOLE, MOST, LEAST = 0.05, 0.9, 20
-"""A whole shift [px], the share of a pair's matches that must have it, and how many there must be."""
+WHOLE, MOST = 0.05, 0.9
+"""A whole shift [px], and the share of a pair's matches, `FEWEST` or more, that must have it."""
 SMOOTH_LEFT = 0.06  # A view whose residuals hold more than this [px] that is no scatter is called doubtful
 MANY_REJECTED = 0.3  # A view that lost a larger share of its observations, not at random, is called doubtful
 
@@ -179,7 +179,7 @@ class Run:
             shift = self.tracks.xy[ties.b] - self.tracks.xy[ties.a]
             whole = np.rint(np.median(shift, axis=0))
             same = np.mean((np.abs(shift - whole) <= WHOLE).all(axis=1))
-            if len(shift) >= LEAST and same >= MOST:
+            if len(shift) >= FEWEST and same >= MOST:
                 names = [self.views[i].name for i in ties.views]
                 for name, other, (col, row) in zip(names, names[::-1], (whole, 0.0 - whole), strict=True):
                     found.setdefault(name, f"{other}, moved by {col:.0f} columns and {row:.0f} rows")

@@ -10,28 +10,35 @@ import numpy as np
 
 from barpc.ba import Adjustment, check_residuals
 from barpc.ba.apart import APART
-from barpc.ba.usual import SURE
+from barpc.ba.usual import SURE, SURELY
 from barpc.base.geodesy import Array
-from barpc.report.holding import (
+from barpc.report.outcome import MANY_REJECTED, Run
+from barpc.report.records import plain, value_of
+from barpc.report.reservations import (
+    GOOD_RMSE,
+    NOISE_LIMIT,
+    anywhere,
     control_reasons,
     dem_lines,
     dem_reasons,
     enu,
     held_lines,
+    is_smooth,
     lengths,
     reference_lines,
     reference_reasons,
+    stands_out,
+    view_status,
 )
-from barpc.report.outcome import MANY_REJECTED, Run
-from barpc.report.records import plain, value_of
-from barpc.report.reservations import NOISE_LIMIT, anywhere, is_smooth, stands_out, view_status
 from barpc.report.summary import LeftOutEntry, Summary, measure_run
+from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.whole import RIVALS, explanations, held_out_places, left_entries
-from barpc.report.summary.words import NAMED, counted, listed, median, metres
+from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS, counted, listed, median, metres
 
+SHOWN = 10  # rows of a table on the terminal, images and pairs alike
+LINES = 20  # sentences of the verdict that are shown at least
 PRIOR_WIDENED = 2.0  # Cameras that are farther off than stated by more than this factor need a look
-MOVED = 3.0  # A scene that moved by more than so many times what its cameras' accuracies let expect needs a look
 _SAY_REJECTED = "contradicted", "rejected", "wrong_matches"  # causes whose sentence says how many were rejected
 _SAY_WHERE = "rejected", "place"  # causes whose sentence says where in the image
 _LOOKED_AT = "The image was looked at"
@@ -167,9 +174,9 @@ def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
     # control, a DEM, heights, an earlier run and fixed views move it as far as they must
     held = (found.control is not None and found.control.used.any()) or found.options.fixed or _holds(found)
     held = held or any(getattr(run.options, name, None) for name in ("dem", "fixed_run"))
-    if not held and (moved[np.isfinite(moved)] > MOVED).any():
+    if not held and (moved[np.isfinite(moved)] > SURELY).any():
         yield (
-            f"The scene moved by {enu(found.gauge.shift)}, more than {MOVED:g} times what the accuracies of its "
+            f"The scene moved by {enu(found.gauge.shift)}, more than {SURELY:g} times what the accuracies of its "
             "cameras let expect: something is not as stated; control points or a DEM would tell."
         )
 
@@ -266,3 +273,67 @@ def _checked_lines(_: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
 def _matched_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     points = counted(run.tracks.num_points, "tie point")
     yield f"{points} of {counted(len(views), 'image')}, {counted(len(run.tracks), 'observation')}."
+
+
+# --- what fits on one screen: the worst first, what is alike said once -------------------------------------
+
+
+def worst_first(views: Sequence[ViewEntry]) -> list[ViewEntry]:
+    """Return images by verdict, by what is wrong, by error; those without reservation as they come."""
+    return sorted(views, key=_badness)
+
+
+def _badness(view: ViewEntry) -> tuple[int, int, float]:
+    if not view.advice:
+        return 1, 0, 0.0
+    cause = list(CAUSES).index(view.cause) if view.cause in CAUSES else len(CAUSES)
+    errors = (view.rmse_after, view.held_out_px, view.rmse_before if view.rmse_after is None else None)
+    worst = max((error for error in errors if error is not None), default=0.0)
+    return -list(STATUS_WORDS).index(view.status), cause, -worst
+
+
+def flagged(views: Sequence[ViewEntry]) -> list[ViewEntry]:
+    """Return images that need a look, the worst first."""
+    return [view for view in worst_first(views) if view.advice]
+
+
+def offset_of(pair: PairEntry) -> float:
+    """Return the epipolar offset (RMS) of a pair at the end of its run [px]; 0 where it is not known."""
+    before, after = pair.offset_rms
+    return (before if pair.epipolar_after is None else after) or 0.0
+
+
+def worst_pairs(pairs: Sequence[PairEntry]) -> list[PairEntry]:
+    """Return pairs by their epipolar offset, the largest first, where it is more than stereo wants; then the others."""
+    return sorted(pairs, key=lambda pair: -max(offset_of(pair), GOOD_RMSE))
+
+
+def torn(pairs: Sequence[PairEntry]) -> list[PairEntry]:
+    """Return pairs whose epipolar offset is more than stereo wants, the worst first."""
+    return [pair for pair in worst_pairs(pairs) if offset_of(pair) > GOOD_RMSE]
+
+
+def sentences(summary: Summary) -> list[str]:
+    """Return the verdict, one sentence for all images of one cause, one for all files left out for one reason."""
+    alike: dict[tuple[str, str], list[tuple[str, str]]] = {}  # names and what is said of each
+    for view in flagged(summary.views):
+        alike.setdefault((view.status, view.cause or view.advice), []).append((view.name, view.reservation))
+    for file in summary.left_out:  # a reason often begins with the file
+        why = file.reason.replace(file.path, "").lstrip(": ")
+        alike.setdefault(("", why), []).append((file.path, file.reason_text))
+    own = {text for found in alike.values() for _, text in found}
+    rest = [line for line in summary.verdict if line not in own]
+    place = next((k for k, line in enumerate(summary.verdict) if line in own), len(rest))
+    return [*rest[:place], *(line for why, found in alike.items() for line in _said(*why, found)), *rest[place:]]
+
+
+def _said(status: str, why: str, alike: Sequence[tuple[str, str]]) -> list[str]:
+    """Return sentences of images of a status, or of files, and why."""
+    names = listed([name for name, _ in alike], NAMED)
+    if len(alike) <= NAMED or (status and why not in CAUSES):
+        return [text for _, text in alike]
+    if not status:
+        return [f"{len(alike)} files were left out, {names}: {why}"]
+    start = f"{len(alike)} images are {STATUS_WORDS[status]}, {CAUSES[why].label}: {names}"
+    remedy = CAUSES[why].remedy.format(image="IMAGE")
+    return [". ".join(filter(None, (start, remedy[:1].upper() + remedy[1:]))) + "."]

@@ -137,14 +137,6 @@ def test_a_move_is_three_numbers_of_metres(image: Path, tmp_path: Path, capsys, 
     assert not (tmp_path / "o").exists()
 
 
-def test_a_longitude_and_latitude_in_the_images_is_no_move(image: Path, tmp_path: Path, capsys):
-    lon, lat, _ = open_camera(image).model.localize(np.array([150.0, 100.0]), np.array(100.0))
-    for words in (f"{lon:.5f},{lat:.5f},180", f"{lat:.5f},{lon:.5f},180"):
-        assert run("convert", str(image), "-o", str(tmp_path / "o"), "--move", words) == 1
-        assert "is a longitude and latitude in the images" in capsys.readouterr().err
-    assert not (tmp_path / "o").exists()
-
-
 def test_a_matrix_that_leaves_the_earth_writes_nothing(image: Path, tmp_path: Path, capsys):
     matrix = np.eye(4)
     for matrix[:3, :3] in (

@@ -14,7 +14,7 @@ from types import ModuleType
 import pytest
 
 import barpc
-from barpc.report.tables import TABLES
+from barpc.report.runfiles import TABLES
 from tests.docs.pages import DOCS, PAGES, ROOT, anchors, links
 
 

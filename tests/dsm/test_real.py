@@ -17,8 +17,8 @@ from barpc.cli import main
 from barpc.dsm import make_dsm
 from barpc.dsm.imagery import block_of_run
 from barpc.pipeline import adjust
+from barpc.report.runfiles import read_summary, read_tables
 from barpc.report.summary.words import metres
-from barpc.report.tables import read_summary, read_tables
 
 pytestmark = pytest.mark.slow
 

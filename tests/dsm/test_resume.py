@@ -16,7 +16,7 @@ from barpc.base.options import DsmOptions
 from barpc.cli import main
 from barpc.dsm import make_dsm
 from barpc.pipeline import adjust
-from barpc.report.tables import SURFACE
+from barpc.report.runfiles import SURFACE
 from tests.dsm.conftest import ALTS
 
 FINE = DsmOptions(alt=ALTS, gsd=0.25)  # four tiles

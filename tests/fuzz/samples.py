@@ -32,7 +32,7 @@ from barpc.pointio.matches import read_matches
 from barpc.rasters.dem import Dem
 from barpc.report.compare import compare_runs
 from barpc.report.page import report_html
-from barpc.report.tables import read_summary
+from barpc.report.runfiles import read_summary
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
 from barpc.rpcio.carried import put_tag
 from barpc.rpcio.grids import SIGN, read_correction

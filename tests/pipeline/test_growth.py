@@ -83,7 +83,6 @@ def test_a_folder_is_listed_once_for_all_its_images_and_again_when_it_changes(bl
 
 @pytest.mark.parametrize("keep_going", [False, True])
 def test_other_workers_read_the_same_views_and_the_first_error_counts(block, folder, monkeypatch, keep_going):
-    monkeypatch.setattr(views, "_MANY", 2)
     monkeypatch.setattr(views, "GROUP", 3)
     told = []
     given = [*block[1], folder / "missing.tif", folder / "none.tif"]

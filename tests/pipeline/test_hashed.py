@@ -15,7 +15,7 @@ from barpc.base.identity import Stamp, take
 from barpc.base.options import RunOptions, TieOptions
 from barpc.base.remote import Remote
 from barpc.pipeline import inputs as hashed
-from barpc.pipeline.inputs import hash_files, hash_inputs
+from barpc.pipeline.inputs import hash_inputs
 from tests.rpcio.conftest import write_image
 
 AT = Remote("https://a.org/x.tif", 10, "one")
@@ -89,23 +89,6 @@ def test_a_matcher_counts_with_its_files_under_its_name(files, monkeypatch) -> N
     assert hash_inputs(run_of(), RunOptions(), {}) == {}
 
 
-def test_small_files_go_together_up_to_64_mebibytes(files, monkeypatch) -> None:
-    assert hashed._TOGETHER == 64 << 20
-    names = [str(files[name]) for name in ("a.tif", "b.tif", "c.tif")]
-    size = files["a.tif"].stat().st_size
-    for together, groups in ((1, [1, 1, 1]), (2 * size, [2, 1]), (2 * size + 1, [3]), (3 * size, [3])):
-        monkeypatch.setattr(hashed, "_TOGETHER", together)
-        assert [len(group) for (group,) in hashed._groups(names)] == groups
-        assert [name for (group,) in hashed._groups(names) for name in group] == names
-    monkeypatch.setattr(hashed, "_TOGETHER", 2 * size + 1)
-    assert [len(group) for (group,) in hashed._groups(2 * names)] == [3, 3]  # each counts from nothing
-    monkeypatch.setattr(hashed, "_TOGETHER", size + 1)
-    assert len(hashed._groups([AT, names[0], AT, names[1]])) == 1  # what is elsewhere is not read
-    monkeypatch.setattr(hashed, "_TOGETHER", size)
-    assert hashed._groups([AT, names[0], AT, names[1]]) == [((AT, names[0]),), ((AT, names[1]),)]
-    assert hashed._groups([]) == []
-
-
 def test_the_work_goes_to_the_executor_under_its_stage_in_order(files, monkeypatch) -> None:
     asked: list[Any] = []
 
@@ -114,9 +97,8 @@ def test_the_work_goes_to_the_executor_under_its_stage_in_order(files, monkeypat
         return [function(*task) for task in tasks]
 
     monkeypatch.setattr(hashed, "ordered", ordered)
-    monkeypatch.setattr(hashed, "_TOGETHER", 1)
     pool, progress = object(), object()
     found = hash_inputs(run_of(files["b.tif"], files["a.tif"]), RunOptions(), {}, pool, progress)  # type: ignore[arg-type]
-    assert asked == [(pool, hash_files, "hash", progress)]
+    assert asked == [(pool, hashed.hashed, "hash", progress)]
     assert [Path(name).name for name in found] == ["b.tif", "a.tif"]
     assert [one.sha256 for one in found.values()] == [digest(files["b.tif"]), digest(files["a.tif"])]

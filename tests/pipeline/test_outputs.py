@@ -22,8 +22,8 @@ from barpc.pipeline.handoff import CONSUMERS, Consumer, Reading, control_grid, d
 from barpc.pipeline.inputs import PRIOR
 from barpc.pipeline.outputs import REOPENED, file_names, output_names, refuse_shadows, write_views
 from barpc.report.page import can_render
+from barpc.report.runfiles import TABLES
 from barpc.report.summary import OutputEntry, StageEntry
-from barpc.report.tables import TABLES
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC

@@ -32,6 +32,7 @@ from barpc.report import Run
 from barpc.scene import Tracks, View
 from barpc.simulate import simulate_block
 from barpc.tie.reference import Accuracy
+from barpc.tie.tasks import HERE, Work
 from tests.rasters.test_dem import write_dem
 from tests.rpcio.conftest import make_rpc
 
@@ -278,7 +279,7 @@ def test_heights_of_a_reference_are_as_sure_as_what_they_count_from(monkeypatch,
         dem="d.tif", reference=("r.tif",), reference_sigma=7.0,
         adjust=AdjustOptions(dem_bias_sigma=stated, dem_sigma=4.0),
     )  # fmt: skip
-    stages._registered(SimpleNamespace(views=views()), options, SimpleNamespace(known=known), None, None)  # type: ignore[arg-type]
+    stages._registered(SimpleNamespace(views=views()), options, SimpleNamespace(known=known), HERE)  # type: ignore[arg-type]
     assert seen["accuracy"] == Accuracy(7.0, 4.0, used)
 
 
@@ -311,7 +312,7 @@ def test_what_a_fit_warns_of_comes_back_from_its_worker_and_is_said_with_the_vie
     block = SimpleNamespace(gauge=SimpleNamespace(sigma=np.ones(3)), sensors=[rpc])
     run = replace(Run("adjust", views(1), (), NONE), adjustment=block)  # type: ignore[arg-type]
     with pytest.warns(BarpcWarning, match="^v0: odd$"):
-        stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), None, None)
+        stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), HERE)
 
 
 @pytest.mark.slow
@@ -329,14 +330,14 @@ def test_a_new_rpc_states_the_error_of_the_scene_and_the_noise_of_the_old_one(si
     block = SimpleNamespace(gauge=SimpleNamespace(sigma=np.array(sigma)), sensors=[rpc] * 9)
     told: list[tuple[str, int, int]] = []
     run = replace(Run("adjust", given, (), NONE), adjustment=block)  # type: ignore[arg-type]
-    found = stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), None, lambda *now: told.append(now))
+    found = stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), Work(None, lambda *now: told.append(now)))
     assert len(found.fits) == 9
     for fit in found.fits:
         assert fit.rpc.err_bias == (None if stated is None else pytest.approx(stated))
         assert fit.rpc.err_rand == 0.7
     assert told[-2:] == [("fit", 8, 9), ("fit", 9, 9)]
     with pytest.raises(FitError, match="v0: "):
-        stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4), tolerance=1e-15)), None, None)
+        stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4), tolerance=1e-15)), HERE)
 
 
 def test_the_images_of_a_result_stand_in_the_order_given() -> None:

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rasterio
+from rasterio.windows import Window
 
 from barpc.base.errors import ImageError, InputError, RpcError
 from barpc.pipeline import load_views
@@ -248,12 +249,8 @@ def test_an_image_is_hashed_in_whole_blocks_and_each_row_counts(tmp_path, monkey
 
     monkeypatch.setattr(views, "_digest", watched)
     with views.open_raster(path) as image:
-        once = views._whole(image, 1)
-        monkeypatch.setattr(views, "_CHUNK", 20 * WIDE)
-        again = views._whole(image, 1)
-    assert once == again
-    assert asked[0] == (0, HIGH)
-    assert asked[1:] == [(0, 16), (16, 16), (32, 16), (48, 16), (64, 16), (80, 10)]
+        assert views._whole(image, 1) == digest(image, 1, [Window(0, 0, WIDE, HIGH)])
+    assert asked == [(top, min(8, HIGH - top)) for top in range(0, HIGH, 8)]
 
 
 def test_numbers_are_the_same_in_any_type() -> None:
@@ -290,8 +287,8 @@ def test_images_are_read_in_groups_and_by_other_workers_when_they_are_many(pair,
             self.asked += 1
             return super().submit(function, *given)
 
-    for many, asked in ((4, 0), (3, 2)):
-        monkeypatch.setattr(views, "_MANY", many)
+    for group, asked in ((3, 0), (2, 2)):
+        monkeypatch.setattr(views, "GROUP", group)
         with Counting(1) as pool:
             load_views([*pair, third], executor=pool)
         assert pool.asked == asked

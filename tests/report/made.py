@@ -9,11 +9,11 @@ from xml.etree import ElementTree
 import numpy as np
 
 from barpc.base.geodesy import Array
+from barpc.report.runfiles import ObservationTable, RunFiles
 from barpc.report.summary import SCHEMA, Summary, TablesEntry, TracksEntry
 from barpc.report.summary.known import GcpEntry
 from barpc.report.summary.pairs import OffsetEntry, PairEntry
 from barpc.report.summary.views import CorrectionEntry, ViewEntry
-from barpc.report.tables import ObservationTable, RunFiles
 
 _VIEW: dict[str, Any] = {
     "path": "", "size": (1000, 800), "alt_range_m": (0.0, 500.0), "rpc_source": None, "gsd_m": 0.5,

@@ -5,14 +5,7 @@ from __future__ import annotations
 import pytest
 
 from barpc.report import maps
-from barpc.report.maps import (
-    coordinate,
-    evenly,
-    round_ticks,
-    tag,
-)
-
-from .made import Drawing
+from barpc.report.maps import coordinate, evenly, round_ticks
 
 # --- pieces -----------------------------------------------------------------------------------------------
 
@@ -23,22 +16,6 @@ from .made import Drawing
 )
 def test_a_coordinate_takes_as_few_characters_as_two_decimals_do(value, text):
     assert coordinate(value) == text
-
-
-def test_words_in_a_drawing_carry_no_markup():
-    assert tag("text", x='a"<b>') == '<text x="a&quot;&lt;b&gt;"/>'
-    assert maps.label(1, 2, "a<b") == '<text x="1" y="2" text-anchor="start" class="tick">a&lt;b</text>'
-    assert maps.titled("<g/>", "a<b", data_v=3) == '<g data-v="3"><title>a&lt;b</title><g/></g>'
-
-
-def test_a_path_is_open_unless_it_is_closed():
-    assert maps.path([(0, 0), (1.5, 2)], "x") == '<path d="M0 0L1.5 2" class="x"/>'
-    assert maps.path([(0, 0), (1.5, 2)], "x", closed=True) == '<path d="M0 0L1.5 2Z" class="x"/>'
-
-
-def test_a_sheet_is_as_wide_as_a_chart_unless_it_says_so():
-    assert Drawing(maps.sheet("k", "t", "d", 50.25, [])).box == (420.0, 50.25)
-    assert Drawing(maps.sheet("k", "t", "d", 50.0, [], width=180.0)).box == (180.0, 50.0)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,7 @@ import pytest
 from barpc import report
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.report import Run
-from barpc.report.digest import decisions
-from barpc.report.page import report_html
+from barpc.report.page import decisions, report_html
 
 
 def summary_of(run: Run, gcps, **options):
@@ -25,7 +24,8 @@ def test_control_that_is_as_stated_is_within_what_chance_allows(block_run):
     assert np.isfinite(w).all()
     assert 0.5 < np.sqrt(np.mean(w**2)) < 2.0  # the larger of two of about one
     test = found.control_test
-    assert (test.num, test.num_beyond, test.critical) == (len(gcps.view), 0, 3.29)
+    assert (test.num, test.num_beyond) == (len(gcps.view), 0)
+    assert test.critical == pytest.approx(3.29, abs=1e-3)
     assert test.expected == pytest.approx(0.002 * test.num, rel=0.01)
     assert test.largest_w == pytest.approx(w.max())
     for entry in found.gcps:

@@ -12,7 +12,7 @@ import pytest
 
 from barpc.ba.held.ground import TerrainTest
 from barpc.report import page
-from barpc.report.digest import decisions
+from barpc.report.page import decisions
 from barpc.report.summary import TracksEntry
 from barpc.report.verdict import block_verdict
 from barpc.tie.reference import ReferenceControl, ViewMatch

@@ -19,7 +19,7 @@ from barpc.cli.main import cli
 from barpc.report import Run
 from barpc.report.compare import compare_runs
 from barpc.report.page import remake_report, report_html
-from barpc.report.tables import read_summary
+from barpc.report.runfiles import read_summary
 from barpc.rpcio import write_rpc
 from tests.rpcio.conftest import make_rpc
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from barpc.report import page
-from barpc.report.digest import decisions
+from barpc.report.page import decisions
 from barpc.report.summary import Summary
 from barpc.report.summary.known import ControlTestEntry
 from barpc.report.summary.whole import AskedEntry, ExplanationEntry, HeldOutEntry, LeftEntry

@@ -17,8 +17,8 @@ from barpc.base.errors import BarpcError, InputError
 from barpc.cli.main import cli
 from barpc.pipeline import outputs
 from barpc.report import Run, maps, page, summarize
+from barpc.report.runfiles import TABLES, ObservationTable, RunFiles
 from barpc.report.summary.words import metres
-from barpc.report.tables import TABLES, ObservationTable, RunFiles
 from barpc.scene import Tracks
 from tests.lanes import rest_slow
 from tests.report.conftest import run_of_block, written

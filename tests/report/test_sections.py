@@ -16,6 +16,8 @@ from barpc.report.summary.whole import DatumEntry, ModeEntry, SceneEntry
 
 from .made import a_correction, a_gcp, a_pair, a_square, a_summary, a_view, files_of, seen
 
+pytest.importorskip("jinja2")
+
 VIEWS = [a_view("A"), a_view("B"), a_view("C")]
 
 
@@ -313,7 +315,6 @@ def test_decisions_have_a_table_of_images_where_cameras_were_adjusted():
 
 @pytest.mark.parametrize(("num", "more"), [(400, False), (401, True)])
 def test_a_verdict_of_four_hundred_sentences_is_shown_whole(monkeypatch, num, more):
-    pytest.importorskip("jinja2")
     files = files_of(a_summary(VIEWS, verdict=tuple(f"s{k}." for k in range(num))))
     monkeypatch.setattr(page, "read_tables", lambda *_: files)
     monkeypatch.setattr(page, "SECTIONS", ())

@@ -68,12 +68,12 @@ def said(run: Any, of: Any = None) -> list[str]:
 def test_the_figures_that_decide():
     found = (
         reservations.GOOD_RMSE,
-        reservations.FEW_OBSERVATIONS,
+        reservations.FEW,
         reservations.ENOUGH_GCPS,
         verdicts.MANY_REJECTED,
     )
     assert found == (0.5, 30, 3, 0.3)
-    found = (reservations.SMOOTH_LEFT, verdicts.PRIOR_WIDENED, verdicts.NOISE_LIMIT, verdicts.MOVED)
+    found = (reservations.SMOOTH_LEFT, verdicts.PRIOR_WIDENED, verdicts.NOISE_LIMIT, verdicts.SURELY)
     assert found == (0.06, 2.0, 2.5, 3.0)
 
 

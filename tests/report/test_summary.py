@@ -12,13 +12,13 @@ import pytest
 from barpc import report
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.report import Run
-from barpc.report.digest import decisions
 from barpc.report.outcome import pair_ties, triangulate_tracks
+from barpc.report.page import decisions
 from barpc.report.records import Number, plain, said, table
+from barpc.report.runfiles import read_summary
 from barpc.report.summary import published_schema
 from barpc.report.summary.place import moved_in_space
 from barpc.report.summary.views import ViewEntry
-from barpc.report.tables import read_summary
 from barpc.scene import middle_altitude
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import epipolar_offset, view_angles

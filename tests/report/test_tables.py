@@ -14,10 +14,10 @@ import pytest
 from barpc.base.errors import InputError
 from barpc.base.geodesy import ecef_from_ground, enu_basis
 from barpc.report import outcome as runs
+from barpc.report import runfiles as modules
 from barpc.report import summarize
-from barpc.report import tables as modules
 from barpc.report.records import plain
-from barpc.report.tables import (
+from barpc.report.runfiles import (
     OBSERVATIONS,
     RESIDUALS,
     TABLES,

@@ -6,17 +6,16 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import ndtri
 
 from barpc.ba import check_residuals
+from barpc.ba.usual import CHANCE
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report.outcome import Run
 from barpc.report.records import Column, Number, Record, said
 from barpc.report.summary.words import ABOVE, Count, Pixel, Vector
 from barpc.scene import IntArray
 
-CRITICAL = 3.29  # standard deviations: of a thousand coordinates chance puts one beyond
-MAX_GCPS = 20  # GCPs that the terminal shows; summary and page have all
 GCPS = "Ground control: what all the others say of a point minus its given place"
 
 
@@ -56,9 +55,9 @@ class GcpEntry(KnownPoint):
     image_w_view: str | None = said("View that it is in", head="largest in", default=None)
 
     @classmethod
-    def worst(cls, points: Sequence[GcpEntry]) -> list[GcpEntry]:
-        """At most `MAX_GCPS` points, in their order: those that are not used, and of the others the largest w."""
-        order = sorted(points, key=lambda point: (point.used, -(point.w or 0.0)))[:MAX_GCPS]
+    def worst(cls, points: Sequence[GcpEntry], most: int) -> list[GcpEntry]:
+        """At most so many points, in their order: those that are not used, and of the others the largest w."""
+        order = sorted(points, key=lambda point: (point.used, -(point.w or 0.0)))[:most]
         return [point for point in points if any(point is one for one in order)]
 
 
@@ -165,10 +164,11 @@ def measure_control(run: Run) -> ControlTestEntry | None:
     if not tests:
         return None
     worst, count = max(tests, key=lambda test: test.w), len(tests)
-    beyond = sum(test.w > CRITICAL for test in tests)
-    chance = 1.0 - (1.0 - 2.0 * ndtr(-CRITICAL)) ** 2
+    critical = -float(ndtri(CHANCE / 2.0))
+    beyond = sum(test.w > critical for test in tests)
+    chance = 1.0 - (1.0 - CHANCE) ** 2  # of two coordinates
     name = run.views[worst.view].name
-    return ControlTestEntry(count, CRITICAL, beyond, float(chance * count), worst.w, name, worst.point)
+    return ControlTestEntry(count, critical, beyond, chance * count, worst.w, name, worst.point)
 
 
 def _grouped(index: IntArray, num: int) -> list[IntArray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from operator import attrgetter
 from typing import Any, ClassVar
 
 import numpy as np
@@ -78,30 +78,20 @@ class PairEntry(Record):
 
 # --- how they are measured --------------------------------------------------------------------------------
 
+_REPORT = attrgetter("means", "control_share", "spread", "beaten", "reason")
+
 
 def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
     """Return every two images with tie points in common."""
     reports = {report.names: report for report in run.matched}
-    geometry, before = (
-        _pair_geometry(run),
-        _pair_offsets(run, run.before, ground_from_ecef(run.ties_before.points)[:, 2]),
-    )
-    after: list[OffsetEntry | None] = [None] * len(before)
-    if run.after is not None:
-        after = _pair_offsets(run, run.after, run.ground[:, 2])
+    before = _pair_offsets(run, run.before, ground_from_ecef(run.ties_before.points)[:, 2])
+    after = [None] * len(before) if run.after is None else _pair_offsets(run, run.after, run.ground[:, 2])
     entries = []
-    for ties, (angle, base, height), first, last in zip(run.pairs, geometry, before, after, strict=True):
+    for ties, (angle, base, height), first, last in zip(run.pairs, _pair_geometry(run), before, after, strict=True):
         names = (run.views[ties.views[0]].name, run.views[ties.views[1]].name)
         report = reports.get(names)
-        entry = PairEntry(*names, len(ties.a), angle, base, height, first, last, None)
-        if report is not None:
-            found: dict[str, Any] = {
-                "decoy_share": report.control_share,
-                "noise_px": report.spread,
-                "tied_by": report.means,
-            }
-            entry = replace(entry, **found, matching=plain(report), chosen_by=report.reason, beaten=report.beaten)
-        entries.append(entry)
+        told = () if report is None else _REPORT(report)
+        entries.append(PairEntry(*names, len(ties.a), angle, base, height, first, last, plain(report), *told))
     return tuple(entries)
 
 

@@ -27,25 +27,10 @@ class EllipseEntry(Record):
 def moved_in_space(
     model: Corrected, covariance: Array, unknowns: str, ground: Array
 ) -> tuple[Array, Array, EllipseEntry]:
-    """Return how far P_BA moves a ground point (3,) near the image's middle, how well it is known, its ellipse.
+    """Return how far P_BA moves a ground point near the image's middle (2,) [px], its sigma (2,), and its ellipse.
 
-    Parameters
-    ----------
-    model : Corrected
-        P_BA.
-    covariance : (q, q)
-        Of rotation (metres: angle x distance), translation [m], then any drift, which is zero in the middle row.
-    unknowns : str
-        "rotation", "translation" or "rotation+translation".
-    ground : (3,)
-        lon, lat [deg], alt [m].
-
-    Returns
-    -------
-    shift, sigma : (2,)
-        col, row [px].
-    ellipse : EllipseEntry
-        Where P_BA sees a pixel on the ground.
+    `covariance` (q, q) is of rotation (metres: angle x distance), translation [m], then any drift, which is zero in the
+    middle row; `unknowns`: "rotation", "translation" or "rotation+translation"; `ground` (3,): lon, lat [deg], alt [m].
     """
     ecef = ecef_from_ground(ground)
     image, by_point, by_rotation, by_translation = model.project_ecef(ecef)

@@ -20,7 +20,6 @@ from barpc.report.records import Number, Record, said
 from barpc.report.summary.words import Count, Vector, metres
 
 AXES = "columns", "rows"
-_LEVEL = 1e-4  # probability of the F test below which something is called smooth
 DATUM = "What holds the scene: how well its motions are known, and what share of that comes from where"
 MODES = {
     "east": "the whole scene may lie {0} farther east or west",
@@ -267,7 +266,7 @@ def _asked(adjustment: Adjustment, what: str) -> AskedEntry | None:
     test = adjustment.asked.get(what)
     if test is None:
         return None
-    found = test.significance < _LEVEL
+    found = test.found(0.0)
     i = int(np.argmax(np.maximum(np.where(found, test.rms, 0.0), test.shared)))
     rms, significance, shared = (float(values[i]) for values in (test.rms, test.significance, test.shared))
     return AskedEntry(adjustment.names[i], rms, significance, shared, int(found.sum()))
