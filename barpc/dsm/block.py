@@ -134,7 +134,9 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: s
         camera = open_camera(folder / grid).model if grid in shot.entry.outputs else shot.rpc
         views.append(View(shot.name, shot.file, shot.size, camera, scene.alt_range, date))
     ties = {frozenset((pair.a, pair.b)): float(pair.num_matches) for pair in scene.summary.pairs}
-    worth = {(i, j): ties.get(frozenset((views[i].name, views[j].name)), 0.0) for i, j in _links(views)}
+    worth = {
+        (i, j): ties.get(frozenset((views[i].name, views[j].name)), 0.0) for i, j in combinations(range(len(views)), 2)
+    }
     there = None if minus is None else {view.name for view in read_summary(Path(minus)).views}
     parts = [[i for i, v in enumerate(views) if there is None or (v.name in there) == old] for old in (False, True)]
     if there is None:
@@ -161,10 +163,6 @@ def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = No
 def _refuse_radar(name: str, radar: bool) -> None:
     if radar:
         raise NoSurfaceError(f"{name}: a radar image: its speckle and layover are nothing that SGBM matches")
-
-
-def _links(views: Sequence[View]) -> list[Link]:
-    return list(combinations(range(len(views)), 2))
 
 
 def _best(

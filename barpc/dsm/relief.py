@@ -8,6 +8,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,7 @@ from barpc.dsm.block import Block, Groups
 from barpc.dsm.cells import F32, Tile, surface_tile
 from barpc.rasters.raster import open_raster
 from barpc.report.page import can_render, remake_report
+from barpc.report.summary import Summary
 from barpc.report.tables import SURFACE, run_key
 from barpc.scene import View
 from barpc.tie.pixels import jpeg, read_pixels, sample_stretch
@@ -31,7 +33,12 @@ _LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])  # from the north-west, 45 degrees 
 
 
 def show_in_report(
-    folder: Path, block: Block, tiles: Sequence[tuple[tuple[int, int], Tile, Groups]], made: Path, band: int
+    folder: Path,
+    run: Summary,
+    block: Block,
+    tiles: Sequence[tuple[tuple[int, int], Tile, Groups]],
+    made: Path,
+    band: int,
 ) -> None:
     """Show both reliefs of the tile that has most heights, and two images on the surface, in a run's report; where
     that fails a line says why.
@@ -40,7 +47,7 @@ def show_in_report(
         with open_raster(made) as file:
             read = ((t, groups[0], file.read([1, 3], window=Window(*at, *t.size))) for at, t, groups in tiles)
             tile, pairs, after = max(read, key=lambda row: np.isfinite(row[2][0]).sum())
-        views = {i: _delivered(block, i) for pair in pairs for i in pair}
+        views = {i: _delivered(block.views[i], run.views[i].rpc_source) for pair in pairs for i in pair}
         before = surface_tile([(views[i], views[j]) for i, j in pairs], tile, band)
         shown: list[dict[str, object]] = []  # as `barpc.report.tables` reads them
         for cameras, (height, nmad) in (("delivered", before[:2]), ("corrected", after)):
@@ -49,7 +56,7 @@ def show_in_report(
             shown.append(row | _picture(shaded(height, tile.step)))
         seen = (block.views[i] for i in pairs[0])
         shown += [{"image": view.name, **_picture(draped(view, tile, after[0], band))} for view in seen]
-        text, name = json.dumps({"run": run_key(block.run), "shown": shown}), f"{TABLES}/{SURFACE}"
+        text, name = json.dumps({"run": run_key(run), "shown": shown}), f"{TABLES}/{SURFACE}"
         with Workspace(folder, overwrite=True, names=[name], adds=True) as own:
             own.write_text(name, text)
         if can_render():
@@ -58,10 +65,8 @@ def show_in_report(
         logger.warning("the report does not show the surface: %s", error)
 
 
-def _delivered(block: Block, index: int) -> View:
-    """Return a view with the camera that came with its image."""
-    view = block.views[index]
-    source = block.run.views[index].rpc_source if block.run else None
+def _delivered(view: View, source: Any) -> View:
+    """Return a view with the camera that came with its image, from its `source`."""
     if source is None:
         raise BarpcError(f"{view.name}: no file holds its delivered camera")
     return replace(view, sensor=open_camera(view.path, camera=source.path).model)

@@ -113,8 +113,8 @@ def make_dsm(
         with Workspace(room) as run:
             made = run.partial / "dsm.tif"
             found = grid.write(out, made, run, executor, progress)
-            if folder is not None and options.minus is None:
-                show_in_report(folder, block, grid.tiles, made, options.band)
+            if folder is not None and block.run is not None and options.minus is None:
+                show_in_report(folder, block.run, block, grid.tiles, made, options.band)
             _place(out, folder, options.overwrite, made)
     except NoSurfaceError:
         shutil.rmtree(room, ignore_errors=True)
@@ -283,7 +283,7 @@ def _common(first: View, second: View, crs: CRS) -> Any:
     parts = []
     for alt in common_range(first, second):
         prints = Footprints((first, second), alt)
-        common = shapely.intersection(*prints.outlines)
+        common = shapely.intersection(prints.outlines[0], prints.outlines[1])
         ground = prints.ground(shapely.get_coordinates(common))
         on_map = np.column_stack(transform("EPSG:4326", crs, *ground[:, :2].T))
         parts.append(shapely.set_coordinates(common, on_map))
