@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numpy.polynomial.polynomial import polyval2d, polyvander2d
-from rasterio.crs import CRS
 from rasterio.warp import transform
 
-from barpc.base.geodesy import Array, ground_from_ecef, wrap_longitude
+from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.scene import View
 from barpc.sensor.geometry import triangulate
-from barpc.tie.patches.dense import ACROSS, FINER, WINDOW, DenseMatches, EpipolarFrame, dense_matches, epipolar_frame
+from barpc.tie.patches.dense import ACROSS, FINER, WINDOW, DenseMatches, dense_matches, epipolar_frame
 
 SIDE = 512
 """Cells a side of a tile: the blocks of the file."""
@@ -24,13 +24,15 @@ MATCHED = 0.2
 Of pictures of different ground 2 to 11 % are (22 trials, rendered, and real ones turned over), of pairs 92 to 97 %.
 """
 NODES = 5
-"""Places a side of a tile, at which cameras and maps are asked."""
+"""Places a side of a tile, at which cameras are asked."""
 _LEVELS = 3  # altitudes
 _SPAN = 128.0  # px of disparity that are searched at once, else a coarser picture says where
 _COARSE = 8  # times a pixel at most of the coarser picture
 _ROOM = 4.0  # px of the coarser picture that heights may lie beyond what it shows
 _AT_ONCE = 1 << 17  # matches intersected at a time
 _SPLIT = 3  # times that a part is halved at most
+
+_median: Callable[..., Any] = np.ma.median  # of what is known
 
 F32 = npt.NDArray[np.float32]
 Found = tuple[Array, Array, float]
@@ -39,7 +41,7 @@ Found = tuple[Array, Array, float]
 
 @dataclass(frozen=True)
 class Tile:
-    """Cells of a map: its CRS (WKT), the corner in the north-west, the side of a cell [m], `size` cells each way.
+    """Cells of a map: its CRS, the corner in the north-west, the side of a cell [m], `size` cells each way.
 
     `alts`: the altitudes [m] between which its ground is looked for.
     """
@@ -51,48 +53,26 @@ class Tile:
     size: tuple[int, int]
     alts: tuple[float, float]
 
-    def part(self, col: int, row: int, size: tuple[int, int]) -> Tile:
+    def part(self, col: int, row: int, side: int) -> Tile:
         """Return the cells from a col, row on, so many each way or as many as there are."""
-        size = min(size[0], self.size[0] - col), min(size[1], self.size[1] - row)
+        size = min(side, self.size[0] - col), min(side, self.size[1] - row)
         return replace(self, west=self.west + self.step * col, north=self.north - self.step * row, size=size)
 
     def quarters(self) -> list[Tile]:
         """Return the tile's quarters, of as many cells of half the side."""
-        fine = replace(self, step=self.step / 2, size=(2 * self.size[0], 2 * self.size[1]))
-        return [fine.part(col, row, self.size) for row in (0, self.size[1]) for col in (0, self.size[0])]
+        width, height = (self.step * count / 2 for count in self.size)
+        near = partial(replace, self, step=self.step / 2)
+        return [near(west=self.west + i * width, north=self.north - j * height) for j in (0, 1) for i in (0, 1)]
 
-    def nodes(self, cols: int = NODES, rows: int = NODES) -> Array:
-        """Return the longitude, latitude (rows cols, 2) [deg] on a grid from corner to corner, the north first."""
-        x = self.west + self.step * np.linspace(0, self.size[0], cols)
-        y = self.north - self.step * np.linspace(0, self.size[1], rows)
-        east, north = (part.ravel() for part in np.meshgrid(x, y))
-        return np.column_stack(transform(CRS.from_wkt(self.crs), CRS.from_epsg(4326), east, north))
+    def nodes(self, count: tuple[int, int] = (NODES, NODES), edge: float = 0.0) -> Array:
+        """Return the longitude, latitude (rows cols, 2) [deg] of a grid, `edge` cells inside, the north first."""
+        col, row = np.meshgrid(*(np.linspace(edge, side - edge, n) for side, n in zip(self.size, count, strict=True)))
+        east, north = self.west + self.step * col.ravel(), self.north - self.step * row.ravel()
+        return np.column_stack(transform(self.crs, "EPSG:4326", east, north))
 
-    def centres(self) -> Array:
-        """Return the longitude, latitude (rows cols, 2) [deg] of the cells' middles."""
-        half, (cols, rows) = self.step / 2, self.size
-        inner = replace(self, west=self.west + half, north=self.north - half, size=(cols - 1, rows - 1))
-        return inner.nodes(cols, rows)
-
-    def places(self) -> Callable[[Array], Array]:
-        """Return a function from lon, lat (n, 2) [deg] to col, row (n, 2) of the cells (cubics: 0.1 mm over 10 km)."""
-        nodes = self.nodes()
-        middle = nodes[len(nodes) // 2]
-
-        def near(lonlat: Array) -> Array:
-            off: Array = np.stack([wrap_longitude(lonlat[:, 0], middle[0]), lonlat[:, 1]]) - middle[:, None]
-            return off
-
-        spread = np.abs(near(nodes)).max(axis=1, keepdims=True)
-        x, y = near(nodes) / spread
-        goal = np.stack(np.meshgrid(*(np.linspace(0, count, NODES) for count in self.size)), axis=-1).reshape(-1, 2)
-        cubics = np.linalg.lstsq(polyvander2d(x, y, [3, 3]), goal, rcond=None)[0].reshape(4, 4, 2)
-
-        def places(lonlat: Array) -> Array:
-            x, y = near(lonlat) / spread
-            return np.asarray(polyval2d(x, y, cubics)).T
-
-        return places
+    def ground(self) -> Array:
+        """Return the ground points (NODES NODES, 3) of the nodes at the middle altitude."""
+        return np.column_stack([self.nodes(), np.full(NODES**2, sum(self.alts) / 2)])
 
 
 def surface_tile(pairs: Sequence[tuple[View, View]], tile: Tile, band: int) -> tuple[F32, ...]:
@@ -108,68 +88,45 @@ def surface_tile(pairs: Sequence[tuple[View, View]], tile: Tile, band: int) -> t
     cells = np.full((2, len(pairs), tile.size[1], tile.size[0]), np.nan, np.float32)
     shares = np.full(len(pairs), np.nan, np.float32)
     for k, pair in enumerate(pairs):
-        if (found := _points(pair, tile, band)) is not None:
-            shares[k] = found[2]
-            if found[2] >= MATCHED:
-                cells[:, k] = gathered(tile, *found[:2])
-    known = np.isfinite(cells[0])
-    height = _median(cells[0])
-    nmad = np.where(known.sum(axis=0) < 2, np.float32(np.nan), 1.4826 * _median(np.abs(cells[0] - height)))
-    with np.errstate(invalid="ignore"):
-        sigma = np.sqrt(np.where(known, cells[1] ** 2, 0.0).sum(axis=0) / known.sum(axis=0))
-    seen = np.tensordot(1 << np.arange(len(pairs)), known, axes=1)
-    return (height, *(np.asarray(one, np.float32) for one in (nmad, sigma, seen)), shares)
+        if found := _points(pair, tile, band):
+            ground, sigma, share = zip(*found, strict=True)
+            shares[k] = np.mean(share)
+            if shares[k] >= MATCHED:
+                cells[:, k] = gathered(tile, np.concatenate(ground), np.concatenate(sigma))
+    heights, sigmas = np.ma.masked_invalid(cells)
+    height, known = _median(heights, axis=0), np.isfinite(cells[0])
+    nmad = np.ma.masked_where(known.sum(axis=0) < 2, 1.4826 * _median(np.abs(heights - height), axis=0))
+    seen = np.tensordot(1 << np.arange(len(pairs)), known, axes=1).astype(np.float32)
+    mean = np.ma.sqrt(np.ma.mean(sigmas**2, axis=0))
+    return (*(one.filled(np.nan).astype(np.float32) for one in (height, nmad, mean)), seen, shares)
 
 
-def _median(values: F32) -> F32:
-    """Return the median over the first axis of what is known; NaN where nothing is."""
-    ordered, count = np.sort(values, axis=0), np.isfinite(values).sum(axis=0)  # NaN come last
-    at = np.stack([np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1)])
-    return np.asarray(np.take_along_axis(ordered, at, axis=0).mean(axis=0), np.float32)
-
-
-def _points(pair: tuple[View, View], tile: Tile, band: int, halved: int = 0) -> Found | None:
-    """Return what is found of a tile; None where it is unseen. Coarser pictures narrow the altitudes first."""
-    zoom = _COARSE
-    while (frame := _frame(pair, tile)) is not None:
+def _points(pair: tuple[View, View], tile: Tile, band: int, halved: int = 0) -> list[Found]:
+    """Return what is found of a tile, part by part; of one unseen nothing. Coarser pictures narrow the altitudes."""
+    zoom, nodes = _COARSE, tile.nodes()
+    while True:
+        levels = np.repeat(np.linspace(tile.alts[0], max(tile.alts[1], tile.alts[0] + 1.0), _LEVELS), len(nodes))
+        ground = np.column_stack([np.tile(nodes, (_LEVELS, 1)), levels])
+        a, b = (view.sensor.project(ground) + 0.5 for view in pair)
+        if not np.isfinite(a + b).all():
+            return []
+        frame = epipolar_frame(a - 0.5, b - 0.5, levels)
         zoom = min(zoom, 1 << max(0, int(np.ceil(np.log2(frame.num / (FINER * _SPAN))))))
         if zoom == 1 and frame.across > ACROSS and halved < _SPLIT:
-            every = (_points(pair, part, band, halved + 1) for part in tile.quarters())
-            parts = [part for part in every if part is not None]
-            return _joined(parts) if parts else None
-        found = _matched(pair, tile, band, zoom)
-        if zoom == 1 or found is None or found[2] < MATCHED or not len(found[0]):
-            return found
-        low, high = np.percentile(found[0][:, 2], [1.0, 99.0]) + np.array([-1.0, 1.0]) * _ROOM * zoom * frame.metres
+            return [one for part in tile.quarters() for one in _points(pair, part, band, halved + 1)]
+        frame = epipolar_frame(a / zoom - 0.5, b / zoom - 0.5, levels)  # of pictures of means of `zoom` px a side
+        sizes = [(view.size[0] // zoom, view.size[1] // zoom) for view in pair]
+        found = dense_matches([view.path for view in pair], sizes, frame, band)
+        if found is None:
+            return []
+        ground = _intersected(pair, found, zoom)
+        known = np.isfinite(ground[:, 2])
+        ground = ground[known]
+        if zoom == 1 or found.share < MATCHED or not len(ground):
+            return [(ground, found.sigma[known] * frame.metres, found.share)]
+        low, high = np.percentile(ground[:, 2], [1.0, 99.0]) + np.array([-1.0, 1.0]) * _ROOM * frame.metres
         tile = replace(tile, alts=(max(tile.alts[0], float(low)), min(tile.alts[1], float(high))))
         zoom //= 2
-    return None
-
-
-def _joined(parts: Sequence[Found]) -> Found:
-    ground, sigma, share = zip(*parts, strict=True)
-    return np.concatenate(ground), np.concatenate(sigma), float(np.mean(share))
-
-
-def _matched(pair: tuple[View, View], tile: Tile, band: int, zoom: int) -> Found | None:
-    """Match as `_points`, on pictures whose pixels are means of `zoom` px a side."""
-    frame = _frame(pair, tile, zoom)
-    sizes = [(view.size[0] // zoom, view.size[1] // zoom) for view in pair]
-    found = None if frame is None else dense_matches([view.path for view in pair], sizes, frame, band)
-    if frame is None or found is None:
-        return None
-    ground = _intersected(pair, found, zoom)
-    known = np.isfinite(ground[:, 2])
-    return ground[known], found.sigma[known] * frame.metres, found.share
-
-
-def _frame(pair: tuple[View, View], tile: Tile, zoom: int = 1) -> EpipolarFrame | None:
-    """Return the frame of the part of two pictures that shows a tile; None where a camera has no answer."""
-    nodes = tile.nodes()
-    levels = np.repeat(np.linspace(tile.alts[0], max(tile.alts[1], tile.alts[0] + 1.0), _LEVELS), len(nodes))
-    ground = np.column_stack([np.tile(nodes, (_LEVELS, 1)), levels])
-    a, b = ((view.sensor.project(ground) + 0.5) / zoom - 0.5 for view in pair)
-    return epipolar_frame(a, b, levels) if np.isfinite(a + b).all() else None
 
 
 def _intersected(pair: tuple[View, View], found: DenseMatches, zoom: int) -> Array:
@@ -186,7 +143,8 @@ def _intersected(pair: tuple[View, View], found: DenseMatches, zoom: int) -> Arr
 def gathered(tile: Tile, ground: Array, sigma: Array) -> F32:
     """Return the median height of the points in each cell and its sigma (2, rows, cols); NaN where there is none."""
     width, height = tile.size
-    col, row = np.floor(tile.places()(ground[:, :2])).astype(np.int64).T
+    east, north = map(np.array, transform("EPSG:4326", tile.crs, *ground[:, :2].T))
+    col, row = (np.floor(one / tile.step).astype(np.int64) for one in (east - tile.west, tile.north - north))
     inside = np.flatnonzero((col >= 0) & (col < width) & (row >= 0) & (row < height))
     cell, alt = row[inside] * width + col[inside], ground[inside, 2]
     order = np.lexsort((alt, cell))

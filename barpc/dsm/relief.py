@@ -5,8 +5,10 @@ from __future__ import annotations
 import base64
 import json
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,8 +17,8 @@ from scipy.ndimage import map_coordinates
 
 from barpc.base.errors import BarpcError
 from barpc.cameras import open_camera
+from barpc.dsm.block import Block, Groups
 from barpc.dsm.cells import F32, Tile, surface_tile
-from barpc.dsm.grid import Grid
 from barpc.rasters.raster import open_raster
 from barpc.report.page import can_render, remake_report
 from barpc.report.runfiles import SURFACE, run_key
@@ -30,10 +32,31 @@ logger = logging.getLogger(__name__)
 _LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])  # from the north-west, 45 degrees up
 
 
-def show_in_report(folder: Path, run: Summary, grid: Grid, out: Path) -> None:
-    """Show both reliefs, and two images on the surface, in a run's report; where that fails a line says why."""
+def show_in_report(
+    folder: Path,
+    run: Summary,
+    block: Block,
+    tiles: Sequence[tuple[tuple[int, int], Tile, Groups]],
+    made: Path,
+    band: int,
+) -> None:
+    """Show both reliefs of the tile that has most heights, and two images on the surface, in a run's report; where
+    that fails a line says why.
+    """
     try:
-        text, name = json.dumps({"run": run_key(run), "shown": _reliefs(run, grid, out)}), f"{TABLES}/{SURFACE}"
+        with open_raster(made) as file:
+            read = ((t, groups[0], file.read([1, 3], window=Window(*at, *t.size))) for at, t, groups in tiles)
+            tile, pairs, after = max(read, key=lambda row: np.isfinite(row[2][0]).sum())
+        views = {i: _delivered(block.views[i], run.views[i].rpc_source) for pair in pairs for i in pair}
+        before = surface_tile([(views[i], views[j]) for i, j in pairs], tile, band)
+        shown: list[dict[str, object]] = []  # as `barpc.report.runfiles` reads them
+        for cameras, (height, nmad) in (("delivered", before[:2]), ("corrected", after)):
+            middle = float(np.nanmedian(nmad)) if np.isfinite(nmad).any() else None
+            row = {"cameras": cameras, "share": float(np.isfinite(height).mean()), "nmad_m": middle}
+            shown.append(row | _picture(shaded(height, tile.step)))
+        seen = (block.views[i] for i in pairs[0])
+        shown += [{"image": view.name, **_picture(draped(view, tile, after[0], band))} for view in seen]
+        text, name = json.dumps({"run": run_key(run), "shown": shown}), f"{TABLES}/{SURFACE}"
         with Workspace(folder, overwrite=True, names=[name], adds=True) as own:
             own.write_text(name, text)
         if can_render():
@@ -42,25 +65,8 @@ def show_in_report(folder: Path, run: Summary, grid: Grid, out: Path) -> None:
         logger.warning("the report does not show the surface: %s", error)
 
 
-def _reliefs(run: Summary, grid: Grid, out: Path) -> list[dict[str, object]]:
-    """Return the pictures, as `barpc.report.runfiles` reads them, of the tile that has most heights."""
-    with open_raster(out) as file:
-        read = ((t, groups[0], file.read([1, 3], window=Window(*at, *t.size))) for at, t, groups in grid.tiles())
-        tile, pairs, after = max(read, key=lambda row: np.isfinite(row[2][0]).sum())
-    views = {i: _delivered(grid.block.views[i], run) for pair in pairs for i in pair}
-    before = surface_tile([(views[i], views[j]) for i, j in pairs], tile, grid.options.band)
-    found: list[dict[str, object]] = []
-    for cameras, (height, nmad) in (("delivered", before[:2]), ("corrected", after)):
-        middle = float(np.nanmedian(nmad)) if np.isfinite(nmad).any() else None
-        row = {"cameras": cameras, "share": float(np.isfinite(height).mean()), "nmad_m": middle}
-        found.append(row | _picture(shaded(height, tile.step)))
-    seen = (grid.block.views[i] for i in pairs[0])
-    return found + [{"image": v.name, **_picture(draped(v, tile, after[0], grid.options.band))} for v in seen]
-
-
-def _delivered(view: View, run: Summary) -> View:
-    """Return a view with the camera that came with its image."""
-    source = next(entry.rpc_source for entry in run.views if entry.name == view.name)
+def _delivered(view: View, source: Any) -> View:
+    """Return a view with the camera that came with its image, from its `source`."""
     if source is None:
         raise BarpcError(f"{view.name}: no file holds its delivered camera")
     return replace(view, sensor=open_camera(view.path, camera=source.path).model)
@@ -73,7 +79,7 @@ def _picture(grey: npt.NDArray[np.uint8]) -> dict[str, object]:
 def draped(view: View, tile: Tile, height: F32, band: int) -> npt.NDArray[np.uint8]:
     """Return what a view shows of a tile's cells of these heights (rows, cols) [m]; black where nothing is known."""
     grey, known = np.zeros(height.shape, np.uint8), np.isfinite(height)
-    at = view.sensor.project(np.column_stack([tile.centres(), height.ravel()])[known.ravel()])
+    at = view.sensor.project(np.column_stack([tile.nodes(tile.size, 0.5), height.ravel()])[known.ravel()])
     at = np.clip(np.nan_to_num(at), 0.0, np.array(view.size) - 1.0)
     low, high = np.floor(at.min(axis=0)).astype(int), np.ceil(at.max(axis=0)).astype(int) + 1
     stretch, box = sample_stretch(view.path, band, view.size), (*low.tolist(), *(high - low).tolist())

@@ -8,22 +8,46 @@ from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rasterio
 import rasterio.shutil
+import shapely
+from rasterio import Affine
+from rasterio.crs import CRS
+from rasterio.errors import CRSError, NotGeoreferencedWarning
+from rasterio.warp import transform
+from rasterio.windows import Window
+from scipy.ndimage import map_coordinates
 
+from barpc import __version__
 from barpc.base.atomic import refuse_existing, replacing
 from barpc.base.errors import InputError, OutputError
+from barpc.base.geodesy import Array, utm
 from barpc.base.options import DsmOptions
 from barpc.base.sidefile import plain_path
-from barpc.dsm.cells import MATCHED, SIDE
-from barpc.dsm.grid import SHARED, Grid
-from barpc.dsm.imagery import NoSurfaceError, block_of_images, block_of_run
+from barpc.dsm.block import Block, Groups, NoSurfaceError, block_of_images, block_of_run
+from barpc.dsm.cells import F32, MATCHED, NODES, SIDE, Tile, surface_tile
 from barpc.dsm.relief import show_in_report
-from barpc.rasters.raster import open_raster
-from barpc.tie.tasks import Progress
+from barpc.pipeline.executor import CachingExecutor, worker_count
+from barpc.rasters.raster import hashed, open_raster
+from barpc.scene import View
+from barpc.sensor.geometry import ground_sample_distance
+from barpc.tie.pairing.epipolar import common_range
+from barpc.tie.pairing.overlaps import Footprints
+from barpc.tie.tasks import Progress, one_by_one
 from barpc.workspace import Workspace
+
+BANDS = (
+    "height above the WGS84 ellipsoid [m]",
+    "pairs of images",
+    "disagreement of the pairs: NMAD [m]",
+    "sigma of the height: matching [m]",
+    "sigma of the height: cameras, without what all cells share [m]",
+)
+CHANGE = "height minus that of the other images [m]"
+SHARED = "SIGMA_SHARED_BY_ALL_CELLS_M"
 
 
 @dataclass(frozen=True)
@@ -70,49 +94,32 @@ def make_dsm(
     InputError, OutputError
         See `barpc.base.errors`; nothing is written then.
     """
-    options, out = options or DsmOptions(), Path(out)
+    options, out, folder = options or DsmOptions(), Path(out), None
     plain_path(out.absolute())
-    folder = Path(source) if isinstance(source, str | Path) else None
     if isinstance(source, str | Path):
-        block = block_of_run(Path(source), options.alt, None if options.minus is None else Path(options.minus))
+        folder = Path(source)
+        block = block_of_run(folder, options.alt, options.minus)
     elif options.minus is not None:
         raise InputError("minus: what two dates share is known of a run alone, not of images")
     else:
         block = block_of_images(source, options.alt, options.band)
     if out.is_dir() or out.resolve() in {Path(view.path).resolve() for view in block.views}:
         raise OutputError(f"{out}: is a folder or one of the images; give -o the name of a new file")
-    grid = Grid.of(block, options)
+    grid = Grid(block, options)
     _place(out, folder, options.overwrite)
     room = out.parent / f"{out.name}.unfinished"  # results of tiles, until the file is whole
     try:
         with Workspace(room) as run:
-            rough, made = run.partial / "tiles.tif", run.partial / "dsm.tif"
-            known, share = _made(run, grid, executor, progress)
+            made = run.partial / "dsm.tif"
+            found = grid.write(out, made, run, executor, progress)
             if folder is not None and block.run is not None and options.minus is None:
-                show_in_report(folder, block.run, grid, made)
-            found = _told(out, grid, rough, known, share)
+                show_in_report(folder, block.run, block, grid.tiles, made, options.band)
             _place(out, folder, options.overwrite, made)
     except NoSurfaceError:
         shutil.rmtree(room, ignore_errors=True)
         raise
     shutil.rmtree(room, ignore_errors=True)
     return found
-
-
-def _made(run: Workspace, grid: Grid, executor: Executor | None, progress: Progress | None) -> tuple[int, float]:
-    """Make the files `tiles.tif` and `dsm.tif` in a room; return the cells with a height and the share matched."""
-    rough, made = run.partial / "tiles.tif", run.partial / "dsm.tif"
-    with run.stage("surface"):
-        known, share = grid.fill(rough, run, executor, progress)
-    if not known:
-        raise NoSurfaceError(
-            f"of the pixels that both images show {100 * max(share, 0):.0f} % are found back at most, "
-            f"fewer than {100 * MATCHED:.0f} %: other seasons, water, clouds or wrong cameras; nothing is written"
-        )
-    layout = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "BLOCKSIZE": str(SIDE), "BIGTIFF": "IF_SAFER"}
-    with run.stage("write"), rasterio.Env(GDAL_NUM_THREADS="1"):
-        rasterio.shutil.copy(rough, made, driver="COG", **layout)
-    return known, share
 
 
 def _place(out: Path, folder: Path | None, overwrite: bool, made: Path | None = None) -> None:
@@ -129,14 +136,154 @@ def _place(out: Path, folder: Path | None, overwrite: bool, made: Path | None = 
                 made.replace(partial)
 
 
-def _told(out: Path, grid: Grid, cells: Path, known: int, share: float) -> Surface:
-    """Return what is said of a surface: its pairs, and medians over its cells or, of many, some of them."""
-    names = [view.name for view in grid.block.views]
-    used = dict.fromkeys(pair for _, _, groups in grid.tiles() for group in groups for pair in group)
-    pairs = tuple(f"{names[i]} - {names[j]}" for i, j in used)
-    with open_raster(cells) as file, warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        some = file.read([3, 4, 5], out_shape=(3, *(min(side, 2 * SIDE) for side in file.shape)))
-        nmad, sigma, cameras = map(float, np.nanmedian(some, axis=(1, 2)))
-        datum = float(file.tags().get(SHARED, "nan"))
-    return Surface(str(out), pairs, grid.whole.step, grid.whole.size, known, share, nmad, sigma, cameras, datum)
+class Grid:
+    """Cells of a map, in UTM or the CRS asked for, of twice the ground sampling distance unless told.
+
+    `whole`: all of them; `side` a tile; `tiles`: first col, row of every tile that is seen, the tile, and the best
+    pairs of each group there.
+    """
+
+    def __init__(self, block: Block, options: DsmOptions) -> None:
+        self.block, self.options, views = block, options, block.views
+        middles = [v.sensor.localize((np.array(v.size) - 1) / 2, np.array(v.altitude)) for v in views]
+        crs = _crs(options.crs, middles[block.groups[0][0][0]])
+        pixels = [float(ground_sample_distance(v.sensor, at)[1]) for v, at in zip(views, middles, strict=True)]
+        step = options.gsd or float(f"{2 * max(pixels):.2g}")
+        if (step / min(pixels)) ** 2 < MATCHED:
+            raise InputError(
+                f"--gsd {step:g}: a pixel of {min(pixels):.2g} m has one match, so fewer than {100 * MATCHED:.0f} % of "
+                "such cells would have a height"
+            )
+        if step > 2 * SIDE * max(pixels):
+            raise InputError(f"--gsd {step:g}: a cell of more than {2 * SIDE} pixels of {max(pixels):.2g} m")
+        outlines = [[_common(views[i], views[j], crs) for i, j in group] for group in block.groups]
+        seen = shapely.intersection_all([shapely.union_all(group) for group in outlines])
+        if seen.is_empty:
+            raise NoSurfaceError("the images do not overlap at the altitudes that they are used for")
+        west, south, east, north = np.array(seen.bounds) / step
+        west, north = float(np.floor(west)), float(np.ceil(north))
+        size = int(np.ceil(east - west)), int(np.ceil(north - south))
+        self.whole = Tile(crs.to_wkt(), west * step, north * step, step, size, common_range(*views))
+        # a tile shows about as many pixels, however large its cells are
+        self.side = SIDE >> max(0, round(np.log2(step / (2 * max(pixels)))))
+        self.tiles: list[tuple[tuple[int, int], Tile, Groups]] = []
+        for row, col in np.ndindex(-(-size[1] // self.side), -(-size[0] // self.side)):
+            at = self.side * col, self.side * row
+            tile = self.whole.part(*at, self.side)
+            east, south = tile.west + step * tile.size[0], tile.north - step * tile.size[1]
+            box = shapely.box(tile.west, south, east, tile.north)
+            groups = [
+                [pair for pair, outline in zip(*one, strict=True) if outline.intersects(box)][: options.pairs]
+                for one in zip(block.groups, outlines, strict=True)
+            ]
+            if all(groups):
+                self.tiles.append((at, tile, groups))
+
+    def write(
+        self, out: Path, made: Path, run: Workspace, executor: Executor | None, progress: Progress | None
+    ) -> Surface:
+        """Write the surface that is to be `out` as `made`; each tile is made by a worker and forgotten once written."""
+        views, known, share, rough = self.block.views, 0, -1.0, run.partial / "tiles.tif"
+        tasks = [
+            (tuple((views[i], views[j]) for i, j in group), tile, self.options.band)
+            for _, tile, groups in self.tiles
+            for group in groups
+        ]
+        paths, shared = [view.path for view in views], self.shared()
+        inputs = {path: hashed(path) for path in paths}
+        with run.stage("surface"), self._opened(rough) as file, CachingExecutor(run, inputs, executor) as caching:
+            results = one_by_one(caching, surface_tile, tasks, "surface", progress, 4 * worker_count(executor))
+            for at, tile, groups in self.tiles:
+                found = [next(results) for _ in groups]
+                bands = self._bands(tile, groups, found, shared)
+                file.write(bands, window=Window(*at, *tile.size))
+                known += int(np.isfinite(bands[0]).sum())
+                share = float(np.nanmax([share, *(part for one in found for part in one[4])]))
+            if self.block.errors is not None:
+                file.update_tags(**{SHARED: f"{self.block.errors.sigma(shared[None])[0]:.4f}"})
+        if not known:
+            raise NoSurfaceError(
+                f"of the pixels that both images show {100 * max(share, 0):.0f} % are found back at most, "
+                f"fewer than {100 * MATCHED:.0f} %: other seasons, water, clouds or wrong cameras; nothing is written"
+            )
+        layout = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "BLOCKSIZE": str(SIDE), "BIGTIFF": "IF_SAFER"}
+        with run.stage("write"), rasterio.Env(GDAL_NUM_THREADS="1"):
+            rasterio.shutil.copy(rough, made, driver="COG", **layout)
+        with open_raster(made) as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # medians of nothing
+            some = file.read([3, 4, 5], out_shape=(3, *(min(side, 2 * SIDE) for side in file.shape)))
+            medians = map(float, [*np.nanmedian(some, axis=(1, 2)), file.tags().get(SHARED, "nan")])
+        used = dict.fromkeys(pair for _, _, groups in self.tiles for group in groups for pair in group)
+        pairs = tuple(f"{views[i].name} - {views[j].name}" for i, j in used)
+        return Surface(str(out), pairs, self.whole.step, self.whole.size, known, share, *medians)
+
+    def shared(self) -> Array:
+        """Return the derivative (V q,) of the mean height of all tiles, or difference of it, by the cameras' unknowns;
+        of images without a run none.
+        """
+        if self.block.errors is None:
+            return np.zeros(0)
+        rows = [self.block.errors.rows(groups, tile.ground()).mean(axis=0) for _, tile, groups in self.tiles]
+        return np.asarray(np.mean(rows, axis=0))
+
+    def _bands(self, tile: Tile, groups: Groups, results: Sequence[Sequence[F32]], shared: Array) -> F32:
+        """Return the bands (5, rows, cols) of a tile: of one group of pairs, or of the first minus the second."""
+        height, *minus = (one[0] for one in results)
+        bands, errors = np.full((len(BANDS), *height.shape), np.nan, np.float32), self.block.errors
+        bands[0], bands[1], bands[2] = height - sum(minus), 0.0, np.sqrt(sum(one[1] ** 2 for one in results))
+        known, seen = np.isfinite(bands[0]), np.stack([np.asarray(one[3], np.int64) for one in results])
+        for patterns in np.unique(seen[:, known], axis=1).T:
+            cells = known & (seen == patterns[:, None, None]).all(axis=0)
+            chosen = [
+                [pair for k, pair in enumerate(group) if pattern >> k & 1]
+                for group, pattern in zip(groups, patterns, strict=True)
+            ]
+            bands[1, cells] = min(map(len, chosen))
+            # pairs of n images have n - 1 independent parallaxes
+            free = [min(len(one), len({view for pair in one for view in pair}) - 1) for one in chosen]
+            bands[3, cells] = np.sqrt(sum(one[2][cells] ** 2 / n for one, n in zip(results, free, strict=True)))
+            if errors is not None:
+                sigma = errors.sigma(errors.rows(chosen, tile.ground()) - shared).reshape(NODES, NODES)
+                at = (np.argwhere(cells) + 0.5) / height.shape * (NODES - 1)
+                bands[4, cells] = map_coordinates(sigma, at.T, order=1)
+        return bands
+
+    def _opened(self, path: Path) -> Any:
+        """Open the file to be written, with the words and tags that it is to have."""
+        cells = self.whole
+        place = {"crs": cells.crs, "transform": Affine(cells.step, 0, cells.west, 0, -cells.step, cells.north)}
+        layout = {"tiled": True, "blockxsize": SIDE, "blockysize": SIDE, "SPARSE_OK": True, "BIGTIFF": "IF_SAFER"}
+        kind = {"dtype": "float32", "nodata": float("nan"), "compress": "deflate"}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            file = rasterio.open(path, "w", "GTiff", *cells.size, len(BANDS), **place, **kind, **layout)
+        file.update_tags(BARPC=__version__, VERTICAL_REFERENCE="WGS84 ellipsoid", IMAGES=self.block.source)
+        file.descriptions = (BANDS[0] if len(self.block.groups) == 1 else CHANGE, *BANDS[1:])
+        return file
+
+
+def _crs(given: str | None, middle: Array) -> CRS:
+    """Return the CRS that was asked for, in metres, or the UTM zone of a place."""
+    if given is None:
+        return CRS.from_string(utm(*middle[:2])[1])
+    try:
+        if given.upper().startswith("EPSG:"):
+            int(given[5:])  # older GDAL reads a code up to what is no digit
+        found = CRS.from_user_input(given)
+    except (CRSError, ValueError) as error:
+        raise InputError(f"--crs {given}: no reference system that PROJ knows ({error})") from error
+    if not found.is_projected or found.linear_units_factor[1] != 1.0:
+        raise InputError(f"--crs {given}: cells need a projected reference system in metres, such as EPSG:32631")
+    return found
+
+
+def _common(first: View, second: View, crs: CRS) -> Any:
+    """Return the ground that two views see at their lowest or highest altitude, on the map."""
+    parts = []
+    for alt in common_range(first, second):
+        prints = Footprints((first, second), alt)
+        common = shapely.intersection(prints.outlines[0], prints.outlines[1])
+        ground = prints.ground(shapely.get_coordinates(common))
+        on_map = np.column_stack(transform("EPSG:4326", crs, *ground[:, :2].T))
+        parts.append(shapely.set_coordinates(common, on_map))
+    return shapely.union_all(parts)

@@ -258,7 +258,7 @@ DIRECT = {
     "workspace.py": "barpc's own source, the state",
     "pipeline/executor.py": "arrays that the caller has put down for its workers",
     "cameras.py": "no file: a row of the table of openers",
-    "report/tables.py": "the schema, which is part of the package",
+    "report/runfiles.py": "the schema, which is part of the package",
     "cli/main.py": "the null device",
 }
 """Modules that may open a file for reading by themselves, and what they open."""

@@ -9,42 +9,59 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
-from barpc.dsm.cells import Tile
-from barpc.dsm.grid import Grid
+from barpc.dsm import block as block_module
+from barpc.dsm.block import CameraErrors
+from barpc.dsm.cells import Tile, gathered
+from barpc.dsm.surface import Grid
 
 
 @pytest.mark.parametrize(("code", "west"), [(32631, 450_000.0), (32760, 810_000.0)])
 def test_places_among_cells_are_those_of_the_map(code: int, west: float) -> None:
-    """To a hundredth of a millimetre over a kilometre; beyond the antimeridian, too, whichever way longitudes turn."""
+    """To a hundredth of a millimetre from a cell's edges; beyond the antimeridian, too, whichever way longitudes
+    turn.
+    """
     tile = Tile(CRS.from_epsg(code).to_wkt(), west, 4_900_000.0, 2.0, (500, 400), (0.0, 1.0))
     rng = np.random.default_rng(0)
-    cells = rng.uniform(0.0, 1.0, (50, 2)) * [500, 400]
     to_lonlat = Transformer.from_crs(code, 4326, always_xy=True)
-    lon, lat = to_lonlat.transform(west + 2.0 * cells[:, 0], 4_900_000.0 - 2.0 * cells[:, 1])
-    for turn in (0.0, 360.0, -360.0):
-        np.testing.assert_allclose(tile.places()(np.column_stack([lon + turn, lat])), cells, atol=5e-6)
+    cells = rng.integers(0, [500, 400], (50, 2))
+    for inside in (np.full((50, 2), 5e-6), np.full((50, 2), 1.0 - 5e-6), rng.uniform(0.0, 1.0, (50, 2))):
+        at = cells + inside
+        lon, lat = to_lonlat.transform(west + 2.0 * at[:, 0], 4_900_000.0 - 2.0 * at[:, 1])
+        for turn in (0.0, 360.0, -360.0):
+            found = gathered(tile, np.column_stack([lon + turn, lat, np.full(50, 7.0)]), np.ones(50))
+            assert set(map(tuple, np.argwhere(found[0] == 7.0)[:, ::-1])) == set(map(tuple, cells))
+            assert np.isfinite(found[1]).sum() == len(set(map(tuple, cells)))
     x, y = west + 2.0 * (np.arange(500) + 0.5), 4_900_000.0 - 2.0 * (np.arange(400) + 0.5)
     middles = np.column_stack(to_lonlat.transform(*(part.ravel() for part in np.meshgrid(x, y))))
-    apart = tile.centres() - middles
+    apart = tile.nodes(tile.size, 0.5) - middles
     np.testing.assert_allclose((apart + 180.0) % 360.0 - 180.0, 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("count", [2, 9])
-def test_what_all_cells_share_is_a_mean_over_all_tiles(count: int) -> None:
+def test_what_all_cells_share_is_a_mean_over_all_tiles(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the pairs of each tile, and of a difference less that of the other date's."""
     by_pair = {(0, 1): 1.0, (0, 2): 4.0, (3, 4): 7.0}
 
-    def rows(pair: tuple[int, int], ground: np.ndarray) -> np.ndarray:
-        return np.column_stack([np.full(len(ground), by_pair[pair]), ground[:, 0]])
+    def by_unknowns(cameras: Any, params: Any, pair: tuple[int, int], points: np.ndarray) -> np.ndarray:
+        """Of either view half of what its pair has; and so of the place."""
+        rows = np.column_stack([np.full(len(points), by_pair[pair]), points[:, 0]])
+        return np.stack([rows / 2, rows / 2], axis=1)
 
-    made: Any = SimpleNamespace(block=SimpleNamespace(errors=SimpleNamespace(rows=rows)))
-    made._rows = lambda tile, groups: Grid._rows(made, tile, groups)
-    tiles: list[Any] = [
-        SimpleNamespace(nodes=lambda n=n: np.full((2, 2), float(n)), alts=(0.0, 1.0)) for n in range(count)
-    ]
-    seen: list[Any] = [((n, 0), tile, (((0, 1), (0, 2)),)) for n, tile in enumerate(tiles)]
-    np.testing.assert_allclose(Grid.shared(made, seen), [2.5, (count - 1) / 2])
-    minus: list[Any] = [((n, 0), tile, (((0, 1),), ((3, 4),))) for n, tile in enumerate(tiles)]
-    np.testing.assert_allclose(Grid.shared(made, minus), [-6.0, 0.0])
-    made.block.errors = None
-    assert Grid.shared(made, seen).shape == (0,)
+    monkeypatch.setattr(block_module, "height_by_unknowns", by_unknowns)
+    monkeypatch.setattr(block_module, "ecef_from_ground", np.asarray)
+    cameras: Any = SimpleNamespace(sensors=range(5), unknowns=SimpleNamespace(size=2))
+    tiles = [SimpleNamespace(ground=lambda n=n: np.full((4, 3), float(n))) for n in range(count)]
+
+    def shared(*groups: tuple[tuple[int, int], ...]) -> np.ndarray:
+        made: Any = SimpleNamespace(block=SimpleNamespace(errors=CameraErrors(cameras, np.eye(10))))
+        made.tiles = [((n, 0), tile, groups) for n, tile in enumerate(tiles)]
+        return Grid.shared(made).reshape(5, 2)
+
+    mean = (count - 1) / 2
+    np.testing.assert_allclose(shared(((0, 1), (0, 2))).sum(axis=0), [2.5, mean])
+    np.testing.assert_allclose(shared(((0, 1), (0, 2)))[:3, 0], [1.25, 0.25, 1.0])
+    minus = shared(((0, 1),), ((3, 4),))
+    np.testing.assert_allclose(minus.sum(axis=0), [-6.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(minus[:, 1], [mean / 2, mean / 2, 0.0, -mean / 2, -mean / 2])
+    none: Any = SimpleNamespace(block=SimpleNamespace(errors=None))
+    assert Grid.shared(none).shape == (0,)

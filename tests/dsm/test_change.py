@@ -13,7 +13,7 @@ from barpc.base.geodesy import ground_from_ecef
 from barpc.base.options import AdjustOptions, DsmOptions
 from barpc.cli import main
 from barpc.dsm import make_dsm
-from barpc.dsm.sigma import CameraErrors
+from barpc.dsm.block import CameraErrors
 from barpc.pipeline import adjust
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import triangulate
@@ -46,9 +46,9 @@ def one_block(seed):
     ground = block.truth.check_ground[:20]
     seen = [sensor.project(ground) for sensor in seen_by]
     first, second = (heights(found.sensors, seen, pair, ground) for pair in DATES)
-    rows = [errors.rows(pair, ground) for pair in DATES]
+    rows = [errors.rows([[pair]], ground) for pair in DATES]
     naive = np.hypot(*(errors.sigma(one) for one in rows))
-    return first - second, errors.sigma(rows[0] - rows[1]), naive, first - ground[:, 2]
+    return first - second, errors.sigma(errors.rows([[pair] for pair in DATES], ground)), naive, first - ground[:, 2]
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from barpc.base.geodesy import ground_from_ecef
 from barpc.base.options import DsmOptions
 from barpc.cli import main
 from barpc.dsm import make_dsm
-from barpc.dsm.imagery import block_of_run
+from barpc.dsm.block import block_of_run
 from barpc.pipeline import adjust
 from barpc.report.runfiles import read_summary, read_tables
 from barpc.report.summary.words import metres
@@ -93,7 +93,7 @@ def test_what_the_cameras_leave_of_a_height_is_what_their_adjustment_says(run):
     block = block_of_run(folder)
     assert block.errors is not None
     points = adjustment.points[np.isfinite(adjustment.points[:, 0])][::20]
-    stated = block.errors.sigma(block.errors.rows((0, 2), ground_from_ecef(points)))
+    stated = block.errors.sigma(block.errors.rows([[(0, 2)]], ground_from_ecef(points)))
     assert np.sqrt(np.mean(stated**2)) == pytest.approx(pair_heights(adjustment, 0, 2).absolute, rel=0.01)
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from barpc.ba import BlockPrior
 from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
+from barpc.dsm.block import CameraErrors
 from barpc.dsm.cells import averaged
 from barpc.dsm.relief import shaded
-from barpc.dsm.sigma import CameraErrors
 from barpc.scene import View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center, triangulate
@@ -56,7 +56,7 @@ def test_a_height_moves_as_its_derivative_says_when_a_camera_does(unknown, views
         alt=230.0,
     )
     change = ground_from_ecef(found.points)[:, 2] - ground[:, 2]
-    stated = errors.rows(pair, ground)[:, view * 6 + part]
+    stated = errors.rows([[pair]], ground)[:, view * 6 + part]
     np.testing.assert_allclose(change, stated, atol=2e-3 * max(1.0, np.abs(stated).max()))
 
 
@@ -67,7 +67,7 @@ def test_what_is_shared_by_both_cameras_moves_all_heights_alike(views):
         1e12 * (np.eye(18) - np.outer(direction, direction) / 3.0) + np.outer(direction, direction) / 9.0 / 4.0
     )
     errors = CameraErrors.of(prior_of(views, information), views)
-    rows = errors.rows((0, 1), np.array([[5.4, 43.3, 230.0], [5.4005, 43.3004, 250.0]]))
+    rows = errors.rows([[(0, 1)]], np.array([[5.4, 43.3, 230.0], [5.4005, 43.3004, 250.0]]))
     # (each camera by a metre is the sum of the three: information 1 / 4 is a sigma of 2 m)
     np.testing.assert_allclose(errors.sigma(rows), 2.0, rtol=2e-3)
     np.testing.assert_allclose(errors.sigma(rows - rows.mean(axis=0)), 0.0, atol=5e-3)

@@ -14,9 +14,9 @@ from barpc.base.options import DsmOptions
 from barpc.cli import main
 from barpc.dsm import NoSurfaceError, make_dsm
 from barpc.dsm import cells as cells_module
-from barpc.dsm import grid as surface_module
+from barpc.dsm import surface as surface_module
+from barpc.dsm.block import _best, block_of_images
 from barpc.dsm.cells import Tile
-from barpc.dsm.imagery import _best, block_of_images
 from barpc.dsm.relief import draped
 from barpc.pipeline import load_views
 from barpc.rpcio import read_rpc
@@ -173,7 +173,7 @@ def test_pairs_with_a_flagged_image_come_after_the_others_and_a_line_says_so(ren
     plain = _best(views, worth)
     assert plain.index((1, 2)) == 2
     flagged = _best(views, worth, flagged=frozenset({0}))
-    assert flagged == ((1, 2), *(pair for pair in plain if pair != (1, 2)))
+    assert flagged == [(1, 2), *(pair for pair in plain if pair != (1, 2))]
     assert "view_00: the verdict of the run has a reservation" in caplog.text
     caplog.clear()
     assert _best(views, worth, flagged=frozenset(range(3))) == plain  # as all are: there is nothing better
@@ -217,7 +217,7 @@ def test_other_ground_is_refused_with_exit_code_3_and_leaves_nothing(rendered, t
 
 
 def test_too_large_an_angle_and_radar_are_refused_with_exit_code_3(rendered, tmp_path, monkeypatch, capsys):
-    import barpc.dsm.imagery as block
+    import barpc.dsm.block as block
 
     monkeypatch.setattr(block, "ANGLES", (2.0, 3.0))
     assert run("dsm", *rendered.paths[:2], "-o", tmp_path / "dsm.tif") == 3
@@ -274,10 +274,10 @@ def test_cells_that_hardly_a_match_falls_in_or_too_many_are_refused(side, said, 
 
 def test_a_tile_shows_as_many_pixels_whatever_the_cells(rendered):
     block = block_of_images(rendered.paths[:2])
-    usual, coarse = (surface_module.Grid.of(block, replace(OPTIONS, gsd=side)) for side in (None, 8.0))
+    usual, coarse = (surface_module.Grid(block, replace(OPTIONS, gsd=side)) for side in (None, 8.0))
     assert usual.side == 512
     assert coarse.side * coarse.whole.step <= 1.1 * usual.side * usual.whole.step
-    whole = coarse.tiles()[0][1]
+    whole = coarse.tiles[0][1]
     parts = whole.quarters()
     assert {part.size for part in parts} == {whole.size}
     corners = np.array([[part.west, part.north, part.step] for part in parts])
