@@ -288,6 +288,7 @@ def test_a_track_that_one_view_sees_is_weak_and_one_that_none_sees_is_none(made)
     assert np.setdiff1d(np.arange(150), heights.tracks).tolist() == [8]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kept", [1.0, 0.993, 0.5])
 def test_the_scenes_move_is_from_where_the_delivered_cameras_put_what_is_seen_now(made, kept: float) -> None:
     """What was cut is mended before: places are those of the adjusted cameras."""
