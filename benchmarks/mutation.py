@@ -201,8 +201,9 @@ class Places:
 
 
 def part_of(path: Path) -> str:
-    """The part of a file: the innermost of its folders that has tests."""
-    return next((name for name in path.parts[-2:0:-1] if (ROOT / "tests" / name).is_dir()), TOP)
+    """The part of a file: the innermost of its folders that has tests; of a module beside the folders its own name."""
+    names = path.parts[-2:0:-1] or (path.stem,)
+    return next((name for name in names if (ROOT / "tests" / name).is_dir()), TOP)
 
 
 def parts() -> dict[str, list[str]]:

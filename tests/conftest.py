@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.lanes import spread
+
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 SHARED = Path(os.environ.get("BARPC_SHARED", Path(__file__).resolve().parents[2] / "shared"))
@@ -28,7 +30,17 @@ def pytest_xdist_auto_num_workers() -> int:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """A sweep of the nightly lane is slow, too: `-m 'not slow'` leaves out both."""
+    """A sweep of the nightly lane is slow, too: `-m 'not slow'` leaves out both. `few(n)`: the rest is slow."""
+    kinds: dict[str, list[pytest.Item]] = {}
     for item in items:
         if item.get_closest_marker("nightly"):
             item.add_marker(pytest.mark.slow)
+        elif item.get_closest_marker("few") and not item.get_closest_marker("slow"):
+            kinds.setdefault(item.nodeid.partition("[")[0], []).append(item)
+    for members in kinds.values():
+        few = members[0].get_closest_marker("few")
+        assert few is not None
+        fast = spread(len(members), *few.args)
+        for number, item in enumerate(members):
+            if number not in fast:
+                item.add_marker(pytest.mark.slow)

@@ -34,6 +34,17 @@ def diagonal(*axes: Iterable[Any], mark: pytest.MarkDecorator = pytest.mark.slow
     ]
 
 
+def spread(count: int, few: int) -> set[int]:
+    """Which of the numbers below `count` the mark `few(n)` keeps before a commit: n from the first to the last.
+
+    >>> sorted(spread(9, 3)), sorted(spread(9, 1)), sorted(spread(2, 3))
+    ([0, 4, 8], [0], [0, 1])
+    """
+    if few >= count:
+        return set(range(count))
+    return {round(k * (count - 1) / max(few - 1, 1)) for k in range(few)}
+
+
 def _param(value: Any, marks: list[pytest.MarkDecorator]) -> Any:
     """A value as a param with more marks; one that is a param already keeps its own and its id."""
     known = pytest.param(value)

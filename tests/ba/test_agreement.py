@@ -122,6 +122,7 @@ def test_the_larger_set_is_used_and_the_others_are_told_to_agree(count, moved) -
     assert not found(count, 1, any_way(1, moved, 40.0)).alike
 
 
+@pytest.mark.slow
 def test_of_many_points_sets_are_drawn_and_the_same_ones_always() -> None:
     offsets = drawn(40, 3, any_way(3, 10, 12.0))
     told = np.ones(40, dtype=bool)

@@ -168,6 +168,16 @@ def test_of_two_views_as_likely_none_is_taken_out(monkeypatch) -> None:
     assert (found.gap, found.runner_up) == (6.0, 0)
 
 
+@pytest.mark.parametrize(("lost", "own"), [(0.3, 0.6), (0.7, 0.7), (1.0, 0.999)])
+def test_the_gain_of_an_own_share_is_that_of_two_binomials_less_the_choice(monkeypatch, lost, own) -> None:
+    monkeypatch.setattr(apart._Left, "usual", 0.02)
+    placed: Any = SimpleNamespace(squared=np.zeros(200))
+    block: Any = SimpleNamespace(views=(None,) * 4)
+    one = apart._Left(1, block, None, placed, 0.6, True)  # type: ignore[arg-type]
+    expected = 200 * (own * np.log(own / 0.02) + (1.0 - own) * np.log((1.0 - own) / 0.98)) - np.log(4.0)
+    assert one.gain(lost) == pytest.approx(expected)
+
+
 def test_a_view_of_which_half_agrees_is_its_own(monkeypatch) -> None:
     assert scripted(monkeypatch, [0.0, 0.0, 0.0], [0.50, 0.3, 0.02]) == (None, None)
     assert scripted(monkeypatch, [0.0, -9.0, -9.0], [0.52, 0.3, 0.02])[0].views == (0,)

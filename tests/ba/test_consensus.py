@@ -141,6 +141,7 @@ def _given(seen, offset: np.ndarray, pair: int = 0) -> tuple[np.ndarray, Any, np
     return residual, seen[1].by_point, use
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("offset", "said"),
     [
@@ -157,6 +158,7 @@ def test_groups_are_told_where_they_are_evident(seen, offset: np.ndarray, said: 
     assert len(two_groups(seen[0].structure, *_given(seen, offset))) == said
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("share", [0.5, 0.3, 0.2])
 def test_what_looks_like_one_group_by_skewness_and_kurtosis_is_one(seen, monkeypatch, share) -> None:
     def coefficient(distance: float) -> float:

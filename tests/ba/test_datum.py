@@ -114,6 +114,7 @@ def test_the_summary_has_it_in_a_table_without_the_sources_that_tell_nothing():
     assert not {"earlier_run", "fixed_views", "heights"} & set(columns)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("options", "dem", "says"),
     [

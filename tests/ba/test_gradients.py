@@ -63,6 +63,7 @@ def _setup(views, model, drift, ecef, scale=5.0):
     return Cameras(views, unknowns, seen), params, bounds
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(("model", "drift"), MODELS)
 def test_tie_observations_have_the_derivatives_of_central_differences(views, ecef, model, drift):
     cameras, params, bounds = _setup(views, model, drift, ecef)

@@ -54,6 +54,7 @@ MIDDLE = {"view": 1, "axis": 1, "start": 0.4, "stop": 0.6, "px": 0.8}
 DETECTOR = {"view": 2, "axis": 0, "start": 0.25, "stop": 0.375, "px": 1.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", rest_slow([MIDDLE, ROWS, DETECTOR]), ids=["middle", "end", "detector"])
 def test_rows_and_columns_that_lie_off_are_named_and_followed(where: Displaced) -> None:
     if where is MIDDLE:

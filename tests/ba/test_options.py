@@ -221,6 +221,7 @@ def test_every_option_has_a_row():
     assert set(ELSEWHERE.values()) <= set(globals())
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "row",
     [

@@ -31,6 +31,7 @@ def worst(unused: Unused) -> list[Place]:
     return met_worse(unused, SIZE[:, : unused.view.max() + 1], *LIMITS)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("each", "wrong"), diagonal([60, 200, 25], [0.03, 0.3, 0.0, 0.5]))
 def test_where_all_places_are_alike_none_is_named(each: int, wrong: float) -> None:
     found = [worst(observed(seed, each, wrong, 2)[0]) for seed in range(12)]

@@ -130,20 +130,20 @@ def test_a_view_that_sees_nothing_stays_where_it_is() -> None:
     ("change", "expected"),
     [
         (lambda image, up: image + 40.0, ((40.0, 40.0), None, False, False)),
-        (lambda image, up: image + 25.0 * up, ((0.0, 50.0), 25.0, False, False)),
-        (lambda image, up: image + 120.0 * up, ((0.0, 240.0), None, False, False)),  # no surface is so far
+        (lambda image, up: image + 25.0 * up, ((0.0, 37.5), 25.0, False, False)),
+        (lambda image, up: image + 120.0 * up, ((0.0, 180.0), None, False, False)),  # no surface is so far
         (lambda image, up: image[::-1], (None, None, True, False)),
         (lambda image, up: image + 0.9, (None, None, False, True)),
         (lambda image, up: image + 40.0 * np.sin(XY / 40.0), (None, None, False, False)),
     ],
 )
 def test_what_would_make_an_rpc_as_good_as_stated_is_said(change, expected) -> None:
-    """Of a camera stated to 1 m, 2 px a metre up and east: an offset, a height, axes that are swapped."""
+    """Of a camera stated to 1 m, 2 px a metre east, 1.5 up: an offset, a height, axes that are swapped."""
     offset, height, swapped, as_stated = expected
     ecef = ecef_from_ground(np.column_stack([5.0 + XY[0] * 1e-5, 44.0 + XY[1] * 1e-5, np.full(80, 300.0)]))
     basis = enu_basis(np.array([5.0, 44.0, 300.0]))
-    by_point = np.repeat((2.0 * np.stack([basis[0], basis[2]]))[:, :, None], 80, axis=2)
-    up = np.array([[0.0], [2.0]]) * np.ones(80)
+    by_point = np.repeat(np.stack([2.0 * basis[0], 1.5 * basis[2]])[:, :, None], 80, axis=2)
+    up = np.array([[0.0], [1.5]]) * np.ones(80)
     image = change(XY, up)
     project = lambda params, points, bounds, what: SimpleNamespace(image=image, by_point=by_point)  # noqa: E731
     cameras = SimpleNamespace(seeing=lambda xy: SimpleNamespace(project=project), unknowns=SimpleNamespace(constants=6))

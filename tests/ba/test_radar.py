@@ -240,6 +240,7 @@ def test_a_radar_that_is_known_well_gives_the_block_its_place(slc: Scene) -> Non
     assert 0.1 * turned.gauge.sigma.min() < clocks.gauge.sigma.min() < 0.3 * turned.gauge.sigma.min()
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("model", "drift"),
     [("rotation+translation", 0), ("translation", 0), ("rotation", 2), ("rotation+translation", 1)],

@@ -62,6 +62,7 @@ def small():
 MODELS = ("rotation", "translation", "rotation+translation")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "model"),
     [
@@ -166,6 +167,7 @@ def test_where_no_drift_is_asked_for_no_spline_takes_its_place(seed):
     assert plain.params.shape[1] == 6
 
 
+@pytest.mark.slow
 def test_a_drift_is_followed_where_the_model_has_one():
     drifting = simulate_block(4, 300, seed=1, drift=20e-6)
     plain, found = (solve(drifting, drift=drift, jitter="off", learn_priors=False, **L2) for drift in (0, 1))

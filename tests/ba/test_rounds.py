@@ -156,6 +156,7 @@ def test_a_better_agreement_takes_the_place_of_a_compromise(clean) -> None:
     assert found.noise == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("wave", "settled"), [(0.0, False), (0.02, False), (0.06, True), (0.5, True)])
 def test_points_follow_what_is_smooth_where_it_is_seen(monkeypatch, wave: float, settled: bool) -> None:
     """Of noise of 0.1 px: a smooth part of less than 0.3 sigmas is taken from each view by itself."""

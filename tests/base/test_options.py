@@ -102,6 +102,7 @@ def one_line(error: BaseException, name: str) -> None:
     assert len(str(error)) < 400 or "1000000000" in str(error)
 
 
+@pytest.mark.few(18)
 @pytest.mark.parametrize(("table", "name", "one"), FIELDS, ids=[f"{t}.{n}" if t else n for t, n, _ in FIELDS])
 def test_what_a_field_cannot_hold_is_refused_on_every_path(
     table: str, name: str, one: Declared, tmp_path: Path

@@ -200,6 +200,7 @@ def sniff_and_read(name: str, text: str) -> None:
 PREFIXES = ["", "LINE_OFF: ", "lineNumCoef = (", "rpc info = {", "<?xml ", "line_num_coeff: ["]
 
 
+@pytest.mark.few(6)
 @pytest.mark.parametrize(("fill", "prefix"), diagonal(FILLS, PREFIXES, mark=pytest.mark.nightly))
 def test_sniffers_and_readers_take_time_in_proportion_to_the_text(fill, prefix):
     small, large = (prefix + FILLS[fill] * n for n in (10_000, 40_000))
@@ -227,6 +228,7 @@ def test_the_largest_rpc_file_that_is_read_ends_in_sensible_time(fill):
         assert cpu(partial(sniff_and_read, name, data.decode())) < 60
 
 
+@pytest.mark.few(14)
 @pytest.mark.parametrize(
     ("kind", "fill"),
     diagonal(
@@ -289,6 +291,7 @@ def _opens(call: ast.Call) -> bool:
     return name in ("open", "read_text", "read_bytes") and not writes and not members
 
 
+@pytest.mark.slow
 def test_no_module_opens_a_file_by_itself():
     root = Path(barpc.__file__).parent
     around = {}

@@ -46,6 +46,7 @@ def test_a_good_run_ends_with_0_and_no_word_on_stderr(pristine, ties, tmp_path):
     assert said.err == ""
 
 
+@pytest.mark.slow
 def test_a_weak_view_ends_with_3(pristine, ties, tmp_path):  # noqa: F811
     head, *rows = ties.read_text().splitlines()
     few = [row for row in rows if not row.startswith("view_02")]
@@ -59,6 +60,7 @@ def test_doubtful_cameras_end_with_3_and_say_so_even_when_quiet(pristine):  # no
     assert_told(command("-q", "check", *pristine[:2]), "need a look", "adjust the cameras")
 
 
+@pytest.mark.slow
 def test_a_file_left_out_ends_with_3(pristine, tmp_path):  # noqa: F811
     (tmp_path / "bad.tif").write_bytes(b"nothing")
     said = command("match", *pristine[:2], tmp_path / "bad.tif", "--keep-going", "-o", tmp_path / "out", "--json")

@@ -127,6 +127,7 @@ def test_the_altitudes_may_come_from_a_dem(
     assert 700.0 < high < 1100.0
 
 
+@pytest.mark.slow
 def test_a_file_of_few_digits_is_fitted_for_them_and_certified_as_it_reads_back(
     shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

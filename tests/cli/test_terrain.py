@@ -82,6 +82,7 @@ def test_altitudes_that_a_table_brings_need_no_word(image, tmp_path, capsys):
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_a_run_s_own_files_know_its_tie_points(finished, capsys):
     summary = json.loads((finished / "summary.json").read_text())
     (name,) = summary["views"][1]["outputs"]

@@ -88,6 +88,7 @@ def parses(words: list[str]) -> None:
     assert "no such file; a list of images is needed" in str(found.exception), found.output
 
 
+@pytest.mark.slow
 def test_the_job_script_of_dask_jobqueue_asks_for_what_the_page_says():
     jobqueue = pytest.importorskip("dask_jobqueue")
     call = re.search(r"SLURMCluster\((.*?)\)\n", block("jobqueue"), re.DOTALL)

@@ -107,6 +107,7 @@ def run_page(page: Path, codes: dict[str, int]) -> None:
                 run_line(line, codes)
 
 
+@pytest.mark.slow
 def test_the_python_block_of_the_readme_runs_on_the_samples(small, monkeypatch):
     folder = small
     monkeypatch.chdir(folder)

@@ -76,6 +76,7 @@ def test_the_file_is_a_cog_in_utm_that_says_what_it_is(made):
     assert sorted(path.name for path in out.parent.iterdir()) == ["dsm.tif"]
 
 
+@pytest.mark.slow
 def test_the_same_bytes_whoever_works_and_in_whatever_order_images_are_given(made, rendered, tmp_path):
     with ThreadPoolExecutor(2) as executor:
         make_dsm(rendered.paths[1::-1], tmp_path / "again.tif", OPTIONS, executor=executor)
@@ -287,6 +288,7 @@ def test_a_tile_shows_as_many_pixels_whatever_the_cells(rendered):
     assert north.min() - step[0] * whole.size[1] == pytest.approx(whole.north - whole.step * whole.size[1])
 
 
+@pytest.mark.slow
 def test_coarse_cells_have_the_median_of_their_ground(rendered, tmp_path):
     make_dsm(rendered.paths[:2], tmp_path / "dsm.tif", replace(OPTIONS, gsd=8.0))
     with rasterio.open(tmp_path / "dsm.tif") as file:
@@ -295,6 +297,7 @@ def test_coarse_cells_have_the_median_of_their_ground(rendered, tmp_path):
     assert nmad(error[np.isfinite(error)]) < 0.5
 
 
+@pytest.mark.slow
 def test_a_refusal_after_long_work_leaves_nothing_either(rendered, tmp_path, monkeypatch):
     """Not even what a run that is gone on with would need: it is refused each time."""
     monkeypatch.setattr("barpc.workspace.KEEP_AFTER", 0.0)

@@ -68,6 +68,7 @@ def test_every_rpc_dictionary_is_the_written_rpc_for_rpcm(run_dir, tmp_path):
         assert np.abs(off).max() < 1e-6
 
 
+@pytest.mark.few(1)
 def test_satnerf_files_hold_what_its_loader_reads(run_dir, tmp_path):
     rpcm = pytest.importorskip("rpcm")
     out = exported(run_dir, "satnerf", tmp_path)
@@ -145,6 +146,7 @@ def test_images_of_one_folder_are_called_by_their_names(southern, tmp_path):
         assert read(name)["img"] == f"{name.stem}.tif"
 
 
+@pytest.mark.slow
 def test_pycolmap_opens_the_model_and_finds_the_errors_that_it_states(southern, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     out = exported(in_one_folder(southern, tmp_path), "colmap", tmp_path)
@@ -281,6 +283,7 @@ def test_stac_items_are_valid_without_a_date_and_across_the_date_line(run_dir, t
     assert read(out / f"{views[1]['name']}.json")["properties"]["datetime"] is None
 
 
+@pytest.mark.slow
 def test_altitudes_may_be_given(southern, tmp_path):
     out = exported(southern, "colmap", tmp_path, alt_range=(-200.0, 2000.0))
     assert read(out / "world.json")["alt_range"] == [-200.0, 2000.0]

@@ -83,6 +83,7 @@ def test_waves_over_the_rows_are_seen_at_their_height(cycles):
     assert np.abs(error).max() <= 1.2 * fit.max_ckp.max()
 
 
+@pytest.mark.slow
 def test_one_bad_node_of_a_grid_of_positions_is_seen():
     size, knots = (20000, 20000), np.linspace(0, 20000, 25)
 

@@ -29,6 +29,7 @@ def miss(camera: Camera) -> float:
     return float(np.abs(camera.rpc.project(ground) - image).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grid", rest_slow([(10, 10, 6), (12, 12, 7)]))
 def test_every_vendors_rpc_is_refitted_to_a_hundred_millionth_of_a_pixel(
     vendors: list[Camera], grid: tuple[int, int, int]

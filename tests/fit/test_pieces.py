@@ -96,6 +96,7 @@ class Shaking:
         return getattr(self.camera.model, name)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.field)
 def test_an_option_changes_the_result_in_its_direction(camera: Camera, row: Row) -> None:
     found = []

@@ -34,6 +34,7 @@ def test_exact_points_give_an_exact_rpc(camera: Camera, points: tuple[Array, Arr
     assert 0.9 < fit.coverage <= 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "factor"),
     [(60, 2.5), *(pytest.param(*row, marks=pytest.mark.slow) for row in ((300, 1.5), (4000, 1.2)))],
@@ -52,6 +53,7 @@ def test_noise_neither_makes_poles_nor_costs_more_than_the_unknowns_do(
         assert abs(rms(fit.rmse_ckp) - 0.3) <= 0.3 * max(0.1, 12 / np.sqrt(count))
 
 
+@pytest.mark.slow
 def test_leave_one_out_residuals_are_those_of_fits_without_the_point(camera: Camera) -> None:
     rng = np.random.default_rng(8)
     ground, image = random_points(camera, 60, rng)

@@ -105,6 +105,7 @@ def fitted(name: str) -> RpcFit:
     return fit_rpc(CASES[name][0](), SIZE, ALTS, strict=False)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", rest_slow(list(CASES), keep=3))
 def test_each_cause_is_named_with_its_size_and_its_place(name):
     _, cause, (low, high), place = CASES[name]

@@ -53,6 +53,7 @@ class Crooked:
         return ground[..., [1, 0, 2]] if self.fault == "lon and lat exchanged, both ways" else ground
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("fault", "largest"),
     [

@@ -15,12 +15,14 @@ from .runner import check, prepared, scratch, sweep
 from .samples import SAMPLES
 
 
+@pytest.mark.few(22)
 @pytest.mark.parametrize("kind", SAMPLES)
 def test_a_sample_is_accepted_as_it_is(kind, tmp_path):
     assert check(kind, SAMPLES[kind].data(), prepared(kind, str(tmp_path)))
 
 
 # GDAL's words of a damaged file may be no text, which rasterio then says of itself
+@pytest.mark.few(22)
 @pytest.mark.filterwarnings("ignore:.*rasterio._env.log_error:pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
     "runs",
@@ -63,6 +65,7 @@ def test_an_archive_is_bent_and_holds_up():
 ODD = [b"", b"\xff\xfe\x00", b"[" * 20_000, b'{"features": ' * 3000, b"<a>" * 20_000, b"PK\x05\x06" + bytes(18)]
 
 
+@pytest.mark.few(22)
 @pytest.mark.parametrize("kind", SAMPLES)
 def test_odd_bytes_are_a_value_or_one_error(kind, tmp_path):
     place = prepared(kind, str(tmp_path))

@@ -53,6 +53,7 @@ def test_results_come_back_in_order_and_are_found_the_next_time(tmp_path):
     assert pool.batches == []
 
 
+@pytest.mark.slow
 def test_quick_tasks_travel_together(tmp_path):
     with (
         Workspace(tmp_path / "run") as workspace,
@@ -91,6 +92,7 @@ def test_a_bug_in_a_worker_says_where(tmp_path):
     assert any("in bug" in note for note in caught.value.__notes__)
 
 
+@pytest.mark.slow
 def test_a_pool_that_was_shut_down_is_an_error_of_every_task(tmp_path):
     pool = Recording()
     pool.shutdown()

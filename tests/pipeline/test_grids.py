@@ -70,6 +70,7 @@ def run_of(folder: Path, *given, **options) -> list[dict[str, dict[str, float | 
         return write_grids(run, given, RunOptions(**options))
 
 
+@pytest.mark.slow
 def test_grids_are_written_where_the_rpc_misses_the_camera_and_nowhere_else(tmp_path, view, camera, fit, easy):
     assert 0.02 < fit.max_ckp.max() < 0.6
     other = replace(view, name="b")
@@ -524,6 +525,7 @@ def test_a_grid_is_the_camera_of_an_image_and_no_image(block, tmp_path):
             check([str(tmp_path / "a" / (images[0].stem + end)), images[1]])
 
 
+@pytest.mark.slow
 def test_a_grid_that_no_rpc_holds_is_not_converted(tmp_path, once):
     path = once[0] / f"a{GRID}"
     found = CliRunner().invoke(cli, ["convert", str(path), str(tmp_path / "a_RPC.TXT")], standalone_mode=False)

@@ -67,6 +67,7 @@ def counted(monkeypatch, owner: object, name: str, counts: Counter[str]) -> None
     monkeypatch.setattr(owner, name, watched)
 
 
+@pytest.mark.slow
 def test_a_folder_is_listed_once_for_all_its_images_and_again_when_it_changes(block, folder, monkeypatch):
     counts: Counter[str] = Counter()
     formats._listed.cache_clear()
@@ -115,6 +116,7 @@ def test_a_summary_asks_each_camera_as_often_in_a_large_block_as_in_a_small_one(
     assert calls[1] < 1.3 * calls[0] < 100
 
 
+@pytest.mark.slow
 def test_pairs_measured_together_are_as_measured_alone(block):
     found = Run("check", block[0].views, (), block[0].tracks)
     entries = {(pair.a, pair.b): pair for pair in report.summarize(found).pairs}

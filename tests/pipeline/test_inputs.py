@@ -21,6 +21,7 @@ from barpc.scene import Tracks
 from .known import WHOLE_AT_NIGHT, errors_at_check_points
 
 
+@pytest.mark.slow
 @WHOLE_AT_NIGHT
 def test_tie_points_from_a_file_give_the_same_answer(known, matched, tmp_path):
     result, out = matched
@@ -62,6 +63,7 @@ def test_control_points_put_the_scene_in_its_place(known, matched, tmp_path):
     assert len(result.summary["gcps"]) == 5
 
 
+@pytest.mark.slow
 def test_one_image_and_control_points_are_enough(shared_data, tmp_path):
     image = shared_data / "optical/qb2_single/qb2_basic1b.tif"
     gcps = shared_data / "optical/qb2_single/gcps.geojson"

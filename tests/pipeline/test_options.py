@@ -345,8 +345,16 @@ ELSEWHERE = (
 tests/remote and tests/reliability, or beside them: matches_only, reference_sigma."""
 
 
+SLOW = ("reference_sigma", "stop_after", "resample", "altimetry", "fit", "fixed_run")
+"""Options that take a run or two of their own: the landing check tries them."""
+
+
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.nightly] * (name in ELSEWHERE)) for name in ROWS]
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.nightly] * (name in ELSEWHERE) + [pytest.mark.slow] * (name in SLOW))
+        for name in ROWS
+    ],
 )
 def test_an_option_does_what_it_says(name: str, run: Run, tmp_path: Path, scene: Path) -> None:
     before = {path.name: path.read_bytes() for path in scene.iterdir() if path.is_file()}
@@ -373,6 +381,7 @@ def test_options_that_contradict_each_other_are_refused(given: dict[str, Any], m
         RunOptions(**given)
 
 
+@pytest.mark.slow
 def test_a_result_prints_its_counts(run: Run) -> None:
     found = run("a" * 200, stop_after="adjustment")
     assert len(repr(found)) < 150

@@ -170,6 +170,7 @@ def test_a_missing_file_ends_the_run_with_one_line(tmp_path, flag, word) -> None
     assert word in line
 
 
+@pytest.mark.slow
 @WHOLE_AT_NIGHT
 def test_an_image_that_the_list_leaves_alone_can_be_left_out(known, tmp_path) -> None:
     pairs = tmp_path / "pairs.txt"

@@ -150,6 +150,7 @@ def test_ventoux_with_little_overlap_is_met_within_five_hundredths_of_a_pixel(re
     assert spread <= 1.1 * 0.184
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", rest_slow(["ventoux_biased", "triplet", "ventoux"]))
 def test_the_files_hold_p_ba_to_a_millionth_of_a_pixel(request, which):
     result, out = request.getfixturevalue(which)

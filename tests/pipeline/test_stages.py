@@ -362,6 +362,7 @@ def test_a_check_has_no_folder_to_make_a_report_of() -> None:
         assert repr(wrote).endswith(f", in {shown})")
 
 
+@pytest.mark.slow
 def test_a_stage_that_is_one_task_says_its_beginning_and_its_end(corner, tmp_path) -> None:
     """Also where it ends in an error its beginning; nobody need listen."""
     told: list[tuple[str, int, int]] = []

@@ -108,6 +108,7 @@ def assert_as_gdal(path: Path) -> None:
             np.testing.assert_array_equal(*(np.ma.getmaskarray(m) for m in masked))
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("dtype", GDAL_TYPES)
 def test_a_vrt_by_gdal_reads_as_gdal_reads_it(tmp_path: Path, dtype: str) -> None:
     nodata = {} if dtype.startswith("complex") else {"nodata": 12}
@@ -185,6 +186,7 @@ def vrt_size(size: tuple[int, int], body: str) -> tuple[tuple[int, int], str]:
     return size, body
 
 
+@pytest.mark.few(7)
 @pytest.mark.parametrize("name", BODIES)
 def test_a_vrt_reads_as_gdal_reads_it(tmp_path: Path, name: str) -> None:
     raster(tmp_path / "a.tif")

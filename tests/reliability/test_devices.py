@@ -77,6 +77,7 @@ def command(verb: str, flag: str, given: Path, crops: list[Path], tmp_path: Path
     return [*source, *rest.get(verb, []), *more]
 
 
+@pytest.mark.few(22)
 @pytest.mark.parametrize("what", ["pipe", "/dev/zero"])
 @pytest.mark.parametrize(("verb", "flag"), CASES)
 def test_what_has_no_end_is_refused_in_one_line(verb, flag, what, crops, tmp_path):

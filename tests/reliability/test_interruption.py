@@ -224,6 +224,7 @@ def test_an_image_that_changed_is_worked_on_again_whatever_its_date(crops, out):
     assert outputs(out)["tables/observations.csv"] != first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("year", rest_slow([1971, 2099]))
 def test_a_clock_that_goes_wrong_changes_nothing(crops, ran, out, tmp_path, year):
     then = (year - 1970) * 365.25 * 86400
@@ -294,6 +295,7 @@ def test_debug_shows_the_traceback_of_a_bug(crops, out, monkeypatch):
     assert "report" in said.err.splitlines()[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("whole", "share"),
     [(False, 0.7), pytest.param(True, 0.95, marks=pytest.mark.nightly)],

@@ -149,6 +149,7 @@ def test_a_name_goes_through_every_file_and_back(names, pristine, tmp_path):
     assert not any(name.startswith("on") for name in page.attributes)
 
 
+@pytest.mark.few(30)
 @pytest.mark.parametrize("where", ["image", "folder", "output"])
 @pytest.mark.parametrize("name", [*REFUSED, *HIDDEN], ids=short)
 def test_a_name_that_files_cannot_carry_is_refused_in_one_line(name, where, pristine, tmp_path):
@@ -181,6 +182,7 @@ def test_folders_may_be_called_so(pristine, tmp_path):
             assert vrt.read(1).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", rest_slow([["#a", " b "], ["-c", '"d']]), ids=short)
 def test_lists_of_images_hold_every_name(pristine, tmp_path, names):
     folder = tmp_path / "list"

@@ -98,6 +98,7 @@ def scheme(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
     return str(request.param)
 
 
+@pytest.mark.few(1)
 @pytest.mark.filterwarnings("ignore")
 def test_an_emulated_store_is_read(scheme: str) -> None:
     hosts, root = [f"{scheme}://scenes"], f"{scheme}://scenes"

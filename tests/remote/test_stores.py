@@ -90,6 +90,7 @@ def test_a_bucket_is_read_by_itself_and_by_workers(store: Store, tmp_path: Path)
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_a_file_beside_an_image_is_found_whatever_its_case(store: Store, tmp_path: Path) -> None:
     rpc = open_camera(SAMPLES / NAMES[1]).rpc
     barpc.write_rpc(rpc, tmp_path / "x.RPB")
@@ -100,6 +101,7 @@ def test_a_file_beside_an_image_is_found_whatever_its_case(store: Store, tmp_pat
     assert store.counts["bytes"] < 3 * (SAMPLES / NAMES[0]).stat().st_size
 
 
+@pytest.mark.slow
 def test_an_object_that_is_replaced_while_it_is_read_is_noticed(store: Store) -> None:
     store.put("a/replaced.tif", (SAMPLES / NAMES[0]).read_bytes())
     at = versioned(located("s3://scenes/a/replaced.tif", HOSTS), IMAGE)

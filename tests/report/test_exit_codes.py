@@ -79,6 +79,7 @@ def check_points_of_strangers(run):
     return replace(run, check_points=replace(run.gcps, left_out=("a.csv: names unknown.tif",)))
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("change", "word"),
     [
@@ -110,6 +111,7 @@ def scattered(adjustment):
     return replace(adjustment, noise=2.6)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -128,6 +130,7 @@ def test_what_the_adjustment_says_of_the_block_needs_a_look(change, words, block
         assert word.format(*run.adjustment.names) in reason
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("noise", "said"), [(2.4, False), (2.6, True), (float("nan"), False)])
 def test_an_image_is_judged_by_tie_points_that_took_no_part(noise, said, block_run):
     run = block_run.run

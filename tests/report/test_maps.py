@@ -382,6 +382,13 @@ def test_of_many_residuals_every_few_th_is_drawn_and_of_many_images_the_most_sys
     assert "are shown" not in panels(rows, many[:60])[2]
 
 
+@pytest.mark.parametrize(("count", "first"), [(10, "V0"), (11, "V9")])
+def test_panels_of_up_to_ten_images_stand_as_the_images_are_given(count, first):
+    pushed = [(9, k, (50.0, 50.0), (0, 0), (0.1, 0.0), True) for k in range(20)]
+    found, _, _ = panels(pushed, [a_view(f"V{k}") for k in range(count)])
+    assert found[0][1].startswith(f"{first}: ")
+
+
 def test_before_and_after_are_two_and_what_is_not_known_or_used_is_left_out():
     rows = [(0, 0, (5, 5), (1.0, 0.0), (np.nan, np.nan), True), (0, 1, (5, 5), (3.0, 0.0), (0.5, 0.0), True)]
     before, after = panels(rows, [a_view()], "before"), panels(rows, [a_view()], "after")

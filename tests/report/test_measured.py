@@ -292,6 +292,7 @@ def test_a_reference_is_said_to_hold_the_points_that_were_kept():
     assert measure_reference(SimpleNamespace(reference=None, adjustment=adjustment)) is None
 
 
+@pytest.mark.slow
 def test_check_points_are_measured_with_the_new_cameras_or_the_old_ones(block_run):
     run = replace(block_run.run, gcps=None, check_points=block_run.run.gcps)
     points = run.check_points

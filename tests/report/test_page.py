@@ -99,6 +99,7 @@ def test_a_check_asks_only_what_it_can_answer(check_run):
     assert "new RPC files" not in html
 
 
+@pytest.mark.slow
 def test_check_points_answer_how_accurate_it_is_on_the_ground(block_run, tmp_path):
     run = block_run.run
     summary = written(replace(run, gcps=None, check_points=run.gcps), tmp_path / "run")

@@ -71,6 +71,7 @@ def test_summaries_follow_the_published_schema(fixture, request):
     assert faults(summary, SCHEMA) == []
 
 
+@pytest.mark.slow
 def test_the_summary_of_views_added_to_an_earlier_run_follows_the_schema():
     block = simulate_block(3, 300, seed=3)
     old = block.tracks.select(block.tracks.view < 2)
@@ -214,6 +215,7 @@ def test_the_simulated_camera_sees_half_a_metre(block_run):
         assert 0 < view["incidence_deg"] < 30
 
 
+@pytest.mark.slow
 def test_an_adjustment_in_the_image_has_no_shift_of_a_camera_in_space(block_run):
     run = block_run.run
     adjustment = adjust_tracks(run.views, run.tracks, AdjustOptions(model="shift"))

@@ -31,6 +31,7 @@ def any_table(draw):
     return first + [[draw(words), *(draw(cells) for _ in range(columns))] for _ in range(rows)]
 
 
+@pytest.mark.slow
 @given(any_table(), st.one_of(st.none(), st.integers(5, 120)))
 def test_no_cell_and_no_unit_is_ever_dropped(table, width):
     text = "\n".join(layout(table, width))
@@ -121,6 +122,7 @@ def a_large_run(bad: int, torn: int = 40, num: int = 300, **fields):
     return a_summary(views, pairs, status="bad", headline="Look.", verdict=verdict, out_dir="out", **fields)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("width", [None, 200, 80])
 @pytest.mark.parametrize("bad", [0, 3, 8, 299])
 def test_a_summary_is_sixty_lines_whatever_its_size(bad, width, monkeypatch):

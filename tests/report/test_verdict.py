@@ -40,6 +40,7 @@ def test_a_check_of_wrong_cameras_says_to_adjust_them(check_run):
     assert not summary["passed"]
 
 
+@pytest.mark.slow
 def test_a_view_with_few_tie_points_is_weakly_tied():
     made = simulate_block(4, 200, seed=5, attitude=3e-6)
     rows = np.flatnonzero(made.tracks.view == 2)
@@ -66,6 +67,7 @@ def test_a_view_without_tie_points_to_the_others_is_not_adjusted():
     assert not summary["passed"]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("placed", "scale", "status", "said"),
     [
@@ -101,6 +103,7 @@ def test_a_view_whose_rpc_is_not_its_own_is_named(block_run, placed, scale, stat
         assert view["correction"]["sigma"] == pytest.approx([0.2] * 9)
 
 
+@pytest.mark.slow
 def test_a_view_among_several_whose_rpc_may_be_strange_needs_a_look(block_run):
     run = block_run.run
     told = Apart((2, 0), 400.0, 9.0, None, 1.0, Look(), None)
@@ -112,6 +115,7 @@ def test_a_view_among_several_whose_rpc_may_be_strange_needs_a_look(block_run):
     assert not summary["scene"]["explanations"]
 
 
+@pytest.mark.slow
 def test_an_rpc_that_misses_its_tolerance_fails_its_view(block_run):
     options = RunOptions(fit=FitOptions(tolerance=1e-15))
     summary = summarize(replace(block_run.run, options=options))

@@ -54,6 +54,7 @@ def test_a_file_that_is_cut_off_anywhere_in_its_numbers_is_refused(sample):
         assert outcome(data[:size]) != "read", size
 
 
+@pytest.mark.few(4)
 @each_sample
 def test_a_flipped_byte_is_read_or_refused_never_anything_else(sample):
     data = SAMPLES[sample].encode()
@@ -156,6 +157,7 @@ def test_an_unexpected_encoding_is_refused_or_read_the_same(sample, encoding):
         assert parse(data, "bad.file")[0].coeffs.shape == (4, 20)
 
 
+@pytest.mark.few(3)
 @each_sample
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())

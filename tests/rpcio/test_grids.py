@@ -130,6 +130,7 @@ def test_a_correction_grid_is_known_however_many_nodes_it_has(tmp_path, width, h
     np.testing.assert_array_equal(found.correction.shift, shift)
 
 
+@pytest.mark.slow
 def test_consumers_find_the_error_of_a_grid_and_not_less(folder, camera, sample, tmp_path):
     """A grid of the RPC alone misses by the jitter; one whose columns are moved by half a pixel, as by another idea of
     where pixels begin, by half a pixel more."""

@@ -132,6 +132,7 @@ def test_a_correction_of_whole_pixels_moves_numbers_and_changes_none(tmp_path):
     np.testing.assert_array_equal(pixels(tmp_path / "b.tif")[:, 2:, :-3], data[:, :-2, 3:])
 
 
+@pytest.mark.slow
 def test_blocks_leave_no_seams(tmp_path, monkeypatch):
     image = raster(tmp_path / "a.tif", seen(60000.0, "uint16"))
     write_resampled(make_rpc(), grid(), image, tmp_path / "b.tif")
@@ -142,6 +143,7 @@ def test_blocks_leave_no_seams(tmp_path, monkeypatch):
     assert np.abs(np.subtract(*(pixels(tmp_path / f"{name}.tif").astype(int) for name in "bc"))).max() <= 1
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("dtype", "nodata"),
     rest_slow(
@@ -221,6 +223,7 @@ def test_numbers_that_are_none_do_not_spread(tmp_path):
     assert lost.sum() == 101
 
 
+@pytest.mark.slow
 def test_a_vrt_is_resampled_like_its_image(tmp_path):
     image = raster(tmp_path / "a.tif", seen(4000.0, "uint16"))
     write_rpc_vrt(make_rpc(), image, tmp_path / "a.vrt")

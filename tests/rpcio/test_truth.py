@@ -102,6 +102,7 @@ def test_every_file_that_holds_an_rpc_is_in_the_list(shared_data):
     assert set(readable) == set(EXPECTED) | beyond
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize("file", EXPECTED)
 def test_number_against_number_rpcm_s_and_gdal_s_formulas_agree(file, shared_data, tmp_path):
     """Through a text file that both read, so that the vendor's syntax plays no part; no printed decimals."""
@@ -145,6 +146,7 @@ def test_number_against_number_the_vendor_s_own_file_reads_as_other_tools_read_i
     assert (np.abs(found - image) / scale).max() <= bound
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("file", ONE_OF_EACH)
 def test_what_is_written_of_a_vendor_s_rpc_reads_the_same_in_every_tool(file, shared_data, tmp_path):
     rpc = read_rpc(shared_data / file)

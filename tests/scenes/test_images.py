@@ -133,18 +133,21 @@ def test_gcps_are_given_as_geojson_with_noisy_image_points(scene, folder):
     assert 0.05 < np.std(error) < 0.4
 
 
+@pytest.mark.slow
 def test_the_same_command_writes_the_same_bytes(folder, tmp_path):
     write_scene(tmp_path / "again", SMALL)
     for path in (p for p in folder.iterdir() if p.is_file()):
         assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes()
 
 
+@pytest.mark.slow
 def test_another_seed_is_another_scene(scene):
     other = Scene(ImageOptions(size=(200, 160), seed=4))
     a, b = scene.picture(0).numbers.astype(float), other.picture(0).numbers.astype(float)
     assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 0.5
 
 
+@pytest.mark.slow
 def test_dates_differ_in_light_and_views_of_a_date_do_not():
     scene = Scene(ImageOptions(size=(200, 160), views=4, sun_azimuth=(150.0, 230.0), change=0.3))
     assert [shot.date for shot in scene.shots] == [0, 1, 0, 1]
@@ -185,6 +188,7 @@ def test_the_command_prints_the_images_that_it_wrote(tmp_path):
     assert json.loads((out / "truth.json").read_text())["options"]["drift"] == pytest.approx(5e-6)
 
 
+@pytest.mark.slow
 def test_a_scene_across_the_antimeridian_is_like_any_other():
     scene = Scene(ImageOptions(size=(150, 120), lon=180.0, lat=-16.8, alt=20.0))
     picture = scene.picture(0)
@@ -194,6 +198,7 @@ def test_a_scene_across_the_antimeridian_is_like_any_other():
     assert np.isfinite(image).all()
 
 
+@pytest.mark.slow
 def test_another_turn_is_another_set_of_viewpoints(scene):
     other = Scene(ImageOptions(size=(200, 160), seed=3, turn=0.5))
     for a, b in zip(scene.shots, other.shots, strict=True):
@@ -201,6 +206,7 @@ def test_another_turn_is_another_set_of_viewpoints(scene):
         assert apart > 5.0 or abs(a.look.incidence - b.look.incidence) > 1.0
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("side", [600, 1000])
 def test_the_line_method_finds_the_camera_centre_of_small_images_within_two_percent(side):
     for shot in Scene(ImageOptions(size=(side, side))).shots:
@@ -215,6 +221,7 @@ def test_three_views_of_600_pixels_take_seconds(tmp_path):
     assert time.process_time() - start < 15.0  # CPU s; some 2 on a machine of its own
 
 
+@pytest.mark.slow
 def test_a_picture_made_in_strips_is_the_picture(monkeypatch):
     scene = Scene(replace(SMALL, snr=0.0))
     whole = scene.picture(1)
@@ -228,6 +235,7 @@ def test_a_picture_made_in_strips_is_the_picture(monkeypatch):
     np.testing.assert_array_equal(noisy.numbers, Scene(SMALL).picture(1).numbers)
 
 
+@pytest.mark.slow
 def test_ground_beyond_what_is_made_is_its_mirror_image_with_all_that_stands_on_it(monkeypatch):
     monkeypatch.setattr(images, "MIRRORED", 60)
     surface = Scene(replace(SMALL, buildings=60.0)).surfaces[0]

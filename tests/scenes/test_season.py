@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import rasterio
 from scipy import ndimage
 
@@ -12,6 +13,7 @@ from tests.scenes.redrawn import redrawn
 from tests.scenes.season import other_season, write_dem, write_reference
 
 
+@pytest.mark.slow
 def test_a_season_changes_what_it_says(tmp_path):
     scene = Scene(ImageOptions(views=1, size=(200, 200), buildings=2.0))
     grey = scene.surfaces[0].ground.values

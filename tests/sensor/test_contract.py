@@ -30,6 +30,7 @@ def test_projecting_a_localised_point_gives_it_back(case, image_alt):
     np.testing.assert_allclose(case.model.project(ground), image, rtol=0, atol=2e-6)
 
 
+@pytest.mark.few(9)
 def test_the_jacobian_is_the_central_difference(case, image_alt):
     ground = case.model.localize(*image_alt)
     value, jacobian = case.model.project_jacobian(ground)
@@ -45,6 +46,7 @@ def test_the_jacobian_is_the_central_difference(case, image_alt):
         np.testing.assert_allclose(jacobian[..., axis], difference, rtol=0, atol=2e-5 * scale)
 
 
+@pytest.mark.few(5)
 def test_leading_axes_broadcast(case, image_alt):
     image, alt = image_alt
     ground = case.model.localize(image.reshape(4, 50, 2), alt.reshape(4, 50))
@@ -60,6 +62,7 @@ def test_leading_axes_broadcast(case, image_alt):
     assert case.model.localize(np.empty((0, 2)), np.empty(0)).shape == (0, 3)
 
 
+@pytest.mark.few(5)
 def test_one_bad_point_is_nan_and_harms_no_other(case, image_alt):
     image, alt = image_alt
     ground = case.model.localize(image, alt)
@@ -81,6 +84,7 @@ def test_one_bad_point_is_nan_and_harms_no_other(case, image_alt):
     np.testing.assert_allclose(located[others], ground[others], rtol=0, atol=1e-12)
 
 
+@pytest.mark.few(5)
 def test_whole_turns_of_longitude_change_nothing(case, image_alt):
     ground = case.model.localize(*image_alt)
     for turn in (-360.0, 360.0):
@@ -89,6 +93,7 @@ def test_whole_turns_of_longitude_change_nothing(case, image_alt):
     assert np.abs(wrap_longitude(ground[:, 0], ground[0, 0]) - ground[:, 0]).max() < 1e-12
 
 
+@pytest.mark.few(5)
 def test_a_model_survives_pickling_and_compares_by_content(case, image_alt):
     copy = pickle.loads(pickle.dumps(case.model))
     assert copy == case.model

@@ -51,6 +51,7 @@ def test_an_rpc_and_its_correction_are_the_camera_between_the_nodes(camera):
     assert np.linalg.norm(camera.project(back) - image, axis=1).max() < LINEAR
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("period", [1024.0, 512.0, 256.0])
 def test_no_wave_hides_between_the_nodes(period):
     """Periods of the very distances that are tried first: nodes that meet a wave at one phase see nothing of it."""
@@ -72,6 +73,7 @@ def test_a_step_between_detectors_is_met_as_near_as_nodes_may_stand():
     assert len(rows) == 9
 
 
+@pytest.mark.slow
 def test_a_grid_of_millions_of_nodes_is_not_made():
     def noise(points):
         return np.sin(1e4 * points[:, :1] * points[:, 1:2]) * np.sin(77.0 * points[:, 2:])
@@ -106,6 +108,7 @@ def test_a_grid_of_a_narrow_image_is_inverted_everywhere():
     assert np.abs(DirectGrid.of(camera, size, alts).project(ground) - image).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_a_looser_promise_takes_fewer_nodes(camera):
     fine, coarse = (DirectGrid.of(camera, SIZE, ALTS, tolerance).lonlat.size for tolerance in (0.005, 0.05))
     assert 10 * coarse < fine

@@ -158,6 +158,7 @@ STATES = {
 }
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", STATES)
 def test_pixels_look_where_the_library_says(name, tmp_path):
     state = STATES[name]
@@ -217,6 +218,7 @@ LIES: dict[str, tuple[State, str]] = {
 }
 
 
+@pytest.mark.few(6)
 @pytest.mark.parametrize("lie", LIES)
 def test_a_state_that_lies_is_said_in_one_line(lie, tmp_path):
     change, words = LIES[lie]
@@ -242,6 +244,7 @@ def delivered(folder: Path, name: str) -> tuple[object, State]:
     return open_camera(path), json.loads(text[text.index("{") :])
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("name", "size"),
     [
@@ -279,6 +282,7 @@ def corrected(model: object, rows: int) -> Corrected:
     return Corrected(model, Correction(turn, move, model.position(middle), drift, row_offset=middle, row_scale=middle))
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("changes", [{"m_opticalDistCoeffs": [0.0] * 3}, {"m_opticalDistCoeffs": [1e-3, 0.0, 0.0]}])
 @pytest.mark.parametrize("flipped", [False, True])
 def test_a_corrected_camera_is_written_as_a_state_that_the_library_reads_as_meant(changes, flipped, tmp_path):
@@ -291,7 +295,9 @@ def test_a_corrected_camera_is_written_as_a_state_that_the_library_reads_as_mean
     ground = moved.localize(image, alt)
     np.testing.assert_allclose(again.model.project(ground), image, rtol=0, atol=1e-5)
     text = (tmp_path / "b.json").read_text()
-    assert offset(json.loads(text[text.index("{") :]), ground, image) < 1e-3  # m: pixels of 7
+    state = json.loads(text[text.index("{") :])
+    assert offset(state, ground, image) < 1e-3  # m: pixels of 7
+    assert state["m_halfSwath"] == pytest.approx(state["m_gsd"] * SIZE[0] / 2.0, rel=0.1)
     off = np.abs(model.project(ground) - image).max()
     assert off > 0.5  # the correction is seen
 

@@ -81,6 +81,7 @@ def vectors(time: np.ndarray, sigma: tuple[float, float, float] = (0.0, 0.0, 0.0
     return noisy, velocity + sigma[2] * rng.normal(size=velocity.shape)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("count", "degree"), [(12, 5), (9, 4), (20, 8)])
 def test_standard_deviations_of_state_vectors_are_found_as_large_as_they_are(count: int, degree: int) -> None:
     time, true = np.linspace(-60, 60, count), (3e-3, 8e-4, 2e-3)
@@ -161,6 +162,7 @@ def test_an_orbit_needs_four_vectors(count: int, ok: bool) -> None:
             fit_orbit(time, position, velocity, (0.0, 5.0))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("scatter", "ok"), [(0.5, True), (2.0, False)])
 def test_vectors_that_scatter_by_more_than_a_metre_are_no_orbit(scatter: float, ok: bool) -> None:
     time = np.linspace(-60, 60, 25)

@@ -159,6 +159,7 @@ _CORNERS = np.array(
 )
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("aberration", "refraction", "low", "high"),
     [(True, True, 0.0, 0.06), (True, False, 1.0, 1.2), (False, True, 18, 19), (False, False, 19, 20)],
@@ -360,6 +361,7 @@ LIES = {
 }
 
 
+@pytest.mark.few(9)
 @pytest.mark.parametrize("lie", LIES)
 def test_a_file_that_lies_gives_one_line(tmp_path, lie):
     text, words = LIES[lie]

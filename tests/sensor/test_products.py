@@ -62,6 +62,7 @@ def first() -> Annotation:
 # --- which file ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("there", "taken", "as_zip"),
     [
@@ -157,6 +158,7 @@ def test_an_error_names_the_product_or_the_orbit_file_that_is_guilty(tmp_path):
         open_product(path, orbit=str(tmp_path / "a.EOF"))
 
 
+@pytest.mark.slow
 def test_a_camera_takes_the_choices_of_a_product(tmp_path):
     path = product_of(tmp_path / "x.SAFE", called("iw1", "vv"), called("iw2", "vv"), called("iw3", "vh"))
     for spec, size in (
@@ -288,6 +290,7 @@ def test_a_grid_whose_times_scatter_by_more_than_ten_microseconds_tells_no_corre
             RangeDoppler.from_annotation(annotation, bistatic="annotated")
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("samples", "lines", "warned"),
     [(4.8, 0.0, False), (5.2, 0.0, True), (0.0, 4.8, False), (0.0, -5.2, True)],

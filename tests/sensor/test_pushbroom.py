@@ -225,6 +225,7 @@ def test_a_shaking_attitude_still_inverts(sensor, points):
         assert np.abs(difference - jacobian[..., axis]).max() < 1e-5 * np.abs(jacobian[..., axis]).max()
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("angle", [30.0, 90.0, 135.0, 180.0])
 def test_the_axes_of_the_camera_may_be_turned_about_its_line_of_sight(sensor, points, angle):
     """The same camera, its detector along any direction of its own axes."""

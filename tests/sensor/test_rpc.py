@@ -71,6 +71,7 @@ def test_localising_inside_the_box_is_exact_but_for_the_rounding_of_degrees(file
     assert error <= 3e-9
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("file", "reach", "count"), FAR)
 def test_far_out_no_point_raises_and_none_is_silently_wrong(file, reach, count, shared_data):
     rpc = read_rpc(shared_data / file)
@@ -84,6 +85,7 @@ def test_far_out_no_point_raises_and_none_is_silently_wrong(file, reach, count, 
         assert found.all()
 
 
+@pytest.mark.few(2)
 @few_vendors
 def test_a_point_found_far_out_lies_on_the_sheet_of_the_centre(file, shared_data):
     """A quotient of cubics has other preimages; across a pole or a fold they are no view of the camera."""

@@ -96,6 +96,7 @@ def safe(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # --- geometry against an exact orbit
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "product",
     [
@@ -114,6 +115,7 @@ def test_times_are_those_of_the_exact_orbit(product: Product) -> None:
     assert np.abs(range_time - truth[1]).max() * SAMPLING <= 1e-6
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("delays", [{}, {"atmosphere": True}, {"bistatic": "annotated"}, {"bistatic": "full"}])
 def test_localisation_inverts_projection_from_the_dead_sea_to_everest(iw1: Product, delays: dict[str, bool]) -> None:
     built = RangeDoppler.from_annotation(read_annotation(iw1.xml()), **delays)
@@ -274,6 +276,7 @@ def test_a_burst_is_a_window_of_the_stitched_frame(iw1: Product, model: RangeDop
         assert np.abs(shifted - model.project(ground)).max() <= 1e-6
 
 
+@pytest.mark.slow
 def test_swaths_stand_side_by_side_in_the_mosaic() -> None:
     annotations = [read_annotation(product.xml()) for product in IW.values()]
     whole = mosaic(annotations)
@@ -434,6 +437,7 @@ def _without(xml: bytes, tag: bytes) -> bytes:
     return xml[:start] + xml[stop:]
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("index", range(13), ids=[what for what, _, _ in broken(IW["IW1"].xml())])
 def test_a_broken_annotation_is_refused_with_what_and_where(iw1: Product, index: int) -> None:
     _, xml, message = list(broken(iw1.xml()))[index]
@@ -527,6 +531,7 @@ def test_an_rpc_of_a_swath_keeps_a_thousandth_of_a_pixel_and_its_rows_to_the_flo
     assert fit.rmse_ckp[1] <= 1e-6
 
 
+@pytest.mark.slow
 def test_an_rpc_of_a_moved_swath_is_fitted_by_the_same_function(model: RangeDoppler) -> None:
     center = model.orbit.states(np.array([12.0]))[0][:, 0]
     moved = Corrected(model, Correction([1e-6, -2e-6, 1e-6], [5.0, -3.0, 2.0], center))
@@ -580,6 +585,7 @@ def _of_three(shared_data: Path) -> list[Path]:
     return sorted((shared_data / "radar" / "s1_three_swaths").glob("*_iw[13].xml"))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("number", rest_slow(range(-1, 10), keep=2))
 def test_a_downlinked_orbit_meets_the_grid_by_the_velocities_it_states(shared_data: Path, number: int) -> None:
     """They are not the derivatives of its positions, by which rows are 0.005 to 0.12 lines off."""
@@ -595,6 +601,7 @@ def test_a_downlinked_orbit_meets_the_grid_by_the_velocities_it_states(shared_da
     assert np.abs(grid_residuals(annotation, derived)[:, 1]).max() > 0.012
 
 
+@pytest.mark.slow
 def test_velocities_that_only_scatter_are_not_followed(shared_data: Path) -> None:
     """A smooth difference of 10 mm/s is; the same as noise is not, nor one of a tenth of a millimetre."""
     annotation = read_annotation(annotation_path(shared_data, AUXILIARY[0]))

@@ -39,6 +39,7 @@ def model_of(tmp_path):
     return make
 
 
+@pytest.mark.few(4)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # sarkit's own
 @pytest.mark.parametrize(("kind", "side"), CASES)
 def test_pixels_lie_where_another_implementation_says(kind, side, tmp_path):
@@ -60,6 +61,7 @@ def test_pixels_lie_where_another_implementation_says(kind, side, tmp_path):
     np.testing.assert_allclose(seen / model.spacing, plane / model.spacing, rtol=0, atol=1e-7)  # px
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(("kind", "side"), CASES)
 def test_range_and_rate_of_a_localised_point_are_those_that_the_document_states(kind, side, model_of):
     """From the definitions: the distance to ARPPoly at the time of the pixel, and how fast that distance changes."""
@@ -140,6 +142,7 @@ def test_a_document_stands_behind_all_that_a_nitf_holds(images, graphics, texts,
         open_sicd(path)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_rpc_holds_the_image(kind, model_of):
     model = model_of(kind)

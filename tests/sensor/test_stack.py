@@ -27,6 +27,7 @@ def sensors():
     return views
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("reach", [1.0, 3.0])
 @pytest.mark.parametrize("counts", [(5, 0, 40, 7, 3, 60), (0, 0, 0, 1, 0, 0), (1500, 1, 1, 0, 9000, 2)])
 def test_ground_points_are_those_of_each_camera(sensors, counts, reach):

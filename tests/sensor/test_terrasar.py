@@ -97,6 +97,7 @@ LIES = {
 }
 
 
+@pytest.mark.few(6)
 @pytest.mark.parametrize("lie", [*NOT_READ, *LIES])
 def test_what_is_not_read_or_lies_is_said_in_one_line(tmp_path, lie):
     path = Terrasar().write(tmp_path)
@@ -164,6 +165,7 @@ def opened(path, old, new):
     return open_terrasar(path)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(("tag", "count"), [("Rows", SIZE[1]), ("Columns", SIZE[0])])
 @pytest.mark.parametrize(("off", "ok"), [(1, True), (-1, True), (3, False), (-3, False)])
 def test_rows_and_columns_last_as_long_as_their_number_to_two(tmp_path, tag, count, off, ok):
@@ -187,6 +189,7 @@ def test_no_signal_is_late_by_more_than_a_millisecond(tmp_path, late, ok):
             open_terrasar(path)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("rows", "columns", "warned"), [(4.9, 0, False), (5.1, 0, True), (0, -4.9, False), (0, 5.1, True)]
 )
@@ -214,6 +217,7 @@ def test_state_vectors_are_those_of_the_earth(tmp_path):
     assert not whole.delays
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("mode", ["SM", "SL", "HS", "HS300", "ST"])
 def test_stripmaps_and_spotlights_are_read(tmp_path, mode):
     path = Terrasar().write(tmp_path)

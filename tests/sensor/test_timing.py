@@ -28,6 +28,7 @@ def model_of(kind: str, folder: Path) -> Clocked:
     return RangeDoppler.from_annotation(annotation, **more)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("kind", MODELS)
 def test_derivatives_by_range_and_azimuth_time_are_central_differences(kind, tmp_path):
     model, rng = model_of(kind, tmp_path), np.random.default_rng(3)
@@ -107,6 +108,7 @@ def test_a_timing_of_nothing_is_refused():
             Timing(coeffs, 0.0, scale)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("kind", "delays", "wanted"),
     [

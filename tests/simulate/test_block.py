@@ -207,6 +207,7 @@ def test_points_lie_at_all_altitudes_that_were_asked_for_and_all_over_the_block(
     assert [view.name for view in block.views[:2]] == ["view_0000", "view_0001"]
 
 
+@pytest.mark.slow
 def test_fewer_observations_are_made_where_less_is_visible():
     lengths = [np.bincount(simulate_block(9, 400, seed=2, visible=share).tracks.point).mean() for share in (1.0, 0.6)]
     assert lengths[1] < 0.85 * lengths[0]

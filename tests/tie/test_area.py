@@ -159,6 +159,7 @@ JSON = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
 @given(JSON)
 def test_any_json_is_an_area_or_one_line(tmp_path_factory, data) -> None:

@@ -78,6 +78,7 @@ def test_a_shift_is_found_whatever_the_grey_values(date):
     assert np.quantile(np.abs(error), 0.95) < 0.25
 
 
+@pytest.mark.slow
 def test_what_is_not_there_does_not_beat_its_decoy():
     found = find(seen(texture(1)), seen(texture(3)), places(), HALF, SEARCH)
     won = found.score > found.decoy
@@ -85,6 +86,7 @@ def test_what_is_not_there_does_not_beat_its_decoy():
     assert found.passed(0.1).mean() < 0.05
 
 
+@pytest.mark.slow
 def test_beyond_the_search_nothing_is_found():
     picture = texture(1)
     there = np.roll(moved(picture), 14, axis=1)

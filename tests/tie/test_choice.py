@@ -300,6 +300,7 @@ def test_a_year_that_closes_ties_every_view_by_two_paths(monkeypatch) -> None:
     assert len(set(twice_tied(40, tied))) == 1
 
 
+@pytest.mark.slow
 def test_a_view_under_clouds_is_given_up_after_some_tries_and_nothing_else_is_lost(monkeypatch) -> None:
     looks = Looks(monkeypatch, lambda i, j: 5 not in (i, j))
     tried, tied = looks.run(dated(40, days(40)))

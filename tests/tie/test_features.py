@@ -13,8 +13,9 @@ from barpc.pipeline.executor import CachingExecutor
 from barpc.scene import View
 from barpc.tie import TieOptions, detect
 from barpc.tie.matchers import features
-from barpc.tie.matchers.features import KeypointFiles, Share, _an_octave_up, detect_tile, quota
+from barpc.tie.matchers.features import KeypointFiles, Share, _an_octave_up, detect_tile, locate, quota
 from barpc.tie.pixels import survey, tiles
+from barpc.tie.tasks import Work, store_of
 from barpc.workspace import Workspace
 from tests.constants import chosen
 
@@ -120,6 +121,41 @@ def test_views_of_one_name_keep_their_own_keypoints(tmp_path, texture) -> None:
     alone = [detect([v])[0] for v in (one, other)]
     for found, expected in zip(detect([one, other]), alone, strict=True):
         np.testing.assert_array_equal(found.xy, expected.xy)
+
+
+def test_every_view_has_the_files_of_its_own_tiles(tmp_path, texture) -> None:
+    """Of two views of two tiles and one; a coarse look's have names of their own."""
+    sizes = {"a": (100, 200), "b": (100, 120)}
+    views = [
+        view(write_image(tmp_path / f"{name}.tif", np.ascontiguousarray(texture[: size[1], : size[0]])), size)
+        for name, size in sizes.items()
+    ]
+    options, alone = TieOptions(tile=128), []
+    for one in views:
+        with store_of(None) as store:
+            alone.append(locate([one], options, Work(store=store))[0].load()[0].xy)
+    with store_of(None) as store:
+        both = locate(views, options, Work(store=store))
+        coarse = locate(views, options, Work(store=store), coarse=True)
+        assert [found.boxes for found in both] == [((0, 0, 100, 128), (0, 128, 100, 72)), ((0, 0, 100, 120),)]
+        assert [len(found.names) for found in both] == [len(found.counts) for found in both] == [2, 1]
+        for found, xy in zip(both, alone, strict=True):
+            assert len(found) == len(xy) > 0
+            np.testing.assert_array_equal(found.load()[0].xy, xy)
+        assert [name for found in coarse for name in found.names if not name.endswith("-coarse")] == []
+
+
+def test_cells_hold_more_where_less_of_an_image_is_looked_at(tmp_path, texture, monkeypatch) -> None:
+    """Keypoints wanted of an image are those of its part that is read."""
+    parts: list[float] = []
+    within = Share.within
+    monkeypatch.setattr(Share, "within", lambda self, part: parts.append(part) or within(self, part))
+    one = view(write_image(tmp_path / "a.tif", np.ascontiguousarray(texture[:200, :300])), (300, 200))
+    monkeypatch.setattr(features, "shared_tiles", lambda views, pairs, options, area, boxes: [boxes[0][:1]])
+    with store_of(None) as store:
+        locate([one], TieOptions(tile=128), Work(store=store))
+        locate([one], TieOptions(tile=128), Work(store=store), pairs=[])
+    assert parts == [1.0, pytest.approx(300 * 128 / (300 * 200))]
 
 
 @pytest.mark.slow

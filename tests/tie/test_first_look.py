@@ -122,6 +122,7 @@ def test_points_of_two_looks_are_not_taken_for_each_other(render, looks, monkeyp
         assert np.sqrt((errors**2).mean(axis=0)).max() <= 0.1
 
 
+@pytest.mark.slow
 def test_images_of_several_dates_are_looked_at_closely_at_once(scene, looks) -> None:
     """What two dates have in common may be fine, and little."""
     dated = [replace(v, date=f"2020-0{k + 1}-01") for k, v in enumerate(scene.views)]

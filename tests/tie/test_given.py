@@ -90,6 +90,7 @@ def test_pairs_that_are_not_given_are_matched_and_points_in_common_are_one_track
         assert typical(scene, result.tracks, *pair) <= 0.1
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_wrong_by_hundreds_of_pixels_does_not_refuse_them(render) -> None:
     scene = render(views=2, size=(300, 300))
     first, second = scene.views

@@ -111,6 +111,7 @@ def test_every_option_has_a_row() -> None:
     assert set(ELSEWHERE.values()) <= set(globals())
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.field)
 def test_an_option_changes_the_result_in_its_direction(scene: Rendered, row: Row) -> None:
     found = []
@@ -153,6 +154,7 @@ def _offset(scene: Rendered) -> tuple[float, float]:
     return float(along), float(across)
 
 
+@pytest.mark.slow
 def test_the_band_that_is_asked_for_is_matched(scene: Rendered, tmp_path) -> None:
     stacked = []
     for view in scene.views:

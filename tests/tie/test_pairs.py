@@ -52,6 +52,7 @@ def test_pairs_do_not_depend_on_where_longitudes_wrap(lon: float) -> None:
     assert pair.overlap == pytest.approx(0.8, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [100, pytest.param(1000, marks=pytest.mark.slow)])
 def test_a_thousand_views_get_their_best_partners_and_not_all_pairs(count: int) -> None:
     grid = [camera(400 * METRE * (k % 40), 400 * METRE * (k // 40)) for k in range(count)]

@@ -27,6 +27,7 @@ def test_every_real_type_is_read_and_stretched_over_the_whole_range(tmp_path, dt
     assert picture.max() > 240
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
     ("dtype", "ratio", "offset"),
     [

@@ -107,6 +107,7 @@ def test_the_correlation_told_is_that_of_the_patches(texture, reference) -> None
     assert np.abs(off).max() < 0.05
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("zoom", [1.0, 1.3])
 def test_enough_is_read_about_a_place_for_the_patch_and_its_interpolation(texture, tmp_path, zoom) -> None:
     """One place at a time, from files, is registered as in the whole images."""

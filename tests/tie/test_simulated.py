@@ -129,6 +129,7 @@ def altered(view: View, folder, change) -> View:
     return replace(view, path=str(write_image(folder / f"{view.name}.tif", data)))
 
 
+@pytest.mark.slow
 def test_tie_points_hold_where_both_images_saturate(render, tmp_path) -> None:
     scene = render(views=2, size=(300, 300))
     bright = [altered(view, tmp_path, lambda d: np.minimum(d, 1200)) for view in scene.views]
@@ -161,6 +162,7 @@ def test_any_real_pixel_type_works(render, tmp_path, change, side: int) -> None:
     assert find_tracks(views).tracks.num_points > 400 * (side / 600) ** 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", SIDES_AT_NIGHT)
 @pytest.mark.parametrize(
     "change",
@@ -212,6 +214,7 @@ def test_what_does_not_match_is_refused_by_name_with_counts_and_advice(pair, tmp
     assert "\n" not in text
 
 
+@pytest.mark.slow
 def test_a_view_that_matches_no_other_is_named(render, tmp_path) -> None:
     views = list(render(views=3, size=(300, 300)).views)
     views[2] = altered(views[2], tmp_path, np.zeros_like)

@@ -108,6 +108,7 @@ def test_a_share_lasts_when_the_cameras_move_a_little() -> None:
 # --- by reference ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_caller_never_loads_keypoints(render, monkeypatch) -> None:
     inside, load = [], KeypointFiles.load
 
