@@ -271,14 +271,14 @@ def passes(
         ([0, 10], [1.0], [1.0], {}, 2),  # a thousandth
         ([0, 11], [1.0], [1.0], {}, 3),
         ([0, 11, 22, 33, 44, 55, 66, 77], [1.0], [1.0], {}, 6),  # and no more than six
-        ([0], [1.0, 1.0, 1.019], [1.0], {}, 2),
-        ([0], [1.0, 1.0, 1.021], [1.0], {}, 3),
-        ([0], [1.0, 1.0, 0.979], [1.0], {}, 3),
+        ([0], [1.0, 1.0, 1.049], [1.0], {}, 2),
+        ([0], [1.0, 1.0, 1.051], [1.0], {}, 3),
+        ([0], [1.0, 1.0, 0.949], [1.0], {}, 3),
         ([0], [1.0, 1.0, 2.0], [1.0], {"estimate_noise": False}, 2),
         ([0], [1.0], [1.0, 1.0, 1.21], {}, 2),  # a fifth, as a logarithm
         ([0], [1.0], [1.0, 1.0, 1.23], {}, 3),
         ([0], [1.0], [1.0, 1.0, 0.81], {}, 3),
-        ([0], [1.0, 1.03], [1.0], {"loss": "linear"}, 2),
+        ([0], [1.0, 1.06], [1.0], {"loss": "linear"}, 2),
         ([0], [1.0], [1.0, 1.3], {"loss": "linear"}, 2),
     ],
 )
@@ -291,9 +291,9 @@ def test_rounds_end_where_cut_noise_and_priors_stand(monkeypatch, cut, noise, pr
     [
         ([0], [1.0], [1.0], 1),  # what was known before stands
         ([11], [1.0], [1.0], 2),
-        ([0], [1.0, 1.021], [1.0], 2),
+        ([0], [1.0, 1.051], [1.0], 2),
         ([0], [1.0], [1.0, 1.23], 2),
-        ([10], [1.0, 0.981], [1.0, 0.82], 1),
+        ([10], [1.0, 0.951], [1.0, 0.82], 1),
     ],
 )
 def test_rounds_that_go_on_from_an_outcome_end_at_once_where_nothing_changes(
@@ -305,14 +305,14 @@ def test_rounds_that_go_on_from_an_outcome_end_at_once_where_nothing_changes(
 @pytest.mark.parametrize(
     ("cut", "options", "revived"),
     [
-        ([99], {}, []),
-        ([101], {}, [2]),  # more than a hundredth, and not before the first
-        ([101, 50, 50], {}, [2]),
-        ([50, 101, 150, 150], {}, [3, 4]),
-        ([101], {"loss": "linear"}, []),
+        ([499], {}, []),
+        ([501], {}, [2]),  # more than a twentieth, and not before the first
+        ([501, 250, 250], {}, [2]),
+        ([250, 501, 750, 750], {}, [3, 4]),
+        ([501], {"loss": "linear"}, []),
     ],
 )
-def test_tracks_are_revived_where_more_than_a_hundredth_was_cut(monkeypatch, cut, options, revived) -> None:
+def test_tracks_are_revived_where_more_than_a_twentieth_was_cut(monkeypatch, cut, options, revived) -> None:
     assert passes(monkeypatch, cut, [1.0], [1.0], **options)[1] == revived
 
 
