@@ -305,14 +305,14 @@ def test_rounds_that_go_on_from_an_outcome_end_at_once_where_nothing_changes(
 @pytest.mark.parametrize(
     ("cut", "options", "revived"),
     [
-        ([499], {}, []),
-        ([501], {}, [2]),  # more than a twentieth, and not before the first
-        ([501, 250, 250], {}, [2]),
-        ([250, 501, 750, 750], {}, [3, 4]),
-        ([501], {"loss": "linear"}, []),
+        ([99], {}, []),
+        ([101], {}, [2]),  # more than a hundredth, and not before the first
+        ([101, 50, 50], {}, [2]),
+        ([50, 101, 150, 150], {}, [3, 4]),
+        ([101], {"loss": "linear"}, []),
     ],
 )
-def test_tracks_are_revived_where_more_than_a_twentieth_was_cut(monkeypatch, cut, options, revived) -> None:
+def test_tracks_are_revived_where_more_than_a_hundredth_was_cut(monkeypatch, cut, options, revived) -> None:
     assert passes(monkeypatch, cut, [1.0], [1.0], **options)[1] == revived
 
 

@@ -311,15 +311,15 @@ def test_two_ways_with_the_same_parts_are_one_the_better(monkeypatch) -> None:
 
 
 def test_a_swing_or_a_motion_below_the_floor_is_nothing() -> None:
-    each = search(floor=0.1)  # of which three are asked
+    each = search(floor=0.1)  # of which two and a half are asked
     for size, nothing in ((0.99, True), (1.01, False)):
-        parts = size * 0.3 * np.array([0.36, 0.48, 0.48, 0.64])
+        parts = size * 0.25 * np.array([0.36, 0.48, 0.48, 0.64])
         assert each._is_nothing(four(), fitted(extra=[7.0, *parts])) == nothing
         moving = np.array([0.6, 0.4, 0.9, 0.0, 0.0, 0.0])
         by_move = np.zeros((2, 1, 6))
         by_move[0, 0, [0, 1]], by_move[1, 0, 2] = [1.0, 50.0], 7.0  # a mean square of 25
         group: Any = SimpleNamespace(by_move=by_move)
-        found = fitted(moving=moving, move=np.array([0.06 * size]))
+        found = fitted(moving=moving, move=np.array([0.05 * size]))
         assert each._is_nothing(explained(MOVING, -1, group=group), found) == nothing
         still = replace(found, moving=0.5 * np.ones(6))
         assert not each._is_nothing(explained(MOVING, -1, group=group), still)

@@ -17,16 +17,15 @@ import scipy.sparse as sp
 from barpc.ba.estimated.priors import CameraPrior, EarlierScene, JointPrior
 from barpc.ba.estimated.waves import Waves
 from barpc.ba.held.gauge import MOTIONS
-from barpc.ba.usual import LARGEST
 from barpc.base.errors import InputError
 from barpc.base.frozen import load_npz
 from barpc.base.geodesy import Array
-from barpc.base.sidefile import ARRAYS
-from barpc.base.sidefile import LARGEST as LARGEST_NUMBER
+from barpc.base.sidefile import ARRAYS, LARGEST
 
 PRIOR = replace(ARRAYS, words="the prior of an adjusted block")
 _SPARSE = ("data", "indices", "indptr")
 _SCENE = ("by_unknown", "own", "radius")
+_LARGEST = 20_000  # unknowns of a block that is gone on from: its matrix is dense then
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,10 +173,10 @@ class BlockPrior:
         """Return the information matrix as an array."""
         if isinstance(self.information, np.ndarray):
             return self.information
-        if self.params.size > LARGEST:  # its matrix is dense then
+        if self.params.size > _LARGEST:
             raise InputError(
                 f"the earlier block has {len(self.names)} views, too many to go on from: at most "
-                f"{LARGEST // self.params.shape[1]}; adjust all images together"
+                f"{_LARGEST // self.params.shape[1]}; adjust all images together"
             )
         matrix: Array = self.information.toarray()
         return matrix if self.less is None else matrix - self.less.T @ self.less
@@ -189,14 +188,14 @@ def _is_scene(scene: EarlierScene, size: int) -> bool:
     return (
         tuple(array.shape for array in arrays) == ((count, size), (count, count))
         and all(array.dtype == np.float64 and _is_plain(array) for array in arrays)
-        and 0.0 < scene.radius <= LARGEST_NUMBER
+        and 0.0 < scene.radius <= LARGEST
     )
 
 
 def _is_plain(array: Array | sp.csr_array) -> bool:
     """Return whether all numbers are finite, and their squares."""
     numbers = array.data if sp.issparse(array) else array
-    return bool((np.abs(np.asarray(numbers)) <= LARGEST_NUMBER).all())
+    return bool((np.abs(np.asarray(numbers)) <= LARGEST).all())
 
 
 def _csr(file: Mapping[str, Array], size: int) -> sp.csr_array:

@@ -35,12 +35,13 @@ from barpc.ba.judging.moving import Found, Ground, Motion, group_of
 from barpc.ba.robust.rounds import Outcome, revived
 from barpc.ba.robust.weights import Observations
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import BACKFITTING, KEPT, LARGEST, RIVALS, SAMPLE, SMALL, SURE, SURELY, TRIED
+from barpc.ba.usual import BACKFITTING, KEPT, LARGEST, RIVALS, SAMPLE, SMALL, SURE, TRIED
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 _LOG = logging.getLogger(__name__)
 
+_SEEN = 2.5  # floors: swings and motions that are taken; sound crops show swings of 1.8, where ties share errors
 OBSERVATIONS = KEPT
 """Of a block, up to which parts of it are judged."""
 _NEAREST = 12  # views of a part
@@ -407,7 +408,7 @@ class _Search:
         elif one.group is not None and (found.moving > 0.5).any():
             away = np.einsum("cmk,m->ck", one.group.by_move[:, :, found.moving > 0.5], found.move)
             size = float(np.sqrt((away**2).sum(axis=0).mean()))
-        return bool(size < self.floor * SURELY)  # sound crops show swings of 1.8, where ties share errors
+        return bool(size < self.floor * _SEEN)
 
     def _members(self, found: Fit, rows: BoolArray) -> Iterator[Explanation]:
         """Yield the parts of images that hold what a group does: rows that lie off move on the ground, too."""

@@ -40,6 +40,7 @@ _LOG = logging.getLogger(__name__)
 
 _SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each view by itself
 _LEAST_NOISE = 0.5  # of the stated sigmas, while outliers are about
+_MANY_CUT = 0.01  # of the observations: more are looked at again
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ class Rounds:
     def _cut_and_solve(self, once: bool) -> Outcome | None:
         """Return one pass; the outcome where it is the last."""
         options, was_in_use, noise = self.options, self.use, self.noise
-        many_cut = self.use.sum() < (1.0 - STANDS) * self.everything.sum()
+        many_cut = self.use.sum() < (1.0 - _MANY_CUT) * self.everything.sum()
         if self.robust and self.passes and many_cut:
             weight = self.everything / self.observations.sigma
             self.state, self.residual = revived(self.problem, self.state, self.residual, self.use, weight)
