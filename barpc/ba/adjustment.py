@@ -222,6 +222,7 @@ def _adjustment(found: Solution, parts: Parts, options: AdjustOptions, in_space:
     """Assemble the `Adjustment`, its points and observations in the order of the tracks given."""
     block, outcome, final = parts.inner, found.outcome, found.final
     covariance = outcome.minimum.covariance(found.problem.free)
+    method = covariance.factor.method
     cameras, is_tie = found.problem.cameras, found.problem.structure.point < block.num_tracks
     points, before, after = _met(found, parts)
     inlier = block.in_order(outcome.inlier)
@@ -243,7 +244,7 @@ def _adjustment(found: Solution, parts: Parts, options: AdjustOptions, in_space:
         noise=outcome.noise,
         cost_history=final.history,
         steps=len(final.history) - outcome.passes,
-        status=f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {covariance.factor.method}",
+        status=f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {method} factorisation",
         cameras=cameras,
         covariance=covariance,
         gauge=gauge,

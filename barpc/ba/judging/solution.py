@@ -30,7 +30,7 @@ from barpc.scene import BoolArray
 
 _TREND = MUCH_NOISE * FLOOR  # px: another model is tried
 _SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
-CLEARLY = 0.8  # of the noise, that another start is to leave at most, or of a view's observations at least
+CLEARLY = 0.8  # of what is left, that another start or model leaves at most; or of a view's observations, kept at least
 
 
 @dataclass(frozen=True, eq=False)
