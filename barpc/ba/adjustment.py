@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -69,8 +68,7 @@ def adjust_tracks(
     reference : Reference or None, control of an orthoimage and the terrain `dem`
     altimetry : Altimetry or None, heights that no image coordinates go with
     keep_largest, hold_out : bool
-        Go on with the largest group of views where they are not all connected; keep a tenth of the tracks out, to
-        measure the result on.
+        Go on with the largest group of connected views; keep a tenth of the tracks out, to measure the result on.
 
     Returns
     -------
@@ -90,7 +88,10 @@ def adjust_tracks(
     block = join(tuple(views), tracks, gcps, options, keep_largest, reference)
     rows = keep_out(block) if hold_out else np.zeros_like(block.use)
     parts = Parts(block, rows, np.zeros(len(rows), dtype=np.int64))
-    solve = partial(solve_block, dem=dem, centers=centers, prior=prior)
+
+    def solve(inner: Block, outer: Block, options: AdjustOptions) -> Solution:
+        return solve_block(inner, outer, options, dem, centers, prior)
+
     return replace(_solved(parts, options, solve, altimetry), seconds=time.process_time() - start)
 
 

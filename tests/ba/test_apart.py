@@ -174,7 +174,7 @@ def test_a_view_of_which_half_agrees_is_its_own(monkeypatch) -> None:
 
 
 def test_a_block_of_which_one_of_several_is_wrong_is_refused_with_their_names(monkeypatch) -> None:
-    def fails(*_: Any, **__: Any) -> Any:
+    def fails(*_: Any) -> Any:
         raise AdjustError("no step lowers the cost")
 
     told: Any = SimpleNamespace(views=(0, 2), clear=False)
