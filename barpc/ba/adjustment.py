@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from barpc.ba.altimetry import hold_by_altimetry
-from barpc.ba.apart import Apart, find_apart
+from barpc.ba.apart import Apart, Solver, find_apart
 from barpc.ba.evidence.scan import neighbours_alike
 from barpc.ba.held.block import Block, join
 from barpc.ba.held.datum import datum_shares
@@ -20,7 +20,7 @@ from barpc.ba.held.terrain import Terrain
 from barpc.ba.judging.following import follow, without_strips
 from barpc.ba.judging.judge import Finding, left_over, standing_out
 from barpc.ba.judging.snooping import image_test
-from barpc.ba.judging.solution import Solution, solve_block
+from barpc.ba.judging.solution import CLEARLY, Solution, solve_block
 from barpc.ba.placing import place
 from barpc.ba.result import Adjustment
 from barpc.ba.robust.consensus import two_groups
@@ -28,15 +28,13 @@ from barpc.ba.robust.heldout import enu_offsets, keep_out, measure
 from barpc.ba.robust.rounds import Outcome
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.standing import Parts, without_moving
-from barpc.ba.usual import CRITICAL, SAMPLE
+from barpc.ba.usual import CRITICAL, FLOOR, SAMPLE
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.options import AUTO, AdjustOptions
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Reference, Tracks, View
 from barpc.sensor.geometry import camera_center
 
-_WORTH = 0.004  # px that an affine must take away: it leaves the tilts of the scene open
-_CLEARLY_BETTER = 0.9  # the same, where the drift that was learnt is no drift
 _MUCH_BETTER = 0.7  # of the error on tracks that took no part: another model may do much to heights
 
 
@@ -62,18 +60,15 @@ def adjust_tracks(
         N views and their tie points; `Tracks.view` counts the views.
     options : AdjustOptions or None, None: the defaults
     gcps : GroundPoints or None, points of known position and where they are seen
-    dem : callable or None
-        lon, lat (n,) [deg] -> altitude (n,) [m above the ellipsoid], NaN outside.
-    centers : (N, 3) or None
-        Camera centres [m], ECEF; None: regressed from the sensors.
+    dem : callable or None, lon, lat (n,) [deg] -> altitude (n,) [m above the ellipsoid], NaN outside
+    centers : (N, 3) or None, camera centres [m], ECEF; None: regressed from the sensors
     prior : BlockPrior or None
         An earlier block, whose views are among these: its corrections and their joint covariance are the
         prior. `tracks` then holds new observations only.
     reference : Reference or None, control of an orthoimage and the terrain `dem`
     altimetry : Altimetry or None, heights that no image coordinates go with
     keep_largest, hold_out : bool
-        Go on with the largest group of views where they are not all connected; keep a tenth of the tracks out, to
-        measure the result on.
+        Go on with the largest group of connected views; keep a tenth of the tracks out, to measure the result on.
 
     Returns
     -------
@@ -83,10 +78,8 @@ def adjust_tracks(
     ------
     TiePointError, DisconnectedError
         A view has too few observations; the views fall into groups that share no tie point.
-    AdjustError
-        There is no usable solution.
-    InputError
-        Views, tracks and options contradict each other.
+    AdjustError, InputError
+        There is no usable solution; views, tracks and options contradict each other.
     """
     start = time.process_time()
     options = AdjustOptions() if options is None else options
@@ -95,17 +88,26 @@ def adjust_tracks(
     block = join(tuple(views), tracks, gcps, options, keep_largest, reference)
     rows = keep_out(block) if hold_out else np.zeros_like(block.use)
     parts = Parts(block, rows, np.zeros(len(rows), dtype=np.int64))
+
+    def solve(inner: Block, outer: Block, options: AdjustOptions) -> Solution:
+        return solve_block(inner, outer, options, dem, centers, prior)
+
+    return replace(_solved(parts, options, solve, altimetry), seconds=time.process_time() - start)
+
+
+def _solved(parts: Parts, options: AdjustOptions, solve: Solver, altimetry: Altimetry | None) -> Adjustment:
+    """Return the block solved by the model that the data choose, held by heights too where there are some."""
+    given = parts.inner, parts.outer
     try:
-        first, apart = _first(parts.inner, parts.outer, options, dem, centers, prior)
-        given = parts.inner, parts.outer
+        first, apart = _first(parts, options, solve)
         if apart is not None and apart.clear:
             parts = parts.without_view(apart.view)
-        found, in_space, parts = _choose_model(parts, options, dem, centers, prior, first)
+        found, in_space, parts = _choose_model(first, parts, options, solve)
         heights = None
         if altimetry is not None:
             found, heights = hold_by_altimetry(found, parts.inner, parts.outer, options, altimetry)
         found.heights.warn()
-        whole = replace(_adjustment(found, parts, options, in_space, start), altimetry=heights)
+        whole = replace(_adjustment(found, parts, options, in_space), altimetry=heights)
         if apart is None or not apart.clear:
             return replace(whole, apart=apart)
         return _with_apart(whole, apart, found, parts.inner, given, CRITICAL)
@@ -116,27 +118,18 @@ def adjust_tracks(
         ) from error
 
 
-def _first(
-    block: Block,
-    outer: Block,
-    options: AdjustOptions,
-    dem: Terrain | None,
-    centers: Array | None,
-    prior: BlockPrior | None,
-) -> tuple[Solution, Apart | None]:
-    """Return the block solved with the model to start with, without a view whose RPC is not its own where
-    there is one.
+def _first(parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[Solution, Apart | None]:
+    """Return the block solved with the model to start with, without a view whose RPC is not its own where there is one.
+
+    What goes on from an earlier block is not asked that.
     """
-
-    def solve(inner: Block, outer: Block) -> Solution:
-        return solve_block(inner, outer, options, dem, centers, prior)
-
-    first, failed = None, None
+    block, first, failed = parts.inner, None, None
     try:
-        first = solve(block, outer)
+        first = solve(block, parts.outer, options)
     except (AdjustError, np.linalg.LinAlgError) as error:
         failed = error
-    apart, without = find_apart(first, block, outer, options, solve) if prior is None else (None, None)
+    goes_on = first is not None and first.goes_on
+    apart, without = (None, None) if goes_on else find_apart(first, block, parts.outer, options, solve)
     if without is not None:
         return without, apart
     if first is not None:
@@ -188,48 +181,37 @@ def _with_apart(
 
 
 def _choose_model(
-    parts: Parts,
-    options: AdjustOptions,
-    dem: Terrain | None,
-    centers: Array | None,
-    prior: BlockPrior | None,
-    first: Solution | None = None,
+    first: Solution, parts: Parts, options: AdjustOptions, solve: Solver
 ) -> tuple[Solution, float | None, Parts]:
-    """Return the block solved; by an affine in the image where the data choose it, and what the model in
-    space left [px].
+    """Return the block, of which one model is solved, by that which the data choose, without ties that move.
 
-    Without ties that move. `first` is the block solved with the model to start with, where it was.
+    An affine in the image where it is much better; and what the model in space leaves then [px].
     """
-
-    def solve(parts: Parts) -> Solution:
-        return solve_block(parts.inner, parts.outer, options, dem, centers, prior)
-
-    found = solve(parts) if first is None else first
-    given = options.model != AUTO or options.drift is not None or prior is not None
-    before, in_image = found, None if given else _in_image(found, parts, options, dem)
-    judges = prior is None and found.problem.cameras.unknowns.geometric
+    given = options.model != AUTO or options.drift is not None or first.goes_on
+    found, in_image = first, None if given else _in_image(first, parts, options, solve)
+    judges = first.problem.cameras.unknowns.geometric and not first.goes_on
     if judges and (in_image is None or not _is_calm(in_image, parts.inner, options.noise_floor)):
         found, parts, judged = without_moving(found, parts, options, solve)
         found = without_strips(found, judged, parts.inner, parts.outer, options)
-    block, outer = parts.inner, parts.outer
-    if found is not before:
-        in_image = None if given else _in_image(found, parts, options, dem)
+    if found is not first:
+        in_image = None if given else _in_image(found, parts, options, solve)
     chosen, in_space = (found, None) if in_image is None else (in_image, found.after.whole_rms)
     if judges:
-        followed = follow(found, block, outer, options)
+        followed = follow(found, parts.inner, parts.outer, options)
         if chosen is found or followed.after.error < _MUCH_BETTER * chosen.after.error:
             return followed, None, parts
     return chosen, in_space, parts
 
 
-def _in_image(found: Solution, parts: Parts, options: AdjustOptions, dem: Terrain | None) -> Solution | None:
+def _in_image(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> Solution | None:
     """Solve the block with an affine in every image, where something is left for it and that is much better."""
     skew = found.is_skew
     if not (skew or found.has_trend):
         return None
-    tried = solve_block(parts.inner, parts.outer, replace(options, model="affine"), dem, None, None)
-    better = tried.after.error < (_CLEARLY_BETTER if skew else _MUCH_BETTER) * found.after.error
-    return tried if better and tried.after.whole_rms < found.after.whole_rms - _WORTH else None
+    tried = solve(parts.inner, parts.outer, replace(options, model="affine"))
+    better = tried.after.error < (CLEARLY if skew else _MUCH_BETTER) * found.after.error
+    # it leaves the tilts of the scene open: not for what no adjustment is asked for
+    return tried if better and tried.after.whole_rms < found.after.whole_rms - FLOOR else None
 
 
 def _is_calm(found: Solution, block: Block, floor: float) -> bool:
@@ -237,46 +219,33 @@ def _is_calm(found: Solution, block: Block, floor: float) -> bool:
     return not (found.has_trend or found.has_waves or standing_out(found.outcome, block, floor))
 
 
-def _adjustment(
-    found: Solution, parts: Parts, options: AdjustOptions, in_space: float | None, start: float
-) -> Adjustment:
+def _adjustment(found: Solution, parts: Parts, options: AdjustOptions, in_space: float | None) -> Adjustment:
     """Assemble the `Adjustment`, its points and observations in the order of the tracks given."""
-    block, outer, apart = parts.inner, parts.outer, parts.apart
-    outcome, final, seen = found.outcome, found.final, found.seen
-    delivered = found.problem.camera_prior.mean
-    moved = [measure(found.problem, params, apart) for params in (delivered, final.params)]
+    block, outcome, final = parts.inner, found.outcome, found.final
     covariance = outcome.minimum.covariance(found.problem.free)
-    cameras = found.problem.cameras
-    points = np.where(seen[:, None], final.points, np.nan)
-    for one in (found.after, moved[1]):
-        points[one.index] = one.points
+    method = covariance.factor.method
+    cameras, is_tie = found.problem.cameras, found.problem.structure.point < block.num_tracks
+    points, before, after = _met(found, parts)
     inlier = block.in_order(outcome.inlier)
     of_reference = 0 if block.reference is None else len(block.reference.points.view)
     ties = slice(0, len(inlier) - len(block.gcps.view) - of_reference)
-    is_tie = found.problem.structure.point < block.num_tracks
-    view = parts.block.in_order(parts.block.view)[ties]
-    before, after = (
-        (block.in_order(inside.T) + outer.in_order(outside.residual.T) + apart.in_order(gone.residual.T))[ties]
-        for inside, outside, gone in ((found.before, found.start, moved[0]), (outcome.residual, found.after, moved[1]))
-    )
     gauge, shares = _place(found, block, covariance)
-    status = f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {covariance.factor.method} factorisation"
     return Adjustment(
         names=block.names,
         sensors=cameras.unknowns.corrected(final.params, block.views),
         params=final.params,
         points=points[: block.num_tracks],
-        residuals_before=before,
-        residuals=after,
+        residuals_before=before[ties],
+        residuals=after[ties],
         inlier=inlier[ties],
-        held_out=outer.in_order(np.ones(len(outer.view), dtype=bool))[ties],
+        held_out=parts.outer.in_order(np.ones(len(parts.outer.view), dtype=bool))[ties],
         held_out_rms=found.after.rms,
         held_out_noise=found.after.noise,
-        view=view,
+        view=parts.block.in_order(parts.block.view)[ties],
         noise=outcome.noise,
         cost_history=final.history,
         steps=len(final.history) - outcome.passes,
-        status=status,
+        status=f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {method} factorisation",
         cameras=cameras,
         covariance=covariance,
         gauge=gauge,
@@ -291,13 +260,29 @@ def _adjustment(
         in_space_rms=in_space,
         two_groups=two_groups(found.problem.structure, outcome.residual, outcome.by_point, outcome.inlier & is_tie),
         held=found.heights.weak[: block.num_tracks],
-        terrain=found.heights.test(final.points, seen),
+        terrain=found.heights.test(final.points, found.seen),
         left_out=block.left_out,
-        apart=None,
         **_control(found, block, covariance, inlier[ties.stop :]),
-        seconds=time.process_time() - start,
         options=options,
     )
+
+
+def _met(found: Solution, parts: Parts) -> tuple[Array, Array, Array]:
+    """Return the points (P, 3) [m], NaN where nothing was kept, and the residuals of all observations before and after.
+
+    Of those that took no part and those that move by points triangulated anew.
+    """
+    outer, cameras = parts.outer, (found.problem.camera_prior.mean, found.final.params)
+    moved = [measure(found.problem, params, parts.apart) for params in cameras]
+    points = np.where(found.seen[:, None], found.final.points, np.nan)
+    for one in (found.after, moved[1]):
+        points[one.index] = one.points
+    inside = found.before, found.outcome.residual
+    before, after = (
+        parts.inner.in_order(one.T) + outer.in_order(out.residual.T) + parts.apart.in_order(gone.residual.T)
+        for one, out, gone in zip(inside, (found.start, found.after), moved, strict=True)
+    )
+    return points, before, after
 
 
 def _alike(block: Block, outcome: Outcome, is_tie: BoolArray) -> Array:

@@ -20,12 +20,10 @@ from barpc.ba.judging.solution import Solution, finished
 from barpc.ba.robust.heldout import is_better
 from barpc.ba.robust.rounds import Rounds
 from barpc.ba.solving.covariance import Covariance
-from barpc.ba.usual import CRITICAL, FEWEST, GROSS, LEVEL
+from barpc.ba.usual import CRITICAL, FEWEST, GROSS, LEVEL, SAMPLE
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
 from barpc.scene import Altimetry, IntArray
-
-_MOST = 5000  # heights used, and tie points held: of more, every n-th; their neighbours tell the same
 
 
 @dataclass(frozen=True)
@@ -60,7 +58,7 @@ def hold_by_altimetry(
         margin = CRITICAL * np.sqrt(np.diag(known)[:2])
         low, high = local[:, :2].min(axis=0) - margin, local[:, :2].max(axis=0) + margin
         near = np.flatnonzero(((place[:, :2] >= low) & (place[:, :2] <= high)).all(axis=1))
-        near = near[:: -(-len(near) // _MOST) or 1]
+        near = near[:: -(-len(near) // SAMPLE) or 1]
     if len(near) < FEWEST:
         return found, _nothing(many, len(near), f"at least {FEWEST} heights on the tie points' surface are needed")
     surface = Surface.of(local)
@@ -71,7 +69,7 @@ def hold_by_altimetry(
     if why_not:
         return found, replace(test, why_not=why_not)
     least = 2 if found.heights.is_whole else 1  # a terrain keeps every second one
-    chosen = np.arange(0, len(ties), max(-(-len(ties) // _MOST), least))
+    chosen = np.arange(0, len(ties), max(-(-len(ties) // SAMPLE), least))
     placed = _placed(points, ties[chosen], local[chosen, :2] / radius, enu, registered, np.sqrt(np.diag(known)))
     tried = _solved(found, block, outer, options, placed)
     if is_better(found.after, tried.after, outer):

@@ -33,7 +33,8 @@ _LOG = logging.getLogger(__name__)
 APART = "apart"
 _TELLING = 3  # views: without one a pair is left, which agrees about much; so each of three is left out
 
-Solver = Callable[[Block, Block], Solution]
+Solver = Callable[[Block, Block, AdjustOptions], Solution]
+"""What is solved, what measures it, and how -> the block solved."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +171,7 @@ def _agreeing(
         if not _is_tied(others, v):
             continue
         try:
-            found = solve(others, outer.without(outer.view == v))
+            found = solve(others, outer.without(outer.view == v), options)
         except (AdjustError, np.linalg.LinAlgError) as error:
             _LOG.info("without %s: %s", block.names[v], error)
             continue

@@ -154,15 +154,15 @@ class Adjustment:
     held: BoolArray
     terrain: TerrainTest | None
     left_out: tuple[str, ...]
-    apart: Apart | None
     control: ControlTest | None
     gcp_w: Array
     reference_w: Array
     gcp_inlier: BoolArray
     reference_inlier: BoolArray
     gcp_residuals: Array
-    seconds: float
     options: AdjustOptions = field(repr=False)
+    seconds: float = 0.0
+    apart: Apart | None = None
     altimetry: AltimetryTest | None = None
 
     def __repr__(self) -> str:

@@ -110,7 +110,7 @@ def _groups(block: Block) -> int:
 
 
 def without_moving(
-    found: Solution, parts: Parts, options: AdjustOptions, solve: Callable[[Parts], Solution]
+    found: Solution, parts: Parts, options: AdjustOptions, solve: Callable[[Block, Block, AdjustOptions], Solution]
 ) -> tuple[Solution, Parts, Judgement]:
     """Solve the block again without groups of ties that move, and find what explains the rest.
 
@@ -137,7 +137,7 @@ def without_moving(
         less = parts.less(found, one.moved)
         if len(groups) == RIVALS or not less.is_tied():
             break
-        tried = solve(less)
+        tried = solve(less.inner, less.outer, options)
         if is_better(measure(found.problem, found.final.params, less.outer), tried.after, less.outer):
             break
         found, parts = tried, less

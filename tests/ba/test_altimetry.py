@@ -361,7 +361,7 @@ def test_a_motion_is_held_at_every_second_tie_point_beside_a_terrain(monkeypatch
     seen = np.arange(60) < 47
     heights = Altimetry(ground_from_ecef(points), np.full(60, 0.5), np.full(60, 2.0))
     held: list[Any] = []
-    monkeypatch.setattr(altimetry, "_MOST", most)
+    monkeypatch.setattr(altimetry, "SAMPLE", most)
     monkeypatch.setattr(altimetry, "_known", lambda covariance, found, ties: np.eye(7))
     monkeypatch.setattr(altimetry, "Surface", SimpleNamespace(of=lambda local: local))
     monkeypatch.setattr(altimetry, "register", lambda surface, *_: surface)

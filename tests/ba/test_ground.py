@@ -22,8 +22,9 @@ from barpc.ba.held.ground import (
     reference_control,
     terrain_heights,
 )
+from barpc.ba.held.terrain import Relief
 from barpc.base.errors import BarpcWarning
-from barpc.base.geodesy import ecef_from_ground
+from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
 from barpc.scene import GroundPoints, Reference
 from barpc.sensor.pushbroom import Pushbroom
@@ -54,6 +55,20 @@ def heights(n: int = 6, **given: Any) -> Heights:
     weak = np.arange(n) >= n - 2
     options = AdjustOptions(**given.pop("options", {}))
     return Heights((), weak, np.arange(n), (0.0, 500.0), options, given.pop("dem", hill), given.pop("reference", None))
+
+
+def test_what_altimetry_holds_a_terrain_does_not_and_of_the_rest_those_with_weak_rays_by_its_slopes() -> None:
+    """Of a DEM that too few tie points can judge: six tracks, the first and the last of which altimetry holds."""
+    points = placed([0.0, 300.0, -300.0, 500.0, 100.0, 0.0], [0.0, 300.0, 200.0, -100.0, 400.0, 50.0], 350.0)
+    relief = Relief(None, np.zeros(6, dtype=bool), np.full(3, np.nan), np.zeros((3, 6)), np.full(3, np.nan))
+    by_altimetry = flat_heights(points, np.array([0, 5]), 350.0, 1.0, 0.0)
+    given = replace(heights(options={"dem_for_weak": False}), relief=relief, placed=by_altimetry)
+    held = given._held(points)
+    assert held is not None
+    assert held.index.tolist() == [1, 2, 3, 4]
+    up = enu_basis(ground_from_ecef(points[1:5]))[:, 2]
+    along = held.rows[:, 0] / np.linalg.norm(held.rows[:, 0], axis=1, keepdims=True)
+    assert ((along * up).sum(axis=1) > 0.9999).tolist() == [True, True, True, False]
 
 
 def test_a_terrain_is_met_along_its_normal() -> None:

@@ -276,7 +276,7 @@ def test_a_block_is_adjusted_as_in_dense_form(monkeypatch, options, n) -> None:
     chosen = AdjustOptions(**{**INDEPENDENT, "solver": "sparse", **options})
     dem = (lambda lon, lat: np.full(len(lon), 300.0)) if options else None
     found = []
-    for name in ("TOLERANCE", "STANDS", "_SAME_NOISE"):  # both end at the minimum, not a step before it
+    for name in ("TOLERANCE", "STANDS"):  # both end at the minimum, not a step before it
         monkeypatch.setattr(f"barpc.ba.robust.rounds.{name}", 1e-10)
     for most in (0, 10**6):
         monkeypatch.setattr(normal, "DENSE_UNKNOWNS", most)

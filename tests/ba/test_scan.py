@@ -172,7 +172,7 @@ def test_the_gain_of_a_displacement_is_that_of_least_squares(axis: int) -> None:
     view, place, wrong, off = ties(7, wrong=0.0)
     told = rng.uniform(0.2, 1.0, len(view))
     inside = (view == 0) & (place[axis] >= 0.4 * SIZE[axis, 0]) & (place[axis] < 0.6 * SIZE[axis, 0])
-    off = (off + inside * np.array([[2.0], [1.0]])).clip(-8.0, 8.0)
+    off = (off + inside * np.array([[2.0], [1.0]])).clip(-5.0, 5.0)
     found = [one for one in scanning.scan(view, place, SIZE, wrong, off, told, 0.3) if not one.by_share]
     one = next(one for one in found if (one.view, one.axis) == (0, axis))
     assert (one.start, one.stop) == pytest.approx((0.4 * SIZE[axis, 0], 0.6 * SIZE[axis, 0]))

@@ -111,7 +111,7 @@ class Cameras:
         if views.start in unknowns.radars:
             found = self._timed(params[views.start], ecef, views.start, wanted)
         else:
-            found = self._moved(params, index, ecef, views, bounds, wanted, seen)
+            found = self._moved(params, ecef, views, bounds, wanted, seen)
         if unknowns.waves is not None and seen is not None:
             unknowns.add_waves(found.image, found.by_unknown, params, index, seen)
         return found
@@ -119,7 +119,6 @@ class Cameras:
     def _moved(
         self,
         params: Array,
-        index: IntArray,
         ecef: Array,
         views: slice,
         bounds: IntArray,
@@ -128,6 +127,7 @@ class Cameras:
     ) -> Projected:
         """Project points through cameras that are turned and shifted."""
         unknowns, of_views = self.unknowns, params[views]
+        index = np.repeat(np.arange(views.start, views.stop), np.diff(bounds))
         if wanted != "unknowns" and not of_views.any():  # cameras as delivered
             none = np.empty((2, 0, len(index)))
             if wanted == "image":

@@ -16,16 +16,14 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg as la
 
+from barpc.ba.usual import SAMPLE
 from barpc.base.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import RowSpline, bsplines, profile, sine_and_cosine
 
 FEWEST = 7  # splines
 FIRST_SIGMA = 0.3  # px: a prior's standard deviation before anything is known
-_DEGREE = 2  # of the polynomials of the row that are the drift's
-DRIFTS = _DEGREE + 1
-"""How many polynomials these are: splines are apart from them."""
-_SAMPLES = 40  # a spline, to integrate over
+DRIFTS = 3  # polynomials of the row that are the drift's, a constant, a slope and a bend: splines are apart from them
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +43,8 @@ class Waves:
         """(M, m) orthonormal coefficients of what is orthogonal to the polynomials, the slowest first."""
         if not self.count:
             return np.zeros((0, 0))
-        u = np.linspace(-1.0, 1.0, self.count * _SAMPLES, dtype=np.float64)
-        free = _complement(bsplines(u, self.count) @ np.vander(u, _DEGREE + 1))
+        u = np.linspace(-1.0, 1.0, SAMPLE, dtype=np.float64)
+        free = _complement(bsplines(u, self.count) @ np.vander(u, DRIFTS))
         rough = np.diff(free, axis=0)
         vectors: Array = free @ la.eigh(rough.T @ rough)[1]
         return vectors * np.where(vectors[-1] < 0, -1.0, 1.0)
@@ -93,7 +91,7 @@ class Waves:
         or swings.
         """
         m, *others = self.parts
-        octave = 2.0 * np.log2(np.arange(m) + _DEGREE + 1.0)
+        octave = 2.0 * np.log2(np.arange(m) + float(DRIFTS))
         rank = np.unique(np.floor(octave), return_inverse=True)[1]
         found, further = [rank, rank], rank.max(initial=-1) + 1
         for count in others:

@@ -22,13 +22,13 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dtrtri
 
 from barpc.ba.evidence.linearised import Linear, Tracks
-from barpc.ba.usual import BACKFITTING, GROSS, ITERATIONS, LEAST_NOISE, RIDGE, SLIGHT, STANDS
+from barpc.ba.usual import BACKFITTING, GROSS, ITERATIONS, LEAST_NOISE, RIDGE, SLIGHT, STANDS, SURE
 from barpc.base.geodesy import CHUNK, Array
 from barpc.scene import BoolArray, IntArray
 
 NEAR_LIMIT = 4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise is large wrong ones lie no nearer
 COOLED = 0.6  # the noise, from one iteration to the next, at most
-SETTLED = 0.3  # change of the log-likelihood at the end
+SETTLED = STANDS * SURE  # change of the log-likelihood at the end
 WRONG = 1.0, 10.0  # of so many observations of a view so many are wrong, before any is seen
 
 

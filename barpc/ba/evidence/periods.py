@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from barpc.ba.evidence.scan import CLIPPED
-from barpc.ba.usual import FEW, SURE
+from barpc.ba.usual import FEW, OUTLIER, SURE
 from barpc.base.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import sine_and_cosine
@@ -58,7 +57,7 @@ def swings(view: IntArray, row: Array, size: Array, right: Array, off: Array, le
         rows = float(size[1, v])
         costs = price(rows, views)
         if len(mine) >= FEW and rows > 2.0 * _FEWEST * _SHORTEST:
-            clipped = np.clip(off[:, mine], -CLIPPED, CLIPPED)
+            clipped = np.clip(off[:, mine], -OUTLIER, OUTLIER)
             best = _Rows(row[mine], rows, right[mine], clipped).largest(costs + least)
             if best is not None:
                 found.append(Swing(v, best[0], best[1] - costs))

@@ -21,7 +21,6 @@ from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 _FINEST = 32  # parts of rows or columns, and a side of the parts of which one observation is taken
-_CELLS = 8  # a side of the finest cells
 
 
 @dataclass(frozen=True)
@@ -72,10 +71,13 @@ def met_worse(unused: Unused, size: Array, limit: float, least: float, share: fl
 
 
 def _places() -> IntArray:
-    """Return (4, P) of every place parts of the columns, and which, parts of the rows, and which; one part is all."""
+    """Return (4, P) of every place parts of the columns, and which, parts of the rows, and which; one part is all.
+
+    Of cells as many as of the finest lines.
+    """
     halved = [2**n for n in range(1, _FINEST.bit_length())]
     lines = [(n, k, 1, 0) for n in halved for k in range(n)]
-    cells = [(n, k % n, n, k // n) for n in halved if n <= _CELLS for k in range(n * n)]
+    cells = [(n, k % n, n, k // n) for n in halved if n * n <= 2 * _FINEST for k in range(n * n)]
     return np.array([*lines, *((rows, n, cols, k) for cols, k, rows, n in lines), *cells]).T
 
 

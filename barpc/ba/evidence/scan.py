@@ -12,15 +12,13 @@ import numpy as np
 from scipy.special import entr, xlogy
 
 from barpc.ba.estimated.waves import DRIFTS
-from barpc.ba.usual import SURE
+from barpc.ba.usual import OUTLIER, SURE
 from barpc.base.geodesy import Array
 from barpc.scene import IntArray
 
 BINS = 40  # stretches of an image's rows or columns
 _STARTS, _STOPS = np.triu_indices(BINS + 1, 1)  # all intervals of these
 LINE = 0.05  # of the larger extent of residuals: a smaller one is that of epipolar lines, which turn over an image
-CLIPPED = 8.0
-"""Standard deviations: one residual tells no more."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +58,7 @@ def scan(
     floor : float, what displacements are let be [the same]: no adjustment is asked to be better
     """
     views, found = size.shape[1], []
-    off, costs = np.clip(off, -CLIPPED, CLIPPED), price(views)
+    off, costs = np.clip(off, -OUTLIER, OUTLIER), price(views)
     for axis in (0, 1):
         bin_ = (place[axis] / size[axis][view] * BINS).astype(np.int64).clip(0, BINS - 1)
         rows = np.array([np.ones(len(view)), wrong])

@@ -224,7 +224,8 @@ class Heights:
         dem = self.dem if believed is None else None
         judged_later = self.is_judged and self.relief is None
         is_whole = dem is not None and self.is_whole and not judged_later
-        index = self.tracks[free if is_whole else free & weak]
+        chosen = free if is_whole else free & weak
+        index = self.tracks[chosen]
         if not len(index):
             return None
         if dem is not None:
@@ -233,7 +234,7 @@ class Heights:
                 alike, span = max(len(index) / ALIKE, 1.0), self.control[1].mean
             elif self.relief is not None:
                 alike = max(len(index) / ALIKE, 1.0)
-            level = None if self.relief is None else ~weak
+            level = None if self.relief is None else ~weak[chosen]
             sigma = self.options.dem_sigma * alike**0.5
             return terrain_heights(points, index, dem, sigma, self._bias, span, level)
         others = self.tracks[~weak]

@@ -20,12 +20,11 @@ from barpc.ba.held.block import Block
 from barpc.ba.robust.heldout import seen_in
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import LEVEL, RIVALS, SAMPLE, TIMES
+from barpc.ba.usual import BACKFITTING, LEVEL, RIVALS, SAMPLE, TIMES
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray, IntArray
 
 CELLS = 6  # a side of the ground: the group's share is free in each
-_LOOK = 8  # steps of every start, cooled twice as fast; only the best go on
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +109,7 @@ def proposal(linear: Linear, ground: Ground, base: Fit, extra: Array, sigma: Arr
         return None
     starts = [replace(group, share=share) for share in _first_shares(ground, rows, base.right)]
     begun = [Mixture(few, extra, sigma, base, start) for start in starts]
-    looks = [one.run(_LOOK, COOLED**2) for one in begun]
+    looks = [one.run(BACKFITTING, COOLED**2) for one in begun]  # only the best go on
     best = sorted(range(len(looks)), key=lambda n: -looks[n].evidence)[:RIVALS]
     ended = [(begun[n].run(), starts[n]) for n in best]
     found, start = max(ended, key=lambda row: row[0].evidence)

@@ -30,7 +30,7 @@ from barpc.scene import BoolArray
 
 _TREND = MUCH_NOISE * FLOOR  # px: another model is tried
 _SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
-_CLEARLY = 0.8  # of the noise, that another start is to leave at most, or of a view's observations at least
+CLEARLY = 0.8  # of what is left, that another start or model leaves at most; or of a view's observations, kept at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +54,11 @@ class Solution:
     def final(self) -> State:
         """The minimum."""
         return self.outcome.minimum.state
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether it goes on from an earlier block."""
+        return self.problem.joint_prior is not None
 
     @property
     def seen(self) -> BoolArray:
@@ -130,7 +135,7 @@ def solve_block(
         projected = problem.project_points(state.params, state.points)
         agree = agreeing(problem.structure, problem.xy, before, projected, block.sigma, block.use)
         again = Rounds(problem, block, state, heights, agree).run()
-        if again.noise < _CLEARLY * outcome.noise and again.inlier.sum() > 0.5 * agree.sum():
+        if again.noise < CLEARLY * outcome.noise and again.inlier.sum() > 0.5 * agree.sum():
             outcome = again
     drift, asked = problem.cameras.unknowns.drift, dict[str, SmoothTest]()
     if options.drift is None and prior is None and drift and outcome.smooth.found(SURELY * FLOOR).any():
@@ -193,4 +198,4 @@ def finished(
 def _is_suspect(outcome: Outcome, structure: Structure, use: BoolArray) -> bool:
     """Return whether the rounds may have ended between two solutions: much noise, or a view that lost much."""
     had, kept = (structure.sum_views(rows.astype(np.float64)[None])[:, 0] for rows in (use, outcome.inlier))
-    return outcome.noise > MUCH_NOISE or bool((kept < _CLEARLY * had).any())
+    return outcome.noise > MUCH_NOISE or bool((kept < CLEARLY * had).any())

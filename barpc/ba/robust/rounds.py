@@ -30,6 +30,7 @@ from barpc.ba.usual import (
     STANDS,
     STEPS,
     SURELY,
+    TRIED,
 )
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
@@ -39,9 +40,7 @@ _LOG = logging.getLogger(__name__)
 
 _SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each view by itself
 _LEAST_NOISE = 0.5  # of the stated sigmas, while outliers are about
-_SAME_NOISE = 0.02  # a change of the noise by less than this part is not solved again
 _MANY_CUT = 0.01  # of the observations: more are looked at again
-MAX_PASSES = 5  # rounds of cutting and solving, at most: they end when nothing changes
 
 
 @dataclass(frozen=True)
@@ -143,11 +142,11 @@ class Rounds:
         _LOG.info("pass %d: %d of %d observations, noise %.3f", *numbers)
         again = self.passes > 1 or self.goes_on
         same = again and int((self.use != was_in_use).sum()) <= SLIGHT * len(self.use)
-        settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < _SAME_NOISE
+        settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < STANDS
         # what is known of the place goes with what is shared, and nothing else learns of it
         share = STANDS if tested.shared > 1.0 else SAME_PRIOR
         settled &= same_prior(prior, self.problem.camera_prior, share)
-        if once or self.passes > MAX_PASSES or (settled and (same or not self.robust)):
+        if once or self.passes >= TRIED or (settled and (same or not self.robust)):
             smooth = self.smooth.test_neighbours(smooth, self.residual, self.use)
             if found.covariance(self.problem.free).is_large:
                 tested = self.variances.learnt(self.problem, found, exact=True)[1]

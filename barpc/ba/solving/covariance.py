@@ -12,12 +12,12 @@ from barpc.ba.algebra.linear import Factor
 from barpc.ba.algebra.multifrontal import Blocks
 from barpc.ba.algebra.structure import parts
 from barpc.ba.solving.normal import Reduced, solve_transposed
+from barpc.ba.usual import KEPT
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
-_COLUMNS = 240  # unit vectors solved for at a time
-_LARGE, _PROBES = 900, 32
-_SMALL = 2000  # unknowns up to which the whole matrix is kept
+_LARGE = 900  # unknowns up to which the whole matrix is kept, and known exactly
+_PROBES = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class Covariance:
 
     def joint(self, views: IntArray) -> Array:
         """Return the covariance (m q, m q) of the unknowns of some views."""
-        of_full = len(self.free) <= _SMALL or "full" in self.__dict__
+        of_full = not self.is_large or "full" in self.__dict__
         if of_full or self.factor.inverse is None:
             place = self._places(views)
             return self._columns(place, of_full)[place]
@@ -112,7 +112,7 @@ class Covariance:
             out[np.ix_(self.free, self.free)] = self.factor.whole_inverse()
             return out
         every = np.arange(len(self.free))
-        for part in parts(len(every), _COLUMNS):
+        for part in parts(len(every), max(KEPT // len(every), 1)):
             out[:, part] = self._columns(every[part], False)
         return 0.5 * (out + out.T)
 
