@@ -45,7 +45,7 @@ def moved(cameras: Sequence[Camera], move: Array | None, transform: str | None, 
     The motion is `move` (3,) [m], east, north and up at the middle of all the images, or that of the file
     `transform`: it takes the points that these cameras make to their true place. One motion for all cameras: rays that
     met still meet, where the motion takes the point. FitError where no RPC holds a moved camera, InputError for a
-    motion that leaves the Earth's surface.
+    motion that leaves the Earth's surface or is a position.
     """
     corners = [_corners(camera) for camera in cameras]
     middle = np.mean([ecef_from_ground(ground).mean(axis=0) for ground in corners], axis=0)
@@ -54,6 +54,7 @@ def moved(cameras: Sequence[Camera], move: Array | None, transform: str | None, 
         matrix = read_transform(transform)
     else:
         assert move is not None
+        _check_position(move, np.concatenate(corners))
         matrix = np.column_stack([np.eye(3), enu_basis(at).T @ move])
     out = []
     for camera, ground in zip(cameras, corners, strict=True):
@@ -80,6 +81,17 @@ def _corners(camera: Camera) -> Array:
     if not len(found):
         raise InputError(f"{camera.path}: shows no ground along the border of its image")
     return found
+
+
+def _check_position(move: Array, ground: Array) -> None:
+    """Refuse metres east and north that are the longitude and latitude of a place in the images."""
+    low, high = ground[:, :2].min(axis=0), ground[:, :2].max(axis=0)
+    for place in (move[:2], move[1::-1]):
+        if ((low <= place) & (place <= high)).all():
+            raise InputError(
+                f"--move {','.join(f'{value:g}' for value in move)}: is a longitude and latitude in the images; metres "
+                "east, north and up are needed"
+            )
 
 
 def refitted(

@@ -56,7 +56,6 @@ def test_the_cameras_show_points_after_a_move_where_they_showed_them_before(imag
     assert "-30.000 m east, +40.000 m north, +90.000 m up" in capsys.readouterr().err
 
 
-@pytest.mark.few(1)
 @pytest.mark.parametrize("scale", [1.0, 1.00002, 0.99998])
 def test_a_matrix_is_followed_to_the_last_digit(image: Path, tmp_path: Path, scale: float, capsys):
     ground, xy = _seen(open_camera(image))
@@ -85,7 +84,6 @@ def test_back_and_forth_is_where_it_was(image: Path, tmp_path: Path):
     np.testing.assert_allclose(read_rpc(twice / "scene.vrt").project(ground), xy, rtol=0, atol=1e-6)
 
 
-@pytest.mark.few(1)
 @pytest.mark.parametrize("words", [("--move", "200,-100,50"), ("--transform", "t.txt")])
 def test_rays_of_three_images_meet_where_the_motion_takes_the_point(tmp_path: Path, words):
     files = sorted(SAMPLES.glob("view_0?.tif"))
@@ -136,6 +134,14 @@ def test_few_digits_are_told_in_metres(image: Path, tmp_path: Path, capsys):
 def test_a_move_is_three_numbers_of_metres(image: Path, tmp_path: Path, capsys, move: str, told: str):
     assert run("convert", str(image), "-o", str(tmp_path / "o"), "--move", move) == 2
     assert told in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_longitude_and_latitude_in_the_images_is_no_move(image: Path, tmp_path: Path, capsys):
+    lon, lat, _ = open_camera(image).model.localize(np.array([150.0, 100.0]), np.array(100.0))
+    for words in (f"{lon:.5f},{lat:.5f},180", f"{lat:.5f},{lon:.5f},180"):
+        assert run("convert", str(image), "-o", str(tmp_path / "o"), "--move", words) == 1
+        assert "is a longitude and latitude in the images" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
 
 
