@@ -56,6 +56,7 @@ def test_the_cameras_show_points_after_a_move_where_they_showed_them_before(imag
     assert "-30.000 m east, +40.000 m north, +90.000 m up" in capsys.readouterr().err
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("scale", [1.0, 1.00002, 0.99998])
 def test_a_matrix_is_followed_to_the_last_digit(image: Path, tmp_path: Path, scale: float, capsys):
     ground, xy = _seen(open_camera(image))
@@ -84,6 +85,7 @@ def test_back_and_forth_is_where_it_was(image: Path, tmp_path: Path):
     np.testing.assert_allclose(read_rpc(twice / "scene.vrt").project(ground), xy, rtol=0, atol=1e-6)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("words", [("--move", "200,-100,50"), ("--transform", "t.txt")])
 def test_rays_of_three_images_meet_where_the_motion_takes_the_point(tmp_path: Path, words):
     files = sorted(SAMPLES.glob("view_0?.tif"))
