@@ -66,10 +66,7 @@ def fit_rpc(
     mirrored = options.allow_mirrored or vendor is not None or is_radar(innermost(model))
     screened(sample.ground, sample.points[:, :2], mirrored)
     contradiction = sample.contradiction()
-    given = partial(_given, model, size, alt_range, options)
-
-    def seen(rpc: RPC, _: FitSolution) -> tuple[Errors, Array]:
-        return sample.sought(lambda ground, at: off(rpc, rpc.localize_direct(at[:, :2], at[:, 2]), ground, at[:, :2]))
+    given, seen = partial(_given, model, size, alt_range, options), partial(_missed, sample)
 
     def attempt(method: str, source: SensorModel = model) -> RpcFit:
         solution = solve(*_given(source, size, alt_range, options, method), options, method, vendor=vendor)
@@ -297,6 +294,11 @@ def inverse(rpc: RPC, ground: Array, image: Array, weight: Array | None = None) 
     )
     lonlat = np.column_stack([wrap_longitude(ground[:, 0], rpc.ground_offset[0]), ground[:, 1]])
     return FitProblem(np.column_stack([image, ground[:, 2]]), lonlat, norm, weight=weight).screened()
+
+
+def _missed(sample: Sample, rpc: RPC, _: FitSolution) -> tuple[Errors, Array]:
+    """Return the errors of a localisation RPC on the check points of a model."""
+    return sample.sought(lambda ground, at: off(rpc, rpc.localize_direct(at[:, :2], at[:, 2]), ground, at[:, :2]))
 
 
 def _left_out(
