@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from barpc.ba.usual import FEW
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, wrap_longitude
 from barpc.base.remote import is_url
@@ -20,6 +19,7 @@ from barpc.report.compare import written_rpc
 from barpc.report.runfiles import RunFiles, read_summary, read_tables
 from barpc.report.summary import Summary
 from barpc.report.summary.views import ViewEntry
+from barpc.report.verdict import sure_pairs
 from barpc.rpcio import CARRIERS
 from barpc.rpcio.sources import Sunlight, light_of
 from barpc.scene import IntArray
@@ -224,7 +224,6 @@ def pairs_of(scene: Scene) -> Sequence[tuple[str, str]]:
 
     Of those under such an angle: two images that need no look, with enough matches to know it, where there are any.
     """
-    doubted = {view.name for view in scene.summary.views if view.advice}
     shown = [pair for pair in scene.summary.pairs if 2.0 <= (pair.convergence_deg or 0.0) <= 50.0]
-    sure = [p for p in shown if p.num_matches >= FEW and not {p.a, p.b} & doubted]
+    sure = sure_pairs(scene.summary.views, shown)
     return [(pair.a, pair.b) for pair in sure or shown or scene.summary.pairs]

@@ -27,7 +27,7 @@ from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.whole import DATUM, DatumEntry, ExplanationEntry, HeldOutEntry, LeftEntry
 from barpc.report.summary.words import NAMED, largest
-from barpc.report.verdict import LINES, SHOWN, flagged, offset_of, sentences, worst_first, worst_pairs
+from barpc.report.verdict import LINES, SHOWN, flagged, offset_of, sentences, sure_pairs, worst_first, worst_pairs
 from barpc.scene import connected_groups
 from barpc.workspace import Workspace
 
@@ -225,8 +225,7 @@ def _pairs(files: RunFiles) -> Section | None:
     if not pairs:
         return None
     worst = max(pairs, key=offset_of)
-    doubted = {view.name for view in files.summary.views if view.advice}
-    sure = [p for p in pairs if p.num_matches >= FEW and not {p.a, p.b} & doubted]
+    sure = sure_pairs(files.summary.views, pairs)
     heights = [pair for pair in sure if pair.height_m_per_px and pair.convergence_deg]
     facts = {
         **{"worst": worst, "offset": offset_of(worst), "wanted": GOOD_RMSE, "enough": FEW},

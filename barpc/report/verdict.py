@@ -10,7 +10,7 @@ import numpy as np
 
 from barpc.ba import Adjustment, check_residuals
 from barpc.ba.apart import APART
-from barpc.ba.usual import SURE, SURELY
+from barpc.ba.usual import FEW, SURE, SURELY
 from barpc.base.geodesy import Array
 from barpc.report.outcome import MANY_REJECTED, Run
 from barpc.report.records import plain, value_of
@@ -306,6 +306,12 @@ def offset_of(pair: PairEntry) -> float:
 def worst_pairs(pairs: Sequence[PairEntry]) -> list[PairEntry]:
     """Return pairs by their epipolar offset, the largest first, where it is more than stereo wants; then the others."""
     return sorted(pairs, key=lambda pair: -max(offset_of(pair), GOOD_RMSE))
+
+
+def sure_pairs(views: Sequence[ViewEntry], pairs: Sequence[PairEntry]) -> list[PairEntry]:
+    """Return pairs of images that need no look, with enough matches to know it."""
+    doubted = {view.name for view in views if view.advice}
+    return [pair for pair in pairs if pair.num_matches >= FEW and not {pair.a, pair.b} & doubted]
 
 
 def torn(pairs: Sequence[PairEntry]) -> list[PairEntry]:
