@@ -30,17 +30,19 @@ def pytest_xdist_auto_num_workers() -> int:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """A sweep of the nightly lane is slow, too: `-m 'not slow'` leaves out both. `few(n)`: the rest is slow."""
-    kinds: dict[str, list[pytest.Item]] = {}
+    """`few(n)`, `landing(n)`: all but n members of a kind wait for the next lane; what is nightly is slow, too."""
+    for mark, wait in (("few", "slow"), ("landing", "nightly")):
+        kinds: dict[str, list[pytest.Item]] = {}
+        for item in items:
+            if item.get_closest_marker(mark) and not any(map(item.get_closest_marker, {wait, "nightly"})):
+                kinds.setdefault(item.nodeid.partition("[")[0], []).append(item)
+        for members in kinds.values():
+            few = members[0].get_closest_marker(mark)
+            assert few is not None
+            kept = spread(len(members), *few.args)
+            for number, item in enumerate(members):
+                if number not in kept:
+                    item.add_marker(wait)
     for item in items:
         if item.get_closest_marker("nightly"):
             item.add_marker(pytest.mark.slow)
-        elif item.get_closest_marker("few") and not item.get_closest_marker("slow"):
-            kinds.setdefault(item.nodeid.partition("[")[0], []).append(item)
-    for members in kinds.values():
-        few = members[0].get_closest_marker("few")
-        assert few is not None
-        fast = spread(len(members), *few.args)
-        for number, item in enumerate(members):
-            if number not in fast:
-                item.add_marker(pytest.mark.slow)

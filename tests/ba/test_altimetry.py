@@ -74,6 +74,7 @@ def test_motions_are_those_that_are_reported():
     np.testing.assert_array_equal(moves[1] @ [0, 0, 0, 0, 0, 0, 1], [1, 2, 0])
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "seeds"), rest_slow(starmap(pytest.param, product([0.4, 0.0], [range(3), range(3, 6)])))

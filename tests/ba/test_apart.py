@@ -207,6 +207,7 @@ def beside(world: World, odd: int) -> tuple[Adjustment, float, float]:
     return found, float(np.max(np.subtract(one.rms, other.rms))), one.shape - other.shape
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "seed",

@@ -116,6 +116,7 @@ def test_what_robust_rounds_would_let_go_is_followed():
     assert 0.01 < after.across < 0.04 < 0.5 < without.across
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", rest_slow([3, 18], mark=pytest.mark.nightly))
 def test_the_drift_is_not_taken_wider_than_it_is_seen_where_jitter_is_followed(seed):
@@ -173,6 +174,7 @@ def test_splines_that_are_asked_for_cost_a_clean_block_little():
         assert max(np.abs(spline.coeffs).max() for spline in found.splines) < 0.05
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_knots_are_no_denser_than_the_observations_hold():
     few, after = solved("jitter 0.5 at 1 Hz", 0, tracks=250)

@@ -86,6 +86,7 @@ def test_rows_and_columns_that_lie_off_are_named_and_followed(where: Displaced) 
     assert not any(isinstance(s, Splined) and s.correction.moved.any() for s in others)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_two_of_them_in_two_images_are_both_found() -> None:
     block, tracks = flawed(3, 1500, MIDDLE, {**DETECTOR, "px": 2.0})
@@ -106,6 +107,7 @@ def test_what_fades_is_named_with_its_length() -> None:
     assert np.hypot(*found.findings[0].size) == pytest.approx(4.0, rel=0.1)
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("first", [0.0, 1.0], ids=["beginning", "end"])
 def test_all_images_that_settle_are_explained_together(first: float) -> None:

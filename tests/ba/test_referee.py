@@ -72,6 +72,7 @@ def test_what_a_drifting_attitude_does_is_corrected_by_default(name, across, sha
     assert median(found, lambda v: v.lost) <= (0.015 if name.startswith("quadratic") else 0.01)  # right tie points
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", rest_slow([SEEDS[:1], SEEDS], mark=pytest.mark.nightly))
 def test_without_a_drift_in_the_model_the_same_scene_is_not_met(seeds):
@@ -163,6 +164,7 @@ def test_a_pair_whose_tie_points_are_of_one_kind_says_nothing(name, seeds):
         assert not solve(make(replace(TABLE[name], seed=seed), hills))[1].two_groups
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "status", "word"),

@@ -193,6 +193,7 @@ def test_bends_are_a_level_two_slopes_and_what_is_curved() -> None:
 # --- whole blocks, flown by other cameras ---------------------------------------------------------------------------
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("hills", [False, True])
 def test_a_dem_with_waves_places_a_scene_as_well_as_it_is_said_to(hills: bool) -> None:

@@ -78,6 +78,7 @@ def test_a_killed_command_goes_on_and_gives_the_same_bytes(rendered, tmp_path):
     assert (folder / "dsm.tif").read_bytes() == whole.read_bytes()
 
 
+@pytest.mark.nightly
 def test_a_finished_run_whose_surface_was_killed_stays_finished(rendered, tmp_path, capsys):
     folder = tmp_path / "run"
     adjust(rendered.paths[:2], folder)

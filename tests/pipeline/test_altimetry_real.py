@@ -80,6 +80,7 @@ def along_tracks(swept: Any, seed: int) -> Altimetry:
     return Altimetry(np.column_stack([lonlat, alt + MOVE[2]]), np.full(len(alt), 0.3), np.zeros(len(alt)))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")
 def test_real_images_are_placed_by_heights_within_what_is_said(swept):

@@ -109,6 +109,7 @@ def test_a_stated_sigma_is_the_scene_s(options, tmp_path):
     assert run.summary["scene"]["sigma_enu_m"][:2] == pytest.approx([2.0, 2.0], rel=0.1)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_reference_of_another_place_moves_nothing(place, options, tmp_path, capsys):
     alone = adjust(IMAGES, tmp_path / "alone", replace(options, reference=()))
@@ -204,6 +205,7 @@ def test_a_real_image_comes_to_its_place_by_finer_and_coarser_references(quickbi
     assert np.hypot(*rms) * 6.5 < 2.0 * np.hypot(*result.summary["scene"]["sigma_enu_m"][:2])
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")
 def test_a_geoid_that_was_left_out_is_the_reason(quickbird):

@@ -89,6 +89,7 @@ def wide(tmp_path_factory) -> list[Path]:
     return [crop(path, folder / path.name, side=360, start=300) for path in SAMPLES[:2]]
 
 
+@pytest.mark.landing(1)
 @posix
 @pytest.mark.slow
 @pytest.mark.parametrize(
