@@ -44,7 +44,7 @@ from barpc.sensor.geometry import altitude_range, epipolar_offset  # noqa: E402
 from barpc.tie import common_tracks, find_tracks, match_pairs, select_pairs  # noqa: E402
 from barpc.tie.matchers.features import join_keypoints  # noqa: E402
 from barpc.tie.pairing.epipolar import frame, robust_affine  # noqa: E402
-from barpc.tie.patches.oriented import HALF, register_oriented  # noqa: E402
+from barpc.tie.patches.oriented import PATCH, register_oriented  # noqa: E402
 from barpc.tie.pixels import read_pixels  # noqa: E402
 from tests.scenes import ImageOptions  # noqa: E402
 from tests.scenes.redrawn import redrawn  # noqa: E402
@@ -193,7 +193,7 @@ def ground(files: list[tuple[str, tuple[int, int]]], at: np.ndarray) -> np.ndarr
     grey = images[0][0]
     white = data & (grey > 1.8 * np.percentile(grey[images[0][1]], 80))
     col, row = at.astype(int).T
-    share = [cv2.blur(one.astype(np.float32), (2 * HALF + 1,) * 2)[row, col] for one in (data, white)]
+    share = [cv2.blur(one.astype(np.float32), (2 * PATCH + 1,) * 2)[row, col] for one in (data, white)]
     return (share[0] > 0.9) & (share[1] < 0.05)
 
 

@@ -20,10 +20,12 @@ from barpc.tie.pixels import CELL, PIECE, SPAN, FloatImage
 Files = Sequence[tuple[str, tuple[int, int]]]
 """Path and size (width, height) of two images."""
 
+PATCH = 24
+"""How far one reaches when matches are registered [px]."""
 SIGMA = 0.1
 """Standard deviation of a place registered by structure [px]; as much across an epipolar line is always tolerated."""
 HALF = 16
-"""How far a template reaches to each side [px], when matches are registered as far again at half the step."""
+"""How far a template reaches to each side [px]."""
 SHOWN = 0.9
 """Part of a template that must be a picture."""
 REACH = 1.5
@@ -52,9 +54,9 @@ class Sampling:
         return channels(*picture(path, (self.band,), whole, origin + nodes @ matrix.T, shape))
 
 
-def found_about(sampling: Sampling, at: Array, xy: Array) -> tuple[Array, BoolArray, Array]:
+def found_about(sampling: Sampling, at: Array, xy: Array, half: int = HALF) -> tuple[Array, BoolArray, Array]:
     """Return the places (n, 2) near those given, whether they stand out and the way back returns; correlations."""
-    tile = PatchTile.of(sampling, at, xy, np.full(2, _FINER), HALF)
+    tile = PatchTile.of(sampling, at, xy, np.full(2, _FINER), half)
     place, ok, score = tile.found()
     return tile.in_b(place), ok & tile.returns(place), score
 
@@ -71,7 +73,7 @@ def register_oriented(
     step = resolution(np.median(linear, axis=0))
     for rows in grouped(*np.floor(reference[:, ::-1] / (step * SPAN)).T):
         at, turn = reference[rows], np.median(linear[rows], axis=0)
-        near, found, _ = found_about(Sampling(files, band, step, turn), at, start[rows])
+        near, found, _ = found_about(Sampling(files, band, step, turn), at, start[rows], PATCH)
         closer = Sampling(files, band, 0.5 * step, turn)
         tile = PatchTile.of(closer, at, near, np.full(2, _FINER), 2 * HALF)
         best, inside, score[rows] = tile.found()
