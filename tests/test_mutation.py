@@ -63,11 +63,11 @@ def test_the_score_leaves_out_equivalents(mutation) -> None:
 def test_every_folder_of_the_package_is_a_part_with_tests(mutation) -> None:
     root = SCRIPT.parents[1]
     folders = {path.parent.name for path in (root / "barpc").glob("*/*.py")} | {"remote"}  # a room of the base
-    assert set(mutation.parts()) == folders | {"top"}
+    assert set(mutation.parts()) == folders | {"top", "simulate"}  # a module that has a folder of tests
     assert all(mutation.parts().values())
     assert "tests/test_mutation.py" not in mutation.parts()["top"]
     assert {path.name for path in (root / "barpc").glob("*.py")} <= {
-        Path(mutant.file).name for mutant in mutation.mutants(["top"])
+        Path(mutant.file).name for mutant in mutation.mutants(["top", "simulate"])
     } | {"__init__.py", "__main__.py", "errors.py"}
 
 
