@@ -28,7 +28,7 @@ from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.overlaps import Terrain
 from barpc.tie.pixels import FloatImage, PixelReader, grow, levelled
 
-_BLUR = 0.7  # px: of pictures before the gradients, and of channels
+_BLUR = 0.75  # px: of pictures before the gradients, and of channels
 _WEAK = 0.5  # of the median gradient: what is weaker is noise
 EDGE = 6
 """Pixels so near to invalid ones know of them [px]; so far beside a search area, where true peaks end, decoys lie."""
