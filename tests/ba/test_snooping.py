@@ -201,9 +201,9 @@ def test_the_summary_has_every_point_with_its_residual_in_the_images():
     across = [np.linalg.norm(offset - offset @ ray * ray) for ray in rays]
     assert found.residual_px == pytest.approx(np.sqrt(np.mean(np.square(across))) / 0.5, rel=0.1)  # pixels of 0.5 m
     many = [replace(one, used=n != 40, w=float(n)) for n in range(60) for one in summary.gcps[:1]]
-    shown = GcpEntry.worst(many)
+    shown = GcpEntry.worst(many, 20)
     assert [int(one.w) for one in shown] == [*range(40, 60)]
-    odd = GcpEntry.worst([replace(one, used=one.w != 3) for one in many])
+    odd = GcpEntry.worst([replace(one, used=one.w != 3) for one in many], 20)
     assert [int(one.w) for one in odd] == [3, *range(41, 60)]
 
 
