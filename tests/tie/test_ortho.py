@@ -218,3 +218,22 @@ def test_an_image_on_a_patch_is_what_its_camera_sees_there(tmp_path) -> None:
     assert shown(shape) == 1.0
     moved = replace(patch, lonlat=patch.lonlat - np.array([1.0, 2.0]) / METRES, moved=np.array([1.0, 2.0]))
     np.testing.assert_allclose(of_image(view, 1, moved), shape, atol=0.02)
+
+
+def test_a_patch_beyond_the_terrain_shows_what_lies_where_it_is_known(tmp_path) -> None:
+    (view,) = views(camera(5.4, 43.3, lean=0.0))
+    view = replace(view, path=str(write_image(tmp_path / "a.tif", textured(4))), size=(160, 120))
+    corner = view.sensor.localize(np.array([[30.0, 20.0]]), np.array([100.0]))[0, :2]
+    at = np.array([[0.0, 0.0], [31.9, 11.0], [32.1, 11.0], [48.0, 39.0]])
+    whole = Patch.on(lambda x, y: np.full(np.shape(x), 100.0), corner, 0.5, (41, 49), np.zeros(2))
+    ends = corner[0] + 0.5 * 36 / METRES[0]  # between the nodes of columns 32 and 40
+    part = replace(whole, heights=np.where(whole.nodes()[..., 0] > ends, np.nan, 100.0))
+    seen = part.seen(view, at)
+    np.testing.assert_allclose(seen[:2], whole.seen(view, at)[:2], atol=1e-9)
+    assert np.isnan(seen[2:]).all()
+    pixels, valid = picture(view.path, (1,), view.size, part.image(view), part.shape)
+    every, all_valid = picture(view.path, (1,), view.size, whole.image(view), whole.shape)
+    np.testing.assert_array_equal(valid, all_valid & (np.arange(49) <= 32))
+    np.testing.assert_allclose(pixels[valid], every[valid], atol=1e-3)
+    lost = replace(whole, heights=np.full_like(whole.heights, np.nan))
+    assert not picture(view.path, (1,), view.size, lost.image(view), lost.shape)[1].any()

@@ -110,9 +110,12 @@ class Patch(Frozen):
         return view.sensor.project(np.concatenate([lonlat, self.heights[..., None]], axis=2))
 
     def seen(self, view: View, at: Array) -> Array:
-        """Return the image points (n, 2) [px] of places x, y (n, 2) [px] of the grid."""
-        rows, cols = _between(at[:, 1], self.shape[0]), _between(at[:, 0], self.shape[1])
-        return np.asarray(np.einsum("nr,rck,nc->nk", rows, self.image(view), cols))
+        """Return the image points (n, 2) [px] of places x, y (n, 2) [px] of the grid; NaN beside an unknown node."""
+        rows, cols, nodes = _between(at[:, 1], self.shape[0]), _between(at[:, 0], self.shape[1]), self.image(view)
+        lacking = ~np.isfinite(nodes).all(axis=2)
+        found = np.einsum("nr,rck,nc->nk", rows, np.where(lacking[..., None], 0.0, nodes), cols)
+        found[np.einsum("nr,rc,nc->n", rows > 0, lacking, cols > 0) > 0] = np.nan
+        return np.asarray(found)
 
 
 def ticks(count: int) -> Array:
@@ -201,15 +204,17 @@ def picture(
     """Resample a raster to a grid (H, W) whose nodes (m, n, 2) lie at its col, row [px]; return also the
     valid pixels.
 
-    Where it is finer than the grid, it is averaged first.
+    Where it is finer than the grid, it is averaged first. What lies between nodes of which one is NaN is not valid.
     """
     nothing = np.zeros(shape, np.float32), np.zeros(shape, dtype=bool)
-    if not np.isfinite(nodes).all():
+    known = np.isfinite(nodes).all(axis=2)
+    if not (known[1:, 1:] & known[:-1, 1:] & known[1:, :-1]).any():
         return nothing
-    low, high = np.floor(nodes.min(axis=(0, 1))).astype(int), np.ceil(nodes.max(axis=(0, 1))).astype(int)
+    low, high = np.floor(nodes[known].min(axis=0)).astype(int), np.ceil(nodes[known].max(axis=0)).astype(int)
     if (high < 0).any() or (low >= size).any():
         return nothing
-    sides = (nodes[-1, 0] - nodes[0, 0]) / (shape[0] - 1), (nodes[0, -1] - nodes[0, 0]) / (shape[1] - 1)
+    pixels = (np.array(shape) - 1) / (np.array(known.shape) - 1)  # between nodes
+    sides = [np.nanmedian(np.diff(nodes, axis=axis), axis=(0, 1)) / pixels[axis] for axis in (0, 1)]
     apart = float(np.sqrt(abs(np.linalg.det(np.stack(sides)))))
     thin = max(1, int(apart))
     if min(size) < thin:
@@ -229,10 +234,11 @@ def picture(
     if (left := apart / thin) > 1.1:
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.5 * (left**2 - 1.0) ** 0.5), np.float32)
     rows, cols = (_between(np.arange(n, dtype=np.float64), n) for n in shape)
-    nodes = (nodes + 0.5) / thin - 0.5 - box[:2]
+    nodes = (np.where(known[..., None], nodes, 0.0) + 0.5) / thin - 0.5 - box[:2]
     x, y = ((rows @ nodes[..., i] @ cols.T).astype(np.float32) for i in (0, 1))
     found = cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     lacking = cv2.remap(
         (~valid).astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0
     )
-    return np.asarray(found, np.float32), np.asarray(lacking == 0.0)
+    within = (rows > 0).astype(np.float32) @ ~known @ (cols > 0).T == 0.0
+    return np.asarray(found, np.float32), np.asarray((lacking == 0.0) & within)
