@@ -112,9 +112,9 @@ class Patch(Frozen):
     def seen(self, view: View, at: Array) -> Array:
         """Return the image points (n, 2) [px] of places x, y (n, 2) [px] of the grid; NaN beside an unknown node."""
         rows, cols, nodes = _between(at[:, 1], self.shape[0]), _between(at[:, 0], self.shape[1]), self.image(view)
-        lacking = ~np.isfinite(nodes).all(axis=2)
-        found = np.einsum("nr,rck,nc->nk", rows, np.where(lacking[..., None], 0.0, nodes), cols)
-        found[np.einsum("nr,rc,nc->n", rows > 0, lacking, cols > 0) > 0] = np.nan
+        known = _known(nodes)
+        found = np.einsum("nr,rck,nc->nk", rows, np.where(known[..., None], nodes, 0.0), cols)
+        found[np.einsum("nr,rc,nc->n", rows, 1.0 - known, cols) > 0] = np.nan
         return np.asarray(found)
 
 
@@ -127,6 +127,11 @@ def _between(at: Array, count: int) -> Array:
     """Return the weights (n, nodes) of the nodes along an axis of `count` px for places (n,)."""
     nodes = ticks(count)
     return np.stack([np.interp(at, nodes, row) for row in np.eye(len(nodes))], axis=1)
+
+
+def _known(nodes: Array) -> BoolArray:
+    """Return the nodes (m, n) of which both coordinates (m, n, 2) are known."""
+    return np.asarray(np.isfinite(nodes).all(axis=2))
 
 
 def _nodes(lonlat: Array, step: float, shape: tuple[int, int]) -> Array:
@@ -207,7 +212,7 @@ def picture(
     Where it is finer than the grid, it is averaged first. What lies between nodes of which one is NaN is not valid.
     """
     nothing = np.zeros(shape, np.float32), np.zeros(shape, dtype=bool)
-    known = np.isfinite(nodes).all(axis=2)
+    known = _known(nodes)
     if not (known[1:, 1:] & known[:-1, 1:] & known[1:, :-1]).any():
         return nothing
     low, high = np.floor(nodes[known].min(axis=0)).astype(int), np.ceil(nodes[known].max(axis=0)).astype(int)
@@ -240,5 +245,5 @@ def picture(
     lacking = cv2.remap(
         (~valid).astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0
     )
-    within = (rows > 0).astype(np.float32) @ ~known @ (cols > 0).T == 0.0
+    within = rows @ (1.0 - known) @ cols.T == 0.0
     return np.asarray(found, np.float32), np.asarray((lacking == 0.0) & within)
