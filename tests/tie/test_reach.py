@@ -213,7 +213,7 @@ finally:  # its own peak: what the kernel tells a parent counts the parent's, fr
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("most", [np.inf, pytest.param(5.0, marks=pytest.mark.nightly)])  # CPU s: of a machine of its own
+@pytest.mark.parametrize("most", [np.inf, pytest.param(5.0, marks=pytest.mark.nightly)])  # CPU s, idle
 def test_a_refusal_ends_within_seconds_a_megapixel_and_six_hundred_megabytes(shared_data, tmp_path, most) -> None:
     """The satellite's image upside down under the same RPC: nothing is where it should be."""
     satellite, aerial = frames(shared_data)
