@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from barpc.dsm.block import NoSurfaceError
+from barpc.dsm.stereo import NoSurfaceError
 from barpc.dsm.surface import Surface, make_dsm
 
 __all__ = ["NoSurfaceError", "Surface", "make_dsm"]

@@ -17,8 +17,8 @@ from scipy.ndimage import map_coordinates
 
 from barpc.base.errors import BarpcError
 from barpc.cameras import open_camera
-from barpc.dsm.block import Block, Groups
 from barpc.dsm.cells import F32, Tile, surface_tile
+from barpc.dsm.stereo import Block, Groups
 from barpc.rasters.raster import open_raster
 from barpc.report.page import can_render, remake_report
 from barpc.report.runfiles import SURFACE, run_key

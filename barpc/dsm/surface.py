@@ -27,9 +27,9 @@ from barpc.base.errors import InputError, OutputError
 from barpc.base.geodesy import Array, utm
 from barpc.base.options import DsmOptions
 from barpc.base.sidefile import plain_path
-from barpc.dsm.block import Block, Groups, NoSurfaceError, block_of_images, block_of_run
 from barpc.dsm.cells import F32, MATCHED, NODES, SIDE, Tile, surface_tile
 from barpc.dsm.relief import show_in_report
+from barpc.dsm.stereo import Block, Groups, NoSurfaceError, block_of_images, block_of_run
 from barpc.pipeline.executor import CachingExecutor, worker_count
 from barpc.rasters.raster import hashed, open_raster
 from barpc.scene import View

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
-from barpc.dsm import block as block_module
-from barpc.dsm.block import CameraErrors
+from barpc.dsm import stereo
 from barpc.dsm.cells import Tile, gathered
+from barpc.dsm.stereo import CameraErrors
 from barpc.dsm.surface import Grid
 
 
@@ -47,8 +47,8 @@ def test_what_all_cells_share_is_a_mean_over_all_tiles(count: int, monkeypatch: 
         rows = np.column_stack([np.full(len(points), by_pair[pair]), points[:, 0]])
         return np.stack([rows / 2, rows / 2], axis=1)
 
-    monkeypatch.setattr(block_module, "height_by_unknowns", by_unknowns)
-    monkeypatch.setattr(block_module, "ecef_from_ground", np.asarray)
+    monkeypatch.setattr(stereo, "height_by_unknowns", by_unknowns)
+    monkeypatch.setattr(stereo, "ecef_from_ground", np.asarray)
     cameras: Any = SimpleNamespace(sensors=range(5), unknowns=SimpleNamespace(size=2))
     tiles = [SimpleNamespace(ground=lambda n=n: np.full((4, 3), float(n))) for n in range(count)]
 

@@ -13,7 +13,7 @@ from barpc.base.geodesy import ground_from_ecef
 from barpc.base.options import AdjustOptions, DsmOptions
 from barpc.cli import main
 from barpc.dsm import make_dsm
-from barpc.dsm.block import CameraErrors
+from barpc.dsm.stereo import CameraErrors
 from barpc.pipeline import adjust
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import triangulate

@@ -15,9 +15,9 @@ from barpc.cli import main
 from barpc.dsm import NoSurfaceError, make_dsm
 from barpc.dsm import cells as cells_module
 from barpc.dsm import surface as surface_module
-from barpc.dsm.block import _best, block_of_images
 from barpc.dsm.cells import Tile
 from barpc.dsm.relief import draped
+from barpc.dsm.stereo import _best, block_of_images
 from barpc.pipeline import load_views
 from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import ImageAffine, ImageCorrected
@@ -218,9 +218,9 @@ def test_other_ground_is_refused_with_exit_code_3_and_leaves_nothing(rendered, t
 
 
 def test_too_large_an_angle_and_radar_are_refused_with_exit_code_3(rendered, tmp_path, monkeypatch, capsys):
-    import barpc.dsm.block as block
+    from barpc.dsm import stereo
 
-    monkeypatch.setattr(block, "ANGLES", (2.0, 3.0))
+    monkeypatch.setattr(stereo, "ANGLES", (2.0, 3.0))
     assert run("dsm", *rendered.paths[:2], "-o", tmp_path / "dsm.tif") == 3
     assert "no pair meets under 2 to 3 degrees, where SGBM can match (view_00 and view_01" in capsys.readouterr().err
     monkeypatch.undo()
@@ -232,7 +232,7 @@ def test_too_large_an_angle_and_radar_are_refused_with_exit_code_3(rendered, tmp
 
     radar = replace(views[0], sensor=Seen(views[0].sensor, ImageAffine(np.zeros(2), np.zeros((2, 2)))))
     with pytest.raises(NoSurfaceError, match="view_00: a radar image"):
-        block.block_of_images([radar, views[1]])
+        stereo.block_of_images([radar, views[1]])
     assert not list(tmp_path.iterdir())
 
 
