@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from barpc.ba import AdjustOptions
 from barpc.ba.estimated.waves import Waves
@@ -283,7 +282,7 @@ def test_a_detector_has_thirty_observations() -> None:
         assert made.split(0, 0.0, 0.0, residual) == (0.0, 0.0)  # where nothing is, nothing begins
 
 
-def test_what_changes_where_all_of_a_focal_plane_change_adds_up() -> None:
+def test_what_changes_where_all_of_a_focal_plane_change_adds_up_less_a_price() -> None:
     cols = [np.arange(100.0), np.arange(100.0), np.arange(100.0)]
     apart, col = columns(cols)
     together, _ = columns(cols, together=True)
@@ -291,7 +290,7 @@ def test_what_changes_where_all_of_a_focal_plane_change_adds_up() -> None:
     single = 0.16 * 25  # n1 n2 / (n1 + n2) of two times fifty
     for v in range(3):
         assert apart.split(v, -np.inf, np.inf, residual) == (pytest.approx(single), 49.5)
-    assert together.split(0, -np.inf, np.inf, residual) == (pytest.approx(3 * single), 49.5)
+    assert together.split(0, -np.inf, np.inf, residual) == (pytest.approx(3 * single - 2 * 4.0), 49.5)
 
 
 def test_means_of_detectors_are_weighted_and_nothing_where_there_is_no_edge() -> None:
@@ -312,27 +311,24 @@ def grown(made: _Columns, residual: np.ndarray, sigma: float = 1.0) -> tuple[lis
 
 
 @pytest.mark.parametrize(("share", "found"), [(0.98, False), (1.02, True)])
-def test_a_step_is_found_where_no_place_explains_as_much_by_chance(share, found) -> None:
-    """Once in a thousand over 199 places, of two coordinates."""
+def test_a_step_is_found_where_it_explains_forty(share, found) -> None:
     made, col = columns([np.arange(200.0)], sigma=0.1)
-    least = float(stats.chi2.isf(1e-3 / 199, 2))
-    size = 0.1 * np.sqrt(share * least / 50.0)  # 50 = 100 100 / 200
+    size = 0.1 * np.sqrt(share * 40.0 / 50.0)  # 50 = 100 100 / 200
     residual = np.stack([0 * col, np.where(col < 100, 0.0, size)])
     edges, left = grown(made, residual, 0.1)
     assert edges == ([[99.5]] if found else [[]])
     # an edge costs what it has to explain
-    assert left == pytest.approx(least if found else squares(residual, np.full(200, 100.0)) * 2, abs=1e-6)
+    assert left == pytest.approx(40.0 if found else squares(residual, np.full(200, 100.0)) * 2, abs=1e-6)
 
 
 @pytest.mark.parametrize(("share", "found"), [(0.98, False), (1.02, True)])
-def test_a_step_of_a_focal_plane_has_two_coordinates_a_view(share, found) -> None:
+def test_a_step_of_a_focal_plane_has_to_explain_four_more_a_view(share, found) -> None:
     made, col = columns([np.arange(200.0)] * 3, together=True)
-    least = float(stats.chi2.isf(1e-3 / 199, 6))
-    residual = np.stack([np.where(col < 100, 0.0, np.sqrt(share * least / 150.0)), 0 * col])
+    residual = np.stack([np.where(col < 100, 0.0, np.sqrt(share * 48.0 / 150.0)), 0 * col])
     edges, left = grown(made, residual)
     assert edges == ([[99.5]] if found else [[]])
     if found:
-        assert left == pytest.approx(least, abs=1e-6)
+        assert left == pytest.approx(48.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(("share", "found"), [(0.48, False), (0.52, True)])
@@ -349,7 +345,7 @@ def test_steps_of_many_detectors_are_found_where_they_begin() -> None:
     levels = np.array([0.0, 3.0, 1.0, 4.0, 2.5, 0.0])
     edges, left = grown(made, np.stack([levels[(col // 100).astype(int)], -levels[(col // 100).astype(int)]]))
     np.testing.assert_allclose(edges[0], [99.5, 199.5, 299.5, 399.5, 499.5])
-    assert left == pytest.approx(5 * stats.chi2.isf(1e-3 / 599, 2), abs=1.0)
+    assert left == pytest.approx(5 * 40.0, abs=1.0)
 
 
 @pytest.fixture(scope="module")

@@ -11,13 +11,16 @@ from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
-from scipy.special import chdtri
 
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import BACKFITTING, CHANCE, FEW, ITERATIONS
+from barpc.ba.usual import BACKFITTING, FEW, ITERATIONS
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray
+
+_LARGE = 40.0  # twice the logarithm of a likelihood ratio: the largest of 10,000 places by chance once in 100,000 views
+_A_VIEW = 4.0  # and so much more for every other view of a focal plane
+_AS_LARGE = 0.5  # of the largest change: not what another view's step leaves here, a quarter of it with three views
 
 Edges = list[list[float]]  # of every group of views, ascending
 
@@ -34,9 +37,6 @@ class _Columns:
         self.groups = groups
         every = [np.unique(np.concatenate([self.col[v] for v in group])) for group in groups]
         self.places = [0.5 * (one[1:] + one[:-1]) for one in every]
-        # two coordinates of every view; of all places none explains as much by chance
-        tests = zip(self.groups, self.places, strict=True)
-        self.least = [float(chdtri(2.0 * len(one), CHANCE / max(len(at), 1))) for one, at in tests]
 
     def means(self, residual: Array, edges: Edges) -> Array:
         """Return every detector's mean (2, K) of residuals (2, K) at its observations in use; zero elsewhere."""
@@ -49,13 +49,13 @@ class _Columns:
         return out
 
     def split(self, g: int, low: float, high: float, residual: Array) -> tuple[float, float]:
-        """Return the largest change between two columns of a group: what it explains (chi-square), and where."""
+        """Return the largest change between two columns of a group: what it explains beyond chance, and where."""
         places = self.places[g][np.searchsorted(self.places[g], low) : np.searchsorted(self.places[g], high)]
         if not len(places):
             return 0.0, low
         gain = sum(self._gains(v, low, high, residual, places) for v in self.groups[g])
         at = int(np.argmax(gain))
-        return float(np.max(gain)), float(places[at])
+        return float(np.max(gain)) - _A_VIEW * (len(self.groups[g]) - 1), float(places[at])
 
     def _gains(self, v: int, low: float, high: float, residual: Array, places: Array) -> Array:
         a, b = np.searchsorted(self.col[v], [low, high])
@@ -106,17 +106,19 @@ def _grown(columns: _Columns, residual: Array, settled: Callable[[Array], Array]
             for g, of_group in enumerate(edges)
             for stretch in pairwise([-np.inf, *of_group, np.inf])
         ]
-        found = [one for one in found if one[1] >= columns.least[one[0]]]
-        if not found:
+        largest = max(gain for _, gain, _ in found)
+        if largest < _LARGE:
             break
-        half = 0.5 * max(gain for _, gain, _ in found)  # another view's step leaves less here, of three views a quarter
-        for g, _, col in (one for one in found if one[1] >= half):
-            edges[g] = sorted([*edges[g], col])
+        for g, gain, col in found:
+            if gain >= max(_LARGE, _AS_LARGE * largest):
+                edges[g] = sorted([*edges[g], col])
         for _ in range(BACKFITTING):
             part += columns.means(settled(residual - part), edges)
     left = settled(residual - part)
     cost = float(((left * weight) ** 2).sum())
-    cost += sum(len(one) * least for one, least in zip(edges, columns.least, strict=True))
+    cost += sum(
+        len(one) * (_LARGE + _A_VIEW * (len(group) - 1)) for one, group in zip(edges, columns.groups, strict=True)
+    )
     return [_placed(columns, g, of_group, part + left) for g, of_group in enumerate(edges)], cost
 
 
@@ -126,5 +128,5 @@ def _placed(columns: _Columns, g: int, edges: list[float], residual: Array) -> l
     for at in range(len(edges)):
         low = found[-1] if found else -np.inf
         gain, col = columns.split(g, low, edges[at + 1] if at + 1 < len(edges) else np.inf, residual)
-        found += [col] if gain >= columns.least[g] else []
+        found += [col] if gain >= _LARGE else []
     return found
