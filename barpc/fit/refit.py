@@ -87,6 +87,12 @@ def fit_rpc(
         raise FitError("; ".join(filter(None, (str(error), advice)))) from error
 
 
+def fit_only(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], method: str) -> RPC:
+    """Return the RPC of a sensor model by one method, without a certificate: whoever calls measures what it misses."""
+    options, alt_range = FitOptions(), widened(alt_range)
+    return solve(*_given(model, size, alt_range, options, method), options, method, vendor=underlying_rpc(model)).rpc
+
+
 def _sampled(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Sample:
     """Return the check points of a model; FitError where it has no ground for too much of its image."""
     sample = Sample.of(model, size, alt_range)

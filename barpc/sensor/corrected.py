@@ -24,8 +24,10 @@ from barpc.base.geodesy import (
     ecef_from_ground_jacobian,
     ground_from_ecef,
     ground_from_ecef_jacobian,
+    pointwise,
+    wrap_longitude,
 )
-from barpc.sensor import STANDS, Behind, Displaced, SensorModel, fixed_point
+from barpc.sensor import Behind, Displaced, SensorModel, fixed_point
 from barpc.sensor.curve import Turn, cross, rotation_left_jacobian, rotation_matrix
 
 IntArray = npt.NDArray[np.int64]
@@ -147,8 +149,10 @@ class Correction(Frozen):
 
     def undo(self, ecef: Array, row: Array) -> Array:
         """Return the points X (N, 3) [m] that `apply` takes to ECEF points (N, 3) at rows (N,)."""
-        drift = Turn(self._turns(row))
-        back = rotation_matrix(self.rotation).T @ drift.back((ecef - self.center).T)
+        back = (ecef - self.center).T
+        if len(self.drift):
+            back = Turn(self._turns(row)).back(back)
+        back = rotation_matrix(self.rotation).T @ back
         return np.asarray(back.T / self.scale + self.translation + self.center)
 
     def _turns(self, row: Array) -> Array:
@@ -223,28 +227,24 @@ class Corrected(Behind):
     def localize(self, image: Array, alt: Array) -> Array:
         """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
 
-        Newton on (lon, lat) from where the uncorrected sensor puts the point, with that sensor's derivative where the
-        point is moved to: a correction turns by so little that each step gains four digits. NaN where it does not
-        settle.
+        Where the uncorrected sensor sees them, brought back; at the altitude from which the correction brings them to
+        the one asked for. It turns by so little that each step gains four digits. NaN where that does not settle.
         """
-        ground, image = np.array(self.sensor.localize(image, alt)), np.asarray(image, dtype=np.float64)
-        row = image[..., 1] if len(self.correction.drift) else None  # where the point will be seen
-        rounding = 8 * np.finfo(float).eps * np.abs(image).max(axis=-1)
-        settled = False
-        with np.errstate(all="ignore"):
-            for _ in range(NEWTON_STEPS):
-                moved = ground_from_ecef(self.correction.apply(ecef_from_ground(ground), row))
-                value, jacobian = self.sensor.project_jacobian(moved)
-                residual = image - value
-                miss = np.abs(residual).max(axis=-1)
-                if settled:
-                    break
-                settled = not (miss > SETTLED).any()
-                a, b, c, d = (jacobian[..., i, j] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
-                det = a * d - b * c
-                ground[..., 0] += (d * residual[..., 0] - b * residual[..., 1]) / det
-                ground[..., 1] += (a * residual[..., 1] - c * residual[..., 0]) / det
-            ground[~(miss <= STANDS + rounding)] = np.nan
+        return pointwise(lambda *part: [self._localize(*part)], [(3,)], image, alt)[0]
+
+    def _localize(self, image: Array, alt: Array) -> Array:
+        before, settled = alt, False
+        for _ in range(NEWTON_STEPS):
+            found = self.sensor.localize(image, before)
+            ground = ground_from_ecef(self.correction.undo(ecef_from_ground(found), image[:, 1]))
+            off = alt - ground[:, 2]
+            if settled:
+                break
+            settled = not (np.abs(off) > SETTLED).any()
+            before = before + off
+        ground[~(np.abs(off) <= SETTLED)] = np.nan
+        ground[:, 2] = alt
+        ground[:, 0] = wrap_longitude(ground[:, 0], found[:, 0])
         return ground
 
 
