@@ -19,9 +19,9 @@ from barpc.fit.points import checked_points, column_ranges, control_points, scre
 from barpc.fit.reasons import reason
 from barpc.fit.system import FitProblem, Normalization
 from barpc.sensor import SensorModel
+from barpc.sensor.displaced import Splined
 from barpc.sensor.geometry import is_radar
 from barpc.sensor.rpc import RPC
-from barpc.sensor.splined import Splined
 
 Seen = Callable[[RPC, FitSolution], tuple[Errors, Array]]
 """What a localisation RPC is off by on points that it has not seen [m, px], and the largest (2,)."""
@@ -49,7 +49,7 @@ def fit_rpc(
     options : FitOptions, optional, grid, solver, tolerance
     strict : bool
         Raise where the tolerance is missed; otherwise give the best fit found, to be judged by `RpcFit.verdict`. A
-        camera behind a spline (`barpc.sensor.splined`) is expected to miss it.
+        camera behind a spline (`barpc.sensor.displaced`) is expected to miss it.
 
     Raises
     ------

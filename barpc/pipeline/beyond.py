@@ -25,10 +25,10 @@ from barpc.pipeline.handoff import verify_grid
 from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid, write_resampled
 from barpc.scene import View
 from barpc.sensor import SensorModel
-from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
 from barpc.sensor.csm import STATE_END as STATE
 from barpc.sensor.csm import is_writable, open_state, state_text
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
+from barpc.sensor.displaced import CorrectionGrid, GridCorrected
 from barpc.sensor.rpc import RPC
 from barpc.tie.tasks import Progress, ordered
 from barpc.workspace import Workspace

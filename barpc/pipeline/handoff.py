@@ -36,9 +36,9 @@ from barpc.rasters.vrt import Vrt, read_vrt
 from barpc.rpcio import Carrier, read_rpc, row_of, sidecars
 from barpc.rpcio.grids import CORRECTION, GRID
 from barpc.sensor import SensorModel
-from barpc.sensor.correction_grid import CorrectionGrid
 from barpc.sensor.csm import STATE_END
 from barpc.sensor.direct_grid import DirectGrid
+from barpc.sensor.displaced import CorrectionGrid
 from barpc.sensor.geometry import image_grid
 
 TOLERANCE = 1e-6  # Largest difference [px] between a file and its model that passes

@@ -31,8 +31,8 @@ from barpc.rasters.raster import BLOCK, open_raster
 from barpc.rpcio.carried import printable, put_tag, read_tag
 from barpc.rpcio.images import TIFF, copying, created, has_mask, require_pixels
 from barpc.scene import BoolArray
-from barpc.sensor.correction_grid import CorrectionGrid
 from barpc.sensor.direct_grid import DirectGrid
+from barpc.sensor.displaced import CorrectionGrid
 from barpc.sensor.rpc import RPC
 
 GRID, CORRECTION = "_grid.tif", "_correction.tif"

@@ -1,4 +1,4 @@
-"""Sensor models behind a correction: in space, P_BA, and in the image.
+"""Sensor models behind a correction in space: P_BA.
 
 The paper's corrected projection is P_BA(X) = P(R (X - T - C) + C) with X in ECEF (eq. 7 of Akiki et al.
 2021, "Robust Rational Polynomial Camera Modelling for SAR and Pushbroom Imaging"). A second rotation, a
@@ -25,8 +25,9 @@ from barpc.base.geodesy import (
     ground_from_ecef,
     ground_from_ecef_jacobian,
 )
-from barpc.sensor import STANDS, Behind, Displaced, SensorModel, fixed_point
+from barpc.sensor import Behind, SensorModel
 from barpc.sensor.curve import Turn, cross, rotation_left_jacobian, rotation_matrix
+from barpc.sensor.displaced import STANDS, fixed_point
 
 IntArray = npt.NDArray[np.int64]
 
@@ -246,39 +247,3 @@ class Corrected(Behind):
                 ground[..., 1] += (a * residual[..., 1] - c * residual[..., 0]) / det
             ground[~(miss <= STANDS + rounding)] = np.nan
         return ground
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class ImageAffine(Frozen):
-    """An affine correction in the image: image + shift + slope @ image."""
-
-    shift: Array  # (2,): col, row [px]
-    slope: Array  # (2, 2): change of (col, row) by (col, row) [px/px]
-
-    def __post_init__(self) -> None:
-        self._array("shift", (2,), RpcError)
-        self._array("slope", (2, 2), RpcError)
-
-    def apply(self, image: Array) -> Array:
-        """Return the corrected image points (..., 2) [px]."""
-        return image @ (np.eye(2) + self.slope).T + self.shift
-
-    def linearised(self, image: Array) -> tuple[Array, Array]:
-        """Return the same, and the derivative (2, 2)."""
-        return self.apply(image), np.eye(2) + self.slope
-
-    def undo(self, image: Array) -> Array:
-        """Return the image points (..., 2) [px] without the correction."""
-        return (image - self.shift) @ np.linalg.inv(np.eye(2) + self.slope).T
-
-
-@dataclass(frozen=True)
-class ImageCorrected(Displaced):
-    """`sensor` with its image points corrected by an affine map; itself a `SensorModel`.
-
-    The bias corrections (shift, drift, affine) of Fraser and Hanley ("Bias compensation in rational functions for
-    Ikonos satellite imagery", 2003) and Grodecki and Dial ("Block adjustment of high-resolution satellite images
-    described by rational polynomials", 2003), for comparison with the correction in space.
-    """
-
-    correction: ImageAffine  # what is added to its image points

@@ -19,8 +19,7 @@ from barpc.base.geodesy import (
     wrap_longitude,
 )
 from barpc.sensor import SensorModel
-from barpc.sensor.rpc import RPC
-from barpc.sensor.stack import localize_stack
+from barpc.sensor.rpc import RPC, localize_stack
 from barpc.sensor.timing import Clocked
 
 BoolArray = npt.NDArray[np.bool_]

@@ -1,13 +1,17 @@
-"""What no rotation and no RPC holds: a correction in the image, by a spline over its rows, steps, strips and swings.
+"""What no rotation and no RPC holds: corrections in the image, behind which a model is a model again.
 
-Attitude jitter moves image rows against each other, a focal plane that is put together of detectors moves its columns,
-a jump of the attitude or of the clock a strip of rows, a wheel out of balance swings them. All are functions of where
-a point is *seen*, so that x = P(X) + s(x): localisation is explicit, projection iterates.
+An affine map, as others correct RPCs. A spline over the rows, steps, strips and swings: attitude jitter moves image
+rows against each other, a focal plane that is put together of detectors moves its columns, a jump of the attitude or of
+the clock a strip of rows, a wheel out of balance swings them. All are functions of where a point is *seen*, so that
+x = P(X) + s(x): localisation is explicit, projection iterates. What an RPC lacks on a grid, by where the RPC has a
+point: true image position = RPC's + (dcol, drow).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -15,9 +19,101 @@ import numpy.typing as npt
 from barpc.base.errors import RpcError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array
-from barpc.sensor import Displaced, fixed_point
+from barpc.sensor import Behind, SensorModel
+from barpc.sensor.direct_grid import LINEAR, LONGEST, linear_axes
+
+if TYPE_CHECKING:
+    from scipy.interpolate import RegularGridInterpolator
 
 IntArray = npt.NDArray[np.int64]
+
+_STEPS = 60  # of a fixed point: a correction gains two or three digits a step, wild ones need more
+STANDS = 1e-7
+"""Of image points that are iterated [px]: what is left after so small a step is a hundredth of it."""
+
+
+class Displacement(Protocol):
+    """A correction of image points: from where a model without it has them to where they are seen, and back."""
+
+    def apply(self, image: Array) -> Array:
+        """Return where points that a model has at (..., 2) [px] are seen."""
+        ...
+
+    def linearised(self, image: Array) -> tuple[Array, Array]:
+        """Return the same, and its derivative (..., 2, 2) by the model's image points."""
+        ...
+
+    def undo(self, image: Array) -> Array:
+        """Return where the model has points that are seen at (..., 2) [px]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Displaced(Behind):
+    """`sensor` with its image points corrected by `correction`; itself a `SensorModel`."""
+
+    sensor: SensorModel
+    correction: Displacement
+
+    def project(self, ground: Array) -> Array:
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
+        return self.correction.apply(self.sensor.project(ground))
+
+    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
+        image, jacobian = self.sensor.project_jacobian(ground)
+        image, slope = self.correction.linearised(image)
+        return image, slope @ jacobian
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
+        return self.sensor.localize(self.correction.undo(np.asarray(image, dtype=np.float64)), alt)
+
+
+def fixed_point(follow: Callable[[Array], Array], image: Array) -> Array:
+    """Return the image points (..., 2) [px] that `follow` leaves where they are, from a first guess."""
+    for _ in range(_STEPS):
+        before, image = image, follow(image)
+        change = np.abs(image - before)
+        if not (change.max(initial=0.0, where=np.isfinite(change)) > STANDS):
+            break
+    return image
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ImageAffine(Frozen):
+    """An affine correction in the image: image + shift + slope @ image."""
+
+    shift: Array  # (2,): col, row [px]
+    slope: Array  # (2, 2): change of (col, row) by (col, row) [px/px]
+
+    def __post_init__(self) -> None:
+        self._array("shift", (2,), RpcError)
+        self._array("slope", (2, 2), RpcError)
+
+    def apply(self, image: Array) -> Array:
+        """Return the corrected image points (..., 2) [px]."""
+        return image @ (np.eye(2) + self.slope).T + self.shift
+
+    def linearised(self, image: Array) -> tuple[Array, Array]:
+        """Return the same, and the derivative (2, 2)."""
+        return self.apply(image), np.eye(2) + self.slope
+
+    def undo(self, image: Array) -> Array:
+        """Return the image points (..., 2) [px] without the correction."""
+        return (image - self.shift) @ np.linalg.inv(np.eye(2) + self.slope).T
+
+
+@dataclass(frozen=True)
+class ImageCorrected(Displaced):
+    """`sensor` with its image points corrected by an affine map; itself a `SensorModel`.
+
+    The bias corrections (shift, drift, affine) of Fraser and Hanley ("Bias compensation in rational functions for
+    Ikonos satellite imagery", 2003) and Grodecki and Dial ("Block adjustment of high-resolution satellite images
+    described by rational polynomials", 2003), for comparison with the correction in space.
+    """
+
+    correction: ImageAffine  # what is added to its image points
 
 
 def bspline_pieces(u: Array, count: int, rate: bool = False) -> tuple[IntArray, Array]:
@@ -168,3 +264,79 @@ class Splined(Displaced):
     """`sensor`, usually P_BA, with its image points displaced by a spline, steps and swings; itself a `SensorModel`."""
 
     correction: RowSpline  # what is added to its image points
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CorrectionGrid(Frozen):
+    """Displacements (dcol, drow) over an image, linear between the nodes and constant beyond them.
+
+    Parameters
+    ----------
+    cols, rows : (W,), (H,), nodes [px], evenly spaced and ascending; (0, 0) is the centre of the top-left pixel
+    shift : (H, W, 2), what is added to the image point of the RPC to get the true one [px]
+    """
+
+    cols: Array
+    rows: Array
+    shift: Array
+    _linear: RegularGridInterpolator = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        for name in ("cols", "rows"):
+            axis = self._array(name, (None,), RpcError)
+            if len(axis) < 2 or not (np.diff(axis) > 0).all():
+                raise RpcError(f"correction grid: {name} must ascend")
+        shift = self._array("shift", (len(self.rows), len(self.cols), 2), RpcError)
+        from scipy.interpolate import RegularGridInterpolator  # a quarter of a second, of grids alone
+
+        self._keep("_linear", RegularGridInterpolator((self.rows, self.cols), shift, bounds_error=False))
+
+    @classmethod
+    def between(
+        cls,
+        rpc: SensorModel,
+        model: SensorModel,
+        size: tuple[int, int],
+        alt: float,
+        tolerance: float = LINEAR,
+    ) -> CorrectionGrid:
+        """Return the displacements from the image points of `rpc` to those of `model` for ground of one
+        altitude [m].
+
+        Linear interpolation misses by no more than `tolerance` [px]. RpcError where a camera sees no ground.
+        """
+
+        def lacking(points: Array) -> Array:
+            return model.project(rpc.localize(points, np.full(points.shape[:-1], alt))) - points
+
+        low, high = np.full(2, -0.5), np.asarray(size) - 0.5
+        cols, rows = linear_axes(lacking, low, high, np.array(LONGEST[:2]), tolerance)
+        nodes = np.stack(np.meshgrid(cols, rows), axis=-1)
+        return cls(cols, rows, lacking(nodes).astype(np.float32).astype(np.float64))
+
+    def at(self, image: Array) -> Array:
+        """Return the displacements (..., 2) [px] at image points (..., 2) [px] of the RPC; NaN at NaN."""
+        low, high = np.array([(axis[0], axis[-1]) for axis in (self.cols, self.rows)]).T
+        inside = np.clip(image, low, high)[..., ::-1]
+        return np.asarray(self._linear(inside)).reshape(inside.shape)
+
+    def apply(self, image: Array) -> Array:
+        """Return the true image points (..., 2) [px] of those of the RPC (..., 2) [px]."""
+        return np.asarray(image + self.at(image))
+
+    def linearised(self, image: Array) -> tuple[Array, Array]:
+        """Return the same, and its derivative (..., 2, 2), over a tenth of a cell around the image points."""
+        reach = 0.05 * np.array([self.cols[1] - self.cols[0], self.rows[1] - self.rows[0]])
+        by_axis = [(self.apply(image + step) - self.apply(image - step)) / (2 * step.sum()) for step in np.diag(reach)]
+        return self.apply(image), np.stack(by_axis, axis=-1)
+
+    def undo(self, image: Array) -> Array:
+        """Return the image points (..., 2) [px] of the RPC that belong to true ones."""
+        return fixed_point(lambda of_rpc: image - self.at(of_rpc), image)
+
+
+@dataclass(frozen=True)
+class GridCorrected(Displaced):
+    """`sensor`, an RPC, and what it lacks; itself a `SensorModel`."""
+
+    correction: CorrectionGrid  # what is added to its image points
