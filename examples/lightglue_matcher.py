@@ -34,7 +34,9 @@ def match(view_a, view_b, prediction):
 
 def _tile(view_a, view_b, box, prediction):
     col, row, width, height = box
-    corners = np.array([(col, row), (col + width, row), (col, row + height), (col + width, row + height)], float)
+    corners = np.array(
+        [(col, row), (col + width, row), (col, row + height), (col + width, row + height)], float
+    )
     where = prediction.at(corners)
     ends = np.concatenate([where.place(where.before), where.place(where.after)])
     if not np.isfinite(ends).all():

@@ -53,7 +53,9 @@ def orthorectify(image: Path, ortho: Path, model: RangeDoppler, pixel: float, **
     transform = rasterio.Affine(step[0], 0.0, west, 0.0, -step[1], north)
     with (
         rasterio.open(image) as source,
-        rasterio.open(ortho, "w", **profile, crs=CRS.from_epsg(4326), transform=transform, nodata=0) as target,
+        rasterio.open(
+            ortho, "w", **profile, crs=CRS.from_epsg(4326), transform=transform, nodata=0
+        ) as target,
     ):
         reproject(
             rasterio.band(source, 1),
@@ -88,7 +90,9 @@ def run(args: argparse.Namespace) -> None:
 
 def main(argv: list[str] | None = None) -> None:
     """Read the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("safe", type=Path, help="the .SAFE folder of an SLC product")
     parser.add_argument("out", type=Path, help="folder for the results")
     parser.add_argument("--swath", default="iw1", help="iw1, iw2, iw3, ew1 ... ew5")
