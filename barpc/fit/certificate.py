@@ -45,14 +45,10 @@ class Reason:
 
     Parameters
     ----------
-    cause : str
-        "row", "column", "altitude", "place", "corner", "pole" or "all".
-    share : float
-        Part of the squared errors that is due to it; of "all", what is left by the best of the others.
-    size_px : float
-        Root mean square of that part.
-    col, row : float
-        Position of a place [px].
+    cause : str, "row", "column", "altitude", "place", "corner", "pole" or "all"
+    share : float, part of the squared errors that is due to it; of "all", what is left by the best of the others
+    size_px : float, root mean square of that part
+    col, row : float, position of a place [px]
     """
 
     cause: str
@@ -150,9 +146,7 @@ class Sample:
         return self.sought(lambda ground, points: rpc.project(ground) - points[:, :2])
 
     def sought(self, off: Callable[[Array, Array], Array]) -> tuple[Errors, Array]:
-        """Return the errors (N, 2) [px] of an RPC at ground points (N, 3) and their (N, 3) col, row [px],
-        altitude [m].
-        """
+        """Return an RPC's errors (N, 2) [px] at ground points (N, 3) and their (N, 3) col, row, altitude."""
         points, miss = self.points, _size(off(self.ground, self.points))
         errors = Errors()
         errors.add(miss[: self.count])
@@ -215,14 +209,10 @@ class Localisation:
 
     Parameters
     ----------
-    rmse_m, max_m : float
-        Root mean square and largest distance on the ground from where the camera localises them [m].
-    rmse_px, max_px : float
-        The same from where the fitted RPC projects the places found [px].
-    min_denominator : float
-        As for the RPC, over image and altitudes.
-    method : str
-        The solver whose result this is.
+    rmse_m, max_m : float, root mean square and largest distance on the ground from where the camera localises them [m]
+    rmse_px, max_px : float, the same from where the fitted RPC projects the places found [px]
+    min_denominator : float, as for the RPC, over image and altitudes
+    method : str, the solver whose result this is
     """
 
     rmse_m: float
@@ -244,9 +234,7 @@ class Localisation:
 
 
 def off(rpc: RPC, found: Array, ground: Array, image: Array) -> Array:
-    """Return the distances (N, 2) [m, px] of places `found` (N, 3) from ground points (N, 3), and of their
-    projections.
-    """
+    """Return the distances (N, 2) of places `found` (N, 3) from ground points [m], and of their projections [px]."""
     miss = found - ground
     miss[:, 0] = wrap_longitude(miss[:, 0])
     metres = np.linalg.norm((miss * metres_per_unit(ground))[:, :2], axis=1)
@@ -259,10 +247,8 @@ class RpcFit:
 
     Parameters
     ----------
-    rpc : RPC
-        The result.
-    rmse_cnp, max_cnp : (2,)
-        Root mean square and largest error of col, row on the control points [px].
+    rpc : RPC, the result
+    rmse_cnp, max_cnp : (2,), root mean square and largest error of col, row on the control points [px]
     rmse_ckp, max_ckp : (2,)
         The same on check points all over image and altitudes, which the fit has not seen [px]; the largest error was
         also looked for around the worst of them.
@@ -274,23 +260,16 @@ class RpcFit:
         around it, over what they are at its centre; above 0 there is no pole.
     roundtrip : float
         Largest distance of a check point from where its projection is localised [px]; infinite where that fails.
-    coverage : float
-        Share of the image inside the convex hull of the control points.
-    h : (2,)
-        Regularisation used for col, row.
-    iterations : int
-        Passes over the points.
-    num_cnp, num_ckp : int
-        Number of points.
-    method : str
-        The solver whose result this is.
-    localisation : Localisation or None
-        The certificate of `rpc.direct`, where it was asked for.
+    coverage : float, share of the image inside the convex hull of the control points
+    h : (2,), regularisation used for col, row
+    iterations : int, passes over the points
+    num_cnp, num_ckp : int, number of points
+    method : str, the solver whose result this is
+    localisation : Localisation or None, the certificate of `rpc.direct`, where it was asked for
     contradiction : float
         Largest distance of a check point from where the model, not the RPC, projects the ground that it localises
         there [px]; 0 for given points. What else projects with the model may be off by as much more.
-    reason : Reason or None
-        Cause of a miss of the tolerance, of a model.
+    reason : Reason or None, cause of a miss of the tolerance, of a model
     """
 
     rpc: RPC
@@ -323,9 +302,7 @@ class RpcFit:
         return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
 
     def as_written(self, rpc: RPC) -> RpcFit:
-        """Return the fit of the RPC as read back from its file: the differences over its box are added to the
-        errors.
-        """
+        """Return the fit of the RPC as read back from its file: what differs over its box is added to the errors."""
         lost = self.rpc.off(rpc)
         return replace(
             self,

@@ -302,9 +302,7 @@ def _minimised(problem: FitProblem, axis: int, x: Array, region: Region) -> tupl
 
 
 def _ahead(problem: FitProblem, system: Compressed, x: Array, penalty: Array, size: Array, region: Region) -> Array:
-    """Return the solution of a system damped towards x, its denominator kept up over a region; x where there
-    is none.
-    """
+    """Return the solution of a system damped towards x, its denominator kept up over a region; x if there is none."""
     for least, solver in (
         (EPS, solution),
         (_DAMPED, partial(bounded, region=region, active=problem.active)),  # which wants it well conditioned

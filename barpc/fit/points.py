@@ -107,9 +107,7 @@ def column_ranges(points: Array) -> tuple[Array, Array]:
 
 
 def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) -> tuple[Array, Array]:
-    """Return checked points as `checked_points` does; FitError where columns look swapped (unless `allow_mirrored`)
-    or points determine no RPC.
-    """
+    """Return `checked_points`; FitError for swapped columns (unless `allow_mirrored`) or points that make no RPC."""
     ground, image = checked_points(ground, image)
     _check_geometry(ground, image, allow_mirrored)
     distinct = len(np.unique(ground, axis=0)) if len(ground) < 400 else len(ground)

@@ -89,9 +89,7 @@ class Region:
 
     @cached_property
     def there(self) -> Array:
-        """Matrix (20, 20) that takes a cubic's coefficients to those in the skew box; its first row gives the
-        value at the centre.
-        """
+        """From a cubic's coefficients to those in the skew box (20, 20); its first row: the value at the centre."""
         places, inverse = _lattice()
         return np.asarray(inverse @ monomials((places @ self.axes + self.offset).T).T)
 
@@ -119,9 +117,7 @@ class Region:
 
 
 def _inside(reach: Array, half: Array) -> npt.NDArray[np.bool_]:
-    """Return the nodes (n, n) of the net of the pieces that a hull touches: its `reach` in all directions,
-    half widths (2,).
-    """
+    """Return the nodes (n, n) of the pieces that a hull of half widths (2,) touches: its `reach` in all directions."""
     width, level = 2.0 / _PIECES, _DIRECTIONS * half
     start = -1.0 + width * np.arange(_PIECES)
     corner = np.stack(np.meshgrid(start, start, indexing="ij"), axis=-1)
@@ -133,9 +129,7 @@ def _inside(reach: Array, half: Array) -> npt.NDArray[np.bool_]:
 
 
 def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:
-    """Return a lower bound of the denominators over a box `low`, `high` (3,) [deg, deg, m] and 25 % around
-    it, over what they are at its centre.
-    """
+    """Return a lower bound of the denominators over a box (3,), (3,) and a margin, over what they are at its centre."""
     box = np.sort(rpc.normalize(np.stack([low, high])), axis=1)
     around = BOX * 0.5 * (box[:, 1] - box[:, 0])
     return Region.box(box + around[:, None] * np.array([-1.0, 1.0])).smallest(rpc.coeffs[1::2])

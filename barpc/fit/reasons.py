@@ -21,9 +21,7 @@ _MOST = 0.5  # of the squares: a cause of more is named
 
 
 def reason(rpc: RPC, sample: Sample) -> Reason | None:
-    """Return what most of the errors of an RPC at the points of a sample depend on; None where errors are not
-    finite.
-    """
+    """Return what most of an RPC's errors at the points of a sample depend on; None where they are not finite."""
     ground, points = sample.ground[: sample.count], sample.points[: sample.count]
     error = rpc.project(ground) - points[:, :2]
     if not (np.isfinite(error).all() and error.any()):
@@ -50,9 +48,7 @@ def reason(rpc: RPC, sample: Sample) -> Reason | None:
 
 
 def _tangent(rpc: RPC, ground: Array, axis: int) -> Array:
-    """Return the directions (N, 39) that small changes of the coefficients of col (`axis` 0) or row (1) move
-    its points in.
-    """
+    """Return the directions (N, 39) of points under small changes of the coefficients of col (`axis` 0) or row (1)."""
     basis = monomials(rpc.normalize(ground)).T
     above, below = basis @ rpc.coeffs[2 * axis], basis @ rpc.coeffs[2 * axis + 1]
     rows = np.hstack([basis, -(above / below)[:, None] * basis[:, 1:]]) / below[:, None]

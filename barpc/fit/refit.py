@@ -147,16 +147,12 @@ def fit_rpc_points(
 
     Parameters
     ----------
-    ground : (N, 3)
-        lon, lat [deg], alt [m above the ellipsoid]; all at one altitude give an RPC for that altitude only.
-    image : (N, 2)
-        col, row [px].
-    sigma : (N,), optional
-        Relative standard deviations of the image points; else equal.
+    ground : (N, 3), lon, lat [deg], alt [m above the ellipsoid]; all at one altitude give an RPC for that altitude only
+    image : (N, 2), col, row [px]
+    sigma : (N,), optional, relative standard deviations of the image points; else equal
     check : (ground, image), optional
         Check points (M, 3) and (M, 2). Without them the certificate holds leave-one-out residuals.
-    size : (width, height), optional
-        Image whose coverage is stated [px]; else the points' own extent.
+    size : (width, height), optional, image whose coverage is stated [px]; else the points' own extent
     vendor : RPC, optional, whose denominators may be kept
     options : FitOptions, optional
         Solver, tolerance. Points that are noisy want a ``tolerance`` of three or four times their noise.
@@ -283,9 +279,7 @@ def _best(
 
 
 def inverse(rpc: RPC, ground: Array, image: Array, weight: Array | None = None) -> FitProblem:
-    """Return the problem of the localisation RPC that goes with an RPC: its normalisation, its points, roles
-    exchanged.
-    """
+    """Return the problem of the localisation RPC of an RPC: its normalisation, its points, roles exchanged."""
     norm = Normalization(
         np.append(rpc.image_offset, rpc.ground_offset[2]),
         np.append(rpc.image_scale, rpc.ground_scale[2]),

@@ -58,8 +58,7 @@ class Normalization(Frozen):
     ----------
     ground_offset, ground_scale : (3,)
         lon, lat [deg], alt [m]. A scale may be negative, not zero.
-    image_offset, image_scale : (2,)
-        col, row [px].
+    image_offset, image_scale : (2,), col, row [px]
     """
 
     ground_offset: Array

@@ -104,9 +104,7 @@ def read_values(file: BinaryIO, directory: Directory, entry: Entry, name: str) -
 
 
 def read_tag(path: Place) -> RPC | None:
-    """Read the RPC in a TIFF's tag, None without such a tag; RpcFormatError where it does not hold 92 usable
-    doubles.
-    """
+    """Read the RPC in a TIFF's tag, None without one; RpcFormatError where it does not hold 92 usable doubles."""
     with opened(path, IMAGE) as file:
         directory = read_directory(file, str(path))
         entry = directory.find(RPC_TAG)

@@ -150,9 +150,7 @@ def _listed(folder: Path, _changed: int) -> Mapping[str, str]:
 
 
 def find_rpc(folder: Path, image: Path) -> Path:
-    """Return the file in a folder that holds the RPC of an image of that name, in a format that is written
-    (or InputError).
-    """
+    """Return the file in a folder that holds an image's RPC in a format that is written (or InputError)."""
     present = files_of(folder)
     ends = [suffix for row in _rows() for suffix in row.suffixes]
     ends += [row.beside for row in WRITABLE.values()]
@@ -164,9 +162,7 @@ def find_rpc(folder: Path, image: Path) -> Path:
 
 
 def parse(data: bytes, name: str, options: ReadOptions | None = None) -> tuple[RPC, str]:
-    """Return the RPC in all bytes of a file called `name`, and its format; RpcFormatError where there is no
-    valid one.
-    """
+    """Return the RPC in all bytes of a file called `name`, and its format; RpcFormatError where none is valid."""
     if not data.strip():
         raise RpcFormatError(f"{name}: the file is empty, expected an RPC")
     RPC_FILE.check(name, len(data))

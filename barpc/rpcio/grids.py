@@ -189,9 +189,7 @@ def _fill(dataset: Any, out: Any, block: Window, correction: CorrectionGrid) -> 
 
 
 def _interpolated(pixels: Pixels, known: BoolArray, place: Array) -> Array:
-    """Return the values of a block at places (2, H, W), row before col; unknown pixels take the value of the
-    nearest known one.
-    """
+    """Return a block's values at places (2, H, W), row before col; unknown pixels are as the nearest known one."""
     from scipy.ndimage import distance_transform_edt, map_coordinates, spline_filter  # of no other output
 
     values = pixels.astype(np.float64)

@@ -53,9 +53,7 @@ class ReadOptions:
 
 
 def number(text: str, name: str, key: str) -> float:
-    """Return the number at the start of `text` (or RpcFormatError); a unit may follow, the exponent may be
-    Fortran's D.
-    """
+    """Return the number at the start of `text` (or RpcFormatError); a unit may follow; 1D3 is Fortran's 1E3."""
     text = text.strip()
     match = NUMBER.match(text)
     rest = text[match.end() :] if match else text
@@ -302,9 +300,7 @@ def bare(text: str) -> bool:
 
 
 def read_bare(text: str, name: str, options: ReadOptions) -> RPC:
-    """Read the numbers without names, separated by commas, blanks or lines, in the order of ENVI's header
-    (IARPA, s2p).
-    """
+    """Read numbers without names, between commas, blanks or lines, in the order of ENVI's header (IARPA, s2p)."""
     values = [number(part, name, "a number") for part in _BETWEEN.split(text) if part]
     rpc = _in_order(values, "a list without names", name, options)
     first = rpc.coeffs[1::2, 0]

@@ -139,9 +139,7 @@ class Correction(Frozen):
         return np.asarray(self.drift.T @ (degree * u ** (degree - 1)) / self.row_scale)
 
     def apply(self, ecef: Array, row: Array | None = None) -> Array:
-        """Return the points s R (X - T - C) + C of ECEF points X (..., 3) [m]; with the drift at rows (...)
-        if given.
-        """
+        """Return s R (X - T - C) + C of ECEF points X (..., 3) [m]; with the drift, if given rows (...)."""
         ecef = np.asarray(ecef, dtype=np.float64)
         rows = None if row is None else np.broadcast_to(row, ecef.shape[:-1]).reshape(-1)
         return self.motion(ecef.reshape(-1, 3).T, rows).ecef.T.reshape(ecef.shape)
@@ -159,8 +157,7 @@ class Correction(Frozen):
 
 
 def correction_of(matrix: Array, at: Array) -> Correction:
-    """Return the correction of a camera after its ground was moved: it shows X where it showed X before the
-    motion.
+    """Return the correction of a camera whose ground was moved: it shows X where it showed X before the motion.
 
     Parameters
     ----------
@@ -197,8 +194,7 @@ class Corrected(Behind):
         return image, by_ecef @ ecef_from_ground_jacobian(ground)
 
     def project_ecef(self, ecef: Array) -> tuple[Array, Array, Array, Array]:
-        """Project ECEF points X (..., 3) [m] to image points (..., 2) [px], with the derivatives that the
-        adjustment needs.
+        """Project ECEF points X (..., 3) [m] to image points (..., 2) [px], with an adjustment's derivatives.
 
         d(image)/dX [px/m], d(image)/dR [px/rad], d(image)/dT [px/m], (..., 2, 3) each.
         """

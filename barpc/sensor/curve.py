@@ -108,9 +108,7 @@ class Curve(Frozen):
 
 
 def about_middle(rotations: Rotation) -> tuple[Array, Array]:
-    """Return the middle (3, 3) of N rotations and the rotation vectors (N, 3) [rad] of all relative to it, in
-    its axes.
-    """
+    """Return the middle (3, 3) of N rotations and the vectors (N, 3) [rad] of all from there, in its axes."""
     middle = rotations[len(rotations) // 2]
     return np.asarray(middle.as_matrix()), np.asarray((middle.inv() * rotations).as_rotvec())
 
@@ -143,9 +141,7 @@ def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[
 
 @dataclass(frozen=True, eq=False)
 class Orbit(Curve):
-    """The polynomial through an orbit's state vectors, and the velocity that they state where it is not its
-    derivative.
-    """
+    """The polynomial through state vectors, and the velocity that they state where it is not its derivative."""
 
     sigma: Array  # (3,): standard deviations of positions along and across the track [m], of velocities [m/s]
     stated: Array  # (K, 3): stated velocity less derivative [m/s], as a polynomial of the time from the first knot
@@ -289,9 +285,7 @@ class Turn:
         return v - self._a * bent + self._b * twice, v - self._b * bent + self._c * twice
 
     def rate(self, v: Array) -> Array:
-        """Return the right Jacobian times v: exp([w + v]x) is exp([w]x) exp([rate]x) to first order in v
-        (..., 3, N).
-        """
+        """Return the right Jacobian times v (..., 3, N): to first order exp([w + v]x) is exp([w]x) exp([rate]x)."""
         bent = cross(self._w, v)
         return np.asarray(v - self._b * bent + self._c * cross(self._w, bent))
 
@@ -302,9 +296,7 @@ def rotation_matrix(rotation: npt.ArrayLike) -> Array:
 
 
 def rotation_left_jacobian(rotation: npt.ArrayLike) -> Array:
-    """Return the left Jacobians J (..., 3, 3) of rotation vectors (..., 3) [rad]: R(w + dw) = R(J dw) R(w) to
-    first order.
-    """
+    """Return the left Jacobians J (..., 3, 3) of vectors w (..., 3) [rad]: R(w + dw) is R(J dw) R(w) to first order."""
     return Turn(-np.asarray(rotation, dtype=np.float64)[..., None]).rate(np.eye(3))
 
 

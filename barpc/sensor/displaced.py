@@ -117,8 +117,7 @@ class ImageCorrected(Displaced):
 
 
 def bspline_pieces(u: Array, count: int, rate: bool = False) -> tuple[IntArray, Array]:
-    """Return the uniform cubic B-splines at u (n,) in -1 .. 1: the first (n,) of the four that are not zero,
-    and these (4, n).
+    """Return the first (n,) of the four uniform cubic B-splines that are not 0 at u (n,) in -1 .. 1, and these (4, n).
 
     The first and the last value hold beyond; `rate`: their derivatives by u instead.
     """
@@ -162,21 +161,15 @@ class RowSpline(Frozen):
     ----------
     coeffs : (M, 2)
         Coefficients of uniform cubic B-splines over the rows, (col, row) [px]; M = 0: none, else at least 4.
-    row_offset, row_scale : float
-        Middle row, and rows from there to the ends of the knots [px].
-    edges : (C,)
-        Columns at which another detector begins [px], ascending.
-    steps : (C + 1, 2)
-        Displacement of each detector, (col, row) [px]; without any detector (0, 2).
+    row_offset, row_scale : float, middle row, and rows from there to the ends of the knots [px]
+    edges : (C,), columns at which another detector begins [px], ascending
+    steps : (C + 1, 2), displacement of each detector, (col, row) [px]; without any detector (0, 2)
     strips : (M, 5)
         Displaced strips: axis (0: columns, 1: rows), first and last place, and origin and rate of their fading,
         exp(-(x - origin) rate) [px, 1/px]; rate 0: none. They may overlap.
-    moved : (M, 2)
-        Displacement of each strip, (col, row) [px]; of one that fades, at its origin.
-    periods : (M,)
-        Periods of the swings of all rows [px].
-    swings : (M, 2, 2)
-        Amplitudes of cosine and sine of 2 pi row / period, (col, row) [px].
+    moved : (M, 2), displacement of each strip, (col, row) [px]; of one that fades, at its origin
+    periods : (M,), periods of the swings of all rows [px]
+    swings : (M, 2, 2), amplitudes of cosine and sine of 2 pi row / period, (col, row) [px]
     """
 
     coeffs: Array
@@ -300,8 +293,7 @@ class CorrectionGrid(Frozen):
         alt: float,
         tolerance: float = LINEAR,
     ) -> CorrectionGrid:
-        """Return the displacements from the image points of `rpc` to those of `model` for ground of one
-        altitude [m].
+        """Return what takes image points of `rpc` to those of `model`, for ground of one altitude [m].
 
         Linear interpolation misses by no more than `tolerance` [px]. RpcError where a camera sees no ground.
         """

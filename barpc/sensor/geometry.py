@@ -29,7 +29,6 @@ _Rows = list[tuple[SensorModel, slice]]  # the observations of each camera
 
 _RAYS = 41  # of a line
 _LEAST_APART = 100.0  # m: altitudes between which a ray is drawn
-_REGRESSED = 10  # points along col, row and altitude
 NOMINAL_ALTITUDE = 650e3  # orbit altitude [m] assumed where a model does not tell its own
 PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this range [m] is not believed
 
@@ -56,9 +55,7 @@ def image_border(size: tuple[int, int], per_side: int = 8) -> Array:
 def image_grid(
     size: tuple[int, int], alt_range: tuple[float, float], nodes: tuple[int, int] = (11, 5)
 ) -> tuple[Array, Array]:
-    """Return the image points (N, 2) [px] and altitudes (N,) [m] on a grid over an image and its altitudes,
-    columns slowest.
-    """
+    """Return the image points (N, 2) [px] and altitudes (N,) [m] of a grid over an image, columns slowest."""
     col, row = (np.linspace(0, side - 1, nodes[0]) for side in size)
     grid = np.stack(np.meshgrid(col, row, np.linspace(*alt_range, nodes[1]), indexing="ij"), axis=-1)
     return grid[..., :2].reshape(-1, 2), grid[..., 2].ravel()
@@ -105,9 +102,7 @@ def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, fl
 
 
 def sight_enu(sensor: SensorModel, ground: Array) -> Array:
-    """Return the unit vectors (..., 3) east, north, up along the lines of sight from ground points (..., 3)
-    to the sensor.
-    """
+    """Return the unit vectors (..., 3) east, north, up from ground points (..., 3) along the rays to the sensor."""
     ground = np.asarray(ground, dtype=np.float64)
     _, jacobian = sensor.project_jacobian(ground)
     metric = jacobian / metres_per_unit(ground)[..., None, :]
@@ -162,8 +157,7 @@ def convergence_angle(sensor_a: SensorModel, sensor_b: SensorModel, ground: Arra
 
 
 def base_to_height(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) -> Array:
-    """Return B/H (...) of two cameras at ground points (..., 3): metres of parallax on level ground a metre
-    of height.
+    """Return B/H (...) of two cameras at ground points (..., 3): metres of parallax a metre of height.
 
     abs(t_a - t_b), t = (east, north) / up of a line of sight: the distance of the two cameras at the height 1. The
     textbook's 2 tan(angle / 2) is that only where the vertical halves the angle: of two cameras on one side of it,
@@ -186,9 +180,7 @@ class Several:
         self._parts = [(sensors[of_row[rows[0]]], rows) for rows in np.split(order, starts)[1:]]
 
     def each(self, function: Callable[[SensorModel, Array], Array], ground: Array) -> Array:
-        """Return what a function of a camera and ground points gives for ground points (N, 3), each with its
-        own camera.
-        """
+        """Return what a function gives for ground points (N, 3), each with its own camera."""
         found = np.empty((len(ground), 3))
         for sensor, rows in self._parts:
             found[rows] = function(sensor, ground[rows])
@@ -316,13 +308,9 @@ def _centers_of_lines(
 
 
 def _center_projective(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
-    """Return the centre (3,) of the 3 x 4 matrix that takes ground points to image points: its null space
-    (Hartley, DLT).
-    """
-    ends = np.linspace(0.0, 1.0, _REGRESSED)
-    unit = np.stack(np.meshgrid(ends, ends, ends), axis=-1).reshape(-1, 3)
-    image, low = unit[:, :2] * (np.array(size) - 1.0), alt_range[0]
-    ecef = ecef_from_ground(sensor.localize(image, low + unit[:, 2] * (alt_range[1] - low)))
+    """Return the centre (3,) of the matrix (3, 4) from ground to image points: its null space (Hartley, DLT)."""
+    image, alt = image_grid(size, alt_range)
+    ecef = ecef_from_ground(sensor.localize(image, alt))
     if not np.isfinite(ecef).all():
         return np.full(3, np.nan)
     middle, spread = ecef.mean(axis=0), float(ecef.std())
@@ -447,9 +435,7 @@ def triangulate(
 def _intersect(
     rows: _Rows, point: IntArray, xy: Array, weight: Array, alt: Array, steps: int
 ) -> tuple[Array, BoolArray]:
-    """Return Gauss-Newton on metres east, north, up from where a view sees a track at `alt`: ground (P, 3),
-    if possible.
-    """
+    """Return ground points (P, 3) by Gauss-Newton from where a view sees a track at `alt`, and if there are any."""
     ground = np.full((len(alt), 3), np.nan)
     for sensor, part in rows:
         new = np.flatnonzero(np.isnan(ground[point[part], 0])) + part.start

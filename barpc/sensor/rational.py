@@ -97,8 +97,7 @@ class Rational:
         return value, out
 
     def solve(self, target: Array, z: Array, work: Array | None = None) -> tuple[Array, BoolArray]:
-        """Return the inverse: points (3, N) whose third variable is `z` (N,) and whose values are `target`
-        (2, N).
+        """Return the points (3, N) whose third variable is `z` (N,) and whose values are `target` (2, N).
 
         The cubic inverse and one Newton step; one more where that was too long to prove it enough; then, and out
         of the box, damped Newton from the centre and a check of value, denominators and orientation. The second result
@@ -187,9 +186,7 @@ class Rational:
         return ok
 
     def _damped_newton(self, target: Array, x: Array, steps: int = 60) -> Array:
-        """Iterate damped Newton steps on `x[:2]`, halved until the error falls, never across a pole; return
-        the error (2, N) left.
-        """
+        """Step `x[:2]` by Newton, halved until errors fall, never across a pole; return what is left (2, N)."""
         left = np.full(target.shape, np.inf)
         active = np.arange(target.shape[1])
         sign = np.sign(self.coeffs[1::2, :1])

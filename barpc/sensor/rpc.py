@@ -87,9 +87,7 @@ class RPC(Pointwise):
         return ", ".join(word.format(o - s, o + s) for word, o, s in zip(words, offset, scale, strict=True))
 
     def normalize(self, ground: Array, out: Array | None = None) -> Array:
-        """Return the normalised longitude, latitude, altitude (3, N), -1 to 1 in the RPC's box, of ground
-        points (N, 3).
-        """
+        """Return longitude, latitude, altitude (3, N) of points (N, 3), from -1 to 1 in the RPC's box."""
         out = np.subtract(ground.T, self.ground_offset[:, None], out=out, order="C")
         if not (out[0].max(initial=0.0) <= 180.0 and out[0].min(initial=0.0) >= -180.0):
             out[0] = wrap_longitude(ground[:, 0], self.ground_offset[0]) - self.ground_offset[0]
@@ -271,9 +269,7 @@ def localize_stack(sensors: Sequence[SensorModel], image: Array, alt: Array, bou
 
 
 def _newton(stack: RpcStack, image: Array, alt: Array, views: slice, bounds: IntArray) -> tuple[Array, BoolArray]:
-    """Return Newton's ground points (n, 3) of consecutive RPCs from their centres, and whether each (n,) is
-    certain: within the box, and no step long beside the one before.
-    """
+    """Return ground points (n, 3) by Newton from RPCs' centres; which (n,) are certain: in the box, steps fall."""
     count = np.diff(bounds)
     offset, scale = (np.repeat(rows[views].T, count, axis=1) for rows in (stack.ground_offset, stack.ground_scale))
     ground, before = offset.copy(), np.full(len(alt), np.inf)

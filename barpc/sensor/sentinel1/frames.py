@@ -126,9 +126,7 @@ class Delays:
         return self.atmosphere or self.bistatic is not None or self.timing is not None
 
     def shift(self, times: Array, ground: Array, sight: Array) -> Array:
-        """Return the delays (2, N) [s] added to the times of points (N, 3) that see the satellite along unit
-        vectors (3, N).
-        """
+        """Return the delays (2, N) [s] of points (N, 3) that see the satellite along unit vectors (3, N)."""
         out = np.zeros_like(times)
         if self.bistatic is not None:
             out[0] = self.bistatic - 0.5 * times[1]

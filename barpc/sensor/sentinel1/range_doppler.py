@@ -148,8 +148,7 @@ class RangeDoppler(Clocked):
         return replace(self, delays=replace(self.delays, timing=timing))
 
     def azimuth_range(self, ground: Array) -> tuple[Array, Array]:
-        """Return the zero-Doppler [s from `epoch`] and two-way slant range times (...) [s] of ground points
-        (..., 3).
+        """Return zero-Doppler [s from `epoch`] and two-way slant range times (...) [s] of points (..., 3).
 
         Pure geometry, without `delays`; NaN off the orbit's time span or on the other side.
         """
@@ -285,9 +284,7 @@ def swaths_model(
 
 
 def grid_residuals(annotation: Annotation, model: RangeDoppler) -> Array:
-    """Return the model minus a swath's own geolocation grid, geometry only: range [samples], azimuth [lines],
-    (G, 2).
-    """
+    """Return model minus geolocation grid (G, 2), pure geometry: range [samples], azimuth [lines]."""
     grid = annotation.grid
     azimuth_time, range_time = model.azimuth_range(grid.ground)
     samples = (range_time - grid.range_time) * annotation.range_sampling_rate
