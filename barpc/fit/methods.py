@@ -30,7 +30,6 @@ from barpc.base.options import FitOptions
 from barpc.fit.points import column_ranges
 from barpc.fit.poles import Region, bounded
 from barpc.fit.system import (
-    ALTITUDE_FLOOR,
     EPS,
     MAX_PASSES,
     PRECISIONS,
@@ -43,6 +42,7 @@ from barpc.fit.system import (
     noise_scaled,
     solution,
 )
+from barpc.sensor.geometry import LEAST_RANGE
 from barpc.sensor.rpc import RPC
 
 Found = tuple[Array, list["Compressed"], Array, int]
@@ -205,7 +205,7 @@ def normalization(ground: Array, image: Array, options: FitOptions, vendor: RPC 
         offset, scale = vendor.ground_offset, vendor.ground_scale
     else:
         offset = tidy(0.5 * (low + high))
-        scale = tidy(np.maximum(0.5 * (high - low), [1e-9, 1e-9, ALTITUDE_FLOOR]))
+        scale = tidy(np.maximum(0.5 * (high - low), [1e-9, 1e-9, LEAST_RANGE / 2]))
     middle, half = tidy(0.5 * (left + right)), tidy(np.maximum(0.5 * (right - left), 1e-6))
     found = Normalization(offset, scale, middle, half)
     return found if options.precision is None else PRECISIONS[options.precision].normalization(found)

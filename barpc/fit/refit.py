@@ -13,10 +13,9 @@ import numpy.typing as npt
 from barpc.base.errors import BarpcWarning, FitError
 from barpc.base.geodesy import CHUNK, Array, wrap_longitude
 from barpc.base.options import FitOptions
-from barpc.fit.certificate import EXACT, Errors, Localisation, RpcFit, Sample, coverage, off, roundtrip
+from barpc.fit.certificate import Localisation, RpcFit, coverage, off, reason, roundtrip
 from barpc.fit.methods import BOUNDED, FitSolution, solve, solve_problem
-from barpc.fit.points import checked_points, column_ranges, control_points, screened, widened
-from barpc.fit.reasons import reason
+from barpc.fit.points import EXACT, Errors, Sample, checked_points, column_ranges, control_points, screened, widened
 from barpc.fit.system import FitProblem, Normalization
 from barpc.sensor import SensorModel
 from barpc.sensor.displaced import Splined

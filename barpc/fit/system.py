@@ -25,7 +25,7 @@ from scipy.linalg.lapack import dtpqrt
 from barpc.base.errors import FitError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array
-from barpc.sensor.rational import MONOMIALS, monomials
+from barpc.sensor.rational import POWERS, monomials
 
 IntArray = npt.NDArray[np.int64]
 Rounding = Callable[[Array], Array]
@@ -35,7 +35,7 @@ _ROWS = 1024  # taken into the triangle at a time: what is worked on stays in ca
 _BLOCK = 8  # columns of a Householder block
 ALL = np.arange(20)
 _DEPENDENT = 1e-9  # rms of what a monomial adds to those of lower degree, on these points
-_DEGREE = np.array([0, *(len(monomial) for monomial in MONOMIALS[1:])])
+_DEGREE = POWERS.sum(axis=1)
 _NUMERATOR = np.array([np.inf, np.inf, 0.1, 0.03])
 _DENOMINATOR = np.array([np.inf, 1.0, 0.1, 0.01])
 _SIGMA_STEPS = 2
@@ -44,10 +44,6 @@ TAU = 0.003
 EPS = float(np.finfo(np.float64).eps)
 MAX_PASSES = 20
 """Of what is iterated."""
-
-
-ALTITUDE_FLOOR = 50.0
-"""Smallest altitude half range [m] that a model is sampled over, and smallest altitude scale of an RPC."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

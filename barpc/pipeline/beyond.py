@@ -18,8 +18,7 @@ from barpc.base.errors import BarpcError, BarpcWarning, FitError, OutputError, R
 from barpc.base.geodesy import Array
 from barpc.base.options import FitOptions, RunOptions
 from barpc.fit import RpcFit, fit_rpc
-from barpc.fit.certificate import Sample
-from barpc.fit.points import widened
+from barpc.fit.points import Sample, widened
 from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.handoff import verify_grid
 from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid, write_resampled

@@ -30,7 +30,7 @@ from rasterio.transform import RPCTransformer
 from barpc.base.errors import OutputError
 from barpc.base.geodesy import Array, wrap_longitude
 from barpc.cameras import open_camera
-from barpc.fit.certificate import Sample
+from barpc.fit.points import Sample
 from barpc.rasters.raster import GDAL_OPTIONS
 from barpc.rasters.vrt import Vrt, read_vrt
 from barpc.rpcio import Carrier, read_rpc, row_of, sidecars

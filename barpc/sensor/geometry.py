@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeGuard
 
@@ -28,7 +28,7 @@ CenterMethod = Literal["line", "projective", "nominal", "stated"]
 _Rows = list[tuple[SensorModel, slice]]  # the observations of each camera
 
 _RAYS = 41  # of a line
-_LEAST_APART = 100.0  # m: altitudes between which a ray is drawn
+LEAST_RANGE = 100.0  # of altitudes [m] between which a ray is drawn, or that an RPC is made for
 NOMINAL_ALTITUDE = 650e3  # orbit altitude [m] assumed where a model does not tell its own
 PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this range [m] is not believed
 
@@ -95,7 +95,7 @@ def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, fl
     """
     image = np.asarray(image, dtype=np.float64)
     alt = np.empty((2, *image.shape[:-1]))
-    alt[0], alt[1] = alt_range[0], max(alt_range[1], alt_range[0] + _LEAST_APART)
+    alt[0], alt[1] = alt_range[0], max(alt_range[1], alt_range[0] + LEAST_RANGE)
     origin, end = ecef_from_ground(sensor.localize(np.broadcast_to(image, (2, *image.shape)), alt))
     direction = end - origin
     return origin, direction / np.linalg.norm(direction, axis=-1, keepdims=True)
@@ -181,29 +181,25 @@ class Several:
 
     def each(self, function: Callable[[SensorModel, Array], Array], ground: Array) -> Array:
         """Return what a function gives for ground points (N, 3), each with its own camera."""
-        found = np.empty((len(ground), 3))
-        for sensor, rows in self._parts:
-            found[rows] = function(sensor, ground[rows])
-        return found
+        return self._of(lambda sensor, part: [function(sensor, part)], [(3,)], ground)[0]
 
     def project(self, ground: Array) -> Array:
         """Project ground points (N, 3) [deg, deg, m] to image points (N, 2) [px]."""
-        return self._of("project", [(2,)], ground)[0]
+        return self._of(lambda sensor, part: [sensor.project(part)], [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Return image points (N, 2) [px] and their derivatives (N, 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = self._of("project_jacobian", [(2,), (2, 3)], ground)
+        image, jacobian = self._of(lambda sensor, part: sensor.project_jacobian(part), [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Localise image points (N, 2) [px] at altitudes (N,) [m]: ground points (N, 3)."""
-        return self._of("localize", [(3,)], image, alt)[0]
+        return self._of(lambda sensor, *part: [sensor.localize(*part)], [(3,)], image, alt)[0]
 
-    def _of(self, name: str, shapes: list[tuple[int, ...]], *given: Array) -> list[Array]:
+    def _of(self, ask: Callable[..., Iterable[Array]], shapes: list[tuple[int, ...]], *given: Array) -> list[Array]:
         out = [np.empty((len(given[0]), *shape)) for shape in shapes]
         for sensor, rows in self._parts:
-            found = getattr(sensor, name)(*(array[rows] for array in given))
-            for whole, part in zip(out, found if len(out) > 1 else [found], strict=True):
+            for whole, part in zip(out, ask(sensor, *(array[rows] for array in given)), strict=True):
                 whole[rows] = part
         return out
 
@@ -291,7 +287,7 @@ def _centers_of_lines(
     image = np.empty((n, 2, m, 2))
     image[..., 0] = side[:, :1, None] * np.linspace(0.0, 1.0, m)
     image[..., 1] = side[:, 1:, None] / 2.0
-    alt = np.repeat(np.column_stack([ends[:, 0], np.maximum(ends[:, 1], ends[:, 0] + _LEAST_APART)]), m)
+    alt = np.repeat(np.column_stack([ends[:, 0], np.maximum(ends[:, 1], ends[:, 0] + LEAST_RANGE)]), m)
     ground = localize_stack(sensors, image.reshape(-1, 2), alt, 2 * m * np.arange(n + 1))
     origin, end = ecef_from_ground(ground).reshape(n, 2, m, 3).swapaxes(0, 1)
     direction = end - origin

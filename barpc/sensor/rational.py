@@ -23,6 +23,8 @@ MONOMIALS = (
     "PLH", "LLL", "LPP", "LHH", "LLP", "PPP", "PHH", "LLH", "PPH", "HHH",
 )  # fmt: skip
 """The twenty monomials in RPC00B order; L = longitude, P = latitude, H = altitude, normalised."""
+POWERS = np.array([[monomial.count(letter) for letter in "LPH"] for monomial in MONOMIALS])
+"""Powers (20, 3) of L, P and H in them."""
 
 REACH = 1.25  # the cubic inverse is trusted this far out of the box; what lies beyond is solved with care
 
@@ -34,8 +36,7 @@ def _derivative_matrices() -> Array:
     out = np.zeros((3, 20, 10))
     for axis, letter in enumerate("LPH"):
         for i, monomial in enumerate(MONOMIALS):
-            power = monomial.count(letter)
-            if power:
+            if power := POWERS[i, axis]:
                 out[axis, i, index["".join(sorted(monomial.replace(letter, "", 1)))]] = power
     return out
 
