@@ -318,11 +318,7 @@ def _minimax(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None)
     coeffs, solved, h, passes = _gauss_newton(problem, None, vendor)
     given, parts, region = 1.0 if problem.weight is None else problem.weight, [], region_of(problem)
     for axis in range(2):
-        x, least, weight = (
-            problem.packed(coeffs[2 * axis : 2 * axis + 2]),
-            np.inf,
-            np.ones(len(problem.image)),
-        )
+        x, least, weight = (problem.packed(coeffs[2 * axis : 2 * axis + 2]), np.inf, np.ones(len(problem.image)))
         for _ in range(MAX_PASSES):
             errors = problem.errors(axis, x)
             if errors.max() < least:

@@ -111,11 +111,7 @@ def _plainer(fit: RpcFit, plain: RpcFit) -> RpcFit:
 
 
 def _given(
-    model: SensorModel,
-    size: tuple[int, int],
-    alt_range: tuple[float, float],
-    options: FitOptions,
-    method: str,
+    model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], options: FitOptions, method: str
 ) -> tuple[Array, Array]:
     """Return the ground (N, 3) and image points (N, 2) for a method."""
     if method in BOUNDED:  # what an RPC cannot follow has any frequency: scattered points alias none
@@ -209,12 +205,7 @@ def relative_weight(sigma: npt.ArrayLike | None, count: int) -> Array | None:
 
 
 def _certified(
-    solution: FitSolution,
-    seen: Errors,
-    largest: Array,
-    loop: float,
-    size: tuple[int, int] | None,
-    beyond: float = 1.0,
+    solution: FitSolution, seen: Errors, largest: Array, loop: float, size: tuple[int, int] | None, beyond: float = 1.0
 ) -> RpcFit:
     """Return the fit with its certificate: errors on the check points, the largest (2,) [px] found near them."""
     problem, rpc = solution.problem, solution.rpc

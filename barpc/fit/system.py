@@ -147,11 +147,7 @@ class FitProblem:
         return replace(self, first=first) if adds.all() else replace(self, active=self.active[adds])
 
     def rows(
-        self,
-        axis: int,
-        denominator: Array | None = None,
-        free: bool = True,
-        numerator: Array | None = None,
+        self, axis: int, denominator: Array | None = None, free: bool = True, numerator: Array | None = None
     ) -> Iterator[tuple[slice, Array]]:
         """Yield the rows (n, k + 1) of (M | y) of col (`axis` 0) or row (1), some hundred points at a time.
 
@@ -183,11 +179,7 @@ class FitProblem:
             yield part, block.T
 
     def compressed(
-        self,
-        axis: int,
-        denominator: Array | None = None,
-        free: bool = True,
-        numerator: Array | None = None,
+        self, axis: int, denominator: Array | None = None, free: bool = True, numerator: Array | None = None
     ) -> Compressed:
         """Return the system of the rows of the same parameters."""
         if self.first is not None and axis == 0 and denominator is None and free:

@@ -47,15 +47,7 @@ _GEOM = _has(r"(?m)^[ \t]*+(\w++\.)?line_num_coeff_00[ \t]*+:")
 _MAXAR = _has(r"<(\w+:)?LINENUMCOEF")
 _JSON = _has(r"\A\s*+\{", r'"row_num"|(?i:"line_num_coeff")')
 _SYNTAXES = (
-    Format(
-        "txt",
-        ("_RPC.TXT", ".rpc", ".txt"),
-        _TXT,
-        text.read_txt,
-        text.write_txt,
-        "_RPC.TXT",
-        (_BESIDE, "rpcm"),
-    ),
+    Format("txt", ("_RPC.TXT", ".rpc", ".txt"), _TXT, text.read_txt, text.write_txt, "_RPC.TXT", (_BESIDE, "rpcm")),
     Format("rpb", (".RPB",), _RPB, text.read_rpb, text.write_rpb, ".RPB", (_BESIDE,)),
     Format("geom", (".geom",), _GEOM, text.read_geom, text.write_geom, ".geom", ("keywords", "shareloc")),
     Format("xml", (".XML",), _MAXAR, xml.read_maxar, xml.write_maxar, ".rpc.xml", (_BESIDE,)),
@@ -87,16 +79,13 @@ class Carrier:
 
 CARRIERS: dict[str, Carrier] = {
     "vrt": Carrier(
-        (".vrt",),
-        lambda rpc, image, path, place, over: write_rpc_vrt(rpc, image, path, place=place, overwrite=over),
+        (".vrt",), lambda rpc, image, path, place, over: write_rpc_vrt(rpc, image, path, place=place, overwrite=over)
     ),
     "copy": Carrier(
         (".tif", ".tiff"), lambda rpc, image, path, _, over: write_rpc_copy(rpc, image, path, overwrite=over)
     ),
     "nitf": Carrier(
-        (".ntf",),
-        lambda rpc, image, path, _, over: write_rpc_nitf(rpc, image, path, overwrite=over),
-        precision="nitf",
+        (".ntf",), lambda rpc, image, path, _, over: write_rpc_nitf(rpc, image, path, overwrite=over), precision="nitf"
     ),
 }
 """Name -> raster that carries an RPC."""

@@ -99,10 +99,7 @@ def fields_in_order(values: Sequence[float], keys: Sequence[str]) -> Fields:
 
 
 def rpc_from_fields(
-    fields: Mapping[str, Sequence[float]],
-    name: str,
-    options: ReadOptions | None = None,
-    first_pixel: float = 0.0,
+    fields: Mapping[str, Sequence[float]], name: str, options: ReadOptions | None = None, first_pixel: float = 0.0
 ) -> RPC:
     """Return the RPC of the fields of a file called `name`.
 

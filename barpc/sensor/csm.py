@@ -321,8 +321,4 @@ def _detector(base: Pushbroom) -> dict[str, Any]:
     focal = 1.0 / float(np.linalg.norm(slope))
     first = base.look @ np.array([1.0, -0.5 - base.look_origin])
     (x, y), (u, v) = focal * first * [-1.0, 1.0], focal * slope * [-1.0, 1.0]
-    return {
-        "m_focalLength": focal,
-        "m_iTransS": [-(u * x + v * y), u, v],
-        "m_iTransL": [v * x - u * y, -v, u],
-    }
+    return {"m_focalLength": focal, "m_iTransS": [-(u * x + v * y), u, v], "m_iTransL": [v * x - u * y, -v, u]}

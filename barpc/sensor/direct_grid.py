@@ -102,11 +102,7 @@ class DirectGrid(Pointwise):
 
     @classmethod
     def of(
-        cls,
-        model: SensorModel,
-        size: tuple[int, int],
-        alt_range: tuple[float, float],
-        tolerance: float = LINEAR,
+        cls, model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], tolerance: float = LINEAR
     ) -> DirectGrid:
         """Return the grid of a camera over an image of `size` (width, height), corner to corner, and its altitudes.
 

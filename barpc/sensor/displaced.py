@@ -286,12 +286,7 @@ class CorrectionGrid(Frozen):
 
     @classmethod
     def between(
-        cls,
-        rpc: SensorModel,
-        model: SensorModel,
-        size: tuple[int, int],
-        alt: float,
-        tolerance: float = LINEAR,
+        cls, rpc: SensorModel, model: SensorModel, size: tuple[int, int], alt: float, tolerance: float = LINEAR
     ) -> CorrectionGrid:
         """Return what takes image points of `rpc` to those of `model`, for ground of one altitude [m].
 

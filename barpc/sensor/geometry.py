@@ -10,14 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import RpcError
-from barpc.base.geodesy import (
-    Array,
-    ecef_from_ground,
-    enu_basis,
-    ground_from_ecef,
-    metres_per_unit,
-    wrap_longitude,
-)
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit, wrap_longitude
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC, localize_stack
 from barpc.sensor.timing import Clocked
@@ -277,9 +270,7 @@ def _center_stated(sensor: Clocked, size: tuple[int, int], alt_range: tuple[floa
 
 
 def _centers_of_lines(
-    sensors: Sequence[SensorModel],
-    sizes: Sequence[tuple[int, int]],
-    alt_ranges: Sequence[tuple[float, float]],
+    sensors: Sequence[SensorModel], sizes: Sequence[tuple[int, int]], alt_ranges: Sequence[tuple[float, float]]
 ) -> Array:
     """Return the points (N, 3) nearest to the rays of every camera's middle line; NaN where one has none."""
     side, ends = np.array(sizes, dtype=np.float64).reshape(-1, 2) - 1.0, np.array(alt_ranges).reshape(-1, 2)

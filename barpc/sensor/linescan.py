@@ -189,11 +189,7 @@ def _check_turn(samples: Samples) -> None:
 
 
 def read_linescan(
-    path: Path,
-    *,
-    band: str | None = None,
-    aberration: bool | None = None,
-    refraction: bool | None = None,
+    path: Path, *, band: str | None = None, aberration: bool | None = None, refraction: bool | None = None
 ) -> Linescan:
     """Return the physical model in an XML file.
 
@@ -219,8 +215,7 @@ def read_linescan(
     read, kind = vendor
     found, usual = read(root, band)
     light = Light(
-        usual.aberration if aberration is None else aberration,
-        usual.refraction if refraction is None else refraction,
+        usual.aberration if aberration is None else aberration, usual.refraction if refraction is None else refraction
     )
     return replace(found, model=replace(found.model, light=light), kind=kind)
 
@@ -407,8 +402,5 @@ def _light(root: Fields) -> Light:
     return Light(*(text.strip().lower() == "true" for text in said))
 
 
-_VENDORS = {
-    "isd": (camera_of_isd, "maxar physical model"),
-    "Dimap_Document": (camera_of_dimap, "dimap physical model"),
-}
+_VENDORS = {"isd": (camera_of_isd, "maxar physical model"), "Dimap_Document": (camera_of_dimap, "dimap physical model")}
 """Root of the document -> its reader and the kind of camera."""

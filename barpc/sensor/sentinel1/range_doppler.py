@@ -25,21 +25,8 @@ from barpc.base.geodesy import (
 )
 from barpc.sensor.curve import Curve, Orbit, fit_orbit
 from barpc.sensor.document import seconds, warn_off_grid
-from barpc.sensor.sentinel1.annotation import (
-    Annotation,
-    StateVectors,
-    burst_rows,
-    read_annotation,
-    read_orbit_file,
-)
-from barpc.sensor.sentinel1.frames import (
-    Bistatic,
-    Delays,
-    Frame,
-    GroundFrame,
-    SlantFrame,
-    bistatic_constant,
-)
+from barpc.sensor.sentinel1.annotation import Annotation, StateVectors, burst_rows, read_annotation, read_orbit_file
+from barpc.sensor.sentinel1.frames import Bistatic, Delays, Frame, GroundFrame, SlantFrame, bistatic_constant
 from barpc.sensor.timing import Clocked, Timing, aside, dot, on_circle
 
 RELIEF = (200.0, 500.0)
