@@ -33,8 +33,8 @@ __all__ = [
 _ORDER = 30  # no polynomial of a document has so high a power
 _SCP_TOLERANCE = 1.0  # px: where the stated centre point must project
 _NITF = b"NITF02.10"
-_SEGMENTS = ((6, 10), (4, 6), (0, 0), (4, 5), (4, 9))
-"""Digits of the lengths of subheader and data: images, graphics, reserved, texts, data extensions."""
+_SEGMENTS = {"images": (6, 10), "graphics": (4, 6), "reserved": (0, 0), "texts": (4, 5), "data extensions": (4, 9)}
+"""Digits of the lengths of subheader and data."""
 
 
 def is_sicd(head: bytes) -> bool:
@@ -62,13 +62,13 @@ def _extensions(file: BinaryIO) -> list[bytes]:
     file.seek(354)  # in the header: its own length, then numbers of segments
     place = _digits(file, 6)
     found = []
-    for kind, (header, data) in enumerate(_SEGMENTS):
+    for kind, (header, data) in _SEGMENTS.items():
         lengths = [(_digits(file, header), _digits(file, data)) for _ in range(_digits(file, 3) if data else 0)]
         if not data:
             file.seek(3, 1)  # the number of reserved segments, always 0
         here = file.tell()
         for subheader, length in lengths:
-            if kind == len(_SEGMENTS) - 1 and length <= MAX_XML:
+            if kind == "data extensions" and length <= MAX_XML:
                 file.seek(place + subheader)
                 found.append(file.read(length))
             place += subheader + length
