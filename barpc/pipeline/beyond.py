@@ -17,18 +17,17 @@ from barpc.base.errors import BarpcError, FitError, OutputError, RpcError
 from barpc.base.geodesy import Array
 from barpc.base.options import RunOptions
 from barpc.fit import RpcFit
-from barpc.fit.certificate import Sample
-from barpc.fit.points import widened
+from barpc.fit.points import Sample, widened
 from barpc.fit.refit import fit_only
 from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.handoff import verify_grid
 from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid, write_resampled
 from barpc.scene import View
 from barpc.sensor import SensorModel
-from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
 from barpc.sensor.csm import STATE_END as STATE
 from barpc.sensor.csm import is_writable, open_state, state_text
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
+from barpc.sensor.displaced import CorrectionGrid, GridCorrected
 from barpc.sensor.rpc import RPC
 from barpc.tie.tasks import Progress, ordered
 from barpc.workspace import Workspace

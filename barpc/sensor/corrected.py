@@ -1,4 +1,4 @@
-"""Sensor models behind a correction: in space, P_BA, and in the image.
+"""Sensor models behind a correction in space: P_BA.
 
 The paper's corrected projection is P_BA(X) = P(R (X - T - C) + C) with X in ECEF (eq. 7 of Akiki et al.
 2021, "Robust Rational Polynomial Camera Modelling for SAR and Pushbroom Imaging"). A second rotation, a
@@ -27,8 +27,9 @@ from barpc.base.geodesy import (
     pointwise,
     wrap_longitude,
 )
-from barpc.sensor import Behind, Displaced, SensorModel, fixed_point
+from barpc.sensor import Behind, SensorModel
 from barpc.sensor.curve import Turn, cross, rotation_left_jacobian, rotation_matrix
+from barpc.sensor.displaced import fixed_point
 
 IntArray = npt.NDArray[np.int64]
 
@@ -140,9 +141,7 @@ class Correction(Frozen):
         return np.asarray(self.drift.T @ (degree * u ** (degree - 1)) / self.row_scale)
 
     def apply(self, ecef: Array, row: Array | None = None) -> Array:
-        """Return the points s R (X - T - C) + C of ECEF points X (..., 3) [m]; with the drift at rows (...)
-        if given.
-        """
+        """Return s R (X - T - C) + C of ECEF points X (..., 3) [m]; with the drift, if given rows (...)."""
         ecef = np.asarray(ecef, dtype=np.float64)
         rows = None if row is None else np.broadcast_to(row, ecef.shape[:-1]).reshape(-1)
         return self.motion(ecef.reshape(-1, 3).T, rows).ecef.T.reshape(ecef.shape)
@@ -162,8 +161,7 @@ class Correction(Frozen):
 
 
 def correction_of(matrix: Array, at: Array) -> Correction:
-    """Return the correction of a camera after its ground was moved: it shows X where it showed X before the
-    motion.
+    """Return the correction of a camera whose ground was moved: it shows X where it showed X before the motion.
 
     Parameters
     ----------
@@ -200,8 +198,7 @@ class Corrected(Behind):
         return image, by_ecef @ ecef_from_ground_jacobian(ground)
 
     def project_ecef(self, ecef: Array) -> tuple[Array, Array, Array, Array]:
-        """Project ECEF points X (..., 3) [m] to image points (..., 2) [px], with the derivatives that the
-        adjustment needs.
+        """Project ECEF points X (..., 3) [m] to image points (..., 2) [px], with an adjustment's derivatives.
 
         d(image)/dX [px/m], d(image)/dR [px/rad], d(image)/dT [px/m], (..., 2, 3) each.
         """
@@ -246,39 +243,3 @@ class Corrected(Behind):
         ground[:, 2] = alt
         ground[:, 0] = wrap_longitude(ground[:, 0], found[:, 0])
         return ground
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class ImageAffine(Frozen):
-    """An affine correction in the image: image + shift + slope @ image."""
-
-    shift: Array  # (2,): col, row [px]
-    slope: Array  # (2, 2): change of (col, row) by (col, row) [px/px]
-
-    def __post_init__(self) -> None:
-        self._array("shift", (2,), RpcError)
-        self._array("slope", (2, 2), RpcError)
-
-    def apply(self, image: Array) -> Array:
-        """Return the corrected image points (..., 2) [px]."""
-        return image @ (np.eye(2) + self.slope).T + self.shift
-
-    def linearised(self, image: Array) -> tuple[Array, Array]:
-        """Return the same, and the derivative (2, 2)."""
-        return self.apply(image), np.eye(2) + self.slope
-
-    def undo(self, image: Array) -> Array:
-        """Return the image points (..., 2) [px] without the correction."""
-        return (image - self.shift) @ np.linalg.inv(np.eye(2) + self.slope).T
-
-
-@dataclass(frozen=True)
-class ImageCorrected(Displaced):
-    """`sensor` with its image points corrected by an affine map; itself a `SensorModel`.
-
-    The bias corrections (shift, drift, affine) of Fraser and Hanley ("Bias compensation in rational functions for
-    Ikonos satellite imagery", 2003) and Grodecki and Dial ("Block adjustment of high-resolution satellite images
-    described by rational polynomials", 2003), for comparison with the correction in space.
-    """
-
-    correction: ImageAffine  # what is added to its image points

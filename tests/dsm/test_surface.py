@@ -20,7 +20,7 @@ from barpc.dsm.relief import draped
 from barpc.dsm.stereo import _best, block_of_images
 from barpc.pipeline import load_views
 from barpc.rpcio import read_rpc
-from barpc.sensor.corrected import ImageAffine, ImageCorrected
+from barpc.sensor.displaced import ImageAffine, ImageCorrected
 from barpc.workspace import own_files
 from tests.dsm.conftest import ALTS, SMALL
 from tests.lanes import rest_slow

@@ -12,13 +12,12 @@ import pytest
 
 from barpc.base.geodesy import ecef_from_ground
 from barpc.sensor import SensorModel
-from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
-from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
+from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.direct_grid import DirectGrid
+from barpc.sensor.displaced import CorrectionGrid, GridCorrected, ImageAffine, ImageCorrected, RowSpline, Splined
 from barpc.sensor.pushbroom import Light, Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.sicd import open_sicd
-from barpc.sensor.splined import RowSpline, Splined
 from barpc.sensor.terrasar import open_terrasar
 from barpc.sensor.timing import Timed, Timing
 from barpc.simulate import Look, fly

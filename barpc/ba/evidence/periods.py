@@ -16,7 +16,7 @@ from scipy.special import chdtri
 from barpc.ba.usual import FEW, OUTLIER, SURE
 from barpc.base.geodesy import Array
 from barpc.scene import IntArray
-from barpc.sensor.splined import sine_and_cosine
+from barpc.sensor.displaced import sine_and_cosine
 
 _SHORTEST = 32.0  # rows: of what is shorter a matcher's window shows the mean
 _FEWEST = 1.5  # waves of an image: fewer are no swing yet, and what is nearer to a peak is its own
