@@ -54,8 +54,10 @@ def pointwise(
     flat: list[Array] = [points.reshape(-1, k)]
     if alt is not None:
         alt = np.asarray(alt, dtype=np.float64)
-        lead = np.broadcast_shapes(lead, alt.shape)
-        flat = [np.broadcast_to(points, (*lead, k)).reshape(-1, k), np.broadcast_to(alt, lead).reshape(-1)]
+        if alt.shape != lead:
+            lead = np.broadcast_shapes(lead, alt.shape)
+            points, alt = np.broadcast_to(points, (*lead, k)), np.broadcast_to(alt, lead)
+        flat = [points.reshape(-1, k), alt.reshape(-1)]
     count = len(flat[0])
     out = [np.empty((count, *shape)) for shape in shapes]
     memory = np.empty((rows, min(count, CHUNK)))

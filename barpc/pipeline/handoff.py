@@ -13,7 +13,7 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from html import escape
@@ -159,20 +159,22 @@ def _readings(
     OutputError where the machine and not the file is to blame; whatever else a reader raises is its finding.
     """
     found = []
-    for name, consumer in consumers.items():
-        if not consumer.installed:
-            continue
-        error, rms = float("nan"), float("nan")
-        try:
-            with warnings.catch_warnings(), nullcontext(path) if name == "barpc" else _lent(path) as place:
-                warnings.simplefilter("ignore")
-                error, rms = measure(consumer, consumer.open(place))
-            note = "" if np.isfinite(error) else "it projects to no finite point"
-        except Exception as failure:
-            if isinstance(failure, OSError) and failure.errno in _MACHINE:
-                raise OutputError(f"{path}: cannot be opened as {name} does ({failure.strerror})") from failure
-            note = " ".join(f"{type(failure).__name__}: {failure}".split())
-        found.append(Reading(path, name, error, note, rms))
+    with ExitStack() as stack:
+        lent = cache(lambda: stack.enter_context(_lent(path)))
+        for name, consumer in consumers.items():
+            if not consumer.installed:
+                continue
+            error, rms = float("nan"), float("nan")
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    error, rms = measure(consumer, consumer.open(path if name == "barpc" else lent()))
+                note = "" if np.isfinite(error) else "it projects to no finite point"
+            except Exception as failure:
+                if isinstance(failure, OSError) and failure.errno in _MACHINE:
+                    raise OutputError(f"{path}: cannot be opened as {name} does ({failure.strerror})") from failure
+                note = " ".join(f"{type(failure).__name__}: {failure}".split())
+            found.append(Reading(path, name, error, note, rms))
     return found
 
 

@@ -167,9 +167,9 @@ def _names(places: Sequence[tuple[ViewEntry, Array]], taken: Taken) -> list[tupl
 
     A name tells how many images have their middle in the same place.
     """
-    taken, names = list(taken), []
+    taken, names, every = list(taken), [], np.array([place for _, place in places])
     for view, place in places:
-        alike = sum(bool(np.abs(other - place).max() < _LINE / 2) for _, other in places) - 1
+        alike = int((np.abs(every - place).max(axis=1) < _LINE / 2).sum()) - 1
         name = view.name if len(view.name) <= _LONGEST else f"…{view.name[1 - _LONGEST :]}"  # its end tells of a series
         name += f" + {alike}" * bool(alike)
         (x, y), half = place.tolist(), 3.6 * len(name)

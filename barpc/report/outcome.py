@@ -177,9 +177,10 @@ class Run:
         found: dict[str, str] = {}
         for ties in self.pairs:
             shift = self.tracks.xy[ties.b] - self.tracks.xy[ties.a]
+            if len(shift) < FEWEST or np.mean((np.abs(shift - np.rint(shift)) <= WHOLE).all(axis=1)) < MOST:
+                continue  # by no whole shift, whichever: most pairs
             whole = np.rint(np.median(shift, axis=0))
-            same = np.mean((np.abs(shift - whole) <= WHOLE).all(axis=1))
-            if len(shift) >= FEWEST and same >= MOST:
+            if np.mean((np.abs(shift - whole) <= WHOLE).all(axis=1)) >= MOST:
                 names = [self.views[i].name for i in ties.views]
                 for name, other, (col, row) in zip(names, names[::-1], (whole, 0.0 - whole), strict=True):
                     found.setdefault(name, f"{other}, moved by {col:.0f} columns and {row:.0f} rows")

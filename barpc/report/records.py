@@ -108,22 +108,25 @@ def _reader(kind: Any) -> Callable[[Any], Any] | None:
     return tuple if item is None else lambda values: tuple(map(item, values))
 
 
-def plain(value: Any) -> Any:
-    """Return a value as JSON holds it: arrays as lists, records as mappings, what is not finite as null."""
+def plain(value: Any, keep: bool = False) -> Any:
+    """Return a value as JSON holds it: arrays as lists, records as mappings, what is not finite as null.
+
+    With `keep` as it is read from there: records stay what they are, lists become tuples.
+    """
     if isinstance(value, float) and not isinstance(value, np.generic):
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, (bool, int, str)):
         return value
+    if isinstance(value, (list, tuple)):
+        found = [plain(item, keep) for item in value]
+        return tuple(found) if keep else found
     if is_dataclass(value) and not isinstance(value, type):
         held = ((name, getattr(value, name), optional) for name, optional in _held(type(value)))
-        return {name: plain(item) for name, item, optional in held if item is not None or not optional}
+        items = {name: plain(item, keep) for name, item, optional in held if item is not None or not optional}
+        return type(value)(**items) if keep else items
     if isinstance(value, (np.ndarray, np.generic)):
-        return plain(value.tolist())
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    return str(value)
+        return plain(value.tolist(), keep)
+    return {str(k): plain(v) for k, v in value.items()} if isinstance(value, Mapping) else str(value)
 
 
 @cache

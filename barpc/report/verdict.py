@@ -55,7 +55,8 @@ def summarize(run: Run) -> Summary:
     found = measure_run(run)
     views = tuple(replace(view, **view_status(view, run)) for view in found.views)  # type: ignore[arg-type]
     verdict = block_verdict(run, views)
-    return Summary.read(plain(replace(found, views=views, passed=verdict["status"] == "good", **verdict)))
+    summary: Summary = plain(replace(found, views=views, passed=verdict["status"] == "good", **verdict), keep=True)
+    return summary
 
 
 def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:

@@ -155,6 +155,12 @@ def test_an_archive_that_claims_more_than_it_holds_is_refused_before_anything_is
         load_npz(tmp_path / "zip.npz")
 
 
+def test_an_archive_of_python_objects_is_refused_by_its_header(tmp_path):
+    np.savez(tmp_path / "objects.npz", names=np.array([{}, None]))
+    with pytest.raises(InputError, match=r"objects\.npz.*names\.npy holds Python objects"):
+        load_npz(tmp_path / "objects.npz")
+
+
 def test_an_archive_that_holds_too_much_is_refused_unpacked(tmp_path):
     path = bomb(tmp_path / "bomb.npz", 10**6, b"\0" * 10**6)
     assert path.stat().st_size < 5000

@@ -307,6 +307,15 @@ def test_nothing_is_replaced_that_is_not_an_earlier_export(target, southern, tmp
     assert (out / foreign).read_text() == "mine"
 
 
+def test_an_image_of_the_run_is_never_written_over(southern, tmp_path):
+    run, out = in_one_folder(southern, tmp_path), tmp_path / "ortho"
+    summary = read(run / "summary.json")
+    summary["views"][0]["path"] = str(out / "ortho.sh")
+    (run / "summary.json").write_text(json.dumps(summary))
+    with pytest.raises(OutputError, match=r"ortho\.sh: is an input and is never written"):
+        export_run(run, "ortho", out)
+
+
 def test_the_run_s_own_folder_is_never_an_export(southern):
     with pytest.raises(OutputError, match="one of its own"):
         export_run(southern, "s2p", southern, overwrite=True)

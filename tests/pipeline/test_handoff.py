@@ -12,6 +12,7 @@ import pytest
 
 from barpc.base.errors import OutputError
 from barpc.base.geodesy import Array
+from barpc.fit.certificate import Sample
 from barpc.pipeline.handoff import (
     CONSUMERS,
     TOLERANCE,
@@ -19,6 +20,7 @@ from barpc.pipeline.handoff import (
     difference,
     unverified,
     verify,
+    verify_grid,
 )
 from barpc.rpcio import (
     CARRIERS,
@@ -30,7 +32,9 @@ from barpc.rpcio import (
     write_rpc,
     write_rpc_copy,
 )
+from barpc.rpcio.grids import CORRECTION, write_correction
 from barpc.scene import BoolArray
+from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
 from barpc.sensor.rpc import RPC
 from barpc.workspace import Workspace
 from tests.rpcio.conftest import make_rpc, write_image
@@ -173,6 +177,16 @@ def test_the_grid_covers_the_image_and_its_altitudes():
     np.testing.assert_allclose(image.min(axis=0), [0, 0], atol=1e-6)
     np.testing.assert_allclose(image.max(axis=0), [SIZE[0] - 1, SIZE[1] - 1], atol=1e-6)
     assert (ground[:, 2].min(), ground[:, 2].max()) == ALTITUDES
+
+
+def test_gdal_s_way_with_a_correction_puts_its_nodes_where_barpc_does_and_keeps_the_ends_beyond(tmp_path):
+    rpc, rng = make_rpc(), np.random.default_rng(0)
+    grid = CorrectionGrid(np.linspace(300.0, 1500.0, 5), np.linspace(100.0, 1600.0, 4), rng.normal(size=(4, 5, 2)))
+    write_correction(grid, rpc, tmp_path / f"a{CORRECTION}")
+    found = verify_grid(tmp_path / f"a{CORRECTION}", Sample.of(GridCorrected(rpc, grid), SIZE, ALTITUDES))
+    assert {one.consumer for one in found} == {"gdal", "barpc"}
+    for one in found:
+        assert one.max_error < 1e-5, one  # the file holds four-byte numbers
 
 
 def test_two_cameras_differ_by_what_one_was_moved():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from scipy.special import erf
 
@@ -13,6 +15,8 @@ from barpc.sensor.corrected import Corrected
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.timing import Timed
+
+_gauss = cache(np.polynomial.legendre.leggauss)  # every image asks
 
 
 class EllipseEntry(Record):
@@ -79,7 +83,7 @@ def ce90(major: float, minor: float) -> float:
     """
     if not major > 0.0:
         return major
-    nodes, weights = np.polynomial.legendre.leggauss(64)
+    nodes, weights = _gauss(64)
     angle, radius = 0.25 * np.pi * (nodes + 1.0), np.linspace(1.6, 2.2, 200)[:, None]  # major axes
     with np.errstate(divide="ignore"):
         held = erf(radius * np.cos(angle) / (np.sqrt(2.0) * np.float64(minor / major)))
