@@ -9,6 +9,7 @@ those beside it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import chdtri
@@ -78,9 +79,10 @@ class _Rows:
         """Return the period, and minus the logarithm of its chance at one frequency; None below `costs`."""
         gain = self._spectrum(self.off)
         band = np.floor(2.0 * np.log2(self.waves[self.first :]))
+        starts = self.first + np.flatnonzero(np.diff(band, prepend=-1.0))
         best = None
-        for start in np.flatnonzero(np.diff(band, prepend=-1.0)).tolist():
-            k = self.first + start + int(gain[self.first + start :][band[start:] == band[start]].argmax())
+        for start, stop in pairwise([*starts.tolist(), len(gain)] if _worth(gain.max(initial=0.0)) > costs else []):
+            k = start + int(gain[start:stop].argmax())
             if _worth(gain[k]) > max(costs, 0.0 if best is None else best[1]):
                 period = self.bins * _BIN / (self.waves[k] + _vertex(gain, k) / _FINE)
                 worth = _worth(gain[k] / self._level(k, period))
