@@ -21,8 +21,8 @@ from barpc.sensor.splined import sine_and_cosine
 
 _SHORTEST = 32.0  # rows: of what is shorter a matcher's window shows the mean
 _FEWEST = 1.5  # waves of an image: fewer are no swing yet, and what is nearer to a peak is its own
-_FINE = 8  # frequencies a wave more
-_BIN = _SHORTEST / _FINE  # rows summed: 2 % of the shortest are lost
+_FINE = 4  # frequencies a wave more
+_BIN = _SHORTEST / _FINE  # rows summed: a tenth of the shortest is lost
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Swing:
 
 def price(rows: float, views: int) -> float:
     """Return the cost of choosing a period, in images of so many rows, and a view [nats]."""
-    # as many as half the frequencies count as tests (Baluev 2008, near the levels asked for)
-    return float(np.log(max(0.5 * _FINE * rows / _SHORTEST, 1.0) * views))
+    # as many as the frequencies count as tests (Baluev 2008, near the levels asked for)
+    return float(np.log(max(_FINE * rows / _SHORTEST, 1.0) * views))
 
 
 def swings(view: IntArray, row: Array, size: Array, right: Array, off: Array, least: float = SURE) -> list[Swing]:

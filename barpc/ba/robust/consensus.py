@@ -16,7 +16,7 @@ from scipy.special import expit
 
 from barpc.ba.algebra.structure import Structure, parts
 from barpc.ba.estimated.projected import Projected
-from barpc.ba.usual import FEW, ITERATIONS, LEVEL, MANY, OUTLIER, STEPS, TRIALS
+from barpc.ba.usual import FEW, ITERATIONS, LEVEL, MANY, OUTLIER, SLIGHT, STEPS, TRIALS
 from barpc.base.geodesy import CHUNK, Array
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.curve import cross
@@ -68,7 +68,9 @@ def _mixture(z: Array) -> tuple[float, float, float]:
             return 0.0, 0.0, 0.0
         high = float(second @ z) / len(z) / (1.0 - part)
         low = -high * (1.0 - part) / part
-        square = whole - part * low**2 - (1.0 - part) * high**2
+        before, square = square, whole - part * low**2 - (1.0 - part) * high**2
+        if abs(square - before) < SLIGHT**2 * whole:
+            break
     sigma, apart = np.sqrt(square), float(high - low)
     groups = ((part, low), (1.0 - part, high))
     both = np.logaddexp(*(np.log(share) - 0.5 * (z - center) ** 2 / square for share, center in groups))
