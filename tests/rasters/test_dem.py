@@ -242,8 +242,9 @@ def test_that_lines_meet_no_terrain_is_said_where_it_reaches_out_of_the_altitude
     assert np.isfinite(ground).all(axis=1).tolist() == [met, met, False]
     assert len(caught) == said
     if said:
-        assert f"heights here are {level:.0f} to {level:.0f} m, the camera is made for 0 to 1000 m: 3 of 3 lines" in str(
-            caught[0].message
+        assert (
+            f"heights here are {level:.0f} to {level:.0f} m, the camera is made for 0 to 1000 m: 3 of 3 lines"
+            in str(caught[0].message)
         )
 
 
