@@ -230,9 +230,10 @@ def _fit_orbit(time: Array, position: Array, velocity: Array, degree: int) -> Or
         squares = np.array([((y - a @ solution) ** 2).sum() for a, y in groups])
         sigma = np.maximum(np.sqrt(squares / count), _DIGITS)
     series = solution.reshape(degree + 1, 3)
-    taylor = [
-        chebyshev.chebval(-1.0, chebyshev.chebder(series, k)) / (half**k * math.factorial(k)) for k in range(degree + 1)
-    ]
+    taylor, derivative = [], series
+    for k in range(degree + 1):
+        taylor.append(chebyshev.chebval(-1.0, derivative) / (half**k * math.factorial(k)))
+        derivative = chebyshev.chebder(derivative)
     lacking = velocity - chebyshev.chebval(x, chebyshev.chebder(series)).T / half
     quadratic = (time - time[0])[:, None] ** np.arange(3)
     stated = np.linalg.lstsq(quadratic, lacking, rcond=None)[0]
