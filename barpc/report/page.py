@@ -249,7 +249,9 @@ def _corrections(files: RunFiles) -> Section | None:
     radars = any(value_of(view, "correction.range_m") is not None for view in views)
     tables = _table("corrections", views, more=ViewEntry.CLOCKS * radars)
     tables += _table("places", views if any(value_of(view, "correction.ellipse") for view in views) else ())
-    return _section("moves", {"most": max(moves), "held": files.summary.gcps}, tables=tables)
+    scene = files.summary.scene
+    moved = float(np.linalg.norm(np.array(scene.shift_enu_m, float))) if scene is not None else 0.0
+    return _section("moves", {"most": max(moves), "moved": moved, "held": files.summary.gcps}, tables=tables)
 
 
 def _decisions(files: RunFiles) -> Section | None:

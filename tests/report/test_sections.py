@@ -173,16 +173,17 @@ def test_corrections_are_told_by_the_farthest_move():
             camera_center=CenterEntry((0, 0, 0), 694e3, "line"),
         ),
     ]
-    section = asked("corrections", views)
-    assert section.answer.startswith("Up to 5.00 px in the middle of an image.")
-    assert section.answer.endswith("the scene's own place, which no tie point can tell.")
+    section = asked("corrections", views, scene=a_scene(shift_enu_m=(-2.0, 2.0, 1.0)))
+    common = "Part of that is common to all images: the scene as a whole moved by 3.0 m, which no tie point can tell."
+    assert section.answer == f"Up to 5.00 px in the middle of an image. {common}"
+    assert asked("corrections", views).answer == "Up to 5.00 px in the middle of an image."
     assert [table.key for table in section.tables] == ["corrections", "places"]
     assert texts(section.tables[0])[0] == ["A", "+3.000 ± 0.10", "-4.000 ± 0.10", "2.00", "-", "-", "-"]
     assert texts(section.tables[0])[1][-2:] == ["694,000", "line"]
     assert [cell.key for cell in section.tables[0].rows[0]][1:3] == [3.0, -4.0]
     assert texts(section.tables[1])[1] == ["B", "3.00", "1.00", "45", "5.00", "-"]
     assert not section.charts
-    held = asked("corrections", views, gcps=(a_gcp("P", 0.0, 0.0),))
+    held = asked("corrections", views, scene=a_scene(shift_enu_m=(9.0, 0.0, 0.0)), gcps=(a_gcp("P", 0.0, 0.0),))
     assert "no tie point can tell" not in held.answer
     assert [table.key for table in asked("corrections", views[:1]).tables] == ["corrections"]
     assert asked("corrections", [views[0], a_view("B")]) is None
