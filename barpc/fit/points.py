@@ -55,8 +55,7 @@ def terrain_range(
     dem: Callable[[Array, Array], Array],
     margin: float,
 ) -> tuple[float, float]:
-    """Return the lowest and highest altitude [m] of a DEM under an image of `size` (width, height), with a
-    margin either side.
+    """Return the lowest and highest altitude [m] of a DEM under an image of `size` (width, height), and a margin.
 
     `alt_range` [m] is where the footprint is looked for; `dem` takes lon, lat [deg] and gives altitudes [m above the
     ellipsoid], NaN where it has none; the paper's `margin` [m] is 500.
@@ -76,8 +75,7 @@ def terrain_range(
 def control_points(
     model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], options: FitOptions
 ) -> tuple[Array, Array]:
-    """Return the grid of control points: ground (n_x, n_y, n_alt, 3) lon, lat [deg], alt [m], and image (n_x,
-    n_y, n_alt, 2) [px].
+    """Return the control points: ground (n_x, n_y, n_alt, 3) lon, lat [deg], alt [m] and image (n_x, n_y, n_alt, 2).
 
     It spans the outer edges of the image and `alt_range` [m]; longitudes run on across the antimeridian. NaN where
     the model fails.
@@ -129,8 +127,7 @@ def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) 
 
 
 def checked_points(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
-    """Return points (N, 3) lon, lat [deg], alt [m] and (N, 2) [px] as finite arrays, longitudes made
-    continuous.
+    """Return points (N, 3) lon, lat [deg], alt [m] and (N, 2) [px] as finite arrays, longitudes made continuous.
 
     FitError: no points, a wrong shape, numbers that are not finite or out of range.
     """

@@ -211,8 +211,7 @@ class FitProblem:
 
 
 def expected_size(active: IntArray) -> Array:
-    """Return the size (k,) expected of each unknown, those of the denominator last; infinite where nothing is
-    expected.
+    """Return the size (k,) expected of each unknown, those of the denominator last; infinite where nothing is expected.
 
     Numerator: 0.1 of degree two, 0.03 of degree three. Denominator: `TAU` of degree one, a tenth of it
     of degree two, a hundredth of degree three: what vendors' RPCs show, with room.

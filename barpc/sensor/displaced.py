@@ -320,10 +320,3 @@ class CorrectionGrid(Frozen):
     def undo(self, image: Array) -> Array:
         """Return the image points (..., 2) [px] of the RPC that belong to true ones."""
         return fixed_point(lambda of_rpc: image - self.at(of_rpc), image)
-
-
-@dataclass(frozen=True)
-class GridCorrected(Displaced):
-    """`sensor`, an RPC, and what it lacks; itself a `SensorModel`."""
-
-    correction: CorrectionGrid  # what is added to its image points
