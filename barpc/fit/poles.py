@@ -134,7 +134,7 @@ def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:
 
 
 def bounded(system: Compressed, region: Region, active: IntArray) -> Array | None:
-    """Return a system's least squares x (k,) with a denominator of at least `FLOOR` over a region; None if there is none.
+    """Return a system's least squares x (k,) with a denominator of at least `FLOOR` over a region; None without one.
 
     The last unknowns are the coefficients of its `active` monomials but the constant one, which is 1. By the
     inequalities that x breaks, taken in few by few: least distance programming, by non-negative least squares (Lawson

@@ -244,7 +244,7 @@ def _accepted(fit: RpcFit, options: FitOptions, strict: bool) -> RpcFit:
 def _best(
     attempt: Callable[[str], RpcFit], options: FitOptions, vendor: RPC | None, strict: bool, exact: bool
 ) -> RpcFit:
-    """Return the fit by the method asked for; of several (``auto``) the best accepted, without one the best or a FitError.
+    """Return the fit by the method asked for; of several (``auto``) the best accepted, or else the best, or a FitError.
 
     Points of a model are `exact`: what a ridge leaves of them is misfit, and the least squares of that are looked for.
     """
