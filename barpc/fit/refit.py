@@ -210,9 +210,7 @@ def _certified(
     problem, rpc = solution.problem, solution.rpc
     ground, image = problem.ground, problem.image
     used = Errors()
-    for start in range(0, len(ground), CHUNK):
-        part = slice(start, start + CHUNK)
-        used.add(rpc.project(ground[part]) - image[part])
+    used.add(rpc.project(ground) - image)
     left, right = column_ranges(image)
     if size is not None:
         left, right = np.full(2, -0.5), np.asarray(size) - 0.5

@@ -75,16 +75,10 @@ class RPC(Pointwise):
         self._keep("_map", Rational(self.coeffs, _ACCURACY / np.abs(self.image_scale)))
 
     def _told(self) -> str:
-        offset = [*self.ground_offset, *self.image_offset]
-        scale = np.abs([*self.ground_scale, *self.image_scale])
-        words = (
-            "lon {:.4f} to {:.4f}",
-            "lat {:.4f} to {:.4f}",
-            "{:g} to {:g} m",
-            "col {:g} to {:g}",
-            "row {:g} to {:g}",
-        )
-        return ", ".join(word.format(o - s, o + s) for word, o, s in zip(words, offset, scale, strict=True))
+        offset = np.append(self.ground_offset, self.image_offset)
+        scale = np.abs(np.append(self.ground_scale, self.image_scale))
+        words = "lon {:.4f} to {:.4f}, lat {:.4f} to {:.4f}, {:g} to {:g} m, col {:g} to {:g}, row {:g} to {:g}"
+        return words.format(*np.column_stack([offset - scale, offset + scale]).ravel())
 
     def normalize(self, ground: Array, out: Array | None = None) -> Array:
         """Return longitude, latitude, altitude (3, N) of points (N, 3), from -1 to 1 in the RPC's box."""
