@@ -13,13 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import FitError
-from barpc.base.geodesy import CHUNK, FAR, Array, metres_per_unit, wrap_longitude
+from barpc.base.geodesy import CHUNK, FAR, Array, BoolArray, metres_per_unit, wrap_longitude
 from barpc.base.options import FitOptions
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import LEAST_RANGE, footprint
 from barpc.sensor.rpc import RPC
-
-BoolArray = npt.NDArray[np.bool_]
 
 EXACT = 1e-6  # px: what no other method is tried on, and no round trip is held to
 CELLS = 45

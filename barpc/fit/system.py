@@ -18,16 +18,14 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dtpqrt
 
 from barpc.base.errors import FitError
 from barpc.base.frozen import Frozen
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import Array, IntArray
 from barpc.sensor.rational import POWERS, monomials
 
-IntArray = npt.NDArray[np.int64]
 Rounding = Callable[[Array], Array]
 """Coefficients (...) to the nearest ones that a file can hold."""
 

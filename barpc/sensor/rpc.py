@@ -11,14 +11,11 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
 from barpc.base.errors import RpcError
-from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array, pointwise, wrap_longitude
+from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array, BoolArray, IntArray, pointwise, wrap_longitude
 from barpc.sensor import Pointwise, SensorModel
-from barpc.sensor.rational import DERIVATIVE, REACH, BoolArray, Rational, monomials
-
-IntArray = npt.NDArray[np.int64]
+from barpc.sensor.rational import DERIVATIVE, REACH, Rational, monomials
 
 _ACCURACY = 1e-9  # px: a localised point must project this near to where it was asked (plus rounding)
 _MANY = 1024  # points of a view: its own inverse is sooner made
