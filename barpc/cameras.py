@@ -30,7 +30,7 @@ from barpc.rpcio.grids import SIGN, read_correction
 from barpc.rpcio.sources import described, metadata_beside, only_physical
 from barpc.sensor import SensorModel
 from barpc.sensor.direct_grid import DirectGrid
-from barpc.sensor.displaced import GridCorrected
+from barpc.sensor.displaced import Displaced
 from barpc.sensor.geometry import altitude_range
 from barpc.sensor.rpc import RPC
 
@@ -264,7 +264,7 @@ def _open_grid(path: Place, altitudes: list[float] | None = None) -> Camera:
 def _open_correction(path: Place) -> Camera:
     rpc, lacking = read_correction(path)
     size = int(lacking.cols[-1]) + 1, int(lacking.rows[-1]) + 1  # its nodes go from corner to corner of the image
-    return Camera(GridCorrected(rpc, lacking), path, "correction", size, altitude_range(rpc))
+    return Camera(Displaced(rpc, lacking), path, "correction", size, altitude_range(rpc))
 
 
 def _numbers(text: str) -> list[float]:

@@ -14,6 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 WGS84_A = 6378137.0  # semi-major axis [m]
 WGS84_F = 1.0 / 298.257223563  # flattening

@@ -59,8 +59,7 @@ _EVEN = 0.05  # a denominator within 1 -/+ this weights nothing
 
 
 def corner(systems: Sequence[Compressed]) -> float:
-    """Return the regularisation h at the corner of the L-curve of systems that share it: the largest
-    curvature, by grids of h.
+    """Return the regularisation h at the corner of the systems' one L-curve: the largest curvature, by grids of h.
 
     The curve (log |M x - y|, log |x|) and its curvature have a closed form in the singular values (Hansen,
     "Rank-deficient and discrete ill-posed problems", 1998).

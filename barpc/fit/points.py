@@ -13,13 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import FitError
-from barpc.base.geodesy import CHUNK, FAR, Array, metres_per_unit, wrap_longitude
+from barpc.base.geodesy import CHUNK, FAR, Array, BoolArray, metres_per_unit, wrap_longitude
 from barpc.base.options import FitOptions
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import LEAST_RANGE, footprint
 from barpc.sensor.rpc import RPC
-
-BoolArray = npt.NDArray[np.bool_]
 
 EXACT = 1e-6  # px: what no other method is tried on, and no round trip is held to
 CELLS = 45
@@ -55,8 +53,7 @@ def terrain_range(
     dem: Callable[[Array, Array], Array],
     margin: float,
 ) -> tuple[float, float]:
-    """Return the lowest and highest altitude [m] of a DEM under an image of `size` (width, height), with a
-    margin either side.
+    """Return the lowest and highest altitude [m] of a DEM under an image of `size` (width, height), and a margin.
 
     `alt_range` [m] is where the footprint is looked for; `dem` takes lon, lat [deg] and gives altitudes [m above the
     ellipsoid], NaN where it has none; the paper's `margin` [m] is 500.
@@ -76,8 +73,7 @@ def terrain_range(
 def control_points(
     model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], options: FitOptions
 ) -> tuple[Array, Array]:
-    """Return the grid of control points: ground (n_x, n_y, n_alt, 3) lon, lat [deg], alt [m], and image (n_x,
-    n_y, n_alt, 2) [px].
+    """Return the control points: ground (n_x, n_y, n_alt, 3) lon, lat [deg], alt [m] and image (n_x, n_y, n_alt, 2).
 
     It spans the outer edges of the image and `alt_range` [m]; longitudes run on across the antimeridian. NaN where
     the model fails.
@@ -129,8 +125,7 @@ def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) 
 
 
 def checked_points(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
-    """Return points (N, 3) lon, lat [deg], alt [m] and (N, 2) [px] as finite arrays, longitudes made
-    continuous.
+    """Return points (N, 3) lon, lat [deg], alt [m] and (N, 2) [px] as finite arrays, longitudes made continuous.
 
     FitError: no points, a wrong shape, numbers that are not finite or out of range.
     """

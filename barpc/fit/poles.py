@@ -12,11 +12,10 @@ from functools import cache, cached_property
 from math import comb
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import solve_triangular
 
-from barpc.base.geodesy import CHUNK, Array
-from barpc.fit.system import EPS, MAX_PASSES, Compressed, IntArray, solution
+from barpc.base.geodesy import CHUNK, Array, BoolArray, IntArray
+from barpc.fit.system import EPS, MAX_PASSES, Compressed, solution
 from barpc.sensor.rational import POWERS, REACH, monomials
 from barpc.sensor.rpc import RPC
 
@@ -59,7 +58,7 @@ class Region:
 
     offset: Array  # (3,) of the centre
     axes: Array  # (3, 3) half axes, margin included, one a row
-    inside: npt.NDArray[np.bool_]  # (n, n) nodes of the net that count, level with the ground
+    inside: BoolArray  # (n, n) nodes of the net that count, level with the ground
 
     @classmethod
     def box(cls, box: Array) -> Region:
@@ -114,7 +113,7 @@ class Region:
             return float(min(self.least(cubic / (self.there[0] @ cubic)) for cubic in cubics))
 
 
-def _inside(reach: Array, half: Array) -> npt.NDArray[np.bool_]:
+def _inside(reach: Array, half: Array) -> BoolArray:
     """Return the nodes (n, n) of the pieces that a hull of half widths (2,) touches: its `reach` in all directions."""
     width, level = 2.0 / _PIECES, _DIRECTIONS * half
     start = -1.0 + width * np.arange(_PIECES)
@@ -134,8 +133,7 @@ def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:
 
 
 def bounded(system: Compressed, region: Region, active: IntArray) -> Array | None:
-    """Return the least-squares solution x (k,) of a system whose denominator is at least `FLOOR` over a
-    region; None if there is none.
+    """Return a system's least squares x (k,) with a denominator of at least `FLOOR` over a region; None without one.
 
     The last unknowns are the coefficients of its `active` monomials but the constant one, which is 1. By the
     inequalities that x breaks, taken in few by few: least distance programming, by non-negative least squares (Lawson

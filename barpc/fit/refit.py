@@ -107,8 +107,7 @@ def _sampled(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, 
 
 
 def _plainer(fit: RpcFit, plain: RpcFit) -> RpcFit:
-    """Choose between two RPCs for a camera behind a spline: the one made without the spline where it is about
-    as good.
+    """Choose between two RPCs for a camera behind a spline: the one made without the spline where it is about as good.
 
     Its denominators are calmer; jitter that is faster than cubics of the row only makes the other one wave.
     """
@@ -217,9 +216,7 @@ def _certified(
     problem, rpc = solution.problem, solution.rpc
     ground, image = problem.ground, problem.image
     used = Errors()
-    for start in range(0, len(ground), CHUNK):
-        part = slice(start, start + CHUNK)
-        used.add(rpc.project(ground[part]) - image[part])
+    used.add(rpc.project(ground) - image)
     left, right = column_ranges(image)
     if size is not None:
         left, right = np.full(2, -0.5), np.asarray(size) - 0.5
@@ -251,8 +248,7 @@ def _accepted(fit: RpcFit, options: FitOptions, strict: bool) -> RpcFit:
 def _best(
     attempt: Callable[[str], RpcFit], options: FitOptions, vendor: RPC | None, strict: bool, exact: bool
 ) -> RpcFit:
-    """Return the fit by the method asked for, of several (``auto``) the best accepted; without one the best,
-    or a FitError.
+    """Return the fit by the method asked for; of several (``auto``) the best accepted, or else the best, or a FitError.
 
     Points of a model are `exact`: what a ridge leaves of them is misfit, and the least squares of that are looked for.
     """
@@ -310,8 +306,7 @@ def _left_out(
 def _localised(
     fit: RpcFit, problem: Callable[[RPC, str], FitProblem], seen: Seen, options: FitOptions, strict: bool, exact: bool
 ) -> RpcFit:
-    """Return the fit, where asked for with a localisation RPC and its certificate; FitError where `strict`
-    and it misses.
+    """Return the fit, if asked for with a localisation RPC and its certificate; FitError if `strict` and it misses.
 
     By a ridge; of a model (`exact`) also by Gauss-Newton, where that is better.
     """

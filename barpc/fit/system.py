@@ -18,16 +18,14 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dtpqrt
 
 from barpc.base.errors import FitError
 from barpc.base.frozen import Frozen
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import Array, IntArray
 from barpc.sensor.rational import POWERS, monomials
 
-IntArray = npt.NDArray[np.int64]
 Rounding = Callable[[Array], Array]
 """Coefficients (...) to the nearest ones that a file can hold."""
 
@@ -211,8 +209,7 @@ class FitProblem:
 
 
 def expected_size(active: IntArray) -> Array:
-    """Return the size (k,) expected of each unknown, those of the denominator last; infinite where nothing is
-    expected.
+    """Return the size (k,) expected of each unknown, those of the denominator last; infinite where nothing is expected.
 
     Numerator: 0.1 of degree two, 0.03 of degree three. Denominator: `TAU` of degree one, a tenth of it
     of degree two, a hundredth of degree three: what vendors' RPCs show, with room.

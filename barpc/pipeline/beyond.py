@@ -27,7 +27,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.csm import STATE_END as STATE
 from barpc.sensor.csm import is_writable, open_state, state_text
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
-from barpc.sensor.displaced import CorrectionGrid, GridCorrected
+from barpc.sensor.displaced import CorrectionGrid, Displaced
 from barpc.sensor.rpc import RPC
 from barpc.tie.tasks import Progress, ordered
 from barpc.workspace import Workspace
@@ -179,7 +179,7 @@ def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss
         except (RpcError, FitError) as error:
             failed = error
             continue
-        found.append((*_off(sample, GridCorrected(one, lacking)), one, lacking))
+        found.append((*_off(sample, Displaced(one, lacking)), one, lacking))
         if found[-1][1] <= LINEAR:
             break
     if not found:

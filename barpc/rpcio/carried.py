@@ -167,8 +167,7 @@ def _fifteen(values: Array) -> Array:
 
 
 def printable(rpc: RPC) -> RPC:
-    """Return the camera with offsets and scales of at most fifteen digits, as GDAL hands on the tag's
-    doubles.
+    """Return the camera with offsets and scales of at most fifteen digits, as GDAL hands on the tag's doubles.
 
     A longitude offset of 17 digits cut to 15 would move an image by up to 2e-8 px. The coefficients take up the
     difference: a normalised coordinate x becomes a x + b with b and a - 1 of 1e-13, the polynomials change by
@@ -219,8 +218,7 @@ def read_nitf(path: Place) -> RPC | None:
 
 
 def nitf_record(rpc: RPC) -> str:
-    """Return the 1041 characters of an RPC00B extension; RpcFormatError where a number does not fit its
-    field.
+    """Return the 1041 characters of an RPC00B extension; RpcFormatError where a number does not fit its field.
 
     Image and height offsets and scales are integers, degrees have four decimals, coefficients seven digits: an
     RPC that was not fitted for it (`barpc.fit`, precision "nitf") loses tenths of a pixel. An unknown accuracy

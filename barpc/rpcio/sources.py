@@ -312,8 +312,7 @@ class Sunlight:
 
 
 def light_of(image: str, camera: str | None = None) -> Sunlight:
-    """Read sun angles and time from the file of an image's camera and the metadata beside the image: Maxar's
-    IMD and XML, Airbus' DIM file.
+    """Read sun angles and time from the camera's file and metadata beside the image: Maxar's IMD, XML, Airbus' DIM.
 
     Of several values over the image (Airbus) the median is taken.
     """

@@ -84,8 +84,7 @@ def write_maxar(rpc: RPC) -> str:
 
 
 def read_dimap(text: str, name: str, options: ReadOptions) -> RPC:
-    """Read Airbus' DIMAP: Pleiades, SPOT 6/7, PeruSat (v1, v2) and Pleiades Neo (v3); its inverse model,
-    never the direct.
+    """Read Airbus' DIMAP: Pleiades, SPOT 6/7, PeruSat (v1, v2), Pleiades Neo (v3); not its direct model.
 
     The first pixel's centre is (1, 1) in v1 and v2 and (0, 0) in v3. ERR_BIAS_ROW and _COL are the error of the
     vendor's own fit [px], no geolocation accuracy: they are left out.

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import RpcError
@@ -20,6 +19,7 @@ from barpc.base.geodesy import (
     NEWTON_STEPS,
     SETTLED,
     Array,
+    IntArray,
     ecef_from_ground,
     ecef_from_ground_jacobian,
     ground_from_ecef,
@@ -30,8 +30,6 @@ from barpc.base.geodesy import (
 from barpc.sensor import Behind, SensorModel
 from barpc.sensor.curve import Turn, cross, rotation_left_jacobian, rotation_matrix
 from barpc.sensor.displaced import fixed_point
-
-IntArray = npt.NDArray[np.int64]
 
 _DIGITS = 1e-8  # of derivatives: the solver's steps ask for no more
 

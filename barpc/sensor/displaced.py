@@ -14,18 +14,16 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from barpc.base.errors import RpcError
 from barpc.base.frozen import Frozen
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import Array, IntArray
 from barpc.sensor import Behind, SensorModel
 from barpc.sensor.direct_grid import LINEAR, LONGEST, linear_axes
 
 if TYPE_CHECKING:
     from scipy.interpolate import RegularGridInterpolator
 
-IntArray = npt.NDArray[np.int64]
 
 _STEPS = 60  # of a fixed point: a correction gains two or three digits a step, wild ones need more
 STANDS = 1e-7
@@ -320,10 +318,3 @@ class CorrectionGrid(Frozen):
     def undo(self, image: Array) -> Array:
         """Return the image points (..., 2) [px] of the RPC that belong to true ones."""
         return fixed_point(lambda of_rpc: image - self.at(of_rpc), image)
-
-
-@dataclass(frozen=True)
-class GridCorrected(Displaced):
-    """`sensor`, an RPC, and what it lacks; itself a `SensorModel`."""
-
-    correction: CorrectionGrid  # what is added to its image points

@@ -10,13 +10,20 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import RpcError
-from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit, wrap_longitude
+from barpc.base.geodesy import (
+    Array,
+    BoolArray,
+    IntArray,
+    ecef_from_ground,
+    enu_basis,
+    ground_from_ecef,
+    metres_per_unit,
+    wrap_longitude,
+)
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC, localize_stack
 from barpc.sensor.timing import Clocked
 
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.int64]
 CenterMethod = Literal["line", "projective", "nominal", "stated"]
 _Rows = list[tuple[SensorModel, slice]]  # the observations of each camera
 

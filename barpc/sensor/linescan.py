@@ -20,8 +20,7 @@ from itertools import count, takewhile
 from pathlib import Path
 
 import numpy as np
-from numpy.polynomial import Polynomial
-from numpy.polynomial.polynomial import polyval
+from numpy.polynomial.polynomial import polyfit, polyval
 from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, RpcError, RpcFormatError
@@ -92,14 +91,8 @@ def camera_of_samples(samples: Samples, detector: Detector, sigma: tuple[float, 
     _check_turn(samples)
     try:
         mount, attitude = attitude_through(samples.ticks, samples.quaternions)
-        model = Pushbroom(
-            _track(samples.times, samples.positions),
-            attitude,
-            mount,
-            detector.look,
-            detector.look_origin,
-            detector.line_period,
-        )
+        orbit = _track(samples.times, samples.positions)
+        model = Pushbroom(orbit, attitude, mount, detector.look, detector.look_origin, detector.line_period)
     except RpcError as error:
         raise RpcFormatError(f"{name}: {error}") from error
     middle = model.localize((np.array(detector.size) - 1) / 2, np.zeros(()))
@@ -119,14 +112,12 @@ def _track(times: Array, positions: Array) -> Curve:
     """
     half = 0.5 * (times[-1] - times[0])
     degree = next((d for d in _DEGREES if _ORBIT * (_RATE * half) ** (d + 1) < _EXACT * math.factorial(d + 1)), 0)
-    if not degree or len(times) <= degree + 1:
-        return Curve.through(times, positions)
-    since = times - times[0]
-    parts = [Polynomial.fit(since, axis, degree) for axis in positions.T]
-    left = positions.T - [part(since) for part in parts]
-    if not np.sqrt((left**2).mean()) <= _SCATTER:
-        return Curve.through(times, positions)
-    return Curve.polynomial(padded(part.convert().coef for part in parts).T, times[0], times[-1])
+    if degree and len(times) > degree + 1:
+        since = times - times[0]
+        coeffs = polyfit(since, positions, degree)
+        if np.sqrt(((polyval(since, coeffs).T - positions) ** 2).mean()) <= _SCATTER:
+            return Curve.polynomial(coeffs, times[0], times[-1])
+    return Curve.through(times, positions)
 
 
 def unit(quaternions: Array, name: str) -> Array:

@@ -11,12 +11,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
-from barpc.base.geodesy import Array
-
-BoolArray = npt.NDArray[np.bool_]
-
+from barpc.base.geodesy import Array, BoolArray, IntArray
 
 MONOMIALS = (
     "1", "L", "P", "H", "LP", "LH", "PH", "LL", "PP", "HH",
@@ -175,7 +171,7 @@ class Rational:
         signs = np.sign(np.concatenate([denominators, (a * d - b * c)[None]]))
         return np.asarray((signs[:, 1:] == signs[:, :1]).all(axis=0))
 
-    def _solve_with_care(self, target: Array, x: Array, index: npt.NDArray[np.int64]) -> BoolArray:
+    def _solve_with_care(self, target: Array, x: Array, index: IntArray) -> BoolArray:
         """Solve the columns `index` of `x` (their `x[2]` given) for `target`; return whether each was found."""
         z = x[2, index]
         state = np.zeros((3, len(index)))

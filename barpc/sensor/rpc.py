@@ -11,14 +11,11 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
 from barpc.base.errors import RpcError
-from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array, pointwise, wrap_longitude
+from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array, BoolArray, IntArray, pointwise, wrap_longitude
 from barpc.sensor import Pointwise, SensorModel
-from barpc.sensor.rational import DERIVATIVE, REACH, BoolArray, Rational, monomials
-
-IntArray = npt.NDArray[np.int64]
+from barpc.sensor.rational import DERIVATIVE, REACH, Rational, monomials
 
 _ACCURACY = 1e-9  # px: a localised point must project this near to where it was asked (plus rounding)
 _MANY = 1024  # points of a view: its own inverse is sooner made
@@ -75,16 +72,10 @@ class RPC(Pointwise):
         self._keep("_map", Rational(self.coeffs, _ACCURACY / np.abs(self.image_scale)))
 
     def _told(self) -> str:
-        offset = [*self.ground_offset, *self.image_offset]
-        scale = np.abs([*self.ground_scale, *self.image_scale])
-        words = (
-            "lon {:.4f} to {:.4f}",
-            "lat {:.4f} to {:.4f}",
-            "{:g} to {:g} m",
-            "col {:g} to {:g}",
-            "row {:g} to {:g}",
-        )
-        return ", ".join(word.format(o - s, o + s) for word, o, s in zip(words, offset, scale, strict=True))
+        offset = np.append(self.ground_offset, self.image_offset)
+        scale = np.abs(np.append(self.ground_scale, self.image_scale))
+        words = "lon {:.4f} to {:.4f}, lat {:.4f} to {:.4f}, {:g} to {:g} m, col {:g} to {:g}, row {:g} to {:g}"
+        return words.format(*np.column_stack([offset - scale, offset + scale]).ravel())
 
     def normalize(self, ground: Array, out: Array | None = None) -> Array:
         """Return longitude, latitude, altitude (3, N) of points (N, 3), from -1 to 1 in the RPC's box."""

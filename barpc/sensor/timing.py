@@ -158,8 +158,7 @@ class Clocked(Pointwise, ABC):
         return pointwise(lambda part: [self._to_radar(part)], [(3,)], ground)[0]
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """Return image points (..., 2) [px] of ground points (..., 3), their derivatives by range and azimuth
-        time, and the coordinate along the flight.
+        """Return image points (..., 2) [px] of ground points (..., 3), derivatives, the place along the flight.
 
         d(image)/d(ground) (..., 2, 3), d(image)/d(range, azimuth time) (..., 2, 2) [px/m, px/s], and (...) [px].
         """

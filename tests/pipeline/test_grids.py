@@ -356,7 +356,7 @@ def test_the_rpc_that_lacks_least_is_the_one_that_is_added_to(monkeypatch, large
     where = np.zeros((1, 3))
     monkeypatch.setattr(grids, "fit_only", fit)
     monkeypatch.setattr(grids, "CorrectionGrid", SimpleNamespace(between=between))
-    monkeypatch.setattr(grids, "GridCorrected", lambda rpc, lacking: lacking)
+    monkeypatch.setattr(grids, "Displaced", lambda rpc, lacking: lacking)
     monkeypatch.setattr(grids, "_off", lambda sample, camera: (*known[camera], where))
     sample = SimpleNamespace(model="model", size=(10, 20), alt_range=(100.0, 300.0))
     rpc, lacking, miss = grids.grid_correction(given, sample)  # type: ignore[arg-type]

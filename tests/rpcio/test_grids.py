@@ -18,7 +18,7 @@ from barpc.pipeline.handoff import unverified, verify_grid
 from barpc.rpcio import read_rpc
 from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
-from barpc.sensor.displaced import CorrectionGrid, GridCorrected
+from barpc.sensor.displaced import CorrectionGrid, Displaced
 from tests.jitter import scene
 from tests.rpcio.conftest import make_rpc
 
@@ -113,7 +113,8 @@ def test_a_correction_grid_is_a_camera(folder, camera):
     image, ground = check_points(camera)
     found = open_camera(folder / f"a{CORRECTION}")
     assert (found.format, found.size) == ("correction", SIZE)
-    assert isinstance(found.model, GridCorrected)
+    assert isinstance(found.model, Displaced)
+    assert isinstance(found.model.correction, CorrectionGrid)
     left = np.linalg.norm(found.model.project(ground) - image, axis=1).max()
     bare = np.linalg.norm(read_rpc(folder / f"a{CORRECTION}").project(ground) - image, axis=1).max()
     assert left < LINEAR < 0.2 < bare
@@ -126,7 +127,8 @@ def test_a_correction_grid_is_known_however_many_nodes_it_has(tmp_path, width, h
     grid = CorrectionGrid(np.linspace(-0.5, 5999.5, width), np.linspace(-0.5, 8999.5, height), shift)
     write_correction(grid, make_rpc(), tmp_path / f"a{CORRECTION}")
     found = open_camera(tmp_path / f"a{CORRECTION}").model
-    assert isinstance(found, GridCorrected)
+    assert isinstance(found, Displaced)
+    assert isinstance(found.correction, CorrectionGrid)
     np.testing.assert_array_equal(found.correction.shift, shift)
 
 

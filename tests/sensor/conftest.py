@@ -15,7 +15,7 @@ from barpc.sensor import SensorModel, terrasar
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.curve import Orbit, fit_orbit
 from barpc.sensor.direct_grid import DirectGrid
-from barpc.sensor.displaced import CorrectionGrid, GridCorrected, ImageAffine, ImageCorrected, RowSpline, Splined
+from barpc.sensor.displaced import CorrectionGrid, Displaced, ImageAffine, ImageCorrected, RowSpline, Splined
 from barpc.sensor.pushbroom import Light, Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.sentinel1 import range_doppler
@@ -152,7 +152,7 @@ MODELS: dict[str, Callable[[], Case]] = {
     ),
     "clocks of a Range-Doppler model": lambda: _timed(_range_doppler(5.4)),
     "clocks of a SICD image": lambda: _timed(_sicd("PLANE")),
-    "rpc and what it lacks": lambda: Case(GridCorrected(make_rpc(), _lacking()), (20000, 19000), (0.0, 1000.0)),
+    "rpc and what it lacks": lambda: Case(Displaced(make_rpc(), _lacking()), (20000, 19000), (0.0, 1000.0)),
     "pushbroom": lambda: Case(_pushbroom(5.4), (20000, 19000), (0.0, 1000.0)),
     "pushbroom across the antimeridian": lambda: Case(_pushbroom(180.0), (20000, 19000), (0.0, 1000.0)),
     "pushbroom of a curved detector": lambda: Case(_curved(), (20000, 19000), (0.0, 1000.0)),

@@ -8,7 +8,7 @@ import pytest
 from barpc.base.errors import RpcError
 from barpc.fit import fit_rpc
 from barpc.sensor.direct_grid import LINEAR, DirectGrid, linear_axes
-from barpc.sensor.displaced import CorrectionGrid, GridCorrected, ImageAffine, ImageCorrected
+from barpc.sensor.displaced import CorrectionGrid, Displaced, ImageAffine, ImageCorrected
 from tests.jitter import scene
 
 SIZE, ALTS = (8000, 8000), (0.0, 1000.0)
@@ -52,7 +52,7 @@ def test_an_rpc_and_its_correction_are_the_camera_between_the_nodes(camera):
     lacking = CorrectionGrid.between(camera.sensor, camera, SIZE, 500.0)
     ground, image = check_points(camera)
     bare = np.linalg.norm(camera.sensor.project(ground) - image, axis=1)
-    whole = GridCorrected(camera.sensor, lacking)
+    whole = Displaced(camera.sensor, lacking)
     left = np.linalg.norm(whole.project(ground) - image, axis=1)
     assert 0.5 < bare.max() < 1.5
     assert LINEAR / 10 < left.max() < LINEAR

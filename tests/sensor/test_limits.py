@@ -18,7 +18,7 @@ from barpc.sensor.corrected import Corrected, Correction, RigidMotion
 from barpc.sensor.curve import Curve, about_middle, cross, rotation_matrix
 from barpc.sensor.displaced import (
     CorrectionGrid,
-    GridCorrected,
+    Displaced,
     ImageAffine,
     ImageCorrected,
     RowSpline,
@@ -287,7 +287,7 @@ def test_a_correction_grid_is_linear_between_its_nodes_and_constant_beyond() -> 
     np.testing.assert_allclose(grid.linearised(np.array([[5.0, 4.0]]))[1][0], [[1.1, 0.0], [0.0, 1.25]])
     np.testing.assert_allclose(grid.linearised(np.array([[10.0, 4.0]]))[1][0, 0, 0], 1.2)  # of either side
     assert np.isnan(grid.at(np.array([[np.nan, 1.0]]))).any()
-    model = GridCorrected(make_rpc(), CorrectionGrid(cols * 1000, rows * 2000, shift))
+    model = Displaced(make_rpc(), CorrectionGrid(cols * 1000, rows * 2000, shift))
     ground = model.localize(np.array([[4003.0, 5001.0]]), np.array([20.0]))
     np.testing.assert_allclose(model.project(ground), [[4003.0, 5001.0]], atol=1e-7)
 

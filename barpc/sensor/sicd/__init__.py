@@ -18,18 +18,6 @@ from barpc.sensor.curve import Curve
 from barpc.sensor.document import RELIEF_AROUND, Fields, padded
 from barpc.sensor.sicd.monostatic import Formation, ImagePlane, Monostatic, PolarFormat, RangeAzimuth, ZeroDoppler
 
-__all__ = [
-    "Formation",
-    "ImagePlane",
-    "Monostatic",
-    "PolarFormat",
-    "RangeAzimuth",
-    "ZeroDoppler",
-    "find_sicd",
-    "is_sicd",
-    "open_sicd",
-]
-
 _ORDER = 30  # no polynomial of a document has so high a power
 _SCP_TOLERANCE = 1.0  # px: where the stated centre point must project
 _NITF = b"NITF02.10"
