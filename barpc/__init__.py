@@ -17,7 +17,7 @@ _MODULES = {
     "barpc.sensor.sentinel1": "RangeDoppler",
     "barpc.sensor": "SensorModel",
     "barpc.sensor.corrected": "Correction Corrected",
-    "barpc.sensor.splined": "RowSpline Splined",
+    "barpc.sensor.displaced": "RowSpline Splined",
     "barpc.scene": "View Tracks GroundPoints",
     "barpc.rpcio": "read_rpc write_rpc",
     "barpc.fit": "fit_rpc fit_rpc_points",
@@ -49,11 +49,11 @@ if TYPE_CHECKING:
     from barpc.sensor import SensorModel as SensorModel
     from barpc.sensor.corrected import Corrected as Corrected
     from barpc.sensor.corrected import Correction as Correction
+    from barpc.sensor.displaced import RowSpline as RowSpline
+    from barpc.sensor.displaced import Splined as Splined
     from barpc.sensor.pushbroom import Pushbroom as Pushbroom
     from barpc.sensor.rpc import RPC as RPC
     from barpc.sensor.sentinel1 import RangeDoppler as RangeDoppler
-    from barpc.sensor.splined import RowSpline as RowSpline
-    from barpc.sensor.splined import Splined as Splined
 
 __all__ = ["__version__", *sorted(_PUBLIC)]
 

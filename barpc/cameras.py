@@ -29,8 +29,8 @@ from barpc.rpcio import read_rpc_source
 from barpc.rpcio.grids import SIGN, read_correction
 from barpc.rpcio.sources import described, metadata_beside, only_physical
 from barpc.sensor import SensorModel
-from barpc.sensor.correction_grid import GridCorrected
 from barpc.sensor.direct_grid import DirectGrid
+from barpc.sensor.displaced import GridCorrected
 from barpc.sensor.geometry import altitude_range
 from barpc.sensor.rpc import RPC
 

@@ -17,7 +17,7 @@ from barpc.ba.solving.normal import cholesky3, point_products, whiten
 from barpc.ba.usual import FEW, GROSS, MUCH_NOISE, SHRINK, SURELY, TIMES
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray
-from barpc.sensor.splined import bsplines
+from barpc.sensor.displaced import bsplines
 
 _SURFACES = 110.0  # m: no geoid lies farther from the ellipsoid, so no mistaken height surface either
 

@@ -26,8 +26,8 @@ from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor import SensorModel
-from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
-from barpc.sensor.splined import RowSpline, Splined
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.displaced import ImageAffine, ImageCorrected, RowSpline, Splined
 from barpc.sensor.timing import Timed, Timing
 
 

@@ -22,8 +22,7 @@ from barpc.cli.flags import expanded
 from barpc.cli.project import altitude_of, exchanged, with_heights
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
 from barpc.fit import FitOptions
-from barpc.fit.certificate import Sample
-from barpc.fit.points import widened
+from barpc.fit.points import Sample, widened
 from barpc.pipeline.handoff import TOLERANCE, Reading, unverified, verify, verify_grid
 from barpc.rasters.dem import Dem
 from barpc.rasters.raster import open_raster

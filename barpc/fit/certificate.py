@@ -1,33 +1,28 @@
-"""What an RPC is worth over a whole image: points that the fit has not seen, poles, round trips.
+"""What an RPC is worth over a whole image, and why it misses a camera: poles, round trips, what its errors go by.
 
-The points are drawn one a cell of the image and at an altitude of its own each, with more along its edges; where the
-error is largest more are drawn around the worst, closer and closer. `RpcFit` is a fit
-with its certificate, and says in words what is wrong with it.
+`RpcFit` is a fit with its certificate, and says in words what is wrong with it.
+
+The errors of an RPC, less what a small change of its coefficients takes away, are asked whether they are a function of
+the row, the column or the altitude. If they are, those of neighbours in that order are alike: half the mean square of
+their differences is what the function leaves (Yatchew, "An elementary estimator of the partial linear model", 1997). No
+shape is assumed, so that swings, bursts and steps count alike.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from barpc.base.errors import FitError
 from barpc.base.geodesy import CHUNK, Array, metres_per_unit, wrap_longitude
-from barpc.sensor import SensorModel
+from barpc.fit.points import EXACT, Sample
+from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 
-BoolArray = npt.NDArray[np.bool_]
-
-EXACT = 1e-6  # px: what no other method is tried on, and no round trip is held to
-CELLS = 45
-"""Along each side of the image: 2025 points of the whole."""
-_EDGE = 12  # points along each edge of the image, at either end of the altitudes
-_WORST, _AROUND, _ROUNDS = 16, 8, 5  # points that are looked around at, new ones around each, rounds, ever nearer
-
-
+_POWERS = np.arange(1, 8)  # of altitudes
+_CELLS = 4  # along each side: where all errors are in one of them, they are in one place
+_MOST = 0.5  # of the squares: a cause of more is named
 _WORDS = {
     "row": "go by the row (a swing of the attitude, bursts, a long pass): a grid of the camera follows it",
     "column": "go by the column (a lens, detectors, a scan): fit fewer columns, or take a grid",
@@ -45,14 +40,10 @@ class Reason:
 
     Parameters
     ----------
-    cause : str
-        "row", "column", "altitude", "place", "corner", "pole" or "all".
-    share : float
-        Part of the squared errors that is due to it; of "all", what is left by the best of the others.
-    size_px : float
-        Root mean square of that part.
-    col, row : float
-        Position of a place [px].
+    cause : str, "row", "column", "altitude", "place", "corner", "pole" or "all"
+    share : float, part of the squared errors that is due to it; of "all", what is left by the best of the others
+    size_px : float, root mean square of that part
+    col, row : float, position of a place [px]
     """
 
     cause: str
@@ -64,126 +55,6 @@ class Reason:
     def __str__(self) -> str:
         words = _WORDS[self.cause].format(col=self.col, row=self.row)
         return f"{self.share:.0%} of its squares, {self.size_px:.3g} px RMS, {words}"
-
-
-@dataclass
-class Errors:
-    """Running root mean square and largest error of (N, 2) residuals [px]."""
-
-    count: int = 0
-    squares: Array = field(default_factory=lambda: np.zeros(2))
-    largest: Array = field(default_factory=lambda: np.zeros(2))
-    # (k, 3) col, row [px], altitude [m] of the largest
-    worst: Array = field(default_factory=lambda: np.empty((0, 3)))
-
-    def add(self, residual: Array) -> None:
-        """Add residuals (N, 2) [px]; one that is NaN makes the result NaN."""
-        if len(residual):
-            self.count += len(residual)
-            self.squares = self.squares + np.einsum("ij,ij->j", residual, residual)
-            self.largest = np.maximum(self.largest, np.abs(residual.T).max(axis=1))
-
-    @property
-    def rmse(self) -> Array:
-        """Root mean square (2,) [px]."""
-        return np.asarray(np.sqrt(self.squares / self.count)) if self.count else np.full(2, np.nan)
-
-
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """Points of a model all over an image of `size` (width, height) and a range of altitudes."""
-
-    model: SensorModel
-    size: tuple[int, int]
-    alt_range: tuple[float, float]
-    points: Array  # (N, 3) col, row [px], altitude [m] with a ground point; those all over the image come first
-    ground: Array  # (N, 3) lon, lat [deg], alt [m]
-    count: int  # of those all over the image
-    missing: float  # part of the image and the altitudes without a ground point
-
-    @classmethod
-    def of(
-        cls,
-        model: SensorModel,
-        size: tuple[int, int],
-        alt_range: tuple[float, float],
-        cells: int = CELLS,
-        seed: int = 0,
-    ) -> Sample:
-        """Sample a model at one random point in each of `cells` x `cells` parts of an image, and along its edges."""
-        if min(size) < 1:
-            raise FitError(f"image size {size[0]} x {size[1]}: nothing to fit over")
-        rng = np.random.default_rng(seed)
-        cell = np.stack(np.meshgrid(*[np.arange(cells)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
-        inside = np.column_stack([cell, rng.permutation(len(cell))]) + rng.random((len(cell), 3))
-        inside /= [cells, cells, len(cell)]
-        t, ends = np.linspace(0.0, 1.0, _EDGE), (0.0, 1.0)
-        edges = [(*at, h) for u in t for end in ends for at in ((u, end), (end, u)) for h in ends]
-        points = _scaled(np.concatenate([inside, edges]), size, alt_range)
-        ground = model.localize(points[:, :2], points[:, 2])
-        known: BoolArray = np.asarray(np.isfinite(ground).all(axis=1))
-        share = float(known[: len(inside)].mean())
-        return cls(model, size, alt_range, points[known], ground[known], int(known[: len(inside)].sum()), 1.0 - share)
-
-    def also(self, points: Array) -> Sample:
-        """Return the sample with more points (M, 3) col, row [px], altitude [m] to look for the worst around."""
-        ground = self.model.localize(points[:, :2], points[:, 2])
-        known = np.isfinite(ground).all(axis=1)
-        more = np.concatenate([self.points, points[known]]), np.concatenate([self.ground, ground[known]])
-        return replace(self, points=more[0], ground=more[1])
-
-    def contradiction(self) -> float:
-        """Return the largest distance [px] of the points from where the model projects their ground; infinite
-        where it fails.
-
-        At the altitudes that were asked for, whatever altitudes it gave back.
-        """
-        asked = np.column_stack([self.ground[:, :2], self.points[:, 2]])
-        return float(_size(self.model.project(asked) - self.points[:, :2]).max(initial=0.0))
-
-    def errors(self, rpc: RPC) -> tuple[Errors, Array]:
-        """Return the errors of an RPC at the sampled points, and its largest errors (2,) [px] after searching
-        around them.
-
-        They are infinite where the RPC has no image point.
-        """
-        return self.sought(lambda ground, points: rpc.project(ground) - points[:, :2])
-
-    def sought(self, off: Callable[[Array, Array], Array]) -> tuple[Errors, Array]:
-        """Return the errors (N, 2) [px] of an RPC at ground points (N, 3) and their (N, 3) col, row [px],
-        altitude [m].
-        """
-        points, miss = self.points, _size(off(self.ground, self.points))
-        errors = Errors()
-        errors.add(miss[: self.count])
-        rng, reach = np.random.default_rng(1), np.array([1.0 / CELLS, 1.0 / CELLS, 0.25])
-        unit = (points - _scaled(np.zeros(3), self.size, self.alt_range)) / self._span
-        for _ in range(_ROUNDS if float(miss.max(initial=0.0)) > EXACT else 0):
-            worst = np.unique(np.concatenate([np.argsort(-miss[:, axis], kind="stable")[:_WORST] for axis in range(2)]))
-            near = unit[np.repeat(worst, _AROUND)] + reach * rng.uniform(-1.0, 1.0, (len(worst) * _AROUND, 3))
-            near = near.clip(0.0, 1.0)
-            at = _scaled(near, self.size, self.alt_range)
-            ground = self.model.localize(at[:, :2], at[:, 2])
-            known = np.isfinite(ground).all(axis=1)
-            found = _size(off(ground[known], at[known]))
-            unit, miss, reach = np.concatenate([unit, near[known]]), np.concatenate([miss, found]), reach / 2
-        if len(miss):
-            errors.worst = _scaled(unit[miss.argmax(axis=0)], self.size, self.alt_range)
-        return errors, miss.max(axis=0, initial=0.0)
-
-    @property
-    def _span(self) -> Array:
-        return np.array([*self.size, max(self.alt_range[1] - self.alt_range[0], 1e-9)], dtype=np.float64)
-
-
-def _size(values: Array) -> Array:
-    return np.nan_to_num(np.abs(values), nan=np.inf)
-
-
-def _scaled(unit: Array, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
-    """Return the col, row, altitude (..., 3) of places in 0 .. 1."""
-    low, high = alt_range
-    return np.asarray(unit * [*size, high - low] + [-0.5, -0.5, low])
 
 
 def roundtrip(rpc: RPC, ground: Array) -> float:
@@ -215,14 +86,10 @@ class Localisation:
 
     Parameters
     ----------
-    rmse_m, max_m : float
-        Root mean square and largest distance on the ground from where the camera localises them [m].
-    rmse_px, max_px : float
-        The same from where the fitted RPC projects the places found [px].
-    min_denominator : float
-        As for the RPC, over image and altitudes.
-    method : str
-        The solver whose result this is.
+    rmse_m, max_m : float, root mean square and largest distance on the ground from where the camera localises them [m]
+    rmse_px, max_px : float, the same from where the fitted RPC projects the places found [px]
+    min_denominator : float, as for the RPC, over image and altitudes
+    method : str, the solver whose result this is
     """
 
     rmse_m: float
@@ -244,9 +111,7 @@ class Localisation:
 
 
 def off(rpc: RPC, found: Array, ground: Array, image: Array) -> Array:
-    """Return the distances (N, 2) [m, px] of places `found` (N, 3) from ground points (N, 3), and of their
-    projections.
-    """
+    """Return the distances (N, 2) of places `found` (N, 3) from ground points [m], and of their projections [px]."""
     miss = found - ground
     miss[:, 0] = wrap_longitude(miss[:, 0])
     metres = np.linalg.norm((miss * metres_per_unit(ground))[:, :2], axis=1)
@@ -259,10 +124,8 @@ class RpcFit:
 
     Parameters
     ----------
-    rpc : RPC
-        The result.
-    rmse_cnp, max_cnp : (2,)
-        Root mean square and largest error of col, row on the control points [px].
+    rpc : RPC, the result
+    rmse_cnp, max_cnp : (2,), root mean square and largest error of col, row on the control points [px]
     rmse_ckp, max_ckp : (2,)
         The same on check points all over image and altitudes, which the fit has not seen [px]; the largest error was
         also looked for around the worst of them.
@@ -274,23 +137,16 @@ class RpcFit:
         around it, over what they are at its centre; above 0 there is no pole.
     roundtrip : float
         Largest distance of a check point from where its projection is localised [px]; infinite where that fails.
-    coverage : float
-        Share of the image inside the convex hull of the control points.
-    h : (2,)
-        Regularisation used for col, row.
-    iterations : int
-        Passes over the points.
-    num_cnp, num_ckp : int
-        Number of points.
-    method : str
-        The solver whose result this is.
-    localisation : Localisation or None
-        The certificate of `rpc.direct`, where it was asked for.
+    coverage : float, share of the image inside the convex hull of the control points
+    h : (2,), regularisation used for col, row
+    iterations : int, passes over the points
+    num_cnp, num_ckp : int, number of points
+    method : str, the solver whose result this is
+    localisation : Localisation or None, the certificate of `rpc.direct`, where it was asked for
     contradiction : float
         Largest distance of a check point from where the model, not the RPC, projects the ground that it localises
         there [px]; 0 for given points. What else projects with the model may be off by as much more.
-    reason : Reason or None
-        Cause of a miss of the tolerance, of a model.
+    reason : Reason or None, cause of a miss of the tolerance, of a model
     """
 
     rpc: RPC
@@ -323,9 +179,7 @@ class RpcFit:
         return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
 
     def as_written(self, rpc: RPC) -> RpcFit:
-        """Return the fit of the RPC as read back from its file: the differences over its box are added to the
-        errors.
-        """
+        """Return the fit of the RPC as read back from its file: what differs over its box is added to the errors."""
         lost = self.rpc.off(rpc)
         return replace(
             self,
@@ -358,3 +212,63 @@ class RpcFit:
         if not self.roundtrip <= max(tolerance, EXACT):
             return f"the RPC cannot be inverted over the scene (round trip {self.roundtrip:.3g} px)"
         return "" if self.localisation is None else self.localisation.verdict(tolerance)
+
+
+# --- why it misses -----------------------------------------------------------------------------------------
+
+
+def reason(rpc: RPC, sample: Sample) -> Reason | None:
+    """Return what most of an RPC's errors at the points of a sample depend on; None where they are not finite."""
+    ground, points = sample.ground[: sample.count], sample.points[: sample.count]
+    error = rpc.project(ground) - points[:, :2]
+    if not (np.isfinite(error).all() and error.any()):
+        return None
+    bases = [np.linalg.qr(_tangent(rpc, ground, axis))[0] for axis in range(2)]
+    left = np.column_stack([e - q @ (q.T @ e) for e, q in zip(error.T, bases, strict=True)])
+    total, rest = float((error**2).sum()), float((left**2).sum())
+    share = {"pole": 1.0 - rest / total}
+    for axis, name in enumerate(("column", "row", "altitude")):
+        share[name] = _along(left, bases, points[:, axis]) * rest / total
+    share["altitude"] = max(share["altitude"], _layered(left, bases, points, sample) * rest / total)
+    where = np.minimum((points[:, :2] + 0.5) / sample.size * _CELLS, _CELLS - 1).astype(np.int64)
+    squares = np.bincount(where @ [1, _CELLS], (error**2).sum(axis=1), minlength=_CELLS**2)
+    share["place"] = float(squares.max()) / total
+    cause, most = max(share.items(), key=lambda item: item[1])
+    size = float(np.sqrt(most * total / len(error)))
+    if most <= _MOST:
+        return Reason("all", 1.0 - most, float(np.sqrt((1.0 - most) * total / len(error))))
+    if cause == "place":
+        col, row = points[(error**2).sum(axis=1).argmax(), :2].tolist()
+        cell = np.array(divmod(int(squares.argmax()), _CELLS))
+        return Reason("corner" if np.isin(cell, (0, _CELLS - 1)).all() else cause, most, size, col, row)
+    return Reason(cause, most, size)
+
+
+def _tangent(rpc: RPC, ground: Array, axis: int) -> Array:
+    """Return the directions (N, 39) of points under small changes of the coefficients of col (`axis` 0) or row (1)."""
+    basis = monomials(rpc.normalize(ground)).T
+    above, below = basis @ rpc.coeffs[2 * axis], basis @ rpc.coeffs[2 * axis + 1]
+    rows = np.hstack([basis, -(above / below)[:, None] * basis[:, 1:]]) / below[:, None]
+    return np.asarray(rows / np.linalg.norm(rows, axis=0))
+
+
+def _along(left: Array, bases: list[Array], place: Array) -> float:
+    """Return the share of errors (N, 2) that is a function of `place` (N,)."""
+    order, rest = np.argsort(place, kind="stable"), 0.0
+    for error, basis in zip(left[order].T, bases, strict=True):
+        change, turn = np.diff(error), np.diff(basis[order], axis=0)
+        found = np.linalg.lstsq(turn, change, rcond=None)[0]
+        rest += 0.5 * float(((change - turn @ found) ** 2).mean()) * len(change) / (len(change) - len(found))
+    return 1.0 - rest / float((left**2).sum() / len(left))
+
+
+def _layered(left: Array, bases: list[Array], points: Array, sample: Sample) -> float:
+    """Return the share of errors (N, 2) that goes by the altitude, otherwise from place to place of the image."""
+    away = (points[:, :2] - (np.array(sample.size) - 1) / 2) / (max(sample.size) / 2)
+    low, high = sample.alt_range
+    up = ((points[:, 2:] - 0.5 * (low + high)) / (0.5 * (high - low))) ** _POWERS
+    layers, rest = np.hstack([up, up * away[:, :1], up * away[:, 1:]]), 0.0
+    for error, basis in zip(left.T, bases, strict=True):
+        shape = layers - basis @ (basis.T @ layers)
+        rest += float(((error - shape @ np.linalg.lstsq(shape, error, rcond=1e-10)[0]) ** 2).sum())
+    return 1.0 - rest / float((left**2).sum())

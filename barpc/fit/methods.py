@@ -30,7 +30,6 @@ from barpc.base.options import FitOptions
 from barpc.fit.points import column_ranges
 from barpc.fit.poles import Region, bounded
 from barpc.fit.system import (
-    ALTITUDE_FLOOR,
     EPS,
     MAX_PASSES,
     PRECISIONS,
@@ -43,6 +42,7 @@ from barpc.fit.system import (
     noise_scaled,
     solution,
 )
+from barpc.sensor.geometry import LEAST_RANGE
 from barpc.sensor.rpc import RPC
 
 Found = tuple[Array, list["Compressed"], Array, int]
@@ -205,7 +205,7 @@ def normalization(ground: Array, image: Array, options: FitOptions, vendor: RPC 
         offset, scale = vendor.ground_offset, vendor.ground_scale
     else:
         offset = tidy(0.5 * (low + high))
-        scale = tidy(np.maximum(0.5 * (high - low), [1e-9, 1e-9, ALTITUDE_FLOOR]))
+        scale = tidy(np.maximum(0.5 * (high - low), [1e-9, 1e-9, LEAST_RANGE / 2]))
     middle, half = tidy(0.5 * (left + right)), tidy(np.maximum(0.5 * (right - left), 1e-6))
     found = Normalization(offset, scale, middle, half)
     return found if options.precision is None else PRECISIONS[options.precision].normalization(found)
@@ -302,9 +302,7 @@ def _minimised(problem: FitProblem, axis: int, x: Array, region: Region) -> tupl
 
 
 def _ahead(problem: FitProblem, system: Compressed, x: Array, penalty: Array, size: Array, region: Region) -> Array:
-    """Return the solution of a system damped towards x, its denominator kept up over a region; x where there
-    is none.
-    """
+    """Return the solution of a system damped towards x, its denominator kept up over a region; x if there is none."""
     for least, solver in (
         (EPS, solution),
         (_DAMPED, partial(bounded, region=region, active=problem.active)),  # which wants it well conditioned
@@ -320,11 +318,7 @@ def _minimax(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None)
     coeffs, solved, h, passes = _gauss_newton(problem, None, vendor)
     given, parts, region = 1.0 if problem.weight is None else problem.weight, [], region_of(problem)
     for axis in range(2):
-        x, least, weight = (
-            problem.packed(coeffs[2 * axis : 2 * axis + 2]),
-            np.inf,
-            np.ones(len(problem.image)),
-        )
+        x, least, weight = (problem.packed(coeffs[2 * axis : 2 * axis + 2]), np.inf, np.ones(len(problem.image)))
         for _ in range(MAX_PASSES):
             errors = problem.errors(axis, x)
             if errors.max() < least:

@@ -1,8 +1,13 @@
-"""The points of a fit: sampled from a sensor model, or given and looked at first (shapes, numbers, geometry)."""
+"""The points of a fit: sampled from a sensor model, or given and looked at first (shapes, numbers, geometry).
+
+Points that the fit has not seen are drawn one a cell of the image and at an altitude of its own each, with more along
+its edges; where the error is largest more are drawn around the worst, closer and closer.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -10,10 +15,17 @@ import numpy.typing as npt
 from barpc.base.errors import FitError
 from barpc.base.geodesy import CHUNK, FAR, Array, metres_per_unit, wrap_longitude
 from barpc.base.options import FitOptions
-from barpc.fit.system import ALTITUDE_FLOOR
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import footprint
+from barpc.sensor.geometry import LEAST_RANGE, footprint
+from barpc.sensor.rpc import RPC
 
+BoolArray = npt.NDArray[np.bool_]
+
+EXACT = 1e-6  # px: what no other method is tried on, and no round trip is held to
+CELLS = 45
+"""Along each side of the image: 2025 points of the whole."""
+_EDGE = 12  # points along each edge of the image, at either end of the altitudes
+_WORST, _AROUND, _ROUNDS = 16, 8, 5  # points that are looked around at, new ones around each, rounds, ever nearer
 _SAMPLES = 400  # of a DEM along each side of the image
 _RANGES = (("longitude", -360.0, 720.0), ("latitude", -90.0, 90.0), ("altitude", -12e3, 100e3))
 _ONE_ALTITUDE = 1e-3  # metres
@@ -28,11 +40,11 @@ def spaced(low: float, high: float, count: int, even: bool = False) -> Array:
 
 
 def widened(alt_range: tuple[float, float]) -> tuple[float, float]:
-    """Return `alt_range` [m] widened to twice `ALTITUDE_FLOOR`: a flat scene still gets its altitude terms."""
+    """Return `alt_range` [m] widened to `LEAST_RANGE`: a flat scene still gets its altitude terms."""
     low, high = float(alt_range[0]), float(alt_range[1])
     if not (np.isfinite(low) and np.isfinite(high) and low <= high):
         raise FitError(f"altitude range {low:g} to {high:g} m is not an interval")
-    lacking = max(0.0, ALTITUDE_FLOOR - 0.5 * (high - low))
+    lacking = max(0.0, 0.5 * (LEAST_RANGE - (high - low)))
     return low - lacking, high + lacking
 
 
@@ -107,9 +119,7 @@ def column_ranges(points: Array) -> tuple[Array, Array]:
 
 
 def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) -> tuple[Array, Array]:
-    """Return checked points as `checked_points` does; FitError where columns look swapped (unless `allow_mirrored`)
-    or points determine no RPC.
-    """
+    """Return `checked_points`; FitError for swapped columns (unless `allow_mirrored`) or points that make no RPC."""
     ground, image = checked_points(ground, image)
     _check_geometry(ground, image, allow_mirrored)
     distinct = len(np.unique(ground, axis=0)) if len(ground) < 400 else len(ground)
@@ -188,3 +198,122 @@ def _check_order(jacobian: Array) -> None:
         "points: they show the ground mirrored, as if col and row or lon and lat were swapped; give "
         "lon, lat, alt and col, row (and allow_mirrored for a radar image that is mirrored)"
     )
+
+
+# --- points that the fit has not seen ----------------------------------------------------------------------
+
+
+@dataclass
+class Errors:
+    """Running root mean square and largest error of (N, 2) residuals [px]."""
+
+    count: int = 0
+    squares: Array = field(default_factory=lambda: np.zeros(2))
+    largest: Array = field(default_factory=lambda: np.zeros(2))
+    # (k, 3) col, row [px], altitude [m] of the largest
+    worst: Array = field(default_factory=lambda: np.empty((0, 3)))
+
+    def add(self, residual: Array) -> None:
+        """Add residuals (N, 2) [px]; one that is NaN makes the result NaN."""
+        if len(residual):
+            self.count += len(residual)
+            self.squares = self.squares + np.einsum("ij,ij->j", residual, residual)
+            self.largest = np.maximum(self.largest, np.abs(residual.T).max(axis=1))
+
+    @property
+    def rmse(self) -> Array:
+        """Root mean square (2,) [px]."""
+        return np.asarray(np.sqrt(self.squares / self.count)) if self.count else np.full(2, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Points of a model all over an image of `size` (width, height) and a range of altitudes."""
+
+    model: SensorModel
+    size: tuple[int, int]
+    alt_range: tuple[float, float]
+    points: Array  # (N, 3) col, row [px], altitude [m] with a ground point; those all over the image come first
+    ground: Array  # (N, 3) lon, lat [deg], alt [m]
+    count: int  # of those all over the image
+    missing: float  # part of the image and the altitudes without a ground point
+
+    @classmethod
+    def of(
+        cls,
+        model: SensorModel,
+        size: tuple[int, int],
+        alt_range: tuple[float, float],
+        cells: int = CELLS,
+        seed: int = 0,
+    ) -> Sample:
+        """Sample a model at one random point in each of `cells` x `cells` parts of an image, and along its edges."""
+        if min(size) < 1:
+            raise FitError(f"image size {size[0]} x {size[1]}: nothing to fit over")
+        rng = np.random.default_rng(seed)
+        cell = np.stack(np.meshgrid(*[np.arange(cells)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+        inside = np.column_stack([cell, rng.permutation(len(cell))]) + rng.random((len(cell), 3))
+        inside /= [cells, cells, len(cell)]
+        t, ends = np.linspace(0.0, 1.0, _EDGE), (0.0, 1.0)
+        edges = [(*at, h) for u in t for end in ends for at in ((u, end), (end, u)) for h in ends]
+        points = _scaled(np.concatenate([inside, edges]), size, alt_range)
+        ground, known = _localised(model, points)
+        share = float(known[: len(inside)].mean())
+        return cls(model, size, alt_range, points[known], ground[known], int(known[: len(inside)].sum()), 1.0 - share)
+
+    def also(self, points: Array) -> Sample:
+        """Return the sample with more points (M, 3) col, row [px], altitude [m] to look for the worst around."""
+        ground, known = _localised(self.model, points)
+        more = np.concatenate([self.points, points[known]]), np.concatenate([self.ground, ground[known]])
+        return replace(self, points=more[0], ground=more[1])
+
+    def contradiction(self) -> float:
+        """Return the largest distance [px] from where the model projects its ground; infinite where it fails.
+
+        At the altitudes that were asked for, whatever altitudes it gave back.
+        """
+        asked = np.column_stack([self.ground[:, :2], self.points[:, 2]])
+        return float(_size(self.model.project(asked) - self.points[:, :2]).max(initial=0.0))
+
+    def errors(self, rpc: RPC) -> tuple[Errors, Array]:
+        """Return an RPC's errors at the points, and the largest (2,) [px] around; infinite where it has no image."""
+        return self.sought(lambda ground, points: rpc.project(ground) - points[:, :2])
+
+    def sought(self, off: Callable[[Array, Array], Array]) -> tuple[Errors, Array]:
+        """Return an RPC's errors (N, 2) [px] at ground points (N, 3) and their (N, 3) col, row, altitude."""
+        points, miss = self.points, _size(off(self.ground, self.points))
+        errors = Errors()
+        errors.add(miss[: self.count])
+        rng, reach = np.random.default_rng(1), np.array([1.0 / CELLS, 1.0 / CELLS, 0.25])
+        unit = (points - _scaled(np.zeros(3), self.size, self.alt_range)) / self._span
+        for _ in range(_ROUNDS if float(miss.max(initial=0.0)) > EXACT else 0):
+            worst = np.unique(np.concatenate([np.argsort(-miss[:, axis], kind="stable")[:_WORST] for axis in range(2)]))
+            near = unit[np.repeat(worst, _AROUND)] + reach * rng.uniform(-1.0, 1.0, (len(worst) * _AROUND, 3))
+            near = near.clip(0.0, 1.0)
+            at = _scaled(near, self.size, self.alt_range)
+            ground, known = _localised(self.model, at)
+            found = _size(off(ground[known], at[known]))
+            unit, miss, reach = np.concatenate([unit, near[known]]), np.concatenate([miss, found]), reach / 2
+        if len(miss):
+            errors.worst = _scaled(unit[miss.argmax(axis=0)], self.size, self.alt_range)
+        return errors, miss.max(axis=0, initial=0.0)
+
+    @property
+    def _span(self) -> Array:
+        return np.array([*self.size, max(self.alt_range[1] - self.alt_range[0], 1e-9)], dtype=np.float64)
+
+
+def _localised(model: SensorModel, points: Array) -> tuple[Array, BoolArray]:
+    """Return the ground (N, 3) of points (N, 3) col, row [px], altitude [m], and where there is any (N,)."""
+    ground = model.localize(points[:, :2], points[:, 2])
+    return ground, np.asarray(np.isfinite(ground).all(axis=1))
+
+
+def _size(values: Array) -> Array:
+    return np.nan_to_num(np.abs(values), nan=np.inf)
+
+
+def _scaled(unit: Array, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
+    """Return the col, row, altitude (..., 3) of places in 0 .. 1."""
+    low, high = alt_range
+    return np.asarray(unit * [*size, high - low] + [-0.5, -0.5, low])

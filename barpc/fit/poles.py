@@ -17,14 +17,12 @@ from scipy.linalg import solve_triangular
 
 from barpc.base.geodesy import CHUNK, Array
 from barpc.fit.system import EPS, MAX_PASSES, Compressed, IntArray, solution
-from barpc.sensor.rational import MONOMIALS, monomials
+from barpc.sensor.rational import POWERS, REACH, monomials
 from barpc.sensor.rpc import RPC
 
 FLOOR = 0.1
 """Least value of a denominator over what it is at the centre."""
-BOX = 0.25  # share of the half width, around a box: of an RPC whose image is not known
 _PIECES = 8  # of a side
-_POWERS = np.array([[monomial.count(letter) for letter in "LPH"] for monomial in MONOMIALS])
 _BERNSTEIN = np.array([[comb(i, k) / comb(3, k) for k in range(4)] for i in range(4)])
 _LEVEL = 32  # directions that a hull is cut in, level with the ground
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, _LEVEL, endpoint=False)
@@ -44,7 +42,7 @@ def _net() -> Array:
                 shifted[k, p] = comb(p, k) * start ** (p - k) * width**k
         rows.append((_BERNSTEIN @ shifted)[:3])
     axis = np.vstack([*rows, np.ones((1, 4))])  # the last one is the value at 1
-    a, b, c = (axis[:, _POWERS[:, i]] for i in range(3))
+    a, b, c = (axis[:, POWERS[:, i]] for i in range(3))
     return np.asarray(a[:, None, None] * b[None, :, None] * c[None, None])
 
 
@@ -89,9 +87,7 @@ class Region:
 
     @cached_property
     def there(self) -> Array:
-        """Matrix (20, 20) that takes a cubic's coefficients to those in the skew box; its first row gives the
-        value at the centre.
-        """
+        """From a cubic's coefficients to those in the skew box (20, 20); its first row: the value at the centre."""
         places, inverse = _lattice()
         return np.asarray(inverse @ monomials((places @ self.axes + self.offset).T).T)
 
@@ -119,9 +115,7 @@ class Region:
 
 
 def _inside(reach: Array, half: Array) -> npt.NDArray[np.bool_]:
-    """Return the nodes (n, n) of the net of the pieces that a hull touches: its `reach` in all directions,
-    half widths (2,).
-    """
+    """Return the nodes (n, n) of the pieces that a hull of half widths (2,) touches: its `reach` in all directions."""
     width, level = 2.0 / _PIECES, _DIRECTIONS * half
     start = -1.0 + width * np.arange(_PIECES)
     corner = np.stack(np.meshgrid(start, start, indexing="ij"), axis=-1)
@@ -133,11 +127,9 @@ def _inside(reach: Array, half: Array) -> npt.NDArray[np.bool_]:
 
 
 def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:
-    """Return a lower bound of the denominators over a box `low`, `high` (3,) [deg, deg, m] and 25 % around
-    it, over what they are at its centre.
-    """
+    """Return a lower bound of the denominators over a box (3,), (3,) and a margin, over what they are at its centre."""
     box = np.sort(rpc.normalize(np.stack([low, high])), axis=1)
-    around = BOX * 0.5 * (box[:, 1] - box[:, 0])
+    around = (REACH - 1.0) * 0.5 * (box[:, 1] - box[:, 0])
     return Region.box(box + around[:, None] * np.array([-1.0, 1.0])).smallest(rpc.coeffs[1::2])
 
 

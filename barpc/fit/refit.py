@@ -13,15 +13,14 @@ import numpy.typing as npt
 from barpc.base.errors import BarpcWarning, FitError
 from barpc.base.geodesy import CHUNK, Array, wrap_longitude
 from barpc.base.options import FitOptions
-from barpc.fit.certificate import EXACT, Errors, Localisation, RpcFit, Sample, coverage, off, roundtrip
+from barpc.fit.certificate import Localisation, RpcFit, coverage, off, reason, roundtrip
 from barpc.fit.methods import BOUNDED, FitSolution, solve, solve_problem
-from barpc.fit.points import checked_points, column_ranges, control_points, screened, widened
-from barpc.fit.reasons import reason
+from barpc.fit.points import EXACT, Errors, Sample, checked_points, column_ranges, control_points, screened, widened
 from barpc.fit.system import FitProblem, Normalization
 from barpc.sensor import SensorModel
+from barpc.sensor.displaced import Splined
 from barpc.sensor.geometry import is_radar
 from barpc.sensor.rpc import RPC
-from barpc.sensor.splined import Splined
 
 Seen = Callable[[RPC, FitSolution], tuple[Errors, Array]]
 """What a localisation RPC is off by on points that it has not seen [m, px], and the largest (2,)."""
@@ -49,7 +48,7 @@ def fit_rpc(
     options : FitOptions, optional, grid, solver, tolerance
     strict : bool
         Raise where the tolerance is missed; otherwise give the best fit found, to be judged by `RpcFit.verdict`. A
-        camera behind a spline (`barpc.sensor.splined`) is expected to miss it.
+        camera behind a spline (`barpc.sensor.displaced`) is expected to miss it.
 
     Raises
     ------
@@ -87,6 +86,12 @@ def fit_rpc(
         raise FitError("; ".join(filter(None, (str(error), advice)))) from error
 
 
+def fit_only(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], method: str) -> RPC:
+    """Return the RPC of a sensor model by one method, without a certificate: whoever calls measures what it misses."""
+    options, alt_range = FitOptions(), widened(alt_range)
+    return solve(*_given(model, size, alt_range, options, method), options, method, vendor=underlying_rpc(model)).rpc
+
+
 def _sampled(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Sample:
     """Return the check points of a model; FitError where it has no ground for too much of its image."""
     sample = Sample.of(model, size, alt_range)
@@ -112,11 +117,7 @@ def _plainer(fit: RpcFit, plain: RpcFit) -> RpcFit:
 
 
 def _given(
-    model: SensorModel,
-    size: tuple[int, int],
-    alt_range: tuple[float, float],
-    options: FitOptions,
-    method: str,
+    model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], options: FitOptions, method: str
 ) -> tuple[Array, Array]:
     """Return the ground (N, 3) and image points (N, 2) for a method."""
     if method in BOUNDED:  # what an RPC cannot follow has any frequency: scattered points alias none
@@ -147,16 +148,12 @@ def fit_rpc_points(
 
     Parameters
     ----------
-    ground : (N, 3)
-        lon, lat [deg], alt [m above the ellipsoid]; all at one altitude give an RPC for that altitude only.
-    image : (N, 2)
-        col, row [px].
-    sigma : (N,), optional
-        Relative standard deviations of the image points; else equal.
+    ground : (N, 3), lon, lat [deg], alt [m above the ellipsoid]; all at one altitude give an RPC for that altitude only
+    image : (N, 2), col, row [px]
+    sigma : (N,), optional, relative standard deviations of the image points; else equal
     check : (ground, image), optional
         Check points (M, 3) and (M, 2). Without them the certificate holds leave-one-out residuals.
-    size : (width, height), optional
-        Image whose coverage is stated [px]; else the points' own extent.
+    size : (width, height), optional, image whose coverage is stated [px]; else the points' own extent
     vendor : RPC, optional, whose denominators may be kept
     options : FitOptions, optional
         Solver, tolerance. Points that are noisy want a ``tolerance`` of three or four times their noise.
@@ -214,12 +211,7 @@ def relative_weight(sigma: npt.ArrayLike | None, count: int) -> Array | None:
 
 
 def _certified(
-    solution: FitSolution,
-    seen: Errors,
-    largest: Array,
-    loop: float,
-    size: tuple[int, int] | None,
-    beyond: float = 1.0,
+    solution: FitSolution, seen: Errors, largest: Array, loop: float, size: tuple[int, int] | None, beyond: float = 1.0
 ) -> RpcFit:
     """Return the fit with its certificate: errors on the check points, the largest (2,) [px] found near them."""
     problem, rpc = solution.problem, solution.rpc
@@ -283,9 +275,7 @@ def _best(
 
 
 def inverse(rpc: RPC, ground: Array, image: Array, weight: Array | None = None) -> FitProblem:
-    """Return the problem of the localisation RPC that goes with an RPC: its normalisation, its points, roles
-    exchanged.
-    """
+    """Return the problem of the localisation RPC of an RPC: its normalisation, its points, roles exchanged."""
     norm = Normalization(
         np.append(rpc.image_offset, rpc.ground_offset[2]),
         np.append(rpc.image_scale, rpc.ground_scale[2]),

@@ -25,7 +25,7 @@ from scipy.linalg.lapack import dtpqrt
 from barpc.base.errors import FitError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array
-from barpc.sensor.rational import MONOMIALS, monomials
+from barpc.sensor.rational import POWERS, monomials
 
 IntArray = npt.NDArray[np.int64]
 Rounding = Callable[[Array], Array]
@@ -35,7 +35,7 @@ _ROWS = 1024  # taken into the triangle at a time: what is worked on stays in ca
 _BLOCK = 8  # columns of a Householder block
 ALL = np.arange(20)
 _DEPENDENT = 1e-9  # rms of what a monomial adds to those of lower degree, on these points
-_DEGREE = np.array([0, *(len(monomial) for monomial in MONOMIALS[1:])])
+_DEGREE = POWERS.sum(axis=1)
 _NUMERATOR = np.array([np.inf, np.inf, 0.1, 0.03])
 _DENOMINATOR = np.array([np.inf, 1.0, 0.1, 0.01])
 _SIGMA_STEPS = 2
@@ -46,10 +46,6 @@ MAX_PASSES = 20
 """Of what is iterated."""
 
 
-ALTITUDE_FLOOR = 50.0
-"""Smallest altitude half range [m] that a model is sampled over, and smallest altitude scale of an RPC."""
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Normalization(Frozen):
     """The offsets and scales of an RPC.
@@ -58,8 +54,7 @@ class Normalization(Frozen):
     ----------
     ground_offset, ground_scale : (3,)
         lon, lat [deg], alt [m]. A scale may be negative, not zero.
-    image_offset, image_scale : (2,)
-        col, row [px].
+    image_offset, image_scale : (2,), col, row [px]
     """
 
     ground_offset: Array
@@ -152,11 +147,7 @@ class FitProblem:
         return replace(self, first=first) if adds.all() else replace(self, active=self.active[adds])
 
     def rows(
-        self,
-        axis: int,
-        denominator: Array | None = None,
-        free: bool = True,
-        numerator: Array | None = None,
+        self, axis: int, denominator: Array | None = None, free: bool = True, numerator: Array | None = None
     ) -> Iterator[tuple[slice, Array]]:
         """Yield the rows (n, k + 1) of (M | y) of col (`axis` 0) or row (1), some hundred points at a time.
 
@@ -188,11 +179,7 @@ class FitProblem:
             yield part, block.T
 
     def compressed(
-        self,
-        axis: int,
-        denominator: Array | None = None,
-        free: bool = True,
-        numerator: Array | None = None,
+        self, axis: int, denominator: Array | None = None, free: bool = True, numerator: Array | None = None
     ) -> Compressed:
         """Return the system of the rows of the same parameters."""
         if self.first is not None and axis == 0 and denominator is None and free:

@@ -4,31 +4,30 @@ from __future__ import annotations
 
 import logging
 import shutil
-import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from barpc.base.atomic import write_text
-from barpc.base.errors import BarpcError, BarpcWarning, FitError, OutputError, RpcError
+from barpc.base.errors import BarpcError, FitError, OutputError, RpcError
 from barpc.base.geodesy import Array
-from barpc.base.options import FitOptions, RunOptions
-from barpc.fit import RpcFit, fit_rpc
-from barpc.fit.certificate import Sample
-from barpc.fit.points import widened
+from barpc.base.options import RunOptions
+from barpc.fit import RpcFit
+from barpc.fit.points import Sample, widened
+from barpc.fit.refit import fit_only
 from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.handoff import verify_grid
 from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid, write_resampled
 from barpc.scene import View
 from barpc.sensor import SensorModel
-from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
 from barpc.sensor.csm import STATE_END as STATE
 from barpc.sensor.csm import is_writable, open_state, state_text
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
+from barpc.sensor.displaced import CorrectionGrid, GridCorrected
 from barpc.sensor.rpc import RPC
 from barpc.tie.tasks import Progress, ordered
 from barpc.workspace import Workspace
@@ -173,13 +172,9 @@ def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss
     model, size, alts = sample.model, sample.size, sample.alt_range
     found: list[tuple[float, float, Array, RPC, CorrectionGrid]] = []
     failed: BarpcError | None = None
-    methods: tuple[Literal["vendor-denominators", "ridge"] | None, ...] = None, "vendor-denominators", "ridge"
-    for method in methods:
+    for method in (None, "vendor-denominators", "ridge"):
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", BarpcWarning)  # the fit of the RPC has said it
-                how = FitOptions(method=method or "auto")
-                one = rpc if method is None else fit_rpc(model, size, alts, options=how, strict=False).rpc
+            one = rpc if method is None else fit_only(model, size, alts, method)
             lacking = CorrectionGrid.between(one, model, size, float(np.mean(alts)))
         except (RpcError, FitError) as error:
             failed = error

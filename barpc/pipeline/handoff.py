@@ -30,15 +30,15 @@ from rasterio.transform import RPCTransformer
 from barpc.base.errors import OutputError
 from barpc.base.geodesy import Array, wrap_longitude
 from barpc.cameras import open_camera
-from barpc.fit.certificate import Sample
+from barpc.fit.points import Sample
 from barpc.rasters.raster import GDAL_OPTIONS
 from barpc.rasters.vrt import Vrt, read_vrt
 from barpc.rpcio import Carrier, read_rpc, row_of, sidecars
 from barpc.rpcio.grids import CORRECTION, GRID
 from barpc.sensor import SensorModel
-from barpc.sensor.correction_grid import CorrectionGrid
 from barpc.sensor.csm import STATE_END
 from barpc.sensor.direct_grid import DirectGrid
+from barpc.sensor.displaced import CorrectionGrid
 from barpc.sensor.geometry import image_grid
 
 TOLERANCE = 1e-6  # Largest difference [px] between a file and its model that passes

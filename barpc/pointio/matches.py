@@ -176,7 +176,7 @@ def _read_csv(path: Path, views: ViewNames) -> Links:
     _, table = read_table(path, {key: (key,) for key in (*_COLUMNS, "sigma")}, _COLUMNS, texts=("image", "track"))
     labels = np.array([label.strip() for label in table["track"]], dtype=str)
     _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
-    point = np.argsort(np.argsort(first))[inverse.ravel()] if len(labels) else np.zeros(0, dtype=np.int64)
+    point = np.argsort(np.argsort(first))[inverse.ravel()]
     spread = table.get("sigma", [IMAGE_SIGMA] * len(labels))
     return _tracks(views, table["image"], point, np.column_stack([table["col"], table["row"]]), np.array(spread))
 

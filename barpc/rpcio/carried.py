@@ -21,7 +21,7 @@ from barpc.base.geodesy import Array
 from barpc.base.remote import Place
 from barpc.base.sidefile import IMAGE, opened, read_head
 from barpc.rpcio.text import COEFFICIENTS, SINGLE, WIDTHS, cells_of, fields_from_rpc, fields_in_order, rpc_from_fields
-from barpc.sensor.rational import DERIVATIVE, MONOMIALS
+from barpc.sensor.rational import DERIVATIVE, POWERS
 from barpc.sensor.rpc import RPC
 
 RPC_TAG = 50844
@@ -104,9 +104,7 @@ def read_values(file: BinaryIO, directory: Directory, entry: Entry, name: str) -
 
 
 def read_tag(path: Place) -> RPC | None:
-    """Read the RPC in a TIFF's tag, None without such a tag; RpcFormatError where it does not hold 92 usable
-    doubles.
-    """
+    """Read the RPC in a TIFF's tag, None without one; RpcFormatError where it does not hold 92 usable doubles."""
     with opened(path, IMAGE) as file:
         directory = read_directory(file, str(path))
         entry = directory.find(RPC_TAG)
@@ -164,9 +162,6 @@ def _unmark_cog(file: BinaryIO) -> None:
         file.write(b"KNOWN_INCOMPATIBLE_EDITION=YES\n")
 
 
-_POWERS = np.array([[monomial.count(letter) for monomial in MONOMIALS] for letter in "LPH"], dtype=np.float64)
-
-
 def _fifteen(values: Array) -> Array:
     return np.array([float(f"{value:.15g}") for value in values.tolist()])
 
@@ -183,7 +178,7 @@ def printable(rpc: RPC) -> RPC:
     image_offset, image_scale = _fifteen(rpc.image_offset), _fifteen(rpc.image_scale)
     shift = (ground_offset - rpc.ground_offset) / rpc.ground_scale
     stretch = (ground_scale - rpc.ground_scale) / rpc.ground_scale
-    coeffs = rpc.coeffs + rpc.coeffs * (stretch @ _POWERS)
+    coeffs = rpc.coeffs + rpc.coeffs * (POWERS @ stretch)
     coeffs[:, :10] += np.einsum("k,kij,pi->pj", shift, DERIVATIVE, rpc.coeffs)
     moved = ((rpc.image_offset - image_offset) / image_scale)[:, None]
     coeffs[::2] = coeffs[::2] * (rpc.image_scale / image_scale)[:, None] + moved * coeffs[1::2]

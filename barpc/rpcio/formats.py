@@ -47,15 +47,7 @@ _GEOM = _has(r"(?m)^[ \t]*+(\w++\.)?line_num_coeff_00[ \t]*+:")
 _MAXAR = _has(r"<(\w+:)?LINENUMCOEF")
 _JSON = _has(r"\A\s*+\{", r'"row_num"|(?i:"line_num_coeff")')
 _SYNTAXES = (
-    Format(
-        "txt",
-        ("_RPC.TXT", ".rpc", ".txt"),
-        _TXT,
-        text.read_txt,
-        text.write_txt,
-        "_RPC.TXT",
-        (_BESIDE, "rpcm"),
-    ),
+    Format("txt", ("_RPC.TXT", ".rpc", ".txt"), _TXT, text.read_txt, text.write_txt, "_RPC.TXT", (_BESIDE, "rpcm")),
     Format("rpb", (".RPB",), _RPB, text.read_rpb, text.write_rpb, ".RPB", (_BESIDE,)),
     Format("geom", (".geom",), _GEOM, text.read_geom, text.write_geom, ".geom", ("keywords", "shareloc")),
     Format("xml", (".XML",), _MAXAR, xml.read_maxar, xml.write_maxar, ".rpc.xml", (_BESIDE,)),
@@ -87,16 +79,13 @@ class Carrier:
 
 CARRIERS: dict[str, Carrier] = {
     "vrt": Carrier(
-        (".vrt",),
-        lambda rpc, image, path, place, over: write_rpc_vrt(rpc, image, path, place=place, overwrite=over),
+        (".vrt",), lambda rpc, image, path, place, over: write_rpc_vrt(rpc, image, path, place=place, overwrite=over)
     ),
     "copy": Carrier(
         (".tif", ".tiff"), lambda rpc, image, path, _, over: write_rpc_copy(rpc, image, path, overwrite=over)
     ),
     "nitf": Carrier(
-        (".ntf",),
-        lambda rpc, image, path, _, over: write_rpc_nitf(rpc, image, path, overwrite=over),
-        precision="nitf",
+        (".ntf",), lambda rpc, image, path, _, over: write_rpc_nitf(rpc, image, path, overwrite=over), precision="nitf"
     ),
 }
 """Name -> raster that carries an RPC."""
@@ -150,9 +139,7 @@ def _listed(folder: Path, _changed: int) -> Mapping[str, str]:
 
 
 def find_rpc(folder: Path, image: Path) -> Path:
-    """Return the file in a folder that holds the RPC of an image of that name, in a format that is written
-    (or InputError).
-    """
+    """Return the file in a folder that holds an image's RPC in a format that is written (or InputError)."""
     present = files_of(folder)
     ends = [suffix for row in _rows() for suffix in row.suffixes]
     ends += [row.beside for row in WRITABLE.values()]
@@ -164,9 +151,7 @@ def find_rpc(folder: Path, image: Path) -> Path:
 
 
 def parse(data: bytes, name: str, options: ReadOptions | None = None) -> tuple[RPC, str]:
-    """Return the RPC in all bytes of a file called `name`, and its format; RpcFormatError where there is no
-    valid one.
-    """
+    """Return the RPC in all bytes of a file called `name`, and its format; RpcFormatError where none is valid."""
     if not data.strip():
         raise RpcFormatError(f"{name}: the file is empty, expected an RPC")
     RPC_FILE.check(name, len(data))

@@ -31,8 +31,8 @@ from barpc.rasters.raster import BLOCK, open_raster
 from barpc.rpcio.carried import printable, put_tag, read_tag
 from barpc.rpcio.images import TIFF, copying, created, has_mask, require_pixels
 from barpc.scene import BoolArray
-from barpc.sensor.correction_grid import CorrectionGrid
 from barpc.sensor.direct_grid import DirectGrid
+from barpc.sensor.displaced import CorrectionGrid
 from barpc.sensor.rpc import RPC
 
 GRID, CORRECTION = "_grid.tif", "_correction.tif"
@@ -189,9 +189,7 @@ def _fill(dataset: Any, out: Any, block: Window, correction: CorrectionGrid) -> 
 
 
 def _interpolated(pixels: Pixels, known: BoolArray, place: Array) -> Array:
-    """Return the values of a block at places (2, H, W), row before col; unknown pixels take the value of the
-    nearest known one.
-    """
+    """Return a block's values at places (2, H, W), row before col; unknown pixels are as the nearest known one."""
     from scipy.ndimage import distance_transform_edt, map_coordinates, spline_filter  # of no other output
 
     values = pixels.astype(np.float64)

@@ -79,9 +79,7 @@ def metadata_beside(image: Path) -> Path:
 
 
 def described(path: Place) -> tuple[tuple[int, int] | None, bool]:
-    """Return the width and height [px] that a vendor's XML states, if it does, and whether it holds a
-    physical model.
-    """
+    """Return the width and height [px] that a vendor's XML states, if so, and whether it holds a physical model."""
     text = decode(read_bytes(path, RPC_FILE))
     found = [
         re.search(rf"<(?:\w+:)?(?:{tag})>\s*+(\d{{1,7}})\s*+<", text) for tag in ("NUMCOLUMNS|NCOLS", "NUMROWS|NROWS")
@@ -150,9 +148,7 @@ def shadows(image: Path | str) -> list[Sidecar]:
 
 
 def hidden_by(paths: Iterable[Path]) -> Iterator[tuple[Path, Path, RPC]]:
-    """Yield the images whose RPC some tool would no longer see if these files were written: file, image, the
-    image's RPC.
-    """
+    """Yield images whose RPC some tool would not see if files were written: the file, the image, its RPC."""
     wanted: dict[Path, dict[str, Path]] = {}
     for path in paths:
         wanted.setdefault(path.parent, {})[path.name.lower()] = path
@@ -267,9 +263,7 @@ def _crop_origin(image: Place, _path: Place) -> _Moved:
 
 
 def _tile_origin(image: Place, path: Place) -> _Moved:
-    """Return the origin of a tile of a DIMAP product: the RPC is the whole image's, ``DIM_*.XML`` gives the
-    size of a tile.
-    """
+    """Return the origin of a tile of a DIMAP product, whose RPC is the whole image's: by ``DIM_*.XML``."""
     tile = re.search(r"_R(\d+)C(\d+)$", image.stem.upper())
     if tile is None or tile.groups() == ("1", "1"):
         return None
@@ -337,9 +331,7 @@ def light_of(image: str, camera: str | None = None) -> Sunlight:
 
 
 def date_taken(image: Place, camera: Place, tags: Mapping[str, str]) -> str:
-    """Return the day (ISO 8601) that the files of `light_of` state, an image's own `tags` last; empty where
-    none does.
-    """
+    """Return the day (ISO 8601) that the files of `light_of` state, or else an image's `tags`; empty if none does."""
     stated = next((time[:10] for text in _texts(image, camera) if (time := _time(text))), "")
     found = (_TAG.match(tags.get(tag, "").strip()) for tag in _TAGS)
     return stated or next((day for tag in found if tag and (day := _day("-".join(tag.groups())))), "")

@@ -53,9 +53,7 @@ class ReadOptions:
 
 
 def number(text: str, name: str, key: str) -> float:
-    """Return the number at the start of `text` (or RpcFormatError); a unit may follow, the exponent may be
-    Fortran's D.
-    """
+    """Return the number at the start of `text` (or RpcFormatError); a unit may follow; 1D3 is Fortran's 1E3."""
     text = text.strip()
     match = NUMBER.match(text)
     rest = text[match.end() :] if match else text
@@ -101,10 +99,7 @@ def fields_in_order(values: Sequence[float], keys: Sequence[str]) -> Fields:
 
 
 def rpc_from_fields(
-    fields: Mapping[str, Sequence[float]],
-    name: str,
-    options: ReadOptions | None = None,
-    first_pixel: float = 0.0,
+    fields: Mapping[str, Sequence[float]], name: str, options: ReadOptions | None = None, first_pixel: float = 0.0
 ) -> RPC:
     """Return the RPC of the fields of a file called `name`.
 
@@ -188,10 +183,11 @@ def _numbered(fields: Fields, separator: str, indices: Sequence[str]) -> list[st
     return lines
 
 
-def _read_lines(
-    text: str, name: str, options: ReadOptions, first: int = 1, words: Mapping[str, str] | None = None
-) -> RPC:
-    """Read a key and a value a line; coefficients are numbered from `first`, or twenty in a line, as GDAL has them."""
+def read_txt(text: str, name: str, options: ReadOptions, first: int = 1, words: Mapping[str, str] | None = None) -> RPC:
+    """Read ``KEY: value``, with or without a unit behind (GDAL, Planet, IKONOS, GeoEye, OrbView, KOMPSAT).
+
+    Coefficients are numbered from `first`, or twenty in a line, as GDAL has them; `words` are other names of keys.
+    """
     pairs: list[tuple[str, float]] = []
     for match in _LINE.finditer(text):
         key, value = match[1].upper(), match[2].strip().removesuffix(";")
@@ -201,11 +197,6 @@ def _read_lines(
         elif key in SINGLE or key.rpartition("_")[0] in LISTS:
             pairs.append((key, number(value, name, key)))
     return rpc_from_fields(collect_numbered(pairs, name, first), name, options)
-
-
-def read_txt(text: str, name: str, options: ReadOptions) -> RPC:
-    """Read ``KEY: value``, with or without a unit behind (GDAL, Planet, IKONOS, GeoEye, OrbView, KOMPSAT)."""
-    return _read_lines(text, name, options)
 
 
 def write_txt(rpc: RPC) -> str:
@@ -262,7 +253,7 @@ def read_geom(text: str, name: str, options: ReadOptions) -> RPC:
     kind = re.search(r"^[ \t]*+polynomial_format:[ \t]*+(\w*+)", text, re.MULTILINE)
     if kind and kind.group(1) != "B":
         raise RpcFormatError(f"{name}: polynomial_format {kind.group(1)!r}, only B (RPC00B) is read")
-    return _read_lines(text, name, options, 0, _GEOM_ERRORS)
+    return read_txt(text, name, options, 0, _GEOM_ERRORS)
 
 
 def write_geom(rpc: RPC) -> str:
@@ -302,9 +293,7 @@ def bare(text: str) -> bool:
 
 
 def read_bare(text: str, name: str, options: ReadOptions) -> RPC:
-    """Read the numbers without names, separated by commas, blanks or lines, in the order of ENVI's header
-    (IARPA, s2p).
-    """
+    """Read numbers without names, between commas, blanks or lines, in the order of ENVI's header (IARPA, s2p)."""
     values = [number(part, name, "a number") for part in _BETWEEN.split(text) if part]
     rpc = _in_order(values, "a list without names", name, options)
     first = rpc.coeffs[1::2, 0]

@@ -1,8 +1,8 @@
 """Sensor models: ground to image and back.
 
 A sensor model is anything with the three methods of `SensorModel`. Models do not know each other; they are frozen,
-picklable and compare by content. Those that stand on their own are `Pointwise`, corrections of image points in front of
-any model `Displaced`.
+picklable and compare by content. Those that stand on their own are `Pointwise`, those that are another one behind a
+correction `Behind`.
 
 `ground` is (lon [deg], lat [deg], alt [m above the WGS84 ellipsoid]); `image` is (col, row) [px] with
 (0, 0) at the CENTRE of the top-left pixel. Both stand on the last axis; leading axes broadcast. A point
@@ -15,14 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
-import numpy as np
-
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, pointwise
-
-_STEPS = 60  # of a fixed point: a correction gains two or three digits a step, wild ones need more
-STANDS = 1e-7
-"""Of image points that are iterated [px]: what is left after so small a step is a hundredth of it."""
 
 
 @runtime_checkable
@@ -84,52 +78,4 @@ class Behind:
         return str(getattr(self.sensor, "advice", ""))
 
 
-class Displacement(Protocol):
-    """A correction of image points: from where a model without it has them to where they are seen, and back."""
-
-    def apply(self, image: Array) -> Array:
-        """Return where points that a model has at (..., 2) [px] are seen."""
-        ...
-
-    def linearised(self, image: Array) -> tuple[Array, Array]:
-        """Return the same, and its derivative (..., 2, 2) by the model's image points."""
-        ...
-
-    def undo(self, image: Array) -> Array:
-        """Return where the model has points that are seen at (..., 2) [px]."""
-        ...
-
-
-@dataclass(frozen=True)
-class Displaced(Behind):
-    """`sensor` with its image points corrected by `correction`; itself a `SensorModel`."""
-
-    sensor: SensorModel
-    correction: Displacement
-
-    def project(self, ground: Array) -> Array:
-        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
-        return self.correction.apply(self.sensor.project(ground))
-
-    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = self.sensor.project_jacobian(ground)
-        image, slope = self.correction.linearised(image)
-        return image, slope @ jacobian
-
-    def localize(self, image: Array, alt: Array) -> Array:
-        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
-        return self.sensor.localize(self.correction.undo(np.asarray(image, dtype=np.float64)), alt)
-
-
-def fixed_point(follow: Callable[[Array], Array], image: Array) -> Array:
-    """Return the image points (..., 2) [px] that `follow` leaves where they are, from a first guess."""
-    for _ in range(_STEPS):
-        before, image = image, follow(image)
-        change = np.abs(image - before)
-        if not (change.max(initial=0.0, where=np.isfinite(change)) > STANDS):
-            break
-    return image
-
-
-__all__ = ["STANDS", "Behind", "Displaced", "Displacement", "Pointwise", "SensorModel", "fixed_point"]
+__all__ = ["Behind", "Pointwise", "SensorModel"]

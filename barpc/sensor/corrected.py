@@ -1,4 +1,4 @@
-"""Sensor models behind a correction: in space, P_BA, and in the image.
+"""Sensor models behind a correction in space: P_BA.
 
 The paper's corrected projection is P_BA(X) = P(R (X - T - C) + C) with X in ECEF (eq. 7 of Akiki et al.
 2021, "Robust Rational Polynomial Camera Modelling for SAR and Pushbroom Imaging"). A second rotation, a
@@ -24,9 +24,12 @@ from barpc.base.geodesy import (
     ecef_from_ground_jacobian,
     ground_from_ecef,
     ground_from_ecef_jacobian,
+    pointwise,
+    wrap_longitude,
 )
-from barpc.sensor import STANDS, Behind, Displaced, SensorModel, fixed_point
+from barpc.sensor import Behind, SensorModel
 from barpc.sensor.curve import Turn, cross, rotation_left_jacobian, rotation_matrix
+from barpc.sensor.displaced import fixed_point
 
 IntArray = npt.NDArray[np.int64]
 
@@ -138,17 +141,17 @@ class Correction(Frozen):
         return np.asarray(self.drift.T @ (degree * u ** (degree - 1)) / self.row_scale)
 
     def apply(self, ecef: Array, row: Array | None = None) -> Array:
-        """Return the points s R (X - T - C) + C of ECEF points X (..., 3) [m]; with the drift at rows (...)
-        if given.
-        """
+        """Return s R (X - T - C) + C of ECEF points X (..., 3) [m]; with the drift, if given rows (...)."""
         ecef = np.asarray(ecef, dtype=np.float64)
         rows = None if row is None else np.broadcast_to(row, ecef.shape[:-1]).reshape(-1)
         return self.motion(ecef.reshape(-1, 3).T, rows).ecef.T.reshape(ecef.shape)
 
     def undo(self, ecef: Array, row: Array) -> Array:
         """Return the points X (N, 3) [m] that `apply` takes to ECEF points (N, 3) at rows (N,)."""
-        drift = Turn(self._turns(row))
-        back = rotation_matrix(self.rotation).T @ drift.back((ecef - self.center).T)
+        back = (ecef - self.center).T
+        if len(self.drift):
+            back = Turn(self._turns(row)).back(back)
+        back = rotation_matrix(self.rotation).T @ back
         return np.asarray(back.T / self.scale + self.translation + self.center)
 
     def _turns(self, row: Array) -> Array:
@@ -158,8 +161,7 @@ class Correction(Frozen):
 
 
 def correction_of(matrix: Array, at: Array) -> Correction:
-    """Return the correction of a camera after its ground was moved: it shows X where it showed X before the
-    motion.
+    """Return the correction of a camera whose ground was moved: it shows X where it showed X before the motion.
 
     Parameters
     ----------
@@ -196,8 +198,7 @@ class Corrected(Behind):
         return image, by_ecef @ ecef_from_ground_jacobian(ground)
 
     def project_ecef(self, ecef: Array) -> tuple[Array, Array, Array, Array]:
-        """Project ECEF points X (..., 3) [m] to image points (..., 2) [px], with the derivatives that the
-        adjustment needs.
+        """Project ECEF points X (..., 3) [m] to image points (..., 2) [px], with an adjustment's derivatives.
 
         d(image)/dX [px/m], d(image)/dR [px/rad], d(image)/dT [px/m], (..., 2, 3) each.
         """
@@ -223,62 +224,22 @@ class Corrected(Behind):
     def localize(self, image: Array, alt: Array) -> Array:
         """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
 
-        Newton on (lon, lat) from where the uncorrected sensor puts the point, with that sensor's derivative where the
-        point is moved to: a correction turns by so little that each step gains four digits. NaN where it does not
-        settle.
+        Where the uncorrected sensor sees them, brought back; at the altitude from which the correction brings them to
+        the one asked for. It turns by so little that each step gains four digits. NaN where that does not settle.
         """
-        ground, image = np.array(self.sensor.localize(image, alt)), np.asarray(image, dtype=np.float64)
-        row = image[..., 1] if len(self.correction.drift) else None  # where the point will be seen
-        rounding = 8 * np.finfo(float).eps * np.abs(image).max(axis=-1)
-        settled = False
-        with np.errstate(all="ignore"):
-            for _ in range(NEWTON_STEPS):
-                moved = ground_from_ecef(self.correction.apply(ecef_from_ground(ground), row))
-                value, jacobian = self.sensor.project_jacobian(moved)
-                residual = image - value
-                miss = np.abs(residual).max(axis=-1)
-                if settled:
-                    break
-                settled = not (miss > SETTLED).any()
-                a, b, c, d = (jacobian[..., i, j] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
-                det = a * d - b * c
-                ground[..., 0] += (d * residual[..., 0] - b * residual[..., 1]) / det
-                ground[..., 1] += (a * residual[..., 1] - c * residual[..., 0]) / det
-            ground[~(miss <= STANDS + rounding)] = np.nan
+        return pointwise(lambda *part: [self._localize(*part)], [(3,)], image, alt)[0]
+
+    def _localize(self, image: Array, alt: Array) -> Array:
+        before, settled = alt, False
+        for _ in range(NEWTON_STEPS):
+            found = self.sensor.localize(image, before)
+            ground = ground_from_ecef(self.correction.undo(ecef_from_ground(found), image[:, 1]))
+            off = alt - ground[:, 2]
+            if settled:
+                break
+            settled = not (np.abs(off) > SETTLED).any()
+            before = before + off
+        ground[~(np.abs(off) <= SETTLED)] = np.nan
+        ground[:, 2] = alt
+        ground[:, 0] = wrap_longitude(ground[:, 0], found[:, 0])
         return ground
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class ImageAffine(Frozen):
-    """An affine correction in the image: image + shift + slope @ image."""
-
-    shift: Array  # (2,): col, row [px]
-    slope: Array  # (2, 2): change of (col, row) by (col, row) [px/px]
-
-    def __post_init__(self) -> None:
-        self._array("shift", (2,), RpcError)
-        self._array("slope", (2, 2), RpcError)
-
-    def apply(self, image: Array) -> Array:
-        """Return the corrected image points (..., 2) [px]."""
-        return image @ (np.eye(2) + self.slope).T + self.shift
-
-    def linearised(self, image: Array) -> tuple[Array, Array]:
-        """Return the same, and the derivative (2, 2)."""
-        return self.apply(image), np.eye(2) + self.slope
-
-    def undo(self, image: Array) -> Array:
-        """Return the image points (..., 2) [px] without the correction."""
-        return (image - self.shift) @ np.linalg.inv(np.eye(2) + self.slope).T
-
-
-@dataclass(frozen=True)
-class ImageCorrected(Displaced):
-    """`sensor` with its image points corrected by an affine map; itself a `SensorModel`.
-
-    The bias corrections (shift, drift, affine) of Fraser and Hanley ("Bias compensation in rational functions for
-    Ikonos satellite imagery", 2003) and Grodecki and Dial ("Block adjustment of high-resolution satellite images
-    described by rational polynomials", 2003), for comparison with the correction in space.
-    """
-
-    correction: ImageAffine  # what is added to its image points

@@ -25,10 +25,9 @@ from barpc.base.geodesy import WGS84_A, WGS84_B, Array, ecef_from_ground, ground
 from barpc.base.sidefile import STATE, parse_json, read_text
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected
-from barpc.sensor.document import MOST_PIXELS, STRAIGHT, Fields
-from barpc.sensor.frame import Frame
-from barpc.sensor.linescan.samples import STEP, Detector, Samples, camera_of_samples, unit
-from barpc.sensor.pushbroom import Pushbroom
+from barpc.sensor.document import STRAIGHT, Fields, padded
+from barpc.sensor.linescan import STEP, Detector, Samples, camera_of_samples, unit
+from barpc.sensor.pushbroom import Frame, Pushbroom
 
 STATE_END = ".adjusted_state.json"
 """End of the name of a state, as ASP writes it."""
@@ -99,7 +98,7 @@ def open_state(path: Path) -> tuple[Pushbroom | Frame, tuple[int, int]]:
     axes = np.array([state.number("m_majorAxis"), state.number("m_minorAxis")])
     if not (np.abs(axes - (WGS84_A, WGS84_B)) < _EARTH).all():
         raise InputError(f"{path}: an ellipsoid of {axes[0]:g} and {axes[1]:g} m, which is not the Earth's")
-    return _READERS[model](state), state.size
+    return _READERS[model](state), state.image_size
 
 
 class _State(Fields):
@@ -116,9 +115,9 @@ class _State(Fields):
         return np.array(value, dtype=np.float64)
 
     @property
-    def size(self) -> tuple[int, int]:
+    def image_size(self) -> tuple[int, int]:
         """Width and height [px]."""
-        return int(self.positive("m_nSamples", MOST_PIXELS)), int(self.positive("m_nLines", MOST_PIXELS))
+        return self.size("m_nSamples", "m_nLines")
 
     def plane(self, origin: tuple[float, float]) -> Array:
         """Return (2, 3): detector's sample and line of CSM's (sample, line, 1) to the place in the focal plane."""
@@ -147,7 +146,7 @@ class _State(Fields):
 
 
 def _linescan(state: _State) -> Pushbroom:
-    size, name = state.size, state.name
+    size, name = state.image_size, state.name
     if np.any(state.numbers("m_currentParameterValue")):
         raise InputError(f"{name}: adjustable parameters that are not 0, which are not read")
     first, period = _lines(state)
@@ -172,7 +171,7 @@ def _lines(state: _State) -> tuple[float, float]:
         raise RpcFormatError(f"{state.name}: {len(line)} m_intTimeLines, {len(start)} times, {len(step)} steps")
     rows, period = line - 1.0, float(step[0])  # the centre of row r is line r + 0.5, half a line after its start
     first = float(start[0] - period * rows[0])
-    here = rows < state.size[1]
+    here = rows < state.image_size[1]
     bent = np.abs(start - first - period * rows)[here].max(initial=0.0)
     if not (period and bent <= STRAIGHT * abs(period) and (np.abs(step[here] / period - 1) < 1e-6).all()):
         raise RpcFormatError(f"{state.name}: the line rate changes, or is none, which is not read")
@@ -198,10 +197,9 @@ def _look(state: _State, width: int) -> tuple[Array, float]:
     at = [Polynomial([part[0] * (origin + 0.5) + part[2], part[0]]) for part in plane]  # of line 0 of the detector
     square = at[0] ** 2 + at[1] ** 2
     bend = 1.0 - Polynomial(state.distortion())(square)
-    parts = [(part * bend).coef for part in at]
-    look = np.stack([np.pad(part, (0, max(map(len, parts)) - len(part))) for part in parts])
+    look = padded((part * bend).coef for part in at)
     degree = max(1, int(np.flatnonzero(look.any(axis=0)).max(initial=1)))
-    return np.asarray(look[:, : degree + 1], np.float64), origin
+    return look[:, : degree + 1], origin
 
 
 def _frame(state: _State) -> Frame:
@@ -252,7 +250,7 @@ def state_text(model: SensorModel, size: tuple[int, int], alt_range: tuple[float
     last = base.line_period * (size[1] - 1)
     sides = np.array([[0.0, 0.0], [1.0, 0.0], [size[0] - 1.0, 0.0]])
     near = ecef_from_ground(model.localize(sides, np.full(3, float(np.mean(alt_range)))))
-    state = {
+    state: dict[str, Any] = {
         **_PLAIN,
         **_detector(base),
         "m_nSamples": size[0],
@@ -323,8 +321,4 @@ def _detector(base: Pushbroom) -> dict[str, Any]:
     focal = 1.0 / float(np.linalg.norm(slope))
     first = base.look @ np.array([1.0, -0.5 - base.look_origin])
     (x, y), (u, v) = focal * first * [-1.0, 1.0], focal * slope * [-1.0, 1.0]
-    return {
-        "m_focalLength": focal,
-        "m_iTransS": [-(u * x + v * y), u, v],
-        "m_iTransL": [v * x - u * y, -v, u],
-    }
+    return {"m_focalLength": focal, "m_iTransS": [-(u * x + v * y), u, v], "m_iTransL": [v * x - u * y, -v, u]}

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 EXTRAPOLATION = 1.0  # seconds beyond its knots that a curve is still believed
 MARGIN = 70.0  # state vectors so far before and after the image take part in the fit of an orbit [s]
 MIN_VECTORS = 4
-MIN_DEGREE, MAX_DEGREE = 5, 11
+DEGREES = range(5, 12)
 
 _TOLERANCE = 1.0  # m: state vectors that scatter more are not one orbit
 _UNSEEN = 1e-4  # m/s: at 900 km 1.6 us, the rounding of times and a thousandth of a line
@@ -108,9 +108,7 @@ class Curve(Frozen):
 
 
 def about_middle(rotations: Rotation) -> tuple[Array, Array]:
-    """Return the middle (3, 3) of N rotations and the rotation vectors (N, 3) [rad] of all relative to it, in
-    its axes.
-    """
+    """Return the middle (3, 3) of N rotations and the vectors (N, 3) [rad] of all from there, in its axes."""
     middle = rotations[len(rotations) // 2]
     return np.asarray(middle.as_matrix()), np.asarray((middle.inv() * rotations).as_rotvec())
 
@@ -143,9 +141,7 @@ def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[
 
 @dataclass(frozen=True, eq=False)
 class Orbit(Curve):
-    """The polynomial through an orbit's state vectors, and the velocity that they state where it is not its
-    derivative.
-    """
+    """The polynomial through state vectors, and the velocity that they state where it is not its derivative."""
 
     sigma: Array  # (3,): standard deviations of positions along and across the track [m], of velocities [m/s]
     stated: Array  # (K, 3): stated velocity less derivative [m/s], as a polynomial of the time from the first knot
@@ -166,8 +162,8 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
     (Sentinel-1: positions to 2e-6 m in auxiliary products and 2e-4 m in downlinked ones, velocities to 1e-5 and
     6e-3 m/s, and where the annotated times, whole microseconds, are not the true ones, positions ALONG the track
     to 3 mm only), so the standard deviations of positions along the track and across it and of velocities are
-    estimated along with the orbit, from the residuals. The degree is the lowest that no higher one (`MIN_DEGREE`
-    to `MAX_DEGREE`) betters by more than half in the residual ACROSS the track: about 5 for downlinked vectors, 6
+    estimated along with the orbit, from the residuals. The degree is the lowest of `DEGREES` that no higher one
+    betters by more than half in the residual ACROSS the track: about 5 for downlinked vectors, 6
     for auxiliary ones, more for a long span. Along the track a high degree would follow the rounding of the times.
 
     Velocities are those that are stated: of downlinked vectors not the derivatives of their positions, by 4 to 17 mm/s
@@ -199,8 +195,7 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
             f"orbit: the image lasts from {window[0]:.1f} to {window[1]:.1f} s, the state vectors from "
             f"{time[0]:.1f} to {time[-1]:.1f} s; give a precise orbit file that covers it"
         )
-    degrees = range(min(MIN_DEGREE, len(time)), min(MAX_DEGREE, len(time)) + 1)
-    fits = [_fit_orbit(time, position, velocity, degree) for degree in degrees]
+    fits = [_fit_orbit(time, position, velocity, degree) for degree in sorted({min(d, len(time)) for d in DEGREES})]
     limit = _GAIN * min(float(fit.sigma[1]) for fit in fits)
     orbit = next(fit for fit in fits if fit.sigma[1] <= limit)
     if not orbit.sigma[:2].max() <= _TOLERANCE:
@@ -235,9 +230,10 @@ def _fit_orbit(time: Array, position: Array, velocity: Array, degree: int) -> Or
         squares = np.array([((y - a @ solution) ** 2).sum() for a, y in groups])
         sigma = np.maximum(np.sqrt(squares / count), _DIGITS)
     series = solution.reshape(degree + 1, 3)
-    taylor = [
-        chebyshev.chebval(-1.0, chebyshev.chebder(series, k)) / (half**k * math.factorial(k)) for k in range(degree + 1)
-    ]
+    taylor, derivative = [], series
+    for k in range(degree + 1):
+        taylor.append(chebyshev.chebval(-1.0, derivative) / (half**k * math.factorial(k)))
+        derivative = chebyshev.chebder(derivative)
     lacking = velocity - chebyshev.chebval(x, chebyshev.chebder(series)).T / half
     quadratic = (time - time[0])[:, None] ** np.arange(3)
     stated = np.linalg.lstsq(quadratic, lacking, rcond=None)[0]
@@ -289,9 +285,7 @@ class Turn:
         return v - self._a * bent + self._b * twice, v - self._b * bent + self._c * twice
 
     def rate(self, v: Array) -> Array:
-        """Return the right Jacobian times v: exp([w + v]x) is exp([w]x) exp([rate]x) to first order in v
-        (..., 3, N).
-        """
+        """Return the right Jacobian times v (..., 3, N): to first order exp([w + v]x) is exp([w]x) exp([rate]x)."""
         bent = cross(self._w, v)
         return np.asarray(v - self._b * bent + self._c * cross(self._w, bent))
 
@@ -302,9 +296,7 @@ def rotation_matrix(rotation: npt.ArrayLike) -> Array:
 
 
 def rotation_left_jacobian(rotation: npt.ArrayLike) -> Array:
-    """Return the left Jacobians J (..., 3, 3) of rotation vectors (..., 3) [rad]: R(w + dw) = R(J dw) R(w) to
-    first order.
-    """
+    """Return the left Jacobians J (..., 3, 3) of vectors w (..., 3) [rad]: R(w + dw) is R(J dw) R(w) to first order."""
     return Turn(-np.asarray(rotation, dtype=np.float64)[..., None]).rate(np.eye(3))
 
 

@@ -88,9 +88,7 @@ class DirectGrid(Pointwise):
 
     @classmethod
     def from_points(cls, ground: npt.ArrayLike, image: npt.ArrayLike) -> DirectGrid:
-        """Return the grid whose nodes, ground (N, 3) and image (N, 2), are listed in any order; RpcError if
-        one is missing.
-        """
+        """Return the grid of nodes ground (N, 3), image (N, 2) in any order; RpcError if one is missing."""
         ground = np.asarray(ground, dtype=np.float64)
         image = np.asarray(image, dtype=np.float64)
         values = (ground[:, 2], image[:, 1], image[:, 0])
@@ -104,14 +102,9 @@ class DirectGrid(Pointwise):
 
     @classmethod
     def of(
-        cls,
-        model: SensorModel,
-        size: tuple[int, int],
-        alt_range: tuple[float, float],
-        tolerance: float = LINEAR,
+        cls, model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], tolerance: float = LINEAR
     ) -> DirectGrid:
-        """Return the grid of a camera from corner to corner of an image of `size` (width, height) and over
-        its altitudes.
+        """Return the grid of a camera over an image of `size` (width, height), corner to corner, and its altitudes.
 
         Linear interpolation between its nodes misses by no more than `tolerance` [px], unless that asks for
         millions of nodes. RpcError where the camera sees no ground.
@@ -120,7 +113,7 @@ class DirectGrid(Pointwise):
         high = np.array([size[0] - 0.5, size[1] - 0.5, alt_range[1]])
         middle = (low + high) / 2
         center = model.localize(middle[:2], middle[2])
-        to_px = np.linalg.inv(_slopes(model, middle)).T
+        to_px = model.project_jacobian(center)[1][:, :2].T
 
         def seen(points: Array) -> Array:
             """Return the ground points (..., 2) of points (..., 3) col, row, altitude, about in pixels."""
@@ -143,9 +136,7 @@ class DirectGrid(Pointwise):
         return image, np.stack([by_lon, by_lat, by_alt], axis=2)
 
     def _project(self, ground: Array) -> Array:
-        """Return the image points (N, 2) of ground points (N, 3): Newton from an inverse cubic, whose
-        derivatives mostly serve.
-        """
+        """Return the image points (N, 2) of points (N, 3): Newton by the derivatives of an inverse cubic, mostly."""
         target, alt = ground[:, :2].copy(), ground[:, 2]
         target[:, 0] = wrap_longitude(target[:, 0], self._lon) - self._lon
         with np.errstate(all="ignore"):
@@ -166,9 +157,7 @@ class DirectGrid(Pointwise):
         return image
 
     def _guess(self, lonlat: Array, alt: Array) -> tuple[Array, Array, Array]:
-        """Return the image points (N, 2) by the inverse cubic, brought back onto the grid, and their
-        derivatives by lon, lat.
-        """
+        """Return the image points (N, 2) of the inverse cubic, within the grid, and derivatives by lon, lat."""
         offset, scale, coeffs = self._inverse[0, :3], self._inverse[1, :3], self._inverse[2:, :2]
         basis = monomials(((np.column_stack([lonlat, alt]) - offset) / scale).T)
         image = basis.T @ coeffs
@@ -208,18 +197,10 @@ def _inverse_cubic(axes: tuple[Array, Array, Array], lonlat: Array) -> Array:
     return np.vstack([offset, scale, np.linalg.lstsq(basis, image, rcond=None)[0]])
 
 
-def _slopes(model: SensorModel, at: Array) -> Array:
-    """Return the derivative (2, 2) [deg/px] of lon, lat by col, row at a point (3,) col, row, altitude."""
-    steps = np.concatenate([np.eye(2), -np.eye(2)])
-    ground = model.localize(at[:2] + steps, np.full(4, at[2]))[:, :2]
-    return np.asarray((wrap_longitude(ground[:2] - ground[2:]) / 2).T)
-
-
 def linear_axes(
     value: Callable[[Array], Array], low: Array, high: Array, longest: Array, tolerance: float
 ) -> list[Array]:
-    """Return the nodes along each axis of a box `low`, `high` (d,), so dense that linear interpolation is
-    within a tolerance.
+    """Return the nodes along each axis of a box `low`, `high` (d,) for linear interpolation within a tolerance.
 
     The error along each axis is measured at random places of random cells, whose phase no wave can hide in.
 

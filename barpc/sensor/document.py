@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from itertools import zip_longest
 from typing import Any, Self, TypeVar
 from xml.etree.ElementTree import Element
 
 import numpy as np
+import numpy.typing as npt
 
 from barpc.base.errors import BarpcWarning, RpcFormatError
 from barpc.base.geodesy import FAR, Array
@@ -29,6 +31,11 @@ _TIME = re.compile(r"(UTC=)?(?P<time>20\d\d-\d\d-\d\d[T ]\d\d:\d\d:\d\d(\.\d{1,9
 def seconds(time: Any, epoch: np.datetime64) -> Any:
     """Return the seconds (float) from an epoch, exact to the nanosecond."""
     return (time - epoch) / np.timedelta64(1, "ns") * 1e-9
+
+
+def padded(rows: Iterable[npt.NDArray[Any] | list[float]]) -> Array:
+    """Return rows (k, N) of coefficients of any number, with zeros behind the shorter ones."""
+    return np.array([*zip_longest(*rows, fillvalue=0.0)], dtype=np.float64).T
 
 
 def parse_time(text: str, name: str) -> np.datetime64:
@@ -87,8 +94,7 @@ class Fields:
             raise RpcFormatError(f"{self.name}: {path} is not a list of numbers ({error})") from error
 
     def numbers(self, path: str, count: int | None = None, between: str = " ") -> Array:
-        """Return the finite numbers (N,) of a field; RpcFormatError where it is missing, holds others, or not
-        `count`.
+        """Return the finite numbers (N,) of a field; RpcFormatError where there are none, or not `count`.
 
         `between` is a character that may separate them, beside blanks.
         """
@@ -109,6 +115,10 @@ class Fields:
     def number(self, path: str) -> float:
         """Return the only number of a field."""
         return float(self.numbers(path, 1)[0])
+
+    def size(self, cols: str, rows: str) -> tuple[int, int]:
+        """Return the width and height [px] of an image."""
+        return int(self.positive(cols, MOST_PIXELS)), int(self.positive(rows, MOST_PIXELS))
 
     def positive(self, path: str, most: float = FAR) -> float:
         """Return the first number of a field; RpcFormatError where it is not above 0 and at most `most`."""

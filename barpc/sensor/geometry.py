@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeGuard
 
@@ -10,17 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import RpcError
-from barpc.base.geodesy import (
-    Array,
-    ecef_from_ground,
-    enu_basis,
-    ground_from_ecef,
-    metres_per_unit,
-    wrap_longitude,
-)
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit, wrap_longitude
 from barpc.sensor import SensorModel
-from barpc.sensor.rpc import RPC
-from barpc.sensor.stack import localize_stack
+from barpc.sensor.rpc import RPC, localize_stack
 from barpc.sensor.timing import Clocked
 
 BoolArray = npt.NDArray[np.bool_]
@@ -29,8 +21,7 @@ CenterMethod = Literal["line", "projective", "nominal", "stated"]
 _Rows = list[tuple[SensorModel, slice]]  # the observations of each camera
 
 _RAYS = 41  # of a line
-_LEAST_APART = 100.0  # m: altitudes between which a ray is drawn
-_REGRESSED = 10  # points along col, row and altitude
+LEAST_RANGE = 100.0  # of altitudes [m] between which a ray is drawn, or that an RPC is made for
 NOMINAL_ALTITUDE = 650e3  # orbit altitude [m] assumed where a model does not tell its own
 PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this range [m] is not believed
 
@@ -57,9 +48,7 @@ def image_border(size: tuple[int, int], per_side: int = 8) -> Array:
 def image_grid(
     size: tuple[int, int], alt_range: tuple[float, float], nodes: tuple[int, int] = (11, 5)
 ) -> tuple[Array, Array]:
-    """Return the image points (N, 2) [px] and altitudes (N,) [m] on a grid over an image and its altitudes,
-    columns slowest.
-    """
+    """Return the image points (N, 2) [px] and altitudes (N,) [m] of a grid over an image, columns slowest."""
     col, row = (np.linspace(0, side - 1, nodes[0]) for side in size)
     grid = np.stack(np.meshgrid(col, row, np.linspace(*alt_range, nodes[1]), indexing="ij"), axis=-1)
     return grid[..., :2].reshape(-1, 2), grid[..., 2].ravel()
@@ -99,16 +88,14 @@ def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, fl
     """
     image = np.asarray(image, dtype=np.float64)
     alt = np.empty((2, *image.shape[:-1]))
-    alt[0], alt[1] = alt_range[0], max(alt_range[1], alt_range[0] + _LEAST_APART)
+    alt[0], alt[1] = alt_range[0], max(alt_range[1], alt_range[0] + LEAST_RANGE)
     origin, end = ecef_from_ground(sensor.localize(np.broadcast_to(image, (2, *image.shape)), alt))
     direction = end - origin
     return origin, direction / np.linalg.norm(direction, axis=-1, keepdims=True)
 
 
 def sight_enu(sensor: SensorModel, ground: Array) -> Array:
-    """Return the unit vectors (..., 3) east, north, up along the lines of sight from ground points (..., 3)
-    to the sensor.
-    """
+    """Return the unit vectors (..., 3) east, north, up from ground points (..., 3) along the rays to the sensor."""
     ground = np.asarray(ground, dtype=np.float64)
     _, jacobian = sensor.project_jacobian(ground)
     metric = jacobian / metres_per_unit(ground)[..., None, :]
@@ -163,8 +150,7 @@ def convergence_angle(sensor_a: SensorModel, sensor_b: SensorModel, ground: Arra
 
 
 def base_to_height(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) -> Array:
-    """Return B/H (...) of two cameras at ground points (..., 3): metres of parallax on level ground a metre
-    of height.
+    """Return B/H (...) of two cameras at ground points (..., 3): metres of parallax a metre of height.
 
     abs(t_a - t_b), t = (east, north) / up of a line of sight: the distance of the two cameras at the height 1. The
     textbook's 2 tan(angle / 2) is that only where the vertical halves the angle: of two cameras on one side of it,
@@ -187,32 +173,26 @@ class Several:
         self._parts = [(sensors[of_row[rows[0]]], rows) for rows in np.split(order, starts)[1:]]
 
     def each(self, function: Callable[[SensorModel, Array], Array], ground: Array) -> Array:
-        """Return what a function of a camera and ground points gives for ground points (N, 3), each with its
-        own camera.
-        """
-        found = np.empty((len(ground), 3))
-        for sensor, rows in self._parts:
-            found[rows] = function(sensor, ground[rows])
-        return found
+        """Return what a function gives for ground points (N, 3), each with its own camera."""
+        return self._of(lambda sensor, part: [function(sensor, part)], [(3,)], ground)[0]
 
     def project(self, ground: Array) -> Array:
         """Project ground points (N, 3) [deg, deg, m] to image points (N, 2) [px]."""
-        return self._of("project", [(2,)], ground)[0]
+        return self._of(lambda sensor, part: [sensor.project(part)], [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Return image points (N, 2) [px] and their derivatives (N, 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = self._of("project_jacobian", [(2,), (2, 3)], ground)
+        image, jacobian = self._of(lambda sensor, part: sensor.project_jacobian(part), [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Localise image points (N, 2) [px] at altitudes (N,) [m]: ground points (N, 3)."""
-        return self._of("localize", [(3,)], image, alt)[0]
+        return self._of(lambda sensor, *part: [sensor.localize(*part)], [(3,)], image, alt)[0]
 
-    def _of(self, name: str, shapes: list[tuple[int, ...]], *given: Array) -> list[Array]:
+    def _of(self, ask: Callable[..., Iterable[Array]], shapes: list[tuple[int, ...]], *given: Array) -> list[Array]:
         out = [np.empty((len(given[0]), *shape)) for shape in shapes]
         for sensor, rows in self._parts:
-            found = getattr(sensor, name)(*(array[rows] for array in given))
-            for whole, part in zip(out, found if len(out) > 1 else [found], strict=True):
+            for whole, part in zip(out, ask(sensor, *(array[rows] for array in given)), strict=True):
                 whole[rows] = part
         return out
 
@@ -290,9 +270,7 @@ def _center_stated(sensor: Clocked, size: tuple[int, int], alt_range: tuple[floa
 
 
 def _centers_of_lines(
-    sensors: Sequence[SensorModel],
-    sizes: Sequence[tuple[int, int]],
-    alt_ranges: Sequence[tuple[float, float]],
+    sensors: Sequence[SensorModel], sizes: Sequence[tuple[int, int]], alt_ranges: Sequence[tuple[float, float]]
 ) -> Array:
     """Return the points (N, 3) nearest to the rays of every camera's middle line; NaN where one has none."""
     side, ends = np.array(sizes, dtype=np.float64).reshape(-1, 2) - 1.0, np.array(alt_ranges).reshape(-1, 2)
@@ -300,7 +278,7 @@ def _centers_of_lines(
     image = np.empty((n, 2, m, 2))
     image[..., 0] = side[:, :1, None] * np.linspace(0.0, 1.0, m)
     image[..., 1] = side[:, 1:, None] / 2.0
-    alt = np.repeat(np.column_stack([ends[:, 0], np.maximum(ends[:, 1], ends[:, 0] + _LEAST_APART)]), m)
+    alt = np.repeat(np.column_stack([ends[:, 0], np.maximum(ends[:, 1], ends[:, 0] + LEAST_RANGE)]), m)
     ground = localize_stack(sensors, image.reshape(-1, 2), alt, 2 * m * np.arange(n + 1))
     origin, end = ecef_from_ground(ground).reshape(n, 2, m, 3).swapaxes(0, 1)
     direction = end - origin
@@ -317,13 +295,9 @@ def _centers_of_lines(
 
 
 def _center_projective(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
-    """Return the centre (3,) of the 3 x 4 matrix that takes ground points to image points: its null space
-    (Hartley, DLT).
-    """
-    ends = np.linspace(0.0, 1.0, _REGRESSED)
-    unit = np.stack(np.meshgrid(ends, ends, ends), axis=-1).reshape(-1, 3)
-    image, low = unit[:, :2] * (np.array(size) - 1.0), alt_range[0]
-    ecef = ecef_from_ground(sensor.localize(image, low + unit[:, 2] * (alt_range[1] - low)))
+    """Return the centre (3,) of the matrix (3, 4) from ground to image points: its null space (Hartley, DLT)."""
+    image, alt = image_grid(size, alt_range)
+    ecef = ecef_from_ground(sensor.localize(image, alt))
     if not np.isfinite(ecef).all():
         return np.full(3, np.nan)
     middle, spread = ecef.mean(axis=0), float(ecef.std())
@@ -448,9 +422,7 @@ def triangulate(
 def _intersect(
     rows: _Rows, point: IntArray, xy: Array, weight: Array, alt: Array, steps: int
 ) -> tuple[Array, BoolArray]:
-    """Return Gauss-Newton on metres east, north, up from where a view sees a track at `alt`: ground (P, 3),
-    if possible.
-    """
+    """Return ground points (P, 3) by Gauss-Newton from where a view sees a track at `alt`, and if there are any."""
     ground = np.full((len(alt), 3), np.nan)
     for sensor, part in rows:
         new = np.flatnonzero(np.isnan(ground[point[part], 0])) + part.start

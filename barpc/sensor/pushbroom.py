@@ -1,6 +1,6 @@
-"""The rigorous pushbroom camera: orbit, attitude, detector line of sight and line time.
+"""Rigorous cameras: pushbroom, by orbit, attitude, detector line of sight and line time, and frame.
 
-A line of the image is taken at one instant. At time t the camera stands at O(t) and its axes in ECEF are
+A line of a pushbroom image is taken at one instant. At time t the camera stands at O(t) and its axes in ECEF are
 A(t) = mount exp([w(t)]x), x along the scan, y along the detector line, z towards the ground. Column c looks
 along A(t) (l_x(c), l_y(c), 1), l being two polynomials of the column. A ground point X is seen at (t, c) with
 
@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+from numpy.polynomial.polynomial import polyder, polyval
 
 from barpc.base.errors import RpcError
 from barpc.base.geodesy import (
@@ -54,9 +55,7 @@ class Light:
     refraction: bool = False
 
     def seen(self, ecef: Array, origin: Array, velocity: Array) -> Array:
-        """Return the apparent directions (3, N) [m] of points (3, N) seen from places (3, N) at velocities
-        (3, N), ECEF.
-        """
+        """Return the apparent directions (3, N) [m] of points from places at velocities (3, N), ECEF."""
         sight = ecef - origin
         if self.refraction:
             sight = sight + self._lift(ecef, sight)[0]
@@ -65,9 +64,7 @@ class Light:
         return sight
 
     def by_point(self, gradient: Array, ecef: Array, origin: Array, velocity: Array) -> Array:
-        """Return derivatives (3, N) by the ground points, from the `gradient` (3, N) by the apparent
-        directions, to 1e-6.
-        """
+        """Return derivatives (3, N) by ground points from those by apparent directions, `gradient`, to 1e-6."""
         sight = ecef - origin
         out = gradient
         if self.aberration:
@@ -95,6 +92,11 @@ def _drag(sight: Array, velocity: Array) -> Array:
 
 
 STRAIGHT = Light()
+
+
+def _check_rotation(matrix: Array, what: str) -> None:
+    if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-9 or np.linalg.det(matrix) < 0:
+        raise RpcError(f"{what} is not a rotation matrix")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -146,8 +148,7 @@ class Pushbroom(Pointwise):
             raise RpcError("pushbroom: all numbers must be finite")
         if self.line_period == 0:
             raise RpcError("pushbroom: a line period of zero")
-        if np.abs(self.mount @ self.mount.T - np.eye(3)).max() > 1e-9 or np.linalg.det(self.mount) < 0:
-            raise RpcError("pushbroom: mount is not a rotation matrix")
+        _check_rotation(self.mount, "pushbroom: mount")
         if not self._span[1] - self._span[0] > 2 * EXTRAPOLATION:
             raise RpcError("pushbroom: orbit and attitude share no time")
 
@@ -185,9 +186,7 @@ class Pushbroom(Pointwise):
         return self._solve(ecef_from_ground(ground).T).T
 
     def line_of_sight(self, image: Array) -> tuple[Array, Array]:
-        """Return the camera centres [m] and unit directions of sight, (..., 3) in ECEF, of image points (...,
-        2) [px].
-        """
+        """Return the camera centres [m] and unit directions of sight (..., 3), ECEF, of image points (..., 2)."""
         image = np.asarray(image, dtype=np.float64)
         origin, direction = self._rays(image.reshape(-1, 2))
         return origin.T.reshape(*image.shape[:-1], 3), direction.T.reshape(*image.shape[:-1], 3)
@@ -282,3 +281,84 @@ class Pushbroom(Pointwise):
         row = (slope[1] * by_x - slope[0] * by_y) / det / self.line_period
         col = (rate[1] * by_x - rate[0] * by_y) / det
         return np.moveaxis(np.stack([col, row]), 2, 0)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Frame(Pointwise):
+    """A frame camera, one instant, one projective centre, radial distortion: itself a `SensorModel`.
+
+    A ground point X is seen along p = R^T (X - C), C the centre and R = ecef_from_camera, under the tangents
+    u = p_xy / p_z. A pixel lies at the place d = A (col, row, 1) of the focal plane, in focal lengths, and there
+    u = d (1 - k(|d|^2)).
+
+    Parameters
+    ----------
+    center : (3,), projective centre [m], ECEF
+    rotation : (3, 3), ecef_from_camera: columns are the camera's x, y and z, z towards the ground
+    plane : (2, 3), (col, row, 1) [px] to the place in the focal plane, in focal lengths
+    distortion : (K,), k as a polynomial of the squared distance from the axis, ascending powers
+
+    Raises
+    ------
+    RpcError
+        A wrong shape, a value that is not finite, a `rotation` that is none, a `plane` without area.
+    """
+
+    center: Array
+    rotation: Array
+    plane: Array
+    distortion: Array
+
+    def __post_init__(self) -> None:
+        for name, *shape in (("center", 3), ("rotation", 3, 3), ("plane", 2, 3), ("distortion", None)):
+            self._array(name, tuple(shape), RpcError)
+        _check_rotation(self.rotation, "frame camera: rotation")
+        if not abs(np.linalg.det(self.plane[:, :2])) > 0:
+            raise RpcError("frame camera: plane has no area")
+
+    def _project(self, ground: Array) -> Array:
+        return self._seen(ecef_from_ground(ground).T)[0].T
+
+    def _localize(self, image: Array, alt: Array) -> Array:
+        at = self.plane @ np.vstack([image.T, np.ones(len(image))])
+        tangents = at * (1.0 - polyval((at**2).sum(axis=0), self.distortion))
+        ray = self.rotation @ np.vstack([tangents, np.ones(len(image))])
+        origin = np.broadcast_to(self.center[:, None], ray.shape)
+        ground = reach(origin, ray / np.sqrt((ray * ray).sum(axis=0)), alt)
+        ground[:, 0] = wrap_longitude(ground[:, 0], float(ground_from_ecef(self.center)[0]))
+        return ground
+
+    def _seen(self, ecef: Array) -> tuple[Array, Array, Array]:
+        """Return image points (2, N), places in the focal plane (2, N), vectors in the camera (3, N)."""
+        p = self.rotation.T @ (ecef - self.center[:, None])
+        tangents = p[:2] / np.where(p[2] > 0, p[2], np.nan)
+        at = tangents * self._farther(np.sqrt((tangents**2).sum(axis=0)))
+        return np.asarray(np.linalg.solve(self.plane[:, :2], at - self.plane[:, 2:]), np.float64), at, p
+
+    def _farther(self, radius: Array) -> Array:
+        """Return how much (N,) farther out than its tangents a place in the focal plane is; NaN if nowhere."""
+        slope, found = polyder(self.distortion), radius
+        settled = SETTLED * float(np.abs(self.plane[:, :2]).max())  # focal lengths
+        step = np.zeros_like(radius)
+        for _ in range(NEWTON_STEPS):
+            square = found**2
+            left = found * (1.0 - polyval(square, self.distortion)) - radius
+            rate = 1.0 - polyval(square, self.distortion) - 2.0 * square * polyval(square, slope)
+            step = left / np.where(rate > 0, rate, np.nan)
+            found = found - step
+            if not (np.abs(step) > settled).any():
+                break
+        found = np.where(np.abs(step) <= settled, found, np.nan)
+        return np.asarray(found / np.where(radius > 0, radius, 1.0))  # in the middle any factor is right
+
+    def _derivatives(self, ground: Array) -> tuple[Array, ...]:
+        image, at, p = self._seen(ecef_from_ground(ground).T)
+        square = (at**2).sum(axis=0)
+        size = 1.0 - polyval(square, self.distortion)
+        bend = -2.0 * polyval(square, polyder(self.distortion))
+        by_place = size * np.eye(2)[:, :, None] + bend * at[:, None] * at[None]  # d tangent / d place (2, 2, N)
+        tangents = p[:2] / p[2]
+        rows = np.stack([self.rotation[:, k, None] - tangents[k] * self.rotation[:, 2, None] for k in range(2)]) / p[2]
+        by_image = np.einsum("ijn,jk->nik", by_place, self.plane[:, :2])
+        jacobian = np.linalg.solve(by_image, np.moveaxis(rows, 2, 0)) @ ecef_from_ground_jacobian(ground)
+        return image.T, jacobian

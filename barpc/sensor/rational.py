@@ -23,6 +23,8 @@ MONOMIALS = (
     "PLH", "LLL", "LPP", "LHH", "LLP", "PPP", "PHH", "LLH", "PPH", "HHH",
 )  # fmt: skip
 """The twenty monomials in RPC00B order; L = longitude, P = latitude, H = altitude, normalised."""
+POWERS = np.array([[monomial.count(letter) for letter in "LPH"] for monomial in MONOMIALS])
+"""Powers (20, 3) of L, P and H in them."""
 
 REACH = 1.25  # the cubic inverse is trusted this far out of the box; what lies beyond is solved with care
 
@@ -34,8 +36,7 @@ def _derivative_matrices() -> Array:
     out = np.zeros((3, 20, 10))
     for axis, letter in enumerate("LPH"):
         for i, monomial in enumerate(MONOMIALS):
-            power = monomial.count(letter)
-            if power:
+            if power := POWERS[i, axis]:
                 out[axis, i, index["".join(sorted(monomial.replace(letter, "", 1)))]] = power
     return out
 
@@ -97,8 +98,7 @@ class Rational:
         return value, out
 
     def solve(self, target: Array, z: Array, work: Array | None = None) -> tuple[Array, BoolArray]:
-        """Return the inverse: points (3, N) whose third variable is `z` (N,) and whose values are `target`
-        (2, N).
+        """Return the points (3, N) whose third variable is `z` (N,) and whose values are `target` (2, N).
 
         The cubic inverse and one Newton step; one more where that was too long to prove it enough; then, and out
         of the box, damped Newton from the centre and a check of value, denominators and orientation. The second result
@@ -187,9 +187,7 @@ class Rational:
         return ok
 
     def _damped_newton(self, target: Array, x: Array, steps: int = 60) -> Array:
-        """Iterate damped Newton steps on `x[:2]`, halved until the error falls, never across a pole; return
-        the error (2, N) left.
-        """
+        """Step `x[:2]` by Newton, halved until errors fall, never across a pole; return what is left (2, N)."""
         left = np.full(target.shape, np.inf)
         active = np.arange(target.shape[1])
         sign = np.sign(self.coeffs[1::2, :1])

@@ -18,7 +18,7 @@ from numpy.polynomial.polynomial import polyval
 from barpc.base.errors import BarpcWarning, InputError, RpcError, RpcFormatError
 from barpc.base.sidefile import parse_xml
 from barpc.sensor.curve import fit_orbit
-from barpc.sensor.document import MOST_PIXELS, RELIEF_AROUND, Fields, seconds, warn_off_grid
+from barpc.sensor.document import RELIEF_AROUND, Fields, seconds, warn_off_grid
 from barpc.sensor.sentinel1.frames import SlantFrame
 from barpc.sensor.sentinel1.range_doppler import RELIEF, RangeDoppler
 
@@ -91,7 +91,7 @@ def _refuse(root: Fields) -> None:
 def _model(root: Fields, late: tuple[float, float]) -> RangeDoppler:
     """Return the model whose times of range and azimuth are later [s] than geometry has them."""
     scene, raster = root.one("productInfo/sceneInfo"), root.one("productInfo/imageDataInfo/imageRaster")
-    size = (int(raster.positive("numberOfColumns", MOST_PIXELS)), int(raster.positive("numberOfRows", MOST_PIXELS)))
+    size = raster.size("numberOfColumns", "numberOfRows")
     start, near = scene.time("start/timeUTC"), scene.positive("rangeTime/firstPixel", 1.0)
     spans = (scene.positive("rangeTime/lastPixel", 1.0) - near, seconds(scene.time("stop/timeUTC"), start))
     steps = [raster.positive(f"{along}Spacing", 1.0) for along in ("row", "column")]  # from column to column

@@ -154,9 +154,7 @@ class Clocked(Pointwise, ABC):
         return ground
 
     def to_radar(self, ground: Array) -> Array:
-        """Return the vectors (..., 3) [m], ECEF, from ground points (..., 3) to the radar that sees them; NaN as
-        `project`.
-        """
+        """Return the vectors (..., 3) [m], ECEF, from points (..., 3) to the radar; NaN as `project`."""
         return pointwise(lambda part: [self._to_radar(part)], [(3,)], ground)[0]
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
@@ -176,9 +174,7 @@ class Clocked(Pointwise, ABC):
 
 
 def is_clocked(sensor: SensorModel) -> TypeGuard[Clocked]:
-    """Return whether a model is a radar whose clocks can be corrected: asking the protocol itself costs 70 us
-    a view.
-    """
+    """Return whether a model is a radar whose clocks can be corrected: 70 us faster than by the protocol."""
     return hasattr(sensor, "timed")
 
 
@@ -206,8 +202,6 @@ class Timed(Behind):
         return self._model.localize(image, alt)
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Return the image points (..., 2) [px], and their derivative by range and azimuth time (..., 2, 2)
-        [px/m, px/s].
-        """
+        """Return image points (..., 2) [px] and their derivative (..., 2, 2) by range and azimuth time."""
         image, _, by_timing, _ = self._model.timing_jacobian(ground)
         return image, by_timing

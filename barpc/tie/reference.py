@@ -277,7 +277,7 @@ class _Work:
             view_of, point, xy, xy_sigma = (np.concatenate(column) for column in zip(*rows, strict=True))
             used, closed = np.unique(point, return_inverse=True)
             shown = [r.heights for r in reports if r.points and r.shows_heights(accuracy.height)]
-            height, bias = max(accuracy.height, *shown, 0.0), max(accuracy.heights, *shown, 0.0)
+            height, bias = max([accuracy.height, *shown]), max([accuracy.heights, *shown])
             single = np.tile([0.1 * self.step, 0.1 * self.step, height], (len(used), 1))
             ground = np.column_stack([places[used], heights[used]])
             names = tuple(f"reference_{n}" for n in used)

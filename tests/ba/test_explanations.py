@@ -32,7 +32,7 @@ from barpc.ba.judging.explanations import (
     sharpened,
 )
 from barpc.ba.judging.judge import Finding
-from barpc.sensor.splined import profile
+from barpc.sensor.displaced import profile
 
 SIZE = np.array([[400.0, 500.0], [1000.0, 2000.0]])  # of two images, columns and rows
 

@@ -14,7 +14,7 @@ from barpc.ba.held.incremental import BlockPrior
 from barpc.ba.result import block_prior
 from barpc.base.errors import InputError
 from barpc.fit import fit_rpc
-from barpc.sensor.splined import Splined
+from barpc.sensor.displaced import Splined
 from benchmarks.referee import cases, judge, make, solve
 from tests.ba.test_referee import hills
 from tests.lanes import rest_slow

@@ -12,8 +12,8 @@ import pytest
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.ba.judging.explanations import FADE, LOCAL, SETTLING, STRIP, SWING, WANDER
 from barpc.scene import Tracks
+from barpc.sensor.displaced import Splined
 from barpc.sensor.geometry import triangulate
-from barpc.sensor.splined import Splined
 from barpc.simulate import Block, simulate_block
 from tests.lanes import rest_slow
 

@@ -20,7 +20,7 @@ from barpc.ba.robust.rounds import Outcome
 from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.scene import GroundPoints, Tracks
-from barpc.sensor.corrected import ImageAffine, ImageCorrected
+from barpc.sensor.displaced import ImageAffine, ImageCorrected
 from barpc.sensor.geometry import triangulate
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import centers_of, solve

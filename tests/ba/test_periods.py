@@ -83,17 +83,17 @@ def test_the_spectrum_is_half_of_what_least_squares_take_away() -> None:
     """A cosine and a sine in both coordinates, in units in which noise scatters alike, at places of whole bins."""
     rng = np.random.default_rng(3)
     rows, n = 1200.0, 400
-    row = rng.integers(0, 300, n) * 4.0 + 1.0
+    row = rng.integers(0, 150, n) * 8.0 + 1.0
     right, off = rng.uniform(0.3, 1.0, n), rng.normal(size=(2, n)) * [[1.0], [2.0]]
     off[1] += 0.5 * off[0] + 0.8 * np.sin(row / 30.0)
     one = periods._Rows(row, rows, right, off)
     found = one._spectrum(off)
-    assert len(found) == 300  # of 37.5 waves
+    assert len(found) == 150  # of 37.5 waves
     centred = off - (off @ right / right.sum())[:, None]
     noise = (centred * right) @ (centred * right).T / right.sum()
     white = np.linalg.solve(np.linalg.cholesky(noise), centred)
     for k in (5, 12, 31):
-        phase = 2.0 * np.pi * (k / 8) * np.floor(row / 4.0) / 300
+        phase = 2.0 * np.pi * (k / 4) * np.floor(row / 8.0) / 150
         basis = np.stack([np.cos(phase), np.sin(phase)])
         pull = (basis * right) @ white.T
         taken = np.einsum("ic,ij,jc->", pull, np.linalg.inv((basis * right) @ basis.T), pull)

@@ -8,7 +8,7 @@ import pytest
 from barpc.ba.algebra.structure import make_structure
 from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.robust.smooth import SPLINES, Smooth, SmoothTest
-from barpc.sensor.splined import bsplines
+from barpc.sensor.displaced import bsplines
 from tests import distributions as stats
 
 SIZE = (10000, 20000)

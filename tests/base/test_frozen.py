@@ -15,9 +15,10 @@ from barpc.base.frozen import Frozen
 from barpc.cameras import Camera
 from barpc.fit import Normalization, fit_rpc
 from barpc.scene import GroundPoints, Tracks, View
-from barpc.sensor.corrected import Corrected, Correction, ImageAffine
+from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.curve import Curve
 from barpc.sensor.direct_grid import DirectGrid
+from barpc.sensor.displaced import ImageAffine
 from barpc.sensor.rpc import RPC
 from barpc.simulate import Look, fly
 

@@ -17,7 +17,7 @@ from barpc.base.errors import InputError, OutputError
 from barpc.cameras import Camera, open_camera
 from barpc.cli import convert as module
 from barpc.cli.convert import _check, _shadow_reasons, _tell, _window, box_of, check_target, window_of
-from barpc.fit.certificate import Sample
+from barpc.fit.points import Sample
 from barpc.pipeline.handoff import Reading
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from tests.cli.test_main import run

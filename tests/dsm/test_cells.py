@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
-from barpc.dsm import stereo
-from barpc.dsm.cells import Tile, gathered
+from barpc.dsm import cells, stereo
+from barpc.dsm.cells import NODES, Tile, gathered
 from barpc.dsm.stereo import CameraErrors
 from barpc.dsm.surface import Grid
 
@@ -23,14 +23,14 @@ def test_places_among_cells_are_those_of_the_map(code: int, west: float) -> None
     tile = Tile(CRS.from_epsg(code).to_wkt(), west, 4_900_000.0, 2.0, (500, 400), (0.0, 1.0))
     rng = np.random.default_rng(0)
     to_lonlat = Transformer.from_crs(code, 4326, always_xy=True)
-    cells = rng.integers(0, [500, 400], (50, 2))
+    picked = rng.integers(0, [500, 400], (50, 2))
     for inside in (np.full((50, 2), 5e-6), np.full((50, 2), 1.0 - 5e-6), rng.uniform(0.0, 1.0, (50, 2))):
-        at = cells + inside
+        at = picked + inside
         lon, lat = to_lonlat.transform(west + 2.0 * at[:, 0], 4_900_000.0 - 2.0 * at[:, 1])
         for turn in (0.0, 360.0, -360.0):
             found = gathered(tile, np.column_stack([lon + turn, lat, np.full(50, 7.0)]), np.ones(50))
-            assert set(map(tuple, np.argwhere(found[0] == 7.0)[:, ::-1])) == set(map(tuple, cells))
-            assert np.isfinite(found[1]).sum() == len(set(map(tuple, cells)))
+            assert set(map(tuple, np.argwhere(found[0] == 7.0)[:, ::-1])) == set(map(tuple, picked))
+            assert np.isfinite(found[1]).sum() == len(set(map(tuple, picked)))
     x, y = west + 2.0 * (np.arange(500) + 0.5), 4_900_000.0 - 2.0 * (np.arange(400) + 0.5)
     middles = np.column_stack(to_lonlat.transform(*(part.ravel() for part in np.meshgrid(x, y))))
     apart = tile.nodes(tile.size, 0.5) - middles
@@ -65,3 +65,49 @@ def test_what_all_cells_share_is_a_mean_over_all_tiles(count: int, monkeypatch: 
     np.testing.assert_allclose(minus[:, 1], [mean / 2, mean / 2, 0.0, -mean / 2, -mean / 2])
     none: Any = SimpleNamespace(block=SimpleNamespace(errors=None))
     assert Grid.shared(none).shape == (0,)
+
+
+def test_the_cameras_share_is_that_of_each_cells_centre() -> None:
+    """Of pairs that see some of the cells: what is asked at the nodes, corner to corner, is read at the middle of a
+    cell; columns to the east, rows to the south.
+    """
+    tile = Tile(CRS.from_epsg(32631).to_wkt(), 450_000.0, 4_900_000.0, 2.0, (8, 6), (0.0, 1.0))
+    east, south = (part.ravel() for part in np.meshgrid(np.linspace(0.0, 8.0, NODES), np.linspace(0.0, 6.0, NODES)))
+
+    def rows(chosen: Any, ground: np.ndarray) -> np.ndarray:
+        assert len(ground) == NODES**2
+        return 10.0 * len(chosen[0]) + east + 100.0 * south
+
+    made: Any = SimpleNamespace(block=SimpleNamespace(errors=SimpleNamespace(rows=rows, sigma=np.asarray)))
+    height, seen = np.full((6, 8), 5.0, np.float32), np.full((6, 8), 3.0, np.float32)
+    seen[:2], height[5, 3] = 1.0, np.nan
+    found = Grid._bands(made, tile, [[(0, 1), (0, 2)]], [(height, height, 4.0 * np.ones((6, 8)), seen)], np.array(7.0))
+    row, col = np.mgrid[:6, :8] + 0.5
+    expected = np.where(row < 2, 10.0, 20.0) + col + 100.0 * row - 7.0
+    expected[5, 3] = np.nan
+    np.testing.assert_allclose(found[4], expected, atol=1e-4)
+    np.testing.assert_array_equal(found[1][:5], np.where(row < 2, 1.0, 2.0)[:5])
+    np.testing.assert_allclose(found[3][:5], np.where(row < 2, 4.0, 4.0 / np.sqrt(2.0))[:5])
+
+
+def test_coarser_pictures_are_framed_by_the_middles_of_their_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Places of the first look are those of the images, of a picture of means of 4 px a side (x + 0.5) / 4 - 0.5."""
+    tile = Tile(CRS.from_epsg(32631).to_wkt(), 450_000.0, 4_900_000.0, 2.0, (8, 6), (100.0, 300.0))
+    asked: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    sizes: list[Any] = []
+
+    def framed(a: np.ndarray, b: np.ndarray, alt: np.ndarray) -> Any:
+        asked.append((a, b, alt))
+        return SimpleNamespace(num=2 * 128 * 4 - 1, across=0.0)
+
+    monkeypatch.setattr(cells, "epipolar_frame", framed)
+    monkeypatch.setattr(cells, "dense_matches", lambda paths, size, frame, band: sizes.append(size))
+    project = [lambda ground, k=k: (1 + k) * ground[:, :2] + ground[:, 2:] for k in range(2)]
+    pair: Any = [SimpleNamespace(sensor=SimpleNamespace(project=one), size=(403, 80), path="") for one in project]
+    assert cells._points(pair, tile, 1) == []
+    ground = np.column_stack([np.tile(tile.nodes(), (3, 1)), np.repeat([100.0, 200.0, 300.0], NODES**2)])
+    for (*seen, alt), side in zip(asked, (1, 4), strict=True):
+        for found, one in zip(seen, project, strict=True):
+            np.testing.assert_allclose(found, (one(ground) + 0.5) / side - 0.5)
+        np.testing.assert_array_equal(alt, ground[:, 2])
+    assert sizes == [[(100, 20), (100, 20)]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
@@ -14,7 +13,7 @@ from barpc.dsm.stereo import CameraErrors
 from barpc.scene import View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center, triangulate
-from barpc.tie.patches.dense import _LEFT, _SLOPE, FINER, WINDOW, epipolar_frame
+from barpc.tie.patches.dense import WINDOW, epipolar_frame
 from tests.dsm.conftest import ALTS
 
 
@@ -111,18 +110,6 @@ def test_a_slope_to_the_light_is_bright_and_one_away_from_it_dark_and_the_unknow
     height[:, :4] = 1.0
     assert (shaded(height, 1.0)[:, 4:] == 0).all()
     assert (shaded(height, 1.0)[:, :3] > 0).all()
-
-
-def test_what_resampling_leaves_of_noise_is_what_sigma_takes_for_it():
-    noise = np.random.default_rng(3).standard_normal((700, 700)).astype(np.float32)
-    found = []
-    for turn in (0.1, 0.5, 0.8, 1.2, 2.0):
-        along = FINER * np.array([np.cos(turn), np.sin(turn)])
-        to_frame = np.array([[*along, 500.3], [-along[1] / FINER, along[0] / FINER, 350.2]])
-        moved = cv2.warpAffine(noise, to_frame, (1000, 700), flags=cv2.INTER_CUBIC)
-        inside = cv2.erode(cv2.warpAffine(np.ones_like(noise), to_frame, (1000, 700)), np.ones((9, 9))) > 0.999
-        found.append([moved[inside].var(), np.gradient(moved, axis=1)[inside].var()])
-    np.testing.assert_allclose(np.mean(found, axis=0), [_LEFT, _SLOPE], rtol=0.03)
 
 
 @pytest.mark.parametrize("side", [1, 2, 3, 5, 8])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from barpc.dsm.relief import draped
 from barpc.dsm.stereo import _best, block_of_images
 from barpc.pipeline import load_views
 from barpc.rpcio import read_rpc
-from barpc.sensor.corrected import ImageAffine, ImageCorrected
+from barpc.sensor.displaced import ImageAffine, ImageCorrected
 from barpc.workspace import own_files
 from tests.dsm.conftest import ALTS, SMALL
 from tests.lanes import rest_slow
@@ -179,6 +180,29 @@ def test_pairs_with_a_flagged_image_come_after_the_others_and_a_line_says_so(ren
     caplog.clear()
     assert _best(views, worth, flagged=frozenset(range(3))) == plain  # as all are: there is nothing better
     assert not caplog.text
+
+
+@pytest.mark.parametrize(("minus", "shown"), [(None, ["run/dsm.tif"]), ("date", [])])
+def test_the_report_of_a_run_shows_its_surface_but_no_change_and_images_have_none(minus, shown, tmp_path, monkeypatch):
+    """Without matching: whose surface it is, alone."""
+    told = []
+
+    def block(source, alt=None, other=None):
+        return SimpleNamespace(views=[], run=None if isinstance(source, list) else source.name)
+
+    def write(out, made, *rest):
+        made.write_bytes(b"cells")
+        return "surface"
+
+    monkeypatch.setattr(surface_module, "block_of_run", block)
+    monkeypatch.setattr(surface_module, "block_of_images", block)
+    monkeypatch.setattr(surface_module, "Grid", lambda block, options: SimpleNamespace(tiles=[], write=write))
+    monkeypatch.setattr(surface_module, "show_in_report", lambda folder, run, *rest: told.append(f"{run}/dsm.tif"))
+    assert make_dsm(tmp_path / "run", tmp_path / "dsm.tif", replace(OPTIONS, minus=minus)) == "surface"
+    assert told == shown
+    assert make_dsm(["a.tif", "b.tif"], tmp_path / "images.tif", OPTIONS) == "surface"
+    assert told == shown
+    assert {path.name for path in tmp_path.iterdir()} == {"dsm.tif", "images.tif"}
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from barpc.base.errors import BarpcWarning, FitError
 from barpc.fit import FitOptions, RpcFit, fit_rpc, fit_rpc_points
-from barpc.fit.certificate import CELLS, Sample
+from barpc.fit.points import CELLS, Sample
 from barpc.fit.poles import Region, smallest_denominator
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC

@@ -16,9 +16,9 @@ from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit import methods as solve_module
 from barpc.fit import refit as fit_module
-from barpc.fit.certificate import CELLS, Errors, Localisation, Sample, off
+from barpc.fit.certificate import Localisation, off
 from barpc.fit.methods import normalization, solve, tidy
-from barpc.fit.points import control_points
+from barpc.fit.points import CELLS, Errors, Sample, control_points
 from barpc.fit.poles import Region, smallest_denominator
 from barpc.fit.refit import _plainer, inverse, underlying_rpc
 from barpc.fit.system import PRECISIONS, FitProblem, solution

@@ -14,9 +14,10 @@ import pytest
 from barpc.base.errors import FitError, InputError, RpcError
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit import refit as fit_module
-from barpc.fit.certificate import Errors, coverage, roundtrip
+from barpc.fit.certificate import coverage, roundtrip
 from barpc.fit.methods import _curvature, solve_lcurve
 from barpc.fit.points import (
+    Errors,
     _check_order,
     control_points,
     screened,

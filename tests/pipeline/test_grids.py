@@ -340,12 +340,12 @@ def test_the_rpc_that_lacks_least_is_the_one_that_is_added_to(monkeypatch, large
     given = replace(rpcs["given"], err_bias=1.5, err_rand=0.25)
     asked: list[str] = []
 
-    def fit(model, size, alts, *, options, strict):
-        assert (model, size, alts, strict) == ("model", (10, 20), (100.0, 300.0), False)
-        if known[options.method][0] is None:
-            asked.append(options.method)
+    def fit(model, size, alts, method):
+        assert (model, size, alts) == ("model", (10, 20), (100.0, 300.0))
+        if known[method][0] is None:
+            asked.append(method)
             raise FitError("no fit")
-        return SimpleNamespace(rpc=rpcs[options.method])
+        return rpcs[method]
 
     def between(rpc, model, size, alt):
         assert (model, size, alt) == ("model", (10, 20), 200.0)
@@ -354,7 +354,7 @@ def test_the_rpc_that_lacks_least_is_the_one_that_is_added_to(monkeypatch, large
         return name
 
     where = np.zeros((1, 3))
-    monkeypatch.setattr(grids, "fit_rpc", fit)
+    monkeypatch.setattr(grids, "fit_only", fit)
     monkeypatch.setattr(grids, "CorrectionGrid", SimpleNamespace(between=between))
     monkeypatch.setattr(grids, "GridCorrected", lambda rpc, lacking: lacking)
     monkeypatch.setattr(grids, "_off", lambda sample, camera: (*known[camera], where))
@@ -370,11 +370,11 @@ def test_where_no_rpc_can_be_added_to_the_last_reason_is_given(monkeypatch) -> N
     def between(rpc, model, size, alt):
         raise FitError("nothing lies there")
 
-    def fit(*given, options, **how):
-        raise FitError(f"no fit by {options.method}")
+    def fit(model, size, alts, method):
+        raise FitError(f"no fit by {method}")
 
     monkeypatch.setattr(grids, "CorrectionGrid", SimpleNamespace(between=between))
-    monkeypatch.setattr(grids, "fit_rpc", fit)
+    monkeypatch.setattr(grids, "fit_only", fit)
     sample = SimpleNamespace(model="model", size=(10, 20), alt_range=(100.0, 300.0))
     with pytest.raises(FitError, match="no fit by ridge"):
         grids.grid_correction(make_rpc(), sample)  # type: ignore[arg-type]

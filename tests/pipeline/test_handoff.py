@@ -34,7 +34,7 @@ from barpc.rpcio import (
 )
 from barpc.rpcio.grids import CORRECTION, write_correction
 from barpc.scene import BoolArray
-from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
+from barpc.sensor.displaced import CorrectionGrid, GridCorrected
 from barpc.sensor.rpc import RPC
 from barpc.workspace import Workspace
 from tests.rpcio.conftest import make_rpc, write_image

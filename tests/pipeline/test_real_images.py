@@ -14,7 +14,7 @@ from barpc.fit import fit_rpc
 from barpc.pipeline.handoff import control_grid
 from barpc.rpcio import read_rpc
 from barpc.scene import Tracks, View
-from barpc.sensor.corrected import ImageAffine, ImageCorrected
+from barpc.sensor.displaced import ImageAffine, ImageCorrected
 from barpc.sensor.geometry import epipolar_offset, triangulate
 from tests.lanes import rest_slow
 

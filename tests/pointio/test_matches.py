@@ -71,6 +71,7 @@ def test_a_track_that_meets_itself_in_one_view_is_left_out(tmp_path):
         ("t.csv", "image,col,row\na,1,2\n", "no column track"),
         ("t.csv", "image,col,row,track\na,1,x,2\n", "line 2: expected image, col, row, track"),
         ("t.csv", "image,col,row,track\na,1,2,1\n", "no track is seen in two"),
+        ("t.csv", "image,col,row,track\n", "no track is seen in two"),
         ("t.csv", "", "among the 0 of its first line"),
         ("a__b.txt", "2 2\n1 2\n", "holds 1"),
         ("a__b.txt", "rubbish\n", "not an ASP text match file"),

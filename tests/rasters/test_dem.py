@@ -222,6 +222,32 @@ def test_a_warning_is_only_given_where_it_is_due(tmp_path):
     assert np.isfinite(ecef_from_ground([5.0, 44.0, float(dem(5.0, 44.0))])).all()
 
 
+@pytest.mark.parametrize(
+    ("level", "said"), [(1000.0, False), (1000.1, True), (0.0, False), (-0.1, True), (500.0, False), (np.nan, False)]
+)
+def test_that_lines_meet_no_terrain_is_said_where_it_reaches_out_of_the_altitudes(level, said, tmp_path):
+    """Up or down, but not over a void, and not of terrain that just reaches an end."""
+    rpc = make_rpc()
+    image = np.array([[9000.0, 9000.0], [9500.0, 9000.0], [11000.0, 9000.0]])
+    (lon, lat, _), _, (void, _, _) = rpc.localize(image, np.full(3, 500.0))
+    heights = np.full((21, 31), level, np.float64)
+    heights[:, 16:] = np.nan
+    corner = rasterio.Affine(abs(void - lon) / 6, 0, lon - abs(void - lon) * 2, 0, -0.01, lat + 0.1)
+    assert void > lon
+    dem = Dem.open(write_dem(tmp_path / "a.tif", 4979, heights, transform=corner, nodata=np.nan))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        ground = localize_on_terrain(rpc, image, dem, (0.0, 1000.0))
+    met = 0.0 <= level <= 1000.0
+    assert np.isfinite(ground).all(axis=1).tolist() == [met, met, False]
+    assert len(caught) == said
+    if said:
+        assert (
+            f"heights here are {level:.0f} to {level:.0f} m, the camera is made for 0 to 1000 m: 3 of 3 lines"
+            in str(caught[0].message)
+        )
+
+
 def test_points_that_spread_over_too_many_cells_are_refused_at_once(tmp_path, monkeypatch):
     dem = Dem.open(write_dem(tmp_path / "a.tif", 4979))
     lon, lat = 5 + STEP * np.array([0.0, 2.5]), 44 - STEP * np.array([0.0, 3.5])  # nodes 0 .. 3 by 0 .. 4

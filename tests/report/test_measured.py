@@ -21,8 +21,8 @@ from barpc.report.summary.place import ce90
 from barpc.report.summary.views import _in_image, cell_numbers, rmse_by_view
 from barpc.report.summary.whole import _asked
 from barpc.scene import Tracks
+from barpc.sensor.displaced import RowSpline
 from barpc.sensor.geometry import epipolar_offset
-from barpc.sensor.splined import RowSpline
 from barpc.tie.reference import ReferenceControl, ViewMatch
 from tests.distributions import norm
 

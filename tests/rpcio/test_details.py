@@ -36,8 +36,8 @@ from barpc.rpcio.grids import read_correction, write_correction, write_grid
 from barpc.rpcio.images import write_crop, write_rpc_nitf
 from barpc.rpcio.sources import Sunlight, hidden_by, light_of, metadata_beside, shadows, sidecars
 from barpc.rpcio.text import collect_numbered, listed_numbers, number
-from barpc.sensor.correction_grid import CorrectionGrid
 from barpc.sensor.direct_grid import DirectGrid
+from barpc.sensor.displaced import CorrectionGrid
 from barpc.sensor.rpc import RPC
 from tests.rpcio.conftest import dimap_v2, grid, make_rpc, write_image, yaml
 

@@ -13,12 +13,12 @@ from scipy.interpolate import RegularGridInterpolator
 from barpc.base.errors import BarpcError, OutputError, RpcError, RpcFormatError
 from barpc.base.geodesy import metres_per_unit
 from barpc.cameras import open_camera
-from barpc.fit.certificate import Sample
+from barpc.fit.points import Sample
 from barpc.pipeline.handoff import unverified, verify_grid
 from barpc.rpcio import read_rpc
 from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid
-from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
+from barpc.sensor.displaced import CorrectionGrid, GridCorrected
 from tests.jitter import scene
 from tests.rpcio.conftest import make_rpc
 

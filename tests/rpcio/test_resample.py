@@ -18,7 +18,7 @@ from barpc.fit import fit_rpc
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import grids, read_rpc, write_rpc_vrt
 from barpc.rpcio.grids import write_resampled
-from barpc.sensor.correction_grid import CorrectionGrid
+from barpc.sensor.displaced import CorrectionGrid
 from barpc.simulate import fly, looks
 from tests.jitter import jittered
 from tests.lanes import rest_slow

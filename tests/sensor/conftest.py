@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 
 from barpc.base.geodesy import ecef_from_ground
-from barpc.sensor import SensorModel
-from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
-from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
+from barpc.sensor import SensorModel, terrasar
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.curve import Orbit, fit_orbit
 from barpc.sensor.direct_grid import DirectGrid
+from barpc.sensor.displaced import CorrectionGrid, GridCorrected, ImageAffine, ImageCorrected, RowSpline, Splined
 from barpc.sensor.pushbroom import Light, Pushbroom
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sentinel1 import range_doppler
 from barpc.sensor.sicd import open_sicd
-from barpc.sensor.splined import RowSpline, Splined
 from barpc.sensor.terrasar import open_terrasar
 from barpc.sensor.timing import Timed, Timing
 from barpc.simulate import Look, fly
@@ -167,6 +168,23 @@ MODELS: dict[str, Callable[[], Case]] = {
     "sicd, zero doppler, to the left": lambda: _sicd("INCA", side="L"),
     "sicd, ground plane across the antimeridian": lambda: _sicd("PLANE", lon=180.0),
 }
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _orbits() -> Iterator[None]:
+    """An orbit through the same state vectors is fitted once: twenty tests change something else of one product."""
+    known: dict[tuple[object, ...], Orbit] = {}
+
+    def once(*vectors: np.ndarray, window: tuple[float, float]) -> Orbit:
+        key = (*(part.tobytes() for part in vectors), *window)
+        if key not in known:
+            known[key] = fit_orbit(*vectors, window)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (range_doppler, terrasar):
+            patch.setattr(module, "fit_orbit", lambda *given: once(*given[:3], window=given[3]))
+        yield
 
 
 @pytest.fixture(scope="module", params=list(MODELS))

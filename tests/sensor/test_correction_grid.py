@@ -7,9 +7,8 @@ import pytest
 
 from barpc.base.errors import RpcError
 from barpc.fit import fit_rpc
-from barpc.sensor.corrected import ImageAffine, ImageCorrected
-from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
 from barpc.sensor.direct_grid import LINEAR, DirectGrid, linear_axes
+from barpc.sensor.displaced import CorrectionGrid, GridCorrected, ImageAffine, ImageCorrected
 from tests.jitter import scene
 
 SIZE, ALTS = (8000, 8000), (0.0, 1000.0)
@@ -35,6 +34,16 @@ def test_a_true_position_is_that_of_the_rpc_and_the_correction(camera):
     lacking = CorrectionGrid.between(rpc, moved, SIZE, 500.0)
     np.testing.assert_allclose(lacking.shift, np.broadcast_to([2.0, -3.0], lacking.shift.shape), atol=1e-5)
     np.testing.assert_allclose(lacking.apply(np.array([[10.0, 20.0]])), [[12.0, 17.0]], atol=1e-5)
+
+
+def test_nodes_reach_from_corner_to_corner_of_the_image_and_no_farther(camera):
+    """What grows over the image is met at its outer corners, too; beyond them it stays as it is there."""
+    stretched = ImageCorrected(camera.sensor, ImageAffine([0.0, 0.0], [[1e-3, 0.0], [0.0, -2e-3]]))
+    lacking = CorrectionGrid.between(camera.sensor, stretched, (3000, 2000), 500.0)
+    assert [lacking.cols[0], lacking.cols[-1], lacking.rows[0], lacking.rows[-1]] == [-0.5, 2999.5, -0.5, 1999.5]
+    corners = np.array([[-0.5, -0.5], [2999.5, 1999.5]])
+    np.testing.assert_allclose(lacking.at(corners), corners * [1e-3, -2e-3], rtol=0, atol=1e-5)
+    np.testing.assert_array_equal(lacking.at(corners + [[-9.0, -9.0], [9.0, 9.0]]), lacking.at(corners))
 
 
 def test_an_rpc_and_its_correction_are_the_camera_between_the_nodes(camera):

@@ -8,9 +8,9 @@ from numpy.polynomial import polynomial
 
 from barpc.base.errors import RpcError
 from barpc.sensor.curve import (
+    DEGREES,
     EXTRAPOLATION,
     MARGIN,
-    MAX_DEGREE,
     Curve,
     Turn,
     _fit_orbit,
@@ -112,7 +112,7 @@ def test_the_degree_is_the_lowest_that_serves() -> None:
     fast = sway * np.sin(2 * np.pi * time / 60)[:, None]
     rate = sway * 2 * np.pi / 60 * np.cos(2 * np.pi * time / 60)[:, None]
     degree = fit_orbit(time, position + fast, velocity + rate, (0.0, 5.0)).coeffs.shape[1] - 1
-    assert 7 <= degree <= MAX_DEGREE
+    assert 7 <= degree <= DEGREES[-1]
 
 
 def test_state_vectors_near_the_image_take_part_and_no_others() -> None:

@@ -270,6 +270,11 @@ def test_pixels_of_the_tolerance_are_those_in_the_middle_of_the_image():
             lonlat = np.stack([lon, 44.0 - 1e-5 * image[..., 1] + 0 * lon], axis=-1)
             return np.concatenate([lonlat, np.broadcast_to(alt, lon.shape)[..., None]], axis=-1)
 
+        def project_jacobian(self, ground):
+            lon, lat, _ = ground
+            image = np.array([2000.0 * np.log((lon - 5.0) / 0.02), (44.0 - lat) * 1e5])
+            return image, np.array([[2000.0 / (lon - 5.0), 0.0, 0.0], [0.0, -1e5, 0.0]])
+
     tolerance = 0.3
     grid = DirectGrid.of(Growing(), (8000, 3000), (0.0, 100.0), tolerance)
     step, pixel = grid.cols[1] - grid.cols[0], 0.02 / 2000.0 * np.exp(2.0)

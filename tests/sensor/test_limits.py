@@ -14,9 +14,18 @@ from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, RpcError, RpcFormatError
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
-from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected, RigidMotion
-from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
+from barpc.sensor.corrected import Corrected, Correction, RigidMotion
 from barpc.sensor.curve import Curve, about_middle, cross, rotation_matrix
+from barpc.sensor.displaced import (
+    CorrectionGrid,
+    GridCorrected,
+    ImageAffine,
+    ImageCorrected,
+    RowSpline,
+    Splined,
+    bspline_pieces,
+    bsplines,
+)
 from barpc.sensor.document import Fields, parse_time, seconds
 from barpc.sensor.geometry import (
     Several,
@@ -31,7 +40,6 @@ from barpc.sensor.geometry import (
     view_angles,
 )
 from barpc.sensor.sicd import ImagePlane, Monostatic, PolarFormat, RangeAzimuth, ZeroDoppler, open_sicd
-from barpc.sensor.splined import RowSpline, Splined, bspline_pieces, bsplines
 from barpc.sensor.timing import Timing, aside, dot, on_circle
 from tests.sensor.conftest import MODELS, make_rpc
 from tests.sensor.radar_documents import document

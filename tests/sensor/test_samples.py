@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, RpcFormatError
 from barpc.base.geodesy import ecef_from_ground, enu_basis
-from barpc.sensor.linescan import read_linescan
-from barpc.sensor.linescan.samples import Detector, Samples, _check_times, camera_of_samples, unit
+from barpc.sensor.linescan import Detector, Samples, _check_times, camera_of_samples, read_linescan, unit
 from tests.sensor.linescan_files import SIZE, Flight, Truth, dimap, isd, stamp
 
 FLIGHT = Flight(swing=0.0)

@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import BSpline
 
 from barpc.base.errors import RpcError
-from barpc.sensor.splined import RowSpline, Splined
+from barpc.sensor.displaced import RowSpline, Splined
 
 from .conftest import make_rpc
 

@@ -10,7 +10,7 @@ import pytest
 from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center, camera_centers
-from barpc.sensor.stack import localize_stack
+from barpc.sensor.rpc import localize_stack
 from barpc.simulate import simulate_block
 from tests.sensor.test_rpc import VENDORS, box
 

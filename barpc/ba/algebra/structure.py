@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-import scipy.sparse as sp
 
 from barpc.ba.algebra.dissection import Dissection, dissect
 from barpc.base.geodesy import Array
@@ -101,15 +100,14 @@ def parts(stop: int, size: int, start: int = 0) -> Iterator[slice]:
 
 
 def counting_sort(key: IntArray, size: int) -> tuple[IntArray, IntArray]:
-    """Return the stable order (n,) of keys 0 .. size - 1, and the start and end of each key's part (size +
-    1,).
+    """Return the stable order (n,) of keys 0 .. size - 1, and the start and end of each key's part (size + 1,).
 
-    What scipy does to compress the rows of a sparse matrix, three times as fast as `argsort`.
+    Sixteen bits at a time, which numpy sorts by counting.
     """
-    count = len(key)
-    rows = sp.coo_array((np.zeros(count, dtype=np.int8), (key, np.arange(count))), shape=(size, count))
-    compressed = rows.tocsr()
-    return compressed.indices.astype(np.int64), compressed.indptr.astype(np.int64)
+    order = np.argsort(key.astype(np.uint16), kind="stable")
+    for shift in range(16, size.bit_length(), 16):
+        order = order[np.argsort((key[order] >> shift).astype(np.uint16), kind="stable")]
+    return order, np.append(0, np.cumsum(np.bincount(key, minlength=size)))
 
 
 def _pairs(by_point: IntArray, starts: IntArray) -> tuple[IntArray, IntArray]:

@@ -19,8 +19,7 @@ from barpc.ba.estimated.unknowns import Unknowns
 from barpc.base.geodesy import CHUNK, Array, ground_from_ecef, ground_rows_from_ecef
 from barpc.scene import IntArray, View
 from barpc.sensor.corrected import RigidMotion
-from barpc.sensor.rpc import RPC
-from barpc.sensor.stack import RpcStack
+from barpc.sensor.rpc import RPC, RpcStack
 
 Wanted = Literal["image", "points", "unknowns"]
 

@@ -17,10 +17,10 @@ from barpc.ba.estimated.waves import Waves
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import IntArray, View
 from barpc.sensor import SensorModel
-from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.displaced import ImageAffine, ImageCorrected, Splined
 from barpc.sensor.geometry import camera_centers
-from barpc.sensor.splined import Splined
-from barpc.sensor.stack import localize_stack
+from barpc.sensor.rpc import localize_stack
 from barpc.sensor.timing import Clocked, Timed, Timing, is_clocked
 
 _IMAGE_TERMS = {"shift": (0,), "shift-drift": (0, 2), "affine": (0, 1, 2)}

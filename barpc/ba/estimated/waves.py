@@ -19,7 +19,7 @@ import scipy.linalg as la
 from barpc.ba.usual import SAMPLE
 from barpc.base.geodesy import Array
 from barpc.scene import IntArray
-from barpc.sensor.splined import RowSpline, bsplines, profile, sine_and_cosine
+from barpc.sensor.displaced import RowSpline, bsplines, profile, sine_and_cosine
 
 FEWEST = 7  # splines
 FIRST_SIGMA = 0.3  # px: a prior's standard deviation before anything is known

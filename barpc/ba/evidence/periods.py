@@ -9,6 +9,7 @@ those beside it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import chdtri
@@ -16,12 +17,12 @@ from scipy.special import chdtri
 from barpc.ba.usual import FEW, OUTLIER, SURE
 from barpc.base.geodesy import Array
 from barpc.scene import IntArray
-from barpc.sensor.splined import sine_and_cosine
+from barpc.sensor.displaced import sine_and_cosine
 
 _SHORTEST = 32.0  # rows: of what is shorter a matcher's window shows the mean
 _FEWEST = 1.5  # waves of an image: fewer are no swing yet, and what is nearer to a peak is its own
-_FINE = 8  # frequencies a wave more
-_BIN = _SHORTEST / _FINE  # rows summed: 2 % of the shortest are lost
+_FINE = 4  # frequencies a wave more
+_BIN = _SHORTEST / _FINE  # rows summed: a tenth of the shortest is lost
 
 
 @dataclass(frozen=True)
@@ -35,8 +36,8 @@ class Swing:
 
 def price(rows: float, views: int) -> float:
     """Return the cost of choosing a period, in images of so many rows, and a view [nats]."""
-    # as many as half the frequencies count as tests (Baluev 2008, near the levels asked for)
-    return float(np.log(max(0.5 * _FINE * rows / _SHORTEST, 1.0) * views))
+    # as many as the frequencies count as tests (Baluev 2008, near the levels asked for)
+    return float(np.log(max(_FINE * rows / _SHORTEST, 1.0) * views))
 
 
 def swings(view: IntArray, row: Array, size: Array, right: Array, off: Array, least: float = SURE) -> list[Swing]:
@@ -78,9 +79,10 @@ class _Rows:
         """Return the period, and minus the logarithm of its chance at one frequency; None below `costs`."""
         gain = self._spectrum(self.off)
         band = np.floor(2.0 * np.log2(self.waves[self.first :]))
+        starts = self.first + np.flatnonzero(np.diff(band, prepend=-1.0))
         best = None
-        for start in np.flatnonzero(np.diff(band, prepend=-1.0)).tolist():
-            k = self.first + start + int(gain[self.first + start :][band[start:] == band[start]].argmax())
+        for start, stop in pairwise([*starts.tolist(), len(gain)] if _worth(gain.max(initial=0.0)) > costs else []):
+            k = start + int(gain[start:stop].argmax())
             if _worth(gain[k]) > max(costs, 0.0 if best is None else best[1]):
                 period = self.bins * _BIN / (self.waves[k] + _vertex(gain, k) / _FINE)
                 worth = _worth(gain[k] / self._level(k, period))

@@ -16,7 +16,7 @@ from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePo
 from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, Tracks, View, connected_groups
-from barpc.sensor.stack import localize_stack
+from barpc.sensor.rpc import localize_stack
 
 MIN_OBSERVATIONS = 4  # of a view, or it stops: six unknowns need three points, and one to check them
 _LISTED = 10  # views named in a message

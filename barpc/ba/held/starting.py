@@ -18,7 +18,6 @@ from barpc.ba.held.terrain import Relief, Terrain
 from barpc.ba.solving.normal import cholesky3, point_products, solve_lower, solve_transposed
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import STEPS
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
 
@@ -87,9 +86,8 @@ def first_state(problem: Problem, block: Block, options: AdjustOptions, dem: Ter
     tracks = np.flatnonzero(seen[: block.num_tracks])
     heights = Heights(tuple(control), weak, tracks, block.alt_range, options, dem, block.reference)
     weight = block.use / block.sigma
-    for _ in range(STEPS - 1):
-        points = heights.hold(problem, points).triangulate(points, projected, weight)
-        projected = problem.project_points(params, points)
+    points = heights.hold(problem, points).triangulate(points, projected, weight)
+    projected = problem.project_points(params, points)
     points = heights.hold(problem, points).triangulate(points, projected, weight)
     if heights.is_judged and len(tracks):
         heights = replace(heights, relief=_relief(problem, heights, points, weight))

@@ -18,8 +18,8 @@ from barpc.ba.robust.smooth import SPLINES
 from barpc.ba.usual import FEW, TIMES
 from barpc.base.geodesy import Array
 from barpc.scene import IntArray
-from barpc.sensor.splined import profile
-from barpc.sensor.splined import sine_and_cosine as waves_of
+from barpc.sensor.displaced import profile
+from barpc.sensor.displaced import sine_and_cosine as waves_of
 
 STRIP = "strip"
 FADE = "fade"

@@ -23,7 +23,7 @@ from barpc.ba.robust.rounds import Outcome, Rounds, faintness, revived
 from barpc.ba.robust.smooth import SmoothTest
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import FLOOR, MUCH_NOISE, STEPS, SURELY
+from barpc.ba.usual import FLOOR, MUCH_NOISE, SURELY
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray
@@ -73,14 +73,11 @@ class Solution:
         NaN for the others. Nothing but the cameras moves between the two: no observation that was cut, no place that
         was given, and no height where the rays of a point tell none.
         """
-        points, shown = self.final.points, self.outcome.residual + self.problem.xy
-        held = staying(points, np.flatnonzero(some & self.heights.weak))
-        mended = replace(self.problem, xy=shown, point_prior=held)
+        points, shown, weak = self.final.points, self.outcome.residual + self.problem.xy, self.heights.weak
+        mended = replace(self.problem, xy=shown, point_prior=staying(points, np.flatnonzero(some & weak)))
         delivered = self.problem.camera_prior.mean
-        if not self.heights.weak.any():  # else their heights are to stay where the adjustment put them
-            points = self.state.points
-        for _ in range(STEPS):
-            points = mended.triangulate(points, mended.project_points(delivered, points), block.use / block.sigma)
+        points = np.where(weak[:, None], points, self.state.points)  # from there it is linear
+        points = mended.triangulate(points, mended.project_points(delivered, points), block.use / block.sigma)
         return np.where(some[:, None], points, np.nan)
 
     @property

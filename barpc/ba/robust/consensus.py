@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.special import expit
 
 from barpc.ba.algebra.structure import Structure, parts
 from barpc.ba.estimated.projected import Projected
-from barpc.ba.usual import FEW, ITERATIONS, LEVEL, MANY, OUTLIER, STEPS, TRIALS
+from barpc.ba.usual import FEW, ITERATIONS, LEVEL, MANY, OUTLIER, SLIGHT, STEPS, TRIALS
 from barpc.base.geodesy import CHUNK, Array
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.curve import cross
@@ -56,20 +57,24 @@ def two_groups(structure: Structure, residual: Array, by_point: Array, use: Bool
 
 def _mixture(z: Array) -> tuple[float, float, float]:
     """Return the smaller share, distance (0: not apart) and gain [nats] of two normals of one width over one."""
-    centers, sigma, part = np.quantile(z, [0.1, 0.9]), 0.5 * z.std(), 0.5
-    likelihood = np.ones_like(z)
+    z = z - z.mean()
+    whole = float((z**2).mean())
+    (low, high), square, part = np.quantile(z, [0.1, 0.9]), 0.25 * whole, 0.5
     for _ in range(ITERATIONS):
-        density = np.array([part, 1.0 - part])[:, None] * np.exp(-0.5 * ((z - centers[:, None]) / sigma) ** 2)
-        likelihood = density.sum(axis=0) + 1e-300
-        first, second = density / likelihood
-        part = float(first.mean())
+        # of one width: the ratio of their densities is an exponential of a line
+        second = expit((high - low) * (z - 0.5 * (low + high)) / square - np.log(part / (1.0 - part)))
+        part = 1.0 - float(second.mean())
         if not 0.0 < part < 1.0:
             return 0.0, 0.0, 0.0
-        centers = np.array([(first * z).sum() / first.sum(), (second * z).sum() / second.sum()])
-        sigma = np.sqrt((first * (z - centers[0]) ** 2 + second * (z - centers[1]) ** 2).mean())
-    one = -0.5 * len(z) - len(z) * np.log(z.std())
-    gain = float(np.log(likelihood).sum() - len(z) * np.log(sigma) - one)
-    apart = float(centers[1] - centers[0])
+        high = float(second @ z) / len(z) / (1.0 - part)
+        low = -high * (1.0 - part) / part
+        before, square = square, whole - part * low**2 - (1.0 - part) * high**2
+        if abs(square - before) < SLIGHT**2 * whole:
+            break
+    sigma, apart = np.sqrt(square), float(high - low)
+    groups = ((part, low), (1.0 - part, high))
+    both = np.logaddexp(*(np.log(share) - 0.5 * (z - center) ** 2 / square for share, center in groups))
+    gain = float((both + 0.5).sum() + 0.5 * len(z) * np.log(whole / square))
     if apart < 2.0 * sigma:  # nearer centres make one mode
         return 0.0, 0.0, gain
     return min(part, 1.0 - part), apart, gain

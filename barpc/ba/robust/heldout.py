@@ -90,10 +90,11 @@ def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Arr
 
 def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
     """Measure the observations of a block that took no part in a problem, under cameras of unknowns (N, q)."""
-    views, index = len(block.views), block.own_points[0]
-    if not len(index):
+    views = len(block.views)
+    if not len(block.view):
         unknown = np.full(views, np.nan)
-        return HeldOut(np.zeros((2, 0)), index, np.zeros((0, 3)), unknown, unknown)
+        return HeldOut(np.zeros((2, 0)), block.point, np.zeros((0, 3)), unknown, unknown)
+    index = block.own_points[0]
     part, first = seen_in(problem, params, block)
     observations = Observations(part, block.sigma, 0.0, np.ones(len(block.view), dtype=bool))
     counted = np.ones(len(block.view))

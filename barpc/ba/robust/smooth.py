@@ -19,7 +19,7 @@ from barpc.ba.robust.resembling import Resemblance
 from barpc.ba.usual import KEPT, OUTLIER, RIDGE
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
-from barpc.sensor.splined import bsplines
+from barpc.sensor.displaced import bsplines
 
 Fit = dict[int, tuple[slice, Array]]
 """View -> where its observations are, coefficients (2, TERMS) of their smooth part."""

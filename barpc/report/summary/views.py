@@ -17,9 +17,9 @@ from barpc.report.records import Cell, Column, Number, Record, said, value_of
 from barpc.report.summary.place import EllipseEntry, moved_by_clocks, moved_in_space, stated_ce90
 from barpc.report.summary.words import ABOVE, CAUSES, STATUS_WORDS, Count, Pixel, Share, Side, Vector, largest
 from barpc.scene import IntArray
-from barpc.sensor.corrected import Corrected, ImageCorrected
+from barpc.sensor.corrected import Corrected
+from barpc.sensor.displaced import ImageCorrected, RowSpline, Splined
 from barpc.sensor.geometry import Several, ground_sample_distance, image_grid, view_angles
-from barpc.sensor.splined import RowSpline, Splined
 from barpc.sensor.timing import Timed
 
 CELLS = 8  # Cells of an image from left to right and from top to bottom

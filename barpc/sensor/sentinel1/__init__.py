@@ -75,8 +75,7 @@ def mosaic(
 
 
 def mosaic_offsets(swaths: Sequence[Annotation]) -> Array:
-    """Return the offsets col, row (S, 2) [px] of the stitched swath frames of one SLC product in that of
-    their mosaic.
+    """Return the offsets col, row (S, 2) [px] of the stitched swaths of one SLC product in their mosaic.
 
     Whole numbers to within 1e-3 in products since 2016. InputError for a GRD, or swaths that are not of one product.
     """

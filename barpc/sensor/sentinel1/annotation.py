@@ -122,8 +122,7 @@ class Annotation:
 
 
 def burst_rows(annotation: Annotation) -> list[BurstRows]:
-    """Return the rows of the bursts of a TOPS SLC swath in the stitched frame; overlaps are cut at their
-    middle.
+    """Return the rows of a TOPS swath's bursts in the stitched frame; overlaps are cut at their middle.
 
     RpcFormatError for bursts out of order, or one without a valid line.
     """
@@ -184,8 +183,7 @@ def read_annotation(source: bytes | Path, name: str | None = None) -> Annotation
 
 
 def read_orbit_file(path: Path, annotation: Annotation) -> StateVectors:
-    """Return the state vectors of a precise or restituted orbit file (``S1A_OPER_AUX_POEORB_....EOF``) around
-    an image.
+    """Return the state vectors around an image in an orbit file (``S1A_OPER_AUX_POEORB_....EOF``).
 
     RpcFormatError where it is no orbit file, another satellite's, or without a vector near that time.
     """

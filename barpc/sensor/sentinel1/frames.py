@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from barpc.base.errors import InputError
 from barpc.base.frozen import Frozen
@@ -22,7 +23,7 @@ from barpc.sensor.timing import Timing
 
 Bistatic = Literal["annotated", "full"]  # which bistatic correction; see `bistatic_constant`
 _SPREAD = 1e-5  # s: what lines and azimuth times of a grid may scatter
-_ZENITH = (2.41, -1.0 / 3411.0, 1.0 / 8.55e7)  # m, per m, per m^2 of altitude
+_ZENITH = Polynomial([2.41, -1.0 / 3411.0, 1.0 / 8.55e7])  # path delay [m] by altitude [m]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -126,14 +127,12 @@ class Delays:
         return self.atmosphere or self.bistatic is not None or self.timing is not None
 
     def shift(self, times: Array, ground: Array, sight: Array) -> Array:
-        """Return the delays (2, N) [s] added to the times of points (N, 3) that see the satellite along unit
-        vectors (3, N).
-        """
+        """Return the delays (2, N) [s] of points (N, 3) that see the satellite along unit vectors (3, N)."""
         out = np.zeros_like(times)
         if self.bistatic is not None:
             out[0] = self.bistatic - 0.5 * times[1]
         if self.atmosphere:
-            out[1] = _zenith(ground[:, 2])[0] / (up(ground) * sight).sum(axis=0) * (2.0 / SPEED_OF_LIGHT)
+            out[1] = _ZENITH(ground[:, 2]) / (up(ground) * sight).sum(axis=0) * (2.0 / SPEED_OF_LIGHT)
         if self.timing is not None:
             out += _as_times(self.timing.at(times[0]))
         return out
@@ -152,7 +151,7 @@ class Delays:
             by_cosine = np.einsum("nj,njk->nk", enu[:, 2, :], by_sight)
             by_cosine[:, 0] += np.radians(east * np.cos(np.radians(ground[:, 1])))
             by_cosine[:, 1] += np.radians(north)
-            zenith, slope = _zenith(ground[:, 2])
+            zenith, slope = _ZENITH(ground[:, 2]), _ZENITH.deriv()(ground[:, 2])
             out[1] = -(zenith / cosine**2)[:, None] * by_cosine
             out[1, :, 2] += slope / cosine
             out[1] *= 2.0 / SPEED_OF_LIGHT
@@ -193,9 +192,3 @@ def bistatic_constant(annotation: Annotation, form: Bistatic) -> float:
 def _as_times(late: Array) -> Array:
     """Return the range [m] and azimuth time [s] (2, N) as azimuth time and two-way range time [s]."""
     return np.stack([late[1], late[0] * (2.0 / SPEED_OF_LIGHT)])
-
-
-def _zenith(alt: Array) -> tuple[Array, Array]:
-    """Return the zenith path delay (N,) [m] at altitudes [m], and its derivative."""
-    a, b, c = _ZENITH
-    return a + alt * (b + alt * c), b + 2 * c * alt

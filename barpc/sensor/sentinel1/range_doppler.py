@@ -25,35 +25,20 @@ from barpc.base.geodesy import (
 )
 from barpc.sensor.curve import Curve, Orbit, fit_orbit
 from barpc.sensor.document import seconds, warn_off_grid
-from barpc.sensor.sentinel1.annotation import (
-    Annotation,
-    StateVectors,
-    burst_rows,
-    read_annotation,
-    read_orbit_file,
-)
-from barpc.sensor.sentinel1.frames import (
-    Bistatic,
-    Delays,
-    Frame,
-    GroundFrame,
-    SlantFrame,
-    bistatic_constant,
-)
+from barpc.sensor.sentinel1.annotation import Annotation, StateVectors, burst_rows, read_annotation, read_orbit_file
+from barpc.sensor.sentinel1.frames import Bistatic, Delays, Frame, GroundFrame, SlantFrame, bistatic_constant
 from barpc.sensor.timing import Clocked, Timing, aside, dot, on_circle
 
 RELIEF = (200.0, 500.0)
 """How far the terrain may lie below the lowest and above the highest point of the geolocation grid [m]."""
 NO_DELAYS = Delays()  # pure geometry
-ORBITS = {"AUX_POEORB": 0.05, "AUX_RESORB": 0.1, "AUX_PREORB": 0.4, "Auxiliary": 0.4}
+ORBITS = {"AUX_POEORB": 0.05, "AUX_RESORB": 0.1, "AUX_PREORB": 0.4, "Auxiliary": 0.4, "Downlink": 2.5}
 """Source of an orbit -> its error [m], RMS in space. Precise, restituted: what is required (Copernicus Sentinel news of
-13 April 2021); predicted: 0.15 to 0.35 m (9 September 2022). An annotation does not tell which of these its own is."""
-ON_BOARD = 2.5
-"""The same of the receiver's own solution [m] (2.43 m: the same news); downlinked, or of no known source."""
-NOT_CORRECTED = (3.5, 4.0)
-"""What the atmosphere adds to the range at the far side of a swath, and the bistatic delay along the flight [m]."""
-CORRECTED = (0.5, 0.5)
-"""What is left of both [m]: ionosphere and water vapour; the Doppler rate at another height than was assumed."""
+13 April 2021); predicted: 0.15 to 0.35 m (9 September 2022). An annotation does not tell which of these its own is. The
+receiver's own solution, downlinked, and of no known source: 2.43 m (the same news)."""
+LEFT = ((3.5, 0.5), (4.0, 0.5))
+"""What the atmosphere adds to the range at the far side of a swath [m], and of that, corrected, ionosphere and water
+vapour; the bistatic delay along the flight, and of that, corrected, the Doppler rate at another height than assumed."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -148,8 +133,7 @@ class RangeDoppler(Clocked):
         return replace(self, delays=replace(self.delays, timing=timing))
 
     def azimuth_range(self, ground: Array) -> tuple[Array, Array]:
-        """Return the zero-Doppler [s from `epoch`] and two-way slant range times (...) [s] of ground points
-        (..., 3).
+        """Return zero-Doppler [s from `epoch`] and two-way slant range times (...) [s] of points (..., 3).
 
         Pure geometry, without `delays`; NaN off the orbit's time span or on the other side.
         """
@@ -268,8 +252,7 @@ def swaths_model(
     nearest = swaths[0]
     alt = np.concatenate([a.grid.ground[:, 2] for a in swaths])
     states = nearest.states if orbit is None else read_orbit_file(orbit, nearest)
-    left = [CORRECTED[k] if done else NOT_CORRECTED[k] for k, done in enumerate((atmosphere, bistatic == "full"))]
-    of_orbit = ORBITS.get(states.source, ON_BOARD)
+    of_orbit, left = ORBITS.get(states.source, ORBITS["Downlink"]), (LEFT[0][atmosphere], LEFT[1][bistatic == "full"])
     model = RangeDoppler(
         orbit=_orbit(nearest, states, epoch),
         epoch=epoch,
@@ -285,9 +268,7 @@ def swaths_model(
 
 
 def grid_residuals(annotation: Annotation, model: RangeDoppler) -> Array:
-    """Return the model minus a swath's own geolocation grid, geometry only: range [samples], azimuth [lines],
-    (G, 2).
-    """
+    """Return model minus geolocation grid (G, 2), pure geometry: range [samples], azimuth [lines]."""
     grid = annotation.grid
     azimuth_time, range_time = model.azimuth_range(grid.ground)
     samples = (range_time - grid.range_time) * annotation.range_sampling_rate

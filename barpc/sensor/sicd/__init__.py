@@ -15,7 +15,7 @@ from barpc.base.errors import InputError, RpcFormatError
 from barpc.base.geodesy import ALTITUDES, EARTH_RATE, Array, ground_from_ecef
 from barpc.base.sidefile import MAX_XML, PRODUCT, opened, parse_xml
 from barpc.sensor.curve import Curve
-from barpc.sensor.document import RELIEF_AROUND, Fields
+from barpc.sensor.document import RELIEF_AROUND, Fields, padded
 from barpc.sensor.sicd.monostatic import Formation, ImagePlane, Monostatic, PolarFormat, RangeAzimuth, ZeroDoppler
 
 __all__ = [
@@ -33,9 +33,8 @@ __all__ = [
 _ORDER = 30  # no polynomial of a document has so high a power
 _SCP_TOLERANCE = 1.0  # px: where the stated centre point must project
 _NITF = b"NITF02.10"
-_COUNTS = 360  # where a NITF's header counts its segments
-_SEGMENTS = ((6, 10), (4, 6), (0, 0), (4, 5), (4, 9))
-"""Digits of the lengths of subheader and data: images, graphics, reserved, texts, data extensions."""
+_SEGMENTS = {"images": (6, 10), "graphics": (4, 6), "reserved": (0, 0), "texts": (4, 5), "data extensions": (4, 9)}
+"""Digits of the lengths of subheader and data."""
 
 
 def is_sicd(head: bytes) -> bool:
@@ -60,16 +59,16 @@ def find_sicd(path: Path) -> bytes | None:
 
 def _extensions(file: BinaryIO) -> list[bytes]:
     """Return the data of all data extensions of a NITF."""
-    file.seek(_COUNTS - 6)
+    file.seek(354)  # in the header: its own length, then numbers of segments
     place = _digits(file, 6)
     found = []
-    for kind, (header, data) in enumerate(_SEGMENTS):
+    for kind, (header, data) in _SEGMENTS.items():
         lengths = [(_digits(file, header), _digits(file, data)) for _ in range(_digits(file, 3) if data else 0)]
         if not data:
             file.seek(3, 1)  # the number of reserved segments, always 0
         here = file.tell()
         for subheader, length in lengths:
-            if kind == len(_SEGMENTS) - 1 and length <= MAX_XML:
+            if kind == "data extensions" and length <= MAX_XML:
                 file.seek(place + subheader)
                 found.append(file.read(length))
             place += subheader + length
@@ -113,7 +112,7 @@ def open_sicd(path: Path) -> Monostatic:
         formation=_formation(root, scp),
         spacing=(root.positive("Grid/Row/SS"), root.positive("Grid/Col/SS")),
         origin=(center[0] - first[0], center[1] - first[1]),
-        size=(int(root.positive("ImageData/NumCols")), int(root.positive("ImageData/NumRows"))),
+        size=root.size("ImageData/NumCols", "ImageData/NumRows"),
         alt_range=(altitude - RELIEF_AROUND, altitude + RELIEF_AROUND),
         look=root.chosen("SCPCOA/SideOfTrack", {"R": "right", "L": "left"}),
         accuracy=_accuracy(root, scp),
@@ -164,11 +163,8 @@ def _error(root: Fields, path: str) -> float:
 
 def _orbit(root: Fields) -> Curve:
     """Read ARPPoly over the time of the collection."""
-    axes = [_polynomial(root, f"Position/ARPPoly/{axis}", 1) for axis in "XYZ"]
-    coeffs = np.zeros((1, max(map(len, axes)), 3))
-    for k, axis in enumerate(axes):
-        coeffs[0, : len(axis), k] = axis
-    return Curve(np.array([0.0, root.positive("Timeline/CollectDuration")]), coeffs)
+    coeffs = padded(_polynomial(root, f"Position/ARPPoly/{axis}", 1) for axis in "XYZ")
+    return Curve.polynomial(coeffs.T, 0.0, root.positive("Timeline/CollectDuration"))
 
 
 def _polynomial(root: Fields, path: str, variables: int) -> Array:

@@ -229,9 +229,7 @@ class Monostatic(Clocked):
         return seen._replace(position=position, velocity=velocity, distance=distance, time=time)
 
     def _miss(self, plane: Array, point: Array) -> tuple[Array, Aperture, Array, Array]:
-        """Return the pixel - point in range and rate (2, N), the aperture, and the point's sight (3, N) and
-        distance (N,).
-        """
+        """Return pixel - point in range and rate (2, N), the aperture, the point's sight (3, N), distance (N,)."""
         seen = self._seen(plane)
         sight = seen.position - point
         distance = np.sqrt(dot(sight, sight))
@@ -249,9 +247,7 @@ class Monostatic(Clocked):
         return self._image(self._solve(ecef_from_ground(ground).T)[0])
 
     def _solve(self, point: Array) -> tuple[Array, Array]:
-        """Return (x, y) (2, N) of points (3, N), ECEF, by Newton from the scene centre; and the last
-        derivative (2, 2, N).
-        """
+        """Return (x, y) (2, N) of points (3, N), by Newton from the scene centre; the last derivative (2, 2, N)."""
         low, high = self._bounds
         plane = np.where(np.isfinite(point[:2]), 0.0, np.nan)
         for _ in range(NEWTON_STEPS):

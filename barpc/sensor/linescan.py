@@ -15,23 +15,32 @@ two look angles as polynomials of the detector: column c looks along (tan psi_y,
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import count, takewhile
 from pathlib import Path
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.polynomial.polynomial import polyval
 from scipy.spatial.transform import Rotation
 
-from barpc.base.errors import InputError, RpcFormatError
-from barpc.base.geodesy import Array
+from barpc.base.errors import InputError, RpcError, RpcFormatError
+from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.base.sidefile import parse_xml
-from barpc.sensor.curve import EXTRAPOLATION
-from barpc.sensor.document import MOST_PIXELS, STRAIGHT, Fields, seconds
-from barpc.sensor.linescan.samples import STEP, Detector, Linescan, Samples, camera_of_samples, unit
-from barpc.sensor.pushbroom import Light
+from barpc.sensor.curve import EXTRAPOLATION, Curve, attitude_through
+from barpc.sensor.document import STRAIGHT, Fields, padded, seconds
+from barpc.sensor.pushbroom import Light, Pushbroom
 
-__all__ = ["Linescan", "read_linescan"]
+STEP = 0.02  # s: at which an attitude is sampled that is given otherwise
+
+_GAP = 4.0  # times the usual step: a longer one is a gap that nothing bridges
+_FASTEST = 0.3  # rad/s: no imaging satellite turns so fast
+_UNIT = 1e-3  # by which the length of a quaternion may miss 1
+_RADII = (6.5e6, 8e6)  # m from the Earth's centre
+_ORBIT, _RATE = 7e6, 1.2e-3  # m, rad/s: radius and turn of an orbit: of its Taylor series in time
+_DEGREES, _EXACT = range(2, 7), 1e-5  # m: the first degree whose next term is smaller is taken
+_SCATTER = 0.01  # m, RMS: samples farther from the polynomial are not noise
+_OFF = 700.0  # m/s: by more than the Earth's rotation no stated velocity differs from that of the positions
 
 _TABLES = {"EPH": (13, 7), "ATT": (15, 5)}  # numbers of a row: with covariances, without
 _LIGHT = Light(aberration=True, refraction=True)  # star trackers tell where the body points
@@ -39,12 +48,148 @@ _UNITS = (1.0, 1e-3, 1e-6)  # s: that LINE_PERIOD may be in
 _AGREE = 0.01  # relative: by how much LINE_PERIOD may miss what START and END say
 
 
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Sampled positions and attitudes of a vendor, times in seconds from that of row 0."""
+
+    name: str  # the file, for messages
+    times: Array  # (N,) of the positions
+    positions: Array  # (N, 3) of the camera, ECEF [m]
+    velocities: Array  # (N, 3), stated [m/s]: they must agree with the positions
+    ticks: Array  # (M,) of the attitudes
+    quaternions: Array  # (M, 4) ecef_from_camera, scalar first, of either sign
+
+
+@dataclass(frozen=True, eq=False)
+class Detector:
+    """Lines of sight of rows and columns in camera axes; see `Pushbroom`."""
+
+    look: Array
+    look_origin: float
+    line_period: float
+    size: tuple[int, int]  # width, height [px]
+
+
+@dataclass(frozen=True, eq=False)
+class Linescan:
+    """A vendor's physical model and the size of its image."""
+
+    model: Pushbroom
+    size: tuple[int, int]
+    kind: str = ""  # whose
+
+
+def camera_of_samples(samples: Samples, detector: Detector, sigma: tuple[float, float] | None = None) -> Linescan:
+    """Return the camera of samples; `sigma`: stated standard deviations of attitude [rad] and position [m].
+
+    RpcFormatError for samples that cannot be those of one image.
+    """
+    name, last = samples.name, detector.line_period * (detector.size[1] - 1)
+    span = (min(0.0, last), max(0.0, last))
+    _check_times(samples.times, span, "positions", name)
+    _check_times(samples.ticks, span, "attitudes", name)
+    _check_orbit(samples)
+    _check_turn(samples)
+    try:
+        mount, attitude = attitude_through(samples.ticks, samples.quaternions)
+        model = Pushbroom(
+            _track(samples.times, samples.positions),
+            attitude,
+            mount,
+            detector.look,
+            detector.look_origin,
+            detector.line_period,
+        )
+    except RpcError as error:
+        raise RpcFormatError(f"{name}: {error}") from error
+    middle = model.localize((np.array(detector.size) - 1) / 2, np.zeros(()))
+    if not np.isfinite(middle).all():
+        raise RpcFormatError(f"{name}: its camera does not look at the Earth; is the attitude that of the image?")
+    if sigma is not None and min(sigma) > 0:
+        place = model.position((detector.size[1] - 1) / 2)
+        far = float(np.linalg.norm(ecef_from_ground(middle) - place))
+        model = replace(model, accuracy=(sigma[0] * far, sigma[1]))
+    return Linescan(model, detector.size)
+
+
+def _track(times: Array, positions: Array) -> Curve:
+    """Return the position over time: a polynomial that any orbit follows for so long, or else a spline.
+
+    Dense samples scatter by millimetres, which a curve through them all carries beyond the first by centimetres.
+    """
+    half = 0.5 * (times[-1] - times[0])
+    degree = next((d for d in _DEGREES if _ORBIT * (_RATE * half) ** (d + 1) < _EXACT * math.factorial(d + 1)), 0)
+    if not degree or len(times) <= degree + 1:
+        return Curve.through(times, positions)
+    since = times - times[0]
+    parts = [Polynomial.fit(since, axis, degree) for axis in positions.T]
+    left = positions.T - [part(since) for part in parts]
+    if not np.sqrt((left**2).mean()) <= _SCATTER:
+        return Curve.through(times, positions)
+    return Curve.polynomial(padded(part.convert().coef for part in parts).T, times[0], times[-1])
+
+
+def unit(quaternions: Array, name: str) -> Array:
+    """Return quaternions (N, 4) scaled to length 1; RpcFormatError where theirs is another."""
+    length = np.linalg.norm(quaternions, axis=1)
+    if not (np.abs(length - 1.0) < _UNIT).all():
+        raise RpcFormatError(f"{name}: a quaternion of length {length[np.abs(length - 1).argmax()]:.4g}, not 1")
+    return np.asarray(quaternions / length[:, None])
+
+
+def _check_times(times: Array, span: tuple[float, float], what: str, name: str) -> None:
+    steps = np.diff(times)
+    if len(times) < 4 or not (steps > 0).all():
+        raise RpcFormatError(f"{name}: {len(times)} {what}, or their times do not rise; four or more are needed")
+    usual = float(np.median(steps))
+    margin = min(EXTRAPOLATION, 0.5 * _GAP * usual)  # as far as from a sample in the longest gap
+    if times[0] - margin > span[0] or times[-1] + margin < span[1]:
+        raise RpcFormatError(
+            f"{name}: the image lasts from {span[0]:.2f} to {span[1]:.2f} s, its {what} from {times[0]:.2f} to "
+            f"{times[-1]:.2f} s; is the list complete?"
+        )
+    gap = (steps > _GAP * usual) & (times[1:] > span[0]) & (times[:-1] < span[1])
+    if gap.any():
+        at = int(np.argmax(gap))
+        raise RpcFormatError(
+            f"{name}: no {what} from {times[at]:.2f} to {times[at + 1]:.2f} s, within the image: they come every "
+            f"{usual:.3g} s"
+        )
+
+
+def _check_orbit(samples: Samples) -> None:
+    radius = np.linalg.norm(samples.positions, axis=1)
+    if not ((radius > _RADII[0]) & (radius < _RADII[1])).all():
+        raise RpcFormatError(
+            f"{samples.name}: positions {radius.min():.4g} to {radius.max():.4g} m from the Earth's centre, no "
+            "satellite's orbit; metres and ECEF are expected"
+        )
+    moved = np.gradient(samples.positions, samples.times, axis=0)
+    off = np.linalg.norm(moved - samples.velocities, axis=1)[1:-1]
+    if not off.max() < _OFF:
+        raise RpcFormatError(
+            f"{samples.name}: positions move by {off.max():.4g} m/s otherwise than their stated velocities; are the "
+            "times right?"
+        )
+
+
+def _check_turn(samples: Samples) -> None:
+    q = unit(samples.quaternions, samples.name)
+    half = np.arccos(np.minimum(np.abs((q[1:] * q[:-1]).sum(axis=1)), 1.0))
+    rate = 2.0 * half / np.diff(samples.ticks)
+    if not rate.max() < _FASTEST:
+        at = int(rate.argmax())
+        raise RpcFormatError(
+            f"{samples.name}: the attitude turns by {rate[at]:.3g} rad/s at {samples.ticks[at]:.2f} s, as no "
+            "satellite does; a damaged quaternion"
+        )
+
+
+# --- vendors' documents -------------------------------------------------------------------------------------
+
+
 def read_linescan(
-    path: Path,
-    *,
-    band: str | None = None,
-    aberration: bool | None = None,
-    refraction: bool | None = None,
+    path: Path, *, band: str | None = None, aberration: bool | None = None, refraction: bool | None = None
 ) -> Linescan:
     """Return the physical model in an XML file.
 
@@ -70,20 +215,17 @@ def read_linescan(
     read, kind = vendor
     found, usual = read(root, band)
     light = Light(
-        usual.aberration if aberration is None else aberration,
-        usual.refraction if refraction is None else refraction,
+        usual.aberration if aberration is None else aberration, usual.refraction if refraction is None else refraction
     )
     return replace(found, model=replace(found.model, light=light), kind=kind)
 
 
 def camera_of_isd(root: Fields, band: str | None = None) -> tuple[Linescan, Light]:
-    """Return the model of an ISD, and how light bends; RpcFormatError where it is damaged, InputError where `band` is
-    none of its bands.
-    """
+    """Return the model of an ISD, and how light bends; InputError where `band` is none of its bands."""
     level = root.text("IMD/PRODUCTLEVEL")
     if "1B" not in level.upper():
         raise RpcFormatError(f"{root.name}: a product of level {level}, resampled: only 1B has a physical model")
-    size = (int(root.positive("IMD/NUMCOLUMNS", MOST_PIXELS)), int(root.positive("IMD/NUMROWS", MOST_PIXELS)))
+    size = root.size("IMD/NUMCOLUMNS", "IMD/NUMROWS")
     period, first = _isd_lines(root, size[1])
     (times, orbit), (ticks, attitude) = (_table(root, part, first) for part in _TABLES)
     body = Rotation.from_quat(unit(attitude[:, 1:5], root.name))
@@ -166,8 +308,7 @@ def _isd_look(root: Fields, band: str | None) -> Array:
 
 
 def _sigma(orbit: Array, attitude: Array) -> tuple[float, float] | None:
-    """Return the standard deviations of an angle [rad] and of a coordinate [m] from upper triangles of
-    covariances.
+    """Return the standard deviations of an angle [rad] and a coordinate [m], from upper triangles of covariances.
 
     A turn by the small angle w changes the quaternion by w / 2.
     """
@@ -179,13 +320,11 @@ def _sigma(orbit: Array, attitude: Array) -> tuple[float, float] | None:
 
 
 def camera_of_dimap(root: Fields, band: str | None = None) -> tuple[Linescan, Light]:
-    """Return the model of a DIMAP, and how light bends; RpcFormatError where it is damaged or has none, InputError
-    for no such `band`.
-    """
+    """Return the model of a DIMAP, and how light bends; InputError where `band` is none of its bands."""
     if root.element.find("Geometric_Data/Refined_Model") is None:
         raise RpcFormatError(f"{root.name}: no Geometric_Data/Refined_Model: it holds no physical camera model")
-    model, raster = root.one("Geometric_Data/Refined_Model"), root.one("Raster_Data/Raster_Dimensions")
-    size = (int(raster.positive("NCOLS", MOST_PIXELS)), int(raster.positive("NROWS", MOST_PIXELS)))
+    model = root.one("Geometric_Data/Refined_Model")
+    size = root.one("Raster_Data/Raster_Dimensions").size("NCOLS", "NROWS")
     first, period = _dimap_lines(model, size[1])
     points = model.all("Ephemeris/Point_List/Point")
     times = _times(points, first)
@@ -245,10 +384,9 @@ def _dimap_look(calibration: Fields, band: str | None) -> tuple[Array, float]:
     tangents = [_tangents(angles, axis) for axis in "YX"]
     if not tangents[0] or len(tangents[1]) < 2:
         raise RpcFormatError(f"{calibration.name}: Polynomial_Look_Angles without YLOS_0, XLOS_0 and XLOS_1")
-    look = np.zeros((2, max(map(len, tangents))))
-    look[0, : len(tangents[0])], look[1, : len(tangents[1])] = tangents[0], np.negative(tangents[1])
     begins = calibration.element.findtext("Swath_Range/FIRST_COL")
-    return look, 0.0 if begins is None else 1.0 - calibration.number("Swath_Range/FIRST_COL")
+    origin = 0.0 if begins is None else 1.0 - calibration.number("Swath_Range/FIRST_COL")
+    return padded(tangents) * [[1.0], [-1.0]], origin
 
 
 def _tangents(angles: Fields, axis: str) -> list[float]:
@@ -264,8 +402,5 @@ def _light(root: Fields) -> Light:
     return Light(*(text.strip().lower() == "true" for text in said))
 
 
-_VENDORS = {
-    "isd": (camera_of_isd, "maxar physical model"),
-    "Dimap_Document": (camera_of_dimap, "dimap physical model"),
-}
+_VENDORS = {"isd": (camera_of_isd, "maxar physical model"), "Dimap_Document": (camera_of_dimap, "dimap physical model")}
 """Root of the document -> its reader and the kind of camera."""

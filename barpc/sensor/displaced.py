@@ -1,0 +1,329 @@
+"""What no rotation and no RPC holds: corrections in the image, behind which a model is a model again.
+
+An affine map, as others correct RPCs. A spline over the rows, steps, strips and swings: attitude jitter moves image
+rows against each other, a focal plane that is put together of detectors moves its columns, a jump of the attitude or of
+the clock a strip of rows, a wheel out of balance swings them. All are functions of where a point is *seen*, so that
+x = P(X) + s(x): localisation is explicit, projection iterates. What an RPC lacks on a grid, by where the RPC has a
+point: true image position = RPC's + (dcol, drow).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from barpc.base.errors import RpcError
+from barpc.base.frozen import Frozen
+from barpc.base.geodesy import Array
+from barpc.sensor import Behind, SensorModel
+from barpc.sensor.direct_grid import LINEAR, LONGEST, linear_axes
+
+if TYPE_CHECKING:
+    from scipy.interpolate import RegularGridInterpolator
+
+IntArray = npt.NDArray[np.int64]
+
+_STEPS = 60  # of a fixed point: a correction gains two or three digits a step, wild ones need more
+STANDS = 1e-7
+"""Of image points that are iterated [px]: what is left after so small a step is a hundredth of it."""
+
+
+class Displacement(Protocol):
+    """A correction of image points: from where a model without it has them to where they are seen, and back."""
+
+    def apply(self, image: Array) -> Array:
+        """Return where points that a model has at (..., 2) [px] are seen."""
+        ...
+
+    def linearised(self, image: Array) -> tuple[Array, Array]:
+        """Return the same, and its derivative (..., 2, 2) by the model's image points."""
+        ...
+
+    def undo(self, image: Array) -> Array:
+        """Return where the model has points that are seen at (..., 2) [px]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Displaced(Behind):
+    """`sensor` with its image points corrected by `correction`; itself a `SensorModel`."""
+
+    sensor: SensorModel
+    correction: Displacement
+
+    def project(self, ground: Array) -> Array:
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
+        return self.correction.apply(self.sensor.project(ground))
+
+    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
+        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
+        image, jacobian = self.sensor.project_jacobian(ground)
+        image, slope = self.correction.linearised(image)
+        return image, slope @ jacobian
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
+        return self.sensor.localize(self.correction.undo(np.asarray(image, dtype=np.float64)), alt)
+
+
+def fixed_point(follow: Callable[[Array], Array], image: Array) -> Array:
+    """Return the image points (..., 2) [px] that `follow` leaves where they are, from a first guess."""
+    for _ in range(_STEPS):
+        before, image = image, follow(image)
+        change = np.abs(image - before)
+        if not (change.max(initial=0.0, where=np.isfinite(change)) > STANDS):
+            break
+    return image
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ImageAffine(Frozen):
+    """An affine correction in the image: image + shift + slope @ image."""
+
+    shift: Array  # (2,): col, row [px]
+    slope: Array  # (2, 2): change of (col, row) by (col, row) [px/px]
+
+    def __post_init__(self) -> None:
+        self._array("shift", (2,), RpcError)
+        self._array("slope", (2, 2), RpcError)
+
+    def apply(self, image: Array) -> Array:
+        """Return the corrected image points (..., 2) [px]."""
+        return image @ (np.eye(2) + self.slope).T + self.shift
+
+    def linearised(self, image: Array) -> tuple[Array, Array]:
+        """Return the same, and the derivative (2, 2)."""
+        return self.apply(image), np.eye(2) + self.slope
+
+    def undo(self, image: Array) -> Array:
+        """Return the image points (..., 2) [px] without the correction."""
+        return (image - self.shift) @ np.linalg.inv(np.eye(2) + self.slope).T
+
+
+@dataclass(frozen=True)
+class ImageCorrected(Displaced):
+    """`sensor` with its image points corrected by an affine map; itself a `SensorModel`.
+
+    The bias corrections (shift, drift, affine) of Fraser and Hanley ("Bias compensation in rational functions for
+    Ikonos satellite imagery", 2003) and Grodecki and Dial ("Block adjustment of high-resolution satellite images
+    described by rational polynomials", 2003), for comparison with the correction in space.
+    """
+
+    correction: ImageAffine  # what is added to its image points
+
+
+def bspline_pieces(u: Array, count: int, rate: bool = False) -> tuple[IntArray, Array]:
+    """Return the first (n,) of the four uniform cubic B-splines that are not 0 at u (n,) in -1 .. 1, and these (4, n).
+
+    The first and the last value hold beyond; `rate`: their derivatives by u instead.
+    """
+    at = (np.clip(np.nan_to_num(u), -1.0, 1.0) + 1.0) * (0.5 * (count - 3))
+    first = np.minimum(at.astype(np.int64), count - 4)
+    t = at - first
+    if not rate:
+        pieces = (1.0 - t) ** 3, (3.0 * t - 6.0) * t**2 + 4.0, ((3.0 - 3.0 * t) * t + 3.0) * t + 1.0, t**3
+        return first, np.stack(pieces) / 6.0
+    pieces = -((1.0 - t) ** 2), (3.0 * t - 4.0) * t, (2.0 - 3.0 * t) * t + 1.0, t**2
+    return first, np.stack(pieces) * np.where(np.abs(u) <= 1.0, 0.25 * (count - 3), 0.0)
+
+
+def bsplines(u: Array, count: int) -> Array:
+    """Return all uniform cubic B-splines (count, n) at u (n,) in -1 .. 1."""
+    first, pieces = bspline_pieces(u, count)
+    basis = np.zeros((count, len(u)))
+    for n, piece in enumerate(pieces):
+        basis[first + n, np.arange(len(u))] = piece
+    return basis
+
+
+def profile(place: Array, start: Array, stop: Array, origin: Array, rate: Array) -> Array:
+    """Return the share of a strip's displacement at places [px] (see `RowSpline.strips`)."""
+    with np.errstate(invalid="ignore"):
+        inside = (place >= start) & (place < stop)
+        return np.asarray(np.where(inside, np.exp(-np.maximum((place - origin) * rate, 0.0)), 0.0))
+
+
+def sine_and_cosine(row: Array, period: Array) -> Array:
+    """Return the cosine and sine (2, ...) of one period [px] at rows (...) [px]; zero where the period is infinite."""
+    phase = 2.0 * np.pi * np.asarray(row) / period
+    return np.where(np.isfinite(period), np.stack([np.cos(phase), np.sin(phase)]), 0.0)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RowSpline(Frozen):
+    """A displacement of image points: where a point is seen, less where a model without it projects it.
+
+    Parameters
+    ----------
+    coeffs : (M, 2)
+        Coefficients of uniform cubic B-splines over the rows, (col, row) [px]; M = 0: none, else at least 4.
+    row_offset, row_scale : float, middle row, and rows from there to the ends of the knots [px]
+    edges : (C,), columns at which another detector begins [px], ascending
+    steps : (C + 1, 2), displacement of each detector, (col, row) [px]; without any detector (0, 2)
+    strips : (M, 5)
+        Displaced strips: axis (0: columns, 1: rows), first and last place, and origin and rate of their fading,
+        exp(-(x - origin) rate) [px, 1/px]; rate 0: none. They may overlap.
+    moved : (M, 2), displacement of each strip, (col, row) [px]; of one that fades, at its origin
+    periods : (M,), periods of the swings of all rows [px]
+    swings : (M, 2, 2), amplitudes of cosine and sine of 2 pi row / period, (col, row) [px]
+    """
+
+    coeffs: Array
+    row_offset: float = 0.0
+    row_scale: float = 1.0
+    edges: Array = field(default_factory=lambda: np.zeros(0))
+    steps: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    strips: Array = field(default_factory=lambda: np.zeros((0, 5)))
+    moved: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    periods: Array = field(default_factory=lambda: np.zeros(0))
+    swings: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
+
+    def __post_init__(self) -> None:
+        shapes = (("coeffs", (None, 2)), ("edges", (None,)), ("steps", (None, 2)), ("strips", (None, 5)))
+        further = ("moved", (None, 2)), ("periods", (None,)), ("swings", (None, 2, 2))
+        for name, shape in (*shapes, *further):
+            self._array(name, shape, RpcError)
+        fine = np.isin(self.strips[:, 0], (0.0, 1.0)).all()
+        if len(self.strips) != len(self.moved) or not fine:
+            raise RpcError("strips: each has an axis (0 or 1), two ends, an origin, a rate and a displacement")
+        if len(self.periods) != len(self.swings) or not (self.periods > 0).all():
+            raise RpcError("swings: each has a period above 0 and what its cosine and sine move")
+        if 0 < len(self.coeffs) < 4:
+            raise RpcError(f"a cubic spline has at least 4 coefficients, found {len(self.coeffs)}")
+        if len(self.steps) != (len(self.edges) + 1) * bool(len(self.edges)) or (np.diff(self.edges) <= 0).any():
+            raise RpcError("detectors: their edges ascend, and there is one detector more than edges")
+        if not (np.isfinite(self.row_offset) and np.isfinite(self.row_scale) and self.row_scale > 0):
+            raise RpcError(f"spline rows: offset {self.row_offset}, scale {self.row_scale}")
+
+    @property
+    def spacing(self) -> float:
+        """Rows between knots [px]; NaN without a spline."""
+        return 2.0 * self.row_scale / (len(self.coeffs) - 3) if len(self.coeffs) else np.nan
+
+    def at(self, image: Array) -> Array:
+        """Return the displacement (..., 2) [px] of points seen at image points (..., 2) [px]."""
+        out = self._along(image[..., 1], rate=False)
+        if len(self.steps):
+            out += self.steps[np.searchsorted(self.edges, image[..., 0], side="right").clip(0, len(self.edges))]
+        for strip, moved in zip(self.strips, self.moved, strict=True):
+            out += profile(image[..., int(strip[0])], *strip[1:])[..., None] * moved
+        for period, moves in zip(self.periods, self.swings, strict=True):
+            out += np.moveaxis(sine_and_cosine(image[..., 1], period), 0, -1) @ moves
+        return np.where(np.isfinite(image).all(axis=-1, keepdims=True), out, np.nan)
+
+    def apply(self, image: Array) -> Array:
+        """Return where points that a model without it has at (..., 2) [px] are seen."""
+        return fixed_point(lambda seen: image + self.at(seen), image)
+
+    def linearised(self, image: Array) -> tuple[Array, Array]:
+        """Return the same, and its derivative (..., 2, 2): the row moves the spline, and the spline the row."""
+        seen = self.apply(image)
+        rate = self.rate(seen[..., 1])
+        slope = np.broadcast_to(np.eye(2), (*image.shape, 2)).copy()
+        slope[..., 1] += rate / (1.0 - rate[..., 1:])
+        return seen, slope
+
+    def undo(self, image: Array) -> Array:
+        """Return where a model without it has points that are seen at (..., 2) [px]."""
+        return image - self.at(image)
+
+    def rate(self, row: Array) -> Array:
+        """Return its derivative by the row (..., 2) [px/px] at rows (...) [px]."""
+        out = self._along(row, rate=True) / self.row_scale
+        for (axis, start, stop, origin, rate), moved in zip(self.strips, self.moved, strict=True):
+            if axis == 1.0:
+                fading = ((row - origin) * rate > 0.0) * rate
+                out -= (profile(row, start, stop, origin, rate) * fading)[..., None] * moved
+        for period, (by_cos, by_sin) in zip(self.periods, self.swings, strict=True):
+            cos, sin = sine_and_cosine(row, period)[..., None] * (2.0 * np.pi / period)
+            out += cos * by_sin - sin * by_cos
+        return out
+
+    def _along(self, row: Array, rate: bool) -> Array:
+        u = (np.asarray(row, dtype=np.float64) - self.row_offset) / self.row_scale
+        if not len(self.coeffs):
+            return np.zeros((*u.shape, 2))
+        first, pieces = bspline_pieces(u.ravel(), len(self.coeffs), rate)
+        out = sum(piece[:, None] * self.coeffs[first + n] for n, piece in enumerate(pieces))
+        return np.asarray(out).reshape(*u.shape, 2)
+
+
+@dataclass(frozen=True)
+class Splined(Displaced):
+    """`sensor`, usually P_BA, with its image points displaced by a spline, steps and swings; itself a `SensorModel`."""
+
+    correction: RowSpline  # what is added to its image points
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CorrectionGrid(Frozen):
+    """Displacements (dcol, drow) over an image, linear between the nodes and constant beyond them.
+
+    Parameters
+    ----------
+    cols, rows : (W,), (H,), nodes [px], evenly spaced and ascending; (0, 0) is the centre of the top-left pixel
+    shift : (H, W, 2), what is added to the image point of the RPC to get the true one [px]
+    """
+
+    cols: Array
+    rows: Array
+    shift: Array
+    _linear: RegularGridInterpolator = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        for name in ("cols", "rows"):
+            axis = self._array(name, (None,), RpcError)
+            if len(axis) < 2 or not (np.diff(axis) > 0).all():
+                raise RpcError(f"correction grid: {name} must ascend")
+        shift = self._array("shift", (len(self.rows), len(self.cols), 2), RpcError)
+        from scipy.interpolate import RegularGridInterpolator  # a quarter of a second, of grids alone
+
+        self._keep("_linear", RegularGridInterpolator((self.rows, self.cols), shift, bounds_error=False))
+
+    @classmethod
+    def between(
+        cls, rpc: SensorModel, model: SensorModel, size: tuple[int, int], alt: float, tolerance: float = LINEAR
+    ) -> CorrectionGrid:
+        """Return what takes image points of `rpc` to those of `model`, for ground of one altitude [m].
+
+        Linear interpolation misses by no more than `tolerance` [px]. RpcError where a camera sees no ground.
+        """
+
+        def lacking(points: Array) -> Array:
+            return model.project(rpc.localize(points, np.full(points.shape[:-1], alt))) - points
+
+        low, high = np.full(2, -0.5), np.asarray(size) - 0.5
+        cols, rows = linear_axes(lacking, low, high, np.array(LONGEST[:2]), tolerance)
+        nodes = np.stack(np.meshgrid(cols, rows), axis=-1)
+        return cls(cols, rows, lacking(nodes).astype(np.float32).astype(np.float64))
+
+    def at(self, image: Array) -> Array:
+        """Return the displacements (..., 2) [px] at image points (..., 2) [px] of the RPC; NaN at NaN."""
+        low, high = np.array([(axis[0], axis[-1]) for axis in (self.cols, self.rows)]).T
+        inside = np.clip(image, low, high)[..., ::-1]
+        return np.asarray(self._linear(inside)).reshape(inside.shape)
+
+    def apply(self, image: Array) -> Array:
+        """Return the true image points (..., 2) [px] of those of the RPC (..., 2) [px]."""
+        return np.asarray(image + self.at(image))
+
+    def linearised(self, image: Array) -> tuple[Array, Array]:
+        """Return the same, and its derivative (..., 2, 2), over a tenth of a cell around the image points."""
+        reach = 0.05 * np.array([self.cols[1] - self.cols[0], self.rows[1] - self.rows[0]])
+        by_axis = [(self.apply(image + step) - self.apply(image - step)) / (2 * step.sum()) for step in np.diag(reach)]
+        return self.apply(image), np.stack(by_axis, axis=-1)
+
+    def undo(self, image: Array) -> Array:
+        """Return the image points (..., 2) [px] of the RPC that belong to true ones."""
+        return fixed_point(lambda of_rpc: image - self.at(of_rpc), image)
+
+
+@dataclass(frozen=True)
+class GridCorrected(Displaced):
+    """`sensor`, an RPC, and what it lacks; itself a `SensorModel`."""
+
+    correction: CorrectionGrid  # what is added to its image points
