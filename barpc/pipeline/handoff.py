@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import errno
 import json
-import shutil
+import sys
 import tempfile
+import uuid
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from html import escape
 from importlib import import_module
 from importlib.util import find_spec
@@ -240,7 +241,7 @@ def _transformer(rpcs: Any) -> Projection:
     return project
 
 
-def _gdal_raster(path: Path) -> Projection:
+def _gdal_raster(path: Path | str) -> Projection:
     with warnings.catch_warnings(), rasterio.Env(**GDAL_OPTIONS):
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with rasterio.open(path) as dataset:
@@ -250,13 +251,11 @@ def _gdal_raster(path: Path) -> Projection:
 
 
 def _gdal_text(path: Path) -> Projection:
-    """Return GDAL reads text only beside an image: one of a single pixel is lent to it."""
+    """Return what GDAL reads of a text, which it does only beside an image: one of a single pixel, both in memory."""
     stem = path.name[: -len("_rpc.txt")] if path.name.lower().endswith("_rpc.txt") else path.stem
-    with tempfile.TemporaryDirectory() as folder:
-        image = Path(folder) / f"{stem}.tif"
-        image.write_bytes(_pixel())
-        shutil.copy(path, folder)
-        return _gdal_raster(image)
+    lend = partial(rasterio.MemoryFile, dirname=uuid.uuid4().hex)
+    with lend(path.read_bytes(), filename=path.name), lend(_pixel(), filename=f"{stem}.tif") as image:
+        return _gdal_raster(image.name)
 
 
 @cache
@@ -283,10 +282,25 @@ def _shareloc(path: Path) -> Projection:
 
     def project(ground: Array) -> Array:
         lon = wrap_longitude(ground[:, 0], model.offset_x)  # it adds no whole turns
-        row, col, _ = model.inverse_loc(lon, *np.ascontiguousarray(ground.T[1:]))
+        with _alone():
+            row, col, _ = model.inverse_loc(lon, *np.ascontiguousarray(ground.T[1:]))
         return _told(np.column_stack([col, row]), lon) - 0.5  # its first pixel's centre is (0.5, 0.5)
 
     return project
+
+
+@contextmanager
+def _alone() -> Iterator[None]:
+    """Keep numba, if a reader has it, to one thread: others wait for their part of few points longer than they work."""
+    if (numba := sys.modules.get("numba")) is None:
+        yield
+        return
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
 
 
 def _told(found: Array, lon: Array) -> Array:

@@ -9,6 +9,7 @@ its derivatives, for one view here and for blocks of views in the adjustment.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -149,8 +150,12 @@ class Correction(Frozen):
         back = (ecef - self.center).T
         if len(self.drift):
             back = Turn(self._turns(row)).back(back)
-        back = rotation_matrix(self.rotation).T @ back
+        back = self._matrix.T @ back
         return np.asarray(back.T / self.scale + self.translation + self.center)
+
+    @cached_property
+    def _matrix(self) -> Array:
+        return rotation_matrix(self.rotation)
 
     def _turns(self, row: Array) -> Array:
         """Return the drift's rotation vectors (3, n) [rad] at rows (n,) [px]."""

@@ -119,6 +119,7 @@ class Rational:
         if len(bad):
             near = np.abs(self.value(x[:, bad]) - target[:, bad]) <= self._tolerance(target[:, bad])
             bad = bad[~(near.all(axis=0) & self._regular(x[:, bad]))]  # most have arrived, out of the box or not
+        if len(bad):
             ok[bad] = self._solve_with_care(target[:, bad], x, bad)
         return x, ok
 

@@ -118,7 +118,8 @@ def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> list[
     two steps from there arrive.
     """
     counts = [len(ties.a) for ties in run.pairs]
-    picks = [np.linspace(0, n - 1, min(n, MAX_PER_PAIR)).astype(np.int64) for n in counts]
+    most = MAX_PER_PAIR
+    picks = [slice(n) if n <= most else np.linspace(0, n - 1, most).astype(np.int64) for n in counts]
     a, b, pair = _rows(run, picks)
     height = alt[run.tracks.point[a]]
     seen = np.isfinite(height)
