@@ -27,7 +27,7 @@ CONSTANTS: dict[type[Options], dict[str, tuple[str, ...]]] = {
         "sigma_drift": ("barpc.ba.estimated.priors.DRIFT_SIGMA",),
         "sigma_shift": ("barpc.ba.estimated.priors.IMAGE_SIGMA",),
         "num_passes": ("barpc.ba.robust.rounds.TRIED",),
-        "max_steps": ("barpc.ba.solving.solve.MAX_STEPS",),
+        "max_steps": ("barpc.ba.solving.solve.ITERATIONS",),
         "tolerance": ("barpc.ba.robust.rounds.TOLERANCE",),
         "min_observations": ("barpc.ba.held.block.MIN_OBSERVATIONS",),
     },

@@ -182,7 +182,7 @@ def test_a_block_leaves_what_it_knows_of_its_free_views() -> None:
 def test_a_large_block_leaves_a_sparse_matrix_that_says_the_same(monkeypatch, tmp_path) -> None:
     made = simulate_block(6, 300, seed=5)
     dense = block_prior(solve(made, fixed=("view_0001",), min_convergence=60.0))
-    monkeypatch.setattr("barpc.ba.solving.normal.DENSE_UNKNOWNS", 0)
+    monkeypatch.setattr("barpc.ba.solving.normal.LEAF", 0)
     block_prior(solve(made, fixed=("view_0001",), min_convergence=60.0)).save(tmp_path / "prior.npz")
     read = BlockPrior.load(tmp_path / "prior.npz")
     assert read.less is not None

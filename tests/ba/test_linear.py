@@ -54,7 +54,7 @@ def test_a_matrix_that_is_not_finite_is_an_adjust_error():
 
 
 def test_a_large_block_is_solved_in_sparse_form_as_in_dense_form(block, adjusted, monkeypatch):
-    monkeypatch.setattr(normal, "DENSE_UNKNOWNS", 0)
+    monkeypatch.setattr(normal, "LEAF", 0)
     sparse = adjust(block)
     assert sparse.covariance.factor.method == "multifrontal"
     np.testing.assert_allclose(sparse.params, adjusted.params, atol=1e-4)

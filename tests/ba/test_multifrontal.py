@@ -204,7 +204,7 @@ def _square(views: int) -> Block:
 def test_a_step_and_its_covariance_are_those_of_the_dense_solve(monkeypatch, views, case, ties, leaf) -> None:
     many = _square(views)
     if views < 200:
-        monkeypatch.setattr(normal, "DENSE_UNKNOWNS", 0)
+        monkeypatch.setattr(normal, "LEAF", 0)
     monkeypatch.setattr(dissection, "LEAF", leaf)
     tracks = many.tracks if ties == "all" else _weakly_tied(many, 6 if ties == "weak" else 0)
     gcps = many.gcps if ties == "all" else None
@@ -248,7 +248,7 @@ def test_a_prior_of_an_earlier_block_ties_its_views_whatever_they_share(monkeypa
     )
     both = []
     for most in (0, 10**6):
-        monkeypatch.setattr(normal, "DENSE_UNKNOWNS", most)
+        monkeypatch.setattr(normal, "LEAF", most)
         chosen = AdjustOptions(**INDEPENDENT)
         joined = join(many.views, many.tracks, None, chosen)
         problem = make_problem(joined, chosen, centers_of(many), prior)
@@ -279,7 +279,7 @@ def test_a_block_is_adjusted_as_in_dense_form(monkeypatch, options, n) -> None:
     for name in ("TOLERANCE", "STANDS"):  # both end at the minimum, not a step before it
         monkeypatch.setattr(f"barpc.ba.robust.rounds.{name}", 1e-10)
     for most in (0, 10**6):
-        monkeypatch.setattr(normal, "DENSE_UNKNOWNS", most)
+        monkeypatch.setattr(normal, "LEAF", most)
         found.append(adjust_tracks(made.views, made.tracks, chosen, dem=dem, centers=centers_of(made)))
     one, other = found
     assert [f.covariance.factor.method for f in found] == ["multifrontal", "dense"]

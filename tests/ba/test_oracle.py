@@ -139,9 +139,9 @@ def _assert_close(found: np.ndarray, expected: np.ndarray, rtol: float = 1e-5) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dense_unknowns", [900, 0])
-def test_the_reduced_system_is_the_schur_complement_of_the_whole_differenced_problem(case, monkeypatch, dense_unknowns):
-    monkeypatch.setattr(normal, "DENSE_UNKNOWNS", dense_unknowns)
+@pytest.mark.parametrize("dense_views", [100, 0])
+def test_the_reduced_system_is_the_schur_complement_of_the_whole_differenced_problem(case, monkeypatch, dense_views):
+    monkeypatch.setattr(normal, "LEAF", dense_views)
     matrix, gradient, cost = case.dense
     size = case.params.size
     reduced = case.reduced

@@ -147,7 +147,7 @@ def test_where_no_damping_however_strong_helps_it_ends(monkeypatch, gain: float,
 
 
 def test_a_cost_that_stands_is_no_failure_and_the_steps_are_counted(monkeypatch) -> None:
-    monkeypatch.setattr(solve, "MAX_STEPS", 5)
+    monkeypatch.setattr(solve, "ITERATIONS", 5)
     found, dampings = run(monkeypatch, [1.0, 1.0 + 5e-13], [0.5])
     assert isinstance(found, Minimum)
     assert dampings == [0.0] * 5

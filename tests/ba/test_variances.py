@@ -246,7 +246,7 @@ def test_variances_of_a_large_block_are_exact_where_they_are_stated_and_probed_w
     """Against the inverse of the whole matrix (9 unknowns a view), whose drifts are a hundredth of the rotations."""
     block = simulate_block(n, 20 * n, seed=1, num_checks=0)
     if n < 300:
-        monkeypatch.setattr("barpc.ba.solving.normal.DENSE_UNKNOWNS", 0)
+        monkeypatch.setattr("barpc.ba.solving.normal.LEAF", 0)
         monkeypatch.setattr("barpc.ba.solving.covariance._LARGE", 0)
     options = AdjustOptions(**({"min_convergence": 60.0} if n < 300 else {}))
     with pytest.warns(BarpcWarning, match="held in height"):  # they share an error, taken off the sparse matrix

@@ -12,12 +12,11 @@ from barpc.ba.algebra.linear import Factor
 from barpc.ba.algebra.multifrontal import Blocks
 from barpc.ba.algebra.structure import parts
 from barpc.ba.solving.normal import Reduced, solve_transposed
-from barpc.ba.usual import KEPT
+from barpc.ba.usual import FEW, KEPT
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 _LARGE = 900  # unknowns up to which the whole matrix is kept, and known exactly
-_PROBES = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +51,7 @@ class Covariance:
 
     def probed_variances(self) -> Array:
         """Estimate the variances (N, q) by random probes (Hutchinson 1990) at the cost of a few solutions:
-        each within a fifth (RMS).
+        each within a quarter (RMS).
 
         Unknowns count in units of their standard deviation where all other views stood still: a variance would
         drown in those of others that are a hundred times as large.
@@ -60,7 +59,7 @@ class Covariance:
         q = self.num_unknowns
         views, unit = np.flatnonzero(self.free[::q]), np.ones((len(self.free) // q, q))
         unit[views] = np.sqrt(np.linalg.inv(self.reduced.of_views()[views]).diagonal(axis1=1, axis2=2))
-        random = np.random.default_rng(unit.size).integers(0, 2, (unit.size, _PROBES))
+        random = np.random.default_rng(unit.size).integers(0, 2, (unit.size, FEW))
         probes = np.where(random > 0, 1.0, -1.0)
         found = (probes * self.solve(probes / unit.reshape(-1, 1))).mean(axis=1)
         return np.asarray(found.reshape(-1, q) * unit)

@@ -21,9 +21,8 @@ from barpc.ba.estimated.priors import PointPrior
 from barpc.base.geodesy import CHUNK, Array
 from barpc.scene import BoolArray, IntArray
 
-DENSE_UNKNOWNS = 9 * LEAF  # up to so many camera unknowns (a front) the reduced matrix is a plain array
-
-TRIANGLE = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))  # order of the elements of symmetric 3x3 matrices
+TRIANGLE = tuple((i, j) for j in range(3) for i in range(j, 3))
+"""Order of the elements of symmetric 3x3 matrices."""
 
 
 @dataclass(frozen=True)
@@ -295,6 +294,6 @@ def _pair_blocks(structure: Structure, cross: Array) -> Array:
 
 
 def _assemble(structure: Structure, diagonal: Array, pairs: Array) -> Matrix:
-    n, q, _ = diagonal.shape
+    """Return the reduced matrix: a plain array of so few views that they are one front anyway."""
     blocks = Blocks(diagonal, pairs, structure.pair_view)
-    return blocks.plain() if n * q <= DENSE_UNKNOWNS else blocks
+    return blocks.plain() if len(diagonal) <= LEAF else blocks

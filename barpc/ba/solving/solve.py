@@ -20,17 +20,14 @@ from barpc.ba.estimated.projected import Projected
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import Reduced
 from barpc.ba.solving.problem import Problem
+from barpc.ba.usual import ITERATIONS, SLIGHT
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)
 
-MAX_STEPS = 30  # linearisations of one solve, at most
 TOLERANCE = 1e-6  # a solve ends when a step would lower the cost by less than this fraction
-_XTOL = 1e-12
-_ROUNDING = 1e-9  # a cost does not fall any more where the step promises less than this fraction
-_LOST = 1e-6  # nor where it promises less than this one, and no damping however strong makes it fall
 
 
 @dataclass(frozen=True)
@@ -156,7 +153,7 @@ def _levenberg_marquardt(
     damping, before = 0.0, np.inf
     reduced = problem.reduce(state.params, state.points, weight, projected)
     state = replace(state, cost=_finite(reduced.cost), history=(*state.history, reduced.cost))
-    for _ in range(MAX_STEPS):
+    for _ in range(ITERATIONS):
         try:
             step, gain, factor = camera_step(problem, reduced, damping)
         except np.linalg.LinAlgError:
@@ -179,12 +176,13 @@ def _levenberg_marquardt(
             damping = damping / 10.0 if damping > 1e-8 else 0.0
             continue
         reduced = problem.reduce(state.params, state.points, weight)
-        if gain <= (_ROUNDING if damping < 1e8 else _LOST) * state.cost:
+        # a cost does not fall any more where so little is promised, or what is tolerated and no damping makes it fall
+        if gain <= TOLERANCE * (SLIGHT if damping < 1e8 else 1.0) * state.cost:
             return Minimum(state, reduced, status=_status(state, "what a step gains is lost in rounding"))
         if damping >= 1e8:
             raise AdjustError(f"no step lowers the cost {state.cost:.6g}: the solution is not usable")
         damping = max(10.0 * damping, 1e-6)
-    _LOG.warning("the adjustment did not settle in %d steps", MAX_STEPS)
+    _LOG.warning("the adjustment did not settle in %d steps", ITERATIONS)
     return Minimum(state, reduced, status=_status(state, "the number of steps is used up"))
 
 
@@ -251,12 +249,12 @@ def _scipy(problem: Problem, state: State, weight: Array, tolerance: float, proj
         method="trf",
         x_scale=10.0 * (1.0 + float(np.linalg.norm(compressed.whitened))),  # no first step cut short
         ftol=tolerance,
-        xtol=_XTOL,
+        xtol=None,
         gtol=np.sqrt(tolerance),  # of whitened unknowns: a thousandth of a standard deviation for a millionth
-        max_nfev=MAX_STEPS,
+        max_nfev=ITERATIONS,
     )
     if not found.success:
-        _LOG.warning("the adjustment did not settle in %d steps", MAX_STEPS)
+        _LOG.warning("the adjustment did not settle in %d steps", ITERATIONS)
     compressed.at(found.x)
     _finite(compressed.state.cost)
     status = f"scipy least_squares, {found.nfev} evaluations: {found.message.rstrip('.')}"
