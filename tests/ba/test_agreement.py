@@ -97,6 +97,7 @@ def test_the_right_points_are_used_and_no_other(count, wrong, size, least) -> No
     assert exact >= (least if count < 9 else 4)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("count", "moved"), rest_slow(starmap(pytest.param, [(2, 1), (4, 2), (6, 3), (12, 6)]), keep=3)
 )
