@@ -28,11 +28,12 @@ def every(mutation) -> list[Any]:
 
 
 def test_every_listed_mutant_has_its_place_and_its_tests(mutation) -> None:
+    tests = mutation.parts()
     for mutant in mutation.chosen():
         before, after = mutant.source()
         assert before != after
         compile(after, mutant.file, "exec")
-        assert mutation.parts()[mutant.part]
+        assert tests[mutant.part]
 
 
 @pytest.mark.slow

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 
+from barpc import simulate
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
+from barpc.fit import fit_rpc
 from barpc.simulate import Block, simulate_block
 from tests.constants import chosen
 
@@ -25,6 +29,14 @@ def solve(block: Block, **options: Any) -> Adjustment:
     hold_out = options.pop("hold_out", True)
     with chosen(AdjustOptions, **{**INDEPENDENT, **options}) as given:
         return adjust_tracks(block.views, block.tracks, given, centers=centers_of(block), hold_out=hold_out)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _delivered() -> Iterator[None]:
+    """The RPC that a simulated camera is delivered with is fitted once, in whichever blocks it flies."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulate, "fit_rpc", cache(fit_rpc))
+        yield
 
 
 @pytest.fixture(scope="session")

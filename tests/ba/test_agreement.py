@@ -97,6 +97,7 @@ def test_the_right_points_are_used_and_no_other(count, wrong, size, least) -> No
     assert exact >= (least if count < 9 else 4)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("count", "moved"), rest_slow(starmap(pytest.param, [(2, 1), (4, 2), (6, 3), (12, 6)]), keep=3)
 )
@@ -110,6 +111,7 @@ def test_two_sets_of_equal_weight_are_both_said_and_none_is_used(count, moved) -
         assert 2 * min(first.sum(), second.sum()) >= moved
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(("count", "moved"), rest_slow(starmap(pytest.param, [(9, 4), (5, 2), (12, 4), (30, 9)])))
 def test_the_larger_set_is_used_and_the_others_are_told_to_agree(count, moved) -> None:
@@ -305,6 +307,7 @@ def test_control_that_passes_as_agreeing_and_tears_the_images_is_let_go(what, mo
     assert "0 of 6 GCPs that are seen hold the block." in decisions(summary)
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("pixels", [1.0, 10.0])
 def test_control_marked_beside_itself_in_one_image_does_not_move_it(pixels) -> None:

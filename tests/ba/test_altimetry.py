@@ -74,7 +74,7 @@ def test_motions_are_those_that_are_reported():
     np.testing.assert_array_equal(moves[1] @ [0, 0, 0, 0, 0, 0, 1], [1, 2, 0])
 
 
-@pytest.mark.landing(2)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "seeds"), rest_slow(starmap(pytest.param, product([0.4, 0.0], [range(3), range(3, 6)])))
@@ -142,6 +142,7 @@ def test_slopes_that_are_noise_know_no_place():
     assert found.share == pytest.approx(0.8, abs=0.1)
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", rest_slow([range(2), range(2, 6)]), ids=str)
 def test_noise_that_neighbours_share_is_no_knowledge(seeds: range):

@@ -42,6 +42,7 @@ def likeliest(z: np.ndarray, logits: tuple[float, ...] = (-2.0, 0.0, 2.0)) -> tu
     return min(part, 1 - part), abs(found.x[2] - found.x[1]), float(gain)
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("share", "apart"),

@@ -68,6 +68,7 @@ def _parts_nothing_that_is_tied(order: Dissection, pairs: np.ndarray, n: int) ->
     assert all(j in known[order.owner[i]] for i, j in zip(early.tolist(), late.tolist(), strict=True))
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("kind", KINDS)
 def test_graphs_of_every_kind_are_cut_soundly(kind) -> None:
     rng = np.random.default_rng(KINDS.index(kind))
@@ -79,6 +80,7 @@ def test_graphs_of_every_kind_are_cut_soundly(kind) -> None:
     _parts_nothing_that_is_tied(order, pairs, n)
 
 
+@pytest.mark.landing(4)
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", rest_slow(range(25), mark=pytest.mark.nightly))
 @pytest.mark.parametrize("kind", KINDS[:8])

@@ -58,6 +58,7 @@ def test_splines_are_as_many_as_asked_for_or_ever_more(options, waves, counts) -
     assert _spline_counts(views_of(3000, 3000, 3000), AdjustOptions(**options), waves) == counts
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("counts", "expected"),
     [

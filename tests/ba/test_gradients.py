@@ -63,7 +63,7 @@ def _setup(views, model, drift, ecef, scale=5.0):
     return Cameras(views, unknowns, seen), params, bounds
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("model", "drift"), MODELS)
 def test_tie_observations_have_the_derivatives_of_central_differences(views, ecef, model, drift):
     cameras, params, bounds = _setup(views, model, drift, ecef)
@@ -80,6 +80,7 @@ def test_tie_observations_have_the_derivatives_of_central_differences(views, ece
         np.testing.assert_allclose(found.by_point[:, axis], high - low, rtol=0, atol=2e-6)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(("model", "drift"), MODELS)
 def test_views_together_project_like_each_corrected_sensor_alone(views, ecef, model, drift):
     cameras, params, bounds = _setup(views, model, drift, ecef)

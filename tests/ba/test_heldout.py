@@ -242,6 +242,7 @@ def test_squares_are_to_be_less_by_three_standard_deviations_of_chance(deviation
     assert compared(own, other, (0.9, noise)) == better
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("wrong", [0.0, 0.1, 0.3, 0.5])
 @pytest.mark.parametrize("freedom", [1.0, 2.0])
 def test_wrong_matches_do_not_change_how_right_ones_scatter(freedom: float, wrong: float) -> None:

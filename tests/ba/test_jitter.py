@@ -108,11 +108,18 @@ def test_all_errors_together_with_detectors_found_and_given():
 
 @pytest.mark.nightly
 def test_what_robust_rounds_would_let_go_is_followed():
+    """Without jitter a part of a view is cut, though no tie is wrong. How large a part says nothing: robust rounds that
+    end with 4 %, 10 % or 19 % cut leave the cameras 0.80, 0.84 or 0.83 px off.
+    """
     found, after = solved("all", 14)
     off, without = solved("all", 14, jitter="off")
-    rows = scene("all", 14).tracks.view == 0
-    assert 0.9 < (off.inlier | off.held_out)[rows].mean() < 0.99  # right as they are, and few are cut
-    assert 0.9 < (found.inlier | found.held_out)[rows].mean() <= 1.0
+    made = scene("all", 14)
+    assert not made.bad.any()
+    rows = made.tracks.view == 0
+    stays, kept = off.inlier | off.held_out, found.inlier | found.held_out
+    assert 0.75 < stays[rows].mean() < 0.99
+    assert 0.9 < kept[rows].mean() <= 1.0
+    assert kept[rows & ~stays].mean() > 0.5
     assert 0.01 < after.across < 0.04 < 0.5 < without.across
 
 
@@ -147,15 +154,13 @@ def test_detectors_are_found_where_they_begin(tracks):
     assert after.across < 0.05 < 0.1 < off.across
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "seeds"),
     [
         ("drift 3", (0,)),
-        *(
-            pytest.param(name, (0, 1), marks=pytest.mark.slow)
-            for name in ("no drift", "drift 3", "distortion 0.1 px", "no drift, 10 % outliers")
-        ),
+        *((name, (0, 1)) for name in ("no drift", "drift 3", "distortion 0.1 px", "no drift, 10 % outliers")),
     ],
 )
 def test_nothing_is_found_where_nothing_is(name, seeds):

@@ -137,6 +137,7 @@ def swung(views: int, tracks: int, px: float, period: float, view: int = 1, seed
     return block, replace(block.tracks, xy=block.tracks.xy + moved[:, None] * np.array([0.8, 0.6]))
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("size", rest_slow([(0.15, 200.0), (0.08, 200.0), (0.15, 60.0), (0.3, 600.0)]), ids=str)
 def test_rows_that_swing_are_named_with_their_period_and_followed(size: tuple[float, float]) -> None:
@@ -174,6 +175,7 @@ def test_of_a_pair_a_swing_is_that_of_one_or_of_either() -> None:
     assert np.nanmax(found.held_out_rms) < 0.1
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_a_swing_below_the_floor_is_none(seed: int) -> None:

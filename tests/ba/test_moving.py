@@ -204,6 +204,7 @@ def test_rows_of_which_more_ties_move_than_stand_are_told() -> None:
 CASES = [(2, 0.2, 2.0, 1, 0.02), (3, 0.25, 6.0, 3, 0.1), (3, 0.35, 2.0, 0, 0.02), (4, 0.45, 1.5, 2, 0.05)]
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("case", rest_slow(CASES, keep=2, mark=pytest.mark.nightly), ids=str)
 def test_a_cloud_is_named_and_the_scene_is_as_without_it(case: tuple[int, float, float, int, float]) -> None:
@@ -229,6 +230,7 @@ def test_a_cloud_is_named_and_the_scene_is_as_without_it(case: tuple[int, float,
     assert np.isfinite(found.residuals[found.moving]).all()
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_vehicles_are_no_group(seed: int) -> None:

@@ -53,6 +53,7 @@ def _work(order: Dissection) -> int:
     return sum(len(f.pivots) * (len(f.pivots) + len(f.border)) ** 2 for f in order.fronts)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("sites", "leaf", "kept"),
     diagonal([(4, 15, 1), (7, 6, 3), (60, 1, 2), (1, 1, 1)], [7, 1, 32, 1000], [0.0, 1e9]),

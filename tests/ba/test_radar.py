@@ -179,6 +179,7 @@ def found(slc: Scene) -> Adjustment:
     return adjust_tracks(slc.views, slc.tracks())
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 def test_a_moved_orbit_is_followed_by_clocks_as_well_as_by_an_attitude(request, scene: Scene) -> None:
     known = scene is request.getfixturevalue("slc")
@@ -198,6 +199,7 @@ def test_a_moved_orbit_is_followed_by_clocks_as_well_as_by_an_attitude(request, 
     assert 0.9 < clocks.noise < 1.2
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "alone"), diagonal(["PFA", "slc"], [False, True]))
 def test_reflectors_seen_by_the_radar_alone_tell_both_offsets(kind, alone, tmp_path) -> None:

@@ -62,6 +62,7 @@ def small():
 MODELS = ("rotation", "translation", "rotation+translation")
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "model"),
@@ -189,6 +190,7 @@ def test_image_models_correct_what_they_can(model, bound):
     assert small.held_out_rms([v.sensor for v in small.views]) > 3 * small.held_out_rms(list(found.sensors))
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("tracks", "seeds"),

@@ -40,6 +40,7 @@ def median(found, value):
     return float(np.median([value(v) for v in found]))
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "across", "shape", "seeds"),
@@ -111,6 +112,7 @@ def test_priors_that_hold_are_left_as_they_are():
     assert np.max(scales) < 1.5
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", [(0, 200.0, 0.0), (1, 200.0, 0.0), (0, 0.0, 800.0), (2, -200.0, 100.0)])
 def test_one_wrong_rpc_of_three_is_named_and_the_place_of_the_scene_still_covered(wrong):
@@ -143,6 +145,7 @@ def test_forty_percent_of_a_view_moved_together_is_left_out():
         assert (offset < [0.5, 0.5, 5.0]).all()  # 7 m without: pairs of delivered cameras meet at many heights
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", ONE_OR_ALL)
 def test_a_pair_whose_tie_points_fall_into_two_groups_says_so(seeds):
@@ -213,6 +216,7 @@ def test_what_is_stated_of_weak_heights_is_as_large_as_it_is(angle):
     assert 0.5 < np.sqrt((said**2).mean() / (true**2).mean()) < 2.0
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::barpc.BarpcWarning")
 @pytest.mark.parametrize(
@@ -225,6 +229,7 @@ def test_heights_of_a_dem_are_wrong_together(bias, seeds):
     assert (said < 25.0).all()
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("bias", [-30.0, 30.0])
 def test_a_dem_that_holds_a_good_block_is_not_believed_to_the_centimetre(bias):

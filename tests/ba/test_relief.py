@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -195,11 +195,15 @@ def test_bends_are_a_level_two_slopes_and_what_is_curved() -> None:
 
 @pytest.mark.landing(1)
 @pytest.mark.slow
-@pytest.mark.parametrize("hills", [False, True])
-def test_a_dem_with_waves_places_a_scene_as_well_as_it_is_said_to(hills: bool) -> None:
+@pytest.mark.parametrize(
+    ("hills", "seeds"),
+    [(False, (4, 6, 8, 12, 18, 20)), (False, range(0, 24, 2)), (True, range(1, 24, 2))],
+    ids=["the half of plains that is quick", "plains", "hills"],
+)
+def test_a_dem_with_waves_places_a_scene_as_well_as_it_is_said_to(hills: bool, seeds: Sequence[int]) -> None:
     """Twelve draws; before, errors over what was said were 3.8 (plains) and 3.0 (hills), RMS, at worst 8.9."""
     over, off, delivered = [], [], []
-    for seed in range(int(hills), 24, 2):
+    for seed in seeds:
         world = make("dem", seed)
         found = adjust_tracks(
             world.views, world.tracks, AdjustOptions(dem_sigma=5.0, dem_bias_sigma=2.0), dem=world.dem

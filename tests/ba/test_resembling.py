@@ -81,6 +81,7 @@ def without(smooth: Smooth) -> Smooth:
     return bare
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("apart", rest_slow([11, 23, 8], keep=2))
 def test_noise_that_templates_share_is_no_jitter(view, apart):

@@ -49,6 +49,7 @@ def test_a_control_point_that_contradicts_is_said_to() -> None:
     assert [tested.status(g) for g in range(3)] == ["used", "contradicts", "rejected"]
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", ONE)
 @pytest.mark.parametrize(

@@ -97,6 +97,7 @@ def test_some_trials_agree_with_the_prediction(tracks, count):
     assert trials.nees.mean() / trials.unknowns == pytest.approx(1.0, abs=4 * spread)
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("views", "tracks", "count", "near"),

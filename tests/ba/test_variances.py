@@ -320,6 +320,7 @@ def test_priors_that_hold_have_a_ratio_of_one_and_stand(seeds: int) -> None:
     assert 6 < np.mean(freedom) < 14
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "seeds"), [(3.0, 3), *(pytest.param(wrong, 5, marks=pytest.mark.slow) for wrong in (3.0, 10.0))]

@@ -153,6 +153,7 @@ def test_an_existing_folder_needs_overwrite(crops, tmp_path):
     assert (tmp_path / "out/notes.txt").read_text() == "mine"
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow  # before a commit: what is matched in them, in tests/tie/test_simulated
 @pytest.mark.parametrize("kind", ["float32", "uint8", "int16", "uint16 with nan bands"])
 def test_pixel_types_and_bands(tmp_path, kind):

@@ -27,8 +27,7 @@ pytestmark = pytest.mark.slow
 def run(shared_data, tmp_path_factory):
     images = sorted((shared_data / "optical" / "phr_triplet_north").glob("*.tif"))
     out = tmp_path_factory.mktemp("triplet") / "run"
-    adjust(images, out)
-    return images, out
+    return images, out, adjust(images, out)
 
 
 @pytest.fixture(scope="module")
@@ -88,9 +87,7 @@ def test_the_command_says_what_it_made(copied, tmp_path, capsys):
 
 def test_what_the_cameras_leave_of_a_height_is_what_their_adjustment_says(run):
     """Of the run's folder alone as of the adjustment that wrote it: the pair's absolute sigma at its tie points."""
-    images, folder = run
-    adjustment = adjust(images, folder.parent / "again").adjustment
-    block = block_of_run(folder)
+    adjustment, block = run[2].adjustment, block_of_run(run[1])
     assert block.errors is not None
     points = adjustment.points[np.isfinite(adjustment.points[:, 0])][::20]
     stated = block.errors.sigma(block.errors.rows([[(0, 2)]], ground_from_ecef(points)))

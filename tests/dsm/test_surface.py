@@ -123,6 +123,7 @@ def test_three_views_are_better_than_two_and_say_so(rendered, tmp_path):
     assert three.sigma < one.sigma
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "scene",

@@ -104,6 +104,7 @@ def test_satnerf_files_hold_what_its_loader_reads(run_dir, tmp_path):
         assert len(rings) == (2 if abs(one["geojson"]["center"][0]) > 100 else 1)
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("run_dir", rest_slow(["on_date_line", "southern"]), indirect=True)
 def test_colmap_s_pinholes_are_as_near_as_they_say(run_dir, tmp_path):

@@ -38,6 +38,7 @@ def fitted(name: str) -> RpcFit:
     return fit_rpc(*hard()[name], strict=False)
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*rest_slow(EASY, keep=2), *rest_slow(HARD, keep=0, mark=pytest.mark.nightly)])
 def test_the_largest_error_certified_is_that_of_a_hundred_thousand_points(name):
@@ -54,6 +55,7 @@ def test_the_largest_error_certified_is_that_of_a_hundred_thousand_points(name):
     assert fit.min_denominator > 0.1
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("width", "at"),
@@ -71,6 +73,7 @@ def test_a_bump_of_a_fortieth_of_the_image_is_found_wherever_it_is(width, at):
     assert fit.max_ckp[1] < 1e-6
 
 
+@pytest.mark.landing(3)
 @pytest.mark.slow
 @pytest.mark.parametrize("cycles", rest_slow([11.0, 0.7, 0.25, 3.0, 23.0, 60.0]))
 def test_waves_over_the_rows_are_seen_at_their_height(cycles):
@@ -137,6 +140,7 @@ def best_possible(name: str, axis: int, start: RPC) -> float:
     return min(found)
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [*rest_slow(EASY[:2]), *rest_slow([*EASY[2:], *HARD], keep=0, mark=pytest.mark.nightly)]

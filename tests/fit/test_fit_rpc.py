@@ -78,6 +78,7 @@ def test_every_grid_reaches_the_rounding_of_coordinates(camera: Camera, space: s
     assert fit.coverage == 1.0
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 def test_the_error_does_not_grow_with_the_area(some_vendors: list[Camera]) -> None:
     for camera in some_vendors:

@@ -120,6 +120,7 @@ def test_given_points_have_one_too_across_the_antimeridian_and_with_noise(lon: f
 # --- the least largest error --------------------------------------------------------------------------------
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "gain"),

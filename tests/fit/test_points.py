@@ -34,6 +34,7 @@ def test_exact_points_give_an_exact_rpc(camera: Camera, points: tuple[Array, Arr
     assert 0.9 < fit.coverage <= 1.0
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "factor"),

@@ -35,6 +35,7 @@ def test_tie_points_from_a_file_give_the_same_answer(known, matched, tmp_path):
     np.testing.assert_array_equal(*runs)
 
 
+@pytest.mark.slow  # before a commit: the same tie points from a table, and ASP's in tests/pointio
 @WHOLE_AT_NIGHT
 def test_asp_text_matches_hold_the_same_tie_points(matched):
     result, out = matched

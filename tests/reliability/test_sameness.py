@@ -72,6 +72,7 @@ def images_of(scene: Path, way: str) -> list[Path]:
     return [*sorted(scene.glob("view_*.tif")), *([scene / "bad.tif"] if way == "a bad file" else [])]
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "way", [pytest.param(way, marks=SELDOM[way]) if way in SELDOM else way for way in ways(Path())]

@@ -111,6 +111,7 @@ def test_an_object_that_is_replaced_while_it_is_read_is_noticed(store: Store) ->
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("url", "hosts", "said"),
     [

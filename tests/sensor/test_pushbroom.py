@@ -210,6 +210,7 @@ def test_a_camera_from_sampled_ephemeris_and_quaternions_is_the_camera_that_was_
     assert np.abs(again.project(again.localize(image, alt)) - image).max() < 2e-8
 
 
+@pytest.mark.few(2)
 def test_a_shaking_attitude_still_inverts(sensor, points):
     """Jitter of half a pixel at 20 Hz, sampled at 500 Hz: forward and back to 1e-7 px, derivative exact."""
     ticks = np.arange(*sensor.time(np.array([-2000.0, 22000.0])), 1 / 500)

@@ -101,7 +101,7 @@ def test_a_pixel_sees_what_lies_on_its_ray(case: str) -> None:
     np.testing.assert_array_equal(model.position(image[:, 1]), origin)
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("light", list(BENT))
 @each
 def test_the_derivative_is_the_central_difference_of_the_projection(case: str, light: str) -> None:

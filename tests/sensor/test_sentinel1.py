@@ -652,6 +652,7 @@ def test_incidence_angles_are_those_of_the_grid(shared_data: Path, stamp: str) -
     assert np.abs(np.rad2deg(np.arccos(cosine)) - stated).max() <= 1e-4
 
 
+@pytest.mark.landing(3)
 @pytest.mark.slow
 @pytest.mark.parametrize("stamp", rest_slow([*SLC[:1], "20211223t051122", *SLC[1:]], keep=2))
 def test_an_independent_tool_finds_the_same_image_points(shared_data: Path, stamp: str) -> None:

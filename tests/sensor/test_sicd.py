@@ -39,7 +39,7 @@ def model_of(tmp_path):
     return make
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # sarkit's own
 @pytest.mark.parametrize(("kind", "side"), CASES)
 def test_pixels_lie_where_another_implementation_says(kind, side, tmp_path):
@@ -120,6 +120,7 @@ def test_a_part_of_an_image_and_a_nitf_are_read_as_they_are(kind, tmp_path, mode
     assert camera.alt_range == pytest.approx((-880.0, 1120.0), abs=1e-3)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_namespace_with_a_prefix_changes_nothing(kind, tmp_path, model_of):
     text = re.sub(r"<(/?)(?=[A-Za-z])", r"<\1sicd:", document(kind)).replace("xmlns=", "xmlns:sicd=")

@@ -177,6 +177,7 @@ def test_rows_and_columns_last_as_long_as_their_number_to_two(tmp_path, tag, cou
             opened(path, *change)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("late", "ok"), [(0.9e-3, True), (-0.9e-3, True), (1.1e-3, False), (-1.1e-3, False)])
 def test_no_signal_is_late_by_more_than_a_millisecond(tmp_path, late, ok):
     product = Terrasar(late=(1.47e-8, late))

@@ -162,6 +162,7 @@ def test_any_real_pixel_type_works(render, tmp_path, change, side: int) -> None:
     assert find_tracks(views).tracks.num_points > 400 * (side / 600) ** 2
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("side", SIDES_AT_NIGHT)
 @pytest.mark.parametrize(
