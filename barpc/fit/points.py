@@ -252,13 +252,13 @@ class Sample:
         t, ends = np.linspace(0.0, 1.0, _EDGE), (0.0, 1.0)
         edges = [(*at, h) for u in t for end in ends for at in ((u, end), (end, u)) for h in ends]
         points = _scaled(np.concatenate([inside, edges]), size, alt_range)
-        ground, known = _localised(model, points)
+        ground, known = _on_ground(model, points)
         share = float(known[: len(inside)].mean())
         return cls(model, size, alt_range, points[known], ground[known], int(known[: len(inside)].sum()), 1.0 - share)
 
     def also(self, points: Array) -> Sample:
         """Return the sample with more points (M, 3) col, row [px], altitude [m] to look for the worst around."""
-        ground, known = _localised(self.model, points)
+        ground, known = _on_ground(self.model, points)
         more = np.concatenate([self.points, points[known]]), np.concatenate([self.ground, ground[known]])
         return replace(self, points=more[0], ground=more[1])
 
@@ -286,7 +286,7 @@ class Sample:
             near = unit[np.repeat(worst, _AROUND)] + reach * rng.uniform(-1.0, 1.0, (len(worst) * _AROUND, 3))
             near = near.clip(0.0, 1.0)
             at = _scaled(near, self.size, self.alt_range)
-            ground, known = _localised(self.model, at)
+            ground, known = _on_ground(self.model, at)
             found = _size(off(ground[known], at[known]))
             unit, miss, reach = np.concatenate([unit, near[known]]), np.concatenate([miss, found]), reach / 2
         if len(miss):
@@ -298,7 +298,7 @@ class Sample:
         return np.array([*self.size, max(self.alt_range[1] - self.alt_range[0], 1e-9)], dtype=np.float64)
 
 
-def _localised(model: SensorModel, points: Array) -> tuple[Array, BoolArray]:
+def _on_ground(model: SensorModel, points: Array) -> tuple[Array, BoolArray]:
     """Return the ground (N, 3) of points (N, 3) col, row [px], altitude [m], and where there is any (N,)."""
     ground = model.localize(points[:, :2], points[:, 2])
     return ground, np.asarray(np.isfinite(ground).all(axis=1))
