@@ -36,7 +36,7 @@ from barpc.rpcio import (
 )
 from barpc.rpcio.grids import CORRECTION, write_correction
 from barpc.scene import BoolArray
-from barpc.sensor.displaced import CorrectionGrid, GridCorrected
+from barpc.sensor.displaced import CorrectionGrid, Displaced
 from barpc.sensor.rpc import RPC
 from barpc.workspace import Workspace
 from tests.rpcio.conftest import make_rpc, write_image
@@ -185,7 +185,7 @@ def test_gdal_s_way_with_a_correction_puts_its_nodes_where_barpc_does_and_keeps_
     rpc, rng = make_rpc(), np.random.default_rng(0)
     grid = CorrectionGrid(np.linspace(300.0, 1500.0, 5), np.linspace(100.0, 1600.0, 4), rng.normal(size=(4, 5, 2)))
     write_correction(grid, rpc, tmp_path / f"a{CORRECTION}")
-    found = verify_grid(tmp_path / f"a{CORRECTION}", Sample.of(GridCorrected(rpc, grid), SIZE, ALTITUDES))
+    found = verify_grid(tmp_path / f"a{CORRECTION}", Sample.of(Displaced(rpc, grid), SIZE, ALTITUDES))
     assert {one.consumer for one in found} == {"gdal", "barpc"}
     for one in found:
         assert one.max_error < 1e-5, one  # the file holds four-byte numbers
