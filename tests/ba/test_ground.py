@@ -240,7 +240,7 @@ def test_a_camera_is_as_accurate_as_it_states_for_attitude_and_position() -> Non
     off = prior_sigmas(views, AdjustOptions(), 0, np.array([1.0, np.nan]))
     np.testing.assert_array_equal(off, [np.repeat([3.0, 1.0], 3), np.repeat([0.3, 9.0], 3)])
     given = prior_sigmas(views, AdjustOptions(sigma_position=2.0), 1, None, 4)
-    np.testing.assert_array_equal(given[:, 3:], [[2.0] * 3 + [0.2] * 3 + [0.3] * 4] * 2)
+    np.testing.assert_array_equal(given[:, 3:], [[2.0] * 3 + [0.2] * 3 + [1.0] * 4] * 2)
 
 
 # --- motions of a scene ---------------------------------------------------------------------------------------------

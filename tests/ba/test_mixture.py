@@ -12,6 +12,7 @@ from barpc.ba.evidence.linearised import Linear, Tracks, linearise
 from barpc.ba.evidence.mixture import Fit, fit, log_likelihoods, off_from_right
 from barpc.ba.held.block import join
 from barpc.ba.held.starting import first_state, make_problem
+from barpc.ba.usual import SLIGHT
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
 from barpc.simulate import simulate_block
@@ -179,6 +180,18 @@ def test_the_evidence_is_of_the_curvature_at_the_end(linear: Linear, monkeypatch
         room = np.linalg.slogdet(matrix)[1] - np.log(linear.precision).sum()
         said = seen[-1].log - 0.5 * linear.precision @ away**2 - 0.5 * room
         assert found.evidence == pytest.approx(said, abs=0.5)
+
+
+def test_noise_that_falls_does_not_stand(linear: Linear) -> None:
+    one = mixture.Mixture(linear, None, None, None)
+    one.cooled, noises, stands = mixture.COOLED, [one.noise], list[bool]()
+    for _ in range(30):
+        stands.append(one._noise(one._expected(), 0.0))
+        noises.append(one.noise)
+    falls = np.array(noises[1:]) / noises[:-1]
+    assert falls[0] == pytest.approx(mixture.COOLED)
+    assert stands == [abs(np.log(part)) < SLIGHT for part in falls]
+    assert (stands[0], stands[-1]) == (False, True)
 
 
 def test_a_first_guess_has_the_least_sum_of_distances(linear: Linear) -> None:

@@ -16,12 +16,13 @@ from barpc.ba.evidence.scan import Interval
 from barpc.ba.held.block import Block as Joined
 from barpc.ba.held.block import join
 from barpc.ba.held.starting import first_state, make_problem
-from barpc.ba.judging import explanations
+from barpc.ba.judging import explanations, moving
 from barpc.ba.judging.explanations import MOVING, STRIP
 from barpc.ba.judging.moving import CELLS, Ground, group_of
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.ba.standing import Parts
+from barpc.ba.usual import LEVEL
 from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
 from barpc.scene import BoolArray, Tracks
 from barpc.sensor.corrected import Corrected
@@ -139,6 +140,19 @@ def test_a_group_is_proposed_where_its_ties_lie() -> None:
     assert ((group.share > 0.5) == moves[block.order]).mean() > 0.95
     assert 0.0 < group.share.min() < 0.1
     assert 0.9 < group.share.max() < 1.0
+
+
+@pytest.mark.parametrize(("cut", "first"), [([], False), ([1], True), ([5], False)])
+def test_what_was_cut_may_be_what_moves(cut: list[int], first: bool) -> None:
+    """Of six ties, the last of which takes no part, in two cells; then each cell may be it."""
+    rows, right = np.arange(6) < 5, np.ones(6)
+    right[cut] = 0.1
+    ground: Any = SimpleNamespace(cells=lambda _: np.array([0, 0, 0, 1, 1, 1]), place=np.arange(12.0).reshape(2, 6))
+    shares = list(moving._first_shares(ground, rows, right))
+    assert len(shares) == 2 + first
+    if first:
+        np.testing.assert_array_equal(shares[0], np.where(right < 0.5, 1.0 - LEVEL, LEVEL))
+    assert [np.flatnonzero(share > 0.5).tolist() for share in shares[first:]] == [[0, 1, 2], [3, 4, 5]]
 
 
 def test_where_no_track_takes_part_no_group_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,8 +12,7 @@ from barpc.ba.algebra.structure import make_structure
 from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.held.block import join
 from barpc.ba.held.ground import ALIKE
-from barpc.ba.robust.resembling import Resemblance
-from barpc.ba.robust.smooth import TERMS, Smooth
+from barpc.ba.robust.smooth import TERMS, Resemblance, Smooth
 from barpc.base.geodesy import metres_per_unit
 from barpc.base.options import AdjustOptions
 from barpc.scene import GroundPoints, Reference, Tracks
@@ -64,7 +63,7 @@ def smooth_of(view, reference, ties: np.ndarray | None = None) -> Smooth:
     half = SIZE[:, None] / 2.0
     unknowns = Unknowns("rotation", 0, np.zeros((1, 3)), np.ones(1), half - 0.5, half)
     structure = make_structure(np.zeros(len(xy), np.int64), np.arange(len(xy)), 1, len(xy))
-    return Smooth(structure, block.xy, unknowns, Resemblance.of(block, TERMS))
+    return Smooth(structure, block.xy, unknowns, Resemblance.of(block))
 
 
 def told(smooth: Smooth, residual: np.ndarray) -> tuple[bool, float, float]:

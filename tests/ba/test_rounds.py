@@ -107,6 +107,25 @@ def test_a_view_that_lost_much_is_solved_again_from_an_agreement(clean, monkeypa
         assert found.inlier[clean.tracks.view == 1].mean() == pytest.approx(1 - share, abs=0.02)
 
 
+@pytest.mark.parametrize(
+    ("gcps", "ties", "asked"), [(0, True, [False]), (5, True, [False, False]), (5, False, [True, False])]
+)
+def test_control_is_let_in_after_the_ties_where_there_are_any(monkeypatch, gcps: int, ties: bool, asked: list) -> None:
+    """Whether one pass was all that was asked for, and whether control held, each time that rounds were run."""
+    made, run, once, held = simulate_block(3, 60, seed=5, num_gcps=gcps, num_checks=0), rounds.Rounds.run, [], []
+
+    def watched(self: Any, only: bool = False, **given: bool) -> Any:
+        once.append(given.get("once", only))
+        held.append(bool((np.abs(self.heights.control[0].rows) > 1e-3).any()))  # by less than a kilometre
+        return run(self, once[-1])
+
+    monkeypatch.setattr(rounds.Rounds, "run", watched)
+    tracks = made.tracks.select(np.full(len(made.tracks), ties))
+    adjust_tracks(made.views, tracks, AdjustOptions(drift=0), made.gcps if gcps else None, hold_out=False)
+    assert once == asked
+    assert held == ([False, True] if gcps else [False])
+
+
 def test_a_median_counts_each_value_by_its_weight() -> None:
     values = np.array([5.0, 2.0, 9.0, 3.0])
     assert _median(values, np.ones(4)) == 3.0

@@ -126,6 +126,17 @@ def test_the_share_s_likelihood_is_that_of_two_binomials() -> None:
     assert found.gain + price(1) == pytest.approx(best)
 
 
+@pytest.mark.parametrize(("total", "bad", "told"), [(40.0, 1.0, False), (180.0, 1.0, True), (40.0, 2.0, True)])
+def test_where_so_few_are_wrong_their_place_tells_nothing(total: float, bad: float, told: bool) -> None:
+    """All of them in one observation's interval: the rest would be certain, whatever is wrong."""
+    count, inside = np.array([[bad], [total - bad]]), np.array([[bad], [0.0]])
+    gain = scanning._shares(count, inside, np.array([total]), np.array([bad]))
+    whole = bad * np.log(bad / total) + (total - bad) * np.log(1.0 - bad / total)
+    assert gain[0, 0] == pytest.approx(-whole if told else 0.0)
+    assert (whole < -SURE) == told
+    assert gain[1, 0] == 0.0  # a share that is smaller inside is no place
+
+
 def test_one_residual_that_is_far_off_is_one_residual() -> None:
     view, place, wrong, off = ties(5, wrong=0.0)
     off[:, 7] = 1e6

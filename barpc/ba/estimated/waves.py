@@ -22,7 +22,7 @@ from barpc.scene import IntArray
 from barpc.sensor.displaced import RowSpline, bsplines, profile, sine_and_cosine
 
 FEWEST = 7  # splines
-FIRST_SIGMA = 0.3  # px: a prior's standard deviation before anything is known
+FIRST_SIGMA = 1.0  # px: a prior's standard deviation before anything is known
 DRIFTS = 3  # polynomials of the row that are the drift's, a constant, a slope and a bend: splines are apart from them
 
 

@@ -14,13 +14,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
-from barpc.ba.usual import CHANCE, CRITICAL, FEWEST, ITERATIONS, RIDGE, STATED, SURELY
+from barpc.ba.usual import CHANCE, CRITICAL, FEWEST, ITERATIONS, RIDGE, SAMPLE, STATED, SURELY, TIMES
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 NEIGHBOURS = 15  # tie points of a patch: its six unknowns are checked by nine
-_SEARCHED = 1000  # heights that the search looks at, at most
-_OPEN = 10.0  # times what is known before: what the heights do not tell
 _FLAT = 0.01  # m: no ground is flatter, and no motion that is smaller is any
 _SIDE = 25  # trials along each axis of the search
 _BIWEIGHT = 4.685  # Tukey's: 95 % as efficient as least squares where all is normal
@@ -160,7 +158,7 @@ def register(surface: Surface, given: Given, radius: float, before: Array) -> Re
     `before` (7,) are the standard deviations of the motions without these heights [m]: how far is looked, and where
     the heights tell nothing, that stays open.
     """
-    free = np.diag((_OPEN * before) ** -2)
+    free = np.diag((TIMES * before) ** -2)
     motion, noise = _settled(surface, given, _search(surface, given, before), radius, free)
     found = _told(surface, given, motion, radius, noise, free)
     wider = _jackknife(surface, given, found, radius, noise, free)
@@ -256,7 +254,7 @@ class _Seen:
 
 def _search(surface: Surface, given: Given, before: Array) -> Array:
     """Return the shift (7,; tilts, turn and scale 0) on which the most heights agree, east and north within 4 sigma."""
-    few = given.select(np.arange(len(given.sigma)) % -(-len(given.sigma) // _SEARCHED) == 0)
+    few = given.select(np.arange(len(given.sigma)) % -(-len(given.sigma) // SAMPLE) == 0)
     first = _Seen.of(surface, few, np.zeros(7), 1.0)
     steep = float(np.sqrt(((surface.patch[:, 1:3] / surface.reach[:, None]) ** 2).mean()))
     wide = float(np.median(first.sigma))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from barpc.ba.estimated.waves import DRIFTS, FEWEST, Waves
+from barpc.ba.estimated.waves import DRIFTS, FEWEST, FIRST_SIGMA, Waves
 from barpc.ba.evidence.linearised import Linear
 from barpc.ba.evidence.mixture import Fit, Group, first_guess, log_likelihoods
 from barpc.ba.evidence.periods import Swing
@@ -32,7 +32,6 @@ LOCAL = STRIP, FADE
 FOLLOWED = *LOCAL, SETTLING, SWING
 """Those that the adjustment follows; others may be beside them."""
 _LENGTHS = 2.0 ** np.arange(-7.0, 1.0)  # of an image: over what it may fade
-_SIZE = 1.0  # px, before it is known; then its own
 SCALE = float(np.log(2.0 * np.log(TIMES)))
 """Nats that are paid for a size, alike in its logarithm."""
 
@@ -70,7 +69,7 @@ class Seen:
     sigma: Array  # (e,) its prior [px]
 
 
-def strip(seen: Seen, interval: Interval, sigma: float = _SIZE) -> list[Explanation]:
+def strip(seen: Seen, interval: Interval, sigma: float = FIRST_SIGMA) -> list[Explanation]:
     """Return the explanation that a stretch of rows or columns of one image is displaced as a whole."""
     start, stop = _open_ended(interval.start, interval.stop, float(seen.size[interval.axis, interval.view]))
     return [_local(STRIP, seen, interval.view, (interval.axis, start, stop, 0.0, 0.0), sigma)]
@@ -93,7 +92,7 @@ def fade(seen: Seen, interval: Interval) -> list[Explanation]:
             # over what is seen to lie off and half of that at least, over the rest of the image at most
             halved = np.arange(np.ceil(np.log2(max(2.0 * (stop - start) / own, 1.0))) + 1.0)
             for length in (stop - start) * 0.5**halved if stop > start else ():
-                one = _local(FADE, seen, interval.view, (1, *ends, origin, sign / float(length)), _SIZE)
+                one = _local(FADE, seen, interval.view, (1, *ends, origin, sign / float(length)), FIRST_SIGMA)
                 cost = first_guess(seen.few, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2]
                 tried.append((cost - _untouched(seen, one), one))
         found += [min(tried, key=lambda row: row[0])[1]] if tried else []
@@ -122,7 +121,7 @@ def settling(seen: Seen, _interval: Interval) -> list[Explanation]:
     So does a satellite that settles after it has turned, before every image.
     """
     shapes = [sign / length for sign in (1.0, -1.0) for length in _LENGTHS * float(np.median(seen.size[1]))]
-    tried = [_settling(seen, rate, _SIZE) for rate in shapes]
+    tried = [_settling(seen, rate, FIRST_SIGMA) for rate in shapes]
     costs = [
         first_guess(seen.few, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2] - _untouched(seen, one)
         for one in tried
@@ -164,7 +163,7 @@ def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explan
     `found` is a fit with it, its own unknowns the last; `others` (2, K) is what those before it move [px].
     """
     moved = found.extra[-len(one.sigma) :]
-    sigma = float(np.clip(np.sqrt((moved**2).mean()), _SIZE / TIMES, _SIZE * TIMES))
+    sigma = float(np.clip(np.sqrt((moved**2).mean()), FIRST_SIGMA / TIMES, FIRST_SIGMA * TIMES))
     if one.where is None:
         return replace(one, sigma=np.full(len(moved), sigma))
     if one.parts:
@@ -218,7 +217,7 @@ def wander(seen: Seen, interval: Interval) -> list[Explanation]:
     rows = np.flatnonzero(seen.linear.view == view)
     u = 2.0 * seen.place[1, rows] / seen.size[1, view] - 1.0
     each = int(np.median(np.bincount(seen.linear.view[seen.linear.taking_part]))) // FEW
-    one = _on_both(seen, WANDER, view, rows, Waves(min(max(each, FEWEST), SPLINES)).splines(u), _SIZE)
+    one = _on_both(seen, WANDER, view, rows, Waves(min(max(each, FEWEST), SPLINES)).splines(u), FIRST_SIGMA)
     return [replace(one, price=one.price + SCALE)]
 
 
@@ -226,7 +225,7 @@ def swing(seen: Seen, found: Swing) -> Explanation:
     """Return the explanation that all rows of an image swing with one period."""
     rows = np.flatnonzero(seen.linear.view == found.view)
     basis = waves_of(seen.place[1, rows], np.array(found.period))
-    one = _on_both(seen, SWING, found.view, rows, basis, _SIZE)
+    one = _on_both(seen, SWING, found.view, rows, basis, FIRST_SIGMA)
     costs = price_of_period(float(seen.size[1, found.view]), seen.linear.choices) + SCALE
     return replace(one, price=costs, period=found.period)
 
@@ -250,7 +249,7 @@ def alike(seen: Seen, one: Explanation, found: Fit) -> list[Explanation]:
         parts -= drift @ (drift.T @ parts)
         explained = ((curve @ parts) ** 2).sum(axis=0) / np.maximum((parts**2).sum(axis=0), 0.1)
         first, last, *rest = (float(shape[int(explained.argmax())]) for shape in shapes)
-        told.append(_local(kind, seen, view, (1, *_open_ended(first, last, size), rest[0], rest[1]), _SIZE))
+        told.append(_local(kind, seen, view, (1, *_open_ended(first, last, size), rest[0], rest[1]), FIRST_SIGMA))
     return told
 
 

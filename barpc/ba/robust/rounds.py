@@ -11,8 +11,7 @@ from barpc.ba.estimated.projected import Projected
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.held.block import Block
 from barpc.ba.held.ground import Heights
-from barpc.ba.robust.resembling import Resemblance
-from barpc.ba.robust.smooth import TERMS, Fit, Smooth, SmoothTest
+from barpc.ba.robust.smooth import TERMS, Fit, Resemblance, Smooth, SmoothTest
 from barpc.ba.robust.variances import SAME_PRIOR, PriorTest, Variances, same_prior
 from barpc.ba.robust.weights import LOSSES, MEDIAN, Observations
 from barpc.ba.solving.problem import Problem
@@ -88,7 +87,7 @@ class Rounds:
         faint = faintness(block, heights)[block.point]
         sigma = block.sigma * faint
         self.observations = Observations(self.problem, sigma, options.noise_floor, is_tie, of_reference)
-        alike = Resemblance.of(block, TERMS)
+        alike = Resemblance.of(block)
         self.smooth = Smooth(problem.structure, problem.xy, unknowns, alike, tells=faint == 1.0)
         given, control = problem.camera_prior, heights.has_control
         self.variances = Variances.of(given, unknowns, options, control, block.views)
