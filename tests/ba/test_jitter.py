@@ -82,7 +82,7 @@ def test_a_spline_that_is_subtracted_makes_it_worse():
     assert judge(made, turned).across > 1.8 * without.across > 20 * after.across
 
 
-@pytest.mark.slow
+@pytest.mark.nightly  # before: swings in test_judge
 def test_fast_jitter_of_one_frequency_is_a_swing():
     """Of all views the differences are seen: which of them swing is not, and heights are bent by what is common."""
     found, after = solved("jitter 0.1 at 5 Hz", 1)
@@ -133,8 +133,8 @@ def test_the_drift_is_not_taken_wider_than_it_is_seen_where_jitter_is_followed(s
     assert 0.5 < after.shape < 4.0  # seed 18: 6.1 with a drift that may be 5.5 m
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", rest_slow([3, 7], mark=pytest.mark.nightly))
+@pytest.mark.nightly  # before: where they begin, below
+@pytest.mark.parametrize("seed", [3, 7])
 def test_detectors_of_one_focal_plane_are_found_where_single_views_do_not_show_them(seed):
     found, after = solved("all", seed)
     (edges,) = {tuple(spline.edges) for spline in found.splines}
