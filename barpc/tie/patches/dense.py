@@ -17,12 +17,12 @@ from barpc.tie.pixels import Box, FloatImage, Stretch, levelled, read_pixels
 ACROSS = 0.02
 """A part in which an affine frame is farther off the epipolar lines [px] is too large for one."""
 FINER = 2  # columns of the frame a pixel: of a Pleiades triplet heights differ by 0.62 m (NMAD), of one by 0.83 m
-WINDOW = 5
-"""Pixels a side over which grey values are compared."""
+WINDOW = 7
+"""Pixels a side over which the step of least squares compares grey values, and matches of one surface are averaged."""
 _SGBM = {
-    "blockSize": WINDOW,
-    "P1": 16 * WINDOW**2,  # twice OpenCV's own, as disparities are twice as fine: 0.62 m, of its own 0.71 m
-    "P2": 64 * WINDOW**2,
+    "blockSize": 5,
+    "P1": 16 * 5**2,  # twice OpenCV's own, as disparities are twice as fine: 0.62 m, of its own 0.71 m
+    "P2": 64 * 5**2,
     "preFilterCap": 63,  # of 15, OpenCV's own, 0.96 m in place of 0.83 m: it cuts strong edges
     "uniquenessRatio": 5,
     "speckleWindowSize": 100,
@@ -133,18 +133,21 @@ def dense_matches(
     seen = shown_left & (_warped(shown_right.astype(np.uint8), disparity, cv2.INTER_NEAREST) > 0)
     good &= seen
     disparity, sigma = _refined(left, right, disparity, good)
-    row, col = np.nonzero((good & _inside(shape, low, frame))[:, ::FINER])  # a match a pixel
-    col *= FINER
-    place = np.column_stack([col, row]) + low
-    moved = place - np.column_stack([disparity[row, col], np.zeros(len(row))])
-    known = np.column_stack([place, disparity[row, col], np.ones(len(row))])
+    # a match a pixel: the mean of those about it that differ by less than a column or so, which is one surface
+    single = np.ascontiguousarray(np.where(good, disparity, -frame.num)[:, ::FINER], np.float32)
+    level = cv2.bilateralFilter(single, WINDOW, sigmaColor=1.0, sigmaSpace=np.inf)
+    row, col = np.nonzero((good & _inside(shape, low, frame))[:, ::FINER])
+    moves = level[row, col].astype(np.float64)
+    place = np.column_stack([FINER * col, row]) + low
+    moved = place - np.column_stack([moves, np.zeros(len(row))])
+    known = np.column_stack([place, moves, np.ones(len(row))])
     middle = frame.num // 2  # disparity at which both are taken to show the same
     both = int(np.count_nonzero(shown_left[:, middle:] & shown_right[:, : shape[0] - middle]))
     return DenseMatches(
         _back(frame.maps[0], place),
         _back(frame.maps[1], moved),
         known @ frame.altitude,
-        sigma[row, col].astype(np.float64),
+        sigma[row, FINER * col].astype(np.float64),
         np.count_nonzero(good) / max(both, 1),
     )
 
