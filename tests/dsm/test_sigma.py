@@ -128,4 +128,4 @@ def test_what_resampling_leaves_of_noise_is_what_sigma_takes_for_it():
 @pytest.mark.parametrize("side", [1, 2, 3, 5, 8])
 def test_the_mean_of_matches_is_known_as_well_as_their_windows_overlap(side):
     lag = np.abs(np.subtract.outer(np.arange(side), np.arange(side)))
-    assert averaged(np.array(float(side))) == pytest.approx(np.maximum(0.0, 1.0 - lag / WINDOW).mean())
+    assert averaged(np.array(float(side))) == pytest.approx(np.maximum(0.0, 1.0 - lag / (2 * WINDOW)).mean())
