@@ -2,7 +2,7 @@
 
     python benchmarks/tie_numbers.py DATA                                every number of `barpc.tie`
     python benchmarks/tie_numbers.py DATA --only patches.register        those of modules with this in their names
-    python benchmarks/tie_numbers.py DATA --numbers _TORN _SMALLER       these
+    python benchmarks/tie_numbers.py DATA --numbers _INNER _FINE          these
 
 A number of several (a tuple) is changed as a whole. Pairs: two of the Pleiades triplet, Ventoux, the multispectral
 image with the other view's panchromatic one, and the triplet's in another season; of each the tracks, the robust spread

@@ -157,9 +157,10 @@ def gathered(tile: Tile, ground: Array, sigma: Array) -> F32:
 
 
 def averaged(side: Array) -> Array:
-    """Return what is left of sigma in the mean of `side` x `side` matches, whose windows overlap.
+    """Return what is left of sigma in the mean of `side` x `side` matches, which look at much the same.
 
-    Of matches k px apart 1 - k / WINDOW of the grey values are the same: a sum over all pairs, an axis at a time.
+    Each is a mean of steps: of matches k px apart 1 - k / (2 WINDOW) is the same. A sum over all pairs, axis by axis.
     """
-    shorter, longer = np.minimum(side, WINDOW), np.maximum(side, WINDOW)
-    return np.asarray(WINDOW / longer * (1.0 - (shorter**2 - 1.0) / (3.0 * side * WINDOW)))
+    wide = 2 * WINDOW
+    shorter, longer = np.minimum(side, wide), np.maximum(side, wide)
+    return np.asarray(wide / longer * (1.0 - (shorter**2 - 1.0) / (3.0 * side * wide)))

@@ -33,9 +33,7 @@ SPAN = 512
 PIECE = 1 << 22
 """Pixels of pictures, or places of templates in them, that are worked on together; decides on no figure."""
 _SAMPLES = 5  # blocks a side whose pixels make the stretch
-_LEVEL = 4  # px a side of a pixel of the samples, where decoding is dear
 _NEGLIGIBLE = 8.0  # a range below so many steps of a float type is a constant image
-_WHITE = 255.0  # grey value of the brightest
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ class Stretch:
     def apply(self, pixels: Pixels, valid: BoolArray) -> ByteImage:
         """Return an 8-bit picture; invalid pixels take the mean of the valid ones, so that they make few edges."""
         if pixels.dtype == np.float32:
-            scaled = (pixels - np.float32(self.low)) * np.float32(_WHITE / (self.high - self.low))
+            scaled = (pixels - np.float32(self.low)) * np.float32(255.0 / (self.high - self.low))
         else:
             scaled = _levelled(pixels, self.low, self.high)
         if not valid.all():
@@ -61,8 +59,8 @@ def _levelled(pixels: Pixels, low: float, high: float) -> FloatImage:
     """Return `low` and `high` as black and white; whatever the scale, nothing overflows."""
     with np.errstate(over="ignore"):
         share = (pixels / 2 - low / 2) / (high / 2 - low / 2)  # halves: a difference may have no number
-    most = _WHITE**2  # beyond it a pixel would drown its surroundings
-    return np.clip(share * _WHITE, -most, most).astype(np.float32)
+    most = 255.0**2  # beyond it a pixel would drown its surroundings
+    return np.clip(share * 255.0, -most, most).astype(np.float32)
 
 
 def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
@@ -186,7 +184,7 @@ def sample_stretch(path: str | os.PathLike[str], band: int = 1, size: tuple[int,
         _check_band(dataset, path, band)
         kind = np.dtype(dataset.dtypes[band - 1])
         pixel, (width, height) = _pixel(dataset, size), size or (dataset.width, dataset.height)
-        zoom = _LEVEL if pixel == (1, 1) and _levels(dataset, band) else 1
+        zoom = _level(dataset, band) if pixel == (1, 1) else 1
         side_x, side_y = (min(zoom * 2 * CELL, n) for n in (width, height))
         for row in np.linspace(0, height - side_y, _SAMPLES).astype(int):
             for col in np.linspace(0, width - side_x, _SAMPLES).astype(int):
@@ -217,13 +215,14 @@ def survey(path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | 
     with open_raster(path) as dataset:
         height, width = dataset.block_shapes[band - 1]
         wide, high = pixel = _pixel(dataset, size)
-        levels = pixel == (1, 1) and _levels(dataset, band)
+        levels = pixel == (1, 1) and _level(dataset, band) > 1
     block = max(1, width // wide), max(1, height // high)
     return None if stretch is None else Survey(stretch, block, levels, pixel)
 
 
-def _levels(dataset: Any, band: int) -> bool:
-    return getattr(dataset, "driver", "") == "JP2OpenJPEG" and {2, _LEVEL} <= set(dataset.overviews(band))
+def _level(dataset: Any, band: int) -> int:
+    """Return so many pixels a side are seen as one at less cost: 4 (and 2, then) where decoding is dear, else 1."""
+    return 4 if getattr(dataset, "driver", "") == "JP2OpenJPEG" and {2, 4} <= set(dataset.overviews(band)) else 1
 
 
 def read_picture(

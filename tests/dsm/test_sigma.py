@@ -115,4 +115,4 @@ def test_a_slope_to_the_light_is_bright_and_one_away_from_it_dark_and_the_unknow
 @pytest.mark.parametrize("side", [1, 2, 3, 5, 8])
 def test_the_mean_of_matches_is_known_as_well_as_their_windows_overlap(side):
     lag = np.abs(np.subtract.outer(np.arange(side), np.arange(side)))
-    assert averaged(np.array(float(side))) == pytest.approx(np.maximum(0.0, 1.0 - lag / WINDOW).mean())
+    assert averaged(np.array(float(side))) == pytest.approx(np.maximum(0.0, 1.0 - lag / (2 * WINDOW)).mean())

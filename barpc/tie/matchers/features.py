@@ -26,7 +26,8 @@ PER_IMAGE = 100_000
 CONTRAST = 0.01
 """SIFT's contrast threshold."""
 _DEFAULTS = TieOptions()
-_AMPLE = 5  # keypoints for each tie point wanted
+AMPLE = 5
+"""Keypoints for each tie point wanted."""
 _ZOOMS = ((1.25e-4, 4), (2e-3, 2))
 """Keypoints wanted a px, below which so many pixels a side are looked at as one: real images hold 1200e-6, 4500e-6."""
 _HOLDS = {2: 4.5e-3, 4: 1.2e-3}  # keypoints a px that real images hold, looked at so
@@ -113,7 +114,7 @@ class Share:
     def of(size: tuple[int, int], options: TieOptions, coarse: bool = False) -> Share:
         """Return the share of a whole image of `size` (width, height); `coarse`: of a first look."""
         area = size[0] * size[1]
-        wanted = min(PER_IMAGE, _AMPLE * options.points_per_image) / area
+        wanted = min(PER_IMAGE, AMPLE * options.points_per_image) / area
         zooms = (zoom for below, zoom in _ZOOMS if wanted < below and min(size) > zoom * options.tile)
         zoom = next(zooms, 1)
         if coarse:

@@ -13,7 +13,7 @@ from barpc.base.geodesy import Array
 from barpc.base.options import TieOptions
 from barpc.scene import IntArray, View
 from barpc.tie.matchers.features import Keypoints
-from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
+from barpc.tie.matchers.matcher import APART, NO_MATCHES, Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments
 
 FloatArray = npt.NDArray[np.float32]
@@ -21,7 +21,6 @@ FloatArray = npt.NDArray[np.float32]
 CLEAR_RATIO = 0.8
 """Largest ratio where only clear matches count."""
 _MAX_TURN = np.radians(30.0)  # between the orientation seen and the one expected
-_APART = 2.0  # px; nearer candidates are the same point
 _ROWS = 64  # points of A, near each other, that are compared with all their candidates at a time
 
 
@@ -101,8 +100,8 @@ class _Best:
         pick = likeness.argmax(axis=1)[:, None]
         self._of_a[rows] = cols[pick[:, 0]]
         self._top[rows] = np.take_along_axis(likeness, pick, axis=1)[:, 0]
-        same = np.abs(du - np.take_along_axis(du, pick, axis=1)) <= _APART
-        same &= np.abs(dw - np.take_along_axis(dw, pick, axis=1)) <= _APART
+        same = np.abs(du - np.take_along_axis(du, pick, axis=1)) <= APART
+        same &= np.abs(dw - np.take_along_axis(dw, pick, axis=1)) <= APART
         self._second[rows] = np.where(same, np.float32(-np.inf), likeness).max(axis=1)
 
     def mutual(self) -> tuple[IntArray, Array, Array]:

@@ -27,6 +27,9 @@ from barpc.tie.matchers.features import Keypoints
 from barpc.tie.pairing.epipolar import EpipolarSegments
 from barpc.tie.pixels import Box
 
+APART = 2
+"""Places that are no farther apart [px] are the same."""
+
 
 @dataclass(frozen=True, eq=False)
 class Prediction:

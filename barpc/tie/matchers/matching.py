@@ -21,9 +21,9 @@ from scipy.spatial import cKDTree
 from barpc.base.geodesy import Array
 from barpc.base.options import TieOptions
 from barpc.scene import IntArray, View
-from barpc.tie.matchers.features import THIN, KeypointFiles, Keypoints, ample_matches, join_keypoints
+from barpc.tie.matchers.features import AMPLE, THIN, KeypointFiles, Keypoints, ample_matches, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
-from barpc.tie.matchers.matcher import NO_MATCHES, Hook, Matcher, Matches, Prediction, hooked
+from barpc.tie.matchers.matcher import APART, NO_MATCHES, Hook, Matcher, Matches, Prediction, hooked
 from barpc.tie.matchers.structural import FineStructure, GradientStructure
 from barpc.tie.pairing.epipolar import (
     FEW,
@@ -59,14 +59,11 @@ TOLERANCE = 3.0
 _DEFAULTS = TieOptions()
 _PASSES = ((20.0, 1500), (80.0, 2000), (float("inf"), 3000))
 """Blind passes: half width [px] (the last: `search`), points of A that are tried."""
-_PEAK = 4.0  # px, width of the window in which true matches of a blind pass fall
 _SIGNIFICANT = 6.0  # standard deviations
 _NOWHERE = "no common offset"
 FALSE_SHARE = 0.01
 """Share of false matches that is accepted, as control bands estimate it."""
-_NEIGHBOURS = 12
 _LOOSE = (0.95, 0.05, 2 / 3)  # ratio and false share of the second attempt; its part of the matches that a pair needs
-_QUICK = 500  # keypoints of a view that tell what a pair promises
 _MARGINS = 150.0, 50.0  # m beyond known altitudes: how wrong cameras make them, and seldom do
 _PROBES = 12  # pixels along a side at which the terrain is asked
 
@@ -268,7 +265,7 @@ def _loaded(
 
 def quick_score(views: tuple[View, View], keypoints: tuple[KeypointFiles, KeypointFiles], options: TieOptions) -> int:
     """Estimate how many of a few keypoints match, with at most 5 % false ones: a cheap forecast for a pair."""
-    few = (keypoints[0].strongest(_QUICK), keypoints[1].strongest(_QUICK))
+    few = (keypoints[0].strongest(AMPLE * THIN), keypoints[1].strongest(AMPLE * THIN))
     if not (len(few[0]) and len(few[1])):
         return 0
     search = _Search(views, _loaded(views, few, options)[0], replace(options, ratio=_LOOSE[0]))
@@ -445,14 +442,15 @@ class _Search:
             return None
         errors = self.errors(found)
         values = np.sort(errors[:, 1])
-        count = np.searchsorted(values, values + _PEAK, side="right") - np.arange(len(values))
+        window = 2 * APART  # px, in which true matches fall
+        count = np.searchsorted(values, values + window, side="right") - np.arange(len(values))
         start, most = int(count.argmax()), int(count.max())
         middle = float(np.median(values[start : start + most]))
-        chance = (len(values) - most) * _PEAK / (2 * width)
+        chance = (len(values) - most) * window / (2 * width)
         significance = (most - chance) / np.sqrt(chance + 1.0)
-        if significance < _SIGNIFICANT or abs(middle) > width - _PEAK:
+        if significance < _SIGNIFICANT or abs(middle) > width - window:
             return None
-        inside = np.abs(errors[:, 1] - middle) <= _PEAK
+        inside = np.abs(errors[:, 1] - middle) <= window
         across = robust_affine(found.xy[inside, 0], errors[inside, 1])
         low, high = np.percentile(errors[inside, 0], [2, 98])
         margin = 0.5 * (high - low) + 10.0
@@ -470,7 +468,7 @@ class _Search:
         across, tree, every = robust_affine(places, errors[:, 1]), cKDTree(places), self._frame
 
         def nearby(xy: Array) -> EpipolarSegments:
-            along = errors[tree.query(xy, k=min(_NEIGHBOURS, len(tight)))[1], 0]
+            along = errors[tree.query(xy, k=min(FEW, len(tight)))[1], 0]
             middle = np.median(along, axis=1)
             half = 4.0 + 3.0 * robust_spread(along, middle[:, None])
             return replace(every(xy).moved(across(xy)), before=middle - half, after=middle + half)

@@ -19,18 +19,16 @@ from barpc.base.geodesy import Array
 from barpc.base.options import TieOptions
 from barpc.scene import IntArray, View
 from barpc.tie.matchers.features import Keypoints
-from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
+from barpc.tie.matchers.matcher import APART, NO_MATCHES, Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments, grouped, linear_map
 from barpc.tie.patches.oriented import HALF, PatchTile, Sampling, found_about, resolution
 from barpc.tie.pixels import PIECE, SPAN, Box, FloatImage
 
 POINTS = 200, 500, 1000
 """Points that are looked for: of the cameras' error, in long bands, in short ones."""
-_FINE_POINTS = 600, 1500  # of the cameras' error, in bands, where whole pixels are looked at
 _RING = 3.5  # pitches about a point whose neighbours speak for its places, together
 _SAY = 4.0  # times as loud as it does itself. Of four pairs that were hardest 1 is tied by 1.5 and 1, 3 by this
 _SMALLEST = 60  # px of a side of the common part, in the coarsest picture
-_BENT = 2  # px by which their parallax may differ, and does not count
 _LONG, _LONGER = 48.0, 130.0  # px of half a band
 
 
@@ -97,7 +95,7 @@ class _Search:
         if not windows:
             return 1, np.empty((0, 2))
         if self._whole:
-            wanted, count = 1, _FINE_POINTS[self._prediction.probes is None]
+            wanted, count = 1, POINTS[1 + (self._prediction.probes is None)]
         elif self._prediction.probes is None:
             wanted, count = (4, POINTS[1]) if half > _LONGER else (2, POINTS[1 + (half < _LONG)])
         else:
@@ -206,7 +204,7 @@ def _near(at: Array, reach: float) -> FloatImage:
 def _supported(surface: FloatImage, near: FloatImage, loud: float) -> FloatImage:
     """Correlations (n, y, x) averaged with the best of neighbours' (n, n) about the same place, so much `loud`er."""
     others = near - np.eye(len(near), dtype=np.float32)
-    kernel = np.ones((2 * _BENT + 1,) * 2, np.uint8)
+    kernel = np.ones((2 * APART + 1,) * 2, np.uint8)
     about = np.stack([cv2.dilate(one, kernel) for one in surface])
     share = np.float32(loud) / np.maximum(others.sum(axis=1, keepdims=True), 1.0)
     return np.asarray((surface + np.tensordot(share * others, about, axes=1)) / np.float32(1.0 + loud))

@@ -17,12 +17,12 @@ from barpc.tie.pixels import Box, FloatImage, Stretch, levelled, read_pixels
 ACROSS = 0.02
 """A part in which an affine frame is farther off the epipolar lines [px] is too large for one."""
 FINER = 2  # columns of the frame a pixel: of a Pleiades triplet heights differ by 0.62 m (NMAD), of one by 0.83 m
-WINDOW = 5
-"""Pixels a side over which grey values are compared."""
+WINDOW = 7
+"""Pixels a side over which the step of least squares compares grey values, and matches of one surface are averaged."""
 _SGBM = {
-    "blockSize": WINDOW,
-    "P1": 16 * WINDOW**2,  # twice OpenCV's own, as disparities are twice as fine: 0.62 m, of its own 0.71 m
-    "P2": 64 * WINDOW**2,
+    "blockSize": 5,
+    "P1": 16 * 5**2,  # twice OpenCV's own, as disparities are twice as fine: 0.62 m, of its own 0.71 m
+    "P2": 64 * 5**2,
     "preFilterCap": 63,  # of 15, OpenCV's own, 0.96 m in place of 0.83 m: it cuts strong edges
     "uniquenessRatio": 5,
     "speckleWindowSize": 100,
@@ -30,9 +30,7 @@ _SGBM = {
     "disp12MaxDiff": -1,  # asked for here, of a second pass
     "mode": cv2.STEREO_SGBM_MODE_SGBM_3WAY,  # 0.64 m, of five ways 0.62 m at half as much time again
 }
-_MARGIN = 16  # px about a part that are matched, too: paths of SGBM begin at the ends
 _LEFT, _SLOPE = 0.741, 0.305  # of white noise of variance 1, in the frame: its variance, and that of its slope
-_HAT = 2 / 12  # variance of two roundings: of two pictures' grey values, and of what SGBM says [columns^2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,30 +131,34 @@ def dense_matches(
     seen = shown_left & (_warped(shown_right.astype(np.uint8), disparity, cv2.INTER_NEAREST) > 0)
     good &= seen
     disparity, sigma = _refined(left, right, disparity, good)
-    row, col = np.nonzero((good & _inside(shape, low, frame))[:, ::FINER])  # a match a pixel
-    col *= FINER
-    place = np.column_stack([col, row]) + low
-    moved = place - np.column_stack([disparity[row, col], np.zeros(len(row))])
-    known = np.column_stack([place, disparity[row, col], np.ones(len(row))])
+    # a match a pixel: the mean of those about it that differ by less than a column or so, which is one surface
+    single = np.ascontiguousarray(np.where(good, disparity, -frame.num)[:, ::FINER], np.float32)
+    level = cv2.bilateralFilter(single, WINDOW, sigmaColor=1.0, sigmaSpace=np.inf)
+    row, col = np.nonzero((good & _inside(shape, low, frame))[:, ::FINER])
+    moves = level[row, col].astype(np.float64)
+    place = np.column_stack([FINER * col, row]) + low
+    moved = place - np.column_stack([moves, np.zeros(len(row))])
+    known = np.column_stack([place, moves, np.ones(len(row))])
     middle = frame.num // 2  # disparity at which both are taken to show the same
     both = int(np.count_nonzero(shown_left[:, middle:] & shown_right[:, : shape[0] - middle]))
     return DenseMatches(
         _back(frame.maps[0], place),
         _back(frame.maps[1], moved),
         known @ frame.altitude,
-        sigma[row, col].astype(np.float64),
+        sigma[row, FINER * col].astype(np.float64),
         np.count_nonzero(good) / max(both, 1),
     )
 
 
 def _window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Array, tuple[int, int]] | None:
     """Return the first pixel (2,) and width, height of the part as far as both images reach, with margins."""
-    low, high = frame.places.min(axis=0) - _MARGIN, frame.places.max(axis=0) + _MARGIN
+    margin = FINER * WINDOW  # matched, too: paths of SGBM begin at the ends
+    low, high = frame.places.min(axis=0) - margin, frame.places.max(axis=0) + margin
     reach = np.array([frame.num, 0.0])
     for size, one, more in zip(sizes, frame.maps, (np.zeros(2), reach), strict=True):
         corners = (np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size - 0.5) @ one[:, :2].T + one[:, 2]
         low, high = np.maximum(low, corners.min(axis=0)), np.minimum(high, corners.max(axis=0) + more)
-    if (high - low < 2 * _MARGIN).any():
+    if (high - low < 2 * margin).any():
         return None
     low, high = np.floor(low - reach), np.ceil(high + reach)
     return low, (int(high[0] - low[0]), int(high[1] - low[1]))
@@ -243,11 +245,11 @@ def _refined(
     bb = np.maximum(bb, 1e-3)
     told = np.maximum(ss - bs**2 / bb, 1e-3)
     shift = (a_s - ab * bs / bb) / told
-    pixels = WINDOW**2 * total
+    pixels, hat = WINDOW**2 * total, 2 / 12  # variance of two roundings: of grey values, of what SGBM says [columns^2]
     left_over = np.maximum(aa - ab**2 / bb - told * shift**2, 0.0)
-    noise = np.maximum(left_over * pixels / np.maximum(pixels - 3, 1) / _LEFT, _HAT)  # 3: the unknowns
+    noise = np.maximum(left_over * pixels / np.maximum(pixels - 3, 1) / _LEFT, hat)  # 3: the unknowns
     variance = noise / pixels / np.maximum(told - noise * _SLOPE / 4, 0.1 * told)
-    found = start - shift * _HAT / (_HAT + variance)
+    found = start - shift * hat / (hat + variance)
     kept = np.clip(found, disparity - 1.0, disparity + 1.0)
     return np.asarray(kept, np.float32), np.asarray(np.sqrt(variance) / FINER, np.float32)
 

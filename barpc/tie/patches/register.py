@@ -28,17 +28,12 @@ MIN_CORRELATION = 0.8
 """Of two registered patches, or the match is left out."""
 PATCH = 21
 """Side of the patches that are registered [px], odd."""
-_SMALLER = 0.7  # side of the patch of the second try and of the check
-_TORN = 0.5  # px that the smaller patch may lie apart
+_INNER = 0.7  # part of a patch that counts most: its Gaussian weight's sigma; the patch of second tries and the check
 _FINE = 4  # samples a pixel and axis
-_STEPS = cv2.INTER_TAB_SIZE * _FINE  # a pixel and axis: positions that the sampler tells apart
-_SETTLED = 0.003  # px: a step below it is the last
-_WEIGHT = 0.7  # standard deviation of the patch's Gaussian weight, in half sides
+_STEPS = cv2.INTER_TAB_SIZE * _FINE  # a pixel and axis: positions that the sampler tells apart, and steps end at
 _TAPS = 6  # samples on either side in the interpolation
 _DISTORTED = 2.0  # times the median sigma about it: the patch lies across a step of the ground
-_LEAST_END_SIGMA = 0.02  # px, of an observation
-
-
+_LEAST_END_SIGMA = 0.02  # px, of an observation: a rendered one that is matched best
 _EPS = float(np.finfo(np.float32).eps)
 
 
@@ -186,7 +181,7 @@ def register_patches(
     """
     fine, best = _upsampled(images[1]), PatchRegistration.none(start)
     pictures = _with_derivatives(images[0])
-    smaller = int(_SMALLER * patch) | 1
+    smaller = int(_INNER * patch) | 1
     for side in (patch, smaller):
         template = _Template(pictures, images[0].shape[1], side)
         whole = np.ones((side, side), np.uint8)
@@ -196,9 +191,9 @@ def register_patches(
             found = template.find(fine, reference[rows].astype(np.int64), start[rows], linear[rows])
             best.put(rows, replace(found, ok=found.ok & _at(usable[1], found.xy)))
     for rows in _chunks(np.flatnonzero(best.ok)):  # on a step of the ground the inner part goes elsewhere
-        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], 10 * _SETTLED)
+        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], 10 / _STEPS)
         apart = np.hypot(*(inner.xy - best.xy[rows]).T)
-        best.ok[rows] = apart <= np.maximum(_TORN, 5.0 * inner.sigma)
+        best.ok[rows] = apart <= 5.0 * np.maximum(oriented.SIGMA, inner.sigma)
     return best
 
 
@@ -258,7 +253,7 @@ class _Template:
         row, col = np.mgrid[-half : half + 1, -half : half + 1]
         self._half = half
         self._col, self._row = col.ravel(), row.ravel()
-        weight = np.exp(-0.5 * (self._col**2 + self._row**2) / (_WEIGHT * half) ** 2)
+        weight = np.exp(-0.5 * (self._col**2 + self._row**2) / (_INNER * half) ** 2)
         self._effective = float(weight.sum() ** 2 / (weight**2).sum())  # pixels that count
         self._weight = (weight / weight.sum()).astype(np.float32)
         self._root = np.sqrt(self._weight)
@@ -273,7 +268,7 @@ class _Template:
         return centred / deviation, deviation
 
     def find(
-        self, fine: FloatImage, reference: IntArray, start: Array, linear: Array, settled: float = _SETTLED
+        self, fine: FloatImage, reference: IntArray, start: Array, linear: Array, settled: float = 1 / _STEPS
     ) -> PatchRegistration:
         """Register the patches about `reference` (N, 2), begun at `start` with the distortion `linear`."""
         offset = self._row * self._width + self._col
