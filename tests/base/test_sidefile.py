@@ -27,6 +27,7 @@ from barpc.base.sidefile import (
     NAMES,
     TABLE,
     Kind,
+    encoding_of,
     opened,
     opened_text,
     parse_json,
@@ -49,6 +50,27 @@ READERS: dict[str, Callable[[Path], object]] = {
     "read_head": lambda path: read_head(path, SMALL, 10),
     "load_npz": lambda path: load_npz(path, SMALL),
 }
+
+
+@pytest.mark.parametrize(
+    ("head", "encoding"),
+    [
+        ("col,row\n".encode("utf-16-le"), "utf-16-le"),
+        ("col,row\n".encode("utf-16-be"), "utf-16-be"),
+        ("col,row\n".encode("utf-16"), "utf-16"),
+        ("col,row\n".encode("utf-8-sig"), "utf-8-sig"),
+        (b"col,row\n", "utf-8-sig"),
+        ("a,b\n".encode("utf-16-le"), "utf-16-le"),
+        ("a,b".encode("utf-16-le"), "utf-8-sig"),
+        (bytes(16), "utf-8-sig"),
+        (b"a\0b\0c\0dxe\0", "utf-8-sig"),
+        (b"a\0b\0\0\0d\0e\0", "utf-8-sig"),
+        (b"", "utf-8-sig"),
+    ],
+    ids=repr,
+)
+def test_utf_16_is_known_by_its_mark_or_by_zeros_between_at_least_four_letters(head: bytes, encoding: str) -> None:
+    assert encoding_of(head) == encoding
 
 
 @pytest.mark.parametrize("read", READERS.values(), ids=READERS)

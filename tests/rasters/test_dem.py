@@ -213,6 +213,11 @@ def test_where_no_terrain_is_met_there_is_no_point():
     below = localize_on_terrain(rpc, np.array([[9000.0, 9000.0]]), lambda lon, lat: np.full_like(lon, -50.0), (0, 9))
     assert np.isnan(nothing).all()
     assert np.isnan(below).all()
+    for level in (0.0, 9.0):  # both ends are included
+        at = localize_on_terrain(
+            rpc, np.array([[9000.0, 9000.0]]), lambda lon, _, z=level: np.full_like(lon, z), (0, 9)
+        )
+        assert at[0, 2] == pytest.approx(level, abs=2e-4)
 
 
 def test_a_warning_is_only_given_where_it_is_due(tmp_path):

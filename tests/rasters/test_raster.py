@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.base.errors import ImageError
-from barpc.rasters.raster import open_raster
+from barpc.base import identity
+from barpc.base.errors import ImageError, InputError
+from barpc.rasters import raster
+from barpc.rasters.raster import hashed, open_raster
 
 
 @pytest.fixture
@@ -49,6 +51,22 @@ def test_a_vrt_of_a_plain_local_raster_opens(image: Path, tmp_path: Path) -> Non
         assert dataset.read(1)[5, 7] == 47
     with open_raster(vrt(tmp_path / "b.vrt", band(str(image), 0))) as dataset:
         assert dataset.read(1)[0, 1] == 1
+
+
+def test_a_vrt_that_is_replaced_while_it_is_hashed_is_no_input(image: Path, tmp_path: Path, monkeypatch) -> None:
+    """Its sources would be those of another one than was hashed."""
+    path = vrt(tmp_path / "a.vrt", band("image.tif"))
+    (part,) = hashed(path).parts
+    assert part == identity.take(image)
+    read = raster.read_vrt
+
+    def replaced(file: Path) -> object:
+        vrt(path, band(str(image), 0))
+        return read(file)
+
+    monkeypatch.setattr(raster, "read_vrt", replaced)
+    with pytest.raises(InputError, match="changed"):
+        hashed(path)
 
 
 @pytest.mark.parametrize(
