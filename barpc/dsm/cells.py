@@ -159,8 +159,12 @@ def gathered(tile: Tile, ground: Array, sigma: Array) -> F32:
 def averaged(side: Array) -> Array:
     """Return what is left of sigma in the mean of `side` x `side` matches, which look at much the same.
 
-    Each is a mean of steps: of matches k px apart 1 - k / (2 WINDOW) is the same. A sum over all pairs, axis by axis.
+    Each is a mean over WINDOW of steps that look at WINDOW pixels: matches correlate as a cubic B-spline of their
+    distance, with knots every WINDOW. A sum over all pairs, axis by axis, interpolated between whole sides.
     """
-    wide = 2 * WINDOW
-    shorter, longer = np.minimum(side, wide), np.maximum(side, wide)
-    return np.asarray(wide / longer * (1.0 - (shorter**2 - 1.0) / (3.0 * side * wide)))
+    lag = np.arange(int(np.ceil(side.max(initial=1.0))))
+    far, num = lag / WINDOW, lag + 1.0
+    alike = np.where(far < 1.0, 1.0 - 1.5 * far**2 + 0.75 * far**3, 0.25 * np.maximum(2.0 - far, 0.0) ** 3)
+    alike[0] = 0.5  # a match is once beside itself, and twice beside another
+    left = 2.0 * (num * np.cumsum(alike) - np.cumsum(lag * alike)) / num**2
+    return np.asarray(np.interp(side, num, left))

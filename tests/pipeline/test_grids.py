@@ -181,6 +181,9 @@ def test_what_steps_leave_is_told(tmp_path, view, camera, fit, caplog):
             image = camera.project(ground)
             return image + 0.1 * (image[..., :1] > 700.25)
 
+        def project_jacobian(self, ground):
+            return self.project(ground), camera.project_jacobian(ground)[1]
+
     with caplog.at_level(logging.WARNING):
         (written,) = run_of(tmp_path, (view, fit, Stepped()), grids=True)
     for end in (GRID, CORRECTION):  # whoever reads a file sees the step that was seen as it was written

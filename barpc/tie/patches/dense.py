@@ -131,9 +131,9 @@ def dense_matches(
     seen = shown_left & (_warped(shown_right.astype(np.uint8), disparity, cv2.INTER_NEAREST) > 0)
     good &= seen
     disparity, sigma = _refined(left, right, disparity, good)
-    # a match a pixel: the mean of those about it that differ by less than a column or so, which is one surface
+    # a match a pixel: the mean of those about it that differ by less than a pixel or so, which is one surface
     single = np.ascontiguousarray(np.where(good, disparity, -frame.num)[:, ::FINER], np.float32)
-    level = cv2.bilateralFilter(single, WINDOW, sigmaColor=1.0, sigmaSpace=np.inf)
+    level = cv2.bilateralFilter(single, WINDOW, sigmaColor=FINER, sigmaSpace=np.inf)
     row, col = np.nonzero((good & _inside(shape, low, frame))[:, ::FINER])
     moves = level[row, col].astype(np.float64)
     place = np.column_stack([FINER * col, row]) + low
