@@ -21,6 +21,7 @@ from barpc.base.geodesy import (
     wrap_longitude,
 )
 from barpc.sensor import SensorModel
+from barpc.sensor.curve import cross
 from barpc.sensor.rpc import RPC, localize_stack
 from barpc.sensor.timing import Clocked
 
@@ -444,7 +445,7 @@ def _intersect(
             np.multiply((image - xy[part]).T, weight[part], out=residual[:, part])
             np.multiply(by_ground.T, weight[part], out=jacobian[:, :, part])
         step, ok = _normal_step(jacobian, residual, point, scale.T)
-        ground -= np.where(ok, step, 0.0).T / scale
+        ground -= step.T / scale
         if not np.abs(step[:, ok]).max(initial=0.0) > 1e-3:  # metres; quadratic: the next is below 1e-9
             break
     return ground, ok
@@ -461,12 +462,14 @@ def _normal_step(jacobian: Array, residual: Array, point: IntArray, scale: Array
         weights: Array = u[0] * v[0] + u[1] * v[1]
         return np.asarray(np.bincount(point, weights, minlength=num), dtype=np.float64)
 
-    normal = np.empty((num, 3, 3))
+    normal = np.empty((3, 3, num))
     for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
-        normal[:, i, j] = normal[:, j, i] = total(jacobian[i], jacobian[j]) / (scale[i] * scale[j])
-    right = np.stack([total(by_axis, residual) / metres for by_axis, metres in zip(jacobian, scale, strict=True)], 1)
-    det, mean = np.linalg.det(normal), np.trace(normal, axis1=1, axis2=2) / 3
+        normal[i, j] = normal[j, i] = total(jacobian[i], jacobian[j]) / (scale[i] * scale[j])
+    right = np.stack([total(by_axis, residual) / metres for by_axis, metres in zip(jacobian, scale, strict=True)])
+    cofactors = np.stack([cross(normal[i - 2], normal[i - 1]) for i in range(3)])  # Cramer: a step need not be exact
+    det, mean = (normal[0] * cofactors[0]).sum(axis=0), (normal[0, 0] + normal[1, 1] + normal[2, 2]) / 3
     # parallel rays: the determinant against the trace; 1e-10 is 0.0006 degrees
     ok = np.isfinite(det) & (det > 1e-10 * mean**3)
-    normal[~ok] = np.eye(3)
-    return np.linalg.solve(normal, right[..., None])[..., 0].T, ok
+    step = (cofactors * right).sum(axis=1) / det
+    step[:, ~ok] = 0.0
+    return step, ok
