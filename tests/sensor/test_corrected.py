@@ -113,3 +113,20 @@ def test_derivatives_with_a_scale_and_a_drift_are_central_differences():
         for found, name, step in ((by_ecef, "x", 1.0), (by_rotation, "r", 1e-6), (by_translation, "t", 1.0)):
             difference = (at(**{name: step * axis}) - at(**{name: -step * axis})) / (2 * step)
             np.testing.assert_allclose(found @ axis, difference, rtol=1e-5, atol=1e-5 / step)
+
+
+@pytest.mark.parametrize("lon", [-179.999, 5.4, 179.999])
+def test_a_point_is_localised_where_the_equation_projects_it_at_its_altitude_and_longitude(lon):
+    rpc = make_rpc(lon)
+    middle = ecef_from_ground(rpc.ground_offset)
+    turn, move, center = np.array([3e-6, -2e-5, 1e-5]), np.array([40.0, -25.0, 60.0]), 1.1 * middle
+    camera = Corrected(rpc, Correction(turn, move, center, scale=1.00001))
+    image = np.random.default_rng(4).uniform(0, 19000, (50, 2))
+    alt = np.linspace(0.0, 1000.0, 50)
+    ground = camera.localize(image, alt)
+    np.testing.assert_array_equal(ground[:, 2], alt)
+    assert np.abs(ground[:, 0] - lon).max() < 1.0  # not a turn away
+    # equation 7 by scipy's rotation, and the projection of the RPC as delivered
+    ecef = ecef_from_ground(ground)
+    moved = 1.00001 * Rotation.from_rotvec(turn).apply(ecef - move - center) + center
+    np.testing.assert_allclose(rpc.project(ground_from_ecef(moved)), image, rtol=0, atol=1e-7)
