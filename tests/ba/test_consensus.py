@@ -42,6 +42,15 @@ def likeliest(z: np.ndarray, logits: tuple[float, ...] = (-2.0, 0.0, 2.0)) -> tu
     return min(part, 1 - part), abs(found.x[2] - found.x[1]), float(gain)
 
 
+@pytest.mark.parametrize("share", [0.3, 0.5])
+@pytest.mark.parametrize("noise", [0.0, 1e-12, 1e-7])
+def test_groups_without_noise_are_two(share: float, noise: float) -> None:
+    z = np.repeat([0.0, 1.0], [round(100 * share), round(100 * (1 - share))])
+    part, distance, gain = _mixture(z + noise * np.random.default_rng(0).standard_normal(100))
+    assert (part, distance) == pytest.approx((share, 1.0), abs=1e-6)
+    assert 1000.0 < gain < 2000.0
+
+
 @pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(

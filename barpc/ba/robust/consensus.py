@@ -68,7 +68,8 @@ def _mixture(z: Array) -> tuple[float, float, float]:
             return 0.0, 0.0, 0.0
         high = float(second @ z) / len(z) / (1.0 - part)
         low = -high * (1.0 - part) / part
-        before, square = square, whole - part * low**2 - (1.0 - part) * high**2
+        rest = whole - part * low**2 - (1.0 - part) * high**2
+        before, square = square, max(rest, np.finfo(float).eps * whole)  # below it is rounding
         if abs(square - before) < SLIGHT**2 * whole:
             break
     sigma, apart = np.sqrt(square), float(high - low)
