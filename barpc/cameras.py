@@ -28,54 +28,13 @@ from barpc.rasters.raster import driver_of, open_raster
 from barpc.rpcio import read_rpc_source
 from barpc.rpcio.grids import SIGN, read_correction
 from barpc.rpcio.sources import described, metadata_beside, only_physical
-from barpc.sensor import SensorModel
+from barpc.scene import Camera
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.displaced import Displaced
 from barpc.sensor.geometry import altitude_range
-from barpc.sensor.rpc import RPC
 
 _HEAD = 4096
 _ON_EARTH = (-500.0, 9000.0)  # m: all ground
-
-
-@dataclass(frozen=True, eq=False)
-class Camera:
-    """A camera and where it came from."""
-
-    model: SensorModel
-    path: Place
-    """The file that holds it: what was given, or a file beside it."""
-    format: str
-    """What that file is: ``tag``, ``nitf``, a row of `barpc.rpcio.FORMATS`, or another row of `OPENERS`."""
-    size: tuple[int, int] | None
-    """Width, height [px] of the image; None where nothing states them."""
-    alt_range: tuple[float, float]
-    """The altitudes [m above the ellipsoid] that it is made for."""
-    notes: tuple[str, ...] = ()
-    """What the user should know."""
-
-    def __repr__(self) -> str:
-        place = self.path if len(str(self.path)) <= 50 else self.path.name
-        return f"Camera({self.format} in {place}, size {self.size}, {self.model})"
-
-    @property
-    def rpc(self) -> RPC:
-        """The RPC, where the model is one; InputError where it is not."""
-        if isinstance(self.model, RPC):
-            return self.model
-        raise InputError(f"{self.path}: a camera of the kind {self.format}, no RPC; make one with 'barpc fit'")
-
-    @property
-    def extent(self) -> tuple[int, int]:
-        """The image's size [px]; InputError where it is not known."""
-        if self.size is None:
-            raise InputError(f"{self.path}: a camera without its image; give the size: FILE,size=WIDTH:HEIGHT")
-        return self.size
-
-    @property
-    def altitude(self) -> float:
-        """Middle of the camera's altitudes [m]."""
-        return (self.alt_range[0] + self.alt_range[1]) / 2
 
 
 Reader = Callable[[str], Any]

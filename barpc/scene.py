@@ -1,4 +1,4 @@
-"""The data that travels between the halves of barpc: views, tracks, ground points.
+"""The data that travels between the halves of barpc: cameras, views, tracks, ground points.
 
 Frozen records of plain float64 arrays. `tie` makes tracks, `ba` reads them; neither knows the other.
 """
@@ -16,13 +16,55 @@ from scipy.sparse.csgraph import connected_components
 from barpc.base.errors import InputError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array
+from barpc.base.remote import Place
 from barpc.sensor import SensorModel
+from barpc.sensor.rpc import RPC
 
 SIGMA_RANGE = 1e-6, 1e9
 """Standard deviations of ground points [m, px] whose squares can be reckoned with."""
 
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A camera and where it came from."""
+
+    model: SensorModel
+    path: Place
+    """The file that holds it: what was given, or a file beside it."""
+    format: str
+    """What that file is: ``tag``, ``nitf``, a row of `barpc.rpcio.FORMATS`, or another row of `OPENERS`."""
+    size: tuple[int, int] | None
+    """Width, height [px] of the image; None where nothing states them."""
+    alt_range: tuple[float, float]
+    """The altitudes [m above the ellipsoid] that it is made for."""
+    notes: tuple[str, ...] = ()
+    """What the user should know."""
+
+    def __repr__(self) -> str:
+        place = self.path if len(str(self.path)) <= 50 else self.path.name
+        return f"Camera({self.format} in {place}, size {self.size}, {self.model})"
+
+    @property
+    def rpc(self) -> RPC:
+        """The RPC, where the model is one; InputError where it is not."""
+        if isinstance(self.model, RPC):
+            return self.model
+        raise InputError(f"{self.path}: a camera of the kind {self.format}, no RPC; make one with 'barpc fit'")
+
+    @property
+    def extent(self) -> tuple[int, int]:
+        """The image's size [px]; InputError where it is not known."""
+        if self.size is None:
+            raise InputError(f"{self.path}: a camera without its image; give the size: FILE,size=WIDTH:HEIGHT")
+        return self.size
+
+    @property
+    def altitude(self) -> float:
+        """Middle of the camera's altitudes [m]."""
+        return (self.alt_range[0] + self.alt_range[1]) / 2
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -114,16 +114,6 @@ def timed(name: str, stages: list[dict[str, Any]]) -> Iterator[list[float]]:
     logger.info("%s: %.2f s, peak memory %.0f MB", name, seconds, memory)
 
 
-TABLES = "tables"
-"""Folder in that of a run for what is neither a corrected camera, nor its report and summary."""
-
-
-def table_path(folder: Path, name: str) -> Path:
-    """Where a run keeps a table: in its folder `TABLES`; runs before release 0.3 beside their summary."""
-    beside, inside = folder / name, folder / TABLES / name
-    return beside if os.path.lexists(beside) and not os.path.lexists(inside) else inside
-
-
 class Workspace:
     """A run folder, held by one run at a time.
 

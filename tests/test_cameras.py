@@ -21,10 +21,11 @@ from barpc.base.geodesy import (
     ground_from_ecef,
 )
 from barpc.base.remote import Remote
-from barpc.cameras import OPENERS, Camera, Opener, open_camera
+from barpc.cameras import OPENERS, Opener, open_camera
 from barpc.cli import main
 from barpc.cli.main import cli
 from barpc.rpcio import read_rpc, write_rpc
+from barpc.scene import Camera
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import altitude_range
 from tests.pipeline.known import part

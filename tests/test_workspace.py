@@ -16,7 +16,8 @@ import pytest
 
 from barpc.base.errors import OutputError, TiePointError
 from barpc.base.identity import take
-from barpc.workspace import Workspace, code_version, key_of, peak_memory, table_path, timed
+from barpc.report.runfiles import table_path
+from barpc.workspace import Workspace, code_version, key_of, peak_memory, timed
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ import numpy as np
 
 from barpc.base.errors import FitError, InputError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.cameras import Camera
 from barpc.cli.terminal import say
 from barpc.fit import FitOptions, fit_rpc
 from barpc.pointio.tables import read_transform
 from barpc.rpcio import CARRIERS
+from barpc.scene import Camera
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, correction_of
 from barpc.sensor.geometry import image_border

@@ -16,7 +16,7 @@ import shapely
 
 from barpc.base.errors import InputError, OutputError
 from barpc.base.sidefile import plain_path
-from barpc.cameras import Camera, open_camera, split_spec
+from barpc.cameras import open_camera, split_spec
 from barpc.cli.alignment import moved, read_move, refitted
 from barpc.cli.flags import expanded
 from barpc.cli.project import altitude_of, exchanged, with_heights
@@ -40,6 +40,7 @@ from barpc.rpcio import (
     write_rpc,
 )
 from barpc.rpcio.grids import GRID, write_grid
+from barpc.scene import Camera
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
 from barpc.sensor.geometry import image_border
 from barpc.sensor.rpc import RPC

@@ -39,7 +39,7 @@ def report(run_dir: str, other: str | None) -> int:
     if other is None:
         if wants_json():
             raise click.UsageError("--json goes with two runs; the summary.json of one is there already")
-        from barpc.report.page import remake_report
+        from barpc.pipeline.outputs import remake_report
 
         echo(remake_report(run_dir))
         return 0

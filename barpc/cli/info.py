@@ -11,12 +11,13 @@ import numpy as np
 
 from barpc.base.errors import InputError, RpcError
 from barpc.base.geodesy import collection, feature, polygon
-from barpc.cameras import Camera, open_camera, split_spec
+from barpc.cameras import open_camera, split_spec
 from barpc.cli.flags import expanded
 from barpc.cli.project import altitude_of, exchanged, ground_at, with_heights
 from barpc.cli.terminal import echo, wants_json
 from barpc.fit.poles import smallest_denominator
 from barpc.rasters.dem import Dem
+from barpc.scene import Camera
 from barpc.sensor import geometry
 from barpc.sensor.rpc import RPC
 

@@ -19,10 +19,10 @@ from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.options import GEOID_HELP
 from barpc.base.remote import Place
 from barpc.base.sidefile import TABLE, opened_text
-from barpc.cameras import Camera, open_camera, split_spec
+from barpc.cameras import open_camera, split_spec
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
 from barpc.rasters.dem import Dem, localize_on_terrain
-from barpc.scene import BoolArray
+from barpc.scene import BoolArray, Camera
 from barpc.sensor import geometry
 
 _APART = 1.0  # px: lines of sight that a point's places miss by as much (RMS) do not meet

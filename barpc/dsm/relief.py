@@ -19,13 +19,14 @@ from barpc.base.errors import BarpcError
 from barpc.cameras import open_camera
 from barpc.dsm.cells import F32, Tile, surface_tile
 from barpc.dsm.stereo import Block, Groups
+from barpc.pipeline.outputs import remake_report
 from barpc.rasters.raster import open_raster
-from barpc.report.page import can_render, remake_report
-from barpc.report.runfiles import SURFACE, run_key
+from barpc.report.page import can_render
+from barpc.report.runfiles import FOLDER, SURFACE, run_key
 from barpc.report.summary import Summary
 from barpc.scene import View
 from barpc.tie.pixels import jpeg, read_pixels, sample_stretch
-from barpc.workspace import TABLES, Workspace
+from barpc.workspace import Workspace
 
 logger = logging.getLogger(__name__)
 
@@ -56,7 +57,7 @@ def show_in_report(
             shown.append(row | _picture(shaded(height, tile.step)))
         seen = (block.views[i] for i in pairs[0])
         shown += [{"image": view.name, **_picture(draped(view, tile, after[0], band))} for view in seen]
-        text, name = json.dumps({"run": run_key(run), "shown": shown}), f"{TABLES}/{SURFACE}"
+        text, name = json.dumps({"run": run_key(run), "shown": shown}), f"{FOLDER}/{SURFACE}"
         with Workspace(folder, overwrite=True, names=[name], adds=True) as own:
             own.write_text(name, text)
         if can_render():

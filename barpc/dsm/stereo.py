@@ -23,13 +23,12 @@ from barpc.cameras import open_camera
 from barpc.export.shots import read_scene
 from barpc.pipeline import load_views
 from barpc.pipeline.inputs import PRIOR
-from barpc.report.runfiles import read_summary
+from barpc.report.runfiles import read_summary, table_path
 from barpc.report.summary import Summary
 from barpc.rpcio.grids import CORRECTION
 from barpc.scene import View
 from barpc.sensor.geometry import is_radar
 from barpc.tie.pairing.overlaps import overlapping_pairs
-from barpc.workspace import table_path
 
 logger = logging.getLogger(__name__)
 

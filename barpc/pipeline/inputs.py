@@ -25,6 +25,7 @@ from barpc.pointio.names import ViewNames
 from barpc.rasters.dem import Dem, geoid_file
 from barpc.rasters.raster import hashed
 from barpc.report import Run
+from barpc.report.runfiles import table_path
 from barpc.report.summary.words import listed
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Tracks, View
 from barpc.sensor.geometry import footprint, ground_sample_distance
@@ -34,7 +35,6 @@ from barpc.tie.pairing.epipolar import grouped
 from barpc.tie.pairing.overlaps import reach_of
 from barpc.tie.patches.channels import Sheet
 from barpc.tie.tasks import Progress, ordered
-from barpc.workspace import table_path
 
 logger = logging.getLogger(__name__)
 

@@ -23,12 +23,12 @@ from barpc.base.geodesy import ALTITUDES
 from barpc.base.identity import Stamp, also_seen, recorded
 from barpc.base.remote import Place, here, located
 from barpc.base.sidefile import IMAGE, plain_path, versioned
-from barpc.cameras import Camera, open_split, split_spec
+from barpc.cameras import open_split, split_spec
 from barpc.pipeline.executor import GROUP
 from barpc.pointio.names import unique_names
 from barpc.rasters.raster import open_raster
 from barpc.rpcio.sources import date_taken
-from barpc.scene import View
+from barpc.scene import Camera, View
 from barpc.sensor.geometry import footprint
 from barpc.tie.tasks import Progress, ordered
 

@@ -22,9 +22,9 @@ from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.handoff import verify
 from barpc.pipeline.inputs import PRIOR
 from barpc.report import Run, Summary
-from barpc.report.page import REPORT, can_render, report_html
+from barpc.report.page import NAME, REPORT, can_render, report_html
 from barpc.report.records import plain
-from barpc.report.runfiles import TABLES, gcps_geojson, read_summary
+from barpc.report.runfiles import FOLDER, TABLES, gcps_geojson, read_summary
 from barpc.report.summary import OutputEntry, StageEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import CARRIERS, WRITABLE, row_of, sidecars, write_camera
@@ -34,10 +34,9 @@ from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
 from barpc.tie.tasks import Progress, ordered
 from barpc.workspace import LAST, Workspace, own_files
-from barpc.workspace import TABLES as TABLES_FOLDER
 
 MATCHES = ("matches.csv", "matches.npz")
-GCPS = f"{TABLES_FOLDER}/gcps.geojson"  # of a reference
+GCPS = f"{FOLDER}/gcps.geojson"  # of a reference
 
 
 Fitted = tuple[View, RpcFit, SensorModel]  # a view, its refitted RPC and P_BA
@@ -107,8 +106,8 @@ def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
 
 def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> list[str]:
     """Return the names of a run's outputs before it starts; of match files those that are already in the folder."""
-    names = [*(f"{TABLES_FOLDER}/{name}" for name in TABLES), LAST]
-    names += ["report.html"] * can_render() + [GCPS] * bool(options.reference)
+    names = [*(f"{FOLDER}/{name}" for name in TABLES), LAST]
+    names += [NAME] * can_render() + [GCPS] * bool(options.reference)
     if options.stop_after == "matching":
         stems = {view.name for view in views}
         pairs = [path.name for path in (folder / "asp").glob("*__*.txt") if _is_pair(path.stem, stems)]
@@ -116,7 +115,7 @@ def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> li
     if options.stop_after == "all":
         names += [name for view in views for name in file_names(view, options.images, options.rpc_formats)]
         names += [name for view in views for name in grid_names(view, options)]
-    return [*names, f"{TABLES_FOLDER}/{PRIOR}"]
+    return [*names, f"{FOLDER}/{PRIOR}"]
 
 
 def _is_pair(stem: str, names: Set[str]) -> bool:
@@ -151,15 +150,15 @@ def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
 
     with workspace.stage("tables"):
         for name, content in TABLES.items():
-            with workspace.output(f"{TABLES_FOLDER}/{name}") as partial:
+            with workspace.output(f"{FOLDER}/{name}") as partial:
                 partial.write_bytes(content(run, summary))
         if run.reference is not None and run.reference.control is not None and run.adjustment is not None:
             workspace.write_text(GCPS, gcps_geojson(run).decode())
     with workspace.stage(REPORT):
         if can_render():
-            workspace.write_text("report.html", report_html(now(), workspace.folder))
+            workspace.write_text(NAME, report_html(now(), workspace.folder))
         # the report shows times and may be made again: it is no result
-    results = sorted((name, sha) for name, sha in workspace.outputs.items() if name != "report.html")
+    results = sorted((name, sha) for name, sha in workspace.outputs.items() if name != NAME)
     summary = replace(summary, outputs=tuple(OutputEntry(name, sha) for name, sha in results))
     texts = {key: _json(value) for key, value in plain(summary).items()}
     texts["stages"] = _json(plain(now().stages))
@@ -264,3 +263,25 @@ def _digest(path: Path) -> str | None:
         return take(path).sha256 if path.is_file() else None
     except OSError:
         return None
+
+
+def remake_report(folder: Path | str) -> Path:
+    """Make report.html of a finished run again, from its files.
+
+    Raises
+    ------
+    InputError
+        The folder holds no finished run.
+    OutputError
+        There is a report.html that barpc did not write, or that was changed since.
+    BarpcError
+        jinja2 is not installed.
+    """
+    folder = Path(folder)
+    summary = read_summary(folder)
+    if not can_render():
+        raise BarpcError("the report needs jinja2: pip install 'barpc[report]'")
+    html = report_html(summary, folder)
+    with Workspace(folder, overwrite=True, names=[NAME], adds=True) as workspace:
+        workspace.write_text(NAME, html)
+    return folder / NAME

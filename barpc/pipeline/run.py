@@ -41,14 +41,15 @@ from barpc.pipeline.inputs import (
     with_located,
 )
 from barpc.pipeline.loading import Image, image_path, load_views
-from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_views
+from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, remake_report, write_tables, write_views
 from barpc.pointio.matches import asp_text, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
 from barpc.rasters.dem import Dem
 from barpc.report import Run, Summary, summarize
 from barpc.report.outcome import pair_ties
-from barpc.report.page import REPORT, remake_report
+from barpc.report.page import REPORT
 from barpc.report.records import plain
+from barpc.report.runfiles import FOLDER
 from barpc.report.summary import InputEntry, StageEntry
 from barpc.rpcio import plain_source
 from barpc.scene import Tracks, View
@@ -58,7 +59,7 @@ from barpc.sensor.rpc import RPC
 from barpc.tie import Scope, find_tracks, read_area
 from barpc.tie.reference import Accuracy, ReferenceControl, register_views
 from barpc.tie.tasks import Progress, Work, ordered
-from barpc.workspace import TABLES, Workspace, timed
+from barpc.workspace import Workspace, timed
 
 logger = logging.getLogger(__name__)
 
@@ -178,7 +179,7 @@ def adjust(
 def _summed_up(run: Run, inputs: Iterable[Input], workspace: Workspace, progress: Progress | None) -> Summary:
     """Write what a later run starts from, summary, tables and report."""
     if run.adjustment is not None:
-        with _told(workspace, "block", progress), workspace.output(f"{TABLES}/{PRIOR}") as partial:
+        with _told(workspace, "block", progress), workspace.output(f"{FOLDER}/{PRIOR}") as partial:
             block_prior(run.adjustment).save(partial)
     with _told(workspace, "summary", progress):
         summary = replace(summarize(run), inputs=_entries(inputs))

@@ -34,7 +34,6 @@ from barpc.base.identity import Input
 from barpc.base.remote import Place, Remote, RemoteFile, location
 from barpc.base.sidefile import IMAGE, read_head
 from barpc.rasters.vrt import INDIRECT, MAGIC, Band, Rect, Source, Vrt, read_vrt
-from barpc.scene import BoolArray
 
 DRIVERS: dict[bytes, str] = {
     b"II*\x00": "GTiff",
@@ -347,10 +346,10 @@ def _handed_on(values: Pixels, source: Source, dtype: str) -> tuple[Any, Pixels]
     return keep, values
 
 
-def _equal(values: Pixels, nodata: float) -> BoolArray:
+def _equal(values: Pixels, nodata: float) -> npt.NDArray[np.bool_]:
     with np.errstate(all="ignore"):
         wanted = values.dtype.type(nodata) if values.dtype.kind in "fc" else nodata
-        found: BoolArray = np.isnan(values) if np.isnan(nodata) else values == wanted
+        found: npt.NDArray[np.bool_] = np.isnan(values) if np.isnan(nodata) else values == wanted
     return found
 
 

@@ -14,9 +14,8 @@ from barpc.ba import Adjustment
 from barpc.ba.evidence.places import Place, Unused, met_worse
 from barpc.ba.usual import CRITICAL, FEWEST
 from barpc.base.geodesy import Array, ground_from_ecef
-from barpc.cameras import Camera
 from barpc.fit import RpcFit
-from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View, middle_altitude
+from barpc.scene import BoolArray, Camera, GroundPoints, IntArray, Tracks, View, middle_altitude
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, Several, Triangulation, triangulate
 from barpc.tie import PairReport, ReferenceControl

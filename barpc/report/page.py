@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from barpc.ba.usual import FEW, LARGEST
-from barpc.base.errors import BarpcError, visible
+from barpc.base.errors import visible
 from barpc.report.compare import flat_options
 from barpc.report.maps import ground_map, residual_panels, template
 from barpc.report.records import MAX_SHOWN, Record, Table, cell_of, table, value_of
 from barpc.report.reservations import GOOD_RMSE
-from barpc.report.runfiles import RunFiles, read_summary, read_tables
+from barpc.report.runfiles import RunFiles, read_tables
 from barpc.report.summary import StageEntry, Summary
 from barpc.report.summary.known import GCPS, CheckPointEntry, GcpEntry, ReferenceViewEntry
 from barpc.report.summary.pairs import PairEntry
@@ -29,7 +29,6 @@ from barpc.report.summary.whole import DATUM, DatumEntry, ExplanationEntry, Held
 from barpc.report.summary.words import NAMED, largest
 from barpc.report.verdict import LINES, SHOWN, flagged, offset_of, sentences, sure_pairs, worst_first, worst_pairs
 from barpc.scene import connected_groups
-from barpc.workspace import Workspace
 
 NAME = "report.html"
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
@@ -64,28 +63,6 @@ def report_html(summary: Summary, folder: Path | str) -> str:
             most=MAX_SHOWN,
         )
     )
-
-
-def remake_report(folder: Path | str) -> Path:
-    """Make report.html of a finished run again, from its files.
-
-    Raises
-    ------
-    InputError
-        The folder holds no finished run.
-    OutputError
-        There is a report.html that barpc did not write, or that was changed since.
-    BarpcError
-        jinja2 is not installed.
-    """
-    folder = Path(folder)
-    summary = read_summary(folder)
-    if not can_render():
-        raise BarpcError("the report needs jinja2: pip install 'barpc[report]'")
-    html = report_html(summary, folder)
-    with Workspace(folder, overwrite=True, names=[NAME], adds=True) as workspace:
-        workspace.write_text(NAME, html)
-    return folder / NAME
 
 
 Pictures = Sequence[tuple[str, str]]  # SVG texts with their captions

@@ -33,7 +33,9 @@ from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import Share, Side
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.geometry import footprint
-from barpc.workspace import table_path
+
+FOLDER = "tables"
+"""Folder in that of a run for what is neither a corrected camera, nor its report and summary."""
 
 _PLACE = "lon", "lat", "height_above_datum"
 RESIDUALS = (*_PLACE, "mean_residual", "num_observations", "mean_residual_before", "track")
@@ -44,6 +46,12 @@ OBSERVATIONS = ("view", "track", "col", "row", "col_before", "row_before", "col_
 
 _BASE64 = r"^[A-Za-z0-9+/]{4,400000}={0,2}\Z"
 _RESIDUAL_CELLS = "{:.3f},{:.3f},{:.4f},{:.4f},{:.4f},{:.4f}".format
+
+
+def table_path(folder: Path, name: str) -> Path:
+    """Where a run keeps a table: in its `FOLDER`; runs before release 0.3 beside their summary."""
+    beside, inside = folder / name, folder / FOLDER / name
+    return beside if os.path.lexists(beside) and not os.path.lexists(inside) else inside
 
 
 def _per_track(run: Run) -> Array:

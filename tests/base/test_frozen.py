@@ -12,9 +12,8 @@ import pytest
 
 from barpc.base.errors import FitError, InputError, RpcError
 from barpc.base.frozen import Frozen
-from barpc.cameras import Camera
 from barpc.fit import Normalization, fit_rpc
-from barpc.scene import GroundPoints, Tracks, View
+from barpc.scene import Camera, GroundPoints, Tracks, View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.curve import Curve
 from barpc.sensor.direct_grid import DirectGrid

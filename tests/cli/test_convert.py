@@ -14,12 +14,13 @@ import rasterio
 from rasterio.windows import Window
 
 from barpc.base.errors import InputError, OutputError
-from barpc.cameras import Camera, open_camera
+from barpc.cameras import open_camera
 from barpc.cli import convert as module
 from barpc.cli.convert import _check, _shadow_reasons, _tell, _window, box_of, check_target, window_of
 from barpc.fit.points import Sample
 from barpc.pipeline.handoff import Reading
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
+from barpc.scene import Camera
 from tests.cli.test_main import run
 from tests.rpcio.conftest import make_rpc, write_image
 

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.cameras import Camera, open_camera
+from barpc.cameras import open_camera
 from barpc.cli.project import altitude_of, exchanged
 from barpc.rpcio import read_rpc, write_rpc_copy
+from barpc.scene import Camera
 from tests.cli.test_images import run
 from tests.report.conftest import run_of_block, written
 from tests.rpcio.conftest import make_rpc, write_image

@@ -32,7 +32,7 @@ from barpc.pointio.matches import read_matches
 from barpc.rasters.dem import Dem
 from barpc.report.compare import compare_runs
 from barpc.report.page import report_html
-from barpc.report.runfiles import read_summary
+from barpc.report.runfiles import read_summary, table_path
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
 from barpc.rpcio.carried import put_tag
 from barpc.rpcio.grids import SIGN, read_correction
@@ -45,7 +45,7 @@ from barpc.sensor.sentinel1 import open_product
 from barpc.sensor.sicd import open_sicd
 from barpc.sensor.terrasar import open_terrasar
 from barpc.tie.pairing.area import read_area
-from barpc.workspace import Workspace, table_path
+from barpc.workspace import Workspace
 from tests.pointio.test_foreign import binary, colmap
 from tests.report.conftest import run_of_block, written
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml

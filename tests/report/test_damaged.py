@@ -16,9 +16,10 @@ from click.testing import CliRunner
 
 from barpc.base.errors import InputError
 from barpc.cli.main import cli
+from barpc.pipeline.outputs import remake_report
 from barpc.report import Run
 from barpc.report.compare import compare_runs
-from barpc.report.page import remake_report, report_html
+from barpc.report.page import report_html
 from barpc.report.runfiles import read_summary
 from barpc.rpcio import write_rpc
 from tests.rpcio.conftest import make_rpc
