@@ -44,7 +44,7 @@ from scipy.sparse.linalg import splu
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.ba.algebra import structure
-from barpc.ba.algebra.multifrontal import Cholesky
+from barpc.ba.algebra.linear import Cholesky
 from barpc.ba.held.block import join
 from barpc.ba.held.starting import make_problem
 from barpc.ba.judging import solution

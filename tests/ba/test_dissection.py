@@ -11,8 +11,8 @@ import pytest
 import scipy.sparse as sp
 from scipy.optimize import linear_sum_assignment
 
-from barpc.ba.algebra import dissection
-from barpc.ba.algebra.dissection import Dissection, dissect
+from barpc.ba.algebra import structure
+from barpc.ba.algebra.structure import Dissection, dissect
 from tests.lanes import rest_slow
 
 KINDS = ("ring", "grid", "clique", "star", "two cliques", "time series", "random", "parts", "path of cliques")
@@ -133,7 +133,7 @@ def test_of_all_cuts_of_an_order_the_best_parts_most_for_the_views_that_touch_it
         before, behind = int(across.any(axis=1).sum()), int(across.any(axis=0).sum())
         near, far = (cut - before, n - cut) if before < behind else (cut, n - cut - behind)
         costs.append((min(before, behind) + 1) / (near * far) if near * far else np.inf)
-    _, cut, cost = dissection._best_cut(graph, order)
+    _, cut, cost = structure._best_cut(graph, order)
     assert cost == pytest.approx(min(costs))
     assert costs[cut - 1] == pytest.approx(min(costs))
 
@@ -154,7 +154,7 @@ def _covered(graph: sp.csr_array) -> np.ndarray:
     """What `_touching` takes, of rows then columns of a bipartite graph."""
     rows, cols = graph.shape
     whole = sp.csr_array(sp.block_array([[None, graph], [graph.T, None]]))
-    cover = dissection._touching(whole, np.arange(rows), rows + np.arange(cols))
+    cover = structure._touching(whole, np.arange(rows), rows + np.arange(cols))
     row, col = graph.nonzero()
     assert (np.isin(row, cover) | np.isin(rows + col, cover)).all()
     return cover

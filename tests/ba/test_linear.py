@@ -8,9 +8,8 @@ import scipy.linalg as la
 
 from barpc.ba import Adjustment
 from barpc.ba.algebra import linear
-from barpc.ba.algebra.dissection import dissect
-from barpc.ba.algebra.multifrontal import Blocks
-from barpc.ba.algebra.structure import counting_sort
+from barpc.ba.algebra.linear import Blocks
+from barpc.ba.algebra.structure import counting_sort, dissect
 from barpc.ba.solving import normal
 from barpc.base.errors import AdjustError
 from barpc.simulate import Block, simulate_block

@@ -11,10 +11,9 @@ import pytest
 import scipy.linalg as la
 
 from barpc.ba import adjust_tracks
-from barpc.ba.algebra import dissection, multifrontal
-from barpc.ba.algebra.dissection import Dissection, dissect
-from barpc.ba.algebra.linear import factorize_blocks
-from barpc.ba.algebra.multifrontal import Blocks
+from barpc.ba.algebra import linear, structure
+from barpc.ba.algebra.linear import Blocks, factorize_blocks
+from barpc.ba.algebra.structure import Dissection, dissect
 from barpc.ba.held.block import join
 from barpc.ba.held.incremental import BlockPrior
 from barpc.ba.held.starting import make_problem
@@ -59,8 +58,8 @@ def _work(order: Dissection) -> int:
     diagonal([(4, 15, 1), (7, 6, 3), (60, 1, 2), (1, 1, 1)], [7, 1, 32, 1000], [0.0, 1e9]),
 )
 def test_solutions_and_blocks_of_the_inverse_are_those_of_the_dense_matrix(monkeypatch, sites, leaf, kept) -> None:
-    monkeypatch.setattr(dissection, "LEAF", leaf)
-    monkeypatch.setattr(multifrontal, "IN_MEMORY", kept)
+    monkeypatch.setattr(structure, "LEAF", leaf)
+    monkeypatch.setattr(linear, "IN_MEMORY", kept)
     pairs, place = _sites(*sites)
     n, q = len(place), 2
     matrix, rng = _matrix(pairs, n, q), np.random.default_rng(leaf)
@@ -206,7 +205,7 @@ def test_a_step_and_its_covariance_are_those_of_the_dense_solve(monkeypatch, vie
     many = _square(views)
     if views < 200:
         monkeypatch.setattr(normal, "LEAF", 0)
-    monkeypatch.setattr(dissection, "LEAF", leaf)
+    monkeypatch.setattr(structure, "LEAF", leaf)
     tracks = many.tracks if ties == "all" else _weakly_tied(many, 6 if ties == "weak" else 0)
     gcps = many.gcps if ties == "all" else None
     with pytest.warns(match="not tied") if ties == "none" else nullcontext():

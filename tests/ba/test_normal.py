@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.algebra.linear import Factor
-from barpc.ba.algebra.multifrontal import Blocks
+from barpc.ba.algebra.linear import Blocks, Factor
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import (
     TRIANGLE,

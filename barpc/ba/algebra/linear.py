@@ -1,17 +1,267 @@
-"""Solving with the reduced camera matrix: dense, or front by front where it is sparse."""
+"""Solving with the reduced camera matrix: dense Cholesky, or front by front where it is sparse (multifrontal).
+
+A front (`barpc.ba.algebra.structure`) is a small dense matrix of its pivots and its border: the matrix's own blocks and
+what the fronts below it leave. Its pivots are eliminated, what that leaves of the border goes to the parent (Duff and
+Reid 1983). The blocks of the inverse where the matrix has some follow from the last front to the first (Takahashi
+1973): that of a border is part of the parent's.
+"""
 
 from __future__ import annotations
 
+import tempfile
+import weakref
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import IO
 
 import numpy as np
 import scipy.linalg as la
+import scipy.sparse as sp
+from scipy.linalg.blas import dsyrk, dtrsm
+from scipy.linalg.lapack import dpotrf, dpotri
 
-from barpc.ba.algebra.dissection import Dissection
-from barpc.ba.algebra.multifrontal import Blocks, Cholesky
+from barpc.ba.algebra.structure import Dissection, Front
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
+from barpc.scene import BoolArray, IntArray
+
+IN_MEMORY = 1.5e9  # bytes of a factor; the rest goes to a temporary file
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """A symmetric matrix of blocks (q, q): N on the diagonal, and those of pairs of views."""
+
+    diagonal: Array  # (N, q, q)
+    pairs: Array  # (M, q, q) block i, j of pair i < j
+    pair_view: IntArray  # (M, 2) sorted
+
+    def plain(self) -> Array:
+        """Return the matrix (N q, N q) as an array."""
+        n, q, _ = self.diagonal.shape
+        i, j = self.pair_view.T
+        dense = np.zeros((n, q, n, q))
+        dense[np.arange(n), :, np.arange(n), :] = self.diagonal
+        dense[i, :, j, :] = self.pairs
+        dense[j, :, i, :] = self.pairs.transpose(0, 2, 1)
+        return dense.reshape(n * q, n * q)
+
+    def sparse(self) -> sp.csr_array:
+        """Return the matrix (N q, N q) as scipy has it."""
+        n, q, _ = self.diagonal.shape
+        (i, j), every = self.pair_view.T, np.arange(n)
+        row, col = np.concatenate([every, i, j]), np.concatenate([every, j, i])
+        order = np.lexsort((col, row))
+        data = np.concatenate([self.diagonal, self.pairs, self.pairs.transpose(0, 2, 1)])[order]
+        indptr = np.searchsorted(row[order], np.arange(n + 1))
+        return sp.csr_array(sp.bsr_array((data, col[order], indptr), shape=(n * q, n * q)))
+
+    def pair(self, i: int, j: int) -> int | None:
+        """Return the index of the pair i < j; None where the block is zero."""
+        start, stop = np.searchsorted(self.pair_view[:, 0], [i, i + 1])
+        at = start + int(np.searchsorted(self.pair_view[start:stop, 1], j))
+        return at if at < stop and self.pair_view[at, 1] == j else None
+
+
+class _Store:
+    """Arrays in the order they came; in a temporary file once they are many."""
+
+    def __init__(self) -> None:
+        self.kept: list[Array | tuple[int, tuple[int, int]]] = []
+        self.size = 0
+        self.file: IO[bytes] | None = None
+
+    def append(self, array: Array) -> None:
+        self.size += array.nbytes
+        if self.size <= IN_MEMORY or not array.size:
+            self.kept.append(array)
+            return
+        if self.file is None:
+            self.file = tempfile.TemporaryFile()  # noqa: SIM115
+            weakref.finalize(self, self.file.close)
+        self.kept.append((self.file.seek(0, 2), array.shape))
+        self.file.write(np.ascontiguousarray(array.T).data)
+
+    def __getitem__(self, number: int) -> Array:
+        kept = self.kept[number]
+        if isinstance(kept, np.ndarray):
+            return kept
+        assert self.file is not None
+        at, (rows, cols) = kept
+        out = np.empty((cols, rows))
+        self.file.seek(at)
+        self.file.readinto(out.data)  # type: ignore[attr-defined]
+        return out.T
+
+
+@dataclass(frozen=True, eq=False)
+class Cholesky:
+    """The factor L of a matrix of blocks, of the views that are eliminated."""
+
+    blocks: Blocks
+    order: Dissection
+    # of every front L of its pivots (p q, p q), above whose diagonal nothing is meant, then of its border (b q, p q)
+    parts: _Store = field(default_factory=_Store)
+
+    @property
+    def _size(self) -> int:
+        return int(self.blocks.diagonal.shape[1])
+
+    @cached_property
+    def _owned(self) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+        """Pairs by the front of their first view eliminated; that view and the other; bounds of each front's part."""
+        rank, owner = self.order.rank, self.order.owner
+        pairs = np.flatnonzero((rank[self.blocks.pair_view] >= 0).all(axis=1))
+        i, j = self.blocks.pair_view[pairs].T
+        early, late = np.where(rank[i] < rank[j], (i, j), (j, i))
+        by_front = np.argsort(owner[early], kind="stable")
+        bounds = np.searchsorted(owner[early][by_front], np.arange(len(self.order.fronts) + 1))
+        return pairs[by_front], early[by_front], late[by_front], bounds
+
+    def _entries(self, number: int, front: Front) -> tuple[IntArray, IntArray, IntArray, BoolArray]:
+        """Return the pairs of a front's pivots: which, their rows and columns in it, and whether row, col is j, i."""
+        pairs, early, late, bounds = self._owned
+        part = slice(*bounds[number : number + 2])
+        return (
+            pairs[part],
+            self._local(front, late[part]),
+            self._local(front, early[part]),
+            early[part] < late[part],
+        )
+
+    def _local(self, front: Front, views: IntArray) -> IntArray:
+        """Return the places of views in a front."""
+        rank = self.order.rank
+        own = rank[views] - rank[front.pivots[0]]
+        beyond = len(front.pivots) + np.searchsorted(rank[front.border], rank[views])
+        return np.where(own < len(front.pivots), own, beyond)
+
+    def factorize(self, damping: float) -> None:
+        """Factorise a matrix, its diagonal larger by a share `damping` of itself."""
+        left: dict[int, list[tuple[IntArray, Array]]] = {}
+        for number, front in enumerate(self.order.fronts):
+            matrix, split = self._assembled(number, front, damping), len(front.pivots) * self._size
+            for views, rest in left.pop(number, ()):
+                _add(matrix, _spread(self._local(front, views), self._size), rest)
+            upper, failed = dpotrf(matrix[:split, :split], lower=1, clean=0)
+            if failed:
+                raise np.linalg.LinAlgError(f"{failed}-th leading minor not positive definite")
+            lower = dtrsm(1.0, upper, matrix[split:, :split], side=1, lower=1, trans_a=1)
+            self.parts.append(upper)
+            self.parts.append(lower)
+            if front.parent >= 0:
+                rest = dsyrk(-1.0, lower, beta=1.0, c=matrix[split:, split:], lower=1)
+                left.setdefault(front.parent, []).append((front.border, rest))
+
+    def _assembled(self, number: int, front: Front, damping: float) -> Array:
+        """Return the matrix's own part of a front: what its pivots have, the lower triangle."""
+        q, count = self._size, len(front.pivots) + len(front.border)
+        matrix = np.zeros((count, q, count, q))  # its transpose: as LAPACK has it
+        diagonal = self.blocks.diagonal[front.pivots]
+        if damping:
+            diagonal = diagonal + damping * diagonal * np.eye(q)
+        own = np.arange(len(front.pivots))
+        matrix[own, :, own, :] = diagonal
+        pairs, row, col, flipped = self._entries(number, front)
+        block = self.blocks.pairs[pairs]
+        matrix[col, :, row, :] = np.where(flipped[:, None, None], block, block.transpose(0, 2, 1))
+        return matrix.reshape(count * q, count * q).T
+
+    def solve(self, b: Array) -> Array:
+        """Return the solutions of right-hand sides (n,) or (n, m), n unknowns of the views that are
+        eliminated, as given.
+        """
+        q, rank = self._size, self.order.rank
+        chosen = _spread(np.argsort(rank[rank >= 0], kind="stable"), q)
+        # rank of the m-th view in use -> place in b
+        y = np.ascontiguousarray(b.reshape(len(b), -1)[chosen])
+        for number, front in enumerate(self.order.fronts):
+            own, border = self._rows(front)
+            upper, lower = self._of(number)
+            y[own] = dtrsm(1.0, upper, y[own].T, side=1, lower=1, trans_a=1).T
+            y[border] -= lower @ y[own]
+        for number in range(len(self.order.fronts) - 1, -1, -1):
+            own, border = self._rows(self.order.fronts[number])
+            upper, lower = self._of(number)
+            rest = y[own] - lower.T @ y[border]
+            y[own] = dtrsm(1.0, upper, rest.T, side=1, lower=1).T
+        out = np.empty_like(y)
+        out[chosen] = y
+        return out.reshape(b.shape)
+
+    def _of(self, number: int) -> tuple[Array, Array]:
+        """Return L of a front: of its pivots and of its border."""
+        return self.parts[2 * number], self.parts[2 * number + 1]
+
+    def _rows(self, front: Front) -> tuple[slice, IntArray]:
+        """Return the unknowns of a front's pivots and its border, in the order of elimination."""
+        first = int(self.order.rank[front.pivots[0]])
+        q = self._size
+        return slice(first * q, (first + len(front.pivots)) * q), _spread(self.order.rank[front.border], q)
+
+    def inverse(self) -> Blocks:
+        """Return the inverse's blocks where the matrix has some; zero for views that are not eliminated."""
+        fronts = self.order.fronts
+        out = Blocks(np.zeros_like(self.blocks.diagonal), np.zeros_like(self.blocks.pairs), self.blocks.pair_view)
+        known: dict[int, Array] = {}
+        children = np.bincount([f.parent for f in fronts if f.parent >= 0], minlength=len(fronts))
+        for number in range(len(fronts) - 1, -1, -1):
+            front = fronts[number]
+            whole = self._inverse_of(number, front, known)
+            if children[number]:
+                known[number] = whole
+            if front.parent >= 0:
+                children[front.parent] -= 1
+                if not children[front.parent]:
+                    del known[front.parent]
+            self._take(out, number, front, whole)
+        return out
+
+    def _inverse_of(self, number: int, front: Front, known: dict[int, Array]) -> Array:
+        """Return the inverse's part (m q, m q) of a front, by that of its parent."""
+        (upper, lower), split = self._of(number), len(front.pivots) * self._size
+        found, failed = dpotri(upper, lower=1)
+        if failed:
+            raise np.linalg.LinAlgError(f"{failed}-th pivot is zero")
+        own: Array = np.tril(found)
+        own += np.tril(own, -1).T
+        if not len(front.border):
+            return own
+        whole = np.empty((split + len(front.border) * self._size,) * 2)
+        place = _spread(self._local(self.order.fronts[front.parent], front.border), self._size)
+        beyond = known[front.parent][np.ix_(place, place)]
+        weights = dtrsm(1.0, upper, lower, side=1, lower=1)
+        across = beyond @ weights
+        whole[split:, split:], whole[split:, :split], whole[:split, split:] = beyond, -across, -across.T
+        whole[:split, :split] = own + weights.T @ across
+        return whole
+
+    def _take(self, out: Blocks, number: int, front: Front, whole: Array) -> None:
+        """Put the blocks of a front's pivots where they belong."""
+        count = len(front.pivots) + len(front.border)
+        blocks = whole.reshape(count, self._size, count, self._size)
+        own = np.arange(len(front.pivots))
+        out.diagonal[front.pivots] = blocks[own, :, own, :]
+        pairs, row, col, flipped = self._entries(number, front)
+        found = blocks[row, :, col, :]
+        out.pairs[pairs] = np.where(flipped[:, None, None], found.transpose(0, 2, 1), found)
+
+
+def _spread(index: IntArray, size: int) -> IntArray:
+    """Return the unknowns of views."""
+    return np.asarray((index[:, None] * size + np.arange(size)).ravel())
+
+
+def _add(matrix: Array, place: IntArray, rest: Array) -> None:
+    """Add what a front below leaves, run by run of its places: they mostly follow each other."""
+    starts = np.flatnonzero(np.diff(place, prepend=-2) != 1)
+    stops = np.append(starts[1:], len(place))
+    for a, b in zip(starts, stops, strict=True):
+        for c, d in zip(starts, stops, strict=True):
+            if d <= b:
+                matrix[place[a] : place[a] + b - a, place[c] : place[c] + d - c] += rest[a:b, c:d]
+
 
 Matrix = Array | Blocks
 

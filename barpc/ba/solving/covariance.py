@@ -8,8 +8,7 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg as la
 
-from barpc.ba.algebra.linear import Factor
-from barpc.ba.algebra.multifrontal import Blocks
+from barpc.ba.algebra.linear import Blocks, Factor
 from barpc.ba.algebra.structure import parts
 from barpc.ba.solving.normal import Reduced, solve_transposed
 from barpc.ba.usual import FEW, KEPT

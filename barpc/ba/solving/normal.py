@@ -13,10 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
-from barpc.ba.algebra.dissection import LEAF
-from barpc.ba.algebra.linear import Factor, Matrix, factorize, factorize_blocks
-from barpc.ba.algebra.multifrontal import Blocks
-from barpc.ba.algebra.structure import Structure, parts
+from barpc.ba.algebra.linear import Blocks, Factor, Matrix, factorize, factorize_blocks
+from barpc.ba.algebra.structure import LEAF, Structure, parts
 from barpc.ba.estimated.priors import PointPrior
 from barpc.base.geodesy import CHUNK, Array
 from barpc.scene import BoolArray, IntArray
