@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.ba.evidence.places import Place, Unused, met_worse
+from barpc.ba.evidence.scan import Place, Unused, met_worse
 from barpc.ba.usual import CRITICAL, FEWEST
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.fit import RpcFit

@@ -11,13 +11,11 @@ import pytest
 
 from barpc.ba import AdjustOptions
 from barpc.ba.estimated.waves import Waves
-from barpc.ba.evidence import detectors
-from barpc.ba.evidence.detectors import _Columns, find_edges
 from barpc.ba.held.block import join
 from barpc.ba.held.starting import make_problem
 from barpc.ba.judging import following
 from barpc.ba.judging.explanations import FADE, STRIP, SWING
-from barpc.ba.judging.following import _given_edges, _spline_counts, _with_edges, follow
+from barpc.ba.judging.following import _Columns, _given_edges, _spline_counts, _with_edges, find_edges, follow
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import ecef_from_ground
@@ -308,7 +306,7 @@ def test_means_of_detectors_are_weighted_and_nothing_where_there_is_no_edge() ->
 
 def grown(made: _Columns, residual: np.ndarray, sigma: float = 1.0) -> tuple[list[list[float]], float]:
     """Edges where points do not share what is wrong."""
-    return detectors._grown(made, residual, lambda given: given, np.full(residual.shape[1], 1.0 / sigma))
+    return following._grown(made, residual, lambda given: given, np.full(residual.shape[1], 1.0 / sigma))
 
 
 @pytest.mark.parametrize(("share", "found"), [(0.98, False), (1.02, True)])
@@ -334,7 +332,7 @@ def test_a_step_of_a_focal_plane_has_to_explain_four_more_a_view(share, found) -
 
 @pytest.mark.parametrize(("share", "found"), [(0.48, False), (0.52, True)])
 def test_changes_half_as_large_as_the_largest_are_taken_with_it(monkeypatch, share, found) -> None:
-    monkeypatch.setattr(detectors, "ITERATIONS", 1)
+    monkeypatch.setattr(following, "ITERATIONS", 1)
     made, col = columns([np.arange(200.0)] * 2)
     size = np.where(np.arange(400) < 200, np.sqrt(200.0 / 50.0), np.sqrt(share * 200.0 / 50.0))
     edges, _ = grown(made, np.stack([np.where(col < 100, 0.0, size), 0 * col]))
@@ -392,14 +390,14 @@ def test_what_was_found_before_is_looked_for_anew(exact) -> None:
     cameras = SimpleNamespace(unknowns=unknowns)
     known: Any = SimpleNamespace(cameras=cameras, structure=problem.structure, xy=problem.xy)
     zero = np.zeros(problem.xy.shape)
-    found = detectors._without_steps(known, replace(state, params=params), zero)
+    found = following._without_steps(known, replace(state, params=params), zero)
     of_steps = params[:, unknowns.in_waves][:, waves.kinds[1]].reshape(3, 2, -1)
     right = problem.xy[0] >= 9000.0
     for v in range(3):
         mine = problem.structure.view == v
         levels = waves._of_steps @ of_steps[v].T  # (2 detectors, 2 coordinates)
         np.testing.assert_allclose(found[:, mine], -levels[right[mine].astype(int)].T, atol=1e-12)
-    assert (detectors._without_steps(problem, state, zero) == 0).all()
+    assert (following._without_steps(problem, state, zero) == 0).all()
 
 
 # --- splines and steps ------------------------------------------------------------------------------------------------

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.ba.evidence import places
-from barpc.ba.evidence.places import Place, Unused, met_worse
+from barpc.ba.evidence import scan
+from barpc.ba.evidence.scan import Place, Unused, met_worse
 from barpc.ba.usual import CHANCE
 from tests.distributions import hypergeom
 from tests.lanes import diagonal
@@ -139,7 +139,7 @@ def test_few_observations_and_exact_ones_say_nothing_wrong() -> None:
 )
 def test_as_many_alike_in_a_place_have_the_hypergeometric_chance(found, count, alike, whole) -> None:
     chance = hypergeom(whole, alike, count).sf(found - 1)
-    assert places._at_least(found, count, alike, whole) == pytest.approx(chance, rel=1e-9)
+    assert scan._at_least(found, count, alike, whole) == pytest.approx(chance, rel=1e-9)
 
 
 def test_a_place_has_the_chance_of_as_many_alike_times_the_tests() -> None:
@@ -158,27 +158,27 @@ def test_a_place_has_the_chance_of_as_many_alike_times_the_tests() -> None:
     among = len(inside[::2])
     assert one.far == pytest.approx(among / len(inside))
     chance = hypergeom(399, among + 20 - 1, len(inside) - 1).sf(among - 2)
-    tests = 2 * places._PLACES.shape[1]
+    tests = 2 * scan._PLACES.shape[1]
     assert one.chance == pytest.approx(chance * (among + 3) * tests, rel=1e-9)
 
 
 def test_places_are_halves_of_rows_columns_both_and_cells() -> None:
     """Of 32 parts: 62 lines each way, and squares of 2, 4 and 8 parts a side; each as large as it says."""
-    assert places._PLACES.shape == (4, 62 + 62 + 4 + 16 + 64)
-    columns, k, rows, n = places._PLACES
+    assert scan._PLACES.shape == (4, 62 + 62 + 4 + 16 + 64)
+    columns, k, rows, n = scan._PLACES
     assert ((k < columns) & (n < rows) & (k >= 0) & (n >= 0)).all()
-    assert len(np.unique(places._PLACES, axis=1).T) == places._PLACES.shape[1]
-    np.testing.assert_array_equal(places._HELD.sum(axis=1), 32 * 32 / (columns * rows))
+    assert len(np.unique(scan._PLACES, axis=1).T) == scan._PLACES.shape[1]
+    np.testing.assert_array_equal(scan._HELD.sum(axis=1), 32 * 32 / (columns * rows))
     first = int(np.flatnonzero((columns == 4) & (rows == 1) & (k == 2))[0])
-    assert np.flatnonzero(places._HELD[first])[:9].tolist() == [16, 17, 18, 19, 20, 21, 22, 23, 48]
-    assert places._ends(800.0, 4, 2) == (400.0, 600.0)
-    assert places._ends(800.0, 1, 0) is None
+    assert np.flatnonzero(scan._HELD[first])[:9].tolist() == [16, 17, 18, 19, 20, 21, 22, 23, 48]
+    assert scan._ends(800.0, 4, 2) == (400.0, 600.0)
+    assert scan._ends(800.0, 1, 0) is None
 
 
 def test_axes_are_those_of_the_covariance_the_largest_first() -> None:
     rng = np.random.default_rng(0)
     standard = np.array([[3.0, 1.0], [0.5, 0.2]]) @ rng.normal(size=(2, 300)) + 9.0
-    axes, spread = places._axes(standard)
+    axes, spread = scan._axes(standard)
     covariance = np.cov(standard, bias=True)
     np.testing.assert_allclose(axes.T @ covariance @ axes, np.diag(spread**2), atol=1e-9)
     assert spread[0] > spread[1] > 0
@@ -187,7 +187,7 @@ def test_axes_are_those_of_the_covariance_the_largest_first() -> None:
 def test_a_small_part_of_an_image_has_one_observation_the_first() -> None:
     xy = np.array([[0.0, 31.0, 40.0, 1600.0, 20.0, 1599.9], [0.0, 31.0, 10.0, 3200.0, 150.0, 3199.0]])
     unused = Unused(np.zeros(6, dtype=int), xy, xy, np.arange(6.0))
-    found = places._thinned(unused, np.array([1600.0, 3200.0]))  # parts of 50 by 100
+    found = scan._thinned(unused, np.array([1600.0, 3200.0]))  # parts of 50 by 100
     assert sorted(found.deviation.tolist()) == [0.0, 3.0, 4.0]
 
 
@@ -197,13 +197,13 @@ def test_the_variance_of_a_place_s_mean_is_that_of_its_parts_its_own_mean_taken_
     along, near = rng.normal(size=(2, n)) * [[1.0], [3.0]], np.ones(n, dtype=bool)
     near[:6] = False
     col, row = rng.integers(0, 32, (2, n))
-    cells = places._cells(near, col, row)
+    cells = scan._cells(near, col, row)
     parts = 2  # of 84: the root of seven twelves
     of_cell = np.where(near, row * parts // 32 * parts + col * parts // 32, -1)
     np.testing.assert_array_equal(cells, of_cell[:, None] == np.arange(4))
     inside = (rng.random((3, n)) < 0.4) & near
     mean = np.stack([along[:, one].mean(axis=1) for one in inside])
-    found = places._variances(along * near, inside.astype(float), mean, cells)
+    found = scan._variances(along * near, inside.astype(float), mean, cells)
     for place, one in enumerate(inside):
         for axis in (0, 1):
             left = along[axis] - one * mean[place, axis]

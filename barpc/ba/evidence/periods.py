@@ -34,7 +34,7 @@ class Swing:
     gain: float  # nats, what the choice among all frequencies and views costs taken off
 
 
-def price(rows: float, views: int) -> float:
+def price_of_period(rows: float, views: int) -> float:
     """Return the cost of choosing a period, in images of so many rows, and a view [nats]."""
     # as many as the frequencies count as tests (Baluev 2008, near the levels asked for)
     return float(np.log(max(_FINE * rows / _SHORTEST, 1.0) * views))
@@ -56,7 +56,7 @@ def swings(view: IntArray, row: Array, size: Array, right: Array, off: Array, le
     found = []
     for v, mine in enumerate(np.split(by_view, np.searchsorted(view[by_view], np.arange(1, views)))):
         rows = float(size[1, v])
-        costs = price(rows, views)
+        costs = price_of_period(rows, views)
         if len(mine) >= FEW and rows > 2.0 * _FEWEST * _SHORTEST:
             clipped = np.clip(off[:, mine], -OUTLIER, OUTLIER)
             best = _Rows(row[mine], rows, right[mine], clipped).largest(costs + least)

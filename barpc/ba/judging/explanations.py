@@ -10,8 +10,7 @@ import numpy as np
 from barpc.ba.estimated.waves import DRIFTS, FEWEST, FIRST_SIGMA, Waves
 from barpc.ba.evidence.linearised import Linear
 from barpc.ba.evidence.mixture import Fit, Group, first_guess, log_likelihoods
-from barpc.ba.evidence.periods import Swing
-from barpc.ba.evidence.periods import price as price_of_period
+from barpc.ba.evidence.periods import Swing, price_of_period
 from barpc.ba.evidence.scan import BINS, Interval, price
 from barpc.ba.judging import moving
 from barpc.ba.robust.smooth import SPLINES
@@ -265,7 +264,7 @@ def group(seen: Seen, _interval: Interval) -> list[Explanation]:
     if one is None:
         return []
     none = np.zeros((2, 0, len(seen.linear.view)))
-    return [Explanation(MOVING, -1, none, np.zeros(0), moving.price(seen.linear, one.cell), group=one)]
+    return [Explanation(MOVING, -1, none, np.zeros(0), moving.price_of_group(seen.linear, one.cell), group=one)]
 
 
 EXPLANATIONS: dict[str, Callable[[Seen, Interval], list[Explanation]]] = {

@@ -120,7 +120,7 @@ def proposal(linear: Linear, ground: Ground, base: Fit, extra: Array, sigma: Arr
     return replace(group, share=member.clip(LEVEL, 1.0 - LEVEL))
 
 
-def price(linear: Linear, cell: IntArray) -> float:
+def price_of_group(linear: Linear, cell: IntArray) -> float:
     """Return the cost of the shares of the cells [nats]: half the logarithm of the number of tracks of each."""
     first = np.concatenate([tracks.rows[:, 0] for tracks in linear.tracks])
     count = np.bincount(cell[first])

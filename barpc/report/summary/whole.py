@@ -10,7 +10,7 @@ import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.ba.apart import APART, Apart
-from barpc.ba.evidence.places import Place
+from barpc.ba.evidence.scan import Place
 from barpc.ba.held.gauge import MOTIONS
 from barpc.ba.judging.explanations import FADE, MOVING, SETTLING, STRIP, SWING, WANDER
 from barpc.ba.judging.judge import Finding
