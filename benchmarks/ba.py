@@ -45,8 +45,7 @@ from scipy.sparse.linalg import splu
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.ba.algebra import structure
 from barpc.ba.algebra.linear import Cholesky
-from barpc.ba.held.block import join
-from barpc.ba.held.starting import make_problem
+from barpc.ba.held.block import join, make_problem
 from barpc.ba.judging import solution
 from barpc.ba.robust.smooth import Smooth
 from barpc.ba.solving.problem import Problem

@@ -13,8 +13,7 @@ from barpc.ba.altimetry import hold_by_altimetry
 from barpc.ba.apart import Apart, Solver, find_apart
 from barpc.ba.evidence.scan import neighbours_alike
 from barpc.ba.held.block import Block, join
-from barpc.ba.held.datum import datum_shares
-from barpc.ba.held.gauge import GaugeReport, earlier_scene, gauge_report
+from barpc.ba.held.gauge import GaugeReport, datum_shares, earlier_scene, gauge_report
 from barpc.ba.held.incremental import BlockPrior
 from barpc.ba.held.terrain import Terrain
 from barpc.ba.judging.following import follow, without_strips

@@ -72,7 +72,7 @@ class Adjustment:
     gauge : GaugeReport
         Shift of the scene, its standard deviation, the weakest modes.
     datum : mapping
-        Source (`barpc.ba.held.datum.SOURCES`) -> its share (10,) in what is known of the scene's `MOTIONS`.
+        Source (`barpc.ba.held.gauge.SOURCES`) -> its share (10,) in what is known of the scene's `MOTIONS`.
     prior : PriorTest
         Comparison of the corrections with the priors given, and the priors learnt.
     smooth : SmoothTest

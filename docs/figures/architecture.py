@@ -30,7 +30,7 @@ JOURNEYS = {
         ("ba/held/block.py", "join", "-> one block, sorted by view"),
         ("ba/robust/heldout.py", "keep_out", "a tenth of the tracks aside"),
         ("ba/judging/solution.py", "solve_block", "one model, its control tested"),
-        ("ba/held/starting.py", "make_problem", "cameras, priors, structure"),
+        ("ba/held/block.py", "make_problem", "cameras, priors, structure"),
         ("ba/robust/rounds.py", "Rounds", "search, cut, solve until nothing changes"),
         ("ba/solving/solve.py", "minimise", "scipy or sparse Levenberg-Marquardt"),
         ("ba/robust/heldout.py", "measure", "what the tenth says"),

@@ -11,8 +11,7 @@ import pytest
 
 from barpc.ba import AdjustOptions
 from barpc.ba.estimated.waves import Waves
-from barpc.ba.held.block import join
-from barpc.ba.held.starting import make_problem
+from barpc.ba.held.block import join, make_problem
 from barpc.ba.judging import following
 from barpc.ba.judging.explanations import FADE, STRIP, SWING
 from barpc.ba.judging.following import _Columns, _given_edges, _spline_counts, _with_edges, find_edges, follow

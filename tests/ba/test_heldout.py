@@ -11,8 +11,7 @@ import pytest
 from scipy.special import gammaln
 
 from barpc.ba import AdjustOptions
-from barpc.ba.held.block import Block, join
-from barpc.ba.held.starting import make_problem
+from barpc.ba.held.block import Block, join, make_problem
 from barpc.ba.robust.heldout import (
     HeldOut,
     _scrambled,

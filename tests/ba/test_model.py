@@ -11,8 +11,7 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, adjustment, block_prior
 from barpc.ba.algebra.structure import make_structure
-from barpc.ba.held.block import join
-from barpc.ba.held.starting import first_state, make_problem
+from barpc.ba.held.block import first_state, join, make_problem
 from barpc.ba.judging import solution as solved
 from barpc.ba.judging.judge import Judgement
 from barpc.ba.judging.solution import Solution

@@ -14,8 +14,7 @@ from barpc.ba.evidence.linearised import linearise
 from barpc.ba.evidence.mixture import Group, fit
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.held.block import Block as Joined
-from barpc.ba.held.block import join
-from barpc.ba.held.starting import first_state, make_problem
+from barpc.ba.held.block import first_state, join, make_problem
 from barpc.ba.judging import explanations, moving
 from barpc.ba.judging.explanations import MOVING, STRIP
 from barpc.ba.judging.moving import CELLS, Ground, group_of

@@ -14,9 +14,8 @@ from barpc.ba import adjust_tracks
 from barpc.ba.algebra import linear, structure
 from barpc.ba.algebra.linear import Blocks, factorize_blocks
 from barpc.ba.algebra.structure import Dissection, dissect
-from barpc.ba.held.block import join
+from barpc.ba.held.block import join, make_problem
 from barpc.ba.held.incremental import BlockPrior
-from barpc.ba.held.starting import make_problem
 from barpc.ba.solving import normal
 from barpc.ba.solving.solve import camera_step
 from barpc.base.geodesy import ecef_from_ground

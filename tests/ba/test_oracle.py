@@ -12,11 +12,9 @@ import scipy.linalg as la
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.ba.estimated.projected import Cameras
-from barpc.ba.held.block import join
-from barpc.ba.held.datum import datum_shares
-from barpc.ba.held.gauge import MOTIONS, _modes, gauge_report
+from barpc.ba.held.block import join, make_problem
+from barpc.ba.held.gauge import MOTIONS, _modes, datum_shares, gauge_report
 from barpc.ba.held.ground import Heights, convergence_angles, ground_control
-from barpc.ba.held.starting import make_problem
 from barpc.ba.judging.snooping import image_test
 from barpc.ba.robust import rounds
 from barpc.ba.robust.weights import Observations

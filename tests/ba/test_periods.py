@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.ba.evidence import periods
-from barpc.ba.evidence.periods import price, swings
+from barpc.ba.evidence.periods import price_of_period, swings
 from barpc.ba.usual import SURE
 
 
@@ -65,8 +65,8 @@ def test_rows_that_wander_gain_far_less_as_a_swing_than_they_are_off(seed: int) 
 
 
 def test_a_period_costs_the_choice_among_four_a_shortest_wave_and_all_views() -> None:
-    assert price(3200.0, 3) == pytest.approx(np.log(400 * 3))
-    assert price(5.0, 3) == pytest.approx(np.log(3))
+    assert price_of_period(3200.0, 3) == pytest.approx(np.log(400 * 3))
+    assert price_of_period(5.0, 3) == pytest.approx(np.log(3))
 
 
 def test_the_vertex_is_that_of_the_parabola() -> None:

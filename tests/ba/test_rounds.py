@@ -11,8 +11,7 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.estimated.priors import CameraPrior
-from barpc.ba.held.block import join
-from barpc.ba.held.starting import first_state, make_problem
+from barpc.ba.held.block import first_state, join, make_problem
 from barpc.ba.judging import solution
 from barpc.ba.robust import rounds
 from barpc.ba.robust.rounds import _median

@@ -13,8 +13,7 @@ from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.ba.estimated.priors import CameraPrior, prior_sigmas
 from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.estimated.waves import Waves
-from barpc.ba.held.block import join
-from barpc.ba.held.starting import make_problem
+from barpc.ba.held.block import join, make_problem
 from barpc.ba.robust.variances import PriorTest, Variances, _Around, same_prior
 from barpc.ba.solving.solve import State, minimise
 from barpc.base.errors import BarpcWarning

@@ -15,8 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from barpc.ba.estimated.waves import FEWEST, Waves
-from barpc.ba.held.block import Block
-from barpc.ba.held.starting import make_problem
+from barpc.ba.held.block import Block, make_problem
 from barpc.ba.judging.explanations import FOLLOWED, LOCAL, SETTLING, SWING
 from barpc.ba.judging.judge import Finding, Judgement, standing_out
 from barpc.ba.judging.solution import Solution, finished

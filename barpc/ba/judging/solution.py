@@ -9,10 +9,9 @@ import numpy as np
 
 from barpc.ba.algebra.structure import Structure
 from barpc.ba.estimated.priors import DRIFT_SIGMA
-from barpc.ba.held.block import Block
+from barpc.ba.held.block import Block, first_state, make_problem
 from barpc.ba.held.ground import Heights, staying
 from barpc.ba.held.incremental import BlockPrior
-from barpc.ba.held.starting import first_state, make_problem
 from barpc.ba.held.terrain import Terrain
 from barpc.ba.judging.agreement import LOOSE, Agreement, agreement, offsets_of
 from barpc.ba.judging.judge import Finding
