@@ -43,11 +43,11 @@ from scipy.sparse import bsr_array, coo_matrix
 from scipy.sparse.linalg import splu
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
-from barpc.ba.algebra import structure
-from barpc.ba.algebra.linear import Cholesky
 from barpc.ba.held.block import join, make_problem
 from barpc.ba.judging import solution
 from barpc.ba.robust.smooth import Smooth
+from barpc.ba.solving import structure
+from barpc.ba.solving.linear import Cholesky
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State, camera_step, minimise
 from barpc.base.geodesy import ecef_from_ground, ground_from_ecef

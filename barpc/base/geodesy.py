@@ -7,7 +7,7 @@ Outlines become GeoJSON as RFC 7946 asks: longitudes -180 to 180, polygons cut a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,12 @@ np.empty(32 * 2**20 - 2**16, dtype=np.uint8)  # its end tells glibc to keep what
 _RAD = np.pi / 180.0
 
 
+def parts(stop: int, size: int = CHUNK, start: int = 0) -> Iterator[slice]:
+    """Yield the pieces of what is numbered start .. stop, of `size` that stay in cache."""
+    for first in range(start, stop, size):
+        yield slice(first, min(first + size, stop))
+
+
 def pointwise(
     function: Callable[..., Iterable[Array]],
     shapes: Sequence[tuple[int, ...]],
@@ -64,8 +70,7 @@ def pointwise(
     out = [np.empty((count, *shape)) for shape in shapes]
     memory = np.empty((rows, min(count, CHUNK)))
     with np.errstate(all="ignore"):
-        for start in range(0, count, CHUNK):
-            part = slice(start, start + CHUNK)
+        for part in parts(count):
             given = [array[part] for array in flat]
             if rows:
                 given.append(memory[:, : len(given[0])])

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from barpc.base.geodesy import CHUNK, Array, metres_per_unit, wrap_longitude
+from barpc.base.geodesy import Array, metres_per_unit, parts, wrap_longitude
 from barpc.fit.points import EXACT, Sample
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
@@ -72,9 +72,8 @@ def coverage(image: Array, low: Array, high: Array) -> float:
     angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
     direction = np.column_stack([np.cos(angle), np.sin(angle)])  # outside is beyond all in one direction
     reach = np.full(len(angle), -np.inf)
-    for start in range(0, len(image), CHUNK):
-        part = (image[start : start + CHUNK] - low) / (high - low)
-        reach = np.maximum(reach, (direction @ part.T).max(axis=1))
+    for part in parts(len(image)):
+        reach = np.maximum(reach, (direction @ ((image[part] - low) / (high - low)).T).max(axis=1))
     t = (np.arange(20) + 0.5) / 20
     cells = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
     return float((cells @ direction.T <= reach + 1e-9).all(axis=1).mean())

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import FitError
-from barpc.base.geodesy import CHUNK, FAR, Array, BoolArray, metres_per_unit, wrap_longitude
+from barpc.base.geodesy import FAR, Array, BoolArray, metres_per_unit, parts, wrap_longitude
 from barpc.base.options import FitOptions
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import LEAST_RANGE, footprint
@@ -173,8 +173,7 @@ def _check_geometry(ground: Array, image: Array, allow_mirrored: bool) -> None:
 def _covariance(ground: Array, image: Array, center: Array, span: Array) -> Array:
     """Return the covariance (5, 5) of lon, lat, alt, col, row, each in units of its span."""
     total, squares = np.zeros(5), np.zeros((5, 5))
-    for start in range(0, len(ground), CHUNK):
-        part = slice(start, start + CHUNK)
+    for part in parts(len(ground)):
         z = np.concatenate([ground[part].T, image[part].T])
         z -= center[:, None]
         z /= span[:, None]

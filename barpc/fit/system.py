@@ -23,7 +23,7 @@ from scipy.linalg.lapack import dtpqrt
 
 from barpc.base.errors import FitError
 from barpc.base.frozen import Frozen
-from barpc.base.geodesy import Array, IntArray
+from barpc.base.geodesy import Array, IntArray, parts
 from barpc.sensor.rational import POWERS, monomials
 
 Rounding = Callable[[Array], Array]
@@ -154,8 +154,7 @@ class FitProblem:
         """
         m, norm = len(self.active), self.norm
         k = 2 * m - 1 if free else m
-        for start in range(0, len(self.image), _ROWS):
-            part = slice(start, start + _ROWS)
+        for part in parts(len(self.image), _ROWS):
             x = np.subtract(self.ground[part].T, norm.ground_offset[:, None], order="C")
             basis = monomials(x / norm.ground_scale[:, None])
             y = (self.image[part, axis] - norm.image_offset[axis]) / norm.image_scale[axis]

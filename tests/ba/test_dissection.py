@@ -11,8 +11,8 @@ import pytest
 import scipy.sparse as sp
 from scipy.optimize import linear_sum_assignment
 
-from barpc.ba.algebra import structure
-from barpc.ba.algebra.structure import Dissection, dissect
+from barpc.ba.solving import structure
+from barpc.ba.solving.structure import Dissection, dissect
 from tests.lanes import rest_slow
 
 KINDS = ("ring", "grid", "clique", "star", "two cliques", "time series", "random", "parts", "path of cliques")

@@ -7,10 +7,9 @@ import pytest
 import scipy.linalg as la
 
 from barpc.ba import Adjustment
-from barpc.ba.algebra import linear
-from barpc.ba.algebra.linear import Blocks
-from barpc.ba.algebra.structure import counting_sort, dissect
-from barpc.ba.solving import normal
+from barpc.ba.solving import linear, normal
+from barpc.ba.solving.linear import Blocks
+from barpc.ba.solving.structure import counting_sort, dissect
 from barpc.base.errors import AdjustError
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import solve as adjust

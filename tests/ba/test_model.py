@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, adjustment, block_prior
-from barpc.ba.algebra.structure import make_structure
 from barpc.ba.held.block import first_state, join, make_problem
 from barpc.ba.judging import solution as solved
 from barpc.ba.judging.judge import Judgement
 from barpc.ba.judging.solution import Solution
 from barpc.ba.robust.rounds import Outcome
+from barpc.ba.solving.structure import make_structure
 from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.scene import GroundPoints, Tracks

@@ -11,13 +11,12 @@ import pytest
 import scipy.linalg as la
 
 from barpc.ba import adjust_tracks
-from barpc.ba.algebra import linear, structure
-from barpc.ba.algebra.linear import Blocks, factorize_blocks
-from barpc.ba.algebra.structure import Dissection, dissect
 from barpc.ba.held.block import join, make_problem
 from barpc.ba.held.incremental import BlockPrior
-from barpc.ba.solving import normal
+from barpc.ba.solving import linear, normal, structure
+from barpc.ba.solving.linear import Blocks, factorize_blocks
 from barpc.ba.solving.solve import camera_step
+from barpc.ba.solving.structure import Dissection, dissect
 from barpc.base.geodesy import ecef_from_ground
 from barpc.base.options import AdjustOptions
 from barpc.scene import GroundPoints, Tracks

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.algebra.linear import Blocks, Factor
 from barpc.ba.solving.covariance import Covariance
+from barpc.ba.solving.linear import Blocks, Factor
 from barpc.ba.solving.normal import (
     TRIANGLE,
     Common,

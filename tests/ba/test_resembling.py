@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from barpc.ba.algebra.structure import make_structure
 from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.held.block import join
 from barpc.ba.held.ground import ALIKE
 from barpc.ba.robust.smooth import TERMS, Resemblance, Smooth
+from barpc.ba.solving.structure import make_structure
 from barpc.base.geodesy import metres_per_unit
 from barpc.base.options import AdjustOptions
 from barpc.scene import GroundPoints, Reference, Tracks

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.ba.algebra.structure import make_structure
 from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.robust.smooth import SPLINES, Smooth, SmoothTest
+from barpc.ba.solving.structure import make_structure
 from barpc.sensor.displaced import bsplines
 from tests import distributions as stats
 

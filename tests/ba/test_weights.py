@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.algebra.structure import make_structure
 from barpc.ba.estimated.priors import PointPrior
 from barpc.ba.estimated.waves import Waves
 from barpc.ba.held.ground import ALIKE
@@ -16,6 +15,7 @@ from barpc.ba.robust import rounds
 from barpc.ba.robust.rounds import _robust
 from barpc.ba.robust.smooth import SPLINES
 from barpc.ba.robust.weights import LOSSES, MEDIAN, Observations
+from barpc.ba.solving.structure import make_structure
 from barpc.base.options import AdjustOptions
 from tests import distributions as stats
 

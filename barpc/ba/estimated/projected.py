@@ -14,9 +14,8 @@ from typing import Literal
 
 import numpy as np
 
-from barpc.ba.algebra.structure import parts
 from barpc.ba.estimated.unknowns import Unknowns
-from barpc.base.geodesy import CHUNK, Array, ground_from_ecef, ground_rows_from_ecef
+from barpc.base.geodesy import CHUNK, Array, ground_from_ecef, ground_rows_from_ecef, parts
 from barpc.scene import IntArray, View
 from barpc.sensor.corrected import RigidMotion
 from barpc.sensor.rpc import RPC, RpcStack
@@ -70,7 +69,7 @@ class Cameras:
         found = self.room(ecef.shape[1], wanted) if out is None else out
         image, by_point, by_unknown = found.image, found.by_point, found.by_unknown
         for views in self._chunks(bounds):
-            for part in parts(bounds[views.stop], CHUNK, bounds[views.start]):
+            for part in parts(bounds[views.stop], start=bounds[views.start]):
                 of_view = np.clip(bounds[views.start : views.stop + 1], part.start, part.stop) - part.start
                 seen = None if self.seen is None else self.seen[:, part]
                 piece = self._project(params, ecef[:, part], views, of_view, wanted, seen)

@@ -13,7 +13,6 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from barpc.ba.algebra.structure import Structure, counting_sort, make_structure
 from barpc.ba.estimated.priors import CameraPrior, prior_sigmas
 from barpc.ba.estimated.projected import Cameras
 from barpc.ba.estimated.unknowns import make_unknowns
@@ -24,6 +23,7 @@ from barpc.ba.held.terrain import Relief, Terrain
 from barpc.ba.solving.normal import cholesky3, point_products, solve_lower, solve_transposed
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
+from barpc.ba.solving.structure import Structure, counting_sort, make_structure
 from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barpc.ba.algebra.structure import Structure
 from barpc.ba.estimated.priors import PointPrior
 from barpc.ba.estimated.projected import Projected
 from barpc.ba.held.terrain import NUM_BENDS, Believed, Relief, Terrain, believe, terrain_slopes
 from barpc.ba.solving.problem import Problem
+from barpc.ba.solving.structure import Structure
 from barpc.base.errors import BarpcWarning
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from barpc.ba.algebra.structure import Structure
 from barpc.ba.estimated.priors import DRIFT_SIGMA
 from barpc.ba.held.block import Block, first_state, make_problem
 from barpc.ba.held.ground import Heights, staying
@@ -22,6 +21,7 @@ from barpc.ba.robust.rounds import Outcome, Rounds, faintness, revived
 from barpc.ba.robust.smooth import SmoothTest
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
+from barpc.ba.solving.structure import Structure
 from barpc.ba.usual import FLOOR, MUCH_NOISE, SURELY
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions

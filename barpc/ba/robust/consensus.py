@@ -14,10 +14,10 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.special import expit
 
-from barpc.ba.algebra.structure import Structure, parts
 from barpc.ba.estimated.projected import Projected
+from barpc.ba.solving.structure import Structure
 from barpc.ba.usual import FEW, ITERATIONS, LEVEL, MANY, OUTLIER, SLIGHT, STEPS, TRIALS
-from barpc.base.geodesy import CHUNK, Array
+from barpc.base.geodesy import Array, parts
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.curve import cross
 
@@ -113,7 +113,7 @@ def agreeing(
 def _across(residual: Array, by_point: Array, first: IntArray, second: IntArray) -> Array:
     """Return the offset across the epipolar line (Q,) [px]: what no move of the point takes away."""
     offset = np.empty(len(first))
-    for part in parts(len(first), CHUNK):
+    for part in parts(len(first)):
         one, two = by_point.take(first[part], axis=2), by_point.take(second[part], axis=2)
         rays = cross(one[0], one[1]), cross(two[0], two[1])  # of a ray only the other's image moves
         of_first, of_second = (one * rays[1]).sum(axis=1), (two * rays[0]).sum(axis=1)

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtrc
 
-from barpc.ba.algebra.structure import Structure
 from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.held.block import Block
 from barpc.ba.held.ground import ALIKE
+from barpc.ba.solving.structure import Structure
 from barpc.ba.usual import KEPT, MANY, OUTLIER, RIDGE
 from barpc.base.geodesy import Array, metres_per_unit
 from barpc.scene import BoolArray, IntArray

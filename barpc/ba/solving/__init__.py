@@ -1,1 +1,1 @@
-"""How a block is solved: observations and priors as a problem, its normal equations, the minimum and its covariance."""
+"""How a block is solved: who sees what, its normal equations and their factors, the minimum and its covariance."""

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
-from barpc.ba.algebra.linear import Blocks, Factor, Matrix, factorize, factorize_blocks
-from barpc.ba.algebra.structure import LEAF, Structure, parts
 from barpc.ba.estimated.priors import PointPrior
-from barpc.base.geodesy import CHUNK, Array
+from barpc.ba.solving.linear import Blocks, Factor, Matrix, factorize, factorize_blocks
+from barpc.ba.solving.structure import LEAF, Structure
+from barpc.base.geodesy import CHUNK, Array, parts
 from barpc.scene import BoolArray, IntArray
 
 TRIANGLE = tuple((i, j) for j in range(3) for i in range(j, 3))
@@ -191,7 +191,7 @@ def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, 
 def point_products(by_point: Array, residual: Array) -> Array:
     """Return the products (9, K): the six elements of A^T A (order of `TRIANGLE`) and the three of A^T r."""
     products = np.empty((9, residual.shape[1]))
-    for part in parts(residual.shape[1], CHUNK):
+    for part in parts(residual.shape[1]):
         (a, b), r = by_point[..., part], residual[:, part]
         for n, (i, j) in enumerate(TRIANGLE):
             np.add(a[i] * a[j], b[i] * b[j], out=products[n, part])
@@ -236,7 +236,7 @@ def _eliminate(structure: Structure, by_point: Array, by_unknown: Array, lower: 
     """Return Y (K, 3, q), the whitened coupling of points and cameras."""
     q, count = by_unknown.shape[1:]
     cross = np.empty((count, 3, q))
-    for part in parts(count, CHUNK):
+    for part in parts(count):
         point = structure.point[part]
         whitened = whiten(by_point[..., part], lower.take(point, axis=1, mode="clip"))
         unknown = by_unknown[..., part]

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from barpc.ba.algebra.structure import Structure
 from barpc.ba.estimated.priors import CameraPrior, JointPrior, PointPrior
 from barpc.ba.estimated.projected import Cameras, Projected
 from barpc.ba.solving.normal import (
@@ -20,6 +19,7 @@ from barpc.ba.solving.normal import (
     solve_transposed,
     whiten,
 )
+from barpc.ba.solving.structure import Structure
 from barpc.ba.usual import KEPT
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray

@@ -15,9 +15,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.linalg as la
 
-from barpc.ba.algebra.linear import Factor
 from barpc.ba.estimated.projected import Projected
 from barpc.ba.solving.covariance import Covariance
+from barpc.ba.solving.linear import Factor
 from barpc.ba.solving.normal import Reduced
 from barpc.ba.solving.problem import Problem
 from barpc.ba.usual import ITERATIONS, SLIGHT

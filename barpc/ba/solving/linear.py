@@ -1,6 +1,6 @@
 """Solving with the reduced camera matrix: dense Cholesky, or front by front where it is sparse (multifrontal).
 
-A front (`barpc.ba.algebra.structure`) is a small dense matrix of its pivots and its border: the matrix's own blocks and
+A front (`barpc.ba.solving.structure`) is a small dense matrix of its pivots and its border: the matrix's own blocks and
 what the fronts below it leave. Its pivots are eliminated, what that leaves of the border goes to the parent (Duff and
 Reid 1983). The blocks of the inverse where the matrix has some follow from the last front to the first (Takahashi
 1973): that of a border is part of the parent's.
@@ -21,7 +21,7 @@ import scipy.sparse as sp
 from scipy.linalg.blas import dsyrk, dtrsm
 from scipy.linalg.lapack import dpotrf, dpotri
 
-from barpc.ba.algebra.structure import Dissection, Front
+from barpc.ba.solving.structure import Dissection, Front
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray

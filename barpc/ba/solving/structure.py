@@ -260,12 +260,6 @@ def make_structure(
     )
 
 
-def parts(stop: int, size: int, start: int = 0) -> Iterator[slice]:
-    """Yield the pieces of observations start .. stop, of `size` that stay in cache."""
-    for first in range(start, stop, size):
-        yield slice(first, min(first + size, stop))
-
-
 def counting_sort(key: IntArray, size: int) -> tuple[IntArray, IntArray]:
     """Return the stable order (n,) of keys 0 .. size - 1, and the start and end of each key's part (size + 1,).
 

@@ -1,1 +1,0 @@
-"""The linear algebra of blocks: who sees what, the order of elimination, and Cholesky in it."""
