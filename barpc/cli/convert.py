@@ -17,7 +17,7 @@ import shapely
 from barpc.base.errors import InputError, OutputError
 from barpc.base.sidefile import plain_path
 from barpc.cameras import open_camera, split_spec
-from barpc.cli.alignment import moved, read_move, refitted
+from barpc.cli.fit import moved, read_move, refitted
 from barpc.cli.flags import expanded
 from barpc.cli.project import altitude_of, exchanged, with_heights
 from barpc.cli.terminal import echo, say, tell_gate, wants_json

@@ -17,8 +17,8 @@ from barpc.dsm import NoSurfaceError, make_dsm
 from barpc.dsm import cells as cells_module
 from barpc.dsm import surface as surface_module
 from barpc.dsm.cells import Tile
-from barpc.dsm.relief import draped
 from barpc.dsm.stereo import _best, block_of_images
+from barpc.dsm.surface import draped
 from barpc.pipeline import load_views
 from barpc.rpcio import read_rpc
 from barpc.sensor.displaced import ImageAffine, ImageCorrected

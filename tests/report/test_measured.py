@@ -17,8 +17,7 @@ from barpc.report.outcome import ControlResidual, pair_ties, triangulate_tracks
 from barpc.report.page import decisions
 from barpc.report.summary import measure_run
 from barpc.report.summary.known import GcpEntry, measure_control, measure_gcps, measure_reference
-from barpc.report.summary.place import ce90
-from barpc.report.summary.views import _in_image, cell_numbers, rmse_by_view
+from barpc.report.summary.views import _in_image, ce90, cell_numbers, rmse_by_view
 from barpc.report.summary.whole import _asked
 from barpc.scene import Tracks
 from barpc.sensor.displaced import RowSpline

@@ -11,7 +11,7 @@ from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.base.geodesy import ecef_from_ground, metres_per_unit
 from barpc.report import Run
 from barpc.report.runfiles import read_tables
-from barpc.report.summary.place import ce90, moved_by_clocks, moved_in_space, stated_ce90
+from barpc.report.summary.views import ce90, moved_by_clocks, moved_in_space, stated_ce90
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.timing import Timed, Timing

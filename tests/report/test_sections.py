@@ -10,8 +10,7 @@ from barpc.report import page
 from barpc.report.summary import StageEntry, TablesEntry, TracksEntry
 from barpc.report.summary.known import CheckPointEntry, ReferenceEntry, ReferenceViewEntry, SeenEntry
 from barpc.report.summary.pairs import OffsetEntry
-from barpc.report.summary.place import EllipseEntry
-from barpc.report.summary.views import CenterEntry, FitEntry
+from barpc.report.summary.views import CenterEntry, EllipseEntry, FitEntry
 from barpc.report.summary.whole import DatumEntry, ModeEntry, SceneEntry
 
 from .made import a_correction, a_gcp, a_pair, a_square, a_summary, a_view, files_of, seen

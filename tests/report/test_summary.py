@@ -17,8 +17,7 @@ from barpc.report.page import decisions
 from barpc.report.records import Number, plain, said, table
 from barpc.report.runfiles import read_summary
 from barpc.report.summary import published_schema
-from barpc.report.summary.place import moved_in_space
-from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.views import ViewEntry, moved_in_space
 from barpc.scene import middle_altitude
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import epipolar_offset, view_angles

@@ -1,29 +1,107 @@
-"""The images of a run: what is said of each, and how it is measured."""
+"""The images of a run: what is said of each, and how it is measured; where its camera puts its middle."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from operator import attrgetter
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from scipy.special import erf
 
 from barpc.ba import Adjustment
-from barpc.base.geodesy import Array
+from barpc.ba.estimated.priors import USABLE_ACCURACY
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit
 from barpc.fit import RpcFit
 from barpc.report.outcome import Run
 from barpc.report.records import Cell, Column, Number, Record, said, value_of
-from barpc.report.summary.place import EllipseEntry, moved_by_clocks, moved_in_space, stated_ce90
 from barpc.report.summary.words import ABOVE, CAUSES, STATUS_WORDS, Count, Pixel, Share, Side, Vector, largest
-from barpc.scene import IntArray
+from barpc.scene import IntArray, View
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.displaced import ImageCorrected, RowSpline, Splined
 from barpc.sensor.geometry import Several, ground_sample_distance, image_grid, view_angles
+from barpc.sensor.pushbroom import Pushbroom
+from barpc.sensor.rpc import RPC
 from barpc.sensor.timing import Timed
 
+_gauss = cache(np.polynomial.legendre.leggauss)  # every image asks
 CELLS = 8  # Cells of an image from left to right and from top to bottom
 _ROWS = 400  # of an image, over which a spline is averaged
+
+
+class EllipseEntry(Record):
+    """How well a camera tells where a ground point in the middle of its image is, its altitude given."""
+
+    major_m: Number = said("Larger semi-axis of the one-sigma ellipse", "m", "semi-axis", ".2f")
+    minor_m: Number = said("Smaller semi-axis", "m", "other", ".2f")
+    azimuth_deg: Number = said("Direction of the larger one, clockwise from north", "deg", "azimuth", ".0f")
+    ce90_m: Number = said("Radius of the circle that holds 90 %", "m", "CE90", ".2f")
+
+
+def moved_in_space(
+    model: Corrected, covariance: Array, unknowns: str, ground: Array
+) -> tuple[Array, Array, EllipseEntry]:
+    """Return how far P_BA moves a ground point near the image's middle (2,) [px], its sigma (2,), and its ellipse.
+
+    `covariance` (q, q) is of rotation (metres: angle x distance), translation [m], then any drift, which is zero in the
+    middle row; `unknowns`: "rotation", "translation" or "rotation+translation"; `ground` (3,): lon, lat [deg], alt [m].
+    """
+    ecef = ecef_from_ground(ground)
+    image, by_point, by_rotation, by_translation = model.project_ecef(ecef)
+    distance = np.linalg.norm(ecef - model.correction.center)
+    parts = {"rotation": by_rotation / distance, "translation": by_translation}
+    jacobian = np.hstack([part for name, part in parts.items() if name in unknowns])
+    return _known(image - model.sensor.project(ground), jacobian, covariance, by_point @ enu_basis(ground)[:2].T)
+
+
+def moved_by_clocks(model: Timed, covariance: Array, ground: Array) -> tuple[Array, Array, EllipseEntry]:
+    """As `moved_in_space`, by a radar's clocks: `covariance` begins with range and place along the flight [m]."""
+    image, by_timing = model.timing_jacobian(ground)
+    by_level = (model.project_jacobian(ground)[1] / metres_per_unit(ground))[:, :2]
+    return _known(image - model.sensor.project(ground), by_timing / [1.0, model.sensor.speed], covariance, by_level)
+
+
+def _known(moved: Array, jacobian: Array, covariance: Array, by_level: Array) -> tuple[Array, Array, EllipseEntry]:
+    """`jacobian` (2, q): [px] by the first unknowns; `by_level` (2, 2): [px/m] by east and north, at one altitude."""
+    q = jacobian.shape[1]
+    variance = jacobian @ covariance[:q, :q] @ jacobian.T
+    seen = np.linalg.inv(by_level)
+    values, axes = np.linalg.eigh(seen @ variance @ seen.T)
+    minor, major = np.sqrt(np.maximum(values, 0.0)).tolist()
+    azimuth = float(np.degrees(np.arctan2(axes[0, 1], axes[1, 1]))) % 180.0
+    sigma = np.sqrt(np.maximum(np.diag(variance), 0.0))
+    return moved, sigma, EllipseEntry(major, minor, azimuth, ce90(major, minor))
+
+
+def stated_ce90(view: View) -> float | None:
+    """Return CE90 [m] of a camera as delivered, of the accuracies per axis that it states."""
+    sensor, sigma = view.sensor, None
+    if isinstance(sensor, Pushbroom) and sensor.accuracy is not None:
+        sigma = float(np.hypot(*sensor.accuracy))
+    elif isinstance(sensor, RPC) and sensor.err_bias is not None and sensor.err_bias > USABLE_ACCURACY:
+        sigma = float(np.hypot(sensor.err_bias, sensor.err_rand or 0.0))
+    return None if sigma is None else ce90(sigma, sigma)
+
+
+def ce90(major: float, minor: float) -> float:
+    """Return the radius that holds 90 % of a normal distribution with such standard deviations along its axes.
+
+    Examples
+    --------
+    >>> [round(ce90(1.0, minor), 3) for minor in (1.0, 0.5, 0.0)]
+    [2.146, 1.737, 1.645]
+    """
+    if not major > 0.0:
+        return major
+    nodes, weights = _gauss(64)
+    angle, radius = 0.25 * np.pi * (nodes + 1.0), np.linspace(1.6, 2.2, 200)[:, None]  # major axes
+    with np.errstate(divide="ignore"):
+        held = erf(radius * np.cos(angle) / (np.sqrt(2.0) * np.float64(minor / major)))
+    density = np.exp(-0.5 * (radius * np.sin(angle)) ** 2) * held * radius * np.cos(angle)
+    share = np.sqrt(2.0 / np.pi) * 0.25 * np.pi * (density @ weights)  # the integral over x of what y holds
+    return major * float(np.interp(0.9, share, radius[:, 0]))  # to some 1e-6
 
 
 class SourceEntry(Record):
@@ -121,6 +199,7 @@ class ViewEntry(Record):
         "name prior_scale num_rejected lost smooth_px smooth_p shared_px correction.jitter_px "
         "correction.detector_px correction.strip_px correction.swing_px"
     )
+    FOOTPRINT: ClassVar = "name path status num_observations rmse_before rmse_after gsd_m"
     CONTROL: ClassVar = "name control_w control_w_point"
     CLOCKS: ClassVar = " correction.range_m correction.azimuth_ms"
     FITS: ClassVar = (
@@ -136,8 +215,6 @@ class ViewEntry(Record):
     def reservation(self) -> str:
         """Its verdict and what to do as a sentence; of an image of which all is well without a meaning."""
         return f"{self.name}: {STATUS_WORDS[self.status]}: {self.advice}."
-
-    FOOTPRINT: ClassVar = "name path status num_observations rmse_before rmse_after gsd_m"
 
     name: str = said("Unique in the run", head="image", minLength=1)
     path: str = said("The image; empty for a view without pixels")
@@ -268,8 +345,7 @@ def rmse_by_view(residuals: Array, view: IntArray, num_views: int) -> Array:
 def cell_numbers(xy: Array, size: Sequence[int] | IntArray) -> IntArray:
     """Return which of the `CELLS` x `CELLS` cells of an image, or each of its own (n, 2), points (n, 2) [px] lie in."""
     col, row = ((xy + 0.5) / np.asarray(size) * CELLS).astype(np.int64).clip(0, CELLS - 1).T
-    number: IntArray = row * CELLS + col
-    return number
+    return np.asarray(row * CELLS + col)
 
 
 def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntry:
