@@ -109,7 +109,7 @@ def surface() -> tuple[int, int]:
     import click
 
     from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions, declared
-    from barpc.cli.main import COMMANDS, Verbs
+    from barpc.cli import COMMANDS, Verbs
 
     verbs = Verbs()
     context = click.Context(verbs)

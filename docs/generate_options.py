@@ -15,8 +15,8 @@ from typing import Any, get_args, get_origin
 import click
 
 from barpc.base.options import AdjustOptions, FitOptions, Options, Rule, RunOptions, TieOptions, declared
+from barpc.cli import COMMANDS, cli
 from barpc.cli.flags import ADJUSTMENT, REMOTE, RUN, TIE, field_of, flag_name
-from barpc.cli.main import COMMANDS, cli
 
 PAGE = Path(__file__).with_name("options.md")
 MANUAL = Path(__file__).parent / "man" / "barpc.1"

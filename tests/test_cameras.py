@@ -22,8 +22,7 @@ from barpc.base.geodesy import (
 )
 from barpc.base.remote import Remote
 from barpc.cameras import OPENERS, Opener, open_camera
-from barpc.cli import main
-from barpc.cli.main import cli
+from barpc.cli import cli, main
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.scene import Camera
 from barpc.sensor import SensorModel

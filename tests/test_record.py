@@ -53,7 +53,7 @@ def test_anything_else_is_refused(value):
     [
         {"class": ["os", "system"], "fields": {}},
         {"class": ["subprocess", "Popen"], "fields": {"args": "true"}},
-        {"class": ["barpc.cli.main", "main"], "fields": {}},
+        {"class": ["barpc.cli", "main"], "fields": {}},
         {"class": ["barpc.scene", "Nothing"], "fields": {}},
         {"array": "missing"},
         {"unknown": 1},

@@ -1,11 +1,213 @@
-"""The command line: parse, call, print. No mathematics, no file formats.
+"""The `barpc` command: a table of verbs, exit codes, and the options that all verbs share.
 
-The click command of a verb has its name, in a module that is loaded only when it is used: `barpc --help` imports
-click and nothing else of weight.
+The command line parses, calls, prints: no mathematics, no file formats. The click command of a verb has its name, in a
+module that is loaded only when it is used: `barpc --help` imports click and nothing else of weight.
 """
 
 from __future__ import annotations
 
-from barpc.cli.main import main
+import difflib
+import gc
+import logging
+import os
+import signal
+import sys
+import threading
+import traceback
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from typing import Any
 
-__all__ = ["main"]
+import click
+
+from barpc import __version__
+from barpc.base.errors import BarpcError, BarpcWarning
+from barpc.cli.terminal import EXIT_GATE as EXIT_GATE
+from barpc.cli.terminal import THREADS, Formatter, echo, say
+
+_OBJECTS = 50_000  # made between two looks for cycles
+
+EXIT_FAILED = 1
+EXIT_INTERRUPTED = 130
+
+_NO_ARGUMENTS: Any = getattr(click.exceptions, "NoArgsIsHelpError", click.exceptions.Exit)  # not in click 8.1
+
+
+COMMANDS = {
+    "adjust": "Correct the cameras of overlapping images and write fresh RPCs.",
+    "match": "Match tie points and stop.",
+    "check": "Measure how well cameras agree, without adjusting.",
+    "fit": "Fit an RPC to any camera or to points, and certify it.",
+    "info": "Where cameras come from, how they look at the ground and at each other.",
+    "project": "Ground points to image points.",
+    "localize": "Image points to ground points, at an altitude or on a DEM.",
+    "triangulate": "Corresponding image points to ground points.",
+    "convert": "Write RPCs in other formats, cut out windows, hand images over.",
+    "export": "Hand a finished run to Sat-NeRF, COLMAP, s2p, CARS, ASP or a catalogue.",
+    "dsm": "A first surface model, with its uncertainty.",
+    "verify": "Whether a finished run is still what it was: inputs, outputs, cameras.",
+    "report": "Make report.html of a finished run again, or compare two runs.",
+}
+"""Verb -> its line in `barpc --help`; the code is the function `<verb>` of `barpc.cli.<verb>`, or of these:"""
+_MODULES = {
+    **dict.fromkeys(("match", "check"), "adjust"),
+    **dict.fromkeys(("report", "export", "verify", "dsm"), "finished"),
+    **dict.fromkeys(("localize", "triangulate"), "project"),
+}
+
+_GENERAL = {
+    **{"-q": "quiet", "--quiet": "quiet", "-v": "verbose", "--verbose": "verbose"},
+    **{"--debug": "debug", "--json": "as_json"},
+}
+
+
+def _kept_lines(text: str | None) -> str | None:
+    r"""Turn the written ``\b`` of a raw docstring into the character by which click keeps lines apart."""
+    return text and text.replace("\\b\n", "\b\n")
+
+
+class Verbs(click.Group):
+    """A group that imports a verb's module when the verb is used."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the verbs, in the table's order."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import the verb's module and hand out its command."""
+        if cmd_name not in COMMANDS:
+            return None
+        module = import_module(f"barpc.cli.{_MODULES.get(cmd_name, cmd_name)}")
+        command: click.Command = getattr(module, cmd_name)
+        command.help = _kept_lines(command.help)
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Refuse an unknown verb with the nearest known one."""
+        args = self._general(ctx, args)
+        if args and not args[0].startswith("-") and args[0] not in COMMANDS:
+            near = difflib.get_close_matches(args[0], COMMANDS, n=1)
+            hint = f" Did you mean '{near[0]}'?" if near else f" One of: {', '.join(COMMANDS)}."
+            raise click.UsageError(f"No such verb '{args[0]}'.{hint}")
+        return super().resolve_command(ctx, args)
+
+    def _general(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Take out of a verb's arguments those that every verb has: they may stand before and after it."""
+        end = args.index("--") if "--" in args else len(args)
+        for word in args[1:end]:
+            name = "verbose" if word == "-vv" else _GENERAL.get(word)
+            if name is not None:
+                ctx.params[name] = ctx.params[name] + word.count("v", 0, 3) if name == "verbose" else True
+        return [word for i, word in enumerate(args) if not 0 < i < end or word not in (*_GENERAL, "-vv")]
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the verbs from the table, without importing them."""
+        with formatter.section("Verbs"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+
+@click.group(cls=Verbs, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(__version__, message="barpc %(version)s")
+@click.option("-v", "--verbose", count=True, help="Log stages with their seconds (-vv: everything).")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no log: results and errors only.")
+@click.option("--json", "as_json", is_flag=True, help="Results as JSON on stdout.")
+@click.option("--debug", is_flag=True, help="Show the traceback of an error.")
+@click.pass_context
+def cli(ctx: click.Context, /, verbose: int, quiet: bool, **_: bool) -> None:
+    r"""Correct the camera models (RPCs) of satellite images.
+
+    \b
+    Example:
+      barpc adjust scene/*.tif -o adjusted
+
+    Exit codes: 0 done, and nothing needs a look; 1 an error (one line says which file and what to do); 2 wrong
+    usage; 3 finished, but an image, a control point or a file needs a look (the last line says which and why); 130
+    interrupted.
+    """
+    ctx.obj = {"quiet": quiet, "verbose": verbose}
+    level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(Formatter("%(levelname).1s %(name)s: %(message)s"))
+    if not verbose:  # libraries log what is raised again, with its traceback
+        handler.addFilter(logging.Filter("barpc"))
+    logging.basicConfig(level=level, handlers=[handler])
+    warnings.showwarning = _log_warning
+
+
+cli.help = _kept_lines(cli.help)
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run a verb, and turn errors into one line and an exit code."""
+    argv = sys.argv[1:] if args is None else args
+    if args is None:  # the process is ours: no looking for cycles every 700 objects while modules are loaded
+        gc.set_threshold(_OBJECTS)
+    for name in THREADS:  # sums keep their order whatever the machine; -j spreads the work
+        os.environ.setdefault(name, "1")
+    with _interruptible(), warnings.catch_warnings():
+        try:
+            code = cli.main(args=argv, prog_name="barpc", standalone_mode=False)
+            sys.stdout.flush()
+        except click.exceptions.Exit as stop:
+            code = stop.exit_code
+        except _NO_ARGUMENTS as error:
+            error.show()
+            code = error.exit_code
+        except BrokenPipeError:  # whoever read the results has gone
+            sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115  (flushed at exit)
+            code = EXIT_FAILED
+        except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001  (nobody wants a traceback)
+            code, message = _told(error)
+            if "--debug" in argv:
+                echo(traceback.format_exc(), err=True)
+            say(message)
+    if args is None:
+        gc.freeze()  # nor at the end in what the system takes back
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _told(error: BaseException) -> tuple[int, str]:
+    """Return the exit code of an error, and what to say."""
+    if isinstance(error, (click.Abort, KeyboardInterrupt)):
+        return EXIT_INTERRUPTED, "interrupted; run the same command again to go on"
+    if isinstance(error, click.ClickException):
+        context = getattr(error, "ctx", None)
+        where = context.command_path if context is not None else "barpc"
+        return error.exit_code, f"{error.format_message()} (see '{where} --help')"
+    text = f"unexpected {type(error).__name__}: {error}; this is a bug: please report what --debug shows"
+    if isinstance(error, BarpcError):
+        text = str(error)
+    elif isinstance(error, MemoryError):
+        kept = "what was finished is kept: run the same command again, with a smaller -j or [tie] tile"
+        text = f"out of memory; {kept}"
+    elif isinstance(error, OSError) and error.strerror:
+        text = f"{error.filename or 'the system'}: {error.strerror}"
+    return EXIT_FAILED, text
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """End at a SIGTERM, as batch systems send it, in the same way as at a Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _log_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: object, **__: object
+) -> None:
+    """Log a warning as one line: barpc's own always, those of libraries with -v."""
+    text = " ".join(str(message).split())
+    if issubclass(category, BarpcWarning):
+        logging.getLogger("barpc").warning(text)
+    else:
+        logging.getLogger("py.warnings").info("%s:%d: %s: %s", filename, lineno, category.__name__, text)

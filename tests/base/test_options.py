@@ -30,8 +30,8 @@ from barpc.base.options import (
     schema,
     with_values,
 )
+from barpc.cli import cli
 from barpc.cli.flags import ADJUSTMENT, RUN, TIE, flag, flag_name, run_options
-from barpc.cli.main import cli
 
 TABLES: dict[str, type[Options]] = {
     "": RunOptions, "tie": TieOptions, "adjust": AdjustOptions, "fit": FitOptions

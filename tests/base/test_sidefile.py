@@ -289,7 +289,7 @@ DIRECT = {
     "pipeline/executor.py": "arrays that the caller has put down for its workers",
     "cameras.py": "no file: a row of the table of openers",
     "report/runfiles.py": "the schema, which is part of the package",
-    "cli/main.py": "the null device",
+    "cli/__init__.py": "the null device",
 }
 """Modules that may open a file for reading by themselves, and what they open."""
 ARRAYS_OF_A_PATH = ("load", "fromfile", "genfromtxt", "loadtxt")

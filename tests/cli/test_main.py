@@ -15,7 +15,7 @@ import click
 import pytest
 
 from barpc.base.errors import BarpcWarning, InputError
-from barpc.cli.main import COMMANDS, Verbs, _interruptible, _log_warning, _told, cli, main
+from barpc.cli import COMMANDS, Verbs, _interruptible, _log_warning, _told, cli, main
 from barpc.cli.terminal import THREADS
 
 

@@ -12,9 +12,9 @@ from click.testing import CliRunner
 
 from barpc.base.errors import InputError
 from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions
+from barpc.cli import cli
 from barpc.cli.adjust import adjust
 from barpc.cli.flags import _jobs, field_of, flag, flag_name, image_paths, run_options
-from barpc.cli.main import cli
 
 
 def given(target: str, *words: str) -> Any:

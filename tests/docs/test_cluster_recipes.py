@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 import barpc
 from barpc.base.options import RunOptions, TieOptions
-from barpc.cli.main import cli
+from barpc.cli import cli
 from tests.docs.pages import DOCS
 
 PAGE = (DOCS / "recipes/cluster.md").read_text(encoding="utf-8")

@@ -10,7 +10,7 @@ import click
 import pytest
 
 from barpc.base.options import read_options
-from barpc.cli.main import COMMANDS, cli
+from barpc.cli import COMMANDS, cli
 from tests.docs.pages import DOCS, PAGES, ROOT, blocks
 
 PRESENT = [page for page in PAGES if page.name != "CHANGELOG.md"]

@@ -12,7 +12,7 @@ import click
 import pytest
 
 from barpc.base.options import RunOptions, declared
-from barpc.cli.main import COMMANDS, cli
+from barpc.cli import COMMANDS, cli
 from barpc.report.summary import published_schema
 from tests.docs.pages import DOCS, PAGES, ROOT, blocks
 

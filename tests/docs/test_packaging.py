@@ -15,7 +15,7 @@ import pytest
 from packaging.requirements import Requirement
 
 import barpc
-from barpc.cli.main import COMMANDS, cli
+from barpc.cli import COMMANDS, cli
 from tests.docs.pages import DOCS, ROOT
 from tests.docs.test_pages import script
 

@@ -18,7 +18,7 @@ from click.testing import CliRunner
 from barpc.base.errors import FitError, ImageError, OutputError
 from barpc.base.options import RunOptions
 from barpc.cameras import open_camera
-from barpc.cli.main import cli
+from barpc.cli import cli
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.pipeline import adjust, check
 from barpc.pipeline import beyond as grids

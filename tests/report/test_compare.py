@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from barpc.base.errors import InputError
-from barpc.cli.main import cli
+from barpc.cli import cli
 from barpc.report.compare import _lines, _pairs, _view, compare_runs, flat_options
 from barpc.report.records import plain
 from barpc.rpcio import read_rpc, write_rpc

@@ -15,7 +15,7 @@ import pytest
 from click.testing import CliRunner
 
 from barpc.base.errors import InputError
-from barpc.cli.main import cli
+from barpc.cli import cli
 from barpc.pipeline.outputs import remake_report
 from barpc.report import Run
 from barpc.report.compare import compare_runs

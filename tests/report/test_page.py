@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from barpc.base.errors import BarpcError, InputError
-from barpc.cli.main import cli
+from barpc.cli import cli
 from barpc.pipeline import outputs
 from barpc.report import Run, maps, page, summarize
 from barpc.report.runfiles import TABLES, ObservationTable, RunFiles

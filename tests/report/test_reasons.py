@@ -15,8 +15,8 @@ import pytest
 
 import barpc
 from barpc.base.options import TieOptions, declared
+from barpc.cli import COMMANDS, cli
 from barpc.cli.adjust import adjust
-from barpc.cli.main import COMMANDS, cli
 from barpc.report.outcome import Run
 from barpc.report.reservations import view_status
 from barpc.report.summary.words import CAUSES, STATUS_WORDS
