@@ -33,7 +33,6 @@ from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.displaced import Displaced
 from barpc.sensor.geometry import altitude_range
 
-_HEAD = 4096
 _ON_EARTH = (-500.0, 9000.0)  # m: all ground
 
 
@@ -82,7 +81,7 @@ def open_split(path: Place, texts: Mapping[str, str], **choices: Any) -> Camera:
     texts = dict(texts)
     size, holder = (choices.pop(key, texts.pop(key, None)) for key in ("size", "camera"))
     file = path if holder is None else location(holder)
-    head = b"" if file.is_dir() else read_head(file, IMAGE, _HEAD)
+    head = b"" if file.is_dir() else read_head(file, IMAGE)
     name, opener = next((n, o) for n, o in reversed(OPENERS.items()) if o.sniff(file, head, {**texts, **choices}))
     for key in (*texts, *choices):
         if key not in opener.choices:
@@ -115,7 +114,7 @@ def split_spec(spec: str | Path, hosts: Sequence[str] = ()) -> tuple[Place, dict
 def read_points(spec: str | Path) -> tuple[Correspondences | None, tuple[int, int] | None]:
     """Return the points of a table or of a localisation grid, and the image size given behind it; None of a camera."""
     path, texts = split_spec(spec)
-    if path.is_dir() or b"<adsHeader>" in read_head(path, IMAGE, _HEAD):
+    if path.is_dir() or b"<adsHeader>" in read_head(path, IMAGE):
         return None, None
     altitudes = _read(_numbers, "altitudes", texts["altitudes"], path) if "altitudes" in texts else None
     if set(texts) - {"size", "altitudes"} or correspondence_kind(path, altitudes) is None:
@@ -250,7 +249,7 @@ def _open_physical(
     from barpc.sensor.linescan import read_linescan
 
     path = _on_disk(path, f"a {model} model")
-    file = path if driver_of(read_head(path, IMAGE, _HEAD)) is None else metadata_beside(path)
+    file = path if driver_of(read_head(path, IMAGE)) is None else metadata_beside(path)
     found = read_linescan(file, **choices)
     low, high = _stated_altitudes(file) if altitudes is None else altitudes
     return Camera(found.model, file, found.kind, found.size, (low, high))

@@ -15,11 +15,9 @@ from barpc.ba.robust.smooth import SPLINES
 from barpc.ba.robust.weights import geman_mcclure
 from barpc.ba.solving.normal import cholesky3, point_products, whiten
 from barpc.ba.usual import FEW, GROSS, MUCH_NOISE, SHRINK, SURELY, TIMES
-from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
+from barpc.base.geodesy import GEOID, Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray
 from barpc.sensor.displaced import bsplines
-
-_SURFACES = 110.0  # m: no geoid lies farther from the ellipsoid, so no mistaken height surface either
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +197,7 @@ def look(found: Solution, block: Block, placed: Placed, view: int) -> Look:
     if not (_half(off - offset[:, None]) < stated):
         return Look()
     height = float(np.nanmedian((by_height * off).sum(axis=0) / (by_height**2).sum(axis=0)))
-    explains = _half(off - height * by_height) < stated and abs(height) < _SURFACES
+    explains = _half(off - height * by_height) < stated and abs(height) < GEOID  # no mistaken height surface is farther
     return Look(offset=offset, height=height if explains else None)
 
 

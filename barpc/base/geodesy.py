@@ -27,6 +27,8 @@ SPEED_OF_LIGHT = 299792458.0  # in vacuum [m/s]
 _EP2 = WGS84_E2 / (1.0 - WGS84_E2)  # second eccentricity, squared
 ALTITUDES = (-1000.0, 9500.0)
 """The Earth's ground stays inside this [m], with a margin; RPCs that state more are cut to it."""
+GEOID = 110.0
+"""m: no geoid lies farther from the ellipsoid."""
 FAR = 1e9
 """No place, size or other number of a file comes near, be it in px, deg or m."""
 NEWTON_STEPS = 12

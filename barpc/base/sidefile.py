@@ -178,7 +178,7 @@ def read_bytes(path: Path | str, kind: Kind) -> bytes:
         return data
 
 
-def read_head(path: Path | str, kind: Kind, size: int) -> bytes:
+def read_head(path: Path | str, kind: Kind, size: int = 4096) -> bytes:
     """Read the first `size` bytes of a file, however large it is."""
     with opened(path, replace(kind, most=None)) as file:
         return file.read(size)

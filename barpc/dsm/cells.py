@@ -11,13 +11,11 @@ import numpy as np
 import numpy.typing as npt
 from rasterio.warp import transform
 
-from barpc.base.geodesy import Array, ground_from_ecef
+from barpc.base.geodesy import Array, ground_from_ecef, parts
 from barpc.scene import View
 from barpc.sensor.geometry import triangulate
 from barpc.tie.patches.dense import ACROSS, FINER, WINDOW, DenseMatches, dense_matches, epipolar_frame
 
-SIDE = 512
-"""Cells a side of a tile: the blocks of the file."""
 MATCHED = 0.2
 """Share of the pixels of a part that is matched at least, or the pair says nothing there.
 
@@ -29,7 +27,6 @@ _LEVELS = 3  # altitudes
 _SPAN = 128.0  # px of disparity that are searched at once, else a coarser picture says where
 _COARSE = 8  # times a pixel at most of the coarser picture
 _ROOM = 4.0  # px of the coarser picture that heights may lie beyond what it shows
-_AT_ONCE = 1 << 17  # matches intersected at a time
 _SPLIT = 3  # times that a part is halved at most
 
 _median: Callable[..., Any] = np.ma.median  # of what is known
@@ -132,8 +129,7 @@ def _points(pair: tuple[View, View], tile: Tile, band: int, halved: int = 0) -> 
 def _intersected(pair: tuple[View, View], found: DenseMatches, zoom: int) -> Array:
     """Return the ground points (n, 3) of matches; NaN where the rays do not meet."""
     places, ground = (np.stack([found.a, found.b], axis=1) + 0.5) * zoom - 0.5, np.empty((len(found.a), 3))
-    for start in range(0, len(ground), _AT_ONCE):
-        part = slice(start, start + _AT_ONCE)
+    for part in parts(len(ground)):
         view, point = np.tile([0, 1], len(places[part])), np.repeat(np.arange(len(places[part])), 2)
         sensors, xy = [one.sensor for one in pair], places[part].reshape(-1, 2)
         ground[part] = ground_from_ecef(triangulate(sensors, view, point, xy, alt=found.alt[part]).points)

@@ -35,11 +35,11 @@ from barpc.base.geodesy import Array, utm
 from barpc.base.options import DsmOptions
 from barpc.base.sidefile import plain_path
 from barpc.cameras import open_camera
-from barpc.dsm.cells import F32, MATCHED, NODES, SIDE, Tile, surface_tile
+from barpc.dsm.cells import F32, MATCHED, NODES, Tile, surface_tile
 from barpc.dsm.stereo import Block, Groups, NoSurfaceError, block_of_images, block_of_run
 from barpc.pipeline.executor import CachingExecutor, worker_count
 from barpc.pipeline.outputs import remake_report
-from barpc.rasters.raster import hashed, open_raster
+from barpc.rasters.raster import BLOCK, hashed, open_raster
 from barpc.report.page import can_render
 from barpc.report.runfiles import FOLDER, SURFACE, run_key
 from barpc.report.summary import Summary
@@ -169,8 +169,8 @@ class Grid:
                 f"--gsd {step:g}: a pixel of {min(pixels):.2g} m has one match, so fewer than {100 * MATCHED:.0f} % of "
                 "such cells would have a height"
             )
-        if step > 2 * SIDE * max(pixels):
-            raise InputError(f"--gsd {step:g}: a cell of more than {2 * SIDE} pixels of {max(pixels):.2g} m")
+        if step > 2 * BLOCK * max(pixels):
+            raise InputError(f"--gsd {step:g}: a cell of more than {2 * BLOCK} pixels of {max(pixels):.2g} m")
         outlines = [[_common(views[i], views[j], crs) for i, j in group] for group in block.groups]
         seen = shapely.intersection_all([shapely.union_all(group) for group in outlines])
         if seen.is_empty:
@@ -180,7 +180,7 @@ class Grid:
         size = int(np.ceil(east - west)), int(np.ceil(north - south))
         self.whole = Tile(crs.to_wkt(), west * step, north * step, step, size, common_range(*views))
         # a tile shows about as many pixels, however large its cells are
-        self.side = SIDE >> max(0, round(np.log2(step / (2 * max(pixels)))))
+        self.side = BLOCK >> max(0, round(np.log2(step / (2 * max(pixels)))))
         self.tiles: list[tuple[tuple[int, int], Tile, Groups]] = []
         for row, col in np.ndindex(-(-size[1] // self.side), -(-size[0] // self.side)):
             at = self.side * col, self.side * row
@@ -221,12 +221,12 @@ class Grid:
                 f"of the pixels that both images show {100 * max(share, 0):.0f} % are found back at most, "
                 f"fewer than {100 * MATCHED:.0f} %: other seasons, water, clouds or wrong cameras; nothing is written"
             )
-        layout = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "BLOCKSIZE": str(SIDE), "BIGTIFF": "IF_SAFER"}
+        layout = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "BLOCKSIZE": str(BLOCK), "BIGTIFF": "IF_SAFER"}
         with run.stage("write"), rasterio.Env(GDAL_NUM_THREADS="1"):
             rasterio.shutil.copy(rough, made, driver="COG", **layout)
         with open_raster(made) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # medians of nothing
-            some = file.read([3, 4, 5], out_shape=(3, *(min(side, 2 * SIDE) for side in file.shape)))
+            some = file.read([3, 4, 5], out_shape=(3, *(min(side, 2 * BLOCK) for side in file.shape)))
             medians = map(float, [*np.nanmedian(some, axis=(1, 2)), file.tags().get(SHARED, "nan")])
         used = dict.fromkeys(pair for _, _, groups in self.tiles for group in groups for pair in group)
         pairs = tuple(f"{views[i].name} - {views[j].name}" for i, j in used)
@@ -267,7 +267,7 @@ class Grid:
         """Open the file to be written, with the words and tags that it is to have."""
         cells = self.whole
         place = {"crs": cells.crs, "transform": Affine(cells.step, 0, cells.west, 0, -cells.step, cells.north)}
-        layout = {"tiled": True, "blockxsize": SIDE, "blockysize": SIDE, "SPARSE_OK": True, "BIGTIFF": "IF_SAFER"}
+        layout = {"tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK, "SPARSE_OK": True, "BIGTIFF": "IF_SAFER"}
         kind = {"dtype": "float32", "nodata": float("nan"), "compress": "deflate"}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)

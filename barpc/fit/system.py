@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +32,6 @@ Rounding = Callable[[Array], Array]
 
 _ROWS = 1024  # taken into the triangle at a time: what is worked on stays in cache
 _BLOCK = 8  # columns of a Householder block
-ALL = np.arange(20)
 _DEPENDENT = 1e-9  # rms of what a monomial adds to those of lower degree, on these points
 _DEGREE = POWERS.sum(axis=1)
 _NUMERATOR = np.array([np.inf, np.inf, 0.1, 0.03])
@@ -128,7 +128,7 @@ class FitProblem:
     ground: Array  # (N, 3) lon, lat [deg], alt [m]
     image: Array  # (N, 2) [px]
     norm: Normalization
-    active: IntArray = field(default_factory=lambda: ALL)  # monomials in use, the constant one first
+    active: IntArray = field(default_factory=partial(np.arange, 20))  # monomials in use, the constant one first
     weight: Array | None = None  # (N,)
     # share of the half width of the points, around them, over which denominators are kept up
     margin: float = 0.1

@@ -29,13 +29,10 @@ from barpc.pointio.names import unique_names
 from barpc.rasters.raster import open_raster
 from barpc.rpcio.sources import date_taken
 from barpc.scene import Camera, View
-from barpc.sensor.geometry import footprint
+from barpc.sensor.geometry import LEAST_RANGE, footprint
 from barpc.tie.tasks import Progress, ordered
 
 logger = logging.getLogger(__name__)
-
-MIN_ALTITUDE_SPAN = 100.0
-"""Altitude ranges narrower than this [m] are widened to it: an RPC with a zero height scale is usable."""
 
 _SAMPLES = ((0.5, 0.5), (0.25, 0.25), (0.75, 0.75))  # of width and height: where the sampled windows lie
 _MORE = tuple((x / 5, y / 5) for x in range(6) for y in range(6))  # where nothing varies there
@@ -169,11 +166,11 @@ def _load(name: str, file: Place, image: Image, band: int, hosts: Sequence[str])
 
 
 def _altitudes(camera: Camera) -> tuple[float, float]:
-    """Return the altitudes that a camera is used for [m]."""
+    """Return the altitudes that a camera is used for [m]: an RPC with a zero height scale is usable."""
     low, high = max(camera.alt_range[0], ALTITUDES[0]), min(camera.alt_range[1], ALTITUDES[1])
-    if high - low < MIN_ALTITUDE_SPAN:
+    if high - low < LEAST_RANGE:
         middle = min(max((low + high) / 2, ALTITUDES[0]), ALTITUDES[1])
-        low, high = middle - MIN_ALTITUDE_SPAN / 2, middle + MIN_ALTITUDE_SPAN / 2
+        low, high = middle - LEAST_RANGE / 2, middle + LEAST_RANGE / 2
     return low, high
 
 

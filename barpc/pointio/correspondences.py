@@ -76,7 +76,7 @@ def read_gcps(path: Path | str, names: Sequence[str]) -> GroundPoints:
     where the file does not parse, or holds no point of these views.
     """
     path = Path(path)
-    head = read_head(path, TABLE, 4096)
+    head = read_head(path, TABLE)
     views = ViewNames(names, str(path))
     if head.lstrip().startswith(b"{"):
         found = list(_read_geojson(path, views))

@@ -10,7 +10,7 @@ from barpc.ba import Adjustment
 from barpc.ba.apart import Apart
 from barpc.ba.judging.snooping import ControlTest
 from barpc.ba.usual import FEW, SURE, SURELY
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import GEOID, Array
 from barpc.report.outcome import MANY_REJECTED, SMOOTH_LEFT, Run
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.whole import LeftEntry, left_entries, strangeness
@@ -24,7 +24,6 @@ ENOUGH_GCPS = 3  # Control points that hold a view without any tie point
 WORST_LEFT = 0.15  # px: an image with more anywhere is called doubtful
 NOISE_LIMIT = 2.5  # Tie points that scatter by more than so many times what the matcher states need a look
 
-_GEOID = 110.0  # m: no geoid lies farther from the ellipsoid
 _CONTROL_WORDS = {
     "rejected": "{} rejected, contradicted by the rest: check coordinates, axes and image positions",
     "contradicts": "{} off by more than 4 standard deviations, used all the same: the stated accuracies are too good, "
@@ -347,7 +346,7 @@ def dem_reasons(adjustment: Adjustment) -> Iterator[str]:
         )
         return
     (level, *rises), (off, *tilts) = terrain.beyond, terrain.delivered
-    no_geoid = level > SURELY and not terrain.is_known and abs(off) < _GEOID
+    no_geoid = level > SURELY and not terrain.is_known and abs(off) < GEOID
     if level > SURELY:
         why = "its heights, the datum that they count from, or the cameras are not as stated"
         if no_geoid:

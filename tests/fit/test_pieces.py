@@ -27,11 +27,13 @@ from barpc.fit.points import (
 )
 from barpc.fit.poles import smallest_denominator
 from barpc.fit.refit import relative_weight, underlying_rpc
-from barpc.fit.system import ALL, FitProblem, expected_size, noise_scaled, solution
+from barpc.fit.system import FitProblem, expected_size, noise_scaled, solution
 from barpc.sensor.rpc import RPC
 from tests.constants import CONSTANTS, chosen
 from tests.fit.cameras import Camera, random_points, synthetic, synthetic_rpc
 from tests.fit.models import Bent, waves
+
+ALL = np.arange(20)
 
 # --- every option ------------------------------------------------------------------------------------------
 

@@ -45,7 +45,6 @@ _SEEN = 2.5  # floors: swings and motions that are taken; sound crops show swing
 OBSERVATIONS = KEPT
 """Of a block, up to which parts of it are judged."""
 _NEAREST = 12  # views of a part
-_NUMBERS = 3e7  # of a mixture, at most: 240 MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +218,7 @@ def around(outcome: Outcome, block: Block, views: IntArray) -> tuple[Linear, Sta
     problem = outcome.problem
     use = block.use & (block.point < block.num_tracks) & np.isin(block.view, views)
     unknowns = problem.free.size // len(block.views) * len(views)
-    if unknowns > SMALL or numbers(np.bincount(block.point[use])) > _NUMBERS:
+    if unknowns > SMALL or numbers(np.bincount(block.point[use])) > 25 * KEPT:  # 200 MB, too
         return None
     state, _ = revived(problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma)
     low, high = block.alt_range

@@ -16,12 +16,10 @@ from scipy.special import expit
 
 from barpc.ba.estimated.projected import Projected
 from barpc.ba.solving.structure import Structure
-from barpc.ba.usual import FEW, ITERATIONS, LEVEL, MANY, OUTLIER, SLIGHT, STEPS, TRIALS
+from barpc.ba.usual import FEW, ITERATIONS, LEVEL, MANY, OUTLIER, SLIGHT, STEPS, SURE, TRIALS
 from barpc.base.geodesy import Array, parts
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.curve import cross
-
-_EVIDENT = 15.0  # nats over one group: two are likelier by a factor of three million
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ def two_groups(structure: Structure, residual: Array, by_point: Array, use: Bool
         maybe = (cube**2 / square**3 + 1.0) >= 4.0 / 9.0 * fourth / square**2
     for pair in np.flatnonzero(maybe & (count >= MANY)):
         share, apart, gain = _mixture(z[bounds[pair] : bounds[pair + 1]])
-        if share > LEVEL and gain > _EVIDENT:
+        if share > LEVEL and gain > 3.0 * SURE:  # nats over one group: two are likelier by a factor of three million
             first, second = structure.pair_view[pair].tolist()
             found.append(TwoGroups((first, second), share, apart))
     return tuple(found)
