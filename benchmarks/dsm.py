@@ -31,7 +31,7 @@ from rasterio.windows import Window
 
 from barpc.base.options import DsmOptions
 from barpc.dsm import NoSurfaceError, make_dsm
-from barpc.dsm.cells import Tile, gathered
+from barpc.dsm.stereo import Tile, gathered
 from barpc.export.shots import read_scene
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.files import image_file

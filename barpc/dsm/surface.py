@@ -35,8 +35,18 @@ from barpc.base.geodesy import Array, utm
 from barpc.base.options import DsmOptions
 from barpc.base.sidefile import plain_path
 from barpc.cameras import open_camera
-from barpc.dsm.cells import F32, MATCHED, NODES, Tile, surface_tile
-from barpc.dsm.stereo import Block, Groups, NoSurfaceError, block_of_images, block_of_run
+from barpc.dsm.stereo import (
+    F32,
+    MATCHED,
+    NODES,
+    Block,
+    Groups,
+    NoSurfaceError,
+    Tile,
+    block_of_images,
+    block_of_run,
+    surface_tile,
+)
 from barpc.pipeline.executor import CachingExecutor, worker_count
 from barpc.pipeline.outputs import remake_report
 from barpc.rasters.raster import BLOCK, hashed, open_raster

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.ba.apart import Parts
 from barpc.ba.evidence.linearised import linearise
 from barpc.ba.evidence.mixture import Group, fit
 from barpc.ba.evidence.scan import Interval
@@ -20,7 +21,6 @@ from barpc.ba.judging.explanations import MOVING, STRIP
 from barpc.ba.judging.moving import CELLS, Ground, group_of
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.ba.standing import Parts
 from barpc.ba.usual import LEVEL
 from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
 from barpc.scene import BoolArray, Tracks
@@ -191,7 +191,7 @@ def test_groups_that_move_are_taken_out_one_by_one(monkeypatch: pytest.MonkeyPat
     found: Any = SimpleNamespace(problem=None, final=SimpleNamespace(params=None))
     for number, share in ((1, 3), (2, 2)):
         inner, outer = parts.inner.point % share == 0, parts.outer.point % share == 0
-        monkeypatch.setattr("barpc.ba.standing.members", lambda *_, outer=outer: outer)
+        monkeypatch.setattr("barpc.ba.apart.members", lambda *_, outer=outer: outer)
         gone = (parts.group == 0) & (block.point % share == 0)
         one: Any = SimpleNamespace(member=inner)
         less = parts.less(found, one)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.dsm.cells import Tile, gathered
+from barpc.dsm.stereo import Tile, gathered
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.files import _write_image
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
-from barpc.dsm import cells, stereo
-from barpc.dsm.cells import NODES, Tile, gathered
-from barpc.dsm.stereo import CameraErrors
+from barpc.dsm import stereo
+from barpc.dsm.stereo import NODES, CameraErrors, Tile, gathered
 from barpc.dsm.surface import Grid
 
 
@@ -100,11 +99,11 @@ def test_coarser_pictures_are_framed_by_the_middles_of_their_pixels(monkeypatch:
         asked.append((a, b, alt))
         return SimpleNamespace(num=2 * 128 * 4 - 1, across=0.0)
 
-    monkeypatch.setattr(cells, "epipolar_frame", framed)
-    monkeypatch.setattr(cells, "dense_matches", lambda paths, size, frame, band: sizes.append(size))
+    monkeypatch.setattr(stereo, "epipolar_frame", framed)
+    monkeypatch.setattr(stereo, "dense_matches", lambda paths, size, frame, band: sizes.append(size))
     project = [lambda ground, k=k: (1 + k) * ground[:, :2] + ground[:, 2:] for k in range(2)]
     pair: Any = [SimpleNamespace(sensor=SimpleNamespace(project=one), size=(403, 80), path="") for one in project]
-    assert cells._points(pair, tile, 1) == []
+    assert stereo._points(pair, tile, 1) == []
     ground = np.column_stack([np.tile(tile.nodes(), (3, 1)), np.repeat([100.0, 200.0, 300.0], NODES**2)])
     for (*seen, alt), side in zip(asked, (1, 4), strict=True):
         for found, one in zip(seen, project, strict=True):

@@ -7,8 +7,7 @@ import pytest
 
 from barpc.ba import BlockPrior
 from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
-from barpc.dsm.cells import averaged
-from barpc.dsm.stereo import CameraErrors
+from barpc.dsm.stereo import CameraErrors, averaged
 from barpc.dsm.surface import shaded
 from barpc.scene import View
 from barpc.sensor.corrected import Corrected, Correction

@@ -14,10 +14,9 @@ from barpc.base.errors import InputError, OutputError
 from barpc.base.options import DsmOptions
 from barpc.cli import main
 from barpc.dsm import NoSurfaceError, make_dsm
-from barpc.dsm import cells as cells_module
+from barpc.dsm import stereo as stereo_module
 from barpc.dsm import surface as surface_module
-from barpc.dsm.cells import Tile
-from barpc.dsm.stereo import _best, block_of_images
+from barpc.dsm.stereo import Tile, _best, block_of_images
 from barpc.dsm.surface import draped
 from barpc.pipeline import load_views
 from barpc.rpcio import read_rpc
@@ -326,7 +325,7 @@ def test_coarse_cells_have_the_median_of_their_ground(rendered, tmp_path):
 def test_a_refusal_after_long_work_leaves_nothing_either(rendered, tmp_path, monkeypatch):
     """Not even what a run that is gone on with would need: it is refused each time."""
     monkeypatch.setattr("barpc.workspace.KEEP_AFTER", 0.0)
-    monkeypatch.setattr(cells_module, "MATCHED", 1.1)
+    monkeypatch.setattr(stereo_module, "MATCHED", 1.1)
     with pytest.raises(NoSurfaceError, match="nothing is written"):
         make_dsm(rendered.paths[:2], tmp_path / "dsm.tif", OPTIONS)
     assert not list(tmp_path.iterdir())
