@@ -31,7 +31,8 @@ _GEOREFERENCE_TAGS = (33550, 33922, 34264)  # ModelPixelScale, ModelTiepoint, Mo
 _SIZES = dict(enumerate((1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4), 1)) | {16: 8, 17: 8, 18: 8}
 _DOUBLE = 12
 _MAX_ENTRIES = 4096
-_MAX_VALUES = 1 << 24  # bytes
+SCANNED = 1 << 24
+"""Bytes of a file that are looked at: for an extension, for a date, or as the values of a tag."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def read_directory(file: BinaryIO, name: str) -> Directory:
 def read_values(file: BinaryIO, directory: Directory, entry: Entry, name: str) -> bytes:
     """Read the bytes of an entry's values, wherever they stand."""
     size = _SIZES.get(entry.kind, 1) * entry.count
-    if size > _MAX_VALUES:
+    if size > SCANNED:
         raise RpcFormatError(f"{name}: TIFF tag {entry.tag} claims {size} bytes")
     if size <= len(entry.value):
         return entry.value[:size]
@@ -193,8 +194,6 @@ def printable(rpc: RPC) -> RPC:
 
 # --- NITF -------------------------------------------------------------------------------------------------
 
-SCANNED = 1 << 24
-"""Bytes of a file that are searched, for this extension, for a date."""
 _WIDTHS = (7, 7, *WIDTHS)
 
 # Position in RPC00A of each of RPC00B's twenty monomials.

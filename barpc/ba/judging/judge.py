@@ -218,7 +218,7 @@ def around(outcome: Outcome, block: Block, views: IntArray) -> tuple[Linear, Sta
     problem = outcome.problem
     use = block.use & (block.point < block.num_tracks) & np.isin(block.view, views)
     unknowns = problem.free.size // len(block.views) * len(views)
-    if unknowns > SMALL or numbers(np.bincount(block.point[use])) > 25 * KEPT:  # 200 MB, too
+    if unknowns > SMALL or numbers(np.bincount(block.point[use])) > 30 * KEPT:  # 240 MB
         return None
     state, _ = revived(problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma)
     low, high = block.alt_range
