@@ -69,6 +69,11 @@ class BarpcWarning(UserWarning):
     """Something the user should know that does not stop the run."""
 
 
+def listed(names: Sequence[str], most: int = 10) -> str:
+    """Return names as a sentence says them: so many, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
 def visible(text: str) -> str:
     r"""Return a text with everything that does not print escaped as in JSON; lines stay lines.
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from barpc.ba import BlockPrior
-from barpc.base.errors import InputError
+from barpc.base.errors import InputError, listed
 from barpc.base.geodesy import Array, ecef_from_ground, metres_per_unit, wrap_longitude
 from barpc.base.identity import Input, Stamp, changed, take
 from barpc.base.options import RunOptions, declared
@@ -26,7 +26,6 @@ from barpc.rasters.dem import Dem, geoid_file
 from barpc.rasters.raster import hashed
 from barpc.report import Run
 from barpc.report.runfiles import table_path
-from barpc.report.summary.words import listed
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Tracks, View
 from barpc.sensor.geometry import footprint, ground_sample_distance
 from barpc.tie import Matches

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from barpc.base.errors import InputError
+from barpc.base.errors import InputError, listed
 from barpc.base.frozen import load_npz
 from barpc.base.geodesy import ALTITUDES, FAR, Array
 from barpc.base.remote import Place
@@ -87,8 +87,8 @@ def read_gcps(path: Path | str, names: Sequence[str]) -> GroundPoints:
         named = not any(numbers_of([word]) for word in words[1:4]) and header_of(words, _POINTS)
         found = list((_read_csv if named else _read_asp)(path, views))
     if not found:
-        others = f"; it names {', '.join(list(views.strangers)[:10])}" if views.strangers else ""
-        raise InputError(f"{path}: no GCP of {', '.join(names[:10])}{others}")
+        others = f"; it names {listed(list(views.strangers))}" if views.strangers else ""
+        raise InputError(f"{path}: no GCP of {listed(names)}{others}")
     try:
         return replace(_assembled(found), strangers=tuple(views.strangers))
     except InputError as error:

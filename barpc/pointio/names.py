@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import PurePath
 
-from barpc.base.errors import InputError
+from barpc.base.errors import InputError, listed
 from barpc.base.remote import Place, pure
 
 MAX_NAME = 120
@@ -167,6 +167,5 @@ class ViewNames:
         """Return the index of the view that `name` means; InputError where there is none."""
         found = self.find(name)
         if found is None:
-            listed = ", ".join(self.names[:10])
-            raise InputError(f"{self.source}: no view is named {name!r}; there are {listed}")
+            raise InputError(f"{self.source}: no view is named {name!r}; there are {listed(self.names)}")
         return found

@@ -16,13 +16,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from barpc.base.errors import listed
 from barpc.base.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.report.records import MAX_SHOWN
 from barpc.report.runfiles import ObservationTable, RunFiles
 from barpc.report.summary.known import CheckPointEntry, GcpEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import CELLS, ViewEntry, cell_numbers
-from barpc.report.summary.words import counted, known, listed, metres
+from barpc.report.summary.words import counted, known, metres
 from barpc.report.verdict import SHOWN, flagged, worst_first
 
 WIDTH = 420.0  # Units of a map from left to right

@@ -11,6 +11,7 @@ import numpy as np
 from barpc.ba import Adjustment, check_residuals
 from barpc.ba.apart import APART
 from barpc.ba.usual import FEW, SURE, SURELY
+from barpc.base.errors import listed
 from barpc.base.geodesy import Array
 from barpc.report.outcome import MANY_REJECTED, Run
 from barpc.report.records import plain, value_of
@@ -34,7 +35,7 @@ from barpc.report.summary import LeftOutEntry, Summary, measure_run
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.whole import RIVALS, explanations, held_out_places, left_entries
-from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS, counted, listed, median, metres
+from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS, counted, median, metres
 
 SHOWN = 10  # rows of a table on the terminal, images and pairs alike
 LINES = 20  # sentences of the verdict that are shown at least

@@ -338,7 +338,7 @@ def test_groups_are_listed_the_largest_first_five_views_of_five() -> None:
     with pytest.raises(DisconnectedError) as caught:
         chain((5, 6, 2))
     assert [len(group) for group in caught.value.groups] == [6, 5, 2]
-    text = "v05, v06, v07, v08, v09, ...; v00, v01, v02, v03, v04; v11, v12; add"
+    text = "v05, v06, v07, v08, v09 and 1 more; v00, v01, v02, v03, v04; v11, v12; add"
     assert f"fall into 3 groups without common tie points: {text}" in str(caught.value)
     with pytest.raises(DisconnectedError) as caught:
         chain((2,) * 7)
@@ -364,7 +364,7 @@ def test_views_with_too_few_observations_are_listed_up_to_ten(made) -> None:
                  None, AdjustOptions())  # fmt: skip
     views = tuple(replace(made.views[0], name=f"v{v:02}") for v in range(12))
     empty = Tracks(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
-    with pytest.raises(TiePointError, match=r"v09 \(0\), 2 more: at least 4 are needed"):
+    with pytest.raises(TiePointError, match=r"v09 \(0\) and 2 more: at least 4 are needed"):
         join(views, empty, None, AdjustOptions())
 
 

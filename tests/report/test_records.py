@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import pytest
 
+from barpc.base.errors import listed
 from barpc.base.options import schema_of
 from barpc.report.records import (
     Cell,
@@ -26,7 +27,7 @@ from barpc.report.records import (
 from barpc.report.summary import SCHEMA, published_schema
 from barpc.report.summary.pairs import OffsetEntry, PairEntry, medians
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import Count, Share, Side, largest, listed, median, metres
+from barpc.report.summary.words import Count, Share, Side, largest, median, metres
 
 from .made import a_correction, a_pair, a_view
 

@@ -24,14 +24,13 @@ from barpc.ba.solving.normal import cholesky3, point_products, solve_lower, solv
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.ba.solving.structure import Structure, counting_sort, make_structure
-from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
+from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError, listed
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, Tracks, View, connected_groups
 from barpc.sensor.rpc import localize_stack
 
 MIN_OBSERVATIONS = 4  # of a view, or it stops: six unknowns need three points, and one to check them
-_LISTED = 10  # views named in a message
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -136,10 +135,9 @@ def join(
         raise InputError("tracks: a track is observed twice in one view; keep one observation or none")
     count = np.bincount(view, minlength=len(views))
     few = [f"{names[v]} ({count[v]})" for v in np.flatnonzero(count < MIN_OBSERVATIONS)]
-    few = few if len(few) <= _LISTED else [*few[:_LISTED], f"{len(few) - _LISTED} more"]
     if few and not keep_largest:
         raise TiePointError(
-            f"too few observations in {', '.join(few)}: at least {MIN_OBSERVATIONS} are needed; "
+            f"too few observations in {listed(few)}: at least {MIN_OBSERVATIONS} are needed; "
             "give more matches (--matches) or leave these views out (--keep-going)"
         )
     left_out = _left_out(names, view[rows], point[rows], tracks.num_points, keep_largest)
@@ -167,7 +165,7 @@ def _check_names(names: Sequence[str], options: AdjustOptions) -> None:
     if len(set(names)) < len(names):
         raise InputError("two views have the same name")
     if unknown := set(options.fixed) - set(names):
-        raise InputError(f"no view is named {', '.join(sorted(unknown))}; there are {', '.join(names[:_LISTED])}")
+        raise InputError(f"no view is named {listed(sorted(unknown))}; there are {listed(names)}")
 
 
 def _left_out(
@@ -181,16 +179,15 @@ def _left_out(
     if len(groups) == 1:
         return ()
     named = [[names[v] for v in group] for group in groups]
-    listed = "; ".join(", ".join(group[:5]) + (", ..." if len(group) > 5 else "") for group in named[:5])
+    told = "; ".join(listed(group, 5) for group in named[:5])
     if not keep_largest:
         raise DisconnectedError(
-            f"the views fall into {len(groups)} groups without common tie points: {listed}; add overlapping "
+            f"the views fall into {len(groups)} groups without common tie points: {told}; add overlapping "
             "views or matches (--matches), or adjust the largest group only (--keep-going)",
             named,
         )
     rest = tuple(name for group in named[1:] for name in group)
-    listed = ", ".join(rest[:_LISTED])
-    message = f"{len(rest)} views are not tied to the largest group and keep their cameras: {listed}"
+    message = f"{len(rest)} views are not tied to the largest group and keep their cameras: {listed(rest)}"
     warnings.warn(message, BarpcWarning, stacklevel=4)
     return rest
 

@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from barpc.ba.estimated.priors import CameraPrior, EarlierScene, JointPrior
 from barpc.ba.estimated.waves import Waves
 from barpc.ba.held.gauge import MOTIONS
-from barpc.base.errors import InputError
+from barpc.base.errors import InputError, listed
 from barpc.base.frozen import load_npz
 from barpc.base.geodesy import Array
 from barpc.base.sidefile import ARRAYS, LARGEST
@@ -238,10 +238,10 @@ def apply_prior(
         raise InputError(f"the earlier block was adjusted with {prior.model} (drift {prior.drift}); use the same")
     missing = sorted(set(prior.names) - set(names))
     if missing:
-        raise InputError(f"views of the earlier block are missing: {', '.join(missing[:10])}")
+        raise InputError(f"views of the earlier block are missing: {listed(missing)}")
     if other := sorted(set(prior.radars) ^ (set(radars) & set(prior.names))):
         raise InputError(
-            f"the earlier block corrected {', '.join(other[:10])} otherwise, as a radar or not as one: give the same "
+            f"the earlier block corrected {listed(other)} otherwise, as a radar or not as one: give the same "
             "camera files, or adjust all images together"
         )
     size = prior.params.shape[1]

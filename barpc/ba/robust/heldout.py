@@ -19,7 +19,7 @@ from barpc.ba.held.block import Block
 from barpc.ba.robust.weights import Observations, geman_mcclure
 from barpc.ba.solving.problem import Problem
 from barpc.ba.usual import BEST, CRITICAL, FEWEST, ITERATIONS, MANY, SLIGHT, STEPS, SURELY
-from barpc.base.errors import InputError
+from barpc.base.errors import InputError, listed
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.scene import BoolArray, GroundPoints, IntArray
 from barpc.sensor import SensorModel
@@ -247,6 +247,6 @@ def split_points(points: GroundPoints, checks: Sequence[str]) -> tuple[GroundPoi
     """
     unknown = sorted(set(checks) - set(points.names))
     if unknown:
-        raise InputError(f"no ground point is named {', '.join(unknown[:10])}")
+        raise InputError(f"no ground point is named {listed(unknown)}")
     is_check = np.isin(np.array(points.names, dtype=object), list(checks))
     return points.select(~is_check), points.select(is_check)

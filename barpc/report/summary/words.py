@@ -37,11 +37,6 @@ NAMED = 5
 """Images, points or reasons that one sentence names."""
 
 
-def listed(names: Sequence[str], most: int = 10) -> str:
-    """Return the names in a sentence."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
 def counted(number: int, what: str) -> str:
     """A number of things.
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from barpc.base.errors import DisconnectedError, TiePointError
+from barpc.base.errors import DisconnectedError, TiePointError, listed
 from barpc.base.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.base.options import TieOptions
 from barpc.scene import View, connected_groups, connected_labels
@@ -213,9 +213,8 @@ def require_connected(views: Sequence[View], links: Sequence[tuple[int, int]], w
     if len(groups) < 2:
         return
     names = [[views[i].name for i in group] for group in groups]
-    more = [f" and {len(group) - 5} more" if len(group) > 5 else "" for group in names]
-    listed = "; ".join(", ".join(group[:5]) + rest for group, rest in zip(names[:6], more[:6], strict=True))
-    raise DisconnectedError(f"the images fall into {len(groups)} groups ({listed}): {why}", names)
+    told = "; ".join(listed(group, 5) for group in names[:6])
+    raise DisconnectedError(f"the images fall into {len(groups)} groups ({told}): {why}", names)
 
 
 def shared_tiles(
