@@ -288,7 +288,6 @@ GM = 3.986004418e14  # gravitational constant of the Earth (WGS84) [m^3/s^2]
 PITCH = 10.0  # views of one site are spread from -PITCH to +PITCH degrees of incidence along the flight
 ROLL = 8.0  # largest incidence across the flight [deg]
 _DEGREE = 4  # of the polynomials of time for position and attitude
-_NODES = 9  # times at which the guided motion is sampled for them
 
 
 @dataclass(frozen=True)
@@ -337,7 +336,8 @@ def fly(target: Array, look: Look, size: tuple[int, int], gsd: float) -> Pushbro
     period = gsd / float(rate * np.linalg.norm(aim))
     half = 0.5 * (size[1] - 1) * period
     stop = 1.1 * half + 8 * period
-    times = stop * np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)[::-1]
+    count = 2 * _DEGREE + 1  # times at which the guided motion is sampled
+    times = stop * np.cos(np.pi * (np.arange(count) + 0.5) / count)[::-1]
 
     position = _circle(place, _level(heading) @ enu, rate, times)
     z = aim + (gsd / period) * times[:, None] * along - position

@@ -29,7 +29,7 @@ from barpc.sensor.rpc import RPC
 MARGIN = 20.0
 """m that the altitudes of a scene reach beyond its tie points, besides a tenth of their range."""
 _SHARE = 0.5  # per cent of the tie points at either end that do not count for it
-_NODES, _CHECKED = (11, 5), (21, 9)  # of the grids on which cameras are fitted, and their errors measured
+_NODES = 11, 5  # of the grid on which cameras are fitted; their errors are measured between them, too
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,8 @@ class Scene:
 
     def samples(self, shot: Shot, checked: bool = False) -> Sampled:
         """Return the points over an image and the scene's altitudes; to measure errors on, more of them."""
-        image, alt = image_grid(shot.size, self.alt_range, _CHECKED if checked else _NODES)
+        nodes = (2 * _NODES[0] - 1, 2 * _NODES[1] - 1) if checked else _NODES
+        image, alt = image_grid(shot.size, self.alt_range, nodes)
         ground = shot.rpc.localize(image, alt)
         known = np.isfinite(ground).all(axis=1)
         if known.sum() < 12:

@@ -23,8 +23,7 @@ FLOOR = 0.1
 """Least value of a denominator over what it is at the centre."""
 _PIECES = 8  # of a side
 _BERNSTEIN = np.array([[comb(i, k) / comb(3, k) for k in range(4)] for i in range(4)])
-_LEVEL = 32  # directions that a hull is cut in, level with the ground
-_ANGLES = np.linspace(0.0, 2.0 * np.pi, _LEVEL, endpoint=False)
+_ANGLES = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)  # in which a hull is cut, level with the ground
 _DIRECTIONS = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 _CUTS = 40  # inequalities that are taken in in a pass of a bounded least squares
 _SLACK = 1e-9  # of a bound: rounding
