@@ -142,8 +142,11 @@ class Correction(Frozen):
     def apply(self, ecef: Array, row: Array | None = None) -> Array:
         """Return s R (X - T - C) + C of ECEF points X (..., 3) [m]; with the drift, if given rows (...)."""
         ecef = np.asarray(ecef, dtype=np.float64)
-        rows = None if row is None else np.broadcast_to(row, ecef.shape[:-1]).reshape(-1)
-        return self.motion(ecef.reshape(-1, 3).T, rows).ecef.T.reshape(ecef.shape)
+        shift = self.scale * self.translation + (self.scale - 1.0) * self.center + self.center
+        moved = self._matrix @ (self.scale * ecef.reshape(-1, 3) - shift).T
+        if row is not None:
+            moved = Turn(self._turns(np.broadcast_to(row, ecef.shape[:-1]).reshape(-1))).forth(moved)
+        return np.asarray(moved.T + self.center).reshape(ecef.shape)
 
     def undo(self, ecef: Array, row: Array) -> Array:
         """Return the points X (N, 3) [m] that `apply` takes to ECEF points (N, 3) at rows (N,)."""
@@ -233,15 +236,17 @@ class Corrected(Behind):
         return pointwise(lambda *part: [self._localize(*part)], [(3,)], image, alt)[0]
 
     def _localize(self, image: Array, alt: Array) -> Array:
-        before, settled = alt, False
-        for _ in range(NEWTON_STEPS):
-            found = self.sensor.localize(image, before)
-            ground = ground_from_ecef(self.correction.undo(ecef_from_ground(found), image[:, 1]))
-            off = alt - ground[:, 2]
-            if settled:
+        ground, off, asked = np.zeros((len(alt), 3)), alt, alt
+        for step in range(NEWTON_STEPS):
+            found = self.sensor.localize(image, asked)
+            before, ground = ground, ground_from_ecef(self.correction.undo(ecef_from_ground(found), image[:, 1]))
+            last, off = off, alt - ground[:, 2]
+            if step and not (np.abs(off) > SETTLED).any():
                 break
-            settled = not (np.abs(off) > SETTLED).any()
-            before = before + off
+            asked = asked + off
+        moved = ground - before  # along the ray, which is straight so near
+        moved[:, 0] = wrap_longitude(moved[:, 0])
+        ground += moved * np.where(last, off / last, 0.0)[:, None]
         ground[~(np.abs(off) <= SETTLED)] = np.nan
         ground[:, 2] = alt
         ground[:, 0] = wrap_longitude(ground[:, 0], found[:, 0])
