@@ -21,6 +21,7 @@ from barpc.base.geodesy import (
     wrap_longitude,
 )
 from barpc.sensor import SensorModel
+from barpc.sensor.corrected import Corrected, Corrections
 from barpc.sensor.curve import cross
 from barpc.sensor.rpc import RPC, RpcStack, localize_stack
 from barpc.sensor.timing import Clocked
@@ -174,10 +175,15 @@ class Several:
     """
 
     def __init__(self, sensors: Sequence[SensorModel], view: npt.ArrayLike) -> None:
-        of_row = np.asarray(view, dtype=np.int64)
-        self._order = np.argsort(of_row, kind="stable")
-        used, first = np.unique(of_row[self._order], return_index=True)
-        self._stack, self._bounds = RpcStack([sensors[v] for v in used.tolist()]), np.append(first, len(of_row))
+        used, camera = np.unique(np.asarray(view, dtype=np.int64), return_inverse=True)
+        cameras = [sensors[v] for v in used.tolist()]
+        self._order = np.argsort(camera, kind="stable")
+        self._stack, self._bounds = RpcStack(cameras), np.searchsorted(camera[self._order], np.arange(len(used) + 1))
+        self.behind: Corrected | None = None  # all cameras are behind corrections in space: one behind many
+        behind = [one for one in cameras if isinstance(one, Corrected)]
+        if len(behind) == len(used) and len({len(one.correction.drift) for one in behind}) == 1:
+            inner = Several([one.sensor for one in behind], camera)
+            self.behind = Corrected(inner, Corrections.of([one.correction for one in behind], camera))
 
     def each(self, function: Callable[[SensorModel, Array], Array], ground: Array) -> Array:
         """Return what a function gives for ground points (N, 3), each with its own camera."""
@@ -188,15 +194,22 @@ class Several:
 
     def project(self, ground: Array) -> Array:
         """Project ground points (N, 3) [deg, deg, m] to image points (N, 2) [px]."""
+        if self.behind is not None:
+            return self.behind.project(ground)
         return self._given_back(self._stack.seen(ground[self._order], self._bounds))
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Return image points (N, 2) [px] and their derivatives (N, 2, 3) [px/deg, px/deg, px/m]."""
+        if self.behind is not None:
+            return self.behind.project_jacobian(ground)
         image, jacobian = self._stack.seen_jacobian(ground[self._order], self._bounds)
         return self._given_back(image), self._given_back(jacobian)
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Localise image points (N, 2) [px] at altitudes (N,) [m]: ground points (N, 3)."""
+        if self.behind is not None:
+            with np.errstate(all="ignore"):
+                return self.behind.localize_rows(image, alt)
         return self._given_back(self._stack.localize(image[self._order], alt[self._order], self._bounds))
 
     def _given_back(self, found: Array) -> Array:

@@ -16,8 +16,6 @@ from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.timing import Timed
 
-_gauss = cache(np.polynomial.legendre.leggauss)  # every image asks
-
 
 class EllipseEntry(Record):
     """How well a camera tells where a ground point in the middle of its image is, its altitude given."""
@@ -29,19 +27,23 @@ class EllipseEntry(Record):
 
 
 def moved_in_space(
-    model: Corrected, covariance: Array, unknowns: str, ground: Array
+    model: Corrected, covariance: Array, unknowns: str, ground: Array, seen: tuple[Array, ...] | None = None
 ) -> tuple[Array, Array, EllipseEntry]:
     """Return how far P_BA moves a ground point near the image's middle (2,) [px], its sigma (2,), and its ellipse.
 
     `covariance` (q, q) is of rotation (metres: angle x distance), translation [m], then any drift, which is zero in the
     middle row; `unknowns`: "rotation", "translation" or "rotation+translation"; `ground` (3,): lon, lat [deg], alt [m].
+    `seen`, if known: what `project_ecef` says of it, and where the camera as delivered sees it.
     """
     ecef = ecef_from_ground(ground)
-    image, by_point, by_rotation, by_translation = model.project_ecef(ecef)
+    image, by_point, by_rotation, by_translation, before = seen or (
+        *model.project_ecef(ecef),
+        model.sensor.project(ground),
+    )
     distance = np.linalg.norm(ecef - model.correction.center)
     parts = {"rotation": by_rotation / distance, "translation": by_translation}
     jacobian = np.hstack([part for name, part in parts.items() if name in unknowns])
-    return _known(image - model.sensor.project(ground), jacobian, covariance, by_point @ enu_basis(ground)[:2].T)
+    return _known(image - before, jacobian, covariance, by_point @ enu_basis(ground)[:2].T)
 
 
 def moved_by_clocks(model: Timed, covariance: Array, ground: Array) -> tuple[Array, Array, EllipseEntry]:
@@ -83,10 +85,18 @@ def ce90(major: float, minor: float) -> float:
     """
     if not major > 0.0:
         return major
-    nodes, weights = _gauss(64)
-    angle, radius = 0.25 * np.pi * (nodes + 1.0), np.linspace(1.6, 2.2, 200)[:, None]  # major axes
+    radius, along, weights = _circles()
     with np.errstate(divide="ignore"):
-        held = erf(radius * np.cos(angle) / (np.sqrt(2.0) * np.float64(minor / major)))
-    density = np.exp(-0.5 * (radius * np.sin(angle)) ** 2) * held * radius * np.cos(angle)
-    share = np.sqrt(2.0 / np.pi) * 0.25 * np.pi * (density @ weights)  # the integral over x of what y holds
-    return major * float(np.interp(0.9, share, radius[:, 0]))  # to some 1e-6
+        held = erf(along / (np.sqrt(2.0) * np.float64(minor / major)))
+    share = (held * weights).sum(axis=1)  # the integral over x of what y holds
+    return major * float(np.interp(0.9, share, radius))  # to some 1e-6
+
+
+@cache  # every image asks
+def _circles() -> tuple[Array, Array, Array]:
+    """Return radii [major axes]; across their halves the extent of y at points, and the weight of each, of x."""
+    nodes, weights = np.polynomial.legendre.leggauss(64)
+    angle, radius = 0.25 * np.pi * (nodes + 1.0), np.linspace(1.6, 2.2, 200)[:, None]
+    along = radius * np.cos(angle)
+    density = np.exp(-0.5 * (radius * np.sin(angle)) ** 2) * along
+    return radius[:, 0], along, np.sqrt(2.0 / np.pi) * 0.25 * np.pi * density * weights

@@ -10,13 +10,14 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.fit import RpcFit
 from barpc.report.outcome import Run
 from barpc.report.records import Cell, Column, Number, Record, said, value_of
 from barpc.report.summary.place import EllipseEntry, moved_by_clocks, moved_in_space, stated_ce90
 from barpc.report.summary.words import ABOVE, CAUSES, STATUS_WORDS, Count, Pixel, Share, Side, Vector, largest
 from barpc.scene import IntArray
+from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.displaced import ImageCorrected, RowSpline, Splined
 from barpc.sensor.geometry import Several, ground_sample_distance, image_grid, view_angles
@@ -227,9 +228,9 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
             control_w_point=control[i].point if i in control else None,
             status="adjusted",
             advice="",
-            **_adjusted(run, i, middle[i]),
+            **adjusted,
         )
-        for i, view in enumerate(run.views)
+        for i, (view, adjusted) in enumerate(zip(run.views, _adjusted(run, middle), strict=True))
     )
 
 
@@ -237,24 +238,38 @@ def _fit(fit: RpcFit) -> FitEntry:
     return replace(FitEntry(*_FIT(fit)), localisation_m=None if fit.localisation is None else fit.localisation.max_m)
 
 
-def _adjusted(run: Run, i: int, middle: Array) -> dict[str, Any]:
-    """Return what an adjustment found of image i; `certified`: ground at its ends, and where its new camera sees it."""
-    found, view = run.adjustment, run.views[i]
+def _adjusted(run: Run, middle: Array) -> list[dict[str, Any]]:
+    """Return what an adjustment found of every image, at the ground points (N, 3) in the middle of each."""
+    found, num = run.adjustment, len(run.views)
     if found is None:
-        return {"smooth_px": None, "prior_scale": None, "correction": None}
-    of_view = {
-        "smooth_px": found.smooth.rms[i],
-        "smooth_p": found.smooth.significance[i],
-        "shared_px": found.smooth.shared[i],
-        "held_out_px": found.held_out_rms[i],
-        "prior_scale": found.prior.scale[i],
-        "correction": _correction(found, i, middle),
-    }
-    if run.written:
-        ground = found.sensors[i].localize(*image_grid(view.size, view.alt_range, (3, 2)))
-        ground = ground[np.isfinite(ground).all(axis=1)]
-        of_view["certified"] = tuple(map(tuple, np.hstack([ground, found.sensors[i].project(ground)]).tolist()))
-    return of_view
+        return [{"smooth_px": None, "prior_scale": None, "correction": None}] * num
+    inner = [model.sensor if isinstance(model, Splined) else model for model in found.sensors]
+    behind, seen = Several(inner, np.arange(num)).behind, list[tuple[Array, ...]]()
+    if behind is not None:
+        seen = list(zip(*behind.project_ecef(ecef_from_ground(middle)), behind.sensor.project(middle), strict=True))
+    certified = _certified(run, found.sensors) if run.written else [None] * num
+    return [
+        {
+            "smooth_px": found.smooth.rms[i],
+            "smooth_p": found.smooth.significance[i],
+            "shared_px": found.smooth.shared[i],
+            "held_out_px": found.held_out_rms[i],
+            "prior_scale": found.prior.scale[i],
+            "correction": _correction(found, i, middle[i], seen[i] if seen else None),
+            "certified": certified[i],
+        }
+        for i in range(num)
+    ]
+
+
+def _certified(run: Run, sensors: Sequence[SensorModel]) -> list[tuple[tuple[float, ...], ...]]:
+    """Return ground at the ends of every image and its altitudes, and where its new camera sees it."""
+    grids = [image_grid(view.size, view.alt_range, (3, 2)) for view in run.views]
+    image, alt = map(np.concatenate, zip(*grids, strict=True))
+    many = Several(sensors, np.repeat(np.arange(len(grids)), len(alt) // len(grids)))
+    ground = many.localize(image, alt)
+    rows = np.hstack([ground, many.project(ground)]).reshape(len(grids), -1, 5)
+    return [tuple(map(tuple, one[np.isfinite(one[:, :3]).all(axis=1)].tolist())) for one in rows]
 
 
 def rmse_by_view(residuals: Array, view: IntArray, num_views: int) -> Array:
@@ -272,8 +287,8 @@ def cell_numbers(xy: Array, size: Sequence[int] | IntArray) -> IntArray:
     return number
 
 
-def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntry:
-    """Return the correction of a view, at the ground point (3,) in the middle of its image."""
+def _correction(adjustment: Adjustment, i: int, middle: Array, seen: tuple[Array, ...] | None) -> CorrectionEntry:
+    """Return the correction of a view, at the ground point (3,) in the middle of its image; `seen`: if known."""
     whole, model = adjustment.sensors[i], adjustment.cameras.unknowns.model
     sensor, spline = (whole.sensor, whole.correction) if isinstance(whole, Splined) else (whole, None)
     covariance, apart = adjustment.covariance.view(i), adjustment.apart
@@ -288,7 +303,7 @@ def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntr
         known: dict[str, Any] = {"range_m": offset[0], "azimuth_ms": offset[1], "timing_slopes": slopes}
         known["timing_sigma"] = (np.array(sigma[:2]) / [1.0, sensor.sensor.speed / 1e3]).tolist()
     elif isinstance(sensor, Corrected):
-        moved, uncertain, place = moved_in_space(sensor, covariance, model, middle)
+        moved, uncertain, place = moved_in_space(sensor, covariance, model, middle, seen)
         known = {
             "rotation_urad": (sensor.correction.rotation * 1e6).tolist(),
             "angle_urad": float(np.linalg.norm(sensor.correction.rotation)) * 1e6,
