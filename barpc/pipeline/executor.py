@@ -29,7 +29,7 @@ from barpc import __version__
 from barpc.base.errors import AdjustError, BarpcError, InputError
 from barpc.base.frozen import Arrays, from_arrays, to_arrays
 from barpc.base.identity import Input, guarded
-from barpc.tie.tasks import Store
+from barpc.tie.tasks import Progress, Store, ordered
 from barpc.workspace import Workspace, key_of
 
 logger = logging.getLogger(__name__)
@@ -54,6 +54,20 @@ def worker_count(executor: Executor | None) -> int:
             logger.warning("the cluster has no worker: the run waits for one; Ctrl-C ends it, and what is done is kept")
         return max(_CLUSTER, sum(threads))
     return int(getattr(executor, "_max_workers", None) or os.cpu_count() or 1)
+
+
+def by_groups(
+    executor: Executor | None,
+    function: Callable[..., Any],
+    items: Sequence[Any],
+    given: tuple[Any, ...],
+    stage: str,
+    progress: Progress | None,
+) -> list[Any]:
+    """Run `function(group, *given)` on `GROUP` items at a time, as `ordered`; progress counts the items."""
+    tasks, num = [(tuple(items[at : at + GROUP]), *given) for at in range(0, len(items), GROUP)], len(items)
+    told = progress and (lambda stage, done, _: progress(stage, min(done * GROUP, num), num))
+    return ordered(executor, function, tasks, stage, told)
 
 
 class CachingExecutor(Executor):

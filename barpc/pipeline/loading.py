@@ -24,13 +24,13 @@ from barpc.base.identity import Stamp, also_seen, recorded
 from barpc.base.remote import Place, here, located
 from barpc.base.sidefile import IMAGE, plain_path, versioned
 from barpc.cameras import Camera, open_split, split_spec
-from barpc.pipeline.executor import GROUP
+from barpc.pipeline.executor import GROUP, by_groups
 from barpc.pointio.names import unique_names
 from barpc.rasters.raster import open_raster
 from barpc.rpcio.sources import date_taken
 from barpc.scene import View
 from barpc.sensor.geometry import footprint
-from barpc.tie.tasks import Progress, ordered
+from barpc.tie.tasks import Progress
 
 logger = logging.getLogger(__name__)
 
@@ -122,9 +122,7 @@ def _read_all(
     progress: Progress | None,
 ) -> tuple[list[_Read | BarpcError], float]:
     """Return every image as it was read, and CPU seconds of other processes."""
-    tasks = [(given[at : at + GROUP], *how) for at in range(0, len(given), GROUP)]
-    told = progress and (lambda stage, done, _: progress(stage, min(done * GROUP, len(given)), len(given)))
-    groups = ordered(executor, read_group, tasks, "cameras", told)
+    groups = by_groups(executor, read_group, given, how, "cameras", progress)
     spent = 0.0 if executor is None else sum(seconds for _, seconds in groups)
     return [read for group, _ in groups for read in group], spent
 

@@ -9,6 +9,7 @@ from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +25,7 @@ from barpc.base.sidefile import plain_path
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
 from barpc.pipeline.beyond import write_grids
-from barpc.pipeline.executor import GROUP, CachingExecutor
+from barpc.pipeline.executor import CachingExecutor, by_groups
 from barpc.pipeline.handoff import unverified
 from barpc.pipeline.inputs import (
     PRIOR,
@@ -57,7 +58,7 @@ from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
 from barpc.tie import Scope, find_tracks, read_area
 from barpc.tie.reference import Accuracy, ReferenceControl, register_views
-from barpc.tie.tasks import Progress, Work, ordered
+from barpc.tie.tasks import Progress, Work
 from barpc.workspace import TABLES, Workspace, timed
 
 logger = logging.getLogger(__name__)
@@ -387,11 +388,8 @@ def _fitted(run: Run, options: RunOptions, work: Work) -> Run:
     known = bias if np.isfinite(bias) and bias > 0 else None
     corrected = zip(run.views, run.adjustment.sensors, strict=True)
     cameras = [(model, view.size, view.alt_range) for view, model in corrected]
-    strict, num = not (options.keep_going or options.grids), len(cameras)
-    tasks = [(tuple(cameras[at : at + GROUP]), options.fit, strict) for at in range(0, num, GROUP)]
-    progress = work.progress
-    told = progress and (lambda stage, done, _: progress(stage, min(done * GROUP, num), num))
-    found = [one for group in ordered(work.executor, fit_group, tasks, "fit", told) for one in group]
+    given = options.fit, not (options.keep_going or options.grids)
+    found = chain(*by_groups(work.executor, fit_group, cameras, given, "fit", work.progress))
     fits: list[RpcFit] = []
     for view, (fit, error, warned) in zip(run.views, found, strict=True):
         if fit is None:

@@ -17,10 +17,9 @@ from barpc.report.records import Cell, Column, Number, Record, said, value_of
 from barpc.report.summary.place import EllipseEntry, moved_by_clocks, moved_in_space, stated_ce90
 from barpc.report.summary.words import ABOVE, CAUSES, STATUS_WORDS, Count, Pixel, Share, Side, Vector, largest
 from barpc.scene import IntArray
-from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.displaced import ImageCorrected, RowSpline, Splined
-from barpc.sensor.geometry import Several, ground_sample_distance, image_grid, view_angles
+from barpc.sensor.geometry import Several, ground_grids, ground_sample_distance, view_angles
 from barpc.sensor.timing import Timed
 
 CELLS = 8  # Cells of an image from left to right and from top to bottom
@@ -239,7 +238,10 @@ def _fit(fit: RpcFit) -> FitEntry:
 
 
 def _adjusted(run: Run, middle: Array) -> list[dict[str, Any]]:
-    """Return what an adjustment found of every image, at the ground points (N, 3) in the middle of each."""
+    """Return what an adjustment found of every image, at the ground points (N, 3) in the middle of each.
+
+    `certified`: ground at its ends, and where its new camera sees it.
+    """
     found, num = run.adjustment, len(run.views)
     if found is None:
         return [{"smooth_px": None, "prior_scale": None, "correction": None}] * num
@@ -247,7 +249,8 @@ def _adjusted(run: Run, middle: Array) -> list[dict[str, Any]]:
     behind, seen = Several(inner, np.arange(num)).behind, list[tuple[Array, ...]]()
     if behind is not None:
         seen = list(zip(*behind.project_ecef(ecef_from_ground(middle)), behind.sensor.project(middle), strict=True))
-    certified = _certified(run, found.sensors) if run.written else [None] * num
+    ends = [(model, view.size, view.alt_range) for model, view in zip(found.sensors, run.views, strict=True)]
+    grids = ground_grids(ends, (3, 2)) if run.written else None
     return [
         {
             "smooth_px": found.smooth.rms[i],
@@ -256,20 +259,10 @@ def _adjusted(run: Run, middle: Array) -> list[dict[str, Any]]:
             "held_out_px": found.held_out_rms[i],
             "prior_scale": found.prior.scale[i],
             "correction": _correction(found, i, middle[i], seen[i] if seen else None),
-            "certified": certified[i],
+            "certified": tuple(map(tuple, grids[i].tolist())) if grids else None,
         }
         for i in range(num)
     ]
-
-
-def _certified(run: Run, sensors: Sequence[SensorModel]) -> list[tuple[tuple[float, ...], ...]]:
-    """Return ground at the ends of every image and its altitudes, and where its new camera sees it."""
-    grids = [image_grid(view.size, view.alt_range, (3, 2)) for view in run.views]
-    image, alt = map(np.concatenate, zip(*grids, strict=True))
-    many = Several(sensors, np.repeat(np.arange(len(grids)), len(alt) // len(grids)))
-    ground = many.localize(image, alt)
-    rows = np.hstack([ground, many.project(ground)]).reshape(len(grids), -1, 5)
-    return [tuple(map(tuple, one[np.isfinite(one[:, :3]).all(axis=1)].tolist())) for one in rows]
 
 
 def rmse_by_view(residuals: Array, view: IntArray, num_views: int) -> Array:
