@@ -247,7 +247,7 @@ class RpcStack:
     ) -> list[Array]:
         """Return what cameras give (..., n) for points: few of RPCs together, else by the camera's method `name`."""
         out = [np.empty((*shape, len(given[0]))) for shape in shapes]
-        few = self.is_rpc & (np.diff(bounds) <= _MANY)
+        few = self.is_rpc & (np.diff(bounds) <= _MANY) & (len(self.sensors) > 1)
         for views in self.runs(bounds, few):
             rows = slice(bounds[views.start], bounds[views.stop])
             part = [array[rows] for array in given]
