@@ -81,6 +81,16 @@ def footprint(sensor: SensorModel, size: tuple[int, int], alt: float | npt.Array
     return ring
 
 
+def footprints(sensors: Sequence[SensorModel], sizes: Sequence[tuple[int, int]], alt: npt.ArrayLike) -> Array:
+    """Return the outlines (N, 32, 2) of images on the ground at an altitude [m], or each at its own: `footprint`s."""
+    borders = np.array([image_border(size) for size in sizes]).reshape(len(sizes), -1, 2)
+    alts = np.repeat(np.broadcast_to(np.asarray(alt, dtype=np.float64), len(sizes)), borders.shape[1])
+    bounds = borders.shape[1] * np.arange(len(sizes) + 1)
+    rings = localize_stack(sensors, borders.reshape(-1, 2), alts, bounds)[:, :2].reshape(borders.shape)
+    rings[..., 0] = wrap_longitude(rings[..., 0], rings[:, :1, 0])
+    return rings
+
+
 def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, float]) -> tuple[Array, Array]:
     """Return the straight lines through the ground points of image points at two altitudes.
 
