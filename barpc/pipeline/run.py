@@ -54,7 +54,7 @@ from barpc.report.summary import InputEntry, StageEntry
 from barpc.rpcio import plain_source
 from barpc.scene import Tracks, View
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import CameraCenter, camera_center
+from barpc.sensor.geometry import CameraCenter, camera_centers
 from barpc.sensor.rpc import RPC
 from barpc.tie import Scope, find_tracks, read_area
 from barpc.tie.reference import Accuracy, ReferenceControl, register_views
@@ -301,7 +301,7 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
     if prior is not None:
         run = replace(run, tracks=only_new(run.tracks, np.isin(names, prior.names)))
     gcps, checks = (load_gcps(paths, run.views, options) for paths in (options.gcp, options.check_points))
-    centers = tuple(_center(view, options.adjust.center) for view in run.views)
+    centers = _centers(run.views, options.adjust.center)
     if run.reference is not None and run.reference.control is None and not len(run.tracks) and gcps is None:
         raise TiePointError(
             f"{', '.join(options.reference)}: the reference {run.reference.refusal}, and nothing else holds the "
@@ -373,11 +373,12 @@ def _only(run: Run, names: frozenset[str]) -> Run:
     )
 
 
-def _center(view: View, how: Literal["line", "projective"] = "line") -> CameraCenter:
-    center = camera_center(view.sensor, view.size, view.alt_range, how)
-    if center.method == "nominal":
-        logger.warning("%s: its camera does not tell where it stands; a nominal centre is used", view.name)
-    return center
+def _centers(views: Sequence[View], how: Literal["line", "projective"]) -> tuple[CameraCenter, ...]:
+    found = camera_centers([v.sensor for v in views], [v.size for v in views], [v.alt_range for v in views], how)
+    for view, center in zip(views, found, strict=True):
+        if center.method == "nominal":
+            logger.warning("%s: its camera does not tell where it stands; a nominal centre is used", view.name)
+    return tuple(found)
 
 
 def _fitted(run: Run, options: RunOptions, work: Work) -> Run:
