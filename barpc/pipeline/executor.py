@@ -140,7 +140,7 @@ class CachingExecutor(Executor):
             return (self._inputs[args],) if args in self._inputs else ()
         if is_dataclass(args) and not isinstance(args, type):
             args = [getattr(args, field.name) for field in fields(args) if field.init]
-        if not isinstance(args, (tuple, list)):
+        if not isinstance(args, (tuple, list)) or not self._inputs:
             return ()
         return tuple(dict.fromkeys(one for arg in args for one in self.guards(arg)))
 

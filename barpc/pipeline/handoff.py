@@ -241,7 +241,7 @@ def _transformer(rpcs: Any) -> Projection:
     def project(ground: Array) -> Array:
         lon = wrap_longitude(ground[:, 0], rpcs.long_off)
         with RPCTransformer(rpcs) as transformer:
-            row, col = transformer.rowcol(lon, ground[:, 1], ground[:, 2], op=lambda v: v)
+            row, col = transformer.rowcol(lon, ground[:, 1], ground[:, 2], op=np.positive)
         return np.column_stack([col, row]) - 0.5  # GDAL counts from the corner of the first pixel
 
     return project
