@@ -17,6 +17,7 @@ from barpc.base.errors import FitError
 from barpc.base.geodesy import CHUNK, FAR, Array, BoolArray, metres_per_unit, wrap_longitude
 from barpc.base.options import FitOptions
 from barpc.sensor import SensorModel
+from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import LEAST_RANGE, footprint
 from barpc.sensor.rpc import RPC
 
@@ -264,7 +265,9 @@ class Sample:
         At the altitudes that were asked for, whatever altitudes it gave back.
         """
         asked = np.column_stack([self.ground[:, :2], self.points[:, 2]])
-        return float(_size(self.model.project(asked) - self.points[:, :2]).max(initial=0.0))
+        image = self.points[:, :2]
+        found = self.model.project(asked, image) if isinstance(self.model, Corrected) else self.model.project(asked)
+        return float(_size(found - image).max(initial=0.0))
 
     def errors(self, rpc: RPC) -> tuple[Errors, Array]:
         """Return an RPC's errors at the points, and the largest (2,) [px] around; infinite where it has no image."""

@@ -220,8 +220,8 @@ class Corrected(Behind):
     sensor: SensorModel  # the model as delivered, P
     correction: Correction  # R, T and C
 
-    def project(self, ground: Array) -> Array:
-        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
+    def project(self, ground: Array, near: Array | None = None) -> Array:
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px], found from what is `near`."""
         ecef = ecef_from_ground(ground)
         if not len(self.correction.drift):
             return self.sensor.project(ground_from_ecef(self.correction.apply(ecef)))
@@ -229,7 +229,7 @@ class Corrected(Behind):
         def seen(image: Array) -> Array:
             return self.sensor.project(ground_from_ecef(self.correction.apply(ecef, image[..., 1])))
 
-        return fixed_point(seen, self.sensor.project(ground))
+        return fixed_point(seen, self.sensor.project(ground) if near is None else near)
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""

@@ -202,10 +202,10 @@ class Several:
             out[rows] = function(sensor, ground[rows])
         return out
 
-    def project(self, ground: Array) -> Array:
-        """Project ground points (N, 3) [deg, deg, m] to image points (N, 2) [px]."""
+    def project(self, ground: Array, near: Array | None = None) -> Array:
+        """Project ground points (N, 3) [deg, deg, m] to image points (N, 2) [px], perhaps known to be `near`."""
         if self.behind is not None:
-            return self.behind.project(ground)
+            return self.behind.project(ground, near)
         return self._given_back(self._stack.seen(ground[self._order], self._bounds))
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
@@ -238,8 +238,9 @@ def ground_grids(
     """
     grids = [image_grid(size, alt_range, nodes) for _, size, alt_range in cameras]
     many = Several([model for model, _, _ in cameras], np.repeat(np.arange(len(grids)), nodes[0] ** 2 * nodes[1]))
-    ground = many.localize(*map(np.concatenate, zip(*grids, strict=True)))
-    rows = np.hstack([ground, many.project(ground)]).reshape(len(grids), -1, 5)
+    image, alt = map(np.concatenate, zip(*grids, strict=True))
+    ground = many.localize(image, alt)
+    rows = np.hstack([ground, many.project(ground, image)]).reshape(len(grids), -1, 5)
     return [one[np.isfinite(one[:, :3]).all(axis=1)] for one in rows]
 
 
