@@ -461,7 +461,7 @@ def triangulate(
     weight = np.ones(len(xy)) if sigma is None else 1.0 / np.asarray(sigma, dtype=np.float64)[order]
     left = np.empty((len(xy), 2))
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        ground, ok = _intersect(stack, bounds, at, goal, weight, np.broadcast_to(alt, num), steps)
+        ground, ok = _intersect((stack, bounds), at, goal, weight, np.broadcast_to(alt, num), steps)
         left[order] = stack.seen(ground[at], bounds).T - goal
     ok &= np.bincount(point, minlength=num) > 0
     ok[point[~np.isfinite(left).all(axis=1)]] = False
@@ -471,9 +471,13 @@ def triangulate(
 
 
 def _intersect(
-    stack: RpcStack, bounds: IntArray, point: IntArray, xy: Array, weight: Array, alt: Array, steps: int
+    cameras: tuple[RpcStack, IntArray], point: IntArray, xy: Array, weight: Array, alt: Array, steps: int
 ) -> tuple[Array, BoolArray]:
-    """Return ground points (P, 3) by Gauss-Newton from where a view sees a track at `alt`, and if there are any."""
+    """Return ground points (P, 3) by Gauss-Newton from where a view sees a track at `alt`, and if there are any.
+
+    `cameras`: them and which rows are whose.
+    """
+    stack, bounds = cameras
     ground = np.full((len(alt), 3), np.nan)
     untried = np.arange(len(point))
     while len(untried):
