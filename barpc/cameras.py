@@ -19,6 +19,7 @@ from barpc.base.errors import ImageError, InputError, RpcError
 from barpc.base.remote import Place, located, location
 from barpc.base.sidefile import IMAGE, read_head
 from barpc.pointio.correspondences import (
+    GRID_TAG,
     Correspondences,
     correspondence_kind,
     read_correspondences,
@@ -77,16 +78,20 @@ def open_camera(spec: str | Path, **choices: Any) -> Camera:
 
 
 def open_split(path: Place, texts: Mapping[str, str], **choices: Any) -> Camera:
-    """Open the camera of a file with the choices behind its name (see `open_camera`, `split_spec`)."""
-    texts = dict(texts)
+    """Open the camera of a file with the choices behind its name (see `open_camera`, `split_spec`).
+
+    `tags`: those of the raster `path`, where it is open already.
+    """
+    texts, tags = dict(texts), choices.pop("tags", None)
     size, holder = (choices.pop(key, texts.pop(key, None)) for key in ("size", "camera"))
     file = path if holder is None else location(holder)
     head = b"" if file.is_dir() else read_head(file, IMAGE)
-    name, opener = next((n, o) for n, o in reversed(OPENERS.items()) if o.sniff(file, head, {**texts, **choices}))
+    known = {**texts, **choices, **({} if tags is None or holder is not None else {"tags": tags})}
+    name, opener = next((n, o) for n, o in reversed(OPENERS.items()) if o.sniff(file, head, known))
     for key in (*texts, *choices):
         if key not in opener.choices:
-            known = ", ".join(("camera", "size", *opener.choices))
-            raise InputError(f"{file}: {key} is no choice for the kind {name}; known are {known}")
+            possible = ", ".join(("camera", "size", *opener.choices))
+            raise InputError(f"{file}: {key} is no choice for the kind {name}; known are {possible}")
     read = {key: _read(opener.choices[key], key, text, file) for key, text in texts.items()}
     camera = opener.open(file, **{**read, **choices})
     if isinstance(size, str):
@@ -209,7 +214,10 @@ def _open_csm(path: Place, altitudes: tuple[float, float] = _ON_EARTH) -> Camera
 
 
 def _is_grid(path: Place, head: bytes, choices: Mapping[str, Any]) -> bool:
-    return driver_of(head) == "GTiff" and ("altitudes" in choices or correspondence_kind(path) == "grid")
+    if driver_of(head) != "GTiff":
+        return False
+    tags = choices.get("tags")
+    return "altitudes" in choices or (correspondence_kind(path) == "grid" if tags is None else GRID_TAG in tags)
 
 
 def _open_grid(path: Place, altitudes: list[float] | None = None) -> Camera:

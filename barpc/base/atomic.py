@@ -52,7 +52,10 @@ def replacing(
             raise
         raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
     finally:
-        shutil.rmtree(place, ignore_errors=True)
+        try:
+            place.rmdir()
+        except OSError:  # something is left in it
+            shutil.rmtree(place, ignore_errors=True)
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,7 @@ from barpc.base.errors import FitError
 from barpc.base.geodesy import FAR, Array, BoolArray, metres_per_unit, parts, wrap_longitude
 from barpc.base.options import FitOptions
 from barpc.sensor import SensorModel
+from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import LEAST_RANGE, footprint
 from barpc.sensor.rpc import RPC
 
@@ -244,16 +246,11 @@ class Sample:
         """Sample a model at one random point in each of `cells` x `cells` parts of an image, and along its edges."""
         if min(size) < 1:
             raise FitError(f"image size {size[0]} x {size[1]}: nothing to fit over")
-        rng = np.random.default_rng(seed)
-        cell = np.stack(np.meshgrid(*[np.arange(cells)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
-        inside = np.column_stack([cell, rng.permutation(len(cell))]) + rng.random((len(cell), 3))
-        inside /= [cells, cells, len(cell)]
-        t, ends = np.linspace(0.0, 1.0, _EDGE), (0.0, 1.0)
-        edges = [(*at, h) for u in t for end in ends for at in ((u, end), (end, u)) for h in ends]
-        points = _scaled(np.concatenate([inside, edges]), size, alt_range)
+        points = _scaled(_scattered(cells, seed), size, alt_range)
         ground, known = _on_ground(model, points)
-        share = float(known[: len(inside)].mean())
-        return cls(model, size, alt_range, points[known], ground[known], int(known[: len(inside)].sum()), 1.0 - share)
+        inside = known[: cells**2]
+        share = float(inside.mean())
+        return cls(model, size, alt_range, points[known], ground[known], int(inside.sum()), 1.0 - share)
 
     def also(self, points: Array) -> Sample:
         """Return the sample with more points (M, 3) col, row [px], altitude [m] to look for the worst around."""
@@ -267,7 +264,9 @@ class Sample:
         At the altitudes that were asked for, whatever altitudes it gave back.
         """
         asked = np.column_stack([self.ground[:, :2], self.points[:, 2]])
-        return float(_size(self.model.project(asked) - self.points[:, :2]).max(initial=0.0))
+        image = self.points[:, :2]
+        found = self.model.project(asked, image) if isinstance(self.model, Corrected) else self.model.project(asked)
+        return float(_size(found - image).max(initial=0.0))
 
     def errors(self, rpc: RPC) -> tuple[Errors, Array]:
         """Return an RPC's errors at the points, and the largest (2,) [px] around; infinite where it has no image."""
@@ -295,6 +294,18 @@ class Sample:
     @property
     def _span(self) -> Array:
         return np.array([*self.size, max(self.alt_range[1] - self.alt_range[0], 1e-9)], dtype=np.float64)
+
+
+@cache
+def _scattered(cells: int, seed: int) -> Array:
+    """Return a random place in each of `cells` x `cells` parts of an image, then places along its edges, in 0 .. 1."""
+    rng = np.random.default_rng(seed)
+    cell = np.stack(np.meshgrid(*[np.arange(cells)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+    inside = np.column_stack([cell, rng.permutation(len(cell))]) + rng.random((len(cell), 3))
+    inside /= [cells, cells, len(cell)]
+    t, ends = np.linspace(0.0, 1.0, _EDGE), (0.0, 1.0)
+    edges = [(*at, h) for u in t for end in ends for at in ((u, end), (end, u)) for h in ends]
+    return np.concatenate([inside, edges])
 
 
 def _on_ground(model: SensorModel, points: Array) -> tuple[Array, BoolArray]:

@@ -30,8 +30,8 @@ _SLACK = 1e-9  # of a bound: rounding
 
 
 @cache
-def _net() -> Array:
-    """Return Bernstein coefficients (n, n, n, 20) of the monomials over the pieces of the cube -1 .. 1."""
+def _axis() -> Array:
+    """Return Bernstein coefficients (n, 4) of the powers 0 .. 3 over the pieces of -1 .. 1."""
     width, rows = 2.0 / _PIECES, []
     for start in -1.0 + width * np.arange(_PIECES):
         shifted = np.zeros((4, 4))  # x^p as a polynomial of the place in the piece
@@ -39,8 +39,13 @@ def _net() -> Array:
             for k in range(p + 1):
                 shifted[k, p] = comb(p, k) * start ** (p - k) * width**k
         rows.append((_BERNSTEIN @ shifted)[:3])
-    axis = np.vstack([*rows, np.ones((1, 4))])  # the last one is the value at 1
-    a, b, c = (axis[:, POWERS[:, i]] for i in range(3))
+    return np.vstack([*rows, np.ones((1, 4))])  # the last one is the value at 1
+
+
+@cache
+def _net() -> Array:
+    """Return Bernstein coefficients (n, n, n, 20) of the monomials over the pieces of the cube -1 .. 1."""
+    a, b, c = (_axis()[:, POWERS[:, i]] for i in range(3))
     return np.asarray(a[:, None, None] * b[None, :, None] * c[None, None])
 
 
@@ -62,7 +67,7 @@ class Region:
     @classmethod
     def box(cls, box: Array) -> Region:
         """Return a region that is a box (3, 2) in normalised coordinates."""
-        return cls(box.mean(axis=1), np.diag(0.5 * (box[:, 1] - box[:, 0])), np.ones(_net().shape[:2], dtype=bool))
+        return cls(box.mean(axis=1), np.diag(0.5 * (box[:, 1] - box[:, 0])), np.ones(2 * (len(_axis()),), dtype=bool))
 
     @classmethod
     def around(cls, ground: Array, image: Array, margin: float) -> Region:
@@ -91,7 +96,11 @@ class Region:
 
     def bernstein(self, cubic: Array) -> Array:
         """Return the Bernstein coefficients (K,) of a cubic (20,); the cubic is nowhere below the least of them."""
-        return np.asarray((_net() @ (self.there @ cubic))[self.inside].ravel())
+        net = np.zeros((4, 4, 4))
+        net[tuple(POWERS.T)] = self.there @ cubic
+        for _ in range(3):  # axis by axis: each is last when its turn is over
+            net = np.tensordot(net, _axis(), (0, 1))
+        return net[self.inside].ravel()
 
     def rows(self, index: IntArray) -> Array:
         """Return the rows (len(index), 20) that take a cubic's coefficients to some of its Bernstein coefficients."""
@@ -118,10 +127,10 @@ def _inside(reach: Array, half: Array) -> BoolArray:
     start = -1.0 + width * np.arange(_PIECES)
     corner = np.stack(np.meshgrid(start, start, indexing="ij"), axis=-1)
     nearest = corner @ level.T + width * np.minimum(level, 0.0).sum(axis=1)
-    inside = np.zeros(_net().shape[:2], dtype=bool)
-    for i, j in np.argwhere((nearest <= reach + _SLACK).all(axis=-1)):
-        inside[3 * i : 3 * i + 4, 3 * j : 3 * j + 4] = True
-    return inside
+    touched = (nearest <= reach + _SLACK).all(axis=-1).astype(np.float64)
+    nodes = np.arange(len(_axis()))[:, None] - 3 * np.arange(_PIECES)
+    of_piece = ((nodes >= 0) & (nodes <= 3)).astype(np.float64)  # each piece has four, the last is the next one's first
+    return np.asarray(of_piece @ touched @ of_piece.T > 0)
 
 
 def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:

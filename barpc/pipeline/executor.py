@@ -29,7 +29,7 @@ from barpc import __version__
 from barpc.base.errors import AdjustError, BarpcError, InputError
 from barpc.base.frozen import Arrays, from_arrays, to_arrays
 from barpc.base.identity import Input, guarded
-from barpc.tie.tasks import Store
+from barpc.tie.tasks import Progress, Store, ordered
 from barpc.workspace import Workspace, key_of
 
 logger = logging.getLogger(__name__)
@@ -54,6 +54,20 @@ def worker_count(executor: Executor | None) -> int:
             logger.warning("the cluster has no worker: the run waits for one; Ctrl-C ends it, and what is done is kept")
         return max(_CLUSTER, sum(threads))
     return int(getattr(executor, "_max_workers", None) or os.cpu_count() or 1)
+
+
+def by_groups(
+    executor: Executor | None,
+    function: Callable[..., Any],
+    items: Sequence[Any],
+    given: tuple[Any, ...],
+    stage: str,
+    progress: Progress | None,
+) -> list[Any]:
+    """Run `function(group, *given)` on `GROUP` items at a time, as `ordered`; progress counts the items."""
+    tasks, num = [(tuple(items[at : at + GROUP]), *given) for at in range(0, len(items), GROUP)], len(items)
+    told = progress and (lambda stage, done, _: progress(stage, min(done * GROUP, num), num))
+    return ordered(executor, function, tasks, stage, told)
 
 
 class CachingExecutor(Executor):
@@ -126,7 +140,7 @@ class CachingExecutor(Executor):
             return (self._inputs[args],) if args in self._inputs else ()
         if is_dataclass(args) and not isinstance(args, type):
             args = [getattr(args, field.name) for field in fields(args) if field.init]
-        if not isinstance(args, (tuple, list)):
+        if not isinstance(args, (tuple, list)) or not self._inputs:
             return ()
         return tuple(dict.fromkeys(one for arg in args for one in self.guards(arg)))
 

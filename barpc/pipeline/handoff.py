@@ -40,7 +40,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.csm import STATE_END
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.displaced import CorrectionGrid
-from barpc.sensor.geometry import image_grid
+from barpc.sensor.geometry import ground_grids
 
 TOLERANCE = 1e-6  # Largest difference [px] between a file and its model that passes
 
@@ -70,9 +70,11 @@ class Reading:
 
 def control_grid(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> tuple[Array, Array]:
     """Return the ground points (N, 3) over an image and its altitudes, and where `model` sees them (N, 2) [px]."""
-    ground = model.localize(*image_grid(size, alt_range))
-    ground = ground[np.isfinite(ground).all(axis=1)]
-    return ground, model.project(ground)
+    return _columns(ground_grids([(model, size, alt_range)])[0])
+
+
+def _columns(grid: Array) -> tuple[Array, Array]:
+    return np.ascontiguousarray(grid[:, :3]), grid[:, 3:]
 
 
 def difference(model: SensorModel, other: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> float:
@@ -86,15 +88,19 @@ def _largest(project: Projection, ground: Array, image: Array) -> float:
 
 
 def verify(
-    paths: Sequence[Path | str], model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]
+    paths: Sequence[Path | str],
+    model: SensorModel,
+    size: tuple[int, int],
+    alt_range: tuple[float, float],
+    grid: Array | None = None,
 ) -> list[Reading]:
     """Open files written for one image as their consumers do and compare what they project with the model.
 
     `model` is the camera that they should hold, over an image of `size` (width, height) [px] and `alt_range` [m above
-    the ellipsoid]. Returns a reading for each file and each consumer that reads its kind and is installed; OutputError
-    where the model sees no point of its own image.
+    the ellipsoid], `grid` its `ground_grids` where that is known. Returns a reading for each file and each consumer
+    that reads its kind and is installed; OutputError where the model sees no point of its own image.
     """
-    ground, image = control_grid(model, size, alt_range)
+    ground, image = control_grid(model, size, alt_range) if grid is None else _columns(grid)
     if not len(ground):
         raise OutputError("hand-off: the model sees no ground point inside its own image")
 
@@ -235,7 +241,7 @@ def _transformer(rpcs: Any) -> Projection:
     def project(ground: Array) -> Array:
         lon = wrap_longitude(ground[:, 0], rpcs.long_off)
         with RPCTransformer(rpcs) as transformer:
-            row, col = transformer.rowcol(lon, ground[:, 1], ground[:, 2], op=lambda v: v)
+            row, col = transformer.rowcol(lon, ground[:, 1], ground[:, 2], op=np.positive)
         return np.column_stack([col, row]) - 0.5  # GDAL counts from the corner of the first pixel
 
     return project

@@ -24,13 +24,13 @@ from barpc.base.identity import Stamp, also_seen, recorded
 from barpc.base.remote import Place, here, located
 from barpc.base.sidefile import IMAGE, plain_path, versioned
 from barpc.cameras import open_split, split_spec
-from barpc.pipeline.executor import GROUP
+from barpc.pipeline.executor import GROUP, by_groups
 from barpc.pointio.names import unique_names
 from barpc.rasters.raster import open_raster
 from barpc.rpcio.sources import date_taken
 from barpc.scene import Camera, View
 from barpc.sensor.geometry import LEAST_RANGE, footprint
-from barpc.tie.tasks import Progress, ordered
+from barpc.tie.tasks import Progress
 
 logger = logging.getLogger(__name__)
 
@@ -119,9 +119,7 @@ def _read_all(
     progress: Progress | None,
 ) -> tuple[list[_Read | BarpcError], float]:
     """Return every image as it was read, and CPU seconds of other processes."""
-    tasks = [(given[at : at + GROUP], *how) for at in range(0, len(given), GROUP)]
-    told = progress and (lambda stage, done, _: progress(stage, min(done * GROUP, len(given)), len(given)))
-    groups = ordered(executor, read_group, tasks, "cameras", told)
+    groups = by_groups(executor, read_group, given, how, "cameras", progress)
     spent = 0.0 if executor is None else sum(seconds for _, seconds in groups)
     return [read for group, _ in groups for read in group], spent
 
@@ -134,35 +132,36 @@ def read_group(
     for name, file, image in given:
         try:
             with recorded({}) as files:
-                view, camera = _load(name, file, image, band, hosts)
-                out.append((view, camera, _sampled(view, band) if distinct else None, files))
+                out.append((*_load(name, file, image, band, hosts, distinct), files))
         except BarpcError as error:
             out.append(error)
     return out, time.thread_time() - start
 
 
-def _load(name: str, file: Place, image: Image, band: int, hosts: Sequence[str]) -> tuple[View, Camera]:
+def _load(
+    name: str, file: Place, image: Image, band: int, hosts: Sequence[str], distinct: bool
+) -> tuple[View, Camera, bytes | None]:
     file = versioned(file, IMAGE)
     with open_raster(file) as dataset:
         size = (int(dataset.width), int(dataset.height))
         if not 1 <= band <= dataset.count:
             raise ImageError(f"{file}: has {dataset.count} band(s), no band {band}")
         tags = dataset.tags()
-    if isinstance(image, View):
-        camera = Camera(image.sensor, file, "given", image.size, image.alt_range)
-        if image.size != size:
-            raise InputError(f"{file}: is {size} px large, but its view says {image.size}")
-    else:
-        path, choices = split_spec(image, hosts)
-        camera = open_split(path if here([path]) else file, choices, size=size)
-        if camera.format in ("grid", "correction") and "camera" not in choices:
-            raise ImageError(f"{file}: a grid and no image; give it behind its image: IMAGE,camera={file}")
-    day = (image.date if isinstance(image, View) else "") or date_taken(file, camera.path, tags)
-    view = View(name, os.fspath(file), size, camera.model, _altitudes(camera), day)
-    ring = footprint(view.sensor, size, view.altitude)
-    if not (abs(ring[:, 1]) <= 90).all():  # NaN fails, too
-        raise RpcError(f"{file}: its RPC does not reach the ground over the image ({size[0]} x {size[1]} px)")
-    return view, camera
+        if isinstance(image, View):
+            camera = Camera(image.sensor, file, "given", image.size, image.alt_range)
+            if image.size != size:
+                raise InputError(f"{file}: is {size} px large, but its view says {image.size}")
+        else:
+            path, choices = split_spec(image, hosts)
+            camera = open_split(path if here([path]) else file, choices, size=size, tags=tags)
+            if camera.format in ("grid", "correction") and "camera" not in choices:
+                raise ImageError(f"{file}: a grid and no image; give it behind its image: IMAGE,camera={file}")
+        day = (image.date if isinstance(image, View) else "") or date_taken(file, camera.path, tags)
+        view = View(name, os.fspath(file), size, camera.model, _altitudes(camera), day)
+        ring = footprint(view.sensor, size, view.altitude)
+        if not (abs(ring[:, 1]) <= 90).all():  # NaN fails, too
+            raise RpcError(f"{file}: its RPC does not reach the ground over the image ({size[0]} x {size[1]} px)")
+        return view, camera, _sampled(dataset, band) if distinct else None
 
 
 def _altitudes(camera: Camera) -> tuple[float, float]:
@@ -222,11 +221,11 @@ class Twins:
         return None if mark is None else (view.size, mark)
 
 
-def _sampled(view: View, band: int) -> bytes | None:
+def _sampled(image: Any, band: int) -> bytes | None:
     """Return a mark of the pixels in a few windows; None where nothing varies in them."""
-    with open_raster(view.path) as image:
-        # fill, perhaps: more is asked before anything is read whole
-        return _digest(image, band, _samples(*view.size)) or _digest(image, band, _samples(*view.size, _MORE))
+    size = image.width, image.height
+    # fill, perhaps: more is asked before anything is read whole
+    return _digest(image, band, _samples(*size)) or _digest(image, band, _samples(*size, _MORE))
 
 
 def _identity(path: str) -> Hashable:
@@ -252,10 +251,11 @@ def _digest(image: Any, band: int, windows: list[Window]) -> bytes | None:
     found = blake2b(digest_size=16)
     low = high = np.nan
     for window in windows:
-        for raw in image.read(band, window=window):
-            row = _numbers(raw)
-            found.update(row.tobytes())
-            low, high = np.fmin(low, np.fmin.reduce(row)), np.fmax(high, np.fmax.reduce(row))
+        raw = image.read(band, window=window)
+        for top in range(0, len(raw), _SAMPLE_SIDE[1]):
+            rows = _numbers(raw[top : top + _SAMPLE_SIDE[1]])
+            found.update(rows.tobytes())
+            low, high = np.fmin(low, np.fmin.reduce(rows, axis=None)), np.fmax(high, np.fmax.reduce(rows, axis=None))
     return found.digest() if high > low else None
 
 

@@ -6,19 +6,21 @@ import json
 from collections.abc import Iterable, Iterator, Sequence, Set
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from barpc.base.errors import BarpcError, InputError, OutputError
+from barpc.base.geodesy import Array
 from barpc.base.identity import take
 from barpc.base.options import RunOptions
 from barpc.base.remote import is_url
 from barpc.cameras import open_camera
 from barpc.fit import RpcFit
 from barpc.pipeline.beyond import REOPENED, RESAMPLED, grid_names, made_in_room
-from barpc.pipeline.executor import CachingExecutor
+from barpc.pipeline.executor import CachingExecutor, by_groups
 from barpc.pipeline.handoff import verify
 from barpc.pipeline.inputs import PRIOR
 from barpc.report import Run, Summary
@@ -31,8 +33,9 @@ from barpc.rpcio import CARRIERS, WRITABLE, row_of, sidecars, write_camera
 from barpc.rpcio.grids import CORRECTION, GRID
 from barpc.scene import View
 from barpc.sensor import SensorModel
+from barpc.sensor.geometry import ground_grids
 from barpc.sensor.rpc import RPC
-from barpc.tie.tasks import Progress, ordered
+from barpc.tie.tasks import Progress
 from barpc.workspace import LAST, Workspace, own_files
 
 MATCHES = ("matches.csv", "matches.npz")
@@ -64,7 +67,7 @@ def write_views(
         with run.stage("verify"):
             paths = [tuple(str(run.folder / name) for name in names) for names in made]
             again = [(there, *one) for there, one in zip(paths, fitted, strict=True)]
-            return ordered(fresh, verify_files, again, "verify", progress)
+            return list(chain(*by_groups(fresh, verify_group, again, (), "verify", progress)))
 
 
 def make_files(view: View, rpc: RPC, images: str, formats: Sequence[str], folder: str, room: str) -> tuple[str, ...]:
@@ -81,11 +84,19 @@ def make_files(view: View, rpc: RPC, images: str, formats: Sequence[str], folder
     return tuple(names)
 
 
-def verify_files(paths: Sequence[str], view: View, fit: RpcFit, model: SensorModel) -> Written:
+def verify_group(group: Sequence[tuple[Sequence[str], View, RpcFit, SensorModel]]) -> list[Written]:
+    """Return what `verify_files` says of some views, whose cameras are asked at once where they see the ground."""
+    grids = ground_grids([(model, view.size, view.alt_range) for _, view, _, model in group])
+    return [verify_files(*one, grid) for one, grid in zip(group, grids, strict=True)]
+
+
+def verify_files(
+    paths: Sequence[str], view: View, fit: RpcFit, model: SensorModel, grid: Array | None = None
+) -> Written:
     """Open the files of a view as their consumers do; OutputError where barpc or GDAL reads another camera."""
     largest = float(np.linalg.norm(fit.max_ckp)) + REOPENED
     written: Written = {Path(path).name: {} for path in paths}
-    readings = verify([Path(path) for path in paths], model, view.size, view.alt_range)
+    readings = verify([Path(path) for path in paths], model, view.size, view.alt_range, grid)
     for reading in sorted(readings, key=lambda one: one.consumer != "barpc"):  # what barpc finds says more
         own = reading.consumer.partition(",")[0] in ("barpc", "gdal")  # which reads texts beside an image
         if own and not reading.max_error <= 2 * largest:

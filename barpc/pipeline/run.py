@@ -9,6 +9,7 @@ from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +25,7 @@ from barpc.base.sidefile import plain_path
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
 from barpc.pipeline.beyond import write_grids
-from barpc.pipeline.executor import GROUP, CachingExecutor
+from barpc.pipeline.executor import CachingExecutor, by_groups
 from barpc.pipeline.handoff import unverified
 from barpc.pipeline.inputs import (
     PRIOR,
@@ -54,11 +55,11 @@ from barpc.report.summary import InputEntry, StageEntry
 from barpc.rpcio import plain_source
 from barpc.scene import Tracks, View
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import CameraCenter, camera_center
+from barpc.sensor.geometry import CameraCenter, camera_centers
 from barpc.sensor.rpc import RPC
 from barpc.tie import Scope, find_tracks, read_area
 from barpc.tie.reference import Accuracy, ReferenceControl, register_views
-from barpc.tie.tasks import Progress, Work, ordered
+from barpc.tie.tasks import Progress, Work
 from barpc.workspace import Workspace, timed
 
 logger = logging.getLogger(__name__)
@@ -301,7 +302,7 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
     if prior is not None:
         run = replace(run, tracks=only_new(run.tracks, np.isin(names, prior.names)))
     gcps, checks = (load_gcps(paths, run.views, options) for paths in (options.gcp, options.check_points))
-    centers = tuple(_center(view, options.adjust.center) for view in run.views)
+    centers = _centers(run.views, options.adjust.center)
     if run.reference is not None and run.reference.control is None and not len(run.tracks) and gcps is None:
         raise TiePointError(
             f"{', '.join(options.reference)}: the reference {run.reference.refusal}, and nothing else holds the "
@@ -373,11 +374,12 @@ def _only(run: Run, names: frozenset[str]) -> Run:
     )
 
 
-def _center(view: View, how: Literal["line", "projective"] = "line") -> CameraCenter:
-    center = camera_center(view.sensor, view.size, view.alt_range, how)
-    if center.method == "nominal":
-        logger.warning("%s: its camera does not tell where it stands; a nominal centre is used", view.name)
-    return center
+def _centers(views: Sequence[View], how: Literal["line", "projective"]) -> tuple[CameraCenter, ...]:
+    found = camera_centers([v.sensor for v in views], [v.size for v in views], [v.alt_range for v in views], how)
+    for view, center in zip(views, found, strict=True):
+        if center.method == "nominal":
+            logger.warning("%s: its camera does not tell where it stands; a nominal centre is used", view.name)
+    return tuple(found)
 
 
 def _fitted(run: Run, options: RunOptions, work: Work) -> Run:
@@ -388,11 +390,8 @@ def _fitted(run: Run, options: RunOptions, work: Work) -> Run:
     known = bias if np.isfinite(bias) and bias > 0 else None
     corrected = zip(run.views, run.adjustment.sensors, strict=True)
     cameras = [(model, view.size, view.alt_range) for view, model in corrected]
-    strict, num = not (options.keep_going or options.grids), len(cameras)
-    tasks = [(tuple(cameras[at : at + GROUP]), options.fit, strict) for at in range(0, num, GROUP)]
-    progress = work.progress
-    told = progress and (lambda stage, done, _: progress(stage, min(done * GROUP, num), num))
-    found = [one for group in ordered(work.executor, fit_group, tasks, "fit", told) for one in group]
+    given = options.fit, not (options.keep_going or options.grids)
+    found = chain(*by_groups(work.executor, fit_group, cameras, given, "fit", work.progress))
     fits: list[RpcFit] = []
     for view, (fit, error, warned) in zip(run.views, found, strict=True):
         if fit is None:

@@ -27,6 +27,7 @@ from barpc.scene import Altimetry, GroundPoints
 GROUND_SIGMA = 1.0  # standard deviation [m] along an axis of a GCP, or of the place of a height, whose file states none
 IMAGE_SIGMA = 0.5  # standard deviation of each image coordinate [px], of GCPs and tie points whose file states none
 HEIGHT_SIGMA = 0.5  # m, of a height whose file states none: ICESat-2 and GEDI over gentle ground
+GRID_TAG = "ALTITUDE_B0"  # of a raster that is a localisation grid
 TURNS = 540.0  # deg: longitudes are taken by whole turns
 
 _NAMES: Names = {
@@ -248,7 +249,7 @@ def correspondence_kind(path: Place, altitudes: Sequence[float] | None = None) -
     head = read_head(path, TABLE, 65536)
     if driver_of(head) == "GTiff":
         with open_raster(path) as dataset:
-            return "grid" if altitudes is not None or "ALTITUDE_B0" in dataset.tags() else None
+            return "grid" if altitudes is not None or GRID_TAG in dataset.tags() else None
     if head[:2] == b"PK":
         return "npz"
     if head.lstrip()[:1] == b"{":

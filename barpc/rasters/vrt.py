@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 from barpc.base.errors import ImageError, RpcFormatError
-from barpc.base.sidefile import parse_xml
+from barpc.base.sidefile import XML, parse_xml, read_bytes
 
 _INTEGERS = {f"{u}int{n}": f"{u.upper()}Int{n}" for n in (16, 32, 64) for u in ("u", "")}
 _COMPLEX = {"complex_int16": "CInt16", "complex64": "CFloat32", "complex128": "CFloat64"}
@@ -149,10 +150,14 @@ def read_vrt(path: Path, *, name: str | None = None) -> Vrt:
     """
     name = name or str(path)
     try:
-        root = parse_xml(path, name=name, max_bytes=_MAX_BYTES)
+        return _parsed(read_bytes(path, replace(XML, most=_MAX_BYTES)), path.resolve().parent, name)
     except RpcFormatError as error:
         raise ImageError(str(error)) from error
-    return vrt_from_xml(root, path.resolve().parent, name)
+
+
+@lru_cache(maxsize=1)  # a file that was written is read twice in a row
+def _parsed(data: bytes, folder: Path, name: str) -> Vrt:
+    return vrt_from_xml(parse_xml(data, name=name, max_bytes=_MAX_BYTES), folder, name)
 
 
 def vrt_from_xml(root: Element, folder: Path, name: str) -> Vrt:

@@ -32,7 +32,7 @@ from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import Share, Side
 from barpc.scene import BoolArray, IntArray
-from barpc.sensor.geometry import footprint
+from barpc.sensor.geometry import footprints
 
 FOLDER = "tables"
 """Folder in that of a run for what is neither a corrected camera, nor its report and summary."""
@@ -109,9 +109,8 @@ def _number(value: float | None, digits: int) -> str:
 
 def _footprints(run: Run, summary: Summary) -> bytes:
     """Return every image at the scene's altitude, through the adjusted cameras, or for a check as they are."""
-    features = []
-    for view, sensor, entry in zip(run.views, run.after or run.before, summary.views, strict=True):
-        ring = np.round(footprint(sensor, view.size, run.altitude), 9)
+    rings, features = footprints(run.after or run.before, [view.size for view in run.views], run.altitude), []
+    for ring, entry in zip(np.round(rings, 9), summary.views, strict=True):
         properties = {key: getattr(entry, key) for key in ViewEntry.FOOTPRINT.split()}
         features.append(feature(ring, **properties, altitude_m=summary.altitude_m))
     return (json.dumps(collection(features)) + "\n").encode()

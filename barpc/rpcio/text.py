@@ -59,7 +59,11 @@ def number(text: str, name: str, key: str) -> float:
     rest = text[match.end() :] if match else text
     if match is None or (rest and not rest[0].isspace() and rest[0] not in "°%"):
         raise RpcFormatError(f"{name}: {key} is not a number ({text[:40]!r})")
-    value = float(match.group().upper().replace("D", "E"))
+    found = match.group()
+    try:
+        value = float(found)
+    except ValueError:
+        value = float(found.upper().replace("D", "E"))
     if not math.isfinite(value):
         raise RpcFormatError(f"{name}: {key} is not finite ({text[:40]!r})")
     return value

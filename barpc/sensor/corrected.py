@@ -8,8 +8,10 @@ its derivatives, for one view here and for blocks of views in the adjustment.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -130,37 +132,71 @@ class Correction(Frozen):
     def motion(self, ecef: Array, row: Array | None = None) -> RigidMotion:
         """Return the motion of points (3, n) [m], ECEF, seen at the rows (n,) [px]."""
         drift = None if row is None else self._turns(row)
-        bounds = np.array([0, ecef.shape[1]])
-        shift = self.scale * self.translation + (self.scale - 1.0) * self.center  # T of the points s X
-        return RigidMotion(self.scale * ecef, self.rotation[None], shift[None], self.center[None], bounds, drift)
+        translation, center = self._columns
+        shift = self.scale * translation + (self.scale - 1.0) * center  # T of the points s X
+        bounds = ecef.shape[1] * np.arange(center.shape[1] + 1) // center.shape[1]
+        return RigidMotion(self.scale * ecef, np.atleast_2d(self.rotation), shift.T, center.T, bounds, drift)
 
     def drift_rate(self, row: Array) -> Array:
         """Return the derivative of the drift by the row (3, n) [rad/px] at rows (n,) [px]."""
         u, degree = (row - self.row_offset) / self.row_scale, np.arange(1, len(self.drift) + 1)[:, None]
-        return np.asarray(self.drift.T @ (degree * u ** (degree - 1)) / self.row_scale)
+        return self._drifted(degree * u ** (degree - 1)) / self.row_scale
 
     def apply(self, ecef: Array, row: Array | None = None) -> Array:
         """Return s R (X - T - C) + C of ECEF points X (..., 3) [m]; with the drift, if given rows (...)."""
         ecef = np.asarray(ecef, dtype=np.float64)
-        rows = None if row is None else np.broadcast_to(row, ecef.shape[:-1]).reshape(-1)
-        return self.motion(ecef.reshape(-1, 3).T, rows).ecef.T.reshape(ecef.shape)
+        translation, center = self._columns
+        moved = self.scale * self._turned(ecef.reshape(-1, 3).T - (translation + center))
+        if row is not None:
+            moved = Turn(self._turns(np.broadcast_to(row, ecef.shape[:-1]).reshape(-1))).forth(moved)
+        return np.asarray((moved + center).T).reshape(ecef.shape)
 
     def undo(self, ecef: Array, row: Array) -> Array:
         """Return the points X (N, 3) [m] that `apply` takes to ECEF points (N, 3) at rows (N,)."""
-        back = (ecef - self.center).T
+        translation, center = self._columns
+        back = ecef.T - center
         if len(self.drift):
             back = Turn(self._turns(row)).back(back)
-        back = self._matrix.T @ back
-        return np.asarray(back.T / self.scale + self.translation + self.center)
+        return np.asarray((self._turned(back, back=True) / self.scale + (translation + center)).T)
+
+    @cached_property
+    def _columns(self) -> tuple[Array, Array]:
+        return np.atleast_2d(self.translation).T, np.atleast_2d(self.center).T
 
     @cached_property
     def _matrix(self) -> Array:
         return rotation_matrix(self.rotation)
 
+    def _turned(self, columns: Array, back: bool = False) -> Array:
+        """Return the columns (3, n) rotated by R, or back."""
+        return np.asarray((self._matrix.T if back else self._matrix) @ columns)
+
     def _turns(self, row: Array) -> Array:
         """Return the drift's rotation vectors (3, n) [rad] at rows (n,) [px]."""
         u = (row - self.row_offset) / self.row_scale
-        return np.asarray(self.drift.T @ u ** np.arange(1, len(self.drift) + 1)[:, None])
+        return self._drifted(u ** np.arange(1, len(self.drift) + 1)[:, None])
+
+    def _drifted(self, powers: Array) -> Array:
+        return np.asarray((np.atleast_3d(self.drift) * powers[:, None]).sum(axis=0))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Corrections(Correction):
+    """Corrections of many cameras as one: every field with a row, its last axis of the drift, for each point."""
+
+    def __post_init__(self) -> None:
+        """The cameras' own fields are known to be good."""
+
+    @classmethod
+    def of(cls, corrections: Sequence[Correction], view: IntArray) -> Corrections:
+        """Return what moves point n by the correction of camera `view[n]`; their drifts are of one degree."""
+        rows: dict[str, Any] = {
+            name: np.array([getattr(one, name) for one in corrections])[view] for name in corrections[0]._given()
+        }
+        return cls(**rows | {"drift": np.moveaxis(rows["drift"], 0, -1)})
+
+    def _turned(self, columns: Array, back: bool = False) -> Array:
+        return np.asarray(np.einsum("nji,jn->in" if back else "nij,jn->in", self._matrix, columns))
 
 
 def correction_of(matrix: Array, at: Array) -> Correction:
@@ -184,8 +220,8 @@ class Corrected(Behind):
     sensor: SensorModel  # the model as delivered, P
     correction: Correction  # R, T and C
 
-    def project(self, ground: Array) -> Array:
-        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
+    def project(self, ground: Array, near: Array | None = None) -> Array:
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px], found from what is `near`."""
         ecef = ecef_from_ground(ground)
         if not len(self.correction.drift):
             return self.sensor.project(ground_from_ecef(self.correction.apply(ecef)))
@@ -193,7 +229,7 @@ class Corrected(Behind):
         def seen(image: Array) -> Array:
             return self.sensor.project(ground_from_ecef(self.correction.apply(ecef, image[..., 1])))
 
-        return fixed_point(seen, self.sensor.project(ground))
+        return fixed_point(seen, self.sensor.project(ground) if near is None else near)
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
@@ -230,18 +266,21 @@ class Corrected(Behind):
         Where the uncorrected sensor sees them, brought back; at the altitude from which the correction brings them to
         the one asked for. It turns by so little that each step gains four digits. NaN where that does not settle.
         """
-        return pointwise(lambda *part: [self._localize(*part)], [(3,)], image, alt)[0]
+        return pointwise(lambda *part: [self.localize_rows(*part)], [(3,)], image, alt)[0]
 
-    def _localize(self, image: Array, alt: Array) -> Array:
-        before, settled = alt, False
-        for _ in range(NEWTON_STEPS):
-            found = self.sensor.localize(image, before)
-            ground = ground_from_ecef(self.correction.undo(ecef_from_ground(found), image[:, 1]))
-            off = alt - ground[:, 2]
-            if settled:
+    def localize_rows(self, image: Array, alt: Array) -> Array:
+        """Localise image points (n, 2) at altitudes (n,), all at once."""
+        ground, off, asked = np.zeros((len(alt), 3)), alt, alt
+        for step in range(NEWTON_STEPS):
+            found = self.sensor.localize(image, asked)
+            before, ground = ground, ground_from_ecef(self.correction.undo(ecef_from_ground(found), image[:, 1]))
+            last, off = off, alt - ground[:, 2]
+            if step and not (np.abs(off) > SETTLED).any():
                 break
-            settled = not (np.abs(off) > SETTLED).any()
-            before = before + off
+            asked = asked + off
+        moved = ground - before  # along the ray, which is straight so near
+        moved[:, 0] = wrap_longitude(moved[:, 0])
+        ground += moved * np.where(last, off / last, 0.0)[:, None]
         ground[~(np.abs(off) <= SETTLED)] = np.nan
         ground[:, 2] = alt
         ground[:, 0] = wrap_longitude(ground[:, 0], found[:, 0])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeGuard
 
@@ -21,12 +21,12 @@ from barpc.base.geodesy import (
     wrap_longitude,
 )
 from barpc.sensor import SensorModel
+from barpc.sensor.corrected import Corrected, Corrections
 from barpc.sensor.curve import cross
-from barpc.sensor.rpc import RPC, localize_stack
+from barpc.sensor.rpc import RPC, RpcStack, localize_stack
 from barpc.sensor.timing import Clocked
 
 CenterMethod = Literal["line", "projective", "nominal", "stated"]
-_Rows = list[tuple[SensorModel, slice]]  # the observations of each camera
 
 _RAYS = 41  # of a line
 LEAST_RANGE = 100.0  # of altitudes [m] between which a ray is drawn, or that an RPC is made for
@@ -79,6 +79,16 @@ def footprint(sensor: SensorModel, size: tuple[int, int], alt: float | npt.Array
     ring = sensor.localize(border, np.broadcast_to(np.asarray(alt, dtype=np.float64), len(border)))[:, :2]
     ring[:, 0] = wrap_longitude(ring[:, 0], ring[0, 0])
     return ring
+
+
+def footprints(sensors: Sequence[SensorModel], sizes: Sequence[tuple[int, int]], alt: npt.ArrayLike) -> Array:
+    """Return the outlines (N, 32, 2) of images on the ground at an altitude [m], or each at its own: `footprint`s."""
+    borders = np.array([image_border(size) for size in sizes]).reshape(len(sizes), -1, 2)
+    alts = np.repeat(np.broadcast_to(np.asarray(alt, dtype=np.float64), len(sizes)), borders.shape[1])
+    bounds = borders.shape[1] * np.arange(len(sizes) + 1)
+    rings = localize_stack(sensors, borders.reshape(-1, 2), alts, bounds)[:, :2].reshape(borders.shape)
+    rings[..., 0] = wrap_longitude(rings[..., 0], rings[:, :1, 0])
+    return rings
 
 
 def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, float]) -> tuple[Array, Array]:
@@ -171,38 +181,67 @@ def base_to_height(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) 
 class Several:
     """Many cameras as one, each point with its own: row n of what is asked belongs to camera `view[n]`.
 
-    So what is asked of one camera is asked of a block with one call a camera, not one a pair.
+    So what is asked of one camera is asked of a block with one call, not one a pair.
     """
 
     def __init__(self, sensors: Sequence[SensorModel], view: npt.ArrayLike) -> None:
-        of_row = np.asarray(view, dtype=np.int64)
-        order = np.argsort(of_row, kind="stable")
-        starts = np.flatnonzero(np.diff(of_row[order], prepend=-1))
-        self._parts = [(sensors[of_row[rows[0]]], rows) for rows in np.split(order, starts)[1:]]
+        used, camera = np.unique(np.asarray(view, dtype=np.int64), return_inverse=True)
+        cameras = [sensors[v] for v in used.tolist()]
+        self._order = np.argsort(camera, kind="stable")
+        self._stack, self._bounds = RpcStack(cameras), np.searchsorted(camera[self._order], np.arange(len(used) + 1))
+        self.behind: Corrected | None = None  # all cameras are behind corrections in space: one behind many
+        behind = [one for one in cameras if isinstance(one, Corrected)]
+        if len(behind) == len(used) and len({len(one.correction.drift) for one in behind}) == 1:
+            inner = Several([one.sensor for one in behind], camera)
+            self.behind = Corrected(inner, Corrections.of([one.correction for one in behind], camera))
 
     def each(self, function: Callable[[SensorModel, Array], Array], ground: Array) -> Array:
         """Return what a function gives for ground points (N, 3), each with its own camera."""
-        return self._of(lambda sensor, part: [function(sensor, part)], [(3,)], ground)[0]
+        out = np.empty_like(ground)
+        for sensor, rows in zip(self._stack.sensors, np.split(self._order, self._bounds[1:-1]), strict=False):
+            out[rows] = function(sensor, ground[rows])
+        return out
 
-    def project(self, ground: Array) -> Array:
-        """Project ground points (N, 3) [deg, deg, m] to image points (N, 2) [px]."""
-        return self._of(lambda sensor, part: [sensor.project(part)], [(2,)], ground)[0]
+    def project(self, ground: Array, near: Array | None = None) -> Array:
+        """Project ground points (N, 3) [deg, deg, m] to image points (N, 2) [px], perhaps known to be `near`."""
+        if self.behind is not None:
+            return self.behind.project(ground, near)
+        return self._given_back(self._stack.seen(ground[self._order], self._bounds))
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Return image points (N, 2) [px] and their derivatives (N, 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = self._of(lambda sensor, part: sensor.project_jacobian(part), [(2,), (2, 3)], ground)
-        return image, jacobian
+        if self.behind is not None:
+            return self.behind.project_jacobian(ground)
+        image, jacobian = self._stack.seen_jacobian(ground[self._order], self._bounds)
+        return self._given_back(image), self._given_back(jacobian)
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Localise image points (N, 2) [px] at altitudes (N,) [m]: ground points (N, 3)."""
-        return self._of(lambda sensor, *part: [sensor.localize(*part)], [(3,)], image, alt)[0]
+        if self.behind is not None:
+            with np.errstate(all="ignore"):
+                return self.behind.localize_rows(image, alt)
+        return self._given_back(self._stack.localize(image[self._order], alt[self._order], self._bounds))
 
-    def _of(self, ask: Callable[..., Iterable[Array]], shapes: list[tuple[int, ...]], *given: Array) -> list[Array]:
-        out = [np.empty((len(given[0]), *shape)) for shape in shapes]
-        for sensor, rows in self._parts:
-            for whole, part in zip(out, ask(sensor, *(array[rows] for array in given)), strict=True):
-                whole[rows] = part
-        return out
+    def _given_back(self, found: Array) -> Array:
+        """Return values (..., N), sorted by camera, as rows (N, ...) in the order that was asked for."""
+        out = np.empty_like(found)
+        out[..., self._order] = found
+        return np.moveaxis(out, -1, 0)
+
+
+def ground_grids(
+    cameras: Sequence[tuple[SensorModel, tuple[int, int], tuple[float, float]]], nodes: tuple[int, int] = (11, 5)
+) -> list[Array]:
+    """Return ground points over images and their altitudes and where their cameras see them: rows (n, 5) of each.
+
+    Of a grid (`image_grid`) of a camera, an image of its size and its altitudes; without points that it does not see.
+    """
+    grids = [image_grid(size, alt_range, nodes) for _, size, alt_range in cameras]
+    many = Several([model for model, _, _ in cameras], np.repeat(np.arange(len(grids)), nodes[0] ** 2 * nodes[1]))
+    image, alt = map(np.concatenate, zip(*grids, strict=True))
+    ground = many.localize(image, alt)
+    rows = np.hstack([ground, many.project(ground, image)]).reshape(len(grids), -1, 5)
+    return [one[np.isfinite(one[:, :3]).all(axis=1)] for one in rows]
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,16 +401,22 @@ def epipolar_offset(
     """
     alt = np.array(np.broadcast_to(np.asarray(alt, dtype=np.float64), len(image_a)))
     with np.errstate(invalid="ignore", divide="ignore"):
+        ground = sensor_a.localize(image_a, alt)
         for step in range(steps + 1):
-            ground = sensor_a.localize(image_a, alt)
-            sight = sight_enu(sensor_a, ground)
-            rise = sight / sight[:, 2:] / metres_per_unit(ground)  # ground units per metre of altitude
+            image, jacobian = sensor_a.project_jacobian(ground)
+            (p, q), (r, s), (u, v) = np.moveaxis(jacobian, 0, -1).swapaxes(0, 1)  # by lon, lat, alt
+            col, row = (image_a - image).T  # what is left of a step along the ray, which bends
+            det = p * s - q * r
+            ground[:, :2] += (np.stack([s * col - r * row, p * row - q * col]) / det).T
+            rise = np.stack([r * v - s * u, q * u - p * v, det]).T / det[:, None]  # ground units a metre of altitude
             image, jacobian = sensor_b.project_jacobian(ground)
             along = (jacobian @ rise[..., None])[..., 0]
             miss = image_b - image
             length2 = (along * along).sum(axis=1)
             if step < steps:
-                alt += (miss * along).sum(axis=1) / length2
+                more = (miss * along).sum(axis=1) / length2
+                alt += more
+                ground += rise * more[:, None]
         offset = (along[:, 0] * miss[:, 1] - along[:, 1] * miss[:, 0]) / np.sqrt(length2)
     return offset, alt
 
@@ -412,14 +457,12 @@ def triangulate(
         return Triangulation(np.empty((0, 3)), np.empty((0, 2)), np.empty(0, dtype=bool))
     order = np.argsort(view, kind="stable")  # so that the rows of a view are a slice
     at, goal = point[order], xy[order]
-    first = np.flatnonzero(np.diff(view[order], prepend=-1))
-    rows = [(sensors[view[order[i]]], slice(i, j)) for i, j in zip(first, [*first[1:], len(view)], strict=True)]
+    stack, bounds = RpcStack(sensors), np.searchsorted(view[order], np.arange(len(sensors) + 1))
     weight = np.ones(len(xy)) if sigma is None else 1.0 / np.asarray(sigma, dtype=np.float64)[order]
     left = np.empty((len(xy), 2))
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        ground, ok = _intersect(rows, at, goal, weight, np.broadcast_to(alt, num), steps)
-        for sensor, part in rows:
-            left[order[part]] = sensor.project(ground[at[part]]) - goal[part]
+        ground, ok = _intersect((stack, bounds), at, goal, weight, np.broadcast_to(alt, num), steps)
+        left[order] = stack.seen(ground[at], bounds).T - goal
     ok &= np.bincount(point, minlength=num) > 0
     ok[point[~np.isfinite(left).all(axis=1)]] = False
     ground[~ok] = np.nan
@@ -428,23 +471,27 @@ def triangulate(
 
 
 def _intersect(
-    rows: _Rows, point: IntArray, xy: Array, weight: Array, alt: Array, steps: int
+    cameras: tuple[RpcStack, IntArray], point: IntArray, xy: Array, weight: Array, alt: Array, steps: int
 ) -> tuple[Array, BoolArray]:
-    """Return ground points (P, 3) by Gauss-Newton from where a view sees a track at `alt`, and if there are any."""
+    """Return ground points (P, 3) by Gauss-Newton from where a view sees a track at `alt`, and if there are any.
+
+    `cameras`: them and which rows are whose.
+    """
+    stack, bounds = cameras
     ground = np.full((len(alt), 3), np.nan)
-    for sensor, part in rows:
-        new = np.flatnonzero(np.isnan(ground[point[part], 0])) + part.start
-        if len(new):
-            ground[point[new]] = sensor.localize(xy[new], alt[point[new]])
-    jacobian, residual = np.empty((3, 2, len(xy))), np.empty((2, len(xy)))
+    untried = np.arange(len(point))
+    while len(untried):
+        rows = np.sort(untried[np.unique(point[untried], return_index=True)[1]])
+        ground[point[rows]] = stack.localize(xy[rows], alt[point[rows]], np.searchsorted(rows, bounds)).T
+        untried = np.setdiff1d(untried, rows, assume_unique=True)
+        untried = untried[np.isnan(ground[point[untried], 0])]
     ok = np.ones(len(ground), dtype=bool)
     for _ in range(steps):
         scale = metres_per_unit(ground)
-        for sensor, part in rows:
-            image, by_ground = sensor.project_jacobian(ground[point[part]])
-            np.multiply((image - xy[part]).T, weight[part], out=residual[:, part])
-            np.multiply(by_ground.T, weight[part], out=jacobian[:, :, part])
-        step, ok = _normal_step(jacobian, residual, point, scale.T)
+        image, jacobian = stack.seen_jacobian(ground[point], bounds)
+        residual = (image - xy.T) * weight
+        jacobian *= weight
+        step, ok = _normal_step(jacobian.swapaxes(0, 1), residual, point, scale.T)
         ground -= step.T / scale
         if not np.abs(step[:, ok]).max(initial=0.0) > 1e-3:  # metres; quadratic: the next is below 1e-9
             break

@@ -153,7 +153,7 @@ class Rational:
             scale = np.maximum(np.ptp(arguments, axis=1)[:, None] / 2, 1e-300)
             basis = monomials((arguments - center) / scale)
             try:
-                coeffs = np.asarray(np.linalg.lstsq(basis.T, x[:2].T, rcond=None)[0].T, dtype=np.float64)
+                coeffs = np.asarray(np.linalg.solve(basis @ basis.T, basis @ x[:2].T).T, dtype=np.float64)
             except np.linalg.LinAlgError:  # coefficients at the ends of what doubles hold
                 return None
             # what one step leaves of an error of 1e-3: quadratic, so it scales with the step's square

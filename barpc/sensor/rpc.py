@@ -6,7 +6,7 @@ normalised by an offset and a scale. Of many cameras RPCs go by their numbers st
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -173,13 +173,17 @@ class RPC(Pointwise):
 
 
 class RpcStack:
-    """The RPCs among the sensors, their numbers stacked (V of N rows are used, the others stay zero)."""
+    """The RPCs among the sensors, their numbers stacked (V of N rows are used, the others stay zero).
+
+    Points are sorted by view: those of view v are bounds[v] : bounds[v + 1].
+    """
 
     def __init__(self, sensors: Sequence[SensorModel]) -> None:
-        n = len(sensors)
+        n, self.sensors = len(sensors), tuple(sensors)
         self.coeffs, self.gradient = np.zeros((n, 4, 20)), np.zeros((n, 12, 10))
         self.ground_offset, self.ground_scale = np.zeros((n, 3)), np.ones((n, 3))
         self.image_offset, self.image_scale = np.zeros((n, 2)), np.ones((n, 2))
+        self.is_rpc = np.array([isinstance(sensor, RPC) for sensor in sensors], dtype=bool)
         rpcs = {i: sensor for i, sensor in enumerate(sensors) if isinstance(sensor, RPC)}
         if rpcs:
             rows = list(rpcs)
@@ -187,6 +191,74 @@ class RpcStack:
                 getattr(self, name)[rows] = [getattr(rpc, name) for rpc in rpcs.values()]
             slopes = np.einsum("npi,aij->npaj", self.coeffs, DERIVATIVE)  # of four polynomials by three axes
             self.gradient = (slopes / self.ground_scale[:, None, :, None]).reshape(n, 12, 10)
+
+    def runs(self, bounds: IntArray, together: BoolArray) -> Iterator[slice]:
+        """Yield the views with points: those `together` (N,) by about CHUNK points, others one by one."""
+        run: slice | None = None
+        for v in np.flatnonzero(np.diff(bounds)).tolist():
+            if run is not None:
+                if together[run.start] and together[v] and bounds[v + 1] - bounds[run.start] <= CHUNK:
+                    run = slice(run.start, v + 1)
+                    continue
+                yield run
+            run = slice(v, v + 1)
+        if run is not None:
+            yield run
+
+    def seen(self, ground: Array, bounds: IntArray) -> Array:
+        """Return the image points (2, n) of ground points (n, 3), as each camera's `project`."""
+
+        def stacked(views: slice, within: IntArray, ground: Array) -> list[Array]:
+            return [_blank(self.image(ground.T, views, within))]
+
+        return self._of("project", stacked, [(2,)], bounds, ground)[0]
+
+    def seen_jacobian(self, ground: Array, bounds: IntArray) -> list[Array]:
+        """Return the image points (2, n) of ground points (n, 3) and derivatives (2, 3, n), as `project_jacobian`."""
+
+        def stacked(views: slice, within: IntArray, ground: Array) -> list[Array]:
+            image, jacobian = self.project(ground.T, views, within)
+            return [_blank(image), _blank(jacobian)]
+
+        return self._of("project_jacobian", stacked, [(2,), (2, 3)], bounds, ground)
+
+    def localize(self, image: Array, alt: Array, bounds: IntArray) -> Array:
+        """Return the ground points (3, n) of image points (n, 2) [px] at altitudes (n,) [m], as each `localize`."""
+        lost = np.zeros(len(self.sensors), dtype=bool)
+
+        def stacked(views: slice, within: IntArray, image: Array, alt: Array) -> list[Array]:
+            ground, found = _newton(self, image.T, alt, views, within)
+            lost[views] = np.bincount(np.repeat(np.arange(len(within) - 1), np.diff(within)), ~found) > 0
+            return [ground]
+
+        (ground,) = self._of("localize", stacked, [(3,)], bounds, image, alt)
+        for v in np.flatnonzero(lost).tolist():
+            part = slice(bounds[v], bounds[v + 1])
+            ground[:, part] = self.sensors[v].localize(image[part], alt[part]).T
+        return ground
+
+    def _of(
+        self,
+        name: str,
+        stacked: Callable[..., list[Array]],
+        shapes: Sequence[tuple[int, ...]],
+        bounds: IntArray,
+        *given: Array,
+    ) -> list[Array]:
+        """Return what cameras give (..., n) for points: few of RPCs together, else by the camera's method `name`."""
+        out = [np.empty((*shape, len(given[0]))) for shape in shapes]
+        few = self.is_rpc & (np.diff(bounds) <= _MANY) & (len(self.sensors) > 1)
+        for views in self.runs(bounds, few):
+            rows = slice(bounds[views.start], bounds[views.stop])
+            part = [array[rows] for array in given]
+            if few[views.start]:
+                found = stacked(views, bounds[views.start : views.stop + 1] - rows.start, *part)
+            else:
+                alone = getattr(self.sensors[views.start], name)(*part)
+                found = [np.moveaxis(piece, 0, -1) for piece in (alone if len(shapes) > 1 else [alone])]
+            for whole, piece in zip(out, found, strict=True):
+                whole[..., rows] = piece
+        return out
 
     def image(self, ground: Array, views: slice, bounds: IntArray) -> Array:
         """Return the image points (2, n) of ground points (3, n) seen by consecutive views."""
@@ -238,29 +310,18 @@ def localize_stack(sensors: Sequence[SensorModel], image: Array, alt: Array, bou
 
     Those of camera v are bounds[v] : bounds[v + 1].
     """
-    ground, stack = np.full((len(image), 3), np.nan), RpcStack(sensors)
-    count = np.diff(bounds)
-    few = np.array([isinstance(sensor, RPC) for sensor in sensors], dtype=bool) & (count <= _MANY)
-    alone, start = (count > 0) & ~few, 0
-    while start < len(sensors):
-        last = int(np.searchsorted(bounds, bounds[start] + CHUNK, side="right")) - 1
-        others = np.flatnonzero(~few[start:])
-        stop = min(max(start + 1, last), start + int(others[0]) if len(others) else len(sensors))
-        if stop > start:
-            rows, views = slice(bounds[start], bounds[stop]), slice(start, stop)
-            within = bounds[start : stop + 1] - bounds[start]
-            ground[rows], found = _newton(stack, image[rows].T, alt[rows], views, within)
-            lost = np.add.reduceat(~found, within[:-1][count[views] > 0]) > 0 if len(found) else ~found
-            alone[views][count[views] > 0] = lost
-        start = max(stop, start + 1)
-    for v in np.flatnonzero(alone).tolist():
-        part = slice(bounds[v], bounds[v + 1])
-        ground[part] = sensors[v].localize(image[part], alt[part])
-    return ground
+    return RpcStack(sensors).localize(image, alt, bounds).T
+
+
+def _blank(found: Array) -> Array:
+    """Return values (..., n), NaN at the points of which one is not finite."""
+    if not np.isfinite(found.sum()):
+        found[..., ~np.isfinite(found).all(axis=tuple(range(found.ndim - 1)))] = np.nan
+    return found
 
 
 def _newton(stack: RpcStack, image: Array, alt: Array, views: slice, bounds: IntArray) -> tuple[Array, BoolArray]:
-    """Return ground points (n, 3) by Newton from RPCs' centres; which (n,) are certain: in the box, steps fall."""
+    """Return ground points (3, n) by Newton from RPCs' centres; which (n,) are certain: in the box, steps fall."""
     count = np.diff(bounds)
     offset, scale = (np.repeat(rows[views].T, count, axis=1) for rows in (stack.ground_offset, stack.ground_scale))
     ground, before = offset.copy(), np.full(len(alt), np.inf)
@@ -278,4 +339,4 @@ def _newton(stack: RpcStack, image: Array, alt: Array, views: slice, bounds: Int
             break
         before = size
     certain &= (size <= _ARRIVED) & (np.abs(ground - offset) <= REACH * np.abs(scale)).all(axis=0)
-    return ground.T, certain
+    return ground, certain

@@ -18,7 +18,6 @@ from barpc.base.errors import BarpcError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.base.options import RunOptions
 from barpc.pipeline import adjust, load_views, outputs, run
-from barpc.pipeline import loading as views
 from barpc.pointio.matches import write_matches
 from barpc.report import Run
 from barpc.rpcio import formats
@@ -84,7 +83,8 @@ def test_a_folder_is_listed_once_for_all_its_images_and_again_when_it_changes(bl
 
 @pytest.mark.parametrize("keep_going", [False, True])
 def test_other_workers_read_the_same_views_and_the_first_error_counts(block, folder, monkeypatch, keep_going):
-    monkeypatch.setattr(views, "GROUP", 3)
+    for place in ("loading", "executor"):
+        monkeypatch.setattr(f"barpc.pipeline.{place}.GROUP", 3)
     told = []
     given = [*block[1], folder / "missing.tif", folder / "none.tif"]
     with ThreadPoolExecutor(2) as executor:

@@ -347,7 +347,7 @@ def test_the_images_of_a_result_stand_in_the_order_given() -> None:
 
 def test_a_camera_that_does_not_say_where_it_stands_is_told(caplog) -> None:
     view = simulate_block(2, 4, seed=1, num_checks=0).views[0]
-    assert stages._center(view).method != "nominal"
+    assert stages._centers([view], "line")[0].method != "nominal"
     assert "nominal" not in caplog.text
 
 

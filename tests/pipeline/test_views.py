@@ -273,7 +273,8 @@ def test_images_are_read_in_groups_and_by_other_workers_when_they_are_many(pair,
         return real(given, *how)
 
     monkeypatch.setattr(views, "read_group", watched)
-    monkeypatch.setattr(views, "GROUP", 2)
+    for place in ("loading", "executor"):
+        monkeypatch.setattr(f"barpc.pipeline.{place}.GROUP", 2)
     third = placed(tmp_path, "c", pixels_of(5), 7)
     told: list[tuple[str, int, int]] = []
     load_views([*pair, third], progress=lambda *now: told.append(now))

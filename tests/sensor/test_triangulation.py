@@ -8,6 +8,7 @@ from scipy.optimize import least_squares
 
 from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.sensor.geometry import triangulate
+from barpc.sensor.rpc import RpcStack
 from tests.sensor.test_geometry import tilted_rpc
 
 SENSORS = [tilted_rpc((0.6, -0.4)), tilted_rpc((-0.3, 0.2)), tilted_rpc((0.1, 0.5))]
@@ -79,9 +80,7 @@ def test_a_track_without_an_observation_has_no_point() -> None:
 def test_it_stops_where_the_step_is_below_a_millimetre(monkeypatch) -> None:
     truth, view, point, xy, _ = scene(noise=0.0)
     calls = []
-    project = type(SENSORS[0]).project_jacobian
-    monkeypatch.setattr(
-        type(SENSORS[0]), "project_jacobian", lambda self, ground: calls.append(1) or project(self, ground)
-    )
+    project = RpcStack.seen_jacobian
+    monkeypatch.setattr(RpcStack, "seen_jacobian", lambda *given: calls.append(1) or project(*given))
     triangulate(SENSORS, view, point, xy, alt=truth[:, 2] + 1.0)
-    assert len(calls) in (3 * 2, 3 * 3)
+    assert len(calls) in (2, 3)  # all cameras at once

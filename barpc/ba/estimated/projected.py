@@ -7,7 +7,7 @@ metres (see `Unknowns`), so that all of them weigh about the same.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Literal
@@ -15,10 +15,10 @@ from typing import Literal
 import numpy as np
 
 from barpc.ba.estimated.unknowns import Unknowns
-from barpc.base.geodesy import CHUNK, Array, ground_from_ecef, ground_rows_from_ecef, parts
+from barpc.base.geodesy import Array, ground_from_ecef, ground_rows_from_ecef, parts
 from barpc.scene import IntArray, View
 from barpc.sensor.corrected import RigidMotion
-from barpc.sensor.rpc import RPC, RpcStack
+from barpc.sensor.rpc import RpcStack
 
 Wanted = Literal["image", "points", "unknowns"]
 
@@ -42,8 +42,8 @@ class Cameras:
         self.seen = seen
         self.sensors = tuple(view.sensor for view in views)
         self.unknowns = unknowns
-        self.is_rpc = np.array([isinstance(sensor, RPC) for sensor in self.sensors])
         self._stack = RpcStack(self.sensors)
+        self.is_rpc = self._stack.is_rpc
 
     def seeing(self, seen: Array) -> Cameras:
         """Return the views with other observations, at image points (2, K) [px]."""
@@ -68,7 +68,7 @@ class Cameras:
         """
         found = self.room(ecef.shape[1], wanted) if out is None else out
         image, by_point, by_unknown = found.image, found.by_point, found.by_unknown
-        for views in self._chunks(bounds):
+        for views in self._stack.runs(bounds, self.is_rpc):
             for part in parts(bounds[views.stop], start=bounds[views.start]):
                 of_view = np.clip(bounds[views.start : views.stop + 1], part.start, part.stop) - part.start
                 seen = None if self.seen is None else self.seen[:, part]
@@ -83,20 +83,6 @@ class Cameras:
         by_point = np.empty((2, 0 if wanted == "image" else 3, count))
         by_unknown = np.empty((2, self.unknowns.size if wanted == "unknowns" else 0, count))
         return Projected(np.empty((2, count)), by_point, by_unknown)
-
-    def _chunks(self, bounds: IntArray) -> Iterator[slice]:
-        """Yield the runs of views of one kind with about CHUNK observations together; other sensors one by one."""
-        run: slice | None = None
-        for v in np.flatnonzero(np.diff(bounds)).tolist():
-            if run is not None:
-                more = v == run.stop and self.is_rpc[v] and self.is_rpc[run.start]
-                if more and bounds[v + 1] - bounds[run.start] <= CHUNK:
-                    run = slice(run.start, v + 1)
-                    continue
-                yield run
-            run = slice(v, v + 1)
-        if run is not None:
-            yield run
 
     def _project(
         self, params: Array, ecef: Array, views: slice, bounds: IntArray, wanted: Wanted, seen: Array | None

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from operator import attrgetter
 from typing import Any, ClassVar
 
 import numpy as np
 
-from barpc.base.geodesy import Array, ground_from_ecef
+from barpc.base.geodesy import CHUNK, Array, ground_from_ecef
 from barpc.report.outcome import Run
 from barpc.report.records import Cell, Column, Number, Record, plain, said
 from barpc.report.summary.words import Count
@@ -101,12 +101,13 @@ def _pair_geometry(run: Run) -> list[list[float]]:
     a, b, pair = _rows(run, picks)
     seen = np.isfinite(run.ground[run.tracks.point[a]]).all(axis=1)
     a, b, pair = a[seen], b[seen], pair[seen]
-    at = run.ground[run.tracks.point[a]]
-    first, second = (Several(run.before, run.tracks.view[rows]) for rows in (a, b))
-    base = base_to_height(first, second, at)
-    finer = np.minimum(ground_sample_distance(first, at)[1], ground_sample_distance(second, at)[1])
-    with np.errstate(divide="ignore"):
-        values = (convergence_angle(first, second, at), base, finer / base)
+    values = np.empty((3, len(a)))
+    for part, first, second in _parts(run, run.before, a, b):
+        at = run.ground[run.tracks.point[a[part]]]
+        base = base_to_height(first, second, at)
+        finer = np.minimum(ground_sample_distance(first, at)[1], ground_sample_distance(second, at)[1])
+        with np.errstate(divide="ignore"):
+            values[:, part] = convergence_angle(first, second, at), base, finer / base
     found = np.array([medians(value, pair, len(run.pairs)) for value in values]).T
     return [list(row) for row in found.tolist()]
 
@@ -124,8 +125,9 @@ def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> list[
     height = alt[run.tracks.point[a]]
     seen = np.isfinite(height)
     a, b, pair = a[seen], b[seen], pair[seen]
-    first, second = (Several(sensors, run.tracks.view[rows]) for rows in (a, b))
-    offset, _ = epipolar_offset(first, second, run.tracks.xy[a], run.tracks.xy[b], height[seen], steps=2)
+    offset, height, xy = np.empty(len(a)), height[seen], run.tracks.xy
+    for part, first, second in _parts(run, sensors, a, b):
+        offset[part], _ = epipolar_offset(first, second, xy[a[part]], xy[b[part]], height[part], steps=2)
     known = np.isfinite(offset)
     offset, pair, num = offset[known], pair[known], len(counts)
     center = medians(offset, pair, num)
@@ -134,6 +136,15 @@ def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> list[
     rms = np.sqrt(square / np.maximum(count, 1))
     rows = zip(center.tolist(), spread.tolist(), rms.tolist(), count.tolist(), strict=True)
     return [OffsetEntry(*row) if row[3] else None for row in rows]
+
+
+def _parts(
+    run: Run, sensors: Sequence[SensorModel], a: IntArray, b: IntArray
+) -> Iterator[tuple[slice, Several, Several]]:
+    """Yield pieces of matches that stay in cache, and the cameras of their observations a and b."""
+    for start in range(0, len(a), CHUNK):
+        part = slice(start, start + CHUNK)
+        yield part, Several(sensors, run.tracks.view[a[part]]), Several(sensors, run.tracks.view[b[part]])
 
 
 def _rows(run: Run, picks: Sequence[slice | IntArray]) -> tuple[IntArray, IntArray, IntArray]:

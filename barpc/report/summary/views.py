@@ -21,12 +21,11 @@ from barpc.report.summary.words import ABOVE, CAUSES, STATUS_WORDS, Count, Pixel
 from barpc.scene import IntArray, View
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.displaced import ImageCorrected, RowSpline, Splined
-from barpc.sensor.geometry import Several, ground_sample_distance, image_grid, view_angles
+from barpc.sensor.geometry import Several, ground_grids, ground_sample_distance, view_angles
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.timing import Timed
 
-_gauss = cache(np.polynomial.legendre.leggauss)  # every image asks
 CELLS = 8  # Cells of an image from left to right and from top to bottom
 _ROWS = 400  # of an image, over which a spline is averaged
 
@@ -41,19 +40,23 @@ class EllipseEntry(Record):
 
 
 def moved_in_space(
-    model: Corrected, covariance: Array, unknowns: str, ground: Array
+    model: Corrected, covariance: Array, unknowns: str, ground: Array, seen: tuple[Array, ...] | None = None
 ) -> tuple[Array, Array, EllipseEntry]:
     """Return how far P_BA moves a ground point near the image's middle (2,) [px], its sigma (2,), and its ellipse.
 
     `covariance` (q, q) is of rotation (metres: angle x distance), translation [m], then any drift, which is zero in the
     middle row; `unknowns`: "rotation", "translation" or "rotation+translation"; `ground` (3,): lon, lat [deg], alt [m].
+    `seen`, if known: what `project_ecef` says of it, and where the camera as delivered sees it.
     """
     ecef = ecef_from_ground(ground)
-    image, by_point, by_rotation, by_translation = model.project_ecef(ecef)
+    image, by_point, by_rotation, by_translation, before = seen or (
+        *model.project_ecef(ecef),
+        model.sensor.project(ground),
+    )
     distance = np.linalg.norm(ecef - model.correction.center)
     parts = {"rotation": by_rotation / distance, "translation": by_translation}
     jacobian = np.hstack([part for name, part in parts.items() if name in unknowns])
-    return _known(image - model.sensor.project(ground), jacobian, covariance, by_point @ enu_basis(ground)[:2].T)
+    return _known(image - before, jacobian, covariance, by_point @ enu_basis(ground)[:2].T)
 
 
 def moved_by_clocks(model: Timed, covariance: Array, ground: Array) -> tuple[Array, Array, EllipseEntry]:
@@ -95,13 +98,21 @@ def ce90(major: float, minor: float) -> float:
     """
     if not major > 0.0:
         return major
-    nodes, weights = _gauss(64)
-    angle, radius = 0.25 * np.pi * (nodes + 1.0), np.linspace(1.6, 2.2, 200)[:, None]  # major axes
+    radius, along, weights = _circles()
     with np.errstate(divide="ignore"):
-        held = erf(radius * np.cos(angle) / (np.sqrt(2.0) * np.float64(minor / major)))
-    density = np.exp(-0.5 * (radius * np.sin(angle)) ** 2) * held * radius * np.cos(angle)
-    share = np.sqrt(2.0 / np.pi) * 0.25 * np.pi * (density @ weights)  # the integral over x of what y holds
-    return major * float(np.interp(0.9, share, radius[:, 0]))  # to some 1e-6
+        held = erf(along / (np.sqrt(2.0) * np.float64(minor / major)))
+    share = (held * weights).sum(axis=1)  # the integral over x of what y holds
+    return major * float(np.interp(0.9, share, radius))  # to some 1e-6
+
+
+@cache  # every image asks
+def _circles() -> tuple[Array, Array, Array]:
+    """Return radii [major axes]; across their halves the extent of y at points, and the weight of each, of x."""
+    nodes, weights = np.polynomial.legendre.leggauss(64)
+    angle, radius = 0.25 * np.pi * (nodes + 1.0), np.linspace(1.6, 2.2, 200)[:, None]
+    along = radius * np.cos(angle)
+    density = np.exp(-0.5 * (radius * np.sin(angle)) ** 2) * along
+    return radius[:, 0], along, np.sqrt(2.0 / np.pi) * 0.25 * np.pi * density * weights
 
 
 class SourceEntry(Record):
@@ -304,9 +315,9 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
             control_w_point=control[i].point if i in control else None,
             status="adjusted",
             advice="",
-            **_adjusted(run, i, middle[i]),
+            **adjusted,
         )
-        for i, view in enumerate(run.views)
+        for i, (view, adjusted) in enumerate(zip(run.views, _adjusted(run, middle), strict=True))
     )
 
 
@@ -314,24 +325,32 @@ def _fit(fit: RpcFit) -> FitEntry:
     return replace(FitEntry(*_FIT(fit)), localisation_m=None if fit.localisation is None else fit.localisation.max_m)
 
 
-def _adjusted(run: Run, i: int, middle: Array) -> dict[str, Any]:
-    """Return what an adjustment found of image i; `certified`: ground at its ends, and where its new camera sees it."""
-    found, view = run.adjustment, run.views[i]
+def _adjusted(run: Run, middle: Array) -> list[dict[str, Any]]:
+    """Return what an adjustment found of every image, at the ground points (N, 3) in the middle of each.
+
+    `certified`: ground at its ends, and where its new camera sees it.
+    """
+    found, num = run.adjustment, len(run.views)
     if found is None:
-        return {"smooth_px": None, "prior_scale": None, "correction": None}
-    of_view = {
-        "smooth_px": found.smooth.rms[i],
-        "smooth_p": found.smooth.significance[i],
-        "shared_px": found.smooth.shared[i],
-        "held_out_px": found.held_out_rms[i],
-        "prior_scale": found.prior.scale[i],
-        "correction": _correction(found, i, middle),
-    }
-    if run.written:
-        ground = found.sensors[i].localize(*image_grid(view.size, view.alt_range, (3, 2)))
-        ground = ground[np.isfinite(ground).all(axis=1)]
-        of_view["certified"] = tuple(map(tuple, np.hstack([ground, found.sensors[i].project(ground)]).tolist()))
-    return of_view
+        return [{"smooth_px": None, "prior_scale": None, "correction": None}] * num
+    inner = [model.sensor if isinstance(model, Splined) else model for model in found.sensors]
+    behind, seen = Several(inner, np.arange(num)).behind, list[tuple[Array, ...]]()
+    if behind is not None:
+        seen = list(zip(*behind.project_ecef(ecef_from_ground(middle)), behind.sensor.project(middle), strict=True))
+    ends = [(model, view.size, view.alt_range) for model, view in zip(found.sensors, run.views, strict=True)]
+    grids = ground_grids(ends, (3, 2)) if run.written else None
+    return [
+        {
+            "smooth_px": found.smooth.rms[i],
+            "smooth_p": found.smooth.significance[i],
+            "shared_px": found.smooth.shared[i],
+            "held_out_px": found.held_out_rms[i],
+            "prior_scale": found.prior.scale[i],
+            "correction": _correction(found, i, middle[i], seen[i] if seen else None),
+            "certified": tuple(map(tuple, grids[i].tolist())) if grids else None,
+        }
+        for i in range(num)
+    ]
 
 
 def rmse_by_view(residuals: Array, view: IntArray, num_views: int) -> Array:
@@ -348,8 +367,8 @@ def cell_numbers(xy: Array, size: Sequence[int] | IntArray) -> IntArray:
     return np.asarray(row * CELLS + col)
 
 
-def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntry:
-    """Return the correction of a view, at the ground point (3,) in the middle of its image."""
+def _correction(adjustment: Adjustment, i: int, middle: Array, seen: tuple[Array, ...] | None) -> CorrectionEntry:
+    """Return the correction of a view, at the ground point (3,) in the middle of its image; `seen`: if known."""
     whole, model = adjustment.sensors[i], adjustment.cameras.unknowns.model
     sensor, spline = (whole.sensor, whole.correction) if isinstance(whole, Splined) else (whole, None)
     covariance, apart = adjustment.covariance.view(i), adjustment.apart
@@ -364,7 +383,7 @@ def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntr
         known: dict[str, Any] = {"range_m": offset[0], "azimuth_ms": offset[1], "timing_slopes": slopes}
         known["timing_sigma"] = (np.array(sigma[:2]) / [1.0, sensor.sensor.speed / 1e3]).tolist()
     elif isinstance(sensor, Corrected):
-        moved, uncertain, place = moved_in_space(sensor, covariance, model, middle)
+        moved, uncertain, place = moved_in_space(sensor, covariance, model, middle, seen)
         known = {
             "rotation_urad": (sensor.correction.rotation * 1e6).tolist(),
             "angle_urad": float(np.linalg.norm(sensor.correction.rotation)) * 1e6,
