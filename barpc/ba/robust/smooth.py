@@ -196,7 +196,7 @@ class Smooth:
         return replace(tested, shared=shared)
 
     def _sums(self, view: IntArray, values: Array) -> Array:
-        return np.bincount(view, values, self.structure.num_views)
+        return np.asarray(np.bincount(view, values, self.structure.num_views))
 
     def _beyond_noise(self, product: Array, square: Array, order: IntArray, pairs: Array) -> tuple[Array, Array]:
         """Return the products (n - 1,) of neighbours (n,) beyond the noise that they share; their numbers (N,)."""
