@@ -120,7 +120,8 @@ class Cameras:
     ) -> None:
         """Project points through cameras with some unknowns, turned and shifted."""
         unknowns, image_only, all_wanted = self.unknowns, not out.by_point.shape[1], bool(out.by_unknown.shape[1])
-        if not (all_wanted or params.any()):  # cameras as delivered
+        as_delivered = not params.any()
+        if as_delivered and not all_wanted:
             if image_only:
                 out.image[:] = self._image(ecef, views, bounds)
             else:
@@ -132,7 +133,7 @@ class Cameras:
             count = np.diff(bounds)
             middle, half = (np.repeat(rows[1, views], count) for rows in (unknowns.middle, unknowns.half))
             row = (seen[1] - middle) / half
-            drift = unknowns.drift_rotation(params, views, count, row)
+            drift = None if as_delivered else unknowns.drift_rotation(params, views, count, row)
         rotation, translation = unknowns.rotation(params, views), unknowns.translation(params)
         motion = RigidMotion(ecef, rotation, translation, unknowns.center[views], bounds, drift)
         if image_only:
