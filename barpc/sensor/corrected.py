@@ -67,10 +67,10 @@ class RigidMotion:
         self._turned = lever if self._drift is None else self._drift.forth(lever)
         self.ecef = self._turned + np.repeat(center.T, count, axis=1)
 
-    def by_point(self, by_moved: Array) -> Array:
+    def by_point(self, by_moved: Array, out: Array | None = None) -> Array:
         """Return the derivatives (2, 3, n) by X [1/m] from those by the moved points; by T they are negative."""
         back = by_moved if self._drift is None else self._drift.back(by_moved, _DIGITS)
-        return _by_view(self._matrix.swapaxes(1, 2), back, self._bounds)
+        return _by_view(self._matrix.swapaxes(1, 2), back, self._bounds, out)
 
     def by_turns(self, by_moved: Array) -> tuple[Array, Array]:
         """Return those by R and d [1/rad]: the same where there is no drift."""
@@ -82,9 +82,9 @@ class RigidMotion:
         return by_rotation, by_rotation if self._drift is None else by_turn
 
 
-def _by_view(matrices: Array, rows: Array, bounds: IntArray) -> Array:
+def _by_view(matrices: Array, rows: Array, bounds: IntArray, out: Array | None = None) -> Array:
     """Return the matrices (m, 3, 3) times the columns bounds[i] : bounds[i + 1] of rows (..., 3, n)."""
-    out = np.empty_like(rows)
+    out = np.empty_like(rows) if out is None else out
     for matrix, start, stop in zip(matrices, bounds[:-1], bounds[1:], strict=True):
         np.matmul(matrix, rows[..., start:stop], out=out[..., start:stop])
     return out

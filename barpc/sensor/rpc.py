@@ -182,13 +182,15 @@ class RpcStack:
         n, self.sensors = len(sensors), tuple(sensors)
         self.coeffs, self.gradient = np.zeros((n, 4, 20)), np.zeros((n, 12, 10))
         self.ground_offset, self.ground_scale = np.zeros((n, 3)), np.ones((n, 3))
-        self.image_offset, self.image_scale = np.zeros((n, 2)), np.ones((n, 2))
         self.is_rpc = np.array([isinstance(sensor, RPC) for sensor in sensors], dtype=bool)
         rpcs = {i: sensor for i, sensor in enumerate(sensors) if isinstance(sensor, RPC)}
         if rpcs:
             rows = list(rpcs)
-            for name in ("coeffs", "ground_offset", "ground_scale", "image_offset", "image_scale"):
+            for name in ("coeffs", "ground_offset", "ground_scale"):
                 getattr(self, name)[rows] = [getattr(rpc, name) for rpc in rpcs.values()]
+            for row, rpc in rpcs.items():  # quotients of pixels
+                above = rpc.coeffs[::2] * rpc.image_scale[:, None] + rpc.coeffs[1::2] * rpc.image_offset[:, None]
+                self.coeffs[row, ::2] = above
             slopes = np.einsum("npi,aij->npaj", self.coeffs, DERIVATIVE)  # of four polynomials by three axes
             self.gradient = (slopes / self.ground_scale[:, None, :, None]).reshape(n, 12, 10)
 
@@ -265,9 +267,7 @@ class RpcStack:
         count = np.diff(bounds)
         poly = _polynomials(self.coeffs[views], self._basis(ground, views, count), bounds)
         with np.errstate(all="ignore"):
-            value = poly[::2] / poly[1::2]
-        value *= np.repeat(self.image_scale[views].T, count, axis=1)
-        value += np.repeat(self.image_offset[views].T, count, axis=1)
+            value: Array = poly[::2] / poly[1::2]
         return value
 
     def project(self, ground: Array, views: slice, bounds: IntArray) -> tuple[Array, Array]:
@@ -276,16 +276,12 @@ class RpcStack:
         basis = self._basis(ground, views, count)
         poly = _polynomials(self.coeffs[views], basis, bounds)
         slope = _polynomials(self.gradient[views], basis[:10], bounds).reshape(4, 3, -1)
-        image_scale = np.repeat(self.image_scale[views].T, count, axis=1)
         with np.errstate(all="ignore"):
             inverse = 1.0 / poly[1::2]
             value = poly[::2] * inverse
-            inverse *= image_scale
             jacobian = value[:, None] * slope[1::2]
             np.subtract(slope[::2], jacobian, out=jacobian)
             jacobian *= inverse[:, None]
-        value *= image_scale
-        value += np.repeat(self.image_offset[views].T, count, axis=1)
         return value, jacobian
 
     def _basis(self, ground: Array, views: slice, count: IntArray) -> Array:
@@ -301,7 +297,7 @@ def _polynomials(coeffs: Array, basis: Array, bounds: IntArray) -> Array:
     """Return the polynomials (m, n) of consecutive views (v, m, 20), each at its own points: a small product a view."""
     out = np.empty((coeffs.shape[1], basis.shape[1]))
     for matrix, start, stop in zip(coeffs, bounds[:-1], bounds[1:], strict=True):
-        out[:, start:stop] = matrix @ basis[:, start:stop]
+        np.matmul(matrix, basis[:, start:stop], out=out[:, start:stop])
     return out
 
 

@@ -87,7 +87,6 @@ def test_a_strip_is_a_displacement_in_columns_and_one_in_rows(axis: int) -> None
 def test_what_fades_is_tried_on_both_sides_of_both_ends_over_halved_lengths(monkeypatch) -> None:
     """The cheapest upwards and the cheapest downwards: here a script wants one origin and length of each."""
     s, asked = seen(), list[tuple[float, float, float, float]]()
-    monkeypatch.setattr(explanations, "_untouched", lambda seen, one: 0.0)
 
     def first_guess(
         few: Any, base: Any, extra: Any, own: np.ndarray, precision: np.ndarray
@@ -123,8 +122,8 @@ def test_what_settles_is_tried_from_either_end_over_all_to_a_hundredth_of_an_ima
     s, rates = seen(), list[float]()
     made = explanations._settling
     monkeypatch.setattr(explanations, "_settling", lambda *given: rates.append(given[1]) or made(*given))
-    costs = [5.0] * 32
-    costs[6], costs[7] = 1.0, 9.0  # of the fourth, with and without it
+    costs = [0.0] * 16
+    costs[3] = -8.0  # what the fourth takes away
     monkeypatch.setattr(explanations, "first_guess", lambda *_: (None, None, costs.pop(0)))
     (one,) = explanations.settling(s, interval(0.0, 1.0))
     lengths = 1500.0 * 2.0 ** np.arange(-7.0, 1.0)

@@ -395,6 +395,7 @@ def script(
         def __init__(self, problem: Any, block: Any, state: Any, heights: Any, use: Any) -> None:
             starts.append((problem.cameras.unknowns.drift, use))
             self.number, self.residual, self.params = len(starts) - 1, "before", state.params
+            self.projected = None
 
         def run(self) -> Any:
             inlier = np.arange(100) < kept[self.number]

@@ -72,10 +72,8 @@ class Cameras:
             for part in parts(bounds[views.stop], start=bounds[views.start]):
                 of_view = np.clip(bounds[views.start : views.stop + 1], part.start, part.stop) - part.start
                 seen = None if self.seen is None else self.seen[:, part]
-                piece = self._project(params, ecef[:, part], views, of_view, wanted, seen)
-                image[:, part] = piece.image
-                by_point[..., part] = piece.by_point[:, : by_point.shape[1]]
-                by_unknown[..., part] = piece.by_unknown[:, : by_unknown.shape[1]]
+                piece = Projected(image[:, part], by_point[..., part], by_unknown[..., part])
+                self._project(params, ecef[:, part], views, of_view, seen, piece)
         return found
 
     def room(self, count: int, wanted: Wanted = "unknowns") -> Projected:
@@ -85,69 +83,65 @@ class Cameras:
         return Projected(np.empty((2, count)), by_point, by_unknown)
 
     def _project(
-        self, params: Array, ecef: Array, views: slice, bounds: IntArray, wanted: Wanted, seen: Array | None
-    ) -> Projected:
-        index = np.repeat(np.arange(views.start, views.stop), np.diff(bounds))
+        self, params: Array, ecef: Array, views: slice, bounds: IntArray, seen: Array | None, out: Projected
+    ) -> None:
         unknowns = self.unknowns
+        index = np.repeat(np.arange(views.start, views.stop), np.diff(bounds))
         if not unknowns.geometric:
-            image, by_point = self._by_ecef(ecef, views, bounds)
-            return Projected(*unknowns.in_image(params, index, image, by_point))
+            found = unknowns.in_image(params, index, *self._by_ecef(ecef, views, bounds))
+            out.image[:] = found[0]
+            out.by_point[:] = found[1][:, : out.by_point.shape[1]]
+            out.by_unknown[:] = found[2][:, : out.by_unknown.shape[1]]
+            return
         if views.start in unknowns.radars:
-            found = self._timed(params[views.start], ecef, views.start, wanted)
+            self._timed(params[views.start], ecef, views.start, out)
         else:
-            found = self._moved(params, ecef, views, bounds, wanted, seen)
+            self._moved(params[views], ecef, views, bounds, seen, out)
         if unknowns.waves is not None and seen is not None:
-            unknowns.add_waves(found.image, found.by_unknown, params, index, seen)
-        return found
+            unknowns.add_waves(out.image, out.by_unknown, params, index, seen)
 
     def _moved(
-        self,
-        params: Array,
-        ecef: Array,
-        views: slice,
-        bounds: IntArray,
-        wanted: Wanted,
-        seen: Array | None,
-    ) -> Projected:
-        """Project points through cameras that are turned and shifted."""
-        unknowns, of_views = self.unknowns, params[views]
-        index = np.repeat(np.arange(views.start, views.stop), np.diff(bounds))
-        if wanted != "unknowns" and not of_views.any():  # cameras as delivered
-            none = np.empty((2, 0, len(index)))
-            if wanted == "image":
-                return Projected(self._image(ecef, views, bounds), none, none)
-            return Projected(*self._by_ecef(ecef, views, bounds), none)
+        self, params: Array, ecef: Array, views: slice, bounds: IntArray, seen: Array | None, out: Projected
+    ) -> None:
+        """Project points through cameras with some unknowns, turned and shifted."""
+        unknowns, image_only, all_wanted = self.unknowns, not out.by_point.shape[1], bool(out.by_unknown.shape[1])
+        as_delivered = not params.any()
+        if as_delivered and not all_wanted:
+            if image_only:
+                out.image[:] = self._image(ecef, views, bounds)
+            else:
+                out.image[:], out.by_point[:] = self._by_ecef(ecef, views, bounds)
+            return
         drift = row = None
         if unknowns.drift:
             assert seen is not None
-            row = (seen[1] - unknowns.middle[1, index]) / unknowns.half[1, index]
-            drift = unknowns.drift_rotation(params, index, row)
-        rotation, translation = unknowns.rotation(of_views, views), unknowns.translation(of_views)
+            count = np.diff(bounds)
+            middle, half = (np.repeat(rows[1, views], count) for rows in (unknowns.middle, unknowns.half))
+            row = (seen[1] - middle) / half
+            drift = None if as_delivered else unknowns.drift_rotation(params, views, count, row)
+        rotation, translation = unknowns.rotation(params, views), unknowns.translation(params)
         motion = RigidMotion(ecef, rotation, translation, unknowns.center[views], bounds, drift)
-        if wanted == "image":
-            none = np.empty((2, 0, len(index)))
-            return Projected(self._image(motion.ecef, views, bounds), none, none)
-        image, by_moved = self._by_ecef(motion.ecef, views, bounds)
-        by_point = motion.by_point(by_moved)
-        if wanted == "points":
-            return Projected(image, by_point, by_point[:, :0])
-        by_unknown = unknowns.stack(*motion.by_turns(by_moved), by_point, index, row)
-        return Projected(image, by_point, by_unknown)
+        if image_only:
+            out.image[:] = self._image(motion.ecef, views, bounds)
+            return
+        out.image[:], by_moved = self._by_ecef(motion.ecef, views, bounds)
+        motion.by_point(by_moved, out.by_point)
+        if all_wanted:
+            inverse = np.repeat(1.0 / unknowns.distance[views], np.diff(bounds))
+            unknowns.stack(*motion.by_turns(by_moved), out.by_point, inverse, row, out.by_unknown)
 
-    def _timed(self, params: Array, ecef: Array, view: int, wanted: Wanted) -> Projected:
+    def _timed(self, params: Array, ecef: Array, view: int, out: Projected) -> None:
         """Project points into a radar whose clocks are corrected."""
         unknowns = self.unknowns
         model = unknowns.radars[view].timed(unknowns.timing(params, view))
         ground, by_ecef = ground_rows_from_ecef(ecef)
-        if wanted == "image":
-            none = np.empty((2, 0, ecef.shape[1]))
-            return Projected(model.project(ground.T).T, none, none)
+        if not out.by_point.shape[1]:
+            out.image[:] = model.project(ground.T).T
+            return
         image, by_ground, by_timing, along = model.timing_jacobian(ground.T)
-        by_point = _times(np.moveaxis(by_ground, 0, -1), by_ecef)
-        by_unknown = by_point[:, :0]
-        if wanted == "unknowns":
-            by_unknown = unknowns.stack_timing(np.moveaxis(by_timing, 0, -1), along, view)
-        return Projected(image.T, by_point, by_unknown)
+        out.image[:], out.by_point[:] = image.T, _times(np.moveaxis(by_ground, 0, -1), by_ecef)
+        if out.by_unknown.shape[1]:
+            out.by_unknown[:] = unknowns.stack_timing(np.moveaxis(by_timing, 0, -1), along, view)
 
     def _image(self, ecef: Array, views: slice, bounds: IntArray) -> Array:
         """Return the uncorrected image points (2, n) without a derivative."""

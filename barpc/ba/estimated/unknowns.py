@@ -92,10 +92,10 @@ class Unknowns:
         start = 3 * self.rotates
         return params[:, start : start + 3]
 
-    def drift_vectors(self, params: Array) -> Array:
-        """Return the rotation vectors (N, D, 3) [rad] that the powers of the normalised row add."""
+    def drift_vectors(self, params: Array, views: slice = slice(None)) -> Array:
+        """Return the rotation vectors (n, D, 3) [rad] that the powers of the normalised row add."""
         vectors = params[:, self.constants : self._in_space].reshape(len(params), self.drift, 3)
-        return vectors / self.distance[:, None, None]
+        return vectors / self.distance[views, None, None]
 
     def timing(self, params: Array, view: int) -> Timing:
         """Return the clock correction of a radar with the unknowns (q,)."""
@@ -120,18 +120,21 @@ class Unknowns:
         """Return col, row (2, n) [px] normalised: -1 at the left and the top, 1 at the right and the bottom."""
         return (image - self.middle[:, index]) / self.half[:, index]
 
-    def drift_rotation(self, params: Array, index: IntArray, row: Array) -> Array:
-        """Return the rotation (3, n) [rad] that the drift adds at normalised rows (n,)."""
-        vectors = self.drift_vectors(params).transpose(1, 2, 0)[:, :, index]  # (D, 3, n)
+    def drift_rotation(self, params: Array, views: slice, count: IntArray, row: Array) -> Array:
+        """Return the rotation (3, n) [rad] that the drift adds at normalised rows (n,), `count` of each view."""
+        vectors = np.repeat(self.drift_vectors(params, views).transpose(1, 2, 0), count, axis=2)  # (D, 3, n)
         added: Array = vectors[-1] * row
         for degree in range(self.drift - 2, -1, -1):
             added = (added + vectors[degree]) * row
         return added
 
-    def stack(self, by_rotation: Array, by_drift: Array, by_point: Array, index: IntArray, row: Array | None) -> Array:
-        """Return derivatives (2, q, n) by unknowns from those (2, 3, n) by rotations [px/rad] and point."""
-        out = np.empty((2, self.size, len(index)))
-        inverse = (1.0 / self.distance)[index]
+    def stack(
+        self, by_rotation: Array, by_drift: Array, by_point: Array, inverse: Array, row: Array | None, out: Array
+    ) -> None:
+        """Write derivatives (2, q, n) by unknowns, of those (2, 3, n) by rotations [px/rad] and point.
+
+        `inverse` (n,) are their views' distances, inverted.
+        """
         at = 0
         if self.rotates:
             np.multiply(by_rotation, inverse, out=out[:, :3])
@@ -145,7 +148,6 @@ class Unknowns:
             scale = scale * row
             np.multiply(by_drift, scale, out=out[:, at : at + 3])
             at += 3
-        return out
 
     def add_waves(self, image: Array, by_unknown: Array, params: Array, index: IntArray, seen: Array) -> None:
         """Add the displacements by splines and steps to image points (2, n) seen at (2, n) [px], and to their

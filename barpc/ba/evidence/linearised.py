@@ -35,7 +35,7 @@ class Tracks:
 
     rows: IntArray  # (T, n) their observations, sorted by what views they are of
     view: IntArray  # (T, n)
-    subsets: BoolArray  # (S, n) which may be right together
+    subsets: Array  # (S, n) which may be right together: 1, else 0
     follow: Array  # (T, 3 S, 2n) a basis of what the ground point follows of each subset; zero outside it
     volume: Array  # (T, S) log of what the integral over the ground point leaves
     by_unknown: Array  # (T, n, 2, q)
@@ -53,7 +53,7 @@ class Tracks:
     def weighed(self, values: Array, followed: Array, weight: Array) -> Array:
         """Return the values (T, 2n) less what ground points absorb, summed over subsets by their weights (T, S)."""
         parts = (weight[..., None] * followed).reshape(len(values), 1, -1) @ self.follow
-        seen: Array = np.repeat(weight @ self.subsets.astype(np.float64), 2, axis=1)
+        seen: Array = np.repeat(weight @ self.subsets, 2, axis=1)
         return np.asarray(seen * values - parts[:, 0])
 
     def weight(self, weight: Array) -> Array:
@@ -61,7 +61,7 @@ class Tracks:
         of_rows = np.repeat(weight, 3, axis=1)[..., None] * self.follow
         out: Array = -(np.swapaxes(self.follow, 1, 2) @ of_rows)
         diagonal = np.einsum("tii->ti", out)
-        diagonal += np.repeat(weight @ self.subsets.astype(np.float64), 2, axis=1)
+        diagonal += np.repeat(weight @ self.subsets, 2, axis=1)
         return out
 
 
@@ -177,7 +177,7 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
         subsets = _subsets(n)
         follow, room = _followed(ground, subsets, held[:, structure.point[rows[:, 0]]])
         of_cameras = np.ascontiguousarray(by_unknown[:, :, rows].transpose(2, 3, 0, 1))
-        tracks.append(Tracks(rows, view, subsets, follow, room - np.log(volume), of_cameras))
+        tracks.append(Tracks(rows, view, subsets.astype(np.float64), follow, room - np.log(volume), of_cameras))
         ends = ground.reshape(len(rows), n, 2, 3)[:, [0, -1]].reshape(len(rows), 4, 3)
         bases.append(np.sqrt(np.maximum(np.linalg.det(np.swapaxes(ends, 1, 2) @ ends), 0.0)))
     far = max(float(np.quantile(np.linalg.norm(residual[:, order], axis=0), 0.99)), 5.0) if len(order) else 5.0

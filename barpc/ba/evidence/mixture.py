@@ -119,8 +119,8 @@ def first_guess(linear: Linear, found: Fit, extra: Array, new: Array, precision:
     """Estimate starting values (e,) of unknowns that move observations by `new` (2, e, K) [px], beside a fit
     with `extra` [px].
 
-    They have the least sum of what all tracks are off by, not of its squares; also the median of that, and the sum over
-    the noise. Their prior's precisions are the last of `precision`.
+    They have the least sum of what all tracks are off by, not of its squares; also the median of that, and the sum less
+    that without them, over the noise. Their prior's precisions are the last of `precision`.
     """
     left = linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma
     prior = np.diag(precision[len(precision) - new.shape[1] :])
@@ -133,7 +133,7 @@ def first_guess(linear: Linear, found: Fit, extra: Array, new: Array, precision:
         off = left[:, rows].transpose(1, 2, 0).reshape(len(some), size, 1)
         follow = tracks.follow[some, :3]
         parts.append(tuple(one - np.swapaxes(follow, 1, 2) @ (follow @ one) for one in (off, columns)))
-    moved, far = np.zeros(new.shape[1]), [np.zeros(0)]
+    moved, far, sums = np.zeros(new.shape[1]), [np.zeros(0)], list[float]()
     for _ in range(BACKFITTING):
         matrix, gradient, far = prior.copy(), prior @ moved, []
         for off, turned in parts:
@@ -143,9 +143,10 @@ def first_guess(linear: Linear, found: Fit, extra: Array, new: Array, precision:
             matrix += (np.swapaxes(weight, 1, 2) @ turned).sum(axis=0)
             gradient = gradient + (np.swapaxes(weight, 1, 2) @ now).sum(axis=0)[:, 0]
         moved = moved - np.linalg.solve(matrix, gradient)
+        sums.append(sum(float(of_tracks.sum()) for of_tracks in far))
     distances = np.concatenate(far)
     middle = float(np.median(distances)) if len(distances) else 0.0
-    return moved, middle, float(distances.sum()) / found.noise
+    return moved, middle, (sums[-1] - sums[0]) / found.noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,10 +188,10 @@ class _Expected:
 def _expect(
     linear: Linear, tracks: Tracks, residual: Array, noise: float, eps: Array, moved: _Moved | None = None
 ) -> _Expected:
-    n, size = tracks.rows.shape[1], len(tracks.subsets)
+    n, subsets = tracks.rows.shape[1], tracks.subsets
+    size = len(subsets)
     area = max(linear.area, 2.0 * np.pi * noise**2 * np.exp(NEAR_LIMIT))
     right, wrong = np.log1p(-eps)[tracks.view], np.log(eps)[tracks.view]
-    subsets = tracks.subsets.astype(np.float64)
     log, square, values, followed = _of_subsets(tracks, residual, noise, area)
     both = [log]
     if moved is not None:
@@ -298,7 +299,7 @@ class Mixture:
                 kinds = zip(seen.kinds, self.beside, strict=True)
                 self.curvature = [self._curvature(kind.weight, beside) for kind, beside in kinds]
             matrix = self._matrix()
-            factor = cho_factor(matrix, lower=True, check_finite=False)
+            factor = cho_factor(matrix.T, lower=True, overwrite_a=True, check_finite=False)  # as LAPACK has it
             if is_new:
                 inverse = np.tril(dtrtri(factor[0], lower=1)[0])
                 known = len(matrix) - float((inverse**2).sum(axis=0) @ self.precision)
@@ -370,7 +371,7 @@ class Mixture:
             square, often = one.sums
             squares += square
             freedom += float(often @ (2 * tracks.subsets.sum(axis=1) - 3))
-            right[tracks.rows] = one.of_subset @ tracks.subsets.astype(np.float64)
+            right[tracks.rows] = one.of_subset @ tracks.subsets
             pull[:, tracks.rows] = one.pull(tracks).reshape(count, n, 2).transpose(2, 0, 1)
         return _Kind(tuple(one.of_subset for one in found), right, pull, squares, freedom)
 
@@ -439,16 +440,17 @@ class Mixture:
     def _of_cameras(self, weight: Array) -> Array:
         """Return the normal matrix (N q, N q) of the cameras' unknowns, of weights (M, 2, 2) of pairs."""
         linear, (views, q), pairs = self.linear, self.linear.shape, self.linear.pairs
-        out, at = np.zeros((views, q, views, q)), pairs.bounds
+        sums, at = np.empty((len(pairs.views), q, q)), pairs.bounds
         starts = at[np.searchsorted(at, np.arange(0, at[-1] + CHUNK, CHUNK), side="right").clip(1) - 1]
         for start, stop in pairwise(np.unique([*starts.tolist(), at[-1]]).tolist()):
             part = slice(start, stop)
-            left = linear.by_row[pairs.first[part]].reshape(-1, q).T
-            right = (weight[pairs.order[part]] @ linear.by_row[pairs.second[part]]).reshape(-1, q)
-            kinds = slice(*np.searchsorted(at, [start, stop]).tolist())
-            ends = 2 * (at[kinds.start : kinds.stop + 1] - start)
-            for (one, other), (a, b) in zip(pairs.views[kinds].tolist(), pairwise(ends.tolist()), strict=True):
-                sums = left[:, a:b] @ right[a:b]
-                out[one, :, other] = sums
-                out[other, :, one] = sums.T
+            left = linear.by_row.take(pairs.first[part], axis=0).reshape(-1, q).T
+            second = linear.by_row.take(pairs.second[part], axis=0)
+            right = (weight.take(pairs.order[part], axis=0) @ second).reshape(-1, q)
+            first, last = np.searchsorted(at, [start, stop]).tolist()
+            for n, (a, b) in enumerate(pairwise((2 * (at[first : last + 1] - start)).tolist()), first):
+                np.matmul(left[:, a:b], right[a:b], out=sums[n])
+        out, (one, other) = np.zeros((views, q, views, q)), pairs.views.T
+        out[one, :, other, :] = sums
+        out[other, :, one, :] = sums.swapaxes(1, 2)
         return out.reshape(views * q, -1)

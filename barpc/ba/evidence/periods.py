@@ -71,17 +71,18 @@ class _Rows:
     def __init__(self, row: Array, rows: float, right: Array, off: Array) -> None:
         self.row, self.off, self.right = row, off, right
         self.bins = int(np.ceil(rows / _BIN))
-        self.last = rows / _SHORTEST
-        self.waves = np.arange(int(_FINE * self.last)) / _FINE  # of an image
+        self.waves = np.arange(int(_FINE * rows / _SHORTEST)) / _FINE  # of an image
         self.first = int(np.ceil(_FINE * _FEWEST))
 
     def largest(self, costs: float) -> tuple[float, float] | None:
         """Return the period, and minus the logarithm of its chance at one frequency; None below `costs`."""
         gain = self._spectrum(self.off)
+        if _worth(gain.max(initial=0.0)) <= costs:
+            return None
         band = np.floor(2.0 * np.log2(self.waves[self.first :]))
         starts = self.first + np.flatnonzero(np.diff(band, prepend=-1.0))
         best = None
-        for start, stop in pairwise([*starts.tolist(), len(gain)] if _worth(gain.max(initial=0.0)) > costs else []):
+        for start, stop in pairwise([*starts.tolist(), len(gain)]):
             k = start + int(gain[start:stop].argmax())
             if _worth(gain[k]) > max(costs, 0.0 if best is None else best[1]):
                 period = self.bins * _BIN / (self.waves[k] + _vertex(gain, k) / _FINE)
@@ -92,22 +93,20 @@ class _Rows:
 
     def _spectrum(self, off: Array) -> Array:
         """Return the half the chi-square that a cosine and a sine of both coordinates take away, by frequency."""
-        right, last = self.right, int(_FINE * self.last)
+        right, last = self.right, len(self.waves)
         centred = (off - (off @ right / right.sum())[:, None]) * right
         spread = centred @ centred.T / right.sum()  # what noise leaves of it once points have followed
         spread[np.diag_indices(2)] += 1e-9 * np.trace(spread) + 1e-30
+        alike = np.linalg.cholesky(np.linalg.inv(spread)).T @ centred  # what noise leaves alike in every direction
         at = (self.row / _BIN).astype(np.int64).clip(0, self.bins - 1)
-        sums = np.array([np.bincount(at, weight, self.bins) for weight in (*centred, right)])
-        col, along, count = np.fft.rfft(sums, _FINE * self.bins, axis=1)
-        half, twice = 0.5 * right.sum(), 0.5 * count[: 2 * last : 2]
-        cos, sin, both = half + twice.real, half - twice.real, twice.imag
-        determinant = np.maximum(cos * sin - both**2, 1e-12 * half**2)
-        lower = np.linalg.cholesky(np.linalg.inv(spread))
-        gain = np.zeros(last)
-        for weights in lower.T:  # of what noise leaves alike in every direction
-            one = weights[0] * col[:last] + weights[1] * along[:last]
-            gain += sin * one.real**2 - 2.0 * both * one.real * one.imag + cos * one.imag**2
-        return np.asarray(0.5 * gain / determinant)
+        sums = np.array([np.bincount(at, weight, self.bins) for weight in alike])
+        found = np.fft.rfft(sums, _FINE * self.bins, axis=1)[:, :last]
+        real, imag = found.real.copy(), found.imag.copy()
+        count = np.fft.rfft(np.bincount(at, right, self.bins), _FINE // 2 * self.bins)[:last]  # of twice the frequency
+        half, twice, both = 0.5 * right.sum(), 0.5 * count.real, 0.5 * count.imag
+        determinant = np.maximum(half**2 - twice**2 - both**2, 1e-12 * half**2)
+        gain = (half - twice) * (real * real).sum(axis=0) + (half + twice) * (imag * imag).sum(axis=0)
+        return np.asarray((0.5 * gain - both * (real * imag).sum(axis=0)) / determinant)
 
     def _level(self, k: int, period: float) -> float:
         """Return the level of the spectrum beside a peak over that of noise, the peak taken away: at least 1."""

@@ -92,16 +92,10 @@ def fade(seen: Seen, interval: Interval) -> list[Explanation]:
             halved = np.arange(np.ceil(np.log2(max(2.0 * (stop - start) / own, 1.0))) + 1.0)
             for length in (stop - start) * 0.5**halved if stop > start else ():
                 one = _local(FADE, seen, interval.view, (1, *ends, origin, sign / float(length)), FIRST_SIGMA)
-                cost = first_guess(seen.few, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2]
-                tried.append((cost - _untouched(seen, one), one))
+                # less than without it: others may be touched by another
+                tried.append((first_guess(seen.few, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2], one))
         found += [min(tried, key=lambda row: row[0])[1]] if tried else []
     return found
-
-
-def _untouched(seen: Seen, one: Explanation) -> float:
-    """Return the cost of the same tracks without an explanation: others may be touched by another."""
-    nothing = np.full(len(one.sigma), 1e18)
-    return first_guess(seen.few, seen.base, seen.extra, one.extra, nothing)[2]
 
 
 def _local(kind: str, seen: Seen, view: int, where: Where, sigma: float) -> Explanation:
@@ -121,10 +115,7 @@ def settling(seen: Seen, _interval: Interval) -> list[Explanation]:
     """
     shapes = [sign / length for sign in (1.0, -1.0) for length in _LENGTHS * float(np.median(seen.size[1]))]
     tried = [_settling(seen, rate, FIRST_SIGMA) for rate in shapes]
-    costs = [
-        first_guess(seen.few, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2] - _untouched(seen, one)
-        for one in tried
-    ]
+    costs = [first_guess(seen.few, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2] for one in tried]
     return [tried[int(np.argmin(costs))]]
 
 

@@ -35,7 +35,7 @@ from barpc.ba.judging.moving import Found, Ground, Motion, group_of
 from barpc.ba.robust.rounds import Outcome, revived
 from barpc.ba.robust.weights import Observations
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import BACKFITTING, KEPT, LARGEST, RIVALS, SAMPLE, SMALL, SURE, TRIED
+from barpc.ba.usual import BACKFITTING, KEPT, LARGEST, RIVALS, SAMPLE, SMALL, STANDS, SURE, TRIED
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
@@ -428,14 +428,16 @@ class _Search:
     def _sharpened(self, one: Explanation, found: Fit) -> tuple[Explanation, Fit]:
         for _ in range(BACKFITTING):
             others = np.einsum("cek,e->ck", self.seen.extra, found.extra[: -len(one.sigma)])
-            tried = [one, faster(one, self._fit(bent(self.seen, one)))] if one.kind in (FADE, SETTLING) else [one]
-            again = [sharpened(self.seen, shape, found, others) for shape in tried]
-            better, made = max(
-                ((self._fit(shape, base=found), shape) for shape in again), key=lambda row: row[0].evidence
-            )
+            tried = [faster(one, self._fit(bent(self.seen, one))), one] if one.kind in (FADE, SETTLING) else [one]
+            better, made = found, one
+            for shape in tried:
+                again = sharpened(self.seen, shape, found, others)
+                # what is as it was gains no more than another did
+                if better.evidence < found.evidence + SETTLED or not _stands(again, one):
+                    fitted = self._fit(again, base=found)
+                    better, made = (fitted, again) if fitted.evidence > better.evidence else (better, made)
             more = better.evidence - found.evidence
-            if more > 0.0:
-                one, found = made, better
+            one, found = made, better
             if more < SETTLED:
                 break
         return one, found
@@ -444,6 +446,11 @@ class _Search:
         seen, sigma = self.seen, np.append(self.seen.sigma, one.sigma)
         extra = np.concatenate([seen.extra, one.extra], axis=1)
         return fit(linear or seen.linear, extra, sigma, base or seen.base, one.group)
+
+
+def _stands(one: Explanation, before: Explanation) -> bool:
+    """Return whether an explanation is where it was, with a prior about as wide."""
+    return one.where == before.where and bool((np.abs(np.log(one.sigma / before.sigma)) < STANDS).all())
 
 
 def _amplitude(unknowns: Array) -> Array:

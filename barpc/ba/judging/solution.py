@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from barpc.ba.estimated.priors import DRIFT_SIGMA
+from barpc.ba.estimated.projected import Projected
 from barpc.ba.held.block import Block, first_state, make_problem
 from barpc.ba.held.ground import Heights, staying
 from barpc.ba.held.incremental import BlockPrior
@@ -48,6 +49,7 @@ class Solution:
     asked: Mapping[str, SmoothTest] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()  # what explains ties beside the cameras, the first taken first
     agreed: Agreement | None = None  # which control points hold it
+    by_point: Array | None = None  # (2, 3, K) derivatives at the start [px/m], where they were kept
 
     @property
     def final(self) -> State:
@@ -74,10 +76,22 @@ class Solution:
         """
         points, shown, weak = self.final.points, self.outcome.residual + self.problem.xy, self.heights.weak
         mended = replace(self.problem, xy=shown, point_prior=staying(points, np.flatnonzero(some & weak)))
-        delivered = self.problem.camera_prior.mean
         points = np.where(weak[:, None], points, self.state.points)  # from there it is linear
-        points = mended.triangulate(points, mended.project_points(delivered, points), block.use / block.sigma)
+        points = mended.triangulate(points, self._as_delivered(points), block.use / block.sigma)
         return np.where(some[:, None], points, np.nan)
+
+    def _as_delivered(self, points: Array) -> Projected:
+        """Return the projection by the delivered cameras of points (P, 3) of which only weak ones have moved."""
+        problem, delivered = self.problem, self.problem.camera_prior.mean
+        if self.by_point is None:
+            return problem.project_points(delivered, points)
+        image, by_point, structure = self.before + problem.xy, self.by_point.copy(), problem.structure
+        rows = np.flatnonzero(self.heights.weak[structure.point])
+        if len(rows):
+            part, bounds = problem.cameras.seeing(problem.xy[:, rows]), np.searchsorted(rows, structure.bounds)
+            moved = part.project(delivered, structure.of_points(points)[:, rows], bounds, "points")
+            image[:, rows], by_point[..., rows] = moved.image, moved.by_point
+        return Projected(image, by_point, by_point[:, :0])
 
     @property
     def has_trend(self) -> bool:
@@ -123,6 +137,7 @@ def solve_block(
     start = measure(problem, state.params, outer)
     rounds = Rounds(problem, block, state, heights, block.use)
     before, agreed, free = rounds.residual, None, None
+    by_point = None if rounds.projected is None else rounds.projected.by_point.copy()
     if block.gcps.names and not (block.point < block.num_tracks).any():  # control is all that holds the cameras
         agreed, heights = _with_control(block, given, rounds.run(once=True))
         rounds = Rounds(problem, block, state, heights, block.use)
@@ -142,10 +157,10 @@ def solve_block(
         asked = {"drift": outcome.smooth}
         problem, outcome = bent, Rounds(bent, block, there, heights, outcome.inlier).run()
     if block.gcps.names and agreed is None:
-        free = Solution(problem, state, before, heights, outcome, start, start, None, asked)
+        free = Solution(problem, state, before, heights, outcome, start, start, None, asked, by_point=by_point)
         agreed, heights = _with_control(block, given, outcome)
         outcome = Rounds(problem, block, outcome.minimum.state, heights, block.use, outcome).run()
-    first = Solution(problem, state, before, heights, outcome, start, start, None, asked, agreed=agreed)
+    first = Solution(problem, state, before, heights, outcome, start, start, None, asked, (), agreed, by_point)
     found = finished(first, problem, block, outer, options, outcome)
     return found if free is None or not found.heights.has_control else _untorn(found, free, block, outer, options)
 

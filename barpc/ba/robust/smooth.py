@@ -134,7 +134,7 @@ class Smooth:
 
     def _terms(self, rows: slice) -> Array:
         col, row = self._col[rows], self._row[rows]
-        return np.vstack([bsplines(row, SPLINES), col, col**2, col**3, row * col])
+        return np.vstack([bsplines(row, SPLINES), col, col * col, col * col * col, row * col])
 
     def part(self, residual: Array, weight: Array, fit: Fit | None = None) -> Array:
         """Return the smooth part (2, K) of residuals (2, K) [px], fitted with weights (K,) >= 0.
@@ -177,34 +177,36 @@ class Smooth:
 
     def test_neighbours(self, tested: SmoothTest, residual: Array, use: BoolArray) -> SmoothTest:
         """Test the same with what neighbours share, in views in which something was fitted."""
-        shared, use = np.zeros_like(tested.rms), use & self._tells
-        for v in np.flatnonzero(np.isfinite(tested.by_row)):
-            shared[v] = self._shared(slice(*self.structure.bounds[v : v + 2]), residual, use)
+        kept = np.flatnonzero(use & self._tells & np.isfinite(tested.by_row)[self.structure.view])
+        shared, view = np.zeros_like(tested.rms), self.structure.view[kept]
+        last = view[1:]
+        pairs = (last == view[:-1]).astype(np.float64)  # of neighbours in one view
+        count = np.maximum(self._sums(last, pairs), 1.0)
+        apart = view * (np.ptp(self._place) + 1.0)
+        for place in self._place[:, kept]:
+            order = kept[np.argsort(apart + place, kind="stable")]
+            ordered, told = residual[:, order], count
+            product = (ordered[:, 1:] * ordered[:, :-1]).sum(axis=0)
+            if self.alike is not None:
+                product, told = self._beyond_noise(product, (ordered**2).sum(axis=0), order, pairs)
+            mean = self._sums(last, product * pairs) / count
+            scatter = np.sqrt(self._sums(last, (product - mean[last]) ** 2 * pairs) / count)
+            sure = mean > OUTLIER * scatter / np.sqrt(np.maximum(told, 1.0))
+            shared = np.maximum(shared, np.sqrt(np.where(sure, mean, 0.0)))
         return replace(tested, shared=shared)
 
-    def _shared(self, rows: slice, residual: Array, use: BoolArray) -> float:
-        """Return the root of the mean product of neighbours' residuals [px], along the rows or the columns."""
-        kept = np.arange(rows.start, rows.stop)[use[rows]]
-        most = 0.0
-        for place in self._place[:, kept]:
-            order = kept[np.argsort(place, kind="stable")]
-            ordered = residual[:, order]
-            product, count = (ordered[:, 1:] * ordered[:, :-1]).sum(axis=0), len(order) - 1.0
-            if self.alike is not None:
-                product, count = self._beyond_noise(product, (ordered**2).sum(axis=0), order)
-            if product.mean() > OUTLIER * product.std() / np.sqrt(max(count, 1.0)):
-                most = max(most, float(np.sqrt(product.mean())))
-        return most
+    def _sums(self, view: IntArray, values: Array) -> Array:
+        return np.asarray(np.bincount(view, values, self.structure.num_views))
 
-    def _beyond_noise(self, product: Array, square: Array, order: IntArray) -> tuple[Array, float]:
-        """Return the products (n - 1,) of neighbours (n,) beyond the noise that they share; their number."""
+    def _beyond_noise(self, product: Array, square: Array, order: IntArray, pairs: Array) -> tuple[Array, Array]:
+        """Return the products (n - 1,) of neighbours (n,) beyond the noise that they share; their numbers (N,)."""
         assert self.alike is not None
         first, second = order[:-1], order[1:]
-        same = self.alike.correlation(first, second)
+        view, same = self.structure.view[second], self.alike.correlation(first, second)
         weight = np.sqrt(self.alike.precision[first] * self.alike.precision[second])
         beyond = weight * (product - same * 0.5 * (square[1:] + square[:-1]))
-        size = max(float((weight * (1.0 - same)).mean()), 1e-12)
-        return beyond / size, float(self.alike.share[second].sum())
+        size = self._sums(view, weight * (1.0 - same) * pairs) / np.maximum(self._sums(view, pairs), 1.0)
+        return beyond / np.maximum(size, 1e-12)[view], self._sums(view, self.alike.share[second] * pairs)
 
     def fit(self, residual: Array, weight: Array) -> Fit:
         """Fit the smooth part of the residuals, of views with enough observations that count."""

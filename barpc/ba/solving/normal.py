@@ -9,6 +9,7 @@ points: they couple all cameras, so that what they take off S stays apart from i
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import scipy.linalg as la
@@ -284,9 +285,8 @@ def _pair_blocks(structure: Structure, cross: Array) -> Array:
         rows = slice(base, bounds[stop])  # "clip": indices are right, and unchecked they are taken faster
         first = cross.take(structure.first[rows], axis=0, mode="clip").reshape(-1, q)
         second = cross.take(structure.second[rows], axis=0, mode="clip").reshape(-1, q)
-        for n in range(m, stop):
-            part = slice(3 * (bounds[n] - base), 3 * (bounds[n + 1] - base))
-            np.matmul(first[part].T, second[part], out=out[n])
+        for n, (a, b) in enumerate(pairwise((3 * (bounds[m : stop + 1] - base)).tolist()), m):
+            np.matmul(first[a:b].T, second[a:b], out=out[n])
         m = stop
     return np.negative(out, out=out)
 
