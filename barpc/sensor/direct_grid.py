@@ -202,25 +202,30 @@ def linear_axes(
 ) -> list[Array]:
     """Return the nodes along each axis of a box `low`, `high` (d,) for linear interpolation within a tolerance.
 
-    The error along each axis is measured at random places of random cells, whose phase no wave can hide in.
+    The error along each axis is measured at random places of random cells, whose phase no wave can hide in; what few
+    cells show is more than the tolerance ends a trial, what is within it all of them say.
 
     Parameters
     ----------
-    value : callable, points (N, d) -> values (N, k), in the unit of `tolerance`
+    value : callable, points (..., d) -> values (..., k), in the unit of `tolerance`
     longest : (d,), cells at the beginning; they are made smaller until the errors of all axes add up to `tolerance`
     """
     counts = np.maximum(_FEWEST, np.ceil((high - low) / longest)).astype(np.int64)
     for axis in range(len(low)):
-        rng, along = np.random.default_rng(axis), np.eye(len(low))[axis]
+        rng, along, tried = np.random.default_rng(axis), np.eye(len(low))[axis], _TRIED // 10
         while True:
             step = (high - low) / counts * along
-            first, t = low + (high - low - step) * rng.random((_TRIED, len(low))), rng.random((_TRIED, 1))
-            miss = (1 - t) * value(first) + t * value(first + step) - value(first + t * step)
+            first, t = low + (high - low - step) * rng.random((tried, len(low))), rng.random((tried, 1))
+            begin, end, between = value(np.stack([first, first + step, first + t * step]))
+            miss = (1 - t) * begin + t * end - between
             worst = float(np.linalg.norm(miss, axis=1).max())
             if not np.isfinite(worst):
                 raise RpcError("localisation grid: the camera has no ground point in part of the image")
             if worst <= tolerance / len(low) or counts[axis] >= _CELLS:
-                break
+                if tried == _TRIED:
+                    break
+                tried = _TRIED
+                continue
             more = min(4.0, max(1.25, 1.1 * (worst * len(low) / tolerance) ** 0.5))
             counts[axis] = min(_CELLS, int(np.ceil(counts[axis] * more)))
     if np.prod(counts + 1.0) > _NODES:

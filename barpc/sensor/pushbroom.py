@@ -25,12 +25,13 @@ from barpc.base.geodesy import (
     NEWTON_STEPS,
     SETTLED,
     SPEED_OF_LIGHT,
+    WGS84_A,
+    WGS84_B,
     Array,
     ecef_from_ground,
     ecef_from_ground_jacobian,
     ground_from_ecef,
     reach,
-    up,
     wrap_longitude,
 )
 from barpc.sensor import Pointwise
@@ -38,6 +39,7 @@ from barpc.sensor.curve import EXTRAPOLATION, Curve, Turn, cross
 
 _AIR = 2.316  # m: of refraction at sea level, times tan z / cos^2 z of the zenith distance z (Noerdlinger 1999)
 _AIR_HEIGHT = 8000.0  # m: in which the air thins to 1/e
+_ELLIPSOID = np.array([[WGS84_A], [WGS84_A], [WGS84_B]]) ** -2.0  # its quadric grows along the vertical
 _BENDS = 3  # light is bent by 3e-5: each step gains four digits
 _GRAZING = 0.1  # cosine of the zenith distance below which refraction is not this simple
 
@@ -76,12 +78,20 @@ class Light:
         return out
 
     def _lift(self, ecef: Array, sight: Array) -> tuple[Array, Array]:
-        """Return the apparent displacement by refraction (3, N) [m], and the vertical (3, N); NaN near the horizon."""
-        ground = ground_from_ecef(ecef.T)
-        vertical, along = up(ground), sight / np.sqrt((sight * sight).sum(axis=0))
+        """Return the apparent displacement by refraction (3, N) [m], and the vertical (3, N); NaN near the horizon.
+
+        Altitudes are of the quadric through a point, to 1e-4 m up to 9 km; verticals of where it stands on the ground.
+        """
+        vertical = ecef * _ELLIPSOID
+        level = np.sqrt((ecef * vertical).sum(axis=0))
+        length = np.sqrt((vertical * vertical).sum(axis=0))
+        alt = (level - 1.0) * level / length
+        vertical = (ecef - (alt / length) * vertical) * _ELLIPSOID
+        vertical = vertical / np.sqrt((vertical * vertical).sum(axis=0))
+        along = sight / np.sqrt((sight * sight).sum(axis=0))
         cosine = -(vertical * along).sum(axis=0)
         with np.errstate(all="ignore"):
-            size = _AIR * np.exp(-ground[:, 2] / _AIR_HEIGHT) / cosine**3
+            size = _AIR * np.exp(-alt / _AIR_HEIGHT) / cosine**3
         return (along + cosine * vertical) * np.where(cosine > _GRAZING, size, np.nan), vertical
 
 

@@ -102,18 +102,18 @@ class PixelReader(ExitStack):
         self, path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None, thin: int = 1
     ) -> None:
         super().__init__()
-        self._band, self._dataset = band, self.enter_context(open_raster(path))
-        wide, high = _pixel(self._dataset, size)
+        dataset = self.enter_context(open_raster(path))
+        wide, high = _pixel(dataset, size)
         self._pixel = thin * wide, thin * high
         try:
-            _check_band(self._dataset, path, band)
+            self._band = _Band.of(dataset, path, band)
         except ImageError:
             self.close()
             raise
 
     def read(self, box: Box) -> tuple[Pixels, BoolArray]:
         """Read the pixels of a window and the mask of valid ones."""
-        return _averaged(self._dataset, box, self._band, self._pixel)
+        return _averaged(self._band, box, self._pixel)
 
 
 def _pixel(dataset: Any, size: tuple[int, int] | None) -> tuple[int, int]:
@@ -122,15 +122,15 @@ def _pixel(dataset: Any, size: tuple[int, int] | None) -> tuple[int, int]:
     return max(1, dataset.width // width), max(1, dataset.height // height)
 
 
-def _averaged(dataset: Any, box: Box, band: int, pixel: tuple[int, int], level: int = 1) -> tuple[Pixels, BoolArray]:
+def _averaged(band: _Band, box: Box, pixel: tuple[int, int], level: int = 1) -> tuple[Pixels, BoolArray]:
     """Return the pixels of a window whose sides hold so many of the file's, as means; valid where all of these are."""
     if pixel == (1, 1):
-        return _read(dataset, box, band, level)
+        return band.read(box, level)
     (col, row, width, height), (wide, high), parts = box, pixel, []
     step = max(1, SPAN // high)
     for top in range(row, row + height, step):
         rows = min(step, row + height - top)
-        raw, known = _read(dataset, (wide * col, high * top, wide * width, high * rows), band)
+        raw, known = band.read((wide * col, high * top, wide * width, high * rows))
         raw /= wide * high  # before the sum: it might have no number
         mean = cv2.resize(raw, (width, rows), interpolation=cv2.INTER_AREA) * raw.dtype.type(wide * high)
         parts.append((mean, known.reshape(rows, high, width, wide).all(axis=(1, 3))))
@@ -139,49 +139,56 @@ def _averaged(dataset: Any, box: Box, band: int, pixel: tuple[int, int], level: 
     return pixels, valid
 
 
-def _check_band(dataset: Any, path: str | os.PathLike[str], band: int) -> None:
-    if not 1 <= band <= dataset.count:
-        raise ImageError(f"{os.fspath(path)}: there is no band {band}, only {dataset.count}")
-    if dataset.dtypes[band - 1].startswith("complex"):
-        raise ImageError(f"{os.fspath(path)}: band {band} is complex; give its amplitude as an image")
+@dataclass(frozen=True, eq=False)
+class _Band:
+    """A band of an open raster, and what is known of all its windows."""
 
+    dataset: Any
+    number: int
+    nodata: float | None  # of the raster
+    invalid: float | None  # the value of the band's pixels that are none
+    by_value: bool  # values alone tell which pixels are valid: GDAL would decode a window again for its mask
 
-def _read(dataset: Any, box: Box, band: int, zoom: int = 1) -> tuple[Pixels, BoolArray]:
-    """Return the pixels of a window, of every `zoom` a side one; above 1 only where the file holds that level."""
-    window = Window(*box)
-    more: dict[str, Any] = {"out_shape": (box[3] // zoom, box[2] // zoom)} if zoom > 1 else {}
-    raw = dataset.read(band, window=window, **more)
-    whole = raw.dtype.kind in "iu"
-    single = raw.dtype.kind != "f" and np.can_cast(raw.dtype, np.float32)
-    pixels: Pixels = raw.astype(np.float32 if single else np.float64)
-    valid = _mask(dataset, band, raw) if whole else None
-    if valid is None:
-        valid = dataset.read_masks(band, window=window, **more) != 0
-    valid &= raw < np.iinfo(raw.dtype).max if whole else np.isfinite(pixels)
-    if whole and dataset.nodata is None and not raw.all():
-        # zeros without a name: a border where they stand together
-        cv2.setNumThreads(1)  # the work is spread by processes
-        zeros = cv2.morphologyEx((raw == 0).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
-        valid &= zeros == 0
-    if not valid.all():
-        pixels[~valid] = 0.0
-    return pixels, valid
+    @classmethod
+    def of(cls, dataset: Any, path: str | os.PathLike[str], number: int) -> _Band:
+        """Return a band, from 1; there is none, or of complex numbers: ImageError."""
+        if not 1 <= number <= dataset.count:
+            raise ImageError(f"{os.fspath(path)}: there is no band {number}, only {dataset.count}")
+        if dataset.dtypes[number - 1].startswith("complex"):
+            raise ImageError(f"{os.fspath(path)}: band {number} is complex; give its amplitude as an image")
+        flags = dataset.mask_flag_enums[number - 1]
+        invalid = dataset.nodatavals[number - 1] if MaskFlags.nodata in flags else None
+        told = getattr(dataset, "driver", None) is not None and flags in ([MaskFlags.nodata], [MaskFlags.all_valid])
+        return cls(dataset, number, dataset.nodata, invalid, told)
 
-
-def _mask(dataset: Any, band: int, raw: npt.NDArray[Any]) -> BoolArray | None:
-    """Return the mask of valid whole numbers, where values alone tell: GDAL would decode the window again."""
-    flags = dataset.mask_flag_enums[band - 1]
-    if getattr(dataset, "driver", None) is None or flags not in ([MaskFlags.nodata], [MaskFlags.all_valid]):
-        return None
-    out: BoolArray = raw != dataset.nodatavals[band - 1] if MaskFlags.nodata in flags else np.ones(raw.shape, bool)
-    return out
+    def read(self, box: Box, zoom: int = 1) -> tuple[Pixels, BoolArray]:
+        """Return the pixels of a window, of every `zoom` a side one; above 1 only where the file holds that level."""
+        window = Window(*box)
+        more: dict[str, Any] = {"out_shape": (box[3] // zoom, box[2] // zoom)} if zoom > 1 else {}
+        raw = self.dataset.read(self.number, window=window, **more)
+        whole = raw.dtype.kind in "iu"
+        single = raw.dtype.kind != "f" and np.can_cast(raw.dtype, np.float32)
+        pixels: Pixels = raw.astype(np.float32 if single else np.float64)
+        valid = raw < np.iinfo(raw.dtype).max if whole else np.isfinite(pixels)
+        if not (whole and self.by_value):
+            valid &= self.dataset.read_masks(self.number, window=window, **more) != 0
+        elif self.invalid is not None:
+            valid &= raw != self.invalid
+        if whole and self.nodata is None and not raw.all():
+            # zeros without a name: a border where they stand together
+            cv2.setNumThreads(1)  # the work is spread by processes
+            zeros = cv2.morphologyEx((raw == 0).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+            valid &= zeros == 0
+        if not valid.all():
+            pixels[~valid] = 0.0
+        return pixels, valid
 
 
 def sample_stretch(path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None) -> Stretch | None:
     """Estimate the stretch, 0.5 to 99.5 %, of a raster (or its picture); None where nothing varies."""
     found: list[Array] = []
     with open_raster(path) as dataset:
-        _check_band(dataset, path, band)
+        read = _Band.of(dataset, path, band)
         kind = np.dtype(dataset.dtypes[band - 1])
         pixel, (width, height) = _pixel(dataset, size), size or (dataset.width, dataset.height)
         zoom = _level(dataset, band) if pixel == (1, 1) else 1
@@ -189,7 +196,7 @@ def sample_stretch(path: str | os.PathLike[str], band: int = 1, size: tuple[int,
         for row in np.linspace(0, height - side_y, _SAMPLES).astype(int):
             for col in np.linspace(0, width - side_x, _SAMPLES).astype(int):
                 box = int(col), int(row), side_x, side_y
-                pixels, valid = _averaged(dataset, box, band, pixel, zoom)
+                pixels, valid = _averaged(read, box, pixel, zoom)
                 found.append(pixels[valid][::7].astype(np.float64))
     values = np.concatenate(found)
     low, high = np.percentile(values, [0.5, 99.5]) if len(values) else (0.0, 0.0)
@@ -237,13 +244,13 @@ def read_picture(
     valid = np.empty(picture.shape, dtype=bool)
     level = zoom if found.levels else 1
     with open_raster(path) as dataset:
-        _check_band(dataset, path, band)
+        read = _Band.of(dataset, path, band)
         step = zoom * found.block[1]
         step *= max(1, SPAN // step)
         top = row
         while top < row + height:
             stop = min(row + height, (top // step + 1) * step)
-            pixels, known = _averaged(dataset, (col, top, width, stop - top), band, found.pixel, level)
+            pixels, known = _averaged(read, (col, top, width, stop - top), found.pixel, level)
             part = slice((top - row) // zoom, (stop - row) // zoom)
             picture[part], valid[part] = _reduced(found.stretch.apply(pixels, known), known, zoom // level)
             top = stop

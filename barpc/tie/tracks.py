@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -125,8 +125,9 @@ def _registered(
     structural = [ends for ends, _, report in tried if report.matcher in (STRUCTURE, FINE)]
     theirs = {looks.ends[views] for views in scope.given}
     verified = {ends: found for ends, found, _ in tried if len(found)}
-    structural += _unlike(looks.views, {p: verified[p] for p in theirs & set(verified)}, options, work)
     tracks = refine(looks.views, linked, spreads, options, structural=structural, work=work)
+    if unlike := _unlike(linked, tracks, sorted(theirs & set(verified))):
+        tracks = refine(looks.views, linked, spreads, options, structural=[*structural, *unlike], work=work)
     needed = theirs | _needed(looks, tracks, list(verified), options)
     known = {ends: found for ends, found in verified.items() if ends in needed}
     exact, tracks = pair_counts(tracks), _with_unregistered(looks.views, tracks, known, options)
@@ -244,13 +245,10 @@ class _Trials:
         return [found[pair.views] for pair in pairs]
 
 
-def _unlike(views: Sequence[View], given: GivenMatches, options: TieOptions, work: Work) -> list[tuple[int, int]]:
-    """Return the given pairs whose grey values do not compare: too few matches could be registered by these."""
-    some = {pair: m.select(np.linspace(0, len(m) - 1, min(len(m), THIN)).astype(int)) for pair, m in given.items()}
-    linked = link([*some], [*some.values()])
-    before, after = pair_counts(linked), pair_counts(refine(views, linked, {}, options, work=work))
-    shares = {pair: after.get(pair, 0) / max(before.get(pair, 0), 1) for pair in given}
-    return [pair for pair, share in shares.items() if share < 0.5 and share * len(given[pair]) < THIN]
+def _unlike(linked: Tracks, registered: Tracks, pairs: Collection[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the pairs whose grey values do not compare: too few of their matches could be registered by these."""
+    before, after = pair_counts(linked), pair_counts(registered)
+    return [pair for pair in pairs if after.get(pair, 0) < min(0.5 * before.get(pair, 0), THIN)]
 
 
 def _with_unregistered(views: Sequence[View], tracks: Tracks, given: GivenMatches, options: TieOptions) -> Tracks:

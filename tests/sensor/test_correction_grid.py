@@ -75,7 +75,7 @@ def test_no_wave_hides_between_the_nodes(period):
 
 def test_a_step_between_detectors_is_met_as_near_as_nodes_may_stand():
     def stepped(points):
-        return np.where(points[:, :1] < 3141.5, 0.0, 0.1) * np.ones(2)
+        return np.where(points[..., :1] < 3141.5, 0.0, 0.1) * np.ones(2)
 
     cols, rows = linear_axes(stepped, np.zeros(2), np.full(2, 8000.0), np.full(2, 1024.0), LINEAR)
     assert len(cols) == 1025
@@ -85,7 +85,7 @@ def test_a_step_between_detectors_is_met_as_near_as_nodes_may_stand():
 @pytest.mark.slow
 def test_a_grid_of_millions_of_nodes_is_not_made():
     def noise(points):
-        return np.sin(1e4 * points[:, :1] * points[:, 1:2]) * np.sin(77.0 * points[:, 2:])
+        return np.sin(1e4 * points[..., :1] * points[..., 1:2]) * np.sin(77.0 * points[..., 2:])
 
     axes = linear_axes(noise, np.zeros(3), np.full(3, 8000.0), np.full(3, 1000.0), 1e-6)
     assert np.prod([len(axis) for axis in axes]) < 4.2e6

@@ -184,7 +184,7 @@ def test_an_axis_has_as_many_nodes_as_its_bend_asks_for_and_few_more(bend, toler
     """Of two axes each may take half of the tolerance; the second is straight and keeps the longest cells."""
 
     def value(points):
-        return bend / 2 * points[:, :1] ** 2 + 0.3 * points[:, 1:] - 7.0
+        return bend / 2 * points[..., :1] ** 2 + 0.3 * points[..., 1:] - 7.0
 
     bent, straight = linear_axes(
         value, np.array([-100.0, 50.0]), np.array([8092.0, 4146.0]), np.array([1024.0, 1000.0]), tolerance
@@ -210,7 +210,7 @@ def test_the_errors_of_all_values_count_together():
     """Of (x^2, x^2) the error is larger by the root of two than that of x^2 alone."""
     low, high, longest = np.zeros(1), np.full(1, 8192.0), np.full(1, 1024.0)
     one = linear_axes(lambda p: 1e-6 * p**2, low, high, longest, 0.005)[0]
-    both = linear_axes(lambda p: 1e-6 * np.hstack([p**2, p**2]), low, high, longest, 0.005)[0]
+    both = linear_axes(lambda p: 1e-6 * np.concatenate([p**2, p**2], axis=-1), low, high, longest, 0.005)[0]
     assert len(one) < len(both) < 1.35 * len(one)
 
 
@@ -218,7 +218,7 @@ def test_more_nodes_than_millions_are_bought_off_by_twice_the_tolerance():
     """Waves that would take 260 cells along each axis: the promise is loosened until four million nodes do."""
 
     def value(points):
-        return np.sin(points).sum(axis=1, keepdims=True)
+        return np.sin(points).sum(axis=-1, keepdims=True)
 
     def nodes(tolerance):
         axes = linear_axes(value, np.zeros(3), np.full(3, 60.0), np.full(3, 60.0), tolerance)

@@ -164,23 +164,23 @@ def test_a_view_that_cannot_be_registered_joins_the_points_that_the_others_are_r
 
 
 def test_no_more_is_read_for_matches_of_others_than_patches_about_them(render, tmp_path, monkeypatch) -> None:
-    """Of nine million pixels an image the corner that the points stand in, once to see how and once to register."""
+    """Of nine million pixels an image the corner that the points stand in, once."""
     scene = render(views=2, size=(300, 300))
     large = []
     for view in scene.views:
         with open_raster(view.path) as image:
             path = write_image(tmp_path / f"{view.name}.tif", np.tile(image.read(1), (10, 10)), tiled=True)
         large.append(replace(view, path=str(path), size=(3000, 3000)))
-    read, pixels = reading._read, []
+    read, pixels = reading._Band.read, []
 
-    def watched(dataset, box, *more):
+    def watched(band, box, *more):
         pixels.append(box[2] * box[3])
-        return read(dataset, box, *more)
+        return read(band, box, *more)
 
-    monkeypatch.setattr(reading, "_read", watched)
+    monkeypatch.setattr(reading._Band, "read", watched)
     given = true_matches(scene, (0, 1), count=200)
     assert find_tracks(large, scope=Scope(given=given)).tracks.num_points > 100
-    assert sum(pixels) <= 2 * 2 * 356**2  # 300 and a margin of 28 px
+    assert 2 * 290**2 < sum(pixels) <= 2 * 356**2  # 300 and a margin of 28 px
 
 
 def test_given_pairs_connect_what_the_cameras_say_is_apart(render) -> None:

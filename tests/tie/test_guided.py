@@ -9,7 +9,7 @@ import pytest
 
 from barpc.tie import TieOptions
 from barpc.tie.matchers.features import Keypoints, Share, Sift, detect_tile, join_keypoints, quota, ranked
-from barpc.tie.matchers.guided import _ROWS, Guided, _near
+from barpc.tie.matchers.guided import _PAIRS, Guided, _Described, _near
 from barpc.tie.matchers.matcher import Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments
 from barpc.tie.pixels import Stretch, grow, read_pixels, sample_stretch, survey, tiles
@@ -241,28 +241,42 @@ def test_all_points_of_slanted_bands_are_looked_at_and_few_others(slope: float, 
     """Bands that rise or fall by some strips along their length, to one side of the prediction or to both."""
     rng = np.random.default_rng(0)
     turned = rng.uniform(0, 2000, (4000, 2))
-    place = rng.uniform(-100, 2100, (500, 2))
-    where = EpipolarSegments(np.array([1.0, 0.0]), *place.T, *(np.full(500, x) for x in (slope, *reach)), np.eye(2))
-    asked, seen = np.arange(0, 500, 3), []
-    for rows, cols in _near(where, 3.0, asked, turned):
-        seen.append(rows)
-        du = turned[:, 0] - where.along[rows, None]
-        dw = turned[:, 1] - where.across[rows, None] - slope * du
-        inside = (du >= reach[0]) & (du <= reach[1]) & (np.abs(dw) <= 3.0)
-        assert np.isin(np.flatnonzero(inside.any(axis=0)), cols).all()
-        assert (np.diff(cols) > 0).all()
-        tilt = 3.0 + abs(slope) * max(abs(end) for end in reach)
-        assert (turned[cols] >= (place[rows] + [reach[0], -tilt]).min(axis=0)).all()
-        assert (turned[cols] <= (place[rows] + [reach[1], tilt]).max(axis=0)).all()
-    assert max(len(rows) for rows in seen) <= _ROWS
-    assert len(np.unique(np.concatenate(seen))) == sum(len(rows) for rows in seen) > 140
-    assert np.isin(np.concatenate(seen), asked).all()
+    place = rng.uniform(-100, 2100, (1500, 2))
+    where = EpipolarSegments(np.array([1.0, 0.0]), *place.T, *(np.full(1500, x) for x in (slope, *reach)), np.eye(2))
+    first, second = (
+        _Described.of(replace(keypoints(rng, xy, np.ones((len(xy), 128), np.uint8)), angle=angle), np.eye(2))
+        for xy, angle in ((place, rng.uniform(0, 7, 1500)), (turned, rng.uniform(0, 7, 4000)))
+    )
+    asked, seen, tilt = np.arange(0, 1500, 3), [], 3.0 + abs(slope) * max(abs(end) for end in reach)
+    for rows, cols in _near(where, 3.0, asked, turned, first, second):
+        seen.append(np.stack([rows, cols], axis=1))
+        assert (np.diff(rows) >= 0).all()
+        du, dw = (turned[cols] - place[rows]).T
+        assert ((du >= reach[0]) & (du <= reach[1])).all()
+        assert (np.abs(dw) <= 4.0 * tilt).all()
+        turn = np.angle(second.direction[cols] / first.direction[rows])
+        assert (np.abs(turn) <= np.radians(90.001)).all()
+    pairs = np.concatenate(seen)
+    du, dw = np.moveaxis(turned - place[asked, None], -1, 0)
+    inside = (du >= reach[0]) & (du <= reach[1]) & (np.abs(dw - slope * du) <= 3.0)
+    inside &= (second.direction * first.direction.conj()[asked, None]).real >= np.cos(np.radians(29.99))
+    wanted = {(int(asked[i]), int(j)) for i, j in np.argwhere(inside)}
+    assert len(wanted) > 40
+    assert wanted <= set(map(tuple, pairs.tolist()))
+    assert len(np.unique(pairs, axis=0)) == len(pairs)
+    in_boxes = len(asked) * len(turned) / 2000**2 * (reach[1] - reach[0]) * 4.0 * tilt / 3.0
+    assert len(pairs) < 1.2 * in_boxes  # at random: two of six sectors, two strips
+    most = np.bincount(pairs[:, 0]).max()
+    assert max(len(part) for part in seen) <= _PAIRS + most
+    assert len({int(row) for part in seen for row in np.unique(part[:, 0])}) == sum(
+        len(np.unique(part[:, 0])) for part in seen
+    )
 
 
 def test_candidates_come_in_portions_that_hold_all_of_a_point(pair, monkeypatch) -> None:
     a, b, where = pair
     whole = guided(a, b, where, 0.85)
-    monkeypatch.setattr("barpc.tie.matchers.guided._ROWS", 7)
+    monkeypatch.setattr("barpc.tie.matchers.guided._PAIRS", 7)
     parts = guided(a, b, where, 0.85)
     np.testing.assert_array_equal(whole.index, parts.index)
     assert len(whole) > 40

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from barpc.scene import Tracks
-from barpc.tie import Matches, TieOptions, tracks
+from barpc.tie import Matches, TieOptions
 from barpc.tie.matchers import matching
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES
 from barpc.tie.matchers.matching import Ground, PairReport, match_pair, match_pairs
 from barpc.tie.pairing.overlaps import Pair
-from barpc.tie.tracks import _joined, _unlike, _with_unregistered
+from barpc.tie.tracks import _joined, _unlike, _with_unregistered, link
 
 from .test_pairs import camera, views
 
@@ -211,26 +211,15 @@ def given_matches(count: int) -> Matches:
 
 @pytest.mark.parametrize(
     ("count", "kept", "unlike"),
-    [
-        (60, 0.47, True),
-        (60, 0.51, False),
-        (1000, 0.09, True),
-        (1000, 0.11, False),
-        (1000, 0.0, True),
-        (1, 0.0, True),
-    ],
+    [(60, 0.47, True), (60, 0.51, False), (1000, 0.09, True), (1000, 0.11, False), (1000, 0.0, True), (1, 0.0, True)],
 )
-def test_grey_values_do_not_compare_where_under_half_of_a_hundred_register_and_too_few_are_left(
-    monkeypatch, count, kept, unlike
+def test_grey_values_do_not_compare_where_under_half_of_the_matches_register_and_too_few_are_left(
+    count, kept, unlike
 ) -> None:
-    monkeypatch.setattr(
-        tracks,
-        "refine",
-        lambda views, linked, *_, **__: linked.select(linked.point < kept * linked.num_points),
-    )
-    given = {(0, 1): given_matches(count)}
-    found = _unlike([None, None], given, TieOptions(), {})  # type: ignore[list-item]
-    assert found == ([(0, 1)] if unlike else [])
+    linked = link([(0, 1)], [given_matches(count)])
+    registered = linked.select(linked.point < kept * linked.num_points)
+    assert _unlike(linked, registered, [(0, 1)]) == ([(0, 1)] if unlike else [])
+    assert _unlike(linked, registered, [(0, 2)]) == []  # no match of it is left to look at
 
 
 def test_given_matches_are_added_where_fewer_than_are_wanted_could_be_registered(caplog) -> None:

@@ -272,14 +272,14 @@ def test_blocks_are_decoded_once_a_stage(pair, tmp_path, monkeypatch, layout, zo
     views, options = [stored(view, tmp_path, layout) for view in pair], TieOptions(tile=512)
     log: list[Any] = []
     opened: list[str] = []
-    read, start = reading._read, reading.open_raster
+    read, start = reading._Band.read, reading.open_raster
     monkeypatch.setattr(reading, "open_raster", lambda path: opened.append(str(path)) or start(path))
 
-    def noted(dataset, box, band, zoom=1):
-        log.append((len(opened), dataset.name, dataset.block_shapes[0], box, zoom))
-        return read(dataset, box, band, zoom)
+    def noted(band, box, zoom=1):
+        log.append((len(opened), band.dataset.name, band.dataset.block_shapes[0], box, zoom))
+        return read(band, box, zoom)
 
-    monkeypatch.setattr(reading, "_read", noted)
+    monkeypatch.setattr(reading._Band, "read", noted)
     known = survey(views[0].path)
     assert known is not None
     assert 0.0 < decoded(log)[views[0].path] <= surveyed

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from barpc.base.geodesy import Array
 from barpc.base.options import TieOptions
-from barpc.scene import IntArray, View
+from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import APART, NO_MATCHES, Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments
@@ -21,7 +21,8 @@ FloatArray = npt.NDArray[np.float32]
 CLEAR_RATIO = 0.8
 """Largest ratio where only clear matches count."""
 _MAX_TURN = np.radians(30.0)  # between the orientation seen and the one expected
-_ROWS = 64  # points of A, near each other, that are compared with all their candidates at a time
+_SECTORS = 6  # of twice that
+_PAIRS = 2**15  # that are looked at at a time: some 30 MB of descriptors if all of them are compared
 
 
 class Guided:
@@ -43,12 +44,14 @@ class Guided:
             self._prepared = where.turn(self._b.xy), *described
         turned, first, second = self._prepared
         best = _Best(len(self._a), len(self._b))
-        for rows, cols in _near(where, prediction.half_width, prediction.chosen(len(self._a)), turned):
-            du = turned[cols, 0] - where.along[rows, None]
-            dw = turned[cols, 1] - where.across[rows, None] - where.slope[rows, None] * du
-            allowed = (np.abs(dw) <= prediction.half_width) & (du <= where.after[rows, None])
-            allowed &= du >= where.before[rows, None]
-            best.update(rows, cols, first.select(rows).likeness(second.select(cols), allowed), du, dw)
+        for rows, cols in _near(where, prediction.half_width, prediction.chosen(len(self._a)), turned, first, second):
+            du = turned[cols, 0] - where.along[rows]
+            dw = turned[cols, 1] - where.across[rows] - where.slope[rows] * du
+            allowed = np.abs(dw) <= prediction.half_width
+            allowed &= first.is_turned_like(second, rows, cols)
+            if allowed.any():
+                rows, cols, du, dw = (values[allowed] for values in (rows, cols, du, dw))
+                best.update(rows, cols, first.likeness(second, rows, cols), du, dw)
         index, distance, ambiguity = best.mutual()
         clear = ambiguity <= (self._ratio if prediction.probes is None else min(self._ratio, CLEAR_RATIO))
         xy = np.stack([self._a.xy[index[:, 0]], self._b.xy[index[:, 1]]], axis=1)
@@ -61,25 +64,29 @@ class _Described:
 
     values: FloatArray  # whole numbers: their products are exact in any order of summing, on any machine
     length: FloatArray
-    direction: FloatArray
+    direction: npt.NDArray[np.complex64]
 
     @staticmethod
     def of(keypoints: Keypoints, linear: Array) -> _Described:
         values = keypoints.descriptors.astype(np.float32)
         length = np.maximum(np.linalg.norm(values, axis=1), np.float32(1e-6))
-        turned = np.stack([np.cos(keypoints.angle), np.sin(keypoints.angle)], axis=-1) @ linear.T
-        turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-9)
-        return _Described(values, length, turned.astype(np.float32))
+        turned = (np.stack([np.cos(keypoints.angle), np.sin(keypoints.angle)], axis=-1) @ linear.T) @ [1.0, 1.0j]
+        return _Described(values, length, (turned / np.maximum(np.abs(turned), 1e-9)).astype(np.complex64))
 
-    def select(self, which: IntArray) -> _Described:
-        """Return those of some keypoints."""
-        return _Described(self.values[which], self.length[which], self.direction[which])
+    def sector(self, turn: float) -> IntArray:
+        """Return the sectors (n,), as wide as all turns that are allowed, of orientations turned by an angle [rad]."""
+        sector: IntArray = np.floor((np.angle(self.direction) + turn) / (2.0 * _MAX_TURN)).astype(np.int64) % _SECTORS
+        return sector
 
-    def likeness(self, other: _Described, allowed: npt.NDArray[np.bool_]) -> FloatArray:
-        """Return the cosines (n, m) of descriptors whose orientation is as expected; else -inf."""
-        allowed &= self.direction @ other.direction.T >= np.float32(np.cos(_MAX_TURN))
-        cosine = self.values @ other.values.T / (self.length[:, None] * other.length)
-        return np.where(allowed, cosine, np.float32(-np.inf))
+    def is_turned_like(self, other: _Described, rows: IntArray, cols: IntArray) -> BoolArray:
+        """Tell the pairs (P,) of rows and others' cols whose orientation is as expected."""
+        cosine = (self.direction[rows] * other.direction.conj()[cols]).real
+        return np.asarray(cosine >= np.cos(_MAX_TURN))
+
+    def likeness(self, other: _Described, rows: IntArray, cols: IntArray) -> FloatArray:
+        """Return the cosines (P,) of the descriptors of pairs."""
+        product = np.einsum("pk,pk->p", self.values[rows], other.values[cols])
+        return np.asarray(product / (self.length[rows] * other.length[cols]))
 
 
 class _Best:
@@ -92,17 +99,21 @@ class _Best:
         self._top_b = np.full(size_b, -np.inf, np.float32)
 
     def update(self, rows: IntArray, cols: IntArray, likeness: FloatArray, du: Array, dw: Array) -> None:
-        """Take in the cosines (n, m) of candidates of some points of A, and their places about the predicted ones."""
-        back = likeness.argmax(axis=0)
-        top = likeness[back, np.arange(len(cols))]
-        more = top > self._top_b[cols]
-        self._of_b[cols[more]], self._top_b[cols[more]] = rows[back[more]], top[more]
-        pick = likeness.argmax(axis=1)[:, None]
-        self._of_a[rows] = cols[pick[:, 0]]
-        self._top[rows] = np.take_along_axis(likeness, pick, axis=1)[:, 0]
-        same = np.abs(du - np.take_along_axis(du, pick, axis=1)) <= APART
-        same &= np.abs(dw - np.take_along_axis(dw, pick, axis=1)) <= APART
-        self._second[rows] = np.where(same, np.float32(-np.inf), likeness).max(axis=1)
+        """Take in pairs (P,), row by row of A, with all candidates of a row, and their places about the predicted."""
+        begin = np.flatnonzero(np.diff(rows, prepend=-1))
+        of, row = np.repeat(np.arange(len(begin)), np.diff(begin, append=len(rows))), rows[begin]
+        top = np.maximum.reduceat(likeness, begin)
+        pick = np.empty(len(begin), dtype=np.int64)
+        hit = np.flatnonzero(likeness == top[of])
+        hit = hit[np.argsort(-cols[hit])]
+        pick[of[hit]] = hit  # of equals the first of B
+        self._of_a[row], self._top[row] = cols[pick], top
+        same = (np.abs(du - du[pick][of]) <= APART) & (np.abs(dw - dw[pick][of]) <= APART)
+        self._second[row] = np.maximum.reduceat(np.where(same, np.float32(-np.inf), likeness), begin)
+        more = np.flatnonzero(likeness > self._top_b[cols])
+        np.maximum.at(self._top_b, cols[more], likeness[more])
+        more = more[likeness[more] == self._top_b[cols[more]]][::-1]
+        self._of_b[cols[more]] = rows[more]  # of equals the first of A
 
     def mutual(self) -> tuple[IntArray, Array, Array]:
         """Return the mutual best pairs (M, 2), their distances, and these over those to the second best (M,).
@@ -118,22 +129,32 @@ class _Best:
 
 
 def _near(
-    where: EpipolarSegments, across: float, wanted: IntArray, turned: Array
+    where: EpipolarSegments, across: float, wanted: IntArray, turned: Array, first: _Described, second: _Described
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield points of A whose bands lie near each other, and the points of B, `turned`, about these; ascending."""
+    """Yield pairs (P,), (P,) of points of A and the points of B, `turned`, in a box about their band, row by row.
+
+    Points of B stand in sectors of orientation, in each in strips across the axis, and there by their place along it.
+    Sectors and strips are as wide as the widest box: two by two ranges hold any.
+    """
     rows = wanted[np.isfinite(where.along + where.across + where.slope)[wanted]]
     if not len(rows):
         return
-    u, w = where.along[rows], where.across[rows]
-    reach = across + np.abs(where.slope[rows]) * np.maximum(np.abs(where.before), np.abs(where.after))[rows]
-    strip = np.floor(w / max(float(np.ptp(w)) * min(1.0, (_ROWS / len(rows)) ** 0.5), across))
-    order, by_w = np.lexsort((u, strip)), np.argsort(turned[:, 1], kind="stable")
-    height = turned[by_w, 1]
-    for first in range(0, len(order), _ROWS):
-        some = order[first : first + _ROWS]
-        low, high = (w - reach)[some].min(), (w + reach)[some].max()
-        cols = by_w[np.searchsorted(height, low, "left") : np.searchsorted(height, high, "right")]
-        left, right = (u + where.before[rows])[some].min(), (u + where.after[rows])[some].max()
-        cols = cols[(turned[cols, 0] >= left) & (turned[cols, 0] <= right)]
-        if len(cols):
-            yield np.sort(rows[some]), np.sort(cols)
+    before, after = where.before[rows], where.after[rows]
+    reach = across + np.abs(where.slope[rows]) * np.maximum(np.abs(before), np.abs(after))
+    low = turned[:, 1].min()
+    strip = np.floor((turned[:, 1] - low) / (2.0 * reach.max())).astype(np.int64) + 2
+    strips = np.floor((where.across[rows] - reach - low) / (2.0 * reach.max())).clip(-2.0, strip.max()) + 2.0
+    u, num_u, num_strips = np.sort(turned[:, 0]), len(turned) + 1, strip.max() + 3
+    key = (second.sector(0.0) * num_strips + strip) * num_u + np.searchsorted(u, turned[:, 0], "left")
+    order = np.argsort(key, kind="stable")
+    sector = (first.sector(-_MAX_TURN)[rows, None, None] + np.arange(2)) % _SECTORS
+    start = (sector * num_strips + strips.astype(np.int64)[:, None, None] + np.arange(2)[:, None]) * num_u
+    left, right = where.along[rows] + before, where.along[rows] + after
+    begin = np.searchsorted(key[order], start + np.searchsorted(u, left, "left")[:, None, None])
+    end = np.searchsorted(key[order], start + np.searchsorted(u, right, "right")[:, None, None])
+    size = np.maximum(end - begin, 0)
+    portion = np.cumsum(size.sum(axis=(1, 2))) // _PAIRS
+    for some in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(portion)) + 1):
+        sizes = size[some].ravel()
+        at = np.repeat(begin[some].ravel() - (np.cumsum(sizes) - sizes), sizes) + np.arange(sizes.sum())
+        yield np.repeat(rows[some], size[some].sum(axis=(1, 2))), order[at]
