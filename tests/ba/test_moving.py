@@ -189,12 +189,13 @@ def test_groups_that_move_are_taken_out_one_by_one(monkeypatch: pytest.MonkeyPat
     made, tracks, _ = drifting(3, 60, 0.1, 1.0)
     block = join(made.views, tracks, None, AdjustOptions())
     parts = Parts(block, block.point % 5 == 0, np.zeros(len(block.view), dtype=np.int64))
-    found: Any = SimpleNamespace(problem=None, final=SimpleNamespace(params=None))
+    found: Any = SimpleNamespace(problem="problem", final=SimpleNamespace(params="params"))
     for number, share in ((1, 3), (2, 2)):
         inner, outer = parts.inner.point % share == 0, parts.outer.point % share == 0
-        monkeypatch.setattr("barpc.ba.standing.members", lambda *_, outer=outer: outer)
-        gone = (parts.group == 0) & (block.point % share == 0)
         one: Any = SimpleNamespace(member=inner)
+        told = {("problem", "params", id(one), id(parts.outer)): outer}
+        monkeypatch.setattr("barpc.ba.standing.members", lambda a, b, *c, told=told: told[a, b, *map(id, c)])
+        gone = (parts.group == 0) & (block.point % share == 0)
         less = parts.less(found, one)
         np.testing.assert_array_equal(less.group, np.where(gone, number, parts.group))
         parts = less

@@ -22,6 +22,7 @@ from barpc.pipeline.inputs import (
     given_matches,
     given_tracks,
     input_files,
+    load_altimetry,
     only_new,
     read_pairs,
     side_inputs,
@@ -89,6 +90,23 @@ def test_a_terrain_covers_a_part_of_the_images_at_least(tmp_path) -> None:
     assert side_inputs(RunOptions(), [there]) == (None, None)
     with pytest.raises(InputError, match="dem_for_weak is given without dem"):
         side_inputs(RunOptions(adjust=AdjustOptions(dem_for_weak=True)), [here])
+
+
+def test_heights_count_within_the_images_and_some_way_around_them(tmp_path) -> None:
+    """An image that shows no ground has none; files follow each other; none in the images are another place."""
+    here, blind = views(1)[0], View("b", "/x/b.tif", (100, 80), make_rpc().crop(1e12, 0.0), (0.0, 300.0))
+    lon, lat, _ = here.sensor.localize(np.array([50.0, 40.0]), np.array(150.0))
+    near, far, turned = (tmp_path / name for name in ("near.csv", "far.csv", "turned.csv"))
+    near.write_text(f"lon,lat,alt\n{lon + 360},{lat},120\n{lon},{lat + 0.5},121\n{lon},{lat},122\n")
+    far.write_text(f"lon,lat,alt\n{lon},{lat + 0.5},120\n")
+    turned.write_text(f"lon,lat,alt\n{lat},{lon},120\n")
+    found = load_altimetry([str(near), str(near)], (blind, here))
+    assert found is not None
+    assert found.lonlatalt[:, 2].tolist() == [120.0, 122.0] * 2
+    assert load_altimetry([], (here,)) is None
+    for path, view, what in ((far, here, "another place"), (turned, here, "exchanged"), (near, blind, "3 heights")):
+        with pytest.raises(InputError, match=what):
+            load_altimetry([str(path)], (view,))
 
 
 # --- given matches ----------------------------------------------------------------------------------------
