@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.base.errors import InputError, OutputError
+from barpc.base.errors import BarpcError, InputError, OutputError
 from barpc.base.options import DsmOptions
 from barpc.cli import main
 from barpc.dsm import NoSurfaceError, make_dsm
 from barpc.dsm import cells as cells_module
 from barpc.dsm import surface as surface_module
 from barpc.dsm.cells import Tile
-from barpc.dsm.relief import draped
+from barpc.dsm.relief import _delivered, draped
 from barpc.dsm.stereo import _best, block_of_images
 from barpc.pipeline import load_views
 from barpc.rpcio import read_rpc
@@ -181,6 +181,17 @@ def test_pairs_with_a_flagged_image_come_after_the_others_and_a_line_says_so(ren
     caplog.clear()
     assert _best(views, worth, flagged=frozenset(range(3))) == plain  # as all are: there is nothing better
     assert not caplog.text
+
+
+def test_a_surface_by_the_delivered_cameras_is_by_those_that_came_with_the_images(rendered):
+    view = load_views(rendered.paths).views[0]
+    moved = replace(view, sensor=view.sensor.crop(10.0, 0.0))
+    at = np.array([5.0, 5.0])
+    for now, path in ((view, rendered.paths[0]), (moved, rendered.paths[0])):
+        came = _delivered(now, SimpleNamespace(path=path)).sensor
+        np.testing.assert_array_equal(came.localize(at, 100.0), view.sensor.localize(at, 100.0))
+    with pytest.raises(BarpcError, match=f"{view.name}: no file holds its delivered camera"):
+        _delivered(view, None)
 
 
 @pytest.mark.parametrize(("minus", "shown"), [(None, ["run/dsm.tif"]), ("date", [])])
