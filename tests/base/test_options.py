@@ -219,6 +219,14 @@ def test_the_schema_and_the_records_agree(tmp_path: Path) -> None:
             validate({table: {name: plain}} if table else {name: plain})
 
 
+def test_only_constant_rotations_without_splines_that_were_asked_for_are_plain() -> None:
+    """Such a run reports what more unknowns would follow instead of following it."""
+    plain = {(drift, jitter): AdjustOptions(drift=drift, jitter=jitter).is_plain for drift, jitter in [
+        (0, "auto"), (1, "auto"), (2, "auto"), (0, "500"), (0, "off"),
+    ]}  # fmt: skip
+    assert [given for given, is_plain in plain.items() if is_plain] == [(0, "auto")]
+
+
 def test_records_print_what_differs_from_the_defaults() -> None:
     for record in TABLES.values():
         assert repr(record()) == f"{record.__name__}()"
