@@ -138,6 +138,23 @@ def test_of_many_points_sets_are_drawn_and_the_same_ones_always() -> None:
     assert found(40, 4).used.all()
 
 
+def test_sets_that_are_drawn_find_what_all_of_them_find(monkeypatch) -> None:
+    """Of three and of twelve points that are off in their own ways, and what another set of them agrees on."""
+    for wrong in (any_way(3, 3, 12.0), dict.fromkeys(range(3), (0.0, 0.0, 60.0)), {}):
+        offsets, told = drawn(7, 3, wrong), np.ones(7, dtype=bool)
+        every = agreement(offsets, told)
+        with monkeypatch.context() as patch:
+            patch.setattr(sets, "_ROOM", 700)
+            patch.setattr(sets, "TRIALS", 40)
+            one, again = agreement(offsets, told), agreement(offsets, told)
+            search = sets._Search(offsets)
+        assert np.flatnonzero(~every.used).tolist() == list(range(len(wrong)))
+        assert (one.used == every.used).all()
+        assert (one.scale, one.alike) == (every.scale, every.alike)
+        assert (again.used == one.used).all()
+        assert len(search.masks) < 2**7 - 1
+
+
 def test_where_nothing_agrees_with_anything_none_is_used() -> None:
     for seed in range(10):
         one = found(6, seed, any_way(seed, 6, 300.0))

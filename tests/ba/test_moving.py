@@ -18,7 +18,7 @@ from barpc.ba.held.block import join
 from barpc.ba.held.starting import first_state, make_problem
 from barpc.ba.judging import explanations, moving
 from barpc.ba.judging.explanations import MOVING, STRIP
-from barpc.ba.judging.moving import CELLS, Ground, group_of
+from barpc.ba.judging.moving import CELLS, Ground, group_of, members
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.ba.standing import Parts
@@ -116,6 +116,10 @@ def test_a_group_is_told_from_what_stands_still() -> None:
     assert one.metres == pytest.approx(3.0 * GSD, rel=0.1)
     assert one.between == (0, 2)
     assert found.noise == pytest.approx(1.0, abs=0.1)
+    held_out = block.without(np.isin(block.point % 5, [1, 2, 3]))
+    mine = members(problem, state.params, one, held_out)
+    assert (mine == moves[~np.isin(block.point % 5, [1, 2, 3])]).mean() > 0.95
+    assert not len(members(problem, state.params, one, block.without(block.point >= 0)))
     few = linear.thinned(300)
     assert 240 <= sum(part.rows.size for part in few.tracks) <= 330
     assert fit(few, group=group).noise == pytest.approx(found.noise, rel=0.15)
