@@ -369,6 +369,25 @@ def test_a_camera_that_does_not_say_where_it_stands_is_told(caplog) -> None:
     assert "nominal" not in caplog.text
 
 
+def test_a_check_ties_what_was_loaded_and_adjusts_nothing(monkeypatch) -> None:
+    loaded, tied = Run("check", views()[:2], (), NONE), Run("check", views(), (), NONE)
+    given = ["/x/v2.tif", "/x/v0.tif", "/x/v1.tif"]
+    told = lambda *_: None  # noqa: E731
+
+    def load(kind, images, options, work):
+        assert (kind, images, options, work.progress) == ("check", given, RunOptions(keep_going=True), told)
+        return loaded
+
+    monkeypatch.setattr(stages, "_loaded", load)
+    monkeypatch.setattr(stages, "_with_ties", lambda run, options, work: tied if run is loaded else None)
+    monkeypatch.setattr(stages, "summarize", lambda run: SimpleNamespace(passed=run is tied, status="good"))
+    result = stages.check(given, RunOptions(keep_going=True), progress=told)
+    assert [view.name for view in result.views] == ["v2", "v0", "v1"]
+    assert result.run is tied
+    assert result.passed
+    assert repr(result) == "AdjustResult(check: 3 views, 0 tie points, 0 observations, good)"
+
+
 def test_a_check_has_no_folder_to_make_a_report_of() -> None:
     run = Run("check", views(), (), NONE)
     result = stages.AdjustResult((), run, SimpleNamespace(status="good"))  # type: ignore[arg-type]

@@ -52,6 +52,7 @@ def test_a_part_of_two_images_is_matched_where_it_was_asked_and_not_beside(tmp_p
     assert found.a.max(axis=0) == pytest.approx([200.0, 160.0], abs=2.0)
     assert np.median(np.abs(found.b - found.a - [20.0, 0.0]), axis=0) == pytest.approx(0.0, abs=0.1)
     assert np.median(found.alt) == pytest.approx(100.0, abs=1.0)
+    assert frame.metres == pytest.approx(5.0)
 
 
 def test_what_resampling_leaves_of_noise_is_what_sigma_takes_for_it():
