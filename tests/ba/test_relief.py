@@ -282,6 +282,14 @@ def test_a_small_block_is_held_by_the_terrain_and_points_by_their_rays() -> None
     assert found.inlier[found.view >= 0].mean() > 0.8
 
 
+@pytest.mark.parametrize(("side", "bands_of"), [(10000.0, 5), (2800.0, 4), (1000.0, 3)])
+def test_bands_are_each_twice_as_wide_up_to_a_sixteenth_of_the_scene(side: float, bands_of: int) -> None:
+    """From nodes of a three-hundredth of the scene and its margins on, or of 15 m."""
+    xy = np.linspace(-0.5, 0.5, 201)[:, None] * [side / 0.98, 0.5 * side]
+    ground = np.column_stack([LON + xy[:, 0] / UNIT[0], LAT + xy[:, 1] / UNIT[1], np.full(201, ALT)])
+    assert len(Bands.of(HILLS, ground).smoothed) == bands_of
+
+
 def test_a_slope_is_all_in_the_coarsest_band() -> None:
     """A plane, 40 m higher a kilometre east and 20 m lower a kilometre north: smoothed it is what it was."""
     rng = np.random.default_rng(4)

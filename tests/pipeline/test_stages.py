@@ -327,10 +327,11 @@ def test_what_a_fit_warns_of_comes_back_from_its_worker_and_is_said_with_the_vie
         return real(*given, **how)
 
     monkeypatch.setattr(stages, "fit_rpc", odd)
-    block = SimpleNamespace(gauge=SimpleNamespace(sigma=np.ones(3)), sensors=[rpc])
+    block = SimpleNamespace(gauge=SimpleNamespace(sigma=np.array([3.0, 4.0, 99.0])), sensors=[rpc])
     run = replace(Run("adjust", views(1), (), NONE), adjustment=block)  # type: ignore[arg-type]
     with pytest.warns(BarpcWarning, match="^v0: odd$"):
-        stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), HERE)
+        found = stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), HERE)
+    assert found.fits[0].rpc.err_bias == pytest.approx(np.sqrt(12.5))  # of the place, east and north
 
 
 @pytest.mark.slow
