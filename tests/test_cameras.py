@@ -21,17 +21,23 @@ from barpc.base.geodesy import (
     ground_from_ecef,
 )
 from barpc.base.remote import Remote
+from barpc.cameras import _ON_EARTH as ON_EARTH
 from barpc.cameras import OPENERS, Opener, open_camera
 from barpc.cli import cli, main
 from barpc.rpcio import read_rpc, write_rpc
+from barpc.rpcio.grids import write_correction
 from barpc.scene import Camera
 from barpc.sensor import SensorModel
+from barpc.sensor.csm import open_state
+from barpc.sensor.displaced import CorrectionGrid
 from barpc.sensor.geometry import altitude_range
 from tests.pipeline.known import part
 from tests.rpcio.conftest import make_rpc, write_image
 from tests.sensor.conftest import MODELS
 from tests.sensor.linescan_files import Flight, isd
 from tests.sensor.terrasar_files import Terrasar
+from tests.sensor.test_csm import linescan
+from tests.sensor.test_csm import write as write_state
 
 
 def run(*args: object) -> int:
@@ -149,6 +155,26 @@ def test_a_localisation_grid_is_a_camera(tmp_path, monkeypatch):
     assert camera.model == case.model
     assert camera.alt_range == (-100.0, 1100.0)
     assert camera.size == (20501, 19301)
+
+
+def test_a_csm_state_is_a_camera_for_all_ground_on_earth_or_the_altitudes_that_are_named(tmp_path):
+    path = write_state(linescan(), tmp_path / "a.json")
+    camera = open_camera(path)
+    assert (camera.format, camera.size, camera.alt_range) == ("csm", (3000, 4000), ON_EARTH)
+    named = open_camera(f"{path},altitudes=0:300")
+    assert named.alt_range == (0.0, 300.0)
+    at, alt = np.array([[10.0, 20.0]]), np.array([150.0])
+    np.testing.assert_array_equal(named.model.localize(at, alt), open_state(path)[0].localize(at, alt))
+
+
+def test_a_correction_grid_is_a_camera_of_the_image_that_it_spans(tmp_path):
+    rpc = make_rpc()
+    lacking = CorrectionGrid(np.array([-0.5, 99.5]), np.array([-0.5, 39.5, 79.5]), np.full((3, 2, 2), [0.25, -0.5]))
+    write_correction(lacking, rpc, tmp_path / "a.tif")
+    camera = open_camera(tmp_path / "a.tif")
+    assert (camera.format, camera.size, camera.alt_range) == ("correction", (100, 80), altitude_range(rpc))
+    ground = rpc.localize(np.array([[50.0, 30.0]]), np.array([200.0]))
+    np.testing.assert_allclose(camera.model.project(ground), [[50.25, 29.5]], atol=1e-4)
 
 
 def _nodes(grid):

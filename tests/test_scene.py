@@ -7,6 +7,7 @@ import pytest
 
 from barpc.base.errors import InputError
 from barpc.scene import (
+    Altimetry,
     GroundPoints,
     Reference,
     Tracks,
@@ -123,6 +124,22 @@ def test_sigmas_of_ground_points_have_squares_that_can_be_reckoned_with(which, s
     else:
         with pytest.raises(InputError, match="sigmas positive, from 1e-06 to 1e\\+09"):
             ground_points(**{which: sigma})
+
+
+@pytest.mark.parametrize(
+    ("sigma", "flat", "taken"),
+    [
+        (1e-6, 0.0, True), (1e9, 1e9, True), (0.9e-6, 0.0, False), (1.1e9, 0.0, False), (1.0, -1e-9, False),
+        (1.0, 1.1e9, False),
+    ],
+)  # fmt: skip
+def test_heights_may_be_of_no_width_and_no_less_sure_than_ground_points(sigma, flat, taken):
+    place = [[5.0, 43.0, 100.0], [5.1, 43.1, 200.0]]
+    if taken:
+        assert len(Altimetry(place, [1.0, sigma], [1.0, flat]).sigma) == 2
+    else:
+        with pytest.raises(InputError, match="sigmas positive, from 1e-06 to 1e\\+09"):
+            Altimetry(place, [1.0, sigma], [1.0, flat])
 
 
 @pytest.mark.parametrize(("point", "taken"), [(0, True), (2, True), (3, False), (-1, False)])

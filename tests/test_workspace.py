@@ -17,7 +17,7 @@ import pytest
 from barpc.base.errors import OutputError, TiePointError
 from barpc.base.identity import take
 from barpc.report.runfiles import table_path
-from barpc.workspace import Workspace, code_version, key_of, peak_memory, timed
+from barpc.workspace import Workspace, code_version, key_of, own_files, peak_memory, timed
 
 
 @dataclass(frozen=True)
@@ -323,6 +323,17 @@ def test_nothing_is_deleted_because_a_state_lists_it(tmp_path, text, notes):
     assert {p for p in tmp_path.rglob("*") if ".barpc" not in p.parts} == before
     assert (folder / "thesis.doc").read_text() == "thesis"
     assert (folder / "hidden/.barpc/state.json").is_file()
+
+
+@pytest.mark.parametrize(("there", "own"), [("old", True), ("new", True), ("mine", False)])
+def test_a_file_that_a_killed_run_wrote_again_is_its_own_with_either_content(tmp_path, there, own):
+    put_state(tmp_path, {"a.txt": sha("old")})
+    (tmp_path / ".barpc/outputs.jsonl").write_text(json.dumps(["a.txt", sha("new")]) + "\n")
+    (tmp_path / "a.txt").write_text(there)
+    assert own_files(tmp_path) == ({"a.txt"} if own else set())
+    with Workspace(tmp_path, overwrite=True) as run:
+        run.remove_stale()
+    assert (tmp_path / "a.txt").exists() != own
 
 
 STATES = {

@@ -219,7 +219,7 @@ def utm(lon: float, lat: float) -> tuple[int, str]:
 
 
 def reach(origin: Array, direction: Array, alt: Array) -> Array:
-    """Return the ground (N, 3) where lines from points (3, N) [m] along unit vectors come down to altitudes (N,).
+    """Return the ground (N, 3) where lines from points (3, N) [m] along vectors come down to altitudes (N,).
 
     NaN where they miss.
     """

@@ -185,7 +185,7 @@ def _pair_lines(middles: Mapping[str, Array], files: RunFiles) -> list[tuple[Pai
     """Return pairs, the share of their matches (its root) and where they begin and end, the strongest last: on top."""
     pairs = [pair for pair in files.summary.pairs if pair.a in middles and pair.b in middles]
     pairs = sorted(pairs, key=lambda pair: pair.num_matches)[-MAX_MARKS:]
-    most = max((pair.num_matches for pair in pairs), default=0) or 1
+    most = max([1, *(pair.num_matches for pair in pairs)])
     return [(pair, math.sqrt(pair.num_matches / most), middles[pair.a], middles[pair.b]) for pair in pairs]
 
 

@@ -158,7 +158,7 @@ class DirectGrid(Pointwise):
 
     def _guess(self, lonlat: Array, alt: Array) -> tuple[Array, Array, Array]:
         """Return the image points (N, 2) of the inverse cubic, within the grid, and derivatives by lon, lat."""
-        offset, scale, coeffs = self._inverse[0, :3], self._inverse[1, :3], self._inverse[2:, :2]
+        (offset, scale), coeffs = self._inverse[:2], self._inverse[2:, :2]
         basis = monomials(((np.column_stack([lonlat, alt]) - offset) / scale).T)
         image = basis.T @ coeffs
         for k, axis in enumerate((self.cols, self.rows)):

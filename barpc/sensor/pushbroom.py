@@ -224,7 +224,7 @@ class Pushbroom(Pointwise):
             for _ in range(_BENDS):
                 bent = self.light.seen(ecef_from_ground(ground).T, origin, velocity)
                 direction = direction + seen - bent / np.sqrt((bent * bent).sum(axis=0))
-                ground = reach(origin, direction / np.sqrt((direction * direction).sum(axis=0)), alt)
+                ground = reach(origin, direction, alt)
         ground[:, 0] = wrap_longitude(ground[:, 0], self._lon)
         ground[~((time >= start) & (time <= stop))] = np.nan
         return ground
@@ -334,7 +334,7 @@ class Frame(Pointwise):
         tangents = at * (1.0 - polyval((at**2).sum(axis=0), self.distortion))
         ray = self.rotation @ np.vstack([tangents, np.ones(len(image))])
         origin = np.broadcast_to(self.center[:, None], ray.shape)
-        ground = reach(origin, ray / np.sqrt((ray * ray).sum(axis=0)), alt)
+        ground = reach(origin, ray, alt)
         ground[:, 0] = wrap_longitude(ground[:, 0], float(ground_from_ecef(self.center)[0]))
         return ground
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from itertools import starmap
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,10 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.judging import agreement as sets
+from barpc.ba.judging import solution
 from barpc.ba.judging.agreement import Agreement, Offsets, agreement, offsets_of
 from barpc.ba.judging.snooping import ControlTest
+from barpc.ba.judging.solution import Solution
 from barpc.base.geodesy import enu_basis
 from barpc.base.options import RunOptions
 from barpc.report import Run, summarize
@@ -133,6 +136,23 @@ def test_of_many_points_sets_are_drawn_and_the_same_ones_always() -> None:
     assert (one.used == again.used).all()
     assert one.scale == again.scale
     assert found(40, 4).used.all()
+
+
+def test_sets_that_are_drawn_find_what_all_of_them_find(monkeypatch) -> None:
+    """Of three and of twelve points that are off in their own ways, and what another set of them agrees on."""
+    for wrong in (any_way(3, 3, 12.0), dict.fromkeys(range(3), (0.0, 0.0, 60.0)), {}):
+        offsets, told = drawn(7, 3, wrong), np.ones(7, dtype=bool)
+        every = agreement(offsets, told)
+        with monkeypatch.context() as patch:
+            patch.setattr(sets, "_ROOM", 700)
+            patch.setattr(sets, "TRIALS", 40)
+            one, again = agreement(offsets, told), agreement(offsets, told)
+            search = sets._Search(offsets)
+        assert np.flatnonzero(~every.used).tolist() == list(range(len(wrong)))
+        assert (one.used == every.used).all()
+        assert (one.scale, one.alike) == (every.scale, every.alike)
+        assert (again.used == one.used).all()
+        assert len(search.masks) < 2**7 - 1
 
 
 def test_where_nothing_agrees_with_anything_none_is_used() -> None:
@@ -305,6 +325,28 @@ def test_control_that_passes_as_agreeing_and_tears_the_images_is_let_go(what, mo
     assert any(line.startswith("Without ground control that agrees") for line in summary.verdict)
     assert [point.status for point in summary.gcps] == ["rejected"] * 6
     assert "0 of 6 GCPs that are seen hold the block." in decisions(summary)
+
+
+@pytest.mark.parametrize(
+    ("held", "free", "better", "let_go"),
+    [(0.50, 0.47, True, True), (0.50, 0.49, True, False), (0.47, 0.50, True, False), (0.50, 0.47, False, False)],
+)
+def test_control_stays_where_images_are_worse_with_it_by_no_more_than_they_tell(
+    monkeypatch, held: float, free: float, better: bool, let_go: bool
+) -> None:
+    """Two unknowns of a view are known to twice the square of the noise floor [px^2] by its ties."""
+    told: Any = SimpleNamespace(whole_rms=free)
+    monkeypatch.setattr(solution, "measure", lambda *_: told)
+    monkeypatch.setattr(solution, "is_better", lambda one, other, _: better and one is told and other is found.after)
+    monkeypatch.setattr(solution, "finished", lambda first, *_: first)
+    found: Any = SimpleNamespace(after=SimpleNamespace(whole_rms=held), agreed=Agreement(np.ones(3, dtype=bool)))
+    state = SimpleNamespace(params=np.zeros((4, 2)))
+    alone = Solution(*[None] * 4, SimpleNamespace(minimum=SimpleNamespace(state=state)), *[None] * 3, {})
+    ended: Any = solution._untorn(found, alone, None, None, AdjustOptions(noise_floor=0.1))  # type: ignore[arg-type]
+    assert (ended is not found) == let_go
+    if let_go:
+        assert ended.agreed.torn == (free, held)
+        assert not ended.agreed.used.any()
 
 
 @pytest.mark.landing(1)

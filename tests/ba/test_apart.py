@@ -168,6 +168,35 @@ def test_of_two_views_as_likely_none_is_taken_out(monkeypatch) -> None:
     assert (found.gap, found.runner_up) == (6.0, 0)
 
 
+@pytest.mark.parametrize(("covered", "worth"), [((4, 3), 50.0 - 2 * np.log(5e4)), (None, -9 * np.log(5e4))])
+def test_ties_that_the_others_do_not_explain_lie_anywhere_in_their_images(monkeypatch, covered, worth) -> None:
+    """Nine of tracks are in use, in images of 2000 px^2, 50,000 times the square of their sigma of 0.2 px."""
+    asked: list[Any] = []
+
+    def looked(outcome: Any, block: Any, views: Any) -> Any:
+        asked.append((outcome.problem, block, views.tolist()))
+        rows = None if covered is None else [SimpleNamespace(rows=np.zeros((n, 1))) for n in covered]
+        return None if rows is None else (SimpleNamespace(tracks=rows), "state")
+
+    def fitted(linear: Any) -> Any:
+        assert linear.area == linear.image == pytest.approx(5e4)
+        return SimpleNamespace(evidence=50.0)
+
+    monkeypatch.setattr(apart, "around", looked)
+    monkeypatch.setattr(apart, "fit", fitted)
+    monkeypatch.setattr(apart, "replace", lambda of, **more: SimpleNamespace(**{**vars(of), **more}))
+    rest = SimpleNamespace(views=(None,) * 2)
+    outcome = SimpleNamespace(problem=SimpleNamespace(camera_prior="learnt"))
+    found = SimpleNamespace(outcome=outcome, problem=SimpleNamespace(camera_prior="stated"))
+    size = [SimpleNamespace(size=one) for one in ((10, 200), (20, 100), (50, 100))]
+    block: Any = SimpleNamespace(
+        use=np.arange(11) > 0, point=np.arange(11), num_tracks=10, views=size, sigma=np.full(11, 0.2)
+    )
+    assert apart._evidence(SimpleNamespace(found=found, block=rest), block) == pytest.approx(worth)  # type: ignore[arg-type]
+    ((problem, given, views),) = asked
+    assert (problem.camera_prior, given, views) == ("stated", rest, [0, 1])
+
+
 @pytest.mark.parametrize(("lost", "own"), [(0.3, 0.6), (0.7, 0.7), (1.0, 0.999)])
 def test_the_gain_of_an_own_share_is_that_of_two_binomials_less_the_choice(monkeypatch, lost, own) -> None:
     monkeypatch.setattr(apart._Left, "usual", 0.02)

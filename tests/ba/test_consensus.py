@@ -81,6 +81,8 @@ def test_nothing_is_gained_where_one_group_takes_all() -> None:
     part, distance, gain = _mixture(lone - lone.mean())
     assert 0 <= part < 0.05
     assert np.isfinite([part, distance, gain]).all()
+    with np.errstate(invalid="ignore"):
+        assert _mixture(np.ones(50)) == (0.0, 0.0, 0.0)
 
 
 @pytest.fixture(scope="module")

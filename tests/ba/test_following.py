@@ -418,6 +418,23 @@ def test_unknowns_of_waves_are_about_as_large_within_half_an_octave() -> None:
     assert Waves(9).size == 2 * 6
 
 
+def test_unknowns_of_another_layout_are_gone_on_from_where_they_are_the_same() -> None:
+    """Splines of as many, strips and one more, swings of as many; detectors are asked again."""
+    strips, edges = np.zeros((2, 2, 5)), np.zeros((2, 1))
+    known = Waves(9, edges, strips[:, :1], np.zeros((2, 1)))
+    more = replace(known, strips=strips)
+    params = np.random.default_rng(0).normal(size=(2, known.size))
+    found = more.carried(params, known)
+    for kind in (0, 3):
+        np.testing.assert_array_equal(found[:, more.kinds[kind]], params[:, known.kinds[kind]])
+    assert not found[:, more.kinds[1]].any()
+    col, row = params[:, known.kinds[2]].T
+    np.testing.assert_array_equal(found[:, more.kinds[2]].T, [col, 0.0 * col, row, 0.0 * row])
+    assert not replace(known, count=11).carried(params, known)[:, : 2 * 8].any()
+    assert not Waves(0, periods=np.zeros((2, 2))).carried(params, known).any()
+    assert not Waves(0, strips=strips).carried(params[:, known.kinds[0]], Waves(9)).any()
+
+
 PERIODS = np.array([[200.0, 31.5], [np.inf, np.inf], [700.0, np.inf]])
 
 

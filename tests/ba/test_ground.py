@@ -22,7 +22,7 @@ from barpc.ba.held.ground import (
     reference_control,
     terrain_heights,
 )
-from barpc.ba.held.terrain import Relief
+from barpc.ba.held.terrain import NUM_BENDS, Believed, Relief
 from barpc.base.errors import BarpcWarning
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
@@ -69,6 +69,28 @@ def test_what_altimetry_holds_a_terrain_does_not_and_of_the_rest_those_with_weak
     up = enu_basis(ground_from_ecef(points[1:5]))[:, 2]
     along = held.rows[:, 0] / np.linalg.norm(held.rows[:, 0], axis=1, keepdims=True)
     assert ((along * up).sum(axis=1) > 0.9999).tolist() == [True, True, True, False]
+
+
+def test_what_is_believed_of_a_dem_holds_all_tracks_but_those_held_already(monkeypatch) -> None:
+    """Single heights as well as so many are worth one; all of them wrong together by bends as large as is told."""
+    points = placed([0.0, 300.0, -300.0, 500.0], [0.0, 300.0, 200.0, -100.0], 350.0)
+    bent = np.linspace(-1.0, 1.0, 4 * NUM_BENDS).reshape(4, NUM_BENDS)
+    alt, slopes = np.array([340.0, 341.0, np.nan, 343.0]), np.tile([0.2, -0.1], (4, 1))
+    found = Believed(alt, slopes, bent, np.ones(3), 2.0, 4.0, 1.0, True)
+    monkeypatch.setattr(Heights, "_believed", lambda self, given: found if given is points else None)
+    asked: list[float] = []
+    relief: Any = SimpleNamespace(common_sigma=lambda bias: asked.append(bias) or np.arange(1.0, NUM_BENDS + 1.0))
+    by_altimetry = flat_heights(points, np.array([3]), 350.0, 1.0, 0.0)
+    held = replace(heights(4), relief=relief, placed=by_altimetry)._held(points)
+    assert held is not None
+    assert held.index.tolist() == [0, 1]
+    off = held.apart(points)[:, 0]
+    np.testing.assert_allclose(off, (350.0 - alt[:2]) / 4.0, rtol=1e-5)  # sigmas of 2 m, of which four are worth one
+    np.testing.assert_allclose(held.apart(placed([10.0] * 4, 0.0, 350.0))[:, 0] - held.apart(
+        placed([0.0] * 4, 0.0, 350.0))[:, 0], -0.5, atol=1e-2)  # fmt: skip
+    np.testing.assert_allclose(held.common[:, 0], bent[:2] * np.arange(1.0, NUM_BENDS + 1.0) / 4.0)
+    assert not held.common[:, 1:].any()
+    assert asked == [DEM_BIAS]
 
 
 def test_a_terrain_is_met_along_its_normal() -> None:

@@ -18,7 +18,7 @@ from barpc.ba.held.block import Block as Joined
 from barpc.ba.held.block import first_state, join, make_problem
 from barpc.ba.judging import explanations, moving
 from barpc.ba.judging.explanations import MOVING, STRIP
-from barpc.ba.judging.moving import CELLS, Ground, group_of
+from barpc.ba.judging.moving import CELLS, Ground, group_of, members
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.ba.usual import LEVEL
@@ -115,6 +115,10 @@ def test_a_group_is_told_from_what_stands_still() -> None:
     assert one.metres == pytest.approx(3.0 * GSD, rel=0.1)
     assert one.between == (0, 2)
     assert found.noise == pytest.approx(1.0, abs=0.1)
+    held_out = block.without(np.isin(block.point % 5, [1, 2, 3]))
+    mine = members(problem, state.params, one, held_out)
+    assert (mine == moves[~np.isin(block.point % 5, [1, 2, 3])]).mean() > 0.95
+    assert not len(members(problem, state.params, one, block.without(block.point >= 0)))
     few = linear.thinned(300)
     assert 240 <= sum(part.rows.size for part in few.tracks) <= 330
     assert fit(few, group=group).noise == pytest.approx(found.noise, rel=0.15)
@@ -188,12 +192,13 @@ def test_groups_that_move_are_taken_out_one_by_one(monkeypatch: pytest.MonkeyPat
     made, tracks, _ = drifting(3, 60, 0.1, 1.0)
     block = join(made.views, tracks, None, AdjustOptions())
     parts = Parts(block, block.point % 5 == 0, np.zeros(len(block.view), dtype=np.int64))
-    found: Any = SimpleNamespace(problem=None, final=SimpleNamespace(params=None))
+    found: Any = SimpleNamespace(problem="problem", final=SimpleNamespace(params="params"))
     for number, share in ((1, 3), (2, 2)):
         inner, outer = parts.inner.point % share == 0, parts.outer.point % share == 0
-        monkeypatch.setattr("barpc.ba.apart.members", lambda *_, outer=outer: outer)
-        gone = (parts.group == 0) & (block.point % share == 0)
         one: Any = SimpleNamespace(member=inner)
+        told = {("problem", "params", id(one), id(parts.outer)): outer}
+        monkeypatch.setattr("barpc.ba.apart.members", lambda a, b, *c, told=told: told[a, b, *map(id, c)])
+        gone = (parts.group == 0) & (block.point % share == 0)
         less = parts.less(found, one)
         np.testing.assert_array_equal(less.group, np.where(gone, number, parts.group))
         parts = less

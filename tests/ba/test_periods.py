@@ -30,6 +30,14 @@ def test_a_swing_is_found_with_its_period_in_its_image(period: float, rows: floa
     assert all(one.gain < SURE for one in found[1:])
 
 
+@pytest.mark.parametrize(("count", "told"), [(30, True), (29, False)])
+def test_thirty_observations_that_swing_are_enough(count: int, told: bool) -> None:
+    row = np.random.default_rng(3).uniform(0.0, 1000.0, count)
+    off = 4.0 * np.sin(2.0 * np.pi * row / 200.0 + np.array([[0.5], [0.5]]))
+    found = swings(np.zeros(count, dtype=int), row, np.full((2, 1), 1000.0), np.ones(count), off)
+    assert [one.period for one in found] == ([pytest.approx(200.0, rel=0.02)] if told else [])
+
+
 def test_chance_swings_nowhere() -> None:
     """Noise gains 5 nats once in 150 blocks: the level is what the number of frequencies asks for."""
     gains = []

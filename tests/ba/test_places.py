@@ -120,6 +120,16 @@ def test_a_scatter_that_is_larger_in_a_part_is_none(part: float, times: float) -
         assert not worst(unused)
 
 
+@pytest.mark.parametrize(("few", "images"), [(20, 2), (19, 1)])
+def test_images_of_twenty_observations_are_among_those_that_a_place_is_chosen_from(few: int, images: int) -> None:
+    unused, _ = observed(1, 600, 0.0, 2)
+    unused.xy[:, 600:] = (np.arange(600) + 0.5) / 600 * SIZE[:, 1:]  # no two of the few in a small part
+    unused.residual[0, :600] += (unused.xy[1, :600] < 0.1 * SIZE[1, 0]) * 3.0
+    (alone,) = worst(unused.part(unused.view == 0))
+    (beside,) = worst(unused.part(np.r_[np.arange(600), 600 + np.linspace(0, 599, few).astype(int)]))
+    assert beside.chance == pytest.approx(images * alone.chance, rel=1e-9, abs=0.0)
+
+
 def test_few_observations_and_exact_ones_say_nothing_wrong() -> None:
     assert worst(observed(1, 19, 0.0)[0]) == []
     unused, _ = observed(1, 300, 0.0)

@@ -57,12 +57,13 @@ def test_of_two_parts_the_smaller_one_lies_off_at_either_end() -> None:
     """What all share is taken up by the camera: the larger part seems to lie where it should."""
     view, place, wrong, off = ties(2, wrong=0.0)
     for first, inside in ((0.0, place[1] < 0.1 * SIZE[1, 0]), (0.9, place[1] > 0.9 * SIZE[1, 0])):
+        larger = ((view == 0) & ~inside).astype(float)
         inside &= view == 0
-        moved = off + np.where(view == 0, inside - inside[view == 0].mean(), 0.0) * 2.0
-        found = scan(view, place, SIZE, wrong, moved)[0]
-        ends = np.array([first, first + 0.1]) * SIZE[1, 0]
-        assert (found.view, found.axis, found.start, found.stop) == pytest.approx((0, 1, *ends))
-        assert found.off == pytest.approx(2.0 * np.sqrt(2.0), abs=0.2)  # along both
+        for moved in (np.where(view == 0, inside - inside[view == 0].mean(), 0.0), -larger):
+            found = scan(view, place, SIZE, wrong, off + 2.0 * moved)[0]
+            ends = np.array([first, first + 0.1]) * SIZE[1, 0]
+            assert (found.view, found.axis, found.start, found.stop) == pytest.approx((0, 1, *ends))
+            assert found.off == pytest.approx(2.0 * np.sqrt(2.0), abs=0.2)  # along both
 
 
 @pytest.mark.slow

@@ -326,6 +326,52 @@ def test_a_swing_or_a_motion_below_the_floor_is_nothing() -> None:
     assert not each._is_nothing(explained(STRIP), fitted(extra=[0.0, 0.0]))
 
 
+def test_parts_of_images_that_hold_what_moves_are_tried_beside_it(monkeypatch) -> None:
+    """Of each image the best rows and columns, by what moves of the ties that take part; groups are looked for once."""
+    rows, moving = np.arange(6) < 5, np.array([0.9, 0.1, 0.2, 0.3, 0.8, 0.7])
+    asked: list[Any] = []
+    best, second = interval(0, 5, by_share=True), replace(interval(2, 5, view=1, by_share=True), gain=30.0)
+    places = [best, replace(best, gain=8.0), interval(0, 9, view=1), second, interval(0, 3, view=2)]
+
+    def scanned(view: Any, place: Any, size: Any, wrong: Any, off: Any, told: Any) -> list[Interval]:
+        asked.append((view.tolist(), place.shape, wrong.tolist(), off.shape, told.tolist()))
+        return [*places, replace(interval(0, 9, view=3, by_share=True), gain=SURE)]
+
+    def proposed(_: Any, intervals: Any, periods: Any, kinds: Any) -> Any:
+        asked.append((intervals, periods, kinds))
+        return (explained(STRIP, one.view) for one in intervals)
+
+    def groups(given: Any, where: Any) -> list[Explanation]:
+        asked.append(where)
+        return [explained(MOVING, -1), explained(MOVING, -2)]
+
+    gains = {-1: 20.0, -2: SURE}
+    monkeypatch.setattr(judging, "scan", scanned)
+    monkeypatch.setattr(judging, "proposed", proposed)
+    monkeypatch.setattr(judging, "EXPLANATIONS", {MOVING: groups})
+    monkeypatch.setattr(_Search, "_sharp", lambda self, made: made)
+
+    def tried(_: Any, made: Any, more: Any) -> list[Any]:
+        return [*made, *((one, fitted(moving=moving), gains.get(one.view, 1.0)) for one in more)]
+
+    monkeypatch.setattr(_Search, "_with", tried)
+    known = seen()
+    known.linear.taking_part = rows  # type: ignore[misc]
+    each = search(seen=known)
+    found = each._moving([best, second], [])
+    assert [(row[0].kind, row[0].view) for row in found] == [
+        (MOVING, -1), (MOVING, -2), (STRIP, 1), (STRIP, 0),
+    ]  # fmt: skip
+    assert asked == [
+        best,
+        ([0, 0, 0, 0, 1], (2, 5), moving[:5].tolist(), (2, 5), [0.0] * 5),
+        ([second, best], [], (MOVING, WANDER)),
+    ]
+    each._moving([second], [])
+    assert asked.count(best) == 1
+    assert second not in asked
+
+
 def four() -> Explanation:
     """A swing of four unknowns."""
     return replace(explained(SWING), extra=np.zeros((2, 4, 6)), sigma=np.full(4, 0.5))

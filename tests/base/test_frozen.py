@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import FitError, InputError, RpcError
-from barpc.base.frozen import Frozen
+from barpc.base.frozen import Frozen, from_arrays, to_arrays
+from barpc.base.remote import Remote
 from barpc.fit import Normalization, fit_rpc
 from barpc.scene import Camera, GroundPoints, Tracks, View
 from barpc.sensor.corrected import Corrected, Correction
@@ -78,6 +79,29 @@ def test_copies_pickles_and_replacements_are_equal_and_stay_read_only(make):
                 array[...] = 0
             with pytest.raises(FrozenInstanceError):
                 setattr(twin, name, array)
+
+
+def test_a_value_comes_back_from_its_arrays_with_all_that_it_holds(make):
+    value = {"one": make(), "more": (1, [2.5, None, "a", True], {}), "xy": np.arange(4.0)[::2], "n": np.float64(3)}
+    kept = to_arrays(value)
+    assert all(isinstance(part, np.ndarray) and not part.dtype.hasobject for part in kept.values())
+    back = from_arrays(kept)
+    assert (back["one"], back["more"], back["n"]) == (make(), value["more"], 3.0)
+    np.testing.assert_array_equal(back["xy"], [0.0, 2.0])
+    remote = Remote("https://a.b/c.tif", 5, "tag")
+    assert from_arrays(to_arrays((remote,)), sent=True) == (remote,)
+    with pytest.raises(ValueError, match="a Remote in a file"):
+        from_arrays(to_arrays((remote,)))
+
+
+def test_what_is_no_value_is_neither_kept_nor_taken():
+    for wrong in (object(), {"a": [1j]}, np.array([None]), Path()):
+        with pytest.raises(TypeError, match="cannot be kept"):
+            to_arrays(wrong)
+    for frame in (b"[", b'{"array": "b"}', b'{"class": ["pathlib", "Path"], "fields": {}}', b'{"map": 1}', b'{"a": 1}',
+                  b'{"class": ["barpc.base.frozen", "to_arrays"], "fields": {}}'):  # fmt: skip
+        with pytest.raises(ValueError):
+            from_arrays({"frame": np.frombuffer(frame, dtype=np.uint8)})
 
 
 def test_one_line_is_printed_with_figures_and_no_long_array(make):

@@ -73,3 +73,14 @@ def test_wrapping_a_longitude_leaves_near_ones_alone_to_the_bit():
 def test_what_is_not_finite_stays_so_without_an_exception():
     assert np.isnan(geodesy.ecef_from_ground([np.nan, 0, 0])).any()
     assert np.isnan(geodesy.ground_from_ecef([np.nan, 0, 0])).any()
+
+
+@pytest.mark.parametrize(
+    ("lon", "lat", "zone"),
+    [
+        (-180.0, 10.0, (1, "EPSG:32601")), (-174.1, 0.0, (1, "EPSG:32601")), (-174.0, -0.1, (2, "EPSG:32702")),
+        (5.4, 43.3, (31, "EPSG:32631")), (179.9, -60.0, (60, "EPSG:32760")), (181.0, 0.0, (1, "EPSG:32601")),
+    ],
+)  # fmt: skip
+def test_a_zone_is_six_degrees_wide_and_counted_from_the_antimeridian(lon, lat, zone):
+    assert geodesy.utm(lon, lat) == zone

@@ -21,6 +21,7 @@ from barpc.base.errors import InputError
 from barpc.base.options import (
     AdjustOptions,
     Declared,
+    DsmOptions,
     FitOptions,
     Options,
     RunOptions,
@@ -217,6 +218,21 @@ def test_the_schema_and_the_records_agree(tmp_path: Path) -> None:
         if one.default is not None and not one.rule.spoken:  # no options file has it
             plain = json.loads(json.dumps(one.default))
             validate({table: {name: plain}} if table else {name: plain})
+
+
+def test_the_altitudes_of_a_surface_begin_with_the_lower_one() -> None:
+    assert DsmOptions(alt=(300.0, 300.1)).alt == (300.0, 300.1)
+    for alt in ((300.0, 300.0), (300.0, 200.0)):
+        with pytest.raises(InputError, match="alt: the lower altitude comes first, found"):
+            DsmOptions(alt=alt)
+
+
+def test_only_constant_rotations_without_splines_that_were_asked_for_are_plain() -> None:
+    """Such a run reports what more unknowns would follow instead of following it."""
+    plain = {(drift, jitter): AdjustOptions(drift=drift, jitter=jitter).is_plain for drift, jitter in [
+        (0, "auto"), (1, "auto"), (2, "auto"), (0, "500"), (0, "off"),
+    ]}  # fmt: skip
+    assert [given for given, is_plain in plain.items() if is_plain] == [(0, "auto")]
 
 
 def test_records_print_what_differs_from_the_defaults() -> None:

@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from barpc import dsm
+from barpc.base.options import DsmOptions
 from barpc.cli import main
 from barpc.cli.terminal import Lines, progress_told
 from barpc.rasters.raster import open_raster
@@ -412,3 +414,38 @@ def test_a_file_that_is_missing_is_one_line_and_exit_code_1(verb, tmp_path, caps
 def test_every_verb_explains_itself(verb, capsys):
     assert run(verb, "--help") == 0
     assert "Example" in capsys.readouterr().out
+
+
+def test_a_surface_is_told_in_three_lines_or_as_json_and_its_flags_are_its_options(tmp_path, monkeypatch, capsys):
+    given: list[tuple[object, str, DsmOptions]] = []
+
+    def make(source, out, options, **_):
+        given.append((source, str(out), options))
+        if options.band == 2:
+            raise dsm.NoSurfaceError("nothing to match")
+        return dsm.Surface(str(out), ("a - b", "a - c"), 2.5, (4, 3), 7, 0.5, 0.25, 0.5, np.nan, 1.125)
+
+    monkeypatch.setattr(dsm, "make_dsm", make)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/summary.json").write_text("{}")
+    flags = ["--gsd", 2.5, "--alt", 10, 20, "--pairs", 2, "--minus", "first", "--overwrite"]
+    assert run("dsm", tmp_path / "run", "-o", "x.tif", *flags) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "7 of 12 cells of 2.5 m have a height, by a - b, a - c",
+        "pairs disagree by 0.25 m, sigma by matching 0.50 m, shared by all cells 1.12 m (medians)",
+        "Written to x.tif",
+    ]
+    expected = DsmOptions(gsd=2.5, alt=(10.0, 20.0), pairs=2, minus="first", overwrite=True)
+    assert given == [(tmp_path / "run", "x.tif", expected)]
+    assert run("-q", "dsm", "a.tif", "b.tif", "-o", "x.tif") == 0
+    assert capsys.readouterr().out == ""
+    assert given[1] == (["a.tif", "b.tif"], "x.tif", DsmOptions())
+    assert run("dsm", "a.tif", "b.tif", "-o", "x.tif", "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["size"], told["known"], told["sigma_cameras"]) == ([4, 3], 7, None)
+    assert run("dsm", "a.tif", "b.tif", "-o", "x.tif", "--band", 2) == 3
+    assert "no surface: nothing to match" in capsys.readouterr().err
+    assert run("dsm", tmp_path / "run", "b.tif", "-o", "x.tif") == 2
+    assert "is a finished run: give it alone" in capsys.readouterr().err
+    assert run("dsm", "a.tif", "b.tif", "-o", "x.tif", "--minus", "first") == 2
+    assert "--minus goes with a RUN" in capsys.readouterr().err

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from types import SimpleNamespace
@@ -10,18 +12,18 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.base.errors import InputError, OutputError
+from barpc.base.errors import BarpcError, InputError, OutputError
 from barpc.base.options import DsmOptions
 from barpc.cli import main
-from barpc.dsm import NoSurfaceError, make_dsm
-from barpc.dsm import stereo as stereo_module
+from barpc.dsm import NoSurfaceError, make_dsm, stereo
 from barpc.dsm import surface as surface_module
-from barpc.dsm.stereo import Tile, _best, block_of_images
-from barpc.dsm.surface import draped
+from barpc.dsm.stereo import CORRECTION, PRIOR, Tile, _best, block_of_images
+from barpc.dsm.surface import _delivered, draped, show_in_report
 from barpc.pipeline import load_views
+from barpc.report.runfiles import run_key
 from barpc.rpcio import read_rpc
 from barpc.sensor.displaced import ImageAffine, ImageCorrected
-from barpc.workspace import own_files
+from barpc.workspace import Workspace, own_files
 from tests.dsm.conftest import ALTS, SMALL
 from tests.lanes import rest_slow
 from tests.scenes import Scene
@@ -182,6 +184,17 @@ def test_pairs_with_a_flagged_image_come_after_the_others_and_a_line_says_so(ren
     assert not caplog.text
 
 
+def test_a_surface_by_the_delivered_cameras_is_by_those_that_came_with_the_images(rendered):
+    view = load_views(rendered.paths).views[0]
+    moved = replace(view, sensor=view.sensor.crop(10.0, 0.0))
+    at = np.array([5.0, 5.0])
+    for now, path in ((view, rendered.paths[0]), (moved, rendered.paths[0])):
+        came = _delivered(now, SimpleNamespace(path=path)).sensor
+        np.testing.assert_array_equal(came.localize(at, 100.0), view.sensor.localize(at, 100.0))
+    with pytest.raises(BarpcError, match=f"{view.name}: no file holds its delivered camera"):
+        _delivered(view, None)
+
+
 @pytest.mark.parametrize(("minus", "shown"), [(None, ["run/dsm.tif"]), ("date", [])])
 def test_the_report_of_a_run_shows_its_surface_but_no_change_and_images_have_none(minus, shown, tmp_path, monkeypatch):
     """Without matching: whose surface it is, alone."""
@@ -325,7 +338,7 @@ def test_coarse_cells_have_the_median_of_their_ground(rendered, tmp_path):
 def test_a_refusal_after_long_work_leaves_nothing_either(rendered, tmp_path, monkeypatch):
     """Not even what a run that is gone on with would need: it is refused each time."""
     monkeypatch.setattr("barpc.workspace.KEEP_AFTER", 0.0)
-    monkeypatch.setattr(stereo_module, "MATCHED", 1.1)
+    monkeypatch.setattr(stereo, "MATCHED", 1.1)
     with pytest.raises(NoSurfaceError, match="nothing is written"):
         make_dsm(rendered.paths[:2], tmp_path / "dsm.tif", OPTIONS)
     assert not list(tmp_path.iterdir())
@@ -348,3 +361,121 @@ def test_two_runs_or_a_run_and_images_are_not_one_source(tmp_path, capsys):
         assert ended.value.code == 2
         assert f"{run} is a finished run: give it alone (--minus OTHER_RUN" in " ".join(capsys.readouterr().err.split())
     assert [one.name for one in tmp_path.iterdir()] == ["run"]
+
+
+# --- a run's own ------------------------------------------------------------------------------------------
+
+
+def shot(name: str, outputs=(), source="rpc", file=None, advice=""):
+    entry = SimpleNamespace(rpc_source=source and SimpleNamespace(format=source), outputs=outputs, advice=advice)
+    place = f"/x/{name}.tif" if file is None else file
+    return SimpleNamespace(name=name, entry=entry, file=place, size=(9, 8), rpc=f"rpc {name}",
+                           light=SimpleNamespace(time=f"2020-01-0{'abcd'.index(name) + 1}T10:00:00Z"))  # fmt: skip
+
+
+@pytest.fixture
+def run_of_shots(monkeypatch, tmp_path):
+    """The block of a run of these images, of which tie points join some pairs; what is asked of pairs."""
+    asked = []
+
+    def best(views, worth, flagged, part):
+        asked.append((worth, flagged, part))
+        return part
+
+    def made(shots, pairs=(), minus=None, there=()):
+        pairs = [SimpleNamespace(a=a, b=b, num_matches=num) for a, b, num in pairs]
+        scene = SimpleNamespace(shots=shots, alt_range=(5.0, 9.0), summary=SimpleNamespace(pairs=pairs))
+        earlier = SimpleNamespace(views=[SimpleNamespace(name=name) for name in there])
+        monkeypatch.setattr(stereo, "read_scene", lambda folder, alts: scene)
+        monkeypatch.setattr(stereo, "read_summary", lambda folder: earlier)
+        return stereo.block_of_run(tmp_path, None, minus)
+
+    monkeypatch.setattr(stereo, "open_camera", lambda path: SimpleNamespace(model=path.name))
+    monkeypatch.setattr(stereo, "_best", best)
+    monkeypatch.setattr(stereo.BlockPrior, "load", lambda path: path.name)
+    monkeypatch.setattr(stereo.CameraErrors, "of", lambda prior, views: (prior, len(views)))
+    return made, asked
+
+
+def test_a_run_s_images_have_its_cameras_and_its_pairs_their_tie_points(run_of_shots, tmp_path):
+    made, asked = run_of_shots
+    shots = [shot("a", advice="look"), shot("b", outputs={"b" + CORRECTION: {}}), shot("c", source=None)]
+    block = made(shots, [("c", "a", 70), ("b", "a", 30)])
+    assert [(v.name, v.path, v.size, v.sensor, v.alt_range, v.date) for v in block.views] == [
+        ("a", "/x/a.tif", (9, 8), "rpc a", (5.0, 9.0), "2020-01-01"),
+        ("b", "/x/b.tif", (9, 8), "b" + CORRECTION, (5.0, 9.0), "2020-01-02"),
+        ("c", "/x/c.tif", (9, 8), "rpc c", (5.0, 9.0), "2020-01-03"),
+    ]
+    assert asked == [({(0, 1): 30.0, (0, 2): 70.0, (1, 2): 0.0}, frozenset({0}), [0, 1, 2])]
+    assert (block.groups, block.source, block.errors) == ([[0, 1, 2]], str(tmp_path), (PRIOR, 3))
+
+
+def test_of_two_dates_the_images_that_the_earlier_run_has_are_taken_away(run_of_shots, tmp_path):
+    made, asked = run_of_shots
+    shots = [shot(name) for name in "abcd"]
+    block = made(shots, minus="first", there=("d", "b", "z"))
+    assert block.groups == [[0, 2], [1, 3]]
+    assert [part for *_, part in asked] == block.groups
+    assert block.source == f"{tmp_path} minus first"
+    for there, num in (("a", 1), ("abd", 3)):
+        with pytest.raises(InputError, match=f"first: has {num} of the 4 images of"):
+            made(shots, minus="first", there=there)
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "said"),
+    [
+        ({"source": "sicd"}, NoSurfaceError, "a: a radar image"),
+        ({"file": "https://a.b/a.tif"}, InputError, "is on another host"),
+        ({"file": ""}, InputError, "a has no pixels"),
+    ],
+)
+def test_images_that_are_not_matched_are_refused_by_name(given, error, said, run_of_shots):
+    with pytest.raises(error, match=said):
+        run_of_shots[0]([shot("a", **given), shot("b")])
+
+
+def test_the_report_shows_the_tile_with_most_heights_by_both_kinds_of_cameras(tmp_path, monkeypatch, caplog):
+    views = [SimpleNamespace(name=name) for name in "abc"]
+    run = SimpleNamespace(views=[SimpleNamespace(rpc_source=f"came with {name}") for name in "abc"], outputs=())
+    bands = np.full((5, 4, 8), np.nan, np.float32)
+    bands[0, 1:, 4:], bands[2, 1:, 4:] = 7.0, [0.25, 0.5, 0.5, 1.0]
+    place = {"crs": "EPSG:32631", "transform": rasterio.Affine(2, 0, 0, 0, -2, 0)}
+    with rasterio.open(tmp_path / "dsm.tif", "w", "GTiff", 8, 4, 5, dtype="float32", **place) as file:
+        file.write(bands)
+    cells = [SimpleNamespace(size=(4, 4), step=2.0, number=n) for n in range(2)]
+    tiles = [((0, 0), cells[0], [[(0, 1)]]), ((4, 0), cells[1], [[(2, 0), (2, 1)], [(0, 1)]])]
+    remade, before = [], np.full((4, 4), 3.0, np.float32)
+
+    def surface(pairs, tile, band):
+        assert pairs == [("c/came with c", "a/came with a"), ("c/came with c", "b/came with b")]
+        assert (tile, band) == (cells[1], 3)
+        return before, np.full((4, 4), np.nan, np.float32), None
+
+    monkeypatch.setattr(surface_module, "surface_tile", surface)
+    monkeypatch.setattr(surface_module, "_delivered", lambda view, source: f"{view.name}/{source}")
+    monkeypatch.setattr(surface_module, "draped", lambda view, tile, height, band: np.full((4, 4), 9, np.uint8))
+    monkeypatch.setattr(surface_module, "remake_report", remade.append)
+    monkeypatch.setattr(surface_module, "can_render", lambda: True)
+    folder = tmp_path / "run"
+    with Workspace(folder):
+        pass
+    given = (run, SimpleNamespace(views=views), tiles, tmp_path / "dsm.tif", 3)
+    show_in_report(folder, *given)
+    told = json.loads((folder / "tables/surface.json").read_text())
+    assert told["run"] == run_key(run)
+    one, two, *images = told["shown"]
+    assert (one["cameras"], one["share"], one["nmad_m"], one["size"]) == ("delivered", 1.0, None, [4, 4])
+    assert (two["cameras"], two["share"], two["nmad_m"]) == ("corrected", 0.75, 0.5)
+    assert [image["image"] for image in images] == ["c", "a"]
+    for row in told["shown"]:
+        assert base64.b64decode(row["picture"]).startswith(b"\xff\xd8\xff")  # a JPEG
+        assert row["size"] == [4, 4]
+    assert remade == [folder]
+    monkeypatch.setattr(surface_module, "can_render", lambda: False)
+    show_in_report(folder, *given)
+    assert remade == [folder]
+    monkeypatch.setattr(surface_module, "_delivered", _delivered)
+    run.views[2].rpc_source = None
+    show_in_report(folder, *given)
+    assert "the report does not show the surface: c: no file holds its delivered camera" in caplog.text

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, OutputError
 from barpc.cli import main
-from barpc.export import TARGETS, export_run, pinholes
+from barpc.export import TARGETS, _link, export_run, pinholes
 from barpc.rpcio import read_rpc, write_rpc_copy
 from barpc.rpcio.sources import light_of
 from barpc.sensor.geometry import image_grid
@@ -190,6 +190,24 @@ def test_colmap_finds_every_image_in_its_folder_and_none_is_copied(southern, tmp
     with pytest.raises(OutputError):
         export_run(southern, "colmap", tmp_path / "other", overwrite=True)
     assert theirs.read_bytes() == b"mine"
+
+
+def test_a_link_takes_the_place_of_an_earlier_one_and_of_nothing_else(tmp_path, monkeypatch, caplog):
+    link = tmp_path / "sparse/images/a.tif"
+    for image in ("../../a.tif", "../../b.tif"):
+        _link(link, image)
+        assert str(link.readlink()) == image
+    (tmp_path / "mine.tif").write_text("mine")
+    with pytest.raises(OutputError, match="is there already and no link of an earlier export"):
+        _link(tmp_path / "mine.tif", "a.tif")
+    assert (tmp_path / "mine.tif").read_text() == "mine"
+
+    def refuse(*_: object) -> None:
+        raise OSError(1, "Operation not permitted")
+
+    monkeypatch.setattr(Path, "symlink_to", refuse)
+    _link(tmp_path / "c.tif", "a.tif")
+    assert "c.tif: no link to a.tif (Operation not permitted): copy the image there" in caplog.text
 
 
 def test_colmap_refuses_a_name_that_its_text_cannot_hold(southern, tmp_path, monkeypatch):

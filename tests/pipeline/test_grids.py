@@ -26,7 +26,9 @@ from barpc.pipeline.beyond import CORRECTION, GRID, RESAMPLED, grid_names, write
 from barpc.rpcio import read_rpc
 from barpc.rpcio.grids import read_correction
 from barpc.scene import View
+from barpc.sensor.csm import STATE_END
 from barpc.sensor.direct_grid import LINEAR
+from barpc.simulate import Look, fly
 from barpc.workspace import Workspace, own_files
 from tests.jitter import scene
 from tests.rpcio.conftest import make_rpc, write_image
@@ -83,6 +85,16 @@ def test_grids_are_written_where_the_rpc_misses_the_camera_and_nowhere_else(tmp_
     assert run_of(tmp_path / "near", (view, near, camera)) == [{}]
     far = replace(fit, max_ckp=np.array([0.0121, 0.0161]))
     assert list(run_of(tmp_path / "far", (view, far, camera))[0]) == ["a" + GRID, "a" + CORRECTION]
+
+
+def test_a_pushbroom_camera_is_written_as_a_state_that_reads_as_it(tmp_path, view):
+    camera = fly(np.array([5.4, 43.3, 300.0]), Look(12.0, 140.0), SIZE, 0.5)
+    fit = SimpleNamespace(rpc=make_rpc(), max_ckp=np.zeros(2))  # no grid is needed
+    (written,) = run_of(tmp_path, (view, fit, camera))
+    assert list(written) == ["a" + STATE_END]
+    ground, image = seen_by(camera)
+    off = np.linalg.norm(open_camera(tmp_path / f"a{STATE_END}").model.project(ground) - image, axis=1).max()
+    assert 0.3 * written["a" + STATE_END]["barpc"] < off < 1e-3
 
 
 @pytest.fixture(scope="module")

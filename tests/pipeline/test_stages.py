@@ -22,6 +22,7 @@ from barpc.pipeline.inputs import (
     given_matches,
     given_tracks,
     input_files,
+    load_altimetry,
     only_new,
     read_pairs,
     side_inputs,
@@ -89,6 +90,23 @@ def test_a_terrain_covers_a_part_of_the_images_at_least(tmp_path) -> None:
     assert side_inputs(RunOptions(), [there]) == (None, None)
     with pytest.raises(InputError, match="dem_for_weak is given without dem"):
         side_inputs(RunOptions(adjust=AdjustOptions(dem_for_weak=True)), [here])
+
+
+def test_heights_count_within_the_images_and_some_way_around_them(tmp_path) -> None:
+    """An image that shows no ground has none; files follow each other; none in the images are another place."""
+    here, blind = views(1)[0], View("b", "/x/b.tif", (100, 80), make_rpc().crop(1e12, 0.0), (0.0, 300.0))
+    lon, lat, _ = here.sensor.localize(np.array([50.0, 40.0]), np.array(150.0))
+    near, far, turned = (tmp_path / name for name in ("near.csv", "far.csv", "turned.csv"))
+    near.write_text(f"lon,lat,alt\n{lon + 360},{lat},120\n{lon},{lat + 0.5},121\n{lon},{lat},122\n")
+    far.write_text(f"lon,lat,alt\n{lon},{lat + 0.5},120\n")
+    turned.write_text(f"lon,lat,alt\n{lat},{lon},120\n")
+    found = load_altimetry([str(near), str(near)], (blind, here))
+    assert found is not None
+    assert found.lonlatalt[:, 2].tolist() == [120.0, 122.0] * 2
+    assert load_altimetry([], (here,)) is None
+    for path, view, what in ((far, here, "another place"), (turned, here, "exchanged"), (near, blind, "3 heights")):
+        with pytest.raises(InputError, match=what):
+            load_altimetry([str(path)], (view,))
 
 
 # --- given matches ----------------------------------------------------------------------------------------
@@ -309,10 +327,11 @@ def test_what_a_fit_warns_of_comes_back_from_its_worker_and_is_said_with_the_vie
         return real(*given, **how)
 
     monkeypatch.setattr(stages, "fit_rpc", odd)
-    block = SimpleNamespace(gauge=SimpleNamespace(sigma=np.ones(3)), sensors=[rpc])
+    block = SimpleNamespace(gauge=SimpleNamespace(sigma=np.array([3.0, 4.0, 99.0])), sensors=[rpc])
     run = replace(Run("adjust", views(1), (), NONE), adjustment=block)  # type: ignore[arg-type]
     with pytest.warns(BarpcWarning, match="^v0: odd$"):
-        stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), HERE)
+        found = stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), HERE)
+    assert found.fits[0].rpc.err_bias == pytest.approx(np.sqrt(12.5))  # of the place, east and north
 
 
 @pytest.mark.slow
@@ -349,6 +368,25 @@ def test_a_camera_that_does_not_say_where_it_stands_is_told(caplog) -> None:
     view = simulate_block(2, 4, seed=1, num_checks=0).views[0]
     assert stages._centers([view], "line")[0].method != "nominal"
     assert "nominal" not in caplog.text
+
+
+def test_a_check_ties_what_was_loaded_and_adjusts_nothing(monkeypatch) -> None:
+    loaded, tied = Run("check", views()[:2], (), NONE), Run("check", views(), (), NONE)
+    given = ["/x/v2.tif", "/x/v0.tif", "/x/v1.tif"]
+    told = lambda *_: None  # noqa: E731
+
+    def load(kind, images, options, work):
+        assert (kind, images, options, work.progress) == ("check", given, RunOptions(keep_going=True), told)
+        return loaded
+
+    monkeypatch.setattr(stages, "_loaded", load)
+    monkeypatch.setattr(stages, "_with_ties", lambda run, options, work: tied if run is loaded else None)
+    monkeypatch.setattr(stages, "summarize", lambda run: SimpleNamespace(passed=run is tied, status="good"))
+    result = stages.check(given, RunOptions(keep_going=True), progress=told)
+    assert [view.name for view in result.views] == ["v2", "v0", "v1"]
+    assert result.run is tied
+    assert result.passed
+    assert repr(result) == "AdjustResult(check: 3 views, 0 tie points, 0 observations, good)"
 
 
 def test_a_check_has_no_folder_to_make_a_report_of() -> None:

@@ -60,6 +60,7 @@ def test_outside_and_where_a_void_has_weight_there_is_no_height(tmp_path):
 def test_ellipsoidal_heights_are_taken_without_a_word(tmp_path):
     dem = Dem.open(write_dem(tmp_path / "a.tif", 4979))
     assert "reference ellipsoid, ellipsoidal" in dem.description
+    assert dem.known
 
 
 def test_heights_above_a_geoid_are_made_ellipsoidal_and_it_is_said(tmp_path):
@@ -67,12 +68,14 @@ def test_heights_above_a_geoid_are_made_ellipsoidal_and_it_is_said(tmp_path):
     dem = Dem.open(path, write_geoid(tmp_path / "g.gtx"))
     assert dem(5.0, 44.0) == pytest.approx(150.0)
     assert "EGM96 height, made ellipsoidal with g.gtx" in dem.description
+    assert dem.known
 
 
 def test_heights_above_a_geoid_without_a_grid_raise_a_loud_warning(tmp_path):
     with pytest.warns(BarpcWarning, match="EGM96 height, TAKEN AS ELLIPSOIDAL.*100 m"):
         dem = Dem.open(write_dem(tmp_path / "a.tif", "EPSG:4326+5773"))
     assert dem(5.0, 44.0) == pytest.approx(100.0)
+    assert not dem.known
 
 
 def test_an_unknown_reference_raises_a_loud_warning_with_and_without_a_grid(tmp_path):

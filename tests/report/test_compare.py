@@ -15,6 +15,7 @@ from barpc.cli import cli
 from barpc.report.compare import _lines, _pairs, _view, compare_runs, flat_options
 from barpc.report.records import plain
 from barpc.rpcio import read_rpc, write_rpc
+from tests.rpcio.conftest import make_rpc
 
 from .made import a_pair, a_summary, a_view
 
@@ -101,6 +102,17 @@ def test_each_run_s_error_is_that_of_its_last_cameras(tmp_path):
     found = _view((tmp_path, tmp_path), views)
     assert (found["rmse"], found["num_observations"]) == ([2.0, 0.2], [5, 100])
     assert found["rpc_difference_px"] is found["rpc_difference_without_shift_px"] is None
+
+
+def test_where_the_first_of_two_cameras_sees_no_ground_no_difference_is_told(tmp_path):
+    view = a_view(outputs={"A_RPC.TXT": {}})
+    folders = tmp_path / "one", tmp_path / "two"
+    for folder, beside in zip(folders, (1e12, 0.0), strict=True):
+        folder.mkdir()
+        write_rpc(make_rpc().crop(beside, 0.0), folder / "A_RPC.TXT")
+    found = _view(folders, (view, view))
+    assert found["rpc_difference_px"] is found["rpc_difference_without_shift_px"] is None
+    assert _view((folders[1], folders[1]), (view, view))["rpc_difference_px"] == 0.0
 
 
 def test_pairs_in_both_are_set_side_by_side_with_their_last_offsets():

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from barpc.report import page
+from barpc.report.runfiles import Draped, ReliefWindow
 from barpc.report.summary import StageEntry, TablesEntry, TracksEntry
 from barpc.report.summary.known import CheckPointEntry, ReferenceEntry, ReferenceViewEntry, SeenEntry
 from barpc.report.summary.pairs import OffsetEntry
@@ -370,3 +371,22 @@ def test_pairs_that_are_torn_are_first():
     assert [row[0].text for row in section.tables[0].rows] == ["B - C", "A - C", "A - B"]
     assert section.tables[0].marks == ["1-2", "0-2", "0-1"]
     assert "0.900 px (RMS) in the worst pair (B - C)" in section.answer
+
+
+@pytest.mark.parametrize(("nmad", "told"), [(0.25, True), (None, False)])
+def test_a_surface_is_shown_by_the_cameras_before_and_after_and_under_two_images(nmad, told):
+    files = files_of(a_summary(VIEWS))
+    assert page._surface(files) is None
+    before = ReliefWindow("delivered", (2, 2), 0.412, nmad, "QUJD")
+    after = replace(before, cameras="corrected", share=0.933, nmad_m=0.5)
+    section = page._surface(replace(files, reliefs=(before, after)))
+    said = "41 % of its cells have a height by the delivered cameras, 93 % by the corrected ones."
+    assert said in section.answer
+    assert ("disagree by 25.0 cm and by 50.0 cm" in section.answer) == told
+    assert [words.partition(",")[0] for _, words in section.charts] == [
+        "The ground by the delivered cameras", "The ground by the corrected cameras",
+    ]  # fmt: skip
+    draped = tuple(Draped(name, (2, 2), "QUJD") for name in "AC")
+    (*_, (chart, words)) = page._surface(replace(files, reliefs=(before, after), draped=draped)).charts
+    assert words.startswith("A (left) and C (right) on the surface by the corrected cameras: ")
+    assert str(chart).count("QUJD") == 2

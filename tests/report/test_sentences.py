@@ -15,6 +15,7 @@ from barpc.ba.robust.consensus import TwoGroups
 from barpc.ba.robust.smooth import SmoothTest
 from barpc.report import reservations
 from barpc.report import verdict as verdicts
+from barpc.report.reservations import control_reasons, enu
 from barpc.report.summary.views import FitEntry
 from barpc.report.verdict import block_verdict, view_status
 from barpc.tie.reference import PEAK, ReferenceControl, ViewMatch
@@ -595,3 +596,35 @@ def test_a_reference_whose_points_lie_off_each_other_by_more_than_its_pixel_is_t
     assert len(found) == told
     if told:
         assert "by more than the 10.0 m of a pixel that finding them may leave, in A (10.1 m): it bends" in found[0]
+
+
+def test_control_that_contradicts_is_named_with_what_it_is_off_by():
+    def said(status: str, **fields: Any) -> list[str]:
+        usual = {
+            "status": lambda g: status.split()[g], "w": np.array([9.5, NO_NUMBER, 1.0]), "torn": (), "sets": (),
+            "residual": np.array([[1.0, -2.0, 3.0], [NO_NUMBER] * 3, [3.0, 0.0, 1.0]]), "agreed": None, "fits": True,
+            "used": np.array([True, True, False]), "scatter": 3.21,
+        }  # fmt: skip
+        return list(control_reasons(NAMES, SimpleNamespace(**{**usual, **fields})))
+
+    assert said("used used used") == []
+    (line,) = said("rejected rejected used")
+    off = f"A ({enu(np.array([1.0, -2.0, 3.0]))}, w = 9.5)"
+    assert line.startswith("2 GCPs rejected, contradicted by the rest: check coordinates, axes and image positions: ")
+    assert off in line
+    assert line.endswith("B (too few images show it to tell by how much).")
+    (line,) = said("used used rejected", agreed=SimpleNamespace(alike=True))
+    assert line.endswith("They agree with each other: is their datum, or their height, another one?")
+    (line,) = said("contradicts used used", fits=False)
+    assert line.startswith("1 GCP off by more than 4 standard deviations, used all the same")
+    assert said("used used used", fits=False) == [
+        "2 GCPs scatter 3.2 times as much as stated: the accuracies are too good, or more than one is wrong."
+    ]
+    sets = (np.array([True, True, False]), np.array([False, False, True]))
+    (line,) = said("undecided undecided undecided", sets=sets)
+    apart = enu(np.array([-2.0, -2.0, 2.0]))
+    assert f"outweighs the others: A, B against C ({apart} between them). None of them was used" in line
+    (line,) = said("undecided undecided undecided", sets=(sets[0] & [False, True, True], sets[1]))
+    assert "outweighs the others: B against C. None of them was used" in line
+    (line,) = said("rejected rejected rejected", torn=(0.1, 0.25))
+    assert "0.100 px became 0.250 px at tie points that took no part" in line

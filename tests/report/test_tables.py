@@ -325,7 +325,6 @@ def test_points_of_a_reference_are_written_as_control_is_read():
 RELIEF = {"size": [2, 2], "share": 0.9, "nmad_m": 0.3, "picture": "QUJD"}
 
 
-@pytest.mark.slow
 def test_a_surface_is_shown_beside_the_results_that_it_was_made_of_alone(block_run, tmp_path):
     shutil.copytree(block_run.folder / "tables", tmp_path / "tables")
     summary = block_run.record

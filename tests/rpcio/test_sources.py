@@ -23,6 +23,7 @@ from barpc.rpcio import (
     write_rpc_copy,
     write_rpc_vrt,
 )
+from barpc.rpcio.sources import described, only_physical
 from barpc.rpcio.xml import rpc_domain
 from tests.rpcio.conftest import dimap_v2, grid, write_image
 
@@ -226,3 +227,26 @@ def test_a_side_file_that_gdal_does_not_look_for_is_found_where_the_image_has_no
     plain = write_image(tagged)
     assert read_rpc_source(plain).rpc == other
     assert [sidecar.path.name for sidecar in shadows(plain)] == [name]
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [
+        ("<a><NCOLS>40</NCOLS><NROWS> 30 </NROWS></a>", (40, 30)),
+        ("<a><isd:NUMCOLUMNS>40</isd:NUMCOLUMNS><isd:NUMROWS>30</isd:NUMROWS></a>", (40, 30)),
+        ("<a><NCOLS>40</NCOLS></a>", None),
+        ("<a><NCOLS>40</NCOLS><NROWS>0</NROWS></a>", None),
+        ("<a><NCOLS>12345678</NCOLS><NROWS>30</NROWS></a>", None),
+    ],
+)
+def test_a_vendor_s_xml_says_how_large_its_image_is(tmp_path, text, size):
+    (tmp_path / "a.xml").write_text(text)
+    assert described(tmp_path / "a.xml") == (size, False)
+    assert not only_physical(tmp_path / "a.xml")
+
+
+def test_an_xml_without_an_rpc_may_hold_a_physical_camera(tmp_path, rpc):
+    (tmp_path / "a.xml").write_text("<isd><ATT><ATTLIST>1 2</ATTLIST></ATT></isd>")
+    (tmp_path / "b.xml").write_text(dimap_v2(rpc))
+    assert [only_physical(tmp_path / name) for name in ("a.xml", "b.xml", "c.xml")] == [True, False, False]
+    assert described(tmp_path / "a.xml") == (None, True)

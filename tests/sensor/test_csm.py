@@ -302,6 +302,16 @@ def test_a_corrected_camera_is_written_as_a_state_that_the_library_reads_as_mean
     assert off > 0.5  # the correction is seen
 
 
+@pytest.mark.parametrize("rows", [2, 4000])
+def test_a_state_is_sampled_from_the_first_row_to_the_last_and_as_far_beyond_as_readers_look(rows, tmp_path):
+    model, _ = open_state(write(linescan(m_opticalDistCoeffs=[0.0] * 3), tmp_path / "a.json"))
+    state = json.loads(state_text(model, (SIZE[0], rows), (0.0, 1000.0)).partition("\n")[2])
+    before, step, count = -state["m_t0Ephem"], state["m_dtEphem"], state["m_numPositions"] // 3
+    after = (count - 1) * step - before - (rows - 1) * PERIOD
+    assert (before, after) == pytest.approx((4.0 * step, 4.0 * step))  # they interpolate through eight samples
+    assert step <= STEP / 2.0
+
+
 def test_a_delivered_state_goes_out_again_as_it_came_in(shared_data, tmp_path):
     """All that ASP's own files hold is in what is written."""
     camera, given = delivered(shared_data, "1040010074793300.adjusted_state.json")

@@ -10,7 +10,7 @@ import pytest
 from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center, camera_centers
-from barpc.sensor.rpc import localize_stack
+from barpc.sensor.rpc import RpcStack, localize_stack
 from barpc.simulate import simulate_block
 from tests.sensor.test_rpc import VENDORS, box
 
@@ -41,6 +41,18 @@ def test_ground_points_are_those_of_each_camera(sensors, counts, reach):
         parts = [slice(*ends) for ends in pairwise(bounds)]
         alone = [one.localize(image[part], alt[part]) for one, part in zip(sensors, parts, strict=True)]
     np.testing.assert_allclose(found, np.concatenate(alone), rtol=0, atol=2e-12)
+
+
+def test_image_points_are_those_of_each_camera(sensors):
+    """Of consecutive RPCs, on both sides of the antimeridian, one of them asked for nothing."""
+    bounds, rng = np.array([0, 40, 40, 47]), np.random.default_rng(1)
+    alone = [sensors[i].localize(rng.uniform(0, 20_000, (n, 2)), rng.uniform(0, 900, n))
+             for i, n in zip((0, 1, 3), (40, 0, 7), strict=True)]  # fmt: skip
+    stack = RpcStack([sensors[i] for i in (5, 0, 1, 3)])
+    found = stack.image(np.concatenate(alone).T, slice(1, 4), bounds)
+    expected = [sensors[i].project(points) for i, points in zip((0, 1, 3), alone, strict=True)]
+    np.testing.assert_allclose(found.T, np.concatenate(expected), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(stack.project(np.concatenate(alone).T, slice(1, 4), bounds)[0], found, atol=1e-6)
 
 
 def test_nothing_is_asked_of_no_camera():

@@ -102,6 +102,13 @@ def test_an_area_may_cross_the_antimeridian(tmp_path, data) -> None:
         assert near.geom_type == "Polygon"
 
 
+def test_a_hole_may_lie_beyond_the_antimeridian(tmp_path) -> None:
+    rings = [*box(179, -1, -179, 1)["coordinates"], *box(-179.6, -0.5, -179.4, 0.5)["coordinates"]]
+    area = read_area(written(tmp_path / "a.json", {"type": "Polygon", "coordinates": rings}))
+    places = np.array([[179.5, 0.0], [-179.7, 0.0], [-179.5, 0.0], [180.5, 0.0], [-179.5, 0.7]])
+    assert area.contains(places).tolist() == [True, True, False, False, True]
+
+
 def test_the_whole_world_is_an_area(tmp_path) -> None:
     area = read_area(written(tmp_path / "a.json", box(-180, -90, 180, 90)))
     assert area.contains(np.array([[0.0, 0.0], [179.0, 89.0], [-179.0, -89.0]])).all()

@@ -6,7 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from barpc.tie.patches.dense import _LEFT, _SLOPE, FINER, epipolar_frame
+from barpc.tie.patches.dense import _LEFT, _SLOPE, FINER, dense_matches, epipolar_frame
+
+from .conftest import write_image
 
 
 @pytest.mark.parametrize("turn", np.radians([20.0, 100.0, 170.0, 200.0, 280.0, 350.0]))
@@ -31,6 +33,26 @@ def test_rows_of_the_frame_run_down_and_columns_to_the_right_whichever_way_the_i
     assert disparity.min() == pytest.approx(FINER, abs=1.0)
     assert frame.num - 16 < disparity.max() + 2 * FINER <= frame.num
     np.testing.assert_allclose(np.column_stack([first, disparity, np.ones(60)]) @ frame.altitude, alt, atol=1e-6)
+
+
+def test_a_part_of_two_images_is_matched_where_it_was_asked_and_not_beside(tmp_path):
+    """A level plain, 100 m up: the second image shows it two columns further for every ten metres of altitude."""
+    noise = np.random.default_rng(7).standard_normal((240, 320)).astype(np.float32)
+    ground = cv2.GaussianBlur(noise, (0, 0), 1.5) * 300.0 + 1000.0
+    write_image(tmp_path / "a.tif", ground[:, 20:].astype(np.uint16))
+    write_image(tmp_path / "b.tif", ground[:, :-20].astype(np.uint16))
+    places = np.stack(np.meshgrid([80.0, 140.0, 200.0], [60.0, 110.0, 160.0]), axis=-1).reshape(-1, 2)
+    alt = np.repeat([0.0, 100.0, 200.0], 9)
+    a = np.tile(places, (3, 1))
+    frame = epipolar_frame(a, a + np.column_stack([0.2 * alt, np.zeros(27)]), alt)
+    found = dense_matches([str(tmp_path / name) for name in ("a.tif", "b.tif")], [(300, 240)] * 2, frame)
+    assert found is not None
+    assert len(found.a) > 0.8 * 120 * 100
+    assert found.a.min(axis=0) == pytest.approx([80.0, 60.0], abs=2.0)
+    assert found.a.max(axis=0) == pytest.approx([200.0, 160.0], abs=2.0)
+    assert np.median(np.abs(found.b - found.a - [20.0, 0.0]), axis=0) == pytest.approx(0.0, abs=0.1)
+    assert np.median(found.alt) == pytest.approx(100.0, abs=1.0)
+    assert frame.metres == pytest.approx(5.0)
 
 
 def test_what_resampling_leaves_of_noise_is_what_sigma_takes_for_it():

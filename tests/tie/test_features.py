@@ -239,3 +239,18 @@ def test_a_spot_is_found_where_it_stands_however_closely_it_is_looked_at(tmp_pat
     scale = found.scale[near.argmin(axis=0)]
     np.testing.assert_allclose(scale, scale.mean(), rtol=0.2)
     assert 6.0 * zoom < scale.mean() < 16.0 * zoom
+
+
+@pytest.mark.parametrize(("share", "least", "most"), [(0.02, 0, 0), (0.045, 12, 36)])
+def test_spots_of_a_twentieth_of_the_span_of_grey_values_are_enough(tmp_path, share, least, most) -> None:
+    """Fainter ones are what noise makes."""
+    row, col = np.mgrid[:400, :480]
+    places = np.stack(np.meshgrid(60.0 * np.arange(6) + 50, 60.0 * np.arange(6) + 50), axis=-1).reshape(-1, 2)
+    spots = places + np.random.default_rng(2).uniform(-3, 3, places.shape)
+    picture = sum(np.exp(-0.5 * ((col - x) ** 2 + (row - y) ** 2) / 4.0**2) for x, y in spots)
+    path = write_image(tmp_path / "a.tif", (100 + 20000 * (share * picture + (col > 420))).astype(np.uint16))
+    known = survey(path)
+    assert known is not None
+    found = detect_tile(str(path), (480, 400), (0, 0, 480, 400), known, Share(0.1, 1), TieOptions())
+    near = np.abs(found.xy[:, None] - spots).max(axis=2) < 1.0
+    assert least <= near.any(axis=0).sum() <= most

@@ -141,8 +141,8 @@ def second_look(monkeypatch):
     return asked
 
 
-def flat(lon, lat):
-    return np.full(np.shape(lon), 80.0)
+def hills(lon, lat):
+    return np.where(lon > 0.0, 90.0, 70.0)
 
 
 def test_structure_is_asked_where_keypoints_find_few_and_not_where_there_are_none(second_look) -> None:
@@ -156,12 +156,12 @@ def test_a_matcher_that_is_named_is_what_is_wanted_unless_the_terrain_tells_stru
     second_look,
 ) -> None:
     few = [report(40)]
-    assert second_look(few, TieOptions(matcher="somewhere:match"), ground=Ground(flat))[0] == []
+    assert second_look(few, TieOptions(matcher="somewhere:match"), ground=Ground(hills))[0] == []
     assert second_look(few, TieOptions(matcher="structure"))[0] == []
-    ((_, name, ranges),) = second_look(few, TieOptions(matcher="structure"), ground=Ground(flat))[0]
+    ((_, name, ranges),) = second_look(few, TieOptions(matcher="structure"), ground=Ground(hills))[0]
     assert name == "structure"
-    assert ranges == [(0.0, 200.0), (30.0, 130.0)]  # 150 m about the terrain, and 50
-    assert second_look([report(100)], TieOptions(matcher="structure"), ground=Ground(flat))[0] == []
+    assert ranges == [(0.0, 200.0), (20.0, 140.0)]  # 150 m about the terrain, and 50
+    assert second_look([report(100)], TieOptions(matcher="structure"), ground=Ground(hills))[0] == []
 
 
 def test_altitudes_are_known_from_pairs_whose_segments_are_five_pixels_to_either_side() -> None:

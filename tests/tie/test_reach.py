@@ -47,6 +47,18 @@ def test_a_camera_may_be_wrong_by_so_many_metres_whatever_its_pixel(pixel, asked
     assert reach_of(view, TieOptions(search=asked)) == pytest.approx(reach, rel=0.01)
 
 
+def test_the_pixel_is_that_in_the_middle_of_the_image() -> None:
+    """Of a camera of 10 m whose pixels grow over its columns."""
+    rpc = camera(0.0, lean=0.0)
+    rpc = replace(rpc, ground_scale=rpc.ground_scale * [20.0, 20.0, 1.0])
+    coeffs = rpc.coeffs.copy()
+    coeffs[1, 1] = coeffs[3, 1] = -0.5
+    (view,) = views(replace(rpc, coeffs=coeffs))
+    (plain,) = views(rpc)
+    assert reach_of(view, TieOptions()) == pytest.approx(reach_of(plain, TieOptions()), rel=0.01)
+    assert reach_of(plain, TieOptions()) == pytest.approx(70.0, rel=0.01)
+
+
 def test_a_camera_that_sees_no_ground_is_searched_as_far_as_any() -> None:
     (view,) = views(camera(0.0).crop(1e12, 0.0))
     assert reach_of(view, TieOptions()) == 700.0

@@ -218,7 +218,6 @@ def wrong(view: View, px: tuple[float, float]) -> tuple[View, np.ndarray]:
     return there, off[0, :2]
 
 
-@pytest.mark.slow
 def test_every_camera_of_a_plain_is_off_by_what_was_done_to_it(plains):
     seen, _, reference, _ = plains
     (first, one), (second, two) = wrong(seen[0], (20.0, -11.0)), wrong(seen[1], (-7.5, 4.25))

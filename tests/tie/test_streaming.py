@@ -226,6 +226,18 @@ def test_the_levels_of_a_jpeg_2000_show_the_same_places(tmp_path, zoom: int, sid
     assert np.abs(offset).max() < 0.1 * zoom
 
 
+@pytest.mark.parametrize(("side", "resolutions", "levels"), [(1024, 5, True), (512, 3, True), (512, 2, False)])
+def test_a_jpeg_2000_has_levels_where_every_second_and_fourth_pixel_are_stored(tmp_path, side, resolutions, levels):
+    rasterio = pytest.importorskip("rasterio")
+    warnings.simplefilter("ignore")
+    layout = {"driver": "JP2OpenJPEG", "RESOLUTIONS": resolutions, "width": side, "height": side, "count": 1}
+    with rasterio.open(tmp_path / "a.jp2", "w", dtype="uint8", **layout) as out:
+        out.write(np.tile(np.arange(side, dtype=np.uint8), (side, 1)), 1)
+    found = survey(tmp_path / "a.jp2")
+    assert found is not None
+    assert found.levels == levels
+
+
 def decoded(log: list[tuple[int, str, tuple[int, int], tuple[int, int, int, int], int]]) -> dict[str, float]:
     """Blocks decoded for the windows of a log over those of the file: GDAL keeps them while it is open."""
     blocks = {

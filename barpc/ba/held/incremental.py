@@ -206,9 +206,7 @@ def _csr(file: Mapping[str, Array], size: int) -> sp.csr_array:
         raise ValueError("the bounds of its rows do not go together")
     if not _within(indices, size - 1):
         raise ValueError("a column beyond its size")
-    matrix = sp.csr_array((data, indices, bounds), shape=(size, size))
-    matrix.check_format()
-    return matrix
+    return sp.csr_array((data, indices, bounds), shape=(size, size))
 
 
 def _within(numbers: Array, most: int) -> bool:

@@ -185,7 +185,7 @@ def register_patches(
     for side in (patch, smaller):
         template = _Template(pictures, images[0].shape[1], side)
         whole = np.ones((side, side), np.uint8)
-        usable = [cv2.erode(np.pad(mask, 1).astype(np.uint8), whole)[1:-1, 1:-1] > 0 for mask in valid]
+        usable = [cv2.erode(mask.astype(np.uint8), whole, borderValue=0) > 0 for mask in valid]
         possible = np.flatnonzero(~best.ok & _at(usable[0], reference) & _at(usable[1], start))
         for rows in _chunks(possible):
             found = template.find(fine, reference[rows].astype(np.int64), start[rows], linear[rows])
