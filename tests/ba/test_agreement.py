@@ -350,7 +350,7 @@ def controlled(seed: int, points: int, views: int, sigma: float, tracks: int) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("worlds", "most"), [(12, 1), pytest.param(40, 2, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(("worlds", "most"), [(6, 1), pytest.param(40, 2, marks=pytest.mark.nightly)])
 def test_of_forty_worlds_with_control_as_stated_none_loses_it(worlds: int, most: int) -> None:
     unused = 0
     for seed in range(worlds):
@@ -359,14 +359,14 @@ def test_of_forty_worlds_with_control_as_stated_none_loses_it(worlds: int, most:
         one = adjust_tracks(world.views, world.tracks, None, world.gcps)
         assert not one.control.torn
         unused += int((~one.control.used).sum())
-    assert unused <= most  # of 210, or 700
+    assert unused <= most  # of 100, or 700
 
 
-@pytest.mark.landing(2)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "tracks", "drawn"),
-    diagonal(["wave", "bend", "flat wave", "noise"], [8000, 400], [(0, 2), (3, 3), (5, 3)], mark=pytest.mark.nightly),
+    diagonal(["wave", "bend", "flat wave", "noise"], [400, 8000], [(0, 2), (3, 3), (5, 3)], mark=pytest.mark.nightly),
 )
 def test_no_wrong_control_raises_what_tie_points_are_left_with(kind, tracks, drawn) -> None:
     seed, views = drawn
