@@ -23,8 +23,11 @@ def shared_data() -> Path:
     return folder
 
 
-def pytest_xdist_auto_num_workers() -> int:
-    """What `-n auto` takes: many tests wait for a process, a host or a disk."""
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """What `-n auto` takes: many tests wait for a process, a host or a disk. Neighbours stay with one worker, which
+    makes what they share once."""
+    if config.option.dist == "no":
+        config.option.dist = "worksteal"
     return max(2, (os.cpu_count() or 1) * 3 // 2)
 
 

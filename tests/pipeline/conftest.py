@@ -18,9 +18,9 @@ def corner(tmp_path_factory) -> Known:
     return part(tmp_path_factory.mktemp("corner"))
 
 
-@pytest.fixture(scope="session", params=["part", pytest.param("whole", marks=pytest.mark.slow)])
+@pytest.fixture(scope="session", params=["part", pytest.param("whole", marks=pytest.mark.nightly)])
 def known(request) -> Known:
-    """Three images with truth: before a commit a part of them, else the whole, too."""
+    """Three images with truth: a part of them, at night the whole, too."""
     found: Known = request.getfixturevalue("corner") if request.param == "part" else whole()
     return found
 
