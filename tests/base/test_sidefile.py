@@ -256,7 +256,7 @@ def test_the_largest_rpc_file_that_is_read_ends_in_sensible_time(fill):
         assert cpu(partial(sniff_and_read, name, data.decode())) < 60
 
 
-@pytest.mark.few(14)
+@pytest.mark.few(8)
 @pytest.mark.parametrize(
     ("kind", "fill"),
     diagonal(

@@ -26,17 +26,18 @@ def known(request) -> Known:
 
 
 @pytest.fixture(scope="session")
-def adjusted(known, tmp_path_factory) -> tuple[AdjustResult, Path]:
-    """The known images, adjusted with the defaults."""
-    out = tmp_path_factory.mktemp("known") / "adjusted"
-    return adjust(known.images, out), out
-
-
-@pytest.fixture(scope="session")
 def matched(known, tmp_path_factory) -> tuple[AdjustResult, Path]:
     """The known images, matched."""
     out = tmp_path_factory.mktemp("matched") / "ties"
     return adjust(known.images, out, RunOptions(stop_after="matching")), out
+
+
+@pytest.fixture(scope="session")
+def adjusted(known, matched, tmp_path_factory) -> tuple[AdjustResult, Path]:
+    """The known images, adjusted with the defaults, going on with what was matched."""
+    out = tmp_path_factory.mktemp("known") / "adjusted"
+    shutil.copytree(matched[1], out)
+    return adjust(known.images, out, RunOptions(overwrite=True)), out
 
 
 @pytest.fixture(scope="session")
