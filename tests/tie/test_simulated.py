@@ -17,7 +17,7 @@ from barpc.sensor.corrected import Corrected
 from barpc.tie import TieOptions, common_tracks, find_tracks
 from tests.lanes import rest_slow
 
-from .conftest import SIDES, SIDES_AT_NIGHT, write_image
+from .conftest import SIDES, write_image
 
 
 def rms(scene, tracks: Tracks, i: int, j: int) -> np.ndarray:
@@ -68,7 +68,7 @@ def test_tie_points_hold_under_other_light_and_half_the_sky_in_clouds(render, co
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("side", SIDES_AT_NIGHT)
+@pytest.mark.parametrize("side", SIDES)
 def test_the_corrected_cameras_of_a_second_pass_find_the_same_ground(render, side: int) -> None:
     scene = render(views=3, size=(side, side))
     exact = [
@@ -140,7 +140,7 @@ def test_tie_points_hold_where_both_images_saturate(render, tmp_path) -> None:
     assert (np.abs(errors).max(axis=1) > 1.0).mean() <= 0.02
 
 
-@pytest.mark.parametrize("side", SIDES_AT_NIGHT)
+@pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize(
     "change",
     rest_slow(
@@ -164,7 +164,7 @@ def test_any_real_pixel_type_works(render, tmp_path, change, side: int) -> None:
 
 @pytest.mark.landing(2)
 @pytest.mark.slow
-@pytest.mark.parametrize("side", SIDES_AT_NIGHT)
+@pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize(
     "change",
     rest_slow(
