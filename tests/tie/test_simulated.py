@@ -99,8 +99,9 @@ def _unpickled(task: bytes):
     ("workers", "number", "side"),
     [
         (Pickled, 2, 300),
+        (ProcessPoolExecutor, 2, 300),
         pytest.param(ThreadPoolExecutor, 3, 600, marks=pytest.mark.nightly),
-        pytest.param(ProcessPoolExecutor, 3, 600, marks=pytest.mark.slow),
+        pytest.param(ProcessPoolExecutor, 3, 600, marks=pytest.mark.nightly),
     ],
 )
 def test_the_result_is_the_same_to_the_byte_for_any_workers(render, workers, number: int, side: int) -> None:
@@ -201,7 +202,7 @@ def test_a_linear_change_of_the_grey_values_moves_no_tie_point(render, tmp_path,
             "no common offset",
             marks=pytest.mark.nightly,
         ),
-        pytest.param(lambda d: np.rot90(d, 2).copy(), "no common offset", marks=pytest.mark.slow),
+        pytest.param(lambda d: np.rot90(d, 2).copy(), "no common offset", marks=pytest.mark.nightly),
     ],
     ids=["nodata", "constant", "nan", "noise", "turned"],
 )
