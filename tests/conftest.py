@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,9 +25,23 @@ def shared_data() -> Path:
     return folder
 
 
-def pytest_xdist_auto_num_workers() -> int:
-    """What `-n auto` takes: many tests wait for a process, a host or a disk."""
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """What `-n auto` takes: many tests wait for a process, a host or a disk. Neighbours stay with one worker, which
+    makes what they share once."""
+    if config.option.dist == "no":
+        config.option.dist = "worksteal"
     return max(2, (os.cpu_count() or 1) * 3 // 2)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """What is collected stays: the garbage collector need not look through it, now or beside the tests."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.hookimpl(tryfirst=True)

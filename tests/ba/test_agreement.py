@@ -78,8 +78,9 @@ def test_points_without_a_blunder_stay_one_set_whatever_their_accuracies(times, 
     assert 0.7 < float(np.mean([one.scale for one in all_of])) / times < 1.2
 
 
-def test_cameras_farther_off_than_stated_blame_no_point() -> None:
-    assert all(found(6, seed, motions=3.0).used.all() for seed in range(20))
+@pytest.mark.parametrize("seeds", rest_slow([range(4), range(4, 20)]))
+def test_cameras_farther_off_than_stated_blame_no_point(seeds) -> None:
+    assert all(found(6, seed, motions=3.0).used.all() for seed in seeds)
 
 
 @pytest.mark.parametrize(
@@ -155,8 +156,9 @@ def test_sets_that_are_drawn_find_what_all_of_them_find(monkeypatch) -> None:
         assert len(search.masks) < 2**7 - 1
 
 
-def test_where_nothing_agrees_with_anything_none_is_used() -> None:
-    for seed in range(10):
+@pytest.mark.parametrize("seeds", rest_slow([range(3), range(3, 10)]))
+def test_where_nothing_agrees_with_anything_none_is_used(seeds) -> None:
+    for seed in seeds:
         one = found(6, seed, any_way(seed, 6, 300.0))
         assert not one.used.any()
         assert len(one.sets) == 2
@@ -392,7 +394,7 @@ def controlled(seed: int, points: int, views: int, sigma: float, tracks: int) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("worlds", "most"), [(12, 1), pytest.param(40, 2, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(("worlds", "most"), [(6, 1), pytest.param(40, 2, marks=pytest.mark.nightly)])
 def test_of_forty_worlds_with_control_as_stated_none_loses_it(worlds: int, most: int) -> None:
     unused = 0
     for seed in range(worlds):
@@ -401,14 +403,14 @@ def test_of_forty_worlds_with_control_as_stated_none_loses_it(worlds: int, most:
         one = adjust_tracks(world.views, world.tracks, None, world.gcps)
         assert not one.control.torn
         unused += int((~one.control.used).sum())
-    assert unused <= most  # of 210, or 700
+    assert unused <= most  # of 100, or 700
 
 
-@pytest.mark.landing(2)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "tracks", "drawn"),
-    diagonal(["wave", "bend", "flat wave", "noise"], [8000, 400], [(0, 2), (3, 3), (5, 3)], mark=pytest.mark.nightly),
+    diagonal(["wave", "bend", "flat wave", "noise"], [400, 8000], [(0, 2), (3, 3), (5, 3)], mark=pytest.mark.nightly),
 )
 def test_no_wrong_control_raises_what_tie_points_are_left_with(kind, tracks, drawn) -> None:
     seed, views = drawn

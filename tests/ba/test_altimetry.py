@@ -121,7 +121,7 @@ def test_two_groups_of_equal_weight_are_no_majority():
 def test_a_plain_tells_heights_and_no_place():
     """Slopes of a plain are its noise: they do not know where it is."""
     rng = np.random.default_rng(2)
-    found = registered(rng, given(rng, 400, [5.0, -7.0, 90.0], size=0.0), size=0.0, noise=0.3)
+    found = registered(rng, given(rng, 200, [5.0, -7.0, 90.0], size=0.0), size=0.0, noise=0.3)
     sigma = np.sqrt(np.diag(found.covariance))[:3]
     assert (sigma[:2] > 9.0).all()
     assert sigma[2] < 0.5

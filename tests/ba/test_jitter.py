@@ -23,6 +23,7 @@ TABLE = cases()
 SEEDS = (0, 1, 2)
 EDGES = tuple(np.arange(1, 8) * 2500.0)
 FEW_STEPS = ("steps 0.1 px", 1000)  # steps and splines are found in both
+SHAKEN = [((1,), 1500), pytest.param(SEEDS, 3000, marks=pytest.mark.nightly)]
 FOUND = [FEW_STEPS, pytest.param("all", 3000, marks=pytest.mark.nightly)]
 
 
@@ -55,19 +56,27 @@ def shaken(made, view, wave):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seeds", "tracks"), [((1,), 1500), pytest.param(SEEDS, 3000, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(("seeds", "tracks"), SHAKEN)
 def test_jitter_is_followed_to_the_noise_and_heights_are_not_bent(seeds, tracks):
     name, many = "jitter 0.5 at 1 Hz", {"tracks": tracks}
-    assert medians(name, lambda j: j.across, seeds, jitter="off", **many) > 0.4
     assert 0.005 < medians(name, lambda j: j.across, seeds, **many) < 0.02  # of tie points with 0.1 px
     for seed in seeds:
         found, after = solved(name, seed, **many)
-        _, off = solved(name, seed, jitter="off", **many)
         before = judge(scene(name, seed, **many), [v.sensor for v in scene(name, seed, **many).views])
-        assert after.shape < 1.05 * min(before.shape, off.shape)
+        assert after.shape < 1.05 * before.shape
         assert all(spline is not None and not len(spline.edges) for spline in found.splines)
         assert not found.smooth.shared.any()
         assert (np.abs(after.move) < 4 * found.gauge.sigma).all()
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(("seeds", "tracks"), SHAKEN)
+def test_jitter_that_is_not_followed_stays_and_bends_heights_no_less(seeds, tracks):
+    name, many = "jitter 0.5 at 1 Hz", {"tracks": tracks}
+    assert medians(name, lambda j: j.across, seeds, jitter="off", **many) > 0.4
+    for seed in seeds:
+        off = solved(name, seed, jitter="off", **many)[1]
+        assert solved(name, seed, **many)[1].shape < 1.05 * off.shape
 
 
 @pytest.mark.slow
@@ -150,8 +159,13 @@ def test_detectors_are_found_where_they_begin(tracks):
     for spline in found.splines:
         assert 5 <= len(spline.edges) <= 7
         assert np.abs(spline.edges[:, None] - EDGES).min(axis=1).max() < 120.0
-    off = solved("steps 0.1 px", 1, jitter="off", tracks=tracks)[1]
-    assert after.across < 0.05 < 0.1 < off.across
+    assert after.across < 0.05
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("tracks", [1000, 3000])
+def test_steps_that_are_not_followed_stay(tracks):
+    assert solved("steps 0.1 px", 1, jitter="off", tracks=tracks)[1].across > 0.1
 
 
 @pytest.mark.landing(2)

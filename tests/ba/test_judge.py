@@ -112,7 +112,7 @@ def test_what_fades_is_named_with_its_length() -> None:
 @pytest.mark.parametrize("first", [0.0, 1.0], ids=["beginning", "end"])
 def test_all_images_that_settle_are_explained_together(first: float) -> None:
     """All see the same ground there: their ties agree with each other, as if it moved."""
-    block = simulate_block(4, 1500, seed=2, attitude=10e-6, position=2.0)
+    block = simulate_block(4, 800, seed=2, attitude=10e-6, position=2.0)
     rows = block.views[0].size[1]
     away = np.abs(block.tracks.xy[:, 1] / rows - first)
     angle = np.array([0.3, 1.9, 3.7, 5.2])[block.tracks.view]
@@ -202,6 +202,7 @@ def test_the_smaller_part_is_said_to_lie_off() -> None:
     assert found.where[1] < 0.0 < found.where[2] < 0.2 * block.views[found.view].size[1]
 
 
+@pytest.mark.landing(8)
 @pytest.mark.parametrize("seed", rest_slow(range(8)))
 @pytest.mark.parametrize("outliers", rest_slow([0.1, 0.0, 0.3]))
 def test_nothing_is_found_where_nothing_is(seed: int, outliers: float) -> None:
@@ -213,7 +214,7 @@ def test_nothing_is_found_where_nothing_is(seed: int, outliers: float) -> None:
 
 @pytest.mark.slow
 def test_rows_that_wander_are_not_taken_for_strips() -> None:
-    block = simulate_block(3, 2000, seed=3, attitude=10e-6, position=2.0)
+    block = simulate_block(3, 1000, seed=3, attitude=10e-6, position=2.0)
     xy, rows = block.tracks.xy.copy(), block.views[1].size[1]
     u = xy[:, 1] / rows
     xy[:, 0] += (block.tracks.view == 1) * 0.6 * (np.sin(17.0 * u + 1.0) + np.cos(11.0 * u))
@@ -231,7 +232,7 @@ def test_rows_that_wander_are_not_taken_for_strips() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("options", rest_slow([{"jitter": "off"}, {"drift": 0}], mark=pytest.mark.nightly), ids=str)
 def test_who_asked_for_no_such_unknowns_is_told_and_gets_none(options: dict[str, Any]) -> None:
-    block, tracks = flawed(3, 1500, MIDDLE)
+    block, tracks = flawed(3, 600, MIDDLE)
     found = adjusted(block, tracks, **options)
     assert found.findings
     assert found.left
@@ -265,7 +266,7 @@ def test_what_cannot_be_judged_is_adjusted_all_the_same(monkeypatch: pytest.Monk
 def test_in_a_block_of_many_views_two_flaws_far_from_each_other_are_followed() -> None:
     """More unknowns than all views may have together, so that explanations are tried on parts of the block."""
     jump = {"view": 30, "axis": 1, "start": 0.5, "stop": 1.1, "px": 3.0}
-    block, tracks = flawed(60, 5000, jump, seed=2)
+    block, tracks = flawed(60, 3000, jump, seed=2)
     view, rows = tracks.view == 55, block.views[55].size[1]
     swung = 0.8 * np.sin(2.0 * np.pi * 7.0 * tracks.xy[:, 1:] / rows) * np.array([0.6, 0.8])
     given = replace(tracks, xy=tracks.xy + view[:, None] * swung)

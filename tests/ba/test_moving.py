@@ -266,7 +266,7 @@ def test_vehicles_are_no_group(seed: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", rest_slow([1, 0], mark=pytest.mark.nightly))
 def test_rows_and_columns_of_one_image_are_no_group(axis: int) -> None:
-    block = simulate_block(3, 1200, seed=7, attitude=10e-6, position=2.0)
+    block = simulate_block(3, 700, seed=7, attitude=10e-6, position=2.0)
     ties, size = block.tracks, block.views[1].size[axis]
     inside = (ties.view == 1) & (ties.xy[:, axis] < 0.35 * size)
     found = adjust_tracks(block.views, replace(ties, xy=ties.xy + inside[:, None] * [1.0, 1.5]))

@@ -227,7 +227,7 @@ def test_every_option_has_a_row():
     [
         pytest.param(
             row,
-            marks=pytest.mark.slow if row.field in ELSEWHERE_TOO else (),
+            marks=pytest.mark.nightly if row.field in ELSEWHERE_TOO else (),
             id=f"{row.field}: {row.low} to {row.high}",
         )
         for row in ROWS

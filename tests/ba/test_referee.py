@@ -14,7 +14,7 @@ from benchmarks.referee import Case, Errors, cases, judge, make, referee, refere
 from tests.lanes import rest_slow
 
 SEEDS = (0, 1, 2)
-ONE_OR_ALL = rest_slow([SEEDS[1:2], SEEDS])
+ONE_OR_ALL = rest_slow([SEEDS[1:2], SEEDS], mark=pytest.mark.nightly)
 TABLE = cases()
 
 
@@ -210,7 +210,7 @@ def heights_of(scenes, dem=None):
 
 @pytest.mark.filterwarnings("ignore::barpc.BarpcWarning")
 @pytest.mark.slow
-@pytest.mark.parametrize("angle", rest_slow([1.1, 0.2, 0.5, 0.9, 1.3, 1.5], keep=2, mark=pytest.mark.nightly))
+@pytest.mark.parametrize("angle", rest_slow([1.1, 0.2, 0.5, 0.9, 1.3, 1.5], mark=pytest.mark.nightly))
 def test_what_is_stated_of_weak_heights_is_as_large_as_it_is(angle):
     true, said = heights_of([weak_pair(angle, seed) for seed in range(12)])
     assert 0.5 < np.sqrt((said**2).mean() / (true**2).mean()) < 2.0

@@ -221,8 +221,8 @@ def test_bends_are_a_level_two_slopes_and_what_is_curved() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("hills", "seeds"),
-    [(False, (4, 6, 8, 12, 18, 20)), (False, range(0, 24, 2)), (True, range(1, 24, 2))],
-    ids=["the half of plains that is quick", "plains", "hills"],
+    [(False, (4, 6, 20)), (False, range(0, 24, 2)), (True, range(1, 24, 2))],
+    ids=["three plains", "plains", "hills"],
 )
 def test_a_dem_with_waves_places_a_scene_as_well_as_it_is_said_to(hills: bool, seeds: Sequence[int]) -> None:
     """Twelve draws; before, errors over what was said were 3.8 (plains) and 3.0 (hills), RMS, at worst 8.9."""

@@ -238,7 +238,7 @@ def test_what_is_determined_is_what_the_prior_alone_does_not_say() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n", rest_slow([50, 300]))
+@pytest.mark.parametrize("n", rest_slow([50, 300], mark=pytest.mark.nightly))
 def test_variances_of_a_large_block_are_exact_where_they_are_stated_and_probed_within_their_bound(
     monkeypatch, n: int
 ) -> None:

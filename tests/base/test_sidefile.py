@@ -256,12 +256,13 @@ def test_the_largest_rpc_file_that_is_read_ends_in_sensible_time(fill):
         assert cpu(partial(sniff_and_read, name, data.decode())) < 60
 
 
-@pytest.mark.few(14)
+@pytest.mark.few(8)
 @pytest.mark.parametrize(
     ("kind", "fill"),
     diagonal(
         [kind for kind in SAMPLES if not kind.startswith(("rpc", "dem", "state", "grid"))],
         ["\n", " ", "7", "(", "[", ","],
+        mark=pytest.mark.nightly,
     ),
 )
 def test_readers_take_time_in_proportion_to_the_file(kind, fill, tmp_path):

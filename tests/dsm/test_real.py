@@ -65,6 +65,7 @@ def test_pairs_of_the_triplet_agree_to_a_third_of_a_metre(surface):
     assert 10.0 < float(tags["SIGMA_SHARED_BY_ALL_CELLS_M"]) < 100.0  # which ties do not tell
 
 
+@pytest.mark.nightly  # before: of rendered images, in test_surface
 def test_the_command_says_what_it_made(copied, tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         main(

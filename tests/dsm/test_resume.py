@@ -18,6 +18,7 @@ from barpc.dsm import make_dsm
 from barpc.pipeline import adjust
 from barpc.report.runfiles import SURFACE
 from tests.dsm.conftest import ALTS
+from tests.lanes import rest_slow
 
 FINE = DsmOptions(alt=ALTS, gsd=0.25)  # four tiles
 pytestmark = pytest.mark.slow
@@ -47,14 +48,15 @@ def run(*args: object) -> int:
     return int(stop.value.code or 0)
 
 
-def test_a_killed_command_goes_on_and_gives_the_same_bytes(rendered, tmp_path):
+@pytest.mark.parametrize("times", rest_slow([(0, 2), (0, 1, 2, 4)], mark=pytest.mark.nightly))
+def test_a_killed_command_goes_on_and_gives_the_same_bytes(rendered, tmp_path, times):
     whole = tmp_path / "whole" / "dsm.tif"
     make_dsm(rendered.paths[:2], whole, FINE)
     folder = tmp_path / "again"
     options = ["--gsd", "0.25", "--alt", *map(str, ALTS)]
     call = ["dsm", *rendered.paths[:2], "-o", str(folder / "dsm.tif"), *options]
     rng, before = np.random.default_rng(int.from_bytes(os.urandom(4))), dict[Path, int]()
-    for tiles in (0, 1, 2, 4):
+    for tiles in times:
         waits = rng.uniform(0.0, 0.3)
         since: list[float] = []
 

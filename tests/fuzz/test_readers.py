@@ -10,6 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.lanes import rest_slow
+
 from .ends import EDITS, by_exponent, cut_number, end_of_doubles, mutate_npz_ends, twice
 from .runner import check, prepared, scratch, sweep
 from .samples import SAMPLES
@@ -24,14 +26,7 @@ def test_a_sample_is_accepted_as_it_is(kind, tmp_path):
 # GDAL's words of a damaged file may be no text, which rasterio then says of itself
 @pytest.mark.few(22)
 @pytest.mark.filterwarnings("ignore:.*rasterio._env.log_error:pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.parametrize(
-    "runs",
-    [
-        10,
-        pytest.param(20, marks=pytest.mark.slow),
-        *(pytest.param(runs, marks=pytest.mark.nightly) for runs in (120, 1200)),
-    ],
-)
+@pytest.mark.parametrize("runs", rest_slow([10, 20, 120, 1200], mark=pytest.mark.nightly))
 @pytest.mark.parametrize("kind", SAMPLES)
 def test_damage_is_a_value_or_one_error(kind, runs):
     runs = int(runs * SAMPLES[kind].share)

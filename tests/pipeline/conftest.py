@@ -18,18 +18,11 @@ def corner(tmp_path_factory) -> Known:
     return part(tmp_path_factory.mktemp("corner"))
 
 
-@pytest.fixture(scope="session", params=["part", pytest.param("whole", marks=pytest.mark.slow)])
+@pytest.fixture(scope="session", params=["part", pytest.param("whole", marks=pytest.mark.nightly)])
 def known(request) -> Known:
-    """Three images with truth: before a commit a part of them, else the whole, too."""
+    """Three images with truth: a part of them, at night the whole, too."""
     found: Known = request.getfixturevalue("corner") if request.param == "part" else whole()
     return found
-
-
-@pytest.fixture(scope="session")
-def adjusted(known, tmp_path_factory) -> tuple[AdjustResult, Path]:
-    """The known images, adjusted with the defaults."""
-    out = tmp_path_factory.mktemp("known") / "adjusted"
-    return adjust(known.images, out), out
 
 
 @pytest.fixture(scope="session")
@@ -37,6 +30,14 @@ def matched(known, tmp_path_factory) -> tuple[AdjustResult, Path]:
     """The known images, matched."""
     out = tmp_path_factory.mktemp("matched") / "ties"
     return adjust(known.images, out, RunOptions(stop_after="matching")), out
+
+
+@pytest.fixture(scope="session")
+def adjusted(known, matched, tmp_path_factory) -> tuple[AdjustResult, Path]:
+    """The known images, adjusted with the defaults, going on with what was matched."""
+    out = tmp_path_factory.mktemp("known") / "adjusted"
+    shutil.copytree(matched[1], out)
+    return adjust(known.images, out, RunOptions(overwrite=True)), out
 
 
 @pytest.fixture(scope="session")

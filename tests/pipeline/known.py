@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from barpc.base.geodesy import ecef_from_ground, enu_basis
 from barpc.sensor.geometry import triangulate
@@ -16,11 +15,6 @@ from tests.reliability.trials import SAMPLES, crop
 
 FOLDER = SAMPLES[0].parent
 START, SIDE = 300, 288  # of a part
-
-WHOLE_AT_NIGHT = pytest.mark.parametrize(
-    "known", ["part", pytest.param("whole", marks=pytest.mark.nightly)], indirect=True, scope="session"
-)
-"""Of a test whose bounds are the same for a part of the images as for the whole."""
 
 
 @dataclass(frozen=True)

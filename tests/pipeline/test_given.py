@@ -114,12 +114,12 @@ def test_a_few_points_beyond_their_image_are_left_out_and_counted(tmp_path, capl
 
 
 @pytest.mark.slow
-def test_an_image_that_is_left_out_leaves_the_rest_of_the_matches(shared_data, tmp_path) -> None:
+def test_an_image_that_is_left_out_leaves_the_rest_of_the_matches(shared_data, corner, tmp_path) -> None:
     """The stray image is the only one that the file ties: what is left is matched here."""
     stray = sorted((shared_data / "optical/phr_triplet_north").glob("*.tif"))[:2]
     ties = noisy(shared_data, tmp_path / "ties", ("img_01", "img_02"))
-    result = check([*IMAGES, *stray], RunOptions(matches=str(ties), keep_going=True))
-    assert [view.name for view in result.views] == [path.stem for path in IMAGES]
+    result = check([*corner.images, *stray], RunOptions(matches=str(ties), keep_going=True))
+    assert [view.name for view in result.views] == [path.stem for path in corner.images]
     assert len(result.run.matched) == 3
 
 

@@ -18,11 +18,10 @@ from barpc.rpcio import read_rpc
 from barpc.rpcio.carried import put_tag
 from barpc.scene import Tracks
 
-from .known import WHOLE_AT_NIGHT, errors_at_check_points
+from .known import errors_at_check_points
 
 
 @pytest.mark.slow
-@WHOLE_AT_NIGHT
 def test_tie_points_from_a_file_give_the_same_answer(known, matched, tmp_path):
     result, out = matched
     runs = []
@@ -36,7 +35,6 @@ def test_tie_points_from_a_file_give_the_same_answer(known, matched, tmp_path):
 
 
 @pytest.mark.slow  # before a commit: the same tie points from a table, and ASP's in tests/pointio
-@WHOLE_AT_NIGHT
 def test_asp_text_matches_hold_the_same_tie_points(matched):
     result, out = matched
     assert sorted(path.name for path in (out / "asp").iterdir()) == [
@@ -52,7 +50,6 @@ def test_asp_text_matches_hold_the_same_tie_points(matched):
     assert theirs <= ours
 
 
-@WHOLE_AT_NIGHT
 def test_control_points_put_the_scene_in_its_place(known, matched, tmp_path):
     options = RunOptions(matches_only=True, matches=str(matched[1] / "matches.npz"), gcp=(str(known.gcps),))
     result = adjust(known.images, tmp_path / "out", options)
@@ -90,7 +87,6 @@ def test_control_points_of_other_images_are_refused_before_any_work(corner, tmp_
 
 
 @pytest.mark.slow  # before a commit: a list that leaves an image alone, and the option
-@WHOLE_AT_NIGHT
 def test_a_stray_image_is_named_and_left_out_when_asked(known, tmp_path):
     stray = tmp_path / "img_01.tif"
     elsewhere(known.images[0], stray)
@@ -124,7 +120,6 @@ def test_a_real_stray_image_is_left_out(corner, shared_data, tmp_path):
 
 
 @pytest.mark.slow  # before a commit: the option
-@WHOLE_AT_NIGHT
 def test_a_later_run_goes_on_from_an_earlier_block(known, matched, tmp_path):
     given = RunOptions(matches_only=True, matches=str(matched[1] / "matches.npz"))
     two = tmp_path / "two.csv"
@@ -191,7 +186,6 @@ def test_paths_with_spaces_and_accents_and_equal_stems(corner, tmp_path):
 
 
 @pytest.mark.slow
-@WHOLE_AT_NIGHT
 def test_check_points_are_measured_and_not_used(known, matched, tmp_path):
     given = RunOptions(matches_only=True, matches=str(matched[1] / "matches.npz"), stop_after="adjustment")
     free = adjust(known.images, tmp_path / "free", given)

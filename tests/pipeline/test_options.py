@@ -345,7 +345,7 @@ ELSEWHERE = (
 tests/remote and tests/reliability, or beside them: matches_only, reference_sigma."""
 
 
-SLOW = ("reference_sigma", "stop_after", "resample", "altimetry", "fit", "fixed_run")
+SLOW = ("reference_sigma", "stop_after", "resample", "altimetry", "fit", "fixed_run", "rpc_formats", "overwrite")
 """Options that take a run or two of their own: the landing check tries them."""
 
 

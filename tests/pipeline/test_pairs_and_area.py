@@ -20,7 +20,7 @@ from barpc.sensor.geometry import triangulate
 from barpc.tie import read_area
 from tests.reliability.conftest import barpc
 
-from .known import SAMPLES, WHOLE_AT_NIGHT
+from .known import SAMPLES
 
 IMAGES = [str(path) for path in SAMPLES]
 
@@ -141,7 +141,6 @@ def area_file(path: Path, views: tuple[View, ...]) -> Path:
 
 
 @pytest.mark.slow
-@WHOLE_AT_NIGHT
 def test_only_the_listed_pairs_are_matched_and_only_in_the_area(known, tmp_path) -> None:
     views = load_views(known.images).views
     pairs = tmp_path / "pairs.txt"
@@ -171,7 +170,6 @@ def test_a_missing_file_ends_the_run_with_one_line(tmp_path, flag, word) -> None
 
 
 @pytest.mark.slow
-@WHOLE_AT_NIGHT
 def test_an_image_that_the_list_leaves_alone_can_be_left_out(known, tmp_path) -> None:
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("view_00 view_01\n")

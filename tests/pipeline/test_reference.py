@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -16,22 +15,27 @@ from barpc.pipeline import adjust
 from barpc.pointio.correspondences import read_gcps
 from barpc.rpcio import read_rpc
 from tests.lanes import rest_slow
-from tests.pipeline.known import FOLDER, SAMPLES, errors_at_check_points
+from tests.pipeline.known import errors_at_check_points, part, whole
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.season import other_season, write_dem, write_reference
 from tests.scenes.terrain import Grid
 
-IMAGES = SAMPLES
 DEM_BIAS = 2.0
 
 
-@pytest.fixture(scope="module")
-def truth():
-    return json.loads((FOLDER / "truth.json").read_text())
+@pytest.fixture(scope="module", params=["windows", pytest.param("whole", marks=pytest.mark.nightly)])
+def shown(request, tmp_path_factory):
+    """Three images with truth: windows of 600 px, at night the whole, too."""
+    return whole() if request.param == "whole" else part(tmp_path_factory.mktemp("windows"), side=600, start=200)
 
 
 @pytest.fixture(scope="module")
-def place(truth, tmp_path_factory):
+def truth(shown):
+    return shown.truth
+
+
+@pytest.fixture(scope="module")
+def place(shown, truth, tmp_path_factory):
     """A folder with a reference, a mirrored one, a terrain and tie points."""
     out = tmp_path_factory.mktemp("place")
     options = {key: tuple(v) if isinstance(v, list) else v for key, v in truth["options"].items()}
@@ -41,7 +45,7 @@ def place(truth, tmp_path_factory):
     write_reference(out / "ref.tif", scene, season, 2.0)
     write_reference(out / "wrong.tif", scene, mirrored, 2.0)
     write_dem(out / "dem.tif", scene, 5, error=1.0, bias=DEM_BIAS)
-    adjust(IMAGES, out / "ties", RunOptions(stop_after="matching"))
+    adjust(shown.images, out / "ties", RunOptions(stop_after="matching"))
     return out
 
 
@@ -56,8 +60,8 @@ def options(place):
 
 
 @pytest.fixture(scope="module")
-def held(place, options):
-    return adjust(IMAGES, place / "held", options)
+def held(shown, place, options):
+    return adjust(shown.images, place / "held", options)
 
 
 def place_of(out, result, truth) -> np.ndarray:
@@ -104,15 +108,15 @@ def test_its_points_can_be_read_as_gcps(held, place):
 
 
 @pytest.mark.nightly  # before: the option's row, and tests/ba/test_reference
-def test_a_stated_sigma_is_the_scene_s(options, tmp_path):
-    run = adjust(IMAGES, tmp_path / "run", replace(options, reference_sigma=2.0, stop_after="adjustment"))
+def test_a_stated_sigma_is_the_scene_s(shown, options, tmp_path):
+    run = adjust(shown.images, tmp_path / "run", replace(options, reference_sigma=2.0, stop_after="adjustment"))
     assert run.summary["scene"]["sigma_enu_m"][:2] == pytest.approx([2.0, 2.0], rel=0.1)
 
 
 @pytest.mark.nightly
 @pytest.mark.slow
-def test_a_reference_of_another_place_moves_nothing(place, options, tmp_path, capsys):
-    alone = adjust(IMAGES, tmp_path / "alone", replace(options, reference=()))
+def test_a_reference_of_another_place_moves_nothing(shown, place, options, tmp_path, capsys):
+    alone = adjust(shown.images, tmp_path / "alone", replace(options, reference=()))
     flags = [
         "--matches",
         *options.matches,
@@ -123,7 +127,7 @@ def test_a_reference_of_another_place_moves_nothing(place, options, tmp_path, ca
         str(place / "wrong.tif"),
     ]
     with pytest.raises(SystemExit) as stopped:
-        main(["adjust", *map(str, IMAGES), *flags, "-o", str(tmp_path / "wrong")])
+        main(["adjust", *map(str, shown.images), *flags, "-o", str(tmp_path / "wrong")])
     assert stopped.value.code == 3
     assert "does not show what the images show" in capsys.readouterr().out
     assert not (tmp_path / "wrong/tables/gcps.geojson").exists()
@@ -133,8 +137,8 @@ def test_a_reference_of_another_place_moves_nothing(place, options, tmp_path, ca
 
 
 @pytest.mark.slow
-def test_one_image_is_enough(options, truth, tmp_path):
-    run = adjust(IMAGES[:1], tmp_path / "run", replace(options, matches=(), matches_only=False))
+def test_one_image_is_enough(shown, options, truth, tmp_path):
+    run = adjust(shown.images[:1], tmp_path / "run", replace(options, matches=(), matches_only=False))
     points = [p for p in truth["check_points"] if run.run.views[0].name in p["image"]]
     ground = np.array([p["ground"] for p in points])
     image = np.array([p["image"][run.run.views[0].name] for p in points])

@@ -177,7 +177,7 @@ WHOLE_RUN = (  # a run goes on to its end: two are enough before a commit
 )  # fmt: skip
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
     "name",
     [pytest.param(name, marks=[pytest.mark.slow] * (name in WHOLE_RUN[1:-1])) for name in HOSTILE],

@@ -56,7 +56,7 @@ def failing(monkeypatch: pytest.MonkeyPatch, where: Any, name: str, when: int, c
     ("where", "name", "least"),
     [
         pytest.param(os, "fsync", 15, id="fsync"),
-        pytest.param(Path, "replace", 8, id="rename"),
+        pytest.param(Path, "replace", 8, id="rename", marks=pytest.mark.slow),
         pytest.param(os, "open", 15, id="open of a descriptor", marks=pytest.mark.slow),
         pytest.param(Path, "open", 8, id="open"),
         pytest.param(Path, "mkdir", 8, id="mkdir", marks=pytest.mark.slow),

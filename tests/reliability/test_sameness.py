@@ -160,6 +160,7 @@ def copied(source: Path, target: Path, **how: object) -> Path:
     return rewrite(Path(shutil.copy(source, target)), camera=other_camera, **how)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "how",
     [

@@ -57,7 +57,7 @@ VERBS = {
 FITTED = ("export colmap",)  # beside the images as the others; pinholes are fitted: tests/export
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("verb", rest_slow(sorted(VERBS, key=lambda verb: verb in FITTED), len(TARGETS) + 1))
 def test_an_image_stays_the_camera_that_it_was(finished, tmp_path, verb) -> None:
     folder = tmp_path / "in"

@@ -98,7 +98,7 @@ def scheme(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
     return str(request.param)
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow  # before a commit: test_stores
 @pytest.mark.filterwarnings("ignore")
 def test_an_emulated_store_is_read(scheme: str) -> None:
     hosts, root = [f"{scheme}://scenes"], f"{scheme}://scenes"
@@ -109,6 +109,7 @@ def test_an_emulated_store_is_read(scheme: str) -> None:
         versioned(located(f"{root}/a/missing.tif", hosts), IMAGE)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_an_emulated_object_that_is_replaced_is_noticed_by_who_reads_it(scheme: str) -> None:
     import fsspec

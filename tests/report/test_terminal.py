@@ -122,7 +122,7 @@ def a_large_run(bad: int, torn: int = 40, num: int = 300, **fields):
     return a_summary(views, pairs, status="bad", headline="Look.", verdict=verdict, out_dir="out", **fields)
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("width", [None, 200, 80])
 @pytest.mark.parametrize("bad", [0, 3, 8, 299])
 def test_a_summary_is_sixty_lines_whatever_its_size(bad, width, monkeypatch):

@@ -157,7 +157,7 @@ def test_an_unexpected_encoding_is_refused_or_read_the_same(sample, encoding):
         assert parse(data, "bad.file")[0].coeffs.shape == (4, 20)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @each_sample
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())

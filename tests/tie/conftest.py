@@ -20,11 +20,8 @@ from barpc.sensor.rpc import RPC
 from barpc.tie import TieResult, find_tracks
 from tests.scenes import ImageOptions, Scene
 
-SIDES = [300, pytest.param(600, marks=pytest.mark.slow)]
-"""Rows and columns of a rendered scene: a quarter of the ground before a commit, all of it in the slower lanes."""
-
-SIDES_AT_NIGHT = [300, pytest.param(600, marks=pytest.mark.nightly)]
-"""The same of tests with bounds that do not depend on the side."""
+SIDES = [300, pytest.param(600, marks=pytest.mark.nightly)]
+"""Rows and columns of a rendered scene: a quarter of the ground, all of it at night."""
 
 
 def write_image(path: Path, data: np.ndarray, **profile: object) -> Path:

@@ -173,7 +173,7 @@ def test_any_json_is_an_area_or_one_line(tmp_path_factory, data) -> None:
     _area_or_one_line(tmp_path_factory.getbasetemp() / "any.json", data)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
 @given(JSON)
 def test_much_json_is_an_area_or_one_line(tmp_path_factory, data) -> None:
@@ -280,7 +280,7 @@ def test_all_tie_points_lie_in_the_area(render, tmp_path) -> None:
 
 @pytest.mark.slow
 def test_all_tie_points_lie_in_the_area_and_other_tiles_are_not_even_read(render, tmp_path, monkeypatch) -> None:
-    scene = render(views=2)
+    scene = render(views=2, size=(450, 450))
     views = [in_blocks(view, tmp_path) for view in scene.views]  # strips are read whole
     area = read_area(written(tmp_path / "a.json", corner(scene, 0.4)))
     read: list[tuple[str, tuple[int, ...]]] = []

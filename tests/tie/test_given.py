@@ -17,7 +17,7 @@ from barpc.tie import Matches, Scope, TieOptions, common_tracks, find_tracks
 from barpc.tie.tracks import pair_counts
 from tests.lanes import rest_slow
 
-from .conftest import SIDES_AT_NIGHT, Rendered, write_image
+from .conftest import SIDES, Rendered, write_image
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 
@@ -46,7 +46,7 @@ def typical(scene: Rendered, tracks: Tracks, i: int, j: int) -> float:
     return 1.4826 * np.median(np.abs(scene.errors(i, j, *common_tracks(tracks, i, j))), axis=0).max()
 
 
-@pytest.mark.parametrize("side", SIDES_AT_NIGHT)
+@pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize(
     ("views", "noise", "false"),
     rest_slow(pytest.param(*row) for row in ((2, 0.4, 0.6), (3, 0.4, 0.6), (3, 0.3, 0.0), (3, 0.5, 0.0))),

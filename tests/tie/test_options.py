@@ -235,8 +235,12 @@ def test_a_pair_needs_as_many_matches_as_asked_for(scene: Rendered) -> None:
     more = find_tracks(scene.views, TieOptions(min_matches=kept + 1))  # those that are not registered stay
     assert kept < more.tracks.num_points <= verified
     assert more.pairs[0].unregistered == more.tracks.num_points - kept
+
+
+@pytest.mark.nightly  # every way is tried
+def test_a_pair_of_fewer_matches_than_asked_for_is_refused(scene: Rendered) -> None:
     with pytest.raises(Exception, match="too few matches"):
-        find_tracks(scene.views, TieOptions(min_matches=2 * verified))
+        find_tracks(scene.views, TieOptions(min_matches=2 * scene.tied.pairs[0].verified))
 
 
 @pytest.mark.parametrize(

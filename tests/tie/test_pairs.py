@@ -53,7 +53,7 @@ def test_pairs_do_not_depend_on_where_longitudes_wrap(lon: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [100, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [100, pytest.param(1000, marks=pytest.mark.nightly)])
 def test_a_thousand_views_get_their_best_partners_and_not_all_pairs(count: int) -> None:
     grid = [camera(400 * METRE * (k % 40), 400 * METRE * (k // 40)) for k in range(count)]
     pairs = select_pairs(views(*grid), TieOptions(neighbours=3))

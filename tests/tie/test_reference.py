@@ -20,6 +20,7 @@ from barpc.scene import View
 from barpc.sensor.rpc import RPC
 from barpc.tie.reference import PEAK, Accuracy, ReferenceControl, ViewMatch, _affine, _Work, peak, register_views
 from barpc.tie.tasks import HERE
+from tests.lanes import rest_slow
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.season import other_season, write_dem, write_reference
 from tests.scenes.terrain import Grid
@@ -77,7 +78,7 @@ def shifted(view: View, px: tuple[float, float]) -> View:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("px", [(0.0, 0.0), (120.0, -90.0)])
+@pytest.mark.parametrize("px", rest_slow([(120.0, -90.0), (0.0, 0.0)], mark=pytest.mark.nightly))
 def test_the_camera_is_off_by_what_was_done_to_it(px, views, reference, dem, truth):
     view = shifted(views[0], px)
     found = register_views([view], [reference], dem)

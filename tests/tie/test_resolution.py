@@ -260,7 +260,7 @@ def test_real_crops_of_a_few_hundred_pixels_are_tied_at_any_two_resolutions(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("swapped", [False, True])
+@pytest.mark.parametrize("swapped", rest_slow([False, True], mark=pytest.mark.nightly))
 def test_a_multispectral_image_is_tied_to_the_panchromatic_one_of_the_other_view(
     ventoux, shared_data: Path, swapped: bool
 ) -> None:

@@ -17,7 +17,7 @@ from barpc.sensor.corrected import Corrected
 from barpc.tie import TieOptions, common_tracks, find_tracks
 from tests.lanes import rest_slow
 
-from .conftest import SIDES, SIDES_AT_NIGHT, write_image
+from .conftest import SIDES, write_image
 
 
 def rms(scene, tracks: Tracks, i: int, j: int) -> np.ndarray:
@@ -68,7 +68,7 @@ def test_tie_points_hold_under_other_light_and_half_the_sky_in_clouds(render, co
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("side", SIDES_AT_NIGHT)
+@pytest.mark.parametrize("side", SIDES)
 def test_the_corrected_cameras_of_a_second_pass_find_the_same_ground(render, side: int) -> None:
     scene = render(views=3, size=(side, side))
     exact = [
@@ -99,8 +99,9 @@ def _unpickled(task: bytes):
     ("workers", "number", "side"),
     [
         (Pickled, 2, 300),
+        (ProcessPoolExecutor, 2, 300),
         pytest.param(ThreadPoolExecutor, 3, 600, marks=pytest.mark.nightly),
-        pytest.param(ProcessPoolExecutor, 3, 600, marks=pytest.mark.slow),
+        pytest.param(ProcessPoolExecutor, 3, 600, marks=pytest.mark.nightly),
     ],
 )
 def test_the_result_is_the_same_to_the_byte_for_any_workers(render, workers, number: int, side: int) -> None:
@@ -140,7 +141,7 @@ def test_tie_points_hold_where_both_images_saturate(render, tmp_path) -> None:
     assert (np.abs(errors).max(axis=1) > 1.0).mean() <= 0.02
 
 
-@pytest.mark.parametrize("side", SIDES_AT_NIGHT)
+@pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize(
     "change",
     rest_slow(
@@ -164,7 +165,7 @@ def test_any_real_pixel_type_works(render, tmp_path, change, side: int) -> None:
 
 @pytest.mark.landing(2)
 @pytest.mark.slow
-@pytest.mark.parametrize("side", SIDES_AT_NIGHT)
+@pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize(
     "change",
     rest_slow(
@@ -201,7 +202,7 @@ def test_a_linear_change_of_the_grey_values_moves_no_tie_point(render, tmp_path,
             "no common offset",
             marks=pytest.mark.nightly,
         ),
-        pytest.param(lambda d: np.rot90(d, 2).copy(), "no common offset", marks=pytest.mark.slow),
+        pytest.param(lambda d: np.rot90(d, 2).copy(), "no common offset", marks=pytest.mark.nightly),
     ],
     ids=["nodata", "constant", "nan", "noise", "turned"],
 )

@@ -108,7 +108,7 @@ def test_as_delivered_it_is_a_tenth_of_a_pixel_off(render) -> None:
     ("side", "axis", "most"),
     [
         (300, np.arange(50.0, 250.0, 20.0), (0.25, 0.3)),
-        pytest.param(600, np.arange(100.0, 500.0, 40.0), (0.15, 0.25), marks=pytest.mark.slow),
+        pytest.param(600, np.arange(100.0, 500.0, 40.0), (0.15, 0.25), marks=pytest.mark.nightly),
     ],
 )
 def test_a_patch_is_registered_where_the_truth_says(render, side, axis, most) -> None:
@@ -128,7 +128,7 @@ def test_a_patch_is_registered_where_the_truth_says(render, side, axis, most) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("step", [120.0, pytest.param(40.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("step", [120.0, pytest.param(40.0, marks=pytest.mark.nightly)])
 def test_two_dates_of_a_satellite_lie_where_they_lie(shared_data, step: float) -> None:
     """Fields ten days apart on one grid, a corner of one under clouds, another without data."""
     paths = sorted((shared_data / "optical/s2_two_dates").glob("*.tif"))
@@ -373,7 +373,7 @@ def test_lines_that_coarser_pictures_lose_tie_a_pair_where_it_lies(shared_data, 
     assert np.sqrt((off**2).mean()) < 0.4
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_another_place_is_no_more_like_it_by_its_neighbours(shared_data, tmp_path) -> None:
     for name, change in (("mirrored", np.fliplr), ("turned", lambda pixels: pixels[::-1, ::-1])):
         (tmp_path / name).mkdir()
