@@ -81,7 +81,7 @@ def rows() -> list[tuple[str, str]]:
         (sidefile.NAMES.words, f"{size(sidefile.NAMES.most)}, {many(sidefile._LINE)} characters a line"),
         ("a VRT", size(vrt._MAX_BYTES)),
         ("a raster read as a DEM or geoid", f"{many(dem._MAX_CELLS)} cells"),
-        ("RPC tags of a TIFF", f"{many(carried._MAX_ENTRIES)} entries, {size(carried._MAX_VALUES)} of values"),
+        ("RPC tags of a TIFF", f"{many(carried._MAX_ENTRIES)} entries, {size(carried.SCANNED)} of values"),
         ("an RPC in a NITF", f"the first {size(carried.SCANNED)}"),
         ("a file of acquisition metadata", f"the first {size(carried.SCANNED)}"),
         ("a run's state", f"{size(workspace._MAX_STATE)}; larger ones count as missing"),

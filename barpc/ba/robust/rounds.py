@@ -12,7 +12,7 @@ from barpc.ba.evidence.scan import Interval
 from barpc.ba.held.block import Block
 from barpc.ba.held.ground import Heights
 from barpc.ba.robust.smooth import TERMS, Fit, Resemblance, Smooth, SmoothTest
-from barpc.ba.robust.variances import PriorTest, Variances, same_prior
+from barpc.ba.robust.variances import SAME_PRIOR, PriorTest, Variances, same_prior
 from barpc.ba.robust.weights import LOSSES, MEDIAN, Observations
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
@@ -142,7 +142,9 @@ class Rounds:
         again = self.passes > 1 or self.goes_on
         same = again and int((self.use != was_in_use).sum()) <= SLIGHT * len(self.use)
         settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < STANDS
-        settled &= same_prior(prior, self.problem.camera_prior)
+        # what is known of the place goes with what is shared, and nothing else learns of it
+        share = STANDS if tested.shared > 1.0 else SAME_PRIOR
+        settled &= same_prior(prior, self.problem.camera_prior, share)
         if once or self.passes >= TRIED or (settled and (same or not self.robust)):
             smooth = self.smooth.test_neighbours(smooth, self.residual, self.use)
             if found.covariance(self.problem.free).is_large:

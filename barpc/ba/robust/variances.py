@@ -32,6 +32,7 @@ _LOG = logging.getLogger(__name__)
 _LIKELIER = -np.log(LEVEL)  # but one odd view is named where all being worse than stated is as improbable beside it
 _MOVING = 0.01  # of a rotation, as drift: the centre it turns about flies some km while an image is taken
 _LOW = 0.1  # then as much is let be as leaves what is seen this likely: a prior too narrow bends all heights alike
+SAME_PRIOR = 0.2  # change of a standard deviation, as a logarithm, below which a block is not solved again
 _LEAST = 0.5  # degrees of freedom below which nothing is said
 
 
@@ -145,11 +146,12 @@ class Variances:
             wide = self._drift(params, known) if self.learn_drift else wide
             prior = self._prior(scale, wide)
             # a drift that is larger than thought looks like constants that are: it is learnt before they are asked
-            stands |= same_prior(prior, before if around.small else now, self._of_drift)
+            last, least = (before, STANDS) if around.small else (now, SAME_PRIOR)
+            stands |= same_prior(prior, last, least, self._of_drift)
             if stands and self.learn_constant and self._too_large(params, known, scale):
                 scale, odd = self._widened(around, params, known, wide)
                 prior = self._prior(scale, wide)
-            if not around.small or same_prior(prior, before):
+            if not around.small or same_prior(prior, before, STANDS):
                 break
             _, params, covariance = around.under(prior)
             known = self._known(covariance, prior)
@@ -320,11 +322,12 @@ def _possible(total: float, freedom: float) -> float:
     return float(total / (2.0 * gammaincinv(0.5 * freedom, _LOW)))
 
 
-def same_prior(a: CameraPrior, b: CameraPrior, part: slice | None = None) -> bool:
-    """Return whether the standard deviations of two priors, or of a part of the unknowns, stand (`STANDS`).
+def same_prior(a: CameraPrior, b: CameraPrior, share: float, part: slice | None = None) -> bool:
+    """Return whether the standard deviations of two priors differ by less than a share; infinite ones are
+    infinite in both.
 
-    Infinite ones are infinite in both.
+    Of all unknowns, or a part.
     """
     one, other = (prior.sigma[:, slice(None) if part is None else part] for prior in (a, b))
     finite = np.isfinite(one) & np.isfinite(other)
-    return bool((np.abs(np.log(one[finite] / other[finite])) < STANDS).all())
+    return bool((np.abs(np.log(one[finite] / other[finite])) < share).all())

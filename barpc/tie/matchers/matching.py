@@ -68,6 +68,11 @@ _MARGINS = 150.0, 50.0  # m beyond known altitudes: how wrong cameras make them,
 _PROBES = 12  # pixels along a side at which the terrain is asked
 
 
+Ends = tuple[View, View]
+Points = tuple[Keypoints | KeypointFiles, Keypoints | KeypointFiles]
+"""Of both views; empty for a matcher that wants none."""
+
+
 @dataclass(frozen=True)
 class PairReport:
     """Result of matching a pair of views."""
@@ -102,7 +107,7 @@ class Ground:
     """What is known of the altitudes of the ground: a terrain, and the matches of pairs that have enough."""
 
     terrain: Terrain | None = None
-    ties: Sequence[tuple[tuple[View, View], Matches]] = ()
+    ties: Sequence[tuple[Ends, Matches]] = ()
 
     def altitudes(self) -> tuple[float, float] | None:
         """Return the lowest and the highest altitude [m] that most matches lie at."""
@@ -114,7 +119,7 @@ class Ground:
                 found.append(0.5 * (low + high) + 0.5 * (high - low) * np.percentile(along, [2, 98]))
         return (float(np.min(found)), float(np.max(found))) if found else None
 
-    def within(self, views: tuple[View, View], known: tuple[float, float] | None, margin: float) -> tuple[View, View]:
+    def within(self, views: Ends, known: tuple[float, float] | None, margin: float) -> Ends:
         """Return two views with fewer altitudes: those of the terrain, or else `known` ones, with a margin [m]."""
         low, high = common_range(*views)
         if self.terrain is not None:
@@ -136,12 +141,7 @@ class Ground:
 _UNKNOWN = Ground()
 
 
-def match_pair(
-    views: tuple[View, View],
-    keypoints: tuple[Keypoints | KeypointFiles, Keypoints | KeypointFiles],
-    pair: Pair,
-    options: TieOptions,
-) -> tuple[Matches, PairReport]:
+def match_pair(views: Ends, keypoints: Points, pair: Pair, options: TieOptions) -> tuple[Matches, PairReport]:
     """Match two views; keypoints are empty for a matcher that wants none. Without matches the report gives
     the reason.
 
@@ -200,8 +200,8 @@ def _better(*attempts: tuple[Matches, PairReport]) -> tuple[Matches, PairReport]
 
 
 def _attempt(
-    views: tuple[View, View],
-    keypoints: tuple[Keypoints | KeypointFiles, Keypoints | KeypointFiles],
+    views: Ends,
+    keypoints: Points,
     pair: Pair,
     options: TieOptions,
     looked: dict[str, _Search] | None = None,
@@ -248,9 +248,7 @@ def _apart(xy: Array, side: float) -> int:
 
 
 def _loaded(
-    views: tuple[View, View],
-    keypoints: tuple[Keypoints | KeypointFiles, Keypoints | KeypointFiles],
-    options: TieOptions,
+    views: Ends, keypoints: Points, options: TieOptions
 ) -> tuple[tuple[Keypoints, Keypoints], tuple[IntArray, IntArray] | None]:
     """Return the keypoints of the tiles that both views may see, and their numbers; None: as they stand."""
     a, b = keypoints
@@ -263,7 +261,7 @@ def _loaded(
     return (first[0], second[0]), (first[1], second[1])
 
 
-def quick_score(views: tuple[View, View], keypoints: tuple[KeypointFiles, KeypointFiles], options: TieOptions) -> int:
+def quick_score(views: Ends, keypoints: tuple[KeypointFiles, KeypointFiles], options: TieOptions) -> int:
     """Estimate how many of a few keypoints match, with at most 5 % false ones: a cheap forecast for a pair."""
     few = (keypoints[0].strongest(AMPLE * THIN), keypoints[1].strongest(AMPLE * THIN))
     if not (len(few[0]) and len(few[1])):
@@ -282,7 +280,7 @@ def first_look(
 
 def _tasks(
     views: Sequence[View], keypoints: Sequence[Keypoints | KeypointFiles], pairs: Sequence[Pair], options: TieOptions
-) -> list[tuple[tuple[View, View], tuple[Any, Any], Pair, TieOptions]]:
+) -> list[tuple[Ends, tuple[Any, Any], Pair, TieOptions]]:
     ends = [(pair, *pair.views) for pair in pairs]
     return [((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options) for pair, i, j in ends]
 
@@ -318,7 +316,7 @@ def match_pairs(
 
 
 def _match_within(
-    several: Sequence[tuple[View, View]], keypoints: tuple[Keypoints, Keypoints], pair: Pair, options: TieOptions
+    several: Sequence[Ends], keypoints: tuple[Keypoints, Keypoints], pair: Pair, options: TieOptions
 ) -> tuple[Matches, PairReport]:
     """Match two views at some altitudes, and at fewer where that finds few: with less to confuse."""
     tried = [match_pair(several[0], keypoints, pair, options)]
@@ -351,7 +349,7 @@ class _Peak(NamedTuple):
 class _Search:
     """The passes over one pair of views."""
 
-    def __init__(self, views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints], options: TieOptions) -> None:
+    def __init__(self, views: Ends, keypoints: tuple[Keypoints, Keypoints], options: TieOptions) -> None:
         self._views, self._options = views, options
         self._offset: list[Prediction | None] = []
         self._matcher = matcher_named(options.matcher)(options, keypoints)

@@ -59,12 +59,7 @@ class PatchRegistration:
 
 
 def register_places(
-    files: tuple[tuple[str, tuple[int, int]], tuple[str, tuple[int, int]]],
-    band: int,
-    reference: Array,
-    start: Array,
-    linear: Array,
-    patch: int,
+    files: oriented.Files, band: int, reference: Array, start: Array, linear: Array, patch: int
 ) -> PatchRegistration:
     """Read what is needed of two images, each a path and its size, and register as `register_patches`, tile by tile.
 
@@ -150,12 +145,7 @@ def _joined(groups: Sequence[IntArray], most: int) -> list[IntArray]:
 
 
 def register_part(
-    files: tuple[tuple[str, tuple[int, int]], tuple[str, tuple[int, int]]],
-    band: int,
-    reference: Array,
-    start: Array,
-    linear: Array,
-    structural: bool,
+    files: oriented.Files, band: int, reference: Array, start: Array, linear: Array, structural: bool
 ) -> PatchRegistration:
     """Register patches by their grey values, or by channels of oriented gradients; `ok` where they are alike."""
     if structural:
