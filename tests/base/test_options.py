@@ -220,6 +220,13 @@ def test_the_schema_and_the_records_agree(tmp_path: Path) -> None:
             validate({table: {name: plain}} if table else {name: plain})
 
 
+def test_a_standard_deviation_may_be_small_and_is_not_zero() -> None:
+    for name in ("dem_sigma", "dem_bias_sigma", "sigma_attitude", "sigma_position"):
+        assert getattr(AdjustOptions(**{name: 1e-3}), name) == 1e-3
+        with pytest.raises(InputError, match=f"{name} must be a number above 0"):
+            AdjustOptions(**{name: 0.0})
+
+
 def test_the_altitudes_of_a_surface_begin_with_the_lower_one() -> None:
     assert DsmOptions(alt=(300.0, 300.1)).alt == (300.0, 300.1)
     for alt in ((300.0, 300.0), (300.0, 200.0)):
