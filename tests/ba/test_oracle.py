@@ -157,7 +157,7 @@ def test_the_reduced_system_is_the_schur_complement_of_the_whole_differenced_pro
 def test_pieces_of_any_size_make_the_same_system(case, monkeypatch):
     whole = case.reduced
     monkeypatch.setattr(normal, "CHUNK", 3)
-    monkeypatch.setattr("barpc.ba.estimated.projected.CHUNK", 5)
+    monkeypatch.setattr("barpc.sensor.rpc.CHUNK", 5)
     pieces = case.reduced
     _assert_close(pieces.matrix, whole.matrix, 1e-12)
     _assert_close(pieces.gradient, whole.gradient, 1e-9)
