@@ -50,6 +50,7 @@ from barpc.tie.pairing.overlaps import (
 from barpc.tie.pairing.resolution import Looks
 from barpc.tie.patches.oriented import REACH
 from barpc.tie.patches.register import refine
+from barpc.tie.pixels import sample_stretch
 from barpc.tie.tasks import Progress, Work, store_of
 
 logger = logging.getLogger(__name__)
@@ -126,7 +127,7 @@ def _registered(
     theirs = {looks.ends[views] for views in scope.given}
     verified = {ends: found for ends, found, _ in tried if len(found)}
     tracks = refine(looks.views, linked, spreads, options, structural=structural, work=work)
-    if unlike := _unlike(linked, tracks, sorted(theirs & set(verified))):
+    if unlike := _with_pictures(looks.views, _unlike(linked, tracks, sorted(theirs & set(verified))), options, work):
         tracks = refine(looks.views, linked, spreads, options, structural=[*structural, *unlike], work=work)
     needed = theirs | _needed(looks, tracks, list(verified), options)
     known = {ends: found for ends, found in verified.items() if ends in needed}
@@ -249,6 +250,16 @@ def _unlike(linked: Tracks, registered: Tracks, pairs: Collection[tuple[int, int
     """Return the pairs whose grey values do not compare: too few of their matches could be registered by these."""
     before, after = pair_counts(linked), pair_counts(registered)
     return [pair for pair in pairs if after.get(pair, 0) < min(0.5 * before.get(pair, 0), THIN)]
+
+
+def _with_pictures(
+    views: Sequence[View], pairs: Sequence[tuple[int, int]], options: TieOptions, work: Work
+) -> list[tuple[int, int]]:
+    """Return the pairs of images that vary: where nothing does, nothing else can be compared either."""
+    some = sorted({view for pair in pairs for view in pair})
+    stretches = work.ordered(sample_stretch, [(views[i].path, options.band, views[i].size) for i in some], "survey")
+    blank = {i for i, stretch in zip(some, stretches, strict=True) if stretch is None}
+    return [pair for pair in pairs if not blank & set(pair)]
 
 
 def _with_unregistered(views: Sequence[View], tracks: Tracks, given: GivenMatches, options: TieOptions) -> Tracks:
