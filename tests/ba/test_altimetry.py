@@ -102,6 +102,25 @@ def test_heights_that_mostly_disagree_agree_on_nothing():
     assert not registered(rng, elsewhere).is_most
 
 
+@pytest.mark.parametrize(
+    ("agree", "near", "rivals", "most"),
+    [
+        (41, 100, 0, True),
+        (40, 100, 0, False),
+        (90, 100, 62, True),
+        (90, 100, 66, False),
+        (4, 4, 0, False),
+        (5, 5, 0, True),
+    ],
+)
+def test_most_is_a_half_but_for_chance_and_clearly_more_than_agree_elsewhere(agree, near, rivals, most):
+    """By two standard deviations of a count, of a half of them as many as agree by chance."""
+    zeros, which = np.zeros(near), np.arange(near) < agree
+    one = Registration(np.zeros(7), np.eye(7), np.ones(near, bool), which, zeros, zeros, rivals)
+    assert one.is_most == most
+    assert one.share == pytest.approx(agree / near)
+
+
 @pytest.mark.slow
 def test_two_groups_of_equal_weight_are_no_majority():
     """Half of the heights in another datum, 30 m off: which half is right nobody knows."""

@@ -279,6 +279,11 @@ def test_what_nothing_tells_of_is_not_tested(small) -> None:
     ray = sight_enu(small.views[gcps.view[first]].sensor, gcps.lonlatalt[3])
     assert abs(once.residual[3] @ ray) < 0.02  # along its ray nothing is told
     assert 0.1 < once.redundancy[3] < 2 / 3
+    last = np.flatnonzero(gcps.point == 3)[1:]
+    twice = held(small, blundered(some(gcps, ~np.isin(np.arange(len(gcps.point)), last[1:])), {3: 20.0})).control
+    assert twice.status(3) == "rejected"  # by two rays, which tell by how much
+    assert np.linalg.norm(twice.residual[3]) == pytest.approx(20.0, abs=2.0)
+    assert twice.w[3] > CRITICAL
 
 
 def test_a_point_alone_is_not_checked_and_two_that_differ_contradict(small) -> None:

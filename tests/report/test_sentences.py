@@ -628,3 +628,22 @@ def test_control_that_contradicts_is_named_with_what_it_is_off_by():
     assert "outweighs the others: B against C. None of them was used" in line
     (line,) = said("rejected rejected rejected", torn=(0.1, 0.25))
     assert "0.100 px became 0.250 px at tie points that took no part" in line
+
+
+def test_altimetry_says_how_well_it_agrees_or_why_it_holds_nothing():
+    usual = {
+        "agree": 70, "near": 80, "spread": 0.4, "expected": 0.5, "motion": np.array([1.0, -2.0, 3.0]), "total": 90,
+        "given": 90, "why_not": "",
+    }  # fmt: skip
+    fine = run_of(adjusted(altimetry=SimpleNamespace(**usual)))
+    line = (
+        "70 of 80 altimetry heights agree with the surface of the tie points to 40.0 cm (50.0 cm expected); they moved "
+        f"it by {enu(np.array([1.0, -2.0, 3.0]))}."
+    )
+    assert line in said(fine)
+    assert any(one.startswith("So its place is known") for one in said(fine))
+    assert not any("altimetry" in one for one in block_verdict(fine, views())["reasons"])
+    odd = run_of(adjusted(altimetry=SimpleNamespace(**{**usual, "why_not": "they lie elsewhere"})))
+    assert not any("altimetry heights agree" in one for one in said(odd))
+    (reason,) = block_verdict(odd, views())["reasons"]
+    assert reason.startswith("The altimetry holds nothing: they lie elsewhere (")
