@@ -124,9 +124,9 @@ def test_triangulate_finds_the_point_that_two_images_see(image, other, capsys):
     (point,) = json.loads(capsys.readouterr().out)
     np.testing.assert_allclose([point["lon"], point["lat"], point["alt"]], ground, atol=1e-4)
     assert point["error"] == pytest.approx(0.0, abs=1e-4)
-    noisy = triangulate(rpcs, [0, 1], [0, 0], np.array(seen) + [[0, 0], [0, 2]])
-    args = [a for xy in np.array(seen) + [[0, 0], [0, 2]] for a in ("--at", *xy)]
-    assert run("triangulate", image, other, *args, "--json") == 3  # a pixel apart
+    noisy = triangulate(rpcs, [0, 1], [0, 0], np.array(seen) + [[0, 0], [0, 2.1]])
+    args = [a for xy in np.array(seen) + [[0, 0], [0, 2.1]] for a in ("--at", *xy)]
+    assert run("triangulate", image, other, *args, "--json") == 3  # more than a pixel apart
     expected = np.sqrt((noisy.residuals**2).sum(axis=1).mean())
     assert json.loads(capsys.readouterr().out)[0]["error"] == pytest.approx(expected, abs=1e-3)
 
