@@ -11,7 +11,7 @@ import pytest
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.held.block import first_state, join, make_problem
 from barpc.ba.held.ground import Heights
-from barpc.ba.held.terrain import NUM_BENDS, Bands, Believed, Relief, believe, bends
+from barpc.ba.held.terrain import NUM_BENDS, Bands, Believed, Relief, _summed, believe, bends
 from barpc.base.geodesy import enu_basis, ground_from_ecef
 from barpc.rasters.dem import Dem
 from barpc.simulate import simulate_block
@@ -154,6 +154,23 @@ def test_a_dem_of_another_terrain_is_told_from_one_that_is_only_coarse() -> None
         assert right.relief == pytest.approx(1.0, abs=0.05)
     plain = waves(1, 1.0, 700.0, 4000.0)  # of a metre: a DEM known to 5 m need not show it
     assert sure(judged(lambda lon, lat: np.full(len(lon), ALT), points(terrain=plain))).shows
+
+
+def test_points_whose_errors_are_alike_are_worth_one_wherever_they_lie() -> None:
+    """A thousand in eight groups along a line that are wrong alike: by cells a sixth of it long, and half of it."""
+    rng = np.random.default_rng(2)
+    group = np.repeat(np.arange(8), 125)
+    along = (group + rng.uniform(0.2, 0.8, 1000)) / 8.0
+    pull = rng.choice([-1.0, 1.0], 8)[group][:, None] * [1.0, 0.0] + rng.normal(size=(1000, 2)) * 0.1
+    for at in (
+        np.column_stack([along, 0.0 * along]),
+        np.column_stack([along, along]),
+        np.column_stack([0.2 * along, along]),
+    ):
+        found = [_summed(1e4 * at + shift, pull) for shift in (0.0, [5e5, 0.0], [-3e4, 4e6])]
+        assert found == pytest.approx([found[0]] * 3)
+        assert 80.0 < found[0] < 250.0
+    assert _summed(np.column_stack([along, along]), rng.normal(size=(1000, 2))) < 3.0
 
 
 def test_holes_and_what_fills_them_hold_nothing() -> None:

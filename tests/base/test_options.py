@@ -265,6 +265,8 @@ def test_records_print_what_differs_from_the_defaults() -> None:
             {"fit": {"space": "images"}},
             r"here \[fit\]: space 'images' is not one of image, ground",
         ),
+        ({"adjust": {"loss": "tukey"}}, r"here \[adjust\]: loss 'tukey' is not one of .*linear"),
+        ({"rpc_formats": ["txt", "doc"]}, r"rpc_formats .*'doc' is not one of txt, "),
         ({"adjust": {"dem_sigma": -1}}, r"here \[adjust\]: dem_sigma must be a number above 0"),
         ({"adjust": {"center_method": "foo"}}, r"here \[adjust\]: unknown option 'center_method'"),
         ({"adjust": {"model": "shift", "drift": 1}}, "drift 1 needs a model with a rotation"),

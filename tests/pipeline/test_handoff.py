@@ -18,6 +18,7 @@ from barpc.fit.certificate import Sample
 from barpc.pipeline.handoff import (
     CONSUMERS,
     TOLERANCE,
+    _lent,
     control_grid,
     difference,
     unverified,
@@ -97,6 +98,21 @@ def test_a_nitf_tells_what_its_record_cut_off(image, tmp_path):
     (reading, *_) = verify([write(rpc, image, tmp_path / "out", "a.ntf")], rpc, SIZE, ALTITUDES)
     assert not reading.passed
     assert 0.1 < reading.max_error < 5
+
+
+def test_a_foreign_reader_sees_a_raster_with_its_rpc_files_and_nothing_else(image, tmp_path):
+    rpc = make_rpc()
+    for name in ("a.tif", "a_RPC.TXT"):
+        write(rpc, image, tmp_path / "out", name)
+    path = tmp_path / "out/a.tif"
+    for more in ("a.tif.aux.xml", "a.tif.ovr", "a.tif.msk"):
+        (path.parent / more).write_text("<a/>")
+    with _lent(path) as lent:
+        assert {file.name for file in lent.parent.iterdir()} == {"a.tif", "a_RPC.TXT"}
+        assert lent.resolve() == path.resolve()
+        assert lent != path
+    with _lent(path.parent / "a_RPC.TXT") as lent:
+        assert lent == path.parent / "a_RPC.TXT"
 
 
 def test_a_file_that_a_tool_cannot_read_is_reported_with_its_reason(tmp_path):

@@ -144,6 +144,7 @@ BODIES = {
     "scaled to float": lambda: band(
         source("a.tif", scaling(-3.7, 0.1), kind="ComplexSource"), dtype="float32"
     ),
+    "doubled": lambda: band(source("a.tif", scaling(0.0, 2.0), kind="ComplexSource")),
     "scaled beyond the range": lambda: band(
         source("f.tif", "<ScaleRatio>2.5</ScaleRatio><NODATA>12.5</NODATA>", kind="ComplexSource"), dtype="int16"
     ),
@@ -186,7 +187,7 @@ def vrt_size(size: tuple[int, int], body: str) -> tuple[tuple[int, int], str]:
     return size, body
 
 
-@pytest.mark.few(7)
+@pytest.mark.few(8)
 @pytest.mark.parametrize("name", BODIES)
 def test_a_vrt_reads_as_gdal_reads_it(tmp_path: Path, name: str) -> None:
     raster(tmp_path / "a.tif")

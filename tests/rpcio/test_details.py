@@ -569,7 +569,9 @@ def test_a_camera_is_written_as_the_name_of_its_place_says(tmp_path: Path) -> No
     write_camera(rpc, tmp_path / "partial", image, place=tmp_path / "b.geom", overwrite=True)
     assert read_rpc_source(tmp_path / "partial").format == "geom"
     write_camera(rpc, tmp_path / "c.vrt", image)
-    assert read_rpc(tmp_path / "c.vrt") == rpc
+    write_camera(rpc, tmp_path / "c.tif", image)
+    for name in ("c.vrt", "c.tif"):
+        assert read_rpc(tmp_path / name) == rpc
     with pytest.raises(RpcFormatError, match="choose one of txt"):
         write_camera(rpc, tmp_path / "b.doc", image)
 

@@ -63,12 +63,14 @@ def test_a_field_is_its_text_its_number_or_its_numbers() -> None:
     assert found.one("e").number("f") == 7.0
     assert found.all("z") == []
     assert found.positive("c") == 1.0
+    assert fields("<w>1000000</w><h>1</h>").size("w", "h") == (1_000_000, 1)
 
 
 @pytest.mark.parametrize(
     ("text", "ask", "words"),
     [
         ("<a> </a>", lambda f: f.text("a"), "no a below <root>; is the file complete"),
+        ("<w>1000001</w><h>1</h>", lambda f: f.size("w", "h"), "w"),
         ("", lambda f: f.one("a"), "no a below <root>"),
         ("<a>1 x</a>", lambda f: f.numbers("a"), "a is not a list of numbers"),
         ("<a>1 2</a>", lambda f: f.number("a"), "a holds 2 numbers, expected 1"),

@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import BSpline
 
 from barpc.base.errors import RpcError
-from barpc.sensor.displaced import RowSpline, Splined
+from barpc.sensor.displaced import RowSpline, Splined, sine_and_cosine
 
 from .conftest import make_rpc
 
@@ -92,6 +92,11 @@ def test_a_camera_behind_strips_is_the_same_both_ways_and_has_its_jacobian() -> 
 
 
 SWINGS = [[[0.1, 0.0], [0.0, -0.2]], [[0.3, 0.1], [-0.1, 0.05]]]
+
+
+def test_a_swing_without_a_period_is_none() -> None:
+    row, period = np.array([0.0, 25.0, 30.0]), np.array([100.0, 100.0, np.inf])
+    np.testing.assert_allclose(sine_and_cosine(row, period), [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], atol=1e-12)
 
 
 def test_swings_repeat_themselves_and_have_their_slope() -> None:

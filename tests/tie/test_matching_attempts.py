@@ -164,6 +164,14 @@ def test_a_matcher_that_is_named_is_what_is_wanted_unless_the_terrain_tells_stru
     assert second_look([report(100)], TieOptions(matcher="structure"), ground=Ground(hills))[0] == []
 
 
+def test_a_pair_without_keypoints_has_no_match_and_no_share_of_them() -> None:
+    two = views(camera(0.0), camera(0.0, lean=0.2))
+    found, told = match_pair(tuple(two), (join_keypoints([]),) * 2, Pair((0, 1), 1.0, 5.0), TieOptions())
+    assert not len(found)
+    assert "keypoints" in told.status
+    assert (told.matches, told.verified, told.inlier_share, told.control_share) == (0, 0, 0.0, 0.0)
+
+
 def test_altitudes_are_known_from_pairs_whose_segments_are_five_pixels_to_either_side() -> None:
     """Of cameras that lean apart by so many pixels a metre, over two hundred metres."""
     for lean, tells in ((0.049, False), (0.051, True)):
