@@ -121,6 +121,10 @@ def test_a_group_is_told_from_what_stands_still() -> None:
     assert not len(members(problem, state.params, one, block.without(block.point >= 0)))
     few = linear.thinned(300)
     assert 240 <= sum(part.rows.size for part in few.tracks) <= 330
+    total = sum(part.rows.size for part in linear.tracks)
+    assert linear.thinned(total) is linear
+    half = linear.thinned(total - 1)
+    assert sum(part.rows.size for part in half.tracks) == pytest.approx(total / 2, abs=3)
     assert fit(few, group=group).noise == pytest.approx(found.noise, rel=0.15)
 
 

@@ -145,7 +145,11 @@ def test_what_would_make_an_rpc_as_good_as_stated_is_said(change, expected) -> N
     by_point = np.repeat(np.stack([2.0 * basis[0], 1.5 * basis[2]])[:, :, None], 80, axis=2)
     up = np.array([[0.0], [1.5]]) * np.ones(80)
     image = change(XY, up)
-    project = lambda params, points, bounds, what: SimpleNamespace(image=image, by_point=by_point)  # noqa: E731
+
+    def project(params: Any, points: Any, bounds: np.ndarray, what: str) -> SimpleNamespace:
+        assert (bounds.tolist(), points.shape, what) == ([0, 80], (3, 80), "points")  # all are the view's
+        return SimpleNamespace(image=image, by_point=by_point)
+
     cameras = SimpleNamespace(seeing=lambda xy: SimpleNamespace(project=project), unknowns=SimpleNamespace(constants=6))
     sigma = np.array([[0.6, 9.0, 9.0, 0.8, 9.0, 9.0]])
     prior = SimpleNamespace(mean=np.zeros((1, 6)), sigma=sigma)

@@ -370,6 +370,21 @@ def test_a_camera_that_does_not_say_where_it_stands_is_told(caplog) -> None:
     assert "nominal" not in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("images", "stop_after", "asked"), [("vrt", "all", True), ("copy", "all", False), ("vrt", "adjustment", False)]
+)
+def test_only_a_vrt_that_will_be_written_asks_for_images_that_it_can_point_at(
+    images, stop_after, asked, tmp_path, monkeypatch
+) -> None:
+    seen: list[str] = []
+    monkeypatch.setattr(stages, "plain_source", seen.append)
+    run, options = Run("adjust", views(2), (), NONE), RunOptions(images=images, stop_after=stop_after)
+    names, keep = stages._files(run, options, tmp_path)
+    assert seen == (["/x/v0.tif", "/x/v1.tif"] if asked else [])
+    assert names == output_names(run.views, options, tmp_path)
+    assert {Path("/x/v0.tif"), Path("/x/v1.tif")} <= set(keep)
+
+
 def test_a_check_ties_what_was_loaded_and_adjusts_nothing(monkeypatch) -> None:
     loaded, tied = Run("check", views()[:2], (), NONE), Run("check", views(), (), NONE)
     given = ["/x/v2.tif", "/x/v0.tif", "/x/v1.tif"]

@@ -10,7 +10,7 @@ import pytest
 from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center, camera_centers
-from barpc.sensor.rpc import RpcStack, localize_stack
+from barpc.sensor.rpc import RPC, RpcStack, localize_stack
 from barpc.simulate import simulate_block
 from tests.sensor.test_rpc import VENDORS, box
 
@@ -53,6 +53,16 @@ def test_image_points_are_those_of_each_camera(sensors):
     expected = [sensors[i].project(points) for i, points in zip((0, 1, 3), alone, strict=True)]
     np.testing.assert_allclose(found.T, np.concatenate(expected), rtol=0, atol=1e-6)
     np.testing.assert_allclose(stack.project(np.concatenate(alone).T, slice(1, 4), bounds)[0], found, atol=1e-6)
+
+
+def test_a_camera_whose_points_are_certain_is_not_asked_alone(sensors, monkeypatch):
+    some, rng = [sensors[i] for i in (0, 1, 3)], np.random.default_rng(1)
+    image, alt, bounds = rng.uniform(5_000, 15_000, (60, 2)), rng.uniform(200, 700, 60), np.array([0, 20, 40, 60])
+    alone = [
+        one.localize(image[part], alt[part]) for one, part in zip(some, map(slice, bounds, bounds[1:]), strict=False)
+    ]
+    monkeypatch.setattr(RPC, "localize", None)
+    np.testing.assert_allclose(localize_stack(some, image, alt, bounds), np.concatenate(alone), rtol=0, atol=2e-12)
 
 
 def test_nothing_is_asked_of_no_camera():

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from barpc.tie.patches.dense import _LEFT, _SLOPE, FINER, dense_matches, epipolar_frame
+from barpc.tie.patches.dense import _LEFT, _SLOPE, FINER, _refined, dense_matches, epipolar_frame
 
 from .conftest import write_image
 
@@ -53,6 +53,20 @@ def test_a_part_of_two_images_is_matched_where_it_was_asked_and_not_beside(tmp_p
     assert np.median(np.abs(found.b - found.a - [20.0, 0.0]), axis=0) == pytest.approx(0.0, abs=0.1)
     assert np.median(found.alt) == pytest.approx(100.0, abs=1.0)
     assert frame.metres == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize("off", [-2.0, 2.0])
+def test_a_step_of_least_squares_moves_no_match_by_more_than_a_column(off):
+    rng = np.random.default_rng(5)
+    left = cv2.GaussianBlur(rng.uniform(0, 255, (60, 90)).astype(np.float32), (0, 0), 4.0)
+    left = cv2.normalize(left, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    right = np.roll(left, -5, axis=1)
+    given = np.full(left.shape, 5.0 + off, np.float32)
+    found = _refined(left, right, given, np.ones(left.shape, dtype=bool))[0][10:-10, 20:-20] - 5.0
+    assert np.abs(found - off).max() <= 1.0
+    assert np.median(found) == pytest.approx(0.5 * off)  # towards the right place, as far as it may
+    exact = _refined(left, right, given - off, np.ones(left.shape, dtype=bool))[0][10:-10, 20:-20]
+    assert np.abs(exact - 5.0).max() < 0.1
 
 
 def test_what_resampling_leaves_of_noise_is_what_sigma_takes_for_it():
