@@ -55,6 +55,24 @@ def test_image_points_are_those_of_each_camera(sensors):
     np.testing.assert_allclose(stack.project(np.concatenate(alone).T, slice(1, 4), bounds)[0], found, atol=1e-6)
 
 
+@pytest.mark.parametrize("count", [7, 0, 5000])
+def test_cameras_of_all_kinds_are_asked_as_each_alone(sensors, count):
+    """RPCs with few points together, others, and with many points, one by one."""
+    rng, bounds = np.random.default_rng(1), count * np.arange(len(sensors) + 1)
+    image, alt = rng.uniform(0, 20_000, (bounds[-1], 2)), rng.uniform(0, 900, bounds[-1])
+    stack, ground = RpcStack(sensors), localize_stack(sensors, image, alt, bounds)
+    parts = [slice(*ends) for ends in pairwise(bounds)]
+    alone = [one.project_jacobian(ground[part]) for one, part in zip(sensors, parts, strict=True)]
+    seen, by_ground = (np.concatenate(values) for values in zip(*alone, strict=True))
+    np.testing.assert_allclose(stack.seen(ground, bounds).T, seen, rtol=0, atol=1e-8)
+    told = np.isfinite(seen)
+    assert not count or told.mean() > 0.9
+    np.testing.assert_allclose(seen[told], image[told], rtol=0, atol=1e-6)
+    found = stack.seen_jacobian(ground, bounds)
+    np.testing.assert_allclose(found[0].T, seen, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(np.moveaxis(found[1], -1, 0), by_ground, rtol=1e-9, atol=1e-9)
+
+
 def test_a_camera_whose_points_are_certain_is_not_asked_alone(sensors, monkeypatch):
     some, rng = [sensors[i] for i in (0, 1, 3)], np.random.default_rng(1)
     image, alt, bounds = rng.uniform(5_000, 15_000, (60, 2)), rng.uniform(200, 700, 60), np.array([0, 20, 40, 60])

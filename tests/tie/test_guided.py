@@ -184,6 +184,7 @@ def test_a_tile_holds_the_keypoints_between_its_edges_away_from_nodata(tmp_path)
     assert (250 - every.xy[:, 0] > 2.9).all()
     assert (250 - every.xy[:, 0] > every.scale - 1.5).all()
     assert (every.xy > 2.0).all()
+    assert (np.abs(every.xy - 159.5) < 3).any(axis=0).all()  # beside the edge of a tile, whose neighbour is looked at
     assert len(every) > 50
 
 

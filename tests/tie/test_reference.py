@@ -355,6 +355,7 @@ def test_points_that_scatter_along_the_line_of_sight_show_what_heights_are_wrong
     assert not replace(seen, slope=0.0).heights
     assert not replace(seen, along=2.9, slope=0.0).shows_heights(0.0)  # from right above heights do not show
     assert replace(seen, along=0.5).heights == 0.0
+    assert replace(seen, along=float(np.hypot(2.0, 6.0)), scatter=2.0).heights == pytest.approx(30.0)
     assert not ViewMatch("A", 3.0, (0.0, 0.0)).shows_heights(1.0)
 
 
