@@ -295,3 +295,8 @@ def test_the_names_are_public_and_cost_no_numpy() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "--reference FILE" in done.stdout
+
+
+def test_what_nobody_chose_is_as_the_manual_says() -> None:
+    usual = AdjustOptions()
+    assert (usual.estimate_noise, usual.noise_floor) == (True, 0.02)

@@ -35,7 +35,8 @@ from barpc.rpcio.formats import files_of, find_rpc, parse, row_of, write_camera
 from barpc.rpcio.grids import read_correction, write_correction, write_grid
 from barpc.rpcio.images import write_crop, write_rpc_nitf
 from barpc.rpcio.sources import Sunlight, hidden_by, light_of, metadata_beside, shadows, sidecars
-from barpc.rpcio.text import collect_numbered, listed_numbers, number
+from barpc.rpcio.text import DIRECT, collect_numbered, listed_numbers, number
+from barpc.rpcio.xml import rpc_domain
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.displaced import CorrectionGrid
 from barpc.sensor.rpc import RPC
@@ -659,6 +660,15 @@ def test_no_image_was_taken_before_there_were_satellites(day: str, stated: bool,
     assert light_of(str(tmp_path / "a.tif")).time == (f"{day}T00:00:00Z" if stated else None)
 
 
+def test_a_correction_grid_whose_nodes_lie_nowhere_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a_correction.tif"
+    write_correction(correction(), make_rpc(), path)
+    with rasterio.open(path, "r+") as file:
+        file.write(np.full((5, 6), 1e30, np.float32), 1)
+    with pytest.raises(RpcFormatError, match="a node of it is no image point, or has no displacement"):
+        read_correction(path)
+
+
 def test_a_correction_grid_is_held_to_what_its_numbers_become(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nodes are kept in four bytes and worked on in eight."""
     path = tmp_path / "a_correction.tif"
@@ -671,3 +681,10 @@ def test_a_correction_grid_is_held_to_what_its_numbers_become(tmp_path: Path, mo
                 read_correction(path)
         else:
             assert read_correction(path)[0] == make_rpc()
+
+
+def test_the_element_of_an_rpc_holds_its_localisation_where_there_is_one() -> None:
+    rpc = make_rpc()
+    both = replace(rpc, direct=np.tile(rpc.coeffs[0], (len(DIRECT), 1)))
+    assert [key in rpc_domain(both) for key in DIRECT] == [True] * len(DIRECT)
+    assert not any(f'"{key}"' in rpc_domain(replace(both, direct=None)) for key in DIRECT)

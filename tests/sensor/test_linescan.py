@@ -402,3 +402,10 @@ def test_damage_anywhere_is_one_line(tmp_path):
         except BarpcError as error:
             said = str(error)
         assert "\n" not in said
+
+
+def test_a_table_that_holds_fewer_samples_than_it_states_is_not_complete(tmp_path):
+    less = re.sub(r"<EPHEMLIST>[^<]*</EPHEMLIST>", "", ISD, count=1)
+    assert less != ISD
+    with pytest.raises(RpcFormatError, match=r"EPHEMLIST holds (\d+) of \d+ samples; is the file complete"):
+        read(tmp_path, less)
