@@ -21,7 +21,7 @@ FloatArray = npt.NDArray[np.float32]
 CLEAR_RATIO = 0.8
 """Largest ratio where only clear matches count."""
 _MAX_TURN = np.radians(30.0)  # between the orientation seen and the one expected
-_SECTORS = 6  # of twice that
+_SECTORS = int(np.rint(np.pi / _MAX_TURN))  # of twice that
 _PAIRS = 2**15  # that are looked at at a time: some 30 MB of descriptors if all of them are compared
 
 
