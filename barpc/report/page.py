@@ -245,8 +245,8 @@ def _decisions(files: RunFiles) -> Section | None:
 
 def decisions(summary: Summary) -> list[str]:
     """Return the decisions on the whole run: what ties its pairs, what each camera may do, what was cut."""
-    options: Any = summary.options or {}
-    matcher, asked = (options.get("tie") or {}).get("matcher"), (options.get("adjust") or {}).get("drift")
+    options = flat_options(summary.options or {})
+    matcher, asked = options.get("tie.matcher"), options.get("adjust.drift")
     text = _words("decided", summary=summary, matcher=matcher, asked=asked, many=LARGEST)
     return [type(text)(item.strip()) for item in re.findall("<li>(.*?)</li>", text)]
 
