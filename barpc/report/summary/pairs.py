@@ -65,7 +65,7 @@ class PairEntry(Record):
     matching: Mapping[str, Any] | None = said("What became of it in matching; null: not matched")
     tied_by: str | None = said("Matcher that tied it, whether loosened", head="tied by", default=None)
     decoy_share: Number = said("Share false, by bands without true matches", head="false", form=".1%", default=None)
-    noise_px: Number = said("Robust spread of its matches across epipolar lines", "px", "noise", ".2f", default=None)
+    noise_px: Number = said("Spread across epipolar lines before registration", "px", "as matched", ".2f", default=None)
     beaten: tuple[str, ...] = said("Attempts that found fewer: matcher, matches of those wanted", default=())
     chosen_by: str | None = said("Why it was tried: overlap and angle, same date, listed, ...", default=None)
 
