@@ -19,6 +19,7 @@ The excess is the baseline's cost over barpc's, less one.
     python benchmarks/ba.py --blocks 1000 3000 10000      # growth with views, by stage, and how far from the optimum
     python benchmarks/ba.py --fill 1000 10000             # what other orders of elimination would cost
     python benchmarks/ba.py --against 26f82d8             # with defaults beside another commit (here 0.2.0), in turns
+    python benchmarks/ba.py --series 1000                 # views of one place: seconds and peak memory
     python benchmarks/ba.py --jump                        # one flawed view of 36 beside the same block without
     python benchmarks/ba.py --ceres                       # plain, beside Ceres, in turns (needs libceres-dev and g++)
 """
@@ -51,6 +52,7 @@ from barpc.ba.solving.linear import Cholesky
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State, camera_step, minimise
 from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
+from barpc.scene import Tracks
 from barpc.sensor.curve import rotation_matrix
 from barpc.sensor.geometry import triangulate
 from barpc.simulate import Block, simulate_block
@@ -190,6 +192,22 @@ def large(views: int, tracks: int) -> None:
             flush=True,
         )
         del found
+
+
+def series(views: int) -> None:
+    """Views of one place, each tied to its next 39 by points seen three times, with defaults: no cut parts them."""
+    made, rng = simulate_block(views, 400, seed=1, per_site=views, num_checks=0), np.random.default_rng(1)
+    seen = made.tracks
+    begin = np.searchsorted(seen.point, np.arange(401))
+    of = rng.integers(400, size=40 * views)  # the point of every track
+    count = np.diff(begin)[of]
+    first = begin[of] + np.clip(rng.integers(-20, count - 20), 0, count - 40)
+    rows = (first[:, None] + np.sort(rng.permuted(np.tile(np.arange(40), (len(of), 1)), axis=1)[:, :3])).ravel()
+    tracks = Tracks(seen.view[rows], np.repeat(np.arange(len(of)), 3), seen.xy[rows], seen.sigma[rows])
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    seconds, found = timed(lambda: adjust_tracks(made.views, tracks))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    print(f"{views} views, {len(of)} tracks: {seconds:.1f} s, {found.status}; peak {peak:.2f} GB ({before:.2f} before)")
 
 
 STAGES = {
@@ -389,6 +407,7 @@ def main() -> None:
     parser.add_argument("--one-block", nargs=2, type=int, help=argparse.SUPPRESS)
     parser.add_argument("--fill", nargs="+", type=int, metavar="VIEWS", help="other orders of elimination")
     parser.add_argument("--against", metavar="COMMIT", help="adjustments with defaults beside another commit's")
+    parser.add_argument("--series", type=int, metavar="VIEWS", help="views of one place")
     parser.add_argument("--jump", action="store_true", help="one flawed view of 36")
     parser.add_argument("--ceres", action="store_true", help="plain adjustments beside Ceres")
     arguments = parser.parse_args()
@@ -403,6 +422,8 @@ def main() -> None:
         blocks(arguments.blocks, arguments.a_view)
     elif arguments.against:
         against(arguments.against, arguments.repeat)
+    elif arguments.series:
+        series(arguments.series)
     elif arguments.jump:
         jump(arguments.repeat)
     elif arguments.ceres:
