@@ -422,10 +422,11 @@ def main() -> None:
         blocks(arguments.blocks, arguments.a_view)
     elif arguments.against:
         against(arguments.against, arguments.repeat)
-    elif arguments.series:
-        series(arguments.series)
-    elif arguments.jump:
-        jump(arguments.repeat)
+    elif arguments.series or arguments.jump:
+        if arguments.jump:
+            jump(arguments.repeat)
+        if arguments.series:
+            series(arguments.series)
     elif arguments.ceres:
         ceres.compare(arguments.repeat)
     elif arguments.fill:

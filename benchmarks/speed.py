@@ -28,6 +28,9 @@ from barpc import __version__
 
 THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
+FIRST = "ad47de3"
+"""The commit of release 0.1."""
+
 HEAD = """# Speed
 
 <!-- Written by benchmarks/speed.py --write. Do not edit. -->
@@ -55,6 +58,11 @@ def benchmarks(data: Path | None, peers: str | None, rpcfit: str | None, cars: s
     chosen = [
         Benchmark("kernels.py", "Kernels of the RPC", given("--python", peers), "rpc.md"),
         Benchmark("ba.py", "Bundle adjustment, beside scipy with finite differences", (), "adjustment.md"),
+        Benchmark("ba.py", "The same, plain, beside Ceres", ("--ceres",), "adjustment.md"),
+        Benchmark("ba.py", "With defaults, beside release 0.1", ("--against", FIRST), "adjustment.md"),
+        Benchmark(
+            "ba.py", "A view that jumps, and views of one place", ("--jump", "--series", "1000"), "adjustment.md"
+        ),
         Benchmark("simulate.py", "Simulation", (), "simulate.md"),
         Benchmark("report.py", "Summary, tables and report", ("--views", "3", "50"), "report.md"),
     ]
