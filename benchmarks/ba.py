@@ -412,27 +412,22 @@ def main() -> None:
     parser.add_argument("--ceres", action="store_true", help="plain adjustments beside Ceres")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
-    if arguments.growth:
-        growth(10)
-    elif arguments.large:
-        large(*arguments.large)
-    elif arguments.one_block:
-        one_block(*arguments.one_block)
-    elif arguments.blocks:
-        blocks(arguments.blocks, arguments.a_view)
-    elif arguments.against:
-        against(arguments.against, arguments.repeat)
-    elif arguments.series or arguments.jump:
-        if arguments.jump:
-            jump(arguments.repeat)
-        if arguments.series:
-            series(arguments.series)
-    elif arguments.ceres:
-        ceres.compare(arguments.repeat)
-    elif arguments.fill:
-        fill(arguments.fill)
-    else:
-        sizes = [(3, 2000), (10, 5000), (30, 10000), (100, 30000)]
+    asked = {
+        growth: arguments.growth and (10,),
+        large: arguments.large,
+        one_block: arguments.one_block,
+        blocks: arguments.blocks and (arguments.blocks, arguments.a_view),
+        against: arguments.against and (arguments.against, arguments.repeat),
+        jump: arguments.jump and (arguments.repeat,),
+        series: arguments.series and (arguments.series,),
+        ceres.compare: arguments.ceres and (arguments.repeat,),
+        fill: arguments.fill and (arguments.fill,),
+    }
+    sizes = [(3, 2000), (10, 5000), (30, 10000), (100, 30000)]
+    for function, values in asked.items():
+        if values:
+            function(*values)
+    if not any(asked.values()):
         ratios(sizes if arguments.all else sizes[:3], arguments.repeat)
 
 

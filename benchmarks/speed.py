@@ -60,9 +60,7 @@ def benchmarks(data: Path | None, peers: str | None, rpcfit: str | None, cars: s
         Benchmark("ba.py", "Bundle adjustment, beside scipy with finite differences", (), "adjustment.md"),
         Benchmark("ba.py", "The same, plain, beside Ceres", ("--ceres",), "adjustment.md"),
         Benchmark("ba.py", "With defaults, beside release 0.1", ("--against", FIRST), "adjustment.md"),
-        Benchmark(
-            "ba.py", "A view that jumps, and views of one place", ("--jump", "--series", "1000"), "adjustment.md"
-        ),
+        Benchmark("ba.py", "A jump, and views of one place", ("--jump", "--series", "1000"), "adjustment.md"),
         Benchmark("simulate.py", "Simulation", (), "simulate.md"),
         Benchmark("report.py", "Summary, tables and report", ("--views", "3", "50"), "report.md"),
     ]
