@@ -177,7 +177,7 @@ def test_a_pair_whose_tie_points_are_of_one_kind_says_nothing(name, seeds):
         pytest.param(
             "jitter 0.5 at 1 Hz",
             "look",
-            " swing by ",
+            "follows attitude jitter",
             marks=pytest.mark.nightly,
         ),
         ("jitter 0.1 at 5 Hz", "look", "px every 27"),
