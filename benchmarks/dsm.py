@@ -31,12 +31,12 @@ from rasterio.windows import Window
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from barpc.base.options import DsmOptions  # noqa: E402
-from barpc.dsm import NoSurfaceError, make_dsm  # noqa: E402
-from barpc.dsm.stereo import Tile, gathered  # noqa: E402
-from barpc.export.shots import read_scene  # noqa: E402
-from tests.scenes import ImageOptions, Scene  # noqa: E402
-from tests.scenes.files import image_file  # noqa: E402
+from barpc.base.options import DsmOptions
+from barpc.dsm import NoSurfaceError, make_dsm
+from barpc.dsm.stereo import Tile, gathered
+from barpc.export.shots import read_scene
+from tests.scenes import ImageOptions, Scene
+from tests.scenes.files import image_file
 
 LOOKED_AT = 40
 """Tiles of a rendered surface that are compared with the ground, at most."""
