@@ -6,6 +6,7 @@ import ast
 import contextlib
 import io
 import json
+import math
 import os
 import re
 import time
@@ -24,6 +25,7 @@ from barpc.base.frozen import load_npz
 from barpc.base.sidefile import (
     ARRAYS,
     GEOJSON,
+    LARGEST,
     NAMES,
     TABLE,
     Kind,
@@ -127,6 +129,12 @@ def test_json_holds_finite_numbers_and_is_not_endlessly_deep(text):
     with pytest.raises(ValueError) as caught:
         parse_json(text)
     assert len(str(caught.value)) < 200
+
+
+def test_the_largest_numbers_are_read_and_none_beyond() -> None:
+    assert parse_json(f"[{LARGEST}, -{LARGEST}, 0.5]") == [LARGEST, -LARGEST, 0.5]
+    with pytest.raises(ValueError, match="is beyond"):
+        parse_json(f"[{math.nextafter(LARGEST, math.inf)}]")
 
 
 @pytest.mark.parametrize(("start", "end"), [("[", "]"), ('{"a":', "}"), ('[1,{"}":', '},"]"]')])

@@ -29,6 +29,19 @@ def test_a_table_that_has_room_has_its_heads_in_one_line(width: int | None) -> N
     ]
 
 
+@pytest.mark.parametrize(
+    ("text", "width", "lines"),
+    [
+        ("a word-of-two parts", None, ["a word-of-two parts"]),
+        ("a word-of-two parts", 12, ["a", "word-of-two", "parts"]),
+        ("", 12, [""]),
+        ("", None, [""]),
+    ],
+)
+def test_lines_end_between_words(text: str, width: int | None, lines: list[str]) -> None:
+    assert terminal._wrapped(text, width) == lines
+
+
 @pytest.mark.parametrize("width", [28, 20])
 def test_heads_are_broken_over_lines_that_end_together(width: int) -> None:
     assert layout(NUMBERS, width) == [

@@ -15,6 +15,7 @@ import pytest
 from barpc.base.errors import OutputError
 from barpc.base.geodesy import Array
 from barpc.fit.certificate import Sample
+from barpc.pipeline import handoff
 from barpc.pipeline.handoff import (
     CONSUMERS,
     TOLERANCE,
@@ -288,6 +289,23 @@ def test_shareloc_counts_from_the_corner_of_the_first_pixel_and_row_before_col(l
     found = CONSUMERS["shareloc"].open(tmp_path / "a.tif")(ground + [turn, 0.0, 0.0])
     np.testing.assert_allclose(found, rpc.project(ground), atol=1e-6 if turn else 1e-9)
     assert (str(tmp_path / "a.tif"),) in model.asked
+
+
+def test_shareloc_is_asked_of_a_grid_from_the_corner_of_the_first_pixel_and_row_before_col(monkeypatch, tmp_path):
+    rpc = make_rpc()
+    at = np.random.default_rng(0).uniform([0.0, 0.0, 100.0], [900.0, 700.0, 800.0], (50, 3))
+    asked = Other(rpc)
+
+    def direct_loc_h(row, col, alt):
+        return np.column_stack([rpc.localize(np.column_stack([col, row]) - 0.5, alt)[:, :2], alt])
+
+    asked.direct_loc_h = direct_loc_h
+    monkeypatch.setattr("barpc.pipeline.handoff.import_module", lambda _: asked)
+    monkeypatch.setattr("barpc.pipeline.handoff.open_camera", lambda _: SimpleNamespace(model=None))
+    localize = handoff._shareloc_grid(tmp_path / "a_grid.tif")
+    np.testing.assert_allclose(localize(at)[:, :2], rpc.localize(at[:, :2], at[:, 2])[:, :2], rtol=0, atol=1e-12)
+    assert asked.asked[0] == "GeoModel"
+    assert asked.asked[1] == (str(tmp_path / "a_grid.tif"), "GRID")
 
 
 def test_shareloc_asks_in_one_thread_and_leaves_as_many_as_there_were(monkeypatch, tmp_path):

@@ -14,7 +14,7 @@ from barpc.base.errors import BarpcError, InputError, RpcError, RpcFormatError
 from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.cameras import open_camera
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.csm import FRAME, LINESCAN, is_writable, open_state, state_text
+from barpc.sensor.csm import FRAME, LINESCAN, is_state, is_writable, open_state, state_text
 
 State = dict[str, object]
 SIZE = (3000, 4000)
@@ -184,6 +184,23 @@ def test_a_state_is_a_camera_whatever_stands_before_it(tmp_path):
     assert (named.format, named.size, named.alt_range) == ("csm", SIZE, (-500.0, 9000.0))
     assert plain.model == named.model
     assert open_camera(f"{tmp_path / 'b.json'},altitudes=0:2000").alt_range == (0.0, 2000.0)
+
+
+@pytest.mark.parametrize(
+    ("head", "told"),
+    [
+        (b'USGS_ASTRO_FRAME_SENSOR_MODEL\n{"a": 1}', True),
+        (b' {"m_centerEphemerisTime": 0.0}', True),
+        (b'{"m_modelName": "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"}', True),
+        (b'{"m_modelName": "another"}', True),
+        (b'{"a": "USGS_ASTRO_"}', True),
+        (b'{"a": 1}', False),
+        (b'[{"m_modelName": 1}]', False),
+        (b"USGS_ASTRO_FRAME_SENSOR_MODEL", False),
+    ],
+)
+def test_a_state_is_known_by_its_first_bytes(head, told):
+    assert is_state(head) is told
 
 
 def test_a_frame_camera_sees_nothing_behind_it(tmp_path):

@@ -79,3 +79,20 @@ def test_what_resampling_leaves_of_noise_is_what_sigma_takes_for_it():
         inside = cv2.erode(cv2.warpAffine(np.ones_like(noise), to_frame, (1000, 700)), np.ones((9, 9))) > 0.999
         found.append([moved[inside].var(), np.gradient(moved, axis=1)[inside].var()])
     np.testing.assert_allclose(np.mean(found, axis=0), [_LEFT, _SLOPE], rtol=0.03)
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(0.7, 40.0), (1.3, -40.0)])
+def test_a_step_finds_the_place_between_columns_and_says_how_well_whatever_gain_and_offset(gain, offset):
+    """What is said is larger than what is off: it is of pictures that were resampled, which halves their noise."""
+    rng = np.random.default_rng(1)
+    texture = cv2.GaussianBlur(rng.standard_normal((120, 400)).astype(np.float32), (0, 0), 3.0)
+    texture *= 25.0 / texture.std()
+    cols, rows = np.meshgrid(np.arange(400, dtype=np.float32), np.arange(120, dtype=np.float32))
+    moved = cv2.remap(texture, cols + 5.3, rows, cv2.INTER_LANCZOS4)
+    pictures = [100.0 + texture, offset + gain * (100.0 + moved)]
+    noisy = [np.clip(np.rint(one + 2.0 * rng.standard_normal(one.shape)), 0, 255).astype(np.uint8) for one in pictures]
+    found, sigma = _refined(*noisy, np.full(texture.shape, 5.0, np.float32), np.ones(texture.shape, dtype=bool))
+    off, said = found[15:-15, 40:-40] - 5.3, FINER * np.median(sigma[15:-15, 40:-40])
+    assert abs(off.mean()) < 0.06
+    assert off.std() < 0.12
+    assert 1.2 < said / off.std() < 1.9

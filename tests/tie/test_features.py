@@ -254,3 +254,22 @@ def test_spots_of_a_twentieth_of_the_span_of_grey_values_are_enough(tmp_path, sh
     found = detect_tile(str(path), (480, 400), (0, 0, 480, 400), known, Share(0.1, 1), TieOptions())
     near = np.abs(found.xy[:, None] - spots).max(axis=2) < 1.0
     assert least <= near.any(axis=0).sum() <= most
+
+
+def test_a_box_looked_at_in_parts_has_the_keypoints_that_the_whole_has_there(tmp_path, texture) -> None:
+    path, box, size = write_image(tmp_path / "a.tif", texture), (64, 128, 384, 256), (500, 400)
+    known = survey(path)
+    assert known is not None
+    boxes, sides = [(0, 0, *size), box, box], [512, 512, 128]
+    whole, once, parts = (
+        detect_tile(str(path), size, each, known, Share(1.0, 1), TieOptions(tile=side))
+        for each, side in zip(boxes, sides, strict=True)
+    )
+    first, last = np.array(box[:2]) - 0.5, np.add(box[:2], box[2:]) - 0.5
+    there = ((whole.xy >= first) & (whole.xy < last)).all(axis=1) & (whole.scale < 12)
+    wanted = {tuple(xy) for xy in np.round(whole.xy[there], 1)}
+    assert len(wanted) > 300
+    for found in (once, parts):
+        assert ((found.xy >= first) & (found.xy < last)).all()
+        seen = {tuple(xy) for xy in np.round(found.xy[found.scale < 12], 1)}
+        assert len(wanted & seen) > 0.97 * len(wanted | seen)
