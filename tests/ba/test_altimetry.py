@@ -17,7 +17,7 @@ import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, altimetry
 from barpc.ba.held import registration
-from barpc.ba.held.registration import NEIGHBOURS, Given, Registration, Surface, displacement, register
+from barpc.ba.held.registration import NEIGHBOURS, Given, Registration, Surface, _search, displacement, register
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.cameras import open_camera
 from barpc.scene import Altimetry, GroundPoints, Tracks, View
@@ -50,6 +50,15 @@ def given(
 
 def registered(rng: np.random.Generator, heights: Given, **scene: Any) -> Registration:
     return register(Surface.of(surface(rng, **scene)), heights, 200.0, BEFORE)
+
+
+def test_the_search_gives_the_shift_on_which_most_heights_agree_and_none_where_there_is_no_surface():
+    rng = np.random.default_rng(4)
+    here = Surface.of(surface(rng))
+    found = _search(here, given(rng, 400, [11.0, -7.0, 30.0], wrong=0.2), BEFORE)
+    np.testing.assert_allclose(found[:3], [11.0, -7.0, 30.0], atol=2.5)
+    assert found[3:].tolist() == [0.0] * 4
+    assert _search(here, given(rng, 50, [5000.0, 0.0, 30.0]), BEFORE).tolist() == [0.0] * 7
 
 
 def test_a_patch_has_its_own_height_and_slopes():

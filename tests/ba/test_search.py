@@ -419,6 +419,22 @@ def test_of_many_explanations_those_are_fitted_that_few_tracks_let_hope(monkeypa
     assert of(30, 2, 1, few=False) == [30, 2, 1]
 
 
+def test_a_mean_stands_out_beyond_the_floor_in_units_of_what_ties_are_known_to(monkeypatch) -> None:
+    asked: list[float] = []
+    monkeypatch.setattr(judging, "off_from_right", lambda linear, left, right: (left, np.zeros(len(VIEW), dtype=bool)))
+    monkeypatch.setattr(judging, "scan", lambda *given: asked.append(given[-1]) or [])
+    monkeypatch.setattr(judging, "swings", lambda *_: [])
+    linear: Any = SimpleNamespace(
+        view=VIEW,
+        sigma=np.ones(len(VIEW)),
+        taking_part=np.arange(len(VIEW)),
+        left=lambda step: np.zeros((2, len(VIEW))),
+    )
+    each = _Search(replace(seen(), linear=linear), [], 0.06, 0.1)
+    each._standing_out(fitted(noise=2.0), np.zeros((2, 0, len(VIEW))))
+    assert asked == [pytest.approx(0.3)]  # 0.06 px of ties that are known to 0.2 px
+
+
 @pytest.mark.parametrize("left", [([], []), ([1], []), ([], [1])])
 def test_nothing_is_left_beside_the_best_where_neither_rows_nor_periods_stand_out(monkeypatch, left) -> None:
     asked: list[Any] = []

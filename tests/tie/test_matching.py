@@ -50,6 +50,9 @@ def test_a_report_says_which_attempts_found_fewer_of_how_many_that_were_wanted()
     none = replace(many, status="too few matches", verified=0)
     assert _better(first, (NO_MATCHES, none))[1].beaten == ("guided 20 of 54", "structure 0 of 100")
     assert _better((NO_MATCHES, few))[1].beaten == ()
+    others = replace(NO_MATCHES)
+    assert _better((NO_MATCHES, few), (others, many))[0] is others
+    assert _better((NO_MATCHES, few), (others, few))[0] is NO_MATCHES  # of equals the earlier one
 
 
 class Scripted:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.scene import Tracks
+from barpc.scene import Tracks, View
 from barpc.tie import Matches, TieOptions
 from barpc.tie.matchers import matching
 from barpc.tie.matchers.features import join_keypoints
@@ -260,3 +260,26 @@ def test_the_quick_score_is_of_the_strongest_and_nought_where_there_are_none(ren
         assert isinstance(store, Store)
         none = replace(files[1], counts=(0,) * len(files[1].counts))
         assert matching.quick_score(pair, (files[0], none), TieOptions()) == 0
+
+
+@pytest.mark.parametrize(
+    ("known", "within"),
+    [
+        (None, None),
+        ((300.0, 400.0), (250.0, 450.0)),
+        ((20.0, 120.0), (100.0, 170.0)),  # the views' own end stays
+        ((880.0, 1000.0), (830.0, 900.0)),
+        ((950.0, 1000.0), (900.0, 900.0)),
+        ((951.0, 1000.0), None),  # altitudes of nothing that both may see
+        ((0.0, 50.0), (100.0, 100.0)),
+        ((0.0, 49.0), None),
+    ],
+)
+def test_a_pair_is_sought_at_altitudes_that_others_lie_at(known, within) -> None:
+    sensor: Any = None
+    two = View("a", "a.tif", (50, 40), sensor, (0.0, 900.0)), View("b", "b.tif", (60, 30), sensor, (100.0, 1000.0))
+    found = Ground().within(two, known, 50.0)
+    if within is None:
+        assert found is two
+    else:
+        assert found == (replace(two[0], alt_range=within), replace(two[1], alt_range=within))
