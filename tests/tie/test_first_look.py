@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,9 @@ import pytest
 from barpc.tie import TieOptions, TieResult, common_tracks, find_tracks, tracks
 from barpc.tie.matchers import features
 from barpc.tie.matchers.features import Share, worth_a_first_look
+from barpc.tie.matchers.matcher import NO_MATCHES
 from barpc.tie.matchers.matching import PairReport, ample
+from barpc.tie.pairing.overlaps import Pair
 
 FEW = TieOptions(points_per_image=500)  # of which 300 px hold enough to look twice
 
@@ -77,6 +81,37 @@ def test_a_first_look_takes_half_the_detail_and_what_is_wanted_alone(side, point
 def test_a_tenth_of_the_points_wanted_is_ample(points, verified, status, is_ample) -> None:
     report = PairReport(("a", "b"), status, (0, 0), verified=verified)
     assert ample(report, TieOptions(points_per_image=points)) == is_ample
+
+
+def test_a_closer_look_is_at_pairs_that_lack_and_knows_the_altitudes_of_the_others(monkeypatch) -> None:
+    """Three pairs, of which a first look shows enough of one."""
+    pairs = [Pair((0, 1), 1.0, 0.0), Pair((0, 2), 1.0, 0.0), Pair((1, 2), 1.0, 0.0)]
+    report = PairReport(("a", "b"), "ok", (0, 0), verified=9)
+    first = [(replace(NO_MATCHES), replace(report, verified=n)) for n in (9, 900, 9)]
+    closer = [(replace(NO_MATCHES), replace(report, verified=n)) for n in (70, 80)]
+    earlier, asked = (("x", "y"), NO_MATCHES), dict[str, Any]()
+
+    def located(views, options, work, pairs, area):
+        asked["near"] = pairs
+        return ["files"] * 3
+
+    def matched(views, keypoints, lacking, options, ground, work):
+        asked.update(lacking=lacking, ground=ground, keypoints=keypoints)
+        return closer
+
+    monkeypatch.setattr(tracks, "first_look", lambda *_: first)
+    monkeypatch.setattr(tracks, "locate", located)
+    monkeypatch.setattr(tracks, "match_pairs", matched)
+    monkeypatch.setattr(tracks, "replace", lambda files, start: (files, start))
+    trials: Any = SimpleNamespace(
+        looks=SimpleNamespace(views=["a", "b", "c"]), _options=TieOptions(), _keypoints=["coarse"] * 3, _work=None,
+        _coarse=True, _closer=0, _scope=SimpleNamespace(terrain=None, area=None),
+    )  # fmt: skip
+    found = tracks._Trials._matched(trials, pairs, [earlier])
+    assert found == [closer[0], first[1], closer[1]]
+    assert asked["near"] == asked["lacking"] == [pairs[0], pairs[2]]
+    assert asked["keypoints"] == [("files", -1 << 32)] * 3
+    assert list(asked["ground"].ties) == [earlier, (("a", "c"), first[1][0])]
 
 
 @pytest.mark.slow
