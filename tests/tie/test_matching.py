@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from barpc.tie import TieOptions
+from barpc.tie.matchers import matching
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
 from barpc.tie.matchers.matching import MATCHERS, PairReport, _better, _latest, _Search, enough
@@ -82,6 +84,16 @@ def search(monkeypatch) -> Callable[[Scripted], _Search]:
         )
 
     return made
+
+
+def test_a_matcher_without_keypoints_has_its_frame_at_the_middles_of_the_tiles_that_both_share(monkeypatch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setitem(MATCHERS, "blind", lambda *_: SimpleNamespace(detects=False))
+    monkeypatch.setattr(matching, "shared_tiles", lambda *_: [[(0, 0, 100, 50), (100, 20, 60, 40)]])
+    monkeypatch.setattr(matching, "frame", lambda a, b, points: asked.append(points) or SimpleNamespace(axis=None))
+    ends = tuple(views(camera(0.0), camera(0.0)))
+    _Search(ends, (join_keypoints([]), join_keypoints([])), TieOptions(matcher="blind"))
+    assert [points.tolist() for points in asked] == [[[50.0, 25.0], [130.0, 40.0]]]
 
 
 FLAT = Prediction(lambda xy: EpipolarSegments(np.array([1.0, 0.0]), *(np.zeros(len(xy)),) * 5, np.eye(2)), 3.0, list)
