@@ -73,7 +73,7 @@ def scan(
         rows = np.array([np.ones(len(view)), wrong])
         sums = np.array([np.bincount(view * BINS + bin_, row, views * BINS) for row in rows])
         whole = sums.reshape(2, views, BINS)
-        shares = _shares(*_intervals(whole).swapaxes(0, 1), *whole.sum(axis=2))
+        shares = _shares(whole)
         gains, displaced = _displacements(view, bin_, off, told, views, floor)
         for by_share, gain in zip((True, False), (shares, gains), strict=True):
             gain[BINS - 1] = 0.0  # all of an image is no interval
@@ -159,16 +159,21 @@ def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) 
     return out - float(np.log(4 * views))
 
 
-def _shares(count: Array, bad: Array, total: Array, all_bad: Array) -> Array:
-    """Return the logarithm of the likelihood ratio of two shares over one, where that inside is the larger."""
+def _shares(bins: Array) -> Array:
+    """Return the logarithm (intervals, N) of the likelihood ratio of two shares over one, where that inside is larger.
+
+    `bins` (2, N, `BINS`) are the numbers of observations and of those that are wrong.
+    """
 
     def log(k: Array, n: Array) -> Array:
         good = np.maximum(n - k, 0.0)
         return np.asarray(xlogy(k, k) + xlogy(good, good) - xlogy(n, n))
 
-    whole, gain = log(all_bad, total), np.zeros_like(count)
+    total, all_bad = bins.sum(axis=2)
+    whole, gain = log(all_bad, total), np.zeros((len(_STARTS), bins.shape[1]))
     told = whole < -SURE  # where all that are wrong lie in one interval, the rest are certain
-    count, bad, total, all_bad = count[:, told], bad[:, told], total[told], all_bad[told]
+    total, all_bad = total[told], all_bad[told]
+    count, bad = _intervals(bins[:, told]).swapaxes(0, 1)
     outside, bad_outside = total - count, all_bad - bad
     more = bad * np.maximum(outside, 1e-9) > bad_outside * count
     gain[:, told] = np.where(more, log(bad, count) + log(bad_outside, outside) - whole[told], 0.0)
