@@ -191,7 +191,7 @@ def _choose_model(
     if judges and (in_image is None or not _is_calm(in_image, parts.inner, options.noise_floor)):
         found, parts, judged = without_moving(found, parts, options, solve)
         found = without_strips(found, judged, parts.inner, parts.outer, options)
-    if found is not first:
+    if found.outcome is not first.outcome:  # else the same would be solved and found again
         in_image = None if given else _in_image(found, parts, options, solve)
     chosen, in_space = (found, None) if in_image is None else (in_image, found.after.whole_rms)
     if judges:

@@ -507,7 +507,7 @@ def followed(
             after.whole_rms = 0.5
         unknowns = SimpleNamespace(unknowns=SimpleNamespace(geometric=geometric))
         return SimpleNamespace(
-            name=options.model, is_skew=False, has_trend=True, has_waves=True, tested=None, after=after,
+            name=options.model, is_skew=False, has_trend=True, has_waves=True, tested=None, after=after, outcome=None,
             problem=SimpleNamespace(cameras=unknowns), goes_on=prior is not None,
         )  # fmt: skip
 

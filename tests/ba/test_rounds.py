@@ -249,7 +249,7 @@ def passes(
             self.state: Any = SimpleNamespace(points=None)
             self.options, self.everything, self.use = options, every, every
             self.passes, self.noise, self.robust, self.is_known = 0, noise[0], options.loss != "linear", known
-            self.goes_on = known
+            self.goes_on, self.learnt = known, None
             self.heights: Any = SimpleNamespace(hold=lambda problem, points: problem)
             self.observations: Any = SimpleNamespace(sigma=np.ones(10_000))
             self.variances: Any = SimpleNamespace(learnt=lambda *_: (learnt(self.passes), SimpleNamespace(shared=1.0)))
@@ -350,6 +350,7 @@ def test_what_was_known_is_gone_on_with_where_the_unknowns_are_the_same(clean, s
     known: Any = SimpleNamespace(
         problem=SimpleNamespace(cameras=SimpleNamespace(unknowns=unknowns), camera_prior=wider),
         inlier=inlier, noise=1.7, smooth=SimpleNamespace(rms=np.array([0.1, 0.2, 0.3])),
+        prior="what was learnt",
     )  # fmt: skip
     each = rounds.Rounds(problem, block, state, heights, use, known)
     assert each.goes_on == same
@@ -357,6 +358,7 @@ def test_what_was_known_is_gone_on_with_where_the_unknowns_are_the_same(clean, s
     assert each.noise == 1.7
     assert each.robust == (loss != "linear")
     assert (each.problem.camera_prior is wider) == same
+    assert each.learnt == ("what was learnt" if same else None)
     tied = each.observations.tied
     np.testing.assert_array_equal(each.everything, tied(block.use))
     np.testing.assert_array_equal(each.use, tied(use & inlier & block.use if same else use & block.use))

@@ -130,8 +130,9 @@ def test_the_share_s_likelihood_is_that_of_two_binomials() -> None:
 @pytest.mark.parametrize(("total", "bad", "told"), [(40.0, 1.0, False), (180.0, 1.0, True), (40.0, 2.0, True)])
 def test_where_so_few_are_wrong_their_place_tells_nothing(total: float, bad: float, told: bool) -> None:
     """All of them in one observation's interval: the rest would be certain, whatever is wrong."""
-    count, inside = np.array([[bad], [total - bad]]), np.array([[bad], [0.0]])
-    gain = scanning._shares(count, inside, np.array([total]), np.array([bad]))
+    bins = np.zeros((2, 1, scanning.BINS))
+    bins[:, 0, 0], bins[0, 0, 1] = bad, total - bad
+    gain = scanning._shares(bins)
     whole = bad * np.log(bad / total) + (total - bad) * np.log(1.0 - bad / total)
     assert gain[0, 0] == pytest.approx(-whole if told else 0.0)
     assert (whole < -SURE) == told

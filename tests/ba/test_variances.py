@@ -465,6 +465,25 @@ def test_priors_that_are_too_narrow_are_widened_by_what_most_views_show(at_minim
     assert told[1].ratio == pytest.approx(tested.ratio) == pytest.approx(total.sum() / freedom.sum())
 
 
+def test_constants_of_a_large_block_once_widened_stay(at_minimum, monkeypatch) -> None:
+    """They take from the drift, which is another then: asked whether it stands it would send them back, in turns."""
+    problem, minimum = at_minimum
+    monkeypatch.setattr("barpc.ba.robust.variances.SMALL", 0)
+    given = CameraPrior(problem.camera_prior.mean, problem.camera_prior.sigma.copy())
+    given.sigma[:, :6] /= 30.0
+    v = Variances(given, problem.cameras.unknowns, True, True, False)
+    tested, priors, scales = None, [given], []
+    for _ in range(12):
+        now = replace(problem, camera_prior=priors[-1])
+        there = minimise(now, minimum.state, np.full(len(problem.structure.view), 10.0), "sparse", 1e-12)
+        prior, tested = v.learnt(now, there, tested)
+        priors.append(prior)
+        scales.append(tested.scale.min())
+    first = np.flatnonzero(np.array(scales) > 1.0)[0]
+    assert min(scales[first:]) > 3.0
+    assert same_prior(priors[-1], priors[-2], 0.2)
+
+
 def test_a_small_block_learns_until_its_priors_stand(at_minimum) -> None:
     """Those it ends with are what they would be after solving with them, wherever it began."""
     problem, minimum = at_minimum

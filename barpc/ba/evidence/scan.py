@@ -21,7 +21,7 @@ from scipy.special import entr, fdtrc, gammaln, xlogy
 
 from barpc.ba.estimated.waves import DRIFTS
 from barpc.ba.usual import CHANCE, FEWEST, OUTLIER, SURE
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import CHUNK, Array, parts
 from barpc.scene import BoolArray, IntArray
 
 BINS = 40  # stretches of an image's rows or columns
@@ -73,7 +73,7 @@ def scan(
         rows = np.array([np.ones(len(view)), wrong])
         sums = np.array([np.bincount(view * BINS + bin_, row, views * BINS) for row in rows])
         whole = sums.reshape(2, views, BINS)
-        shares = _shares(*_intervals(whole).swapaxes(0, 1), *whole.sum(axis=2))
+        shares = _shares(whole)
         gains, displaced = _displacements(view, bin_, off, told, views, floor)
         for by_share, gain in zip((True, False), (shares, gains), strict=True):
             gain[BINS - 1] = 0.0  # all of an image is no interval
@@ -106,24 +106,28 @@ def _displacements(
     stands out beside a step is its middle; the step itself is what explains it.
     """
     at = view * BINS + bin_
-    sums = [np.bincount(at, told * row, views * BINS) for row in (np.ones(len(view)), *off)]
+    sums = [np.bincount(at, row, views * BINS) for row in (told, *(told * off))]
     count, *shifts = np.array(sums, dtype=np.float64).reshape(3, views, BINS)
     smooth = np.vander(np.linspace(-1.0, 1.0, BINS), DRIFTS, increasing=True)
     weighted = count[:, :, None] * smooth
     normal = np.swapaxes(weighted, 1, 2) @ smooth + 1e-9 * np.eye(DRIFTS) * (count.sum(axis=1) + 1.0)[:, None, None]
     shift = np.stack(shifts, axis=2)  # (N, bins, 2)
     followed = smooth @ np.linalg.solve(normal, smooth.T @ shift)
-    left = (off.T - followed[view, bin_]).T * np.sqrt(told)
+    left = (off - np.ascontiguousarray(followed.reshape(-1, 2).T).take(at, axis=1)) * np.sqrt(told)
     scatter = [[np.bincount(view, a * b, views) for a in left] for b in left]
     size, axes = np.linalg.eigh(np.moveaxis(np.array(scatter), 2, 0) / (count.sum(axis=1) + 1.0)[:, None, None])
     rest = np.swapaxes((shift - count[:, :, None] * followed) @ axes, 1, 2)
     across = np.linalg.solve(np.linalg.cholesky(normal), np.swapaxes(weighted, 1, 2))
-    squares = (_intervals(bins) ** 2 for bins in (*np.moveaxis(rest, 1, 0), *np.moveaxis(across, 1, 0)))
-    own, (one, other, *by_smooth) = _intervals(count), squares
-    own, size = np.maximum(own - sum(by_smooth), 0.5), np.maximum(size, 1.0)
-    more = own * floor**2
-    gain = 0.5 / own * (one / (size[:, 0] + more) + other / (size[:, 1] + more))
-    return gain, np.sqrt(one + other) / own
+    size = np.maximum(size, 1.0)
+    gain, displaced = np.empty((2, len(_STARTS), views))
+    for some in parts(views, CHUNK // BINS):
+        squares = (_intervals(bins) ** 2 for bins in (*rest[some].swapaxes(0, 1), *across[some].swapaxes(0, 1)))
+        own, (one, other, *by_smooth) = _intervals(count[some]), squares
+        own = np.maximum(own - sum(by_smooth), 0.5)
+        more = own * floor**2
+        gain[:, some] = 0.5 / own * (one / (size[some, 0] + more) + other / (size[some, 1] + more))
+        displaced[:, some] = np.sqrt(one + other) / own
+    return gain, displaced
 
 
 def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) -> Array:
@@ -155,16 +159,21 @@ def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) 
     return out - float(np.log(4 * views))
 
 
-def _shares(count: Array, bad: Array, total: Array, all_bad: Array) -> Array:
-    """Return the logarithm of the likelihood ratio of two shares over one, where that inside is the larger."""
+def _shares(bins: Array) -> Array:
+    """Return the logarithm (intervals, N) of the likelihood ratio of two shares over one, where that inside is larger.
+
+    `bins` (2, N, `BINS`) are the numbers of observations and of those that are wrong.
+    """
 
     def log(k: Array, n: Array) -> Array:
         good = np.maximum(n - k, 0.0)
         return np.asarray(xlogy(k, k) + xlogy(good, good) - xlogy(n, n))
 
-    whole, gain = log(all_bad, total), np.zeros_like(count)
+    total, all_bad = bins.sum(axis=2)
+    whole, gain = log(all_bad, total), np.zeros((len(_STARTS), bins.shape[1]))
     told = whole < -SURE  # where all that are wrong lie in one interval, the rest are certain
-    count, bad, total, all_bad = count[:, told], bad[:, told], total[told], all_bad[told]
+    total, all_bad = total[told], all_bad[told]
+    count, bad = _intervals(bins[:, told]).swapaxes(0, 1)
     outside, bad_outside = total - count, all_bad - bad
     more = bad * np.maximum(outside, 1e-9) > bad_outside * count
     gain[:, told] = np.where(more, log(bad, count) + log(bad_outside, outside) - whole[told], 0.0)

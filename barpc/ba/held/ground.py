@@ -14,9 +14,10 @@ from barpc.ba.held.terrain import NUM_BENDS, Believed, Relief, Terrain, believe,
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.structure import Structure
 from barpc.base.errors import BarpcWarning
-from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef, parts
 from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference
+from barpc.sensor.curve import cross
 
 FIRST_PLACED = NUM_BENDS
 """Errors in common in front of altimetry's own: a terrain's bends, or a terrain's and a reference's."""
@@ -138,15 +139,17 @@ def _slopes(points: Array, span: Array) -> Array:
 
 def convergence_angles(structure: Structure, projected: Projected, points: Array) -> Array:
     """Return the convergence angle (P,) [rad] of each point's rays: twice the largest angle to their mean."""
-    by_point = projected.by_point
-    ray = np.cross(by_point[0], by_point[1], axis=0)
-    up = structure.of_points(points)
-    with np.errstate(all="ignore"):
-        ray *= np.sign((ray * up).sum(axis=0)) / np.linalg.norm(ray, axis=0)
-    ray = np.nan_to_num(ray)
-    mean = structure.sum_points(ray)
+    count, up = len(structure.point), np.ascontiguousarray(points.T)
+    rays, apart = np.empty((3, count)), np.empty(count)
+    for part in parts(count):
+        ray = cross(*projected.by_point[..., part])
+        with np.errstate(all="ignore"):
+            ray *= np.sign((ray * up.take(structure.point[part], axis=1)).sum(axis=0)) / np.linalg.norm(ray, axis=0)
+        rays[:, part] = np.nan_to_num(ray)
+    mean = structure.sum_points(rays)
     mean /= np.maximum(np.linalg.norm(mean, axis=0), 1e-12)
-    apart = np.linalg.norm(ray - mean.take(structure.point, axis=1, mode="clip"), axis=0)
+    for part in parts(count):
+        apart[part] = np.linalg.norm(rays[:, part] - mean.take(structure.point[part], axis=1), axis=0)
     largest = np.zeros(structure.num_points)
     np.maximum.at(largest, structure.point, apart)
     return 4.0 * np.arcsin(np.minimum(0.5 * largest, 1.0))

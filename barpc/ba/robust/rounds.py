@@ -91,10 +91,12 @@ class Rounds:
         self.smooth = Smooth(problem.structure, problem.xy, unknowns, alike, tells=faint == 1.0)
         given, control = problem.camera_prior, heights.has_control
         self.variances = Variances.of(given, unknowns, options, control, block.views)
+        self.learnt: PriorTest | None = None  # with what the present priors were learnt
         # what the same unknowns ended with is gone on with: cut, accuracies, misfit
         self.goes_on = known is not None and known.problem.cameras.unknowns is unknowns
         if known is not None and self.goes_on:
             self.problem, use = (replace(self.problem, camera_prior=known.problem.camera_prior), use & known.inlier)
+            self.learnt = known.prior
         self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
         self.use = self.observations.tied(use & self.everything)
         self.counted = (self.use if known is None else self.use & known.inlier).astype(np.float64)
@@ -135,7 +137,7 @@ class Rounds:
         self.passes += 1
         self._cut()
         found = self._solve()
-        prior, tested = self.variances.learnt(self.problem, found)
+        prior, tested = self.variances.learnt(self.problem, found, self.learnt)
         smooth = self._estimate_noise()
         numbers = self.passes, self.use.sum(), len(self.use), self.noise
         _LOG.info("pass %d: %d of %d observations, noise %.3f", *numbers)
@@ -148,7 +150,7 @@ class Rounds:
         if once or self.passes >= TRIED or (settled and (same or not self.robust)):
             smooth = self.smooth.test_neighbours(smooth, self.residual, self.use)
             if found.covariance(self.problem.free).is_large:
-                tested = self.variances.learnt(self.problem, found, exact=True)[1]
+                tested = self.variances.learnt(self.problem, found, self.learnt, exact=True)[1]
             by_point = self._by_points().by_point.copy()  # the next projection overwrites it
             return Outcome(
                 self.problem,
@@ -162,7 +164,7 @@ class Rounds:
                 smooth,
                 by_point,
             )
-        self.problem = replace(self.problem, camera_prior=prior)
+        self.problem, self.learnt = replace(self.problem, camera_prior=prior), tested
         return None
 
     def _cut(self) -> None:

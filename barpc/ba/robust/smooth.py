@@ -18,7 +18,7 @@ from barpc.ba.held.block import Block
 from barpc.ba.held.ground import ALIKE
 from barpc.ba.solving.structure import Structure
 from barpc.ba.usual import KEPT, MANY, OUTLIER, RIDGE
-from barpc.base.geodesy import Array, metres_per_unit
+from barpc.base.geodesy import Array, metres_per_unit, parts
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.displaced import bsplines
 
@@ -126,11 +126,17 @@ class Smooth:
         col, row = unknowns.normalized(xy, structure.view).clip(-1.0, 1.0)
         self._place = xy
         self._col, self._row = col, row
-        self._kept = self._terms(slice(None)) if len(col) <= KEPT else None
+        self._kept = self._all_terms() if len(col) <= KEPT else None
 
     def _basis(self, rows: slice) -> Array:
         """Return the terms (TERMS, n) at some observations."""
         return self._terms(rows) if self._kept is None else self._kept[:, rows]
+
+    def _all_terms(self) -> Array:
+        out = np.empty((TERMS, len(self._col)))
+        for part in parts(len(self._col)):
+            out[:, part] = self._terms(part)
+        return out
 
     def _terms(self, rows: slice) -> Array:
         col, row = self._col[rows], self._row[rows]

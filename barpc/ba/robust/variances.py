@@ -111,20 +111,25 @@ class Variances:
         """Return the wider priors used while outliers are looked for, so that unexpected drift is not cut."""
         return self._prior(np.ones(len(self.given.sigma)), np.full(self._degrees, TIMES))
 
-    def learnt(self, problem: Problem, minimum: Minimum, exact: bool = False) -> tuple[CameraPrior, PriorTest]:
+    def learnt(
+        self, problem: Problem, minimum: Minimum, last: PriorTest | None = None, exact: bool = False
+    ) -> tuple[CameraPrior, PriorTest]:
         """Estimate the priors that the block supports, in its linearisation at a minimum.
 
-        A large block's variances are probed unless they are to be `exact`.
+        `last` is what the priors of the problem were learnt with, where they were. A large block's variances are
+        probed unless they are to be `exact`.
         """
+        widened = last is not None and bool((last.scale > 1.0).any())
         try:
-            return self._learnt(problem, minimum, exact)
+            return self._learnt(problem, minimum, widened, exact)
         except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
             _LOG.warning("the priors of the cameras are left as they are: %s", error)
             n = len(minimum.state.params)
             nothing = PriorTest(float("nan"), 0.0, np.ones(n), np.zeros(n, dtype=bool), ())
             return problem.camera_prior, nothing
 
-    def _learnt(self, problem: Problem, minimum: Minimum, exact: bool) -> tuple[CameraPrior, PriorTest]:
+    def _learnt(self, problem: Problem, minimum: Minimum, widened: bool, exact: bool) -> tuple[CameraPrior, PriorTest]:
+        """Return what `learnt` does, of a problem whose constants' priors were `widened` or not."""
         if self.learn_waves:
             self = self._going_on(problem.camera_prior.sigma)
         around = _Around(problem, minimum)
@@ -138,7 +143,8 @@ class Variances:
         total, freedom = (float(part.sum()) for part in self._squares(params, known))
         ratio = total / freedom if freedom > _LEAST else float("nan")
         shared = self._shared(params, known)
-        stands = not self.learn_drift
+        # constants of a large block that were widened take from the drift, which need not stand again
+        stands = not self.learn_drift or (not around.small and widened)
         for _ in range(ITERATIONS):
             before = prior
             if self.learn_waves:

@@ -189,11 +189,16 @@ def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, 
     )
 
 
-def point_products(by_point: Array, residual: Array) -> Array:
-    """Return the products (9, K): the six elements of A^T A (order of `TRIANGLE`) and the three of A^T r."""
+def point_products(by_point: Array, residual: Array, weight: Array | None = None) -> Array:
+    """Return the products (9, K): the six elements of A^T A (order of `TRIANGLE`) and the three of A^T r.
+
+    Of whitened derivatives and residuals, or of such that weights (K,) whiten.
+    """
     products = np.empty((9, residual.shape[1]))
     for part in parts(residual.shape[1]):
         (a, b), r = by_point[..., part], residual[:, part]
+        if weight is not None:
+            a, b, r = a * weight[part], b * weight[part], r * weight[part]
         for n, (i, j) in enumerate(TRIANGLE):
             np.add(a[i] * a[j], b[i] * b[j], out=products[n, part])
         np.add(a * r[0], b * r[1], out=products[6:, part])

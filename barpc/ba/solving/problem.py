@@ -105,9 +105,8 @@ class Problem:
 
     def triangulate(self, points: Array, projected: Projected, weight: Array) -> Array:
         """Move all points (P, 3) [m] by one Gauss-Newton step with the cameras held."""
-        residual = (projected.image - self.xy) * weight
         matrix, gradient = self.point_terms(points)
-        sums = self.structure.sum_points(point_products(projected.by_point * weight, residual))
+        sums = self.structure.sum_points(point_products(projected.by_point, projected.image - self.xy, weight))
         lower = cholesky3(sums[:6] + matrix)
         step = solve_transposed(lower, solve_lower(lower, sums[6:] + gradient))
         return points - step.T
