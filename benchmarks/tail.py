@@ -1,13 +1,15 @@
 """Whole runs by the number of images: CPU seconds and memory of every stage of `barpc adjust`.
 
 Simulated blocks as files: small images with simulated RPCs, and matches.npz given with --matches, so that everything
-but the matching is measured; or small images of one ground, which are matched. Prints, for each size, pairs, CPU
+but the matching is measured; or small images of one ground, which are matched; or large blank ones, whose matches
+given are verified and looked for in the pixels (--matches alone). Prints, for each size, pairs, CPU
 seconds (whole process tree) and peak memory; then the CPU seconds of every stage and the share of the run's time that
 stages account for; then the exponent of CPU seconds over images between the sizes. Of matched images it says, too,
 what the exact tie points of the simulation are left with.
 
     python benchmarks/tail.py --views 100 300 1000 --folder /somewhere
     python benchmarks/tail.py --matching 192 --views 100 300 1000
+    python benchmarks/tail.py --blank 20000 --views 250 --tracks 200
 """
 
 from __future__ import annotations
@@ -56,15 +58,19 @@ class Trial:
     page: float  # MB of report.html
 
 
-def write_block(folder: Path, num_views: int, tracks: int) -> Path:
-    """The files of a block; the list of its images."""
+def write_block(folder: Path, num_views: int, tracks: int, blank: int | None = None) -> Path:
+    """The files of a block, or of one of so many blank pixels a side on the same ground; the list of its images."""
     listed = folder / "images.txt"
     if listed.exists():
         return listed
     folder.mkdir(parents=True)
-    block = simulate_block(num_views, tracks * num_views, seed=1, num_checks=0, **LAYOUT)
+    layout = LAYOUT if blank is None else LAYOUT | {"size": (blank, blank), "gsd": GSD * SIDE / blank}
+    block = simulate_block(num_views, tracks * num_views, seed=1, num_checks=0, **layout)
     ramp = np.add.outer(np.arange(SIDE), np.arange(SIDE)).astype(np.uint16)
-    paths = [_write_image(folder, view, ramp + n) for n, view in enumerate(block.views)]
+    paths = [
+        _write_image(folder, view, ramp + n) if blank is None else _write_blank(folder, view, blank)
+        for n, view in enumerate(block.views)
+    ]
     write_matches(folder / "matches.npz", block.tracks, [view.name for view in block.views])
     listed.write_text("".join(f"{path}\n" for path in paths))
     return listed
@@ -123,11 +129,21 @@ def _write_image(folder: Path, view: View, pixels: np.ndarray) -> Path:
     return path
 
 
-def run(listed: Path, out: Path, jobs: int) -> Trial:
+def _write_blank(folder: Path, view: View, side: int) -> Path:
+    path = folder / f"{view.name}.tif"
+    warnings.simplefilter("ignore", NotGeoreferencedWarning)
+    profile = {"driver": "GTiff", "width": side, "height": side, "count": 1, "dtype": "uint16", "tiled": True}
+    with rasterio.open(path, "w", sparse_ok=True, **profile):
+        pass  # tiles that nothing is written to take no room
+    put_tag(path, view.sensor)
+    return path
+
+
+def run(listed: Path, out: Path, jobs: int, only: bool = True) -> Trial:
     """`barpc adjust` in a process of its own."""
     matches = listed.parent / "matches.npz"
     command = [sys.executable, "-m", "barpc", "-q", "adjust", "--image-list", listed]
-    command += ["--matches", matches, "--matches-only"] * matches.exists()
+    command += ["--matches", matches, *["--matches-only"] * only] * matches.exists()
     start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
     words = [str(word) for word in (*command, "-o", out, "--overwrite", "-j", jobs)]
     done = subprocess.run(words, capture_output=True, text=True, env=os.environ | THREADS, check=False)
@@ -158,6 +174,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, nargs="+", default=[100, 300, 1000], help="images, ascending")
     parser.add_argument("--tracks", type=int, default=95, help="tracks an image")
     parser.add_argument("--matching", type=int, metavar="SIDE", help="match images of so many pixels a side")
+    parser.add_argument("--blank", type=int, metavar="SIDE", help="verify matches given of blank images of this side")
     parser.add_argument("--jobs", type=int, default=1, help="worker processes")
     parser.add_argument("--folder", type=Path, help="where the files go and stay; default: a temporary one")
     options = parser.parse_args()
@@ -167,10 +184,11 @@ def main() -> None:
         trials = {}
         for num in options.views:
             if options.matching is None:
-                listed = write_block(folder / f"block_{num}", num, options.tracks)
+                name = f"block_{num}" if options.blank is None else f"blank_{num}"
+                listed = write_block(folder / name, num, options.tracks, options.blank)
             else:
                 listed = write_pictures(folder / f"pictures_{num}", num, options.matching)
-            trials[num] = found = run(listed, folder / f"run_{listed.parent.name}", options.jobs)
+            trials[num] = found = run(listed, folder / f"run_{listed.parent.name}", options.jobs, options.blank is None)
             if options.matching is not None:
                 before, after = left(listed, folder / f"run_{listed.parent.name}")
                 print(f"{num} images: exact tie points are left with {before:.2f} -> {after:.3f} px", flush=True)

@@ -116,6 +116,21 @@ class PixelReader(ExitStack):
         return _averaged(self._band, box, self._pixel)
 
 
+class OpenReaders(ExitStack):
+    """Each `PixelReader` that was asked for, opened once and kept open."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._known: dict[tuple[str, int, tuple[int, int], int], PixelReader] = {}
+
+    def of(self, path: str, band: int, size: tuple[int, int], thin: int) -> PixelReader:
+        """Return the reader of an image; arguments as those of `PixelReader`."""
+        key = path, band, size, thin
+        if key not in self._known:
+            self._known[key] = self.enter_context(PixelReader(path, band, size, thin))
+        return self._known[key]
+
+
 def _pixel(dataset: Any, size: tuple[int, int] | None) -> tuple[int, int]:
     """Return the columns and rows of a raster that one pixel of its picture of a size (width, height) holds."""
     width, height = size or (dataset.width, dataset.height)
@@ -174,7 +189,9 @@ class _Band:
             valid &= self.dataset.read_masks(self.number, window=window, **more) != 0
         elif self.invalid is not None:
             valid &= raw != self.invalid
-        if whole and self.nodata is None and not raw.all():
+        if whole and self.nodata is None and not raw.any():
+            valid[:] = False
+        elif whole and self.nodata is None and not raw.all():
             # zeros without a name: a border where they stand together
             cv2.setNumThreads(1)  # the work is spread by processes
             zeros = cv2.morphologyEx((raw == 0).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))

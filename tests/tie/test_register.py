@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from barpc.tie.patches import register
 from barpc.tie.patches.register import _Template, _upsampled, _with_derivatives, register_patches, register_places
+from barpc.tie.pixels import PixelReader
 from tests.lanes import diagonal
 from tests.tie.conftest import write_image
 
@@ -141,6 +143,20 @@ def test_what_is_invalid_in_either_file_is_not_used(texture, tmp_path, holed: in
     places = np.array([[203.0, 198.0], [100.0, 120.0], [300.0, 200.0]])
     found = register_places(tuple(files), 1, places, places + 0.3, np.broadcast_to(np.eye(2), (3, 2, 2)), 21)
     assert found.ok.tolist() == [False, True, True]
+
+
+def test_images_that_hold_nothing_are_read_as_little_as_it_takes_to_know(tmp_path, monkeypatch) -> None:
+    read: list[object] = []
+    files = [(str(tmp_path / f"{k}.tif"), (SIZE, SIZE)) for k in (0, 1)]
+    for path, _ in files:
+        write_image(path, np.zeros((SIZE, SIZE), np.uint16))
+    kept = PixelReader.read
+    monkeypatch.setattr(PixelReader, "read", lambda self, box: read.append(box) or kept(self, box))
+    monkeypatch.setattr(register, "_upsampled", None)  # would fail
+    xy = np.array([[50.0, 50.0], [SIZE - 50.0, SIZE - 60.0]])
+    found = register_places(files, 1, xy, xy + 0.25, np.tile(np.eye(2), (2, 1, 1)), 21)
+    assert not found.ok.any()
+    assert len(read) == len(xy)
 
 
 def test_gain_and_offset_between_the_images_do_not_matter(texture, reference) -> None:

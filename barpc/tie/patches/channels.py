@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import lru_cache, reduce
 
 import cv2
 import numpy as np
@@ -26,7 +26,7 @@ from barpc.base.geodesy import Array, metres_per_unit
 from barpc.rasters.raster import open_raster
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.overlaps import Terrain
-from barpc.tie.pixels import FloatImage, PixelReader, grow, levelled
+from barpc.tie.pixels import FloatImage, OpenReaders, grow, levelled
 
 _BLUR = 0.75  # px: of pictures before the gradients, and of channels
 _WEAK = 0.5  # of the median gradient: what is weaker is noise
@@ -129,6 +129,14 @@ def _between(at: Array, count: int) -> Array:
     return np.stack([np.interp(at, nodes, row) for row in np.eye(len(nodes))], axis=1)
 
 
+@lru_cache(maxsize=64)
+def _between_all(count: int) -> Array:
+    """Return the weights (count, nodes) of the nodes along an axis for each of its px."""
+    weights = _between(np.arange(count, dtype=np.float64), count)
+    weights.flags.writeable = False
+    return weights
+
+
 def _known(nodes: Array) -> BoolArray:
     """Return the nodes (m, n) of which both coordinates (m, n, 2) are known."""
     return np.asarray(np.isfinite(nodes).all(axis=2))
@@ -204,7 +212,12 @@ def shown(picture: FloatImage) -> float:
 
 
 def picture(
-    path: str, bands: Sequence[int], size: tuple[int, int], nodes: Array, shape: tuple[int, int]
+    path: str,
+    bands: Sequence[int],
+    size: tuple[int, int],
+    nodes: Array,
+    shape: tuple[int, int],
+    readers: OpenReaders | None = None,
 ) -> tuple[FloatImage, BoolArray]:
     """Resample a raster to a grid (H, W) whose nodes (m, n, 2) lie at its col, row [px]; return also the
     valid pixels.
@@ -226,10 +239,8 @@ def picture(
         return nothing
     low, high = low // thin, high // thin
     box = grow((int(low[0]), int(low[1]), *(high - low + 1).tolist()), 4, (size[0] // thin, size[1] // thin))
-    each = []
-    for band in bands:
-        with PixelReader(path, band, size, thin) as reader:
-            each.append(reader.read(box))
+    with OpenReaders() as own:
+        each = [(readers or own).of(path, band, size, thin).read(box) for band in bands]
     valid = np.all([known for _, known in each], axis=0)
     if not valid.any():
         return nothing
@@ -238,12 +249,12 @@ def picture(
     cv2.setNumThreads(1)
     if (left := apart / thin) > 1.1:
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.5 * (left**2 - 1.0) ** 0.5), np.float32)
-    rows, cols = (_between(np.arange(n, dtype=np.float64), n) for n in shape)
+    rows, cols = (_between_all(n) for n in shape)
     nodes = (np.where(known[..., None], nodes, 0.0) + 0.5) / thin - 0.5 - box[:2]
     x, y = ((rows @ nodes[..., i] @ cols.T).astype(np.float32) for i in (0, 1))
     found = cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     lacking = cv2.remap(
         (~valid).astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0
     )
-    within = rows @ (1.0 - known) @ cols.T == 0.0
+    within = known.all() or rows @ (1.0 - known) @ cols.T == 0.0
     return np.asarray(found, np.float32), np.asarray((lacking == 0.0) & within)

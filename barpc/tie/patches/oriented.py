@@ -15,7 +15,7 @@ from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 from barpc.tie.pairing.epipolar import grouped
 from barpc.tie.patches.channels import EDGE, channels, correlation, cut, picture, ticks
-from barpc.tie.pixels import CELL, PIECE, SPAN, FloatImage
+from barpc.tie.pixels import CELL, PIECE, SPAN, FloatImage, OpenReaders
 
 Files = Sequence[tuple[str, tuple[int, int]]]
 """Path and size (width, height) of two images."""
@@ -46,12 +46,13 @@ class Sampling:
     band: int
     step: float  # px of A that a pixel of the grids holds
     linear: Array  # (2, 2) d(B)/d(A)
+    readers: OpenReaders | None = None  # of both images, where blocks would be decoded again
 
     def seen(self, which: int, origin: Array, matrix: Array, size: IntArray) -> FloatImage:
         """Return the channels (C, H, W) of an image on a grid: pixel k at `origin` + `matrix` k."""
         (path, whole), shape = self.files[which], (int(size[1]), int(size[0]))
         nodes = np.stack(np.meshgrid(ticks(shape[1]), ticks(shape[0])), axis=-1)
-        return channels(*picture(path, (self.band,), whole, origin + nodes @ matrix.T, shape))
+        return channels(*picture(path, (self.band,), whole, origin + nodes @ matrix.T, shape, self.readers))
 
 
 def found_about(sampling: Sampling, at: Array, xy: Array, half: int = HALF) -> tuple[Array, BoolArray, Array]:
@@ -71,13 +72,14 @@ def register_oriented(
     """
     place, ok, score = start.copy(), np.zeros(len(start), dtype=bool), np.zeros(len(start))
     step = resolution(np.median(linear, axis=0))
-    for rows in grouped(*np.floor(reference[:, ::-1] / (step * SPAN)).T):
-        at, turn = reference[rows], np.median(linear[rows], axis=0)
-        near, found, _ = found_about(Sampling(files, band, step, turn), at, start[rows], PATCH)
-        closer = Sampling(files, band, 0.5 * step, turn)
-        tile = PatchTile.of(closer, at, near, np.full(2, _FINER), 2 * HALF)
-        best, inside, score[rows] = tile.found()
-        place[rows], ok[rows] = tile.in_b(best), found & inside
+    with OpenReaders() as readers:
+        for rows in grouped(*np.floor(reference[:, ::-1] / (step * SPAN)).T):
+            at, turn = reference[rows], np.median(linear[rows], axis=0)
+            near, found, _ = found_about(Sampling(files, band, step, turn, readers), at, start[rows], PATCH)
+            closer = Sampling(files, band, 0.5 * step, turn, readers)
+            tile = PatchTile.of(closer, at, near, np.full(2, _FINER), 2 * HALF)
+            best, inside, score[rows] = tile.found()
+            place[rows], ok[rows] = tile.in_b(best), found & inside
     return place, ok, score
 
 

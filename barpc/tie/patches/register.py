@@ -73,6 +73,8 @@ def register_places(
     with PixelReader(path, band, size) as first, PixelReader(other, band, beyond) as second:
         for rows in groups:
             a, valid_a, shift_a = read(first, size, reference[rows], margin)
+            if not valid_a.any():  # nothing to look for
+                continue
             b, valid_b, shift_b = read(second, beyond, start[rows], margin)
             places = reference[rows] - shift_a, start[rows] - shift_b
             found = register_patches((a, b), (valid_a, valid_b), *places, linear[rows], patch)
@@ -109,10 +111,12 @@ def _mosaics(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int)
         low, high = corner.clip(0), np.minimum(corner + side, size)
         if (high > low).all():
             pixels, known = reader.read((int(low[0]), int(low[1]), *(high - low).tolist()))
+            if not known.any():
+                continue
             (left, top), (right, below) = low - corner, corner + side - high
             place, border = np.s_[row : row + side, col : col + side], (top, below, left, right)
             picture[place] = cv2.copyMakeBorder(levelled(pixels, known), *border, cv2.BORDER_REFLECT_101)
-            usable[place] = np.pad(known, ((top, below), (left, right)))
+            usable[row + top : row + side - below, col + left : col + side - right] = known
     return picture, usable, shift
 
 
@@ -169,8 +173,10 @@ def register_patches(
     `linear` (N, 2, 2) a first guess of d(second)/d(first). What fails (at a border, on a steep slope) is tried again
     with a smaller patch; what succeeds must be confirmed by it.
     """
-    fine, best = _upsampled(images[1]), PatchRegistration.none(start)
-    pictures = _with_derivatives(images[0])
+    best = PatchRegistration.none(start)
+    if not all(mask.any() for mask in valid):
+        return best
+    fine, pictures = _upsampled(images[1]), _with_derivatives(images[0])
     smaller = int(_INNER * patch) | 1
     for side in (patch, smaller):
         template = _Template(pictures, images[0].shape[1], side)
