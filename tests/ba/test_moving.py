@@ -13,6 +13,7 @@ from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.apart import Parts
 from barpc.ba.evidence.linearised import linearise
 from barpc.ba.evidence.mixture import Group, fit
+from barpc.ba.evidence.mixture import moving as moving_of
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.held.block import Block as Joined
 from barpc.ba.held.block import first_state, join, make_problem
@@ -119,6 +120,10 @@ def test_a_group_is_told_from_what_stands_still() -> None:
     mine = members(problem, state.params, one, held_out)
     assert (mine == moves[~np.isin(block.point % 5, [1, 2, 3])]).mean() > 0.95
     assert not len(members(problem, state.params, one, block.without(block.point >= 0)))
+    taking_part = np.concatenate([part.rows.ravel() for part in linear.tracks])
+    none = np.zeros((2, 0, len(block.view)))
+    again = moving_of(linear, none, replace(group, share=one.shares[group.cell]), found)[taking_part]
+    np.testing.assert_allclose(again, found.moving[taking_part], atol=0.02)  # the shares are a step farther
     few = linear.thinned(300)
     assert 240 <= sum(part.rows.size for part in few.tracks) <= 330
     total = sum(part.rows.size for part in linear.tracks)

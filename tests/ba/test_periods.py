@@ -106,3 +106,16 @@ def test_the_spectrum_is_half_of_what_least_squares_take_away() -> None:
         pull = (basis * right) @ white.T
         taken = np.einsum("ic,ij,jc->", pull, np.linalg.inv((basis * right) @ basis.T), pull)
         assert found[k] == pytest.approx(0.5 * taken, rel=1e-6)
+
+
+def test_the_level_beside_a_peak_is_one_of_noise_and_more_where_rows_wander() -> None:
+    """In white noise it is 1 about a swing, of whatever size: the swing itself is taken away."""
+    rng, rows, n = np.random.default_rng(8), 8000.0, 4000
+    row, right = rng.uniform(0.0, rows, n), np.ones(n)
+    noise, period = rng.normal(size=(2, n)), 400.0
+    swing = np.sin(2.0 * np.pi * row / period)
+    walk = np.interp(row, np.linspace(0.0, rows, 400), np.cumsum(rng.normal(size=400)))
+    for size, wander, least, most in ((0.0, 0.0, 1.0, 1.3), (3.0, 0.0, 1.0, 1.3), (3.0, 0.3, 2.0, 40.0)):
+        one = periods._Rows(row, rows, right, noise + size * swing + wander * walk)
+        k = int(np.argmin(np.abs(one.waves - rows / period)))
+        assert least <= one._level(k, period) < most
