@@ -94,6 +94,10 @@ def test_a_matcher_without_keypoints_has_its_frame_at_the_middles_of_the_tiles_t
     ends = tuple(views(camera(0.0), camera(0.0)))
     _Search(ends, (join_keypoints([]), join_keypoints([])), TieOptions(matcher="blind"))
     assert [points.tolist() for points in asked] == [[[50.0, 25.0], [130.0, 40.0]]]
+    monkeypatch.setitem(MATCHERS, "scripted", lambda *_: Scripted([]))
+    keypoints: Any = SimpleNamespace(xy="of the first"), SimpleNamespace(xy="of the second")
+    _Search(ends, keypoints, TieOptions(matcher="scripted"))
+    assert asked[1] == "of the first"
 
 
 FLAT = Prediction(lambda xy: EpipolarSegments(np.array([1.0, 0.0]), *(np.zeros(len(xy)),) * 5, np.eye(2)), 3.0, list)
@@ -120,6 +124,7 @@ def test_as_many_matches_are_trusted_as_the_bands_aside_allow(search, aside, sha
 
 
 def test_no_matches_are_none_in_every_column() -> None:
+    assert [column.shape for column in (NO_MATCHES.xy, NO_MATCHES.score, NO_MATCHES.index)] == [(0, 2, 2), (0,), (0, 2)]
     assert [len(NO_MATCHES), len(NO_MATCHES.xy), len(NO_MATCHES.score), len(NO_MATCHES.index)] == [0] * 4
     assert NO_MATCHES.index.shape == (0, 2)
     assert np.isnan(NO_MATCHES.sigma) or NO_MATCHES.sigma >= 0
