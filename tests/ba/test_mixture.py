@@ -256,3 +256,12 @@ def test_numbers_of_a_mixture_are_those_of_its_subsets() -> None:
     """Six of each view of every subset; of more than four views of all, all but one, and none."""
     assert linearised.numbers(np.array([2, 3, 4])) == 6 * (4 * 2 + 8 * 3 + 16 * 4)
     assert linearised.numbers(np.array([5, 12])) == 6 * (6 * 5 + 13 * 12)
+
+
+def test_a_track_moves_by_the_share_of_what_is_right_of_it_that_moves() -> None:
+    """Something of three tracks is right with 0.7, 0.3 and 0.2, of which 0.1, 0 and all is where it moved."""
+    nothing, stands = np.zeros((3, 2)), np.array([[0.4, 0.2], [0.3, 0.0], [0.0, 0.0]])
+    moves = np.array([[0.05, 0.05], [0.0, 0.0], [0.2, 0.0]])
+    gone = mixture._Expected(nothing, moves, nothing, nothing, nothing, nothing)
+    both = mixture._Expected(nothing, stands, nothing, nothing, nothing, nothing, gone)
+    np.testing.assert_allclose(both.gone, [0.1 / 0.7, 0.0, 1.0])

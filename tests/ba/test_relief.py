@@ -322,3 +322,17 @@ def test_a_slope_is_all_in_the_coarsest_band() -> None:
     np.testing.assert_allclose(heights[-1, middle], ground[middle, 2], atol=5.0)
     assert np.abs(heights[:-1, middle]).max() < 2.0
     np.testing.assert_allclose(slopes.sum(axis=0)[middle], np.tile([0.04, -0.02], (middle.sum(), 1)), atol=2e-3)
+
+
+def test_points_that_pull_alike_where_they_lie_together_count_as_one() -> None:
+    """Four groups of nine: within each pulls are the same, or each has its own."""
+    rng = np.random.default_rng(2)
+    corners = np.array([[0.0, 0.0], [900.0, 0.0], [0.0, 900.0], [900.0, 900.0]])
+    at = np.repeat(corners, 9, axis=0) + rng.uniform(0.0, 5.0, (36, 2))
+    alike = np.repeat([[1.0, -1.0], [-1.0, 1.0], [1.0, 1.0], [-1.0, -1.0]], 9, axis=0)
+    assert _summed(at, alike) == pytest.approx(9.0, rel=0.1)
+    apart = np.tile([[1.0, 0.0], [-1.0, 0.0]], (18, 1))
+    assert 1.0 <= _summed(at, apart) < 2.0
+    assert _summed(rng.uniform(0.0, 900.0, (1, 2)), np.ones((1, 2))) == 1.0
+    far = np.array([[0.0, 0.0], [900.0, 900.0]])
+    assert _summed(far, np.array([[1.0, 1.0], [-1.0, -1.0]])) == pytest.approx(1.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import zipfile
 from dataclasses import FrozenInstanceError, fields, replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import FitError, InputError, RpcError
-from barpc.base.frozen import Frozen, from_arrays, to_arrays
+from barpc.base.frozen import Frozen, from_arrays, load_npz, to_arrays
 from barpc.base.remote import Remote
 from barpc.fit import Normalization, fit_rpc
 from barpc.scene import Camera, GroundPoints, Tracks, View
@@ -179,3 +180,15 @@ def test_zero_has_no_sign_and_shapes_count():
 def test_a_wrong_array_is_refused_by_name(wrong, error, said):
     with pytest.raises(error, match=said):
         wrong()
+
+
+@pytest.mark.parametrize(("version", "taken"), [((1, 0), True), ((2, 0), True), ((3, 0), False)])
+def test_archives_hold_arrays_with_a_header_of_either_size(version, taken, tmp_path):
+    path, values = tmp_path / "a.npz", np.arange(6.0)
+    with zipfile.ZipFile(path, "w") as archive, archive.open("values.npy", "w") as file:
+        np.lib.format.write_array(file, values, version=version)
+    if taken:
+        np.testing.assert_array_equal(load_npz(path)["values"], values)
+    else:
+        with pytest.raises(InputError, match="not "):
+            load_npz(path)

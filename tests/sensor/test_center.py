@@ -148,3 +148,24 @@ def test_the_rays_that_meet_are_those_of_the_middle_row(monkeypatch) -> None:
     np.testing.assert_array_equal(image[:, 1], (SIZE[1] - 1) / 2)
     np.testing.assert_array_equal(alt, np.repeat(ALTITUDES, half))
     np.testing.assert_array_equal(bounds, [0, 2 * half])
+
+
+def test_the_centre_of_a_matrix_is_the_same_whatever_the_unit_of_the_image() -> None:
+    """Where cells are not seen exactly; in pixels a thousandth as large as in the image itself."""
+    size = (301, 226)
+
+    def moved(scale: float) -> Any:
+        camera: Any = Pinhole()
+        noise = np.random.default_rng(1)
+
+        class Seen:
+            def localize(self, image: Any, alt: Any) -> Any:
+                ground = camera.localize(np.asarray(image) * scale, alt)
+                return ground + noise.normal(0.0, 1e-7, ground.shape) * [1.0, 1.0, 0.0]
+
+        return Seen()
+
+    one = geometry._center_projective(moved(10.0), size, ALTITUDES)
+    other = geometry._center_projective(moved(0.01), tuple(1000 * (side - 1) + 1 for side in size), ALTITUDES)
+    np.testing.assert_allclose(one, other, rtol=1e-6)
+    assert np.linalg.norm(one - Pinhole().center) < 0.2 * 7e5
