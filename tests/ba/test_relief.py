@@ -11,7 +11,7 @@ import pytest
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.held.block import first_state, join, make_problem
 from barpc.ba.held.ground import Heights
-from barpc.ba.held.terrain import NUM_BENDS, Bands, Believed, Relief, _summed, believe, bends
+from barpc.ba.held.terrain import NUM_BENDS, Bands, Believed, Relief, _middling, _summed, believe, bends
 from barpc.base.geodesy import enu_basis, ground_from_ecef
 from barpc.rasters.dem import Dem
 from barpc.simulate import simulate_block
@@ -336,3 +336,9 @@ def test_points_that_pull_alike_where_they_lie_together_count_as_one() -> None:
     assert _summed(rng.uniform(0.0, 900.0, (1, 2)), np.ones((1, 2))) == 1.0
     far = np.array([[0.0, 0.0], [900.0, 900.0]])
     assert _summed(far, np.array([[1.0, 1.0], [-1.0, -1.0]])) == pytest.approx(1.0)
+
+
+def test_values_within_five_standard_deviations_of_the_median_are_the_middle_ones() -> None:
+    """Of values whose median lies at 2 and whose median distance from it is 1: 1.4826 is a standard deviation."""
+    values = 2.0 + np.array([-1.0, -1.0, 0.0, 1.0, 1.0, -7.4, 7.5, 1.0, -1.0])
+    assert _middling(values).tolist() == [True] * 6 + [False] + [True] * 2

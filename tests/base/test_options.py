@@ -19,13 +19,16 @@ from click.testing import CliRunner
 import barpc
 from barpc.base.errors import InputError
 from barpc.base.options import (
+    PAPER,
     AdjustOptions,
     Declared,
     DsmOptions,
     FitOptions,
     Options,
+    Rule,
     RunOptions,
     TieOptions,
+    checked,
     declared,
     read_options,
     schema,
@@ -300,3 +303,19 @@ def test_the_names_are_public_and_cost_no_numpy() -> None:
 def test_what_nobody_chose_is_as_the_manual_says() -> None:
     usual = AdjustOptions()
     assert (usual.estimate_noise, usual.noise_floor) == (True, 0.02)
+
+
+def test_the_model_of_the_paper_is_constant_of_all_observations() -> None:
+    assert PAPER["adjust"] == {
+        "model": "rotation+translation", "center": "projective", "drift": 0, "jitter": "off", "learn_priors": False,
+        "solver": "scipy",
+    }  # fmt: skip
+
+
+def test_bounds_are_where_they_are_said_to_be() -> None:
+    assert AdjustOptions(min_convergence=180.0).min_convergence == 180.0
+    with pytest.raises(InputError, match="min_convergence"):
+        AdjustOptions(min_convergence=180.5)
+    assert checked("count", int, Rule("A number."), 2**53 - 1) == 2**53 - 1
+    with pytest.raises(InputError, match="count"):
+        checked("count", int, Rule("A number."), 2**53)

@@ -46,6 +46,15 @@ def test_heights_between_nodes_are_bilinear(tmp_path):
     assert dem(5.005, 43.995) == pytest.approx(105.5)
 
 
+@pytest.mark.parametrize("shape", [(40, 5), (5, 40)])
+def test_a_strip_is_read_to_its_ends_whichever_way_it_lies(shape, tmp_path):
+    row, col = np.mgrid[: shape[0], : shape[1]]
+    dem = Dem.open(write_dem(tmp_path / "a.tif", 4979, (100.0 + 10 * col + row).astype(np.float32)))
+    at = np.array([[0.5, 0.5], [shape[1] - 1.5, shape[0] - 1.5], [shape[1] - 1.0, shape[0] - 1.0]])
+    found = dem(*(np.array([5.0, 44.0]) + STEP * at * [1, -1]).T)
+    np.testing.assert_allclose(found, 100.0 + at @ [10.0, 1.0], atol=1e-6)
+
+
 def test_outside_and_where_a_void_has_weight_there_is_no_height(tmp_path):
     row, col = np.mgrid[:21, :31]
     heights = (100.0 + 10 * col + row).astype(np.float32)
