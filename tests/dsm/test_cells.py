@@ -110,3 +110,11 @@ def test_coarser_pictures_are_framed_by_the_middles_of_their_pixels(monkeypatch:
             np.testing.assert_allclose(found, (one(ground) + 0.5) / side - 0.5)
         np.testing.assert_array_equal(alt, ground[:, 2])
     assert sizes == [[(100, 20), (100, 20)]]
+
+
+@pytest.mark.parametrize(("at", "size"), [((0, 0), (5, 5)), ((5, 0), (3, 5)), ((0, 5), (5, 1)), ((5, 5), (3, 1))])
+def test_a_part_of_a_tile_is_as_large_as_what_is_left_of_it(at, size):
+    tile = Tile(CRS.from_epsg(32631).to_wkt(), 450_000.0, 4_900_000.0, 2.0, (8, 6), (0.0, 1.0))
+    part = tile.part(*at, 5)
+    assert (part.size, part.step, part.alts) == (size, tile.step, tile.alts)
+    assert (part.west, part.north) == (450_000.0 + 2.0 * at[0], 4_900_000.0 - 2.0 * at[1])

@@ -313,6 +313,7 @@ def test_a_corrected_camera_is_written_as_a_state_that_the_library_reads_as_mean
     np.testing.assert_allclose(again.model.project(ground), image, rtol=0, atol=1e-5)
     text = (tmp_path / "b.json").read_text()
     state = json.loads(text[text.index("{") :])
+    assert state["m_centerEphemerisTime"] == state["m_detectorLineOrigin"] == 0.0  # times count from the first row's
     assert offset(state, ground, image) < 1e-3  # m: pixels of 7
     assert state["m_halfSwath"] == pytest.approx(state["m_gsd"] * SIZE[0] / 2.0, rel=0.1)
     off = np.abs(model.project(ground) - image).max()
