@@ -33,6 +33,7 @@ import rasterio  # noqa: E402
 from rasterio.windows import Window  # noqa: E402
 
 from barpc.base.errors import BarpcError  # noqa: E402
+from barpc.base.usual import robust_spread  # noqa: E402
 from barpc.pipeline.executor import CachingExecutor  # noqa: E402
 from barpc.pipeline.loading import load_views  # noqa: E402
 from barpc.scene import View  # noqa: E402
@@ -50,7 +51,7 @@ from barpc.tie import (  # noqa: E402
     refine,
     select_pairs,
 )
-from barpc.tie.pairing.epipolar import affine_inliers, frame, robust_spread  # noqa: E402
+from barpc.tie.pairing.epipolar import affine_inliers, frame  # noqa: E402
 from barpc.tie.pixels import read_pixels, sample_stretch  # noqa: E402
 from barpc.workspace import Workspace  # noqa: E402
 

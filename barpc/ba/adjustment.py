@@ -11,6 +11,7 @@ import numpy as np
 
 from barpc.ba.altimetry import hold_by_altimetry
 from barpc.ba.apart import Apart, Parts, Solver, find_apart, without_moving
+from barpc.ba.estimated.priors import FLOOR
 from barpc.ba.evidence.scan import neighbours_alike
 from barpc.ba.held.block import Block, join
 from barpc.ba.held.gauge import GaugeReport, datum_shares, earlier_scene, gauge_report
@@ -26,10 +27,10 @@ from barpc.ba.robust.consensus import two_groups
 from barpc.ba.robust.heldout import enu_offsets, keep_out, measure
 from barpc.ba.robust.rounds import Outcome
 from barpc.ba.solving.covariance import Covariance
-from barpc.ba.usual import CRITICAL, FLOOR, SAMPLE
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.options import AUTO, AdjustOptions
+from barpc.base.usual import CRITICAL, SAMPLE
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Reference, Tracks, View
 from barpc.sensor.geometry import camera_center
 

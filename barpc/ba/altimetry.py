@@ -20,9 +20,9 @@ from barpc.ba.judging.solution import Solution, finished
 from barpc.ba.robust.heldout import is_better
 from barpc.ba.robust.rounds import Rounds
 from barpc.ba.solving.covariance import Covariance
-from barpc.ba.usual import CRITICAL, FEWEST, GROSS, LEVEL, SAMPLE
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
+from barpc.base.usual import CRITICAL, FEWEST, GROSS, LEVEL, SAMPLE, robust_spread
 from barpc.scene import Altimetry, IntArray
 
 
@@ -137,7 +137,7 @@ def _solved(found: Solution, block: Block, outer: Block, options: AdjustOptions,
 
 def _tested(registered: Registration, many: int) -> AltimetryTest:
     agree = registered.agree
-    spread = 1.4826 * float(np.median(np.abs(registered.residual[agree]))) if agree.any() else np.nan
+    spread = robust_spread(registered.residual[agree]) if agree.any() else np.nan
     expected = float(np.median(registered.sigma[agree])) if agree.any() else np.nan
     sigma = np.sqrt(np.diag(registered.covariance)[:3])
     counts = int(registered.near.sum()), int(agree.sum())

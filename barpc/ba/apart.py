@@ -28,10 +28,10 @@ from barpc.ba.judging.moving import Found, Motion, members
 from barpc.ba.judging.solution import Solution
 from barpc.ba.placing import Look, Placed, look, place
 from barpc.ba.robust.heldout import is_better, measure
-from barpc.ba.usual import CRITICAL, LARGEST, LEVEL, MUCH_NOISE, RIVALS, SMALL, SURE, TRIED
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.base.options import GEOMETRIC, AdjustOptions
+from barpc.base.usual import CRITICAL, LARGEST, LEVEL, MUCH_NOISE, RIVALS, SMALL, SURE, TRIED
 from barpc.scene import BoolArray, IntArray, connected_groups
 
 _LOG = logging.getLogger(__name__)

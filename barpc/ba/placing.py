@@ -14,8 +14,8 @@ from barpc.ba.judging.solution import Solution
 from barpc.ba.robust.smooth import SPLINES
 from barpc.ba.robust.weights import geman_mcclure
 from barpc.ba.solving.normal import cholesky3, point_products, whiten
-from barpc.ba.usual import FEW, GROSS, MUCH_NOISE, SHRINK, SURELY, TIMES
 from barpc.base.geodesy import GEOID, Array, enu_basis, ground_from_ecef
+from barpc.base.usual import FEW, GROSS, MUCH_NOISE, SHRINK, SURELY, TIMES
 from barpc.scene import BoolArray
 from barpc.sensor.displaced import bsplines
 

@@ -21,9 +21,9 @@ from barpc.ba.robust.consensus import TwoGroups
 from barpc.ba.robust.smooth import SmoothTest
 from barpc.ba.robust.variances import PriorTest
 from barpc.ba.solving.covariance import Covariance
-from barpc.ba.usual import MANY
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
+from barpc.base.usual import MANY
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction

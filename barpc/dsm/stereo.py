@@ -26,6 +26,7 @@ from barpc.base.errors import BarpcError, InputError
 from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, parts
 from barpc.base.options import TieOptions
 from barpc.base.remote import is_url
+from barpc.base.usual import MAD
 from barpc.cameras import open_camera
 from barpc.export.shots import read_scene
 from barpc.pipeline import load_views
@@ -123,7 +124,7 @@ def surface_tile(pairs: Sequence[tuple[View, View]], tile: Tile, band: int) -> t
                 cells[:, k] = gathered(tile, np.concatenate(ground), np.concatenate(sigma))
     heights, sigmas = np.ma.masked_invalid(cells)
     height, known = _median(heights, axis=0), np.isfinite(cells[0])
-    nmad = np.ma.masked_where(known.sum(axis=0) < 2, 1.4826 * _median(np.abs(heights - height), axis=0))
+    nmad = np.ma.masked_where(known.sum(axis=0) < 2, MAD * _median(np.abs(heights - height), axis=0))
     seen = np.tensordot(1 << np.arange(len(pairs)), known, axes=1).astype(np.float32)
     mean = np.ma.sqrt(np.ma.mean(sigmas**2, axis=0))
     return (*(one.filled(np.nan).astype(np.float32) for one in (height, nmad, mean)), seen, shares)

@@ -12,8 +12,8 @@ import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.ba.evidence.scan import Place, Unused, met_worse
-from barpc.ba.usual import CRITICAL, FEWEST
 from barpc.base.geodesy import Array, ground_from_ecef
+from barpc.base.usual import CRITICAL, FEWEST
 from barpc.fit import RpcFit
 from barpc.scene import BoolArray, Camera, GroundPoints, IntArray, Tracks, View, middle_altitude
 from barpc.sensor import SensorModel

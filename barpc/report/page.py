@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from barpc.ba.usual import FEW, LARGEST
 from barpc.base.errors import visible
+from barpc.base.usual import FEW, LARGEST
 from barpc.report.compare import flat_options
 from barpc.report.maps import ground_map, residual_panels, template
 from barpc.report.records import MAX_SHOWN, Record, Table, cell_of, table, value_of

@@ -9,9 +9,9 @@ import numpy as np
 from barpc.ba import Adjustment
 from barpc.ba.apart import Apart
 from barpc.ba.judging.snooping import ControlTest
-from barpc.ba.usual import FEW, SURE, SURELY
 from barpc.base.errors import listed
 from barpc.base.geodesy import GEOID, Array
+from barpc.base.usual import FEW, SURE, SURELY
 from barpc.report.outcome import MANY_REJECTED, SMOOTH_LEFT, Run
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.whole import LeftEntry, left_entries, strangeness

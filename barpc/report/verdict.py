@@ -10,9 +10,9 @@ import numpy as np
 
 from barpc.ba import Adjustment, check_residuals
 from barpc.ba.apart import APART
-from barpc.ba.usual import FEW, SURE, SURELY
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array
+from barpc.base.usual import FEW, SURE, SURELY
 from barpc.report.outcome import MANY_REJECTED, Run
 from barpc.report.records import plain, value_of
 from barpc.report.reservations import (

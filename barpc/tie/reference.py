@@ -16,6 +16,7 @@ import numpy as np
 
 from barpc.base.geodesy import NEWTON_STEPS, Array, metres_per_unit
 from barpc.base.options import TieOptions
+from barpc.base.usual import robust_spread
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
 from barpc.tie.matchers.structural import POINTS
@@ -181,7 +182,7 @@ def peak(votes: Sequence[FloatImage | None]) -> tuple[float, Array]:
         return 0.0, np.zeros(2)
     total = np.sum(cast, axis=0, dtype=np.float64)
     middle = np.median(total)
-    spread = 1.4826 * float(np.median(np.abs(total - middle)))
+    spread = robust_spread(total.ravel(), middle)
     row, col = np.unravel_index(total.argmax(), total.shape)
     z = float((total.max() - middle) / spread) if spread > 0 else 0.0
     return z, np.array([col, row], dtype=np.float64) - total.shape[0] // 2
@@ -370,5 +371,5 @@ def _affine(
         if keep.sum() < _LEAST:
             return None
         fitted = design @ np.linalg.lstsq(design[keep], shift[keep], rcond=None)[0]
-        scale = 1.4826 * np.median(np.abs(shift - fitted)[keep], axis=0).clip(0.02 * step)
+        scale = robust_spread((shift - fitted)[keep].T).clip(step / 30.0)
     return fitted, keep, (float(scale[0]), float(scale[1]))

@@ -353,7 +353,7 @@ def test_what_a_plane_is_told_is_the_covariance_of_an_m_estimate(noise: float):
     surface: Any = plane_of((0.3, -0.2), 0.4)
     free = np.diag(np.arange(1.0, 8.0) ** -2.0)
     found = registration._told(surface, heights, np.zeros(7), 200.0, noise, free)
-    scale, cut = max(noise, 1.0), registration._BIWEIGHT
+    scale, cut = max(noise, 1.0), registration.BIWEIGHT
     sigma = np.sqrt(0.4**2 + 0.5**2 + (0.3**2 + 0.2**2) * 0.9**2)
     near = place[:, :2].max(axis=1) <= 300.0
     off = place[:, 2] - place[:, :2] @ [0.3, -0.2]

@@ -11,9 +11,9 @@ from barpc.ba.evidence import linearised, mixture
 from barpc.ba.evidence.linearised import Linear, Tracks, linearise
 from barpc.ba.evidence.mixture import Fit, fit, log_likelihoods, off_from_right
 from barpc.ba.held.block import first_state, join, make_problem
-from barpc.ba.usual import SLIGHT
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
+from barpc.base.usual import SLIGHT
 from barpc.simulate import simulate_block
 from tests.distributions import multivariate_normal
 

@@ -22,8 +22,8 @@ from barpc.ba.judging.explanations import MOVING, STRIP
 from barpc.ba.judging.moving import CELLS, Ground, group_of, members
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import LEVEL
 from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
+from barpc.base.usual import LEVEL
 from barpc.scene import BoolArray, Tracks
 from barpc.sensor.corrected import Corrected
 from barpc.simulate import Block, simulate_block

@@ -7,7 +7,7 @@ import pytest
 
 from barpc.ba.evidence import scan
 from barpc.ba.evidence.scan import Place, Unused, met_worse
-from barpc.ba.usual import CHANCE
+from barpc.base.usual import CHANCE
 from tests.distributions import hypergeom
 from tests.lanes import diagonal
 

@@ -7,7 +7,7 @@ import pytest
 
 from barpc.ba.evidence import scan as scanning
 from barpc.ba.evidence.scan import BINS, neighbours_alike, price
-from barpc.ba.usual import SURE
+from barpc.base.usual import SURE
 from tests.lanes import rest_slow
 
 SIZE = np.array([[8000.0, 4000.0], [12000.0, 6000.0]])  # of two images, columns and rows

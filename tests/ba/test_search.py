@@ -27,7 +27,7 @@ from barpc.ba.judging.judge import (
     _State,
     _Taken,
 )
-from barpc.ba.usual import SURE
+from barpc.base.usual import SURE
 
 VIEW = np.array([0, 0, 0, 0, 1, 1])
 

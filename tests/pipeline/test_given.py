@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import InputError
+from barpc.base.usual import robust_spread
 from barpc.pipeline import RunOptions, adjust, check
 from barpc.pipeline.inputs import given_matches, given_tracks
 from barpc.pipeline.loading import load_views
 from barpc.pointio.matches import read_matches
-from barpc.tie.pairing.epipolar import affine_inliers, frame, robust_spread
+from barpc.tie.pairing.epipolar import affine_inliers, frame
 from tests.pointio.test_foreign import binary
 
 from .conftest import check_points

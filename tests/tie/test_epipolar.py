@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from barpc.base.usual import robust_spread
 from barpc.tie.pairing.epipolar import (
     Affine,
     affine_inliers,
@@ -13,7 +14,6 @@ from barpc.tie.pairing.epipolar import (
     grouped,
     linear_map,
     robust_affine,
-    robust_spread,
 )
 from tests.tie.conftest import Rendered
 

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from barpc.base.usual import robust_spread
 from barpc.scene import Tracks, View
 from barpc.tie import TieOptions, TieResult, common_tracks, detect, find_tracks, match_pairs, select_pairs
-from barpc.tie.pairing.epipolar import Affine, affine_inliers, frame, robust_affine, robust_spread
+from barpc.tie.pairing.epipolar import Affine, affine_inliers, frame, robust_affine
 
 PAIRS = [(0, 1), (0, 2), (1, 2)]
 

@@ -24,6 +24,10 @@ USABLE_ACCURACY = 0.1  # m: less is stated in pixels of a fit (as Airbus does), 
 IMAGE_SIGMA = 20.0  # px, at the edge of the image: of every coefficient of models in the image
 
 
+FLOOR = AdjustOptions().noise_floor
+"""Pixels: what all ties of a view share the error of; no camera is known better, and less is let be."""
+
+
 @dataclass(frozen=True)
 class CameraPrior:
     """Independent priors: (p - mean) / sigma."""

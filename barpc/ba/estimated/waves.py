@@ -16,8 +16,8 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg as la
 
-from barpc.ba.usual import SAMPLE
 from barpc.base.geodesy import Array
+from barpc.base.usual import SAMPLE
 from barpc.scene import IntArray
 from barpc.sensor.displaced import RowSpline, bsplines, profile, sine_and_cosine
 

@@ -22,8 +22,8 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dtrtri
 
 from barpc.ba.evidence.linearised import Linear, Tracks
-from barpc.ba.usual import BACKFITTING, GROSS, ITERATIONS, LEAST_NOISE, RIDGE, SLIGHT, STANDS, SURE
 from barpc.base.geodesy import CHUNK, Array
+from barpc.base.usual import BACKFITTING, GROSS, ITERATIONS, LEAST_NOISE, RIDGE, SLIGHT, STANDS, SURE
 from barpc.scene import BoolArray, IntArray
 
 NEAR_LIMIT = 4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise is large wrong ones lie no nearer

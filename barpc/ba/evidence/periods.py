@@ -14,8 +14,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import chdtri
 
-from barpc.ba.usual import FEW, OUTLIER, SURE
 from barpc.base.geodesy import Array
+from barpc.base.usual import FEW, OUTLIER, SURE
 from barpc.scene import IntArray
 from barpc.sensor.displaced import sine_and_cosine
 

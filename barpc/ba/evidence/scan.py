@@ -20,8 +20,8 @@ import numpy as np
 from scipy.special import entr, fdtrc, gammaln, xlogy
 
 from barpc.ba.estimated.waves import DRIFTS
-from barpc.ba.usual import CHANCE, FEWEST, OUTLIER, SURE
 from barpc.base.geodesy import CHUNK, Array, parts
+from barpc.base.usual import CHANCE, FEWEST, OUTLIER, SURE
 from barpc.scene import BoolArray, IntArray
 
 BINS = 40  # stretches of an image's rows or columns

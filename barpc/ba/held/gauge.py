@@ -22,8 +22,8 @@ from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import Reduced, solve_lower
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import SAMPLE
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
+from barpc.base.usual import SAMPLE
 from barpc.scene import BoolArray
 
 MOTIONS = ("east", "north", "up", "tilt east", "tilt north", "turn", "scale", "twist", "bend east", "bend north")

@@ -16,6 +16,7 @@ from barpc.ba.solving.structure import Structure
 from barpc.base.errors import BarpcWarning
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef, parts
 from barpc.base.options import AdjustOptions
+from barpc.base.usual import robust_spread
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference
 from barpc.sensor.curve import cross
 
@@ -278,7 +279,7 @@ class Heights:
         held, shows = self._held(points), believed is None or believed.shows
         count = 0 if held is None or not shows else int(np.isin(index[known], held.index).sum())
         offset = float(np.median(above[known])) if known.any() else np.nan
-        spread = 1.4826 * float(np.median(np.abs(above[known] - offset))) if known.any() else np.nan
+        spread = robust_spread(above[known], offset) if known.any() else np.nan
         found = TerrainTest(count, int(known.sum()), len(index), offset, spread, self._bias)
         found = replace(found, is_known=self._is_known is not False)
         if self.relief is not None:

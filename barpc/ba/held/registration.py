@@ -14,14 +14,25 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
-from barpc.ba.usual import CHANCE, CRITICAL, FEWEST, ITERATIONS, RIDGE, SAMPLE, STATED, SURELY, TIMES
 from barpc.base.geodesy import Array
+from barpc.base.usual import (
+    BIWEIGHT,
+    CHANCE,
+    CRITICAL,
+    FEWEST,
+    ITERATIONS,
+    RIDGE,
+    SAMPLE,
+    STATED,
+    SURELY,
+    TIMES,
+    robust_spread,
+)
 from barpc.scene import BoolArray, IntArray
 
 NEIGHBOURS = 15  # tie points of a patch: its six unknowns are checked by nine
 _FLAT = 0.01  # m: no ground is flatter, and no motion that is smaller is any
 _SIDE = 25  # trials along each axis of the search
-_BIWEIGHT = 4.685  # Tukey's: 95 % as efficient as least squares where all is normal
 _KNOWN = 0.2  # of the information that slopes claim: below, they are their own noise
 
 
@@ -173,17 +184,17 @@ def _settled(
     for step in range(ITERATIONS):
         seen = _Seen.of(surface, given, motion, radius)
         whitened = seen.residual / seen.sigma
-        near = seen.near & (np.abs(whitened) < _BIWEIGHT * noise)
+        near = seen.near & (np.abs(whitened) < BIWEIGHT * noise)
         if near.sum() < len(motion):
             break
-        rows = np.where(near, np.maximum(1.0 - (whitened / (_BIWEIGHT * noise)) ** 2, 0.0), 0.0)
+        rows = np.where(near, np.maximum(1.0 - (whitened / (BIWEIGHT * noise)) ** 2, 0.0), 0.0)
         weight = (rows / seen.sigma) ** 2  # rows^2 is the biweight
         normal = (seen.rows * weight[:, None]).T @ seen.rows + free
         change = np.linalg.solve(normal, seen.rows.T @ (weight * np.where(near, seen.residual, 0.0)) - free @ motion)
         motion = motion + change
         if not is_known and step >= 2:
-            among = np.abs(whitened[seen.near & (np.abs(whitened) < 2.0 * _BIWEIGHT * noise)])
-            noise = float(np.clip(1.4826 * np.median(among), 0.5, max(noise, 1.0)))
+            among = np.abs(whitened[seen.near & (np.abs(whitened) < 2.0 * BIWEIGHT * noise)])
+            noise = float(np.clip(robust_spread(among), 0.5, max(noise, 1.0)))
         if (is_known or step > 5) and np.abs(change).max() < _FLAT:
             break
     return motion, noise
@@ -285,7 +296,7 @@ def _told(surface: Surface, given: Given, motion: Array, radius: float, noise: f
     agree = seen.near & (np.abs(seen.residual) < SURELY * scale * seen.sigma)
     residual = np.where(seen.near, seen.residual, np.nan)
     # of an M-estimate (Huber, "Robust statistics", 1981, 7.6): what wrong heights among the right ones cost is in it
-    part = np.where(seen.near, seen.residual / (_BIWEIGHT * scale * seen.sigma), 1.0) ** 2
+    part = np.where(seen.near, seen.residual / (BIWEIGHT * scale * seen.sigma), 1.0) ** 2
     inside = part < 1.0
     rate = np.where(inside, (1.0 - part) * (1.0 - 5.0 * part), 0.0)[inside].mean() if inside.any() else 0.0
     rows, inverse = seen.rows[inside], max(float(rate), _KNOWN) / (scale * seen.sigma[inside]) ** 2

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barpc.ba.usual import BACKFITTING, CRITICAL, MANY, MUCH_NOISE, OUTLIER, STATED, SURELY
 from barpc.base.geodesy import Array, metres_per_unit, wrap_longitude
+from barpc.base.usual import BACKFITTING, CRITICAL, MANY, MUCH_NOISE, OUTLIER, STATED, SURELY, robust_spread
 from barpc.scene import BoolArray, IntArray
 
 Terrain = Callable[[Array, Array], Array]
@@ -188,8 +188,8 @@ class Relief:
         for _ in range(BACKFITTING):
             delivered = _coefficients(flat[near], off[near])
             left = np.abs(off - flat @ delivered)
-            near = left <= OUTLIER * 1.4826 * np.median(left)
-        tell[index[sharp[index] < max(1.4826 * float(np.median(left)), stated)]] = True
+            near = left <= OUTLIER * robust_spread(left)
+        tell[index[sharp[index] < max(robust_spread(left), stated)]] = True
         fit[:, index] = np.linalg.pinv(flat)
         return cls(bands, tell, delivered, fit, unknown)
 
@@ -272,7 +272,7 @@ def _compared(at: Array, above: Array, bent: Array, slopes: Array, smooth: Array
         rest = above - bent @ gains
         part = moved @ _coefficients(moved[fits], rest[fits])
         left = rest - part
-        spread = 1.4826 * float(np.median(np.abs(left[fits])))
+        spread = robust_spread(left[fits])
         fits = tell & (np.abs(left) <= max(OUTLIER * spread, 1e-6))
     return _Compared(gains, rising, part, left, fits, moved.shape[1] + len(gains))
 
@@ -280,7 +280,7 @@ def _compared(at: Array, above: Array, bent: Array, slopes: Array, smooth: Array
 def _middling(values: Array) -> BoolArray:
     """Return the mask of n values about their median."""
     off = np.abs(values - np.median(values))
-    return np.asarray(off <= OUTLIER * 1.4826 * np.median(off))
+    return np.asarray(off <= OUTLIER * robust_spread(off))
 
 
 def _coefficients(design: Array, values: Array) -> Array:

@@ -21,8 +21,8 @@ from barpc.ba.held.block import Block
 from barpc.ba.robust.heldout import enu_offsets
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import solve_transposed
-from barpc.ba.usual import CRITICAL, GROSS, LEVEL, SURE, TRIALS
 from barpc.base.geodesy import Array, enu_basis
+from barpc.base.usual import CRITICAL, GROSS, LEVEL, SURE, TRIALS
 from barpc.scene import BoolArray
 
 LOOSE = 1e4  # m: a place so uncertain holds nothing, and keeps a point that one ray shows from running away

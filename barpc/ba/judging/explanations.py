@@ -14,8 +14,8 @@ from barpc.ba.evidence.periods import Swing, price_of_period
 from barpc.ba.evidence.scan import BINS, Interval, price
 from barpc.ba.judging import moving
 from barpc.ba.robust.smooth import SPLINES
-from barpc.ba.usual import FEW, TIMES
 from barpc.base.geodesy import Array
+from barpc.base.usual import FEW, TIMES
 from barpc.scene import IntArray
 from barpc.sensor.displaced import profile
 from barpc.sensor.displaced import sine_and_cosine as waves_of

@@ -23,9 +23,9 @@ from barpc.ba.robust.heldout import is_better
 from barpc.ba.robust.rounds import Rounds, revived
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import BACKFITTING, FEW, ITERATIONS, LARGEST
 from barpc.base.geodesy import Array
 from barpc.base.options import AUTO, OFF, AdjustOptions
+from barpc.base.usual import BACKFITTING, FEW, ITERATIONS, LARGEST
 from barpc.scene import BoolArray
 
 _LARGE = 40.0  # twice the logarithm of a likelihood ratio: the largest of 10,000 places by chance once in 100,000 views

@@ -35,8 +35,8 @@ from barpc.ba.judging.moving import Found, Ground, Motion, group_of
 from barpc.ba.robust.rounds import Outcome, revived
 from barpc.ba.robust.weights import Observations
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import BACKFITTING, KEPT, LARGEST, RIVALS, SAMPLE, SMALL, STANDS, SURE, TRIED
 from barpc.base.geodesy import Array
+from barpc.base.usual import BACKFITTING, KEPT, LARGEST, RIVALS, SAMPLE, SMALL, STANDS, SURE, TRIED
 from barpc.scene import BoolArray, IntArray
 
 _LOG = logging.getLogger(__name__)

@@ -20,8 +20,8 @@ from barpc.ba.held.block import Block
 from barpc.ba.robust.heldout import seen_in
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.ba.usual import BACKFITTING, LEVEL, RIVALS, SAMPLE, TIMES
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
+from barpc.base.usual import BACKFITTING, LEVEL, RIVALS, SAMPLE, TIMES
 from barpc.scene import BoolArray, IntArray
 
 CELLS = 6  # a side of the ground: the group's share is free in each

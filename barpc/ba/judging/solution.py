@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from barpc.ba.estimated.priors import DRIFT_SIGMA
+from barpc.ba.estimated.priors import DRIFT_SIGMA, FLOOR
 from barpc.ba.estimated.projected import Projected
 from barpc.ba.held.block import Block, first_state, make_problem
 from barpc.ba.held.ground import Heights, staying
@@ -23,9 +23,9 @@ from barpc.ba.robust.smooth import SmoothTest
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.ba.solving.structure import Structure
-from barpc.ba.usual import FLOOR, MUCH_NOISE, SURELY
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
+from barpc.base.usual import MUCH_NOISE, SURELY
 from barpc.scene import BoolArray
 
 _TREND = MUCH_NOISE * FLOOR  # px: another model is tried

@@ -16,8 +16,8 @@ from scipy.special import expit
 
 from barpc.ba.estimated.projected import Projected
 from barpc.ba.solving.structure import Structure
-from barpc.ba.usual import FEW, ITERATIONS, LEVEL, MANY, OUTLIER, SLIGHT, STEPS, SURE, TRIALS
 from barpc.base.geodesy import Array, parts
+from barpc.base.usual import FEW, ITERATIONS, LEVEL, MANY, OUTLIER, SLIGHT, STEPS, SURE, TRIALS
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.curve import cross
 

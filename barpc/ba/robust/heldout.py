@@ -18,9 +18,9 @@ from barpc.ba.evidence.mixture import NEAR_LIMIT, WRONG
 from barpc.ba.held.block import Block
 from barpc.ba.robust.weights import Observations, geman_mcclure
 from barpc.ba.solving.problem import Problem
-from barpc.ba.usual import BEST, CRITICAL, FEWEST, ITERATIONS, MANY, SLIGHT, STEPS, SURELY
 from barpc.base.errors import InputError, listed
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis
+from barpc.base.usual import BEST, CRITICAL, FEWEST, ITERATIONS, MANY, SLIGHT, STEPS, SURELY
 from barpc.scene import BoolArray, GroundPoints, IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import triangulate

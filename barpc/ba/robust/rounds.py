@@ -16,7 +16,9 @@ from barpc.ba.robust.variances import SAME_PRIOR, PriorTest, Variances, same_pri
 from barpc.ba.robust.weights import LOSSES, MEDIAN, Observations
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
-from barpc.ba.usual import (
+from barpc.base.geodesy import Array
+from barpc.base.options import AdjustOptions
+from barpc.base.usual import (
     BACKFITTING,
     BEST,
     CRITICAL,
@@ -31,8 +33,6 @@ from barpc.ba.usual import (
     SURELY,
     TRIED,
 )
-from barpc.base.geodesy import Array
-from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)

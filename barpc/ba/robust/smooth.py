@@ -17,8 +17,8 @@ from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.held.block import Block
 from barpc.ba.held.ground import ALIKE
 from barpc.ba.solving.structure import Structure
-from barpc.ba.usual import KEPT, MANY, OUTLIER, RIDGE
 from barpc.base.geodesy import Array, metres_per_unit, parts
+from barpc.base.usual import KEPT, MANY, OUTLIER, RIDGE
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.displaced import bsplines
 

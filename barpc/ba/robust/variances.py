@@ -16,15 +16,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc, gammaincinv
 
-from barpc.ba.estimated.priors import CameraPrior, states_accuracy
+from barpc.ba.estimated.priors import FLOOR, CameraPrior, states_accuracy
 from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.linear import factorize
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum
-from barpc.ba.usual import CHANCE, FLOOR, GROSS, ITERATIONS, LEVEL, SMALL, STANDS, STATED, SURE, TIMES
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
+from barpc.base.usual import CHANCE, GROSS, ITERATIONS, LEVEL, SMALL, STANDS, STATED, SURE, TIMES
 from barpc.scene import BoolArray, View
 
 _LOG = logging.getLogger(__name__)

@@ -14,8 +14,8 @@ import numpy as np
 from barpc.ba.held.ground import ALIKE
 from barpc.ba.robust.smooth import SPLINES
 from barpc.ba.solving.problem import Problem
-from barpc.ba.usual import FEWEST, GROSS, OUTLIER
 from barpc.base.geodesy import Array
+from barpc.base.usual import FEWEST, GROSS, OUTLIER
 from barpc.scene import BoolArray
 
 MEDIAN = 0.55  # of |r|^2 over its expectation: chi-square with 1 (two views) to 2 (many) degrees of freedom

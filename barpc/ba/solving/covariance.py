@@ -10,8 +10,8 @@ import scipy.linalg as la
 
 from barpc.ba.solving.linear import Blocks, Factor
 from barpc.ba.solving.normal import Reduced, solve_transposed
-from barpc.ba.usual import FEW, KEPT
 from barpc.base.geodesy import Array, parts
+from barpc.base.usual import FEW, KEPT
 from barpc.scene import BoolArray, IntArray
 
 _LARGE = 900  # unknowns up to which the whole matrix is kept, and known exactly

@@ -20,8 +20,8 @@ from barpc.ba.solving.normal import (
     whiten,
 )
 from barpc.ba.solving.structure import Structure
-from barpc.ba.usual import KEPT
 from barpc.base.geodesy import Array
+from barpc.base.usual import KEPT
 from barpc.scene import BoolArray
 
 

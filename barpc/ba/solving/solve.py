@@ -20,9 +20,9 @@ from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.linear import Factor
 from barpc.ba.solving.normal import Reduced
 from barpc.ba.solving.problem import Problem
-from barpc.ba.usual import ITERATIONS, SLIGHT
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
+from barpc.base.usual import ITERATIONS, SLIGHT
 from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)

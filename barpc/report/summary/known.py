@@ -9,8 +9,8 @@ import numpy as np
 from scipy.special import ndtri
 
 from barpc.ba import check_residuals
-from barpc.ba.usual import CHANCE
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.base.usual import CHANCE
 from barpc.report.outcome import Run
 from barpc.report.records import Column, Number, Record, said
 from barpc.report.summary.words import ABOVE, Count, Pixel, Vector

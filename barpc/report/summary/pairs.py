@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from barpc.base.geodesy import CHUNK, Array, ground_from_ecef
+from barpc.base.usual import MAD
 from barpc.report.outcome import Run
 from barpc.report.records import Cell, Column, Number, Record, plain, said
 from barpc.report.summary.words import Count
@@ -131,7 +132,7 @@ def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> list[
     known = np.isfinite(offset)
     offset, pair, num = offset[known], pair[known], len(counts)
     center = medians(offset, pair, num)
-    spread = 1.4826 * medians(np.abs(offset - center[pair]), pair, num)
+    spread = MAD * medians(np.abs(offset - center[pair]), pair, num)
     count, square = np.bincount(pair, minlength=num), np.bincount(pair, offset**2, minlength=num)
     rms = np.sqrt(square / np.maximum(count, 1))
     rows = zip(center.tolist(), spread.tolist(), rms.tolist(), count.tolist(), strict=True)

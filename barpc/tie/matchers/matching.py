@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 
 from barpc.base.geodesy import Array
 from barpc.base.options import TieOptions
+from barpc.base.usual import robust_spread
 from barpc.scene import IntArray, View
 from barpc.tie.matchers.features import AMPLE, THIN, KeypointFiles, Keypoints, ample_matches, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
@@ -33,7 +34,6 @@ from barpc.tie.pairing.epipolar import (
     common_range,
     frame,
     robust_affine,
-    robust_spread,
 )
 from barpc.tie.pairing.overlaps import Pair, Terrain, reach_of, shared_tiles
 from barpc.tie.tasks import HERE, Work

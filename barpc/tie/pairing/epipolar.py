@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.geodesy import Array
+from barpc.base.usual import BIWEIGHT, robust_spread
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pixels import SPAN
 
 FEW = 30
 """Points below which an affine error is not told from a constant one, and a spread is none."""
-_TUKEY = 4.685
 OUTLYING = 3.0
 """Robust standard deviations beyond which a value does not agree with others."""
 LEAST_REACH = 5.0
@@ -128,25 +128,13 @@ def robust_affine(xy: Array, values: Array, steps: int = 12) -> Affine:
     for _ in range(steps):
         residual = values - design @ coefficients
         spread = max(robust_spread(residual), 1e-3)
-        weight = np.maximum(0.0, 1.0 - (residual / (_TUKEY * spread)) ** 2)  # the biweight's root
+        weight = np.maximum(0.0, 1.0 - (residual / (BIWEIGHT * spread)) ** 2)  # the biweight's root
         solution = np.linalg.lstsq(design[:, :columns] * weight[:, None], values * weight, rcond=1e-9)[0]
         change = np.abs(solution - coefficients[:columns]).max()
         coefficients[:columns] = solution
         if change < 1e-4 * spread:
             break
     return Affine(coefficients, middle, scale, robust_spread(values - design @ coefficients))
-
-
-def robust_spread(values: Array, center: float | Array = 0.0) -> Any:
-    """Return the robust standard deviation: 1.4826 times the median over the last axis of the distances from
-    a centre.
-
-    Residuals are measured from zero; a sample that is stated with its median from that median.
-    """
-    if not len(values):
-        return 0.0
-    spread = 1.4826 * np.median(np.abs(values - center), axis=-1)
-    return spread if spread.ndim else float(spread)
 
 
 def affine_inliers(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:

@@ -1,6 +1,10 @@
-"""Numbers that mean the same wherever the adjustment decides or computes, each in one place."""
+"""Numbers that mean the same wherever something is decided or computed, each in one place."""
 
-from barpc.base.options import AdjustOptions
+from typing import Any
+
+import numpy as np
+
+from barpc.base.geodesy import Array
 
 # --- what is sure -----------------------------------------------------------------------------------------
 
@@ -23,6 +27,12 @@ CRITICAL = 4.0
 """Standard deviations of what many are tested by: a component is larger by chance once in 16,000, one of five points
 once in a thousand."""
 
+BIWEIGHT = 4.685
+"""Standard deviations at which Tukey's biweight ends: 95 % as efficient as least squares where all is normal."""
+
+MAD = 1.4826
+"""Of a median of distances: the standard deviation of normal errors."""
+
 MUCH_NOISE = 1.5
 """Times what is stated: more noise than that is no noise."""
 
@@ -34,9 +44,6 @@ TIMES = 30.0
 
 GROSS = 100.0
 """Standard deviations of what holds nothing: of another place, or open."""
-
-FLOOR = AdjustOptions().noise_floor
-"""Pixels: what all ties of a view share the error of; no camera is known better, and less is let be."""
 
 # --- what is enough ---------------------------------------------------------------------------------------
 
@@ -98,3 +105,14 @@ LARGEST = 12_000
 
 SMALL = 400
 """Unknowns up to which a block is solved again for every explanation that is tried."""
+
+
+def robust_spread(values: Array, center: float | Array = 0.0) -> Any:
+    """Return the robust standard deviation: `MAD` times the median over the last axis of the distances from a centre.
+
+    Residuals are measured from zero; a sample that is stated with its median from that median. Of none it is 0.
+    """
+    if not len(values):
+        return 0.0
+    spread = MAD * np.median(np.abs(values - center), axis=-1)
+    return spread if spread.ndim else float(spread)
