@@ -16,7 +16,7 @@ import numpy as np
 
 from barpc.base.geodesy import NEWTON_STEPS, Array, metres_per_unit
 from barpc.base.options import TieOptions
-from barpc.base.usual import robust_spread
+from barpc.base.usual import MAD, robust_spread
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
 from barpc.tie.matchers.structural import POINTS
@@ -371,5 +371,5 @@ def _affine(
         if keep.sum() < _LEAST:
             return None
         fitted = design @ np.linalg.lstsq(design[keep], shift[keep], rcond=None)[0]
-        scale = robust_spread((shift - fitted)[keep].T).clip(step / 30.0)
+        scale = robust_spread((shift - fitted)[keep].T).clip(MAD * 0.02 * step)
     return fitted, keep, (float(scale[0]), float(scale[1]))

@@ -386,5 +386,5 @@ def test_shifts_without_any_scatter_are_good_to_a_thirtieth_of_a_pixel():
     local, _, true = shifts(50, 0)
     fitted, keep, scatter = _affine(local, true, np.ones(50, dtype=bool), 2.0)
     assert keep.all()
-    assert scatter == pytest.approx([2.0 / 30.0] * 2)
+    assert scatter == pytest.approx([1.4826 * 0.02 * 2.0] * 2)
     np.testing.assert_allclose(fitted, true, atol=1e-9)
