@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -27,10 +28,10 @@ from barpc.ba.robust.consensus import two_groups
 from barpc.ba.robust.heldout import enu_offsets, keep_out, measure
 from barpc.ba.robust.rounds import Outcome
 from barpc.ba.solving.covariance import Covariance
-from barpc.base.errors import AdjustError
+from barpc.base.errors import AdjustError, BarpcWarning
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.options import AUTO, AdjustOptions
-from barpc.base.usual import CRITICAL, SAMPLE
+from barpc.base.usual import CRITICAL, ITERATIONS, SAMPLE
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Reference, Tracks, View
 from barpc.sensor.geometry import camera_center
 
@@ -106,6 +107,7 @@ def _solved(parts: Parts, options: AdjustOptions, solve: Solver, altimetry: Alti
         if altimetry is not None:
             found, heights = hold_by_altimetry(found, parts.inner, parts.outer, options, altimetry)
         found.heights.warn()
+        _warn(found.outcome)
         whole = replace(_adjustment(found, parts, options, in_space), altimetry=heights)
         if apart is None or not apart.clear:
             return replace(whole, apart=apart)
@@ -115,6 +117,16 @@ def _solved(parts: Parts, options: AdjustOptions, solve: Solver, altimetry: Alti
             f"the normal equations cannot be solved ({error}): is a standard deviation among the options, or of a "
             "point, beyond anything real?"
         ) from error
+
+
+def _warn(outcome: Outcome) -> None:
+    """Warn of what the last solve could not do; what is tried on the way to it may fail."""
+    if not outcome.minimum.settled:
+        message = f"the adjustment did not settle in {ITERATIONS} steps: look at what is left before its result is used"
+        warnings.warn(message, BarpcWarning, stacklevel=4)
+    if outcome.prior.failed:
+        message = "the accuracy of the cameras is taken as it is given: the normal equations are too weak to learn it"
+        warnings.warn(message, BarpcWarning, stacklevel=4)
 
 
 def _first(parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[Solution, Apart | None]:

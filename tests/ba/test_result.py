@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,9 @@ import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, adjustment, pair_heights
+from barpc.ba.robust import rounds
+from barpc.ba.robust.variances import Variances
+from barpc.base.errors import BarpcWarning
 from barpc.base.geodesy import enu_basis, ground_from_ecef
 from barpc.sensor.geometry import triangulate
 from barpc.simulate import Block, simulate_block
@@ -44,6 +48,36 @@ def test_seconds_are_those_of_the_adjustment(made) -> None:
     start = time.process_time()
     found = solve(made, drift=0)
     assert 0.0 < found.seconds <= time.process_time() - start
+
+
+@pytest.mark.parametrize("asked", ["sparse", "scipy"])
+def test_what_did_not_settle_is_told_of_the_last_solve_alone(made, monkeypatch, caplog, asked) -> None:
+    """On the way to it solves of wrong views, wrong starts and wider priors may fail, which nobody needs to know."""
+    real, made_first = rounds.minimise, list[bool]()
+
+    def once(*args: Any) -> Any:  # the first pass of the rounds does not settle, those after it do
+        found = real(*args)
+        made_first.append(True)
+        return replace(found, settled=len(made_first) > 1)
+
+    monkeypatch.setattr(rounds, "minimise", once)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert solve(made, drift=0, solver=asked).inlier.any()
+    assert len(made_first) > 1
+    assert not caplog.records
+    monkeypatch.setattr(rounds, "minimise", lambda *args: replace(real(*args), settled=False))
+    with pytest.warns(BarpcWarning, match="did not settle in 100 steps"):
+        solve(made, drift=0, solver=asked)
+
+
+def test_priors_that_cannot_be_learnt_are_told(made, monkeypatch) -> None:
+    def fails(*_: Any) -> None:
+        raise np.linalg.LinAlgError("not positive definite")
+
+    monkeypatch.setattr(Variances, "_known", fails)
+    with pytest.warns(BarpcWarning, match="accuracy of the cameras is taken as it is given"):
+        solve(made, drift=0)
 
 
 def measured(block: Block, found: Adjustment, pair: tuple[int, int]) -> tuple[float, float, int]:

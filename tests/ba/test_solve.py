@@ -152,6 +152,8 @@ def test_a_cost_that_stands_is_no_failure_and_the_steps_are_counted(monkeypatch)
     assert isinstance(found, Minimum)
     assert dampings == [0.0] * 5
     assert "the number of steps is used up" in found.status
+    assert not found.settled
+    assert Minimum(found.state, found.reduced).settled
     assert len(found.state.history) == 7
 
 

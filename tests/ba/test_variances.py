@@ -522,7 +522,8 @@ def test_a_matrix_that_does_not_factorise_leaves_the_priors_as_they_are(at_minim
     assert (tested.freedom, tested.drift_sigma) == (0.0, ())
     np.testing.assert_array_equal(tested.scale, 1.0)
     assert not tested.odd.any()
-    assert "left as they are" in caplog.text
+    assert tested.failed
+    assert not caplog.records  # the last one alone is told: on the way to it much is tried
 
 
 @pytest.mark.parametrize(("unknowns", "small"), [(400, True), (401, False)])

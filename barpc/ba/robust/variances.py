@@ -49,6 +49,7 @@ class PriorTest:
     # standard deviation of the drift's coefficients in use, degree by degree [m]
     drift_sigma: tuple[float, ...]
     shared: float = 1.0  # by how much standard deviations that RPCs state were widened, as all views share what is off
+    failed: bool = False  # the matrix could not be factorised: nothing was learnt
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +124,9 @@ class Variances:
         try:
             return self._learnt(problem, minimum, widened, exact)
         except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
-            _LOG.warning("the priors of the cameras are left as they are: %s", error)
+            _LOG.info("the priors of the cameras are left as they are: %s", error)
             n = len(minimum.state.params)
-            nothing = PriorTest(float("nan"), 0.0, np.ones(n), np.zeros(n, dtype=bool), ())
+            nothing = PriorTest(float("nan"), 0.0, np.ones(n), np.zeros(n, dtype=bool), (), failed=True)
             return problem.camera_prior, nothing
 
     def _learnt(self, problem: Problem, minimum: Minimum, widened: bool, exact: bool) -> tuple[CameraPrior, PriorTest]:

@@ -54,6 +54,7 @@ class Minimum:
     factor: Factor | None = None  # of its matrix, free unknowns only, where it was factorised
     status: str = ""  # which solver ran, and why it stopped
     ahead: tuple[Array, Projected | None] | None = None  # `Problem.prepare` of the state, where that was asked
+    settled: bool = True  # or the number of steps was used up
     _known: list[Covariance] = field(default_factory=list, repr=False)
 
     def covariance(self, free: BoolArray) -> Covariance:
@@ -182,8 +183,7 @@ def _levenberg_marquardt(
         if damping >= 1e8:
             raise AdjustError(f"no step lowers the cost {state.cost:.6g}: the solution is not usable")
         damping = max(10.0 * damping, 1e-6)
-    _LOG.warning("the adjustment did not settle in %d steps", ITERATIONS)
-    return Minimum(state, reduced, status=_status(state, "the number of steps is used up"))
+    return Minimum(state, reduced, status=_status(state, "the number of steps is used up"), settled=False)
 
 
 def _status(state: State, reason: str) -> str:
@@ -253,12 +253,10 @@ def _scipy(problem: Problem, state: State, weight: Array, tolerance: float, proj
         gtol=np.sqrt(tolerance),  # of whitened unknowns: a thousandth of a standard deviation for a millionth
         max_nfev=ITERATIONS,
     )
-    if not found.success:
-        _LOG.warning("the adjustment did not settle in %d steps", ITERATIONS)
     compressed.at(found.x)
     _finite(compressed.state.cost)
     status = f"scipy least_squares, {found.nfev} evaluations: {found.message.rstrip('.')}"
-    return Minimum(compressed.state, compressed.reduced, status=status)
+    return Minimum(compressed.state, compressed.reduced, status=status, settled=bool(found.success))
 
 
 def _finite(cost: float) -> float:
