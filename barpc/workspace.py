@@ -38,6 +38,7 @@ from barpc import __version__
 from barpc.base.atomic import PARTIAL, STATE, replacing
 from barpc.base.errors import BarpcError, OutputError
 from barpc.base.frozen import Arrays, load_npz
+from barpc.base.sidefile import MAX_XML
 from barpc.rpcio import hidden_by
 
 logger = logging.getLogger(__name__)
@@ -46,7 +47,6 @@ STATE_FILE, NOTES, LOCK, CACHE = "state.json", "outputs.jsonl", "lock", "cache"
 LAST = "summary.json"
 """Output of a run that is written last: with it its folder is complete."""
 _FILES = (STATE_FILE, NOTES, LOCK)
-_MAX_STATE = 32 << 20  # bytes: larger state files (some 300,000 outputs) count as missing
 _CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 KEEP_AFTER = 30.0
@@ -437,7 +437,7 @@ def _is_odd(path: Path, found: os.stat_result) -> bool:
 def _text(path: Path) -> str:
     try:
         found = path.lstat()
-        if not stat.S_ISREG(found.st_mode) or found.st_size > _MAX_STATE:
+        if not stat.S_ISREG(found.st_mode) or found.st_size > MAX_XML:
             return ""
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError:

@@ -10,14 +10,14 @@ import argparse
 import re
 from pathlib import Path
 
-from barpc import scene, workspace
+from barpc import scene
 from barpc.ba.held import incremental
 from barpc.base import frozen, geodesy, options, sidefile
 from barpc.base.remote import _KEPT as HELD
 from barpc.base.remote import _LONGEST as REQUEST
 from barpc.base.remote import BLOCK, hosts
 from barpc.pointio import foreign, names
-from barpc.rasters import dem, raster, vrt
+from barpc.rasters import dem, raster
 from barpc.report import runfiles
 from barpc.rpcio import carried
 from barpc.sensor import document as metadata
@@ -71,7 +71,7 @@ def rows() -> list[tuple[str, str]]:
         ("a COLMAP database", f"{many(foreign._STEPS)} times 100,000 instructions of SQLite"),
         (
             "an HDF5 file",
-            f"{many(sidefile.MAX_ELEMENTS)} objects, groups {foreign._DEEPEST} deep; an array "
+            f"{many(sidefile.MAX_ELEMENTS)} objects, groups {sidefile.MAX_DEPTH} deep; an array "
             f"{many(frozen.DEFLATED)} times its stored bytes",
         ),
         (
@@ -79,12 +79,12 @@ def rows() -> list[tuple[str, str]]:
             f"{size(sidefile.TABLE.most)} as numbers of {sidefile.NUMBER} bytes",
         ),
         (sidefile.NAMES.words, f"{size(sidefile.NAMES.most)}, {many(sidefile._LINE)} characters a line"),
-        ("a VRT", size(vrt._MAX_BYTES)),
+        ("a VRT", size(sidefile.MB)),
         ("a raster read as a DEM or geoid", f"{many(dem._MAX_CELLS)} cells"),
         ("RPC tags of a TIFF", f"{many(carried._MAX_ENTRIES)} entries, {size(carried.SCANNED)} of values"),
         ("an RPC in a NITF", f"the first {size(carried.SCANNED)}"),
         ("a file of acquisition metadata", f"the first {size(carried.SCANNED)}"),
-        ("a run's state", f"{size(workspace._MAX_STATE)}; larger ones count as missing"),
+        ("a run's state", f"{size(sidefile.MAX_XML)}; larger ones count as missing"),
         (
             "a file of a web server or store",
             f"{size(BLOCK)} to {size(REQUEST)} a request, {size(HELD)} held a process",

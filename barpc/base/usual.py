@@ -97,6 +97,9 @@ SHRINK = 0.25
 KEPT = 1_000_000
 """Observations whose derivatives are kept from one step to the next, some 200 bytes each."""
 
+ROUNDING = 1e-9
+"""Of a size: what differs by less is the same but for rounding, and a column that adds less to others is none."""
+
 RIDGE = 1e-6
 """Of the weight of what is known: what nothing tells stays where it is."""
 

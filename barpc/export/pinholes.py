@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array
 from barpc.base.remote import is_url
+from barpc.base.usual import ITERATIONS
 from barpc.export.files import Files, as_json
 from barpc.export.shots import Sampled, Scene, Shot, relative_link
 from barpc.sensor.curve import rotation_matrix
 
-_STEPS = 40  # of Levenberg's method
 _TIMES = 1.0, 2.0, 3.0  # an image that is affine along its flight is best seen from farther away than it was
 _CORNER = 0.5  # px from the corner of the first pixel, where COLMAP counts from, to its centre
 
@@ -75,7 +75,7 @@ def _refined(start: Pinhole, samples: Sampled) -> Pinhole:
     """Return the least squares solution, by Levenberg's method on small turn, move, focal lengths, principal point."""
     pinhole, damping = start, 1e-3
     cost, left = _cost(pinhole, samples)
-    for _ in range(_STEPS):
+    for _ in range(ITERATIONS):
         jacobian = _jacobian(pinhole, samples.world)
         scale = np.linalg.norm(jacobian, axis=0)
         system = np.vstack([jacobian / scale, np.sqrt(damping) * np.eye(10)])

@@ -25,6 +25,7 @@ from scipy.linalg.lapack import dtpqrt
 from barpc.base.errors import FitError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, IntArray, parts
+from barpc.base.usual import ROUNDING
 from barpc.sensor.rational import POWERS, monomials
 
 Rounding = Callable[[Array], Array]
@@ -32,7 +33,6 @@ Rounding = Callable[[Array], Array]
 
 _ROWS = 1024  # taken into the triangle at a time: what is worked on stays in cache
 _BLOCK = 8  # columns of a Householder block
-_DEPENDENT = 1e-9  # rms of what a monomial adds to those of lower degree, on these points
 _DEGREE = POWERS.sum(axis=1)
 _NUMERATOR = np.array([np.inf, np.inf, 0.1, 0.03])
 _DENOMINATOR = np.array([np.inf, 1.0, 0.1, 0.01])
@@ -141,7 +141,7 @@ class FitProblem:
         degree one in H. A dependent one would make a = b = 0 a solution.
         """
         first = self.compressed(0)
-        adds = np.abs(np.diag(first.matrix)[: len(self.active)]) > _DEPENDENT * np.sqrt(len(self.image))
+        adds = np.abs(np.diag(first.matrix)[: len(self.active)]) > ROUNDING * np.sqrt(len(self.image))
         return replace(self, first=first) if adds.all() else replace(self, active=self.active[adds])
 
     def rows(

@@ -29,6 +29,7 @@ from barpc import __version__
 from barpc.base.errors import AdjustError, BarpcError, InputError
 from barpc.base.frozen import Arrays, from_arrays, to_arrays
 from barpc.base.identity import Input, guarded
+from barpc.base.sidefile import MB
 from barpc.tie.tasks import Progress, Store, ordered
 from barpc.workspace import Workspace, key_of
 
@@ -36,7 +37,6 @@ logger = logging.getLogger(__name__)
 
 BATCH_SECONDS = 0.5  # work that is handed in at a time [s], as far as there are tasks for all workers
 GROUP = 8  # images, or tiles of one, of a task whose result is kept
-LARGE = 1 << 20  # arrays of so many bytes are sent as paths
 _PER_WORKER = 3  # batches in flight for each worker: enough that none waits
 _CLUSTER = 32  # workers of a cluster, at least: it may grow when there is work
 _LOST = ("KilledWorker", "FutureCancelledError")  # of distributed, which may not be installed
@@ -174,7 +174,7 @@ class CachingExecutor(Executor):
             return args
         large = {}
         for name, array in record.items():
-            if array.nbytes >= LARGE:
+            if array.nbytes >= MB:
                 digest = hashlib.sha256(self._digest(array).encode()).hexdigest()
                 large[name] = place = f"{self.store.scratch}/{digest[:32]}"
                 if place not in self._spilled:

@@ -31,7 +31,7 @@ from rasterio.transform import RPCTransformer
 from barpc.base.errors import OutputError
 from barpc.base.geodesy import Array, wrap_longitude
 from barpc.cameras import open_camera
-from barpc.fit.points import Sample
+from barpc.fit.points import EXACT, Sample
 from barpc.rasters.raster import GDAL_OPTIONS
 from barpc.rasters.vrt import Vrt, read_vrt
 from barpc.rpcio import Carrier, read_rpc, row_of, sidecars
@@ -42,7 +42,7 @@ from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.displaced import CorrectionGrid
 from barpc.sensor.geometry import ground_grids
 
-TOLERANCE = 1e-6  # Largest difference [px] between a file and its model that passes
+TOLERANCE = EXACT  # Largest difference [px] between a file and its model that passes
 
 Projection = Callable[[Array], Array]
 """Ground points (N, 3) [deg, deg, m] -> image points (N, 2) [px], centre of the first pixel = (0, 0)."""

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from barpc.base.errors import BarpcError, InputError
 from barpc.base.frozen import DEFLATED, HEADER, Arrays, load_npz
 from barpc.base.geodesy import Array
-from barpc.base.sidefile import MAX_ELEMENTS, NUMBER, TABLE, Kind, opened, read_bytes, read_head, read_text
+from barpc.base.sidefile import MAX_DEPTH, MAX_ELEMENTS, NUMBER, TABLE, Kind, opened, read_bytes, read_head, read_text
 from barpc.pointio.names import ViewNames
 from barpc.scene import IntArray
 
@@ -264,7 +264,6 @@ def _allowed(action: int, first: str | None, _second: str | None, _base: str | N
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
 _KEYPOINTS, _MATCHES = "keypoints", "matches0"
-_DEEPEST = 32  # groups in each other
 _FEATURES = ("features.h5", "keypoints.h5")
 
 
@@ -302,8 +301,8 @@ def _datasets(file: Any, h5py: Any) -> Iterator[tuple[str, Any]]:
         group, place, depth = waiting.pop()
         for name in group:
             count += 1
-            if count > MAX_ELEMENTS or depth > _DEEPEST:
-                raise ValueError(f"more than {MAX_ELEMENTS} objects, or groups nested more than {_DEEPEST} deep")
+            if count > MAX_ELEMENTS or depth > MAX_DEPTH:
+                raise ValueError(f"more than {MAX_ELEMENTS} objects, or groups nested more than {MAX_DEPTH} deep")
             if group.get(name, getlink=True).__class__ is not h5py.HardLink:
                 continue
             found = group[name]

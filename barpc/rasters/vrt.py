@@ -15,7 +15,7 @@ from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 from barpc.base.errors import ImageError, RpcFormatError
-from barpc.base.sidefile import XML, parse_xml, read_bytes
+from barpc.base.sidefile import MB, XML, parse_xml, read_bytes
 
 _INTEGERS = {f"{u}int{n}": f"{u.upper()}Int{n}" for n in (16, 32, 64) for u in ("u", "")}
 _COMPLEX = {"complex_int16": "CInt16", "complex64": "CFloat32", "complex128": "CFloat64"}
@@ -23,8 +23,6 @@ _FLOATS = {"float32": "Float32", "float64": "Float64"}
 GDAL_TYPES = {"uint8": "Byte", "int8": "Int8"} | _INTEGERS | _FLOATS | _COMPLEX
 """rasterio's names of pixel types -> GDAL's."""
 MAGIC = b"<VRTDataset"
-_MAX_BYTES = 1 << 20  # larger files are no VRTs; one that carries an RPC takes a few thousand
-
 Rect = tuple[int, int, int, int]  # col, row of the first pixel, width, height [px]
 
 _ANY = r"(?s:.*)"
@@ -150,14 +148,14 @@ def read_vrt(path: Path, *, name: str | None = None) -> Vrt:
     """
     name = name or str(path)
     try:
-        return _parsed(read_bytes(path, replace(XML, most=_MAX_BYTES)), path.resolve().parent, name)
+        return _parsed(read_bytes(path, replace(XML, most=MB)), path.resolve().parent, name)
     except RpcFormatError as error:
         raise ImageError(str(error)) from error
 
 
 @lru_cache(maxsize=1)  # a file that was written is read twice in a row
 def _parsed(data: bytes, folder: Path, name: str) -> Vrt:
-    return vrt_from_xml(parse_xml(data, name=name, max_bytes=_MAX_BYTES), folder, name)
+    return vrt_from_xml(parse_xml(data, name=name, max_bytes=MB), folder, name)
 
 
 def vrt_from_xml(root: Element, folder: Path, name: str) -> Vrt:

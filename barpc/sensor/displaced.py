@@ -18,6 +18,7 @@ import numpy as np
 from barpc.base.errors import RpcError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, IntArray
+from barpc.base.usual import ITERATIONS
 from barpc.sensor import Behind, SensorModel
 from barpc.sensor.direct_grid import LINEAR, LONGEST, linear_axes
 
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from scipy.interpolate import RegularGridInterpolator
 
 
-_STEPS = 60  # of a fixed point: a correction gains two or three digits a step, wild ones need more
 STANDS = 1e-7
 """Of image points that are iterated [px]: what is left after so small a step is a hundredth of it."""
 
@@ -71,7 +71,7 @@ class Displaced(Behind):
 def fixed_point(follow: Callable[[Array], Array], image: Array) -> Array:
     """Return the image points (..., 2) [px] that `follow` leaves where they are, from a first guess."""
     change = np.zeros(())
-    for _ in range(_STEPS):
+    for _ in range(ITERATIONS):
         before, image = image, follow(image)
         last, change = change, np.abs(image - before)
         with np.errstate(all="ignore"):  # a step leaves a hundredth of itself, or what it was of the step before

@@ -16,7 +16,7 @@ from rasterio.windows import Window
 from barpc.base.errors import ImageError
 from barpc.base.geodesy import Array
 from barpc.base.options import TieOptions
-from barpc.rasters.raster import open_raster
+from barpc.rasters.raster import BLOCK, open_raster
 from barpc.scene import BoolArray
 
 FloatImage = npt.NDArray[np.float32]
@@ -28,7 +28,7 @@ Box = tuple[int, int, int, int]
 
 CELL = 64
 """Side of the cells that each hold a quota of keypoints [px]; tiles are whole cells."""
-SPAN = 512
+SPAN = BLOCK
 """Rows that are read at a time (at least one row of blocks), and what else is done in parts of so many."""
 PIECE = 1 << 22
 """Pixels of pictures, or places of templates in them, that are worked on together; decides on no figure."""

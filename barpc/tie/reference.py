@@ -16,11 +16,10 @@ import numpy as np
 
 from barpc.base.geodesy import NEWTON_STEPS, Array, metres_per_unit
 from barpc.base.options import TieOptions
-from barpc.base.usual import MAD, robust_spread
+from barpc.base.usual import MAD, SURELY, robust_spread
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
 from barpc.tie.matchers.structural import POINTS
-from barpc.tie.pairing.epipolar import OUTLYING
 from barpc.tie.pairing.overlaps import Terrain
 from barpc.tie.patches.channels import EDGE, Patch, Sheet, correlation, of_image, of_reference, shown
 from barpc.tie.patches.oriented import HALF, PatchTile
@@ -62,7 +61,7 @@ class ViewMatch:
 
         Measured: 0.5 to 1.3 times what is expected, over a terrain of another place, mirrored or flat 6 to 9 times.
         """
-        return bool(self.along > OUTLYING * np.hypot(self.scatter, self.slope * sigma))
+        return bool(self.along > SURELY * np.hypot(self.scatter, self.slope * sigma))
 
 
 @dataclass(frozen=True, eq=False)
@@ -358,16 +357,16 @@ def _affine(
     """Return an affine (n, 2) through most of the shifts (n, 2), those near it, their standard deviations
     along both axes.
 
-    The search starts where most shifts lie together, within `OUTLYING` px. None where too few agree.
+    The search starts where most shifts lie together, within `SURELY` px. None where too few agree.
     """
     if passed.sum() < _LEAST:
         return None
     design = np.column_stack([np.ones(len(local)), local / max(float(np.abs(local).max()), 1.0)])
     apart = np.linalg.norm(shift[passed, None] - shift[None, passed], axis=2)
-    fitted = np.broadcast_to(shift[passed][(apart < OUTLYING * step).sum(axis=1).argmax()], shift.shape)
+    fitted = np.broadcast_to(shift[passed][(apart < SURELY * step).sum(axis=1).argmax()], shift.shape)
     scale, keep = np.full(2, step), passed
     for _ in range(NEWTON_STEPS):
-        keep = passed & (np.abs(shift - fitted) < OUTLYING * scale).all(axis=1)
+        keep = passed & (np.abs(shift - fitted) < SURELY * scale).all(axis=1)
         if keep.sum() < _LEAST:
             return None
         fitted = design @ np.linalg.lstsq(design[keep], shift[keep], rcond=None)[0]

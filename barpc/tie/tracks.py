@@ -14,9 +14,10 @@ from scipy.spatial import cKDTree
 from barpc.base.errors import TiePointError
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.options import TieOptions
+from barpc.base.usual import MANY
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
-from barpc.tie.matchers.features import THIN, KeypointFiles, locate, worth_a_first_look
+from barpc.tie.matchers.features import KeypointFiles, locate, worth_a_first_look
 from barpc.tie.matchers.given import GivenMatches, verify_given
 from barpc.tie.matchers.matcher import Matches
 from barpc.tie.matchers.matching import (
@@ -249,7 +250,7 @@ class _Trials:
 def _unlike(linked: Tracks, registered: Tracks, pairs: Collection[tuple[int, int]]) -> list[tuple[int, int]]:
     """Return the pairs whose grey values do not compare: too few of their matches could be registered by these."""
     before, after = pair_counts(linked), pair_counts(registered)
-    return [pair for pair in pairs if after.get(pair, 0) < min(0.5 * before.get(pair, 0), THIN)]
+    return [pair for pair in pairs if after.get(pair, 0) < min(0.5 * before.get(pair, 0), MANY)]
 
 
 def _with_pictures(

@@ -14,7 +14,8 @@ import pytest
 from barpc import __version__
 from barpc.base.errors import AdjustError, ImageError, OutputError
 from barpc.base.identity import Input
-from barpc.pipeline.executor import LARGE, CachingExecutor, Spilled, run_batch, worker_count
+from barpc.base.sidefile import MB
+from barpc.pipeline.executor import CachingExecutor, Spilled, run_batch, worker_count
 from barpc.workspace import Workspace
 
 
@@ -118,7 +119,7 @@ def test_a_full_disk_reaches_whoever_asks_for_the_result(tmp_path, monkeypatch):
 
 
 def test_large_arrays_are_sent_as_paths_and_taken_away(tmp_path):
-    pad = np.arange(LARGE // 8 + 1.0)
+    pad = np.arange(MB // 8 + 1.0)
     sent = []
 
     class Looking(ThreadPoolExecutor):
@@ -335,7 +336,7 @@ def test_arrays_count_by_values_type_and_shape(tmp_path) -> None:
 
 
 def test_a_large_array_is_spilled_once_and_a_small_one_is_sent(tmp_path) -> None:
-    large, small = np.zeros(LARGE // 8), np.zeros(LARGE // 8 - 1)
+    large, small = np.zeros(MB // 8), np.zeros(MB // 8 - 1)
     with Workspace(tmp_path / "run") as workspace:
         caching = CachingExecutor(workspace, {}, Later())
         assert caching._spill((1, small)) == (1, small)

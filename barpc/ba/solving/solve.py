@@ -22,7 +22,7 @@ from barpc.ba.solving.normal import Reduced
 from barpc.ba.solving.problem import Problem
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
-from barpc.base.usual import ITERATIONS, SLIGHT
+from barpc.base.usual import ITERATIONS, ROUNDING, SLIGHT
 from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)
@@ -114,8 +114,10 @@ def minimise(
 def _settled(gain: float, before: float, cost: float, tolerance: float) -> bool:
     """Return whether a step that should gain `gain`, after one that should have gained `before`, is the last.
 
-    The gains shrink at least in the proportion of the last two: what the step leaves is gain^2 / before.
+    The gains shrink at least in the proportion of the last two: what the step leaves is gain^2 / before. Of what is met
+    without noise the cost is rounding alone: what is tolerated is a thousandth of a standard deviation at least.
     """
+    cost = max(cost, 1.0)
     return gain <= tolerance * cost or gain * gain <= 1e-3 * tolerance * cost * before < np.inf
 
 
@@ -249,7 +251,7 @@ def _scipy(problem: Problem, state: State, weight: Array, tolerance: float, proj
         method="trf",
         x_scale=10.0 * (1.0 + float(np.linalg.norm(compressed.whitened))),  # no first step cut short
         ftol=tolerance,
-        xtol=None,
+        xtol=ROUNDING,  # no step lowers the cost any more
         gtol=np.sqrt(tolerance),  # of whitened unknowns: a thousandth of a standard deviation for a millionth
         max_nfev=ITERATIONS,
     )

@@ -19,6 +19,7 @@ import numpy as np
 from barpc.base.errors import BarpcError, InputError, RpcError, RpcFormatError, visible
 from barpc.base.geodesy import Array
 from barpc.base.sidefile import MAX_XML, PRODUCT, opened, read_head
+from barpc.base.usual import ROUNDING
 from barpc.sensor.curve import Orbit, fit_orbit
 from barpc.sensor.document import seconds
 from barpc.sensor.sentinel1.annotation import Annotation, BurstRows, burst_rows, read_annotation
@@ -44,7 +45,6 @@ __all__ = [
 
 T = TypeVar("T")
 MOSAIC = "mosaic"  # the swath of all swaths
-_SAME = 1e-9  # relative: intervals and rates of the swaths of one mosaic
 _NAME = re.compile(r"s1[a-d]-(?P<swath>\w+)-(slc|grd)-(?P<pol>vv|hh|vh|hv)-.*\.xml", re.IGNORECASE)
 _POLARISATIONS = ("vv", "hh", "vh", "hv")
 
@@ -91,7 +91,7 @@ def mosaic_offsets(swaths: Sequence[Annotation]) -> Array:
             other.range_sampling_rate / first.range_sampling_rate,
         )
         late = apart > other.lines * other.azimuth_time_interval
-        if other.mission != first.mission or late or max(abs(rate - 1.0) for rate in rates) > _SAME:
+        if other.mission != first.mission or late or max(abs(rate - 1.0) for rate in rates) > ROUNDING:
             raise InputError(f"{other.name}: not of the same product as {first.name}")
     near = min(a.slant_range_time for a in swaths)
     epoch = min(a.first_line_time for a in swaths)

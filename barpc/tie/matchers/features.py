@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from barpc.base.geodesy import Array
 from barpc.base.options import TieOptions
+from barpc.base.usual import MANY
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.overlaps import Pair, shared_tiles
@@ -31,11 +32,9 @@ AMPLE = 5
 _ZOOMS = ((1.25e-4, 4), (2e-3, 2))
 """Keypoints wanted a px, below which so many pixels a side are looked at as one: real images hold 1200e-6, 4500e-6."""
 _HOLDS = {2: 4.5e-3, 4: 1.2e-3}  # keypoints a px that real images hold, looked at so
-THIN = 100
-"""Verified matches of a pair below which it is tried again."""
 _PART = 0.1
 """Verified matches of a pair that make a closer look needless, as a part of the points wanted of an image, at least
-`THIN`: with 250 tracks in place of 3664 three real pairs meet check points alike, to 0.139, 0.154, 0.129 px."""
+`MANY`: with 250 tracks in place of 3664 three real pairs meet check points alike, to 0.139, 0.154, 0.129 px."""
 _HELD = 4.0  # keypoints that images are to hold for each of these, or nothing is gained; the triplet has 2.1 to 2.5
 
 
@@ -141,7 +140,7 @@ class Share:
 
 def ample_matches(options: TieOptions) -> int:
     """Return the number of verified matches at a first look that makes a closer one needless."""
-    return max(THIN, int(np.ceil(_PART * options.points_per_image)))
+    return max(MANY, int(np.ceil(_PART * options.points_per_image)))
 
 
 def worth_a_first_look(sizes: Sequence[tuple[int, int]], options: TieOptions) -> bool:

@@ -20,14 +20,13 @@ from scipy.spatial import cKDTree
 
 from barpc.base.geodesy import Array
 from barpc.base.options import TieOptions
-from barpc.base.usual import robust_spread
+from barpc.base.usual import FEW, MANY, robust_spread
 from barpc.scene import IntArray, View
-from barpc.tie.matchers.features import AMPLE, THIN, KeypointFiles, Keypoints, ample_matches, join_keypoints
+from barpc.tie.matchers.features import AMPLE, KeypointFiles, Keypoints, ample_matches, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
 from barpc.tie.matchers.matcher import APART, NO_MATCHES, Hook, Matcher, Matches, Prediction, hooked
 from barpc.tie.matchers.structural import FineStructure, GradientStructure
 from barpc.tie.pairing.epipolar import (
-    FEW,
     LEAST_REACH,
     EpipolarSegments,
     affine_inliers,
@@ -52,7 +51,7 @@ def matcher_named(name: str) -> type[Matcher] | Hook:
 
 
 SHARE = 0.3
-"""A pair of fewer than `THIN` is not tried again where they are this share of the keypoints in its common area, and
+"""A pair of fewer than `MANY` is not tried again where they are this share of the keypoints in its common area, and
 `FEW`: small images have no more to give; nor is a wider pass where this share of the matches stands in the peak."""
 TOLERANCE = 3.0
 """Half the width of the band about the corrected epipolar line, at most [px]."""
@@ -182,7 +181,7 @@ def enough(report: PairReport) -> bool:
 def _wanted(report: PairReport) -> int:
     """Return the number of matches that a pair should have: fewer where little is in common."""
     common = report.overlap * min(report.keypoints)
-    return math.ceil(min(THIN, max(FEW, SHARE * common))) if common > 0 else THIN
+    return math.ceil(min(MANY, max(FEW, SHARE * common))) if common > 0 else MANY
 
 
 def _better(*attempts: tuple[Matches, PairReport]) -> tuple[Matches, PairReport]:
@@ -263,7 +262,7 @@ def _loaded(
 
 def quick_score(views: Ends, keypoints: tuple[KeypointFiles, KeypointFiles], options: TieOptions) -> int:
     """Estimate how many of a few keypoints match, with at most 5 % false ones: a cheap forecast for a pair."""
-    few = (keypoints[0].strongest(AMPLE * THIN), keypoints[1].strongest(AMPLE * THIN))
+    few = (keypoints[0].strongest(AMPLE * MANY), keypoints[1].strongest(AMPLE * MANY))
     if not (len(few[0]) and len(few[1])):
         return 0
     search = _Search(views, _loaded(views, few, options)[0], replace(options, ratio=_LOOSE[0]))

@@ -9,14 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.geodesy import Array
-from barpc.base.usual import BIWEIGHT, robust_spread
+from barpc.base.usual import BIWEIGHT, FEW, SURELY, robust_spread
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pixels import SPAN
 
-FEW = 30
-"""Points below which an affine error is not told from a constant one, and a spread is none."""
-OUTLYING = 3.0
-"""Robust standard deviations beyond which a value does not agree with others."""
 LEAST_REACH = 5.0
 """Half a segment [px] below which places along it say nothing of altitudes."""
 
@@ -141,7 +137,7 @@ def affine_inliers(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolAr
     """Return the values (N,) [px] that agree with an affine function of position (N, 2) [px], and their
     distances from it (N,).
 
-    Each window of 4 `SPAN` has its own function; what lies within `OUTLYING` robust standard deviations of it, or
+    Each window of 4 `SPAN` has its own function; what lies within `SURELY` robust standard deviations of it, or
     `floor` [px], agrees.
     """
     keep = np.zeros(len(values), dtype=bool)
@@ -151,7 +147,7 @@ def affine_inliers(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolAr
     for rows in grouped(*np.floor(xy[:, ::-1] / (4 * SPAN)).T):
         if len(rows) >= 2 * FEW:
             residual[rows] = values[rows] - robust_affine(xy[rows], values[rows])(xy[rows])
-        keep[rows] = np.abs(residual[rows]) <= max(OUTLYING * robust_spread(residual[rows]), floor)
+        keep[rows] = np.abs(residual[rows]) <= max(SURELY * robust_spread(residual[rows]), floor)
     return keep, residual
 
 

@@ -18,9 +18,9 @@ from scipy.spatial import cKDTree
 
 from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array
 from barpc.base.options import TieOptions
-from barpc.base.usual import robust_spread
+from barpc.base.usual import FEW, robust_spread
 from barpc.scene import BoolArray, IntArray, Tracks, View
-from barpc.tie.pairing.epipolar import FEW, LEAST_REACH, affine_inliers, frame, grouped, linear_map
+from barpc.tie.pairing.epipolar import LEAST_REACH, affine_inliers, frame, grouped, linear_map
 from barpc.tie.patches import oriented
 from barpc.tie.pixels import SPAN, FloatImage, PixelReader, grow, levelled
 from barpc.tie.tasks import HERE, Work
