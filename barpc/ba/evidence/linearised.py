@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations
 
 import numpy as np
 
@@ -13,9 +12,6 @@ from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
-
-# views of a track up to which every subset may be right; of more, all of them or all but one
-_MOST_SUBSETS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,18 +196,12 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
 
 def numbers(count: IntArray) -> float:
     """Return the count of numbers that tracks of so many views each (T,) need."""
-    subsets = np.where(count <= _MOST_SUBSETS, 2.0 ** count.astype(np.float64), count + 1.0)
-    return float((6.0 * subsets * count).sum())
+    return float((6.0 * (count + 1.0) * count).sum())
 
 
 def _subsets(n: int) -> BoolArray:
-    """Return the subsets (S, n) of n views that may be right together: all, then fewer."""
-    sizes = range(n, 1, -1) if n <= _MOST_SUBSETS else range(n, n - 2, -1)
-    chosen = [subset for size in sizes for subset in combinations(range(n), size)]
-    out = np.zeros((len(chosen), n), dtype=bool)
-    for row, subset in zip(out, chosen, strict=True):
-        row[list(subset)] = True
-    return out
+    """Return the subsets (S, n) of n views that may be right together: all, then all but one, two at least."""
+    return np.vstack([np.ones((1, n), dtype=bool), ~np.eye(n, dtype=bool)[::-1]])[: n + 1 if n > 2 else 1]
 
 
 def _followed(ground: Array, subsets: BoolArray, held: Array) -> tuple[Array, Array]:
