@@ -454,6 +454,12 @@ def _want_two(r: Result, _plan: Plan) -> list[str]:
     return _unsaid(r) + _far(r)
 
 
+def _want_plane(r: Result, _plan: Plan) -> list[str]:
+    left = min(r.files.left, r.adjusted.left)  # as of one step
+    faults = [f"left {left:.2f}"] if not left <= 0.5 else []
+    return _unsaid(r) + _far(r) + faults + (["taken for another's"] if "not adjusted" in _all_words(r) else [])
+
+
 def _want_angles(r: Result, _plan: Plan) -> list[str]:
     return [f"height {r.files.move[2]:.0f} m, said {r.sigma[2]:.0f}"] if not abs(r.z[2]) <= 3 else []
 
@@ -488,6 +494,7 @@ WANTED: dict[str, tuple[str, Callable[[Result, Plan], list[str]]]] = {
     "foreign": ("the odd view named; the others as without it (0.02 px, 0.05 m)", _want_foreign),
     "clean": ("good, and nothing widened or invented", _want_clean),
     "two": ("none good above 0.15 px", _want_two),
+    "plane": ("0.5 px left at most; no other image's camera; none good above 0.15 px", _want_plane),
     "angles": ("mean height within 3 sigma", _want_angles),
     "control": (
         "wrong points named, right ones not; the scene within 3 sigma, its shape kept",

@@ -413,6 +413,17 @@ def _two(seed: int, rng: np.random.Generator) -> Plan:
     return plan
 
 
+def _plane(seed: int, rng: np.random.Generator) -> Plan:
+    """All detectors of one view off, each by itself, every other time with a swing of its rows."""
+    plan = draw(rng, 2 + (seed + 1) % 3)
+    view, size = int(rng.integers(len(plan.looks))), plan.some(0.2, 1.2)
+    plan.flaw(view, chips=rng.normal(0.0, size, (CHIPS, 2)))
+    if seed % 2:
+        plan.flaw(view, pointing=wave(plan.some(100, 600), 0.0, plan.some(0.1, 0.3) * plan.direction()))
+    plan.injected.append(Injected("detectors", (view,), 0, 0, plan.size[0], size, "and a swing" if seed % 2 else ""))
+    return plan
+
+
 ANGLES = (0.2, 0.5, 0.8, 1.0, 1.1, 1.5, 2.0, 3.0)
 
 
@@ -497,6 +508,7 @@ FAMILIES: dict[str, Callable[[int, np.random.Generator], Plan]] = {
     "foreign": _foreign,
     "clean": _clean,
     "two": _two,
+    "plane": _plane,
     "angles": _angles,
     "control": _control,
     "dem": _dem,

@@ -37,6 +37,9 @@ from barpc.sensor.geometry import camera_center
 
 _MUCH_BETTER = 0.7  # of the error on tracks that took no part: another model may do much to heights
 
+_Chosen = tuple[Solution, float | None, Parts]
+"""What is solved, what the model in space leaves where another was chosen [px], and its observations."""
+
 
 def adjust_tracks(
     views: Sequence[View],
@@ -99,10 +102,7 @@ def _solved(parts: Parts, options: AdjustOptions, solve: Solver, altimetry: Alti
     """Return the block solved by the model that the data choose, held by heights too where there are some."""
     given = parts.inner, parts.outer
     try:
-        first, apart = _first(parts, options, solve)
-        if apart is not None and apart.clear:
-            parts = parts.without_view(apart.view)
-        found, in_space, parts = _choose_model(first, parts, options, solve)
+        (found, in_space, parts), apart = _explained(parts, options, solve)
         heights = None
         if altimetry is not None:
             found, heights = hold_by_altimetry(found, parts.inner, parts.outer, options, altimetry)
@@ -119,6 +119,21 @@ def _solved(parts: Parts, options: AdjustOptions, solve: Solver, altimetry: Alti
         ) from error
 
 
+def _explained(parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[_Chosen, Apart | None]:
+    """Return the block by the model that the data choose, and the view it was solved without or that may be wrong."""
+    first, apart, without = _first(parts, options, solve)
+    if apart is not None and apart.may_be_its_own and first is not None:
+        # what its rows and columns explain, bent, makes it no other image's
+        chosen = _choose_model(first, parts, options, solve)
+        if chosen[2].keeps(chosen[0], apart.view):
+            return chosen, None
+    if apart is not None and apart.clear:
+        parts = parts.without_view(apart.view)
+    start = first if without is None else without
+    assert start is not None
+    return _choose_model(start, parts, options, solve), apart
+
+
 def _warn(outcome: Outcome) -> None:
     """Warn of what the last solve could not do; what is tried on the way to it may fail."""
     if not outcome.minimum.settled:
@@ -129,8 +144,11 @@ def _warn(outcome: Outcome) -> None:
         warnings.warn(message, BarpcWarning, stacklevel=4)
 
 
-def _first(parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[Solution, Apart | None]:
-    """Return the block solved with the model to start with, without a view whose RPC is not its own where there is one.
+def _first(
+    parts: Parts, options: AdjustOptions, solve: Solver
+) -> tuple[Solution | None, Apart | None, Solution | None]:
+    """Return the block solved with the model to start with, and without a view whose RPC is not its own where there
+    is one; one of the two at least.
 
     What goes on from an earlier block is not asked that.
     """
@@ -141,10 +159,8 @@ def _first(parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[Solutio
         failed = error
     goes_on = first is not None and first.goes_on
     apart, without = (None, None) if goes_on else find_apart(first, block, parts.outer, options, solve)
-    if without is not None:
-        return without, apart
-    if first is not None:
-        return first, apart
+    if without is not None or first is not None:
+        return first, apart, without
     assert failed is not None
     if apart is None:
         raise failed
@@ -191,9 +207,7 @@ def _with_apart(
     return replace(whole, apart=told, params=params, sensors=sensors, prior=tested, **new)
 
 
-def _choose_model(
-    first: Solution, parts: Parts, options: AdjustOptions, solve: Solver
-) -> tuple[Solution, float | None, Parts]:
+def _choose_model(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> _Chosen:
     """Return the block, of which one model is solved, by that which the data choose, without ties that move.
 
     An affine in the image where it is much better; and what the model in space leaves then [px].

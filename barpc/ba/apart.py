@@ -72,6 +72,11 @@ class Apart:
         """Whether it can only be this view."""
         return len(self.views) == 1
 
+    @property
+    def may_be_its_own(self) -> bool:
+        """Whether it sees the place and is left as it is: its rows and columns may be bent."""
+        return self.clear and self.placed is None and (self.look.as_stated or self.look.offset is not None)
+
     def is_view(self, view: int) -> bool:
         """Return whether a view is clearly the one that the others contradict."""
         return self.views == (view,)
@@ -287,6 +292,14 @@ class Parts:
         kept, had = (np.bincount(b.view[b.use], minlength=len(b.views)) for b in (inner, block))
         enough = bool((kept[had > 0] >= MIN_OBSERVATIONS).all())
         return enough and _groups(inner) == _groups(block)
+
+    def keeps(self, found: Solution, view: int) -> bool:
+        """Return whether a solution keeps half as many of a view's tie points as of another's, and no group moves.
+
+        Where ties move it may be those of the view that do.
+        """
+        kept = 1.0 - _lost(found, self.inner)
+        return not self.group.any() and bool(kept[view] >= 0.5 * np.median(np.delete(kept, view)))
 
     def mostly_moving(self, inlier: BoolArray) -> list[Interval]:
         """Return the rows of images, of the kept (K,) of `inner`, of which more ties move than stand."""

@@ -12,6 +12,7 @@ import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, adjustment, apart
 from barpc.ba.apart import find_apart
+from barpc.ba.placing import Look
 from barpc.base.errors import AdjustError
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import triangulate
@@ -261,6 +262,54 @@ def test_a_foreign_rpc_leaves_the_others_as_without_it(seed: int) -> None:
     assert (found.apart.placed is not None) == (seed == 5)
     if seed == 5:  # adjusted alone it is as good as the others
         assert judge(world, found.sensors).rms[odd] < 0.03
+
+
+@pytest.mark.slow
+def test_detectors_that_lie_off_make_a_camera_no_other_images() -> None:
+    """Eight of a pixel each: more than half of its ties contradict the others wherever it is, but its columns do it."""
+    world = make("plane", 6)
+    found = adjust_tracks(world.views, world.tracks)
+    assert found.apart is None
+    assert judge(world, [view.sensor for view in world.views]).left > 20.0
+    assert judge(world, found.sensors).left < 0.15
+    (fault,) = world.plan.injected
+    (odd,) = fault.views
+    of_it = ~found.held_out & (world.tracks.view == odd) & ~world.bad
+    assert found.inlier[of_it].mean() > 0.97
+
+
+def test_a_view_is_its_own_where_a_solution_keeps_its_ties_and_none_move() -> None:
+    tracks = np.zeros(12, dtype=np.int64), np.repeat(np.arange(3), 4)
+    block: Any = SimpleNamespace(
+        view=tracks[1],
+        views=(None,) * 3,
+        point=tracks[0],
+        num_tracks=1,
+        use=np.ones(12, dtype=bool),
+        without=lambda rows: block,
+    )
+    for kept, moves, own in ((2, False, True), (1, False, False), (4, True, False)):
+        inlier = np.ones(12, dtype=bool)
+        inlier[: 4 - kept] = False
+        found: Any = SimpleNamespace(outcome=SimpleNamespace(inlier=inlier))
+        group = np.where(np.arange(12) == 11, int(moves), 0)
+        assert apart.Parts(block, np.zeros(12, dtype=bool), group).keeps(found, 0) == own
+        assert apart.Parts(block, np.zeros(12, dtype=bool), group).keeps(found, 1) == (not moves)
+
+
+@pytest.mark.parametrize(
+    ("look", "placed", "views", "own"),
+    [
+        (Look(as_stated=True), None, (1,), True),
+        (Look(offset=np.array([5.0, 3.0])), None, (1,), True),
+        (Look(), None, (1,), False),  # it does not see the place at all
+        (Look(swapped=True), None, (1,), False),
+        (Look(as_stated=True), "placed", (1,), False),  # it meets the others where it was found
+        (Look(as_stated=True), None, (1, 2), False),
+    ],
+)
+def test_what_sees_the_place_may_be_its_own(look: Look, placed: Any, views: tuple[int, ...], own: bool) -> None:
+    assert apart.Apart(views, 9.0, 9.0, None, 0.6, look, placed).may_be_its_own == own
 
 
 @pytest.mark.slow
