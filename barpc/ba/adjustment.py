@@ -21,7 +21,7 @@ from barpc.ba.held.terrain import Terrain
 from barpc.ba.judging.following import follow, without_strips
 from barpc.ba.judging.judge import Finding, left_over, standing_out
 from barpc.ba.judging.snooping import image_test
-from barpc.ba.judging.solution import CLEARLY, Solution, solve_block
+from barpc.ba.judging.solution import CLEARLY, MUCH_BETTER, Solution, solve_block
 from barpc.ba.placing import place
 from barpc.ba.result import Adjustment
 from barpc.ba.robust.consensus import two_groups
@@ -34,8 +34,6 @@ from barpc.base.options import AUTO, AdjustOptions
 from barpc.base.usual import CRITICAL, ITERATIONS, SAMPLE
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Reference, Tracks, View
 from barpc.sensor.geometry import camera_center
-
-_MUCH_BETTER = 0.7  # of the error on tracks that took no part: another model may do much to heights
 
 _Chosen = tuple[Solution, float | None, Parts]
 """What is solved, what the model in space leaves where another was chosen [px], and its observations."""
@@ -223,7 +221,7 @@ def _choose_model(first: Solution, parts: Parts, options: AdjustOptions, solve: 
     chosen, in_space = (found, None) if in_image is None else (in_image, found.after.whole_rms)
     if judges:
         followed = follow(found, parts.inner, parts.outer, options)
-        if chosen is found or followed.after.error < _MUCH_BETTER * chosen.after.error:
+        if chosen is found or followed.after.error < MUCH_BETTER * chosen.after.error:
             return followed, None, parts
     return chosen, in_space, parts
 
@@ -234,7 +232,7 @@ def _in_image(found: Solution, parts: Parts, options: AdjustOptions, solve: Solv
     if not (skew or found.has_trend):
         return None
     tried = solve(parts.inner, parts.outer, replace(options, model="affine"))
-    better = tried.after.error < (CLEARLY if skew else _MUCH_BETTER) * found.after.error
+    better = tried.after.error < (CLEARLY if skew else MUCH_BETTER) * found.after.error
     # it leaves the tilts of the scene open: not for what no adjustment is asked for
     return tried if better and tried.after.whole_rms < found.after.whole_rms - FLOOR else None
 

@@ -17,15 +17,15 @@ import numpy as np
 from barpc.ba.estimated.waves import FEWEST, Waves
 from barpc.ba.held.block import Block, make_problem
 from barpc.ba.judging.explanations import FOLLOWED, LOCAL, SETTLING, SWING
-from barpc.ba.judging.judge import Finding, Judgement, standing_out
-from barpc.ba.judging.solution import Solution, finished
+from barpc.ba.judging.judge import Finding, Judgement, shared, standing_out
+from barpc.ba.judging.solution import MUCH_BETTER, Solution, finished
 from barpc.ba.robust.heldout import is_better
 from barpc.ba.robust.rounds import Rounds, revived
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array
 from barpc.base.options import AUTO, OFF, AdjustOptions
-from barpc.base.usual import BACKFITTING, FEW, ITERATIONS, LARGEST
+from barpc.base.usual import BACKFITTING, FEW, ITERATIONS, LARGEST, SURE
 from barpc.scene import BoolArray
 
 _LARGE = 40.0  # twice the logarithm of a likelihood ratio: the largest of 10,000 places by chance once in 100,000 views
@@ -163,7 +163,18 @@ def follow(found: Solution, block: Block, outer: Block, options: AdjustOptions) 
             tried = _with_edges(_with_waves(found, block, outer, options, waves, True), block, outer, options)
         better = given or (asked and best is found) or is_better(tried.after, best.after, outer)
         best, misses = (tried, 0) if better else (best, misses + 1)
-    return best if best is found else replace(best, asked={**found.asked, "jitter": found.outcome.smooth})
+    if best is found or not (given or asked or _explains(best, found, block)):
+        return found
+    return replace(best, asked={**found.asked, "jitter": found.outcome.smooth})
+
+
+def _explains(tried: Solution, found: Solution, block: Block) -> bool:
+    """Return whether what is followed explains most of what neighbouring ties share, or much is gained.
+
+    Ties that took no part err as their neighbours do: they do not tell cameras from noise that many share.
+    """
+    left, before = (shared(one.outcome, block) for one in (tried, found))
+    return left <= max(0.5 * before, SURE) or tried.after.error < MUCH_BETTER * found.after.error
 
 
 def without_strips(found: Solution, judged: Judgement, block: Block, outer: Block, options: AdjustOptions) -> Solution:

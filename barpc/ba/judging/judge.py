@@ -12,6 +12,7 @@ from barpc.ba.evidence.linearised import Linear, linearise, numbers
 from barpc.ba.evidence.mixture import SETTLED, Fit, fit, off_from_right
 from barpc.ba.evidence.periods import Swing, swings
 from barpc.ba.evidence.scan import Interval, scan
+from barpc.ba.evidence.shared import shared_errors
 from barpc.ba.held.block import Block
 from barpc.ba.judging.explanations import (
     EXPLANATIONS,
@@ -36,7 +37,7 @@ from barpc.ba.robust.rounds import Outcome, revived
 from barpc.ba.robust.weights import Observations
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array
-from barpc.base.usual import BACKFITTING, KEPT, LARGEST, RIVALS, SAMPLE, SMALL, STANDS, SURE, TRIED
+from barpc.base.usual import BACKFITTING, KEPT, LARGEST, OUTLIER, RIVALS, SAMPLE, SMALL, STANDS, SURE, TRIED
 from barpc.scene import BoolArray, IntArray
 
 _LOG = logging.getLogger(__name__)
@@ -121,6 +122,22 @@ def swinging(outcome: Outcome, block: Block) -> list[Swing]:
     """Find the periods with which the rows of images swing more than chance allows, at most one an image."""
     rows, off = _whitened(outcome, block)
     return swings(block.view[rows], block.xy[1, rows], _sizes(block), _told(outcome, block)[rows], off)
+
+
+def shared(outcome: Outcome, block: Block) -> float:
+    """Return by how much noise that neighbours share explains the ties kept better than noise of each alone [nats]."""
+    rows, off = _whitened(outcome, block)
+    return _shared(block.view[rows], block.xy[:, rows], _sizes(block), off, outcome.inlier[rows], block.point[rows])
+
+
+def _shared(view: IntArray, place: Array, size: Array, off: Array, right: BoolArray, track: IntArray) -> float:
+    """Return what noise that neighbours share explains [nats], of ties (k,) off by (2, k) standard deviations.
+
+    A track of n views leaves 2 n - 3 of its 2 n residuals free.
+    """
+    right = right & (np.hypot(*off) < OUTLIER)
+    free = 1.0 - 1.5 * len(np.unique(track[right])) / max(int(right.sum()), 1)
+    return free * float(shared_errors(view[right], place[:, right], size, off[:, right]).sum())
 
 
 def _told(outcome: Outcome, block: Block) -> Array:
@@ -300,6 +317,8 @@ class _Search:
         while not ended:
             states, ended = self._grown(states)
         best, margin = states[0], states[0].gain - (states[1].gain if len(states) > 1 else 0.0)
+        if best.gain <= self._by_neighbours():
+            return Judgement()
         self.seen = best.seen
         # what was not the best by itself is beside the others: by what these gain together
         taken = [row if row.gap > 0.0 else replace(row, gap=margin) for row in best.taken]
@@ -307,6 +326,17 @@ class _Search:
         base = best.seen.base if followed == len(taken) else best.followed
         found = tuple(one for n in range(len(taken)) for one in _said(taken, n, best.seen))
         return Judgement(found, base.step, base.right)
+
+    def _by_neighbours(self) -> float:
+        """Return what noise that neighbours share explains where nothing else was taken [nats]."""
+        seen, found, linear = self.start, self.start.base, self.start.linear
+        off, _ = off_from_right(linear, linear.left(found.step), found.right)
+        track = np.full(len(linear.view), -1)
+        for n, tracks in enumerate(linear.tracks):
+            track[tracks.rows] = len(linear.view) * n + np.arange(len(tracks.rows))[:, None]
+        right = (track >= 0) & (found.right > 0.5)
+        # what is larger than what matchers are stated to err by is no noise of theirs
+        return _shared(linear.view, seen.place, seen.size, off, right, track)
 
     def _grown(self, states: list[_State]) -> tuple[list[_State], bool]:
         """Return the best with one more explanation, and whether they are the last."""

@@ -30,6 +30,7 @@ from barpc.scene import BoolArray
 
 _TREND = MUCH_NOISE * FLOOR  # px: another model is tried
 _SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
+MUCH_BETTER = 0.7  # of the error on tracks that took no part: another model may do much to heights
 CLEARLY = 0.8  # of what is left, that another start or model leaves at most; or of a view's observations, kept at least
 
 
