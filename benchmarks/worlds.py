@@ -454,6 +454,12 @@ def _want_two(r: Result, _plan: Plan) -> list[str]:
     return _unsaid(r) + _far(r)
 
 
+def _want_biased(r: Result, plan: Plan) -> list[str]:
+    found = re.search(_INVENTED, _all_words(r))
+    faults = [f"says '{found[0]}'"] if found else []
+    return _far(r) + faults + ([f"left {r.adjusted.left:.3f}"] if not r.adjusted.left <= plan.injected[0].size else [])
+
+
 def _want_plane(r: Result, _plan: Plan) -> list[str]:
     left = min(r.files.left, r.adjusted.left)  # as of one step
     faults = [f"left {left:.2f}"] if not left <= 0.5 else []
@@ -494,6 +500,7 @@ WANTED: dict[str, tuple[str, Callable[[Result, Plan], list[str]]]] = {
     "foreign": ("the odd view named; the others as without it (0.02 px, 0.05 m)", _want_foreign),
     "clean": ("good, and nothing widened or invented", _want_clean),
     "two": ("none good above 0.15 px", _want_two),
+    "biased": ("nothing invented; less left than the ties share; the scene within 3 sigma", _want_biased),
     "plane": ("0.5 px left at most; no other image's camera; none good above 0.15 px", _want_plane),
     "angles": ("mean height within 3 sigma", _want_angles),
     "control": (

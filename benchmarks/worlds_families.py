@@ -102,6 +102,7 @@ class Plan:
     moves: list[Callable[[Array, float], tuple[Array, Array]]] = field(default_factory=list)
     control: Control | None = None
     dem: Wrong | None = None  # what is wrong with the DEM that is given, if one is
+    bias: tuple[float, int] | None = None  # px, common to the ties of each of n x n cells of an image
 
     def flaw(self, view: int, **changed: Any) -> None:
         """Change a view's flaw; a `pointing` is added to those that are there."""
@@ -424,6 +425,14 @@ def _plane(seed: int, rng: np.random.Generator) -> Plan:
     return plan
 
 
+def _biased(_seed: int, rng: np.random.Generator) -> Plan:
+    """Matches that err alike in each cell of an image, by half of their own noise to twice of it."""
+    plan = draw(rng, int(rng.integers(2, 5)))
+    plan.bias = plan.some(0.05, 0.2), int(rng.integers(6, 25))
+    plan.injected.append(Injected("bias", (), 1, 0, 0, plan.bias[0], f"{plan.bias[1]} cells a side"))
+    return plan
+
+
 ANGLES = (0.2, 0.5, 0.8, 1.0, 1.1, 1.5, 2.0, 3.0)
 
 
@@ -509,6 +518,7 @@ FAMILIES: dict[str, Callable[[int, np.random.Generator], Plan]] = {
     "clean": _clean,
     "two": _two,
     "plane": _plane,
+    "biased": _biased,
     "angles": _angles,
     "control": _control,
     "dem": _dem,
@@ -636,6 +646,10 @@ def _ties(plan: Plan, cameras: Sequence[Camera], ground: Array, uv: Array) -> tu
             grounds[v] = geodetic(place)
     view, point, xy = _seen(cameras, plan.flaws, grounds, plan.size, plan.tracks, rng)
     bad = rng.uniform(size=len(view)) < plan.outliers
+    if plan.bias is not None:
+        size, side = plan.bias
+        cell = (xy / np.array(plan.size) * side).astype(int).clip(0, side - 1)
+        xy = xy + rng.normal(0, size, (num, side, side, 2))[view, cell[:, 0], cell[:, 1]]
     xy = xy + rng.normal(0, NOISE, xy.shape) + bad[:, None] * rng.uniform(-30, 30, xy.shape)
     xy = np.clip(xy, 0.0, np.array(plan.size) - 1.0)  # no matcher finds a point outside its image
     bad |= moving[point]

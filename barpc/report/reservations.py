@@ -117,7 +117,7 @@ def is_smooth(i: int, adjustment: Adjustment) -> bool:
 def _why_smooth(adjustment: Adjustment) -> str:
     if adjustment.options.drift == 0:
         return "a drift was not allowed (--drift 0)"
-    why = "attitude jitter, optics, or steps between detectors, which one RPC does not follow"
+    why = "attitude jitter, optics, steps between detectors, which one RPC does not follow, or matches that err alike"
     if not adjustment.reference_inlier.any():
         return why
     if adjustment.terrain is not None and not adjustment.terrain.is_known:

@@ -118,6 +118,7 @@ def followed(monkeypatch, tells: str, better: str, **options: Any) -> tuple[str,
 
     monkeypatch.setattr(following, "_with_waves", with_waves)
     monkeypatch.setattr(following, "_with_edges", lambda found, *_: found)
+    monkeypatch.setattr(following, "_explains", lambda *_: True)
     monkeypatch.setattr(following, "is_better", lambda one, other, outer: one in better and other < one)
     found = follow(solution(-1), views_of(3000, 3000), None, AdjustOptions(**options))  # type: ignore[arg-type]
     assert found.asked == ({"drift": 1} if found.name == "0" else {"drift": 1, "jitter": "smooth of 0"})
@@ -142,6 +143,25 @@ def test_knots_are_denser_until_nothing_is_left_or_two_are_no_better(monkeypatch
     found, made = followed(monkeypatch, tells, better)
     assert (found, len(made)) == (kept, tried)
     assert made == ["13", "23", "43", "83"][:tried]
+
+
+@pytest.mark.parametrize(
+    ("before", "left", "error", "kept"),
+    [
+        (100.0, 50.0, 0.99, True),
+        (100.0, 51.0, 0.99, False),  # most of it is left: noise that neighbours share
+        (100.0, 90.0, 0.69, True),  # much is gained
+        (100.0, 90.0, 0.71, False),
+        (0.0, 5.0, 0.99, True),  # too little to tell
+        (0.0, 5.1, 0.99, False),
+    ],
+)
+def test_what_is_followed_explains_most_of_what_neighbours_share(monkeypatch, before, left, error, kept) -> None:
+    monkeypatch.setattr(following, "shared", lambda outcome, block: outcome)
+    tried, found = (
+        SimpleNamespace(outcome=o, after=SimpleNamespace(error=e)) for o, e in ((left, error), (before, 1.0))
+    )
+    assert following._explains(tried, found, None) == kept  # type: ignore[arg-type]
 
 
 def test_what_is_asked_for_is_taken_once(monkeypatch) -> None:

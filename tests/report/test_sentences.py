@@ -569,8 +569,8 @@ def test_a_reference_on_heights_that_may_be_above_a_geoid_is_told_so_and_not_jit
     smooth = SmoothTest(np.array([0.2, 0.0, 0.0]), np.array([1e-9, 1, 1]), np.full(3, 0.9), np.zeros(3))
     for fields, words in (
         (held, "is left: the heights of the DEM (no --geoid), or attitude jitter"),
-        ({**held, "terrain": None}, "which one RPC does not follow; or the reference bends"),
-        ({}, "which one RPC does not follow"),
+        ({**held, "terrain": None}, "which one RPC does not follow, or matches that err alike; or the reference bends"),
+        ({}, "which one RPC does not follow, or matches that err alike"),
     ):
         told = view_status(a_view("A"), run_of(adjusted(**fields, smooth=smooth)))["advice"]
         assert words in told
