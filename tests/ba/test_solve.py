@@ -162,8 +162,21 @@ def test_a_cost_that_is_not_finite_is_an_error(monkeypatch, cost: float) -> None
     assert "the cost is not finite" in str(run(monkeypatch, [cost], [1.0])[0])
 
 
-@pytest.mark.parametrize(("asked", "taken"), [("auto", "sparse"), ("scipy", "scipy"), ("sparse", "sparse")])
-def test_scipy_solves_where_it_is_asked_for(monkeypatch, asked: str, taken: str) -> None:
+@pytest.mark.parametrize(
+    ("free", "asked", "tolerance", "taken"),
+    [
+        (0, "auto", 1e-6, "sparse"),  # all cameras are fixed
+        (1, "auto", 1e-6, "scipy"),
+        (200, "auto", 1e-9, "scipy"),
+        (201, "auto", 1e-6, "sparse"),
+        (1, "auto", 1e-3, "sparse"),  # a stage of the robust rounds
+        (201, "scipy", 1e-3, "scipy"),
+        (1, "sparse", 1e-6, "sparse"),
+    ],
+)
+def test_auto_asks_scipy_for_the_minimum_of_up_to_200_unknowns(
+    monkeypatch, free: int, asked: str, tolerance: float, taken: str
+) -> None:
     def solver(name: str) -> Any:
         return lambda problem, state, weight, tolerance, projected: SimpleNamespace(
             state=STATE, said=(name, tolerance, projected)
@@ -171,6 +184,6 @@ def test_scipy_solves_where_it_is_asked_for(monkeypatch, asked: str, taken: str)
 
     monkeypatch.setattr(solve, "_scipy", solver("scipy"))
     monkeypatch.setattr(solve, "_levenberg_marquardt", solver("sparse"))
-    problem: Any = SimpleNamespace(free=np.ones(3, dtype=bool))
-    found: Any = solve.minimise(problem, STATE, np.ones(1), asked, 1e-3, "projected")  # type: ignore[arg-type]
-    assert found.said == (taken, 1e-3, "projected")
+    problem: Any = SimpleNamespace(free=np.arange(300) < free)
+    found: Any = solve.minimise(problem, STATE, np.ones(1), asked, tolerance, "projected")  # type: ignore[arg-type]
+    assert found.said == (taken, tolerance, "projected")

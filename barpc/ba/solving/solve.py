@@ -1,8 +1,12 @@
-"""Minimising a `Problem` at fixed weights: scipy on the compressed problem, or Levenberg-Marquardt.
+"""Least squares of a `Problem` at fixed weights: scipy's `least_squares`, or a sparse Levenberg-Marquardt method.
 
-Both see the joint least-squares problem in cameras AND points. In compressed form, with S = U^T U the
-reduced matrix and g its gradient, f = (U^-T g, sqrt(cost - gain - |U^-T g|^2)) and J = (U; 0) have the
-cost, the gradient and the Gauss-Newton step of the full problem, in N q + 1 residuals. scipy's own tolerances end
+By default up to `SCIPY_UNKNOWNS` camera unknowns are minimised by `scipy.optimize.least_squares`, more of them by
+Gauss-Newton steps of the sparse system that are damped where one fails; a minimum that is only a stage of the robust
+rounds (a tolerance above `TOLERANCE`) always by the latter.
+
+Both solve the joint least-squares problem of cameras AND points, whose points are eliminated. scipy sees it compressed:
+with S = U^T U the reduced matrix and g its gradient, f = (U^-T g, sqrt(cost - gain - |U^-T g|^2)) and J = (U; 0) have
+the cost, the gradient and the Gauss-Newton step of the full problem, in N q + 1 residuals. scipy's own tolerances end
 its iteration; the last thing that it evaluates is the linearisation at the minimum, which the covariance comes from.
 """
 
@@ -28,6 +32,7 @@ from barpc.scene import BoolArray
 _LOG = logging.getLogger(__name__)
 
 TOLERANCE = 1e-6  # a solve ends when a step would lower the cost by less than this fraction
+SCIPY_UNKNOWNS = 200  # 22 views of nine: beyond, the dense products of `_Compressed` take over a tenth of an adjustment
 
 
 @dataclass(frozen=True)
@@ -80,15 +85,15 @@ def minimise(
     problem: Problem,
     state: State,
     weight: Array,
-    solver: str = "sparse",
+    solver: str = "auto",
     tolerance: float = TOLERANCE,
     projected: Projected | None = None,
 ) -> Minimum:
     """Minimise at fixed weights (K,) [1/px] from a state near the minimum.
 
     The step that is expected to gain less than `tolerance` of the cost is taken and is the last, and so is one
-    that is expected to leave a thousandth of it (see `_settled`). `projected` is `Problem.linearise` of the state,
-    and is used up.
+    that is expected to leave a thousandth of it (see `_settled`). `solver` is "scipy", "sparse" or "auto", which chooses
+    as the head of this module says. `projected` is `Problem.linearise` of the state, and is used up.
 
     Raises
     ------
@@ -96,18 +101,19 @@ def minimise(
         The cost is not finite, or no step lowers it.
     """
     start = time.process_time()
-    result = None
+    unknowns, result = int(problem.free.sum()), None
+    if solver == "auto":
+        solver = "scipy" if 0 < unknowns <= SCIPY_UNKNOWNS and tolerance <= TOLERANCE else "sparse"
     if solver == "scipy":
         try:
             result = _scipy(problem, state, weight, tolerance, projected)
         except np.linalg.LinAlgError as error:  # its SVD may fail on a finite matrix
             _LOG.warning("least_squares failed (%s): going on by Levenberg-Marquardt", error)
-            projected = None
+            solver, projected = "sparse", None
     if result is None:
         result = _levenberg_marquardt(problem, state, weight, tolerance, projected)
     seconds = time.process_time() - start
-    numbers = problem.free.sum(), result.state.cost, seconds
-    _LOG.info("%s: %d unknowns, cost %.6g, %.2f s", "scipy" if solver == "scipy" else "sparse", *numbers)
+    _LOG.info("%s: %d unknowns, cost %.6g, %.2f s", solver, unknowns, result.state.cost, seconds)
     return result
 
 
@@ -241,7 +247,7 @@ class _Compressed:
 
 
 def _scipy(problem: Problem, state: State, weight: Array, tolerance: float, projected: Projected | None) -> Minimum:
-    from scipy.optimize import least_squares  # a quarter of a second, and most runs end before they come here
+    from scipy.optimize import least_squares  # a twentieth of a second, which large blocks do not need
 
     compressed = _Compressed(problem, state, weight, projected)
     found = least_squares(
@@ -250,6 +256,8 @@ def _scipy(problem: Problem, state: State, weight: Array, tolerance: float, proj
         compressed.jacobian,
         method="trf",
         x_scale=10.0 * (1.0 + float(np.linalg.norm(compressed.whitened))),  # no first step cut short
+        tr_solver="lsmr",  # nearly the identity takes few products; "exact" decomposes it at every step
+        tr_options={"regularize": False, "atol": ROUNDING, "btol": ROUNDING},
         ftol=tolerance,
         xtol=ROUNDING,  # no step lowers the cost any more
         gtol=np.sqrt(tolerance),  # of whitened unknowns: a thousandth of a standard deviation for a millionth
