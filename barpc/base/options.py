@@ -335,8 +335,8 @@ class AdjustOptions(Options):
     )
     solver: Literal["auto", "scipy", "sparse"] = option(
         "auto",
-        """scipy's `least_squares` on the compressed problem, or a sparse Levenberg-Marquardt; `auto` takes scipy's up to
-        200 camera unknowns (22 views of nine).""",
+        """scipy's `least_squares` on the compressed problem, or a sparse Levenberg-Marquardt; `auto` takes scipy's for
+        up to 200 camera unknowns (22 views of nine).""",
     )
 
     def __post_init__(self) -> None:

@@ -19,13 +19,12 @@ from scipy.special import chdtrc, gammaincinv
 from barpc.ba.estimated.priors import FLOOR, CameraPrior, states_accuracy
 from barpc.ba.estimated.unknowns import Unknowns
 from barpc.ba.solving.covariance import Covariance
-from barpc.ba.solving.linear import factorize
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
-from barpc.base.usual import CHANCE, GROSS, ITERATIONS, LEVEL, SMALL, STANDS, STATED, SURE, TIMES
-from barpc.scene import BoolArray, View
+from barpc.base.usual import CHANCE, GROSS, ITERATIONS, KEPT, LEVEL, SMALL, STANDS, STATED, SURE, TIMES
+from barpc.scene import BoolArray, IntArray, View
 
 _LOG = logging.getLogger(__name__)
 
@@ -68,18 +67,98 @@ class _Around:
         """Return the evidence (logarithm, but for a constant), unknowns (N, q) and covariance under other priors."""
         now, reduced, start = self.problem.camera_prior, self.minimum.reduced, self.minimum.state.params
         free = self.problem.free
-        change = np.where(free, (1.0 / prior.sigma**2 - 1.0 / now.sigma**2).ravel(), 0.0)
-        given = reduced.plain(np.ones_like(free))
-        matrix = given + np.diag(change)
-        factor = factorize(matrix[np.ix_(free, free)])
-        covariance = Covariance(replace(reduced, matrix=matrix), factor, free)
-        offset = (start - now.mean).ravel()
-        step = -covariance.solve(change * offset)
-        moved = offset + step
-        cost = float(step @ (given @ step) + change @ moved**2)
-        held = free & np.isfinite(prior.sigma.ravel())
-        volume = factor.log_determinant + 2.0 * float(np.log(prior.sigma.ravel()[held]).sum())
-        return -0.5 * (cost + volume), start + step.reshape(start.shape), covariance
+        change = np.where(free.reshape(start.shape), 1.0 / prior.sigma**2 - 1.0 / now.sigma**2, 0.0)
+        other = reduced.with_diagonal(change)
+        factor = other.factor(free)
+        covariance = Covariance(other, factor, free)
+        offset = start - now.mean
+        step = -covariance.solve((change * offset).ravel()).reshape(start.shape)
+        # the data's own cost rises by -step (change moved), as the new minimum is where both pull alike
+        cost = float((change * (offset + step) * offset).sum())
+        volume = factor.log_determinant + float(_log_variance(prior.sigma, free).sum())
+        return -0.5 * (cost + volume), start + step, covariance
+
+    def posterior(self, prior: CameraPrior) -> _Posterior:
+        """Return what is known of every view under other priors."""
+        evidence, params, covariance = self.under(prior)
+        free = self.problem.free.reshape(params.shape)
+        return _Posterior(evidence, params - prior.mean, covariance.of_views(), prior.sigma, free, covariance)
+
+
+def _log_variance(sigma: Array, free: BoolArray) -> Array:
+    """Return the logarithms (N, q) of the variances of proper priors on free unknowns; 0 for all others."""
+    use = free.reshape(sigma.shape) & np.isfinite(sigma)
+    return 2.0 * np.log(sigma, where=use, out=np.zeros(sigma.shape))
+
+
+@dataclass(frozen=True, eq=False)
+class _Posterior:
+    """What is known of every view under some priors: other priors of a view are an update of rank q."""
+
+    evidence: float  # logarithm, but for a constant
+    offset: Array  # (N, q) unknowns minus their priors' means
+    blocks: Array  # (N, q, q) covariance of every view's unknowns
+    sigma: Array  # (N, q) of the priors
+    free: BoolArray  # (N, q)
+    start: Covariance  # of all unknowns, before the updates
+    # of every update the covariance (N, q, m) with the m unknowns whose priors changed, and M (m, m)
+    updates: tuple[tuple[Array, Array], ...] = ()
+
+    def _change(self, sigma: Array) -> Array:
+        """Return what the precisions of the priors change by (N, q) to other standard deviations (N, q)."""
+        return np.where(self.free, 1.0 / sigma**2 - 1.0 / self.sigma**2, 0.0)
+
+    def alone(self, sigma: Array) -> tuple[Array, Array, Array]:
+        """Return evidence (N,), offset (N, q) and variances (N, q) of every view if its prior alone were another.
+
+        With its change D of precision and its covariance C the determinant of all grows by |I + D C|, and the
+        inverse changes by C_v M C_v^T, M = (I + D C)^-1 D (matrix determinant lemma, Woodbury).
+        """
+        change = self._change(sigma)[:, :, None]
+        system = np.eye(sigma.shape[1]) + change * self.blocks
+        gain = np.linalg.solve(system, change * np.eye(sigma.shape[1]))
+        pulled = gain @ self.offset[:, :, None]
+        cost = (self.offset[:, :, None] * pulled).sum(axis=(1, 2))
+        sign, volume = np.linalg.slogdet(system)
+        volume += (_log_variance(sigma, self.free) - _log_variance(self.sigma, self.free)).sum(axis=1)
+        offset = self.offset - (self.blocks @ pulled)[:, :, 0]
+        less = (self.blocks @ gain * self.blocks).sum(axis=2)
+        evidence = np.where(sign > 0, self.evidence - 0.5 * (cost + volume), -np.inf)
+        return evidence, offset, self.blocks.diagonal(axis1=1, axis2=2) - less
+
+    def under(self, prior: CameraPrior, around: _Around) -> _Posterior:
+        """Return the same under other priors, which differ in few views from those that it has."""
+        change = self._change(prior.sigma)
+        views = np.flatnonzero(change.any(axis=1))
+        if not len(views):
+            return replace(self, sigma=prior.sigma)
+        rows = (views[:, None] * change.shape[1] + np.arange(change.shape[1])).ravel()
+        if (len(self.updates) + 1) * change.size * len(rows) > 30 * KEPT:  # 240 MB
+            return around.posterior(prior)
+        columns = self._columns(rows)
+        own, offset = columns.reshape(-1, len(rows))[rows], self.offset[views].ravel()
+        system = np.eye(len(rows)) + change[views].reshape(-1, 1) * own
+        gain = np.linalg.solve(system, np.diag(change[views].ravel()))
+        pulled = gain @ offset
+        volume = np.linalg.slogdet(system)[1]
+        volume += (_log_variance(prior.sigma, self.free) - _log_variance(self.sigma, self.free)).sum()
+        return replace(
+            self,
+            evidence=self.evidence - 0.5 * float(offset @ pulled + volume),
+            offset=self.offset - columns @ pulled,
+            blocks=self.blocks - columns @ gain @ columns.swapaxes(1, 2),
+            sigma=prior.sigma,
+            updates=(*self.updates, (columns, gain)),
+        )
+
+    def _columns(self, rows: IntArray) -> Array:
+        """Return the covariance (N, q, m) of all unknowns with m of them."""
+        unit = np.zeros((self.offset.size, len(rows)))
+        unit[rows, np.arange(len(rows))] = 1.0
+        out = self.start.solve(unit).reshape(*self.offset.shape, -1)
+        for columns, gain in self.updates:
+            out -= columns @ (gain @ columns.reshape(-1, columns.shape[2])[rows].T)
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,56 +339,64 @@ class Variances:
         """Return the factors (N,) by which each view's prior is widened, and the views that are odd."""
         n = len(params)
         total, freedom = self._squares(params, known)
+        common = np.full(n, self._common(total, freedom))
+        if n <= 2:
+            return common, np.zeros(n, dtype=bool)
+        both, beyond, together = self._odd(around, wide, common)
+        few, odd, alone = self._odd(around, wide, np.ones(n), together)
+        if alone >= together + _LIKELIER:
+            return few, odd
+        if beyond.any():  # which the others need not be as wide for
+            both = np.where(beyond, both, self._common(total[~beyond], freedom[~beyond]))
+        return (np.maximum(few, both) if alone >= together - SURE else both), beyond  # priors that cover either
+
+    def _common(self, total: Array, freedom: Array) -> float:
+        """Return the factor by which the priors of views are widened together, by their squares and freedoms (n,)."""
         factor = max((STATED + total.sum()) / (STATED + freedom.sum()), 1.0)
         if self.cautious:
             factor = max(factor, _possible(total.sum(), freedom.sum()))
-        odd = np.zeros(n, dtype=bool)
-        if around.small and n > 2:
-            common = np.full(n, np.sqrt(factor))
-            scale, alone, evidence = self._odd(around, wide)
-            together = around.under(self._prior(common, wide))[0]
-            evidence -= float(np.log(n))  # of the choice among the views
-            if evidence >= together + _LIKELIER:
-                return scale, alone
-            both_may_be = evidence >= together - SURE  # the priors cover both
-            return (np.maximum(scale, common) if both_may_be else common), odd
-        if n > 2 and not around.small:  # one view of many is seen at once
-            own = np.median(total[freedom > _LEAST] / freedom[freedom > _LEAST])
-            factor = max((STATED + own * freedom.sum()) / (STATED + freedom.sum()), 1.0)
-            odd = np.asarray(chdtrc(np.maximum(freedom, _LEAST), total / factor) < LEVEL / n)
-        alone = (STATED * factor + total) / (STATED + freedom)
-        return np.sqrt(np.where(odd, np.maximum(alone, factor), factor)), odd
+        return float(np.sqrt(factor))
 
-    def _odd(self, around: _Around, wide: Array) -> tuple[Array, BoolArray, float]:
-        """Find a few views whose cameras explain the corrections, by forward selection, and the evidence for them."""
-        n = len(self.given.sigma)
-        odd, chosen = np.zeros(n, dtype=bool), np.ones(n)
-        scale, last = np.ones(n), -np.inf
-        for _ in range(max(1, n // 3)):
-            tried = {v: self._alone(around, wide, chosen, v) for v in np.flatnonzero(chosen == 1.0).tolist()}
-            best = max(tried, key=lambda v: tried[v][0])
-            if tried[best][0] < last + SURE:
+    def _odd(
+        self, around: _Around, wide: Array, usual: Array, rival: float | None = None
+    ) -> tuple[Array, BoolArray, float]:
+        """Find a few views whose cameras explain the corrections beside those of `usual` widened priors (N,), by
+        forward selection: the factors, the views and the evidence for them.
+
+        One is added of those that share points, at a time, where it is likelier than its choice among all views. Where
+        there is the evidence of a rival, one at least is chosen, and none once they cannot come near it: what further
+        ones add becomes less.
+        """
+        n = len(usual)
+        odd, chosen, scale = np.zeros(n, dtype=bool), usual.copy(), usual.copy()
+        known, price, count = around.posterior(self._prior(usual, wide)), float(np.log(n)), 0
+        while count < max(1, n // 3):
+            evidence, size = self._alone(known, wide, chosen)
+            evidence[chosen > usual] = -np.inf
+            gains = np.sort(evidence - known.evidence)
+            if rival is not None and known.evidence + gains[n - n // 3 + count :].clip(0.0).sum() < rival - SURE:
+                return usual, np.zeros(n, dtype=bool), -np.inf
+            pairs = around.problem.structure.pair_view
+            tops = _first_of_largest(evidence, pairs)
+            tops &= evidence - known.evidence >= (gains[-1] if rival is not None and not count else max(SURE, price))
+            if not tops.any():
                 break
-            last = tried[best][0]
-            for v, (evidence, size) in tried.items():
-                if evidence > last - SURE:  # as good an explanation as the best
-                    odd[v], scale[v] = True, size
-            chosen[best] = tried[best][1]
-        return scale, odd, last
+            chosen_near = _largest(np.where(tops, evidence, -np.inf), pairs)
+            as_good = (chosen_near > -np.inf) & (evidence > chosen_near - SURE)  # explain as well as one that is
+            odd, scale = odd | as_good, np.where(as_good, np.maximum(size, scale), scale)
+            chosen[tops] = size[tops]
+            known, count = known.under(self._prior(chosen, wide), around), count + int(tops.sum())
+        return scale, odd, known.evidence - count * price
 
-    def _alone(self, around: _Around, wide: Array, scale: Array, v: int) -> tuple[float, float]:
-        """Return the evidence for view v being odd as well, and the factor that its prior then needs."""
-        trial = scale.copy()
-        trial[v] = GROSS
-        prior = self._prior(trial, wide)
-        try:
-            _, params, covariance = around.under(prior)
-        except np.linalg.LinAlgError:
-            return -np.inf, 1.0
-        known = self._known(covariance, prior)
-        total, freedom = (part[v] for part in self._squares(params, known))
-        trial[v] = max(np.sqrt((STATED + total) / (STATED + freedom)), 1.0)
-        return around.under(self._prior(trial, wide))[0], float(trial[v])
+    def _alone(self, known: _Posterior, wide: Array, scale: Array) -> tuple[Array, Array]:
+        """Return the evidence (N,) for each view being odd as well, and the factor that its prior then needs."""
+        prior = self._prior(np.maximum(scale, GROSS), wide)
+        _, offset, variance = known.alone(prior.sigma)
+        seen = 1.0 - variance / prior.sigma**2
+        seen = np.where(known.free & np.isfinite(prior.sigma), seen.clip(0.0, 1.0), 0.0)
+        total, freedom = self._squares(offset + self.given.mean, seen)
+        size = np.maximum(np.sqrt((STATED + total) / (STATED + freedom)), scale)
+        return known.alone(self._prior(size, wide).sigma)[0], size
 
     def _drift(self, params: Array, known: Array) -> Array:
         """Return the factors (D,) on the drift's standard deviations, the given ones counting for a few."""
@@ -322,6 +409,23 @@ class Variances:
             if careful and freedom > _LEAST and chdtrc(freedom, total) < CHANCE:
                 factors[degree] = max(factors[degree], _possible(total, freedom))
         return np.sqrt(factors)
+
+
+def _largest(values: Array, pairs: IntArray) -> Array:
+    """Return the largest (N,) of the values of every view and of those that it shares points with."""
+    i, j = pairs.T
+    out = values.copy()
+    np.maximum.at(out, i, values[j])
+    np.maximum.at(out, j, values[i])
+    return out
+
+
+def _first_of_largest(values: Array, pairs: IntArray) -> BoolArray:
+    """Return whether every view (N,) has the largest value of those that it shares points with; the first of equals."""
+    i, j = pairs.T
+    tops: BoolArray = values == _largest(values, pairs)
+    tops[j[tops[i] & tops[j]]] = False
+    return tops
 
 
 def _possible(total: float, freedom: float) -> float:

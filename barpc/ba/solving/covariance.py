@@ -47,6 +47,13 @@ class Covariance:
             return self.full.diagonal().reshape(-1, self.num_unknowns)
         return np.asarray(self._near.diagonal.diagonal(axis1=1, axis2=2))
 
+    def of_views(self) -> Array:
+        """Return the covariances (N, q, q) of every view's unknowns."""
+        if self.factor.inverse is not None:
+            return self._near.diagonal
+        q, every = self.num_unknowns, np.arange(len(self.free) // self.num_unknowns)
+        return np.asarray(self.full.reshape(-1, q, len(every), q)[every, :, every])
+
     def probed_variances(self) -> Array:
         """Estimate the variances (N, q) by random probes (Hutchinson 1990) at the cost of a few solutions:
         each within a quarter (RMS).

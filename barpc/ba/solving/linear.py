@@ -137,9 +137,10 @@ class Cholesky:
         beyond = len(front.pivots) + np.searchsorted(rank[front.border], rank[views])
         return np.where(own < len(front.pivots), own, beyond)
 
-    def factorize(self, damping: float) -> None:
-        """Factorise a matrix, its diagonal larger by a share `damping` of itself."""
+    def factorize(self, damping: float) -> float:
+        """Factorise a matrix, its diagonal larger by a share `damping` of itself; the logarithm of its determinant."""
         left: dict[int, list[tuple[IntArray, Array]]] = {}
+        volume = 0.0
         for number, front in enumerate(self.order.fronts):
             matrix, split = self._assembled(number, front, damping), len(front.pivots) * self._size
             for views, rest in left.pop(number, ()):
@@ -147,12 +148,14 @@ class Cholesky:
             upper, failed = dpotrf(matrix[:split, :split], lower=1, clean=0)
             if failed:
                 raise np.linalg.LinAlgError(f"{failed}-th leading minor not positive definite")
+            volume += 2.0 * float(np.log(upper.diagonal()).sum())
             lower = dtrsm(1.0, upper, matrix[split:, :split], side=1, lower=1, trans_a=1)
             self.parts.append(upper)
             self.parts.append(lower)
             if front.parent >= 0:
                 rest = dsyrk(-1.0, lower, beta=1.0, c=matrix[split:, split:], lower=1)
                 left.setdefault(front.parent, []).append((front.border, rest))
+        return volume
 
     def _assembled(self, number: int, front: Front, damping: float) -> Array:
         """Return the matrix's own part of a front: what its pivots have, the lower triangle."""
@@ -274,7 +277,7 @@ class Factor:
     method: str  # "dense" or "multifrontal"
     inverse: Callable[[], Blocks] | None = None  # the inverse's blocks where the matrix has some, if it has blocks
     whole_inverse: Callable[[], Array] | None = None  # (n, n), of a dense one
-    log_determinant: float = np.nan  # of the matrix, of a dense one
+    log_determinant: float = np.nan  # of the matrix
 
 
 def factorize(matrix: Array, damping: float = 0.0) -> Factor:
@@ -311,8 +314,8 @@ def factorize_blocks(matrix: Blocks, order: Dissection, damping: float = 0.0, le
     """Factorise S, of the views in an order of elimination, less B^T B of a few rows `less` (m, n)."""
     _check(matrix.diagonal)
     cholesky = Cholesky(matrix, order)
-    cholesky.factorize(damping)
-    factor = Factor(cholesky.solve, "multifrontal", cholesky.inverse)
+    volume = cholesky.factorize(damping)
+    factor = Factor(cholesky.solve, "multifrontal", cholesky.inverse, log_determinant=volume)
     return factor if less is None else _updated(factor, less, order)
 
 
@@ -341,4 +344,5 @@ def _updated(factor: Factor, less: Array, order: Dissection) -> Factor:
         found.pairs[...] += by_view[i] @ by_view[j].swapaxes(1, 2)
         return found
 
-    return Factor(solve, factor.method, inverse)
+    volume = factor.log_determinant + 2.0 * float(np.log(upper.diagonal()).sum())
+    return Factor(solve, factor.method, inverse, log_determinant=volume)

@@ -8,7 +8,7 @@ points: they couple all cameras, so that what they take off S stays apart from i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -78,6 +78,13 @@ class Reduced:
         order = self.structure.order(free[:: self.cross.shape[2]])
         less = None if self.common is None else self.common.by_camera[:, free]
         return factorize_blocks(self.matrix, order, damping, less)
+
+    def with_diagonal(self, more: Array) -> Reduced:
+        """Return the same with (N, q) added to S's diagonal: what priors on single unknowns know."""
+        if isinstance(self.matrix, np.ndarray):
+            return replace(self, matrix=self.matrix + np.diag(more.ravel()))
+        diagonal = self.matrix.diagonal + more[:, :, None] * np.eye(more.shape[1])
+        return replace(self, matrix=replace(self.matrix, diagonal=diagonal))
 
     def with_joint(self, index: IntArray, information: Array) -> Matrix:
         """Return S and the information (n, n) of unknowns `index` (n,), which are those of views that are joined."""
