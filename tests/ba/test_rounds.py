@@ -225,13 +225,34 @@ def test_a_cut_that_changes_little_is_not_solved_again(monkeypatch) -> None:
     assert passes == [6, 2]  # no more than six, and never less than two
 
 
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
+def test_accuracies_stated_far_too_well_leave_no_trace_once_they_are_learnt(seed: int) -> None:
+    """What views could not follow under them weighed down their ties, and nothing else may go by it at the end."""
+    made = simulate_block(10, 3000, seed=seed)
+    right, narrow = (
+        adjust_tracks(made.views, made.tracks, AdjustOptions(min_convergence=0.01, **stated))
+        for stated in ({}, {"sigma_attitude": 2.0, "sigma_position": 0.3})
+    )
+    assert narrow.prior.scale.min() > 4.0
+    assert narrow.noise == pytest.approx(right.noise, rel=2e-3)
+    assert made.held_out_rms(list(narrow.sensors)) < 0.0075
+
+
 # --- when they end, by script -------------------------------------------------------------------------------------
 
 
 def passes(
-    monkeypatch, cut: list[int], noise: list[float], prior: list[float], known: bool = False, **given: Any
+    monkeypatch,
+    cut: list[int],
+    noise: list[float],
+    prior: list[float],
+    known: bool = False,
+    misfit: tuple[float, ...] = (0.0,),
+    **given: Any,
 ) -> tuple[int, list[int]]:
     """Number of passes where so many of 10,000 observations are cut, such noise is seen and such priors are learnt.
+
+    And where views have such a misfit, by whose square weights shrink.
 
     The last of each goes on for ever. Also before which passes tracks were revived.
     """
@@ -251,7 +272,10 @@ def passes(
             self.passes, self.noise, self.robust, self.is_known = 0, noise[0], options.loss != "linear", known
             self.goes_on, self.learnt = known, None
             self.heights: Any = SimpleNamespace(hold=lambda problem, points: problem)
-            self.observations: Any = SimpleNamespace(sigma=np.ones(10_000))
+            self.observations: Any = SimpleNamespace(
+                sigma=np.ones(10_000), weight=lambda use, noise, misfit: use / (noise * (1.0 + misfit**2))
+            )
+            self.misfit = misfit[0]
             self.variances: Any = SimpleNamespace(learnt=lambda *_: (learnt(self.passes), SimpleNamespace(shared=1.0)))
             self.smooth: Any = SimpleNamespace(test_neighbours=lambda *_: "smooth")
             self.residual = self.weight = np.zeros(1)
@@ -266,9 +290,11 @@ def passes(
 
         def _solve(self) -> Any:
             self.projected: Any = SimpleNamespace(by_point=np.zeros(0))
+            self.weight = self.observations.weight(self.use, self.noise, self.misfit)
             return self.found
 
         def _estimate_noise(self) -> Any:
+            self.misfit = misfit[min(self.passes, len(misfit) - 1)]
             self.noise = noise[min(self.passes, len(noise) - 1)]
 
     made = Scripted()
@@ -287,6 +313,9 @@ def passes(
     [
         ([0], [1.0], [1.0], {}, 2),  # never less than two
         ([0], [1.0], [1.0], {"loss": "linear"}, 1),
+        ([0], [1.0], [1.0], {"misfit": (0.0, 2.0, 2.04)}, 2),  # of weights 1/5 and 1/5.16
+        ([0], [1.0], [1.0], {"misfit": (0.0, 2.0, 2.1)}, 3),
+        ([0], [1.0], [1.0], {"misfit": (0.0, 2.0, 0.5)}, 3),
         ([0, 10], [1.0], [1.0], {}, 2),  # a thousandth
         ([0, 11], [1.0], [1.0], {}, 3),
         ([0, 11, 22, 33, 44, 55, 66, 77], [1.0], [1.0], {}, 6),  # and no more than six

@@ -252,10 +252,10 @@ def test_one_at_least_is_odd_beside_a_rival_and_none_beside_all_that_are_wide(mo
 
 
 def test_what_cannot_come_near_its_rival_any_more_is_left(monkeypatch) -> None:
-    """Two of six may be odd, and the second adds no more than the first."""
-    gains = {(1,): 20.0, (1, 4): 39.0}
-    assert forward(monkeypatch, gains, rival=43.9)[0] == [1, 4]
-    odd, scale, evidence = forward(monkeypatch, gains, rival=44.1)
+    """Two of six may be odd, and together they add no more than each by itself."""
+    gains = {(1,): 20.0, (4,): 12.0, (1, 4): 31.0}
+    assert forward(monkeypatch, gains, rival=35.9)[0] == [1, 4]
+    odd, scale, evidence = forward(monkeypatch, gains, rival=37.1)
     assert (odd, evidence) == ([], -np.inf)
     np.testing.assert_array_equal(scale, 1.0)
 

@@ -127,7 +127,7 @@ class Rounds:
 
     def _cut_and_solve(self, once: bool) -> Outcome | None:
         """Return one pass; the outcome where it is the last."""
-        options, was_in_use, noise = self.options, self.use, self.noise
+        was_in_use = self.use
         many_cut = self.use.sum() < (1.0 - _MANY_CUT) * self.everything.sum()
         if self.robust and self.passes and many_cut:
             weight = self.everything / self.observations.sigma
@@ -143,7 +143,7 @@ class Rounds:
         _LOG.info("pass %d: %d of %d observations, noise %.3f", *numbers)
         again = self.passes > 1 or self.goes_on
         same = again and int((self.use != was_in_use).sum()) <= SLIGHT * len(self.use)
-        settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < STANDS
+        settled = self._weights_stand()
         # what is known of the place goes with what is shared, and nothing else learns of it
         share = STANDS if tested.shared > 1.0 else SAME_PRIOR
         settled &= same_prior(prior, self.problem.camera_prior, share)
@@ -166,6 +166,12 @@ class Rounds:
             )
         self.problem, self.learnt = replace(self.problem, camera_prior=prior), tested
         return None
+
+    def _weights_stand(self) -> bool:
+        """Return whether the noise and the misfit of this solution would weigh observations as they were for it."""
+        noise = self.noise if self.options.estimate_noise else 1.0
+        next_weight = self.observations.weight(self.use, noise, self.misfit)[self.use]
+        return bool((np.abs(self.weight[self.use] / next_weight - 1.0) < STANDS).all())
 
     def _cut(self) -> None:
         """Cut observations by residuals without their smooth part."""
