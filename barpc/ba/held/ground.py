@@ -27,7 +27,6 @@ KNOWN_BIAS = 5.0  # m: the same, where it is known what its heights count from
 ALIKE = 25.0  # independent errors that those of a reference are worth together, at most: they resemble each other
 _STAYS = 1.0  # m: rays of weak points tell heights to hundreds of metres (0.05 m under 0.01 degrees: 290 m)
 _FLAT_SIGMA = 50.0  # m: least spread of altitudes that tracks held without a DEM are given
-_TOGETHER = 0.25  # of it: what their mean may be wrong by (RPCs' ranges lie about the terrain, roughly)
 
 
 def _join(priors: Sequence[PointPrior | None]) -> PointPrior | None:
@@ -187,7 +186,7 @@ class Heights:
     tracks: IntArray  # (T,) points that are tracks (GCPs are held already)
     alt_range: tuple[float, float]  # altitudes [m] to expect where no other track tells
     options: AdjustOptions  # `dem_sigma`, `dem_bias_sigma`, `dem_for_weak`
-    dem: Terrain | None  # none: weak tracks are held to the altitude of the others, within their spread
+    dem: Terrain | None  # none: weak tracks resemble the others in height, wherever these are
     reference: Reference | None = None  # whose heights are the DEM's
     has_control: bool = False  # whether GCPs hold the scene's place
     relief: Relief | None = None  # the DEM beside what rays alone say of heights, where these may judge it
@@ -241,14 +240,14 @@ class Heights:
             level = None if self.relief is None else ~weak[chosen]
             sigma = self.options.dem_sigma * alike**0.5
             return terrain_heights(points, index, dem, sigma, self._bias, span, level)
-        others = self.tracks[~weak]
+        others, (lowest, highest) = self.tracks[~weak], self.alt_range
+        middle, sigma = 0.5 * (lowest + highest), 0.5 * (highest - lowest)
         if len(others) >= 10:
             low, middle, high = np.percentile(ground_from_ecef(points[others])[:, 2], [5, 50, 95])
-        else:
-            low, high = self.alt_range
-            middle = 0.5 * (low + high)
-        sigma = max(float(high - low) * (1.0 if len(others) >= 10 else 0.5), _FLAT_SIGMA)
-        return flat_heights(points, index, float(middle), sigma, _TOGETHER * sigma)
+            sigma = high - low
+        # what they all are off by is told by the cameras, as far as they tell it: that heights of tracks just above
+        # the least angle are right is known to nobody, and of the altitudes of an RPC that they lie within its range
+        return flat_heights(points, index, float(middle), max(float(sigma), _FLAT_SIGMA), highest - lowest)
 
     @property
     def is_whole(self) -> bool:
