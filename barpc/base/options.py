@@ -403,11 +403,6 @@ class FitOptions(Options):
         """Fit the localisation RPC, too: lon, lat as quotients of cubics of col, row and altitude, which txt, json and
         vrt files hold.""",
     )
-    allow_mirrored: bool = option(
-        False,
-        """Accept points that show the ground mirrored (as radar images do) without suspecting that two columns are
-        swapped.""",
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -145,6 +145,7 @@ class RpcFit:
     contradiction : float
         Largest distance of a check point from where the model, not the RPC, projects the ground that it localises
         there [px]; 0 for given points. What else projects with the model may be off by as much more.
+    axes : str, exchanged longitude and latitude, or the altitude's sign, of a model, in words
     reason : Reason or None, cause of a miss of the tolerance, of a model
     """
 
@@ -164,6 +165,7 @@ class RpcFit:
     method: str
     localisation: Localisation | None = None
     contradiction: float = 0.0
+    axes: str = ""
     reason: Reason | None = None
 
     def __repr__(self) -> str:
@@ -197,6 +199,8 @@ class RpcFit:
                 f"away, wanted {tolerance:g}: `project` and `localize` are not of one camera (an altitude left out of "
                 "one, coordinates exchanged, half a pixel)"
             )
+        if self.axes:
+            return self.axes
         if not worst <= tolerance:
             return (
                 f"the RPC misses its check points by up to {worst:.3g} px (RMSE col {self.rmse_ckp[0]:.3g}, "

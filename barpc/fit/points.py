@@ -116,14 +116,14 @@ def column_ranges(points: Array) -> tuple[Array, Array]:
     return np.array([c.min() for c in columns]), np.array([c.max() for c in columns])
 
 
-def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) -> tuple[Array, Array]:
-    """Return `checked_points`; FitError for swapped columns (unless `allow_mirrored`) or points that make no RPC."""
+def screened(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array, bool]:
+    """Return `checked_points`, and whether they show the ground mirrored; FitError for points that make no RPC."""
     ground, image = checked_points(ground, image)
-    _check_geometry(ground, image, allow_mirrored)
+    mirrored = _is_mirrored(_checked_slope(ground, image))
     distinct = len(np.unique(ground, axis=0)) if len(ground) < 400 else len(ground)
     if distinct < min(len(ground), 40):
         raise FitError(f"points: only {distinct} of {len(ground)} are distinct, too few for an RPC")
-    return ground, image
+    return ground, image, mirrored
 
 
 def checked_points(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
@@ -150,7 +150,8 @@ def checked_points(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, 
     return ground, image
 
 
-def _check_geometry(ground: Array, image: Array, allow_mirrored: bool) -> None:
+def _checked_slope(ground: Array, image: Array) -> Array:
+    """Return d(col, row) / d(east, north) (2, 2) [px/m]; FitError for points on a line or in a plane."""
     (low, left), (high, right) = zip(column_ranges(ground), column_ranges(image), strict=True)
     low, high = np.concatenate([low, left]), np.concatenate([high, right])
     span = high - low
@@ -166,10 +167,9 @@ def _check_geometry(ground: Array, image: Array, allow_mirrored: bool) -> None:
                 f"points: {where} they lie {'in a plane' if len(axes) == 3 else 'on a line'}; an RPC needs "
                 "points at several altitudes everywhere"
             )
-    if not allow_mirrored:
-        slope = np.linalg.solve(covariance[np.ix_(used, used)], covariance[np.ix_(used, [3, 4])])
-        metres = span[:2] * metres_per_unit(0.5 * (low[:3] + high[:3]))[:2]
-        _check_order(slope[:2].T * span[3:, None] / metres)
+    slope = np.linalg.solve(covariance[np.ix_(used, used)], covariance[np.ix_(used, [3, 4])])
+    metres = span[:2] * metres_per_unit(0.5 * (low[:3] + high[:3]))[:2]
+    return np.asarray(slope[:2].T * span[3:, None] / metres)
 
 
 def _covariance(ground: Array, image: Array, center: Array, span: Array) -> Array:
@@ -184,16 +184,11 @@ def _covariance(ground: Array, image: Array, center: Array, span: Array) -> Arra
     return np.asarray(squares / len(ground) - np.outer(total, total) / len(ground) ** 2)
 
 
-def _check_order(jacobian: Array) -> None:
-    """Refuse an image mirrored as given whose d(col, row) / d(east, north) [px/m] is square and upright."""
+def _is_mirrored(jacobian: Array) -> bool:
+    """Return whether an image whose d(col, row) / d(east, north) [px/m] is square and upright is mirrored."""
     a, b = np.linalg.norm(jacobian, axis=1)
     square = 0.5 < a / b < 2.0 and abs(jacobian[0] @ jacobian[1]) < 0.5 * a * b
-    if np.linalg.det(jacobian) < 0 or not square:  # rows run down: a view from above is < 0
-        return
-    raise FitError(
-        "points: they show the ground mirrored, as if col and row or lon and lat were swapped; give "
-        "lon, lat, alt and col, row (and allow_mirrored for a radar image that is mirrored)"
-    )
+    return bool(square and np.linalg.det(jacobian) > 0)  # rows run down: a view from above is < 0
 
 
 # --- points that the fit has not seen ----------------------------------------------------------------------

@@ -13,13 +13,13 @@ import numpy.typing as npt
 from barpc.base.errors import BarpcWarning, FitError
 from barpc.base.geodesy import CHUNK, Array, wrap_longitude
 from barpc.base.options import FitOptions
+from barpc.fit.axes import wrong_axes
 from barpc.fit.certificate import Localisation, RpcFit, coverage, off, reason, roundtrip
 from barpc.fit.methods import BOUNDED, FitSolution, solve, solve_problem
 from barpc.fit.points import EXACT, Errors, Sample, checked_points, column_ranges, control_points, screened, widened
 from barpc.fit.system import FitProblem, Normalization
 from barpc.sensor import SensorModel
 from barpc.sensor.displaced import Splined
-from barpc.sensor.geometry import is_radar
 from barpc.sensor.rpc import RPC
 
 Seen = Callable[[RPC, FitSolution], tuple[Errors, Array]]
@@ -53,8 +53,9 @@ def fit_rpc(
     Raises
     ------
     FitError
-        The model cannot be localised over the image, its two directions contradict each other, it shows the ground
-        mirrored (and is neither a radar nor built on an RPC), or the RPC does not reach the tolerance.
+        The model cannot be localised over the image, its two directions contradict each other, it exchanges longitude
+        and latitude or the altitude's sign (`wrong_axes`, not of one built on an RPC), or the RPC does not reach the
+        tolerance.
 
     Warns
     -----
@@ -62,16 +63,16 @@ def fit_rpc(
     """
     options, alt_range, vendor = options or FitOptions(), widened(alt_range), underlying_rpc(model)
     sample = _sampled(model, size, alt_range)
-    mirrored = options.allow_mirrored or vendor is not None or is_radar(innermost(model))
-    screened(sample.ground, sample.points[:, :2], mirrored)
+    screened(sample.ground, sample.points[:, :2])
     contradiction = sample.contradiction()
+    axes = "" if vendor is not None else wrong_axes(model, size, alt_range)  # an RPC's lines of sight are cubics' own
     given, seen = partial(_given, model, size, alt_range, options), partial(_missed, sample)
 
     def attempt(method: str, source: SensorModel = model) -> RpcFit:
         solution = solve(*_given(source, size, alt_range, options, method), options, method, vendor=vendor)
         loop, beyond = roundtrip(solution.rpc, sample.ground), 1.0 - 0.05 ** (1.0 / sample.count)
         errors = sample.errors(solution.rpc)
-        return replace(_certified(solution, *errors, loop, size, beyond), contradiction=contradiction)
+        return replace(_certified(solution, *errors, loop, size, beyond), contradiction=contradiction, axes=axes)
 
     try:
         fit = _best(attempt, options, vendor, False, exact=True)
@@ -161,10 +162,18 @@ def fit_rpc_points(
     Raises
     ------
     FitError
-        Too few points, not finite, swapped columns, points in a plane; or the tolerance is not reached.
+        Too few points, not finite, out of range, points in a plane; or the tolerance is not reached.
+
+    Warns
+    -----
+    BarpcWarning : the points show the ground mirrored
     """
     options = options or FitOptions()
-    given = cnp, cnp_image = screened(ground, image, options.allow_mirrored)
+    cnp, cnp_image, mirrored = screened(ground, image)
+    given = cnp, cnp_image
+    if mirrored:
+        message = "points: they show the ground mirrored: the image is, or two of lon, lat or of col, row are exchanged"
+        warnings.warn(message, BarpcWarning, stacklevel=2)
     weight = relative_weight(sigma, len(cnp))
     held_out = None if check is None else checked_points(*check)
 

@@ -56,6 +56,18 @@ def test_points_become_an_rpc_file_that_reads_back(
     assert run("fit", tmp_path / "p.npz", "-o", out, "--overwrite") == 0
 
 
+@pytest.mark.filterwarnings("default:points")
+def test_a_table_that_mirrors_the_ground_is_fitted_and_said(
+    camera: Camera, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    ground, image = random_points(camera, 300, np.random.default_rng(0))
+    for name, columns, said in (("plain", [0, 1, 2], False), ("exchanged", [1, 0, 2], True)):
+        np.savez(tmp_path / f"{name}.npz", ground=ground[:, columns], image=image)
+        assert run("fit", tmp_path / f"{name}.npz", "-o", tmp_path / f"{name}_RPC.TXT") == 0
+        assert ("show the ground mirrored" in caplog.text) == said
+        assert np.abs(read_rpc(tmp_path / f"{name}_RPC.TXT").project(ground[:, columns]) - image).max() < 1e-5
+
+
 def test_a_miss_exits_3_and_writes_nothing_unless_forced(
     camera: Camera, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,0 +1,274 @@
+"""Handedness refuses no model; its lines of sight tell exchanged axes, and never those of an honest one."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barpc.base.errors import FitError
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.cameras import open_camera
+from barpc.fit import FitOptions, fit_rpc
+from barpc.fit.axes import wrong_axes
+from barpc.sensor.direct_grid import DirectGrid
+from barpc.simulate import Look, fly
+from tests.fit.cameras import adjusted, synthetic_rpc
+from tests.fit.models import Bent, Frame, hard, waves
+
+SIZE, ALTS = (12000, 9000), (0.0, 1000.0)
+EXCHANGED, NEGATIVE = "with longitude and latitude exchanged", "with the altitude's sign changed"
+Case = tuple[Any, tuple[int, int], tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Changed:
+    """Two methods of a model, all that a fit asks for, and what is done to its ground or its image."""
+
+    model: Any
+    change: str = ""
+    size: tuple[int, int] = SIZE
+
+    def _ground(self, ground: Array) -> Array:
+        if self.change == EXCHANGED:
+            return ground[..., [1, 0, 2]]
+        return ground * [1.0, 1.0, -1.0] if self.change == NEGATIVE else ground
+
+    def _image(self, image: Array) -> Array:
+        if self.change == "transposed":
+            return image[..., ::-1]
+        flipped = [name in self.change for name in ("columns", "rows")]
+        return np.where(flipped, np.array(self.size) - 1 - image, image)
+
+    def project(self, ground: Array) -> Array:
+        return self._image(self.model.project(self._ground(ground)))
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        alt = -alt if self.change == NEGATIVE else alt
+        return self._ground(self.model.localize(self._image(image), alt))
+
+
+@dataclass(frozen=True)
+class Radar:
+    """Zero-Doppler images from a straight flight: X where it is abeam and `near` + col * spacing m away."""
+
+    lon: float
+    lat: float
+    heading: float
+    side: float  # 1: looks to the right
+    ground_range: bool = False
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        image, alt = np.broadcast_arrays(image, np.asarray(alt)[..., None])
+        target = np.array([self.lon, self.lat, 0.0])
+        axes = enu_basis(target)
+        turn = np.radians(self.heading)
+        ahead = axes.T @ [np.sin(turn), np.cos(turn), 0.0]
+        right = axes.T @ [np.cos(turn), -np.sin(turn), 0.0]
+        up = axes[2]
+        start = ecef_from_ground(target) + 600e3 * up - self.side * 400e3 * right
+        along = ahead * (image[..., 1:] - SIZE[1] / 2) * 1.5
+        far = 5e4 * (image[..., :1] / SIZE[0] - 0.5)
+        slant = np.sqrt(600e3**2 + (400e3 + far) ** 2) if self.ground_range else 721e3 + 0.55 * far
+        angle = np.full(slant.shape, np.arctan2(400e3, 600e3))
+        for _ in range(12):  # the look angle at which the beam's circle has the altitude
+            place = start + along + slant * (np.sin(angle) * self.side * right - np.cos(angle) * up)
+            turned = slant * (np.cos(angle) * self.side * right + np.sin(angle) * up)
+            normal = enu_basis(ground_from_ecef(place))[..., 2, :]
+            rise = (turned * normal).sum(axis=-1, keepdims=True)
+            angle = angle + (alt[..., :1] - ground_from_ecef(place)[..., 2:]) / rise
+        return ground_from_ecef(place)
+
+
+@cache
+def own() -> dict[str, Case]:
+    """Name -> model, size, altitude range of models of many kinds, made without a file."""
+    found: dict[str, Case] = {}
+    for place in ((5.4, 0.7), (48.0, 43.2), (-71.0, -33.0), (18.0, 70.0)):
+        for scan in (0, 90, 190, 280):
+            look = Look(incidence=3.0 + scan / 12, azimuth=float(scan) + 77.0, scan=float(scan))
+            found[f"pushbroom {place}, scan {scan}"] = fly(np.array([*place, 200.0]), look, SIZE, 0.5), SIZE, ALTS
+    plain = found["pushbroom (48.0, 43.2), scan 190"][0]
+    for change in ("columns", "rows", "rows and columns"):
+        found[f"pushbroom, {change} reversed"] = Changed(plain, change), SIZE, ALTS
+    found["pushbroom, transposed"] = Changed(plain, "transposed"), SIZE[::-1], ALTS
+    found["pushbroom, a crop"] = plain, (400, 300), ALTS
+    found["grid of a pushbroom"] = DirectGrid.of(plain, SIZE, ALTS), SIZE, ALTS
+    frame, size = Frame(5.4, 43.2, 5000.0, 4000.0, (4000, 3000), -0.05), (4000, 3000)
+    found["frame"] = frame, size, (0.0, 600.0)
+    found["frame, columns reversed"] = Changed(frame, "columns", size), size, (0.0, 600.0)
+    for side in (-1.0, 1.0):
+        for flat in (False, True):
+            heading = 190.0 + 160.0 * flat
+            found[f"radar, side {side}, ground range {flat}"] = Radar(11.0, 46.0, heading, side, flat), SIZE, ALTS
+    return found
+
+
+def changed(case: Case, change: str) -> Case:
+    """What a case is with its ground changed."""
+    model, size, (low, high) = case
+    return Changed(model, change, size), size, ((-high, -low) if change == NEGATIVE else (low, high))
+
+
+def files(folder: Path) -> dict[str, Case]:
+    """Cameras in files of others: physical models, states, radars, and vendors' RPCs without their type."""
+    kinds = {"csm": "*.json", "physical_maxar": "*.xml", "sar": "*.xml", "radar": "TDX1*.xml"}
+    names = [str(path) for kind, pattern in kinds.items() for path in sorted((folder / kind).glob(pattern))]
+    names = [f"{name},model=physical" if "physical" in name else name for name in names]
+    names += [str(folder / "physical" / "GRID_P1BP--2017092838284574CP.tif")]
+    found = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name in names:
+            camera = open_camera(name)
+            found[Path(name).name] = camera.model, camera.extent, camera.alt_range
+    return found
+
+
+def rpcs(folder: Path) -> dict[str, Case]:
+    """Vendors' RPCs behind the two methods alone."""
+    found = {}
+    for path in sorted((folder / "rpc_formats").iterdir()):
+        if path.suffix != ".gcp":
+            camera = open_camera(str(path))
+            size = camera.size or tuple(int(n) for n in camera.rpc.image_offset + np.abs(camera.rpc.image_scale))
+            found[path.name] = Changed(camera.model, "", size), size, camera.alt_range
+    return found
+
+
+@pytest.mark.parametrize("name", own())
+def test_of_an_honest_model_nothing_is_said_and_of_exchanged_axes_which(name: str) -> None:
+    case = own()[name]
+    assert wrong_axes(*case) == ""
+    assert EXCHANGED in wrong_axes(*changed(case, EXCHANGED))
+    assert NEGATIVE in wrong_axes(*changed(case, NEGATIVE))
+
+
+@pytest.mark.parametrize("name", ["columns", "rows", "transposed", "frame, columns"])
+def test_a_mirrored_model_is_fitted_without_a_word(name: str) -> None:
+    name = next(key for key in own() if name in key)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit = fit_rpc(*own()[name], options=FitOptions(method="ridge"))
+    assert fit.axes == ""
+    assert fit.max_ckp.max() < 0.01
+
+
+def test_exchanged_axes_are_refused_or_left_to_who_judges_by_the_verdict() -> None:
+    case = changed(own()["pushbroom, columns reversed"], EXCHANGED)  # handedness as from above: nothing is mirrored
+    with pytest.raises(FitError, match=EXCHANGED):
+        fit_rpc(*case)
+    fit = fit_rpc(*case, strict=False)
+    assert fit.max_ckp.max() < 1e-3  # the fit itself is as good as any
+    assert EXCHANGED in fit.verdict(1.0)
+    assert fit.as_written(fit.rpc).axes == fit.axes
+
+
+def test_models_of_files_are_told_all_and_none_falsely(shared_data: Path) -> None:
+    for name, case in files(shared_data).items():
+        assert wrong_axes(*case) == "", name
+        for change in ("columns", "rows"):
+            assert wrong_axes(Changed(case[0], change, case[1]), *case[1:]) == "", name
+        assert EXCHANGED in wrong_axes(*changed(case, EXCHANGED)), name
+        assert NEGATIVE in wrong_axes(*changed(case, NEGATIVE)), name
+
+
+def test_of_vendors_rpcs_few_are_told_and_none_falsely(shared_data: Path) -> None:
+    """They follow their cameras to some 1e-3 px, about as far as exchanged axes bend lines of sight."""
+    cases = rpcs(shared_data)
+    assert [name for name, case in cases.items() if wrong_axes(*case)] == []
+    for change, fewest in ((EXCHANGED, 6), (NEGATIVE, 5)):
+        told = [wrong_axes(*changed(case, change)) for case in cases.values()]
+        assert sum(change in words for words in told) >= fewest
+        assert all(change in words for words in told if words)
+
+
+def test_a_state_with_its_detectors_reversed_is_fitted(shared_data: Path, tmp_path: Path) -> None:
+    path = shared_data / "csm" / "1040010074793300.adjusted_state.json"
+    text = path.read_text()
+    state = json.loads(text[text.index("{") :])
+    state["m_iTransS"] = [-value for value in state["m_iTransS"]]
+    sign = state["m_detectorSampleOrigin"]
+    state["m_detectorSampleOrigin"] = state["m_nSamples"] - sign
+    (tmp_path / path.name).write_text(text[: text.index("{")] + json.dumps(state))
+    plain, turned = open_camera(str(path)), open_camera(str(tmp_path / path.name))
+    at, size = np.array([[1000.0, 500.0]]), plain.extent
+    there = plain.model.localize(at, np.array([50.0]))
+    np.testing.assert_allclose(turned.model.project(there), [[size[0] - 1 - 1000.0, 500.0]], atol=1e-3)
+    fit = fit_rpc(turned.model, (size[0], 5000), (0.0, 500.0), options=FitOptions(method="ridge", tolerance=0.1))
+    assert fit.axes == ""
+
+
+@pytest.mark.parametrize("noise", [1e-4, 1e-2, 1.0])
+@pytest.mark.parametrize("name", ["pushbroom (48.0, 43.2), scan 190", "frame", "pushbroom, a crop", "pushbroom (18.0"])
+def test_noise_of_a_model_is_never_taken_for_exchanged_axes(name: str, noise: float) -> None:
+    model, size, alts = own()[next(key for key in own() if key.startswith(name))]
+
+    class Noisy:
+        def localize(self, image: Array, alt: Array) -> Array:
+            return model.localize(image + np.random.default_rng(2).normal(0, noise, np.shape(image)), alt)
+
+    assert wrong_axes(Noisy(), size, alts) == ""  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("lat", [0.0, 45.0, -70.0, 85.0])
+@pytest.mark.parametrize("lon", [0.0, 60.0, 89.0])
+def test_verticals_and_affine_maps_have_no_camera(lon: float, lat: float) -> None:
+    """A map's lines of sight meet at the Earth's centre, or nowhere: whatever order is better, none is of a camera."""
+
+    class Map:
+        tilt = 0.0
+
+        def localize(self, image: Array, alt: Array) -> Array:
+            step = (image - 5000.0) * [1e-5, -7e-6] + self.tilt * np.asarray(alt)[..., None]
+            return np.concatenate([step + [lon, lat], np.asarray(alt)[..., None]], axis=-1)
+
+    for Map.tilt in (0.0, 1e-6, -8e-6):
+        assert wrong_axes(Map(), (10000, 10000), ALTS) == ""  # type: ignore[arg-type]
+
+
+def test_models_that_no_rpc_follows_are_honest_all_the_same() -> None:
+    for name, case in hard().items():
+        assert wrong_axes(*case) == "", name
+    shaken = Bent(own()["pushbroom (18.0, 70.0), scan 0"][0], waves(9000, 60.0, 2.0))
+    assert wrong_axes(shaken, SIZE, ALTS) == ""  # type: ignore[arg-type]
+
+
+def test_an_rpc_and_its_correction_are_not_asked() -> None:
+    """Whatever made it: cubics of few terms may look like anything, as here an RPC of exchanged axes does."""
+    size, alts = (12000, 9000), (0.0, 1000.0)
+    wrong = fit_rpc(*changed(own()["pushbroom (48.0, 43.2), scan 190"], EXCHANGED), strict=False).rpc
+    assert EXCHANGED in wrong_axes(wrong, size, alts)
+    centre = ecef_from_ground([*wrong.ground_offset[:2], 7e5])
+    for model in (wrong, adjusted(wrong, centre, 0)):
+        assert fit_rpc(model, size, alts, options=FitOptions(method="ridge")).axes == ""
+    mirrored = turned_over(synthetic_rpc())
+    assert wrong_axes(mirrored, (20000, 19000), alts) == ""
+
+
+def turned_over(rpc: Any) -> Any:
+    """An RPC whose columns count the other way."""
+    return type(rpc)(rpc.coeffs, rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale * [-1.0, 1.0])
+
+
+def test_rows_beside_the_ground_are_left_out_and_without_any_nothing_is_said() -> None:
+    model, size, alts = own()["pushbroom (48.0, 43.2), scan 190"]
+
+    class Part:
+        share = 0.3
+
+        def localize(self, image: Array, alt: Array) -> Array:
+            ground = model.localize(image, alt)[..., [1, 0, 2]]
+            return np.where(image[..., 1:] < self.share * size[1], np.nan, ground)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert EXCHANGED in wrong_axes(Part(), size, alts)  # type: ignore[arg-type]
+        Part.share = 1.1
+        assert wrong_axes(Part(), size, alts) == ""  # type: ignore[arg-type]
