@@ -17,8 +17,8 @@ import shapely
 from barpc.base.errors import InputError, OutputError
 from barpc.base.sidefile import plain_path
 from barpc.cameras import open_camera, split_spec
-from barpc.cli.fit import moved, read_move, refitted
 from barpc.cli.flags import expanded
+from barpc.cli.moving import moved, read_move, refitted
 from barpc.cli.project import altitude_of, exchanged, with_heights
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
 from barpc.fit import FitOptions

@@ -347,7 +347,7 @@ def test_a_grid_goes_into_an_rpc_where_one_holds_it(
     assert "belongs to the input and is never replaced" in capsys.readouterr().err
     poor = type("Fit", (), {"verdict": lambda self, tolerance: f"misses {tolerance == options.tolerance}"})()
     options = module.FitOptions()
-    monkeypatch.setattr("barpc.cli.fit.fit_rpc", lambda *_, **__: poor)
+    monkeypatch.setattr("barpc.cli.moving.fit_rpc", lambda *_, **__: poor)
     assert run("convert", str(grid), str(file.parent / "none.geom")) == 1
     assert f"{grid}: misses True ('barpc fit --keep-going' writes it" in capsys.readouterr().err
     assert not (file.parent / "none.geom").exists()

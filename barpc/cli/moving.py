@@ -1,0 +1,119 @@
+"""A motion of the ground, `--move` or `--transform`, brought back into cameras; and cameras refitted into RPCs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import click
+import numpy as np
+
+from barpc.base.errors import FitError, InputError
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.cli.terminal import say
+from barpc.fit import FitOptions, fit_rpc
+from barpc.pointio.tables import read_transform
+from barpc.rpcio import CARRIERS
+from barpc.scene import Camera
+from barpc.sensor import SensorModel
+from barpc.sensor.corrected import Corrected, correction_of
+from barpc.sensor.geometry import image_border
+from barpc.sensor.rpc import RPC
+
+_DEEPEST, _HIGHEST = -12e3, 10e3
+"""Altitudes between which all ground on Earth lies [m], that of the sea's bottom, too."""
+_TOLD = 0.01  # m: rounding of a matrix that is told
+
+
+def read_move(_: click.Context, __: click.Parameter, text: str | None) -> Array | None:
+    """Return the three numbers of --move, metres east, north and up."""
+    if text is None:
+        return None
+    try:
+        east, north, up = (float(word) for word in text.split(","))
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is not three numbers E,N,U [m] with commas between") from None
+    move = np.array([east, north, up])
+    if not (np.abs(move) < _HIGHEST - _DEEPEST).all():
+        raise click.BadParameter(f"{text!r}: a motion of less than 22 km along each axis is expected [m]")
+    return move
+
+
+def moved(cameras: Sequence[Camera], move: Array | None, transform: str | None, carrier: str) -> list[Camera]:
+    """Return cameras that show the moved ground where these show it unmoved, each refitted into an RPC and certified.
+
+    The motion is `move` (3,) [m], east, north and up at the middle of all the images, or that of the file
+    `transform`: it takes the points that these cameras make to their true place. One motion for all cameras: rays that
+    met still meet, where the motion takes the point. FitError where no RPC holds a moved camera, InputError for a
+    motion that leaves the Earth's surface or is a position.
+    """
+    corners = [_corners(camera) for camera in cameras]
+    middle = np.mean([ecef_from_ground(ground).mean(axis=0) for ground in corners], axis=0)
+    at = ground_from_ecef(middle)
+    if transform is not None:
+        matrix = read_transform(transform)
+    else:
+        assert move is not None
+        _check_position(move, np.concatenate(corners))
+        matrix = np.column_stack([np.eye(3), enu_basis(at).T @ move])
+    out = []
+    for camera, ground in zip(cameras, corners, strict=True):
+        there = ground_from_ecef(ecef_from_ground(ground) @ matrix[:, :3].T + matrix[:, 3])
+        low, high = float(there[:, 2].min()), float(there[:, 2].max())
+        if not (low > _DEEPEST and high < _HIGHEST):
+            what = "a matrix of other coordinates than ECEF?" if transform else "give metres"
+            file, ends = transform or "--move", f"{low:.0f} to {high:.0f} m"
+            raise InputError(f"{file}: takes the ground of {camera.path} to altitudes of {ends}: {what}")
+        moving = Corrected(camera.model, correction_of(matrix, middle))
+        direct = isinstance(camera.model, RPC) and camera.model.direct is not None
+        options = replace(FitOptions(), precision=CARRIERS[carrier].precision, localisation=direct)
+        out.append(refitted(camera, moving, (low, high), options, "moved and refitted"))
+    _tell(matrix, middle)
+    return out
+
+
+def _corners(camera: Camera) -> Array:
+    """Return ground (n, 3) along the border of a camera's image, at its lowest and highest altitude."""
+    edge = image_border(camera.extent, 4)
+    levels = (np.full(len(edge), alt) for alt in camera.alt_range)
+    ground = np.concatenate([camera.model.localize(edge, level) for level in levels])
+    found: Array = ground[np.isfinite(ground).all(axis=1)]
+    if not len(found):
+        raise InputError(f"{camera.path}: shows no ground along the border of its image")
+    return found
+
+
+def _check_position(move: Array, ground: Array) -> None:
+    """Refuse metres east and north that are the longitude and latitude of a place in the images."""
+    low, high = ground[:, :2].min(axis=0), ground[:, :2].max(axis=0)
+    for place in (move[:2], move[1::-1]):
+        if ((low <= place) & (place <= high)).all():
+            raise InputError(
+                f"--move {','.join(f'{value:g}' for value in move)}: is a longitude and latitude in the images; metres "
+                "east, north and up are needed"
+            )
+
+
+def refitted(
+    camera: Camera, model: SensorModel, alt_range: tuple[float, float], options: FitOptions, done: str
+) -> Camera:
+    """Return a camera with the RPC of a model, and say how near it comes; FitError where none holds it."""
+    fit = fit_rpc(model, camera.extent, alt_range, options=options, strict=False)
+    if wrong := fit.verdict(options.tolerance):
+        raise FitError(f"{camera.path}: {wrong} ('barpc fit --keep-going' writes it all the same)")
+    say(f"{camera.path}: {done} to {float(fit.max_ckp.max()):.1g} px")
+    return replace(camera, model=fit.rpc, alt_range=alt_range)
+
+
+def _tell(matrix: Array, middle: Array) -> None:
+    """Say what the motion is at the middle of the images, and what the digits of its matrix are worth there."""
+    at, stretch = ground_from_ecef(middle), np.linalg.svd(matrix[:, :3], compute_uv=False)
+    rounding = float((stretch[0] - stretch[-1]) / stretch.mean() * np.linalg.norm(middle))
+    if rounding > _TOLD:
+        say(f"the matrix is written with few digits: it places the ground to some {rounding:.2g} m only")
+    east, north, up = enu_basis(at) @ (matrix @ np.append(middle, 1.0) - middle)
+    scale = float(stretch.mean())
+    turn = float(np.arccos(np.clip((np.trace(matrix[:, :3]) / scale - 1.0) / 2.0, -1.0, 1.0)))
+    more = f", turned by {1e6 * turn:.3g} urad, scaled by {scale:.9g}"
+    more *= bool((matrix[:, :3] != np.eye(3)).any())
+    say(f"the ground moves by {east:+.3f} m east, {north:+.3f} m north, {up:+.3f} m up at its middle{more}")
