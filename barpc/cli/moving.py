@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import click
 import numpy as np
 
-from barpc.base.errors import FitError, InputError
+from barpc.base.errors import BarpcWarning, FitError, InputError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.cli.terminal import say
-from barpc.fit import FitOptions, fit_rpc
+from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.pointio.tables import read_transform
 from barpc.rpcio import CARRIERS
 from barpc.scene import Camera
 from barpc.sensor import SensorModel
-from barpc.sensor.corrected import Corrected, correction_of
+from barpc.sensor.corrected import Corrected, Correction, correction_of
 from barpc.sensor.geometry import image_border
 from barpc.sensor.rpc import RPC
 
 _DEEPEST, _HIGHEST = -12e3, 10e3
 """Altitudes between which all ground on Earth lies [m], that of the sea's bottom, too."""
 _TOLD = 0.01  # m: rounding of a matrix that is told
+_EXACT = 1e-5  # px, a thousandth of the tolerance: over all that an RPC states; else its image goes first
+_MOVED = "moved and refitted"
 
 
 def read_move(_: click.Context, __: click.Parameter, text: str | None) -> Array | None:
@@ -60,14 +64,13 @@ def moved(cameras: Sequence[Camera], move: Array | None, transform: str | None, 
     for camera, ground in zip(cameras, corners, strict=True):
         there = ground_from_ecef(ecef_from_ground(ground) @ matrix[:, :3].T + matrix[:, 3])
         low, high = float(there[:, 2].min()), float(there[:, 2].max())
-        if not (low > _DEEPEST and high < _HIGHEST):
+        if not _DEEPEST < (low + high) / 2 < _HIGHEST:  # an RPC may state more altitudes than there is ground
             what = "a matrix of other coordinates than ECEF?" if transform else "give metres"
             file, ends = transform or "--move", f"{low:.0f} to {high:.0f} m"
             raise InputError(f"{file}: takes the ground of {camera.path} to altitudes of {ends}: {what}")
-        moving = Corrected(camera.model, correction_of(matrix, middle))
         direct = isinstance(camera.model, RPC) and camera.model.direct is not None
         options = replace(FitOptions(), precision=CARRIERS[carrier].precision, localisation=direct)
-        out.append(refitted(camera, moving, (low, high), options, "moved and refitted"))
+        out.append(_moved(camera, correction_of(matrix, middle), (low, high), options))
     _tell(matrix, middle)
     return out
 
@@ -94,6 +97,32 @@ def _check_position(move: Array, ground: Array) -> None:
             )
 
 
+def _moved(camera: Camera, correction: Correction, alt_range: tuple[float, float], options: FitOptions) -> Camera:
+    """Return a camera behind a correction, refitted; an RPC over all that it states, where one holds that exactly.
+
+    The image may be a crop of what the RPC is made for: fitted over the crop alone it is no camera of the rest.
+    """
+    if isinstance(camera.model, RPC):
+        low, high = _domain(camera.model, camera.extent)
+        moving = Corrected(camera.model.crop(*low), correction)
+        with suppress(FitError), warnings.catch_warnings():
+            warnings.simplefilter("ignore", BarpcWarning)  # of what lies beyond the image
+            size, ridge = (high[0] - low[0], high[1] - low[1]), replace(options, method="ridge")
+            fit = fit_rpc(moving, size, alt_range, options=ridge, strict=False)
+            if fit.max_ckp.max() <= _EXACT and not fit.verdict(options.tolerance):
+                return _told(replace(camera, model=fit.rpc.crop(-low[0], -low[1]), alt_range=alt_range), fit, _MOVED)
+    return refitted(camera, Corrected(camera.model, correction), alt_range, options, _MOVED)
+
+
+def _domain(rpc: RPC, size: tuple[int, int]) -> tuple[list[int], list[int]]:
+    """Return the first and last pixel [px] of all that an RPC states: its image and ground, and an image of `size`."""
+    nodes = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+    ground = rpc.project(rpc.ground_offset + nodes * rpc.ground_scale)
+    image = rpc.image_offset + nodes[:, :2] * rpc.image_scale
+    known = np.vstack([ground[np.isfinite(ground).all(axis=1)], image, [[0.0, 0.0], size]])
+    return np.floor(known.min(axis=0)).astype(int).tolist(), np.ceil(known.max(axis=0)).astype(int).tolist()
+
+
 def refitted(
     camera: Camera, model: SensorModel, alt_range: tuple[float, float], options: FitOptions, done: str
 ) -> Camera:
@@ -101,8 +130,12 @@ def refitted(
     fit = fit_rpc(model, camera.extent, alt_range, options=options, strict=False)
     if wrong := fit.verdict(options.tolerance):
         raise FitError(f"{camera.path}: {wrong} ('barpc fit --keep-going' writes it all the same)")
+    return _told(replace(camera, model=fit.rpc, alt_range=alt_range), fit, done)
+
+
+def _told(camera: Camera, fit: RpcFit, done: str) -> Camera:
     say(f"{camera.path}: {done} to {float(fit.max_ckp.max()):.1g} px")
-    return replace(camera, model=fit.rpc, alt_range=alt_range)
+    return camera
 
 
 def _tell(matrix: Array, middle: Array) -> None:
@@ -112,8 +145,8 @@ def _tell(matrix: Array, middle: Array) -> None:
     if rounding > _TOLD:
         say(f"the matrix is written with few digits: it places the ground to some {rounding:.2g} m only")
     east, north, up = enu_basis(at) @ (matrix @ np.append(middle, 1.0) - middle)
-    scale = float(stretch.mean())
+    scale, place = float(stretch.mean()), f"lon {at[0]:.7f}, lat {at[1]:.7f}"
     turn = float(np.arccos(np.clip((np.trace(matrix[:, :3]) / scale - 1.0) / 2.0, -1.0, 1.0)))
     more = f", turned by {1e6 * turn:.3g} urad, scaled by {scale:.9g}"
     more *= bool((matrix[:, :3] != np.eye(3)).any())
-    say(f"the ground moves by {east:+.3f} m east, {north:+.3f} m north, {up:+.3f} m up at its middle{more}")
+    say(f"the ground moves by {east:+.3f} m east, {north:+.3f} m north, {up:+.3f} m up at its middle, {place}{more}")

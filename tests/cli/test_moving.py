@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.cameras import open_camera
+from barpc.cli.moving import moved
 from barpc.rpcio import read_rpc, write_rpc_copy
+from barpc.scene import Camera
 from barpc.sensor.geometry import triangulate
 from tests.cli.test_main import run
 from tests.rpcio.conftest import make_rpc, write_image
@@ -41,19 +46,30 @@ def _similarity(at, scale):
     return matrix
 
 
+_IMAGES_ALONE = "md_ov", "ssc1d3"
+"""OrbView-3's denominators are those of no turned RPC; SkySat's states two degrees of ground for an image of 2 km."""
+
+
+def _saved(matrix, folder: Path) -> str:
+    np.savetxt(folder / "t.txt", matrix, fmt="%.17g")
+    return str(folder / "t.txt")
+
+
 def test_the_cameras_show_points_after_a_move_where_they_showed_them_before(image: Path, tmp_path: Path, capsys):
     before = open_camera(image)
     ground, xy = _seen(before)
     assert run("convert", str(image), "-o", str(tmp_path / "out"), "--move", "-30,40,90") == 0
     after = open_camera(tmp_path / "out" / "scene.vrt")
     # told from the points themselves: up is up, and a motion against the sign would be twice as far
-    at = ground_from_ecef(ecef_from_ground(ground).mean(axis=0))
+    told = capsys.readouterr().err
+    at = np.array([*map(float, re.search(r"at its middle, lon (\S+), lat (\S+)$", told, re.M).groups()), 0.0])
+    assert np.abs(at - ground.mean(axis=0))[:2].max() < 2e-3
     moved = ground_from_ecef(ecef_from_ground(ground) + enu_basis(at).T @ [-30.0, 40.0, 90.0])
     np.testing.assert_allclose((moved - ground)[:, 2], 90.0, atol=0.1)
-    np.testing.assert_allclose(after.model.project(moved), xy, rtol=0, atol=2e-3)  # the middle is the image's own
+    np.testing.assert_allclose(after.model.project(moved), xy, rtol=0, atol=1e-6)
     assert np.abs(after.model.project(ground) - xy).min() > 1.0
     assert after.alt_range[0] == pytest.approx(before.alt_range[0] + 90, abs=60)
-    assert "-30.000 m east, +40.000 m north, +90.000 m up" in capsys.readouterr().err
+    assert "-30.000 m east, +40.000 m north, +90.000 m up" in told
 
 
 @pytest.mark.few(1)
@@ -83,6 +99,69 @@ def test_back_and_forth_is_where_it_was(image: Path, tmp_path: Path):
     words = ("--rpc", str(once), "-o", str(twice), "--transform", str(tmp_path / "back.txt"))
     assert run("convert", str(image), *words) == 0
     np.testing.assert_allclose(read_rpc(twice / "scene.vrt").project(ground), xy, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("length", [1.0, 30.0, 1000.0])
+def test_the_rpc_of_a_crop_still_holds_all_the_ground_that_it_was_made_for(image: Path, tmp_path: Path, length: float):
+    """Its image is a seventieth of that: an RPC fitted there alone is off elsewhere."""
+    before = open_camera(image)
+    rpc = before.rpc
+    ground = rpc.ground_offset + np.random.default_rng(0).uniform(-1, 1, (500, 3)) * rpc.ground_scale
+    matrix = _similarity(ecef_from_ground(ground).mean(axis=0), 1.00001)
+    matrix[:3, 3] *= 1.0 + length / 6.4e6
+    np.savetxt(tmp_path / "t.txt", matrix, fmt="%.17g")
+    assert run("convert", str(image), "-o", str(tmp_path / "o"), "--transform", str(tmp_path / "t.txt")) == 0
+    there = ground_from_ecef(ecef_from_ground(ground) @ matrix[:3, :3].T + matrix[:3, 3])
+    after = open_camera(tmp_path / "o" / "scene.vrt")
+    np.testing.assert_allclose(after.rpc.project(there), rpc.project(ground), rtol=0, atol=1e-6)
+    assert after.size == before.size
+
+
+def test_what_no_rpc_holds_so_exactly_is_fitted_over_its_image(tmp_path: Path, capsys):
+    rpc = make_rpc()
+    coeffs = np.array(rpc.coeffs)
+    coeffs[1::2, 4:10] += 0.2  # turned, it is no quotient of cubics any more
+    bent = replace(rpc, coeffs=coeffs)
+    size, alts = (200, 150), (0.0, 300.0)
+    camera = Camera(bent.crop(900, 900), tmp_path / "a.RPB", "rpb", size, alts)
+    (after,) = moved([camera], np.array([300.0, -400.0, 200.0]), None, "vrt")
+    worst = float(re.search(r"moved and refitted to (\S+) px", capsys.readouterr().err)[1])
+    assert worst < 1e-6
+    assert np.abs(after.rpc.image_offset - (np.array(size) - 1) / 2).max() < 1.0
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("length", [1.0, 30.0, 1000.0])
+@pytest.mark.parametrize("turn", [0.0, 1e-4])
+def test_vendors_rpcs_follow_a_motion_over_all_their_ground(
+    shared_data: Path, tmp_path: Path, length: float, turn: float
+):
+    """PROJ moves the ground: of the image, and all that the RPC is made for."""
+    to_ecef = pyproj.Transformer.from_crs(4979, 4978, always_xy=True)
+    rng, count = np.random.default_rng(int(length)), 0
+    for path in sorted((shared_data / "rpc_formats").iterdir()):
+        if path.suffix == ".gcp":
+            continue
+        camera = open_camera(str(path))
+        rpc = camera.rpc
+        size = camera.size or tuple(int(n) for n in np.ceil(rpc.image_offset + np.abs(rpc.image_scale)))
+        xy = rng.uniform(0, 1, (300, 2)) * size
+        ground = rpc.localize(xy, rng.uniform(*camera.alt_range, 300))
+        if not any(name in path.name for name in _IMAGES_ALONE):
+            ground = np.vstack([ground, rpc.ground_offset + rng.uniform(-1, 1, (300, 3)) * rpc.ground_scale])
+        ecef = np.stack(to_ecef.transform(*ground.T), axis=-1)
+        shift = rng.normal(size=3)
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_rotvec(turn * rng.normal(size=3)).as_matrix()
+        middle = ecef.mean(axis=0)
+        matrix[:3, 3] = middle - matrix[:3, :3] @ middle + length * shift / np.linalg.norm(shift)
+        (after,) = moved([replace(camera, size=size)], None, _saved(matrix, tmp_path), "vrt")
+        moved_to = ecef @ matrix[:3, :3].T + matrix[:3, 3]
+        there = np.stack(to_ecef.transform(*moved_to.T, direction="INVERSE"), axis=-1)
+        off = np.abs(after.rpc.project(there) - rpc.project(ground)).max()
+        assert off < (5e-5 if "md_ov" in path.name else 1e-5), path.name
+        count += 1
+    assert count == 17
 
 
 @pytest.mark.few(1)
