@@ -15,7 +15,7 @@ import click
 import numpy as np
 
 from barpc.base.errors import BarpcError, InputError
-from barpc.base.geodesy import Array, ground_from_ecef
+from barpc.base.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.base.options import GEOID_HELP
 from barpc.base.remote import Place
 from barpc.base.sidefile import TABLE, opened_text
@@ -24,7 +24,9 @@ from barpc.cli.terminal import echo, say, tell_gate, wants_json
 from barpc.rasters.dem import Dem, localize_on_terrain
 from barpc.scene import BoolArray, Camera
 from barpc.sensor import geometry
+from barpc.sensor.rpc import RPC
 
+_SAME = 0.01  # deg: places that are one; others that are seen alike lie degrees away
 _APART = 1.0  # px: lines of sight that a point's places miss by as much (RMS) do not meet
 _NUMBERS = {"ignore_unknown_options": True}  # -3.5 is a number, not an option
 
@@ -108,20 +110,28 @@ def ground_at(camera: Camera, image: Array, alt: Array | float, dem: Dem | None)
 
 def exchanged(camera: Camera, ground: Array) -> str:
     """Return what to say of points (N, 3) far off an image that shows them with lon and lat exchanged; else empty."""
-    if camera.size is None or not len(ground):
+    if not len(ground) or (camera.size is None and not isinstance(camera.model, RPC)):
         return ""
     swapped = ground[:, [1, 0, 2]]
-    on_earth = np.abs(swapped[:, 1]) <= 90.0
-    if _near(camera, ground).any() or not (on_earth & _near(camera, swapped)).any():
+    if _near(camera, ground).any() or not _near(camera, swapped[np.abs(swapped[:, 1]) <= 90.0]).any():
         return ""
     return "far off the image, and on it with longitude and latitude exchanged: give LON first, then LAT"
 
 
 def _near(camera: Camera, ground: Array) -> BoolArray:
-    """Return which points (N, 3) are on the image, or less than its size off it."""
-    size = np.array(camera.extent)
-    with np.errstate(invalid="ignore"):
-        return np.asarray((np.abs(camera.model.project(ground) - size / 2) <= 1.5 * size).all(axis=1))
+    """Return which points (N, 3) are on the image, or less than its size off it: as stated, or that of an RPC alone.
+
+    Far out an RPC comes near its image again; there it shows another place.
+    """
+    if camera.size is None:
+        middle, side = camera.rpc.image_offset, 2.0 * np.abs(camera.rpc.image_scale)
+    else:
+        middle, side = np.array(camera.size) / 2, np.array(camera.size)
+    image = camera.model.project(ground)
+    near = np.asarray((np.abs(image - middle) <= 1.5 * side).all(axis=1))
+    off = camera.model.localize(image[near], ground[near, 2]) - ground[near]
+    near[near] = (np.abs(np.column_stack([wrap_longitude(off[:, 0]), off[:, 1]])) <= _SAME).all(axis=1)
+    return near
 
 
 # --- the verbs ---------------------------------------------------------------------------------------------

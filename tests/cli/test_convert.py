@@ -159,6 +159,9 @@ class Flat:
         lean = ground[..., 2] / 1000.0  # a column for a kilometre
         return np.stack([(ground[..., 0] - 10) * 100 + lean, (50 - ground[..., 1]) * 100], axis=-1)
 
+    def localize(self, image: Any, alt: Any) -> np.ndarray:
+        return np.stack([10 + (image[..., 0] - alt / 1000.0) / 100, 50 - image[..., 1] / 100, alt], axis=-1)
+
 
 CAMERA = Camera(Flat(), Path("flat"), "rpb", (200, 100), (0.0, 2000.0))  # type: ignore[arg-type]
 

@@ -13,7 +13,7 @@ import rasterio
 
 from barpc.cameras import open_camera
 from barpc.cli.project import altitude_of, exchanged
-from barpc.rpcio import read_rpc, write_rpc_copy
+from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.scene import Camera
 from tests.cli.test_images import run
 from tests.report.conftest import run_of_block, written
@@ -181,8 +181,8 @@ class Map:
         self.asked = []
 
     def localize(self, image, alt):
-        self.asked.append((image.tolist(), float(alt)))
-        return np.array([11.0, 49.5, alt])
+        self.asked.append((image.tolist(), np.asarray(alt).tolist()))
+        return np.stack([10 + image[..., 0] / 100, 50 - image[..., 1] / 100, alt], axis=-1)
 
     def project(self, ground):
         return np.stack([(ground[..., 0] - 10) * 100, (50 - ground[..., 1]) * 100], axis=-1)
@@ -235,3 +235,23 @@ def test_coordinates_are_exchanged_where_only_the_other_order_is_near_the_image(
     assert exchanged(a_map(), np.vstack([point, [[11.0, 49.5, 0.0]]])) == ""  # one is on the image
     assert exchanged(a_map(size=None), point) == ""
     assert exchanged(a_map(), point[:0]) == ""
+
+
+@pytest.mark.parametrize("name", ["alone", "of an image"])
+def test_exchanged_coordinates_are_recognised_whatever_the_rpc_does_far_out(name, tmp_path, capsys):
+    """An RPC file alone has no image whose size is known; far out its quotients may come near the image again."""
+    rpc = make_rpc()
+    coeffs = np.array(rpc.coeffs)
+    coeffs[:, 4:] = 0.0
+    coeffs[1::2, 4] = -4e-3
+    far = replace(rpc, coeffs=coeffs)
+    for number, one in enumerate((rpc, far)):
+        write_rpc(one, file := tmp_path / f"{number}_RPC.TXT")
+        camera = f"{file},size=2000:2000" if name == "of an image" else file
+        lon, lat, alt = one.localize(one.image_offset, 100.0)
+        assert (np.abs(one.project([lat, lon, alt]) - one.image_offset).max() < 1500) == bool(number)
+        assert run("project", camera, lat, lon, alt) == 3
+        assert "on it with longitude and latitude exchanged" in capsys.readouterr().err
+        assert run("project", camera, lon, lat, alt) == 0
+        assert run("project", camera, lon + 10.0, lat, alt) == 0
+        assert "exchanged" not in capsys.readouterr().err
