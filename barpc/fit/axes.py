@@ -13,6 +13,7 @@ import numpy as np
 
 from barpc.base.geodesy import WGS84_A, Array, ecef_from_ground
 from barpc.sensor import SensorModel
+from barpc.sensor.geometry import LEAST_RANGE
 
 _POINT, _PLANE = 100.0, 1e4
 """Times that another reading is better before it is believed. What a model errs by is in all its readings alike: of 160
@@ -20,6 +21,7 @@ honest models none was better by more than 2.2 in a wrong one; one over a flat E
 Of models with axes exchanged or upside down physical ones were better by 320 and more, the planes of radars by 5e6."""
 _NEAR = 2.0 / WGS84_A  # 1/m: of the distance of a camera; verticals meet at the Earth's centre, -1 / WGS84_A
 _ROUNDING = 1e-8  # m: of places in ECEF, and of what iterations leave
+_FEWEST = 5  # nodes along a line: of few lines of sight any two or three meet
 _LINES, _POINTS = np.linspace(0.1, 0.9, 5), np.linspace(0.02, 0.98, 9)  # of the image's sides
 
 
@@ -33,7 +35,27 @@ def wrong_axes(model: SensorModel, size: tuple[int, int], alt_range: tuple[float
     places = np.stack([rows, rows[..., ::-1]]) * size - 0.5
     image = np.repeat(places[..., None, :], 2, axis=-2)
     alt = np.broadcast_to(alt_range, image.shape[:-1])
-    ground = np.concatenate([model.localize(image, alt)[..., :2], alt[..., None]], axis=-1)  # whatever it gave back
+    ground = model.localize(image, alt)
+    return _told(np.concatenate([ground[..., :2], alt[..., None]], axis=-1))  # whatever altitude it gave back
+
+
+def wrong_axes_of_grid(ground: Array, image: Array) -> str:
+    """Return the same of points (N, 3), (N, 2) that are all the nodes of a grid; of others nothing is said."""
+    values = (ground[:, 2], image[:, 1], image[:, 0])
+    axes, places = zip(*(np.unique(value, return_inverse=True) for value in values), strict=True)
+    shape = tuple(len(axis) for axis in axes)
+    if len(ground) != np.prod(shape) or np.ptp(axes[0]) < LEAST_RANGE or min(shape[1:]) < _FEWEST:
+        return ""
+    nodes = np.full((*shape, 3), np.nan)
+    nodes[places] = ground
+    nodes = np.moveaxis(nodes[[0, -1]], 0, 2)  # rows, columns, low and high
+    picked = [[(part * (side - 1)).round().astype(int) for part in (_LINES, _POINTS)] for side in shape[1:]]
+    (row, rows), (col, cols) = picked
+    return _told(np.stack([nodes[np.ix_(row, cols)], nodes[np.ix_(rows, col)].swapaxes(0, 1)]))
+
+
+def _told(ground: Array) -> str:
+    """Return what is wrong with ground points (2, lines, points, 2, 3) of rows and of columns, at two altitudes."""
     point, plane, _ = _sights(ground)
     for what, other in _readings(ground):
         at, within, near = _sights(other)
@@ -74,7 +96,7 @@ def _bundle(ecef: Array) -> tuple[float, float, float]:
     mean = sight.sum(axis=0) / np.linalg.norm(sight.sum(axis=0))
     slope, depth = sight / (sight @ mean)[:, None] - mean, (ecef[:, 0] @ mean)[:, None]
     across = ecef[:, 0] - depth * (mean + slope)
-    width = np.abs(across).max()
+    width = np.abs(across).max() or 1.0
     system = np.column_stack([across.ravel() / width, np.tile(np.eye(3), (len(ecef), 1))])
     found = np.linalg.lstsq(system, -slope.ravel(), rcond=None)[0]
     off, rounding = system @ found + slope.ravel(), _ROUNDING / np.linalg.norm(sight, axis=1).min()

@@ -145,7 +145,7 @@ class RpcFit:
     contradiction : float
         Largest distance of a check point from where the model, not the RPC, projects the ground that it localises
         there [px]; 0 for given points. What else projects with the model may be off by as much more.
-    axes : str, exchanged longitude and latitude, or the altitude's sign, of a model, in words
+    axes : str, exchanged longitude and latitude, or the altitude's sign, of a model or a grid, in words
     reason : Reason or None, cause of a miss of the tolerance, of a model
     """
 

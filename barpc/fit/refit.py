@@ -13,7 +13,7 @@ import numpy.typing as npt
 from barpc.base.errors import BarpcWarning, FitError
 from barpc.base.geodesy import CHUNK, Array, wrap_longitude
 from barpc.base.options import FitOptions
-from barpc.fit.axes import wrong_axes
+from barpc.fit.axes import wrong_axes, wrong_axes_of_grid
 from barpc.fit.certificate import Localisation, RpcFit, coverage, off, reason, roundtrip
 from barpc.fit.methods import BOUNDED, FitSolution, solve, solve_problem
 from barpc.fit.points import EXACT, Errors, Sample, checked_points, column_ranges, control_points, screened, widened
@@ -162,7 +162,8 @@ def fit_rpc_points(
     Raises
     ------
     FitError
-        Too few points, not finite, out of range, points in a plane; or the tolerance is not reached.
+        Too few points, not finite, out of range, points in a plane, a grid of them with exchanged axes; or the
+        tolerance is not reached.
 
     Warns
     -----
@@ -174,6 +175,7 @@ def fit_rpc_points(
     if mirrored:
         message = "points: they show the ground mirrored: the image is, or two of lon, lat or of col, row are exchanged"
         warnings.warn(message, BarpcWarning, stacklevel=2)
+    axes = wrong_axes_of_grid(*given)
     weight = relative_weight(sigma, len(cnp))
     held_out = None if check is None else checked_points(*check)
 
@@ -186,7 +188,7 @@ def fit_rpc_points(
         for residual in left:
             errors.add(residual)
         loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // CHUNK)])
-        return _certified(solution, errors, errors.largest, loop, size)
+        return replace(_certified(solution, errors, errors.largest, loop, size), axes=axes)
 
     fit = _best(attempt, options, vendor, strict, exact=False)
     seen = partial(_left_out, held_out, *given)

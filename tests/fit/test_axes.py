@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from barpc.base.errors import FitError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.cameras import open_camera
-from barpc.fit import FitOptions, fit_rpc
-from barpc.fit.axes import _bundle, wrong_axes
+from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
+from barpc.fit.axes import _bundle, wrong_axes, wrong_axes_of_grid
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.simulate import Look, fly
 from tests.fit.cameras import adjusted, synthetic_rpc
@@ -155,6 +155,38 @@ def test_of_an_honest_model_nothing_is_said_and_of_exchanged_axes_which(name: st
     assert wrong_axes(*case) == ""
     assert EXCHANGED in wrong_axes(*changed(case, EXCHANGED))
     assert NEGATIVE in wrong_axes(*changed(case, NEGATIVE))
+
+
+@pytest.mark.parametrize("name", [name for name in own() if "scan 90" in name or "radar" in name or name == "frame"])
+def test_points_that_are_a_grid_are_told_as_a_model_is(name: str) -> None:
+    model, size, alts = own()[name]
+    axes = [np.linspace(-0.5, side - 0.5, 7) for side in size]
+    nodes = np.stack(np.meshgrid(*axes, [*alts, np.mean(alts)]), axis=-1).reshape(-1, 3)
+    nodes = np.random.default_rng(0).permutation(nodes)
+    ground, image = model.localize(nodes[:, :2], nodes[:, 2]), nodes[:, :2]
+    ground[:, 2] = nodes[:, 2]
+    assert wrong_axes_of_grid(ground, image) == ""
+    assert EXCHANGED in wrong_axes_of_grid(ground[:, [1, 0, 2]], image)
+    assert NEGATIVE in wrong_axes_of_grid(ground * [1, 1, -1], image)
+    assert wrong_axes_of_grid(ground[1:, [1, 0, 2]], image[1:]) == ""  # a node is missing
+    few = np.isin(image[:, 0], axes[0][:4])
+    assert wrong_axes_of_grid(ground[few][:, [1, 0, 2]], image[few]) == ""
+    level = ground[:, 2] == alts[0]
+    assert wrong_axes_of_grid(ground[level][:, [1, 0, 2]], image[level]) == ""
+    ground[:] = ground[0]  # of no use, and no error
+    assert wrong_axes_of_grid(np.column_stack([ground[:, :2], nodes[:, 2]]), image) == ""
+
+
+def test_a_grid_of_exchanged_axes_is_refused() -> None:
+    model, size, alts = own()["pushbroom (48.0, 43.2), scan 190"]
+    nodes = np.stack(np.meshgrid(*[np.linspace(0, side - 1, 9) for side in size], np.linspace(*alts, 4)), axis=-1)
+    ground, image = model.localize(nodes[..., :2], nodes[..., 2]).reshape(-1, 3), nodes.reshape(-1, 3)[:, :2]
+    assert fit_rpc_points(ground, image).axes == ""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(FitError, match=EXCHANGED):
+            fit_rpc_points(ground[:, [1, 0, 2]], image)
+        assert EXCHANGED in fit_rpc_points(ground[:, [1, 0, 2]], image, strict=False).axes
 
 
 @pytest.mark.parametrize("name", ["columns", "rows", "transposed", "frame, columns"])
