@@ -162,19 +162,14 @@ def fit_rpc_points(
     Raises
     ------
     FitError
-        Too few points, not finite, out of range, points in a plane, a grid of them with exchanged axes; or the
-        tolerance is not reached.
+        Too few points, not finite, out of range, in a plane, a grid of exchanged axes; or the tolerance is not reached.
 
     Warns
     -----
     BarpcWarning : the points show the ground mirrored
     """
     options = options or FitOptions()
-    cnp, cnp_image, mirrored = screened(ground, image)
-    given = cnp, cnp_image
-    if mirrored:
-        message = "points: they show the ground mirrored: the image is, or two of lon, lat or of col, row are exchanged"
-        warnings.warn(message, BarpcWarning, stacklevel=2)
+    cnp, cnp_image = given = _looked_at(ground, image)
     axes = wrong_axes_of_grid(*given)
     weight = relative_weight(sigma, len(cnp))
     held_out = None if check is None else checked_points(*check)
@@ -193,6 +188,15 @@ def fit_rpc_points(
     fit = _best(attempt, options, vendor, strict, exact=False)
     seen = partial(_left_out, held_out, *given)
     return _localised(fit, lambda rpc, _: inverse(rpc, *given, weight), seen, options, strict, exact=False)
+
+
+def _looked_at(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
+    """Return given points, screened; where they show the ground mirrored that is warned of."""
+    ground, image, mirrored = screened(ground, image)
+    if mirrored:
+        message = "points: they show the ground mirrored: the image is, or two of lon, lat or of col, row are exchanged"
+        warnings.warn(message, BarpcWarning, stacklevel=3)
+    return ground, image
 
 
 def underlying_rpc(model: object) -> RPC | None:
