@@ -115,11 +115,10 @@ def _moved(camera: Camera, correction: Correction, alt_range: tuple[float, float
 
 
 def _domain(rpc: RPC, size: tuple[int, int]) -> tuple[list[int], list[int]]:
-    """Return the first and last pixel [px] of all that an RPC states: its image and ground, and an image of `size`."""
+    """Return the first and last pixel [px] of all the ground that an RPC states, and of an image of `size`."""
     nodes = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
-    ground = rpc.project(rpc.ground_offset + nodes * rpc.ground_scale)
-    image = rpc.image_offset + nodes[:, :2] * rpc.image_scale
-    known = np.vstack([ground[np.isfinite(ground).all(axis=1)], image, [[0.0, 0.0], size]])
+    image = rpc.project(rpc.ground_offset + nodes * rpc.ground_scale)
+    known = np.vstack([image[np.isfinite(image).all(axis=1)], [[0.0, 0.0], size]])
     return np.floor(known.min(axis=0)).astype(int).tolist(), np.ceil(known.max(axis=0)).astype(int).tolist()
 
 

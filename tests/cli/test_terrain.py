@@ -237,6 +237,16 @@ def test_coordinates_are_exchanged_where_only_the_other_order_is_near_the_image(
     assert exchanged(a_map(), point[:0]) == ""
 
 
+@pytest.mark.parametrize(("far", "told"), [(0.0, True), (2.8, True), (-2.8, True), (3.2, False), (-3.2, False)])
+def test_an_rpc_alone_has_the_image_that_it_states(far, told):
+    """Half an image is a scale: a point is near to three scales from the middle, seldom to the last digit."""
+    rpc = make_rpc()
+    ground = rpc.localize(rpc.image_offset + [far * rpc.image_scale[0], 0.3 * far * rpc.image_scale[1]], 137.7)
+    camera = Camera(rpc, Path("a.RPB"), "rpb", None, (0.0, 300.0))
+    assert bool(exchanged(camera, ground[None, [1, 0, 2]])) == told
+    assert exchanged(camera, ground[None]) == ""
+
+
 @pytest.mark.parametrize("name", ["alone", "of an image"])
 def test_exchanged_coordinates_are_recognised_whatever_the_rpc_does_far_out(name, tmp_path, capsys):
     """An RPC file alone has no image whose size is known; far out its quotients may come near the image again."""
