@@ -74,8 +74,15 @@ class Apart:
 
     @property
     def may_be_its_own(self) -> bool:
-        """Whether it sees the place and is left as it is: its rows and columns may be bent."""
-        return self.clear and self.placed is None and (self.look.as_stated or self.look.offset is not None)
+        """Whether it sees the place and is left as it is: its rows and columns may be bent. Few tie points tell nothing
+        of that, and splines would follow them anywhere.
+        """
+        return (
+            self.clear
+            and self.placed is None
+            and np.isfinite(self.gap)
+            and (self.look.as_stated or self.look.offset is not None)
+        )
 
     def is_view(self, view: int) -> bool:
         """Return whether a view is clearly the one that the others contradict."""
@@ -104,7 +111,12 @@ class _Left:
 
         If the others lie anywhere, it is the matches that are wrong, and they are cut.
         """
-        return self.coherent and 1.0 - self.contradicted < 0.5 * (1.0 - self.usual)
+        return self.coherent and self.disagrees
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether that holds wherever the others lie."""
+        return 1.0 - self.contradicted < 0.5 * (1.0 - self.usual)
 
     def gain(self, lost: float) -> float:
         """Return the log-likelihood gain [nats] of the view's own lost share over that of the others; the
@@ -141,15 +153,31 @@ def find_apart(
             asked = asked[gone[asked]]
     views = [v for v in asked.tolist() if block.names[v] not in options.fixed]
     left: list[_Left] = []
-    for one in _agreeing(views, block, outer, options, solve):
-        left.append(one)
+    too_few: list[tuple[int, Solution]] = []  # views of which the others' points are too few to find them by
+    for v, others, found in _agreeing(views, block, outer, options, solve):
+        placed = place(found, others, block, v)
+        if placed is None:
+            too_few.append((v, found))
+            continue
+        left.append(_Left(v, others, found, placed, placed.contradicted(CRITICAL), placed.is_coherent(CRITICAL)))
         if num > _TELLING:  # those that agree without it contradict it, as far as it is wrong, in any block with it
             break
     if odd is not None and first is not None:
         return _by_prior(left, float(first.outcome.prior.scale[odd]), block)
-    chosen = [one for one in left if one.strange or (one.placed.meets and gone[one.view])]
+    chosen = [
+        one for one in left if one.strange or (one.placed.meets and gone[one.view]) or (first is None and one.disagrees)
+    ]  # with matches that no cut copes with the block has no solution, and without them it has
     chosen = [one for one in chosen if one.gain(lost[one.view]) > SURE]
-    return _likeliest(chosen, left, lost, block) if chosen else (None, None)
+    if chosen:
+        return _likeliest(chosen, left, lost, block)
+    asks = first is None or (len(too_few) == 1 and not agrees(first))
+    return _of_few(too_few) if asks and too_few else (None, None)
+
+
+def _of_few(without: list[tuple[int, Solution]]) -> tuple[Apart, Solution | None]:
+    """Return the views without which a block agrees and with which it does not, and the solution without the only."""
+    told = Apart(tuple(v for v, _ in without), np.nan, np.inf, None, 1.0, Look(as_stated=True), None)
+    return told, without[0][1] if told.clear else None
 
 
 def agrees(found: Solution) -> bool:
@@ -176,7 +204,7 @@ def _lost(found: Solution, block: Block) -> Array:
 
 def _agreeing(
     views: Sequence[int], block: Block, outer: Block, options: AdjustOptions, solve: Solver
-) -> Iterator[_Left]:
+) -> Iterator[tuple[int, Block, Solution]]:
     """Yield the block without one view after the other, where the rest is tied together and agrees."""
     for v in views:
         others = block.without(block.view == v)
@@ -188,9 +216,8 @@ def _agreeing(
             _LOG.info("without %s: %s", block.names[v], error)
             continue
         measured = np.isfinite(found.after.error) or np.delete(_lost(found, others), v).max() < 0.5
-        placed = place(found, others, block, v) if measured and agrees(found) else None
-        if placed is not None:
-            yield _Left(v, others, found, placed, placed.contradicted(CRITICAL), placed.is_coherent(CRITICAL))
+        if measured and agrees(found):
+            yield v, others, found
 
 
 def _is_tied(block: Block, without: int) -> bool:

@@ -136,6 +136,32 @@ def test_a_view_of_wrong_matches_is_no_foreign_one() -> None:
     assert found.inlier[(made.tracks.view == 2) & ~wrong & ~found.held_out].mean() > 0.9
 
 
+@pytest.mark.few(2)
+@pytest.mark.parametrize("num", [14, 20, 30])
+@pytest.mark.parametrize("views", [3, 5])
+def test_of_few_tie_points_those_of_one_view_may_all_be_wrong(views: int, num: int) -> None:
+    """As of another date, cloud or scale: it is named, or its ties are rejected, and the others are adjusted."""
+    for seed in range(3):
+        made, bad = simulate_block(views, num, seed=seed, per_site=views, num_checks=200), seed % views
+        of_it, xy = made.tracks.view == bad, made.tracks.xy.copy()
+        xy[of_it] += np.random.default_rng(seed).uniform(-300.0, 300.0, (of_it.sum(), 2))
+        found = adjust_tracks(made.views, replace(made.tracks, xy=xy), AdjustOptions(min_convergence=0.01))
+        assert (found.apart is None) == (views == 5)
+        assert found.apart is None or found.apart.views == (bad,)
+        assert found.inlier[of_it].sum() <= 2
+        assert found.inlier[~of_it & ~found.held_out].mean() > 0.9
+        assert np.abs(found.residuals[found.inlier]).max() < 0.5
+        np.testing.assert_allclose(found.params[bad], 0.0, atol=1e-9 if views == 3 else 30.0)
+
+
+@pytest.mark.parametrize("num", [20, 30])
+def test_of_two_views_whose_ties_are_all_wrong_too_few_agree(num: int) -> None:
+    made = simulate_block(2, num, seed=1)
+    xy = made.tracks.xy + np.random.default_rng(1).uniform(-300.0, 300.0, made.tracks.xy.shape)
+    with pytest.raises(AdjustError, match=f"of {2 * num} observations . are inliers, and an image needs 4"):
+        adjust_tracks(made.views, replace(made.tracks, xy=xy), AdjustOptions(min_convergence=0.01), hold_out=False)
+
+
 @pytest.mark.parametrize("given", [{"loss": "linear"}, {"model": "affine"}, {"drift": 0}])
 def test_who_asks_for_less_than_cameras_have_gets_it_of_all(given) -> None:
     block: Any = SimpleNamespace(views=(None,) * 4)
@@ -145,14 +171,17 @@ def test_who_asks_for_less_than_cameras_have_gets_it_of_all(given) -> None:
 def scripted(monkeypatch, evidence: list[float], contradicted: list[float]) -> Any:
     """What is found where each view's leaving makes the others agree with so much evidence."""
     num = len(evidence)
-    placed = SimpleNamespace(meets=False, squared=np.zeros(200))
 
     def agreeing(views: Any, *_: Any) -> Any:
         for v in views:
-            one = apart._Left(v, SimpleNamespace(views=(None,) * num), "solved", placed, contradicted[v], True)  # type: ignore[arg-type]
-            yield one
+            yield v, SimpleNamespace(views=(None,) * num), "solved"
+
+    def placed(found: Any, others: Any, block: Any, view: int) -> Any:
+        told = {"contradicted": lambda _: contradicted[view], "is_coherent": lambda _: True}
+        return SimpleNamespace(meets=False, squared=np.zeros(200), **told)
 
     monkeypatch.setattr(apart, "_agreeing", agreeing)
+    monkeypatch.setattr(apart, "place", placed)
     monkeypatch.setattr(apart._Left, "usual", 0.02)
     monkeypatch.setattr(apart, "_evidence", lambda one, block: evidence[one.view])
     monkeypatch.setattr(apart, "look", lambda *_: "looked")

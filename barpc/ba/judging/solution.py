@@ -9,7 +9,7 @@ import numpy as np
 
 from barpc.ba.estimated.priors import DRIFT_SIGMA, FLOOR
 from barpc.ba.estimated.projected import Projected
-from barpc.ba.held.block import Block, first_state, make_problem
+from barpc.ba.held.block import MIN_OBSERVATIONS, Block, first_state, make_problem
 from barpc.ba.held.ground import Heights, staying
 from barpc.ba.held.incremental import BlockPrior
 from barpc.ba.held.terrain import Terrain
@@ -23,6 +23,7 @@ from barpc.ba.robust.smooth import SmoothTest
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.ba.solving.structure import Structure
+from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
 from barpc.base.usual import MUCH_NOISE, SURELY
@@ -161,9 +162,20 @@ def solve_block(
         free = Solution(problem, state, before, heights, outcome, start, start, None, asked, by_point=by_point)
         agreed, heights = _with_control(block, given, outcome)
         outcome = Rounds(problem, block, outcome.minimum.state, heights, block.use, outcome).run()
+    _check_inliers(outcome, problem.structure, block)
     first = Solution(problem, state, before, heights, outcome, start, start, None, asked, (), agreed, by_point)
     found = finished(first, problem, block, outer, options, outcome)
     return found if free is None or not found.heights.has_control else _untorn(found, free, block, outer, options)
+
+
+def _check_inliers(outcome: Outcome, structure: Structure, block: Block) -> None:
+    """Raise AdjustError where the cuts leave no view the observations that a camera takes."""
+    kept = structure.sum_views(outcome.inlier.astype(np.float64)[None])
+    if kept.max() < MIN_OBSERVATIONS:
+        raise AdjustError(
+            f"too few tie points agree: of {int(block.use.sum())} observations {int(kept.sum())} are inliers, and an "
+            f"image needs {MIN_OBSERVATIONS}; give more matches, and check that all images show the same ground"
+        )
 
 
 def _untorn(found: Solution, free: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
