@@ -3,6 +3,7 @@
 ::
 
     OUT/                     what the user asked for
+    OUT/SHA256SUMS           written last: every output by its sha256 (`barpc.base.manifest`)
     OUT/.barpc/state.json    status, stages with seconds and peak memory, the outputs with their sha256
     OUT/.barpc/outputs.jsonl the same of the outputs of a run at work
     OUT/.barpc/lock          held while a run is at work
@@ -35,9 +36,12 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc import __version__
+from barpc.base import manifest
 from barpc.base.atomic import PARTIAL, STATE, replacing
-from barpc.base.errors import BarpcError, OutputError
+from barpc.base.errors import BarpcError, InputError, OutputError
 from barpc.base.frozen import Arrays, load_npz
+from barpc.base.manifest import SUMS
+from barpc.base.remote import is_url
 from barpc.base.sidefile import MAX_XML
 from barpc.rpcio import hidden_by
 
@@ -165,7 +169,11 @@ class Workspace:
         shutil.rmtree(self.partial, ignore_errors=True)  # of a run that was killed
         self._earlier = _read_own(self.folder)  # again: another run may have ended in between
         # what is added to a finished run, or fails to be, leaves it finished: nothing else may replace its files
-        self._finished = adds and _read_state(self.folder).get("status") == "done"
+        before = _read_state(self.folder) if adds else {}
+        self._finished = before.get("status") == "done"
+        self._home = str(before.get("folder", self.folder))
+        stages = before.get("stages")
+        self._before: list[Any] = stages if isinstance(stages, list) else []
         try:
             self._save_state("running")
         except BaseException:  # a full disk
@@ -234,6 +242,8 @@ class Workspace:
     def _end(self, status: str) -> None:
         """Save the last state; where that fails, the same command is to go on and not to find a finished run."""
         try:
+            if status == "done" and self._adds and self.outputs:
+                self._add_layer()
             self._save_state(status)
         except BarpcError:
             if status == "done":  # it may say so, and only the disk was not told
@@ -309,6 +319,29 @@ class Workspace:
             partial.write_bytes(text.encode())
         return self.folder / name
 
+    def seal(self, after: str = "", links: Mapping[str, str] | None = None) -> str:
+        """Write SHA256SUMS of all outputs and return their root.
+
+        `after`: the root of the run that they were made from; `links`: to inputs, with the SHA-256 of these.
+        """
+        files = self.outputs | dict(links or {})
+        first = manifest.Layer(manifest.head(__version__, code_version(), after), files)
+        self.write_text(SUMS, manifest.render([first]))
+        return self.outputs[SUMS]
+
+    def _add_layer(self) -> None:
+        """Add what is new to the SHA256SUMS of a finished run; one that somebody changed stays, for `verify` to see."""
+        try:
+            root, layers = manifest.read(self.folder)
+        except InputError:
+            return
+        known = {name: sha for layer in layers for name, sha in layer.files.items()}
+        new = dict(self.outputs.items() - known.items())
+        if new and self._earlier.setdefault(SUMS, root) == root:
+            self._may_replace = True
+            layers.append(manifest.Layer(manifest.head(__version__, code_version(), root), new))
+            self.write_text(SUMS, manifest.render(layers))
+
     def remove_stale(self) -> None:
         """Take away what an earlier run wrote here, nobody has changed, and this run did not write."""
         for name in self._earlier.keys() - self.outputs.keys():
@@ -323,7 +356,8 @@ class Workspace:
         earlier = {} if status == "done" and not self._adds else self._earlier
         outputs = dict(sorted((earlier | self.outputs).items()))
         told = "done" if self._finished else status
-        state = {"barpc": __version__, "status": told, "stages": self.stages, "outputs": outputs}
+        stages = [*self._before, *self.stages]
+        state = {"barpc": __version__, "status": told, "folder": self._home, "stages": stages, "outputs": outputs}
         with replacing(self.folder / STATE / STATE_FILE, overwrite=True, room=self.partial) as partial:
             partial.write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
         if status != "failed":
@@ -395,6 +429,36 @@ def _read_own(folder: Path) -> dict[str, str]:
 def own_files(folder: Path) -> set[str]:
     """Return the names of barpc's own files that are in a folder, as it wrote them."""
     return {name for name, sha in _read_own(folder).items() if _owns(folder, name, sha)}
+
+
+def noted_outputs(folder: Path) -> dict[str, str]:
+    """Return the sha256 of every output as the commands in a folder noted it; none where its state was deleted."""
+    return _read_own(folder)
+
+
+def portable(path: str, folder: Path) -> str:
+    """Return a path relative to a run folder, with slashes, as its files hold it; a URL, or none, as it is."""
+    if not path or is_url(path):
+        return path
+    try:
+        return Path(os.path.relpath(Path(path).absolute(), folder.absolute())).as_posix()
+    except ValueError:  # on another drive
+        return path
+
+
+def homes(folder: Path, path: str) -> tuple[Path, Path]:
+    """Return where the file of a `portable` path may be: seen from the folder as it lies, and where it was made."""
+    made = str(_read_state(folder).get("folder", folder))
+    return folder / path, Path(os.path.normpath(Path(made) / path))
+
+
+def located(folder: Path, path: str) -> str:
+    """Return the path, absolute, of the file that a run names by a `portable` one; a URL, or none, as it is."""
+    if not path or is_url(path):
+        return path
+    here, there = homes(folder, path)
+    found = there if there.is_file() and not here.is_file() else here
+    return os.path.normpath(found.absolute())
 
 
 def _note(folder: Path, name: str, sha: str) -> None:

@@ -121,7 +121,7 @@ def _tell(obj: Mapping[str, Any], result: AdjustResult) -> int:
     if wants_json():
         echo(json.dumps(result.summary, indent=1))
     elif not obj["quiet"]:
-        print_summary(result.record)
+        print_summary(result.record, result.root)
     if result.passed:
         return 0
     # on the screen: every reason once

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict
@@ -94,26 +95,33 @@ def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | N
 @click.command("verify")
 @click.argument("run_dir", metavar="RUN_DIR")
 @click.argument("places", nargs=-1, metavar="[FOLDER...]")
-def verify(run_dir: str, places: tuple[str, ...]) -> int:
-    r"""Say which inputs and outputs of a finished run are still the same, and whether its cameras read as certified.
+@click.option("--expect", metavar="ROOT", help="The root that the run printed, or a later command.")
+def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
+    r"""Say whether every file of a finished run, and of its inputs, is what it was, and reads as the certified camera.
 
-    Files are compared by the SHA-256 in summary.json. An input that is no longer where it was is looked for by its name
-    beside the run, in it, and in the folders given. Exit code 0: all is as it was; 3: something is not.
+    SHA256SUMS in the run folder lists all files but those in .barpc; `sha256sum -c SHA256SUMS` reads it, too. Its own
+    SHA-256 is the root. Who changes files and that list alike is found out by --expect alone, with the root that was
+    kept elsewhere. An input that is no longer where it was is looked for by its name beside the run, in it, and in the
+    folders given; those on other hosts are not asked. Exit code 0: all that was asked is as it was; 3: a file is
+    changed, missing or added, or the root is another; 1: there is no SHA256SUMS (a run of release 0.3, or one that was
+    interrupted), or it cannot be read.
 
     \b
     Examples:
       barpc verify adjusted
-      barpc verify adjusted /archive/images
+      barpc verify adjusted --expect 4a1e...c09f /archive/images
     """
     from barpc.pipeline.outputs import GOOD, SAME, prove
 
-    found = prove(Path(run_dir), [Path(place) for place in places])
+    if expect is not None and not re.fullmatch("[0-9a-fA-F]{64}", expect):
+        raise click.UsageError(f"--expect {expect}: a root has 64 hexadecimal digits")
+    found = prove(Path(run_dir), [Path(place) for place in places], expect and expect.lower())
     wrong = [one for one in found if one.now not in GOOD]
     if wants_json():
         echo(json.dumps([asdict(one) for one in found]))
     else:
         for one in found:
-            if one.now != SAME:
+            if one.now != SAME or one.kind == "root":
                 echo(f"{one.kind} {one.file}: {one.now}" + (f", {one.note}" if one.note else ""))
         counts = Counter((one.kind, one.now) for one in found)
         for kind in ("input", "output", "camera"):

@@ -83,15 +83,18 @@ class Formatter(logging.Formatter):
         return visible(super().formatException(ei))
 
 
-def print_summary(summary: Summary) -> None:
-    """Print tables of views, pairs and control, and the verdict: `MOST_LINES` in a pipe, or 80 columns wide."""
+def print_summary(summary: Summary, root: str = "") -> None:
+    """Print tables of views, pairs and control, and the verdict: `MOST_LINES` in a pipe, or 80 columns wide.
+
+    `root`: that of the files that were written.
+    """
     from barpc.report.verdict import LINES, SHOWN, sentences
 
     width, lines = output_width(), sentences(summary)
     counted = width and max(width, _USUAL)  # nothing is dropped because a terminal is narrow
     for rows in range(SHOWN, 0, -1):
         tables = _tables(summary, rows)
-        room = MOST_LINES - 3 - sum(_height(table, counted) for table in tables)
+        room = MOST_LINES - 3 - bool(root) - sum(_height(table, counted) for table in tables)
         if room >= min(len(lines), LINES):
             break
     for title, texts, more in tables:
@@ -100,6 +103,8 @@ def print_summary(summary: Summary) -> None:
     _echo_lines(_fitting(lines, room, counted), width)
     if summary.out_dir:
         echo(f"Written to {summary.out_dir}")
+        if root:
+            echo(f"Root: {root}")
         if any(view.outputs for view in summary.views):
             folder = shlex.quote(summary.out_dir)
             echo(f"Orthoimages by GDAL: barpc export {folder} ortho --to ortho && sh ortho/ortho.sh")

@@ -10,11 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from barpc.base.errors import InputError, OutputError
+from barpc.base.identity import take
+from barpc.base.manifest import SUMS
 from barpc.base.sidefile import plain_path
 from barpc.export.files import Files, asp, cars, ortho, points, s2p, satnerf, stac
 from barpc.export.pinholes import colmap, image_links
 from barpc.export.shots import Scene, read_scene, relative_link
-from barpc.workspace import Workspace
+from barpc.workspace import Workspace, located
 
 __all__ = ["TARGETS", "export_run"]
 
@@ -66,13 +68,17 @@ def export_run(
         raise OutputError(f"{out}: the folder of the run; give the export one of its own")
     files = TARGETS[target](scene, out.absolute())
     inputs = [Path(shot.file) for shot in scene.shots if "\0" not in shot.file]
-    with Workspace(out, overwrite=overwrite, keep=inputs, names=files) as workspace:
+    links = image_links(scene) if target == "colmap" else {}
+    content = {located(folder, one.path): one.sha256 for one in scene.summary.inputs or ()}
+    root = take(folder / SUMS).sha256 if (folder / SUMS).is_file() else ""  # none of an older release's run
+    with Workspace(out, overwrite=overwrite, keep=inputs, names=[*files, SUMS]) as workspace:
         for name, data in files.items():
             with workspace.output(name) as partial:
                 partial.write_bytes(data)
         workspace.remove_stale()
-    for name, image in (image_links(scene) if target == "colmap" else {}).items():
-        _link(out / name, relative_link(image, (out / name).parent))
+        for name, image in links.items():
+            _link(out / name, relative_link(image, (out / name).parent))
+        workspace.seal(root, {name: content[image] for name, image in links.items() if image in content})
     return [out / name for name in files]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,6 +19,7 @@ from barpc.report.records import plain
 from barpc.report.runfiles import ply
 from barpc.rpcio import WRITABLE
 from barpc.sensor.geometry import footprint
+from barpc.workspace import located
 
 Files = dict[str, bytes]
 
@@ -266,14 +266,15 @@ def ortho(scene: Scene, out: Path) -> Files:
     On the run's DEM, made ellipsoidal where it had a geoid; without one at the altitude of the tie points.
     """
     given: Any = scene.summary.options or {}
-    dem, geoid = (name if isinstance(name := given.get(key), str) else None for key in ("dem", "geoid"))
+    names = (name if isinstance(name := given.get(key), str) else "" for key in ("dem", "geoid"))
+    dem, geoid = (located(scene.folder, name) for name in names)
     lines, heights = [], f"RPC_HEIGHT={scene.origin[2]:.0f}"
     about = "all ground at one altitude; give a DEM to adjust"
     if dem:
         heights, about = f"RPC_DEM={relative_link(dem, out)}", f"heights of {Path(dem).name}"
     if dem and geoid:
         heights = "RPC_DEM=dem_ellipsoidal.tif"
-        above = f"+proj=longlat +datum=WGS84 +geoidgrids={os.path.abspath(geoid)} +vto_meter=1"  # noqa: PTH100
+        above = f"+proj=longlat +datum=WGS84 +geoidgrids={geoid} +vto_meter=1"
         lines.append(_gdalwarp("-s_srs", above, "-t_srs", "EPSG:4979", relative_link(dem, out), "dem_ellipsoidal.tif"))
     crs = utm(*scene.origin[:2])[1]
     lines += [_warp(shot, heights, crs, out) for shot in scene.shots]

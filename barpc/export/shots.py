@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePath
 from typing import Any
@@ -25,6 +25,7 @@ from barpc.rpcio.sources import Sunlight, light_of
 from barpc.scene import IntArray
 from barpc.sensor.geometry import camera_center, footprint, image_grid, sight_enu
 from barpc.sensor.rpc import RPC
+from barpc.workspace import located
 
 MARGIN = 20.0
 """m that the altitudes of a scene reach beyond its tie points, besides a tenth of their range."""
@@ -157,6 +158,7 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
         No finished adjustment, without RPC files, or one whose files contradict each other.
     """
     summary = read_summary(folder)
+    summary = replace(summary, views=tuple(_located(view, folder) for view in summary.views))
     if summary.kind != "adjust":
         raise InputError(f"{folder / 'summary.json'}: a run of the kind {summary.kind}, without corrected cameras")
     files = read_tables(summary, folder)
@@ -183,6 +185,14 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
         shots.append(Shot(view, rpc, view.path, _carrier(folder, view), light, *seen))
     noise = _noise(files, counted)
     return Scene(folder, summary, tuple(shots), files.points[:, :3], files.tracks, alt_range, noise)
+
+
+def _located(view: ViewEntry, folder: Path) -> ViewEntry:
+    """Return what is said of a view, with absolute paths."""
+    source = view.rpc_source
+    if source is not None:
+        source = replace(source, path=located(folder, source.path))
+    return replace(view, path=located(folder, view.path), rpc_source=source)
 
 
 def _places(known: IntArray, asked: IntArray) -> tuple[IntArray, Any]:

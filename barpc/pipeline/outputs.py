@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence, Set
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from itertools import chain
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
+from barpc.base import manifest
+from barpc.base.atomic import STATE
 from barpc.base.errors import BarpcError, InputError, OutputError
 from barpc.base.geodesy import Array
 from barpc.base.identity import take
+from barpc.base.manifest import SUMS, Layer
 from barpc.base.options import RunOptions
 from barpc.base.remote import is_url
 from barpc.cameras import open_camera
@@ -27,7 +31,7 @@ from barpc.report import Run, Summary
 from barpc.report.page import NAME, REPORT, can_render, report_html
 from barpc.report.records import plain
 from barpc.report.runfiles import FOLDER, TABLES, gcps_geojson, read_summary
-from barpc.report.summary import OutputEntry, StageEntry
+from barpc.report.summary import OutputEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import CARRIERS, WRITABLE, row_of, sidecars, write_camera
 from barpc.rpcio.grids import CORRECTION, GRID
@@ -36,7 +40,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.geometry import ground_grids
 from barpc.sensor.rpc import RPC
 from barpc.tie.tasks import Progress
-from barpc.workspace import LAST, Workspace, own_files
+from barpc.workspace import LAST, Workspace, homes, noted_outputs, own_files
 
 MATCHES = ("matches.csv", "matches.npz")
 GCPS = f"{FOLDER}/gcps.geojson"  # of a reference
@@ -117,7 +121,7 @@ def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
 
 def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> list[str]:
     """Return the names of a run's outputs before it starts; of match files those that are already in the folder."""
-    names = [*(f"{FOLDER}/{name}" for name in TABLES), LAST]
+    names = [*(f"{FOLDER}/{name}" for name in TABLES), LAST, SUMS]
     names += [NAME] * can_render() + [GCPS] * bool(options.reference)
     if options.stop_after == "matching":
         stems = {view.name for view in views}
@@ -150,15 +154,7 @@ def refuse_shadows(folder: Path, names: Sequence[str]) -> None:
 
 
 def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
-    """Write the tables, report.html where jinja2 is there, and summary.json last: with it a folder is complete.
-
-    Returns the summary with the stages that this took.
-    """
-    stages, start = summary.stages, len(workspace.stages)
-
-    def now() -> Summary:
-        return replace(summary, stages=(*stages, *map(StageEntry.read, workspace.stages[start:])))
-
+    """Write the tables, report.html where jinja2 is there, and summary.json after them; return what that holds."""
     with workspace.stage("tables"):
         for name, content in TABLES.items():
             with workspace.output(f"{FOLDER}/{name}") as partial:
@@ -167,15 +163,13 @@ def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
             workspace.write_text(GCPS, gcps_geojson(run).decode())
     with workspace.stage(REPORT):
         if can_render():
-            workspace.write_text(NAME, report_html(now(), workspace.folder))
-        # the report shows times and may be made again: it is no result
+            workspace.write_text(NAME, report_html(summary, workspace.folder))
+    # the report may be made again by another release: it is no result
     results = sorted((name, sha) for name, sha in workspace.outputs.items() if name != NAME)
     summary = replace(summary, outputs=tuple(OutputEntry(name, sha) for name, sha in results))
-    texts = {key: _json(value) for key, value in plain(summary).items()}
-    texts["stages"] = _json(plain(now().stages))
-    body = ",\n".join(f"{json.dumps(key)}: {text}" for key, text in texts.items())
-    workspace.write_text(LAST, f"{{\n{body}\n}}\n")
-    return now()
+    texts = ",\n".join(f"{json.dumps(key)}: {_json(value)}" for key, value in plain(summary).items())
+    workspace.write_text(LAST, f"{{\n{texts}\n}}\n")
+    return summary
 
 
 def _json(value: Any) -> str:
@@ -188,13 +182,14 @@ def _json(value: Any) -> str:
 # --- whether a finished run is still what it was ----------------------------------------------------------
 
 
-SAME, MOVED, CHANGED, MISSING, UNKNOWN = "same", "moved", "changed", "missing", "not asked"
-GOOD = (SAME, MOVED)
+SAME, MOVED, LATER, UNKNOWN = "same", "moved", "later", "not asked"
+GOOD = (SAME, MOVED, LATER, UNKNOWN)
+CHANGED, MISSING, ADDED = "changed", "missing", "added"
 
 
 @dataclass(frozen=True)
 class Proved:
-    """What became of a file: its `kind` (input, output or camera), a word for its state, and details."""
+    """What became of a file: its `kind` (root, input, output or camera), a word for its state, and details."""
 
     kind: str
     file: str
@@ -202,43 +197,102 @@ class Proved:
     note: str = ""
 
 
-def prove(folder: Path, places: Sequence[Path] = ()) -> list[Proved]:
-    """Compare a run with what its summary says of it; inputs that are gone are looked for by name in `places`.
+def prove(folder: Path, places: Sequence[Path] = (), expected: str | None = None) -> list[Proved]:
+    """Compare a run, or an export, with its SHA256SUMS, and that with an `expected` root, of any of its layers.
 
-    InputError where the folder holds no finished run, or one of a release that hashed nothing.
+    Inputs that are gone are looked for by name in `places`. InputError where SHA256SUMS is missing or damaged.
     """
-    summary = read_summary(folder)
-    if summary.inputs is None or summary.outputs is None:
-        raise InputError(f"{folder}: its summary holds no hashes: an older release wrote it; run the adjustment again")
-    return [
-        *_inputs(summary, (folder, folder.parent, *places)),
-        *_outputs(summary, folder),
-        *_cameras(summary, folder),
-    ]
+    if not os.path.lexists(folder / SUMS):
+        read_summary(folder)
+        raise InputError(
+            f"{folder / SUMS}: missing, as of a run that was interrupted, or of release 0.3 or older, if nobody took "
+            "it away; nothing else says what the files were: run the adjustment again"
+        )
+    root, layers = manifest.read(folder)
+    noted, listed = noted_outputs(folder), {name: sha for layer in layers for name, sha in layer.files.items()}
+    # of what the first command wrote a later one makes the report again, and nothing else
+    listed |= {name: sha for name, sha in layers[0].files.items() if name != NAME}
+    found = [*_roots(root, noted.get(SUMS, root), layers, expected), *_outputs(folder, listed, noted)]
+    if LAST in listed:
+        try:
+            summary = read_summary(folder)
+        except InputError as error:
+            return [*found, Proved("input", LAST, MISSING, f"what it says of inputs: {error}")]
+        found += [*_inputs(summary, folder, places), *_cameras(summary, folder)]
+    return found
 
 
-def _inputs(summary: Summary, places: Iterable[Path]) -> Iterator[Proved]:
+def _roots(root: str, noted: str, layers: Sequence[Layer], expected: str | None) -> Iterator[Proved]:
+    """Say whether SHA256SUMS has the expected root, now or before a later layer, and what came after."""
+    if noted != root != expected:
+        yield Proved("root", SUMS, CHANGED, f"its root is {root}, and {noted} was noted")
+    elif expected in (None, root):
+        yield Proved("root", SUMS, SAME, f"{root}, layer {len(layers)} of {len(layers)}")
+    if expected in (None, root):
+        return
+    number = next((k for k in range(1, len(layers)) if layers[k].after == expected), 0)
+    if not number or manifest.root_of(layers[:number]) != expected:
+        yield Proved("root", SUMS, CHANGED, f"its root is {root}, and none of its {len(layers)} layers has {expected}")
+        return
+    yield Proved("root", SUMS, SAME, f"{expected}, layer {number} of {len(layers)}")
+    before = {name for layer in layers[:number] for name in layer.files}
+    for name in sorted({name for layer in layers[number:] for name in layer.files}):
+        yield Proved("root", name, LATER, "made again after that root" if name in before else "added after that root")
+
+
+def _outputs(folder: Path, listed: Mapping[str, str], noted: Mapping[str, str]) -> Iterator[Proved]:
+    """Compare every file with what is `listed`; one that is `noted` otherwise is of a command that was ended."""
+    for name, sha in sorted(listed.items()):
+        found = _digest(folder / name)
+        now = SAME if found == sha else MISSING if found is None else CHANGED
+        yield Proved("output", name, now, _ENDED if found == noted.get(name) and now == CHANGED else "")
+    parents = {parent.as_posix() for name in listed for parent in PurePosixPath(name).parents}
+    for name, there in _files(folder, parents):
+        if there is not None:
+            yield Proved("output", name, UNKNOWN, f"a folder of its own: barpc verify {there}")
+        elif name not in listed and name != SUMS:
+            yield Proved("output", name, ADDED, _ENDED if name in noted else "by nobody who noted it")
+
+
+_ENDED = "by a command that did not come to its end: give it again"
+
+
+def _files(folder: Path, parents: Set[str]) -> Iterator[tuple[str, Path | None]]:
+    """Yield every file and link in a folder by name, but its state; of a folder below with a SHA256SUMS only that."""
+
+    def refuse(error: OSError) -> None:
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror})")
+
+    for top, folders, files in os.walk(folder, onerror=refuse):
+        at = Path(top).relative_to(folder)
+        kept = []
+        for name in sorted([*folders, *files]):
+            path, known = folder / at / name, (at / name).as_posix()
+            if name in files or path.is_symlink():
+                yield known, None
+            elif (path / SUMS).is_file() and known not in parents:
+                yield known, path
+            elif known != STATE:
+                kept.append(name)
+        folders[:] = kept
+
+
+def _inputs(summary: Summary, folder: Path, places: Iterable[Path]) -> Iterator[Proved]:
     for one in summary.inputs or ():
         if is_url(one.path):
             yield Proved("input", one.path, UNKNOWN, "on another host")
             continue
-        found = _digest(Path(one.path))
-        if found == one.sha256:
+        here = homes(folder, one.path)
+        found = [_digest(path) for path in here]
+        if one.sha256 in found:
             yield Proved("input", one.path, SAME)
             continue
-        elsewhere = (place / Path(one.path).name for place in places)
+        elsewhere = (place / Path(one.path).name for place in (folder, folder.parent, *places))
         moved = next((str(path) for path in elsewhere if _digest(path) == one.sha256), None)
         if moved is not None:
             yield Proved("input", one.path, MOVED, f"it is {moved}")
         else:
-            yield Proved("input", one.path, MISSING if found is None else CHANGED)
-
-
-def _outputs(summary: Summary, folder: Path) -> Iterator[Proved]:
-    for one in summary.outputs or ():
-        found = _digest(folder / one.file)
-        now = SAME if found == one.sha256 else MISSING if found is None else CHANGED
-        yield Proved("output", one.file, now)
+            yield Proved("input", one.path, CHANGED if any(found) else MISSING)
 
 
 def _cameras(summary: Summary, folder: Path) -> Iterator[Proved]:

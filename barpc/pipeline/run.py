@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
@@ -19,7 +20,7 @@ from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior
 from barpc.ba.held.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
 from barpc.base.identity import Input, Stamp, ask, guarded, recorded
-from barpc.base.options import FitOptions, RunOptions
+from barpc.base.options import FitOptions, RunOptions, declared
 from barpc.base.remote import here
 from barpc.base.sidefile import plain_path
 from barpc.fit import RpcFit, fit_rpc
@@ -60,9 +61,10 @@ from barpc.sensor.rpc import RPC
 from barpc.tie import Scope, find_tracks, read_area
 from barpc.tie.reference import Accuracy, ReferenceControl, register_views
 from barpc.tie.tasks import Progress, Work
-from barpc.workspace import Workspace, timed
+from barpc.workspace import Workspace, portable, timed
 
 logger = logging.getLogger(__name__)
+_PATHS = ("file", "dir")  # units of options
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -76,11 +78,13 @@ class AdjustResult:
         All intermediate results. Here and in `tracks`, `adjustment`, `summary` and files images stand in the
         order of their names, `run.views`, whatever the order given.
     record : Summary, content of summary.json as a typed record
+    root : str, the SHA-256 of SHA256SUMS, by which `barpc verify` knows the run; empty where nothing was written
     """
 
     views: tuple[View, ...]
     run: Run
     record: Summary
+    root: str = ""
 
     @cached_property
     def summary(self) -> dict[str, Any]:
@@ -172,29 +176,48 @@ def adjust(
         run = replace(run, out_dir=str(out_dir), stages=workspace.stages)
         summary = _summed_up(run, inputs.values(), workspace, progress)
         workspace.remove_stale()
+        root = workspace.seal()
     sensors = run.after or run.before
     views = [replace(view, sensor=sensor) for view, sensor in zip(run.views, sensors, strict=True)]
-    return AdjustResult(_as_given(views, images, options), run, summary)
+    return AdjustResult(_as_given(views, images, options), run, summary, root)
 
 
 def _summed_up(run: Run, inputs: Iterable[Input], workspace: Workspace, progress: Progress | None) -> Summary:
-    """Write what a later run starts from, summary, tables and report."""
+    """Write what a later run starts from, summary, tables and report: the same in any folder, at any time."""
     if run.adjustment is not None:
         with _told(workspace, "block", progress), workspace.output(f"{FOLDER}/{PRIOR}") as partial:
             block_prior(run.adjustment).save(partial)
+    run = _portable(run, workspace.folder)
     with _told(workspace, "summary", progress):
-        summary = replace(summarize(run), inputs=_entries(inputs))
-    summary = replace(summary, stages=tuple(map(StageEntry.read, run.stages)))
+        summary = replace(summarize(run), inputs=_entries(inputs, workspace.folder), out_dir=None, stages=None)
     _tell(progress, REPORT, 0)
     summary = write_tables(workspace, run, summary)
     _tell(progress, REPORT, 1)
-    return summary
+    return replace(summary, out_dir=run.out_dir, stages=tuple(map(StageEntry.read, workspace.stages)))
 
 
-def _entries(inputs: Iterable[Input]) -> tuple[InputEntry, ...]:
+def _entries(inputs: Iterable[Input], folder: Path) -> tuple[InputEntry, ...]:
     """Return every file that was read, once, by its path."""
-    files = {one.path: one for given in inputs for one in given.every()}
+    files = {portable(one.path, folder): one for given in inputs for one in given.every()}
     return tuple(InputEntry(path, one.size, one.sha256) for path, one in sorted(files.items()))
+
+
+def _portable(run: Run, folder: Path) -> Run:
+    """Return the run with every path relative to its folder, and without what was only said to this command."""
+
+    def at(path: Any) -> Any:
+        return tuple(map(at, path)) if isinstance(path, tuple) else portable(os.fspath(path), folder)
+
+    options = run.options
+    assert isinstance(options, RunOptions)
+    given = {key: getattr(options, key) for key, one in declared(RunOptions).items() if one.rule.unit in _PATHS}
+    return replace(
+        run,
+        views=tuple(replace(view, path=at(view.path)) for view in run.views),
+        sources=tuple(replace(source, path=at(source.path)) for source in run.sources),
+        left_out=tuple((at(path), reason.replace(path, at(path))) for path, reason in run.left_out),
+        options=replace(options, overwrite=False, **{key: at(value) for key, value in given.items() if value}),
+    )
 
 
 def _tell(progress: Progress | None, stage: str, done: int) -> None:

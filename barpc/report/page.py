@@ -21,7 +21,7 @@ from barpc.report.maps import ground_map, residual_panels, template
 from barpc.report.records import MAX_SHOWN, Record, Table, cell_of, table, value_of
 from barpc.report.reservations import GOOD_RMSE
 from barpc.report.runfiles import RunFiles, read_tables
-from barpc.report.summary import StageEntry, Summary
+from barpc.report.summary import Summary
 from barpc.report.summary.known import GCPS, CheckPointEntry, GcpEntry, ReferenceViewEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
@@ -32,7 +32,7 @@ from barpc.scene import connected_groups
 
 NAME = "report.html"
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
-REPORT = "report"  # the stage that makes the page, which cannot tell how long it took
+REPORT = "report"  # the stage that makes the page
 
 
 def can_render() -> bool:
@@ -106,7 +106,6 @@ _TABLES: dict[str, tuple[str, type[Record], str]] = {
     "again": ("Pairs that were tried again, and what found too few matches", PairEntry, PairEntry.AGAIN),
     "check-points": ("Check points: found minus given place", CheckPointEntry, CheckPointEntry.PAGE),
     "fits": ("Refitted RPCs against the corrected cameras, on points new to the fit", ViewEntry, ViewEntry.FITS),
-    "stages": ("Stages of the run", StageEntry, StageEntry.PAGE),
 }
 """Key of a table -> its caption, and the columns of its records."""
 _FOLDED = "places", "control", "decided", "again", "options"
@@ -285,11 +284,9 @@ def _files(files: RunFiles) -> Section | None:
 
 
 def _run(files: RunFiles) -> Section:
-    stages = [stage for stage in files.summary.stages if stage.stage != REPORT]
     rows = [[cell_of(key), cell_of(str(value))] for key, value in flat_options(files.summary.options or {}).items()]
     options = Table("options", "Options of the run", ["option", "value"], rows)
-    facts = {"summary": files.summary, "stages": stages}
-    return _section("run", facts, tables=[*_table("stages", stages), options])
+    return _section("run", {"summary": files.summary}, tables=[options])
 
 
 SECTIONS: Sequence[Callable[[RunFiles], Section | None]] = (

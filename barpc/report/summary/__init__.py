@@ -75,7 +75,6 @@ class StageEntry(Record):
     """A stage of the run."""
 
     MORE: ClassVar = _Plain
-    PAGE: ClassVar = "stage seconds cpu_seconds peak_memory_mb"
 
     stage: str = said("Name", head="stage")
     seconds: float = said("Wall time in seconds", head="seconds", form=".2f")
@@ -94,7 +93,6 @@ class Summary(Record):
     verdict: tuple[str, ...] = said("What was reached, what is unknown, what needs a look")
     reasons: tuple[str, ...] = said("Those of its sentences that say why it is not good")
     passed: bool = said("Whether it is good: no image, point or file has a reservation (exit code 0, else 3)")
-    out_dir: str = said("Where the results are")
     altitude_m: Number = said("Median altitude of the tie points", ABOVE)
     views: tuple[ViewEntry, ...] = said("The images", minItems=1)
     pairs: tuple[PairEntry, ...] = said("Pairs with tie points in common")
@@ -104,13 +102,14 @@ class Summary(Record):
     scene: SceneEntry | None = said("The block as a whole; null for a check")
     gcps: tuple[GcpEntry, ...] = said("Ground control")
     check_points: tuple[CheckPointEntry, ...] = said("Points that stayed out of the adjustment")
-    stages: tuple[StageEntry, ...] = said("Stages of the run")
     options: Mapping[str, _Value | Mapping[str, _Value | Mapping[str, _Value]]] | None = said("Options of the run")
     versions: Mapping[str, str] = said("Versions of Python and packages")
     control_test: ControlTestEntry | None = said("The residuals of control, each tested", default=None)
     reference: ReferenceEntry | None = said("A reference orthoimage, where one was given", default=None)
     inputs: tuple[InputEntry, ...] | None = said("Every file that was read, as `barpc verify` asks", default=None)
     outputs: tuple[OutputEntry, ...] | None = said("Every file written but this and the report", default=None)
+    out_dir: str | None = said("Where the results are; of a result at hand, not in the file", default=None)
+    stages: tuple[StageEntry, ...] | None = said("Stages of the run; not in the file, see .barpc", default=None)
 
     def __repr__(self) -> str:
         return f"Summary({self.kind} of {len(self.views)} views, {self.status}: {self.headline})"
