@@ -129,7 +129,7 @@ def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
             echo(f"{kind}s: {told or 'none'}")
     if not wrong:
         return 0
-    return tell_gate("the run is not what it was:", [f"{one.file} {one.now}" for one in wrong])
+    return tell_gate("the run is not what it was:", list(dict.fromkeys(f"{one.file} {one.now}" for one in wrong)))
 
 
 # --- a surface --------------------------------------------------------------------------------------------

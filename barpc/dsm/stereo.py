@@ -294,7 +294,6 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: s
         (i, j): ties.get(frozenset((views[i].name, views[j].name)), 0.0) for i, j in combinations(range(len(views)), 2)
     }
     there = None if minus is None else {view.name for view in read_summary(Path(minus)).views}
-    names = ", ".join(view.name for view in views) + ("" if there is None else f" minus {', '.join(sorted(there))}")
     parts = [[i for i, v in enumerate(views) if there is None or (v.name in there) == old] for old in (False, True)]
     if there is None:
         del parts[1]
@@ -306,7 +305,8 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: s
     flagged = frozenset(i for i, shot in enumerate(scene.shots) if shot.entry.advice)
     groups = [_best(views, worth, flagged, part) for part in parts]
     errors = CameraErrors.of(BlockPrior.load(table_path(folder, PRIOR)), views)
-    return Block(views, groups, names, errors, scene.summary)
+    source = " minus ".join(", ".join(views[i].name for i in part) for part in parts)
+    return Block(views, groups, source, errors, scene.summary)
 
 
 def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = None, band: int = 1) -> Block:

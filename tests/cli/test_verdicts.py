@@ -237,7 +237,7 @@ def test_a_result_is_printed_once_and_its_exit_code_says_whether_it_passes(
 ) -> None:
     monkeypatch.setattr("barpc.cli.adjust.wants_json", lambda: as_json)
     record = a_summary([], reasons=("One.",))
-    result: Any = SimpleNamespace(summary={"a": 1}, record=record, passed=True)
+    result: Any = SimpleNamespace(summary={"a": 1}, record=record, passed=True, root="")
     assert _tell({"quiet": quiet}, result) == 0
     assert capsys.readouterr() == (out, "")
     result.passed = False
@@ -255,7 +255,7 @@ def test_match_stops_after_matching_and_check_asks_another_entry(monkeypatch: py
             assert executor is None
             assert callable(progress)
             asked.append((name, list(images), options.stop_after, where))
-            return SimpleNamespace(summary={}, record=a_summary([]), passed=True)
+            return SimpleNamespace(summary={}, record=a_summary([]), passed=True, root="")
 
         return work
 

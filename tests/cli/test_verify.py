@@ -1,18 +1,28 @@
-"""`barpc verify`: what is still the same of a finished run, and what is not, told apart."""
+"""`barpc verify`: every file of a finished run is what it was, by one root, or is named."""
 
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+from collections.abc import Callable
+from hashlib import sha256
 from pathlib import Path
 
 import pytest
 
 from barpc import adjust
+from barpc.base import manifest
 from barpc.base.options import RunOptions
+from barpc.pipeline import outputs
+from barpc.pipeline.outputs import GOOD, prove
 from barpc.rpcio import read_rpc, write_rpc
+from barpc.workspace import Workspace
 from tests.reliability.conftest import barpc
 from tests.reliability.trials import SAMPLES, crop
+
+SUMS = "SHA256SUMS"
 
 
 @pytest.fixture(scope="module")
@@ -31,10 +41,35 @@ def run(finished, tmp_path) -> Path:
     return tmp_path / "out"
 
 
-def findings(run: Path, *places: Path) -> tuple[int, dict[tuple[str, str], str]]:
+def findings(run: Path, *places: object) -> tuple[int, dict[tuple[str, str], str]]:
     said = barpc("verify", run, *places, "--json")
     rows = json.loads(said.out)
     return said.code, {(one["kind"], Path(one["file"]).name): one["now"] for one in rows}
+
+
+def wrong(run: Path, root: str | None = None) -> set[tuple[str, str]]:
+    """Files that are not what they were, and what became of them."""
+    return {(one.file, one.now) for one in prove(run, (), root) if one.now not in GOOD}
+
+
+def files(run: Path) -> list[str]:
+    """Every file of a run but its state."""
+    names = (path.relative_to(run).as_posix() for path in sorted(run.rglob("*")) if path.is_file())
+    return [name for name in names if not name.startswith(".barpc/")]
+
+
+def root_of(run: Path) -> str:
+    return sha256((run / SUMS).read_bytes()).hexdigest()
+
+
+def settled(run: Path) -> None:
+    """What an adversary does who knows all: hashes of every file as it is now, in SHA256SUMS and in the state."""
+    first = manifest.read(run)[1][0]
+    layer = manifest.Layer(first.head, {n: sha256((run / n).read_bytes()).hexdigest() for n in files(run) if n != SUMS})
+    (run / SUMS).write_text(manifest.render([layer]))
+    state = json.loads((run / ".barpc/state.json").read_text())
+    state["outputs"] = {**layer.files, SUMS: root_of(run)}
+    (run / ".barpc/state.json").write_text(json.dumps(state))
 
 
 @pytest.mark.slow
@@ -42,15 +77,151 @@ def test_a_run_that_nobody_touched_is_what_it_was(run) -> None:
     code, found = findings(run)
     assert code == 0
     assert set(found.values()) == {"same"}
-    written = {path.relative_to(run).as_posix() for path in run.rglob("*") if path.is_file()}
-    expected = {name for name in written if not name.startswith(".barpc/")} - {"summary.json", "report.html"}
-    assert {name for kind, name in found if kind == "output"} == {Path(name).name for name in expected}
+    written = set(files(run)) - {SUMS}
+    assert {name for kind, name in found if kind == "output"} == {Path(name).name for name in written}
     assert {name for kind, name in found if kind == "input"} >= {"view_00.tif", "view_01.tif"}
     cameras = {name for kind, name in found if kind == "camera"}
     assert {"view_00.vrt", "view_00_RPC.TXT", "view_00.RPB", "view_00_grid.tif"} <= cameras
     said = barpc("verify", run)
     assert said.err == ""
-    assert f"outputs: {len(expected)} same" in said.out
+    assert f"outputs: {len(written)} same" in said.out
+    assert f"root {SUMS}: same, {root_of(run)}, layer 1 of 1\n" in said.out
+
+
+@pytest.mark.skipif(shutil.which("sha256sum") is None, reason="sha256sum is not installed")
+def test_sha256sum_reads_what_the_run_lists_and_tells_its_root(run) -> None:
+    def asked(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(["sha256sum", *words], cwd=run, capture_output=True, text=True, check=False)
+
+    told = asked("-c", "--strict", SUMS)
+    assert told.returncode == 0, told
+    assert len(told.stdout.splitlines()) == len(files(run)) - 1
+    assert asked(SUMS).stdout.split()[0] == root_of(run)
+    (run / "report.html").unlink()
+    (run / "view_00.RPB").unlink()
+    assert asked("-c", SUMS).returncode == 1
+
+
+# --- any byte, any file -----------------------------------------------------------------------------------
+
+
+def edits(data: bytes) -> dict[str, bytes]:
+    """A file, changed: a bit at its beginning, in the middle and at its end; cut, emptied, lengthened."""
+    flipped = {}
+    for at in (0, len(data) // 2, len(data) - 1):
+        flipped[f"bit of byte {at}"] = data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
+    return {**flipped, "cut": data[:-1], "empty": b"", "longer": data + b"\n"}
+
+
+def test_every_edit_of_every_file_is_named_and_so_is_its_absence(run, monkeypatch) -> None:
+    monkeypatch.setattr(outputs, "_cameras", lambda summary, folder: ())  # the hashes alone find it
+    root, names = root_of(run), files(run)
+    assert len(names) > 20
+    for name in names:
+        path = run / name
+        data, before = path.read_bytes(), path.stat()
+        for how, changed in edits(data).items():
+            path.write_bytes(changed)
+            os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+            said = barpc("verify", run)
+            assert said.code in ((1, 3) if name == SUMS else (3,)), (name, how)
+            assert name in said.err, (name, how)
+            assert barpc("verify", run, "--expect", root).code in (1, 3), (name, how)
+        path.unlink()
+        said = barpc("verify", run)
+        assert (said.code, name in said.err) == (1 if name == SUMS else 3, True), name
+        path.write_bytes(data)
+    assert wrong(run, root) == set()
+
+
+def test_every_consistent_edit_is_found_by_the_root_alone(run, monkeypatch) -> None:
+    monkeypatch.setattr(outputs, "_cameras", lambda summary, folder: ())
+    root = root_of(run)
+    for name in set(files(run)) - {SUMS, "summary.json"}:
+        data, sums = (run / name).read_bytes(), (run / SUMS).read_bytes()
+        state = (run / ".barpc/state.json").read_bytes()
+        (run / name).write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+        settled(run)
+        assert wrong(run) == set(), name
+        assert wrong(run, root) == {(SUMS, "changed")}, name
+        for path, old in ((name, data), (SUMS, sums), (".barpc/state.json", state)):
+            (run / path).write_bytes(old)
+    assert wrong(run, root) == set()
+
+
+BESIDE = ".RPB", ".XML", ".xml", "_rpc.txt", ".rpc", ".vrt.aux.xml", ".geom", ".vrt.RPB", "_RPB.TXT", "-RPC.txt", ".IMD"
+
+
+@pytest.mark.parametrize("end", BESIDE)
+def test_a_file_that_another_tool_would_read_first_is_named(run, end) -> None:
+    for name in ("view_00", "view_01"):
+        (run / f"{name}{end}").unlink(missing_ok=True)
+    shutil.copy(run / "view_01_RPC.TXT", run / f"view_00{end}")
+    found = wrong(run)
+    assert (f"view_00{end}", "changed" if end == ".RPB" else "added") in found
+    assert barpc("verify", run).code == 3
+
+
+def edited(run: Path, change: Callable[[dict], object]) -> None:
+    """Edit the summary, which is valid afterwards."""
+    summary = json.loads((run / "summary.json").read_text())
+    change(summary)
+    (run / "summary.json").write_text(json.dumps(summary))
+
+
+def turned(run: Path) -> None:
+    """Point a VRT at the other image, and give its hash."""
+    path = run / "view_00.vrt"
+    path.write_text(path.read_text().replace("view_00.tif", "view_01.tif"))
+    sha = sha256(path.read_bytes()).hexdigest()
+    edited(run, lambda s: [one.update(sha256=sha) for one in s["outputs"] if one["file"] == "view_00.vrt"])
+
+
+FAULTS: dict[str, tuple[Callable[[Path], object], set[tuple[str, str]]]] = {
+    "another report": (lambda run: (run / "report.html").write_text("All is well."), {("report.html", "changed")}),
+    "no report": (lambda run: (run / "report.html").unlink(), {("report.html", "missing")}),
+    "better figures": (
+        lambda run: edited(run, lambda s: s["views"][0].update(rmse_after=1e-3)),
+        {("summary.json", "changed")},
+    ),
+    "no certified camera": (
+        lambda run: edited(run, lambda s: [view.update(certified=[]) for view in s["views"]]),
+        {("summary.json", "changed")},
+    ),
+    "no outputs": (lambda run: edited(run, lambda s: s.update(outputs=[])), {("summary.json", "changed")}),
+    "no inputs": (lambda run: edited(run, lambda s: s.update(inputs=[])), {("summary.json", "changed")}),
+    "inputs elsewhere": (
+        lambda run: edited(run, lambda s: [one.update(path="https://a.org/x.tif") for one in s["inputs"]]),
+        {("summary.json", "changed")},
+    ),
+    "another image": (turned, {("summary.json", "changed"), ("view_00.vrt", "changed")}),
+    "another folder": (lambda run: (run / "tables").rename(run / "Tables"), {("Tables/pairs.csv", "added")}),
+    "no summary": (lambda run: (run / "summary.json").unlink(), {("summary.json", "missing")}),
+    "a summary that is none": (lambda run: (run / "summary.json").write_text("{}"), {("summary.json", "changed")}),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_that_stays_within_what_a_summary_says_is_named(run, name) -> None:
+    root, (fault, expected) = root_of(run), FAULTS[name]
+    fault(run)
+    assert expected <= wrong(run)
+    assert barpc("verify", run).code == 3
+    settled(run)  # with all hashes made right, the root that was printed tells
+    assert barpc("verify", run, "--expect", root).code == 3
+
+
+def test_line_ends_that_were_converted_are_named(run) -> None:
+    ours = (run / SUMS).read_bytes()
+    for name in files(run):
+        if name.endswith((".csv", ".TXT", ".json", SUMS)):
+            (run / name).write_bytes((run / name).read_bytes().replace(b"\n", b"\r\n"))
+    said = barpc("verify", run)
+    assert (said.code, said.out) == (1, "")
+    assert f"{SUMS}: changed" in said.err
+    assert "line ends" in said.err
+    (run / SUMS).write_bytes(ours)
+    assert {("tables/pairs.csv", "changed"), ("view_00_RPC.TXT", "changed")} <= wrong(run)
 
 
 def test_an_output_that_was_changed_is_named(run) -> None:
@@ -70,9 +241,129 @@ def test_an_output_that_was_changed_is_named(run) -> None:
     assert "exit code 3" in said.err
 
 
-def test_a_report_that_is_made_again_is_no_fault(run) -> None:
+# --- what later commands add ------------------------------------------------------------------------------
+
+
+def test_a_report_that_is_made_again_is_the_same_file(run) -> None:
+    root = root_of(run)
     (run / "report.html").unlink()
-    assert findings(run)[0] == 0
+    assert findings(run)[0] == 3
+    assert barpc("report", run).code == 0
+    assert findings(run, "--expect", root)[0] == 0
+    assert root_of(run) == root
+
+
+def test_later_commands_add_layers_and_every_root_is_known(run, monkeypatch) -> None:
+    roots, page = [root_of(run)], outputs.report_html
+    for text in ("<!-- another release -->", "<!-- one more -->"):
+        monkeypatch.setattr(outputs, "report_html", lambda summary, folder, text=text: page(summary, folder) + text)
+        assert barpc("report", run).code == 0
+        roots.append(root_of(run))
+    assert barpc("convert", SAMPLES[2], "-o", run, "--rpc-format", "rpb").code == 0
+    roots.append(root_of(run))
+    assert len(set(roots)) == 4
+    for number, root in enumerate(roots, start=1):
+        said = barpc("verify", run, "--expect", root)
+        assert said.code == 0, said
+        assert f"same, {root}, layer {number} of 4" in said.out
+        assert ("report.html: later, made again after that root" in said.out) == (number < 3)
+        assert ("later, added after that root" in said.out) == (number < 4)
+    head = (run / SUMS).read_text().splitlines()
+    assert [line.partition(", after ")[2] for line in head if "code" in line] == ["", *roots[:3]]
+    assert barpc("convert", SAMPLES[0], "-o", run, "--rpc-format", "rpb", "--overwrite").code == 0
+    assert wrong(run, roots[0]) == {("view_00.vrt", "changed"), ("view_00.RPB", "changed")}  # results are the run's own
+    (run / "report.html").write_text("theirs")
+    assert {barpc("verify", run, "--expect", root).code for root in roots} == {3}
+
+
+def test_a_later_command_hides_no_earlier_edit(run, monkeypatch) -> None:
+    root = root_of(run)
+    (run / "view_00_RPC.TXT").write_bytes((run / "view_01_RPC.TXT").read_bytes())
+    monkeypatch.setattr(outputs, "report_html", lambda summary, folder: "of another release")
+    assert barpc("report", run).code == 0
+    assert root_of(run) != root
+    assert wrong(run) == wrong(run, root) == {("view_00_RPC.TXT", "changed")}
+    sums = (run / SUMS).read_text().replace("# barpc 0", "# barpc 9", 1)
+    (run / SUMS).write_text(sums)
+    monkeypatch.setattr(outputs, "report_html", lambda summary, folder: "of one more")
+    assert barpc("report", run).code == 0
+    assert (run / SUMS).read_text() == sums  # changed by somebody: nothing is built on it
+    assert (SUMS, "changed") in wrong(run)
+
+
+def test_a_command_that_is_killed_before_its_layer_is_said_and_heals(run, monkeypatch) -> None:
+    root = root_of(run)
+    with monkeypatch.context() as patch:
+        patch.setattr(outputs, "report_html", lambda summary, folder: "of another release")
+        with monkeypatch.context() as killed:
+            killed.setattr(Workspace, "_add_layer", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))
+            assert barpc("report", run).code == 130
+        assert root_of(run) == root
+        said = barpc("verify", run)
+        assert said.code == 3
+        assert "output report.html: changed, by a command that did not come to its end: give it again" in said.out
+        assert barpc("report", run).code == 0
+    assert wrong(run, root) == set()
+
+
+@pytest.mark.parametrize("target", ["satnerf", "colmap"])
+def test_an_export_has_a_root_of_its_own_that_names_the_run_s(run, tmp_path, target) -> None:
+    root = root_of(run)
+    for place in (tmp_path / "beside", run / "inside"):
+        assert barpc("export", run, place, "--to", target).code == 0
+        assert findings(run, "--expect", root) == findings(run)
+        assert findings(run)[0] == 0
+        assert f", after {root}\n" in (place / SUMS).read_text()
+        own = root_of(place)
+        assert wrong(place, own) == set()
+        name = next(name for name in files(place) if name != SUMS and not (place / name).is_symlink())
+        (place / name).write_bytes(b"other")
+        assert (name, "changed") in wrong(place)
+        settled_sums = manifest.read(place)[1]
+        settled_sums[0].files[name] = sha256(b"other").hexdigest()
+        (place / SUMS).write_text(manifest.render(settled_sums))
+        assert (SUMS, "changed") in wrong(place, own)
+    assert "not asked, a folder of its own: barpc verify" in barpc("verify", run).out
+
+
+# --- where it lies ----------------------------------------------------------------------------------------
+
+
+def test_a_run_that_was_moved_or_copied_passes_and_a_whole_project_too(finished, run, tmp_path) -> None:
+    root = root_of(run)
+    run.rename(tmp_path / "Other name")
+    assert findings(tmp_path / "Other name", "--expect", root)[0] == 0
+    project = Path(shutil.copytree(finished, tmp_path / "disk" / "project"))
+    shutil.rmtree(project / "out/.barpc")  # knows no place
+    code, found = findings(project / "out", "--expect", root)
+    assert code == 0
+    assert set(found.values()) == {"same"}
+    (project / "in").rename(project / "images")
+    assert findings(project / "out")[0] == 3
+    assert findings(project / "out", project / "images")[0] == 0
+    (tmp_path / "link").symlink_to(project / "out")
+    assert findings(tmp_path / "link", project / "images", "--expect", root.upper())[0] == 0
+
+
+def test_what_is_no_root_is_wrong_usage(run) -> None:
+    for given in ("", "1234", root_of(run)[:-1], root_of(run) + "0", "g" * 64):
+        said = barpc("verify", run, "--expect", given)
+        assert (said.code, said.out) == (2, "")
+    said = barpc("verify", run, "--expect", "0" * 64)
+    assert said.code == 3
+    assert f"none of its 1 layers has {'0' * 64}" in said.out
+
+
+def test_a_run_of_an_older_release_is_one_line(run) -> None:
+    (run / SUMS).unlink()
+    said = barpc("verify", run)
+    assert (said.code, said.out) == (1, "")
+    assert len(said.err.splitlines()) == 1
+    assert f"{run / SUMS}: missing" in said.err
+    assert "release 0.3 or older" in said.err
+    assert barpc("report", run).code == 0
+    assert not (run / SUMS).exists()
+    assert barpc("verify", run.parent / "nowhere").code == 1
 
 
 def test_inputs_that_changed_are_told_from_those_that_moved(finished, run, tmp_path) -> None:
@@ -84,6 +375,7 @@ def test_inputs_that_changed_are_told_from_those_that_moved(finished, run, tmp_p
     for one in summary["inputs"]:
         one["path"] = str(tmp_path / "gone" / Path(one["path"]).name)
     (run / "summary.json").write_text(json.dumps(summary))
+    settled(run)
     code, found = findings(run)
     assert code == 3
     assert {now for (kind, _), now in found.items() if kind == "input"} == {"missing"}
@@ -96,13 +388,3 @@ def test_inputs_that_changed_are_told_from_those_that_moved(finished, run, tmp_p
     (tmp_path / "gone").mkdir()
     shutil.copy(finished / "in" / "view_00.tif", tmp_path / "gone" / "view_01.tif")
     assert findings(run)[1]["input", "view_01.tif"] == "changed"
-
-
-def test_a_run_without_hashes_is_one_line(run) -> None:
-    summary = json.loads((run / "summary.json").read_text())
-    del summary["inputs"]
-    (run / "summary.json").write_text(json.dumps(summary))
-    said = barpc("verify", run)
-    assert (said.code, said.out) == (1, "")
-    assert "holds no hashes" in said.err
-    assert barpc("verify", run.parent / "nowhere").code == 1

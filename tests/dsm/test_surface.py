@@ -407,7 +407,7 @@ def test_a_run_s_images_have_its_cameras_and_its_pairs_their_tie_points(run_of_s
         ("c", "/x/c.tif", (9, 8), "rpc c", (5.0, 9.0), "2020-01-03"),
     ]
     assert asked == [({(0, 1): 30.0, (0, 2): 70.0, (1, 2): 0.0}, frozenset({0}), [0, 1, 2])]
-    assert (block.groups, block.source, block.errors) == ([[0, 1, 2]], str(tmp_path), (PRIOR, 3))
+    assert (block.groups, block.source, block.errors) == ([[0, 1, 2]], "a, b, c", (PRIOR, 3))
 
 
 def test_of_two_dates_the_images_that_the_earlier_run_has_are_taken_away(run_of_shots, tmp_path):
@@ -416,7 +416,7 @@ def test_of_two_dates_the_images_that_the_earlier_run_has_are_taken_away(run_of_
     block = made(shots, minus="first", there=("d", "b", "z"))
     assert block.groups == [[0, 2], [1, 3]]
     assert [part for *_, part in asked] == block.groups
-    assert block.source == f"{tmp_path} minus first"
+    assert block.source == "a, c minus b, d"
     for there, num in (("a", 1), ("abd", 3)):
         with pytest.raises(InputError, match=f"first: has {num} of the 4 images of"):
             made(shots, minus="first", there=there)

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import OutputError
-from barpc.base.options import RunOptions, TieOptions
+from barpc.base.options import RunOptions
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.pipeline import handoff, outputs
 from barpc.pipeline.handoff import CONSUMERS, Consumer, Reading, control_grid, difference, verify
@@ -23,7 +23,7 @@ from barpc.pipeline.inputs import PRIOR
 from barpc.pipeline.outputs import REOPENED, file_names, output_names, refuse_shadows, write_views
 from barpc.report.page import can_render
 from barpc.report.runfiles import TABLES
-from barpc.report.summary import OutputEntry, StageEntry
+from barpc.report.summary import OutputEntry
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
@@ -48,7 +48,6 @@ def write_view(
 @dataclass(frozen=True)
 class Said:
     of: str
-    stages: tuple[StageEntry, ...] = ()
     outputs: tuple[OutputEntry, ...] = ()
 
 
@@ -283,7 +282,7 @@ def test_the_outputs_of_a_run_are_known_before_it_starts(tmp_path, view) -> None
     }
     prior, common = (
         f"tables/{PRIOR}",
-        [*(f"tables/{name}" for name in TABLES), "summary.json"] + (["report.html"] if can_render() else []),
+        [*(f"tables/{name}" for name in TABLES), "summary.json", "SHA256SUMS"] + ["report.html"] * can_render(),
     )
     pairs = ["asp/b__c__scene.txt", "asp/scene__b__c.txt"]
     assert sorted(names["matching"]) == sorted([*common, "matches.csv", "matches.npz", *pairs])
@@ -320,8 +319,9 @@ def test_a_folder_with_a_summary_is_complete(tmp_path, monkeypatch, page: bool) 
     assert summary.pop("outputs") == [
         {"file": name, "sha256": hashlib.sha256((folder / name).read_bytes()).hexdigest()} for name in names[:2]
     ]
-    assert summary == {"of": "what was found", "stages": [asdict(stage) for stage in told.stages]}
-    assert [stage["stage"] for stage in summary["stages"]] == ["tables", "report"]
+    assert summary == {"of": "what was found"}
+    assert told.of == "what was found"
+    assert [stage["stage"] for stage in run.stages] == ["tables", "report"]
     assert (folder / "summary.json").read_text().endswith("\n")
 
 
@@ -423,20 +423,3 @@ def test_points_of_a_reference_are_written_where_it_held_the_block(
     with Workspace(tmp_path / "out") as workspace:
         outputs.write_tables(workspace, run, Said("x"))  # type: ignore[arg-type]
     assert (tmp_path / "out/tables/gcps.geojson").exists() == written
-
-
-@pytest.mark.parametrize("page", [True, False])
-def test_the_stages_of_a_run_are_told_with_those_of_its_tables(tmp_path, monkeypatch, page) -> None:
-    monkeypatch.setattr(outputs, "TABLES", {})
-    monkeypatch.setattr(outputs, "can_render", lambda: page)
-    monkeypatch.setattr(outputs, "report_html", lambda summary, folder: "page")
-    options = RunOptions(tie=TieOptions(band=3))
-    run = SimpleNamespace(reference=None, adjustment=None, options=options)
-    said = Said("x", (StageEntry("before", 1.0, 1.0, 1.0),))
-    with Workspace(tmp_path / "out") as workspace:
-        with workspace.stage("earlier"):
-            pass
-        told = outputs.write_tables(workspace, run, said)  # type: ignore[arg-type]
-    stages = ["before", "tables", "report"]
-    assert [stage.stage for stage in told.stages] == stages
-    assert json.loads((tmp_path / "out/summary.json").read_text())["stages"] == [asdict(one) for one in told.stages]

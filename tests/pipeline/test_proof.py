@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 from hashlib import sha256
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,40 +13,77 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import InputError
+from barpc.base.manifest import Layer, render
 from barpc.pipeline import outputs as proof
 from barpc.pipeline.beyond import REOPENED
-from barpc.pipeline.outputs import CHANGED, GOOD, MISSING, MOVED, SAME, UNKNOWN, Proved, prove
+from barpc.pipeline.outputs import ADDED, CHANGED, GOOD, LATER, MISSING, MOVED, SAME, UNKNOWN, Proved
 from barpc.rpcio import write_rpc
 from tests.rpcio.conftest import make_rpc
 
 POINTS = [[5.4, 43.2, alt] for alt in (60.0, 120.0, 250.0)]
 
 
-def noted(path: Path, name: str = "path") -> Any:
-    return SimpleNamespace(
-        **{name: path.name if name == "file" else str(path), "sha256": sha256(path.read_bytes()).hexdigest()}
-    )
+def noted(path: Path) -> Any:
+    return SimpleNamespace(path=str(path), sha256=sha256(path.read_bytes()).hexdigest())
 
 
 @pytest.fixture
 def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """What a summary says; its folder is `out`."""
-    summary = SimpleNamespace(inputs=[], outputs=[], views=[])
+    """What a summary says; its folder is `out`, which has no other file."""
+    summary = SimpleNamespace(inputs=[], views=[])
     (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "summary.json").touch()
+    listed(tmp_path / "out")
     monkeypatch.setattr(proof, "read_summary", lambda folder: summary)
     return summary
 
 
+def listed(folder: Path, *later: dict[str, bytes]) -> str:
+    """SHA256SUMS of the files of a folder, and of later contents; its root."""
+    files = {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "SHA256SUMS"}
+    layers: list[Layer] = []
+    for part in (files, *later):
+        after = f", after {sha256(render(layers).encode()).hexdigest()}" if layers else ""
+        hashes = {name: sha256(data).hexdigest() for name, data in part.items()}
+        layers.append(Layer(f"barpc 0, code 0{after}", hashes))
+    (folder / "SHA256SUMS").write_text(render(layers))
+    return sha256(render(layers).encode()).hexdigest()
+
+
+def prove(folder: Path, places: Any = (), expected: str | None = None) -> list[Proved]:
+    """What is said of inputs and cameras; of outputs and the root, what is wrong or later."""
+    found = proof.prove(folder, places, expected)
+    return [one for one in found if one.kind in ("input", "camera") or one.now != SAME]
+
+
 def test_the_words_are_those_of_the_page() -> None:
-    assert (SAME, MOVED, CHANGED, MISSING, UNKNOWN) == ("same", "moved", "changed", "missing", "not asked")
-    assert GOOD == (SAME, MOVED)
+    assert (SAME, MOVED, LATER, UNKNOWN) == ("same", "moved", "later", "not asked")
+    assert (CHANGED, MISSING, ADDED) == ("changed", "missing", "added")
+    assert GOOD == (SAME, MOVED, LATER, UNKNOWN)
     assert Proved("input", "a", SAME).note == ""
 
 
-@pytest.mark.parametrize("lacks", ["inputs", "outputs"])
-def test_a_run_without_hashes_is_refused(told, tmp_path, lacks) -> None:
-    setattr(told, lacks, None)
-    with pytest.raises(InputError, match="out: its summary holds no hashes"):
+def test_a_run_without_sums_is_refused_and_so_is_one_whose_sums_are_not_as_barpc_writes_them(told, tmp_path) -> None:
+    sums = tmp_path / "out" / "SHA256SUMS"
+    text = sums.read_bytes()
+    for bad in (
+        b"",
+        text[:-1],
+        text.replace(b"\n", b"\r\n"),
+        text + b"\n",
+        text + text[-79:],
+        text[1:],
+        b"\xff" + text,
+    ):
+        sums.write_bytes(bad)
+        with pytest.raises(InputError, match="SHA256SUMS: changed"):
+            prove(tmp_path / "out")
+    for name in ("../x", "/x", "a\\b", "a/../../x"):
+        sums.write_bytes(text.replace(b"summary.json", name.encode()))
+        with pytest.raises(InputError, match="SHA256SUMS: changed"):
+            prove(tmp_path / "out")
+    sums.unlink()
+    with pytest.raises(InputError, match=r"SHA256SUMS: missing, .* interrupted, or of release 0\.3"):
         prove(tmp_path / "out")
 
 
@@ -57,7 +96,7 @@ def test_an_input_is_looked_for_in_the_run_beside_it_and_where_one_says(told, tm
     for place in (tmp_path / "out", tmp_path / "elsewhere"):
         place.mkdir(exist_ok=True)
         (place / "in.tif").write_bytes(b"one")
-        (found,) = prove(tmp_path / "out", [tmp_path / "elsewhere"])
+        found = prove(tmp_path / "out", [tmp_path / "elsewhere"])[-1]  # in the run: nobody put it there, besides
         assert found == Proved("input", str(path), MOVED, f"it is {place / 'in.tif'}")
         (place / "in.tif").unlink()
     path.unlink()
@@ -75,8 +114,10 @@ def test_an_input_on_another_host_is_not_asked(told, tmp_path) -> None:
 
 def test_an_output_is_the_same_changed_or_missing(told, tmp_path) -> None:
     (path := tmp_path / "out" / "a.csv").write_bytes(b"one")
-    told.outputs = [noted(path, "file")]
-    assert prove(tmp_path / "out") == [Proved("output", "a.csv", SAME)]
+    assert prove(tmp_path / "out") == [Proved("output", "a.csv", ADDED, "by nobody who noted it")]
+    listed(tmp_path / "out")
+    assert prove(tmp_path / "out") == []
+    assert Proved("output", "a.csv", SAME) in proof.prove(tmp_path / "out")
     path.write_bytes(b"two")
     assert prove(tmp_path / "out") == [Proved("output", "a.csv", CHANGED)]
     path.unlink()
@@ -86,14 +127,137 @@ def test_an_output_is_the_same_changed_or_missing(told, tmp_path) -> None:
 
 
 def test_what_cannot_be_read_counts_as_missing(told, tmp_path, monkeypatch) -> None:
-    (path := tmp_path / "out" / "a.csv").write_bytes(b"one")
-    told.outputs = [noted(path, "file")]
-
     def refuse(path: Path) -> None:
         raise PermissionError(path)
 
     monkeypatch.setattr(proof, "take", refuse)
-    assert prove(tmp_path / "out") == [Proved("output", "a.csv", MISSING)]
+    assert prove(tmp_path / "out") == [Proved("output", "summary.json", MISSING)]
+
+
+# --- layers -----------------------------------------------------------------------------------------------
+
+
+def test_a_root_is_that_of_any_layer_and_what_came_after_is_said(told, tmp_path) -> None:
+    out = tmp_path / "out"
+    (out / "report.html").write_bytes(b"first")
+    first = listed(out)
+    layers = ({"dsm.tif": b"surface", "report.html": b"second"}, {"report.html": b"third"})
+    second, last = listed(out, layers[0]), listed(out, *layers)
+    (out / "report.html").write_bytes(b"third")
+    (out / "dsm.tif").write_bytes(b"surface")
+    assert len({first, second, last}) == 3
+    assert prove(out) == prove(out, (), last) == []
+    again = Proved("root", "report.html", LATER, "made again after that root")
+    assert prove(out, (), second) == [again]
+    assert prove(out, (), first) == [Proved("root", "dsm.tif", LATER, "added after that root"), again]
+    of = {expected: proof.prove(out, (), expected)[0] for expected in (None, first, second, last)}
+    assert {one.now for one in of.values()} == {SAME}
+    assert of[first].note == f"{first}, layer 1 of 3"
+    assert of[second].note == f"{second}, layer 2 of 3"
+    assert of[last].note == of[None].note == f"{last}, layer 3 of 3"
+    for wrong in ("0" * 64, sha256(b"").hexdigest()):
+        (one,) = prove(out, (), wrong)
+        assert (one.kind, one.file, one.now) == ("root", "SHA256SUMS", CHANGED)
+        assert one.note == f"its root is {last}, and none of its 3 layers has {wrong}"
+
+
+def test_a_later_layer_vouches_for_no_other_result_of_the_run(told, tmp_path) -> None:
+    """A result that is replaced, and a forged layer that lists it: the first layer says what it was."""
+    (out := tmp_path / "out").joinpath("a_RPC.TXT").write_bytes(b"ours")
+    first = listed(out)
+    listed(out, {"a_RPC.TXT": b"theirs", "b": b"new"})
+    out.joinpath("a_RPC.TXT").write_bytes(b"theirs")
+    out.joinpath("b").write_bytes(b"new")
+    for expected in (None, first):
+        assert Proved("output", "a_RPC.TXT", CHANGED) in prove(out, (), expected)
+    out.joinpath("a_RPC.TXT").write_bytes(b"ours")
+    assert prove(out) == []
+
+
+def test_earlier_layers_cannot_be_rewritten(told, tmp_path) -> None:
+    (out := tmp_path / "out").joinpath("a").write_bytes(b"ours")
+    first = listed(out)
+    listed(out, {"b": b"new"})
+    out.joinpath("b").write_bytes(b"new")
+    sums = out / "SHA256SUMS"
+    assert prove(out, (), first) == [Proved("root", "b", LATER, "added after that root")]
+    out.joinpath("a").write_bytes(b"theirs")
+    sums.write_text(sums.read_text().replace(sha256(b"ours").hexdigest(), sha256(b"theirs").hexdigest()))
+    assert prove(out) == []  # all alike: the root alone can tell
+    (one,) = prove(out, (), first)
+    assert (one.file, one.now) == ("SHA256SUMS", CHANGED)
+
+
+def test_the_root_that_was_noted_is_told_from_that_of_sums_that_were_changed(told, tmp_path) -> None:
+    out, sums = tmp_path / "out", tmp_path / "out" / "SHA256SUMS"
+    root = sha256(sums.read_bytes()).hexdigest()
+    (out / ".barpc").mkdir()
+    state = {"outputs": {"SHA256SUMS": root, "added": sha256(b"1").hexdigest(), "odd": 3}}
+    (out / ".barpc/state.json").write_text(json.dumps(state))
+    assert prove(out) == prove(out, (), root) == []
+    (out / "added").write_bytes(b"1")
+    ended = "by a command that did not come to its end: give it again"
+    assert prove(out) == [Proved("output", "added", ADDED, ended)]
+    (out / "added").unlink()
+    sums.write_text(sums.read_text().replace("barpc 0,", "barpc 1,"))
+    new = sha256(sums.read_bytes()).hexdigest()
+    assert prove(out) == [Proved("root", "SHA256SUMS", CHANGED, f"its root is {new}, and {root} was noted")]
+    assert prove(out, (), new) == []  # that root was kept elsewhere
+
+
+# --- what lies in the folder ------------------------------------------------------------------------------
+
+
+def test_links_pipes_and_folders_that_hide_files_are_found(told, tmp_path) -> None:
+    out = tmp_path / "out"
+    (out / "tables").mkdir()
+    (elsewhere := tmp_path / "elsewhere").mkdir()
+    (elsewhere / "x").write_bytes(b"")
+    listed_by_hand = Layer("barpc 0, code 0", dict.fromkeys(("summary.json", "tables/a"), sha256(b"").hexdigest()))
+    (out / "SHA256SUMS").write_text(render([listed_by_hand]))
+    (out / "tables/a").symlink_to(elsewhere / "x")
+    assert prove(out) == []  # of the same content: what a store of large files leaves
+    (out / "tables/SHA256SUMS").touch()  # no folder of its own: the run's files are in it
+    (out / "more").symlink_to(elsewhere, target_is_directory=True)
+    os.mkfifo(out / "pipe")
+    (out / ".BARPC").mkdir()
+    (out / ".BARPC/x").touch()
+    (out / "Summary.json").touch()
+    (out / "empty").mkdir()
+    (out / "deep/er").mkdir(parents=True)
+    (out / "deep/er/SUMMARY.JSON").touch()
+    added = [".BARPC/x", "Summary.json", "deep/er/SUMMARY.JSON", "more", "pipe", "tables/SHA256SUMS"]
+    assert sorted(one.file for one in prove(out) if one.now == ADDED) == added
+    assert len(prove(out)) == len(added)
+
+
+def test_a_state_that_is_a_link_is_no_state(told, tmp_path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "out/.barpc").symlink_to(tmp_path / "elsewhere")
+    assert prove(tmp_path / "out") == [Proved("output", ".barpc", ADDED, "by nobody who noted it")]
+
+
+def test_a_folder_below_with_sums_is_named_and_not_asked(told, tmp_path) -> None:
+    (export := tmp_path / "out/nerf").mkdir()
+    (export / "a.json").touch()
+    (found,) = prove(tmp_path / "out")
+    assert (found.file, found.now) == ("nerf/a.json", ADDED)
+    listed(export)
+    assert prove(tmp_path / "out") == [Proved("output", "nerf", UNKNOWN, f"a folder of its own: barpc verify {export}")]
+    assert prove(export) == []
+    (export / "a.json").write_bytes(b"1")
+    assert prove(export) == [Proved("output", "a.json", CHANGED)]
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may read anywhere")
+def test_a_folder_that_cannot_be_read_is_no_empty_one(told, tmp_path) -> None:
+    (hidden := tmp_path / "out/hidden").mkdir()
+    hidden.chmod(0)
+    with pytest.raises(InputError, match="hidden: cannot be read"):
+        prove(tmp_path / "out")
+
+
+# --- cameras ----------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -106,6 +270,7 @@ def camera(told, tmp_path) -> Any:
         certified=np.hstack([points, rpc.project(points)]).tolist(), outputs={"a_RPC.TXT": {"barpc": 1e-9}}
     )
     told.views = [view]
+    listed(tmp_path / "out")
     return view
 
 
@@ -131,11 +296,11 @@ def test_one_point_that_is_off_is_enough_in_both_directions(camera, tmp_path) ->
 
 def test_a_camera_that_cannot_be_opened_says_why(camera, tmp_path) -> None:
     (tmp_path / "out" / "a_RPC.TXT").write_text("LINE_OFF: 1\n")
-    (found,) = prove(tmp_path / "out")
+    _, found = prove(tmp_path / "out")
     assert (found.kind, found.now) == ("camera", CHANGED)
     assert "a_RPC.TXT" in found.note
     (tmp_path / "out" / "a_RPC.TXT").unlink()
-    (found,) = prove(tmp_path / "out")
+    _, found = prove(tmp_path / "out")
     assert found.now == MISSING
 
 

@@ -111,7 +111,7 @@ def test_every_field_may_be_anything(verb, step, small_runs, block_run, tmp_path
     assert taken
 
 
-@pytest.mark.parametrize("key", ["views", "pairs", "scene", "tracks", "tables", "versions", "stages"])
+@pytest.mark.parametrize("key", ["views", "pairs", "scene", "tracks", "tables", "versions"])
 def test_what_is_missing_is_named(block_run, tmp_path, key):
     (tmp_path / "summary.json").write_text(json.dumps(changed(block_run.summary, (key,))))
     for verb in (["report", tmp_path], ["report", tmp_path, tmp_path]):
