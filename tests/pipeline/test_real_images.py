@@ -198,7 +198,8 @@ def test_camera_centres_are_at_the_height_of_the_orbit(triplet):
 def test_the_summary_is_plain_json_and_says_what_was_reached(triplet):
     result, out = triplet
     summary = json.loads((out / "summary.json").read_text(), parse_constant=lambda name: pytest.fail(name))
-    assert summary == json.loads(json.dumps(result.summary))
+    of_this_run = ("out_dir", "stages")
+    assert summary == {k: v for k, v in json.loads(json.dumps(result.summary)).items() if k not in of_this_run}
     assert summary["passed"] is True
     for view in summary["views"]:
         assert view["status"] == "adjusted"
@@ -209,7 +210,7 @@ def test_the_summary_is_plain_json_and_says_what_was_reached(triplet):
             assert "barpc" in consumers
     for pair in summary["pairs"]:
         assert abs(pair["epipolar_after"]["median"]) < 0.03 < abs(pair["epipolar_before"]["median"])
-    assert {stage["stage"] for stage in summary["stages"]} >= {
+    assert {stage["stage"] for stage in result.summary["stages"]} >= {
         "tie points",
         "adjustment",
         "fit",

@@ -34,9 +34,6 @@ from barpc.workspace import code_version
 
 SAMPLES = sorted((Path(__file__).resolve().parents[2] / "data_samples").glob("*.tif"))
 SIDE = 160  # px of a crop: a third of a second a run
-ABOUT_THE_RUN = ("stages", "out_dir", "outputs")
-"""What summary.json tells about the run and not about its result (the outputs' hashes: of files that hold paths);
-report.html shows the stages, too."""
 
 
 def crop(source: Path, target: Path, side: int = SIDE, start: int = 300) -> Path:
@@ -54,17 +51,9 @@ def crop(source: Path, target: Path, side: int = SIDE, start: int = 300) -> Path
 
 
 def outputs(folder: Path) -> dict[str, bytes]:
-    """The final files of a run by name, without what tells about the run itself."""
-    found = {}
-    for path in sorted(folder.rglob("*")):
-        name = path.relative_to(folder).as_posix()
-        if path.is_file() and not name.startswith(".barpc/") and name != "report.html":
-            found[name] = path.read_bytes()
-    if "summary.json" in found:
-        summary = json.loads(found["summary.json"])
-        kept = {key: value for key, value in summary.items() if key not in ABOUT_THE_RUN}
-        found["summary.json"] = json.dumps(kept).encode()
-    return found
+    """The final files of a run by name: all but its state."""
+    names = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {name: path.read_bytes() for name, path in names.items() if not name.startswith(".barpc/")}
 
 
 def start(command: list[str], log: Path) -> int:
