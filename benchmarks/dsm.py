@@ -161,7 +161,7 @@ def main() -> None:
         views = json.loads((run / "summary.json").read_text())["views"]
         smallest = min(w * h for w, h in (view["size"] for view in views)) / 1e6
         after = measure(str(run), None, arguments.against)
-        paths = [view["path"] for view in views]
+        paths = [str(run / view["path"]) for view in views]
         try:
             before = measure(paths, read_scene(run).alt_range, arguments.against)
         except NoSurfaceError as error:

@@ -152,6 +152,7 @@ def run(listed: Path, out: Path, jobs: int, only: bool = True) -> Trial:
         raise SystemExit(done.stderr)
     cpu = sum(getattr(after, name) - getattr(before, name) for name in ("ru_utime", "ru_stime"))
     summary = json.loads((out / "summary.json").read_text())
+    summary["stages"] = json.loads((out / ".barpc/state.json").read_text())["stages"]
     page = (out / "report.html").stat().st_size / 1e6 if (out / "report.html").exists() else 0.0
     return Trial(cpu, wall, after.ru_maxrss / 1e3, summary, page)
 

@@ -31,10 +31,10 @@ def turn(checkout: Path, compiled: str, arguments: list[str]) -> dict[str, float
         places = {"PYTHONPATH": str(checkout), "PYTHONPYCACHEPREFIX": compiled, "PYTHONDONTWRITEBYTECODE": ""}
         environment = os.environ | THREADS | places
         subprocess.run(command, check=True, env=environment, cwd=folder)
-        summary = json.loads(Path(folder, "out", "summary.json").read_text())
+        state = json.loads(Path(folder, "out", ".barpc", "state.json").read_text())
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     whole = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    stages = {entry["stage"]: entry["cpu_seconds"] for entry in summary["stages"]}
+    stages = {entry["stage"]: entry["cpu_seconds"] for entry in state["stages"]}
     return {"start": whole - sum(stages.values()), **stages, "whole": whole}
 
 

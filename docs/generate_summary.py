@@ -21,8 +21,8 @@ HEAD = """# The values of summary.json
 <!-- Written by docs/generate_summary.py. Edit the records in barpc/report/summary/, then run it again. -->
 
 Pixel (0, 0) is the centre of the first one. A number that is not finite is null; `?` behind a type: it may be null; no
-type: a number or null; `*` behind a name: it may be missing. Records have headings of their own. The same as a
-[JSON schema](summary.schema.json).
+type: a number or null; `*` behind a name: it may be missing. Records have headings of their own. Paths are
+relative to the run folder. The same as a [JSON schema](summary.schema.json).
 """
 
 WORDS = {"string": "text", "boolean": "true/false", "object": "record", "array": "list"}

@@ -681,3 +681,8 @@ def _documented(record: type[Options]) -> str:
 
 for _record in (TieOptions, AdjustOptions, FitOptions, RunOptions):
     _record.__doc__ = _documented(_record)
+
+
+def file_options() -> list[str]:
+    """Return the names of the options of a run that are paths of files and folders."""
+    return [name for name, one in declared(RunOptions).items() if one.rule.unit in ("file", "dir")]

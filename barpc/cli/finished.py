@@ -95,16 +95,14 @@ def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | N
 @click.command("verify")
 @click.argument("run_dir", metavar="RUN_DIR")
 @click.argument("places", nargs=-1, metavar="[FOLDER...]")
-@click.option("--expect", metavar="ROOT", help="The root that the run printed, or a later command.")
+@click.option("--expect", metavar="ROOT", help="The root that was printed, or a later one.")
 def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
-    r"""Say whether every file of a finished run, and of its inputs, is what it was, and reads as the certified camera.
+    r"""Say which files of a run or export are changed, missing or added, and whether cameras read as certified.
 
-    SHA256SUMS in the run folder lists all files but those in .barpc; `sha256sum -c SHA256SUMS` reads it, too. Its own
-    SHA-256 is the root. Who changes files and that list alike is found out by --expect alone, with the root that was
-    kept elsewhere. An input that is no longer where it was is looked for by its name beside the run, in it, and in the
-    folders given; those on other hosts are not asked. Exit code 0: all that was asked is as it was; 3: a file is
-    changed, missing or added, or the root is another; 1: there is no SHA256SUMS (a run of release 0.3, or one that was
-    interrupted), or it cannot be read.
+    SHA256SUMS lists all (but .barpc), for `sha256sum -c`, too; its own SHA-256 is the root. Edits of files and list
+    alike are found by --expect alone. Inputs that are gone are looked for by name beside the run, in it, and in the
+    folders given; other hosts are not asked. Exit code 0: all that was asked is as it was; 3: something is
+    not; 1: no SHA256SUMS (interrupted, or of release 0.3), or a damaged one.
 
     \b
     Examples:

@@ -305,8 +305,8 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: s
     flagged = frozenset(i for i, shot in enumerate(scene.shots) if shot.entry.advice)
     groups = [_best(views, worth, flagged, part) for part in parts]
     errors = CameraErrors.of(BlockPrior.load(table_path(folder, PRIOR)), views)
-    source = " minus ".join(", ".join(views[i].name for i in part) for part in parts)
-    return Block(views, groups, source, errors, scene.summary)
+    images = " minus ".join(", ".join(views[i].name for i in part) for part in parts)
+    return Block(views, groups, images, errors, scene.summary)
 
 
 def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = None, band: int = 1) -> Block:

@@ -20,7 +20,7 @@ from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior
 from barpc.ba.held.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
 from barpc.base.identity import Input, Stamp, ask, guarded, recorded
-from barpc.base.options import FitOptions, RunOptions, declared
+from barpc.base.options import FitOptions, RunOptions, file_options
 from barpc.base.remote import here
 from barpc.base.sidefile import plain_path
 from barpc.fit import RpcFit, fit_rpc
@@ -64,7 +64,6 @@ from barpc.tie.tasks import Progress, Work
 from barpc.workspace import Workspace, portable, timed
 
 logger = logging.getLogger(__name__)
-_PATHS = ("file", "dir")  # units of options
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -210,7 +209,7 @@ def _portable(run: Run, folder: Path) -> Run:
 
     options = run.options
     assert isinstance(options, RunOptions)
-    given = {key: getattr(options, key) for key, one in declared(RunOptions).items() if one.rule.unit in _PATHS}
+    given = {key: getattr(options, key) for key in file_options()}
     return replace(
         run,
         views=tuple(replace(view, path=at(view.path)) for view in run.views),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from operator import itemgetter
 from pathlib import Path
@@ -10,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from barpc.base.errors import BarpcError, InputError
+from barpc.base.options import file_options
+from barpc.base.remote import is_url
 from barpc.report.records import plain
 from barpc.report.runfiles import read_summary
 from barpc.report.summary import Summary
@@ -41,6 +44,7 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
             why = f"the runs have no image in common ({first} and others there, {second} here)"
         raise InputError(f"{folder_a} and {folder_b}: {why}: nothing to compare")
     given = [flat_options(run.options or {}) for run in runs]
+    placed = [_placed(one, folder) for one, folder in zip(given, folders, strict=True)]  # from folders of two depths
     comparison = {
         "a": str(folder_a),
         "b": str(folder_b),
@@ -49,14 +53,25 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
         "only_a": [name for name in a if name not in same],
         "only_b": [name for name in b if name not in same],
         "options": [
-            {"option": key, "values": [one.get(key) for one in given]}
+            {"option": key, "values": [one.get(key) for one in placed]}
             for key in given[0] | given[1]
-            if given[0].get(key) != given[1].get(key) and key not in _NO_EFFECT
+            if all(one.get(key) != other.get(key) for one, other in (given, placed)) and key not in _NO_EFFECT
         ],
         "versions": [run.barpc for run in runs],
     }
     found: dict[str, Any] = plain({**comparison, "lines": _lines(comparison)})
     return found
+
+
+def _placed(options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return the options of a run with absolute paths."""
+
+    def at(path: Any) -> Any:
+        if isinstance(path, (list, tuple)):
+            return [at(one) for one in path]
+        return path if not isinstance(path, str) or is_url(path) else os.path.normpath(folder.absolute() / path)
+
+    return {**options, **{name: at(options[name]) for name in file_options() if options.get(name)}}
 
 
 def _other_file(path_a: str, path_b: str, runs: tuple[Summary, Summary]) -> bool:

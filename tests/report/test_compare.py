@@ -161,3 +161,20 @@ def test_runs_of_other_images_of_the_same_names_are_not_compared(block_run, tmp_
     (tmp_path / "two/summary.json").write_text(json.dumps(summary))
     with pytest.raises(InputError, match="are other files, so these runs have none in common: nothing to compare"):
         compare_runs(tmp_path / "one", tmp_path / "two")
+
+
+def test_a_file_is_the_same_option_from_folders_of_any_depth(block_run, tmp_path):
+    def of(folder, path):
+        shutil.copytree(block_run.folder, tmp_path / folder)
+        summary = json.loads((tmp_path / folder / "summary.json").read_text())
+        summary["options"].update(dem=path, gcp=[path, "https://a.org/x"], aoi=None)
+        (tmp_path / folder / "summary.json").write_text(json.dumps(summary))
+        return tmp_path / folder
+
+    one, deeper = of("one", "../srtm.tif"), of("two/deeper", "../../srtm.tif")
+    other, moved = of("three/other", "../srtm.tif"), of("other/folder", "../../other.tif")
+    assert compare_runs(one, deeper)["options"] == []
+    assert compare_runs(one, other)["options"] == []  # a run that was moved
+    differ = compare_runs(one, moved)["options"]
+    assert [row["option"] for row in differ] == ["dem", "gcp"]
+    assert differ[0]["values"] == [str(tmp_path / "srtm.tif"), str(tmp_path / "other.tif")]

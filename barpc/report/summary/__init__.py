@@ -108,8 +108,8 @@ class Summary(Record):
     reference: ReferenceEntry | None = said("A reference orthoimage, where one was given", default=None)
     inputs: tuple[InputEntry, ...] | None = said("Every file that was read, as `barpc verify` asks", default=None)
     outputs: tuple[OutputEntry, ...] | None = said("Every file written but this and the report", default=None)
-    out_dir: str | None = said("Where the results are; of a result at hand, not in the file", default=None)
-    stages: tuple[StageEntry, ...] | None = said("Stages of the run; not in the file, see .barpc", default=None)
+    out_dir: str | None = said("Where results are; not in the file", default=None)
+    stages: tuple[StageEntry, ...] | None = said("Stages of the run; not in the file", default=None)
 
     def __repr__(self) -> str:
         return f"Summary({self.kind} of {len(self.views)} views, {self.status}: {self.headline})"
@@ -125,7 +125,8 @@ def published_schema() -> dict[str, Any]:
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "summary.json of a barpc run",
-        "description": "Pixel (0, 0) is the centre of the first one. A number that is not finite is null.",
+        "description": "Pixel (0, 0) is the centre of the first one. A number that is not finite is null. "
+        "Paths are relative to the run folder.",
         **Summary.json_schema(),
     }
 
