@@ -14,10 +14,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from barpc import __version__
 from barpc.base.errors import OutputError, TiePointError
 from barpc.base.identity import take
 from barpc.report.runfiles import table_path
-from barpc.workspace import Workspace, code_version, key_of, own_files, peak_memory, timed
+from barpc.workspace import (
+    Workspace,
+    code_version,
+    homes,
+    key_of,
+    located,
+    noted_outputs,
+    own_files,
+    peak_memory,
+    portable,
+    timed,
+)
 
 
 @dataclass(frozen=True)
@@ -577,3 +589,104 @@ def test_a_run_whose_last_state_cannot_be_saved_is_not_taken_for_finished(tmp_pa
     with Workspace(tmp_path / "run") as again:  # the same command goes on
         again.write_text("summary.json", "{}")
     assert (tmp_path / "run/summary.json").exists()
+
+
+# --- the root of a folder, and paths that do not depend on its place ---------------------------------------
+
+
+def test_a_sealed_folder_lists_its_outputs_and_names_what_they_were_made_from(tmp_path):
+    with Workspace(tmp_path / "run") as run:
+        run.write_text("b/c.txt", "1")
+        run.write_text("a.txt", "2")
+        root = run.seal("f" * 64, {"link.tif": "0" * 64})
+    sums = (tmp_path / "run/SHA256SUMS").read_bytes()
+    assert root == hashlib.sha256(sums).hexdigest() == noted_outputs(tmp_path / "run")["SHA256SUMS"]
+    head, *lines = sums.decode().splitlines()
+    assert head == f"# barpc {__version__}, code {code_version()}, after {'f' * 64}"
+    hashes = {"a.txt": hashlib.sha256(b"2").hexdigest(), "b/c.txt": hashlib.sha256(b"1").hexdigest()}
+    assert lines == [f"{sha}  {name}" for name, sha in {**hashes, "link.tif": "0" * 64}.items()]
+    assert "link.tif" not in own_files(tmp_path / "run")
+
+
+def test_what_is_added_to_a_sealed_folder_is_a_layer_and_the_same_again_is_none(tmp_path):
+    folder = tmp_path / "run"
+    with Workspace(folder) as run:
+        run.write_text("a", "1")
+        first = run.seal()
+    sums = folder / "SHA256SUMS"
+    for text, layers in (("2", 2), ("2", 2), ("3", 3), ("2", 4)):
+        with Workspace(folder, adds=True, overwrite=True, names=["b"]) as run:
+            run.write_text("b", text)
+        assert sums.read_text().count("# barpc ") == layers
+    assert f", after {first}\n" in sums.read_text()
+    assert sums.read_text().count("  b\n") == 3
+    assert sum(line.endswith("  b") and line[0] != "#" for line in sums.read_text().splitlines()) == 1
+    with pytest.raises(RuntimeError), Workspace(folder, adds=True, overwrite=True, names=["b"]) as run:
+        run.write_text("b", "of a command that fails")
+        raise RuntimeError
+    assert sums.read_text().count("# barpc ") == 4
+    with Workspace(folder, overwrite=True) as run:  # another run begins anew
+        run.write_text("a", "5")
+        run.seal()
+    assert sums.read_text().count("# barpc ") == 1
+    shutil.rmtree(folder / ".barpc")  # the notes may be deleted
+    with Workspace(folder, adds=True, names=["c"]) as run:
+        run.write_text("c", "4")
+    assert sums.read_text().count("# barpc ") == 2
+
+
+def test_sums_that_somebody_changed_are_neither_replaced_nor_built_on(tmp_path):
+    folder = tmp_path / "run"
+    with Workspace(folder) as run:
+        run.write_text("a", "1")
+        run.seal()
+    for text in (b"# barpc 9, code 0\n" + b"0" * 64 + b"  a\n", b"mine"):
+        (folder / "SHA256SUMS").write_bytes(text)
+        with Workspace(folder, adds=True, overwrite=True, names=["b"]) as run:
+            run.write_text("b", text.decode())
+        assert (folder / "SHA256SUMS").read_bytes() == text
+        with pytest.raises(OutputError, match="SHA256SUMS: not written by a run in this folder, or changed since"):
+            Workspace(folder, overwrite=True, names=["SHA256SUMS"])
+
+
+def test_stages_and_the_place_of_a_run_outlast_what_is_added_to_it(tmp_path):
+    with Workspace(tmp_path / "run") as run:
+        with run.stage("match"):
+            pass
+        run.write_text("a", "1")
+    (tmp_path / "run").rename(tmp_path / "moved")
+    with Workspace(tmp_path / "moved", adds=True) as run, run.stage("dsm"):
+        pass
+    state = json.loads((tmp_path / "moved/.barpc/state.json").read_text())
+    assert [stage["stage"] for stage in state["stages"]] == ["match", "dsm"]
+    assert state["folder"] == str(tmp_path / "run")
+    (tmp_path / "moved/.barpc/state.json").write_text('{"status": "done", "stages": 5, "folder": [1]}')
+    with Workspace(tmp_path / "moved", adds=True):
+        pass
+    assert json.loads((tmp_path / "moved/.barpc/state.json").read_text())["stages"] == []
+
+
+def test_a_portable_path_is_that_of_its_file_from_wherever_the_folder_lies(tmp_path, monkeypatch):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in/a.tif").touch()
+    monkeypatch.chdir(tmp_path / "in")
+    with Workspace(tmp_path / "deep/run") as run:
+        run.write_text("a", "1")
+    folder = tmp_path / "deep/run"
+    for given in ("a.tif", "../in/a.tif", str(tmp_path / "in/a.tif")):
+        assert portable(given, folder) == "../../in/a.tif"
+    assert portable(str(folder / "x/y"), folder) == "x/y"
+    monkeypatch.chdir(tmp_path)
+    assert (
+        located(folder, "../../in/a.tif") == located(Path("deep/run"), "../../in/a.tif") == str(tmp_path / "in/a.tif")
+    )
+    for same in ("", "https://a.org/a.tif", "s3://b/a.tif"):
+        assert portable(same, folder) == located(folder, same) == same
+    moved = folder.rename(tmp_path / "moved")  # alone: the file is where it was
+    assert located(moved, "../../in/a.tif") == str(tmp_path / "in/a.tif")
+    (tmp_path / "b/c").mkdir(parents=True)
+    (tmp_path / "b/in").mkdir()
+    (tmp_path / "b/in/a.tif").touch()
+    both = moved.rename(tmp_path / "b/c/run")  # to where another lies: as a VRT would have it
+    assert located(both, "../../in/a.tif") == str(tmp_path / "b/in/a.tif")
+    assert homes(both, "../../in/a.tif")[1] == tmp_path / "in/a.tif"

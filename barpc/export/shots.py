@@ -188,8 +188,10 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
 
 
 def _located(view: ViewEntry, folder: Path) -> ViewEntry:
-    """Return what is said of a view, with absolute paths."""
+    """Return what is said of a view, with absolute paths; release 0.3 wrote them so, or as seen from its folder."""
     source = view.rpc_source
+    if PurePath(view.path).is_absolute():
+        return view
     if source is not None:
         source = replace(source, path=located(folder, source.path))
     return replace(view, path=located(folder, view.path), rpc_source=source)

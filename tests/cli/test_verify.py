@@ -15,6 +15,7 @@ import pytest
 from barpc import adjust
 from barpc.base import manifest
 from barpc.base.options import RunOptions
+from barpc.export.shots import read_scene
 from barpc.pipeline import outputs
 from barpc.pipeline.outputs import GOOD, prove
 from barpc.rpcio import read_rpc, write_rpc
@@ -343,6 +344,36 @@ def test_a_run_that_was_moved_or_copied_passes_and_a_whole_project_too(finished,
     assert findings(project / "out", project / "images")[0] == 0
     (tmp_path / "link").symlink_to(project / "out")
     assert findings(tmp_path / "link", project / "images", "--expect", root.upper())[0] == 0
+
+
+def test_the_same_inputs_give_the_same_root_and_no_file_holds_time_or_place(finished, tmp_path, monkeypatch) -> None:
+    """Another folder, seen from elsewhere, by other paths; a run that is gone on with; one that is made again."""
+    shutil.copytree(finished / "in", tmp_path / "project/in")
+    monkeypatch.chdir(tmp_path / "project/in")
+    formats = ("--grids", "--resample", "--rpc-format", "txt,rpb")
+    said = barpc("adjust", "view_01.tif", "./view_00.tif", "-o", "../of another name", *formats)
+    assert said.code == 0
+    root = root_of(tmp_path / "project/of another name")
+    assert root == root_of(finished / "out")
+    assert f"\nRoot: {root}\n" in said.out
+    assert barpc("adjust", ".", "-o", "../of another name", "--overwrite", *formats).code == 0
+    assert root_of(tmp_path / "project/of another name") == root
+    here = (str(tmp_path), str(finished), "seconds", "another name")
+    for name in files(tmp_path / "project/of another name"):
+        data = (tmp_path / "project/of another name" / name).read_bytes()
+        assert not [word for word in here if word.encode() in data], name
+
+
+def test_files_of_a_project_that_was_moved_are_found_from_any_folder(finished, tmp_path, monkeypatch) -> None:
+    project = Path(shutil.copytree(finished, tmp_path / "elsewhere/project"))
+    shutil.rmtree(project / "out/.barpc")
+    monkeypatch.chdir(tmp_path)
+    scene = read_scene(Path("elsewhere/project/out"))
+    assert [shot.file for shot in scene.shots] == [str(project / "in" / f"view_0{k}.tif") for k in (0, 1)]
+    assert [shot.entry.rpc_source.path for shot in scene.shots] == [shot.file for shot in scene.shots]
+    shutil.copytree(finished / "out", tmp_path / "alone")  # knows where it was made
+    files_of_both = [shot.file for shot in read_scene(Path("alone")).shots]
+    assert files_of_both == [str(finished / "in" / f"view_0{k}.tif") for k in (0, 1)]
 
 
 def test_what_is_no_root_is_wrong_usage(run) -> None:

@@ -176,5 +176,5 @@ def test_a_file_is_the_same_option_from_folders_of_any_depth(block_run, tmp_path
     assert compare_runs(one, deeper)["options"] == []
     assert compare_runs(one, other)["options"] == []  # a run that was moved
     differ = compare_runs(one, moved)["options"]
-    assert [row["option"] for row in differ] == ["dem", "gcp"]
-    assert differ[0]["values"] == [str(tmp_path / "srtm.tif"), str(tmp_path / "other.tif")]
+    assert [row["option"] for row in differ] == ["gcp", "dem"]
+    assert differ[1]["values"] == [str(tmp_path / "srtm.tif"), str(tmp_path / "other.tif")]
