@@ -26,7 +26,7 @@ import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -446,19 +446,29 @@ def portable(path: str, folder: Path) -> str:
         return path
 
 
-def homes(folder: Path, path: str) -> tuple[Path, Path]:
-    """Return where the file of a `portable` path may be: seen from the folder as it lies, and where it was made."""
-    made = str(_read_state(folder).get("folder", folder))
-    return folder / path, Path(os.path.normpath(Path(made) / path))
+@dataclass(frozen=True)
+class Homes:
+    """Where `portable` paths start from: a run folder as it lies, and where it was made, if its state still says so."""
 
+    folder: Path
+    made: Path
 
-def located(folder: Path, path: str) -> str:
-    """Return the path, absolute, of the file that a run names by a `portable` one; a URL, or none, as it is."""
-    if not path or is_url(path):
-        return path
-    here, there = homes(folder, path)
-    found = there if there.is_file() and not here.is_file() else here
-    return os.path.normpath(found.absolute())
+    @classmethod
+    def of(cls, folder: Path) -> Homes:
+        """Read the state of a run folder."""
+        return cls(folder, Path(str(_read_state(folder).get("folder", folder))))
+
+    def candidates(self, path: str) -> tuple[Path, Path]:
+        """Return where the file of a path may be."""
+        return self.folder / path, Path(os.path.normpath(self.made / path))
+
+    def located(self, path: str) -> str:
+        """Return the absolute path of a file; a URL, or none, as it is."""
+        if not path or is_url(path):
+            return path
+        here, there = self.candidates(path)
+        found = there if there.is_file() and not here.is_file() else here
+        return os.path.normpath(found.absolute())
 
 
 def _note(folder: Path, name: str, sha: str) -> None:

@@ -19,11 +19,10 @@ from barpc.base.errors import OutputError, TiePointError
 from barpc.base.identity import take
 from barpc.report.runfiles import table_path
 from barpc.workspace import (
+    Homes,
     Workspace,
     code_version,
-    homes,
     key_of,
-    located,
     noted_outputs,
     own_files,
     peak_memory,
@@ -677,16 +676,15 @@ def test_a_portable_path_is_that_of_its_file_from_wherever_the_folder_lies(tmp_p
         assert portable(given, folder) == "../../in/a.tif"
     assert portable(str(folder / "x/y"), folder) == "x/y"
     monkeypatch.chdir(tmp_path)
-    assert (
-        located(folder, "../../in/a.tif") == located(Path("deep/run"), "../../in/a.tif") == str(tmp_path / "in/a.tif")
-    )
+    for seen in (folder, Path("deep/run")):
+        assert Homes.of(seen).located("../../in/a.tif") == str(tmp_path / "in/a.tif")
     for same in ("", "https://a.org/a.tif", "s3://b/a.tif"):
-        assert portable(same, folder) == located(folder, same) == same
+        assert portable(same, folder) == Homes.of(folder).located(same) == same
     moved = folder.rename(tmp_path / "moved")  # alone: the file is where it was
-    assert located(moved, "../../in/a.tif") == str(tmp_path / "in/a.tif")
+    assert Homes.of(moved).located("../../in/a.tif") == str(tmp_path / "in/a.tif")
     (tmp_path / "b/c").mkdir(parents=True)
     (tmp_path / "b/in").mkdir()
     (tmp_path / "b/in/a.tif").touch()
     both = moved.rename(tmp_path / "b/c/run")  # to where another lies: as a VRT would have it
-    assert located(both, "../../in/a.tif") == str(tmp_path / "b/in/a.tif")
-    assert homes(both, "../../in/a.tif")[1] == tmp_path / "in/a.tif"
+    assert Homes.of(both).located("../../in/a.tif") == str(tmp_path / "b/in/a.tif")
+    assert Homes.of(both).candidates("../../in/a.tif")[1] == tmp_path / "in/a.tif"

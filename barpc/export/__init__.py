@@ -16,7 +16,7 @@ from barpc.base.sidefile import plain_path
 from barpc.export.files import Files, asp, cars, ortho, points, s2p, satnerf, stac
 from barpc.export.pinholes import colmap, image_links
 from barpc.export.shots import Scene, read_scene, relative_link
-from barpc.workspace import Workspace, located
+from barpc.workspace import Homes, Workspace
 
 __all__ = ["TARGETS", "export_run"]
 
@@ -69,7 +69,8 @@ def export_run(
     files = TARGETS[target](scene, out.absolute())
     inputs = [Path(shot.file) for shot in scene.shots if "\0" not in shot.file]
     links = image_links(scene) if target == "colmap" else {}
-    content = {located(folder, one.path): one.sha256 for one in scene.summary.inputs or ()}
+    homes = Homes.of(folder)
+    content = {homes.located(one.path): one.sha256 for one in scene.summary.inputs or ()} if links else {}
     root = take(folder / SUMS).sha256 if (folder / SUMS).is_file() else ""  # none of an older release's run
     with Workspace(out, overwrite=overwrite, keep=inputs, names=[*files, SUMS]) as workspace:
         for name, data in files.items():

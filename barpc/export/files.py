@@ -19,7 +19,7 @@ from barpc.report.records import plain
 from barpc.report.runfiles import ply
 from barpc.rpcio import WRITABLE
 from barpc.sensor.geometry import footprint
-from barpc.workspace import located
+from barpc.workspace import Homes
 
 Files = dict[str, bytes]
 
@@ -267,7 +267,7 @@ def ortho(scene: Scene, out: Path) -> Files:
     """
     given: Any = scene.summary.options or {}
     names = (name if isinstance(name := given.get(key), str) else "" for key in ("dem", "geoid"))
-    dem, geoid = (located(scene.folder, name) for name in names)
+    dem, geoid = map(Homes.of(scene.folder).located, names)
     lines, heights = [], f"RPC_HEIGHT={scene.origin[2]:.0f}"
     about = "all ground at one altitude; give a DEM to adjust"
     if dem:

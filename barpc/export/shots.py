@@ -25,7 +25,7 @@ from barpc.rpcio.sources import Sunlight, light_of
 from barpc.scene import IntArray
 from barpc.sensor.geometry import camera_center, footprint, image_grid, sight_enu
 from barpc.sensor.rpc import RPC
-from barpc.workspace import located
+from barpc.workspace import Homes
 
 MARGIN = 20.0
 """m that the altitudes of a scene reach beyond its tie points, besides a tenth of their range."""
@@ -158,7 +158,8 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
         No finished adjustment, without RPC files, or one whose files contradict each other.
     """
     summary = read_summary(folder)
-    summary = replace(summary, views=tuple(_located(view, folder) for view in summary.views))
+    homes = Homes.of(folder)
+    summary = replace(summary, views=tuple(_located(view, homes) for view in summary.views))
     if summary.kind != "adjust":
         raise InputError(f"{folder / 'summary.json'}: a run of the kind {summary.kind}, without corrected cameras")
     files = read_tables(summary, folder)
@@ -187,14 +188,14 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
     return Scene(folder, summary, tuple(shots), files.points[:, :3], files.tracks, alt_range, noise)
 
 
-def _located(view: ViewEntry, folder: Path) -> ViewEntry:
+def _located(view: ViewEntry, homes: Homes) -> ViewEntry:
     """Return what is said of a view, with absolute paths; release 0.3 wrote them so, or as seen from its folder."""
     source = view.rpc_source
     if PurePath(view.path).is_absolute():
         return view
     if source is not None:
-        source = replace(source, path=located(folder, source.path))
-    return replace(view, path=located(folder, view.path), rpc_source=source)
+        source = replace(source, path=homes.located(source.path))
+    return replace(view, path=homes.located(view.path), rpc_source=source)
 
 
 def _places(known: IntArray, asked: IntArray) -> tuple[IntArray, Any]:

@@ -40,7 +40,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.geometry import ground_grids
 from barpc.sensor.rpc import RPC
 from barpc.tie.tasks import Progress
-from barpc.workspace import LAST, Workspace, homes, noted_outputs, own_files
+from barpc.workspace import LAST, Homes, Workspace, noted_outputs, own_files
 
 MATCHES = ("matches.csv", "matches.npz")
 GCPS = f"{FOLDER}/gcps.geojson"  # of a reference
@@ -212,7 +212,8 @@ def prove(folder: Path, places: Sequence[Path] = (), expected: str | None = None
     noted, listed = noted_outputs(folder), {name: sha for layer in layers for name, sha in layer.files.items()}
     # of what the first command wrote a later one makes the report again, and nothing else
     listed |= {name: sha for name, sha in layers[0].files.items() if name != NAME}
-    found = [*_roots(root, noted.get(SUMS, root), layers, expected), *_outputs(folder, listed, noted)]
+    roots = {root, *(layer.after for layer in layers[1:])}
+    found = [*_roots(root, noted.get(SUMS, root), layers, expected), *_outputs(folder, listed, noted, roots)]
     if LAST in listed:
         try:
             summary = read_summary(folder)
@@ -240,18 +241,23 @@ def _roots(root: str, noted: str, layers: Sequence[Layer], expected: str | None)
         yield Proved("root", name, LATER, "made again after that root" if name in before else "added after that root")
 
 
-def _outputs(folder: Path, listed: Mapping[str, str], noted: Mapping[str, str]) -> Iterator[Proved]:
-    """Compare every file with what is `listed`; one that is `noted` otherwise is of a command that was ended."""
+def _outputs(folder: Path, listed: Mapping[str, str], noted: Mapping[str, str], roots: Set[str]) -> Iterator[Proved]:
+    """Compare every file with what is `listed`; one that is `noted` otherwise is of a command that was ended.
+
+    Of folders below with a SHA256SUMS, exports of a run with one of the `roots` are compared, too.
+    """
     for name, sha in sorted(listed.items()):
         found = _digest(folder / name)
         now = SAME if found == sha else MISSING if found is None else CHANGED
         yield Proved("output", name, now, _ENDED if found == noted.get(name) and now == CHANGED else "")
     parents = {parent.as_posix() for name in listed for parent in PurePosixPath(name).parents}
-    for name, there in _files(folder, parents):
-        if there is not None:
-            yield Proved("output", name, UNKNOWN, f"a folder of its own: barpc verify {there}")
-        elif name not in listed and name != SUMS:
+    for name, below in _files(folder, parents):
+        if below is None and name not in listed and name != SUMS:
             yield Proved("output", name, ADDED, _ENDED if name in noted else "by nobody who noted it")
+        elif below is not None and manifest.read(below)[1][0].after in roots:  # an export of this run
+            yield from (replace(one, file=f"{name}/{one.file}") for one in prove(below))
+        elif below is not None:
+            yield Proved("output", name, UNKNOWN, f"not of this run: barpc verify {below}")
 
 
 _ENDED = "by a command that did not come to its end: give it again"
@@ -264,11 +270,10 @@ def _files(folder: Path, parents: Set[str]) -> Iterator[tuple[str, Path | None]]
         raise InputError(f"{error.filename}: cannot be read ({error.strerror})")
 
     for top, folders, files in os.walk(folder, onerror=refuse):
-        at = Path(top).relative_to(folder)
-        kept = []
+        at, no_folders, kept = Path(top).relative_to(folder), set(files), []
         for name in sorted([*folders, *files]):
             path, known = folder / at / name, (at / name).as_posix()
-            if name in files or path.is_symlink():
+            if name in no_folders or path.is_symlink():
                 yield known, None
             elif (path / SUMS).is_file() and known not in parents:
                 yield known, path
@@ -278,12 +283,12 @@ def _files(folder: Path, parents: Set[str]) -> Iterator[tuple[str, Path | None]]
 
 
 def _inputs(summary: Summary, folder: Path, places: Iterable[Path]) -> Iterator[Proved]:
+    homes = Homes.of(folder)
     for one in summary.inputs or ():
         if is_url(one.path):
             yield Proved("input", one.path, UNKNOWN, "on another host")
             continue
-        here = homes(folder, one.path)
-        found = [_digest(path) for path in here]
+        found = [_digest(path) for path in homes.candidates(one.path)]
         if one.sha256 in found:
             yield Proved("input", one.path, SAME)
             continue

@@ -324,7 +324,12 @@ def test_an_export_has_a_root_of_its_own_that_names_the_run_s(run, tmp_path, tar
         settled_sums[0].files[name] = sha256(b"other").hexdigest()
         (place / SUMS).write_text(manifest.render(settled_sums))
         assert (SUMS, "changed") in wrong(place, own)
-    assert "not asked, a folder of its own: barpc verify" in barpc("verify", run).out
+    assert wrong(run) == {(f"inside/{SUMS}", "changed")}  # exports in the run are asked with it
+    (run / "inside/mine.txt").touch()
+    assert ("inside/mine.txt", "added") in wrong(run)
+    (run / "inside" / SUMS).write_text("none")
+    said = barpc("verify", run)
+    assert (said.code, f"inside/{SUMS}: changed" in said.err) == (1, True)
 
 
 # --- where it lies ----------------------------------------------------------------------------------------

@@ -243,7 +243,7 @@ def test_a_folder_below_with_sums_is_named_and_not_asked(told, tmp_path) -> None
     (found,) = prove(tmp_path / "out")
     assert (found.file, found.now) == ("nerf/a.json", ADDED)
     listed(export)
-    assert prove(tmp_path / "out") == [Proved("output", "nerf", UNKNOWN, f"a folder of its own: barpc verify {export}")]
+    assert prove(tmp_path / "out") == [Proved("output", "nerf", UNKNOWN, f"not of this run: barpc verify {export}")]
     assert prove(export) == []
     (export / "a.json").write_bytes(b"1")
     assert prove(export) == [Proved("output", "a.json", CHANGED)]
