@@ -381,6 +381,21 @@ def test_files_of_a_project_that_was_moved_are_found_from_any_folder(finished, t
     assert files_of_both == [str(finished / "in" / f"view_0{k}.tif") for k in (0, 1)]
 
 
+def test_paths_of_a_run_of_an_older_release_are_as_it_wrote_them(finished, run, monkeypatch) -> None:
+    """Its images are absolute, its cameras' files as the command line had them."""
+    images = [str(finished / "in" / f"view_0{k}.tif") for k in (0, 1)]
+
+    def older(summary: dict) -> None:
+        for view, image in zip(summary["views"], images, strict=True):
+            view.update(path=image)
+            view["rpc_source"].update(path=f"in/{Path(image).name}")
+
+    edited(run, older)
+    shots = read_scene(run).shots
+    assert [shot.file for shot in shots] == images
+    assert [shot.entry.rpc_source.path for shot in shots] == ["in/view_00.tif", "in/view_01.tif"]
+
+
 def test_what_is_no_root_is_wrong_usage(run) -> None:
     for given in ("", "1234", root_of(run)[:-1], root_of(run) + "0", "g" * 64):
         said = barpc("verify", run, "--expect", given)

@@ -226,7 +226,12 @@ def test_links_pipes_and_folders_that_hide_files_are_found(told, tmp_path) -> No
     (out / "empty").mkdir()
     (out / "deep/er").mkdir(parents=True)
     (out / "deep/er/SUMMARY.JSON").touch()
-    added = [".BARPC/x", "Summary.json", "deep/er/SUMMARY.JSON", "more", "pipe", "tables/SHA256SUMS"]
+    (out / "deep/.barpc").mkdir()
+    (out / "deep/.barpc/a_RPC.TXT").touch()
+    (out / ".barpc").mkdir()
+    (out / ".barpc/state.json").touch()  # not asked
+    added = [".BARPC/x", "Summary.json", "deep/.barpc/a_RPC.TXT", "deep/er/SUMMARY.JSON", "more", "pipe"]
+    added.append("tables/SHA256SUMS")
     assert sorted(one.file for one in prove(out) if one.now == ADDED) == added
     assert len(prove(out)) == len(added)
 
