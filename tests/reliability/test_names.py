@@ -123,6 +123,9 @@ def test_a_name_goes_through_every_file_and_back(names, pristine, tmp_path):
     assert_printable(said)
     assert said.code in (0, 3), said
     assert_printable(barpc("report", out))
+    said = barpc("verify", out)
+    assert_printable(said)
+    assert said.code == 0, said
     assert hashes(images) == before
     summary = json.loads((out / "summary.json").read_text())
     names = sorted(names)  # as in every table
@@ -130,7 +133,7 @@ def test_a_name_goes_through_every_file_and_back(names, pristine, tmp_path):
     for name, view in zip(names, summary["views"], strict=True):
         assert set(view["outputs"]) == {f"{name}.vrt", f"{name}_RPC.TXT"}
         assert read_rpc(out / f"{name}_RPC.TXT") == read_rpc(out / f"{name}.vrt")
-        with rasterio.open(out / f"{name}.vrt") as vrt, rasterio.open(view["path"]) as image:
+        with rasterio.open(out / f"{name}.vrt") as vrt, rasterio.open(out / view["path"]) as image:
             assert (vrt.read(1) == image.read(1)).all()
     assert [
         f["properties"]["name"] for f in json.loads((out / "tables/footprints.geojson").read_text())["features"]
