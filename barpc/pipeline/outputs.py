@@ -33,7 +33,7 @@ from barpc.report.records import plain
 from barpc.report.runfiles import FOLDER, TABLES, gcps_geojson, read_summary
 from barpc.report.summary import OutputEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.rpcio import CARRIERS, WRITABLE, row_of, sidecars, write_camera
+from barpc.rpcio import CARRIERS, WRITABLE, hidden_by, row_of, sidecars, write_camera
 from barpc.rpcio.grids import CORRECTION, GRID
 from barpc.scene import View
 from barpc.sensor import SensorModel
@@ -214,6 +214,9 @@ def prove(folder: Path, places: Sequence[Path] = (), expected: str | None = None
     listed |= {name: sha for name, sha in layers[0].files.items() if name != NAME}
     roots = {root, *(layer.after for layer in layers[1:])}
     found = [*_roots(root, noted.get(SUMS, root), layers, expected), *_outputs(folder, listed, noted, roots)]
+    for path, image, _ in hidden_by(folder / name for name in listed if name not in layers[0].files):
+        if image.name in layers[0].files:  # no command of barpc writes such a file
+            found.append(Proved("output", path.name, ADDED, f"for some tools it goes before the RPC of {image.name}"))
     if LAST in listed:
         try:
             summary = read_summary(folder)

@@ -159,8 +159,17 @@ def test_a_file_that_another_tool_would_read_first_is_named(run, end) -> None:
         (run / f"{name}{end}").unlink(missing_ok=True)
     shutil.copy(run / "view_01_RPC.TXT", run / f"view_00{end}")
     found = wrong(run)
-    assert (f"view_00{end}", "changed" if end == ".RPB" else "added") in found
+    now = "changed" if end == ".RPB" else "added"
+    assert (f"view_00{end}", now) in found
     assert barpc("verify", run).code == 3
+    # the same with a layer that lists it, as a later command would
+    root, layers = root_of(run), manifest.read(run)[1]
+    sha = sha256((run / f"view_00{end}").read_bytes()).hexdigest()
+    layers.append(manifest.Layer(manifest.head("0", "0", root), {f"view_00{end}": sha}))
+    (run / SUMS).write_text(manifest.render(layers))
+    state = json.loads((run / ".barpc/state.json").read_text())
+    (run / ".barpc/state.json").write_text(json.dumps({"folder": state["folder"]}))
+    assert ((f"view_00{end}", now) in wrong(run, root)) == (end != ".IMD")  # which holds no RPC
 
 
 def edited(run: Path, change: Callable[[dict], object]) -> None:
