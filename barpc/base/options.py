@@ -32,7 +32,10 @@ Model = Literal["auto", "rotation+translation", "rotation", "translation", "shif
 HOOK = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"  # a name in a module
 _MOST = 1 << 53  # whole numbers stay below: beyond, not every one has a double of its own
 _REAL = 1e30  # no option is larger, or smaller and not 0: squares, and squares of them, are numbers then
-GEOID_HELP = "Geoid of a DEM of orthometric heights: `egm96`, `egm2008`, or the file of a grid."
+GEOID_HELP = (
+    "Geoid that a DEM's heights count from: `egm96`, `egm2008`, the file of a grid, or `none` of ellipsoidal ones. "
+    "Without: the one that the DEM names."
+)
 MOST_POINTS = (TABLE.most or 0) // (5 * NUMBER)
 """Control points of a fit: as many as a table of them may hold, five numbers each."""
 _SHORT = reprlib.Repr()

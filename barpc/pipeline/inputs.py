@@ -24,6 +24,7 @@ from barpc.pointio.matches import Links, read_links, tracks_of
 from barpc.pointio.names import ViewNames
 from barpc.rasters.dem import Dem, geoid_file
 from barpc.rasters.raster import hashed
+from barpc.rasters.vertical import NONE
 from barpc.report import Run
 from barpc.report.runfiles import table_path
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Tracks, View
@@ -81,7 +82,7 @@ def with_located(options: RunOptions) -> RunOptions:
         return path if here([found]) else os.fspath(versioned(found, IMAGE))
 
     geoid = None if options.geoid is None else geoid_file(options.geoid)
-    dem, geoid = (path if path is None else at(path) for path in (options.dem, geoid))
+    dem, geoid = (path if path in (None, NONE) else at(path) for path in (options.dem, geoid))
     return replace(options, dem=dem, geoid=geoid, reference=tuple(map(at, options.reference)))
 
 

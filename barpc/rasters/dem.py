@@ -1,13 +1,12 @@
 """Terrain heights from a DEM, always above the ellipsoid, and it is always said how they became so.
 
-DEM files are mostly orthometric: above a geoid, up to 100 m from the ellipsoid. A geoid grid makes them ellipsoidal;
-heights of unknown reference, or taken as they are, raise a loud warning.
+DEM files are mostly orthometric: above a geoid, up to 100 m from the ellipsoid. What a file says of unit, scale and
+reference is applied; heights of unknown reference are taken as ellipsoidal, with a loud warning.
 """
 
 from __future__ import annotations
 
 import os
-import re
 import sys
 import warnings
 from collections.abc import Callable
@@ -29,16 +28,19 @@ from barpc.base.geodesy import FAR, Array
 from barpc.base.remote import Place, location
 from barpc.base.sidefile import GRID, opened
 from barpc.rasters.raster import open_raster
+from barpc.rasters.vertical import ELLIPSOID, NONE, UNKNOWN, Vertical, vertical_of
 from barpc.sensor import SensorModel
 
-HEIGHTS = {".hgt": ("SRTMHGT", "EGM96 height"), ".gtx": ("GTX", "ellipsoid")}
+HEIGHTS = {
+    ".hgt": ("SRTMHGT", Vertical("EGM96 height", geoid="egm96", stated=True)),
+    ".gtx": ("GTX", Vertical(ELLIPSOID, stated=True)),
+}
 """Suffix -> the driver that may open it (its first bytes say nothing), and what its heights count from."""
 _MAX_CELLS = 400_000_000
 _EXACT = 1e-4  # m: of a place on the terrain
 _A_POST = 4.0  # steps: with 60 m of noise a post, under 27 degrees, 1.7 % of lines pass a corner, of two steps 3.2 %
 _STEPS = 64  # of a line of sight over a terrain whose posts are not known
 _AT_ONCE = 500_000  # heights
-_VERTICAL = re.compile(r'(?:VERTCRS|VERT_CS|VERTICALCRS)\s*\[\s*"([^"]+)"')
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +53,8 @@ class HeightGrid:
     crs: CRS
     to_pixel: Affine  # from coordinates to col, row, (0, 0) at the corner of the first node's cell
     west: float  # coordinate of the western edge
-    reference: str  # what heights count from: "ellipsoid", the name of a geoid or datum, or "unknown"
+    vertical: Vertical  # what heights count from, and their unit
+    linear: tuple[float, float]  # scale and offset of the numbers in the file, in that unit
     period: float  # columns in a full turn of longitude where the grid goes around the Earth, else 0
 
     @classmethod
@@ -60,12 +63,15 @@ class HeightGrid:
         path = location(path)
         with opened(path, GRID) as file:
             length = file.seek(0, 2)
-        driver, reference = HEIGHTS.get(path.suffix.lower(), (None, None))
+        driver, vertical = HEIGHTS.get(path.suffix.lower(), (None, None))
         try:
             with open_raster(path, driver) as dataset:
                 crs, shape, forward, extent = dataset.crs, dataset.shape, dataset.transform, dataset.bounds
+                unit, linear = dataset.units[0] or "", (float(dataset.scales[0]), float(dataset.offsets[0]))
                 if crs is None:
                     raise InputError(f"{path}: a DEM or geoid grid needs a CRS, and this raster has none")
+                if not (np.isfinite(linear).all() and linear[0]):
+                    raise InputError(f"{path}: its heights have scale {linear[0]:g} and offset {linear[1]:g}")
                 if driver == "GTX" and length != 40 + 4 * shape[0] * shape[1]:
                     raise ImageError(f"{path}: its header does not go with its size")
         except ImageError as error:
@@ -78,15 +84,17 @@ class HeightGrid:
         to_pixel = _inverse(forward, path)
         turn = 360.0 * abs(to_pixel.a) if crs.is_geographic else 0.0
         around = turn > 0 and (extent.right - extent.left) * abs(to_pixel.a) >= turn - 0.5
-        reference = reference or _vertical_reference(crs.to_wkt())
+        vertical = vertical or vertical_of(crs.to_wkt(), unit, os.fspath(path))
         period = float(round(turn)) if around else 0.0
-        return cls(path, driver, shape, crs, to_pixel, float(extent.left), reference, period)
+        return cls(path, driver, shape, crs, to_pixel, float(extent.left), vertical, linear, period)
 
     def read(self, top: int, bottom: int, left: int, right: int) -> Array:
         """Read the heights (bottom - top, right - left) [m] of a window, NaN in voids."""
         with open_raster(self.path, self.driver) as dataset:
             window = Window.from_slices((top, bottom), (left, right))
-            return np.asarray(dataset.read(1, window=window, masked=True).astype(np.float64).filled(np.nan))
+            numbers = dataset.read(1, window=window, masked=True).astype(np.float64).filled(np.nan)
+        scale, offset = self.linear
+        return np.asarray((numbers * scale + offset) * self.vertical.metres)
 
     def locate(self, lon: Array, lat: Array) -> tuple[Array, Array]:
         """Return the fractional row, col (N,) of lon, lat (N,) [deg], node centres at integers."""
@@ -166,15 +174,6 @@ def _inverse(forward: Affine, path: Place) -> Affine:
     raise InputError(f"{path}: its geotransform {tuple(forward[:6])} maps no grid of nodes")
 
 
-def _vertical_reference(wkt: str) -> str:
-    """Return the vertical reference of a CRS: the name of its vertical part, or the ellipsoid of a 3-D CRS."""
-    match = _VERTICAL.search(wkt)
-    if match:
-        return "ellipsoid" if "ellipsoid" in match.group(1).lower() else match.group(1)
-    three_axes = re.search(r'CS\[ellipsoidal,\s*3|AXIS\["Ellipsoidal height"', wkt, re.IGNORECASE)
-    return "ellipsoid" if three_axes else "unknown"
-
-
 @dataclass(frozen=True, eq=False)
 class Dem:
     """Altitudes of the terrain above the WGS84 ellipsoid: call it with lon, lat."""
@@ -186,26 +185,22 @@ class Dem:
 
     @classmethod
     def open(cls, path: Path | str, geoid: Path | str | None = None) -> Dem:
-        """Open a DEM (``.hgt``, or any raster with a CRS), and the ``.gtx``, raster or name of `GEOIDS` of its geoid.
+        """Open a DEM (``.hgt``, or any raster with a CRS), with the geoid that it names or that is given: a ``.gtx`` or
+        raster, a name of `GEOIDS`, or "none" for heights that are ellipsoidal whatever the file says of them.
 
         InputError or ImageError where it is none, or a geoid is given for heights that are ellipsoidal already; a
-        BarpcWarning for an unknown vertical reference, or orthometric heights that are taken as they are.
+        BarpcWarning for an unknown vertical reference, or one for whose geoid another had to be taken.
         """
         grid = HeightGrid.open(path)
-        geoid = None if geoid is None else geoid_file(geoid)
-        known = grid.reference
-        if known == "ellipsoid" and geoid is not None:
+        own, vertical = grid.vertical, grid.vertical.by(None if geoid is None else os.fspath(geoid))
+        if own.reference == ELLIPSOID and vertical.geoid is not None:
             raise InputError(f"{path}: its heights are ellipsoidal already; leave out the geoid {geoid}")
-        done, advice = "ellipsoidal", ""
-        if geoid is not None:
-            done = f"made ellipsoidal with {location(geoid).name}"
-        elif known != "ellipsoid":
-            done = "TAKEN AS ELLIPSOIDAL"
-            advice = "; give a geoid grid, or expect errors up to 100 m in height"
-        description = f"{location(path).name}: vertical reference {known}, {done}"
-        if advice or known == "unknown":
-            warnings.warn(f"DEM {description}{advice}", BarpcWarning, stacklevel=2)
-        return cls(grid, None if geoid is None else HeightGrid.open(geoid), description, not advice)
+        file, done, loud = _geoid_of(own, vertical, geoid is not None)
+        unit = f" in {own.unit} ({abs(own.metres):.12g} m)" if own.unit else ""
+        description = f"{location(path).name}: vertical reference {own.reference}{unit}, {done}"
+        if loud:
+            warnings.warn(f"DEM {description}", BarpcWarning, stacklevel=2)
+        return cls(grid, None if file is None else HeightGrid.open(file), description, vertical.stated)
 
     def __call__(self, lon: npt.ArrayLike, lat: npt.ArrayLike) -> Array:
         """Altitude above the ellipsoid (...) [m] at lon, lat (...) [deg]; NaN in voids and outside."""
@@ -301,6 +296,27 @@ def _met(sensor: SensorModel, image: Array, terrain: Callable[[Array, Array], Ar
     return sensor.localize(image, (upper + lower) / 2)
 
 
+def _geoid_of(own: Vertical, said: Vertical, by_person: bool) -> tuple[str | None, str, bool]:
+    """Return the geoid's file for heights as `said` of them, in words what is done, and whether it is said loudly."""
+    if said.geoid is None:
+        if said.stated:
+            return None, "ellipsoidal" if own.reference == ELLIPSOID else "taken as ellipsoidal, as is said", False
+        advice = (
+            "say --geoid egm96 for heights above the sea, --geoid none for ellipsoidal ones: up to 100 m lie between"
+        )
+        return None, f"TAKEN AS ELLIPSOIDAL; {advice}", True
+    of_file = own.reference.lower().replace(" ", "")
+    try:
+        file = geoid_file(said.geoid)
+    except InputError:
+        if by_person:
+            raise
+        file = geoid_file("egm96")  # a metre from it
+    done = f"made ellipsoidal with {location(file).name}"
+    other = not by_person and not any(name in of_file and name in Path(file).name for name in GEOIDS)
+    return file, f"{done}, which lies within some 2 m of it" if other else done, other or own.reference == UNKNOWN
+
+
 # --- geoids by name ---------------------------------------------------------------------------------------
 
 _OWN = {"egm96": Path(__file__).with_name("egm96_15.tif")}
@@ -310,7 +326,7 @@ GEOIDS = (*_OWN, *_IN_PROJ)
 
 
 def geoid_file(given: str | os.PathLike[str]) -> str:
-    """Return the file of a geoid grid, given by its path or as one of `GEOIDS`.
+    """Return the file of a geoid grid, given by its path or as one of `GEOIDS`; "none" is none.
 
     Raises
     ------
@@ -319,6 +335,8 @@ def geoid_file(given: str | os.PathLike[str]) -> str:
     """
     text = os.fspath(given)
     name = text.lower()
+    if name == NONE:
+        return name
     if name not in GEOIDS or Path(text).exists():
         return text
     if name in _OWN:

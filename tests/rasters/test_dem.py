@@ -6,20 +6,25 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
 import rasterio
 
 from barpc.base.errors import BarpcWarning, InputError
 from barpc.base.geodesy import ecef_from_ground
-from barpc.rasters.dem import Dem, HeightGrid, localize_on_terrain
+from barpc.rasters.dem import Dem, HeightGrid, geoid_file, localize_on_terrain
+from barpc.rasters.vertical import Vertical
 from barpc.rpcio import read_rpc
 from barpc.sensor.geometry import altitude_range
 from tests.sensor.conftest import make_rpc
 
 STEP = 0.01
+GEOID = geoid_file("egm96")
 
 
-def write_dem(path: Path, crs: object, heights: np.ndarray | None = None, **profile: object) -> Path:
+def write_dem(
+    path: Path, crs: object, heights: np.ndarray | None = None, band: dict[str, object] | None = None, **profile: object
+) -> Path:
     """A plane of heights h = 100 + 10 col + row, nodes every hundredth of a degree from 5 E, 44 N."""
     if heights is None:
         row, col = np.mgrid[:21, :31]
@@ -28,6 +33,8 @@ def write_dem(path: Path, crs: object, heights: np.ndarray | None = None, **prof
     options = {"driver": "GTiff", "width": heights.shape[1], "height": heights.shape[0], "count": 1}
     options |= {"dtype": heights.dtype, "crs": crs, "transform": transform, "nodata": -9999.0} | profile
     with rasterio.open(path, "w", **options) as out:
+        for name, value in (band or {}).items():  # scales, offsets, units
+            setattr(out, name, (value,))
         out.write(heights, 1)
     return path
 
@@ -80,11 +87,69 @@ def test_heights_above_a_geoid_are_made_ellipsoidal_and_it_is_said(tmp_path):
     assert dem.known
 
 
-def test_heights_above_a_geoid_without_a_grid_raise_a_loud_warning(tmp_path):
-    with pytest.warns(BarpcWarning, match="EGM96 height, TAKEN AS ELLIPSOIDAL.*100 m"):
-        dem = Dem.open(write_dem(tmp_path / "a.tif", "EPSG:4326+5773"))
-    assert dem(5.0, 44.0) == pytest.approx(100.0)
-    assert not dem.known
+def surface(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+    """Ellipsoidal altitudes [m] of a plane, which any file is to give."""
+    return 180.0 + 2000.0 * (lon - 5.0) - 900.0 * (lat - 44.0)
+
+
+@pytest.mark.parametrize(
+    ("crs", "geoid", "says"),
+    [
+        ("EPSG:4979", None, "ellipsoid"),
+        ("EPSG:4326+5773", None, "egm96"),  # named by the file
+        ("EPSG:4326+5773", "egm96", "egm96"),
+        ("EPSG:4326+5773", "none", "ellipsoid"),  # a person knows better
+        ("EPSG:4326", "egm96", "egm96"),
+        ("EPSG:4326", "none", "ellipsoid"),
+        ("EPSG:4326+5703", "egm96", "egm96"),  # NAVD88
+        ("EPSG:4326+6360", "egm96", "egm96"),  # the same in US survey feet
+        ("EPSG:4326+8228", "egm96", "egm96"),  # in feet
+        ("EPSG:4326+5715", "egm96", "egm96"),  # a depth
+    ],
+)
+@pytest.mark.parametrize("stored", ["numbers", "scaled", "integers"])
+@pytest.mark.parametrize("unit", ["", "metre", "ft", "US survey foot", "cm"])
+def test_a_height_is_one_whatever_unit_and_datum_it_stands_in(tmp_path, crs, geoid, says, stored, unit) -> None:
+    """Of bands with a unit that counts, else their CRS', with scale and offset: to a centimetre."""
+    lon, lat = np.meshgrid(5.0 + STEP * np.arange(31), 44.0 - STEP * np.arange(21))
+    heights = surface(lon, lat)
+    if says == "egm96":
+        heights = heights - HeightGrid.open(GEOID).sample(lon, lat)
+    axis = pyproj.CRS(crs).axis_info[-1]
+    of_crs = 1.0 if pyproj.CRS(crs) == pyproj.CRS(4326) else axis.unit_conversion_factor
+    metres = {"": of_crs, "metre": 1.0, "ft": 0.3048, "US survey foot": 1200 / 3937, "cm": 0.01}[unit]
+    heights = heights / metres * (-1.0 if axis.direction == "down" else 1.0)
+    scale, offset = {"numbers": (1.0, 0.0), "scaled": (0.5, -1000.0), "integers": (0.001 / metres, 250.0)}[stored]
+    numbers = (heights - offset) / scale
+    kind = np.int32 if stored == "integers" else np.float64
+    numbers = np.round(numbers).astype(kind) if kind == np.int32 else numbers
+    band = {"scales": scale, "offsets": offset} | ({"units": unit} if unit else {})
+    path = write_dem(tmp_path / "a.tif", crs, numbers, band)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", BarpcWarning)
+        dem = Dem.open(path, geoid)
+    at = np.array([5.003, 5.1, 5.29]), np.array([43.99, 43.85, 43.81])
+    np.testing.assert_allclose(dem(*at), surface(*at), atol=0.01)
+    assert dem.known
+
+
+def test_a_datum_without_a_grid_of_its_own_is_met_by_another_which_is_said(tmp_path, monkeypatch) -> None:
+    with pytest.warns(BarpcWarning, match="NAVD88 height, made ellipsoidal with egm96.*within some 2 m"):
+        dem = Dem.open(write_dem(tmp_path / "a.tif", "EPSG:4326+5703"))
+    assert dem(5.0, 44.0) == pytest.approx(100.0 + float(HeightGrid.open(GEOID).sample(5.0, 44.0)))
+    assert dem.known
+    monkeypatch.setattr("barpc.rasters.dem.proj_folders", list)
+    path = write_dem(tmp_path / "b.tif", "EPSG:4326+3855")
+    with pytest.warns(BarpcWarning, match="EGM2008 height, made ellipsoidal with egm96"):
+        Dem.open(path)
+    with pytest.raises(InputError, match="geoid egm2008: no "):  # who asks for it gets it or nothing
+        Dem.open(path, "egm2008")
+
+
+def test_a_unit_that_is_no_length_is_refused(tmp_path) -> None:
+    path = write_dem(tmp_path / "a.tif", 4979, band={"units": "kelvin"})
+    with pytest.raises(InputError, match=r"a.tif: the unit 'kelvin' of its heights is not known"):
+        Dem.open(path)
 
 
 def test_an_unknown_reference_raises_a_loud_warning_with_and_without_a_grid(tmp_path):
@@ -154,7 +219,7 @@ def test_a_tile_and_a_geoid_are_read_as_their_bytes_stand(tmp_path):
     grid = HeightGrid.open(tmp_path / "S34W071.hgt")
     expected = np.where(tile == -32768, np.nan, tile.astype(float))
     np.testing.assert_array_equal(grid.read(0, 1201, 0, 1201), expected)
-    assert grid.reference == "EGM96 height"
+    assert grid.vertical == Vertical("EGM96 height", geoid="egm96", stated=True)
     assert grid.sample(-71.0, -33.0) == tile[0, 0]
     assert grid.sample(-70.0, -34.0) == tile[-1, -1]
     geoid = rng.normal(0, 30, (19, 36)).astype(">f4")
@@ -163,7 +228,7 @@ def test_a_tile_and_a_geoid_are_read_as_their_bytes_stand(tmp_path):
     grid = HeightGrid.open(tmp_path / "g.gtx")
     heights = grid.sample(*np.meshgrid(np.arange(-180, 180, 10.0), np.arange(-90, 91, 10.0)))
     np.testing.assert_array_equal(heights, np.where(geoid == np.float32(-88.8888), np.nan, geoid.astype(float)))
-    assert grid.reference == "ellipsoid"
+    assert grid.vertical.reference == "ellipsoid"
 
 
 def test_a_dem_without_crs_is_refused(tmp_path):
@@ -176,7 +241,7 @@ def test_a_dem_without_crs_is_refused(tmp_path):
 def test_srtm_over_mont_ventoux_is_what_gdal_reads_plus_the_geoid(shared_data):
     folder = shared_data / "dem"
     dem = Dem.open(folder / "N44E005.hgt", folder / "egm96_15.gtx")
-    assert dem.grid.reference == "EGM96 height"
+    assert dem.grid.vertical.reference == "EGM96 height"
     with rasterio.open(folder / "N44E005.hgt") as tile:
         heights = tile.read(1).astype(float)
     rng = np.random.default_rng(0)
