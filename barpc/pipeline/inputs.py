@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from barpc.ba import BlockPrior
+from barpc.ba.held.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.errors import InputError, listed
 from barpc.base.geodesy import Array, ecef_from_ground, metres_per_unit, wrap_longitude
 from barpc.base.identity import Input, Stamp, changed, take
@@ -48,8 +49,9 @@ def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None,
 
     A file that cannot be used, those of ground points included, stops the run here (InputError), not after an hour.
     """
+    dem = None if options.dem is None else Dem.open(options.dem, options.geoid)
     for paths in (options.gcp, options.check_points):
-        points = load_gcps(paths, views, options)
+        points = load_gcps(paths, views, options, dem)
         for line in () if points is None else points.left_out:
             logger.warning("%s", line)
     load_altimetry(options.altimetry, views)
@@ -57,7 +59,6 @@ def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None,
         raise InputError("dem_for_weak is given without dem: there are no heights to hold the tie points to")
     for path in options.reference:
         Sheet.read(path)
-    dem = None if options.dem is None else Dem.open(options.dem, options.geoid)
     if dem is not None:
         _require_cover(dem, str(options.dem), views)
     prior = None if options.fixed_run is None else BlockPrior.load(table_path(Path(options.fixed_run), PRIOR))
@@ -270,13 +271,15 @@ _MISTAKES = {
 """What people do to coordinates -> the columns that longitude and latitude are taken from, and their signs."""
 
 
-def load_gcps(paths: Sequence[str], views: Sequence[View], options: RunOptions) -> GroundPoints | None:
+def load_gcps(
+    paths: Sequence[str], views: Sequence[View], options: RunOptions, dem: Dem | None = None
+) -> GroundPoints | None:
     """Return the ground points of several files, one after the other; None without files.
 
     Points that cannot be where they are said to be, images that are no views, and files that cannot be read are an
-    InputError, or with `keep_going` left out and named in `left_out`.
+    InputError, or with `keep_going` left out and named in `left_out`. Altitudes that are not known come from `dem`.
     """
-    parts = [_load(path, views, options) for path in paths]
+    parts = [_load(path, views, options, dem) for path in paths]
     if not parts:
         return None
     starts = np.cumsum([0, *(len(part.names) for part in parts)])[:-1]
@@ -289,13 +292,14 @@ def load_gcps(paths: Sequence[str], views: Sequence[View], options: RunOptions) 
     return GroundPoints(names, point=point, **joined, strangers=strangers, left_out=left_out)
 
 
-def _load(path: str, views: Sequence[View], options: RunOptions) -> GroundPoints:
+def _load(path: str, views: Sequence[View], options: RunOptions, dem: Dem | None) -> GroundPoints:
     try:
         points = read_gcps(path, [view.name for view in views])
     except InputError as error:
         if not options.keep_going:
             raise
         return replace(GroundPoints.none(), left_out=(f"{error}; the file is left out",))
+    points, said = _with_altitudes(points, views, options, dem)
     out, keep = [], np.ones(len(points.names), dtype=bool)
     search = np.array([reach_of(view, options.tie) for view in views])[points.view]
     for wrong, what in _implausible(points, views, search):
@@ -308,7 +312,37 @@ def _load(path: str, views: Sequence[View], options: RunOptions) -> GroundPoints
         out.append(f"it names images that are not in this run: {listed(points.strangers)}")
     if out and not options.keep_going:
         raise InputError(f"{path}: {out[0]}; correct it, or leave it out with --keep-going")
-    return replace(points.select(keep), left_out=tuple(f"{path}: {line}; left out" for line in out))
+    lines = *(f"{path}: {line}" for line in said), *(f"{path}: {line}; left out" for line in out)
+    return replace(points.select(keep), left_out=lines)
+
+
+def _with_altitudes(
+    points: GroundPoints, views: Sequence[View], options: RunOptions, dem: Dem | None
+) -> tuple[GroundPoints, list[str]]:
+    """Return the points with the altitudes that a DEM has where theirs are 0, as tools write where none is known; and
+    what is to be said where none has.
+
+    These are held sideways alone: in height to the middle of the cameras' altitudes, and together to their range.
+    """
+    unknown = points.lonlatalt[:, 2] == 0.0
+    if not unknown.any():
+        return points, []
+    ground, sigma, count = points.lonlatalt.copy(), points.sigma.copy(), int(unknown.sum())
+    what = f"{count} of {len(unknown)} points have altitude 0, as tools write where none is known"
+    if dem is not None:
+        height = dem(*ground[unknown, :2].T)
+        known = unknown.copy()
+        known[unknown] = np.isfinite(height)
+        ground[known, 2] = height[np.isfinite(height)]
+        given = options.adjust.dem_bias_sigma or (KNOWN_BIAS if dem.known else DEM_BIAS)
+        # what all heights of a DEM are wrong by does not average
+        sigma[known, 2] = np.hypot(options.adjust.dem_sigma, given * np.sqrt(max(known.sum(), 1)))
+        logger.warning("%s: the DEM's are taken for %d of them", what, known.sum())
+        unknown &= ~known
+    low, high = min(view.alt_range[0] for view in views), max(view.alt_range[1] for view in views)
+    ground[unknown, 2], sigma[unknown, 2] = 0.5 * (low + high), (high - low) * np.sqrt(max(unknown.sum(), 1))
+    said = f"{what}: {int(unknown.sum())} hold the images sideways alone; give their altitudes, or --dem"
+    return replace(points, lonlatalt=ground, sigma=sigma), [said] if unknown.any() else []
 
 
 def _implausible(points: GroundPoints, views: Sequence[View], search: Array) -> Iterator[tuple[BoolArray, str]]:

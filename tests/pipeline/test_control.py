@@ -8,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from barpc.ba import adjust_tracks
 from barpc.base.errors import InputError
+from barpc.base.geodesy import ground_from_ecef
 from barpc.base.options import RunOptions, TieOptions
 from barpc.pipeline import inputs as control
 from barpc.pipeline.inputs import load_gcps
@@ -445,3 +447,76 @@ def test_of_several_files_each_observation_keeps_its_point_and_strangers_are_nam
     assert kept == {row for row in seen if row[1] != 2}
     assert found.strangers == ("/some/where/else.tif",)
     assert [line.split(":")[0] for line in found.left_out] == list(map(str, paths))
+
+
+# --- altitudes that nobody knows ---------------------------------------------------------------------------
+
+
+class Plane:
+    """A DEM that knows heights west of a longitude."""
+
+    known = True
+
+    def __init__(self, east: float = np.inf) -> None:
+        self.east = east
+
+    def __call__(self, lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+        return np.where(lon < self.east, 321.0, np.nan)
+
+
+def at_zero(points: GroundPoints, some: np.ndarray) -> GroundPoints:
+    """Points of which some have the altitude that GDAL and QGIS write for none."""
+    return replace(points, lonlatalt=np.where(some[:, None], points.lonlatalt * [1.0, 1.0, 0.0], points.lonlatalt))
+
+
+@pytest.mark.parametrize("some", [np.ones(6, dtype=bool), np.arange(6) == 2, np.arange(6) > 1])
+def test_an_altitude_of_zero_is_none_and_holds_an_image_sideways_alone(tmp_path, some) -> None:
+    path = tmp_path / "p.gcp"
+    found = load(path, asp(at_zero(POINTS, some)))
+    low, high = min(view.alt_range[0] for view in VIEWS), max(view.alt_range[1] for view in VIEWS)
+    count = int(some.sum())
+    np.testing.assert_array_equal(found.lonlatalt[some, 2], 0.5 * (low + high))
+    np.testing.assert_allclose(found.sigma[some, 2], (high - low) * count**0.5)  # together no better than the range
+    np.testing.assert_array_equal(found.sigma[:, :2], POINTS.sigma[:, :2])
+    for name in ("lonlatalt", "sigma"):
+        np.testing.assert_array_equal(getattr(found, name)[~some], getattr(POINTS, name)[~some])
+    assert found.left_out == (
+        f"{path}: {count} of 6 points have altitude 0, as tools write where none is known: {count} hold the images "
+        "sideways alone; give their altitudes, or --dem",
+    )
+
+
+def test_a_dem_knows_the_altitudes_that_are_zero_where_it_reaches(tmp_path, caplog) -> None:
+    path = tmp_path / "p.gcp"
+    path.write_text(asp(at_zero(POINTS, np.arange(6) != 1)))
+    options = RunOptions()
+    found = load_gcps([str(path)], VIEWS, options, Plane())  # type: ignore[arg-type]
+    assert found is not None
+    assert found.lonlatalt[:, 2].tolist() == [321.0, POINTS.lonlatalt[1, 2], *[321.0] * 4]
+    np.testing.assert_allclose(found.sigma[[0, 2], 2], np.hypot(options.adjust.dem_sigma, 5.0 * 5**0.5))
+    assert found.sigma[1, 2] == 0.3
+    assert found.left_out == ()
+    assert "5 of 6 points have altitude 0, as tools write where none is known: the DEM's are taken" in caplog.text
+    east = float(np.median(POINTS.lonlatalt[:, 0]))
+    found = load_gcps([str(path)], VIEWS, options, Plane(east))  # type: ignore[arg-type]
+    assert found is not None
+    beyond = (POINTS.lonlatalt[:, 0] >= east) & (np.arange(6) != 1)
+    np.testing.assert_array_equal(found.lonlatalt[:, 2] == 321.0, ~beyond & (np.arange(6) != 1))
+    assert f"{beyond.sum()} hold the images sideways alone" in found.left_out[0]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_control_without_altitudes_says_no_more_of_the_height_than_it_knows(tmp_path, seed) -> None:
+    """Its truth 200 m from the middle of the range: within what is said; taken as 0 it was 40 m off, known to 0.45."""
+    block = simulate_block(3, 200, num_gcps=8, seed=seed)
+    gcps, lines = block.gcps, {}
+    for g, v, (col, row) in zip(gcps.point, gcps.view, gcps.xy.tolist(), strict=True):
+        lon, lat, _ = gcps.lonlatalt[g].tolist()
+        lines[g] = f"g{g} {lat} {lon} 0 1 1 1 {block.views[v].name} {col} {row} 1 1\n"
+    (path := tmp_path / "p.gcp").write_text("".join(lines.values()))
+    gcps = load_gcps([str(path)], block.views, RunOptions())
+    found = adjust_tracks(block.views, block.tracks, gcps=gcps)
+    off = ground_from_ecef(found.points) - block.truth.ground
+    metres = np.nanmean(off, axis=0) * [111e3 * np.cos(np.radians(43.3)), 111e3, 1.0]
+    assert (np.abs(metres) < 3.0 * found.gauge.sigma).all()
+    assert found.gauge.sigma[2] > 5.0
