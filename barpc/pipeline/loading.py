@@ -84,7 +84,8 @@ def load_views(
     files = [plain_path(image_path(image, hosts)) for image in images]
     if len(files) < min_views:
         found = files[0] if files else "none"
-        raise InputError(f"{len(files)} image(s) given ({found}): at least {min_views} that overlap are needed")
+        alone = "; one alone is adjusted by ground control points (--gcp)" if len(files) == 1 else ""
+        raise InputError(f"{len(files)} image(s) given ({found}): at least {min_views} that overlap are needed{alone}")
     given = sorted(zip(unique_names(files), files, images, strict=True), key=lambda row: row[:2])
     how = (band, distinct, tuple(hosts))
     opened, spent = _read_all(given, how, executor if len(given) > GROUP else None, progress)

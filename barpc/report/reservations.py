@@ -51,7 +51,9 @@ def _reservations(view: ViewEntry, run: Run) -> Found:
         yield from _failed(view, run, adjustment)
     by_reference = run.reference is not None and any(v.points and v.name == view.name for v in run.reference.views)
     if view.num_observations < FEW and view.num_gcps < ENOUGH_GCPS and not by_reference:
-        yield "few" if view.num_observations else "none", {"few": view.num_observations}
+        gcps = f"{view.num_gcps} GCP{'s' * (view.num_gcps > 1)}"
+        what = "few" if view.num_observations else "few_gcps" if view.num_gcps else "none"
+        yield what, {"few": view.num_observations, "gcps": gcps}
     if run.kind == "match":  # how well cameras agree is not what was asked
         return
     if view.name in run.copies:

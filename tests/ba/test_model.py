@@ -364,7 +364,7 @@ def test_views_with_too_few_observations_are_listed_up_to_ten(made) -> None:
                  None, AdjustOptions())  # fmt: skip
     views = tuple(replace(made.views[0], name=f"v{v:02}") for v in range(12))
     empty = Tracks(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
-    with pytest.raises(TiePointError, match=r"v09 \(0\) and 2 more: at least 4 are needed"):
+    with pytest.raises(TiePointError, match=r"v09 \(0\) and 2 more: at least 4 tie points are needed"):
         join(views, empty, None, AdjustOptions())
 
 
@@ -420,7 +420,8 @@ def script(
     monkeypatch.setattr(solved, "revived", lambda problem, state, *_: (state, None))
     monkeypatch.setattr(solved, "finished", lambda found, problem, block, outer, options, outcome: found)
     use = np.ones(100)
-    block: Any = SimpleNamespace(use=use, sigma=1.0, views=("a", "b"), gcps=GroundPoints.none())
+    seen = {"view": np.zeros(100, dtype=np.int64), "point": np.arange(100), "num_tracks": 100}
+    block: Any = SimpleNamespace(use=use, sigma=1.0, views=("a", "b"), gcps=GroundPoints.none(), **seen)
     options = AdjustOptions() if options is None else options
     made = solved.solve_block(block, None, options, None, None, prior)  # type: ignore[arg-type]
     named = [

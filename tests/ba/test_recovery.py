@@ -262,6 +262,31 @@ def test_a_single_view_is_refined_by_gcps_alone():
     assert np.abs(found.gcp_residuals).max() < 0.5
 
 
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_one_to_three_gcps_tell_a_view_what_they_can_and_priors_the_rest(count):
+    """Its errors all over the image are as large as its covariance says, and it is met at the points themselves."""
+    z, at_points = [], []
+    options = AdjustOptions(**{**INDEPENDENT, "drift": 0})
+    for seed in range(12):
+        one = simulate_block(1, 0, seed=seed, num_gcps=12, num_checks=0)
+        gcps = one.gcps.select(np.arange(12) < count)
+        gcps = replace(gcps, sigma=np.full(gcps.sigma.shape, 0.1))  # they are exact
+        found = adjust_tracks(one.views, one.tracks, options, gcps, centers=centers_of(one))
+        truth, unknowns = truth_sensors(one)[0], found.cameras.unknowns
+        image = np.random.default_rng(seed).uniform(0, 19999, (20, 2))
+        ground = truth.localize(image, np.full(20, 300.0))
+        off = (found.sensors[0].project(ground) - image).ravel()
+        steps = 1e-3 * np.eye(found.params.shape[1])
+        moved = [unknowns.corrected(found.params + step, one.views)[0].project(ground).ravel() for step in steps]
+        jacobian = (np.array(moved) - found.sensors[0].project(ground).ravel()).T / 1e-3
+        sigma = np.sqrt(np.einsum("ij,jk,ik->i", jacobian, found.covariance.view(0), jacobian))
+        z.append(np.sqrt(np.mean((off / sigma) ** 2)))
+        at_points.append(np.abs(truth.project(gcps.lonlatalt) - found.sensors[0].project(gcps.lonlatalt)).max())
+    assert 0.4 < np.sqrt(np.mean(np.square(z))) < 1.3  # what is learnt of priors by so few is rather too wide
+    assert max(z) < 3.5
+    assert np.median(at_points) < 0.5
+
+
 @pytest.mark.slow
 def test_a_dem_holds_the_height_of_the_scene():
     block = simulate_block(3, 600, seed=8, alt_range=(200.0, 201.0))

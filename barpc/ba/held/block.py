@@ -30,7 +30,7 @@ from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, Tracks, View, connected_groups
 from barpc.sensor.rpc import localize_stack
 
-MIN_OBSERVATIONS = 4  # of a view, or it stops: six unknowns need three points, and one to check them
+MIN_OBSERVATIONS = 4  # tie points of a view, or it stops: six unknowns need three points, and one to check them
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -134,11 +134,12 @@ def join(
     if not (np.diff(key[rows]) > 0).all():
         raise InputError("tracks: a track is observed twice in one view; keep one observation or none")
     count = np.bincount(view, minlength=len(views))
-    few = [f"{names[v]} ({count[v]})" for v in np.flatnonzero(count < MIN_OBSERVATIONS)]
+    controlled = np.bincount(view[len(tracks.view) :], minlength=len(views)) > 0  # by points whose places are known
+    few = [f"{names[v]} ({count[v]})" for v in np.flatnonzero((count < MIN_OBSERVATIONS) & ~controlled)]
     if few and not keep_largest:
         raise TiePointError(
-            f"too few observations in {listed(few)}: at least {MIN_OBSERVATIONS} are needed; "
-            "give more matches (--matches) or leave these views out (--keep-going)"
+            f"too few observations in {listed(few)}: at least {MIN_OBSERVATIONS} tie points are needed, or one ground "
+            "control point (--gcp); give more matches (--matches) or leave these views out (--keep-going)"
         )
     left_out = _left_out(names, view[rows], point[rows], tracks.num_points, keep_largest)
     order, _ = counting_sort(view, len(views))

@@ -162,16 +162,16 @@ def solve_block(
         free = Solution(problem, state, before, heights, outcome, start, start, None, asked, by_point=by_point)
         agreed, heights = _with_control(block, given, outcome)
         outcome = Rounds(problem, block, outcome.minimum.state, heights, block.use, outcome).run()
-    _check_inliers(outcome, problem.structure, block)
+    _check_inliers(outcome, block)
     first = Solution(problem, state, before, heights, outcome, start, start, None, asked, (), agreed, by_point)
     found = finished(first, problem, block, outer, options, outcome)
     return found if free is None or not found.heights.has_control else _untorn(found, free, block, outer, options)
 
 
-def _check_inliers(outcome: Outcome, structure: Structure, block: Block) -> None:
-    """Raise AdjustError where the cuts leave no view the observations that a camera takes."""
-    kept = structure.sum_views(outcome.inlier.astype(np.float64)[None])
-    if kept.max() < MIN_OBSERVATIONS:
+def _check_inliers(outcome: Outcome, block: Block) -> None:
+    """Raise AdjustError where the cuts leave no control, and no view the tie points that a camera takes."""
+    kept = np.bincount(block.view[outcome.inlier])
+    if kept.max(initial=0) < MIN_OBSERVATIONS and not (block.point[outcome.inlier] >= block.num_tracks).any():
         raise AdjustError(
             f"too few tie points agree: of {int(block.use.sum())} observations {int(kept.sum())} are inliers, and an "
             f"image needs {MIN_OBSERVATIONS}; give more matches, and check that all images show the same ground"

@@ -108,6 +108,8 @@ CAUSES = {
         "check that the RPC belongs to this image (IMAGE,camera=FILE names another); look for clouds, water, change"),
     "few": Cause("weak", "few tie points", "only {few} tie points", "check overlap, clouds and dates"),
     "none": Cause("weak", "no tie points", "no tie points", "check overlap, clouds and dates"),
+    "few_gcps": Cause("weak", "few GCPs", "it is held by {gcps} alone, in which an error would hardly show",
+        "give three or more"),
     "copy": Cause("doubtful", "shown twice", "shows the same pixels as {other}", "give each image once"),
     "apart": Cause("doubtful", "RPC not its own",
         "its RPC is {stated}: {strangeness}. It was adjusted alone, against points of the other images",
