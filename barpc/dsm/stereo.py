@@ -6,15 +6,13 @@ Tile by tile the best pairs that see it are matched, intersected and gathered in
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy.linalg as la
 from rasterio.warp import transform
 
@@ -28,6 +26,7 @@ from barpc.base.options import TieOptions
 from barpc.base.remote import is_url
 from barpc.base.usual import MAD
 from barpc.cameras import open_camera
+from barpc.dsm.consensus import F32, consensus, median
 from barpc.export.shots import read_scene
 from barpc.pipeline import load_views
 from barpc.pipeline.inputs import PRIOR
@@ -54,11 +53,10 @@ _COARSE = 8  # times a pixel at most of the coarser picture
 _ROOM = 4.0  # px of the coarser picture that heights may lie beyond what it shows
 _SPLIT = 3  # times that a part is halved at most
 
-_median: Callable[..., Any] = np.ma.median  # of what is known
-
-F32 = npt.NDArray[np.float32]
-Found = tuple[Array, Array, float]
-"""Ground points (n, 3), their standard deviations in height (n,) [m], and the share of the pixels matched."""
+Found = tuple[Array, Array, float, float]
+"""Ground points (n, 3), their standard deviations in height (n,) [m], the share of the pixels matched, and the height
+that a pixel of disparity stands for [m].
+"""
 ANGLES = 2.0, 45.0
 """Convergence angles [deg] of pairs that are matched: below, a pixel is 30 of height; above, SGBM finds decoys."""
 _RADAR = ("sentinel-1", "terrasar-x", "sicd")
@@ -105,29 +103,31 @@ class Tile:
 
 
 def surface_tile(pairs: Sequence[tuple[View, View]], tile: Tile, band: int) -> tuple[F32, ...]:
-    """Compute the cells of a tile in a worker: the median of each pair's matches, then of the pairs' heights.
+    """Compute the cells of a tile in a worker: the median of each pair's matches, then of the heights of the pairs that
+    agree (`barpc.dsm.consensus`).
 
     Returns
     -------
-    height, nmad, sigma : (rows, cols) [m], NaN where unknown; of the pairs' disagreement, and of the noise of one
-        match through the intersection (root mean square of the pairs)
-    seen : (rows, cols), as float32: bit k is set where pair k has a height
+    height, nmad, sigma : (rows, cols) [m], NaN where unknown; of the disagreement of all pairs, and of the noise of one
+        match through the intersection (root mean square of the pairs that are taken)
+    seen : (rows, cols), as float32: bit k is set where the height of pair k is taken
     shares : (pairs,), of the pixels that both images show so many were matched; NaN: they show nothing of it
     """
     cells = np.full((2, len(pairs), tile.size[1], tile.size[0]), np.nan, np.float32)
-    shares = np.full(len(pairs), np.nan, np.float32)
+    shares, metres = np.full((2, len(pairs)), np.nan, np.float32)
     for k, pair in enumerate(pairs):
         if found := _points(pair, tile, band):
-            ground, sigma, share = zip(*found, strict=True)
-            shares[k] = np.mean(share)
+            ground, sigma, share, pixel = zip(*found, strict=True)
+            shares[k], metres[k] = np.mean(share), np.max(pixel)
             if shares[k] >= MATCHED:
                 cells[:, k] = gathered(tile, np.concatenate(ground), np.concatenate(sigma))
-    heights, sigmas = np.ma.masked_invalid(cells)
-    height, known = _median(heights, axis=0), np.isfinite(cells[0])
-    nmad = np.ma.masked_where(known.sum(axis=0) < 2, MAD * _median(np.abs(heights - height), axis=0))
-    seen = np.tensordot(1 << np.arange(len(pairs)), known, axes=1).astype(np.float32)
-    mean = np.ma.sqrt(np.ma.mean(sigmas**2, axis=0))
-    return (*(one.filled(np.nan).astype(np.float32) for one in (height, nmad, mean)), seen, shares)
+    taken = consensus(cells[0], metres)
+    height = median(np.where(taken, cells[0], np.nan))
+    several = np.isfinite(cells[0]).sum(axis=0) > 1
+    nmad = np.where(several, MAD * median(np.abs(cells[0] - height)), np.nan)
+    seen = np.tensordot(1 << np.arange(len(pairs)), taken, axes=1)
+    total, count = np.where(taken, cells[1] ** 2, 0.0).sum(axis=0), np.where(seen > 0, taken.sum(axis=0), np.nan)
+    return (*(one.astype(np.float32) for one in (height, nmad, np.sqrt(total / count), seen)), shares)
 
 
 def _points(pair: tuple[View, View], tile: Tile, band: int, halved: int = 0) -> list[Found]:
@@ -152,7 +152,7 @@ def _points(pair: tuple[View, View], tile: Tile, band: int, halved: int = 0) -> 
         known = np.isfinite(ground[:, 2])
         ground = ground[known]
         if zoom == 1 or found.share < MATCHED or not len(ground):
-            return [(ground, found.sigma[known] * frame.metres, found.share)]
+            return [(ground, found.sigma[known] * frame.metres, found.share, frame.metres)]
         low, high = np.percentile(ground[:, 2], [1.0, 99.0]) + np.array([-1.0, 1.0]) * _ROOM * frame.metres
         tile = replace(tile, alts=(max(tile.alts[0], float(low)), min(tile.alts[1], float(high))))
         zoom //= 2
