@@ -188,12 +188,16 @@ class Column:
 def table(
     key: str, caption: str, rows: Sequence[Record], kind: type[Record], columns: str, adjusted: bool = True
 ) -> Table:
-    """Return the table of records, a row each; words of `columns`: fields (``part.field``), columns of `OWN`."""
+    """Return the table of records, a row each; words of `columns`: fields (``part.field``), columns of `OWN`.
+
+    Of cameras that are not `adjusted` nothing is before or after.
+    """
     found = [column_of(kind, name) for name in columns.split()]  # type: ignore[arg-type]
     found = [column for column in found if adjusted or not column.adjusted]
     cells = [[cell for column in found for cell in column.cells(row)] for row in rows]
     heads = [[column.head] if isinstance(column.head, str) else column.head for column in found]
-    return Table(key, caption, [head for some in heads for head in some], cells)
+    words = [head if adjusted else head.replace("before", "now") for some in heads for head in some]
+    return Table(key, caption, words, cells)
 
 
 @cache

@@ -230,8 +230,8 @@ def test_an_image_shows_shares_in_percent():
     assert not {"RPC fit [px]", "after [px]", "shift col, row [px]"} & set(checked)
     assert "RPC fit [px]" in table("k", "c", [view], ViewEntry, every).columns
     pairs = table("k", "c", [a_pair()], PairEntry, PairEntry.PAGE, adjusted=False).columns
-    assert "before [px]" in pairs
-    assert "after [px]" not in pairs
+    assert "now [px]" in pairs
+    assert not {"before [px]", "after [px]"} & {*pairs, *checked}
 
 
 def test_what_numbers_a_file_may_hold():

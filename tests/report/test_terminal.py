@@ -84,8 +84,9 @@ def test_the_summary_keeps_every_column_at_every_width(block_run, width, monkeyp
 
 def test_a_check_shows_no_columns_of_new_cameras(check_run, monkeypatch):
     text = shown(check_run, None, monkeypatch)
-    assert "before [px]" in text
-    assert "after [px]" not in text
+    assert text.count("now [px]") == 2
+    assert "before" not in text
+    assert "after" not in text
 
 
 @pytest.mark.parametrize("width", [None, 200, 80, 60, 40])
