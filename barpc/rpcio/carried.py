@@ -175,21 +175,19 @@ def printable(rpc: RPC) -> RPC:
     b dp/dx + (a - 1) x dp/dx, and what is left of second order is 1e-26.
     """
     ground_offset, ground_scale = _fifteen(rpc.ground_offset), _fifteen(rpc.ground_scale)
-    image_offset, image_scale = _fifteen(rpc.image_offset), _fifteen(rpc.image_scale)
     shift = (ground_offset - rpc.ground_offset) / rpc.ground_scale
     stretch = (ground_scale - rpc.ground_scale) / rpc.ground_scale
     coeffs = rpc.coeffs + rpc.coeffs * (POWERS @ stretch)
     coeffs[:, :10] += np.einsum("k,kij,pi->pj", shift, DERIVATIVE, rpc.coeffs)
-    moved = ((rpc.image_offset - image_offset) / image_scale)[:, None]
+    rpc = replace(rpc, coeffs=coeffs, ground_offset=ground_offset, ground_scale=ground_scale)
+    return _counted_from(rpc, _fifteen(rpc.image_offset), _fifteen(rpc.image_scale))
+
+
+def _counted_from(rpc: RPC, image_offset: Array, image_scale: Array) -> RPC:
+    """Return the same camera with another offset and scale of the image: numerators take up the difference exactly."""
+    coeffs, moved = rpc.coeffs.copy(), ((rpc.image_offset - image_offset) / image_scale)[:, None]
     coeffs[::2] = coeffs[::2] * (rpc.image_scale / image_scale)[:, None] + moved * coeffs[1::2]
-    return replace(
-        rpc,
-        coeffs=coeffs,
-        ground_offset=ground_offset,
-        ground_scale=ground_scale,
-        image_offset=image_offset,
-        image_scale=image_scale,
-    )
+    return replace(rpc, coeffs=coeffs, image_offset=image_offset, image_scale=image_scale)
 
 
 # --- NITF -------------------------------------------------------------------------------------------------
@@ -220,10 +218,13 @@ def nitf_record(rpc: RPC) -> str:
     """Return the 1041 characters of an RPC00B extension; RpcFormatError where a number does not fit its field.
 
     Image and height offsets and scales are integers, degrees have four decimals, coefficients seven digits: an
-    RPC that was not fitted for it (`barpc.fit`, precision "nitf") loses tenths of a pixel. An unknown accuracy
-    is written as zero, as the format asks.
+    RPC that was not fitted for it (`barpc.fit`, precision "nitf") loses tenths of a pixel. The image's offsets have
+    no sign: those of a part of an image may be negative, and start from 0. An unknown accuracy is written as zero, as
+    the format asks.
     """
-    fields = fields_from_rpc(rpc)
+    fields = fields_from_rpc(
+        _counted_from(rpc, np.maximum(np.rint(rpc.image_offset), 0.0), np.maximum(np.rint(rpc.image_scale), 1.0))
+    )
     decimals = {"ERR": 2, "LAT": 4, "LONG": 4}
     cells = ["1"]
     for key, width in zip(SINGLE, _WIDTHS, strict=True):

@@ -17,7 +17,7 @@ from barpc.base.errors import InputError, RpcFormatError
 from barpc.base.remote import Place
 from barpc.base.sidefile import RPC_FILE
 from barpc.rpcio import text, xml
-from barpc.rpcio.images import write_rpc_copy, write_rpc_nitf, write_rpc_vrt
+from barpc.rpcio.images import NITF_NAMES, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
 from barpc.rpcio.text import ReadOptions
 from barpc.sensor.rpc import RPC
 
@@ -85,7 +85,7 @@ CARRIERS: dict[str, Carrier] = {
         (".tif", ".tiff"), lambda rpc, image, path, _, over: write_rpc_copy(rpc, image, path, overwrite=over)
     ),
     "nitf": Carrier(
-        (".ntf",), lambda rpc, image, path, _, over: write_rpc_nitf(rpc, image, path, overwrite=over), precision="nitf"
+        NITF_NAMES, lambda rpc, image, path, _, over: write_rpc_nitf(rpc, image, path, overwrite=over), precision="nitf"
     ),
 }
 """Name -> raster that carries an RPC."""

@@ -26,11 +26,13 @@ from barpc.base.remote import Place
 from barpc.base.sidefile import IMAGE, opened, plain_path
 from barpc.rasters.raster import Mosaic, identify, open_raster
 from barpc.rasters.vrt import GDAL_TYPES
-from barpc.rpcio.carried import nitf_record, printable, put_tag
+from barpc.rpcio.carried import nitf_record, printable, put_tag, read_nitf
 from barpc.rpcio.xml import rpc_domain
 from barpc.sensor.rpc import RPC
 
 TIFF = {"driver": "GTiff", "BIGTIFF": "IF_SAFER", "TILED": "YES", "COMPRESS": "DEFLATE"}
+NITF_NAMES = (".ntf", ".nitf", ".nsf")
+"""Ends of the names of NITF files, in any case."""
 _FULL = 1 << 16  # bytes: with less free space GDAL's error is taken for that of a full disk
 
 
@@ -159,7 +161,8 @@ def write_crop(
     Parameters
     ----------
     rpc : RPC, the camera of `image_path`
-    image_path, crop_path : Path or str, the image, and the tiled GeoTIFF to write
+    image_path, crop_path : Path or str, the image, and the file to write: a NITF by its name (`NITF_NAMES`), else a
+        tiled GeoTIFF
     window : (col, row, width, height), whole pixels, inside the image
     overwrite : bool, replace an existing file, never the image itself
 
@@ -169,19 +172,23 @@ def write_crop(
 
     Raises
     ------
-    ImageError, OutputError
-        The window is not inside the image, or that cannot be read; the crop exists or cannot be written.
+    ImageError, OutputError, RpcFormatError
+        The window is not inside the image, or that cannot be read; the crop exists or cannot be written; a NITF does
+        not hold its RPC.
     """
     col, row, width, height = window
-    cropped = printable(rpc.crop(col, row))
+    cropped, nitf = rpc.crop(col, row), Path(crop_path).name.lower().endswith(NITF_NAMES)
+    layout = {"driver": "NITF", "TRE": f"RPC00B={nitf_record(cropped)}"} if nitf else TIFF
     with copying(image_path, crop_path, overwrite) as (dataset, partial):
         if not (0 <= col < col + width <= dataset.width and 0 <= row < row + height <= dataset.height):
             raise ImageError(
                 f"{image_path}: window {window} is not inside the image of {dataset.width} x {dataset.height}"
             )
-        _copy_window(dataset, partial, Path(crop_path), Window(col, row, width, height), **TIFF)
-        put_tag(partial, cropped, placed=dataset.crs is not None)
-    return cropped
+        _copy_window(dataset, partial, Path(crop_path), Window(col, row, width, height), **layout)
+        if nitf:
+            return read_nitf(partial) or cropped
+        put_tag(partial, printable(cropped), placed=dataset.crs is not None)
+    return printable(cropped)
 
 
 @contextmanager
@@ -210,7 +217,7 @@ def _convert(dataset: Any, partial: Path, target: Path, **options: str) -> None:
 def _copy_window(dataset: Any, partial: Path, target: Path, window: Window, **options: str) -> None:
     profile = {"width": window.width, "height": window.height, "count": dataset.count, **options}
     profile |= {"dtype": dataset.dtypes[0], "nodata": dataset.nodata}
-    if dataset.crs is not None:
+    if dataset.crs is not None and options["driver"] == "GTiff":  # a NITF's corners are rounded, and north-up for some
         a, b, x, d, e, y = dataset.transform[:6]
         col, row = window.col_off, window.row_off
         moved = rasterio.Affine(a, b, x + a * col + b * row, d, e, y + d * col + e * row)

@@ -269,6 +269,39 @@ def test_a_window_lies_within_the_image_and_has_pixels(window: tuple[int, ...], 
     assert read_rpc(tmp_path / "b.tif") == crop
 
 
+@pytest.mark.parametrize(("middle", "offset"), [((950.0, 900.0), (943.0, 895.0)), ((-50.3, 1.0), (0.0, 0.0))])
+@pytest.mark.parametrize("placed", [False, True])
+@pytest.mark.parametrize("kind", [{"dtype": "uint16", "nodata": 0}, {"dtype": "float32", "shape": (3, 40, 60)}])
+def test_a_window_of_a_nitf_has_its_pixels_and_the_camera_that_the_file_holds(
+    kind, placed, middle, offset, tmp_path: Path
+) -> None:
+    """Also of an image that is placed on a map: the RPC alone says where a NITF is; nothing is left beside it. An
+    RPC's middle may lie before the part, where the format's numbers have no sign.
+    """
+    rpc = replace(
+        make_rpc(), image_offset=middle, image_scale=[1010.0, 980.0], ground_offset=[5.4, 43.2, 167.0],
+        ground_scale=[0.0062, 0.0045, 143.0],
+    )  # fmt: skip
+    rpc = replace(rpc, coeffs=np.round(rpc.coeffs, 6))
+    turned = {"crs": 4326, "transform": rasterio.Affine(1.1e-5, 3e-6, 5.0, -2e-6, -0.9e-5, 44.0)}
+    image = write_image(tmp_path / "a.tif", **kind, **(turned if placed else {}))
+    crop = write_crop(rpc, image, tmp_path / "b.NTF", (7, 5, 30, 20))
+    assert crop == read_rpc(tmp_path / "b.NTF")
+    np.testing.assert_array_equal(crop.image_offset, offset)
+    assert crop.off(rpc.crop(7, 5)).max() < 2e-3
+    np.testing.assert_array_equal(pixels(tmp_path / "b.NTF"), pixels(image)[:, 5:25, 7:37])
+    with open_raster(tmp_path / "b.NTF") as made:
+        assert made.driver == "NITF"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.tif", "b.NTF"]
+
+
+def test_a_window_whose_rpc_a_nitf_cannot_hold_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
+    image = write_image(tmp_path / "a.tif")
+    with pytest.raises(RpcFormatError, match="does not fit"):
+        write_crop(replace(make_rpc(), ground_offset=[5.4, 43.2, 123456.0]), image, tmp_path / "b.ntf", (7, 5, 30, 20))
+    assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
+
+
 def test_no_writer_replaces_a_file_unless_it_is_told_to(tmp_path: Path) -> None:
     rpc, image = make_rpc(), write_image(tmp_path / "a.tif", dtype="uint8")
     whole = replace(
@@ -509,7 +542,7 @@ def test_a_record_of_a_nitf_holds_nine_powers_of_ten_and_whole_pixels() -> None:
     for change, ok in (
         ({"image_offset": [99999.0, 999999.0]}, True),
         ({"image_offset": [100000.0, 0.0]}, False),
-        ({"image_offset": [-1.0, 0.0]}, False),
+        ({"image_offset": [-1.0, 0.0]}, True),
         ({"ground_offset": [-179.0, -89.0, -9999.0]}, True),
         ({"ground_offset": [5.0, 43.0, 10000.0]}, False),
     ):

@@ -203,8 +203,9 @@ def test_alos_columns_are_read(tmp_path):
 
 def test_a_nitf_record_has_1041_characters_and_says_when_a_number_does_not_fit(rpc):
     assert len(nitf_record(rpc)) == 1041
-    with pytest.raises(RpcFormatError, match=r"LINE_OFF = -49\.3 does not fit"):
-        nitf_record(rpc.crop(0, 1000))
+    assert nitf_record(rpc.crop(0, 1000))[15:26] == "00000000999"  # line, sample: no sign, so the first counts from 0
+    with pytest.raises(RpcFormatError, match=r"LINE_OFF = 1\.00095e\+06 does not fit"):
+        nitf_record(rpc.crop(0, -1_000_000))
 
 
 @pytest.mark.parametrize(
