@@ -113,7 +113,12 @@ class Verbs(click.Group):
 @click.group(cls=Verbs, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(__version__, message="barpc %(version)s")
 @click.option("-v", "--verbose", count=True, help="Log stages with their seconds (-vv: everything).")
-@click.option("-q", "--quiet", is_flag=True, help="No progress, no log: results and errors only.")
+@click.option(
+    "-q",
+    "--quiet",
+    is_flag=True,
+    help="Errors only, and numbers or JSON that were asked for: no verdict, no progress, no log.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Results as JSON on stdout.")
 @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
 @click.pass_context

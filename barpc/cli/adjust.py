@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from barpc.cli.flags import ADJUSTMENT, MATCH, RUN, TIE, Grouped, expanded, image_paths, paper, run_options, with_flags
-from barpc.cli.terminal import echo, executor_for, output_width, print_summary, progress_told, tell_gate, wants_json
+from barpc.cli.terminal import (
+    echo,
+    executor_for,
+    output_width,
+    print_summary,
+    progress_told,
+    tell,
+    tell_gate,
+    wants_json,
+)
 
 if TYPE_CHECKING:
     from barpc.pipeline import AdjustResult
@@ -108,13 +117,13 @@ def _run(
 ) -> int:
     """Run an entry of the pipeline with what the command line says and what the verb has `fixed`, and tell."""
     options = replace(run_options(flags, flags["options_file"]), **(fixed or {}))
-    paths = _given(images, flags)
+    paths = _given(images, flags, options.keep_going)
     with executor_for(flags["jobs"]) as executor, progress_told(obj["quiet"], obj["verbose"]) as progress:
         return _tell(obj, work(paths, options=options, executor=executor, progress=progress, **where))
 
 
-def _given(images: tuple[str, ...], flags: Mapping[str, Any]) -> list[str]:
-    return expanded(image_paths(images, flags["image_list"]))
+def _given(images: tuple[str, ...], flags: Mapping[str, Any], keep_going: bool = False) -> list[str]:
+    return expanded(image_paths(images, flags["image_list"], keep_going))
 
 
 def _tell(obj: Mapping[str, Any], result: AdjustResult) -> int:
@@ -126,7 +135,8 @@ def _tell(obj: Mapping[str, Any], result: AdjustResult) -> int:
         return 0
     # on the screen: every reason once
     said = output_width() is not None and not (wants_json() or obj["quiet"])
-    return tell_gate(result.record.headline, [] if said else list(result.record.reasons))
+    reasons = [] if said else list(result.record.reasons)
+    return tell_gate("" if obj["quiet"] and reasons else result.record.headline, reasons)
 
 
 def _compare(images: list[str], against: Path) -> int:
@@ -145,6 +155,6 @@ def _compare(images: list[str], against: Path) -> int:
         echo(json.dumps(rows, indent=1))
     else:
         for path, compared, px in found:
-            echo(f"{path}  {compared}  max {px:.3g} px")
+            tell(f"{path}  {compared}  max {px:.3g} px")
     off = [f"{path}: {px:.3g} px." for path, _, px in found if not px <= TOLERANCE]
     return tell_gate(f"{len(off)} of {len(found)} RPCs differ.", off) if off else 0

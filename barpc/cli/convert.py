@@ -20,7 +20,7 @@ from barpc.cameras import open_camera, split_spec
 from barpc.cli.flags import expanded
 from barpc.cli.moving import moved, read_move, refitted
 from barpc.cli.project import altitude_of, exchanged, with_heights
-from barpc.cli.terminal import echo, say, tell_gate, wants_json
+from barpc.cli.terminal import remark, tell, tell_gate, wants_json
 from barpc.fit import FitOptions
 from barpc.fit.points import Sample, widened
 from barpc.pipeline.handoff import TOLERANCE, Reading, unverified, verify, verify_grid
@@ -33,6 +33,7 @@ from barpc.rpcio import (
     find_rpc,
     hidden_by,
     read_rpc,
+    row_of,
     shadows,
     sidecars,
     write_camera,
@@ -88,7 +89,7 @@ def convert(files: tuple[str, ...], out_dir: str | None, **flags: Any) -> int:
 
     TARGET ends as --rpc-format says (xml is Maxar's, json rpcm's); .vrt, .tif and .ntf carry the image, too;
     _grid.tif is a localisation grid. A SOURCE that is a grid goes into an RPC where one holds it. With --window,
-    --bbox or --aoi the GeoTIFF TARGET is a part of the image, with the RPC of exactly that part. With -o images get
+    --bbox or --aoi the .tif or .ntf is a part of the image, with the RPC of exactly that part. With -o images get
     their RPCs, or those of --rpc, in a new folder; every file is then opened as GDAL, rpcm and others do, and what
     lies beside an image and would hide an RPC put into it is named. Images stay as they are. --move and --transform
     bring an alignment of a DEM or a point cloud back into the cameras that it was made with.
@@ -149,11 +150,13 @@ def _to_target(files: tuple[str, ...], flags: Mapping[str, Any]) -> int:
     check_target(target, [image, camera.path], overwrite, None if cut else camera.rpc)
     if not cut:
         return _copy(camera, image, target, flags["formats"], overwrite)
+    if row_of(target) not in (CARRIERS["copy"], CARRIERS["nitf"]):
+        ends = ", ".join((*CARRIERS["copy"].suffixes, *CARRIERS["nitf"].suffixes))
+        raise click.UsageError(f"{target}: a part of an image goes into a file whose name ends in {ends}")
     window = _window(flags)(camera, image)
     write_crop(camera.rpc, image, target, window, overwrite=overwrite)
     text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
-    echo(json.dumps({"path": target, "window": window}) if wants_json() else text)
-    return 0
+    return _read_back(camera.rpc.crop(*window[:2]), target, {"path": target, "window": window}, text)
 
 
 def _copy(camera: Camera, image: Path, target: str, formats: str | None, overwrite: bool) -> int:
@@ -162,12 +165,16 @@ def _copy(camera: Camera, image: Path, target: str, formats: str | None, overwri
         write_camera(camera.rpc, target, image, overwrite=overwrite)
     else:
         write_rpc(camera.rpc, target, format=formats, overwrite=overwrite)
-    lost = float(camera.rpc.off(read_rpc(target)).max())
-    row = {"source": str(camera.path), "format": camera.format, "target": target, "max_px": lost}
-    text = f"{camera.path} ({camera.format}) -> {target} (read back: {lost:.1g} px)"
-    echo(json.dumps(row) if wants_json() else text)
-    for note in () if wants_json() else camera.notes:
-        say(note)
+    for line in () if wants_json() else camera.notes:
+        remark(line)
+    row = {"source": str(camera.path), "format": camera.format, "target": target}
+    return _read_back(camera.rpc, target, row, f"{camera.path} ({camera.format}) -> {target}")
+
+
+def _read_back(rpc: RPC, target: str, row: Mapping[str, object], text: str) -> int:
+    """Say what was written, and how far off a file's RPC is when it is read back; the exit code."""
+    lost = float(rpc.off(read_rpc(target)).max())
+    tell(json.dumps({**row, "max_px": lost}) if wants_json() else f"{text} (read back: {lost:.1g} px)")
     if lost <= TOLERANCE:
         return 0
     return tell_gate(
@@ -207,7 +214,7 @@ def check_target(target: str | Path, sources: Sequence[str | Path], overwrite: b
                 f"{target}: would be read in place of the RPC that {image} has; give another folder or name, or "
                 "--overwrite if that is meant"
             )
-        say(f"{target} is read in place of the RPC that {image} had")
+        remark(f"{target} is read in place of the RPC that {image} had")
 
 
 # --- windows -----------------------------------------------------------------------------------------------
@@ -246,7 +253,7 @@ def window_of(camera: Camera, path: Path, bbox: Box, alt: float | None, dem: Dem
         missed = exchanged(camera, np.nan_to_num(ground)) or f"does not meet {camera.path}"
         raise click.UsageError(f"--bbox {bbox}: {missed} (ground at {np.median(level):g} m)")
     if (kept := float(np.prod((high - low) / (whole[1] - whole[0])))) < 1.0:
-        say(f"{path}: --bbox reaches beyond the image; {100 * (1 - kept):.2g} % of it is cut off")
+        remark(f"{path}: --bbox reaches beyond the image; {100 * (1 - kept):.2g} % of it is cut off")
     (col, row), (width, height) = low.astype(int).tolist(), (high - low).astype(int).tolist()
     return col, row, width, height
 
@@ -262,7 +269,7 @@ def windows_of(
         except click.UsageError as error:
             if len(images) == 1:
                 raise
-            say(f"{path} is left out: {error.message}")
+            remark(f"{path} is left out: {error.message}")
     if not found:
         raise click.UsageError("no image shows what is to be cut out")
     return found
@@ -318,7 +325,7 @@ def _told(readings: list[Reading], reasons: Sequence[str] = (), notes: Sequence[
     """Say what readers of the files see; return the exit code."""
     _tell(readings)
     for sentence in notes:
-        say(sentence)
+        remark(sentence)
     off = [reading for reading in readings if not reading.passed]
     wrong = (f"{r.path}: {r.consumer} {r.note or f'reads it {r.max_error:.1e} px off'}." for r in off)
     reasons = [*reasons, *wrong]
@@ -329,16 +336,16 @@ def _tell(readings: list[Reading]) -> None:
     rows = [(str(r.path), r.consumer, None if r.note else r.max_error, r.note) for r in readings]
     if wants_json():
         keys = ("path", "consumer", "max_px", "note")
-        echo(json.dumps([dict(zip(keys, row, strict=True)) for row in rows]))
+        tell(json.dumps([dict(zip(keys, row, strict=True)) for row in rows]))
         return
     for path, consumer, error, note in rows:
-        echo(f"{path}: {consumer} {note or f'{error:.1e} px'}")
+        tell(f"{path}: {consumer} {note or f'{error:.1e} px'}")
 
 
 def _shadow_reasons(image: Path, written: list[Path]) -> list[str]:
     """Return what lies beside a new file and hides its RPC; what lies beside the image is only said."""
     for sidecar in shadows(image):
-        say(f"beside {image}: {sidecar.path.name} hides an RPC put into the image")
+        remark(f"beside {image}: {sidecar.path.name} hides an RPC put into the image")
     hiding = [sidecar.path for sidecar in shadows(written[0]) if sidecar.path not in written]
     return [f"{path} hides the RPC of {written[0]}: move it away." for path in hiding]
 

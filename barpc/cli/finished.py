@@ -14,7 +14,7 @@ import click
 
 from barpc.base.options import DsmOptions, declared
 from barpc.cli.flags import Function, expanded, jobs_option
-from barpc.cli.terminal import echo, executor_for, print_comparison, progress_told, say, tell_gate, wants_json
+from barpc.cli.terminal import echo, executor_for, print_comparison, progress_told, remark, tell, tell_gate, wants_json
 
 if TYPE_CHECKING:
     from barpc.dsm import Surface
@@ -42,7 +42,7 @@ def report(run_dir: str, other: str | None) -> int:
             raise click.UsageError("--json goes with two runs; the summary.json of one is there already")
         from barpc.pipeline.outputs import remake_report
 
-        echo(remake_report(run_dir))
+        tell(remake_report(run_dir))
         return 0
     from barpc.report.compare import compare_runs
 
@@ -86,9 +86,9 @@ def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | N
         echo(json.dumps([str(path) for path in paths]))
         return 0
     for path in paths:
-        echo(path)
+        tell(path)
     if target != "points" and any(Path(run_dir).glob("*.vrt")):  # (points name no image)
-        say("the images stay where they are: move them together with both folders, or adjust with --images copy")
+        remark("the images stay where they are: move them together with both folders, or adjust with --images copy")
     return 0
 
 
@@ -120,11 +120,11 @@ def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
     else:
         for one in found:
             if one.now != SAME or one.kind == "root":
-                echo(f"{one.kind} {one.file}: {one.now}" + (f", {one.note}" if one.note else ""))
+                tell(f"{one.kind} {one.file}: {one.now}" + (f", {one.note}" if one.note else ""))
         counts = Counter((one.kind, one.now) for one in found)
         for kind in ("input", "output", "camera"):
             told = ", ".join(f"{count} {now}" for (of, now), count in counts.items() if of == kind)
-            echo(f"{kind}s: {told or 'none'}")
+            tell(f"{kind}s: {told or 'none'}")
     if not wrong:
         return 0
     return tell_gate("the run is not what it was:", list(dict.fromkeys(f"{one.file} {one.now}" for one in wrong)))
@@ -158,9 +158,9 @@ def dsm(obj: dict[str, Any], /, source: tuple[str, ...], out: str, jobs: int | s
     r"""Make a first surface model (DSM) of a finished run, or of images with the cameras that come with them.
 
     The best pairs of images are matched pixel by pixel, matches are intersected with the corrected cameras, and every
-    cell of a map gets the median of its pairs. The file, a Cloud-Optimised GeoTIFF, has five bands: height above the
-    ellipsoid, number of pairs, their disagreement, and the height's standard deviation by matching and by cameras; its
-    tag SIGMA_SHARED_BY_ALL_CELLS_M says how well the height of the whole is known. Only a run knows its cameras'.
+    cell of a map gets the median of the pairs that agree. The file, a Cloud-Optimised GeoTIFF, has five bands: height
+    above the ellipsoid, number of pairs, their disagreement, and the height's standard deviation by matching and by
+    cameras; its tag SIGMA_SHARED_BY_ALL_CELLS_M says how well the height of the whole is known. Only a run knows its cameras'.
 
     The run's report.html then shows a window of the ground by the delivered and by the corrected cameras.
 

@@ -11,7 +11,7 @@ import click
 
 from barpc.base.options import GEOID_HELP
 from barpc.cli.flags import flag, paper, run_options
-from barpc.cli.terminal import echo, say, tell_gate, wants_json
+from barpc.cli.terminal import echo, remark, tell_gate, wants_json
 
 if TYPE_CHECKING:
     from barpc.fit import RpcFit
@@ -118,7 +118,7 @@ def _fit(source: str, output: str | None, flags: dict[str, Any]) -> tuple[RpcFit
         if not fit.verdict(options.tolerance):
             return fit, options.tolerance
         low, high = alt_range
-        say(f"no RPC holds all ground on Earth here: fitted over the scene's altitudes, {low:g} to {high:g} m")
+        remark(f"no RPC holds all ground on Earth here: fitted over the scene's altitudes, {low:g} to {high:g} m")
     fit = fit_rpc(camera.model, camera.extent, alt_range, options=options, strict=False)
     return fit, options.tolerance
 

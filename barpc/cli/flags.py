@@ -166,7 +166,11 @@ jobs_option = click.option(
     help="Worker processes, or a dask.distributed cluster (tcp://host:8786).  [default: 1]",
 )
 _RUN_OPTIONS = (
-    click.option("--image-list", metavar="FILE", help="More image paths from a file, one a line."),
+    click.option(
+        "--image-list",
+        metavar="FILE",
+        help="More image paths from a file, one a line, relative to its folder.",
+    ),
     click.option("--options", "options_file", metavar="FILE", help="Options from a TOML file; flags win."),
     jobs_option,
 )
@@ -209,13 +213,24 @@ def expanded(specs: Sequence[str]) -> list[str]:
     return found
 
 
-def image_paths(images: tuple[str, ...], image_list: str | None) -> list[str]:
-    """Return images of the command line, then those of a list file (blank lines and # comments are skipped)."""
+def image_paths(images: tuple[str, ...], image_list: str | None, keep_going: bool = False) -> list[str]:
+    """Return images of the command line, then those of a list file (blank lines and # comments are skipped).
+
+    Relative paths of a list count from its folder; InputError for a line whose file is missing, unless `keep_going`.
+    """
     paths = list(images)
-    if image_list is not None:
-        folder, lines = Path(image_list).parent, read_names(image_list, "a list of images")
-        named = [line.strip() for line in lines if line.strip() and not line.startswith("#")]
-        paths += [name if is_url(name) else str(folder / name) for name in named]
+    if image_list is None:
+        return paths
+    folder = Path(image_list).parent
+    for number, line in enumerate(read_names(image_list, "a list of images"), start=1):
+        name = line.strip()
+        if not name or line.startswith("#"):
+            continue
+        paths.append(name if is_url(name) else str(folder / name))
+        file = name_of(paths[-1])
+        if not (keep_going or is_url(name) or os.path.lexists(file) or glob.glob(file)):  # noqa: PTH207
+            where = f"relative paths count from the list's folder, {folder.absolute()}"
+            raise InputError(f"{image_list}, line {number}: {file}: no such file; {where}")
     return paths
 
 

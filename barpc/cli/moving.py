@@ -12,7 +12,7 @@ import numpy as np
 
 from barpc.base.errors import BarpcWarning, FitError, InputError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.cli.terminal import say
+from barpc.cli.terminal import remark
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.pointio.tables import read_transform
 from barpc.rpcio import CARRIERS
@@ -133,7 +133,7 @@ def refitted(
 
 
 def _told(camera: Camera, fit: RpcFit, done: str) -> Camera:
-    say(f"{camera.path}: {done} to {float(fit.max_ckp.max()):.1g} px")
+    remark(f"{camera.path}: {done} to {float(fit.max_ckp.max()):.1g} px")
     return camera
 
 
@@ -142,10 +142,10 @@ def _tell(matrix: Array, middle: Array) -> None:
     at, stretch = ground_from_ecef(middle), np.linalg.svd(matrix[:, :3], compute_uv=False)
     rounding = float((stretch[0] - stretch[-1]) / stretch.mean() * np.linalg.norm(middle))
     if rounding > _TOLD:
-        say(f"the matrix is written with few digits: it places the ground to some {rounding:.2g} m only")
+        remark(f"the matrix is written with few digits: it places the ground to some {rounding:.2g} m only")
     east, north, up = enu_basis(at) @ (matrix @ np.append(middle, 1.0) - middle)
     scale, place = float(stretch.mean()), f"lon {at[0]:.7f}, lat {at[1]:.7f}"
     turn = float(np.arccos(np.clip((np.trace(matrix[:, :3]) / scale - 1.0) / 2.0, -1.0, 1.0)))
     more = f", turned by {1e6 * turn:.3g} urad, scaled by {scale:.9g}"
     more *= bool((matrix[:, :3] != np.eye(3)).any())
-    say(f"the ground moves by {east:+.3f} m east, {north:+.3f} m north, {up:+.3f} m up at its middle, {place}{more}")
+    remark(f"the ground moves by {east:+.3f} m east, {north:+.3f} m north, {up:+.3f} m up at its middle, {place}{more}")

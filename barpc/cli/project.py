@@ -20,7 +20,7 @@ from barpc.base.options import GEOID_HELP
 from barpc.base.remote import Place
 from barpc.base.sidefile import TABLE, opened_text
 from barpc.cameras import open_camera, split_spec
-from barpc.cli.terminal import echo, say, tell_gate, wants_json
+from barpc.cli.terminal import echo, remark, tell_gate, wants_json
 from barpc.rasters.dem import Dem, localize_on_terrain
 from barpc.scene import BoolArray, Camera
 from barpc.sensor import geometry
@@ -71,7 +71,7 @@ def altitude_of(camera: Camera, image: Place, given: float | None = None) -> flo
         known = _written_in(path.absolute().parent).get(path.name) if isinstance(path, Path) else None
         if known is not None:
             return known
-    say(f"{image}: {_unknown(camera)}; give --alt or --dem")
+    remark(f"{image}: {_unknown(camera)}; give --alt or --dem")
     return camera.altitude
 
 

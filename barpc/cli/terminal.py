@@ -50,8 +50,13 @@ _COLORS = {"good": "green", "look": "yellow", "bad": "red"}
 
 def wants_json() -> bool:
     """Return whether results go to stdout as JSON: `--json`, before or behind the verb."""
+    return _general("as_json")
+
+
+def _general(name: str) -> bool:
+    """Return whether a flag was given that every verb has."""
     context = click.get_current_context(silent=True)
-    return context is not None and bool(context.find_root().params.get("as_json"))
+    return context is not None and bool(context.find_root().params.get(name))
 
 
 def echo(text: object = "", *, err: bool = False, nl: bool = True, **style: Any) -> None:
@@ -62,6 +67,18 @@ def echo(text: object = "", *, err: bool = False, nl: bool = True, **style: Any)
 def say(message: str) -> None:
     """Print one line on stderr, of this command."""
     echo(f"barpc: {' '.join(message.split())}", err=True)
+
+
+def remark(message: str) -> None:
+    """Print one line on stderr that is no error; with -q nothing."""
+    if not _general("quiet"):
+        say(message)
+
+
+def tell(text: object) -> None:
+    """Print what a command has done, or its JSON, on stdout; with -q the JSON alone."""
+    if wants_json() or not _general("quiet"):
+        echo(text)
 
 
 def tell_gate(headline: str, reasons: list[str]) -> int:

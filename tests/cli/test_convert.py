@@ -19,6 +19,7 @@ from barpc.cli import convert as module
 from barpc.cli.convert import _check, _shadow_reasons, _tell, _window, box_of, check_target, window_of
 from barpc.fit.points import Sample
 from barpc.pipeline.handoff import Reading
+from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.scene import Camera
 from tests.cli.test_main import run
@@ -309,12 +310,34 @@ def test_a_window_is_cut_and_told(image: Path, tmp_path: Path, capsys: pytest.Ca
     words = ("--window", "50", "60", "100", "80")
     target = str(tmp_path / "w.tif")
     assert run("convert", str(image), target, *words) == 0
-    assert capsys.readouterr().out == f"{target}: col 50, row 60, 100 x 80 px\n"
+    said = capsys.readouterr().out
+    assert said.startswith(f"{target}: col 50, row 60, 100 x 80 px (read back: ")
     np.testing.assert_allclose(read_rpc(target).image_offset, read_rpc(image).image_offset - [50, 60], atol=1e-9)
     assert run("convert", str(image), target, *words) == 1
     assert run("convert", str(image), target, *words, "--overwrite", "--json") == 0
     found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found.pop("max_px") < 1e-9
     assert found == {"path": target, "window": [50, 60, 100, 80]}
+
+
+@pytest.mark.parametrize("name", ["w.ntf", "W.NTF", "w.nitf", "w.nsf"])
+def test_a_window_under_a_name_of_nitf_is_one_and_what_its_digits_lose_is_said(name, image, tmp_path, capsys):
+    """Of an RPC that was not fitted for it tenths of a pixel, as of a whole image."""
+    target = tmp_path / name
+    assert run("convert", str(image), str(target), "--window", "50", "60", "100", "80", "--json") == 3
+    said = capsys.readouterr()
+    assert 1e-6 < json.loads(said.out)["max_px"] < 2.0
+    assert "px off: too few digits for this RPC ('barpc fit'" in said.err
+    with open_raster(target) as part, open_raster(image) as whole:
+        assert part.driver == "NITF"
+        np.testing.assert_array_equal(part.read(), whole.read()[:, 60:140, 50:150])
+
+
+@pytest.mark.parametrize("name", ["w.vrt", "w.png", "w_RPC.TXT", "w"])
+def test_a_window_goes_into_no_file_whose_name_says_another_kind(name, image, tmp_path, capsys):
+    assert run("convert", str(image), str(tmp_path / name), "--window", "50", "60", "100", "80") == 2
+    assert "ends in .tif, .tiff, .ntf, .nitf, .nsf" in capsys.readouterr().err
+    assert not (tmp_path / name).exists()
 
 
 # --- grids ------------------------------------------------------------------------------------------------

@@ -130,7 +130,7 @@ def test_jobs_are_a_number_or_an_address(text: str, jobs: Any) -> None:
 def test_a_list_of_images_is_read_behind_those_of_the_command_line(tmp_path: Path) -> None:
     path = tmp_path / "list.txt"
     path.write_text("# two images\n\n  a.tif \nhttps://host/b.tif\n/c.tif\n   \n")
-    assert image_paths(("x.tif",), str(path)) == [
+    assert image_paths(("x.tif",), str(path), keep_going=True) == [
         "x.tif",
         str(tmp_path / "a.tif"),
         "https://host/b.tif",
@@ -138,6 +138,32 @@ def test_a_list_of_images_is_read_behind_those_of_the_command_line(tmp_path: Pat
     ]
     assert image_paths(("x.tif", "y.tif"), None) == ["x.tif", "y.tif"]
     assert image_paths((), None) == []
+
+
+def test_paths_of_a_list_count_from_its_folder_and_a_missing_one_is_named_with_its_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "lists").mkdir()
+    (tmp_path / "b.tif").touch()  # of the same name in the current folder: not meant
+    for name in ("a.tif", "d,e.tif"):
+        (tmp_path / "lists" / name).touch()
+    monkeypatch.chdir(tmp_path)
+    listed = tmp_path / "lists" / "l.txt"
+    listed.write_text(f"# x\na.tif\n{tmp_path}/b.tif\n../b.tif,band=2\nd,e.tif,band=1\n*.tif\n")
+    assert image_paths((), "lists/l.txt") == [
+        "lists/a.tif",
+        f"{tmp_path}/b.tif",
+        "lists/../b.tif,band=2",
+        "lists/d,e.tif,band=1",
+        "lists/*.tif",
+    ]
+    for missing in ("b.tif", "b.tif,band=2", "*.jp2"):
+        listed.write_text(f"a.tif\n\n{missing}\n")
+        with pytest.raises(InputError) as error:
+            image_paths((), "lists/l.txt")
+        said = f"lists/l.txt, line 3: lists/{missing.removesuffix(',band=2')}: no such file"
+        assert str(error.value) == f"{said}; relative paths count from the list's folder, {tmp_path / 'lists'}"
+        assert image_paths((), "lists/l.txt", keep_going=True) == ["lists/a.tif", f"lists/{missing}"]
 
 
 def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) -> None:

@@ -242,7 +242,8 @@ def test_a_result_is_printed_once_and_its_exit_code_says_whether_it_passes(
     assert capsys.readouterr() == (out, "")
     result.passed = False
     assert _tell({"quiet": quiet}, result) == 3
-    assert capsys.readouterr() == (out, "barpc: exit code 3: All well. One.\n")
+    headline = "" if quiet else "All well. "
+    assert capsys.readouterr() == (out, f"barpc: exit code 3: {headline}One.\n")
 
 
 def test_match_stops_after_matching_and_check_asks_another_entry(monkeypatch: pytest.MonkeyPatch) -> None:

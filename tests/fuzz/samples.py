@@ -500,7 +500,7 @@ SAMPLES: dict[str, Sample] = {
     ),
     "images": Sample(
         "list.txt",
-        lambda path: image_paths((), str(path)),
+        lambda path: image_paths((), str(path), keep_going=True),
         lambda: b"left.tif\n# x\nright.tif\n",
         (mutate_text,),
     ),
