@@ -160,7 +160,8 @@ def dsm(obj: dict[str, Any], /, source: tuple[str, ...], out: str, jobs: int | s
     The best pairs of images are matched pixel by pixel, matches are intersected with the corrected cameras, and every
     cell of a map gets the median of the pairs that agree. The file, a Cloud-Optimised GeoTIFF, has five bands: height
     above the ellipsoid, number of pairs, their disagreement, and the height's standard deviation by matching and by
-    cameras; its tag SIGMA_SHARED_BY_ALL_CELLS_M says how well the height of the whole is known. Only a run knows its cameras'.
+    cameras; its tag SIGMA_SHARED_BY_ALL_CELLS_M says how well the height of the whole is known. Only a run knows its
+    cameras'.
 
     The run's report.html then shows a window of the ground by the delivered and by the corrected cameras.
 
