@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import maximum_filter
 
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray
@@ -56,8 +57,9 @@ def consensus(heights: F32, metres: F32) -> BoolArray:
     first = agree.argmax(axis=0)
     taken: BoolArray = np.abs(level - np.take_along_axis(level, first[None], axis=0)) <= within[:, first]
     rival, single = known & (agree == agree.max(axis=0)), known.sum(axis=0) == 1
-    asked = (rival & ~taken).any(axis=0) | single
-    sure = np.where(asked, np.nan, median(np.where(taken, level, np.nan)))
+    tied = (rival & ~taken).any(axis=0)
+    sure = np.where(tied | single, np.nan, median(np.where(taken, level, np.nan)))
+    asked = tied | (single & maximum_filter(np.isfinite(sure), 2 * REACH + 1))  # where nobody is near none refuses
     rival, level, single = rival[:, asked], level[:, asked], single[asked]
     votes, witnesses = _votes(sure, np.where(rival, level, np.nan), metres, np.nonzero(asked))
     votes[~rival] = -1
