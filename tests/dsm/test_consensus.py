@@ -127,8 +127,10 @@ def test_heights_a_pixel_of_disparity_apart_are_one_surface_of_the_coarser_pair(
 def test_where_neighbours_know_nothing_or_as_much_of_both_a_contradiction_is_void():
     cells = np.full((2, 40, 40), np.nan, np.float32)
     cells[:, 5, 5] = 0.0, 10.0
-    cells[:, 20:, :] = 0.0
+    cells[:, 18:, :] = 0.0  # 13 cells away
     assert not consensus(cells, PIXEL[:2])[:, 5, 5].any()
+    cells[:, 17, 5] = 0.0
+    assert consensus(cells, PIXEL[:2])[:, 5, 5].tolist() == [True, False]
     cells = np.zeros((2, 41, 41), np.float32)
     cells[:, :, 21:] = 10.0  # a roof, and between it and the ground a column in which the pairs contradict
     cells[1, :, 20] = 10.0
@@ -158,6 +160,14 @@ def test_a_single_pair_is_asked_only_where_it_is_surrounded_and_a_slope_at_a_bor
     alone = np.concatenate([alone, np.full_like(alone, np.nan)])
     assert consensus(alone, PIXEL[:2])[0].all()
     assert not consensus(alone, PIXEL[:2])[1].any()
+
+
+def test_beyond_a_straight_border_of_the_others_two_cells_are_asked_and_no_more():
+    cells = np.zeros((2, 60, 60), np.float32)
+    cells[1, :30] = np.nan
+    cells[0, 20:30] = 9.0  # a wall, as far as the others could tell
+    kept = consensus(cells, PIXEL[:2])[0, :, 15:-15].all(axis=1)
+    assert kept.tolist() == [True] * 28 + [False] * 2 + [True] * 30
 
 
 def test_the_median_of_what_is_known_is_numpys():
