@@ -7,10 +7,12 @@ delivered:
   against the same of heights minus another tool's DSM (`--against`, of s2p or CARS), with the share of its cells
   CPU     seconds a million pixels of the smaller image of a pair, and the peak memory [MB]
 
-python benchmarks/dsm.py RUN... [--against DSM] [--rendered SIDE [--kinds]]
+python benchmarks/dsm.py RUN... [--against DSM] [--rendered SIDE [--kinds]] [--triplets SIDE]
 
 `--rendered` makes images of SIDE px of a scene whose ground is known: nmad is of heights minus the truth, and `within`
 the share of cells within one sigma. `--kinds`: of scenes that differ in slopes, buildings, noise, pixel and dates.
+`--triplets`: of three views of each kind the share of the cells that are more than 10 pixels off all ground within a
+cell (5 m of 0.5 m), by the median of all pairs and by that of those that agree; and of the cells that are void for it.
 """
 
 from __future__ import annotations
@@ -23,17 +25,20 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import rasterio
 from rasterio.warp import Resampling, reproject
 from rasterio.windows import Window
+from scipy.ndimage import maximum_filter, minimum_filter
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from barpc.base.options import DsmOptions
-from barpc.dsm import NoSurfaceError, make_dsm
-from barpc.dsm.stereo import Tile, gathered
+from barpc.dsm import NoSurfaceError, make_dsm, stereo
+from barpc.dsm.stereo import Tile, block_of_images, gathered, surface_tile
+from barpc.dsm.surface import Grid
 from barpc.export.shots import read_scene
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.files import image_file
@@ -49,6 +54,7 @@ KINDS: dict[str, dict[str, object]] = {
     "clean": {"relief": 30.0, "snr": 400.0, "seed": 8},
     "bare": {"buildings": 0.0, "seed": 10},
     "coarse": {"gsd": 2.0, "relief": 200.0, "buildings": 1.0, "seed": 12},
+    "dark": {"relief": 30.0, "snr": 8.0, "seed": 17},
     "two dates": {"relief": 30.0, "sun_azimuth": (150.0, 190.0), "change": 0.3, "seed": 13},
 }
 """Kinds of scenes, by what differs from `tests.scenes.ImageOptions`."""
@@ -96,10 +102,10 @@ def written(scene: Scene, index: int, path: Path) -> np.ndarray:
 
 
 class Ground:
-    """A pair of rendered images of a kind with exact cameras, in a folder, and the ground that they show."""
+    """Rendered images of a kind with exact cameras, in a folder, and the ground that they show."""
 
-    def __init__(self, side: int, kind: str, folder: Path) -> None:
-        scene = Scene(ImageOptions(views=2, size=(side, side), **KINDS[kind]))
+    def __init__(self, side: int, kind: str, folder: Path, views: int = 2) -> None:
+        scene = Scene(ImageOptions(views=views, size=(side, side), **KINDS[kind]))
         self.shots, self.paths = scene.shots, [str(folder / f"{shot.name}.tif") for shot in scene.shots]
         self.shown = [written(scene, i, Path(path)) for i, path in enumerate(self.paths)]
         edges = [(np.nanmin(part), np.nanmax(part)) for one in self.shown for part in np.array_split(one, 8)]
@@ -149,6 +155,24 @@ def rendered(side: int, kind: str = "usual") -> dict[str, object]:
         return found | {"peak": peak / 1024, "tiles": len(windows)}
 
 
+def triplet(side: int, kind: str) -> tuple[float, float, float]:
+    """Shares of wrong cells by the median of all pairs and of those that agree, and of the cells that are void."""
+    with tempfile.TemporaryDirectory() as folder:
+        made = Ground(side, kind, Path(folder), views=3)
+        block, found = block_of_images(made.paths, made.alt), []
+        for _, tile, (group,) in Grid(block, DsmOptions(alt=made.alt)).tiles:
+            truth, pairs = made.truth(tile), [(block.views[i], block.views[j]) for i, j in group]
+            low = minimum_filter(np.where(np.isfinite(truth), truth, np.inf), 3) - 5.0 * tile.step
+            high = maximum_filter(np.where(np.isfinite(truth), truth, -np.inf), 3) + 5.0 * tile.step
+            agreeing = surface_tile(pairs, tile, 1)[0]
+            with patch.object(stereo, "consensus", lambda heights, _: np.isfinite(heights)):
+                every = surface_tile(pairs, tile, 1)[0]
+            found += [(one[at], low[at], high[at]) for one in (every, agreeing) for at in [np.isfinite(one + truth)]]
+        both = [[np.concatenate(part) for part in zip(*found[k::2], strict=True)] for k in range(2)]
+        wrong = [float(np.mean((one < low) | (one > high))) for one, low, high in both]
+        return wrong[0], wrong[1], 1.0 - len(both[1][0]) / len(both[0][0])
+
+
 def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -156,6 +180,7 @@ def main() -> None:
     parser.add_argument("--against", type=Path)
     parser.add_argument("--rendered", type=int)
     parser.add_argument("--kinds", action="store_true")
+    parser.add_argument("--triplets", type=int)
     arguments = parser.parse_args()
     for run in arguments.runs:
         views = json.loads((run / "summary.json").read_text())["views"]
@@ -176,6 +201,10 @@ def main() -> None:
                 f"{run.name:12}{name:11}{row['pairs']} pairs {row['cells']:8} cells {row['share']:6.1%} matched "
                 f"nmad {row['nmad']:.2f} m sigma {row['sigma']:.2f} m {cost:5.1f} CPU s/Mpx {row['peak']:.0f} MB{more}"
             )
+    for kind in KINDS if arguments.triplets else ():
+        every, agreeing, lost = triplet(arguments.triplets, kind)
+        words = f"wrong {every:.2%} by all pairs, {agreeing:.2%} by those that agree, {lost:.2%} void"
+        print(f"triplet {arguments.triplets} px, {kind}: {words}", flush=True)
     for kind in (KINDS if arguments.kinds else ["usual"]) if arguments.rendered else ():
         row, area = rendered(arguments.rendered, kind), arguments.rendered**2 / 1e6
         print(
