@@ -7,6 +7,7 @@ fsspec knows the stores' credentials and addresses as every tool does.
 from __future__ import annotations
 
 import atexit
+import io
 import os
 import re
 import socket
@@ -16,10 +17,10 @@ import time
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from http.client import HTTPConnection, HTTPException, HTTPResponse, HTTPSConnection
 from itertools import chain
-from typing import Any
+from typing import Any, BinaryIO
 from urllib.parse import quote, urljoin, urlsplit
 
 from barpc.base.errors import visible
@@ -67,6 +68,7 @@ _SLOWEST = 10_000  # bytes a second, on top of TIMEOUT
 _AGAIN = (408, 425, 429, 500, 502, 503, 504)
 _ELSEWHERE = (301, 302, 303, 307, 308)
 _MOVES = 3
+_EXTRA = 1 << 20  # bytes of an answer beside its data, whose chunks may be of one byte: these take six
 _KEPT = "/%:@!$&'()*+,;=~"  # characters that stand in an address as they are
 
 _idle: dict[tuple[int, str, str], list[HTTPConnection]] = {}  # process (a fork shares no socket), scheme, host
@@ -109,6 +111,7 @@ def _once(url: str, start: int, stop: int) -> Part | str:
     """Return the part, or the address where it is said to be."""
     scheme, host, path, query = urlsplit(url)[:4]
     connection = _connection(scheme, host)
+    connection.response_class = partial(_response, _EXTRA + 6 * (stop - start))  # type: ignore[assignment]
     longest, late = TIMEOUT + (stop - start) / _SLOWEST, threading.Event()
     limit = threading.Timer(longest, _cut, (connection.sock, late))
     limit.start()
@@ -122,7 +125,7 @@ def _once(url: str, start: int, stop: int) -> Part | str:
         with closing(connection.getresponse()) as answer:
             found = _answered(answer, start, stop)
             again = answer.isclosed() and not answer.will_close
-    except (HTTPException, TimeoutError, ConnectionError, ssl.SSLError, _PassingError) as error:
+    except (HTTPException, ValueError, TimeoutError, ConnectionError, ssl.SSLError, _PassingError) as error:
         if late.is_set():  # however the cut shows: as an end, as a reset
             raise _PassingError(f"its host takes more than {longest:.3g} s for {stop - start} bytes") from error
         if isinstance(error, _PassingError):
@@ -138,6 +141,34 @@ def _once(url: str, start: int, stop: int) -> Part | str:
     if found is None:
         raise FileNotFoundError(f"its host answers {answer.status}")
     return found
+
+
+class _Wire(io.RawIOBase):
+    """What a server sends, up to so many bytes: http.client reads headers, chunks and trailers as long as there are."""
+
+    def __init__(self, sent: BinaryIO, most: int) -> None:
+        self._sent, self._left = sent, most
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        data = self._sent.read1(min(len(buffer), self._left))  # type: ignore[attr-defined]
+        if not self._left:
+            raise _PassingError("its host sends more than was asked, and goes on")
+        buffer[: len(data)] = data
+        self._left -= len(data)
+        return len(data)
+
+    def close(self) -> None:
+        self._sent.close()
+        super().close()
+
+
+def _response(most: int, *args: Any, **given: Any) -> HTTPResponse:
+    answer = HTTPResponse(*args, **given)
+    answer.fp = io.BufferedReader(_Wire(answer.fp, most))
+    return answer
 
 
 def _cut(connected: socket.socket, late: threading.Event) -> None:
@@ -198,7 +229,7 @@ def _answered(answer: HTTPResponse, start: int, stop: int) -> Part | str | None:
 def _body(answer: HTTPResponse, wanted: int) -> bytes:
     """Read a given number of bytes, and no more."""
     data = answer.read(wanted)
-    if len(data) < wanted:
+    if len(data) != wanted:
         raise _PassingError(f"its host sent {len(data)} of {wanted} bytes")
     return data
 
@@ -235,14 +266,14 @@ class _Opened:
         found = _told(store.info, str(at))
         if found.get("type") == "directory":
             raise OSError("a folder")
-        self.version = _version(found)
+        self.version = _told(_version, found)
 
     def read(self, start: int, stop: int) -> bytes:
         with self._lock:
             _told(self._file.seek, start)
             data = bytes(_told(self._file.read, stop - start))
             if not self._url.startswith("s3:"):  # s3fs asks for bytes of the version that it opened
-                self.require(*_version(_told(self._store.info, self._url)))
+                self.require(*_told(_version, _told(self._store.info, self._url)))
             return data
 
     def require(self, size: int, tag: str) -> None:
