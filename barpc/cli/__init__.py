@@ -10,13 +10,9 @@ import difflib
 import gc
 import logging
 import os
-import signal
 import sys
-import threading
 import traceback
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
@@ -24,13 +20,13 @@ import click
 
 from barpc import __version__
 from barpc.base.errors import BarpcError, BarpcWarning
+from barpc.cli.process import EXIT_INTERRUPTED, INTERRUPTED, hold_streams, interruptible
 from barpc.cli.terminal import EXIT_GATE as EXIT_GATE
 from barpc.cli.terminal import THREADS, Formatter, echo, say
 
 _OBJECTS = 50_000  # made between two looks for cycles
 
 EXIT_FAILED = 1
-EXIT_INTERRUPTED = 130
 
 _NO_ARGUMENTS: Any = getattr(click.exceptions, "NoArgsIsHelpError", click.exceptions.Exit)  # not in click 8.1
 
@@ -151,9 +147,11 @@ def main(args: list[str] | None = None) -> None:
     argv = sys.argv[1:] if args is None else args
     if args is None:  # the process is ours: no looking for cycles every 700 objects while modules are loaded
         gc.set_threshold(_OBJECTS)
+        hold_streams()
     for name in THREADS:  # sums keep their order whatever the machine; -j spreads the work
         os.environ.setdefault(name, "1")
-    with _interruptible(), warnings.catch_warnings():
+    code: object
+    with interruptible(own=args is None) as interrupt, warnings.catch_warnings():
         try:
             code = cli.main(args=argv, prog_name="barpc", standalone_mode=False)
             sys.stdout.flush()
@@ -163,22 +161,26 @@ def main(args: list[str] | None = None) -> None:
             error.show()
             code = error.exit_code
         except BrokenPipeError:  # whoever read the results has gone
-            sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115  (flushed at exit)
             code = EXIT_FAILED
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001  (nobody wants a traceback)
-            code, message = _told(error)
+            # what an interruption makes of others' code may be any error
+            code, message = _told(KeyboardInterrupt() if interrupt.end() else error)
             if "--debug" in argv:
                 echo(traceback.format_exc(), err=True)
             say(message)
+        code = code if isinstance(code, int) else 0
+        interrupt.done(code)
     if args is None:
         gc.freeze()  # nor at the end in what the system takes back
-    sys.exit(code if isinstance(code, int) else 0)
+    sys.exit(code)
 
 
 def _told(error: BaseException) -> tuple[int, str]:
     """Return the exit code of an error, and what to say."""
+    if isinstance(error, click.Abort):  # of an end of file, too
+        error = error.__cause__ or error
     if isinstance(error, (click.Abort, KeyboardInterrupt)):
-        return EXIT_INTERRUPTED, "interrupted; run the same command again to go on"
+        return EXIT_INTERRUPTED, INTERRUPTED
     if isinstance(error, click.ClickException):
         context = getattr(error, "ctx", None)
         where = context.command_path if context is not None else "barpc"
@@ -192,19 +194,6 @@ def _told(error: BaseException) -> tuple[int, str]:
     elif isinstance(error, OSError) and error.strerror:
         text = f"{error.filename or 'the system'}: {error.strerror}"
     return EXIT_FAILED, text
-
-
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """End at a SIGTERM, as batch systems send it, in the same way as at a Ctrl-C."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _log_warning(

@@ -18,7 +18,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any
@@ -392,7 +392,7 @@ def _cluster(address: str) -> Iterator[Executor]:
 @contextmanager
 def _processes(jobs: int) -> Iterator[Executor]:
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_enter_worker)
+    pool = _Workers(jobs, mp_context=context, initializer=_enter_worker)
     try:
         yield pool
     except BaseException:  # an error or Ctrl-C: nobody waits for what is in flight
@@ -401,6 +401,19 @@ def _processes(jobs: int) -> Iterator[Executor]:
             process.kill()
         raise
     pool.shutdown()
+
+
+class _Workers(ProcessPoolExecutor):
+    """Processes, started one by one as tasks come, without an ear for Ctrl-C, which comes to all of a terminal."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        if not hasattr(signal, "pthread_sigmask"):
+            return super().submit(fn, *args, **kwargs)
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            return super().submit(fn, *args, **kwargs)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _enter_worker() -> None:
