@@ -43,23 +43,26 @@ def many(value: float) -> str:
     return f"{value:,}" if isinstance(value, int) else re.sub(r"e([+-])0*", r"e\1", f"{value:g}").replace("e+", "e")
 
 
-def _numbers(kind: sidefile.Kind) -> str:
-    """How many numbers a text may hold."""
-    return f", {many((kind.most or 0) // sidefile.NUMBER)} numbers" if kind.between else ""
-
-
 def rows() -> list[tuple[str, str]]:
     """What is read, and what of it is refused beyond."""
     bounded = (sidefile.RPC_FILE, sidefile.GEOJSON, sidefile.OPTIONS, sidefile.SUMMARY)
     unpacked = f"packed, unpacked, and as numbers of {sidefile.NUMBER} bytes"
     return [
-        *((kind.words, size(kind.most) + _numbers(kind)) for kind in bounded),
+        *((kind.words, size(kind.most)) for kind in bounded),
         (
             sidefile.XML.words,
             f"{size(sidefile.XML.most)}, {sidefile.MAX_DEPTH} levels, {many(sidefile.MAX_ELEMENTS)} elements",
         ),
-        (sidefile.TABLE.words, size(sidefile.TABLE.most) + _numbers(sidefile.TABLE)),
-        ("JSON", f"{sidefile.MAX_DEPTH} levels"),
+        (
+            sidefile.TABLE.words,
+            f"{size(sidefile.TABLE.most)}, {many(sidefile.TABLE.lines or 0)} lines, a line {size(sidefile.LINE)}",
+        ),
+        (
+            "JSON",
+            f"{sidefile.MAX_DEPTH} levels, {many(sidefile.GEOJSON.values)} values, of a summary "
+            f"{many(sidefile.SUMMARY.values)}",
+        ),
+        ("a key of TOML", f"{options._PARTS} parts"),
         (
             f"{sidefile.ARRAYS.words} (`.npz`)",
             f"{size(sidefile.ARRAYS.most)} {unpacked}; a member {many(frozen.DEFLATED)} times its stored bytes",
@@ -91,7 +94,8 @@ def rows() -> list[tuple[str, str]]:
         ),
         (
             "an answer of a web server",
-            f"{hosts.TIMEOUT:g} s, and 1 s for {hosts._SLOWEST:,} bytes; {hosts._MOVES} redirects",
+            f"{hosts.TIMEOUT:g} s, and 1 s for {hosts._SLOWEST:,} bytes; {hosts._MOVES} redirects; "
+            f"{size(hosts._EXTRA)} beside the data",
         ),
         ("rasters open at a time", many(raster._MOST_OPEN)),
         ("an image of a product's metadata", f"{many(metadata.MOST_PIXELS)} rows or columns"),

@@ -596,6 +596,13 @@ def with_values(options: Record, values: Mapping[str, Any], where: str = "option
         raise InputError(f"{where}: {error}") from error
 
 
+_PARTS = 10  # of a dotted key: tables of options are three deep at most
+_QUOTED = re.compile(
+    r'#[^\n]*|"""(?:\\.|[^\\])*?"""|\'\'\'.*?\'\'\'|"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'', re.DOTALL
+)  # and comments
+_DEEP = re.compile(rf"(?<![\w-])(?:[\w-]+[ \t]*\.[ \t]*){{{_PARTS}}}")
+
+
 def read_options(path: str | Path, options: RunOptions | None = None) -> RunOptions:
     """Read options from a TOML file: top-level keys, and the tables [tie], [adjust], [fit].
 
@@ -604,6 +611,8 @@ def read_options(path: str | Path, options: RunOptions | None = None) -> RunOpti
     import tomllib  # most runs read none
 
     text = read_text(path, OPTIONS)
+    if _DEEP.search(_QUOTED.sub("q", text)):  # tomllib keeps every beginning of a dotted key: the square of its parts
+        raise InputError(f"{path}: not an options file (TOML): a key of more than {_PARTS} parts")
     try:
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # a date or a number that is none is not its own class

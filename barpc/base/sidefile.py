@@ -44,46 +44,43 @@ class Kind:
     words: str  # what a message calls it
     most: int | None  # larger files are refused [bytes]; None for images, which are never read whole
     error: type[BarpcError] = InputError
-    between: bytes = b""  # what stands between the numbers of a text, which are counted
+    lines: int | None = None  # texts of more lines, or of a line of more than `LINE` bytes, are refused
+    values: int = 8 * MB  # of JSON, which take 60 to 110 bytes each in memory: 1 GB at most
 
     def check(self, path: Path | str, size: int) -> None:
         """Raise if a file of `size` bytes is too large."""
         if self.most is not None and size > self.most:
             raise self.error(f"{path}: {size} bytes, too large for {self.words} (at most {self.most} are read)")
 
-    def check_numbers(self, path: Path | str, file: BinaryIO) -> None:
-        """Raise if a text holds more numbers than `most` bytes can: short ones take more in memory than in the file."""
-        limit = (self.most or 0) // NUMBER
-        if self.between and file.seek(0, os.SEEK_END) > limit:
-            file.seek(0)
-            count = sum(_count(part, self.between) for part in iter(lambda: file.read(MB), b""))
-            if count > limit:
-                raise self.error(f"{path}: {count} numbers, too many for {self.words} (at most {limit} are read)")
-        if self.between:
-            file.seek(0)
+    def check_lines(self, path: Path | str, file: BinaryIO) -> None:
+        """Raise if a text has more or longer lines than are read, before it is parsed; end at its beginning."""
+        count = 0
+        for part in iter(lambda: file.read(LINE), b"") if self.lines else ():
+            ends = max(part.count(b"\n"), part.count(b"\r"))
+            if not ends and len(part) == LINE:
+                raise self.error(f"{path}: a line of more than {LINE} bytes, too long for {self.words}")
+            count += ends
+        if self.lines and count > self.lines:
+            raise self.error(f"{path}: {count} lines, too many for {self.words} (at most {self.lines} are read)")
+        file.seek(0)
 
 
-def _count(text: bytes, between: bytes) -> int:
-    """Count the values of a text: by the signs between them, and by words where blanks are among these."""
-    words = len(text.split()) if _BLANK in between else 0
-    return words + sum(text.count(sign) for sign in between if sign != _BLANK)
-
-
-_BLANK = ord(" ")
-_OF_JSON, _OF_TABLE = b",:", b",; "
+LINE = MB
+"""Bytes of a line of a table, a ground point in thousands of images; the longest one may have twice as many."""
+_LINES = 16 * MB  # of a table: names and numbers of a line take 150 bytes in memory, 2.5 GB at most
 
 IMAGE = Kind("an image", None, ImageError)
 PRODUCT = Kind("a product", None, RpcFormatError)
 GRID = Kind("a height grid", None)
 RPC_FILE = Kind("an RPC file", 32 * MB, RpcFormatError)
 XML = Kind("an XML file", MAX_XML, RpcFormatError)
-TABLE = Kind("a table of points", 1024 * MB, between=_OF_TABLE)
+TABLE = Kind("a table of points", 1024 * MB, lines=_LINES)
 ARRAYS = Kind("an archive of arrays", 1024 * MB)
-GEOJSON = Kind("a GeoJSON file", 256 * MB, between=_OF_JSON)
+GEOJSON = Kind("a GeoJSON file", 256 * MB)
 OPTIONS = Kind("an options file", MB)
 NAMES = Kind("a list of names", 16 * MB)
-STATE = Kind("a camera's state", 64 * MB, RpcFormatError, between=_OF_JSON)
-SUMMARY = Kind("a run's summary", 512 * MB, between=_OF_JSON)
+STATE = Kind("a camera's state", 64 * MB, RpcFormatError)
+SUMMARY = Kind("a run's summary", 512 * MB, values=32 * MB)
 
 
 @contextmanager
@@ -159,7 +156,7 @@ def opened_text(path: Path | str, kind: Kind, newline: str | None = None) -> Ite
 
 @contextmanager
 def _utf8(file: BinaryIO, path: Path | str, kind: Kind, newline: str | None = None) -> Iterator[TextIO]:
-    kind.check_numbers(path, file)
+    kind.check_lines(path, file)
     encoding = encoding_of(file.read(_TOLD))
     file.seek(0)
     try:
@@ -239,13 +236,16 @@ def read_json(path: Path | str, kind: Kind) -> Any:
     """Read what a JSON file holds (see `parse_json`)."""
     text = read_text(path, kind)
     try:
-        return parse_json(text)
+        return parse_json(text, kind.values)
     except ValueError as error:
         raise kind.error(f"{path}: not JSON that can be read, so not {kind.words} ({error})") from error
 
 
-def parse_json(text: str) -> Any:
-    """Parse a JSON text; ValueError for numbers that are not finite or beyond 64 bits, or nested too deep."""
+def parse_json(text: str, most: int = Kind.values) -> Any:
+    """Parse a JSON text; ValueError for numbers that are not finite or beyond 64 bits, too many values or levels."""
+    values = sum(map(text.count, ",:[{"))  # one, or the name of one, behind each
+    if values > most:
+        raise ValueError(f"{values} values, at most {most} are read")
     if _depth(text) > MAX_DEPTH:  # how deep json itself goes differs between versions of Python
         raise ValueError(f"nested too deep, at most {MAX_DEPTH} levels are read")
     return json.loads(text, parse_constant=_refuse, parse_int=_whole, parse_float=_finite)

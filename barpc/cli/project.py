@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import sys
+from array import array
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from functools import cache, wraps
@@ -252,25 +253,27 @@ def given_points(numbers: Sequence[float], file: str | None, names: Sequence[str
 
 
 def _table(lines: Iterable[str], file: str, names: Sequence[str], fill: float | None) -> Array:
-    rows = [row for line in lines if (row := _cells(line))]
-    columns = list(range(len(names)))
-    if rows and not _is_number(rows[0][0]):
-        header = [cell.strip().lower() for cell in rows.pop(0)]
-        columns = [header.index(name) if name in header else -1 for name in names]
-        if -1 in columns[: -1 if fill is not None else None]:
-            raise InputError(f"{file}: columns {', '.join(names)} expected, found {', '.join(header)}")
-    points = np.empty((len(rows), len(names)))
-    if fill is not None:
-        points[:, -1] = fill
-    for i, row in enumerate(rows):
-        for j, column in enumerate(columns):
+    columns, found, width = list[int](), array("d"), len(names)
+    for row in filter(None, map(_cells, lines)):
+        if not columns:
+            columns = list(range(width))
+            if not _is_number(row[0]):
+                header = [cell.strip().lower() for cell in row]
+                columns = [header.index(name) if name in header else -1 for name in names]
+                if -1 in columns[: -1 if fill is not None else None]:
+                    raise InputError(f"{file}: columns {', '.join(names)} expected, found {', '.join(header)}")
+                continue
+        place = f"{file}: point {len(found) // width + 1}"
+        for name, column in zip(names, columns, strict=True):
             if 0 <= column < len(row):
                 if not _is_number(row[column]):
-                    raise InputError(f"{file}: point {i + 1}: {row[column]!r} is no number")
-                points[i, j] = float(row[column])
-            elif fill is None or j < len(names) - 1:
-                raise InputError(f"{file}: point {i + 1} has {len(row)} columns, expected {', '.join(names)}")
-    return points
+                    raise InputError(f"{place}: {row[column]!r} is no number")
+                found.append(float(row[column]))
+            elif fill is None or name != names[-1]:
+                raise InputError(f"{place} has {len(row)} columns, expected {', '.join(names)}")
+            else:
+                found.append(fill)
+    return np.array(found).reshape(-1, width)
 
 
 def _cells(line: str) -> list[str]:

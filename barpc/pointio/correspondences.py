@@ -7,7 +7,8 @@ orthority mean them; GDAL leaves the meaning of its tags to the application. Alt
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,11 @@ from barpc.base.errors import InputError, listed
 from barpc.base.frozen import load_npz
 from barpc.base.geodesy import ALTITUDES, FAR, Array
 from barpc.base.remote import Place
-from barpc.base.sidefile import GEOJSON, NUMBER, TABLE, Kind, read_head, read_json, read_text
+from barpc.base.sidefile import GEOJSON, NUMBER, TABLE, Kind, opened_text, read_head, read_json
 from barpc.pointio.names import ViewNames
-from barpc.pointio.tables import COLUMNS, Names, first_words, header_of, numbers_of, read_table
+from barpc.pointio.tables import COLUMNS, Names, first_words, header_of, numbered, numbers_of, read_table
 from barpc.rasters.raster import driver_of, open_raster
-from barpc.scene import Altimetry, GroundPoints
+from barpc.scene import Altimetry, GroundPoints, IntArray
 
 GROUND_SIGMA = 1.0  # standard deviation [m] along an axis of a GCP, or of the place of a height, whose file states none
 IMAGE_SIGMA = 0.5  # standard deviation of each image coordinate [px], of GCPs and tie points whose file states none
@@ -58,16 +59,27 @@ _HEIGHTS: Names = {
 """As ICESat-2's ATL03, ATL06 and ATL08 and GEDI's L2A call it, too."""
 
 
-@dataclass(frozen=True)
-class _Point:
-    """One GCP in one image: the files repeat the ground point for each of its images."""
+@dataclass(frozen=True, eq=False)
+class _Observed:
+    """GCPs (K,) as images show them: the files repeat the ground point for each of its images."""
 
-    name: str  # empty: called by its place among the points
-    lonlatalt: tuple[float, float, float]
-    sigma: tuple[float, float, float]
-    view: int
-    xy: tuple[float, float]
-    xy_sigma: float
+    names: Sequence[str]  # empty: called by its place among the points
+    view: IntArray  # (K,)
+    numbers: Array  # (K, 9): lon, lat, alt, their sigmas east, north, up [m], col, row, their sigma [px]
+
+    @staticmethod
+    def of_rows(rows: Iterable[_Row]) -> _Observed:
+        """Gather the rows that a reader yields."""
+        names, views, numbers = list[str](), array("q"), array("d")
+        for name, view, *values in rows:
+            names.append(name)
+            views.append(view)
+            numbers.extend(values)
+        return _Observed(names, np.array(views, dtype=np.int64), np.array(numbers).reshape(-1, 9))
+
+
+_Row = tuple[Any, ...]
+"""Name, view and the nine numbers of a GCP in an image."""
 
 
 def read_gcps(path: Path | str, names: Sequence[str]) -> GroundPoints:
@@ -80,14 +92,14 @@ def read_gcps(path: Path | str, names: Sequence[str]) -> GroundPoints:
     head = read_head(path, TABLE)
     views = ViewNames(names, str(path))
     if head.lstrip().startswith(b"{"):
-        found = list(_read_geojson(path, views))
+        found = _Observed.of_rows(_read_geojson(path, views))
     elif driver_of(head) is not None or b"\0" in head:
-        found = list(_read_tags(path, views))
+        found = _Observed.of_rows(_read_tags(path, views))
     else:
         words = first_words(head)
         named = not any(numbers_of([word]) for word in words[1:4]) and header_of(words, _POINTS)
-        found = list((_read_csv if named else _read_asp)(path, views))
-    if not found:
+        found = _read_csv(path, views) if named else _Observed.of_rows(_read_asp(path, views))
+    if not len(found.view):
         others = f"; it names {listed(list(views.strangers))}" if views.strangers else ""
         raise InputError(f"{path}: no GCP of {listed(names)}{others}")
     try:
@@ -96,32 +108,31 @@ def read_gcps(path: Path | str, names: Sequence[str]) -> GroundPoints:
         raise InputError(f"{path}: {error}") from error
 
 
-def _read_asp(path: Path, views: ViewNames) -> Iterator[_Point]:
+def _read_asp(path: Path, views: ViewNames) -> Iterator[_Row]:
     """Read the lines `id lat lon alt sigma_x sigma_y sigma_z image col row sigma_col sigma_row [image ...]`."""
-    for number, raw in enumerate(read_text(path, TABLE).split("\n"), start=1):
-        words = re.split(r"(?:^|\s)#", raw, maxsplit=1)[0].replace(",", " ").split()
-        if not words:
-            continue
-        try:
-            lat, lon, alt, *sigma = (float(word) for word in words[1:7])
-            images = [words[i : i + 5] for i in range(7, len(words), 5)]
-            east, north, up = sigma
-            if not images:
-                raise ValueError("no image")
-            for image, *numbers in images:
-                col, row, sigma_col, sigma_row = (float(word) for word in numbers)
-                view = views.find(image)
-                if view is not None:
-                    spread = max(sigma_col, sigma_row)
-                    yield _Point(words[0], (lon, lat, alt), (east, north, up), view, (col, row), spread)
-        except ValueError as error:
-            raise InputError(
-                f"{path}, line {number}: expected 'id lat lon alt sx sy sz image col row scol srow ...', or a CSV that "
-                f"begins with its columns' names ({error})"
-            ) from error
+    with opened_text(path, TABLE) as lines:
+        for number, raw in enumerate(lines, start=1):
+            line = re.split(r"(?:^|\s)#", raw, maxsplit=1)[0] if "#" in raw else raw
+            words = line.replace(",", " ").split()
+            if not words:
+                continue
+            try:
+                lat, lon, *ground = map(float, words[1:7])
+                if len(words) < 12 or len(words) % 5 != 2:
+                    raise ValueError(f"{len(words)} words")
+                for i in range(7, len(words), 5):
+                    col, row, *spread = map(float, words[i + 1 : i + 5])
+                    view = views.find(words[i])
+                    if view is not None:
+                        yield words[0], view, lon, lat, *ground, col, row, max(spread)
+            except ValueError as error:
+                raise InputError(
+                    f"{path}, line {number}: expected 'id lat lon alt sx sy sz image col row scol srow ...', or a CSV "
+                    f"that begins with its columns' names ({error})"
+                ) from error
 
 
-def _read_csv(path: Path, views: ViewNames) -> Iterator[_Point]:
+def _read_csv(path: Path, views: ViewNames) -> _Observed:
     """Read a header of column names, then a line for each point and image; sigmas not stated are the default."""
     needed = [*COLUMNS, "image"][: len(COLUMNS) + (len(views.names) > 1)]
     columns = {**COLUMNS, **_NAMES, **_SIGMAS}
@@ -131,21 +142,32 @@ def _read_csv(path: Path, views: ViewNames) -> Iterator[_Point]:
             raise InputError(
                 f"{path}: column {word[:40]!r} is none that is read; accuracies are called {', '.join(_SIGMAS)}"
             )
-    named = "image" in table
-    names, images = (table.pop(key, [""] * len(table["lon"])) for key in _NAMES)
-    for name, image, *cells in zip(names, images, *table.values(), strict=True):
-        of = {key: value for key, value in zip(table, cells, strict=True) if value is not None}
-        every = of.get("sigma", GROUND_SIGMA)
-        level = of.get("sigma_xy", every)
-        sigma = (of.get("sigma_x", level), of.get("sigma_y", level), of.get("sigma_z", every))
-        pixels = [of[key] for key in ("sigma_px", "sigma_col", "sigma_row") if key in of] or [IMAGE_SIGMA]
-        view = views.find(image) if named else 0
-        if view is not None:
-            place = (of["lon"], of["lat"], of["alt"])
-            yield _Point(name.strip(), place, sigma, view, (of["col"], of["row"]), max(pixels))
+    num = len(table["lon"])
+
+    def stated(key: str, default: Array) -> Array:
+        cells = table.get(key, [None] * num)
+        known = np.array([cell is not None for cell in cells], dtype=bool)
+        return np.where(known, np.array(cells, dtype=np.float64), default)
+
+    every = stated("sigma", np.full(num, GROUND_SIGMA))
+    level = stated("sigma_xy", every)
+    sigmas = (stated("sigma_x", level), stated("sigma_y", level), stated("sigma_z", every))
+    pixels = np.max([stated(key, np.full(num, -np.inf)) for key in ("sigma_px", "sigma_col", "sigma_row")], axis=0)
+    pixels[pixels == -np.inf] = IMAGE_SIGMA
+    numbers = np.column_stack(
+        [*(table[key] for key in ("lon", "lat", "alt")), *sigmas, table["col"], table["row"], pixels]
+    )
+    view = (
+        views.of(map(str, table["image"].different))[table["image"].index]
+        if "image" in table
+        else np.zeros(num, np.int64)
+    )
+    names = [name.strip() for name in table["id"].per_row()] if "id" in table else [""] * num
+    kept = np.flatnonzero(view >= 0)
+    return _Observed([names[i] for i in kept], view[kept], numbers[kept])
 
 
-def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Point]:
+def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Row]:
     """Yield the features with a 3-D point and the properties `ji` (col, row), `filename`, perhaps `id` and sigmas."""
     for (lon, lat, alt, col, row), properties in geojson_points(path, "filename"):
         view = views.find(str(properties["filename"]))
@@ -156,10 +178,10 @@ def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Point]:
                 spread = float(properties.get("sigma_px", IMAGE_SIGMA))
             except (TypeError, ValueError) as error:
                 raise InputError(f"{path}: sigma_m is [east, north, up], sigma_px a number ({error})") from error
-            yield _Point(name, (lon, lat, alt), (east, north, up), view, (col, row), spread)
+            yield name, view, lon, lat, alt, east, north, up, col, row, spread
 
 
-def _read_tags(path: Path, views: ViewNames) -> Iterator[_Point]:
+def _read_tags(path: Path, views: ViewNames) -> Iterator[_Row]:
     """Yield the GCP tags of an image: they are seen in that image alone."""
     view = views.index(str(path))
     with open_raster(path) as dataset:
@@ -169,20 +191,21 @@ def _read_tags(path: Path, views: ViewNames) -> Iterator[_Point]:
     for n, gcp in enumerate(gcps, 1):
         if gcp.z is None:
             raise InputError(f"{path}: GCP {gcp.id or n} has no altitude")
-        place, xy = (float(gcp.x), float(gcp.y), float(gcp.z)), (float(gcp.col), float(gcp.row))
-        yield _Point(str(gcp.id or n), place, (GROUND_SIGMA,) * 3, view, xy, IMAGE_SIGMA)
+        yield str(gcp.id or n), view, gcp.x, gcp.y, gcp.z, *(GROUND_SIGMA,) * 3, gcp.col, gcp.row, IMAGE_SIGMA
 
 
-def _assembled(found: list[_Point]) -> GroundPoints:
-    """Return the observations of points of the same name and place belong to one point."""
-    first: dict[tuple[str, tuple[float, float, float]], _Point] = {}
-    for point in found:
-        first.setdefault((point.name, point.lonlatalt), point)
-    index = {key: i for i, key in enumerate(first)}
-    points = list(first.values())
-    names = tuple(point.name or f"gcp_{n}" for n, point in enumerate(points, 1))
-    numbers = np.array([point.lonlatalt for point in points])
-    wrong = ~(np.abs(numbers) <= (TURNS, TURNS, FAR)).all(axis=1)  # NaN fails, too
+def _assembled(found: _Observed) -> GroundPoints:
+    """Return the observations of points of the same name and place as those of one point, in their first order."""
+    keys = np.column_stack([numbered(found.names, {}), found.numbers[:, :3]])
+    order = np.lexsort(keys.T)
+    new = np.append(True, (np.diff(keys[order], axis=0) != 0).any(axis=1))
+    first = order[new]  # the sort is stable
+    point = np.empty(len(order), dtype=np.int64)
+    point[order] = np.argsort(np.argsort(first))[np.cumsum(new) - 1]
+    first.sort()
+    names = tuple(found.names[i] or f"gcp_{n}" for n, i in enumerate(first, 1))
+    ground = found.numbers[first]
+    wrong = ~(np.abs(ground[:, :3]) <= (TURNS, TURNS, FAR)).all(axis=1)  # NaN fails, too
     if wrong.any():
         raise InputError(
             f"GCP {names[int(wrong.argmax())]}: a coordinate is not finite, or no longitude and latitude in degrees; "
@@ -190,12 +213,12 @@ def _assembled(found: list[_Point]) -> GroundPoints:
         )
     return GroundPoints(
         names=names,
-        lonlatalt=numbers,
-        sigma=np.array([point.sigma for point in points]),
-        point=np.array([index[point.name, point.lonlatalt] for point in found]),
-        view=np.array([point.view for point in found]),
-        xy=np.array([point.xy for point in found]),
-        xy_sigma=np.array([point.xy_sigma for point in found]),
+        lonlatalt=ground[:, :3],
+        sigma=ground[:, 3:6],
+        point=point,
+        view=found.view,
+        xy=found.numbers[:, 6:8],
+        xy_sigma=found.numbers[:, 8],
     )
 
 

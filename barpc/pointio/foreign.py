@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
+from array import array
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from functools import cache
@@ -27,7 +28,7 @@ import numpy.typing as npt
 from barpc.base.errors import BarpcError, InputError
 from barpc.base.frozen import DEFLATED, HEADER, Arrays, load_npz
 from barpc.base.geodesy import Array
-from barpc.base.sidefile import MAX_DEPTH, MAX_ELEMENTS, NUMBER, TABLE, Kind, opened, read_bytes, read_head, read_text
+from barpc.base.sidefile import MAX_DEPTH, MAX_ELEMENTS, NUMBER, TABLE, Kind, opened, opened_text, read_bytes, read_head
 from barpc.pointio.names import ViewNames
 from barpc.scene import IntArray
 
@@ -115,15 +116,19 @@ def _images(path: Path, views: ViewNames) -> tuple[str, str]:
 def _asp_text(path: Path) -> tuple[Array, Array]:
     """Read an ASP text file: counts on the first line, then one keypoint a line, col and row first."""
     try:
-        lines = read_text(path, TABLE).split("\n")
-        left, right = (int(word) for word in lines[0].split()[:2])
-        rows = [line.split()[:2] for line in lines[1:] if line.strip()]
-        points = np.array(rows, dtype=np.float64).reshape(-1, 2)
+        with opened_text(path, TABLE) as lines:
+            left, right = (int(word) for word in next(lines, "").split()[:2])
+            points = array("d")
+            for words in (line.split(None, 2)[:2] for line in lines):
+                if words:
+                    col, row = map(float, words)
+                    points.extend((col, row))
     except ValueError as error:
         raise InputError(f"{path}: not an ASP text match file ({error})") from error
-    if left != right or len(points) != left + right:
-        raise InputError(f"{path}: says {left} and {right} keypoints but holds {len(points)}")
-    return points[:left], points[left:]
+    xy = np.array(points).reshape(-1, 2)
+    if left != right or len(xy) != left + right:
+        raise InputError(f"{path}: says {left} and {right} keypoints but holds {len(xy)}")
+    return xy[:left], xy[left:]
 
 
 def _asp_binary(path: Path) -> tuple[Array, Array]:

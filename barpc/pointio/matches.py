@@ -20,7 +20,7 @@ from barpc.base.sidefile import TABLE, read_head
 from barpc.pointio.correspondences import IMAGE_SIGMA
 from barpc.pointio.foreign import COLMAP, ENDINGS, HDF5, PairPoints, in_folder, read_colmap, read_hloc, read_pair_files
 from barpc.pointio.names import ViewNames, cell
-from barpc.pointio.tables import read_table
+from barpc.pointio.tables import numbered, read_table
 from barpc.scene import IntArray, Tracks, connected_labels
 
 _COLUMNS = ("image", "col", "row", "track")
@@ -174,11 +174,13 @@ def _read(path: Path, views: ViewNames) -> Links:
 
 def _read_csv(path: Path, views: ViewNames) -> Links:
     _, table = read_table(path, {key: (key,) for key in (*_COLUMNS, "sigma")}, _COLUMNS, texts=("image", "track"))
-    labels = np.array([label.strip() for label in table["track"]], dtype=str)
-    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
-    point = np.argsort(np.argsort(first))[inverse.ravel()]
-    spread = table.get("sigma", [IMAGE_SIGMA] * len(labels))
-    return _tracks(views, table["image"], point, np.column_stack([table["col"], table["row"]]), np.array(spread))
+    image, track = table["image"], table["track"]
+    point = track.index
+    if not isinstance(track.different, np.ndarray):
+        point = numbered((label.strip() for label in track.different), {})[point]
+    spread = table.get("sigma", np.full(len(point), IMAGE_SIGMA))
+    xy = np.column_stack([table["col"], table["row"]])
+    return _tracks(views.of(map(str, image.different))[image.index], point, xy, spread)
 
 
 def _read_npz(path: Path, file: Arrays, views: ViewNames) -> Links:
@@ -190,31 +192,28 @@ def _read_npz(path: Path, file: Arrays, views: ViewNames) -> Links:
             raise ValueError(f"shapes {index.shape}, {point.shape}, {xy.shape}, {spread.shape}")
         if len(index) and index.min() < 0:
             raise ValueError("a view that has no name")
-        names = np.array([str(name) for name in file["names"]])[index]
+        view = views.of(str(name) for name in file["names"])[index]
     except (KeyError, ValueError, TypeError, IndexError) as error:
         raise InputError(f"{path}: not an npz of names, view, track, xy (K, 2) ({error})") from error
-    return _tracks(views, names.tolist(), point, xy, spread)
+    return _tracks(view, point, xy, spread)
 
 
-def _tracks(views: ViewNames, names: Sequence[str], point: IntArray, xy: Array, sigma: Array) -> Links:
-    """Return the observations of tracks in images of these names, of those that are views."""
-    found = [views.find(name) for name in names]
-    view = np.array([-1 if one is None else one for one in found], dtype=np.int64)
+def _tracks(view: IntArray, point: IntArray, xy: Array, sigma: Array) -> Links:
+    """Return the observations of tracks, those in other images than the views (-1) left out."""
     keep = view >= 0
     return Links.of_tracks(view[keep], point[keep], xy[keep], sigma[keep])
 
 
 def tracks_of(links: Links, path: Path | str) -> Tracks:
     """Return the tracks of linked points, sorted by view, without those that are seen once, or twice in one view."""
-    view, point, xy, sigma = links.view, links.tracks(), links.xy, links.sigma
+    view, point = links.view, links.tracks()
     order = np.lexsort((view, point))
-    view, point, xy, sigma = view[order], point[order], xy[order], sigma[order]
-    twice = np.zeros(len(view), dtype=bool)
-    twice[1:] = (point[1:] == point[:-1]) & (view[1:] == view[:-1])
-    good = ~np.isin(point, point[twice])
-    _, index, count = np.unique(point, return_inverse=True, return_counts=True)
-    keep = good & (count[index] >= 2)
-    if not keep.any():
+    track, seen = point[order], view[order]
+    again = np.append(False, (track[1:] == track[:-1]) & (seen[1:] == seen[:-1]))
+    good = np.bincount(point) >= 2
+    good[track[again]] = False
+    if not good.any():
         raise InputError(f"{path}: no track is seen in two of the views")
-    _, closed = np.unique(point[keep], return_inverse=True)
-    return Tracks(view[keep], closed, xy[keep], sigma[keep])
+    kept = order[good[track]]
+    closed = np.cumsum(good) - 1
+    return Tracks(view[kept], closed[point[kept]], links.xy[kept], links.sigma[kept])

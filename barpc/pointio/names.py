@@ -9,8 +9,11 @@ import os
 import unicodedata
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import PurePath
+
+import numpy as np
+import numpy.typing as npt
 
 from barpc.base.errors import InputError, listed
 from barpc.base.remote import Place, pure
@@ -153,6 +156,10 @@ class ViewNames:
         if found is None:
             self.strangers[name] = self.strangers.get(name, 0) + 1
         return found
+
+    def of(self, names: Iterable[str]) -> npt.NDArray[np.int64]:
+        """Return the index of the view that each name means, -1 where it means none."""
+        return np.array([-1 if (one := self.find(name)) is None else one for name in names], dtype=np.int64)
 
     def _meant(self, name: str) -> int | None:
         bare = name.strip()

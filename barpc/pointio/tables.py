@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from barpc.base.errors import InputError
+from barpc.base.errors import BarpcError, InputError
 from barpc.base.geodesy import Array
 from barpc.base.sidefile import LARGEST, OPTIONS, TABLE, opened_text, read_text
 from barpc.pointio.names import from_cell
+from barpc.scene import IntArray
 
 Names = Mapping[str, Sequence[str]]
 """Quantity -> what files call it."""
@@ -37,8 +41,8 @@ def read_table(
     unnamed: Sequence[str] = (),
     texts: Collection[str] = (),
     blank: Collection[str] = (),
-) -> tuple[list[str], dict[str, list[Any]]]:
-    """Return the words of a table's first line, and its columns: numbers, None where a cell is blank, or texts.
+) -> tuple[list[str], dict[str, Any]]:
+    """Return the words of a table's first line, and its columns: arrays of numbers, or `Texts`.
 
     Cells stand between tabs, semicolons (then with decimal commas), commas or blanks, whichever the first line has;
     ``#`` begins a comment. InputError for a line that lacks a number, or a first line without the columns needed.
@@ -48,34 +52,146 @@ def read_table(
     names, needed : the columns that are read, and those that must be there
     unnamed : the order of columns whose first line is numbers, not names; those beyond `needed` may be missing, what
         comes behind is passed over where all are needed
-    texts, blank : columns that are no numbers, and columns whose cells may be blank or missing
+    texts, blank : columns that are no numbers, and columns whose cells may be blank or missing: lists of numbers and
+        None
     """
-    words, delimiter = list[str](), ","
-    columns, found = dict[str, int](), dict[str, list[Any]]()
-    with opened_text(path, TABLE) as lines:
-        for number, raw in enumerate(lines, start=1):
-            line = raw if texts else raw.partition("#")[0]
-            if not line.strip() or line.lstrip().startswith("#"):
-                continue
+    with opened_text(path, TABLE) as text:
+        number, first = next(((n, line) for n, raw in enumerate(text, 1) for line in _content([raw], texts)), (1, ""))
+        delimiter = next((sign for sign in "\t;," if sign in first), " ")
+        with _line_named(path, number, needed):
+            words = _cells(first, delimiter)
+            columns = _columns(path, words, delimiter, names, needed, unnamed)
+        table = _Table(columns, delimiter, texts, blank)
+        rows = chain([first], text) if _numbers(words, delimiter) else text
+        number += rows is text
+        while batch := list(islice(rows, _BATCH)):
             try:
-                if first := not columns:
-                    delimiter = next((sign for sign in "\t;," if sign in line), " ")
-                cells = _cells(line, delimiter)
-                if first:
-                    words = cells
-                    columns = _columns(path, words, delimiter, names, needed, unnamed)
-                    found = {name: [] for name in columns}
-                if not first or _numbers(words, delimiter):
-                    for name, place in columns.items():
-                        text = cells[place] if place < len(cells) or name not in blank else ""
-                        found[name].append(
-                            from_cell(text) if name in texts else _number(text, delimiter, name in blank)
-                        )
-            except (ValueError, IndexError, csv.Error) as error:
-                raise InputError(f"{path}, line {number}: expected {', '.join(columns or needed)} ({error})") from error
-    if not columns:
-        raise _lacking(path, needed, words)
-    return words, found
+                table.add(_content(batch, texts))
+            except _WRONG:
+                for n, raw in enumerate(batch, number):
+                    with _line_named(path, n, list(columns)):
+                        table.parsed(_content([raw], texts))
+                raise
+            number += len(batch)
+    return words, table.whole()
+
+
+_DIGITS = 18  # of whole numbers of 64 bits
+_BATCH = 1 << 12  # lines that are parsed at a time: their cells stay in the processor's cache
+_WRONG = (ValueError, IndexError, csv.Error)
+
+
+def _content(lines: Sequence[str], texts: Collection[str]) -> list[str]:
+    """Return the lines without comments, which of lines of numbers alone may stand behind these, and empty ones."""
+    if not texts:
+        lines = [line.partition("#")[0] for line in lines]
+    return [line for line in lines if (bare := line.lstrip()) and bare[0] != "#"]
+
+
+@contextmanager
+def _line_named(path: Path, number: int, columns: Sequence[str]) -> Iterator[None]:
+    try:
+        yield
+    except BarpcError:
+        raise
+    except _WRONG as error:
+        raise InputError(f"{path}, line {number}: expected {', '.join(columns)} ({error})") from error
+
+
+@dataclass(frozen=True, eq=False)
+class Texts:
+    """A column of texts: those there are in the order of their first rows, and which of them each row (N,) has."""
+
+    different: Sequence[str] | IntArray  # numbers, where all are written as `str` does
+    index: IntArray
+
+    def per_row(self) -> list[str]:
+        """Return the text of each row."""
+        texts = list(map(str, self.different))
+        return [texts[i] for i in self.index]
+
+
+def numbered(texts: Iterable[str], known: dict[str, int]) -> IntArray:
+    """Return the number of each text, that of its first appearance among all that are `known`, which grows."""
+    return np.array([known.setdefault(text, len(known)) for text in texts], dtype=np.int64)
+
+
+class _Texts:
+    """Texts that come in parts; whole numbers as `str` writes them, labels of most tables, are kept as such."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, int] | None = None
+        self._parts: list[IntArray] = []
+
+    def append(self, cells: list[str]) -> None:
+        part = _whole(cells) if self._known is None else None
+        if part is None:
+            if self._known is None:
+                self._known = {}
+                self._parts = [numbered(map(str, part.tolist()), self._known) for part in self._parts]
+            part = numbered(cells, self._known)
+        self._parts.append(part)
+
+    def column(self) -> Texts:
+        index = np.concatenate([np.zeros(0, dtype=np.int64), *self._parts])
+        if self._known is not None:
+            return Texts([from_cell(cell) for cell in self._known], index)
+        values, first, inverse = np.unique(index, return_index=True, return_inverse=True)
+        order = np.argsort(first)
+        return Texts(values[order], np.argsort(order)[inverse.ravel()])
+
+
+def _whole(cells: list[str]) -> IntArray | None:
+    """Return texts as the numbers (N,) that they are; None unless all are written as `str` does."""
+    joined = "".join(cells)
+    if not (joined.isascii() and joined.isdecimal()) or max(map(len, cells)) > _DIGITS:
+        return None
+    values = np.array(cells, dtype=np.int64)
+    digits = len(values) + sum(np.count_nonzero(values >= 10**n) for n in range(1, _DIGITS))
+    return values if digits == len(joined) else None
+
+
+class _Table:
+    """Columns that grow by batches of lines."""
+
+    def __init__(self, columns: dict[str, int], delimiter: str, texts: Collection[str], blank: Collection[str]) -> None:
+        self._columns, self._delimiter, self._texts, self._blank = columns, delimiter, texts, blank
+        self._parts = {name: _Texts() if name in texts else list[Any]() for name in columns}
+
+    def add(self, lines: Sequence[str]) -> None:
+        for name, part in self.parsed(lines).items() if lines else ():
+            self._parts[name].append(part)
+
+    def parsed(self, lines: Sequence[str]) -> dict[str, Any]:
+        """Return the cells of each column: texts, numbers, or, where they may be blank, numbers and None."""
+        sign = self._delimiter
+        plain = sign != " "  # split at once; what is left of blanks does no harm to numbers
+        rows = [line.split(sign) if plain and '"' not in line else _cells(line, sign) for line in lines]
+        found: dict[str, Any] = {}
+        for name, place in self._columns.items():
+            if name in self._blank:
+                cells = [row[place].strip() if place < len(row) else "" for row in rows]
+                found[name] = [float(_pointed(cell, sign)) if cell else None for cell in cells]
+            elif name in self._texts:
+                found[name] = [row[place].lstrip(" ").rstrip("\r\n") for row in rows]
+            else:
+                cells = [row[place] for row in rows]
+                found[name] = np.array([_pointed(cell, sign) for cell in cells] if sign == ";" else cells, np.float64)
+        return found
+
+    def whole(self) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for name in self._columns:
+            parts = self._parts.pop(name)
+            if isinstance(parts, _Texts):
+                found[name] = parts.column()
+            else:
+                found[name] = list(chain.from_iterable(parts)) if name in self._blank else np.concatenate([[], *parts])
+        return found
+
+
+def _pointed(cell: str, delimiter: str) -> str:
+    return cell.replace(",", ".") if delimiter == ";" else cell
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
@@ -88,14 +204,8 @@ def _cells(line: str, delimiter: str) -> list[str]:
     return [cell for cell in row if delimiter != " " or cell]
 
 
-def _number(cell: str, delimiter: str, blank: bool) -> float | None:
-    if blank and not cell.strip():
-        return None
-    return float(cell.replace(",", ".") if delimiter == ";" else cell)
-
-
 def _numbers(words: Sequence[str], delimiter: str) -> bool:
-    return numbers_of([word.replace(",", ".") if delimiter == ";" else word for word in words]) is not None
+    return numbers_of([_pointed(word, delimiter) for word in words]) is not None
 
 
 def _columns(

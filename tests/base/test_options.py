@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import time
+import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +21,8 @@ from click.testing import CliRunner
 import barpc
 from barpc.base.errors import InputError
 from barpc.base.options import (
+    _DEEP,
+    _QUOTED,
     PAPER,
     AdjustOptions,
     Declared,
@@ -319,3 +323,39 @@ def test_bounds_are_where_they_are_said_to_be() -> None:
     assert checked("count", int, Rule("A number."), 2**53 - 1) == 2**53 - 1
     with pytest.raises(InputError, match="count"):
         checked("count", int, Rule("A number."), 2**53)
+
+
+@pytest.mark.parametrize("text", [
+    "a.b.c.d.e.f.g.h.i.j.k = 1", "[a.b.c.d.e.f.g.h.i.j.k]", "[[ a . b.c.d.e.f.g.h.i.j.k ]]",
+    "x = {a.b.c.d.e.f.g.h.i.j.k=1}",
+    '"a"."b".c.\'d\'.e.f.g.h."i.x".j.k = 1', "a = 1 # '\nb.b.c.d.e.f.g.h.i.j.k = 1", "a" + ".a" * 20000 + " = 1",
+])  # fmt: skip
+def test_a_key_of_many_parts_is_refused_before_it_is_parsed(tmp_path, text) -> None:
+    """tomllib takes 1.7 GB for 40 kB of one, and ten seconds."""
+    path = tmp_path / "o.toml"
+    path.write_text(text)
+    start = time.process_time()
+    with pytest.raises(InputError, match=r"o\.toml: not an options file .*: a key of more than 10 parts"):
+        read_options(path)
+    assert time.process_time() - start < 1.0
+
+
+@pytest.mark.parametrize("text", [
+    f"{'grids = true':<20}# " + "a." * 40, "aoi = '" + "../" * 40 + "a.b'", f'aoi = "{"a." * 40}tif"',
+    f'aoi = """\n{"a." * 40}\n"""', f"aoi = \'\'\'{'a.' * 40}\'\'\'", f'aoi = "\\"{"a." * 40}"',
+])  # fmt: skip
+def test_dots_that_part_no_key_are_no_parts(tmp_path, text) -> None:
+    path = tmp_path / "o.toml"
+    path.write_text(text)
+    tomllib.loads(text)
+    assert read_options(path) is not None
+
+
+@pytest.mark.parametrize("text", [
+    "a" * (1 << 20), "a-" * (1 << 19), '"' * (1 << 20), "'\"" * (1 << 19), "a." * (1 << 19),
+    '"""' + "\\" * (1 << 19), "a.b.c.d.e.f.g.h.i " * 50000, "#\n" * (1 << 19),
+])  # fmt: skip
+def test_parts_are_counted_in_a_time_that_grows_with_the_text(text) -> None:
+    start = time.process_time()
+    _DEEP.search(_QUOTED.sub("q", text[: 1 << 20]))
+    assert time.process_time() - start < 3.0

@@ -26,7 +26,10 @@ from barpc.base.sidefile import (
     ARRAYS,
     GEOJSON,
     LARGEST,
+    LINE,
+    MB,
     NAMES,
+    SUMMARY,
     TABLE,
     Kind,
     encoding_of,
@@ -298,7 +301,7 @@ DIRECT = {
     "pipeline/executor.py": "arrays that the caller has put down for its workers",
     "cameras.py": "no file: a row of the table of openers",
     "report/runfiles.py": "the schema, which is part of the package",
-    "cli/__init__.py": "the null device",
+    "cli/process.py": "the null device",
 }
 """Modules that may open a file for reading by themselves, and what they open."""
 ARRAYS_OF_A_PATH = ("load", "fromfile", "genfromtxt", "loadtxt")
@@ -348,33 +351,45 @@ def test_a_new_reader_that_goes_around_is_found(line):
     assert direct_opens(line)
 
 
-@pytest.mark.parametrize(
-    ("text", "numbers"),
-    [("1,2,3\n4,5,6\n", 6), ("1  2   3\n4 5 6\n", 6),
-     ("1;2;3;4;5;6\n", 6), (",,,,,\n", 6), ("1\n" * 6, 6), ("1\t" * 6, 6)],
-    ids=["commas", "blanks", "semicolons", "nothing between", "lines", "tabs"],
-)  # fmt: skip
-def test_a_text_of_more_numbers_than_memory_is_meant_for_is_refused(text, numbers, tmp_path):
-    path = tmp_path / "a.csv"
-    path.write_text(text)
-    kind = replace(TABLE, most=8 * numbers)
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("line", ["1,2,3", "", "# no number"])
+def test_a_table_of_more_lines_than_memory_is_meant_for_is_refused(line, end, tmp_path):
+    path, text = tmp_path / "a.csv", 6 * f"{line}\n"
+    path.write_bytes(text.replace("\n", end).encode())
+    kind = replace(TABLE, lines=6)
     assert read_text(path, kind) == text
     with opened_text(path, kind) as file:
         assert file.read() == text
-    fewer = replace(TABLE, most=8 * numbers - 8)
-    said = f"{path}: {numbers} numbers, too many for a table of points (at most {numbers - 1} are read)"
+    fewer = replace(TABLE, lines=5)
+    said = f"{path}: 6 lines, too many for a table of points (at most 5 are read)"
     with pytest.raises(InputError, match=re.escape(said)):
         read_text(path, fewer)
     with pytest.raises(InputError, match=re.escape(said)), opened_text(path, fewer):
         pass
 
 
-def test_what_a_json_holds_is_counted_before_it_is_parsed(tmp_path):
+def test_a_line_of_a_table_without_end_is_refused_and_long_ones_are_read(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(f"x\n{'a,' * (LINE // 2 - 1)}\nx\n")
+    assert len(read_text(path, TABLE)) == LINE + 3
+    path.write_text(f"x\n{'a,' * LINE}\nx\n")
+    with pytest.raises(InputError, match=f"a line of more than {LINE} bytes, too long for a table of points"):
+        read_text(path, TABLE)
+    assert len(read_text(path, GEOJSON)) == 2 * LINE + 5  # of one line, as most are
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [('{"a": [1, 1, 1]}', 5), ("[[[[[]]]]]", 5), ('[{"a": 1}, {}]', 5), ('["a,b:c[d{"]', 5)],
+    ids=["numbers", "levels", "objects", "an upper bound"],
+)
+def test_what_a_json_holds_is_counted_before_it_is_parsed(text, values, tmp_path):
     path = tmp_path / "a.json"
-    path.write_text(json.dumps({"a": [1] * 30}))
-    assert len(read_json(path, replace(GEOJSON, most=256))["a"]) == 30
-    with pytest.raises(InputError, match="30 numbers, too many for a GeoJSON file"):
-        read_json(path, replace(GEOJSON, most=232))
+    path.write_text(text)
+    assert read_json(path, replace(GEOJSON, values=values)) == json.loads(text)
+    with pytest.raises(InputError, match=f"{values} values, at most {values - 1} are read"):
+        read_json(path, replace(GEOJSON, values=values - 1))
+    assert (parse_json("[]"), GEOJSON.values, SUMMARY.values) == ([], 8 * MB, 32 * MB)
 
 
 def test_large_files_of_few_numbers_are_read(tmp_path):

@@ -201,7 +201,7 @@ class Pool:
 
 
 def test_several_processes_are_spawned_and_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(module, "_Workers", Pool)
     with executor_for(2) as pool:
         assert isinstance(pool, Pool)
         assert pool.jobs == 2
@@ -215,7 +215,7 @@ def test_several_processes_are_spawned_and_waited_for(monkeypatch: pytest.Monkey
 def test_after_an_error_nobody_waits_for_workers(error: type[BaseException], monkeypatch: pytest.MonkeyPatch) -> None:
     killed = list[int]()
     workers = [SimpleNamespace(kill=lambda n=n: killed.append(n)) for n in range(2)]
-    monkeypatch.setattr(module, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(module, "_Workers", Pool)
     monkeypatch.setattr(module.multiprocessing, "active_children", lambda: workers)
     with pytest.raises(error), executor_for(3) as pool:
         raise error
