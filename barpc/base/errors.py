@@ -5,13 +5,26 @@ A message is one line that says which file or view, what was found, and what to 
 
 from __future__ import annotations
 
+import errno
+import mmap
+import re
+import sys
 from collections.abc import Sequence
 
 _LONGEST = 1500  # characters of a message
 
 
 class BarpcError(Exception):
-    """Base of all errors that barpc raises on purpose."""
+    """Base of all errors that barpc raises on purpose.
+
+    MemoryError instead where it would put another sentence on an error that only says that memory is out.
+    """
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)
+        cause = sys.exception()
+        if out_of_memory(cause) and not has_room():
+            raise MemoryError from cause
 
     def __str__(self) -> str:
         """One printable line of bounded length, whatever a damaged file has put into the message."""
@@ -67,6 +80,41 @@ class OutputError(BarpcError, OSError):
 
 class BarpcWarning(UserWarning):
     """Something the user should know that does not stop the run."""
+
+
+_ROOM = 256 << 20  # bytes: more than any library or block of work maps at once that fails while others still do not
+_MEMORY = re.compile(
+    r"failed to map segment|annot (?:allocate|map)|[Oo]ut of memory|[Ii]nsufficient memory|emory allocation failed|"
+    r"nable to allocate|ot enough memory|can't start new thread"
+)
+_OTHER = re.compile(r"static TLS|not permitted")  # too many libraries of a kind; a disk that nothing may run from
+
+
+def has_room(size: int = _ROOM) -> bool:
+    """Return whether this process can still map so many bytes of memory."""
+    try:
+        mmap.mmap(-1, size).close()
+    except (OSError, MemoryError):
+        return False
+    return True
+
+
+def out_of_memory(error: BaseException | None) -> bool:
+    """Return whether an error, or one that it came from, says that memory is out.
+
+    MemoryError, ENOMEM and OpenCV's error -4 do. What others say - the loader of libraries, GDAL, HDF5, threads -
+    counts where no memory can be had: a loader fails so for want of leave to run a file, GDAL on a damaged one.
+    """
+    seen, words = list[BaseException](), ""
+    while error is not None and error not in seen:
+        seen.append(error)
+        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+            return True
+        if type(error).__module__ == "cv2" and "(-4:" in str(error):
+            return True
+        words = words if isinstance(error, BarpcError) else f"{words} {error}"
+        error = error.__cause__ or error.__context__
+    return bool(_MEMORY.search(words)) and not _OTHER.search(words) and not has_room()
 
 
 def listed(names: Sequence[str], most: int = 10) -> str:

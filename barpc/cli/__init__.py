@@ -19,11 +19,12 @@ from typing import Any
 import click
 
 from barpc import __version__
-from barpc.base.errors import BarpcError, BarpcWarning
+from barpc.base.errors import BarpcError, BarpcWarning, has_room, out_of_memory
 from barpc.cli.process import EXIT_INTERRUPTED, INTERRUPTED, hold_streams, interruptible
 from barpc.cli.terminal import EXIT_GATE as EXIT_GATE
 from barpc.cli.terminal import THREADS, Formatter, echo, say
 
+_LIBRARIES = 512 << 20  # bytes that numpy, scipy, GDAL and OpenCV map: 460 MB, of which OpenBLAS waits for its own
 _OBJECTS = 50_000  # made between two looks for cycles
 
 EXIT_FAILED = 1
@@ -129,6 +130,8 @@ def cli(ctx: click.Context, /, verbose: int, quiet: bool, **_: bool) -> None:
     usage; 3 finished, but an image, a control point or a file needs a look (the last line says which and why); 130
     interrupted.
     """
+    if not has_room(_LIBRARIES):  # OpenBLAS tries for ever, deaf to signals
+        raise MemoryError
     ctx.obj = {"quiet": quiet, "verbose": verbose}
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     handler = logging.StreamHandler(sys.stderr)
@@ -188,7 +191,7 @@ def _told(error: BaseException) -> tuple[int, str]:
     text = f"unexpected {type(error).__name__}: {error}; this is a bug: please report what --debug shows"
     if isinstance(error, BarpcError):
         text = str(error)
-    elif isinstance(error, MemoryError):
+    elif out_of_memory(error):
         kept = "what was finished is kept: run the same command again, with a smaller -j or [tie] tile"
         text = f"out of memory; {kept}"
     elif isinstance(error, OSError) and error.strerror:

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from barpc import __version__
-from barpc.base.errors import AdjustError, BarpcError, InputError
+from barpc.base.errors import AdjustError, BarpcError, InputError, out_of_memory
 from barpc.base.frozen import Arrays, from_arrays, to_arrays
 from barpc.base.identity import Input, guarded
 from barpc.base.sidefile import MB
@@ -328,10 +328,11 @@ def run_batch(
             with guarded(inputs):
                 value = fn(*(task.load() if isinstance(task, Spilled) else task))
             outcomes.append((time.perf_counter() - start, value, None))
-        except Exception as error:  # noqa: BLE001  (raised again where the result is asked for)
-            if not isinstance(error, BarpcError):
-                error.add_note("in a worker:\n" + traceback.format_exc())
-            outcomes.append((time.perf_counter() - start, None, error))
+        except Exception as failed:  # noqa: BLE001  (raised again where the result is asked for)
+            failure = MemoryError() if out_of_memory(failed) else failed  # there, room may be found
+            if not isinstance(failure, BarpcError):
+                failure.add_note("in a worker:\n" + traceback.format_exc())
+            outcomes.append((time.perf_counter() - start, None, failure))
     return outcomes, time.thread_time() - cpu
 
 

@@ -28,7 +28,7 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.transform import RPCTransformer
 
-from barpc.base.errors import OutputError
+from barpc.base.errors import OutputError, out_of_memory
 from barpc.base.geodesy import Array, wrap_longitude
 from barpc.cameras import open_camera
 from barpc.fit.points import EXACT, Sample
@@ -178,6 +178,8 @@ def _readings(
                     error, rms = measure(consumer, consumer.open(path if name == "barpc" else lent()))
                 note = "" if np.isfinite(error) else "it projects to no finite point"
             except Exception as failure:
+                if out_of_memory(failure):
+                    raise MemoryError from failure
                 if isinstance(failure, OSError) and failure.errno in _MACHINE:
                     raise OutputError(f"{path}: cannot be opened as {name} does ({failure.strerror})") from failure
                 note = " ".join(f"{type(failure).__name__}: {failure}".split())
