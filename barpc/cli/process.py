@@ -9,8 +9,9 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from types import FrameType
 from typing import Any
 
@@ -63,6 +64,15 @@ def hold_streams() -> None:
 
 # --- signals ----------------------------------------------------------------------------------------------
 
+_at_last: list[Callable[[], None]] = []
+
+
+@atexit.register
+def _leave() -> None:
+    """Run at exit behind what libraries do there: registered before they are imported."""
+    for work in _at_last:
+        work()
+
 
 class Interrupt:
     """Handler of SIGINT and SIGTERM: the first raises KeyboardInterrupt, one after `CLEAN_UP` ends the process."""
@@ -114,7 +124,7 @@ def interruptible(own: bool) -> Iterator[Interrupt]:
         for number in before:
             signal.signal(number, interrupt)
     if own:
-        atexit.register(interrupt.leave, tuple(before))
+        _at_last.append(partial(interrupt.leave, tuple(before)))
     try:
         yield interrupt
     finally:
