@@ -147,6 +147,9 @@ class RpcFit:
         there [px]; 0 for given points. What else projects with the model may be off by as much more.
     axes : str, exchanged longitude and latitude, or the altitude's sign, of a model or a grid, in words
     reason : Reason or None, cause of a miss of the tolerance, of a model
+    height_px : float
+        Standard deviation of projections [px] of ground 100 m above or below given points by the first power of the
+        altitude alone, at least; 0 for a model.
     """
 
     rpc: RPC
@@ -167,6 +170,7 @@ class RpcFit:
     contradiction: float = 0.0
     axes: str = ""
     reason: Reason | None = None
+    height_px: float = 0.0
 
     def __repr__(self) -> str:
         return f"RpcFit({self.method}, at most {self.max_ckp.max():.2g} px at {self.num_ckp} check points, {self.rpc})"
@@ -214,6 +218,12 @@ class RpcFit:
             return "the RPC has a pole near the scene: use more control points, or a smaller pole_margin"
         if not self.roundtrip <= max(tolerance, EXACT):
             return f"the RPC cannot be inverted over the scene (round trip {self.roundtrip:.3g} px)"
+        if not self.height_px <= tolerance:
+            low, high = self.rpc.ground_offset[2] + self.rpc.ground_scale[2] * np.array([-1.0, 1.0])
+            return (
+                f"the points hold no height terms: the RPC is good at their altitudes alone, {low:.6g} to {high:.6g} "
+                f"m, and 100 m beyond off by {self.height_px:.3g} px or more: give points at other altitudes too"
+            )
         return "" if self.localisation is None else self.localisation.verdict(tolerance)
 
 

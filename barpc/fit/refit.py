@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import BarpcWarning, FitError
-from barpc.base.geodesy import CHUNK, Array, wrap_longitude
+from barpc.base.geodesy import CHUNK, Array, metres_per_unit, wrap_longitude
 from barpc.base.options import FitOptions
 from barpc.fit.axes import wrong_axes, wrong_axes_of_grid
 from barpc.fit.certificate import Localisation, RpcFit, coverage, off, reason, roundtrip
@@ -20,6 +20,7 @@ from barpc.fit.points import EXACT, Errors, Sample, checked_points, column_range
 from barpc.fit.system import FitProblem, Normalization
 from barpc.sensor import SensorModel
 from barpc.sensor.displaced import Splined
+from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 
 Seen = Callable[[RPC, FitSolution], tuple[Errors, Array]]
@@ -183,11 +184,37 @@ def fit_rpc_points(
         for residual in left:
             errors.add(residual)
         loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // CHUNK)])
-        return replace(_certified(solution, errors, errors.largest, loop, size), axes=axes)
+        fit = _certified(solution, errors, errors.largest, loop, size)
+        rpc = _within(fit.rpc, cnp[:, 2]) if options.precision is None and vendor is None else fit.rpc
+        return replace(fit, rpc=rpc, axes=axes, height_px=_height_unknown(*given, float(fit.rmse_cnp.max())))
 
     fit = _best(attempt, options, vendor, strict, exact=False)
     seen = partial(_left_out, held_out, *given)
     return _localised(fit, lambda rpc, _: inverse(rpc, *given, weight), seen, options, strict, exact=False)
+
+
+def _within(rpc: RPC, alt: Array) -> RPC:
+    """Return the same RPC, stated for no other altitudes than those of points (N,) [m], and a metre at least."""
+    scale = rpc.ground_scale.copy()
+    scale[2] = max(float(f"{0.5 * np.ptp(alt):.12g}"), 1.0)
+    powers = monomials(np.array([[1.0], [1.0], [scale[2] / rpc.ground_scale[2]]]))[:, 0]
+    return replace(rpc, coeffs=rpc.coeffs * powers, ground_scale=scale)
+
+
+def _height_unknown(ground: Array, image: Array, rmse: float) -> float:
+    """Return what 100 m of altitude do to a projection [px], as far as points met to `rmse` [px] leave it open.
+
+    The slope of col or row by altitude is known by the altitudes that longitude and latitude do not tell (of a surface
+    its relief, less a cubic). Of none of these all is open: 100 m are as much aside under 45 degrees.
+    """
+    low, high = column_ranges(ground)
+    place = monomials(((ground - 0.5 * (low + high)) / np.maximum(0.5 * (high - low), 1e-9)).T)
+    flat = place[[0, 1, 2, 4, 7, 8, 11, 12, 14, 15]].T  # the terms without altitude
+    rest = ground[:, 2] - flat @ np.linalg.lstsq(flat, ground[:, 2], rcond=None)[0]
+    scatter = float(np.linalg.norm(rest))
+    metres = np.ptp(ground[:, :2], axis=0) * metres_per_unit(0.5 * (low + high))[:2]
+    pixels = float(np.linalg.norm(np.ptp(image, axis=0)) / np.linalg.norm(metres))
+    return 100.0 * min(rmse / max(scatter, 1e-12), pixels)
 
 
 def _looked_at(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:

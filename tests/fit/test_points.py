@@ -120,10 +120,38 @@ def test_layers_at_two_altitudes_do_not_make_the_zero_solution(camera: Camera) -
 def test_points_at_one_altitude_give_an_rpc_for_that_altitude(camera: Camera) -> None:
     image = np.random.default_rng(10).uniform(0, 19000, (200, 2))
     ground = camera.model.localize(image, np.full(200, 200.0))
-    fit = fit_rpc_points(ground, image)
+    with pytest.raises(FitError, match=r"no height terms: .* altitudes alone, 199 to 201 m, and 100 m beyond off by"):
+        fit_rpc_points(ground, image)
+    fit = fit_rpc_points(ground, image, strict=False)
     assert np.abs(fit.rpc.project(ground) - image).max() <= 1e-3
-    assert fit.rpc.ground_scale[2] == 50.0
+    assert fit.rpc.ground_scale[2] == 1.0
     assert np.isfinite(fit.rpc.coeffs).all()
+    higher = camera.model.localize(image, np.full(200, 300.0))
+    assert 1.0 < np.abs(fit.rpc.project(higher) - image).max() < fit.height_px  # the worst that a camera may look aside
+
+
+@pytest.mark.parametrize("relief", [3.0, 22.0, 400.0])
+def test_points_on_a_surface_tell_heights_as_far_as_its_relief_lets_them(camera: Camera, relief: float) -> None:
+    """What is said of ground 100 m higher, by noise of 0.3 px, is the least it is off by; the range is the points'."""
+    said, off = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        image = rng.uniform(0, 19000, (400, 2))
+        alt = 200.0 + relief * rng.uniform(-0.5, 0.5, 400)
+        ground = camera.model.localize(image, alt)
+        noisy = image + rng.normal(0.0, 0.3, image.shape)
+        fit = fit_rpc_points(ground, noisy, options=FitOptions(tolerance=3.0), strict=False)
+        assert fit.rpc.ground_offset[2] == pytest.approx(200.0, abs=0.1 * relief)
+        assert fit.rpc.ground_scale[2] == pytest.approx(0.5 * relief, rel=0.1)
+        inside = camera.model.localize(image, np.full(400, 200.0))
+        assert np.sqrt(np.mean((fit.rpc.project(inside) - image) ** 2)) < 0.3
+        higher = camera.model.localize(image, np.full(400, 300.0))
+        off.append(np.mean((fit.rpc.project(higher) - fit.rpc.project(inside)) ** 2))
+        said.append(fit.height_px)
+        assert ("no height terms" in fit.verdict(3.0)) == (fit.height_px > 3.0)
+    assert np.ptp(said) < 0.3 * np.mean(said)
+    assert (np.mean(said) > 1.0) == (relief == 3.0)
+    assert np.sqrt(np.mean(off)) > 0.5 * np.mean(said)
 
 
 @pytest.mark.parametrize("shift", [360.0, -360.0])
