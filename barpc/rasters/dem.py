@@ -207,6 +207,12 @@ class Dem:
         height = self.grid.sample(lon, lat)
         return height if self.geoid is None else height + self.geoid.sample(lon, lat)
 
+    def posts(self, lon: Array, lat: Array) -> Array:
+        """Return numbers (n, 4) of the posts whose heights make those at lon, lat (n,) [deg]; NaN at no place."""
+        row, col = (np.floor(one) for one in self.grid.locate(lon, lat))
+        first = row * self.grid.shape[1] + col
+        return np.stack([first, first + 1, first + self.grid.shape[1], first + self.grid.shape[1] + 1], axis=1)
+
     def between(self, start: Array, end: Array) -> tuple[float, float, float]:
         """Return, for lines from `start` to `end` (N, 3), the most posts that one passes, and the terrain's ends [m].
 

@@ -154,6 +154,7 @@ class Relief:
     delivered: Array  # (3,) how they lie to the DEM as delivered: level, rise to the east, to the north [m]
     fit: Array  # (3, P) that by the heights of the points
     cameras: Array  # (3,) what the cameras' accuracies let expect of that [m]; NaN where they do not say
+    posts: Array | None = None  # (P, 4) numbers of the DEM's posts about the points, where it has some
 
     def beyond(self, bias: float) -> Array:
         """Return level and slopes (3,) above the DEM as delivered, over what cameras and a `bias` [m] allow."""
@@ -178,6 +179,8 @@ class Relief:
         off = ground[index, 2] - np.asarray(terrain(ground[index, 0], ground[index, 1]))
         index, off = index[np.isfinite(off)], off[np.isfinite(off)]
         tell, fit, unknown = np.zeros(len(strong), dtype=bool), np.zeros((3, len(strong))), np.full(3, np.nan)
+        posts_of = getattr(terrain, "posts", None)
+        posts = None if posts_of is None else posts_of(ground[:, 0], ground[:, 1])
         if len(index) < MANY:
             return cls(None, tell, unknown, fit, unknown)
         bands = Bands.of(terrain, ground[index])
@@ -191,7 +194,11 @@ class Relief:
             near = left <= OUTLIER * robust_spread(left)
         tell[index[sharp[index] < max(robust_spread(left), stated)]] = True
         fit[:, index] = np.linalg.pinv(flat)
-        return cls(bands, tell, delivered, fit, unknown)
+        return cls(bands, tell, delivered, fit, unknown, posts)
+
+    def independent(self, points: IntArray) -> float:
+        """Return the number of independent heights that a DEM has at points (n,), at most: of its posts there."""
+        return np.inf if self.posts is None else float(len(np.unique(self.posts[points])))
 
 
 def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Believed | None:
@@ -219,7 +226,7 @@ def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Be
     kept, bent = (smooth @ trend).sum(axis=1), heights.T - smooth @ trend
     bent_slopes = slopes - np.einsum("nmx,mk->knx", by_place, trend)
     above = ground[:, 2] - kept
-    found = _compared(at, above, bent, bent_slopes, smooth, tell)
+    found = _compared(at, above, bent, bent_slopes, smooth, tell, relief.independent(index[tell]))
     fits, left, rising = found.fits, found.left, found.rising
     freedom = max(int(fits.sum()) - found.unknowns, 1)
     pull = rising[fits] - smooth[fits] @ _coefficients(smooth[fits], rising[fits])
@@ -232,7 +239,7 @@ def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Be
         smooth,
         found.gains,
         float(np.sqrt((STATED * stated**2 + (left[fits] ** 2).sum()) / (STATED + freedom))),
-        _summed(at[fits], pull * left[fits, None]),
+        max(_summed(at[fits], pull * left[fits, None]), fits.sum() / relief.independent(index[fits])),
         times,
         shows,
     )
@@ -250,18 +257,22 @@ class _Compared:
     unknowns: int
 
 
-def _compared(at: Array, above: Array, bent: Array, slopes: Array, smooth: Array, tell: BoolArray) -> _Compared:
+def _compared(
+    at: Array, above: Array, bent: Array, slopes: Array, smooth: Array, tell: BoolArray, independent: float
+) -> _Compared:
     """Return the heights (n,) [m] of points that `tell` (n,) by bands (n, K) of slopes (K, n, 2), a motion
     and a bend (n, m).
 
-    Where hills are too few to be told from what errors happen to be, no slope is believed.
+    Where hills are too few to be told from what errors happen to be, no slope is believed: as many as the slopes show,
+    and as the DEM has `independent` heights at most.
     """
     from scipy.optimize import lsq_linear  # a fifth of a second, of blocks with a DEM alone
 
     gains, fits, both, believes = np.ones(bent.shape[1]), tell, np.column_stack([above, bent]), True
     for _ in range(BACKFITTING):
         rising = np.einsum("k,knx->nx", gains, slopes)
-        believes = believes and fits.sum() > _HILLS * _summed(at[fits], rising[fits] - rising[fits].mean(axis=0))
+        hills = fits.sum() / _summed(at[fits], rising[fits] - rising[fits].mean(axis=0))
+        believes = believes and min(hills, independent) > _HILLS
         moved = smooth
         if believes:  # a shift, a turn, a growth
             moved = np.column_stack([smooth, *(rising * smooth[:, k, None] for k in range(3))])
