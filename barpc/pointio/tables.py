@@ -144,7 +144,7 @@ class _Texts:
 def _whole(cells: list[str]) -> IntArray | None:
     """Return texts as the numbers (N,) that they are; None unless all are written as `str` does."""
     joined = "".join(cells)
-    if not (joined.isascii() and joined.isdecimal()) or max(map(len, cells)) > _DIGITS:
+    if not (joined.isascii() and joined.isdecimal() and all(cells)) or max(map(len, cells)) > _DIGITS:
         return None
     values = np.array(cells, dtype=np.int64)
     digits = len(values) + sum(np.count_nonzero(values >= 10**n) for n in range(1, _DIGITS))

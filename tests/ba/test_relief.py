@@ -280,8 +280,44 @@ def test_a_wrong_dem_neither_bends_nor_moves_a_scene(seed: int, kind: str) -> No
     assert found.terrain.shows == (kind != "shows")
     assert {"tilt": beyond[1] > 10, "level": beyond[0] > 7, "shows": found.terrain.held == 0}[kind]
     assert after.left < 0.05
-    assert after.tilt < 1.0
+    assert after.tilt < 1.3  # of what splines over the rows of a pair follow beside it, at most
     assert (np.abs(np.array(after.move) / found.gauge.sigma) < 3.0).all()
+
+
+def test_heights_between_the_same_posts_are_no_independent_ones() -> None:
+    """A DEM of wide posts: as many heights as posts under the points, and slopes of no more hills than these."""
+    rng = np.random.default_rng(0)
+    at = rng.uniform(0.0, 2000.0, (400, 2))
+    ground = np.column_stack([5.0 + at[:, 0] / 80e3, 44.0 + at[:, 1] / 111e3, np.zeros(400)])
+    ground[:, 2] = 300.0 + 40.0 * np.sin(at[:, 0] / 130.0) + 30.0 * np.cos(at[:, 1] / 110.0)
+
+    class Posts:
+        def __init__(self, step: float) -> None:
+            self.step = step
+
+        def __call__(self, lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+            east, north = (np.asarray(lon) - 5.0) * 80e3, (np.asarray(lat) - 44.0) * 111e3
+            return 300.0 + 40.0 * np.sin(east / 130.0) + 30.0 * np.cos(north / 110.0)
+
+        def posts(self, lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+            col, row = np.floor((lon - 5.0) * 80e3 / self.step), np.floor((lat - 44.0) * 111e3 / self.step)
+            first = row * 1000.0 + col
+            return np.stack([first, first + 1, first + 1000, first + 1001], axis=1)
+
+    every = np.arange(400)
+    noisy = ground + rng.normal(0.0, 1.0, (400, 1)) * [0.0, 0.0, 1.0]
+    found = {}
+    for step in (20.0, 400.0, 1000.0):
+        dem = Posts(step)
+        relief = Relief.of(dem, noisy, np.ones(400, dtype=bool), np.full(400, 0.3), 2.0)
+        told = believe(relief, every, noisy, 2.0)
+        assert told is not None
+        found[step] = told.alike, np.abs(told.slopes).max()
+    assert found[20.0][0] < 4.0  # some hundred posts
+    assert found[400.0][0] == pytest.approx(400 / 36, rel=0.15)
+    assert found[1000.0][0] == pytest.approx(400 / 9, rel=0.15)
+    assert found[20.0][1] > 0.1
+    assert found[1000.0][1] < 0.5 * found[20.0][1]
 
 
 @pytest.mark.slow
