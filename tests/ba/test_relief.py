@@ -285,7 +285,7 @@ def test_a_wrong_dem_neither_bends_nor_moves_a_scene(seed: int, kind: str) -> No
 
 
 def test_heights_between_the_same_posts_are_no_independent_ones() -> None:
-    """A DEM of wide posts: as many heights as posts under the points, and slopes of no more hills than these."""
+    """A DEM of wide posts has as many heights as posts under the points."""
     rng = np.random.default_rng(0)
     at = rng.uniform(0.0, 2000.0, (400, 2))
     ground = np.column_stack([5.0 + at[:, 0] / 80e3, 44.0 + at[:, 1] / 111e3, np.zeros(400)])
@@ -312,12 +312,10 @@ def test_heights_between_the_same_posts_are_no_independent_ones() -> None:
         relief = Relief.of(dem, noisy, np.ones(400, dtype=bool), np.full(400, 0.3), 2.0)
         told = believe(relief, every, noisy, 2.0)
         assert told is not None
-        found[step] = told.alike, np.abs(told.slopes).max()
-    assert found[20.0][0] < 4.0  # some hundred posts
-    assert found[400.0][0] == pytest.approx(400 / 36, rel=0.15)
-    assert found[1000.0][0] == pytest.approx(400 / 9, rel=0.15)
-    assert found[20.0][1] > 0.1
-    assert found[1000.0][1] < 0.5 * found[20.0][1]
+        found[step] = told.alike
+    assert found[20.0] < 4.0  # some hundred posts
+    assert found[400.0] == pytest.approx(400 / 36, rel=0.15)
+    assert found[1000.0] == pytest.approx(400 / 9, rel=0.15)
 
 
 @pytest.mark.slow
