@@ -171,17 +171,15 @@ def fit_rpc_points(
     """
     options = options or FitOptions()
     cnp, cnp_image = given = _looked_at(ground, image)
-    axes = wrong_axes_of_grid(*given)
-    weight = relative_weight(sigma, len(cnp))
+    axes, weight = wrong_axes_of_grid(*given), relative_weight(sigma, len(cnp))
     held_out = None if check is None else checked_points(*check)
 
     def attempt(method: str) -> RpcFit:
         solution = solve(cnp, cnp_image, options, method, weight=weight, vendor=vendor)
-        left = solution.leave_one_out()
-        if held_out is not None:
-            left = iter([solution.rpc.project(held_out[0]) - held_out[1]])
         errors = Errors()
-        for residual in left:
+        if held_out is not None:
+            errors.add(solution.rpc.project(held_out[0]) - held_out[1])
+        for residual in solution.leave_one_out() if held_out is None else ():
             errors.add(residual)
         loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // CHUNK)])
         fit = _certified(solution, errors, errors.largest, loop, size)

@@ -176,8 +176,7 @@ def adjust(
         summary = _summed_up(run, inputs.values(), workspace, progress)
         workspace.remove_stale()
         root = workspace.seal()
-    sensors = run.after or run.before
-    views = [replace(view, sensor=sensor) for view, sensor in zip(run.views, sensors, strict=True)]
+    views = [replace(view, sensor=one) for view, one in zip(run.views, run.after or run.before, strict=True)]
     return AdjustResult(_as_given(views, images, options), run, summary, root)
 
 
