@@ -7,8 +7,8 @@ columns of a table there, it stands in that, too. A module for each thing: views
 from __future__ import annotations
 
 import platform
+import sys
 from collections.abc import Mapping
-from importlib.metadata import version as package_version
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -131,11 +131,16 @@ def published_schema() -> dict[str, Any]:
     }
 
 
+def _versions() -> dict[str, str]:
+    """Return the versions of the libraries that computed, as they say them."""
+    names = {"numpy": "numpy", "scipy": "scipy", "cv2": "opencv", "rasterio": "rasterio", "shapely": "shapely"}
+    return {name: str(sys.modules[module].__version__) for module, name in names.items() if module in sys.modules}
+
+
 def measure_run(run: Run) -> Summary:
     """Return the summary of a run, without the verdict on it. Numbers may be NaN here."""
     usable, written = int(np.isfinite(run.ground).all(axis=1).sum()), len(run.written_tracks)
     lengths = np.bincount(np.bincount(run.tracks.point))
-    names = ("numpy", "scipy", "opencv-python-headless", "rasterio", "shapely")
     return Summary(
         schema=SCHEMA,
         barpc=__version__,
@@ -163,5 +168,5 @@ def measure_run(run: Run) -> Summary:
         reference=known.measure_reference(run),
         stages=tuple(StageEntry.read(stage) for stage in run.stages),
         options=plain(run.options),
-        versions={"python": platform.python_version(), **{name: package_version(name) for name in names}},
+        versions={"python": platform.python_version(), **_versions()},
     )
