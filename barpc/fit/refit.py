@@ -205,11 +205,11 @@ def _height_unknown(ground: Array, image: Array, rmse: float) -> float:
     The slope of col or row by altitude is known by the altitudes that longitude and latitude do not tell (of a surface
     its relief, less a cubic). Of none of these all is open: 100 m are as much aside under 45 degrees.
     """
-    low, high = column_ranges(ground)
-    place = monomials(((ground - 0.5 * (low + high)) / np.maximum(0.5 * (high - low), 1e-9)).T)
+    (low, high), some = column_ranges(ground), ground[:: max(1, len(ground) // CHUNK)]
+    place = monomials(((some - 0.5 * (low + high)) / np.maximum(0.5 * (high - low), 1e-9)).T)
     flat = place[[0, 1, 2, 4, 7, 8, 11, 12, 14, 15]].T  # the terms without altitude
-    rest = ground[:, 2] - flat @ np.linalg.lstsq(flat, ground[:, 2], rcond=None)[0]
-    scatter = float(np.linalg.norm(rest))
+    rest = some[:, 2] - flat @ np.linalg.lstsq(flat, some[:, 2], rcond=None)[0]
+    scatter = float(np.linalg.norm(rest)) * (len(ground) / len(some)) ** 0.5
     metres = np.ptp(ground[:, :2], axis=0) * metres_per_unit(0.5 * (low + high))[:2]
     pixels = float(np.linalg.norm(np.ptp(image, axis=0)) / np.linalg.norm(metres))
     return 100.0 * min(rmse / max(scatter, 1e-12), pixels)
