@@ -20,7 +20,16 @@ from barpc.base.errors import ImageError, RpcFormatError
 from barpc.base.geodesy import Array
 from barpc.base.remote import Place
 from barpc.base.sidefile import IMAGE, opened, read_head
-from barpc.rpcio.text import COEFFICIENTS, SINGLE, WIDTHS, cells_of, fields_from_rpc, fields_in_order, rpc_from_fields
+from barpc.rpcio.text import (
+    COEFFICIENTS,
+    SINGLE,
+    WIDTHS,
+    cells_of,
+    fields_from_rpc,
+    fields_in_order,
+    in_order_b,
+    rpc_from_fields,
+)
 from barpc.sensor.rational import DERIVATIVE, POWERS
 from barpc.sensor.rpc import RPC
 
@@ -194,9 +203,6 @@ def _counted_from(rpc: RPC, image_offset: Array, image_scale: Array) -> RPC:
 
 _WIDTHS = (7, 7, *WIDTHS)
 
-# Position in RPC00A of each of RPC00B's twenty monomials.
-_B_FROM_A = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 7, 11, 14, 17, 12, 15, 18, 13, 16, 19)
-
 
 def read_nitf(path: Place) -> RPC | None:
     """Read the RPC in a NITF's RPC00B (or RPC00A) extension, None without one; RpcFormatError where it is not valid."""
@@ -209,9 +215,7 @@ def read_nitf(path: Place) -> RPC | None:
     if not record.startswith("1"):
         raise RpcFormatError(f"{name}: its SUCCESS flag is {record[:1]!r}, not 1: the vendor's fit failed")
     fields = cells_of(record[1:], _WIDTHS, SINGLE, name)
-    if match.group(1) == b"A":
-        fields |= {key: [fields[key][i] for i in _B_FROM_A] for key in COEFFICIENTS}
-    return rpc_from_fields(fields, name)
+    return rpc_from_fields(in_order_b(fields, f"RPC00{match.group(1).decode()}", name), name)
 
 
 def nitf_record(rpc: RPC) -> str:

@@ -41,7 +41,8 @@ def _has(*patterns: str) -> Callable[[str], bool]:
 
 
 _BESIDE = "gdal, beside an image"
-_TXT = _has(r"(?im)^[ \t]*+LINE_NUM_COEFF(_1)?[ \t]*+[:=](?(1)|[ \t]*+[-+.\d])")
+# OSSIM's keys, in small letters, have two digits
+_TXT = _has(r"(?im)^[ \t]*+(?:[a-z][\w.]*?[._])?LINE_NUM_COEFF(_1|(?-i:(?<=F)_01))?[ \t]*+[:=](?(1)|[ \t]*+[-+.\d])")
 _RPB = _has(r"(?i)lineNumCoef\s*+=")
 _GEOM = _has(r"(?m)^[ \t]*+(\w++\.)?line_num_coeff_00[ \t]*+:")
 _MAXAR = _has(r"<(\w+:)?LINENUMCOEF")

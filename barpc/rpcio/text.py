@@ -9,8 +9,8 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -52,26 +52,80 @@ class ReadOptions:
     """Which band's RPC, from 1, where a file holds one for each."""
 
 
+_UNITS = {
+    word: (measure, size)
+    for measure, size, words in (
+        ("pixels", 1.0, "px pixel pixels line lines row rows sample samples column columns"),
+        ("degrees", 1.0, "deg degree degrees decimaldegree decimaldegrees"),
+        ("degrees", 180.0 / math.pi, "rad radian radians"),
+        ("metres", 1.0, "m meter meters metre metres"),
+        ("metres", 0.3048, "ft foot feet internationalfoot internationalfeet"),
+        ("metres", 1200.0 / 3937.0, "ftus usft usfoot usfeet surveyfoot surveyfeet ussurveyfoot ussurveyfeet"),
+    )
+    for word in words.split()
+}
+"""Unit, as files write it behind a number -> what it measures, and how many of the unit of `Fields` it is."""
+_MEASURES = {
+    "pixels": re.compile(r"(?i)(line|samp|row|col)(?!.*(num|den))"),
+    "degrees": re.compile(r"(?i)(lat|lon)(?!.*(num|den))"),
+    "metres": re.compile(r"(?i)(height|alt|err|bias|rand)"),
+}
+_WORDS = re.compile(r"[\s(\[]*([^\W\d_][^\W\d]*(?:[\s.-]+[^\W\d]+){0,4})")
+
+
+class Stated(float):
+    """A number with a unit behind it, in that of `Fields`."""
+
+    size = 1.0  # of its own unit
+
+
+def _measure(key: str) -> str | None:
+    """Return the unit of a field, by the name that a file has for it; None of coefficients, which have none."""
+    return next((measure for measure, names in _MEASURES.items() if names.match(key)), None)
+
+
+def _size(rest: str, name: str, key: str) -> float | None:
+    """Return the size of the unit behind a number of a field, None without one; RpcFormatError where it is no such."""
+    found, measure = _WORDS.match(rest.replace("°", " deg ")), _measure(key)
+    if found is None or measure is None:
+        return None
+    words = found[1].lower().replace("_", " ").replace("-", " ").replace(".", " ").split()
+    for end in range(len(words), 0, -1):
+        unit = _UNITS.get("".join(words[:end]))
+        if unit is not None and unit[0] == measure and all(len(word) > 1 for word in words[end : end + 1]):
+            return unit[1]
+    raise RpcFormatError(f"{name}: {key} is in {rest.strip()[:40]!r}, expected {measure}")
+
+
 def number(text: str, name: str, key: str) -> float:
-    """Return the number at the start of `text` (or RpcFormatError); a unit may follow; 1D3 is Fortran's 1E3."""
+    """Return the number at the start of `text` (or RpcFormatError); 1D3 is Fortran's 1E3.
+
+    A unit may follow: `Stated` numbers are in pixels, degrees or metres; what is no unit of `key` is refused.
+    """
     text = text.strip()
     match = NUMBER.match(text)
     rest = text[match.end() :] if match else text
-    if match is None or (rest and not rest[0].isspace() and rest[0] not in "°%"):
+    apart = not rest or rest[0].isspace() or rest[0] in "°%" or (rest[0].isalpha() and _measure(key) is not None)
+    if match is None or not apart:
         raise RpcFormatError(f"{name}: {key} is not a number ({text[:40]!r})")
-    found = match.group()
+    found, size = match.group(), _size(rest, name, key) if rest else None
     try:
         value = float(found)
     except ValueError:
         value = float(found.upper().replace("D", "E"))
     if not math.isfinite(value):
         raise RpcFormatError(f"{name}: {key} is not finite ({text[:40]!r})")
-    return value
+    if size is None:
+        return value
+    stated = Stated(value * size)
+    stated.size = size
+    return stated
 
 
 def listed_numbers(text: str, name: str, key: str) -> list[float]:
-    """Return the numbers of a list separated by blanks or commas."""
-    return [number(part, name, key) for part in re.split(r"[\s,]+", text.strip()) if part]
+    """Return the numbers of a list separated by blanks or commas, of a measure each with its unit, if any."""
+    apart = r"[\s,]+" if _measure(key) is None else r"[\s,]+(?=[-+.\d]|nan\b|inf)"
+    return [number(part, name, key) for part in re.split(apart, text.strip(), flags=re.IGNORECASE) if part]
 
 
 def format_number(value: float) -> str:
@@ -79,27 +133,39 @@ def format_number(value: float) -> str:
     return repr(float(value)).removesuffix(".0")
 
 
-def collect_numbered(pairs: Iterable[tuple[str, float]], name: str, first: int = 1) -> Fields:
-    """Gather ``LINE_NUM_COEFF_1 .. _20`` (the first index is `first`) into lists, in whatever order they come."""
+def collect_numbered(pairs: Iterable[tuple[str, float]], name: str) -> Fields:
+    """Gather ``LINE_NUM_COEFF_1 .. _20``, or ``_0 .. _19``, into lists, in whatever order they come."""
     single: dict[str | int, float] = {}
     lists: dict[str, dict[str | int, float]] = {}
     for key, value in pairs:
         found = _INDEXED.fullmatch(key)
-        slot = int(found[2][:9]) - first if found else key
+        slot = int(found[2][:9]) if found else key
         known = (lists.setdefault(found[1], {}) if found else single).setdefault(slot, value)
         if known != value:
             raise RpcFormatError(f"{name}: {key} is given twice, {known} and {value}")
     for stem, values in lists.items():
-        if set(values) != set(range(20)):
-            raise RpcFormatError(f"{name}: {stem} has {len(values)} coefficients, expected 20")
+        if set(values) not in (set(range(20)), set(range(1, 21))):
+            raise RpcFormatError(f"{name}: {stem} has {len(values)} coefficients, expected 20, numbered from 0 or 1")
     one = {str(key): [value] for key, value in single.items()}
-    return one | {stem: [values[i] for i in range(20)] for stem, values in lists.items()}
+    return one | {stem: [values[i] for i in sorted(values)] for stem, values in lists.items()}
 
 
 def fields_in_order(values: Sequence[float], keys: Sequence[str]) -> Fields:
     """Return the fields of numbers without names: single ones `keys`, then four times twenty coefficients."""
     fields: Fields = {key: [value] for key, value in zip(keys, values, strict=False)}
     return fields | {key: list(values[len(keys) + 20 * i :][:20]) for i, key in enumerate(COEFFICIENTS)}
+
+
+# Position in RPC00A of each of RPC00B's twenty monomials.
+_B_FROM_A = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 7, 11, 14, 17, 12, 15, 18, 13, 16, 19)
+
+
+def in_order_b(fields: Fields, order: str, name: str) -> Fields:
+    """Return the fields with coefficients in RPC00B's order, of one that a file calls "RPC00A" or "RPC00B"."""
+    if order not in ("RPC00A", "RPC00B"):
+        raise RpcFormatError(f"{name}: coefficients in the order {order[:40]!r}, only RPC00A and RPC00B are read")
+    lists = (key for key in COEFFICIENTS if order == "RPC00A" and len(fields.get(key, ())) == len(_B_FROM_A))
+    return fields | {key: [fields[key][i] for i in _B_FROM_A] for key in lists}
 
 
 def rpc_from_fields(
@@ -120,6 +186,10 @@ def rpc_from_fields(
             what = "is missing" if not found else f"has {found} numbers, expected {count}"
             raise RpcFormatError(f"{name}: {key} {what}")
     ground, image = ("LONG", "LAT", "HEIGHT"), ("SAMP", "LINE")
+    for axis in ground:
+        both = [getattr(fields[f"{axis}_{part}"][0], "size", None) for part in ("OFF", "SCALE")]
+        if None in both and set(both) - {None, 1.0}:
+            raise RpcFormatError(f"{name}: of {axis}_OFF and {axis}_SCALE one states a unit, the other none")
     try:
         return RPC(
             coeffs=np.array([fields[f"{axis}_{part}_COEFF"] for axis in image for part in ("NUM", "DEN")]),
@@ -187,20 +257,41 @@ def _numbered(fields: Fields, separator: str, indices: Sequence[str]) -> list[st
     return lines
 
 
-def read_txt(text: str, name: str, options: ReadOptions, first: int = 1, words: Mapping[str, str] | None = None) -> RPC:
+_GEOM_ERRORS = {"BIAS_ERROR": "ERR_BIAS", "RAND_ERROR": "ERR_RAND"}
+
+
+def _lines(text: str, name: str) -> Iterator[tuple[str, str]]:
+    """Yield keys, in capitals, and values of a text; a prefix that all have, ``RPC_`` or ``image0.``, is left out."""
+    lines = [(match[1].upper(), match[2].strip().removesuffix(";")) for match in _LINE.finditer(text)]
+    found = {match[1] for key, _ in lines if (match := _PREFIX.fullmatch(key))}
+    if len(found - {""}) > 1:
+        raise RpcFormatError(f"{name}: RPCs of several images ({', '.join(sorted(found))}); give a file of one")
+    prefix = min(found, default="")
+    for key, value in lines:
+        if key.startswith(prefix):
+            yield key.removeprefix(prefix), value
+
+
+_PREFIX = re.compile(r"(|.*[._])LINE_OFF")
+
+
+def read_txt(text: str, name: str, options: ReadOptions) -> RPC:
     """Read ``KEY: value``, with or without a unit behind (GDAL, Planet, IKONOS, GeoEye, OrbView, KOMPSAT).
 
-    Coefficients are numbered from `first`, or twenty in a line, as GDAL has them; `words` are other names of keys.
+    Coefficients are numbered from 1 or 0, or twenty in a line, as GDAL has them.
     """
+    return rpc_from_fields(_fields_of_lines(_lines(text, name), name), name, options)
+
+
+def _fields_of_lines(lines: Iterable[tuple[str, str]], name: str) -> Fields:
     pairs: list[tuple[str, float]] = []
-    for match in _LINE.finditer(text):
-        key, value = match[1].upper(), match[2].strip().removesuffix(";")
-        key = (words or {}).get(key, key)
+    for word, value in lines:
+        key = _GEOM_ERRORS.get(word, word)
         if key in LISTS:
-            pairs += [(f"{key}_{i}", one) for i, one in enumerate(listed_numbers(value, name, key), first)]
+            pairs += [(f"{key}_{i}", one) for i, one in enumerate(listed_numbers(value, name, key), 1)]
         elif key in SINGLE or key.rpartition("_")[0] in LISTS:
             pairs.append((key, number(value, name, key)))
-    return rpc_from_fields(collect_numbered(pairs, name, first), name, options)
+    return collect_numbered(pairs, name)
 
 
 def write_txt(rpc: RPC) -> str:
@@ -213,7 +304,9 @@ def write_txt(rpc: RPC) -> str:
 _RPB_PAIR = re.compile(r"\b(\w++)\s*+=\s*+(\([^()]*+\)|[^;\n()]*+);?")
 
 
-def _read_words(pairs: Iterable[tuple[str, str]], words: Mapping[str, str], name: str, options: ReadOptions) -> RPC:
+def _read_words(
+    pairs: Iterable[tuple[str, str]], words: Mapping[str, str], name: str, options: ReadOptions, order: str = "RPC00B"
+) -> RPC:
     """Return the RPC of words, of a field each, and values: numbers, or lists of them in parentheses or brackets."""
     keys = {word.lower(): key for key, word in words.items()}
     fields: Fields = {}
@@ -225,14 +318,14 @@ def _read_words(pairs: Iterable[tuple[str, str]], words: Mapping[str, str], name
             raise RpcFormatError(f"{name}: {word} is given twice; give a file of one image")
         if bare_value not in ("null", "~"):
             fields[key] = listed_numbers(bare_value, name, word)
-    return rpc_from_fields(fields, name, options)
+    return rpc_from_fields(in_order_b(fields, order, name), name, options)
 
 
 def read_rpb(text: str, name: str, options: ReadOptions) -> RPC:
     """Read Maxar's ``key = value;`` with lists in parentheses."""
-    if re.search(r'SpecId\s*+=\s*+"RPC00A"', text, re.IGNORECASE):
-        raise RpcFormatError(f"{name}: coefficients in RPC00A order; only RPC00B is written to .RPB files")
-    return _read_words(_RPB_PAIR.findall(text), MAXAR, name, options)
+    spec = re.search(r'SpecId\s*+=\s*+"([^"\n]*+)"', text, re.IGNORECASE)
+    order = spec[1].strip().upper() if spec else "RPC00B"
+    return _read_words(_RPB_PAIR.findall(text), MAXAR, name, options, order)
 
 
 def write_rpb(rpc: RPC) -> str:
@@ -249,15 +342,47 @@ def write_rpb(rpc: RPC) -> str:
 
 # --- .geom ------------------------------------------------------------------------------------------------
 
-_GEOM_ERRORS = {"BIAS_ERROR": "ERR_BIAS", "RAND_ERROR": "ERR_RAND"}
-
 
 def read_geom(text: str, name: str, options: ReadOptions) -> RPC:
-    """Read OSSIM's keyword list, as OTB and CARS use it; the RPC of the FULL image."""
-    kind = re.search(r"^[ \t]*+polynomial_format:[ \t]*+(\w*+)", text, re.MULTILINE)
-    if kind and kind.group(1) != "B":
-        raise RpcFormatError(f"{name}: polynomial_format {kind.group(1)!r}, only B (RPC00B) is read")
-    return read_txt(text, name, options, 0, _GEOM_ERRORS)
+    """Read OSSIM's keyword list, as OTB and CARS use it, with its current adjustment; the RPC of the FULL image."""
+    lines = dict(_lines(text, name))
+    kind = lines.get("POLYNOMIAL_FORMAT", "B")
+    fields = in_order_b(_fields_of_lines(_lines(text, name), name), f"RPC00{kind}", name)
+    return _adjusted(rpc_from_fields(fields, name, options), lines, name)
+
+
+def _adjusted(rpc: RPC, lines: Mapping[str, str], name: str) -> RPC:
+    """Return an RPC with OSSIM's adjustments: offsets and scales of rows and columns, and a rotation.
+
+    Each is center + sigma * parameter. OSSIM rotates the quotients, which are quotients again only where both have one
+    denominator: else a rotation is refused.
+    """
+    current = f"ADJUSTMENT_{lines.get('CURRENT_ADJUSTMENT', '0').strip()}.ADJ_PARAM_"
+    sizes = dict.fromkeys("01234", 0.0)
+    for index in {key.removeprefix(current).partition(".")[0] for key in lines if key.startswith(current)}:
+        center, sigma, parameter = (
+            number(lines.get(f"{current}{index}.{part}", "0"), name, f"adj_param_{index}.{part.lower()}")
+            for part in ("CENTER", "SIGMA", "PARAMETER")
+        )
+        sizes[index] = center + sigma * parameter
+        if (parameter and not sigma) or (sizes[index] and index not in "01234"):
+            raise RpcFormatError(f"{name}: adj_param_{index} is no adjustment of OSSIM's RPC (0 to 4), or has no sigma")
+    rows, cols, row_scale, col_scale, turn = (sizes[index] for index in "01234")
+    coeffs = rpc.coeffs
+    if turn:
+        if not (coeffs[1] == coeffs[3]).all():
+            raise RpcFormatError(
+                f"{name}: adjusted by a rotation of {turn:g} degrees, which an RPC holds only where rows and columns "
+                "have one denominator; project points with OSSIM and give them to 'barpc fit'"
+            )
+        cos, sin = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+        col, row = cos * coeffs[0] - sin * coeffs[2], cos * coeffs[2] + sin * coeffs[0]
+        coeffs = np.array([col, coeffs[1], row, coeffs[3]])
+    offset, scale = np.add(rpc.image_offset, [cols, rows]), np.add(rpc.image_scale, [col_scale, row_scale])
+    try:
+        return replace(rpc, coeffs=coeffs, image_offset=offset, image_scale=scale)
+    except RpcError as error:
+        raise RpcFormatError(f"{name}: adjusted, {error}") from error
 
 
 def write_geom(rpc: RPC) -> str:

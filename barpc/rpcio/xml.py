@@ -22,6 +22,7 @@ from barpc.rpcio.text import (
     ReadOptions,
     fields_from_rpc,
     format_number,
+    in_order_b,
     listed_numbers,
     number,
     rpc_from_fields,
@@ -56,8 +57,6 @@ def read_maxar(text: str, name: str, options: ReadOptions) -> RPC:
     root = _root(text, name)
     rpb = root if root.tag == "RPB" else _element(root, ("RPB",), name)
     spec = rpb.findtext("SPECID", "RPC00B").strip()
-    if spec != "RPC00B":
-        raise RpcFormatError(f"{name}: coefficients in {spec} order, only RPC00B is read from this format")
     image = _element(rpb, ("IMAGE",), name)
     fields: Fields = {}
     for key, word in MAXAR.items():
@@ -65,7 +64,7 @@ def read_maxar(text: str, name: str, options: ReadOptions) -> RPC:
         path = f"{tag}List/{tag}" if key in COEFFICIENTS else tag
         if key not in ERRORS or image.find(path) is not None:
             fields[key] = _numbers(image, path, name)
-    return rpc_from_fields(fields, name, options)
+    return rpc_from_fields(in_order_b(fields, spec, name), name, options)
 
 
 def write_maxar(rpc: RPC) -> str:

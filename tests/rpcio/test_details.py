@@ -508,8 +508,8 @@ def test_the_rpc_of_an_image_is_found_by_its_name_in_any_format(tmp_path: Path) 
 
 def test_a_geom_of_another_polynomial_is_refused() -> None:
     text = FORMATS["geom"].write(make_rpc())
-    for other in ("A", ""):
-        with pytest.raises(RpcFormatError, match=f"polynomial_format '{other}', only B"):
+    for other in ("C", ""):
+        with pytest.raises(RpcFormatError, match=f"order 'RPC00{other}', only RPC00A and RPC00B"):
             parse(text.replace("polynomial_format:  B", f"polynomial_format:  {other}").encode(), "m")
     silent = re.sub(r"polynomial_format:.*\n", "", text)
     assert silent != text
@@ -573,19 +573,22 @@ def test_lists_are_parted_by_blanks_and_commas() -> None:
     assert listed_numbers(" 1, 2  3,4,\n5 ,", "a", "K") == [1, 2, 3, 4, 5]
 
 
-def test_numbered_coefficients_are_gathered_from_their_first_index_on() -> None:
+def test_numbered_coefficients_are_gathered_from_0_or_1_on() -> None:
     for first in (0, 1):
         pairs = [(f"LINE_NUM_COEFF_{i + first}", float(i)) for i in reversed(range(20))]
-        assert collect_numbered([*pairs, ("LINE_OFF", 3.0)], "a", first=first) == {
+        assert collect_numbered([*pairs, ("LINE_OFF", 3.0)], "a") == {
             "LINE_OFF": [3.0], "LINE_NUM_COEFF": [float(i) for i in range(20)],
         }  # fmt: skip
-        with pytest.raises(RpcFormatError, match="LINE_NUM_COEFF has 20 coefficients, expected 20"):
-            collect_numbered(pairs, "a", first=1 - first)
-        with pytest.raises(RpcFormatError, match="LINE_NUM_COEFF has 19 coefficients"):
-            collect_numbered(pairs[1:], "a", first=first)
-        assert collect_numbered([*pairs, pairs[3]], "a", first=first)
+        for missing in (0, 7, 19):
+            with pytest.raises(RpcFormatError, match="LINE_NUM_COEFF has 19 coefficients"):
+                collect_numbered(pairs[:missing] + pairs[missing + 1 :], "a")
+        assert collect_numbered([*pairs, pairs[3]], "a")
         with pytest.raises(RpcFormatError, match=r"given twice, 3\.0 and 4\.0"):
-            collect_numbered([("LINE_OFF", 3.0), ("LINE_OFF", 4.0)], "a", first=first)
+            collect_numbered([("LINE_OFF", 3.0), ("LINE_OFF", 4.0)], "a")
+    beyond = [(f"LINE_NUM_COEFF_{i}", float(i)) for i in range(21)]
+    for pairs in (beyond, [(f"LINE_NUM_COEFF_{i}", float(i)) for i in range(2, 22)]):
+        with pytest.raises(RpcFormatError, match=r"2. coefficients, expected 20, numbered from 0 or 1"):
+            collect_numbered(pairs, "a")
 
 
 @pytest.mark.parametrize(("name", "row"), [("a_RPC.TXT", "txt"), ("A.rpb", "rpb"), ("a.JSON", "json"), ("a.doc", None)])

@@ -116,8 +116,8 @@ def test_maxar_xml_may_begin_with_its_rpb_and_say_nothing_of_errors(rpc):
     assert parse(silent.encode(), "memory") == (replace(rpc, err_bias=None, err_rand=None), "xml")
     nameless = re.sub(r".*<SPECID>.*\n", "", text)
     assert parse(nameless.encode(), "memory") == (rpc, "xml")
-    with pytest.raises(RpcFormatError, match="RPC00A order, only RPC00B"):
-        parse(text.replace("RPC00B", "RPC00A").encode(), "memory")
+    with pytest.raises(RpcFormatError, match="order 'RPC00C', only RPC00A and RPC00B"):
+        parse(text.replace("RPC00B", "RPC00C").encode(), "memory")
     with pytest.raises(RpcFormatError, match="<LATSCALE> is missing or empty"):
         parse(re.sub(r".*<LATSCALE>.*\n", "", text).encode(), "memory")
 

@@ -1,0 +1,293 @@
+"""What other tools write of one RPC, in their own words: units, indices from 0, prefixes, orders, adjustments."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.base.errors import RpcFormatError
+from barpc.rpcio import FORMATS, read_rpc
+from barpc.rpcio.formats import parse
+from barpc.rpcio.text import COEFFICIENTS, KEYS, fields_from_rpc
+from barpc.rpcio.xml import rpc_domain
+from tests.rpcio.conftest import grid, make_rpc
+from tests.rpcio.test_orders import A_ORDER
+
+B_ORDER = "1 L P H LP LH PH LL PP HH PLH LLL LPP LHH LLP PPP PHH LLH PPH HHH"
+UNITS = {"LINE": "pixels", "SAMP": "pixels", "LAT": "degrees", "LONG": "degrees", "HEIGHT": "meters", "ERR": "meters"}
+
+
+def written(fields, units=UNITS, key=lambda name: name):
+    """A line each number, with its unit behind."""
+    lines = []
+    for name, values in fields.items():
+        unit = units.get(name.split("_")[0], "") if len(values) == 1 else ""
+        names = [f"{name}_{i}" for i in range(1, 21)] if len(values) > 1 else [name]
+        lines += [f"{key(n)}: {value!r} {unit}".rstrip() for n, value in zip(names, values, strict=True)]
+    return "\n".join(lines) + "\n"
+
+
+def read(text):
+    return parse(text.encode(), "memory")[0]
+
+
+# --- units ------------------------------------------------------------------------------------------------
+
+
+def domain_with(units):
+    """GDAL's metadata with a unit behind every offset and scale."""
+    text = f"<PAMDataset>\n{rpc_domain(make_rpc())}\n</PAMDataset>\n"
+
+    def unit(match):
+        return f"{match[1]} {units[match[2].split('_')[0]]}</MDI>"
+
+    return re.sub(r'(<MDI key="(\w+_(?:OFF|SCALE|BIAS|RAND))">[^<]*)</MDI>', unit, text)
+
+
+SAME = [
+    UNITS,
+    dict(UNITS, HEIGHT="metres", LAT="deg", LINE="px", SAMP="lines"),
+    dict(UNITS, HEIGHT="m above the ellipsoid", LAT="°", LONG="Degrees.", ERR="(m)"),
+    dict(UNITS, HEIGHT="[metre]", LAT="decimal degrees", LINE="// of the image", SAMP="# of the centre"),
+]
+
+
+@pytest.mark.parametrize("units", SAME)
+def test_a_unit_behind_a_number_says_what_is_meant_anyway(units, rpc):
+    assert read(written(fields_from_rpc(rpc), units)) == rpc
+    assert read(domain_with(units)) == rpc
+
+
+def test_a_unit_is_read_in_every_syntax_of_numbers(rpc):
+    for name, old, new in (
+        ("rpb", "heightOffset = 166.6667;", "heightOffset = 166.6667 meters;"),
+        ("xml", "<LATSCALE>0.0045<", "<LATSCALE>0.0045 degrees<"),
+        ("json", '"row_offset": 950.7', '"row_offset": "950.7 pixels"'),
+        ("geom", "height_scale:  142.8571", "height_scale:  142.8571 m"),
+        ("txt", "LINE_OFF: 950.7", "LINE_OFF: 950.7pixels"),
+    ):
+        text = FORMATS[name].write(rpc)
+        assert old in text
+        assert read(text.replace(old, new)) == rpc, name
+
+
+@pytest.mark.parametrize(
+    ("unit", "size"),
+    [("feet", 0.3048), ("ft", 0.3048), ("Foot", 0.3048), ("US survey feet", 1200 / 3937), ("ftUS", 1200 / 3937)],
+)
+def test_heights_in_feet_are_converted_offset_and_scale_alike(unit, size, rpc):
+    """A polynomial of normalised heights is the same in every unit: offset and scale are all there is to convert."""
+    fields = fields_from_rpc(rpc)
+    for key in ("HEIGHT_OFF", "HEIGHT_SCALE"):
+        fields[key] = [fields[key][0] / size]
+    for text in (written(fields, dict(UNITS, HEIGHT=unit)), json_of(fields, unit)):
+        found = read(text)
+        np.testing.assert_allclose(found.project(grid(rpc)), rpc.project(grid(rpc)), rtol=0, atol=1e-8)
+        assert found.ground_scale[2] == pytest.approx(rpc.ground_scale[2], rel=1e-14)
+
+
+def json_of(fields, unit):
+    named = {key.lower(): values if len(values) > 1 else values[0] for key, values in fields.items()}
+    return json.dumps({key: f"{v} {unit}" if key.startswith("height") else v for key, v in named.items()})
+
+
+def test_angles_in_radians_and_accuracies_in_feet_are_converted(rpc):
+    fields = fields_from_rpc(rpc)
+    for key in ("LAT_OFF", "LAT_SCALE", "LONG_OFF", "LONG_SCALE"):
+        fields[key] = [float(np.radians(fields[key][0]))]
+    fields["ERR_BIAS"] = [10.0]
+    found = read(written(fields, dict(UNITS, LAT="radians", LONG="rad", ERR="feet")))
+    np.testing.assert_allclose(found.project(grid(rpc)), rpc.project(grid(rpc)), rtol=0, atol=1e-6)
+    assert found.err_bias == pytest.approx(3.048, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("axis", "unit", "expected"),
+    [
+        ("HEIGHT", "yards", "metres"),
+        ("HEIGHT", "degrees", "metres"),
+        ("HEIGHT", "km", "metres"),
+        ("LINE", "meters", "pixels"),
+        ("LAT", "gon", "degrees"),
+        ("LAT", "arc seconds", "degrees"),
+        ("LONG", "° W", "degrees"),
+        ("LAT", "S", "degrees"),
+        ("ERR", "pixels", "metres"),
+    ],
+)
+def test_what_is_no_unit_of_a_field_is_refused_by_name(axis, unit, expected, rpc):
+    for text in (written(fields_from_rpc(rpc), dict(UNITS, **{axis: unit})), domain_with(dict(UNITS, **{axis: unit}))):
+        with pytest.raises(RpcFormatError, match=rf"memory: {axis}_\w+ is in '{unit}', expected {expected}"):
+            read(text)
+
+
+def test_feet_of_an_offset_alone_say_nothing_of_the_scale(rpc):
+    text = FORMATS["txt"].write(rpc)
+    for one, other in (("OFF", "SCALE"), ("SCALE", "OFF")):
+        half = re.sub(rf"(HEIGHT_{one}: \S+)", r"\1 feet", text)
+        with pytest.raises(RpcFormatError, match="HEIGHT_OFF and HEIGHT_SCALE one states a unit"):
+            read(half)
+        both = re.sub(rf"(HEIGHT_{other}: \S+)", r"\1 metres", half)
+        assert read(both).ground_scale[2] == pytest.approx(rpc.ground_scale[2] * (0.3048 if one == "SCALE" else 1))
+        assert read(re.sub(rf"(HEIGHT_{one}: \S+)", r"\1 metres", text)) == rpc
+
+
+# --- names and indices ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("digits", ["", "02"])
+@pytest.mark.parametrize("first", [0, 1])
+def test_coefficients_may_be_numbered_from_0(first, digits, rpc):
+    text = FORMATS["txt"].write(rpc)
+    text = re.sub(r"(COEFF_)(\d+):", lambda m: f"{m[1]}{int(m[2]) - 1 + first:{digits}}:", text)
+    assert f"COEFF_{19 + first}:" in text
+    assert read(text) == rpc
+
+
+@pytest.mark.parametrize("prefix", ["RPC_", "rpc.", "Image0.", "RPC_METADATA_"])
+@pytest.mark.parametrize("separator", ["=", ": "])
+def test_keys_may_have_a_prefix_all_of_them_the_same(prefix, separator, rpc):
+    text = re.sub(r"(?m)^(\w+): ", rf"{prefix}\1{separator}", FORMATS["txt"].write(rpc))
+    assert f"{prefix}LINE_OFF{separator}950.7" in text
+    assert read(text) == rpc
+    assert read(text + "OTHER_ERR_BIAS: 77\n") == rpc
+    second = text.replace(prefix, "B_" + prefix)
+    with pytest.raises(RpcFormatError, match="RPCs of several images"):
+        read(text + second)
+
+
+def test_a_key_without_a_prefix_goes_before_others(rpc):
+    assert read("SCENE_LINE_OFF: 1\n" + FORMATS["txt"].write(rpc) + "SCENE_LAT_OFF: 7\n") == rpc
+
+
+def test_a_geom_may_have_a_prefix(rpc):
+    text = re.sub(r"(?m)^", "image0.", FORMATS["geom"].write(rpc).rstrip("\n")) + "\n"
+    assert read(text) == rpc
+
+
+# --- the order of the terms -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("rpb", 'SpecId = "RPC00B"', 'SpecId = "RPC00A"'),
+        ("xml", "<SPECID>RPC00B<", "<SPECID>RPC00A<"),
+        ("geom", "polynomial_format:  B", "polynomial_format:  A"),
+    ],
+)
+def test_the_order_that_a_file_states_is_the_order_of_its_terms(name, old, new, rpc):
+    """The file's numbers, summed in the order of RPC00A (STDI-0002), not by a permutation of ours."""
+    text = FORMATS[name].write(rpc)
+    assert old in text
+    found, points = read(text.replace(old, new)), grid(rpc)
+    L, P, H = ((points - rpc.ground_offset) / rpc.ground_scale).T
+    value = {"1": np.ones(len(points)), "L": L, "P": P, "H": H}
+    for order, camera in ((B_ORDER, rpc), (A_ORDER, found)):
+        terms = [np.prod([value[letter] for letter in word], axis=0) for word in order.split()]
+        col, col_den, row, row_den = rpc.coeffs @ np.array(terms)
+        expected = np.column_stack([col / col_den, row / row_den]) * rpc.image_scale + rpc.image_offset
+        np.testing.assert_allclose(camera.project(points), expected, rtol=0, atol=1e-8)
+    assert np.abs(found.project(points) - rpc.project(points)).max() > 1e-3
+    with pytest.raises(RpcFormatError, match="only RPC00A and RPC00B are read"):
+        read(text.replace(old, new.replace("RPC00A", "IKONOS").replace("  A", "  Z")))
+
+
+# --- OSSIM's adjustments ----------------------------------------------------------------------------------
+
+
+def adjusted(rpc, *sizes, number=0, current=0, sigma=(50, 50, 50, 50, 0.1), center=(0, 0, 0, 0, 0)):
+    """A .geom whose adjustments add up to `sizes`: rows, columns, scale of rows, of columns, rotation [deg]."""
+    lines = [f"current_adjustment:  {current}", f"number_of_adjustments:  {number + 1}"]
+    for i, (size, s, c) in enumerate(zip(sizes, sigma, center, strict=False)):
+        head = f"adjustment_{number}.adj_param_{i}"
+        lines += [f"{head}.center:  {c}", f"{head}.parameter:  {(size - c) / s!r}", f"{head}.sigma:  {s}"]
+        lines += [f"{head}.description:  any", f"{head}.units:  pixel", f"{head}.lock_flag:  0"]
+    return FORMATS["geom"].write(rpc) + "\n".join(lines) + "\n"
+
+
+def by_ossim(rpc, points, rows, cols, row_scale, col_scale, turn):
+    """ossimRpcModel::worldToLineSample, in its own letters."""
+    L, P, H = ((points - rpc.ground_offset) / rpc.ground_scale).T
+    value = {"1": np.ones(len(points)), "L": L, "P": P, "H": H}
+    terms = np.array([np.prod([value[letter] for letter in word], axis=0) for word in B_ORDER.split()])
+    pv, qv, pu, qu = rpc.coeffs @ terms
+    u_rot, v_rot, a = pu / qu, pv / qv, np.radians(turn)
+    u, v = u_rot * np.cos(a) + v_rot * np.sin(a), v_rot * np.cos(a) - u_rot * np.sin(a)
+    line = u * (rpc.image_scale[1] + row_scale) + rpc.image_offset[1] + rows
+    samp = v * (rpc.image_scale[0] + col_scale) + rpc.image_offset[0] + cols
+    return np.column_stack([samp, line])
+
+
+@pytest.mark.parametrize(
+    "sizes", [(25.0, -10.0, 0, 0, 0), (0, 0, 3.5, -1.25, 0), (7.0, 3.0, -2.0, 4.0, 0), (0.0,) * 5, (1.5, 0.25)]
+)
+def test_adjustments_of_offset_and_scale_are_applied_as_ossim_applies_them(sizes, rpc):
+    found = read(adjusted(rpc, *sizes))
+    expected = by_ossim(rpc, grid(rpc), *sizes, *[0.0] * (5 - len(sizes)))
+    np.testing.assert_allclose(found.project(grid(rpc)), expected, rtol=0, atol=1e-8)
+    assert (found == rpc) == (not any(sizes))
+
+
+def test_a_center_counts_and_the_adjustment_in_use_is_the_current_one(rpc):
+    sizes = (25.0, -10.0, 1.0, 2.0, 0.0)
+    expected = by_ossim(rpc, grid(rpc), *sizes)
+    found = read(adjusted(rpc, *sizes, center=(20, -11, 3, 1, 0)))
+    np.testing.assert_allclose(found.project(grid(rpc)), expected, rtol=0, atol=1e-8)
+    found = read(adjusted(rpc, *sizes, number=1, current=1))
+    np.testing.assert_allclose(found.project(grid(rpc)), expected, rtol=0, atol=1e-8)
+    assert read(adjusted(rpc, *sizes, number=1, current=0)) == rpc
+
+
+def test_a_rotation_is_applied_under_one_denominator_else_refused(rpc):
+    sizes = (2.0, -3.0, 1.5, -0.5, 0.7)
+    with pytest.raises(RpcFormatError, match=r"memory: adjusted by a rotation of 0\.7 degrees"):
+        read(adjusted(rpc, *sizes))
+    shared = replace(rpc, coeffs=rpc.coeffs[[0, 1, 2, 1]])
+    found = read(adjusted(shared, *sizes))
+    expected = by_ossim(shared, grid(rpc), *sizes)
+    np.testing.assert_allclose(found.project(grid(rpc)), expected, rtol=0, atol=1e-8)
+    opposite = by_ossim(shared, grid(rpc), *sizes[:4], -0.7)
+    assert np.abs(found.project(grid(rpc)) - opposite).max() > 10.0
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("adjustment_0.adj_param_5.center:  0.5\n", "adj_param_5 is no adjustment"),
+        ("adjustment_0.adj_param_1.parameter:  0.5\n", "adj_param_1 .* has no sigma"),
+        ("adjustment_0.adj_param_1.center:  many\n", "adj_param_1.center is not a number"),
+        ("adjustment_0.adj_param_2.center:  -980.9\n", "a scale is zero"),
+    ],
+)
+def test_an_adjustment_that_is_none_is_refused(text, what, rpc):
+    with pytest.raises(RpcFormatError, match=what):
+        read(FORMATS["geom"].write(rpc) + text)
+
+
+# --- the cases of the shared data -------------------------------------------------------------------------
+
+P = np.array([[5.4, 43.3, 250.0]])
+
+
+@pytest.mark.parametrize(
+    ("file", "expected"),
+    [
+        ("refined.geom", (499.7732, 565.4442)),
+        ("rpc_units.tif", (509.7732, 540.4442)),
+        ("rpc_zero_based_RPC.TXT", (509.7732, 540.4442)),
+    ],
+)
+def test_a_case_from_the_field_projects_as_its_oracle(file, expected, shared_data):
+    folder = shared_data / "field_cases"
+    if not folder.is_dir():
+        pytest.skip("no field cases in the shared data")
+    np.testing.assert_allclose(read_rpc(folder / file).project(P)[0], expected, rtol=0, atol=1e-4)
+
+
+def test_the_keys_of_these_tests_are_those_of_the_reader():
+    assert set(fields_from_rpc(make_rpc())) == set(KEYS) >= set(COEFFICIENTS)
