@@ -162,9 +162,9 @@ def _to_target(files: tuple[str, ...], flags: Mapping[str, Any]) -> int:
 def _copy(camera: Camera, image: Path, target: str, formats: str | None, overwrite: bool) -> int:
     """Write an RPC as it is, read it back and say how far off it is."""
     if formats is None:
-        write_camera(camera.rpc, target, image, overwrite=overwrite)
+        write_camera(camera.rpc, target, image, overwrite=overwrite, size=camera.size)
     else:
-        write_rpc(camera.rpc, target, format=formats, overwrite=overwrite)
+        write_rpc(camera.rpc, target, format=formats, overwrite=overwrite, size=camera.size)
     for line in () if wants_json() else camera.notes:
         remark(line)
     row = {"source": str(camera.path), "format": camera.format, "target": target}
@@ -304,13 +304,14 @@ def _hand_off(
     with Workspace(folder, overwrite=overwrite, keep=keep, names=together, adds=True) as workspace:
         for (path, camera, window), row in zip(images, names, strict=True):
             rpc, written = camera.rpc, [folder / name for name in row]
+            size = _size(path) if window is None else window[2:]
             for name in row:
                 with workspace.output(name) as partial:
                     if window is not None and name == row[0]:
                         rpc = write_crop(rpc, path, partial, window, overwrite=True)
                     else:
-                        write_camera(rpc, partial, path, place=folder / name, overwrite=True)
-            readings += verify(written, rpc, _size(path) if window is None else window[2:], camera.alt_range)
+                        write_camera(rpc, partial, path, place=folder / name, overwrite=True, size=size)
+            readings += verify(written, rpc, size, camera.alt_range)
             reasons += _shadow_reasons(path, written) if window is None else []
     whole = images[0][2] is None
     return _told(readings, reasons, unverified([folder / name for name in names[0]]) if whole else ())

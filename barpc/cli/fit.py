@@ -69,10 +69,10 @@ def fit(
         from barpc.cli.convert import check_target
 
         check_target(output, [image], overwrite)
-    fit, tolerance = _fit(source, output, flags)
+    fit, tolerance, size = _fit(source, output, flags)
     written = False
     if output is not None and (keep_going or not fit.verdict(tolerance)):
-        fit, written = _write(fit, image, output, overwrite, None if keep_going else tolerance)
+        fit, written = _write(fit, image, output, overwrite, None if keep_going else tolerance, size)
     verdict = fit.verdict(tolerance)
     if wants_json():
         summary = {**fit.summary(), "verdict": verdict, "output": output if written else None}
@@ -89,8 +89,8 @@ def fit(
     return tell_gate(f"{verdict}; {how}", [])
 
 
-def _fit(source: str, output: str | None, flags: dict[str, Any]) -> tuple[RpcFit, float]:
-    """Return the fit and the tolerance [px] that it is to meet."""
+def _fit(source: str, output: str | None, flags: dict[str, Any]) -> tuple[RpcFit, float, tuple[int, int] | None]:
+    """Return the fit, the tolerance [px] that it is to meet, and the image's width and height, if known."""
     from barpc.cameras import open_camera, read_points, split_spec
     from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
     from barpc.fit.points import terrain_range
@@ -105,7 +105,7 @@ def _fit(source: str, output: str | None, flags: dict[str, Any]) -> tuple[RpcFit
     if points is not None:
         ground, image = points.ground, points.image
         fit = fit_rpc_points(ground, image, sigma=points.sigma, size=size, options=options, strict=False)
-        return fit, options.tolerance
+        return fit, options.tolerance, size
     camera = open_camera(source)
     if split_spec(source)[1].get("swath", "").lower() == "mosaic" and options.grid == FitOptions().grid:
         options = replace(options, grid=_MOSAIC_GRID)
@@ -116,25 +116,32 @@ def _fit(source: str, output: str | None, flags: dict[str, Any]) -> tuple[RpcFit
     elif not flags["alt_range"] and (all_ground := getattr(camera.model, "all_ground", None)):
         fit = fit_rpc(camera.model, camera.extent, all_ground, options=options, strict=False)
         if not fit.verdict(options.tolerance):
-            return fit, options.tolerance
+            return fit, options.tolerance, camera.size
         low, high = alt_range
         remark(f"no RPC holds all ground on Earth here: fitted over the scene's altitudes, {low:g} to {high:g} m")
     fit = fit_rpc(camera.model, camera.extent, alt_range, options=options, strict=False)
-    return fit, options.tolerance
+    return fit, options.tolerance, camera.size
 
 
 class _Missed(Exception):  # noqa: N818 - it never leaves this page
     """What was written does not hold the fit: it goes again."""
 
 
-def _write(fit: RpcFit, source: str, output: str, overwrite: bool, tolerance: float | None) -> tuple[RpcFit, bool]:
+def _write(
+    fit: RpcFit,
+    source: str,
+    output: str,
+    overwrite: bool,
+    tolerance: float | None,
+    size: tuple[int, int] | None,
+) -> tuple[RpcFit, bool]:
     """Write the RPC and read it back: the fit as its file holds it, and whether it stays there (within a tolerance)."""
     from barpc.base.atomic import replacing
     from barpc.rpcio import read_rpc, write_camera
 
     stays = False
     with suppress(_Missed), replacing(output, overwrite=overwrite) as partial:
-        write_camera(fit.rpc, partial, source, place=output, overwrite=True)
+        write_camera(fit.rpc, partial, source, place=output, overwrite=True, size=size)
         fit = fit.as_written(read_rpc(partial))
         if tolerance is not None and fit.verdict(tolerance):
             raise _Missed

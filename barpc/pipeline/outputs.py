@@ -80,7 +80,7 @@ def make_files(view: View, rpc: RPC, images: str, formats: Sequence[str], folder
     for name in names:
         try:
             place.mkdir(parents=True, exist_ok=True)
-            write_camera(rpc, place / name, view.path, place=Path(folder) / name, overwrite=True)
+            write_camera(rpc, place / name, view.path, place=Path(folder) / name, overwrite=True, size=view.size)
         except OSError as error:
             if isinstance(error, OutputError) or error.errno is None:
                 raise

@@ -30,9 +30,10 @@ class Format:
     suffixes: tuple[str, ...]  # ends of the names of written files in any case, the usual one first
     sniff: Callable[[str], bool]  # whether a file's text is of this format
     read: Callable[[str, str, ReadOptions], RPC]  # of text, file name for messages, options
-    write: Callable[[RPC], str] | None = None
+    write: Callable[..., str] | None = None  # of an RPC; `sized`: and of the width and height of its image, or None
     beside: str = ""  # end of the name of the file that a run writes for an image, after the image's name
     consumers: tuple[str, ...] = ()  # that read what is written (`barpc.pipeline.handoff.CONSUMERS`), besides barpc
+    sized: bool = False  # whether it states the size of its image
 
 
 def _has(*patterns: str) -> Callable[[str], bool]:
@@ -51,7 +52,7 @@ _SYNTAXES = (
     Format("txt", ("_RPC.TXT", ".rpc", ".txt"), _TXT, text.read_txt, text.write_txt, "_RPC.TXT", (_BESIDE, "rpcm")),
     Format("rpb", (".RPB",), _RPB, text.read_rpb, text.write_rpb, ".RPB", (_BESIDE,)),
     Format("geom", (".geom",), _GEOM, text.read_geom, text.write_geom, ".geom", ("keywords", "shareloc")),
-    Format("xml", (".XML",), _MAXAR, xml.read_maxar, xml.write_maxar, ".rpc.xml", (_BESIDE,)),
+    Format("xml", (".XML",), _MAXAR, xml.read_maxar, xml.write_maxar, ".rpc.xml", (_BESIDE,), sized=True),
     Format("json", (".json",), _JSON, text.read_rpc_json, text.write_json, ".rpc.json", ("rpcm",)),
     Format("dimap", (), _has(r"<(\w+:)?Global_RFM"), xml.read_dimap),  # a Dimap_Document, or the model alone
     Format("enmap", (), _has(r"<bandID\s", r"(?i)<ROW_NUM_0?1>"), xml.read_enmap),
@@ -103,19 +104,25 @@ def row_of(path: Path | str) -> Format | Carrier | None:
 
 
 def write_camera(
-    rpc: RPC, path: Path | str, image: Path | str, *, place: Path | str | None = None, overwrite: bool = False
+    rpc: RPC,
+    path: Path | str,
+    image: Path | str,
+    *,
+    place: Path | str | None = None,
+    overwrite: bool = False,
+    size: tuple[int, int] | None = None,
 ) -> None:
     """Write an RPC into a file, or into a raster with the pixels of `image`, as the name of `path` says.
 
     `place` is where the file will stand in the end, if not at `path`: its name decides. An existing file is replaced
-    if `overwrite` is true, never the image.
+    if `overwrite` is true, never the image. `size` is the image's (width, height) [px], which Maxar's XML states.
     """
     place = Path(path if place is None else place)
     row = row_of(place)
     if isinstance(row, Carrier):
         row.write(rpc, remote.location(image), Path(path), place, overwrite)
     else:
-        write_text(path, _writer(place, None)(rpc), overwrite=overwrite)
+        write_text(path, _text_of(rpc, place, None, size), overwrite=overwrite)
 
 
 _SETTLED = 2_000_000_000  # ns: after so long a change shows in a folder's time
@@ -167,7 +174,14 @@ def parse(data: bytes, name: str, options: ReadOptions | None = None) -> tuple[R
 holds_physical = _has(r"<(\w+:)?(ATTLIST|Refined_Model)\b")
 
 
-def write_rpc(rpc: RPC, path: Path | str, *, format: str | None = None, overwrite: bool = False) -> None:
+def write_rpc(
+    rpc: RPC,
+    path: Path | str,
+    *,
+    format: str | None = None,
+    overwrite: bool = False,
+    size: tuple[int, int] | None = None,
+) -> None:
     """Write an RPC to a text file; every number reads back to the bit.
 
     Parameters
@@ -177,6 +191,7 @@ def write_rpc(rpc: RPC, path: Path | str, *, format: str | None = None, overwrit
         a raster by `write_rpc_vrt` or `write_rpc_copy`, never into the input.
     format : str, optional, a row of `FORMATS`, whatever the name
     overwrite : bool, replace an existing file
+    size : tuple of int, optional, width and height of the image [px]: Maxar's XML states it
 
     Raises
     ------
@@ -185,12 +200,12 @@ def write_rpc(rpc: RPC, path: Path | str, *, format: str | None = None, overwrit
     OutputError
         The file exists or cannot be written.
     """
-    write_text(path, _writer(Path(path), format)(rpc), overwrite=overwrite)
+    write_text(path, _text_of(rpc, Path(path), format, size), overwrite=overwrite)
 
 
-def _writer(path: Path, name: str | None) -> Callable[[RPC], str]:
+def _text_of(rpc: RPC, path: Path, name: str | None, size: tuple[int, int] | None) -> str:
     row = row_of(path) if name is None else WRITABLE.get(name)
     if isinstance(row, Format) and row.write is not None:
-        return row.write
+        return row.write(rpc, size) if row.sized else row.write(rpc)
     known = ", ".join(f"{n} ({row.suffixes[0]})" for n, row in WRITABLE.items())
     raise RpcFormatError(f"{path}: an RPC is not written in this format; choose one of {known}")

@@ -295,8 +295,16 @@ def _fields_of_lines(lines: Iterable[tuple[str, str]], name: str) -> Fields:
 
 
 def write_txt(rpc: RPC) -> str:
-    """Write ``KEY: value`` without units (rpcm stumbles on them); every number reads back to the bit."""
-    return "\n".join(_numbered(fields_from_rpc(rpc, direct=True), ": ", [str(i) for i in range(1, 21)])) + "\n"
+    """Write ``KEY: value`` without units (rpcm stumbles on them); every number reads back to the bit.
+
+    The first ninety lines are those of readers that go by the line alone; what only some RPCs have stands behind.
+    """
+    return "\n".join(_numbered(_errors_last(rpc), ": ", [str(i) for i in range(1, 21)])) + "\n"
+
+
+def _errors_last(rpc: RPC) -> Fields:
+    fields = fields_from_rpc(rpc, direct=True)
+    return {key: fields[key] for key in (*OFFSETS, *SCALES, *LISTS, *ERRORS) if key in fields}
 
 
 # --- .RPB -------------------------------------------------------------------------------------------------
@@ -481,9 +489,7 @@ def _values(value: Any, name: str, key: str) -> list[float]:
 
 def write_json(rpc: RPC) -> str:
     """Write the dictionary of rpcm and s2p."""
-    fields = fields_from_rpc(rpc, direct=True)
-    order = (*(key for key in KEYS if key not in ERRORS), *DIRECT, *ERRORS)
-    rpcm = {_RPCM[k]: fields[k] if k in LISTS else fields[k][0] for k in order if k in fields}
+    rpcm = {_RPCM[k]: values if k in LISTS else values[0] for k, values in _errors_last(rpc).items()}
     return json.dumps({"rpc": rpcm}, indent=1) + "\n"
 
 

@@ -67,8 +67,9 @@ def read_maxar(text: str, name: str, options: ReadOptions) -> RPC:
     return rpc_from_fields(in_order_b(fields, spec, name), name, options)
 
 
-def write_maxar(rpc: RPC) -> str:
-    """Write the `<RPB>` part of Maxar's image support data."""
+def write_maxar(rpc: RPC, size: tuple[int, int] | None = None) -> str:
+    """Write the `<RPB>` part of Maxar's image support data; of its `<IMD>` the width and height [px], where known."""
+    counts = [f"\t\t<{tag}>{n}</{tag}>" for tag, n in zip(("NUMCOLUMNS", "NUMROWS"), size or (), strict=False)]
     lines = []
     for key, values in fields_from_rpc(rpc).items():
         tag = MAXAR[key].upper()
@@ -78,7 +79,8 @@ def write_maxar(rpc: RPC) -> str:
         else:
             lines.append(f"\t\t\t{element}")
     xml = '<?xml version="1.0" encoding="UTF-8"?>'
-    head = [xml, "<isd>", "\t<RPB>", "\t\t<SPECID>RPC00B</SPECID>", "\t\t<IMAGE>"]
+    imd = ["\t<IMD>", *reversed(counts), "\t</IMD>"] if counts else []
+    head = [xml, "<isd>", *imd, "\t<RPB>", "\t\t<SPECID>RPC00B</SPECID>", "\t\t<IMAGE>"]
     return "\n".join([*head, *lines, "\t\t</IMAGE>", "\t</RPB>", "</isd>"]) + "\n"
 
 

@@ -376,13 +376,13 @@ def test_files_are_made_in_a_room_of_their_view_for_their_place(tmp_path, view, 
     monkeypatch.setattr(
         outputs,
         "write_camera",
-        lambda rpc, path, image, *, place, overwrite: seen.append((path, place, overwrite)),
+        lambda rpc, path, image, *, place, overwrite, size: seen.append((path, place, overwrite, size)),
     )
     for _ in range(2):
         made = outputs.make_files(view, make_rpc(), "vrt", ("txt",), str(tmp_path / "out"), str(tmp_path / "r"))
     names = ["scene.vrt", "scene_RPC.TXT"]
     assert made == tuple(names)
-    assert seen == [(tmp_path / "r/scene" / name, tmp_path / "out" / name, True) for name in names] * 2
+    assert seen == [(tmp_path / "r/scene" / name, tmp_path / "out" / name, True, view.size) for name in names] * 2
     assert (tmp_path / "r/scene").is_dir()
 
 

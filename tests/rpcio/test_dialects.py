@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import rasterio
 
 from barpc.base.errors import RpcFormatError
-from barpc.rpcio import FORMATS, read_rpc
+from barpc.rpcio import FORMATS, read_rpc, write_camera, write_rpc
 from barpc.rpcio.formats import parse
+from barpc.rpcio.sources import described
 from barpc.rpcio.text import COEFFICIENTS, KEYS, fields_from_rpc
 from barpc.rpcio.xml import rpc_domain
-from tests.rpcio.conftest import grid, make_rpc
+from tests.rpcio.conftest import grid, make_rpc, write_image
 from tests.rpcio.test_orders import A_ORDER
 
 B_ORDER = "1 L P H LP LH PH LL PP HH PLH LLL LPP LHH LLP PPP PHH LLH PPH HHH"
@@ -267,6 +270,52 @@ def test_a_rotation_is_applied_under_one_denominator_else_refused(rpc):
 def test_an_adjustment_that_is_none_is_refused(text, what, rpc):
     with pytest.raises(RpcFormatError, match=what):
         read(FORMATS["geom"].write(rpc) + text)
+
+
+# --- as others read what is written -----------------------------------------------------------------------
+
+
+def by_line(text):
+    """As readers that know no names: the n-th line is the n-th number (MicMac's ASCII mode, learned stereo)."""
+    values = [float(line.split()[1]) for line in text.splitlines()[:90]]
+    row, col, lat, lon, alt = zip(values[:5], values[5:10], strict=True)
+    return row, col, lat, lon, alt, np.array(values[10:]).reshape(4, 20)
+
+
+@pytest.mark.parametrize("changes", [{}, {"err_bias": None, "err_rand": None}, {"direct": np.full((4, 20), 0.25)}])
+def test_a_reader_that_goes_by_the_line_finds_every_number(changes, tmp_path):
+    rpc = replace(make_rpc(), **changes)
+    write_rpc(rpc, tmp_path / "a_RPC.TXT")
+    text = (tmp_path / "a_RPC.TXT").read_text()
+    row, col, lat, lon, alt, (row_num, row_den, col_num, col_den) = by_line(text)
+    L, P, H = ((p - o) / s for p, (o, s) in zip(grid(rpc).T, (lon, lat, alt), strict=True))
+    value = {"1": np.ones(len(L)), "L": L, "P": P, "H": H}
+    terms = np.array([np.prod([value[letter] for letter in word], axis=0) for word in B_ORDER.split()])
+    found = [
+        o + s * (num @ terms) / (den @ terms) for (o, s), num, den in ((col, col_num, col_den), (row, row_num, row_den))
+    ]
+    np.testing.assert_allclose(np.column_stack(found), rpc.project(grid(rpc)), rtol=0, atol=1e-9)
+    behind = [line.split(":")[0] for line in text.splitlines()[90:]]
+    assert [key for key in behind if key.startswith("ERR")] == (["ERR_BIAS", "ERR_RAND"] if rpc.err_bias else [])
+    assert read(text) == rpc
+
+
+def test_maxar_xml_states_the_size_of_the_image_where_it_is_known(rpc, tmp_path):
+    """GDAL takes rows and columns, and the RPC, from one file beside an image."""
+    image = write_image(tmp_path / "scene.tif", (1, 40, 60))
+    write_rpc(rpc, tmp_path / "scene.XML", size=(60, 40))
+    root = ElementTree.parse(tmp_path / "scene.XML").getroot()
+    assert (root.findtext("IMD/NUMROWS"), root.findtext("IMD/NUMCOLUMNS")) == ("40", "60")
+    assert described(tmp_path / "scene.XML") == ((60, 40), False)
+    assert read_rpc(tmp_path / "scene.XML") == read_rpc(image) == rpc
+    with rasterio.open(image) as dataset:
+        assert dataset.rpcs.line_off == rpc.image_offset[1]
+        assert dataset.tags(ns="IMD")["NUMROWS"] == "40"
+    write_rpc(rpc, tmp_path / "other.XML")
+    assert "NUM" not in (tmp_path / "other.XML").read_text().replace("NUMCOEF", "")
+    for name, wide in (("b.XML", True), ("b_RPC.TXT", False)):
+        write_camera(rpc, tmp_path / name, image, size=(7, 9))
+        assert ("<NUMCOLUMNS>7<" in (tmp_path / name).read_text()) == wide
 
 
 # --- the cases of the shared data -------------------------------------------------------------------------
