@@ -185,18 +185,15 @@ def rpc_from_fields(
         if found != count:
             what = "is missing" if not found else f"has {found} numbers, expected {count}"
             raise RpcFormatError(f"{name}: {key} {what}")
-    ground, image = ("LONG", "LAT", "HEIGHT"), ("SAMP", "LINE")
-    for axis in ground:
+    for axis in ("LAT", "LONG", "HEIGHT"):
         both = [getattr(fields[f"{axis}_{part}"][0], "size", None) for part in ("OFF", "SCALE")]
         if None in both and set(both) - {None, 1.0}:
             raise RpcFormatError(f"{name}: of {axis}_OFF and {axis}_SCALE one states a unit, the other none")
     try:
-        return RPC(
-            coeffs=np.array([fields[f"{axis}_{part}_COEFF"] for axis in image for part in ("NUM", "DEN")]),
-            ground_offset=np.array([fields[f"{axis}_OFF"][0] for axis in ground]),
-            ground_scale=np.array([fields[f"{axis}_SCALE"][0] for axis in ground]),
-            image_offset=np.array([fields[f"{axis}_OFF"][0] for axis in image]) - first_pixel,
-            image_scale=np.array([fields[f"{axis}_SCALE"][0] for axis in image]),
+        image = [fields[key][0] - first_pixel for key in OFFSETS[:2]]
+        numbers = [*image, *(fields[key][0] for key in OFFSETS[2:] + SCALES), *(fields[key] for key in COEFFICIENTS)]
+        return RPC.of_numbers(
+            numbers,
             err_bias=_accuracy(fields.get("ERR_BIAS")),
             err_rand=_accuracy(fields.get("ERR_RAND")),
             direct=np.array([fields[key] for key in DIRECT]) if lists is LISTS else None,
@@ -220,14 +217,8 @@ def fields_from_rpc(rpc: RPC, direct: bool = False) -> Fields:
     Those of its localisation RPC come last, in files that hold them (`direct`).
     """
     fields = {key: [value] for key, value in zip(ERRORS, (rpc.err_bias, rpc.err_rand), strict=True) if value}
-    for keys, image, ground in (
-        (OFFSETS, rpc.image_offset, rpc.ground_offset),
-        (SCALES, rpc.image_scale, rpc.ground_scale),
-    ):
-        (col, row), (lon, lat, alt) = image.tolist(), ground.tolist()
-        fields |= {key: [value] for key, value in zip(keys, (row, col, lat, lon, alt), strict=True)}
-    col_num, col_den, row_num, row_den = rpc.coeffs.tolist()
-    fields |= dict(zip(COEFFICIENTS, (row_num, row_den, col_num, col_den), strict=True))
+    keys = OFFSETS + SCALES + COEFFICIENTS
+    fields |= {k: v if k in LISTS else [v] for k, v in zip(keys, rpc.numbers(), strict=True)}
     held = rpc.direct.tolist() if direct and rpc.direct is not None else []
     return fields | dict(zip(DIRECT, held, strict=False))
 
@@ -299,12 +290,10 @@ def write_txt(rpc: RPC) -> str:
 
     The first ninety lines are those of readers that go by the line alone; what only some RPCs have stands behind.
     """
-    return "\n".join(_numbered(_errors_last(rpc), ": ", [str(i) for i in range(1, 21)])) + "\n"
-
-
-def _errors_last(rpc: RPC) -> Fields:
     fields = fields_from_rpc(rpc, direct=True)
-    return {key: fields[key] for key in (*OFFSETS, *SCALES, *LISTS, *ERRORS) if key in fields}
+    order = (*OFFSETS, *SCALES, *LISTS, *ERRORS)
+    lines = _numbered({key: fields[key] for key in order if key in fields}, ": ", [str(i) for i in range(1, 21)])
+    return "\n".join(lines) + "\n"
 
 
 # --- .RPB -------------------------------------------------------------------------------------------------
@@ -489,8 +478,7 @@ def _values(value: Any, name: str, key: str) -> list[float]:
 
 def write_json(rpc: RPC) -> str:
     """Write the dictionary of rpcm and s2p."""
-    rpcm = {_RPCM[k]: values if k in LISTS else values[0] for k, values in _errors_last(rpc).items()}
-    return json.dumps({"rpc": rpcm}, indent=1) + "\n"
+    return json.dumps({"rpc": rpc.to_rpcm_dict()}, indent=1) + "\n"
 
 
 _PAIR = re.compile(r"^[ \t-]*+(\w++):[ \t]*+(\[[^\[\]]*+\]|[^\n\[{]*+)", re.MULTILINE)

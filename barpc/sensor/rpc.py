@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from importlib import import_module
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -17,6 +18,16 @@ from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array, BoolArray, IntArray, 
 from barpc.sensor import Pointwise, SensorModel
 from barpc.sensor.rational import DERIVATIVE, REACH, Rational, monomials
 
+_RASTERIO = [
+    *(f"{axis}_{part}" for part in ("off", "scale") for axis in ("line", "samp", "lat", "long", "height")),
+    *(f"{axis}_{part}_coeff" for axis in ("line", "samp") for part in ("num", "den")),
+]
+_RPCM = [
+    *(f"{axis}_{part}" for part in ("offset", "scale") for axis in ("row", "col", "lat", "lon", "alt")),
+    *(f"{axis}_{part}" for axis in ("row", "col") for part in ("num", "den")),
+]
+_RPCM_DIRECT = ["lon_num", "lon_den", "lat_num", "lat_den"]
+_ACCURACIES = ["err_bias", "err_rand"]
 _ACCURACY = 1e-9  # px: a localised point must project this near to where it was asked (plus rounding)
 _MANY = 1024  # points of a view: its own inverse is sooner made
 _SHRINK = 0.25  # of the step before: nothing singular is near (Kantorovich: a half)
@@ -76,6 +87,88 @@ class RPC(Pointwise):
         scale = np.abs(np.append(self.ground_scale, self.image_scale))
         words = "lon {:.4f} to {:.4f}, lat {:.4f} to {:.4f}, {:g} to {:g} m, col {:g} to {:g}, row {:g} to {:g}"
         return words.format(*np.column_stack([offset - scale, offset + scale]).ravel())
+
+    @classmethod
+    def of_numbers(cls, values: Sequence[Any], **more: Any) -> RPC:
+        """Return the RPC of fourteen values in the order of `numbers`; `more` are its other parameters."""
+        row, col, lat, lon, alt, *scales = values[:10]
+        row_num, row_den, col_num, col_den = values[10:]
+        return cls(
+            np.array([col_num, col_den, row_num, row_den], dtype=np.float64),
+            np.array([lon, lat, alt], dtype=np.float64),
+            np.array([scales[i] for i in (3, 2, 4)], dtype=np.float64),
+            np.array([col, row], dtype=np.float64),
+            np.array([scales[i] for i in (1, 0)], dtype=np.float64),
+            **more,
+        )
+
+    def numbers(self) -> list[Any]:
+        """Return fourteen values in the order of RPC files.
+
+        Offsets of row, col, lat, lon, alt, their scales, then lists of twenty: numerator and denominator of the row, of
+        the column.
+        """
+        (col, row), (lon, lat, alt) = self.image_offset.tolist(), self.ground_offset.tolist()
+        (col_scale, row_scale), (lon_scale, lat_scale, alt_scale) = (
+            self.image_scale.tolist(),
+            self.ground_scale.tolist(),
+        )
+        col_num, col_den, row_num, row_den = self.coeffs.tolist()
+        scales = [row_scale, col_scale, lat_scale, lon_scale, alt_scale]
+        return [row, col, lat, lon, alt, *scales, row_num, row_den, col_num, col_den]
+
+    @classmethod
+    def from_rasterio(cls, rpcs: Any) -> RPC:
+        """Return the RPC of rasterio's ``dataset.rpcs``; RpcError where it is None or lacks a number.
+
+        >>> from rasterio.rpc import RPC as Rasterio
+        >>> rpc = RPC([[1.0] * 20] * 4, [5.4, 43.2, 100.0], [0.1, 0.2, 500.0], [999.5, 499.5], [1000.0, 500.0])
+        >>> rpc.to_rasterio().long_off, rpc.to_rasterio().line_off
+        (5.4, 499.5)
+        >>> isinstance(rpc.to_rasterio(), Rasterio) and RPC.from_rasterio(rpc.to_rasterio()) == rpc
+        True
+        """
+        return cls._of_attributes(rpcs, _RASTERIO)
+
+    def to_rasterio(self) -> Any:
+        """Return a ``rasterio.rpc.RPC``: for ``dataset.rpcs`` of a file that is written, for warping."""
+        named = dict(zip(_RASTERIO, self.numbers(), strict=True))
+        # by name: the mathematics stands without rasterio
+        return import_module("rasterio.rpc").RPC(**named, err_bias=self.err_bias, err_rand=self.err_rand)
+
+    @classmethod
+    def from_rpcm(cls, model: Any) -> RPC:
+        """Return the RPC of an ``rpcm.RPCModel``, its localisation RPC with it; RpcError where it lacks a number."""
+        direct = [getattr(model, name, None) for name in _RPCM_DIRECT]
+        rpc = cls._of_attributes(model, _RPCM)
+        return rpc if None in direct else replace(rpc, direct=np.array(direct, dtype=np.float64))
+
+    def to_rpcm_dict(self) -> dict[str, Any]:
+        """Return the dictionary for ``rpcm.RPCModel(d, dict_format="rpcm")``; known accuracies stand at its end.
+
+        >>> from types import SimpleNamespace
+        >>> rpc = RPC([[1.0] * 20] * 4, [5.4, 43.2, 100.0], [0.1, 0.2, 500.0], [999.5, 499.5], [1000.0, 500.0])
+        >>> rpc.to_rpcm_dict()["row_offset"]
+        499.5
+        >>> RPC.from_rpcm(SimpleNamespace(**rpc.to_rpcm_dict())) == rpc
+        True
+        """
+        named = dict(zip(_RPCM, self.numbers(), strict=True))
+        if self.direct is not None:
+            named |= dict(zip(_RPCM_DIRECT, self.direct.tolist(), strict=True))
+        return named | {key: value for key in _ACCURACIES if (value := getattr(self, key))}
+
+    @classmethod
+    def _of_attributes(cls, given: Any, names: Sequence[str]) -> RPC:
+        if given is None:
+            raise RpcError("None instead of an RPC: the image has none")
+        values = [getattr(given, name, None) for name in names]
+        for name, value, size in zip(names, values, (*[1] * 10, *[20] * 4), strict=True):
+            if value is None or np.size(value) != size:
+                what = "is missing" if value is None else f"has {np.size(value)} numbers, expected {size}"
+                raise RpcError(f"RPC of a {type(given).__name__}: {name} {what}")
+        stated = {key: getattr(given, key, None) for key in _ACCURACIES}
+        return cls.of_numbers(values, **{key: value if value and value > 0 else None for key, value in stated.items()})
 
     def normalize(self, ground: Array, out: Array | None = None) -> Array:
         """Return longitude, latitude, altitude (3, N) of points (N, 3), from -1 to 1 in the RPC's box."""
