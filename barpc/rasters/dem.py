@@ -10,9 +10,11 @@ import os
 import sys
 import warnings
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +29,7 @@ from barpc.base.errors import BarpcWarning, ImageError, InputError
 from barpc.base.geodesy import FAR, Array
 from barpc.base.remote import Place, location
 from barpc.base.sidefile import GRID, opened
+from barpc.rasters.pgm import open_pgm
 from barpc.rasters.raster import open_raster
 from barpc.rasters.vertical import ELLIPSOID, NONE, UNKNOWN, Vertical, vertical_of
 from barpc.sensor import SensorModel
@@ -34,6 +37,7 @@ from barpc.sensor import SensorModel
 HEIGHTS = {
     ".hgt": ("SRTMHGT", Vertical("EGM96 height", geoid="egm96", stated=True)),
     ".gtx": ("GTX", Vertical(ELLIPSOID, stated=True)),
+    ".pgm": ("PGM", Vertical(ELLIPSOID, stated=True)),
 }
 """Suffix -> the driver that may open it (its first bytes say nothing), and what its heights count from."""
 _MAX_CELLS = 400_000_000
@@ -59,13 +63,16 @@ class HeightGrid:
 
     @classmethod
     def open(cls, path: Path | str) -> HeightGrid:
-        """Return a grid from ``.hgt`` (SRTM), ``.gtx`` (NOAA's geoid grids) or any raster with a CRS; or InputError."""
+        """Return a grid from ``.hgt`` (SRTM), ``.gtx`` (NOAA), ``.pgm`` (GeographicLib) or any raster with a CRS.
+
+        InputError where it is none.
+        """
         path = location(path)
         with opened(path, GRID) as file:
             length = file.seek(0, 2)
         driver, vertical = HEIGHTS.get(path.suffix.lower(), (None, None))
         try:
-            with open_raster(path, driver) as dataset:
+            with _opened(path, driver) as dataset:
                 crs, shape, forward, extent = dataset.crs, dataset.shape, dataset.transform, dataset.bounds
                 unit, linear = dataset.units[0] or "", (float(dataset.scales[0]), float(dataset.offsets[0]))
                 if crs is None:
@@ -90,7 +97,7 @@ class HeightGrid:
 
     def read(self, top: int, bottom: int, left: int, right: int) -> Array:
         """Read the heights (bottom - top, right - left) [m] of a window, NaN in voids."""
-        with open_raster(self.path, self.driver) as dataset:
+        with _opened(self.path, self.driver) as dataset:
             window = Window.from_slices((top, bottom), (left, right))
             numbers = dataset.read(1, window=window, masked=True).astype(np.float64).filled(np.nan)
         scale, offset = self.linear
@@ -157,6 +164,10 @@ class HeightGrid:
         height = map_coordinates(np.where(void, 0.0, cells), at, order=1, mode="nearest")
         height[map_coordinates(void.astype(np.float64), at, order=1, mode="nearest") > 0] = np.nan
         return np.asarray(height)
+
+
+def _opened(path: Place, driver: str | None) -> AbstractContextManager[Any]:
+    return open_pgm(path) if driver == "PGM" else open_raster(path, driver)
 
 
 def _snapped(index: Array) -> Array:

@@ -221,6 +221,11 @@ def _gtx() -> bytes:
     return head + np.full((19, 36), 50.0, ">f4").tobytes()
 
 
+def _pgm() -> bytes:
+    head = b"P5\n# Geoid file in PGM format\n# Offset -108\n# Scale 0.003\n# Origin 90N 0E\n36 19\n65535\n"
+    return head + np.full((19, 36), 52_000, ">u2").tobytes()
+
+
 # --- arrays -----------------------------------------------------------------------------------------------
 
 
@@ -514,6 +519,7 @@ SAMPLES: dict[str, Sample] = {
     "dem": Sample("dem.tif", _use_dem, _dem, (_mutate_transform(_dem), mutate_header), share=0.2),
     "dem hgt": Sample("N43E005.hgt", _use_dem, cache(lambda: bytes(2 * 1201**2)), (), share=0.02),
     "geoid gtx": Sample("geoid.gtx", _use_dem, _gtx, (mutate_header,)),
+    "geoid pgm": Sample("geoid.pgm", _use_dem, _pgm, (mutate_header,)),
     "grid": Sample("nodes.tif", _use_grid, _localisation, (_mutate_transform(_localisation), mutate_header), share=0.2),
     "correction": Sample(
         "a_correction.tif",

@@ -1,0 +1,92 @@
+"""Geoid grids of GeographicLib, ``.pgm``: 16-bit numbers from the north pole down, from Greenwich on, one a node.
+
+The comments of the header state an offset and a scale: height of the geoid [m] = offset + scale * number.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+import numpy as np
+from rasterio import Affine
+from rasterio.coords import BoundingBox
+from rasterio.crs import CRS
+from rasterio.transform import array_bounds
+from rasterio.windows import Window
+
+from barpc.base.errors import InputError
+from barpc.base.remote import Place
+from barpc.base.sidefile import GRID, opened
+
+_HEAD = re.compile(rb"P5\s++((?:#[^\n]*+\n\s*+)*+)(\d{1,6})\s++(\d{1,6})\s++((?:#[^\n]*+\n\s*+)*+)65535[ \t\r\n]")
+_LONGEST = 65536  # bytes of a header; those in use have 600
+
+
+@dataclass(frozen=True)
+class Pgm:
+    """An open grid: what `barpc.rasters.dem` asks of a dataset, under rasterio's names."""
+
+    path: Place
+    file: BinaryIO
+    start: int  # of the numbers [bytes]
+    shape: tuple[int, int]
+    offset: float
+    scale: float
+    crs = CRS.from_epsg(4326)
+
+    @property
+    def transform(self) -> Affine:
+        """From col, row to lon, lat [deg], nodes at the centres of cells."""
+        rows, cols = self.shape
+        east, south = 360.0 / cols, 180.0 / (rows - 1)
+        return Affine(east, 0.0, -east / 2, 0.0, -south, 90.0 + south / 2)
+
+    @property
+    def bounds(self) -> BoundingBox:
+        """Edges of the cells [deg]."""
+        return BoundingBox(*array_bounds(*self.shape, self.transform))
+
+    def read(self, _band: int, window: Window, masked: bool = True) -> Any:
+        """Read the heights of a window [m], row by row: a grid of one arc minute has half a gigabyte."""
+        (top, bottom), (left, right) = window.toranges()
+        numbers = np.empty((bottom - top, right - left), dtype=">u2")
+        for i, row in enumerate(numbers):
+            self.file.seek(self.start + 2 * ((top + i) * self.shape[1] + left))
+            data = self.file.read(row.nbytes)
+            if len(data) != row.nbytes:
+                raise InputError(f"{self.path}: ended while it was read")
+            row[:] = np.frombuffer(data, dtype=row.dtype)
+        heights = self.offset + self.scale * numbers.astype(np.float64)
+        return np.ma.MaskedArray(heights) if masked else heights
+
+
+@contextmanager
+def open_pgm(path: Place) -> Iterator[Pgm]:
+    """Open a geoid grid; InputError where it is none of GeographicLib's."""
+    with opened(path, GRID) as file:
+        head = file.read(_LONGEST)
+        found = _HEAD.match(head)
+        if found is None:
+            raise InputError(f"{path}: no .pgm of 16-bit numbers (P5, comments, width, height, 65535)")
+        cols, rows = int(found[2]), int(found[3])
+        said = {
+            key.decode("latin-1").lower(): text.decode("latin-1").strip()
+            for key, text in re.findall(rb"#[ \t]*+(\w++)[ \t]++([^\n]*+)", found[1] + found[4])
+        }
+        try:
+            offset, scale = float(said["offset"]), float(said["scale"])
+        except (KeyError, ValueError):
+            offset = scale = np.nan
+        if not (np.isfinite([offset, scale]).all() and scale > 0):
+            raise InputError(f"{path}: no geoid grid of GeographicLib, whose comments state '# Offset' and '# Scale'")
+        origin, kind = said.get("origin", "90N 0E"), said.get("area_or_point", "Point")
+        if (origin.split(), kind.lower()) != (["90N", "0E"], "point"):
+            raise InputError(f"{path}: Origin {origin}, {kind}: only grids of points from 90N 0E on are read")
+        length = found.end() + 2 * rows * cols
+        if rows < 2 or cols < 2 or file.seek(0, 2) != length:
+            raise InputError(f"{path}: {file.seek(0, 2)} bytes, its header of {cols} x {rows} numbers needs {length}")
+        yield Pgm(path, file, found.end(), (rows, cols), offset, scale)
