@@ -15,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from barpc.base.errors import ImageError, InputError, RpcError
+from barpc.base.errors import ImageError, InputError, MissingRpcError, RpcError
 from barpc.base.remote import Place, located, location
 from barpc.base.sidefile import IMAGE, read_head
 from barpc.pointio.correspondences import (
@@ -23,6 +23,7 @@ from barpc.pointio.correspondences import (
     Correspondences,
     correspondence_kind,
     read_correspondences,
+    read_gcp_grid,
     read_grid,
 )
 from barpc.rasters.raster import driver_of, open_raster
@@ -117,15 +118,33 @@ def split_spec(spec: str | Path, hosts: Sequence[str] = ()) -> tuple[Place, dict
 
 
 def read_points(spec: str | Path) -> tuple[Correspondences | None, tuple[int, int] | None]:
-    """Return the points of a table or of a localisation grid, and the image size given behind it; None of a camera."""
+    """Return the points of a table, a localisation grid or an image that has GCPs and no RPC; None of a camera.
+
+    And the size of the image, given behind the file or its own.
+    """
     path, texts = split_spec(spec)
     if path.is_dir() or b"<adsHeader>" in read_head(path, IMAGE):
         return None, None
     altitudes = _read(_numbers, "altitudes", texts["altitudes"], path) if "altitudes" in texts else None
-    if set(texts) - {"size", "altitudes"} or correspondence_kind(path, altitudes) is None:
+    if set(texts) - {"size", "altitudes"}:
         return None, None
     size = _read(_size, "size", texts["size"], path) if "size" in texts else None
+    if correspondence_kind(path, altitudes) is None:
+        points, own = _tagged(path)
+        return points, size or own
     return read_correspondences(path, altitudes=altitudes), size
+
+
+def _tagged(path: Place) -> tuple[Correspondences | None, tuple[int, int] | None]:
+    if driver_of(read_head(path, IMAGE)) is None:
+        return None, None
+    try:
+        read_rpc_source(path)
+    except MissingRpcError:
+        return read_gcp_grid(path)
+    except (ImageError, RpcError):
+        pass  # it is said where the camera is opened
+    return None, None
 
 
 def _read(reader: Reader, key: str, text: str, file: Place) -> Any:

@@ -53,7 +53,8 @@ def fit(
 
     SOURCE is whatever 'barpc info' knows as a camera - an image with an RPC or an RPC file (refitted), a
     direct-localisation grid, a Sentinel-1 or TerraSAR-X product or annotation, a SICD image, a CSM state - or a table
-    of points (CSV, npz, GeoJSON). Choices stand behind it: 'barpc info --help' lists them.
+    of points (CSV, npz, GeoJSON), or an image that has GCPs and no RPC. Choices stand behind it: 'barpc info --help'
+    lists them.
 
     \b
     Examples:
@@ -104,6 +105,10 @@ def _fit(source: str, output: str | None, flags: dict[str, Any]) -> tuple[RpcFit
     points, size = read_points(source)
     if points is not None:
         ground, image = points.ground, points.image
+        if points.note:
+            say(points.note)
+        if (alt := ground[:, 2]).min() == alt.max():
+            say(f"all points are at {alt[0]:g} m: the RPC's heights hold no terms, it is good at that altitude only")
         fit = fit_rpc_points(ground, image, sigma=points.sigma, size=size, options=options, strict=False)
         return fit, options.tolerance, size
     camera = open_camera(source)

@@ -184,14 +184,20 @@ def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Row]:
 def _read_tags(path: Path, views: ViewNames) -> Iterator[_Row]:
     """Yield the GCP tags of an image: they are seen in that image alone."""
     view = views.index(str(path))
+    for name, lon, lat, alt, col, row in _tags(path)[0]:
+        yield name, view, lon, lat, alt, *(GROUND_SIGMA,) * 3, col, row, IMAGE_SIGMA
+
+
+def _tags(path: Place) -> tuple[list[_Row], tuple[int, int]]:
+    """Return the GCP tags of an image, each a name, lon, lat, alt and col, row as they stand; its width and height."""
     with open_raster(path) as dataset:
-        gcps, crs = dataset.gcps
+        (gcps, crs), size = dataset.gcps, (int(dataset.width), int(dataset.height))
     if gcps and crs is not None and not crs.is_geographic:
         raise InputError(f"{path}: its GCPs are in {crs}; longitude and latitude on WGS84 are needed")
     for n, gcp in enumerate(gcps, 1):
         if gcp.z is None:
             raise InputError(f"{path}: GCP {gcp.id or n} has no altitude")
-        yield str(gcp.id or n), view, gcp.x, gcp.y, gcp.z, *(GROUND_SIGMA,) * 3, gcp.col, gcp.row, IMAGE_SIGMA
+    return [(str(gcp.id or n), gcp.x, gcp.y, gcp.z, gcp.col, gcp.row) for n, gcp in enumerate(gcps, 1)], size
 
 
 def _assembled(found: _Observed) -> GroundPoints:
@@ -232,6 +238,7 @@ class Correspondences:
     ground: Array  # (N, 3): lon, lat [deg], alt [m above the ellipsoid]
     image: Array  # (N, 2): col, row [px]
     sigma: Array | None = None  # (N,): standard deviation of the image points [px]
+    note: str = ""  # how they were understood
 
 
 def read_correspondences(path: Path | str, *, altitudes: Sequence[float] | None = None) -> Correspondences:
@@ -265,6 +272,22 @@ def read_correspondences(path: Path | str, *, altitudes: Sequence[float] | None 
         raise InputError(f"{path}: columns of different lengths")
     ground, image = (np.column_stack([arrays[key] for key in keys]) for keys in (("lon", "lat", "alt"), ("col", "row")))
     return Correspondences(ground, image, arrays.get("sigma"))
+
+
+def read_gcp_grid(path: Place) -> tuple[Correspondences | None, tuple[int, int]]:
+    """Return the GCP tags of an image, None without any, as the points of its camera; and its width and height [px].
+
+    A grid from 0 to the last pixel, as Sentinel-1's, counts from the centre of the first pixel; any other from its
+    corner, as GDAL does: half a pixel is taken off.
+    """
+    found, size = _tags(path)
+    if not found:
+        return None, size
+    ground, image = (np.array([row[part] for row in found], dtype=np.float64) for part in (slice(1, 4), slice(4, 6)))
+    centres = (image.min(axis=0) == 0).all() and (image.max(axis=0) == np.array(size) - 1).all()
+    where = "centre" if centres else "corner"
+    note = f"{len(found)} GCPs of {path.name}, counted from the {where} of the first pixel"
+    return Correspondences(ground, image - (0.0 if centres else 0.5), note=note), size
 
 
 def correspondence_kind(path: Place, altitudes: Sequence[float] | None = None) -> str | None:

@@ -224,9 +224,17 @@ def _image_source(path: Place, head: bytes, options: ReadOptions) -> RpcSource:
     else:
         raise MissingRpcError(
             f"{path}: no RPC in the image and none beside it (.RPB, _RPC.TXT, .XML, .geom and others)"
+            + _with_gcps(path)
             + ("; HDF5 files are not read: write its coefficients as an _RPC.TXT" if head.startswith(_HDF5) else "")
         )
     return replace(source, notes=source.notes + ((f"not used: {', '.join(ignored)}",) if ignored else ()))
+
+
+def _with_gcps(path: Place) -> str:
+    with suppress(ImageError), open_raster(path) as dataset:
+        if count := len(dataset.gcps[0]):
+            return f"; it has {count} GCPs: 'barpc fit' makes an RPC of them"
+    return ""
 
 
 def _own_rpc(path: Place, head: bytes) -> RPC | None:

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
+from rasterio.control import GroundControlPoint
+from rasterio.crs import CRS
 
 from barpc.cli import main
 from barpc.rpcio import read_rpc, write_rpc
+from barpc.sensor.geometry import altitude_range
+from barpc.sensor.rpc import RPC
 from barpc.sensor.sentinel1 import RangeDoppler
 from tests.fit.cameras import Camera, random_points, synthetic
+from tests.rpcio.conftest import make_rpc
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +38,79 @@ def table(path: Path, camera: Camera, noise: float = 0.0) -> Path:
     ground, image = random_points(camera, 400, rng)
     np.savez(path, ground=ground, image=image + rng.normal(0, 1, image.shape) * noise)
     return path
+
+
+def tagged(path: Path, rpc: RPC, first: float, flat: float | None = None, steps: int = 10, crs: int = 4326) -> Path:
+    """An image of 1001 x 801 px with GCPs and no RPC; `first` is what its tags call the first pixel's centre."""
+    cols, rows = np.meshgrid(np.linspace(0, 1000 + 2 * first, steps + 1), np.linspace(0, 800 + 2 * first, steps + 1))
+    image = np.column_stack([cols.ravel(), rows.ravel()])
+    low, high = altitude_range(rpc)
+    alt = low + (high - low) * (0.5 + 0.4 * np.sin(image[:, 0] / 97) * np.cos(image[:, 1] / 71))
+    ground = rpc.localize(image - first, alt if flat is None else np.full(len(image), flat))
+    gcps = [
+        GroundControlPoint(row, col, *place, id=str(i))
+        for i, ((col, row), place) in enumerate(zip(image, ground, strict=True))
+    ]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with rasterio.open(
+            path, "w", driver="GTiff", width=1001, height=801, count=1, dtype="uint8", gcps=gcps, crs=CRS.from_epsg(crs)
+        ) as out:
+            out.write(np.zeros((1, 801, 1001), np.uint8))
+    return path
+
+
+@pytest.mark.parametrize(("first", "where"), [(0.5, "corner"), (0.0, "centre")])
+def test_an_image_with_a_grid_of_gcps_and_no_rpc_becomes_an_rpc(
+    first: float, where: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """GDAL counts from the corner; Sentinel-1's grids go from 0 to the last pixel, whose centres they mean."""
+    rpc, out = make_rpc().crop(500, 500), tmp_path / "new_RPC.TXT"
+    image = tagged(tmp_path / "grd.tif", rpc, first)
+    assert run("fit", image, "-o", out, "--json") == 0
+    told = capsys.readouterr()
+    assert f"121 GCPs of grd.tif, counted from the {where} of the first pixel" in told.err
+    assert "hold no terms" not in told.err
+    assert json.loads(told.out)["coverage"] > 0.9
+    points = np.random.default_rng(3).uniform(0, 800, (500, 2))
+    for alt in altitude_range(rpc):
+        found = read_rpc(out).project(rpc.localize(points, np.full(500, alt)))
+        assert np.abs(found - points).max() < 0.01
+    assert run("info", image) == 1
+    assert "it has 121 GCPs: 'barpc fit' makes an RPC of them" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("alt", [0.0, 250.0])
+def test_of_gcps_at_one_altitude_it_is_said_that_heights_hold_nothing(
+    alt: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = tagged(tmp_path / "a.tif", make_rpc().crop(500, 500), 0.5, flat=alt)
+    run("fit", image)
+    assert f"all points are at {alt:g} m: the RPC's heights hold no terms" in capsys.readouterr().err
+
+
+def test_an_rpc_goes_before_gcps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rpc = make_rpc().crop(500, 500)
+    image = tagged(tmp_path / "a.tif", rpc, 0.5)
+    write_rpc(rpc.crop(30, 40), tmp_path / "a.RPB")
+    assert run("fit", image, "-o", tmp_path / "b_RPC.TXT") == 0
+    assert "GCPs" not in capsys.readouterr().err
+    np.testing.assert_allclose(
+        read_rpc(tmp_path / "b_RPC.TXT").localize([[500.0, 400.0]], [170.0]), rpc.localize([[530.0, 440.0]], [170.0])
+    )
+    (tmp_path / "a.RPB").write_text("lineNumCoef = (1")
+    assert run("fit", image) == 1
+    assert "a.RPB" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("given", "said"), [({"crs": 32631}, "its GCPs are in EPSG:32631"), ({"steps": 4}, "25 points are too few")]
+)
+def test_gcps_that_make_no_rpc_are_refused(
+    given: dict[str, int], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("fit", tagged(tmp_path / "a.tif", make_rpc().crop(500, 500), 0.5, **given)) == 1
+    assert said in capsys.readouterr().err
 
 
 def test_examples_in_the_help_stand_on_lines_of_their_own(capsys: pytest.CaptureFixture[str]) -> None:
