@@ -29,11 +29,12 @@ from barpc.pointio.correspondences import (
 from barpc.rasters.raster import driver_of, open_raster
 from barpc.rpcio import read_rpc_source
 from barpc.rpcio.grids import SIGN, read_correction
-from barpc.rpcio.sources import described, metadata_beside, only_physical
+from barpc.rpcio.sources import at_tile, described, metadata_beside, only_physical
 from barpc.scene import Camera
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.displaced import Displaced
 from barpc.sensor.geometry import altitude_range
+from barpc.sensor.rpc import RPC
 
 _ON_EARTH = (-500.0, 9000.0)  # m: all ground
 
@@ -95,6 +96,8 @@ def open_split(path: Place, texts: Mapping[str, str], **choices: Any) -> Camera:
             raise InputError(f"{file}: {key} is no choice for the kind {name}; known are {possible}")
     read = {key: _read(opener.choices[key], key, text, file) for key, text in texts.items()}
     camera = opener.open(file, **{**read, **choices})
+    if holder is not None and isinstance(camera.model, RPC) and (tile := at_tile(path, camera.path, camera.model)):
+        camera = replace(camera, model=tile[0], notes=(*camera.notes, tile[1]), size=None)
     if isinstance(size, str):
         size = _read(_size, "size", size, file)
     elif size is None:  # of the image's own pixels; those of a grid are not the image's
@@ -171,7 +174,7 @@ def _pixels(path: Place) -> tuple[int, int] | None:
 
 def _open_rpc(path: Place, first_pixel: float | None = None, band: int = 1) -> Camera:
     source = read_rpc_source(path, first_pixel=first_pixel, band=band)
-    size, notes = None, source.notes
+    size, notes = source.size, source.notes
     if source.path == path and source.format in ("xml", "dimap"):  # given alone: it speaks of its whole image
         size, physical = described(path)
         if physical:

@@ -36,13 +36,14 @@ class RpcSource:
     format: str  # tag, nitf, or a row of FORMATS
     path: Place  # the file that holds it: the image, or one beside it
     notes: tuple[str, ...] = ()  # what the user should know: an origin that was applied, files passed over
+    size: tuple[int, int] | None = None  # width and height [px] of the mosaic whose tiles a file lists
 
 
 @dataclass(frozen=True)
 class Sidecar:
     """A file beside an image that may hold an RPC."""
 
-    kind: str  # rpb, txt, xml, dimap, alos, pam or geom
+    kind: str  # rpb, txt, xml, dimap, alos, pam, geom or strip
     path: Place
     before_tag: bool  # whether GDAL and its users read it instead of the image's own RPC
 
@@ -61,7 +62,8 @@ def sidecars(image: Path | str) -> list[Sidecar]:
         path = image.parent / (found_name or "")
         if found_name in (None, image.name) or not path.is_file():
             continue
-        if kind in ("xml", "dimap", "pam") and not FORMATS["gdal" if kind == "pam" else kind].sniff(_readable(path)):
+        syntax = FORMATS[{"pam": "gdal", "dimap": "dimap"}.get(kind, "xml")]
+        if path.suffix.lower() == ".xml" and not syntax.sniff(_readable(path)):
             continue
         if path not in [sidecar.path for sidecar in found]:
             found.append(Sidecar(kind, path, before_tag and (kind in ("rpb", "xml") or not metadata_only)))
@@ -124,6 +126,10 @@ def _names(name: str) -> Iterator[tuple[str, str, bool]]:
     yield "rpb", f"{name}.RPB", False  # names that GDAL does not look for
     yield "rpb", f"{stem}_RPB.TXT", False
     yield "txt", f"{stem}-RPC.txt", False
+    if strip := _strip(stem):
+        yield "strip", f"{strip}.RPB", False
+        yield "strip", f"{strip}.XML", False
+        yield "strip", f"{strip}_RPC.TXT", False
 
 
 def _readable(path: Place) -> str:
@@ -144,7 +150,8 @@ def shadows(image: Path | str) -> list[Sidecar]:
     head = read_head(image, IMAGE, 64)
     vrt = _is_vrt(head)
     own = vrt or _own_rpc(image, head) is not None
-    return [s for s in sidecars(image) if s.kind == "geom" or (s.before_tag and not vrt) or not own]
+    found = (s for s in sidecars(image) if s.kind != "strip")  # which no tool reads for one tile
+    return [s for s in found if s.kind == "geom" or (s.before_tag and not vrt) or not own]
 
 
 def hidden_by(paths: Iterable[Path]) -> Iterator[tuple[Path, Path, RPC]]:
@@ -154,7 +161,7 @@ def hidden_by(paths: Iterable[Path]) -> Iterator[tuple[Path, Path, RPC]]:
         wanted.setdefault(path.parent, {})[path.name.lower()] = path
     for folder, files in wanted.items():
         for image in sorted(folder.iterdir()) if folder.is_dir() else ():
-            beside = (files.get(name.lower()) for _, name, _ in _names(image.name))
+            beside = (files.get(name.lower()) for kind, name, _ in _names(image.name) if kind != "strip")
             found = next((path for path in beside if path is not None and path.name != image.name), None)
             if found is not None:
                 with suppress(ImageError, RpcError):
@@ -196,7 +203,13 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
         if items is None:
             return _image_source(path, head, options)
         return RpcSource(rpc_from_domain(items, str(path), options), "gdal", path)
-    rpc, name = parse(read_bytes(path, RPC_FILE), str(path), options)
+    data = read_bytes(path, RPC_FILE)
+    if tiles := _tiles(decode(data), path):
+        ends = np.array(list(tiles.values()))[:, 2:].max(axis=0) + 1
+        found = _image_source(path, head, options)
+        notes = (f"a mosaic of {len(tiles)} tiles", *found.notes)
+        return replace(found, notes=notes, size=(int(ends[0]), int(ends[1])))
+    rpc, name = parse(data, str(path), options)
     return RpcSource(rpc, name, path)
 
 
@@ -244,7 +257,7 @@ def _own_rpc(path: Place, head: bytes) -> RPC | None:
 
 def _sidecar_source(image: Place, sidecar: Sidecar, options: ReadOptions) -> RpcSource:
     rpc, name = parse(read_bytes(sidecar.path, RPC_FILE), str(sidecar.path), options)
-    origin = {"geom": _crop_origin, "dimap": _tile_origin}.get(sidecar.kind)
+    origin = {"geom": _crop_origin, **_WHOLE}.get(sidecar.kind)
     moved = origin(image, sidecar.path) if origin else None
     if moved is None:
         return RpcSource(rpc, name, sidecar.path)
@@ -276,15 +289,94 @@ def _tile_origin(image: Place, path: Place) -> _Moved:
     if tile is None or tile.groups() == ("1", "1"):
         return None
     product = path.name[4:]
-    near = files_of(image.parent) if isinstance(image, Path) else beside(image, [f"DIM_{product}"])
-    dim = near.get(f"dim_{product}".lower())
-    text = decode(read_bytes(image.parent / dim, RPC_FILE)) if dim else ""
+    dim = _near(image, f"DIM_{product}") or _near(path, f"DIM_{product}")
+    text = decode(read_bytes(dim, RPC_FILE)) if dim else ""
     width, height = (re.search(rf"<NTILES_SIZE\b[^<>]*\b{key}=\"(\d{{1,9}})\"", text) for key in ("ncols", "nrows"))
     if width is None or height is None:
         raise RpcFormatError(f"{path}: the tile size of {image.name} is unknown (no DIM_{product} with NTILES_SIZE)")
     row, col = (int(index) - 1 for index in tile.groups())
     x, y = col * int(width.group(1)), row * int(height.group(1))
     return (x, y, 1.0, 1.0), f"tile origin ({x}, {y})"
+
+
+# --- tiles ------------------------------------------------------------------------------------------------
+
+_TILE = re.compile(r"_R(\d{1,4})C(\d{1,4})(?=[-_]|$)", re.IGNORECASE)
+
+
+def _strip(stem: str) -> str:
+    """Return the name of the strip of a tile, ``X`` of ``X_R1C2``; empty of what is called otherwise."""
+    found = _TILE.search(stem)
+    return stem[: found.start()] + stem[found.end() :] if found else ""
+
+
+def _near(file: Place, name: str) -> Place | None:
+    """Return the file of a name, whatever its case, beside another one; None without one."""
+    present = files_of(file.parent) if isinstance(file, Path) else beside(file, [name])
+    found = present.get(name.lower())
+    return None if found is None else file.parent / found
+
+
+def _tiles(text: str, path: Place) -> dict[str, tuple[int, int, int, int]]:
+    """Return the first and last col, row of every tile that Maxar's ``.TIL`` lists, by name in lower case."""
+    found = {}
+    for number, part in enumerate(re.split(r"BEGIN_GROUP\s*+=\s*+TILE_\d++", text)[1:], start=1):
+        words = {word.lower(): value for word, value in re.findall(r'(\w++)\s*+=\s*+"?([^";\n]*+)"?;', part)}
+        cells = [words.get(f"{key}offset", "").strip() for key in ("ulcol", "ulrow", "lrcol", "lrrow")]
+        if not (words.get("filename") and all(re.fullmatch(r"\d{1,7}", cell) for cell in cells)):
+            raise RpcFormatError(f"{path}: tile {number} has no file name, or no corners UL and LR in pixels")
+        left, top, right, bottom = map(int, cells)
+        found[words["filename"].strip().lower()] = (left, top, right, bottom)
+    return found
+
+
+def _strip_origin(image: Place, path: Place) -> _Moved:
+    """Return the origin of a tile in the strip whose RPC `path` is: by the ``.TIL`` beside either."""
+    name, place = f"{_strip(image.stem)}.TIL", _TILE.search(image.stem)
+    til = _near(image, name) or _near(path, name)
+    if til is None:
+        if place and [int(index) for index in place.groups()] == [1, 1]:
+            return None
+        raise RpcFormatError(
+            f"{path}: the RPC of a strip, and where its tile {image.name} lies is not known: {name} is missing"
+        )
+    corners = _tiles(decode(read_bytes(til, RPC_FILE)), til).get(image.name.lower())
+    with open_raster(image) as dataset:
+        size = dataset.width, dataset.height
+    if corners is None or size != (corners[2] - corners[0] + 1, corners[3] - corners[1] + 1):
+        raise RpcFormatError(
+            f"{til}: lists no tile {image.name} of {size[0]} x {size[1]} px, so its place is not known"
+        )
+    left, top = corners[:2]
+    return ((left, top, 1.0, 1.0), f"tile origin ({left}, {top})") if left or top else None
+
+
+def at_tile(image: Place, path: Place, rpc: RPC) -> tuple[RPC, str] | None:
+    """Return the RPC of a tile, and what was done, where that of the file `path`, given for it, is its whole image's.
+
+    The whole image's file is called so, or equal to the one beside the tile. None of an image that is no tile.
+    """
+    strip = _strip(image.stem)
+    if not strip or path.name.lower().startswith(image.stem.lower()):
+        return None
+    kinds = {name.lower(): kind for kind, name, _ in _names(image.name) if kind in _WHOLE}
+    equal = (s.kind for s in sidecars(image) if s.kind in _WHOLE and _parsed(s.path) == rpc)
+    kind = kinds.get(path.name.lower()) or next(equal, None)
+    if kind is not None:
+        moved = _WHOLE[kind](image, path)
+        return (rpc.window(*moved[0]), f"{moved[1]} applied") if moved else None
+    listed = any(_near(image, f"{strip}{end}") for end in (".TIL", ".IMD"))
+    return (rpc, f"taken as the RPC of this tile alone, not of its strip {strip}") if listed else None
+
+
+def _parsed(path: Place) -> RPC | None:
+    with suppress(BarpcError):
+        return parse(read_bytes(path, RPC_FILE), str(path))[0]
+    return None
+
+
+_WHOLE = {"dimap": _tile_origin, "strip": _strip_origin}
+"""Kind of a file beside a tile whose RPC is that of the whole image -> where the tile lies in it."""
 
 
 # --- sun and date -----------------------------------------------------------------------------------------
