@@ -11,7 +11,7 @@ import click
 
 from barpc.base.options import GEOID_HELP
 from barpc.cli.flags import flag, paper, run_options
-from barpc.cli.terminal import echo, remark, tell_gate, wants_json
+from barpc.cli.terminal import echo, remark, say, tell_gate, wants_json
 
 if TYPE_CHECKING:
     from barpc.fit import RpcFit
@@ -106,7 +106,7 @@ def _fit(source: str, output: str | None, flags: dict[str, Any]) -> tuple[RpcFit
     if points is not None:
         ground, image = points.ground, points.image
         if points.note:
-            say(points.note)
+            remark(points.note)
         if (alt := ground[:, 2]).min() == alt.max():
             say(f"all points are at {alt[0]:g} m: the RPC's heights hold no terms, it is good at that altitude only")
         fit = fit_rpc_points(ground, image, sigma=points.sigma, size=size, options=options, strict=False)

@@ -23,20 +23,18 @@ from barpc.base.remote import Place
 from barpc.base.sidefile import GRID, opened
 
 _HEAD = re.compile(rb"P5\s++((?:#[^\n]*+\n\s*+)*+)(\d{1,6})\s++(\d{1,6})\s++((?:#[^\n]*+\n\s*+)*+)65535[ \t\r\n]")
-_LONGEST = 65536  # bytes of a header; those in use have 600
 
 
 @dataclass(frozen=True)
 class Pgm:
     """An open grid: what `barpc.rasters.dem` asks of a dataset, under rasterio's names."""
 
-    path: Place
     file: BinaryIO
     start: int  # of the numbers [bytes]
     shape: tuple[int, int]
-    offset: float
-    scale: float
-    crs = CRS.from_epsg(4326)
+    offsets: tuple[float]
+    scales: tuple[float]
+    crs, units = CRS.from_epsg(4326), ("m",)
 
     @property
     def transform(self) -> Affine:
@@ -50,33 +48,24 @@ class Pgm:
         """Edges of the cells [deg]."""
         return BoundingBox(*array_bounds(*self.shape, self.transform))
 
-    def read(self, _band: int, window: Window, masked: bool = True) -> Any:
-        """Read the heights of a window [m], row by row: a grid of one arc minute has half a gigabyte."""
-        (top, bottom), (left, right) = window.toranges()
-        numbers = np.empty((bottom - top, right - left), dtype=">u2")
-        for i, row in enumerate(numbers):
-            self.file.seek(self.start + 2 * ((top + i) * self.shape[1] + left))
-            data = self.file.read(row.nbytes)
-            if len(data) != row.nbytes:
-                raise InputError(f"{self.path}: ended while it was read")
-            row[:] = np.frombuffer(data, dtype=row.dtype)
-        heights = self.offset + self.scale * numbers.astype(np.float64)
-        return np.ma.MaskedArray(heights) if masked else heights
+    def read(self, _band: int, window: Window, masked: bool) -> Any:
+        """Read the numbers of a window, of its rows alone: a grid of one arc minute has half a gigabyte."""
+        (top, bottom), columns = window.toranges()[0], slice(*window.toranges()[1])
+        self.file.seek(self.start + 2 * top * self.shape[1])
+        numbers = np.frombuffer(self.file.read(2 * (bottom - top) * self.shape[1]), dtype=">u2")
+        return np.ma.MaskedArray(numbers.reshape(bottom - top, -1)[:, columns])
 
 
 @contextmanager
 def open_pgm(path: Place) -> Iterator[Pgm]:
     """Open a geoid grid; InputError where it is none of GeographicLib's."""
     with opened(path, GRID) as file:
-        head = file.read(_LONGEST)
-        found = _HEAD.match(head)
+        found = _HEAD.match(file.read(65536))
         if found is None:
             raise InputError(f"{path}: no .pgm of 16-bit numbers (P5, comments, width, height, 65535)")
         cols, rows = int(found[2]), int(found[3])
-        said = {
-            key.decode("latin-1").lower(): text.decode("latin-1").strip()
-            for key, text in re.findall(rb"#[ \t]*+(\w++)[ \t]++([^\n]*+)", found[1] + found[4])
-        }
+        pairs = re.findall(r"#[ \t]*+(\w++)[ \t]++([^\n]*+)", (found[1] + found[4]).decode("latin-1"))
+        said = {key.lower(): text.strip() for key, text in pairs}
         try:
             offset, scale = float(said["offset"]), float(said["scale"])
         except (KeyError, ValueError):
@@ -89,4 +78,4 @@ def open_pgm(path: Place) -> Iterator[Pgm]:
         length = found.end() + 2 * rows * cols
         if rows < 2 or cols < 2 or file.seek(0, 2) != length:
             raise InputError(f"{path}: {file.seek(0, 2)} bytes, its header of {cols} x {rows} numbers needs {length}")
-        yield Pgm(path, file, found.end(), (rows, cols), offset, scale)
+        yield Pgm(file, found.end(), (rows, cols), (offset,), (scale,))

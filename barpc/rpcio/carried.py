@@ -20,16 +20,7 @@ from barpc.base.errors import ImageError, RpcFormatError
 from barpc.base.geodesy import Array
 from barpc.base.remote import Place
 from barpc.base.sidefile import IMAGE, opened, read_head
-from barpc.rpcio.text import (
-    COEFFICIENTS,
-    SINGLE,
-    WIDTHS,
-    cells_of,
-    fields_from_rpc,
-    fields_in_order,
-    in_order_b,
-    rpc_from_fields,
-)
+from barpc.rpcio.text import COEFFICIENTS, SINGLE, WIDTHS, cells_of, fields_from_rpc, fields_in_order, rpc_from_fields
 from barpc.sensor.rational import DERIVATIVE, POWERS
 from barpc.sensor.rpc import RPC
 
@@ -214,8 +205,7 @@ def read_nitf(path: Place) -> RPC | None:
     name = f"{path} (RPC00{match.group(1).decode()})"
     if not record.startswith("1"):
         raise RpcFormatError(f"{name}: its SUCCESS flag is {record[:1]!r}, not 1: the vendor's fit failed")
-    fields = cells_of(record[1:], _WIDTHS, SINGLE, name)
-    return rpc_from_fields(in_order_b(fields, f"RPC00{match.group(1).decode()}", name), name)
+    return rpc_from_fields(cells_of(record[1:], _WIDTHS, SINGLE, name, f"RPC00{match.group(1).decode()}"), name)
 
 
 def nitf_record(rpc: RPC) -> str:

@@ -18,7 +18,7 @@ from barpc.base.remote import Place
 from barpc.base.sidefile import RPC_FILE
 from barpc.rpcio import text, xml
 from barpc.rpcio.images import NITF_NAMES, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
-from barpc.rpcio.text import ReadOptions
+from barpc.rpcio.text import ReadOptions, Size
 from barpc.sensor.rpc import RPC
 
 
@@ -110,7 +110,7 @@ def write_camera(
     *,
     place: Path | str | None = None,
     overwrite: bool = False,
-    size: tuple[int, int] | None = None,
+    size: Size | None = None,
 ) -> None:
     """Write an RPC into a file, or into a raster with the pixels of `image`, as the name of `path` says.
 
@@ -175,12 +175,7 @@ holds_physical = _has(r"<(\w+:)?(ATTLIST|Refined_Model)\b")
 
 
 def write_rpc(
-    rpc: RPC,
-    path: Path | str,
-    *,
-    format: str | None = None,
-    overwrite: bool = False,
-    size: tuple[int, int] | None = None,
+    rpc: RPC, path: Path | str, *, format: str | None = None, overwrite: bool = False, size: Size | None = None
 ) -> None:
     """Write an RPC to a text file; every number reads back to the bit.
 
@@ -203,7 +198,7 @@ def write_rpc(
     write_text(path, _text_of(rpc, Path(path), format, size), overwrite=overwrite)
 
 
-def _text_of(rpc: RPC, path: Path, name: str | None, size: tuple[int, int] | None) -> str:
+def _text_of(rpc: RPC, path: Path, name: str | None, size: Size | None) -> str:
     row = row_of(path) if name is None else WRITABLE.get(name)
     if isinstance(row, Format) and row.write is not None:
         return row.write(rpc, size) if row.sized else row.write(rpc)

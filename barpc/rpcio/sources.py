@@ -205,10 +205,9 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
         return RpcSource(rpc_from_domain(items, str(path), options), "gdal", path)
     data = read_bytes(path, RPC_FILE)
     if tiles := _tiles(decode(data), path):
-        ends = np.array(list(tiles.values()))[:, 2:].max(axis=0) + 1
+        width, height = (max(corners[i] for corners in tiles.values()) + 1 for i in (2, 3))
         found = _image_source(path, head, options)
-        notes = (f"a mosaic of {len(tiles)} tiles", *found.notes)
-        return replace(found, notes=notes, size=(int(ends[0]), int(ends[1])))
+        return replace(found, notes=(f"a mosaic of {len(tiles)} tiles", *found.notes), size=(width, height))
     rpc, name = parse(data, str(path), options)
     return RpcSource(rpc, name, path)
 
@@ -325,8 +324,7 @@ def _tiles(text: str, path: Place) -> dict[str, tuple[int, int, int, int]]:
         cells = [words.get(f"{key}offset", "").strip() for key in ("ulcol", "ulrow", "lrcol", "lrrow")]
         if not (words.get("filename") and all(re.fullmatch(r"\d{1,7}", cell) for cell in cells)):
             raise RpcFormatError(f"{path}: tile {number} has no file name, or no corners UL and LR in pixels")
-        left, top, right, bottom = map(int, cells)
-        found[words["filename"].strip().lower()] = (left, top, right, bottom)
+        found[words["filename"].strip().lower()] = (int(cells[0]), int(cells[1]), int(cells[2]), int(cells[3]))
     return found
 
 
@@ -360,19 +358,15 @@ def at_tile(image: Place, path: Place, rpc: RPC) -> tuple[RPC, str] | None:
     if not strip or path.name.lower().startswith(image.stem.lower()):
         return None
     kinds = {name.lower(): kind for kind, name, _ in _names(image.name) if kind in _WHOLE}
-    equal = (s.kind for s in sidecars(image) if s.kind in _WHOLE and _parsed(s.path) == rpc)
-    kind = kinds.get(path.name.lower()) or next(equal, None)
+    kind = kinds.get(path.name.lower())
+    for sidecar in (s for s in sidecars(image) if s.kind in _WHOLE and kind is None):
+        with suppress(BarpcError):
+            kind = sidecar.kind if parse(read_bytes(sidecar.path, RPC_FILE), "")[0] == rpc else None
     if kind is not None:
         moved = _WHOLE[kind](image, path)
         return (rpc.window(*moved[0]), f"{moved[1]} applied") if moved else None
     listed = any(_near(image, f"{strip}{end}") for end in (".TIL", ".IMD"))
     return (rpc, f"taken as the RPC of this tile alone, not of its strip {strip}") if listed else None
-
-
-def _parsed(path: Place) -> RPC | None:
-    with suppress(BarpcError):
-        return parse(read_bytes(path, RPC_FILE), str(path))[0]
-    return None
 
 
 _WHOLE = {"dimap": _tile_origin, "strip": _strip_origin}

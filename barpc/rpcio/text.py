@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,6 +35,7 @@ _MAXAR = (
 MAXAR = dict(zip(KEYS, _MAXAR.split(), strict=True))
 """GDAL's name of a field -> Maxar's in an ``.RPB`` file; its XML has them in capitals."""
 
+Size = tuple[int, int]  # width, height [px]
 Fields = dict[str, list[float]]
 """Field name -> its numbers: one, or twenty for the four lists of coefficients (RPC00B order)."""
 
@@ -89,7 +90,7 @@ def _size(rest: str, name: str, key: str) -> float | None:
     found, measure = _WORDS.match(rest.replace("°", " deg ")), _measure(key)
     if found is None or measure is None:
         return None
-    words = found[1].lower().replace("_", " ").replace("-", " ").replace(".", " ").split()
+    words = re.split(r"[\s_.-]+", found[1].lower())
     for end in range(len(words), 0, -1):
         unit = _UNITS.get("".join(words[:end]))
         if unit is not None and unit[0] == measure and all(len(word) > 1 for word in words[end : end + 1]):
@@ -192,23 +193,11 @@ def rpc_from_fields(
     try:
         image = [fields[key][0] - first_pixel for key in OFFSETS[:2]]
         numbers = [*image, *(fields[key][0] for key in OFFSETS[2:] + SCALES), *(fields[key] for key in COEFFICIENTS)]
-        return RPC.of_numbers(
-            numbers,
-            err_bias=_accuracy(fields.get("ERR_BIAS")),
-            err_rand=_accuracy(fields.get("ERR_RAND")),
-            direct=np.array([fields[key] for key in DIRECT]) if lists is LISTS else None,
-        )
-    except RpcFormatError:
-        raise
+        bias, rand = (next(iter(fields.get(key, ())), None) for key in ERRORS)
+        direct = np.array([fields[key] for key in DIRECT]) if lists is LISTS else None
+        return RPC.of_numbers(numbers, bias, rand, direct)
     except RpcError as error:
         raise RpcFormatError(f"{name}: {error}") from error
-
-
-def _accuracy(value: Sequence[float] | None) -> float | None:
-    """Return a stated accuracy [m]; zero and below mean that nobody knows, not that it is perfect."""
-    if not value or not math.isfinite(value[0]) or value[0] <= 0:
-        return None
-    return float(value[0])
 
 
 def fields_from_rpc(rpc: RPC, direct: bool = False) -> Fields:
@@ -227,6 +216,7 @@ def fields_from_rpc(rpc: RPC, direct: bool = False) -> Fields:
 
 # Patterns here take time in proportion to the text, whatever it holds: no two repetitions can share a character,
 # and one that may run far begins where a line or a word begins.
+_PREFIX = re.compile(r"(|.*[._])LINE_OFF")
 _LINE = re.compile(r"^[ \t]*+([A-Za-z][\w.]*+)[ \t]*+[:=](.*)$", re.MULTILINE)
 
 
@@ -251,19 +241,14 @@ def _numbered(fields: Fields, separator: str, indices: Sequence[str]) -> list[st
 _GEOM_ERRORS = {"BIAS_ERROR": "ERR_BIAS", "RAND_ERROR": "ERR_RAND"}
 
 
-def _lines(text: str, name: str) -> Iterator[tuple[str, str]]:
-    """Yield keys, in capitals, and values of a text; a prefix that all have, ``RPC_`` or ``image0.``, is left out."""
+def _lines(text: str, name: str) -> list[tuple[str, str]]:
+    """Return keys, in capitals, and values of a text; a prefix that all have, ``RPC_`` or ``image0.``, is left out."""
     lines = [(match[1].upper(), match[2].strip().removesuffix(";")) for match in _LINE.finditer(text)]
     found = {match[1] for key, _ in lines if (match := _PREFIX.fullmatch(key))}
     if len(found - {""}) > 1:
         raise RpcFormatError(f"{name}: RPCs of several images ({', '.join(sorted(found))}); give a file of one")
     prefix = min(found, default="")
-    for key, value in lines:
-        if key.startswith(prefix):
-            yield key.removeprefix(prefix), value
-
-
-_PREFIX = re.compile(r"(|.*[._])LINE_OFF")
+    return [(key.removeprefix(prefix), value) for key, value in lines if key.startswith(prefix)]
 
 
 def read_txt(text: str, name: str, options: ReadOptions) -> RPC:
@@ -342,10 +327,10 @@ def write_rpb(rpc: RPC) -> str:
 
 def read_geom(text: str, name: str, options: ReadOptions) -> RPC:
     """Read OSSIM's keyword list, as OTB and CARS use it, with its current adjustment; the RPC of the FULL image."""
-    lines = dict(_lines(text, name))
-    kind = lines.get("POLYNOMIAL_FORMAT", "B")
-    fields = in_order_b(_fields_of_lines(_lines(text, name), name), f"RPC00{kind}", name)
-    return _adjusted(rpc_from_fields(fields, name, options), lines, name)
+    lines = _lines(text, name)
+    order = f"RPC00{dict(lines).get('POLYNOMIAL_FORMAT', 'B')}"
+    fields = in_order_b(_fields_of_lines(lines, name), order, name)
+    return _adjusted(rpc_from_fields(fields, name, options), dict(lines), name)
 
 
 def _adjusted(rpc: RPC, lines: Mapping[str, str], name: str) -> RPC:
@@ -496,14 +481,15 @@ WIDTHS = 2 * (6, 5, 8, 9, 5)
 """Characters of offsets and scales, as NITF and ALOS have them."""
 
 
-def cells_of(text: str, widths: Sequence[int], keys: Sequence[str], name: str) -> Fields:
+def cells_of(text: str, widths: Sequence[int], keys: Sequence[str], name: str, order: str = "RPC00B") -> Fields:
     """Return the fields of one record: single numbers `keys` of these widths, then four times twenty coefficients."""
     ends = np.cumsum([*widths, *[12] * 80]).tolist()
     if len(text) < ends[-1]:
         raise RpcFormatError(f"{name}: an RPC record of {len(text)} characters, expected {ends[-1]}")
     labels = [*keys, *(f"{key}_{i}" for key in COEFFICIENTS for i in range(1, 21))]
     places = zip(labels, [0, *ends[:-1]], ends, strict=True)
-    return fields_in_order([number(text[start:end], name, label) for label, start, end in places], keys)
+    values = [number(text[start:end], name, label) for label, start, end in places]
+    return in_order_b(fields_in_order(values, keys), order, name)
 
 
 def read_alos(text: str, name: str, options: ReadOptions) -> RPC:

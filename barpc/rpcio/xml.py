@@ -20,6 +20,7 @@ from barpc.rpcio.text import (
     SCALES,
     Fields,
     ReadOptions,
+    Size,
     fields_from_rpc,
     format_number,
     in_order_b,
@@ -67,7 +68,7 @@ def read_maxar(text: str, name: str, options: ReadOptions) -> RPC:
     return rpc_from_fields(in_order_b(fields, spec, name), name, options)
 
 
-def write_maxar(rpc: RPC, size: tuple[int, int] | None = None) -> str:
+def write_maxar(rpc: RPC, size: Size | None = None) -> str:
     """Write the `<RPB>` part of Maxar's image support data; of its `<IMD>` the width and height [px], where known."""
     counts = [f"\t\t<{tag}>{n}</{tag}>" for tag, n in zip(("NUMCOLUMNS", "NUMROWS"), size or (), strict=False)]
     lines = []

@@ -89,8 +89,13 @@ class RPC(Pointwise):
         return words.format(*np.column_stack([offset - scale, offset + scale]).ravel())
 
     @classmethod
-    def of_numbers(cls, values: Sequence[Any], **more: Any) -> RPC:
-        """Return the RPC of fourteen values in the order of `numbers`; `more` are its other parameters."""
+    def of_numbers(
+        cls, values: Sequence[Any], bias: float | None = None, rand: float | None = None, direct: Array | None = None
+    ) -> RPC:
+        """Return the RPC of fourteen values in the order of `numbers`, accuracies and a localisation RPC.
+
+        An accuracy of zero and below means that nobody knows it, not that it is perfect.
+        """
         row, col, lat, lon, alt, *scales = values[:10]
         row_num, row_den, col_num, col_den = values[10:]
         return cls(
@@ -99,7 +104,9 @@ class RPC(Pointwise):
             np.array([scales[i] for i in (3, 2, 4)], dtype=np.float64),
             np.array([col, row], dtype=np.float64),
             np.array([scales[i] for i in (1, 0)], dtype=np.float64),
-            **more,
+            float(bias) if bias and 0 < bias < np.inf else None,
+            float(rand) if rand and 0 < rand < np.inf else None,
+            direct,
         )
 
     def numbers(self) -> list[Any]:
@@ -167,8 +174,7 @@ class RPC(Pointwise):
             if value is None or np.size(value) != size:
                 what = "is missing" if value is None else f"has {np.size(value)} numbers, expected {size}"
                 raise RpcError(f"RPC of a {type(given).__name__}: {name} {what}")
-        stated = {key: getattr(given, key, None) for key in _ACCURACIES}
-        return cls.of_numbers(values, **{key: value if value and value > 0 else None for key, value in stated.items()})
+        return cls.of_numbers(values, *(getattr(given, key, None) for key in _ACCURACIES))
 
     def normalize(self, ground: Array, out: Array | None = None) -> Array:
         """Return longitude, latitude, altitude (3, N) of points (N, 3), from -1 to 1 in the RPC's box."""

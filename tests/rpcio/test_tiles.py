@@ -39,7 +39,8 @@ def strip(folder: Path, rpc, end: str = ".RPB") -> Path:
     til = folder / f"{STRIP}.TIL"
     til.write_text("\n".join([*lines, "END;", ""]))
     (folder / f"{STRIP}.IMD").write_text(
-        'version = "28.3";\nbandId = "P";\nnumRows = 70;\nnumColumns = 90;\nbitsPerPixel = 16;\nBEGIN_GROUP = IMAGE_1\n\tsatId = "WV02";\n'
+        'version = "28.3";\nbandId = "P";\nnumRows = 70;\nnumColumns = 90;\nbitsPerPixel = 16;\n'
+        'BEGIN_GROUP = IMAGE_1\n\tsatId = "WV02";\n'
         "END_GROUP = IMAGE_1\nEND;\n"
     )
     write_rpc(rpc, folder / f"{STRIP}{end}")
