@@ -137,3 +137,42 @@ def visible(text: str) -> str:
 
 def _escaped(char: str) -> str:
     return f"\\u{ord(char):04x}" if ord(char) < 0x10000 else f"\\U{ord(char):08x}"
+
+
+_OWN_WORDS = {
+    r"could not convert string to (?:float|complex): (.*)": "{} is no number",
+    r"invalid literal for int\(\) with base \d+: (.*)": "{} is no whole number",
+    r"(?:not enough|too many) values to unpack.*|zip\(\) argument.*": "too many or too few values",
+    r"(.*): line (\d+) column (\d+) \(char \d+\)": "{} at line {}, column {}",
+}
+_OF_PYTHON = re.compile(
+    r"object\b|\bargument\b(?<!Invalid argument)|cannot (?:reshape|cast|convert|unpack|be interpreted)|broadcast|"
+    r"setting an array|inhomogeneous|index|buffer|unpack|operand|Cannot parse header|all the input|embedded null|codec|"
+    r"must be (?:a |an |real |str)|math domain|float NaN|indices|Python int"
+)
+
+
+def plain(error: BaseException) -> str:
+    """Return what an error says of a file in words that are no Python: of barpc's own its text.
+
+    Examples
+    --------
+    >>> plain(KeyError("ji")), plain(ValueError("could not convert string to float: 'high'")), plain(IndexError("list"))
+    ("no 'ji'", "'high' is no number", 'a value is missing, or of another kind')
+    """
+    text = str(error)
+    if isinstance(error, BarpcError):
+        return text
+    if isinstance(error, KeyError):
+        return f"no {text}"
+    for pattern, words in _OWN_WORDS.items():
+        if found := re.fullmatch(pattern, text, re.DOTALL):
+            return words.format(*(group[:60].replace("\\n", "") for group in found.groups()))
+    library = isinstance(error, (ValueError, OSError)) or type(error).__module__ not in (
+        "builtins",
+        "struct",
+        "tokenize",
+    )
+    if not library or _OF_PYTHON.search(text):
+        return "a value is missing, or of another kind"
+    return (error.strerror if isinstance(error, OSError) else None) or text

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib import format as npy
 
-from barpc.base.errors import BarpcError, InputError
+from barpc.base.errors import BarpcError, InputError, plain
 from barpc.base.remote import Remote
 from barpc.base.sidefile import ARRAYS, NUMBER, Kind, opened
 
@@ -128,7 +128,7 @@ def from_arrays(arrays: Mapping[str, npt.NDArray[Any]], *, sent: bool = False) -
         frame = json.loads(np.asarray(arrays[_FRAME], dtype=np.uint8).tobytes())
         return _decode(frame, arrays, sent)
     except (KeyError, TypeError, AttributeError, IndexError, RecursionError, UnicodeDecodeError) as error:
-        raise ValueError(f"not a stage result: {error!r}") from error
+        raise ValueError(f"not a stage result: {plain(error)}") from error
 
 
 def _encode(value: Any, arrays: Arrays) -> Any:
@@ -199,9 +199,7 @@ def _unpack(file: IO[bytes], path: Path | str, kind: Kind) -> Arrays:
     except BarpcError:
         raise
     except Exception as error:
-        raise kind.error(
-            f"{path}: not {kind.words} (.npz) that can be read ({type(error).__name__}: {error})"
-        ) from error
+        raise kind.error(f"{path}: not {kind.words} (.npz) that can be read ({plain(error)})") from error
 
 
 def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> tuple[int, int]:

@@ -23,7 +23,7 @@ from typing import Any, BinaryIO, NoReturn, TextIO
 from xml.etree import ElementTree
 
 from barpc.base import identity
-from barpc.base.errors import BarpcError, ImageError, InputError, RpcFormatError, visible
+from barpc.base.errors import BarpcError, ImageError, InputError, RpcFormatError, plain, visible
 from barpc.base.remote import BLOCK, Place, Remote, RemoteFile, location, pinned
 
 MB = 1 << 20
@@ -238,7 +238,7 @@ def read_json(path: Path | str, kind: Kind) -> Any:
     try:
         return parse_json(text, kind.values)
     except ValueError as error:
-        raise kind.error(f"{path}: not JSON that can be read, so not {kind.words} ({error})") from error
+        raise kind.error(f"{path}: not JSON that can be read, so not {kind.words} ({plain(error)})") from error
 
 
 def parse_json(text: str, most: int = Kind.values) -> Any:

@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from barpc.base.errors import BarpcError, InputError
+from barpc.base.errors import BarpcError, InputError, plain
 from barpc.base.frozen import DEFLATED, HEADER, Arrays, load_npz
 from barpc.base.geodesy import Array
 from barpc.base.sidefile import MAX_DEPTH, MAX_ELEMENTS, NUMBER, TABLE, Kind, opened, opened_text, read_bytes, read_head
@@ -124,7 +124,7 @@ def _asp_text(path: Path) -> tuple[Array, Array]:
                     col, row = map(float, words)
                     points.extend((col, row))
     except ValueError as error:
-        raise InputError(f"{path}: not an ASP text match file ({error})") from error
+        raise InputError(f"{path}: not an ASP text match file ({plain(error)})") from error
     xy = np.array(points).reshape(-1, 2)
     if left != right or len(xy) != left + right:
         raise InputError(f"{path}: says {left} and {right} keypoints but holds {len(xy)}")
@@ -145,7 +145,7 @@ def _asp_binary(path: Path) -> tuple[Array, Array]:
         if len(set(records["length"].tolist())) != 1:
             raise ValueError("descriptors of unlike lengths")
     except (ValueError, OverflowError) as error:
-        raise InputError(f"{path}: not an ASP match file ({error})") from error
+        raise InputError(f"{path}: not an ASP match file ({plain(error)})") from error
     points: Array = records["xy"].astype(np.float64)
     return points[:count], points[count:]
 
@@ -161,7 +161,7 @@ def matched_keypoints(path: Path, arrays: Arrays) -> tuple[Array, Array]:
             return first, second
         pairs = index_pairs(known, (len(first), len(second)))
     except (KeyError, ValueError, TypeError) as error:
-        raise InputError(f"{path}: not an npz of keypoints0, keypoints1 (N, 2), matches0 ({error})") from error
+        raise InputError(f"{path}: not an npz of keypoints0, keypoints1 (N, 2), matches0 ({plain(error)})") from error
     return first[pairs[:, 0]], second[pairs[:, 1]]
 
 
@@ -201,7 +201,7 @@ def read_colmap(path: Path, views: ViewNames) -> Iterator[PairPoints]:
         with closing(sqlite3.connect(where, uri=True)) as database:
             yield from _pairs_of_database(path, database, views)
     except (sqlite3.Error, ValueError, TypeError, OverflowError, MemoryError) as error:
-        raise InputError(f"{path}: not a COLMAP database that can be read ({error})") from error
+        raise InputError(f"{path}: not a COLMAP database that can be read ({plain(error)})") from error
 
 
 def _pairs_of_database(path: Path, database: sqlite3.Connection, views: ViewNames) -> Iterator[PairPoints]:
@@ -286,7 +286,7 @@ def read_hloc(path: Path, views: ViewNames) -> Iterator[PairPoints]:
     except BarpcError:
         raise
     except Exception as error:  # h5py raises what the damage happens to hit
-        said = " ".join(str(error).split())[:200]
+        said = " ".join(plain(error).split())[:200]
         raise InputError(f"{path}: not an HDF5 file of matches that can be read ({said})") from error
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from barpc.base.errors import InputError
+from barpc.base.errors import InputError, plain
 from barpc.base.frozen import Arrays, load_npz
 from barpc.base.geodesy import Array
 from barpc.base.sidefile import TABLE, read_head
@@ -101,7 +101,7 @@ def read_links(path: Path | str, names: Sequence[str]) -> Links:
     try:
         links = _read(path, views)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read as tie points ({error})") from error
+        raise InputError(f"{path}: cannot be read as tie points ({plain(error)})") from error
     if not (np.isfinite(links.xy).all() and np.isfinite(links.sigma).all() and (links.sigma > 0).all()):
         raise InputError(f"{path}: a coordinate is not finite, or a sigma not positive")
     if not (links.view[links.ends[:, 0]] != links.view[links.ends[:, 1]]).any():
@@ -194,7 +194,7 @@ def _read_npz(path: Path, file: Arrays, views: ViewNames) -> Links:
             raise ValueError("a view that has no name")
         view = views.of(str(name) for name in file["names"])[index]
     except (KeyError, ValueError, TypeError, IndexError) as error:
-        raise InputError(f"{path}: not an npz of names, view, track, xy (K, 2) ({error})") from error
+        raise InputError(f"{path}: not an npz of names, view, track, xy (K, 2) ({plain(error)})") from error
     return _tracks(view, point, xy, spread)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc import __version__
-from barpc.base.errors import InputError
+from barpc.base.errors import InputError, plain
 from barpc.base.geodesy import Array, collection, ecef_from_ground, enu_basis, feature
 from barpc.base.sidefile import GEOJSON, SUMMARY, TABLE, Kind, parse_json, read_json, read_text
 from barpc.pointio.names import cell, from_cell
@@ -322,7 +322,7 @@ def _read(path: Path, kind: Kind, parse: Any) -> Any:
     try:
         return parse(text)
     except (ValueError, LookupError, TypeError, AttributeError, StopIteration, csv.Error) as error:
-        raise InputError(f"{path}: damaged ({error!r}); run the adjustment again") from error
+        raise InputError(f"{path}: damaged ({plain(error)}); run the adjustment again") from error
 
 
 def _columns(text: str, header: Sequence[str]) -> list[list[str]]:

@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from barpc.base.errors import ImageError, RpcFormatError
+from barpc.base.errors import ImageError, RpcFormatError, plain
 from barpc.base.geodesy import Array
 from barpc.base.remote import Place
 from barpc.base.sidefile import IMAGE, opened, read_head
@@ -82,7 +82,7 @@ def read_directory(file: BinaryIO, name: str) -> Directory:
         if len(following) != struct.calcsize(offset):
             raise RpcFormatError(f"{name}: the TIFF directory is cut off")
     except (struct.error, OverflowError, OSError) as error:
-        raise RpcFormatError(f"{name}: not a TIFF file that can be read ({error})") from error
+        raise RpcFormatError(f"{name}: not a TIFF file that can be read ({plain(error)})") from error
     return replace(found, entries=entries, following=following)
 
 
@@ -98,7 +98,7 @@ def read_values(file: BinaryIO, directory: Directory, entry: Entry, name: str) -
         file.seek(offset)
         data = file.read(size)
     except (OverflowError, OSError) as error:
-        raise RpcFormatError(f"{name}: TIFF tag {entry.tag} points nowhere ({error})") from error
+        raise RpcFormatError(f"{name}: TIFF tag {entry.tag} points nowhere ({plain(error)})") from error
     if len(data) != size:
         raise RpcFormatError(f"{name}: TIFF tag {entry.tag} lies beyond the end of the file")
     return data

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from barpc.base.errors import RpcError, RpcFormatError
+from barpc.base.errors import RpcError, RpcFormatError, plain
 from barpc.base.sidefile import encoding_of, parse_json
 from barpc.sensor.rpc import RPC
 
@@ -431,7 +431,7 @@ def read_rpc_json(text: str, name: str, options: ReadOptions) -> RPC:
     try:
         document = parse_json(text)
     except ValueError as error:
-        raise RpcFormatError(f"{name}: not JSON ({error})") from error
+        raise RpcFormatError(f"{name}: not JSON ({plain(error)})") from error
     for dialect, mark in ((_RPCM, "row_num"), (_PLAIN, "line_num_coeff")):
         found = _find(document, mark)
         if found is not None:

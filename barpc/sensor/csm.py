@@ -20,7 +20,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from scipy.spatial.transform import Rotation
 
-from barpc.base.errors import InputError, RpcError, RpcFormatError
+from barpc.base.errors import InputError, RpcError, RpcFormatError, plain
 from barpc.base.geodesy import WGS84_A, WGS84_B, Array, ecef_from_ground, ground_from_ecef
 from barpc.base.sidefile import STATE, parse_json, read_text
 from barpc.sensor import SensorModel
@@ -90,7 +90,7 @@ def open_state(path: Path) -> tuple[Pushbroom | Frame, tuple[int, int]]:
     try:
         found = parse_json(text[max(text.find("{"), 0) :])
     except ValueError as error:
-        raise RpcFormatError(f"{path}: no CSM state that can be read ({error})") from error
+        raise RpcFormatError(f"{path}: no CSM state that can be read ({plain(error)})") from error
     state = _State(found if isinstance(found, dict) else {}, str(path))
     model = str(state.content.get("m_modelName"))
     if model not in _READERS:

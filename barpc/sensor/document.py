@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import numpy.typing as npt
 
-from barpc.base.errors import BarpcWarning, RpcFormatError
+from barpc.base.errors import BarpcWarning, RpcFormatError, plain
 from barpc.base.geodesy import FAR, Array
 
 T = TypeVar("T")
@@ -91,7 +91,7 @@ class Fields:
         try:
             return np.array(self.text(path).replace(between, " ").split(), dtype=np.float64)
         except ValueError as error:
-            raise RpcFormatError(f"{self.name}: {path} is not a list of numbers ({error})") from error
+            raise RpcFormatError(f"{self.name}: {path} is not a list of numbers ({plain(error)})") from error
 
     def numbers(self, path: str, count: int | None = None, between: str = " ") -> Array:
         """Return the finite numbers (N,) of a field; RpcFormatError where there are none, or not `count`.

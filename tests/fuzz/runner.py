@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 import time
 import warnings
@@ -18,6 +19,16 @@ from .used import not_finite
 
 LONGEST = 10.0
 """No file of a sample's size takes so many CPU seconds."""
+
+
+PYTHON = re.compile(
+    r"\b[A-Z][a-z]+\w*(?:Error|Exception)\b|could not convert|invalid literal for|to unpack|NoneType|Traceback"
+    r"|object (?:is|has|of|cannot|does)|(?:list|tuple|string) index|index \S+ is out|not subscriptable|has no attribute"
+    r"|must be (?:an? )?(?:str|real|int|bytes|list|tuple|dict)\b|indices must|codec can't|arguments|argument \d"
+    r"|cannot (?:reshape|cast|be interpreted|convert)|could not broadcast|requires a buffer|buffer (?:is|size)"
+    r"|unsupported operand|inhomogeneous|\(char \d+\)"
+)
+"""What Python and numpy say of their own, which tells no user what to do."""
 
 
 class Unexpected(AssertionError):
@@ -46,7 +57,7 @@ def check(kind: str, data: bytes, folder: Path) -> bool:
         raise Unexpected(f"{kind}: {error!r}") from error
     if time.process_time() - began > LONGEST:
         raise Unexpected(f"{kind}: {time.process_time() - began:.0f} CPU s for {len(data)} bytes")
-    if refused is not None and not _is_one_line(str(refused), path):
+    if refused is not None and (not _is_one_line(str(refused), path) or PYTHON.search(str(refused))):
         raise Unexpected(f"{kind}: says {str(refused)!r}")
     return refused is None
 

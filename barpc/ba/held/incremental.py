@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from barpc.ba.estimated.priors import CameraPrior, EarlierScene, JointPrior
 from barpc.ba.estimated.waves import Waves
 from barpc.ba.held.gauge import MOTIONS
-from barpc.base.errors import InputError, listed
+from barpc.base.errors import InputError, listed, plain
 from barpc.base.frozen import load_npz
 from barpc.base.geodesy import Array
 from barpc.base.sidefile import ARRAYS, LARGEST
@@ -139,7 +139,7 @@ class BlockPrior:
                 scene = EarlierScene(by_unknown, own, float(radius))
             prior = cls(names, *known, splines, edges, radars, strips, periods, scene)
         except (KeyError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
-            raise InputError(f"{path}: not the prior of an adjusted block ({error})") from error
+            raise InputError(f"{path}: not the prior of an adjusted block ({plain(error)})") from error
         if not prior._is_whole():
             raise InputError(f"{path}: not the prior of an adjusted block (its arrays do not go together)")
         return prior
@@ -248,7 +248,7 @@ def apply_prior(
     try:
         root = la.cholesky(prior.dense())
     except la.LinAlgError as error:
-        raise InputError(f"the earlier block's information is damaged ({error})") from error
+        raise InputError(f"the earlier block's information is damaged ({plain(error)})") from error
     place = {name: i for i, name in enumerate(names)}
     views = np.array([place[name] for name in prior.names])
     mean, sigma = cameras.mean.copy(), cameras.sigma.copy()

@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from barpc.base.errors import BarpcError, InputError, RpcError, RpcFormatError, visible
+from barpc.base.errors import BarpcError, InputError, RpcError, RpcFormatError, plain, visible
 from barpc.base.geodesy import Array
 from barpc.base.sidefile import MAX_XML, PRODUCT, opened, read_head
 from barpc.base.usual import ROUNDING
@@ -175,7 +175,7 @@ def _from_zip(path: Path, what: str, use: Callable[[zipfile.ZipFile], T]) -> T:
     except BarpcError:
         raise
     except Exception as error:
-        raise RpcFormatError(f"{path}: {what} cannot be read ({error})") from error
+        raise RpcFormatError(f"{path}: {what} cannot be read ({plain(error)})") from error
 
 
 def _annotations(path: Path) -> list[_File]:

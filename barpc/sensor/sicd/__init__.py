@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from barpc.base.errors import InputError, RpcFormatError
+from barpc.base.errors import InputError, RpcFormatError, plain
 from barpc.base.geodesy import ALTITUDES, EARTH_RATE, Array, ground_from_ecef
 from barpc.base.sidefile import MAX_XML, PRODUCT, opened, parse_xml
 from barpc.sensor.curve import Curve
@@ -42,7 +42,7 @@ def find_sicd(path: Path) -> bytes | None:
         try:
             return next((text for text in _extensions(file) if is_sicd(text[:4096])), None)
         except ValueError as error:
-            raise RpcFormatError(f"{path}: a NITF with a damaged header ({error})") from error
+            raise RpcFormatError(f"{path}: a NITF with a damaged header ({plain(error)})") from error
 
 
 def _extensions(file: BinaryIO) -> list[bytes]:

@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 from shapely import affinity
 
-from barpc.base.errors import InputError
+from barpc.base.errors import InputError, plain
 from barpc.base.geodesy import Array, wrap_longitude
 from barpc.base.sidefile import GEOJSON, read_json
 from barpc.scene import BoolArray
@@ -65,7 +65,7 @@ def read_area(path: str | os.PathLike[str]) -> Area:
             raise ValueError(f"its coordinates are in {crs['properties']['name']}")
         polygons = [_valid(polygon) for polygon in _polygons(data)]
     except _MALFORMED as error:
-        said = " ".join(str(error).split())[:200] or type(error).__name__
+        said = " ".join(plain(error).split())[:200]
         raise InputError(f"{path}: not an area of interest, GeoJSON polygons in degrees ({said})") from error
     turns = [affinity.translate(polygon, turn) for polygon in polygons for turn in (-360.0, 0.0, 360.0)]
     outline = shapely.union_all(turns)
