@@ -166,6 +166,9 @@ class GroundPoints(Frozen):
     xy_sigma : (M,), standard deviation of each coordinate [px]
     strangers : tuple of str, images that their file names and that are none of the views
     left_out : tuple of str, points left out of their files, with the reason, in sentences
+    said : tuple of str, how their files were read, where that had to be guessed or converted, in sentences
+    vertical : str or None, what their file says that altitudes count from: "ellipsoid" or the name of a height system
+        (reading made them ellipsoidal); None where it says nothing, or files differ
     """
 
     names: tuple[str, ...]
@@ -177,6 +180,8 @@ class GroundPoints(Frozen):
     xy_sigma: Array
     strangers: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
+    said: tuple[str, ...] = ()
+    vertical: str | None = None
 
     def __post_init__(self) -> None:
         g = len(self.names)

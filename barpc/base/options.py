@@ -33,8 +33,8 @@ HOOK = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"  # a name in a module
 _MOST = 1 << 53  # whole numbers stay below: beyond, not every one has a double of its own
 _REAL = 1e30  # no option is larger, or smaller and not 0: squares, and squares of them, are numbers then
 GEOID_HELP = (
-    "Geoid that a DEM's heights count from: `egm96`, `egm2008`, the file of a grid, or `none` of ellipsoidal ones. "
-    "Without: the one that the DEM names."
+    "Geoid that heights of a DEM, or of ground points, count from: `egm96`, `egm2008`, the file of a grid, or `none` "
+    "of ellipsoidal ones. Without: the one that their file names."
 )
 MOST_POINTS = (TABLE.most or 0) // (5 * NUMBER)
 """Control points of a fit: as many as a table of them may hold, five numbers each."""
@@ -465,7 +465,17 @@ class RunOptions(Options):
         "Tie points only inside polygons in lon/lat (GeoJSON), and only what may show them is read.",
         unit="file",
     )
-    gcp: tuple[str, ...] = option((), "Ground control points: CSV, .gcp, GeoJSON, image tags.", unit="file")
+    gcp: tuple[str, ...] = option(
+        (),
+        """Ground control points: CSV, GeoJSON, GeoPackage, Shapefile, image tags, or files of QGIS, ODM, MicMac, ENVI,
+        ASP and Metashape.""",
+        unit="file",
+    )
+    gcp_crs: str | None = option(
+        None,
+        """Reference system of ground points, whatever their files say: EPSG:32631, or with that of the heights,
+        EPSG:26910+5703. Without: the file's own, else longitude and latitude on WGS84.""",
+    )
     altimetry: tuple[str, ...] = option(
         (),
         """Heights without image coordinates (ICESat-2, GEDI, lidar): CSV of lon, lat, alt above the ellipsoid, perhaps
@@ -502,8 +512,8 @@ class RunOptions(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.geoid is not None and self.dem is None:
-            raise InputError("geoid is given without dem: there are no heights to convert")
+        if self.geoid is not None and self.dem is None and not (self.gcp or self.check_points):
+            raise InputError("geoid is given without dem or ground points: there are no heights to convert")
         if self.reference and self.dem is None:
             raise InputError("reference is given without dem: an orthoimage tells no heights")
         if self.reference_sigma is not None and not self.reference:

@@ -24,7 +24,17 @@ REMOTE = "allow_remote"
 _ALL = "barpc.help_all"  # key of a context whose help shows every flag
 TIE = ("tie.band", "tie.matcher", "matches", "matches_only", "overlap_list", "aoi")
 CAMERA = ("adjust.model", "adjust.drift", "adjust.jitter", "adjust.fixed")
-GROUND = ("gcp", "altimetry", "check_points", "fixed_run", "dem", "adjust.dem_for_weak", "geoid", "reference")
+GROUND = (
+    "gcp",
+    "gcp_crs",
+    "altimetry",
+    "check_points",
+    "fixed_run",
+    "dem",
+    "adjust.dem_for_weak",
+    "geoid",
+    "reference",
+)
 ADJUSTMENT = (*CAMERA, *GROUND)
 MATCH = ("overwrite", "keep_going")
 RUN = (*MATCH, "images", "rpc_formats", "grids", "resample")

@@ -212,7 +212,7 @@ def _height_unknown(ground: Array, image: Array, rmse: float) -> float:
     scatter = float(np.linalg.norm(rest)) * (len(ground) / len(some)) ** 0.5
     metres = np.ptp(ground[:, :2], axis=0) * metres_per_unit(0.5 * (low + high))[:2]
     pixels = float(np.linalg.norm(np.ptp(image, axis=0)) / np.linalg.norm(metres))
-    return 100.0 * min(rmse / max(scatter, 1e-12), pixels)
+    return float(100.0 * min(rmse / max(scatter, 1e-12), pixels))
 
 
 def _looked_at(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:

@@ -20,7 +20,8 @@ from barpc.base.identity import Input, Stamp, changed, take
 from barpc.base.options import RunOptions, declared
 from barpc.base.remote import here, located, location
 from barpc.base.sidefile import IMAGE, read_names, versioned
-from barpc.pointio.correspondences import read_altimetry, read_gcps
+from barpc.pointio.correspondences import read_altimetry
+from barpc.pointio.gcps import Frame, read_gcps
 from barpc.pointio.matches import Links, read_links, tracks_of
 from barpc.pointio.names import ViewNames
 from barpc.rasters.dem import Dem, geoid_file
@@ -52,7 +53,7 @@ def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None,
     dem = None if options.dem is None else Dem.open(options.dem, options.geoid)
     for paths in (options.gcp, options.check_points):
         points = load_gcps(paths, views, options, dem)
-        for line in () if points is None else points.left_out:
+        for line in () if points is None else (*points.said, *points.left_out):
             logger.warning("%s", line)
     load_altimetry(options.altimetry, views)
     if options.adjust.dem_for_weak and options.dem is None:
@@ -279,7 +280,8 @@ def load_gcps(
     Points that cannot be where they are said to be, images that are no views, and files that cannot be read are an
     InputError, or with `keep_going` left out and named in `left_out`. Altitudes that are not known come from `dem`.
     """
-    parts = [_load(path, views, options, dem) for path in paths]
+    frame = Frame(options.gcp_crs, options.geoid, tuple(paths))
+    parts = [_load(path, views, options, dem, frame) for path in paths]
     if not parts:
         return None
     starts = np.cumsum([0, *(len(part.names) for part in parts)])[:-1]
@@ -289,12 +291,17 @@ def load_gcps(
     names = tuple(name for part in parts for name in part.names)
     strangers = tuple(dict.fromkeys(name for part in parts for name in part.strangers))
     left_out = tuple(line for part in parts for line in part.left_out)
-    return GroundPoints(names, point=point, **joined, strangers=strangers, left_out=left_out)
+    said = tuple(line for part in parts for line in part.said)
+    levels = {part.vertical for part in parts if part.names}
+    vertical = levels.pop() if len(levels) == 1 else None
+    return GroundPoints(
+        names, point=point, **joined, strangers=strangers, left_out=left_out, said=said, vertical=vertical
+    )
 
 
-def _load(path: str, views: Sequence[View], options: RunOptions, dem: Dem | None) -> GroundPoints:
+def _load(path: str, views: Sequence[View], options: RunOptions, dem: Dem | None, frame: Frame) -> GroundPoints:
     try:
-        points = read_gcps(path, [view.name for view in views])
+        points = read_gcps(path, [view.name for view in views], frame)
     except InputError as error:
         if not options.keep_going:
             raise

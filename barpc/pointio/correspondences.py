@@ -1,29 +1,25 @@
-"""Ground points and where images show them: GCPs, correspondences that an RPC is fitted to, heights by a laser.
+"""Ground points without a camera: correspondences that an RPC is fitted to, heights by a laser.
 
-Image coordinates have (0, 0) at the centre of the top-left pixel. Those of GCPs are taken as they stand, as ASP and
-orthority mean them; GDAL leaves the meaning of its tags to the application. Altitudes are ellipsoidal.
+Image coordinates have (0, 0) at the centre of the top-left pixel. Altitudes are ellipsoidal.
 """
 
 from __future__ import annotations
 
-import re
-from array import array
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from barpc.base.errors import InputError, listed
+from barpc.base.errors import InputError, plain
 from barpc.base.frozen import load_npz
 from barpc.base.geodesy import ALTITUDES, FAR, Array
 from barpc.base.remote import Place
-from barpc.base.sidefile import GEOJSON, NUMBER, TABLE, Kind, opened_text, read_head, read_json
-from barpc.pointio.names import ViewNames
-from barpc.pointio.tables import COLUMNS, Names, first_words, header_of, numbered, numbers_of, read_table
+from barpc.base.sidefile import GEOJSON, NUMBER, TABLE, Kind, read_head, read_json
+from barpc.pointio.tables import COLUMNS, Names, first_words, header_of, numbers_of, read_table
 from barpc.rasters.raster import driver_of, open_raster
-from barpc.scene import Altimetry, GroundPoints, IntArray
+from barpc.scene import Altimetry
 
 GROUND_SIGMA = 1.0  # standard deviation [m] along an axis of a GCP, or of the place of a height, whose file states none
 IMAGE_SIGMA = 0.5  # standard deviation of each image coordinate [px], of GCPs and tie points whose file states none
@@ -31,20 +27,6 @@ HEIGHT_SIGMA = 0.5  # m, of a height whose file states none: ICESat-2 and GEDI o
 GRID_TAG = "ALTITUDE_B0"  # of a raster that is a localisation grid
 TURNS = 540.0  # deg: longitudes are taken by whole turns
 
-_NAMES: Names = {
-    "id": ("id", "name", "gcp", "gcp_id", "point", "point_id", "label"),
-    "image": ("image", "file", "filename", "image_name", "img", "view"),
-}
-_SIGMAS: Names = {
-    "sigma": ("sigma", "sigma_m", "accuracy"),  # east, north and up
-    "sigma_xy": ("sigma_xy", "sigma_en", "sigma_horizontal", "accuracy_xy"),
-    "sigma_x": ("sigma_x", "sigma_e", "sigma_east", "sigma_lon", "sx"),
-    "sigma_y": ("sigma_y", "sigma_n", "sigma_north", "sigma_lat", "sy"),
-    "sigma_z": ("sigma_z", "sigma_u", "sigma_up", "sigma_alt", "sigma_height", "sz", "accuracy_z"),
-    "sigma_px": ("sigma_px", "sigma_image", "sigma_pixel"),
-    "sigma_col": ("sigma_col", "scol"),
-    "sigma_row": ("sigma_row", "srow"),
-}
 _POINTS: Names = {**COLUMNS, "sigma": ("sigma", "sigma_px")}
 _HEIGHTS: Names = {
     "lon": (*COLUMNS["lon"], "lon_lowestmode"),
@@ -59,136 +41,7 @@ _HEIGHTS: Names = {
 """As ICESat-2's ATL03, ATL06 and ATL08 and GEDI's L2A call it, too."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Observed:
-    """GCPs (K,) as images show them: the files repeat the ground point for each of its images."""
-
-    names: Sequence[str]  # empty: called by its place among the points
-    view: IntArray  # (K,)
-    numbers: Array  # (K, 9): lon, lat, alt, their sigmas east, north, up [m], col, row, their sigma [px]
-
-    @staticmethod
-    def of_rows(rows: Iterable[_Row]) -> _Observed:
-        """Gather the rows that a reader yields."""
-        names, views, numbers = list[str](), array("q"), array("d")
-        for name, view, *values in rows:
-            names.append(name)
-            views.append(view)
-            numbers.extend(values)
-        return _Observed(names, np.array(views, dtype=np.int64), np.array(numbers).reshape(-1, 9))
-
-
-_Row = tuple[Any, ...]
-"""Name, view and the nine numbers of a GCP in an image."""
-
-
-def read_gcps(path: Path | str, names: Sequence[str]) -> GroundPoints:
-    """Read GCPs and where they are seen, of a CSV or `.gcp` file, a GeoJSON file, or an image with GCP tags.
-
-    Observations in other images than the views called `names` are left out, and these named in `strangers`. InputError
-    where the file does not parse, or holds no point of these views.
-    """
-    path = Path(path)
-    head = read_head(path, TABLE)
-    views = ViewNames(names, str(path))
-    if head.lstrip().startswith(b"{"):
-        found = _Observed.of_rows(_read_geojson(path, views))
-    elif driver_of(head) is not None or b"\0" in head:
-        found = _Observed.of_rows(_read_tags(path, views))
-    else:
-        words = first_words(head)
-        named = not any(numbers_of([word]) for word in words[1:4]) and header_of(words, _POINTS)
-        found = _read_csv(path, views) if named else _Observed.of_rows(_read_asp(path, views))
-    if not len(found.view):
-        others = f"; it names {listed(list(views.strangers))}" if views.strangers else ""
-        raise InputError(f"{path}: no GCP of {listed(names)}{others}")
-    try:
-        return replace(_assembled(found), strangers=tuple(views.strangers))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-
-
-def _read_asp(path: Path, views: ViewNames) -> Iterator[_Row]:
-    """Read the lines `id lat lon alt sigma_x sigma_y sigma_z image col row sigma_col sigma_row [image ...]`."""
-    with opened_text(path, TABLE) as lines:
-        for number, raw in enumerate(lines, start=1):
-            line = re.split(r"(?:^|\s)#", raw, maxsplit=1)[0] if "#" in raw else raw
-            words = line.replace(",", " ").split()
-            if not words:
-                continue
-            try:
-                lat, lon, *ground = map(float, words[1:7])
-                if len(words) < 12 or len(words) % 5 != 2:
-                    raise ValueError(f"{len(words)} words")
-                for i in range(7, len(words), 5):
-                    col, row, *spread = map(float, words[i + 1 : i + 5])
-                    view = views.find(words[i])
-                    if view is not None:
-                        yield words[0], view, lon, lat, *ground, col, row, max(spread)
-            except ValueError as error:
-                raise InputError(
-                    f"{path}, line {number}: expected 'id lat lon alt sx sy sz image col row scol srow ...', or a CSV "
-                    f"that begins with its columns' names ({error})"
-                ) from error
-
-
-def _read_csv(path: Path, views: ViewNames) -> _Observed:
-    """Read a header of column names, then a line for each point and image; sigmas not stated are the default."""
-    needed = [*COLUMNS, "image"][: len(COLUMNS) + (len(views.names) > 1)]
-    columns = {**COLUMNS, **_NAMES, **_SIGMAS}
-    words, table = read_table(path, columns, needed, texts=_NAMES, blank=_SIGMAS)
-    for word in (word for i, word in enumerate(words) if i not in header_of(words, columns).values()):
-        if re.match("sigma|std|stdev|acc|err", word.lower()):
-            raise InputError(
-                f"{path}: column {word[:40]!r} is none that is read; accuracies are called {', '.join(_SIGMAS)}"
-            )
-    num = len(table["lon"])
-
-    def stated(key: str, default: Array) -> Array:
-        cells = table.get(key, [None] * num)
-        known = np.array([cell is not None for cell in cells], dtype=bool)
-        return np.where(known, np.array(cells, dtype=np.float64), default)
-
-    every = stated("sigma", np.full(num, GROUND_SIGMA))
-    level = stated("sigma_xy", every)
-    sigmas = (stated("sigma_x", level), stated("sigma_y", level), stated("sigma_z", every))
-    pixels = np.max([stated(key, np.full(num, -np.inf)) for key in ("sigma_px", "sigma_col", "sigma_row")], axis=0)
-    pixels[pixels == -np.inf] = IMAGE_SIGMA
-    numbers = np.column_stack(
-        [*(table[key] for key in ("lon", "lat", "alt")), *sigmas, table["col"], table["row"], pixels]
-    )
-    view = (
-        views.of(map(str, table["image"].different))[table["image"].index]
-        if "image" in table
-        else np.zeros(num, np.int64)
-    )
-    names = [name.strip() for name in table["id"].per_row()] if "id" in table else [""] * num
-    kept = np.flatnonzero(view >= 0)
-    return _Observed([names[i] for i in kept], view[kept], numbers[kept])
-
-
-def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Row]:
-    """Yield the features with a 3-D point and the properties `ji` (col, row), `filename`, perhaps `id` and sigmas."""
-    for (lon, lat, alt, col, row), properties in geojson_points(path, "filename"):
-        view = views.find(str(properties["filename"]))
-        if view is not None:
-            name = "" if properties.get("id") is None else str(properties["id"])
-            try:
-                east, north, up = (float(value) for value in properties.get("sigma_m", (GROUND_SIGMA,) * 3))
-                spread = float(properties.get("sigma_px", IMAGE_SIGMA))
-            except (TypeError, ValueError) as error:
-                raise InputError(f"{path}: sigma_m is [east, north, up], sigma_px a number ({error})") from error
-            yield name, view, lon, lat, alt, east, north, up, col, row, spread
-
-
-def _read_tags(path: Path, views: ViewNames) -> Iterator[_Row]:
-    """Yield the GCP tags of an image: they are seen in that image alone."""
-    view = views.index(str(path))
-    for name, lon, lat, alt, col, row in _tags(path)[0]:
-        yield name, view, lon, lat, alt, *(GROUND_SIGMA,) * 3, col, row, IMAGE_SIGMA
-
-
-def _tags(path: Place) -> tuple[list[_Row], tuple[int, int]]:
+def _tags(path: Place) -> tuple[list[tuple[Any, ...]], tuple[int, int]]:
     """Return the GCP tags of an image, each a name, lon, lat, alt and col, row as they stand; its width and height."""
     with open_raster(path) as dataset:
         (gcps, crs), size = dataset.gcps, (int(dataset.width), int(dataset.height))
@@ -198,34 +51,6 @@ def _tags(path: Place) -> tuple[list[_Row], tuple[int, int]]:
         if gcp.z is None:
             raise InputError(f"{path}: GCP {gcp.id or n} has no altitude")
     return [(str(gcp.id or n), gcp.x, gcp.y, gcp.z, gcp.col, gcp.row) for n, gcp in enumerate(gcps, 1)], size
-
-
-def _assembled(found: _Observed) -> GroundPoints:
-    """Return the observations of points of the same name and place as those of one point, in their first order."""
-    keys = np.column_stack([numbered(found.names, {}), found.numbers[:, :3]])
-    order = np.lexsort(keys.T)
-    new = np.append(True, (np.diff(keys[order], axis=0) != 0).any(axis=1))
-    first = order[new]  # the sort is stable
-    point = np.empty(len(order), dtype=np.int64)
-    point[order] = np.argsort(np.argsort(first))[np.cumsum(new) - 1]
-    first.sort()
-    names = tuple(found.names[i] or f"gcp_{n}" for n, i in enumerate(first, 1))
-    ground = found.numbers[first]
-    wrong = ~(np.abs(ground[:, :3]) <= (TURNS, TURNS, FAR)).all(axis=1)  # NaN fails, too
-    if wrong.any():
-        raise InputError(
-            f"GCP {names[int(wrong.argmax())]}: a coordinate is not finite, or no longitude and latitude in degrees; "
-            "map coordinates are not read"
-        )
-    return GroundPoints(
-        names=names,
-        lonlatalt=ground[:, :3],
-        sigma=ground[:, 3:6],
-        point=point,
-        view=found.view,
-        xy=found.numbers[:, 6:8],
-        xy_sigma=found.numbers[:, 8],
-    )
 
 
 # --- correspondences --------------------------------------------------------------------------------------
@@ -311,7 +136,7 @@ def _columns_of_npz(path: Path) -> dict[str, Array]:
     try:
         arrays = {name: np.asarray(value, dtype=np.float64) for name, value in found.items()}
     except (ValueError, TypeError) as error:
-        raise InputError(f"{path}: not an npz of numbers ({error})") from error
+        raise InputError(f"{path}: not an npz of numbers ({plain(error)})") from error
     if "ground" in arrays and "image" in arrays:
         shapes = [arrays[key].shape for key in ("ground", "image", "sigma") if key in arrays]
         n = shapes[0][0] if shapes[0] else 0
@@ -335,7 +160,7 @@ def geojson_points(path: Path, *needed: str) -> list[tuple[list[float], dict[str
         return [_feature(feature, needed) for feature in document["features"]]
     except (ValueError, KeyError, TypeError, IndexError) as error:
         words = ", ".join(("ji", *needed))
-        raise InputError(f"{path}: not a GeoJSON of 3-D points with {words} ({error!r})") from error
+        raise InputError(f"{path}: not a GeoJSON of 3-D points with {words} ({plain(error)})") from error
 
 
 def _feature(feature: dict[str, Any], needed: Sequence[str]) -> tuple[list[float], dict[str, Any]]:

@@ -6,11 +6,12 @@ Views get their names before any work, so that every file of a run carries them 
 from __future__ import annotations
 
 import os
+import re
 import unicodedata
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from pathlib import PurePath
+from pathlib import PurePath, PureWindowsPath
 
 import numpy as np
 import numpy.typing as npt
@@ -143,6 +144,8 @@ class ViewNames:
         self._exact = {name: i for i, name in enumerate(names)}
         self._index.update(self._exact)
         self._known: dict[str, int | None] = {}  # what names meant: a table repeats them in every line
+        folded = Counter(_folded(key) for key in self._index)
+        self._loose = {_folded(key): i for key, i in self._index.items() if folded[_folded(key)] == 1}
 
     def exact(self, name: str) -> int | None:
         """Return the index of the view that has this very name."""
@@ -168,7 +171,19 @@ class ViewNames:
             for key in (text, path.name, path.stem):
                 if key in self._index:
                     return self._index[key]
-        return None
+        path = PureWindowsPath(bare.strip('"'))  # folders either way
+        return next((self._loose[key] for key in map(_folded, (path.name, path.stem)) if key in self._loose), None)
+
+    def among(self, file: str) -> int | None:
+        """Return the index of the view whose name a file of its points begins with, the longest; None without."""
+        keys = [key for key in self._loose if re.match(rf"{re.escape(key)}(?![^\W_])", _folded(file))]
+        return self._loose[max(keys, key=len)] if keys else None
+
+    def said(self) -> str:
+        """Return which names meant a view of another name, but for folders and endings."""
+        loose = {name: self.names[i] for name, i in self._known.items() if i is not None}
+        others = [f"{name} is {view}" for name, view in loose.items() if PurePath(view).stem not in name]
+        return listed(others, 3)
 
     def index(self, name: str) -> int:
         """Return the index of the view that `name` means; InputError where there is none."""

@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from barpc.base.errors import BarpcError, InputError
+from barpc.base.errors import BarpcError, InputError, plain
 from barpc.base.geodesy import Array
 from barpc.base.sidefile import LARGEST, OPTIONS, TABLE, opened_text, read_text
 from barpc.pointio.names import from_cell
+from barpc.rasters.vertical import ELLIPSOID, UNKNOWN, Vertical
 from barpc.scene import IntArray
 
 Names = Mapping[str, Sequence[str]]
@@ -59,21 +60,32 @@ def read_table(
         number, first = next(((n, line) for n, raw in enumerate(text, 1) for line in _content([raw], texts)), (1, ""))
         delimiter = next((sign for sign in "\t;," if sign in first), " ")
         with _line_named(path, number, needed):
-            words = _cells(first, delimiter)
+            words = row_of(first, delimiter)
             columns = _columns(path, words, delimiter, names, needed, unnamed)
-        table = _Table(columns, delimiter, texts, blank)
         rows = chain([first], text) if _numbers(words, delimiter) else text
-        number += rows is text
-        while batch := list(islice(rows, _BATCH)):
-            try:
-                table.add(_content(batch, texts))
-            except _WRONG:
-                for n, raw in enumerate(batch, number):
-                    with _line_named(path, n, list(columns)):
-                        table.parsed(_content([raw], texts))
-                raise
-            number += len(batch)
-    return words, table.whole()
+        return words, _filled(path, rows, number + (rows is text), _Table(columns, delimiter, texts, blank))
+
+
+def read_columns(
+    path: Path, skipped: int, delimiter: str, columns: dict[str, int], texts: Collection[str], blank: Collection[str]
+) -> dict[str, Any]:
+    """Return the columns of a table, whose places are known, below the lines that are skipped (see `read_table`)."""
+    with opened_text(path, TABLE) as text:
+        return _filled(path, islice(text, skipped, None), skipped + 1, _Table(columns, delimiter, texts, blank))
+
+
+def _filled(path: Path, rows: Iterator[str], number: int, table: _Table) -> dict[str, Any]:
+    """Return the columns of the lines that begin with the one called `number`, read by batches."""
+    while batch := list(islice(rows, _BATCH)):
+        try:
+            table.add(_content(batch, table.texts))
+        except _WRONG:
+            for n, raw in enumerate(batch, number):
+                with _line_named(path, n, list(table.columns)):
+                    table.parsed(_content([raw], table.texts))
+            raise
+        number += len(batch)
+    return table.whole()
 
 
 _DIGITS = 18  # of whole numbers of 64 bits
@@ -95,7 +107,7 @@ def _line_named(path: Path, number: int, columns: Sequence[str]) -> Iterator[Non
     except BarpcError:
         raise
     except _WRONG as error:
-        raise InputError(f"{path}, line {number}: expected {', '.join(columns)} ({error})") from error
+        raise InputError(f"{path}, line {number}: expected {', '.join(columns)} ({plain(error)})") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +156,7 @@ class _Texts:
 def _whole(cells: list[str]) -> IntArray | None:
     """Return texts as the numbers (N,) that they are; None unless all are written as `str` does."""
     joined = "".join(cells)
-    if not (joined.isascii() and joined.isdecimal() and all(cells)) or max(map(len, cells)) > _DIGITS:
+    if not (all(cells) and joined.isascii() and joined.isdecimal()) or max(map(len, cells)) > _DIGITS:
         return None
     values = np.array(cells, dtype=np.int64)
     digits = len(values) + sum(np.count_nonzero(values >= 10**n) for n in range(1, _DIGITS))
@@ -155,7 +167,7 @@ class _Table:
     """Columns that grow by batches of lines."""
 
     def __init__(self, columns: dict[str, int], delimiter: str, texts: Collection[str], blank: Collection[str]) -> None:
-        self._columns, self._delimiter, self._texts, self._blank = columns, delimiter, texts, blank
+        self.columns, self._delimiter, self.texts, self._blank = columns, delimiter, texts, blank
         self._parts = {name: _Texts() if name in texts else list[Any]() for name in columns}
 
     def add(self, lines: Sequence[str]) -> None:
@@ -166,22 +178,22 @@ class _Table:
         """Return the cells of each column: texts, numbers, or, where they may be blank, numbers and None."""
         sign = self._delimiter
         plain = sign != " "  # split at once; what is left of blanks does no harm to numbers
-        rows = [line.split(sign) if plain and '"' not in line else _cells(line, sign) for line in lines]
+        rows = [line.split(sign) if plain and '"' not in line else row_of(line, sign) for line in lines]
         found: dict[str, Any] = {}
-        for name, place in self._columns.items():
+        for name, place in self.columns.items():
             if name in self._blank:
                 cells = [row[place].strip() if place < len(row) else "" for row in rows]
                 found[name] = [float(_pointed(cell, sign)) if cell else None for cell in cells]
-            elif name in self._texts:
+            elif name in self.texts:
                 found[name] = [row[place].lstrip(" ").rstrip("\r\n") for row in rows]
             else:
                 cells = [row[place] for row in rows]
-                found[name] = np.array([_pointed(cell, sign) for cell in cells] if sign == ";" else cells, np.float64)
+                found[name] = _numeric([_pointed(cell, sign) for cell in cells] if sign in ";\t" else cells, name)
         return found
 
     def whole(self) -> dict[str, Any]:
         found: dict[str, Any] = {}
-        for name in self._columns:
+        for name in self.columns:
             parts = self._parts.pop(name)
             if isinstance(parts, _Texts):
                 found[name] = parts.column()
@@ -191,10 +203,19 @@ class _Table:
 
 
 def _pointed(cell: str, delimiter: str) -> str:
-    return cell.replace(",", ".") if delimiter == ";" else cell
+    return cell.replace(",", ".") if delimiter in ";\t" else cell
 
 
-def _cells(line: str, delimiter: str) -> list[str]:
+def _numeric(cells: list[str], name: str) -> Array:
+    try:
+        return np.array(cells, np.float64)
+    except ValueError:
+        if name not in ("lon", "lat"):
+            raise
+        return np.array([degrees(cell, name) for cell in cells])
+
+
+def row_of(line: str, delimiter: str) -> list[str]:
     """Return the cells of a line, those that are empty too unless blanks part them."""
     line = line.rstrip("\r\n")
     if '"' in line:
@@ -235,6 +256,120 @@ def header_of(words: Sequence[str], names: Names) -> dict[str, int]:
         either = {key: lower.index(word) for key, word in zip(left[0], "xy", strict=True) if word in lower}
         found = {**either, **found}
     return found
+
+
+def guessed(words: Sequence[str], known: Names) -> tuple[dict[str, int], list[str], Vertical]:
+    """Return the column of each quantity of control points, by the names of `known` and `COLUMNS`, then by likeness;
+    in words, which were guessed so; and what the altitude's name says of it. InputError where two could be that.
+    """
+    if {"X", "Y", "x", "y"} <= set(words):  # where the case alone tells them apart, as scripts for Metashape write it
+        words = [
+            f"map_{word}" if word in ("X", "Y", "Z") else f"px_{word}" if word in ("x", "y") else word for word in words
+        ]
+    bare = [_bare(word) for word in words]
+    found = header_of(bare, {**COLUMNS, **known})
+    exact = dict(found)
+    if {"x", "y"} <= set(bare) and not {"lon", "lat", "col", "row"} & set(found):
+        pair = ("east", "north") if "alt" in found else ("col", "row")
+        found |= {key: bare.index(word) for key, word in zip(pair, "xy", strict=True)}
+    for key, pattern in _LIKE.items():
+        free = [i for i, word in enumerate(bare) if i not in found.values() and not _ERRORS.match(word)]
+        hits = [i for i in free if pattern.fullmatch(bare[i])]
+        if key in found or not hits:
+            continue
+        above = [i for i in hits if "ellips" in bare[i] or "hae" in bare[i]]
+        if key == "alt" and len(hits) > 1 and len(above) != 1:
+            raise InputError(
+                f"columns {' and '.join(repr(words[i]) for i in hits)} could be the altitude; rename one alt"
+            )
+        found[key] = (above or hits)[0]
+    said = [f"column {words[i]!r} is {key}" for key, i in found.items() if exact.get(key) != i]
+    word = words[found["alt"]] if "alt" in found else ""
+    unit = _UNIT.search(word)
+    name, geoid = next((of for sign, of in _LEVELS.items() if re.search(sign, word, re.IGNORECASE)), (UNKNOWN, None))
+    metres = 1.0 if unit is None else 1200 / 3937 if unit[1] else 0.3048 if unit[2] else 1.0
+    return found, said, Vertical(name, metres, unit[0].strip("[]()_ ") if unit else "", geoid, name != UNKNOWN)
+
+
+_UNIT = re.compile(
+    r"[\s_\[(](?:(us[\s_-]*(?:survey)?[\s_-]*f(?:t|oot|eet)|ft[\s_-]*us|survey[\s_-]*f(?:t|oot|eet))|(ft|foot|feet)"
+    r"|m|met(?:re|er)s?)[\])]?\s*$",
+    re.IGNORECASE,
+)
+_LEVELS = {
+    "ellips|hae": (ELLIPSOID, None), "egm.?96": ("EGM96 height", "egm96"),
+    "egm.?(20)?08": ("EGM2008 height", "egm2008"),
+    "navd.?88": ("NAVD88 height", "egm96"), "ortho|msl|geoid": ("the sea", "egm96"),
+}  # fmt: skip
+_ERRORS = re.compile(
+    "sigma|std|stdev|acc|err|resid|d[xyz]$|.*_(error|est|sigma|std|accuracy)$|(image|img)_(width|height)"
+)
+_IMAGE = "image|img|pixel|pix|px|photo|source|raster|im"
+_MAP = "utm|map|world|ground|geo|coord|point|proj|gk|l93|lambert|lambert93|terrain|gcp|coordinate"
+_LIKE = {
+    key: re.compile(pattern)
+    for key, pattern in {
+        "col": rf"({_IMAGE})_?(x|u|col|column|sample)|(x|u|col|column|sample)_?({_IMAGE})|u",
+        "row": rf"({_IMAGE})_?(y|v|row|line)|(y|v|row|line)_?({_IMAGE})|v",
+        "lon": r"(.+_)?(lon|long|longitude|lng)(_.+)?",
+        "lat": r"(.+_)?(lat|latitude)(_.+)?",
+        "east": rf"e|(.+_)?(east|eastings?|rechtswert)(_.+)?|({_MAP})_?(x|e)|x_?({_MAP})",
+        "north": rf"n|(.+_)?(north|northings?|hochwert)(_.+)?|({_MAP})_?(y|n)|y_?({_MAP})",
+        "alt": r"(.+_)?(alt|altitude|height|hgt|elev|elevation|z|h|hae|msl)(_.+)?",
+        "image": r"(.+_)?(image|img|photo|picture|camera|file|filename)(_(name|file|id|label|path))?",
+        "id": r"(gcp|point|pt|marker|target|station)_?(id|name|no|nr|num|number|label)?|fid|no|nr|num|number",
+    }.items()
+}
+"""What columns that nobody lists are taken for: the log says so."""
+
+
+def _bare(word: str) -> str:
+    """Return a column's name in lower case, words joined by lines, without unit; of X/Longitude the latter."""
+    unit = _UNIT.search(word)
+    if unit is not None:  # accuracies are read in metres alone
+        word = (
+            re.sub(r"\W", "_", word) if (unit[1] or unit[2]) and _ERRORS.match(word.lower()) else word[: unit.start()]
+        )
+    word = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", word.strip().rpartition("/")[2])
+    return re.sub(r"[^\w]+", "_", re.sub(r"[\[(].*", "", word).lower()).strip("_")
+
+
+_DEGREES = re.compile(
+    r"([NSEW])?\s*([+-]?\d{1,3}(?:[.,]\d+)?)\s*(?:[°ºd:]|deg)?\s*(?:(\d{1,2}(?:[.,]\d+)?)\s*(?:['′’m:]|min)?\s*"
+    r"(?:(\d{1,2}(?:[.,]\d+)?)\s*(?:[\"″”s]|''|sec)?)?)?\s*([NSEW])?"
+)
+
+
+def degrees(text: str, axis: str) -> float:
+    r"""Return a longitude or latitude (`axis` lon or lat), decimal or in degrees, minutes and seconds; or ValueError.
+
+    Examples
+    --------
+    >>> degrees("43°30'36\"S", "lat"), degrees("W 5 24", "lon"), degrees("694517.1", "lon")
+    (-43.51, -5.4, 694517.1)
+    """
+    if (plain := numbers_of([text])) is not None:
+        return plain[0]
+    found = _DEGREES.fullmatch(text.strip().replace("−", "-"))
+    if found is None:
+        raise ValueError(f"{text[:40]!r} is no number, and no degrees, minutes and seconds")
+    before, whole, *parts, behind = found.groups()
+    sign, letters = -1.0 if whole.startswith("-") else 1.0, (before or "") + (behind or "")
+    numbers = [float(part.replace(",", ".")) for part in (whole.lstrip("+-"), *parts) if part]
+    if len(letters) > 1 or (letters and (sign < 0 or (letters in "NS") != (axis == "lat"))):
+        raise ValueError(f"{text[:40]!r} is no {axis}")
+    if any(number >= 60.0 for number in numbers[1:]) or any(number % 1.0 for number in numbers[:-1]):
+        raise ValueError(f"{text[:40]!r} is no degrees, minutes and seconds")
+    value = sum(number / 60.0**k for k, number in enumerate(numbers))
+    return float(np.round(value, 12)) * (-1.0 if letters and letters in "SW" else sign)
+
+
+def number_of(text: str) -> float:
+    """Return a cell as a number; ValueError where it is none."""
+    found = numbers_of([text])
+    if found is None:
+        raise ValueError(f"{text[:40]!r} is no number")
+    return found[0]
 
 
 def first_words(head: bytes) -> list[str]:

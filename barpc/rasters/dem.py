@@ -206,7 +206,7 @@ class Dem:
         own, vertical = grid.vertical, grid.vertical.by(None if geoid is None else os.fspath(geoid))
         if own.reference == ELLIPSOID and vertical.geoid is not None:
             raise InputError(f"{path}: its heights are ellipsoidal already; leave out the geoid {geoid}")
-        file, done, loud = _geoid_of(own, vertical, geoid is not None)
+        file, done, loud = geoid_of(own, vertical, geoid is not None)
         unit = f" in {own.unit} ({abs(own.metres):.12g} m)" if own.unit else ""
         description = f"{location(path).name}: vertical reference {own.reference}{unit}, {done}"
         if loud:
@@ -313,7 +313,7 @@ def _met(sensor: SensorModel, image: Array, terrain: Callable[[Array, Array], Ar
     return sensor.localize(image, (upper + lower) / 2)
 
 
-def _geoid_of(own: Vertical, said: Vertical, by_person: bool) -> tuple[str | None, str, bool]:
+def geoid_of(own: Vertical, said: Vertical, by_person: bool) -> tuple[str | None, str, bool]:
     """Return the geoid's file for heights as `said` of them, in words what is done, and whether it is said loudly."""
     if said.geoid is None:
         if said.stated:

@@ -15,7 +15,7 @@ import rasterio
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.base.errors import BarpcWarning
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.pointio.correspondences import read_gcps
+from barpc.pointio.gcps import read_gcps
 from barpc.rasters.dem import Dem
 from barpc.rpcio import read_rpc
 from barpc.scene import GroundPoints, Tracks, View

@@ -155,7 +155,8 @@ def test_all_ground_on_earth_is_tried_first_where_a_camera_asks_for_it(
         asked.append((alts, options.grid))
         return a_fit(verdict=lambda tolerance: wide if alts == (-500.0, 9000.0) else "")
 
-    camera = SimpleNamespace(model=SimpleNamespace(all_ground=(-500.0, 9000.0)), extent=(5, 5), alt_range=(1.0, 200.5))
+    ground = SimpleNamespace(all_ground=(-500.0, 9000.0))
+    camera = SimpleNamespace(model=ground, extent=(5, 5), size=(5, 5), alt_range=(1.0, 200.5))
     monkeypatch.setattr(fit, "fit_rpc", fit_rpc)
     monkeypatch.setattr(cameras, "open_camera", lambda _: camera)
     assert run("fit", source) == 0

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pyproj
 import pytest
 
 from barpc.ba import adjust_tracks
@@ -139,7 +140,6 @@ def test_sigmas_may_be_stated_together(tmp_path, columns, cells, ground, image):
 @pytest.mark.parametrize(
     ("head", "says"),
     [
-        ("id,lon,lat,image,col,row", "no column alt"),
         ("id,lon,lat,h,col,row", "no column image"),
         ("id,x,y,z,image", "no column"),
         ("id,lon,lat,h,image,col,row,sigma_elephant", "'sigma_elephant' is none that is read"),
@@ -520,3 +520,41 @@ def test_control_without_altitudes_says_no_more_of_the_height_than_it_knows(tmp_
     metres = np.nanmean(off, axis=0) * [111e3 * np.cos(np.radians(43.3)), 111e3, 1.0]
     assert (np.abs(metres) < 3.0 * found.gauge.sigma).all()
     assert found.gauge.sigma[2] > 5.0
+
+
+def test_points_without_a_column_of_altitudes_are_as_those_of_zero(tmp_path) -> None:
+    (path := tmp_path / "p.csv").write_text(table(POINTS, "id,lon,lat,image,col,row"))
+    found = load_gcps([str(path)], VIEWS, RunOptions())
+    assert found is not None
+    assert found.said == (f"{path}: CSV; no altitudes",)
+    assert found.left_out[0].endswith("6 hold the images sideways alone; give their altitudes, or --dem; left out") or (
+        found.left_out[0].endswith("6 hold the images sideways alone; give their altitudes, or --dem")
+    )
+    found = load_gcps([str(path)], VIEWS, RunOptions(), Plane())  # type: ignore[arg-type]
+    assert found is not None
+    assert found.lonlatalt[:, 2].tolist() == [321.0] * 6
+    assert found.left_out == ()
+
+
+def test_a_map_and_degrees_are_the_same_points_ground_and_image_apart_too(tmp_path) -> None:
+    """The files of one --gcp go together: MicMac's ground points with the image points of another file, once."""
+    to_map = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32631", always_xy=True).transform
+    ground = "".join(
+        f"<OneAppuisDAF><Pt>{x!r} {y!r} {z!r}</Pt><NamePt>{name}</NamePt></OneAppuisDAF>"
+        for name, (lon, lat, z) in zip(POINTS.names, POINTS.lonlatalt.tolist(), strict=True)
+        for x, y in [to_map(lon, lat)]
+    )
+    seen = "".join(
+        f"<MesureAppuiFlottant1Im><NameIm>{VIEWS[v].name}</NameIm><OneMesureAF1I><NamePt>{POINTS.names[g]}</NamePt>"
+        f"<PtIm>{col!r} {row!r}</PtIm></OneMesureAF1I></MesureAppuiFlottant1Im>"
+        for g, v, (col, row) in zip(POINTS.point, POINTS.view, POINTS.xy.tolist(), strict=True)
+    )
+    (first := tmp_path / "ground.xml").write_text(f"<Global>{ground}</Global>")
+    (second := tmp_path / "seen.xml").write_text(f"<SetOfMesureAppuisFlottants>{seen}</SetOfMesureAppuisFlottants>")
+    for paths in ([first], [first, second], [second, first]):
+        found = load_gcps(list(map(str, paths)), VIEWS, RunOptions(gcp_crs="EPSG:32631"))
+        assert found is not None
+        assert sorted(found.names) == sorted(POINTS.names)
+        assert len(found.view) == len(POINTS.view)
+        order = [found.names.index(name) for name in POINTS.names]
+        np.testing.assert_allclose(found.lonlatalt[order], POINTS.lonlatalt, rtol=0, atol=1e-8)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 import pytest
 from rasterio import Affine
 from scipy.interpolate import NearestNDInterpolator
@@ -222,6 +223,22 @@ def altimetry(run: Run, out: Path, scene: Path) -> None:
     assert 11.0 < ups[0] - ups[1] < 13.0
 
 
+def gcp_crs(run: Run, out: Path, scene: Path) -> None:
+    """Points on a map hold the block as those in degrees do, the reference system said; unsaid they are refused."""
+    known = json.loads((scene / "gcps.geojson").read_text(encoding="utf-8"))
+    to_map = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32631", always_xy=True).transform
+    for feature in known["features"]:
+        place = feature["geometry"]["coordinates"]
+        place[:2] = to_map(*place[:2])
+    path = out / "map.geojson"
+    path.write_text(json.dumps(known), encoding="utf-8")
+    degrees = run("b", gcp=(str(scene / "gcps.geojson"),), stop_after="adjustment")
+    metres = run("c", gcp=(str(path),), gcp_crs="EPSG:32631", stop_after="adjustment")
+    np.testing.assert_allclose(metres.adjustment.params, degrees.adjustment.params, atol=1e-4)
+    with pytest.raises(InputError, match="map coordinates"):
+        run("d", gcp=(str(path),))
+
+
 def check_points(run: Run, out: Path, scene: Path) -> None:
     known = (str(scene / "gcps.geojson"),)
     free, checked = run.plain, run("b", check_points=known, stop_after="adjustment")
@@ -266,7 +283,7 @@ def geoid(run: Run, out: Path, scene: Path) -> None:
     with pytest.warns(BarpcWarning, match="geoid"):
         without = run("b", adjust=TIGHT, dem=str(scene / "dem/a.tif"), stop_after="adjustment")
     assert _height(with_geoid) - _height(without) == pytest.approx(40.0, abs=4.0)
-    with pytest.raises(InputError, match="geoid is given without dem"):
+    with pytest.raises(InputError, match="geoid is given without dem or ground points"):
         RunOptions(geoid="g.gtx")
 
 
@@ -326,7 +343,8 @@ ROWS = {
     "images": images, "rpc_formats": rpc_formats, "stop_after": stop_after,
     "grids": grids, "resample": resample,
     "keep_going": keep_going, "overwrite": overwrite, "matches": matches, "matches_only": matches_only,
-    "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "altimetry": altimetry, "check_points": check_points,
+    "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "gcp_crs": gcp_crs, "altimetry": altimetry,
+    "check_points": check_points,
     "fixed_run": fixed_run, "dem": dem, "geoid": geoid,
     "reference": reference, "reference_sigma": reference_sigma,
     "allow_remote": allow_remote, "tie": tie, "adjust": adjust_, "fit": fit,
@@ -345,7 +363,17 @@ ELSEWHERE = (
 tests/remote and tests/reliability, or beside them: matches_only, reference_sigma."""
 
 
-SLOW = ("reference_sigma", "stop_after", "resample", "altimetry", "fit", "fixed_run", "rpc_formats", "overwrite")
+SLOW = (
+    "gcp_crs",
+    "reference_sigma",
+    "stop_after",
+    "resample",
+    "altimetry",
+    "fit",
+    "fixed_run",
+    "rpc_formats",
+    "overwrite",
+)
 """Options that take a run or two of their own: the landing check tries them."""
 
 

@@ -12,7 +12,7 @@ from barpc.base.errors import InputError, TiePointError
 from barpc.base.options import RunOptions
 from barpc.cli import main
 from barpc.pipeline import adjust
-from barpc.pointio.correspondences import read_gcps
+from barpc.pointio.gcps import read_gcps
 from barpc.rpcio import read_rpc
 from tests.lanes import rest_slow
 from tests.pipeline.known import errors_at_check_points, part, whole

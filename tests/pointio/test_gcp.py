@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pyproj
 import pytest
 import rasterio
 from rasterio.control import GroundControlPoint
 
 from barpc.base.errors import InputError
-from barpc.pointio.correspondences import GROUND_SIGMA, IMAGE_SIGMA, read_gcps
+from barpc.pointio.correspondences import GROUND_SIGMA, IMAGE_SIGMA
+from barpc.pointio.gcps import read_gcps
 
 NAMES = ["left", "right"]
 
@@ -84,15 +86,15 @@ def test_tags_of_an_image_belong_to_that_image(tmp_path):
     np.testing.assert_array_equal(found.lonlatalt, [[5.4, 43.2, 100.0]])
 
 
-def test_tags_in_a_map_projection_are_refused(tmp_path):
+def test_tags_in_a_map_projection_are_brought_to_wgs84(tmp_path):
     path = tmp_path / "left.tif"
     gcps = [GroundControlPoint(row=2, col=1, x=5e5, y=4.7e6, z=100.0, id="p")]
     with rasterio.open(
         path, "w", driver="GTiff", width=4, height=4, count=1, dtype="uint8", gcps=gcps, crs="EPSG:32631"
     ):
         pass
-    with pytest.raises(InputError, match="longitude and latitude"):
-        read_gcps(path, NAMES)
+    x, y = pyproj.Proj(proj="utm", zone=31, ellps="WGS84")(5e5, 4.7e6, inverse=True)
+    np.testing.assert_allclose(read_gcps(path, NAMES).lonlatalt, [[x, y, 100.0]], atol=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -100,7 +102,7 @@ def test_tags_in_a_map_projection_are_refused(tmp_path):
     [
         ("1 43 5 120 1 1 1 left.tif 1 2 1\n", "line 1"),
         ("1 43 5 120 1 1\n", "line 1"),
-        ("1 4812345.6 512345.6 120 1 1 1 left.tif 1 2 1 1\n", "map coordinates are not read"),
+        ("1 4812345.6 512345.6 120 1 1 1 left.tif 1 2 1 1\n", "map coordinates"),
         ("1 43 5 120 1 1 1 far.tif 1 2 1 1\n", "no GCP of left, right; it names far.tif"),
         ("# nothing\n", "no GCP"),
         ('{"features": [{"properties": {}}]}', "not a GeoJSON"),

@@ -13,7 +13,7 @@ import pytest
 
 from barpc.base.errors import InputError
 from barpc.pointio import tables
-from barpc.pointio.correspondences import read_gcps
+from barpc.pointio.gcps import read_gcps
 from barpc.pointio.matches import read_links, read_matches
 from barpc.pointio.tables import read_table
 
@@ -22,7 +22,8 @@ BATCH = tables._BATCH
 
 MEASURED = """
 import sys, time
-from barpc.pointio.correspondences import read_altimetry, read_correspondences, read_gcps
+from barpc.pointio.correspondences import read_altimetry, read_correspondences
+from barpc.pointio.gcps import read_gcps
 from barpc.pointio.foreign import read_pair_files
 from barpc.pointio.matches import read_links
 from barpc.tie.pairing.area import read_area

@@ -212,7 +212,8 @@ def test_a_scheme_may_be_written_in_any_case() -> None:
 @pytest.mark.parametrize("reader", ["matches", "gcp", "points", "asp"])
 def test_no_reader_shows_lines_of_a_text_that_is_none_of_its_files(tmp_path, reader) -> None:
     """A link in a folder of somebody else's may lead anywhere that this user may read."""
-    from barpc.pointio.correspondences import read_correspondences, read_gcps
+    from barpc.pointio.correspondences import read_correspondences
+    from barpc.pointio.gcps import read_gcps
 
     secret = tmp_path / "secret"
     secret.write_text("the-key-of-the-house is under, the, stone, 42\nand the gate is open on mondays, 1, 2, 3\n")
