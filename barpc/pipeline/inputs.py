@@ -335,7 +335,7 @@ def _with_altitudes(
     if not unknown.any():
         return points, []
     ground, sigma, count = points.lonlatalt.copy(), points.sigma.copy(), int(unknown.sum())
-    what = f"{count} of {len(unknown)} points have altitude 0, as tools write where none is known"
+    what = f"{count} of {len(unknown)} points have no altitude, or 0 as tools write for none"
     if dem is not None:
         height = dem(*ground[unknown, :2].T)
         known = unknown.copy()
