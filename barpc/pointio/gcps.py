@@ -155,16 +155,20 @@ def _joined(path: Path, kind: str, table: Table, given: Sequence[Path]) -> Table
         raise InputError(f"{path}: {kind}, image points alone; give the file of ground points with another --gcp")
     files = [one for one in given if _opened(one)[1].apart == "image"]
     if not files and kind == MICMAC:
-        files = [one for one in sorted(path.parent.glob("*.xml")) if b"SetOfMesureAppuis" in read_head(one, TABLE)]
+        beside = [one for one in sorted(path.parent.glob("*.xml")) if b"SetOfMesureAppuis" in read_head(one, TABLE)]
+        files = [one for one in beside if one != path and _opened(one)[1].apart == "image"]
     if not files or (len(files) > 1 and not set(files) <= set(given)):
         many = f", and image points in {listed([one.name for one in files])}" if files else ""
         raise InputError(
             f"{path}: {kind}, ground points (no column col, row){many}; give a file of image points with another --gcp"
         )
     ground = dict(zip(table.names, table.numbers, strict=True))
+    pictured = [_opened(one)[1] for one in files]
+    if nameless := [one.name for one, seen in zip(files, pictured, strict=True) if seen.images is None]:
+        raise InputError(f"{path}: {kind}, whose image points in {listed(nameless)} name no image")
     rows = [
         (name, image, *ground[name][:6], *numbers[6:])
-        for seen in (_opened(one)[1] for one in files)
+        for seen in pictured
         for name, image, numbers in zip(seen.names, (seen.images or _NONE).per_row(), seen.numbers, strict=True)
         if name in ground
     ]
@@ -203,10 +207,13 @@ def _assembled(
     ground, vertical, words = _placed(numbers[first, :3], table, frame)
     wrong = ~(np.abs(ground) <= (TURNS, TURNS, FAR)).all(axis=1)  # NaN fails, too
     if wrong.any():
-        how = "" if frame.crs or table.crs else ": map coordinates? --gcp-crs EPSG:... says of which reference system"
-        raise InputError(
-            f"GCP {names[int(wrong.argmax())]}: a coordinate is not finite, or no longitude, latitude in degrees{how}"
-        )
+        name, (x, y, z) = names[int(wrong.argmax())], ground[int(wrong.argmax())]
+        if np.isfinite([x, y]).all() and abs(z) <= FAR and not (frame.crs or table.crs):
+            raise InputError(
+                f"GCP {name} at {x:.10g}, {y:.10g}: map coordinates? Say their reference system with --gcp-crs, such as "
+                "EPSG:32631"
+            )
+        raise InputError(f"GCP {name}: a coordinate is not finite, or no longitude and latitude in degrees")
     made = GroundPoints(
         names=names,
         lonlatalt=ground,

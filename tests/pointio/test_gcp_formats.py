@@ -195,7 +195,9 @@ def test_what_is_no_reference_system_of_places_is_refused(tmp_path, crs) -> None
 
 
 def test_without_a_reference_system_none_is_guessed_and_pyproj_not_imported(tmp_path) -> None:
-    with pytest.raises(InputError, match=r"GCP p: .*map coordinates\? --gcp-crs EPSG"):
+    with pytest.raises(
+        InputError, match=r"g\.csv: CSV, GCP p at 694\d+\.\d+, 4796\d+\.\d+: map coordinates\? Say .* --gcp-crs"
+    ):
         one(tmp_path, EAST, NORTH, 1.0, Frame())
     (tmp_path / "a.gcp").write_text(SAME["asp"][1])
     code = f"import sys; from barpc.pointio.gcps import read_gcps as r; r({str(tmp_path / 'a.gcp')!r}, ['left']); " \
