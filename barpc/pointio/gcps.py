@@ -210,7 +210,7 @@ def _assembled(
         name, (x, y, z) = names[int(wrong.argmax())], ground[int(wrong.argmax())]
         if np.isfinite([x, y]).all() and abs(z) <= FAR and not (frame.crs or table.crs):
             raise InputError(
-                f"GCP {name} at {x:.10g}, {y:.10g}: map coordinates? Say their reference system with --gcp-crs, such as "
+                f"GCP {name} at {x:.10g}, {y:.10g}: map coordinates? Say their reference system with --gcp-crs, as "
                 "EPSG:32631"
             )
         raise InputError(f"GCP {name}: a coordinate is not finite, or no longitude and latitude in degrees")
