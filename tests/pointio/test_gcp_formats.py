@@ -156,6 +156,7 @@ def test_earth_centred_coordinates_have_their_altitude(tmp_path) -> None:
     ground = np.array([-121.5, 38.5, 123.0])
     found = one(tmp_path, *ecef_from_ground(ground).tolist(), Frame("EPSG:4978"))
     near(found, ground)
+    assert found.vertical == "ellipsoid"
 
 
 @pytest.mark.parametrize(
