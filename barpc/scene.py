@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from barpc.base.errors import InputError
 from barpc.base.frozen import Frozen
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import Array, HeightDatum
 from barpc.base.remote import Place
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
@@ -167,8 +167,7 @@ class GroundPoints(Frozen):
     strangers : tuple of str, images that their file names and that are none of the views
     left_out : tuple of str, points left out of their files, with the reason, in sentences
     said : tuple of str, how their files were read, where that had to be guessed or converted, in sentences
-    vertical : str or None, what their file says that altitudes count from: "ellipsoid" or the name of a height system
-        (reading made them ellipsoidal); None where it says nothing, or files differ
+    datums : tuple of HeightDatum, what the altitudes of their files were taken to count from, where no person said it
     """
 
     names: tuple[str, ...]
@@ -181,7 +180,7 @@ class GroundPoints(Frozen):
     strangers: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
     said: tuple[str, ...] = ()
-    vertical: str | None = None
+    datums: tuple[HeightDatum, ...] = ()
 
     def __post_init__(self) -> None:
         g = len(self.names)
@@ -256,11 +255,13 @@ class Altimetry(Frozen):
     lonlatalt : (A, 3), lon, lat [deg], alt [m above the ellipsoid]
     sigma : (A,), standard deviation of the altitude [m]
     sigma_flat : (A,), standard deviation of the place along an axis, each point's own [m]
+    datums : tuple of HeightDatum, what is known of what the altitudes count from, where no person said it
     """
 
     lonlatalt: Array
     sigma: Array
     sigma_flat: Array
+    datums: tuple[HeightDatum, ...] = ()
 
     def __post_init__(self) -> None:
         count = len(self._array("lonlatalt", (None, 3)))

@@ -8,6 +8,7 @@ Outlines become GeoJSON as RFC 7946 asks: longitudes -180 to 180, polygons cut a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,8 @@ ALTITUDES = (-1000.0, 9500.0)
 """The Earth's ground stays inside this [m], with a margin; RPCs that state more are cut to it."""
 GEOID = 110.0
 """m: no geoid lies farther from the ellipsoid."""
+STATED, INFERRED, DEFAULT = "stated", "inferred", "default"
+"""How it is known what heights count from: a person or a file says it; a format's definition does; nothing does."""
 FAR = 1e9
 """No place, size or other number of a file comes near, be it in px, deg or m."""
 NEWTON_STEPS = 12
@@ -39,6 +42,18 @@ CHUNK = 8192
 """Points worked on at a time, so that temporaries stay in cache."""
 np.empty(32 * 2**20 - 2**16, dtype=np.uint8)  # its end tells glibc to keep what is freed: pages taken again cost faults
 _RAD = np.pi / 180.0
+
+
+@dataclass(frozen=True)
+class HeightDatum:
+    """What heights of a source were taken to count from: the ellipsoid, or a geoid; and what speaks for the other."""
+
+    source: str  # of the adjustment's datum: "gcps", "heights" (of a DEM) or "altimetry"
+    name: str  # in sentences
+    otherwise: float  # m that the heights would be higher by if they counted from the other of both
+    provenance: str  # `STATED`, `INFERRED` or `DEFAULT`
+    converted: bool = False  # by a geoid: they were taken to count from it
+    above: tuple[tuple[float, float], ...] = ()  # their offset above others of known datum, and its sigma [m]
 
 
 def parts(stop: int, size: int = CHUNK, start: int = 0) -> Iterator[slice]:

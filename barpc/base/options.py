@@ -36,6 +36,7 @@ GEOID_HELP = (
     "Geoid that heights of a DEM, or of ground points, count from: `egm96`, `egm2008`, the file of a grid, or `none` "
     "of ellipsoidal ones. Without: the one that their file names."
 )
+HEIGHTS_HELP = "What heights count from in files that do not say it: `ellipsoidal`, `egm96`, `egm2008`, a geoid's grid."
 MOST_POINTS = (TABLE.most or 0) // (5 * NUMBER)
 """Control points of a fit: as many as a table of them may hold, five numbers each."""
 _SHORT = reprlib.Repr()
@@ -478,8 +479,8 @@ class RunOptions(Options):
     )
     altimetry: tuple[str, ...] = option(
         (),
-        """Heights without image coordinates (ICESat-2, GEDI, lidar): CSV of lon, lat, alt above the ellipsoid, perhaps
-        sigma and sigma_flat [m]. They hold the scene where most of them agree with the surface of the tie points.""",
+        """Heights without image coordinates (ICESat-2, GEDI, lidar): CSV of lon, lat, alt, perhaps sigma and sigma_flat
+        [m]. They hold the scene where most of them agree with the surface of the tie points.""",
         unit="file",
     )
     check_points: tuple[str, ...] = option(
@@ -496,6 +497,7 @@ class RunOptions(Options):
         unit="file",
     )
     geoid: str | None = option(None, GEOID_HELP, unit="file")
+    heights: str | None = option(None, HEIGHTS_HELP, unit="file")
     reference: tuple[str, ...] = option(
         (),
         """Orthoimage in the right place, of any date, resolution and CRS: with the heights of `dem` it holds the block.

@@ -33,6 +33,7 @@ GROUND = (
     "dem",
     "adjust.dem_for_weak",
     "geoid",
+    "heights",
     "reference",
 )
 ADJUSTMENT = (*CAMERA, *GROUND)
@@ -56,7 +57,8 @@ def field_of(target: str) -> Declared:
 
 _USUAL = {
     "--out-dir", "--overwrite", "--keep-going", "--images", "--image-list", "--options", "--jobs", "--against",
-    "--help", "--help-all", "--matches", "--aoi", "--gcp", "--check-points", "--dem", "--geoid", "--reference",
+    "--help", "--help-all", "--matches", "--aoi", "--gcp", "--check-points", "--dem", "--geoid", "--heights",
+    "--reference",
 }  # fmt: skip
 """Flags that `--help` lists; `--help-all` has the rest."""
 _GROUPS = {"Tie points": TIE, "Cameras": CAMERA, "Ground": GROUND}

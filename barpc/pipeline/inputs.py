@@ -20,13 +20,14 @@ from barpc.base.identity import Input, Stamp, changed, take
 from barpc.base.options import RunOptions, declared
 from barpc.base.remote import here, located, location
 from barpc.base.sidefile import IMAGE, read_names, versioned
+from barpc.base.usual import robust_spread
 from barpc.pointio.correspondences import read_altimetry
 from barpc.pointio.gcps import Frame, read_gcps
 from barpc.pointio.matches import Links, read_links, tracks_of
 from barpc.pointio.names import ViewNames
 from barpc.rasters.dem import Dem, geoid_file
 from barpc.rasters.raster import hashed
-from barpc.rasters.vertical import NONE
+from barpc.rasters.vertical import ELLIPSOIDAL, NONE
 from barpc.report import Run
 from barpc.report.runfiles import table_path
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Tracks, View
@@ -50,12 +51,12 @@ def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None,
 
     A file that cannot be used, those of ground points included, stops the run here (InputError), not after an hour.
     """
-    dem = None if options.dem is None else Dem.open(options.dem, options.geoid)
+    dem = None if options.dem is None else Dem.open(options.dem, options.geoid, options.heights)
     for paths in (options.gcp, options.check_points):
         points = load_gcps(paths, views, options, dem)
         for line in () if points is None else (*points.said, *points.left_out):
             logger.warning("%s", line)
-    load_altimetry(options.altimetry, views)
+    load_altimetry(options.altimetry, views, options.heights)
     if options.adjust.dem_for_weak and options.dem is None:
         raise InputError("dem_for_weak is given without dem: there are no heights to hold the tie points to")
     for path in options.reference:
@@ -83,9 +84,11 @@ def with_located(options: RunOptions) -> RunOptions:
         found = located(path, options.allow_remote)
         return path if here([found]) else os.fspath(versioned(found, IMAGE))
 
-    geoid = None if options.geoid is None else geoid_file(options.geoid)
-    dem, geoid = (path if path in (None, NONE) else at(path) for path in (options.dem, geoid))
-    return replace(options, dem=dem, geoid=geoid, reference=tuple(map(at, options.reference)))
+    geoid, heights = (None if name is None else geoid_file(name) for name in (options.geoid, options.heights))
+    dem, geoid, heights = (
+        path if path in (None, NONE, ELLIPSOIDAL) else at(path) for path in (options.dem, geoid, heights)
+    )
+    return replace(options, dem=dem, geoid=geoid, heights=heights, reference=tuple(map(at, options.reference)))
 
 
 def reference_names(options: RunOptions) -> list[str]:
@@ -280,7 +283,7 @@ def load_gcps(
     Points that cannot be where they are said to be, images that are no views, and files that cannot be read are an
     InputError, or with `keep_going` left out and named in `left_out`. Altitudes that are not known come from `dem`.
     """
-    frame = Frame(options.gcp_crs, options.geoid, tuple(paths))
+    frame = Frame(options.gcp_crs, options.geoid, options.heights, tuple(paths))
     parts = [_load(path, views, options, dem, frame) for path in paths]
     if not parts:
         return None
@@ -292,11 +295,8 @@ def load_gcps(
     strangers = tuple(dict.fromkeys(name for part in parts for name in part.strangers))
     left_out = tuple(line for part in parts for line in part.left_out)
     said = tuple(line for part in parts for line in part.said)
-    levels = {part.vertical for part in parts if part.names}
-    vertical = levels.pop() if len(levels) == 1 else None
-    return GroundPoints(
-        names, point=point, **joined, strangers=strangers, left_out=left_out, said=said, vertical=vertical
-    )
+    datums = tuple(one for part in parts for one in part.datums)
+    return GroundPoints(names, point=point, **joined, strangers=strangers, left_out=left_out, said=said, datums=datums)
 
 
 def _load(path: str, views: Sequence[View], options: RunOptions, dem: Dem | None, frame: Frame) -> GroundPoints:
@@ -306,7 +306,7 @@ def _load(path: str, views: Sequence[View], options: RunOptions, dem: Dem | None
         if not options.keep_going:
             raise
         return replace(GroundPoints.none(), left_out=(f"{error}; the file is left out",))
-    points, said = _with_altitudes(points, views, options, dem)
+    points, said = _with_altitudes(_beside(dem, points, options), views, options, dem)
     out, keep = [], np.ones(len(points.names), dtype=bool)
     search = np.array([reach_of(view, options.tie) for view in views])[points.view]
     for wrong, what in _implausible(points, views, search):
@@ -350,6 +350,20 @@ def _with_altitudes(
     ground[unknown, 2], sigma[unknown, 2] = 0.5 * (low + high), (high - low) * np.sqrt(max(unknown.sum(), 1))
     said = f"{what}: {int(unknown.sum())} hold the images sideways alone; give their altitudes, or --dem"
     return replace(points, lonlatalt=ground, sigma=sigma), [said] if unknown.any() else []
+
+
+def _beside(dem: Dem | None, points: GroundPoints, options: RunOptions) -> GroundPoints:
+    """Return the points with how far they lie above a DEM, where it is known what its heights count from."""
+    ground = points.lonlatalt[points.lonlatalt[:, 2] != 0.0]
+    if dem is None or not dem.known or not points.datums:
+        return points
+    off = ground[:, 2] - dem(*ground[:, :2].T)
+    off = off[np.isfinite(off)]
+    if not len(off):
+        return points
+    bias, single = options.adjust.dem_bias_sigma or KNOWN_BIAS, max(robust_spread(off), options.adjust.dem_sigma)
+    above = float(np.median(off)), float(np.hypot(bias, single / np.sqrt(len(off))))
+    return replace(points, datums=tuple(replace(one, above=(above,)) for one in points.datums))
 
 
 def _implausible(points: GroundPoints, views: Sequence[View], search: Array) -> Iterator[tuple[BoolArray, str]]:
@@ -398,27 +412,28 @@ def _distance(points: GroundPoints, shown: Array, columns: tuple[int, int], sign
     return np.asarray(np.linalg.norm(ecef_from_ground(given) - ecef_from_ground(shown), axis=1))
 
 
-def load_altimetry(paths: Sequence[str], views: Sequence[View]) -> Altimetry | None:
+def load_altimetry(paths: Sequence[str], views: Sequence[View], heights: str | None = None) -> Altimetry | None:
     """Return the heights of several files in the images, one after the other; None without files.
 
     InputError for a file that cannot be read or has no height in the images.
     """
-    parts = [_heights_of(path, views) for path in paths]
+    parts = [_heights_of(path, views, heights) for path in paths]
     if not parts:
         return None
     columns = ("lonlatalt", "sigma", "sigma_flat")
-    return Altimetry(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in columns})
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in columns}
+    return Altimetry(**joined, datums=tuple(one for part in parts for one in part.datums))
 
 
-def _heights_of(path: str, views: Sequence[View]) -> Altimetry:
-    given = read_altimetry(path)
+def _heights_of(path: str, views: Sequence[View], heights: str | None) -> Altimetry:
+    given = read_altimetry(path, heights)
     inside = _inside(given.lonlatalt, views)
     if not inside.any():
         swapped = given.lonlatalt[:, [1, 0, 2]]
         at = f"{len(inside)} heights about {', '.join(f'{x:.4f}' for x in np.median(given.lonlatalt[:, :2], axis=0))}"
         what = "are longitude and latitude exchanged?" if _inside(swapped, views).any() else "another place?"
         raise InputError(f"{path}: none of its {at} (lon, lat) lies in the images: {what}")
-    return Altimetry(given.lonlatalt[inside], given.sigma[inside], given.sigma_flat[inside])
+    return Altimetry(given.lonlatalt[inside], given.sigma[inside], given.sigma_flat[inside], given.datums)
 
 
 def _inside(lonlatalt: Array, views: Sequence[View]) -> BoolArray:

@@ -19,6 +19,7 @@ import numpy as np
 from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior
 from barpc.ba.held.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
+from barpc.base.geodesy import ground_from_ecef
 from barpc.base.identity import Input, Stamp, ask, guarded, recorded
 from barpc.base.options import FitOptions, RunOptions, file_options
 from barpc.base.remote import here
@@ -329,6 +330,7 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
             f"{', '.join(options.reference)}: the reference {run.reference.refusal}, and nothing else holds the "
             "images: check its place and the DEM's, or take a finer one"
         )
+    altimetry = load_altimetry(options.altimetry, run.views, options.heights)
     adjustment = adjust_tracks(
         run.views,
         run.tracks,
@@ -338,10 +340,12 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
         centers=np.array([center.ecef for center in centers]),
         prior=prior,
         reference=None if run.reference is None else run.reference.control,
-        altimetry=load_altimetry(options.altimetry, run.views),
+        altimetry=altimetry,
         keep_largest=options.keep_going,
     )
-    return replace(run, centers=centers, gcps=gcps, check_points=checks, adjustment=adjustment)
+    datums = [] if dem is None else [*dem.datums(ground_from_ecef(adjustment.points))]
+    datums += [one for given in (gcps, altimetry) if given is not None for one in given.datums]
+    return replace(run, centers=centers, gcps=gcps, check_points=checks, adjustment=adjustment, datums=tuple(datums))
 
 
 def _with_ties(run: Run, options: RunOptions, work: Work, terrain: Dem | None = None) -> Run:

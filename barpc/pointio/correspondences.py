@@ -14,11 +14,13 @@ import numpy as np
 
 from barpc.base.errors import InputError, plain
 from barpc.base.frozen import load_npz
-from barpc.base.geodesy import ALTITUDES, FAR, Array
+from barpc.base.geodesy import ALTITUDES, FAR, INFERRED, Array
 from barpc.base.remote import Place
 from barpc.base.sidefile import GEOJSON, NUMBER, TABLE, Kind, read_head, read_json
-from barpc.pointio.tables import COLUMNS, Names, first_words, header_of, numbers_of, read_table
+from barpc.pointio.tables import COLUMNS, Names, first_words, header_of, numbers_of, read_table, vertical_of_column
+from barpc.rasters.dem import HeightGrid, datum_of, geoid_of
 from barpc.rasters.raster import driver_of, open_raster
+from barpc.rasters.vertical import ELLIPSOID, Vertical
 from barpc.scene import Altimetry
 
 GROUND_SIGMA = 1.0  # standard deviation [m] along an axis of a GCP, or of the place of a height, whose file states none
@@ -208,16 +210,23 @@ def read_grid(path: Place, altitudes: Sequence[float] | None = None) -> Correspo
 # --- altimetry --------------------------------------------------------------------------------------------
 
 
-def read_altimetry(path: Path | str) -> Altimetry:
+def read_altimetry(path: Path | str, heights: str | None = None) -> Altimetry:
     """Read the heights of a text: a header that names columns, or lines of lon, lat, alt, perhaps sigma, sigma_flat.
 
+    They are brought to the ellipsoid and to metres from what the name of their column says; `heights` is what they
+    count from where it says nothing: a geoid, or "ellipsoidal".
     Lines whose height is blank or none on Earth, as fill values are, are left out. InputError where a line does not
     parse, a place is none in degrees, or no height is left.
     """
     path = Path(path)
     order = list(_HEIGHTS)
-    _, table = read_table(path, _HEIGHTS, order[:3], unnamed=order, blank=order)
+    words, table = read_table(path, _HEIGHTS, order[:3], unnamed=order, blank=order)
     lon, lat, alt = (np.array(table[name], dtype=np.float64) for name in order[:3])
+    at = header_of(words, _HEIGHTS).get("alt")
+    own = Vertical(ELLIPSOID, provenance=INFERRED) if at is None else vertical_of_column(words[at])
+    by_person = None if own.stated else heights
+    file, _, _ = geoid_of(own, own.by(by_person), by_person is not None)
+    alt = alt * own.metres + (0.0 if file is None else HeightGrid.open(file).sample(lon, lat))
     known = (alt >= ALTITUDES[0]) & (alt <= ALTITUDES[1])
     if not known.any():
         raise InputError(f"{path}: holds no height")
@@ -231,6 +240,8 @@ def read_altimetry(path: Path | str) -> Altimetry:
     sigma, flat = (np.array(table.get(name, [None] * len(known)), dtype=np.float64)[known] for name in order[3:])
     sigma[np.isnan(sigma)], flat[np.isnan(flat)] = HEIGHT_SIGMA, GROUND_SIGMA
     try:
-        return Altimetry(ground, sigma, flat)
+        name = f"the altimetry of {path.name}"
+        datums = datum_of(None if by_person else own, ground, "altimetry", name)
+        return Altimetry(ground, sigma, flat, datums)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

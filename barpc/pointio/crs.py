@@ -8,7 +8,7 @@ from contextlib import suppress
 import numpy as np
 
 from barpc.base.errors import InputError
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import STATED, Array
 from barpc.rasters.vertical import ELLIPSOID, Vertical, vertical_of
 
 _LETTERS = 50_000  # of a reference system: the longest WKT of EPSG has a fifth
@@ -37,7 +37,9 @@ def to_wgs84(place: Array, crs: str, source: str) -> tuple[Array, Vertical, str]
             known = 0.0
             with suppress(ProjError):  # WGS84 itself: nothing was done
                 known = to.get_last_used_operation().accuracy
-        vertical = vertical_of(system.to_wkt()) if upper else Vertical(ELLIPSOID, stated=True) if solid else Vertical()
+        vertical = (
+            vertical_of(system.to_wkt()) if upper else Vertical(ELLIPSOID, provenance=STATED) if solid else Vertical()
+        )
     except (CRSError, ProjError, UnicodeError) as error:
         raise InputError(
             f"{source}: {crs[:60]!r} is no reference system of places that PROJ knows; say it with --gcp-crs, such as "

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from barpc.base.errors import BarpcError, InputError, listed, plain
-from barpc.base.geodesy import FAR, Array
+from barpc.base.geodesy import FAR, INFERRED, Array, HeightDatum
 from barpc.base.sidefile import GEOJSON, TABLE, encoding_of, opened_text, parse_xml, read_head, read_json
 from barpc.pointio.correspondences import GROUND_SIGMA, IMAGE_SIGMA, TURNS
 from barpc.pointio.crs import to_wgs84
@@ -35,7 +35,7 @@ from barpc.pointio.tables import (
     read_columns,
     row_of,
 )
-from barpc.rasters.dem import HeightGrid, geoid_of
+from barpc.rasters.dem import HeightGrid, datum_of, geoid_of
 from barpc.rasters.raster import driver_of, open_raster
 from barpc.rasters.vertical import ELLIPSOID, Vertical
 from barpc.scene import GroundPoints, IntArray
@@ -68,6 +68,7 @@ class Frame:
 
     crs: str | None = None  # the reference system of its places, whatever the file says
     geoid: str | None = None  # of altitudes that the file says count from one (see `Dem.open`)
+    heights: str | None = None  # what altitudes count from where the file does not say it: a geoid, or "ellipsoidal"
     others: tuple[str, ...] = ()  # the files that are given: ground points and image points may be apart
 
 
@@ -204,7 +205,7 @@ def _assembled(
     point[order] = np.argsort(np.argsort(first))[np.cumsum(new) - 1]
     first.sort()
     names = tuple(called[i] or f"gcp_{n}" for n, i in enumerate(first, 1))
-    ground, vertical, words = _placed(numbers[first, :3], table, frame)
+    ground, datums, words = _placed(numbers[first, :3], table, frame)
     wrong = ~(np.abs(ground) <= (TURNS, TURNS, FAR)).all(axis=1)  # NaN fails, too
     if wrong.any():
         name, (x, y, z) = names[int(wrong.argmax())], ground[int(wrong.argmax())]
@@ -222,13 +223,13 @@ def _assembled(
         view=view,
         xy=numbers[:, 6:8],
         xy_sigma=numbers[:, 8],
-        vertical=vertical,
+        datums=datums,
     )
     return made, words
 
 
-def _placed(place: Array, table: Table, frame: Frame) -> tuple[Array, str | None, str]:
-    """Return lon, lat, altitude [m above the ellipsoid; 0: none], what the file says of altitudes, and words."""
+def _placed(place: Array, table: Table, frame: Frame) -> tuple[Array, tuple[HeightDatum, ...], str]:
+    """Return lon, lat, altitude [m above the ellipsoid; 0: none], what is known of the altitudes' datum, and words."""
     crs, vertical, words = frame.crs or table.crs, table.vertical, list[str]()
     if frame.crs and table.crs and frame.crs != table.crs:
         words.append(f"not its own reference system {table.crs[:40]!r}")
@@ -243,13 +244,20 @@ def _placed(place: Array, table: Table, frame: Frame) -> tuple[Array, str | None
     words += ["no altitudes"] if np.isnan(ground[:, 2]).all() else []
     if vertical.metres != 1.0 and known.any():
         words.append(f"altitudes in units of {vertical.metres:.12g} m")
-    if vertical.stated and vertical.reference != ELLIPSOID and known.any():
-        file, done, _ = geoid_of(vertical, vertical.by(frame.geoid), frame.geoid is not None)
-        words.append(f"altitudes above {vertical.reference} {done}")
+    by_person = frame.heights
+    if vertical.stated:
+        by_person = frame.geoid if vertical.reference != ELLIPSOID else None
+    said = vertical.by(by_person)
+    if said.geoid is not None and known.any():
+        file, done, _ = geoid_of(vertical, said, by_person is not None)
+        words.append(f"altitudes above {vertical.reference if vertical.stated else by_person} {done}")
         if file is not None:
             ground[known, 2] += HeightGrid.open(file).sample(*ground[known, :2].T)
     ground[np.isnan(place[:, 2]), 2] = 0.0
-    return ground, vertical.reference if vertical.stated else None, "; ".join(words)
+    datums = datum_of(
+        None if by_person else said, ground[known], "gcps", f"{known.sum()} GCP{'s' * int(known.sum() > 1)}"
+    )
+    return ground, datums, "; ".join(words)
 
 
 # --- tables -----------------------------------------------------------------------------------------------
@@ -352,7 +360,7 @@ def _read_asp(path: Path) -> Table:
                     f"({plain(error)})"
                 ) from error
 
-    return Table.of_rows(rows())
+    return Table.of_rows(rows())._replace(vertical=Vertical(ELLIPSOID, provenance=INFERRED))
 
 
 def _words_of(path: Path, sign: str = "#") -> Iterator[tuple[int, list[str]]]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from barpc.base.errors import BarpcError, InputError, plain
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import DEFAULT, INFERRED, STATED, Array
 from barpc.base.sidefile import LARGEST, OPTIONS, TABLE, opened_text, read_text
 from barpc.pointio.names import from_cell
 from barpc.rasters.vertical import ELLIPSOID, UNKNOWN, Vertical
@@ -284,11 +284,16 @@ def guessed(words: Sequence[str], known: Names) -> tuple[dict[str, int], list[st
             )
         found[key] = (above or hits)[0]
     said = [f"column {words[i]!r} is {key}" for key, i in found.items() if exact.get(key) != i]
-    word = words[found["alt"]] if "alt" in found else ""
+    return found, said, vertical_of_column(words[found["alt"]] if "alt" in found else "")
+
+
+def vertical_of_column(word: str) -> Vertical:
+    """Return what altitudes count from, and their unit, as the name of their column says it."""
     unit = _UNIT.search(word)
-    name, geoid = next((of for sign, of in _LEVELS.items() if re.search(sign, word, re.IGNORECASE)), (UNKNOWN, None))
+    none = (UNKNOWN, None, DEFAULT)
+    name, geoid, known = next((of for sign, of in _LEVELS.items() if re.search(sign, word, re.IGNORECASE)), none)
     metres = 1.0 if unit is None else 1200 / 3937 if unit[1] else 0.3048 if unit[2] else 1.0
-    return found, said, Vertical(name, metres, unit[0].strip("[]()_ ") if unit else "", geoid, name != UNKNOWN)
+    return Vertical(name, metres, unit[0].strip("[]()_ ") if unit else "", geoid, known)
 
 
 _UNIT = re.compile(
@@ -297,9 +302,11 @@ _UNIT = re.compile(
     re.IGNORECASE,
 )
 _LEVELS = {
-    "ellips|hae": (ELLIPSOID, None), "egm.?96": ("EGM96 height", "egm96"),
-    "egm.?(20)?08": ("EGM2008 height", "egm2008"),
-    "navd.?88": ("NAVD88 height", "egm96"), "ortho|msl|geoid": ("the sea", "egm96"),
+    "ellips|hae": (ELLIPSOID, None, STATED), "egm.?96": ("EGM96 height", "egm96", STATED),
+    "egm.?(20)?08": ("EGM2008 height", "egm2008", STATED),
+    "navd.?88": ("NAVD88 height", "egm96", STATED), "ortho|msl|geoid": ("the sea", "egm96", STATED),
+    # as barpc, GeoJSON, ICESat-2 and GEDI define them
+    r"^alt(?![a-z])|^h_(?:ph|li|te_best_fit|mean)$|lowestmode": (ELLIPSOID, None, INFERRED),
 }  # fmt: skip
 _ERRORS = re.compile(
     "sigma|std|stdev|acc|err|resid|d[xyz]$|.*_(error|est|sigma|std|accuracy)$|(image|img)_(width|height)"

@@ -26,18 +26,18 @@ from rasterio.warp import transform as warp_points
 from rasterio.windows import Window
 
 from barpc.base.errors import BarpcWarning, ImageError, InputError
-from barpc.base.geodesy import FAR, Array
+from barpc.base.geodesy import DEFAULT, FAR, STATED, Array, HeightDatum
 from barpc.base.remote import Place, location
 from barpc.base.sidefile import GRID, opened
 from barpc.rasters.pgm import open_pgm
 from barpc.rasters.raster import open_raster
-from barpc.rasters.vertical import ELLIPSOID, NONE, UNKNOWN, Vertical, vertical_of
+from barpc.rasters.vertical import ELLIPSOID, NONE, Vertical, vertical_of
 from barpc.sensor import SensorModel
 
 HEIGHTS = {
-    ".hgt": ("SRTMHGT", Vertical("EGM96 height", geoid="egm96", stated=True)),
-    ".gtx": ("GTX", Vertical(ELLIPSOID, stated=True)),
-    ".pgm": ("PGM", Vertical(ELLIPSOID, stated=True)),
+    ".hgt": ("SRTMHGT", Vertical("EGM96 height", geoid="egm96", provenance=STATED)),
+    ".gtx": ("GTX", Vertical(ELLIPSOID, provenance=STATED)),
+    ".pgm": ("PGM", Vertical(ELLIPSOID, provenance=STATED)),
 }
 """Suffix -> the driver that may open it (its first bytes say nothing), and what its heights count from."""
 _MAX_CELLS = 400_000_000
@@ -193,30 +193,40 @@ class Dem:
     geoid: HeightGrid | None  # height of the geoid above the ellipsoid, added to `grid`
     description: str  # which vertical reference was read and what was done with it
     known: bool = True  # whether it is known what they count from
+    taken: Vertical | None = None  # how they were taken, where no person said it
 
     @classmethod
-    def open(cls, path: Path | str, geoid: Path | str | None = None) -> Dem:
+    def open(cls, path: Path | str, geoid: Path | str | None = None, heights: str | None = None) -> Dem:
         """Open a DEM (``.hgt``, or any raster with a CRS), with the geoid that it names or that is given: a ``.gtx`` or
-        raster, a name of `GEOIDS`, or "none" for heights that are ellipsoidal whatever the file says of them.
+        raster, a name of `GEOIDS`, or "none" for heights that are ellipsoidal whatever the file says of them. `heights`
+        is the same, or "ellipsoidal", of a file that says nothing.
 
         InputError or ImageError where it is none, or a geoid is given for heights that are ellipsoidal already; a
         BarpcWarning for an unknown vertical reference, or one for whose geoid another had to be taken.
         """
         grid = HeightGrid.open(path)
-        own, vertical = grid.vertical, grid.vertical.by(None if geoid is None else os.fspath(geoid))
+        own = grid.vertical
+        by_person = os.fspath(geoid) if geoid is not None else None if own.stated else heights
+        vertical = own.by(by_person)
         if own.reference == ELLIPSOID and vertical.geoid is not None:
             raise InputError(f"{path}: its heights are ellipsoidal already; leave out the geoid {geoid}")
-        file, done, loud = geoid_of(own, vertical, geoid is not None)
+        file, done, loud = geoid_of(own, vertical, by_person is not None)
         unit = f" in {own.unit} ({abs(own.metres):.12g} m)" if own.unit else ""
         description = f"{location(path).name}: vertical reference {own.reference}{unit}, {done}"
         if loud:
             warnings.warn(f"DEM {description}", BarpcWarning, stacklevel=2)
-        return cls(grid, None if file is None else HeightGrid.open(file), description, vertical.stated)
+        taken = None if by_person else vertical
+        return cls(grid, None if file is None else HeightGrid.open(file), description, vertical.stated, taken)
 
     def __call__(self, lon: npt.ArrayLike, lat: npt.ArrayLike) -> Array:
         """Altitude above the ellipsoid (...) [m] at lon, lat (...) [deg]; NaN in voids and outside."""
         height = self.grid.sample(lon, lat)
         return height if self.geoid is None else height + self.geoid.sample(lon, lat)
+
+    def datums(self, ground: Array) -> tuple[HeightDatum, ...]:
+        """Return what its heights were taken to count from at ground points (n, 3), where no person said it."""
+        ground = ground[np.isfinite(ground).all(axis=1)]
+        return datum_of(self.taken, ground, "heights", f"the DEM {self.grid.path.name}")
 
     def posts(self, lon: Array, lat: Array) -> Array:
         """Return numbers (n, 4) of the posts whose heights make those at lon, lat (n,) [deg]; NaN at no place."""
@@ -316,7 +326,7 @@ def _met(sensor: SensorModel, image: Array, terrain: Callable[[Array, Array], Ar
 def geoid_of(own: Vertical, said: Vertical, by_person: bool) -> tuple[str | None, str, bool]:
     """Return the geoid's file for heights as `said` of them, in words what is done, and whether it is said loudly."""
     if said.geoid is None:
-        if said.stated:
+        if said.provenance != DEFAULT:
             return None, "ellipsoidal" if own.reference == ELLIPSOID else "taken as ellipsoidal, as is said", False
         advice = (
             "say --geoid egm96 for heights above the sea, --geoid none for ellipsoidal ones: up to 100 m lie between"
@@ -331,7 +341,18 @@ def geoid_of(own: Vertical, said: Vertical, by_person: bool) -> tuple[str | None
         file = geoid_file("egm96")  # a metre from it
     done = f"made ellipsoidal with {location(file).name}"
     other = not by_person and not any(name in of_file and name in Path(file).name for name in GEOIDS)
-    return file, f"{done}, which lies within some 2 m of it" if other else done, other or own.reference == UNKNOWN
+    return file, f"{done}, which lies within some 2 m of it" if other else done, other
+
+
+def datum_of(vertical: Vertical | None, ground: Array, source: str, name: str) -> tuple[HeightDatum, ...]:
+    """Return what may be otherwise with heights at places (n, 2 or more), taken as `vertical` says; nothing where a
+    person said it (None).
+    """
+    if vertical is None or not len(ground):
+        return ()
+    undulation = float(HeightGrid.open(geoid_file("egm96")).sample(*np.median(ground[:, :2], axis=0)))
+    converted = vertical.geoid is not None
+    return (HeightDatum(source, name, -undulation if converted else undulation, vertical.provenance, converted),)
 
 
 # --- geoids by name ---------------------------------------------------------------------------------------

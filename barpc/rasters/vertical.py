@@ -10,9 +10,10 @@ import re
 from dataclasses import dataclass, replace
 
 from barpc.base.errors import InputError
+from barpc.base.geodesy import DEFAULT, STATED
 
 ELLIPSOID, UNKNOWN = "ellipsoid", "unknown"
-NONE = "none"
+NONE, ELLIPSOIDAL = "none", "ellipsoidal"
 """Said in place of a geoid: heights are ellipsoidal."""
 _GEOIDS = (("egm2008", "egm2008"), ("egm08", "egm2008"), ("egm96", "egm96"), ("egm84", "egm96"))
 _OTHERS = "egm96"  # of any other orthometric datum, from which it lies a metre or two
@@ -35,15 +36,18 @@ class Vertical:
     metres: float = 1.0  # of a unit, upwards
     unit: str = ""  # its name, where it is no metre
     geoid: str | None = None  # grid that makes the heights ellipsoidal; None: they are, or are taken so
-    stated: bool = False  # by the file or a person; else ellipsoidal heights are the default
+    provenance: str = DEFAULT  # `STATED` by the file or a person, `INFERRED` of its format; else taken as ellipsoidal
+
+    @property
+    def stated(self) -> bool:
+        """Whether the file or a person says what heights count from."""
+        return self.provenance == STATED
 
     def by(self, geoid: str | None) -> Vertical:
         """Return the same with what a person says of its geoid: a name or a file, `NONE`, or nothing (None)."""
         if geoid is None:
             return self
-        if geoid.lower() == NONE:
-            return replace(self, geoid=None, stated=True)
-        return replace(self, geoid=geoid, stated=True)
+        return replace(self, geoid=None if geoid.lower() in (NONE, ELLIPSOIDAL) else geoid, provenance=STATED)
 
 
 def metres_of(unit: str) -> float | None:
@@ -83,7 +87,7 @@ def _of_crs(wkt: str) -> Vertical:
     unit = "" if axis.unit_conversion_factor == 1.0 else axis.unit_name
     name = parts[0].name
     if parts[0] is crs or "ellipsoid" in name.lower():
-        return Vertical(ELLIPSOID, metres, unit, None, stated=True)
+        return Vertical(ELLIPSOID, metres, unit, None, STATED)
     plain = re.sub(r"[^a-z0-9]", "", name.lower())
     geoid = next((grid for text, grid in _GEOIDS if text in plain), _OTHERS)
-    return Vertical(name, metres, unit, geoid, stated=True)
+    return Vertical(name, metres, unit, geoid, STATED)

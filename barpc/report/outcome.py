@@ -12,7 +12,7 @@ import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.ba.evidence.scan import Place, Unused, met_worse
-from barpc.base.geodesy import Array, ground_from_ecef
+from barpc.base.geodesy import Array, HeightDatum, ground_from_ecef
 from barpc.base.usual import CRITICAL, FEWEST
 from barpc.fit import RpcFit
 from barpc.scene import BoolArray, Camera, GroundPoints, IntArray, Tracks, View, middle_altitude
@@ -54,7 +54,7 @@ class Run:
     points from a file); `adjustment`, `centers`, `fits`: of an adjustment that went so far; `written`, per view: file,
     consumer that reopened it, largest difference to P_BA [px] or why it does not read it; `left_out`: files, and why;
     `stages`: their seconds and peak memory so far; `check_points` stayed out of the adjustment; `reference`: what an
-    orthoimage said.
+    orthoimage said; `datums`: what heights that hold the scene were taken to count from, where no person said it.
     """
 
     kind: Literal["adjust", "check", "match"]
@@ -73,6 +73,7 @@ class Run:
     gcps: GroundPoints | None = None
     check_points: GroundPoints | None = None
     reference: ReferenceControl | None = None
+    datums: tuple[HeightDatum, ...] = ()
 
     @cached_property
     def before(self) -> tuple[SensorModel, ...]:

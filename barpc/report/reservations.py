@@ -10,7 +10,7 @@ from barpc.ba import Adjustment
 from barpc.ba.apart import Apart
 from barpc.ba.judging.snooping import ControlTest
 from barpc.base.errors import listed
-from barpc.base.geodesy import GEOID, Array
+from barpc.base.geodesy import Array
 from barpc.base.usual import FEW, SURE, SURELY
 from barpc.report.outcome import MANY_REJECTED, SMOOTH_LEFT, Run
 from barpc.report.summary.views import ViewEntry
@@ -331,9 +331,6 @@ def dem_lines(adjustment: Adjustment) -> Iterator[str]:
         f"; they lie {terrain.offset:+.1f} m above it (median; spread {terrain.spread:.1f} m)" if terrain.known else ""
     )
     yield f"It has a height for {100 * terrain.known / terrain.total:.0f} % of the tie points{lie}."
-    if not terrain.is_known and not by_reference:
-        why = "Nothing says that its heights count from the ellipsoid"
-        yield f"{why}: give --geoid, or they may be wrong by up to 100 m."
 
 
 def dem_reasons(adjustment: Adjustment) -> Iterator[str]:
@@ -349,11 +346,8 @@ def dem_reasons(adjustment: Adjustment) -> Iterator[str]:
         )
         return
     (level, *rises), (off, *tilts) = terrain.beyond, terrain.delivered
-    no_geoid = level > SURELY and not terrain.is_known and abs(off) < GEOID
     if level > SURELY:
         why = "its heights, the datum that they count from, or the cameras are not as stated"
-        if no_geoid:
-            why = "nothing says that its heights count from the ellipsoid: a geoid was left out, give --geoid"
         yield (
             f"The DEM is {abs(off):.1f} m {'below' if off > 0 else 'above'} the tie points as the delivered cameras "
             f"put them, {level:.1f} times what the accuracies of both let expect: {why}."
@@ -363,12 +357,6 @@ def dem_reasons(adjustment: Adjustment) -> Iterator[str]:
         yield (
             f"The DEM is tilted against the tie points as delivered, by {' and '.join(tilted)} at the scene's edge, "
             f"more than {SURELY:g} times what the accuracies of it and of the cameras let expect."
-        )
-    if not terrain.is_known and adjustment.reference_inlier.any() and not no_geoid:
-        yield (
-            "The reference stands on the DEM, and nothing says that its heights count from the ellipsoid: if a "
-            "geoid was left out, give --geoid, or the scene may lie up to 100 m too high or low, and its images aside "
-            "by what they look aside over that. If they are ellipsoidal, its CRS should say so (EPSG:4979)."
         )
 
 

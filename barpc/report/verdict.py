@@ -13,6 +13,7 @@ from barpc.ba.apart import APART
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array
 from barpc.base.usual import FEW, SURE, SURELY
+from barpc.report.datum import datum_reasons
 from barpc.report.outcome import MANY_REJECTED, Run
 from barpc.report.records import plain, value_of
 from barpc.report.reservations import (
@@ -105,6 +106,7 @@ def _block_reasons(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     if len(run.tracks):
         yield from (*_of_cameras(found), *_of_places(run, found, views), *_of_solution(run, found))
     yield from dem_reasons(found)
+    yield from datum_reasons(run.datums, found)
 
 
 def _of_cameras(found: Adjustment) -> Iterator[str]:

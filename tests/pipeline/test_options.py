@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pyproj
 import pytest
+import rasterio
 from rasterio import Affine
 from scipy.interpolate import NearestNDInterpolator
 
@@ -288,6 +289,20 @@ def geoid(run: Run, out: Path, scene: Path) -> None:
         RunOptions(geoid="g.gtx")
 
 
+def heights(run: Run, out: Path, scene: Path) -> None:
+    """What nothing says it for: a file that names its geoid keeps that, and a person's word on a DEM's comes first."""
+    with rasterio.open(scene / "dem/a.tif") as file:
+        unsaid = write_dem(scene / "dem/unsaid.tif", "EPSG:4326", file.read(1), transform=file.transform)
+    given = {"adjust": TIGHT, "dem": str(unsaid), "stop_after": "adjustment"}
+    none, sea, mine = (run(f"h{k}", **more, **given) for k, more in enumerate(HEIGHTS))
+    assert _height(sea) - _height(none) == pytest.approx(49.0, abs=4.0)
+    assert _height(mine) == pytest.approx(_height(none), abs=0.1)
+    assert not any("count from" in reason for found in (none, sea, mine) for reason in found.summary["reasons"])
+
+
+HEIGHTS = {"heights": "ellipsoidal"}, {"heights": "egm96"}, {"heights": "egm96", "geoid": "none"}
+
+
 def _referred(run: Run, sigma: float | None) -> AdjustResult:
     """With the terrain for a reference: it shows nothing of what the images show."""
     dem, geoid = str(run.scene / "dem/flat.tif"), str(run.scene / "dem/g.gtx")
@@ -346,7 +361,7 @@ ROWS = {
     "keep_going": keep_going, "overwrite": overwrite, "matches": matches, "matches_only": matches_only,
     "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "gcp_crs": gcp_crs, "altimetry": altimetry,
     "check_points": check_points,
-    "fixed_run": fixed_run, "dem": dem, "geoid": geoid,
+    "fixed_run": fixed_run, "dem": dem, "geoid": geoid, "heights": heights,
     "reference": reference, "reference_sigma": reference_sigma,
     "allow_remote": allow_remote, "tie": tie, "adjust": adjust_, "fit": fit,
 }  # fmt: skip

@@ -253,8 +253,10 @@ def test_ground_points_that_are_left_out_are_said_and_references_are_looked_at(t
     monkeypatch.setattr(inputs, "_require_cover", lambda *given: None)
     monkeypatch.setattr(inputs, "Dem", SimpleNamespace(open=lambda *given: given))
     monkeypatch.setattr(inputs, "BlockPrior", SimpleNamespace(load=lambda path: path))
-    with_all = RunOptions(dem="d.tif", geoid="g.gtx", reference=("r.tif", "s.tif"), fixed_run="earlier")
-    assert side_inputs(with_all, views()) == (("d.tif", "g.gtx"), Path("earlier/tables") / PRIOR)
+    with_all = RunOptions(
+        dem="d.tif", geoid="g.gtx", heights="egm96", reference=("r.tif", "s.tif"), fixed_run="earlier"
+    )
+    assert side_inputs(with_all, views()) == (("d.tif", "g.gtx", "egm96"), Path("earlier/tables") / PRIOR)
     assert read == ["r.tif", "s.tif"]
 
 

@@ -152,13 +152,15 @@ def test_a_unit_that_is_no_length_is_refused(tmp_path) -> None:
         Dem.open(path)
 
 
-def test_an_unknown_reference_raises_a_loud_warning_with_and_without_a_grid(tmp_path):
+def test_an_unknown_reference_raises_a_loud_warning_unless_a_person_says_it(tmp_path):
     path = write_dem(tmp_path / "a.tif", 4326)
     with pytest.warns(BarpcWarning, match="reference unknown, TAKEN AS ELLIPSOIDAL"):
         Dem.open(path)
-    with pytest.warns(BarpcWarning, match="reference unknown, made ellipsoidal"):
-        dem = Dem.open(path, write_geoid(tmp_path / "g.gtx"))
+    dem = Dem.open(path, write_geoid(tmp_path / "g.gtx"))
     assert dem(5.0, 44.0) == pytest.approx(150.0)
+    assert Dem.open(path, None, str(tmp_path / "g.gtx"))(5.0, 44.0) == pytest.approx(150.0)
+    assert Dem.open(path, "none", str(tmp_path / "g.gtx"))(5.0, 44.0) == pytest.approx(100.0)
+    assert Dem.open(path, None, "ellipsoidal").known
 
 
 def test_a_geoid_for_ellipsoidal_heights_is_a_contradiction(tmp_path):
@@ -219,7 +221,7 @@ def test_a_tile_and_a_geoid_are_read_as_their_bytes_stand(tmp_path):
     grid = HeightGrid.open(tmp_path / "S34W071.hgt")
     expected = np.where(tile == -32768, np.nan, tile.astype(float))
     np.testing.assert_array_equal(grid.read(0, 1201, 0, 1201), expected)
-    assert grid.vertical == Vertical("EGM96 height", geoid="egm96", stated=True)
+    assert grid.vertical == Vertical("EGM96 height", geoid="egm96", provenance="stated")
     assert grid.sample(-71.0, -33.0) == tile[0, 0]
     assert grid.sample(-70.0, -34.0) == tile[-1, -1]
     geoid = rng.normal(0, 30, (19, 36)).astype(">f4")
