@@ -175,13 +175,16 @@ def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
         )
     with np.errstate(all="ignore"):
         moved = np.abs(found.gauge.shift) / found.gauge.delivered_sigma
-    # control, a DEM, heights, an earlier run and fixed views move it as far as they must
-    held = (found.control is not None and found.control.used.any()) or found.options.fixed or _holds(found)
-    held = held or any(getattr(run.options, name, None) for name in ("dem", "fixed_run"))
+    # control, an earlier run and fixed views move it as far as they must, a DEM and altimetry in height
+    held = (found.control is not None and found.control.used.any()) or found.options.fixed
+    held = held or found.reference_inlier.any() or getattr(run.options, "fixed_run", None)
+    by_heights = _holds(found) or getattr(run.options, "dem", None)
+    moved = moved[:2] if by_heights else moved
     if not held and (moved[np.isfinite(moved)] > SURELY).any():
+        which = "heights may be another place's; control points" if by_heights else "control points or a DEM"
         yield (
             f"The scene moved by {enu(found.gauge.shift)}, more than {SURELY:g} times what the accuracies of its "
-            "cameras let expect: something is not as stated; control points or a DEM would tell."
+            f"cameras let expect: something is not as stated; {which} would tell."
         )
 
 

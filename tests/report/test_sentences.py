@@ -324,7 +324,13 @@ def test_a_scene_that_moved_far_is_said_to_where_nothing_but_the_cameras_holds_i
     assert reasons(moved(6.0)) == []
     (line,) = reasons(moved(6.1))
     assert line.startswith("The scene moved by +0.00 m east, -6.10 m north, +0.10 m up, more than 3 times what the")
-    assert reasons(moved(6.1), options=SimpleNamespace(dem="x")) == []
+    (line,) = reasons(moved(6.1), options=SimpleNamespace(dem="x"))  # which may lift a scene, not carry it off
+    assert line.endswith("heights may be another place's; control points would tell.")
+    lifted = moved(6.1)
+    lifted.gauge.shift = np.array([0.0, 0.1, 50.0])
+    assert len(reasons(lifted)) == 1
+    assert reasons(lifted, options=SimpleNamespace(dem="x")) == []
+    assert reasons(moved(6.1, reference_inlier=np.ones(2, bool)), options=SimpleNamespace(dem="x")) == []
     assert reasons(moved(6.1), options=SimpleNamespace(fixed_run="x")) == []
     assert len(reasons(moved(6.1), options=SimpleNamespace(dem=None, fixed_run=None))) == 1
     fixed = SimpleNamespace(drift=None, fixed=("A",), dem_for_weak=True, min_convergence=1.0, dem_sigma=2.0)
