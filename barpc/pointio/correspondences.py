@@ -17,7 +17,16 @@ from barpc.base.frozen import load_npz
 from barpc.base.geodesy import ALTITUDES, FAR, INFERRED, Array
 from barpc.base.remote import Place
 from barpc.base.sidefile import GEOJSON, NUMBER, TABLE, Kind, read_head, read_json
-from barpc.pointio.tables import COLUMNS, Names, first_words, header_of, numbers_of, read_table, vertical_of_column
+from barpc.pointio.tables import (
+    COLUMNS,
+    Names,
+    first_words,
+    header_of,
+    like_altitudes,
+    numbers_of,
+    read_table,
+    vertical_of_column,
+)
 from barpc.rasters.dem import HeightGrid, datum_of, geoid_of
 from barpc.rasters.raster import driver_of, open_raster
 from barpc.rasters.vertical import ELLIPSOID, Vertical
@@ -220,9 +229,14 @@ def read_altimetry(path: Path | str, heights: str | None = None) -> Altimetry:
     """
     path = Path(path)
     order = list(_HEIGHTS)
-    words, table = read_table(path, _HEIGHTS, order[:3], unnamed=order, blank=order)
+    head = first_words(read_head(path, TABLE))
+    like = [] if "alt" in header_of(head, _HEIGHTS) else like_altitudes(head)
+    if len(like) > 1:
+        raise InputError(f"{path}: columns {', '.join(like)} could be the altitude; rename one alt")
+    names = {**_HEIGHTS, "alt": (*_HEIGHTS["alt"], *like)}
+    words, table = read_table(path, names, order[:3], unnamed=order, blank=order)
     lon, lat, alt = (np.array(table[name], dtype=np.float64) for name in order[:3])
-    at = header_of(words, _HEIGHTS).get("alt")
+    at = header_of(words, names).get("alt")
     own = Vertical(ELLIPSOID, provenance=INFERRED) if at is None else vertical_of_column(words[at])
     by_person = None if own.stated else heights
     file, _, _ = geoid_of(own, own.by(by_person), by_person is not None)

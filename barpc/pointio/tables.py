@@ -248,7 +248,7 @@ def _lacking(path: Path, names: Sequence[str], words: Sequence[str]) -> InputErr
 
 def header_of(words: Sequence[str], names: Names) -> dict[str, int]:
     """Return the column of each quantity that a header names."""
-    lower = [re.sub(r"[\[(].*", "", word.lower()).strip().replace(" ", "_") for word in words]
+    lower = [_plain(word) for word in words]
     hits = {key: [lower.index(a) for a in aliases if a in lower] for key, aliases in names.items()}
     found = {key: places[0] for key, places in hits.items() if places}
     left = [pair for pair in _EITHER if set(pair) <= set(names) and not set(pair) <= set(found)]
@@ -256,6 +256,15 @@ def header_of(words: Sequence[str], names: Names) -> dict[str, int]:
         either = {key: lower.index(word) for key, word in zip(left[0], "xy", strict=True) if word in lower}
         found = {**either, **found}
     return found
+
+
+def _plain(word: str) -> str:
+    return re.sub(r"[\[(].*", "", word.lower()).strip().replace(" ", "_")
+
+
+def like_altitudes(words: Sequence[str]) -> list[str]:
+    """Return the names, as `header_of` compares them, that are like that of an altitude."""
+    return [_plain(word) for word in words if _LIKE["alt"].fullmatch(bare := _bare(word)) and not _ERRORS.match(bare)]
 
 
 def guessed(words: Sequence[str], known: Names) -> tuple[dict[str, int], list[str], Vertical]:
@@ -322,7 +331,7 @@ _LIKE = {
         "lat": r"(.+_)?(lat|latitude)(_.+)?",
         "east": rf"e|(.+_)?(east|eastings?|rechtswert)(_.+)?|({_MAP})_?(x|e)|x_?({_MAP})",
         "north": rf"n|(.+_)?(north|northings?|hochwert)(_.+)?|({_MAP})_?(y|n)|y_?({_MAP})",
-        "alt": r"(.+_)?(alt|altitude|height|hgt|elev|elevation|z|h|hae|msl)(_.+)?",
+        "alt": r"(.+_)?(alt|altitude|height|hgt|elev|elevation|z|h|hae|msl|egm_?(20)?(96|08)|navd_?88)(_.+)?",
         "image": r"(.+_)?(image|img|photo|picture|camera|file|filename)(_(name|file|id|label|path))?",
         "id": r"(gcp|point|pt|marker|target|station)_?(id|name|no|nr|num|number|label)?|fid|no|nr|num|number",
     }.items()
