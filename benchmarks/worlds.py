@@ -484,6 +484,19 @@ def _want_control(r: Result, plan: Plan) -> list[str]:
     return faults + _far(r) + _unsaid(r)
 
 
+def _want_ground(r: Result, plan: Plan) -> list[str]:
+    left, shape = r.adjusted.left, r.files.shape
+    faults = [f"left {left:.3f}"] if not left <= 0.05 else []
+    if not shape <= max(0.15, r.before.shape + 0.05):
+        faults.append(f"shape {r.before.shape:.2f} -> {shape:.2f}")
+    named = re.search(
+        r"mov(?:e|ing|ed together)|two groups|two solutions", _all_words(r).replace("The scene as a whole moved", "")
+    )
+    if r.code >= 0 and not named:
+        faults.append("nothing said of what moved")
+    return _unsaid(r) + _far(r) + faults
+
+
 WANTED: dict[str, tuple[str, Callable[[Result, Plan], list[str]]]] = {
     "local": ("none good above 0.15 px; 34 of 40 with 0.05 px left at most", _want_local),
     "swing": (
@@ -508,6 +521,10 @@ WANTED: dict[str, tuple[str, Callable[[Result, Plan], list[str]]]] = {
         _want_control,
     ),
     "dem": ("with --solver-only: the scene within 3 sigma; error / said 1.3 RMS", _want_two),
+    "glacier": ("0.05 px left; shape 0.15 m, or as delivered; what moved is named", _want_ground),
+    "fault": ("as glacier", _want_ground),
+    "slide": ("as glacier", _want_ground),
+    "lost": ("none good above 0.15 px; 0.05 px left at most", _want_local),
     "wrong_dem": ("with --solver-only: no worse in shape", _want_wander),
 }
 

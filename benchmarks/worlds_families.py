@@ -103,6 +103,9 @@ class Plan:
     control: Control | None = None
     dem: Wrong | None = None  # what is wrong with the DEM that is given, if one is
     bias: tuple[float, int] | None = None  # px, common to the ties of each of n x n cells of an image
+    dates: tuple[int, ...] = ()  # of the views; empty: one date
+    shifts: list[Callable[[Array], Array]] = field(default_factory=list)  # of ground from a date to the next [m, ENU]
+    tails: float = 0.0  # degrees of freedom of the ties' errors, of Student's distribution; 0: normal
 
     def flaw(self, view: int, **changed: Any) -> None:
         """Change a view's flaw; a `pointing` is added to those that are there."""
@@ -507,6 +510,79 @@ def _wrong_dem(seed: int, rng: np.random.Generator) -> Plan:
     return plan
 
 
+DATES = ((0, 0, 1, 1), (0, 0, 1), (0, 1), (0, 0, 0, 1, 1, 1), (0, 1, 0, 1))
+
+
+def _dated(seed: int, rng: np.random.Generator) -> Plan:
+    """Views of two dates, ties with heavy tails and errors that neighbours share."""
+    dates = DATES[seed % len(DATES)]
+    plan = draw(rng, len(dates), side=(8000, 20000))
+    plan.dates, plan.tails = dates, rng.uniform(3, 6)
+    plan.bias = plan.some(0.02, 0.06), int(rng.integers(8, 20))
+    return plan
+
+
+def _glacier(seed: int, rng: np.random.Generator) -> Plan:
+    """A connected part of the ground that flowed between the dates, slower to its sides; every third one thinned."""
+    plan = _dated(seed, rng)
+    part, size = rng.uniform(0.1, 0.45), plan.some(0.5, 5)
+    axis, start, wind = plan.direction(), rng.uniform(-0.4, 0.4), plan.direction()
+    thins = size * rng.uniform(0.3, 1.0) if seed % 3 == 2 else 0.0
+
+    def shift(uv: Array) -> Array:
+        off = np.abs(uv @ axis - start + 0.15 * np.sin(3.0 * (uv @ axis[::-1])))
+        half = max(float(np.quantile(off, part)), 1e-9)
+        flow = np.clip(1.0 - (off / half) ** 4, 0.0, None)  # a plug, as ice flows
+        return flow[:, None] * np.append(size * wind, -thins)
+
+    plan.shifts.append(shift)
+    note = f"{size:.1f} m on {100 * part:.0f} %{f', {thins:.1f} m thinner' if thins else ''}"
+    plan.injected.append(Injected("glacier", tuple(range(len(plan.looks))), 1, 0, 0, size / plan.gsd, note))
+    return plan
+
+
+def _fault(seed: int, rng: np.random.Generator) -> Plan:
+    """Ground to one side of a line that moved between the dates; one of both sides is the larger or they are alike."""
+    plan = _dated(seed, rng)
+    part, size = (0.5, 0.35, 0.2)[seed % 3], plan.some(0.5, 4)
+    normal, slip = plan.direction(), np.append(plan.direction(), rng.uniform(-0.3, 0.3)) * size
+
+    def shift(uv: Array) -> Array:
+        across = uv @ normal
+        return (across > np.quantile(across, 1 - part))[:, None] * slip
+
+    plan.shifts.append(shift)
+    note = f"{size:.1f} m on {100 * part:.0f} %"
+    plan.injected.append(Injected("fault", tuple(range(len(plan.looks))), 1, 0, 0, size / plan.gsd, note))
+    return plan
+
+
+def _slide(seed: int, rng: np.random.Generator) -> Plan:
+    """A landslide: a few per cent of the ground, moved far."""
+    plan = _dated(seed, rng)
+    part, size, middle = rng.uniform(0.02, 0.08), plan.some(2, 20), rng.uniform(-0.5, 0.5, 2)
+    slip = np.append(plan.direction() * size, -0.4 * size)
+
+    def shift(uv: Array) -> Array:
+        off = np.linalg.norm(uv - middle, axis=1)
+        return (off < np.quantile(off, part))[:, None] * slip
+
+    plan.shifts.append(shift)
+    plan.injected.append(Injected("slide", (), 1, 0, 0, size / plan.gsd, f"{size:.1f} m on {100 * part:.0f} %"))
+    return plan
+
+
+def _lost(seed: int, rng: np.random.Generator) -> Plan:
+    """Lines that were lost in two views of four: what follows in the image is seen tens of pixels early."""
+    plan = draw(rng, 4, side=(8000, 20000))
+    plan.tails, plan.bias = rng.uniform(3, 6), (0.03, 12)
+    for view in (int(v) for v in rng.permutation(4)[: 1 + seed % 2]):
+        size, low = float(rng.integers(4, 60)), rng.uniform(0.15, 0.85) * plan.size[1]
+        plan.flaw(view, pointing=step(low, np.inf, np.array([0.0, -size])))
+        plan.injected.append(Injected("jump", (view,), 1, low, plan.size[1], size, "lines lost"))
+    return plan
+
+
 FAMILIES: dict[str, Callable[[int, np.random.Generator], Plan]] = {
     "local": _local,
     "swing": _swing,
@@ -523,6 +599,10 @@ FAMILIES: dict[str, Callable[[int, np.random.Generator], Plan]] = {
     "control": _control,
     "dem": _dem,
     "wrong_dem": _wrong_dem,
+    "glacier": _glacier,
+    "fault": _fault,
+    "slide": _slide,
+    "lost": _lost,
 }
 
 
@@ -644,13 +724,21 @@ def _ties(plan: Plan, cameras: Sequence[Camera], ground: Array, uv: Array) -> tu
             enu = np.column_stack([speed * (times[v] - times.mean()), rise])
             place = ecef(grounds[v]) + np.einsum("ni,nij->nj", enu, compass(grounds[v]))
             grounds[v] = geodetic(place)
+    for shift in plan.shifts:
+        enu = shift(uv)
+        moving |= (enu != 0).any(axis=1)
+        for v, date in enumerate(plan.dates):
+            grounds[v] = geodetic(ecef(grounds[v]) + date * np.einsum("ni,nij->nj", enu, compass(grounds[v])))
     view, point, xy = _seen(cameras, plan.flaws, grounds, plan.size, plan.tracks, rng)
     bad = rng.uniform(size=len(view)) < plan.outliers
     if plan.bias is not None:
         size, side = plan.bias
         cell = (xy / np.array(plan.size) * side).astype(int).clip(0, side - 1)
         xy = xy + rng.normal(0, size, (num, side, side, 2))[view, cell[:, 0], cell[:, 1]]
-    xy = xy + rng.normal(0, NOISE, xy.shape) + bad[:, None] * rng.uniform(-30, 30, xy.shape)
+    noise = rng.normal(0, NOISE, xy.shape)
+    if plan.tails:
+        noise = 0.6 * NOISE * rng.standard_t(plan.tails, xy.shape)
+    xy = xy + noise + bad[:, None] * rng.uniform(-30, 30, xy.shape)
     xy = np.clip(xy, 0.0, np.array(plan.size) - 1.0)  # no matcher finds a point outside its image
     bad |= moving[point]
     point = np.unique(point, return_inverse=True)[1]
