@@ -57,8 +57,7 @@ def field_of(target: str) -> Declared:
 
 _USUAL = {
     "--out-dir", "--overwrite", "--keep-going", "--images", "--image-list", "--options", "--jobs", "--against",
-    "--help", "--help-all", "--matches", "--aoi", "--gcp", "--check-points", "--dem", "--geoid", "--heights",
-    "--reference",
+    "--help", "--help-all", "--matches", "--aoi", "--gcp", "--check-points", "--dem", "--geoid", "--reference",
 }  # fmt: skip
 """Flags that `--help` lists; `--help-all` has the rest."""
 _GROUPS = {"Tie points": TIE, "Cameras": CAMERA, "Ground": GROUND}

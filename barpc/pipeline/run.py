@@ -21,7 +21,7 @@ from barpc.ba.held.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.base.identity import Input, Stamp, ask, guarded, recorded
-from barpc.base.options import FitOptions, RunOptions, file_options
+from barpc.base.options import AdjustOptions, FitOptions, RunOptions, file_options
 from barpc.base.remote import here
 from barpc.base.sidefile import plain_path
 from barpc.fit import RpcFit, fit_rpc
@@ -49,7 +49,7 @@ from barpc.pointio.matches import asp_text, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
 from barpc.rasters.dem import Dem
 from barpc.report import Run, Summary, summarize
-from barpc.report.outcome import pair_ties
+from barpc.report.outcome import WHOLE_PIXELS, pair_ties
 from barpc.report.page import REPORT
 from barpc.report.records import plain
 from barpc.report.runfiles import FOLDER
@@ -334,7 +334,7 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
     adjustment = adjust_tracks(
         run.views,
         run.tracks,
-        options.adjust,
+        _with_rounding(run, options.adjust),
         gcps,
         dem,
         centers=np.array([center.ecef for center in centers]),
@@ -346,6 +346,13 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
     datums = [] if dem is None else [*dem.datums(ground_from_ecef(adjustment.points))]
     datums += [one for given in (gcps, altimetry) if given is not None for one in given.datums]
     return replace(run, centers=centers, gcps=gcps, check_points=checks, adjustment=adjustment, datums=tuple(datums))
+
+
+def _with_rounding(run: Run, options: AdjustOptions) -> AdjustOptions:
+    """Return the options with the part of errors that does not average away as large as whole pixels leave it."""
+    if not run.whole_pixels.issuperset(view.name for view in run.views):
+        return options
+    return replace(options, noise_floor=max(options.noise_floor, WHOLE_PIXELS))
 
 
 def _with_ties(run: Run, options: RunOptions, work: Work, terrain: Dem | None = None) -> Run:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -19,12 +20,14 @@ from barpc.scene import BoolArray, Camera, GroundPoints, IntArray, Tracks, View,
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, Several, Triangulation, triangulate
 from barpc.tie import PairReport, ReferenceControl
+from barpc.tie.matchers.matching import FINE
 
 MAX_TRACKS = 200_000
 """Of more tracks, every n-th is written, so that the files of a huge run can still be opened."""
 WHOLE, MOST = 0.05, 0.9
 """A whole shift [px], and the share of a pair's matches, `FEWEST` or more, that must have it."""
 SMOOTH_LEFT = 0.06  # A view whose residuals hold more than this [px] that is no scatter is called doubtful
+WHOLE_PIXELS = 12**-0.5  # px: standard deviation of rounding to whole pixels, alike where images are shifted alike
 MANY_REJECTED = 0.3  # A view that lost a larger share of its observations, not at random, is called doubtful
 
 
@@ -143,6 +146,15 @@ class Run:
             shared = np.bincount(view[self.held_out & seen[point]], minlength=num)
             found |= {v: bad for v in np.flatnonzero(2 * shared > held).tolist() if v != bad}
         return found
+
+    @cached_property
+    def whole_pixels(self) -> frozenset[str]:
+        """Names of the views most of whose matches were found at whole pixels: their rounding may be common to all."""
+        count: dict[bool, Counter[str]] = {True: Counter(), False: Counter()}
+        for report in self.matched:
+            for name in report.names if report.status == "ok" else ():
+                count[report.matcher == FINE][name] += report.verified
+        return frozenset(name for name, whole in count[True].items() if whole > count[False][name])
 
     @cached_property
     def control_tests(self) -> list[ControlResidual]:

@@ -12,7 +12,7 @@ from barpc.ba.judging.snooping import ControlTest
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array
 from barpc.base.usual import FEW, SURE, SURELY
-from barpc.report.outcome import MANY_REJECTED, SMOOTH_LEFT, Run
+from barpc.report.outcome import MANY_REJECTED, SMOOTH_LEFT, WHOLE_PIXELS, Run
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.whole import LeftEntry, left_entries, strangeness
 from barpc.report.summary.words import CAUSES, NAMED, counted, known, metres
@@ -49,11 +49,7 @@ def _reservations(view: ViewEntry, run: Run) -> Found:
     adjustment = run.adjustment
     if adjustment is not None:
         yield from _failed(view, run, adjustment)
-    by_reference = run.reference is not None and any(v.points and v.name == view.name for v in run.reference.views)
-    if view.num_observations < FEW and view.num_gcps < ENOUGH_GCPS and not by_reference:
-        gcps = f"{view.num_gcps} GCP{'s' * (view.num_gcps > 1)}"
-        what = "few" if view.num_observations else "few_gcps" if view.num_gcps else "none"
-        yield what, {"few": view.num_observations, "gcps": gcps}
+    yield from _weakly_tied(view, run)
     if run.kind == "match":  # how well cameras agree is not what was asked
         return
     if view.name in run.copies:
@@ -72,6 +68,19 @@ def _reservations(view: ViewEntry, run: Run) -> Found:
     for one in () if adjustment is None else left_entries(adjustment):
         if one.image == view.name and (what := stands_out(one)):
             yield "place", {"place": f"{one.axis} {one.first:.0f}-{one.last:.0f}", "what": what}
+
+
+def _weakly_tied(view: ViewEntry, run: Run) -> Found:
+    """Say that an image has few tie points, or some that may all be off alike, where no control tells either."""
+    by_reference = run.reference is not None and any(v.points and v.name == view.name for v in run.reference.views)
+    if by_reference or view.num_gcps >= ENOUGH_GCPS:
+        return
+    if view.num_observations < FEW:
+        gcps = f"{view.num_gcps} GCP{'s' * (view.num_gcps > 1)}"
+        what = "few" if view.num_observations else "few_gcps" if view.num_gcps else "none"
+        yield what, {"few": view.num_observations, "gcps": gcps}
+    if view.name in run.whole_pixels and run.kind != "match":
+        yield "whole_pixels", {"shared": WHOLE_PIXELS}
 
 
 def _failed(view: ViewEntry, run: Run, adjustment: Adjustment) -> Found:

@@ -176,9 +176,9 @@ def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
     with np.errstate(all="ignore"):
         moved = np.abs(found.gauge.shift) / found.gauge.delivered_sigma
     # control, an earlier run and fixed views move it as far as they must, a DEM and altimetry in height
-    held = (found.control is not None and found.control.used.any()) or found.options.fixed
-    held = held or found.reference_inlier.any() or getattr(run.options, "fixed_run", None)
-    by_heights = _holds(found) or getattr(run.options, "dem", None)
+    used = found.control is not None and bool(found.control.used.any())
+    held = used or bool(found.reference_inlier.any()) or bool(found.options.fixed or _option(run, "fixed_run"))
+    by_heights = _holds(found) or bool(_option(run, "dem"))
     moved = moved[:2] if by_heights else moved
     if not held and (moved[np.isfinite(moved)] > SURELY).any():
         which = "heights may be another place's; control points" if by_heights else "control points or a DEM"
@@ -186,6 +186,10 @@ def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
             f"The scene moved by {enu(found.gauge.shift)}, more than {SURELY:g} times what the accuracies of its "
             f"cameras let expect: something is not as stated; {which} would tell."
         )
+
+
+def _option(run: Run, name: str) -> object:
+    return getattr(run.options, name, None)
 
 
 def _holds(found: Adjustment) -> bool:

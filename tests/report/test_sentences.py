@@ -15,9 +15,11 @@ from barpc.ba.robust.consensus import TwoGroups
 from barpc.ba.robust.smooth import SmoothTest
 from barpc.report import reservations
 from barpc.report import verdict as verdicts
+from barpc.report.outcome import Run
 from barpc.report.reservations import control_reasons, enu
 from barpc.report.summary.views import FitEntry
 from barpc.report.verdict import block_verdict, view_status
+from barpc.scene import Tracks
 from barpc.tie.reference import PEAK, ReferenceControl, ViewMatch
 from tests.rpcio.conftest import make_rpc
 
@@ -50,7 +52,7 @@ def run_of(adjustment: Any = None, kind: str = "adjust", **fields: Any) -> Any:
         "kind": kind, "adjustment": adjustment or adjusted(), "options": SimpleNamespace(), "reference": None,
         "copies": {}, "number": {name: k for k, name in enumerate(NAMES)}, "gcps": None, "check_points": None,
         "left_out": (), "after": None, "tracks": [0] * 9, "met_worse": (), "matched": (), "beside": {},
-        "datums": (),
+        "datums": (), "whole_pixels": frozenset(),
         "views": tuple(SimpleNamespace(name=name, sensor=make_rpc()) for name in NAMES),
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **fields})
@@ -647,3 +649,21 @@ def test_altimetry_says_how_well_it_agrees_or_why_it_holds_nothing():
     assert not any("altimetry heights agree" in one for one in said(odd))
     (reason,) = block_verdict(odd, views())["reasons"]
     assert reason.startswith("The altimetry holds nothing: they lie elsewhere (")
+
+
+@pytest.mark.parametrize(("whole", "sharp", "said"), [(87, 0, True), (87, 100, False), (0, 87, False)])
+def test_matches_at_whole_pixels_are_told_unless_as_many_are_sharper(whole, sharp, said):
+    pair = {"status": "ok", "names": ("A", "B")}
+    matched = (
+        SimpleNamespace(**pair, matcher="fine-structure", verified=whole),
+        SimpleNamespace(**pair, matcher="structure", verified=sharp),
+        SimpleNamespace(status="no common offset", names=("A", "C"), matcher="fine-structure", verified=9),
+    )
+    run = Run("adjust", (), (), Tracks(*np.zeros((2, 0), int), np.zeros((0, 2)), np.zeros(0)), matched)
+    assert run.whole_pixels == (frozenset("AB") if said else frozenset())
+    told = view_status(a_view("A"), run_of(whole_pixels=run.whole_pixels))
+    assert (told["cause"] == "whole_pixels") == said
+    if said:
+        assert "all of them may be off alike by 0.3 px" in str(told["advice"])
+        assert view_status(a_view("A", num_gcps=3), run_of(whole_pixels=run.whole_pixels))["cause"] is None
+        assert view_status(a_view("A"), run_of(kind="match", whole_pixels=run.whole_pixels))["cause"] is None
