@@ -58,7 +58,7 @@ def test_what_tied_the_pairs_is_said_with_what_found_fewer(record):
     assert f"{count} pairs tied: {count - 1} by guided, 1 by structure" in text
     assert "1 pair tried again" in text
     first = record.pairs[0]
-    assert f"at most 3 % of a pair's are false ({first.a} - {first.b})" in text
+    assert f"at most 3 % of the matches of a pair are false ({first.a} - {first.b})" in text
     assert "Why these pairs were tried: 1 same date." in text
 
 
@@ -73,52 +73,62 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
     given = AskedEntry(image="B", smooth_px=0.31, smooth_p=3e-12, shared_px=0.12, num_images=3)
     assert record.options["adjust"]["drift"] is None
     plain = said(record, drift_degree=1, drift_sigma_m=(0.12,))
-    assert "with degree 1 (standard deviation at the first and last row: 12.0 cm): no F test asked for more" in plain
+    assert (
+        "as a polynomial of degree 1 (standard deviation at the first and last row: 12.0 cm): no higher degree was "
+        "needed" in plain
+    )
     more = said(record, drift_degree=2, drift_sigma_m=(0.12, 0.3), drift_asked=given)
-    assert "with degree 2 (standard deviation at the first and last row: 12.0 cm, 30.0 cm): degree 1 left " in more
-    assert "0.31 px that was smooth in B (F test: p = 3e-12; below 1e-4 in 3 images)" in more
-    assert "and neighbours shared 0.12 px" in more
+    assert (
+        "as a polynomial of degree 2 (standard deviation at the first and last row: 12.0 cm, 30.0 cm): degree 1 left "
+        in more
+    )
+    assert "a systematic residual of 0.31 px in B (F test: p = 3e-12; below 1e-4 in 3 images)" in more
+    assert "and 0.12 px correlated between neighbours" in more
     assert "no F test" not in more
     surely = said(record, drift_degree=2, drift_asked=replace(given, smooth_p=0.0, shared_px=0.0))
     assert "p = 0;" in surely
     assert "neighbours shared" not in surely
-    assert "as those of the earlier run do" in said(record, drift_degree=1, drift_sigma_m=(None,))
-    assert "No drift was solved for" in said(record, drift_degree=0, drift_sigma_m=())
+    assert "as in the earlier run" in said(record, drift_degree=1, drift_sigma_m=(None,))
+    assert "No rotation drift was estimated" in said(record, drift_degree=0, drift_sigma_m=())
     text = said(asked(record, drift=2), drift_degree=2)
-    assert "A drift of degree 2 was asked for." in text
+    assert "The degree of the rotation drift, 2, was set by an option." in text
     assert "F test asked" not in text
 
 
 def test_priors_hold_or_were_widened(record):
     held = with_views(record, *[{"prior_scale": 1.0}] * 9)
-    assert "Squared corrections are 0.7 times what the accuracies stated let expect: none was widened." in said(
-        held, prior_ratio=0.7
+    assert (
+        "The squares of the corrections are 0.7 times those expected from the stated accuracies: no prior was widened."
+        in said(held, prior_ratio=0.7)
     )
     text = said(with_views(held, {"prior_scale": 1.5}, {"prior_scale": 3.2}), prior_ratio=9.0)
-    assert f"those of 2 images were widened, 3.2 times at most ({record.views[1].name})" in text
-    assert "none was widened" not in text
+    assert f"the priors of 2 images were widened, at most 3.2 times ({record.views[1].name})" in text
+    assert "no prior was widened" not in text
     assert "Squared corrections" not in said(held, prior_ratio=None)
     assert "Taken as shared" not in text
     shared = said(held, prior_ratio=0.7, prior_shared=1.84)
-    assert "none was widened. Taken as shared by all images, the accuracies stated were widened 1.8 times." in shared
+    assert (
+        "no prior was widened. As an error common to all images, the stated accuracies were widened 1.8 times."
+        in shared
+    )
 
 
 def test_the_model_in_the_image_is_said_to_be_better(record):
     assert "Each camera is corrected by rotation+translation." in said(record)
     views = with_views(record, *[{"held_out_px": 0.05}] * 8, {"held_out_px": 0.08})
     text = said(views, in_space_px=0.4)
-    assert "Rotations and translations leave 0.400 px of tie points that took no part, an affine" in text
-    assert "at most 0.080 px, which was taken" in text
+    assert "Check tie points keep residuals of 0.400 px with a rotation and translation per image, of at most" in text
+    assert "at most 0.080 px with an affine in each image, which was selected" in text
     assert "Each camera is" not in text
 
 
 def test_what_was_cut_and_kept_out_is_counted(record):
     none = with_views(record, *[{"num_rejected": 0, "num_observations": 100}] * 9)
-    assert "No observation of a tie point was cut." in said(none)
+    assert "No observation of a tie point was rejected." in said(none)
     text = said(with_views(none, {}, {"num_rejected": 100}), num_held_out=70)
     most = f"the most in {record.views[1].name}: 50.0 %"
-    assert f"100 of 1000 observations of tie points (10.0 %) were cut as wrong, {most}." in text
-    assert "70 more took no part" in text
+    assert f"100 of 1000 observations of tie points (10.0 %) were rejected as outliers, {most}." in text
+    assert "70 more were held out as independent checks" in text
     assert "No observation" not in text
     assert "took no part, so" not in said(none, num_held_out=0)
 
@@ -131,9 +141,9 @@ def test_splines_are_said_with_the_rows_between_the_knots_of_the_largest(record)
         {"detectors": (1.0,)},
     )
     text = said(waving)
-    assert "Splines with a knot every 400 rows follow jitter in 2 images, up to 0.30 px RMS" in text
+    assert "Splines with a knot every 400 rows model attitude jitter in 2 images, up to 0.30 px RMS" in text
     assert "without them there was" not in text
-    assert "Detectors begin at up to 1 column of 1 image." in text
+    assert "Steps between detectors are estimated at up to 1 column of 1 image." in text
 
 
 STRIP = ExplanationEntry(
@@ -145,51 +155,55 @@ def test_jitter_is_said_with_what_was_left_without_it(record):
     before = AskedEntry(image="B", smooth_px=0.5, smooth_p=1e-9, shared_px=0.0, num_images=2)
     waving = with_views(record, {"jitter_px": 0.1, "jitter_rows": 500.0}, {"jitter_px": 0.3, "jitter_rows": 500.0})
     text, name = said(waving, jitter_asked=before), record.views[1].name
-    assert f"Splines with a knot every 500 rows follow jitter in 2 images, up to 0.30 px RMS ({name}): without" in text
-    assert "there was 0.50 px that was smooth in B (F test: p = 1e-09; below 1e-4 in 2 images)" in text
+    assert (
+        f"Splines with a knot every 500 rows model attitude jitter in 2 images, up to 0.30 px RMS ({name}): without"
+        in text
+    )
+    assert "without them a systematic residual of 0.50 px in B (F test: p = 1e-09; below 1e-4 in 2 images)" in text
     assert "Splines" not in said(record)
 
 
 def test_control_is_counted_and_its_test_says_what_chance_does(record):
-    assert "6 of 6 GCPs that are seen hold the block." in said(record)
+    assert "6 of 6 visible GCPs constrain the block." in said(record)
     wrong = (replace(record.gcps[0], status="rejected", used=False), *record.gcps[1:5])
     unseen = replace(record.gcps[5], status="not seen", images=(), used=False)
-    assert "4 of 5 GCPs that are seen hold the block." in said(replace(record, gcps=(*wrong, unseen)))
+    assert "4 of 5 visible GCPs constrain the block." in said(replace(record, gcps=(*wrong, unseen)))
     assert "GCPs" not in said(replace(record, gcps=()))
     test = ControlTestEntry(200, 3.29, 1, 0.4, 4.6, "B", "P3")
     assert decisions(replace(record, control_test=test))[-1] == (
-        "1 of 200 residuals of control in the images beyond 3.29 times its own standard deviation, where chance puts "
-        "0.4 (the largest: w = 4.6, P3 in B)."
+        "1 of 200 residuals of control points in the images exceed 3.29 times their standard deviation; "
+        "0.4 are expected by chance (the largest: w = 4.6, P3 in B)."
     )
     assert "residuals of control" not in said(replace(record, control_test=None))
 
 
 def test_a_check_and_an_older_summary_say_what_they_know(check_run, record):
-    assert decisions(check_run.record) == ["Tie points were taken as given: nothing was matched."]
+    assert decisions(check_run.record) == ["Tie points were given: nothing was matched."]
     bare = replace(record.scene, drift_asked=None, prior_ratio=None, model="", num_held_out=0, held_out_places=None)
     older = with_views(record, *[{"shared_px": None, "smooth_p": None, "num_rejected": 0}] * 9)
     found = decisions(replace(older, scene=bare, options=None, control_test=None, gcps=(), pairs=()))
-    assert [line.split()[0] for line in found] == ["Rotations", "No"]
+    assert [line.split()[0] for line in found] == ["The", "No"]
 
 
 def test_an_accuracy_is_widened_from_half_a_percent_on(record):
     calm = with_views(record, *[{"prior_scale": 1.0}] * 9)
-    assert "none was widened" in said(with_views(calm, {"prior_scale": 1.005}), prior_ratio=1.0)
-    assert "those of 1 image were widened, 1.0 times" in said(with_views(calm, {"prior_scale": 1.006}), prior_ratio=1.0)
-    assert "none was widened" in said(with_views(calm, *[{"prior_scale": None}] * 9), prior_ratio=1.0)
+    assert "no prior was widened" in said(with_views(calm, {"prior_scale": 1.005}), prior_ratio=1.0)
+    slightly = said(with_views(calm, {"prior_scale": 1.006}), prior_ratio=1.0)
+    assert "the priors of 1 image were widened, at most 1.0 times" in slightly
+    assert "no prior was widened" in said(with_views(calm, *[{"prior_scale": None}] * 9), prior_ratio=1.0)
     given = AskedEntry(image="B", smooth_px=None, smooth_p=None, shared_px=0.0, num_images=1)
     unknown = said(calm, drift_degree=2, drift_asked=given)
-    assert "nan px that was smooth in B (F test: p = nan; below 1e-4 in 1 image)" in unknown
+    assert "a systematic residual of nan px in B (F test: p = nan; below 1e-4 in 1 image)" in unknown
 
 
 def test_where_nothing_won_it_is_said_why(record):
-    assert "Nothing stood out that the cameras' errors as stated do not explain" in said(record)
+    assert "The standard camera model explains all residuals" in said(record)
     left = LeftEntry("B", "columns", 10.0, 99.0, 0.42, 0.031, 2.0, 17.0)
     text = said(record, left=(left,))
-    assert "None of what was tried beside the cameras' errors explains what stands out." in text
+    assert "No extra model that was tested explains the residuals that stand out." in text
     assert "Nothing stood out" not in text
     many = with_views(record, *[{"unknowns": (0.0,) * 1500}] * 9)
-    assert "in blocks of more than 12,000 unknowns explanations do not compete" in said(many, left=(left,))
+    assert "in blocks of more than 12,000 unknowns none is" in said(many, left=(left,))
     strip = ExplanationEntry("strip", "rows lie off", "B", 120.4, 33.0, "wander", "rows", 5.0, 9.0, 1.0)
     assert "None of what was tried" not in said(record, left=(left,), explanations=(strip,))
     assert "Nothing stood out" not in said(record, held_out_places=None)  # of an earlier release
@@ -210,7 +224,7 @@ def test_what_was_taken_and_what_stands_out_are_tables(record):
 
 
 def test_what_took_no_part_is_said_to_agree(record):
-    agrees = "Tie points that took no part are met alike over rows, columns and cells of every image."
+    agrees = "Independent check tie points fit equally well in all rows, columns and cells of every image."
     assert agrees in said(record)
     assert agrees not in said(record, num_held_out=0)
     one = HeldOutEntry("B", "Rows 0-99 of B: they lie off", None, (0.0, 100.0), 20, 0.0, 0.2, 3e-7)

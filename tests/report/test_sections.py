@@ -33,16 +33,16 @@ def texts(table) -> list[list[str]]:
 
 def test_images_without_reservation_are_counted():
     section = asked("images")
-    agreement = " What is left after the adjustment is agreement, not accuracy on the ground."
-    assert section.answer == f"3 of 3 without reservation.{agreement}"
+    agreement = " Residuals measure how well the images agree with each other, not their accuracy on the ground."
+    assert section.answer == f"3 of 3 images passed.{agreement}"
     (table,) = section.tables
     assert table.columns[:3] == ["image", "verdict", "tie points"]
     assert [row[0].text for row in table.rows] == ["A", "B", "C"]
     assert table.marks == ["0", "1", "2"]
     doubted = asked("images", [VIEWS[0], a_view("B", status="weak", advice="look")])
-    assert doubted.answer == f"1 of 2 without reservation.{agreement}"
+    assert doubted.answer == f"1 of 2 images passed.{agreement}"
     check = asked("images", [a_view(status="consistent", rmse_after=None)], kind="check")
-    assert check.answer == "1 of 1 without reservation."
+    assert check.answer == "1 of 1 image passed."
     assert "after [px]" not in check.tables[0].columns
     assert "after [px]" in table.columns
 
@@ -89,15 +89,15 @@ def test_how_images_hang_together():
     def answer(pairs, num=4):
         tracks = TracksEntry(10, 26, {"2": 8, "3": 0, "5": 2})
         found = asked("map", [a_view(name) for name in "ABCD"[:num]], pairs, tracks=tracks).answer
-        assert found.endswith(" Tie points are seen in so many images: 8 in 2, 2 in 5.")
+        assert found.endswith(" Tie points by the number of images that see them: 8 in 2, 2 in 5.")
         return found[: found.rindex(" Tie points")]
 
     ring = [a_pair("A", "B"), a_pair("B", "C"), a_pair("C", "D"), a_pair("A", "D")]
-    assert answer(ring) == "All images hang together."
-    assert answer(ring[:3]) == "All images hang together. Tied to one other image only: A, D."
-    assert answer(ring[:1]) == "By tie points they fall into 3 groups. Tied to one other image only: A, B."
-    assert answer(ring[:1], 2) == "All images hang together."
-    assert answer([]) == "By tie points they fall into 4 groups."
+    assert answer(ring) == "Tie points connect all images."
+    assert answer(ring[:3]) == "Tie points connect all images. Tied to one other image only: A, D."
+    assert answer(ring[:1]) == "Tie points connect the images in 3 separate groups. Tied to one other image only: A, B."
+    assert answer(ring[:1], 2) == "Tie points connect all images."
+    assert answer([]) == "Tie points connect the images in 4 separate groups."
 
 
 def pushed(view: int, cells: int, of: int):
@@ -135,9 +135,9 @@ def test_pairs_are_told_by_the_worst_offset_and_the_best_heights():
     ]
     section = asked("pairs", pairs=pairs)
     assert section.answer == (
-        "The epipolar offset, which no height explains, is 0.100 px (RMS) in the worst pair (A - B); stereo matching "
-        "along epipolar lines wants it well below 0.5 px. Heights come best from A - C: the rays meet under 0.9 "
-        "degrees, so one pixel of parallax is 71.2 cm of height."
+        "The epipolar offset, the part of a mismatch that no height explains, is 0.100 px (RMS) in the worst pair "
+        "(A - B); stereo matching along epipolar lines needs it well below 0.5 px. The best pair for heights is A - C: "
+        "its convergence angle is 0.9 degrees, so one pixel of parallax is 71.2 cm of height."
     )
     assert section.tables[0].marks == ["0-1", "0-2", "1-2"]
     assert texts(section.tables[0])[0] == [
@@ -159,7 +159,7 @@ def test_pairs_without_an_angle_say_nothing_of_heights():
     for field in ("height_m_per_px", "convergence_deg"):
         unknown = asked("pairs", pairs=[a_pair(**{field: None})])
         assert unknown.answer.endswith(
-            "No pair of images without reservation, 30 matches and an angle tells of heights."
+            "No pair of images that passed has 30 matches and a convergence angle that determines heights."
         )
 
 
@@ -174,9 +174,11 @@ def test_corrections_are_told_by_the_farthest_move():
         ),
     ]
     section = asked("corrections", views, scene=a_scene(shift_enu_m=(-2.0, 2.0, 1.0)))
-    common = "Part of that is common to all images: the scene as a whole moved by 3.0 m, which no tie point can tell."
-    assert section.answer == f"Up to 5.00 px in the middle of an image. {common}"
-    assert asked("corrections", views).answer == "Up to 5.00 px in the middle of an image."
+    common = (
+        "Part of that is common to all images: the scene as a whole moved by 3.0 m, which tie points cannot determine."
+    )
+    assert section.answer == f"Up to 5.00 px at the centre of an image. {common}"
+    assert asked("corrections", views).answer == "Up to 5.00 px at the centre of an image."
     assert [table.key for table in section.tables] == ["corrections", "places"]
     assert texts(section.tables[0])[0] == ["A", "+3.000 ± 0.10", "-4.000 ± 0.10", "2.00", "-", "-", "-"]
     assert texts(section.tables[0])[1][-2:] == ["694,000", "line"]
@@ -216,11 +218,11 @@ def test_what_the_images_cannot_tell_is_said_of_the_weakest():
     )
     section = asked("gauge", scene=scene)
     assert section.points == ["All heights.", "The scene."]
-    assert section.answer.endswith(" Ground control points (--gcp) are what helps where it matters.")
+    assert section.answer.endswith(" Ground control points (--gcp) reduce it.")
     assert "held in height" not in section.answer
     assert section.tables == []
     assert (
-        " 7 tie points seen under too small an angle were held in height."
+        " The heights of 7 tie points with too small a convergence angle were constrained."
         in asked("gauge", scene=a_scene(num_held_in_height=7)).answer
     )
     assert asked("gauge") is None
@@ -264,7 +266,7 @@ def test_check_points_are_shown():
     )
     section = asked("check_points", check_points=points)
     assert section.answer == (
-        "3 check points, which the adjustment did not see; what they are met to, the verdict says."
+        "3 check points that the adjustment did not use; the verdict states the RMS of their residuals."
     )
     assert texts(section.tables[0]) == [
         ["P", "1", "5.000", "+3.000", "0", "-0.400"], ["Q", "1", "0", "-", "+1.000", "+1.000"],
@@ -277,7 +279,7 @@ def test_files_are_held_to_what_their_readers_found():
     fit = FitEntry((1e-3, 2e-3), (4e-3, 3e-3), 0.9, 1e-5, 1.0, "lstsq", 500)
     outputs = {"A_RPC.TXT": {"gdal": 1e-9, "rpcm": "cannot read it"}, "A.json": {"barpc": 0.0}}
     section = asked("files", [a_view("A", fit=fit, outputs=outputs), a_view("B", fit=fit)])
-    assert section.answer.startswith("To 4.0e-03 px at worst, on check points")
+    assert section.answer.startswith("At most 4.0e-03 px off, on check points")
     fits, files = section.tables
     assert texts(fits)[0] == ["A", "1.0e-03, 2.0e-03", "4.0e-03", "0.900", "1.0e-05", "100%", "500", "lstsq"]
     assert files.columns == ["file", "gdal [px]", "rpcm [px]", "barpc [px]"]
@@ -298,7 +300,7 @@ def test_how_it_was_made_says_its_options_and_no_time():
     assert [texts(one) for one in section.tables] == [[["tie.band", "1"], ["dem", "None"]]]
     some = asked("run", tables=TablesEntry(900, 300, complete=False))
     assert (
-        some.answer == "3 images, 5 tie points, 12 observations. Tables and charts hold 300 tie points, evenly taken."
+        some.answer == "3 images, 5 tie points, 12 observations. Tables and charts show 300 tie points, sampled evenly."
     )
 
 
@@ -353,11 +355,13 @@ def test_heights_are_recommended_of_images_without_reservation_with_thirty_match
 
     best = a_pair("A", "B", 29, height_m_per_px=0.5)
     next_best = a_pair("A", "C", 30, height_m_per_px=0.6)
-    assert "come best from A - C" in answer(best, next_best)
-    assert "come best from A - B" in answer(replace(best, num_matches=30), next_best)
+    assert "best pair for heights is A - C" in answer(best, next_best)
+    assert "best pair for heights is A - B" in answer(replace(best, num_matches=30), next_best)
     doubted = [VIEWS[0], a_view("B", **BAD), VIEWS[2]]
-    assert "come best from A - C" in answer(replace(best, num_matches=900), next_best, views=doubted)
-    assert answer(best).endswith("No pair of images without reservation, 30 matches and an angle tells of heights.")
+    assert "best pair for heights is A - C" in answer(replace(best, num_matches=900), next_best, views=doubted)
+    assert answer(best).endswith(
+        "No pair of images that passed has 30 matches and a convergence angle that determines heights."
+    )
 
 
 def test_pairs_that_are_torn_are_first():
@@ -376,9 +380,9 @@ def test_a_surface_is_shown_by_the_cameras_before_and_after_and_under_two_images
     before = ReliefWindow("delivered", (2, 2), 0.412, nmad, "QUJD")
     after = replace(before, cameras="corrected", share=0.933, nmad_m=0.5)
     section = page._surface(replace(files, reliefs=(before, after)))
-    said = "41 % of its cells have a height by the delivered cameras, 93 % by the corrected ones."
+    said = "41 % of its cells have a height with the delivered cameras, 93 % with the corrected ones."
     assert said in section.answer
-    assert ("disagree by 25.0 cm and by 50.0 cm" in section.answer) == told
+    assert ("differ by 25.0 cm and by 50.0 cm" in section.answer) == told
     assert [words.partition(",")[0] for _, words in section.charts] == [
         "The ground by the delivered cameras", "The ground by the corrected cameras",
     ]  # fmt: skip

@@ -16,7 +16,7 @@ from barpc.report.records import Column, Number, Record, said
 from barpc.report.summary.words import ABOVE, Count, Pixel, Vector
 from barpc.scene import IntArray
 
-GCPS = "Ground control: what all the others say of a point minus its given place"
+GCPS = "GCP residuals, each predicted without that GCP (prediction minus given)"
 
 
 class KnownPoint(Record):

@@ -20,7 +20,7 @@ from barpc.report.records import Number, Record, said
 from barpc.report.summary.words import Count, Vector, metres
 
 AXES = "columns", "rows"
-DATUM = "What holds the scene: how well its motions are known, and what share of that comes from where"
+DATUM = "Uncertainty of the scene's position and shape (1 sigma), and the shares of its sources"
 MODES = {
     "east": "the whole scene may lie {0} farther east or west",
     "north": "the whole scene may lie {0} farther north or south",
@@ -69,7 +69,7 @@ class ModeEntry(Record):
 
 
 class DatumEntry(Record):
-    """What holds a motion of the scene: shares of what is known of it. Tie points have none."""
+    """Sources of a motion of the scene, as shares of its information. Tie points have none."""
 
     part: str = said("Motion of the scene", head="motion", enum=list(MODES))
     sigma_m: Number = said("Posterior standard deviation (of turns: at the edge)", "m", "known to", ".2f")
@@ -197,7 +197,7 @@ class SceneEntry(Record):
     gcp_residuals_enu_m: tuple[Vector, ...] = said("Adjusted GCPs minus their given place", "m")
     solver: str = said("What the solver did")
     prior_shared: Number = said("Times by which stated accuracies were widened, as shared", default=1.0)
-    datum: tuple[DatumEntry, ...] = said("What holds the scene", default=())
+    datum: tuple[DatumEntry, ...] = said("Sources of the scene's position and shape", default=())
     dem: DemEntry | None = said("What the DEM did; null without one", default=None)
     altimetry: AltimetryEntry | None = said("What heights alone did", default=None)
     gcp_scatter: Number = said("RMS residual of the GCPs used over what their accuracies let expect", default=None)
