@@ -126,7 +126,7 @@ def read_points(spec: str | Path) -> tuple[Correspondences | None, tuple[int, in
     And the size of the image, given behind the file or its own.
     """
     path, texts = split_spec(spec)
-    if path.is_dir() or b"<adsHeader>" in read_head(path, IMAGE):
+    if path.is_dir() or path.suffix.lower() == ".zip" or b"<adsHeader>" in read_head(path, IMAGE):
         return None, None
     altitudes = _read(_numbers, "altitudes", texts["altitudes"], path) if "altitudes" in texts else None
     if set(texts) - {"size", "altitudes"}:

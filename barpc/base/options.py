@@ -491,9 +491,10 @@ class RunOptions(Options):
         "An earlier run some of whose views are among these: they keep what it knows about them.",
         unit="dir",
     )
-    dem: str | None = option(
-        None,
-        "Terrain heights: they hold the scene's height and, as far as its relief tells, its place.",
+    dem: tuple[str, ...] = option(
+        (),
+        """Terrain heights: they hold the scene's height and, as far as its relief tells, its place. Of several the
+        first that knows a place counts.""",
         unit="file",
     )
     geoid: str | None = option(None, GEOID_HELP, unit="file")
@@ -514,9 +515,9 @@ class RunOptions(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.geoid is not None and self.dem is None and not (self.gcp or self.check_points):
+        if self.geoid is not None and not (self.dem or self.gcp or self.check_points):
             raise InputError("geoid is given without dem or ground points: there are no heights to convert")
-        if self.reference and self.dem is None:
+        if self.reference and not self.dem:
             raise InputError("reference is given without dem: an orthoimage tells no heights")
         if self.reference_sigma is not None and not self.reference:
             raise InputError("reference_sigma is given without reference")

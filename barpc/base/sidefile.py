@@ -125,13 +125,21 @@ def _regular(path: Path | str, kind: Kind) -> BinaryIO:
         found = os.fstat(descriptor)
         if not stat.S_ISREG(found.st_mode):
             what = next((words for test, words in _KINDS.items() if test(found.st_mode)), "a device")
-            raise kind.error(f"{path}: {what}, not a file; {kind.words} is needed")
+            raise kind.error(f"{path}: {what}, not a file; {kind.words} is needed{unread(Path(path))}")
         kind.check(path, found.st_size)
         identity.note(path, found)
     except BaseException:
         os.close(descriptor)
         raise
     return open(descriptor, "rb")  # noqa: PTH123  (a descriptor, no path)
+
+
+def unread(path: Path) -> str:
+    """Return what a message adds about a folder or archive that is not read, and the cure; else nothing."""
+    named = path.name.lower().endswith((".zarr", ".zarr.zip"))
+    if not (named or any((path / name).is_file() for name in (".zgroup", ".zmetadata", "zarr.json"))):
+        return ""
+    return "; a Zarr store, which is not read: of Sentinel-1 take the same product as SAFE, else the image as GeoTIFF"
 
 
 def encoding_of(head: bytes) -> str:

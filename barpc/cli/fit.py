@@ -29,7 +29,12 @@ _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third 
     help="Altitudes [m above the ellipsoid] to fit over.  [default: the camera's own; of a radar all "
     "ground on Earth, -500 to 9000 m, where an RPC holds it]",
 )
-@click.option("--dem", metavar="FILE", help="Take the altitudes of this DEM over the image, with a margin.")
+@click.option(
+    "--dem",
+    metavar="FILE",
+    multiple=True,
+    help="Take the altitudes of this DEM over the image, with a margin (repeatable).",
+)
 @click.option(
     "--dem-margin",
     type=click.FloatRange(0),

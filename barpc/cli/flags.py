@@ -15,7 +15,7 @@ import click
 from barpc.base.errors import BarpcError, InputError
 from barpc.base.options import PAPER, Declared, RunOptions, checked, declared, read_options, with_values
 from barpc.base.remote import is_url
-from barpc.base.sidefile import IMAGE, read_head, read_names
+from barpc.base.sidefile import IMAGE, read_head, read_names, unread
 from barpc.cli.terminal import echo
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -271,7 +271,7 @@ def _files(name: str) -> list[str]:
 
             if find_annotation(path):
                 return [name]
-            raise InputError(f"{name}: a folder without images ({', '.join(_ENDS)})")
+            raise InputError(f"{name}: a folder without images ({', '.join(_ENDS)}){unread(path)}")
         return rasters
     if os.path.lexists(name):
         return [name]

@@ -46,15 +46,15 @@ def with_heights(alt: str, both: bool = False) -> Callable[[Function], Function]
 
     def added(verb: Function) -> Function:
         @click.option("--alt", type=float, help=alt)
-        @click.option("--dem", metavar="FILE", help="Take the altitudes from a DEM.")
+        @click.option("--dem", metavar="FILE", multiple=True, help="Take the altitudes from a DEM (repeatable).")
         @click.option("--geoid", metavar="NAME|FILE", help=GEOID_HELP)
         @wraps(verb)
-        def told(*, alt: float | None, dem: str | None, geoid: str | None, **given: Any) -> Any:
-            if dem is None and geoid is not None:
+        def told(*, alt: float | None, dem: tuple[str, ...], geoid: str | None, **given: Any) -> Any:
+            if geoid is not None and not dem:
                 raise click.UsageError("--geoid goes with --dem")
-            if dem is not None and alt is not None and not both:
+            if dem and alt is not None and not both:
                 raise click.UsageError("give either --alt or --dem")
-            return verb(alt=alt, terrain=None if dem is None else Dem.open(dem, geoid), **given)
+            return verb(alt=alt, terrain=Dem.open(dem, geoid) if dem else None, **given)
 
         return cast(Function, told)
 

@@ -51,18 +51,18 @@ def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None,
 
     A file that cannot be used, those of ground points included, stops the run here (InputError), not after an hour.
     """
-    dem = None if options.dem is None else Dem.open(options.dem, options.geoid, options.heights)
+    dem = Dem.open(options.dem, options.geoid, options.heights) if options.dem else None
     for paths in (options.gcp, options.check_points):
         points = load_gcps(paths, views, options, dem)
         for line in () if points is None else (*points.said, *points.left_out):
             logger.warning("%s", line)
     load_altimetry(options.altimetry, views, options.heights)
-    if options.adjust.dem_for_weak and options.dem is None:
+    if options.adjust.dem_for_weak and not options.dem:
         raise InputError("dem_for_weak is given without dem: there are no heights to hold the tie points to")
     for path in options.reference:
         Sheet.read(path)
     if dem is not None:
-        _require_cover(dem, str(options.dem), views)
+        _require_cover(dem, ", ".join(options.dem), views)
     prior = None if options.fixed_run is None else BlockPrior.load(table_path(Path(options.fixed_run), PRIOR))
     return dem, prior
 
@@ -85,10 +85,9 @@ def with_located(options: RunOptions) -> RunOptions:
         return path if here([found]) else os.fspath(versioned(found, IMAGE))
 
     geoid, heights = (None if name is None else geoid_file(name) for name in (options.geoid, options.heights))
-    dem, geoid, heights = (
-        path if path in (None, NONE, ELLIPSOIDAL) else at(path) for path in (options.dem, geoid, heights)
-    )
-    return replace(options, dem=dem, geoid=geoid, heights=heights, reference=tuple(map(at, options.reference)))
+    geoid, heights = (path if path in (None, NONE, ELLIPSOIDAL) else at(path) for path in (geoid, heights))
+    dem, reference = (tuple(map(at, paths)) for paths in (options.dem, options.reference))
+    return replace(options, dem=dem, geoid=geoid, heights=heights, reference=reference)
 
 
 def reference_names(options: RunOptions) -> list[str]:

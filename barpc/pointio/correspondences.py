@@ -16,27 +16,28 @@ from barpc.base.errors import InputError, plain
 from barpc.base.frozen import load_npz
 from barpc.base.geodesy import ALTITUDES, FAR, INFERRED, Array
 from barpc.base.remote import Place
-from barpc.base.sidefile import GEOJSON, NUMBER, TABLE, Kind, read_head, read_json
-from barpc.pointio.tables import (
+from barpc.base.sidefile import NUMBER, TABLE, Kind, read_head
+from barpc.pointio.columns import (
     COLUMNS,
+    GROUND_SIGMA,
+    TURNS,
     Names,
     first_words,
     header_of,
     like_altitudes,
     numbers_of,
-    read_table,
     vertical_of_column,
 )
+from barpc.pointio.gcp_formats import read_geojson, read_tags
+from barpc.pointio.gcp_table import Table
+from barpc.pointio.tables import read_table
 from barpc.rasters.dem import HeightGrid, datum_of, geoid_of
 from barpc.rasters.raster import driver_of, open_raster
 from barpc.rasters.vertical import ELLIPSOID, Vertical
 from barpc.scene import Altimetry
 
-GROUND_SIGMA = 1.0  # standard deviation [m] along an axis of a GCP, or of the place of a height, whose file states none
-IMAGE_SIGMA = 0.5  # standard deviation of each image coordinate [px], of GCPs and tie points whose file states none
 HEIGHT_SIGMA = 0.5  # m, of a height whose file states none: ICESat-2 and GEDI over gentle ground
 GRID_TAG = "ALTITUDE_B0"  # of a raster that is a localisation grid
-TURNS = 540.0  # deg: longitudes are taken by whole turns
 
 _POINTS: Names = {**COLUMNS, "sigma": ("sigma", "sigma_px")}
 _HEIGHTS: Names = {
@@ -50,18 +51,6 @@ _HEIGHTS: Names = {
     "sigma_flat": ("sigma_flat", "sigma_xy", "sigma_horizontal", "accuracy_xy"),
 }
 """As ICESat-2's ATL03, ATL06 and ATL08 and GEDI's L2A call it, too."""
-
-
-def _tags(path: Place) -> tuple[list[tuple[Any, ...]], tuple[int, int]]:
-    """Return the GCP tags of an image, each a name, lon, lat, alt and col, row as they stand; its width and height."""
-    with open_raster(path) as dataset:
-        (gcps, crs), size = dataset.gcps, (int(dataset.width), int(dataset.height))
-    if gcps and crs is not None and not crs.is_geographic:
-        raise InputError(f"{path}: its GCPs are in {crs}; longitude and latitude on WGS84 are needed")
-    for n, gcp in enumerate(gcps, 1):
-        if gcp.z is None:
-            raise InputError(f"{path}: GCP {gcp.id or n} has no altitude")
-    return [(str(gcp.id or n), gcp.x, gcp.y, gcp.z, gcp.col, gcp.row) for n, gcp in enumerate(gcps, 1)], size
 
 
 # --- correspondences --------------------------------------------------------------------------------------
@@ -94,13 +83,12 @@ def read_correspondences(path: Path | str, *, altitudes: Sequence[float] | None 
         raise InputError(f"{path}: neither a table of points (CSV, npz, GeoJSON) nor a localisation grid")
     if kind == "grid":
         return read_grid(path, altitudes)
-    columns: dict[str, Any] = dict.fromkeys(COLUMNS, ())
+    if kind == "geojson":
+        return _of_control(path, read_geojson(path))
     if kind == "npz":
-        columns = _columns_of_npz(path)
-    elif kind == "csv":  # without a header: lon, lat, alt, col, row
+        columns: dict[str, Any] = _columns_of_npz(path)
+    else:  # without a header: lon, lat, alt, col, row
         _, columns = read_table(path, _POINTS, list(COLUMNS), unnamed=list(COLUMNS))
-    elif points := geojson_points(path):
-        columns = dict(zip(COLUMNS, zip(*(numbers for numbers, _ in points), strict=True), strict=True))
     arrays = {name: np.array(column, dtype=np.float64) for name, column in columns.items()}
     if not arrays["lon"].size:
         raise InputError(f"{path}: no points in it")
@@ -110,20 +98,25 @@ def read_correspondences(path: Path | str, *, altitudes: Sequence[float] | None 
     return Correspondences(ground, image, arrays.get("sigma"))
 
 
+def _of_control(path: Place, table: Table) -> Correspondences:
+    """Return ground control points as those of a camera; InputError where they are no lon, lat, alt, col and row."""
+    if table.crs not in (None, "EPSG:4979"):
+        raise InputError(f"{path}: its GCPs are in {str(table.crs)[:60]}; longitude and latitude on WGS84 are needed")
+    if not table.names or table.apart:
+        raise InputError(f"{path}: no points in it that have lon, lat, alt and col, row (or ji)")
+    if (flat := np.isnan(table.numbers[:, 2])).any():
+        raise InputError(f"{path}: GCP {table.names[n := int(flat.argmax())] or n + 1} has no altitude")
+    ground = table.numbers[:, :3] * (1.0, 1.0, table.vertical.metres)
+    return Correspondences(ground, table.numbers[:, 6:8], note=table.said)
+
+
 def read_gcp_grid(path: Place) -> tuple[Correspondences | None, tuple[int, int]]:
     """Return the GCP tags of an image, None without any, as the points of its camera; and its width and height [px].
 
-    A grid from 0 to the last pixel, as Sentinel-1's, counts from the centre of the first pixel; any other from its
-    corner, as GDAL does: half a pixel is taken off.
+    InputError where they are no longitude, latitude and altitude. `read_tags` decides where they count from.
     """
-    found, size = _tags(path)
-    if not found:
-        return None, size
-    ground, image = (np.array([row[part] for row in found], dtype=np.float64) for part in (slice(1, 4), slice(4, 6)))
-    centres = (image.min(axis=0) == 0).all() and (image.max(axis=0) == np.array(size) - 1).all()
-    where = "centre" if centres else "corner"
-    note = f"{len(found)} GCPs of {path.name}, counted from the {where} of the first pixel"
-    return Correspondences(ground, image - (0.0 if centres else 0.5), note=note), size
+    table, size = read_tags(path)
+    return _of_control(path, table) if table.names else None, size
 
 
 def correspondence_kind(path: Place, altitudes: Sequence[float] | None = None) -> str | None:
@@ -159,28 +152,6 @@ def _columns_of_npz(path: Path) -> dict[str, Array]:
     if missing := [name for name in COLUMNS if name not in columns]:
         raise InputError(f"{path}: neither ground and image nor {', '.join(missing)}; has {', '.join(arrays)}")
     return columns
-
-
-def geojson_points(path: Path, *needed: str) -> list[tuple[list[float], dict[str, Any]]]:
-    """Return the points of a GeoJSON: lon, lat, alt, col, row (property ``ji``, or ``col``, ``row``); properties.
-
-    InputError where it is no such file, or has not all properties that are `needed`.
-    """
-    document = read_json(path, GEOJSON)
-    try:
-        return [_feature(feature, needed) for feature in document["features"]]
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        words = ", ".join(("ji", *needed))
-        raise InputError(f"{path}: not a GeoJSON of 3-D points with {words} ({plain(error)})") from error
-
-
-def _feature(feature: dict[str, Any], needed: Sequence[str]) -> tuple[list[float], dict[str, Any]]:
-    lon, lat, alt = feature["geometry"]["coordinates"]
-    properties = feature["properties"]
-    col, row = properties["ji"] if "ji" in properties else (properties["col"], properties["row"])
-    if missing := [key for key in needed if key not in properties]:
-        raise KeyError(missing[0])
-    return [float(value) for value in (lon, lat, alt, col, row)], properties
 
 
 def read_grid(path: Place, altitudes: Sequence[float] | None = None) -> Correspondences:

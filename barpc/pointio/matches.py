@@ -17,10 +17,10 @@ from barpc.base.errors import InputError, plain
 from barpc.base.frozen import Arrays, load_npz
 from barpc.base.geodesy import Array
 from barpc.base.sidefile import TABLE, read_head
-from barpc.pointio.correspondences import IMAGE_SIGMA
+from barpc.pointio.columns import IMAGE_SIGMA
 from barpc.pointio.foreign import COLMAP, ENDINGS, HDF5, PairPoints, in_folder, read_colmap, read_hloc, read_pair_files
 from barpc.pointio.names import ViewNames, cell
-from barpc.pointio.tables import numbered, read_table
+from barpc.pointio.tables import distinct, numbered, read_table
 from barpc.scene import IntArray, Tracks, connected_labels
 
 _COLUMNS = ("image", "col", "row", "track")
@@ -64,13 +64,7 @@ class Links:
 
     def merged(self) -> Links:
         """Return the points of a view at the very same place as one, the most certain."""
-        table = np.column_stack([self.view, self.xy])
-        order = np.lexsort((self.sigma, *table.T[::-1]))
-        new = np.ones(len(table), dtype=bool)
-        new[1:] = (np.diff(table[order], axis=0) != 0).any(axis=1)
-        number = np.empty(len(table), dtype=np.int64)
-        number[order] = np.cumsum(new) - 1
-        kept = order[new]
+        kept, number = distinct(np.column_stack([self.view, self.xy]), self.sigma)
         return Links(self.view[kept], self.xy[kept], self.sigma[kept], number[self.ends])
 
     @staticmethod

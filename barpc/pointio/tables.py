@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, islice
@@ -14,24 +14,11 @@ from typing import Any
 import numpy as np
 
 from barpc.base.errors import BarpcError, InputError, plain
-from barpc.base.geodesy import DEFAULT, INFERRED, STATED, Array
+from barpc.base.geodesy import Array
 from barpc.base.sidefile import LARGEST, OPTIONS, TABLE, opened_text, read_text
+from barpc.pointio.columns import Names, degrees, header_of, numbers_of
 from barpc.pointio.names import from_cell
-from barpc.rasters.vertical import ELLIPSOID, UNKNOWN, Vertical
 from barpc.scene import IntArray
-
-Names = Mapping[str, Sequence[str]]
-"""Quantity -> what files call it."""
-
-COLUMNS: Names = {
-    "lon": ("lon", "long", "longitude", "lng"),
-    "lat": ("lat", "latitude"),
-    "alt": ("alt", "altitude", "height", "h", "z", "elevation", "elev", "height_above_datum"),
-    "col": ("col", "column", "samp", "sample", "pixel", "px", "pixel_x", "image_x"),
-    "row": ("row", "line", "py", "pixel_y", "image_y"),
-}
-_EITHER = ("lon", "lat"), ("col", "row")
-"""What x and y are: the pair that no other column is named for."""
 
 
 def read_table(
@@ -107,7 +94,9 @@ def _line_named(path: Path, number: int, columns: Sequence[str]) -> Iterator[Non
     except BarpcError:
         raise
     except _WRONG as error:
-        raise InputError(f"{path}, line {number}: expected {', '.join(columns)} ({plain(error)})") from error
+        said = plain(error)
+        cure = "; decimal commas need semicolons or tabs between cells" if re.match(r"'[+-]?\d+,\d+' ", said) else ""
+        raise InputError(f"{path}, line {number}: expected {', '.join(columns)} ({said}{cure})") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +105,13 @@ class Texts:
 
     different: Sequence[str] | IntArray  # numbers, where all are written as `str` does
     index: IntArray
+
+    @classmethod
+    def of(cls, texts: Iterable[str]) -> Texts:
+        """Return the column of texts, one a row."""
+        known: dict[str, int] = {}
+        index = numbered(texts, known)
+        return cls(list(known), index)
 
     def per_row(self) -> list[str]:
         """Return the text of each row."""
@@ -126,6 +122,16 @@ class Texts:
 def numbered(texts: Iterable[str], known: dict[str, int]) -> IntArray:
     """Return the number of each text, that of its first appearance among all that are `known`, which grows."""
     return np.array([known.setdefault(text, len(known)) for text in texts], dtype=np.int64)
+
+
+def distinct(rows: Array, *by: Array) -> tuple[IntArray, IntArray]:
+    """Return the first of all rows (N, m) that are the same, least in `by` (N,), in their order; and which each is."""
+    order = np.lexsort((*by, *rows.T[::-1]))
+    new = np.ones(len(rows), dtype=bool)
+    new[1:] = (np.diff(rows[order], axis=0) != 0).any(axis=1)
+    number = np.empty(len(rows), dtype=np.int64)
+    number[order] = np.cumsum(new) - 1
+    return order[new], number
 
 
 class _Texts:
@@ -238,169 +244,13 @@ def _columns(
         return dict(zip(unnamed, range(len(words)), strict=False))
     found = header_of(words, names)
     if not set(needed) <= set(found):
-        raise _lacking(path, [name for name in needed if name not in found], words)
+        raise lacking(path, [name for name in needed if name not in found], words)
     return found
 
 
-def _lacking(path: Path, names: Sequence[str], words: Sequence[str]) -> InputError:
+def lacking(path: Path, names: Sequence[str], words: Sequence[str]) -> InputError:
+    """Return the error of a table without columns that are needed."""
     return InputError(f"{path}: no column {', '.join(names)} among the {len(words)} of its first line")
-
-
-def header_of(words: Sequence[str], names: Names) -> dict[str, int]:
-    """Return the column of each quantity that a header names."""
-    lower = [_plain(word) for word in words]
-    hits = {key: [lower.index(a) for a in aliases if a in lower] for key, aliases in names.items()}
-    found = {key: places[0] for key, places in hits.items() if places}
-    left = [pair for pair in _EITHER if set(pair) <= set(names) and not set(pair) <= set(found)]
-    if len(left) == 1:
-        either = {key: lower.index(word) for key, word in zip(left[0], "xy", strict=True) if word in lower}
-        found = {**either, **found}
-    return found
-
-
-def _plain(word: str) -> str:
-    return re.sub(r"[\[(].*", "", word.lower()).strip().replace(" ", "_")
-
-
-def like_altitudes(words: Sequence[str]) -> list[str]:
-    """Return the names, as `header_of` compares them, that are like that of an altitude."""
-    return [_plain(word) for word in words if _LIKE["alt"].fullmatch(bare := _bare(word)) and not _ERRORS.match(bare)]
-
-
-def guessed(words: Sequence[str], known: Names) -> tuple[dict[str, int], list[str], Vertical]:
-    """Return the column of each quantity of control points, by the names of `known` and `COLUMNS`, then by likeness;
-    in words, which were guessed so; and what the altitude's name says of it. InputError where two could be that.
-    """
-    if {"X", "Y", "x", "y"} <= set(words):  # where the case alone tells them apart, as scripts for Metashape write it
-        words = [
-            f"map_{word}" if word in ("X", "Y", "Z") else f"px_{word}" if word in ("x", "y") else word for word in words
-        ]
-    bare = [_bare(word) for word in words]
-    found = header_of(bare, {**COLUMNS, **known})
-    exact = dict(found)
-    if {"x", "y"} <= set(bare) and not {"lon", "lat", "col", "row"} & set(found):
-        pair = ("east", "north") if "alt" in found else ("col", "row")
-        found |= {key: bare.index(word) for key, word in zip(pair, "xy", strict=True)}
-    for key, pattern in _LIKE.items():
-        free = [i for i, word in enumerate(bare) if i not in found.values() and not _ERRORS.match(word)]
-        hits = [i for i in free if pattern.fullmatch(bare[i])]
-        if key in found or not hits:
-            continue
-        above = [i for i in hits if "ellips" in bare[i] or "hae" in bare[i]]
-        if key == "alt" and len(hits) > 1 and len(above) != 1:
-            raise InputError(
-                f"columns {' and '.join(repr(words[i]) for i in hits)} could be the altitude; rename one alt"
-            )
-        found[key] = (above or hits)[0]
-    said = [f"column {words[i]!r} is {key}" for key, i in found.items() if exact.get(key) != i]
-    return found, said, vertical_of_column(words[found["alt"]] if "alt" in found else "")
-
-
-def vertical_of_column(word: str) -> Vertical:
-    """Return what altitudes count from, and their unit, as the name of their column says it."""
-    unit = _UNIT.search(word)
-    none = (UNKNOWN, None, DEFAULT)
-    name, geoid, known = next((of for sign, of in _LEVELS.items() if re.search(sign, word, re.IGNORECASE)), none)
-    metres = 1.0 if unit is None else 1200 / 3937 if unit[1] else 0.3048 if unit[2] else 1.0
-    return Vertical(name, metres, unit[0].strip("[]()_ ") if unit else "", geoid, known)
-
-
-_UNIT = re.compile(
-    r"[\s_\[(](?:(us[\s_-]*(?:survey)?[\s_-]*f(?:t|oot|eet)|ft[\s_-]*us|survey[\s_-]*f(?:t|oot|eet))|(ft|foot|feet)"
-    r"|m|met(?:re|er)s?)[\])]?\s*$",
-    re.IGNORECASE,
-)
-_LEVELS = {
-    "ellips|hae": (ELLIPSOID, None, STATED), "egm.?96": ("EGM96 height", "egm96", STATED),
-    "egm.?(20)?08": ("EGM2008 height", "egm2008", STATED),
-    "navd.?88": ("NAVD88 height", "egm96", STATED), "ortho|msl|geoid": ("the sea", "egm96", STATED),
-    # as barpc, GeoJSON, ICESat-2 and GEDI define them
-    r"^alt(?![a-z])|^h_(?:ph|li|te_best_fit|mean)$|lowestmode": (ELLIPSOID, None, INFERRED),
-}  # fmt: skip
-_ERRORS = re.compile(
-    "sigma|std|stdev|acc|err|resid|d[xyz]$|.*_(error|est|sigma|std|accuracy)$|(image|img)_(width|height)"
-)
-_IMAGE = "image|img|pixel|pix|px|photo|source|raster|im"
-_MAP = "utm|map|world|ground|geo|coord|point|proj|gk|l93|lambert|lambert93|terrain|gcp|coordinate"
-_LIKE = {
-    key: re.compile(pattern)
-    for key, pattern in {
-        "col": rf"({_IMAGE})_?(x|u|col|column|sample)|(x|u|col|column|sample)_?({_IMAGE})|u",
-        "row": rf"({_IMAGE})_?(y|v|row|line)|(y|v|row|line)_?({_IMAGE})|v",
-        "lon": r"(.+_)?(lon|long|longitude|lng)(_.+)?",
-        "lat": r"(.+_)?(lat|latitude)(_.+)?",
-        "east": rf"e|(.+_)?(east|eastings?|rechtswert)(_.+)?|({_MAP})_?(x|e)|x_?({_MAP})",
-        "north": rf"n|(.+_)?(north|northings?|hochwert)(_.+)?|({_MAP})_?(y|n)|y_?({_MAP})",
-        "alt": r"(.+_)?(alt|altitude|height|hgt|elev|elevation|z|h|hae|msl|egm_?(20)?(96|08)|navd_?88)(_.+)?",
-        "image": r"(.+_)?(image|img|photo|picture|camera|file|filename)(_(name|file|id|label|path))?",
-        "id": r"(gcp|point|pt|marker|target|station)_?(id|name|no|nr|num|number|label)?|fid|no|nr|num|number",
-    }.items()
-}
-"""What columns that nobody lists are taken for: the log says so."""
-
-
-def _bare(word: str) -> str:
-    """Return a column's name in lower case, words joined by lines, without unit; of X/Longitude the latter."""
-    unit = _UNIT.search(word)
-    if unit is not None:  # accuracies are read in metres alone
-        word = (
-            re.sub(r"\W", "_", word) if (unit[1] or unit[2]) and _ERRORS.match(word.lower()) else word[: unit.start()]
-        )
-    word = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", word.strip().rpartition("/")[2])
-    return re.sub(r"[^\w]+", "_", re.sub(r"[\[(].*", "", word).lower()).strip("_")
-
-
-_DEGREES = re.compile(
-    r"([NSEW])?\s*([+-]?\d{1,3}(?:[.,]\d+)?)\s*(?:[°ºd:]|deg)?\s*(?:(\d{1,2}(?:[.,]\d+)?)\s*(?:['′’m:]|min)?\s*"
-    r"(?:(\d{1,2}(?:[.,]\d+)?)\s*(?:[\"″”s]|''|sec)?)?)?\s*([NSEW])?"
-)
-
-
-def degrees(text: str, axis: str) -> float:
-    r"""Return a longitude or latitude (`axis` lon or lat), decimal or in degrees, minutes and seconds; or ValueError.
-
-    Examples
-    --------
-    >>> degrees("43°30'36\"S", "lat"), degrees("W 5 24", "lon"), degrees("694517.1", "lon")
-    (-43.51, -5.4, 694517.1)
-    """
-    if (plain := numbers_of([text])) is not None:
-        return plain[0]
-    found = _DEGREES.fullmatch(text.strip().replace("−", "-"))
-    if found is None:
-        raise ValueError(f"{text[:40]!r} is no number, and no degrees, minutes and seconds")
-    before, whole, *parts, behind = found.groups()
-    sign, letters = -1.0 if whole.startswith("-") else 1.0, (before or "") + (behind or "")
-    numbers = [float(part.replace(",", ".")) for part in (whole.lstrip("+-"), *parts) if part]
-    if len(letters) > 1 or (letters and (sign < 0 or (letters in "NS") != (axis == "lat"))):
-        raise ValueError(f"{text[:40]!r} is no {axis}")
-    if any(number >= 60.0 for number in numbers[1:]) or any(number % 1.0 for number in numbers[:-1]):
-        raise ValueError(f"{text[:40]!r} is no degrees, minutes and seconds")
-    value = sum(number / 60.0**k for k, number in enumerate(numbers))
-    return float(np.round(value, 12)) * (-1.0 if letters and letters in "SW" else sign)
-
-
-def number_of(text: str) -> float:
-    """Return a cell as a number; ValueError where it is none."""
-    found = numbers_of([text])
-    if found is None:
-        raise ValueError(f"{text[:40]!r} is no number")
-    return found[0]
-
-
-def first_words(head: bytes) -> list[str]:
-    """Return the words of the first line of a text that is no comment, as it begins."""
-    lines = head.decode("utf-8-sig", errors="replace").splitlines()
-    first = next((line for line in lines if line.strip() and not line.lstrip().startswith("#")), "")
-    return [word.strip().strip('"') for word in re.split(r"[,;\t]|\s+", first.strip()) if word.strip()]
-
-
-def numbers_of(words: Sequence[str]) -> list[float] | None:
-    """Return the words as numbers; None where one is none."""
-    try:
-        return [float(word) for word in words]
-    except ValueError:
-        return None
 
 
 # --- motions ----------------------------------------------------------------------------------------------

@@ -9,9 +9,10 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -108,13 +109,30 @@ class HeightGrid:
         if self.crs.is_geographic:
             x, y = self.west + np.mod(lon - self.west, 360.0), lat
         else:
-            try:
-                found = warp_points("EPSG:4326", self.crs, lon, lat)
-            except (CRSError, CPLE_BaseError) as error:
-                raise InputError(f"{self.path}: lon, lat cannot be brought into its CRS ({error})") from error
-            x, y = np.asarray(found[0]), np.asarray(found[1])
+            x, y = self._warped(CRS.from_epsg(4326), self.crs, lon, lat)
         a, b, c, d, e, f = self.to_pixel[:6]
         return _snapped(d * x + e * y + f - 0.5), _snapped(a * x + b * y + c - 0.5)
+
+    def place(self, row: Array, col: Array) -> tuple[Array, Array]:
+        """Return the lon, lat (N,) [deg] of fractional row, col (N,): what `locate` takes."""
+        x, y = ~self.to_pixel * (col + 0.5, row + 0.5)
+        return (x, y) if self.crs.is_geographic else self._warped(self.crs, CRS.from_epsg(4326), x, y)
+
+    def _warped(self, start: CRS, end: CRS, x: Array, y: Array) -> tuple[Array, Array]:
+        """Return places (N,) in another CRS, NaN where there is none, as far from a map's zone."""
+        found, known = np.full((2, len(x)), np.nan), np.isfinite(x) & np.isfinite(y)
+        try:
+            try:
+                found[:, known] = warp_points(start, end, x[known], y[known])
+            except CPLE_BaseError:  # of one place: GDAL does not say of which
+                from pyproj import Transformer
+
+                both = Transformer.from_crs(start.to_wkt(), end.to_wkt(), always_xy=True).transform(x[known], y[known])
+                known[known] = np.isfinite(both).all(axis=0)
+                found[:, known] = warp_points(start, end, x[known], y[known])
+        except (CRSError, CPLE_BaseError) as error:
+            raise InputError(f"{self.path}: lon, lat cannot be brought into its CRS ({error})") from error
+        return found[0], found[1]
 
     def sample(self, lon: npt.ArrayLike, lat: npt.ArrayLike) -> Array:
         """Return the bilinear heights (...) [m] at lon, lat (...) [deg]; NaN outside and where a void has weight."""
@@ -187,58 +205,137 @@ def _inverse(forward: Affine, path: Place) -> Affine:
 
 @dataclass(frozen=True, eq=False)
 class Dem:
-    """Altitudes of the terrain above the WGS84 ellipsoid: call it with lon, lat."""
+    """Altitudes of the terrain above the WGS84 ellipsoid: call it with lon, lat.
+
+    Of several DEMs the first counts that has a height at a place. Where tiles abut, and their outermost posts are a
+    step apart, heights are bilinear between the posts of both.
+    """
 
     grid: HeightGrid  # the heights as the file gives them
     geoid: HeightGrid | None  # height of the geoid above the ellipsoid, added to `grid`
     description: str  # which vertical reference was read and what was done with it
-    known: bool = True  # whether it is known what they count from
-    taken: Vertical | None = None  # how they were taken, where no person said it
+    known: bool = True  # whether it is known what all of them count from
+    taken: Vertical | None = None  # how the heights of this one were taken, where no person said it
+    after: tuple[Dem, ...] = ()  # those that count where this one has no height, in their order
 
     @classmethod
-    def open(cls, path: Path | str, geoid: Path | str | None = None, heights: str | None = None) -> Dem:
-        """Open a DEM (``.hgt``, or any raster with a CRS), with the geoid that it names or that is given: a ``.gtx`` or
-        raster, a name of `GEOIDS`, or "none" for heights that are ellipsoidal whatever the file says of them. `heights`
-        is the same, or "ellipsoidal", of a file that says nothing.
+    def open(
+        cls, path: Path | str | Sequence[Path | str], geoid: Path | str | None = None, heights: str | None = None
+    ) -> Dem:
+        """Open one DEM or several (``.hgt``, or any raster with a CRS), each with the geoid that it names or that is
+        given: a ``.gtx`` or raster, a name of `GEOIDS`, or "none" for ellipsoidal heights. `heights` is the same of
+        files that say nothing.
 
-        InputError or ImageError where it is none, or a geoid is given for heights that are ellipsoidal already; a
-        BarpcWarning for an unknown vertical reference, or one for whose geoid another had to be taken.
+        What is given goes before what one DEM says of itself. Of several each is as it says; what is given holds for
+        those that say nothing, and a grid also for those whose own geoid is not at hand.
+
+        InputError or ImageError where it is none, or a geoid is given for heights that are ellipsoidal already, or for
+        several of which each has its own; a BarpcWarning for an unknown vertical reference, or one for whose geoid
+        another had to be taken.
         """
-        grid = HeightGrid.open(path)
-        own = grid.vertical
-        by_person = os.fspath(geoid) if geoid is not None else None if own.stated else heights
-        vertical = own.by(by_person)
+        said = None if geoid is None else os.fspath(geoid)
+        grids = [HeightGrid.open(one) for one in ((path,) if isinstance(path, (str, Path)) else path)]
+        taken: list[str | None] = [said] * len(grids)
+        if len(grids) > 1 and said is not None:
+            taken = [said if _lacking(grid.vertical, said) else None for grid in grids]
+            if not any(taken):
+                names = ", ".join(os.fspath(grid.path) for grid in grids)
+                raise InputError(f"{names}: each says what its heights count from; leave out the geoid {said}")
+        taken = [
+            heights if of is None and not grid.vertical.stated else of for grid, of in zip(grids, taken, strict=True)
+        ]
+        first, *others = [cls._of(*both) for both in zip(grids, taken, strict=True)]
+        words, known = "; ".join(one.description for one in (first, *others)), all(o.known for o in (first, *others))
+        return replace(first, description=words, known=known, after=tuple(others))
+
+    @classmethod
+    def _of(cls, grid: HeightGrid, geoid: str | None) -> Dem:
+        own, vertical = grid.vertical, grid.vertical.by(geoid)
         if own.reference == ELLIPSOID and vertical.geoid is not None:
-            raise InputError(f"{path}: its heights are ellipsoidal already; leave out the geoid {geoid}")
-        file, done, loud = geoid_of(own, vertical, by_person is not None)
+            raise InputError(f"{grid.path}: its heights are ellipsoidal already; leave out the geoid {geoid}")
+        file, done, loud = geoid_of(own, vertical, geoid is not None)
         unit = f" in {own.unit} ({abs(own.metres):.12g} m)" if own.unit else ""
-        description = f"{location(path).name}: vertical reference {own.reference}{unit}, {done}"
+        description = f"{location(grid.path).name}: vertical reference {own.reference}{unit}, {done}"
         if loud:
-            warnings.warn(f"DEM {description}", BarpcWarning, stacklevel=2)
-        taken = None if by_person else vertical
+            warnings.warn(f"DEM {description}", BarpcWarning, stacklevel=3)
+        taken = vertical if geoid is None else None
         return cls(grid, None if file is None else HeightGrid.open(file), description, vertical.stated, taken)
+
+    @property
+    def parts(self) -> tuple[Dem, ...]:
+        """The DEMs in their order, this one without the others first."""
+        return (replace(self, after=()), *self.after)
 
     def __call__(self, lon: npt.ArrayLike, lat: npt.ArrayLike) -> Array:
         """Altitude above the ellipsoid (...) [m] at lon, lat (...) [deg]; NaN in voids and outside."""
+        if self.after:
+            lon, lat = np.broadcast_arrays(np.asarray(lon, np.float64), np.asarray(lat, np.float64))
+            return self._counted(lon.ravel(), lat.ravel())[0].reshape(lon.shape)
         height = self.grid.sample(lon, lat)
         return height if self.geoid is None else height + self.geoid.sample(lon, lat)
+
+    def _counted(self, lon: Array, lat: Array, joined: bool = True) -> tuple[Array, npt.NDArray[np.int64]]:
+        """Return the altitude (n,) at lon, lat (n,) and the number of the DEM that counts there, -1: none.
+
+        Heights between the posts of one DEM go before those between the posts of several (`joined`).
+        """
+        height, which, parts = np.full(len(lon), np.nan), np.full(len(lon), -1), self.parts
+        heights: list[Callable[[Array, Array], Array]] = [*parts]
+        heights += [partial(part._joined, self) for part in parts if joined]
+        for number, heights_of in enumerate(heights):
+            left = np.flatnonzero(np.isnan(height))
+            height[left] = heights_of(lon[left], lat[left])
+            which[left[np.isfinite(height[left])]] = number % len(parts)
+        return height, which
+
+    def _joined(self, whole: Dem, lon: Array, lat: Array) -> Array:
+        """Return altitudes (n,) within a step of the outermost posts: bilinear, the posts beyond are the others'."""
+        row, col = self.grid.locate(lon, lat)
+        with np.errstate(invalid="ignore"):
+            near = (row > -1) & (col > -1) & (row < self.grid.shape[0]) & (col < self.grid.shape[1])
+        found = np.full(len(lon), np.nan)
+        top, left = np.floor(row[near]), np.floor(col[near])
+        down, right = row[near] - top, col[near] - left
+        total = np.zeros(int(near.sum()))
+        for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            weight = np.abs(1 - i - down) * np.abs(1 - j - right)
+            post = whole._counted(*self.grid.place(top + i, left + j), joined=False)[0]
+            total += np.where(weight > 0, weight * post, 0.0)
+        found[near] = total
+        return found
 
     def datums(self, ground: Array) -> tuple[HeightDatum, ...]:
         """Return what its heights were taken to count from at ground points (n, 3), where no person said it."""
         ground = ground[np.isfinite(ground).all(axis=1)]
-        return datum_of(self.taken, ground, "heights", f"the DEM {self.grid.path.name}")
+        which = self._counted(*ground[:, :2].T)[1]
+        return tuple(
+            one
+            for number, part in enumerate(self.parts)
+            for one in datum_of(part.taken, ground[which == number], "heights", f"the DEM {part.grid.path.name}")
+        )
 
     def posts(self, lon: Array, lat: Array) -> Array:
-        """Return numbers (n, 4) of the posts whose heights make those at lon, lat (n,) [deg]; NaN at no place."""
-        row, col = (np.floor(one) for one in self.grid.locate(lon, lat))
-        first = row * self.grid.shape[1] + col
-        return np.stack([first, first + 1, first + self.grid.shape[1], first + self.grid.shape[1] + 1], axis=1)
+        """Return numbers (n, 4) of the posts whose heights make those at lon, lat (n,) [deg]; NaN at no place.
+
+        Of several DEMs they are those of the one that counts there.
+        """
+        which = self._counted(lon, lat)[1] if self.after else np.zeros(len(lon), dtype=np.int64)
+        found, before = np.full((len(lon), 4), np.nan), 0
+        for number, part in enumerate(self.parts):
+            own = which == number
+            row, col = (np.floor(one) + 1 for one in part.grid.locate(lon[own], lat[own]))  # -1: beyond the first one
+            wide = part.grid.shape[1] + 2
+            found[own] = (before + row * wide + col)[:, None] + (0, 1, wide, wide + 1)
+            before += (part.grid.shape[0] + 2) * wide
+        return found
 
     def between(self, start: Array, end: Array) -> tuple[float, float, float]:
         """Return, for lines from `start` to `end` (N, 3), the most posts that one passes, and the terrain's ends [m].
 
-        Zero and infinite ends where none of them is on the DEM.
+        Zero and infinite ends where none of them is on the DEM; of several DEMs the ends are infinite.
         """
+        if self.after:
+            return max(part.between(start, end)[0] for part in self.parts), -np.inf, np.inf
         both = [np.stack(self.grid.locate(*points[:, :2].T)) for points in (start, end)]
         across = both[1] - both[0]
         if self.grid.crs.is_geographic:  # west of the DEM is a turn to the east
@@ -252,6 +349,11 @@ class Dem:
             return posts, -np.inf, np.inf
         bend = float(np.ptp(lift[np.isfinite(lift)]))  # of the geoid: between the lines' ends no more again
         return posts, lowest + float(np.nanmin(lift)) - bend, highest + float(np.nanmax(lift)) + bend
+
+
+def _lacking(own: Vertical, said: str) -> bool:
+    """Return whether a DEM needs what is said of its geoid: it states none, or one of which no grid is at hand."""
+    return not own.stated or (said.lower() != NONE and geoid_of(own, own, False)[2])
 
 
 def localize_on_terrain(

@@ -18,12 +18,16 @@ NONE, ELLIPSOIDAL = "none", "ellipsoidal"
 _GEOIDS = (("egm2008", "egm2008"), ("egm08", "egm2008"), ("egm96", "egm96"), ("egm84", "egm96"))
 _OTHERS = "egm96"  # of any other orthometric datum, from which it lies a metre or two
 _UNITS = {
-    "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0, "mt": 1.0, "1": 1.0,
-    "ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "international foot": 0.3048, "ift": 0.3048,
-    "us survey foot": 1200 / 3937, "us_survey_foot": 1200 / 3937, "foot_us": 1200 / 3937, "ftus": 1200 / 3937,
-    "us-ft": 1200 / 3937, "sft": 1200 / 3937, "us survey feet": 1200 / 3937,
-    "cm": 0.01, "centimetre": 0.01, "centimeter": 0.01, "dm": 0.1, "decimetre": 0.1, "decimeter": 0.1,
-    "mm": 0.001, "millimetre": 0.001, "millimeter": 0.001, "km": 1000.0, "kilometre": 1000.0, "kilometer": 1000.0,
+    word: size
+    for size, words in (
+        (1.0, "m metre meter metres meters mt 1"),
+        (0.3048, "ft foot feet internationalfoot ift"),
+        (1200 / 3937, "ussurveyfoot ussurveyfeet ussurveyft usfoot usfeet usft footus ftus sft surveyfoot surveyfeet "
+         "surveyft"),
+        (0.01, "cm centimetre centimeter"), (0.1, "dm decimetre decimeter"),
+        (0.001, "mm millimetre millimeter"), (1000.0, "km kilometre kilometer"),
+    )
+    for word in words.split()
 }  # fmt: skip
 _VERTICAL = re.compile(r"\b(?:VERTCRS|VERT_CS|VERTICALCRS)\s*\[|CS\[ellipsoidal,\s*3|AXIS\[\"Ellipsoidal height")
 
@@ -52,7 +56,7 @@ class Vertical:
 
 def metres_of(unit: str) -> float | None:
     """Return the length [m] of a unit of heights by its name; None for a name that is none."""
-    return _UNITS.get(unit.strip().lower())
+    return _UNITS.get(re.sub(r"[\s_-]", "", unit.lower()))
 
 
 def vertical_of(wkt: str, unit: str = "", of: str = "heights") -> Vertical:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -110,3 +111,34 @@ def test_a_folder_says_by_which_ends_images_are_known(tmp_path):
     assert str(error.value) == f"{tmp_path}: a folder without images ({ends})"
     write_image(tmp_path / "B.TIF")
     assert expanded([str(tmp_path)]) == [str(tmp_path / "B.TIF")]
+
+
+@pytest.mark.parametrize("name", ["S1A.zarr", "S1A.ZARR/", "store", "v3", "S1A.zarr.zip", "a.zarr,swath=iw1"])
+@pytest.mark.parametrize("verb", ["info", "fit", "adjust", "match", "convert", "localize"])
+def test_a_zarr_store_is_named_with_its_cure(verb, name, tmp_path, capsys):
+    """EOPF's, by name or content; a folder of something else is not called so."""
+    store = tmp_path / name.partition(",")[0]
+    if name.endswith(".zip"):
+        with zipfile.ZipFile(store, "w") as archive:
+            archive.writestr(".zmetadata", "{}")
+    else:
+        (store / "measurements").mkdir(parents=True)
+        (store / ("zarr.json" if name == "v3" else ".zmetadata" if name == "store" else "other")).write_text("{}")
+    given = [str(tmp_path / name)]
+    rest = {"adjust": ["-o", tmp_path / "o"], "match": ["-o", tmp_path / "o"], "convert": [tmp_path / "x_RPC.TXT"],
+            "localize": ["1", "2"]}.get(verb, [])  # fmt: skip
+    if verb in ("adjust", "match"):
+        if name.endswith(".zip"):
+            pytest.skip("one image is refused before it is opened")
+        given.append(str(tmp_path / name))
+    assert run(verb, *given, *rest) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "a Zarr store, which is not read: of Sentinel-1 take the same product as SAFE" in said
+    assert not (tmp_path / "o").exists()
+
+
+def test_another_folder_is_no_zarr_store(tmp_path, capsys):
+    (tmp_path / "zarr").mkdir()
+    assert run("info", tmp_path / "zarr") == 1
+    assert "Zarr" not in capsys.readouterr().err

@@ -53,7 +53,9 @@ def option_of(target: str) -> click.Option:
         ("rpc_formats", (), None),
         ("gcp", ("--gcp", "a", "--gcp", "b"), ("a", "b")),
         ("gcp", (), None),
-        ("dem", ("--dem", "a.tif"), "a.tif"),
+        ("dem", ("--dem", "a.tif"), ("a.tif",)),
+        ("dem", ("--dem", "a.tif", "--dem", "b.tif"), ("a.tif", "b.tif")),
+        ("dem", (), None),
     ],
 )
 def test_a_flag_is_of_the_field_s_type(target: str, words: tuple[str, ...], value: Any) -> None:
@@ -183,7 +185,7 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) 
     }
     found = run_options(flags, str(path))
     assert (found.tie.band, found.adjust.model, found.adjust.dem_for_weak) == (9, "shift", True)
-    assert (found.overwrite, found.fit.tolerance, found.dem) == (True, 0.5, "d.tif")
+    assert (found.overwrite, found.fit.tolerance, found.dem) == (True, 0.5, ("d.tif",))
     alone = run_options(flags, None)
     assert (alone.tie, alone.adjust) == (
         TieOptions(band=9),

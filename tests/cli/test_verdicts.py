@@ -134,8 +134,8 @@ def test_altitudes_come_from_a_dem_and_its_margin_unless_they_are_given(
     monkeypatch.setattr(Dem, "open", lambda dem, geoid: (dem, geoid))
     monkeypatch.setattr("barpc.fit.points.terrain_range", terrain_range)
     assert run("fit", source, "--dem", "d.tif", "--geoid", "g.gtx", "--dem-margin", "50") == 0
-    assert run("fit", source, "--dem", "d.tif") == 0
-    assert asked == [((600, 500), ("d.tif", "g.gtx"), 50.0), ((600, 500), ("d.tif", None), 500.0)]
+    assert run("fit", source, "--dem", "d.tif", "--dem", "e.tif") == 0
+    assert asked == [((600, 500), (("d.tif",), "g.gtx"), 50.0), ((600, 500), (("d.tif", "e.tif"), None), 500.0)]
     assert [row[1] for row in fitted] == [(50.0, 150.0), (-400.0, 600.0)]
     assert run("fit", source, "--dem", "d.tif", "--alt-range", "0", "300") == 0
     assert len(asked) == 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shlex
 import shutil
 from pathlib import Path
@@ -20,6 +21,7 @@ from barpc.rpcio import read_rpc, write_rpc_copy
 from barpc.rpcio.sources import light_of
 from barpc.sensor.geometry import image_grid
 from tests.lanes import rest_slow
+from tests.rasters.test_dem import write_dem, write_geoid
 from tests.rpcio.conftest import write_image
 
 
@@ -471,3 +473,27 @@ def test_orthoimages_stand_on_the_run_s_dem_made_ellipsoidal(southern, tmp_path)
         assert found[-1].count("RPC_DEM") == 1
         assert "my dem.tif" in " ".join(shlex.split(found[0]))
         assert ("RPC_DEM=dem_ellipsoidal.tif" in found[-1]) == (options["geoid"] is not None)
+
+
+def test_orthoimages_stand_on_several_dems_each_above_what_it_counted_from(southern, tmp_path):
+    shutil.copytree(southern, tmp_path / "run")
+    where = {"heights": np.zeros((9, 9), np.float32), "transform": rasterio.Affine(30, 0, 5e5, 0, -30, 6e6)}
+    level = write_dem(tmp_path / "level.tif", 4979, where["heights"])
+    named = write_dem(tmp_path / "named.tif", "EPSG:32731+5773", **where)
+    feet = write_dem(tmp_path / "feet.tif", 32731, band={"units": "ft"}, **where)
+    options = {"dem": [str(level), str(named), str(feet)], "geoid": str(write_geoid(tmp_path / "g.gtx"))}
+    summary = read(tmp_path / "run/summary.json")
+    (tmp_path / "run/summary.json").write_text(json.dumps({**summary, "options": options}))
+    export_run(tmp_path / "run", "ortho", tmp_path / "maps")
+    text = (tmp_path / "maps/ortho.sh").read_text()
+    lines = [shlex.split(line) for line in text.splitlines() if line.startswith("gdal")]
+    assert [line[-1] for line in lines[:3]] == ["dem_1.tif", "dem_2.tif", "dem_3.tif"]
+    assert "-s_srs" not in lines[0]
+    for line, geoid, unit in ((lines[1], "egm96_15.tif", "1"), (lines[2], "g.gtx", "0.3048")):
+        system = line[line.index("-s_srs") + 1]
+        assert "+proj=utm +zone=31 +south" in system
+        assert re.search(rf"\+geoidgrids=\S*{geoid} \+vto_meter={unit}$", system)
+    assert lines[3][0] == "gdalbuildvrt"
+    assert lines[3][-4:] == ["dem.vrt", "dem_3.tif", "dem_2.tif", "dem_1.tif"]  # the first lies above
+    assert all("RPC_DEM=dem.vrt" in line for line in lines[4:])
+    assert "heights of level.tif, named.tif, feet.tif" in text

@@ -56,6 +56,24 @@ def test_geojson_points_carry_their_image_position(tmp_path: Path) -> None:
     check(path)
 
 
+@pytest.mark.parametrize(
+    ("place", "crs", "says"),
+    [
+        ([5.0, 43.0], None, "GCP p has no altitude"),
+        ([694517.1, 4796000.0, 100.0], "urn:ogc:def:crs:EPSG::32631", "its GCPs are in urn:ogc:def:crs:EPSG::32631"),
+        ([5.0, 43.0, 100.0], "EPSG:4267", "its GCPs are in EPSG:4267"),  # another datum: 100 m and more
+    ],
+)
+def test_geojson_points_that_are_no_places_on_wgs84_are_refused(tmp_path: Path, place, crs, says) -> None:
+    feature = {"properties": {"id": "p", "ji": [1, 2]}, "geometry": {"type": "Point", "coordinates": place}}
+    document = {"type": "FeatureCollection", "features": [feature]}
+    document |= {"crs": {"properties": {"name": crs}}} if crs else {}
+    (tmp_path / "a.geojson").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=says) as told:
+        read_correspondences(tmp_path / "a.geojson")
+    assert "\n" not in str(told.value)
+
+
 def test_a_localisation_grid_counts_from_the_corner_of_the_first_pixel(tmp_path: Path) -> None:
     rasterio = pytest.importorskip("rasterio")
     path = tmp_path / "grid.tif"

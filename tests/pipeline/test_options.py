@@ -268,10 +268,21 @@ def _held(run: Run) -> AdjustResult:
     return run.once("held", adjust=TIGHT, stop_after="adjustment", **given)
 
 
+def _far(folder: Path) -> str:
+    """A DEM that says nothing of its heights, at another place."""
+    where = Affine(0.01, 0, 100, 0, -0.01, 10)
+    folder.mkdir(parents=True, exist_ok=True)
+    return str(write_dem(folder / "far.tif", 4326, np.zeros((9, 9), np.float32), transform=where))
+
+
 def dem(run: Run, out: Path, scene: Path) -> None:
     held = _held(run)
     assert held.summary.get("reference") is None  # a terrain alone is none
     assert _height(held) - _height(run.plain) == pytest.approx(15.0, abs=1.5)
+    more = run("two", adjust=TIGHT, stop_after="adjustment", dem=(_far(out), str(scene / "dem/a.tif")), geoid="none")
+    alone = run("one", adjust=TIGHT, stop_after="adjustment", dem=str(scene / "dem/a.tif"), geoid="none")
+    assert _height(more) == pytest.approx(_height(alone) + 49.0, abs=4.0)  # of two each counts from what it names
+    assert [Path(path).name for path in more.summary["options"]["dem"]] == ["far.tif", "a.tif"]
     with pytest.raises(InputError):
         run("c", dem=str(out / "nowhere.tif"))
     with pytest.raises(InputError, match="dem_for_weak is given without dem"):

@@ -50,7 +50,7 @@ def views(count: int = 3) -> tuple[View, ...]:
 def test_every_file_that_options_name_is_an_input() -> None:
     given = RunOptions(
         fixed_run="earlier", matches=("a.csv", "b.npz"), gcp=("g.csv",), check_points=("c.csv", "d.csv"),
-        dem="dem.tif", geoid="geoid.gtx", reference=("r.tif",), overlap_list="pairs.txt", aoi="area.json",
+        dem=("dem.tif", "e.tif"), geoid="geoid.gtx", reference=("r.tif",), overlap_list="pairs.txt", aoi="area.json",
     )  # fmt: skip
     names = [
         "a.csv",
@@ -59,6 +59,7 @@ def test_every_file_that_options_name_is_an_input() -> None:
         "c.csv",
         "d.csv",
         "dem.tif",
+        "e.tif",
         "geoid.gtx",
         "r.tif",
         "pairs.txt",
@@ -256,7 +257,7 @@ def test_ground_points_that_are_left_out_are_said_and_references_are_looked_at(t
     with_all = RunOptions(
         dem="d.tif", geoid="g.gtx", heights="egm96", reference=("r.tif", "s.tif"), fixed_run="earlier"
     )
-    assert side_inputs(with_all, views()) == (("d.tif", "g.gtx", "egm96"), Path("earlier/tables") / PRIOR)
+    assert side_inputs(with_all, views()) == ((("d.tif",), "g.gtx", "egm96"), Path("earlier/tables") / PRIOR)
     assert read == ["r.tif", "s.tif"]
 
 

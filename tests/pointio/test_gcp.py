@@ -11,7 +11,7 @@ import rasterio
 from rasterio.control import GroundControlPoint
 
 from barpc.base.errors import InputError
-from barpc.pointio.correspondences import GROUND_SIGMA, IMAGE_SIGMA
+from barpc.pointio.columns import GROUND_SIGMA, IMAGE_SIGMA
 from barpc.pointio.gcps import read_gcps
 
 NAMES = ["left", "right"]

@@ -15,9 +15,11 @@ from rasterio.warp import transform
 
 from barpc.base.errors import InputError, plain
 from barpc.base.geodesy import HeightDatum, ecef_from_ground
-from barpc.pointio import gcps
-from barpc.pointio.gcps import FORMATS, Frame, read_gcps
-from barpc.pointio.tables import COLUMNS, degrees, guessed
+from barpc.pointio import gcp_formats
+from barpc.pointio.columns import COLUMNS, degrees, guessed
+from barpc.pointio.gcp_formats import FORMATS
+from barpc.pointio.gcp_table import NAMES as NAMES_OF
+from barpc.pointio.gcps import Frame, read_gcps
 from barpc.scene import GroundPoints
 
 NAMES = ["left", "right"]
@@ -172,6 +174,7 @@ def test_earth_centred_coordinates_have_their_altitude(tmp_path) -> None:
         ("height [m]", 1.0, None),
         ("Elev (ft)", 0.3048, None), ("z_ftUS", US_FOOT, None), ("alt_feet", 0.3048, None),
         ("height_us_survey_ft", US_FOOT, None), ("ellipsoidal height", 1.0, "ellipsoid"),
+        ("h_ell_cm", 0.01, "ellipsoid"), ("z_level", 1.0, None), ("h_bell", 1.0, None),
         ("h_msl", 1.0, "the sea"), ("orthometric_height_ft", 0.3048, "the sea"),
         ("NAVD88 elev ft", 0.3048, "NAVD88 height"),
     ],
@@ -264,13 +267,15 @@ def test_what_is_no_angle_is_refused(text, axis) -> None:
         ("lat,lon,z_error,img_height,h,row_px,col_px", "lat lon - - alt row col"),
         ("h_ortho,h_ellipsoid,lon,lat,px,py", "- alt lon lat col row"),
         ("imageX,imageY,mapX,mapY", "col row east north"),
+        ("gcp_name,E [m],N [m],H (m),file,x [px],y (Pixels)", "id east north alt image col row"),
+        ("x_img,y_img,lon,lat,ele", "col row lon lat alt"),
     ],
 )
 def test_columns_are_taken_for_what_they_are_called(header, means) -> None:
     words = header.split(",")
-    found, said, _ = guessed(words, gcps._NAMES)
+    found, said, _ = guessed(words, NAMES_OF)
     assert found == {what: i for i, what in enumerate(means.split()) if what != "-"}
-    listed = {alias for aliases in {**COLUMNS, **gcps._NAMES}.values() for alias in aliases}
+    listed = {alias for aliases in {**COLUMNS, **NAMES_OF}.values() for alias in aliases}
     for key, i in found.items():  # what is no listed name, but for case, blanks and unit, is said
         plainly = words[i].lower().partition(" (")[0].replace(" ", "_").replace("elev_m", "elev")
         if plainly not in listed | {"x", "y", "imagex", "imagey"}:
@@ -372,7 +377,9 @@ def test_a_layer_of_points_is_read_by_either_library(tmp_path, monkeypatch, read
     with fiona.open(tmp_path / file, "w", driver=driver, crs="EPSG:32631", schema=schema) as layer:
         point = {"type": "Point", "coordinates": (EAST, NORTH, ALT)}
         layer.write({"type": "Feature", "geometry": point, "properties": {"name": "p", "pixel": COL, "line": ROW}})
-    monkeypatch.setattr(gcps, "find_spec", lambda name: importlib.util.find_spec(name) if name == reader else None)
+    monkeypatch.setattr(
+        gcp_formats, "find_spec", lambda name: importlib.util.find_spec(name) if name == reader else None
+    )
     found = read_gcps(tmp_path / file, NAMES)
     assert found.names == ("p",)
     assert found.view.tolist() == [0]
@@ -382,7 +389,7 @@ def test_a_layer_of_points_is_read_by_either_library(tmp_path, monkeypatch, read
 
 @pytest.mark.parametrize("head", [b"SQLite format 3\0", b"\0\0\x27\x0a"])
 def test_without_a_library_a_layer_says_what_to_install(tmp_path, monkeypatch, head) -> None:
-    monkeypatch.setattr(gcps, "find_spec", lambda name: None)
+    monkeypatch.setattr(gcp_formats, "find_spec", lambda name: None)
     (tmp_path / "a.gpkg").write_bytes(head + bytes(100))
     with pytest.raises(InputError, match="a GeoPackage or Shapefile, which pyogrio reads: pip install pyogrio"):
         read_gcps(tmp_path / "a.gpkg", NAMES)

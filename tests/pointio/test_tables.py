@@ -12,13 +12,8 @@ import rasterio
 from rasterio.control import GroundControlPoint
 
 from barpc.base.errors import InputError
-from barpc.pointio.correspondences import (
-    GROUND_SIGMA,
-    IMAGE_SIGMA,
-    correspondence_kind,
-    read_correspondences,
-    read_grid,
-)
+from barpc.pointio.columns import GROUND_SIGMA, IMAGE_SIGMA
+from barpc.pointio.correspondences import correspondence_kind, read_correspondences, read_grid
 from barpc.pointio.foreign import in_folder, index_pairs, pair_of
 from barpc.pointio.gcps import read_gcps
 from barpc.pointio.matches import Links, asp_text, read_links, read_matches, tracks_of

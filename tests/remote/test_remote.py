@@ -281,16 +281,16 @@ def test_heights_and_a_reference_are_read_where_they_are_wanted(server: Web) -> 
     urls = {"dem": server.url("dem.tif"), "reference": (server.url("ortho.tif"),)}
     for allowed in ((), ("http://127.0.0.1:1",)):
         with pytest.raises(BarpcError):
-            Dem.open(with_located(RunOptions(allow_remote=allowed, **urls)).dem or "")
+            Dem.open(with_located(RunOptions(allow_remote=allowed, **urls)).dem)
     assert server.counts["requests"] == 0
     options = with_located(RunOptions(allow_remote=(server.host,), **urls))
     lon, lat = np.random.default_rng(5).uniform((5.7, 44.3), (5.75, 44.35), (50, 2)).T
-    assert options.dem is not None
+    assert len(options.dem) == 1
     assert np.array_equal(Dem.open(options.dem)(lon, lat), Dem.open(server.folder / "dem.tif")(lon, lat))
     here, there = Sheet.read(str(server.folder / "ortho.tif")), Sheet.read(options.reference[0])
     assert vars(replace(there, path=here.path)) == vars(here)
     assert server.counts["bytes"] < 0.2 * sum(path.stat().st_size for path in server.folder.iterdir())
-    assert isinstance(replace(options, keep_going=True).dem, Remote)  # leave is not lost on the way
+    assert isinstance(replace(options, keep_going=True).dem[0], Remote)  # leave is not lost on the way
     assert [str(path) for path in input_files(options)] == []
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from barpc.base.errors import BarpcError, InputError, RpcError, RpcFormatError, plain, visible
 from barpc.base.geodesy import Array
-from barpc.base.sidefile import MAX_XML, PRODUCT, opened, read_head
+from barpc.base.sidefile import MAX_XML, PRODUCT, opened, read_head, unread
 from barpc.base.usual import ROUNDING
 from barpc.sensor.curve import Orbit, fit_orbit
 from barpc.sensor.document import seconds
@@ -206,7 +206,7 @@ def _named(path: Path, member: str | None) -> _File | None:
 def _choose(path: Path, polarisation: str | None) -> dict[str, _File]:
     files = _annotations(path)
     if not files:
-        raise RpcFormatError(f"{path}: no Sentinel-1 annotation (annotation/s1?-*.xml) in it")
+        raise RpcFormatError(f"{path}: no Sentinel-1 annotation (annotation/s1?-*.xml) in it{unread(path)}")
     there = sorted({f.polarisation for f in files}, key=_POLARISATIONS.index)
     wanted = polarisation.lower() if polarisation else there[0]
     chosen = {f.swath: f for f in files if f.polarisation == wanted}

@@ -1,0 +1,375 @@
+"""Files of ground control points as other tools write them: a table of formats, each told by its content.
+
+A reader says what its file holds (`Table`): places in the file's own reference system, altitudes as they stand, image
+points, which `opened` brings to (0, 0) at the centre of the first pixel. Those of CSV, GeoJSON and ASP are taken as
+they stand.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from barpc.base.errors import BarpcError, InputError, plain
+from barpc.base.geodesy import INFERRED, Array
+from barpc.base.remote import Place
+from barpc.base.sidefile import GEOJSON, TABLE, encoding_of, opened_text, parse_xml, read_head, read_json
+from barpc.pointio.columns import IMAGE_SIGMA, degrees, guessed, number_of, numbers_of
+from barpc.pointio.gcp_table import ALONE, KNOWN, NAMES, NAN, SIGMAS, TEXTS, Row, Table, named, of_columns
+from barpc.pointio.tables import Texts, read_columns, row_of
+from barpc.rasters.raster import driver_of, open_raster
+from barpc.rasters.vertical import ELLIPSOID, Vertical
+
+
+class Format(NamedTuple):
+    """One syntax: how its files begin, its reader, and what its image points have more than barpc's [px]."""
+
+    sniff: Callable[[str, bytes], bool]  # of a file's beginning, as a text and as bytes
+    read: Callable[[Path], Table]
+    more: float = 0.0
+
+
+def opened(path: Path) -> tuple[str, Table]:
+    """Return the name of a file's format and what it holds; InputError where it does not parse."""
+    text, head = _start(path)
+    name = next(name for name, form in FORMATS.items() if form.sniff(text.lstrip("\ufeff \t\r\n"), head))
+    table = FORMATS[name].read(path)
+    table.numbers[:, 6:8] -= FORMATS[name].more
+    if table.apart == "image" and table.images is None:  # of the image that the file is called as
+        table = table._replace(images=Texts.of([path.name] * len(table.names)))
+    return name, table
+
+
+def _start(path: Path) -> tuple[str, bytes]:
+    head = read_head(path, TABLE, 65536)
+    return head.decode(encoding_of(head), "replace"), head
+
+
+# --- tables with names of columns -------------------------------------------------------------------------
+
+_STATED = re.compile(
+    r"^#[ \t]*(?:(?:CRS|SRS|CoordinateSystem|Projection)[ \t]*[:=][ \t]*(\S.*)|(EPSG:\S+))",
+    re.IGNORECASE | re.MULTILINE,
+)
+_AGISOFT = re.compile(r"^#\s*CoordinateSystem|X/(?:Longitude|East)", re.IGNORECASE | re.MULTILINE)
+
+
+def _read_csv(path: Path) -> Table:
+    """Read a header of names, perhaps behind `#`, and comments that say the reference system."""
+    text = _start(path)[0]
+    at, delimiter, words = _header(text)
+    columns, empty = named(path, words, lax=_AGISOFT.search(text) is not None)
+    blank = {"alt", *SIGMAS} & columns.keys()
+    read = read_columns(path, at + 1, delimiter, columns, columns.keys() & {*TEXTS}, blank)
+    table, stated = of_columns(path, read, empty), _STATED.search("\n".join(_LINES.split(text)))
+    return table if stated is None or table.crs else table._replace(crs=(stated[1] or stated[2]).rstrip())
+
+
+_LINES = re.compile(r"\r\n|\r|\n")
+
+
+def _header(text: str) -> tuple[int, str, list[str]]:
+    """Return which line names columns, what stands between its cells, and these.
+
+    It is counted from 0: the first that is no comment, or a comment before it of as many cells; -1: none.
+    """
+    none: tuple[int, str, list[str]] = (-1, "", [])
+    last = none
+    for i, line in enumerate(_LINES.split(text)):
+        bare = line.lstrip("\ufeff").strip()
+        if not bare:
+            continue
+        sign = next((sign for sign in "\t;," if sign in bare), " ")
+        words, comment = row_of(bare.lstrip("# "), sign), bare.startswith("#")
+        if not comment and len(words) <= len(last[2]):
+            return last
+        if not any(numbers_of([word]) for word in words[1:4]) and _names_columns(words):
+            last = i, sign, words
+        if not comment:
+            return last if last[0] == i else none
+    return none
+
+
+def _names_columns(words: Sequence[str]) -> bool:
+    """Return whether words are a header: three columns of control or more, or two that could be one."""
+    try:
+        return len(guessed(words, KNOWN)[0]) > 2
+    except InputError:
+        return True
+
+
+def _read_qgis(path: Path) -> Table:
+    """Read a CSV whose rows of pixels count upwards."""
+    table = _read_csv(path)
+    table.numbers[:, 7] *= -1.0
+    if (table.numbers[:, 7] < 0.0).any():
+        raise InputError(
+            f"{path}: QGIS .points above its image (sourceY is positive): of an image with map coordinates of its own; "
+            "set the points in the image without them"
+        )
+    return table
+
+
+# --- lines in an order of their own -----------------------------------------------------------------------
+
+_ODM = re.compile(r"(EPSG:\d+(?:\+\d+)?|\+proj=.*)|WGS84\s+UTM\s+(\d+)\s*([NS])", re.IGNORECASE)
+_ENVI = re.compile(
+    r"projection info\s*=\s*\{\s*(?:UTM\s*,\s*(?:1\s*,\s*)?(\d+)\s*,\s*(North|South)|(Geographic))", re.I
+)
+
+
+def _read_asp(path: Path) -> Table:
+    """Read the lines `id lat lon alt sigma_x sigma_y sigma_z image col row sigma_col sigma_row [image ...]`."""
+
+    def rows() -> Iterator[Row]:
+        for number, words in _words_of(path):
+            try:
+                lat, lon, *ground = map(float, words[1:7])
+                if len(words) < 12 or len(words) % 5 != 2:
+                    raise ValueError(f"{len(words)} words")
+                for i in range(7, len(words), 5):
+                    col, row, *spread = map(float, words[i + 1 : i + 5])
+                    yield words[0], words[i], lon, lat, *ground, col, row, max(spread)
+            except ValueError as error:
+                raise InputError(
+                    f"{path}, line {number}: in no format that is read ({', '.join(FORMATS)}): a CSV begins with its "
+                    "columns' names, a line of ASP's is 'id lat lon alt sx sy sz image col row scol srow ...' "
+                    f"({plain(error)})"
+                ) from error
+
+    return Table.of_rows(rows())._replace(vertical=Vertical(ELLIPSOID, provenance=INFERRED))
+
+
+def _words_of(path: Path, sign: str = "#") -> Iterator[tuple[int, list[str]]]:
+    """Yield the lines of words between blanks and commas that are no comments, by their numbers."""
+    with opened_text(path, TABLE) as lines:
+        for number, raw in enumerate(lines, start=1):
+            line = re.split(rf"(?:^|\s){sign}", raw, maxsplit=1)[0] if sign in raw else raw
+            quoted = '"' in line  # names of images with blanks
+            if words := row_of(" ".join(line.split()), " ") if quoted else line.replace(",", " ").split():
+                yield number, words
+
+
+def _in_order(path: Path, order: str, lines: Iterable[tuple[int, list[str]]]) -> Table:
+    """Read lines whose words stand in an order of x, y, alt, col, row, image and id, of which the latter may lack."""
+
+    def rows() -> Iterator[Row]:
+        for number, words in lines:
+            of = dict(zip(order.split(), words, strict=False))
+            try:
+                x, y, col, row = (number_of(of[key]) for key in ("x", "y", "col", "row"))
+                alt = number_of(of.get("alt", "nan"))
+            except (KeyError, ValueError) as error:
+                raise InputError(f"{path}, line {number}: expected '{order}' ({plain(error)})") from error
+            yield of.get("id", ""), of.get("image"), x, y, alt, *ALONE, col, row, IMAGE_SIGMA
+
+    return Table.of_rows(rows())
+
+
+def _read_odm(path: Path) -> Table:
+    """Read a reference system, then lines `x y z col row image [name]`."""
+    lines = _words_of(path)
+    found = _ODM.match(" ".join(next(lines)[1]))
+    crs = None if found is None else found[1] or f"WGS 84 / UTM zone {int(found[2])}{found[3].upper()}"
+    return _in_order(path, "x y alt col row image id", lines)._replace(crs=crs)
+
+
+def _read_envi(path: Path) -> Table:
+    """Read comments that say the reference system and the order, then lines `x y col row`."""
+    head = _start(path)[0]
+    if re.search(r"^;.*\b(Base|Warp)\b", head, re.MULTILINE):
+        raise InputError(f"{path}: ENVI .pts of two images; one from image to map is needed")
+    found, turned = _ENVI.search(head), re.search(r"^;\s*Image.*Map", head, re.MULTILINE | re.IGNORECASE)
+    crs = None if found is None or found[3] else f"WGS 84 / UTM zone {int(found[1])}{found[2][0].upper()}"
+    return _in_order(path, "col row x y" if turned else "x y col row", _words_of(path, ";"))._replace(crs=crs)
+
+
+# --- layers of points -------------------------------------------------------------------------------------
+
+
+def read_geojson(path: Path) -> Table:
+    """Read a GeoJSON, with the reference system that it could name before 2016; InputError where it is none."""
+    document, crs = read_json(path, GEOJSON), None
+    try:
+        if "crs" in document:
+            crs = str(document["crs"]["properties"]["name"])
+        features = list(document["features"])
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: not a GeoJSON of points ({plain(error)})") from error
+    return _of_features(path, features, None if crs is None or crs.endswith(("CRS84", "EPSG::4326")) else crs)
+
+
+def _of_features(path: Path, features: Sequence[Any], crs: str | None) -> Table:
+    """Read features with points and properties: `ji` (col, row) or names as of columns, `sigma_m` of three numbers."""
+    spread, rows = {"ji": ("col", "row"), "sigma_m": ("sx", "sy", "sz")}, list[dict[str, Any]]()
+    try:
+        for feature in features:
+            of = dict(feature["properties"] or {})
+            if feature.get("id") is not None and not {key.lower() for key in of} & set(NAMES["id"]):
+                of["id"] = feature["id"]
+            for key in spread.keys() & of.keys():
+                of |= dict(zip(spread[key], of.pop(key), strict=True))
+            x, y, *z = feature["geometry"]["coordinates"]
+            rows.append({"lon": x, "lat": y} | ({"alt": z[0]} if z else {}) | of)
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+        raise InputError(
+            f"{path}: not a GeoJSON of points, each with ji = [col, row], filename; sigma_m is [east, north, up], "
+            f"sigma_px a number ({plain(error)})"
+        ) from error
+    if not rows:
+        return Table.of_rows([])
+    columns, empty = named(path, words := list(dict.fromkeys(key for of in rows for key in of)))
+    read: dict[str, Any] = {}
+    for key, name in ((key, words[i]) for key, i in columns.items()):
+        cells, needed = [of.get(name) for of in rows], key in ("lon", "lat", "col", "row")
+        if key in TEXTS:
+            read[key] = Texts.of("" if cell is None else str(cell) for cell in cells)
+            continue
+        try:
+            read[key] = [None if cell is None and not needed else _value(key, cell) for cell in cells]
+        except ValueError as error:
+            raise InputError(f"{path}: {name!r} of a point: {plain(error)}") from error
+    return of_columns(path, read, empty)._replace(crs=crs)
+
+
+def _value(key: str, cell: Any) -> float:
+    if isinstance(cell, bool) or not isinstance(cell, (str, int, float)):
+        raise ValueError(f"{str(cell)[:40]!r} is no number")
+    return degrees(str(cell), key) if key in ("lon", "lat") else number_of(str(cell))
+
+
+def _read_vector(path: Path) -> Table:
+    """Read the points of a GeoPackage or Shapefile, by pyogrio or fiona."""
+    reader = next((name for name in ("pyogrio", "fiona") if find_spec(name)), None)
+    if reader is None:
+        raise InputError(f"{path}: a GeoPackage or Shapefile, which pyogrio reads: pip install pyogrio")
+    try:
+        if reader == "fiona":
+            with import_module(reader).open(path) as file:
+                features, crs = [dict(shape.__geo_interface__, id=None) for shape in file], file.crs_wkt or None
+        else:
+            meta, _, shapes, fields = import_module("pyogrio.raw").read(path)
+            rows = zip(shapes, *(field.tolist() for field in fields), strict=True)
+            features, crs = (
+                [
+                    {
+                        "geometry": {"coordinates": _point(shape)},
+                        "properties": dict(zip(meta["fields"], cells, strict=True)),
+                    }
+                    for shape, *cells in rows
+                ],
+                meta["crs"],
+            )
+    except (RuntimeError, ValueError, OSError) as error:
+        raise InputError(f"{path}: a GeoPackage or Shapefile that {reader} cannot read") from error
+    return _of_features(path, features, crs)
+
+
+def _point(wkb: bytes) -> list[float]:
+    """Return the coordinates of a point in OGC's or ISO's well-known binary; ValueError for another shape."""
+    order = "<" if wkb[0] else ">"
+    if int(np.frombuffer(wkb, f"{order}u4", 1, 1)[0]) & 0xFFFFFFF not in (1, 1001):
+        raise ValueError("no point")
+    return [float(value) for value in np.frombuffer(wkb, f"{order}f8", offset=5)]
+
+
+# --- images -----------------------------------------------------------------------------------------------
+
+
+def read_tags(path: Place) -> tuple[Table, tuple[int, int]]:
+    """Return the GCP tags of an image, seen in that image alone, and its width and height [px].
+
+    GDAL leaves to the application where they count from: what they cover tells (`_first_pixel`), or that the raster is
+    one of points, whose tags GDAL hands on counted from the corner. Where nothing tells they are taken as they stand.
+    """
+    with open_raster(path) as dataset:
+        (gcps, crs), size, tags = dataset.gcps, (int(dataset.width), int(dataset.height)), dataset.tags()
+    table = Table.of_rows(
+        (str(g.id or n), str(path), g.x, g.y, NAN if g.z is None else g.z, *ALONE, g.col, g.row, IMAGE_SIGMA)
+        for n, g in enumerate(gcps, 1)
+    )
+    if not gcps:
+        return table, size
+    at, why = table.numbers[:, 6:8], ""
+    if (first := _first_pixel(at, np.array(size))) is None:
+        points = tags.get("AREA_OR_POINT") == "Point"
+        first, why = (0.5, ", as of a raster of points") if points else (0.0, ", as nothing says otherwise")
+    at -= first
+    where = {0.0: "the centre", 0.5: "the corner"}.get(first, f"{first:g} px before the centre")
+    said = f"{len(gcps)} GCPs of {path.name}, counted from {where} of the first pixel{why}"
+    system = None if crs is None or crs.to_string() in ("EPSG:4326", "OGC:CRS84") else crs.to_string()
+    return table._replace(crs=system, said=said), size
+
+
+_NEAR = 1e-3  # px: GCPs that end so near to a pixel's centre or edge are meant to lie there
+
+
+def _first_pixel(at: Array, size: Array) -> float | None:
+    """Return what image points (K, 2) call the first pixel's centre, by what they cover; None where that does not tell.
+
+    Those that span a pixel less than the image, as Sentinel-1's, go from centre to centre, those that span all of it
+    from edge to edge: they may begin at 0, at 0.5 or, of rasters of points that GDAL wrote and read, at 1.
+    """
+    start, beyond = at.min(axis=0), np.ptp(at, axis=0) - size
+    edges = float(np.rint(beyond[0])) + 1.0
+    told = edges in (0.0, 1.0) and (np.abs(beyond - edges + 1.0) <= _NEAR).all() and np.ptp(start) <= _NEAR
+    first = np.rint(2.0 * start[0]) / 2.0
+    return float(first + 0.5 * edges) if told and 0.0 <= first <= 1.0 and abs(start[0] - first) <= _NEAR else None
+
+
+# --- MicMac -----------------------------------------------------------------------------------------------
+
+MICMAC = "MicMac XML"
+
+
+def _read_micmac(path: Path) -> Table:
+    """Read ground points (DicoAppuisFlottant), image points (SetOfMesureAppuisFlottants), or both."""
+    try:
+        root = parse_xml(path, strip_namespaces=True)
+    except BarpcError as error:
+        raise InputError(str(error)) from error
+    ground, rows = dict[str, tuple[float, ...]](), list[Row]()
+    try:
+        for point in root.iter("OneAppuisDAF"):
+            x, y, z = map(number_of, (point.findtext("Pt") or "").split())
+            e, n, up = map(number_of, (point.findtext("Incertitude") or "1 1 1").split())
+            ground[(point.findtext("NamePt") or "").strip()] = x, y, z, e, n, up
+        for image in root.iter("MesureAppuiFlottant1Im"):
+            for point in image.iter("OneMesureAF1I"):
+                col, row = map(number_of, (point.findtext("PtIm") or "").split())
+                name, file = (point.findtext("NamePt") or "").strip(), (image.findtext("NameIm") or "").strip()
+                if name in ground or not ground:
+                    rows.append((name, file, *ground.get(name, (*[NAN] * 3, *ALONE)), col, row, IMAGE_SIGMA))
+    except ValueError as error:
+        raise InputError(f"{path}: {MICMAC}, expected Pt of three numbers, PtIm of two ({plain(error)})") from error
+    if not rows and not ground:
+        raise InputError(f"{path}: XML without OneAppuisDAF or OneMesureAF1I, so no points of MicMac's")
+    alone = ((name, None, *place, NAN, NAN, IMAGE_SIGMA) for name, place in ground.items())
+    return Table.of_rows(rows or alone, "" if rows and ground else "image" if rows else "ground")
+
+
+FORMATS: dict[str, Format] = {
+    "GeoPackage or Shapefile": Format(
+        lambda _, head: head.startswith((b"SQLite format 3\0", b"\0\0\x27\x0a")), _read_vector
+    ),
+    "image with GCP tags": Format(
+        lambda text, head: driver_of(head) is not None or "\0" in text, lambda path: read_tags(path)[0]
+    ),
+    "GeoJSON": Format(lambda text, _: text.startswith("{"), read_geojson),
+    MICMAC: Format(lambda text, _: text.startswith("<"), _read_micmac),
+    "ENVI .pts": Format(lambda text, _: text.startswith(";"), _read_envi, 1.5),  # corner of the first pixel: (1, 1)
+    "QGIS .points": Format(lambda text, _: "mapX" in text[:4096] and _header(text)[0] >= 0, _read_qgis, 0.5),
+    "ODM gcp_list.txt": Format(lambda text, _: _ODM.match(text) is not None, _read_odm, 0.5),
+    "Metashape CSV": Format(
+        lambda text, _: _AGISOFT.search(text) is not None and _header(text)[0] >= 0, _read_csv, 0.5
+    ),
+    "CSV": Format(lambda text, _: _header(text)[0] >= 0, _read_csv),
+    "ASP .gcp": Format(lambda *_: True, _read_asp),
+}
+"""Name -> row: the first that knows the beginning reads the file. QGIS, ODM and Metashape count from the corner."""
