@@ -1,7 +1,13 @@
 """The size of the house: lines, modules, numbers that decide, long functions, names that stand twice, flags, options.
 
+Numbers are counted by their meanings, so that a constant that is shared counts wherever it means something else: module
+constants, modules beyond the first that use a number of `barpc.base.usual`, floats inside functions other than 0, 0.5,
+1, 2 and powers of ten, and numeric defaults of parameters. Names are those of classes, functions and constants of
+modules, a leading _ left out.
+
 python benchmarks/house.py            # a table of the package and its folders
 python benchmarks/house.py --numbers  # every module constant that is a number, with where it stands
+python benchmarks/house.py --names    # every name that stands in two modules or more, with where
 """
 
 from __future__ import annotations
@@ -12,8 +18,11 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "barpc"
+USUAL = PACKAGE / "base/usual.py"
 LONG, MANY = 55, 6
 """Lines of a function, and its parameters: more are counted."""
 
@@ -61,16 +70,66 @@ def parameters(function: ast.FunctionDef) -> int:
     return sum(arg.arg not in ("self", "cls") for arg in (*args.posonlyargs, *args.args, *args.kwonlyargs))
 
 
-def twice(trees: dict[Path, ast.Module]) -> list[str]:
-    """Public functions and classes of one name in two modules, and modules of one name."""
-    defined = Counter(
-        node.name
-        for tree in trees.values()
-        for node in tree.body
-        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_")
+def is_counted(value: float) -> bool:
+    """Whether a float in a function is a choice: not 0, 0.5, 1, 2 or a power of ten, as of units."""
+    size = abs(value)
+    return size not in (0.0, 0.5, 1.0, 2.0) and abs(np.log10(size) - round(np.log10(size))) > 1e-12
+
+
+def floats(tree: ast.Module) -> int:
+    """Floats inside functions that are choices."""
+    inside = {
+        inner
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.Lambda)
+        for part in (node.body if isinstance(node.body, list) else [node.body])
+        for inner in ast.walk(part)
+        if isinstance(inner, ast.Constant) and isinstance(inner.value, float)
+    }
+    return sum(is_counted(node.value) for node in inside)
+
+
+def defaults(tree: ast.Module) -> int:
+    """Parameters whose default is a number."""
+    return sum(
+        is_number(default) for node in functions(tree) for default in (*node.args.defaults, *node.args.kw_defaults)
     )
-    files = Counter(path.stem for path in trees if path.stem not in ("__init__", "__main__"))
-    return sorted(name for names in (defined, files) for name, count in names.items() if count > 1)
+
+
+def shared(trees: dict[Path, ast.Module]) -> Counter[str]:
+    """Modules that use each number of `barpc.base.usual`."""
+    known = {name for _, name in numbers(ast.parse(USUAL.read_text(encoding="utf-8")))}
+    found: Counter[str] = Counter()
+    for tree in trees.values():
+        imported = {
+            alias.name
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom) and node.module == "barpc.base.usual"
+            for alias in node.names
+        }
+        found.update(imported & known)
+    return found
+
+
+def meanings(trees: dict[Path, ast.Module]) -> int:
+    """Numbers that decide, by their meanings: see the module's text."""
+    uses = shared(trees)
+    return sum(sum(1 for _ in numbers(tree)) + floats(tree) + defaults(tree) for tree in trees.values()) + (
+        sum(uses.values()) - len(uses)
+    )
+
+
+def twice(trees: dict[Path, ast.Module]) -> dict[str, list[Path]]:
+    """Names of classes, functions and constants that stand in two modules or more, a leading _ left out; and where."""
+    found: dict[str, list[Path]] = {}
+    for path, tree in trees.items():
+        names = {node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+        for node in tree.body:
+            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+            names |= {inner.id for one in targets if one for inner in ast.walk(one) if isinstance(inner, ast.Name)}
+        for name in {name.lstrip("_") for name in names if not name.endswith("__")}:
+            found.setdefault(name, []).append(path)
+    return {name: paths for name, paths in sorted(found.items()) if len(paths) > 1}
 
 
 def measured(trees: dict[Path, ast.Module]) -> tuple[int, ...]:
@@ -79,7 +138,7 @@ def measured(trees: dict[Path, ast.Module]) -> tuple[int, ...]:
     return (
         lines,
         len(trees),
-        sum(1 for tree in trees.values() for _ in numbers(tree)),
+        meanings(trees),
         sum(f.end_lineno - f.lineno + 1 > LONG for f in found if f.end_lineno),
         sum(parameters(f) > MANY for f in found),
         len(twice(trees)),
@@ -129,8 +188,13 @@ def surface() -> tuple[int, int]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--numbers", action="store_true")
+    parser.add_argument("--names", action="store_true")
     args = parser.parse_args()
     trees = modules()
+    if args.names:
+        for name, paths in twice(trees).items():
+            print(name, *(path.relative_to(PACKAGE) for path in paths))
+        return
     if args.numbers:
         for path, tree in trees.items():
             for line, name in numbers(tree):
