@@ -88,7 +88,7 @@ class Section:
 
 
 _TABLES: dict[str, tuple[str, type[Record], str]] = {
-    "images": ("Images: errors (RMS) of the tie points that count; worst first", ViewEntry, ViewEntry.PAGE),
+    "images": ("Images: errors (RMS) of the tie points that count", ViewEntry, ViewEntry.PAGE),
     "pairs": ("Pairs: offset from the epipolar line, median ± spread (1.4826 MAD)", PairEntry, PairEntry.PAGE),
     "corrections": ("Corrections: shift in the middle of the image ± one sigma", ViewEntry, ViewEntry.CORRECTIONS),
     "places": (
@@ -148,7 +148,8 @@ def _images(files: RunFiles) -> Section:
     views, number, adjusted = worst_first(files.summary.views), files.number, files.summary.adjusted
     (shown,) = _table("images", views, adjusted, " " if any(view.cause for view in views) else " wrong ")
     marks = [f"{number[view.name]}" for view in views]
-    return _section("images", {"views": views, "adjusted": adjusted}, tables=[replace(shown, marks=marks)])
+    shown = replace(shown, caption=shown.caption + "; worst first" * bool(flagged(views)), marks=marks)
+    return _section("images", {"views": views, "adjusted": adjusted}, tables=[shown])
 
 
 def _map(files: RunFiles) -> Section:

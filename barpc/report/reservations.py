@@ -224,7 +224,8 @@ def held_lines(tested: ControlTest | None, gcps: GroundPoints, views: Sequence[V
         yield f"{with_points}, taken for {scale:.0f} times less accurate than stated, {known}."
     else:
         yield f"{counted(held, 'GCP')} that hold the scene do not agree: what is known of its place they do not tell."
-    if held and tested is not None and tested.agrees and not tested.checked:
+    # others that were rejected have been held against them
+    if held == is_seen.sum() > 0 and tested is not None and tested.agrees and not tested.checked:
         yield f"Nothing checks {'it' if held == 1 else 'them'}: an error in a GCP would not show."
     alone = np.unique(gcps.view)
     if held and len(alone) == 1 and len(views) > 1:

@@ -250,6 +250,8 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
         yield from held_lines(run.adjustment.control, gcps, views, known)
     elif _holds(run.adjustment) or (run.reference is not None and run.reference.control is not None):
         yield f"So {known}."
+    elif (terrain := run.adjustment.terrain) is not None and terrain.shows and terrain.held:
+        yield f"With the DEM {known}."
     else:
         yield f"Without ground control {known} only."
     yield from dem_lines(run.adjustment)

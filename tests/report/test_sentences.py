@@ -438,7 +438,10 @@ def test_control_is_said_to_hold_the_place_and_when_nothing_checks_it():
     assert "With 2 GCPs" in lines(control(), gcps(view=(0, 1), point=(0, 2)))
     blind = control(redundancy=np.full(3, 0.05))
     assert "Nothing checks them: an error in a GCP would not show." in lines(blind)
-    assert "Nothing checks it:" in lines(control(redundancy=np.full(3, 0.05), used=np.array([False, True, False])))
+    assert "Nothing checks" not in lines(control(redundancy=np.full(3, 0.05), used=np.array([False, True, False])))
+    single = gcps(1, view=(0, 1), point=(0, 0))
+    one = ControlTest(np.ones(1, bool), np.zeros((1, 3)), np.ones(1), np.full(1, 0.05))
+    assert "Nothing checks it: an error in a GCP would not show." in lines(one, single)
     assert "Nothing checks" not in lines(control())
     assert "Nothing checks" not in lines(control(redundancy=np.full(3, 0.05), fits=False))
     assert "Nothing checks" not in lines(control(redundancy=np.full(3, 0.05), used=np.zeros(3, bool)))
@@ -468,6 +471,12 @@ def test_a_dem_is_said_to_hold_and_how_the_points_lie_to_it():
     assert "more than 2.5 degrees;" in lines(held=0, options=SimpleNamespace(**options))[0]
     nowhere = f"{held}it has no height where it is needed."
     assert lines(held=0, options=SimpleNamespace(**{**options, "dem_for_weak": False}))[0] == nowhere
+    held = replace(TerrainTest(30, 30, 40, 2.0, 3.0, 0.5), sigma=4.0)
+    for terrain, start in (
+        (held, "With the DEM its place"),
+        (replace(held, shows=False), "Without ground control its"),
+    ):
+        assert any(line.startswith(start) for line in said(run_of(adjusted(terrain=terrain))))
     terrain = TerrainTest(0, 20, 40, 2.0, 3.0, 0.5)
     assert said(run_of(adjusted(terrain=terrain, held=np.array([False, True]))))[-2] == nowhere
 
