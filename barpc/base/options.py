@@ -332,7 +332,7 @@ class AdjustOptions(Options):
         above=0,
     )
     dem_for_weak: bool = option(
-        False, "The DEM holds only tracks whose rays meet under less than `min_convergence`, not all."
+        False, "Constrain only tracks with a convergence angle below `min_convergence` to the DEM."
     )
     min_convergence: float = option(
         1.0, "Tracks whose rays meet under a smaller angle are held in height.", unit="deg", least=0, most=180
@@ -463,7 +463,7 @@ class RunOptions(Options):
     overlap_list: str | None = option(None, "Match only these pairs: two image names or paths a line.", unit="file")
     aoi: str | None = option(
         None,
-        "Tie points only inside polygons in lon/lat (GeoJSON), and only what may show them is read.",
+        "Restrict tie points to polygons (GeoJSON, lon/lat); only image parts that can see them are read.",
         unit="file",
     )
     gcp: tuple[str, ...] = option(

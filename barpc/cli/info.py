@@ -112,8 +112,8 @@ def _lines_of_rpc(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     known = [f"{value:.3g} m {what}" for what, value in stated.items() if value is not None]
     yield "accuracy", ", ".join(known) or "not stated"
     least = report["smallest_denominator"]
-    pole = "0 would be a pole" if least > 0 else "it may have a pole in or near these bounds"
-    yield "denominators", f"at least {least:.3g} of what they are in the middle: {pole}"
+    pole = "no pole" if least > 0 else "a pole may lie in or near these bounds"
+    yield "denominators", f"at least {least:.3g} of their value at the centre: {pole}"
 
 
 def _lines_of_geometry(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

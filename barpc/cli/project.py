@@ -78,12 +78,12 @@ def altitude_of(camera: Camera, image: Place, given: float | None = None) -> flo
 
 def _unknown(camera: Camera) -> str:
     """Return what it is worth not to know the ground, in words."""
-    text = f"its ground is taken at {camera.altitude:g} m, the middle of its altitudes"
+    text = f"terrain height unknown, {camera.altitude:g} m assumed (the middle of the camera's altitude range)"
     if camera.size is None:
         return text
     at = camera.model.localize((np.array(camera.size) - 1) / 2, np.array(camera.altitude))
     _, jacobian = camera.model.project_jacobian(at)
-    return f"{text}: 100 m more or less are {100 * float(np.linalg.norm(jacobian[:, 2])):.3g} px"
+    return f"{text}: an error of 100 m shifts the result by {100 * float(np.linalg.norm(jacobian[:, 2])):.3g} px"
 
 
 @cache

@@ -324,23 +324,21 @@ def dem_lines(adjustment: Adjustment) -> Iterator[str]:
         return
     by_reference = bool(adjustment.reference_inlier.any())  # which stands on it: no tie point does
     if not terrain.total:
-        yield from ["The DEM holds nothing: there are no tie points."] * (not by_reference)
+        yield from ["The DEM constrains nothing: there are no tie points."] * (not by_reference)
         return
-    held = f"The DEM holds {terrain.held} of {counted(terrain.total, 'tie point')}"
+    held = f"DEM heights constrain {terrain.held} of {counted(terrain.total, 'tie point')}"
     if terrain.held:
-        single = metres(options.dem_sigma)
-        if np.isfinite(terrain.sigma):
-            single = f"{metres(terrain.sigma)}, of which {terrain.alike:.1f} are worth one,"
-        yield f"{held}, each to {single} and all together to {metres(terrain.bias)}."
+        single = f"{metres(terrain.sigma if np.isfinite(terrain.sigma) else options.dem_sigma)} per point"
+        if np.isfinite(terrain.sigma) and terrain.alike >= 1.05:
+            single += f" ({terrain.alike:.1f} correlated heights count as one)"
+        yield f"{held}. Assumed error: {single}, and {metres(terrain.bias)} common to all."
     elif options.dem_for_weak and terrain.known and not adjustment.held.any():
         least = f"{options.min_convergence:g} degree{'' if options.min_convergence == 1 else 's'}"
-        yield f"{held}: all rays meet under more than {least}; without --dem-for-weak it holds the scene."
+        yield f"{held}: all rays meet under more than {least}; without --dem-for-weak they constrain the scene."
     else:
-        yield f"{held}: it has no height where it is needed."
-    lie = (
-        f"; they lie {terrain.offset:+.1f} m above it (median; spread {terrain.spread:.1f} m)" if terrain.known else ""
-    )
-    yield f"It has a height for {100 * terrain.known / terrain.total:.0f} % of the tie points{lie}."
+        yield f"{held}: the DEM has no height where one is needed."
+    lie = f"; they lie {terrain.offset:+.1f} m above it (median; NMAD {terrain.spread:.1f} m)" if terrain.known else ""
+    yield f"The DEM covers {100 * terrain.known / terrain.total:.0f} % of the tie points{lie}."
 
 
 def dem_reasons(adjustment: Adjustment) -> Iterator[str]:

@@ -121,18 +121,21 @@ def test_the_summary_has_it_in_a_table_without_the_sources_that_tell_nothing():
         (
             {"dem_for_weak": True},
             level,
-            "The DEM holds 0 of 396 tie points: all rays meet under more than 0.01 degrees; without --dem-for-weak it",
+            "DEM heights constrain 0 of 396 tie points: all rays meet under more than 0.01 degrees; without "
+            "--dem-for-weak they",
         ),
         (
             {"learn_priors": False},
             level,
-            "The DEM holds 400 of 400 tie points, each to 10.0 m and all together to 20.0 m.",
+            "DEM heights constrain 400 of 400 tie points. Assumed error: 10.0 m per point, and 20.0 m common to all.",
         ),
-        pytest.param({"min_convergence": 90.0}, level, "The DEM holds 400 of 400 tie points", marks=pytest.mark.slow),
+        pytest.param(
+            {"min_convergence": 90.0}, level, "DEM heights constrain 400 of 400 tie points", marks=pytest.mark.slow
+        ),
         pytest.param(
             {},
             lambda lon, lat: np.full(len(lon), np.nan),
-            "it has no height where it is needed",
+            "the DEM has no height where one is needed",
             marks=pytest.mark.slow,
         ),
     ],
@@ -151,7 +154,7 @@ def test_what_a_terrain_did_is_said(options, dem, says):
     summary = summarize(Run("adjust", BLOCK.views, (), BLOCK.tracks, adjustment=found))
     assert any(says in line for line in summary.verdict), summary.verdict
     if dem is level:
-        assert any("It has a height for 100 % of the tie points; they lie " in line for line in summary.verdict)
+        assert any("The DEM covers 100 % of the tie points; they lie " in line for line in summary.verdict)
         assert summary.scene.dem.num_known == summary.scene.dem.num_tracks
         assert summary.scene.dem.offset_m == pytest.approx(found.terrain.offset)
         assert abs(summary.scene.dem.offset_m) < 60.0

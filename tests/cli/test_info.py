@@ -178,9 +178,9 @@ def test_an_rpc_says_what_it_is_made_for() -> None:
     assert lines["camera"] == "RPC (rpb) in a in b.RPB"
     assert lines["made for"] == "lon 5.00000 to 6.00000, lat 43.00000 to 44.00000 deg"
     assert lines["accuracy"] == "3 m common to the image"
-    assert lines["denominators"] == "at least 0.5 of what they are in the middle: 0 would be a pole"
+    assert lines["denominators"] == "at least 0.5 of their value at the centre: no pole"
     for least in (0.0, -0.25):
-        assert "may have a pole" in told(**{**BOX, "smallest_denominator": least})["denominators"]
+        assert "a pole may lie" in told(**{**BOX, "smallest_denominator": least})["denominators"]
     accuracy = told(**{**BOX, "err_bias_m": 0.0, "err_rand_m": 1.2345})["accuracy"]
     assert accuracy == "0 m common to the image, 1.23 m of each point"
     assert told(**{**BOX, "err_bias_m": None})["accuracy"] == "not stated"

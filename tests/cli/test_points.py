@@ -168,7 +168,7 @@ def test_altitudes_of_a_table_count_and_the_others_are_the_one_given(
     assert run("localize", str(file), "--points", str(tmp_path / "t.csv")) == 0
     told = capsys.readouterr()
     assert rows(told.out)[:, 2].tolist() == pytest.approx([50.0, rpc.ground_offset[2]], abs=1e-4)
-    assert "its ground is taken at" in told.err
+    assert "terrain height unknown" in told.err
 
 
 def test_a_dem_tells_the_altitudes_of_projected_points(

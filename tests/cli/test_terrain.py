@@ -70,8 +70,8 @@ def test_the_middle_of_the_rpc_is_taken_aloud(verb, image, tmp_path, capsys):
     middle = rpc.ground_offset[2]
     at = rpc.localize([299.5, 199.5], middle)
     off = np.linalg.norm(rpc.project(at + [0, 0, 50.0]) - rpc.project(at - [0, 0, 50.0]))
-    assert f"taken at {middle:g} m, the middle" in said
-    told = float(said.split("100 m more or less are ")[1].split(" px")[0])
+    assert f"terrain height unknown, {middle:g} m assumed" in said
+    told = float(said.split("an error of 100 m shifts the result by ")[1].split(" px")[0])
     assert told == pytest.approx(off, rel=0.02)
     assert run(*verbs[verb], "--alt", 123, *(["--overwrite"] if verb == "crop" else [])) == 0
     assert "middle" not in capsys.readouterr().err
@@ -106,7 +106,7 @@ def test_a_damaged_summary_and_a_stranger_s_file_know_nothing(finished, tmp_path
     (damaged / "summary.json").write_text("{")
     camera = open_camera(damaged / other)
     assert altitude_of(camera, damaged / other) == camera.altitude
-    assert capsys.readouterr().err.count("the middle of its altitudes") == 2
+    assert capsys.readouterr().err.count("the middle of the camera's altitude range") == 2
 
 
 def test_a_dem_is_asked_where_one_is_given(image, dem, tmp_path, capsys):
@@ -205,8 +205,8 @@ def a_map(**changes) -> Camera:
 def test_what_an_unknown_altitude_is_worth_is_measured_in_the_middle(capsys):
     camera = a_map()
     assert altitude_of(camera, Path("map.tif")) == 25.0
-    told = "barpc: map.tif: its ground is taken at 25 m, the middle of its altitudes"
-    assert capsys.readouterr().err == f"{told}: 100 m more or less are 5 px; give --alt or --dem\n"
+    told = "barpc: map.tif: terrain height unknown, 25 m assumed (the middle of the camera's altitude range)"
+    assert capsys.readouterr().err == f"{told}: an error of 100 m shifts the result by 5 px; give --alt or --dem\n"
     assert camera.model.asked == [([99.5, 49.5], 25.0)]
     assert altitude_of(a_map(size=None), Path("map.tif")) == 25.0
     assert capsys.readouterr().err == f"{told}; give --alt or --dem\n"

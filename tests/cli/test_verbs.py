@@ -268,7 +268,7 @@ def test_info_says_where_the_rpc_comes_from_and_what_was_passed_over(image, caps
         f"  altitudes    {low:.5g} to {high:.5g} m above the ellipsoid",
         f"  made for     lon {lon_min:.5f} to {lon_max:.5f}, lat {lat_min:.5f} to {lat_max:.5f} deg",
         "  accuracy     3.1 m common to the image, 0.7 m of each point",
-        f"  denominators at least {least:.3g} of what they are in the middle: 0 would be a pole",
+        f"  denominators at least {least:.3g} of their value at the centre: no pole",
         f"  centre       lon {lon:.6f}, lat {lat:.6f} deg at {(low + high) / 2:.5g} m",
         f"  pixel        {gsd['col']:.3f} m a column, {gsd['row']:.3f} m a row on the ground",
         f"  looks        {angle:.2f} deg off the vertical, from {side:.2f} deg (north is 0)",
@@ -285,7 +285,7 @@ def test_info_says_in_words_what_is_not_known_of_a_camera(tmp_path, capsys):
     told = capsys.readouterr().out
     assert "  image        its size is not known; with FILE,size=WIDTH:HEIGHT angles" in told
     assert "  accuracy     not stated\n" in told
-    assert re.search(r"  denominators at least -\d\.\d+ of .*: it may have a pole", told)
+    assert re.search(r"  denominators at least -\d\.\d+ of .*: a pole may lie", told)
     assert "centre of the first" not in told
 
 

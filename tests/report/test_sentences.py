@@ -458,18 +458,19 @@ def test_a_dem_is_said_to_hold_and_how_the_points_lie_to_it():
         return said(run_of(adjusted(terrain=terrain, **fields)))[-2:]
 
     assert lines() == [
-        "The DEM holds 30 of 40 tie points, each to 2.0 m and all together to 50.0 cm.",
-        "It has a height for 50 % of the tie points; they lie +2.0 m above it (median; spread 3.0 m).",
+        "DEM heights constrain 30 of 40 tie points. Assumed error: 2.0 m per point, and 50.0 cm common to all.",
+        "The DEM covers 50 % of the tie points; they lie +2.0 m above it (median; NMAD 3.0 m).",
     ]
-    assert lines(known=0)[1] == "It has a height for 0 % of the tie points."
-    assert lines(known=0, total=0, held=0)[1] == "The DEM holds nothing: there are no tie points."
-    held = "The DEM holds 0 of 40 tie points: "
+    assert lines(known=0)[1] == "The DEM covers 0 % of the tie points."
+    assert lines(known=0, total=0, held=0)[1] == "The DEM constrains nothing: there are no tie points."
+    held = "DEM heights constrain 0 of 40 tie points: "
     assert (
-        lines(held=0)[0] == f"{held}all rays meet under more than 1 degree; without --dem-for-weak it holds the scene."
+        lines(held=0)[0]
+        == f"{held}all rays meet under more than 1 degree; without --dem-for-weak they constrain the scene."
     )
     options = {"drift": None, "fixed": (), "dem_for_weak": True, "min_convergence": 2.5, "dem_sigma": 2.0}
     assert "more than 2.5 degrees;" in lines(held=0, options=SimpleNamespace(**options))[0]
-    nowhere = f"{held}it has no height where it is needed."
+    nowhere = f"{held}the DEM has no height where one is needed."
     assert lines(held=0, options=SimpleNamespace(**{**options, "dem_for_weak": False}))[0] == nowhere
     held = replace(TerrainTest(30, 30, 40, 2.0, 3.0, 0.5), sigma=4.0)
     for terrain, start in (
@@ -484,7 +485,8 @@ def test_a_dem_is_said_to_hold_and_how_the_points_lie_to_it():
 def test_how_much_of_a_dem_is_believed_is_said():
     told = replace(TerrainTest(30, 30, 40, 2.0, 3.0, 0.5), sigma=4.0, alike=3.5, relief=0.98)
     assert said(run_of(adjusted(terrain=told)))[-2] == (
-        "The DEM holds 30 of 40 tie points, each to 4.0 m, of which 3.5 are worth one, and all together to 50.0 cm."
+        "DEM heights constrain 30 of 40 tie points. Assumed error: 4.0 m per point (3.5 correlated heights count as "
+        "one), and 50.0 cm common to all."
     )
     assert wrong(told) == []
     assert wrong(replace(told, is_known=False)) == []
@@ -517,7 +519,7 @@ def test_what_is_wrong_with_a_dem_is_said_and_needs_a_look():
     assert why.endswith("It was not used, and moved nothing.")
     verdict = block_verdict(told_of(other), views())
     assert verdict["status"] == "look"
-    assert not any("The DEM holds" in line for line in verdict["verdict"])
+    assert not any("DEM heights" in line for line in verdict["verdict"])
 
 
 def test_a_reference_is_said_to_hold_what_and_how_far_off_the_cameras_were():
@@ -571,7 +573,7 @@ def test_tie_points_alone_are_counted():
 def test_a_reference_on_heights_that_may_be_above_a_geoid_is_no_jitter():
     unstated = replace(TerrainTest(0, 0, 0, np.nan, np.nan, 20.0), is_known=False)
     held = {"terrain": unstated, "reference_inlier": np.array([True, True])}
-    assert not [line for line in said(run_of(adjusted(**held))) if "The DEM holds" in line]  # there is no tie point
+    assert not [line for line in said(run_of(adjusted(**held))) if "DEM heights" in line]  # there is no tie point
     for less in ({"terrain": replace(unstated, is_known=True)}, {"reference_inlier": np.zeros(2, bool)}):
         assert reasons(adjusted(**{**held, **less})) == []
     smooth = SmoothTest(np.array([0.2, 0.0, 0.0]), np.array([1e-9, 1, 1]), np.full(3, 0.9), np.zeros(3))
