@@ -205,7 +205,7 @@ def given_tracks(paths: Sequence[str | Path], views: Sequence[View]) -> Tracks:
 def given_matches(
     paths: Sequence[str | Path], views: Sequence[View], *, partly: bool = False
 ) -> dict[tuple[int, int], Matches]:
-    """Read the matches of files by pairs; InputError for a file without any, but for part (`partly`) of the images."""
+    """Read the matches of files by pairs; InputError for a file of other images, but for part (`partly`) of them."""
     links = _linked(paths, views, partly)
     swapped = links.view[links.ends[:, 0]] > links.view[links.ends[:, 1]]
     ends = np.where(swapped[:, None], links.ends[:, ::-1], links.ends)
@@ -231,6 +231,8 @@ def _linked(paths: Sequence[str | Path], views: Sequence[View], partly: bool = F
                 raise
             logger.warning("%s", error)
             continue
+        if not parts[-1].joins_views:
+            logger.warning("%s: holds no match of two of the images, which is as if it were not given", path)
         parts[-1] = _in_images(path, views, parts[-1])
     return Links.joined(parts[1:] or parts)
 

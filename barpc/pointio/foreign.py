@@ -13,6 +13,7 @@ keypoints may lie in a file of their own. Needs h5py.
 
 from __future__ import annotations
 
+import logging
 import os
 import sqlite3
 from array import array
@@ -31,6 +32,8 @@ from barpc.base.geodesy import Array
 from barpc.base.sidefile import MAX_DEPTH, MAX_ELEMENTS, NUMBER, TABLE, Kind, opened, opened_text, read_bytes, read_head
 from barpc.pointio.names import ViewNames
 from barpc.scene import IntArray
+
+logger = logging.getLogger(__name__)
 
 PairPoints = tuple[int, int, Array, Array]
 """Two views, and points (M, 2), (M, 2) [px] of them that show the same ground."""
@@ -76,10 +79,12 @@ def _joined(
 # --- files of pairs ---------------------------------------------------------------------------------------
 
 
-def in_folder(folder: Path) -> list[Path]:
-    """Return the files of pairs in a folder; of two that ASP wrote of a pair, the clean one."""
-    found = sorted(path for ending in ENDINGS for path in folder.glob(f"*_*{ending}"))
-    return [path for path in found if path.with_stem(path.stem + _CLEAN) not in found]
+def pair_files(path: Path) -> list[Path]:
+    """Return the files of pairs in a folder, of two that ASP wrote of a pair the clean one; or a file that is one."""
+    if not path.is_dir():
+        return [path] if "__" in path.name and path.suffix.lower() in ENDINGS else []
+    found = sorted(one for ending in ENDINGS for one in path.glob(f"*_*{ending}"))
+    return [one for one in found if one.with_stem(one.stem + _CLEAN) not in found]
 
 
 def read_pair_files(paths: Sequence[Path], views: ViewNames) -> Iterator[PairPoints]:
@@ -87,7 +92,10 @@ def read_pair_files(paths: Sequence[Path], views: ViewNames) -> Iterator[PairPoi
     for path in paths:
         pair = pair_of(path, views)
         if pair is not None:
-            yield *pair, *_READERS[path.suffix.lower()](path)
+            first, second = _READERS[path.suffix.lower()](path)
+            if not len(first):
+                logger.warning("%s: holds no match", path)
+            yield *pair, first, second
 
 
 def pair_of(path: Path, views: ViewNames) -> tuple[int, int] | None:
@@ -117,7 +125,7 @@ def _asp_text(path: Path) -> tuple[Array, Array]:
     """Read an ASP text file: counts on the first line, then one keypoint a line, col and row first."""
     try:
         with opened_text(path, TABLE) as lines:
-            left, right = (int(word) for word in next(lines, "").split()[:2])
+            left, right = (int(word) for word in next(lines, "0 0").split()[:2])
             points = array("d")
             for words in (line.split(None, 2)[:2] for line in lines):
                 if words:
@@ -134,6 +142,8 @@ def _asp_text(path: Path) -> tuple[Array, Array]:
 def _asp_binary(path: Path) -> tuple[Array, Array]:
     """Read two counts of 8 bytes, then the records of both images, each with a descriptor of one length."""
     data = read_bytes(path, TABLE)
+    if not any(data) and len(data) in (0, 16):  # of a matcher that found nothing
+        return np.empty((0, 2)), np.empty((0, 2))
     try:
         count, other = np.frombuffer(data, "<u8", 2).tolist()
         size = _HEAD + 4 * int(np.frombuffer(data, "<u8", 1, 16 + _HEAD - 8)[0])

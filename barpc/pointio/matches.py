@@ -18,12 +18,13 @@ from barpc.base.frozen import Arrays, load_npz
 from barpc.base.geodesy import Array
 from barpc.base.sidefile import TABLE, read_head
 from barpc.pointio.columns import IMAGE_SIGMA
-from barpc.pointio.foreign import COLMAP, ENDINGS, HDF5, PairPoints, in_folder, read_colmap, read_hloc, read_pair_files
+from barpc.pointio.foreign import COLMAP, HDF5, PairPoints, pair_files, pair_of, read_colmap, read_hloc, read_pair_files
 from barpc.pointio.names import ViewNames, cell
 from barpc.pointio.tables import distinct, numbered, read_table
 from barpc.scene import IntArray, Tracks, connected_labels
 
 _COLUMNS = ("image", "col", "row", "track")
+_NO_TRACK = "no track is seen in two of the views"
 _STEPS = 16  # observations of a track are linked to so many after them: all of a usual track
 
 
@@ -79,6 +80,11 @@ class Links:
             ends.append(np.column_stack([order[same], order[same + step]]))
         return Links(view, xy, sigma, np.concatenate(ends))
 
+    @property
+    def joins_views(self) -> bool:
+        """Whether any match is one of two views."""
+        return bool((self.view[self.ends[:, 0]] != self.view[self.ends[:, 1]]).any())
+
     def tracks(self) -> IntArray:
         """Return the track (K,) of every point: points that are linked belong to one."""
         return connected_labels(len(self.view), self.ends)
@@ -88,7 +94,7 @@ def read_links(path: Path | str, names: Sequence[str]) -> Links:
     """Read the matches in a file, or a folder of files of pairs, between the views called `names`.
 
     What a file holds is told by its content. Points in other images are left out; InputError where it does not parse,
-    or holds no match of these views.
+    or holds no match of these views: but files named after a pair of them may be of a matcher that found none.
     """
     path = Path(path)
     views = ViewNames(names, str(path))
@@ -98,10 +104,10 @@ def read_links(path: Path | str, names: Sequence[str]) -> Links:
         raise InputError(f"{path}: cannot be read as tie points ({plain(error)})") from error
     if not (np.isfinite(links.xy).all() and np.isfinite(links.sigma).all() and (links.sigma > 0).all()):
         raise InputError(f"{path}: a coordinate is not finite, or a sigma not positive")
-    if not (links.view[links.ends[:, 0]] != links.view[links.ends[:, 1]]).any():
+    if not links.joins_views and not _named_after_pairs(path, views):
         others = ", ".join(name[:60] for name in [*views.strangers][:3])
         found = f"; it names {others}, and the images are {', '.join(views.names[:3])}" if others else ""
-        raise InputError(f"{path}: no track is seen in two of the views{found}")
+        raise InputError(f"{path}: {_NO_TRACK}{found}")
     return links
 
 
@@ -154,16 +160,20 @@ def asp_text(first: Array, second: Array) -> str:
 
 def _read(path: Path, views: ViewNames) -> Links:
     if path.is_dir():
-        return Links.of_pairs(read_pair_files(in_folder(path), views))
+        return Links.of_pairs(read_pair_files(pair_files(path), views))
     head, ending = read_head(path, TABLE, 16), path.suffix.lower()
     for magic, read in ((COLMAP, read_colmap), (HDF5, read_hloc)):
         if head.startswith(magic):
             return Links.of_pairs(read(path, views))
     if ending == ".npz" and "keypoints0" not in (arrays := load_npz(path)):
         return _read_npz(path, arrays, views)
-    if ending == ".npz" or ("__" in path.name and ending in ENDINGS):
+    if ending == ".npz" or pair_files(path):
         return Links.of_pairs(read_pair_files([path], views))
     return _read_csv(path, views)
+
+
+def _named_after_pairs(path: Path, views: ViewNames) -> bool:
+    return any(pair_of(one, views) is not None for one in pair_files(path))
 
 
 def _read_csv(path: Path, views: ViewNames) -> Links:
@@ -203,11 +213,12 @@ def tracks_of(links: Links, path: Path | str) -> Tracks:
     view, point = links.view, links.tracks()
     order = np.lexsort((view, point))
     track, seen = point[order], view[order]
-    again = np.append(False, (track[1:] == track[:-1]) & (seen[1:] == seen[:-1]))
+    again = np.zeros(len(order), dtype=bool)
+    again[1:] = (track[1:] == track[:-1]) & (seen[1:] == seen[:-1])
     good = np.bincount(point) >= 2
     good[track[again]] = False
     if not good.any():
-        raise InputError(f"{path}: no track is seen in two of the views")
+        raise InputError(f"{path}: {_NO_TRACK}")
     kept = order[good[track]]
     closed = np.cumsum(good) - 1
     return Tracks(view[kept], closed[point[kept]], links.xy[kept], links.sigma[kept])

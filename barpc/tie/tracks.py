@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,7 +18,7 @@ from barpc.base.usual import MANY
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
 from barpc.tie.matchers.features import KeypointFiles, locate, worth_a_first_look
-from barpc.tie.matchers.given import GivenMatches, verify_given
+from barpc.tie.matchers.given import GivenMatches, beside_given, verify_given
 from barpc.tie.matchers.matcher import Matches
 from barpc.tie.matchers.matching import (
     FINE,
@@ -38,6 +38,7 @@ from barpc.tie.pairing.epipolar import grouped, linear_map
 from barpc.tie.pairing.overlaps import (
     COMPARED,
     EVERYWHERE,
+    GIVEN,
     TRIES,
     Pair,
     Scope,
@@ -105,13 +106,12 @@ def find_tracks(
     with store_of(executor) as store:
         trials = _Trials(views, options, scope, Work(executor, progress, store))
         trials.run(possible_pairs(views, options, scope), all_of_them=bool(scope.only))
-    tried = sorted(trials.tried.items())
-    pairs, reports = [pair for _, (pair, _, _) in tried], tuple(report for _, (_, _, report) in tried)
-    require_matches(views, pairs, reports)
-    tracks, bare = _registered(trials, scope, options, Work(executor, progress))
-    reports = tuple(replace(r, unregistered=bare.get(p.views, 0)) for p, r in zip(pairs, reports, strict=True))
+        require_matches(views, *trials.outcome)
+        tracks, bare = _registered(trials, scope, options, Work(executor, progress))
+    pairs, reports = trials.outcome
+    reports = [replace(r, unregistered=bare.get(p.views, 0)) for p, r in zip(pairs, reports, strict=True)]
     require_tracks(views, tracks, pairs, reports)
-    return TieResult(tracks, reports, trials.keypoints)
+    return TieResult(tracks, tuple(reports), trials.keypoints)
 
 
 def _registered(
@@ -125,11 +125,14 @@ def _registered(
     sizes = [view.size for view in looks.views]
     linked = thin(linked, sizes, most)
     structural = [ends for ends, _, report in tried if report.matcher in (STRUCTURE, FINE)]
-    theirs = {looks.ends[views] for views in scope.given}
+    theirs = {looks.ends[views] for views, (*_, report) in trials.tried.items() if report.matcher == GIVEN}
     verified = {ends: found for ends, found, _ in tried if len(found)}
     tracks = refine(looks.views, linked, spreads, options, structural=structural, work=work)
     if unlike := _with_pictures(looks.views, _unlike(linked, tracks, sorted(theirs & set(verified))), options, work):
         tracks = refine(looks.views, linked, spreads, options, structural=[*structural, *unlike], work=work)
+        counts = pair_counts(tracks)
+        if trials.rematch({pair: counts.get(pair, 0) for pair in _unlike(linked, tracks, unlike)}):
+            return _registered(trials, scope, options, work)
     needed = theirs | _needed(looks, tracks, list(verified), options)
     known = {ends: found for ends, found in verified.items() if ends in needed}
     exact, tracks = pair_counts(tracks), _with_unregistered(looks.views, tracks, known, options)
@@ -162,11 +165,13 @@ class _Trials:
         self._keypoints: list[KeypointFiles] = []
         self.tried: dict[tuple[int, int], tuple[Pair, Matches, PairReport]] = {}
         self._scores: dict[tuple[int, int], int] = {}
+        self._beside: dict[tuple[int, int], tuple[Matches, PairReport]] = {}  # given, and too few: own count beside
 
     def run(self, pool: Sequence[Pair], all_of_them: bool) -> None:
         """Match the best pairs of a pool, or all, and others in place of those that fail."""
         own = self._options.matcher in MATCHERS  # another one reads the files itself
         self.looks = Looks.at(self._views, pool, apart=own)
+        self._verify([pair for pair in pool if pair.views in self._given])
         assert self._work.store is not None
         self._keypoints = [KeypointFiles(self._work.store)] * len(self.looks.views)
         sizes = [view.size for view in self.looks.views]
@@ -189,6 +194,21 @@ class _Trials:
             if not chosen:
                 break
 
+    def _verify(self, known: Sequence[Pair]) -> None:
+        """Verify the matches given; pairs of which too few are right are matched as if none were given, too."""
+        looks = self.looks
+        given = {
+            looks.ends[pair]: replace(self._given[pair], xy=looks.places(pair, self._given[pair].xy))
+            for pair in (pair.views for pair in known)
+        }
+        found = verify_given(looks.views, given, [looks.pair(pair) for pair in known], self._options, self._work)
+        for pair, one in zip(known, found, strict=True):
+            if enough(one[1]):
+                self.tried[pair.views] = pair, *one
+            else:
+                self._beside[pair.views] = one
+        self._given = {pair: self._given[pair] for pair in self.tried}
+
     def _locate(self, pairs: Sequence[Pair]) -> None:
         """Find the keypoints that pairs need."""
         others = [self.looks.pair(pair) for pair in pairs if pair.views not in self._given]
@@ -201,6 +221,12 @@ class _Trials:
         """Number of keypoints found in each view."""
         count = np.bincount(self.looks.of, weights=[len(k) for k in self._keypoints])
         return tuple(count.astype(int).tolist())
+
+    @property
+    def outcome(self) -> tuple[list[Pair], list[PairReport]]:
+        """The pairs tried, ascending, and their reports."""
+        tried = [self.tried[views] for views in sorted(self.tried)]
+        return [pair for pair, _, _ in tried], [report for _, _, report in tried]
 
     def _judged(self, pairs: Sequence[Pair]) -> list[Pair]:
         """Return the pairs with their quick scores, where keypoints can tell."""
@@ -216,17 +242,29 @@ class _Trials:
         return (self.looks.views[i], self.looks.views[j]), (self._keypoints[i], self._keypoints[j])
 
     def _try(self, pairs: Sequence[Pair]) -> None:
-        known, others = ([p for p in pairs if (p.views in self._given) is there] for there in (True, False))
+        others = [pair for pair in pairs if pair.views not in self.tried]
         before = [(self._ends(pair)[0], found) for pair, found, report in self.tried.values() if enough(report)]
-        looks, options = self.looks, self._options
-        own = self._matched([looks.pair(pair) for pair in others], before)
-        given = {
-            looks.ends[pair]: replace(self._given[pair], xy=looks.places(pair, self._given[pair].xy))
-            for pair in (pair.views for pair in known)
-        }
-        theirs = verify_given(looks.views, given, [looks.pair(pair) for pair in known], options, self._work)
-        for pair, (found, report) in zip([*others, *known], [*own, *theirs], strict=True):
-            self.tried[pair.views] = pair, found, report
+        own = self._matched([self.looks.pair(pair) for pair in others], before)
+        for pair, one in zip(others, own, strict=True):
+            self.tried[pair.views] = pair, *beside_given(one, self._beside.get(pair.views))
+
+    def rematch(self, registered: Mapping[tuple[int, int], int]) -> bool:
+        """Match pairs of looks of whose matches given only so many could be `registered`; return whether own matches
+        took the place of any: of these more can be, and enough.
+        """
+        looks, options, of = self.looks, self._options, self.looks.of
+        pairs = [self.tried[int(of[i]), int(of[j])][0] for i, j in registered]
+        own = self._looked_closer([looks.pair(pair) for pair in pairs], Ground(self._scope.terrain))
+        changed = False
+        for pair, (ends, count), (found, report) in zip(pairs, registered.items(), own, strict=True):
+            structural = [ends] * (report.matcher in (STRUCTURE, FINE))
+            linked = thin(link([ends], [found]), [view.size for view in looks.views], options.points_per_image)
+            tracks = refine(looks.views, linked, {}, options, structural=structural, work=self._work)
+            if tracks.num_points >= max(count + 1, options.min_matches):
+                words = "%s - %s: of %d matches given %d could be registered, of own ones %d: these are used"
+                logger.warning(words, *report.names, len(self.tried[pair.views][1]), count, tracks.num_points)
+                self.tried[pair.views], changed = (pair, found, report), True
+        return changed
 
     def _matched(
         self, pairs: Sequence[Pair], before: Sequence[tuple[tuple[View, View], Matches]]
@@ -236,15 +274,23 @@ class _Trials:
         first = first_look(views, keypoints, pairs, options, self._work) if self._coarse else []
         found = {p.views: one for p, one in zip(pairs, first, strict=False) if ample(one[1], options)}
         lacking = [pair for pair in pairs if pair.views not in found]
-        if self._coarse and lacking:
-            closer = locate(views, options, self._work, pairs=lacking, area=self._scope.area)
-            self._closer += 1  # each numbers its keypoints, below 0, where no place is
-            keypoints = [replace(files, start=-self._closer << 32) for files in closer]
         known = [((views[p.views[0]], views[p.views[1]]), found[p.views][0]) for p in pairs if p.views in found]
         ground = Ground(self._scope.terrain, (*before, *known))
-        again = match_pairs(views, keypoints, lacking, options, ground, self._work)
+        if self._coarse and lacking:
+            again = self._looked_closer(lacking, ground)
+        else:
+            again = match_pairs(views, keypoints, lacking, options, ground, self._work)
         found |= {pair.views: one for pair, one in zip(lacking, again, strict=True)}
         return [found[pair.views] for pair in pairs]
+
+    def _looked_closer(self, pairs: Sequence[Pair], ground: Ground) -> list[tuple[Matches, PairReport]]:
+        """Match pairs of looks by keypoints of their own."""
+        views, options = self.looks.views, self._options
+        detects = matcher_named(options.matcher).detects
+        closer = locate(views, options, self._work, pairs=pairs, area=self._scope.area) if detects else self._keypoints
+        self._closer += 1  # each numbers its keypoints, below 0, where no place is
+        keypoints = [replace(files, start=-self._closer << 32) for files in closer]
+        return match_pairs(views, keypoints, pairs, options, ground, self._work)
 
 
 def _unlike(linked: Tracks, registered: Tracks, pairs: Collection[tuple[int, int]]) -> list[tuple[int, int]]:

@@ -124,6 +124,24 @@ def test_an_image_that_is_left_out_leaves_the_rest_of_the_matches(shared_data, c
     assert len(result.run.matched) == 3
 
 
+@pytest.mark.parametrize(
+    ("name", "content"), [("a.txt", b""), ("a.txt", b"0 0\n"), ("a.match", bytes(16)), ("a.match", b"")]
+)
+def test_a_file_without_a_match_of_its_pair_is_as_none_and_said(corner, tmp_path, caplog, name, content) -> None:
+    """A matcher that found nothing writes one; a folder without any file of these images is a mistake."""
+    first, second = corner.images[:2]
+    ties = tmp_path / "ties"
+    ties.mkdir()
+    with pytest.raises(InputError, match="ties: no track is seen in two of the views"):
+        check([first, second], RunOptions(matches=str(ties)))
+    (ties / f"{first.stem}__{second.stem}{name[1:]}").write_bytes(content)
+    result = check([first, second], RunOptions(matches=str(ties)))
+    assert "holds no match" in caplog.text
+    assert result.tracks.xy.tolist() == check([first, second]).tracks.xy.tolist()
+    with pytest.raises(InputError, match="no track is seen in two of the views"):
+        check([first, second], RunOptions(matches=str(ties), matches_only=True))
+
+
 def test_several_files_are_one(tmp_path) -> None:
     """Points at the same place of an image are one, with the smaller sigma; a file that says nothing is an error."""
     views = load_views(IMAGES).views

@@ -14,7 +14,7 @@ from rasterio.control import GroundControlPoint
 from barpc.base.errors import InputError
 from barpc.pointio.columns import GROUND_SIGMA, IMAGE_SIGMA
 from barpc.pointio.correspondences import correspondence_kind, read_correspondences, read_grid
-from barpc.pointio.foreign import in_folder, index_pairs, pair_of
+from barpc.pointio.foreign import index_pairs, pair_files, pair_of
 from barpc.pointio.gcps import read_gcps
 from barpc.pointio.matches import Links, asp_text, read_links, read_matches, tracks_of
 from barpc.pointio.names import (
@@ -543,7 +543,7 @@ def test_a_file_is_named_after_its_two_images(name, pair) -> None:
 def test_of_two_files_of_a_pair_the_clean_one_is_taken(tmp_path) -> None:
     for name in ("a__b.match", "a__b-clean.match", "a__b.txt", "b_c.npz", "note.txt", "a__c.csv"):
         (tmp_path / name).touch()
-    assert [path.name for path in in_folder(tmp_path)] == ["a__b-clean.match", "a__b.txt", "b_c.npz"]
+    assert [path.name for path in pair_files(tmp_path)] == ["a__b-clean.match", "a__b.txt", "b_c.npz"]
 
 
 def test_what_is_written_for_asp_reads_back(tmp_path) -> None:

@@ -103,11 +103,12 @@ def test_a_closer_look_is_at_pairs_that_lack_and_knows_the_altitudes_of_the_othe
     monkeypatch.setattr(tracks, "locate", located)
     monkeypatch.setattr(tracks, "match_pairs", matched)
     monkeypatch.setattr(tracks, "replace", lambda files, start: (files, start))
-    trials: Any = SimpleNamespace(
-        looks=SimpleNamespace(views=["a", "b", "c"]), _options=TieOptions(), _keypoints=["coarse"] * 3, _work=None,
-        _coarse=True, _closer=0, _scope=SimpleNamespace(terrain=None, area=None),
-    )  # fmt: skip
-    found = tracks._Trials._matched(trials, pairs, [earlier])
+    trials = object.__new__(tracks._Trials)
+    trials.looks: Any = SimpleNamespace(views=["a", "b", "c"])
+    trials._scope: Any = SimpleNamespace(terrain=None, area=None)
+    trials._options, trials._keypoints, trials._work = TieOptions(), ["coarse"] * 3, None
+    trials._coarse, trials._closer = True, 0
+    found = trials._matched(pairs, [earlier])
     assert found == [closer[0], first[1], closer[1]]
     assert asked["near"] == asked["lacking"] == [pairs[0], pairs[2]]
     assert asked["keypoints"] == [("files", -1 << 32)] * 3

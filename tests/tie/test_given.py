@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +11,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 import barpc.tie.pixels as reading
-from barpc.base.errors import DisconnectedError
+from barpc.base.errors import DisconnectedError, TiePointError
 from barpc.rasters.raster import open_raster
 from barpc.scene import Tracks
 from barpc.tie import Matches, Scope, TieOptions, common_tracks, find_tracks
+from barpc.tie.pairing.epipolar import frame
 from barpc.tie.tracks import pair_counts
 from tests.lanes import rest_slow
 
@@ -69,13 +71,61 @@ def test_half_a_pixel_becomes_a_tenth_and_false_matches_go(
         assert (errors > 1.0).mean() <= 0.02
 
 
-def test_false_matches_alone_are_refused_and_said(render, caplog) -> None:
+def shifted(scene: Rendered, by: tuple[float, float]) -> dict[tuple[int, int], Matches]:
+    """Places in the first view and, all in one direction, beside the true ones of the second."""
+    given = true_matches(scene, (0, 1), noise=0.2)[0, 1]
+    return {(0, 1): replace(given, xy=given.xy + np.array([[0.0, 0.0], by]))}
+
+
+@pytest.mark.parametrize("count", [6, 13, 500])
+def test_false_matches_are_as_none_given_and_that_is_said(render, caplog, count: int) -> None:
     scene = render(views=2, size=(300, 300))
-    with pytest.raises(Exception, match=r"(no common offset|too few matches).* \(500 and 500"):
-        find_tracks(scene.views, scope=Scope(given=true_matches(scene, (0, 1), false=1.0)))
-    assert "the matches given are not used" in caplog.text
-    with pytest.raises(Exception, match="too few matches given"):
-        find_tracks(scene.views, scope=Scope(given=true_matches(scene, (0, 1), count=11)))
+    alone = find_tracks(scene.views)
+    result = find_tracks(scene.views, scope=Scope(given=true_matches(scene, (0, 1), count=count, false=1.0)))
+    assert result.tracks.xy.tolist() == alone.tracks.xy.tolist()
+    assert re.search(rf"of {count} matches given 0 are verified \(.*\): own are used, ok, \d\d\d", caplog.text)
+
+
+@pytest.mark.parametrize("by", [(0.0, 9.0), (-30.0, 0.0), (3.0, -4.0)])
+def test_matches_that_agree_with_each_other_and_with_no_pixel_give_way_to_own_ones(render, caplog, by) -> None:
+    """As those of other crops, or of another pair, do: their epipolar lines are straight, and elsewhere."""
+    scene = render(views=2, size=(300, 300))
+    result = find_tracks(scene.views, scope=Scope(given=shifted(scene, by)))
+    assert re.search(
+        r"of \d\d\d matches given \d\d? could be registered, of own ones \d{3,4}: these are used", caplog.text
+    )
+    assert result.pairs[0].matcher == "guided"
+    assert typical(scene, result.tracks, 0, 1) <= 0.1
+    errors = scene.errors(0, 1, *common_tracks(result.tracks, 0, 1))
+    assert np.abs(np.median(errors, axis=0)).max() <= 0.05
+
+
+@pytest.mark.parametrize(("count", "used"), [(25, False), (400, True)])
+def test_few_true_matches_have_own_ones_beside_them(render, caplog, count: int, used: bool) -> None:
+    scene = render(views=2, size=(300, 300))
+    result = find_tracks(scene.views, scope=Scope(given=true_matches(scene, (0, 1), count=count)))
+    assert (result.pairs[0].matcher == "given") is used
+    assert ("own are used" in caplog.text) is not used
+    assert typical(scene, result.tracks, 0, 1) <= 0.1
+
+
+@pytest.mark.parametrize(("noise", "used"), [(0.4, True), (7.0, False)])
+def test_where_nothing_else_ties_what_agrees_by_chance_is_refused(render, tmp_path, noise: float, used: bool) -> None:
+    """Images that show nothing: a matcher's places, or places that lie as densely beside a line as on it."""
+    scene, count = render(views=2, size=(300, 300)), 40
+    blank = write_image(tmp_path / "blank.tif", np.full((300, 300), 900, np.uint16))
+    views = [replace(view, path=str(blank)) for view in scene.views]
+    for seed in range(10):
+        given = true_matches(scene, (0, 1), count=count)[0, 1]
+        where = frame(*views, given.xy[:, 0])
+        along = np.random.default_rng(seed).normal(0, [[20.0], [noise]], (2, count))
+        places = np.stack([given.xy[:, 0], replace(where, across=where.across + along[1]).place(along[0])], axis=1)
+        scope = Scope(given={(0, 1): replace(given, xy=places)})
+        if used:
+            assert find_tracks(views, scope=scope).tracks.num_points >= 30
+            continue
+        with pytest.raises(TiePointError, match="too few tie points: view_00 - view_01"):
+            find_tracks(views, scope=scope)
 
 
 @pytest.mark.slow

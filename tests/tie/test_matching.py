@@ -14,7 +14,7 @@ from barpc.tie import TieOptions
 from barpc.tie.matchers import matching
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
-from barpc.tie.matchers.matching import MATCHERS, PairReport, _better, _latest, _Search, enough
+from barpc.tie.matchers.matching import MATCHERS, PairReport, _latest, _Search, better, enough
 from barpc.tie.pairing.epipolar import (
     EpipolarSegments,
 )
@@ -44,17 +44,17 @@ def test_a_report_says_which_attempts_found_fewer_of_how_many_that_were_wanted()
     few = PairReport(("v0", "v1"), "ok", (360, 400), 40, 20, spread=0.5, angle=9.0, overlap=0.5)
     loose = replace(few, verified=25, loosened=True)
     many = replace(few, matcher="structure", keypoints=(0, 0), verified=240)
-    first = _better((NO_MATCHES, few), (NO_MATCHES, loose))
+    first = better((NO_MATCHES, few), (NO_MATCHES, loose))
     assert first[1] == replace(loose, beaten=("guided 20 of 54",))
-    assert _better(first, (NO_MATCHES, many))[1] == replace(
+    assert better(first, (NO_MATCHES, many))[1] == replace(
         many, beaten=("guided 20 of 54", "guided, loosened 25 of 54")
     )
     none = replace(many, status="too few matches", verified=0)
-    assert _better(first, (NO_MATCHES, none))[1].beaten == ("guided 20 of 54", "structure 0 of 100")
-    assert _better((NO_MATCHES, few))[1].beaten == ()
+    assert better(first, (NO_MATCHES, none))[1].beaten == ("guided 20 of 54", "structure 0 of 100")
+    assert better((NO_MATCHES, few))[1].beaten == ()
     others = replace(NO_MATCHES)
-    assert _better((NO_MATCHES, few), (others, many))[0] is others
-    assert _better((NO_MATCHES, few), (others, few))[0] is NO_MATCHES  # of equals the earlier one
+    assert better((NO_MATCHES, few), (others, many))[0] is others
+    assert better((NO_MATCHES, few), (others, few))[0] is NO_MATCHES  # of equals the earlier one
 
 
 class Scripted:

@@ -29,8 +29,8 @@ from barpc.tie.matchers.matching import (
     FINE,
     STRUCTURE,
     Ground,
-    _better,
     _match_within,
+    better,
     match_pair,
 )
 from barpc.tie.matchers.structural import (
@@ -227,7 +227,7 @@ def test_the_attempt_with_more_verified_matches_counts_and_a_refused_one_never(m
         ((refused, few), few),
         ((few, replace(few, loosened=True)), few),
     ):
-        won = _better(*((found, attempt) for attempt in attempts))[1]
+        won = better(*((found, attempt) for attempt in attempts))[1]
         assert len(won.beaten) == len(attempts) - 1
         assert replace(won, beaten=()) == best
 

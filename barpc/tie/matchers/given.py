@@ -8,13 +8,16 @@ from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
+from scipy.special import bdtrc
 
 from barpc.base.options import TieOptions
+from barpc.base.usual import CHANCE
 from barpc.scene import View
 from barpc.tie.matchers.features import Keypoints
-from barpc.tie.matchers.matcher import Matches, Prediction
-from barpc.tie.matchers.matching import PairReport, match_pair
-from barpc.tie.pairing.overlaps import Pair
+from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
+from barpc.tie.matchers.matching import Ends, PairReport, better, match_pair
+from barpc.tie.pairing.epipolar import frame, robust_affine
+from barpc.tie.pairing.overlaps import GIVEN, Pair
 from barpc.tie.tasks import Work
 
 logger = logging.getLogger(__name__)
@@ -54,15 +57,38 @@ def verify_given(
         points = (_keypoints(given[pair.views], 0), _keypoints(given[pair.views], 1))
         tasks.append((ends, points, pair, chosen))
     verified = []
-    for pair, (found, report) in zip(pairs, work.ordered(match_pair, tasks, "verify"), strict=True):
+    for task, pair, (found, report) in zip(tasks, pairs, work.ordered(match_pair, tasks, "verify"), strict=True):
         if report.status == "too few keypoints":
             report = replace(report, status="too few matches given")
-        if report.status != "ok":
-            words = "%s - %s: the matches given are not used: %s (matches_only takes them as they are)"
-            logger.warning(words, *report.names, report.status)
-        report = replace(report, matcher="given")
+        if report.status == "ok" and not _stand_out(task[0], given[pair.views], found):
+            found, report = NO_MATCHES, replace(report, status="no more agree than by chance", verified=0)
+        report = replace(report, matcher=GIVEN)
         verified.append((replace(found, index=given[pair.views].index[found.index[:, 0]]), report))
     return verified
+
+
+def beside_given(
+    own: tuple[Matches, PairReport], given: tuple[Matches, PairReport] | None
+) -> tuple[Matches, PairReport]:
+    """Return own matches of a pair or those given, of which too few were verified: whichever are more; it is said."""
+    if given is None:
+        return own
+    best, report = better(own, given), given[1]
+    words = "%s - %s: of %d matches given %d are verified (%s): %s"
+    used = f"own are used, {best[1].status}, {best[1].verified}" if best[0] is own[0] else "they are used"
+    logger.warning(words, *report.names, report.keypoints[0], report.verified, report.status, used)
+    return best
+
+
+def _stand_out(ends: Ends, given: Matches, found: Matches) -> bool:
+    """Return whether more of the matches given lie as near to the fit of those verified as the farthest of these than
+    lie as far again from it, and not by chance: false ones are as many here as there, wherever a matcher looked.
+    """
+    rows, places = found.index[:, 0], given.xy[:, 0]
+    across = frame(*ends, places).errors(given.xy[:, 1])[:, 1]
+    off = np.abs(across - robust_affine(places[rows], across[rows])(places))
+    within, about = (int((off <= reach).sum()) for reach in off[rows].max() * np.array([1.0, 2.0]))
+    return bool(bdtrc(within - 1, about, 0.5) < CHANCE)
 
 
 def _keypoints(matches: Matches, end: int) -> Keypoints:

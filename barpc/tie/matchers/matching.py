@@ -165,7 +165,7 @@ def match_pair(views: Ends, keypoints: Points, pair: Pair, options: TieOptions) 
     if structural and all(report.status != "ok" for _, report in tried):
         found, report = _attempt(views, keypoints, pair, replace(loose, matcher=FINE), None, _LOOSE[1])
         tried.append((found, replace(report, loosened=True)))
-    return _better(*tried)
+    return better(*tried)
 
 
 def ample(report: PairReport, options: TieOptions) -> bool:
@@ -184,7 +184,7 @@ def _wanted(report: PairReport) -> int:
     return math.ceil(min(MANY, max(FEW, SHARE * common))) if common > 0 else MANY
 
 
-def _better(*attempts: tuple[Matches, PairReport]) -> tuple[Matches, PairReport]:
+def better(*attempts: tuple[Matches, PairReport]) -> tuple[Matches, PairReport]:
     """Return the attempt with most verified matches, of those that count; the earlier one of equals."""
     best = max(attempts, key=lambda attempt: attempt[1].verified if attempt[1].status == "ok" else -1)
     beaten = tuple(
@@ -310,7 +310,7 @@ def match_pairs(
         for k in thin
     ]
     for k, one in zip(thin, work.ordered(_match_within, again, STRUCTURE), strict=True):
-        found[k] = _better(found[k], one)
+        found[k] = better(found[k], one)
     return found
 
 
@@ -322,7 +322,7 @@ def _match_within(
     for views in several[1:]:
         if not enough(tried[-1][1]) and views[0].alt_range != several[0][0].alt_range:
             tried.append(match_pair(views, keypoints, pair, options))
-    return _better(*tried)
+    return better(*tried)
 
 
 def _latest(where: Callable[[Array], EpipolarSegments]) -> Callable[[Array], EpipolarSegments]:
