@@ -9,7 +9,7 @@ import errno
 import mmap
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 _LONGEST = 1500  # characters of a message
 
@@ -55,11 +55,15 @@ class TiePointError(BarpcError):
 
 
 class DisconnectedError(TiePointError):
-    """The views fall into groups that share no tie point: `groups`, tuples of their names, the largest first."""
+    """The views fall into groups that share no tie point: `groups`, tuples of their names, the largest first; `said`,
+    what is known to be wrong with some of them, by name.
+    """
 
-    def __init__(self, message: str, groups: Sequence[Sequence[str]] = ()) -> None:
+    def __init__(
+        self, message: str, groups: Sequence[Sequence[str]] = (), said: Mapping[str, str] | None = None
+    ) -> None:
         super().__init__(message)
-        self.groups = tuple(tuple(group) for group in groups)
+        self.groups, self.said = tuple(tuple(group) for group in groups), dict(said or {})
 
 
 class AdjustError(BarpcError):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -374,7 +374,7 @@ def _with_ties(run: Run, options: RunOptions, work: Work, terrain: Dem | None = 
     except DisconnectedError as error:
         if not options.keep_going or len(error.groups[0]) < 2:
             raise
-        kept = _only(run, frozenset(error.groups[0]))
+        kept = _only(run, frozenset(error.groups[0]), error.said)
         logger.warning("%d of %d images are tied together and kept", len(kept.views), len(views))
         return _with_ties(kept, options, work, terrain)
     return replace(run, tracks=ties.tracks, matched=ties.pairs)
@@ -391,10 +391,10 @@ def _write_matches(run: Run, workspace: Workspace) -> None:
         workspace.write_text(f"asp/{pair_name(names[i], names[j])}.txt", text)
 
 
-def _only(run: Run, names: frozenset[str]) -> Run:
+def _only(run: Run, names: frozenset[str], said: Mapping[str, str]) -> Run:
     """Return the run as it was loaded, without the views that the others are not tied to."""
     why = "it shares no tie points with the largest group of images"
-    dropped = tuple((view.path, why) for view in run.views if view.name not in names)
+    dropped = tuple((view.path, said.get(view.name, why)) for view in run.views if view.name not in names)
     kept = [i for i, view in enumerate(run.views) if view.name in names]
     return replace(
         run,

@@ -33,6 +33,7 @@ from barpc.tie.matchers.matching import (
     matcher_named,
     quick_score,
 )
+from barpc.tie.matchers.placings import misplaced, stretched
 from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.epipolar import grouped, linear_map
 from barpc.tie.pairing.overlaps import (
@@ -272,7 +273,7 @@ class _Trials:
         """Return matches of pairs of looks by a first look, and by a closer one where that shows too little."""
         views, options, keypoints = self.looks.views, self._options, self._keypoints
         first = first_look(views, keypoints, pairs, options, self._work) if self._coarse else []
-        found = {p.views: one for p, one in zip(pairs, first, strict=False) if ample(one[1], options)}
+        found = {p.views: one for p, one in zip(pairs, first, strict=False) if self._is_ample(p, *one)}
         lacking = [pair for pair in pairs if pair.views not in found]
         known = [((views[p.views[0]], views[p.views[1]]), found[p.views][0]) for p in pairs if p.views in found]
         ground = Ground(self._scope.terrain, (*before, *known))
@@ -282,6 +283,10 @@ class _Trials:
             again = match_pairs(views, keypoints, lacking, options, ground, self._work)
         found |= {pair.views: one for pair, one in zip(lacking, again, strict=True)}
         return [found[pair.views] for pair in pairs]
+
+    def _is_ample(self, pair: Pair, found: Matches, report: PairReport) -> bool:
+        i, j = pair.views
+        return ample(report, self._options) and not stretched((self.looks.views[i], self.looks.views[j]), *found.ends)
 
     def _looked_closer(self, pairs: Sequence[Pair], ground: Ground) -> list[tuple[Matches, PairReport]]:
         """Match pairs of looks by keypoints of their own."""
@@ -364,6 +369,9 @@ def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
 def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Sequence[PairReport]) -> None:
     """Raise TiePointError where two views do not match, DisconnectedError where more fall into groups."""
     failed = [report for report in reports if report.status != "ok"]
+    links = [pair.views for pair, report in zip(pairs, reports, strict=True) if report.status == "ok"]
+    placings = {pair.views: report.placings for pair, report in zip(pairs, reports, strict=True)}
+    said = misplaced(views, links, placings)
     listed = "; ".join(
         f"{r.names[0]} - {r.names[1]}: {r.status} ({r.keypoints[0]} and {r.keypoints[1]} keypoints, "
         f"{r.verified} of {r.matches} matches verified)"
@@ -376,10 +384,10 @@ def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Seque
     if blank:
         names = ", ".join(blank[:4])
         advice = f"no detail in {names} (one value? no valid pixels? clouds?): look at the images"
+    why = "; ".join(f"{view.path}: {said[view.name]}" for view in views if view.name in said) or f"{listed}: {advice}"
     if len(views) == 2 and failed:
-        raise TiePointError(f"too few tie points: {listed}: {advice}")
-    links = [pair.views for pair, report in zip(pairs, reports, strict=True) if report.status == "ok"]
-    require_connected(views, links, f"no tie points between them: {listed}: {advice}")
+        raise TiePointError(f"too few tie points: {why}")
+    require_connected(views, links, f"no tie points between them: {why}", said)
 
 
 def require_tracks(views: Sequence[View], tracks: Tracks, pairs: Sequence[Pair], reports: Sequence[PairReport]) -> None:

@@ -14,8 +14,8 @@ import pytest
 import rasterio
 from rasterio.windows import Window
 
-from barpc.base.errors import ImageError, InputError, RpcError
-from barpc.pipeline import load_views
+from barpc.base.errors import DisconnectedError, ImageError, InputError, RpcError
+from barpc.pipeline import RunOptions, adjust, load_views
 from barpc.pipeline import loading as views
 from barpc.pipeline.loading import image_path
 from barpc.rpcio import write_rpc
@@ -300,3 +300,24 @@ def test_a_copy_in_another_folder_is_found_whatever_its_name(pair, tmp_path) -> 
     copy = shutil.copy(pair[0], tmp_path / "far" / "z.tif")
     write_rpc(make_rpc().crop(3, 4), tmp_path / "far" / "z_RPC.TXT")
     refused([pair[0], Path(copy)], r"z\.tif: shows the same pixels as .*a\.tif")
+
+
+@pytest.mark.slow
+def test_an_image_that_its_rpc_is_not_for_is_left_out_and_said(corner, tmp_path) -> None:
+    """Mirrored, as some readers write images: the two others are adjusted as without it."""
+    mirrored = tmp_path / corner.images[1].name
+    with rasterio.open(corner.images[1]) as image:
+        pixels, profile, tags = image.read()[:, :, ::-1], image.profile, image.tags(ns="RPC")
+    with rasterio.open(mirrored, "w", **profile) as out:
+        out.write(pixels)
+        out.update_tags(ns="RPC", **tags)
+    images = [corner.images[0], mirrored, corner.images[2]]
+    words = "shows the picture mirrored, its columns reversed, as keypoints of"
+    with pytest.raises(DisconnectedError, match=f"{mirrored}: {words}"):
+        adjust(images, tmp_path / "out")
+    assert not (tmp_path / "out/summary.json").exists()
+    result = adjust(images, tmp_path / "out", RunOptions(keep_going=True, overwrite=True))
+    assert result.record.left_out[0].reason.startswith(words)
+    assert result.record.status == "bad"
+    alone = adjust([images[0], images[2]], tmp_path / "alone")
+    assert result.tracks.xy.tolist() == alone.tracks.xy.tolist()

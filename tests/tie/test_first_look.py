@@ -102,6 +102,7 @@ def test_a_closer_look_is_at_pairs_that_lack_and_knows_the_altitudes_of_the_othe
     monkeypatch.setattr(tracks, "first_look", lambda *_: first)
     monkeypatch.setattr(tracks, "locate", located)
     monkeypatch.setattr(tracks, "match_pairs", matched)
+    monkeypatch.setattr(tracks, "stretched", lambda *_: False)
     monkeypatch.setattr(tracks, "replace", lambda files, start: (files, start))
     trials = object.__new__(tracks._Trials)
     trials.looks: Any = SimpleNamespace(views=["a", "b", "c"])

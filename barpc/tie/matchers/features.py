@@ -56,6 +56,10 @@ class Keypoints:
         """Return the keypoints of a mask or of indices."""
         return Keypoints(*(getattr(self, field.name)[which] for field in fields(self)))
 
+    def strongest(self, most: int) -> Keypoints:
+        """Return so many keypoints, the strongest."""
+        return self.select(np.argsort(-self.response, kind="stable")[:most])
+
 
 def join_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
     """Join the keypoints of several tiles; an empty set of none."""

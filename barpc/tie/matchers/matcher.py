@@ -80,6 +80,11 @@ class Matches:
         """Number of matches M."""
         return len(self.xy)
 
+    @property
+    def ends(self) -> tuple[Array, Array]:
+        """Places (M, 2), (M, 2) [px] in either view."""
+        return self.xy[:, 0], self.xy[:, 1]
+
     @staticmethod
     def of_places(xy: Array, score: Array) -> Matches:
         """Return the matches whose points are numbered by the pixel in which they lie."""

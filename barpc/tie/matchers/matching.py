@@ -20,11 +20,12 @@ from scipy.spatial import cKDTree
 
 from barpc.base.geodesy import Array
 from barpc.base.options import TieOptions
-from barpc.base.usual import FEW, MANY, robust_spread
+from barpc.base.usual import FEW, MANY, SAMPLE, robust_spread
 from barpc.scene import IntArray, View
 from barpc.tie.matchers.features import AMPLE, KeypointFiles, Keypoints, ample_matches, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
 from barpc.tie.matchers.matcher import APART, NO_MATCHES, Hook, Matcher, Matches, Prediction, hooked
+from barpc.tie.matchers.placings import Placing, Placings, likeliest, stretched
 from barpc.tie.matchers.structural import FineStructure, GradientStructure
 from barpc.tie.pairing.epipolar import (
     LEAST_REACH,
@@ -93,6 +94,7 @@ class PairReport:
     reason: str = ""  # why the pair was tried
     beaten: tuple[str, ...] = ()
     """Attempts that found fewer: matcher, whether loosened, verified matches of those wanted, as "guided 12 of 100"."""
+    placings: Placings = (None, None)
     unregistered: int = 0  # of its tracks stand where keypoints were found: their patches could not be registered
 
     @property
@@ -144,8 +146,34 @@ def match_pair(views: Ends, keypoints: Points, pair: Pair, options: TieOptions) 
     """Match two views; keypoints are empty for a matcher that wants none. Without matches the report gives
     the reason.
 
-    Where few or none are found, loosened thresholds are tried, and what finds more counts.
+    Where few or none are found, loosened thresholds are tried, and what finds more counts; where none are, or matches
+    of another size than the cameras say, it is asked whether a picture lies otherwise than its camera says.
     """
+    found, report = _attempts(views, keypoints, pair, options)
+    if options.matcher != _DEFAULTS.matcher or (report.status == "ok" and not stretched(views, *found.ends)):
+        return found, report
+    a, b = (
+        points.strongest(SAMPLE).load()[0] if isinstance(points, KeypointFiles) else points.strongest(SAMPLE)
+        for points in keypoints
+    )
+    placings = _placing(views[::-1], (b, a), pair, options), _placing(views, (a, b), pair, options)
+    if placings == (None, None):
+        return found, report
+    return NO_MATCHES, replace(
+        report, status="a picture lies otherwise than its RPC says", verified=0, placings=placings
+    )
+
+
+def _placing(views: Ends, keypoints: tuple[Keypoints, Keypoints], pair: Pair, options: TieOptions) -> Placing | None:
+    """Return how the second picture lies if it matches so, and by the keypoints' own looks not as its camera says."""
+    a, b = keypoints
+    placing, count = likeliest(views, keypoints) if len(a) and len(b) else (None, 0)
+    if placing is None or count < options.min_matches or placing.is_stated(reach_of(views[1], options)):
+        return None
+    return placing if _attempt(views, (a, placing.undone(b)), pair, options)[1].status == "ok" else None
+
+
+def _attempts(views: Ends, keypoints: Points, pair: Pair, options: TieOptions) -> tuple[Matches, PairReport]:
     looked: dict[str, _Search] = {}
     first = _attempt(views, keypoints, pair, options, looked)
     if enough(first[1]) or "keypoints" in first[1].status or options.matcher not in MATCHERS:
@@ -176,6 +204,11 @@ def ample(report: PairReport, options: TieOptions) -> bool:
 def enough(report: PairReport) -> bool:
     """Return whether a pair has enough matches not to be tried again."""
     return report.status == "ok" and report.verified >= _wanted(report)
+
+
+def _worth_more(report: PairReport) -> bool:
+    """Return whether another matcher may find what one by keypoints did not."""
+    return not any(report.placings) and "keypoints" not in report.status
 
 
 def _wanted(report: PairReport) -> int:
@@ -301,7 +334,7 @@ def match_pairs(
     named = options.matcher != _DEFAULTS.matcher
     if named and (options.matcher != STRUCTURE or ground.terrain is None):  # a name is what is wanted
         return found
-    thin = [k for k, (_, report) in enumerate(found) if not enough(report) and "keypoints" not in report.status]
+    thin = [k for k, (_, report) in enumerate(found) if not enough(report) and _worth_more(report)]
     good = [(task[0], one[0]) for task, one in zip(tasks, found, strict=True) if thin and enough(one[1])]
     known = Ground(ground.terrain, (*ground.ties, *good)).altitudes() if thin else None
     none, other = join_keypoints([]), replace(options, matcher=STRUCTURE)

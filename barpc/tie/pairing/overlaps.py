@@ -207,14 +207,18 @@ def _candidates(
     return sorted(pairs, key=lambda pair: pair.views)
 
 
-def require_connected(views: Sequence[View], links: Sequence[tuple[int, int]], why: str) -> None:
-    """Raise DisconnectedError unless the links connect all views; `why` says what is missing and what to do."""
+def require_connected(
+    views: Sequence[View], links: Sequence[tuple[int, int]], why: str, said: Mapping[str, str] | None = None
+) -> None:
+    """Raise DisconnectedError unless the links connect all views; `why` says what is missing and what to do, `said` of
+    single views what is wrong with them.
+    """
     groups = connected_groups(len(views), links)
     if len(groups) < 2:
         return
     names = [[views[i].name for i in group] for group in groups]
     told = "; ".join(listed(group, 5) for group in names[:6])
-    raise DisconnectedError(f"the images fall into {len(groups)} groups ({told}): {why}", names)
+    raise DisconnectedError(f"the images fall into {len(groups)} groups ({told}): {why}", names, said)
 
 
 def shared_tiles(

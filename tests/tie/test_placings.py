@@ -1,0 +1,164 @@
+"""Pictures that lie otherwise than their RPCs say: each is named, the others go on, and none that is right is asked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from barpc.base.errors import DisconnectedError, TiePointError
+from barpc.rasters.raster import open_raster
+from barpc.scene import View
+from barpc.tie import find_tracks
+from barpc.tie.matchers import matching
+from barpc.tie.matchers.features import Sift
+from barpc.tie.matchers.placings import Placing, _mirrored, misplaced, stretched
+from tests.lanes import rest_slow
+
+from .conftest import write_image
+
+
+def _mean(pixels: np.ndarray, side: int) -> np.ndarray:
+    rows, cols = (n // side for n in pixels.shape)
+    return pixels[: rows * side, : cols * side].reshape(rows, side, cols, side).mean(axis=(1, 3)).astype(pixels.dtype)
+
+
+def _times(pixels: np.ndarray, factor: int) -> np.ndarray:
+    return cv2.resize(pixels, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
+
+
+LAID = {
+    "with rows and columns exchanged,": np.transpose,
+    "at half the size that its RPC is for,": lambda pixels: _mean(pixels, 2),
+    "mirrored, its columns reversed,": np.fliplr,
+    "mirrored, its rows reversed,": np.flipud,
+    "turned by 90 degrees clockwise,": lambda pixels: np.rot90(pixels, -1),
+    "turned by 180 degrees,": lambda pixels: np.rot90(pixels, 2),
+    "turned by 90 degrees counter-clockwise,": np.rot90,
+    "with rows and columns exchanged and both reversed,": lambda pixels: np.rot90(pixels, 2).T,
+    "at a quarter of the size that its RPC is for,": lambda pixels: _mean(pixels, 4),
+    "at a third of the size that its RPC is for,": lambda pixels: _mean(pixels, 3),
+    "at twice the size that its RPC is for,": lambda pixels: _times(pixels, 2),
+    "at 4 times the size that its RPC is for,": lambda pixels: _times(pixels, 4),
+    "mirrored, its columns reversed, at half the size that its RPC is for,": lambda pixels: _mean(pixels[:, ::-1], 2),
+}
+
+
+def laid(view: View, how: str, folder: Path) -> View:
+    with open_raster(view.path) as image:
+        pixels = np.ascontiguousarray(LAID[how](image.read(1)))
+    return replace(view, path=str(write_image(folder / f"{view.name}.tif", pixels)), size=pixels.shape[::-1])
+
+
+@pytest.mark.parametrize("how", rest_slow(LAID, 3))
+def test_a_picture_that_lies_otherwise_is_named_and_how(render, tmp_path, how: str) -> None:
+    scene = render(views=3, size=(300, 300))
+    for wrong in range(3):
+        views = [laid(view, how, tmp_path) if k == wrong else view for k, view in enumerate(scene.views)]
+        with pytest.raises(DisconnectedError) as caught:
+            find_tracks(views)
+        name = views[wrong].name
+        assert list(caught.value.said) == [name]
+        assert caught.value.said[name].startswith(f"shows the picture {how} as keypoints of view_0")
+        assert f"{views[wrong].path}: shows the picture {how}" in str(caught.value)
+        assert caught.value.groups == (tuple(v.name for k, v in enumerate(views) if k != wrong), (name,))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", LAID)
+def test_so_it_is_among_real_images(triplet, ventoux, tmp_path, how: str) -> None:
+    views = [triplet[0], laid(triplet[1], how, tmp_path), triplet[2]]
+    with pytest.raises(DisconnectedError, match=f"img_02.tif: shows the picture {how} as keypoints of img_0"):
+        find_tracks(views)
+    if "quarter" in how:  # of 500 px, of which they share a third
+        return
+    with pytest.raises(TiePointError, match=f"right_image.tif: shows the picture {how}|left_image.tif: shows "):
+        find_tracks([ventoux[0], laid(ventoux[1], how, tmp_path)])
+
+
+@pytest.mark.slow
+def test_of_two_images_the_size_of_the_whole_tells_which(render, tmp_path) -> None:
+    """An RPC for the whole image ends where this does; of a crop nothing tells, and both are named."""
+    scene = render(views=2, size=(300, 300))
+    how = "at half the size that its RPC is for,"
+    for wrong in (0, 1):
+        views = [laid(view, how, tmp_path) if k == wrong else view for k, view in enumerate(scene.views)]
+        with pytest.raises(TiePointError, match=rf"{views[wrong].path}: shows the picture {how} as keypoints of"):
+            find_tracks(views)
+    with pytest.raises(TiePointError, match=r"view_01.tif: shows the picture .*, or view_00 the reverse, as keypoints"):
+        find_tracks([scene.views[0], laid(scene.views[1], "turned by 180 degrees,", tmp_path)])
+
+
+def test_images_that_are_right_are_not_asked(render, triplet, ventoux, monkeypatch) -> None:
+    """Nor crops with RPCs of their own, which end where the whole images do."""
+
+    def never(*_: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(matching, "likeliest", never)
+    for views in (render(views=2, size=(300, 300)).views, triplet[:2], ventoux):
+        assert find_tracks(views).tracks.num_points > 200
+
+
+@pytest.mark.slow
+def test_pictures_of_nothing_in_common_lie_no_how(render, tmp_path) -> None:
+    first, second = render(views=2, size=(300, 300)).views
+    noise = np.random.default_rng(1).integers(100, 3000, (300, 300)).astype(np.uint16)
+    for pixels in (noise, np.full((300, 300), 900, np.uint16)):
+        other = replace(second, path=str(write_image(tmp_path / "other.tif", pixels)))
+        with pytest.raises(TiePointError) as caught:
+            find_tracks([first, other])
+        assert "shows the picture" not in str(caught.value)
+
+
+def test_descriptors_of_a_mirrored_picture_are_those_of_the_picture_in_another_order() -> None:
+    picture = cv2.GaussianBlur(np.random.default_rng(4).integers(0, 255, (200, 200)).astype(np.float32), (0, 0), 2.5)
+    picture = cv2.normalize(picture, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
+
+    def found(pixels: np.ndarray) -> object:
+        return Sift().detect(np.ascontiguousarray(pixels), lambda xy, _scale, _response: np.arange(len(xy)))
+
+    ours, theirs = found(picture), found(picture[::-1])
+    matched = 0
+    for xy, angle, described in zip(ours.xy, ours.angle, _mirrored(ours.descriptors), strict=True):
+        near = np.hypot(*(theirs.xy - [xy[0], 199 - xy[1]]).T) + 50 * np.abs(
+            np.exp(1j * theirs.angle) - np.exp(-1j * angle)
+        )
+        k = int(near.argmin())
+        if near[k] < 3.0:
+            matched += 1
+            cosine = np.dot(described / 255.0, theirs.descriptors[k] / 255.0)
+            assert cosine > 0.9
+    assert matched > 50
+    assert (_mirrored(_mirrored(ours.descriptors)) == ours.descriptors).all()
+
+
+@pytest.mark.parametrize(
+    ("scale", "asked"), [(1.0, False), (0.75, False), (1.35, False), (0.5, True), (2.0, True), (-1.0, True)]
+)
+def test_scale_is_asked_across_the_lines_where_relief_has_no_say(render, scale: float, asked: bool) -> None:
+    scene = render(views=2, size=(300, 300))
+    rng = np.random.default_rng(2)
+    first = rng.uniform(0, 299, (200, 2))
+    where = matching.frame(*scene.views, first)
+    across = where.across.mean() + scale * (where.across - where.across.mean()) + rng.normal(0, 0.3, 200)
+    second = replace(where, across=across).place(rng.normal(0, 40, 200))
+    assert stretched((scene.views[0], scene.views[1]), first, second) is asked
+    line = np.abs(where.across - np.median(where.across)) < 0.3  # on one line nothing tells
+    assert not stretched((scene.views[0], scene.views[1]), first[line], second[line])
+    assert not stretched((scene.views[0], scene.views[1]), first[:0], second[:0])
+
+
+def test_who_is_wrong_is_who_the_others_are_not_tied_to(render) -> None:
+    """Of two groups alike both are named; of pairs that lie alike none is."""
+    views = [replace(render(views=2, size=(300, 300)).views[0], name=name) for name in "abcd"]
+    turned = Placing(False, 2, 1.0)
+    assert list(misplaced(views, [(0, 1), (1, 2)], {(0, 3): (turned, turned), (2, 3): (turned, None)})) == ["d"]
+    said = misplaced(views, [(0, 1), (2, 3)], {(0, 2): (turned, turned)})
+    assert list(said) == ["c"]
+    assert "or a the reverse" in said["c"]
+    assert misplaced(views, [(0, 1), (1, 2)], {(0, 3): (None, None)}) == {}
+    assert misplaced(views, [(0, 1), (1, 2)], {(0, 2): (turned, turned)}) == {}
