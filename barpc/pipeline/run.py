@@ -377,7 +377,7 @@ def _with_ties(run: Run, options: RunOptions, work: Work, terrain: Dem | None = 
         kept = _only(run, frozenset(error.groups[0]), error.said)
         logger.warning("%d of %d images are tied together and kept", len(kept.views), len(views))
         return _with_ties(kept, options, work, terrain)
-    return replace(run, tracks=ties.tracks, matched=ties.pairs)
+    return replace(run, tracks=ties.tracks, matched=ties.pairs, detail=ties.detail)
 
 
 def _write_matches(run: Run, workspace: Workspace) -> None:

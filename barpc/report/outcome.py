@@ -20,6 +20,7 @@ from barpc.scene import BoolArray, Camera, GroundPoints, IntArray, Tracks, View,
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, Several, Triangulation, triangulate
 from barpc.tie import PairReport, ReferenceControl
+from barpc.tie.detail import Gap, gap, in_parts
 from barpc.tie.matchers.matching import FINE
 
 MAX_TRACKS = 200_000
@@ -57,7 +58,8 @@ class Run:
     points from a file); `adjustment`, `centers`, `fits`: of an adjustment that went so far; `written`, per view: file,
     consumer that reopened it, largest difference to P_BA [px] or why it does not read it; `left_out`: files, and why;
     `stages`: their seconds and peak memory so far; `check_points` stayed out of the adjustment; `reference`: what an
-    orthoimage said; `datums`: what heights that hold the scene were taken to count from, where no person said it.
+    orthoimage said; `datums`: what heights that hold the scene were taken to count from, where no person said it;
+    `detail`: where keypoints of the views, as matching saw them, let tie points be expected.
     """
 
     kind: Literal["adjust", "check", "match"]
@@ -77,6 +79,7 @@ class Run:
     check_points: GroundPoints | None = None
     reference: ReferenceControl | None = None
     datums: tuple[HeightDatum, ...] = ()
+    detail: tuple[IntArray, ...] = ()
 
     @cached_property
     def before(self) -> tuple[SensorModel, ...]:
@@ -108,6 +111,15 @@ class Run:
     def moving(self) -> BoolArray:
         """The observations (K,) of tie points that move together: they took no part either."""
         return self._rows("moving")
+
+    @cached_property
+    def gaps(self) -> dict[int, Gap]:
+        """The columns or rows of views that have no tie points though their detail lets these be expected."""
+        found, tracks = dict[int, Gap](), self.tracks
+        for v, (view, detail) in enumerate(zip(self.views, self.detail, strict=False)):
+            one = gap(detail, in_parts(tracks.xy[tracks.view == v], view.size), view.size)
+            found |= {} if one is None else {v: one}
+        return found
 
     @cached_property
     def met_worse(self) -> list[Place]:

@@ -14,7 +14,7 @@ from barpc.base.geodesy import Array
 from barpc.base.usual import FEW, SURE, SURELY
 from barpc.report.outcome import MANY_REJECTED, SMOOTH_LEFT, WHOLE_PIXELS, Run
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.whole import LeftEntry, left_entries, strangeness
+from barpc.report.summary.whole import AXES, LeftEntry, left_entries, strangeness
 from barpc.report.summary.words import CAUSES, NAMED, counted, known, metres
 from barpc.scene import GroundPoints
 from barpc.sensor.rpc import RPC
@@ -71,16 +71,18 @@ def _reservations(view: ViewEntry, run: Run) -> Found:
 
 
 def _weakly_tied(view: ViewEntry, run: Run) -> Found:
-    """Say that an image has few tie points, or some that may all be off alike, where no control tells either."""
+    """Say that a view has few tie points, some that may all be off alike, or a part without where there is detail."""
     by_reference = run.reference is not None and any(v.points and v.name == view.name for v in run.reference.views)
-    if by_reference or view.num_gcps >= ENOUGH_GCPS:
-        return
-    if view.num_observations < FEW:
+    controlled = by_reference or view.num_gcps >= ENOUGH_GCPS
+    if view.num_observations < FEW and not controlled:
         gcps = f"{view.num_gcps} GCP{'s' * (view.num_gcps > 1)}"
         what = "few" if view.num_observations else "few_gcps" if view.num_gcps else "none"
         yield what, {"few": view.num_observations, "gcps": gcps}
-    if view.name in run.whole_pixels and run.kind != "match":
+    if view.name in run.whole_pixels and run.kind != "match" and not controlled:
         yield "whole_pixels", {"shared": WHOLE_PIXELS}
+    if (gap := run.gaps.get(run.number[view.name])) is not None:
+        place = f"{AXES[gap.axis]} {gap.first:.0f}-{gap.last:.0f}"
+        yield "gap", {"place": place, "found": gap.found, "due": gap.expected}
 
 
 def _failed(view: ViewEntry, run: Run, adjustment: Adjustment) -> Found:

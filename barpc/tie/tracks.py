@@ -14,9 +14,10 @@ from scipy.spatial import cKDTree
 from barpc.base.errors import TiePointError
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.options import TieOptions
-from barpc.base.usual import MANY
+from barpc.base.usual import FEW, MANY
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
+from barpc.tie.detail import Seen, seen_detail
 from barpc.tie.matchers.features import KeypointFiles, locate, worth_a_first_look
 from barpc.tie.matchers.given import GivenMatches, beside_given, verify_given
 from barpc.tie.matchers.matcher import Matches
@@ -50,7 +51,7 @@ from barpc.tie.pairing.overlaps import (
     require_connected,
     several_dates,
 )
-from barpc.tie.pairing.resolution import Looks
+from barpc.tie.pairing.resolution import Looks, finer
 from barpc.tie.patches.oriented import REACH
 from barpc.tie.patches.register import refine
 from barpc.tie.pixels import sample_stretch
@@ -72,6 +73,7 @@ class TieResult:
     tracks: Tracks
     pairs: tuple[PairReport, ...]  # one a pair that was tried
     keypoints: tuple[int, ...]  # of each view
+    detail: tuple[IntArray, ...] = ()  # of each view: what partners see of it, as `seen_detail` counts
 
 
 def find_tracks(
@@ -109,10 +111,11 @@ def find_tracks(
         trials.run(possible_pairs(views, options, scope), all_of_them=bool(scope.only))
         require_matches(views, *trials.outcome)
         tracks, bare = _registered(trials, scope, options, Work(executor, progress))
+        detail = trials.detail()
     pairs, reports = trials.outcome
     reports = [replace(r, unregistered=bare.get(p.views, 0)) for p, r in zip(pairs, reports, strict=True)]
     require_tracks(views, tracks, pairs, reports)
-    return TieResult(tracks, tuple(reports), trials.keypoints)
+    return TieResult(tracks, tuple(reports), trials.keypoints, detail)
 
 
 def _registered(
@@ -222,6 +225,18 @@ class _Trials:
         """Number of keypoints found in each view."""
         count = np.bincount(self.looks.of, weights=[len(k) for k in self._keypoints])
         return tuple(count.astype(int).tolist())
+
+    def detail(self) -> tuple[IntArray, ...]:
+        """Return the keypoints of every view that partners see with which keypoints tie it, as `seen_detail` counts."""
+        seen: list[list[Seen]] = [[] for _ in self._views]
+        for (i, j), (_, found, report) in self.tried.items():
+            if report.matcher == _DEFAULTS.matcher and len(found) >= FEW:
+                first, second = map(finer, found.ends, self.looks.pixel[list(self.looks.ends[i, j])])
+                seen[i].append((first, second, self._views[j].size))
+                seen[j].append((second, first, self._views[i].size))
+        whole = [int(np.flatnonzero(self.looks.of == v)[0]) for v in range(len(self._views))]
+        tasks = [(self._keypoints[k], view.size, one) for k, view, one in zip(whole, self._views, seen, strict=True)]
+        return tuple(self._work.ordered(seen_detail, tasks, "detail"))
 
     @property
     def outcome(self) -> tuple[list[Pair], list[PairReport]]:

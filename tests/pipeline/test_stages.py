@@ -280,7 +280,7 @@ def test_the_page_is_named_where_it_can_be_drawn(tmp_path, monkeypatch, drawn) -
 def test_a_run_without_some_of_its_views_keeps_what_belongs_to_the_others() -> None:
     sources = tuple(SimpleNamespace(path=Path(f"{n}.RPB")) for n in range(3))
     run = Run("adjust", views(), sources, NONE, left_out=(("/x/bad.tif", "bad"),))  # type: ignore[arg-type]
-    kept = stages._only(run, frozenset(["v0", "v2"]))
+    kept = stages._only(run, frozenset(["v0", "v2"]), {})
     assert [view.name for view in kept.views] == ["v0", "v2"]
     assert kept.sources == (sources[0], sources[2])
     assert kept.left_out == (
@@ -288,6 +288,8 @@ def test_a_run_without_some_of_its_views_keeps_what_belongs_to_the_others() -> N
         ("/x/v1.tif", "it shares no tie points with the largest group of images"),
     )
     assert (kept.adjustment, kept.reference) == (None, None)
+    known = stages._only(run, frozenset(["v0", "v2"]), {"v1": "shows the picture mirrored"})
+    assert known.left_out[1] == ("/x/v1.tif", "shows the picture mirrored")
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from barpc.report.reservations import control_reasons, enu
 from barpc.report.summary.views import FitEntry
 from barpc.report.verdict import block_verdict, view_status
 from barpc.scene import Tracks
+from barpc.tie.detail import Gap
 from barpc.tie.reference import PEAK, ReferenceControl, ViewMatch
 from tests.rpcio.conftest import make_rpc
 
@@ -52,7 +53,7 @@ def run_of(adjustment: Any = None, kind: str = "adjust", **fields: Any) -> Any:
         "kind": kind, "adjustment": adjustment or adjusted(), "options": SimpleNamespace(), "reference": None,
         "copies": {}, "number": {name: k for k, name in enumerate(NAMES)}, "gcps": None, "check_points": None,
         "left_out": (), "after": None, "tracks": [0] * 9, "met_worse": (), "matched": (), "beside": {},
-        "datums": (), "whole_pixels": frozenset(),
+        "datums": (), "whole_pixels": frozenset(), "gaps": {},
         "views": tuple(SimpleNamespace(name=name, sensor=make_rpc()) for name in NAMES),
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **fields})
@@ -142,6 +143,12 @@ def test_what_is_advised_has_its_figures():
     assert advice(check, rmse_before=0.5, rmse_after=9.0) == ""
     assert advice(run_of(kind="match"), rmse_before=9.0, rmse_after=9.0, num_rejected=999) == ""
     assert advice(run_of(kind="match"), num_observations=5).startswith("only 5")
+    lacking = run_of(kind="match", gaps={0: Gap(1, 40.0, 157.0, 1, 216)})
+    assert advice(lacking) == (
+        "rows 40-157 have 1 of some 216 tie points that their detail lets expect, so an error there would not show: "
+        "look for clouds, water, change there, or a jump of the image"
+    )
+    assert view_status(a_view("B"), lacking)["advice"] == ""
     copies = {"A": "B, moved by 1 columns and 2 rows"}
     assert (
         advice(run_of(copies=copies))

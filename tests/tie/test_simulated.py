@@ -114,7 +114,7 @@ def test_the_result_is_the_same_to_the_byte_for_any_workers(render, workers, num
     for name in ("view", "point", "xy", "sigma"):
         assert getattr(result.tracks, name).tobytes() == getattr(expected.tracks, name).tobytes()
     assert result.pairs == expected.pairs
-    assert {stage for stage, _, _ in seen} == {"read", "detect", "match", "refine"}
+    assert {stage for stage, _, _ in seen} == {"read", "detect", "match", "refine", "detail"}
     assert all(1 <= done <= total for _, done, total in seen)
 
 

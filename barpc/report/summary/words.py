@@ -131,6 +131,9 @@ CAUSES = {
         "look for repeated patterns and noise, or give matches of your own (--matches)"),
     "place": Cause("doubtful", "a part of it lies off",
         "{place} stand out, {what}", "look for clouds, water, change there"),
+    "gap": Cause("doubtful", "a part of it without tie points",
+        "{place} have {found} of some {due} tie points that their detail lets expect, so an error there would not show",
+        "look for clouds, water, change there, or a jump of the image"),
     "beside": Cause("doubtful", "beside an image that contradicts",
         "tie points that took no part are left with {error:.2f} px, and most of these are seen in {other} too, whose "
         "tie points contradict the others",

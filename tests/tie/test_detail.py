@@ -1,0 +1,118 @@
+"""Ground without tie points is said where there is as much to see as beside it, and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from barpc.rasters.raster import open_raster
+from barpc.scene import View
+from barpc.tie import find_tracks
+from barpc.tie.detail import PARTS, Gap, gap, in_parts
+from barpc.tie.tracks import TieResult
+
+from .conftest import write_image
+
+SIZE = (640, 1280)
+
+
+def counts(rng: np.random.Generator, share: np.ndarray, a_part: float = 60.0) -> tuple[np.ndarray, np.ndarray]:
+    """Keypoints, alike in all columns, and ties, of which rows have so large a share."""
+    keypoints = rng.poisson(a_part, (2, PARTS))
+    ties = rng.binomial(keypoints[1], share)
+    return keypoints, np.stack([rng.multinomial(ties.sum(), np.full(PARTS, 1 / PARTS)), ties])
+
+
+@pytest.mark.parametrize(("first", "last"), [(20, 26), (0, 9), (50, 64), (12, 44)])
+def test_rows_without_ties_are_found_and_nothing_beside_them(first: int, last: int) -> None:
+    """With a false one now and then; where half of the rows lack most of them are named."""
+    for seed in range(20):
+        share = np.full(PARTS, 0.5)
+        share[first:last] = 0.001
+        found = gap(*counts(np.random.default_rng(seed), share), SIZE)
+        assert found is not None
+        assert found.axis == 1
+        assert found.first >= 20 * first
+        assert found.last < 20 * last
+        assert found.last + 1 - found.first >= 0.6 * 20 * (last - first)
+        assert found.found <= 0.05 * found.expected
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_varies_is_no_gap(seed: int) -> None:
+    """Even ties, shares that fall to a fifth, a slope to nothing, and few keypoints of all."""
+    rng, x = np.random.default_rng(seed), np.linspace(0, 1, PARTS)
+    for share in (np.full(PARTS, 0.4), np.where((x > 0.3) & (x < 0.6), 0.1, 0.5), 0.5 * x):
+        for a_part in (2.0, 20.0, 300.0):
+            assert gap(*counts(rng, share, a_part), SIZE) is None
+    none = np.zeros((2, PARTS), np.int64)
+    assert gap(none, none, SIZE) is None
+    assert gap(np.full((2, PARTS), 50), none, SIZE) is None  # it is not tied by keypoints at all
+
+
+@pytest.mark.parametrize("lost", [0, 3, 10])
+def test_where_there_is_nothing_to_see_nothing_lacks(lost: int) -> None:
+    """Water with a shore that no tie is found on, and rows at an end that no partner sees."""
+    rng = np.random.default_rng(lost)
+    keypoints, ties = counts(rng, np.full(PARTS, 0.5))
+    water = slice(20, 40)
+    keypoints[1, water] = rng.poisson(0.3, 20)
+    keypoints[1, [20, 39]] = 200
+    ties[1, water] = rng.poisson(lost / 20, 20)
+    assert gap(keypoints, ties, SIZE) is None
+    keypoints[1, 50:] = 0
+    ties[1, 52:] = 0  # some stand where relief may hide them
+    assert gap(keypoints, ties, SIZE) is None
+
+
+def test_few_of_many_are_found_where_chance_would_not_hide_them() -> None:
+    """Once in a million images: so few as none of 19 are borne, none of 38 are not."""
+    detail = np.full((2, PARTS), 10)
+    for parts, told in ((2, False), (4, True)):
+        ties = np.full((2, PARTS), 10)
+        ties[1, 30 : 30 + parts] = 0
+        found = gap(detail, ties, SIZE)
+        assert (found == Gap(1, 600.0, 679.0, 0, 38)) if told else found is None
+
+
+def changed(view: View, folder: Path, rows: slice, sigma: float) -> View:
+    """The image with a texture of its own in some rows."""
+    with open_raster(view.path) as image:
+        pixels = image.read(1)
+    noise = ndimage.gaussian_filter(np.random.default_rng(1).normal(0, 1, pixels[rows].shape), 1.5)
+    pixels[rows] = (np.median(pixels) + sigma * noise / noise.std()).clip(1, 60000)
+    return replace(view, path=str(write_image(folder / f"{view.name}_changed.tif", pixels)))
+
+
+def lacking(views: list[View], ties: TieResult) -> list[Gap | None]:
+    tracks = ties.tracks
+    each = [in_parts(tracks.xy[tracks.view == v], view.size) for v, view in enumerate(views)]
+    return [gap(detail, own, view.size) for view, detail, own in zip(views, ties.detail, each, strict=True)]
+
+
+@pytest.mark.parametrize(("sigma", "told"), [(300.0, True), (0.5, False)])
+def test_rows_of_another_texture_are_told_of_the_image_that_has_them(
+    render, tmp_path, sigma: float, told: bool
+) -> None:
+    """Of three images; where it is water, of which the others show the land, nothing of its own lacks."""
+    views = list(render(views=3, size=(300, 300)).views)
+    views[1] = changed(views[1], tmp_path, slice(100, 200), sigma)
+    found = lacking(views, find_tracks(views))
+    assert found[0] is None
+    assert found[2] is None
+    assert (found[1] is not None) is told
+    if found[1] is not None:
+        assert found[1].axis == 1
+        assert 90 <= found[1].first <= 120
+        assert 180 <= found[1].last <= 210
+
+
+def test_clean_images_lack_nothing(render, triplet, triplet_ties, ventoux, ventoux_ties) -> None:
+    scene = render(views=3, size=(300, 300))
+    for views, ties in ((scene.views, scene.tied), (triplet, triplet_ties), (ventoux, ventoux_ties)):
+        assert lacking(views, ties) == [None] * len(views)
+        assert all(detail.sum() > 200 for detail in ties.detail)
