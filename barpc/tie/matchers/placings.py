@@ -63,7 +63,7 @@ class Placing:
         if self.size != 1.0:
             found.append(f"at {_SIZES.get(self.size, f'{self.size:.3g} times the size')} that its RPC is for")
         col, row = (-start for start in self.start)
-        return ", ".join(found) or f"cropped, {col:.2g} columns and {row:.2g} rows from where its RPC begins"
+        return ", ".join(found) or f"moved by some {col:.2g} columns and {row:.2g} rows, as a crop is"
 
     def is_stated(self, reach: float) -> bool:
         """Return whether it is as the camera says, which may be wrong by so much [px]."""
@@ -141,10 +141,11 @@ def likeliest(views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints]) 
 
 def _alike(first: npt.NDArray[np.uint8], second: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.int64], ...]:
     """Return the rows of descriptors that are clearly each other's nearest."""
-    a, b = (x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-6) for x in map(np.float32, (first, second)))
+    a, b = (x.astype(np.float32) for x in (first, second))  # whole numbers: their products are exact on any machine
     if min(len(a), len(b)) < 2:
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    cosine = a @ b.T
+    length = [np.maximum(np.linalg.norm(x, axis=1), np.float32(1e-6)) for x in (a, b)]
+    cosine = a @ b.T / length[0][:, None] / length[1]
     nearest = cosine.argmax(axis=1)
     rows = np.flatnonzero(cosine.argmax(axis=0)[nearest] == np.arange(len(a)))
     two = np.sqrt(np.maximum(2.0 - 2.0 * np.partition(cosine[rows], -2, axis=1)[:, -2:], 0.0))
