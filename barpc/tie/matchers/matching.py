@@ -159,9 +159,8 @@ def match_pair(views: Ends, keypoints: Points, pair: Pair, options: TieOptions) 
     placings = _placing(views[::-1], (b, a), pair, options), _placing(views, (a, b), pair, options)
     if placings == (None, None):
         return found, report
-    return NO_MATCHES, replace(
-        report, status="a picture lies otherwise than its RPC says", verified=0, placings=placings
-    )
+    status = "a picture lies otherwise than its RPC says" if report.status == "ok" else report.status
+    return NO_MATCHES, replace(report, status=status, verified=0, placings=placings)
 
 
 def _placing(views: Ends, keypoints: tuple[Keypoints, Keypoints], pair: Pair, options: TieOptions) -> Placing | None:

@@ -63,7 +63,10 @@ class Placing:
         if self.size != 1.0:
             found.append(f"at {_SIZES.get(self.size, f'{self.size:.3g} times the size')} that its RPC is for")
         col, row = (-start for start in self.start)
-        return ", ".join(found) or f"moved by some {col:.2g} columns and {row:.2g} rows, as a crop is"
+        return (
+            ", ".join(found)
+            or f"moved by some {col:.2g} columns and {row:.2g} rows, more than was searched, as a crop is"
+        )
 
     def is_stated(self, reach: float) -> bool:
         """Return whether it is as the camera says, which may be wrong by so much [px]."""
