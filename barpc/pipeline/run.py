@@ -322,7 +322,8 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
     """Return the run with an adjustment and what went into it."""
     names = [view.name for view in run.views]
     if prior is not None:
-        run = replace(run, tracks=only_new(run.tracks, np.isin(names, prior.names)))
+        # where the earlier block saw more, tie points lack on purpose
+        run = replace(run, tracks=only_new(run.tracks, np.isin(names, prior.names)), detail=())
     gcps, checks = (load_gcps(paths, run.views, options, dem) for paths in (options.gcp, options.check_points))
     centers = _centers(run.views, options.adjust.center)
     if run.reference is not None and run.reference.control is None and not len(run.tracks) and gcps is None:

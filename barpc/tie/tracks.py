@@ -227,10 +227,13 @@ class _Trials:
         return tuple(count.astype(int).tolist())
 
     def detail(self) -> tuple[IntArray, ...]:
-        """Return the keypoints of every view that partners see with which keypoints tie it, as `seen_detail` counts."""
+        """Return the keypoints of every view that partners see with which keypoints tie it, as `seen_detail` counts.
+
+        None of an area of interest: beside it no tie points are wanted.
+        """
         seen: list[list[Seen]] = [[] for _ in self._views]
         for (i, j), (_, found, report) in self.tried.items():
-            if report.matcher == _DEFAULTS.matcher and len(found) >= FEW:
+            if self._scope.area is None and report.matcher == _DEFAULTS.matcher and len(found) >= FEW:
                 first, second = map(finer, found.ends, self.looks.pixel[list(self.looks.ends[i, j])])
                 seen[i].append((first, second, self._views[j].size))
                 seen[j].append((second, first, self._views[i].size))

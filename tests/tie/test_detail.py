@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 from scipy import ndimage
 
 from barpc.rasters.raster import open_raster
 from barpc.scene import View
-from barpc.tie import find_tracks
+from barpc.sensor.geometry import footprint
+from barpc.tie import Area, Scope, find_tracks
 from barpc.tie.detail import PARTS, Gap, gap, in_parts
 from barpc.tie.tracks import TieResult
 
@@ -116,3 +118,14 @@ def test_clean_images_lack_nothing(render, triplet, triplet_ties, ventoux, vento
     for views, ties in ((scene.views, scene.tied), (triplet, triplet_ties), (ventoux, ventoux_ties)):
         assert lacking(views, ties) == [None] * len(views)
         assert all(detail.sum() > 200 for detail in ties.detail)
+
+
+def test_beside_an_area_of_interest_nothing_is_expected(render) -> None:
+    """Half of the images is of interest: the other half has as much to see and no tie point."""
+    views = render(views=2, size=(300, 300)).views
+    ring = footprint(views[0].sensor, views[0].size, views[0].altitude)[:, :2]
+    low, high = ring.min(axis=0), ring.max(axis=0)
+    half = Area(shapely.box(low[0], low[1], high[0], 0.5 * (low[1] + high[1])))
+    ties = find_tracks(views, scope=Scope(area=half))
+    assert ties.tracks.num_points > 50
+    assert lacking(views, ties) == [None, None]
