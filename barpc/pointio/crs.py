@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +16,19 @@ from barpc.rasters.vertical import ELLIPSOID, Vertical, vertical_of
 
 _LETTERS = 50_000  # of a reference system: the longest WKT of EPSG has a fifth
 _EXACT = 1.0  # m: transformations that are better known than this need no word; ensembles as WGS84 are no better
+
+
+@contextmanager
+def _offline() -> Iterator[None]:
+    """Take no grid from the network, whatever PROJ is set to: results are not to depend on it, nor to fail without."""
+    network: Any = import_module("pyproj.network")
+
+    was = network.is_network_enabled()
+    network.set_network_enabled(False)
+    try:
+        yield
+    finally:
+        network.set_network_enabled(was)
 
 
 def to_wgs84(place: Array, crs: str, source: str) -> tuple[Array, Vertical, str]:
@@ -30,7 +46,7 @@ def to_wgs84(place: Array, crs: str, source: str) -> tuple[Array, Vertical, str]
         if not (level.is_geographic or level.is_projected or level.is_geocentric):
             raise CRSError("no places")
         solid = len(level.axis_info) == 3
-        with warnings.catch_warnings():  # of grids that are missing: how well the others know the place is said
+        with _offline(), warnings.catch_warnings():  # of missing grids: how well the others know the place is said
             warnings.simplefilter("ignore")
             to = Transformer.from_crs(level, "EPSG:4979" if solid else "EPSG:4326", always_xy=True)
             x, y, z = to.transform(place[:, 0], place[:, 1], np.nan_to_num(place[:, 2]))

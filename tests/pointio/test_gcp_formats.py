@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
 import rasterio
 from rasterio.warp import transform
@@ -159,6 +160,19 @@ def test_heights_are_in_the_unit_and_above_what_the_system_says(
         own = one(tmp_path, x, y, z, Frame(crs))
         assert -35.0 < own.lonlatalt[0, 2] - alt - 30.0 < -25.0  # EGM96 near Sacramento
         assert f"altitudes above {vertical} made ellipsoidal with egm96_15.tif" in own.said[0]
+
+
+def test_no_grid_is_asked_of_the_network(tmp_path, geoid, monkeypatch) -> None:
+    """PROJ that may go there, as a user sets it, gives the same place where nobody answers; and is left as it was."""
+    monkeypatch.setenv("PROJ_NETWORK_ENDPOINT", "https://127.0.0.1:9")
+    (x,), (y,) = transform("EPSG:4326", "EPSG:26910", [-121.5], [38.5])
+    places = []
+    for enabled in (False, True):
+        pyproj.network.set_network_enabled(enabled)
+        places.append(one(tmp_path, x, y, 100.0, Frame("EPSG:26910+5703", geoid)).lonlatalt)
+        assert pyproj.network.is_network_enabled() == enabled
+    pyproj.network.set_network_enabled(None)
+    np.testing.assert_array_equal(*places)
 
 
 def test_earth_centred_coordinates_have_their_altitude(tmp_path) -> None:
