@@ -68,7 +68,7 @@ def hold_by_altimetry(
     why_not = _why_not(registered, known, _is_held(found, block))
     if why_not:
         return found, replace(test, why_not=why_not)
-    least = 2 if found.heights.is_whole else 1  # a terrain keeps every second one
+    least = 1 if found.heights.dem is None else 2  # a terrain keeps every second one
     chosen = np.arange(0, len(ties), max(-(-len(ties) // SAMPLE), least))
     placed = _placed(points, ties[chosen], local[chosen, :2] / radius, enu, registered, np.sqrt(np.diag(known)))
     tried = _solved(found, block, outer, options, placed)

@@ -331,9 +331,6 @@ class AdjustOptions(Options):
         unit="m",
         above=0,
     )
-    dem_for_weak: bool = option(
-        False, "Constrain only tracks with a convergence angle below `min_convergence` to the DEM."
-    )
     min_convergence: float = option(
         1.0, "Tracks whose rays meet under a smaller angle are held in height.", unit="deg", least=0, most=180
     )

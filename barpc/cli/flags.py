@@ -31,7 +31,6 @@ GROUND = (
     "check_points",
     "fixed_run",
     "dem",
-    "adjust.dem_for_weak",
     "geoid",
     "heights",
     "reference",

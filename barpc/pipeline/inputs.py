@@ -57,8 +57,6 @@ def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None,
         for line in () if points is None else (*points.said, *points.left_out):
             logger.warning("%s", line)
     load_altimetry(options.altimetry, views, options.heights)
-    if options.adjust.dem_for_weak and not options.dem:
-        raise InputError("dem_for_weak is given without dem: there are no heights to hold the tie points to")
     for path in options.reference:
         Sheet.read(path)
     if dem is not None:

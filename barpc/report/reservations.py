@@ -334,9 +334,6 @@ def dem_lines(adjustment: Adjustment) -> Iterator[str]:
         if np.isfinite(terrain.sigma) and terrain.alike >= 1.05:
             single += f" ({terrain.alike:.1f} correlated heights count as one)"
         yield f"{held}. Assumed error: {single}, and {metres(terrain.bias)} common to all."
-    elif options.dem_for_weak and terrain.known and not adjustment.held.any():
-        least = f"{options.min_convergence:g} degree{'' if options.min_convergence == 1 else 's'}"
-        yield f"{held}: all rays meet under more than {least}; without --dem-for-weak they constrain the scene."
     else:
         yield f"{held}: the DEM has no height where one is needed."
     lie = f"; they lie {terrain.offset:+.1f} m above it (median; NMAD {terrain.spread:.1f} m)" if terrain.known else ""

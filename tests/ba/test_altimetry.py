@@ -404,7 +404,7 @@ def test_a_motion_is_held_at_every_second_tie_point_beside_a_terrain(monkeypatch
     outcome = SimpleNamespace(minimum=SimpleNamespace(covariance=lambda free: None))
     found: Any = SimpleNamespace(
         seen=seen, final=SimpleNamespace(points=points), outcome=outcome, problem=SimpleNamespace(free=None),
-        heights=SimpleNamespace(is_whole=whole), after="before",
+        heights=SimpleNamespace(dem="a DEM" if whole else None), after="before",
     )  # fmt: skip
     block: Any = SimpleNamespace(num_tracks=60)
     tried, said = altimetry.hold_by_altimetry(found, block, block, AdjustOptions(), heights)

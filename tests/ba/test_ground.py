@@ -62,7 +62,7 @@ def test_what_altimetry_holds_a_terrain_does_not_and_of_the_rest_those_with_weak
     points = placed([0.0, 300.0, -300.0, 500.0, 100.0, 0.0], [0.0, 300.0, 200.0, -100.0, 400.0, 50.0], 350.0)
     relief = Relief(None, np.zeros(6, dtype=bool), np.full(3, np.nan), np.zeros((3, 6)), np.full(3, np.nan))
     by_altimetry = flat_heights(points, np.array([0, 5]), 350.0, 1.0, 0.0)
-    given = replace(heights(options={"dem_for_weak": False}), relief=relief, placed=by_altimetry)
+    given = replace(heights(), relief=relief, placed=by_altimetry)
     held = given._held(points)
     assert held is not None
     assert held.index.tolist() == [1, 2, 3, 4]
@@ -175,12 +175,11 @@ def test_blocks_with_and_without_errors_in_common_are_joined() -> None:
 @pytest.mark.parametrize(
     ("options", "index", "bias"),
     [
-        ({"dem_for_weak": True}, [4, 5], DEM_BIAS),
-        ({"dem_for_weak": True, "dem_bias_sigma": 3.0}, [4, 5], 3.0),
+        ({"learn_priors": False, "dem_bias_sigma": 3.0}, [0, 1, 2, 3, 4, 5], 3.0),
         ({"learn_priors": False}, [0, 1, 2, 3, 4, 5], DEM_BIAS),
     ],
 )
-def test_a_terrain_holds_weak_tracks_or_all(options: dict[str, Any], index: list[int], bias: float) -> None:
+def test_a_terrain_holds_all_tracks(options: dict[str, Any], index: list[int], bias: float) -> None:
     points = placed(np.linspace(0, 2000, 6), np.linspace(0, 1000, 6), 350.0)
     held = heights(options={"dem_sigma": 4.0, **options})._held(points)
     assert held is not None
@@ -211,18 +210,15 @@ def test_tracks_beside_a_reference_share_its_terrain(n: int, factor: float) -> N
     assert held.common[-1, 0, 1] == pytest.approx(2.0 / factor * 1500 / 4000, rel=0.01)
 
 
-@pytest.mark.parametrize(("whole", "count"), [(False, 1), (True, 4)])
-def test_how_tie_points_lie_to_a_terrain_is_a_median_and_its_deviation(whole: bool, count: int) -> None:
+def test_how_tie_points_lie_to_a_terrain_is_a_median_and_its_deviation() -> None:
     east = np.array([0.0, 100.0, 200.0, 300.0, -2500.0, 500.0])
     above = np.array([3.0, 7.0, 4.0, 900.0, 7.0, 9.0])
     points = placed(east, 0.0, np.nan_to_num(300.0 + 0.2 * east) + above)
-    made = replace(
-        heights(dem=hill, options={"dem_for_weak": not whole, "learn_priors": False}), weak=np.arange(6) >= 3
-    )
+    made = replace(heights(dem=hill, options={"learn_priors": False}), weak=np.arange(6) >= 3)
     seen = np.array([1, 1, 1, 1, 1, 0], dtype=bool)
     found = made.test(points, seen)
     assert found is not None
-    assert (found.held, found.known, found.total, found.bias) == (count, 4, 5, 20.0)
+    assert (found.held, found.known, found.total, found.bias) == (4, 4, 5, 20.0)
     assert found.offset == pytest.approx(5.5, abs=1e-3)  # of 3, 4, 7 and 900
     assert found.spread == pytest.approx(1.4826 * 2.0, abs=2e-3)  # of 2.5, 1.5, 1.5, 894.5
     none = made.test(placed(-2500.0, 0.0, np.full(6, 300.0)), seen)

@@ -101,15 +101,6 @@ ROWS = [
         rest={"dem_sigma": 0.5, "learn_priors": False},
         dem=400.0,
     ),
-    Row(
-        "dem_for_weak",
-        False,
-        True,
-        off_dem,
-        1,
-        rest={"dem_sigma": 0.5, "dem_bias_sigma": 0.5, "learn_priors": False},
-        dem=400.0,
-    ),
     Row("min_convergence", 0.01, 90.0, lambda found: 1 + found.held.sum(), 1, 10.0),
     Row("max_steps", 1, 30, steps, 1, rest={"loss": "linear", "tolerance": 1e-15, "solver": "sparse"}),
     Row("tolerance", 1e-14, 1e-2, steps, -1, rest={"loss": "linear", "solver": "sparse"}),
@@ -120,7 +111,7 @@ ELSEWHERE = {
     "solver": "test_the_solver_that_is_asked_for_is_the_one_that_runs",
 }
 ELSEWHERE_TOO = (
-    "model", "drift", "jitter", "detectors", "fixed", "dem_sigma", "dem_for_weak", "tolerance", "max_steps",
+    "model", "drift", "jitter", "detectors", "fixed", "dem_sigma", "tolerance", "max_steps",
     "sigma_position", "learn_priors", "num_passes", "estimate_noise", "sigma_drift", "sigma_shift", "loss",
 )  # fmt: skip
 """What tests of its own have among the fast ones, too."""

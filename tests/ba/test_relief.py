@@ -110,7 +110,7 @@ def test_points_are_asked_to_move_back_to_where_the_terrain_is(east: float) -> N
 
 def test_cameras_let_expect_what_their_unknowns_move_points_by() -> None:
     """Level and slopes of all points above a DEM, each unknown of each camera off by its own standard deviation."""
-    made, options = simulate_block(3, 200, seed=1), AdjustOptions(dem_for_weak=False)
+    made, options = simulate_block(3, 200, seed=1), AdjustOptions()
     block = join(made.views, made.tracks, None, options)
     problem = make_problem(block, options, centers_of(made), None)
     state, held = first_state(problem, block, options, lambda lon, lat: np.full(np.shape(lon), ALT))

@@ -107,7 +107,7 @@ def test_a_shell_completes_the_choices() -> None:
     ("target", "name"),
     [
         ("rpc_formats", "--rpc-format"),
-        ("adjust.dem_for_weak", "--dem-for-weak"),
+        ("adjust.jitter", "--jitter"),
         ("aoi", "--aoi"),
     ],
 )
@@ -177,19 +177,19 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) 
     flags = {
         "flag_tie_band": 9,
         "flag_adjust_model": None,
-        "flag_adjust_dem_for_weak": True,
+        "flag_adjust_jitter": "off",
         "flag_overwrite": None,
         "flag_fit_tolerance": 0.5,
         "flag_dem": "d.tif",
         "other": 3,
     }
     found = run_options(flags, str(path))
-    assert (found.tie.band, found.adjust.model, found.adjust.dem_for_weak) == (9, "shift", True)
+    assert (found.tie.band, found.adjust.model, found.adjust.jitter) == (9, "shift", "off")
     assert (found.overwrite, found.fit.tolerance, found.dem) == (True, 0.5, ("d.tif",))
     alone = run_options(flags, None)
     assert (alone.tie, alone.adjust) == (
         TieOptions(band=9),
-        AdjustOptions(dem_for_weak=True),
+        AdjustOptions(jitter="off"),
     )
     with pytest.raises(InputError, match="command line"):
         run_options({"flag_fit_tolerance": -1.0}, None)

@@ -285,8 +285,6 @@ def dem(run: Run, out: Path, scene: Path) -> None:
     assert [Path(path).name for path in more.summary["options"]["dem"]] == ["far.tif", "a.tif"]
     with pytest.raises(InputError):
         run("c", dem=str(out / "nowhere.tif"))
-    with pytest.raises(InputError, match="dem_for_weak is given without dem"):
-        run("d", adjust=AdjustOptions(dem_for_weak=True))
 
 
 @pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")

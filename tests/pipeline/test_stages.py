@@ -89,8 +89,6 @@ def test_a_terrain_covers_a_part_of_the_images_at_least(tmp_path) -> None:
     with pytest.raises(InputError, match=r"holds no height at the images' place \(15\.\d+, 43\.\d+\)"):
         side_inputs(options, [there])
     assert side_inputs(RunOptions(), [there]) == (None, None)
-    with pytest.raises(InputError, match="dem_for_weak is given without dem"):
-        side_inputs(RunOptions(adjust=AdjustOptions(dem_for_weak=True)), [here])
 
 
 def test_heights_count_within_the_images_and_some_way_around_them(tmp_path) -> None:

@@ -39,7 +39,7 @@ def adjusted(**fields: Any) -> Any:
         "prior": SimpleNamespace(odd=np.zeros(3, bool), scale=np.ones(3), drift_sigma=()),
         "smooth": SmoothTest(np.zeros(3), np.ones(3), np.full(3, NO_NUMBER), np.zeros(3)),
         "held_out_noise": np.ones(3), "held_out_rms": np.full(3, 0.2), "held": np.zeros(9, bool), "terrain": None,
-        "options": SimpleNamespace(drift=None, fixed=(), dem_for_weak=True, min_convergence=1.0, dem_sigma=2.0),
+        "options": SimpleNamespace(drift=None, fixed=(), min_convergence=1.0, dem_sigma=2.0),
         "gauge": SimpleNamespace(shift=np.array([1.0, -2.0, 3.0]), sigma=np.array([1.0, 2.0, 0.5]) * 10,
                                  delivered_sigma=np.array([1.0, 2.0, 0.5]) * 10,
                                  motion_sigma=np.array([1.0, 2.0, 3.0, 0.4, 5.0, 6.0, 7.0, 0.8, 9.0, 0.1])),
@@ -342,7 +342,7 @@ def test_a_scene_that_moved_far_is_said_to_where_nothing_but_the_cameras_holds_i
     assert reasons(moved(6.1, reference_inlier=np.ones(2, bool)), options=SimpleNamespace(dem="x")) == []
     assert reasons(moved(6.1), options=SimpleNamespace(fixed_run="x")) == []
     assert len(reasons(moved(6.1), options=SimpleNamespace(dem=None, fixed_run=None))) == 1
-    fixed = SimpleNamespace(drift=None, fixed=("A",), dem_for_weak=True, min_convergence=1.0, dem_sigma=2.0)
+    fixed = SimpleNamespace(drift=None, fixed=("A",), min_convergence=1.0, dem_sigma=2.0)
     assert reasons(moved(6.1, options=fixed)) == []
     for used, num in ((True, 0), (False, 1)):
         test = ControlTest(np.array([used]), np.zeros((1, 3)), np.zeros(1), np.ones(1))
@@ -471,14 +471,8 @@ def test_a_dem_is_said_to_hold_and_how_the_points_lie_to_it():
     assert lines(known=0)[1] == "The DEM covers 0 % of the tie points."
     assert lines(known=0, total=0, held=0)[1] == "The DEM constrains nothing: there are no tie points."
     held = "DEM heights constrain 0 of 40 tie points: "
-    assert (
-        lines(held=0)[0]
-        == f"{held}all rays meet under more than 1 degree; without --dem-for-weak they constrain the scene."
-    )
-    options = {"drift": None, "fixed": (), "dem_for_weak": True, "min_convergence": 2.5, "dem_sigma": 2.0}
-    assert "more than 2.5 degrees;" in lines(held=0, options=SimpleNamespace(**options))[0]
     nowhere = f"{held}the DEM has no height where one is needed."
-    assert lines(held=0, options=SimpleNamespace(**{**options, "dem_for_weak": False}))[0] == nowhere
+    assert lines(held=0)[0] == nowhere
     held = replace(TerrainTest(30, 30, 40, 2.0, 3.0, 0.5), sigma=4.0)
     for terrain, start in (
         (held, "With the DEM its place"),

@@ -185,7 +185,7 @@ class Heights:
     weak: BoolArray  # (P,) points whose rays meet under too small an angle
     tracks: IntArray  # (T,) points that are tracks (GCPs are held already)
     alt_range: tuple[float, float]  # altitudes [m] to expect where no other track tells
-    options: AdjustOptions  # `dem_sigma`, `dem_bias_sigma`, `dem_for_weak`
+    options: AdjustOptions  # `dem_sigma`, `dem_bias_sigma`
     dem: Terrain | None  # none: weak tracks resemble the others in height, wherever these are
     reference: Reference | None = None  # whose heights are the DEM's
     has_control: bool = False  # whether GCPs hold the scene's place
@@ -202,7 +202,7 @@ class Heights:
     def is_judged(self) -> bool:
         """Whether the tie points decide how far the DEM is believed."""
         given = self.dem is None or self.reference is not None
-        return not given and not self.options.dem_for_weak and self.options.learn_priors
+        return not given and self.options.learn_priors
 
     def hold(self, problem: Problem, points: Array) -> Problem:
         """Return the problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
@@ -226,7 +226,7 @@ class Heights:
             return held.select(np.isin(held.index, self.tracks[free]))
         dem = self.dem if believed is None else None
         judged_later = self.is_judged and self.relief is None
-        is_whole = dem is not None and self.is_whole and not judged_later
+        is_whole = dem is not None and not judged_later
         chosen = free if is_whole else free & weak
         index = self.tracks[chosen]
         if not len(index):
@@ -248,11 +248,6 @@ class Heights:
         # what they all are off by is told by the cameras, as far as they tell it: that heights of tracks just above
         # the least angle are right is known to nobody, and of the altitudes of an RPC that they lie within its range
         return flat_heights(points, index, float(middle), max(float(sigma), _FLAT_SIGMA), highest - lowest)
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether a terrain holds all tracks."""
-        return self.dem is not None and (not self.options.dem_for_weak or self.reference is not None)
 
     @property
     def _bias(self) -> float:
