@@ -51,7 +51,7 @@ from barpc.tie import (  # noqa: E402
     refine,
     select_pairs,
 )
-from barpc.tie.pairing.epipolar import affine_inliers, frame  # noqa: E402
+from barpc.tie.pairing.epipolar import coherent, frame  # noqa: E402
 from barpc.tie.pixels import read_pixels, sample_stretch  # noqa: E402
 from barpc.workspace import Workspace  # noqa: E402
 
@@ -100,7 +100,7 @@ def stages(views: list[View]) -> float:
 def spread(first: View, second: View, xy_first: np.ndarray, xy_second: np.ndarray) -> float:
     """Robust standard deviation across the epipolar line after an affine fit [px]."""
     across = frame(first, second, xy_first).errors(xy_second)[:, 1]
-    return robust_spread(affine_inliers(xy_first, across)[1])
+    return robust_spread(coherent(xy_first, across)[1])
 
 
 def opencv(views: list[View]) -> float:

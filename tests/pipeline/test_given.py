@@ -19,7 +19,7 @@ from barpc.pipeline import RunOptions, adjust, check
 from barpc.pipeline.inputs import given_matches, given_tracks
 from barpc.pipeline.loading import load_views
 from barpc.pointio.matches import read_matches
-from barpc.tie.pairing.epipolar import affine_inliers, frame
+from barpc.tie.pairing.epipolar import coherent, frame
 from tests.pointio.test_foreign import binary
 
 from .conftest import check_points
@@ -45,7 +45,7 @@ def spread(views, tracks, i: int, j: int) -> float:
     a, b = tracks.view == i, tracks.view == j
     _, rows_a, rows_b = np.intersect1d(tracks.point[a], tracks.point[b], return_indices=True)
     first, second = tracks.xy[a][rows_a], tracks.xy[b][rows_b]
-    return robust_spread(affine_inliers(first, frame(views[i], views[j], first).errors(second)[:, 1])[1])
+    return robust_spread(coherent(first, frame(views[i], views[j], first).errors(second)[:, 1])[1])
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 from barpc.base.usual import robust_spread
 from barpc.tie.pairing.epipolar import (
     Affine,
-    affine_inliers,
+    coherent,
     common_range,
     frame,
     grouped,
@@ -102,21 +102,38 @@ def test_the_mad_is_a_standard_deviation_about_zero() -> None:
     assert robust_spread(np.random.default_rng(0).normal(0, 5, 20000)) == pytest.approx(5.0, rel=0.03)
 
 
-def test_what_agrees_lies_within_three_deviations_or_the_floor_window_by_window() -> None:
+@pytest.mark.parametrize("size", [0.0, 0.5, 3.0, -12.0, 40.0])
+@pytest.mark.parametrize(("axis", "part"), [(1, 0.1), (1, 0.5), (1, 0.9), (0, 0.3)])
+def test_what_neighbours_share_stays_wherever_an_image_jumps_and_what_stands_alone_goes(axis, part, size) -> None:
     rng = np.random.default_rng(2)
-    xy = np.vstack([rng.uniform(0, 2000, (200, 2)), rng.uniform(0, 2000, (200, 2)) + [4096, 0]])
-    noise = rng.uniform(-0.1, 0.1, 400)
-    values = noise + np.where(xy[:, 0] > 3000, 40.0, 0.0)
-    values[5], values[6], values[205] = 0.32, 0.28, 40.0 + 0.32
-    keep, residual = affine_inliers(xy, values, floor=0.3)
-    assert np.flatnonzero(~keep).tolist() == [5, 205]
-    np.testing.assert_allclose(residual[:5], values[:5], atol=0.05)
-    wide = rng.normal(0, 1.0, 400)
-    wide[7], wide[8] = 4.5, 2.3
-    keep, _ = affine_inliers(xy[:200], wide[:200], floor=0.3)
-    assert not keep[7]
-    assert keep[8]
-    assert affine_inliers(xy[:0], values[:0])[0].shape == (0,)
+    xy = rng.uniform(0, 1000, (900, 2))
+    beyond = xy[:, axis] > 1000 * part
+    values = 3.0 + 2e-3 * xy[:, 0] + rng.normal(0.0, 0.08, 900) + np.where(beyond, size, 0.0)
+    alone = rng.choice(900, 90, replace=False)
+    away = rng.choice([-1.0, 1.0], 90) * rng.uniform(0.8, 2.0, 90)
+    values[alone] += np.where(np.abs(np.abs(away) - abs(size)) < 0.4, 2.4 * np.sign(away), away)
+    keep, residual = coherent(xy, values)
+    sound = np.delete(np.arange(900), alone)
+    assert keep[sound].mean() > 0.99
+    assert keep[alone].mean() < 0.02
+    near = np.abs(xy[sound, axis] - 1000 * part) < 40  # beside an edge too
+    assert keep[sound][near].mean() > 0.93
+    assert robust_spread(residual) == pytest.approx(0.09, abs=0.02)  # the jump is no noise
+
+
+def test_a_swing_is_no_outlier_and_normal_noise_is_cut_at_about_three_deviations() -> None:
+    rng = np.random.default_rng(3)
+    xy = rng.uniform(0, 1000, (2000, 2))
+    swing = 1.5 * np.sin(2 * np.pi * xy[:, 1] / 400)
+    assert coherent(xy, swing + rng.normal(0.0, 0.1, 2000))[0].mean() > 0.94
+    noise = rng.normal(0.0, 1.0, 2000)
+    keep = coherent(xy, noise)[0]
+    assert keep[np.abs(noise) < 2.5].all()
+    assert not keep[np.abs(noise) > 4.0].any()
+    few = coherent(xy[:12], np.append(np.zeros(11), 1.0))[0]
+    assert np.flatnonzero(~few).tolist() == [11]
+    for count in (0, 1):
+        assert coherent(xy[:count], noise[:count])[0].tolist() == [True] * count
 
 
 def test_a_frames_linear_map_is_that_of_the_middle_of_the_points_that_are_seen(scene: Rendered) -> None:

@@ -10,7 +10,7 @@ import pytest
 from barpc.base.usual import robust_spread
 from barpc.scene import Tracks, View
 from barpc.tie import TieOptions, TieResult, common_tracks, detect, find_tracks, match_pairs, select_pairs
-from barpc.tie.pairing.epipolar import Affine, affine_inliers, frame, robust_affine
+from barpc.tie.pairing.epipolar import Affine, coherent, frame, robust_affine
 
 PAIRS = [(0, 1), (0, 2), (1, 2)]
 
@@ -34,7 +34,7 @@ def raw_spread(views: list[View]) -> dict[tuple[int, int], float]:
     pairs = select_pairs(views, options)
     for pair, (matches, _) in zip(pairs, match_pairs(views, detect(views, options), pairs, options), strict=True):
         errors = across(views, *pair.views, matches.xy[:, 0], matches.xy[:, 1])
-        found[pair.views] = robust_spread(affine_inliers(matches.xy[:, 0], errors)[1])
+        found[pair.views] = robust_spread(coherent(matches.xy[:, 0], errors)[1])
     return found
 
 

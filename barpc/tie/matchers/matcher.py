@@ -91,6 +91,14 @@ class Matches:
         pixel = np.rint(xy).astype(np.int64)
         return Matches(xy, score, (pixel[..., 1] << 32) + pixel[..., 0])
 
+    def and_others(self, more: Matches) -> Matches:
+        """Return the matches, and those of `more` whose points are neither of these in either view."""
+        new = ~(np.isin(more.index[:, 0], self.index[:, 0]) | np.isin(more.index[:, 1], self.index[:, 1]))
+        some = more.select(new)
+        columns = ((getattr(one, name) for one in (self, some)) for name in ("xy", "score", "index"))
+        xy, score, index = map(np.concatenate, map(list, columns))
+        return replace(self, xy=xy, score=score, index=index)
+
     def select(self, keep: IntArray | BoolArray) -> Matches:
         """Return the matches of a mask or of indices."""
         return replace(self, xy=self.xy[keep], score=self.score[keep], index=self.index[keep])

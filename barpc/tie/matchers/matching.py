@@ -20,8 +20,8 @@ from scipy.spatial import cKDTree
 
 from barpc.base.geodesy import Array
 from barpc.base.options import TieOptions
-from barpc.base.usual import FEW, MANY, SAMPLE, robust_spread
-from barpc.scene import IntArray, View
+from barpc.base.usual import FEW, MANY, RIVALS, SAMPLE, robust_spread
+from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.matchers.features import AMPLE, KeypointFiles, Keypoints, ample_matches, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
 from barpc.tie.matchers.matcher import APART, NO_MATCHES, Hook, Matcher, Matches, Prediction, hooked
@@ -30,9 +30,10 @@ from barpc.tie.matchers.structural import FineStructure, GradientStructure
 from barpc.tie.pairing.epipolar import (
     LEAST_REACH,
     EpipolarSegments,
-    affine_inliers,
+    coherent,
     common_range,
     frame,
+    gradient,
     robust_affine,
 )
 from barpc.tie.pairing.overlaps import Pair, Terrain, reach_of, shared_tiles
@@ -60,6 +61,10 @@ _DEFAULTS = TieOptions()
 _PASSES = ((20.0, 1500), (80.0, 2000), (float("inf"), 3000))
 """Blind passes: half width [px] (the last: `search`), points of A that are tried."""
 _SIGNIFICANT = 6.0  # standard deviations
+_NEAR, _SPARSE = (
+    3,
+    2.0,
+)  # so many matches lie about a point, usually; it has none near where they lie so many times as far
 _NOWHERE = "no common offset"
 FALSE_SHARE = 0.01
 """Share of false matches that is accepted, as control bands estimate it."""
@@ -254,13 +259,15 @@ def _attempt(
     coarse = search.offset()
     if coarse is None:
         return NO_MATCHES, replace(report, status=f"{_NOWHERE} within {search.reach:.4g} px")
-    tight, _ = search.trusted(coarse, _LOOSE[1])
+    tight = search.further(search.trusted(coarse, _LOOSE[1])[0])
     report = replace(report, matches=len(tight))
     if len(tight) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches")
-    found, control = search.trusted(search.local(tight), false_share or FALSE_SHARE)
+    local = search.local(tight)
+    found, control = search.trusted(local, false_share or FALSE_SHARE)
+    found = found.and_others(tight.select(~local.contains(tight.xy)))
     errors = search.errors(found)
-    keep, residual = affine_inliers(found.xy[:, 0], errors[:, 1])
+    keep, residual = coherent(found.xy[:, 0], errors[:, 1])
     report = replace(report, matches=len(found), verified=int(keep.sum()), control_share=control)
     if _apart(found.xy[keep, 0], search.patch) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches on common epipolar lines")
@@ -390,7 +397,7 @@ class _Search:
         if not self._matcher.detects:
             middles = [(col + 0.5 * width, row + 0.5 * height) for col, row, width, height in self._windows()]
             points = np.array(middles).reshape(-1, 2)
-        first = frame(*views, points)
+        self._points, first = points, frame(*views, points)
         self._axis = first.axis
         self._frame = _latest(lambda xy: first if xy is points else frame(*views, xy, first.axis))
 
@@ -429,8 +436,11 @@ class _Search:
         "decoys" of peptide identification: Elias and Gygi 2007.)
         """
         found, aside = self._distinct(prediction), 2.0 * prediction.half_width + 6.0
-        decoys = [self._distinct(replace(prediction, aside=side * aside)).score for side in (-1.0, 1.0)]
-        false = 0.5 * np.searchsorted(np.sort(np.concatenate(decoys)), found.score, side="right")
+        decoys = [np.sort(self._distinct(replace(prediction, aside=side * aside)).score) for side in (-1.0, 1.0)]
+        few, many = sorted(decoys, key=len)
+        if len(many) - len(few) > _SIGNIFICANT * np.sqrt(len(many)):  # some are true: rows that lie there
+            many = few
+        false = 0.5 * sum(np.searchsorted(decoy, found.score, side="right") for decoy in (few, many))
         share = false / np.arange(1, len(found) + 1)
         good = np.flatnonzero(share <= false_share)
         count = good[-1] + 1 if len(good) else 0
@@ -457,13 +467,45 @@ class _Search:
                 break
         return None if best is None else best.prediction
 
-    def _blind(self, width: float, probes: int) -> _Peak | None:
-        """Return one pass: a peak among the errors across the epipolar lines of some points, if there is one."""
+    def further(self, tight: Matches) -> Matches:
+        """Return matches and those of other offsets: of points that have none near them, where these show a peak.
+
+        From some row on, or column, an image may lie elsewhere.
+        """
+        for _ in range(RIVALS if self._matcher.detects and len(tight) >= FEW else 0):
+            peak = self._beside(tight.xy[:, 0])
+            more = NO_MATCHES if peak is None else self.trusted(peak.prediction, _LOOSE[1])[0]
+            both = tight.and_others(more)
+            if len(both) - len(tight) < FEW:
+                break
+            tight = both
+        return tight
+
+    def _beside(self, places: Array) -> _Peak | None:
+        """Return a blind pass over the points that have none of some places (M, 2) near them."""
+        tree = cKDTree(places)
+
+        def nearest(xy: Array, count: int) -> Array:
+            return np.asarray(tree.query(xy, k=[count])[0])[:, 0]
+
+        reach = _SPARSE * float(np.median(nearest(places, _NEAR + 1)))
+        count = int((nearest(self._points, _NEAR) > reach).sum())
+        if count < FEW:
+            return None
+        width, probes = _PASSES[0]
+        return self._blind(width, probes * len(self._points) // count, lambda xy: nearest(xy, _NEAR) > reach)
+
+    def _blind(self, width: float, probes: int, bare: Callable[[Array], BoolArray] | None = None) -> _Peak | None:
+        """Return one pass: a peak among the errors across the epipolar lines of some points, if there is one.
+
+        Only of points that are `bare` where that is given.
+        """
         every = self._frame  # and not this search: what it found would keep it, and it what it found
 
         def everywhere(xy: Array) -> EpipolarSegments:
             where = every(xy)
-            return replace(where, before=where.before - width, after=where.after + width)
+            along = where.along if bare is None else np.where(bare(xy), where.along, np.nan)
+            return replace(where, along=along, before=where.before - width, after=where.after + width)
 
         prediction = replace(self._predicted(everywhere, width), probes=probes)
         found = self._matcher.match(*self._views, prediction)
@@ -494,12 +536,16 @@ class _Search:
     def local(self, tight: Matches) -> Prediction:
         """Return the corrected prediction: each point in a band about its neighbours' places by the matches so far."""
         errors, places = self.errors(tight), tight.xy[:, 0]
-        across, tree, every = robust_affine(places, errors[:, 1]), cKDTree(places), self._frame
+        tree, every = cKDTree(places), self._frame
+        slope, spread = gradient(places, errors[:, 1]), robust_spread(coherent(places, errors[:, 1])[1])
+        level = errors[:, 1] - places @ slope
 
         def nearby(xy: Array) -> EpipolarSegments:
-            along = errors[tree.query(xy, k=min(FEW, len(tight)))[1], 0]
+            near = tree.query(xy, k=min(FEW, len(tight)))[1]
+            along = errors[near, 0]
             middle = np.median(along, axis=1)
             half = 4.0 + 3.0 * robust_spread(along, middle[:, None])
-            return replace(every(xy).moved(across(xy)), before=middle - half, after=middle + half)
+            where = every(xy).moved(xy @ slope + np.median(level[near], axis=1))
+            return replace(where, before=middle - half, after=middle + half)
 
-        return self._predicted(nearby, float(np.clip(4.0 * across.spread, 0.6, TOLERANCE)))
+        return self._predicted(nearby, float(np.clip(4.0 * spread, 0.6, TOLERANCE)))

@@ -7,14 +7,17 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from barpc.base.geodesy import Array
 from barpc.base.usual import BIWEIGHT, FEW, SURELY, robust_spread
 from barpc.scene import BoolArray, IntArray, View
-from barpc.tie.pixels import SPAN
 
 LEAST_REACH = 5.0
 """Half a segment [px] below which places along it say nothing of altitudes."""
+_SIDE = 1 / 3
+"""Part of the neighbours that agree: beside a straight edge half of them are of one side, less two standard deviations
+of `FEW` draws."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,22 +136,35 @@ def robust_affine(xy: Array, values: Array, steps: int = 12) -> Affine:
     return Affine(coefficients, middle, scale, robust_spread(values - design @ coefficients))
 
 
-def affine_inliers(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:
-    """Return the values (N,) [px] that agree with an affine function of position (N, 2) [px], and their
-    distances from it (N,).
+def gradient(xy: Array, values: Array) -> Array:
+    """Return the gradient (2,) [per px] of values (N,) at positions (N, 2) [px] that most places share, between jumps.
 
-    Each window of 4 `SPAN` has its own function; what lies within `SURELY` robust standard deviations of it, or
-    `floor` [px], agrees.
+    Each place tells the difference to one of its `FEW` nearest: few of these differences are those of a jump.
     """
-    keep = np.zeros(len(values), dtype=bool)
-    if not len(values):
-        return keep, values
-    residual = values - robust_affine(xy, values)(xy)
-    for rows in grouped(*np.floor(xy[:, ::-1] / (4 * SPAN)).T):
-        if len(rows) >= 2 * FEW:
-            residual[rows] = values[rows] - robust_affine(xy[rows], values[rows])(xy[rows])
-        keep[rows] = np.abs(residual[rows]) <= max(SURELY * robust_spread(residual[rows]), floor)
-    return keep, residual
+    if len(values) <= FEW:
+        return np.zeros(2)
+    far = np.asarray(cKDTree(xy).query(xy, k=[FEW])[1])[:, 0]
+    fitted = robust_affine(xy[far] - xy, values[far] - values)
+    out: Array = fitted.coefficients[1:] / fitted.scale
+    return out
+
+
+def coherent(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:
+    """Return the values (N,) [px] at positions (N, 2) [px] that neighbours share, and their distances from the
+    median of these (N,).
+
+    An image may jump at a row or a column, so that no function of position holds all of it: a value that agrees with
+    enough of the `FEW` nearest is none that came by chance. It does within `SURELY` robust standard deviations, or
+    `floor` [px].
+    """
+    if len(values) < 2:
+        return np.ones(len(values), dtype=bool), np.zeros(len(values))
+    level = values - xy @ gradient(xy, values)
+    near = cKDTree(xy).query(xy, k=min(FEW + 1, len(xy)))[1]
+    others = level[near]
+    residual = level - np.median(others, axis=1)
+    agree = np.abs(others - level[:, None]) <= max(SURELY * robust_spread(residual), floor)
+    return agree.sum(axis=1) - 1 >= _SIDE * (near.shape[1] - 1), residual
 
 
 def grouped(*keys: npt.NDArray[Any]) -> list[IntArray]:

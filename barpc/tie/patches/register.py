@@ -20,7 +20,7 @@ from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array
 from barpc.base.options import TieOptions
 from barpc.base.usual import FEW, robust_spread
 from barpc.scene import BoolArray, IntArray, Tracks, View
-from barpc.tie.pairing.epipolar import LEAST_REACH, affine_inliers, frame, grouped, linear_map
+from barpc.tie.pairing.epipolar import LEAST_REACH, coherent, frame, grouped, linear_map
 from barpc.tie.patches import oriented
 from barpc.tie.pixels import SPAN, FloatImage, PixelReader, grow, levelled
 from barpc.tie.tasks import HERE, Work
@@ -420,7 +420,7 @@ class _Links:
                 usual = _usual(self.origin[group], found.sigma[group])
                 group = group[found.sigma[group] <= _DISTORTED * usual]
                 errors, reach[group] = self.errors(found, group)
-                verified[group] = affine_inliers(self.origin[group], errors[:, 1], oriented.SIGMA)[0]
+                verified[group] = coherent(self.origin[group], errors[:, 1], oriented.SIGMA)[0]
                 altitude[group] = errors[:, 0] / np.maximum(reach[group], 1e-9)
         return verified & ~self._torn(verified, altitude, reach)
 
@@ -435,7 +435,7 @@ class _Links:
         views = self.tracks.view
         three = views[self.reference[first]], views[self.other[first]], views[self.other[second]]
         for group in grouped(*three):
-            agree = affine_inliers(self.origin[first[group]], apart[group], 2 * oriented.SIGMA)[0]
+            agree = coherent(self.origin[first[group]], apart[group], 2 * oriented.SIGMA)[0]
             for end in (first[group], second[group]):
                 compared[end] = True
                 agreed[end[agree]] = True
@@ -449,7 +449,7 @@ class _Links:
             group = group[good[group]]
             if len(group) >= FEW:
                 across = self.errors(found, group)[0][:, 1]
-                residual = affine_inliers(self.origin[group], across, oriented.SIGMA)[1]
+                residual = coherent(self.origin[group], across, oriented.SIGMA)[1]
                 sigma[group] *= max(1.0, robust_spread(residual / sigma[group]))
         return sigma
 
