@@ -215,8 +215,7 @@ def _agreeing(
         except (AdjustError, np.linalg.LinAlgError) as error:
             _LOG.info("without %s: %s", block.names[v], error)
             continue
-        measured = np.isfinite(found.after.error) or np.delete(_lost(found, others), v).max() < 0.5
-        if measured and agrees(found):
+        if np.delete(_lost(found, others), v).max() < 0.5 and agrees(found):  # the few left of many agree by choice
             yield v, others, found
 
 
