@@ -156,8 +156,9 @@ def solve_block(
         ended, weight = outcome.minimum.state, block.use / block.sigma
         there, _ = revived(problem, ended, outcome.residual, outcome.inlier, weight)
         there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
-        asked = {"drift": outcome.smooth}
-        problem, outcome = bent, Rounds(bent, block, there, heights, outcome.inlier).run()
+        tried = Rounds(bent, block, there, heights, outcome.inlier).run()
+        if tried.inlier.sum() > 0.5 * outcome.inlier.sum():  # the few left of many agree with anything
+            asked, problem, outcome = {"drift": outcome.smooth}, bent, tried
     if block.gcps.names and agreed is None:
         free = Solution(problem, state, before, heights, outcome, start, start, None, asked, by_point=by_point)
         agreed, heights = _with_control(block, given, outcome)

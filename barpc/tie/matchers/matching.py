@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from barpc.base.geodesy import Array
 from barpc.base.options import TieOptions
-from barpc.base.usual import FEW, MANY, RIVALS, SAMPLE, robust_spread
+from barpc.base.usual import FEW, MANY, RIVALS, SAMPLE, SURELY, robust_spread
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.matchers.features import AMPLE, KeypointFiles, Keypoints, ample_matches, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
@@ -437,10 +437,9 @@ class _Search:
         """
         found, aside = self._distinct(prediction), 2.0 * prediction.half_width + 6.0
         decoys = [np.sort(self._distinct(replace(prediction, aside=side * aside)).score) for side in (-1.0, 1.0)]
-        few, many = sorted(decoys, key=len)
-        if len(many) - len(few) > _SIGNIFICANT * np.sqrt(len(many)):  # some are true: rows that lie there
-            many = few
-        false = 0.5 * sum(np.searchsorted(decoy, found.score, side="right") for decoy in (few, many))
+        few, many = np.sort([np.searchsorted(decoy, found.score, side="right") for decoy in decoys], axis=0)
+        # some in one of them are true where an image's rows lie as far off
+        false = np.where(many - few > SURELY * np.sqrt(few + many), few, 0.5 * (few + many))
         share = false / np.arange(1, len(found) + 1)
         good = np.flatnonzero(share <= false_share)
         count = good[-1] + 1 if len(good) else 0
@@ -473,16 +472,17 @@ class _Search:
         From some row on, or column, an image may lie elsewhere.
         """
         for _ in range(RIVALS if self._matcher.detects and len(tight) >= FEW else 0):
-            peak = self._beside(tight.xy[:, 0])
+            peak = self._beside(tight)
             more = NO_MATCHES if peak is None else self.trusted(peak.prediction, _LOOSE[1])[0]
             both = tight.and_others(more)
-            if len(both) - len(tight) < FEW:
+            if len(both) == len(tight):
                 break
             tight = both
         return tight
 
-    def _beside(self, places: Array) -> _Peak | None:
-        """Return a blind pass over the points that have none of some places (M, 2) near them."""
+    def _beside(self, found: Matches) -> _Peak | None:
+        """Return a blind pass over the points that have none of some matches near them, about the offset of these."""
+        places, offset = found.xy[:, 0], float(np.median(self.errors(found)[:, 1]))
         tree = cKDTree(places)
 
         def nearest(xy: Array, count: int) -> Array:
@@ -490,9 +490,9 @@ class _Search:
 
         reach = _SPARSE * float(np.median(nearest(places, _NEAR + 1)))
         count = int((nearest(self._points, _NEAR) > reach).sum())
-        if count < FEW:
+        if not count:
             return None
-        width, probes = _PASSES[0]
+        width, probes = _PASSES[0][0] + abs(offset), _PASSES[0][1]
         return self._blind(width, probes * len(self._points) // count, lambda xy: nearest(xy, _NEAR) > reach)
 
     def _blind(self, width: float, probes: int, bare: Callable[[Array], BoolArray] | None = None) -> _Peak | None:
