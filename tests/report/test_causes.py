@@ -42,17 +42,18 @@ def test_every_explanation_has_its_words() -> None:
     [
         (
             STRIP, 1, (1, 4999.4, 12000.0, 0.0, 0.0), (3.0, 4.0),
-            "rows 5000-5999 of east lie 5.00 px off the rest of it", (5000.0, 5999.0),
+            "rows 5000-5999 of east (or what west shows of them) lie 5.00 px off the rest of it", (5000.0, 5999.0),
         ),
         (
             STRIP, 0, (0, -8000.0, 100.0, 0.0, 0.0), (0.0, -0.5),
-            "columns 0-99 of west lie 0.50 px off the rest of it", (0.0, 99.0),
+            "columns 0-99 of west (or what east shows of them) lie 0.50 px off the rest of it", (0.0, 99.0),
         ),
         (
             FADE, 0, (1, -12000.0, 24000.0, 0.0, 1 / 400.0), (2.0, 0.0),
-            "rows of west lie 2.00 px off at row 0, which fades within 400 rows", (0.0, 11999.0),
+            "rows of west (or what east shows of them) lie 2.00 px off at row 0, which fades within 400 rows",
+            (0.0, 11999.0),
         ),
-        (WANDER, 1, None, (0.3, 0.4), "rows of east wander by 0.50 px", (None, None)),
+        (WANDER, 1, None, (0.3, 0.4), "rows of east or west wander by 0.50 px", (None, None)),
     ],
 )  # fmt: skip
 def test_a_finding_is_said_with_its_place_and_size(kind, view, where, size, sentence, ends) -> None:

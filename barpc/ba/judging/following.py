@@ -200,8 +200,8 @@ def without_strips(found: Solution, judged: Judgement, block: Block, outer: Bloc
     plain = follow(found, block, outer, options)  # splines and detectors may explain the same, and leave nothing
     left = [sum(one.gain for one in standing_out(of.outcome, block, options.noise_floor)) for of in (plain, tried)]
     calm = plain is not found and left[0] <= left[1]
-    least = swing and not shaken  # the fewer unknowns stay, where the others are not surely better
-    stays = not is_better(plain.after, tried.after, outer) if least else is_better(tried.after, plain.after, outer)
+    # of parts of few images the fewer unknowns stay, where the others are not surely better
+    stays = is_better(tried.after, plain.after, outer) if shaken else not is_better(plain.after, tried.after, outer)
     if not calm or stays:
         return tried
     return plainly if shaken or swing else found

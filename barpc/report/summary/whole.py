@@ -289,13 +289,18 @@ def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
 def _explained(one: Finding, adjustment: Adjustment) -> ExplanationEntry:
     """Return an explanation; of a settling of all images, the largest is told of."""
     names = adjustment.names
-    image, others = names[one.view], tuple(names[v] for v in one.or_of)
+    # of two images each is only seen against the other
+    of_pair = len(names) == 2 and one.motion is None
+    image, others = names[one.view], tuple(names[v] for v in ((1 - one.view,) if of_pair else one.or_of))
+    of_all = one.motion is not None or one.kind == SETTLING
     alike = [each for each in adjustment.findings if each.kind == SETTLING] if one.kind == SETTLING else [one]
     size = max(float(np.hypot(*each.size)) for each in alike)
-    fields: dict[str, Any] = {"size_px": size, "period": one.period, "or_of": others or None}
+    fields: dict[str, Any] = {"size_px": size, "period": one.period, "or_of": None if of_all else others or None}
     # two images do not tell what there is along their epipolar lines
     words: dict[str, Any] = {"size": size, "least": "at least " if len(names) == 2 else "", **fields}
     words["image"] = " or ".join([image, *others])
+    if others and one.kind in (STRIP, FADE):  # places are those of the first
+        words["image"] = f"{image} (or what {' or '.join(others)} shows of them)"
     if one.motion is not None:
         box = one.motion.box
         middle = wrap_longitude(box[0] + (box[2] - box[0]) % 360.0 / 2.0), (box[1] + box[3]) / 2.0
@@ -316,7 +321,6 @@ def _explained(one: Finding, adjustment: Adjustment) -> ExplanationEntry:
             last = 2.0 * adjustment.cameras.unknowns.half[axis, one.view] - 1.0
             fields["first"], fields["last"] = np.clip((np.ceil(start), np.ceil(stop) - 1.0), 0.0, last).tolist()
             words |= fields
-    of_all = one.motion is not None or one.kind == SETTLING
     numbers = one.gain, one.gap, one.runner_up or None
     return ExplanationEntry(one.kind, _WORDS[one.kind].format(**words), None if of_all else image, *numbers, **fields)
 
