@@ -231,38 +231,31 @@ def plants(clean: Clean, kinds: Sequence[str], seed: int) -> Iterator[tuple[floa
                 yield size, Plant(kind, view, axis, start, (float(by[0]), float(by[1])))
 
 
+def _written(plant: Plant, source: str, folder: Path) -> tuple[Path, tuple[int, int]]:
+    """Write the image as it is delivered; return its path and size."""
+    with rasterio.open(source) as file:
+        pixels = file.read(1)
+    kept = np.iinfo(pixels.dtype)
+    warped = np.clip(np.rint(plant.pixels(pixels.astype(np.float64))), kept.min, kept.max).astype(pixels.dtype)
+    path, shape = folder / Path(source).name, (warped.shape[1], warped.shape[0])
+    plain = {"driver": "GTiff", "count": 1, "dtype": pixels.dtype, "width": shape[0], "height": shape[1]}
+    with rasterio.open(path, "w", **plain) as file:
+        file.write(warped, 1)
+    return path, shape
+
+
 def planted(clean: Clean, plant: Plant, size: float, folder: Path) -> Result:
     """Plant an error, run, and measure."""
     views, one = list(clean.views), clean.views[plant.view]
-    with rasterio.open(one.path) as file:
-        pixels, profile = file.read(1), file.profile
-    kept = np.iinfo(pixels.dtype)
-    warped = np.clip(np.rint(plant.pixels(pixels.astype(np.float64))), kept.min, kept.max).astype(pixels.dtype)
-    shape = (warped.shape[1], warped.shape[0])
-    path = folder / Path(one.path).name
-    plain = {"driver": "GTiff", "count": 1, "dtype": profile["dtype"], "width": shape[0], "height": shape[1]}
-    with rasterio.open(path, "w", **plain) as file:
-        file.write(warped, 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        path, shape = _written(plant, one.path, folder)
     views[plant.view] = replace(one, path=str(path), size=shape)
     result, said, seconds = run(views)
     names = [view.name for view in clean.views]
     if result is None:
-        nan = float("nan")
-        return Result(
-            clean.name,
-            one.name,
-            size,
-            str(plant),
-            1,
-            "refused",
-            nan,
-            nan,
-            nan,
-            (),
-            False,
-            seconds,
-            (said.replace(str(folder), ""),),
-        )
+        numbers, said = (float("nan"),) * 3, said.replace(str(folder), "")
+        return Result(clean.name, one.name, size, str(plant), 1, "refused", *numbers, (), False, seconds, (said,))
     sensors = dict(zip(result.adjustment.names, result.adjustment.sensors, strict=True))
     error, worst = measured(clean, plant, shape, [sensors[name] for name in names])
     told = result.summary
@@ -270,10 +263,8 @@ def planted(clean: Clean, plant: Plant, size: float, folder: Path) -> Result:
     named = tuple(name for name in names if any(name in text for text in words))
     right = named == (one.name,) if len(names) > 2 else one.name in named
     shown = measured(clean, plant, shape, clean.sensors)[0]
-    code = 0 if result.passed else 3
-    return Result(
-        clean.name, one.name, size, str(plant), code, told["status"], error, worst, shown, named, right, seconds, words
-    )
+    code, status, numbers = 0 if result.passed else 3, told["status"], (error, worst, shown)
+    return Result(clean.name, one.name, size, str(plant), code, status, *numbers, named, right, seconds, words)
 
 
 def _summary(results: Sequence[Result]) -> str:

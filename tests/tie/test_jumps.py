@@ -1,0 +1,93 @@
+"""An image of which rows or columns lie elsewhere: its tie points are found behind the edge as before it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.base.options import TieOptions
+from barpc.rasters.raster import open_raster
+from barpc.scene import View
+from barpc.tie import common_tracks, find_tracks
+from barpc.tie.matchers.given import verify_given
+from barpc.tie.matchers.matcher import Matches
+from barpc.tie.matchers.matching import _Search
+from barpc.tie.pairing.overlaps import Pair
+from barpc.tie.tasks import HERE
+from benchmarks.planted import Plant
+from tests.tie.conftest import Rendered, write_image
+
+PLANTS = [
+    Plant("jump", 1, 1, 150, (0.0, 2.0)),
+    Plant("jump", 1, 1, 90, (-12.0, 0.0)),
+    Plant("lost", 1, 1, 150, (0.0, -6.0)),
+    Plant("detector", 1, 0, 200, (3.0, 0.0)),
+    Plant("jump", 1, 1, 230, (0.0, 6.0)),
+    Plant("jump", 1, 1, 150, (1.0, 0.0)),
+    Plant("jump", 1, 1, 60, (3.0, 0.0)),
+    Plant("detector", 1, 0, 100, (0.0, -1.0)),
+]
+
+
+def planted(view: View, plant: Plant, folder) -> View:
+    """The view as it is delivered with the error."""
+    with open_raster(view.path) as dataset:
+        pixels = dataset.read(1)
+    moved = np.clip(np.rint(plant.pixels(pixels.astype(np.float64))), 0, np.iinfo(pixels.dtype).max)
+    path = write_image(folder / f"{view.name}.tif", moved.astype(pixels.dtype))
+    return replace(view, path=str(path), size=(moved.shape[1], moved.shape[0]))
+
+
+@pytest.mark.few(4)
+@pytest.mark.parametrize("plant", PLANTS, ids=str)
+def test_ties_stand_behind_an_edge_as_they_do_before_it(scene: Rendered, plant: Plant, tmp_path) -> None:
+    usual, _ = common_tracks(scene.tied.tracks, 0, 1)
+    views = [scene.views[0], planted(scene.views[1], plant, tmp_path)]
+    first, second = common_tracks(find_tracks(views).tracks, 0, 1)
+    true = scene.place(0, 1, first)
+    beyond = true[:, plant.axis] > plant.start - 0.5 - min(0.0, plant.by[plant.axis])
+    off = second - true - np.where(beyond[:, None], plant.by, 0.0)
+    edge = np.abs(true[:, plant.axis] - plant.start) < 12 + np.abs(plant.by).max()
+    known = np.isfinite(off).all(axis=1) & ~edge
+    assert np.quantile(np.abs(off[known]), 0.95) < 0.25
+    assert np.median(np.hypot(*off[known].T)) < 0.1
+    before = scene.place(0, 1, usual)[:, plant.axis] > plant.start
+    for side in (True, False):  # both sides keep what they had, but for a band about the edge
+        assert (beyond == side).sum() > 0.6 * (before == side).sum()
+
+
+def given(scene: Rendered, jump: tuple[float, float], wrong: float, count: int = 400) -> tuple[Matches, np.ndarray]:
+    """Matches of which the lower part of the second view has jumped, and a share lies anywhere; which are right."""
+    rng = np.random.default_rng(5)
+    first = rng.uniform(20, 280, (3 * count, 2))
+    second = scene.place(0, 1, first)
+    fine = np.flatnonzero(np.isfinite(second).all(axis=1) & (second > 5).all(axis=1) & (second < 280).all(axis=1))
+    first, second = first[fine[:count]], second[fine[:count]] + rng.normal(0.0, 0.1, (count, 2))
+    second += np.where(second[:, 1:] > 150, jump, 0.0)
+    right = rng.uniform(size=count) >= wrong
+    second[~right] = rng.uniform(20, 280, ((~right).sum(), 2))
+    return Matches.of_places(np.stack([first, second], axis=1), np.zeros(count)), right
+
+
+@pytest.mark.parametrize("wrong", [0.1, 0.3, 0.5])
+@pytest.mark.parametrize("jump", [(0.0, 0.0), (2.0, 0.0), (12.0, 0.0), (0.0, -6.0)])
+def test_of_given_matches_those_behind_a_jump_stay_and_those_anywhere_go(scene: Rendered, jump, wrong: float) -> None:
+    matches, right = given(scene, jump, wrong)
+    pair = Pair((0, 1), 1.0, 5.0)
+    ((found, report),) = verify_given(scene.views, {(0, 1): matches}, [pair], TieOptions(), HERE)
+    assert report.status == "ok"
+    kept = (found.xy[:, None] == matches.xy[None]).all(axis=(2, 3)).any(axis=0)
+    lower = matches.xy[:, 1, 1] > 150 + jump[1]
+    for side in (lower, ~lower):
+        assert kept[right & side].mean() > 0.85
+    assert kept[~right].sum() <= max(3, 0.03 * kept.sum())
+
+
+def test_a_clean_pair_is_not_looked_at_for_offsets_that_it_does_not_have(scene: Rendered, monkeypatch) -> None:
+    peaks, beside = [], _Search._beside
+    monkeypatch.setattr(_Search, "_beside", lambda *args: peaks.append(beside(*args)) or peaks[-1])
+    find_tracks(scene.views)
+    assert peaks
+    assert not any(peaks)
