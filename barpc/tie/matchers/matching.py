@@ -263,9 +263,7 @@ def _attempt(
     report = replace(report, matches=len(tight))
     if len(tight) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches")
-    local = search.local(tight)
-    found, control = search.trusted(local, false_share or FALSE_SHARE)
-    found = found.and_others(tight.select(~local.contains(tight.xy)))
+    found, control = search.trusted(search.local(tight), false_share or FALSE_SHARE)
     errors = search.errors(found)
     keep, residual = coherent(found.xy[:, 0], errors[:, 1])
     report = replace(report, matches=len(found), verified=int(keep.sum()), control_share=control)
