@@ -65,9 +65,18 @@ def _reservations(view: ViewEntry, run: Run) -> Found:
     moving = view.num_moving / max(view.num_moving + view.num_rejected + view.num_observations, 1)
     if moving > MANY_REJECTED:
         yield "moving", {"share": 100 * moving}
-    for one in () if adjustment is None else left_entries(adjustment):
+    if adjustment is not None:
+        yield from _of_places(view, adjustment)
+
+
+def _of_places(view: ViewEntry, adjustment: Adjustment) -> Found:
+    """Return what rows and columns say that stand out."""
+    for one in left_entries(adjustment):
         if one.image == view.name and (what := stands_out(one)):
-            yield "place", {"place": f"{one.axis} {one.first:.0f}-{one.last:.0f}", "what": what}
+            place, cause = f"{one.axis} {one.first:.0f}-{one.last:.0f}", "clouds, water, change there"
+            if one.axis == AXES[0] and one.rejected <= MANY_REJECTED:  # nothing on the ground is as long as the pass
+                place, cause = f"{place}, over all rows,", "detectors or resampling"
+            yield "place", {"place": place, "what": what, "cause": cause}
 
 
 def _weakly_tied(view: ViewEntry, run: Run) -> Found:

@@ -591,6 +591,7 @@ def test_what_was_cut_in_an_interval_is_said_with_its_distance(monkeypatch) -> N
     away[0, 4] = np.nan  # row 20
     away[:, 1::2] = 1e3
     monkeypatch.setattr(judging, "revived", lambda *_: (None, away))
+    monkeypatch.setattr(judging, "shared", lambda *_: 0.0)
     outcome: Any = SimpleNamespace(
         minimum=SimpleNamespace(state=None), problem=None, residual=None, inlier=inlier, standing_out={}
     )
@@ -606,6 +607,9 @@ def test_what_was_cut_in_an_interval_is_said_with_its_distance(monkeypatch) -> N
     assert apart(replace(one, view=1)) == [pytest.approx(np.hypot(1e3, 1e3))]
     assert apart(interval(10.0, 60.0)) == [0.0]  # none by its share: nothing is measured
     assert apart(interval(10.0, 60.0), one) == [15.0, 15.0]
+    monkeypatch.setattr(judging, "shared", lambda *_: 1e9)  # a mean that noise of neighbours explains is none
+    assert apart(interval(10.0, 60.0)) == []
+    assert apart(interval(10.0, 60.0), one) == [15.0]
 
 
 def test_what_was_cut_is_seen_where_two_others_tell_its_point() -> None:

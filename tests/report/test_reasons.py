@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import barpc
+from barpc.ba.evidence.scan import Interval
 from barpc.base.options import TieOptions, declared
 from barpc.cli import COMMANDS, cli
 from barpc.cli.adjust import adjust
@@ -106,6 +107,20 @@ def test_where_tie_points_contradict_is_said_of_the_image_and_not_again_of_the_b
     cause, advice = reason(run, name=name, num_observations=60, num_rejected=90)
     assert cause == "rejected"  # it is a part of the image that is off, and so its RPC is its own
     assert "same direction; most in rows 100-399, where 80 % were" in advice
+
+
+def test_columns_that_lie_off_over_all_rows_are_no_clouds():
+    columns = Interval(0, 0, 100.0, 400.0, 30.0, 0.02, 0.16, False, 0.0)
+    names = tuple(found_by_judge(left=[]).names)
+    for one, told in (
+        (columns, "columns 100-399, over all rows, stand out, their tie points are left with 0.16 px in common: look "
+         "for detectors or resampling"),
+        (replace(columns, share=0.8, by_share=True, apart=2.5), "look for clouds, water, change there"),
+        (replace(columns, axis=1), "look for clouds, water, change there"),
+    ):  # fmt: skip
+        run = run_of(adjusted(left=[one], names=names), number={name: k for k, name in enumerate(names)})
+        assert reason(run, name=names[0])[0] == "place"
+        assert reason(run, name=names[0])[1].endswith(told)
 
 
 @pytest.mark.parametrize(

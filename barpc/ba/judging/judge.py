@@ -102,6 +102,11 @@ def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
     As their tracks see it that are triangulated with all that may be seen, where all of one was cut.
     """
     found = standing_out(outcome, block, floor)
+    if not all(
+        one.by_share for one in found
+    ):  # noise that neighbours share makes means of them, and is none of an image's part
+        by_neighbours = shared(outcome, block)
+        found = [one for one in found if one.by_share or one.gain > by_neighbours]
     if not any(one.by_share for one in found):
         return found
     state, weight = outcome.minimum.state, block.use / block.sigma

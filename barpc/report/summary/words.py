@@ -130,7 +130,7 @@ CAUSES = {
         "that took no part are left with {error:.2f} px",
         "look for repeated patterns and noise, or give matches of your own (--matches)"),
     "place": Cause("doubtful", "a part of it lies off",
-        "{place} stand out, {what}", "look for clouds, water, change there"),
+        "{place} stand out, {what}", "look for {cause}"),
     "gap": Cause("doubtful", "a part of it without tie points",
         "{place} have {found} of some {due} tie points that their detail lets expect, so an error there would not show",
         "look for clouds, water, change there, or a jump of the image"),
