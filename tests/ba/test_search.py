@@ -57,7 +57,7 @@ def seen() -> Seen:
 
 
 def taken(gain: float, kind: str = STRIP, view: int = 0, gap: float = 1.0) -> _Taken:
-    return _Taken(explained(kind, view), gain, gap, "", ())
+    return _Taken(explained(kind, view), gain, gap, "", (), seen())
 
 
 # --- intervals and explanations that are the same ---------------------------------------------------------------------
@@ -234,11 +234,12 @@ def test_what_ends_as_best_is_sure_by_what_the_next_ones_lack(monkeypatch) -> No
     def ran(*states: _State) -> tuple[list[_Taken], Any]:
         monkeypatch.setattr(_Search, "_grown", lambda self, before: (list(states), True))
         monkeypatch.setattr(judging, "_said", lambda rows, n, seen: [rows[n]])
-        monkeypatch.setattr(_Search, "_by_neighbours", lambda self: shared)
+        noise = iter([shared, *beside])
+        monkeypatch.setattr(judging, "_by_neighbours", lambda seen: next(noise))
         found = search().run()
         return list(found.findings), found  # type: ignore[arg-type]
 
-    shared = 41.9
+    shared, beside = 41.9, [11.9]
     last, earlier = fitted(right=np.zeros(6)), fitted(step=np.ones((2, 3)))
     one = _State(replace(seen(), base=last), earlier, (taken(30.0, gap=-2.0), taken(12.0, FADE, gap=3.0)))
     rows, found = ran(one, state(35.0))
@@ -252,6 +253,9 @@ def test_what_ends_as_best_is_sure_by_what_the_next_ones_lack(monkeypatch) -> No
     assert len(moves) == 2
     assert found.step is earlier.step
     assert found.right is earlier.right
+    shared, beside = 41.9, [12.0]  # beside the first it explains as much as the second: that stays out
+    rows, found = ran(one)
+    assert [row.gain for row in rows] == [30.0]
     shared = 42.0  # noise that neighbours share explains as much as all that was taken
     rows, found = ran(one)
     assert rows == []
@@ -262,7 +266,7 @@ def test_what_neighbours_share_is_asked_of_right_ties_in_stated_deviations(monke
     """Two tracks of three views and one of two: of 16 residuals 3 + 3 + 1 are free."""
     tracks = [SimpleNamespace(rows=np.array([[0, 1, 2], [3, 4, 5]])), SimpleNamespace(rows=np.array([[6, 7]]))]
     view = np.array([0, 1, 2, 0, 1, 2, 0, 1, 2])  # the last takes no part
-    linear: Any = SimpleNamespace(view=view, tracks=tracks, left=lambda step: np.zeros((2, 9)))
+    linear: Any = SimpleNamespace(view=view, tracks=tracks, left=lambda step: np.zeros((2, 9)), sigma=np.ones(9))
     off, asked = np.zeros((2, 9)), list[Any]()
     monkeypatch.setattr(judging, "off_from_right", lambda *_: (off, None))
 
@@ -273,14 +277,15 @@ def test_what_neighbours_share_is_asked_of_right_ties_in_stated_deviations(monke
     monkeypatch.setattr(judging, "shared_errors", told)
     size = np.full((2, 3), 100.0)
     base = fitted(right=np.ones(9), noise=7.0)
-    one = search(seen=replace(seen(), linear=linear, base=base, place=np.arange(18.0).reshape(2, 9), size=size))
-    assert one._by_neighbours() == pytest.approx(16.0 * 7 / 16)
+    place, extra = np.arange(18.0).reshape(2, 9), np.zeros((2, 0, 9))
+    one = replace(seen(), linear=linear, base=base, place=place, size=size, extra=extra)
+    assert judging._by_neighbours(one) == pytest.approx(16.0 * 7 / 16)
     of_view, place, _, values = asked.pop()
     assert of_view.tolist() == view[:8].tolist()
     np.testing.assert_array_equal(place, np.arange(18.0).reshape(2, 9)[:, :8])
     assert values.shape == (2, 8)
     off[0, 6] = 5.1  # what is larger is no noise, whatever the noise of all is
-    assert one._by_neighbours() == pytest.approx(16.0 * (1.0 - 1.5 * 3 / 7))
+    assert judging._by_neighbours(one) == pytest.approx(16.0 * (1.0 - 1.5 * 3 / 7))
     assert asked.pop()[0].tolist() == [0, 1, 2, 0, 1, 2, 1]
 
 

@@ -257,6 +257,7 @@ class _Taken:
     gap: float
     runner_up: str
     or_of: tuple[int, ...]
+    beside: Seen  # what was taken before
 
     @property
     def what(self) -> tuple[str, int]:
@@ -300,12 +301,25 @@ class _State:
         close = [row[0] for row in others if row[2] > gain - SURE]
         or_of = tuple(sorted({row.view for row in close if one.kind == row.kind == SWING}))
         _LOG.info("%s of view %d, %s: %.0f nats (%s %.0f)", one.kind, one.view, one.where, gain, *other)
-        taken = (*self.taken, _Taken(one, gain, gain - max(other[1], 0.0), other[0], or_of))
+        taken = (*self.taken, _Taken(one, gain, gain - max(other[1], 0.0), other[0], or_of, self.seen))
         extra = np.concatenate([self.seen.extra, one.extra], axis=1)
         sigma = np.append(self.seen.sigma, one.sigma)
         seen = replace(self.seen, base=made, extra=extra, sigma=sigma)
         follows = one.kind in FOLLOWED
         return _State(seen, made if follows else self.followed, taken, not follows or len(taken) == TRIED)
+
+
+def _by_neighbours(seen: Seen) -> float:
+    """Return what noise that neighbours share explains beside what was taken [nats]."""
+    found, linear = seen.base, seen.linear
+    left = linear.left(found.step) + np.einsum("cek,e->ck", seen.extra, found.extra) / linear.sigma
+    off, _ = off_from_right(linear, left, found.right)
+    track = np.full(len(linear.view), -1)
+    for n, tracks in enumerate(linear.tracks):
+        track[tracks.rows] = len(linear.view) * n + np.arange(len(tracks.rows))[:, None]
+    right = (track >= 0) & (found.right > 0.5)
+    # what is larger than what matchers are stated to err by is no noise of theirs
+    return _shared(linear.view, seen.place, seen.size, off, right, track)
 
 
 class _Search:
@@ -322,7 +336,11 @@ class _Search:
         while not ended:
             states, ended = self._grown(states)
         best, margin = states[0], states[0].gain - (states[1].gain if len(states) > 1 else 0.0)
-        if best.gain <= self._by_neighbours():
+        for n, row in enumerate(best.taken):  # what is left, as well
+            if sum(one.gain for one in best.taken[n:]) <= _by_neighbours(row.beside):
+                best = _State(row.beside, row.beside.base, best.taken[:n])
+                break
+        if not best.taken:
             return Judgement()
         self.seen = best.seen
         # what was not the best by itself is beside the others: by what these gain together
@@ -331,17 +349,6 @@ class _Search:
         base = best.seen.base if followed == len(taken) else best.followed
         found = tuple(one for n in range(len(taken)) for one in _said(taken, n, best.seen))
         return Judgement(found, base.step, base.right)
-
-    def _by_neighbours(self) -> float:
-        """Return what noise that neighbours share explains where nothing else was taken [nats]."""
-        seen, found, linear = self.start, self.start.base, self.start.linear
-        off, _ = off_from_right(linear, linear.left(found.step), found.right)
-        track = np.full(len(linear.view), -1)
-        for n, tracks in enumerate(linear.tracks):
-            track[tracks.rows] = len(linear.view) * n + np.arange(len(tracks.rows))[:, None]
-        right = (track >= 0) & (found.right > 0.5)
-        # what is larger than what matchers are stated to err by is no noise of theirs
-        return _shared(linear.view, seen.place, seen.size, off, right, track)
 
     def _grown(self, states: list[_State]) -> tuple[list[_State], bool]:
         """Return the best with one more explanation, and whether they are the last."""
