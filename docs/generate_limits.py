@@ -11,7 +11,6 @@ import re
 from pathlib import Path
 
 from barpc import scene
-from barpc.ba.held import incremental
 from barpc.base import frozen, geodesy, options, sidefile
 from barpc.base.remote import _KEPT as HELD
 from barpc.base.remote import _LONGEST as REQUEST
@@ -102,7 +101,6 @@ def rows() -> list[tuple[str, str]]:
         ("a polynomial of a SICD", f"degree {sicd._ORDER}"),
         ("a name of an image", f"{names.MAX_NAME} bytes"),
         ("control points of a fit", many(options.MOST_POINTS)),
-        ("unknowns of an earlier block", many(incremental._LARGEST)),
         ("an area", f"{many(area._MOST_CROSSED)} times that its outline crosses itself"),
         (
             "numbers of JSON and `block.npz`",

@@ -50,6 +50,7 @@ def adjust_tracks(
     prior: BlockPrior | None = None,
     reference: Reference | None = None,
     altimetry: Altimetry | None = None,
+    known: BoolArray | None = None,
     keep_largest: bool = False,
     hold_out: bool = True,
 ) -> Adjustment:
@@ -64,8 +65,11 @@ def adjust_tracks(
     dem : callable or None, lon, lat (n,) [deg] -> altitude (n,) [m above the ellipsoid], NaN outside
     centers : (N, 3) or None, camera centres [m], ECEF; None: regressed from the sensors
     prior : BlockPrior or None
-        An earlier block, whose views are among these: its corrections and their joint covariance are the
-        prior. `tracks` then holds new observations only.
+        An earlier block, some of whose views are among these: their corrections and joint covariance are the prior,
+        and they need no tie points. `tracks` then holds tie points with a new view only.
+    known : (K,) or None
+        Observations of its views that the earlier block was learnt from, or may have been: of these counts what they
+        tell with the others, and not again what they tell alone. None: all are new.
     reference : Reference or None, control of an orthoimage and the terrain `dem`
     altimetry : Altimetry or None, heights that no image coordinates go with
     keep_largest, hold_out : bool
@@ -86,14 +90,20 @@ def adjust_tracks(
     options = AdjustOptions() if options is None else options
     if centers is None and options.center != "line":
         centers = np.array([camera_center(v.sensor, v.size, v.alt_range, options.center).ecef for v in views])
-    block = join(tuple(views), tracks, gcps, options, keep_largest, reference)
+    prior = None if prior is None else prior.marginal([view.name for view in views])
+    held = () if prior is None else prior.names
+    block = join(tuple(views), tracks, gcps, options, keep_largest, reference, held)
+    if known is not None and prior is not None:
+        given = np.append(known & np.isin([view.name for view in views], held)[tracks.view], np.zeros(block.num_rows))
+        block = replace(block, known=given[block.order].astype(bool))
     rows = keep_out(block) if hold_out else np.zeros_like(block.use)
     parts = Parts(block, rows, np.zeros(len(rows), dtype=np.int64))
 
     def solve(inner: Block, outer: Block, options: AdjustOptions) -> Solution:
         return solve_block(inner, outer, options, dem, centers, prior)
 
-    return replace(_solved(parts, options, solve, altimetry), seconds=time.process_time() - start)
+    found = _solved(parts, options, solve, altimetry)
+    return replace(found, earlier=prior, seconds=time.process_time() - start)
 
 
 def _solved(parts: Parts, options: AdjustOptions, solve: Solver, altimetry: Altimetry | None) -> Adjustment:
@@ -274,6 +284,7 @@ def _adjustment(found: Solution, parts: Parts, options: AdjustOptions, in_space:
         gauge=gauge,
         datum=shares,
         prior=outcome.prior,
+        told=outcome.told,
         smooth=outcome.smooth,
         asked=found.asked,
         findings=tuple(_said(found.findings, parts, points)),

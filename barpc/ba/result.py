@@ -75,6 +75,8 @@ class Adjustment:
         Source (`barpc.ba.held.gauge.SOURCES`) -> its share (10,) in what is known of the scene's `MOTIONS`.
     prior : PriorTest
         Comparison of the corrections with the priors given, and the priors learnt.
+    told : (N,)
+        What tie points tell of each view, before what all of a view share caps it [1/px^2].
     smooth : SmoothTest
         Smooth part of the residuals that are left, with its test.
     asked : mapping
@@ -119,6 +121,8 @@ class Adjustment:
         East, north, up [m] of the adjusted GCPs minus their given place.
     seconds : float
         CPU time.
+    earlier : BlockPrior or None
+        What an earlier block knew of those of its views that are among these.
     options : AdjustOptions
         As given.
     """
@@ -143,6 +147,7 @@ class Adjustment:
     gauge: GaugeReport
     datum: Mapping[str, Array]
     prior: PriorTest
+    told: Array
     smooth: SmoothTest
     asked: Mapping[str, SmoothTest]
     findings: tuple[Finding, ...]
@@ -164,6 +169,7 @@ class Adjustment:
     seconds: float = 0.0
     apart: Apart | None = None
     altimetry: AltimetryTest | None = None
+    earlier: BlockPrior | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         used = f"{np.count_nonzero(self.inlier)} of {len(self.inlier)} observations"
@@ -290,7 +296,7 @@ def _rms(rows: Array, covariance: Array) -> float:
 
 
 def block_prior(adjustment: Adjustment) -> BlockPrior:
-    """Return the prior that a later run starts from.
+    """Return the prior that a later run starts from: of a run that goes on from a block, of all views of both.
 
     Parameters
     ----------
@@ -301,15 +307,17 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
     -------
     BlockPrior
     """
-    reduced, free, n = adjustment.covariance.reduced, adjustment.covariance.free, len(adjustment.names)
+    reduced, n = adjustment.covariance.reduced, len(adjustment.names)
+    used = ~np.isin(adjustment.names, adjustment.left_out)  # others are as they came, and may be given again
+    free = adjustment.covariance.free & np.repeat(used, len(adjustment.covariance.free) // n)
     waves = adjustment.cameras.unknowns.waves
     views, matrix = np.flatnonzero(free.reshape(n, -1)[:, 0]), reduced.matrix
-    return BlockPrior(
+    found = BlockPrior(
         tuple(adjustment.names[v] for v in views),
         adjustment.cameras.unknowns.model,
         adjustment.cameras.unknowns.drift,
         adjustment.params[views],
-        reduced.plain(free) if isinstance(matrix, np.ndarray) else matrix.sparse()[free][:, free],
+        reduced.plain(free) if isinstance(matrix, np.ndarray) else matrix.select(views),
         adjustment.cameras.unknowns.center[views],
         None if isinstance(matrix, np.ndarray) or reduced.common is None else reduced.common.by_camera[:, free],
         waves.count if waves else 0,
@@ -318,4 +326,50 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
         waves.strips[views] if waves and waves.strips.size else None,
         waves.periods[views] if waves and waves.periods.size else None,
         EarlierScene(adjustment.gauge.by_unknown[:, free], adjustment.gauge.own, adjustment.gauge.radius),
+        adjustment.told[views],
+        adjustment.prior.shown,
     )
+    if adjustment.earlier is None:
+        return found
+    return adjustment.earlier.joined(found)
+
+
+def moved_px(before: BlockPrior, after: BlockPrior, places: Array, pixel: Array) -> Array:
+    """Return how far (n,) [px] the cameras of a block move, where it has grown out of another.
+
+    Parameters
+    ----------
+    before, after : BlockPrior
+        A block of n views, and one whose first n views are these.
+    places : (n, 3)
+        ECEF [m] of a ground point in the middle of each image.
+    pixel : (n,)
+        Side of a pixel on the ground there [m].
+
+    Returns
+    -------
+    moved : (n,)
+        The largest of the first, middle and last row, across the line of sight; of models in the image an upper bound.
+    """
+    change, n = after.params[: len(before.names)] - before.params, len(before.names)
+    if not {"rotation", "translation"} & set(before.model.split("+")):
+        return np.asarray(np.abs(change).sum(axis=1))
+    rotates, translates = (word in before.model for word in ("rotation", "translation"))
+    turned = change[:, :3] if rotates else np.zeros((n, 3))
+    shifted = change[:, 3 * rotates : 3 * rotates + 3] if translates else np.zeros((n, 3))
+    first = 3 * (rotates + translates)
+    drift = change[:, first : first + 3 * before.drift].reshape(n, before.drift, 3)
+    sight = places - before.center
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    up = enu_basis(ground_from_ecef(places))[:, 2]
+    # as wide as it is seen, along the line of sight
+    side = pixel * np.sqrt(np.abs((sight * up).sum(axis=1)))
+    radar, most = np.isin(before.names, before.radars), np.zeros(n)
+    for row in (-1.0, 0.0, 1.0):
+        powers = row ** np.arange(1, before.drift + 1)
+        vector = turned + np.einsum("d,ndx->nx", powers, drift)
+        moved = np.cross(vector, sight) - shifted
+        moved -= (moved * sight).sum(axis=1, keepdims=True) * sight
+        moved = np.where(radar[:, None], vector * [1.0, 1.0, 0.0], moved)
+        most = np.maximum(most, np.linalg.norm(moved, axis=1))
+    return np.asarray(most / side)

@@ -483,10 +483,14 @@ class RunOptions(Options):
     check_points: tuple[str, ...] = option(
         (), "Ground points that stay out of the adjustment and are measured after it.", unit="file"
     )
-    fixed_run: str | None = option(
+    add_to: str | None = option(
         None,
-        "An earlier run some of whose views are among these: they keep what it knows about them.",
+        "A finished run that the images are added to: only those of its images that they meet are matched.",
         unit="dir",
+    )
+    update: bool = option(
+        False,
+        "With `add_to`: write cameras of that run that move, too.",
     )
     dem: tuple[str, ...] = option(
         (),
@@ -512,6 +516,8 @@ class RunOptions(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.update and self.add_to is None:
+            raise InputError("update is given without add_to: there is no run whose cameras could move")
         if self.geoid is not None and not (self.dem or self.gcp or self.check_points):
             raise InputError("geoid is given without dem or ground points: there are no heights to convert")
         if self.reference and not self.dem:

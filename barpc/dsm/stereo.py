@@ -219,14 +219,15 @@ class CameraErrors:
         free = np.flatnonzero(np.isin(names, prior.names))
         if not len(free):
             raise InputError("the block's covariance names none of the run's images: run the adjustment again")
-        at = np.array([prior.names.index(names[i]) for i in free])
-        centers = prior.center[at] if len(free) == len(views) else None
+        known = prior.marginal(names)
+        own = np.array([names.index(name) for name in known.names])
+        centers = known.center[np.argsort(own)] if len(free) == len(views) else None
         unknowns = make_unknowns(views, prior.model, prior.drift, centers, prior.waves(names))
         if unknowns.size != q:
             raise InputError(f"the block's covariance is of {q} unknowns an image, its cameras have {unknowns.size}")
-        theirs, own = ((index[:, None] * q + np.arange(q)).ravel() for index in (at, free))
+        own = (own[:, None] * q + np.arange(q)).ravel()
         try:
-            found = la.cho_solve(la.cho_factor(prior.dense()), np.eye(prior.params.size)[:, theirs])[theirs]
+            found = la.inv(known.dense())
         except la.LinAlgError as error:
             raise InputError(f"the block's information is damaged ({error})") from error
         covariance = np.zeros((len(views) * q, len(views) * q))

@@ -177,8 +177,10 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
             raise InputError(f"{folder / 'summary.json'}: an image is called {view.name}, no name of a file")
         rpc = written_rpc(folder, view)
         if rpc is None:
+            update = any(one.outputs for one in summary.views) and not view.outputs  # of a run that added images
             raise InputError(
                 f"{folder / 'summary.json'}: names no RPC file of {view.name} that can be read: run it again"
+                + ", with --update" * update
             )
         rows = counted[starts[number] : starts[number + 1]]
         light = light_of(view.path, None if view.rpc_source is None else view.rpc_source.path)

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from barpc.ba import BlockPrior
 from barpc.ba.held.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.errors import InputError, listed
 from barpc.base.geodesy import Array, ecef_from_ground, metres_per_unit, wrap_longitude
@@ -41,13 +40,13 @@ from barpc.tie.tasks import Progress, ordered
 
 logger = logging.getLogger(__name__)
 
-PRIOR = "block.npz"  # the file in a run folder that a later run starts from
+PRIOR, IMAGES = "block.npz", "images.json"  # the files in a run folder that a later run starts from
 _MARGIN = 1.5  # px beyond the centres of the outermost pixels that a matcher may still mean
 _ASTRAY = 0.05  # of the points may lie farther off, where a matcher looks over borders; of other crops more
 
 
-def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None, BlockPrior | None]:
-    """Return the terrain, and what an earlier run knows about its views, read before any work starts.
+def side_inputs(options: RunOptions, views: Sequence[View]) -> Dem | None:
+    """Return the terrain, read before any work starts.
 
     A file that cannot be used, those of ground points included, stops the run here (InputError), not after an hour.
     """
@@ -61,8 +60,7 @@ def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None,
         Sheet.read(path)
     if dem is not None:
         _require_cover(dem, ", ".join(options.dem), views)
-    prior = None if options.fixed_run is None else BlockPrior.load(table_path(Path(options.fixed_run), PRIOR))
-    return dem, prior
+    return dem
 
 
 def _require_cover(dem: Dem, path: str, views: Sequence[View]) -> None:
@@ -95,7 +93,8 @@ def reference_names(options: RunOptions) -> list[str]:
 
 def input_files(options: RunOptions) -> list[Path]:
     """Return every file of this machine that the options name; none of them is ever written."""
-    found = [] if options.fixed_run is None else [table_path(Path(options.fixed_run), PRIOR)]
+    earlier = () if options.add_to is None else (PRIOR, IMAGES)
+    found = [table_path(Path(str(options.add_to)), name) for name in earlier]
     for name, one in declared(RunOptions).items():
         value = getattr(options, name)
         if one.rule.unit == "file" and value is not None:
@@ -151,22 +150,6 @@ def _resolved(path: str | Path) -> object:
     return location(path).resolve()
 
 
-def only_new(tracks: Tracks, old: BoolArray) -> Tracks:
-    """Return the tracks with observations that an earlier block, of the views `old` (N,), did not have.
-
-    Tracks without a new view are left out. Of those seen in several old views one old observation is kept: how
-    these views lie to each other is in the earlier block's normal matrix already.
-    """
-    is_old = old[tracks.view]
-    has_new = np.bincount(tracks.point, ~is_old, minlength=tracks.num_points) > 0
-    order = np.lexsort((tracks.sigma, tracks.point))  # the surest old observation of a track comes first
-    order = order[is_old[order]]
-    _, first = np.unique(tracks.point[order], return_index=True)
-    keep = ~is_old
-    keep[order[first]] = True
-    return tracks.select(keep & has_new[tracks.point])
-
-
 def hash_inputs(
     run: Run,
     options: RunOptions,
@@ -198,6 +181,16 @@ def hash_inputs(
 def given_tracks(paths: Sequence[str | Path], views: Sequence[View]) -> Tracks:
     """Return the tie points of files as they are."""
     return tracks_of(_linked(paths, views), ", ".join(map(str, paths)))
+
+
+def linked_names(paths: Sequence[str | Path], new: Sequence[str], old: Sequence[str]) -> list[str]:
+    """Return which images of an earlier run files have matches of with new ones, by their names."""
+    names, found = [*new, *old], set[int]()
+    for path in paths:
+        links = read_links(path, names)
+        ends = links.view[links.ends]
+        found.update(ends[(ends < len(new)).any(axis=1)].ravel().tolist())
+    return [names[i] for i in sorted(found) if i >= len(new)]
 
 
 def given_matches(

@@ -26,7 +26,7 @@ from barpc.fit import RpcFit
 from barpc.pipeline.beyond import REOPENED, RESAMPLED, grid_names, made_in_room
 from barpc.pipeline.executor import CachingExecutor, by_groups
 from barpc.pipeline.handoff import verify
-from barpc.pipeline.inputs import PRIOR
+from barpc.pipeline.inputs import IMAGES, PRIOR
 from barpc.report import Run, Summary
 from barpc.report.page import NAME, REPORT, can_render, report_html
 from barpc.report.records import plain
@@ -130,7 +130,7 @@ def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> li
     if options.stop_after == "all":
         names += [name for view in views for name in file_names(view, options.images, options.rpc_formats)]
         names += [name for view in views for name in grid_names(view, options)]
-    return [*names, f"{FOLDER}/{PRIOR}"]
+    return [*names, f"{FOLDER}/{IMAGES}", f"{FOLDER}/{PRIOR}"]
 
 
 def _is_pair(stem: str, names: Set[str]) -> bool:

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior
+from barpc.ba import Adjustment, adjust_tracks, block_prior
 from barpc.ba.held.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
@@ -27,9 +27,11 @@ from barpc.base.sidefile import plain_path
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
 from barpc.pipeline.beyond import write_grids
+from barpc.pipeline.earlier import Earlier, added, chosen_pairs, images_table, join_earlier, movers, of_new
 from barpc.pipeline.executor import CachingExecutor, by_groups
 from barpc.pipeline.handoff import unverified
 from barpc.pipeline.inputs import (
+    IMAGES,
     PRIOR,
     given_matches,
     given_tracks,
@@ -37,7 +39,6 @@ from barpc.pipeline.inputs import (
     input_files,
     load_altimetry,
     load_gcps,
-    only_new,
     read_pairs,
     reference_names,
     side_inputs,
@@ -55,7 +56,7 @@ from barpc.report.records import plain
 from barpc.report.runfiles import FOLDER
 from barpc.report.summary import InputEntry, StageEntry
 from barpc.rpcio import plain_source
-from barpc.scene import Tracks, View
+from barpc.scene import BoolArray, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, camera_centers
 from barpc.sensor.rpc import RPC
@@ -163,6 +164,8 @@ def adjust(
         with workspace.stage("fingerprints"), recorded(seen):
             given = side_inputs(options, run.views)
             inputs = hash_inputs(run, options, seen, executor, progress)
+            if run.earlier is not None:
+                run.earlier.refuse_changed(run, inputs)
         with CachingExecutor(workspace, inputs, executor) as caching:
             with guarded(inputs.values()):
                 run = _solve(run, options, given, workspace, Work(caching, progress))
@@ -174,25 +177,55 @@ def adjust(
             if run.fits:
                 run = _written(run, options, workspace, work)
         run = replace(run, out_dir=str(out_dir), stages=workspace.stages)
-        summary = _summed_up(run, inputs.values(), workspace, progress)
+        summary = _summed_up(run, images, inputs, workspace, work)
         workspace.remove_stale()
         root = workspace.seal()
     views = [replace(view, sensor=one) for view, one in zip(run.views, run.after or run.before, strict=True)]
     return AdjustResult(_as_given(views, images, options), run, summary, root)
 
 
-def _summed_up(run: Run, inputs: Iterable[Input], workspace: Workspace, progress: Progress | None) -> Summary:
+def _summed_up(
+    run: Run, images: Sequence[Image], inputs: Mapping[str, Input], workspace: Workspace, work: Work
+) -> Summary:
     """Write what a later run starts from, summary, tables and report: the same in any folder, at any time."""
+    progress = work.progress
     if run.adjustment is not None:
-        with _told(workspace, "block", progress), workspace.output(f"{FOLDER}/{PRIOR}") as partial:
-            block_prior(run.adjustment).save(partial)
+        run = _with_block(run, images, inputs, workspace, work)
     run = _portable(run, workspace.folder)
     with _told(workspace, "summary", progress):
-        summary = replace(summarize(run), inputs=_entries(inputs, workspace.folder), out_dir=None, stages=None)
+        entries = _entries(inputs.values(), workspace.folder)
+        summary = replace(summarize(run), inputs=entries, out_dir=None, stages=None)
     _tell(progress, REPORT, 0)
     summary = write_tables(workspace, run, summary)
     _tell(progress, REPORT, 1)
     return replace(summary, out_dir=run.out_dir, stages=tuple(map(StageEntry.read, workspace.stages)))
+
+
+def _with_block(
+    run: Run, images: Sequence[Image], inputs: Mapping[str, Input], workspace: Workspace, work: Work
+) -> Run:
+    """Write the block and the list of its images, and with `update` the cameras that move; return what that says."""
+    assert run.adjustment is not None
+    options = run.options
+    assert isinstance(options, RunOptions)
+    with _told(workspace, "block", work.progress):
+        block = block_prior(run.adjustment)
+        with workspace.output(f"{FOLDER}/{PRIOR}") as partial:
+            block.save(partial)
+        text = images_table(run, images, inputs, workspace.folder, block)
+        workspace.write_text(f"{FOLDER}/{IMAGES}", text)
+    if run.earlier is None:
+        return run
+    run = replace(run, added=added(run, run.earlier, block, options.adjust.noise_floor))
+    if options.update and options.stop_after == "all":
+        views, sensors = movers(run, block, {view.name for view in run.views}, options.allow_remote)
+        assert run.adjustment is not None
+        fits = _fits(views, sensors, run.adjustment, options, work)
+        with guarded(inputs.values()):
+            fitted = list(zip(views, fits, sensors, strict=True))
+            write_views(workspace, fitted, options.images, options.rpc_formats, work.executor, work.progress)
+            write_grids(workspace, fitted, options, work.executor, work.progress)
+    return run
 
 
 def _entries(inputs: Iterable[Input], folder: Path) -> tuple[InputEntry, ...]:
@@ -251,7 +284,8 @@ def check(
 
 def _as_given(views: Iterable[View], images: Sequence[Image], options: RunOptions) -> tuple[View, ...]:
     place = {str(image_path(image, options.allow_remote)): number for number, image in enumerate(images)}
-    return tuple(sorted(views, key=lambda view: place[view.path]))
+    given = (view for view in views if view.path in place)  # not those of an earlier run that these meet
+    return tuple(sorted(given, key=lambda view: place[view.path]))
 
 
 def _loaded(
@@ -265,49 +299,83 @@ def _loaded(
     for path in input_files(options):
         plain_path(path)
     least = 1 if options.gcp or options.reference else 2  # one image and control are enough
-    loaded = load_views(
-        images,
-        min_views=least,
-        keep_going=options.keep_going,
-        band=options.tie.band,
-        hosts=options.allow_remote,
-        executor=work.executor,
-        progress=work.progress,
-    )
+    how: dict[str, Any] = {
+        "min_views": least,
+        "keep_going": options.keep_going,
+        "band": options.tie.band,
+        "hosts": options.allow_remote,
+        "executor": work.executor,
+        "progress": work.progress,
+    }
+    earlier = None if options.add_to is None else Earlier.open(options.add_to)
+    loaded = load_views(images, **how) if earlier is None else join_earlier(images, options, earlier, how)
     if workers is not None:
         workers.append(loaded.worker_seconds)
     none = Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
-    return Run(kind, loaded.views, loaded.sources, none, left_out=loaded.left_out, options=options)
+    run = Run(kind, loaded.views, loaded.sources, none, left_out=loaded.left_out, options=options, earlier=earlier)
+    if earlier is None or options.update:
+        return run
+    given = {str(image_path(image, options.allow_remote)) for image in images}
+    return replace(run, unwritten=frozenset(view.name for view in run.views if view.path not in given))
 
 
 def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[Path]]:
     """Return the files that a run writes and those that it keeps; what is in the way is refused before any work."""
-    views = run.views
+    views = [view for view in run.views if view.name not in run.unwritten]
     if options.stop_after == "matching":
         require_pair_names([view.name for view in views])
     if options.images == "vrt" and options.stop_after == "all":
         for view in views:
             plain_source(view.path)
-    inputs = (*(view.path for view in views), *(source.path for source in run.sources))
+    inputs = (*(view.path for view in run.views), *(source.path for source in run.sources))
     keep = {*here(inputs), *input_files(options)}
     names = output_names(views, options, folder)
     refuse_shadows(folder, names)
     return names, keep
 
 
-def _solve(
-    run: Run, options: RunOptions, given: tuple[Dem | None, BlockPrior | None], workspace: Workspace, work: Work
-) -> Run:
+def _solve(run: Run, options: RunOptions, dem: Dem | None, workspace: Workspace, work: Work) -> Run:
     with workspace.stage("tie points"):
-        run = _with_ties(run, options, work, given[0])
+        run = _with_ties(run, options, work, dem)
     if options.stop_after == "matching":
         _write_matches(run, workspace)
         return replace(run, kind="match")
-    if given[0] is not None and options.reference:
+    if run.earlier is not None:
+        run = _met(run, options)
+    if dem is not None and options.reference:
         with workspace.stage("reference"):
-            run = replace(run, reference=_registered(run, options, given[0], work))
+            run = replace(run, reference=_registered(run, options, dem, work))
     with _told(workspace, "adjustment", work.progress):
-        return _adjusted(run, options, *given)
+        return _adjusted(run, options, dem)
+
+
+def _met(run: Run, options: RunOptions) -> Run:
+    """Return the run with the tie points of its new images, and those of the earlier ones that have some.
+
+    The others stay as the earlier run has them, but for what control is given of them.
+    """
+    old, tracks = _is_old(run), of_new(run.tracks, _is_old(run))
+    tied = np.bincount(tracks.view, minlength=len(run.views)) > 0
+    keep = ~old | tied | bool(options.gcp or options.reference)
+    if not (old & keep).any():
+        raise TiePointError(
+            f"no tie point of the images given is seen in one of {run.earlier.folder}: look at the images (clouds? "
+            "dates?), or give matches (--matches)"
+        )
+    place = np.cumsum(keep) - 1
+    kept = [i for i in range(len(keep)) if keep[i]]
+    return replace(
+        run,
+        views=tuple(run.views[i] for i in kept),
+        sources=tuple(run.sources[i] for i in kept),
+        tracks=replace(tracks, view=place[tracks.view]),
+    )
+
+
+def _is_old(run: Run) -> BoolArray:
+    """Return which views (N,) are images of the earlier run; none without one."""
+    known = () if run.earlier is None else run.earlier.number
+    return np.array([view.name in known for view in run.views], dtype=bool)
 
 
 def _registered(run: Run, options: RunOptions, dem: Dem, work: Work) -> ReferenceControl:
@@ -318,12 +386,8 @@ def _registered(run: Run, options: RunOptions, dem: Dem, work: Work) -> Referenc
     return register_views(run.views, reference_names(options), dem, options.tie.band, accuracy, work)
 
 
-def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior | None) -> Run:
+def _adjusted(run: Run, options: RunOptions, dem: Dem | None) -> Run:
     """Return the run with an adjustment and what went into it."""
-    names = [view.name for view in run.views]
-    if prior is not None:
-        # where the earlier block saw more, tie points lack on purpose
-        run = replace(run, tracks=only_new(run.tracks, np.isin(names, prior.names)), detail=())
     gcps, checks = (load_gcps(paths, run.views, options, dem) for paths in (options.gcp, options.check_points))
     centers = _centers(run.views, options.adjust.center)
     if run.reference is not None and run.reference.control is None and not len(run.tracks) and gcps is None:
@@ -339,7 +403,8 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
         gcps,
         dem,
         centers=np.array([center.ecef for center in centers]),
-        prior=prior,
+        prior=None if run.earlier is None else run.earlier.prior,
+        known=None if run.earlier is None else np.ones(len(run.tracks), dtype=bool),  # at best some are new
         reference=None if run.reference is None else run.reference.control,
         altimetry=altimetry,
         keep_largest=options.keep_going,
@@ -363,9 +428,12 @@ def _with_ties(run: Run, options: RunOptions, work: Work, terrain: Dem | None = 
         return replace(run, tracks=given_tracks(options.matches, views))
     if len(views) < 2:
         return run
-    scope = Scope(terrain=terrain)
+    old = _is_old(run)
+    scope = Scope(terrain=terrain, joined=np.flatnonzero(old).tolist())
     if options.overlap_list is not None:
         scope = replace(scope, only=read_pairs(options.overlap_list, views, [path for path, _ in run.left_out]))
+    elif run.earlier is not None:
+        scope = replace(scope, only=chosen_pairs(views, old.tolist(), options.tie))
     if options.aoi is not None:
         scope = replace(scope, area=read_area(options.aoi))
     if options.matches:
@@ -373,12 +441,14 @@ def _with_ties(run: Run, options: RunOptions, work: Work, terrain: Dem | None = 
     try:
         ties = find_tracks(views, options.tie, scope, executor=work.executor, progress=work.progress)
     except DisconnectedError as error:
-        if not options.keep_going or len(error.groups[0]) < 2:
+        groups = [group for group in error.groups if run.earlier is None or {*group} & {*run.earlier.number}]
+        if not options.keep_going or not groups or len(groups[0]) < 2:
             raise
-        kept = _only(run, frozenset(error.groups[0]), error.said)
+        kept = _only(run, frozenset(groups[0]), error.said)
         logger.warning("%d of %d images are tied together and kept", len(kept.views), len(views))
         return _with_ties(kept, options, work, terrain)
-    return replace(run, tracks=ties.tracks, matched=ties.pairs, detail=ties.detail)
+    detail = ties.detail if run.earlier is None else ()  # where the earlier run saw more, they lack on purpose
+    return replace(run, tracks=ties.tracks, matched=ties.pairs, detail=detail)
 
 
 def _write_matches(run: Run, workspace: Workspace) -> None:
@@ -418,22 +488,29 @@ def _centers(views: Sequence[View], how: Literal["line", "projective"]) -> tuple
 def _fitted(run: Run, options: RunOptions, work: Work) -> Run:
     """Refit every P_BA: only when all can be written is any."""
     assert run.adjustment is not None
+    return replace(run, fits=tuple(_fits(run.views, run.adjustment.sensors, run.adjustment, options, work)))
+
+
+def _fits(
+    views: Sequence[View], sensors: Sequence[SensorModel], adjustment: Adjustment, options: RunOptions, work: Work
+) -> list[RpcFit]:
+    """Return the RPCs fitted to the corrected cameras of views."""
     # what is known of the place afterwards is the error common to the image; the noise of a point is the vendor's
-    bias = float(np.sqrt((run.adjustment.gauge.sigma[:2] ** 2).mean()))
+    bias = float(np.sqrt((adjustment.gauge.sigma[:2] ** 2).mean()))
     known = bias if np.isfinite(bias) and bias > 0 else None
-    corrected = zip(run.views, run.adjustment.sensors, strict=True)
+    corrected = zip(views, sensors, strict=True)
     cameras = [(model, view.size, view.alt_range) for view, model in corrected]
     given = options.fit, not (options.keep_going or options.grids)
     found = chain(*by_groups(work.executor, fit_group, cameras, given, "fit", work.progress))
     fits: list[RpcFit] = []
-    for view, (fit, error, warned) in zip(run.views, found, strict=True):
+    for view, (fit, error, warned) in zip(views, found, strict=True):
         if fit is None:
             raise FitError(f"{view.name}: {error}")
         for message in warned:
             warnings.warn(f"{view.name}: {message}", BarpcWarning, stacklevel=2)
         rand = view.sensor.err_rand if isinstance(view.sensor, RPC) else None
         fits.append(replace(fit, rpc=replace(fit.rpc, err_bias=known, err_rand=rand)))
-    return replace(run, fits=tuple(fits))
+    return fits
 
 
 def fit_group(
@@ -460,10 +537,12 @@ def fit_group(
 def _written(run: Run, options: RunOptions, workspace: Workspace, work: Work) -> Run:
     """Write the refitted RPCs, and open them again."""
     assert run.adjustment is not None
-    fitted = list(zip(run.views, run.fits, run.adjustment.sensors, strict=True))
+    every = zip(run.views, run.fits, run.adjustment.sensors, strict=True)
+    fitted = [one for one in every if one[0].name not in run.unwritten]
     written = write_views(workspace, fitted, options.images, options.rpc_formats, work.executor, work.progress)
     beyond = write_grids(workspace, fitted, options, work.executor, work.progress)
     names = [*written[0], *(name for one in beyond for name in one)]
     for sentence in unverified([workspace.folder / name for name in names]):
         logger.warning(sentence)
-    return replace(run, written=tuple({**one, **more} for one, more in zip(written, beyond, strict=True)))
+    found = {one[0].name: {**w, **more} for one, w, more in zip(fitted, written, beyond, strict=True)}
+    return replace(run, written=tuple(found.get(view.name, {}) for view in run.views))

@@ -50,6 +50,19 @@ class ControlResidual:
     w: float
 
 
+@dataclass(frozen=True)
+class Added:
+    """What adding images does to those of a finished run."""
+
+    run: str  # name of its folder
+    images: int  # that it has
+    met: int  # of these, tied to new ones
+    beyond: tuple[tuple[str, float], ...]  # those that should move by more than the floor, and by how much [px]
+    largest: tuple[str, float]  # the one that should move farthest, and by how much [px]
+    floor: float  # [px]
+    updated: bool  # whether the cameras of those that should move are written
+
+
 @dataclass(frozen=True, eq=False)
 class Run:
     """Everything that a run found out.
@@ -80,6 +93,15 @@ class Run:
     reference: ReferenceControl | None = None
     datums: tuple[HeightDatum, ...] = ()
     detail: tuple[IntArray, ...] = ()
+    earlier: Any = None  # the finished run that images are added to, as the pipeline has it
+    unwritten: frozenset[str] = frozenset()  # names of its images whose cameras this run leaves as they are
+    added: Added | None = None
+
+    @property
+    def known(self) -> frozenset[str]:
+        """Names of the views that are images of an earlier run."""
+        held = getattr(self.adjustment, "earlier", None)
+        return frozenset(() if held is None else held.names)
 
     @cached_property
     def before(self) -> tuple[SensorModel, ...]:

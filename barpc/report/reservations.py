@@ -83,7 +83,8 @@ def _weakly_tied(view: ViewEntry, run: Run) -> Found:
     """Say that a view has few tie points, some that may all be off alike, or a part without where there is detail."""
     by_reference = run.reference is not None and any(v.points and v.name == view.name for v in run.reference.views)
     controlled = by_reference or view.num_gcps >= ENOUGH_GCPS
-    if view.num_observations < FEW and not controlled:
+    held = view.name in run.known  # by an earlier run: it needs no tie points of its own
+    if view.num_observations < FEW and not controlled and not held:
         gcps = f"{view.num_gcps} GCP{'s' * (view.num_gcps > 1)}"
         what = "few" if view.num_observations else "few_gcps" if view.num_gcps else "none"
         yield what, {"few": view.num_observations, "gcps": gcps}

@@ -14,7 +14,7 @@ from barpc.base.errors import listed
 from barpc.base.geodesy import Array
 from barpc.base.usual import FEW, SURE, SURELY
 from barpc.report.datum import datum_reasons
-from barpc.report.outcome import MANY_REJECTED, Run
+from barpc.report.outcome import MANY_REJECTED, Added, Run
 from barpc.report.records import plain, value_of
 from barpc.report.reservations import (
     GOOD_RMSE,
@@ -177,7 +177,7 @@ def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
         moved = np.abs(found.gauge.shift) / found.gauge.delivered_sigma
     # control, an earlier run and fixed views move it as far as they must, a DEM and altimetry in height
     used = found.control is not None and bool(found.control.used.any())
-    held = used or bool(found.reference_inlier.any()) or bool(found.options.fixed or _option(run, "fixed_run"))
+    held = used or bool(found.reference_inlier.any()) or bool(found.options.fixed or _option(run, "add_to"))
     by_heights = _holds(found) or bool(_option(run, "dem"))
     moved = moved[:2] if by_heights else moved
     if not held and (moved[np.isfinite(moved)] > SURELY).any():
@@ -237,6 +237,8 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
         )
     found = [one.sentence for one in explanations(run.adjustment) if one.name != APART]
     yield from (f"{sentence[0].upper()}{sentence[1:]}." for sentence in found)
+    if run.added is not None:
+        yield from _added_lines(run.added, len(views))
     if len(run.tracks) or gcps is not None:
         yield f"The scene as a whole moved by {enu(gauge.shift)}."
     yield from reference_lines(run)
@@ -245,18 +247,37 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
             f"{heights.agree} of {heights.near} altimetry heights agree with the surface of the tie points to "
             f"{metres(heights.spread)} ({metres(heights.expected)} expected); they moved it by {enu(heights.motion)}."
         )
-    known = f"its place is known to {lengths(gauge.sigma)} (east, north, up; one sigma)"
-    if gcps is not None:
-        yield from held_lines(run.adjustment.control, gcps, views, known)
-    elif _holds(run.adjustment) or (run.reference is not None and run.reference.control is not None):
-        yield f"So {known}."
-    elif (terrain := run.adjustment.terrain) is not None and terrain.shows and terrain.held:
-        yield f"With the DEM {known}."
-    else:
-        yield f"Without ground control {known} only."
+    yield from _known_lines(run, run.adjustment, views)
     yield from dem_lines(run.adjustment)
     if run.check_points is not None and run.after is not None:
         yield _met(check_residuals(run.after, run.check_points).rms(), len(run.check_points.names))
+
+
+def _added_lines(added: Added, num: int) -> Iterator[str]:
+    """Say what was added to which run, and whether its own images should move: which, and by how much."""
+    new = counted(num - added.met, "image")
+    yield f"{new} added to the {counted(added.images, 'image')} of {added.run}, {added.met} of which they meet."
+    name, far = added.largest
+    if not added.beyond:
+        yield f"None of these need move: {name} would by {far:.3f} px, no more than the {added.floor:g} px all share."
+        return
+    some = listed([f"{one} ({px:.2f} px)" for one, px in added.beyond], NAMED)
+    do = "their cameras are written here" if added.updated else "--update writes their cameras, too"
+    many = counted(len(added.beyond), "image")
+    yield f"{many} of {added.run} should move by more than {added.floor:g} px: {some}; {do}."
+
+
+def _known_lines(run: Run, found: Adjustment, views: Sequence[ViewEntry]) -> Iterator[str]:
+    """Return how well the scene's place is known, and what tells it."""
+    known = f"its place is known to {lengths(found.gauge.sigma)} (east, north, up; one sigma)"
+    if run.gcps is not None:
+        yield from held_lines(found.control, run.gcps, views, known)
+    elif _holds(found) or (run.reference is not None and run.reference.control is not None):
+        yield f"So {known}."
+    elif (terrain := found.terrain) is not None and terrain.shows and terrain.held:
+        yield f"With the DEM {known}."
+    else:
+        yield f"Without ground control {known} only."
 
 
 def _clocks(view: ViewEntry) -> str:

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -109,12 +110,12 @@ def find_tracks(
     with store_of(executor) as store:
         trials = _Trials(views, options, scope, Work(executor, progress, store))
         trials.run(possible_pairs(views, options, scope), all_of_them=bool(scope.only))
-        require_matches(views, *trials.outcome)
+        require_matches(views, *trials.outcome, scope.joined)
         tracks, bare = _registered(trials, scope, options, Work(executor, progress))
         detail = trials.detail()
     pairs, reports = trials.outcome
     reports = [replace(r, unregistered=bare.get(p.views, 0)) for p, r in zip(pairs, reports, strict=True)]
-    require_tracks(views, tracks, pairs, reports)
+    require_tracks(views, tracks, pairs, reports, scope.joined)
     return TieResult(tracks, tuple(reports), trials.keypoints, detail)
 
 
@@ -384,8 +385,13 @@ def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
     return tracks.select(kept[tracks.point])
 
 
-def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Sequence[PairReport]) -> None:
-    """Raise TiePointError where two views do not match, DisconnectedError where more fall into groups."""
+def require_matches(
+    views: Sequence[View], pairs: Sequence[Pair], reports: Sequence[PairReport], joined: Sequence[int] = ()
+) -> None:
+    """Raise TiePointError where two views do not match, DisconnectedError where more fall into groups.
+
+    Views that are `joined` are one group without matches.
+    """
     failed = [report for report in reports if report.status != "ok"]
     links = [pair.views for pair, report in zip(pairs, reports, strict=True) if report.status == "ok"]
     placings = {pair.views: report.placings for pair, report in zip(pairs, reports, strict=True)}
@@ -405,17 +411,24 @@ def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Seque
     why = "; ".join(f"{view.path}: {said[view.name]}" for view in views if view.name in said) or f"{listed}: {advice}"
     if len(views) == 2 and failed:
         raise TiePointError(f"too few tie points: {why}")
+    links += pairwise(joined)
     require_connected(views, links, f"no tie points between them: {why}", said)
 
 
-def require_tracks(views: Sequence[View], tracks: Tracks, pairs: Sequence[Pair], reports: Sequence[PairReport]) -> None:
+def require_tracks(
+    views: Sequence[View],
+    tracks: Tracks,
+    pairs: Sequence[Pair],
+    reports: Sequence[PairReport],
+    joined: Sequence[int] = (),
+) -> None:
     """Raise as `require_matches`, for the pairs that keep `NEEDED` tracks or more."""
     left, counts = [], pair_counts(tracks)
     for pair, report in zip(pairs, reports, strict=True):
         common = counts.get(pair.views, 0)
         status = "ok" if common >= NEEDED else f"only {common} tracks after registration"
         left.append(replace(report, status=status if report.status == "ok" else report.status))
-    require_matches(views, pairs, left)
+    require_matches(views, pairs, left, joined)
 
 
 def link(pairs: Sequence[tuple[int, int]], matches: Sequence[Matches]) -> Tracks:

@@ -183,16 +183,29 @@ def test_priors_on_cameras_have_the_derivatives_of_central_differences():
     rng = np.random.default_rng(0)
     params = rng.normal(size=(3, 6))
     prior = CameraPrior(rng.normal(size=(3, 6)), rng.uniform(1, 5, (3, 6)))
-    joint = JointPrior(np.array([2, 7, 11]), rng.normal(size=3), np.triu(rng.normal(size=(3, 3))))
+    root, taken, at = rng.normal(size=(3, 3)), rng.normal(size=(3, 3)), rng.normal(size=(3, 6))
+    joint = JointPrior(np.array([2, 7, 11]), rng.normal(size=3), root.T @ root)
+    joint = joint.without(taken.T @ taken, rng.normal(size=3), at)
     for n in range(params.size):
         step = np.zeros(params.size)
         step[n] = 0.5
         step = step.reshape(params.shape)
         numeric = prior.residual(params + step) - prior.residual(params - step)
         np.testing.assert_allclose(numeric.ravel()[n], prior.jacobian().ravel()[n], atol=1e-12)
-        numeric = joint.residual(params + step) - joint.residual(params - step)
-        column = joint.jacobian()[:, joint.index == n].sum(axis=1)
-        np.testing.assert_allclose(numeric, column, atol=1e-12)
+        numeric = joint.cost(params + step) - joint.cost(params - step)
+        np.testing.assert_allclose(numeric, 2.0 * joint.gradient(params)[joint.index == n].sum(), atol=1e-12)
+
+
+def test_what_is_taken_off_a_joint_prior_is_the_cost_of_what_was_observed_there() -> None:
+    """Of linear observations A p = b known before, at any point where their gradient was taken: but for a constant."""
+    rng = np.random.default_rng(1)
+    root, a, b = rng.normal(size=(5, 3)), rng.normal(size=(4, 3)), rng.normal(size=4)
+    joint = JointPrior(np.arange(3), rng.normal(size=3), root.T @ root)
+    for _ in range(3):
+        at = rng.normal(size=(1, 3))
+        left = joint.without(a.T @ a, a.T @ (a @ at[0] - b), at)
+        rest = [left.cost(p) - joint.cost(p) + ((a @ p[0] - b) ** 2).sum() for p in rng.normal(size=(4, 1, 3))]
+        np.testing.assert_allclose(rest, rest[0], atol=1e-10)
 
 
 @pytest.mark.parametrize("name", LOSSES)

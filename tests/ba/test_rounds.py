@@ -273,7 +273,9 @@ def passes(
             self.goes_on, self.learnt = known, None
             self.heights: Any = SimpleNamespace(hold=lambda problem, points: problem)
             self.observations: Any = SimpleNamespace(
-                sigma=np.ones(10_000), weight=lambda use, noise, misfit: use / (noise * (1.0 + misfit**2))
+                sigma=np.ones(10_000),
+                weight=lambda use, noise, misfit: use / (noise * (1.0 + misfit**2)),
+                told_by=lambda weight: weight,
             )
             self.misfit = misfit[0]
             self.variances: Any = SimpleNamespace(learnt=lambda *_: (learnt(self.passes), SimpleNamespace(shared=1.0)))

@@ -162,6 +162,7 @@ def test_what_a_field_can_hold_is_taken_as_it_is(table: str, name: str, one: Dec
         given += words.get(rule.unit, ["view_00", Path("view_00")])
     rest = {"dem": "dem.tif"} if name in ("geoid", "reference", "reference_sigma") else {}
     rest |= {"reference": ("ortho.tif",)} if name == "reference_sigma" else {}
+    rest |= {"add_to": "earlier"} if name == "update" else {}
     for value in given:
         value = value if isinstance(value, type(one.default)) and value is one.default else whole(value, one)
         if name == "angles":
@@ -174,7 +175,7 @@ def test_what_a_field_can_hold_is_taken_as_it_is(table: str, name: str, one: Dec
 
 
 def test_there_are_few_and_each_has_a_meaning() -> None:
-    assert len(FIELDS) <= 55
+    assert len(FIELDS) <= 56
     for table, name, one in FIELDS:
         assert len(one.rule.help) > 15, (table, name)
         if element(one) is float:
@@ -200,11 +201,11 @@ def test_a_flag_says_what_is_declared(target: str) -> None:
 
 def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) -> None:
     path = tmp_path / "o.toml"
-    path.write_text('fixed_run = "earlier"\n[tie]\nband = 2\nsearch = 9\n[adjust]\nfixed = ["a"]\n')
+    path.write_text('add_to = "earlier"\n[tie]\nband = 2\nsearch = 9\n[adjust]\nfixed = ["a"]\n')
     flags = {"flag_tie_band": 3, "flag_adjust_fixed": ("b", "c"), "flag_matches": (), "flag_gcp": ()}
     found = run_options(flags, str(path))
     assert (found.tie.band, found.tie.search, found.adjust.fixed) == (3, 9.0, ("b", "c"))
-    assert (found.fixed_run, found.matches, found.gcp) == ("earlier", (), ())
+    assert (found.add_to, found.matches, found.gcp) == ("earlier", (), ())
 
 
 def test_the_schema_and_the_records_agree(tmp_path: Path) -> None:

@@ -145,11 +145,11 @@ def _block_file(sparse: bool) -> bytes:
     )
     prior = block_prior(found)
     if sparse:
-        import scipy.sparse as sp
+        from barpc.ba.solving.linear import Blocks
 
         whole = np.asarray(prior.dense())
         prior = BlockPrior(
-            prior.names, prior.model, prior.drift, prior.params, sp.csr_array(whole), prior.center,
+            prior.names, prior.model, prior.drift, prior.params, Blocks.of(whole, prior.params.shape[1]), prior.center,
             1e-3 * np.ones((1, prior.params.size)),
         )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:

@@ -43,7 +43,7 @@ def test_images_references_side_files_and_what_options_name_are_inputs(files, mo
         gcp=("gcps.csv", "nowhere.csv"),
         dem=str(files["b.tif"]),
         reference=("c.tif",),
-        fixed_run=str(tmp_path),
+        add_to=str(tmp_path),
     )
     seen = {str(files["beside.txt"]): Stamp.of(files["beside.txt"].stat())}
     found = hash_inputs(run_of(files["a.tif"], files["a.tif"]), options, seen)

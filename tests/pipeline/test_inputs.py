@@ -12,11 +12,9 @@ import rasterio
 
 from barpc.base.errors import DisconnectedError, InputError
 from barpc.pipeline import RunOptions, adjust
-from barpc.pipeline.inputs import only_new
 from barpc.pointio.matches import read_matches
 from barpc.rpcio import read_rpc
 from barpc.rpcio.carried import put_tag
-from barpc.scene import Tracks
 
 from .known import errors_at_check_points
 
@@ -128,27 +126,13 @@ def test_a_later_run_goes_on_from_an_earlier_block(known, matched, tmp_path):
     half = replace(given, matches=str(two), stop_after="adjustment")
     adjust(known.images[:2], tmp_path / "two", half)
     joint = adjust(known.images, tmp_path / "joint", replace(given, stop_after="adjustment"))
-    result = adjust(known.images, tmp_path / "three", replace(given, fixed_run=str(tmp_path / "two")))
+    result = adjust(known.images, tmp_path / "three", replace(given, add_to=str(tmp_path / "two")))
     rms, _ = errors_at_check_points([read_rpc(tmp_path / f"three/{v.name}.vrt") for v in result.views], known.truth)
     assert rms <= 0.03
     sigma = [np.sqrt(np.diag(run.adjustment.covariance.view(2))) for run in (joint, result)]
     np.testing.assert_allclose(sigma[1], sigma[0], rtol=0.2)
-    with pytest.raises(InputError, match="prior of an adjusted block"):
-        adjust(known.images, tmp_path / "none", RunOptions(fixed_run=str(tmp_path)))
-
-
-def test_what_the_earlier_block_knew_does_not_count_twice():
-    # track 0: old views only; 1: both old views and the new one; 2: one old and the new one
-    tracks = Tracks(
-        [0, 1, 0, 1, 2, 1, 2],
-        [0, 0, 1, 1, 1, 2, 2],
-        np.arange(14.0).reshape(7, 2),
-        [1, 1, 0.3, 0.2, 0.1, 1, 1],
-    )
-    new = only_new(tracks, np.array([True, True, False]))
-    assert new.view.tolist() == [1, 2, 1, 2]
-    assert new.point.tolist() == [0, 0, 1, 1]
-    assert new.sigma.tolist() == [0.2, 0.1, 1, 1]
+    with pytest.raises(InputError, match="no finished run"):
+        adjust(known.images, tmp_path / "none", RunOptions(add_to=str(tmp_path)))
 
 
 @pytest.mark.slow

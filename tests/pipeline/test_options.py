@@ -248,10 +248,15 @@ def check_points(run: Run, out: Path, scene: Path) -> None:
     np.testing.assert_array_equal(free.adjustment.params, checked.adjustment.params)
 
 
-def fixed_run(run: Run, out: Path, scene: Path) -> None:
-    free, going_on = run.plain, run("b", fixed_run=str(scene / "earlier"), stop_after="adjustment")
+def add_to(run: Run, out: Path, scene: Path) -> None:
+    free, going_on = run.plain, run("b", add_to=str(scene / "earlier"), stop_after="adjustment")
     assert 0 < len(going_on.tracks) < len(free.tracks)
     np.testing.assert_allclose(going_on.adjustment.params, free.adjustment.params, atol=0.2)
+
+
+def update(run: Run, out: Path, scene: Path) -> None:
+    with pytest.raises(InputError, match="update is given without add_to"):
+        run("c", update=True)
 
 
 def _height(found: AdjustResult) -> float:
@@ -370,7 +375,7 @@ ROWS = {
     "keep_going": keep_going, "overwrite": overwrite, "matches": matches, "matches_only": matches_only,
     "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "gcp_crs": gcp_crs, "altimetry": altimetry,
     "check_points": check_points,
-    "fixed_run": fixed_run, "dem": dem, "geoid": geoid, "heights": heights,
+    "add_to": add_to, "update": update, "dem": dem, "geoid": geoid, "heights": heights,
     "reference": reference, "reference_sigma": reference_sigma,
     "allow_remote": allow_remote, "tie": tie, "adjust": adjust_, "fit": fit,
 }  # fmt: skip
@@ -395,7 +400,7 @@ SLOW = (
     "resample",
     "altimetry",
     "fit",
-    "fixed_run",
+    "add_to",
     "rpc_formats",
     "overwrite",
 )

@@ -284,12 +284,12 @@ def test_the_outputs_of_a_run_are_known_before_it_starts(tmp_path, view) -> None
         f"tables/{PRIOR}",
         [*(f"tables/{name}" for name in TABLES), "summary.json", "SHA256SUMS"] + ["report.html"] * can_render(),
     )
-    pairs = ["asp/b__c__scene.txt", "asp/scene__b__c.txt"]
+    pairs, known = ["asp/b__c__scene.txt", "asp/scene__b__c.txt"], "tables/images.json"
     assert sorted(names["matching"]) == sorted([*common, "matches.csv", "matches.npz", *pairs])
-    assert sorted(names["adjustment"]) == sorted([*common, prior])
+    assert sorted(names["adjustment"]) == sorted([*common, known, prior])
     ends = [".vrt", ".RPB", "_grid.tif", "_correction.tif"]  # grids where an RPC turns out not to do
     files = [name + end for name in ("scene", "b__c") for end in ends]
-    assert sorted(names["all"]) == sorted([*common, *files, prior])
+    assert sorted(names["all"]) == sorted([*common, *files, known, prior])
     assert sorted(output_names([view], RunOptions(stop_after="matching"), tmp_path / "new")) == sorted(
         [*common, "matches.csv", "matches.npz"]
     )

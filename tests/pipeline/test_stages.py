@@ -17,13 +17,14 @@ from barpc.base.options import AdjustOptions, RunOptions
 from barpc.fit import FitOptions, fit_rpc
 from barpc.pipeline import inputs
 from barpc.pipeline import run as stages
+from barpc.pipeline.earlier import of_new
 from barpc.pipeline.inputs import (
+    IMAGES,
     PRIOR,
     given_matches,
     given_tracks,
     input_files,
     load_altimetry,
-    only_new,
     read_pairs,
     side_inputs,
     with_located,
@@ -49,7 +50,7 @@ def views(count: int = 3) -> tuple[View, ...]:
 
 def test_every_file_that_options_name_is_an_input() -> None:
     given = RunOptions(
-        fixed_run="earlier", matches=("a.csv", "b.npz"), gcp=("g.csv",), check_points=("c.csv", "d.csv"),
+        add_to="earlier", matches=("a.csv", "b.npz"), gcp=("g.csv",), check_points=("c.csv", "d.csv"),
         dem=("dem.tif", "e.tif"), geoid="geoid.gtx", reference=("r.tif",), overlap_list="pairs.txt", aoi="area.json",
     )  # fmt: skip
     names = [
@@ -66,8 +67,8 @@ def test_every_file_that_options_name_is_an_input() -> None:
         "area.json",
     ]
     found = input_files(given)
-    assert found[0] == Path("earlier/tables") / PRIOR
-    assert sorted(map(str, found[1:])) == sorted(names)
+    assert found[:2] == [Path("earlier/tables") / name for name in (PRIOR, IMAGES)]
+    assert sorted(map(str, found[2:])) == sorted(names)
     assert input_files(RunOptions()) == []
 
 
@@ -85,10 +86,10 @@ def test_a_terrain_covers_a_part_of_the_images_at_least(tmp_path) -> None:
     options = RunOptions(dem=str(dem))
     here = views(1)[0]
     there = View("far", "/x/far.tif", (100, 80), far, (0.0, 300.0))
-    assert side_inputs(options, [there, here])[0] is not None
+    assert side_inputs(options, [there, here]) is not None
     with pytest.raises(InputError, match=r"holds no height at the images' place \(15\.\d+, 43\.\d+\)"):
         side_inputs(options, [there])
-    assert side_inputs(RunOptions(), [there]) == (None, None)
+    assert side_inputs(RunOptions(), [there]) is None
 
 
 def test_heights_count_within_the_images_and_some_way_around_them(tmp_path) -> None:
@@ -217,23 +218,19 @@ def test_paths_of_a_list_start_where_it_lies_or_from_here(tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_of_each_track_with_something_new_the_surest_old_observation_is_kept(seed) -> None:
+def test_of_each_track_with_something_new_all_observations_are_kept(seed) -> None:
     """Against the rule, track by track."""
     rng = np.random.default_rng(seed)
     seen = [(t, v) for t in range(30) for v in range(5) if rng.random() < 0.6]
     point = np.unique([t for t, _ in seen], return_inverse=True)[1]
-    sigma = rng.permutation(len(seen)) + 1.0
-    xy = np.column_stack([np.arange(len(seen)), sigma])
-    given = Tracks(np.array([v for _, v in seen]), point, xy.astype(float), sigma)
-    old = np.array([True, False, True, True, False])
-    wanted = []
+    xy = np.column_stack([np.arange(len(seen)), np.zeros(len(seen))])
+    given = Tracks(np.array([v for _, v in seen]), point, xy.astype(float), np.ones(len(seen)))
+    old, wanted = np.array([True, False, True, True, False]), list[int]()
     for t in range(given.num_points):
         rows = np.flatnonzero(given.point == t)
-        new, known = rows[~old[given.view[rows]]], rows[old[given.view[rows]]]
-        kept = [*new, *known[np.argsort(sigma[known])][:1]]
-        if len(new) and len(kept) > 1:  # one alone is no tie
-            wanted += kept
-    assert only_new(given, old).xy[:, 0].tolist() == sorted(map(float, wanted))
+        if (~old[given.view[rows]]).any() and len(rows) > 1:  # one alone is no tie
+            wanted += rows.tolist()
+    assert of_new(given, old).xy[:, 0].tolist() == wanted
 
 
 # --- what is read before any work -------------------------------------------------------------------------
@@ -244,18 +241,15 @@ def test_ground_points_that_are_left_out_are_said_and_references_are_looked_at(t
     for name in ("g.csv", "c.csv"):
         (tmp_path / name).write_text("nothing\n")
     given = RunOptions(gcp=(str(tmp_path / "g.csv"),), check_points=(str(tmp_path / "c.csv"),), keep_going=True)
-    assert side_inputs(given, views()) == (None, None)
+    assert side_inputs(given, views()) is None
     lines = [record.getMessage() for record in caplog.records]
     assert [Path(line.split(",")[0]).name for line in lines] == ["g.csv", "c.csv"]
     read = []
     monkeypatch.setattr(inputs, "Sheet", SimpleNamespace(read=read.append))
     monkeypatch.setattr(inputs, "_require_cover", lambda *given: None)
     monkeypatch.setattr(inputs, "Dem", SimpleNamespace(open=lambda *given: given))
-    monkeypatch.setattr(inputs, "BlockPrior", SimpleNamespace(load=lambda path: path))
-    with_all = RunOptions(
-        dem="d.tif", geoid="g.gtx", heights="egm96", reference=("r.tif", "s.tif"), fixed_run="earlier"
-    )
-    assert side_inputs(with_all, views()) == ((("d.tif",), "g.gtx", "egm96"), Path("earlier/tables") / PRIOR)
+    with_all = RunOptions(dem="d.tif", geoid="g.gtx", heights="egm96", reference=("r.tif", "s.tif"))
+    assert side_inputs(with_all, views()) == (("d.tif",), "g.gtx", "egm96")
     assert read == ["r.tif", "s.tif"]
 
 

@@ -25,7 +25,7 @@ RUN = (
     "--image-list",
 )
 CASES: list[tuple[str, str]] = [
-    *(("adjust", flag) for flag in (*RUN, "--image-list", "--fixed-run")),
+    *(("adjust", flag) for flag in (*RUN, "--image-list", "--add-to")),
     *(("match", flag) for flag in ("--overlap-list", "--aoi", "--options", "--image-list")),
     *(("check", flag) for flag in ("--matches", "--image-list", "--options")),
     *((verb, flag) for verb in ("localize", "project") for flag in ("--points", "--dem", "--geoid")),
@@ -51,7 +51,7 @@ def no_waiting() -> Iterator[None]:
 
 
 def command(verb: str, flag: str, given: Path, crops: list[Path], tmp_path: Path) -> list[object]:
-    if flag == "--fixed-run" or verb.startswith("report"):
+    if flag == "--add-to" or verb.startswith("report"):
         name = "block.npz" if flag else "summary.json"
         (tmp_path / "run").mkdir()
         (tmp_path / "run" / name).symlink_to(given)

@@ -393,11 +393,11 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
         ("too few", "view_00"),
     ),
     "nine wrong tie points in ten": (outliers, 3, ()),
-    "an earlier run that is none": (given("--fixed-run", "/nowhere"), 1, ("/nowhere",)),
+    "an earlier run that is none": (given("--add-to", "/nowhere"), 1, ("/nowhere",)),
     "an earlier run that is damaged": (
-        lambda s: [s.a, s.b, "--fixed-run", s.file("block.npz", "PK\3\4x").parent],
+        lambda s: [s.a, s.b, "--add-to", s.file("block.npz", "PK\3\4x").parent],
         1,
-        ("block.npz",),
+        ("summary.json",),
     ),
     "a VRT of nothing": (
         lambda s: [s.a, s.file("x.vrt", '<VRTDataset rasterXSize="9" rasterYSize="9"></VRTDataset>')],

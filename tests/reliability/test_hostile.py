@@ -162,7 +162,7 @@ HOSTILE: dict[str, Callable[[Trap, list[Path]], list[object]]] = {
     ],
     "an earlier run that is a pickle": lambda t, c: [
         *c,
-        "--fixed-run",
+        "--add-to",
         evil_npz(c[0].parent / "block.npz", t.canary, "names", "model", "drift", "params").parent,
     ],
     "a run folder that lists files elsewhere": lambda t, c: foreign_state(c, t),

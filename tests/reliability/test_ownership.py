@@ -126,8 +126,8 @@ def test_a_folder_of_a_release_without_hashes_is_left_as_it_is(crops, out, tmp_p
 
 def test_a_prior_is_not_replaced_by_the_run_that_starts_from_it(crops, out, tmp_path):
     before = hashes([tmp_path])
-    said = barpc("adjust", *crops, "-o", out, "--fixed-run", out, "--overwrite")
-    assert_one_line(said, 1, "block.npz", "input")
+    said = barpc("adjust", *crops, "-o", out, "--add-to", out, "--overwrite")
+    assert_one_line(said, 1, "none to add")
     assert hashes([tmp_path]) == before
 
 

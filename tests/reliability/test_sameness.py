@@ -56,7 +56,7 @@ def ways(scene: Path) -> dict[str, RunOptions]:
         ),
         "a list of pairs": RunOptions(overlap_list=str(scene / "pairs.txt")),
         "an area": RunOptions(aoi=str(scene / "area.geojson")),
-        "an earlier run": RunOptions(fixed_run=str(scene / "earlier")),
+        "an earlier run": RunOptions(add_to=str(scene / "earlier")),
         "a bad file": RunOptions(keep_going=True),
     }
 

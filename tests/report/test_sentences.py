@@ -53,7 +53,7 @@ def run_of(adjustment: Any = None, kind: str = "adjust", **fields: Any) -> Any:
         "kind": kind, "adjustment": adjustment or adjusted(), "options": SimpleNamespace(), "reference": None,
         "copies": {}, "number": {name: k for k, name in enumerate(NAMES)}, "gcps": None, "check_points": None,
         "left_out": (), "after": None, "tracks": [0] * 9, "met_worse": (), "matched": (), "beside": {},
-        "datums": (), "whole_pixels": frozenset(), "gaps": {},
+        "datums": (), "whole_pixels": frozenset(), "gaps": {}, "known": frozenset(), "added": None,
         "views": tuple(SimpleNamespace(name=name, sensor=make_rpc()) for name in NAMES),
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **fields})
@@ -340,8 +340,8 @@ def test_a_scene_that_moved_far_is_said_to_where_nothing_but_the_cameras_holds_i
     assert len(reasons(lifted)) == 1
     assert reasons(lifted, options=SimpleNamespace(dem="x")) == []
     assert reasons(moved(6.1, reference_inlier=np.ones(2, bool)), options=SimpleNamespace(dem="x")) == []
-    assert reasons(moved(6.1), options=SimpleNamespace(fixed_run="x")) == []
-    assert len(reasons(moved(6.1), options=SimpleNamespace(dem=None, fixed_run=None))) == 1
+    assert reasons(moved(6.1), options=SimpleNamespace(add_to="x")) == []
+    assert len(reasons(moved(6.1), options=SimpleNamespace(dem=None, add_to=None))) == 1
     fixed = SimpleNamespace(drift=None, fixed=("A",), min_convergence=1.0, dem_sigma=2.0)
     assert reasons(moved(6.1, options=fixed)) == []
     for used, num in ((True, 0), (False, 1)):

@@ -6,7 +6,7 @@ observations, which are not, are in `problem`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -55,20 +55,32 @@ class EarlierScene:
 
 @dataclass(frozen=True)
 class JointPrior:
-    """A prior on several views together, with all of their correlations: root (p - mean)."""
+    """A prior on several views together, with all of their correlations: d^T information d + 2 slope d, d = p - mean.
+
+    Observations that it was learnt from, and that are adjusted again with others of their tie points, are taken off it:
+    alone it need not be positive.
+    """
 
     index: IntArray  # (n,) places of the unknowns in the raveled (N, q) array
     mean: Array  # (n,) their prior mean
-    root: Array  # (n, n) upper triangular factor of the information matrix
+    information: Array  # (n, n)
     scene: EarlierScene | None = None  # that these views knew; None: not known
+    told: Array | float = 0.0  # (N,) what tie points told of each view [1/px^2]
+    shown: Array | None = None  # what its corrections show of the priors given
+    slope: Array | float = 0.0  # (n,) half the derivative of its cost at the mean
 
-    def residual(self, params: Array) -> Array:
-        """Return the whitened residuals (n,) of unknowns (N, q)."""
-        return self.root @ (params.ravel()[self.index] - self.mean)
+    def gradient(self, params: Array) -> Array:
+        """Return half the derivative (n,) of the cost by the unknowns `index` at unknowns (N, q)."""
+        return self.information @ (params.ravel()[self.index] - self.mean) + self.slope
 
-    def jacobian(self) -> Array:
-        """Return the derivative (n, n) by the unknowns `index`."""
-        return self.root
+    def cost(self, params: Array) -> float:
+        """Return the cost of unknowns (N, q)."""
+        return float((params.ravel()[self.index] - self.mean) @ (self.gradient(params) + self.slope))
+
+    def without(self, information: Array, gradient: Array, params: Array) -> JointPrior:
+        """Return what is left where observations are taken off: information (n, n), and gradient (n,) at params."""
+        slope = information @ (params.ravel()[self.index] - self.mean) - gradient
+        return replace(self, information=self.information - information, slope=self.slope + slope)
 
 
 @dataclass(frozen=True)

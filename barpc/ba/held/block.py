@@ -5,9 +5,10 @@ from: the problem, points where the delivered cameras put them, what holds those
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -53,6 +54,7 @@ class Block:
     num_points: int  # and points of the reference
     num_rows: int  # given, used or not
     left_out: tuple[str, ...]  # views outside the largest group
+    known: BoolArray | None = None  # (K,) observations that an earlier block was learnt from; None: there is none
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -75,6 +77,7 @@ class Block:
             sigma=self.sigma[keep],
             order=self.order[keep],
             use=self.use[keep],
+            known=None if self.known is None else self.known[keep],
         )
 
     def in_order(self, rows: npt.NDArray[Scalar]) -> npt.NDArray[Scalar]:
@@ -116,8 +119,12 @@ def join(
     options: AdjustOptions,
     keep_largest: bool = False,
     reference: Reference | None = None,
+    held: Collection[str] = (),
 ) -> Block:
-    """Join tracks and GCPs into one block; arguments and errors as in `barpc.ba.adjust_tracks`."""
+    """Join tracks and GCPs into one block; arguments and errors as in `barpc.ba.adjust_tracks`.
+
+    Views that an earlier block has `held` are tied to each other by it, and need no tie points.
+    """
     names = [view.name for view in views]
     _check_names(names, options)
     gcps = GroundPoints.none() if gcps is None else gcps
@@ -134,14 +141,16 @@ def join(
     if not (np.diff(key[rows]) > 0).all():
         raise InputError("tracks: a track is observed twice in one view; keep one observation or none")
     count = np.bincount(view, minlength=len(views))
+    is_held = np.isin(names, list(held))
     controlled = np.bincount(view[len(tracks.view) :], minlength=len(views)) > 0  # by points whose places are known
+    controlled |= is_held
     few = [f"{names[v]} ({count[v]})" for v in np.flatnonzero((count < MIN_OBSERVATIONS) & ~controlled)]
     if few and not keep_largest:
         raise TiePointError(
             f"too few observations in {listed(few)}: at least {MIN_OBSERVATIONS} tie points are needed, or one ground "
             "control point (--gcp); give more matches (--matches) or leave these views out (--keep-going)"
         )
-    left_out = _left_out(names, view[rows], point[rows], tracks.num_points, keep_largest)
+    left_out = _left_out(names, view[rows], point[rows], tracks.num_points, keep_largest, is_held)
     order, _ = counting_sort(view, len(views))
     use = ~np.isin(view, np.flatnonzero(np.isin(names, left_out)))
     return Block(
@@ -170,13 +179,14 @@ def _check_names(names: Sequence[str], options: AdjustOptions) -> None:
 
 
 def _left_out(
-    names: Sequence[str], view: IntArray, point: IntArray, num_tracks: int, keep_largest: bool
+    names: Sequence[str], view: IntArray, point: IntArray, num_tracks: int, keep_largest: bool, is_held: BoolArray
 ) -> tuple[str, ...]:
     """Return the views outside the largest group, rows sorted by point; GCPs tie their views to each other."""
     point = np.where(point >= num_tracks, num_tracks, point)
     same = point[1:] == point[:-1]
     keys = np.unique((view[:-1] * len(names) + view[1:])[same])
-    groups = connected_groups(len(names), [divmod(int(key), len(names)) for key in keys])
+    held = np.flatnonzero(is_held).tolist()
+    groups = connected_groups(len(names), [*(divmod(int(key), len(names)) for key in keys), *pairwise(held)])
     if len(groups) == 1:
         return ()
     named = [[names[v] for v in group] for group in groups]

@@ -188,7 +188,7 @@ def datum_shares(
     paid["cameras"] += np.einsum("nqm->m", (problem.camera_prior.jacobian()[..., None] * unknowns) ** 2)
     if (joint := problem.joint_prior) is not None:
         flat = unknowns.reshape(-1, len(variance))[joint.index]
-        paid["earlier_run"] += ((joint.jacobian() @ flat) ** 2).sum(axis=0)
+        paid["earlier_run"] += (flat * (joint.information @ flat)).sum(axis=0)
     prior = problem.point_prior
     if (prior is not None and len(prior.index)) or not problem.free.all():
         reduced, structure = covariance.reduced, problem.structure

@@ -1,12 +1,14 @@
 """Carrying an adjusted block into the next run: its reduced normal matrix as a prior on its views.
 
-Old tie points are not needed again: everything that they say about the old views is in the matrix. New tie
-points may observe old views; an observation that the old block has used must not come back.
+Old tie points are not needed again: everything that they say about the old views is in the matrix. A run that adds
+images has some of the old views only, those that the new images meet: `BlockPrior.marginal` eliminates the others, and
+`BlockPrior.joined` puts what the run found back into the matrix of all views, new ones behind. So a block that grows
+image by image ends with the matrix of one that was adjusted whole, but for where it was linearised.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,15 +19,29 @@ import scipy.sparse as sp
 from barpc.ba.estimated.priors import CameraPrior, EarlierScene, JointPrior
 from barpc.ba.estimated.waves import Waves
 from barpc.ba.held.gauge import MOTIONS
+from barpc.ba.solving.linear import Blocks, Cholesky, Store, woodbury
+from barpc.ba.solving.structure import dissect
 from barpc.base.errors import InputError, listed, plain
 from barpc.base.frozen import load_npz
 from barpc.base.geodesy import Array
 from barpc.base.sidefile import ARRAYS, LARGEST
+from barpc.scene import IntArray
 
 PRIOR = replace(ARRAYS, words="the prior of an adjusted block")
-_SPARSE = ("data", "indices", "indptr")
+_SPARSE = ("diagonal", "pairs", "pair_view")
+_CSR = ("data", "indices", "indptr")  # of release 0.3
+_LEARNT = ("told", "shown")
 _SCENE = ("by_unknown", "own", "radius")
-_LARGEST = 20_000  # unknowns of a block that is gone on from: its matrix is dense then
+_IN_MEMORY = 1e8  # bytes of the factor of a whole block, which is read twice: the rest goes to a temporary file
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """A block of which some views are left, the others eliminated."""
+
+    block: BlockPrior  # the whole of it
+    index: IntArray  # (m q,) the unknowns that are left
+    solve: Callable[[Array], Array]  # (n q,) or (n q, k) right-hand sides -> solutions with the whole matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +56,7 @@ class BlockPrior:
         The unknowns (see `AdjustOptions`).
     params : (n, q)
         Their values.
-    information : (n q, n q), array or csr_array
+    information : (n q, n q), array or Blocks
         Their joint information matrix, priors included.
     center : (n, 3)
         Camera centres [m], ECEF.
@@ -52,13 +68,19 @@ class BlockPrior:
         Views of the block whose unknowns are a radar's clocks.
     scene : EarlierScene or None
         Scene of the block, by its cameras' unknowns; None: written by an earlier release.
+    told : (n,) or None
+        What tie points tell of each view, before what all of a view share caps it [1/px^2].
+    shown : (3 + drift, 2) or None
+        What the corrections of all views show of the priors given (`barpc.ba.robust.variances.Variances.shown`).
+    rest : Rest or None
+        The block that these views are only some of.
     """
 
     names: tuple[str, ...]
     model: str
     drift: int
     params: Array
-    information: Array | sp.csr_array
+    information: Array | Blocks
     center: Array
     less: Array | None = None
     splines: int = 0
@@ -67,6 +89,9 @@ class BlockPrior:
     strips: Array | None = None
     periods: Array | None = None
     scene: EarlierScene | None = None
+    told: Array | None = None
+    shown: Array | None = None
+    rest: Rest | None = None
 
     def waves(self, names: tuple[str, ...]) -> Waves | None:
         """Return the unknowns in the image of the views that go on from the block; a new view has splines alone."""
@@ -99,8 +124,9 @@ class BlockPrior:
             arrays["less"] = np.zeros((0, self.params.size)) if self.less is None else self.less
         if self.scene is not None:
             arrays |= {f"scene_{name}": np.asarray(getattr(self.scene, name)) for name in _SCENE}
+        arrays |= {name: array for name in _LEARNT if (array := getattr(self, name)) is not None}
         with Path(path).open("wb") as file:
-            np.savez_compressed(
+            np.savez(  # random digits: a tenth is all that compression takes off them
                 file,
                 names=np.array(self.names),
                 model=self.model,
@@ -125,9 +151,9 @@ class BlockPrior:
         file = load_npz(path, PRIOR)
         try:
             names = tuple(str(name) for name in file["names"])
-            params, sparse = file["params"], "indptr" in file
-            matrix = file["information"] if not sparse else _csr(file, params.size)
-            less = file["less"] if sparse else None
+            params = file["params"]
+            matrix = file["information"] if "information" in file else _blocks(file, *params.shape)
+            less = None if "information" in file else file["less"]
             splines, edges = int(file.get("splines", 0)), file.get("edges", np.zeros((len(names), 0)))
             known = str(file["model"]), int(file["drift"]), params, matrix, file["center"], less
             radars = tuple(str(name) for name in file.get("radars", ()))
@@ -137,7 +163,8 @@ class BlockPrior:
             if "scene_radius" in file:
                 by_unknown, own, radius = (file[f"scene_{name}"] for name in _SCENE)
                 scene = EarlierScene(by_unknown, own, float(radius))
-            prior = cls(names, *known, splines, edges, radars, strips, periods, scene)
+            learnt = file.get("told"), file.get("shown")
+            prior = cls(names, *known, splines, edges, radars, strips, periods, scene, *learnt)
         except (KeyError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({plain(error)})") from error
         if not prior._is_whole():
@@ -147,15 +174,22 @@ class BlockPrior:
     def _is_whole(self) -> bool:
         """Return whether the arrays have the shapes that the names ask for, and hold numbers that a prior can."""
         n, q = len(self.names), self.params.shape[-1] if self.params.ndim else 0
-        shapes = {"params": (n, q), "information": (n * q, n * q), "center": (n, 3)}
-        arrays = [getattr(self, name) for name in shapes]
+        shapes: dict[str, tuple[int, ...]] = {"params": (n, q), "information": (n * q, n * q), "center": (n, 3)}
+        arrays = {name: getattr(self, name) for name in shapes}
+        if isinstance(self.information, Blocks):
+            own = self.information.diagonal
+            shapes |= {"information": (n, q, q), "pairs": (len(self.information.pair_view), q, q)}
+            arrays |= {"information": own, "pairs": self.information.pairs}
+            diagonal = own.diagonal(axis1=1, axis2=2) if own.shape == (n, q, q) else np.zeros(1)
+        else:
+            diagonal = self.information.diagonal()
         return (
             n * q > 0
             and len(set(self.names)) == n
-            and all(array.shape == shape for array, shape in zip(arrays, shapes.values(), strict=True))
-            and all(array.dtype == np.float64 for array in arrays)
-            and all(_is_plain(array) for array in arrays)
-            and bool((self.information.diagonal() > 0).all())
+            and all(arrays[name].shape == shape for name, shape in shapes.items())
+            and all(array.dtype == np.float64 for array in arrays.values())
+            and all(_is_plain(array) for array in arrays.values())
+            and bool((diagonal > 0).all())
             and self._edges.ndim == 2
             and len(self._edges) == n
             and self._strips.shape[::2] == (n, 5)
@@ -166,20 +200,140 @@ class BlockPrior:
             and bool((self._periods > 0.0).all())
             and (self.splines == 0 or 4 <= self.splines <= q)
             and (self.scene is None or _is_scene(self.scene, n * q))
+            and (self.told is None or (self.told.shape == (n,) and _is_counted(self.told)))
+            and (self.shown is None or (self.shown.shape == (3 + self.drift, 2) and _is_counted(self.shown)))
             and (self.less is None or (self.less.shape[1:] == (n * q,) and _is_plain(self.less)))
         )
 
     def dense(self) -> Array:
-        """Return the information matrix as an array."""
+        """Return the information matrix (n q, n q) as an array."""
         if isinstance(self.information, np.ndarray):
             return self.information
-        if self.params.size > _LARGEST:
-            raise InputError(
-                f"the earlier block has {len(self.names)} views, too many to go on from: at most "
-                f"{_LARGEST // self.params.shape[1]}; adjust all images together"
-            )
-        matrix: Array = self.information.toarray()
-        return matrix if self.less is None else matrix - self.less.T @ self.less
+        matrix = self.information.plain()
+        return matrix if self.less is None else np.asarray(matrix - self.less.T @ self.less)
+
+    def marginal(self, names: Collection[str]) -> BlockPrior:
+        """Return what the block knows of some of its views, in its order: all others are eliminated.
+
+        Raises
+        ------
+        InputError
+            None of the views is among the names, or the matrix is damaged.
+        """
+        wanted = set(names)
+        views = np.array([i for i, name in enumerate(self.names) if name in wanted], dtype=np.int64)
+        if not len(views):
+            raise InputError("the earlier block has none of these views: nothing is gone on from")
+        try:
+            rest, information = self._eliminated(views)
+        except la.LinAlgError as error:
+            raise InputError(f"the earlier block's information is damaged ({plain(error)})") from error
+        left, scene = [self.names[i] for i in views], self.scene
+        if scene is not None:
+            moves = rest.solve(scene.by_unknown.T)
+            by_unknown = moves[rest.index].T @ information
+            own = scene.own + scene.by_unknown @ moves - by_unknown @ moves[rest.index]
+            scene = EarlierScene(by_unknown, own, scene.radius)
+        return replace(
+            self,
+            names=tuple(left),
+            params=self.params[views],
+            information=information,
+            center=self.center[views],
+            less=None,
+            edges=self._edges[views],
+            strips=self._strips[views],
+            periods=self._periods[views],
+            radars=tuple(name for name in self.radars if name in wanted),
+            scene=scene,
+            told=None if self.told is None else self.told[views],
+            rest=rest,
+        )
+
+    def _eliminated(self, views: IntArray) -> tuple[Rest, Array]:
+        """Return the block with views (m,) left, and their information (m q, m q)."""
+        n, q = self.params.shape
+        blocks = self.information if isinstance(self.information, Blocks) else Blocks.of(self.information, q)
+        order = dissect(blocks.pair_view, self.center[:, :2], np.ones(n, dtype=bool), views)
+        cholesky = Cholesky(blocks, order, Store(_IN_MEMORY))
+        cholesky.factorize(0.0)
+        index, information = (views[:, None] * q + np.arange(q)).ravel(), cholesky.last()
+        if self.less is None or not len(self.less):
+            return Rest(self, index, cholesky.solve), information
+        root, _ = woodbury(cholesky.solve, self.less)
+        held = information @ root[index]
+        information -= held @ np.linalg.solve(np.eye(held.shape[1]) + root[index].T @ held, held.T)
+        return Rest(self, index, lambda b: cholesky.solve(b) + root @ (root.T @ b)), information
+
+    def joined(self, later: BlockPrior) -> BlockPrior:
+        """Return the whole block with what a later run found: of some of its views, and of new ones, which come behind.
+
+        Old views that took no part move with their neighbours, as their covariance says.
+
+        Parameters
+        ----------
+        later : BlockPrior
+            The later run's, in which what this one says of its views, those of a `marginal`, is contained.
+        """
+        assert self.rest is not None
+        whole, q = self.rest.block, self.params.shape[1]
+        own = {name: i for i, name in enumerate(self.names)}
+        at = np.array([own.get(name, -1) for name in later.names])
+        known, new = np.flatnonzero(at >= 0), np.flatnonzero(at < 0)
+        # what the later run has beyond what it was given
+        more = later.dense().copy()
+        there, here = _unknowns(known, q), _unknowns(at[known], q)
+        more[np.ix_(there, there)] -= self.dense()[np.ix_(here, here)]
+        moved = np.zeros_like(self.params)
+        moved[at[known]] = later.params[known] - self.params[at[known]]
+        pull = np.zeros(whole.params.size)
+        pull[self.rest.index] = self.dense() @ moved.ravel()
+        params = whole.params + self.rest.solve(pull).reshape(whole.params.shape)
+        old, count = self.rest.index[::q] // q, len(whole.names)
+        params[old[at[known]]] = later.params[known]
+        place = np.empty(len(later.names), dtype=np.int64)
+        place[known], place[new] = old[at[known]], count + np.arange(len(new))
+        scene, wider = whole.scene, len(new) * q
+        if scene is not None:
+            scene = replace(scene, by_unknown=np.pad(scene.by_unknown, ((0, 0), (0, wider))))
+        names, told = tuple(later.names[i] for i in new), None
+        if whole.told is not None and later.told is not None:
+            told = np.concatenate([whole.told, later.told[new]])
+        return replace(
+            whole,
+            names=(*whole.names, *names),
+            params=np.concatenate([params, later.params[new]]),
+            information=_extended(whole, more, place, len(new)),
+            center=np.concatenate([whole.center, later.center[new]]),
+            less=np.pad(np.zeros((0, whole.params.size)) if whole.less is None else whole.less, ((0, 0), (0, wider))),
+            edges=np.concatenate([whole._edges, later._edges[new]]),
+            strips=np.concatenate([whole._strips, later._strips[new]]),
+            periods=np.concatenate([whole._periods, later._periods[new]]),
+            radars=(*whole.radars, *(name for name in later.radars if name in names)),
+            scene=scene,
+            told=told,
+            shown=later.shown,
+        )
+
+
+def _unknowns(views: IntArray, size: int) -> IntArray:
+    return np.asarray((views[:, None] * size + np.arange(size)).ravel())
+
+
+def _extended(whole: BlockPrior, more: Array, place: IntArray, new: int) -> Blocks:
+    """Return the information of a block with `new` views behind it, and with more (m q, m q) of views `place` (m,)."""
+    q, count = whole.params.shape[1], len(whole.names) + new
+    blocks = whole.information if isinstance(whole.information, Blocks) else Blocks.of(whole.information, q)
+    of_views = more.reshape(len(place), q, len(place), q)
+    every, diagonal = np.arange(len(place)), np.concatenate([blocks.diagonal, np.zeros((new, q, q))])
+    diagonal[place] += of_views[every, :, every, :]
+    i, j = np.nonzero(place[:, None] < place)
+    added, had = place[i] * count + place[j], blocks.pair_view @ [count, 1]
+    keys = np.union1d(had, added)
+    pairs = np.zeros((len(keys), q, q))
+    pairs[np.searchsorted(keys, had)] = blocks.pairs
+    pairs[np.searchsorted(keys, added)] += of_views[i, :, j, :]
+    return Blocks(diagonal, pairs, np.column_stack([keys // count, keys % count]))
 
 
 def _is_scene(scene: EarlierScene, size: int) -> bool:
@@ -192,14 +346,32 @@ def _is_scene(scene: EarlierScene, size: int) -> bool:
     )
 
 
-def _is_plain(array: Array | sp.csr_array) -> bool:
+def _is_plain(array: Array) -> bool:
     """Return whether all numbers are finite, and their squares."""
-    numbers = array.data if sp.issparse(array) else array
-    return bool((np.abs(np.asarray(numbers)) <= LARGEST).all())
+    return bool(not array.size or (array.min() >= -LARGEST and array.max() <= LARGEST))
+
+
+def _is_counted(array: Array) -> bool:
+    """Return whether all numbers are finite, and none is negative."""
+    return array.dtype == np.float64 and _is_plain(array) and bool((array >= 0.0).all())
+
+
+def _blocks(file: Mapping[str, Array], n: int, q: int) -> Blocks:
+    """Return the blocks that `save` wrote, or those of the matrix that release 0.3 wrote row by row."""
+    if "indptr" in file:
+        return Blocks.of(_csr(file, n * q), q)
+    pairs: IntArray = np.asarray(file["pair_view"])
+    blocks = Blocks(file["diagonal"], file["pairs"], pairs)
+    if not (pairs.ndim == 2 and pairs.shape[1] == 2 and pairs.dtype == np.int64):
+        raise ValueError("its pairs of views are none")
+    keys = pairs @ [n, 1]
+    if not (_within(pairs.ravel(), n - 1) and (pairs[:, 0] < pairs[:, 1]).all() and (np.diff(keys) > 0).all()):
+        raise ValueError("its pairs of views are not in order")
+    return blocks
 
 
 def _csr(file: Mapping[str, Array], size: int) -> sp.csr_array:
-    data, indices, bounds = (file[name] for name in _SPARSE)
+    data, indices, bounds = (file[name] for name in _CSR)
     # scipy's own check takes differences, which wrap round for numbers at the ends: what it then reads is not its own
     ends = bounds.shape == (size + 1,) and bounds[0] == 0 and bounds[-1] == len(indices) == len(data)
     if not (ends and _within(bounds, len(indices)) and (bounds[1:] >= bounds[:-1]).all()):
@@ -209,7 +381,7 @@ def _csr(file: Mapping[str, Array], size: int) -> sp.csr_array:
     return sp.csr_array((data, indices, bounds), shape=(size, size))
 
 
-def _within(numbers: Array, most: int) -> bool:
+def _within(numbers: Array | IntArray, most: int) -> bool:
     """Return whether all are whole, and from 0 to `most`."""
     return bool(numbers.ndim == 1 and numbers.dtype.kind in "iu" and ((numbers >= 0) & (numbers <= most)).all())
 
@@ -230,13 +402,10 @@ def apply_prior(
     Raises
     ------
     InputError
-        The old block's unknowns are others, or one of its views is missing.
+        The old block's unknowns are others.
     """
     if (prior.model, prior.drift) != (model, drift):
         raise InputError(f"the earlier block was adjusted with {prior.model} (drift {prior.drift}); use the same")
-    missing = sorted(set(prior.names) - set(names))
-    if missing:
-        raise InputError(f"views of the earlier block are missing: {listed(missing)}")
     if other := sorted(set(prior.radars) ^ (set(radars) & set(prior.names))):
         raise InputError(
             f"the earlier block corrected {listed(other)} otherwise, as a radar or not as one: give the same "
@@ -245,13 +414,12 @@ def apply_prior(
     size = prior.params.shape[1]
     if size != cameras.mean.shape[1]:
         raise InputError(f"the earlier block has {size} unknowns a view, not {cameras.mean.shape[1]}")
-    try:
-        root = la.cholesky(prior.dense())
-    except la.LinAlgError as error:
-        raise InputError(f"the earlier block's information is damaged ({plain(error)})") from error
     place = {name: i for i, name in enumerate(names)}
     views = np.array([place[name] for name in prior.names])
     mean, sigma = cameras.mean.copy(), cameras.sigma.copy()
     mean[views], sigma[views] = prior.params, np.inf
-    index = (views[:, None] * size + np.arange(size)).ravel()
-    return replace(cameras, mean=mean, sigma=sigma), JointPrior(index, prior.params.ravel(), root, prior.scene)
+    index, told = _unknowns(views, size), np.zeros(len(names))
+    told[views] = 0.0 if prior.told is None else prior.told
+    return replace(cameras, mean=mean, sigma=sigma), JointPrior(
+        index, prior.params.ravel(), prior.dense(), prior.scene, told, prior.shown
+    )

@@ -53,6 +53,7 @@ class Outcome:
     inlier: BoolArray  # (K,) observations in the final solve
     noise: float  # observed over stated standard deviation
     passes: int  # rounds of cutting
+    told: Array  # (N,) what tie points tell of each view [1/px^2]
     prior: PriorTest  # how the corrections compare with the priors given, and what the priors became
     smooth: SmoothTest  # what is smooth in the residuals that are left
     by_point: Array  # (2, 3, K) derivatives of the image points by the points at the end [px/m]
@@ -86,11 +87,16 @@ class Rounds:
         of_reference = block.point >= block.num_known
         faint = faintness(block, heights)[block.point]
         sigma = block.sigma * faint
-        self.observations = Observations(self.problem, sigma, options.noise_floor, is_tie, of_reference)
+        earlier = problem.joint_prior
+        told = 0.0 if earlier is None else earlier.told
+        self.observations = Observations(self.problem, sigma, options.noise_floor, is_tie, of_reference, told)
+        # where an earlier block knows some of the observations
+        self.earlier, self.again = (None if block.known is None else earlier), block.known
         alike = Resemblance.of(block)
         self.smooth = Smooth(problem.structure, problem.xy, unknowns, alike, tells=faint == 1.0)
         given, control = problem.camera_prior, heights.has_control
-        self.variances = Variances.of(given, unknowns, options, control, block.views)
+        shown = None if earlier is None else earlier.shown
+        self.variances = Variances.of(given, unknowns, options, control, block.views, shown)
         self.learnt: PriorTest | None = None  # with what the present priors were learnt
         # what the same unknowns ended with is gone on with: cut, accuracies, misfit
         self.goes_on = known is not None and known.problem.cameras.unknowns is unknowns
@@ -151,6 +157,7 @@ class Rounds:
             smooth = self.smooth.test_neighbours(smooth, self.residual, self.use)
             if found.covariance(self.problem.free).is_large:
                 tested = self.variances.learnt(self.problem, found, self.learnt, exact=True)[1]
+            noise = self.noise if self.options.estimate_noise else 1.0
             by_point = self._by_points().by_point.copy()  # the next projection overwrites it
             return Outcome(
                 self.problem,
@@ -160,6 +167,7 @@ class Rounds:
                 self.use,
                 self.noise,
                 self.passes,
+                self.observations.told_by(self.use / (self.observations.sigma * noise)),
                 tested,
                 smooth,
                 by_point,
@@ -187,6 +195,10 @@ class Rounds:
         tolerance = TOLERANCE if again or not self.robust else STANDS
         noise = self.noise if self.options.estimate_noise else 1.0
         self.weight = weight = self.observations.weight(self.use, noise, self.misfit)
+        if self.earlier is not None and self.again is not None:
+            given = replace(self.problem, joint_prior=self.earlier)
+            known = weight * self.observations.tied(self.use & self.again)
+            self.problem = given.counted_once(self.state.params, self.state.points, known)
         found = minimise(self.problem, self.state, weight, self.options.solver, tolerance, self.projected)
         state = found.state
         self.residual, self.projected = found.ahead or self.problem.prepare(state.params, state.points)

@@ -48,6 +48,8 @@ class PriorTest:
     # standard deviation of the drift's coefficients in use, degree by degree [m]
     drift_sigma: tuple[float, ...]
     shared: float = 1.0  # by how much standard deviations that RPCs state were widened, as all views share what is off
+    # what the corrections show, with those of an earlier block (see `Variances.shown`)
+    shown: Array | None = None
     failed: bool = False  # the matrix could not be factorised: nothing was learnt
 
 
@@ -171,16 +173,26 @@ class Variances:
     learn_drift: bool
     cautious: bool  # rather too wide than too narrow: no control holds the scene
     stated: BoolArray | None = None  # (N,) views whose RPCs state what counts here; None: none does
+    # (3 + D, 2) of an earlier block, whose views have no prior of their own here: squared corrections over the
+    # variances given, and their freedom, of constants, of those that are stated, and of the drift degree by degree; in
+    # the third row the number of views that state
+    shown: Array | None = None
 
     @classmethod
     def of(
-        cls, given: CameraPrior, unknowns: Unknowns, options: AdjustOptions, control: bool, views: Sequence[View] = ()
+        cls,
+        given: CameraPrior,
+        unknowns: Unknowns,
+        options: AdjustOptions,
+        control: bool,
+        views: Sequence[View] = (),
+        shown: Array | None = None,
     ) -> Variances:
         """Return the priors to be learnt by the options, with control points or without."""
         geometric = unknowns.geometric and options.learn_priors
         own = options.sigma_attitude is None and options.sigma_position is None and len(views) > 0
         stated = np.array([states_accuracy(view) for view in views]) if own else None
-        return cls(given, unknowns, geometric, geometric, not control, stated)
+        return cls(given, unknowns, geometric, geometric, not control, stated, shown)
 
     @property
     def constants(self) -> int:
@@ -205,7 +217,9 @@ class Variances:
         except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
             _LOG.info("the priors of the cameras are left as they are: %s", error)
             n = len(minimum.state.params)
-            nothing = PriorTest(float("nan"), 0.0, np.ones(n), np.zeros(n, dtype=bool), (), failed=True)
+            nothing = PriorTest(
+                float("nan"), 0.0, np.ones(n), np.zeros(n, dtype=bool), (), shown=self.shown, failed=True
+            )
             return problem.camera_prior, nothing
 
     def _learnt(self, problem: Problem, minimum: Minimum, widened: bool, exact: bool) -> tuple[CameraPrior, PriorTest]:
@@ -244,7 +258,8 @@ class Variances:
         drift = tuple(float(np.median(prior.sigma[:, self._drift_part(d).start])) for d in range(self._degrees))
         sigma = prior.sigma.copy()
         sigma[:, : self.constants] *= shared[:, None]
-        tested = PriorTest(ratio, freedom, scale, odd, drift, float(shared.max()))
+        shown = self._showing(params, known)
+        tested = PriorTest(ratio, freedom, scale, odd, drift, float(shared.max()), shown)
         return CameraPrior(prior.mean, sigma), tested
 
     def _shared(self, params: Array, known: Array) -> Array:
@@ -258,12 +273,32 @@ class Variances:
         wider = np.ones(len(params))
         if self.stated is None or not self.learn_constant:
             return wider
-        squares, freedom = (part[self.stated].sum() for part in self._squares(params, known))
+        (squares, freedom), (count, _) = self._of_stated(params, known)
         if freedom > _LEAST:
             alone = min(float(squares / (2.0 * gammaincinv(0.5 * freedom, CHANCE))), 1.0)
-            count = np.count_nonzero(known[self.stated, : self.constants].any(axis=1))
             wider[self.stated] = np.sqrt(max(alone + (1.0 - alone) * count * 3.0 / self.constants, 1.0))
         return wider
+
+    def _of_stated(self, params: Array, known: Array) -> Array:
+        """Return the second and third row of `shown` (2, 2), of an earlier block and of this."""
+        assert self.stated is not None
+        squares, freedom = (part[self.stated].sum() for part in self._squares(params, known))
+        count = np.count_nonzero(known[self.stated, : self.constants].any(axis=1))
+        return np.asarray(self._before(slice(1, 3)) + np.array([[squares, freedom], [count, 0.0]]))
+
+    def _before(self, rows: int | slice) -> Array:
+        """Return rows of what an earlier block showed; zeros without one."""
+        return np.asarray((np.zeros((3 + self._degrees, 2)) if self.shown is None else self.shown)[rows])
+
+    def _showing(self, params: Array, known: Array) -> Array:
+        """Return `shown` for a later run: by this block and those before it."""
+        out = self._before(slice(None)).copy()
+        out[0] += [part.sum() for part in self._squares(params, known)]
+        if self.stated is not None:
+            out[1:3] = self._of_stated(params, known)
+        for degree in range(self._degrees):
+            out[3 + degree] += [x.sum() for x in self._squares(params, known, part=self._drift_part(degree))]
+        return out
 
     @property
     def learn_waves(self) -> bool:
@@ -332,7 +367,9 @@ class Variances:
 
     def _too_large(self, params: Array, known: Array, scale: Array) -> bool:
         """Return whether the corrections are larger than chance allows."""
+        squares, free = self._before(0)
         total, freedom = (float(part.sum()) for part in self._squares(params, known, scale))
+        total, freedom = total + squares / float(np.min(scale)) ** 2, freedom + free
         return freedom > _LEAST and float(chdtrc(freedom, total)) < LEVEL
 
     def _widened(self, around: _Around, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
@@ -352,9 +389,10 @@ class Variances:
 
     def _common(self, total: Array, freedom: Array) -> float:
         """Return the factor by which the priors of views are widened together, by their squares and freedoms (n,)."""
-        factor = max((STATED + total.sum()) / (STATED + freedom.sum()), 1.0)
+        squares, free = self._before(0) + np.array([total.sum(), freedom.sum()])
+        factor = max((STATED + squares) / (STATED + free), 1.0)
         if self.cautious:
-            factor = max(factor, _possible(total.sum(), freedom.sum()))
+            factor = max(factor, _possible(squares, free))
         return float(np.sqrt(factor))
 
     def _odd(
@@ -404,7 +442,8 @@ class Variances:
         careful = self.cautious and not (waves and (waves.count or waves.edges.size))
         factors = np.ones(self._degrees)
         for degree in range(self._degrees):
-            total, freedom = (x.sum() for x in self._squares(params, known, part=self._drift_part(degree)))
+            own = self._squares(params, known, part=self._drift_part(degree))
+            total, freedom = self._before(3 + degree) + np.array([x.sum() for x in own])
             factors[degree] = (STATED + total) / (STATED + freedom)
             if careful and freedom > _LEAST and chdtrc(freedom, total) < CHANCE:
                 factors[degree] = max(factors[degree], _possible(total, freedom))

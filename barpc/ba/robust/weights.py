@@ -72,9 +72,11 @@ class Observations:
         noise_floor: float,
         is_tie: BoolArray,
         of_reference: BoolArray | None = None,
+        told: Array | float = 0.0,
     ) -> None:
         self.structure, self.sigma, self.noise_floor = problem.structure, sigma, noise_floor
         self.is_tie = is_tie
+        self.told = told  # (N,) by an earlier block's tie points of its views [1/px^2]
         waves = problem.cameras.unknowns.waves
         # errors that neighbours share are others in every stretch of a spline, of columns and of rows
         self.stretches = 1.0 if waves is None else waves.stretches(2.0 * float(problem.cameras.unknowns.half[1].max()))
@@ -126,13 +128,17 @@ class Observations:
         `SPLINES` independent errors.
         """
         weight: Array = use / (self.sigma * noise)
-        information = self.structure.sum_views((weight * self.is_tie)[None] ** 2)[:, 0]
+        information = self.told_by(weight)
         floor = self.noise_floor**2 / self.stretches + np.minimum(misfit, _LARGEST_MISFIT) ** 2 / SPLINES
         cap = 1.0 / np.sqrt(np.maximum(information * floor, 1.0))
         count = self.structure.sum_views((use & self.of_reference).astype(np.float64)[None])[:, 0]
         alike = np.sqrt(np.minimum(ALIKE / np.maximum(count, 1.0), 1.0))
         weight = np.where(self.of_reference, use / self.sigma * alike[self.structure.view], weight)
         return np.where(self.is_tie, weight * cap[self.structure.view], weight)
+
+    def told_by(self, weight: Array) -> Array:
+        """Return what tie points of weights (K,) [1/px] tell of each view, or told before (N,) [1/px^2]."""
+        return np.maximum(self.structure.sum_views((weight * self.is_tie)[None] ** 2)[:, 0], self.told)
 
     def noise(self, residual: Array, use: BoolArray, problem: Problem, fitted: int = 0) -> float:
         """Estimate the observed over stated standard deviation of the observations in use; 1 where there are

@@ -47,6 +47,13 @@ class Blocks:
         dense[j, :, i, :] = self.pairs.transpose(0, 2, 1)
         return dense.reshape(n * q, n * q)
 
+    def select(self, views: IntArray) -> Blocks:
+        """Return the matrix of some of its views (n,), ascending."""
+        place = np.full(len(self.diagonal), -1)
+        place[views] = np.arange(len(views))
+        kept = (place[self.pair_view] >= 0).all(axis=1)
+        return Blocks(self.diagonal[views], self.pairs[kept], place[self.pair_view[kept]])
+
     def sparse(self) -> sp.csr_array:
         """Return the matrix (N q, N q) as scipy has it."""
         n, q, _ = self.diagonal.shape
@@ -57,6 +64,17 @@ class Blocks:
         indptr = np.searchsorted(row[order], np.arange(n + 1))
         return sp.csr_array(sp.bsr_array((data, col[order], indptr), shape=(n * q, n * q)))
 
+    @classmethod
+    def of(cls, matrix: Array | sp.csr_array, size: int) -> Blocks:
+        """Return a symmetric matrix (N q, N q) as blocks of q = `size` unknowns a view."""
+        whole = sp.csr_array(matrix).tobsr((size, size))
+        whole.sort_indices()
+        n = len(whole.indptr) - 1
+        row, col = np.repeat(np.arange(n), np.diff(whole.indptr)), whole.indices.astype(np.int64)
+        diagonal, above = np.zeros((n, size, size)), row < col
+        diagonal[row[row == col]] = whole.data[row == col]
+        return cls(diagonal, whole.data[above], np.column_stack([row[above], col[above]]))
+
     def pair(self, i: int, j: int) -> int | None:
         """Return the index of the pair i < j; None where the block is zero."""
         start, stop = np.searchsorted(self.pair_view[:, 0], [i, i + 1])
@@ -64,17 +82,19 @@ class Blocks:
         return at if at < stop and self.pair_view[at, 1] == j else None
 
 
-class _Store:
-    """Arrays in the order they came; in a temporary file once they are many."""
+class Store:
+    """Arrays in the order they came; in a temporary file once they are more than so many bytes."""
 
-    def __init__(self) -> None:
+    def __init__(self, in_memory: float | None = None) -> None:
+        self.in_memory = IN_MEMORY if in_memory is None else in_memory
         self.kept: list[Array | tuple[int, tuple[int, int]]] = []
         self.size = 0
         self.file: IO[bytes] | None = None
 
     def append(self, array: Array) -> None:
+        """Keep one more."""
         self.size += array.nbytes
-        if self.size <= IN_MEMORY or not array.size:
+        if self.size <= self.in_memory or not array.size:
             self.kept.append(array)
             return
         if self.file is None:
@@ -102,7 +122,7 @@ class Cholesky:
     blocks: Blocks
     order: Dissection
     # of every front L of its pivots (p q, p q), above whose diagonal nothing is meant, then of its border (b q, p q)
-    parts: _Store = field(default_factory=_Store)
+    parts: Store = field(default_factory=Store)
 
     @property
     def _size(self) -> int:
@@ -170,6 +190,11 @@ class Cholesky:
         block = self.blocks.pairs[pairs]
         matrix[col, :, row, :] = np.where(flipped[:, None, None], block, block.transpose(0, 2, 1))
         return matrix.reshape(count * q, count * q).T
+
+    def last(self) -> Array:
+        """Return what is left (m, m) for the unknowns of the last front once all others are eliminated."""
+        lower = np.tril(self._of(len(self.order.fronts) - 1)[0])
+        return np.asarray(lower @ lower.T)
 
     def solve(self, b: Array) -> Array:
         """Return the solutions of right-hand sides (n,) or (n, m), n unknowns of the views that are
@@ -324,11 +349,22 @@ def _check(diagonal: Array) -> None:
         raise AdjustError("the normal equations are not finite: a camera cannot be evaluated at its tie points")
 
 
-def _updated(factor: Factor, less: Array, order: Dissection) -> Factor:
-    """Return the factor of S - B^T B from that of S (Woodbury's formula)."""
-    pulled = factor.solve(np.ascontiguousarray(less.T))
+def woodbury(solve: Callable[[Array], Array], less: Array) -> tuple[Array, Array]:
+    """Return R (n, m) of (S - B^T B)^-1 = S^-1 + R R^T by solutions with S and B = `less` (m, n); U of I - B S^-1 B^T.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        S - B^T B is not positive definite.
+    """
+    pulled = solve(np.ascontiguousarray(less.T))
     upper = la.cholesky(np.eye(len(less)) - less @ pulled)
-    root = la.solve_triangular(upper, pulled.T, trans="T").T  # (S - B^T B)^-1 = S^-1 + root root^T
+    return np.asarray(la.solve_triangular(upper, pulled.T, trans="T").T), upper
+
+
+def _updated(factor: Factor, less: Array, order: Dissection) -> Factor:
+    """Return the factor of S - B^T B from that of S."""
+    root, upper = woodbury(factor.solve, less)
 
     def solve(b: Array) -> Array:
         first = factor.solve(b)

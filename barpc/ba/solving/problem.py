@@ -48,7 +48,7 @@ class Problem:
         """Return the sum of the squared residuals of all priors."""
         cost = float((self.camera_prior.residual(params) ** 2).sum())
         if self.joint_prior is not None:
-            cost += float((self.joint_prior.residual(params) ** 2).sum())
+            cost += self.joint_prior.cost(params)
         return cost if self.point_prior is None else cost + self.point_prior.cost(points)
 
     def cost(self, params: Array, points: Array, whitened: Array) -> float:
@@ -141,7 +141,19 @@ class Problem:
         prior = self.joint_prior
         if prior is None:
             return reduced
-        root = prior.jacobian()
         gradient = reduced.gradient.copy()
-        gradient[prior.index] += root.T @ prior.residual(params)
-        return replace(reduced, matrix=reduced.with_joint(prior.index, root.T @ root), gradient=gradient)
+        gradient[prior.index] += prior.gradient(params)
+        return replace(reduced, matrix=reduced.with_joint(prior.index, prior.information), gradient=gradient)
+
+    def counted_once(self, params: Array, points: Array, weight: Array) -> Problem:
+        """Return the problem with the joint prior without observations that it knows already, of `weight` (K,) [1/px].
+
+        What is left of these is what their tie points tell with others: the cost of the others given them. That holds
+        for observations that the prior was not learnt from, too.
+        """
+        prior = self.joint_prior
+        assert prior is not None
+        nothing = CameraPrior(self.camera_prior.mean, np.full_like(self.camera_prior.sigma, np.inf))
+        known = replace(self, camera_prior=nothing, joint_prior=None, _room=[]).reduce(params, points, weight)
+        matrix = known.plain(np.ones(len(self.free), dtype=bool))[np.ix_(prior.index, prior.index)]
+        return replace(self, joint_prior=prior.without(matrix, known.gradient[prior.index], params))

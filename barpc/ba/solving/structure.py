@@ -39,14 +39,20 @@ class Dissection:
     owner: IntArray  # (N,) the front whose pivot it is, or -1
 
 
-def dissect(pairs: IntArray, place: Array, use: BoolArray) -> Dissection:
-    """Return the nested-dissection order of the views in `use` (N,), tied in `pairs` (M, 2), at `place` (N, 2)."""
+def dissect(pairs: IntArray, place: Array, use: BoolArray, last: IntArray | None = None) -> Dissection:
+    """Return the nested-dissection order of the views in `use` (N,), tied in `pairs` (M, 2), at `place` (N, 2).
+
+    Views that are to come `last` (n,) are the last front, in the order given: its matrix is what is left of theirs once
+    all others are eliminated.
+    """
     n = len(place)
     (i, j), own = pairs[use[pairs].all(axis=1)].astype(np.int32).T, np.arange(n, dtype=np.int32)
     ties = np.concatenate([i, j, own]), np.concatenate([j, i, own])
     graph = sp.csr_array((np.ones(len(ties[0]), dtype=np.int8), ties), shape=(n, n))
     pieces: list[IntArray] = []
-    _cut(graph, np.nan_to_num(place), np.flatnonzero(use), pieces)
+    last = np.zeros(0, dtype=np.int64) if last is None else last
+    _cut(graph, np.nan_to_num(place), np.setdiff1d(np.flatnonzero(use), last), pieces)
+    pieces += [last] if len(last) else []
     rank, owner, at = np.full(n, -1), np.full(n, -1), 0
     for number, piece in enumerate(pieces):
         rank[piece], owner[piece] = at + np.arange(len(piece)), number

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import compress
+from itertools import compress, pairwise
 from math import isfinite
 from typing import Any
 
@@ -52,12 +52,14 @@ class Scope:
         matched here. Where too few can be registered, they keep their places with the measured standard deviation
     terrain : callable, optional, lon, lat (n,) [deg] -> altitude [m above the ellipsoid], NaN outside: narrows the
         search for structure
+    joined : sequence of int, views that are tied to each other already, by an earlier adjustment
     """
 
     only: Sequence[Link] = ()
     area: Area | None = None
     given: Mapping[Link, Any] = field(default_factory=dict)
     terrain: Terrain | None = None
+    joined: Sequence[int] = ()
 
 
 EVERYWHERE = Scope()
@@ -174,7 +176,7 @@ def possible_pairs(views: Sequence[View], options: TieOptions, scope: Scope = EV
     where += " inside the area of interest" if scope.area is not None else ""
     require_connected(
         views,
-        [*(pair.views for pair in pairs), *scope.given],
+        [*(pair.views for pair in pairs), *scope.given, *pairwise(scope.joined)],
         f"no overlap of at least {options.min_overlap:.0%} under {options.angles[0]:g} to "
         f"{options.angles[1]:g} deg {where}; remove the stray images (--keep-going keeps the largest group), or lower "
         "min_overlap ([tie] of a file given with --options)",

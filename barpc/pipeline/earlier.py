@@ -1,0 +1,341 @@
+"""A finished run that images are added to: which images it has and where they lie, which of them new ones meet.
+
+A run folder has `tables/images.json` beside its block: every image of the block, those of the runs that it went on
+from too, so that no other folder is needed to go on.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from barpc.ba import BlockPrior
+from barpc.ba.estimated.unknowns import make_unknowns
+from barpc.ba.result import moved_px
+from barpc.base import manifest
+from barpc.base.errors import InputError, plain
+from barpc.base.geodesy import Array, ecef_from_ground, metres_per_unit, wrap_longitude
+from barpc.base.identity import Input, take
+from barpc.base.options import RunOptions, TieOptions
+from barpc.base.remote import is_url, location
+from barpc.base.sidefile import GEOJSON, parse_json, read_text
+from barpc.cameras import split_spec
+from barpc.pipeline.inputs import IMAGES, PRIOR, linked_names
+from barpc.pipeline.loading import Image, LoadedViews, image_path, load_views
+from barpc.pointio.names import unique_names
+from barpc.report import Run
+from barpc.report.outcome import Added
+from barpc.report.runfiles import table_path
+from barpc.scene import BoolArray, Tracks, View
+from barpc.sensor.geometry import footprints
+from barpc.tie.pairing.overlaps import Footprints, overlapping_pairs, reach_of
+from barpc.workspace import Homes, portable
+
+logger = logging.getLogger(__name__)
+
+_LOOKED_AT = 4  # times as many images as are matched are opened, the largest common areas: angles count, too
+
+
+@dataclass(frozen=True)
+class Known:
+    """An image of a finished run."""
+
+    name: str
+    path: str  # absolute
+    choices: Mapping[str, str] | None  # that its camera was opened with; None: it came with the image, from no file
+    size: tuple[int, int]
+    altitude: float  # [m] of its outline
+    outline: tuple[tuple[float, float], ...]  # lon, lat [deg], by its corrected camera
+    bytes: int
+    sha256: str
+    camera_sha256: str  # of the file that holds its camera; empty: no file
+
+    @property
+    def spec(self) -> str:
+        """The file with the choices behind it."""
+        return self.path + "".join(f",{key}={text}" for key, text in (self.choices or {}).items())
+
+
+@dataclass(frozen=True, eq=False)
+class Earlier:
+    """A finished run: its folder, its images and what it knows of their cameras, in one order."""
+
+    folder: Path
+    images: tuple[Known, ...]
+    prior: BlockPrior
+
+    @classmethod
+    def open(cls, folder: str | Path) -> Earlier:
+        """Read a run folder; InputError where it is none, unfinished, of another release, or was changed since."""
+        folder = Path(folder)
+        if not (folder / "summary.json").exists():
+            raise InputError(f"{folder}: no summary.json, so no finished run; give the folder of one")
+        table, block = table_path(folder, IMAGES), table_path(folder, PRIOR)
+        if not block.exists():
+            raise InputError(f"{block}: missing, and it is what a later run goes on from: run the adjustment again")
+        if not table.exists():
+            raise InputError(f"{table}: missing, as of a run of another release: run the adjustment again")
+        _refuse_edited(folder, (table, block))
+        prior = BlockPrior.load(block)
+        try:
+            rows = parse_json(read_text(table, GEOJSON), GEOJSON.values)["images"]
+            images = {row["name"]: _known(row, Homes.of(folder)) for row in rows}
+            return cls(folder, tuple(images[name] for name in prior.names), prior)
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise InputError(f"{table}: damaged ({plain(error)}); run the adjustment again") from error
+
+    @cached_property
+    def number(self) -> dict[str, int]:
+        """Name of an image -> its index."""
+        return {image.name: i for i, image in enumerate(self.images)}
+
+    def of_given(self, files: Sequence[Any]) -> dict[str, Known]:
+        """Return which of the files given (absolute) are images of the run: by path, or under another by content."""
+        by_path = {os.path.realpath(image.path): image for image in self.images if not is_url(image.path)}
+        by_content = {(image.bytes, image.sha256): image for image in self.images}
+        sizes, found = {image.bytes for image in self.images}, dict[str, Known]()
+        for file in files:
+            if not isinstance(file, Path) or not file.is_file():
+                continue
+            image = by_path.get(os.path.realpath(file))
+            if image is None and file.stat().st_size in sizes:
+                image = by_content.get((file.stat().st_size, take(file).sha256))
+            if image is not None:
+                found[str(file)] = image
+        return found
+
+    def near(self, views: Sequence[View], tie: TieOptions) -> list[int]:
+        """Return the images whose outlines meet those of views that may be off, the largest common areas of each."""
+        grown = Footprints(views, float(np.median([v.altitude for v in views])), [reach_of(v, tie) for v in views])
+        usable = [image for image in self.images if image.outline]
+        rings = np.array([image.outline for image in usable]).reshape(len(usable), -1, 2)
+        outlines = np.atleast_1d(np.asarray(shapely.polygons(grown.plane(rings)), dtype=object))
+        tree, found = shapely.STRtree(outlines), set[int]()
+        for outline in grown.outlines:
+            index = tree.query(outline, predicate="intersects")
+            area = shapely.area(shapely.intersection(tree.geometries[index], outline))
+            best = np.lexsort((index, -area))[: _LOOKED_AT * tie.neighbours]
+            found.update(self.number[usable[i].name] for i in index[best])
+        return sorted(found)
+
+    def refuse_changed(self, run: Run, inputs: Mapping[str, Input]) -> None:
+        """Raise InputError where an image of the run, or the file with its camera, is not what the run was made of."""
+        for view, source in zip(run.views, run.sources, strict=True):
+            image = self.images[self.number[view.name]] if view.name in self.number else None
+            if image is not None and _sha(inputs, view.path) != image.sha256:
+                raise InputError(
+                    f"{view.path}: is not the image that {self.folder} was made of (it was changed since); give the "
+                    "new one under another name"
+                )
+            if image is not None and _sha(inputs, str(source.path.absolute())) != image.camera_sha256:
+                raise InputError(
+                    f"{source.path}: is not the camera of {view.path} that {self.folder} was made of (it was changed "
+                    "since); put the former one back, or adjust all images together"
+                )
+
+    def moved(self, grown: BlockPrior) -> Array:
+        """Return how far [px] the cameras of its images (n,) move, where a block has grown out of this."""
+        lonlat = np.array([_middle(image.outline) for image in self.images])
+        alt = np.array([image.altitude for image in self.images])
+        places = np.column_stack([lonlat, alt])
+        side = [np.sqrt(_area(image) / (image.size[0] * image.size[1])) for image in self.images]
+        return moved_px(self.prior, grown, ecef_from_ground(places), np.array(side))
+
+
+def _sha(inputs: Mapping[str, Input], path: str) -> str:
+    return inputs[path].sha256 if path in inputs else ""
+
+
+def _refuse_edited(folder: Path, files: Sequence[Path]) -> None:
+    if not os.path.lexists(folder / manifest.SUMS):
+        raise InputError(f"{folder / manifest.SUMS}: missing, as of a run that was interrupted: run it again")
+    sums = {name: sha for layer in manifest.read(folder)[1] for name, sha in layer.files.items()}
+    for file in files:
+        if sums.get(file.relative_to(folder).as_posix()) != take(file).sha256:
+            raise InputError(f"{file}: was changed since the run wrote it (barpc verify {folder}): run it again")
+
+
+def _known(row: Mapping[str, Any], homes: Homes) -> Known:
+    choices = row["choices"]
+    if choices is not None and "camera" in choices:
+        choices = {**choices, "camera": homes.located(choices["camera"])}
+    ring = np.array(row["outline"], dtype=np.float64).reshape(-1, 2)
+    if not (np.isfinite(ring).all() and len(row["size"]) == 2 and min(row["size"]) > 0):
+        raise ValueError(f"{row['name']}: no outline, or no size")
+    outline = tuple((lon, lat) for lon, lat in ring.tolist())
+    texts = (str(row[key]) for key in ("sha256", "camera_sha256"))
+    size = (int(row["size"][0]), int(row["size"][1]))
+    path = homes.located(str(row["path"]))
+    return Known(str(row["name"]), path, choices, size, float(row["altitude"]), outline, int(row["bytes"]), *texts)
+
+
+def _middle(outline: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    ring = np.array(outline)
+    return tuple(ring.mean(axis=0)) if len(ring) else (0.0, 0.0)
+
+
+def _area(image: Known) -> float:
+    """Return the area of an outline [m^2]."""
+    ring = np.array(image.outline).reshape(-1, 2)
+    if not len(ring):
+        return float(image.size[0] * image.size[1])
+    ring = ring.copy()
+    ring[:, 0] = wrap_longitude(ring[:, 0], ring[0, 0])
+    scale = metres_per_unit(np.array([*ring[0], image.altitude]))[:2]
+    return float(shapely.Polygon((ring - ring[0]) * scale).area)
+
+
+# --- the images of a run that goes on ---------------------------------------------------------------------
+
+
+def join_earlier(images: Sequence[Image], options: RunOptions, earlier: Earlier, how: dict[str, Any]) -> LoadedViews:
+    """Return the images given and those of an earlier run that they meet, under the names that they have there.
+
+    `how`: arguments of `load_views`. InputError where none of the images is new, or none meets the earlier ones.
+    """
+    files = [image_path(image, options.allow_remote) for image in images]
+    how = {**how, "min_views": 1}
+    old = earlier.of_given(files)
+    fresh = [image for image, file in zip(images, files, strict=True) if str(file) not in old]
+    if not fresh:
+        file, image = next(iter(old.items()))
+        raise InputError(
+            f"every image given is in {earlier.folder} already ({file} is its {image.name}): there is none to add"
+        )
+    given = load_views(fresh, **how)
+    names = {image.name for image in old.values()}
+    wanted = [i for i in _wanted(given.views, options, earlier) if earlier.images[i].name not in names]
+    reached = [image for image in map(earlier.images.__getitem__, wanted) if _is_there(image, earlier.folder)]
+    if not reached and not old:
+        where = "its images there cannot be opened" if wanted else "none of its images meets the images given"
+        raise InputError(f"{earlier.folder}: {where}, so there is nothing to add them to; give its images, too, or "
+                         "adjust without --add-to")  # fmt: skip
+    loaded = load_views([*images, *(image.spec for image in reached)], **how)
+    known = {**{str(file): image.name for file, image in old.items()}, **{image.path: image.name for image in reached}}
+    return _renamed(loaded, known, earlier)
+
+
+def _is_there(image: Known, folder: Path) -> bool:
+    if image.choices is not None and (is_url(image.path) or Path(image.path).is_file()):
+        return True
+    why = "no such file any more" if image.choices is not None else "its camera came from no file"
+    logger.warning("%s: an image of %s that is not matched: %s; give it, too, where it is now", image.path, folder, why)
+    return False
+
+
+def _wanted(views: Sequence[View], options: RunOptions, earlier: Earlier) -> list[int]:
+    """Return the images of a run that views are matched with, or that matches of theirs are given with."""
+    found = set[int]()
+    if options.matches:
+        names = _new_names([view.path for view in views], earlier), [image.name for image in earlier.images]
+        found = {earlier.number[name] for name in linked_names(options.matches, *names)}
+    return sorted(found) if options.matches_only else sorted(found.union(earlier.near(views, options.tie)))
+
+
+def _renamed(loaded: LoadedViews, known: Mapping[str, str], earlier: Earlier) -> LoadedViews:
+    """Return views under the names of an earlier run, new ones under others, in the order of these."""
+    new = [view.path for view in loaded.views if view.path not in known]
+    named = dict(zip(new, _new_names(new, earlier), strict=True)) | dict(known)
+    rows = [(replace(v, name=named[v.path]), s) for v, s in zip(loaded.views, loaded.sources, strict=True)]
+    rows.sort(key=lambda row: row[0].name)
+    return replace(loaded, views=tuple(v for v, _ in rows), sources=tuple(s for _, s in rows))
+
+
+def _new_names(paths: Sequence[str], earlier: Earlier) -> list[str]:
+    """Return names of new images that no image of an earlier run has."""
+    taken = [Path(f"/{image.name}.x") for image in earlier.images]
+    return unique_names([*map(location, paths), *taken])[: len(paths)]
+
+
+def chosen_pairs(views: Sequence[View], is_old: Sequence[bool], tie: TieOptions) -> list[tuple[int, int]]:
+    """Return the pairs to match: of each new view the best partners, old or new."""
+    pairs = sorted(overlapping_pairs(views, tie), key=lambda pair: (-pair.score, pair.views))
+    if not any(is_old[i] != is_old[j] for i, j in (pair.views for pair in pairs)):
+        reaches = [reach_of(view, tie) for view in views]
+        pairs = sorted(overlapping_pairs(views, tie, reaches), key=lambda pair: (-pair.score, pair.views))
+    taken, chosen = [0] * len(views), []
+    for pair in pairs:
+        own = [i for i in pair.views if not is_old[i]]
+        if any(taken[i] < tie.neighbours for i in own):
+            chosen.append(pair.views)
+            for i in own:
+                taken[i] += 1
+    return sorted(chosen)
+
+
+def of_new(tracks: Tracks, is_old: BoolArray) -> Tracks:
+    """Return the tracks that a new view observes, with all their observations: what the old block knows of those that
+    old views share is taken off it (`barpc.ba.solving.problem.Problem.counted_once`).
+    """
+    new = ~is_old[tracks.view]
+    return tracks.select((np.bincount(tracks.point, new, minlength=tracks.num_points) > 0)[tracks.point])
+
+
+# --- what the next run needs ------------------------------------------------------------------------------
+
+
+def images_table(run: Run, given: Sequence[Image], inputs: Mapping[str, Input], folder: Path, block: BlockPrior) -> str:
+    """Return the text of `tables/images.json`: the images of a block, those of an earlier run behind it too."""
+    assert run.adjustment is not None
+    hosts = getattr(run.options, "allow_remote", ())
+    choices: dict[str, Mapping[str, str] | None] = {}
+    for image in given:
+        choices[str(image_path(image, hosts))] = None if isinstance(image, View) else split_spec(image, hosts)[1]
+    before = {} if run.earlier is None else {image.name: image for image in run.earlier.images}
+    rings = footprints(run.adjustment.sensors, [view.size for view in run.views], run.altitude)[:, ::4]
+    rows = {name: _row(image, folder) for name, image in before.items()}
+    for view, ring, source in zip(run.views, rings, run.sources, strict=True):
+        was, ring = before.get(view.name), np.round(ring, 8)
+        of_file = choices.get(view.path, None if was is None else was.choices)
+        known, camera = inputs.get(view.path), _sha(inputs, str(source.path.absolute()))
+        outline = tuple((lon, lat) for lon, lat in ring.tolist()) if np.isfinite(ring).all() else ()
+        size, sha = (0, "") if known is None else (known.size, known.sha256)
+        rows[view.name] = _row(
+            Known(view.name, view.path, of_file, view.size, float(run.altitude), outline, size, sha, camera), folder
+        )
+    text = ",\n".join(json.dumps(rows[name]) for name in block.names)
+    return f'{{"images": [\n{text}\n]}}\n'
+
+
+def _row(image: Known, folder: Path) -> dict[str, Any]:
+    choices = image.choices
+    if choices is not None and "camera" in choices:
+        choices = {**choices, "camera": portable(choices["camera"], folder)}
+    return {**vars(image), "path": portable(image.path, folder), "choices": choices}
+
+
+def added(run: Run, earlier: Earlier, grown: BlockPrior, floor: float) -> Added:
+    """Return what a run did to the block that it added images to: how far its images should move [px]."""
+    moved = earlier.moved(grown)
+    ranked = [(earlier.images[i].name, float(moved[i])) for i in np.argsort(-moved, kind="stable")]
+    beyond = tuple(one for one in ranked if one[1] > floor)
+    met, name = len(run.known), earlier.folder.resolve().name
+    here = {view.name for view in run.views} - run.unwritten
+    written = bool(run.fits) and (getattr(run.options, "update", False) or all(one in here for one, _ in beyond))
+    return Added(name, len(earlier.images), met, beyond, ranked[0], floor, written)
+
+
+def movers(run: Run, grown: BlockPrior, done: Collection[str], hosts: Sequence[str]) -> tuple[list[View], Any]:
+    """Return the images that move beside those `done`, as delivered, and their corrected cameras."""
+    assert run.added is not None
+    earlier: Earlier = run.earlier
+    wanted = [earlier.images[earlier.number[name]] for name, _ in run.added.beyond if name not in done]
+    there = [image for image in wanted if _is_there(image, earlier.folder)]
+    if not there:
+        return [], []
+    loaded = load_views([image.spec for image in there], min_views=1, distinct=False, hosts=hosts)
+    names = {image.path: image.name for image in there}
+    views = [replace(view, name=names[view.path]) for view in loaded.views]
+    rows = np.array([earlier.number[view.name] for view in views])
+    waves = grown.waves(tuple(view.name for view in views))
+    unknowns = make_unknowns(views, grown.model, grown.drift, grown.center[rows], waves)
+    return views, unknowns.corrected(grown.params[rows], views)
