@@ -326,7 +326,7 @@ def test_control_that_passes_as_agreeing_and_tears_the_images_is_let_go(what, mo
     assert any("the images would agree less with each other" in reason for reason in summary.reasons)
     assert any(line.startswith("Without ground control that agrees") for line in summary.verdict)
     assert [point.status for point in summary.gcps] == ["rejected"] * 6
-    assert "0 of 6 GCPs that are seen hold the block." in decisions(summary)
+    assert "0 of 6 visible GCPs constrain the block." in decisions(summary)
 
 
 @pytest.mark.parametrize(

@@ -302,7 +302,7 @@ DIRECT = {
     "cameras.py": "no file: a row of the table of openers",
     "report/runfiles.py": "the schema, which is part of the package",
     "cli/process.py": "the null device",
-    "pointio/gcps.py": "layers of a GeoPackage or Shapefile, which fiona opens, once their head has been read there",
+    "pointio/gcp_formats.py": "layers of a GeoPackage or Shapefile, which fiona opens, once their head is read",
 }
 """Modules that may open a file for reading by themselves, and what they open."""
 ARRAYS_OF_A_PATH = ("load", "fromfile", "genfromtxt", "loadtxt")
@@ -328,7 +328,7 @@ def _opens(call: ast.Call) -> bool:
     if name in ARRAYS_OF_A_PATH:
         return owner == "np"
     writes = bool(words & {"w", "wb", "r+b"})
-    members = owner in ("archive", "ZipFile", "Dem", "HeightGrid")
+    members = owner in ("archive", "ZipFile", "Dem", "HeightGrid", "Earlier")
     return name in ("open", "read_text", "read_bytes") and not writes and not members
 
 

@@ -106,7 +106,7 @@ def test_the_report_shows_the_same_window_before_and_after(surface, copied):
     page = (copied / "report.html").read_text(encoding="utf-8")
     assert "What do they make of the ground?" in page
     assert page.count("by the delivered cameras, lit") == page.count("by the corrected cameras, lit") == 2
-    assert f"disagree by {metres(before.nmad_m)} and by {metres(after.nmad_m)}" in page
+    assert f"differ by {metres(before.nmad_m)} and by {metres(after.nmad_m)}" in page
     assert page.count('class="swipe"') == 1
     assert "img_01 (left) and img_03 (right) on the surface by the corrected cameras" in page
     assert len(page) < 2_000_000

@@ -54,6 +54,9 @@ def command(verb: str, flag: str, given: Path, crops: list[Path], tmp_path: Path
     if flag == "--add-to" or verb.startswith("report"):
         name = "block.npz" if flag else "summary.json"
         (tmp_path / "run").mkdir()
+        if flag:
+            (tmp_path / "run" / "summary.json").write_text("{}")
+            (tmp_path / "run" / "images.json").write_text('{"images": []}')
         (tmp_path / "run" / name).symlink_to(given)
         if not flag:
             return [tmp_path / "run"] * len(verb.split())

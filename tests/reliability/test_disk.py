@@ -96,7 +96,13 @@ def names_and_pixels(folder: Path, names: dict[str, bytes]) -> dict[str, object]
         if name.endswith((".vrt", ".tif")):
             with rasterio.open(folder / name) as image:
                 found[name] = (image.read().tobytes(), image.rpcs.to_dict())
-        elif name not in ("summary.json", "report.html", "SHA256SUMS", "tables/footprints.geojson"):
+        elif name not in (
+            "summary.json",
+            "report.html",
+            "SHA256SUMS",
+            "tables/footprints.geojson",
+            "tables/images.json",
+        ):
             found[name] = (folder / name).read_bytes()
     return found
 

@@ -388,7 +388,10 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
     "an npz that is none": (given("--matches", "t.npz", t__npz=b"PK\3\4 cut"), 1, ("t.npz",)),
     "an npz that is a text": (given("--matches", "t.npz", t__npz="hello"), 1, ("t.npz",)),
     "too few tie points": (
-        matches([(f"view_0{v}", 10.0 + 20 * t, 50.0, t) for t in range(3) for v in (0, 1)]),
+        lambda s: [
+            *matches([(f"view_0{v}", 10.0 + 20 * t, 50.0, t) for t in range(3) for v in (0, 1)])(s),
+            "--matches-only",
+        ],
         1,
         ("too few", "view_00"),
     ),

@@ -79,7 +79,7 @@ def test_the_summary_of_views_added_to_an_earlier_run_follows_the_schema():
     record = report.summarize(Run("adjust", block.views, (), block.tracks, adjustment=adjustment))
     assert record.scene.drift_sigma_m == (None,)  # the earlier run's matrix has it
     assert faults(json.loads(json.dumps(plain(record))), SCHEMA) == []
-    assert "as those of the earlier run do" in " ".join(decisions(record))
+    assert "as in the earlier run" in " ".join(decisions(record))
 
 
 def test_the_schema_refuses_what_is_missing_unknown_or_of_another_kind(block_run):
