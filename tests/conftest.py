@@ -12,7 +12,6 @@ import pytest
 from tests.lanes import spread
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("NUMBA_THREADING_LAYER", "workqueue")  # of oracles: beside OpenMP's no test could fork
 
 SHARED = Path(os.environ.get("BARPC_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 
