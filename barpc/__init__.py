@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 __version__ = "0.3.0"
 
-_MODULES = {
+_PUBLIC_MODULES = {
     "barpc.sensor.rpc": "RPC",
     "barpc.sensor.pushbroom": "Pushbroom",
     "barpc.sensor.sentinel1": "RangeDoppler",
     "barpc.sensor": "SensorModel",
     "barpc.sensor.corrected": "Correction Corrected",
-    "barpc.sensor.displaced": "RowSpline Splined",
+    "barpc.sensor.image_corrections": "RowSpline Splined",
     "barpc.scene": "View Tracks GroundPoints",
     "barpc.rpcio": "read_rpc write_rpc",
     "barpc.fit": "fit_rpc fit_rpc_points",
@@ -26,7 +26,7 @@ _MODULES = {
     "barpc.cameras": "open_camera",
     "barpc.base.errors": "BarpcError BarpcWarning",
 }
-_PUBLIC = {name: module for module, names in _MODULES.items() for name in names.split()}
+_PUBLIC = {name: module for module, names in _PUBLIC_MODULES.items() for name in names.split()}
 
 if TYPE_CHECKING:
     from barpc.base.errors import BarpcError as BarpcError
@@ -49,8 +49,8 @@ if TYPE_CHECKING:
     from barpc.sensor import SensorModel as SensorModel
     from barpc.sensor.corrected import Corrected as Corrected
     from barpc.sensor.corrected import Correction as Correction
-    from barpc.sensor.displaced import RowSpline as RowSpline
-    from barpc.sensor.displaced import Splined as Splined
+    from barpc.sensor.image_corrections import RowSpline as RowSpline
+    from barpc.sensor.image_corrections import Splined as Splined
     from barpc.sensor.pushbroom import Pushbroom as Pushbroom
     from barpc.sensor.rpc import RPC as RPC
     from barpc.sensor.sentinel1 import RangeDoppler as RangeDoppler

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from barpc.base.errors import ImageError, InputError, MissingRpcError, RpcError
-from barpc.base.remote import Place, located, location
-from barpc.base.sidefile import IMAGE, read_head
+from barpc.base.remote import PathOrUrl, located, location
+from barpc.base.safe_io import IMAGE, read_head
 from barpc.pointio.correspondences import (
     GRID_TAG,
     Correspondences,
@@ -32,14 +32,14 @@ from barpc.rpcio.grids import SIGN, read_correction
 from barpc.rpcio.sources import at_tile, described, metadata_beside, only_physical
 from barpc.scene import Camera
 from barpc.sensor.direct_grid import DirectGrid
-from barpc.sensor.displaced import Displaced
 from barpc.sensor.geometry import altitude_range
+from barpc.sensor.image_corrections import Displaced
 from barpc.sensor.rpc import RPC
 
 _ON_EARTH = (-500.0, 9000.0)  # m: all ground
 
 
-Reader = Callable[[str], Any]
+ChoiceReader = Callable[[str], Any]
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Opener:
     """(path, its first 4096 bytes - none of a folder -, choices) -> whether it is of this kind."""
     open: Callable[..., Camera]
     """(path, **choices) -> Camera."""
-    choices: Mapping[str, Reader] = field(default_factory=dict)
+    choices: Mapping[str, ChoiceReader] = field(default_factory=dict)
     """What may be given behind the file, and how its text is read (ValueError or KeyError: not so)."""
     whole: bool = False
     """Whether it states the size of its image: of pixels of another size it is no camera."""
@@ -79,7 +79,7 @@ def open_camera(spec: str | Path, **choices: Any) -> Camera:
     return open_split(*split_spec(spec), **choices)
 
 
-def open_split(path: Place, texts: Mapping[str, str], **choices: Any) -> Camera:
+def open_split(path: PathOrUrl, texts: Mapping[str, str], **choices: Any) -> Camera:
     """Open the camera of a file with the choices behind its name (see `open_camera`, `split_spec`).
 
     `tags`: those of the raster `path`, where it is open already.
@@ -94,20 +94,20 @@ def open_split(path: Place, texts: Mapping[str, str], **choices: Any) -> Camera:
         if key not in opener.choices:
             possible = ", ".join(("camera", "size", *opener.choices))
             raise InputError(f"{file}: {key} is no choice for the kind {name}; known are {possible}")
-    read = {key: _read(opener.choices[key], key, text, file) for key, text in texts.items()}
+    read = {key: _parse_choice(opener.choices[key], key, text, file) for key, text in texts.items()}
     camera = opener.open(file, **{**read, **choices})
     if holder is not None and isinstance(camera.model, RPC) and (tile := at_tile(path, camera.path, camera.model)):
         camera = replace(camera, model=tile[0], notes=(*camera.notes, tile[1]), size=None)
     if isinstance(size, str):
-        size = _read(_size, "size", size, file)
+        size = _parse_choice(_parse_size, "size", size, file)
     elif size is None:  # of the image's own pixels; those of a grid are not the image's
-        size = _pixels(path) if holder is not None or opener.whole or camera.size is None else None
+        size = _raster_size(path) if holder is not None or opener.whole or camera.size is None else None
     if opener.whole and size not in (None, camera.size):
         raise InputError(f"{path}: is {size} px large, its physical model in {camera.path} of {camera.size}")
     return camera if size is None else replace(camera, size=size)
 
 
-def split_spec(spec: str | Path, hosts: Sequence[str] = ()) -> tuple[Place, dict[str, str]]:
+def split_spec(spec: str | Path, hosts: Sequence[str] = ()) -> tuple[PathOrUrl, dict[str, str]]:
     """Split a file from the choices given behind it, as texts; ImageError for a host that is not allowed."""
     name, texts = os.fspath(spec), dict[str, str]()
     known = {"camera", "size", *(key for opener in OPENERS.values() for key in opener.choices)}
@@ -128,17 +128,17 @@ def read_points(spec: str | Path) -> tuple[Correspondences | None, tuple[int, in
     path, texts = split_spec(spec)
     if path.is_dir() or path.suffix.lower() == ".zip" or b"<adsHeader>" in read_head(path, IMAGE):
         return None, None
-    altitudes = _read(_numbers, "altitudes", texts["altitudes"], path) if "altitudes" in texts else None
+    altitudes = _parse_choice(_colon_numbers, "altitudes", texts["altitudes"], path) if "altitudes" in texts else None
     if set(texts) - {"size", "altitudes"}:
         return None, None
-    size = _read(_size, "size", texts["size"], path) if "size" in texts else None
+    size = _parse_choice(_parse_size, "size", texts["size"], path) if "size" in texts else None
     if correspondence_kind(path, altitudes) is None:
         points, own = _tagged(path)
         return points, size or own
     return read_correspondences(path, altitudes=altitudes), size
 
 
-def _tagged(path: Place) -> tuple[Correspondences | None, tuple[int, int] | None]:
+def _tagged(path: PathOrUrl) -> tuple[Correspondences | None, tuple[int, int] | None]:
     if driver_of(read_head(path, IMAGE)) is None:
         return None, None
     try:
@@ -150,21 +150,21 @@ def _tagged(path: Place) -> tuple[Correspondences | None, tuple[int, int] | None
     return None, None
 
 
-def _read(reader: Reader, key: str, text: str, file: Place) -> Any:
+def _parse_choice(reader: ChoiceReader, key: str, text: str, file: PathOrUrl) -> Any:
     try:
         return reader(text)
     except (ValueError, KeyError) as error:
         raise InputError(f"{file}: {key}={text} cannot be read") from error
 
 
-def _size(text: str) -> tuple[int, int]:
+def _parse_size(text: str) -> tuple[int, int]:
     width, height = (int(part) for part in text.split(":"))
     if min(width, height) < 1:
         raise ValueError(text)
     return width, height
 
 
-def _pixels(path: Place) -> tuple[int, int] | None:
+def _raster_size(path: PathOrUrl) -> tuple[int, int] | None:
     try:
         with open_raster(path) as dataset:
             return int(dataset.width), int(dataset.height)
@@ -172,7 +172,7 @@ def _pixels(path: Place) -> tuple[int, int] | None:
         return None
 
 
-def _open_rpc(path: Place, first_pixel: float | None = None, band: int = 1) -> Camera:
+def _open_rpc(path: PathOrUrl, first_pixel: float | None = None, band: int = 1) -> Camera:
     source = read_rpc_source(path, first_pixel=first_pixel, band=band)
     size, notes = source.size, source.notes
     if source.path == path and source.format in ("xml", "dimap"):  # given alone: it speaks of its whole image
@@ -182,12 +182,12 @@ def _open_rpc(path: Place, first_pixel: float | None = None, band: int = 1) -> C
     return Camera(source.rpc, source.path, source.format, size, altitude_range(source.rpc), notes)
 
 
-def _is_sentinel1(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
+def _is_sentinel1(path: PathOrUrl, head: bytes, _choices: Mapping[str, Any]) -> bool:
     """Return whether it is a product folder or zip, its manifest, or an annotation."""
     return path.is_dir() or path.suffix.lower() in (".safe", ".zip") or b"<adsHeader>" in head
 
 
-def _is_terrasar(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
+def _is_terrasar(path: PathOrUrl, head: bytes, _choices: Mapping[str, Any]) -> bool:
     """Return whether it is a product folder, or its annotation."""
     if not (path.is_dir() and isinstance(path, Path)):
         return b"<level1Product" in head
@@ -196,7 +196,7 @@ def _is_terrasar(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
     return find_annotation(path) is not None
 
 
-def _is_sicd(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
+def _holds_sicd(path: PathOrUrl, head: bytes, _choices: Mapping[str, Any]) -> bool:
     """Return whether it is the XML of a SICD image, or a NITF that holds it."""
     if b"SICD" not in head and not head.startswith(b"NITF02.10"):
         return False
@@ -205,7 +205,7 @@ def _is_sicd(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
     return is_sicd(head) or (head.startswith(b"NITF02.10") and isinstance(path, Path) and find_sicd(path) is not None)
 
 
-def _is_csm(_path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
+def _is_csm(_path: PathOrUrl, head: bytes, _choices: Mapping[str, Any]) -> bool:
     if b"USGS_ASTRO_" not in head and b'"m_' not in head:
         return False
     from barpc.sensor.csm import is_state
@@ -213,7 +213,7 @@ def _is_csm(_path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
     return is_state(head)
 
 
-def _open_radar(path: Place, key: str, reader: str, **choices: Any) -> Camera:
+def _open_radar(path: PathOrUrl, key: str, reader: str, **choices: Any) -> Camera:
     """Open a radar's own model by a reader, ``module:function``, that is imported when it is needed."""
     module, _, function = reader.partition(":")
     choices |= {"polarisation": choices.pop("pol")} if "pol" in choices else {}
@@ -221,60 +221,60 @@ def _open_radar(path: Place, key: str, reader: str, **choices: Any) -> Camera:
     return Camera(model, path, key, model.size, model.alt_range)
 
 
-def _on_disk(path: Place, what: str) -> Path:
+def _on_disk(path: PathOrUrl, what: str) -> Path:
     """Return a file of this machine; ImageError on another host, as such a camera lies in many files."""
     if not isinstance(path, Path):
         raise ImageError(f"{path}: {what} is read from disk only")
     return path
 
 
-def _open_csm(path: Place, altitudes: tuple[float, float] = _ON_EARTH) -> Camera:
+def _open_csm(path: PathOrUrl, altitudes: tuple[float, float] = _ON_EARTH) -> Camera:
     from barpc.sensor.csm import open_state
 
     model, size = open_state(_on_disk(path, "a camera's state"))
     return Camera(model, path, "csm", size, altitudes)
 
 
-def _is_grid(path: Place, head: bytes, choices: Mapping[str, Any]) -> bool:
+def _is_grid(path: PathOrUrl, head: bytes, choices: Mapping[str, Any]) -> bool:
     if driver_of(head) != "GTiff":
         return False
     tags = choices.get("tags")
     return "altitudes" in choices or (correspondence_kind(path) == "grid" if tags is None else GRID_TAG in tags)
 
 
-def _open_grid(path: Place, altitudes: list[float] | None = None) -> Camera:
+def _open_grid(path: PathOrUrl, altitudes: list[float] | None = None) -> Camera:
     nodes = read_grid(path, altitudes)
     grid = DirectGrid.from_points(nodes.ground, nodes.image)
     size = (max(1, int(grid.cols[-1]) + 1), max(1, int(grid.rows[-1]) + 1))  # an image that begins at (0, 0)
     return Camera(grid, path, "grid", size, (float(grid.alts[0]), float(grid.alts[-1])))
 
 
-def _open_correction(path: Place) -> Camera:
+def _open_correction(path: PathOrUrl) -> Camera:
     rpc, lacking = read_correction(path)
     size = int(lacking.cols[-1]) + 1, int(lacking.rows[-1]) + 1  # its nodes go from corner to corner of the image
     return Camera(Displaced(rpc, lacking), path, "correction", size, altitude_range(rpc))
 
 
-def _numbers(text: str) -> list[float]:
+def _colon_numbers(text: str) -> list[float]:
     return [float(part) for part in text.split(":")]
 
 
 def _interval(text: str) -> tuple[float, float]:
-    low, high = _numbers(text)
+    low, high = _colon_numbers(text)
     if not -1e4 <= low < high <= 1e5:
         raise ValueError(text)
     return low, high
 
 
-def _is_physical(path: Place, head: bytes, choices: Mapping[str, Any]) -> bool:
+def _is_physical(path: PathOrUrl, head: bytes, choices: Mapping[str, Any]) -> bool:
     """Return whether the physical model is asked for, or is all that an XML holds."""
     if "model" in choices or not isinstance(path, Path):
         return choices.get("model") == "physical"
-    return _VENDORS(head) is not None and only_physical(path)
+    return _has_vendor_root(head) is not None and only_physical(path)
 
 
 def _open_physical(
-    path: Place, model: str = "physical", altitudes: tuple[float, float] | None = None, **choices: Any
+    path: PathOrUrl, model: str = "physical", altitudes: tuple[float, float] | None = None, **choices: Any
 ) -> Camera:
     from barpc.sensor.linescan import read_linescan
 
@@ -295,7 +295,7 @@ def _stated_altitudes(file: Path) -> tuple[float, float]:
     return _ON_EARTH
 
 
-_VENDORS = re.compile(rb"<(\w+:)?(isd|Dimap_Document)\b").search
+_has_vendor_root = re.compile(rb"<(\w+:)?(isd|Dimap_Document)\b").search
 _YES_NO = {"yes": True, "no": False}.__getitem__
 
 OPENERS: dict[str, Opener] = {
@@ -304,8 +304,8 @@ OPENERS: dict[str, Opener] = {
         _open_rpc,
         {"first_pixel": {"auto": None, "0": 0.0, "0.5": 0.5, "1": 1.0}.__getitem__, "band": int},
     ),
-    "sicd": Opener(_is_sicd, partial(_open_radar, key="sicd", reader="sicd:open_sicd")),
-    "grid": Opener(_is_grid, _open_grid, {"altitudes": _numbers}),
+    "sicd": Opener(_holds_sicd, partial(_open_radar, key="sicd", reader="sicd:open_sicd")),
+    "grid": Opener(_is_grid, _open_grid, {"altitudes": _colon_numbers}),
     "correction": Opener(
         lambda _path, head, _choices: driver_of(head) == "GTiff" and SIGN.encode() in head, _open_correction
     ),

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from barpc.base.errors import InputError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, HeightDatum
-from barpc.base.remote import Place
+from barpc.base.remote import PathOrUrl
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
 
@@ -32,7 +32,7 @@ class Camera:
     """A camera and where it came from."""
 
     model: SensorModel
-    path: Place
+    path: PathOrUrl
     """The file that holds it: what was given, or a file beside it."""
     format: str
     """What that file is: ``tag``, ``nitf``, a row of `barpc.rpcio.FORMATS`, or another row of `OPENERS`."""
@@ -137,7 +137,7 @@ class Tracks(Frozen):
         return len(self.view)
 
     def _told(self) -> str:
-        return f"{self.num_points} tie points, {_seen(self.view, self.sigma)}"
+        return f"{self.num_points} tie points, {_observation_words(self.view, self.sigma)}"
 
     @property
     def num_points(self) -> int:
@@ -198,7 +198,7 @@ class GroundPoints(Frozen):
             raise InputError("ground points: an observation names a point that does not exist")
 
     def _told(self) -> str:
-        return f"{len(self.names)} points, {_seen(self.view, self.xy_sigma)}"
+        return f"{len(self.names)} points, {_observation_words(self.view, self.xy_sigma)}"
 
     @classmethod
     def none(cls) -> GroundPoints:
@@ -274,7 +274,7 @@ class Altimetry(Frozen):
         return f"{len(self.sigma)} heights"
 
 
-def _seen(view: IntArray, sigma: Array) -> str:
+def _observation_words(view: IntArray, sigma: Array) -> str:
     """Return the observations in a few words."""
     if not len(view):
         return "no observations"

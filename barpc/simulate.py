@@ -26,7 +26,7 @@ from barpc.sensor.geometry import triangulate
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 
-__all__ = ["Block", "BlockOptions", "BlockTruth", "Look", "fly", "recentred", "simulate_block"]
+__all__ = ["BlockOptions", "BlockTruth", "Look", "SimulatedBlock", "fly", "recentred", "simulate_block"]
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class BlockOptions:
 
 
 @dataclass(frozen=True)
-class _Grid:
+class _SiteGrid:
     """Sites on a square grid, row by row: counts, centre and steps [deg]."""
 
     columns: int
@@ -68,7 +68,7 @@ class _Grid:
     step: tuple[float, float]
 
     @classmethod
-    def square(cls, num_views: int, options: BlockOptions, lon: float, lat: float) -> _Grid:
+    def square(cls, num_views: int, options: BlockOptions, lon: float, lat: float) -> _SiteGrid:
         """Return the grid that holds `num_views` views around a centre [deg]."""
         sites = -(-num_views // options.per_site)
         columns = int(np.ceil(np.sqrt(sites)))
@@ -87,11 +87,11 @@ class _Grid:
 
 
 @dataclass(frozen=True, eq=False)
-class _Scene:
+class _SimulatedScene:
     """Who sees what: ground points drawn over the block and projected by the exact cameras."""
 
     cameras: tuple[Corrected, ...]
-    grid: _Grid
+    grid: _SiteGrid
     options: BlockOptions
     rng: np.random.Generator
 
@@ -160,7 +160,7 @@ class BlockTruth:
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class SimulatedBlock:
     """Views, tie points and GCPs as an adjustment receives them, with the truth."""
 
     views: tuple[View, ...]  # without pixels; `sensor` is the delivered RPC
@@ -196,7 +196,7 @@ def simulate_block(
     num_checks: int = 500,
     num_gcps: int = 0,
     **options: object,
-) -> Block:
+) -> SimulatedBlock:
     """Return a block of views with tie points, GCPs and held-out points.
 
     Views stand in groups of `per_site` over sites on a square grid; neighbouring sites overlap.
@@ -213,8 +213,8 @@ def simulate_block(
         raise InputError("block: at least one view, and no negative count")
     chosen = BlockOptions(**options)  # type: ignore[arg-type]
     rng = np.random.default_rng(seed)
-    grid = _Grid.square(num_views, chosen, lon, lat)
-    views, centers = _cameras(grid, num_views, chosen)
+    grid = _SiteGrid.square(num_views, chosen, lon, lat)
+    views, centers = _simulated_views(grid, num_views, chosen)
     corrections = tuple(
         Correction(rng.normal(0, chosen.attitude, 3), rng.normal(0, chosen.position, 3), center) for center in centers
     )
@@ -224,14 +224,14 @@ def simulate_block(
         Corrected(v.sensor, replace(c, drift=d[None], row_offset=rows / 2, row_scale=rows) if d.any() else c)
         for v, c, d in zip(views, corrections, drift, strict=True)
     )
-    scene = _Scene(exact, grid, chosen, rng)
+    scene = _SimulatedScene(exact, grid, chosen, rng)
 
     ground, tracks = scene.observe(num_tracks, fewest=2, visible=chosen.visible)
     noisy, outlier = _disturbed(tracks, chosen, rng)
     check_ground, check = scene.observe(num_checks, fewest=2, visible=1.0)
     gcps = _gcps(*scene.observe(num_gcps, fewest=1, visible=chosen.visible), chosen, rng)
     truth = BlockTruth(corrections, drift, ground, outlier, check_ground, check)
-    return Block(views, noisy, gcps, truth)
+    return SimulatedBlock(views, noisy, gcps, truth)
 
 
 def _gcps(ground: Array, seen: Tracks, options: BlockOptions, rng: np.random.Generator) -> GroundPoints:
@@ -241,7 +241,7 @@ def _gcps(ground: Array, seen: Tracks, options: BlockOptions, rng: np.random.Gen
     return GroundPoints(names, ground, sigma, noisy.point, noisy.view, noisy.xy, noisy.sigma)
 
 
-def _cameras(grid: _Grid, num_views: int, options: BlockOptions) -> tuple[tuple[View, ...], list[Array]]:
+def _simulated_views(grid: _SiteGrid, num_views: int, options: BlockOptions) -> tuple[tuple[View, ...], list[Array]]:
     """Return the views with delivered RPCs, and their camera centres (3,) [m, ECEF]; site by site."""
     views: list[View] = []
     centers: list[Array] = []
@@ -287,7 +287,7 @@ def _disturbed(tracks: Tracks, options: BlockOptions, rng: np.random.Generator) 
 GM = 3.986004418e14  # gravitational constant of the Earth (WGS84) [m^3/s^2]
 PITCH = 10.0  # views of one site are spread from -PITCH to +PITCH degrees of incidence along the flight
 ROLL = 8.0  # largest incidence across the flight [deg]
-_DEGREE = 4  # of the polynomials of time for position and attitude
+_ORBIT_DEGREE = 4  # of the polynomials of time for position and attitude
 
 
 @dataclass(frozen=True)
@@ -331,28 +331,28 @@ def fly(target: Array, look: Look, size: tuple[int, int], gsd: float) -> Pushbro
     """
     place, aim, enu = _standpoint(target, look), ecef_from_ground(target), enu_basis(target)
     heading = np.radians(look.heading)
-    along = _level(heading if look.scan is None else np.radians(look.scan)) @ enu
+    along = _horizontal(heading if look.scan is None else np.radians(look.scan)) @ enu
     rate = np.sqrt(GM / np.linalg.norm(place) ** 3)
     period = gsd / float(rate * np.linalg.norm(aim))
     half = 0.5 * (size[1] - 1) * period
     stop = 1.1 * half + 8 * period
-    count = 2 * _DEGREE + 1  # times at which the guided motion is sampled
+    count = 2 * _ORBIT_DEGREE + 1  # times at which the guided motion is sampled
     times = stop * np.cos(np.pi * (np.arange(count) + 0.5) / count)[::-1]
 
-    position = _circle(place, _level(heading) @ enu, rate, times)
+    position = _circle(place, _horizontal(heading) @ enu, rate, times)
     z = aim + (gsd / period) * times[:, None] * along - position
     z /= np.linalg.norm(z, axis=1, keepdims=True)
     y = np.cross(z, along)
     y /= np.linalg.norm(y, axis=1, keepdims=True)
     mount, vectors = about_middle(Rotation.from_matrix(np.stack([np.cross(y, z), y, z], axis=2)))
     orbit, attitude = (
-        Curve.polynomial(polyfit(times + stop, values, _DEGREE), -stop, stop) for values in (position, vectors)
+        Curve.polynomial(polyfit(times + stop, values, _ORBIT_DEGREE), -stop, stop) for values in (position, vectors)
     )
     look_angles = np.array([[0.0, 0.0], [0.0, -gsd / look.altitude]])
     return Pushbroom(orbit, attitude, mount, look_angles, 0.5 * (size[0] - 1), period, -half)
 
 
-def _level(azimuth: float) -> Array:
+def _horizontal(azimuth: float) -> Array:
     return np.array([np.sin(azimuth), np.cos(azimuth), 0.0])
 
 
@@ -361,7 +361,7 @@ def _standpoint(target: Array, look: Look) -> Array:
     the target.
     """
     incidence, azimuth = np.radians([look.incidence, look.azimuth])
-    enu = np.sin(incidence) * _level(azimuth) + [0.0, 0.0, np.cos(incidence)]
+    enu = np.sin(incidence) * _horizontal(azimuth) + [0.0, 0.0, np.cos(incidence)]
     origin, direction = ecef_from_ground(target), enu @ enu_basis(target)
     foot = ecef_from_ground(np.array([target[0], target[1], 0.0]))
     along = origin @ direction

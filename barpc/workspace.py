@@ -42,7 +42,7 @@ from barpc.base.errors import BarpcError, InputError, OutputError
 from barpc.base.frozen import Arrays, load_npz
 from barpc.base.manifest import SUMS
 from barpc.base.remote import is_url
-from barpc.base.sidefile import MAX_XML
+from barpc.base.safe_io import MAX_XML
 from barpc.rpcio import hidden_by
 
 logger = logging.getLogger(__name__)
@@ -73,11 +73,11 @@ def key_of(*parts: object) -> str:
 
     Parts are strings, numbers, None, sequences, mappings, dataclasses, arrays, paths.
     """
-    text = json.dumps([code_version(), *parts], default=_plain, sort_keys=True)
+    text = json.dumps([code_version(), *parts], default=_key_form, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def _plain(value: object) -> object:
+def _key_form(value: object) -> object:
     if is_dataclass(value) and not isinstance(value, type):
         kept = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
         return {"type": type(value).__name__, **kept}
@@ -306,10 +306,10 @@ class Workspace:
             self._refuse_foreign(name)
             if name not in self._named:
                 self._refuse_hiding([name])
-            sha = _content(partial)
+            sha = _content_hash(partial)
             if sha is None:
                 raise OutputError(f"{self.folder / name}: cannot be written (it is no regular file)")
-            _note(self.folder, name, sha)
+            _append_record(self.folder, name, sha)
             self._noted = True
         self.outputs[name] = sha
 
@@ -367,7 +367,7 @@ class Workspace:
 # --- which files are barpc's own --------------------------------------------------------------------------
 
 
-def _content(path: Path) -> str | None:
+def _content_hash(path: Path) -> str | None:
     """Return the sha256 of a regular file, no link; None for anything else, OSError where it cannot be read."""
     if not stat.S_ISREG(path.lstat().st_mode):
         return None
@@ -376,9 +376,9 @@ def _content(path: Path) -> str | None:
 
 
 def _digest(path: Path) -> str | None:
-    """Hash as `_content`; None also where there is nothing, or it cannot be read. No FIFO is waited for."""
+    """Hash as `_content_hash`; None also where there is nothing, or it cannot be read. No FIFO is waited for."""
     try:
-        return _content(path)
+        return _content_hash(path)
     except (OSError, ValueError):
         return None
 
@@ -402,7 +402,7 @@ def _owns(folder: Path, name: str, sha: str) -> bool:
 def _read_state(folder: Path) -> dict[str, Any]:
     """Read state.json; nothing where it is missing, damaged, too large or no regular file."""
     try:
-        state = json.loads(_text(folder / STATE / STATE_FILE))
+        state = json.loads(_bounded_text(folder / STATE / STATE_FILE))
     except (ValueError, RecursionError):
         return {}
     return state if isinstance(state, dict) else {}
@@ -413,7 +413,7 @@ def _read_own(folder: Path) -> dict[str, str]:
     listed = _read_state(folder).get("outputs")
     known: dict[str, dict[str, None]] = {}
     pairs: list[Any] = list(listed.items()) if isinstance(listed, dict) else []
-    for line in _text(folder / STATE / NOTES).split("\n"):
+    for line in _bounded_text(folder / STATE / NOTES).split("\n"):
         with suppress(ValueError, RecursionError):  # the last line of a run that was killed
             pairs.append(json.loads(line))
     for pair in pairs:
@@ -471,7 +471,7 @@ class Homes:
         return os.path.normpath(found.absolute())
 
 
-def _note(folder: Path, name: str, sha: str) -> None:
+def _append_record(folder: Path, name: str, sha: str) -> None:
     path = folder / STATE / NOTES
     line = "\n" + json.dumps([name, sha]) + "\n"  # on a line of its own, whatever a killed run left
     try:
@@ -508,7 +508,7 @@ def _is_odd(path: Path, found: os.stat_result) -> bool:
     return not stat.S_ISREG(found.st_mode) or shared or (path.name == LOCK and found.st_size > 0)
 
 
-def _text(path: Path) -> str:
+def _bounded_text(path: Path) -> str:
     try:
         found = path.lstat()
         if not stat.S_ISREG(found.st_mode) or found.st_size > MAX_XML:

@@ -44,9 +44,9 @@ from scipy.sparse import bsr_array, coo_matrix
 from scipy.sparse.linalg import splu
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
-from barpc.ba.held.block import join, make_problem
+from barpc.ba.constraints.block import join, make_problem
 from barpc.ba.judging import solution
-from barpc.ba.robust.smooth import Smooth
+from barpc.ba.robust.systematic_residuals import Smooth
 from barpc.ba.solving import structure
 from barpc.ba.solving.linear import Cholesky
 from barpc.ba.solving.problem import Problem
@@ -55,7 +55,7 @@ from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.scene import Tracks
 from barpc.sensor.curve import rotation_matrix
 from barpc.sensor.geometry import triangulate
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 
 PEER = {"ftol": 1e-4, "xtol": 1e-10}
 """The peer's tolerances."""
@@ -68,7 +68,7 @@ PEERS = {"drift": 0, "jitter": "off", "learn_priors": False}
 """Unknowns that the baseline does not have, off: both solve for rotations and points, of all observations."""
 
 
-def adjust(block: Block, model: str = "rotation", **options: object) -> Adjustment:
+def adjust(block: SimulatedBlock, model: str = "rotation", **options: object) -> Adjustment:
     """The block by barpc, plain least squares."""
     centers = np.array([correction.center for correction in block.truth.corrections])
     chosen = AdjustOptions(**{**PLAIN, **PEERS, "model": model, "sigma_attitude": 1e4, **options})
@@ -78,7 +78,7 @@ def adjust(block: Block, model: str = "rotation", **options: object) -> Adjustme
 class Baseline:
     """Rotations and points in one vector, finite differences."""
 
-    def __init__(self, block: Block) -> None:
+    def __init__(self, block: SimulatedBlock) -> None:
         self.block = block
         self.centers = np.array([correction.center for correction in block.truth.corrections])
         tracks = block.tracks
@@ -161,7 +161,7 @@ def ratios(sizes: list[tuple[int, int]], repeat: int) -> None:
         )
 
 
-def _one_pass(block: Block, options: dict[str, object]) -> OptimizeResult:
+def _one_pass(block: SimulatedBlock, options: dict[str, object]) -> OptimizeResult:
     baseline = Baseline(block)
     return baseline.solve(baseline.start, **options)
 
@@ -307,7 +307,7 @@ def fill(sizes: list[int]) -> None:
         _fill_of(views, made)
 
 
-def _fill_of(views: int, made: Block) -> None:
+def _fill_of(views: int, made: SimulatedBlock) -> None:
     options = AdjustOptions(**PLAIN)
     joined = join(made.views, made.tracks, None, options)
     centers = np.array([correction.center for correction in made.truth.corrections])

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.ba.held.block import Block, first_state, join, make_problem
+from barpc.ba.constraints.block import Block, first_state, join, make_problem
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State, minimise
 from barpc.simulate import simulate_block

@@ -29,10 +29,10 @@ import numpy as np
 from barpc.ba import BlockPrior, adjust_tracks, block_prior
 from barpc.base.geodesy import Array
 from barpc.scene import IntArray, Tracks, View
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 
 
-def part(block: Block, chosen: IntArray, of: int | None = None) -> tuple[list[View], Tracks]:
+def part(block: SimulatedBlock, chosen: IntArray, of: int | None = None) -> tuple[list[View], Tracks]:
     """Return some views of a block, ascending, and their tie points; with `of` those of the one at this place."""
     tracks = block.tracks.select(np.isin(block.tracks.view, chosen))
     if of is not None:

@@ -1,8 +1,8 @@
 """The size of the house: lines, modules, numbers that decide, long functions, names that stand twice, flags, options.
 
 Numbers are counted by their meanings, so that a constant that is shared counts wherever it means something else: module
-constants, modules beyond the first that use a number of `barpc.base.usual`, floats inside functions other than 0, 0.5,
-1, 2 and powers of ten, and numeric defaults of parameters. Names are those of classes, functions and constants of
+constants, modules beyond the first that use a number of `barpc.base.statistics`, floats inside functions other than 0,
+0.5, 1, 2 and powers of ten, and numeric defaults of parameters. Names are those of classes, functions and constants of
 modules, a leading _ left out.
 
 python benchmarks/house.py            # a table of the package and its folders
@@ -22,7 +22,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "barpc"
-USUAL = PACKAGE / "base/usual.py"
+USUAL = PACKAGE / "base/statistics.py"
 LONG, MANY = 55, 6
 """Lines of a function, and its parameters: more are counted."""
 
@@ -97,14 +97,14 @@ def defaults(tree: ast.Module) -> int:
 
 
 def shared(trees: dict[Path, ast.Module]) -> Counter[str]:
-    """Modules that use each number of `barpc.base.usual`."""
+    """Modules that use each number of `barpc.base.statistics`."""
     known = {name for _, name in numbers(ast.parse(USUAL.read_text(encoding="utf-8")))}
     found: Counter[str] = Counter()
     for tree in trees.values():
         imported = {
             alias.name
             for node in ast.walk(tree)
-            if isinstance(node, ast.ImportFrom) and node.module == "barpc.base.usual"
+            if isinstance(node, ast.ImportFrom) and node.module == "barpc.base.statistics"
             for alias in node.names
         }
         found.update(imported & known)

@@ -43,8 +43,8 @@ from barpc.scene import View  # noqa: E402
 from barpc.sensor.geometry import altitude_range, epipolar_offset  # noqa: E402
 from barpc.tie import common_tracks, find_tracks, match_pairs, select_pairs  # noqa: E402
 from barpc.tie.matchers.features import join_keypoints  # noqa: E402
-from barpc.tie.pairing.epipolar import frame, robust_affine  # noqa: E402
-from barpc.tie.patches.oriented import PATCH, register_oriented  # noqa: E402
+from barpc.tie.pairing.epipolar import epipolar_segments, robust_affine  # noqa: E402
+from barpc.tie.patches.oriented import TEMPLATE_REACH, register_oriented  # noqa: E402
 from barpc.tie.pixels import read_pixels  # noqa: E402
 from tests.scenes import ImageOptions  # noqa: E402
 from tests.scenes.redrawn import redrawn  # noqa: E402
@@ -193,7 +193,7 @@ def ground(files: list[tuple[str, tuple[int, int]]], at: np.ndarray) -> np.ndarr
     grey = images[0][0]
     white = data & (grey > 1.8 * np.percentile(grey[images[0][1]], 80))
     col, row = at.astype(int).T
-    share = [cv2.blur(one.astype(np.float32), (2 * PATCH + 1,) * 2)[row, col] for one in (data, white)]
+    share = [cv2.blur(one.astype(np.float32), (2 * TEMPLATE_REACH + 1,) * 2)[row, col] for one in (data, white)]
     return (share[0] > 0.9) & (share[1] < 0.05)
 
 
@@ -216,7 +216,7 @@ def angles(seeds: int) -> None:
                     print(f"{start} {' '.join(str(error).split())[:90]} |", flush=True)
                     continue
                 errors = scene.errors(0, 1, *common_tracks(found.tracks, 0, 1))
-                errors = np.abs(frame(first, second, np.array([[350.0, 350.0]])).turn(errors))[:, ::-1]
+                errors = np.abs(epipolar_segments(first, second, np.array([[350.0, 350.0]])).turn(errors))[:, ::-1]
                 spread, report = 1.4826 * np.median(errors, axis=0), found.pairs[0]
                 off = [f"{(errors[:, 0] > most).mean():.3f}" for most in (1.0, 2.0)]
                 kind = report.matcher + ", loosened" * report.loosened

@@ -34,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # tests, where bar
 from barpc.base.options import RunOptions
 from barpc.cameras import open_camera
 from barpc.fit import fit_rpc
-from barpc.pipeline.beyond import write_grids
+from barpc.pipeline.grid_outputs import write_grids
 from barpc.rpcio import WRITABLE
 from barpc.scene import View
 from barpc.simulate import Look, fly

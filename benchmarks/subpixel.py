@@ -37,7 +37,7 @@ from scipy import ndimage  # noqa: E402
 from barpc.base.options import TieOptions  # noqa: E402
 from barpc.pipeline.loading import load_views  # noqa: E402
 from barpc.tie import common_tracks, find_tracks  # noqa: E402
-from barpc.tie.pairing.epipolar import frame, linear_map  # noqa: E402
+from barpc.tie.pairing.epipolar import epipolar_segments, linear_map  # noqa: E402
 from barpc.tie.patches.register import MIN_CORRELATION, PATCH, register_patches  # noqa: E402
 
 warnings.simplefilter("ignore")
@@ -335,7 +335,7 @@ def pairs(data: Path) -> None:
         checks = [np.stack([table[f"col_{k}"], table[f"row_{k}"]], axis=1) for k in "ab"]
         name = f"{names[0]} - {names[1]}"
         mine, good = registered(images, whole, start, linear)
-        place = frame(views[0], views[1], whole)
+        place = epipolar_segments(views[0], views[1], whole)
         for other, find in OTHERS.items():
             theirs = np.array(
                 [find(splines, *one) for one in zip(whole, np.rint(start), linear, strict=True)]  # type: ignore[operator]
@@ -343,7 +343,7 @@ def pairs(data: Path) -> None:
             row(name, "tie points", other, place.errors(mine) - place.errors(theirs), good)
         simple = by_parabolas([image.astype(np.float32) for image in images], whole, np.rint(start))
         row(name, "tie points", "as check points", place.errors(mine) - place.errors(simple), good)
-        place, linear = frame(views[0], views[1], checks[0]), linear_map(views[0], views[1], checks[0])
+        place, linear = epipolar_segments(views[0], views[1], checks[0]), linear_map(views[0], views[1], checks[0])
         mine, good = registered(images, checks[0], checks[1], linear)
         row(name, "check points", "themselves", place.errors(mine) - place.errors(checks[1]), good)
         for other, find in OTHERS.items():

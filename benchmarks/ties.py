@@ -33,7 +33,7 @@ import rasterio  # noqa: E402
 from rasterio.windows import Window  # noqa: E402
 
 from barpc.base.errors import BarpcError  # noqa: E402
-from barpc.base.usual import robust_spread  # noqa: E402
+from barpc.base.statistics import robust_spread  # noqa: E402
 from barpc.pipeline.executor import CachingExecutor  # noqa: E402
 from barpc.pipeline.loading import load_views  # noqa: E402
 from barpc.scene import View  # noqa: E402
@@ -51,7 +51,7 @@ from barpc.tie import (  # noqa: E402
     refine,
     select_pairs,
 )
-from barpc.tie.pairing.epipolar import coherent, frame  # noqa: E402
+from barpc.tie.pairing.epipolar import coherent, epipolar_segments  # noqa: E402
 from barpc.tie.pixels import read_pixels, sample_stretch  # noqa: E402
 from barpc.workspace import Workspace  # noqa: E402
 
@@ -99,7 +99,7 @@ def stages(views: list[View]) -> float:
 
 def spread(first: View, second: View, xy_first: np.ndarray, xy_second: np.ndarray) -> float:
     """Robust standard deviation across the epipolar line after an affine fit [px]."""
-    across = frame(first, second, xy_first).errors(xy_second)[:, 1]
+    across = epipolar_segments(first, second, xy_first).errors(xy_second)[:, 1]
     return robust_spread(coherent(xy_first, across)[1])
 
 

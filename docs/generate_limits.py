@@ -11,11 +11,11 @@ import re
 from pathlib import Path
 
 from barpc import scene
-from barpc.base import frozen, geodesy, options, sidefile
-from barpc.base.remote import _KEPT as HELD
-from barpc.base.remote import _LONGEST as REQUEST
-from barpc.base.remote import BLOCK, hosts
-from barpc.pointio import foreign, names
+from barpc.base import frozen, geodesy, options, safe_io
+from barpc.base.remote import _CACHE_BYTES as HELD
+from barpc.base.remote import _MAX_REQUEST_BYTES as REQUEST
+from barpc.base.remote import REQUEST_BYTES, hosts
+from barpc.pointio import names, third_party_matches
 from barpc.rasters import dem, raster
 from barpc.report import runfiles
 from barpc.rpcio import carried
@@ -44,52 +44,53 @@ def many(value: float) -> str:
 
 def rows() -> list[tuple[str, str]]:
     """What is read, and what of it is refused beyond."""
-    bounded = (sidefile.RPC_FILE, sidefile.GEOJSON, sidefile.OPTIONS, sidefile.SUMMARY)
-    unpacked = f"packed, unpacked, and as numbers of {sidefile.NUMBER} bytes"
+    bounded = (safe_io.RPC_FILE, safe_io.GEOJSON, safe_io.OPTIONS, safe_io.SUMMARY)
+    unpacked = f"packed, unpacked, and as numbers of {safe_io.BYTES_PER_NUMBER} bytes"
     return [
         *((kind.words, size(kind.most)) for kind in bounded),
         (
-            sidefile.XML.words,
-            f"{size(sidefile.XML.most)}, {sidefile.MAX_DEPTH} levels, {many(sidefile.MAX_ELEMENTS)} elements",
+            safe_io.XML.words,
+            f"{size(safe_io.XML.most)}, {safe_io.MAX_DEPTH} levels, {many(safe_io.MAX_ELEMENTS)} elements",
         ),
         (
-            sidefile.TABLE.words,
-            f"{size(sidefile.TABLE.most)}, {many(sidefile.TABLE.lines or 0)} lines, a line {size(sidefile.LINE)}",
+            safe_io.TABLE.words,
+            f"{size(safe_io.TABLE.most)}, {many(safe_io.TABLE.lines or 0)} lines, "
+            f"a line {size(safe_io.MAX_LINE_BYTES)}",
         ),
         (
             "JSON",
-            f"{sidefile.MAX_DEPTH} levels, {many(sidefile.GEOJSON.values)} values, of a summary "
-            f"{many(sidefile.SUMMARY.values)}",
+            f"{safe_io.MAX_DEPTH} levels, {many(safe_io.GEOJSON.values)} values, of a summary "
+            f"{many(safe_io.SUMMARY.values)}",
         ),
         ("a key of TOML", f"{options._PARTS} parts"),
         (
-            f"{sidefile.ARRAYS.words} (`.npz`)",
-            f"{size(sidefile.ARRAYS.most)} {unpacked}; a member {many(frozen.DEFLATED)} times its stored bytes",
+            f"{safe_io.ARRAYS.words} (`.npz`)",
+            f"{size(safe_io.ARRAYS.most)} {unpacked}; a member {many(frozen.DEFLATED)} times its stored bytes",
         ),
         (
-            foreign._CONTENT.words,
-            f"{size(foreign._CONTENT.most)} as numbers of {sidefile.NUMBER} bytes",
+            third_party_matches._CONTENT.words,
+            f"{size(third_party_matches._CONTENT.most)} as numbers of {safe_io.BYTES_PER_NUMBER} bytes",
         ),
-        ("a COLMAP database", f"{many(foreign._STEPS)} times 100,000 instructions of SQLite"),
+        ("a COLMAP database", f"{many(third_party_matches._MAX_SQLITE_STEPS)} times 100,000 instructions of SQLite"),
         (
             "an HDF5 file",
-            f"{many(sidefile.MAX_ELEMENTS)} objects, groups {sidefile.MAX_DEPTH} deep; an array "
+            f"{many(safe_io.MAX_ELEMENTS)} objects, groups {safe_io.MAX_DEPTH} deep; an array "
             f"{many(frozen.DEFLATED)} times its stored bytes",
         ),
         (
             "a localisation or correction grid",
-            f"{size(sidefile.TABLE.most)} as numbers of {sidefile.NUMBER} bytes",
+            f"{size(safe_io.TABLE.most)} as numbers of {safe_io.BYTES_PER_NUMBER} bytes",
         ),
-        (sidefile.NAMES.words, f"{size(sidefile.NAMES.most)}, {many(sidefile._LINE)} characters a line"),
-        ("a VRT", size(sidefile.MB)),
+        (safe_io.NAMES.words, f"{size(safe_io.NAMES.most)}, {many(safe_io._MAX_NAME_LENGTH)} characters a line"),
+        ("a VRT", size(safe_io.MB)),
         ("a raster read as a DEM or geoid", f"{many(dem._MAX_CELLS)} cells"),
         ("RPC tags of a TIFF", f"{many(carried._MAX_ENTRIES)} entries, {size(carried.SCANNED)} of values"),
         ("an RPC in a NITF", f"the first {size(carried.SCANNED)}"),
         ("a file of acquisition metadata", f"the first {size(carried.SCANNED)}"),
-        ("a run's state", f"{size(sidefile.MAX_XML)}; larger ones count as missing"),
+        ("a run's state", f"{size(safe_io.MAX_XML)}; larger ones count as missing"),
         (
             "a file of a web server or store",
-            f"{size(BLOCK)} to {size(REQUEST)} a request, {size(HELD)} held a process",
+            f"{size(REQUEST_BYTES)} to {size(REQUEST)} a request, {size(HELD)} held a process",
         ),
         (
             "an answer of a web server",
@@ -104,19 +105,20 @@ def rows() -> list[tuple[str, str]]:
         ("an area", f"{many(area._MOST_CROSSED)} times that its outline crosses itself"),
         (
             "numbers of JSON and `block.npz`",
-            f"{many(sidefile.LARGEST)}; whole ones of JSON {sidefile._DIGITS} digits",
+            f"{many(safe_io.MAX_NUMBER)}; whole ones of JSON {safe_io._DIGITS} digits",
         ),
         (
             "numbers of options",
-            f"{many(1 / options._REAL)} to {many(options._REAL)}, and 0; whole ones below {many(options._MOST)}",
+            f"{many(1 / options._REAL)} to {many(options._REAL)}, and 0; "
+            f"whole ones below {many(options._MAX_EXACT_INTEGER)}",
         ),
-        ("numbers of metadata of a camera", many(geodesy.FAR)),
+        ("numbers of metadata of a camera", many(geodesy.MAX_COORDINATE)),
         (
             "points of a fit, of a table, of a grid",
-            f"{many(geodesy.FAR)} px",
+            f"{many(geodesy.MAX_COORDINATE)} px",
         ),
-        ("numbers of a run's tables", many(runfiles._FAR)),
-        ("coordinates of a DEM", many(geodesy.FAR)),
+        ("numbers of a run's tables", many(runfiles._MAX_TABLE_VALUE)),
+        ("coordinates of a DEM", many(geodesy.MAX_COORDINATE)),
         ("standard deviations of ground points", " to ".join(map(many, scene.SIGMA_RANGE))),
     ]
 

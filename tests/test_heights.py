@@ -12,7 +12,7 @@ import rasterio
 from rasterio import Affine
 
 from barpc.pointio.correspondences import read_altimetry
-from barpc.pointio.gcps import Frame, read_gcps
+from barpc.pointio.gcps import ControlReference, read_gcps
 from barpc.rasters.dem import Dem, HeightGrid, geoid_file
 
 LON, LAT, ALT = 5.4, 43.3, 251.37  # m above the ellipsoid
@@ -80,7 +80,7 @@ def test_points_whose_column_or_a_person_says_it(tmp_path, column) -> None:
                  "properties": {"id": "A", column.strip(): value, "col": 1, "row": 2}}]  # fmt: skip
     (tmp_path / "p.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
     for path in (table, tmp_path / "p.geojson"):
-        found = read_gcps(path, ["a"], Frame(heights=said))
+        found = read_gcps(path, ["a"], ControlReference(heights=said))
         assert found.lonlatalt[0] == pytest.approx([LON, LAT, ALT], abs=CENTIMETRE), path.name
         assert bool(found.datums) == (said is None or "ortho" in column)  # a person's word is not held against anything
 
@@ -103,5 +103,5 @@ def test_points_in_a_compound_system(tmp_path, system, vertical, datum) -> None:
     (x,), (y,) = rasterio.warp.transform("EPSG:4326", system, [LON], [LAT])
     path = tmp_path / "p.csv"
     path.write_text(f"id,x,y,z,col,row\nA,{x!r},{y!r},{number(1.0, datum)!r},1,2\n")
-    found = read_gcps(path, ["a"], Frame(f"{system}+{vertical}"))
+    found = read_gcps(path, ["a"], ControlReference(f"{system}+{vertical}"))
     assert found.lonlatalt[0] == pytest.approx([LON, LAT, ALT], abs=CENTIMETRE)

@@ -16,7 +16,7 @@ import pytest
 
 from barpc import __version__
 from barpc.base.errors import OutputError, TiePointError
-from barpc.base.identity import take
+from barpc.base.identity import fingerprint
 from barpc.report.runfiles import table_path
 from barpc.workspace import (
     Homes,
@@ -92,10 +92,20 @@ def test_the_fingerprint_is_of_the_content(tmp_path):
     a, b = tmp_path / "a", tmp_path / "b"
     a.write_bytes(b"one")
     b.write_bytes(b"one")
-    assert take(a).key == take(b).key == take(a).sha256
+    assert fingerprint(a).key == fingerprint(b).key == fingerprint(a).sha256
     b.write_bytes(b"two")
-    assert take(a).key != take(b).key
-    assert len({take(a).key, take(a, [take(b)]).key, take(b, [take(a)]).key, take(a, [take(a)]).key}) == 4
+    assert fingerprint(a).key != fingerprint(b).key
+    assert (
+        len(
+            {
+                fingerprint(a).key,
+                fingerprint(a, [fingerprint(b)]).key,
+                fingerprint(b, [fingerprint(a)]).key,
+                fingerprint(a, [fingerprint(a)]).key,
+            }
+        )
+        == 4
+    )
 
 
 def test_a_folder_with_other_things_is_refused_and_left_alone(tmp_path):

@@ -6,7 +6,7 @@ what a block knows for a later run with more views; `pair_heights` says how well
 """
 
 from barpc.ba.adjustment import adjust_tracks
-from barpc.ba.held.incremental import BlockPrior
+from barpc.ba.constraints.incremental import BlockPrior
 from barpc.ba.result import Adjustment, PairHeights, block_prior, pair_heights
 from barpc.ba.robust.heldout import CheckResiduals, check_residuals, split_points
 from barpc.base.options import AdjustOptions

@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 
 from barpc.ba.altimetry import hold_by_altimetry
-from barpc.ba.apart import Apart, Parts, Solver, find_apart, without_moving
-from barpc.ba.estimated.priors import FLOOR
+from barpc.ba.apart import ForeignCamera, Parts, Solver, find_apart, without_moving
+from barpc.ba.constraints.block import Block, join
+from barpc.ba.constraints.gauge import GaugeReport, datum_shares, earlier_scene, gauge_report
+from barpc.ba.constraints.incremental import BlockPrior
+from barpc.ba.constraints.terrain import Terrain
 from barpc.ba.evidence.scan import neighbours_alike
-from barpc.ba.held.block import Block, join
-from barpc.ba.held.gauge import GaugeReport, datum_shares, earlier_scene, gauge_report
-from barpc.ba.held.incremental import BlockPrior
-from barpc.ba.held.terrain import Terrain
 from barpc.ba.judging.following import follow, without_strips
 from barpc.ba.judging.judge import Finding, left_over, standing_out
 from barpc.ba.judging.snooping import image_test
 from barpc.ba.judging.solution import CLEARLY, MUCH_BETTER, Solution, solve_block
-from barpc.ba.placing import place
+from barpc.ba.parameters.priors import NOISE_FLOOR
+from barpc.ba.resection import resect
 from barpc.ba.result import Adjustment
 from barpc.ba.robust.consensus import two_groups
 from barpc.ba.robust.heldout import enu_offsets, keep_out, measure
@@ -31,7 +31,7 @@ from barpc.ba.solving.covariance import Covariance
 from barpc.base.errors import AdjustError, BarpcWarning
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.options import AUTO, AdjustOptions
-from barpc.base.usual import CRITICAL, ITERATIONS, SAMPLE
+from barpc.base.statistics import CRITICAL, ITERATIONS, SAMPLE
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Reference, Tracks, View
 from barpc.sensor.geometry import camera_center
 
@@ -102,15 +102,15 @@ def adjust_tracks(
     def solve(inner: Block, outer: Block, options: AdjustOptions) -> Solution:
         return solve_block(inner, outer, options, dem, centers, prior)
 
-    found = _solved(parts, options, solve, altimetry)
+    found = _solved_adjustment(parts, options, solve, altimetry)
     return replace(found, earlier=prior, seconds=time.process_time() - start)
 
 
-def _solved(parts: Parts, options: AdjustOptions, solve: Solver, altimetry: Altimetry | None) -> Adjustment:
+def _solved_adjustment(parts: Parts, options: AdjustOptions, solve: Solver, altimetry: Altimetry | None) -> Adjustment:
     """Return the block solved by the model that the data choose, held by heights too where there are some."""
     given = parts.inner, parts.outer
     try:
-        (found, in_space, parts), apart = _explained(parts, options, solve)
+        (found, in_space, parts), apart = _select_model(parts, options, solve)
         heights = None
         if altimetry is not None:
             found, heights = hold_by_altimetry(found, parts.inner, parts.outer, options, altimetry)
@@ -127,7 +127,7 @@ def _solved(parts: Parts, options: AdjustOptions, solve: Solver, altimetry: Alti
         ) from error
 
 
-def _explained(parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[_Chosen, Apart | None]:
+def _select_model(parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[_Chosen, ForeignCamera | None]:
     """Return the block by the model that the data choose, and the view it was solved without or that may be wrong."""
     first, apart, without = _first(parts, options, solve)
     if apart is not None and apart.may_be_its_own and first is not None:
@@ -154,7 +154,7 @@ def _warn(outcome: Outcome) -> None:
 
 def _first(
     parts: Parts, options: AdjustOptions, solve: Solver
-) -> tuple[Solution | None, Apart | None, Solution | None]:
+) -> tuple[Solution | None, ForeignCamera | None, Solution | None]:
     """Return the block solved with the model to start with, and without a view whose RPC is not its own where there
     is one; one of the two at least.
 
@@ -180,14 +180,14 @@ def _first(
 
 
 def _with_apart(
-    whole: Adjustment, apart: Apart, found: Solution, others: Block, parts: tuple[Block, Block], limit: float
+    whole: Adjustment, apart: ForeignCamera, found: Solution, others: Block, parts: tuple[Block, Block], limit: float
 ) -> Adjustment:
     """Return the result with the view that the others were adjusted without: adjusted alone, or as delivered.
 
     `parts` have its observations, those that might take part and those kept out; it is measured on the others' points.
     """
     v, params = apart.view, whole.params.copy()
-    placed = None if apart.placed is None else place(found, others, parts[0], v)
+    placed = None if apart.placed is None else resect(found, others, parts[0], v)
     if placed is not None and not placed.meets:
         placed = None
     if placed is not None:
@@ -221,13 +221,13 @@ def _choose_model(first: Solution, parts: Parts, options: AdjustOptions, solve: 
     An affine in the image where it is much better; and what the model in space leaves then [px].
     """
     given = options.model != AUTO or options.drift is not None or first.goes_on
-    found, in_image = first, None if given else _in_image(first, parts, options, solve)
+    found, in_image = first, None if given else _solve_image_affine(first, parts, options, solve)
     judges = first.problem.cameras.unknowns.geometric and not first.goes_on
     if judges and (in_image is None or not _is_calm(in_image, parts.inner, options.noise_floor)):
         found, parts, judged = without_moving(found, parts, options, solve)
         found = without_strips(found, judged, parts.inner, parts.outer, options)
     if found.outcome is not first.outcome:  # else the same would be solved and found again
-        in_image = None if given else _in_image(found, parts, options, solve)
+        in_image = None if given else _solve_image_affine(found, parts, options, solve)
     chosen, in_space = (found, None) if in_image is None else (in_image, found.after.whole_rms)
     if judges:
         followed = follow(found, parts.inner, parts.outer, options)
@@ -236,7 +236,7 @@ def _choose_model(first: Solution, parts: Parts, options: AdjustOptions, solve: 
     return chosen, in_space, parts
 
 
-def _in_image(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> Solution | None:
+def _solve_image_affine(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> Solution | None:
     """Solve the block with an affine in every image, where something is left for it and that is much better."""
     skew = found.is_skew
     if not (skew or found.has_trend):
@@ -244,7 +244,7 @@ def _in_image(found: Solution, parts: Parts, options: AdjustOptions, solve: Solv
     tried = solve(parts.inner, parts.outer, replace(options, model="affine"))
     better = tried.after.error < (CLEARLY if skew else MUCH_BETTER) * found.after.error
     # it leaves the tilts of the scene open: not for what no adjustment is asked for
-    return tried if better and tried.after.whole_rms < found.after.whole_rms - FLOOR else None
+    return tried if better and tried.after.whole_rms < found.after.whole_rms - NOISE_FLOOR else None
 
 
 def _is_calm(found: Solution, block: Block, floor: float) -> bool:
@@ -258,11 +258,11 @@ def _adjustment(found: Solution, parts: Parts, options: AdjustOptions, in_space:
     covariance = outcome.minimum.covariance(found.problem.free)
     method = covariance.factor.method
     cameras, is_tie = found.problem.cameras, found.problem.structure.point < block.num_tracks
-    points, before, after = _met(found, parts)
+    points, before, after = _points_and_residuals(found, parts)
     inlier = block.in_order(outcome.inlier)
     of_reference = 0 if block.reference is None else len(block.reference.points.view)
     ties = slice(0, len(inlier) - len(block.gcps.view) - of_reference)
-    gauge, shares = _place(found, block, covariance)
+    gauge, shares = _scene_accuracy(found, block, covariance)
     return Adjustment(
         names=block.names,
         sensors=cameras.unknowns.corrected(final.params, block.views),
@@ -287,10 +287,10 @@ def _adjustment(found: Solution, parts: Parts, options: AdjustOptions, in_space:
         told=outcome.told,
         smooth=outcome.smooth,
         asked=found.asked,
-        findings=tuple(_said(found.findings, parts, points)),
+        findings=tuple(_reported_findings(found.findings, parts, points)),
         moving=parts.block.in_order(parts.group > 0)[ties],
         left=(*left_over(outcome, block, options.noise_floor), *parts.mostly_moving(outcome.inlier)),
-        alike=_alike(block, outcome, is_tie),
+        alike=_neighbour_correlation(block, outcome, is_tie),
         in_space_rms=in_space,
         two_groups=two_groups(found.problem.structure, outcome.residual, outcome.by_point, outcome.inlier & is_tie),
         held=found.heights.weak[: block.num_tracks],
@@ -301,7 +301,7 @@ def _adjustment(found: Solution, parts: Parts, options: AdjustOptions, in_space:
     )
 
 
-def _met(found: Solution, parts: Parts) -> tuple[Array, Array, Array]:
+def _points_and_residuals(found: Solution, parts: Parts) -> tuple[Array, Array, Array]:
     """Return the points (P, 3) [m], NaN where nothing was kept, and the residuals of all observations before and after.
 
     Of those that took no part and those that move by points triangulated anew.
@@ -319,12 +319,12 @@ def _met(found: Solution, parts: Parts) -> tuple[Array, Array, Array]:
     return points, before, after
 
 
-def _alike(block: Block, outcome: Outcome, is_tie: BoolArray) -> Array:
+def _neighbour_correlation(block: Block, outcome: Outcome, is_tie: BoolArray) -> Array:
     wrong = is_tie & block.use & ~outcome.inlier & np.isfinite(outcome.residual).all(axis=0)
     return neighbours_alike(block.view[wrong], block.xy[:, wrong], outcome.residual[:, wrong], len(block.views))
 
 
-def _said(findings: Sequence[Finding], parts: Parts, points: Array) -> Iterator[Finding]:
+def _reported_findings(findings: Sequence[Finding], parts: Parts, points: Array) -> Iterator[Finding]:
     """Yield the findings without what the judge worked with."""
     number = 0
     for one in findings:
@@ -363,17 +363,17 @@ def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
     return w
 
 
-def _place(found: Solution, block: Block, covariance: Covariance) -> tuple[GaugeReport, Mapping[str, Array]]:
+def _scene_accuracy(found: Solution, block: Block, covariance: Covariance) -> tuple[GaugeReport, Mapping[str, Array]]:
     """Report the motion and the accuracy of the scene's place, and what holds it; an earlier run keeps its
     own scene.
     """
     known, outcome = (block.num_tracks, block.num_known), found.outcome
-    gauge = _gauge(found, block, covariance)
+    gauge = _datum_report(found, block, covariance)
     shares = datum_shares(covariance, gauge.by_unknown, outcome.problem, found.final, outcome.weight, known)
     return gauge, shares
 
 
-def _gauge(found: Solution, block: Block, covariance: Covariance) -> GaugeReport:
+def _datum_report(found: Solution, block: Block, covariance: Covariance) -> GaugeReport:
     joint = found.problem.joint_prior
     if joint is not None and joint.scene is not None:
         return earlier_scene(covariance, joint, joint.scene, found.final.params)

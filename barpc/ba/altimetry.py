@@ -1,8 +1,8 @@
 """Altimetry as control: heights without image coordinates hold the block where its surface lies on them.
 
 The block is solved without them first. The motion that brings the surface of its tie points onto the heights is found
-where most of them agree (`barpc.ba.held.registration`), and held, with its covariance, at the tie points. Tilts, turn,
-scale and bending that the heights do not tell stay as open as they were.
+where most of them agree (`barpc.ba.constraints.registration`), and held, with its covariance, at the tie points. Tilts,
+turn, scale and bending that the heights do not tell stay as open as they were.
 """
 
 from __future__ import annotations
@@ -11,18 +11,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barpc.ba.estimated.priors import PointPrior
-from barpc.ba.held.block import Block
-from barpc.ba.held.gauge import MOTIONS, SIMILAR, gauge_report
-from barpc.ba.held.ground import FIRST_PLACED
-from barpc.ba.held.registration import NEIGHBOURS, Given, Registration, Surface, displacement, register
+from barpc.ba.constraints.block import Block
+from barpc.ba.constraints.gauge import MOTIONS, SIMILAR, gauge_report
+from barpc.ba.constraints.ground import FIRST_PLACED
+from barpc.ba.constraints.registration import (
+    PATCH_POINTS,
+    GivenHeights,
+    Registration,
+    TieSurface,
+    displacement,
+    register,
+)
 from barpc.ba.judging.solution import Solution, finished
+from barpc.ba.parameters.priors import PointPrior
 from barpc.ba.robust.heldout import is_better
 from barpc.ba.robust.rounds import Rounds
 from barpc.ba.solving.covariance import Covariance
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
-from barpc.base.usual import CRITICAL, FEWEST, GROSS, LEVEL, SAMPLE, robust_spread
+from barpc.base.statistics import CRITICAL, FEWEST, GROSS, LEVEL, SAMPLE, robust_spread
 from barpc.scene import Altimetry, IntArray
 
 
@@ -47,22 +54,22 @@ def hold_by_altimetry(
     ties = np.flatnonzero(found.seen[: block.num_tracks])
     points = found.final.points
     near, many = np.zeros(0, dtype=np.int64), len(given.sigma)
-    if len(ties) > NEIGHBOURS:
+    if len(ties) > PATCH_POINTS:
         middle = points[ties].mean(axis=0)
         enu = enu_basis(ground_from_ecef(middle))
         local = (points[ties] - middle) @ enu.T
         place = (ecef_from_ground(given.lonlatalt) - middle) @ enu.T
         radius = max(float(np.sqrt((local[:, :2] ** 2).sum(axis=1).mean())), 1e-6)
         covariance = found.outcome.minimum.covariance(found.problem.free)
-        known = _known(covariance, found, ties)
+        known = _covariance_without_heights(covariance, found, ties)
         margin = CRITICAL * np.sqrt(np.diag(known)[:2])
         low, high = local[:, :2].min(axis=0) - margin, local[:, :2].max(axis=0) + margin
         near = np.flatnonzero(((place[:, :2] >= low) & (place[:, :2] <= high)).all(axis=1))
         near = near[:: -(-len(near) // SAMPLE) or 1]
     if len(near) < FEWEST:
         return found, _nothing(many, len(near), f"at least {FEWEST} heights on the tie points' surface are needed")
-    surface = Surface.of(local)
-    heights = Given(place[near], given.sigma[near], given.sigma_flat[near])
+    surface = TieSurface.of(local)
+    heights = GivenHeights(place[near], given.sigma[near], given.sigma_flat[near])
     registered = register(surface, heights, radius, np.sqrt(np.diag(known)))
     test = _tested(registered, many)
     why_not = _why_not(registered, known, _is_held(found, block))
@@ -70,14 +77,16 @@ def hold_by_altimetry(
         return found, replace(test, why_not=why_not)
     least = 1 if found.heights.dem is None else 2  # a terrain keeps every second one
     chosen = np.arange(0, len(ties), max(-(-len(ties) // SAMPLE), least))
-    placed = _placed(points, ties[chosen], local[chosen, :2] / radius, enu, registered, np.sqrt(np.diag(known)))
-    tried = _solved(found, block, outer, options, placed)
+    placed = _registered_ties(
+        points, ties[chosen], local[chosen, :2] / radius, enu, registered, np.sqrt(np.diag(known))
+    )
+    tried = _solved_with_heights(found, block, outer, options, placed)
     if is_better(found.after, tried.after, outer):
         return found, replace(test, why_not="held by them, the images would agree less with each other")
     return tried, test
 
 
-def _known(covariance: Covariance, found: Solution, ties: IntArray) -> Array:
+def _covariance_without_heights(covariance: Covariance, found: Solution, ties: IntArray) -> Array:
     """Return the covariance (7, 7) of the scene's motions without the heights [m^2]."""
     use = np.zeros(len(found.seen), dtype=bool)
     use[ties] = True
@@ -108,7 +117,7 @@ def _why_not(registered: Registration, known: Array, is_held: bool) -> str:
     return ""
 
 
-def _placed(
+def _registered_ties(
     points: Array, index: IntArray, at: Array, enu: Array, registered: Registration, before: Array
 ) -> PointPrior:
     """Return the tie points held where the motion takes them, with its errors in common and bends that stay open.
@@ -127,7 +136,9 @@ def _placed(
     return PointPrior(index, mean, np.tile(enu / own, (len(index), 1, 1)), common)
 
 
-def _solved(found: Solution, block: Block, outer: Block, options: AdjustOptions, placed: PointPrior) -> Solution:
+def _solved_with_heights(
+    found: Solution, block: Block, outer: Block, options: AdjustOptions, placed: PointPrior
+) -> Solution:
     """Return the block solved again from where it ended, held at some tie points."""
     held = replace(found, heights=replace(found.heights, placed=placed))
     state = found.final

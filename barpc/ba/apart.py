@@ -5,7 +5,7 @@ Such a view is found by leaving views out, then placed by what the others see.
 A camera of another date, with its axes swapped, cut from another tile or above another height surface bends the whole
 block. Its mark: without it the others agree to the noise, with it they do not. So where a block does not agree it is
 solved without each of its views; where the others agree then, the one left out is placed alone against their points
-(`barpc.ba.placing`). If more than half of its tie points contradict them wherever its camera is, it is the camera of
+(`barpc.ba.resection`). If more than half of its tie points contradict them wherever its camera is, it is the camera of
 another image and stays as delivered. If they agree, though the block had to let go of them, or though the priors
 leave no doubt that it is this view, it keeps the place found alone and bends the others no more. Where more than half
 agree and the rest does not, parts of its image lie off (`barpc.ba.judging.judge`), and the camera is its own.
@@ -20,32 +20,32 @@ from functools import cached_property
 
 import numpy as np
 
-from barpc.ba.evidence.mixture import fit
+from barpc.ba.constraints.block import MIN_OBSERVATIONS, Block
+from barpc.ba.evidence.mixture import fit_mixture
 from barpc.ba.evidence.scan import Interval, scan
-from barpc.ba.held.block import MIN_OBSERVATIONS, Block
-from barpc.ba.judging.judge import Finding, Judgement, around, judge
-from barpc.ba.judging.moving import Found, Motion, members
+from barpc.ba.judging.judge import Finding, Selection, around, judge
+from barpc.ba.judging.moving import Motion, MovingGroup, members
 from barpc.ba.judging.solution import Solution
-from barpc.ba.placing import Look, Placed, look, place
+from barpc.ba.resection import Placed, RpcDiagnosis, diagnose_rpc, resect
 from barpc.ba.robust.heldout import is_better, measure
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.base.options import GEOMETRIC, AdjustOptions
-from barpc.base.usual import CRITICAL, LARGEST, LEVEL, MUCH_NOISE, RIVALS, SMALL, SURE, TRIED
+from barpc.base.statistics import CRITICAL, LARGEST, LEVEL, MUCH_NOISE, RIVALS, SMALL, SURE, TRIED
 from barpc.scene import BoolArray, IntArray, connected_groups
 
-_LOG = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
-APART = "apart"
+FOREIGN_CAMERA = "apart"
 _TELLING = 3  # views: without one a pair is left, which agrees about much; so each of three is left out
 
 Solver = Callable[[Block, Block, AdjustOptions], Solution]
 """What is solved, what measures it, and how -> the block solved."""
-_NAMES = ("west", "east"), ("south", "north")
+_COMPASS_SIDES = ("west", "east"), ("south", "north")
 
 
 @dataclass(frozen=True, eq=False)
-class Apart:
+class ForeignCamera:
     """A view that the others contradict, or several of which one may be.
 
     `gain` is by how many nats its share of contradicted tie points is likelier as its own than as that of the others
@@ -58,7 +58,7 @@ class Apart:
     gap: float
     runner_up: int | None
     contradicted: float  # share of its tie points that contradict the others', wherever its camera is
-    look: Look
+    look: RpcDiagnosis
     placed: Placed | None  # where it was found alone; None: it is left as delivered
     scale: float = 1.0  # by how much its prior had to be widened, where that told
 
@@ -90,7 +90,7 @@ class Apart:
 
 
 @dataclass(frozen=True, eq=False)
-class _Left:
+class LeaveOneOut:
     """A block whose views agree without one."""
 
     view: int
@@ -130,7 +130,7 @@ class _Left:
 
 def find_apart(
     first: Solution | None, block: Block, outer: Block, options: AdjustOptions, solve: Solver
-) -> tuple[Apart | None, Solution | None]:
+) -> tuple[ForeignCamera | None, Solution | None]:
     """Find the view whose RPC is not its own, where a block shows one, and the block solved without it.
 
     `first` is the block solved with all views; None: it has no solution. Nothing is tried where it agrees and no prior
@@ -152,14 +152,14 @@ def find_apart(
         if unknowns > SMALL:
             asked = asked[gone[asked]]
     views = [v for v in asked.tolist() if block.names[v] not in options.fixed]
-    left: list[_Left] = []
+    left: list[LeaveOneOut] = []
     too_few: list[tuple[int, Solution]] = []  # views of which the others' points are too few to find them by
-    for v, others, found in _agreeing(views, block, outer, options, solve):
-        placed = place(found, others, block, v)
+    for v, others, found in _leave_one_view_out(views, block, outer, options, solve):
+        placed = resect(found, others, block, v)
         if placed is None:
             too_few.append((v, found))
             continue
-        left.append(_Left(v, others, found, placed, placed.contradicted(CRITICAL), placed.is_coherent(CRITICAL)))
+        left.append(LeaveOneOut(v, others, found, placed, placed.contradicted(CRITICAL), placed.is_coherent(CRITICAL)))
         if num > _TELLING:  # those that agree without it contradict it, as far as it is wrong, in any block with it
             break
     if odd is not None and first is not None:
@@ -174,9 +174,9 @@ def find_apart(
     return _of_few(too_few) if asks and too_few else (None, None)
 
 
-def _of_few(without: list[tuple[int, Solution]]) -> tuple[Apart, Solution | None]:
+def _of_few(without: list[tuple[int, Solution]]) -> tuple[ForeignCamera, Solution | None]:
     """Return the views without which a block agrees and with which it does not, and the solution without the only."""
-    told = Apart(tuple(v for v, _ in without), np.nan, np.inf, None, 1.0, Look(as_stated=True), None)
+    told = ForeignCamera(tuple(v for v, _ in without), np.nan, np.inf, None, 1.0, RpcDiagnosis(as_stated=True), None)
     return told, without[0][1] if told.clear else None
 
 
@@ -202,7 +202,7 @@ def _lost(found: Solution, block: Block) -> Array:
     return np.asarray(1.0 - kept / np.maximum(had, 1))
 
 
-def _agreeing(
+def _leave_one_view_out(
     views: Sequence[int], block: Block, outer: Block, options: AdjustOptions, solve: Solver
 ) -> Iterator[tuple[int, Block, Solution]]:
     """Yield the block without one view after the other, where the rest is tied together and agrees."""
@@ -213,7 +213,7 @@ def _agreeing(
         try:
             found = solve(others, outer.without(outer.view == v), options)
         except (AdjustError, np.linalg.LinAlgError) as error:
-            _LOG.info("without %s: %s", block.names[v], error)
+            logger.info("without %s: %s", block.names[v], error)
             continue
         if np.delete(_lost(found, others), v).max() < 0.5 and agrees(found):  # the few left of many agree by choice
             yield v, others, found
@@ -229,34 +229,34 @@ def _is_tied(block: Block, without: int) -> bool:
     return len(groups) == 2 and any(list(group) == [without] for group in groups)
 
 
-def _by_prior(left: list[_Left], scale: float, block: Block) -> tuple[Apart | None, Solution | None]:
+def _by_prior(left: list[LeaveOneOut], scale: float, block: Block) -> tuple[ForeignCamera | None, Solution | None]:
     """Return the view that its prior tells of, if it meets the others' points where it is found alone."""
     if not left or not left[0].placed.meets:
         return None, None
     (one,) = left
-    said = look(one.found, block, one.placed, one.view)
-    told = Apart((one.view,), np.nan, np.inf, None, one.contradicted, said, one.placed, scale)
+    said = diagnose_rpc(one.found, block, one.placed, one.view)
+    told = ForeignCamera((one.view,), np.nan, np.inf, None, one.contradicted, said, one.placed, scale)
     return told, one.found
 
 
 def _likeliest(
-    chosen: list[_Left], left: list[_Left], lost: Array, block: Block
-) -> tuple[Apart | None, Solution | None]:
+    chosen: list[LeaveOneOut], left: list[LeaveOneOut], lost: Array, block: Block
+) -> tuple[ForeignCamera | None, Solution | None]:
     """Return the likeliest of the views `chosen`; `left` are those without which the rest agrees."""
-    evidence = {one.view: _evidence(one, block) for one in left} if len(left) > 1 else {chosen[0].view: 0.0}
+    evidence = {one.view: _tie_evidence(one, block) for one in left} if len(left) > 1 else {chosen[0].view: 0.0}
     chosen = sorted(chosen, key=lambda one: -evidence[one.view])
     best = chosen[0]
     views = tuple(one.view for one in chosen if evidence[one.view] > evidence[best.view] - SURE)
     rest = sorted(((e, v) for v, e in evidence.items() if v not in views), reverse=True)
     gain = best.gain(lost[best.view])
     gap, runner_up = (evidence[best.view] - rest[0][0], rest[0][1]) if rest else (gain, None)
-    said, placed = look(best.found, block, best.placed, best.view), best.placed if best.placed.meets else None
-    told = Apart(views, gain, gap, runner_up, best.contradicted, said, placed)
-    _LOG.info("%s against the others: %.0f nats", ", ".join(block.names[v] for v in views), gain)
+    said, placed = diagnose_rpc(best.found, block, best.placed, best.view), best.placed if best.placed.meets else None
+    told = ForeignCamera(views, gain, gap, runner_up, best.contradicted, said, placed)
+    logger.info("%s against the others: %.0f nats", ", ".join(block.names[v] for v in views), gain)
     return told, best.found if told.clear else None
 
 
-def _evidence(left: _Left, block: Block) -> float:
+def _tie_evidence(left: LeaveOneOut, block: Block) -> float:
     """Return the logarithm of the evidence of all ties of a block, of which those without one view are
     explained.
 
@@ -272,7 +272,7 @@ def _evidence(left: _Left, block: Block) -> float:
         return -ties * float(np.log(area))
     linear, _ = known
     covered = sum(tracks.rows.size for tracks in linear.tracks)
-    return fit(replace(linear, area=area, image=area)).evidence - (ties - covered) * float(np.log(area))
+    return fit_mixture(replace(linear, area=area, image=area)).evidence - (ties - covered) * float(np.log(area))
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,7 +303,7 @@ class Parts:
         of_it = self.block.view == view
         return Parts(self.block.without(of_it), self.kept_out[~of_it], self.group[~of_it])
 
-    def less(self, found: Solution, one: Found) -> Parts:
+    def less(self, found: Solution, one: MovingGroup) -> Parts:
         """Return the parts with one more group taken out."""
         number, group = self.group.max(initial=0) + 1, self.group.copy()
         still = group == 0
@@ -340,7 +340,7 @@ class Parts:
         sure = [one for one in found if one.by_share and one.axis == 1 and one.gain > SURE]
         return [replace(one, moves=True) for one in sure if one.share > 0.5]
 
-    def motion(self, number: int, one: Found, points: Array) -> Motion:
+    def motion(self, number: int, one: MovingGroup, points: Array) -> Motion:
         """Return the motion of a group, of the points (P, 3) [m] of all tracks."""
         placed = self.block.point[self.block.point < self.block.num_tracks]
         placed = placed[np.isfinite(points[placed, 0])]
@@ -353,7 +353,7 @@ class Parts:
         middle = np.quantile(whole, (LEVEL, 1.0 - LEVEL), axis=0).mean(axis=0)  # a wrong match may lie anywhere
         sides = [
             names[0] if high[axis] < middle[axis] else names[1] if low[axis] > middle[axis] else ""
-            for axis, names in enumerate(_NAMES)
+            for axis, names in enumerate(_COMPASS_SIDES)
         ]
         west, east = (float(wrap_longitude(lon)) for lon in (low[0], high[0]))
         box = west, float(low[1]), east, float(high[1])
@@ -372,7 +372,7 @@ def _groups(block: Block) -> int:
 
 def without_moving(
     found: Solution, parts: Parts, options: AdjustOptions, solve: Solver
-) -> tuple[Solution, Parts, Judgement]:
+) -> tuple[Solution, Parts, Selection]:
     """Solve the block again without groups of ties that move, and find what explains the rest.
 
     `Solution.findings` has both.
@@ -383,7 +383,7 @@ def without_moving(
     noise = MUCH_NOISE * found.outcome.noise * float(np.median(parts.inner.sigma))
     too_small = options.is_plain and bool(found.outcome.smooth.found(noise).all())
     if options.loss == "linear" or too_small:
-        return found, parts, Judgement()
+        return found, parts, Selection()
     groups: list[Finding] = []
     while True:
         judged = judge(found.outcome, parts.inner, options.noise_floor)

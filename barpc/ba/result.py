@@ -8,26 +8,26 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from barpc.ba.altimetry import AltimetryTest
-from barpc.ba.apart import Apart
-from barpc.ba.estimated.priors import EarlierScene
-from barpc.ba.estimated.projected import Cameras
+from barpc.ba.apart import ForeignCamera
+from barpc.ba.constraints.gauge import GaugeReport
+from barpc.ba.constraints.ground import TerrainTest
+from barpc.ba.constraints.incremental import BlockPrior
 from barpc.ba.evidence.scan import Interval
-from barpc.ba.held.gauge import GaugeReport
-from barpc.ba.held.ground import TerrainTest
-from barpc.ba.held.incremental import BlockPrior
 from barpc.ba.judging.judge import Finding
 from barpc.ba.judging.snooping import ControlTest
+from barpc.ba.parameters.priors import EarlierScene
+from barpc.ba.parameters.projected import Cameras
 from barpc.ba.robust.consensus import TwoGroups
-from barpc.ba.robust.smooth import SmoothTest
+from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.ba.robust.variances import PriorTest
 from barpc.ba.solving.covariance import Covariance
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
-from barpc.base.usual import MANY
+from barpc.base.statistics import MANY
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.displaced import ImageAffine, ImageCorrected, RowSpline, Splined
+from barpc.sensor.image_corrections import ImageAffine, ImageCorrected, RowSpline, Splined
 from barpc.sensor.timing import Timed, Timing
 
 
@@ -42,7 +42,7 @@ class Adjustment:
     sensors : tuple of SensorModel
         P_BA of every view: the delivered sensor behind its correction.
     params : (N, q)
-        The unknowns in metres (or px for image models), see `barpc.ba.estimated.unknowns`.
+        The unknowns in metres (or px for image models), see `barpc.ba.parameters.unknowns`.
     points : (P, 3)
         Ground points of the tracks, ECEF [m]; NaN for a track of which nothing was kept.
     residuals_before, residuals : (K, 2)
@@ -72,7 +72,7 @@ class Adjustment:
     gauge : GaugeReport
         Shift of the scene, its standard deviation, the weakest modes.
     datum : mapping
-        Source (`barpc.ba.held.gauge.SOURCES`) -> its share (10,) in what is known of the scene's `MOTIONS`.
+        Source (`barpc.ba.constraints.gauge.SOURCES`) -> its share (10,) in what is known of the scene's `MOTIONS`.
     prior : PriorTest
         Comparison of the corrections with the priors given, and the priors learnt.
     told : (N,)
@@ -167,7 +167,7 @@ class Adjustment:
     gcp_residuals: Array
     options: AdjustOptions = field(repr=False)
     seconds: float = 0.0
-    apart: Apart | None = None
+    apart: ForeignCamera | None = None
     altimetry: AltimetryTest | None = None
     earlier: BlockPrior | None = field(default=None, repr=False)
 
@@ -264,7 +264,9 @@ def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights
     by_camera = height_by_unknowns(cameras, params, pair, points).reshape(n, -1)
     covariance = adjustment.covariance.joint(np.array(pair))
     relative = by_camera - by_camera.mean(axis=0)
-    return PairHeights((first, second), _rms(by_camera, covariance), _rms(relative, covariance), n)
+    return PairHeights(
+        (first, second), _rms_uncertainty(by_camera, covariance), _rms_uncertainty(relative, covariance), n
+    )
 
 
 def height_by_unknowns(cameras: Cameras, params: Array, pair: tuple[int, int], points: Array) -> Array:
@@ -291,7 +293,7 @@ def height_by_unknowns(cameras: Cameras, params: Array, pair: tuple[int, int], p
     return found
 
 
-def _rms(rows: Array, covariance: Array) -> float:
+def _rms_uncertainty(rows: Array, covariance: Array) -> float:
     return float(np.sqrt(np.einsum("ni,ij,nj->n", rows, covariance, rows).mean()))
 
 

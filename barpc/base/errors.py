@@ -11,7 +11,7 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 
-_LONGEST = 1500  # characters of a message
+_MAX_MESSAGE_LENGTH = 1500  # characters of a message
 
 
 class BarpcError(Exception):
@@ -29,8 +29,8 @@ class BarpcError(Exception):
     def __str__(self) -> str:
         """One printable line of bounded length, whatever a damaged file has put into the message."""
         text = super().__str__()
-        if len(text) > _LONGEST:
-            text = f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
+        if len(text) > _MAX_MESSAGE_LENGTH:
+            text = f"{text[: _MAX_MESSAGE_LENGTH // 2]} ... {text[-_MAX_MESSAGE_LENGTH // 2 :]}"
         return visible(text).replace("\n", "\\n")
 
 
@@ -86,7 +86,9 @@ class BarpcWarning(UserWarning):
     """Something the user should know that does not stop the run."""
 
 
-_ROOM = 256 << 20  # bytes: more than any library or block of work maps at once that fails while others still do not
+_MEMORY_ALLOWANCE = (
+    256 << 20
+)  # bytes: more than any library or block of work maps at once that fails while others still do not
 _MEMORY = re.compile(
     r"failed to map segment|annot (?:allocate|map)|[Oo]ut of memory|[Ii]nsufficient memory|emory allocation failed|"
     r"nable to allocate|ot enough memory|can't start new thread"
@@ -94,7 +96,7 @@ _MEMORY = re.compile(
 _OTHER = re.compile(r"static TLS|not permitted")  # too many libraries of a kind; a disk that nothing may run from
 
 
-def has_room(size: int = _ROOM) -> bool:
+def has_room(size: int = _MEMORY_ALLOWANCE) -> bool:
     """Return whether this process can still map so many bytes of memory."""
     try:
         mmap.mmap(-1, size).close()

@@ -17,7 +17,7 @@ from numpy.lib import format as npy
 
 from barpc.base.errors import BarpcError, InputError, plain
 from barpc.base.remote import Remote
-from barpc.base.sidefile import ARRAYS, NUMBER, Kind, opened
+from barpc.base.safe_io import ARRAYS, BYTES_PER_NUMBER, Kind, opened
 
 
 class Frozen:
@@ -68,7 +68,7 @@ class Frozen:
         return f"{type(self).__name__}({self._told()})"
 
     def _content(self) -> tuple[object, ...]:
-        return tuple(_plain(getattr(self, name)) for name in self._given())
+        return tuple(_comparable(getattr(self, name)) for name in self._given())
 
     def __eq__(self, other: object) -> bool:
         return type(other) is type(self) and isinstance(other, Frozen) and self._content() == other._content()
@@ -81,7 +81,7 @@ class Frozen:
             self._keep(name, value)
 
 
-def _plain(value: object) -> object:
+def _comparable(value: object) -> object:
     """Return a value in the form in which it is compared; -0.0 is 0.0."""
     if not isinstance(value, np.ndarray):
         return value
@@ -99,7 +99,7 @@ def _short(value: object) -> str:
 
 Arrays = dict[str, npt.NDArray[Any]]  # named plain arrays: what an ``.npz`` file holds
 
-_FRAME = "frame"
+_FRAME_KEY = "frame"
 
 
 def to_arrays(value: Any) -> Arrays:
@@ -115,7 +115,7 @@ def to_arrays(value: Any) -> Arrays:
     """
     arrays: Arrays = {}
     frame = _encode(value, arrays)
-    arrays[_FRAME] = np.frombuffer(json.dumps(frame).encode(), dtype=np.uint8)
+    arrays[_FRAME_KEY] = np.frombuffer(json.dumps(frame).encode(), dtype=np.uint8)
     return arrays
 
 
@@ -125,7 +125,7 @@ def from_arrays(arrays: Mapping[str, npt.NDArray[Any]], *, sent: bool = False) -
     A Remote is taken of arrays that were `sent` by our own process only: those of a file may be anybody's.
     """
     try:
-        frame = json.loads(np.asarray(arrays[_FRAME], dtype=np.uint8).tobytes())
+        frame = json.loads(np.asarray(arrays[_FRAME_KEY], dtype=np.uint8).tobytes())
         return _decode(frame, arrays, sent)
     except (KeyError, TypeError, AttributeError, IndexError, RecursionError, UnicodeDecodeError) as error:
         raise ValueError(f"not a stage result: {plain(error)}") from error
@@ -194,7 +194,7 @@ def _unpack(file: IO[bytes], path: Path | str, kind: Kind) -> Arrays:
         with zipfile.ZipFile(file) as archive:
             members = archive.infolist()
             kind.check(f"{path}, unpacked", sum(member.file_size for member in members))
-            kind.check(f"{path}, as numbers", NUMBER * sum(_header(archive, m)[0] for m in members))
+            kind.check(f"{path}, as numbers", BYTES_PER_NUMBER * sum(_npy_header(archive, m)[0] for m in members))
             return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
     except BarpcError:
         raise
@@ -202,7 +202,7 @@ def _unpack(file: IO[bytes], path: Path | str, kind: Kind) -> Arrays:
         raise kind.error(f"{path}: not {kind.words} (.npz) that can be read ({plain(error)})") from error
 
 
-def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> tuple[int, int]:
+def _npy_header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> tuple[int, int]:
     """Return the elements and bytes of a member that the archive claims; ValueError where it cannot hold them."""
     packed = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: DEFLATED}.get(member.compress_type)
     if packed is None or member.file_size > packed * member.compress_size + HEADER:

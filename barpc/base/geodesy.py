@@ -32,11 +32,11 @@ GEOID = 110.0
 """m: no geoid lies farther from the ellipsoid."""
 STATED, INFERRED, DEFAULT = "stated", "inferred", "default"
 """How it is known what heights count from: a person or a file says it; a format's definition does; nothing does."""
-FAR = 1e9
+MAX_COORDINATE = 1e9
 """No place, size or other number of a file comes near, be it in px, deg or m."""
 NEWTON_STEPS = 12
 """Steps of a Newton method that gains digits with every one, at most: it ends where it has settled."""
-SETTLED = 1e-4
+NEWTON_TOLERANCE = 1e-4
 """Of the last of these steps [px or m], where they are quadratic: what it leaves is below rounding."""
 CHUNK = 8192
 """Points worked on at a time, so that temporaries stay in cache."""
@@ -283,12 +283,12 @@ def polygon(ring: Array) -> dict[str, Any] | None:
     return {"type": "MultiPolygon", "coordinates": parts}
 
 
-def feature(ring: Array, **properties: Any) -> dict[str, Any]:
+def geojson_feature(ring: Array, **properties: Any) -> dict[str, Any]:
     """Return a Feature of a footprint with its properties."""
     return {"type": "Feature", "properties": properties, "geometry": polygon(ring)}
 
 
-def collection(features: list[dict[str, Any]]) -> dict[str, Any]:
+def feature_collection(features: list[dict[str, Any]]) -> dict[str, Any]:
     """Return a FeatureCollection."""
     return {"type": "FeatureCollection", "features": features}
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from barpc.base.errors import InputError
 from barpc.base.remote import Remote
 
-_HOST = platform.node()
+_HOST_NAME = platform.node()
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Stamp:
     @classmethod
     def of(cls, found: os.stat_result) -> Stamp:
         """Return the stamp that `os.stat` gives."""
-        return cls(found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino, found.st_dev, _HOST)
+        return cls(found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino, found.st_dev, _HOST_NAME)
 
     def times(self) -> tuple[int, int, int]:
         """Return the parts of the stamp that every host sees alike."""
@@ -83,16 +83,16 @@ class Input:
             found = Stamp.of(Path(self.path).stat())
         except OSError:
             return False
-        if found.matches(self.stamp) or found == _known.get(self.path):
+        if found.matches(self.stamp) or found == _stamps.get(self.path):
             return True
         # some file systems number a file anew: then its bytes are asked
-        if found.times() != self.stamp.times() or take(self.path).sha256 != self.sha256:
+        if found.times() != self.stamp.times() or fingerprint(self.path).sha256 != self.sha256:
             return False
-        _known[self.path] = found
+        _stamps[self.path] = found
         return True
 
 
-_known: dict[str, Stamp] = {}  # files whose bytes were asked by this process
+_stamps: dict[str, Stamp] = {}  # files whose bytes were asked by this process
 
 
 def changed(path: str) -> InputError:
@@ -102,7 +102,7 @@ def changed(path: str) -> InputError:
     )
 
 
-def take(path: str | os.PathLike[str], parts: Iterable[Input] = ()) -> Input:
+def fingerprint(path: str | os.PathLike[str], parts: Iterable[Input] = ()) -> Input:
     """Hash a file; InputError where it changes meanwhile, OSError where it cannot be read."""
     if isinstance(path, Remote):
         text = f"{path} {path.size} {path.tag}"
@@ -117,7 +117,7 @@ def take(path: str | os.PathLike[str], parts: Iterable[Input] = ()) -> Input:
         after = Stamp.of(os.fstat(file.fileno()))
     if not before.matches(after):
         raise changed(name)
-    noted = (_seen.get() or {}).get(name)
+    noted = (_stamps_of_run.get() or {}).get(name)
     if noted is not None and not noted.matches(before):
         raise changed(name)
     return Input(name, before.size, digest, before, tuple(parts))
@@ -151,17 +151,17 @@ def ask(path: str | os.PathLike[str] | None = None) -> None:
 
 # --- what was read ----------------------------------------------------------------------------------------
 
-_seen: ContextVar[dict[str, Stamp] | None] = ContextVar("seen", default=None)
+_stamps_of_run: ContextVar[dict[str, Stamp] | None] = ContextVar("seen", default=None)
 
 
 @contextmanager
 def recorded(seen: dict[str, Stamp]) -> Iterator[dict[str, Stamp]]:
-    """Record every file that `barpc.base.sidefile` opens in the block, as it was the first time."""
-    token = _seen.set(seen)
+    """Record every file that `barpc.base.safe_io` opens in the block, as it was the first time."""
+    token = _stamps_of_run.set(seen)
     try:
         yield seen
     finally:
-        _seen.reset(token)
+        _stamps_of_run.reset(token)
 
 
 def note(path: str | os.PathLike[str], found: os.stat_result) -> None:
@@ -171,7 +171,7 @@ def note(path: str | os.PathLike[str], found: os.stat_result) -> None:
 
 def also_seen(files: Mapping[str, Stamp]) -> None:
     """Note files that were opened here or in another process."""
-    seen = _seen.get()
+    seen = _stamps_of_run.get()
     if seen is not None:
         for name, stamp in files.items():
             if not seen.setdefault(name, stamp).matches(stamp):

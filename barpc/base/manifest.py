@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from barpc.base.errors import InputError
-from barpc.base.sidefile import SUMMARY, read_bytes
+from barpc.base.safe_io import SUMMARY, read_bytes
 
 SUMS = "SHA256SUMS"
 _ENTRY = re.compile(r"(?:# )?([0-9a-f]{64})  ((?!/)[^\0-\x1f\\]+)")

@@ -20,24 +20,24 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from barpc.base.errors import InputError
-from barpc.base.remote import HOST
-from barpc.base.sidefile import NUMBER, OPTIONS, TABLE, read_text
+from barpc.base.remote import HOST_PATTERN
+from barpc.base.safe_io import BYTES_PER_NUMBER, OPTIONS, TABLE, read_text
 
 T = TypeVar("T")
-Record = TypeVar("Record", bound="Options")
+OptionsRecord = TypeVar("OptionsRecord", bound="Options")
 
 AUTO, OFF, GEOMETRIC = "auto", "off", "rotation+translation"
 Model = Literal["auto", "rotation+translation", "rotation", "translation", "shift", "shift-drift", "affine"]
 
 HOOK = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"  # a name in a module
-_MOST = 1 << 53  # whole numbers stay below: beyond, not every one has a double of its own
+_MAX_EXACT_INTEGER = 1 << 53  # whole numbers stay below: beyond, not every one has a double of its own
 _REAL = 1e30  # no option is larger, or smaller and not 0: squares, and squares of them, are numbers then
 GEOID_HELP = (
     "Geoid that heights of a DEM, or of ground points, count from: `egm96`, `egm2008`, the file of a grid, or `none` "
     "of ellipsoidal ones. Without: the one that their file names."
 )
 HEIGHTS_HELP = "What heights count from in files that do not say it: `ellipsoidal`, `egm96`, `egm2008`, a geoid's grid."
-MOST_POINTS = (TABLE.most or 0) // (5 * NUMBER)
+MOST_POINTS = (TABLE.most or 0) // (5 * BYTES_PER_NUMBER)
 """Control points of a fit: as many as a table of them may hold, five numbers each."""
 _SHORT = reprlib.Repr()
 _SHORT.maxstring, _SHORT.maxother = 60, 200
@@ -55,7 +55,7 @@ class Rule:
     below: float | None = None  # not reached
     rows: str = ""  # the table whose keys are the values allowed, as module and name
     hook: bool = False  # or `module:name`, of a user's own
-    spoken: bool = False  # said by a person: no options file may set it
+    cli_only: bool = False  # given on the command line or in Python: no options file may set it
 
     def holds(self, number: float) -> bool:
         """Return whether a number lies within the bounds; NaN and the infinities do not."""
@@ -173,13 +173,13 @@ def checked(name: str, kind: Any, rule: Rule, value: Any) -> Any:
             raise InputError(f"{name} {value!r} is not {wanted(kind, rule)}")
         found = value
     else:
-        found = _plain(kind, rule, value)
+        found = _as_type(kind, rule, value)
     if found is None:
         raise InputError(f"{name} must be {wanted(kind, rule)}, found {value!r}")
     return found
 
 
-def _plain(kind: Any, rule: Rule, value: Any) -> Any:
+def _as_type(kind: Any, rule: Rule, value: Any) -> Any:
     """Return a single value as its type, numpy's numbers and paths included; None if it is none, or out of range."""
     if kind is str:
         text = os.fspath(value) if isinstance(value, (str, os.PathLike)) else None
@@ -188,14 +188,14 @@ def _plain(kind: Any, rule: Rule, value: Any) -> Any:
         return value if isinstance(value, kind) else None
     if isinstance(value, bool) or not isinstance(value, Integral if kind is int else Real):
         return None
-    if isinstance(value, Integral) and abs(int(value)) >= _MOST:
+    if isinstance(value, Integral) and abs(int(value)) >= _MAX_EXACT_INTEGER:
         return None
     number = kind(value)
-    beyond = kind is float and number != 0 and not _is_plain(number)
+    beyond = kind is float and number != 0 and not _is_allowed_size(number)
     return number if rule.holds(number) and not beyond else None
 
 
-def _is_plain(number: float) -> bool:
+def _is_allowed_size(number: float) -> bool:
     """Return whether the size of a number other than 0 is one that options allow."""
     return 1 / _REAL <= abs(number) <= _REAL
 
@@ -356,7 +356,7 @@ class AdjustOptions(Options):
             rows = float(self.jitter)
         except ValueError:
             return 0.0
-        return rows if _is_plain(rows) else 0.0
+        return rows if _is_allowed_size(rows) else 0.0
 
     @property
     def first_model(self) -> str:
@@ -448,7 +448,7 @@ class RunOptions(Options):
         without. `HOST` is that of `https://HOST/...`; a bucket is given as `s3://BUCKET` (or gs, az). Never taken from
         an options file.""",
         unit="host",
-        spoken=True,
+        cli_only=True,
     )
     matches: tuple[str, ...] = option(
         (),
@@ -527,7 +527,7 @@ class RunOptions(Options):
         if self.matches_only and not self.matches:
             raise InputError("matches_only is given without matches: there would be no tie points")
         for host in self.allow_remote:
-            if not HOST.fullmatch(host):
+            if not HOST_PATTERN.fullmatch(host):
                 raise InputError(f"allow_remote {host!r} is no HOST, HOST:PORT or s3://BUCKET")
         for name in ("overlap_list", "aoi"):
             if self.matches_only and getattr(self, name) is not None:
@@ -592,7 +592,7 @@ class DsmOptions(Options):
             raise InputError(f"alt: the lower altitude comes first, found {self.alt}")
 
 
-def with_values(options: Record, values: Mapping[str, Any], where: str = "options") -> Record:
+def with_values(options: OptionsRecord, values: Mapping[str, Any], where: str = "options") -> OptionsRecord:
     """Return a copy of a record with some fields changed, nested records by nested mappings.
 
     InputError for an unknown field, or a value of the wrong type or out of range, of the source called `where`.
@@ -634,7 +634,7 @@ def read_options(path: str | Path, options: RunOptions | None = None) -> RunOpti
     except (ValueError, RecursionError) as error:  # a date or a number that is none is not its own class
         raise InputError(f"{path}: not an options file (TOML): {error}") from error
     for name in data:
-        if (one := declared(RunOptions).get(name)) is not None and one.rule.spoken:
+        if (one := declared(RunOptions).get(name)) is not None and one.rule.cli_only:
             raise InputError(f"{path}: {name} is not taken from a file, which may be anybody's; give the flag")
     _refuse_code(path, RunOptions, data)
     return with_values(options or RunOptions(), data, str(path))
@@ -658,7 +658,7 @@ def schema(record: type[Options] = RunOptions) -> dict[str, Any]:
     for name, one in declared(record).items():
         if isinstance(one.default, Options):
             properties[name] = schema(type(one.default))
-        elif not one.rule.spoken:
+        elif not one.rule.cli_only:
             properties[name] = {**schema_of(one.kind, one.rule), "description": one.rule.help}
             if one.default is not None:
                 listed = isinstance(one.default, tuple)
@@ -666,7 +666,7 @@ def schema(record: type[Options] = RunOptions) -> dict[str, Any]:
     return {"type": "object", "additionalProperties": False, "properties": properties}
 
 
-_WORDS = {str: "string", int: "integer", float: "number", bool: "boolean", NoneType: "null"}
+_TYPE_NAMES = {str: "string", int: "integer", float: "number", bool: "boolean", NoneType: "null"}
 
 
 def schema_of(kind: Any, rule: Rule = _FREE) -> dict[str, Any]:
@@ -688,7 +688,7 @@ def schema_of(kind: Any, rule: Rule = _FREE) -> dict[str, Any]:
     ends = {"minimum": rule.least, "exclusiveMinimum": rule.above}
     ends |= {"maximum": rule.most, "exclusiveMaximum": rule.below}
     bounds = {word: value for word, value in ends.items() if value is not None}
-    return {} if kind is Any else {"type": _WORDS[kind], **bounds}
+    return {} if kind is Any else {"type": _TYPE_NAMES[kind], **bounds}
 
 
 def _either(schemas: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -48,9 +48,9 @@ COMMANDS = {
     "report": "Make report.html of a finished run again, or compare two runs.",
 }
 """Verb -> its line in `barpc --help`; the code is the function `<verb>` of `barpc.cli.<verb>`, or of these:"""
-_MODULES = {
+_COMMAND_MODULES = {
     **dict.fromkeys(("match", "check"), "adjust"),
-    **dict.fromkeys(("report", "export", "verify", "dsm"), "finished"),
+    **dict.fromkeys(("report", "export", "verify", "dsm"), "run_commands"),
     **dict.fromkeys(("localize", "triangulate"), "project"),
 }
 
@@ -76,7 +76,7 @@ class Verbs(click.Group):
         """Import the verb's module and hand out its command."""
         if cmd_name not in COMMANDS:
             return None
-        module = import_module(f"barpc.cli.{_MODULES.get(cmd_name, cmd_name)}")
+        module = import_module(f"barpc.cli.{_COMMAND_MODULES.get(cmd_name, cmd_name)}")
         command: click.Command = getattr(module, cmd_name)
         command.help = _kept_lines(command.help)
         return command
@@ -167,7 +167,7 @@ def main(args: list[str] | None = None) -> None:
             code = EXIT_FAILED
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001  (nobody wants a traceback)
             # what an interruption makes of others' code may be any error
-            code, message = _told(KeyboardInterrupt() if interrupt.end() else error)
+            code, message = _exit_message(KeyboardInterrupt() if interrupt.end() else error)
             if "--debug" in argv:
                 echo(traceback.format_exc(), err=True)
             say(message)
@@ -178,7 +178,7 @@ def main(args: list[str] | None = None) -> None:
     sys.exit(code)
 
 
-def _told(error: BaseException) -> tuple[int, str]:
+def _exit_message(error: BaseException) -> tuple[int, str]:
     """Return the exit code of an error, and what to say."""
     if isinstance(error, click.Abort):  # of an end of file, too
         error = error.__cause__ or error

@@ -25,12 +25,12 @@ from barpc.cli.terminal import (
 if TYPE_CHECKING:
     from barpc.pipeline import AdjustResult
 
-_images = click.argument("images", nargs=-1, required=False, metavar="IMAGE...")
+_images_argument = click.argument("images", nargs=-1, required=False, metavar="IMAGE...")
 _out_dir = click.option("-o", "--out-dir", required=True, metavar="DIR", help="Folder for the results.")
 
 
 @click.command("adjust", cls=Grouped)
-@_images
+@_images_argument
 @_out_dir
 @paper
 @with_flags(*RUN, *TIE, *ADJUSTMENT)
@@ -61,11 +61,11 @@ def adjust(
     """
     from barpc import pipeline
 
-    return _run(obj, pipeline.adjust, images, flags, out_dir=out_dir)
+    return _run_pipeline(obj, pipeline.adjust, images, flags, out_dir=out_dir)
 
 
 @click.command("match", cls=Grouped)
-@_images
+@_images_argument
 @_out_dir
 @with_flags(*MATCH, *TIE)
 @click.pass_obj
@@ -81,11 +81,11 @@ def match(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags
     """
     from barpc import pipeline
 
-    return _run(obj, pipeline.adjust, images, flags, {"stop_after": "matching"}, out_dir=out_dir)
+    return _run_pipeline(obj, pipeline.adjust, images, flags, {"stop_after": "matching"}, out_dir=out_dir)
 
 
 @click.command("check", cls=Grouped)
-@_images
+@_images_argument
 @click.option("--against", metavar="PATH", help="Compare with this RPC (one image), or those of this folder.")
 @with_flags(*TIE)
 @click.pass_obj
@@ -103,11 +103,11 @@ def check(obj: dict[str, Any], /, images: tuple[str, ...], against: str | None, 
     from barpc import pipeline
 
     if against is not None:
-        return _compare(_given(images, flags), Path(against))
-    return _run(obj, pipeline.check, images, flags)
+        return _compare(_image_arguments(images, flags), Path(against))
+    return _run_pipeline(obj, pipeline.check, images, flags)
 
 
-def _run(
+def _run_pipeline(
     obj: Mapping[str, Any],
     work: Callable[..., AdjustResult],
     images: tuple[str, ...],
@@ -117,16 +117,16 @@ def _run(
 ) -> int:
     """Run an entry of the pipeline with what the command line says and what the verb has `fixed`, and tell."""
     options = replace(run_options(flags, flags["options_file"]), **(fixed or {}))
-    paths = _given(images, flags, options.keep_going)
+    paths = _image_arguments(images, flags, options.keep_going)
     with executor_for(flags["jobs"]) as executor, progress_told(obj["quiet"], obj["verbose"]) as progress:
-        return _tell(obj, work(paths, options=options, executor=executor, progress=progress, **where))
+        return _tell_result(obj, work(paths, options=options, executor=executor, progress=progress, **where))
 
 
-def _given(images: tuple[str, ...], flags: Mapping[str, Any], keep_going: bool = False) -> list[str]:
+def _image_arguments(images: tuple[str, ...], flags: Mapping[str, Any], keep_going: bool = False) -> list[str]:
     return expanded(image_paths(images, flags["image_list"], keep_going))
 
 
-def _tell(obj: Mapping[str, Any], result: AdjustResult) -> int:
+def _tell_result(obj: Mapping[str, Any], result: AdjustResult) -> int:
     if wants_json():
         echo(json.dumps(result.summary, indent=1))
     elif not obj["quiet"]:
@@ -142,7 +142,7 @@ def _tell(obj: Mapping[str, Any], result: AdjustResult) -> int:
 def _compare(images: list[str], against: Path) -> int:
     from barpc.cameras import open_camera
     from barpc.pipeline import load_views
-    from barpc.pipeline.handoff import TOLERANCE, difference
+    from barpc.pipeline.verify_outputs import READING_TOLERANCE, difference
     from barpc.rpcio import find_rpc
 
     found = []
@@ -156,5 +156,5 @@ def _compare(images: list[str], against: Path) -> int:
     else:
         for path, compared, px in found:
             tell(f"{path}  {compared}  max {px:.3g} px")
-    off = [f"{path}: {px:.3g} px." for path, _, px in found if not px <= TOLERANCE]
+    off = [f"{path}: {px:.3g} px." for path, _, px in found if not px <= READING_TOLERANCE]
     return tell_gate(f"{len(off)} of {len(found)} RPCs differ.", off) if off else 0

@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 
 from barpc.base.errors import InputError, OutputError
-from barpc.base.sidefile import plain_path
+from barpc.base.safe_io import plain_path
 from barpc.cameras import open_camera, split_spec
 from barpc.cli.flags import expanded
 from barpc.cli.moving import moved, read_move, refitted
@@ -23,7 +23,7 @@ from barpc.cli.project import altitude_of, exchanged, with_heights
 from barpc.cli.terminal import remark, tell, tell_gate, wants_json
 from barpc.fit import FitOptions
 from barpc.fit.points import Sample, widened
-from barpc.pipeline.handoff import TOLERANCE, Reading, unverified, verify, verify_grid
+from barpc.pipeline.verify_outputs import READING_TOLERANCE, Reading, unverified, verify, verify_grid
 from barpc.rasters.dem import Dem
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import (
@@ -31,16 +31,16 @@ from barpc.rpcio import (
     FORMATS,
     WRITABLE,
     find_rpc,
+    format_for,
     hidden_by,
     read_rpc,
-    row_of,
     shadows,
     sidecars,
     write_camera,
     write_crop,
     write_rpc,
 )
-from barpc.rpcio.grids import GRID, write_grid
+from barpc.rpcio.grids import GRID_SUFFIX, write_grid
 from barpc.scene import Camera
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
 from barpc.sensor.geometry import image_border
@@ -49,7 +49,7 @@ from barpc.tie import read_area
 from barpc.workspace import Workspace
 
 Window = tuple[int, int, int, int]
-Box = tuple[float, float, float, float]
+GroundBox = tuple[float, float, float, float]
 
 
 @click.command("convert")
@@ -119,14 +119,14 @@ def _to_folder(files: tuple[str, ...], folder: Path, flags: Mapping[str, Any]) -
     names = [name.strip() for name in (flags["formats"] or ("" if cut else "txt")).split(",") if name.strip()]
     images = tuple(expanded(files))
     files_of = [Path(split_spec(image)[0]) for image in images]
-    _check(files_of, folder, names)
+    _refuse_source_folder(files_of, folder, names)
     cameras = _cameras(images, flags["rpcs"])
     if flags["move"] is not None or flags["transform"] is not None:
         cameras = moved(cameras, flags["move"], flags["transform"], carrier)
     ends = [".tif" if cut else CARRIERS[carrier].suffixes[0], *(WRITABLE[name].beside for name in names)]
     shown = list(zip(files_of, cameras, strict=True))
     keep = [*files_of, *(Path(camera.path) for camera in cameras)]
-    parts = windows_of(shown, _window(flags)) if cut else [(file, camera, None) for file, camera in shown]
+    parts = windows_of(shown, _window_chooser(flags)) if cut else [(file, camera, None) for file, camera in shown]
     return _hand_off(parts, folder, ends, keep, flags["overwrite"])
 
 
@@ -142,7 +142,7 @@ def _to_target(files: tuple[str, ...], flags: Mapping[str, Any]) -> int:
     source, target = files
     camera, image = open_camera(source), Path(split_spec(source)[0])
     cut = any(flags[name] is not None for name in ("window", "bbox", "aoi"))
-    if target.endswith(GRID) and not cut:
+    if target.endswith(GRID_SUFFIX) and not cut:
         check_target(target, [image, camera.path], overwrite)
         return _as_grid(camera, target, overwrite)
     if camera.format in ("grid", "correction"):
@@ -150,10 +150,10 @@ def _to_target(files: tuple[str, ...], flags: Mapping[str, Any]) -> int:
     check_target(target, [image, camera.path], overwrite, None if cut else camera.rpc)
     if not cut:
         return _copy(camera, image, target, flags["formats"], overwrite)
-    if row_of(target) not in (CARRIERS["copy"], CARRIERS["nitf"]):
+    if format_for(target) not in (CARRIERS["copy"], CARRIERS["nitf"]):
         ends = ", ".join((*CARRIERS["copy"].suffixes, *CARRIERS["nitf"].suffixes))
         raise click.UsageError(f"{target}: a part of an image goes into a file whose name ends in {ends}")
-    window = _window(flags)(camera, image)
+    window = _window_chooser(flags)(camera, image)
     write_crop(camera.rpc, image, target, window, overwrite=overwrite)
     text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
     return _read_back(camera.rpc.crop(*window[:2]), target, {"path": target, "window": window}, text)
@@ -175,7 +175,7 @@ def _read_back(rpc: RPC, target: str, row: Mapping[str, object], text: str) -> i
     """Say what was written, and how far off a file's RPC is when it is read back; the exit code."""
     lost = float(rpc.off(read_rpc(target)).max())
     tell(json.dumps({**row, "max_px": lost}) if wants_json() else f"{text} (read back: {lost:.1g} px)")
-    if lost <= TOLERANCE:
+    if lost <= READING_TOLERANCE:
         return 0
     return tell_gate(
         f"{target} reads back {lost:.2g} px off: too few digits for this RPC ('barpc fit' fits one that it holds), or "
@@ -189,7 +189,7 @@ def _as_grid(camera: Camera, target: str, overwrite: bool) -> int:
     alts = widened(camera.alt_range)
     write_grid(DirectGrid.of(camera.model, camera.extent, alts), target, overwrite=overwrite)
     readings = verify_grid(Path(target), Sample.of(camera.model, camera.extent, alts))
-    _tell(readings)
+    _tell_readings(readings)
     off = [f"{one.consumer}: {one.note or one.max_error}" for one in readings if not one.max_error <= LINEAR]
     return tell_gate(f"{target} does not hold the camera to {LINEAR:g} px", off) if off else 0
 
@@ -220,7 +220,7 @@ def check_target(target: str | Path, sources: Sequence[str | Path], overwrite: b
 # --- windows -----------------------------------------------------------------------------------------------
 
 
-def _window(flags: Mapping[str, Any]) -> Callable[[Camera, Path], Window]:
+def _window_chooser(flags: Mapping[str, Any]) -> Callable[[Camera, Path], Window]:
     """Return what tells the window of an image that is asked for, or the pixels of a box or area on the ground."""
     if sum(flags[name] is not None for name in ("window", "bbox", "aoi")) != 1:
         raise click.UsageError("give one of --window, --bbox and --aoi")
@@ -231,7 +231,7 @@ def _window(flags: Mapping[str, Any]) -> Callable[[Camera, Path], Window]:
     return lambda camera, path: window_of(camera, path, bbox, flags["alt"], flags["terrain"])
 
 
-def box_of(path: str) -> Box:
+def box_of(path: str) -> GroundBox:
     """Return west, south, east, north [deg] of an area of interest; east is less than west across the antimeridian."""
     outline = read_area(path).outline  # three times, a whole turn apart
     found = [shapely.clip_by_rect(outline, west, -90.0, west + 360.0, 90.0).bounds for west in (-180.0, 0.0)]
@@ -239,7 +239,7 @@ def box_of(path: str) -> Box:
     return west, south, east - 360.0 * (east > 180.0), north
 
 
-def window_of(camera: Camera, path: Path, bbox: Box, alt: float | None, dem: Dem | None) -> Window:
+def window_of(camera: Camera, path: Path, bbox: GroundBox, alt: float | None, dem: Dem | None) -> Window:
     """Return the pixels that a box on the ground covers, cut to the image; a usage error where it does not meet it."""
     west, south, east, north = bbox
     east += 360.0 * (east < west)  # a box across the antimeridian
@@ -285,7 +285,7 @@ def _cameras(images: Sequence[str], rpcs: str | None) -> list[Camera]:
     cameras = []
     for file in (Path(split_spec(image)[0]) for image in images):
         camera = open_camera(str(find_rpc(Path(rpcs), file)) if Path(rpcs).is_dir() else rpcs)
-        cameras.append(replace(camera, size=_size(file)))
+        cameras.append(replace(camera, size=_image_size(file)))
     return cameras
 
 
@@ -304,7 +304,7 @@ def _hand_off(
     with Workspace(folder, overwrite=overwrite, keep=keep, names=together, adds=True) as workspace:
         for (path, camera, window), row in zip(images, names, strict=True):
             rpc, written = camera.rpc, [folder / name for name in row]
-            size = _size(path) if window is None else window[2:]
+            size = _image_size(path) if window is None else window[2:]
             for name in row:
                 with workspace.output(name) as partial:
                     if window is not None and name == row[0]:
@@ -314,17 +314,17 @@ def _hand_off(
             readings += verify(written, rpc, size, camera.alt_range)
             reasons += _shadow_reasons(path, written) if window is None else []
     whole = images[0][2] is None
-    return _told(readings, reasons, unverified([folder / name for name in names[0]]) if whole else ())
+    return _exit_code(readings, reasons, unverified([folder / name for name in names[0]]) if whole else ())
 
 
-def _size(image: Path) -> tuple[int, int]:
+def _image_size(image: Path) -> tuple[int, int]:
     with open_raster(image) as dataset:
         return dataset.width, dataset.height
 
 
-def _told(readings: list[Reading], reasons: Sequence[str] = (), notes: Sequence[str] = ()) -> int:
+def _exit_code(readings: list[Reading], reasons: Sequence[str] = (), notes: Sequence[str] = ()) -> int:
     """Say what readers of the files see; return the exit code."""
-    _tell(readings)
+    _tell_readings(readings)
     for sentence in notes:
         remark(sentence)
     off = [reading for reading in readings if not reading.passed]
@@ -333,7 +333,7 @@ def _told(readings: list[Reading], reasons: Sequence[str] = (), notes: Sequence[
     return tell_gate("The hand-off needs a look.", reasons) if reasons else 0
 
 
-def _tell(readings: list[Reading]) -> None:
+def _tell_readings(readings: list[Reading]) -> None:
     rows = [(str(r.path), r.consumer, None if r.note else r.max_error, r.note) for r in readings]
     if wants_json():
         keys = ("path", "consumer", "max_px", "note")
@@ -351,7 +351,7 @@ def _shadow_reasons(image: Path, written: list[Path]) -> list[str]:
     return [f"{path} hides the RPC of {written[0]}: move it away." for path in hiding]
 
 
-def _check(images: list[Path], folder: Path, formats: list[str]) -> None:
+def _refuse_source_folder(images: list[Path], folder: Path, formats: list[str]) -> None:
     for name in formats:
         if name not in WRITABLE:
             raise click.UsageError(f"--rpc-format {name}: not a format that is written")

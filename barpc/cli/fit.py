@@ -75,10 +75,10 @@ def fit(
         from barpc.cli.convert import check_target
 
         check_target(output, [image], overwrite)
-    fit, tolerance, size = _fit(source, output, flags)
+    fit, tolerance, size = _fit_source(source, output, flags)
     written = False
     if output is not None and (keep_going or not fit.verdict(tolerance)):
-        fit, written = _write(fit, image, output, overwrite, None if keep_going else tolerance, size)
+        fit, written = _write_rpc_file(fit, image, output, overwrite, None if keep_going else tolerance, size)
     verdict = fit.verdict(tolerance)
     if wants_json():
         summary = {**fit.summary(), "verdict": verdict, "output": output if written else None}
@@ -95,16 +95,16 @@ def fit(
     return tell_gate(f"{verdict}; {how}", [])
 
 
-def _fit(source: str, output: str | None, flags: dict[str, Any]) -> tuple[RpcFit, float, tuple[int, int] | None]:
+def _fit_source(source: str, output: str | None, flags: dict[str, Any]) -> tuple[RpcFit, float, tuple[int, int] | None]:
     """Return the fit, the tolerance [px] that it is to meet, and the image's width and height, if known."""
     from barpc.cameras import open_camera, read_points, split_spec
     from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
     from barpc.fit.points import terrain_range
     from barpc.rasters.dem import Dem
-    from barpc.rpcio import Carrier, row_of
+    from barpc.rpcio import Carrier, format_for
 
     options = run_options(flags, flags["options_file"]).fit
-    row = None if output is None else row_of(output)
+    row = None if output is None else format_for(output)
     if isinstance(row, Carrier) and options.precision is None:
         options = replace(options, precision=row.precision)
     points, size = read_points(source)
@@ -137,7 +137,7 @@ class _Missed(Exception):  # noqa: N818 - it never leaves this page
     """What was written does not hold the fit: it goes again."""
 
 
-def _write(
+def _write_rpc_file(
     fit: RpcFit,
     source: str,
     output: str,

@@ -15,7 +15,7 @@ import click
 from barpc.base.errors import BarpcError, InputError
 from barpc.base.options import PAPER, Declared, RunOptions, checked, declared, read_options, with_values
 from barpc.base.remote import is_url
-from barpc.base.sidefile import IMAGE, read_head, read_names, unread
+from barpc.base.safe_io import IMAGE, read_head, read_names, unread
 from barpc.cli.terminal import echo
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -40,12 +40,12 @@ ADJUSTMENT = (*CAMERA, *GROUND)
 MATCH = ("overwrite", "keep_going")
 RUN = (*MATCH, "images", "rpc_formats", "grids", "resample")
 """Fields of RunOptions that have flags, by what their verbs do, with their table before a dot."""
-_NAMES = {"rpc_formats": "--rpc-format"}
+_FLAG_NAMES = {"rpc_formats": "--rpc-format"}
 
 
 def flag_name(target: str) -> str:
     """Return the flag that sets a field."""
-    return _NAMES.get(target) or "--" + target.rpartition(".")[2].replace("_", "-")
+    return _FLAG_NAMES.get(target) or "--" + target.rpartition(".")[2].replace("_", "-")
 
 
 def field_of(target: str) -> Declared:
@@ -55,7 +55,7 @@ def field_of(target: str) -> Declared:
     return declared(record)[name]
 
 
-_USUAL = {
+_LISTED_FLAGS = {
     "--out-dir", "--overwrite", "--keep-going", "--images", "--image-list", "--options", "--jobs", "--against",
     "--help", "--help-all", "--matches", "--aoi", "--gcp", "--check-points", "--dem", "--geoid", "--reference",
 }  # fmt: skip
@@ -77,7 +77,7 @@ class Grouped(click.Command):
         of = {_parameter(target): words for words, targets in _GROUPS.items() for target in targets}
         rows: dict[str, list[tuple[str, str]]] = {"Files and the run": [], **{words: [] for words in _GROUPS}}
         for option in self.get_params(ctx):
-            usual = not isinstance(option, click.Option) or not _USUAL.isdisjoint(option.opts)
+            usual = not isinstance(option, click.Option) or not _LISTED_FLAGS.isdisjoint(option.opts)
             row = option.get_help_record(ctx) if usual or ctx.meta.get(_ALL) else None
             if row is not None:
                 rows[of.get(option.name or "", "Files and the run")].append(row)
@@ -220,7 +220,7 @@ def expanded(specs: Sequence[str]) -> list[str]:
         if not os.path.lexists(spec) and not is_url(spec):
             name = os.fspath(name_of(spec))
             choices = spec[len(name) :]
-        found += [one + choices for one in _files(name)]
+        found += [one + choices for one in _matching_files(name)]
     return found
 
 
@@ -257,7 +257,7 @@ def name_of(spec: str) -> str:
     return spec
 
 
-def _files(name: str) -> list[str]:
+def _matching_files(name: str) -> list[str]:
     path = Path(name)
     if is_url(name) or not (path.is_dir() or any(char in name for char in "*?[")):
         return [name]

@@ -10,7 +10,7 @@ import click
 import numpy as np
 
 from barpc.base.errors import InputError, RpcError
-from barpc.base.geodesy import collection, feature, polygon
+from barpc.base.geodesy import feature_collection, geojson_feature, polygon
 from barpc.cameras import open_camera, split_spec
 from barpc.cli.flags import expanded
 from barpc.cli.project import altitude_of, exchanged, ground_at, with_heights
@@ -58,7 +58,7 @@ def info(
     images = tuple(expanded(images))
     cameras = [open_camera(image) for image in images]
     if outlines:
-        echo(json.dumps(_outlines(images, cameras, alt, terrain)))
+        echo(json.dumps(_outlines_geojson(images, cameras, alt, terrain)))
         return 0
     if at is not None and (wrong := exchanged(cameras[0], np.array([at]))):
         raise InputError(f"--at {at}: {wrong}")
@@ -66,23 +66,23 @@ def info(
     reports = [_describe(camera, height, at) for camera, height in zip(cameras, alts, strict=True)]
     if len(cameras) > 1:
         for i, report in enumerate(reports):
-            report["pairs"] = _pairs(images, cameras, i, alts[i], at)
+            report["pairs"] = _viewed_together(images, cameras, i, alts[i], at)
     if wants_json():
         echo(json.dumps(reports))
     else:
         for image, report in zip(images, reports, strict=True):
-            echo("\n".join([image, *(f"  {label:<13}{line}" for label, line in _lines(report))]))
+            echo("\n".join([image, *(f"  {label:<13}{line}" for label, line in _labelled_sentences(report))]))
     return 0
 
 
-_METHODS = {
+_CENTRE_METHODS = {
     "line": "where the rays of an image line meet",
     "stated": "by its orbit",
     "nominal": "assumed: the rays of an image line meet in no orbit",
 }
 
 
-def _lines(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def _labelled_sentences(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield what is told of a camera in words: label and sentence of each line."""
     is_rpc = "domain" in report
     yield "camera", f"RPC ({report['rpc'].replace(' in ', ') in ', 1)}" if is_rpc else report["rpc"]
@@ -127,7 +127,7 @@ def _lines_of_geometry(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         "{incidence_deg:.2f} deg off the vertical, from {azimuth_deg:.2f} deg (north is 0)".format(**report),
     )
     stand = report["camera_altitude_m"]
-    yield "sensor", f"{stand['value'] / 1e3:.1f} km high, {_METHODS[stand['method']]}"
+    yield "sensor", f"{stand['value'] / 1e3:.1f} km high, {_CENTRE_METHODS[stand['method']]}"
 
 
 def _altitude(image: str, camera: Camera, alt: float | None, terrain: Dem | None) -> float:
@@ -142,7 +142,7 @@ def _altitude(image: str, camera: Camera, alt: float | None, terrain: Dem | None
     return float(found)
 
 
-def _outlines(
+def _outlines_geojson(
     images: Sequence[str], cameras: Sequence[Camera], alt: float | None, terrain: Dem | None
 ) -> dict[str, Any]:
     """Return GeoJSON (RFC 7946: cut at the antimeridian) of the images' outlines."""
@@ -155,11 +155,11 @@ def _outlines(
         if not np.isfinite(ring).all():
             raise RpcError(f"{image}: no ground point at its image's border at {height:g} m")
         path = split_spec(image)[0]
-        features.append(feature(ring, name=path.stem, path=str(path), alt=height))
-    return collection(features)
+        features.append(geojson_feature(ring, name=path.stem, path=str(path), alt=height))
+    return feature_collection(features)
 
 
-def _pairs(
+def _viewed_together(
     images: Sequence[str], cameras: Sequence[Camera], i: int, alt: float, at: tuple[float, ...] | None
 ) -> list[dict[str, Any]]:
     """Return what an image and each later one see together at its centre: the angle between their rays, and B/H."""

@@ -24,9 +24,9 @@ from barpc.sensor.rpc import RPC
 
 _DEEPEST, _HIGHEST = -12e3, 10e3
 """Altitudes between which all ground on Earth lies [m], that of the sea's bottom, too."""
-_TOLD = 0.01  # m: rounding of a matrix that is told
-_EXACT = 1e-5  # px, a thousandth of the tolerance: over all that an RPC states; else its image goes first
-_MOVED = "moved and refitted"
+_NOTEWORTHY_ROUNDING = 0.01  # m: rounding of a matrix that is told
+_EXACT_REFIT = 1e-5  # px, a thousandth of the tolerance: over all that an RPC states; else its image goes first
+_MOVED_NOTE = "moved and refitted"
 
 
 def read_move(_: click.Context, __: click.Parameter, text: str | None) -> Array | None:
@@ -70,8 +70,8 @@ def moved(cameras: Sequence[Camera], move: Array | None, transform: str | None, 
             raise InputError(f"{file}: takes the ground of {camera.path} to altitudes of {ends}: {what}")
         direct = isinstance(camera.model, RPC) and camera.model.direct is not None
         options = replace(FitOptions(), precision=CARRIERS[carrier].precision, localisation=direct)
-        out.append(_moved(camera, correction_of(matrix, middle), (low, high), options))
-    _tell(matrix, middle)
+        out.append(_refitted(camera, correction_of(matrix, middle), (low, high), options))
+    _tell_motion(matrix, middle)
     return out
 
 
@@ -97,7 +97,7 @@ def _check_position(move: Array, ground: Array) -> None:
             )
 
 
-def _moved(camera: Camera, correction: Correction, alt_range: tuple[float, float], options: FitOptions) -> Camera:
+def _refitted(camera: Camera, correction: Correction, alt_range: tuple[float, float], options: FitOptions) -> Camera:
     """Return a camera behind a correction, refitted; an RPC over all that it states, where one holds that exactly.
 
     The image may be a crop of what the RPC is made for: fitted over the crop alone it is no camera of the rest.
@@ -109,9 +109,11 @@ def _moved(camera: Camera, correction: Correction, alt_range: tuple[float, float
             warnings.simplefilter("ignore", BarpcWarning)  # of what lies beyond the image
             size, ridge = (high[0] - low[0], high[1] - low[1]), replace(options, method="ridge")
             fit = fit_rpc(moving, size, alt_range, options=ridge, strict=False)
-            if fit.max_ckp.max() <= _EXACT and not fit.verdict(options.tolerance):
-                return _told(replace(camera, model=fit.rpc.crop(-low[0], -low[1]), alt_range=alt_range), fit, _MOVED)
-    return refitted(camera, Corrected(camera.model, correction), alt_range, options, _MOVED)
+            if fit.max_ckp.max() <= _EXACT_REFIT and not fit.verdict(options.tolerance):
+                return _announced(
+                    replace(camera, model=fit.rpc.crop(-low[0], -low[1]), alt_range=alt_range), fit, _MOVED_NOTE
+                )
+    return refitted(camera, Corrected(camera.model, correction), alt_range, options, _MOVED_NOTE)
 
 
 def _domain(rpc: RPC, size: tuple[int, int]) -> tuple[list[int], list[int]]:
@@ -129,19 +131,19 @@ def refitted(
     fit = fit_rpc(model, camera.extent, alt_range, options=options, strict=False)
     if wrong := fit.verdict(options.tolerance):
         raise FitError(f"{camera.path}: {wrong} ('barpc fit --keep-going' writes it all the same)")
-    return _told(replace(camera, model=fit.rpc, alt_range=alt_range), fit, done)
+    return _announced(replace(camera, model=fit.rpc, alt_range=alt_range), fit, done)
 
 
-def _told(camera: Camera, fit: RpcFit, done: str) -> Camera:
+def _announced(camera: Camera, fit: RpcFit, done: str) -> Camera:
     remark(f"{camera.path}: {done} to {float(fit.max_ckp.max()):.1g} px")
     return camera
 
 
-def _tell(matrix: Array, middle: Array) -> None:
+def _tell_motion(matrix: Array, middle: Array) -> None:
     """Say what the motion is at the middle of the images, and what the digits of its matrix are worth there."""
     at, stretch = ground_from_ecef(middle), np.linalg.svd(matrix[:, :3], compute_uv=False)
     rounding = float((stretch[0] - stretch[-1]) / stretch.mean() * np.linalg.norm(middle))
-    if rounding > _TOLD:
+    if rounding > _NOTEWORTHY_ROUNDING:
         remark(f"the matrix is written with few digits: it places the ground to some {rounding:.2g} m only")
     east, north, up = enu_basis(at) @ (matrix @ np.append(middle, 1.0) - middle)
     scale, place = float(stretch.mean()), f"lon {at[0]:.7f}, lat {at[1]:.7f}"

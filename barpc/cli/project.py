@@ -18,8 +18,8 @@ import numpy as np
 from barpc.base.errors import BarpcError, InputError
 from barpc.base.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.base.options import GEOID_HELP
-from barpc.base.remote import Place
-from barpc.base.sidefile import TABLE, opened_text
+from barpc.base.remote import PathOrUrl
+from barpc.base.safe_io import TABLE, opened_text
 from barpc.cameras import open_camera, split_spec
 from barpc.cli.terminal import echo, remark, tell_gate, wants_json
 from barpc.rasters.dem import Dem, localize_on_terrain
@@ -27,8 +27,8 @@ from barpc.scene import BoolArray, Camera
 from barpc.sensor import geometry
 from barpc.sensor.rpc import RPC
 
-_SAME = 0.01  # deg: places that are one; others that are seen alike lie degrees away
-_APART = 1.0  # px: lines of sight that a point's places miss by as much (RMS) do not meet
+_SAME_PLACE = 0.01  # deg: places that are one; others that are seen alike lie degrees away
+_MAX_INTERSECTION_ERROR = 1.0  # px: lines of sight that a point's places miss by as much (RMS) do not meet
 _NUMBERS = {"ignore_unknown_options": True}  # -3.5 is a number, not an option
 
 
@@ -61,7 +61,7 @@ def with_heights(alt: str, both: bool = False) -> Callable[[Function], Function]
     return added
 
 
-def altitude_of(camera: Camera, image: Place, given: float | None = None) -> float:
+def altitude_of(camera: Camera, image: PathOrUrl, given: float | None = None) -> float:
     """Return the altitude of an image's ground [m]: as given, of the tie points of its run, else the camera's middle.
 
     Where nothing is known of the ground a line says so, and what that may be worth.
@@ -114,12 +114,12 @@ def exchanged(camera: Camera, ground: Array) -> str:
     if not len(ground) or (camera.size is None and not isinstance(camera.model, RPC)):
         return ""
     swapped = ground[:, [1, 0, 2]]
-    if _near(camera, ground).any() or not _near(camera, swapped[np.abs(swapped[:, 1]) <= 90.0]).any():
+    if _on_image(camera, ground).any() or not _on_image(camera, swapped[np.abs(swapped[:, 1]) <= 90.0]).any():
         return ""
     return "far off the image, and on it with longitude and latitude exchanged: give LON first, then LAT"
 
 
-def _near(camera: Camera, ground: Array) -> BoolArray:
+def _on_image(camera: Camera, ground: Array) -> BoolArray:
     """Return which points (N, 3) are on the image, or less than its size off it: as stated, or that of an RPC alone.
 
     Far out an RPC comes near its image again; there it shows another place.
@@ -131,21 +131,21 @@ def _near(camera: Camera, ground: Array) -> BoolArray:
     image = camera.model.project(ground)
     near = np.asarray((np.abs(image - middle) <= 1.5 * side).all(axis=1))
     off = camera.model.localize(image[near], ground[near, 2]) - ground[near]
-    near[near] = (np.abs(np.column_stack([wrap_longitude(off[:, 0]), off[:, 1]])) <= _SAME).all(axis=1)
+    near[near] = (np.abs(np.column_stack([wrap_longitude(off[:, 0]), off[:, 1]])) <= _SAME_PLACE).all(axis=1)
     return near
 
 
 # --- the verbs ---------------------------------------------------------------------------------------------
 
 
-def _points(columns: str) -> Callable[..., Any]:
+def _points_option(columns: str) -> Callable[..., Any]:
     return click.option("--points", metavar="FILE", help=f"CSV with {columns}; - is standard input.")
 
 
 @click.command("project", context_settings=_NUMBERS)
 @click.argument("image")
 @click.argument("numbers", nargs=-1, type=float, metavar="[LON LAT ALT]...")
-@_points("lon, lat, alt")
+@_points_option("lon, lat, alt")
 @with_heights("Altitude of points without one [m above the ellipsoid].", both=True)
 def project(image: str, numbers: tuple[float, ...], points: str | None, alt: float | None, terrain: Dem | None) -> int:
     r"""Print the image points (col, row; the first pixel's centre is 0, 0) of ground points.
@@ -169,7 +169,7 @@ def project(image: str, numbers: tuple[float, ...], points: str | None, alt: flo
 @click.command("localize", context_settings=_NUMBERS)
 @click.argument("image")
 @click.argument("numbers", nargs=-1, type=float, metavar="[COL ROW]...")
-@_points("col, row and perhaps alt")
+@_points_option("col, row and perhaps alt")
 @with_heights(
     "Altitude of points without one [m].  [default: of the run's tie points, else the middle of the camera's]",
     both=True,
@@ -194,7 +194,7 @@ def localize(image: str, numbers: tuple[float, ...], points: str | None, alt: fl
 @click.command("triangulate", context_settings=_NUMBERS)
 @click.argument("images", nargs=-1, required=True, metavar="IMAGE IMAGE...")
 @click.option("--at", type=(float, float), multiple=True, help="COL ROW, once for each image.")
-@_points("col1, row1, col2, row2, ...")
+@_points_option("col1, row1, col2, row2, ...")
 def triangulate(images: tuple[str, ...], at: tuple[tuple[float, float], ...], points: str | None) -> int:
     r"""Print the ground points where the lines of sight of several images meet, and the error that is left.
 
@@ -223,7 +223,7 @@ def triangulate(images: tuple[str, ...], at: tuple[tuple[float, float], ...], po
     with np.errstate(invalid="ignore", divide="ignore"):
         table[:count, 3] = np.sqrt(square / np.bincount(point, minlength=count))
     _print_points(("lon", "lat", "alt", "error"), table, (10, 10, 4, 4))
-    apart = np.flatnonzero(table[:, 3] >= _APART)
+    apart = np.flatnonzero(table[:, 3] >= _MAX_INTERSECTION_ERROR)
     if not len(apart):
         return _tell_failures(table[:, :1], "could not be intersected")
     failed = int(np.isnan(table[:, 0]).sum())
@@ -243,7 +243,7 @@ def given_points(numbers: Sequence[float], file: str | None, names: Sequence[str
     """
     if file is not None:
         with nullcontext(sys.stdin) if file == "-" else opened_text(file, TABLE, newline="") as stream:
-            return _table(stream, file, names, fill)
+            return _point_table(stream, file, names, fill)
     width = len(names) if fill is None else len(names) - 1
     if not numbers or len(numbers) % width:
         wanted = " ".join(names[:width]).upper()
@@ -252,9 +252,9 @@ def given_points(numbers: Sequence[float], file: str | None, names: Sequence[str
     return points if fill is None else np.column_stack([points, np.full(len(points), fill)])
 
 
-def _table(lines: Iterable[str], file: str, names: Sequence[str], fill: float | None) -> Array:
+def _point_table(lines: Iterable[str], file: str, names: Sequence[str], fill: float | None) -> Array:
     columns, found, width = list[int](), array("d"), len(names)
-    for row in filter(None, map(_cells, lines)):
+    for row in filter(None, map(_split_line, lines)):
         if not columns:
             columns = list(range(width))
             if not _is_number(row[0]):
@@ -276,7 +276,7 @@ def _table(lines: Iterable[str], file: str, names: Sequence[str], fill: float | 
     return np.array(found).reshape(-1, width)
 
 
-def _cells(line: str) -> list[str]:
+def _split_line(line: str) -> list[str]:
     line = line.split("#", 1)[0].strip()
     return next(csv.reader([line])) if "," in line else line.split()
 

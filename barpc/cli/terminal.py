@@ -37,12 +37,12 @@ if TYPE_CHECKING:
 EXIT_GATE = 3
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 MOST_LINES = 60  # of a summary, whatever its size
-_USUAL = 80  # columns of a terminal
+_TERMINAL_COLUMNS = 80  # columns of a terminal
 _LIMITS = {
     "views": "{:,} images, none with a reservation: all {}",
     "pairs": "{:,} pairs, none with an epipolar offset of more than 0.5 px (RMS): all {}",
 }
-GAP = "  "
+COLUMN_GAP = "  "
 _REASONS = 5  # in the line that says why a run does not pass
 NARROWEST = 12  # The first column of a table is not folded below so many characters
 _COLORS = {"good": "green", "look": "yellow", "bad": "red"}
@@ -105,14 +105,14 @@ def print_summary(summary: Summary, root: str = "") -> None:
 
     `root`: that of the files that were written.
     """
-    from barpc.report.verdict import LINES, SHOWN, sentences
+    from barpc.report.verdict import TABLE_ROWS_SHOWN, VERDICT_SENTENCES, sentences
 
     width, lines = output_width(), sentences(summary)
-    counted = width and max(width, _USUAL)  # nothing is dropped because a terminal is narrow
-    for rows in range(SHOWN, 0, -1):
+    counted = width and max(width, _TERMINAL_COLUMNS)  # nothing is dropped because a terminal is narrow
+    for rows in range(TABLE_ROWS_SHOWN, 0, -1):
         tables = _tables(summary, rows)
         room = MOST_LINES - 3 - bool(root) - sum(_height(table, counted) for table in tables)
-        if room >= min(len(lines), LINES):
+        if room >= min(len(lines), VERDICT_SENTENCES):
             break
     for title, texts, more in tables:
         _echo_table(title, texts, width, more)
@@ -131,10 +131,10 @@ def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str
     """Return titles, cells and what is said of the rest: of more rows the worst of those that pass a limit."""
     from barpc.report import verdict
     from barpc.report.records import table
-    from barpc.report.summary.known import GCPS, GcpEntry
+    from barpc.report.summary.block import DATUM, DatumEntry
+    from barpc.report.summary.ground_points import GCP_CAPTION, GcpEntry
     from barpc.report.summary.pairs import PairEntry
     from barpc.report.summary.views import ViewEntry
-    from barpc.report.summary.whole import DATUM, DatumEntry
 
     views, pairs, adjusted = summary.views, summary.pairs, summary.adjusted
     some_views = views if len(views) <= rows else verdict.flagged(views)[:rows]
@@ -149,7 +149,7 @@ def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str
     wanted = (
         (table("views", errors, some_views, ViewEntry, ViewEntry.TERMINAL, adjusted), len(views), places[0]),
         (table("pairs", offsets, some_pairs, PairEntry, PairEntry.TERMINAL, adjusted), len(pairs), places[1]),
-        (table("gcps", GCPS, gcps, GcpEntry, GcpEntry.TERMINAL), len(summary.gcps), places[0]),
+        (table("gcps", GCP_CAPTION, gcps, GcpEntry, GcpEntry.TERMINAL), len(summary.gcps), places[0]),
         (table("datum", DATUM, datum, DatumEntry, DatumEntry.columns(datum)), len(datum), ""),
     )
     found = []
@@ -187,14 +187,14 @@ def print_comparison(comparison: Mapping[str, Any]) -> None:
     heads = ["image", "points A", "points B", "error A [px]", "error B [px]", "RPCs differ [px]"]
     views = [[*heads, "without shift [px]"]]
     for view in comparison["views"]:
-        numbers = [*map(str, view["num_observations"]), *map(_number, view["rmse"])]
+        numbers = [*map(str, view["num_observations"]), *map(_three_decimals, view["rmse"])]
         differences = [view["rpc_difference_px"], view["rpc_difference_without_shift_px"]]
         numbers += ["-" if value is None else f"{value:.2g}" for value in differences]
         views.append([view["name"], *numbers])
     _echo_table("Reprojection error (RMS) and RPC files", views, width)
     pairs = [["pair", "matches A", "matches B", "offset A [px]", "offset B [px]"]]
     for pair in comparison["pairs"]:
-        numbers = [*map(str, pair["num_matches"]), *map(_number, pair["epipolar_rms"])]
+        numbers = [*map(str, pair["num_matches"]), *map(_three_decimals, pair["epipolar_rms"])]
         pairs.append([f"{pair['a']} - {pair['b']}", *numbers])
     if len(pairs) > 1:
         _echo_table("Epipolar offset (RMS)", pairs, width)
@@ -226,10 +226,10 @@ def layout(table: Sequence[Sequence[str]], width: int | None) -> list[str]:
     """
     heads, rows = table[0], table[1:]
     numbers = [max(map(len, column)) for column in zip(*table, strict=True)]
-    if width is None or sum(numbers) + len(GAP) * (len(heads) - 1) <= width:
-        return [_line(row, numbers) for row in table]
+    if width is None or sum(numbers) + len(COLUMN_GAP) * (len(heads) - 1) <= width:
+        return [_table_row(row, numbers) for row in table]
     narrow = [max(map(len, [*head.split(), *column])) for head, *column in zip(*table, strict=True)]
-    room = width - sum(narrow[1:]) - len(GAP) * (len(heads) - 1)
+    room = width - sum(narrow[1:]) - len(COLUMN_GAP) * (len(heads) - 1)
     if room < min(narrow[0], NARROWEST):
         cells = ((f"  {head}: {cell}" for head, cell in zip(heads[1:], row[1:], strict=True)) for row in rows)
         return [line for row, block in zip(rows, cells, strict=True) for line in (row[0], *block)]
@@ -237,16 +237,16 @@ def layout(table: Sequence[Sequence[str]], width: int | None) -> list[str]:
     broken = [textwrap.wrap(head, size) for head, size in zip(heads, widths, strict=True)]
     depth = max(map(len, broken))
     deep = ([""] * (depth - len(head)) + head for head in broken)
-    lines = [_line(row, widths) for row in zip(*deep, strict=True)]
+    lines = [_table_row(row, widths) for row in zip(*deep, strict=True)]
     for row in rows:
         first, *folded = textwrap.wrap(row[0], widths[0]) or [""]
-        lines += [_line([first, *row[1:]], widths), *folded]
+        lines += [_table_row([first, *row[1:]], widths), *folded]
     return lines
 
 
-def _line(row: Sequence[str], widths: Sequence[int]) -> str:
+def _table_row(row: Sequence[str], widths: Sequence[int]) -> str:
     numbers = (cell.rjust(size) for cell, size in zip(row[1:], widths[1:], strict=True))
-    return GAP.join([row[0].ljust(widths[0]), *numbers]).rstrip()
+    return COLUMN_GAP.join([row[0].ljust(widths[0]), *numbers]).rstrip()
 
 
 def _echo_table(title: str, table: Sequence[Sequence[str]], width: int | None, more: str = "") -> None:
@@ -261,7 +261,7 @@ def _echo_lines(lines: Sequence[str], width: int | None) -> None:
         echo(line if width is None else textwrap.fill(line, width, break_on_hyphens=False))
 
 
-def _number(value: float | None) -> str:
+def _three_decimals(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
 
 

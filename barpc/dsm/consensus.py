@@ -18,7 +18,7 @@ from barpc.base.geodesy import Array
 from barpc.scene import BoolArray
 
 F32 = npt.NDArray[np.float32]
-REACH = 12
+NEIGHBOUR_RADIUS = 12
 """Cells that neighbours are away at most; every second one each way is asked.
 
 Matches up to two windows apart (7 cells of two pixels) look at the same pixels and are wrong together, so evidence
@@ -29,11 +29,13 @@ SURROUNDED = 0.4
 
 Beyond a straight border of what others see they are fewer from two cells on, where a slope may lead away from them.
 """
-_AWAY = range(-REACH, REACH + 1, 2)
-_NEIGHBOURS = [(down, right) for down in _AWAY for right in _AWAY if 0 < down**2 + right**2 <= REACH**2]
+_AWAY = range(-NEIGHBOUR_RADIUS, NEIGHBOUR_RADIUS + 1, 2)
+_NEIGHBOUR_OFFSETS = [
+    (down, right) for down in _AWAY for right in _AWAY if 0 < down**2 + right**2 <= NEIGHBOUR_RADIUS**2
+]
 
 
-def median(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def finite_median(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return the median along the first axis of what is known; NaN where nothing is."""
     ranked, num = np.sort(values, axis=0), np.isfinite(values).sum(axis=0)  # NaN comes last
     low, high = (np.take_along_axis(ranked, at[None], axis=0)[0] for at in ((num - 1) // 2, num // 2))
@@ -51,30 +53,36 @@ def consensus(heights: F32, metres: F32) -> BoolArray:
     known = np.isfinite(heights)
     if len(heights) == 1:
         return known
-    level, within, agree = _levelled(heights), np.maximum(metres[:, None], metres), np.zeros(heights.shape, np.int8)
+    level, within, agree = (
+        _without_offset(heights),
+        np.maximum(metres[:, None], metres),
+        np.zeros(heights.shape, np.int8),
+    )
     for other, most in zip(level, within, strict=True):
         agree += np.abs(level - other) <= most[:, None, None]
     first = agree.argmax(axis=0)
     taken: BoolArray = np.abs(level - np.take_along_axis(level, first[None], axis=0)) <= within[:, first]
     rival, single = known & (agree == agree.max(axis=0)), known.sum(axis=0) == 1
     tied = (rival & ~taken).any(axis=0)
-    sure = np.where(tied | single, np.nan, median(np.where(taken, level, np.nan)))
-    asked = tied | (single & maximum_filter(np.isfinite(sure), 2 * REACH + 1))  # where nobody is near none refuses
+    sure = np.where(tied | single, np.nan, finite_median(np.where(taken, level, np.nan)))
+    asked = tied | (
+        single & maximum_filter(np.isfinite(sure), 2 * NEIGHBOUR_RADIUS + 1)
+    )  # where nobody is near none refuses
     rival, level, single = rival[:, asked], level[:, asked], single[asked]
     votes, witnesses = _votes(sure, np.where(rival, level, np.nan), metres, np.nonzero(asked))
     votes[~rival] = -1
     best = votes.argmax(axis=0)
     chosen = np.abs(level - np.take_along_axis(level, best[None], axis=0)) <= within[:, best]
     others = np.where(rival & ~chosen, votes, -1).max(axis=0)
-    free = single & (witnesses < SURROUNDED * len(_NEIGHBOURS))
+    free = single & (witnesses < SURROUNDED * len(_NEIGHBOUR_OFFSETS))
     taken[:, asked] = chosen & ((votes.max(axis=0) > np.maximum(others, 0)) | free)
     return taken
 
 
-def _levelled(heights: F32) -> F32:
+def _without_offset(heights: F32) -> F32:
     """Return the heights without what a pair is off all over, as cameras move them: that is no contradiction."""
     several = np.isfinite(heights).sum(axis=0) > 1
-    apart = [one[several & np.isfinite(one)] for one in heights - median(heights)]
+    apart = [one[several & np.isfinite(one)] for one in heights - finite_median(heights)]
     off = np.array([np.median(one) if len(one) else 0.0 for one in apart], np.float32)
     return np.asarray(heights - off[:, None, None])
 
@@ -85,9 +93,9 @@ def _votes(
     """Return how many neighbouring heights agree with each of the candidates (K, n) of n cells, and how many are
     known (n,).
     """
-    around, (row, col) = np.pad(sure, REACH, constant_values=np.nan), (one + REACH for one in at)
+    around, (row, col) = np.pad(sure, NEIGHBOUR_RADIUS, constant_values=np.nan), (one + NEIGHBOUR_RADIUS for one in at)
     votes, witnesses = np.zeros(candidates.shape, np.int16), np.zeros(len(row), np.int16)
-    for down, right in _NEIGHBOURS:
+    for down, right in _NEIGHBOUR_OFFSETS:
         neighbour = around[row + down, col + right]
         votes += np.abs(candidates - neighbour) <= metres[:, None]
         witnesses += np.isfinite(neighbour)

@@ -17,26 +17,26 @@ import scipy.linalg as la
 from rasterio.warp import transform
 
 from barpc.ba import BlockPrior
-from barpc.ba.estimated.projected import Cameras
-from barpc.ba.estimated.unknowns import make_unknowns
+from barpc.ba.parameters.projected import Cameras
+from barpc.ba.parameters.unknowns import make_unknowns
 from barpc.ba.result import height_by_unknowns
 from barpc.base.errors import BarpcError, InputError
 from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, parts
 from barpc.base.options import TieOptions
 from barpc.base.remote import is_url
-from barpc.base.usual import MAD
+from barpc.base.statistics import MAD
 from barpc.cameras import open_camera
-from barpc.dsm.consensus import F32, consensus, median
+from barpc.dsm.consensus import F32, consensus, finite_median
 from barpc.export.shots import read_scene
 from barpc.pipeline import load_views
-from barpc.pipeline.inputs import PRIOR
+from barpc.pipeline.inputs import PRIOR_FILE
 from barpc.report.runfiles import read_summary, table_path
 from barpc.report.summary import Summary
 from barpc.rpcio.grids import CORRECTION
 from barpc.scene import View
 from barpc.sensor.geometry import is_radar, triangulate
 from barpc.tie.pairing.overlaps import overlapping_pairs
-from barpc.tie.patches.dense import ACROSS, FINER, WINDOW, DenseMatches, dense_matches, epipolar_frame
+from barpc.tie.patches.dense import ACROSS, COLUMNS_PER_PIXEL, WINDOW, DenseMatches, dense_matches, epipolar_frame
 
 logger = logging.getLogger(__name__)
 
@@ -45,19 +45,19 @@ MATCHED = 0.2
 
 Of pictures of different ground 2 to 11 % are (22 trials, rendered, and real ones turned over), of pairs 92 to 97 %.
 """
-NODES = 5
+TILE_NODES = 5
 """Places a side of a tile, at which cameras are asked."""
-_LEVELS = 3  # altitudes
-_SPAN = 128.0  # px of disparity that are searched at once, else a coarser picture says where
+_NUM_ALTITUDES = 3  # altitudes
+_MAX_DISPARITY_SPAN = 128.0  # px of disparity that are searched at once, else a coarser picture says where
 _COARSE = 8  # times a pixel at most of the coarser picture
-_ROOM = 4.0  # px of the coarser picture that heights may lie beyond what it shows
+_HEIGHT_ALLOWANCE = 4.0  # px of the coarser picture that heights may lie beyond what it shows
 _SPLIT = 3  # times that a part is halved at most
 
-Found = tuple[Array, Array, float, float]
+TilePoints = tuple[Array, Array, float, float]
 """Ground points (n, 3), their standard deviations in height (n,) [m], the share of the pixels matched, and the height
 that a pixel of disparity stands for [m].
 """
-ANGLES = 2.0, 45.0
+CONVERGENCE_RANGE = 2.0, 45.0
 """Convergence angles [deg] of pairs that are matched: below, a pixel is 30 of height; above, SGBM finds decoys."""
 _RADAR = ("sentinel-1", "terrasar-x", "sicd")
 
@@ -91,7 +91,7 @@ class Tile:
         near = partial(replace, self, step=self.step / 2)
         return [near(west=self.west + i * width, north=self.north - j * height) for j in (0, 1) for i in (0, 1)]
 
-    def nodes(self, count: tuple[int, int] = (NODES, NODES), edge: float = 0.0) -> Array:
+    def nodes(self, count: tuple[int, int] = (TILE_NODES, TILE_NODES), edge: float = 0.0) -> Array:
         """Return the longitude, latitude (rows cols, 2) [deg] of a grid, `edge` cells inside, the north first."""
         col, row = np.meshgrid(*(np.linspace(edge, side - edge, n) for side, n in zip(self.size, count, strict=True)))
         east, north = self.west + self.step * col.ravel(), self.north - self.step * row.ravel()
@@ -99,7 +99,7 @@ class Tile:
 
     def ground(self) -> Array:
         """Return the ground points (NODES NODES, 3) of the nodes at the middle altitude."""
-        return np.column_stack([self.nodes(), np.full(NODES**2, sum(self.alts) / 2)])
+        return np.column_stack([self.nodes(), np.full(TILE_NODES**2, sum(self.alts) / 2)])
 
 
 def surface_tile(pairs: Sequence[tuple[View, View]], tile: Tile, band: int) -> tuple[F32, ...]:
@@ -116,33 +116,33 @@ def surface_tile(pairs: Sequence[tuple[View, View]], tile: Tile, band: int) -> t
     cells = np.full((2, len(pairs), tile.size[1], tile.size[0]), np.nan, np.float32)
     shares, metres = np.full((2, len(pairs)), np.nan, np.float32)
     for k, pair in enumerate(pairs):
-        if found := _points(pair, tile, band):
+        if found := _tile_points(pair, tile, band):
             ground, sigma, share, pixel = zip(*found, strict=True)
             shares[k], metres[k] = np.mean(share), np.max(pixel)
             if shares[k] >= MATCHED:
                 cells[:, k] = gathered(tile, np.concatenate(ground), np.concatenate(sigma))
     taken = consensus(cells[0], metres)
-    height = median(np.where(taken, cells[0], np.nan))
+    height = finite_median(np.where(taken, cells[0], np.nan))
     several = np.isfinite(cells[0]).sum(axis=0) > 1
-    nmad = np.where(several, MAD * median(np.abs(cells[0] - height)), np.nan)
+    nmad = np.where(several, MAD * finite_median(np.abs(cells[0] - height)), np.nan)
     seen = np.tensordot(1 << np.arange(len(pairs)), taken, axes=1)
     total, count = np.where(taken, cells[1] ** 2, 0.0).sum(axis=0), np.where(seen > 0, taken.sum(axis=0), np.nan)
     return (*(one.astype(np.float32) for one in (height, nmad, np.sqrt(total / count), seen)), shares)
 
 
-def _points(pair: tuple[View, View], tile: Tile, band: int, halved: int = 0) -> list[Found]:
+def _tile_points(pair: tuple[View, View], tile: Tile, band: int, halved: int = 0) -> list[TilePoints]:
     """Return what is found of a tile, part by part; of one unseen nothing. Coarser pictures narrow the altitudes."""
     zoom, nodes = _COARSE, tile.nodes()
     while True:
-        levels = np.repeat(np.linspace(tile.alts[0], max(tile.alts[1], tile.alts[0] + 1.0), _LEVELS), len(nodes))
-        ground = np.column_stack([np.tile(nodes, (_LEVELS, 1)), levels])
+        levels = np.repeat(np.linspace(tile.alts[0], max(tile.alts[1], tile.alts[0] + 1.0), _NUM_ALTITUDES), len(nodes))
+        ground = np.column_stack([np.tile(nodes, (_NUM_ALTITUDES, 1)), levels])
         a, b = (view.sensor.project(ground) + 0.5 for view in pair)
         if not np.isfinite(a + b).all():
             return []
         frame = epipolar_frame(a - 0.5, b - 0.5, levels)
-        zoom = min(zoom, 1 << max(0, int(np.ceil(np.log2(frame.num / (FINER * _SPAN))))))
+        zoom = min(zoom, 1 << max(0, int(np.ceil(np.log2(frame.num / (COLUMNS_PER_PIXEL * _MAX_DISPARITY_SPAN))))))
         if zoom == 1 and frame.across > ACROSS and halved < _SPLIT:
-            return [one for part in tile.quarters() for one in _points(pair, part, band, halved + 1)]
+            return [one for part in tile.quarters() for one in _tile_points(pair, part, band, halved + 1)]
         frame = epipolar_frame(a / zoom - 0.5, b / zoom - 0.5, levels)  # of pictures of means of `zoom` px a side
         sizes = [(view.size[0] // zoom, view.size[1] // zoom) for view in pair]
         found = dense_matches([view.path for view in pair], sizes, frame, band)
@@ -153,7 +153,7 @@ def _points(pair: tuple[View, View], tile: Tile, band: int, halved: int = 0) -> 
         ground = ground[known]
         if zoom == 1 or found.share < MATCHED or not len(ground):
             return [(ground, found.sigma[known] * frame.metres, found.share, frame.metres)]
-        low, high = np.percentile(ground[:, 2], [1.0, 99.0]) + np.array([-1.0, 1.0]) * _ROOM * frame.metres
+        low, high = np.percentile(ground[:, 2], [1.0, 99.0]) + np.array([-1.0, 1.0]) * _HEIGHT_ALLOWANCE * frame.metres
         tile = replace(tile, alts=(max(tile.alts[0], float(low)), min(tile.alts[1], float(high))))
         zoom //= 2
 
@@ -180,11 +180,11 @@ def gathered(tile: Tile, ground: Array, sigma: Array) -> F32:
     cells = np.full((2, height * width), np.nan, np.float32)
     cells[0, of] = (alt[order[start + (count - 1) // 2]] + alt[order[start + count // 2]]) / 2
     total = np.bincount(cell, sigma[inside] ** 2, height * width)[of]
-    cells[1, of] = np.sqrt(total / count) * averaged(np.sqrt(count))
+    cells[1, of] = np.sqrt(total / count) * noise_of_mean(np.sqrt(count))
     return cells.reshape(2, height, width)
 
 
-def averaged(side: Array) -> Array:
+def noise_of_mean(side: Array) -> Array:
     """Return what is left of sigma in the mean of `side` x `side` matches, which look at much the same.
 
     Each is a mean over WINDOW of steps that look at WINDOW pixels: matches correlate as a cubic B-spline of their
@@ -253,7 +253,7 @@ class CameraErrors:
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class StereoBlock:
     """Views with the cameras that are believed, their pairs, and the errors of the cameras where known.
 
     `run`: what was said of the run that they are of.
@@ -266,7 +266,7 @@ class Block:
     run: Summary | None = None
 
 
-def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: str | None = None) -> Block:
+def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: str | None = None) -> StereoBlock:
     """Return the images of a finished run behind its corrected cameras; altitudes by its tie points unless given.
 
     `minus`: a run of some of these images (an earlier one, that this one went on from); they are another group then.
@@ -304,18 +304,18 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: s
             "is told by a run with at least two images of each, minus one of a single date: adjust both together"
         )
     flagged = frozenset(i for i, shot in enumerate(scene.shots) if shot.entry.advice)
-    groups = [_best(views, worth, flagged, part) for part in parts]
-    errors = CameraErrors.of(BlockPrior.load(table_path(folder, PRIOR)), views)
+    groups = [_ranked_pairs(views, worth, flagged, part) for part in parts]
+    errors = CameraErrors.of(BlockPrior.load(table_path(folder, PRIOR_FILE)), views)
     images = " minus ".join(", ".join(views[i].name for i in part) for part in parts)
-    return Block(views, groups, images, errors, scene.summary)
+    return StereoBlock(views, groups, images, errors, scene.summary)
 
 
-def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = None, band: int = 1) -> Block:
+def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = None, band: int = 1) -> StereoBlock:
     """Return the images with the cameras that come with them; altitudes are those of the cameras unless given."""
     views = [replace(view, alt_range=alts or view.alt_range) for view in load_views(images, band=band).views]
     for view in views:
         _refuse_radar(view.name, is_radar(view.sensor))
-    return Block(views, [_best(views)], ", ".join(view.name for view in views))
+    return StereoBlock(views, [_ranked_pairs(views)], ", ".join(view.name for view in views))
 
 
 def _refuse_radar(name: str, radar: bool) -> None:
@@ -323,7 +323,7 @@ def _refuse_radar(name: str, radar: bool) -> None:
         raise NoSurfaceError(f"{name}: a radar image: its speckle and layover are nothing that SGBM matches")
 
 
-def _best(
+def _ranked_pairs(
     views: Sequence[View],
     ties: dict[Link, float] | None = None,
     flagged: frozenset[int] = frozenset(),
@@ -339,14 +339,14 @@ def _best(
     found = [pair for pair in found if among is None or set(pair.views) <= set(among)]
     rows = []
     for pair in found:
-        if ANGLES[0] <= pair.angle <= ANGLES[1]:
+        if CONVERGENCE_RANGE[0] <= pair.angle <= CONVERGENCE_RANGE[1]:
             worth = (pair.score if ties is None else ties[pair.views]) * np.tan(np.radians(pair.angle)) ** 2
             dates = {views[i].date for i in pair.views}
             rows.append((len(dates), not flagged.isdisjoint(pair.views), -worth, pair.views))
     if not rows:
         said = [f"{views[p.views[0]].name} and {views[p.views[1]].name} {p.angle:.1f} deg" for p in found[:3]]
         raise NoSurfaceError(
-            f"no pair meets under {ANGLES[0]:g} to {ANGLES[1]:g} degrees, where SGBM can match "
+            f"no pair meets under {CONVERGENCE_RANGE[0]:g} to {CONVERGENCE_RANGE[1]:g} degrees, where SGBM can match "
             f"({'; '.join(said) or 'no two images overlap at the altitudes that they are used for'})"
         )
     rows.sort()

@@ -33,15 +33,15 @@ from barpc.base.atomic import refuse_existing, replacing
 from barpc.base.errors import BarpcError, InputError, OutputError
 from barpc.base.geodesy import Array, utm
 from barpc.base.options import DsmOptions
-from barpc.base.sidefile import plain_path
+from barpc.base.safe_io import plain_path
 from barpc.cameras import open_camera
 from barpc.dsm.consensus import F32
 from barpc.dsm.stereo import (
     MATCHED,
-    NODES,
-    Block,
+    TILE_NODES,
     Groups,
     NoSurfaceError,
+    StereoBlock,
     Tile,
     block_of_images,
     block_of_run,
@@ -49,7 +49,7 @@ from barpc.dsm.stereo import (
 )
 from barpc.pipeline.executor import CachingExecutor, worker_count
 from barpc.pipeline.outputs import remake_report
-from barpc.rasters.raster import BLOCK, hashed, open_raster
+from barpc.rasters.raster import BLOCK_SIZE, hashed, open_raster
 from barpc.report.page import can_render
 from barpc.report.runfiles import FOLDER, SURFACE, run_key
 from barpc.report.summary import Summary
@@ -72,7 +72,7 @@ BANDS = (
 )
 CHANGE = "height minus that of the other images [m]"
 SHARED = "SIGMA_SHARED_BY_ALL_CELLS_M"
-_LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])  # from the north-west, 45 degrees up
+_SHADING_DIRECTION = np.array([-0.5, 0.5, np.sqrt(0.5)])  # from the north-west, 45 degrees up
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def make_dsm(
     if out.is_dir() or out.resolve() in {Path(view.path).resolve() for view in block.views}:
         raise OutputError(f"{out}: is a folder or one of the images; give -o the name of a new file")
     grid = Grid(block, options)
-    _place(out, folder, options.overwrite)
+    _publish(out, folder, options.overwrite)
     room = out.parent / f"{out.name}.unfinished"  # results of tiles, until the file is whole
     try:
         with Workspace(room) as run:
@@ -139,7 +139,7 @@ def make_dsm(
             found = grid.write(out, made, run, executor, progress)
             if folder is not None and block.run is not None and options.minus is None:
                 show_in_report(folder, block.run, block, grid.tiles, made, options.band)
-            _place(out, folder, options.overwrite, made)
+            _publish(out, folder, options.overwrite, made)
     except NoSurfaceError:
         shutil.rmtree(room, ignore_errors=True)
         raise
@@ -147,7 +147,7 @@ def make_dsm(
     return found
 
 
-def _place(out: Path, folder: Path | None, overwrite: bool, made: Path | None = None) -> None:
+def _publish(out: Path, folder: Path | None, overwrite: bool, made: Path | None = None) -> None:
     """Give a file its place, in the folder of its run as one of the run's own; without a file ask whether it may."""
     if folder is None or out.parent.resolve() != folder.resolve():
         refuse_existing(out, overwrite)
@@ -168,7 +168,7 @@ class Grid:
     pairs of each group there.
     """
 
-    def __init__(self, block: Block, options: DsmOptions) -> None:
+    def __init__(self, block: StereoBlock, options: DsmOptions) -> None:
         self.block, self.options, views = block, options, block.views
         middles = [v.sensor.localize((np.array(v.size) - 1) / 2, np.array(v.altitude)) for v in views]
         crs = _crs(options.crs, middles[block.groups[0][0][0]])
@@ -179,9 +179,9 @@ class Grid:
                 f"--gsd {step:g}: a pixel of {min(pixels):.2g} m has one match, so fewer than {100 * MATCHED:.0f} % of "
                 "such cells would have a height"
             )
-        if step > 2 * BLOCK * max(pixels):
-            raise InputError(f"--gsd {step:g}: a cell of more than {2 * BLOCK} pixels of {max(pixels):.2g} m")
-        outlines = [[_common(views[i], views[j], crs) for i, j in group] for group in block.groups]
+        if step > 2 * BLOCK_SIZE * max(pixels):
+            raise InputError(f"--gsd {step:g}: a cell of more than {2 * BLOCK_SIZE} pixels of {max(pixels):.2g} m")
+        outlines = [[_common_ground(views[i], views[j], crs) for i, j in group] for group in block.groups]
         seen = shapely.intersection_all([shapely.union_all(group) for group in outlines])
         if seen.is_empty:
             raise NoSurfaceError("the images do not overlap at the altitudes that they are used for")
@@ -190,7 +190,7 @@ class Grid:
         size = int(np.ceil(east - west)), int(np.ceil(north - south))
         self.whole = Tile(crs.to_wkt(), west * step, north * step, step, size, common_range(*views))
         # a tile shows about as many pixels, however large its cells are
-        self.side = BLOCK >> max(0, round(np.log2(step / (2 * max(pixels)))))
+        self.side = BLOCK_SIZE >> max(0, round(np.log2(step / (2 * max(pixels)))))
         self.tiles: list[tuple[tuple[int, int], Tile, Groups]] = []
         for row, col in np.ndindex(-(-size[1] // self.side), -(-size[0] // self.side)):
             at = self.side * col, self.side * row
@@ -231,12 +231,12 @@ class Grid:
                 f"of the pixels that both images show {100 * max(share, 0):.0f} % are found back at most, "
                 f"fewer than {100 * MATCHED:.0f} %: other seasons, water, clouds or wrong cameras; nothing is written"
             )
-        layout = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "BLOCKSIZE": str(BLOCK), "BIGTIFF": "IF_SAFER"}
+        layout = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "BLOCKSIZE": str(BLOCK_SIZE), "BIGTIFF": "IF_SAFER"}
         with run.stage("write"), rasterio.Env(GDAL_NUM_THREADS="1"):
             rasterio.shutil.copy(rough, made, driver="COG", **layout)
         with open_raster(made) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # medians of nothing
-            some = file.read([3, 4, 5], out_shape=(3, *(min(side, 2 * BLOCK) for side in file.shape)))
+            some = file.read([3, 4, 5], out_shape=(3, *(min(side, 2 * BLOCK_SIZE) for side in file.shape)))
             medians = map(float, [*np.nanmedian(some, axis=(1, 2)), file.tags().get(SHARED, "nan")])
         used = dict.fromkeys(pair for _, _, groups in self.tiles for group in groups for pair in group)
         pairs = tuple(f"{views[i].name} - {views[j].name}" for i, j in used)
@@ -268,8 +268,8 @@ class Grid:
             free = [min(len(one), len({view for pair in one for view in pair}) - 1) for one in chosen]
             bands[3, cells] = np.sqrt(sum(one[2][cells] ** 2 / n for one, n in zip(results, free, strict=True)))
             if errors is not None:
-                sigma = errors.sigma(errors.rows(chosen, tile.ground()) - shared).reshape(NODES, NODES)
-                at = (np.argwhere(cells) + 0.5) / height.shape * (NODES - 1)
+                sigma = errors.sigma(errors.rows(chosen, tile.ground()) - shared).reshape(TILE_NODES, TILE_NODES)
+                at = (np.argwhere(cells) + 0.5) / height.shape * (TILE_NODES - 1)
                 bands[4, cells] = map_coordinates(sigma, at.T, order=1)
         return bands
 
@@ -277,7 +277,13 @@ class Grid:
         """Open the file to be written, with the words and tags that it is to have."""
         cells = self.whole
         place = {"crs": cells.crs, "transform": Affine(cells.step, 0, cells.west, 0, -cells.step, cells.north)}
-        layout = {"tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK, "SPARSE_OK": True, "BIGTIFF": "IF_SAFER"}
+        layout = {
+            "tiled": True,
+            "blockxsize": BLOCK_SIZE,
+            "blockysize": BLOCK_SIZE,
+            "SPARSE_OK": True,
+            "BIGTIFF": "IF_SAFER",
+        }
         kind = {"dtype": "float32", "nodata": float("nan"), "compress": "deflate"}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
@@ -302,7 +308,7 @@ def _crs(given: str | None, middle: Array) -> CRS:
     return found
 
 
-def _common(first: View, second: View, crs: CRS) -> Any:
+def _common_ground(first: View, second: View, crs: CRS) -> Any:
     """Return the ground that two views see at their lowest or highest altitude, on the map."""
     parts = []
     for alt in common_range(first, second):
@@ -317,7 +323,7 @@ def _common(first: View, second: View, crs: CRS) -> Any:
 def show_in_report(
     folder: Path,
     run: Summary,
-    block: Block,
+    block: StereoBlock,
     tiles: Sequence[tuple[tuple[int, int], Tile, Groups]],
     made: Path,
     band: int,
@@ -335,9 +341,9 @@ def show_in_report(
         for cameras, (height, nmad) in (("delivered", before[:2]), ("corrected", after)):
             middle = float(np.nanmedian(nmad)) if np.isfinite(nmad).any() else None
             row = {"cameras": cameras, "share": float(np.isfinite(height).mean()), "nmad_m": middle}
-            shown.append(row | _picture(shaded(height, tile.step)))
+            shown.append(row | _encoded_picture(shaded(height, tile.step)))
         seen = (block.views[i] for i in pairs[0])
-        shown += [{"image": view.name, **_picture(draped(view, tile, after[0], band))} for view in seen]
+        shown += [{"image": view.name, **_encoded_picture(draped(view, tile, after[0], band))} for view in seen]
         text, name = json.dumps({"run": run_key(run), "shown": shown}), f"{FOLDER}/{SURFACE}"
         with Workspace(folder, overwrite=True, names=[name], adds=True) as own:
             own.write_text(name, text)
@@ -354,7 +360,7 @@ def _delivered(view: View, source: Any) -> View:
     return replace(view, sensor=open_camera(view.path, camera=source.path).model)
 
 
-def _picture(grey: npt.NDArray[np.uint8]) -> dict[str, object]:
+def _encoded_picture(grey: npt.NDArray[np.uint8]) -> dict[str, object]:
     return {"size": [grey.shape[1], grey.shape[0]], "picture": base64.b64encode(jpeg(grey)).decode()}
 
 
@@ -375,5 +381,5 @@ def shaded(height: F32, step: float) -> npt.NDArray[np.uint8]:
     """Return a relief (rows, cols) [m] of cells of `step` [m] in the light of the north-west; the unknown black."""
     by_row, by_col = np.gradient(height.astype(np.float64), step)
     normal = np.stack([-by_col, by_row, np.ones(height.shape)])  # rows count to the south
-    light = np.einsum("i,ijk->jk", _LIGHT, normal / np.linalg.norm(normal, axis=0))
+    light = np.einsum("i,ijk->jk", _SHADING_DIRECTION, normal / np.linalg.norm(normal, axis=0))
     return np.asarray(np.nan_to_num(np.clip(light, 0.05, 1.0) * 255.0), np.uint8)

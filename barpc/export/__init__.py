@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from barpc.base.errors import InputError, OutputError
-from barpc.base.identity import take
+from barpc.base.identity import fingerprint
 from barpc.base.manifest import SUMS
-from barpc.base.sidefile import plain_path
+from barpc.base.safe_io import plain_path
 from barpc.export.files import Files, asp, cars, ortho, points, s2p, satnerf, stac
 from barpc.export.pinholes import colmap, image_links
 from barpc.export.shots import Scene, read_scene, relative_link
@@ -20,7 +20,7 @@ from barpc.workspace import Homes, Workspace
 
 __all__ = ["TARGETS", "export_run"]
 
-_LOG = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
 TARGETS: dict[str, Callable[[Scene, Path], Files]] = {
     make.__name__: make for make in (satnerf, colmap, s2p, cars, asp, ortho, stac, points)
@@ -71,19 +71,19 @@ def export_run(
     links = image_links(scene) if target == "colmap" else {}
     homes = Homes.of(folder)
     content = {homes.located(one.path): one.sha256 for one in scene.summary.inputs or ()} if links else {}
-    root = take(folder / SUMS).sha256 if (folder / SUMS).is_file() else ""  # none of an older release's run
+    root = fingerprint(folder / SUMS).sha256 if (folder / SUMS).is_file() else ""  # none of an older release's run
     with Workspace(out, overwrite=overwrite, keep=inputs, names=[*files, SUMS]) as workspace:
         for name, data in files.items():
             with workspace.output(name) as partial:
                 partial.write_bytes(data)
         workspace.remove_stale()
         for name, image in links.items():
-            _link(out / name, relative_link(image, (out / name).parent))
+            _link_image(out / name, relative_link(image, (out / name).parent))
         workspace.seal(root, {name: content[image] for name, image in links.items() if image in content})
     return [out / name for name in files]
 
 
-def _link(path: Path, image: str) -> None:
+def _link_image(path: Path, image: str) -> None:
     """A link to an image in place of an earlier one; a note in the log where the system makes none."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -93,4 +93,4 @@ def _link(path: Path, image: str) -> None:
     except FileExistsError:
         raise OutputError(f"{path}: is there already and no link of an earlier export; move it away") from None
     except OSError as error:
-        _LOG.warning("%s: no link to %s (%s): copy the image there", path, image, error.strerror)
+        logger.warning("%s: no link to %s (%s): copy the image there", path, image, error.strerror)

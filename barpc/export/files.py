@@ -18,8 +18,8 @@ from barpc.base.errors import BarpcError, InputError, listed
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, polygon, utm, wrap_longitude
 from barpc.export.shots import Scene, Shot, pairs_of, relative_link
 from barpc.rasters.dem import Dem
-from barpc.rasters.vertical import NONE
-from barpc.report.records import plain
+from barpc.rasters.vertical import NO_GEOID
+from barpc.report.records import json_form
 from barpc.report.runfiles import ply
 from barpc.rpcio import WRITABLE
 from barpc.sensor.geometry import footprint
@@ -29,7 +29,7 @@ Files = dict[str, bytes]
 
 _COLLECTION = "collection.json"
 _EXTENSIONS = ("projection/v2.0.0", "view/v1.0.0")
-_UNKNOWN = {"start_datetime": "1957-10-04T00:00:00Z", "end_datetime": "9999-12-31T23:59:59Z"}
+_UNKNOWN_TIME = {"start_datetime": "1957-10-04T00:00:00Z", "end_datetime": "9999-12-31T23:59:59Z"}
 """When an image was taken of which no file says it: since there are satellites."""
 _TYPES = {
     ".tif": "image/tiff; application=geotiff",
@@ -38,13 +38,13 @@ _TYPES = {
     ".json": "application/json",
     ".ntf": "application/vnd.nitf",
 }
-_AXES = [(i, j) for i in range(3) for j in range(i, 3)]
-_VARIANCES = tuple(f"var_{'enu'[i]}{'enu'[j]}" for i, j in _AXES)
+_COVARIANCE_ENTRIES = [(i, j) for i in range(3) for j in range(i, 3)]
+_VARIANCES = tuple(f"var_{'enu'[i]}{'enu'[j]}" for i, j in _COVARIANCE_ENTRIES)
 
 
 def as_json(value: Any) -> bytes:
     """Return a JSON text; what is not finite is null."""
-    return (json.dumps(plain(value), indent=1, ensure_ascii=False) + "\n").encode()
+    return (json.dumps(json_form(value), indent=1, ensure_ascii=False) + "\n").encode()
 
 
 def rpc_of(shot: Shot) -> dict[str, Any]:
@@ -100,7 +100,7 @@ def _image(shot: Shot, out: Path) -> str:
     return relative_link(shot.carrier or shot.file, out)
 
 
-def _text(shot: Shot, name: str) -> bytes:
+def _rpc_text(shot: Shot, name: str) -> bytes:
     write = WRITABLE[name].write
     assert write is not None
     return write(shot.rpc).encode()
@@ -120,13 +120,13 @@ def cars(scene: Scene, out: Path) -> Files:
         sensors[shot.name] = {"image": _image(shot, out), "geomodel": camera}
     pairing = [list(pair) for pair in pairs_of(scene)]
     found = {"input": {"sensors": sensors, "pairing": pairing}, "output": {"directory": "cars_out"}}
-    files = {f"{shot.name}.geom": _text(shot, "geom") for shot in scene.shots}
+    files = {f"{shot.name}.geom": _rpc_text(shot, "geom") for shot in scene.shots}
     return {**files, "inputs.yaml": as_json(found)}  # (JSON is YAML)
 
 
 def asp(scene: Scene, out: Path) -> Files:
     """Write ``<image>.xml`` each (in Maxar's form), and lists of images and cameras for its tools, run in `out`."""
-    files = {f"{shot.name}.xml": _text(shot, "xml") for shot in scene.shots}
+    files = {f"{shot.name}.xml": _rpc_text(shot, "xml") for shot in scene.shots}
     lists = {"images.txt": [_image(shot, out) for shot in scene.shots], "cameras.txt": list(files)}
     return files | {name: ("\n".join(lines) + "\n").encode() for name, lines in lists.items()}
 
@@ -139,10 +139,10 @@ def stac(scene: Scene, out: Path) -> Files:
     items = {f"{shot.name}.json": _item(scene, shot, out) for shot in scene.shots}
     if _COLLECTION in items:
         raise InputError(f"an image is called {_COLLECTION[:-5]}, as the collection of its catalogue is: rename it")
-    return {name: as_json(item) for name, item in ({_COLLECTION: _collection(scene, items)} | items).items()}
+    return {name: as_json(item) for name, item in ({_COLLECTION: _stac_collection(scene, items)} | items).items()}
 
 
-def _collection(scene: Scene, items: Mapping[str, Any]) -> dict[str, Any]:
+def _stac_collection(scene: Scene, items: Mapping[str, Any]) -> dict[str, Any]:
     """Return the STAC collection of a run's items."""
     boxes = np.array([item["bbox"] for item in items.values()])
     west = wrap_longitude(boxes[:, 0], boxes[0, 0])
@@ -190,7 +190,7 @@ def _item(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
         "bbox": [west, float(ring[:, 1].min()), east, float(ring[:, 1].max())],
         "properties": {
             **when,
-            **(_UNKNOWN if time is None else {}),
+            **(_UNKNOWN_TIME if time is None else {}),
             **{key: value for key, value in seen.items() if value is not None},
             "proj:code": None,
             "proj:shape": [shot.size[1], shot.size[0]],
@@ -220,7 +220,7 @@ def points(scene: Scene, _out: Path) -> Files:
     the scene, is stated in the head of both.
     """
     covariance = _covariances(scene)
-    sums = np.array([covariance[:, i, j] for i, j in _AXES]).T
+    sums = np.array([covariance[:, i, j] for i, j in _COVARIANCE_ENTRIES]).T
     place = scene.summary.scene
     sigma = "unknown" if place is None else ", ".join(f"{v:.4g}" for v in place.sigma_enu_m if v is not None)
     said = f"covariance [m2] of the intersection alone; noise {scene.noise:.4g} px;"
@@ -257,7 +257,7 @@ def _covariances(scene: Scene) -> Array:
 # --- orthoimages ------------------------------------------------------------------------------------------
 
 
-_HEAD = """#!/bin/sh
+_SCRIPT_HEADER = """#!/bin/sh
 # Orthoimages of the corrected cameras: gdalwarp is of GDAL ({about}).
 set -e
 cd "$(dirname "$0")"
@@ -276,11 +276,11 @@ def ortho(scene: Scene, out: Path) -> Files:
     about = "all ground at one altitude; give a DEM to adjust"
     if dems:
         geoid = str(given.get("geoid") or "")
-        lines, terrain = _ellipsoidal(dems, geoid if geoid in ("", NONE) else at(geoid), out)
+        lines, terrain = _ellipsoidal(dems, geoid if geoid in ("", NO_GEOID) else at(geoid), out)
         heights, about = f"RPC_DEM={terrain}", f"heights of {listed([Path(dem).name for dem in dems])}"
     crs = utm(*scene.origin[:2])[1]
     lines += [_warp(shot, heights, crs, out) for shot in scene.shots]
-    return {"ortho.sh": (_HEAD.format(about=about) + "\n".join(lines) + "\n").encode()}
+    return {"ortho.sh": (_SCRIPT_HEADER.format(about=about) + "\n".join(lines) + "\n").encode()}
 
 
 def _ellipsoidal(dems: Sequence[str], geoid: str, out: Path) -> tuple[list[str], str]:
@@ -288,7 +288,7 @@ def _ellipsoidal(dems: Sequence[str], geoid: str, out: Path) -> tuple[list[str],
 
     A DEM counts from the geoid that the run took for it; of one that is no longer there from the geoid given.
     """
-    sources = [f"{_LONLAT} +geoidgrids={geoid} +vto_meter=1" if geoid not in ("", NONE) else ""] * len(dems)
+    sources = [f"{_LONLAT} +geoidgrids={geoid} +vto_meter=1" if geoid not in ("", NO_GEOID) else ""] * len(dems)
     with warnings.catch_warnings(), suppress(BarpcError):
         warnings.simplefilter("ignore")
         sources = [_crs_of(part) for part in Dem.open(dems, geoid or None).parts]

@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array
 from barpc.base.remote import is_url
-from barpc.base.usual import ITERATIONS
+from barpc.base.statistics import ITERATIONS
 from barpc.export.files import Files, as_json
 from barpc.export.shots import Sampled, Scene, Shot, relative_link
 from barpc.sensor.curve import rotation_matrix
 
-_TIMES = 1.0, 2.0, 3.0  # an image that is affine along its flight is best seen from farther away than it was
+_DISTANCE_FACTORS = 1.0, 2.0, 3.0  # an image that is affine along its flight is best seen from farther away than it was
 _CORNER = 0.5  # px from the corner of the first pixel, where COLMAP counts from, to its centre
 
 
@@ -48,8 +48,8 @@ def fit_pinhole(samples: Sampled, at: Array, pixel: Array, rows: Array, sight: A
     sight : (3,), unit vector to the sensor there
     far : float, distance of the sensor [m]
     """
-    starts = [_start(sign, at, pixel, rows, sight, times * far) for times in _TIMES for sign in (1.0, -1.0)]
-    found = [_refined(start, samples) for start in starts]
+    starts = [_start(sign, at, pixel, rows, sight, times * far) for times in _DISTANCE_FACTORS for sign in (1.0, -1.0)]
+    found = [_least_squares_pinhole(start, samples) for start in starts]
     return min(found, key=lambda pinhole: samples.error(pinhole.project(samples.world)))
 
 
@@ -71,7 +71,7 @@ def _start(sign: float, at: Array, pixel: Array, rows: Array, sight: Array, far:
     return Pinhole(focal, pixel - focal * ray[:2], rotation, -rotation @ (at + far * sight))
 
 
-def _refined(start: Pinhole, samples: Sampled) -> Pinhole:
+def _least_squares_pinhole(start: Pinhole, samples: Sampled) -> Pinhole:
     """Return the least squares solution, by Levenberg's method on small turn, move, focal lengths, principal point."""
     pinhole, damping = start, 1e-3
     cost, left = _cost(pinhole, samples)
@@ -80,7 +80,7 @@ def _refined(start: Pinhole, samples: Sampled) -> Pinhole:
         scale = np.linalg.norm(jacobian, axis=0)
         system = np.vstack([jacobian / scale, np.sqrt(damping) * np.eye(10)])
         step = np.linalg.lstsq(system, np.append(left, np.zeros(10)), rcond=1e-15)[0] / scale
-        tried = _moved(pinhole, step)
+        tried = _stepped(pinhole, step)
         now, rest = _cost(tried, samples)
         if now < cost:
             done = cost - now <= 1e-12 * cost
@@ -113,7 +113,7 @@ def _jacobian(pinhole: Pinhole, world: Array) -> Array:
     return out.reshape(-1, 10)
 
 
-def _moved(pinhole: Pinhole, step: Array) -> Pinhole:
+def _stepped(pinhole: Pinhole, step: Array) -> Pinhole:
     turn = rotation_matrix(step[:3])
     return Pinhole(
         pinhole.focal * np.exp(step[6:8]),
@@ -152,11 +152,11 @@ def colmap(scene: Scene, out: Path) -> Files:
         pinhole, errors[name] = pinhole_of(scene, shot)
         center = pinhole.center + _CORNER
         numbers = [*shot.size, *pinhole.focal.tolist(), *center.tolist()]
-        cameras.append(_line(number, "PINHOLE", *numbers))
+        cameras.append(_text_line(number, "PINHOLE", *numbers))
         turn = _quaternion(pinhole.rotation).tolist()
-        images.append(_line(number, *turn, *pinhole.translation.tolist(), number, name))
+        images.append(_text_line(number, *turn, *pinhole.translation.tolist(), number, name))
         places = zip((shot.xy + _CORNER).tolist(), (shot.index + 1).tolist(), strict=True)
-        images.append(" ".join(_line(*xy, point) for xy, point in places))
+        images.append(" ".join(_text_line(*xy, point) for xy, point in places))
         miss = np.linalg.norm(pinhole.project(world[shot.index]) - shot.xy, axis=1)
         for place, (point, error) in enumerate(zip(shot.index.tolist(), miss.tolist(), strict=True)):
             seen.setdefault(point, []).append((number, place, error))
@@ -164,7 +164,7 @@ def colmap(scene: Scene, out: Path) -> Files:
     for point in sorted(seen):
         track = [value for image, place, _ in seen[point] for value in (image, place)]
         mean = float(np.mean([error for *_, error in seen[point]]))
-        points.append(_line(point + 1, *world[point].tolist(), 128, 128, 128, mean, *track))
+        points.append(_text_line(point + 1, *world[point].tolist(), 128, 128, 128, mean, *track))
     about = {"world_to_ecef": scene.world_to_ecef, "alt_range": scene.alt_range, "pinhole_error_px": errors}
     named = zip(scene.shots, _called(scene), strict=True)
     about["images"] = {name: relative_link(shot.file, out) for shot, name in named}
@@ -188,7 +188,7 @@ def image_links(scene: Scene) -> dict[str, str]:
     return {f"images/{name}": shot.file for shot, name in rows if not is_url(shot.file)}
 
 
-def _line(*values: float | str) -> str:
+def _text_line(*values: float | str) -> str:
     return " ".join(value if isinstance(value, str) else repr(value) for value in values)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, wrap_longitude
 from barpc.base.remote import is_url
-from barpc.base.sidefile import plain_path
+from barpc.base.safe_io import plain_path
 from barpc.report.compare import written_rpc
 from barpc.report.runfiles import RunFiles, read_summary, read_tables
 from barpc.report.summary import Summary
@@ -27,10 +27,10 @@ from barpc.sensor.geometry import camera_center, footprint, image_grid, sight_en
 from barpc.sensor.rpc import RPC
 from barpc.workspace import Homes
 
-MARGIN = 20.0
+ALTITUDE_MARGIN = 20.0
 """m that the altitudes of a scene reach beyond its tie points, besides a tenth of their range."""
-_SHARE = 0.5  # per cent of the tie points at either end that do not count for it
-_NODES = 11, 5  # of the grid on which cameras are fitted; their errors are measured between them, too
+_TAIL_PERCENT = 0.5  # per cent of the tie points at either end that do not count for it
+_FIT_NODES = 11, 5  # of the grid on which cameras are fitted; their errors are measured between them, too
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ class Scene:
 
     def samples(self, shot: Shot, checked: bool = False) -> Sampled:
         """Return the points over an image and the scene's altitudes; to measure errors on, more of them."""
-        nodes = (2 * _NODES[0] - 1, 2 * _NODES[1] - 1) if checked else _NODES
+        nodes = (2 * _FIT_NODES[0] - 1, 2 * _FIT_NODES[1] - 1) if checked else _FIT_NODES
         image, alt = image_grid(shot.size, self.alt_range, nodes)
         ground = shot.rpc.localize(image, alt)
         known = np.isfinite(ground).all(axis=1)
@@ -159,17 +159,17 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
     """
     summary = read_summary(folder)
     homes = Homes.of(folder)
-    summary = replace(summary, views=tuple(_located(view, homes) for view in summary.views))
+    summary = replace(summary, views=tuple(_with_absolute_paths(view, homes) for view in summary.views))
     if summary.kind != "adjust":
         raise InputError(f"{folder / 'summary.json'}: a run of the kind {summary.kind}, without corrected cameras")
     files = read_tables(summary, folder)
     order = np.argsort(files.tracks, kind="stable")
-    index, found = _places(files.tracks[order], files.observations.track)
+    index, found = _positions_in(files.tracks[order], files.observations.track)
     counted = np.flatnonzero(found & files.observations.used)
     counted = counted[np.argsort(files.observations.view[counted], kind="stable")]
     starts = np.searchsorted(files.observations.view[counted], np.arange(len(summary.views) + 1))
     if alt_range is None:
-        alt_range = _altitudes(files.points[:, 2], summary)
+        alt_range = _scene_altitudes(files.points[:, 2], summary)
     shots = []
     for number, view in enumerate(summary.views):
         plain_path(view.name)
@@ -190,7 +190,7 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
     return Scene(folder, summary, tuple(shots), files.points[:, :3], files.tracks, alt_range, noise)
 
 
-def _located(view: ViewEntry, homes: Homes) -> ViewEntry:
+def _with_absolute_paths(view: ViewEntry, homes: Homes) -> ViewEntry:
     """Return what is said of a view, with absolute paths; release 0.3 wrote them so, or as seen from its folder."""
     source = view.rpc_source
     if PurePath(view.path).is_absolute():
@@ -200,7 +200,7 @@ def _located(view: ViewEntry, homes: Homes) -> ViewEntry:
     return replace(view, path=homes.located(view.path), rpc_source=source)
 
 
-def _places(known: IntArray, asked: IntArray) -> tuple[IntArray, Any]:
+def _positions_in(known: IntArray, asked: IntArray) -> tuple[IntArray, Any]:
     """Return the positions of numbers (K,) in an ascending list, and whether they are in it."""
     if not len(known):
         return np.zeros(len(asked), dtype=np.int64), np.zeros(len(asked), dtype=bool)
@@ -208,13 +208,13 @@ def _places(known: IntArray, asked: IntArray) -> tuple[IntArray, Any]:
     return at, known[at] == asked
 
 
-def _altitudes(alt: Array, summary: Summary) -> tuple[float, float]:
+def _scene_altitudes(alt: Array, summary: Summary) -> tuple[float, float]:
     """Return the altitudes of a scene: those of its tie points and a margin, or of its cameras without any."""
     if not len(alt):
         ranges = np.array([view.alt_range_m for view in summary.views])
         return float(ranges[:, 0].min()), float(ranges[:, 1].max())
-    low, high = np.percentile(alt, [_SHARE, 100.0 - _SHARE])
-    margin = MARGIN + 0.1 * (high - low)
+    low, high = np.percentile(alt, [_TAIL_PERCENT, 100.0 - _TAIL_PERCENT])
+    margin = ALTITUDE_MARGIN + 0.1 * (high - low)
     return float(np.floor(low - margin)), float(np.ceil(high + margin))
 
 

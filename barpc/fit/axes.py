@@ -19,10 +19,12 @@ _POINT, _PLANE = 100.0, 1e4
 """Times that another reading is better before it is believed. What a model errs by is in all its readings alike: of 160
 honest models none was better by more than 2.2 in a wrong one; one over a flat Earth may be by tens, its planes by 2000.
 Of models with axes exchanged or upside down physical ones were better by 320 and more, the planes of radars by 5e6."""
-_NEAR = 2.0 / WGS84_A  # 1/m: of the distance of a camera; verticals meet at the Earth's centre, -1 / WGS84_A
-_ROUNDING = 1e-8  # m: of places in ECEF, and of what iterations leave
-_FEWEST = 5  # nodes along a line: of few lines of sight any two or three meet
-_LINES, _POINTS = np.linspace(0.1, 0.9, 5), np.linspace(0.02, 0.98, 9)  # of the image's sides
+_FLAT_CONVERGENCE = (
+    2.0 / WGS84_A
+)  # 1/m: of the distance of a camera; verticals meet at the Earth's centre, -1 / WGS84_A
+_ECEF_ROUNDING = 1e-8  # m: of places in ECEF, and of what iterations leave
+_MIN_NODES = 5  # nodes along a line: of few lines of sight any two or three meet
+_LINE_POSITIONS, _POINT_POSITIONS = np.linspace(0.1, 0.9, 5), np.linspace(0.02, 0.98, 9)  # of the image's sides
 
 
 def wrong_axes(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> str:
@@ -31,12 +33,12 @@ def wrong_axes(model: SensorModel, size: tuple[int, int], alt_range: tuple[float
     Exchanged longitude and latitude, or altitudes that grow downwards; of models with a noise of some 1e-3 px, of
     places where both orders are about the same (lon = lat = 0) and lines of sight of neither kind nothing is said.
     """
-    rows = np.stack(np.meshgrid(_POINTS, _LINES), axis=-1)
+    rows = np.stack(np.meshgrid(_POINT_POSITIONS, _LINE_POSITIONS), axis=-1)
     places = np.stack([rows, rows[..., ::-1]]) * size - 0.5
     image = np.repeat(places[..., None, :], 2, axis=-2)
     alt = np.broadcast_to(alt_range, image.shape[:-1])
     ground = model.localize(image, alt)
-    return _told(np.concatenate([ground[..., :2], alt[..., None]], axis=-1))  # whatever altitude it gave back
+    return _geometry_fault(np.concatenate([ground[..., :2], alt[..., None]], axis=-1))  # whatever altitude it gave back
 
 
 def wrong_axes_of_grid(ground: Array, image: Array) -> str:
@@ -44,27 +46,29 @@ def wrong_axes_of_grid(ground: Array, image: Array) -> str:
     values = (ground[:, 2], image[:, 1], image[:, 0])
     axes, places = zip(*(np.unique(value, return_inverse=True) for value in values), strict=True)
     shape = tuple(len(axis) for axis in axes)
-    if len(ground) != np.prod(shape) or np.ptp(axes[0]) < LEAST_RANGE or min(shape[1:]) < _FEWEST:
+    if len(ground) != np.prod(shape) or np.ptp(axes[0]) < LEAST_RANGE or min(shape[1:]) < _MIN_NODES:
         return ""
     nodes = np.full((*shape, 3), np.nan)
     nodes[places] = ground
     nodes = np.moveaxis(nodes[[0, -1]], 0, 2)  # rows, columns, low and high
-    picked = [[(part * (side - 1)).round().astype(int) for part in (_LINES, _POINTS)] for side in shape[1:]]
+    picked = [
+        [(part * (side - 1)).round().astype(int) for part in (_LINE_POSITIONS, _POINT_POSITIONS)] for side in shape[1:]
+    ]
     (row, rows), (col, cols) = picked
-    return _told(np.stack([nodes[np.ix_(row, cols)], nodes[np.ix_(rows, col)].swapaxes(0, 1)]))
+    return _geometry_fault(np.stack([nodes[np.ix_(row, cols)], nodes[np.ix_(rows, col)].swapaxes(0, 1)]))
 
 
-def _told(ground: Array) -> str:
+def _geometry_fault(ground: Array) -> str:
     """Return what is wrong with ground points (2, lines, points, 2, 3) of rows and of columns, at two altitudes."""
     point, plane, _ = _sights(ground)
-    for what, other in _readings(ground):
+    for what, other in _interpretations(ground):
         at, within, near = _sights(other)
-        if near > _NEAR and (point > _POINT * at or plane > _PLANE * within):
+        if near > _FLAT_CONVERGENCE and (point > _POINT * at or plane > _PLANE * within):
             return f"the model's lines of sight are those of a camera only {what}: give lon, lat [deg], alt [m], up"
     return ""
 
 
-def _readings(ground: Array) -> Iterator[tuple[str, Array]]:
+def _interpretations(ground: Array) -> Iterator[tuple[str, Array]]:
     """Yield what could be meant, in words and as ground points, the lower altitude first."""
     yield "with the altitude's sign changed", ground[..., ::-1, :] * [1.0, 1.0, -1.0]
     if np.nanmax(np.abs(ground[..., 0]), initial=0.0) < 90.0:
@@ -99,7 +103,7 @@ def _bundle(ecef: Array) -> tuple[float, float, float]:
     width = np.abs(across).max() or 1.0
     system = np.column_stack([across.ravel() / width, np.tile(np.eye(3), (len(ecef), 1))])
     found = np.linalg.lstsq(system, -slope.ravel(), rcond=None)[0]
-    off, rounding = system @ found + slope.ravel(), _ROUNDING / np.linalg.norm(sight, axis=1).min()
+    off, rounding = system @ found + slope.ravel(), _ECEF_ROUNDING / np.linalg.norm(sight, axis=1).min()
     spread = np.linalg.svd(ecef.reshape(-1, 3), compute_uv=False)
-    thickness = (spread[2] + _ROUNDING) / spread[0]
+    thickness = (spread[2] + _ECEF_ROUNDING) / spread[0]
     return float(np.sqrt((off**2).mean()) + rounding), float(thickness), float(found[0] / width)

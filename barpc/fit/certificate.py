@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 
 from barpc.base.geodesy import Array, metres_per_unit, parts, wrap_longitude
-from barpc.fit.points import EXACT, Sample
+from barpc.fit.points import NEGLIGIBLE_FIT_ERROR, Sample
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 
-_POWERS = np.arange(1, 8)  # of altitudes
-_CELLS = 4  # along each side: where all errors are in one of them, they are in one place
-_MOST = 0.5  # of the squares: a cause of more is named
-_WORDS = {
+_ALTITUDE_POWERS = np.arange(1, 8)  # of altitudes
+_CAUSE_CELLS = 4  # along each side: where all errors are in one of them, they are in one place
+_DOMINANT_SHARE = 0.5  # of the squares: a cause of more is named
+_CAUSE_WORDS = {
     "row": "go by the row (a swing of the attitude, bursts, a long pass): a grid of the camera follows it",
     "column": "go by the column (a lens, detectors, a scan): fit fewer columns, or take a grid",
     "altitude": "go by the altitude: fit a smaller altitude range",
@@ -53,7 +53,7 @@ class Reason:
     row: float = float("nan")
 
     def __str__(self) -> str:
-        words = _WORDS[self.cause].format(col=self.col, row=self.row)
+        words = _CAUSE_WORDS[self.cause].format(col=self.col, row=self.row)
         return f"{self.share:.0%} of its squares, {self.size_px:.3g} px RMS, {words}"
 
 
@@ -109,7 +109,7 @@ class Localisation:
         return "" if self.min_denominator > 0 else "the localisation RPC has a pole near the scene: do without it"
 
 
-def off(rpc: RPC, found: Array, ground: Array, image: Array) -> Array:
+def localisation_errors(rpc: RPC, found: Array, ground: Array, image: Array) -> Array:
     """Return the distances (N, 2) of places `found` (N, 3) from ground points [m], and of their projections [px]."""
     miss = found - ground
     miss[:, 0] = wrap_longitude(miss[:, 0])
@@ -197,7 +197,7 @@ class RpcFit:
     def verdict(self, tolerance: float) -> str:
         """Return the faults of this fit at a tolerance [px], in words; empty if there are none."""
         worst = float(self.max_ckp.max())
-        if not self.contradiction <= max(tolerance, EXACT):
+        if not self.contradiction <= max(tolerance, NEGLIGIBLE_FIT_ERROR):
             return (
                 f"the model contradicts itself: ground that it localises it projects up to {self.contradiction:.3g} px "
                 f"away, wanted {tolerance:g}: `project` and `localize` are not of one camera (an altitude left out of "
@@ -216,7 +216,7 @@ class RpcFit:
             )
         if not self.min_denominator > 0:
             return "the RPC has a pole near the scene: use more control points, or a smaller pole_margin"
-        if not self.roundtrip <= max(tolerance, EXACT):
+        if not self.roundtrip <= max(tolerance, NEGLIGIBLE_FIT_ERROR):
             return f"the RPC cannot be inverted over the scene (round trip {self.roundtrip:.3g} px)"
         if not self.height_px <= tolerance:
             low, high = self.rpc.ground_offset[2] + self.rpc.ground_scale[2] * np.array([-1.0, 1.0])
@@ -243,17 +243,17 @@ def reason(rpc: RPC, sample: Sample) -> Reason | None:
     for axis, name in enumerate(("column", "row", "altitude")):
         share[name] = _along(left, bases, points[:, axis]) * rest / total
     share["altitude"] = max(share["altitude"], _layered(left, bases, points, sample) * rest / total)
-    where = np.minimum((points[:, :2] + 0.5) / sample.size * _CELLS, _CELLS - 1).astype(np.int64)
-    squares = np.bincount(where @ [1, _CELLS], (error**2).sum(axis=1), minlength=_CELLS**2)
+    where = np.minimum((points[:, :2] + 0.5) / sample.size * _CAUSE_CELLS, _CAUSE_CELLS - 1).astype(np.int64)
+    squares = np.bincount(where @ [1, _CAUSE_CELLS], (error**2).sum(axis=1), minlength=_CAUSE_CELLS**2)
     share["place"] = float(squares.max()) / total
     cause, most = max(share.items(), key=lambda item: item[1])
     size = float(np.sqrt(most * total / len(error)))
-    if most <= _MOST:
+    if most <= _DOMINANT_SHARE:
         return Reason("all", 1.0 - most, float(np.sqrt((1.0 - most) * total / len(error))))
     if cause == "place":
         col, row = points[(error**2).sum(axis=1).argmax(), :2].tolist()
-        cell = np.array(divmod(int(squares.argmax()), _CELLS))
-        return Reason("corner" if np.isin(cell, (0, _CELLS - 1)).all() else cause, most, size, col, row)
+        cell = np.array(divmod(int(squares.argmax()), _CAUSE_CELLS))
+        return Reason("corner" if np.isin(cell, (0, _CAUSE_CELLS - 1)).all() else cause, most, size, col, row)
     return Reason(cause, most, size)
 
 
@@ -279,7 +279,7 @@ def _layered(left: Array, bases: list[Array], points: Array, sample: Sample) -> 
     """Return the share of errors (N, 2) that goes by the altitude, otherwise from place to place of the image."""
     away = (points[:, :2] - (np.array(sample.size) - 1) / 2) / (max(sample.size) / 2)
     low, high = sample.alt_range
-    up = ((points[:, 2:] - 0.5 * (low + high)) / (0.5 * (high - low))) ** _POWERS
+    up = ((points[:, 2:] - 0.5 * (low + high)) / (0.5 * (high - low))) ** _ALTITUDE_POWERS
     layers, rest = np.hstack([up, up * away[:, :1], up * away[:, 1:]]), 0.0
     for error, basis in zip(left.T, bases, strict=True):
         shape = layers - basis @ (basis.T @ layers)

@@ -34,10 +34,10 @@ from barpc.fit.system import (
     MAX_PASSES,
     PRECISIONS,
     TAU,
-    Compressed,
     FitProblem,
     Normalization,
     Rounding,
+    TriangularSystem,
     expected_size,
     noise_scaled,
     solution,
@@ -45,20 +45,20 @@ from barpc.fit.system import (
 from barpc.sensor.geometry import LEAST_RANGE
 from barpc.sensor.rpc import RPC
 
-Found = tuple[Array, list["Compressed"], Array, int]
+SolverResult = tuple[Array, list["TriangularSystem"], Array, int]
 """Coefficients (4, 20); final systems of col and row, penalties included; their regularisation h (2,); passes."""
 
 WEIGHTED = 1
 """Further passes of ``ridge`` with the residuals weighted by 1 / denominator, where that varies."""
-TOLERANCE = 1e-10
+RMSE_TOLERANCE = 1e-10
 """Change of the RMSE [px] at which the iterations stop."""
 _DAMPED = 1e-6  # of the size of a column, at first
 _POWER = 1.5  # of the errors that weights grow with, and 20 rounds: 0.94 px for 1.21 at 89.9 N, 60 rounds 0.89
-_GAIN = 1e-3  # of the sum of squares: less in a step, and it stands
-_EVEN = 0.05  # a denominator within 1 -/+ this weights nothing
+_MIN_STEP_GAIN = 1e-3  # of the sum of squares: less in a step, and it stands
+_NEGLIGIBLE_DENOMINATOR = 0.05  # a denominator within 1 -/+ this weights nothing
 
 
-def corner(systems: Sequence[Compressed]) -> float:
+def corner(systems: Sequence[TriangularSystem]) -> float:
     """Return the regularisation h at the corner of the systems' one L-curve: the largest curvature, by grids of h.
 
     The curve (log |M x - y|, log |x|) and its curvature have a closed form in the singular values (Hansen,
@@ -95,7 +95,7 @@ def _curvature(h: Array, s: Array, beta: Array, rest: float) -> Array:
     return np.asarray((rho1 * eta22 - rho22 * eta1) / (rho1**2 + eta1**2) ** 1.5)
 
 
-def solve_lcurve(problem: FitProblem) -> tuple[Array, list[Compressed], float, int]:
+def solve_lcurve(problem: FitProblem) -> tuple[Array, list[TriangularSystem], float, int]:
     """Fit col and row with one h: the paper's joint problem of 78 unknowns.
 
     Gives coefficients (4, 20), the final systems with their penalties, h, and the passes over the points: weighted ones
@@ -105,7 +105,7 @@ def solve_lcurve(problem: FitProblem) -> tuple[Array, list[Compressed], float, i
     h = corner(systems)
     ridge = np.full(len(systems[0].target), h)
     solved, passes, least = [system.penalized(ridge) for system in systems], 1, np.inf
-    best = _coefficients(problem, solved), solved
+    best = _solved_coefficients(problem, solved), solved
     for penalty, corrected in ((ridge, False), (np.ones_like(ridge), True)):
         (coeffs, solved), last = best, np.inf
         for _ in range(MAX_PASSES + 1):
@@ -113,18 +113,22 @@ def solve_lcurve(problem: FitProblem) -> tuple[Array, list[Compressed], float, i
             rmse, following = _reweighted(problem, coeffs, penalty, corrected)
             if rmse < least:
                 least, best = rmse, (coeffs, solved)
-            if not abs(last - rmse) >= TOLERANCE:  # nor a number, where a denominator is 0 at a point
+            if not abs(last - rmse) >= RMSE_TOLERANCE:  # nor a number, where a denominator is 0 at a point
                 break
-            coeffs, solved, last = _coefficients(problem, following), following, rmse
+            coeffs, solved, last = _solved_coefficients(problem, following), following, rmse
     return *best, h, passes
 
 
-def _coefficients(problem: FitProblem, systems: list[Compressed], quantize: Rounding | None = None) -> Array:
+def _solved_coefficients(
+    problem: FitProblem, systems: list[TriangularSystem], quantize: Rounding | None = None
+) -> Array:
     """Return the coefficients (4, 20) that solve the systems of col and row."""
     return np.concatenate([problem.expanded(solution(system, quantize)) for system in systems])
 
 
-def _reweighted(problem: FitProblem, coeffs: Array, penalty: Array, corrected: bool) -> tuple[float, list[Compressed]]:
+def _reweighted(
+    problem: FitProblem, coeffs: Array, penalty: Array, corrected: bool
+) -> tuple[float, list[TriangularSystem]]:
     """Return RMSE [px] of coefficients, and the systems that their denominators weight."""
     squares, following = 0.0, []
     for axis in range(2):
@@ -143,7 +147,7 @@ class FitSolution:
 
     coeffs: Array  # (4, 20)
     problem: FitProblem
-    solved: list[Compressed]
+    solved: list[TriangularSystem]
     h: Array
     iterations: int
     method: str
@@ -247,7 +251,7 @@ def solve_problem(problem: FitProblem, options: FitOptions, method: str, vendor:
     return FitSolution(coeffs, problem, systems, h, passes, method)
 
 
-def _ridge(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> Found:
+def _ridge(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> SolverResult:
     solved, h, passes = [], np.zeros(2), 1
     expected = expected_size(problem.active)
     for axis in range(2):
@@ -256,14 +260,14 @@ def _ridge(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -
             system, sigma = noise_scaled(problem.compressed(axis, denominator), expected)
             denominator = problem.expanded(solution(system))[-1]
             passes = max(passes, 1 + done)
-            if np.abs(denominator[1:]).sum() < _EVEN:
+            if np.abs(denominator[1:]).sum() < _NEGLIGIBLE_DENOMINATOR:
                 break
         solved.append(system)
         h[axis] = sigma / TAU
-    return _coefficients(problem, solved, quantize), solved, h, passes
+    return _solved_coefficients(problem, solved, quantize), solved, h, passes
 
 
-def _gauss_newton(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> Found:
+def _gauss_newton_fit(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> SolverResult:
     start, _, _, passes = _ridge(problem, None, vendor)
     parts, solved, region = [], [], region_of(problem)
     for axis in range(2):
@@ -278,10 +282,10 @@ def _gauss_newton(problem: FitProblem, quantize: Rounding | None, vendor: RPC | 
     return np.concatenate(parts), solved, np.zeros(2), passes
 
 
-def _minimised(problem: FitProblem, axis: int, x: Array, region: Region) -> tuple[Array, Compressed, int]:
+def _minimised(problem: FitProblem, axis: int, x: Array, region: Region) -> tuple[Array, TriangularSystem, int]:
     """Return the least squares of y - a / b from unknowns x (k,), the system there, and the passes over the points."""
 
-    def linearised(x: Array) -> Compressed:
+    def linearised(x: Array) -> TriangularSystem:
         numerator, denominator = problem.expanded(x)
         return problem.compressed(axis, denominator, numerator=numerator)
 
@@ -293,14 +297,16 @@ def _minimised(problem: FitProblem, axis: int, x: Array, region: Region) -> tupl
         before, after = system.squares(x), following.squares(ahead)
         if after < before:
             x, system, damping = ahead, following, 0.1 * damping if damping > _DAMPED else 0.0
-            if before - after < _GAIN * before:
+            if before - after < _MIN_STEP_GAIN * before:
                 break
         else:
             damping = max(10.0 * damping, _DAMPED)
     return x, system, passes
 
 
-def _ahead(problem: FitProblem, system: Compressed, x: Array, penalty: Array, size: Array, region: Region) -> Array:
+def _ahead(
+    problem: FitProblem, system: TriangularSystem, x: Array, penalty: Array, size: Array, region: Region
+) -> Array:
     """Return the solution of a system damped towards x, its denominator kept up over a region; x if there is none."""
     for least, solver in (
         (EPS, solution),
@@ -313,8 +319,8 @@ def _ahead(problem: FitProblem, system: Compressed, x: Array, penalty: Array, si
     return x
 
 
-def _minimax(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> Found:
-    coeffs, solved, h, passes = _gauss_newton(problem, None, vendor)
+def _minimax(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> SolverResult:
+    coeffs, solved, h, passes = _gauss_newton_fit(problem, None, vendor)
     given, parts, region = 1.0 if problem.weight is None else problem.weight, [], region_of(problem)
     for axis in range(2):
         x, least, weight = (problem.packed(coeffs[2 * axis : 2 * axis + 2]), np.inf, np.ones(len(problem.image)))
@@ -331,12 +337,17 @@ def _minimax(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None)
     return np.concatenate(parts), solved, h, passes
 
 
-def _lcurve(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> Found:
+def _lcurve(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> SolverResult:
     coeffs, solved, h, passes = solve_lcurve(problem)
-    return coeffs if quantize is None else _coefficients(problem, solved, quantize), solved, np.full(2, h), passes
+    return (
+        coeffs if quantize is None else _solved_coefficients(problem, solved, quantize),
+        solved,
+        np.full(2, h),
+        passes,
+    )
 
 
-def _vendor_denominators(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> Found:
+def _vendor_denominators(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> SolverResult:
     assert vendor is not None
     parts, solved = [], []
     for axis, denominator in enumerate(vendor.coeffs[1::2]):
@@ -350,9 +361,9 @@ def _vendor_denominators(problem: FitProblem, quantize: Rounding | None, vendor:
     return np.concatenate(parts), solved, np.zeros(2), 1
 
 
-METHODS: dict[str, Callable[[FitProblem, Rounding | None, RPC | None], Found]] = {
+METHODS: dict[str, Callable[[FitProblem, Rounding | None, RPC | None], SolverResult]] = {
     "ridge": _ridge,
-    "gauss-newton": _gauss_newton,
+    "gauss-newton": _gauss_newton_fit,
     "minimax": _minimax,
     "lcurve-joint": _lcurve,
     "vendor-denominators": _vendor_denominators,

@@ -14,19 +14,19 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import FitError
-from barpc.base.geodesy import FAR, Array, BoolArray, metres_per_unit, parts, wrap_longitude
+from barpc.base.geodesy import MAX_COORDINATE, Array, BoolArray, metres_per_unit, parts, wrap_longitude
 from barpc.base.options import FitOptions
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import LEAST_RANGE, footprint
 from barpc.sensor.rpc import RPC
 
-EXACT = 1e-6  # px: what no other method is tried on, and no round trip is held to
-CELLS = 45
+NEGLIGIBLE_FIT_ERROR = 1e-6  # px: what no other method is tried on, and no round trip is held to
+SAMPLE_CELLS = 45
 """Along each side of the image: 2025 points of the whole."""
-_EDGE = 12  # points along each edge of the image, at either end of the altitudes
+_EDGE_POINTS = 12  # points along each edge of the image, at either end of the altitudes
 _WORST, _AROUND, _ROUNDS = 16, 8, 5  # points that are looked around at, new ones around each, rounds, ever nearer
-_SAMPLES = 400  # of a DEM along each side of the image
+_DEM_SAMPLES = 400  # of a DEM along each side of the image
 _RANGES = (("longitude", -360.0, 720.0), ("latitude", -90.0, 90.0), ("altitude", -12e3, 100e3))
 _ONE_ALTITUDE = 1e-3  # metres
 
@@ -61,7 +61,7 @@ def terrain_range(
     ellipsoid], NaN where it has none; the paper's `margin` [m] is 500.
     """
     (west, east), (south, north) = _ground_box(model, size, alt_range)
-    lon, lat = np.meshgrid(np.linspace(west, east, _SAMPLES), np.linspace(south, north, _SAMPLES))
+    lon, lat = np.meshgrid(np.linspace(west, east, _DEM_SAMPLES), np.linspace(south, north, _DEM_SAMPLES))
     alt = dem(lon.ravel(), lat.ravel())
     alt = alt[np.isfinite(alt)]
     if not len(alt):
@@ -143,7 +143,7 @@ def checked_points(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, 
         if value.min() < low or value.max() > high:
             wrong = value.min() if value.min() < low else value.max()
             raise FitError(f"points: {wrong:g} is not a {name}: are the columns swapped? Give lon, lat [deg], alt [m]")
-    if not (np.abs(image) <= FAR).all():
+    if not (np.abs(image) <= MAX_COORDINATE).all():
         raise FitError(f"points: {np.abs(image).max():g} px is no place in an image")
     if np.ptp(ground[:, 0]) > 180.0:
         ground = np.column_stack([wrap_longitude(ground[:, 0], ground[0, 0]), ground[:, 1:]])
@@ -235,7 +235,7 @@ class Sample:
         model: SensorModel,
         size: tuple[int, int],
         alt_range: tuple[float, float],
-        cells: int = CELLS,
+        cells: int = SAMPLE_CELLS,
         seed: int = 0,
     ) -> Sample:
         """Sample a model at one random point in each of `cells` x `cells` parts of an image, and along its edges."""
@@ -261,7 +261,7 @@ class Sample:
         asked = np.column_stack([self.ground[:, :2], self.points[:, 2]])
         image = self.points[:, :2]
         found = self.model.project(asked, image) if isinstance(self.model, Corrected) else self.model.project(asked)
-        return float(_size(found - image).max(initial=0.0))
+        return float(_finite_size(found - image).max(initial=0.0))
 
     def errors(self, rpc: RPC) -> tuple[Errors, Array]:
         """Return an RPC's errors at the points, and the largest (2,) [px] around; infinite where it has no image."""
@@ -269,18 +269,18 @@ class Sample:
 
     def sought(self, off: Callable[[Array, Array], Array]) -> tuple[Errors, Array]:
         """Return an RPC's errors (N, 2) [px] at ground points (N, 3) and their (N, 3) col, row, altitude."""
-        points, miss = self.points, _size(off(self.ground, self.points))
+        points, miss = self.points, _finite_size(off(self.ground, self.points))
         errors = Errors()
         errors.add(miss[: self.count])
-        rng, reach = np.random.default_rng(1), np.array([1.0 / CELLS, 1.0 / CELLS, 0.25])
+        rng, reach = np.random.default_rng(1), np.array([1.0 / SAMPLE_CELLS, 1.0 / SAMPLE_CELLS, 0.25])
         unit = (points - _scaled(np.zeros(3), self.size, self.alt_range)) / self._span
-        for _ in range(_ROUNDS if float(miss.max(initial=0.0)) > EXACT else 0):
+        for _ in range(_ROUNDS if float(miss.max(initial=0.0)) > NEGLIGIBLE_FIT_ERROR else 0):
             worst = np.unique(np.concatenate([np.argsort(-miss[:, axis], kind="stable")[:_WORST] for axis in range(2)]))
             near = unit[np.repeat(worst, _AROUND)] + reach * rng.uniform(-1.0, 1.0, (len(worst) * _AROUND, 3))
             near = near.clip(0.0, 1.0)
             at = _scaled(near, self.size, self.alt_range)
             ground, known = _on_ground(self.model, at)
-            found = _size(off(ground[known], at[known]))
+            found = _finite_size(off(ground[known], at[known]))
             unit, miss, reach = np.concatenate([unit, near[known]]), np.concatenate([miss, found]), reach / 2
         if len(miss):
             errors.worst = _scaled(unit[miss.argmax(axis=0)], self.size, self.alt_range)
@@ -298,7 +298,7 @@ def _scattered(cells: int, seed: int) -> Array:
     cell = np.stack(np.meshgrid(*[np.arange(cells)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
     inside = np.column_stack([cell, rng.permutation(len(cell))]) + rng.random((len(cell), 3))
     inside /= [cells, cells, len(cell)]
-    t, ends = np.linspace(0.0, 1.0, _EDGE), (0.0, 1.0)
+    t, ends = np.linspace(0.0, 1.0, _EDGE_POINTS), (0.0, 1.0)
     edges = [(*at, h) for u in t for end in ends for at in ((u, end), (end, u)) for h in ends]
     return np.concatenate([inside, edges])
 
@@ -309,7 +309,7 @@ def _on_ground(model: SensorModel, points: Array) -> tuple[Array, BoolArray]:
     return ground, np.asarray(np.isfinite(ground).all(axis=1))
 
 
-def _size(values: Array) -> Array:
+def _finite_size(values: Array) -> Array:
     return np.nan_to_num(np.abs(values), nan=np.inf)
 
 

@@ -15,17 +15,17 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from barpc.base.geodesy import CHUNK, Array, BoolArray, IntArray
-from barpc.base.usual import ROUNDING
-from barpc.fit.system import EPS, MAX_PASSES, Compressed, solution
-from barpc.sensor.rational import POWERS, REACH, monomials
+from barpc.base.statistics import ROUNDING
+from barpc.fit.system import EPS, MAX_PASSES, TriangularSystem, solution
+from barpc.sensor.rational import POWERS, TRUSTED_REACH, monomials
 from barpc.sensor.rpc import RPC
 
-FLOOR = 0.1
+MIN_DENOMINATOR_RATIO = 0.1
 """Least value of a denominator over what it is at the centre."""
 _PIECES = 8  # of a side
 _BERNSTEIN = np.array([[comb(i, k) / comb(3, k) for k in range(4)] for i in range(4)])
-_ANGLES = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)  # in which a hull is cut, level with the ground
-_DIRECTIONS = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+_HULL_DIRECTIONS = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)  # in which a hull is cut, level with the ground
+_DIRECTIONS = np.column_stack([np.cos(_HULL_DIRECTIONS), np.sin(_HULL_DIRECTIONS)])
 _CUTS = 40  # inequalities that are taken in in a pass of a bounded least squares
 
 
@@ -50,7 +50,7 @@ def _net() -> Array:
 
 
 @cache
-def _lattice() -> tuple[Array, Array]:
+def _cubic_nodes() -> tuple[Array, Array]:
     """Return the places (64, 3) in the cube, and what takes values there to the coefficients of a cubic (20, 64)."""
     places = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 4)] * 3), axis=-1).reshape(-1, 3)
     return places, np.asarray(np.linalg.pinv(monomials(places.T).T))
@@ -85,13 +85,13 @@ class Region:
         away = np.linalg.pinv(skew) @ sides
         reach = np.max([(ground[i : i + CHUNK] @ away).max(axis=0) for i in range(0, len(ground), CHUNK)], axis=0)
         middle, half = 0.5 * (reach[:3] - reach[3:6]), 0.5 * (reach[:3] + reach[3:6])
-        inside = _inside(reach[6:] - _DIRECTIONS @ middle[:2], half[:2])
+        inside = _touched_nodes(reach[6:] - _DIRECTIONS @ middle[:2], half[:2])
         return cls(middle @ skew, (1.0 + margin) * half[:, None] * skew, inside)
 
     @cached_property
     def there(self) -> Array:
         """From a cubic's coefficients to those in the skew box (20, 20); its first row: the value at the centre."""
-        places, inverse = _lattice()
+        places, inverse = _cubic_nodes()
         return np.asarray(inverse @ monomials((places @ self.axes + self.offset).T).T)
 
     def bernstein(self, cubic: Array) -> Array:
@@ -112,8 +112,8 @@ class Region:
         return float(self.bernstein(cubic).min())
 
     def above(self, cubic: Array) -> bool:
-        """Return whether a denominator (20,) is above `FLOOR` of what it is at the centre."""
-        return self.least(cubic) > FLOOR * float(self.there[0] @ cubic)
+        """Return whether a denominator (20,) is above `MIN_DENOMINATOR_RATIO` of what it is at the centre."""
+        return self.least(cubic) > MIN_DENOMINATOR_RATIO * float(self.there[0] @ cubic)
 
     def smallest(self, cubics: Array) -> float:
         """Return a lower bound of cubics (k, 20) over what they are at the centre; NaN where one is 0 there."""
@@ -121,7 +121,7 @@ class Region:
             return float(min(self.least(cubic / (self.there[0] @ cubic)) for cubic in cubics))
 
 
-def _inside(reach: Array, half: Array) -> BoolArray:
+def _touched_nodes(reach: Array, half: Array) -> BoolArray:
     """Return the nodes (n, n) of the pieces that a hull of half widths (2,) touches: its `reach` in all directions."""
     width, level = 2.0 / _PIECES, _DIRECTIONS * half
     start = -1.0 + width * np.arange(_PIECES)
@@ -136,12 +136,13 @@ def _inside(reach: Array, half: Array) -> BoolArray:
 def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:
     """Return a lower bound of the denominators over a box (3,), (3,) and a margin, over what they are at its centre."""
     box = np.sort(rpc.normalize(np.stack([low, high])), axis=1)
-    around = (REACH - 1.0) * 0.5 * (box[:, 1] - box[:, 0])
+    around = (TRUSTED_REACH - 1.0) * 0.5 * (box[:, 1] - box[:, 0])
     return Region.box(box + around[:, None] * np.array([-1.0, 1.0])).smallest(rpc.coeffs[1::2])
 
 
-def bounded(system: Compressed, region: Region, active: IntArray) -> Array | None:
-    """Return a system's least squares x (k,) with a denominator of at least `FLOOR` over a region; None without one.
+def bounded(system: TriangularSystem, region: Region, active: IntArray) -> Array | None:
+    """Return a system's least squares x (k,) with a denominator of at least `MIN_DENOMINATOR_RATIO` over a region; None
+    without one.
 
     The last unknowns are the coefficients of its `active` monomials but the constant one, which is 1. By the
     inequalities that x breaks, taken in few by few: least distance programming, by non-negative least squares (Lawson
@@ -149,7 +150,7 @@ def bounded(system: Compressed, region: Region, active: IntArray) -> Array | Non
     """
     from scipy.optimize import nnls  # a tenth of a second, which smooth cameras do not need
 
-    floor = FLOOR + 10.0 * ROUNDING
+    floor = MIN_DENOMINATOR_RATIO + 10.0 * ROUNDING
     x, used, cubic, m = solution(system), np.empty(0, dtype=np.int64), np.eye(20)[0], len(active) - 1
     for _ in range(MAX_PASSES):
         cubic[active[1:]] = x[-m:]

@@ -14,21 +14,30 @@ from barpc.base.errors import BarpcWarning, FitError
 from barpc.base.geodesy import CHUNK, Array, metres_per_unit, wrap_longitude
 from barpc.base.options import FitOptions
 from barpc.fit.axes import wrong_axes, wrong_axes_of_grid
-from barpc.fit.certificate import Localisation, RpcFit, coverage, off, reason, roundtrip
+from barpc.fit.certificate import Localisation, RpcFit, coverage, localisation_errors, reason, roundtrip
 from barpc.fit.methods import BOUNDED, FitSolution, solve, solve_problem
-from barpc.fit.points import EXACT, Errors, Sample, checked_points, column_ranges, control_points, screened, widened
+from barpc.fit.points import (
+    NEGLIGIBLE_FIT_ERROR,
+    Errors,
+    Sample,
+    checked_points,
+    column_ranges,
+    control_points,
+    screened,
+    widened,
+)
 from barpc.fit.system import FitProblem, Normalization
 from barpc.sensor import SensorModel
-from barpc.sensor.displaced import Splined
+from barpc.sensor.image_corrections import Splined
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 
-Seen = Callable[[RPC, FitSolution], tuple[Errors, Array]]
+LocalisationCheck = Callable[[RPC, FitSolution], tuple[Errors, Array]]
 """What a localisation RPC is off by on points that it has not seen [m, px], and the largest (2,)."""
 
 _ABOUT = 1.1  # times the error
-_MISSING = 0.1  # part of the image without a ground point, at most
-_CELLS = 72  # of ``gauss-newton``, along each side of the image
+_MAX_MISSING_SHARE = 0.1  # part of the image without a ground point, at most
+_SCATTERED_CELLS = 72  # of ``gauss-newton``, along each side of the image
 
 
 def fit_rpc(
@@ -49,7 +58,7 @@ def fit_rpc(
     options : FitOptions, optional, grid, solver, tolerance
     strict : bool
         Raise where the tolerance is missed; otherwise give the best fit found, to be judged by `RpcFit.verdict`. A
-        camera behind a spline (`barpc.sensor.displaced`) is expected to miss it.
+        camera behind a spline (`barpc.sensor.image_corrections`) is expected to miss it.
 
     Raises
     ------
@@ -63,26 +72,28 @@ def fit_rpc(
     BarpcWarning : part of the image has no ground point
     """
     options, alt_range, vendor = options or FitOptions(), widened(alt_range), underlying_rpc(model)
-    sample = _sampled(model, size, alt_range)
+    sample = _check_sample(model, size, alt_range)
     screened(sample.ground, sample.points[:, :2])
     contradiction = sample.contradiction()
     axes = "" if vendor is not None else wrong_axes(model, size, alt_range)  # an RPC's lines of sight are cubics' own
-    given, seen = partial(_given, model, size, alt_range, options), partial(_missed, sample)
+    given, seen = partial(_points_for_method, model, size, alt_range, options), partial(_missed, sample)
 
     def attempt(method: str, source: SensorModel = model) -> RpcFit:
-        solution = solve(*_given(source, size, alt_range, options, method), options, method, vendor=vendor)
+        solution = solve(*_points_for_method(source, size, alt_range, options, method), options, method, vendor=vendor)
         loop, beyond = roundtrip(solution.rpc, sample.ground), 1.0 - 0.05 ** (1.0 / sample.count)
         errors = sample.errors(solution.rpc)
         return replace(_certified(solution, *errors, loop, size, beyond), contradiction=contradiction, axes=axes)
 
     try:
-        fit = _best(attempt, options, vendor, False, exact=True)
+        fit = _best_method(attempt, options, vendor, False, exact=True)
         if isinstance(model, Splined):
             fit = _plainer(fit, attempt("ridge", model.sensor))
         if not float(fit.max_ckp.max()) <= options.tolerance:
             fit = replace(fit, reason=reason(fit.rpc, sample))
         _accepted(fit, options, strict and not isinstance(model, Splined))
-        return _localised(fit, lambda rpc, method: inverse(rpc, *given(method)), seen, options, strict, exact=True)
+        return _localised(
+            fit, lambda rpc, method: localisation_problem(rpc, *given(method)), seen, options, strict, exact=True
+        )
     except FitError as error:
         advice = getattr(model, "advice", "")  # of a model that knows why
         raise FitError("; ".join(filter(None, (str(error), advice)))) from error
@@ -91,13 +102,15 @@ def fit_rpc(
 def fit_only(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], method: str) -> RPC:
     """Return the RPC of a sensor model by one method, without a certificate: whoever calls measures what it misses."""
     options, alt_range = FitOptions(), widened(alt_range)
-    return solve(*_given(model, size, alt_range, options, method), options, method, vendor=underlying_rpc(model)).rpc
+    return solve(
+        *_points_for_method(model, size, alt_range, options, method), options, method, vendor=underlying_rpc(model)
+    ).rpc
 
 
-def _sampled(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Sample:
+def _check_sample(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Sample:
     """Return the check points of a model; FitError where it has no ground for too much of its image."""
     sample = Sample.of(model, size, alt_range)
-    if sample.missing > _MISSING:
+    if sample.missing > _MAX_MISSING_SHARE:
         raise FitError(
             f"the model has no ground point for {sample.missing:.0%} of the image over altitudes "
             f"{alt_range[0]:g} to {alt_range[1]:g} m: give an altitude range that it is made for"
@@ -117,12 +130,12 @@ def _plainer(fit: RpcFit, plain: RpcFit) -> RpcFit:
     return plain if other <= _ABOUT * error or not fit.min_denominator > 0 else fit
 
 
-def _given(
+def _points_for_method(
     model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], options: FitOptions, method: str
 ) -> tuple[Array, Array]:
     """Return the ground (N, 3) and image points (N, 2) for a method."""
     if method in BOUNDED:  # what an RPC cannot follow has any frequency: scattered points alias none
-        scattered = Sample.of(model, size, alt_range, _CELLS, seed=1)
+        scattered = Sample.of(model, size, alt_range, _SCATTERED_CELLS, seed=1)
         ground, image = scattered.ground, scattered.points[:, :2]
     else:
         grid = control_points(model, size, alt_range, options)
@@ -183,15 +196,15 @@ def fit_rpc_points(
             errors.add(residual)
         loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // CHUNK)])
         fit = _certified(solution, errors, errors.largest, loop, size)
-        rpc = _within(fit.rpc, cnp[:, 2]) if options.precision is None and vendor is None else fit.rpc
+        rpc = _limited_to_altitudes(fit.rpc, cnp[:, 2]) if options.precision is None and vendor is None else fit.rpc
         return replace(fit, rpc=rpc, axes=axes, height_px=_height_unknown(*given, float(fit.rmse_cnp.max())))
 
-    fit = _best(attempt, options, vendor, strict, exact=False)
-    seen = partial(_left_out, held_out, *given)
-    return _localised(fit, lambda rpc, _: inverse(rpc, *given, weight), seen, options, strict, exact=False)
+    fit = _best_method(attempt, options, vendor, strict, exact=False)
+    seen = partial(_check_errors, held_out, *given)
+    return _localised(fit, lambda rpc, _: localisation_problem(rpc, *given, weight), seen, options, strict, exact=False)
 
 
-def _within(rpc: RPC, alt: Array) -> RPC:
+def _limited_to_altitudes(rpc: RPC, alt: Array) -> RPC:
     """Return the same RPC, stated for no other altitudes than those of points (N,) [m], and a metre at least."""
     scale = rpc.ground_scale.copy()
     scale[2] = max(float(f"{0.5 * np.ptp(alt):.12g}"), 1.0)
@@ -285,7 +298,7 @@ def _accepted(fit: RpcFit, options: FitOptions, strict: bool) -> RpcFit:
     return fit
 
 
-def _best(
+def _best_method(
     attempt: Callable[[str], RpcFit], options: FitOptions, vendor: RPC | None, strict: bool, exact: bool
 ) -> RpcFit:
     """Return the fit by the method asked for; of several (``auto``) the best accepted, or else the best, or a FitError.
@@ -295,7 +308,7 @@ def _best(
     if options.method != "auto":
         return _accepted(attempt(str(options.method)), options, strict)
     fits = [attempt("ridge")]
-    if exact and not float(fits[0].max_ckp.max()) <= EXACT:
+    if exact and not float(fits[0].max_ckp.max()) <= NEGLIGIBLE_FIT_ERROR:
         fits.append(attempt("gauss-newton"))
     if vendor is not None and all(fit.verdict(options.tolerance) for fit in fits):
         fits.append(attempt("vendor-denominators"))
@@ -310,7 +323,7 @@ def _best(
 # --- the localisation RPC, from image and altitude to the ground: the same solvers, roles exchanged ------------------
 
 
-def inverse(rpc: RPC, ground: Array, image: Array, weight: Array | None = None) -> FitProblem:
+def localisation_problem(rpc: RPC, ground: Array, image: Array, weight: Array | None = None) -> FitProblem:
     """Return the problem of the localisation RPC of an RPC: its normalisation, its points, roles exchanged."""
     norm = Normalization(
         np.append(rpc.image_offset, rpc.ground_offset[2]),
@@ -324,27 +337,34 @@ def inverse(rpc: RPC, ground: Array, image: Array, weight: Array | None = None) 
 
 def _missed(sample: Sample, rpc: RPC, _: FitSolution) -> tuple[Errors, Array]:
     """Return the errors of a localisation RPC on the check points of a model."""
-    return sample.sought(lambda ground, at: off(rpc, rpc.localize_direct(at[:, :2], at[:, 2]), ground, at[:, :2]))
+    return sample.sought(
+        lambda ground, at: localisation_errors(rpc, rpc.localize_direct(at[:, :2], at[:, 2]), ground, at[:, :2])
+    )
 
 
-def _left_out(
+def _check_errors(
     held_out: tuple[Array, Array] | None, ground: Array, image: Array, rpc: RPC, found: FitSolution
 ) -> tuple[Errors, Array]:
     """Return the errors of a localisation RPC on given check points, or its leave-one-out errors."""
     errors, start = Errors(), 0
     if held_out is not None:
-        errors.add(off(rpc, rpc.localize_direct(held_out[1], held_out[0][:, 2]), *held_out))
+        errors.add(localisation_errors(rpc, rpc.localize_direct(held_out[1], held_out[0][:, 2]), *held_out))
         return errors, errors.largest
     for residual in found.leave_one_out():
         part = slice(start, start + len(residual))
         start = part.stop
         places = ground[part] + np.pad(residual, ((0, 0), (0, 1)))
-        errors.add(off(rpc, places, ground[part], image[part]))
+        errors.add(localisation_errors(rpc, places, ground[part], image[part]))
     return errors, errors.largest
 
 
 def _localised(
-    fit: RpcFit, problem: Callable[[RPC, str], FitProblem], seen: Seen, options: FitOptions, strict: bool, exact: bool
+    fit: RpcFit,
+    problem: Callable[[RPC, str], FitProblem],
+    seen: LocalisationCheck,
+    options: FitOptions,
+    strict: bool,
+    exact: bool,
 ) -> RpcFit:
     """Return the fit, if asked for with a localisation RPC and its certificate; FitError if `strict` and it misses.
 
@@ -360,7 +380,7 @@ def _localised(
         least = solution.region.smallest(solution.coeffs[1::2])
         (rmse_m, rmse_px), (max_m, max_px) = errors.rmse.tolist(), largest.tolist()
         found.append((direct, Localisation(rmse_m, max_m, rmse_px, max_px, least, method)))
-        if max_px <= EXACT:
+        if max_px <= NEGLIGIBLE_FIT_ERROR:
             break
     rpc, certificate = min(found, key=lambda each: (not each[1].min_denominator > 0, each[1].rmse_m))
     if strict and (wrong := certificate.verdict(options.tolerance)):

@@ -25,15 +25,15 @@ from scipy.linalg.lapack import dtpqrt
 from barpc.base.errors import FitError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, IntArray, parts
-from barpc.base.usual import ROUNDING
+from barpc.base.statistics import ROUNDING
 from barpc.sensor.rational import POWERS, monomials
 
 Rounding = Callable[[Array], Array]
 """Coefficients (...) to the nearest ones that a file can hold."""
 
-_ROWS = 1024  # taken into the triangle at a time: what is worked on stays in cache
-_BLOCK = 8  # columns of a Householder block
-_DEGREE = POWERS.sum(axis=1)
+_TRIANGLE_ROWS = 1024  # taken into the triangle at a time: what is worked on stays in cache
+_HOUSEHOLDER_COLUMNS = 8  # columns of a Householder block
+_MONOMIAL_DEGREES = POWERS.sum(axis=1)
 _NUMERATOR = np.array([np.inf, np.inf, 0.1, 0.03])
 _DENOMINATOR = np.array([np.inf, 1.0, 0.1, 0.01])
 _SIGMA_STEPS = 2
@@ -68,7 +68,7 @@ class Normalization(Frozen):
 
 
 @dataclass(frozen=True, eq=False)
-class Compressed:
+class TriangularSystem:
     """Triangle R (k + 1, k + 1) of the QR decomposition of (M | y) of one coordinate, M of `num_points` rows.
 
     Its last column is Q' y, its last entry the norm of the part of y that no solution reaches.
@@ -102,21 +102,21 @@ class Compressed:
         rest = self.matrix @ solution - self.target
         return float(rest @ rest + self.triangle[-1, -1] ** 2)
 
-    def solved_by(self, solution: Array) -> Compressed:
+    def solved_by(self, solution: Array) -> TriangularSystem:
         """Return the system that a given solution (k,) solves: y replaced by M x, the residual of the rows kept."""
         triangle = self.triangle.copy()
         triangle[:-1, -1] = self.matrix @ solution
-        return Compressed(triangle, self.num_points)
+        return TriangularSystem(triangle, self.num_points)
 
-    def penalized(self, penalty: Array, toward: Array | float = 0.0) -> Compressed:
+    def penalized(self, penalty: Array, toward: Array | float = 0.0) -> TriangularSystem:
         """Return the system with the rows diag(`penalty`) x = `toward` below."""
         rows = np.column_stack([np.diag(penalty), np.broadcast_to(toward, penalty.shape)])
-        return Compressed(_take_in(self.triangle, rows), self.num_points)
+        return TriangularSystem(_take_in(self.triangle, rows), self.num_points)
 
 
 def _take_in(triangle: Array, rows: Array) -> Array:
     """Return the triangular factor of `triangle` on top of `rows`."""
-    block = min(_BLOCK, len(triangle))
+    block = min(_HOUSEHOLDER_COLUMNS, len(triangle))
     factor: Array = dtpqrt(0, block, triangle, np.asfortranarray(rows), overwrite_b=True)[0]
     return factor
 
@@ -132,7 +132,7 @@ class FitProblem:
     weight: Array | None = None  # (N,)
     # share of the half width of the points, around them, over which denominators are kept up
     margin: float = 0.1
-    first: Compressed | None = None  # of col without a denominator, where it is known already
+    first: TriangularSystem | None = None  # of col without a denominator, where it is known already
 
     def screened(self) -> FitProblem:
         """Return the problem without the monomials that its points cannot tell from those of lower degree.
@@ -154,7 +154,7 @@ class FitProblem:
         """
         m, norm = len(self.active), self.norm
         k = 2 * m - 1 if free else m
-        for part in parts(len(self.image), _ROWS):
+        for part in parts(len(self.image), _TRIANGLE_ROWS):
             x = np.subtract(self.ground[part].T, norm.ground_offset[:, None], order="C")
             basis = monomials(x / norm.ground_scale[:, None])
             y = (self.image[part, axis] - norm.image_offset[axis]) / norm.image_scale[axis]
@@ -177,7 +177,7 @@ class FitProblem:
 
     def compressed(
         self, axis: int, denominator: Array | None = None, free: bool = True, numerator: Array | None = None
-    ) -> Compressed:
+    ) -> TriangularSystem:
         """Return the system of the rows of the same parameters."""
         if self.first is not None and axis == 0 and denominator is None and free:
             return self.first
@@ -185,7 +185,7 @@ class FitProblem:
         triangle: Array = np.zeros((size, size), order="F")
         for _, rows in self.rows(axis, denominator, free, numerator):
             triangle = _take_in(triangle, rows)
-        return Compressed(np.triu(triangle), len(self.image))
+        return TriangularSystem(np.triu(triangle), len(self.image))
 
     def expanded(self, solution: Array, denominator: Array | None = None) -> Array:
         """Return the numerator and denominator (2, 20) of a solution; monomials not in use are zero."""
@@ -213,11 +213,11 @@ def expected_size(active: IntArray) -> Array:
     Numerator: 0.1 of degree two, 0.03 of degree three. Denominator: `TAU` of degree one, a tenth of it
     of degree two, a hundredth of degree three: what vendors' RPCs show, with room.
     """
-    degree = _DEGREE[active]
+    degree = _MONOMIAL_DEGREES[active]
     return np.concatenate([_NUMERATOR[degree], TAU * _DENOMINATOR[degree[1:]]])
 
 
-def noise_scaled(system: Compressed, expected: Array) -> tuple[Compressed, float]:
+def noise_scaled(system: TriangularSystem, expected: Array) -> tuple[TriangularSystem, float]:
     """Return the system with each unknown penalised by sigma / its expected size, and sigma.
 
     The free solution lets noisy denominators shrink, and the residual with them; the residual of the
@@ -232,7 +232,7 @@ def noise_scaled(system: Compressed, expected: Array) -> tuple[Compressed, float
     return penalised, sigma
 
 
-def solution(system: Compressed, quantize: Rounding | None = None) -> Array:
+def solution(system: TriangularSystem, quantize: Rounding | None = None) -> Array:
     """Return the least-squares solution (k,), by back substitution.
 
     Where quantized, each coefficient is rounded in turn and the ones still to come make up for it (Babai's nearest

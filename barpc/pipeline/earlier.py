@@ -19,17 +19,17 @@ import numpy as np
 import shapely
 
 from barpc.ba import BlockPrior
-from barpc.ba.estimated.unknowns import make_unknowns
+from barpc.ba.parameters.unknowns import make_unknowns
 from barpc.ba.result import moved_px
 from barpc.base import manifest
 from barpc.base.errors import InputError, plain
 from barpc.base.geodesy import Array, ecef_from_ground, metres_per_unit, wrap_longitude
-from barpc.base.identity import Input, take
+from barpc.base.identity import Input, fingerprint
 from barpc.base.options import RunOptions, TieOptions
 from barpc.base.remote import is_url, location
-from barpc.base.sidefile import GEOJSON, parse_json, read_text
+from barpc.base.safe_io import GEOJSON, parse_json, read_text
 from barpc.cameras import split_spec
-from barpc.pipeline.inputs import IMAGES, PRIOR, linked_names
+from barpc.pipeline.inputs import IMAGES, PRIOR_FILE, linked_names
 from barpc.pipeline.loading import Image, LoadedViews, image_path, load_views
 from barpc.pointio.names import unique_names
 from barpc.report import Run
@@ -42,7 +42,7 @@ from barpc.workspace import Homes, portable
 
 logger = logging.getLogger(__name__)
 
-_LOOKED_AT = 4  # times as many images as are matched are opened, the largest common areas: angles count, too
+_OPENED_PER_NEIGHBOUR = 4  # times as many images as are matched are opened, the largest common areas: angles count, too
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Earlier:
         folder = Path(folder)
         if not (folder / "summary.json").exists():
             raise InputError(f"{folder}: no summary.json, so no finished run; give the folder of one")
-        table, block = table_path(folder, IMAGES), table_path(folder, PRIOR)
+        table, block = table_path(folder, IMAGES), table_path(folder, PRIOR_FILE)
         if not block.exists():
             raise InputError(f"{block}: missing, and it is what a later run goes on from: run the adjustment again")
         if not table.exists():
@@ -88,7 +88,7 @@ class Earlier:
         prior = BlockPrior.load(block)
         try:
             rows = parse_json(read_text(table, GEOJSON), GEOJSON.values)["images"]
-            images = {row["name"]: _known(row, Homes.of(folder)) for row in rows}
+            images = {row["name"]: _parse_known(row, Homes.of(folder)) for row in rows}
             return cls(folder, tuple(images[name] for name in prior.names), prior)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise InputError(f"{table}: damaged ({plain(error)}); run the adjustment again") from error
@@ -108,7 +108,7 @@ class Earlier:
                 continue
             image = by_path.get(os.path.realpath(file))
             if image is None and file.stat().st_size in sizes:
-                image = by_content.get((file.stat().st_size, take(file).sha256))
+                image = by_content.get((file.stat().st_size, fingerprint(file).sha256))
             if image is not None:
                 found[str(file)] = image
         return found
@@ -123,7 +123,7 @@ class Earlier:
         for outline in grown.outlines:
             index = tree.query(outline, predicate="intersects")
             area = shapely.area(shapely.intersection(tree.geometries[index], outline))
-            best = np.lexsort((index, -area))[: _LOOKED_AT * tie.neighbours]
+            best = np.lexsort((index, -area))[: _OPENED_PER_NEIGHBOUR * tie.neighbours]
             found.update(self.number[usable[i].name] for i in index[best])
         return sorted(found)
 
@@ -144,10 +144,10 @@ class Earlier:
 
     def moved(self, grown: BlockPrior) -> Array:
         """Return how far [px] the cameras of its images (n,) move, where a block has grown out of this."""
-        lonlat = np.array([_middle(image.outline) for image in self.images])
+        lonlat = np.array([_outline_centre(image.outline) for image in self.images])
         alt = np.array([image.altitude for image in self.images])
         places = np.column_stack([lonlat, alt])
-        side = [np.sqrt(_area(image) / (image.size[0] * image.size[1])) for image in self.images]
+        side = [np.sqrt(_outline_area(image) / (image.size[0] * image.size[1])) for image in self.images]
         return moved_px(self.prior, grown, ecef_from_ground(places), np.array(side))
 
 
@@ -160,11 +160,11 @@ def _refuse_edited(folder: Path, files: Sequence[Path]) -> None:
         raise InputError(f"{folder / manifest.SUMS}: missing, as of a run that was interrupted: run it again")
     sums = {name: sha for layer in manifest.read(folder)[1] for name, sha in layer.files.items()}
     for file in files:
-        if sums.get(file.relative_to(folder).as_posix()) != take(file).sha256:
+        if sums.get(file.relative_to(folder).as_posix()) != fingerprint(file).sha256:
             raise InputError(f"{file}: was changed since the run wrote it (barpc verify {folder}): run it again")
 
 
-def _known(row: Mapping[str, Any], homes: Homes) -> Known:
+def _parse_known(row: Mapping[str, Any], homes: Homes) -> Known:
     choices = row["choices"]
     if choices is not None and "camera" in choices:
         choices = {**choices, "camera": homes.located(choices["camera"])}
@@ -178,12 +178,12 @@ def _known(row: Mapping[str, Any], homes: Homes) -> Known:
     return Known(str(row["name"]), path, choices, size, float(row["altitude"]), outline, int(row["bytes"]), *texts)
 
 
-def _middle(outline: Sequence[tuple[float, float]]) -> tuple[float, float]:
+def _outline_centre(outline: Sequence[tuple[float, float]]) -> tuple[float, float]:
     ring = np.array(outline)
     return tuple(ring.mean(axis=0)) if len(ring) else (0.0, 0.0)
 
 
-def _area(image: Known) -> float:
+def _outline_area(image: Known) -> float:
     """Return the area of an outline [m^2]."""
     ring = np.array(image.outline).reshape(-1, 2)
     if not len(ring):
@@ -213,7 +213,7 @@ def join_earlier(images: Sequence[Image], options: RunOptions, earlier: Earlier,
         )
     given = load_views(fresh, **how)
     names = {image.name for image in old.values()}
-    wanted = [i for i in _wanted(given.views, options, earlier) if earlier.images[i].name not in names]
+    wanted = [i for i in _needed_images(given.views, options, earlier) if earlier.images[i].name not in names]
     reached = [image for image in map(earlier.images.__getitem__, wanted) if _is_there(image, earlier.folder)]
     if not reached and not old:
         where = "its images there cannot be opened" if wanted else "none of its images meets the images given"
@@ -232,7 +232,7 @@ def _is_there(image: Known, folder: Path) -> bool:
     return False
 
 
-def _wanted(views: Sequence[View], options: RunOptions, earlier: Earlier) -> list[int]:
+def _needed_images(views: Sequence[View], options: RunOptions, earlier: Earlier) -> list[int]:
     """Return the images of a run that views are matched with, or that matches of theirs are given with."""
     found = set[int]()
     if options.matches:

@@ -29,7 +29,7 @@ from barpc import __version__
 from barpc.base.errors import AdjustError, BarpcError, InputError, out_of_memory
 from barpc.base.frozen import Arrays, from_arrays, to_arrays
 from barpc.base.identity import Input, guarded
-from barpc.base.sidefile import MB
+from barpc.base.safe_io import MB
 from barpc.tie.tasks import Progress, Store, ordered
 from barpc.workspace import Workspace, key_of
 
@@ -41,8 +41,8 @@ _PER_WORKER = 3  # batches in flight for each worker: enough that none waits
 _CLUSTER = 32  # workers of a cluster, at least: it may grow when there is work
 _LOST = ("KilledWorker", "FutureCancelledError")  # of distributed, which may not be installed
 
-Function = Callable[..., Any]
-Outcome = tuple[float, Any, BaseException | None]  # seconds, result, error of one task
+TaskFunction = Callable[..., Any]
+TaskOutcome = tuple[float, Any, BaseException | None]  # seconds, result, error of one task
 
 
 def worker_count(executor: Executor | None) -> int:
@@ -93,17 +93,17 @@ class CachingExecutor(Executor):
         self._limit = _PER_WORKER * worker_count(executor)
         self._lock = threading.Lock()
         self._storing = threading.RLock()  # while results are kept: `shutdown` waits for it
-        self._waiting: deque[_Task] = deque()
+        self._waiting: deque[_PendingTask] = deque()
         self._in_flight, self._open = 0, True
-        self._seconds: dict[Function, float] = {}
+        self._seconds: dict[TaskFunction, float] = {}
         self._digests: dict[int, tuple[object, str]] = {}
         self._spilled: set[str] = set()
 
-    def submit(self, fn: Function, /, *args: Any, **kwargs: Any) -> Future[Any]:
+    def submit(self, fn: TaskFunction, /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Submit `fn(*args)`; its result is looked up in the workspace, or computed when its turn comes."""
         if kwargs:
             raise TypeError("tasks take positional arguments only")
-        task = _Task(self, fn, args)
+        task = _PendingTask(self, fn, args)
         if self.executor is not None:
             with self._lock:
                 self._waiting.append(task)
@@ -118,7 +118,7 @@ class CachingExecutor(Executor):
             self._digests.clear()
             self.store.clear()
 
-    def key(self, fn: Function, args: tuple[Any, ...]) -> str:
+    def key(self, fn: TaskFunction, args: tuple[Any, ...]) -> str:
         """Return the key under which the result of a task is kept."""
         return key_of(fn.__module__, fn.__qualname__, [self._canonical(arg) for arg in args])
 
@@ -162,7 +162,7 @@ class CachingExecutor(Executor):
                 assert self.executor is not None
                 future = self.executor.submit(run_batch, batch[0].fn, tasks, __version__, guards)
             except (RuntimeError, OSError) as error:  # the pool is broken or shut down; the disk is full
-                self._resolve(batch, [(0.0, None, _explained(error))] * len(batch))
+                self._resolve(batch, [(0.0, None, _worker_error(error))] * len(batch))
             else:
                 future.add_done_callback(partial(self._completed, batch))
 
@@ -184,13 +184,13 @@ class CachingExecutor(Executor):
             return args
         return Spilled({name: array for name, array in record.items() if name not in large}, large, self.store)
 
-    def _next_batch(self) -> list[_Task]:
+    def _next_batch(self) -> list[_PendingTask]:
         """Return the waiting tasks of one function without a kept result; they count as in flight, if any."""
         with self._lock:
             if not self._open or self._in_flight >= self._limit:
                 return []
             self._in_flight += 1
-        batch: list[_Task] = []
+        batch: list[_PendingTask] = []
         while (task := self._next_task(batch)) is not None:
             if task.begin():
                 batch.append(task)
@@ -199,7 +199,7 @@ class CachingExecutor(Executor):
                 self._in_flight -= 1
         return batch
 
-    def _next_task(self, batch: Sequence[_Task]) -> _Task | None:
+    def _next_task(self, batch: Sequence[_PendingTask]) -> _PendingTask | None:
         """Return one more for a batch: as many as take BATCH_SECONDS, as far as the other workers get as many."""
         with self._lock:
             if not self._waiting:
@@ -212,11 +212,11 @@ class CachingExecutor(Executor):
 
     # -- taking back -------------------------------------------------------------------------------
 
-    def _completed(self, batch: Sequence[_Task], future: Future[Any]) -> None:
+    def _completed(self, batch: Sequence[_PendingTask], future: Future[Any]) -> None:
         try:
             outcomes, spent = future.result()
         except BaseException as error:  # noqa: BLE001  (goes to whoever asks for the result)
-            outcomes = [(0.0, None, _explained(error))] * len(batch)
+            outcomes = [(0.0, None, _worker_error(error))] * len(batch)
         else:
             with self._lock:
                 self.workspace.worker_seconds += spent
@@ -225,7 +225,7 @@ class CachingExecutor(Executor):
         self._resolve(batch, outcomes)
         self._send()
 
-    def _resolve(self, batch: Sequence[_Task], outcomes: Sequence[Outcome]) -> None:
+    def _resolve(self, batch: Sequence[_PendingTask], outcomes: Sequence[TaskOutcome]) -> None:
         with self._lock:
             self._in_flight -= 1
         with self._storing:
@@ -233,10 +233,10 @@ class CachingExecutor(Executor):
                 task.finish(value, error, keep=self._open)
 
 
-class _Task(Future[Any]):
+class _PendingTask(Future[Any]):
     """One task: found, in flight, or to be done when asked for."""
 
-    def __init__(self, owner: CachingExecutor, fn: Function, args: tuple[Any, ...]) -> None:
+    def __init__(self, owner: CachingExecutor, fn: TaskFunction, args: tuple[Any, ...]) -> None:
         super().__init__()
         self._owner, self.fn, self.args = owner, fn, args
         self._key, self._stage = "", fn.__name__.strip("_")
@@ -305,11 +305,11 @@ class Spilled:
 
 
 def run_batch(
-    fn: Function,
+    fn: TaskFunction,
     tasks: Sequence[tuple[Any, ...] | Spilled],
     version: str,
     guards: Sequence[tuple[Input, ...]] | None = None,
-) -> tuple[list[Outcome], float]:
+) -> tuple[list[TaskOutcome], float]:
     """Run a batch of tasks in a worker; an error of one leaves the others theirs. Returns CPU seconds, too.
 
     `guards`: the inputs that each task names. One that came to a cluster with another `version` works on nothing.
@@ -320,7 +320,7 @@ def run_batch(
             "everywhere"
         )
         return [(0.0, None, error)] * len(tasks), 0.0
-    outcomes: list[Outcome] = []
+    outcomes: list[TaskOutcome] = []
     cpu = time.thread_time()
     for task, inputs in zip(tasks, guards or [()] * len(tasks), strict=True):
         start = time.perf_counter()
@@ -336,7 +336,7 @@ def run_batch(
     return outcomes, time.thread_time() - cpu
 
 
-def _explained(error: BaseException) -> BaseException:
+def _worker_error(error: BaseException) -> BaseException:
     """Return a lost worker's error in words; any other error as it is."""
     if not isinstance(error, (BrokenExecutor, CancelledError)) and type(error).__name__ not in _LOST:
         return error

@@ -12,21 +12,21 @@ from pathlib import Path
 
 import numpy as np
 
-from barpc.ba.held.ground import DEM_BIAS, KNOWN_BIAS
+from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.errors import InputError, listed
 from barpc.base.geodesy import Array, ecef_from_ground, metres_per_unit, wrap_longitude
-from barpc.base.identity import Input, Stamp, changed, take
+from barpc.base.identity import Input, Stamp, changed, fingerprint
 from barpc.base.options import RunOptions, declared
 from barpc.base.remote import here, located, location
-from barpc.base.sidefile import IMAGE, read_names, versioned
-from barpc.base.usual import robust_spread
+from barpc.base.safe_io import IMAGE, read_names, versioned
+from barpc.base.statistics import robust_spread
 from barpc.pointio.correspondences import read_altimetry
-from barpc.pointio.gcps import Frame, read_gcps
+from barpc.pointio.gcps import ControlReference, read_gcps
 from barpc.pointio.matches import Links, read_links, tracks_of
 from barpc.pointio.names import ViewNames
 from barpc.rasters.dem import Dem, geoid_file
 from barpc.rasters.raster import hashed
-from barpc.rasters.vertical import ELLIPSOIDAL, NONE
+from barpc.rasters.vertical import ELLIPSOIDAL, NO_GEOID
 from barpc.report import Run
 from barpc.report.runfiles import table_path
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Tracks, View
@@ -40,9 +40,9 @@ from barpc.tie.tasks import Progress, ordered
 
 logger = logging.getLogger(__name__)
 
-PRIOR, IMAGES = "block.npz", "images.json"  # the files in a run folder that a later run starts from
-_MARGIN = 1.5  # px beyond the centres of the outermost pixels that a matcher may still mean
-_ASTRAY = 0.05  # of the points may lie farther off, where a matcher looks over borders; of other crops more
+PRIOR_FILE, IMAGES = "block.npz", "images.json"  # the files in a run folder that a later run starts from
+_IMAGE_MARGIN = 1.5  # px beyond the centres of the outermost pixels that a matcher may still mean
+_MAX_OUTSIDE_SHARE = 0.05  # of the points may lie farther off, where a matcher looks over borders; of other crops more
 
 
 def side_inputs(options: RunOptions, views: Sequence[View]) -> Dem | None:
@@ -81,7 +81,7 @@ def with_located(options: RunOptions) -> RunOptions:
         return path if here([found]) else os.fspath(versioned(found, IMAGE))
 
     geoid, heights = (None if name is None else geoid_file(name) for name in (options.geoid, options.heights))
-    geoid, heights = (path if path in (None, NONE, ELLIPSOIDAL) else at(path) for path in (geoid, heights))
+    geoid, heights = (path if path in (None, NO_GEOID, ELLIPSOIDAL) else at(path) for path in (geoid, heights))
     dem, reference = (tuple(map(at, paths)) for paths in (options.dem, options.reference))
     return replace(options, dem=dem, geoid=geoid, heights=heights, reference=reference)
 
@@ -93,7 +93,7 @@ def reference_names(options: RunOptions) -> list[str]:
 
 def input_files(options: RunOptions) -> list[Path]:
     """Return every file of this machine that the options name; none of them is ever written."""
-    earlier = () if options.add_to is None else (PRIOR, IMAGES)
+    earlier = () if options.add_to is None else (PRIOR_FILE, IMAGES)
     found = [table_path(Path(str(options.add_to)), name) for name in earlier]
     for name, one in declared(RunOptions).items():
         value = getattr(options, name)
@@ -173,7 +173,7 @@ def hash_inputs(
         if known is not None and one.stamp is not None and not known.matches(one.stamp):
             raise changed(one.path)
     if code := hook_files(options.tie.matcher):
-        first, *rest = map(take, code)
+        first, *rest = map(fingerprint, code)
         inputs[options.tie.matcher] = Input(first.path, first.size, first.sha256, first.stamp, tuple(rest))
     return inputs
 
@@ -224,14 +224,14 @@ def _linked(paths: Sequence[str | Path], views: Sequence[View], partly: bool = F
             continue
         if not parts[-1].joins_views:
             logger.warning("%s: holds no match of two of the images, which is as if it were not given", path)
-        parts[-1] = _in_images(path, views, parts[-1])
+        parts[-1] = _matches_inside(path, views, parts[-1])
     return Links.joined(parts[1:] or parts)
 
 
-def _in_images(path: str | Path, views: Sequence[View], links: Links) -> Links:
+def _matches_inside(path: str | Path, views: Sequence[View], links: Links) -> Links:
     """Return the matches without points outside their images; InputError where these are more than a few."""
-    beyond = np.array([view.size for view in views])[links.view] + (_MARGIN - 1.0)
-    inside = np.asarray(((links.xy >= -_MARGIN) & (links.xy <= beyond)).all(axis=1))
+    beyond = np.array([view.size for view in views])[links.view] + (_IMAGE_MARGIN - 1.0)
+    inside = np.asarray(((links.xy >= -_IMAGE_MARGIN) & (links.xy <= beyond)).all(axis=1))
     wrong = np.flatnonzero(~inside)
     if not len(wrong):
         return links
@@ -240,7 +240,7 @@ def _in_images(path: str | Path, views: Sequence[View], links: Links) -> Links:
         f"{path}: {len(wrong)} of {len(inside)} points lie outside their images, as ({col:g}, {row:g}) in {of.name},"
         f" {of.size[0]} x {of.size[1]} pixels"
     )
-    if len(wrong) > _ASTRAY * len(inside):
+    if len(wrong) > _MAX_OUTSIDE_SHARE * len(inside):
         raise InputError(f"{said}; were they found in other crops, or in reduced images?")
     logger.warning("%s: they are left out", said)
     number = np.cumsum(inside) - 1
@@ -251,7 +251,7 @@ def _in_images(path: str | Path, views: Sequence[View], links: Links) -> Links:
 # --- ground points and altimetry against the cameras ------------------------------------------------------
 
 
-_REACH = 1000.0  # m: ten times what delivered cameras are wrong by where they are bad
+_MAX_CAMERA_ERROR = 1000.0  # m: ten times what delivered cameras are wrong by where they are bad
 _ALT_REACH = 500.0  # m beyond a camera's altitudes: a geoid is 100 m, and ranges miss relief by some hundred
 
 _MISTAKES = {
@@ -275,8 +275,8 @@ def load_gcps(
     Points that cannot be where they are said to be, images that are no views, and files that cannot be read are an
     InputError, or with `keep_going` left out and named in `left_out`. Altitudes that are not known come from `dem`.
     """
-    frame = Frame(options.gcp_crs, options.geoid, options.heights, tuple(paths))
-    parts = [_load(path, views, options, dem, frame) for path in paths]
+    frame = ControlReference(options.gcp_crs, options.geoid, options.heights, tuple(paths))
+    parts = [_load_control(path, views, options, dem, frame) for path in paths]
     if not parts:
         return None
     starts = np.cumsum([0, *(len(part.names) for part in parts)])[:-1]
@@ -291,14 +291,16 @@ def load_gcps(
     return GroundPoints(names, point=point, **joined, strangers=strangers, left_out=left_out, said=said, datums=datums)
 
 
-def _load(path: str, views: Sequence[View], options: RunOptions, dem: Dem | None, frame: Frame) -> GroundPoints:
+def _load_control(
+    path: str, views: Sequence[View], options: RunOptions, dem: Dem | None, frame: ControlReference
+) -> GroundPoints:
     try:
         points = read_gcps(path, [view.name for view in views], frame)
     except InputError as error:
         if not options.keep_going:
             raise
         return replace(GroundPoints.none(), left_out=(f"{error}; the file is left out",))
-    points, said = _with_altitudes(_beside(dem, points, options), views, options, dem)
+    points, said = _with_altitudes(_with_height_above_dem(dem, points, options), views, options, dem)
     out, keep = [], np.ones(len(points.names), dtype=bool)
     search = np.array([reach_of(view, options.tie) for view in views])[points.view]
     for wrong, what in _implausible(points, views, search):
@@ -344,7 +346,7 @@ def _with_altitudes(
     return replace(points, lonlatalt=ground, sigma=sigma), [said] if unknown.any() else []
 
 
-def _beside(dem: Dem | None, points: GroundPoints, options: RunOptions) -> GroundPoints:
+def _with_height_above_dem(dem: Dem | None, points: GroundPoints, options: RunOptions) -> GroundPoints:
     """Return the points with how far they lie above a DEM, where it is known what its heights count from."""
     ground = points.lonlatalt[points.lonlatalt[:, 2] != 0.0]
     if dem is None or not dem.known or not points.datums:
@@ -362,8 +364,8 @@ def _implausible(points: GroundPoints, views: Sequence[View], search: Array) -> 
     """Yield the points (G,) that cannot be meant, and why; the first reason counts. `search` (M,): `reach_of` [px]."""
     low, high = np.array([view.alt_range for view in views])[points.view].T
     alt = points.lonlatalt[points.point, 2]
-    shown, pixel = _shown(points, views, np.clip(alt, low, high))
-    reach = np.maximum(_REACH, search * pixel)
+    shown, pixel = _image_positions(points, views, np.clip(alt, low, high))
+    reach = np.maximum(_MAX_CAMERA_ERROR, search * pixel)
     away = _distance(points, shown, (0, 1), (1, 1))
     yield _any(points, ~np.isfinite(away)), "no ground is seen at the position in the image"
     far = _any(points, away > reach) | (np.abs(points.lonlatalt[:, 1]) > 90.0)
@@ -387,7 +389,7 @@ def _any(points: GroundPoints, observed: BoolArray) -> BoolArray:
     return np.bincount(points.point, observed, minlength=len(points.names)) > 0
 
 
-def _shown(points: GroundPoints, views: Sequence[View], alt: Array) -> tuple[Array, Array]:
+def _image_positions(points: GroundPoints, views: Sequence[View], alt: Array) -> tuple[Array, Array]:
     """Return where each image shows a point (M, 3) at altitudes (M,) [m], and the pixel size there (M,) [m]."""
     ground, pixel = np.empty((len(alt), 3)), np.empty(len(alt))
     for v in np.unique(points.view):
@@ -419,16 +421,16 @@ def load_altimetry(paths: Sequence[str], views: Sequence[View], heights: str | N
 
 def _heights_of(path: str, views: Sequence[View], heights: str | None) -> Altimetry:
     given = read_altimetry(path, heights)
-    inside = _inside(given.lonlatalt, views)
+    inside = _within_bounds(given.lonlatalt, views)
     if not inside.any():
         swapped = given.lonlatalt[:, [1, 0, 2]]
         at = f"{len(inside)} heights about {', '.join(f'{x:.4f}' for x in np.median(given.lonlatalt[:, :2], axis=0))}"
-        what = "are longitude and latitude exchanged?" if _inside(swapped, views).any() else "another place?"
+        what = "are longitude and latitude exchanged?" if _within_bounds(swapped, views).any() else "another place?"
         raise InputError(f"{path}: none of its {at} (lon, lat) lies in the images: {what}")
     return Altimetry(given.lonlatalt[inside], given.sigma[inside], given.sigma_flat[inside], given.datums)
 
 
-def _inside(lonlatalt: Array, views: Sequence[View]) -> BoolArray:
+def _within_bounds(lonlatalt: Array, views: Sequence[View]) -> BoolArray:
     """Return the places (n, 3) within the ground bounds of any image, or near them."""
     found = np.zeros(len(lonlatalt), dtype=bool)
     for view in views:
@@ -437,7 +439,7 @@ def _inside(lonlatalt: Array, views: Sequence[View]) -> BoolArray:
         if not len(ring):
             continue
         middle = ring.mean(axis=0)
-        margin = _REACH / metres_per_unit([*middle, 0.0])[:2]
+        margin = _MAX_CAMERA_ERROR / metres_per_unit([*middle, 0.0])[:2]
         ring[:, 0] = wrap_longitude(ring[:, 0], middle[0])
         place = np.column_stack([wrap_longitude(lonlatalt[:, 0], middle[0]), lonlatalt[:, 1]])
         low, high = ring.min(axis=0) - margin, ring.max(axis=0) + margin

@@ -21,8 +21,8 @@ from rasterio.windows import Window
 from barpc.base.errors import BarpcError, ImageError, InputError, MissingRpcError, RpcError
 from barpc.base.geodesy import ALTITUDES
 from barpc.base.identity import Stamp, also_seen, recorded
-from barpc.base.remote import Place, here, located
-from barpc.base.sidefile import IMAGE, plain_path, versioned
+from barpc.base.remote import PathOrUrl, here, located
+from barpc.base.safe_io import IMAGE, plain_path, versioned
 from barpc.cameras import open_split, split_spec
 from barpc.pipeline.executor import GROUP, by_groups
 from barpc.pointio.names import unique_names
@@ -34,7 +34,7 @@ from barpc.tie.tasks import Progress
 
 logger = logging.getLogger(__name__)
 
-_SAMPLES = ((0.5, 0.5), (0.25, 0.25), (0.75, 0.75))  # of width and height: where the sampled windows lie
+_WINDOW_POSITIONS = ((0.5, 0.5), (0.25, 0.25), (0.75, 0.75))  # of width and height: where the sampled windows lie
 _MORE = tuple((x / 5, y / 5) for x in range(6) for y in range(6))  # where nothing varies there
 _SAMPLE_SIDE = (256, 16)  # px: many columns and few rows, so that few strips are decoded
 _GIVE_RPC = "name its file behind it, {},camera=FILE, or leave the image out (--keep-going of adjust and match)"
@@ -52,12 +52,12 @@ class LoadedViews:
     worker_seconds: float = 0.0  # of CPU, spent in other processes
 
 
-_Read = tuple[View, Camera, bytes | None, Mapping[str, Stamp]]
+_OpenedImage = tuple[View, Camera, bytes | None, Mapping[str, Stamp]]
 """An image that was opened: the mark of its sampled pixels (see `Twins`), and all files that were opened for it."""
-_Given = tuple[str, Place, Image]  # name, file, and what was given
+_ImageRequest = tuple[str, PathOrUrl, Image]  # name, file, and what was given
 
 
-def image_path(image: Image, hosts: Sequence[str] = ()) -> Place:
+def image_path(image: Image, hosts: Sequence[str] = ()) -> PathOrUrl:
     """Return the file with the pixels, absolute; on another host where it is one of `hosts`."""
     path = located(image.path, hosts) if isinstance(image, View) else split_spec(image, hosts)[0]
     return path.absolute()
@@ -114,11 +114,11 @@ def load_views(
 
 
 def _read_all(
-    given: list[_Given],
+    given: list[_ImageRequest],
     how: tuple[int, bool, tuple[str, ...]],
     executor: Executor | None,
     progress: Progress | None,
-) -> tuple[list[_Read | BarpcError], float]:
+) -> tuple[list[_OpenedImage | BarpcError], float]:
     """Return every image as it was read, and CPU seconds of other processes."""
     groups = by_groups(executor, read_group, given, how, "cameras", progress)
     spent = 0.0 if executor is None else sum(seconds for _, seconds in groups)
@@ -126,21 +126,21 @@ def _read_all(
 
 
 def read_group(
-    given: Sequence[_Given], band: int, distinct: bool, hosts: Sequence[str] = ()
-) -> tuple[list[_Read | BarpcError], float]:
+    given: Sequence[_ImageRequest], band: int, distinct: bool, hosts: Sequence[str] = ()
+) -> tuple[list[_OpenedImage | BarpcError], float]:
     """Read some images in a worker; an error of one leaves the others theirs. Returns CPU seconds, too."""
-    start, out = time.thread_time(), list[_Read | BarpcError]()
+    start, out = time.thread_time(), list[_OpenedImage | BarpcError]()
     for name, file, image in given:
         try:
             with recorded({}) as files:
-                out.append((*_load(name, file, image, band, hosts, distinct), files))
+                out.append((*_open_image(name, file, image, band, hosts, distinct), files))
         except BarpcError as error:
             out.append(error)
     return out, time.thread_time() - start
 
 
-def _load(
-    name: str, file: Place, image: Image, band: int, hosts: Sequence[str], distinct: bool
+def _open_image(
+    name: str, file: PathOrUrl, image: Image, band: int, hosts: Sequence[str], distinct: bool
 ) -> tuple[View, Camera, bytes | None]:
     file = versioned(file, IMAGE)
     with open_raster(file) as dataset:
@@ -158,14 +158,14 @@ def _load(
             if camera.format in ("grid", "correction") and "camera" not in choices:
                 raise ImageError(f"{file}: a grid and no image; give it behind its image: IMAGE,camera={file}")
         day = (image.date if isinstance(image, View) else "") or date_taken(file, camera.path, tags)
-        view = View(name, os.fspath(file), size, camera.model, _altitudes(camera), day)
+        view = View(name, os.fspath(file), size, camera.model, _altitudes_used(camera), day)
         ring = footprint(view.sensor, size, view.altitude)
         if not (abs(ring[:, 1]) <= 90).all():  # NaN fails, too
             raise RpcError(f"{file}: its RPC does not reach the ground over the image ({size[0]} x {size[1]} px)")
-        return view, camera, _sampled(dataset, band) if distinct else None
+        return view, camera, _sampled_digest(dataset, band) if distinct else None
 
 
-def _altitudes(camera: Camera) -> tuple[float, float]:
+def _altitudes_used(camera: Camera) -> tuple[float, float]:
     """Return the altitudes that a camera is used for [m]: an RPC with a zero height scale is usable."""
     low, high = max(camera.alt_range[0], ALTITUDES[0]), min(camera.alt_range[1], ALTITUDES[1])
     if high - low < LEAST_RANGE:
@@ -212,21 +212,21 @@ class Twins:
             self._alike[like] = view.path
             return None
         with open_raster(view.path) as image:
-            mark = _whole(image, self._band)
+            mark = _whole_digest(image, self._band)
         first, self._alike[like] = self._alike[like], None
         if first is not None:
             with open_raster(first) as image:
-                before = _whole(image, self._band)
+                before = _whole_digest(image, self._band)
             if before is not None:
                 self._known[view.size, before] = first
         return None if mark is None else (view.size, mark)
 
 
-def _sampled(image: Any, band: int) -> bytes | None:
+def _sampled_digest(image: Any, band: int) -> bytes | None:
     """Return a mark of the pixels in a few windows; None where nothing varies in them."""
     size = image.width, image.height
     # fill, perhaps: more is asked before anything is read whole
-    return _digest(image, band, _samples(*size)) or _digest(image, band, _samples(*size, _MORE))
+    return _pixel_digest(image, band, _samples(*size)) or _pixel_digest(image, band, _samples(*size, _MORE))
 
 
 def _identity(path: str) -> Hashable:
@@ -236,31 +236,31 @@ def _identity(path: str) -> Hashable:
     return file.st_dev, file.st_ino
 
 
-def _samples(width: int, height: int, at: Sequence[tuple[float, float]] = _SAMPLES) -> list[Window]:
+def _samples(width: int, height: int, at: Sequence[tuple[float, float]] = _WINDOW_POSITIONS) -> list[Window]:
     wide, high = (min(side, size) for side, size in zip(_SAMPLE_SIDE, (width, height), strict=True))
     return [Window(int(x * (width - wide)), int(y * (height - high)), wide, high) for x, y in at]
 
 
-def _whole(image: Any, band: int) -> bytes | None:
+def _whole_digest(image: Any, band: int) -> bytes | None:
     """Return a hash of all pixels, row by row; None for an image in which nothing varies: it shows nothing."""
     rows = image.block_shapes[band - 1][0]  # whole blocks, so that each is decoded once
     tops = range(0, image.height, rows)
-    return _digest(image, band, [Window(0, top, image.width, min(rows, image.height - top)) for top in tops])
+    return _pixel_digest(image, band, [Window(0, top, image.width, min(rows, image.height - top)) for top in tops])
 
 
-def _digest(image: Any, band: int, windows: list[Window]) -> bytes | None:
+def _pixel_digest(image: Any, band: int, windows: list[Window]) -> bytes | None:
     found = blake2b(digest_size=16)
     low = high = np.nan
     for window in windows:
         raw = image.read(band, window=window)
         for top in range(0, len(raw), _SAMPLE_SIDE[1]):
-            rows = _numbers(raw[top : top + _SAMPLE_SIDE[1]])
+            rows = _as_floats(raw[top : top + _SAMPLE_SIDE[1]])
             found.update(rows.tobytes())
             low, high = np.fmin(low, np.fmin.reduce(rows, axis=None)), np.fmax(high, np.fmax.reduce(rows, axis=None))
     return found.digest() if high > low else None
 
 
-def _numbers(raw: Any) -> Any:
+def _as_floats(raw: Any) -> Any:
     """Return the pixels as 8-byte floats (complex ones as two), with one kind of zero and one of NaN."""
     parts = raw.astype(np.complex128).view(np.float64) if np.iscomplexobj(raw) else raw
     numbers = parts.astype(np.float64) + 0.0

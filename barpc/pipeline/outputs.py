@@ -17,24 +17,24 @@ from barpc.base import manifest
 from barpc.base.atomic import STATE
 from barpc.base.errors import BarpcError, InputError, OutputError
 from barpc.base.geodesy import Array
-from barpc.base.identity import take
+from barpc.base.identity import fingerprint
 from barpc.base.manifest import SUMS, Layer
 from barpc.base.options import RunOptions
 from barpc.base.remote import is_url
 from barpc.cameras import open_camera
 from barpc.fit import RpcFit
-from barpc.pipeline.beyond import REOPENED, RESAMPLED, grid_names, made_in_room
 from barpc.pipeline.executor import CachingExecutor, by_groups
-from barpc.pipeline.handoff import verify
-from barpc.pipeline.inputs import IMAGES, PRIOR
+from barpc.pipeline.grid_outputs import REOPENED, RESAMPLED, grid_names, made_in_room
+from barpc.pipeline.inputs import IMAGES, PRIOR_FILE
+from barpc.pipeline.verify_outputs import verify
 from barpc.report import Run, Summary
-from barpc.report.page import NAME, REPORT, can_render, report_html
-from barpc.report.records import plain
+from barpc.report.page import REPORT_FILE, REPORT_STAGE, can_render, report_html
+from barpc.report.records import json_form
 from barpc.report.runfiles import FOLDER, TABLES, gcps_geojson, read_summary
 from barpc.report.summary import OutputEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.rpcio import CARRIERS, WRITABLE, hidden_by, row_of, sidecars, write_camera
-from barpc.rpcio.grids import CORRECTION, GRID
+from barpc.rpcio import CARRIERS, WRITABLE, format_for, hidden_by, sidecars, write_camera
+from barpc.rpcio.grids import CORRECTION, GRID_SUFFIX
 from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import ground_grids
@@ -42,8 +42,8 @@ from barpc.sensor.rpc import RPC
 from barpc.tie.tasks import Progress
 from barpc.workspace import LAST, Homes, Workspace, noted_outputs, own_files
 
-MATCHES = ("matches.csv", "matches.npz")
-GCPS = f"{FOLDER}/gcps.geojson"  # of a reference
+MATCH_FILES = ("matches.csv", "matches.npz")
+GCP_FILE = f"{FOLDER}/gcps.geojson"  # of a reference
 
 
 Fitted = tuple[View, RpcFit, SensorModel]  # a view, its refitted RPC and P_BA
@@ -122,15 +122,15 @@ def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
 def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> list[str]:
     """Return the names of a run's outputs before it starts; of match files those that are already in the folder."""
     names = [*(f"{FOLDER}/{name}" for name in TABLES), LAST, SUMS]
-    names += [NAME] * can_render() + [GCPS] * bool(options.reference)
+    names += [REPORT_FILE] * can_render() + [GCP_FILE] * bool(options.reference)
     if options.stop_after == "matching":
         stems = {view.name for view in views}
         pairs = [path.name for path in (folder / "asp").glob("*__*.txt") if _is_pair(path.stem, stems)]
-        return [*names, *MATCHES, *(f"asp/{name}" for name in pairs)]
+        return [*names, *MATCH_FILES, *(f"asp/{name}" for name in pairs)]
     if options.stop_after == "all":
         names += [name for view in views for name in file_names(view, options.images, options.rpc_formats)]
         names += [name for view in views for name in grid_names(view, options)]
-    return [*names, f"{FOLDER}/{IMAGES}", f"{FOLDER}/{PRIOR}"]
+    return [*names, f"{FOLDER}/{IMAGES}", f"{FOLDER}/{PRIOR_FILE}"]
 
 
 def _is_pair(stem: str, names: Set[str]) -> bool:
@@ -160,14 +160,14 @@ def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
             with workspace.output(f"{FOLDER}/{name}") as partial:
                 partial.write_bytes(content(run, summary))
         if run.reference is not None and run.reference.control is not None and run.adjustment is not None:
-            workspace.write_text(GCPS, gcps_geojson(run).decode())
-    with workspace.stage(REPORT):
+            workspace.write_text(GCP_FILE, gcps_geojson(run).decode())
+    with workspace.stage(REPORT_STAGE):
         if can_render():
-            workspace.write_text(NAME, report_html(summary, workspace.folder))
+            workspace.write_text(REPORT_FILE, report_html(summary, workspace.folder))
     # the report may be made again by another release: it is no result
-    results = sorted((name, sha) for name, sha in workspace.outputs.items() if name != NAME)
+    results = sorted((name, sha) for name, sha in workspace.outputs.items() if name != REPORT_FILE)
     summary = replace(summary, outputs=tuple(OutputEntry(name, sha) for name, sha in results))
-    texts = ",\n".join(f"{json.dumps(key)}: {_json(value)}" for key, value in plain(summary).items())
+    texts = ",\n".join(f"{json.dumps(key)}: {_json(value)}" for key, value in json_form(summary).items())
     workspace.write_text(LAST, f"{{\n{texts}\n}}\n")
     return summary
 
@@ -182,8 +182,8 @@ def _json(value: Any) -> str:
 # --- whether a finished run is still what it was ----------------------------------------------------------
 
 
-SAME, MOVED, LATER, UNKNOWN = "same", "moved", "later", "not asked"
-GOOD = (SAME, MOVED, LATER, UNKNOWN)
+SAME, MOVED, LATER, NOT_ASKED = "same", "moved", "later", "not asked"
+PASSED_STATES = (SAME, MOVED, LATER, NOT_ASKED)
 CHANGED, MISSING, ADDED = "changed", "missing", "added"
 
 
@@ -211,7 +211,7 @@ def prove(folder: Path, places: Sequence[Path] = (), expected: str | None = None
     root, layers = manifest.read(folder)
     noted, listed = noted_outputs(folder), {name: sha for layer in layers for name, sha in layer.files.items()}
     # of what the first command wrote a later one makes the report again, and nothing else
-    listed |= {name: sha for name, sha in layers[0].files.items() if name != NAME}
+    listed |= {name: sha for name, sha in layers[0].files.items() if name != REPORT_FILE}
     roots = {root, *(layer.after for layer in layers[1:])}
     found = [*_roots(root, noted.get(SUMS, root), layers, expected), *_outputs(folder, listed, noted, roots)]
     for path, image, _ in hidden_by(folder / name for name in listed if name not in layers[0].files):
@@ -222,7 +222,7 @@ def prove(folder: Path, places: Sequence[Path] = (), expected: str | None = None
             summary = read_summary(folder)
         except InputError as error:
             return [*found, Proved("input", LAST, MISSING, f"what it says of inputs: {error}")]
-        found += [*_inputs(summary, folder, places), *_cameras(summary, folder)]
+        found += [*_inputs(summary, folder, places), *_verify_cameras(summary, folder)]
     return found
 
 
@@ -250,23 +250,23 @@ def _outputs(folder: Path, listed: Mapping[str, str], noted: Mapping[str, str], 
     Of folders below with a SHA256SUMS, exports of a run with one of the `roots` are compared, too.
     """
     for name, sha in sorted(listed.items()):
-        found = _digest(folder / name)
+        found = _file_digest(folder / name)
         now = SAME if found == sha else MISSING if found is None else CHANGED
         yield Proved("output", name, now, _ENDED if found == noted.get(name) and now == CHANGED else "")
     parents = {parent.as_posix() for name in listed for parent in PurePosixPath(name).parents}
-    for name, below in _files(folder, parents):
+    for name, below in _folder_files(folder, parents):
         if below is None and name not in listed and name != SUMS:
             yield Proved("output", name, ADDED, _ENDED if name in noted else "by nobody who noted it")
         elif below is not None and manifest.read(below)[1][0].after in roots:  # an export of this run
             yield from (replace(one, file=f"{name}/{one.file}") for one in prove(below))
         elif below is not None:
-            yield Proved("output", name, UNKNOWN, f"not of this run: barpc verify {below}")
+            yield Proved("output", name, NOT_ASKED, f"not of this run: barpc verify {below}")
 
 
 _ENDED = "by a command that did not come to its end: give it again"
 
 
-def _files(folder: Path, parents: Set[str]) -> Iterator[tuple[str, Path | None]]:
+def _folder_files(folder: Path, parents: Set[str]) -> Iterator[tuple[str, Path | None]]:
     """Yield every file and link in a folder by name, but its state; of a folder below with a SHA256SUMS only that."""
 
     def refuse(error: OSError) -> None:
@@ -289,21 +289,21 @@ def _inputs(summary: Summary, folder: Path, places: Iterable[Path]) -> Iterator[
     homes = Homes.of(folder)
     for one in summary.inputs or ():
         if is_url(one.path):
-            yield Proved("input", one.path, UNKNOWN, "on another host")
+            yield Proved("input", one.path, NOT_ASKED, "on another host")
             continue
-        found = [_digest(path) for path in homes.candidates(one.path)]
+        found = [_file_digest(path) for path in homes.candidates(one.path)]
         if one.sha256 in found:
             yield Proved("input", one.path, SAME)
             continue
         elsewhere = (place / Path(one.path).name for place in (folder, folder.parent, *places))
-        moved = next((str(path) for path in elsewhere if _digest(path) == one.sha256), None)
+        moved = next((str(path) for path in elsewhere if _file_digest(path) == one.sha256), None)
         if moved is not None:
             yield Proved("input", one.path, MOVED, f"it is {moved}")
         else:
             yield Proved("input", one.path, CHANGED if any(found) else MISSING)
 
 
-def _cameras(summary: Summary, folder: Path) -> Iterator[Proved]:
+def _verify_cameras(summary: Summary, folder: Path) -> Iterator[Proved]:
     for view in summary.views:
         for name, consumers in view.outputs.items():
             stated = consumers.get("barpc")
@@ -315,7 +315,7 @@ def _holds_camera(path: Path) -> bool:
     """Return whether a file holds the camera of its whole image: a resampled image has its own."""
     if path.name.endswith(RESAMPLED):
         return False
-    return path.name.endswith((GRID, CORRECTION)) or row_of(path) is not None
+    return path.name.endswith((GRID_SUFFIX, CORRECTION)) or format_for(path) is not None
 
 
 def _camera(view: ViewEntry, path: Path, name: str, stated: float) -> Proved:
@@ -331,9 +331,9 @@ def _camera(view: ViewEntry, path: Path, name: str, stated: float) -> Proved:
     return Proved("camera", name, CHANGED, far)
 
 
-def _digest(path: Path) -> str | None:
+def _file_digest(path: Path) -> str | None:
     try:
-        return take(path).sha256 if path.is_file() else None
+        return fingerprint(path).sha256 if path.is_file() else None
     except OSError:
         return None
 
@@ -355,6 +355,6 @@ def remake_report(folder: Path | str) -> Path:
     if not can_render():
         raise BarpcError("the report needs jinja2: pip install 'barpc[report]'")
     html = report_html(summary, folder)
-    with Workspace(folder, overwrite=True, names=[NAME], adds=True) as workspace:
-        workspace.write_text(NAME, html)
-    return folder / NAME
+    with Workspace(folder, overwrite=True, names=[REPORT_FILE], adds=True) as workspace:
+        workspace.write_text(REPORT_FILE, html)
+    return folder / REPORT_FILE

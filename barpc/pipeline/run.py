@@ -17,22 +17,21 @@ from typing import Any, Literal
 import numpy as np
 
 from barpc.ba import Adjustment, adjust_tracks, block_prior
-from barpc.ba.held.ground import DEM_BIAS, KNOWN_BIAS
+from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.base.identity import Input, Stamp, ask, guarded, recorded
 from barpc.base.options import AdjustOptions, FitOptions, RunOptions, file_options
 from barpc.base.remote import here
-from barpc.base.sidefile import plain_path
+from barpc.base.safe_io import plain_path
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
-from barpc.pipeline.beyond import write_grids
 from barpc.pipeline.earlier import Earlier, added, chosen_pairs, images_table, join_earlier, movers, of_new
 from barpc.pipeline.executor import CachingExecutor, by_groups
-from barpc.pipeline.handoff import unverified
+from barpc.pipeline.grid_outputs import write_grids
 from barpc.pipeline.inputs import (
     IMAGES,
-    PRIOR,
+    PRIOR_FILE,
     given_matches,
     given_tracks,
     hash_inputs,
@@ -45,14 +44,15 @@ from barpc.pipeline.inputs import (
     with_located,
 )
 from barpc.pipeline.loading import Image, image_path, load_views
-from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, remake_report, write_tables, write_views
+from barpc.pipeline.outputs import MATCH_FILES, output_names, refuse_shadows, remake_report, write_tables, write_views
+from barpc.pipeline.verify_outputs import unverified
 from barpc.pointio.matches import asp_text, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
 from barpc.rasters.dem import Dem
 from barpc.report import Run, Summary, summarize
 from barpc.report.outcome import WHOLE_PIXELS, pair_ties
-from barpc.report.page import REPORT
-from barpc.report.records import plain
+from barpc.report.page import REPORT_STAGE
+from barpc.report.records import json_form
 from barpc.report.runfiles import FOLDER
 from barpc.report.summary import InputEntry, StageEntry
 from barpc.rpcio import plain_source
@@ -90,7 +90,7 @@ class AdjustResult:
     @cached_property
     def summary(self) -> dict[str, Any]:
         """Content of summary.json."""
-        found: dict[str, Any] = plain(self.record)
+        found: dict[str, Any] = json_form(self.record)
         return found
 
     def __repr__(self) -> str:
@@ -156,8 +156,8 @@ def adjust(
     stages, seen, work = list[dict[str, Any]](), dict[str, Stamp](), Work(executor, progress)
     with timed("inputs", stages) as workers:
         with recorded(seen):
-            run = _loaded("adjust", images, options, work, workers)
-        names, keep = _files(run, options, folder)
+            run = _with_views("adjust", images, options, work, workers)
+        names, keep = _planned_files(run, options, folder)
         workspace = Workspace(out_dir, overwrite=options.overwrite, keep=keep, names=names)
     with workspace:
         workspace.stages += stages
@@ -168,7 +168,7 @@ def adjust(
                 run.earlier.refuse_changed(run, inputs)
         with CachingExecutor(workspace, inputs, executor) as caching:
             with guarded(inputs.values()):
-                run = _solve(run, options, given, workspace, Work(caching, progress))
+                run = _tied_and_adjusted(run, options, given, workspace, Work(caching, progress))
             if run.adjustment is not None and options.stop_after == "all":
                 with workspace.stage("fit"):
                     run = _fitted(run, options, Work(caching, progress))
@@ -191,13 +191,13 @@ def _summed_up(
     progress = work.progress
     if run.adjustment is not None:
         run = _with_block(run, images, inputs, workspace, work)
-    run = _portable(run, workspace.folder)
-    with _told(workspace, "summary", progress):
+    run = _portable_run(run, workspace.folder)
+    with _stage_progress(workspace, "summary", progress):
         entries = _entries(inputs.values(), workspace.folder)
         summary = replace(summarize(run), inputs=entries, out_dir=None, stages=None)
-    _tell(progress, REPORT, 0)
+    _report_progress(progress, REPORT_STAGE, 0)
     summary = write_tables(workspace, run, summary)
-    _tell(progress, REPORT, 1)
+    _report_progress(progress, REPORT_STAGE, 1)
     return replace(summary, out_dir=run.out_dir, stages=tuple(map(StageEntry.read, workspace.stages)))
 
 
@@ -208,9 +208,9 @@ def _with_block(
     assert run.adjustment is not None
     options = run.options
     assert isinstance(options, RunOptions)
-    with _told(workspace, "block", work.progress):
+    with _stage_progress(workspace, "block", work.progress):
         block = block_prior(run.adjustment)
-        with workspace.output(f"{FOLDER}/{PRIOR}") as partial:
+        with workspace.output(f"{FOLDER}/{PRIOR_FILE}") as partial:
             block.save(partial)
         text = images_table(run, images, inputs, workspace.folder, block)
         workspace.write_text(f"{FOLDER}/{IMAGES}", text)
@@ -234,7 +234,7 @@ def _entries(inputs: Iterable[Input], folder: Path) -> tuple[InputEntry, ...]:
     return tuple(InputEntry(path, one.size, one.sha256) for path, one in sorted(files.items()))
 
 
-def _portable(run: Run, folder: Path) -> Run:
+def _portable_run(run: Run, folder: Path) -> Run:
     """Return the run with every path relative to its folder, and without what was only said to this command."""
 
     def at(path: Any) -> Any:
@@ -252,18 +252,18 @@ def _portable(run: Run, folder: Path) -> Run:
     )
 
 
-def _tell(progress: Progress | None, stage: str, done: int) -> None:
+def _report_progress(progress: Progress | None, stage: str, done: int) -> None:
     if progress is not None:
         progress(stage, done, 1)
 
 
 @contextmanager
-def _told(workspace: Workspace, stage: str, progress: Progress | None) -> Iterator[None]:
+def _stage_progress(workspace: Workspace, stage: str, progress: Progress | None) -> Iterator[None]:
     """Report the progress of a stage that is one task."""
-    _tell(progress, stage, 0)
+    _report_progress(progress, stage, 0)
     with workspace.stage(stage):
         yield
-    _tell(progress, stage, 1)
+    _report_progress(progress, stage, 1)
 
 
 def check(
@@ -278,7 +278,7 @@ def check(
     Parameters and errors are those of `adjust`, without a folder; the result has no adjustment.
     """
     options, work = with_located(options or RunOptions()), Work(executor, progress)
-    run = _with_ties(_loaded("check", images, options, work), options, work)
+    run = _with_ties(_with_views("check", images, options, work), options, work)
     return AdjustResult(_as_given(run.views, images, options), run, summarize(run))
 
 
@@ -288,7 +288,7 @@ def _as_given(views: Iterable[View], images: Sequence[Image], options: RunOption
     return tuple(sorted(given, key=lambda view: place[view.path]))
 
 
-def _loaded(
+def _with_views(
     kind: Literal["adjust", "check"],
     images: Sequence[Image],
     options: RunOptions,
@@ -319,7 +319,7 @@ def _loaded(
     return replace(run, unwritten=frozenset(view.name for view in run.views if view.path not in given))
 
 
-def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[Path]]:
+def _planned_files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[Path]]:
     """Return the files that a run writes and those that it keeps; what is in the way is refused before any work."""
     views = [view for view in run.views if view.name not in run.unwritten]
     if options.stop_after == "matching":
@@ -334,19 +334,19 @@ def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[
     return names, keep
 
 
-def _solve(run: Run, options: RunOptions, dem: Dem | None, workspace: Workspace, work: Work) -> Run:
+def _tied_and_adjusted(run: Run, options: RunOptions, dem: Dem | None, workspace: Workspace, work: Work) -> Run:
     with workspace.stage("tie points"):
         run = _with_ties(run, options, work, dem)
     if options.stop_after == "matching":
-        _write_matches(run, workspace)
+        _write_asp_matches(run, workspace)
         return replace(run, kind="match")
     if run.earlier is not None:
         run = _met(run, options)
     if dem is not None and options.reference:
         with workspace.stage("reference"):
-            run = replace(run, reference=_registered(run, options, dem, work))
-    with _told(workspace, "adjustment", work.progress):
-        return _adjusted(run, options, dem)
+            run = replace(run, reference=_register_to_reference(run, options, dem, work))
+    with _stage_progress(workspace, "adjustment", work.progress):
+        return _with_adjustment(run, options, dem)
 
 
 def _met(run: Run, options: RunOptions) -> Run:
@@ -378,7 +378,7 @@ def _is_old(run: Run) -> BoolArray:
     return np.array([view.name in known for view in run.views], dtype=bool)
 
 
-def _registered(run: Run, options: RunOptions, dem: Dem, work: Work) -> ReferenceControl:
+def _register_to_reference(run: Run, options: RunOptions, dem: Dem, work: Work) -> ReferenceControl:
     """Register the views, with the cameras as delivered, to the reference."""
     given = options.adjust.dem_bias_sigma
     bias = (KNOWN_BIAS if dem.known else DEM_BIAS) if given is None else given
@@ -386,7 +386,7 @@ def _registered(run: Run, options: RunOptions, dem: Dem, work: Work) -> Referenc
     return register_views(run.views, reference_names(options), dem, options.tie.band, accuracy, work)
 
 
-def _adjusted(run: Run, options: RunOptions, dem: Dem | None) -> Run:
+def _with_adjustment(run: Run, options: RunOptions, dem: Dem | None) -> Run:
     """Return the run with an adjustment and what went into it."""
     gcps, checks = (load_gcps(paths, run.views, options, dem) for paths in (options.gcp, options.check_points))
     centers = _centers(run.views, options.adjust.center)
@@ -451,9 +451,9 @@ def _with_ties(run: Run, options: RunOptions, work: Work, terrain: Dem | None = 
     return replace(run, tracks=ties.tracks, matched=ties.pairs, detail=detail)
 
 
-def _write_matches(run: Run, workspace: Workspace) -> None:
+def _write_asp_matches(run: Run, workspace: Workspace) -> None:
     names = [view.name for view in run.views]
-    for name in MATCHES:
+    for name in MATCH_FILES:
         with workspace.output(name) as partial:
             write_matches(partial, run.tracks, names)
     for ties in pair_ties(run.tracks):

@@ -31,7 +31,7 @@ _EITHER = ("lon", "lat"), ("col", "row")
 
 def header_of(words: Sequence[str], names: Names) -> dict[str, int]:
     """Return the column of each quantity that a header names."""
-    lower = [_plain(word) for word in words]
+    lower = [_normalised_word(word) for word in words]
     hits = {key: [lower.index(a) for a in aliases if a in lower] for key, aliases in names.items()}
     found = {key: places[0] for key, places in hits.items() if places}
     left = [pair for pair in _EITHER if set(pair) <= set(names) and not set(pair) <= set(found)]
@@ -80,10 +80,14 @@ def vertical_of_column(word: str) -> Vertical:
 
 def like_altitudes(words: Sequence[str]) -> list[str]:
     """Return the names, as `header_of` compares them, that are like that of an altitude."""
-    return [_plain(word) for word in words if _LIKE["alt"].fullmatch(bare := _bare(word)) and not _ERRORS.match(bare)]
+    return [
+        _normalised_word(word)
+        for word in words
+        if _LIKE["alt"].fullmatch(bare := _bare(word)) and not _ERRORS.match(bare)
+    ]
 
 
-def _plain(word: str) -> str:
+def _normalised_word(word: str) -> str:
     return re.sub(r"[\[(].*", "", word.lower()).strip().replace(" ", "_")
 
 
@@ -107,13 +111,13 @@ _LEVELS = {
 _ERRORS = re.compile(
     "sigma|std|stdev|acc|err|resid|d[xyz]$|.*_(error|est|sigma|std|accuracy)$|(image|img)_(width|height)"
 )
-_IMAGE = "image|img|pixel|pix|px|photo|source|raster|im"
+_IMAGE_WORDS = "image|img|pixel|pix|px|photo|source|raster|im"
 _MAP = "utm|map|world|ground|geo|coord|point|proj|gk|l93|lambert|lambert93|terrain|gcp|coordinate"
 _LIKE = {
     key: re.compile(pattern)
     for key, pattern in {
-        "col": rf"({_IMAGE})_?(x|u|col|column|sample)|(x|u|col|column|sample)_?({_IMAGE})|u",
-        "row": rf"({_IMAGE})_?(y|v|row|line)|(y|v|row|line)_?({_IMAGE})|v",
+        "col": rf"({_IMAGE_WORDS})_?(x|u|col|column|sample)|(x|u|col|column|sample)_?({_IMAGE_WORDS})|u",
+        "row": rf"({_IMAGE_WORDS})_?(y|v|row|line)|(y|v|row|line)_?({_IMAGE_WORDS})|v",
         "lon": r"(.+_)?(lon|long|longitude|lng)(_.+)?",
         "lat": r"(.+_)?(lat|latitude)(_.+)?",
         "east": rf"e|(.+_)?(east|eastings?|rechtswert)(_.+)?|({_MAP})_?(x|e)|x_?({_MAP})",

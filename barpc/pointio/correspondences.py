@@ -14,9 +14,9 @@ import numpy as np
 
 from barpc.base.errors import InputError, plain
 from barpc.base.frozen import load_npz
-from barpc.base.geodesy import ALTITUDES, FAR, INFERRED, Array
-from barpc.base.remote import Place
-from barpc.base.sidefile import NUMBER, TABLE, Kind, read_head
+from barpc.base.geodesy import ALTITUDES, INFERRED, MAX_COORDINATE, Array
+from barpc.base.remote import PathOrUrl
+from barpc.base.safe_io import BYTES_PER_NUMBER, TABLE, Kind, read_head
 from barpc.pointio.columns import (
     COLUMNS,
     GROUND_SIGMA,
@@ -29,7 +29,7 @@ from barpc.pointio.columns import (
     vertical_of_column,
 )
 from barpc.pointio.gcp_formats import read_geojson, read_tags
-from barpc.pointio.gcp_table import Table
+from barpc.pointio.gcp_table import GcpTable
 from barpc.pointio.tables import read_table
 from barpc.rasters.dem import HeightGrid, datum_of, geoid_of
 from barpc.rasters.raster import driver_of, open_raster
@@ -39,8 +39,8 @@ from barpc.scene import Altimetry
 HEIGHT_SIGMA = 0.5  # m, of a height whose file states none: ICESat-2 and GEDI over gentle ground
 GRID_TAG = "ALTITUDE_B0"  # of a raster that is a localisation grid
 
-_POINTS: Names = {**COLUMNS, "sigma": ("sigma", "sigma_px")}
-_HEIGHTS: Names = {
+_CORRESPONDENCE_COLUMNS: Names = {**COLUMNS, "sigma": ("sigma", "sigma_px")}
+_HEIGHT_COLUMNS: Names = {
     "lon": (*COLUMNS["lon"], "lon_lowestmode"),
     "lat": (*COLUMNS["lat"], "lat_lowestmode"),
     "alt": (
@@ -88,7 +88,7 @@ def read_correspondences(path: Path | str, *, altitudes: Sequence[float] | None 
     if kind == "npz":
         columns: dict[str, Any] = _columns_of_npz(path)
     else:  # without a header: lon, lat, alt, col, row
-        _, columns = read_table(path, _POINTS, list(COLUMNS), unnamed=list(COLUMNS))
+        _, columns = read_table(path, _CORRESPONDENCE_COLUMNS, list(COLUMNS), unnamed=list(COLUMNS))
     arrays = {name: np.array(column, dtype=np.float64) for name, column in columns.items()}
     if not arrays["lon"].size:
         raise InputError(f"{path}: no points in it")
@@ -98,7 +98,7 @@ def read_correspondences(path: Path | str, *, altitudes: Sequence[float] | None 
     return Correspondences(ground, image, arrays.get("sigma"))
 
 
-def _of_control(path: Place, table: Table) -> Correspondences:
+def _of_control(path: PathOrUrl, table: GcpTable) -> Correspondences:
     """Return ground control points as those of a camera; InputError where they are no lon, lat, alt, col and row."""
     if table.crs not in (None, "EPSG:4979"):
         raise InputError(f"{path}: its GCPs are in {str(table.crs)[:60]}; longitude and latitude on WGS84 are needed")
@@ -110,7 +110,7 @@ def _of_control(path: Place, table: Table) -> Correspondences:
     return Correspondences(ground, table.numbers[:, 6:8], note=table.said)
 
 
-def read_gcp_grid(path: Place) -> tuple[Correspondences | None, tuple[int, int]]:
+def read_gcp_grid(path: PathOrUrl) -> tuple[Correspondences | None, tuple[int, int]]:
     """Return the GCP tags of an image, None without any, as the points of its camera; and its width and height [px].
 
     InputError where they are no longitude, latitude and altitude. `read_tags` decides where they count from.
@@ -119,7 +119,7 @@ def read_gcp_grid(path: Place) -> tuple[Correspondences | None, tuple[int, int]]
     return _of_control(path, table) if table.names else None, size
 
 
-def correspondence_kind(path: Place, altitudes: Sequence[float] | None = None) -> str | None:
+def correspondence_kind(path: PathOrUrl, altitudes: Sequence[float] | None = None) -> str | None:
     """Return the kind of a file: "csv", "npz", "geojson", "grid", or None for neither (an image or an RPC file)."""
     head = read_head(path, TABLE, 65536)
     if driver_of(head) == "GTiff":
@@ -130,7 +130,9 @@ def correspondence_kind(path: Place, altitudes: Sequence[float] | None = None) -
     if head.lstrip()[:1] == b"{":
         return "geojson" if b'"FeatureCollection"' in head else None
     words = first_words(head)  # a header that names columns, or a line of five numbers
-    table = (numbers_of(words) is not None and len(words) >= 5) or {"lon", "lat"} <= set(header_of(words, _POINTS))
+    table = (numbers_of(words) is not None and len(words) >= 5) or {"lon", "lat"} <= set(
+        header_of(words, _CORRESPONDENCE_COLUMNS)
+    )
     return "csv" if table else None
 
 
@@ -148,13 +150,13 @@ def _columns_of_npz(path: Path) -> dict[str, Array]:
             raise InputError(f"{path}: arrays of shapes {shapes}, not (N, 3), (N, 2), (N,)")
         columns = dict(zip(COLUMNS, (*arrays["ground"].T, *arrays["image"].T), strict=True))
         return columns | {key: arrays[key] for key in ("sigma",) if key in arrays}
-    columns = {key: arrays[list(arrays)[i]] for key, i in header_of(list(arrays), _POINTS).items()}
+    columns = {key: arrays[list(arrays)[i]] for key, i in header_of(list(arrays), _CORRESPONDENCE_COLUMNS).items()}
     if missing := [name for name in COLUMNS if name not in columns]:
         raise InputError(f"{path}: neither ground and image nor {', '.join(missing)}; has {', '.join(arrays)}")
     return columns
 
 
-def read_grid(path: Place, altitudes: Sequence[float] | None = None) -> Correspondences:
+def read_grid(path: PathOrUrl, altitudes: Sequence[float] | None = None) -> Correspondences:
     """Read a direct-localisation grid: bands lon, lat of each altitude layer, nodes by the geotransform.
 
     The geotransform counts from the corner of the first pixel, as GDAL does; half a pixel is taken off. Altitudes of
@@ -162,7 +164,7 @@ def read_grid(path: Place, altitudes: Sequence[float] | None = None) -> Correspo
     """
     with open_raster(path) as dataset:
         Kind("a localisation grid", TABLE.most).check(
-            f"{path}, read", NUMBER * dataset.count * dataset.width * dataset.height
+            f"{path}, read", BYTES_PER_NUMBER * dataset.count * dataset.width * dataset.height
         )
         bands = np.real(dataset.read()).astype(np.float64)
         to_image, tags = dataset.transform, dataset.tags()
@@ -182,7 +184,7 @@ def read_grid(path: Place, altitudes: Sequence[float] | None = None) -> Correspo
     alt = np.broadcast_to(np.asarray(altitudes, dtype=np.float64)[:, None, None], (layers, *col.shape))
     ground = np.stack([bands[::2], bands[1::2], alt], axis=-1).reshape(-1, 3)
     ok = np.isfinite(ground).all(axis=1)
-    if (np.abs(ground[ok]) > (TURNS, 90.0, FAR)).any() or not (np.abs(image) <= FAR).all():
+    if (np.abs(ground[ok]) > (TURNS, 90.0, MAX_COORDINATE)).any() or not (np.abs(image) <= MAX_COORDINATE).all():
         raise InputError(f"{path}: a node of it is no longitude, latitude and altitude, or no image point")
     return Correspondences(ground[ok], image[ok])
 
@@ -199,12 +201,12 @@ def read_altimetry(path: Path | str, heights: str | None = None) -> Altimetry:
     parse, a place is none in degrees, or no height is left.
     """
     path = Path(path)
-    order = list(_HEIGHTS)
+    order = list(_HEIGHT_COLUMNS)
     head = first_words(read_head(path, TABLE))
-    like = [] if "alt" in header_of(head, _HEIGHTS) else like_altitudes(head)
+    like = [] if "alt" in header_of(head, _HEIGHT_COLUMNS) else like_altitudes(head)
     if len(like) > 1:
         raise InputError(f"{path}: columns {', '.join(like)} could be the altitude; rename one alt")
-    names = {**_HEIGHTS, "alt": (*_HEIGHTS["alt"], *like)}
+    names = {**_HEIGHT_COLUMNS, "alt": (*_HEIGHT_COLUMNS["alt"], *like)}
     words, table = read_table(path, names, order[:3], unnamed=order, blank=order)
     lon, lat, alt = (np.array(table[name], dtype=np.float64) for name in order[:3])
     at = header_of(words, names).get("alt")

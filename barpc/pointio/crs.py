@@ -14,8 +14,10 @@ from barpc.base.errors import InputError
 from barpc.base.geodesy import STATED, Array
 from barpc.rasters.vertical import ELLIPSOID, Vertical, vertical_of
 
-_LETTERS = 50_000  # of a reference system: the longest WKT of EPSG has a fifth
-_EXACT = 1.0  # m: transformations that are better known than this need no word; ensembles as WGS84 are no better
+_MAX_CRS_LETTERS = 50_000  # of a reference system: the longest WKT of EPSG has a fifth
+_NOTEWORTHY_ACCURACY = (
+    1.0  # m: transformations that are better known than this need no word; ensembles as WGS84 are no better
+)
 
 
 @contextmanager
@@ -41,7 +43,7 @@ def to_wgs84(place: Array, crs: str, source: str) -> tuple[Array, Vertical, str]
     from pyproj.exceptions import CRSError, ProjError
 
     try:
-        system = CRS.from_user_input(crs[:_LETTERS])
+        system = CRS.from_user_input(crs[:_MAX_CRS_LETTERS])
         level, *upper = system.sub_crs_list if system.is_compound else [system]
         if not (level.is_geographic or level.is_projected or level.is_geocentric):
             raise CRSError("no places")
@@ -62,4 +64,8 @@ def to_wgs84(place: Array, crs: str, source: str) -> tuple[Array, Vertical, str]
             "EPSG:32631, or EPSG:26910+5703 with its heights"
         ) from error
     alt = np.where(np.isnan(place[:, 2]), np.nan, z) if solid else place[:, 2]
-    return np.column_stack([x, y, alt]), vertical, system.name + (f", known to {known:g} m" if known > _EXACT else "")
+    return (
+        np.column_stack([x, y, alt]),
+        vertical,
+        system.name + (f", known to {known:g} m" if known > _NOTEWORTHY_ACCURACY else ""),
+    )

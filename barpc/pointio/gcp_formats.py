@@ -1,8 +1,8 @@
 """Files of ground control points as other tools write them: a table of formats, each told by its content.
 
-A reader says what its file holds (`Table`): places in the file's own reference system, altitudes as they stand, image
-points, which `opened` brings to (0, 0) at the centre of the first pixel. Those of CSV, GeoJSON and ASP are taken as
-they stand.
+A reader says what its file holds (`GcpTable`): places in the file's own reference system, altitudes as they stand,
+image points, which `open_gcps` brings to (0, 0) at the centre of the first pixel. Those of CSV, GeoJSON and ASP are
+taken as they stand.
 """
 
 from __future__ import annotations
@@ -18,56 +18,56 @@ import numpy as np
 
 from barpc.base.errors import BarpcError, InputError, plain
 from barpc.base.geodesy import INFERRED, Array
-from barpc.base.remote import Place
-from barpc.base.sidefile import GEOJSON, TABLE, encoding_of, opened_text, parse_xml, read_head, read_json
+from barpc.base.remote import PathOrUrl
+from barpc.base.safe_io import GEOJSON, TABLE, encoding_of, opened_text, parse_xml, read_head, read_json
 from barpc.pointio.columns import IMAGE_SIGMA, degrees, guessed, number_of, numbers_of
-from barpc.pointio.gcp_table import ALONE, KNOWN, NAMES, NAN, SIGMAS, TEXTS, Row, Table, named, of_columns
+from barpc.pointio.gcp_table import ALONE, GCP_NAMES, KNOWN, NAN, SIGMAS, TEXTS, GcpTable, Row, named, of_columns
 from barpc.pointio.tables import Texts, read_columns, row_of
 from barpc.rasters.raster import driver_of, open_raster
 from barpc.rasters.vertical import ELLIPSOID, Vertical
 
 
-class Format(NamedTuple):
+class GcpFormat(NamedTuple):
     """One syntax: how its files begin, its reader, and what its image points have more than barpc's [px]."""
 
     sniff: Callable[[str, bytes], bool]  # of a file's beginning, as a text and as bytes
-    read: Callable[[Path], Table]
+    read: Callable[[Path], GcpTable]
     more: float = 0.0
 
 
-def opened(path: Path) -> tuple[str, Table]:
+def open_gcps(path: Path) -> tuple[str, GcpTable]:
     """Return the name of a file's format and what it holds; InputError where it does not parse."""
-    text, head = _start(path)
-    name = next(name for name, form in FORMATS.items() if form.sniff(text.lstrip("\ufeff \t\r\n"), head))
-    table = FORMATS[name].read(path)
-    table.numbers[:, 6:8] -= FORMATS[name].more
+    text, head = _decoded_head(path)
+    name = next(name for name, form in GCP_FORMATS.items() if form.sniff(text.lstrip("\ufeff \t\r\n"), head))
+    table = GCP_FORMATS[name].read(path)
+    table.numbers[:, 6:8] -= GCP_FORMATS[name].more
     if table.apart == "image" and table.images is None:  # of the image that the file is called as
         table = table._replace(images=Texts.of([path.name] * len(table.names)))
     return name, table
 
 
-def _start(path: Path) -> tuple[str, bytes]:
+def _decoded_head(path: Path) -> tuple[str, bytes]:
     head = read_head(path, TABLE, 65536)
     return head.decode(encoding_of(head), "replace"), head
 
 
 # --- tables with names of columns -------------------------------------------------------------------------
 
-_STATED = re.compile(
+_STATED_CRS = re.compile(
     r"^#[ \t]*(?:(?:CRS|SRS|CoordinateSystem|Projection)[ \t]*[:=][ \t]*(\S.*)|(EPSG:\S+))",
     re.IGNORECASE | re.MULTILINE,
 )
 _AGISOFT = re.compile(r"^#\s*CoordinateSystem|X/(?:Longitude|East)", re.IGNORECASE | re.MULTILINE)
 
 
-def _read_csv(path: Path) -> Table:
+def _read_csv(path: Path) -> GcpTable:
     """Read a header of names, perhaps behind `#`, and comments that say the reference system."""
-    text = _start(path)[0]
+    text = _decoded_head(path)[0]
     at, delimiter, words = _header(text)
     columns, empty = named(path, words, lax=_AGISOFT.search(text) is not None)
     blank = {"alt", *SIGMAS} & columns.keys()
     read = read_columns(path, at + 1, delimiter, columns, columns.keys() & {*TEXTS}, blank)
-    table, stated = of_columns(path, read, empty), _STATED.search("\n".join(_LINES.split(text)))
+    table, stated = of_columns(path, read, empty), _STATED_CRS.search("\n".join(_LINES.split(text)))
     return table if stated is None or table.crs else table._replace(crs=(stated[1] or stated[2]).rstrip())
 
 
@@ -104,7 +104,7 @@ def _names_columns(words: Sequence[str]) -> bool:
         return True
 
 
-def _read_qgis(path: Path) -> Table:
+def _read_qgis(path: Path) -> GcpTable:
     """Read a CSV whose rows of pixels count upwards."""
     table = _read_csv(path)
     table.numbers[:, 7] *= -1.0
@@ -124,7 +124,7 @@ _ENVI = re.compile(
 )
 
 
-def _read_asp(path: Path) -> Table:
+def _read_asp(path: Path) -> GcpTable:
     """Read the lines `id lat lon alt sigma_x sigma_y sigma_z image col row sigma_col sigma_row [image ...]`."""
 
     def rows() -> Iterator[Row]:
@@ -138,12 +138,12 @@ def _read_asp(path: Path) -> Table:
                     yield words[0], words[i], lon, lat, *ground, col, row, max(spread)
             except ValueError as error:
                 raise InputError(
-                    f"{path}, line {number}: in no format that is read ({', '.join(FORMATS)}): a CSV begins with its "
-                    "columns' names, a line of ASP's is 'id lat lon alt sx sy sz image col row scol srow ...' "
+                    f"{path}, line {number}: in no format that is read ({', '.join(GCP_FORMATS)}): a CSV begins with "
+                    "its columns' names, a line of ASP's is 'id lat lon alt sx sy sz image col row scol srow ...' "
                     f"({plain(error)})"
                 ) from error
 
-    return Table.of_rows(rows())._replace(vertical=Vertical(ELLIPSOID, provenance=INFERRED))
+    return GcpTable.of_rows(rows())._replace(vertical=Vertical(ELLIPSOID, provenance=INFERRED))
 
 
 def _words_of(path: Path, sign: str = "#") -> Iterator[tuple[int, list[str]]]:
@@ -156,7 +156,7 @@ def _words_of(path: Path, sign: str = "#") -> Iterator[tuple[int, list[str]]]:
                 yield number, words
 
 
-def _in_order(path: Path, order: str, lines: Iterable[tuple[int, list[str]]]) -> Table:
+def _in_order(path: Path, order: str, lines: Iterable[tuple[int, list[str]]]) -> GcpTable:
     """Read lines whose words stand in an order of x, y, alt, col, row, image and id, of which the latter may lack."""
 
     def rows() -> Iterator[Row]:
@@ -169,10 +169,10 @@ def _in_order(path: Path, order: str, lines: Iterable[tuple[int, list[str]]]) ->
                 raise InputError(f"{path}, line {number}: expected '{order}' ({plain(error)})") from error
             yield of.get("id", ""), of.get("image"), x, y, alt, *ALONE, col, row, IMAGE_SIGMA
 
-    return Table.of_rows(rows())
+    return GcpTable.of_rows(rows())
 
 
-def _read_odm(path: Path) -> Table:
+def _read_odm(path: Path) -> GcpTable:
     """Read a reference system, then lines `x y z col row image [name]`."""
     lines = _words_of(path)
     found = _ODM.match(" ".join(next(lines)[1]))
@@ -180,9 +180,9 @@ def _read_odm(path: Path) -> Table:
     return _in_order(path, "x y alt col row image id", lines)._replace(crs=crs)
 
 
-def _read_envi(path: Path) -> Table:
+def _read_envi_points(path: Path) -> GcpTable:
     """Read comments that say the reference system and the order, then lines `x y col row`."""
-    head = _start(path)[0]
+    head = _decoded_head(path)[0]
     if re.search(r"^;.*\b(Base|Warp)\b", head, re.MULTILINE):
         raise InputError(f"{path}: ENVI .pts of two images; one from image to map is needed")
     found, turned = _ENVI.search(head), re.search(r"^;\s*Image.*Map", head, re.MULTILINE | re.IGNORECASE)
@@ -193,7 +193,7 @@ def _read_envi(path: Path) -> Table:
 # --- layers of points -------------------------------------------------------------------------------------
 
 
-def read_geojson(path: Path) -> Table:
+def read_geojson(path: Path) -> GcpTable:
     """Read a GeoJSON, with the reference system that it could name before 2016; InputError where it is none."""
     document, crs = read_json(path, GEOJSON), None
     try:
@@ -205,13 +205,13 @@ def read_geojson(path: Path) -> Table:
     return _of_features(path, features, None if crs is None or crs.endswith(("CRS84", "EPSG::4326")) else crs)
 
 
-def _of_features(path: Path, features: Sequence[Any], crs: str | None) -> Table:
+def _of_features(path: Path, features: Sequence[Any], crs: str | None) -> GcpTable:
     """Read features with points and properties: `ji` (col, row) or names as of columns, `sigma_m` of three numbers."""
     spread, rows = {"ji": ("col", "row"), "sigma_m": ("sx", "sy", "sz")}, list[dict[str, Any]]()
     try:
         for feature in features:
             of = dict(feature["properties"] or {})
-            if feature.get("id") is not None and not {key.lower() for key in of} & set(NAMES["id"]):
+            if feature.get("id") is not None and not {key.lower() for key in of} & set(GCP_NAMES["id"]):
                 of["id"] = feature["id"]
             for key in spread.keys() & of.keys():
                 of |= dict(zip(spread[key], of.pop(key), strict=True))
@@ -223,7 +223,7 @@ def _of_features(path: Path, features: Sequence[Any], crs: str | None) -> Table:
             f"sigma_px a number ({plain(error)})"
         ) from error
     if not rows:
-        return Table.of_rows([])
+        return GcpTable.of_rows([])
     columns, empty = named(path, words := list(dict.fromkeys(key for of in rows for key in of)))
     read: dict[str, Any] = {}
     for key, name in ((key, words[i]) for key, i in columns.items()):
@@ -244,7 +244,7 @@ def _value(key: str, cell: Any) -> float:
     return degrees(str(cell), key) if key in ("lon", "lat") else number_of(str(cell))
 
 
-def _read_vector(path: Path) -> Table:
+def _read_vector(path: Path) -> GcpTable:
     """Read the points of a GeoPackage or Shapefile, by pyogrio or fiona."""
     reader = next((name for name in ("pyogrio", "fiona") if find_spec(name)), None)
     if reader is None:
@@ -282,7 +282,7 @@ def _point(wkb: bytes) -> list[float]:
 # --- images -----------------------------------------------------------------------------------------------
 
 
-def read_tags(path: Place) -> tuple[Table, tuple[int, int]]:
+def read_tags(path: PathOrUrl) -> tuple[GcpTable, tuple[int, int]]:
     """Return the GCP tags of an image, seen in that image alone, and its width and height [px].
 
     GDAL leaves to the application where they count from: what they cover tells (`_first_pixel`), or that the raster is
@@ -290,7 +290,7 @@ def read_tags(path: Place) -> tuple[Table, tuple[int, int]]:
     """
     with open_raster(path) as dataset:
         (gcps, crs), size, tags = dataset.gcps, (int(dataset.width), int(dataset.height)), dataset.tags()
-    table = Table.of_rows(
+    table = GcpTable.of_rows(
         (str(g.id or n), str(path), g.x, g.y, NAN if g.z is None else g.z, *ALONE, g.col, g.row, IMAGE_SIGMA)
         for n, g in enumerate(gcps, 1)
     )
@@ -307,7 +307,7 @@ def read_tags(path: Place) -> tuple[Table, tuple[int, int]]:
     return table._replace(crs=system, said=said), size
 
 
-_NEAR = 1e-3  # px: GCPs that end so near to a pixel's centre or edge are meant to lie there
+_CENTRE_TOLERANCE = 1e-3  # px: GCPs that end so near to a pixel's centre or edge are meant to lie there
 
 
 def _first_pixel(at: Array, size: Array) -> float | None:
@@ -318,9 +318,17 @@ def _first_pixel(at: Array, size: Array) -> float | None:
     """
     start, beyond = at.min(axis=0), np.ptp(at, axis=0) - size
     edges = float(np.rint(beyond[0])) + 1.0
-    told = edges in (0.0, 1.0) and (np.abs(beyond - edges + 1.0) <= _NEAR).all() and np.ptp(start) <= _NEAR
+    told = (
+        edges in (0.0, 1.0)
+        and (np.abs(beyond - edges + 1.0) <= _CENTRE_TOLERANCE).all()
+        and np.ptp(start) <= _CENTRE_TOLERANCE
+    )
     first = np.rint(2.0 * start[0]) / 2.0
-    return float(first + 0.5 * edges) if told and 0.0 <= first <= 1.0 and abs(start[0] - first) <= _NEAR else None
+    return (
+        float(first + 0.5 * edges)
+        if told and 0.0 <= first <= 1.0 and abs(start[0] - first) <= _CENTRE_TOLERANCE
+        else None
+    )
 
 
 # --- MicMac -----------------------------------------------------------------------------------------------
@@ -328,7 +336,7 @@ def _first_pixel(at: Array, size: Array) -> float | None:
 MICMAC = "MicMac XML"
 
 
-def _read_micmac(path: Path) -> Table:
+def _read_micmac(path: Path) -> GcpTable:
     """Read ground points (DicoAppuisFlottant), image points (SetOfMesureAppuisFlottants), or both."""
     try:
         root = parse_xml(path, strip_namespaces=True)
@@ -351,25 +359,27 @@ def _read_micmac(path: Path) -> Table:
     if not rows and not ground:
         raise InputError(f"{path}: XML without OneAppuisDAF or OneMesureAF1I, so no points of MicMac's")
     alone = ((name, None, *place, NAN, NAN, IMAGE_SIGMA) for name, place in ground.items())
-    return Table.of_rows(rows or alone, "" if rows and ground else "image" if rows else "ground")
+    return GcpTable.of_rows(rows or alone, "" if rows and ground else "image" if rows else "ground")
 
 
-FORMATS: dict[str, Format] = {
-    "GeoPackage or Shapefile": Format(
+GCP_FORMATS: dict[str, GcpFormat] = {
+    "GeoPackage or Shapefile": GcpFormat(
         lambda _, head: head.startswith((b"SQLite format 3\0", b"\0\0\x27\x0a")), _read_vector
     ),
-    "image with GCP tags": Format(
+    "image with GCP tags": GcpFormat(
         lambda text, head: driver_of(head) is not None or "\0" in text, lambda path: read_tags(path)[0]
     ),
-    "GeoJSON": Format(lambda text, _: text.startswith("{"), read_geojson),
-    MICMAC: Format(lambda text, _: text.startswith("<"), _read_micmac),
-    "ENVI .pts": Format(lambda text, _: text.startswith(";"), _read_envi, 1.5),  # corner of the first pixel: (1, 1)
-    "QGIS .points": Format(lambda text, _: "mapX" in text[:4096] and _header(text)[0] >= 0, _read_qgis, 0.5),
-    "ODM gcp_list.txt": Format(lambda text, _: _ODM.match(text) is not None, _read_odm, 0.5),
-    "Metashape CSV": Format(
+    "GeoJSON": GcpFormat(lambda text, _: text.startswith("{"), read_geojson),
+    MICMAC: GcpFormat(lambda text, _: text.startswith("<"), _read_micmac),
+    "ENVI .pts": GcpFormat(
+        lambda text, _: text.startswith(";"), _read_envi_points, 1.5
+    ),  # corner of the first pixel: (1, 1)
+    "QGIS .points": GcpFormat(lambda text, _: "mapX" in text[:4096] and _header(text)[0] >= 0, _read_qgis, 0.5),
+    "ODM gcp_list.txt": GcpFormat(lambda text, _: _ODM.match(text) is not None, _read_odm, 0.5),
+    "Metashape CSV": GcpFormat(
         lambda text, _: _AGISOFT.search(text) is not None and _header(text)[0] >= 0, _read_csv, 0.5
     ),
-    "CSV": Format(lambda text, _: _header(text)[0] >= 0, _read_csv),
-    "ASP .gcp": Format(lambda *_: True, _read_asp),
+    "CSV": GcpFormat(lambda text, _: _header(text)[0] >= 0, _read_csv),
+    "ASP .gcp": GcpFormat(lambda *_: True, _read_asp),
 }
 """Name -> row: the first that knows the beginning reads the file. QGIS, ODM and Metashape count from the corner."""

@@ -16,7 +16,7 @@ from barpc.pointio.columns import GROUND_SIGMA, IMAGE_SIGMA, Names, guessed
 from barpc.pointio.tables import Texts, lacking
 from barpc.rasters.vertical import Vertical
 
-NAMES: Names = {
+GCP_NAMES: Names = {
     "id": ("id", "name", "gcp", "gcp_id", "point", "point_id", "label"),
     "image": ("image", "file", "filename", "image_name", "img", "view"),
 }
@@ -31,7 +31,7 @@ SIGMAS: Names = {
     "sigma_row": ("sigma_row", "srow"),
 }
 KNOWN: Names = {
-    **NAMES, **SIGMAS, "enable": ("enable", "enabled"), "crs": ("crs", "epsg", "srid"),
+    **GCP_NAMES, **SIGMAS, "enable": ("enable", "enabled"), "crs": ("crs", "epsg", "srid"),
     "east": ("east",), "north": ("north",),
 }  # fmt: skip
 TEXTS = "id", "image", "enable", "crs"
@@ -42,7 +42,7 @@ Row = tuple[Any, ...]
 """Name, image (None: not named) and the nine numbers of a GCP in an image."""
 
 
-class Table(NamedTuple):
+class GcpTable(NamedTuple):
     """GCPs (K,) as a file holds them: it repeats the ground point for each of its images."""
 
     names: Sequence[str]  # empty: called by its place among the points
@@ -54,7 +54,7 @@ class Table(NamedTuple):
     said: str = ""  # what was taken for what, where that had to be guessed
 
     @staticmethod
-    def of_rows(rows: Iterable[Row], apart: str = "") -> Table:
+    def of_rows(rows: Iterable[Row], apart: str = "") -> GcpTable:
         """Gather the rows that a reader yields."""
         names, images, numbers = list[str](), dict[str | None, int](), array("d")
         index = array("q")
@@ -63,10 +63,10 @@ class Table(NamedTuple):
             index.append(images.setdefault(image, len(images)))
             numbers.extend(values)
         of = None if None in images else Texts([str(image) for image in images], np.array(index, dtype=np.int64))
-        return Table(names, of, np.array(numbers).reshape(-1, 9), apart)
+        return GcpTable(names, of, np.array(numbers).reshape(-1, 9), apart)
 
 
-def named(path: Path, words: Sequence[str], lax: bool = False) -> tuple[dict[str, int], Table]:
+def named(path: Path, words: Sequence[str], lax: bool = False) -> tuple[dict[str, int], GcpTable]:
     """Return the columns of a table by their names, and an empty table that says what these say.
 
     In a `lax` table columns of errors may stand that are no accuracies. InputError where the names do not tell.
@@ -86,10 +86,10 @@ def named(path: Path, words: Sequence[str], lax: bool = False) -> tuple[dict[str
         needed = (*(() if place else ("lon", "lat")), "col", "row")
         raise lacking(path, [name for name in needed if name not in columns], words)
     apart = "" if place and seen else "ground" if place else "image"
-    return columns, Table([], None, np.empty((0, 9)), apart, None, vertical, ", ".join(said))
+    return columns, GcpTable([], None, np.empty((0, 9)), apart, None, vertical, ", ".join(said))
 
 
-def of_columns(path: Path, columns: Mapping[str, Any], empty: Table) -> Table:
+def of_columns(path: Path, columns: Mapping[str, Any], empty: GcpTable) -> GcpTable:
     """Return a table of its columns: numbers (NaN or None: blank) or `Texts`; sigmas not stated are the default.
 
     InputError for points of several reference systems.

@@ -12,21 +12,21 @@ from pathlib import Path
 import numpy as np
 
 from barpc.base.errors import InputError, listed
-from barpc.base.geodesy import FAR, Array, HeightDatum
-from barpc.base.sidefile import TABLE, read_head
+from barpc.base.geodesy import MAX_COORDINATE, Array, HeightDatum
+from barpc.base.safe_io import TABLE, read_head
 from barpc.pointio.columns import TURNS
 from barpc.pointio.crs import to_wgs84
-from barpc.pointio.gcp_formats import FORMATS, MICMAC, opened
-from barpc.pointio.gcp_table import Table
+from barpc.pointio.gcp_formats import GCP_FORMATS, MICMAC, open_gcps
+from barpc.pointio.gcp_table import GcpTable
 from barpc.pointio.names import ViewNames
-from barpc.pointio.tables import Texts, distinct, numbered
+from barpc.pointio.tables import Texts, distinct, index_texts
 from barpc.rasters.dem import HeightGrid, datum_of, geoid_of
 from barpc.rasters.vertical import ELLIPSOID
 from barpc.scene import GroundPoints, IntArray
 
 
 @dataclass(frozen=True)
-class Frame:
+class ControlReference:
     """What is known beside a file of control points."""
 
     crs: str | None = None  # the reference system of its places, whatever the file says
@@ -35,19 +35,19 @@ class Frame:
     others: tuple[str, ...] = ()  # the files that are given: ground points and image points may be apart
 
 
-def read_gcps(path: Path | str, names: Sequence[str], frame: Frame | None = None) -> GroundPoints:
-    """Read GCPs and where they are seen, in any of `FORMATS`.
+def read_gcps(path: Path | str, names: Sequence[str], frame: ControlReference | None = None) -> GroundPoints:
+    """Read GCPs and where they are seen, in any of `GCP_FORMATS`.
 
     Observations in other images than the views called `names` are left out, and these named in `strangers`; altitudes
     that the file does not hold are 0, as other tools write them. InputError where it does not parse, or holds no point
     of these views.
     """
-    path, frame = Path(path), frame or Frame()
-    kind, table = opened(path)
+    path, frame = Path(path), frame or ControlReference()
+    kind, table = open_gcps(path)
     views, given = ViewNames(names, str(path)), [Path(one) for one in frame.others if Path(one) != path]
-    if table.apart == "image" and any(opened(one)[1].apart == "ground" for one in given):
+    if table.apart == "image" and any(open_gcps(one)[1].apart == "ground" for one in given):
         return GroundPoints.none()  # that file takes the image points of this one
-    table = _joined(path, kind, table, given) if table.apart else table
+    table = _with_image_points(path, kind, table, given) if table.apart else table
     view = _views_of(table, path, views)
     kept = np.flatnonzero(view >= 0)
     if not len(kept):
@@ -59,20 +59,20 @@ def read_gcps(path: Path | str, names: Sequence[str], frame: Frame | None = None
         )
     except InputError as error:
         raise InputError(f"{path}: {kind}, {error}") from error
-    more = FORMATS[kind].more
+    more = GCP_FORMATS[kind].more
     centre = f"the centre of its first pixel is ({more:g}, {more:g})" if more else ""
     said = "; ".join(part for part in (centre, table.said, words, views.said()) if part)
     return replace(points, strangers=tuple(views.strangers), said=(f"{path}: {kind}; {said}",) if said else ())
 
 
-def _joined(path: Path, kind: str, table: Table, given: Sequence[Path]) -> Table:
+def _with_image_points(path: Path, kind: str, table: GcpTable, given: Sequence[Path]) -> GcpTable:
     """Return ground points with the image points of their names in the files `given`, or MicMac's beside them."""
     if table.apart == "image":
         raise InputError(f"{path}: {kind}, image points alone; give the file of ground points with another --gcp")
-    files = [one for one in given if opened(one)[1].apart == "image"]
+    files = [one for one in given if open_gcps(one)[1].apart == "image"]
     if not files and kind == MICMAC:
         beside = [one for one in sorted(path.parent.glob("*.xml")) if b"SetOfMesureAppuis" in read_head(one, TABLE)]
-        files = [one for one in beside if one != path and opened(one)[1].apart == "image"]
+        files = [one for one in beside if one != path and open_gcps(one)[1].apart == "image"]
     if not files or (len(files) > 1 and not set(files) <= set(given)):
         many = f", and image points in {listed([one.name for one in files])}" if files else ""
         raise InputError(
@@ -81,15 +81,15 @@ def _joined(path: Path, kind: str, table: Table, given: Sequence[Path]) -> Table
     ground = dict(zip(table.names, table.numbers, strict=True))
     rows = [
         (name, image, *ground[name][:6], *numbers[6:])
-        for seen in (opened(one)[1] for one in files)
+        for seen in (open_gcps(one)[1] for one in files)
         for name, image, numbers in zip(seen.names, (seen.images or Texts.of(())).per_row(), seen.numbers, strict=True)
         if name in ground
     ]
     said = "; ".join(filter(None, (table.said, f"image points of {listed([one.name for one in files])}")))
-    return Table.of_rows(rows)._replace(crs=table.crs, vertical=table.vertical, said=said)
+    return GcpTable.of_rows(rows)._replace(crs=table.crs, vertical=table.vertical, said=said)
 
 
-def _views_of(table: Table, path: Path, views: ViewNames) -> IntArray:
+def _views_of(table: GcpTable, path: Path, views: ViewNames) -> IntArray:
     """Return the view (K,) of each row, -1: none; a file that names no image is of the one of its name, or the only."""
     if table.images is not None:
         return views.of(map(str, table.images.different))[table.images.index]
@@ -103,17 +103,17 @@ def _views_of(table: Table, path: Path, views: ViewNames) -> IntArray:
 
 
 def _assembled(
-    called: Sequence[str], view: IntArray, numbers: Array, table: Table, frame: Frame
+    called: Sequence[str], view: IntArray, numbers: Array, table: GcpTable, frame: ControlReference
 ) -> tuple[GroundPoints, str]:
     """Return the observations of points of the same name and place as those of one point, in their first order."""
-    first, point = distinct(np.column_stack([numbered(called, {}), np.nan_to_num(numbers[:, :3])]))
+    first, point = distinct(np.column_stack([index_texts(called, {}), np.nan_to_num(numbers[:, :3])]))
     point, first = np.argsort(np.argsort(first))[point], np.sort(first)
     names = tuple(called[i] or f"gcp_{n}" for n, i in enumerate(first, 1))
-    ground, datums, words = _placed(numbers[first, :3], table, frame)
-    wrong = ~(np.abs(ground) <= (TURNS, TURNS, FAR)).all(axis=1)  # NaN fails, too
+    ground, datums, words = _geolocated(numbers[first, :3], table, frame)
+    wrong = ~(np.abs(ground) <= (TURNS, TURNS, MAX_COORDINATE)).all(axis=1)  # NaN fails, too
     if wrong.any():
         name, (x, y, z) = names[int(wrong.argmax())], ground[int(wrong.argmax())]
-        if np.isfinite([x, y]).all() and abs(z) <= FAR and not (frame.crs or table.crs):
+        if np.isfinite([x, y]).all() and abs(z) <= MAX_COORDINATE and not (frame.crs or table.crs):
             raise InputError(
                 f"GCP {name} at {x:.10g}, {y:.10g}: map coordinates? Say their reference system with --gcp-crs, as "
                 "EPSG:32631"
@@ -132,7 +132,7 @@ def _assembled(
     return made, words
 
 
-def _placed(place: Array, table: Table, frame: Frame) -> tuple[Array, tuple[HeightDatum, ...], str]:
+def _geolocated(place: Array, table: GcpTable, frame: ControlReference) -> tuple[Array, tuple[HeightDatum, ...], str]:
     """Return lon, lat, altitude [m above the ellipsoid; 0: none], what is known of the altitudes' datum, and words."""
     crs, vertical, words = frame.crs or table.crs, table.vertical, list[str]()
     if frame.crs and table.crs and frame.crs != table.crs:

@@ -2,7 +2,7 @@
 
 (0, 0) is the centre of the top-left pixel. CSV: a header with the columns `image, col, row, track` and, where it is
 known, `sigma` [px], in any order. npz: arrays `names`, `view`, `track`, `xy` (K, 2) and `sigma`. Files of one pair
-(ASP, LightGlue), or a folder of them, COLMAP's databases and hloc's HDF5: `barpc.pointio.foreign`.
+(ASP, LightGlue), or a folder of them, COLMAP's databases and hloc's HDF5: `barpc.pointio.third_party_matches`.
 """
 
 from __future__ import annotations
@@ -16,16 +16,25 @@ import numpy as np
 from barpc.base.errors import InputError, plain
 from barpc.base.frozen import Arrays, load_npz
 from barpc.base.geodesy import Array
-from barpc.base.sidefile import TABLE, read_head
+from barpc.base.safe_io import TABLE, read_head
 from barpc.pointio.columns import IMAGE_SIGMA
-from barpc.pointio.foreign import COLMAP, HDF5, PairPoints, pair_files, pair_of, read_colmap, read_hloc, read_pair_files
 from barpc.pointio.names import ViewNames, cell
-from barpc.pointio.tables import distinct, numbered, read_table
+from barpc.pointio.tables import distinct, index_texts, read_table
+from barpc.pointio.third_party_matches import (
+    COLMAP,
+    HDF5,
+    PairPoints,
+    pair_files,
+    pair_of,
+    read_colmap,
+    read_hloc,
+    read_pair_files,
+)
 from barpc.scene import IntArray, Tracks, connected_labels
 
-_COLUMNS = ("image", "col", "row", "track")
+_MATCH_COLUMNS = ("image", "col", "row", "track")
 _NO_TRACK = "no track is seen in two of the views"
-_STEPS = 16  # observations of a track are linked to so many after them: all of a usual track
+_MAX_LINKED_DISTANCE = 16  # observations of a track are linked to so many after them: all of a usual track
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +82,7 @@ class Links:
         """Return the observations of tracks: each is linked to the next ones of its track."""
         order = np.lexsort((view, track))
         label, ends = track[order], [np.zeros((0, 2), dtype=np.int64)]
-        for step in range(1, min(_STEPS, len(view) - 1) + 1):
+        for step in range(1, min(_MAX_LINKED_DISTANCE, len(view) - 1) + 1):
             same = np.flatnonzero(label[step:] == label[:-step])
             if not len(same):
                 break
@@ -99,7 +108,7 @@ def read_links(path: Path | str, names: Sequence[str]) -> Links:
     path = Path(path)
     views = ViewNames(names, str(path))
     try:
-        links = _read(path, views)
+        links = _read_by_kind(path, views)
     except OSError as error:
         raise InputError(f"{path}: cannot be read as tie points ({plain(error)})") from error
     if not (np.isfinite(links.xy).all() and np.isfinite(links.sigma).all() and (links.sigma > 0).all()):
@@ -130,7 +139,7 @@ def write_matches(path: Path | str, tracks: Tracks, names: Sequence[str]) -> Non
     if path.suffix.lower() != ".csv":
         raise InputError(f"{path}: tie points are written as .csv or .npz")
     with path.open("w", encoding="utf-8", newline="") as text:
-        text.write(",".join([*_COLUMNS, "sigma"]) + "\r\n")
+        text.write(",".join([*_MATCH_COLUMNS, "sigma"]) + "\r\n")
         cells = [cell(name) for name in names]
         rows = (array.tolist() for array in (tracks.view, tracks.point, tracks.xy, tracks.sigma))
         for view, point, (col, row), sigma in zip(*rows, strict=True):
@@ -158,7 +167,7 @@ def asp_text(first: Array, second: Array) -> str:
     return "\n".join([f"{len(first)} {len(second)}", *rows]) + "\n"
 
 
-def _read(path: Path, views: ViewNames) -> Links:
+def _read_by_kind(path: Path, views: ViewNames) -> Links:
     if path.is_dir():
         return Links.of_pairs(read_pair_files(pair_files(path), views))
     head, ending = read_head(path, TABLE, 16), path.suffix.lower()
@@ -169,19 +178,21 @@ def _read(path: Path, views: ViewNames) -> Links:
         return _read_npz(path, arrays, views)
     if ending == ".npz" or pair_files(path):
         return Links.of_pairs(read_pair_files([path], views))
-    return _read_csv(path, views)
+    return _read_matches_csv(path, views)
 
 
 def _named_after_pairs(path: Path, views: ViewNames) -> bool:
     return any(pair_of(one, views) is not None for one in pair_files(path))
 
 
-def _read_csv(path: Path, views: ViewNames) -> Links:
-    _, table = read_table(path, {key: (key,) for key in (*_COLUMNS, "sigma")}, _COLUMNS, texts=("image", "track"))
+def _read_matches_csv(path: Path, views: ViewNames) -> Links:
+    _, table = read_table(
+        path, {key: (key,) for key in (*_MATCH_COLUMNS, "sigma")}, _MATCH_COLUMNS, texts=("image", "track")
+    )
     image, track = table["image"], table["track"]
     point = track.index
     if not isinstance(track.different, np.ndarray):
-        point = numbered((label.strip() for label in track.different), {})[point]
+        point = index_texts((label.strip() for label in track.different), {})[point]
     spread = table.get("sigma", np.full(len(point), IMAGE_SIGMA))
     xy = np.column_stack([table["col"], table["row"]])
     return _tracks(views.of(map(str, image.different))[image.index], point, xy, spread)

@@ -17,14 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import InputError, listed
-from barpc.base.remote import Place, pure
+from barpc.base.remote import PathOrUrl, pure
 
 MAX_NAME = 120
 """Bytes of a view's name: the file of a pair's matches carries two, and 255 are what a file system takes."""
 _FORMULA = frozenset("=+-@＝＋－＠\t\r")
 
 
-def unique_names(files: Sequence[Place]) -> list[str]:
+def unique_names(files: Sequence[PathOrUrl]) -> list[str]:
     """Return a name for each file: its stem, with as many folders before it as it takes to tell them apart.
 
     Names that differ in case or composition only are taken for one, as file systems and GDAL do; two files of one

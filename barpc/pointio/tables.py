@@ -15,7 +15,7 @@ import numpy as np
 
 from barpc.base.errors import BarpcError, InputError, plain
 from barpc.base.geodesy import Array
-from barpc.base.sidefile import LARGEST, OPTIONS, TABLE, opened_text, read_text
+from barpc.base.safe_io import MAX_NUMBER, OPTIONS, TABLE, opened_text, read_text
 from barpc.pointio.columns import Names, degrees, header_of, numbers_of
 from barpc.pointio.names import from_cell
 from barpc.scene import IntArray
@@ -44,13 +44,15 @@ def read_table(
         None
     """
     with opened_text(path, TABLE) as text:
-        number, first = next(((n, line) for n, raw in enumerate(text, 1) for line in _content([raw], texts)), (1, ""))
+        number, first = next(
+            ((n, line) for n, raw in enumerate(text, 1) for line in _content_lines([raw], texts)), (1, "")
+        )
         delimiter = next((sign for sign in "\t;," if sign in first), " ")
         with _line_named(path, number, needed):
             words = row_of(first, delimiter)
-            columns = _columns(path, words, delimiter, names, needed, unnamed)
-        rows = chain([first], text) if _numbers(words, delimiter) else text
-        return words, _filled(path, rows, number + (rows is text), _Table(columns, delimiter, texts, blank))
+            columns = _column_indices(path, words, delimiter, names, needed, unnamed)
+        rows = chain([first], text) if _are_numbers(words, delimiter) else text
+        return words, _filled(path, rows, number + (rows is text), _GrowingTable(columns, delimiter, texts, blank))
 
 
 def read_columns(
@@ -58,18 +60,18 @@ def read_columns(
 ) -> dict[str, Any]:
     """Return the columns of a table, whose places are known, below the lines that are skipped (see `read_table`)."""
     with opened_text(path, TABLE) as text:
-        return _filled(path, islice(text, skipped, None), skipped + 1, _Table(columns, delimiter, texts, blank))
+        return _filled(path, islice(text, skipped, None), skipped + 1, _GrowingTable(columns, delimiter, texts, blank))
 
 
-def _filled(path: Path, rows: Iterator[str], number: int, table: _Table) -> dict[str, Any]:
+def _filled(path: Path, rows: Iterator[str], number: int, table: _GrowingTable) -> dict[str, Any]:
     """Return the columns of the lines that begin with the one called `number`, read by batches."""
     while batch := list(islice(rows, _BATCH)):
         try:
-            table.add(_content(batch, table.texts))
-        except _WRONG:
+            table.add(_content_lines(batch, table.texts))
+        except _PARSE_ERRORS:
             for n, raw in enumerate(batch, number):
                 with _line_named(path, n, list(table.columns)):
-                    table.parsed(_content([raw], table.texts))
+                    table.parsed(_content_lines([raw], table.texts))
             raise
         number += len(batch)
     return table.whole()
@@ -77,10 +79,10 @@ def _filled(path: Path, rows: Iterator[str], number: int, table: _Table) -> dict
 
 _DIGITS = 18  # of whole numbers of 64 bits
 _BATCH = 1 << 12  # lines that are parsed at a time: their cells stay in the processor's cache
-_WRONG = (ValueError, IndexError, csv.Error)
+_PARSE_ERRORS = (ValueError, IndexError, csv.Error)
 
 
-def _content(lines: Sequence[str], texts: Collection[str]) -> list[str]:
+def _content_lines(lines: Sequence[str], texts: Collection[str]) -> list[str]:
     """Return the lines without comments, which of lines of numbers alone may stand behind these, and empty ones."""
     if not texts:
         lines = [line.partition("#")[0] for line in lines]
@@ -93,7 +95,7 @@ def _line_named(path: Path, number: int, columns: Sequence[str]) -> Iterator[Non
         yield
     except BarpcError:
         raise
-    except _WRONG as error:
+    except _PARSE_ERRORS as error:
         said = plain(error)
         cure = "; decimal commas need semicolons or tabs between cells" if re.match(r"'[+-]?\d+,\d+' ", said) else ""
         raise InputError(f"{path}, line {number}: expected {', '.join(columns)} ({said}{cure})") from error
@@ -110,7 +112,7 @@ class Texts:
     def of(cls, texts: Iterable[str]) -> Texts:
         """Return the column of texts, one a row."""
         known: dict[str, int] = {}
-        index = numbered(texts, known)
+        index = index_texts(texts, known)
         return cls(list(known), index)
 
     def per_row(self) -> list[str]:
@@ -119,7 +121,7 @@ class Texts:
         return [texts[i] for i in self.index]
 
 
-def numbered(texts: Iterable[str], known: dict[str, int]) -> IntArray:
+def index_texts(texts: Iterable[str], known: dict[str, int]) -> IntArray:
     """Return the number of each text, that of its first appearance among all that are `known`, which grows."""
     return np.array([known.setdefault(text, len(known)) for text in texts], dtype=np.int64)
 
@@ -142,12 +144,12 @@ class _Texts:
         self._parts: list[IntArray] = []
 
     def append(self, cells: list[str]) -> None:
-        part = _whole(cells) if self._known is None else None
+        part = _as_integers(cells) if self._known is None else None
         if part is None:
             if self._known is None:
                 self._known = {}
-                self._parts = [numbered(map(str, part.tolist()), self._known) for part in self._parts]
-            part = numbered(cells, self._known)
+                self._parts = [index_texts(map(str, part.tolist()), self._known) for part in self._parts]
+            part = index_texts(cells, self._known)
         self._parts.append(part)
 
     def column(self) -> Texts:
@@ -159,7 +161,7 @@ class _Texts:
         return Texts(values[order], np.argsort(order)[inverse.ravel()])
 
 
-def _whole(cells: list[str]) -> IntArray | None:
+def _as_integers(cells: list[str]) -> IntArray | None:
     """Return texts as the numbers (N,) that they are; None unless all are written as `str` does."""
     joined = "".join(cells)
     if not (all(cells) and joined.isascii() and joined.isdecimal()) or max(map(len, cells)) > _DIGITS:
@@ -169,7 +171,7 @@ def _whole(cells: list[str]) -> IntArray | None:
     return values if digits == len(joined) else None
 
 
-class _Table:
+class _GrowingTable:
     """Columns that grow by batches of lines."""
 
     def __init__(self, columns: dict[str, int], delimiter: str, texts: Collection[str], blank: Collection[str]) -> None:
@@ -231,16 +233,16 @@ def row_of(line: str, delimiter: str) -> list[str]:
     return [cell for cell in row if delimiter != " " or cell]
 
 
-def _numbers(words: Sequence[str], delimiter: str) -> bool:
+def _are_numbers(words: Sequence[str], delimiter: str) -> bool:
     return numbers_of([_pointed(word, delimiter) for word in words]) is not None
 
 
-def _columns(
+def _column_indices(
     path: Path, words: Sequence[str], delimiter: str, names: Names, needed: Sequence[str], unnamed: Sequence[str]
 ) -> dict[str, int]:
     """Return the column of each quantity by the first line: its names, or the order of numbers."""
     most = len(words) if len(unnamed) == len(needed) else len(unnamed)
-    if unnamed and len(needed) <= len(words) <= most and _numbers(words, delimiter):
+    if unnamed and len(needed) <= len(words) <= most and _are_numbers(words, delimiter):
         return dict(zip(unnamed, range(len(words)), strict=False))
     found = header_of(words, names)
     if not set(needed) <= set(found):
@@ -272,7 +274,7 @@ def read_transform(path: Path | str) -> Array:
     rows = [words for words in lines if words]
     for word in (word for words in rows for word in words):
         value = numbers_of([word])
-        if value is None or not abs(value[0]) <= LARGEST:
+        if value is None or not abs(value[0]) <= MAX_NUMBER:
             raise InputError(f"{path}: {word[:40]!r} is no finite number; {_WANTED}")
     shape = len(rows), *sorted({len(row) for row in rows})
     if shape == (4, 3):

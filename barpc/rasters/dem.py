@@ -27,24 +27,24 @@ from rasterio.warp import transform as warp_points
 from rasterio.windows import Window
 
 from barpc.base.errors import BarpcWarning, ImageError, InputError
-from barpc.base.geodesy import DEFAULT, FAR, STATED, Array, HeightDatum
-from barpc.base.remote import Place, location
-from barpc.base.sidefile import GRID, opened
+from barpc.base.geodesy import DEFAULT, MAX_COORDINATE, STATED, Array, HeightDatum
+from barpc.base.remote import PathOrUrl, location
+from barpc.base.safe_io import GRID, opened
 from barpc.rasters.pgm import open_pgm
 from barpc.rasters.raster import open_raster
-from barpc.rasters.vertical import ELLIPSOID, NONE, Vertical, vertical_of
+from barpc.rasters.vertical import ELLIPSOID, NO_GEOID, Vertical, vertical_of
 from barpc.sensor import SensorModel
 
-HEIGHTS = {
+HEIGHT_DRIVERS = {
     ".hgt": ("SRTMHGT", Vertical("EGM96 height", geoid="egm96", provenance=STATED)),
     ".gtx": ("GTX", Vertical(ELLIPSOID, provenance=STATED)),
     ".pgm": ("PGM", Vertical(ELLIPSOID, provenance=STATED)),
 }
 """Suffix -> the driver that may open it (its first bytes say nothing), and what its heights count from."""
 _MAX_CELLS = 400_000_000
-_EXACT = 1e-4  # m: of a place on the terrain
+_TERRAIN_TOLERANCE = 1e-4  # m: of a place on the terrain
 _A_POST = 4.0  # steps: with 60 m of noise a post, under 27 degrees, 1.7 % of lines pass a corner, of two steps 3.2 %
-_STEPS = 64  # of a line of sight over a terrain whose posts are not known
+_SIGHT_STEPS = 64  # of a line of sight over a terrain whose posts are not known
 _AT_ONCE = 500_000  # heights
 
 
@@ -52,7 +52,7 @@ _AT_ONCE = 500_000  # heights
 class HeightGrid:
     """Heights at the nodes of a regular grid, read when they are asked for."""
 
-    path: Place
+    path: PathOrUrl
     driver: str | None
     shape: tuple[int, int]  # number of nodes: rows, cols
     crs: CRS
@@ -71,9 +71,9 @@ class HeightGrid:
         path = location(path)
         with opened(path, GRID) as file:
             length = file.seek(0, 2)
-        driver, vertical = HEIGHTS.get(path.suffix.lower(), (None, None))
+        driver, vertical = HEIGHT_DRIVERS.get(path.suffix.lower(), (None, None))
         try:
-            with _opened(path, driver) as dataset:
+            with _open_heights(path, driver) as dataset:
                 crs, shape, forward, extent = dataset.crs, dataset.shape, dataset.transform, dataset.bounds
                 unit, linear = dataset.units[0] or "", (float(dataset.scales[0]), float(dataset.offsets[0]))
                 if crs is None:
@@ -89,7 +89,7 @@ class HeightGrid:
                 f"{error} (an SRTM tile is called as N44E005.hgt and has 1201 or 3601 nodes a side; a .gtx is as long "
                 "as its header says)"
             ) from error
-        to_pixel = _inverse(forward, path)
+        to_pixel = _inverse_transform(forward, path)
         turn = 360.0 * abs(to_pixel.a) if crs.is_geographic else 0.0
         around = turn > 0 and (extent.right - extent.left) * abs(to_pixel.a) >= turn - 0.5
         vertical = vertical or vertical_of(crs.to_wkt(), unit, os.fspath(path))
@@ -98,7 +98,7 @@ class HeightGrid:
 
     def read(self, top: int, bottom: int, left: int, right: int) -> Array:
         """Read the heights (bottom - top, right - left) [m] of a window, NaN in voids."""
-        with _opened(self.path, self.driver) as dataset:
+        with _open_heights(self.path, self.driver) as dataset:
             window = Window.from_slices((top, bottom), (left, right))
             numbers = dataset.read(1, window=window, masked=True).astype(np.float64).filled(np.nan)
         scale, offset = self.linear
@@ -184,7 +184,7 @@ class HeightGrid:
         return np.asarray(height)
 
 
-def _opened(path: Place, driver: str | None) -> AbstractContextManager[Any]:
+def _open_heights(path: PathOrUrl, driver: str | None) -> AbstractContextManager[Any]:
     return open_pgm(path) if driver == "PGM" else open_raster(path, driver)
 
 
@@ -194,11 +194,11 @@ def _snapped(index: Array) -> Array:
     return np.where(np.abs(index - node) < 1e-6, node, index)
 
 
-def _inverse(forward: Affine, path: Place) -> Affine:
+def _inverse_transform(forward: Affine, path: PathOrUrl) -> Affine:
     """Return the inverse transformation, from coordinates to pixels, where there is one."""
     numbers = np.array(forward[:6])
     area = abs(forward.determinant)
-    if np.isfinite(numbers).all() and np.abs(numbers).max() <= FAR and area >= FAR**-2:
+    if np.isfinite(numbers).all() and np.abs(numbers).max() <= MAX_COORDINATE and area >= MAX_COORDINATE**-2:
         return ~forward
     raise InputError(f"{path}: its geotransform {tuple(forward[:6])} maps no grid of nodes")
 
@@ -237,7 +237,7 @@ class Dem:
         grids = [HeightGrid.open(one) for one in ((path,) if isinstance(path, (str, Path)) else path)]
         taken: list[str | None] = [said] * len(grids)
         if len(grids) > 1 and said is not None:
-            taken = [said if _lacking(grid.vertical, said) else None for grid in grids]
+            taken = [said if _needs_geoid(grid.vertical, said) else None for grid in grids]
             if not any(taken):
                 names = ", ".join(os.fspath(grid.path) for grid in grids)
                 raise InputError(f"{names}: each says what its heights count from; leave out the geoid {said}")
@@ -351,9 +351,9 @@ class Dem:
         return posts, lowest + float(np.nanmin(lift)) - bend, highest + float(np.nanmax(lift)) + bend
 
 
-def _lacking(own: Vertical, said: str) -> bool:
+def _needs_geoid(own: Vertical, said: str) -> bool:
     """Return whether a DEM needs what is said of its geoid: it states none, or one of which no grid is at hand."""
-    return not own.stated or (said.lower() != NONE and geoid_of(own, own, False)[2])
+    return not own.stated or (said.lower() != NO_GEOID and geoid_of(own, own, False)[2])
 
 
 def localize_on_terrain(
@@ -382,18 +382,18 @@ def localize_on_terrain(
         return np.empty((0, 3))
     high, low = alt_range[1], alt_range[0]
     ends = np.stack([sensor.localize(image, np.full(len(image), end)) for end in (high, low)])
-    steps, lowest, highest = _STEPS, low, high
+    steps, lowest, highest = _SIGHT_STEPS, low, high
     if isinstance(terrain, Dem):
         posts, lowest, highest = terrain.between(*ends)
-        top, bottom = np.clip([highest + _EXACT, lowest - _EXACT], low, high)
-        steps = max(2, int(np.ceil(_A_POST * posts * (top - bottom) / max(high - low, _EXACT))))
+        top, bottom = np.clip([highest + _TERRAIN_TOLERANCE, lowest - _TERRAIN_TOLERANCE], low, high)
+        steps = max(2, int(np.ceil(_A_POST * posts * (top - bottom) / max(high - low, _TERRAIN_TOLERANCE))))
         high, low = float(top), float(bottom)
     levels, size = np.linspace(high, low, steps + 1), max(1, _AT_ONCE // (steps + 1))
-    parts = [_met(sensor, image[i : i + size], terrain, levels) for i in range(0, len(image), size)]
+    parts = [_terrain_intersection(sensor, image[i : i + size], terrain, levels) for i in range(0, len(image), size)]
     ground = np.concatenate(parts)
     ground[np.isnan(ground[:, 2])] = np.nan
     without = int(np.isnan(ground[:, 2]).sum())
-    outside = lowest < alt_range[0] - _EXACT or highest > alt_range[1] + _EXACT
+    outside = lowest < alt_range[0] - _TERRAIN_TOLERANCE or highest > alt_range[1] + _TERRAIN_TOLERANCE
     if without and outside and np.isfinite(highest):
         warnings.warn(
             f"the DEM's heights here are {lowest:.0f} to {highest:.0f} m, the camera is made for {alt_range[0]:g} to "
@@ -404,7 +404,9 @@ def localize_on_terrain(
     return ground
 
 
-def _met(sensor: SensorModel, image: Array, terrain: Callable[[Array, Array], Array], levels: Array) -> Array:
+def _terrain_intersection(
+    sensor: SensorModel, image: Array, terrain: Callable[[Array, Array], Array], levels: Array
+) -> Array:
     """Return the ground points (N, 3) between descending levels [m]; terrain at the first and last counts."""
 
     def above(alt: Array) -> Array:
@@ -412,13 +414,13 @@ def _met(sensor: SensorModel, image: Array, terrain: Callable[[Array, Array], Ar
         return np.asarray(alt - terrain(ground[..., 0], ground[..., 1]))
 
     height = above(np.broadcast_to(levels[:, None], (len(levels), len(image))))
-    height[0] += _EXACT
-    height[-1] -= _EXACT
+    height[0] += _TERRAIN_TOLERANCE
+    height[-1] -= _TERRAIN_TOLERANCE
     met = (height[:-1] >= 0) & (height[1:] < 0)
     first = met.argmax(axis=0)
     upper = np.where(met.any(axis=0), levels[first], np.nan)
     lower = np.where(met.any(axis=0), levels[first + 1], np.nan)
-    for _ in range(int(np.ceil(np.log2(max(levels[0] - levels[1], _EXACT) / _EXACT)))):
+    for _ in range(int(np.ceil(np.log2(max(levels[0] - levels[1], _TERRAIN_TOLERANCE) / _TERRAIN_TOLERANCE)))):
         middle = (upper + lower) / 2
         under = above(middle) < 0
         lower, upper = np.where(under, middle, lower), np.where(under, upper, middle)
@@ -475,7 +477,7 @@ def geoid_file(given: str | os.PathLike[str]) -> str:
     """
     text = os.fspath(given)
     name = text.lower()
-    if name == NONE:
+    if name == NO_GEOID:
         return name
     if name not in GEOIDS or Path(text).exists():
         return text

@@ -19,10 +19,10 @@ from rasterio.transform import array_bounds
 from rasterio.windows import Window
 
 from barpc.base.errors import InputError
-from barpc.base.remote import Place
-from barpc.base.sidefile import GRID, opened
+from barpc.base.remote import PathOrUrl
+from barpc.base.safe_io import GRID, opened
 
-_HEAD = re.compile(rb"P5\s++((?:#[^\n]*+\n\s*+)*+)(\d{1,6})\s++(\d{1,6})\s++((?:#[^\n]*+\n\s*+)*+)65535[ \t\r\n]")
+_PGM_HEADER = re.compile(rb"P5\s++((?:#[^\n]*+\n\s*+)*+)(\d{1,6})\s++(\d{1,6})\s++((?:#[^\n]*+\n\s*+)*+)65535[ \t\r\n]")
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,10 @@ class Pgm:
 
 
 @contextmanager
-def open_pgm(path: Place) -> Iterator[Pgm]:
+def open_pgm(path: PathOrUrl) -> Iterator[Pgm]:
     """Open a geoid grid; InputError where it is none of GeographicLib's."""
     with opened(path, GRID) as file:
-        found = _HEAD.match(file.read(65536))
+        found = _PGM_HEADER.match(file.read(65536))
         if found is None:
             raise InputError(f"{path}: no .pgm of 16-bit numbers (P5, comments, width, height, 65535)")
         cols, rows = int(found[2]), int(found[3])

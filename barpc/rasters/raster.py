@@ -31,8 +31,8 @@ from rasterio.windows import Window
 from barpc.base import identity
 from barpc.base.errors import ImageError
 from barpc.base.identity import Input
-from barpc.base.remote import Place, Remote, RemoteFile, location
-from barpc.base.sidefile import IMAGE, read_head
+from barpc.base.remote import PathOrUrl, Remote, RemoteFile, location
+from barpc.base.safe_io import IMAGE, read_head
 from barpc.rasters.vrt import INDIRECT, MAGIC, Band, Rect, Source, Vrt, read_vrt
 
 DRIVERS: dict[bytes, str] = {
@@ -59,7 +59,7 @@ GDAL_OPTIONS: dict[str, Any] = {
     "GDAL_NUM_THREADS": "1",  # threads open the file anew: what fails in one of them nobody hears of
 }
 """Settings under which every raster is read."""
-_ALONE: dict[str, Any] = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
+_NO_SIDECAR_OPTIONS: dict[str, Any] = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
 # An .ovr, .msk or .aux.xml beside an image may be, or name, a web service: GDAL is told that there is none.
 
 _WARNINGS = threading.Lock()  # catch_warnings is process-wide
@@ -69,17 +69,17 @@ _WARNINGS = threading.Lock()  # catch_warnings is process-wide
 def open_raster(path: str | os.PathLike[str], driver: str | None = None) -> Iterator[Any]:
     """Open a raster read-only, as a rasterio.DatasetReader or a Mosaic; an error while it is open names the file, too.
 
-    `driver` may open a file whose first bytes do not tell its kind (`barpc.rasters.dem.HEIGHTS`). ImageError for a file
-    that is missing, a folder, empty, of no kind that barpc reads, damaged, remote, or a VRT that is not of the grammar
-    of `barpc.rasters.vrt` or points at anything else than plain local rasters.
+    `driver` may open a file whose first bytes do not tell its kind (`barpc.rasters.dem.HEIGHT_DRIVERS`). ImageError for
+    a file that is missing, a folder, empty, of no kind that barpc reads, damaged, remote, or a VRT that is not of the
+    grammar of `barpc.rasters.vrt` or points at anything else than plain local rasters.
     """
     name = os.fspath(path)
     identity.ask(path)
     file, driver = identify(path, driver)
     try:
         with (
-            rasterio.Env(**GDAL_OPTIONS, **_ALONE),
-            _mosaic(file, name) if driver == "VRT" else _opened(file, driver) as dataset,
+            rasterio.Env(**GDAL_OPTIONS, **_NO_SIDECAR_OPTIONS),
+            _open_mosaic(file, name) if driver == "VRT" else _open_dataset(file, driver) as dataset,
         ):
             yield dataset
     except RasterioError as error:
@@ -87,7 +87,7 @@ def open_raster(path: str | os.PathLike[str], driver: str | None = None) -> Iter
         raise ImageError(f"{name}: cannot be read as {driver}: {reason}") from error
 
 
-def _opened(file: Place, driver: str) -> Any:
+def _open_dataset(file: PathOrUrl, driver: str) -> Any:
     if isinstance(file, Remote):
         return _opened_remote(file, driver)
     with _WARNINGS, warnings.catch_warnings():
@@ -112,7 +112,7 @@ class _Asked(RemoteFile):
             return 0
 
 
-_SHOWN = "remote"  # the one file that GDAL finds
+_VISIBLE_NAME = "remote"  # the one file that GDAL finds
 
 
 @contextmanager
@@ -121,14 +121,14 @@ def _opened_remote(file: Remote, driver: str) -> Iterator[Any]:
     failures: list[OSError] = []
 
     def opener(name: str, _mode: str = "rb", **_given: Any) -> _Asked:
-        if name != _SHOWN:
+        if name != _VISIBLE_NAME:
             raise FileNotFoundError(name)
         return _Asked(file, failures)
 
     try:
         with _WARNINGS, warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            dataset = rasterio.open(_SHOWN, driver=driver, opener=opener)
+            dataset = rasterio.open(_VISIBLE_NAME, driver=driver, opener=opener)
         with dataset:
             yield dataset
     except RasterioError:
@@ -138,7 +138,7 @@ def _opened_remote(file: Remote, driver: str) -> Iterator[Any]:
         raise ImageError(f"{file}: cannot be read ({failures[0]})") from failures[0]
 
 
-def _mosaic(file: Place, name: str) -> Mosaic:
+def _open_mosaic(file: PathOrUrl, name: str) -> Mosaic:
     """Return a VRT whose sources are all rasters that are read here."""
     if isinstance(file, Remote):
         raise ImageError(f"{name}: a VRT is read from disk only; give the images it is made of")
@@ -149,17 +149,17 @@ def _mosaic(file: Place, name: str) -> Mosaic:
             drivers[source.file] = identify(source.file)[1]
             if drivers[source.file] == "VRT":
                 raise ImageError(f"{name}: a VRT of a VRT is not read; give the images it is made of")
-    return Mosaic(name, vrt, lambda source: _opened(source, drivers[source]))
+    return Mosaic(name, vrt, lambda source: _open_dataset(source, drivers[source]))
 
 
-def hashed(path: Place | str) -> Input:
+def hashed(path: PathOrUrl | str) -> Input:
     """Hash a file, of a VRT the sources that it shows, too; ImageError where one cannot be read."""
     try:
         if isinstance(path, Remote) or driver_of(read_head(path, IMAGE, 64)) != "VRT":
-            return identity.take(path)
-        whole = identity.take(path)  # before it is read: what it shows is what was hashed
+            return identity.fingerprint(path)
+        whole = identity.fingerprint(path)  # before it is read: what it shows is what was hashed
         files = dict.fromkeys(source.file for source in read_vrt(Path(path)).sources)
-        found = replace(whole, parts=tuple(identity.take(file) for file in files))
+        found = replace(whole, parts=tuple(identity.fingerprint(file) for file in files))
     except OSError as error:
         if isinstance(error, ImageError):
             raise
@@ -168,7 +168,7 @@ def hashed(path: Place | str) -> Input:
     return found
 
 
-def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[Place, str]:
+def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[PathOrUrl, str]:
     """Return a raster's absolute path (or Remote) and the only driver that may open it, given or by its first bytes."""
     name = os.fspath(path)
     if not isinstance(path, Remote) and INDIRECT.match(name) and not os.path.lexists(name):
@@ -190,9 +190,9 @@ def driver_of(head: bytes) -> str | None:
 
 # --- the raster that a VRT describes ----------------------------------------------------------------------
 
-Pixels = npt.NDArray[Any]
+PixelArray = npt.NDArray[Any]
 
-BLOCK = 512  # px a side, read and written at a time
+BLOCK_SIZE = 512  # px a side, read and written at a time
 _MOST_OPEN = 64
 _WIDE = ("int32", "uint32", "int64", "uint64", "float64")  # GDAL scales them as float64, others as float32
 
@@ -209,7 +209,7 @@ class Mosaic:
         self.dtypes = tuple(band.dtype for band in vrt.bands)
         self.nodatavals = tuple(band.nodata for band in vrt.bands)
         self.nodata = self.nodatavals[0]
-        self.block_shapes = [(min(BLOCK, self.height), min(BLOCK, self.width))] * self.count
+        self.block_shapes = [(min(BLOCK_SIZE, self.height), min(BLOCK_SIZE, self.width))] * self.count
         names = ColorInterp.__members__
         self.colorinterp = tuple(names.get(band.color, ColorInterp.undefined) for band in vrt.bands)
         self.crs = self._crs(vrt.srs)
@@ -246,7 +246,7 @@ class Mosaic:
 
     def read(
         self, indexes: int | Sequence[int] | None = None, window: Window | None = None, masked: bool = False
-    ) -> Pixels:
+    ) -> PixelArray:
         """Read the pixels of one band (H, W), or of several (bands, H, W); masked where they mean nothing, if asked."""
         wanted = [indexes] if isinstance(indexes, int) else list(indexes or self.indexes)
         box = self._box(window)
@@ -299,15 +299,15 @@ class Mosaic:
             self._open[file] = self._stack.enter_context(self._opener(file))
         return self._open[file]
 
-    def _assembled(self, band: Band, box: Rect) -> Pixels:
+    def _assembled(self, band: Band, box: Rect) -> PixelArray:
         dtype = np.dtype("complex64" if band.dtype == "complex_int16" else band.dtype)
         out = np.broadcast_to(_converted(np.array(band.fill), dtype), (box[3], box[2])).copy()
         for source in band.sources:
-            if source.dst is None or _common(box, source.dst):
+            if source.dst is None or _intersection(box, source.dst):
                 self._paste(source, band, box, out)
         return out
 
-    def _paste(self, source: Source, band: Band, box: Rect, out: Pixels) -> None:
+    def _paste(self, source: Source, band: Band, box: Rect, out: PixelArray) -> None:
         dataset = self._dataset(source.file)
         if source.band > dataset.count or source.band < 1:
             raise ImageError(f"{self.name}: there is no band {source.band} in {os.fspath(source.file)}")
@@ -318,8 +318,8 @@ class Mosaic:
                 f"{self.name}: the VRT resamples {os.fspath(source.file)}, which is not read; write it out as a GeoTIFF"
             )
         right, down = dst[0] - src[0], dst[1] - src[1]
-        inside = _common(dst, (right, down, dataset.width, dataset.height))
-        part = _common(box, inside) if inside else None
+        inside = _intersection(dst, (right, down, dataset.width, dataset.height))
+        part = _intersection(box, inside) if inside else None
         if part is None:
             return
         window = Window(part[0] - right, part[1] - down, part[2], part[3])
@@ -329,7 +329,7 @@ class Mosaic:
         place[keep] = _converted(values, out.dtype)[keep]
 
 
-def _handed_on(values: Pixels, source: Source, dtype: str) -> tuple[Any, Pixels]:
+def _handed_on(values: PixelArray, source: Source, dtype: str) -> tuple[Any, PixelArray]:
     """Return the mask of values that a source passes on, and what they become."""
     keep: Any = ...
     if source.plain:
@@ -346,14 +346,14 @@ def _handed_on(values: Pixels, source: Source, dtype: str) -> tuple[Any, Pixels]
     return keep, values
 
 
-def _equal(values: Pixels, nodata: float) -> npt.NDArray[np.bool_]:
+def _equal(values: PixelArray, nodata: float) -> npt.NDArray[np.bool_]:
     with np.errstate(all="ignore"):
         wanted = values.dtype.type(nodata) if values.dtype.kind in "fc" else nodata
         found: npt.NDArray[np.bool_] = np.isnan(values) if np.isnan(nodata) else values == wanted
     return found
 
 
-def _converted(values: Pixels, dtype: np.dtype[Any]) -> Pixels:
+def _converted(values: PixelArray, dtype: np.dtype[Any]) -> PixelArray:
     """Convert values to another type as GDAL does: rounded half away from zero and cut at the type's range."""
     if values.dtype == dtype:
         return values
@@ -372,7 +372,7 @@ def _converted(values: Pixels, dtype: np.dtype[Any]) -> Pixels:
         return np.where(out >= high, high, np.where(out <= low, low, out.astype(dtype))).astype(dtype)
 
 
-def _common(a: Rect, b: Rect) -> Rect | None:
+def _intersection(a: Rect, b: Rect) -> Rect | None:
     left, top = max(a[0], b[0]), max(a[1], b[1])
     right, bottom = min(a[0] + a[2], b[0] + b[2]), min(a[1] + a[3], b[1] + b[3])
     return (left, top, right - left, bottom - top) if right > left and bottom > top else None

@@ -13,11 +13,11 @@ from barpc.base.errors import InputError
 from barpc.base.geodesy import DEFAULT, STATED
 
 ELLIPSOID, UNKNOWN = "ellipsoid", "unknown"
-NONE, ELLIPSOIDAL = "none", "ellipsoidal"
+NO_GEOID, ELLIPSOIDAL = "none", "ellipsoidal"
 """Said in place of a geoid: heights are ellipsoidal."""
-_GEOIDS = (("egm2008", "egm2008"), ("egm08", "egm2008"), ("egm96", "egm96"), ("egm84", "egm96"))
+_GEOID_NAMES = (("egm2008", "egm2008"), ("egm08", "egm2008"), ("egm96", "egm96"), ("egm84", "egm96"))
 _OTHERS = "egm96"  # of any other orthometric datum, from which it lies a metre or two
-_UNITS = {
+_HEIGHT_UNITS = {
     word: size
     for size, words in (
         (1.0, "m metre meter metres meters mt 1"),
@@ -48,15 +48,15 @@ class Vertical:
         return self.provenance == STATED
 
     def by(self, geoid: str | None) -> Vertical:
-        """Return the same with what a person says of its geoid: a name or a file, `NONE`, or nothing (None)."""
+        """Return the same with what a person says of its geoid: a name or a file, `NO_GEOID`, or nothing (None)."""
         if geoid is None:
             return self
-        return replace(self, geoid=None if geoid.lower() in (NONE, ELLIPSOIDAL) else geoid, provenance=STATED)
+        return replace(self, geoid=None if geoid.lower() in (NO_GEOID, ELLIPSOIDAL) else geoid, provenance=STATED)
 
 
 def metres_of(unit: str) -> float | None:
     """Return the length [m] of a unit of heights by its name; None for a name that is none."""
-    return _UNITS.get(re.sub(r"[\s_-]", "", unit.lower()))
+    return _HEIGHT_UNITS.get(re.sub(r"[\s_-]", "", unit.lower()))
 
 
 def vertical_of(wkt: str, unit: str = "", of: str = "heights") -> Vertical:
@@ -93,5 +93,5 @@ def _of_crs(wkt: str) -> Vertical:
     if parts[0] is crs or "ellipsoid" in name.lower():
         return Vertical(ELLIPSOID, metres, unit, None, STATED)
     plain = re.sub(r"[^a-z0-9]", "", name.lower())
-    geoid = next((grid for text, grid in _GEOIDS if text in plain), _OTHERS)
+    geoid = next((grid for text, grid in _GEOID_NAMES if text in plain), _OTHERS)
     return Vertical(name, metres, unit, geoid, STATED)

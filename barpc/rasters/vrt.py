@@ -15,7 +15,7 @@ from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 from barpc.base.errors import ImageError, RpcFormatError
-from barpc.base.sidefile import MB, XML, parse_xml, read_bytes
+from barpc.base.safe_io import MB, XML, parse_xml, read_bytes
 
 _INTEGERS = {f"{u}int{n}": f"{u.upper()}Int{n}" for n in (16, 32, 64) for u in ("u", "")}
 _COMPLEX = {"complex_int16": "CInt16", "complex64": "CFloat32", "complex128": "CFloat64"}
@@ -26,9 +26,9 @@ MAGIC = b"<VRTDataset"
 Rect = tuple[int, int, int, int]  # col, row of the first pixel, width, height [px]
 
 _ANY = r"(?s:.*)"
-_WHOLE = r"\d{1,9}"
-_NUMBER = r"[+-]?(?:\d{1,400}\.?\d{0,400}|\.\d{1,400})(?:[eE][+-]?\d{1,4})?"
-_NODATA = rf"{_NUMBER}|[+-]?nan|[+-]?inf(?:inity)?"
+_INTEGER_PATTERN = r"\d{1,9}"
+_REAL_PATTERN = r"[+-]?(?:\d{1,400}\.?\d{0,400}|\.\d{1,400})(?:[eE][+-]?\d{1,4})?"
+_NODATA = rf"{_REAL_PATTERN}|[+-]?nan|[+-]?inf(?:inity)?"
 _SWITCH = "0|1"
 _TYPE = "|".join(GDAL_TYPES.values())
 _RESAMPLING = "nearest|near|bilinear|cubic|cubicspline|lanczos|average|rms|mode|gauss"
@@ -46,28 +46,28 @@ class _Tag(NamedTuple):
 
 
 _RECT = ("xOff", "yOff", "xSize", "ySize")
-_SIZES = ("RasterXSize", "RasterYSize", "BlockXSize", "BlockYSize")
-_SOURCE = "SourceFilename SourceBand SourceProperties SrcRect DstRect"
+_SIZE_ATTRIBUTES = ("RasterXSize", "RasterYSize", "BlockXSize", "BlockYSize")
+_SOURCE_ELEMENTS = "SourceFilename SourceBand SourceProperties SrcRect DstRect"
 _BAND = "ColorInterp NoDataValue HideNoDataValue SimpleSource ComplexSource"
 _FORGOTTEN = "Description UnitType Offset Scale Metadata CategoryNames ColorTable Histograms"
-_COUNTS = ("BlockXSize", "BlockYSize", "BucketCount", "IncludeOutOfRange", "Approximate")
-_AXES = r"-?\d(,-?\d){0,3}"
+_INTEGER_ELEMENTS = ("BlockXSize", "BlockYSize", "BucketCount", "IncludeOutOfRange", "Approximate")
+_AXIS_MAPPING = r"-?\d(,-?\d){0,3}"
 _GRAMMAR: dict[str, _Tag] = {
     "VRTDataset": _Tag(
         None,
-        {"rasterXSize": _WHOLE, "rasterYSize": _WHOLE},
+        {"rasterXSize": _INTEGER_PATTERN, "rasterYSize": _INTEGER_PATTERN},
         "SRS GeoTransform GCPList Metadata BlockXSize BlockYSize OverviewList VRTRasterBand MaskBand",
     ),
-    "SRS": _Tag(_SRS, {"dataAxisToSRSAxisMapping": _AXES, "coordinateEpoch": _NUMBER}),
-    "GeoTransform": _Tag(rf"{_NUMBER}(\s*,\s*{_NUMBER}){{5}}"),
-    "GCPList": _Tag(None, {"Projection": f"{_SRS}|", "dataAxisToSRSAxisMapping": _AXES}, "GCP"),
-    "GCP": _Tag(None, {"Id": _ANY, "Info": _ANY, **dict.fromkeys(("Pixel", "Line", "X", "Y", "Z"), _NUMBER)}),
+    "SRS": _Tag(_SRS, {"dataAxisToSRSAxisMapping": _AXIS_MAPPING, "coordinateEpoch": _REAL_PATTERN}),
+    "GeoTransform": _Tag(rf"{_REAL_PATTERN}(\s*,\s*{_REAL_PATTERN}){{5}}"),
+    "GCPList": _Tag(None, {"Projection": f"{_SRS}|", "dataAxisToSRSAxisMapping": _AXIS_MAPPING}, "GCP"),
+    "GCP": _Tag(None, {"Id": _ANY, "Info": _ANY, **dict.fromkeys(("Pixel", "Line", "X", "Y", "Z"), _REAL_PATTERN)}),
     "Metadata": _Tag(None, {"domain": _ANY}, "MDI"),
     "MDI": _Tag(_ANY, {"key": _ANY}),
     "OverviewList": _Tag(r"[\d\s]*", {"resampling": r"\w+"}),
     "VRTRasterBand": _Tag(
         None,
-        {"dataType": _TYPE, **dict.fromkeys(("band", "blockXSize", "blockYSize"), _WHOLE)},
+        {"dataType": _TYPE, **dict.fromkeys(("band", "blockXSize", "blockYSize"), _INTEGER_PATTERN)},
         f"{_BAND} {_FORGOTTEN}",
     ),
     "MaskBand": _Tag(None, {}, "VRTRasterBand"),
@@ -75,19 +75,19 @@ _GRAMMAR: dict[str, _Tag] = {
     "HideNoDataValue": _Tag(_SWITCH),
     "CategoryNames": _Tag(None, {}, "Category"),
     "ColorTable": _Tag(None, {}, "Entry"),
-    "Entry": _Tag(None, dict.fromkeys(("c1", "c2", "c3", "c4"), _WHOLE)),
+    "Entry": _Tag(None, dict.fromkeys(("c1", "c2", "c3", "c4"), _INTEGER_PATTERN)),
     "Histograms": _Tag(None, {}, "HistItem"),
     "HistItem": _Tag(None, {}, "HistMin HistMax BucketCount IncludeOutOfRange Approximate HistCounts"),
     "HistCounts": _Tag(r"[\d|]*"),
-    "SimpleSource": _Tag(None, {"resampling": _RESAMPLING}, _SOURCE),
-    "ComplexSource": _Tag(None, {"resampling": _RESAMPLING}, f"{_SOURCE} NODATA ScaleOffset ScaleRatio"),
+    "SimpleSource": _Tag(None, {"resampling": _RESAMPLING}, _SOURCE_ELEMENTS),
+    "ComplexSource": _Tag(None, {"resampling": _RESAMPLING}, f"{_SOURCE_ELEMENTS} NODATA ScaleOffset ScaleRatio"),
     "SourceFilename": _Tag(_ANY, {"relativeToVRT": _SWITCH, "shared": _SWITCH}),
-    "SourceBand": _Tag(rf"{_WHOLE}|mask,{_WHOLE}"),
-    "SourceProperties": _Tag(None, {"DataType": r"\w+", **dict.fromkeys(_SIZES, _WHOLE)}),
-    **dict.fromkeys(("SrcRect", "DstRect"), _Tag(None, dict.fromkeys(_RECT, _NUMBER))),
-    **dict.fromkeys(_COUNTS, _Tag(_WHOLE)),
+    "SourceBand": _Tag(rf"{_INTEGER_PATTERN}|mask,{_INTEGER_PATTERN}"),
+    "SourceProperties": _Tag(None, {"DataType": r"\w+", **dict.fromkeys(_SIZE_ATTRIBUTES, _INTEGER_PATTERN)}),
+    **dict.fromkeys(("SrcRect", "DstRect"), _Tag(None, dict.fromkeys(_RECT, _REAL_PATTERN))),
+    **dict.fromkeys(_INTEGER_ELEMENTS, _Tag(_INTEGER_PATTERN)),
     **dict.fromkeys(("Description", "UnitType", "Category"), _Tag(_ANY)),
-    **dict.fromkeys(("Offset", "Scale", "ScaleOffset", "ScaleRatio"), _Tag(_NUMBER)),
+    **dict.fromkeys(("Offset", "Scale", "ScaleOffset", "ScaleRatio"), _Tag(_REAL_PATTERN)),
     **dict.fromkeys(("NoDataValue", "NODATA", "HistMin", "HistMax"), _Tag(_NODATA)),
 }
 _REPEATED = "Metadata MDI GCP Entry Category HistItem VRTRasterBand SimpleSource ComplexSource"
@@ -162,11 +162,11 @@ def vrt_from_xml(root: Element, folder: Path, name: str) -> Vrt:
     """Read a VRT as `read_vrt`, from the parsed document and the folder to which its sources are relative."""
     if root.tag != "VRTDataset":
         raise ImageError(f"{name}: <{root.tag}> where <VRTDataset> was expected")
-    _check(root, name)
-    return _Reader(folder, name).dataset(root)
+    _require_grammar(root, name)
+    return _ElementReader(folder, name).dataset(root)
 
 
-def _check(element: Element, name: str) -> None:
+def _require_grammar(element: Element, name: str) -> None:
     """Raise unless the element and all in it are of the grammar."""
     tag = _GRAMMAR[element.tag]
     for key, value in element.attrib.items():
@@ -184,7 +184,7 @@ def _check(element: Element, name: str) -> None:
         if child.tag in seen and child.tag not in _REPEATED.split():
             raise _refused(name, f"two <{child.tag}> in <{element.tag}>")
         seen.add(child.tag)
-        _check(child, name)
+        _require_grammar(child, name)
 
 
 def _refused(name: str, what: str) -> ImageError:
@@ -192,8 +192,8 @@ def _refused(name: str, what: str) -> ImageError:
 
 
 @dataclass(frozen=True)
-class _Reader:
-    """Values of elements that passed `_check`."""
+class _ElementReader:
+    """Values of elements that passed `_require_grammar`."""
 
     folder: Path
     name: str

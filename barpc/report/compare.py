@@ -13,10 +13,10 @@ import numpy as np
 from barpc.base.errors import BarpcError, InputError
 from barpc.base.options import file_options
 from barpc.base.remote import is_url
-from barpc.report.records import plain
+from barpc.report.records import json_form
 from barpc.report.runfiles import read_summary
 from barpc.report.summary import Summary
-from barpc.report.summary.views import CELLS, ViewEntry
+from barpc.report.summary.views import COVERAGE_CELLS, ViewEntry
 from barpc.report.summary.words import median
 from barpc.rpcio import read_rpc
 from barpc.sensor.geometry import image_grid
@@ -44,12 +44,14 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
             why = f"the runs have no image in common ({first} and others there, {second} here)"
         raise InputError(f"{folder_a} and {folder_b}: {why}: nothing to compare")
     given = [flat_options(run.options or {}) for run in runs]
-    placed = [_placed(one, folder) for one, folder in zip(given, folders, strict=True)]  # from folders of two depths
+    placed = [
+        _absolute_options(one, folder) for one, folder in zip(given, folders, strict=True)
+    ]  # from folders of two depths
     comparison = {
         "a": str(folder_a),
         "b": str(folder_b),
         "views": [_view(folders, (a[name], b[name])) for name in same],
-        "pairs": _pairs(*runs),
+        "pairs": _compared_pairs(*runs),
         "only_a": [name for name in a if name not in same],
         "only_b": [name for name in b if name not in same],
         "options": [
@@ -59,11 +61,11 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
         ],
         "versions": [run.barpc for run in runs],
     }
-    found: dict[str, Any] = plain({**comparison, "lines": _lines(comparison)})
+    found: dict[str, Any] = json_form({**comparison, "lines": _comparison_lines(comparison)})
     return found
 
 
-def _placed(options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def _absolute_options(options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return the options of a run with absolute paths."""
 
     def at(path: Any) -> Any:
@@ -102,7 +104,7 @@ def _rpc_difference(
     if first is None or second is None:
         return None, None
     with np.errstate(all="ignore"):  # where the second has no value there is no difference
-        ground = first.localize(*image_grid(views[0].size, views[0].alt_range_m, (CELLS, CELLS)))
+        ground = first.localize(*image_grid(views[0].size, views[0].alt_range_m, (COVERAGE_CELLS, COVERAGE_CELLS)))
         difference = second.project(ground) - first.project(ground)
     difference = difference[np.isfinite(difference).all(axis=1)]
     if not len(difference):
@@ -123,7 +125,7 @@ def written_rpc(folder: Path, view: ViewEntry) -> RPC | None:
     return None
 
 
-def _pairs(run_a: Summary, run_b: Summary) -> list[dict[str, Any]]:
+def _compared_pairs(run_a: Summary, run_b: Summary) -> list[dict[str, Any]]:
     of_b, rows = {(pair.a, pair.b): pair for pair in run_b.pairs}, []
     for both in ((pair, of_b.get((pair.a, pair.b))) for pair in run_a.pairs):
         if both[1] is not None:
@@ -150,7 +152,7 @@ def flat_options(options: Mapping[str, Any], before: str = "") -> dict[str, Any]
     return flat
 
 
-def _lines(comparison: Mapping[str, Any]) -> list[str]:
+def _comparison_lines(comparison: Mapping[str, Any]) -> list[str]:
     views = comparison["views"]
     a, b = (median([view["rmse"][k] for view in views]) for k in (0, 1))
     lines = [f"{len(views)} images in both: their tie points agree to {a:.3f} px in A, {b:.3f} px in B."]

@@ -7,12 +7,12 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.ba.held.ground import KNOWN_BIAS
+from barpc.ba.constraints.ground import KNOWN_BIAS
 from barpc.base.geodesy import DEFAULT, HeightDatum
-from barpc.base.usual import SURE, SURELY
+from barpc.base.statistics import SURE, SURELY
 from barpc.report.summary.words import metres
 
-_SOURCES = {"gcps": ("gcps",), "heights": ("heights", "reference"), "altimetry": ("altimetry",)}
+_HEIGHT_SHARES = {"gcps": ("gcps",), "heights": ("heights", "reference"), "altimetry": ("altimetry",)}
 """Source of heights -> the shares of the scene's height that stand on it."""
 _UP = 2  # place of the scene's height among its motions
 
@@ -27,7 +27,7 @@ def datum_reasons(datums: Iterable[HeightDatum], adjustment: Adjustment) -> Iter
     the other would move the scene by more than its height is known to.
     """
     for one in datums:
-        share = sum(np.nan_to_num(adjustment.datum[name][_UP]) for name in _SOURCES[one.source])
+        share = sum(np.nan_to_num(adjustment.datum[name][_UP]) for name in _HEIGHT_SHARES[one.source])
         evidence = [*one.above, *_beside_cameras(one.source, adjustment, share)]
         offset, sigma = np.array(evidence).reshape(-1, 2).T
         taken, other = (float((((offset + more) / sigma) ** 2).sum()) for more in (0.0, one.otherwise))

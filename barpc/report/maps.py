@@ -20,21 +20,21 @@ from barpc.base.errors import listed
 from barpc.base.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.report.records import MAX_SHOWN
 from barpc.report.runfiles import ObservationTable, RunFiles
-from barpc.report.summary.known import CheckPointEntry, GcpEntry
+from barpc.report.summary.ground_points import CheckPointEntry, GcpEntry
 from barpc.report.summary.pairs import PairEntry
-from barpc.report.summary.views import CELLS, ViewEntry, cell_numbers
+from barpc.report.summary.views import COVERAGE_CELLS, ViewEntry, cell_numbers
 from barpc.report.summary.words import counted, known, metres
-from barpc.report.verdict import SHOWN, flagged, worst_first
+from barpc.report.verdict import TABLE_ROWS_SHOWN, flagged, worst_first
 
 WIDTH = 420.0  # Units of a map from left to right
 MAX_MARKS = 1500  # Tie points on the map, and lines between images
-_MARGIN = 34.0
-_MOST = 60  # images on the page: those with the largest systematic part
+_MAP_MARGIN = 34.0
+_MAX_MAP_IMAGES = 60  # images on the page: those with the largest systematic part
 _VECTORS = 6000
 _PANEL = 180.0
-_LONGEST = 16  # characters of a name on the map
-_LINE = 14.0  # units of a line of names
-_REACH = 12.0  # units of a long residual
+_MAX_LABEL_LENGTH = 16  # characters of a name on the map
+_LABEL_HEIGHT = 14.0  # units of a line of names
+_ARROW_LENGTH = 12.0  # units of a long residual
 
 
 @cache
@@ -112,8 +112,8 @@ def _plane_of(lonlat: Array) -> Plane:
     lon, lat = ((low + high) / 2).tolist()
     per_degree = metres_per_unit(np.array([lon, lat, 0.0]))[:2]
     extent = np.maximum((high - low) * per_degree, 1.0)
-    scale = float(min((WIDTH - 2 * _MARGIN) / extent[0], 420.0 / extent[1]))
-    return Plane(lon, lat, per_degree * scale, float(extent[1] * scale) + 2 * _MARGIN + 24, scale)
+    scale = float(min((WIDTH - 2 * _MAP_MARGIN) / extent[0], 420.0 / extent[1]))
+    return Plane(lon, lat, per_degree * scale, float(extent[1] * scale) + 2 * _MAP_MARGIN + 24, scale)
 
 
 def ground_map(files: RunFiles) -> str:
@@ -144,7 +144,7 @@ def ground_map(files: RunFiles) -> str:
         groups=[(sentence, *plane(ends).ravel()[[0, 3, 2, 1]].tolist()) for sentence, ends in groups],
         outlines=[(k, view, [plane(ring[:-1]).tolist() for ring in outline]) for k, view, outline in drawn],
         pairs=_pair_lines(middles, files),
-        shown=_names([(view, middles[view.name]) for view in named], taken),
+        shown=_map_labels([(view, middles[view.name]) for view in named], taken),
         marks=[(kind, point.name, x, y, up) for (kind, up, point), (x, y) in zip(points, plane(placed), strict=True)],
         summary=summary,
     )
@@ -160,22 +160,26 @@ def _drawn(files: RunFiles) -> list[tuple[int, ViewEntry, Sequence[Array]]]:
     return [*(evenly(good, room) if room else ()), *(whole[view.name] for view in bad[::-1])]
 
 
-Taken = list[tuple[float, float, float]]  # places that words have on the map: x, y, half their width
+OccupiedAreas = list[tuple[float, float, float]]  # places that words have on the map: x, y, half their width
 
 
-def _names(places: Sequence[tuple[ViewEntry, Array]], taken: Taken) -> list[tuple[ViewEntry, str, float, float]]:
+def _map_labels(
+    places: Sequence[tuple[ViewEntry, Array]], taken: OccupiedAreas
+) -> list[tuple[ViewEntry, str, float, float]]:
     """Return names of images at places (2,), but those that would stand on others or on what is taken.
 
     A name tells how many images have their middle in the same place.
     """
     taken, names, every = list(taken), [], np.array([place for _, place in places])
     for view, place in places:
-        alike = int((np.abs(every - place).max(axis=1) < _LINE / 2).sum()) - 1
-        name = view.name if len(view.name) <= _LONGEST else f"…{view.name[1 - _LONGEST :]}"  # its end tells of a series
+        alike = int((np.abs(every - place).max(axis=1) < _LABEL_HEIGHT / 2).sum()) - 1
+        name = (
+            view.name if len(view.name) <= _MAX_LABEL_LENGTH else f"…{view.name[1 - _MAX_LABEL_LENGTH :]}"
+        )  # its end tells of a series
         name += f" + {alike}" * bool(alike)
         (x, y), half = place.tolist(), 3.6 * len(name)
         x = min(max(x, half), WIDTH - half)
-        if all(abs(x - u) > half + other or abs(y - v) > _LINE for u, v, other in taken):
+        if all(abs(x - u) > half + other or abs(y - v) > _LABEL_HEIGHT for u, v, other in taken):
             taken.append((x, y, half))
             names.append((view, name, x, y))
     return names
@@ -189,21 +193,21 @@ def _pair_lines(middles: Mapping[str, Array], files: RunFiles) -> list[tuple[Pai
     return [(pair, math.sqrt(pair.num_matches / most), middles[pair.a], middles[pair.b]) for pair in pairs]
 
 
-def _graticule(plane: Plane) -> tuple[list[Any], list[Any], tuple[float, float, float, str], Taken]:
+def _graticule(plane: Plane) -> tuple[list[Any], list[Any], tuple[float, float, float, str], OccupiedAreas]:
     """Return lines of longitude and latitude, their degrees (x, y, words, anchor), the scale bar, and what is taken."""
     right, bottom = WIDTH - 4, plane.height - 24
     reach = np.array([WIDTH / 2, plane.height / 2]) / plane.unit
     lines: list[Any] = []
     texts: list[Any] = []
-    taken: Taken = []
+    taken: OccupiedAreas = []
     for lon in round_ticks(plane.lon - reach[0], plane.lon + reach[0], 4):
-        x, words = float(plane(np.array([lon, plane.lat]))[0]), _degrees((lon + 180.0) % 360.0 - 180.0, "EW")
+        x, words = float(plane(np.array([lon, plane.lat]))[0]), _degree_label((lon + 180.0) % 360.0 - 180.0, "EW")
         if 50 < x < right - 40:
             lines.append((x, 4, x, bottom))
             texts.append((x, bottom - 4, words, "middle"))
             taken.append((x, bottom - 8, 3.6 * len(words)))
     for lat in round_ticks(plane.lat - reach[1], plane.lat + reach[1], 4):
-        y, words = float(plane(np.array([plane.lon, lat]))[1]), _degrees(lat, "NS")
+        y, words = float(plane(np.array([plane.lon, lat]))[1]), _degree_label(lat, "NS")
         if 16 < y < bottom - 20:
             lines.append((4, y, right, y))
             texts.append((4, y - 3, words, "start"))
@@ -213,7 +217,7 @@ def _graticule(plane: Plane) -> tuple[list[Any], list[Any], tuple[float, float, 
     return lines, texts, (right - length * plane.scale, bottom + 9, length * plane.scale, words), taken
 
 
-def _degrees(value: float, letters: str) -> str:
+def _degree_label(value: float, letters: str) -> str:
     return f"{abs(value):g}° {letters[value < 0]}" if value else "0°"
 
 
@@ -236,14 +240,14 @@ class Cells:
 
 def residual_cells(xy: Array, residuals: Array, size: Sequence[int]) -> Cells:
     """Return mean and spread of residuals (m, 2) [px] over a grid of cells on the image."""
-    cell, num = cell_numbers(xy, size), CELLS**2
+    cell, num = cell_numbers(xy, size), COVERAGE_CELLS**2
     count = np.bincount(cell, minlength=num)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.stack([np.bincount(cell, r, num) / count for r in residuals.T], axis=-1)
         square = np.bincount(cell, (residuals**2).sum(axis=1), num) / count
         spread = np.maximum(square - (mean**2).sum(axis=1), 0.0)
         systematic = ((mean**2).sum(axis=1) > 9 * spread / count) & (count >= 10)
-    shape = (CELLS, CELLS)
+    shape = (COVERAGE_CELLS, COVERAGE_CELLS)
     return Cells(np.sqrt(square).reshape(shape), mean.reshape(*shape, 2), systematic.reshape(shape))
 
 
@@ -260,7 +264,7 @@ def residual_panels(
     use = observations.used & np.isfinite(residuals).all(axis=1)
     norm = np.hypot(*residuals[use].T)
     longest = (float(np.quantile(norm, 0.95)) if len(norm) else 0.0) or 1.0
-    most = min(_VECTORS // min(max(len(views), 20), _MOST), 300)
+    most = min(_VECTORS // min(max(len(views), 20), _MAX_MAP_IMAGES), 300)
     order = np.flatnonzero(use)
     order = order[np.argsort(observations.view[order], kind="stable")]
     rows_of = np.split(order, np.searchsorted(observations.view[order], np.arange(1, len(views))))
@@ -271,13 +275,13 @@ def residual_panels(
     shares = [cells.share for cells in grids]
     charts = []
     rest = [k for k in range(len(views)) if k not in first]
-    if len(views) > SHOWN:
+    if len(views) > TABLE_ROWS_SHOWN:
         rest.sort(key=lambda k: -shares[k])
-    for k in [*first, *rest][:_MOST]:
+    for k in [*first, *rest][:_MAX_MAP_IMAGES]:
         rows = evenly(rows_of[k], most)
         svg = _panel(when, k, views[k], grids[k], np.hstack([observations.xy[rows], residuals[rows]]), longest)
-        charts.append((svg, f"{views[k].name}: {_note(grids[k])}"))
-    words = f"A thin line of a {_PANEL / _REACH:.0f}th of a panel's width is {longest:.2g} px"
+        charts.append((svg, f"{views[k].name}: {_panel_note(grids[k])}"))
+    words = f"A thin line of a {_PANEL / _ARROW_LENGTH:.0f}th of a panel's width is {longest:.2g} px"
     key = f"{words}; bold arrows are drawn twice as long."
     if len(charts) < len(views):
         key += f" Of {len(views)} images {len(charts)} are shown: "
@@ -285,7 +289,7 @@ def residual_panels(
     return charts, shares, key
 
 
-def _note(cells: Cells) -> str:
+def _panel_note(cells: Cells) -> str:
     return f"{100 * cells.share:.0f} % systematic" if np.isfinite(cells.rms).any() else "no tie points"
 
 
@@ -293,14 +297,14 @@ def _panel(when: str, number: int, view: ViewEntry, cells: Cells, drawn: Array, 
     """Draw the map of an image, with the residuals that are drawn (m, 4): col, row, dcol, drow [px]."""
     width, height = view.size
     box = np.array([_PANEL, _PANEL * min(max(height / width, 0.4), 2.5)])
-    side, start = box / CELLS, (drawn[:, :2] + 0.5) * (box / view.size)
+    side, start = box / COVERAGE_CELLS, (drawn[:, :2] + 0.5) * (box / view.size)
     heat = [
         (j * side[0], i * side[1], *side, 0.06 + 0.5 * min(float(rms) / (2 * longest), 1.0))
         for (i, j), rms in np.ndenumerate(cells.rms)
         if np.isfinite(rms)
     ]
     found = np.argwhere(cells.systematic)
-    arrows = [_arrow(side * (j + 0.5, i + 0.5), cells.mean[i, j] * (2 * _REACH / longest)) for i, j in found]
+    arrows = [_arrow(side * (j + 0.5, i + 0.5), cells.mean[i, j] * (2 * _ARROW_LENGTH / longest)) for i, j in found]
     text: str = template("drawings.svg.j2").module.panel(
         when=when,
         number=number,
@@ -308,9 +312,9 @@ def _panel(when: str, number: int, view: ViewEntry, cells: Cells, drawn: Array, 
         width=box[0],
         height=box[1],
         cells=heat,
-        shafts=np.hstack([start, start + drawn[:, 2:] * (_REACH / longest)]).tolist(),
+        shafts=np.hstack([start, start + drawn[:, 2:] * (_ARROW_LENGTH / longest)]).tolist(),
         arrows=arrows,
-        described=f"{len(drawn)} residuals are drawn; {_note(cells)}.",
+        described=f"{len(drawn)} residuals are drawn; {_panel_note(cells)}.",
     )
     return text
 

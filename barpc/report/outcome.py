@@ -12,20 +12,20 @@ from typing import Any, Literal
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.ba.evidence.scan import Place, Unused, met_worse
+from barpc.ba.evidence.scan import ImageRegion, Unused, met_worse
 from barpc.base.geodesy import Array, HeightDatum, ground_from_ecef
-from barpc.base.usual import CRITICAL, FEWEST
+from barpc.base.statistics import CRITICAL, FEWEST
 from barpc.fit import RpcFit
 from barpc.scene import BoolArray, Camera, GroundPoints, IntArray, Tracks, View, middle_altitude
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, Several, Triangulation, triangulate
 from barpc.tie import PairReport, ReferenceControl
 from barpc.tie.detail import Gap, gap, in_parts
-from barpc.tie.matchers.matching import FINE
+from barpc.tie.matchers.matching import FINE_STRUCTURE
 
 MAX_TRACKS = 200_000
 """Of more tracks, every n-th is written, so that the files of a huge run can still be opened."""
-WHOLE, MOST = 0.05, 0.9
+WHOLE_PIXEL_TOLERANCE, MIN_WHOLE_SHARE = 0.05, 0.9
 """A whole shift [px], and the share of a pair's matches, `FEWEST` or more, that must have it."""
 SMOOTH_LEFT = 0.06  # A view whose residuals hold more than this [px] that is no scatter is called doubtful
 WHOLE_PIXELS = 12**-0.5  # px: standard deviation of rounding to whole pixels, alike where images are shifted alike
@@ -144,7 +144,7 @@ class Run:
         return found
 
     @cached_property
-    def met_worse(self) -> list[Place]:
+    def met_worse(self) -> list[ImageRegion]:
         """Rows, columns and cells of images in which tie points that took no part are met worse than elsewhere."""
         found, tracks = self.adjustment, self.tracks
         # who asks for plain least squares has no tie point that may be wrong
@@ -187,7 +187,7 @@ class Run:
         count: dict[bool, Counter[str]] = {True: Counter(), False: Counter()}
         for report in self.matched:
             for name in report.names if report.status == "ok" else ():
-                count[report.matcher == FINE][name] += report.verified
+                count[report.matcher == FINE_STRUCTURE][name] += report.verified
         return frozenset(name for name, whole in count[True].items() if whole > count[False][name])
 
     @cached_property
@@ -223,10 +223,13 @@ class Run:
         found: dict[str, str] = {}
         for ties in self.pairs:
             shift = self.tracks.xy[ties.b] - self.tracks.xy[ties.a]
-            if len(shift) < FEWEST or np.mean((np.abs(shift - np.rint(shift)) <= WHOLE).all(axis=1)) < MOST:
+            if (
+                len(shift) < FEWEST
+                or np.mean((np.abs(shift - np.rint(shift)) <= WHOLE_PIXEL_TOLERANCE).all(axis=1)) < MIN_WHOLE_SHARE
+            ):
                 continue  # by no whole shift, whichever: most pairs
             whole = np.rint(np.median(shift, axis=0))
-            if np.mean((np.abs(shift - whole) <= WHOLE).all(axis=1)) >= MOST:
+            if np.mean((np.abs(shift - whole) <= WHOLE_PIXEL_TOLERANCE).all(axis=1)) >= MIN_WHOLE_SHARE:
                 names = [self.views[i].name for i in ties.views]
                 for name, other, (col, row) in zip(names, names[::-1], (whole, 0.0 - whole), strict=True):
                     found.setdefault(name, f"{other}, moved by {col:.0f} columns and {row:.0f} rows")

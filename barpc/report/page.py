@@ -15,24 +15,33 @@ from typing import Any
 import numpy as np
 
 from barpc.base.errors import visible
-from barpc.base.usual import FEW, LARGEST
+from barpc.base.statistics import FEW, LARGEST
 from barpc.report.compare import flat_options
 from barpc.report.maps import ground_map, residual_panels, template
+from barpc.report.quality_checks import GOOD_RMSE
 from barpc.report.records import MAX_SHOWN, Record, Table, cell_of, table, value_of
-from barpc.report.reservations import GOOD_RMSE
 from barpc.report.runfiles import RunFiles, read_tables
 from barpc.report.summary import Summary
-from barpc.report.summary.known import GCPS, CheckPointEntry, GcpEntry, ReferenceViewEntry
+from barpc.report.summary.block import DATUM, DatumEntry, ExplanationEntry, HeldOutEntry, LeftEntry
+from barpc.report.summary.ground_points import GCP_CAPTION, CheckPointEntry, GcpEntry, ReferenceViewEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.whole import DATUM, DatumEntry, ExplanationEntry, HeldOutEntry, LeftEntry
 from barpc.report.summary.words import NAMED, largest
-from barpc.report.verdict import LINES, SHOWN, flagged, offset_of, sentences, sure_pairs, worst_first, worst_pairs
+from barpc.report.verdict import (
+    TABLE_ROWS_SHOWN,
+    VERDICT_SENTENCES,
+    flagged,
+    offset_of,
+    sentences,
+    sure_pairs,
+    worst_first,
+    worst_pairs,
+)
 from barpc.scene import connected_groups
 
-NAME = "report.html"
+REPORT_FILE = "report.html"
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
-REPORT = "report"  # the stage that makes the page
+REPORT_STAGE = "report"  # the stage that makes the page
 
 
 def can_render() -> bool:
@@ -50,15 +59,15 @@ def report_html(summary: Summary, folder: Path | str) -> str:
     """
     files = read_tables(summary, Path(folder))
     shown = [section for make in SECTIONS if (section := make(files)) is not None]
-    if len(summary.views) > SHOWN:
+    if len(summary.views) > TABLE_ROWS_SHOWN:
         shown = [replace(section, folded=section.key not in _OPEN) for section in shown]
     return visible(
         template("template.html.j2").render(
             summary=summary,
             sections=shown,
             verdict=sentences(summary),
-            large=len(summary.views) > SHOWN,
-            shown_lines=LINES,
+            large=len(summary.views) > TABLE_ROWS_SHOWN,
+            shown_lines=VERDICT_SENTENCES,
             folded=_FOLDED,
             most=MAX_SHOWN,
         )
@@ -87,7 +96,7 @@ class Section:
     folded: bool = False
 
 
-_TABLES: dict[str, tuple[str, type[Record], str]] = {
+_TABLE_CAPTIONS: dict[str, tuple[str, type[Record], str]] = {
     "images": ("Images: errors (RMS) of the tie points that count", ViewEntry, ViewEntry.PAGE),
     "pairs": ("Pairs: offset from the epipolar line, median ± spread (1.4826 MAD)", PairEntry, PairEntry.PAGE),
     "corrections": ("Corrections: shift in the middle of the image ± one sigma", ViewEntry, ViewEntry.CORRECTIONS),
@@ -96,7 +105,7 @@ _TABLES: dict[str, tuple[str, type[Record], str]] = {
         ViewEntry,
         ViewEntry.PLACES,
     ),
-    "gcps": (GCPS, GcpEntry, GcpEntry.PAGE),
+    "gcps": (GCP_CAPTION, GcpEntry, GcpEntry.PAGE),
     "control": ("Control in each image: the largest residual (Baarda's w)", ViewEntry, ViewEntry.CONTROL),
     "reference": ("Reference: what it says of each delivered camera", ReferenceViewEntry, ReferenceViewEntry.PAGE),
     "decided": ("Figures of each image: its prior widened, what was cut, what is left", ViewEntry, ViewEntry.DECISIONS),
@@ -111,9 +120,11 @@ _TABLES: dict[str, tuple[str, type[Record], str]] = {
 _FOLDED = "places", "control", "decided", "again", "options"
 
 
-def _table(key: str, rows: Sequence[Record], adjusted: bool = True, without: str = " ", more: str = "") -> list[Table]:
+def _tables_of(
+    key: str, rows: Sequence[Record], adjusted: bool = True, without: str = " ", more: str = ""
+) -> list[Table]:
     """Return a table, if it has rows; `without`: columns that have nothing to say."""
-    caption, kind, columns = _TABLES[key]
+    caption, kind, columns = _TABLE_CAPTIONS[key]
     columns = columns.replace(without, " ") + more
     return [table(key, caption, rows, kind, columns, adjusted)] if rows else []
 
@@ -144,15 +155,15 @@ def _words(macro: str, **facts: object) -> Any:
     return type(text)(re.sub("[ \n]+", " ", text).strip())
 
 
-def _images(files: RunFiles) -> Section:
+def _images_section(files: RunFiles) -> Section:
     views, number, adjusted = worst_first(files.summary.views), files.number, files.summary.adjusted
-    (shown,) = _table("images", views, adjusted, " " if any(view.cause for view in views) else " wrong ")
+    (shown,) = _tables_of("images", views, adjusted, " " if any(view.cause for view in views) else " wrong ")
     marks = [f"{number[view.name]}" for view in views]
     shown = replace(shown, caption=shown.caption + "; worst first" * bool(flagged(views)), marks=marks)
     return _section("images", {"views": views, "adjusted": adjusted}, tables=[shown])
 
 
-def _map(files: RunFiles) -> Section:
+def _map_section(files: RunFiles) -> Section:
     summary, number, num = files.summary, files.number, len(files.summary.views)
     links = [(number[pair.a], number[pair.b]) for pair in summary.pairs]
     partners = np.bincount(np.array(links, dtype=np.int64).ravel(), minlength=num)
@@ -167,22 +178,22 @@ def _map(files: RunFiles) -> Section:
     return _section("map", facts, charts=[(ground_map(files), caption)] if any(files.outlines) else [])
 
 
-def _randomness(files: RunFiles) -> Section | None:
+def _randomness_section(files: RunFiles) -> Section | None:
     if not len(files.observations.view):
         return None
     views, adjusted, folds = files.summary.views, files.summary.adjusted, []
     first = [files.number[view.name] for view in flagged(views)]
     panels, shares, key = residual_panels(views, files.observations, "after" if adjusted else "before", first)
     marked = [view.name for view, share in zip(views, shares, strict=True) if share > 0.5]
-    if len(panels) > SHOWN:
-        folds.append((f"{len(panels) - SHOWN} more images", panels[SHOWN:]))
+    if len(panels) > TABLE_ROWS_SHOWN:
+        folds.append((f"{len(panels) - TABLE_ROWS_SHOWN} more images", panels[TABLE_ROWS_SHOWN:]))
     if adjusted:
         before, _, lengths = residual_panels(views, files.observations, "before", first)
         folds.append((f"Before the adjustment. {lengths}", before))
-    return _section("random", {"marked": marked, "key": key}, panels=panels[:SHOWN], folds=folds)
+    return _section("random", {"marked": marked, "key": key}, panels=panels[:TABLE_ROWS_SHOWN], folds=folds)
 
 
-def _surface(files: RunFiles) -> Section | None:
+def _surface_section(files: RunFiles) -> Section | None:
     if not files.reliefs:
         return None
     before, after = files.reliefs
@@ -197,7 +208,7 @@ def _surface(files: RunFiles) -> Section | None:
     return _section("surface", {"before": before, "after": after}, charts=charts)
 
 
-def _pairs(files: RunFiles) -> Section | None:
+def _pairs_section(files: RunFiles) -> Section | None:
     pairs, number = worst_pairs(files.summary.pairs), files.number
     if not pairs:
         return None
@@ -208,12 +219,12 @@ def _pairs(files: RunFiles) -> Section | None:
         **{"worst": worst, "offset": offset_of(worst), "wanted": GOOD_RMSE, "enough": FEW},
         "best": min(heights, key=lambda pair: pair.height_m_per_px or 0.0, default=None),
     }
-    (shown,) = _table("pairs", pairs, files.summary.adjusted)
+    (shown,) = _tables_of("pairs", pairs, files.summary.adjusted)
     marks = ["{}-{}".format(*sorted((number[pair.a], number[pair.b]))) for pair in pairs]
     return _section("pairs", facts, tables=[replace(shown, marks=marks)])
 
 
-def _corrections(files: RunFiles) -> Section | None:
+def _corrections_section(files: RunFiles) -> Section | None:
     views = files.summary.views
     known = [(one.center_shift_px, one.center_sigma_px) for view in views if (one := view.correction)]
     moves = [
@@ -224,22 +235,22 @@ def _corrections(files: RunFiles) -> Section | None:
     if len(moves) < len(views):
         return None
     radars = any(value_of(view, "correction.range_m") is not None for view in views)
-    tables = _table("corrections", views, more=ViewEntry.CLOCKS * radars)
-    tables += _table("places", views if any(value_of(view, "correction.ellipse") for view in views) else ())
+    tables = _tables_of("corrections", views, more=ViewEntry.CLOCKS * radars)
+    tables += _tables_of("places", views if any(value_of(view, "correction.ellipse") for view in views) else ())
     scene = files.summary.scene
     moved = float(np.linalg.norm(np.array(scene.shift_enu_m, float))) if scene is not None else 0.0
     return _section("moves", {"most": max(moves), "moved": moved, "held": files.summary.gcps}, tables=tables)
 
 
-def _decisions(files: RunFiles) -> Section | None:
+def _decisions_section(files: RunFiles) -> Section | None:
     summary, scene = files.summary, files.summary.scene
     if not (points := decisions(summary)):
         return None
-    tables = _table("decided", summary.views if summary.adjusted else ())
+    tables = _tables_of("decided", summary.views if summary.adjusted else ())
     if scene is not None:
-        tables += _table("explained", scene.explanations) + _table("left", scene.left)
-        tables += _table("worse", scene.held_out_places or ())
-    tables += _table("again", [pair for pair in summary.pairs if pair.beaten])
+        tables += _tables_of("explained", scene.explanations) + _tables_of("left", scene.left)
+        tables += _tables_of("worse", scene.held_out_places or ())
+    tables += _tables_of("again", [pair for pair in summary.pairs if pair.beaten])
     return _section("decisions", {}, points=points, tables=tables)
 
 
@@ -251,28 +262,28 @@ def decisions(summary: Summary) -> list[str]:
     return [type(text)(item.strip()) for item in re.findall("<li>(.*?)</li>", text)]
 
 
-def _gauge(files: RunFiles) -> Section | None:
+def _gauge_section(files: RunFiles) -> Section | None:
     scene, reference, gcps = files.summary.scene, files.summary.reference, files.summary.gcps
     if scene is None:
         return None
     points = [f"{mode.words[0].upper()}{mode.words[1:]}." for mode in scene.weakest_modes[:NAMED] if mode.sigma_m]
     columns = DatumEntry.columns(scene.datum)
     tables = [table("datum", DATUM, scene.datum, DatumEntry, columns)] if scene.datum else []
-    tables += _table("gcps", gcps)
-    tables += _table("control", [view for view in files.summary.views if view.control_w is not None])
-    tables += _table("reference", () if reference is None else reference.views)
+    tables += _tables_of("gcps", gcps)
+    tables += _tables_of("control", [view for view in files.summary.views if view.control_w is not None])
+    tables += _tables_of("reference", () if reference is None else reference.views)
     held = bool(gcps or (reference and reference.used))
     return _section("gauge", {"scene": scene, "held": held}, points=points, tables=tables)
 
 
-def _check_points(files: RunFiles) -> Section | None:
+def _check_points_section(files: RunFiles) -> Section | None:
     points = files.summary.check_points
-    return _section("accuracy", {"num": len(points)}, tables=_table("check-points", points)) if points else None
+    return _section("accuracy", {"num": len(points)}, tables=_tables_of("check-points", points)) if points else None
 
 
-def _files(files: RunFiles) -> Section | None:
+def _files_section(files: RunFiles) -> Section | None:
     views = files.summary.views
-    tables = _table("fits", views if all(view.fit for view in views) else ())
+    tables = _tables_of("fits", views if all(view.fit for view in views) else ())
     if outputs := {file: found for view in views for file, found in view.outputs.items()}:
         consumers = list(dict.fromkeys(consumer for found in outputs.values() for consumer in found))
         rows = [
@@ -284,13 +295,14 @@ def _files(files: RunFiles) -> Section | None:
     return _section("files", {"worst": worst}, tables=tables) if tables else None
 
 
-def _run(files: RunFiles) -> Section:
+def _run_section(files: RunFiles) -> Section:
     rows = [[cell_of(key), cell_of(str(value))] for key, value in flat_options(files.summary.options or {}).items()]
     options = Table("options", "Options of the run", ["option", "value"], rows)
     return _section("run", {"summary": files.summary}, tables=[options])
 
 
 SECTIONS: Sequence[Callable[[RunFiles], Section | None]] = (
-    _images, _map, _randomness, _pairs, _surface, _corrections, _gauge, _decisions, _check_points, _files, _run
+    _images_section, _map_section, _randomness_section, _pairs_section, _surface_section, _corrections_section,
+    _gauge_section, _decisions_section, _check_points_section, _files_section, _run_section,
 )  # fmt: skip
 """In the order of the page; a section that has nothing to show is None."""

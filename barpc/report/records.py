@@ -19,7 +19,7 @@ from barpc.base.options import schema_of
 Number = float | None  # A number; None (null) stands for what is not finite
 
 
-def said(
+def column(
     text: str,
     unit: str = "",
     head: str | tuple[str, ...] = "",
@@ -50,9 +50,9 @@ def said(
     return field(default=default, metadata={"schema": more, "column": (heads, form, adjusted)})
 
 
-@dataclass_transform(frozen_default=True, field_specifiers=(said,))
+@dataclass_transform(frozen_default=True, field_specifiers=(column,))
 class Record:
-    """A part of the summary: its children are frozen dataclasses whose fields are declared by `said`."""
+    """A part of the summary: its children are frozen dataclasses whose fields are declared by `column`."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
@@ -67,7 +67,7 @@ class Record:
     @classmethod
     def read(cls, found: Mapping[str, Any]) -> Self:
         """Return the record of what a file holds, checked before; what it does not know is passed over."""
-        readers = _readers(cls)  # type: ignore[arg-type]  # a class can be hashed
+        readers = _field_readers(cls)  # type: ignore[arg-type]  # a class can be hashed
         known = ((key, value, readers[key]) for key, value in found.items() if key in readers)
         return cls(**{key: read(item) if read and item is not None else item for key, item, read in known})
 
@@ -91,7 +91,7 @@ def _hints(record: Any) -> dict[str, Any]:
 
 
 @cache
-def _readers(record: Any) -> dict[str, Callable[[Any], Any] | None]:
+def _field_readers(record: Any) -> dict[str, Callable[[Any], Any] | None]:
     hints = _hints(record)
     return {field.name: _reader(hints[field.name]) for field in fields(record)}
 
@@ -108,7 +108,7 @@ def _reader(kind: Any) -> Callable[[Any], Any] | None:
     return tuple if item is None else lambda values: tuple(map(item, values))
 
 
-def plain(value: Any, keep: bool = False) -> Any:
+def json_form(value: Any, keep: bool = False) -> Any:
     """Return a value as JSON holds it: arrays as lists, records as mappings, what is not finite as null.
 
     With `keep` as it is read from there: records stay what they are, lists become tuples.
@@ -118,19 +118,19 @@ def plain(value: Any, keep: bool = False) -> Any:
     if value is None or isinstance(value, (bool, int, str)):
         return value
     if isinstance(value, (list, tuple)):
-        found = [plain(item, keep) for item in value]
+        found = [json_form(item, keep) for item in value]
         return tuple(found) if keep else found
     if is_dataclass(value) and not isinstance(value, type):
-        held = ((name, getattr(value, name), optional) for name, optional in _held(type(value)))
-        items = {name: plain(item, keep) for name, item, optional in held if item is not None or not optional}
+        held = ((name, getattr(value, name), optional) for name, optional in _serialized_fields(type(value)))
+        items = {name: json_form(item, keep) for name, item, optional in held if item is not None or not optional}
         return type(value)(**items) if keep else items
     if isinstance(value, (np.ndarray, np.generic)):
-        return plain(value.tolist(), keep)
-    return {str(k): plain(v) for k, v in value.items()} if isinstance(value, Mapping) else str(value)
+        return json_form(value.tolist(), keep)
+    return {str(k): json_form(v) for k, v in value.items()} if isinstance(value, Mapping) else str(value)
 
 
 @cache
-def _held(kind: Any) -> list[tuple[str, bool]]:
+def _serialized_fields(kind: Any) -> list[tuple[str, bool]]:
     """Return the fields of a dataclass, and whether they are left out while None."""
     of_record = issubclass(kind, Record)
     return [(f.name, of_record and f.default is None) for f in fields(kind) if f.name[0] != "_"]
@@ -171,7 +171,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Column:
-    """A column: its head (several: a column for each of its values), its value in a row, and as in `said`."""
+    """A column: its head (several: a column for each of its values), its value in a row, and as in `column`."""
 
     head: str | tuple[str, ...]
     value: Callable[[Any], Any]

@@ -22,11 +22,11 @@ import numpy.typing as npt
 
 from barpc import __version__
 from barpc.base.errors import InputError, plain
-from barpc.base.geodesy import Array, collection, ecef_from_ground, enu_basis, feature
-from barpc.base.sidefile import GEOJSON, SUMMARY, TABLE, Kind, parse_json, read_json, read_text
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, feature_collection, geojson_feature
+from barpc.base.safe_io import GEOJSON, SUMMARY, TABLE, Kind, parse_json, read_json, read_text
 from barpc.pointio.names import cell, from_cell
 from barpc.report.outcome import Run
-from barpc.report.records import Number, Record, said, value_of
+from barpc.report.records import Number, Record, column, value_of
 from barpc.report.summary import SCHEMA, Summary, published_schema
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
@@ -41,7 +41,7 @@ _PLACE = "lon", "lat", "height_above_datum"
 RESIDUALS = (*_PLACE, "mean_residual", "num_observations", "mean_residual_before", "track")
 """Columns of residuals.csv, one row a track. Heights: above the ellipsoid."""
 
-OBSERVATIONS = ("view", "track", "col", "row", "col_before", "row_before", "col_after", "row_after", "used")
+OBSERVATION_COLUMNS = ("view", "track", "col", "row", "col_before", "row_before", "col_after", "row_after", "used")
 """Columns of observations.csv, one row an observation: residuals are projected - observed [px]."""
 
 _BASE64 = r"^[A-Za-z0-9+/]{4,400000}={0,2}\Z"
@@ -69,7 +69,7 @@ def _per_track(run: Run) -> Array:
 
 def _residuals_csv(run: Run, _: Summary) -> bytes:
     rows = [
-        f"{lon:.9f},{lat:.9f},{alt:.4f},{mean:.4f},{count:.0f},{_number(before, 4)},{track:.0f}"
+        f"{lon:.9f},{lat:.9f},{alt:.4f},{mean:.4f},{count:.0f},{_rounded(before, 4)},{track:.0f}"
         for lon, lat, alt, mean, count, before, track in _per_track(run).tolist()
     ]
     return "\n".join([",".join(RESIDUALS), *rows, ""]).encode()
@@ -83,9 +83,9 @@ def _observations_csv(run: Run, _: Summary) -> bytes:
     numbers = np.column_stack([tracks.xy[rows], before, after])
     names, whole = [cell(view.name) for view in run.views], np.isfinite(numbers).all(axis=1)
     columns = (tracks.view[rows], tracks.point[rows], numbers, run.keep[rows], whole)
-    lines = [",".join(OBSERVATIONS)]
-    for view, track, row, used, full in zip(*(column.tolist() for column in columns), strict=True):
-        text = _RESIDUAL_CELLS(*row) if full else ",".join(_number(value, 4) for value in row)
+    lines = [",".join(OBSERVATION_COLUMNS)]
+    for view, track, row, used, full in zip(*(part.tolist() for part in columns), strict=True):
+        text = _RESIDUAL_CELLS(*row) if full else ",".join(_rounded(value, 4) for value in row)
         lines.append(f"{names[view]},{track},{text},{used:d}")
     return "\n".join([*lines, ""]).encode()
 
@@ -93,27 +93,27 @@ def _observations_csv(run: Run, _: Summary) -> bytes:
 def _pairs_csv(_: Run, summary: Summary) -> bytes:
     paths = PairEntry.CSV.split()
     lines = [[path.replace(".", "_") + "_px" * ("." in path) for path in paths]]
-    lines += [[_cell(value_of(pair, path)) for path in paths] for pair in summary.pairs]
+    lines += [[_formatted_cell(value_of(pair, path)) for path in paths] for pair in summary.pairs]
     return "".join(",".join(line) + "\n" for line in lines).encode()
 
 
-def _cell(value: str | float | None) -> str:
+def _formatted_cell(value: str | float | None) -> str:
     if isinstance(value, str):
         return cell(value)
-    return str(value) if isinstance(value, int) else _number(value, 5)
+    return str(value) if isinstance(value, int) else _rounded(value, 5)
 
 
-def _number(value: float | None, digits: int) -> str:
+def _rounded(value: float | None, digits: int) -> str:
     return "" if value is None or not np.isfinite(value) else f"{value:.{digits}f}"
 
 
-def _footprints(run: Run, summary: Summary) -> bytes:
+def _footprints_geojson(run: Run, summary: Summary) -> bytes:
     """Return every image at the scene's altitude, through the adjusted cameras, or for a check as they are."""
     rings, features = footprints(run.after or run.before, [view.size for view in run.views], run.altitude), []
     for ring, entry in zip(np.round(rings, 9), summary.views, strict=True):
         properties = {key: getattr(entry, key) for key in ViewEntry.FOOTPRINT.split()}
-        features.append(feature(ring, **properties, altitude_m=summary.altitude_m))
-    return (json.dumps(collection(features)) + "\n").encode()
+        features.append(geojson_feature(ring, **properties, altitude_m=summary.altitude_m))
+    return (json.dumps(feature_collection(features)) + "\n").encode()
 
 
 def _points_ply(run: Run, _: Summary) -> bytes:
@@ -165,7 +165,7 @@ TABLES: dict[str, Callable[[Run, Summary], bytes]] = {
     "residuals.csv": _residuals_csv,
     "observations.csv": _observations_csv,
     "pairs.csv": _pairs_csv,
-    "footprints.geojson": _footprints,
+    "footprints.geojson": _footprints_geojson,
     "points.ply": _points_ply,
 }
 """File name -> its bytes, of a run and its summary."""
@@ -175,7 +175,7 @@ SURFACE = "surface.json"
 
 
 # --- read back --------------------------------------------------------------------------------------------
-_FAR = 1e12  # px, deg and m: no number of a table comes near
+_MAX_TABLE_VALUE = 1e12  # px, deg and m: no number of a table comes near
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,11 +198,11 @@ class ReliefWindow(Record):
 
     MORE: ClassVar = Any
 
-    cameras: Literal["delivered", "corrected"] = said("Which cameras")
-    size: tuple[Side, Side] = said("Width and height of the picture", "px")
-    share: Share = said("Part of the window that has heights")
-    nmad_m: Number = said("How far pairs of images disagree, by median", "m")
-    picture: str = said("A shaded relief, a JPEG in base64", pattern=_BASE64)
+    cameras: Literal["delivered", "corrected"] = column("Which cameras")
+    size: tuple[Side, Side] = column("Width and height of the picture", "px")
+    share: Share = column("Part of the window that has heights")
+    nmad_m: Number = column("How far pairs of images disagree, by median", "m")
+    picture: str = column("A shaded relief, a JPEG in base64", pattern=_BASE64)
 
 
 class Draped(Record):
@@ -210,9 +210,9 @@ class Draped(Record):
 
     MORE: ClassVar = Any
 
-    image: str = said("Its name")
-    size: tuple[Side, Side] = said("Width and height of the picture", "px")
-    picture: str = said("The image, a JPEG in base64", pattern=_BASE64)
+    image: str = column("Its name")
+    size: tuple[Side, Side] = column("Width and height of the picture", "px")
+    picture: str = column("The image, a JPEG in base64", pattern=_BASE64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,15 +284,15 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
         A table is missing or damaged; the message names it.
     """
     names = [view.name for view in summary.views]
-    outlines = _read(place := table_path(folder, "footprints.geojson"), GEOJSON, _outlines)
+    outlines = _parse_file(place := table_path(folder, "footprints.geojson"), GEOJSON, _parse_outlines)
     if len(outlines) != len(names):
         raise InputError(f"{place}: {len(outlines)} outlines of {len(names)} images")
-    of_names = partial(_observations, names=names)
-    observations = _read(table_path(folder, "observations.csv"), TABLE, of_names)
-    points, tracks = _read(table_path(folder, "residuals.csv"), TABLE, _points)
+    of_names = partial(_parse_observations, names=names)
+    observations = _parse_file(table_path(folder, "observations.csv"), TABLE, of_names)
+    points, tracks = _parse_file(table_path(folder, "residuals.csv"), TABLE, _parse_points)
     surface = table_path(folder, SURFACE)
     made = summary.outputs and os.path.lexists(surface)  # none of a run that is at work: an earlier one's
-    shown = _read(surface, SUMMARY, partial(_surface, run=run_key(summary))) if made else ((), ())
+    shown = _parse_file(surface, SUMMARY, partial(_parse_surface, run=run_key(summary))) if made else ((), ())
     return RunFiles(summary, observations, points, tracks, outlines, *shown)
 
 
@@ -302,7 +302,7 @@ def run_key(summary: Summary) -> str:
     return hashlib.sha256(repr(results).encode()).hexdigest()
 
 
-def _surface(text: str, run: str) -> tuple[tuple[ReliefWindow, ...], tuple[Draped, ...]]:
+def _parse_surface(text: str, run: str) -> tuple[tuple[ReliefWindow, ...], tuple[Draped, ...]]:
     import fastjsonschema
 
     found = parse_json(text)
@@ -317,7 +317,7 @@ def _surface(text: str, run: str) -> tuple[tuple[ReliefWindow, ...], tuple[Drape
     return reliefs, draped
 
 
-def _read(path: Path, kind: Kind, parse: Any) -> Any:
+def _parse_file(path: Path, kind: Kind, parse: Any) -> Any:
     text = read_text(path, kind)
     try:
         return parse(text)
@@ -325,7 +325,7 @@ def _read(path: Path, kind: Kind, parse: Any) -> Any:
         raise InputError(f"{path}: damaged ({plain(error)}); run the adjustment again") from error
 
 
-def _columns(text: str, header: Sequence[str]) -> list[list[str]]:
+def _table_columns(text: str, header: Sequence[str]) -> list[list[str]]:
     rows = csv.reader(io.StringIO(text, newline=""))
     if tuple(next(rows)) != tuple(header):
         raise ValueError(f"its columns are not {', '.join(header)}")
@@ -338,26 +338,26 @@ def _columns(text: str, header: Sequence[str]) -> list[list[str]]:
 def _floats(columns: Sequence[Sequence[str]], known: int) -> Array:
     """Return the columns (n, len(columns)) of numbers, of which only those from `known` on may be empty (NaN)."""
     table = np.array([[float(cell or "nan") for cell in column] for column in columns], dtype=np.float64).T
-    if np.isnan(table[:, :known]).any() or (np.abs(table) > _FAR).any():
+    if np.isnan(table[:, :known]).any() or (np.abs(table) > _MAX_TABLE_VALUE).any():
         raise ValueError("a number is missing or absurdly large")
     return table
 
 
-def _observations(text: str, names: Sequence[str]) -> ObservationTable:
-    columns = _columns(text, OBSERVATIONS)
+def _parse_observations(text: str, names: Sequence[str]) -> ObservationTable:
+    columns = _table_columns(text, OBSERVATION_COLUMNS)
     index = {name: i for i, name in enumerate(names)}
     view = np.array([index[from_cell(name)] for name in columns[0]], dtype=np.int64)
     numbers = _floats(columns[2:8], 2)
     used = np.array([cell == "1" for cell in columns[8]], dtype=bool)
-    return ObservationTable(view, _numbers(columns[1]), numbers[:, :2], numbers[:, 2:4], numbers[:, 4:], used)
+    return ObservationTable(view, _track_numbers(columns[1]), numbers[:, :2], numbers[:, 2:4], numbers[:, 4:], used)
 
 
-def _points(text: str) -> tuple[Array, IntArray]:
-    columns = _columns(text, RESIDUALS)
-    return _in_degrees(_floats(columns[:4], 3)), _numbers(columns[6])
+def _parse_points(text: str) -> tuple[Array, IntArray]:
+    columns = _table_columns(text, RESIDUALS)
+    return _in_degrees(_floats(columns[:4], 3)), _track_numbers(columns[6])
 
 
-def _numbers(cells: Sequence[str]) -> IntArray:
+def _track_numbers(cells: Sequence[str]) -> IntArray:
     """Return the numbers of tracks."""
     if not all(cell.isdecimal() and len(cell) <= 18 for cell in cells):
         raise ValueError("a number of a track is none")
@@ -370,17 +370,17 @@ def _in_degrees(places: Array) -> Array:
     return places
 
 
-def _outlines(text: str) -> list[list[Array]]:
+def _parse_outlines(text: str) -> list[list[Array]]:
     outlines = []
     for item in parse_json(text)["features"]:
         geometry = item["geometry"] or {"type": "MultiPolygon", "coordinates": []}
         parts = geometry["coordinates"]
         parts = [parts] if geometry["type"] == "Polygon" else parts
-        outlines.append([_ring(part[0]) for part in parts])
+        outlines.append([_closed_ring(part[0]) for part in parts])
     return outlines
 
 
-def _ring(positions: Any) -> Array:
+def _closed_ring(positions: Any) -> Array:
     """Return a closed outline (m, 2) [deg]."""
     ring = np.array(positions, dtype=np.float64)
     if ring.ndim != 2 or ring.shape[1] != 2 or len(ring) < 4:

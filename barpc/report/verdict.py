@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from barpc.ba import Adjustment, check_residuals
-from barpc.ba.apart import APART
+from barpc.ba.apart import FOREIGN_CAMERA
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array
-from barpc.base.usual import FEW, SURE, SURELY
+from barpc.base.statistics import FEW, SURE, SURELY
 from barpc.report.datum import datum_reasons
 from barpc.report.outcome import MANY_REJECTED, Added, Run
-from barpc.report.records import plain, value_of
-from barpc.report.reservations import (
+from barpc.report.quality_checks import (
     GOOD_RMSE,
     NOISE_LIMIT,
     anywhere,
@@ -32,14 +31,15 @@ from barpc.report.reservations import (
     stands_out,
     view_status,
 )
+from barpc.report.records import json_form, value_of
 from barpc.report.summary import LeftOutEntry, Summary, measure_run
+from barpc.report.summary.block import EXPLANATION_WORDS, explanations, held_out_places, left_entries
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.whole import RIVALS, explanations, held_out_places, left_entries
 from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS, counted, median, metres
 
-SHOWN = 10  # rows of a table on the terminal, images and pairs alike
-LINES = 20  # sentences of the verdict that are shown at least
+TABLE_ROWS_SHOWN = 10  # rows of a table on the terminal, images and pairs alike
+VERDICT_SENTENCES = 20  # sentences of the verdict that are shown at least
 PRIOR_WIDENED = 2.0  # Cameras that are farther off than stated by more than this factor need a look
 _SAY_REJECTED = "contradicted", "rejected", "wrong_matches"  # causes whose sentence says how many were rejected
 _SAY_WHERE = "rejected", "place"  # causes whose sentence says where in the image
@@ -57,7 +57,7 @@ def summarize(run: Run) -> Summary:
     found = measure_run(run)
     views = tuple(replace(view, **view_status(view, run)) for view in found.views)  # type: ignore[arg-type]
     verdict = block_verdict(run, views)
-    summary: Summary = plain(replace(found, views=views, passed=verdict["status"] == "good", **verdict), keep=True)
+    summary: Summary = json_form(replace(found, views=views, passed=verdict["status"] == "good", **verdict), keep=True)
     return summary
 
 
@@ -155,7 +155,7 @@ def _of_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry]) -> 
     yield from (line for image, line in worst.items() if image not in said)
     rivals = [one.runner_up for one in adjustment.findings if one.motion is not None and one.gap < SURE]
     for rival in filter(None, dict.fromkeys(rivals)):
-        words = f"explains them no better than that {RIVALS[rival]}"
+        words = f"explains them no better than that {EXPLANATION_WORDS[rival]}"
         yield f"That tie points move together {words}: look at where they are."
 
 
@@ -177,8 +177,8 @@ def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
         moved = np.abs(found.gauge.shift) / found.gauge.delivered_sigma
     # control, an earlier run and fixed views move it as far as they must, a DEM and altimetry in height
     used = found.control is not None and bool(found.control.used.any())
-    held = used or bool(found.reference_inlier.any()) or bool(found.options.fixed or _option(run, "add_to"))
-    by_heights = _holds(found) or bool(_option(run, "dem"))
+    held = used or bool(found.reference_inlier.any()) or bool(found.options.fixed or _option_value(run, "add_to"))
+    by_heights = _holds(found) or bool(_option_value(run, "dem"))
     moved = moved[:2] if by_heights else moved
     if not held and (moved[np.isfinite(moved)] > SURELY).any():
         which = "heights may be another place's; control points" if by_heights else "control points or a DEM"
@@ -188,7 +188,7 @@ def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
         )
 
 
-def _option(run: Run, name: str) -> object:
+def _option_value(run: Run, name: str) -> object:
     return getattr(run.options, name, None)
 
 
@@ -235,7 +235,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
             f"More than {100 * MANY_REJECTED:.0f} % of the tie points of {listed(many)} were rejected, neighbours in "
             f"any direction, {why}."
         )
-    found = [one.sentence for one in explanations(run.adjustment) if one.name != APART]
+    found = [one.sentence for one in explanations(run.adjustment) if one.name != FOREIGN_CAMERA]
     yield from (f"{sentence[0].upper()}{sentence[1:]}." for sentence in found)
     if run.added is not None:
         yield from _added_lines(run.added, len(views))
@@ -250,7 +250,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     yield from _known_lines(run, run.adjustment, views)
     yield from dem_lines(run.adjustment)
     if run.check_points is not None and run.after is not None:
-        yield _met(check_residuals(run.after, run.check_points).rms(), len(run.check_points.names))
+        yield _residual_sentence(check_residuals(run.after, run.check_points).rms(), len(run.check_points.names))
 
 
 def _added_lines(added: Added, num: int) -> Iterator[str]:
@@ -287,7 +287,7 @@ def _clocks(view: ViewEntry) -> str:
     return f"{view.name}: range {by_range:+.2f} ± {sigma[0]:.2f} m, azimuth {azimuth:+.3f} ± {sigma[1]:.3f} ms"
 
 
-def _met(rms: tuple[Array, Array], num: int) -> str:
+def _residual_sentence(rms: tuple[Array, Array], num: int) -> str:
     image, ground = rms
     met = f"{counted(num, 'check point')}, not used above, {'is' if num == 1 else 'are'}"
     if not np.isfinite(image).all():
@@ -364,10 +364,14 @@ def sentences(summary: Summary) -> list[str]:
     own = {text for found in alike.values() for _, text in found}
     rest = [line for line in summary.verdict if line not in own]
     place = next((k for k, line in enumerate(summary.verdict) if line in own), len(rest))
-    return [*rest[:place], *(line for why, found in alike.items() for line in _said(*why, found)), *rest[place:]]
+    return [
+        *rest[:place],
+        *(line for why, found in alike.items() for line in _status_sentences(*why, found)),
+        *rest[place:],
+    ]
 
 
-def _said(status: str, why: str, alike: Sequence[tuple[str, str]]) -> list[str]:
+def _status_sentences(status: str, why: str, alike: Sequence[tuple[str, str]]) -> list[str]:
     """Return sentences of images of a status, or of files, and why."""
     names = listed([name for name, _ in alike], NAMED)
     if len(alike) <= NAMED or (status and why not in CAUSES):

@@ -6,7 +6,7 @@ precedence. See ``docs/formats.md``.
 
 from __future__ import annotations
 
-from barpc.rpcio.formats import CARRIERS, FORMATS, WRITABLE, Carrier, find_rpc, row_of, write_camera, write_rpc
+from barpc.rpcio.formats import CARRIERS, FORMATS, WRITABLE, Carrier, find_rpc, format_for, write_camera, write_rpc
 from barpc.rpcio.images import plain_source, write_crop, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
 from barpc.rpcio.sources import hidden_by, read_rpc, read_rpc_source, shadows, sidecars
 
@@ -16,11 +16,11 @@ __all__ = [
     "WRITABLE",
     "Carrier",
     "find_rpc",
+    "format_for",
     "hidden_by",
     "plain_source",
     "read_rpc",
     "read_rpc_source",
-    "row_of",
     "shadows",
     "sidecars",
     "write_camera",

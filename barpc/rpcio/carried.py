@@ -18,8 +18,8 @@ import numpy as np
 
 from barpc.base.errors import ImageError, RpcFormatError, plain
 from barpc.base.geodesy import Array
-from barpc.base.remote import Place
-from barpc.base.sidefile import IMAGE, opened, read_head
+from barpc.base.remote import PathOrUrl
+from barpc.base.safe_io import IMAGE, opened, read_head
 from barpc.rpcio.text import COEFFICIENTS, SINGLE, WIDTHS, cells_of, fields_from_rpc, fields_in_order, rpc_from_fields
 from barpc.sensor.rational import DERIVATIVE, POWERS
 from barpc.sensor.rpc import RPC
@@ -28,7 +28,7 @@ RPC_TAG = 50844
 _GEOREFERENCE_TAGS = (33550, 33922, 34264)  # ModelPixelScale, ModelTiepoint, ModelTransformation
 
 # Of a type [bytes].
-_SIZES = dict(enumerate((1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4), 1)) | {16: 8, 17: 8, 18: 8}
+_TIFF_TYPE_BYTES = dict(enumerate((1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4), 1)) | {16: 8, 17: 8, 18: 8}
 _DOUBLE = 12
 _MAX_ENTRIES = 4096
 SCANNED = 1 << 24
@@ -88,7 +88,7 @@ def read_directory(file: BinaryIO, name: str) -> Directory:
 
 def read_values(file: BinaryIO, directory: Directory, entry: Entry, name: str) -> bytes:
     """Read the bytes of an entry's values, wherever they stand."""
-    size = _SIZES.get(entry.kind, 1) * entry.count
+    size = _TIFF_TYPE_BYTES.get(entry.kind, 1) * entry.count
     if size > SCANNED:
         raise RpcFormatError(f"{name}: TIFF tag {entry.tag} claims {size} bytes")
     if size <= len(entry.value):
@@ -104,7 +104,7 @@ def read_values(file: BinaryIO, directory: Directory, entry: Entry, name: str) -
     return data
 
 
-def read_tag(path: Place) -> RPC | None:
+def read_tag(path: PathOrUrl) -> RPC | None:
     """Read the RPC in a TIFF's tag, None without one; RpcFormatError where it does not hold 92 usable doubles."""
     with opened(path, IMAGE) as file:
         directory = read_directory(file, str(path))
@@ -192,10 +192,10 @@ def _counted_from(rpc: RPC, image_offset: Array, image_scale: Array) -> RPC:
 
 # --- NITF -------------------------------------------------------------------------------------------------
 
-_WIDTHS = (7, 7, *WIDTHS)
+_RPC_FIELD_WIDTHS = (7, 7, *WIDTHS)
 
 
-def read_nitf(path: Place) -> RPC | None:
+def read_nitf(path: PathOrUrl) -> RPC | None:
     """Read the RPC in a NITF's RPC00B (or RPC00A) extension, None without one; RpcFormatError where it is not valid."""
     data = read_head(path, IMAGE, SCANNED)
     match = re.search(rb"RPC00([AB])01041", data)
@@ -205,7 +205,9 @@ def read_nitf(path: Place) -> RPC | None:
     name = f"{path} (RPC00{match.group(1).decode()})"
     if not record.startswith("1"):
         raise RpcFormatError(f"{name}: its SUCCESS flag is {record[:1]!r}, not 1: the vendor's fit failed")
-    return rpc_from_fields(cells_of(record[1:], _WIDTHS, SINGLE, name, f"RPC00{match.group(1).decode()}"), name)
+    return rpc_from_fields(
+        cells_of(record[1:], _RPC_FIELD_WIDTHS, SINGLE, name, f"RPC00{match.group(1).decode()}"), name
+    )
 
 
 def nitf_record(rpc: RPC) -> str:
@@ -221,7 +223,7 @@ def nitf_record(rpc: RPC) -> str:
     )
     decimals = {"ERR": 2, "LAT": 4, "LONG": 4}
     cells = ["1"]
-    for key, width in zip(SINGLE, _WIDTHS, strict=True):
+    for key, width in zip(SINGLE, _RPC_FIELD_WIDTHS, strict=True):
         value = fields.get(key, [0.0])[0]
         axis = key.split("_")[0]
         sign = "+" if axis in ("LAT", "LONG", "HEIGHT") else ""

@@ -14,8 +14,8 @@ from typing import Literal
 from barpc.base import remote
 from barpc.base.atomic import write_text
 from barpc.base.errors import InputError, RpcFormatError
-from barpc.base.remote import Place
-from barpc.base.sidefile import RPC_FILE
+from barpc.base.remote import PathOrUrl
+from barpc.base.safe_io import RPC_FILE
 from barpc.rpcio import text, xml
 from barpc.rpcio.images import NITF_NAMES, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
 from barpc.rpcio.text import ReadOptions, Size
@@ -32,7 +32,9 @@ class Format:
     read: Callable[[str, str, ReadOptions], RPC]  # of text, file name for messages, options
     write: Callable[..., str] | None = None  # of an RPC; `sized`: and of the width and height of its image, or None
     beside: str = ""  # end of the name of the file that a run writes for an image, after the image's name
-    consumers: tuple[str, ...] = ()  # that read what is written (`barpc.pipeline.handoff.CONSUMERS`), besides barpc
+    consumers: tuple[
+        str, ...
+    ] = ()  # that read what is written (`barpc.pipeline.verify_outputs.CONSUMERS`), besides barpc
     sized: bool = False  # whether it states the size of its image
 
 
@@ -46,20 +48,20 @@ _BESIDE = "gdal, beside an image"
 _TXT = _has(r"(?im)^[ \t]*+(?:[a-z][\w.]*?[._])?LINE_NUM_COEFF(_1|(?-i:(?<=F)_01))?[ \t]*+[:=](?(1)|[ \t]*+[-+.\d])")
 _RPB = _has(r"(?i)lineNumCoef\s*+=")
 _GEOM = _has(r"(?m)^[ \t]*+(\w++\.)?line_num_coeff_00[ \t]*+:")
-_MAXAR = _has(r"<(\w+:)?LINENUMCOEF")
+_is_maxar = _has(r"<(\w+:)?LINENUMCOEF")
 _JSON = _has(r"\A\s*+\{", r'"row_num"|(?i:"line_num_coeff")')
 _SYNTAXES = (
     Format("txt", ("_RPC.TXT", ".rpc", ".txt"), _TXT, text.read_txt, text.write_txt, "_RPC.TXT", (_BESIDE, "rpcm")),
     Format("rpb", (".RPB",), _RPB, text.read_rpb, text.write_rpb, ".RPB", (_BESIDE,)),
     Format("geom", (".geom",), _GEOM, text.read_geom, text.write_geom, ".geom", ("keywords", "shareloc")),
-    Format("xml", (".XML",), _MAXAR, xml.read_maxar, xml.write_maxar, ".rpc.xml", (_BESIDE,), sized=True),
+    Format("xml", (".XML",), _is_maxar, xml.read_maxar, xml.write_maxar, ".rpc.xml", (_BESIDE,), sized=True),
     Format("json", (".json",), _JSON, text.read_rpc_json, text.write_json, ".rpc.json", ("rpcm",)),
     Format("dimap", (), _has(r"<(\w+:)?Global_RFM"), xml.read_dimap),  # a Dimap_Document, or the model alone
     Format("enmap", (), _has(r"<bandID\s", r"(?i)<ROW_NUM_0?1>"), xml.read_enmap),
     Format("gdal", (), _has(r"<(VRTDataset|PAMDataset)\b", r'domain="RPC"'), xml.read_gdal),
     Format("yaml", (), _has(r"(?m)^[ \t]++line_num_coeff:"), text.read_yaml),
     Format("envi", (), _has(r"(?im)^[ \t]*+rpc info\s*+=\s*+\{"), text.read_envi),
-    Format("bare", (), text.bare, text.read_bare),
+    Format("bare", (), text.is_bare_rpc, text.read_bare),
     Format("alos", (), _has(r"\A[\d+\-. ]{66}[\d+\-. Ee]{960}"), text.read_alos),
 )
 FORMATS: dict[str, Format] = {row.name: row for row in _SYNTAXES}
@@ -74,7 +76,7 @@ class Carrier:
     """A raster that carries an RPC."""
 
     suffixes: tuple[str, ...]
-    write: Callable[[RPC, Place, Path, Path, bool], None]  # rpc, image, path, where it will stand, overwrite
+    write: Callable[[RPC, PathOrUrl, Path, Path, bool], None]  # rpc, image, path, where it will stand, overwrite
     consumers: tuple[str, ...] = ("gdal", "rpcm", "shareloc", "orthority")
     precision: Literal["nitf"] | None = None  # whose digits it holds (`barpc.fit.system`); None: all of them
 
@@ -93,14 +95,14 @@ CARRIERS: dict[str, Carrier] = {
 """Name -> raster that carries an RPC."""
 
 
-def _rows() -> list[Format | Carrier]:
+def _writable_formats() -> list[Format | Carrier]:
     return [*CARRIERS.values(), *WRITABLE.values()]
 
 
-def row_of(path: Path | str) -> Format | Carrier | None:
+def format_for(path: Path | str) -> Format | Carrier | None:
     """Return the row of a file to be written, by its name; None where no name ends so."""
     name = Path(path).name.lower()
-    return next((row for row in _rows() if name.endswith(tuple(end.lower() for end in row.suffixes))), None)
+    return next((row for row in _writable_formats() if name.endswith(tuple(end.lower() for end in row.suffixes))), None)
 
 
 def write_camera(
@@ -118,14 +120,14 @@ def write_camera(
     if `overwrite` is true, never the image. `size` is the image's (width, height) [px], which Maxar's XML states.
     """
     place = Path(path if place is None else place)
-    row = row_of(place)
+    row = format_for(place)
     if isinstance(row, Carrier):
         row.write(rpc, remote.location(image), Path(path), place, overwrite)
     else:
         write_text(path, _text_of(rpc, place, None, size), overwrite=overwrite)
 
 
-_SETTLED = 2_000_000_000  # ns: after so long a change shows in a folder's time
+_STABLE_FOLDER_AGE = 2_000_000_000  # ns: after so long a change shows in a folder's time
 
 
 def files_of(folder: Path) -> Mapping[str, str]:
@@ -135,35 +137,35 @@ def files_of(folder: Path) -> Mapping[str, str]:
     """
     try:
         changed = folder.stat().st_mtime_ns
-        settled = time.time_ns() - changed > _SETTLED
-        return (_listed if settled else _listed.__wrapped__)(folder, changed)
+        settled = time.time_ns() - changed > _STABLE_FOLDER_AGE
+        return (_folder_listing if settled else _folder_listing.__wrapped__)(folder, changed)
     except OSError:
         return {}
 
 
 @lru_cache(maxsize=4)
-def _listed(folder: Path, _changed: int) -> Mapping[str, str]:
+def _folder_listing(folder: Path, _changed: int) -> Mapping[str, str]:
     return {name.lower(): name for name in sorted(entry.name for entry in os.scandir(folder))}
 
 
 def find_rpc(folder: Path, image: Path) -> Path:
     """Return the file in a folder that holds an image's RPC in a format that is written (or InputError)."""
     present = files_of(folder)
-    ends = [suffix for row in _rows() for suffix in row.suffixes]
+    ends = [suffix for row in _writable_formats() for suffix in row.suffixes]
     ends += [row.beside for row in WRITABLE.values()]
     for name in (image.name, *(image.stem + end for end in dict.fromkeys(ends))):
         if name.lower() in present:
             return folder / present[name.lower()]
-    tried = ", ".join(row.suffixes[0] for row in _rows())
+    tried = ", ".join(row.suffixes[0] for row in _writable_formats())
     raise InputError(f"{folder}: no RPC of {image.name} there (looked for {image.stem} with {tried})")
 
 
-def parse(data: bytes, name: str, options: ReadOptions | None = None) -> tuple[RPC, str]:
+def parse_rpc(data: bytes, name: str, options: ReadOptions | None = None) -> tuple[RPC, str]:
     """Return the RPC in all bytes of a file called `name`, and its format; RpcFormatError where none is valid."""
     if not data.strip():
         raise RpcFormatError(f"{name}: the file is empty, expected an RPC")
     RPC_FILE.check(name, len(data))
-    content = text.decode(data)
+    content = text.decode_text(data)
     for row in FORMATS.values():
         if row.sniff(content):
             return row.read(content, name, options or ReadOptions()), row.name
@@ -199,7 +201,7 @@ def write_rpc(
 
 
 def _text_of(rpc: RPC, path: Path, name: str | None, size: Size | None) -> str:
-    row = row_of(path) if name is None else WRITABLE.get(name)
+    row = format_for(path) if name is None else WRITABLE.get(name)
     if isinstance(row, Format) and row.write is not None:
         return row.write(rpc, size) if row.sized else row.write(rpc)
     known = ", ".join(f"{n} ({row.suffixes[0]})" for n, row in WRITABLE.items())

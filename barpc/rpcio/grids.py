@@ -24,24 +24,24 @@ from rasterio.windows import Window
 
 from barpc.base.atomic import replacing
 from barpc.base.errors import ImageError, RpcError, RpcFormatError
-from barpc.base.geodesy import FAR, Array
-from barpc.base.remote import Place
-from barpc.base.sidefile import NUMBER, Kind
-from barpc.rasters.raster import BLOCK, open_raster
+from barpc.base.geodesy import MAX_COORDINATE, Array
+from barpc.base.remote import PathOrUrl
+from barpc.base.safe_io import BYTES_PER_NUMBER, Kind
+from barpc.rasters.raster import BLOCK_SIZE, open_raster
 from barpc.rpcio.carried import printable, put_tag, read_tag
-from barpc.rpcio.images import TIFF, copying, created, has_mask, require_pixels
+from barpc.rpcio.images import TIFF_PROFILE, copying, created, has_mask, require_pixels
 from barpc.scene import BoolArray
 from barpc.sensor.direct_grid import DirectGrid
-from barpc.sensor.displaced import CorrectionGrid
+from barpc.sensor.image_corrections import CorrectionGrid
 from barpc.sensor.rpc import RPC
 
-GRID, CORRECTION = "_grid.tif", "_correction.tif"
+GRID_SUFFIX, CORRECTION = "_grid.tif", "_correction.tif"
 """Ends of the names of localisation and correction grids."""
 
 SIGN = "image point = that of the RPC in this file + (dcol, drow)"
-_TIFF: dict[str, Any] = {"driver": "GTiff", "COMPRESS": "DEFLATE", "PREDICTOR": 3}
-_EVEN = 1e-6  # of a step: how far nodes may be off
-_TABLE = Kind("a correction grid", 1 << 30, RpcFormatError)
+_GRID_PROFILE: dict[str, Any] = {"driver": "GTiff", "COMPRESS": "DEFLATE", "PREDICTOR": 3}
+_SPACING_TOLERANCE = 1e-6  # of a step: how far nodes may be off
+_GRID_KIND = Kind("a correction grid", 1 << 30, RpcFormatError)
 
 
 def write_grid(grid: DirectGrid, path: Path | str, *, overwrite: bool = False) -> None:
@@ -53,7 +53,7 @@ def write_grid(grid: DirectGrid, path: Path | str, *, overwrite: bool = False) -
     layers = np.moveaxis(grid.lonlat, -1, 1).reshape(-1, *grid.lonlat.shape[1:3])
     tags = {f"ALTITUDE_B{i}": repr(float(grid.alts[i // 2])) for i in range(len(layers))}
     with replacing(path, overwrite=overwrite) as partial:
-        _write(partial, layers, origin, steps, {"REF": "EPSG:4326", **tags})
+        _write_bands(partial, layers, origin, steps, {"REF": "EPSG:4326", **tags})
 
 
 def write_correction(grid: CorrectionGrid, rpc: RPC, path: Path | str, *, overwrite: bool = False) -> None:
@@ -61,14 +61,14 @@ def write_correction(grid: CorrectionGrid, rpc: RPC, path: Path | str, *, overwr
     origin, steps = _even(grid.cols, grid.rows)
     layers = np.moveaxis(grid.shift, -1, 0).astype(np.float32)
     with replacing(path, overwrite=overwrite) as partial:
-        _write(partial, layers, origin - steps / 2, steps, {"CORRECTION": SIGN}, ("dcol", "drow"))
+        _write_bands(partial, layers, origin - steps / 2, steps, {"CORRECTION": SIGN}, ("dcol", "drow"))
         put_tag(partial, printable(rpc))
 
 
-def read_correction(path: Place) -> tuple[RPC, CorrectionGrid]:
+def read_correction(path: PathOrUrl) -> tuple[RPC, CorrectionGrid]:
     """Read the RPC and the displacements of a correction grid; RpcFormatError where the file is none."""
     with open_raster(path) as dataset:
-        _TABLE.check(f"{path}, read", NUMBER * dataset.count * dataset.width * dataset.height)
+        _GRID_KIND.check(f"{path}, read", BYTES_PER_NUMBER * dataset.count * dataset.width * dataset.height)
         if dataset.count != 2 or dataset.tags().get("CORRECTION") != SIGN:
             raise RpcFormatError(f"{path}: no correction grid: it lacks the tag CORRECTION or its two bands")
         shift = np.moveaxis(np.real(dataset.read()), 0, -1).astype(np.float64)
@@ -80,7 +80,7 @@ def read_correction(path: Place) -> tuple[RPC, CorrectionGrid]:
     with np.errstate(all="ignore"):
         cols = c + a * (np.arange(shape[1]) + 0.5) - 0.5
         rows = f + e * (np.arange(shape[0]) + 0.5) - 0.5
-    if not all((np.abs(axis) <= FAR).all() for axis in (cols, rows, shift)):
+    if not all((np.abs(axis) <= MAX_COORDINATE).all() for axis in (cols, rows, shift)):
         raise RpcFormatError(f"{path}: a node of it is no image point, or has no displacement")
     try:
         return rpc, CorrectionGrid(cols, rows, shift)
@@ -92,12 +92,12 @@ def _even(cols: Array, rows: Array) -> tuple[Array, Array]:
     """Return the first node (2,), from the corner of the first pixel, and the steps (2,) [px] of an even grid."""
     steps = np.array([(axis[-1] - axis[0]) / (len(axis) - 1) for axis in (cols, rows)])
     for axis, step in zip((cols, rows), steps, strict=True):
-        if np.abs(np.diff(axis) - step).max() > _EVEN * step:
+        if np.abs(np.diff(axis) - step).max() > _SPACING_TOLERANCE * step:
             raise RpcError("a grid whose nodes are not evenly spaced is not written")
     return np.array([cols[0], rows[0]]) + 0.5, steps
 
 
-def _write(
+def _write_bands(
     path: Path,
     layers: npt.NDArray[Any],
     origin: Array,
@@ -105,7 +105,7 @@ def _write(
     tags: Mapping[str, str],
     names: Sequence[str] = (),
 ) -> None:
-    profile = {**_TIFF, "count": len(layers), "dtype": layers.dtype.name}
+    profile = {**_GRID_PROFILE, "count": len(layers), "dtype": layers.dtype.name}
     # one strip a band: the places of many would push the tags out of the file's head, by which it is known
     profile |= {"height": layers.shape[1], "width": layers.shape[2], "blockysize": layers.shape[1]}
     profile["transform"] = rasterio.Affine(steps[0], 0.0, origin[0], 0.0, steps[1], origin[1])
@@ -118,10 +118,10 @@ def _write(
 
 # --- images -----------------------------------------------------------------------------------------------
 
-Pixels = npt.NDArray[Any]
+PixelArray = npt.NDArray[Any]
 
-_MARGIN = 16  # px around a block: a spline has forgotten what is farther away to 1e-9
-_MOST = 4096  # px a side of what a block is made of
+_SPLINE_MARGIN = 16  # px around a block: a spline has forgotten what is farther away to 1e-9
+_MAX_BLOCK_SIDE = 4096  # px a side of what a block is made of
 
 
 def write_resampled(
@@ -146,25 +146,27 @@ def write_resampled(
     with copying(image_path, path, overwrite) as (dataset, partial):
         if any(np.dtype(kind).kind == "c" for kind in dataset.dtypes):
             raise ImageError(f"{image_path}: complex pixels are not resampled; give the amplitude as an image")
-        profile = {"width": dataset.width, "height": dataset.height, "count": dataset.count, **TIFF}
+        profile = {"width": dataset.width, "height": dataset.height, "count": dataset.count, **TIFF_PROFILE}
         profile |= {"dtype": dataset.dtypes[0], "nodata": dataset.nodata}
-        profile |= {"blockxsize": BLOCK, "blockysize": BLOCK}
+        profile |= {"blockxsize": BLOCK_SIZE, "blockysize": BLOCK_SIZE}
         with created(partial, profile) as out:
             out.colorinterp = dataset.colorinterp
             blocks = [block for _, block in out.block_windows(1)]
-            sums = {(block.col_off, block.row_off): _fill(dataset, out, block, correction) for block in blocks}
+            sums = {
+                (block.col_off, block.row_off): _resample_block(dataset, out, block, correction) for block in blocks
+            }
         require_pixels(partial, Path(path), lambda block: sums[block.col_off, block.row_off])
         put_tag(partial, printable(rpc), placed=False)
 
 
-def _fill(dataset: Any, out: Any, block: Window, correction: CorrectionGrid) -> int:
+def _resample_block(dataset: Any, out: Any, block: Window, correction: CorrectionGrid) -> int:
     """Write one block of all bands, and of the mask; a checksum of its pixels."""
     cols, rows = block.col_off + np.arange(block.width), block.row_off + np.arange(block.height)
     at = correction.apply(np.stack(np.meshgrid(cols, rows), axis=-1).astype(np.float64))
     frame = np.array([dataset.width, dataset.height])
-    low = np.clip(np.floor(at.min(axis=(0, 1))).astype(int) - _MARGIN, 0, frame - 1)
-    size = np.clip(np.ceil(at.max(axis=(0, 1))).astype(int) + _MARGIN + 1, low + 1, frame) - low
-    if size.max() > _MOST:
+    low = np.clip(np.floor(at.min(axis=(0, 1))).astype(int) - _SPLINE_MARGIN, 0, frame - 1)
+    size = np.clip(np.ceil(at.max(axis=(0, 1))).astype(int) + _SPLINE_MARGIN + 1, low + 1, frame) - low
+    if size.max() > _MAX_BLOCK_SIDE:
         raise ImageError(f"{dataset.name}: a correction that spreads a block over {size.max()} px is none")
     source, place = Window(*low, *size), np.clip(at - low, 0, size - 1)[..., ::-1]
     nearest = tuple(np.moveaxis(np.rint(place).astype(int), -1, 0))
@@ -188,7 +190,7 @@ def _fill(dataset: Any, out: Any, block: Window, correction: CorrectionGrid) -> 
     return crc32(whole.tobytes())
 
 
-def _interpolated(pixels: Pixels, known: BoolArray, place: Array) -> Array:
+def _interpolated(pixels: PixelArray, known: BoolArray, place: Array) -> Array:
     """Return a block's values at places (2, H, W), row before col; unknown pixels are as the nearest known one."""
     from scipy.ndimage import distance_transform_edt, map_coordinates, spline_filter  # of no other output
 
@@ -203,14 +205,14 @@ def _interpolated(pixels: Pixels, known: BoolArray, place: Array) -> Array:
     return found
 
 
-def _stored(values: Array, shown: BoolArray, dtype: np.dtype[Any], nodata: float | None) -> Pixels:
+def _stored(values: Array, shown: BoolArray, dtype: np.dtype[Any], nodata: float | None) -> PixelArray:
     """Return the values in the type of the image: rounded and cut at its range, none of those shown equal to nodata."""
     if dtype.kind in "iu":
         limits = np.iinfo(dtype)
         values = np.clip(np.rint(values), limits.min, limits.max)
         if nodata is not None:
             values[shown & (values == nodata)] += 1 if nodata < limits.max else -1
-    out: Pixels = values.astype(dtype)
+    out: PixelArray = values.astype(dtype)
     if nodata is not None:
         out[~shown] = nodata
     return out

@@ -22,15 +22,15 @@ from rasterio.windows import Window
 
 from barpc.base.atomic import replacing, write_text
 from barpc.base.errors import ImageError, OutputError
-from barpc.base.remote import Place
-from barpc.base.sidefile import IMAGE, opened, plain_path
+from barpc.base.remote import PathOrUrl
+from barpc.base.safe_io import IMAGE, opened, plain_path
 from barpc.rasters.raster import Mosaic, identify, open_raster
 from barpc.rasters.vrt import GDAL_TYPES
 from barpc.rpcio.carried import nitf_record, printable, put_tag, read_nitf
 from barpc.rpcio.xml import rpc_domain
 from barpc.sensor.rpc import RPC
 
-TIFF = {"driver": "GTiff", "BIGTIFF": "IF_SAFER", "TILED": "YES", "COMPRESS": "DEFLATE"}
+TIFF_PROFILE = {"driver": "GTiff", "BIGTIFF": "IF_SAFER", "TILED": "YES", "COMPRESS": "DEFLATE"}
 NITF_NAMES = (".ntf", ".nitf", ".nsf")
 """Ends of the names of NITF files, in any case."""
 _FULL = 1 << 16  # bytes: with less free space GDAL's error is taken for that of a full disk
@@ -137,7 +137,7 @@ def write_rpc_copy(rpc: RPC, image_path: Path | str, copy_path: Path | str, *, o
             with opened(image_path, IMAGE) as file, partial.open("wb") as copy:
                 shutil.copyfileobj(file, copy)
         else:
-            _convert(dataset, partial, Path(copy_path), **TIFF)
+            _translate(dataset, partial, Path(copy_path), **TIFF_PROFILE)
         put_tag(partial, printable(rpc), placed=dataset.crs is not None)
 
 
@@ -145,7 +145,7 @@ def write_rpc_nitf(rpc: RPC, image_path: Path | str, nitf_path: Path | str, *, o
     """Write a NITF copy of an image with an RPC in its RPC00B extension (`nitf_record` says what it holds)."""
     record = nitf_record(rpc)
     with copying(image_path, nitf_path, overwrite) as (dataset, partial):
-        _convert(dataset, partial, Path(nitf_path), driver="NITF", TRE=f"RPC00B={record}")
+        _translate(dataset, partial, Path(nitf_path), driver="NITF", TRE=f"RPC00B={record}")
 
 
 def write_crop(
@@ -178,7 +178,7 @@ def write_crop(
     """
     col, row, width, height = window
     cropped, nitf = rpc.crop(col, row), Path(crop_path).name.lower().endswith(NITF_NAMES)
-    layout = {"driver": "NITF", "TRE": f"RPC00B={nitf_record(cropped)}"} if nitf else TIFF
+    layout = {"driver": "NITF", "TRE": f"RPC00B={nitf_record(cropped)}"} if nitf else TIFF_PROFILE
     with copying(image_path, crop_path, overwrite) as (dataset, partial):
         if not (0 <= col < col + width <= dataset.width and 0 <= row < row + height <= dataset.height):
             raise ImageError(
@@ -204,7 +204,7 @@ def copying(image_path: Path | str, target: Path | str, overwrite: bool) -> Iter
             raise unwritten(target, str(error.__cause__ or error)) from error
 
 
-def _convert(dataset: Any, partial: Path, target: Path, **options: str) -> None:
+def _translate(dataset: Any, partial: Path, target: Path, **options: str) -> None:
     """Copy an image by another driver; a VRT's pixels are GDAL's only when they stand in a file."""
     whole = Window(0, 0, dataset.width, dataset.height)
     if isinstance(dataset, Mosaic):
@@ -265,6 +265,6 @@ def unwritten(target: Path, reason: str) -> OutputError:
     return OutputError(f"{target}: cannot be written ({os.strerror(errno.ENOSPC) if full else reason})")
 
 
-def _refuse_same(source: Place, target: Path) -> None:
+def _refuse_same(source: PathOrUrl, target: Path) -> None:
     if isinstance(source, Path) and target.exists() and target.resolve() == source.resolve():
         raise OutputError(f"{target}: is the input image, which is never written to; choose another name")

@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from barpc.base.errors import BarpcError, ImageError, MissingRpcError, RpcError, RpcFormatError
-from barpc.base.remote import Place, beside, is_url, location
-from barpc.base.sidefile import IMAGE, RPC_FILE, encoding_of, read_bytes, read_head
+from barpc.base.remote import PathOrUrl, beside, is_url, location
+from barpc.base.safe_io import IMAGE, RPC_FILE, encoding_of, read_bytes, read_head
 from barpc.rasters.raster import driver_of, identify, open_raster
 from barpc.rasters.vrt import MAGIC, read_vrt
 from barpc.rpcio.carried import SCANNED, read_nitf, read_tag
-from barpc.rpcio.formats import FORMATS, files_of, holds_physical, parse
-from barpc.rpcio.text import ReadOptions, decode
+from barpc.rpcio.formats import FORMATS, files_of, holds_physical, parse_rpc
+from barpc.rpcio.text import ReadOptions, decode_text
 from barpc.rpcio.xml import rpc_from_domain
 from barpc.sensor.rpc import RPC
 
@@ -34,7 +34,7 @@ class RpcSource:
 
     rpc: RPC
     format: str  # tag, nitf, or a row of FORMATS
-    path: Place  # the file that holds it: the image, or one beside it
+    path: PathOrUrl  # the file that holds it: the image, or one beside it
     notes: tuple[str, ...] = ()  # what the user should know: an origin that was applied, files passed over
     size: tuple[int, int] | None = None  # width and height [px] of the mosaic whose tiles a file lists
 
@@ -44,7 +44,7 @@ class Sidecar:
     """A file beside an image that may hold an RPC."""
 
     kind: str  # rpb, txt, xml, dimap, alos, pam, geom or strip
-    path: Place
+    path: PathOrUrl
     before_tag: bool  # whether GDAL and its users read it instead of the image's own RPC
 
 
@@ -57,7 +57,7 @@ def sidecars(image: Path | str) -> list[Sidecar]:
     present = _present(image)
     found: list[Sidecar] = []
     metadata_only = f"{image.stem}.imd".lower() in present  # with it GDAL takes the image for Maxar's
-    for kind, name, before_tag in _names(image.name):
+    for kind, name, before_tag in _sidecar_names(image.name):
         found_name = present.get(name.lower())
         path = image.parent / (found_name or "")
         if found_name in (None, image.name) or not path.is_file():
@@ -80,9 +80,9 @@ def metadata_beside(image: Path) -> Path:
     raise ImageError(f"{image}: no metadata with a physical model beside it ({' or '.join(names[:2])})")
 
 
-def described(path: Place) -> tuple[tuple[int, int] | None, bool]:
+def described(path: PathOrUrl) -> tuple[tuple[int, int] | None, bool]:
     """Return the width and height [px] that a vendor's XML states, if so, and whether it holds a physical model."""
-    text = decode(read_bytes(path, RPC_FILE))
+    text = decode_text(read_bytes(path, RPC_FILE))
     found = [
         re.search(rf"<(?:\w+:)?(?:{tag})>\s*+(\d{{1,7}})\s*+<", text) for tag in ("NUMCOLUMNS|NCOLS", "NUMROWS|NROWS")
     ]
@@ -96,19 +96,19 @@ def only_physical(path: Path) -> bool:
     return holds_physical(text) and not any(row.sniff(text) for row in FORMATS.values())
 
 
-def _present(image: Place) -> Mapping[str, str]:
+def _present(image: PathOrUrl) -> Mapping[str, str]:
     """Return the files beside an image, by name in lower case; on another host those that count."""
     if isinstance(image, Path):
         return files_of(image.parent)
     try:
-        return beside(image, [f"{image.stem}.IMD", *(name for _, name, _ in _names(image.name))])
+        return beside(image, [f"{image.stem}.IMD", *(name for _, name, _ in _sidecar_names(image.name))])
     except OSError as error:
         raise ImageError(
             f"{image}: its host does not say what lies beside it ({error}); name its camera: IMAGE,camera=URL"
         ) from error
 
 
-def _names(name: str) -> Iterator[tuple[str, str, bool]]:
+def _sidecar_names(name: str) -> Iterator[tuple[str, str, bool]]:
     """Yield (kind, file name, read before the tag) of all sidecars that an image of this name may have."""
     stem = name.rpartition(".")[0] or name
     yield "rpb", f"{stem}.RPB", True
@@ -126,16 +126,16 @@ def _names(name: str) -> Iterator[tuple[str, str, bool]]:
     yield "rpb", f"{name}.RPB", False  # names that GDAL does not look for
     yield "rpb", f"{stem}_RPB.TXT", False
     yield "txt", f"{stem}-RPC.txt", False
-    if strip := _strip(stem):
+    if strip := _strip_name(stem):
         yield "strip", f"{strip}.RPB", False
         yield "strip", f"{strip}.XML", False
         yield "strip", f"{strip}_RPC.TXT", False
 
 
-def _readable(path: Place) -> str:
+def _readable(path: PathOrUrl) -> str:
     """Return the text of a file; empty where it cannot be read."""
     try:
-        return decode(read_bytes(path, RPC_FILE))
+        return decode_text(read_bytes(path, RPC_FILE))
     except BarpcError:
         return ""
 
@@ -161,7 +161,7 @@ def hidden_by(paths: Iterable[Path]) -> Iterator[tuple[Path, Path, RPC]]:
         wanted.setdefault(path.parent, {})[path.name.lower()] = path
     for folder, files in wanted.items():
         for image in sorted(folder.iterdir()) if folder.is_dir() else ():
-            beside = (files.get(name.lower()) for kind, name, _ in _names(image.name) if kind != "strip")
+            beside = (files.get(name.lower()) for kind, name, _ in _sidecar_names(image.name) if kind != "strip")
             found = next((path for path in beside if path is not None and path.name != image.name), None)
             if found is not None:
                 with suppress(ImageError, RpcError):
@@ -204,11 +204,11 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
             return _image_source(path, head, options)
         return RpcSource(rpc_from_domain(items, str(path), options), "gdal", path)
     data = read_bytes(path, RPC_FILE)
-    if tiles := _tiles(decode(data), path):
+    if tiles := _tile_extents(decode_text(data), path):
         width, height = (max(corners[i] for corners in tiles.values()) + 1 for i in (2, 3))
         found = _image_source(path, head, options)
         return replace(found, notes=(f"a mosaic of {len(tiles)} tiles", *found.notes), size=(width, height))
-    rpc, name = parse(data, str(path), options)
+    rpc, name = parse_rpc(data, str(path), options)
     return RpcSource(rpc, name, path)
 
 
@@ -216,7 +216,7 @@ def _is_vrt(head: bytes) -> bool:
     return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(MAGIC)
 
 
-def _image_source(path: Place, head: bytes, options: ReadOptions) -> RpcSource:
+def _image_source(path: PathOrUrl, head: bytes, options: ReadOptions) -> RpcSource:
     found = sidecars(path)
     first = next((sidecar for sidecar in found if sidecar.before_tag), None)
     own: RPC | None = None
@@ -237,26 +237,30 @@ def _image_source(path: Place, head: bytes, options: ReadOptions) -> RpcSource:
         raise MissingRpcError(
             f"{path}: no RPC in the image and none beside it (.RPB, _RPC.TXT, .XML, .geom and others)"
             + _with_gcps(path)
-            + ("; HDF5 files are not read: write its coefficients as an _RPC.TXT" if head.startswith(_HDF5) else "")
+            + (
+                "; HDF5 files are not read: write its coefficients as an _RPC.TXT"
+                if head.startswith(_HDF5_MAGIC)
+                else ""
+            )
         )
     return replace(source, notes=source.notes + ((f"not used: {', '.join(ignored)}",) if ignored else ()))
 
 
-def _with_gcps(path: Place) -> str:
+def _with_gcps(path: PathOrUrl) -> str:
     with suppress(ImageError), open_raster(path) as dataset:
         if count := len(dataset.gcps[0]):
             return f"; it has {count} GCPs: 'barpc fit' makes an RPC of them"
     return ""
 
 
-def _own_rpc(path: Place, head: bytes) -> RPC | None:
+def _own_rpc(path: PathOrUrl, head: bytes) -> RPC | None:
     reader = {"GTiff": read_tag, "NITF": read_nitf}.get(driver_of(head) or "")
     return reader(path) if reader else None
 
 
-def _sidecar_source(image: Place, sidecar: Sidecar, options: ReadOptions) -> RpcSource:
-    rpc, name = parse(read_bytes(sidecar.path, RPC_FILE), str(sidecar.path), options)
-    origin = {"geom": _crop_origin, **_WHOLE}.get(sidecar.kind)
+def _sidecar_source(image: PathOrUrl, sidecar: Sidecar, options: ReadOptions) -> RpcSource:
+    rpc, name = parse_rpc(read_bytes(sidecar.path, RPC_FILE), str(sidecar.path), options)
+    origin = {"geom": _crop_origin, **_TILE_ORIGINS}.get(sidecar.kind)
     moved = origin(image, sidecar.path) if origin else None
     if moved is None:
         return RpcSource(rpc, name, sidecar.path)
@@ -264,12 +268,12 @@ def _sidecar_source(image: Place, sidecar: Sidecar, options: ReadOptions) -> Rpc
     return RpcSource(rpc.window(*window), name, sidecar.path, (f"{note} applied",))
 
 
-_HDF5 = b"\x89HDF"
-_Moved = tuple[tuple[float, float, float, float], str] | None
+_HDF5_MAGIC = b"\x89HDF"
+_RpcWindow = tuple[tuple[float, float, float, float], str] | None
 """Corner and steps of a window of the image that an RPC speaks of, and what it is; None for the whole."""
 
 
-def _crop_origin(image: Place, _path: Place) -> _Moved:
+def _crop_origin(image: PathOrUrl, _path: PathOrUrl) -> _RpcWindow:
     """Return where a crop is by its geotransform without CRS: a ``.geom`` speaks of the full image."""
     with open_raster(image) as dataset:
         step_x, _, x, _, step_y, y = dataset.transform[:6]
@@ -282,14 +286,14 @@ def _crop_origin(image: Place, _path: Place) -> _Moved:
     return (x, row, step_x, abs(step_y)), f"crop origin ({x:g}, {row:g}) of the geotransform"
 
 
-def _tile_origin(image: Place, path: Place) -> _Moved:
+def _tile_origin(image: PathOrUrl, path: PathOrUrl) -> _RpcWindow:
     """Return the origin of a tile of a DIMAP product, whose RPC is the whole image's: by ``DIM_*.XML``."""
     tile = re.search(r"_R(\d+)C(\d+)$", image.stem.upper())
     if tile is None or tile.groups() == ("1", "1"):
         return None
     product = path.name[4:]
-    dim = _near(image, f"DIM_{product}") or _near(path, f"DIM_{product}")
-    text = decode(read_bytes(dim, RPC_FILE)) if dim else ""
+    dim = _file_beside(image, f"DIM_{product}") or _file_beside(path, f"DIM_{product}")
+    text = decode_text(read_bytes(dim, RPC_FILE)) if dim else ""
     width, height = (re.search(rf"<NTILES_SIZE\b[^<>]*\b{key}=\"(\d{{1,9}})\"", text) for key in ("ncols", "nrows"))
     if width is None or height is None:
         raise RpcFormatError(f"{path}: the tile size of {image.name} is unknown (no DIM_{product} with NTILES_SIZE)")
@@ -303,20 +307,20 @@ def _tile_origin(image: Place, path: Place) -> _Moved:
 _TILE = re.compile(r"_R(\d{1,4})C(\d{1,4})(?=[-_]|$)", re.IGNORECASE)
 
 
-def _strip(stem: str) -> str:
+def _strip_name(stem: str) -> str:
     """Return the name of the strip of a tile, ``X`` of ``X_R1C2``; empty of what is called otherwise."""
     found = _TILE.search(stem)
     return stem[: found.start()] + stem[found.end() :] if found else ""
 
 
-def _near(file: Place, name: str) -> Place | None:
+def _file_beside(file: PathOrUrl, name: str) -> PathOrUrl | None:
     """Return the file of a name, whatever its case, beside another one; None without one."""
     present = files_of(file.parent) if isinstance(file, Path) else beside(file, [name])
     found = present.get(name.lower())
     return None if found is None else file.parent / found
 
 
-def _tiles(text: str, path: Place) -> dict[str, tuple[int, int, int, int]]:
+def _tile_extents(text: str, path: PathOrUrl) -> dict[str, tuple[int, int, int, int]]:
     """Return the first and last col, row of every tile that Maxar's ``.TIL`` lists, by name in lower case."""
     found = {}
     for number, part in enumerate(re.split(r"BEGIN_GROUP\s*+=\s*+TILE_\d++", text)[1:], start=1):
@@ -328,17 +332,17 @@ def _tiles(text: str, path: Place) -> dict[str, tuple[int, int, int, int]]:
     return found
 
 
-def _strip_origin(image: Place, path: Place) -> _Moved:
+def _strip_origin(image: PathOrUrl, path: PathOrUrl) -> _RpcWindow:
     """Return the origin of a tile in the strip whose RPC `path` is: by the ``.TIL`` beside either."""
-    name, place = f"{_strip(image.stem)}.TIL", _TILE.search(image.stem)
-    til = _near(image, name) or _near(path, name)
+    name, place = f"{_strip_name(image.stem)}.TIL", _TILE.search(image.stem)
+    til = _file_beside(image, name) or _file_beside(path, name)
     if til is None:
         if place and [int(index) for index in place.groups()] == [1, 1]:
             return None
         raise RpcFormatError(
             f"{path}: the RPC of a strip, and where its tile {image.name} lies is not known: {name} is missing"
         )
-    corners = _tiles(decode(read_bytes(til, RPC_FILE)), til).get(image.name.lower())
+    corners = _tile_extents(decode_text(read_bytes(til, RPC_FILE)), til).get(image.name.lower())
     with open_raster(image) as dataset:
         size = dataset.width, dataset.height
     if corners is None or size != (corners[2] - corners[0] + 1, corners[3] - corners[1] + 1):
@@ -349,27 +353,27 @@ def _strip_origin(image: Place, path: Place) -> _Moved:
     return ((left, top, 1.0, 1.0), f"tile origin ({left}, {top})") if left or top else None
 
 
-def at_tile(image: Place, path: Place, rpc: RPC) -> tuple[RPC, str] | None:
+def at_tile(image: PathOrUrl, path: PathOrUrl, rpc: RPC) -> tuple[RPC, str] | None:
     """Return the RPC of a tile, and what was done, where that of the file `path`, given for it, is its whole image's.
 
     The whole image's file is called so, or equal to the one beside the tile. None of an image that is no tile.
     """
-    strip = _strip(image.stem)
+    strip = _strip_name(image.stem)
     if not strip or path.name.lower().startswith(image.stem.lower()):
         return None
-    kinds = {name.lower(): kind for kind, name, _ in _names(image.name) if kind in _WHOLE}
+    kinds = {name.lower(): kind for kind, name, _ in _sidecar_names(image.name) if kind in _TILE_ORIGINS}
     kind = kinds.get(path.name.lower())
-    for sidecar in (s for s in sidecars(image) if s.kind in _WHOLE and kind is None):
+    for sidecar in (s for s in sidecars(image) if s.kind in _TILE_ORIGINS and kind is None):
         with suppress(BarpcError):
-            kind = sidecar.kind if parse(read_bytes(sidecar.path, RPC_FILE), "")[0] == rpc else None
+            kind = sidecar.kind if parse_rpc(read_bytes(sidecar.path, RPC_FILE), "")[0] == rpc else None
     if kind is not None:
-        moved = _WHOLE[kind](image, path)
+        moved = _TILE_ORIGINS[kind](image, path)
         return (rpc.window(*moved[0]), f"{moved[1]} applied") if moved else None
-    listed = any(_near(image, f"{strip}{end}") for end in (".TIL", ".IMD"))
+    listed = any(_file_beside(image, f"{strip}{end}") for end in (".TIL", ".IMD"))
     return (rpc, f"taken as the RPC of this tile alone, not of its strip {strip}") if listed else None
 
 
-_WHOLE = {"dimap": _tile_origin, "strip": _strip_origin}
+_TILE_ORIGINS = {"dimap": _tile_origin, "strip": _strip_origin}
 """Kind of a file beside a tile whose RPC is that of the whole image -> where the tile lies in it."""
 
 
@@ -378,10 +382,10 @@ _WHOLE = {"dimap": _tile_origin, "strip": _strip_origin}
 _TAGS = ("ACQUISITIONDATETIME", "NITF_IDATIM", "TIFFTAG_DATETIME")  # the last is often that of the file
 _TAG = re.compile(r"(\d{4})[-:/]?(\d\d)[-:/]?(\d\d)")
 _FIRST = 1957  # no satellite took an image before
-_NUMBER = rb"([+-]?\d{1,3}(?:\.\d{1,20})?(?:e[+-]?\d{1,2})?)"
+_NUMBER_PATTERN = rb"([+-]?\d{1,3}(?:\.\d{1,20})?(?:e[+-]?\d{1,2})?)"
 _SUN = {
     name: re.compile(
-        rb"(?<![a-z])(?:mean_?)?sun_?" + word + rb"\"?(?:\s?unit=\"\w{1,9}\")?\s{0,9}[>=:]\s{0,9}" + _NUMBER,
+        rb"(?<![a-z])(?:mean_?)?sun_?" + word + rb"\"?(?:\s?unit=\"\w{1,9}\")?\s{0,9}[>=:]\s{0,9}" + _NUMBER_PATTERN,
         re.IGNORECASE,
     )
     for name, word in (("elevation", rb"el(?:ev(?:ation)?)?"), ("azimuth", rb"az(?:im(?:uth)?)?"))
@@ -393,7 +397,7 @@ _WHEN = re.compile(
     rb"\s{0,9}[>=:]\s{0,9}\"?" + _DAY + rb"(?:T" + _CLOCK + rb")?",
     re.IGNORECASE,
 )
-_TIME = re.compile(rb"<IMAGING_TIME>" + _CLOCK)
+_IMAGING_TIME = re.compile(rb"<IMAGING_TIME>" + _CLOCK)
 
 
 @dataclass(frozen=True)
@@ -423,7 +427,7 @@ def light_of(image: str, camera: str | None = None) -> Sunlight:
     return Sunlight(found.get("elevation"), found.get("azimuth"), time or None)
 
 
-def date_taken(image: Place, camera: Place, tags: Mapping[str, str]) -> str:
+def date_taken(image: PathOrUrl, camera: PathOrUrl, tags: Mapping[str, str]) -> str:
     """Return the day (ISO 8601) that the files of `light_of` state, or else an image's `tags`; empty if none does."""
     stated = next((time[:10] for text in _texts(image, camera) if (time := _time(text))), "")
     found = (_TAG.match(tags.get(tag, "").strip()) for tag in _TAGS)
@@ -444,12 +448,12 @@ def _time(text: bytes) -> str:
     if not (stated and day):
         return ""
     clock = stated[2]
-    if clock is None and (later := _TIME.search(text, stated.end(), stated.end() + 500)):
+    if clock is None and (later := _IMAGING_TIME.search(text, stated.end(), stated.end() + 500)):
         clock = later[1]
     return f"{day}T{clock.decode()}Z" if clock else day
 
 
-def _texts(image: Place, camera: Place) -> Iterator[bytes]:
+def _texts(image: PathOrUrl, camera: PathOrUrl) -> Iterator[bytes]:
     """Yield how the file of the camera and the metadata beside an image begin; nothing of images elsewhere."""
     if not (isinstance(image, Path) and isinstance(camera, Path)):
         return

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from barpc.base.errors import RpcError, RpcFormatError, plain
-from barpc.base.sidefile import encoding_of, parse_json
+from barpc.base.safe_io import encoding_of, parse_json
 from barpc.sensor.rpc import RPC
 
 OFFSETS = ("LINE_OFF", "SAMP_OFF", "LAT_OFF", "LONG_OFF", "HEIGHT_OFF")
@@ -24,15 +24,15 @@ SCALES = ("LINE_SCALE", "SAMP_SCALE", "LAT_SCALE", "LONG_SCALE", "HEIGHT_SCALE")
 COEFFICIENTS = ("LINE_NUM_COEFF", "LINE_DEN_COEFF", "SAMP_NUM_COEFF", "SAMP_DEN_COEFF")
 DIRECT = ("LON_NUM_COEFF", "LON_DEN_COEFF", "LAT_NUM_COEFF", "LAT_DEN_COEFF")  # rpcm's: of a localisation RPC
 LISTS = COEFFICIENTS + DIRECT
-ERRORS = ("ERR_BIAS", "ERR_RAND")
-SINGLE = ERRORS + OFFSETS + SCALES
+ERROR_FIELDS = ("ERR_BIAS", "ERR_RAND")
+SINGLE = ERROR_FIELDS + OFFSETS + SCALES
 KEYS = SINGLE + COEFFICIENTS  # GDAL's names of all fields, in the order of the GeoTIFF tag
 
-_MAXAR = (
+_MAXAR_WORDS = (
     "errBias errRand lineOffset sampOffset latOffset longOffset heightOffset lineScale sampScale latScale longScale "
     "heightScale lineNumCoef lineDenCoef sampNumCoef sampDenCoef"
 )
-MAXAR = dict(zip(KEYS, _MAXAR.split(), strict=True))
+MAXAR = dict(zip(KEYS, _MAXAR_WORDS.split(), strict=True))
 """GDAL's name of a field -> Maxar's in an ``.RPB`` file; its XML has them in capitals."""
 
 Size = tuple[int, int]  # width, height [px]
@@ -71,7 +71,7 @@ _MEASURES = {
     "degrees": re.compile(r"(?i)(lat|lon)(?!.*(num|den))"),
     "metres": re.compile(r"(?i)(height|alt|err|bias|rand)"),
 }
-_WORDS = re.compile(r"[\s(\[]*([^\W\d_][^\W\d]*(?:[\s.-]+[^\W\d]+){0,4})")
+_UNIT_WORDS = re.compile(r"[\s(\[]*([^\W\d_][^\W\d]*(?:[\s.-]+[^\W\d]+){0,4})")
 
 
 class Stated(float):
@@ -80,14 +80,14 @@ class Stated(float):
     size = 1.0  # of its own unit
 
 
-def _measure(key: str) -> str | None:
+def _field_measure(key: str) -> str | None:
     """Return the unit of a field, by the name that a file has for it; None of coefficients, which have none."""
     return next((measure for measure, names in _MEASURES.items() if names.match(key)), None)
 
 
-def _size(rest: str, name: str, key: str) -> float | None:
+def _unit_size(rest: str, name: str, key: str) -> float | None:
     """Return the size of the unit behind a number of a field, None without one; RpcFormatError where it is no such."""
-    found, measure = _WORDS.match(rest.replace("°", " deg ")), _measure(key)
+    found, measure = _UNIT_WORDS.match(rest.replace("°", " deg ")), _field_measure(key)
     if found is None or measure is None:
         return None
     words = re.split(r"[\s_.-]+", found[1].lower())
@@ -106,10 +106,10 @@ def number(text: str, name: str, key: str) -> float:
     text = text.strip()
     match = NUMBER.match(text)
     rest = text[match.end() :] if match else text
-    apart = not rest or rest[0].isspace() or rest[0] in "°%" or (rest[0].isalpha() and _measure(key) is not None)
+    apart = not rest or rest[0].isspace() or rest[0] in "°%" or (rest[0].isalpha() and _field_measure(key) is not None)
     if match is None or not apart:
         raise RpcFormatError(f"{name}: {key} is not a number ({text[:40]!r})")
-    found, size = match.group(), _size(rest, name, key) if rest else None
+    found, size = match.group(), _unit_size(rest, name, key) if rest else None
     try:
         value = float(found)
     except ValueError:
@@ -125,7 +125,7 @@ def number(text: str, name: str, key: str) -> float:
 
 def listed_numbers(text: str, name: str, key: str) -> list[float]:
     """Return the numbers of a list separated by blanks or commas, of a measure each with its unit, if any."""
-    apart = r"[\s,]+" if _measure(key) is None else r"[\s,]+(?=[-+.\d]|nan\b|inf)"
+    apart = r"[\s,]+" if _field_measure(key) is None else r"[\s,]+(?=[-+.\d]|nan\b|inf)"
     return [number(part, name, key) for part in re.split(apart, text.strip(), flags=re.IGNORECASE) if part]
 
 
@@ -193,7 +193,7 @@ def rpc_from_fields(
     try:
         image = [fields[key][0] - first_pixel for key in OFFSETS[:2]]
         numbers = [*image, *(fields[key][0] for key in OFFSETS[2:] + SCALES), *(fields[key] for key in COEFFICIENTS)]
-        bias, rand = (next(iter(fields.get(key, ())), None) for key in ERRORS)
+        bias, rand = (next(iter(fields.get(key, ())), None) for key in ERROR_FIELDS)
         direct = np.array([fields[key] for key in DIRECT]) if lists is LISTS else None
         return RPC.of_numbers(numbers, bias, rand, direct)
     except RpcError as error:
@@ -205,7 +205,7 @@ def fields_from_rpc(rpc: RPC, direct: bool = False) -> Fields:
 
     Those of its localisation RPC come last, in files that hold them (`direct`).
     """
-    fields = {key: [value] for key, value in zip(ERRORS, (rpc.err_bias, rpc.err_rand), strict=True) if value}
+    fields = {key: [value] for key, value in zip(ERROR_FIELDS, (rpc.err_bias, rpc.err_rand), strict=True) if value}
     keys = OFFSETS + SCALES + COEFFICIENTS
     fields |= {k: v if k in LISTS else [v] for k, v in zip(keys, rpc.numbers(), strict=True)}
     held = rpc.direct.tolist() if direct and rpc.direct is not None else []
@@ -217,10 +217,10 @@ def fields_from_rpc(rpc: RPC, direct: bool = False) -> Fields:
 # Patterns here take time in proportion to the text, whatever it holds: no two repetitions can share a character,
 # and one that may run far begins where a line or a word begins.
 _PREFIX = re.compile(r"(|.*[._])LINE_OFF")
-_LINE = re.compile(r"^[ \t]*+([A-Za-z][\w.]*+)[ \t]*+[:=](.*)$", re.MULTILINE)
+_KEY_VALUE_LINE = re.compile(r"^[ \t]*+([A-Za-z][\w.]*+)[ \t]*+[:=](.*)$", re.MULTILINE)
 
 
-def decode(data: bytes) -> str:
+def decode_text(data: bytes) -> str:
     """Return the text of a file, with line ends of one kind: UTF-8, UTF-16, else Latin-1 (a degree sign, say)."""
     try:
         text = data.decode(encoding_of(data))
@@ -229,7 +229,7 @@ def decode(data: bytes) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _numbered(fields: Fields, separator: str, indices: Sequence[str]) -> list[str]:
+def _numbered_lines(fields: Fields, separator: str, indices: Sequence[str]) -> list[str]:
     """Return a line for every number; the coefficients of a list have these indices."""
     lines = []
     for key, values in fields.items():
@@ -241,9 +241,9 @@ def _numbered(fields: Fields, separator: str, indices: Sequence[str]) -> list[st
 _GEOM_ERRORS = {"BIAS_ERROR": "ERR_BIAS", "RAND_ERROR": "ERR_RAND"}
 
 
-def _lines(text: str, name: str) -> list[tuple[str, str]]:
+def _key_value_pairs(text: str, name: str) -> list[tuple[str, str]]:
     """Return keys, in capitals, and values of a text; a prefix that all have, ``RPC_`` or ``image0.``, is left out."""
-    lines = [(match[1].upper(), match[2].strip().removesuffix(";")) for match in _LINE.finditer(text)]
+    lines = [(match[1].upper(), match[2].strip().removesuffix(";")) for match in _KEY_VALUE_LINE.finditer(text)]
     found = {match[1] for key, _ in lines if (match := _PREFIX.fullmatch(key))}
     if len(found - {""}) > 1:
         raise RpcFormatError(f"{name}: RPCs of several images ({', '.join(sorted(found))}); give a file of one")
@@ -256,7 +256,7 @@ def read_txt(text: str, name: str, options: ReadOptions) -> RPC:
 
     Coefficients are numbered from 1 or 0, or twenty in a line, as GDAL has them.
     """
-    return rpc_from_fields(_fields_of_lines(_lines(text, name), name), name, options)
+    return rpc_from_fields(_fields_of_lines(_key_value_pairs(text, name), name), name, options)
 
 
 def _fields_of_lines(lines: Iterable[tuple[str, str]], name: str) -> Fields:
@@ -276,8 +276,8 @@ def write_txt(rpc: RPC) -> str:
     The first ninety lines are those of readers that go by the line alone; what only some RPCs have stands behind.
     """
     fields = fields_from_rpc(rpc, direct=True)
-    order = (*OFFSETS, *SCALES, *LISTS, *ERRORS)
-    lines = _numbered({key: fields[key] for key in order if key in fields}, ": ", [str(i) for i in range(1, 21)])
+    order = (*OFFSETS, *SCALES, *LISTS, *ERROR_FIELDS)
+    lines = _numbered_lines({key: fields[key] for key in order if key in fields}, ": ", [str(i) for i in range(1, 21)])
     return "\n".join(lines) + "\n"
 
 
@@ -327,13 +327,13 @@ def write_rpb(rpc: RPC) -> str:
 
 def read_geom(text: str, name: str, options: ReadOptions) -> RPC:
     """Read OSSIM's keyword list, as OTB and CARS use it, with its current adjustment; the RPC of the FULL image."""
-    lines = _lines(text, name)
+    lines = _key_value_pairs(text, name)
     order = f"RPC00{dict(lines).get('POLYNOMIAL_FORMAT', 'B')}"
     fields = in_order_b(_fields_of_lines(lines, name), order, name)
-    return _adjusted(rpc_from_fields(fields, name, options), dict(lines), name)
+    return _with_ossim_adjustment(rpc_from_fields(fields, name, options), dict(lines), name)
 
 
-def _adjusted(rpc: RPC, lines: Mapping[str, str], name: str) -> RPC:
+def _with_ossim_adjustment(rpc: RPC, lines: Mapping[str, str], name: str) -> RPC:
     """Return an RPC with OSSIM's adjustments: offsets and scales of rows and columns, and a rotation.
 
     Each is center + sigma * parameter. OSSIM rotates the quotients, which are quotients again only where both have one
@@ -371,42 +371,42 @@ def write_geom(rpc: RPC) -> str:
     """Write OSSIM's keyword list with all keys that its readers ask for (they add the half pixel themselves)."""
     fields = fields_from_rpc(rpc)
     errors = {word: fields.pop(key, [0.0]) for word, key in _GEOM_ERRORS.items()}  # 0 is OSSIM's "unknown"
-    lines = _numbered(errors | fields, ":  ", [f"{i:02d}" for i in range(20)])
+    lines = _numbered_lines(errors | fields, ":  ", [f"{i:02d}" for i in range(20)])
     head = ["type:  ossimRpcModel", "polynomial_format:  B"]
     return "\n".join([*head, *(line.lower() for line in lines)]) + "\n"
 
 
-_ENVI = re.compile(r"^[ \t]*+rpc info\s*+=\s*+\{([^{}]*+)\}", re.MULTILINE | re.IGNORECASE)
+_ENVI_RPC_INFO = re.compile(r"^[ \t]*+rpc info\s*+=\s*+\{([^{}]*+)\}", re.MULTILINE | re.IGNORECASE)
 
 
 def read_envi(text: str, name: str, options: ReadOptions) -> RPC:
     """Read ENVI's header: offsets, scales, four times twenty coefficients; three more numbers may follow."""
-    match = _ENVI.search(text)
+    match = _ENVI_RPC_INFO.search(text)
     values = listed_numbers(match.group(1), name, "rpc info") if match else []
-    return _in_order(values, "rpc info", name, options)
+    return _rpc_in_order(values, "rpc info", name, options)
 
 
-def _in_order(values: Sequence[float], what: str, name: str, options: ReadOptions) -> RPC:
-    if len(values) not in _COUNTS:
+def _rpc_in_order(values: Sequence[float], what: str, name: str, options: ReadOptions) -> RPC:
+    if len(values) not in _RPC_LENGTHS:
         raise RpcFormatError(f"{name}: {what} has {len(values)} numbers, expected 90 or 93")
     return rpc_from_fields(fields_in_order(values, OFFSETS + SCALES), name, options)
 
 
-_COUNTS = (90, 93)  # numbers of an RPC; three more may follow
+_RPC_LENGTHS = (90, 93)  # numbers of an RPC; three more may follow
 _BETWEEN = re.compile(r"[\s,;]+")
 _ONE = 0.01  # by which the first coefficient of a denominator may miss 1: OrbView's are 0.99995
 
 
-def bare(text: str) -> bool:
+def is_bare_rpc(text: str) -> bool:
     """Return whether a text holds the numbers of an RPC and nothing else."""
     parts = [part for part in _BETWEEN.split(text, maxsplit=100) if part]
-    return len(parts) in _COUNTS and all(map(NUMBER.fullmatch, parts))
+    return len(parts) in _RPC_LENGTHS and all(map(NUMBER.fullmatch, parts))
 
 
 def read_bare(text: str, name: str, options: ReadOptions) -> RPC:
     """Read numbers without names, between commas, blanks or lines, in the order of ENVI's header (IARPA, s2p)."""
     values = [number(part, name, "a number") for part in _BETWEEN.split(text) if part]
-    rpc = _in_order(values, "a list without names", name, options)
+    rpc = _rpc_in_order(values, "a list without names", name, options)
     first = rpc.coeffs[1::2, 0]
     if not (np.abs(first - 1.0) <= _ONE).all():
         raise RpcFormatError(
@@ -421,9 +421,9 @@ _RPCM_WORDS = (
     "err_bias err_rand row_offset col_offset lat_offset lon_offset alt_offset row_scale col_scale lat_scale lon_scale "
     "alt_scale row_num row_den col_num col_den"
 )
-_RPCM = dict(zip(KEYS, _RPCM_WORDS.split(), strict=True))
-_RPCM |= {key: key.removesuffix("_COEFF").lower() for key in DIRECT}
-_PLAIN = {key: key.lower() for key in KEYS}
+_RPCM_KEYS = dict(zip(KEYS, _RPCM_WORDS.split(), strict=True))
+_RPCM_KEYS |= {key: key.removesuffix("_COEFF").lower() for key in DIRECT}
+_LOWER_KEYS = {key: key.lower() for key in KEYS}
 
 
 def read_rpc_json(text: str, name: str, options: ReadOptions) -> RPC:
@@ -432,7 +432,7 @@ def read_rpc_json(text: str, name: str, options: ReadOptions) -> RPC:
         document = parse_json(text)
     except ValueError as error:
         raise RpcFormatError(f"{name}: not JSON ({plain(error)})") from error
-    for dialect, mark in ((_RPCM, "row_num"), (_PLAIN, "line_num_coeff")):
+    for dialect, mark in ((_RPCM_KEYS, "row_num"), (_LOWER_KEYS, "line_num_coeff")):
         found = _find(document, mark)
         if found is not None:
             values = {word.lower(): value for word, value in found.items() if value is not None}
@@ -472,7 +472,7 @@ _PAIR = re.compile(r"^[ \t-]*+(\w++):[ \t]*+(\[[^\[\]]*+\]|[^\n\[{]*+)", re.MULT
 def read_yaml(text: str, name: str, options: ReadOptions) -> RPC:
     """Read a parameter file of orthority with one image: names as rasterio's, lists in brackets or as dashes."""
     text = re.sub(r"\n[ \t]*+-[ \t]++(?=[+-.\d])", ", ", text)  # a block list into one line
-    return _read_words(_PAIR.findall(text), _PLAIN, name, options)
+    return _read_words(_PAIR.findall(text), _LOWER_KEYS, name, options)
 
 
 # --- columns of fixed width -------------------------------------------------------------------------------

@@ -8,12 +8,12 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from barpc.base.errors import ImageError, RpcFormatError
-from barpc.base.sidefile import parse_xml
+from barpc.base.safe_io import parse_xml
 from barpc.rasters.vrt import vrt_from_xml
 from barpc.rpcio.text import (
     COEFFICIENTS,
     DIRECT,
-    ERRORS,
+    ERROR_FIELDS,
     KEYS,
     MAXAR,
     OFFSETS,
@@ -31,12 +31,12 @@ from barpc.rpcio.text import (
 from barpc.sensor.rpc import RPC
 
 
-def _root(text: str, name: str, *, strip_namespaces: bool = True) -> Element:
+def _xml_root(text: str, name: str, *, strip_namespaces: bool = True) -> Element:
     body = re.sub(r"\A\s*+<\?xml[^<>]*\?>", "", text, count=1)  # the encoding it declares is no longer its own
     return parse_xml(body.encode(), name=name, strip_namespaces=strip_namespaces)
 
 
-def _numbers(parent: Element, path: str, name: str) -> list[float]:
+def _element_numbers(parent: Element, path: str, name: str) -> list[float]:
     """Return the numbers in an element."""
     text = parent.findtext(path, "").strip()
     if not text:
@@ -55,7 +55,7 @@ def _element(parent: Element, paths: Iterable[str], name: str) -> Element:
 
 def read_maxar(text: str, name: str, options: ReadOptions) -> RPC:
     """Read Maxar's image support data: `<RPB><IMAGE>`, twenty numbers in one element a list."""
-    root = _root(text, name)
+    root = _xml_root(text, name)
     rpb = root if root.tag == "RPB" else _element(root, ("RPB",), name)
     spec = rpb.findtext("SPECID", "RPC00B").strip()
     image = _element(rpb, ("IMAGE",), name)
@@ -63,8 +63,8 @@ def read_maxar(text: str, name: str, options: ReadOptions) -> RPC:
     for key, word in MAXAR.items():
         tag = word.upper()
         path = f"{tag}List/{tag}" if key in COEFFICIENTS else tag
-        if key not in ERRORS or image.find(path) is not None:
-            fields[key] = _numbers(image, path, name)
+        if key not in ERROR_FIELDS or image.find(path) is not None:
+            fields[key] = _element_numbers(image, path, name)
     return rpc_from_fields(in_order_b(fields, spec, name), name, options)
 
 
@@ -91,15 +91,15 @@ def read_dimap(text: str, name: str, options: ReadOptions) -> RPC:
     The first pixel's centre is (1, 1) in v1 and v2 and (0, 0) in v3. ERR_BIAS_ROW and _COL are the error of the
     vendor's own fit [px], no geolocation accuracy: they are left out.
     """
-    root = _root(text, name)
+    root = _xml_root(text, name)
     model = _element(root, ("Global_RFM",), name)
     if model.find(".//F_COL") is not None:
         return _read_dimap_v1(model, name, options)
     inverse = _element(model, ("Inverse_Model", "GroundtoImage_Values"), name)
     validity = _element(model, ("RFM_Validity",), name)
-    fields: Fields = {key: _numbers(validity, key, name) for key in OFFSETS + SCALES}
+    fields: Fields = {key: _element_numbers(validity, key, name) for key in OFFSETS + SCALES}
     for key in COEFFICIENTS:
-        fields[key] = [value for i in range(1, 21) for value in _numbers(inverse, f"{key}_{i}", name)]
+        fields[key] = [value for i in range(1, 21) for value in _element_numbers(inverse, f"{key}_{i}", name)]
     return rpc_from_fields(fields, name, options, 0.0 if inverse.tag == "GroundtoImage_Values" else 1.0)
 
 
@@ -107,7 +107,7 @@ def _read_dimap_v1(model: Element, name: str, options: ReadOptions) -> RPC:
     """Read DIMAP v1: forty numbers an element, scales A and offsets B by axis."""
     fields: Fields = {}
     for axis, field in (("ROW", "LINE"), ("COL", "SAMP")):
-        values = _numbers(model, f".//F_{axis}", name)
+        values = _element_numbers(model, f".//F_{axis}", name)
         if len(values) != 40:
             raise RpcFormatError(f"{name}: F_{axis} has {len(values)} coefficients, expected 40")
         fields[f"{field}_NUM_COEFF"], fields[f"{field}_DEN_COEFF"] = values[:20], values[20:]
@@ -115,7 +115,7 @@ def _read_dimap_v1(model: Element, name: str, options: ReadOptions) -> RPC:
     validity = _element(model, ("RFM_Validity",), name)
     for axis, field in axes.items():
         element = _element(validity, (axis,), name)
-        fields[f"{field}_SCALE"], fields[f"{field}_OFF"] = (_numbers(element, part, name) for part in "AB")
+        fields[f"{field}_SCALE"], fields[f"{field}_OFF"] = (_element_numbers(element, part, name) for part in "AB")
     return rpc_from_fields(fields, name, options, first_pixel=1.0)
 
 
@@ -124,7 +124,7 @@ _ENMAP_AXES = {"LINE": "ROW", "SAMP": "COL"}
 
 def read_enmap(text: str, name: str, options: ReadOptions) -> RPC:
     """Read EnMAP's metadata: `options.band` chooses among the bands' RPCs."""
-    root = _root(text, name)
+    root = _xml_root(text, name)
     bands = [b for rpc in root.iter("RPC") for b in rpc.iter("bandID") if b.get("number") == str(options.band)]
     if not bands:
         raise RpcFormatError(f"{name}: no RPC of band {options.band}")
@@ -142,7 +142,7 @@ def read_enmap(text: str, name: str, options: ReadOptions) -> RPC:
 
 def read_gdal(text: str, name: str, options: ReadOptions) -> RPC:
     """Read GDAL's RPC metadata domain; a VRT is read by the grammar by which it is opened (`barpc.rasters.vrt`)."""
-    root = _root(text, name, strip_namespaces=False)
+    root = _xml_root(text, name, strip_namespaces=False)
     found = root.find("Metadata[@domain='RPC']")
     if root.tag == "VRTDataset":
         try:

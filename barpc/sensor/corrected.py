@@ -20,7 +20,7 @@ from barpc.base.errors import RpcError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import (
     NEWTON_STEPS,
-    SETTLED,
+    NEWTON_TOLERANCE,
     Array,
     IntArray,
     ecef_from_ground,
@@ -32,9 +32,9 @@ from barpc.base.geodesy import (
 )
 from barpc.sensor import Behind, SensorModel
 from barpc.sensor.curve import Turn, cross, rotation_left_jacobian, rotation_matrix
-from barpc.sensor.displaced import fixed_point
+from barpc.sensor.image_corrections import fixed_point
 
-_DIGITS = 1e-8  # of derivatives: the solver's steps ask for no more
+_DERIVATIVE_ACCURACY = 1e-8  # of derivatives: the solver's steps ask for no more
 
 
 class RigidMotion:
@@ -69,14 +69,14 @@ class RigidMotion:
 
     def by_point(self, by_moved: Array, out: Array | None = None) -> Array:
         """Return the derivatives (2, 3, n) by X [1/m] from those by the moved points; by T they are negative."""
-        back = by_moved if self._drift is None else self._drift.back(by_moved, _DIGITS)
+        back = by_moved if self._drift is None else self._drift.back(by_moved, _DERIVATIVE_ACCURACY)
         return _by_view(self._matrix.swapaxes(1, 2), back, self._bounds, out)
 
     def by_turns(self, by_moved: Array) -> tuple[Array, Array]:
         """Return those by R and d [1/rad]: the same where there is no drift."""
         before = by_turn = cross(self._turned, by_moved)
         if self._drift is not None:
-            before, by_turn = self._drift.back_and_rate(by_turn, _DIGITS)
+            before, by_turn = self._drift.back_and_rate(by_turn, _DERIVATIVE_ACCURACY)
         left = rotation_left_jacobian(self._rotation).swapaxes(1, 2)
         by_rotation = _by_view(left, before, self._bounds)
         return by_rotation, by_rotation if self._drift is None else by_turn
@@ -275,13 +275,13 @@ class Corrected(Behind):
             found = self.sensor.localize(image, asked)
             before, ground = ground, ground_from_ecef(self.correction.undo(ecef_from_ground(found), image[:, 1]))
             last, off = off, alt - ground[:, 2]
-            if step and not (np.abs(off) > SETTLED).any():
+            if step and not (np.abs(off) > NEWTON_TOLERANCE).any():
                 break
             asked = asked + off
         moved = ground - before  # along the ray, which is straight so near
         moved[:, 0] = wrap_longitude(moved[:, 0])
         ground += moved * np.where(last, off / last, 0.0)[:, None]
-        ground[~(np.abs(off) <= SETTLED)] = np.nan
+        ground[~(np.abs(off) <= NEWTON_TOLERANCE)] = np.nan
         ground[:, 2] = alt
         ground[:, 0] = wrap_longitude(ground[:, 0], found[:, 0])
         return ground

@@ -22,11 +22,11 @@ from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, RpcError, RpcFormatError, plain
 from barpc.base.geodesy import WGS84_A, WGS84_B, Array, ecef_from_ground, ground_from_ecef
-from barpc.base.sidefile import STATE, parse_json, read_text
+from barpc.base.safe_io import CAMERA_STATE, parse_json, read_text
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected
-from barpc.sensor.document import STRAIGHT, Fields, padded
-from barpc.sensor.linescan import STEP, Detector, Samples, camera_of_samples, unit
+from barpc.sensor.document import LINE_TIME_TOLERANCE, XmlFields, padded
+from barpc.sensor.linescan import ATTITUDE_STEP, Detector, Samples, camera_of_samples, unit
 from barpc.sensor.pushbroom import Frame, Pushbroom
 
 STATE_END = ".adjusted_state.json"
@@ -35,10 +35,10 @@ LINESCAN, FRAME = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL", "USGS_ASTRO_FRAME_SENS
 
 _EARTH = 100.0  # m: by which the axes of an Earth's ellipsoid may differ from WGS84's
 FLIP = np.diag([1.0, -1.0, -1.0])
-_BEYOND = 4  # samples before and after the image: readers interpolate through eight
-_COLUMNS = 9  # of a row, through which its attitude goes
+_EXTRA_SAMPLES = 4  # samples before and after the image: readers interpolate through eight
+_ATTITUDE_COLUMNS = 9  # of a row, through which its attitude goes
 
-_PLAIN: dict[str, Any] = {
+_DEFAULT_STATE: dict[str, Any] = {
     "m_centerEphemerisTime": 0.0,
     "m_covariance": [0.0] * 256,
     "m_currentParameterValue": [0.0] * 16,
@@ -86,22 +86,22 @@ def open_state(path: Path) -> tuple[Pushbroom | Frame, tuple[int, int]]:
     InputError
         A state of another model, body or distortion than is read.
     """
-    text = read_text(path, STATE)
+    text = read_text(path, CAMERA_STATE)
     try:
         found = parse_json(text[max(text.find("{"), 0) :])
     except ValueError as error:
         raise RpcFormatError(f"{path}: no CSM state that can be read ({plain(error)})") from error
-    state = _State(found if isinstance(found, dict) else {}, str(path))
+    state = _StateFields(found if isinstance(found, dict) else {}, str(path))
     model = str(state.content.get("m_modelName"))
-    if model not in _READERS:
-        raise InputError(f"{path}: a CSM state of {model[:60]}, read are {' and '.join(_READERS)}")
+    if model not in _MODEL_READERS:
+        raise InputError(f"{path}: a CSM state of {model[:60]}, read are {' and '.join(_MODEL_READERS)}")
     axes = np.array([state.number("m_majorAxis"), state.number("m_minorAxis")])
     if not (np.abs(axes - (WGS84_A, WGS84_B)) < _EARTH).all():
         raise InputError(f"{path}: an ellipsoid of {axes[0]:g} and {axes[1]:g} m, which is not the Earth's")
-    return _READERS[model](state), state.image_size
+    return _MODEL_READERS[model](state), state.image_size
 
 
-class _State(Fields):
+class _StateFields(XmlFields):
     """The fields of a state; what is missing or malformed is refused by name."""
 
     def __init__(self, content: Mapping[str, Any], name: str) -> None:
@@ -145,26 +145,26 @@ class _State(Fields):
         return np.asarray(np.pad(given, (0, 3 - len(given))) * self.positive("m_focalLength") ** np.array([0, 2, 4]))
 
 
-def _linescan(state: _State) -> Pushbroom:
+def _linescan(state: _StateFields) -> Pushbroom:
     size, name = state.image_size, state.name
     if np.any(state.numbers("m_currentParameterValue")):
         raise InputError(f"{name}: adjustable parameters that are not 0, which are not read")
-    first, period = _lines(state)
-    times, positions = _sampled(state, "positions", "Ephem", 3, first)
-    _, velocities = _sampled(state, "velocities", "Ephem", 3, first)
-    ticks, quaternions = _sampled(state, "quaternions", "Quat", 4, first)
+    first, period = _line_timing(state)
+    times, positions = _state_samples(state, "positions", "Ephem", 3, first)
+    _, velocities = _state_samples(state, "velocities", "Ephem", 3, first)
+    ticks, quaternions = _state_samples(state, "quaternions", "Quat", 4, first)
     if len(velocities) != len(positions):
         raise RpcFormatError(f"{name}: {len(velocities)} velocities of {len(positions)} positions")
     rotation = Rotation.from_quat(unit(quaternions, name))
     middle = len(rotation) // 2
-    look, origin = _look(state, size[0])
+    look, origin = _look_polynomial(state, size[0])
     if rotation[middle].as_matrix()[:, 2] @ positions[len(positions) // 2] > 0:  # away from the Earth
         rotation, look = rotation * Rotation.from_matrix(FLIP), look * [[-1.0], [1.0]]
     samples = Samples(name, times, positions, velocities, ticks, rotation.as_quat(scalar_first=True))
     return camera_of_samples(samples, Detector(look, origin, period, size)).model
 
 
-def _lines(state: _State) -> tuple[float, float]:
+def _line_timing(state: _StateFields) -> tuple[float, float]:
     """Time of row 0 and from one row to the next [s]."""
     line, start, step = (state.numbers(f"m_intTime{what}") for what in ("Lines", "StartTimes", "s"))
     if not 0 < len(line) == len(start) == len(step):
@@ -173,12 +173,12 @@ def _lines(state: _State) -> tuple[float, float]:
     first = float(start[0] - period * rows[0])
     here = rows < state.image_size[1]
     bent = np.abs(start - first - period * rows)[here].max(initial=0.0)
-    if not (period and bent <= STRAIGHT * abs(period) and (np.abs(step[here] / period - 1) < 1e-6).all()):
+    if not (period and bent <= LINE_TIME_TOLERANCE * abs(period) and (np.abs(step[here] / period - 1) < 1e-6).all()):
         raise RpcFormatError(f"{state.name}: the line rate changes, or is none, which is not read")
     return first, period
 
 
-def _sampled(state: _State, what: str, kind: str, width: int, first: float) -> tuple[Array, Array]:
+def _state_samples(state: _StateFields, what: str, kind: str, width: int, first: float) -> tuple[Array, Array]:
     """Return the times [s from row 0] and rows of a list of samples at equal steps."""
     values = state.numbers(f"m_{what}")
     stated = state.content.get(f"m_num{what.capitalize()}", len(values))
@@ -189,7 +189,7 @@ def _sampled(state: _State, what: str, kind: str, width: int, first: float) -> t
     return np.asarray(times, np.float64), values.reshape(-1, width)
 
 
-def _look(state: _State, width: int) -> tuple[Array, float]:
+def _look_polynomial(state: _StateFields, width: int) -> tuple[Array, float]:
     """Return `Pushbroom.look` of the column and its origin, the middle of the image; exact, distortion too."""
     origin = (width - 1) / 2.0
     plane = state.plane((state.number("m_detectorSampleOrigin"), state.number("m_detectorLineOrigin")))
@@ -202,7 +202,7 @@ def _look(state: _State, width: int) -> tuple[Array, float]:
     return look[:, : degree + 1], origin
 
 
-def _frame(state: _State) -> Frame:
+def _frame_camera(state: _StateFields) -> Frame:
     pose = state.numbers("m_currentParameterValue", 7)
     if np.any(state.content.get("m_lineTimes") or 0):
         raise InputError(f"{state.name}: a rolling shutter with jitter, which is not read")
@@ -218,7 +218,7 @@ def _frame(state: _State) -> Frame:
     return Frame(center, rotation, plane, state.distortion())
 
 
-_READERS: dict[str, Callable[[_State], Pushbroom | Frame]] = {LINESCAN: _linescan, FRAME: _frame}
+_MODEL_READERS: dict[str, Callable[[_StateFields], Pushbroom | Frame]] = {LINESCAN: _linescan, FRAME: _frame_camera}
 
 
 # --- writing -----------------------------------------------------------------------------------------------------
@@ -241,17 +241,17 @@ def state_text(model: SensorModel, size: tuple[int, int], alt_range: tuple[float
     base = _base(model)
     count = int(np.ceil((size[1] - 1) * base.line_period / _step(base))) + 1
     step = (size[1] - 1) * base.line_period / (count - 1)
-    late = step * np.arange(-_BEYOND, count + _BEYOND)
+    late = step * np.arange(-_EXTRA_SAMPLES, count + _EXTRA_SAMPLES)
     rows: Array = np.asarray(late / base.line_period, dtype=np.float64)
     positions = _positions(model, rows)
-    attitude = _attitude(model, base, rows, positions, (size[0], float(np.mean(alt_range))))
+    attitude = _row_rotations(model, base, rows, positions, (size[0], float(np.mean(alt_range))))
     velocities = np.gradient(positions, step, axis=0)
     middle = model.localize((np.array(size) - 1.0) / 2, np.array(np.mean(alt_range)))
     last = base.line_period * (size[1] - 1)
     sides = np.array([[0.0, 0.0], [1.0, 0.0], [size[0] - 1.0, 0.0]])
     near = ecef_from_ground(model.localize(sides, np.full(3, float(np.mean(alt_range)))))
     state: dict[str, Any] = {
-        **_PLAIN,
+        **_DEFAULT_STATE,
         **_detector(base),
         "m_nSamples": size[0],
         "m_nLines": size[1],
@@ -288,7 +288,7 @@ def _base(model: SensorModel) -> Pushbroom:
 def _step(base: Pushbroom) -> float:
     """Return the sampling step [s]: half of the camera's own."""
     own = np.diff(base.attitude.knots)
-    return min(STEP, float(np.median(own)) / 2) if len(own) > 1 else STEP
+    return min(ATTITUDE_STEP, float(np.median(own)) / 2) if len(own) > 1 else ATTITUDE_STEP
 
 
 def _positions(model: SensorModel, rows: Array) -> Array:
@@ -298,16 +298,18 @@ def _positions(model: SensorModel, rows: Array) -> Array:
     return model.correction.undo(_positions(model.sensor, rows), rows)
 
 
-def _attitude(model: SensorModel, base: Pushbroom, rows: Array, positions: Array, seen: tuple[int, float]) -> Rotation:
+def _row_rotations(
+    model: SensorModel, base: Pushbroom, rows: Array, positions: Array, seen: tuple[int, float]
+) -> Rotation:
     """Return the rotation ecef_from_camera, z away from the ground, nearest to the lines of sight of each row."""
-    cols = np.linspace(0.0, seen[0] - 1.0, _COLUMNS)
+    cols = np.linspace(0.0, seen[0] - 1.0, _ATTITUDE_COLUMNS)
     image = np.stack(np.broadcast_arrays(cols, rows[:, None]), axis=-1)
     away = ecef_from_ground(model.localize(image, np.full(image.shape[:2], seen[1]))) - positions[:, None]
     if not np.isfinite(away).all():
         raise RpcError("a camera that does not see the ground over its image is not written as a CSM state")
     away /= np.linalg.norm(away, axis=-1, keepdims=True)
-    tangents = base.look @ np.stack([np.ones(_COLUMNS), cols - base.look_origin])
-    inside = np.vstack([tangents, np.ones(_COLUMNS)]).T
+    tangents = base.look @ np.stack([np.ones(_ATTITUDE_COLUMNS), cols - base.look_origin])
+    inside = np.vstack([tangents, np.ones(_ATTITUDE_COLUMNS)]).T
     inside /= np.linalg.norm(inside, axis=1, keepdims=True)
     left, _, right = np.linalg.svd(np.einsum("nki,kj->nij", away, inside))  # Wahba's problem
     turn = np.ones((len(rows), 3))

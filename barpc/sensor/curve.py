@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 EXTRAPOLATION = 1.0  # seconds beyond its knots that a curve is still believed
-MARGIN = 70.0  # state vectors so far before and after the image take part in the fit of an orbit [s]
+ORBIT_MARGIN = 70.0  # state vectors so far before and after the image take part in the fit of an orbit [s]
 MIN_VECTORS = 4
-DEGREES = range(5, 12)
+ORBIT_DEGREES = range(5, 12)
 
-_TOLERANCE = 1.0  # m: state vectors that scatter more are not one orbit
+_MAX_ORBIT_SCATTER = 1.0  # m: state vectors that scatter more are not one orbit
 _UNSEEN = 1e-4  # m/s: at 900 km 1.6 us, the rounding of times and a thousandth of a line
-_DIGITS = np.array([1e-5, 1e-5, 1e-6])  # m, m, m/s: no standard deviation is smaller
-_GAIN = 1.5  # a higher degree must lower the residual across the track by this factor
+_MIN_ORBIT_SIGMAS = np.array([1e-5, 1e-5, 1e-6])  # m, m, m/s: no standard deviation is smaller
+_DEGREE_GAIN = 1.5  # a higher degree must lower the residual across the track by this factor
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -162,7 +162,7 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
     (Sentinel-1: positions to 2e-6 m in auxiliary products and 2e-4 m in downlinked ones, velocities to 1e-5 and
     6e-3 m/s, and where the annotated times, whole microseconds, are not the true ones, positions ALONG the track
     to 3 mm only), so the standard deviations of positions along the track and across it and of velocities are
-    estimated along with the orbit, from the residuals. The degree is the lowest of `DEGREES` that no higher one
+    estimated along with the orbit, from the residuals. The degree is the lowest of `ORBIT_DEGREES` that no higher one
     betters by more than half in the residual ACROSS the track: about 5 for downlinked vectors, 6
     for auxiliary ones, more for a long span. Along the track a high degree would follow the rounding of the times.
 
@@ -175,7 +175,7 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
     ----------
     time : (N,) [s from the epoch]
     position, velocity : (N, 3), ECEF [m, m/s]
-    window : (float, float), first and last time of the image [s]; vectors within `MARGIN` of it are used
+    window : (float, float), first and last time of the image [s]; vectors within `ORBIT_MARGIN` of it are used
 
     Raises
     ------
@@ -183,11 +183,11 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
         Fewer than `MIN_VECTORS` vectors, an image more than `EXTRAPOLATION` beyond them, or no one orbit.
     """
     time, first = np.unique(time, return_index=True)
-    use = (time >= window[0] - MARGIN) & (time <= window[1] + MARGIN)
+    use = (time >= window[0] - ORBIT_MARGIN) & (time <= window[1] + ORBIT_MARGIN)
     time, position, velocity = time[use], position[first][use], velocity[first][use]
     if len(time) < MIN_VECTORS:
         raise RpcError(
-            f"orbit: {len(time)} state vectors within {MARGIN:g} s of the image, at least {MIN_VECTORS} "
+            f"orbit: {len(time)} state vectors within {ORBIT_MARGIN:g} s of the image, at least {MIN_VECTORS} "
             "needed; give a precise orbit file of that day"
         )
     if window[0] < time[0] - EXTRAPOLATION or window[1] > time[-1] + EXTRAPOLATION:
@@ -195,10 +195,12 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
             f"orbit: the image lasts from {window[0]:.1f} to {window[1]:.1f} s, the state vectors from "
             f"{time[0]:.1f} to {time[-1]:.1f} s; give a precise orbit file that covers it"
         )
-    fits = [_fit_orbit(time, position, velocity, degree) for degree in sorted({min(d, len(time)) for d in DEGREES})]
-    limit = _GAIN * min(float(fit.sigma[1]) for fit in fits)
+    fits = [
+        _fit_orbit(time, position, velocity, degree) for degree in sorted({min(d, len(time)) for d in ORBIT_DEGREES})
+    ]
+    limit = _DEGREE_GAIN * min(float(fit.sigma[1]) for fit in fits)
     orbit = next(fit for fit in fits if fit.sigma[1] <= limit)
-    if not orbit.sigma[:2].max() <= _TOLERANCE:
+    if not orbit.sigma[:2].max() <= _MAX_ORBIT_SCATTER:
         raise RpcError(f"orbit: the state vectors scatter by {orbit.sigma.max():.3g} m about any smooth orbit")
     return orbit
 
@@ -228,7 +230,7 @@ def _fit_orbit(time: Array, position: Array, velocity: Array, degree: int) -> Or
         scale = np.linalg.norm(matrix, axis=0)
         solution = np.linalg.lstsq(matrix / scale, target, rcond=None)[0] / scale
         squares = np.array([((y - a @ solution) ** 2).sum() for a, y in groups])
-        sigma = np.maximum(np.sqrt(squares / count), _DIGITS)
+        sigma = np.maximum(np.sqrt(squares / count), _MIN_ORBIT_SIGMAS)
     series = solution.reshape(degree + 1, 3)
     taylor, derivative = [], series
     for k in range(degree + 1):
@@ -238,7 +240,7 @@ def _fit_orbit(time: Array, position: Array, velocity: Array, degree: int) -> Or
     quadratic = (time - time[0])[:, None] ** np.arange(3)
     stated = np.linalg.lstsq(quadratic, lacking, rcond=None)[0]
     left, free = lacking - quadratic @ stated, max(len(time) - 3, 1) / len(time)
-    if not np.sqrt((lacking**2).mean()) > _GAIN * max(_UNSEEN, np.sqrt((left**2).mean() / free)):
+    if not np.sqrt((lacking**2).mean()) > _DEGREE_GAIN * max(_UNSEEN, np.sqrt((left**2).mean() / free)):
         stated = np.zeros((1, 3))
     return Orbit(time[[0, -1]], np.array(taylor)[None], sigma, stated)
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import RpcError
-from barpc.base.geodesy import FAR, NEWTON_STEPS, SETTLED, Array, wrap_longitude
+from barpc.base.geodesy import MAX_COORDINATE, NEWTON_STEPS, NEWTON_TOLERANCE, Array, wrap_longitude
 from barpc.sensor import Pointwise, SensorModel
 from barpc.sensor.rational import DERIVATIVE, monomials
 
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
 LINEAR = 0.005  # px: what linear interpolation in a grid made here may miss by
 
-_SHRINK = 1e-4  # of a step to the next: more asks for new derivatives
+_REDERIVE_SHRINK = 1e-4  # of a step to the next: more asks for new derivatives
 
-LONGEST = 1024.0, 1024.0, 1000.0  # px, px, m: from node to node of a grid made here
-_FEWEST, _CELLS = 3, 1024  # cells along an axis; splines are cubic from three on
-_NODES = 4_000_000  # of a grid made here, at most
-_TRIED = 1000  # cells
+MAX_NODE_SPACING = 1024.0, 1024.0, 1000.0  # px, px, m: from node to node of a grid made here
+_MIN_GRID_CELLS, _MAX_GRID_CELLS = 3, 1024  # cells along an axis; splines are cubic from three on
+_MAX_GRID_NODES = 4_000_000  # of a grid made here, at most
+_CELLS_TRIED = 1000  # cells
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -69,7 +69,7 @@ class DirectGrid(Pointwise):
         shape = (*(len(np.atleast_1d(axis)) for axis in axes), 2)
         if self.lonlat.shape != shape or min(shape) < 2:
             raise RpcError(f"localisation grid: lon, lat {self.lonlat.shape} on {shape[:3]} nodes")
-        if not all((np.abs(axis) <= FAR).all() and (np.diff(axis) > 0).all() for axis in axes):
+        if not all((np.abs(axis) <= MAX_COORDINATE).all() and (np.diff(axis) > 0).all() for axis in axes):
             raise RpcError("localisation grid: columns, rows and altitudes must ascend")
         if not (np.abs(self.lonlat) <= (540.0, 90.0)).all():  # NaN neither
             raise RpcError("localisation grid: a node has no ground point")
@@ -120,7 +120,7 @@ class DirectGrid(Pointwise):
             lonlat = model.localize(points[..., :2], points[..., 2])[..., :2]
             return np.asarray((wrap_longitude(lonlat, center[:2]) - center[:2]) @ to_px)
 
-        cols, rows, alts = linear_axes(seen, low, high, np.array(LONGEST), tolerance)
+        cols, rows, alts = linear_axes(seen, low, high, np.array(MAX_NODE_SPACING), tolerance)
         plane = np.stack(np.meshgrid(cols, rows), axis=-1)
         layers = [model.localize(plane, np.full(plane.shape[:2], alt))[..., :2] for alt in alts]
         return cls(cols, rows, alts, np.stack(layers))
@@ -147,13 +147,13 @@ class DirectGrid(Pointwise):
                 step = by_lon * miss[:, :1] + by_lat * miss[:, 1:]
                 image = image + step
                 length = np.abs(step).max(axis=1)
-                todo = ~(length < SETTLED) & np.isfinite(length)
+                todo = ~(length < NEWTON_TOLERANCE) & np.isfinite(length)
                 if not todo.any():
                     break
-                if (length > _SHRINK * before)[todo].any():
+                if (length > _REDERIVE_SHRINK * before)[todo].any():
                     by_lon, by_lat = self._inverse_2x2(image, alt)
                 before = length
-            image[~(length < SETTLED)] = np.nan
+            image[~(length < NEWTON_TOLERANCE)] = np.nan
         return image
 
     def _guess(self, lonlat: Array, alt: Array) -> tuple[Array, Array, Array]:
@@ -210,9 +210,9 @@ def linear_axes(
     value : callable, points (..., d) -> values (..., k), in the unit of `tolerance`
     longest : (d,), cells at the beginning; they are made smaller until the errors of all axes add up to `tolerance`
     """
-    counts = np.maximum(_FEWEST, np.ceil((high - low) / longest)).astype(np.int64)
+    counts = np.maximum(_MIN_GRID_CELLS, np.ceil((high - low) / longest)).astype(np.int64)
     for axis in range(len(low)):
-        rng, along, tried = np.random.default_rng(axis), np.eye(len(low))[axis], _TRIED // 10
+        rng, along, tried = np.random.default_rng(axis), np.eye(len(low))[axis], _CELLS_TRIED // 10
         while True:
             step = (high - low) / counts * along
             first, t = low + (high - low - step) * rng.random((tried, len(low))), rng.random((tried, 1))
@@ -221,13 +221,13 @@ def linear_axes(
             worst = float(np.linalg.norm(miss, axis=1).max())
             if not np.isfinite(worst):
                 raise RpcError("localisation grid: the camera has no ground point in part of the image")
-            if worst <= tolerance / len(low) or counts[axis] >= _CELLS:
-                if tried == _TRIED:
+            if worst <= tolerance / len(low) or counts[axis] >= _MAX_GRID_CELLS:
+                if tried == _CELLS_TRIED:
                     break
-                tried = _TRIED
+                tried = _CELLS_TRIED
                 continue
             more = min(4.0, max(1.25, 1.1 * (worst * len(low) / tolerance) ** 0.5))
-            counts[axis] = min(_CELLS, int(np.ceil(counts[axis] * more)))
-    if np.prod(counts + 1.0) > _NODES:
+            counts[axis] = min(_MAX_GRID_CELLS, int(np.ceil(counts[axis] * more)))
+    if np.prod(counts + 1.0) > _MAX_GRID_NODES:
         return linear_axes(value, low, high, longest, 2 * tolerance)
     return [np.linspace(a, b, n + 1) for a, b, n in zip(low, high, counts, strict=True)]

@@ -13,19 +13,19 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import BarpcWarning, RpcFormatError, plain
-from barpc.base.geodesy import FAR, Array
+from barpc.base.geodesy import MAX_COORDINATE, Array
 
 T = TypeVar("T")
 RELIEF_AROUND = 1000.0
 """Altitudes about that of a scene [m] that it is used for, where its document says nothing."""
 MOST_PIXELS = 1_000_000
 """No image has more rows, or columns."""
-STRAIGHT = 0.01
+LINE_TIME_TOLERANCE = 0.01
 """Rows by which line times may leave a straight line."""
 GRID_TOLERANCE = 5.0
 """A grid that misses by more [px] does not belong to the orbit."""
 
-_TIME = re.compile(r"(UTC=)?(?P<time>20\d\d-\d\d-\d\d[T ]\d\d:\d\d:\d\d(\.\d{1,9})?)Z?")
+_ISO_TIME = re.compile(r"(UTC=)?(?P<time>20\d\d-\d\d-\d\d[T ]\d\d:\d\d:\d\d(\.\d{1,9})?)Z?")
 
 
 def seconds(time: Any, epoch: np.datetime64) -> Any:
@@ -40,7 +40,7 @@ def padded(rows: Iterable[npt.NDArray[Any] | list[float]]) -> Array:
 
 def parse_time(text: str, name: str) -> np.datetime64:
     """Parse a UTC time such as "2021-02-16T15:12:07.524369", perhaps with a Z behind it or "UTC=" before."""
-    match = _TIME.fullmatch(text.strip())
+    match = _ISO_TIME.fullmatch(text.strip())
     try:
         return np.datetime64(match["time"] if match else "none", "ns")
     except ValueError as error:
@@ -59,7 +59,7 @@ def warn_off_grid(name: str, off: Array) -> None:
         )
 
 
-class Fields:
+class XmlFields:
     """Fields of an XML element; what is missing or malformed is refused by name."""
 
     def __init__(self, element: Element, name: str) -> None:
@@ -99,7 +99,7 @@ class Fields:
         `between` is a character that may separate them, beside blanks.
         """
         numbers = self._listed(path, between)
-        if not (np.abs(numbers) <= FAR).all():
+        if not (np.abs(numbers) <= MAX_COORDINATE).all():
             raise RpcFormatError(f"{self.name}: {path} holds a number that is not finite or absurdly large")
         if count not in (None, len(numbers)):
             raise RpcFormatError(f"{self.name}: {path} holds {len(numbers)} numbers, expected {count}")
@@ -120,7 +120,7 @@ class Fields:
         """Return the width and height [px] of an image."""
         return int(self.positive(cols, MOST_PIXELS)), int(self.positive(rows, MOST_PIXELS))
 
-    def positive(self, path: str, most: float = FAR) -> float:
+    def positive(self, path: str, most: float = MAX_COORDINATE) -> float:
         """Return the first number of a field; RpcFormatError where it is not above 0 and at most `most`."""
         value = float(self.numbers(path)[0])
         if not 0 < value <= most:

@@ -25,26 +25,31 @@ from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, RpcError, RpcFormatError
 from barpc.base.geodesy import Array, ecef_from_ground
-from barpc.base.sidefile import parse_xml
+from barpc.base.safe_io import parse_xml
 from barpc.sensor.curve import EXTRAPOLATION, Curve, attitude_through
-from barpc.sensor.document import STRAIGHT, Fields, padded, seconds
+from barpc.sensor.document import LINE_TIME_TOLERANCE, XmlFields, padded, seconds
 from barpc.sensor.pushbroom import Light, Pushbroom
 
-STEP = 0.02  # s: at which an attitude is sampled that is given otherwise
+ATTITUDE_STEP = 0.02  # s: at which an attitude is sampled that is given otherwise
 
-_GAP = 4.0  # times the usual step: a longer one is a gap that nothing bridges
+_GAP_STEPS = 4.0  # times the usual step: a longer one is a gap that nothing bridges
 _FASTEST = 0.3  # rad/s: no imaging satellite turns so fast
-_UNIT = 1e-3  # by which the length of a quaternion may miss 1
+_QUATERNION_TOLERANCE = 1e-3  # by which the length of a quaternion may miss 1
 _RADII = (6.5e6, 8e6)  # m from the Earth's centre
 _ORBIT, _RATE = 7e6, 1.2e-3  # m, rad/s: radius and turn of an orbit: of its Taylor series in time
-_DEGREES, _EXACT = range(2, 7), 1e-5  # m: the first degree whose next term is smaller is taken
+_ATTITUDE_DEGREES, _ATTITUDE_TERM_TOLERANCE = (
+    range(2, 7),
+    1e-5,
+)  # m: the first degree whose next term is smaller is taken
 _SCATTER = 0.01  # m, RMS: samples farther from the polynomial are not noise
-_OFF = 700.0  # m/s: by more than the Earth's rotation no stated velocity differs from that of the positions
+_MAX_VELOCITY_DIFFERENCE = (
+    700.0  # m/s: by more than the Earth's rotation no stated velocity differs from that of the positions
+)
 
-_TABLES = {"EPH": (13, 7), "ATT": (15, 5)}  # numbers of a row: with covariances, without
-_LIGHT = Light(aberration=True, refraction=True)  # star trackers tell where the body points
-_UNITS = (1.0, 1e-3, 1e-6)  # s: that LINE_PERIOD may be in
-_AGREE = 0.01  # relative: by how much LINE_PERIOD may miss what START and END say
+_SAMPLE_LISTS = {"EPH": (13, 7), "ATT": (15, 5)}  # numbers of a row: with covariances, without
+_STAR_TRACKER_LIGHT = Light(aberration=True, refraction=True)  # star trackers tell where the body points
+_PERIOD_UNITS = (1.0, 1e-3, 1e-6)  # s: that LINE_PERIOD may be in
+_LINE_PERIOD_TOLERANCE = 0.01  # relative: by how much LINE_PERIOD may miss what START and END say
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +116,14 @@ def _track(times: Array, positions: Array) -> Curve:
     Dense samples scatter by millimetres, which a curve through them all carries beyond the first by centimetres.
     """
     half = 0.5 * (times[-1] - times[0])
-    degree = next((d for d in _DEGREES if _ORBIT * (_RATE * half) ** (d + 1) < _EXACT * math.factorial(d + 1)), 0)
+    degree = next(
+        (
+            d
+            for d in _ATTITUDE_DEGREES
+            if _ORBIT * (_RATE * half) ** (d + 1) < _ATTITUDE_TERM_TOLERANCE * math.factorial(d + 1)
+        ),
+        0,
+    )
     if degree and len(times) > degree + 1:
         since = times - times[0]
         coeffs = polyfit(since, positions, degree)
@@ -123,7 +135,7 @@ def _track(times: Array, positions: Array) -> Curve:
 def unit(quaternions: Array, name: str) -> Array:
     """Return quaternions (N, 4) scaled to length 1; RpcFormatError where theirs is another."""
     length = np.linalg.norm(quaternions, axis=1)
-    if not (np.abs(length - 1.0) < _UNIT).all():
+    if not (np.abs(length - 1.0) < _QUATERNION_TOLERANCE).all():
         raise RpcFormatError(f"{name}: a quaternion of length {length[np.abs(length - 1).argmax()]:.4g}, not 1")
     return np.asarray(quaternions / length[:, None])
 
@@ -133,13 +145,13 @@ def _check_times(times: Array, span: tuple[float, float], what: str, name: str) 
     if len(times) < 4 or not (steps > 0).all():
         raise RpcFormatError(f"{name}: {len(times)} {what}, or their times do not rise; four or more are needed")
     usual = float(np.median(steps))
-    margin = min(EXTRAPOLATION, 0.5 * _GAP * usual)  # as far as from a sample in the longest gap
+    margin = min(EXTRAPOLATION, 0.5 * _GAP_STEPS * usual)  # as far as from a sample in the longest gap
     if times[0] - margin > span[0] or times[-1] + margin < span[1]:
         raise RpcFormatError(
             f"{name}: the image lasts from {span[0]:.2f} to {span[1]:.2f} s, its {what} from {times[0]:.2f} to "
             f"{times[-1]:.2f} s; is the list complete?"
         )
-    gap = (steps > _GAP * usual) & (times[1:] > span[0]) & (times[:-1] < span[1])
+    gap = (steps > _GAP_STEPS * usual) & (times[1:] > span[0]) & (times[:-1] < span[1])
     if gap.any():
         at = int(np.argmax(gap))
         raise RpcFormatError(
@@ -157,7 +169,7 @@ def _check_orbit(samples: Samples) -> None:
         )
     moved = np.gradient(samples.positions, samples.times, axis=0)
     off = np.linalg.norm(moved - samples.velocities, axis=1)[1:-1]
-    if not off.max() < _OFF:
+    if not off.max() < _MAX_VELOCITY_DIFFERENCE:
         raise RpcFormatError(
             f"{samples.name}: positions move by {off.max():.4g} m/s otherwise than their stated velocities; are the "
             "times right?"
@@ -196,10 +208,10 @@ def read_linescan(
     RpcFormatError
         There is no such model, or it is damaged.
     """
-    root = Fields(parse_xml(path, strip_namespaces=True), str(path))
-    vendor = _VENDORS.get(root.element.tag)
+    root = XmlFields(parse_xml(path, strip_namespaces=True), str(path))
+    vendor = _VENDOR_READERS.get(root.element.tag)
     if vendor is None:
-        known = ", ".join(f"<{tag}>" for tag in _VENDORS)
+        known = ", ".join(f"<{tag}>" for tag in _VENDOR_READERS)
         raise RpcFormatError(
             f"{path}: no physical camera model; its root is <{root.element.tag}>, expected one of {known}"
         )
@@ -211,14 +223,14 @@ def read_linescan(
     return replace(found, model=replace(found.model, light=light), kind=kind)
 
 
-def camera_of_isd(root: Fields, band: str | None = None) -> tuple[Linescan, Light]:
+def camera_of_isd(root: XmlFields, band: str | None = None) -> tuple[Linescan, Light]:
     """Return the model of an ISD, and how light bends; InputError where `band` is none of its bands."""
     level = root.text("IMD/PRODUCTLEVEL")
     if "1B" not in level.upper():
         raise RpcFormatError(f"{root.name}: a product of level {level}, resampled: only 1B has a physical model")
     size = root.size("IMD/NUMCOLUMNS", "IMD/NUMROWS")
     period, first = _isd_lines(root, size[1])
-    (times, orbit), (ticks, attitude) = (_table(root, part, first) for part in _TABLES)
+    (times, orbit), (ticks, attitude) = (_sample_table(root, part, first) for part in _SAMPLE_LISTS)
     body = Rotation.from_quat(unit(attitude[:, 1:5], root.name))
     camera = root.one("GEO/CAMERA_ATTITUDE")
     mounting = np.array([camera.number(f"QCS{k}") for k in (1, 2, 3, 4)])
@@ -231,10 +243,10 @@ def camera_of_isd(root: Fields, band: str | None = None) -> tuple[Linescan, Ligh
         positions = positions + body.apply(arm)
     samples = Samples(root.name, times, positions, orbit[:, 4:7], ticks, quaternions)
     detector = Detector(_isd_look(root, band), 0.0, period, size)
-    return camera_of_samples(samples, detector, _sigma(orbit, attitude)), _LIGHT
+    return camera_of_samples(samples, detector, _sigma(orbit, attitude)), _STAR_TRACKER_LIGHT
 
 
-def _isd_lines(root: Fields, rows: int) -> tuple[float, np.datetime64]:
+def _isd_lines(root: XmlFields, rows: int) -> tuple[float, np.datetime64]:
     """Time from one row to the next [s], and the time of row 0."""
     image = root.one("IMD/IMAGE")
     table = np.array([row.numbers(".", 2) for row in image.all("TLCLISTList/TLCLIST")]).reshape(-1, 2)
@@ -250,7 +262,7 @@ def _isd_lines(root: Fields, rows: int) -> tuple[float, np.datetime64]:
     if not 0 < abs(period) < 1:
         raise RpcFormatError(f"{root.name}: TLCLIST gives {period:g} s a row")
     bent = np.abs(start + period * (table[:, 0] - line) - table[:, 1]).max() / abs(period)
-    if not bent <= STRAIGHT:
+    if not bent <= LINE_TIME_TOLERANCE:
         raise RpcFormatError(f"{root.name}: the line rate changes ({bent:.3g} rows in TLCLIST), which is not read")
     begins = start - period * line
     first = image.time("TLCTIME") + np.timedelta64(round(begins * 1e9), "ns")
@@ -260,7 +272,7 @@ def _isd_lines(root: Fields, rows: int) -> tuple[float, np.datetime64]:
     return period, first
 
 
-def _table(root: Fields, part: str, epoch: np.datetime64) -> tuple[Array, Array]:
+def _sample_table(root: XmlFields, part: str, epoch: np.datetime64) -> tuple[Array, Array]:
     """Return the times [s from the epoch] and rows of EPHEMLIST or ATTLIST."""
     of, tag = root.one(part), f"{part}{'EM' * (part == 'EPH')}LIST"
     stated = int(of.positive("NUMPOINTS"))
@@ -268,17 +280,17 @@ def _table(root: Fields, part: str, epoch: np.datetime64) -> tuple[Array, Array]
     if len(rows) != stated:
         raise RpcFormatError(f"{root.name}: {tag} holds {len(rows)} of {stated} samples; is the file complete?")
     widths = {len(row) for row in rows}
-    if len(widths) != 1 or not widths <= set(_TABLES[part]):
+    if len(widths) != 1 or not widths <= set(_SAMPLE_LISTS[part]):
         raise RpcFormatError(
             f"{root.name}: rows of {tag} hold {', '.join(map(str, sorted(widths)))} numbers, expected "
-            + " or ".join(map(str, _TABLES[part]))
+            + " or ".join(map(str, _SAMPLE_LISTS[part]))
         )
     table = np.array(rows)
     start = seconds(of.time("STARTTIME"), epoch)
     return start + of.positive("TIMEINTERVAL", 100.0) * (table[:, 0] - 1.0), table
 
 
-def _isd_look(root: Fields, band: str | None) -> Array:
+def _isd_look(root: XmlFields, band: str | None) -> Array:
     """Return the detector line in the focal plane, as `Pushbroom.look` of the column."""
     geo = root.one("GEO")
     if geo.number("OPTICAL_DISTORTION/POLYORDER") >= 0:
@@ -303,14 +315,14 @@ def _sigma(orbit: Array, attitude: Array) -> tuple[float, float] | None:
 
     A turn by the small angle w changes the quaternion by w / 2.
     """
-    if orbit.shape[1] < _TABLES["EPH"][0] or attitude.shape[1] < _TABLES["ATT"][0]:
+    if orbit.shape[1] < _SAMPLE_LISTS["EPH"][0] or attitude.shape[1] < _SAMPLE_LISTS["ATT"][0]:
         return None
     turn = 4.0 * attitude[:, [5, 9, 12, 14]].sum(axis=1).mean() / 3.0
     place = orbit[:, [7, 10, 12]].sum(axis=1).mean() / 3.0
     return (math.sqrt(turn), math.sqrt(place)) if turn > 0 and place > 0 else None
 
 
-def camera_of_dimap(root: Fields, band: str | None = None) -> tuple[Linescan, Light]:
+def camera_of_dimap(root: XmlFields, band: str | None = None) -> tuple[Linescan, Light]:
     """Return the model of a DIMAP, and how light bends; InputError where `band` is none of its bands."""
     if root.element.find("Geometric_Data/Refined_Model") is None:
         raise RpcFormatError(f"{root.name}: no Geometric_Data/Refined_Model: it holds no physical camera model")
@@ -318,7 +330,7 @@ def camera_of_dimap(root: Fields, band: str | None = None) -> tuple[Linescan, Li
     size = root.one("Raster_Data/Raster_Dimensions").size("NCOLS", "NROWS")
     first, period = _dimap_lines(model, size[1])
     points = model.all("Ephemeris/Point_List/Point")
-    times = _times(points, first)
+    times = _sample_times(points, first)
     positions, velocities = (
         np.array([point.numbers(tag, 3, ",") for point in points]).reshape(-1, 3)
         for tag in ("LOCATION_XYZ", "VELOCITY_XYZ")
@@ -329,30 +341,30 @@ def camera_of_dimap(root: Fields, band: str | None = None) -> tuple[Linescan, Li
     return camera_of_samples(samples, Detector(look, origin, period, size)), _light(root)
 
 
-def _times(parts: list[Fields], epoch: np.datetime64) -> Array:
+def _sample_times(parts: list[XmlFields], epoch: np.datetime64) -> Array:
     return np.array([seconds(part.time("TIME"), epoch) for part in parts])
 
 
-def _dimap_lines(model: Fields, rows: int) -> tuple[np.datetime64, float]:
+def _dimap_lines(model: XmlFields, rows: int) -> tuple[np.datetime64, float]:
     """Time of row 0, and from one row to the next [s], in the unit that agrees with the time of the last."""
     span = model.one("Time/Time_Range")
     start, lasts = span.time("START"), seconds(span.time("END"), span.time("START"))
     stated = model.positive("Time/Time_Stamp/LINE_PERIOD")
-    for scale in _UNITS:
-        if abs(stated * scale * rows - lasts) <= _AGREE * lasts + 2 * stated * scale:
+    for scale in _PERIOD_UNITS:
+        if abs(stated * scale * rows - lasts) <= _LINE_PERIOD_TOLERANCE * lasts + 2 * stated * scale:
             return start, stated * scale
     raise RpcFormatError(
         f"{model.name}: LINE_PERIOD {stated:g} times {rows} rows is not the {lasts:g} s from START to END, in no unit"
     )
 
 
-def _attitude(attitudes: Fields, first: np.datetime64, lasts: float) -> tuple[Array, Array]:
+def _attitude(attitudes: XmlFields, first: np.datetime64, lasts: float) -> tuple[Array, Array]:
     """Return the times [s from the first row] and quaternions, scalar first."""
     listed = attitudes.all("Quaternion_List/Quaternion")
     if listed:
-        return _times(listed, first), np.array([[q.number(f"Q{k}") for k in range(4)] for q in listed])
+        return _sample_times(listed, first), np.array([[q.number(f"Q{k}") for k in range(4)] for q in listed])
     poly = attitudes.one("Polynomial_Quaternions")
-    ticks = np.arange(-EXTRAPOLATION, lasts + EXTRAPOLATION + STEP, STEP)
+    ticks = np.arange(-EXTRAPOLATION, lasts + EXTRAPOLATION + ATTITUDE_STEP, ATTITUDE_STEP)
     days = first.astype("datetime64[D]") + np.arange(-1, 2)  # OFFSET counts from a midnight
     since = min(seconds(first, days.astype("datetime64[ns]")) - poly.number("OFFSET"), key=abs)
     scaled = (ticks + since) / poly.positive("SCALE")
@@ -364,7 +376,7 @@ def _attitude(attitudes: Fields, first: np.datetime64, lasts: float) -> tuple[Ar
     return ticks, np.stack(values, axis=1)
 
 
-def _dimap_look(calibration: Fields, band: str | None) -> tuple[Array, float]:
+def _dimap_look(calibration: XmlFields, band: str | None) -> tuple[Array, float]:
     """Return `Pushbroom.look` and its origin."""
     bands = calibration.all("Band_Calibration_List/Band_Calibration")
     names = [part.element.findtext("BAND_ID", "").strip() for part in bands]
@@ -380,18 +392,21 @@ def _dimap_look(calibration: Fields, band: str | None) -> tuple[Array, float]:
     return padded(tangents) * [[1.0], [-1.0]], origin
 
 
-def _tangents(angles: Fields, axis: str) -> list[float]:
+def _tangents(angles: XmlFields, axis: str) -> list[float]:
     """Return the coefficients of one look angle, ascending, as many as there are."""
     tags = takewhile(lambda tag: angles.element.find(tag) is not None, (f"{axis}LOS_{k}" for k in count()))
     return [angles.number(tag) for tag in tags]
 
 
-def _light(root: Fields) -> Light:
+def _light(root: XmlFields) -> Light:
     """Return the light bending that the product's settings state: none (Pleiades), refraction (Neo)."""
     stated = "Processing_Information/Product_Settings/Geometric_Settings/{}_SETTING"
     said = (root.element.findtext(stated.format(w), "") for w in ("LIGHT_SPEED", "ATMOSPHERIC_REFRACTION"))
     return Light(*(text.strip().lower() == "true" for text in said))
 
 
-_VENDORS = {"isd": (camera_of_isd, "maxar physical model"), "Dimap_Document": (camera_of_dimap, "dimap physical model")}
+_VENDOR_READERS = {
+    "isd": (camera_of_isd, "maxar physical model"),
+    "Dimap_Document": (camera_of_dimap, "dimap physical model"),
+}
 """Root of the document -> its reader and the kind of camera."""

@@ -23,7 +23,7 @@ from barpc.base.errors import RpcError
 from barpc.base.geodesy import (
     EARTH_RATE,
     NEWTON_STEPS,
-    SETTLED,
+    NEWTON_TOLERANCE,
     SPEED_OF_LIGHT,
     WGS84_A,
     WGS84_B,
@@ -39,7 +39,7 @@ from barpc.sensor.curve import EXTRAPOLATION, Curve, Turn, cross
 
 _AIR = 2.316  # m: of refraction at sea level, times tan z / cos^2 z of the zenith distance z (Noerdlinger 1999)
 _AIR_HEIGHT = 8000.0  # m: in which the air thins to 1/e
-_ELLIPSOID = np.array([[WGS84_A], [WGS84_A], [WGS84_B]]) ** -2.0  # its quadric grows along the vertical
+_ELLIPSOID_QUADRIC = np.array([[WGS84_A], [WGS84_A], [WGS84_B]]) ** -2.0  # its quadric grows along the vertical
 _BENDS = 3  # light is bent by 3e-5: each step gains four digits
 _GRAZING = 0.1  # cosine of the zenith distance below which refraction is not this simple
 
@@ -82,11 +82,11 @@ class Light:
 
         Altitudes are of the quadric through a point, to 1e-4 m up to 9 km; verticals of where it stands on the ground.
         """
-        vertical = ecef * _ELLIPSOID
+        vertical = ecef * _ELLIPSOID_QUADRIC
         level = np.sqrt((ecef * vertical).sum(axis=0))
         length = np.sqrt((vertical * vertical).sum(axis=0))
         alt = (level - 1.0) * level / length
-        vertical = (ecef - (alt / length) * vertical) * _ELLIPSOID
+        vertical = (ecef - (alt / length) * vertical) * _ELLIPSOID_QUADRIC
         vertical = vertical / np.sqrt((vertical * vertical).sum(axis=0))
         along = sight / np.sqrt((sight * sight).sum(axis=0))
         cosine = -(vertical * along).sum(axis=0)
@@ -264,7 +264,11 @@ class Pushbroom(Pointwise):
             d_col = (rate[0] * miss[1] - rate[1] * miss[0]) / det
             time = np.clip(time + d_time, start, stop)
             col = col + d_col
-            settled = (np.abs(d_time) < SETTLED * abs(self.line_period)) & (np.abs(d_col) < SETTLED) & (depth > 0)
+            settled = (
+                (np.abs(d_time) < NEWTON_TOLERANCE * abs(self.line_period))
+                & (np.abs(d_col) < NEWTON_TOLERANCE)
+                & (depth > 0)
+            )
             if not (~settled & np.isfinite(col) & np.isfinite(time)).any():
                 break
         out = np.stack([col, (time - self.first_line) / self.line_period])
@@ -348,7 +352,7 @@ class Frame(Pointwise):
     def _farther(self, radius: Array) -> Array:
         """Return how much (N,) farther out than its tangents a place in the focal plane is; NaN if nowhere."""
         slope, found = polyder(self.distortion), radius
-        settled = SETTLED * float(np.abs(self.plane[:, :2]).max())  # focal lengths
+        settled = NEWTON_TOLERANCE * float(np.abs(self.plane[:, :2]).max())  # focal lengths
         step = np.zeros_like(radius)
         for _ in range(NEWTON_STEPS):
             square = found**2

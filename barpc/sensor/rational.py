@@ -22,7 +22,7 @@ MONOMIALS = (
 POWERS = np.array([[monomial.count(letter) for letter in "LPH"] for monomial in MONOMIALS])
 """Powers (20, 3) of L, P and H in them."""
 
-REACH = 1.25  # the cubic inverse is trusted this far out of the box; what lies beyond is solved with care
+TRUSTED_REACH = 1.25  # the cubic inverse is trusted this far out of the box; what lies beyond is solved with care
 
 
 def _derivative_matrices() -> Array:
@@ -114,7 +114,7 @@ class Rational:
         if long.any():
             long = ~(self._step(target, x, work) <= inverse.safe_step)
         out = np.abs(x).max(axis=0)
-        bad = np.flatnonzero(long | ~(out <= REACH))
+        bad = np.flatnonzero(long | ~(out <= TRUSTED_REACH))
         ok = np.ones(len(z), dtype=bool)
         if len(bad):
             near = np.abs(self.value(x[:, bad]) - target[:, bad]) <= self._tolerance(target[:, bad])

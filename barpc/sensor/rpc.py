@@ -16,21 +16,21 @@ import numpy as np
 from barpc.base.errors import RpcError
 from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array, BoolArray, IntArray, pointwise, wrap_longitude
 from barpc.sensor import Pointwise, SensorModel
-from barpc.sensor.rational import DERIVATIVE, REACH, Rational, monomials
+from barpc.sensor.rational import DERIVATIVE, TRUSTED_REACH, Rational, monomials
 
 _RASTERIO = [
     *(f"{axis}_{part}" for part in ("off", "scale") for axis in ("line", "samp", "lat", "long", "height")),
     *(f"{axis}_{part}_coeff" for axis in ("line", "samp") for part in ("num", "den")),
 ]
-_RPCM = [
+_RPCM_ATTRIBUTES = [
     *(f"{axis}_{part}" for part in ("offset", "scale") for axis in ("row", "col", "lat", "lon", "alt")),
     *(f"{axis}_{part}" for axis in ("row", "col") for part in ("num", "den")),
 ]
 _RPCM_DIRECT = ["lon_num", "lon_den", "lat_num", "lat_den"]
 _ACCURACIES = ["err_bias", "err_rand"]
 _ACCURACY = 1e-9  # px: a localised point must project this near to where it was asked (plus rounding)
-_MANY = 1024  # points of a view: its own inverse is sooner made
-_SHRINK = 0.25  # of the step before: nothing singular is near (Kantorovich: a half)
+_MAX_BATCHED_POINTS = 1024  # points of a view: its own inverse is sooner made
+_NEWTON_SHRINK = 0.25  # of the step before: nothing singular is near (Kantorovich: a half)
 _ARRIVED = 1e-6  # of the box's half width: a step is squared, and what it leaves is below rounding
 
 
@@ -147,7 +147,7 @@ class RPC(Pointwise):
     def from_rpcm(cls, model: Any) -> RPC:
         """Return the RPC of an ``rpcm.RPCModel``, its localisation RPC with it; RpcError where it lacks a number."""
         direct = [getattr(model, name, None) for name in _RPCM_DIRECT]
-        rpc = cls._of_attributes(model, _RPCM)
+        rpc = cls._of_attributes(model, _RPCM_ATTRIBUTES)
         return rpc if None in direct else replace(rpc, direct=np.array(direct, dtype=np.float64))
 
     def to_rpcm_dict(self) -> dict[str, Any]:
@@ -160,7 +160,7 @@ class RPC(Pointwise):
         >>> RPC.from_rpcm(SimpleNamespace(**rpc.to_rpcm_dict())) == rpc
         True
         """
-        named = dict(zip(_RPCM, self.numbers(), strict=True))
+        named = dict(zip(_RPCM_ATTRIBUTES, self.numbers(), strict=True))
         if self.direct is not None:
             named |= dict(zip(_RPCM_DIRECT, self.direct.tolist(), strict=True))
         return named | {key: value for key in _ACCURACIES if (value := getattr(self, key))}
@@ -236,8 +236,8 @@ class RPC(Pointwise):
         x += self.ground_offset[:, None]
         x[2] = alt
         ground = x.T
-        span = REACH * np.abs(self.ground_scale)
-        if not (reach <= REACH and span[0] < 180.0 and np.abs(self.ground_offset[1]) + span[1] < 90.0):
+        span = TRUSTED_REACH * np.abs(self.ground_scale)
+        if not (reach <= TRUSTED_REACH and span[0] < 180.0 and np.abs(self.ground_offset[1]) + span[1] < 90.0):
             ok &= self._holds(ground, image)
         ground[~ok] = np.nan
         return ground
@@ -348,7 +348,7 @@ class RpcStack:
     ) -> list[Array]:
         """Return what cameras give (..., n) for points: few of RPCs together, else by the camera's method `name`."""
         out = [np.empty((*shape, len(given[0]))) for shape in shapes]
-        few = self.is_rpc & (np.diff(bounds) <= _MANY) & (len(self.sensors) > 1)
+        few = self.is_rpc & (np.diff(bounds) <= _MAX_BATCHED_POINTS) & (len(self.sensors) > 1)
         for views in self.runs(bounds, few):
             rows = slice(bounds[views.start], bounds[views.stop])
             part = [array[rows] for array in given]
@@ -429,9 +429,9 @@ def _newton(stack: RpcStack, image: Array, alt: Array, views: slice, bounds: Int
             step = np.stack([d * col - b * row, a * row - c * col]) / (a * d - b * c)
         ground[:2] += step
         size = np.abs(step / scale[:2]).max(axis=0)
-        certain &= size <= np.maximum(_SHRINK * before, _ARRIVED)
+        certain &= size <= np.maximum(_NEWTON_SHRINK * before, _ARRIVED)
         if not certain.any() or size[certain].max() <= _ARRIVED:
             break
         before = size
-    certain &= (size <= _ARRIVED) & (np.abs(ground - offset) <= REACH * np.abs(scale)).all(axis=0)
+    certain &= (size <= _ARRIVED) & (np.abs(ground - offset) <= TRUSTED_REACH * np.abs(scale)).all(axis=0)
     return ground, certain

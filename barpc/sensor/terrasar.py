@@ -16,24 +16,24 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 
 from barpc.base.errors import BarpcWarning, InputError, RpcError, RpcFormatError
-from barpc.base.sidefile import parse_xml
+from barpc.base.safe_io import parse_xml
 from barpc.sensor.curve import fit_orbit
-from barpc.sensor.document import RELIEF_AROUND, Fields, seconds, warn_off_grid
+from barpc.sensor.document import RELIEF_AROUND, XmlFields, seconds, warn_off_grid
 from barpc.sensor.sentinel1.frames import SlantFrame
 from barpc.sensor.sentinel1.range_doppler import RELIEF, RangeDoppler
 
 ROOT = "level1Product"
 
-_NAME = "*1_SAR__*.xml"  # TSX1, TDX1, PAZ1
-_MODES = ("SM", "SL", "HS", "HS300", "ST")  # ScanSAR stores its bursts apart
-_FRAME = re.compile(r"(WGS-?84|ITRF|IG[Sb])[-_ ()G\d]*")  # of any year: they agree to centimetres
-_AGREE = 2.0  # rows or columns that first and last may be off their number times their interval
+_PRODUCT_PATTERN = "*1_SAR__*.xml"  # TSX1, TDX1, PAZ1
+_IMAGING_MODES = ("SM", "SL", "HS", "HS300", "ST")  # ScanSAR stores its bursts apart
+_REFERENCE_FRAME = re.compile(r"(WGS-?84|ITRF|IG[Sb])[-_ ()G\d]*")  # of any year: they agree to centimetres
+_SPAN_TOLERANCE = 2.0  # rows or columns that first and last may be off their number times their interval
 _LATEST = 1e-3  # s: no stated delay is longer
 
 
 def find_annotation(folder: Path) -> Path | None:
     """Return the annotation in a product folder; None where it is not one."""
-    found = sorted(folder.glob(_NAME))
+    found = sorted(folder.glob(_PRODUCT_PATTERN))
     return found[0] if len(found) == 1 else None
 
 
@@ -53,10 +53,10 @@ def open_terrasar(path: str | Path) -> RangeDoppler:
     """
     path = Path(path)
     file = (find_annotation(path) or path) if path.is_dir() else path
-    root = Fields(parse_xml(file, strip_namespaces=True), str(file))
+    root = XmlFields(parse_xml(file, strip_namespaces=True), str(file))
     if root.element.tag != ROOT:
         raise RpcFormatError(f"{file}: no TerraSAR-X annotation; its root is <{root.element.tag}>, not <{ROOT}>")
-    _refuse(root)
+    _refuse_other_geometry(root)
     path = file.parent / "ANNOTATION" / "GEOREF.xml"
     if not path.exists():
         warnings.warn(
@@ -65,12 +65,12 @@ def open_terrasar(path: str | Path) -> RangeDoppler:
             stacklevel=2,
         )
         return _model(root, (0.0, 0.0))
-    georef = Fields(parse_xml(path, strip_namespaces=True), str(path))
-    late = (_stated(georef, "rangeDelay", root), _stated(georef, "azimuthShift", root))
-    return _held(_model(root, late), georef, late)
+    georef = XmlFields(parse_xml(path, strip_namespaces=True), str(path))
+    late = (_delay_sum(georef, "rangeDelay", root), _delay_sum(georef, "azimuthShift", root))
+    return _checked_by_grid(_model(root, late), georef, late)
 
 
-def _refuse(root: Fields) -> None:
+def _refuse_other_geometry(root: XmlFields) -> None:
     """InputError for what has another geometry."""
     projection = root.text("productInfo/productVariantInfo/projection")
     if projection != "SLANTRANGE":
@@ -78,8 +78,8 @@ def _refuse(root: Fields) -> None:
             f"{root.name}: a product in {projection[:20]} projection, which is not read: take the slant range one (SSC)"
         )
     mode = root.text("productInfo/acquisitionInfo/imagingMode")
-    if mode not in _MODES:
-        raise InputError(f"{root.name}: an image of mode {mode[:20]}, read are {', '.join(_MODES)}")
+    if mode not in _IMAGING_MODES:
+        raise InputError(f"{root.name}: an image of mode {mode[:20]}, read are {', '.join(_IMAGING_MODES)}")
     if "_BRX" in root.one("generalHeader").element.get("fileName", ""):
         raise InputError(f"{root.name}: received by another satellite than sent, only monostatic images are read")
     image = root.one("productSpecific/complexImageInfo")
@@ -88,7 +88,7 @@ def _refuse(root: Fields) -> None:
             raise InputError(f"{root.name}: {tag} is {image.text(tag)[:40]}, only {known} is read")
 
 
-def _model(root: Fields, late: tuple[float, float]) -> RangeDoppler:
+def _model(root: XmlFields, late: tuple[float, float]) -> RangeDoppler:
     """Return the model whose times of range and azimuth are later [s] than geometry has them."""
     scene, raster = root.one("productInfo/sceneInfo"), root.one("productInfo/imageDataInfo/imageRaster")
     size = raster.size("numberOfColumns", "numberOfRows")
@@ -96,12 +96,12 @@ def _model(root: Fields, late: tuple[float, float]) -> RangeDoppler:
     spans = (scene.positive("rangeTime/lastPixel", 1.0) - near, seconds(scene.time("stop/timeUTC"), start))
     steps = [raster.positive(f"{along}Spacing", 1.0) for along in ("row", "column")]  # from column to column
     for step, span, count, what in zip(steps, spans, size, ("columns", "rows"), strict=True):
-        if not abs(span / step - (count - 1)) <= _AGREE:
+        if not abs(span / step - (count - 1)) <= _SPAN_TOLERANCE:
             raise RpcFormatError(
                 f"{root.name}: {count} {what} every {step:g} s do not last the {span:g} s from the first to the last"
             )
     frame = root.element.findtext("platform/orbit/orbitHeader/stateVectorRefFrame", "WGS84").strip()
-    if not _FRAME.fullmatch(frame):
+    if not _REFERENCE_FRAME.fullmatch(frame):
         raise RpcFormatError(f"{root.name}: state vectors in {frame[:20]}, WGS84 or ITRF is needed")
     epoch = start - np.timedelta64(round(late[1] * 1e9), "ns")
     vectors = root.all("platform/orbit/stateVec")
@@ -124,7 +124,7 @@ def _model(root: Fields, late: tuple[float, float]) -> RangeDoppler:
     )
 
 
-def _stated(georef: Fields, kind: str, root: Fields) -> float:
+def _delay_sum(georef: XmlFields, kind: str, root: XmlFields) -> float:
     """Return the sum of the delays of one kind at mid range [s]."""
     ends = [root.number(f"productInfo/sceneInfo/rangeTime/{end}Pixel") for end in ("first", "last")]
     total = 0.0
@@ -136,7 +136,7 @@ def _stated(georef: Fields, kind: str, root: Fields) -> float:
     return total
 
 
-def _held(model: RangeDoppler, georef: Fields, late: tuple[float, float]) -> RangeDoppler:
+def _checked_by_grid(model: RangeDoppler, georef: XmlFields, late: tuple[float, float]) -> RangeDoppler:
     """Return the model with the altitudes of the product's grid, which it is held against."""
     origin = georef.one("geolocationGrid/gridReferenceTime")
     since = seconds(origin.time("tReferenceTimeUTC"), model.epoch) - late[1]

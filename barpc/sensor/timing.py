@@ -16,7 +16,7 @@ from numpy.polynomial import polynomial
 
 from barpc.base.errors import RpcError
 from barpc.base.frozen import Frozen
-from barpc.base.geodesy import NEWTON_STEPS, SETTLED, Array, ground_from_ecef, pointwise, up, wrap_longitude
+from barpc.base.geodesy import NEWTON_STEPS, NEWTON_TOLERANCE, Array, ground_from_ecef, pointwise, up, wrap_longitude
 from barpc.sensor import Behind, Pointwise, SensorModel
 from barpc.sensor.curve import Curve, cross
 
@@ -70,10 +70,10 @@ def on_circle(
         turned = span * (across * np.cos(angle) + above * np.sin(angle))
         moved = (alt - ground[:, 2]) / dot(up(ground), turned)
         angle = angle + moved / distance
-        if not (np.abs(moved).max(initial=0.0, where=np.isfinite(moved)) > SETTLED):
+        if not (np.abs(moved).max(initial=0.0, where=np.isfinite(moved)) > NEWTON_TOLERANCE):
             break
     away, ground = at(angle)
-    ground[~(np.abs(ground[:, 2] - alt) <= SETTLED)] = np.nan
+    ground[~(np.abs(ground[:, 2] - alt) <= NEWTON_TOLERANCE)] = np.nan
     ground[:, 2] = alt
     return ground, -away
 

@@ -9,13 +9,15 @@ import numpy as np
 from scipy.special import pdtr
 
 from barpc.base.geodesy import Array
-from barpc.base.usual import LEVEL
+from barpc.base.statistics import LEVEL
 from barpc.scene import IntArray
 from barpc.tie.matchers.features import KeypointFiles
 
-PARTS = 64
+PARTS_PER_SIDE = 64
 """Equal parts of an image's columns, and of its rows, in which keypoints are counted."""
-_CHANCE = 1e-6 / (PARTS * (PARTS - 1) / 2)  # of a stretch, so that one of all in a million axes is found by chance
+_CHANCE_PER_PAIR = 1e-6 / (
+    PARTS_PER_SIDE * (PARTS_PER_SIDE - 1) / 2
+)  # of a stretch, so that one of all in a million axes is found by chance
 Seen = tuple[Array, Array, tuple[int, int]]
 """Matches of a view (M, 2) with a partner (M, 2) [px], and the partner's size."""
 
@@ -39,9 +41,9 @@ def seen_detail(files: KeypointFiles, size: tuple[int, int], partners: Sequence[
     keypoints = files.load()[0]
     xy, seen = keypoints.xy, np.zeros(len(keypoints), dtype=bool)
     for here, there, other in partners:
-        linear = np.linalg.lstsq(_design(here), there, rcond=None)[0]
-        relief = np.abs(there - _design(here) @ linear).max(axis=0)  # it may hide what is so near an edge
-        place = _design(xy) @ linear
+        linear = np.linalg.lstsq(_affine_design(here), there, rcond=None)[0]
+        relief = np.abs(there - _affine_design(here) @ linear).max(axis=0)  # it may hide what is so near an edge
+        place = _affine_design(xy) @ linear
         seen |= ((place >= relief) & (place <= np.array(other) - 1.0 - relief)).all(axis=1)
     every = [here @ [1.0, 1.0j] for here, _, _ in partners]
     ties = np.isin(xy @ [1.0, 1.0j], np.concatenate(every)) if every else seen
@@ -50,14 +52,14 @@ def seen_detail(files: KeypointFiles, size: tuple[int, int], partners: Sequence[
     return in_parts(xy[seen], size)
 
 
-def _design(xy: Array) -> Array:
+def _affine_design(xy: Array) -> Array:
     return np.column_stack([np.ones(len(xy)), xy])
 
 
 def in_parts(xy: Array, size: tuple[int, int]) -> IntArray:
     """Count points (N, 2) [px] in parts of columns and rows (2, PARTS)."""
     ends = [(-0.5, length - 0.5) for length in size]
-    return np.stack([np.histogram(xy[:, axis], PARTS, ends[axis])[0] for axis in (0, 1)]).astype(np.int64)
+    return np.stack([np.histogram(xy[:, axis], PARTS_PER_SIDE, ends[axis])[0] for axis in (0, 1)]).astype(np.int64)
 
 
 def gap(detail: IntArray, ties: IntArray, size: tuple[int, int]) -> Gap | None:
@@ -67,19 +69,21 @@ def gap(detail: IntArray, ties: IntArray, size: tuple[int, int]) -> Gap | None:
     fewer; the keypoints of all its parts are taken to be those of its poorest: water, with a shore, has none to lack.
     By chance (Poisson) they are as few as found once in a million images; and no more are found than may be wrong.
     """
-    start, stop = np.triu_indices(PARTS + 1, 2)  # in one part alone a shore may lie
-    before, after = np.maximum(2 * start - stop, 0), np.minimum(2 * stop - start, PARTS)
-    best, found = _CHANCE, None
+    start, stop = np.triu_indices(PARTS_PER_SIDE + 1, 2)  # in one part alone a shore may lie
+    before, after = np.maximum(2 * start - stop, 0), np.minimum(2 * stop - start, PARTS_PER_SIDE)
+    best, found = _CHANCE_PER_PAIR, None
     for axis in (0, 1):
         k, n = (np.append(0, np.cumsum(counts[axis])) for counts in (detail, ties))
         beside = [c[start] - c[before] + c[after] - c[stop] for c in (n, k)]
-        poorest = np.concatenate([np.minimum.accumulate(detail[axis, first:])[1:] for first in range(PARTS - 1)])
+        poorest = np.concatenate(
+            [np.minimum.accumulate(detail[axis, first:])[1:] for first in range(PARTS_PER_SIDE - 1)]
+        )
         rate = np.minimum(beside[0] / np.maximum(beside[1], 1), n[-1] / max(k[-1], 1))
         expected, seen = (stop - start) * poorest * rate, n[stop] - n[start]
         chance = np.where(seen <= LEVEL * expected, pdtr(seen, expected), 1.0)
         at = int(chance.argmin())
         if chance[at] < best:
-            best, side = float(chance[at]), size[axis] / PARTS
+            best, side = float(chance[at]), size[axis] / PARTS_PER_SIDE
             first, last = float(np.ceil(start[at] * side)), float(np.ceil(stop[at] * side) - 1.0)
             found = Gap(axis, first, last, int(seen[at]), round(float(expected[at])))
     return found

@@ -16,7 +16,7 @@ from rasterio.windows import Window
 from barpc.base.errors import ImageError
 from barpc.base.geodesy import Array
 from barpc.base.options import TieOptions
-from barpc.rasters.raster import BLOCK, open_raster
+from barpc.rasters.raster import BLOCK_SIZE, open_raster
 from barpc.scene import BoolArray
 
 FloatImage = npt.NDArray[np.float32]
@@ -28,11 +28,11 @@ Box = tuple[int, int, int, int]
 
 CELL = 64
 """Side of the cells that each hold a quota of keypoints [px]; tiles are whole cells."""
-SPAN = BLOCK
+SPAN = BLOCK_SIZE
 """Rows that are read at a time (at least one row of blocks), and what else is done in parts of so many."""
 PIECE = 1 << 22
 """Pixels of pictures, or places of templates in them, that are worked on together; decides on no figure."""
-_SAMPLES = 5  # blocks a side whose pixels make the stretch
+_STRETCH_BLOCKS = 5  # blocks a side whose pixels make the stretch
 _NEGLIGIBLE = 8.0  # a range below so many steps of a float type is a constant image
 
 
@@ -48,14 +48,14 @@ class Stretch:
         if pixels.dtype == np.float32:
             scaled = (pixels - np.float32(self.low)) * np.float32(255.0 / (self.high - self.low))
         else:
-            scaled = _levelled(pixels, self.low, self.high)
+            scaled = _contrast_stretched(pixels, self.low, self.high)
         if not valid.all():
             scaled = np.where(valid, scaled, scaled[valid].mean() if valid.any() else np.float32(0.0))
         picture: ByteImage = np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
         return picture
 
 
-def _levelled(pixels: Pixels, low: float, high: float) -> FloatImage:
+def _contrast_stretched(pixels: Pixels, low: float, high: float) -> FloatImage:
     """Return `low` and `high` as black and white; whatever the scale, nothing overflows."""
     with np.errstate(over="ignore"):
         share = (pixels / 2 - low / 2) / (high / 2 - low / 2)  # halves: a difference may have no number
@@ -76,7 +76,7 @@ def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
         low, high = known.min(), known.max()
     if not high > low:
         return np.zeros(pixels.shape, np.float32)
-    return np.where(valid, _levelled(pixels, float(low), float(high)), np.float32(0.0))
+    return np.where(valid, _contrast_stretched(pixels, float(low), float(high)), np.float32(0.0))
 
 
 def read_pixels(
@@ -103,17 +103,17 @@ class PixelReader(ExitStack):
     ) -> None:
         super().__init__()
         dataset = self.enter_context(open_raster(path))
-        wide, high = _pixel(dataset, size)
+        wide, high = _picture_factors(dataset, size)
         self._pixel = thin * wide, thin * high
         try:
-            self._band = _Band.of(dataset, path, band)
+            self._band = _RasterBand.of(dataset, path, band)
         except ImageError:
             self.close()
             raise
 
     def read(self, box: Box) -> tuple[Pixels, BoolArray]:
         """Read the pixels of a window and the mask of valid ones."""
-        return _averaged(self._band, box, self._pixel)
+        return _block_means(self._band, box, self._pixel)
 
 
 class OpenReaders(ExitStack):
@@ -131,13 +131,13 @@ class OpenReaders(ExitStack):
         return self._known[key]
 
 
-def _pixel(dataset: Any, size: tuple[int, int] | None) -> tuple[int, int]:
+def _picture_factors(dataset: Any, size: tuple[int, int] | None) -> tuple[int, int]:
     """Return the columns and rows of a raster that one pixel of its picture of a size (width, height) holds."""
     width, height = size or (dataset.width, dataset.height)
     return max(1, dataset.width // width), max(1, dataset.height // height)
 
 
-def _averaged(band: _Band, box: Box, pixel: tuple[int, int], level: int = 1) -> tuple[Pixels, BoolArray]:
+def _block_means(band: _RasterBand, box: Box, pixel: tuple[int, int], level: int = 1) -> tuple[Pixels, BoolArray]:
     """Return the pixels of a window whose sides hold so many of the file's, as means; valid where all of these are."""
     if pixel == (1, 1):
         return band.read(box, level)
@@ -155,7 +155,7 @@ def _averaged(band: _Band, box: Box, pixel: tuple[int, int], level: int = 1) -> 
 
 
 @dataclass(frozen=True, eq=False)
-class _Band:
+class _RasterBand:
     """A band of an open raster, and what is known of all its windows."""
 
     dataset: Any
@@ -165,7 +165,7 @@ class _Band:
     by_value: bool  # values alone tell which pixels are valid: GDAL would decode a window again for its mask
 
     @classmethod
-    def of(cls, dataset: Any, path: str | os.PathLike[str], number: int) -> _Band:
+    def of(cls, dataset: Any, path: str | os.PathLike[str], number: int) -> _RasterBand:
         """Return a band, from 1; there is none, or of complex numbers: ImageError."""
         if not 1 <= number <= dataset.count:
             raise ImageError(f"{os.fspath(path)}: there is no band {number}, only {dataset.count}")
@@ -205,15 +205,15 @@ def sample_stretch(path: str | os.PathLike[str], band: int = 1, size: tuple[int,
     """Estimate the stretch, 0.5 to 99.5 %, of a raster (or its picture); None where nothing varies."""
     found: list[Array] = []
     with open_raster(path) as dataset:
-        read = _Band.of(dataset, path, band)
+        read = _RasterBand.of(dataset, path, band)
         kind = np.dtype(dataset.dtypes[band - 1])
-        pixel, (width, height) = _pixel(dataset, size), size or (dataset.width, dataset.height)
-        zoom = _level(dataset, band) if pixel == (1, 1) else 1
+        pixel, (width, height) = _picture_factors(dataset, size), size or (dataset.width, dataset.height)
+        zoom = _overview_factor(dataset, band) if pixel == (1, 1) else 1
         side_x, side_y = (min(zoom * 2 * CELL, n) for n in (width, height))
-        for row in np.linspace(0, height - side_y, _SAMPLES).astype(int):
-            for col in np.linspace(0, width - side_x, _SAMPLES).astype(int):
+        for row in np.linspace(0, height - side_y, _STRETCH_BLOCKS).astype(int):
+            for col in np.linspace(0, width - side_x, _STRETCH_BLOCKS).astype(int):
                 box = int(col), int(row), side_x, side_y
-                pixels, valid = _averaged(read, box, pixel, zoom)
+                pixels, valid = _block_means(read, box, pixel, zoom)
                 found.append(pixels[valid][::7].astype(np.float64))
     values = np.concatenate(found)
     low, high = np.percentile(values, [0.5, 99.5]) if len(values) else (0.0, 0.0)
@@ -238,13 +238,13 @@ def survey(path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | 
     stretch = sample_stretch(path, band, size)
     with open_raster(path) as dataset:
         height, width = dataset.block_shapes[band - 1]
-        wide, high = pixel = _pixel(dataset, size)
-        levels = pixel == (1, 1) and _level(dataset, band) > 1
+        wide, high = pixel = _picture_factors(dataset, size)
+        levels = pixel == (1, 1) and _overview_factor(dataset, band) > 1
     block = max(1, width // wide), max(1, height // high)
     return None if stretch is None else Survey(stretch, block, levels, pixel)
 
 
-def _level(dataset: Any, band: int) -> int:
+def _overview_factor(dataset: Any, band: int) -> int:
     """Return so many pixels a side are seen as one at less cost: 4 (and 2, then) where decoding is dear, else 1."""
     return 4 if getattr(dataset, "driver", "") == "JP2OpenJPEG" and {2, 4} <= set(dataset.overviews(band)) else 1
 
@@ -261,13 +261,13 @@ def read_picture(
     valid = np.empty(picture.shape, dtype=bool)
     level = zoom if found.levels else 1
     with open_raster(path) as dataset:
-        read = _Band.of(dataset, path, band)
+        read = _RasterBand.of(dataset, path, band)
         step = zoom * found.block[1]
         step *= max(1, SPAN // step)
         top = row
         while top < row + height:
             stop = min(row + height, (top // step + 1) * step)
-            pixels, known = _averaged(read, (col, top, width, stop - top), found.pixel, level)
+            pixels, known = _block_means(read, (col, top, width, stop - top), found.pixel, level)
             part = slice((top - row) // zoom, (stop - row) // zoom)
             picture[part], valid[part] = _reduced(found.stretch.apply(pixels, known), known, zoom // level)
             top = stop

@@ -1,9 +1,9 @@
 """Control from a reference orthoimage: it and an image, brought onto one grid on the ground, are matched densely.
 
 An image is projected through its camera and the terrain onto a local grid, at the coarser of the two resolutions. First
-many blocks vote together for one shift of the whole camera, within `REACH` metres; how far the peak stands above the
-rest of the sum says whether this is the same place. With the camera moved so, points on a regular grid on the ground,
-the same for all views, are looked for one by one (`barpc.tie.patches.channels`), and those are kept that agree.
+many blocks vote together for one shift of the whole camera, within `VOTE_RADIUS` metres; how far the peak stands above
+the rest of the sum says whether this is the same place. With the camera moved so, points on a regular grid on the
+ground, the same for all views, are looked for one by one (`barpc.tie.patches.channels`), and those are kept that agree.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ import numpy as np
 
 from barpc.base.geodesy import NEWTON_STEPS, Array, metres_per_unit
 from barpc.base.options import TieOptions
-from barpc.base.usual import MAD, SURELY, robust_spread
+from barpc.base.statistics import MAD, SURELY, robust_spread
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
-from barpc.tie.matchers.structural import POINTS
+from barpc.tie.matchers.structural import GRID_POINTS
 from barpc.tie.pairing.overlaps import Terrain
-from barpc.tie.patches.channels import EDGE, Patch, Sheet, correlation, of_image, of_reference, shown
+from barpc.tie.patches.channels import INVALID_MARGIN, Patch, Sheet, correlation, of_image, of_reference, picture_share
 from barpc.tie.patches.oriented import HALF, PatchTile
 from barpc.tie.pixels import CELL, SPAN, FloatImage
 from barpc.tie.tasks import HERE, Work
 
-REACH = 150.0  # m: how far a camera may be off
+VOTE_RADIUS = 150.0  # m: how far a camera may be off
 PEAK = 6.5  # a vote that stands out by fewer standard deviations is none: other places reach 5.1
 _SEARCH = 6, 5.0  # px and m: what the vote and the terrain leave, together
-_FINE, _BLOCKS = 2.0, 8  # of the first vote: m a pixel, at least; blocks along a side
-_SHOWN = 0.5, 0.3  # of a block and of the reference around it
-_LEAST = TieOptions().min_matches  # points that agree in a view
-_MARGIN = 0.1  # by which a correlation beats its decoy's
+_VOTE_RESOLUTION, _BLOCKS = 2.0, 8  # of the first vote: m a pixel, at least; blocks along a side
+_MIN_PICTURE_SHARES = 0.5, 0.3  # of a block and of the reference around it
+_MIN_AGREEING_POINTS = TieOptions().min_matches  # points that agree in a view
+_DECOY_MARGIN = 0.1  # by which a correlation beats its decoy's
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,8 @@ class ReferenceControl:
         tried, passed = sum(view.tried for view in self.views), max(view.passed for view in self.views)
         return (
             f"shows the place of the images (its highest peak stands out by {best.peak:.1f} standard deviations), but "
-            f"of {tried} points looked for there no {_LEAST} of an image agree with each other ({passed} found at most)"
+            f"of {tried} points looked for there no {_MIN_AGREEING_POINTS} of an image agree with "
+            f"each other ({passed} found at most)"
         )
 
 
@@ -104,7 +105,7 @@ class Accuracy:
     heights: float = 5.0
 
 
-USUAL = Accuracy()
+DEFAULT_REFERENCE_ACCURACY = Accuracy()
 
 
 def register_views(
@@ -112,7 +113,7 @@ def register_views(
     paths: Sequence[str],
     terrain: Terrain,
     band: int = 1,
-    accuracy: Accuracy = USUAL,
+    accuracy: Accuracy = DEFAULT_REFERENCE_ACCURACY,
     work: Work = HERE,
 ) -> ReferenceControl:
     """Register views to orthoimages and a terrain.
@@ -130,7 +131,7 @@ def register_views(
     known = [middle[:2] for middle in middles if np.isfinite(middle).all()]
     pixels = [min(sheet.step(place) for sheet in sheets) for place in known]
     own = [float(ground_sample_distance(view.sensor, _middle(view))[1]) for view in views]
-    found = _Work(tuple(views), sheets, terrain, band, max(pixels + own), work)
+    found = _ReferenceWork(tuple(views), sheets, terrain, band, max(pixels + own), work)
     place = max(0.5, 0.25 * max(pixels, default=0.0)) if accuracy.place is None else accuracy.place
     return found.search(found.vote(), replace(accuracy, place=place))
 
@@ -144,10 +145,10 @@ def vote(view: View, band: int, paths: tuple[str, ...], patch: Patch, reach: int
     (2 reach + 1, 2 reach + 1) correlations; None where it or the reference shows nothing.
     """
     template = of_image(view, band, patch)[:, reach:-reach, reach:-reach]
-    if shown(template) < _SHOWN[0]:
+    if picture_share(template) < _MIN_PICTURE_SHARES[0]:
         return None
     area = of_reference(paths, patch)
-    return None if shown(area) < _SHOWN[1] else correlation(template[None], area[None])[0]
+    return None if picture_share(area) < _MIN_PICTURE_SHARES[1] else correlation(template[None], area[None])[0]
 
 
 def search(
@@ -156,7 +157,7 @@ def search(
     """Find points x, y (n, 2) [px] of the reference on a patch in an image: shifts, and whether they beat decoys."""
     tile = PatchTile.same((of_reference(paths, patch), of_image(view, band, patch)), points, reach, HALF)
     place, ok, score = tile.found()
-    return place - tile.at, ok & (score > tile.decoys() + _MARGIN) & tile.shown(1, place) & tile.returns(place)
+    return place - tile.at, ok & (score > tile.decoys() + _DECOY_MARGIN) & tile.shown(1, place) & tile.returns(place)
 
 
 # --- all of it --------------------------------------------------------------------------------------------
@@ -188,7 +189,7 @@ def peak(votes: Sequence[FloatImage | None]) -> tuple[float, Array]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Tile:
+class _PointTile:
     """Points of a view that are looked for together."""
 
     points: IntArray  # which
@@ -197,7 +198,7 @@ class _Tile:
 
 
 @dataclass(frozen=True, eq=False)
-class _Work:
+class _ReferenceWork:
     """Views and what they are registered to."""
 
     views: tuple[View, ...]
@@ -213,8 +214,8 @@ class _Work:
 
     def vote(self) -> list[tuple[float, Array]]:
         """Return, for every view, the peak of its vote and the camera's error (2,) [m]."""
-        coarse = max(self.step, _FINE)
-        found = self._votes([np.zeros(2)] * len(self.views), coarse, REACH, "reference: vote")
+        coarse = max(self.step, _VOTE_RESOLUTION)
+        found = self._votes([np.zeros(2)] * len(self.views), coarse, VOTE_RADIUS, "reference: vote")
         if coarse == self.step:
             return found
         near = [shift for _, shift in found]
@@ -295,23 +296,26 @@ class _Work:
         metres = metres_per_unit(np.append(origin, 0.0))[:2]
         local = [(ring - origin) * metres for ring in rings]
         areas = [0.5 * abs(float((x * np.roll(y, 1) - y * np.roll(x, 1)).sum())) for x, y in (r.T for r in local)]
-        apart = self.step * max(HALF // 2, round((max(areas) / POINTS[-1]) ** 0.5 / self.step))
+        apart = self.step * max(HALF // 2, round((max(areas) / GRID_POINTS[-1]) ** 0.5 / self.step))
         every = np.concatenate(local)
-        low, high = (np.floor((every.min(axis=0) - REACH) / apart), np.ceil((every.max(axis=0) + REACH) / apart))
+        low, high = (
+            np.floor((every.min(axis=0) - VOTE_RADIUS) / apart),
+            np.ceil((every.max(axis=0) + VOTE_RADIUS) / apart),
+        )
         grid = np.meshgrid(*(apart * np.arange(a, b + 1) for a, b in zip(low, high, strict=True)))
         places = origin + np.stack(grid, axis=-1).reshape(-1, 2) / metres
         places = places[np.any([sheet.shows(places) for sheet in self.sheets], axis=0)]
         heights = self.terrain(places[:, 0], places[:, 1])
         return places[np.isfinite(heights)], heights[np.isfinite(heights)]
 
-    def _tiles(self, view: View, moved: Array, places: Array, heights: Array, reach: int) -> list[_Tile]:
+    def _tiles(self, view: View, moved: Array, places: Array, heights: Array, reach: int) -> list[_PointTile]:
         """Return the points of a view, tile by tile."""
         metres = metres_per_unit(np.append(places.mean(axis=0), 0.0))[:2]
         at = view.sensor.project(np.column_stack([places + moved / metres, heights]))
         edge = 0.5 * HALF * self.step / float(ground_sample_distance(view.sensor, _middle(view))[1])
         with np.errstate(invalid="ignore"):
             inside = np.flatnonzero(((at >= edge) & (at <= np.array(view.size) - 1.0 - edge)).all(axis=1))
-        pad = HALF + 3 * reach + 2 * EDGE  # where decoys end
+        pad = HALF + 3 * reach + 2 * INVALID_MARGIN  # where decoys end
         cell = np.floor(places[inside] * metres / self.step / SPAN).astype(np.int64)
         _, group = np.unique(cell, axis=0, return_inverse=True)
         tiles = []
@@ -321,11 +325,11 @@ class _Work:
             px = (places[points] - first) * scale / self.step * [1.0, -1.0] + pad
             shape = (int(px[:, 1].max()) + pad + 2, int(px[:, 0].max()) + pad + 2)
             corner = first + np.array([-pad, pad]) * self.step / scale
-            tiles.append(_Tile(points, Patch.on(self.terrain, corner, self.step, shape, moved), px))
+            tiles.append(_PointTile(points, Patch.on(self.terrain, corner, self.step, shape, moved), px))
         return tiles
 
     def _agreeing(
-        self, view: View, report: ViewMatch, parts: Sequence[tuple[_Tile, tuple[Array, BoolArray]]], places: Array
+        self, view: View, report: ViewMatch, parts: Sequence[tuple[_PointTile, tuple[Array, BoolArray]]], places: Array
     ) -> tuple[ViewMatch, tuple[IntArray, Array, Array] | None]:
         """Return a view's points that agree with an affine: report; their index, image points, sigmas [px]."""
         if not parts:
@@ -359,7 +363,7 @@ def _affine(
 
     The search starts where most shifts lie together, within `SURELY` px. None where too few agree.
     """
-    if passed.sum() < _LEAST:
+    if passed.sum() < _MIN_AGREEING_POINTS:
         return None
     design = np.column_stack([np.ones(len(local)), local / max(float(np.abs(local).max()), 1.0)])
     apart = np.linalg.norm(shift[passed, None] - shift[None, passed], axis=2)
@@ -367,7 +371,7 @@ def _affine(
     scale, keep = np.full(2, step), passed
     for _ in range(NEWTON_STEPS):
         keep = passed & (np.abs(shift - fitted) < SURELY * scale).all(axis=1)
-        if keep.sum() < _LEAST:
+        if keep.sum() < _MIN_AGREEING_POINTS:
             return None
         fitted = design @ np.linalg.lstsq(design[keep], shift[keep], rcond=None)[0]
         scale = robust_spread((shift - fitted)[keep].T).clip(MAD * 0.02 * step)

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from barpc.base.errors import TiePointError
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.options import TieOptions
-from barpc.base.usual import FEW, MANY
+from barpc.base.statistics import FEW, MANY
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
 from barpc.tie.detail import Seen, seen_detail
@@ -23,10 +23,10 @@ from barpc.tie.matchers.features import KeypointFiles, locate, worth_a_first_loo
 from barpc.tie.matchers.given import GivenMatches, beside_given, verify_given
 from barpc.tie.matchers.matcher import Matches
 from barpc.tie.matchers.matching import (
-    FINE,
+    FINE_STRUCTURE,
     MATCHERS,
     STRUCTURE,
-    Ground,
+    GroundAltitudes,
     PairReport,
     ample,
     enough,
@@ -41,19 +41,19 @@ from barpc.tie.pairing.epipolar import grouped, linear_map
 from barpc.tie.pairing.overlaps import (
     COMPARED,
     EVERYWHERE,
-    GIVEN,
+    GIVEN_PAIR,
     TRIES,
     Pair,
     Scope,
     best_pairs,
     further_pairs,
-    judged,
     possible_pairs,
     require_connected,
+    scored_pair,
     several_dates,
 )
 from barpc.tie.pairing.resolution import Looks, finer
-from barpc.tie.patches.oriented import REACH
+from barpc.tie.patches.oriented import MAX_PATCH_SHIFT
 from barpc.tie.patches.register import refine
 from barpc.tie.pixels import sample_stretch
 from barpc.tie.tasks import Progress, Work, store_of
@@ -111,7 +111,7 @@ def find_tracks(
         trials = _Trials(views, options, scope, Work(executor, progress, store))
         trials.run(possible_pairs(views, options, scope), all_of_them=bool(scope.only))
         require_matches(views, *trials.outcome, scope.joined)
-        tracks, bare = _registered(trials, scope, options, Work(executor, progress))
+        tracks, bare = _registered_tracks(trials, scope, options, Work(executor, progress))
         detail = trials.detail()
     pairs, reports = trials.outcome
     reports = [replace(r, unregistered=bare.get(p.views, 0)) for p, r in zip(pairs, reports, strict=True)]
@@ -119,25 +119,25 @@ def find_tracks(
     return TieResult(tracks, tuple(reports), trials.keypoints, detail)
 
 
-def _registered(
+def _registered_tracks(
     trials: _Trials, scope: Scope, options: TieOptions, work: Work
 ) -> tuple[Tracks, dict[tuple[int, int], int]]:
     """Link, thin and register the matches of the pairs tried; return also how many could not be registered."""
     looks, area, most = trials.looks, scope.area, options.points_per_image
     tried = [(looks.ends[views], *trials.tried[views][1:]) for views in sorted(trials.tried)]
-    linked = inside(looks.views, link([ends for ends, _, _ in tried], [found for _, found, _ in tried]), area)
+    linked = tracks_inside(looks.views, link([ends for ends, _, _ in tried], [found for _, found, _ in tried]), area)
     spreads = {ends: report.spread for ends, _, report in tried if report.status == "ok"}
     sizes = [view.size for view in looks.views]
     linked = thin(linked, sizes, most)
-    structural = [ends for ends, _, report in tried if report.matcher in (STRUCTURE, FINE)]
-    theirs = {looks.ends[views] for views, (*_, report) in trials.tried.items() if report.matcher == GIVEN}
+    structural = [ends for ends, _, report in tried if report.matcher in (STRUCTURE, FINE_STRUCTURE)]
+    theirs = {looks.ends[views] for views, (*_, report) in trials.tried.items() if report.matcher == GIVEN_PAIR}
     verified = {ends: found for ends, found, _ in tried if len(found)}
     tracks = refine(looks.views, linked, spreads, options, structural=structural, work=work)
     if unlike := _with_pictures(looks.views, _unlike(linked, tracks, sorted(theirs & set(verified))), options, work):
         tracks = refine(looks.views, linked, spreads, options, structural=[*structural, *unlike], work=work)
         counts = pair_counts(tracks)
         if trials.rematch({pair: counts.get(pair, 0) for pair in _unlike(linked, tracks, unlike)}):
-            return _registered(trials, scope, options, work)
+            return _registered_tracks(trials, scope, options, work)
     needed = theirs | _needed(looks, tracks, list(verified), options)
     known = {ends: found for ends, found in verified.items() if ends in needed}
     exact, tracks = pair_counts(tracks), _with_unregistered(looks.views, tracks, known, options)
@@ -145,7 +145,7 @@ def _registered(
         (int(looks.of[i]), int(looks.of[j])): count - exact.get((i, j), 0)
         for (i, j), count in pair_counts(tracks).items()
     }
-    return looks.tracks(thin(inside(looks.views, tracks, area), sizes, most)), bare
+    return looks.tracks(thin(tracks_inside(looks.views, tracks, area), sizes, most)), bare
 
 
 def _needed(
@@ -255,7 +255,7 @@ class _Trials:
         scores = self._work.ordered(quick_score, tasks, "compare")
         self._scores |= {pair.views: score for pair, score in zip(new, scores, strict=True)}
         known = self._scores
-        return [judged(self._views, p, known[p.views]) if p.views in known else p for p in pairs]
+        return [scored_pair(self._views, p, known[p.views]) if p.views in known else p for p in pairs]
 
     def _ends(self, pair: Pair) -> tuple[tuple[View, View], tuple[KeypointFiles, KeypointFiles]]:
         i, j = self.looks.ends[pair.views]
@@ -274,10 +274,10 @@ class _Trials:
         """
         looks, options, of = self.looks, self._options, self.looks.of
         pairs = [self.tried[int(of[i]), int(of[j])][0] for i, j in registered]
-        own = self._looked_closer([looks.pair(pair) for pair in pairs], Ground(self._scope.terrain))
+        own = self._looked_closer([looks.pair(pair) for pair in pairs], GroundAltitudes(self._scope.terrain))
         changed = False
         for pair, (ends, count), (found, report) in zip(pairs, registered.items(), own, strict=True):
-            structural = [ends] * (report.matcher in (STRUCTURE, FINE))
+            structural = [ends] * (report.matcher in (STRUCTURE, FINE_STRUCTURE))
             linked = thin(link([ends], [found]), [view.size for view in looks.views], options.points_per_image)
             tracks = refine(looks.views, linked, {}, options, structural=structural, work=self._work)
             if tracks.num_points >= max(count + 1, options.min_matches):
@@ -295,7 +295,7 @@ class _Trials:
         found = {p.views: one for p, one in zip(pairs, first, strict=False) if self._is_ample(p, *one)}
         lacking = [pair for pair in pairs if pair.views not in found]
         known = [((views[p.views[0]], views[p.views[1]]), found[p.views][0]) for p in pairs if p.views in found]
-        ground = Ground(self._scope.terrain, (*before, *known))
+        ground = GroundAltitudes(self._scope.terrain, (*before, *known))
         if self._coarse and lacking:
             again = self._looked_closer(lacking, ground)
         else:
@@ -307,7 +307,7 @@ class _Trials:
         i, j = pair.views
         return ample(report, self._options) and not stretched((self.looks.views[i], self.looks.views[j]), *found.ends)
 
-    def _looked_closer(self, pairs: Sequence[Pair], ground: Ground) -> list[tuple[Matches, PairReport]]:
+    def _looked_closer(self, pairs: Sequence[Pair], ground: GroundAltitudes) -> list[tuple[Matches, PairReport]]:
         """Match pairs of looks by keypoints of their own."""
         views, options = self.looks.views, self._options
         detects = matcher_named(options.matcher).detects
@@ -358,12 +358,12 @@ def _with_unregistered(views: Sequence[View], tracks: Tracks, given: GivenMatche
         logger.warning(words, views[i].name, views[j].name, count, len(known), known.sigma)
     sizes, most = [view.size for view in views], options.points_per_image
     more = thin(link(lost, [given[pair] for pair in lost]), sizes, most)
-    return _joined(views, tracks, more)
+    return _merge_registered(views, tracks, more)
 
 
-def _joined(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
+def _merge_registered(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
     """Return the registered tracks and others: those that stand beside a registered one are the same point."""
-    reach = REACH + float(np.hypot(0.5, 0.5))  # registration, and rounding, may move a point by so much
+    reach = MAX_PATCH_SHIFT + float(np.hypot(0.5, 0.5))  # registration, and rounding, may move a point by so much
     known, asked = (np.array([2 * reach * part.view, *part.xy.T]).T for part in (tracks, others))
     near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=reach))
     same = np.flatnonzero(np.isfinite(near))
@@ -386,7 +386,7 @@ def _joined(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
     return Tracks(view[once], point, xy[once], sigma[once])
 
 
-def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
+def tracks_inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
     """Return the tracks whose ground points lie in an area, all without one; TiePointError where none does."""
     if area is None or not len(tracks):
         return tracks
@@ -492,11 +492,11 @@ def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], most: int) -> Tracks:
     first_cell = np.concatenate([[0], np.cumsum(columns * rows)])
     col, row = np.floor((tracks.xy + 0.5) / side[tracks.view][:, None]).astype(np.int64).clip(0).T
     cell = first_cell[tracks.view] + row * columns[tracks.view] + col
-    keep = _fill(tracks, cell.tolist(), int(first_cell[-1]), most, len(sizes))
+    keep = _fill_cells(tracks, cell.tolist(), int(first_cell[-1]), most, len(sizes))
     return tracks.select(keep[tracks.point])
 
 
-def _fill(tracks: Tracks, cell: list[int], num_cells: int, most: int, num_views: int) -> BoolArray:
+def _fill_cells(tracks: Tracks, cell: list[int], num_cells: int, most: int, num_views: int) -> BoolArray:
     """Return the mask of tracks that are taken, greedily, in rounds of growing quota where images have empty parts."""
     starts = np.searchsorted(tracks.point, np.arange(tracks.num_points + 1))
     worst = np.maximum.reduceat(tracks.sigma, starts[:-1])

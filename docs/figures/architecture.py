@@ -27,14 +27,14 @@ JOURNEYS = {
     ),
     "tracks -> correction": (
         ("ba/adjustment.py", "adjust_tracks", "views, tracks, control"),
-        ("ba/held/block.py", "join", "-> one block, sorted by view"),
+        ("ba/constraints/block.py", "join", "-> one block, sorted by view"),
         ("ba/robust/heldout.py", "keep_out", "a tenth of the tracks aside"),
         ("ba/judging/solution.py", "solve_block", "one model, its control tested"),
-        ("ba/held/block.py", "make_problem", "cameras, priors, structure"),
+        ("ba/constraints/block.py", "make_problem", "cameras, priors, structure"),
         ("ba/robust/rounds.py", "Rounds", "search, cut, solve until nothing changes"),
         ("ba/solving/solve.py", "minimise", "scipy or sparse Levenberg-Marquardt"),
         ("ba/robust/heldout.py", "measure", "what the tenth says"),
-        ("ba/held/gauge.py", "gauge_report", "where the scene went, how well that is known"),
+        ("ba/constraints/gauge.py", "gauge_report", "where the scene went, how well that is known"),
     ),
     "model -> RPC": (
         ("fit/refit.py", "fit_rpc", "any sensor model"),

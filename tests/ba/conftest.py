@@ -12,19 +12,19 @@ import pytest
 from barpc import simulate
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.fit import fit_rpc
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 from tests.constants import chosen
 
 INDEPENDENT = {"noise_floor": 0.0, "sigma_attitude": 10.4, "sigma_position": 1.0, "min_convergence": 0.01}
 """What simulated blocks are: white noise, 15 urad at 694 km, 1 m."""
 
 
-def centers_of(block: Block) -> np.ndarray:
+def centers_of(block: SimulatedBlock) -> np.ndarray:
     """The camera centres that the block was made with."""
     return np.array([correction.center for correction in block.truth.corrections])
 
 
-def solve(block: Block, **options: Any) -> Adjustment:
+def solve(block: SimulatedBlock, **options: Any) -> Adjustment:
     """The block adjusted with priors that are true of it."""
     hold_out = options.pop("hold_out", True)
     with chosen(AdjustOptions, **{**INDEPENDENT, **options}) as given:
@@ -40,12 +40,12 @@ def _delivered() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def block() -> Block:
+def block() -> SimulatedBlock:
     """Ten views, 2000 tie points, noise of a tenth of a pixel."""
     return simulate_block(10, 2000, seed=11)
 
 
 @pytest.fixture(scope="session")
-def adjusted(block: Block) -> Adjustment:
+def adjusted(block: SimulatedBlock) -> Adjustment:
     """`block`, adjusted."""
     return solve(block)

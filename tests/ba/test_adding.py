@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior
-from barpc.ba.estimated.priors import EarlierScene
+from barpc.ba.parameters.priors import EarlierScene
 from barpc.ba.result import moved_px
 from barpc.ba.solving.linear import Blocks
 from barpc.base.errors import DisconnectedError, InputError, TiePointError
 from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.scene import IntArray, Tracks, View
 from barpc.sensor.geometry import ground_sample_distance
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 
 
-def part(made: Block, chosen: Any, new: Any = None) -> tuple[list[View], Tracks]:
+def part(made: SimulatedBlock, chosen: Any, new: Any = None) -> tuple[list[View], Tracks]:
     """Some views, ascending, and their tie points; those that `new` ones observe only."""
     chosen = np.asarray(chosen)
     tracks = made.tracks.select(np.isin(made.tracks.view, chosen))
@@ -30,13 +30,13 @@ def part(made: Block, chosen: Any, new: Any = None) -> tuple[list[View], Tracks]
     return [made.views[i] for i in chosen], Tracks(view, tracks.point, tracks.xy, tracks.sigma)
 
 
-def met(made: Block, have: IntArray, new: IntArray) -> IntArray:
+def met(made: SimulatedBlock, have: IntArray, new: IntArray) -> IntArray:
     """The new views, and those that they share tie points with."""
     every = np.union1d(have, new)
     return np.union1d(every[np.unique(part(made, every, new)[1].view)], new)
 
 
-def add(made: Block, have: IntArray, new: IntArray, prior: BlockPrior, **given: Any) -> Adjustment:
+def add(made: SimulatedBlock, have: IntArray, new: IntArray, prior: BlockPrior, **given: Any) -> Adjustment:
     views, tracks = part(made, met(made, have, new), new)
     return adjust_tracks(views, tracks, prior=prior, known=np.ones(len(tracks), dtype=bool), **given)
 
@@ -142,7 +142,7 @@ def test_a_grown_block_is_read_as_it_was_written_and_a_damaged_one_is_refused(tm
 
 
 @pytest.fixture(scope="module")
-def sixty() -> tuple[Block, IntArray, IntArray, BlockPrior, Adjustment]:
+def sixty() -> tuple[SimulatedBlock, IntArray, IntArray, BlockPrior, Adjustment]:
     made, new = simulate_block(61, 61 * 60, seed=7), np.array([30])
     have = np.setdiff1d(np.arange(61), new)
     prior = block_prior(adjust_tracks(*part(made, have), hold_out=False))

@@ -145,10 +145,10 @@ def test_sets_that_are_drawn_find_what_all_of_them_find(monkeypatch) -> None:
         offsets, told = drawn(7, 3, wrong), np.ones(7, dtype=bool)
         every = agreement(offsets, told)
         with monkeypatch.context() as patch:
-            patch.setattr(sets, "_ROOM", 700)
+            patch.setattr(sets, "_MAX_SET_POINTS", 700)
             patch.setattr(sets, "TRIALS", 40)
             one, again = agreement(offsets, told), agreement(offsets, told)
-            search = sets._Search(offsets)
+            search = sets._SubsetSearch(offsets)
         assert np.flatnonzero(~every.used).tolist() == list(range(len(wrong)))
         assert (one.used == every.used).all()
         assert (one.scale, one.alike) == (every.scale, every.alike)
@@ -178,7 +178,7 @@ def test_points_that_nothing_tells_of_take_no_part() -> None:
 def test_the_evidence_of_a_set_is_the_density_of_what_it_shows(scale) -> None:
     offsets = drawn(5, 2, {0: (9.0, 0.0, 0.0)}, free=50.0)
     chosen = np.array([0, 1, 1, 0, 1], dtype=bool)
-    (score,), (squared,), (together,) = sets._evidence(offsets, chosen[None], scale)
+    (score,), (squared,), (together,) = sets._log_evidence(offsets, chosen[None], scale)
     motions = offsets.motions.reshape(15, -1)
     whole = motions @ motions.T + scale**2 * np.eye(15)
     rows = np.repeat(chosen, 3)
@@ -344,7 +344,7 @@ def test_control_stays_where_images_are_worse_with_it_by_no_more_than_they_tell(
     found: Any = SimpleNamespace(after=SimpleNamespace(whole_rms=held), agreed=Agreement(np.ones(3, dtype=bool)))
     state = SimpleNamespace(params=np.zeros((4, 2)))
     alone = Solution(*[None] * 4, SimpleNamespace(minimum=SimpleNamespace(state=state)), *[None] * 3, {})
-    ended: Any = solution._untorn(found, alone, None, None, AdjustOptions(noise_floor=0.1))  # type: ignore[arg-type]
+    ended: Any = solution._without_distorting_control(found, alone, None, None, AdjustOptions(noise_floor=0.1))  # type: ignore[arg-type]
     assert (ended is not found) == let_go
     if let_go:
         assert ended.agreed.torn == (free, held)

@@ -16,8 +16,16 @@ import pyproj
 import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, altimetry
-from barpc.ba.held import registration
-from barpc.ba.held.registration import NEIGHBOURS, Given, Registration, Surface, _search, displacement, register
+from barpc.ba.constraints import registration
+from barpc.ba.constraints.registration import (
+    PATCH_POINTS,
+    GivenHeights,
+    Registration,
+    TieSurface,
+    _search_shift,
+    displacement,
+    register,
+)
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.cameras import open_camera
 from barpc.scene import Altimetry, GroundPoints, Tracks, View
@@ -40,31 +48,31 @@ def surface(rng: np.random.Generator, size: float = 1.0, noise: float = 0.1, n: 
 
 def given(
     rng: np.random.Generator, n: int, moved: Any, size: float = 1.0, sigma: float = 0.3, wrong: float = 0.0
-) -> Given:
+) -> GivenHeights:
     """Heights of the relief after it was moved by (east, north, up); a share is wrong by up to 60 m, upwards."""
     xy = rng.uniform(-230.0, 230.0, (n, 2))
     alt = relief(*xy.T, size) + rng.normal(0, sigma, n)
     alt += np.where(rng.random(n) < wrong, rng.uniform(3.0, 60.0, n), 0.0)
-    return Given(np.column_stack([xy, alt]) + moved, np.full(n, sigma), np.zeros(n))
+    return GivenHeights(np.column_stack([xy, alt]) + moved, np.full(n, sigma), np.zeros(n))
 
 
-def registered(rng: np.random.Generator, heights: Given, **scene: Any) -> Registration:
-    return register(Surface.of(surface(rng, **scene)), heights, 200.0, BEFORE)
+def registered(rng: np.random.Generator, heights: GivenHeights, **scene: Any) -> Registration:
+    return register(TieSurface.of(surface(rng, **scene)), heights, 200.0, BEFORE)
 
 
 def test_the_search_gives_the_shift_on_which_most_heights_agree_and_none_where_there_is_no_surface():
     rng = np.random.default_rng(4)
-    here = Surface.of(surface(rng))
-    found = _search(here, given(rng, 400, [11.0, -7.0, 30.0], wrong=0.2), BEFORE)
+    here = TieSurface.of(surface(rng))
+    found = _search_shift(here, given(rng, 400, [11.0, -7.0, 30.0], wrong=0.2), BEFORE)
     np.testing.assert_allclose(found[:3], [11.0, -7.0, 30.0], atol=2.5)
     assert found[3:].tolist() == [0.0] * 4
-    assert _search(here, given(rng, 50, [5000.0, 0.0, 30.0]), BEFORE).tolist() == [0.0] * 7
+    assert _search_shift(here, given(rng, 50, [5000.0, 0.0, 30.0]), BEFORE).tolist() == [0.0] * 7
 
 
 def test_a_patch_has_its_own_height_and_slopes():
     rng = np.random.default_rng(0)
     xy = rng.uniform(0.0, 100.0, (300, 2))
-    found = Surface.of(np.column_stack([xy, 5.0 + 0.3 * xy[:, 0] - 0.2 * xy[:, 1]]))
+    found = TieSurface.of(np.column_stack([xy, 5.0 + 0.3 * xy[:, 0] - 0.2 * xy[:, 1]]))
     slope, _ = found.slope(xy, np.arange(300))
     np.testing.assert_allclose(slope, np.tile([0.3, -0.2], (300, 1)), atol=1e-5)
     height, nearest, near = found.at(np.array([[40.0, 60.0], [500.0, 50.0]]))
@@ -106,7 +114,7 @@ def test_heights_that_mostly_disagree_agree_on_nothing():
     rng = np.random.default_rng(1)
     assert not registered(rng, given(rng, 150, [5.0, -7.0, 90.0], wrong=0.8)).is_most
     scattered = given(rng, 150, 0.0)
-    elsewhere = Given(rng.permutation(scattered.place), scattered.sigma, scattered.sigma_flat)
+    elsewhere = GivenHeights(rng.permutation(scattered.place), scattered.sigma, scattered.sigma_flat)
     elsewhere.place[:, 2] = rng.uniform(0.0, 60.0, 150)
     assert not registered(rng, elsewhere).is_most
 
@@ -160,12 +168,14 @@ def test_slopes_that_are_noise_know_no_place():
     """A plain again, where it ends: what slopes claim to know is taken away from what they are uncertain by."""
     rng = np.random.default_rng(2)
     heights, free = given(rng, 400, 0.0, size=0.0), np.diag((10.0 * BEFORE) ** -2)
-    plain = Surface.of(surface(rng, size=0.0, noise=0.3))
-    sigma = np.sqrt(np.diag(registration._told(plain, heights, np.zeros(7), 200.0, 1.0, free).covariance))
+    plain = TieSurface.of(surface(rng, size=0.0, noise=0.3))
+    sigma = np.sqrt(
+        np.diag(registration._registration_result(plain, heights, np.zeros(7), 200.0, 1.0, free).covariance)
+    )
     assert (sigma[:2] > 9.0).all()
     assert sigma[2] < 0.5
-    hills = Surface.of(surface(rng))
-    found = registration._told(hills, given(rng, 400, 0.0, wrong=0.2), np.zeros(7), 200.0, 1.0, free)
+    hills = TieSurface.of(surface(rng))
+    found = registration._registration_result(hills, given(rng, 400, 0.0, wrong=0.2), np.zeros(7), 200.0, 1.0, free)
     assert (np.sqrt(np.diag(found.covariance))[:3] < [0.5, 0.5, 0.1]).all()
     assert found.share == pytest.approx(0.8, abs=0.1)
 
@@ -182,7 +192,7 @@ def test_noise_that_neighbours_share_is_no_knowledge(seeds: range):
         xy = np.column_stack([np.repeat(rng.uniform(-220, 220, 12), len(along) // 12), along])
         shared = np.repeat(rng.normal(0, 1.0, len(along) // 10 + 1), 10)[: len(along)]
         place = np.column_stack([xy, relief(*xy.T) + shared + rng.normal(0, 0.2, len(along))])
-        heights = Given(place + [3.0, 2.0, -20.0], np.full(len(along), 0.5), np.zeros(len(along)))
+        heights = GivenHeights(place + [3.0, 2.0, -20.0], np.full(len(along), 0.5), np.zeros(len(along)))
         found = registered(rng, heights)
         ratio.append((found.motion[:3] - [3.0, 2.0, -20.0]) / np.sqrt(np.diag(found.covariance))[:3])
     assert np.sqrt(np.mean(np.square(ratio))) < 1.5
@@ -320,7 +330,7 @@ def test_heights_and_a_terrain_hold_together(scene: Any):
 
 def test_fewer_tie_points_than_a_patch_needs_are_said(scene: Any):
     views, tracks, _ = scene
-    few = tracks.select(tracks.point < NEIGHBOURS)
+    few = tracks.select(tracks.point < PATCH_POINTS)
     after = adjust_tracks(views, few, altimetry=heights(3), hold_out=False)
     assert after.altimetry is not None
     assert "are needed" in after.altimetry.why_not
@@ -349,10 +359,10 @@ def test_what_a_plane_is_told_is_the_covariance_of_an_m_estimate(noise: float):
     place = np.column_stack([rng.uniform(0.0, 400.0, (80, 2)), np.zeros(80)])
     place[:, 2] = place[:, :2] @ [0.3, -0.2] + rng.normal(0.0, 0.8, 80)
     place[:9, 2] += rng.uniform(2.0, 30.0, 9)
-    heights = Given(place, np.full(80, 0.5), np.full(80, 0.9))
+    heights = GivenHeights(place, np.full(80, 0.5), np.full(80, 0.9))
     surface: Any = plane_of((0.3, -0.2), 0.4)
     free = np.diag(np.arange(1.0, 8.0) ** -2.0)
-    found = registration._told(surface, heights, np.zeros(7), 200.0, noise, free)
+    found = registration._registration_result(surface, heights, np.zeros(7), 200.0, noise, free)
     scale, cut = max(noise, 1.0), registration.BIWEIGHT
     sigma = np.sqrt(0.4**2 + 0.5**2 + (0.3**2 + 0.2**2) * 0.9**2)
     near = place[:, :2].max(axis=1) <= 300.0
@@ -392,14 +402,14 @@ def test_a_motion_is_held_at_every_second_tie_point_beside_a_terrain(monkeypatch
     heights = Altimetry(ground_from_ecef(points), np.full(60, 0.5), np.full(60, 2.0))
     held: list[Any] = []
     monkeypatch.setattr(altimetry, "SAMPLE", most)
-    monkeypatch.setattr(altimetry, "_known", lambda covariance, found, ties: np.eye(7))
-    monkeypatch.setattr(altimetry, "Surface", SimpleNamespace(of=lambda local: local))
+    monkeypatch.setattr(altimetry, "_covariance_without_heights", lambda covariance, found, ties: np.eye(7))
+    monkeypatch.setattr(altimetry, "TieSurface", SimpleNamespace(of=lambda local: local))
     monkeypatch.setattr(altimetry, "register", lambda surface, *_: surface)
     monkeypatch.setattr(altimetry, "_tested", lambda registered, many: f"{len(registered)} of {many}")
     monkeypatch.setattr(altimetry, "_why_not", lambda *_: "")
     monkeypatch.setattr(altimetry, "_is_held", lambda *_: False)
-    monkeypatch.setattr(altimetry, "_placed", lambda *given: held.append(given))
-    monkeypatch.setattr(altimetry, "_solved", lambda *_: SimpleNamespace(after="after"))
+    monkeypatch.setattr(altimetry, "_registered_ties", lambda *given: held.append(given))
+    monkeypatch.setattr(altimetry, "_solved_with_heights", lambda *_: SimpleNamespace(after="after"))
     monkeypatch.setattr(altimetry, "is_better", lambda one, other, outer: False)
     outcome = SimpleNamespace(minimum=SimpleNamespace(covariance=lambda free: None))
     found: Any = SimpleNamespace(

@@ -12,12 +12,12 @@ import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, adjustment, apart
 from barpc.ba.apart import find_apart
-from barpc.ba.placing import Look
+from barpc.ba.resection import RpcDiagnosis
 from barpc.base.errors import AdjustError
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.rpc import RPC
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 from benchmarks.worlds import judge
 from benchmarks.worlds_families import World, make
 
@@ -42,21 +42,21 @@ def raised(rpc: RPC) -> RPC:
     return replace(rpc, ground_offset=rpc.ground_offset + np.array([0.0, 0.0, 100.0]))
 
 
-def block_with(view: int, change: Change, views: int = 3, tracks: int = 300, seed: int = 1) -> Block:
+def block_with(view: int, change: Change, views: int = 3, tracks: int = 300, seed: int = 1) -> SimulatedBlock:
     """A simulated block of which one view has an RPC that was changed."""
     made = simulate_block(views, tracks, seed=seed, attitude=5e-6, position=1.0)
     given = [replace(v, sensor=change(v.sensor)) if n == view else v for n, v in enumerate(made.views)]  # type: ignore[arg-type]
     return replace(made, views=tuple(given))
 
 
-def without(block: Block, view: int) -> tuple[tuple[View, ...], Tracks]:
+def without(block: SimulatedBlock, view: int) -> tuple[tuple[View, ...], Tracks]:
     tracks = block.tracks.select(block.tracks.view != view)
     views = tuple(v for n, v in enumerate(block.views) if n != view)
     number = np.cumsum(np.arange(len(block.views)) != view) - 1
     return views, Tracks(number[tracks.view], tracks.point, tracks.xy, tracks.sigma)
 
 
-def met(found: Adjustment, block: Block, view: int) -> float:
+def met(found: Adjustment, block: SimulatedBlock, view: int) -> float:
     """RMS [px] at which a camera meets exact check points, intersected by all."""
     check = block.truth.check
     left = triangulate(found.sensors, check.view, check.point, check.xy).residuals[check.view == view]
@@ -180,11 +180,11 @@ def scripted(monkeypatch, evidence: list[float], contradicted: list[float]) -> A
         told = {"contradicted": lambda _: contradicted[view], "is_coherent": lambda _: True}
         return SimpleNamespace(meets=False, squared=np.zeros(200), **told)
 
-    monkeypatch.setattr(apart, "_agreeing", agreeing)
-    monkeypatch.setattr(apart, "place", placed)
-    monkeypatch.setattr(apart._Left, "usual", 0.02)
-    monkeypatch.setattr(apart, "_evidence", lambda one, block: evidence[one.view])
-    monkeypatch.setattr(apart, "look", lambda *_: "looked")
+    monkeypatch.setattr(apart, "_leave_one_view_out", agreeing)
+    monkeypatch.setattr(apart, "resect", placed)
+    monkeypatch.setattr(apart.LeaveOneOut, "usual", 0.02)
+    monkeypatch.setattr(apart, "_tie_evidence", lambda one, block: evidence[one.view])
+    monkeypatch.setattr(apart, "diagnose_rpc", lambda *_: "looked")
     block: Any = SimpleNamespace(views=(None,) * num, names=tuple("abcdef"[:num]))
     return find_apart(None, block, block, AdjustOptions(), pytest.fail)
 
@@ -213,7 +213,7 @@ def test_ties_that_the_others_do_not_explain_lie_anywhere_in_their_images(monkey
         return SimpleNamespace(evidence=50.0)
 
     monkeypatch.setattr(apart, "around", looked)
-    monkeypatch.setattr(apart, "fit", fitted)
+    monkeypatch.setattr(apart, "fit_mixture", fitted)
     monkeypatch.setattr(apart, "replace", lambda of, **more: SimpleNamespace(**{**vars(of), **more}))
     rest = SimpleNamespace(views=(None,) * 2)
     outcome = SimpleNamespace(problem=SimpleNamespace(camera_prior="learnt"))
@@ -222,17 +222,17 @@ def test_ties_that_the_others_do_not_explain_lie_anywhere_in_their_images(monkey
     block: Any = SimpleNamespace(
         use=np.arange(11) > 0, point=np.arange(11), num_tracks=10, views=size, sigma=np.full(11, 0.2)
     )
-    assert apart._evidence(SimpleNamespace(found=found, block=rest), block) == pytest.approx(worth)  # type: ignore[arg-type]
+    assert apart._tie_evidence(SimpleNamespace(found=found, block=rest), block) == pytest.approx(worth)  # type: ignore[arg-type]
     ((problem, given, views),) = asked
     assert (problem.camera_prior, given, views) == ("stated", rest, [0, 1])
 
 
 @pytest.mark.parametrize(("lost", "own"), [(0.3, 0.6), (0.7, 0.7), (1.0, 0.999)])
 def test_the_gain_of_an_own_share_is_that_of_two_binomials_less_the_choice(monkeypatch, lost, own) -> None:
-    monkeypatch.setattr(apart._Left, "usual", 0.02)
+    monkeypatch.setattr(apart.LeaveOneOut, "usual", 0.02)
     placed: Any = SimpleNamespace(squared=np.zeros(200))
     block: Any = SimpleNamespace(views=(None,) * 4)
-    one = apart._Left(1, block, None, placed, 0.6, True)  # type: ignore[arg-type]
+    one = apart.LeaveOneOut(1, block, None, placed, 0.6, True)  # type: ignore[arg-type]
     expected = 200 * (own * np.log(own / 0.02) + (1.0 - own) * np.log((1.0 - own) / 0.98)) - np.log(4.0)
     assert one.gain(lost) == pytest.approx(expected)
 
@@ -329,16 +329,16 @@ def test_a_view_is_its_own_where_a_solution_keeps_its_ties_and_none_move() -> No
 @pytest.mark.parametrize(
     ("look", "placed", "views", "own"),
     [
-        (Look(as_stated=True), None, (1,), True),
-        (Look(offset=np.array([5.0, 3.0])), None, (1,), True),
-        (Look(), None, (1,), False),  # it does not see the place at all
-        (Look(swapped=True), None, (1,), False),
-        (Look(as_stated=True), "placed", (1,), False),  # it meets the others where it was found
-        (Look(as_stated=True), None, (1, 2), False),
+        (RpcDiagnosis(as_stated=True), None, (1,), True),
+        (RpcDiagnosis(offset=np.array([5.0, 3.0])), None, (1,), True),
+        (RpcDiagnosis(), None, (1,), False),  # it does not see the place at all
+        (RpcDiagnosis(swapped=True), None, (1,), False),
+        (RpcDiagnosis(as_stated=True), "placed", (1,), False),  # it meets the others where it was found
+        (RpcDiagnosis(as_stated=True), None, (1, 2), False),
     ],
 )
-def test_what_sees_the_place_may_be_its_own(look: Look, placed: Any, views: tuple[int, ...], own: bool) -> None:
-    assert apart.Apart(views, 9.0, 9.0, None, 0.6, look, placed).may_be_its_own == own
+def test_what_sees_the_place_may_be_its_own(look: RpcDiagnosis, placed: Any, views: tuple[int, ...], own: bool) -> None:
+    assert apart.ForeignCamera(views, 9.0, 9.0, None, 0.6, look, placed).may_be_its_own == own
 
 
 @pytest.mark.slow

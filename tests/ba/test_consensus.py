@@ -10,7 +10,7 @@ from scipy.linalg import null_space
 from scipy.optimize import brentq, minimize
 
 from barpc.ba import AdjustOptions
-from barpc.ba.held.block import join, make_problem
+from barpc.ba.constraints.block import join, make_problem
 from barpc.ba.robust.consensus import TwoGroups, _across, _mixture, _on_one_plane, agreeing, two_groups
 from barpc.ba.solving.problem import Problem
 from barpc.base.geodesy import ecef_from_ground

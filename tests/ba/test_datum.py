@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
-from barpc.ba.held.gauge import SOURCES
+from barpc.ba.constraints.gauge import SOURCES
 from barpc.base.geodesy import enu_basis, ground_from_ecef
 from barpc.report import Run, summarize
 from barpc.scene import GroundPoints

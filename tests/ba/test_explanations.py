@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.evidence.mixture import Fit
+from barpc.ba.evidence.mixture import MixtureFit
 from barpc.ba.evidence.periods import Swing
 from barpc.ba.evidence.scan import BINS, Interval, price
 from barpc.ba.judging import explanations, following
@@ -16,12 +16,12 @@ from barpc.ba.judging.explanations import (
     FADE,
     MOVING,
     SCALE,
-    SETTLING,
     STRIP,
     SWING,
+    TRANSIENT,
     WANDER,
+    BlockResiduals,
     Explanation,
-    Seen,
     _at_one_end,
     _largest_part,
     _open_ended,
@@ -32,12 +32,12 @@ from barpc.ba.judging.explanations import (
     sharpened,
 )
 from barpc.ba.judging.judge import Finding
-from barpc.sensor.displaced import profile
+from barpc.sensor.image_corrections import profile
 
 SIZE = np.array([[400.0, 500.0], [1000.0, 2000.0]])  # of two images, columns and rows
 
 
-def seen(n: int = 30, views: int = 2, choices: int = 5) -> Seen:
+def seen(n: int = 30, views: int = 2, choices: int = 5) -> BlockResiduals:
     """Observations that are evenly spread over the rows of some images, one after the other."""
     view = np.repeat(np.arange(views), n)
     size = SIZE[:, :views]
@@ -49,11 +49,11 @@ def seen(n: int = 30, views: int = 2, choices: int = 5) -> Seen:
     )  # fmt: skip
     nothing: Any = None
     base = fitted(len(view))
-    return Seen(linear, linear, nothing, place, size, base, np.zeros((2, 0, len(view))), np.zeros(0))
+    return BlockResiduals(linear, linear, nothing, place, size, base, np.zeros((2, 0, len(view))), np.zeros(0))
 
 
-def fitted(n: int, extra: Any = (), step: float = 0.0) -> Fit:
-    return Fit(0.0, np.full((2, 3), step), np.array(extra), 1.0, np.zeros(2), np.ones(n))
+def fitted(n: int, extra: Any = (), step: float = 0.0) -> MixtureFit:
+    return MixtureFit(0.0, np.full((2, 3), step), np.array(extra), 1.0, np.zeros(2), np.ones(n))
 
 
 def interval(start: float, stop: float, view: int = 1, axis: int = 1) -> Interval:
@@ -97,7 +97,7 @@ def test_what_fades_is_tried_on_both_sides_of_both_ends_over_halved_lengths(monk
     monkeypatch.setattr(explanations, "first_guess", first_guess)
     local = explanations._local
 
-    def watched(kind: str, seen: Seen, view: int, where: Any, sigma: float) -> Explanation:
+    def watched(kind: str, seen: BlockResiduals, view: int, where: Any, sigma: float) -> Explanation:
         asked.append(where[1:])
         return local(kind, seen, view, where, sigma)
 
@@ -120,12 +120,12 @@ def test_what_fades_is_tried_on_both_sides_of_both_ends_over_halved_lengths(monk
 
 def test_what_settles_is_tried_from_either_end_over_all_to_a_hundredth_of_an_image(monkeypatch) -> None:
     s, rates = seen(), list[float]()
-    made = explanations._settling
-    monkeypatch.setattr(explanations, "_settling", lambda *given: rates.append(given[1]) or made(*given))
+    made = explanations._transient
+    monkeypatch.setattr(explanations, "_transient", lambda *given: rates.append(given[1]) or made(*given))
     costs = [0.0] * 16
     costs[3] = -8.0  # what the fourth takes away
     monkeypatch.setattr(explanations, "first_guess", lambda *_: (None, None, costs.pop(0)))
-    (one,) = explanations.settling(s, interval(0.0, 1.0))
+    (one,) = explanations.transient(s, interval(0.0, 1.0))
     lengths = 1500.0 * 2.0 ** np.arange(-7.0, 1.0)
     np.testing.assert_allclose(rates, np.concatenate([1.0 / lengths, -1.0 / lengths]))
     assert one.where == (1, -np.inf, np.inf, 0.0, pytest.approx(1.0 / lengths[3]))
@@ -134,7 +134,7 @@ def test_what_settles_is_tried_from_either_end_over_all_to_a_hundredth_of_an_ima
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_each_image_settles_by_its_own_amount_from_its_own_end(sign: float) -> None:
     s = seen()
-    one = explanations._settling(s, sign / 100.0, 2.0)
+    one = explanations._transient(s, sign / 100.0, 2.0)
     first = np.where(sign > 0, 0.0, SIZE[1, s.linear.view])
     faded = np.exp(-np.abs(s.place[1] - first) / 100.0)
     for v in (0, 1):
@@ -142,7 +142,7 @@ def test_each_image_settles_by_its_own_amount_from_its_own_end(sign: float) -> N
         np.testing.assert_allclose(one.extra[:, 2 * v : 2 * v + 2], [[own, 0 * own], [0 * own, own]])
     np.testing.assert_array_equal(one.sigma, [2.0] * 4)
     assert one.price == pytest.approx(np.log(2.0) + 2.0 * SCALE)
-    assert (one.kind, one.view, [part.view for part in one.parts]) == (SETTLING, -1, [0, 1])
+    assert (one.kind, one.view, [part.view for part in one.parts]) == (TRANSIENT, -1, [0, 1])
     assert one.where == (1, -np.inf, np.inf, 0.0, sign / 100.0)
 
 
@@ -152,8 +152,8 @@ def test_a_rate_s_change_is_a_further_unknown_that_a_fit_says() -> None:
     for made in (
         lambda rate: explanations._local(FADE, s, 1, (1, 300.0, 4000.0, 300.0, rate), 1.0),
         lambda rate: explanations._local(FADE, s, 1, (1, -2000.0, 900.0, 900.0, -rate), 1.0),
-        lambda rate: explanations._settling(s, rate, 1.0),
-        lambda rate: explanations._settling(s, -rate, 1.0),
+        lambda rate: explanations._transient(s, rate, 1.0),
+        lambda rate: explanations._transient(s, -rate, 1.0),
     ):
         one, near = made(1.0 / 400.0), made(np.exp(step) / 400.0)
         found = bent(s, one)
@@ -215,9 +215,20 @@ def test_what_is_proposed_once_is_not_again(monkeypatch) -> None:
             explanations.EXPLANATIONS, kind, lambda seen, one, kind=kind: said.append((kind, one)) or [kind]
         )
     rows = [interval(0.0, 100.0), interval(0.0, 300.0), interval(0.0, 100.0, 0)]
-    assert list(proposed(seen(), rows, [])) == [STRIP, FADE, SETTLING, WANDER, MOVING, STRIP, FADE, STRIP, FADE, WANDER]
+    assert list(proposed(seen(), rows, [])) == [
+        STRIP,
+        FADE,
+        TRANSIENT,
+        WANDER,
+        MOVING,
+        STRIP,
+        FADE,
+        STRIP,
+        FADE,
+        WANDER,
+    ]
     assert [one for kind, one in said if kind == WANDER] == [rows[0], rows[2]]
-    assert list(proposed(seen(), rows[:1], [], (MOVING, FADE))) == [STRIP, SETTLING, WANDER]
+    assert list(proposed(seen(), rows[:1], [], (MOVING, FADE))) == [STRIP, TRANSIENT, WANDER]
     middle = [interval(0.0, 100.0), interval(500.0, 600.0)]
     assert list(proposed(seen(), middle, [], (MOVING, WANDER))) == [STRIP, FADE, STRIP, FADE]
     (only,) = proposed(seen(), [], [Swing(0, 50.0, 1.0)])
@@ -249,11 +260,11 @@ def test_the_largest_part_is_the_run_with_the_largest_sum(gain: list[int], part:
     assert sums[part] == max(sums.values())
 
 
-def gains(monkeypatch, s: Seen, inside: np.ndarray) -> list[np.ndarray]:
+def gains(monkeypatch, s: BlockResiduals, inside: np.ndarray) -> list[np.ndarray]:
     """Single ties of view 1 gain where they are `inside` and lose elsewhere; what they were asked with."""
     asked: list[np.ndarray] = []
 
-    def log_likelihoods(linear: Any, residual: np.ndarray, found: Fit) -> np.ndarray:
+    def log_likelihoods(linear: Any, residual: np.ndarray, found: MixtureFit) -> np.ndarray:
         asked.append(residual)
         return np.where(inside, 1.0, -1.0) if len(asked) % 2 else np.zeros(residual.shape[1])
 
@@ -322,7 +333,7 @@ def test_what_settles_and_what_has_no_place_are_as_wide_as_they_are_large() -> N
     found = sharpened(s, swing, fitted(60, [5.0, 1.0, 1.0, 1.0, 3.0]), np.zeros((2, 60)))
     np.testing.assert_allclose(found.sigma, [np.sqrt(3.0)] * 4)
     assert found.extra is swing.extra
-    settles = explanations._settling(s, 0.01, 1.0)
+    settles = explanations._transient(s, 0.01, 1.0)
     found = sharpened(s, settles, fitted(60, [2.0] * 4), np.zeros((2, 60)))
     assert found.where == settles.where
     np.testing.assert_allclose(found.sigma, 2.0)
@@ -367,7 +378,7 @@ def test_what_was_found_are_unknowns_of_the_images_with_the_sizes_found() -> Non
         found(STRIP, 2, 1.0, 2.0, where=strip),
         found(SWING, 0, 3.0, 4.0, 5.0, 6.0, period=50.0),
         found(FADE, 2, 7.0, 8.0, where=fade),
-        found(SETTLING, 1, 9.0, 10.0, where=fade),
+        found(TRANSIENT, 1, 9.0, 10.0, where=fade),
     ]
     waves, params = following._waves_of(parts, 4)
     assert waves.count == 0

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions
-from barpc.ba.estimated.waves import Waves
-from barpc.ba.held.block import join, make_problem
+from barpc.ba.constraints.block import join, make_problem
 from barpc.ba.judging import following
 from barpc.ba.judging.explanations import FADE, STRIP, SWING
 from barpc.ba.judging.following import _Columns, _given_edges, _spline_counts, _with_edges, find_edges, follow
+from barpc.ba.parameters.additional_parameters import AdditionalParameters
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import ecef_from_ground
@@ -110,7 +110,9 @@ def followed(monkeypatch, tells: str, better: str, **options: Any) -> tuple[str,
         name = str(made.index(f"{count}") + 1) if count >= 0 else "0"
         return Tried(name, name, name in tells, SimpleNamespace(smooth=f"smooth of {name}"), {"drift": 1})
 
-    def with_waves(found: Any, block: Any, outer: Any, options: Any, waves: Waves, once: bool = False) -> Tried:
+    def with_waves(
+        found: Any, block: Any, outer: Any, options: Any, waves: AdditionalParameters, once: bool = False
+    ) -> Tried:
         assert found.name == "0"  # always from where it ended without
         assert once == (not options.detectors)
         made.append(str(waves.count))
@@ -157,7 +159,7 @@ def test_knots_are_denser_until_nothing_is_left_or_two_are_no_better(monkeypatch
     ],
 )
 def test_what_is_followed_explains_most_of_what_neighbours_share(monkeypatch, before, left, error, kept) -> None:
-    monkeypatch.setattr(following, "shared", lambda outcome, block: outcome)
+    monkeypatch.setattr(following, "correlated_noise_gain", lambda outcome, block: outcome)
     tried, found = (
         SimpleNamespace(outcome=o, after=SimpleNamespace(error=e)) for o, e in ((left, error), (before, 1.0))
     )
@@ -197,7 +199,7 @@ def test_strips_of_all_images_compete_with_what_follows_them_as_a_whole(monkeypa
     findings = tuple(SimpleNamespace(kind=kind, view=v, where=(1,), moved=None) for v, kind in parts.items())
     found, whole = Ended("found", 9), Ended("whole", plain)
     monkeypatch.setattr(following, "_waves_of", lambda *_: (None, None))
-    monkeypatch.setattr(following, "_judged", lambda found, *_: found)
+    monkeypatch.setattr(following, "_at_selection", lambda found, *_: found)
     monkeypatch.setattr(following, "_with_waves", lambda *_, **__: Ended("tried", 2))
     monkeypatch.setattr(following, "follow", lambda *_: whole)
     monkeypatch.setattr(following, "standing_out", lambda *_: [])
@@ -212,7 +214,7 @@ def steps(monkeypatch, counts: list[int], tells: list[bool], given: int = 0) -> 
     sigmas: list[float] = []
     solved: list[int] = []
 
-    def solution(waves: Waves) -> Any:
+    def solution(waves: AdditionalParameters) -> Any:
         unknowns = SimpleNamespace(unknowns=SimpleNamespace(waves=waves))
         outcome = SimpleNamespace(noise=2.0, problem=None, residual=None, inlier=None)
         return SimpleNamespace(
@@ -222,7 +224,9 @@ def steps(monkeypatch, counts: list[int], tells: list[bool], given: int = 0) -> 
             has_waves=tells[len(solved)],
         )
 
-    def with_waves(found: Any, block: Any, outer: Any, options: Any, waves: Waves, once: bool = False) -> Any:
+    def with_waves(
+        found: Any, block: Any, outer: Any, options: Any, waves: AdditionalParameters, once: bool = False
+    ) -> Any:
         assert not once
         assert waves.count == 13
         solved.append(waves.edges.shape[1])
@@ -234,7 +238,7 @@ def steps(monkeypatch, counts: list[int], tells: list[bool], given: int = 0) -> 
 
     monkeypatch.setattr(following, "_with_waves", with_waves)
     monkeypatch.setattr(following, "find_edges", look)
-    start = solution(Waves(13, np.zeros((2, given))))
+    start = solution(AdditionalParameters(13, np.zeros((2, given))))
     _with_edges(start, SimpleNamespace(sigma=np.full(3, 0.1)), None, None)  # type: ignore[arg-type]
     return solved, sigmas
 
@@ -403,7 +407,7 @@ def test_the_step_of_one_view_is_found_in_that_view_and_that_of_all_in_all(exact
 def test_what_was_found_before_is_looked_for_anew(exact) -> None:
     """Residuals of cameras that know the steps are those of cameras without, what their splines do left out."""
     problem, state = exact
-    waves = Waves(9, np.tile([9000.0], (3, 1)))
+    waves = AdditionalParameters(9, np.tile([9000.0], (3, 1)))
     unknowns = replace(problem.cameras.unknowns, waves=waves)
     params = np.hstack([state.params, np.random.default_rng(1).normal(0, 0.2, (3, waves.size))])
     cameras = SimpleNamespace(unknowns=unknowns)
@@ -423,25 +427,25 @@ def test_what_was_found_before_is_looked_for_anew(exact) -> None:
 
 
 def test_unknowns_of_waves_are_about_as_large_within_half_an_octave() -> None:
-    bands = Waves(13, np.zeros((2, 3))).bands
-    m, s, strips, swings = Waves(13, np.zeros((2, 3))).parts
+    bands = AdditionalParameters(13, np.zeros((2, 3))).bands
+    m, s, strips, swings = AdditionalParameters(13, np.zeros((2, 3))).parts
     assert strips == swings == 0
     assert (m, s) == (10, 2)  # a shift and a scale of the columns are not theirs
     # of 3, 4, 5, ... half waves: between powers of the root of two
     expected = [0, 1, 1, 2, 2, 3, 3, 3, 3, 4]
     assert bands.tolist() == [*expected, *expected, *[5] * 2 * s]
-    assert Waves(0, np.zeros((1, 1))).bands.tolist() == [0, 0]
-    assert Waves(0, np.zeros((1, 1))).parts == (0, 1, 0, 0)
-    both = Waves(13, np.zeros((2, 3)), np.zeros((2, 4, 5)))  # strips are as large as each other
+    assert AdditionalParameters(0, np.zeros((1, 1))).bands.tolist() == [0, 0]
+    assert AdditionalParameters(0, np.zeros((1, 1))).parts == (0, 1, 0, 0)
+    both = AdditionalParameters(13, np.zeros((2, 3)), np.zeros((2, 4, 5)))  # strips are as large as each other
     assert both.bands.tolist() == [*expected, *expected, *[5] * 2 * s, *[6] * 8]
-    assert Waves(0, np.zeros((2, 0)), np.zeros((2, 4, 5))).bands.tolist() == [0] * 8
-    assert Waves(9).size == 2 * 6
+    assert AdditionalParameters(0, np.zeros((2, 0)), np.zeros((2, 4, 5))).bands.tolist() == [0] * 8
+    assert AdditionalParameters(9).size == 2 * 6
 
 
 def test_unknowns_of_another_layout_are_gone_on_from_where_they_are_the_same() -> None:
     """Splines of as many, strips and one more, swings of as many; detectors are asked again."""
     strips, edges = np.zeros((2, 2, 5)), np.zeros((2, 1))
-    known = Waves(9, edges, strips[:, :1], np.zeros((2, 1)))
+    known = AdditionalParameters(9, edges, strips[:, :1], np.zeros((2, 1)))
     more = replace(known, strips=strips)
     params = np.random.default_rng(0).normal(size=(2, known.size))
     found = more.carried(params, known)
@@ -451,15 +455,15 @@ def test_unknowns_of_another_layout_are_gone_on_from_where_they_are_the_same() -
     col, row = params[:, known.kinds[2]].T
     np.testing.assert_array_equal(found[:, more.kinds[2]].T, [col, 0.0 * col, row, 0.0 * row])
     assert not replace(known, count=11).carried(params, known)[:, : 2 * 8].any()
-    assert not Waves(0, periods=np.zeros((2, 2))).carried(params, known).any()
-    assert not Waves(0, strips=strips).carried(params[:, known.kinds[0]], Waves(9)).any()
+    assert not AdditionalParameters(0, periods=np.zeros((2, 2))).carried(params, known).any()
+    assert not AdditionalParameters(0, strips=strips).carried(params[:, known.kinds[0]], AdditionalParameters(9)).any()
 
 
 PERIODS = np.array([[200.0, 31.5], [np.inf, np.inf], [700.0, np.inf]])
 
 
 def test_swings_are_cosines_and_sines_of_the_row_seen() -> None:
-    waves = Waves(0, np.zeros((3, 0)), np.zeros((3, 0, 5)), PERIODS)
+    waves = AdditionalParameters(0, np.zeros((3, 0)), np.zeros((3, 0, 5)), PERIODS)
     assert waves.parts == (0, 0, 0, 4)
     assert waves.size == 8
     assert waves.bands.tolist() == [0] * 8
@@ -479,16 +483,18 @@ def test_swings_are_cosines_and_sines_of_the_row_seen() -> None:
 
 def test_an_error_that_neighbours_share_is_another_in_every_half_of_a_wave() -> None:
     none, strips = np.zeros((3, 0)), np.zeros((3, 0, 5))
-    assert Waves(13, none, strips).stretches(9000.0) == Waves(13).size
+    assert AdditionalParameters(13, none, strips).stretches(9000.0) == AdditionalParameters(13).size
     of_waves = 9000.0 / 200.0 + 9000.0 / 31.5
-    assert Waves(0, none, strips, PERIODS).stretches(9000.0) == pytest.approx(4.0 * of_waves)
-    assert Waves(13, none, strips, PERIODS).stretches(9000.0) == pytest.approx(Waves(13).size + 4.0 * of_waves)
-    assert Waves(0, none, strips, 1e9 * PERIODS).stretches(9000.0) == 8  # as many as there are unknowns
+    assert AdditionalParameters(0, none, strips, PERIODS).stretches(9000.0) == pytest.approx(4.0 * of_waves)
+    assert AdditionalParameters(13, none, strips, PERIODS).stretches(9000.0) == pytest.approx(
+        AdditionalParameters(13).size + 4.0 * of_waves
+    )
+    assert AdditionalParameters(0, none, strips, 1e9 * PERIODS).stretches(9000.0) == 8  # as many as there are unknowns
 
 
 @pytest.mark.parametrize("count", [1, 2, 7])
 def test_steps_leave_a_shift_and_a_scale_to_others(count: int) -> None:
-    steps = Waves(0, np.zeros((1, count)))._of_steps
+    steps = AdditionalParameters(0, np.zeros((1, count)))._of_steps
     place = np.linspace(-1, 1, count + 1)
     np.testing.assert_allclose(steps.T @ np.ones(count + 1), 0.0, atol=1e-12)
     if count > 1:
@@ -497,7 +503,7 @@ def test_steps_leave_a_shift_and_a_scale_to_others(count: int) -> None:
 
 
 def test_a_view_without_edges_has_no_steps_and_one_with_fewer_its_own() -> None:
-    waves = Waves(0, np.array([[5.0, 9.0], [7.0, np.inf], [np.inf, np.inf]]))
+    waves = AdditionalParameters(0, np.array([[5.0, 9.0], [7.0, np.inf], [np.inf, np.inf]]))
     col, index = np.tile([4.9, 5.0, 8.0, 9.5], 3), np.repeat([0, 1, 2], 4)
     (basis,) = waves.basis(np.zeros(12), np.stack([col, col * 0.0]), index)
     levels = waves._of_steps.T

@@ -11,12 +11,12 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pytest
 
-from barpc.ba.estimated.priors import CameraPrior, JointPrior, PointPrior
-from barpc.ba.estimated.projected import Cameras
-from barpc.ba.estimated.unknowns import make_unknowns
-from barpc.ba.estimated.waves import Waves
-from barpc.ba.held import ground as on_points
-from barpc.ba.held.ground import flat_heights, ground_control, reference_control, staying, terrain_heights
+from barpc.ba.constraints import ground as on_points
+from barpc.ba.constraints.ground import flat_heights, ground_control, reference_control, staying, terrain_heights
+from barpc.ba.parameters.additional_parameters import AdditionalParameters
+from barpc.ba.parameters.priors import CameraPrior, JointPrior, PointPrior
+from barpc.ba.parameters.projected import Cameras
+from barpc.ba.parameters.unknowns import make_unknowns
 from barpc.ba.robust.weights import LOSSES
 from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.base.options import AUTO, Model
@@ -50,7 +50,7 @@ def _setup(views, model, drift, ecef, scale=5.0):
     """Cameras that see ten points each, where their corrected sensors see them."""
     edges = np.array([[5000.0, 12000.0], [9000.0, np.inf], [np.inf, np.inf]])
     periods = np.array([[2000.0, 5000.0], [np.inf, np.inf], [7000.0, np.inf]])
-    waves = Waves(9, edges, np.zeros((3, 0, 5)), periods) if drift == 2 else None
+    waves = AdditionalParameters(9, edges, np.zeros((3, 0, 5)), periods) if drift == 2 else None
     unknowns, bounds = make_unknowns(views, model, drift, waves=waves), np.array([0, 10, 20, 30])
     assert unknowns.size
     params = np.random.default_rng(3).normal(0, scale, (3, unknowns.size))

@@ -10,19 +10,19 @@ import numpy as np
 import pyproj
 import pytest
 
-from barpc.ba.estimated.priors import DEFAULT_ACCURACY, USABLE_ACCURACY, _stated, prior_sigmas
-from barpc.ba.held.gauge import MOTIONS, _motion_of_points
-from barpc.ba.held.ground import (
+from barpc.ba.constraints.gauge import MOTIONS, _motion_of_points
+from barpc.ba.constraints.ground import (
     DEM_BIAS,
-    Heights,
-    _join,
+    PointConstraints,
+    _join_priors,
     _slopes,
     flat_heights,
     ground_control,
     reference_control,
     terrain_heights,
 )
-from barpc.ba.held.terrain import NUM_BENDS, Believed, Relief
+from barpc.ba.constraints.terrain import NUM_BENDS, RegularisedDem, Relief
+from barpc.ba.parameters.priors import DEFAULT_ACCURACY, USABLE_ACCURACY, _stated_accuracy, prior_sigmas
 from barpc.base.errors import BarpcWarning
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
@@ -50,11 +50,13 @@ def hill(lon: Any, lat: Any) -> np.ndarray:
     return np.where(east > -2000.0, 300.0 + 0.2 * east - 0.1 * north, np.nan)
 
 
-def heights(n: int = 6, **given: Any) -> Heights:
+def heights(n: int = 6, **given: Any) -> PointConstraints:
     """Of n tracks the last two are weak."""
     weak = np.arange(n) >= n - 2
     options = AdjustOptions(**given.pop("options", {}))
-    return Heights((), weak, np.arange(n), (0.0, 500.0), options, given.pop("dem", hill), given.pop("reference", None))
+    return PointConstraints(
+        (), weak, np.arange(n), (0.0, 500.0), options, given.pop("dem", hill), given.pop("reference", None)
+    )
 
 
 def test_what_altimetry_holds_a_terrain_does_not_and_of_the_rest_those_with_weak_rays_by_its_slopes() -> None:
@@ -76,8 +78,8 @@ def test_what_is_believed_of_a_dem_holds_all_tracks_but_those_held_already(monke
     points = placed([0.0, 300.0, -300.0, 500.0], [0.0, 300.0, 200.0, -100.0], 350.0)
     bent = np.linspace(-1.0, 1.0, 4 * NUM_BENDS).reshape(4, NUM_BENDS)
     alt, slopes = np.array([340.0, 341.0, np.nan, 343.0]), np.tile([0.2, -0.1], (4, 1))
-    found = Believed(alt, slopes, bent, np.ones(3), 2.0, 4.0, 1.0, True)
-    monkeypatch.setattr(Heights, "_believed", lambda self, given: found if given is points else None)
+    found = RegularisedDem(alt, slopes, bent, np.ones(3), 2.0, 4.0, 1.0, True)
+    monkeypatch.setattr(PointConstraints, "_believed", lambda self, given: found if given is points else None)
     asked: list[float] = []
     relief: Any = SimpleNamespace(common_sigma=lambda bias: asked.append(bias) or np.arange(1.0, NUM_BENDS + 1.0))
     by_altimetry = flat_heights(points, np.array([3]), 350.0, 1.0, 0.0)
@@ -135,7 +137,7 @@ def test_where_the_slope_is_unknown_the_height_holds_alone_and_where_the_height_
     assert abs(east) < 0.02
     nowhere = terrain_heights(points[1:2], np.array([0]), hill, 1.0, 5.0)
     assert nowhere.common.shape == (0, 3, 3)
-    assert _join([nowhere, None]) is None
+    assert _join_priors([nowhere, None]) is None
 
 
 def test_what_heights_share_is_a_level_and_slopes_that_are_as_large_at_the_edges() -> None:
@@ -162,7 +164,7 @@ def test_blocks_with_and_without_errors_in_common_are_joined() -> None:
         ground_control(gcps, np.array([0])),
         flat_heights(points, np.array([1, 2]), 300.0, 2.0, 6.0),
     )
-    joined = _join([control, None, flat])
+    joined = _join_priors([control, None, flat])
     assert joined is not None
     assert joined.index.tolist() == [0, 1, 2]
     assert joined.common.shape == (3, 3, 3)
@@ -247,9 +249,9 @@ def flown(*accuracy: float) -> Any:
 
 
 def test_a_camera_is_as_accurate_as_it_states_for_attitude_and_position() -> None:
-    assert _stated(flown(3.0, 0.5)) == (3.0, 0.5)
-    assert _stated(flown(0.01, 0.02)) == (USABLE_ACCURACY, USABLE_ACCURACY)
-    assert _stated(flown()) == (DEFAULT_ACCURACY, DEFAULT_ACCURACY)
+    assert _stated_accuracy(flown(3.0, 0.5)) == (3.0, 0.5)
+    assert _stated_accuracy(flown(0.01, 0.02)) == (USABLE_ACCURACY, USABLE_ACCURACY)
+    assert _stated_accuracy(flown()) == (DEFAULT_ACCURACY, DEFAULT_ACCURACY)
     views: Any = (flown(3.0, 0.5), flown(0.3, 9.0))
     sigma = prior_sigmas(views, AdjustOptions(), 2)
     np.testing.assert_array_equal(sigma[0], np.repeat([3.0, 0.5, 0.2, 0.2], 3))

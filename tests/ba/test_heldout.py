@@ -11,7 +11,7 @@ import pytest
 from scipy.special import gammaln
 
 from barpc.ba import AdjustOptions
-from barpc.ba.held.block import Block, join, make_problem
+from barpc.ba.constraints.block import Block, join, make_problem
 from barpc.ba.robust.heldout import (
     HeldOut,
     _scrambled,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from barpc.ba.estimated.priors import CameraPrior, EarlierScene
-from barpc.ba.held.incremental import BlockPrior, apply_prior
+from barpc.ba.constraints.incremental import BlockPrior, apply_prior
+from barpc.ba.parameters.priors import CameraPrior, EarlierScene
 from barpc.ba.result import block_prior
 from barpc.base.errors import InputError
 from barpc.simulate import simulate_block

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.ba.estimated.waves import Waves
-from barpc.ba.held.incremental import BlockPrior
+from barpc.ba.constraints.incremental import BlockPrior
+from barpc.ba.parameters.additional_parameters import AdditionalParameters
 from barpc.ba.result import block_prior
 from barpc.base.errors import InputError
 from barpc.fit import fit_rpc
-from barpc.sensor.displaced import Splined
+from barpc.sensor.image_corrections import Splined
 from benchmarks.referee import cases, judge, make, solve
 from tests.ba.test_referee import hills
 from tests.lanes import rest_slow
@@ -272,7 +272,7 @@ def test_the_best_single_rpc_is_fitted_to_the_camera_with_jitter():
 
 
 def test_splines_leave_to_the_drift_what_it_can_do():
-    waves = Waves(13)
+    waves = AdditionalParameters(13)
     u, index = np.linspace(-1, 1, 4001), np.zeros(4001, dtype=np.int64)
     (basis,) = waves.basis(u, u, index)
     assert basis.shape == (10, 4001)

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
-from barpc.ba.judging.explanations import FADE, LOCAL, SETTLING, STRIP, SWING, WANDER
+from barpc.ba.judging.explanations import FADE, LOCAL, STRIP, SWING, TRANSIENT, WANDER
 from barpc.scene import Tracks
-from barpc.sensor.displaced import Splined
 from barpc.sensor.geometry import triangulate
-from barpc.simulate import Block, simulate_block
+from barpc.sensor.image_corrections import Splined
+from barpc.simulate import SimulatedBlock, simulate_block
 from tests.lanes import rest_slow
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*held in height")
@@ -30,7 +30,7 @@ def profile_of(tracks: Tracks, where: Displaced, size: tuple[int, int]) -> np.nd
     return (inside * faded * where["px"])[:, None] * np.array([np.cos(angle), np.sin(angle)])
 
 
-def flawed(views: int, tracks: int, *all_of: Displaced, seed: int = 0, **options: Any) -> tuple[Block, Tracks]:
+def flawed(views: int, tracks: int, *all_of: Displaced, seed: int = 0, **options: Any) -> tuple[SimulatedBlock, Tracks]:
     block = simulate_block(views, tracks, seed=seed, attitude=10e-6, position=2.0, **options)
     xy = block.tracks.xy.copy()
     for where in all_of:
@@ -38,12 +38,12 @@ def flawed(views: int, tracks: int, *all_of: Displaced, seed: int = 0, **options
     return block, replace(block.tracks, xy=xy)
 
 
-def adjusted(block: Block, tracks: Tracks, **options: Any) -> Adjustment:
+def adjusted(block: SimulatedBlock, tracks: Tracks, **options: Any) -> Adjustment:
     return adjust_tracks(block.views, tracks, AdjustOptions(**options))
 
 
 @cache
-def in_the_middle() -> tuple[Block, Tracks, Adjustment]:
+def in_the_middle() -> tuple[SimulatedBlock, Tracks, Adjustment]:
     """A block of which rows in the middle of an image lie off, and its adjustment."""
     block, tracks = flawed(3, 300, MIDDLE)
     return block, tracks, adjusted(block, tracks)
@@ -118,7 +118,7 @@ def test_all_images_that_settle_are_explained_together(first: float) -> None:
     angle = np.array([0.3, 1.9, 3.7, 5.2])[block.tracks.view]
     moved = 8.0 * np.exp(-away / 0.02) * np.array([np.cos(angle), np.sin(angle)])
     found = adjusted(block, replace(block.tracks, xy=block.tracks.xy + moved.T))
-    assert [one.kind for one in found.findings] == [SETTLING] * 4
+    assert [one.kind for one in found.findings] == [TRANSIENT] * 4
     assert sorted(one.view for one in found.findings) == [0, 1, 2, 3]
     for one in found.findings:
         assert one.where is not None
@@ -130,7 +130,9 @@ def test_all_images_that_settle_are_explained_together(first: float) -> None:
     assert not found.moving.any()
 
 
-def swung(views: int, tracks: int, px: float, period: float, view: int = 1, seed: int = 0) -> tuple[Block, Tracks]:
+def swung(
+    views: int, tracks: int, px: float, period: float, view: int = 1, seed: int = 0
+) -> tuple[SimulatedBlock, Tracks]:
     """Ties of a block of which the rows of a view swing."""
     block = simulate_block(views, tracks, seed=seed, attitude=10e-6, position=2.0)
     moved = px * np.sin(2.0 * np.pi * block.tracks.xy[:, 1] / period + 1.0) * (block.tracks.view == view)
@@ -256,7 +258,7 @@ def test_what_cannot_be_judged_is_adjusted_all_the_same(monkeypatch: pytest.Monk
     def fails(*_: Any) -> None:
         raise np.linalg.LinAlgError("7-th leading minor")
 
-    monkeypatch.setattr("barpc.ba.judging.judge.fit", fails)
+    monkeypatch.setattr("barpc.ba.judging.judge.fit_mixture", fails)
     found = adjusted(*flawed(3, 400, MIDDLE))
     assert not found.findings
     assert {one.view for one in found.left} == {1}  # and what stands out is still said

@@ -11,18 +11,18 @@ from barpc.ba.solving import linear, normal
 from barpc.ba.solving.linear import Blocks
 from barpc.ba.solving.structure import counting_sort, dissect
 from barpc.base.errors import AdjustError
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import solve as adjust
 
 
 @pytest.fixture(scope="module")
-def block() -> Block:
+def block() -> SimulatedBlock:
     """Four views, 300 tie points."""
     return simulate_block(4, 300, seed=11)
 
 
 @pytest.fixture(scope="module")
-def adjusted(block: Block) -> Adjustment:
+def adjusted(block: SimulatedBlock) -> Adjustment:
     """`block`, adjusted."""
     return adjust(block)
 
@@ -62,7 +62,7 @@ def test_a_large_block_is_solved_in_sparse_form_as_in_dense_form(block, adjusted
 def test_what_a_large_block_does_not_keep_it_works_out_again(block, adjusted, monkeypatch):
     """Derivatives from one step to the next, and the terms of the smooth parts."""
     monkeypatch.setattr("barpc.ba.solving.problem.KEPT", 0)
-    monkeypatch.setattr("barpc.ba.robust.smooth.KEPT", 0)
+    monkeypatch.setattr("barpc.ba.robust.systematic_residuals.KEPT", 0)
     found = adjust(block)
     np.testing.assert_allclose(found.params, adjusted.params, atol=1e-7)
     np.testing.assert_allclose(found.smooth.rms, adjusted.smooth.rms, atol=1e-9)

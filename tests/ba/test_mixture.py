@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.evidence import linearised, mixture
-from barpc.ba.evidence.linearised import Linear, Tracks, linearise
-from barpc.ba.evidence.mixture import Fit, fit, log_likelihoods, off_from_right
-from barpc.ba.held.block import first_state, join, make_problem
+from barpc.ba.evidence.linearised import Linear, TrackGroup, linearise
+from barpc.ba.evidence.mixture import MixtureFit, fit_mixture, log_likelihoods, off_from_right
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
-from barpc.base.usual import SLIGHT
+from barpc.base.statistics import SLIGHT
 from barpc.simulate import simulate_block
 from tests.distributions import multivariate_normal
 
@@ -34,7 +34,7 @@ def linear() -> Linear:
     return linear_of()
 
 
-def projector(tracks: Tracks) -> Array:
+def projector(tracks: TrackGroup) -> Array:
     """What takes away what the ground point follows (T, 2n, 2n), all views right."""
     weight = np.zeros((len(tracks.rows), len(tracks.subsets)))
     weight[:, 0] = 1.0
@@ -87,17 +87,17 @@ def test_a_track_s_likelihood_is_the_integral_over_its_ground_point(linear: Line
 
 @pytest.mark.slow
 def test_the_true_noise_and_the_true_share_of_outliers_are_found() -> None:
-    found = fit(linear_of(3, 1500, outliers=0.2))
+    found = fit_mixture(linear_of(3, 1500, outliers=0.2))
     assert found.noise == pytest.approx(1.0, rel=0.05)
     assert found.eps.mean() == pytest.approx(0.2, abs=0.04)
     assert 0.75 < found.right.mean() < 0.85
 
 
 def test_an_unknown_that_explains_nothing_costs_the_room_that_it_takes(linear: Linear) -> None:
-    base = fit(linear)
+    base = fit_mixture(linear)
     extra = np.zeros((2, 1, len(linear.view)))
     extra[0, 0, linear.view == 1] = np.where(np.arange((linear.view == 1).sum()) % 2, 1.0, -1.0)
-    costs = [base.evidence - fit(linear, extra, np.array([sigma])).evidence for sigma in (1.0, 10.0, 100.0)]
+    costs = [base.evidence - fit_mixture(linear, extra, np.array([sigma])).evidence for sigma in (1.0, 10.0, 100.0)]
     np.testing.assert_allclose(np.diff(costs), np.log(10.0), atol=0.02)
     assert costs[0] > 2.0
 
@@ -107,15 +107,15 @@ def test_what_was_put_in_comes_out_warm_or_cold(linear: Linear) -> None:
     extra = np.zeros((2, 2, len(rows)))
     extra[0, 0] = extra[1, 1] = rows
     moved = replace(linear, residual=linear.residual - rows * np.array([[8.0], [-5.0]]))
-    found = [fit(moved, extra, np.full(2, 1.0), warm) for warm in (None, fit(moved))]
+    found = [fit_mixture(moved, extra, np.full(2, 1.0), warm) for warm in (None, fit_mixture(moved))]
     for one in found:
         np.testing.assert_allclose(one.extra, np.array([8.0, -5.0]) * 0.1, atol=0.05)
     assert found[0].evidence == pytest.approx(found[1].evidence, abs=0.5)
-    assert found[0].evidence > fit(moved).evidence + 100.0
+    assert found[0].evidence > fit_mixture(moved).evidence + 100.0
 
 
 def test_a_track_s_likelihood_falls_where_it_is_displaced(linear: Linear) -> None:
-    found = fit(linear)
+    found = fit_mixture(linear)
     left = linear.left(found.step)
     away = left.copy()
     away[:, linear.view == 0] += 20.0
@@ -124,8 +124,8 @@ def test_a_track_s_likelihood_falls_where_it_is_displaced(linear: Linear) -> Non
 
 
 def test_the_same_block_gives_the_same_bits(linear: Linear) -> None:
-    one, other = fit(linear), fit(linear)
-    assert isinstance(one, Fit)
+    one, other = fit_mixture(linear), fit_mixture(linear)
+    assert isinstance(one, MixtureFit)
     assert (one.step == other.step).all()
     assert one.evidence == other.evidence
 
@@ -200,7 +200,7 @@ def test_a_first_guess_has_the_least_sum_of_distances(linear: Linear) -> None:
     """Of what all tracks are off by, points following, against the same steps written track by track."""
     rng = np.random.default_rng(2)
     moved = replace(linear, residual=linear.residual + rng.normal(0.0, 3.0, linear.residual.shape))
-    base = replace(fit(linear), noise=1.5)
+    base = replace(fit_mixture(linear), noise=1.5)
     old, new = rng.normal(size=(2, 1, len(linear.view))), np.zeros((2, 2, len(linear.view)))
     new[0, 0] = new[1, 1] = (linear.view == 1) & (np.arange(len(linear.view)) % 2 == 0)
     base = replace(base, extra=np.array([0.2]))
@@ -257,8 +257,8 @@ def test_a_wrong_match_lies_in_an_image_or_along_an_epipolar_line() -> None:
 
 def test_numbers_of_a_mixture_are_those_of_its_subsets() -> None:
     """Six of each view of every subset: all, and all but one."""
-    assert linearised.numbers(np.array([2, 3, 4])) == 6 * (3 * 2 + 4 * 3 + 5 * 4)
-    assert linearised.numbers(np.array([5, 12])) == 6 * (6 * 5 + 13 * 12)
+    assert linearised.array_elements(np.array([2, 3, 4])) == 6 * (3 * 2 + 4 * 3 + 5 * 4)
+    assert linearised.array_elements(np.array([5, 12])) == 6 * (6 * 5 + 13 * 12)
 
 
 def test_a_track_moves_by_the_share_of_what_is_right_of_it_that_moves() -> None:

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, adjustment, block_prior
-from barpc.ba.held.block import first_state, join, make_problem
+from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.judging import solution as solved
-from barpc.ba.judging.judge import Judgement
+from barpc.ba.judging.judge import Selection
 from barpc.ba.judging.solution import Solution
 from barpc.ba.robust.rounds import Outcome
 from barpc.ba.solving.structure import make_structure
 from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.scene import GroundPoints, Tracks
-from barpc.sensor.displaced import ImageAffine, ImageCorrected
 from barpc.sensor.geometry import triangulate
-from barpc.simulate import Block, simulate_block
+from barpc.sensor.image_corrections import ImageAffine, ImageCorrected
+from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import centers_of, solve
 from tests.constants import chosen
 
@@ -29,7 +29,7 @@ CALM = {"learn_priors": False, "hold_out": False}
 
 
 @pytest.fixture(scope="module")
-def made() -> Block:
+def made() -> SimulatedBlock:
     return simulate_block(3, 150, seed=5)
 
 
@@ -50,7 +50,7 @@ def choose(monkeypatch, skew: bool, trend: bool, error: float, rms: float, **giv
     monkeypatch.setattr(adjustment, "standing_out", lambda *_: [])
     monkeypatch.setattr(adjustment, "follow", lambda found, *_: found)
     monkeypatch.setattr(adjustment, "without_strips", lambda found, *_: found)
-    monkeypatch.setattr(adjustment, "without_moving", lambda found, parts, *_: (found, parts, Judgement()))
+    monkeypatch.setattr(adjustment, "without_moving", lambda found, parts, *_: (found, parts, Selection()))
     parts: Any = SimpleNamespace(inner=None, outer=None)
     options = AdjustOptions(**given)
     first: Any = by_script(None, None, options)
@@ -115,7 +115,7 @@ def test_what_an_affine_explains_wholly_no_parts_of_images_are_asked_to(monkeypa
 
     def without_moving(found: Any, parts: Any, *_: Any) -> Any:
         asked.append("moving")
-        return found, parts, Judgement()
+        return found, parts, Selection()
 
     def without_strips(found: Any, *_: Any) -> Any:
         asked.append("strips")
@@ -254,7 +254,7 @@ def test_an_earlier_blocks_centres_are_kept_and_the_others_regressed(made) -> No
 # --- where it starts ----------------------------------------------------------------------------------------------
 
 
-def uneven(made: Block) -> Block:
+def uneven(made: SimulatedBlock) -> SimulatedBlock:
     """Observations of three sigmas, and noise to go with them."""
     sigma = np.array([0.1, 0.5, 2.0])[np.arange(len(made.tracks)) % 3]
     xy = made.tracks.xy + sigma[:, None] * np.random.default_rng(0).normal(size=made.tracks.xy.shape)
@@ -417,7 +417,7 @@ def script(
     monkeypatch.setattr(solved, "Rounds", Scripted)
     monkeypatch.setattr(solved, "_is_suspect", lambda *_: suspect)
     monkeypatch.setattr(solved, "agreeing", lambda *_: Agreed(agreed))
-    monkeypatch.setattr(solved, "revived", lambda problem, state, *_: (state, None))
+    monkeypatch.setattr(solved, "retriangulate_rejected", lambda problem, state, *_: (state, None))
     monkeypatch.setattr(solved, "finished", lambda found, problem, block, outer, options, outcome: found)
     use = np.ones(100)
     seen = {"view": np.zeros(100, dtype=np.int64), "point": np.arange(100), "num_tracks": 100}
@@ -518,7 +518,7 @@ def followed(
 
     monkeypatch.setattr(adjustment, "follow", follow)
     monkeypatch.setattr(adjustment, "without_strips", lambda found, *_: found)
-    monkeypatch.setattr(adjustment, "without_moving", lambda found, parts, *_: (found, parts, Judgement()))
+    monkeypatch.setattr(adjustment, "without_moving", lambda found, parts, *_: (found, parts, Selection()))
     parts: Any = SimpleNamespace(inner=None, outer=None)
     found, left, _ = adjustment._choose_model(
         solve_block(None, None, AdjustOptions()), parts, AdjustOptions(), solve_block

@@ -11,22 +11,22 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.apart import Parts
+from barpc.ba.constraints.block import Block as Joined
+from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.evidence.linearised import linearise
-from barpc.ba.evidence.mixture import Group, fit
+from barpc.ba.evidence.mixture import Group, fit_mixture
 from barpc.ba.evidence.mixture import moving as moving_of
 from barpc.ba.evidence.scan import Interval
-from barpc.ba.held.block import Block as Joined
-from barpc.ba.held.block import first_state, join, make_problem
 from barpc.ba.judging import explanations, moving
 from barpc.ba.judging.explanations import MOVING, STRIP
-from barpc.ba.judging.moving import CELLS, Ground, group_of, members
+from barpc.ba.judging.moving import GROUND_CELLS, GroundMotion, group_of, members
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
-from barpc.base.usual import LEVEL
+from barpc.base.statistics import LEVEL
 from barpc.scene import BoolArray, Tracks
 from barpc.sensor.corrected import Corrected
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 from tests.lanes import rest_slow
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*held in height")
@@ -40,7 +40,7 @@ def shifted(ground: Array, east_north: Array) -> Array:
     return out
 
 
-def across(block: Block) -> Array:
+def across(block: SimulatedBlock) -> Array:
     """The direction (2,) on the ground, east and north, that no height looks like in the first and last view."""
     middle = block.truth.ground.mean(axis=0)[None]
     leans = []
@@ -53,7 +53,7 @@ def across(block: Block) -> Array:
     return np.array([-along[1], along[0]]) / np.hypot(*along)
 
 
-def corner(block: Block, part: float) -> BoolArray:
+def corner(block: SimulatedBlock, part: float) -> BoolArray:
     """Which ground points (P,) lie in the north-west: about so many of them."""
     place = block.truth.ground[:, 1] - block.truth.ground[:, 0]
     chosen: BoolArray = place > np.quantile(place, 1.0 - part)
@@ -62,7 +62,7 @@ def corner(block: Block, part: float) -> BoolArray:
 
 def drifting(
     views: int, tracks: int, part: float, metres: float, seed: int = 0, outliers: float = 0.0
-) -> tuple[Block, Tracks, BoolArray]:
+) -> tuple[SimulatedBlock, Tracks, BoolArray]:
     """A block whose corner moves by `metres` from the first to the last view; which ties (K,) are there."""
     block = simulate_block(views, tracks, seed=seed, attitude=10e-6, position=2.0, per_site=views, outliers=outliers)
     ties, moves = block.tracks, corner(block, part)[block.tracks.point]
@@ -75,7 +75,7 @@ def drifting(
     return block, replace(ties, xy=xy), moves
 
 
-def started(views: Block, tracks: Tracks) -> tuple[Joined, Problem, State]:
+def started(views: SimulatedBlock, tracks: Tracks) -> tuple[Joined, Problem, State]:
     """A block at its delivered cameras."""
     block = join(views.views, tracks, None, AdjustOptions())
     problem = make_problem(block, AdjustOptions(), None, None)
@@ -85,7 +85,7 @@ def started(views: Block, tracks: Tracks) -> tuple[Joined, Problem, State]:
 def test_a_metre_on_the_ground_moves_images_as_cameras_say() -> None:
     made = simulate_block(3, 60, seed=2)
     block, problem, state = started(made, made.tracks)
-    ground = Ground.of(problem, state)
+    ground = GroundMotion.of(problem, state)
     rows = np.flatnonzero(block.view == 1)
     at = ground_from_ecef(state.points[block.point[rows]])
     for axis in (0, 1):
@@ -96,8 +96,8 @@ def test_a_metre_on_the_ground_moves_images_as_cameras_say() -> None:
     assert not by_move[:, :, block.view == 0].any()
     np.testing.assert_allclose(by_move[:, :2, rows], ground.by_ground[:, :2, rows] * ground.pixel)
     assert not by_move[:, 2:, rows].any()
-    assert ground.cells(CELLS).min() == 0
-    assert ground.cells(CELLS).max() == CELLS**2 - 1
+    assert ground.cells(GROUND_CELLS).min() == 0
+    assert ground.cells(GROUND_CELLS).max() == GROUND_CELLS**2 - 1
 
 
 def test_a_group_is_told_from_what_stands_still() -> None:
@@ -105,11 +105,11 @@ def test_a_group_is_told_from_what_stands_still() -> None:
     made, tracks, moves = drifting(3, 300, 0.3, 3.0 * GSD)
     block, problem, state = started(made, tracks)
     linear = linearise(problem, state, block.use, block.sigma, 800.0)
-    ground, moves = Ground.of(problem, state), moves[block.order]
+    ground, moves = GroundMotion.of(problem, state), moves[block.order]
     by_move = ground.by_moves(block.view, 3)
     start = np.where(corner(made, 0.15)[block.point], 0.95, 0.3)
-    group = Group(by_move, np.full(4, 30.0), ground.cells(CELLS), start)
-    base, found = fit(linear), fit(linear, group=group)
+    group = Group(by_move, np.full(4, 30.0), ground.cells(GROUND_CELLS), start)
+    base, found = fit_mixture(linear), fit_mixture(linear, group=group)
     assert found.evidence > base.evidence + 200.0
     one = group_of(linear, ground, group, found)
     assert (one.member == moves).mean() > 0.98
@@ -130,7 +130,7 @@ def test_a_group_is_told_from_what_stands_still() -> None:
     assert linear.thinned(total) is linear
     half = linear.thinned(total - 1)
     assert sum(part.rows.size for part in half.tracks) == pytest.approx(total / 2, abs=3)
-    assert fit(few, group=group).noise == pytest.approx(found.noise, rel=0.15)
+    assert fit_mixture(few, group=group).noise == pytest.approx(found.noise, rel=0.15)
 
 
 def test_a_group_is_proposed_where_its_ties_lie() -> None:
@@ -139,8 +139,10 @@ def test_a_group_is_proposed_where_its_ties_lie() -> None:
     block, problem, state = started(made, tracks)
     linear = linearise(problem, state, block.use, block.sigma, 800.0)
     nothing = np.zeros((2, 0, len(block.view)))
-    ground = Ground.of(problem, state)
-    seen: Any = SimpleNamespace(linear=linear, ground=ground, base=fit(linear), extra=nothing, sigma=np.zeros(0))
+    ground = GroundMotion.of(problem, state)
+    seen: Any = SimpleNamespace(
+        linear=linear, ground=ground, base=fit_mixture(linear), extra=nothing, sigma=np.zeros(0)
+    )
     (one,) = explanations.group(seen, Interval(0, 0, 0.0, 1.0, 9.0, 0.5, 0.0, True))
     group = one.group
     assert group is not None

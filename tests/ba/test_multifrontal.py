@@ -11,8 +11,8 @@ import pytest
 import scipy.linalg as la
 
 from barpc.ba import adjust_tracks
-from barpc.ba.held.block import join, make_problem
-from barpc.ba.held.incremental import BlockPrior
+from barpc.ba.constraints.block import join, make_problem
+from barpc.ba.constraints.incremental import BlockPrior
 from barpc.ba.solving import linear, normal, structure
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.linear import Blocks, factorize_blocks
@@ -21,7 +21,7 @@ from barpc.ba.solving.structure import Dissection, dissect
 from barpc.base.geodesy import ecef_from_ground
 from barpc.base.options import AdjustOptions
 from barpc.scene import GroundPoints, Tracks
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import INDEPENDENT, centers_of
 from tests.lanes import diagonal
 
@@ -144,7 +144,7 @@ def test_little_fills_in() -> None:
     assert _numbers(order) < 1.1 * a_view[1] * len(place)  # places that lie cost nothing: ties tell
 
 
-def _weakly_tied(block: Block, few: int) -> Tracks:
+def _weakly_tied(block: SimulatedBlock, few: int) -> Tracks:
     """The tracks without all but a few of those that views of both halves see."""
     tracks, half = block.tracks, len(block.views) // 2
     last = np.zeros(tracks.num_points, dtype=bool)
@@ -157,7 +157,7 @@ def _weakly_tied(block: Block, few: int) -> Tracks:
     return Tracks(tracks.view[keep], renamed, tracks.xy[keep], tracks.sigma[keep])
 
 
-def _reduced(block: Block, tracks: Tracks, gcps: GroundPoints | None = None, **options: Any) -> Any:
+def _reduced(block: SimulatedBlock, tracks: Tracks, gcps: GroundPoints | None = None, **options: Any) -> Any:
     """The problem and its linearisation where it starts, and 1 / sigma."""
     chosen = AdjustOptions(**{**INDEPENDENT, **options})
     joined = join(block.views, tracks, gcps, chosen, keep_largest=True)
@@ -181,7 +181,7 @@ CASES: dict[str, dict[str, Any]] = {
 
 
 @cache
-def _square(views: int) -> Block:
+def _square(views: int) -> SimulatedBlock:
     """So many views in a square."""
     return simulate_block(views, 20 * views, seed=3, num_gcps=5, num_checks=0)
 

@@ -14,12 +14,12 @@ import pytest
 import scipy.optimize
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
-from barpc.ba.estimated.priors import prior_sigmas, stated_accuracy
+from barpc.ba.parameters.priors import prior_sigmas, stated_accuracy
 from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.scene import Tracks
 from barpc.sensor.geometry import camera_center
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import centers_of
 from tests.constants import CONSTANTS, chosen
 
@@ -118,7 +118,7 @@ ELSEWHERE_TOO = (
 
 
 @pytest.fixture(scope="module")
-def dirty() -> Block:
+def dirty() -> SimulatedBlock:
     """Four views, tie points with twice the stated noise and a tenth of them wrong."""
     made = simulate_block(4, 150, seed=21, noise=0.2, outliers=0.1)
     tracks = made.tracks
@@ -127,7 +127,7 @@ def dirty() -> Block:
 
 
 def run(
-    block: Block, dem: float | None = None, keep_largest: bool = False, hold_out: bool = True, **options: Any
+    block: SimulatedBlock, dem: float | None = None, keep_largest: bool = False, hold_out: bool = True, **options: Any
 ) -> Adjustment:
     terrain = None if dem is None else lambda lon, lat: np.full(len(lon), dem)
     # among ties of twice the stated noise a foreign RPC is looked for in every run: test_apart.py
@@ -147,12 +147,12 @@ def run(
 
 
 @pytest.fixture(scope="module")
-def ended() -> Callable[[Block, float | None, dict[str, Any]], Adjustment]:
+def ended() -> Callable[[SimulatedBlock, float | None, dict[str, Any]], Adjustment]:
     """As `run`; what differs in no option from what was asked for before is not adjusted again."""
     known = {field.name: field.default for field in fields(AdjustOptions)} | BASE
     found: dict[tuple[float | None, str], Adjustment] = {}
 
-    def end(block: Block, dem: float | None, options: dict[str, Any]) -> Adjustment:
+    def end(block: SimulatedBlock, dem: float | None, options: dict[str, Any]) -> Adjustment:
         told = {name: value for name, value in options.items() if name not in known or known[name] != value}
         key = (dem, repr(sorted(told.items())))
         if key not in found:

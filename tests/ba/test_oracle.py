@@ -11,17 +11,17 @@ import pytest
 import scipy.linalg as la
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
-from barpc.ba.estimated.projected import Cameras
-from barpc.ba.held.block import join, make_problem
-from barpc.ba.held.gauge import MOTIONS, _modes, datum_shares, gauge_report
-from barpc.ba.held.ground import Heights, convergence_angles, ground_control
+from barpc.ba.constraints.block import join, make_problem
+from barpc.ba.constraints.gauge import MOTIONS, _modes, datum_shares, gauge_report
+from barpc.ba.constraints.ground import PointConstraints, convergence_angles, ground_control
 from barpc.ba.judging import snooping
 from barpc.ba.judging.snooping import image_test
+from barpc.ba.parameters.projected import Cameras
 from barpc.ba.robust import rounds
 from barpc.ba.robust.weights import Observations
 from barpc.ba.solving import normal
 from barpc.ba.solving.problem import Problem
-from barpc.ba.solving.solve import Minimum, State, _Compressed, camera_step, gauss_newton
+from barpc.ba.solving.solve import Minimum, State, _WhitenedProblem, camera_step, gauss_newton
 from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of
@@ -81,7 +81,7 @@ def make_case(drift: int = 0, fixed: tuple[str, ...] = ()) -> Case:
     weak = np.zeros(12, dtype=bool)
     weak[[2, 5, 8]] = True
     control = ground_control(gcps, np.array([10, 11]))
-    heights = Heights(
+    heights = PointConstraints(
         (control,),
         weak,
         np.arange(10),
@@ -181,7 +181,7 @@ def test_one_step_is_the_gauss_newton_step_of_the_whole(case):
 
 
 def test_what_scipy_sees_has_the_cost_the_gradient_and_the_matrix_of_the_reduced_problem(case):
-    compressed = _Compressed(case.problem, _state(case), case.weight, None)
+    compressed = _WhitenedProblem(case.problem, _state(case), case.weight, None)
     size = case.params.size
     upper0 = la.cholesky(case.reduced.plain(np.ones(size, dtype=bool)))
     for x in (np.zeros(size), np.random.default_rng(3).normal(0, 0.5, size)):
@@ -312,7 +312,7 @@ def test_the_whole_covariance_is_put_together_of_any_number_of_columns(case, mon
 
 @pytest.mark.parametrize("small", [0, 900])
 def test_blocks_of_views_are_the_same_whether_the_whole_is_kept_or_not(case, monkeypatch, small):
-    monkeypatch.setattr("barpc.ba.solving.covariance._LARGE", small)
+    monkeypatch.setattr("barpc.ba.solving.covariance._DENSE_UNKNOWNS", small)
     q = case.params.shape[1]
     inverse = np.linalg.inv(case.dense[0])
     fresh = Minimum(_state(case), case.reduced).covariance(case.problem.free)
@@ -367,9 +367,9 @@ def test_a_sample_of_many_points_stands_for_the_scene_and_their_own_noise_averag
     covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
     before, use = case.points - [3.0, 0.0, 1.0] * (np.arange(12) == 7)[:, None], np.ones(12, dtype=bool)
     whole = gauge_report(covariance, case.points, before, use)
-    monkeypatch.setattr("barpc.ba.held.gauge.SAMPLE", 12)
+    monkeypatch.setattr("barpc.ba.constraints.gauge.SAMPLE", 12)
     assert gauge_report(covariance, case.points, before, use).radius != whole.radius  # every second
-    monkeypatch.setattr("barpc.ba.held.gauge.SAMPLE", 4)
+    monkeypatch.setattr("barpc.ba.constraints.gauge.SAMPLE", 4)
     some = gauge_report(covariance, case.points, before, use)
     monkeypatch.undo()
     sample = np.arange(12) % 4 == 0
@@ -589,7 +589,7 @@ def test_weak_tracks_are_held_to_the_altitude_of_the_others(strong, spread, alt,
     altitudes = np.r_[700.0 + np.linspace(-0.5, 0.5, strong) * spread, -50.0, 2000.0]
     points = ecef_of(np.column_stack([lon, lat, altitudes]))
     weak = np.arange(strong + 2) >= strong
-    heights = Heights((), weak, np.arange(strong + 2), (100.0, 500.0), AdjustOptions(), None)
+    heights = PointConstraints((), weak, np.arange(strong + 2), (100.0, 500.0), AdjustOptions(), None)
     prior = heights._held(points)
     assert prior is not None
     assert prior.index.tolist() == [strong, strong + 1]

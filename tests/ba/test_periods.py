@@ -7,7 +7,7 @@ import pytest
 
 from barpc.ba.evidence import periods
 from barpc.ba.evidence.periods import price_of_period, swings
-from barpc.base.usual import SURE
+from barpc.base.statistics import SURE
 
 
 def ties(seed: int, rows: float = 9000.0, views: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

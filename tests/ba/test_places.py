@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from barpc.ba.evidence import scan
-from barpc.ba.evidence.scan import Place, Unused, met_worse
-from barpc.base.usual import CHANCE
+from barpc.ba.evidence.scan import ImageRegion, Unused, met_worse
+from barpc.base.statistics import CHANCE
 from tests.distributions import hypergeom
 from tests.lanes import diagonal
 
@@ -27,7 +27,7 @@ def observed(seed: int, each: int, wrong: float, images: int = 1) -> tuple[Unuse
     return Unused(view, xy, residual, np.full(len(view), np.sqrt(2) * NOISE)), rng
 
 
-def worst(unused: Unused) -> list[Place]:
+def worst(unused: Unused) -> list[ImageRegion]:
     return met_worse(unused, SIZE[:, : unused.view.max() + 1], *LIMITS)
 
 
@@ -178,9 +178,9 @@ def test_places_are_halves_of_rows_columns_both_and_cells() -> None:
     columns, k, rows, n = scan._PLACES
     assert ((k < columns) & (n < rows) & (k >= 0) & (n >= 0)).all()
     assert len(np.unique(scan._PLACES, axis=1).T) == scan._PLACES.shape[1]
-    np.testing.assert_array_equal(scan._HELD.sum(axis=1), 32 * 32 / (columns * rows))
+    np.testing.assert_array_equal(scan._CELLS_OF_REGIONS.sum(axis=1), 32 * 32 / (columns * rows))
     first = int(np.flatnonzero((columns == 4) & (rows == 1) & (k == 2))[0])
-    assert np.flatnonzero(scan._HELD[first])[:9].tolist() == [16, 17, 18, 19, 20, 21, 22, 23, 48]
+    assert np.flatnonzero(scan._CELLS_OF_REGIONS[first])[:9].tolist() == [16, 17, 18, 19, 20, 21, 22, 23, 48]
     assert scan._ends(800.0, 4, 2) == (400.0, 600.0)
     assert scan._ends(800.0, 1, 0) is None
 
@@ -207,7 +207,7 @@ def test_the_variance_of_a_place_s_mean_is_that_of_its_parts_its_own_mean_taken_
     along, near = rng.normal(size=(2, n)) * [[1.0], [3.0]], np.ones(n, dtype=bool)
     near[:6] = False
     col, row = rng.integers(0, 32, (2, n))
-    cells = scan._cells(near, col, row)
+    cells = scan._image_cells(near, col, row)
     parts = 2  # of 84: the root of seven twelves
     of_cell = np.where(near, row * parts // 32 * parts + col * parts // 32, -1)
     np.testing.assert_array_equal(cells, of_cell[:, None] == np.arange(4))

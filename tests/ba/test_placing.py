@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba import placing
-from barpc.ba.placing import Placed, _half, _Sight, known_points, look, median_noise
+from barpc.ba import resection
+from barpc.ba.resection import Placed, _half, _Sight, diagnose_rpc, median_noise, retained_tracks
 from barpc.base.geodesy import ecef_from_ground, enu_basis
 from tests.distributions import chi2
 
@@ -39,8 +39,8 @@ def test_what_is_far_is_farther_than_so_many_deviations_of_both_coordinates(size
     left[0, 39] = np.nan
     assert placed(left).contradicted(3.0) == pytest.approx(0.025 + 0.25 * far)
     assert placed(left, squared=np.zeros(40)).agree(3.0).all()  # of what is left with splines nothing
-    assert placed(left, placing.MUCH_NOISE * 0.99).meets
-    assert not placed(left, placing.MUCH_NOISE).meets
+    assert placed(left, resection.MUCH_NOISE * 0.99).meets
+    assert not placed(left, resection.MUCH_NOISE).meets
 
 
 def test_a_camera_is_wrong_where_neighbours_lie_off_alike() -> None:
@@ -64,7 +64,7 @@ def test_a_camera_is_wrong_where_neighbours_lie_off_alike() -> None:
 def test_points_that_two_kept_observations_tell_are_known() -> None:
     found: Any = SimpleNamespace(outcome=SimpleNamespace(inlier=np.array([1, 1, 0, 1, 1, 1, 1], dtype=bool)))
     block: Any = SimpleNamespace(point=np.array([0, 0, 1, 1, 2, 2, 3]), num_points=4, num_tracks=2)
-    np.testing.assert_array_equal(known_points(found, block), [True, False, False, False])
+    np.testing.assert_array_equal(retained_tracks(found, block), [True, False, False, False])
 
 
 def sight(n: int = 80, size: int = 3) -> tuple[_Sight, np.ndarray, np.ndarray]:
@@ -158,7 +158,7 @@ def test_what_would_make_an_rpc_as_good_as_stated_is_said(change, expected) -> N
     )
     block: Any = SimpleNamespace(point=np.arange(80), xy=XY, views=[None])
     one = placed(np.zeros((2, 80)), 99.0)
-    said = look(found, block, one, 0)
+    said = diagnose_rpc(found, block, one, 0)
     assert (said.swapped, said.as_stated) == (swapped, as_stated)
     if offset is None:
         assert said.offset is None
@@ -166,4 +166,4 @@ def test_what_would_make_an_rpc_as_good_as_stated_is_said(change, expected) -> N
         np.testing.assert_allclose(said.offset, offset, atol=0.5)
     assert said.height == (pytest.approx(height, abs=0.3) if height else None)
     if as_stated:  # one that meets its points is asked for the rest
-        assert not look(found, block, placed(np.zeros((2, 80)), 0.5), 0).as_stated
+        assert not diagnose_rpc(found, block, placed(np.zeros((2, 80)), 0.5), 0).as_stated

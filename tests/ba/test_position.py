@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
-from barpc.ba.held.gauge import MOTIONS
-from barpc.ba.held.incremental import BlockPrior
+from barpc.ba.constraints.gauge import MOTIONS
+from barpc.ba.constraints.incremental import BlockPrior
 from barpc.base.geodesy import enu_basis, metres_per_unit
 from barpc.base.options import RunOptions
 from barpc.fit import fit_rpc
 from barpc.report import Run, summarize
-from barpc.report.records import plain
+from barpc.report.records import json_form
 from barpc.scene import GroundPoints, Tracks
 from barpc.sensor.geometry import triangulate
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import centers_of
 from tests.lanes import rest_slow
 
@@ -31,7 +31,7 @@ def seen(given: Tracks | GroundPoints, ground: np.ndarray, sensors: list, seed: 
     return replace(given, xy=xy)
 
 
-def right_cameras(num_tracks: int, num_gcps: int) -> Block:
+def right_cameras(num_tracks: int, num_gcps: int) -> SimulatedBlock:
     """A block whose delivered cameras are right, with few tie points."""
     block = simulate_block(3, max(num_tracks, 40), seed=3, num_gcps=num_gcps)
     sensors = [view.sensor for view in block.views]
@@ -133,7 +133,7 @@ def test_an_image_that_is_added_makes_no_motion_less_known(tmp_path) -> None:
     assert not again.by_unknown[:, first.params.size :].any()
 
 
-def stating(block: Block, sensors: list, accuracy: float) -> tuple:
+def stating(block: SimulatedBlock, sensors: list, accuracy: float) -> tuple:
     """The views with RPCs of sensors that state an accuracy [m]."""
     return tuple(
         replace(view, sensor=replace(fit_rpc(sensor, view.size, view.alt_range).rpc, err_bias=accuracy))
@@ -189,7 +189,7 @@ def test_accuracies_that_are_shared_are_in_the_summary() -> None:
     assert found.prior.shared > 1.2
     summary = summarize(Run("adjust", views, (), block.tracks, adjustment=found, options=RunOptions()))
     assert summary.scene.prior_shared == found.prior.shared
-    assert plain(summary)["scene"]["prior_shared"] == pytest.approx(found.prior.shared)
+    assert json_form(summary)["scene"]["prior_shared"] == pytest.approx(found.prior.shared)
 
 
 @pytest.mark.slow

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, BlockPrior, adjust_tracks, block_prior
-from barpc.ba.estimated.priors import prior_sigmas
-from barpc.ba.estimated.projected import Cameras
-from barpc.ba.estimated.unknowns import make_unknowns
+from barpc.ba.parameters.priors import prior_sigmas
+from barpc.ba.parameters.projected import Cameras
+from barpc.ba.parameters.unknowns import make_unknowns
 from barpc.base.errors import InputError
 from barpc.base.geodesy import (
     SPEED_OF_LIGHT,
@@ -23,7 +23,7 @@ from barpc.base.geodesy import (
     metres_per_unit,
 )
 from barpc.report import Run, summarize
-from barpc.report.records import plain
+from barpc.report.records import json_form
 from barpc.scene import GroundPoints, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Correction
@@ -310,4 +310,4 @@ def test_the_summary_states_metres_and_milliseconds(slc: Scene, found: Adjustmen
     line = next(line for line in summary.verdict if "clocks" in line)
     assert line.startswith(f"Radar images are corrected by their clocks: radar: range {told.coeffs[0, 0]:+.2f} ± ")
     assert line.endswith(" ms.")
-    assert plain(summary)["views"][2]["correction"]["range_m"] == radar.range_m
+    assert json_form(summary)["views"][2]["correction"]["range_m"] == radar.range_m

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.ba.estimated.priors import prior_sigmas
-from barpc.ba.held.ground import ALIKE, reference_control
+from barpc.ba.constraints.ground import MAX_INDEPENDENT_ERRORS, reference_control
+from barpc.ba.parameters.priors import prior_sigmas
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.scene import GroundPoints, Reference
 from barpc.simulate import simulate_block
@@ -104,7 +104,7 @@ def test_common_errors_are_the_terrain_s_the_orthoimage_s_and_what_stands_on_it(
     n = len(reference.points.names)
     prior = reference_control(reference, np.arange(n))
     points = ecef_from_ground(reference.points.lonlatalt)
-    up = POINT[2] * np.sqrt(n / ALIKE)
+    up = POINT[2] * np.sqrt(n / MAX_INDEPENDENT_ERRORS)
     assert 1.0 / np.linalg.norm(prior.rows[0], axis=1) == pytest.approx([POINT[0], POINT[1], up])
     middle = ground_from_ecef(points.mean(axis=0))
     for axis, columns in ((0, [3]), (1, [4]), (2, [0, 5])):

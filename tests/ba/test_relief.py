@@ -9,9 +9,18 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.ba.held.block import first_state, join, make_problem
-from barpc.ba.held.ground import Heights
-from barpc.ba.held.terrain import NUM_BENDS, Bands, Believed, Relief, _middling, _summed, believe, bends
+from barpc.ba.constraints.block import first_state, join, make_problem
+from barpc.ba.constraints.ground import PointConstraints
+from barpc.ba.constraints.terrain import (
+    NUM_BENDS,
+    Bands,
+    RegularisedDem,
+    Relief,
+    _middling,
+    _summed,
+    believe,
+    quadratic_basis,
+)
 from barpc.base.geodesy import enu_basis, ground_from_ecef
 from barpc.rasters.dem import Dem
 from barpc.simulate import simulate_block
@@ -59,13 +68,13 @@ def sum_of(*parts: Surface) -> Surface:
     return lambda lon, lat: ALT + sum(part(lon, lat) for part in parts)
 
 
-def judged(dem: Surface, ground: np.ndarray, stated: float = 5.0, **given: Any) -> Believed | None:
+def judged(dem: Surface, ground: np.ndarray, stated: float = 5.0, **given: Any) -> RegularisedDem | None:
     every = np.ones(len(ground), dtype=bool)
     relief = Relief.of(dem, ground, given.get("strong", every), np.full(len(ground), 0.3), stated)
     return believe(relief, np.arange(len(ground)), ground, stated)
 
 
-def sure(found: Believed | None) -> Believed:
+def sure(found: RegularisedDem | None) -> RegularisedDem:
     assert found is not None
     return found
 
@@ -99,7 +108,7 @@ def test_points_are_asked_to_move_back_to_where_the_terrain_is(east: float) -> N
     ground = points(east=east)
     found = sure(judged(sum_of(HILLS, SINGLE), ground))
     off = ground[:, 2] - found.alt
-    design = np.column_stack([found.slopes, bends((ground[:, :2] - [LON, LAT]) * UNIT / SIDE)])
+    design = np.column_stack([found.slopes, quadratic_basis((ground[:, :2] - [LON, LAT]) * UNIT / SIDE)])
     moved = np.linalg.lstsq(design, off, rcond=None)[0]
     assert moved[0] == pytest.approx(-east, abs=2.5)
     assert moved[1] == pytest.approx(0.0, abs=2.5)
@@ -214,7 +223,7 @@ def test_what_contradicts_the_cameras_is_let_go_and_the_rest_is_not() -> None:
 def test_a_dem_of_a_known_datum_is_wrong_together_by_less() -> None:
     def bias(dem: Any, **options: Any) -> float:
         none = np.zeros(0, dtype=bool)
-        heights = Heights((), none, np.zeros(0, dtype=np.int64), (0.0, 1.0), AdjustOptions(**options), dem)
+        heights = PointConstraints((), none, np.zeros(0, dtype=np.int64), (0.0, 1.0), AdjustOptions(**options), dem)
         return heights._bias
 
     known, unknown = (Dem(None, None, "", known) for known in (True, False))  # type: ignore[arg-type]
@@ -224,7 +233,7 @@ def test_a_dem_of_a_known_datum_is_wrong_together_by_less() -> None:
 
 def test_bends_are_a_level_two_slopes_and_what_is_curved() -> None:
     at = np.random.default_rng(0).uniform(-1, 1, (30, 2))
-    found = bends(at)
+    found = quadratic_basis(at)
     assert found.shape == (30, NUM_BENDS)
     np.testing.assert_array_equal(found[:, 0], 1.0)
     np.testing.assert_array_equal(found[:, 1:3], at)

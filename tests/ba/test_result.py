@@ -17,13 +17,13 @@ from barpc.ba.robust.variances import Variances
 from barpc.base.errors import BarpcWarning
 from barpc.base.geodesy import enu_basis, ground_from_ecef
 from barpc.sensor.geometry import triangulate
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import solve
 from tests.lanes import rest_slow
 
 
 @pytest.fixture(scope="module")
-def made() -> Block:
+def made() -> SimulatedBlock:
     return simulate_block(3, 120, seed=6)
 
 
@@ -80,7 +80,7 @@ def test_priors_that_cannot_be_learnt_are_told(made, monkeypatch) -> None:
         solve(made, drift=0)
 
 
-def measured(block: Block, found: Adjustment, pair: tuple[int, int]) -> tuple[float, float, int]:
+def measured(block: SimulatedBlock, found: Adjustment, pair: tuple[int, int]) -> tuple[float, float, int]:
     """Standard deviations of heights and of relative ones, by moving each unknown of two views by a little."""
     tracks = block.tracks
     kept = [np.unique(tracks.point[(tracks.view == v) & ~found.held_out]) for v in pair]
@@ -142,7 +142,7 @@ def test_neighbours_are_asked_of_tie_points_that_were_cut(monkeypatch) -> None:
     residual = xy + 20.0
     residual[1, 2] = np.nan
     outcome: Any = SimpleNamespace(inlier=np.array([0, 1, 0, 0, 0], dtype=bool), residual=residual)
-    assert adjustment._alike(block, outcome, np.array([1, 1, 1, 1, 0], dtype=bool)) == "said"
+    assert adjustment._neighbour_correlation(block, outcome, np.array([1, 1, 1, 1, 0], dtype=bool)) == "said"
     ((of_view, place, off, views),) = asked
     assert of_view.tolist() == [0]
     np.testing.assert_array_equal(place, xy[:, :1])

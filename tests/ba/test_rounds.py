@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.ba.estimated.priors import CameraPrior
-from barpc.ba.held.block import first_state, join, make_problem
+from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.judging import solution
+from barpc.ba.parameters.priors import CameraPrior
 from barpc.ba.robust import rounds
-from barpc.ba.robust.rounds import _median
+from barpc.ba.robust.rounds import _weighted_median
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import centers_of, solve
 from tests.constants import chosen
 
@@ -25,7 +25,7 @@ CALM = {"drift": 0, "learn_priors": False, "hold_out": False}
 
 
 @pytest.fixture(scope="module")
-def clean() -> Block:
+def clean() -> SimulatedBlock:
     return simulate_block(3, 150, seed=5)
 
 
@@ -41,7 +41,7 @@ def seen(monkeypatch: pytest.MonkeyPatch, module: Any, name: str) -> list[tuple[
     return calls
 
 
-def moved_together(block: Block, view: int, share: float, by: float) -> Block:
+def moved_together(block: SimulatedBlock, view: int, share: float, by: float) -> SimulatedBlock:
     """A share of the observations of a view moved by the same amount [px] along the columns."""
     tracks, xy = block.tracks, block.tracks.xy.copy()
     mine = np.flatnonzero(tracks.view == view)
@@ -50,7 +50,7 @@ def moved_together(block: Block, view: int, share: float, by: float) -> Block:
 
 
 def test_a_clean_block_is_solved_twice_and_nothing_is_looked_at_again(clean, monkeypatch) -> None:
-    again = seen(monkeypatch, rounds, "revived"), seen(monkeypatch, solution, "agreeing")
+    again = seen(monkeypatch, rounds, "retriangulate_rejected"), seen(monkeypatch, solution, "agreeing")
     solves = seen(monkeypatch, rounds, "minimise")
     found = solve(clean, **CALM)
     assert found.status.startswith("2 passes of cutting")
@@ -89,7 +89,7 @@ def test_rounds_go_on_until_the_noise_stands(clean, monkeypatch) -> None:
     ("outliers", "looked"), [pytest.param(0.05, True, marks=pytest.mark.slow), (0.008, True), (0.004, False)]
 )
 def test_tracks_that_were_cut_are_looked_at_again_where_they_are_many(monkeypatch, outliers, looked) -> None:
-    again = seen(monkeypatch, rounds, "revived")
+    again = seen(monkeypatch, rounds, "retriangulate_rejected")
     dirty = simulate_block(3, 400, seed=5, outliers=outliers)
     found = solve(dirty, **CALM)
     assert 0.99 - 3 * outliers < found.inlier.mean() < 1.0
@@ -127,12 +127,12 @@ def test_control_is_let_in_after_the_ties_where_there_are_any(monkeypatch, gcps:
 
 def test_a_median_counts_each_value_by_its_weight() -> None:
     values = np.array([5.0, 2.0, 9.0, 3.0])
-    assert _median(values, np.ones(4)) == 3.0
-    assert _median(values, np.array([1.0, 1.0, 1.0, 0.5])) == 5.0
-    assert _median(values, np.array([0.0, 0.0, 1.0, 0.0])) == 9.0
-    assert _median(values, np.array([0.0, 3.0, 1.0, 1.0])) == 2.0
-    assert _median(values, np.zeros(4)) == 1.0  # as stated where nothing counts
-    assert _median(values[:0], values[:0]) == 1.0
+    assert _weighted_median(values, np.ones(4)) == 3.0
+    assert _weighted_median(values, np.array([1.0, 1.0, 1.0, 0.5])) == 5.0
+    assert _weighted_median(values, np.array([0.0, 0.0, 1.0, 0.0])) == 9.0
+    assert _weighted_median(values, np.array([0.0, 3.0, 1.0, 1.0])) == 2.0
+    assert _weighted_median(values, np.zeros(4)) == 1.0  # as stated where nothing counts
+    assert _weighted_median(values[:0], values[:0]) == 1.0
 
 
 def test_points_that_were_cut_are_seen_where_the_cameras_see_them_now(clean) -> None:
@@ -150,7 +150,7 @@ def test_points_that_were_cut_are_seen_where_the_cameras_see_them_now(clean) -> 
     kept = problem.structure.point[np.flatnonzero(use & lost[problem.structure.point])[0]]
     state = State(good.params, points, 7.0, (9.0, 8.0))
     residual = np.full(problem.xy.shape, 0.25)
-    again, left = rounds.revived(problem, state, residual, use, np.full(len(use), 10.0))
+    again, left = rounds.retriangulate_rejected(problem, state, residual, use, np.full(len(use), 10.0))
     lost[kept] = False
     np.testing.assert_array_equal(again.points[~lost], points[~lost])
     np.testing.assert_allclose(again.points[lost], good.points[lost], atol=0.5)
@@ -188,7 +188,7 @@ def test_points_follow_what_is_smooth_where_it_is_seen(monkeypatch, wave: float,
     smooth = wave * np.sin(5 * row) * (block.view == 1)
     noise = np.random.default_rng(0).normal(0, 0.02, block.xy.shape)
     each.residual = noise + np.stack([smooth, smooth])
-    again = seen(monkeypatch, rounds.Problem, "settling")
+    again = seen(monkeypatch, rounds.Problem, "projected_off_points")
     left = each._scatter()
     assert bool(again) == settled
     assert np.sqrt((left**2).mean()) < 0.025
@@ -204,7 +204,7 @@ def test_residuals_settle_where_no_move_of_a_point_makes_them_smaller() -> None:
     projected = problem.project_points(state.params, state.points)
     rng = np.random.default_rng(0)
     residual, weight = rng.normal(0, 1, block.xy.shape), rng.uniform(0.5, 2, len(block.view))
-    settled = problem.settling(projected, weight)(residual)
+    settled = problem.projected_off_points(projected, weight)(residual)
     for point in (0, 50):
         rows = block.point == point
         matrix = (projected.by_point[:, :, rows] * weight[rows]).transpose(0, 2, 1).reshape(-1, 3)
@@ -302,7 +302,7 @@ def passes(
     made = Scripted()
     monkeypatch.setattr(
         rounds,
-        "revived",
+        "retriangulate_rejected",
         lambda problem, state, residual, *_: again.append(made.passes + 1) or (state, residual),
     )
     outcome = made.run()

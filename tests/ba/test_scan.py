@@ -7,7 +7,7 @@ import pytest
 
 from barpc.ba.evidence import scan as scanning
 from barpc.ba.evidence.scan import BINS, neighbours_alike, price
-from barpc.base.usual import SURE
+from barpc.base.statistics import SURE
 from tests.lanes import rest_slow
 
 SIZE = np.array([[8000.0, 4000.0], [12000.0, 6000.0]])  # of two images, columns and rows
@@ -132,7 +132,7 @@ def test_where_so_few_are_wrong_their_place_tells_nothing(total: float, bad: flo
     """All of them in one observation's interval: the rest would be certain, whatever is wrong."""
     bins = np.zeros((2, 1, scanning.BINS))
     bins[:, 0, 0], bins[0, 0, 1] = bad, total - bad
-    gain = scanning._shares(bins)
+    gain = scanning._share_log_ratios(bins)
     whole = bad * np.log(bad / total) + (total - bad) * np.log(1.0 - bad / total)
     assert gain[0, 0] == pytest.approx(-whole if told else 0.0)
     assert (whole < -SURE) == told

@@ -9,25 +9,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.evidence.mixture import Fit
+from barpc.ba.evidence.mixture import MixtureFit
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.judging import judge as judging
-from barpc.ba.judging.explanations import FADE, MOVING, SETTLING, STRIP, SWING, WANDER, Explanation, Seen
+from barpc.ba.judging.explanations import FADE, MOVING, STRIP, SWING, TRANSIENT, WANDER, BlockResiduals, Explanation
 from barpc.ba.judging.judge import (
     _amplitude,
     _differs,
-    _distinct,
-    _joined,
-    _near,
+    _ExplanationSearch,
+    _image_share,
+    _neighbour_views,
     _of_one_image,
-    _part,
-    _rivals,
+    _rival_states,
     _same,
-    _Search,
-    _State,
-    _Taken,
+    _SearchState,
+    _TakenExplanation,
+    _uncovered,
+    _with_findings,
 )
-from barpc.base.usual import SURE
+from barpc.base.statistics import SURE
 
 VIEW = np.array([0, 0, 0, 0, 1, 1])
 
@@ -44,20 +44,22 @@ def explained(kind: str, view: int = 0, start: float = 0.0, stop: float = 9.0, *
     return Explanation(kind, view, extra, np.full(2, 0.5), given.pop("price", 0.0), where, **given)
 
 
-def fitted(evidence: float = 0.0, extra: Any = (), **given: Any) -> Fit:
+def fitted(evidence: float = 0.0, extra: Any = (), **given: Any) -> MixtureFit:
     n = len(VIEW)
-    return replace(Fit(evidence, np.zeros((2, 3)), np.array(extra), 1.0, np.zeros(2), np.ones(n)), **given)
+    return replace(MixtureFit(evidence, np.zeros((2, 3)), np.array(extra), 1.0, np.zeros(2), np.ones(n)), **given)
 
 
-def seen() -> Seen:
+def seen() -> BlockResiduals:
     linear: Any = SimpleNamespace(view=VIEW, sigma=np.ones(len(VIEW)))
     other: Any = SimpleNamespace(view=VIEW)
     nothing: Any = None
-    return Seen(linear, other, nothing, np.zeros((2, 6)), np.ones((2, 2)), fitted(), np.zeros((2, 0, 6)), np.zeros(0))
+    return BlockResiduals(
+        linear, other, nothing, np.zeros((2, 6)), np.ones((2, 2)), fitted(), np.zeros((2, 0, 6)), np.zeros(0)
+    )
 
 
-def taken(gain: float, kind: str = STRIP, view: int = 0, gap: float = 1.0) -> _Taken:
-    return _Taken(explained(kind, view), gain, gap, "", (), seen())
+def taken(gain: float, kind: str = STRIP, view: int = 0, gap: float = 1.0) -> _TakenExplanation:
+    return _TakenExplanation(explained(kind, view), gain, gap, "", (), seen())
 
 
 # --- intervals and explanations that are the same ---------------------------------------------------------------------
@@ -81,7 +83,7 @@ def test_intervals_are_the_same_whose_most_is_common(one, other, same) -> None:
 
 def test_of_intervals_that_are_the_same_the_first_stays() -> None:
     rows = [interval(0, 10), interval(0, 12), interval(50, 60), interval(1, 10), interval(49, 61)]
-    assert _distinct(rows) == [rows[0], rows[2]]
+    assert _uncovered(rows) == [rows[0], rows[2]]
 
 
 def test_explanations_differ_by_kind_view_axis_and_rows_that_do_not_overlap() -> None:
@@ -111,10 +113,10 @@ def test_a_part_and_its_complement_are_of_one_image() -> None:
 
 
 def test_a_part_is_counted_in_observations_of_its_image_or_of_all() -> None:
-    assert _part(explained(STRIP, 0, rows=[0, 1, 2, 4]), seen()) == pytest.approx(3 / 4)
-    assert _part(explained(STRIP, 1, rows=[0, 4]), seen()) == pytest.approx(1 / 2)
-    assert _part(explained(SETTLING, -1, rows=[0, 4]), seen()) == pytest.approx(2 / 6)
-    assert _part(explained(STRIP, 7, rows=[0]), seen()) == 0.0
+    assert _image_share(explained(STRIP, 0, rows=[0, 1, 2, 4]), seen()) == pytest.approx(3 / 4)
+    assert _image_share(explained(STRIP, 1, rows=[0, 4]), seen()) == pytest.approx(1 / 2)
+    assert _image_share(explained(TRANSIENT, -1, rows=[0, 4]), seen()) == pytest.approx(2 / 6)
+    assert _image_share(explained(STRIP, 7, rows=[0]), seen()) == 0.0
 
 
 def test_a_swing_s_amplitude_is_that_of_a_cosine_and_a_sine_each_in_columns_and_rows() -> None:
@@ -123,14 +125,14 @@ def test_a_swing_s_amplitude_is_that_of_a_cosine_and_a_sine_each_in_columns_and_
 
 def test_rivals_are_the_best_of_other_kinds_or_images_with_more_than_a_third_of_the_gain() -> None:
     def of(*rows: tuple[Explanation, float]) -> list[int]:
-        return _rivals([(one, fitted(), gain) for one, gain in rows])
+        return _rival_states([(one, fitted(), gain) for one, gain in rows])
 
     first = (explained(STRIP, 0, 0.0, 5.0), 30.0)
     assert of(first) == []
     assert of(first, (explained(FADE), 10.0)) == []
     assert of(first, (explained(FADE), 10.1)) == [1]
     assert of(first, (explained(STRIP, 0, 1.0, 6.0), 29.0), (explained(STRIP, 0, 5.0, 6.0), 28.0)) == [2]
-    assert of(first, (explained(MOVING, -1), 29.0), (explained(WANDER), 28.0), (explained(SETTLING, -1), 27.0)) == [3]
+    assert of(first, (explained(MOVING, -1), 29.0), (explained(WANDER), 28.0), (explained(TRANSIENT, -1), 27.0)) == [3]
     assert of(first, (explained(FADE), 20.0), (explained(FADE), 19.0), (explained(FADE, 1), 18.0)) == [1, 3]
     assert of(first, (explained(FADE), 20.0), (explained(SWING), 19.0), (explained(FADE, 1), 18.0)) == [1, 2]
 
@@ -138,8 +140,8 @@ def test_rivals_are_the_best_of_other_kinds_or_images_with_more_than_a_third_of_
 # --- states -----------------------------------------------------------------------------------------------------------
 
 
-def state(*gains: float, **given: Any) -> _State:
-    return _State(seen(), fitted(), tuple(taken(gain) for gain in gains), **given)
+def state(*gains: float, **given: Any) -> _SearchState:
+    return _SearchState(seen(), fitted(), tuple(taken(gain) for gain in gains), **given)
 
 
 def test_a_state_may_pass_another_with_as_many_more_as_that_has_and_two() -> None:
@@ -152,8 +154,8 @@ def test_a_state_may_pass_another_with_as_many_more_as_that_has_and_two() -> Non
 
 
 def test_what_gains_as_much_beside_the_best_is_no_other_way() -> None:
-    best = _State(seen(), fitted(), (taken(60.0, SWING, 1),))
-    other = _State(seen(), fitted(), (taken(30.0, FADE),))
+    best = _SearchState(seen(), fitted(), (taken(60.0, SWING, 1),))
+    other = _SearchState(seen(), fitted(), (taken(30.0, FADE),))
     same = explained(FADE)
     assert other.adds_to(best, [(same, fitted(), 30.0 - SURE + 0.1)])
     assert not other.adds_to(best, [(same, fitted(), 30.0 - SURE)])
@@ -224,16 +226,16 @@ def test_a_search_ends_with_six_or_with_what_is_not_followed(kind: str, before: 
 # --- the search -------------------------------------------------------------------------------------------------------
 
 
-def search(**given: Any) -> _Search:
-    return _Search(given.pop("seen", seen()), given.pop("first", []), given.pop("floor", 0.1), 0.1)
+def search(**given: Any) -> _ExplanationSearch:
+    return _ExplanationSearch(given.pop("seen", seen()), given.pop("first", []), given.pop("floor", 0.1), 0.1)
 
 
 def test_what_ends_as_best_is_sure_by_what_the_next_ones_lack(monkeypatch) -> None:
     """Where it was not the best by itself; all that are followed have their cameras and probabilities."""
 
-    def ran(*states: _State) -> tuple[list[_Taken], Any]:
-        monkeypatch.setattr(_Search, "_grown", lambda self, before: (list(states), True))
-        monkeypatch.setattr(judging, "_said", lambda rows, n, seen: [rows[n]])
+    def ran(*states: _SearchState) -> tuple[list[_TakenExplanation], Any]:
+        monkeypatch.setattr(_ExplanationSearch, "_grown", lambda self, before: (list(states), True))
+        monkeypatch.setattr(judging, "_findings_of", lambda rows, n, seen: [rows[n]])
         noise = iter([shared, *beside])
         monkeypatch.setattr(judging, "_by_neighbours", lambda seen: next(noise))
         found = search().run()
@@ -241,7 +243,7 @@ def test_what_ends_as_best_is_sure_by_what_the_next_ones_lack(monkeypatch) -> No
 
     shared, beside = 41.9, [11.9]
     last, earlier = fitted(right=np.zeros(6)), fitted(step=np.ones((2, 3)))
-    one = _State(replace(seen(), base=last), earlier, (taken(30.0, gap=-2.0), taken(12.0, FADE, gap=3.0)))
+    one = _SearchState(replace(seen(), base=last), earlier, (taken(30.0, gap=-2.0), taken(12.0, FADE, gap=3.0)))
     rows, found = ran(one, state(35.0))
     assert [row.gap for row in rows] == [7.0, 3.0]
     assert found.right is last.right
@@ -289,16 +291,18 @@ def test_what_neighbours_share_is_asked_of_right_ties_in_stated_deviations(monke
     assert asked.pop()[0].tolist() == [0, 1, 2, 0, 1, 2, 1]
 
 
-def grown(monkeypatch, states: list[_State], *tried: list[tuple[Explanation, float]]) -> tuple[list[_State], bool]:
+def grown(
+    monkeypatch, states: list[_SearchState], *tried: list[tuple[Explanation, float]]
+) -> tuple[list[_SearchState], bool]:
     """States with one more each, where so much is tried, in turn."""
     left = [[(one, fitted(), gain) for one, gain in rows] for rows in tried]
-    monkeypatch.setattr(_Search, "_tried", lambda self: left.pop(0))
+    monkeypatch.setattr(_ExplanationSearch, "_tried", lambda self: left.pop(0))
     found = search()._grown(states)
     assert not left
     return found
 
 
-def whats(states: list[_State]) -> list[list[tuple[str, int]]]:
+def whats(states: list[_SearchState]) -> list[list[tuple[str, int]]]:
     return [[row.what for row in one.taken] for one in states]
 
 
@@ -323,7 +327,7 @@ def test_a_search_ends_where_nothing_gains_enough(monkeypatch) -> None:
 
 
 def test_another_way_that_finds_nothing_more_has_ended(monkeypatch) -> None:
-    best, other = state(30.0), _State(seen(), fitted(), (taken(12.0, SWING, 1),))
+    best, other = state(30.0), _SearchState(seen(), fitted(), (taken(12.0, SWING, 1),))
     found, ended = grown(monkeypatch, [best, other], [(explained(FADE, 1), 10.0)], [])
     assert whats(found) == [[(STRIP, 0), (FADE, 1)], [(SWING, 1)]]
     assert [one.ended for one in found] == [False, True]
@@ -331,18 +335,18 @@ def test_another_way_that_finds_nothing_more_has_ended(monkeypatch) -> None:
 
 
 def test_what_has_ended_stays_and_what_may_not_pass_it_is_let_be(monkeypatch) -> None:
-    best, slow = state(90.0, ended=True), _State(seen(), fitted(), (taken(20.0, SWING, 1),))
+    best, slow = state(90.0, ended=True), _SearchState(seen(), fitted(), (taken(20.0, SWING, 1),))
     found, ended = grown(monkeypatch, [best, slow])  # 20 and two of 20
     assert found == [best, slow]
     assert ended
-    fast = _State(seen(), fitted(), (taken(40.0, SWING, 1),))
+    fast = _SearchState(seen(), fitted(), (taken(40.0, SWING, 1),))
     found, ended = grown(monkeypatch, [best, fast], [(explained(FADE, 1), 60.0)])
     assert whats(found) == [[(SWING, 1), (FADE, 1)], [(STRIP, 0)]]
     assert not ended
 
 
 def test_two_ways_with_the_same_parts_are_one_the_better(monkeypatch) -> None:
-    one, other = state(30.0), _State(seen(), fitted(), (taken(25.0, SWING, 1),))
+    one, other = state(30.0), _SearchState(seen(), fitted(), (taken(25.0, SWING, 1),))
     found, _ = grown(monkeypatch, [one, other], [(explained(SWING, 1), 12.0)], [(explained(STRIP), 19.0)])
     assert whats(found) == [[(SWING, 1), (STRIP, 0)]]
     assert found[0].gain == 44.0
@@ -387,12 +391,12 @@ def test_parts_of_images_that_hold_what_moves_are_tried_beside_it(monkeypatch) -
     monkeypatch.setattr(judging, "scan", scanned)
     monkeypatch.setattr(judging, "proposed", proposed)
     monkeypatch.setattr(judging, "EXPLANATIONS", {MOVING: groups})
-    monkeypatch.setattr(_Search, "_sharp", lambda self, made: made)
+    monkeypatch.setattr(_ExplanationSearch, "_sharp", lambda self, made: made)
 
     def tried(_: Any, made: Any, more: Any) -> list[Any]:
         return [*made, *((one, fitted(moving=moving), gains.get(one.view, 1.0)) for one in more)]
 
-    monkeypatch.setattr(_Search, "_with", tried)
+    monkeypatch.setattr(_ExplanationSearch, "_with", tried)
     known = seen()
     known.linear.taking_part = rows  # type: ignore[misc]
     each = search(seen=known)
@@ -419,14 +423,14 @@ def test_ends_are_looked_for_where_they_may_gain_most(monkeypatch) -> None:
     """Of three a kind, and only of what is not far behind what is sure already."""
     sharp: list[Explanation] = []
 
-    def sharpened(self: _Search, one: Explanation, found: Fit) -> tuple[Explanation, Fit]:
+    def sharpened(self: _ExplanationSearch, one: Explanation, found: MixtureFit) -> tuple[Explanation, MixtureFit]:
         sharp.append(one)
         return one, replace(found, evidence=found.evidence + 1.0)
 
-    monkeypatch.setattr(_Search, "_sharpened", sharpened)
+    monkeypatch.setattr(_ExplanationSearch, "_sharpened", sharpened)
 
     def of(*gains: float) -> list[int]:
-        kinds = (STRIP, STRIP, STRIP, STRIP, FADE, SETTLING, SWING, WANDER, MOVING)
+        kinds = (STRIP, STRIP, STRIP, STRIP, FADE, TRANSIENT, SWING, WANDER, MOVING)
         rows = [(explained(kind), fitted(gain), gain) for kind, gain in zip(kinds, gains, strict=False)]
         sharp.clear()
         made = search()._sharp(rows)
@@ -442,8 +446,10 @@ def test_ends_are_looked_for_where_they_may_gain_most(monkeypatch) -> None:
 
 
 def test_of_many_explanations_those_are_fitted_that_few_tracks_let_hope(monkeypatch) -> None:
-    monkeypatch.setattr(judging, "fit", lambda *_: fitted(100.0))
-    monkeypatch.setattr(_Search, "_fit", lambda self, one, linear=None, base=None: fitted(100.0 + one.view + one.price))
+    monkeypatch.setattr(judging, "fit_mixture", lambda *_: fitted(100.0))
+    monkeypatch.setattr(
+        _ExplanationSearch, "_fit", lambda self, one, linear=None, base=None: fitted(100.0 + one.view + one.price)
+    )
 
     def of(*gains: int, few: bool = True) -> list[int]:
         each = search()
@@ -468,7 +474,7 @@ def test_a_mean_stands_out_beyond_the_floor_in_units_of_what_ties_are_known_to(m
         taking_part=np.arange(len(VIEW)),
         left=lambda step: np.zeros((2, len(VIEW))),
     )
-    each = _Search(replace(seen(), linear=linear), [], 0.06, 0.1)
+    each = _ExplanationSearch(replace(seen(), linear=linear), [], 0.06, 0.1)
     each._standing_out(fitted(noise=2.0), np.zeros((2, 0, len(VIEW))))
     assert asked == [pytest.approx(0.3)]  # 0.06 px of ties that are known to 0.2 px
 
@@ -476,7 +482,7 @@ def test_a_mean_stands_out_beyond_the_floor_in_units_of_what_ties_are_known_to(m
 @pytest.mark.parametrize("left", [([], []), ([1], []), ([], [1])])
 def test_nothing_is_left_beside_the_best_where_neither_rows_nor_periods_stand_out(monkeypatch, left) -> None:
     asked: list[Any] = []
-    monkeypatch.setattr(_Search, "_standing_out", lambda self, found, extra: asked.append(extra) or left)
+    monkeypatch.setattr(_ExplanationSearch, "_standing_out", lambda self, found, extra: asked.append(extra) or left)
     one, found = explained(STRIP), fitted()
     assert search()._leaves_nothing([(one, found, SURE + 0.1)]) == (left == ([], []))
     np.testing.assert_array_equal(asked[0], one.extra)
@@ -506,24 +512,24 @@ def tied(pairs: list[tuple[int, int]], views: int) -> Any:
 
 def test_a_view_is_judged_among_those_that_share_most_tracks_with_it() -> None:
     block = tied([(0, v) for v in range(1, 15) for _ in range(v)], 16)
-    assert _near(block, 0).tolist() == [0, *range(4, 15)]
-    assert _near(block, 3).tolist() == [0, 3]
+    assert _neighbour_views(block, 0).tolist() == [0, *range(4, 15)]
+    assert _neighbour_views(block, 3).tolist() == [0, 3]
     unused = tied([(0, 1), (0, 1), (0, 2), (1, 2)], 4)
-    assert _near(unused, 0).tolist() == [0, 1, 2]
+    assert _neighbour_views(unused, 0).tolist() == [0, 1, 2]
     unused.use[[4, 5]] = False  # its track with view 2
-    assert _near(unused, 0).tolist() == [0, 1]
+    assert _neighbour_views(unused, 0).tolist() == [0, 1]
     control = tied([(0, 1), (0, 2)], 3)
     control.num_tracks = 1
-    assert _near(control, 0).tolist() == [0, 1]
+    assert _neighbour_views(control, 0).tolist() == [0, 1]
 
 
 def test_findings_among_some_views_are_those_of_the_block() -> None:
     step = np.zeros((5, 2))
     step[3] = 7.0
-    all_of = judging.Judgement(("first",), step, np.ones(6))  # type: ignore[arg-type]
+    all_of = judging.Selection(("first",), step, np.ones(6))  # type: ignore[arg-type]
     found = judging.Finding(SWING, 1, None, np.zeros(2), 9.0, 1.0, "", np.zeros(4), 30.0, (0, 2))
-    own = judging.Judgement((found,), np.arange(6.0).reshape(3, 2) + 1.0, np.array([0.1, 0.2]))
-    both = _joined(all_of, own, np.array([1, 3, 4]), np.array([2, 5]))
+    own = judging.Selection((found,), np.arange(6.0).reshape(3, 2) + 1.0, np.array([0.1, 0.2]))
+    both = _with_findings(all_of, own, np.array([1, 3, 4]), np.array([2, 5]))
     assert both.findings[0] == "first"
     assert (both.findings[1].view, both.findings[1].or_of) == (3, (1, 4))
     # of a view that was judged before the first is kept
@@ -537,12 +543,12 @@ def judged(monkeypatch, size: int, rows: list[int], periods: list[int], views: i
     """Which views are judged together in a block of so many unknowns; whether periods were looked for."""
     asked: list[list[int]] = []
 
-    def among(outcome: Any, block: Any, floor: float, chosen: np.ndarray) -> judging.Judgement:
+    def among(outcome: Any, block: Any, floor: float, chosen: np.ndarray) -> judging.Selection:
         asked.append(chosen.tolist())
         found = judging.Finding(STRIP, 0, None, np.zeros(2), 9.0, 1.0, "", np.zeros(2))
         n = len(chosen)
         rows = np.isin(block.view, chosen)
-        return judging.Judgement((found,), np.ones((n, size // views)), np.zeros(int(rows.sum())))
+        return judging.Selection((found,), np.ones((n, size // views)), np.zeros(int(rows.sum())))
 
     looked: list[int] = []
     monkeypatch.setattr(judging, "_judged_among", among)
@@ -576,9 +582,9 @@ def test_a_large_block_is_judged_around_each_view_that_stands_out(monkeypatch) -
     assert judged(monkeypatch, 12_000, [3], [], 12)[0] == [[2, 3]]
     asked, _, found = judged(monkeypatch, 12_001, [3], [3], 12)
     assert (asked, found.findings, found.step.shape) == ([], (), (0, 0))
-    monkeypatch.setattr(judging, "OBSERVATIONS", 4 * 14)
+    monkeypatch.setattr(judging, "MAX_OBSERVATIONS", 4 * 14)
     assert judged(monkeypatch, 14 * 9, [3], [])[0] == [[*range(14)]]
-    monkeypatch.setattr(judging, "OBSERVATIONS", 4 * 14 - 1)
+    monkeypatch.setattr(judging, "MAX_OBSERVATIONS", 4 * 14 - 1)
     assert judged(monkeypatch, 14 * 9, [3], [])[0] == []
 
 
@@ -595,8 +601,8 @@ def test_what_was_cut_in_an_interval_is_said_with_its_distance(monkeypatch) -> N
     away[0, ::2], away[1, ::2] = 3.0 * np.arange(8), 4.0 * np.arange(8)  # 5 times the number
     away[0, 4] = np.nan  # row 20
     away[:, 1::2] = 1e3
-    monkeypatch.setattr(judging, "revived", lambda *_: (None, away))
-    monkeypatch.setattr(judging, "shared", lambda *_: 0.0)
+    monkeypatch.setattr(judging, "retriangulate_rejected", lambda *_: (None, away))
+    monkeypatch.setattr(judging, "correlated_noise_gain", lambda *_: 0.0)
     outcome: Any = SimpleNamespace(
         minimum=SimpleNamespace(state=None), problem=None, residual=None, inlier=inlier, standing_out={}
     )
@@ -612,7 +618,9 @@ def test_what_was_cut_in_an_interval_is_said_with_its_distance(monkeypatch) -> N
     assert apart(replace(one, view=1)) == [pytest.approx(np.hypot(1e3, 1e3))]
     assert apart(interval(10.0, 60.0)) == [0.0]  # none by its share: nothing is measured
     assert apart(interval(10.0, 60.0), one) == [15.0, 15.0]
-    monkeypatch.setattr(judging, "shared", lambda *_: 1e9)  # a mean that noise of neighbours explains is none
+    monkeypatch.setattr(
+        judging, "correlated_noise_gain", lambda *_: 1e9
+    )  # a mean that noise of neighbours explains is none
     assert apart(interval(10.0, 60.0)) == []
     assert apart(interval(10.0, 60.0), one) == [15.0]
 
@@ -620,7 +628,7 @@ def test_what_was_cut_in_an_interval_is_said_with_its_distance(monkeypatch) -> N
 def test_what_was_cut_is_seen_where_two_others_tell_its_point() -> None:
     block: Any = SimpleNamespace(point=np.array([0, 0, 0, 1, 1, 2]), num_points=4)
     outcome: Any = SimpleNamespace(inlier=np.array([True, True, False, True, False, True]))
-    np.testing.assert_array_equal(judging._told(outcome, block), [1, 1, 1, 0, 0, 0])
+    np.testing.assert_array_equal(judging._confirmed_observations(outcome, block), [1, 1, 1, 0, 0, 0])
 
 
 def test_what_stands_out_is_asked_and_said_in_pixels(monkeypatch) -> None:
@@ -662,7 +670,7 @@ def test_what_stands_out_is_asked_and_said_in_pixels(monkeypatch) -> None:
 
 def test_ties_among_some_views_are_linearised_where_they_are_not_too_many(monkeypatch) -> None:
     asked: list[Any] = []
-    monkeypatch.setattr(judging, "revived", lambda *given: asked.append(given) or ("revived", None))
+    monkeypatch.setattr(judging, "retriangulate_rejected", lambda *given: asked.append(given) or ("revived", None))
     monkeypatch.setattr(judging, "linearise", lambda *given: asked.append(given) or "linear")
     block = tied([(0, 1), (1, 2), (0, 2), (0, 1)], 3)
     block.num_tracks, block.sigma, block.alt_range = 3, np.full(8, 0.5), (100.0, 450.0)
@@ -676,10 +684,10 @@ def test_ties_among_some_views_are_linearised_where_they_are_not_too_many(monkey
     np.testing.assert_array_equal(use, [0, 1, 1, 0, 1, 0, 0, 0])
     assert judging.around(outcome, block, np.arange(3)) is None  # 600 unknowns
     counted = list[Any]()
-    monkeypatch.setattr(judging, "numbers", lambda count: counted.append(count.tolist()) or 3e7)
+    monkeypatch.setattr(judging, "array_elements", lambda count: counted.append(count.tolist()) or 3e7)
     assert judging.around(outcome, block, np.array([0, 1])) is not None
     assert counted == [[1, 1, 1]]
-    monkeypatch.setattr(judging, "numbers", lambda count: 3.1e7)
+    monkeypatch.setattr(judging, "array_elements", lambda count: 3.1e7)
     assert judging.around(outcome, block, np.array([0, 1])) is None
 
 
@@ -690,11 +698,13 @@ def test_some_views_are_judged_under_numbers_of_their_own(monkeypatch, caplog) -
     linear = SimpleNamespace(among=lambda views: SimpleNamespace(views=views, thinned=lambda most: ("few", most)))
     monkeypatch.setattr(judging, "around", lambda *_: (linear, "state"))
     parts = SimpleNamespace(of=lambda problem, state: SimpleNamespace(part=lambda rows: rows))
-    monkeypatch.setattr(judging, "Ground", parts)
+    monkeypatch.setattr(judging, "GroundMotion", parts)
     monkeypatch.setattr(judging, "standing_out", lambda *_: [interval(0, 1, view) for view in (3, 0, 1)])
-    monkeypatch.setattr(judging, "fit", lambda linear: "base")
+    monkeypatch.setattr(judging, "fit_mixture", lambda linear: "base")
     asked: list[Any] = []
-    monkeypatch.setattr(judging, "_Search", lambda *given: asked.append(given) or SimpleNamespace(run=lambda: "said"))
+    monkeypatch.setattr(
+        judging, "_ExplanationSearch", lambda *given: asked.append(given) or SimpleNamespace(run=lambda: "said")
+    )
     outcome: Any = SimpleNamespace(problem=None)
     assert judging._judged_among(outcome, block, 0.07, np.array([1, 3])) == "said"
     ((found, first, floor, sigma),) = asked
@@ -709,7 +719,7 @@ def test_some_views_are_judged_under_numbers_of_their_own(monkeypatch, caplog) -
     def fails(_: Any) -> None:
         raise np.linalg.LinAlgError("not positive definite")
 
-    monkeypatch.setattr(judging, "fit", fails)
+    monkeypatch.setattr(judging, "fit_mixture", fails)
     assert judging._judged_among(outcome, block, 0.07, np.array([1, 3])).findings == ()
     assert "not judged" in caplog.text
     monkeypatch.setattr(judging, "around", lambda *_: None)

@@ -10,8 +10,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from barpc.ba import adjust_tracks
-from barpc.ba.evidence import shared
-from barpc.ba.evidence.shared import shared_errors
+from barpc.ba.evidence import correlated_noise
+from barpc.ba.evidence.correlated_noise import shared_errors
 from barpc.ba.judging.explanations import LOCAL
 from benchmarks.worlds import judge
 from benchmarks.worlds_families import World, make
@@ -56,8 +56,8 @@ def test_errors_of_cells_are_found_in_the_view_that_has_them(side: int) -> None:
 def test_the_gain_is_that_of_a_normal_distribution_less_the_choice(monkeypatch) -> None:
     view, place, off = ties(60)
     off = with_cells(place, view, off, 2, 1.5, 0)
-    monkeypatch.setattr(shared, "_SIDES", np.array([2]))
-    monkeypatch.setattr(shared, "_ALIKE", np.array([0.6]))
+    monkeypatch.setattr(correlated_noise, "_SIDES", np.array([2]))
+    monkeypatch.setattr(correlated_noise, "_CORRELATED_SHARES", np.array([0.6]))
     found = shared_errors(view, place, SIZE, off)
     for v in range(2):
         mine = view == v

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.ba.estimated.unknowns import Unknowns
-from barpc.ba.robust.smooth import SPLINES, Smooth, SmoothTest
+from barpc.ba.parameters.unknowns import Unknowns
+from barpc.ba.robust.systematic_residuals import SPLINES, Smooth, SmoothTest
 from barpc.ba.solving.structure import make_structure
-from barpc.sensor.displaced import bsplines
+from barpc.sensor.image_corrections import bsplines
 from tests import distributions as stats
 
 SIZE = (10000, 20000)
@@ -207,7 +207,7 @@ def test_what_neighbours_share_is_found_though_it_is_no_smooth_function(axis: in
 
 @pytest.mark.parametrize(("most", "once"), [(599, False), (600, True)])
 def test_terms_of_a_block_that_is_not_large_are_worked_out_once(monkeypatch, most: int, once: bool) -> None:
-    monkeypatch.setattr("barpc.ba.robust.smooth.KEPT", most)
+    monkeypatch.setattr("barpc.ba.robust.systematic_residuals.KEPT", most)
     asked: list[slice] = []
     terms = Smooth._terms
     monkeypatch.setattr(Smooth, "_terms", lambda self, rows: asked.append(rows) or terms(self, rows))

@@ -15,10 +15,10 @@ from barpc.ba.judging.snooping import CRITICAL, ControlTest, _together
 from barpc.base.geodesy import ecef_from_ground, enu_basis, metres_per_unit
 from barpc.base.options import RunOptions
 from barpc.report import Run, summarize
-from barpc.report.summary.known import GcpEntry
+from barpc.report.summary.ground_points import GcpEntry
 from barpc.scene import GroundPoints
 from barpc.sensor.geometry import sight_enu, triangulate
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 from benchmarks.referee import cases, judge, make
 from tests import distributions as stats
 from tests.ba.conftest import INDEPENDENT, centers_of
@@ -212,7 +212,7 @@ def test_the_summary_has_every_point_with_its_residual_in_the_images():
 
 
 @pytest.fixture(scope="module")
-def small() -> Block:
+def small() -> SimulatedBlock:
     """Three views, a hundred tie points, six control points of 0.3 m and 0.1 px."""
     block = simulate_block(3, 100, seed=5, num_gcps=6, num_checks=0)
     gcps, rng = block.gcps, np.random.default_rng(1)
@@ -220,7 +220,7 @@ def small() -> Block:
     return replace(block, gcps=replace(gcps, lonlatalt=place, sigma=np.full((6, 3), 0.3)))
 
 
-def held(small: Block, gcps: GroundPoints, **options: Any) -> Adjustment:
+def held(small: SimulatedBlock, gcps: GroundPoints, **options: Any) -> Adjustment:
     options = {"drift": 0, "jitter": "off", "learn_priors": False, **INDEPENDENT, **options}
     centers = centers_of(small)
     return adjust_tracks(small.views, small.tracks, AdjustOptions(**options), gcps, centers=centers, hold_out=False)

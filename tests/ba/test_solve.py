@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from barpc.ba.solving import solve
-from barpc.ba.solving.solve import Minimum, State, _settled
+from barpc.ba.solving.solve import Minimum, State, _has_converged
 from barpc.base.errors import AdjustError
 
 STATE = State(np.zeros((1, 2)), np.zeros((1, 3)), history=(7.0,))
@@ -96,7 +96,7 @@ def test_a_step_that_gains_what_it_should_is_the_last(monkeypatch, off: float, l
     ],
 )
 def test_a_step_is_the_last_where_what_it_leaves_does_not_matter(gain, before, last) -> None:
-    assert _settled(gain, before, 1000.0, 1e-6) == last
+    assert _has_converged(gain, before, 1000.0, 1e-6) == last
 
 
 def test_a_step_that_fails_is_damped_and_the_damping_let_go(monkeypatch) -> None:

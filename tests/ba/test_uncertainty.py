@@ -9,12 +9,12 @@ import pytest
 from scipy.special import chdtri, ndtr
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior, pair_heights
-from barpc.ba.estimated.priors import DRIFT_SIGMA
-from barpc.ba.held.incremental import BlockPrior
+from barpc.ba.constraints.incremental import BlockPrior
+from barpc.ba.parameters.priors import DRIFT_SIGMA
 from barpc.base.errors import InputError
 from barpc.base.geodesy import ecef_from_ground, enu_basis
 from barpc.scene import Tracks
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import centers_of, solve
 
 SIGMA_ATTITUDE, SIGMA_POSITION, NOISE = 4.0, 1.0, 0.1
@@ -54,7 +54,7 @@ class Trials:
         assert (squares < many).all()
 
 
-def run_trials(block: Block, count: int, options: AdjustOptions = OPTIONS) -> Trials:
+def run_trials(block: SimulatedBlock, count: int, options: AdjustOptions = OPTIONS) -> Trials:
     """Draw corrections from the prior and noise, adjust, compare."""
     rng = np.random.default_rng(5)
     centers = centers_of(block)
@@ -156,7 +156,7 @@ def test_the_gauge_report_names_the_height_as_the_weakest_mode(adjusted):
     assert (np.abs(adjusted.scene_shift) < 5 * np.linalg.norm(adjusted.gauge.sigma)).all()
 
 
-def _divided(block: Block, old: int) -> tuple[Tracks, Tracks, np.ndarray]:
+def _divided(block: SimulatedBlock, old: int) -> tuple[Tracks, Tracks, np.ndarray]:
     """Tracks among the first views, the others, and how old tracks are counted in the whole."""
     tracks = block.tracks
     last = np.zeros(tracks.num_points, dtype=int)

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
-from barpc.ba.estimated.priors import CameraPrior, prior_sigmas
-from barpc.ba.estimated.unknowns import Unknowns
-from barpc.ba.estimated.waves import Waves
-from barpc.ba.held.block import join, make_problem
+from barpc.ba.constraints.block import join, make_problem
+from barpc.ba.parameters.additional_parameters import AdditionalParameters
+from barpc.ba.parameters.priors import CameraPrior, prior_sigmas
+from barpc.ba.parameters.unknowns import Unknowns
 from barpc.ba.robust.variances import PriorTest, Variances, _Around, same_prior
 from barpc.ba.solving.solve import State, minimise
 from barpc.base.errors import BarpcWarning
 from barpc.base.geodesy import ecef_from_ground
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import centers_of, solve
 from tests.distributions import chi2
 from tests.lanes import rest_slow
@@ -304,7 +304,7 @@ def test_variances_of_a_large_block_are_exact_where_they_are_stated_and_probed_w
     block = simulate_block(n, 20 * n, seed=1, num_checks=0)
     if n < 300:
         monkeypatch.setattr("barpc.ba.solving.normal.LEAF", 0)
-        monkeypatch.setattr("barpc.ba.solving.covariance._LARGE", 0)
+        monkeypatch.setattr("barpc.ba.solving.covariance._DENSE_UNKNOWNS", 0)
     options = AdjustOptions(**({"min_convergence": 60.0} if n < 300 else {}))
     with pytest.warns(BarpcWarning, match="held in height"):  # they share an error, taken off the sparse matrix
         found = adjust_tracks(block.views, block.tracks, options, centers=centers_of(block))
@@ -325,7 +325,7 @@ def test_variances_of_a_large_block_are_exact_where_they_are_stated_and_probed_w
 
 
 @pytest.fixture(scope="module")
-def made() -> Block:
+def made() -> SimulatedBlock:
     return simulate_block(3, 200, seed=5, attitude=5e-6)
 
 
@@ -387,7 +387,7 @@ def test_other_priors_of_single_views_are_an_update_of_what_is_known(n: int) -> 
     assert exact.evidence > first.evidence + 20.0
 
 
-def adjusted(block: Block, **options: Any) -> Adjustment:
+def adjusted(block: SimulatedBlock, **options: Any) -> Adjustment:
     return solve(block, drift=0, hold_out=False, **options)
 
 
@@ -445,7 +445,7 @@ def waved(n: int = 3) -> Variances:
     """Priors of views with splines and a step, whose standard deviations differ from one to another."""
     unknowns = Unknowns(
         "rotation", 1, np.zeros((n, 3)), np.ones(n), np.zeros((2, n)), np.ones((2, n)),
-        waves=Waves(9, np.full((n, 2), 5.0)),
+        waves=AdditionalParameters(9, np.full((n, 2), 5.0)),
     )  # fmt: skip
     sigma = np.full((n, unknowns.size), 2.0)
     sigma[:, unknowns.in_waves] = 0.3

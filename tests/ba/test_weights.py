@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.estimated.priors import PointPrior
-from barpc.ba.estimated.waves import Waves
-from barpc.ba.held.ground import ALIKE
+from barpc.ba.constraints.ground import MAX_INDEPENDENT_ERRORS
+from barpc.ba.parameters.additional_parameters import AdditionalParameters
+from barpc.ba.parameters.priors import PointPrior
 from barpc.ba.robust import rounds
 from barpc.ba.robust.rounds import _robust
-from barpc.ba.robust.smooth import SPLINES
+from barpc.ba.robust.systematic_residuals import SPLINES
 from barpc.ba.robust.weights import LOSSES, MEDIAN, Observations
 from barpc.ba.solving.structure import make_structure
 from barpc.base.options import AdjustOptions
@@ -43,7 +43,9 @@ def test_the_median_lies_between_those_of_one_and_of_two_degrees_of_freedom() ->
 POINTS, TRACKS, KNOWN = 7, 4, 5
 
 
-def observations(noise_floor: float = 0.0, waves: Waves | None = None, num: int = POINTS) -> Observations:
+def observations(
+    noise_floor: float = 0.0, waves: AdditionalParameters | None = None, num: int = POINTS
+) -> Observations:
     """The sigmas are 0.1 px; what counts from `KNOWN` on is a reference's."""
     point = np.tile(np.arange(num), 2)
     structure = make_structure(np.repeat([0, 1], num), point, 2, num)
@@ -85,14 +87,14 @@ def test_points_of_a_reference_count_as_stated_whatever_the_noise_and_resemble_e
         weight = made.weight(use, 2.0).reshape(2, num)
         np.testing.assert_allclose(weight[:, :KNOWN], 5.0)
         for view, count in ((0, more - 1), (1, more)):
-            expected = 10.0 * min(np.sqrt(ALIKE / count), 1.0)
+            expected = 10.0 * min(np.sqrt(MAX_INDEPENDENT_ERRORS / count), 1.0)
             np.testing.assert_allclose(weight[view, KNOWN : KNOWN + count], expected)
         assert weight[0, -1] == 0.0
 
 
 def test_the_floor_is_that_of_every_stretch_of_a_spline() -> None:
     """What neighbours share averages away over as many stretches as there are unknowns in the image."""
-    waves = Waves(13)
+    waves = AdditionalParameters(13)
     use = np.ones(14, dtype=bool)
     for made, stretches in ((observations(0.3), 1), (observations(0.3, waves), waves.size)):
         weight = made.weight(use, 1.0)[:TRACKS]

@@ -19,7 +19,7 @@ from barpc.scene import Camera, GroundPoints, Tracks, View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.curve import Curve
 from barpc.sensor.direct_grid import DirectGrid
-from barpc.sensor.displaced import ImageAffine
+from barpc.sensor.image_corrections import ImageAffine
 from barpc.sensor.rpc import RPC
 from barpc.simulate import Look, fly
 

@@ -7,7 +7,7 @@ import pytest
 import shapely
 from shapely.geometry import shape
 
-from barpc.base.geodesy import collection, feature, polygon
+from barpc.base.geodesy import feature_collection, geojson_feature, polygon
 from barpc.sensor.geometry import footprint
 from barpc.simulate import Look, fly
 from tests.sensor.conftest import make_rpc
@@ -78,5 +78,5 @@ def test_a_camera_across_the_antimeridian_keeps_its_area():
 
 
 def test_features_carry_their_properties():
-    document = collection([feature(ring(5, 43, 6, 44), name="a", alt=3.0)])
+    document = feature_collection([geojson_feature(ring(5, 43, 6, 44), name="a", alt=3.0)])
     assert document["features"][0]["properties"] == {"name": "a", "alt": 3.0}

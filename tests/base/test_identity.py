@@ -16,7 +16,7 @@ def test_a_file_whose_number_changes_and_whose_bytes_do_not_is_the_same(tmp_path
     """Some file systems number files anew; times that changed mean that somebody was at it."""
     path = tmp_path / "a"
     path.write_bytes(b"x" * 1000)
-    found = identity.take(path)
+    found = identity.fingerprint(path)
     found.ask()
     assert found.stamp is not None
     renumbered = identity.Input(
@@ -24,7 +24,7 @@ def test_a_file_whose_number_changes_and_whose_bytes_do_not_is_the_same(tmp_path
     )
     renumbered.ask()
     wrong = identity.Input(found.path, found.size, "0" * 64, identity.Stamp(*found.stamp.times(), 3, 2, "here"))
-    identity._known.clear()
+    identity._stamps.clear()
     with pytest.raises(InputError, match="was changed or replaced"):
         wrong.ask()
     path.unlink()
@@ -47,30 +47,30 @@ def test_devices_are_compared_on_one_host_only() -> None:
 def test_a_pipe_in_the_place_of_a_file_is_not_waited_for(tmp_path) -> None:
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="not a regular file"):
-        identity.take(tmp_path / "pipe")
+        identity.fingerprint(tmp_path / "pipe")
     with pytest.raises(InputError, match="not a regular file"):
-        identity.take("/dev/zero")
+        identity.fingerprint("/dev/zero")
 
 
 def test_an_input_is_its_bytes_and_those_of_its_parts(tmp_path) -> None:
     (tmp_path / "a").write_bytes(b"one")
     (tmp_path / "b").write_bytes(b"two")
-    a, b = identity.take(tmp_path / "a"), identity.take(tmp_path / "b")
+    a, b = identity.fingerprint(tmp_path / "a"), identity.fingerprint(tmp_path / "b")
     assert (a.path, a.size, a.sha256) == (str(tmp_path / "a"), 3, hashlib.sha256(b"one").hexdigest())
     assert a.key == a.sha256
-    whole = identity.take(tmp_path / "a", [b])
+    whole = identity.fingerprint(tmp_path / "a", [b])
     assert whole.key not in (a.key, b.key)
     assert [one.path for one in whole.every()] == [a.path, b.path]
-    elsewhere = identity.take(Remote("https://a.org/x", 7, "tag"))
+    elsewhere = identity.fingerprint(Remote("https://a.org/x", 7, "tag"))
     assert (elsewhere.size, elsewhere.stamp) == (7, None)
-    assert elsewhere.sha256 != identity.take(Remote("https://a.org/x", 7, "other")).sha256
+    assert elsewhere.sha256 != identity.fingerprint(Remote("https://a.org/x", 7, "other")).sha256
     elsewhere.ask()  # its host is asked for that version
 
 
 def test_within_a_block_every_input_is_asked_at_the_end_and_one_when_it_is_opened(tmp_path) -> None:
     (tmp_path / "a").write_bytes(b"one")
     (tmp_path / "b").write_bytes(b"two")
-    a, b = identity.take(tmp_path / "a"), identity.take(tmp_path / "b")
+    a, b = identity.fingerprint(tmp_path / "a"), identity.fingerprint(tmp_path / "b")
     identity.ask()
     with identity.guarded([a, b]):
         identity.ask()
@@ -95,12 +95,12 @@ def test_what_was_read_is_noted_once_and_must_stay(tmp_path) -> None:
         identity.note(path, path.stat())
         identity.note(path, path.stat())
         assert list(seen) == [str(path)]
-        identity.take(path)
+        identity.fingerprint(path)
         path.write_bytes(b"another")
         with pytest.raises(InputError, match="was changed"):
             identity.note(path, path.stat())
         with pytest.raises(InputError, match="was changed"):
-            identity.take(path)
+            identity.fingerprint(path)
         with pytest.raises(InputError, match="was changed"):
             identity.also_seen({str(path): identity.Stamp.of(path.stat())})
     identity.note(path, path.stat())

@@ -223,7 +223,7 @@ def test_the_schema_and_the_records_agree(tmp_path: Path) -> None:
             wrong = json.loads(json.dumps(wrong))
             with pytest.raises(fastjsonschema.JsonSchemaException):
                 validate({table: {name: wrong}} if table else {name: wrong})
-        if one.default is not None and not one.rule.spoken:  # no options file has it
+        if one.default is not None and not one.rule.cli_only:  # no options file has it
             plain = json.loads(json.dumps(one.default))
             validate({table: {name: plain}} if table else {name: plain})
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from barpc.base.errors import RpcFormatError
-from barpc.base.sidefile import parse_xml
+from barpc.base.safe_io import parse_xml
 
 LAUGHS = b'<!DOCTYPE a [<!ENTITY x "lol"><!ENTITY y "&x;&x;&x;&x;">]><a>&y;</a>'
 

@@ -22,11 +22,11 @@ import pytest
 import barpc
 from barpc.base.errors import BarpcError, InputError
 from barpc.base.frozen import load_npz
-from barpc.base.sidefile import (
+from barpc.base.safe_io import (
     ARRAYS,
     GEOJSON,
-    LARGEST,
-    LINE,
+    MAX_LINE_BYTES,
+    MAX_NUMBER,
     MB,
     NAMES,
     SUMMARY,
@@ -42,7 +42,7 @@ from barpc.base.sidefile import (
     read_text,
 )
 from barpc.rpcio import FORMATS
-from barpc.rpcio.formats import parse
+from barpc.rpcio.formats import parse_rpc
 from barpc.rpcio.text import ReadOptions
 from tests.fuzz.samples import SAMPLES
 from tests.lanes import diagonal, rest_slow
@@ -135,9 +135,9 @@ def test_json_holds_finite_numbers_and_is_not_endlessly_deep(text):
 
 
 def test_the_largest_numbers_are_read_and_none_beyond() -> None:
-    assert parse_json(f"[{LARGEST}, -{LARGEST}, 0.5]") == [LARGEST, -LARGEST, 0.5]
+    assert parse_json(f"[{MAX_NUMBER}, -{MAX_NUMBER}, 0.5]") == [MAX_NUMBER, -MAX_NUMBER, 0.5]
     with pytest.raises(ValueError, match="is beyond"):
-        parse_json(f"[{math.nextafter(LARGEST, math.inf)}]")
+        parse_json(f"[{math.nextafter(MAX_NUMBER, math.inf)}]")
 
 
 @pytest.mark.parametrize(("start", "end"), [("[", "]"), ('{"a":', "}"), ('[1,{"}":', '},"]"]')])
@@ -253,7 +253,7 @@ def test_sniffers_and_readers_take_time_in_proportion_to_the_text(fill, prefix):
 
 
 def test_twenty_thousand_blank_lines_are_nothing():
-    assert cpu(lambda: parse(b"\n" * 20_000 + b"x", "x")) < 0.1
+    assert cpu(lambda: parse_rpc(b"\n" * 20_000 + b"x", "x")) < 0.1
     for row in FORMATS.values():
         assert cpu(partial(row.sniff, "\n" * 20_000)) < 0.1
 
@@ -262,7 +262,7 @@ def test_twenty_thousand_blank_lines_are_nothing():
 @pytest.mark.parametrize("fill", rest_slow(["<", "\n", " ", "(", "7", "<a>", "a"], mark=pytest.mark.nightly))
 def test_the_largest_rpc_file_that_is_read_ends_in_sensible_time(fill):
     data = (fill * (32 << 20))[: 32 << 20].encode()
-    assert cpu(lambda: parse(b"x" + data[1:], "x")) < 20
+    assert cpu(lambda: parse_rpc(b"x" + data[1:], "x")) < 20
     for name in ("txt", "rpb", "xml", "json"):
         assert cpu(partial(sniff_and_read, name, data.decode())) < 60
 
@@ -292,9 +292,9 @@ def test_readers_take_time_in_proportion_to_the_file(kind, fill, tmp_path):
 # --- no way around ----------------------------------------------------------------------------------------
 
 DIRECT = {
-    "base/sidefile.py": "the one place",
+    "base/safe_io.py": "the one place",
     "base/atomic.py": "syncs what was written",
-    "pipeline/handoff.py": "reopens what barpc has just written, as its consumers do",
+    "pipeline/verify_outputs.py": "reopens what barpc has just written, as its consumers do",
     "rasters/raster.py": "images, checked there",
     "base/identity.py": "any input, to hash it: below sidefile, which asks it; regular files only",
     "workspace.py": "barpc's own source, the state",
@@ -371,12 +371,12 @@ def test_a_table_of_more_lines_than_memory_is_meant_for_is_refused(line, end, tm
 
 def test_a_line_of_a_table_without_end_is_refused_and_long_ones_are_read(tmp_path):
     path = tmp_path / "a.csv"
-    path.write_text(f"x\n{'a,' * (LINE // 2 - 1)}\nx\n")
-    assert len(read_text(path, TABLE)) == LINE + 3
-    path.write_text(f"x\n{'a,' * LINE}\nx\n")
-    with pytest.raises(InputError, match=f"a line of more than {LINE} bytes, too long for a table of points"):
+    path.write_text(f"x\n{'a,' * (MAX_LINE_BYTES // 2 - 1)}\nx\n")
+    assert len(read_text(path, TABLE)) == MAX_LINE_BYTES + 3
+    path.write_text(f"x\n{'a,' * MAX_LINE_BYTES}\nx\n")
+    with pytest.raises(InputError, match=f"a line of more than {MAX_LINE_BYTES} bytes, too long for a table of points"):
         read_text(path, TABLE)
-    assert len(read_text(path, GEOJSON)) == 2 * LINE + 5  # of one line, as most are
+    assert len(read_text(path, GEOJSON)) == 2 * MAX_LINE_BYTES + 5  # of one line, as most are
 
 
 @pytest.mark.parametrize(

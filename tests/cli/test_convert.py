@@ -16,9 +16,17 @@ from rasterio.windows import Window
 from barpc.base.errors import InputError, OutputError
 from barpc.cameras import open_camera
 from barpc.cli import convert as module
-from barpc.cli.convert import _check, _shadow_reasons, _tell, _window, box_of, check_target, window_of
+from barpc.cli.convert import (
+    _refuse_source_folder,
+    _shadow_reasons,
+    _tell_readings,
+    _window_chooser,
+    box_of,
+    check_target,
+    window_of,
+)
 from barpc.fit.points import Sample
-from barpc.pipeline.handoff import Reading
+from barpc.pipeline.verify_outputs import Reading
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.scene import Camera
@@ -215,14 +223,14 @@ def test_a_box_may_lie_across_the_antimeridian() -> None:
 
 def test_a_window_stands_as_given_and_one_of_both_is_taken() -> None:
     none: dict[str, Any] = {"window": None, "bbox": None, "aoi": None}
-    assert _window({**none, "window": (1, 2, 3, 4)})(CAMERA, Path("a")) == (1, 2, 3, 4)
+    assert _window_chooser({**none, "window": (1, 2, 3, 4)})(CAMERA, Path("a")) == (1, 2, 3, 4)
     for both in (
         {},
         {"window": (1, 2, 3, 4), "bbox": (0.0, 0.0, 1.0, 1.0)},
         {"bbox": (0.0,) * 4, "aoi": "a"},
     ):
         with pytest.raises(click.UsageError, match="give one of --window, --bbox and --aoi"):
-            _window({**none, **both})
+            _window_chooser({**none, **both})
 
 
 # --- a part of the ground out of many images --------------------------------------------------------------
@@ -400,10 +408,10 @@ def test_what_readers_see_is_a_line_or_a_row_each(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     readings = [Reading(Path("a"), "gdal", 1.3e-9), Reading(Path("b"), "rpcm", NAN, "no field")]
-    _tell(readings)
+    _tell_readings(readings)
     assert capsys.readouterr().out == "a: gdal 1.3e-09 px\nb: rpcm no field\n"
     monkeypatch.setattr(module, "wants_json", lambda: True)
-    _tell(readings)
+    _tell_readings(readings)
     assert json.loads(capsys.readouterr().out) == [
         {"path": "a", "consumer": "gdal", "max_px": 1.3e-9, "note": ""},
         {"path": "b", "consumer": "rpcm", "max_px": None, "note": "no field"},
@@ -413,15 +421,15 @@ def test_what_readers_see_is_a_line_or_a_row_each(
 def test_names_of_a_hand_off_are_checked_first(tmp_path: Path) -> None:
     a, b = tmp_path / "a" / "x.tif", tmp_path / "b" / "x.tif"
     out = tmp_path / "out"
-    _check([a, b.with_name("y.tif")], out, ["txt", "geom"])
+    _refuse_source_folder([a, b.with_name("y.tif")], out, ["txt", "geom"])
     with pytest.raises(click.UsageError, match="--rpc-format doc: not a format that is written"):
-        _check([a], out, ["txt", "doc"])
+        _refuse_source_folder([a], out, ["txt", "doc"])
     with pytest.raises(InputError, match="several images named x: apply them one folder at a time"):
-        _check([a, b], out, ["txt"])
+        _refuse_source_folder([a, b], out, ["txt"])
     with pytest.raises(InputError, match="the folder of the images; choose a new one"):
-        _check([b, a.with_name("y.tif")], a.parent, ["txt"])
+        _refuse_source_folder([b, a.with_name("y.tif")], a.parent, ["txt"])
     with pytest.raises(InputError):
-        _check([a], Path(str(tmp_path / "a\0b")), ["txt"])
+        _refuse_source_folder([a], Path(str(tmp_path / "a\0b")), ["txt"])
 
 
 def test_what_hides_an_rpc_is_told_of_the_input_and_counts_in_the_output(

@@ -14,7 +14,7 @@ import pytest
 from barpc.base.errors import InputError, RpcError
 from barpc.cameras import open_camera
 from barpc.cli import info as module
-from barpc.cli.info import _altitude, _describe, _lines, _outlines, _pairs
+from barpc.cli.info import _altitude, _describe, _labelled_sentences, _outlines_geojson, _viewed_together
 from barpc.rpcio import write_rpc
 from barpc.sensor.rpc import RPC
 from tests.cli.test_main import run
@@ -117,7 +117,7 @@ def test_a_box_is_the_rpc_s_offset_and_scale_on_either_side(tmp_path: Path) -> N
 def test_the_angle_of_a_pair_is_that_between_the_rays(pair: list[str], tmp_path: Path) -> None:
     cameras = [open_camera(spec) for spec in pair]
     for at in (None, (5.402, 43.199, 80.0)):
-        (found,) = _pairs(pair, cameras, 0, 150.0, at)
+        (found,) = _viewed_together(pair, cameras, 0, 150.0, at)
         first = cameras[0].rpc
         place = first.localize((np.array(SIZE) - 1) / 2, 150.0) if at is None else at
         one, two = (ray(camera.rpc, place) for camera in cameras)
@@ -126,8 +126,8 @@ def test_the_angle_of_a_pair_is_that_between_the_rays(pair: list[str], tmp_path:
         base = np.linalg.norm(one[:2] / one[2] - two[:2] / two[2])
         assert found["b_over_h"] == pytest.approx(base, rel=0.01)
         assert found["with"] == "right"
-    assert _pairs(pair, cameras, 1, 150.0, None) == []
-    three = _pairs([*pair, pair[0]], [*cameras, cameras[0]], 0, 150.0, None)
+    assert _viewed_together(pair, cameras, 1, 150.0, None) == []
+    three = _viewed_together([*pair, pair[0]], [*cameras, cameras[0]], 0, 150.0, None)
     assert [row["with"] for row in three] == ["right", "left"]
     assert three[1]["convergence_deg"] == pytest.approx(0.0, abs=1e-4)
 
@@ -156,11 +156,11 @@ BOX: dict[str, Any] = {
 
 def told(**changes: Any) -> dict[str, str]:
     report = {key: value for key, value in {**REPORT, **changes}.items() if value is not ...}
-    return {label: line for label, line in _lines(report) if label != "note"}
+    return {label: line for label, line in _labelled_sentences(report) if label != "note"}
 
 
 def test_a_camera_that_is_no_rpc_says_where_it_is() -> None:
-    assert list(_lines(REPORT)) == [
+    assert list(_labelled_sentences(REPORT)) == [
         ("camera", "rpb in a in b.RPB"),
         ("note", "one"),
         ("note", "two"),
@@ -210,7 +210,7 @@ def test_a_camera_that_sees_no_ground_has_a_problem(pair: list[str]) -> None:
     camera = replace(open_camera(pair[0]), model=Blind())
     assert _describe(camera, 1.0, None)["problem"] == "no ground point at the image's centre"
     with pytest.raises(RpcError, match=r"left.*: no ground point at its image's border at 7 m"):
-        _outlines(pair[:1], [camera], 7.0, None)
+        _outlines_geojson(pair[:1], [camera], 7.0, None)
 
 
 # --- altitudes and outlines -------------------------------------------------------------------------------

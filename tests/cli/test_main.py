@@ -13,7 +13,7 @@ import click
 import pytest
 
 from barpc.base.errors import BarpcWarning, InputError
-from barpc.cli import COMMANDS, Verbs, _log_warning, _told, cli, main
+from barpc.cli import COMMANDS, Verbs, _exit_message, _log_warning, cli, main
 from barpc.cli.process import interruptible
 from barpc.cli.terminal import THREADS
 
@@ -155,7 +155,7 @@ def _from(cause: BaseException, error: BaseException) -> BaseException:
     ],
 )  # fmt: skip
 def test_an_error_is_an_exit_code_and_a_sentence(error: BaseException, code: int, text: str) -> None:
-    assert _told(error) == (code, text)
+    assert _exit_message(error) == (code, text)
 
 
 @pytest.fixture

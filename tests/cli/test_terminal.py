@@ -12,8 +12,8 @@ import pytest
 
 from barpc.cli import terminal
 from barpc.cli.terminal import Formatter, layout, output_width, print_comparison, print_summary, tell_gate
-from barpc.report.summary.known import GCPS
-from barpc.report.summary.whole import DATUM, DatumEntry
+from barpc.report.summary.block import DATUM, DatumEntry
+from barpc.report.summary.ground_points import GCP_CAPTION
 from tests.report.made import a_gcp, a_pair, a_summary, a_view
 
 NUMBERS = [["image", "error [px]", "tie points"], ["a", "0.5", "12"], ["bb", "10.25", "3"]]
@@ -166,7 +166,7 @@ def test_a_summary_is_tables_a_headline_in_colour_and_the_verdict(
         "Reprojection error of the tie points",
         "Epipolar offset: median ± spread (1.4826 MAD) across the epipolar line",
     ]
-    assert titles[2:] == [GCPS, "Look here."]
+    assert titles[2:] == [GCP_CAPTION, "Look here."]
     tables = [text for text, style in spoken if not style.get("bold") and "\n" in text]
     assert [len(text.splitlines()) for text in tables] == [3, 2, 3]
     assert all(text.endswith("\n") for text in tables)

@@ -375,12 +375,12 @@ def test_convert_names_what_hides_the_rpc_beside_the_input_and_in_the_new_folder
 
 
 def test_convert_reports_a_file_that_a_tool_cannot_read_as_valid_json(image, tmp_path, capsys, monkeypatch):
-    from barpc.pipeline import handoff
+    from barpc.pipeline import verify_outputs
 
     def broken(path):
         raise RuntimeError("no such\nfield")
 
-    monkeypatch.setitem(handoff.CONSUMERS, "gdal", handoff.Consumer("rasterio", broken))
+    monkeypatch.setitem(verify_outputs.CONSUMERS, "gdal", verify_outputs.Consumer("rasterio", broken))
     write_rpc(read_rpc(image), tmp_path / "a.geom")
     assert run("convert", image, "--rpc", tmp_path / "a.geom", "-o", tmp_path / "out", "--json") == 3
     rows = {row["consumer"]: row for row in json.loads(capsys.readouterr().out)}

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from barpc.cli import fit as fitting
-from barpc.cli.adjust import _tell
+from barpc.cli.adjust import _tell_result
 from barpc.cli.fit import _certificate
 from barpc.rpcio import write_rpc
 from tests.cli.test_main import run
@@ -203,7 +203,7 @@ def test_a_millionth_of_a_pixel_is_the_bound(
 ) -> None:
     image = write_image(tmp_path / "i.tif", shape=(1, 40, 60))
     write_rpc(make_rpc().crop(900, 900), tmp_path / "i.RPB")
-    monkeypatch.setattr("barpc.pipeline.handoff.difference", lambda *_: far)
+    monkeypatch.setattr("barpc.pipeline.verify_outputs.difference", lambda *_: far)
     assert run("check", str(image), "--against", str(tmp_path / "i.RPB")) == code
 
 
@@ -239,10 +239,10 @@ def test_a_result_is_printed_once_and_its_exit_code_says_whether_it_passes(
     monkeypatch.setattr("barpc.cli.adjust.wants_json", lambda: as_json)
     record = a_summary([], reasons=("One.",))
     result: Any = SimpleNamespace(summary={"a": 1}, record=record, passed=True, root="")
-    assert _tell({"quiet": quiet}, result) == 0
+    assert _tell_result({"quiet": quiet}, result) == 0
     assert capsys.readouterr() == (out, "")
     result.passed = False
-    assert _tell({"quiet": quiet}, result) == 3
+    assert _tell_result({"quiet": quiet}, result) == 3
     headline = "" if quiet else "All well. "
     assert capsys.readouterr() == (out, f"barpc: exit code 3: {headline}One.\n")
 

@@ -17,7 +17,7 @@ from barpc.base import manifest
 from barpc.base.options import RunOptions
 from barpc.export.shots import read_scene
 from barpc.pipeline import outputs
-from barpc.pipeline.outputs import GOOD, prove
+from barpc.pipeline.outputs import PASSED_STATES, prove
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.workspace import Workspace
 from tests.reliability.conftest import barpc
@@ -50,7 +50,7 @@ def findings(run: Path, *places: object) -> tuple[int, dict[tuple[str, str], str
 
 def wrong(run: Path, root: str | None = None) -> set[tuple[str, str]]:
     """Files that are not what they were, and what became of them."""
-    return {(one.file, one.now) for one in prove(run, (), root) if one.now not in GOOD}
+    return {(one.file, one.now) for one in prove(run, (), root) if one.now not in PASSED_STATES}
 
 
 def files(run: Path) -> list[str]:
@@ -115,7 +115,7 @@ def edits(data: bytes) -> dict[str, bytes]:
 
 
 def test_every_edit_of_every_file_is_named_and_so_is_its_absence(run, monkeypatch) -> None:
-    monkeypatch.setattr(outputs, "_cameras", lambda summary, folder: ())  # the hashes alone find it
+    monkeypatch.setattr(outputs, "_verify_cameras", lambda summary, folder: ())  # the hashes alone find it
     root, names = root_of(run), files(run)
     assert len(names) > 20
     for name in names:
@@ -136,7 +136,7 @@ def test_every_edit_of_every_file_is_named_and_so_is_its_absence(run, monkeypatc
 
 
 def test_every_consistent_edit_is_found_by_the_root_alone(run, monkeypatch) -> None:
-    monkeypatch.setattr(outputs, "_cameras", lambda summary, folder: ())
+    monkeypatch.setattr(outputs, "_verify_cameras", lambda summary, folder: ())
     root = root_of(run)
     for name in set(files(run)) - {SUMS, "summary.json"}:
         data, sums = (run / name).read_bytes(), (run / SUMS).read_bytes()

@@ -10,7 +10,7 @@ import pytest
 from pyproj import CRS, Transformer
 
 from barpc.dsm import stereo
-from barpc.dsm.stereo import NODES, CameraErrors, Tile, gathered
+from barpc.dsm.stereo import TILE_NODES, CameraErrors, Tile, gathered
 from barpc.dsm.surface import Grid
 
 
@@ -71,10 +71,12 @@ def test_the_cameras_share_is_that_of_each_cells_centre() -> None:
     cell; columns to the east, rows to the south.
     """
     tile = Tile(CRS.from_epsg(32631).to_wkt(), 450_000.0, 4_900_000.0, 2.0, (8, 6), (0.0, 1.0))
-    east, south = (part.ravel() for part in np.meshgrid(np.linspace(0.0, 8.0, NODES), np.linspace(0.0, 6.0, NODES)))
+    east, south = (
+        part.ravel() for part in np.meshgrid(np.linspace(0.0, 8.0, TILE_NODES), np.linspace(0.0, 6.0, TILE_NODES))
+    )
 
     def rows(chosen: Any, ground: np.ndarray) -> np.ndarray:
-        assert len(ground) == NODES**2
+        assert len(ground) == TILE_NODES**2
         return 10.0 * len(chosen[0]) + east + 100.0 * south
 
     made: Any = SimpleNamespace(block=SimpleNamespace(errors=SimpleNamespace(rows=rows, sigma=np.asarray)))
@@ -103,8 +105,8 @@ def test_coarser_pictures_are_framed_by_the_middles_of_their_pixels(monkeypatch:
     monkeypatch.setattr(stereo, "dense_matches", lambda paths, size, frame, band: sizes.append(size))
     project = [lambda ground, k=k: (1 + k) * ground[:, :2] + ground[:, 2:] for k in range(2)]
     pair: Any = [SimpleNamespace(sensor=SimpleNamespace(project=one), size=(403, 80), path="") for one in project]
-    assert stereo._points(pair, tile, 1) == []
-    ground = np.column_stack([np.tile(tile.nodes(), (3, 1)), np.repeat([100.0, 200.0, 300.0], NODES**2)])
+    assert stereo._tile_points(pair, tile, 1) == []
+    ground = np.column_stack([np.tile(tile.nodes(), (3, 1)), np.repeat([100.0, 200.0, 300.0], TILE_NODES**2)])
     for (*seen, alt), side in zip(asked, (1, 4), strict=True):
         for found, one in zip(seen, project, strict=True):
             np.testing.assert_allclose(found, (one(ground) + 0.5) / side - 0.5)

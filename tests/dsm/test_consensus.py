@@ -11,7 +11,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from barpc.base.options import DsmOptions
 from barpc.dsm import stereo
-from barpc.dsm.consensus import REACH, SURROUNDED, consensus, median
+from barpc.dsm.consensus import NEIGHBOUR_RADIUS, SURROUNDED, consensus, finite_median
 from barpc.dsm.stereo import block_of_images, gathered, surface_tile
 from barpc.dsm.surface import Grid
 from tests.dsm.conftest import SMALL, Rendered
@@ -35,7 +35,7 @@ def known_median(values: np.ndarray) -> np.ndarray:
 
 
 def heights_of(cells: np.ndarray) -> np.ndarray:
-    return median(np.where(consensus(cells, PIXEL[: len(cells)]), cells, np.nan))
+    return finite_median(np.where(consensus(cells, PIXEL[: len(cells)]), cells, np.nan))
 
 
 def taken_by_hand(heights: np.ndarray, metres: np.ndarray) -> np.ndarray:
@@ -57,8 +57,8 @@ def taken_by_hand(heights: np.ndarray, metres: np.ndarray) -> np.ndarray:
             sure[at] = np.median(one[list(groups[best[0]])])
         elif best:
             open_cells[at] = best, groups
-    away = range(-REACH, REACH + 1, 2)
-    around = [(i, j) for i in away for j in away if 0 < i * i + j * j <= REACH**2]
+    away = range(-NEIGHBOUR_RADIUS, NEIGHBOUR_RADIUS + 1, 2)
+    around = [(i, j) for i in away for j in away if 0 < i * i + j * j <= NEIGHBOUR_RADIUS**2]
     for at, (best, groups) in open_cells.items():
         near = [(at[0] + i, at[1] + j) for i, j in around]
         near = [sure[one] for one in near if 0 <= one[0] < rows and 0 <= one[1] < cols and np.isfinite(sure[one])]
@@ -175,7 +175,7 @@ def test_the_median_of_what_is_known_is_numpys():
     values = rng.normal(size=(5, 20, 30))
     values[rng.random(values.shape) < 0.5] = np.nan
     values[:, 0, 0] = np.nan
-    np.testing.assert_allclose(median(values), known_median(values), rtol=1e-15)
+    np.testing.assert_allclose(finite_median(values), known_median(values), rtol=1e-15)
 
 
 def test_a_tile_says_which_pairs_it_took_and_how_far_all_of_them_disagree(monkeypatch):
@@ -186,7 +186,9 @@ def test_a_tile_says_which_pairs_it_took_and_how_far_all_of_them_disagree(monkey
     cells[:, 30, 30] = 0.0, np.nan, np.nan
     sigma = np.broadcast_to(np.array([1.0, 2.0, 4.0], np.float32)[:, None, None], cells.shape)
     metres = iter([2.0, 1.5, 2.5])
-    monkeypatch.setattr(stereo, "_points", lambda pair, tile, band: [(np.zeros((1, 3)), np.ones(1), 0.9, next(metres))])
+    monkeypatch.setattr(
+        stereo, "_tile_points", lambda pair, tile, band: [(np.zeros((1, 3)), np.ones(1), 0.9, next(metres))]
+    )
     made = iter(np.stack([cells, sigma], axis=1))
     monkeypatch.setattr(stereo, "gathered", lambda *given: next(made))
     tile = SimpleNamespace(size=(48, 48))

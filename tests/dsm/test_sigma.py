@@ -7,7 +7,7 @@ import pytest
 
 from barpc.ba import BlockPrior
 from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
-from barpc.dsm.stereo import CameraErrors, averaged
+from barpc.dsm.stereo import CameraErrors, noise_of_mean
 from barpc.dsm.surface import shaded
 from barpc.scene import View
 from barpc.sensor.corrected import Corrected, Correction
@@ -116,5 +116,7 @@ def test_the_mean_of_matches_is_known_as_well_as_what_they_look_at_overlaps(side
     look = np.ones(WINDOW)
     weights = np.convolve(look, look)  # of the pixels under a match: a mean of steps, each of a window
     seen = np.convolve(weights, np.ones(side) / side)  # under the mean of a row of matches
-    assert averaged(np.array([float(side), 1.0]))[0] == pytest.approx((seen @ seen) / (weights @ weights), abs=0.01)
-    assert averaged(np.array([1.0])) == 1.0
+    assert noise_of_mean(np.array([float(side), 1.0]))[0] == pytest.approx(
+        (seen @ seen) / (weights @ weights), abs=0.01
+    )
+    assert noise_of_mean(np.array([1.0])) == 1.0

@@ -17,12 +17,12 @@ from barpc.base.options import DsmOptions
 from barpc.cli import main
 from barpc.dsm import NoSurfaceError, make_dsm, stereo
 from barpc.dsm import surface as surface_module
-from barpc.dsm.stereo import CORRECTION, PRIOR, Tile, _best, block_of_images
+from barpc.dsm.stereo import CORRECTION, PRIOR_FILE, Tile, _ranked_pairs, block_of_images
 from barpc.dsm.surface import _delivered, draped, show_in_report
 from barpc.pipeline import load_views
 from barpc.report.runfiles import run_key
 from barpc.rpcio import read_rpc
-from barpc.sensor.displaced import ImageAffine, ImageCorrected
+from barpc.sensor.image_corrections import ImageAffine, ImageCorrected
 from barpc.workspace import Workspace, own_files
 from tests.dsm.conftest import ALTS, SMALL
 from tests.lanes import rest_slow
@@ -87,7 +87,7 @@ def test_the_same_bytes_whoever_works_and_in_whatever_order_images_are_given(mad
 
 @pytest.mark.slow
 def test_an_interrupted_command_goes_on_where_it_was(rendered, tmp_path, monkeypatch):
-    monkeypatch.setattr(surface_module, "BLOCK", 128)
+    monkeypatch.setattr(surface_module, "BLOCK_SIZE", 128)
     asked = []
     whole = surface_module.surface_tile
 
@@ -174,13 +174,13 @@ def test_images_on_the_surface_are_alike_and_beside_it_are_not(made, rendered):
 def test_pairs_with_a_flagged_image_come_after_the_others_and_a_line_says_so(rendered, caplog):
     views = load_views(rendered.paths).views
     worth = {(0, 1): 500.0, (0, 2): 900.0, (1, 2): 1.0}
-    plain = _best(views, worth)
+    plain = _ranked_pairs(views, worth)
     assert plain.index((1, 2)) == 2
-    flagged = _best(views, worth, flagged=frozenset({0}))
+    flagged = _ranked_pairs(views, worth, flagged=frozenset({0}))
     assert flagged == [(1, 2), *(pair for pair in plain if pair != (1, 2))]
     assert "view_00: the verdict of the run has a reservation" in caplog.text
     caplog.clear()
-    assert _best(views, worth, flagged=frozenset(range(3))) == plain  # as all are: there is nothing better
+    assert _ranked_pairs(views, worth, flagged=frozenset(range(3))) == plain  # as all are: there is nothing better
     assert not caplog.text
 
 
@@ -257,7 +257,7 @@ def test_other_ground_is_refused_with_exit_code_3_and_leaves_nothing(rendered, t
 def test_too_large_an_angle_and_radar_are_refused_with_exit_code_3(rendered, tmp_path, monkeypatch, capsys):
     from barpc.dsm import stereo
 
-    monkeypatch.setattr(stereo, "ANGLES", (2.0, 3.0))
+    monkeypatch.setattr(stereo, "CONVERGENCE_RANGE", (2.0, 3.0))
     assert run("dsm", *rendered.paths[:2], "-o", tmp_path / "dsm.tif") == 3
     assert "no pair meets under 2 to 3 degrees, where SGBM can match (view_00 and view_01" in capsys.readouterr().err
     monkeypatch.undo()
@@ -391,7 +391,7 @@ def run_of_shots(monkeypatch, tmp_path):
         return stereo.block_of_run(tmp_path, None, minus)
 
     monkeypatch.setattr(stereo, "open_camera", lambda path: SimpleNamespace(model=path.name))
-    monkeypatch.setattr(stereo, "_best", best)
+    monkeypatch.setattr(stereo, "_ranked_pairs", best)
     monkeypatch.setattr(stereo.BlockPrior, "load", lambda path: path.name)
     monkeypatch.setattr(stereo.CameraErrors, "of", lambda prior, views: (prior, len(views)))
     return made, asked
@@ -407,7 +407,7 @@ def test_a_run_s_images_have_its_cameras_and_its_pairs_their_tie_points(run_of_s
         ("c", "/x/c.tif", (9, 8), "rpc c", (5.0, 9.0), "2020-01-03"),
     ]
     assert asked == [({(0, 1): 30.0, (0, 2): 70.0, (1, 2): 0.0}, frozenset({0}), [0, 1, 2])]
-    assert (block.groups, block.source, block.errors) == ([[0, 1, 2]], "a, b, c", (PRIOR, 3))
+    assert (block.groups, block.source, block.errors) == ([[0, 1, 2]], "a, b, c", (PRIOR_FILE, 3))
 
 
 def test_of_two_dates_the_images_that_the_earlier_run_has_are_taken_away(run_of_shots, tmp_path):

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, OutputError
 from barpc.cli import main
-from barpc.export import TARGETS, _link, export_run, pinholes
+from barpc.export import TARGETS, _link_image, export_run, pinholes
 from barpc.rpcio import read_rpc, write_rpc_copy
 from barpc.rpcio.sources import light_of
 from barpc.sensor.geometry import image_grid
@@ -197,18 +197,18 @@ def test_colmap_finds_every_image_in_its_folder_and_none_is_copied(southern, tmp
 def test_a_link_takes_the_place_of_an_earlier_one_and_of_nothing_else(tmp_path, monkeypatch, caplog):
     link = tmp_path / "sparse/images/a.tif"
     for image in ("../../a.tif", "../../b.tif"):
-        _link(link, image)
+        _link_image(link, image)
         assert str(link.readlink()) == image
     (tmp_path / "mine.tif").write_text("mine")
     with pytest.raises(OutputError, match="is there already and no link of an earlier export"):
-        _link(tmp_path / "mine.tif", "a.tif")
+        _link_image(tmp_path / "mine.tif", "a.tif")
     assert (tmp_path / "mine.tif").read_text() == "mine"
 
     def refuse(*_: object) -> None:
         raise OSError(1, "Operation not permitted")
 
     monkeypatch.setattr(Path, "symlink_to", refuse)
-    _link(tmp_path / "c.tif", "a.tif")
+    _link_image(tmp_path / "c.tif", "a.tif")
     assert "c.tif: no link to a.tif (Operation not permitted): copy the image there" in caplog.text
 
 
@@ -386,9 +386,9 @@ def test_the_verb_prints_what_it_wrote(southern, tmp_path, capsys):
 
 
 def test_the_verb_offers_every_target():
-    from barpc.cli.finished import _TARGETS
+    from barpc.cli.run_commands import _TARGET_NAMES
 
-    assert tuple(TARGETS) == _TARGETS
+    assert tuple(TARGETS) == _TARGET_NAMES
 
 
 @pytest.mark.parametrize(

@@ -55,12 +55,12 @@ def test_the_derivative_by_the_unknowns_is_that_of_differences():
     found = pinholes._jacobian(TRUE, points)
     assert found.shape == (10, 10)
     for k, step in enumerate(size[:, None] * np.eye(10)):
-        both = [pinholes._moved(TRUE, sign * step).project(points).ravel() for sign in (1.0, -1.0)]
+        both = [pinholes._stepped(TRUE, sign * step).project(points).ravel() for sign in (1.0, -1.0)]
         assert found[:, k] == pytest.approx((both[0] - both[1]) / (2 * size[k]), rel=1e-5, abs=1e-4)
 
 
 def test_a_step_turns_moves_and_stretches():
-    moved = pinholes._moved(TRUE, np.array([0.0, 0.0, np.pi / 2, 1.0, 2.0, 3.0, np.log(2.0), 0.0, 4.0, -5.0]))
+    moved = pinholes._stepped(TRUE, np.array([0.0, 0.0, np.pi / 2, 1.0, 2.0, 3.0, np.log(2.0), 0.0, 4.0, -5.0]))
     assert moved.focal == pytest.approx([18000.0, 8500.0])
     assert moved.center == pytest.approx([484.0, 295.0])
     assert moved.translation == pytest.approx([21.0, -8.0, 6003.0])
@@ -132,8 +132,8 @@ def test_a_refinement_ends_where_the_squares_are_least():
     points = world(200)
     noise = np.random.default_rng(1).normal(0, 0.5, (200, 2))
     samples = Sampled(points, TRUE.project(points) + noise)
-    start = pinholes._moved(TRUE, np.array([2e-3, -1e-3, 3e-3, 2.0, 3.0, 40.0, 0.01, -0.01, 5.0, -4.0]))
-    found = pinholes._refined(start, samples)
+    start = pinholes._stepped(TRUE, np.array([2e-3, -1e-3, 3e-3, 2.0, 3.0, 40.0, 0.01, -0.01, 5.0, -4.0]))
+    found = pinholes._least_squares_pinhole(start, samples)
     jacobian, (cost, left) = pinholes._jacobian(found, points), pinholes._cost(found, samples)
     step = np.linalg.lstsq(jacobian, left)[0]
     assert cost - float(np.sum((left - jacobian @ step) ** 2)) < 1e-6 * cost
@@ -143,7 +143,9 @@ def test_a_refinement_ends_where_the_squares_are_least():
 def test_of_the_refinements_the_one_with_the_smallest_largest_error_is_taken(monkeypatch):
     points = world()
     errors = iter([5.0, 3.0, 1.0, 2.0, 4.0, 6.0])
-    monkeypatch.setattr(pinholes, "_refined", lambda *_: replace(TRUE, center=TRUE.center + [next(errors), 0.0]))
+    monkeypatch.setattr(
+        pinholes, "_least_squares_pinhole", lambda *_: replace(TRUE, center=TRUE.center + [next(errors), 0.0])
+    )
     found = fit_pinhole(Sampled(points, TRUE.project(points)), **view_of(TRUE, points[0]))
     assert found.center[0] == TRUE.center[0] + 1.0
 
@@ -151,5 +153,5 @@ def test_of_the_refinements_the_one_with_the_smallest_largest_error_is_taken(mon
 def test_a_step_that_makes_it_worse_is_not_taken(monkeypatch):
     points = world()
     samples = Sampled(points, TRUE.project(points) + 1.0)
-    monkeypatch.setattr(pinholes, "_moved", lambda pinhole, _: replace(pinhole, center=pinhole.center - 1.0))
-    assert pinholes._refined(TRUE, samples) is TRUE
+    monkeypatch.setattr(pinholes, "_stepped", lambda pinhole, _: replace(pinhole, center=pinhole.center - 1.0))
+    assert pinholes._least_squares_pinhole(TRUE, samples) is TRUE

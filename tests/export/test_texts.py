@@ -66,11 +66,11 @@ def test_altitudes_reach_a_margin_beyond_all_but_half_a_per_cent(south):
     low, high = np.percentile(south.points[:, 2], [0.5, 99.5])
     margin = 20.0 + 0.1 * (high - low)
     assert south.alt_range == (np.floor(low - margin), np.ceil(high + margin))
-    assert scene._altitudes(np.array([100.0, 100.0]), south.summary) == (80.0, 120.0)
+    assert scene._scene_altitudes(np.array([100.0, 100.0]), south.summary) == (80.0, 120.0)
     wide = tuple(
         replace(view, alt_range_m=(10.0 * k - 50, 10.0 * k + 500)) for k, view in enumerate(south.summary.views)
     )
-    assert scene._altitudes(np.zeros(0), replace(south.summary, views=wide)) == (-50.0, 520.0)
+    assert scene._scene_altitudes(np.zeros(0), replace(south.summary, views=wide)) == (-50.0, 520.0)
 
 
 def test_the_origin_is_in_the_middle_of_the_tie_points(south, dateline):
@@ -176,10 +176,10 @@ def test_the_run_s_raster_with_the_rpc_in_it_goes_before_the_image(southern, sou
 
 
 def test_places_of_numbers_in_a_list():
-    at, found = scene._places(np.array([2, 5, 9]), np.array([5, 9, 1, 10, 2]))
+    at, found = scene._positions_in(np.array([2, 5, 9]), np.array([5, 9, 1, 10, 2]))
     assert found.tolist() == [True, True, False, False, True]
     assert at[found].tolist() == [1, 2, 0]
-    assert scene._places(np.zeros(0, int), np.array([1]))[1].tolist() == [False]
+    assert scene._positions_in(np.zeros(0, int), np.array([1]))[1].tolist() == [False]
 
 
 # --- for renderers ----------------------------------------------------------------------------------------

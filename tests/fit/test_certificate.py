@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from barpc.base.errors import BarpcWarning, FitError
 from barpc.fit import FitOptions, RpcFit, fit_rpc, fit_rpc_points
-from barpc.fit.points import CELLS, Sample
+from barpc.fit.points import SAMPLE_CELLS, Sample
 from barpc.fit.poles import Region, smallest_denominator
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
@@ -49,7 +49,7 @@ def test_the_largest_error_certified_is_that_of_a_hundred_thousand_points(name):
     assert fit.max_ckp.max() <= 2.5 * error.max()  # edges and corners are among its points
     # one point of 2025 may be a bump's only one
     np.testing.assert_allclose(np.sqrt((error**2).mean()), np.sqrt((fit.rmse_ckp**2).mean()), rtol=0.3)
-    assert 2000 < fit.num_ckp <= CELLS**2
+    assert 2000 < fit.num_ckp <= SAMPLE_CELLS**2
     assert fit.beyond == pytest.approx(3.0 / fit.num_ckp, rel=0.01)
     assert (error > fit.max_ckp).any(axis=1).mean() < fit.beyond
     assert fit.min_denominator > 0.1
@@ -207,7 +207,7 @@ def test_what_is_missing_is_stated_by_area_and_five_percent_are_fitted():
     with pytest.warns(BarpcWarning, match=r"^(4\.[6-9]|5\.[0-4])% of the image has no ground point and is left out"):
         fit = fit_rpc(Holed(camera.model, -1.0, 0.05 * rows), camera.size, camera.alt_range)
     assert fit.max_ckp.max() < 1e-6
-    assert 0.93 * CELLS**2 < fit.num_ckp < 0.97 * CELLS**2
+    assert 0.93 * SAMPLE_CELLS**2 < fit.num_ckp < 0.97 * SAMPLE_CELLS**2
     with pytest.raises(FitError, match=r"no ground point for (19|20|21)% of the image"):
         fit_rpc(Holed(camera.model, 0.4 * rows, 0.6 * rows), camera.size, camera.alt_range)
 
@@ -216,8 +216,8 @@ def test_points_are_all_over_the_image_and_its_altitudes():
     camera = synthetic()
     sample = Sample.of(camera.model, camera.size, camera.alt_range)
     inside = sample.points[: sample.count]
-    cells = np.floor((inside[:, :2] + 0.5) / camera.size * CELLS).astype(int)
-    assert len(np.unique(cells, axis=0)) == CELLS**2  # one each
+    cells = np.floor((inside[:, :2] + 0.5) / camera.size * SAMPLE_CELLS).astype(int)
+    assert len(np.unique(cells, axis=0)) == SAMPLE_CELLS**2  # one each
     heights = np.sort(inside[:, 2])
     assert max(b - a for a, b in pairwise(heights.tolist())) < 3 * np.ptp(heights) / len(heights)
     corners = {(col, row) for col in (-0.5, 19999.5) for row in (-0.5, 18999.5)}

@@ -16,11 +16,11 @@ from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit import methods as solve_module
 from barpc.fit import refit as fit_module
-from barpc.fit.certificate import Localisation, off
+from barpc.fit.certificate import Localisation, localisation_errors
 from barpc.fit.methods import normalization, solve, tidy
-from barpc.fit.points import CELLS, Errors, Sample, control_points
+from barpc.fit.points import SAMPLE_CELLS, Errors, Sample, control_points
 from barpc.fit.poles import Region, smallest_denominator
-from barpc.fit.refit import _plainer, inverse, underlying_rpc
+from barpc.fit.refit import _plainer, localisation_problem, underlying_rpc
 from barpc.fit.system import PRECISIONS, FitProblem, solution
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
@@ -64,7 +64,7 @@ def test_gauss_newton_ends_where_no_neighbour_is_better(camera: Camera, weighted
     ground, image, norm = wavy(camera)
     weight = np.random.default_rng(1).uniform(0.2, 1.0, len(ground)) if weighted else None
     problem = FitProblem(ground, image, norm, weight=weight)
-    coeffs, solved, h, passes = solve_module._gauss_newton(problem, None, None)
+    coeffs, solved, h, passes = solve_module._gauss_newton_fit(problem, None, None)
     squares = (left(problem, coeffs) ** 2).sum(axis=0)
     for axis in range(2):
         assert squares[axis] <= 1.01 * best(problem, axis, coeffs)
@@ -106,7 +106,7 @@ def test_a_ridge_with_a_pole_makes_way_for_a_polynomial(camera: Camera, monkeypa
         return whole(problem, axis, x, region)
 
     monkeypatch.setattr(solve_module, "_minimised", seen)
-    plain, *_ = solve_module._gauss_newton(problem, None, None)
+    plain, *_ = solve_module._gauss_newton_fit(problem, None, None)
     ridge = solve_module._ridge(problem, None, None)
     np.testing.assert_array_equal(starts[0], np.concatenate([ridge[0][0], ridge[0][1, 1:]]))
     basis = monomials(((ground - norm.ground_offset) / norm.ground_scale).T)
@@ -118,7 +118,7 @@ def test_a_ridge_with_a_pole_makes_way_for_a_polynomial(camera: Camera, monkeypa
         poles[1::2] = 0.0
         poles[1::2, 0], poles[1::2, 1] = 1.0, -slope
         monkeypatch.setattr(solve_module, "_ridge", lambda *_, poles=poles: (poles, *ridge[1:]))
-        found, *_ = solve_module._gauss_newton(problem, None, None)
+        found, *_ = solve_module._gauss_newton_fit(problem, None, None)
         for axis in range(2):
             y = (image[:, axis] - norm.image_offset[axis]) / norm.image_scale[axis]
             polynomial = np.append(np.linalg.lstsq(basis.T, y, rcond=None)[0], np.zeros(19))
@@ -148,7 +148,7 @@ def test_a_step_that_makes_things_worse_is_not_taken(camera: Camera) -> None:
 def test_minimax_keeps_the_round_with_the_least_largest_error(camera: Camera) -> None:
     ground, image, norm = wavy(camera, 200)
     problem = FitProblem(ground, image, norm)
-    plain, *_, few = solve_module._gauss_newton(problem, None, None)
+    plain, *_, few = solve_module._gauss_newton_fit(problem, None, None)
     even, *_, passes = solve_module._minimax(problem, None, None)
     largest = [np.abs(left(problem, coeffs)).max(axis=0) for coeffs in (plain, even)]
     assert (largest[1] < 0.85 * largest[0]).all()
@@ -226,13 +226,13 @@ def test_the_least_squares_are_looked_for_where_a_ridge_leaves_a_millionth_of_a_
         tried.append(method)
         return made(method=method, max_ckp=np.array([largest, 1e-9]), rmse_ckp=np.full(2, 1e-7))
 
-    fit_module._best(attempt, FitOptions(), None, True, exact=True)
+    fit_module._best_method(attempt, FitOptions(), None, True, exact=True)
     assert tried == methods
     tried.clear()
-    fit_module._best(attempt, FitOptions(), None, True, exact=False)
+    fit_module._best_method(attempt, FitOptions(), None, True, exact=False)
     assert tried == ["ridge"]
     tried.clear()
-    fit_module._best(attempt, FitOptions(method="lcurve-joint"), None, True, exact=True)
+    fit_module._best_method(attempt, FitOptions(method="lcurve-joint"), None, True, exact=True)
     assert tried == ["lcurve-joint"]
 
 
@@ -241,7 +241,7 @@ def test_of_accepted_fits_the_one_with_the_least_error_is_taken() -> None:
         "ridge": made(rmse_ckp=np.array([3e-3, 4e-3])),
         "gauss-newton": made(method="gauss-newton", rmse_ckp=np.array([4.5e-3, 1e-3])),
     }
-    choose = partial(fit_module._best, exact=True)
+    choose = partial(fit_module._best_method, exact=True)
     assert choose(fits.__getitem__, FitOptions(), None, True).method == "gauss-newton"
     fits["gauss-newton"] = replace(fits["gauss-newton"], rmse_ckp=np.array([5.1e-3, 0.0]))
     assert choose(fits.__getitem__, FitOptions(), None, True).method == "ridge"
@@ -290,7 +290,7 @@ def test_a_model_without_ground_for_a_tenth_of_its_image_is_refused() -> None:
 
     class Holed:
         def __init__(self, cells: int) -> None:
-            self.below = cells / CELLS * camera.size[1] - 0.5
+            self.below = cells / SAMPLE_CELLS * camera.size[1] - 0.5
 
         def localize(self, image: Any, alt: Any) -> Any:
             ground = camera.model.localize(image, alt)
@@ -322,8 +322,8 @@ def test_the_points_of_an_image_cover_it_from_corner_to_corner() -> None:
 def test_the_certificate_counts_what_it_says(camera: Camera) -> None:
     options = FitOptions(grid=(6, 7, 5), method="ridge")
     fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=options)
-    assert (fit.num_cnp, fit.num_ckp) == (6 * 7 * 5, CELLS**2)
-    assert fit.beyond == pytest.approx(1 - 0.05 ** (1 / CELLS**2), rel=1e-9)
+    assert (fit.num_cnp, fit.num_ckp) == (6 * 7 * 5, SAMPLE_CELLS**2)
+    assert fit.beyond == pytest.approx(1 - 0.05 ** (1 / SAMPLE_CELLS**2), rel=1e-9)
     ground, image = (
         p.reshape(-1, k)
         for p, k in zip(control_points(camera.model, camera.size, camera.alt_range, options), (3, 2), strict=True)
@@ -343,8 +343,8 @@ def test_the_certificate_counts_what_it_says(camera: Camera) -> None:
 def test_around_the_worst_points_of_either_coordinate_more_are_looked_at_closer_and_closer() -> None:
     camera = synthetic()
     sample = Sample.of(camera.model, camera.size, camera.alt_range)
-    assert sample.count == CELLS**2
-    assert len(sample.points) == CELLS**2 + 12 * 2 * 2 * 2  # along the edges, at either end of the altitudes
+    assert sample.count == SAMPLE_CELLS**2
+    assert len(sample.points) == SAMPLE_CELLS**2 + 12 * 2 * 2 * 2  # along the edges, at either end of the altitudes
     scale, low = np.array([*camera.size, 1000.0]), np.array([-0.5, -0.5, 0.0])
     peaks = np.array([[0.3, 0.4, 0.6], [0.8, 0.7, 0.2]])  # of col and of row
     asked: list[Array] = []
@@ -435,7 +435,7 @@ def test_off_are_metres_on_the_ground_and_pixels_in_the_image() -> None:
     ground = rpc.localize(np.array([[9000.0, 4000.0], [12000.0, 9000.0]]), np.array([300.0, 700.0]))
     found = ground + [[-360.0 + 1e-5, 0.0, 0.0], [0.0, -2e-5, 0.0]]
     image = rpc.project(ground) + [[0.0, 0.0], [3.0, 4.0]]
-    metres, pixels = off(rpc, found, ground, image).T
+    metres, pixels = localisation_errors(rpc, found, ground, image).T
     expected = np.linalg.norm(ecef_from_ground(found) - ecef_from_ground(ground), axis=1)
     np.testing.assert_allclose(metres, expected, rtol=1e-5)
     np.testing.assert_allclose(pixels, np.linalg.norm(rpc.project(found) - image, axis=1), rtol=1e-9)
@@ -445,7 +445,7 @@ def test_the_inverse_problem_exchanges_ground_and_image() -> None:
     camera = synthetic(lon=179.99)
     ground, image = random_points(camera, 200, np.random.default_rng(1))
     turned = ground + np.where(np.arange(200) % 2, 360.0, 0.0)[:, None] * [1.0, 0.0, 0.0]
-    problem = inverse(camera.rpc, turned, image, weight=np.full(200, 0.5))
+    problem = localisation_problem(camera.rpc, turned, image, weight=np.full(200, 0.5))
     rpc = camera.rpc
     np.testing.assert_array_equal(problem.ground, np.column_stack([image, ground[:, 2]]))
     np.testing.assert_allclose(problem.image, ground[:, :2], rtol=0, atol=1e-12)

@@ -347,7 +347,7 @@ def test_a_fit_with_a_pole_gives_way_to_one_without(camera: Camera, least: float
         "ridge": _fit(min_denominator=least, max_ckp=np.full(2, 0.02)),
         "vendor-denominators": _fit(max_ckp=np.full(2, 0.03), method="vendor-denominators"),
     }
-    choose = partial(fit_module._best, exact=False)
+    choose = partial(fit_module._best_method, exact=False)
     vendor = camera.rpc
     assert choose(fits.__getitem__, FitOptions(tolerance=0.1), vendor, True).method == "vendor-denominators"
     assert choose(fits.__getitem__, FitOptions(tolerance=0.01), vendor, False).method == "vendor-denominators"

@@ -10,8 +10,8 @@ from scipy.optimize import least_squares, minimize
 
 from barpc.base.geodesy import Array
 from barpc.fit import FitOptions, RpcFit, fit_rpc
-from barpc.fit.poles import FLOOR, Region, bounded
-from barpc.fit.system import Compressed
+from barpc.fit.poles import MIN_DENOMINATOR_RATIO, Region, bounded
+from barpc.fit.system import TriangularSystem
 from barpc.sensor.rpc import RPC
 from tests.fit.models import Bent, pushbroom
 
@@ -89,10 +89,10 @@ def test_no_denominator_is_small_over_the_image_and_its_margin(rate, margin):
     fit = fitted(rate, margin)
     x = spread(detector(rate), 20_000, margin, fit.rpc)
     below = fit.rpc.coeffs[1::2] @ terms(x)
-    assert below.min() >= FLOOR - 1e-4  # the middle of these points is not quite that of the fit's
+    assert below.min() >= MIN_DENOMINATOR_RATIO - 1e-4  # the middle of these points is not quite that of the fit's
     middle = fit.rpc.coeffs[1::2] @ terms(0.5 * (x.min(axis=0) + x.max(axis=0))[None])
-    assert FLOOR * 0.9 < fit.min_denominator <= (below / middle).min() + 1e-4
-    assert (below / middle).min() < 1.6 * FLOOR  # what binds is there, and not far outside
+    assert MIN_DENOMINATOR_RATIO * 0.9 < fit.min_denominator <= (below / middle).min() + 1e-4
+    assert (below / middle).min() < 1.6 * MIN_DENOMINATOR_RATIO  # what binds is there, and not far outside
 
 
 def test_a_region_is_the_images_own_ground_and_not_the_box_around_it():
@@ -117,10 +117,10 @@ def test_a_bounded_least_squares_is_that_of_another_solver():
     rows = rng.normal(size=(80, 39)) / 10
     want = np.concatenate([rng.normal(size=20), rng.normal(0, 0.4, 19)])
     triangle = np.triu(np.linalg.qr(np.column_stack([rows, rows @ want]), mode="complete")[1][:40])
-    system = Compressed(triangle, 80)
+    system = TriangularSystem(triangle, 80)
     found = bounded(system, region, ALL)
     least = region.bernstein(np.append(1.0, found[20:])).min()
-    assert least == pytest.approx(FLOOR, abs=1e-6)
+    assert least == pytest.approx(MIN_DENOMINATOR_RATIO, abs=1e-6)
     lines = region.rows(np.arange(len(region.bernstein(np.eye(20)[0]))))
 
     def cost(x):
@@ -128,7 +128,7 @@ def test_a_bounded_least_squares_is_that_of_another_solver():
 
     bound = {
         "type": "ineq",
-        "fun": lambda x: ((lines - FLOOR * region.there[0]) @ np.append(1.0, x[20:]))[::7],
+        "fun": lambda x: ((lines - MIN_DENOMINATOR_RATIO * region.there[0]) @ np.append(1.0, x[20:]))[::7],
     }
     other = minimize(
         cost,
@@ -140,5 +140,5 @@ def test_a_bounded_least_squares_is_that_of_another_solver():
     )
     assert cost(found) >= other.fun - 1e-6  # which is held to every seventh bound only
     assert cost(found) <= 1.1 * other.fun + 1e-6
-    free = Compressed(np.triu(np.linalg.qr(np.column_stack([rows, rows @ (0.1 * want)]))[1]), 80)
+    free = TriangularSystem(np.triu(np.linalg.qr(np.column_stack([rows, rows @ (0.1 * want)]))[1]), 80)
     np.testing.assert_allclose(bounded(free, region, ALL), 0.1 * want, atol=1e-9)  # within the bound: as it is

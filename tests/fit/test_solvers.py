@@ -8,7 +8,7 @@ import pytest
 from barpc.base.geodesy import Array
 from barpc.fit import Normalization
 from barpc.fit.methods import _reweighted, corner
-from barpc.fit.system import PRECISIONS, Compressed, FitProblem, expected_size, noise_scaled, solution
+from barpc.fit.system import PRECISIONS, FitProblem, TriangularSystem, expected_size, noise_scaled, solution
 from tests.fit.cameras import Camera, random_points
 
 ALL = np.arange(20)
@@ -97,7 +97,7 @@ def test_a_corner_that_is_not_sharp_is_one() -> None:
     curvature = (rho1 * eta2 - rho2 * eta1) / (rho1**2 + eta1**2) ** 1.5
     best = 10 + int(np.argmax(curvature[10:-10]))
     assert curvature[best] == pytest.approx(0.47, abs=0.01)
-    assert corner([Compressed(triangle, 10)]) == pytest.approx(np.exp(t[best]), rel=0.01)
+    assert corner([TriangularSystem(triangle, 10)]) == pytest.approx(np.exp(t[best]), rel=0.01)
 
 
 def test_without_a_corner_the_regularisation_is_the_least() -> None:
@@ -105,7 +105,7 @@ def test_without_a_corner_the_regularisation_is_the_least() -> None:
     s, beta = np.array([0.4, 0.1]), np.array([0.05, 0.9])
     triangle = np.zeros((3, 3))
     triangle[:2] = np.column_stack([np.diag(s), beta])
-    assert corner([Compressed(triangle, 10)]) == pytest.approx(0.1)
+    assert corner([TriangularSystem(triangle, 10)]) == pytest.approx(0.1)
 
 
 def test_one_point_more_than_unknowns_tells_the_noise(problem: FitProblem) -> None:

@@ -16,8 +16,8 @@ import numpy as np
 import rasterio
 
 from barpc.ba import BlockPrior
-from barpc.ba.estimated.priors import CameraPrior
-from barpc.ba.held.incremental import apply_prior
+from barpc.ba.constraints.incremental import apply_prior
+from barpc.ba.parameters.priors import CameraPrior
 from barpc.base.errors import RpcError
 from barpc.base.frozen import from_arrays, load_npz, to_arrays
 from barpc.base.options import read_options
@@ -38,7 +38,7 @@ from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
 from barpc.rpcio.carried import put_tag
 from barpc.rpcio.grids import SIGN, read_correction
 from barpc.rpcio.sources import light_of
-from barpc.rpcio.text import ReadOptions, decode
+from barpc.rpcio.text import ReadOptions, decode_text
 from barpc.scene import View
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.linescan import read_linescan
@@ -82,7 +82,7 @@ def _alos() -> str:
 
 def _read_format(path: Path, kind: str) -> object:
     """As whoever is sent this file reads it, and past the sniffing."""
-    FORMATS[kind].read(decode(path.read_bytes()), str(path), ReadOptions())
+    FORMATS[kind].read(decode_text(path.read_bytes()), str(path), ReadOptions())
     return read_rpc(path)
 
 

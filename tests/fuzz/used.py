@@ -22,11 +22,11 @@ from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior
 from barpc.base.errors import BarpcError
 from barpc.base.options import AdjustOptions, FitOptions, Rule, declared, read_options
 from barpc.base.remote import Remote, hosts
-from barpc.base.sidefile import IMAGE, RPC_FILE, read_bytes, read_head, versioned
+from barpc.base.safe_io import IMAGE, RPC_FILE, read_bytes, read_head, versioned
 from barpc.fit import fit_rpc
 from barpc.pointio.matches import read_matches
 from barpc.rasters.raster import open_raster
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 from tests.pointio.test_foreign import hloc
 from tests.rpcio.conftest import make_rpc, write_image
 
@@ -38,7 +38,7 @@ from .mutate import Rng, mutate_npz, mutate_text, pick
 
 
 @cache
-def small_block() -> Block:
+def small_block() -> SimulatedBlock:
     """Three views, 60 tracks, four control points: adjusted in 30 ms."""
     return simulate_block(3, 60, seed=1, num_checks=5, num_gcps=4)
 
@@ -354,7 +354,7 @@ def _use_answer(path: Path) -> object:
     with (
         mock.patch.object(hosts, "WAITS", (0.0,)),
         mock.patch.object(hosts, "TIMEOUT", 2.0),
-        mock.patch.object(remote, "_blocks", remote._Blocks()),
+        mock.patch.object(remote, "_blocks", remote._BlockCache()),
     ):
         pinned = versioned(at, IMAGE)
         read_head(pinned, IMAGE, 100)

@@ -18,24 +18,24 @@ import rasterio
 from barpc.ba import BlockPrior
 from barpc.base.errors import BarpcError, InputError
 from barpc.pipeline import AdjustResult, RunOptions, adjust
-from barpc.pipeline.outputs import GOOD, prove
+from barpc.pipeline.outputs import PASSED_STATES, prove
 from barpc.pointio.matches import write_matches
 from barpc.rpcio import read_rpc
 from barpc.rpcio.carried import put_tag
 from barpc.sensor.rpc import RPC
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*held in height")
 COUNT = 12  # four sites in a square, three views each
 
 
 @pytest.fixture(scope="module")
-def made() -> Block:
+def made() -> SimulatedBlock:
     return simulate_block(COUNT, 70 * COUNT, seed=3, size=(2000, 2000))
 
 
 @pytest.fixture(scope="module")
-def archive(made: Block, tmp_path_factory) -> Path:
+def archive(made: SimulatedBlock, tmp_path_factory) -> Path:
     """The block's images, of noise, with their RPCs, and its tie points."""
     folder, rng = tmp_path_factory.mktemp("archive"), np.random.default_rng(0)
     for view in made.views:
@@ -65,10 +65,10 @@ def eleven(archive: Path, tmp_path_factory) -> Path:
 
 
 def sound(folder: Path) -> None:
-    assert {one.now for one in prove(folder)} <= set(GOOD)
+    assert {one.now for one in prove(folder)} <= set(PASSED_STATES)
 
 
-def test_an_image_alone_is_added_to_a_run(eleven: Path, archive: Path, made: Block, tmp_path: Path) -> None:
+def test_an_image_alone_is_added_to_a_run(eleven: Path, archive: Path, made: SimulatedBlock, tmp_path: Path) -> None:
     """Its camera is written, those of the run are not, and what they should do is said."""
     before = {path: path.read_bytes() for path in (eleven / "first").rglob("*") if path.is_file()}
     found = run(eleven, ["view_0004"], "second", archive, add_to=str(eleven / "first"))
@@ -91,7 +91,7 @@ def test_an_image_alone_is_added_to_a_run(eleven: Path, archive: Path, made: Blo
     sound(eleven / "second")
 
 
-def test_what_moves_is_written_where_that_is_asked_for(eleven: Path, archive: Path, made: Block) -> None:
+def test_what_moves_is_written_where_that_is_asked_for(eleven: Path, archive: Path, made: SimulatedBlock) -> None:
     found = run(eleven, ["view_0004"], "updated", archive, add_to=str(eleven / "first"), update=True)
     block, before = (BlockPrior.load(eleven / one / "tables/block.npz") for one in ("updated", "first"))
     assert set(before.names) < set(block.names)
@@ -172,7 +172,7 @@ def test_a_chain_of_runs_refuses_nothing_without_cause_and_says_nothing_false(
             block = BlockPrior.load(tmp_path / out / "tables/block.npz")
             assert set(block.names) == set(have)
     for folder in tmp_path.glob("run*"):
-        wrong = [one for one in prove(folder) if one.now not in GOOD]  # images that were lost or renamed since
+        wrong = [one for one in prove(folder) if one.now not in PASSED_STATES]  # images that were lost or renamed since
         unlike = [one for one in wrong if (one.kind, one.now) != ("input", "missing") or not one.file.endswith(".tif")]
         assert not unlike
 

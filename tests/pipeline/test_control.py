@@ -406,11 +406,11 @@ def test_the_reach_is_that_of_pixels_on_the_ground_or_a_kilometre(monkeypatch, s
 def test_each_image_is_asked_for_its_own_observations(monkeypatch) -> None:
     monkeypatch.setattr(control, "ground_sample_distance", lambda sensor, ground: (None, 10.0 * ground[:, 0]))
     points = made((0, 1, 300.0, 1.0), (1, 0, 100.0, 2.0), (0, 0, 200.0, 3.0), lonlatalt=np.zeros((2, 3)))
-    ground, pixel = control._shown(points, flat(), np.array([5.0, 6.0, 7.0]))
+    ground, pixel = control._image_positions(points, flat(), np.array([5.0, 6.0, 7.0]))
     np.testing.assert_allclose(ground, [[3.0, 0.01, 5.0], [1.0, 0.02, 6.0], [2.0, 0.03, 7.0]])
     np.testing.assert_allclose(pixel, [30.0, 10.0, 20.0])
     monkeypatch.setattr(control, "ground_sample_distance", lambda sensor, ground: (None, np.full(len(ground), np.nan)))
-    assert control._shown(points, flat(), np.zeros(3))[1].tolist() == [0.0] * 3
+    assert control._image_positions(points, flat(), np.zeros(3))[1].tolist() == [0.0] * 3
 
 
 def test_several_faults_are_several_lines_and_a_point_has_the_first_that_fits(tmp_path) -> None:

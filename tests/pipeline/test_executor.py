@@ -14,7 +14,7 @@ import pytest
 from barpc import __version__
 from barpc.base.errors import AdjustError, ImageError, OutputError
 from barpc.base.identity import Input
-from barpc.base.sidefile import MB
+from barpc.base.safe_io import MB
 from barpc.pipeline.executor import CachingExecutor, Spilled, run_batch, worker_count
 from barpc.workspace import Workspace
 

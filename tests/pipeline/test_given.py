@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import InputError
-from barpc.base.usual import robust_spread
+from barpc.base.statistics import robust_spread
 from barpc.pipeline import RunOptions, adjust, check
 from barpc.pipeline.inputs import given_matches, given_tracks
 from barpc.pipeline.loading import load_views
 from barpc.pointio.matches import read_matches
-from barpc.tie.pairing.epipolar import coherent, frame
+from barpc.tie.pairing.epipolar import coherent, epipolar_segments
 from tests.pointio.test_foreign import binary
 
 from .conftest import check_points
@@ -45,7 +45,7 @@ def spread(views, tracks, i: int, j: int) -> float:
     a, b = tracks.view == i, tracks.view == j
     _, rows_a, rows_b = np.intersect1d(tracks.point[a], tracks.point[b], return_indices=True)
     first, second = tracks.xy[a][rows_a], tracks.xy[b][rows_b]
-    return robust_spread(coherent(first, frame(views[i], views[j], first).errors(second)[:, 1])[1])
+    return robust_spread(coherent(first, epipolar_segments(views[i], views[j], first).errors(second)[:, 1])[1])
 
 
 @pytest.mark.slow
@@ -64,7 +64,7 @@ def test_noisy_matches_of_real_images_become_as_exact_as_our_own(shared_data, tm
     for i, j in ((0, 1), (0, 2), (1, 2)):
         xy = check_points(shared_data, f"img_0{i + 1}", f"img_0{j + 1}")
         pair = [replace(view, sensor=camera) for view, camera in zip(result.run.views, cameras, strict=True)]
-        across = frame(pair[i], pair[j], xy[:, :2]).errors(xy[:, 2:])[:, 1]
+        across = epipolar_segments(pair[i], pair[j], xy[:, :2]).errors(xy[:, 2:])[:, 1]
         assert abs(np.median(across)) <= 0.05
 
 

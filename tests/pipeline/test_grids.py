@@ -21,8 +21,8 @@ from barpc.cameras import open_camera
 from barpc.cli import cli
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.pipeline import adjust, check
-from barpc.pipeline import beyond as grids
-from barpc.pipeline.beyond import CORRECTION, GRID, RESAMPLED, grid_names, write_grids
+from barpc.pipeline import grid_outputs as grids
+from barpc.pipeline.grid_outputs import CORRECTION, GRID_SUFFIX, RESAMPLED, grid_names, write_grids
 from barpc.rpcio import read_rpc
 from barpc.rpcio.grids import read_correction
 from barpc.scene import View
@@ -36,7 +36,7 @@ from tests.rpcio.conftest import make_rpc, write_image
 from .test_growth import write_block
 
 SIZE, ALTS = (1500, 2200), (0.0, 600.0)
-ENDS = (GRID, CORRECTION, RESAMPLED)
+ENDS = (GRID_SUFFIX, CORRECTION, RESAMPLED)
 
 
 @pytest.fixture(scope="module")
@@ -77,14 +77,14 @@ def test_grids_are_written_where_the_rpc_misses_the_camera_and_nowhere_else(tmp_
     assert 0.02 < fit.max_ckp.max() < 0.6
     other = replace(view, name="b")
     written = run_of(tmp_path / "out", (view, fit, camera), (other, easy, camera.sensor))
-    assert [list(one) for one in written] == [["a" + GRID, "a" + CORRECTION], []]
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {".barpc", "a" + GRID, "a" + CORRECTION}
+    assert [list(one) for one in written] == [["a" + GRID_SUFFIX, "a" + CORRECTION], []]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {".barpc", "a" + GRID_SUFFIX, "a" + CORRECTION}
     (written,) = run_of(tmp_path / "all", (other, easy, camera.sensor), grids=True)
-    assert list(written) == ["b" + GRID, "b" + CORRECTION]
+    assert list(written) == ["b" + GRID_SUFFIX, "b" + CORRECTION]
     near = replace(fit, max_ckp=np.array([0.0119, 0.0159]))  # 0.0199 together
     assert run_of(tmp_path / "near", (view, near, camera)) == [{}]
     far = replace(fit, max_ckp=np.array([0.0121, 0.0161]))
-    assert list(run_of(tmp_path / "far", (view, far, camera))[0]) == ["a" + GRID, "a" + CORRECTION]
+    assert list(run_of(tmp_path / "far", (view, far, camera))[0]) == ["a" + GRID_SUFFIX, "a" + CORRECTION]
 
 
 def test_a_pushbroom_camera_is_written_as_a_state_that_reads_as_it(tmp_path, view):
@@ -108,12 +108,12 @@ def once(tmp_path_factory, view, camera, fit) -> tuple[Path, dict[str, dict[str,
 def test_what_is_told_of_a_grid_is_its_error(once, camera):
     tmp_path, written = once
     ground, image = seen_by(camera)
-    for name in (GRID, CORRECTION):
+    for name in (GRID_SUFFIX, CORRECTION):
         off = np.linalg.norm(open_camera(tmp_path / f"a{name}").model.project(ground) - image, axis=1).max()
         told = written[f"a{name}"]["barpc"]
         assert 0.3 * told < off < 1.2 * told
         assert told < LINEAR
-    assert LINEAR / 10 < written["a" + GRID]["linear"] < LINEAR
+    assert LINEAR / 10 < written["a" + GRID_SUFFIX]["linear"] < LINEAR
 
 
 def test_no_altitude_changes_what_is_added_to_the_rpc_of_a_correction(once, camera, fit):
@@ -130,7 +130,7 @@ def test_no_altitude_changes_what_is_added_to_the_rpc_of_a_correction(once, came
 def test_a_resampled_image_has_one_rpc_that_holds(tmp_path, view, camera, fit):
     """Its pixels are those of the image, taken where the camera sees what its RPC sees."""
     (written,) = run_of(tmp_path, (view, fit, camera), resample=True)
-    assert list(written) == ["a" + GRID, "a" + CORRECTION, "a" + RESAMPLED]
+    assert list(written) == ["a" + GRID_SUFFIX, "a" + CORRECTION, "a" + RESAMPLED]
     assert max(written["a" + RESAMPLED].values()) < 0.02
     rpc, _ = read_correction(tmp_path / f"a{CORRECTION}")
     assert read_rpc(tmp_path / f"a{RESAMPLED}").off(rpc).max() < 1e-9
@@ -161,7 +161,7 @@ def test_a_run_that_dies_half_way_leaves_nothing_half_written(tmp_path, view, ca
     assert not list((tmp_path / "out" / ".barpc" / "partial").rglob("*.tif"))
     monkeypatch.undo()
     run_of(tmp_path / "out", (view, fit, camera), resample=True)
-    assert own_files(tmp_path / "out") == {"a" + GRID, "a" + CORRECTION, "a" + RESAMPLED}
+    assert own_files(tmp_path / "out") == {"a" + GRID_SUFFIX, "a" + CORRECTION, "a" + RESAMPLED}
 
 
 def test_a_camera_without_ground_in_a_part_of_its_image_is_one_line(tmp_path, view, camera, fit):
@@ -198,15 +198,15 @@ def test_what_steps_leave_is_told(tmp_path, view, camera, fit, caplog):
 
     with caplog.at_level(logging.WARNING):
         (written,) = run_of(tmp_path, (view, fit, Stepped()), grids=True)
-    for end in (GRID, CORRECTION):  # whoever reads a file sees the step that was seen as it was written
+    for end in (GRID_SUFFIX, CORRECTION):  # whoever reads a file sees the step that was seen as it was written
         (told,) = re.findall(rf"a{end}: \S+ px RMS off, up to (0\.\d+) px", caplog.text)
         assert 0.02 < 0.99 * float(told) <= written["a" + end]["barpc"] < 0.3
 
 
 def test_all_names_are_known_before_the_run(view):
-    assert grid_names(view, RunOptions()) == ["a" + GRID, "a" + CORRECTION]
+    assert grid_names(view, RunOptions()) == ["a" + GRID_SUFFIX, "a" + CORRECTION]
     names = grid_names(view, RunOptions(resample=True))
-    assert names == ["a" + GRID, "a" + CORRECTION, "a" + RESAMPLED]
+    assert names == ["a" + GRID_SUFFIX, "a" + CORRECTION, "a" + RESAMPLED]
 
 
 # --- its parts ---------------------------------------------------------------------------------------------
@@ -215,12 +215,12 @@ def test_all_names_are_known_before_the_run(view):
 @pytest.mark.parametrize(
     ("asked", "resampled", "ends"),
     [
-        (False, False, []), (True, False, [GRID, CORRECTION]), (False, True, [CORRECTION, RESAMPLED]),
-        (True, True, [GRID, CORRECTION, RESAMPLED]),
+        (False, False, []), (True, False, [GRID_SUFFIX, CORRECTION]), (False, True, [CORRECTION, RESAMPLED]),
+        (True, True, [GRID_SUFFIX, CORRECTION, RESAMPLED]),
     ],
 )  # fmt: skip
 def test_a_resampled_image_has_its_correction_beside_it(view, asked, resampled, ends) -> None:
-    assert grids.Files(asked, resampled).names(view) == ["a" + end for end in ends]
+    assert grids.GridFiles(asked, resampled).names(view) == ["a" + end for end in ends]
 
 
 def plane(left: float = 0.0, **more) -> SimpleNamespace:
@@ -237,7 +237,7 @@ def tasks(monkeypatch) -> list:
         found.extend((view.name, rpc, files.grids, files.resampled) for view, rpc, _, files in tasks)
         return [{f"{view.name}.x": {"barpc": 1.0}} for view, *_ in tasks]
 
-    monkeypatch.setattr(grids, "_write", write)
+    monkeypatch.setattr(grids, "_write_grids", write)
     return found
 
 
@@ -286,13 +286,13 @@ def read_as(monkeypatch, **rms: float) -> list:
 def test_a_reader_sees_the_error_that_was_seen_in_writing(tmp_path, view, monkeypatch, rms, fine) -> None:
     asked = read_as(monkeypatch, **rms)
     where = np.array([[3.0, 4.0, 5.0], [6.0, 7.0, 8.0]])
-    errors = {"a" + GRID: (0.005, 0.01, where)}
+    errors = {"a" + GRID_SUFFIX: (0.005, 0.01, where)}
     model = make_rpc()
     if fine:
         found = grids.verify_grids(view, model, errors, str(tmp_path))
-        assert found == {"a" + GRID: {name: 2 * px for name, px in rms.items()}}
+        assert found == {"a" + GRID_SUFFIX: {name: 2 * px for name, px in rms.items()}}
         count = len(grids.Sample.of(model, view.size, grids.widened(view.alt_range)).points)
-        assert asked == [("a" + GRID, None, count + 2)]
+        assert asked == [("a" + GRID_SUFFIX, None, count + 2)]
         return
     ((name, px),) = rms.items()
     said = rf"a_grid\.tif: {name} reads it {px:.3g} px RMS off, not 0\.005; is the disk full"
@@ -303,7 +303,7 @@ def test_a_reader_sees_the_error_that_was_seen_in_writing(tmp_path, view, monkey
 def test_only_a_resampled_image_is_seen_through_its_correction(tmp_path, view, monkeypatch) -> None:
     asked = read_as(monkeypatch, barpc=0.0)
     monkeypatch.setattr(grids, "read_correction", lambda path: (None, path.name))
-    errors = {"a" + end: (0.0, 0.0, np.empty((0, 3))) for end in (GRID, CORRECTION, RESAMPLED)}
+    errors = {"a" + end: (0.0, 0.0, np.empty((0, 3))) for end in (GRID_SUFFIX, CORRECTION, RESAMPLED)}
     assert list(grids.verify_grids(view, make_rpc(), errors, str(tmp_path))) == list(errors)
     assert [row[1] for row in asked] == [None, None, "a" + CORRECTION]
 
@@ -327,7 +327,7 @@ def test_the_larger_of_the_errors_written_and_read_is_told(
     monkeypatch.setattr(grids, "make_grids", made)
     monkeypatch.setattr(grids, "verify_grids", lambda *given: {"a.x": {"barpc": read, "gdal": 9.0}})
     with Workspace(tmp_path / "out") as run:
-        found = grids._write(run, [(view, None, None, None)], None, None)  # type: ignore[arg-type, list-item]
+        found = grids._write_grids(run, [(view, None, None, None)], None, None)  # type: ignore[arg-type, list-item]
         assert not (run.partial / "grids").exists()
     assert found == [{"a.x": {"barpc": read, "gdal": 9.0}}]
     assert (tmp_path / "out/a.x").read_text() == "grid"
@@ -372,7 +372,7 @@ def test_the_rpc_that_lacks_least_is_the_one_that_is_added_to(monkeypatch, large
     monkeypatch.setattr(grids, "fit_only", fit)
     monkeypatch.setattr(grids, "CorrectionGrid", SimpleNamespace(between=between))
     monkeypatch.setattr(grids, "Displaced", lambda rpc, lacking: lacking)
-    monkeypatch.setattr(grids, "_off", lambda sample, camera: (*known[camera], where))
+    monkeypatch.setattr(grids, "_largest_miss", lambda sample, camera: (*known[camera], where))
     sample = SimpleNamespace(model="model", size=(10, 20), alt_range=(100.0, 300.0))
     rpc, lacking, miss = grids.grid_correction(given, sample)  # type: ignore[arg-type]
     assert asked == list(names[:tried])
@@ -399,7 +399,7 @@ def test_a_camera_is_off_by_root_mean_square_and_by_most(view) -> None:
     rpc = make_rpc()
     sample = grids.Sample.of(rpc, (2000, 1900), (30.0, 300.0), cells=5)
     beside = SimpleNamespace(project=lambda ground: rpc.project(ground) + [3.0, -4.0])
-    rms, largest, where = grids._off(sample, beside)  # type: ignore[arg-type]
+    rms, largest, where = grids._largest_miss(sample, beside)  # type: ignore[arg-type]
     assert rms == pytest.approx(5.0, abs=1e-5)
     assert largest == pytest.approx(5.0, abs=1e-5)
     assert where.shape[1] == 3
@@ -429,12 +429,12 @@ def test_what_a_dead_run_left_in_the_room_is_written_again(tmp_path, view, monke
     (tmp_path / "a").mkdir()
     monkeypatch.setattr(grids, "DirectGrid", SimpleNamespace(of=grid))
     monkeypatch.setattr(grids, "grid_correction", correction)
-    monkeypatch.setattr(grids, "_off", lambda sample, camera: (0.1, 0.2, where))
+    monkeypatch.setattr(grids, "_largest_miss", lambda sample, camera: (0.1, 0.2, where))
     for kind in ("grid", "correction", "resampled"):
         monkeypatch.setattr(grids, f"write_{kind}", recorded(kind))
-    errors = grids.make_grids(view, rpc, rpc, grids.Files(asked, resampled), str(tmp_path))
+    errors = grids.make_grids(view, rpc, rpc, grids.GridFiles(asked, resampled), str(tmp_path))
     known = {
-        "a" + GRID: (asked, (0.1, 0.2, where), ("grid", "grid", True)),
+        "a" + GRID_SUFFIX: (asked, (0.1, 0.2, where), ("grid", "grid", True)),
         "a" + CORRECTION: (True, (0.3, 0.4, where), ("correction", "lacking", "better", True)),
         "a" + RESAMPLED: (resampled, (0.3, 0.4, where), ("resampled", "better", "lacking", view.path, True)),
     }
@@ -446,7 +446,7 @@ def test_what_ends_the_work_before_any_file_is_said_itself(tmp_path, view, monke
     """There is no room to clear then."""
     monkeypatch.setattr(grids, "make_grids", lambda *given: 1 / 0)
     with Workspace(tmp_path / "out") as run, pytest.raises(ZeroDivisionError):
-        grids._write(run, [(view, None, None, None)], None, None)  # type: ignore[arg-type, list-item]
+        grids._write_grids(run, [(view, None, None, None)], None, None)  # type: ignore[arg-type, list-item]
 
 
 # --- whole runs -------------------------------------------------------------------------------------------
@@ -471,7 +471,7 @@ def test_a_run_with_everything_is_told_and_the_same_whatever_the_workers(block, 
         for name in view.outputs:
             assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
         assert all(isinstance(px, float) and px < LINEAR for one in view.outputs.values() for px in one.values())
-        for end in (GRID, CORRECTION, RESAMPLED):
+        for end in (GRID_SUFFIX, CORRECTION, RESAMPLED):
             found = open_camera(tmp_path / "a" / (view.name + end)).model
             ground = found.localize(np.array([[10.0, 20.0], [200.0, 250.0]]), np.array([*view.alt_range_m]))
             rpc = read_rpc(tmp_path / "a" / f"{view.name}_RPC.TXT")
@@ -485,11 +485,11 @@ def test_a_file_of_the_user_is_never_replaced(block, tmp_path):
     images, matches = block
     out = tmp_path / "out"
     out.mkdir()
-    (out / f"{images[0].stem}{GRID}").write_text("mine")
+    (out / f"{images[0].stem}{GRID_SUFFIX}").write_text("mine")
     options = RunOptions(matches=matches, matches_only=True, overwrite=True)
     with pytest.raises(OutputError, match=r"_grid\.tif"):
         adjust(images, out, options)
-    assert (out / f"{images[0].stem}{GRID}").read_text() == "mine"
+    assert (out / f"{images[0].stem}{GRID_SUFFIX}").read_text() == "mine"
 
 
 @pytest.mark.slow
@@ -508,7 +508,7 @@ def test_verbs_understand_grids(block, tmp_path):
     images, matches = block
     adjust(images, tmp_path / "a", RunOptions(matches=matches, matches_only=True, grids=True))
     name = images[0].stem
-    grid, rpc = str(tmp_path / "a" / f"{name}{GRID}"), str(tmp_path / "a" / f"{name}.vrt")
+    grid, rpc = str(tmp_path / "a" / f"{name}{GRID_SUFFIX}"), str(tmp_path / "a" / f"{name}.vrt")
 
     def said(*words):
         found = CliRunner().invoke(cli, [str(word) for word in words], standalone_mode=False)
@@ -520,9 +520,9 @@ def test_verbs_understand_grids(block, tmp_path):
     assert [one["rpc"].split(" in ")[0] for one in json.loads(text)] == ["grid", "correction"]
     assert said("convert", grid, tmp_path / "b_RPC.TXT")[0] == 0
     assert read_rpc(tmp_path / "b_RPC.TXT").off(read_rpc(rpc)).max() < 1e-2
-    code, text = said("convert", rpc, tmp_path / f"c{GRID}", "--json")
+    code, text = said("convert", rpc, tmp_path / f"c{GRID_SUFFIX}", "--json")
     assert (code, json.loads(text)[-1]["consumer"]) == (0, "barpc")
-    assert open_camera(tmp_path / f"c{GRID}").model.lonlat.shape == open_camera(grid).model.lonlat.shape
+    assert open_camera(tmp_path / f"c{GRID_SUFFIX}").model.lonlat.shape == open_camera(grid).model.lonlat.shape
     code, text = said("check", "--json", rpc, "--against", grid)
     assert json.loads(text)[0]["max_px"] < 1e-3
     assert said("fit", grid)[0] == 0
@@ -532,7 +532,7 @@ def test_verbs_understand_grids(block, tmp_path):
 def test_a_grid_is_the_camera_of_an_image_and_no_image(block, tmp_path):
     images, matches = block
     adjust(images, tmp_path / "a", RunOptions(matches=matches, matches_only=True, grids=True))
-    for end in (GRID, CORRECTION):
+    for end in (GRID_SUFFIX, CORRECTION):
         given = [f"{path},camera={tmp_path / 'a' / (path.stem + end)}" for path in images]
         found = check(given, RunOptions(matches=matches, matches_only=True))
         assert found.record.views[0].rmse_before < 0.5
@@ -542,7 +542,7 @@ def test_a_grid_is_the_camera_of_an_image_and_no_image(block, tmp_path):
 
 @pytest.mark.slow
 def test_a_grid_that_no_rpc_holds_is_not_converted(tmp_path, once):
-    path = once[0] / f"a{GRID}"
+    path = once[0] / f"a{GRID_SUFFIX}"
     found = CliRunner().invoke(cli, ["convert", str(path), str(tmp_path / "a_RPC.TXT")], standalone_mode=False)
     assert str(path) in str(found.exception)
     assert "wanted 0.01" in str(found.exception)

@@ -24,13 +24,13 @@ from barpc.rpcio import formats
 from barpc.rpcio.carried import put_tag
 from barpc.sensor.geometry import Several, epipolar_offset
 from barpc.sensor.rpc import RPC
-from barpc.simulate import Block, simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 
 SIDE = 256
 LAYOUT = {"size": (SIDE, SIDE), "gsd": 40.0, "attitude": 5e-5}
 
 
-def write_block(folder: Path, num: int) -> tuple[Block, list[Path]]:
+def write_block(folder: Path, num: int) -> tuple[SimulatedBlock, list[Path]]:
     """A block with small images, which differ."""
     block = simulate_block(num, 40 * num, seed=3, num_checks=0, **LAYOUT)
     paths = [folder / f"{view.name}.tif" for view in block.views]
@@ -52,7 +52,7 @@ def folder(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def block(folder) -> tuple[Block, list[Path]]:
+def block(folder) -> tuple[SimulatedBlock, list[Path]]:
     return write_block(folder, 12)
 
 
@@ -69,7 +69,7 @@ def counted(monkeypatch, owner: object, name: str, counts: Counter[str]) -> None
 @pytest.mark.slow
 def test_a_folder_is_listed_once_for_all_its_images_and_again_when_it_changes(block, folder, monkeypatch):
     counts: Counter[str] = Counter()
-    formats._listed.cache_clear()
+    formats._folder_listing.cache_clear()
     counted(monkeypatch, formats.os, "scandir", counts)
     assert len(load_views(block[1]).views) == 12
     assert counts["scandir"] == 1

@@ -15,10 +15,10 @@ import pytest
 from barpc.base.errors import OutputError
 from barpc.base.geodesy import Array
 from barpc.fit.certificate import Sample
-from barpc.pipeline import handoff
-from barpc.pipeline.handoff import (
+from barpc.pipeline import verify_outputs
+from barpc.pipeline.verify_outputs import (
     CONSUMERS,
-    TOLERANCE,
+    READING_TOLERANCE,
     _lent,
     control_grid,
     difference,
@@ -30,15 +30,15 @@ from barpc.rpcio import (
     CARRIERS,
     WRITABLE,
     find_rpc,
+    format_for,
     read_rpc,
-    row_of,
     write_camera,
     write_rpc,
     write_rpc_copy,
 )
 from barpc.rpcio.grids import CORRECTION, write_correction
 from barpc.scene import BoolArray
-from barpc.sensor.displaced import CorrectionGrid, Displaced
+from barpc.sensor.image_corrections import CorrectionGrid, Displaced
 from barpc.sensor.rpc import RPC
 from barpc.workspace import Workspace
 from tests.rpcio.conftest import make_rpc, write_image
@@ -66,7 +66,7 @@ def image(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_file_is_read_by_another_tool_than_barpc_to_a_billionth_of_a_pixel(name, image, tmp_path):
-    if not any(CONSUMERS[tool].installed for tool in row_of(name).consumers):
+    if not any(CONSUMERS[tool].installed for tool in format_for(name).consumers):
         pytest.skip("none of the tools that read this format is installed")
     rpc = make_rpc()
     readings = verify([write(rpc, image, tmp_path / "out", name)], rpc, SIZE, ALTITUDES)
@@ -136,7 +136,7 @@ def test_a_fault_of_the_machine_is_no_finding_about_a_file(image, tmp_path, monk
     def lend(*_: object, **__: object) -> None:
         raise OSError(code, "so it is")
 
-    monkeypatch.setattr("barpc.pipeline.handoff.rasterio.MemoryFile", lend)
+    monkeypatch.setattr("barpc.pipeline.verify_outputs.rasterio.MemoryFile", lend)
     if refused:
         with pytest.raises(OutputError, match=r"a_RPC\.TXT: cannot be opened as gdal.* does \(so it is\)"):
             verify([path], make_rpc(), SIZE, ALTITUDES)
@@ -179,7 +179,7 @@ def test_a_new_format_is_one_row_written_verified_and_offered(image, tmp_path, m
 def test_every_row_names_consumers_that_exist(row):
     assert row.consumers
     assert set(row.consumers) <= set(CONSUMERS)
-    assert all(row_of(f"a{suffix}") is row for suffix in row.suffixes)
+    assert all(format_for(f"a{suffix}") is row for suffix in row.suffixes)
 
 
 def test_a_format_that_no_installed_tool_reads_says_so(monkeypatch):
@@ -227,7 +227,7 @@ def test_the_consumers_that_are_always_there_need_no_other_package():
         "keywords",
         "barpc",
     }
-    assert TOLERANCE <= 1e-6
+    assert READING_TOLERANCE <= 1e-6
 
 
 class Other:
@@ -254,7 +254,7 @@ def test_rpcm_is_asked_in_the_way_that_suits_the_file(name, reader, image, tmp_p
     path = write(rpc, image, tmp_path / "out", name)
     rpcm = Other(rpc)
     rpcm.projection = lambda lon, lat, alt: rpc.project(np.column_stack([lon, lat, alt])).T
-    monkeypatch.setattr("barpc.pipeline.handoff.import_module", lambda module: {"rpcm.rpc_model": rpcm}[module])
+    monkeypatch.setattr("barpc.pipeline.verify_outputs.import_module", lambda module: {"rpcm.rpc_model": rpcm}[module])
     project = CONSUMERS["rpcm"].open(path)
     ground, _ = control_grid(rpc, SIZE, ALTITUDES)
     np.testing.assert_array_equal(project(ground), rpc.project(ground))
@@ -284,7 +284,7 @@ def shareloc(rpc: RPC, takes: Callable[[Array], BoolArray] = lambda lon: np.abs(
 def test_shareloc_counts_from_the_corner_of_the_first_pixel_and_row_before_col(lon, turn, monkeypatch, tmp_path):
     rpc = make_rpc(lon=lon)
     model = shareloc(rpc)
-    monkeypatch.setattr("barpc.pipeline.handoff.import_module", lambda _: model)
+    monkeypatch.setattr("barpc.pipeline.verify_outputs.import_module", lambda _: model)
     ground, _ = control_grid(rpc, SIZE, ALTITUDES)
     found = CONSUMERS["shareloc"].open(tmp_path / "a.tif")(ground + [turn, 0.0, 0.0])
     np.testing.assert_allclose(found, rpc.project(ground), atol=1e-6 if turn else 1e-9)
@@ -300,9 +300,9 @@ def test_shareloc_is_asked_of_a_grid_from_the_corner_of_the_first_pixel_and_row_
         return np.column_stack([rpc.localize(np.column_stack([col, row]) - 0.5, alt)[:, :2], alt])
 
     asked.direct_loc_h = direct_loc_h
-    monkeypatch.setattr("barpc.pipeline.handoff.import_module", lambda _: asked)
-    monkeypatch.setattr("barpc.pipeline.handoff.open_camera", lambda _: SimpleNamespace(model=None))
-    localize = handoff._shareloc_grid(tmp_path / "a_grid.tif")
+    monkeypatch.setattr("barpc.pipeline.verify_outputs.import_module", lambda _: asked)
+    monkeypatch.setattr("barpc.pipeline.verify_outputs.open_camera", lambda _: SimpleNamespace(model=None))
+    localize = verify_outputs._shareloc_grid(tmp_path / "a_grid.tif")
     np.testing.assert_allclose(localize(at)[:, :2], rpc.localize(at[:, :2], at[:, 2])[:, :2], rtol=0, atol=1e-12)
     assert asked.asked[0] == "GeoModel"
     assert asked.asked[1] == (str(tmp_path / "a_grid.tif"), "GRID")
@@ -315,7 +315,7 @@ def test_shareloc_asks_in_one_thread_and_leaves_as_many_as_there_were(monkeypatc
     model = shareloc(rpc)
     inverse = model.inverse_loc
     model.inverse_loc = lambda *given: threads.append(10 * threads[-1]) or inverse(*given)
-    monkeypatch.setattr("barpc.pipeline.handoff.import_module", lambda _: model)
+    monkeypatch.setattr("barpc.pipeline.verify_outputs.import_module", lambda _: model)
     monkeypatch.setitem(sys.modules, "numba", numba)
     CONSUMERS["shareloc"].open(tmp_path / "a.tif")(control_grid(rpc, SIZE, ALTITUDES)[0])
     assert threads == [2, 1, 10, 2]
@@ -342,9 +342,9 @@ def test_shareloc_asks_in_one_thread_and_leaves_as_many_as_there_were(monkeypatc
 )
 def test_what_shareloc_leaves_out_beyond_180_degrees_is_told(lon, takes, note, monkeypatch, tmp_path):
     rpc = make_rpc(lon=lon)
-    monkeypatch.setattr("barpc.pipeline.handoff.import_module", lambda _: shareloc(rpc, takes))
+    monkeypatch.setattr("barpc.pipeline.verify_outputs.import_module", lambda _: shareloc(rpc, takes))
     named = {"shareloc": replace(CONSUMERS["shareloc"], package="numpy"), "barpc": CONSUMERS["barpc"]}
-    monkeypatch.setattr("barpc.pipeline.handoff._consumers", lambda _: named)
+    monkeypatch.setattr("barpc.pipeline.verify_outputs._consumers", lambda _: named)
     write_rpc(rpc, tmp_path / "a.geom")
     reading, own = verify([tmp_path / "a.geom"], rpc, SIZE, ALTITUDES)
     assert own.passed
@@ -357,7 +357,7 @@ def test_orthority_counts_as_barpc_does(monkeypatch, tmp_path):
     rpc = make_rpc()
     model = Other(rpc)
     model.world_to_pixel = lambda columns: rpc.project(columns.T).T
-    monkeypatch.setattr("barpc.pipeline.handoff.import_module", lambda _: model)
+    monkeypatch.setattr("barpc.pipeline.verify_outputs.import_module", lambda _: model)
     ground, _ = control_grid(rpc, SIZE, ALTITUDES)
     found = CONSUMERS["orthority"].open(tmp_path / "a.tif")(ground)
     np.testing.assert_array_equal(found, rpc.project(ground))

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from barpc.base.errors import InputError
-from barpc.base.identity import Stamp, take
+from barpc.base.identity import Stamp, fingerprint
 from barpc.base.options import RunOptions, TieOptions
 from barpc.base.remote import Remote
 from barpc.pipeline import inputs as hashed
@@ -75,7 +75,7 @@ def test_a_file_that_is_another_than_was_read_ends_the_run(files) -> None:
 
 def test_a_file_elsewhere_is_its_version(monkeypatch) -> None:
     found = hash_inputs(run_of(AT), RunOptions(), {str(AT): Stamp(1, 1, 1, 1, 1, "x")})
-    assert found == {str(AT): take(AT)}
+    assert found == {str(AT): fingerprint(AT)}
     assert found[str(AT)].stamp is None
 
 

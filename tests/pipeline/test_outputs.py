@@ -17,10 +17,10 @@ import pytest
 from barpc.base.errors import OutputError
 from barpc.base.options import RunOptions
 from barpc.fit import FitOptions, RpcFit, fit_rpc
-from barpc.pipeline import handoff, outputs
-from barpc.pipeline.handoff import CONSUMERS, Consumer, Reading, control_grid, difference, verify
-from barpc.pipeline.inputs import PRIOR
+from barpc.pipeline import outputs, verify_outputs
+from barpc.pipeline.inputs import PRIOR_FILE
 from barpc.pipeline.outputs import REOPENED, file_names, output_names, refuse_shadows, write_views
+from barpc.pipeline.verify_outputs import CONSUMERS, Consumer, Reading, control_grid, difference, verify
 from barpc.report.page import can_render
 from barpc.report.runfiles import TABLES
 from barpc.report.summary import OutputEntry
@@ -211,7 +211,7 @@ def test_the_largest_error_of_all_points_is_what_counts(tmp_path, monkeypatch) -
         "absent": Consumer("no_such_package", no_number),
         "barpc": CONSUMERS["barpc"],
     }
-    monkeypatch.setattr(handoff, "_consumers", lambda path: consumers)
+    monkeypatch.setattr(verify_outputs, "_consumers", lambda path: consumers)
     write_rpc(rpc, tmp_path / "A_RPC.TXT")
     corner, nan, own = verify([tmp_path / "A_RPC.TXT"], rpc, SIZE, ALTITUDES)
     assert own.passed
@@ -281,7 +281,7 @@ def test_the_outputs_of_a_run_are_known_before_it_starts(tmp_path, view) -> None
         for stop in ("matching", "adjustment", "all")
     }
     prior, common = (
-        f"tables/{PRIOR}",
+        f"tables/{PRIOR_FILE}",
         [*(f"tables/{name}" for name in TABLES), "summary.json", "SHA256SUMS"] + ["report.html"] * can_render(),
     )
     pairs, known = ["asp/b__c__scene.txt", "asp/scene__b__c.txt"], "tables/images.json"

@@ -15,8 +15,8 @@ import pytest
 from barpc.base.errors import InputError
 from barpc.base.manifest import Layer, render
 from barpc.pipeline import outputs as proof
-from barpc.pipeline.beyond import REOPENED
-from barpc.pipeline.outputs import ADDED, CHANGED, GOOD, LATER, MISSING, MOVED, SAME, UNKNOWN, Proved
+from barpc.pipeline.grid_outputs import REOPENED
+from barpc.pipeline.outputs import ADDED, CHANGED, LATER, MISSING, MOVED, NOT_ASKED, PASSED_STATES, SAME, Proved
 from barpc.rpcio import write_rpc
 from tests.rpcio.conftest import make_rpc
 
@@ -57,9 +57,9 @@ def prove(folder: Path, places: Any = (), expected: str | None = None) -> list[P
 
 
 def test_the_words_are_those_of_the_page() -> None:
-    assert (SAME, MOVED, LATER, UNKNOWN) == ("same", "moved", "later", "not asked")
+    assert (SAME, MOVED, LATER, NOT_ASKED) == ("same", "moved", "later", "not asked")
     assert (CHANGED, MISSING, ADDED) == ("changed", "missing", "added")
-    assert GOOD == (SAME, MOVED, LATER, UNKNOWN)
+    assert PASSED_STATES == (SAME, MOVED, LATER, NOT_ASKED)
     assert Proved("input", "a", SAME).note == ""
 
 
@@ -109,7 +109,7 @@ def test_an_input_is_looked_for_in_the_run_beside_it_and_where_one_says(told, tm
 
 def test_an_input_on_another_host_is_not_asked(told, tmp_path) -> None:
     told.inputs = [SimpleNamespace(path="https://a.org/x.tif", sha256="0")]
-    assert prove(tmp_path / "out") == [Proved("input", "https://a.org/x.tif", UNKNOWN, "on another host")]
+    assert prove(tmp_path / "out") == [Proved("input", "https://a.org/x.tif", NOT_ASKED, "on another host")]
 
 
 def test_an_output_is_the_same_changed_or_missing(told, tmp_path) -> None:
@@ -130,7 +130,7 @@ def test_what_cannot_be_read_counts_as_missing(told, tmp_path, monkeypatch) -> N
     def refuse(path: Path) -> None:
         raise PermissionError(path)
 
-    monkeypatch.setattr(proof, "take", refuse)
+    monkeypatch.setattr(proof, "fingerprint", refuse)
     assert prove(tmp_path / "out") == [Proved("output", "summary.json", MISSING)]
 
 
@@ -248,7 +248,7 @@ def test_a_folder_below_with_sums_is_named_and_not_asked(told, tmp_path) -> None
     (found,) = prove(tmp_path / "out")
     assert (found.file, found.now) == ("nerf/a.json", ADDED)
     listed(export)
-    assert prove(tmp_path / "out") == [Proved("output", "nerf", UNKNOWN, f"not of this run: barpc verify {export}")]
+    assert prove(tmp_path / "out") == [Proved("output", "nerf", NOT_ASKED, f"not of this run: barpc verify {export}")]
     assert prove(export) == []
     (export / "a.json").write_bytes(b"1")
     assert prove(export) == [Proved("output", "a.json", CHANGED)]
@@ -325,11 +325,11 @@ def test_what_holds_no_certified_camera_is_not_opened(camera, tmp_path, name, st
 
 
 def test_a_grid_holds_the_camera_of_its_image_and_a_resampled_one_does_not() -> None:
-    from barpc.pipeline.beyond import RESAMPLED
-    from barpc.rpcio.grids import CORRECTION, GRID
+    from barpc.pipeline.grid_outputs import RESAMPLED
+    from barpc.rpcio.grids import CORRECTION, GRID_SUFFIX
 
     for end, holds in (
-        (GRID, True),
+        (GRID_SUFFIX, True),
         (CORRECTION, True),
         (RESAMPLED, False),
         ("_RPC.TXT", True),

@@ -11,11 +11,11 @@ import pytest
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.base.geodesy import ground_from_ecef
 from barpc.fit import fit_rpc
-from barpc.pipeline.handoff import control_grid
+from barpc.pipeline.verify_outputs import control_grid
 from barpc.rpcio import read_rpc
 from barpc.scene import Tracks, View
-from barpc.sensor.displaced import ImageAffine, ImageCorrected
 from barpc.sensor.geometry import epipolar_offset, triangulate
+from barpc.sensor.image_corrections import ImageAffine, ImageCorrected
 from tests.lanes import rest_slow
 
 from .conftest import check_points

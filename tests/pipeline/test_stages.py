@@ -20,7 +20,7 @@ from barpc.pipeline import run as stages
 from barpc.pipeline.earlier import of_new
 from barpc.pipeline.inputs import (
     IMAGES,
-    PRIOR,
+    PRIOR_FILE,
     given_matches,
     given_tracks,
     input_files,
@@ -67,7 +67,7 @@ def test_every_file_that_options_name_is_an_input() -> None:
         "area.json",
     ]
     found = input_files(given)
-    assert found[:2] == [Path("earlier/tables") / name for name in (PRIOR, IMAGES)]
+    assert found[:2] == [Path("earlier/tables") / name for name in (PRIOR_FILE, IMAGES)]
     assert sorted(map(str, found[2:])) == sorted(names)
     assert input_files(RunOptions()) == []
 
@@ -263,7 +263,7 @@ def test_the_page_is_named_where_it_can_be_drawn(tmp_path, monkeypatch, drawn) -
     assert ("report.html" in names) is drawn
     assert ("tables/gcps.geojson" in output_names(views(), RunOptions(dem="d", reference=("r",)), tmp_path)) is True
     assert "tables/gcps.geojson" not in names
-    assert names[-1] == f"tables/{PRIOR}"
+    assert names[-1] == f"tables/{PRIOR_FILE}"
 
 
 # --- the run itself ---------------------------------------------------------------------------------------
@@ -294,7 +294,7 @@ def test_heights_of_a_reference_are_as_sure_as_what_they_count_from(monkeypatch,
         dem="d.tif", reference=("r.tif",), reference_sigma=7.0,
         adjust=AdjustOptions(dem_bias_sigma=stated, dem_sigma=4.0),
     )  # fmt: skip
-    stages._registered(SimpleNamespace(views=views()), options, SimpleNamespace(known=known), HERE)  # type: ignore[arg-type]
+    stages._register_to_reference(SimpleNamespace(views=views()), options, SimpleNamespace(known=known), HERE)  # type: ignore[arg-type]
     assert seen["accuracy"] == Accuracy(7.0, 4.0, used)
 
 
@@ -376,7 +376,7 @@ def test_only_a_vrt_that_will_be_written_asks_for_images_that_it_can_point_at(
     seen: list[str] = []
     monkeypatch.setattr(stages, "plain_source", seen.append)
     run, options = Run("adjust", views(2), (), NONE), RunOptions(images=images, stop_after=stop_after)
-    names, keep = stages._files(run, options, tmp_path)
+    names, keep = stages._planned_files(run, options, tmp_path)
     assert seen == (["/x/v0.tif", "/x/v1.tif"] if asked else [])
     assert names == output_names(run.views, options, tmp_path)
     assert {Path("/x/v0.tif"), Path("/x/v1.tif")} <= set(keep)
@@ -391,7 +391,7 @@ def test_a_check_ties_what_was_loaded_and_adjusts_nothing(monkeypatch) -> None:
         assert (kind, images, options, work.progress) == ("check", given, RunOptions(keep_going=True), told)
         return loaded
 
-    monkeypatch.setattr(stages, "_loaded", load)
+    monkeypatch.setattr(stages, "_with_views", load)
     monkeypatch.setattr(stages, "_with_ties", lambda run, options, work: tied if run is loaded else None)
     monkeypatch.setattr(stages, "summarize", lambda run: SimpleNamespace(passed=run is tied, status="good"))
     result = stages.check(given, RunOptions(keep_going=True), progress=told)
@@ -423,8 +423,8 @@ def test_a_stage_that_is_one_task_says_its_beginning_and_its_end(corner, tmp_pat
     took = [stage["stage"] for stage in result.summary["stages"]]
     assert took[-6:] == ["tie points", "adjustment", "block", "summary", "tables", "report"]
     told.clear()
-    stages._tell(None, "x", 0)
+    stages._report_progress(None, "x", 0)
     space = SimpleNamespace(stage=nullcontext)
-    with pytest.raises(KeyError), stages._told(space, "x", lambda *now: told.append(now)):  # type: ignore[arg-type]
+    with pytest.raises(KeyError), stages._stage_progress(space, "x", lambda *now: told.append(now)):  # type: ignore[arg-type]
         raise KeyError
     assert told == [("x", 0, 1)]

@@ -121,7 +121,7 @@ def test_a_view_brings_its_own_camera_altitudes_and_date_and_its_size_is_that_of
     ],
 )
 def test_altitudes_are_those_of_the_earth_and_a_hundred_metres_at_least(stated, used) -> None:
-    assert views._altitudes(SimpleNamespace(alt_range=stated)) == pytest.approx(used)  # type: ignore[arg-type]
+    assert views._altitudes_used(SimpleNamespace(alt_range=stated)) == pytest.approx(used)  # type: ignore[arg-type]
 
 
 def test_an_rpc_that_does_not_reach_the_ground_is_named(pair) -> None:
@@ -198,9 +198,9 @@ def test_one_pixel_makes_another_image_wherever_it_is(tmp_path) -> None:
 
 def test_images_alike_in_the_samples_are_read_whole_once_each_and_no_others(tmp_path, monkeypatch) -> None:
     read: list[str] = []
-    whole = views._whole
+    whole = views._whole_digest
     monkeypatch.setattr(
-        views, "_whole", lambda image, band: (read.append(Path(image.name).stem), whole(image, band))[1]
+        views, "_whole_digest", lambda image, band: (read.append(Path(image.name).stem), whole(image, band))[1]
     )
     given = []
     for number in range(4):
@@ -241,21 +241,21 @@ def test_windows_lie_in_the_middle_and_at_the_quarters_and_inside_small_images()
 def test_an_image_is_hashed_in_whole_blocks_and_each_row_counts(tmp_path, monkeypatch) -> None:
     path = placed(tmp_path, "a", pixels_of(), blockysize=8)
     asked: list[tuple[float, float]] = []
-    digest = views._digest
+    digest = views._pixel_digest
 
     def watched(image, band, windows):
         asked.extend((w.row_off, w.height) for w in windows)
         return digest(image, band, windows)
 
-    monkeypatch.setattr(views, "_digest", watched)
+    monkeypatch.setattr(views, "_pixel_digest", watched)
     with views.open_raster(path) as image:
-        assert views._whole(image, 1) == digest(image, 1, [Window(0, 0, WIDE, HIGH)])
+        assert views._whole_digest(image, 1) == digest(image, 1, [Window(0, 0, WIDE, HIGH)])
     assert asked == [(top, min(8, HIGH - top)) for top in range(0, HIGH, 8)]
 
 
 def test_numbers_are_the_same_in_any_type() -> None:
     row = np.array([[1, 2, 65535]])
-    of = views._numbers
+    of = views._as_floats
     for kind in (np.uint16, np.int32, np.float32, np.float64):
         np.testing.assert_array_equal(of(row.astype(kind)), row.astype(np.float64))
     assert of(np.array([-0.0])).tobytes() == np.array([0.0]).tobytes()

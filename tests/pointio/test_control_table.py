@@ -15,7 +15,7 @@ import pytest
 from rasterio.warp import transform
 
 from barpc.base.errors import InputError
-from barpc.pointio.gcps import Frame, read_gcps
+from barpc.pointio.gcps import ControlReference, read_gcps
 
 VIEWS = ["left", "right.img", "IMG_2021-03 a"]
 FOOT, US_FOOT = 0.3048, 1200 / 3937
@@ -33,7 +33,7 @@ class Case:
     text: str
     file: str = "control.csv"
     encode: Callable[[str], bytes] = str.encode
-    frame: Frame | None = None
+    frame: ControlReference | None = None
     points: dict[str, tuple[float, float, float]] | None = None  # other places than P
     seen: tuple[tuple[str, int, float, float], ...] | None = None  # others than SEEN
     tolerance: float = 1e-9  # deg: a tenth of a millimetre
@@ -189,28 +189,29 @@ CASES: dict[str, Case] = {
                                    + rows("{p},32631,{x!r},{y!r},{z},{i},{c},{r}", UTM)),
     "utm, northing first, feet": Case(
         "pt;Northing;Easting;Elevation (ft);photo;column;line\n"
-        + rows("{p};{y!r};{x!r};{z!r};{i};{c};{r}", scaled(UTM, FOOT)), frame=Frame("EPSG:32631")),
+        + rows("{p};{y!r};{x!r};{z!r};{i};{c};{r}", scaled(UTM, FOOT)), frame=ControlReference("EPSG:32631")),
     "utm, german, decimal commas": Case(
         "Punkt;Rechtswert;Hochwert;H;image;col;row\n".replace("Punkt", "name")
-        + comma(rows("{p};{x!r};{y!r};{z};{i};{c};{r}", moved("EPSG:25832"))), frame=Frame("EPSG:25832")),
+        + comma(rows("{p};{x!r};{y!r};{z};{i};{c};{r}", moved("EPSG:25832"))), frame=ControlReference("EPSG:25832")),
     "utm south, in a comment": Case(
         "# CRS: EPSG:32760\nname,E,N,ellipsoidal height,image,col,row\n"
         + rows("{p},{x!r},{y!r},{z},{i},{c},{r}", moved("EPSG:32760", SOUTH)), points=SOUTH),
     "northing first by its system": Case(  # NZTM's axes are north, east: x stays the east
         "name,x_map,y_map,h,image,col,row\n" + rows("{p},{x!r},{y!r},{z},{i},{c},{r}", moved("EPSG:2193", SOUTH)),
-        frame=Frame("EPSG:2193"), points=SOUTH),
+        frame=ControlReference("EPSG:2193"), points=SOUTH),
     "state plane, all in feet": Case(
         "name,east,north,z_ftUS,image,col,row\n"
         + rows("{p},{x!r},{y!r},{z!r},{i},{c},{r}", scaled(moved("EPSG:6418", at(-121.5, 38.5)), US_FOOT)),
-        frame=Frame("EPSG:6418"), points=at(-121.5, 38.5)),
+        frame=ControlReference("EPSG:6418"), points=at(-121.5, 38.5)),
     "web mercator, case tells": Case(
         "name,X,Y,Z,x,y,image\n" + rows("{p},{x!r},{y!r},{z},{c},{r},{i}", moved("EPSG:3857")),
-        frame=Frame("EPSG:3857")),
+        frame=ControlReference("EPSG:3857")),
     "utm, units tell": Case(
         "gcp_name,E [m],N [m],h_ell [m],file,x [px],y [px]\n" + rows("{p},{x!r},{y!r},{z},{i},{c},{r}", UTM),
-        frame=Frame("EPSG:32631")),
+        frame=ControlReference("EPSG:32631")),
     "earth-centred": Case(
-        "name,X,Y,Z,image,col,row\n" + rows("{p},{x!r},{y!r},{z!r},{i},{c},{r}", ECEF), frame=Frame("EPSG:4978")),
+        "name,X,Y,Z,image,col,row\n" + rows("{p},{x!r},{y!r},{z!r},{i},{c},{r}", ECEF),
+        frame=ControlReference("EPSG:4978")),
     "2-D csv": Case("name,lon,lat,image,col,row\n" + rows("{p},{x},{y},{i},{c},{r}"), flat=True),
     # --- formats
     "geojson": Case(geojson(), "g.geojson"),
@@ -228,7 +229,7 @@ CASES: dict[str, Case] = {
     "qgis, map coordinates by flag": Case(
         "mapX,mapY,pixelX,pixelY,enable\n"
         + "".join(f"{UTM[p][0]!r},{UTM[p][1]!r},{c + 0.5},{-r - 0.5},1\n" for p, _, c, r in LEFT), "left.tif.points",
-        frame=Frame("EPSG:32631"), seen=LEFT, flat=True),
+        frame=ControlReference("EPSG:32631"), seen=LEFT, flat=True),
     "odm, dos, comments": Case(
         "EPSG:32631\n# x y z\n" + "".join(
             f"{UTM[p][0]!r}\t{UTM[p][1]!r}\t{UTM[p][2]}\t{c + 0.5}\t{r + 0.5}\t{NAMED[v]}.JPG\t{p}\n"
@@ -244,7 +245,7 @@ CASES: dict[str, Case] = {
         "gcp_list.txt"),
     "micmac": Case(micmac(), "g.xml"),
     "micmac, utf-16": Case(micmac().replace("'1.0'", "'1.0' encoding='utf-16'"), "g.xml", encode=utf16),
-    "micmac, map coordinates": Case(micmac(UTM), "g.xml", frame=Frame("EPSG:32631")),
+    "micmac, map coordinates": Case(micmac(UTM), "g.xml", frame=ControlReference("EPSG:32631")),
     "envi, dos": Case(
         "; ENVI Image to Map GCP File\n; projection info = {UTM, 31, North, WGS-84, units=Meters}\n"
         "; Map (x,y), Image (x,y)\n;\n" + "".join(

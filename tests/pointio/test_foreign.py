@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import InputError
-from barpc.base.sidefile import Kind
+from barpc.base.safe_io import Kind
 from barpc.pointio.matches import read_links, read_matches
 
 NAMES = ["a", "b", "c"]
@@ -443,7 +443,7 @@ def test_a_database_is_held_to_what_its_numbers_become(tmp_path: Path, monkeypat
     keypoints = sum(4 * len(KEYPOINTS[name]) for name in "ab")
     most = 8 * (keypoints + 2 * len(MATCHES["a", "b"]))
     for limit, refused in ((most, False), (most - 1, True)):
-        monkeypatch.setattr("barpc.pointio.foreign._CONTENT", Kind("what it holds", limit))
+        monkeypatch.setattr("barpc.pointio.third_party_matches._CONTENT", Kind("what it holds", limit))
         if refused:
             with pytest.raises(InputError, match=f"{most} bytes, too large for what it holds"):
                 read_matches(path, ["a", "b"])

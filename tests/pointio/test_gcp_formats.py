@@ -18,9 +18,9 @@ from barpc.base.errors import InputError, plain
 from barpc.base.geodesy import HeightDatum, ecef_from_ground
 from barpc.pointio import gcp_formats
 from barpc.pointio.columns import COLUMNS, degrees, guessed
-from barpc.pointio.gcp_formats import FORMATS
-from barpc.pointio.gcp_table import NAMES as NAMES_OF
-from barpc.pointio.gcps import Frame, read_gcps
+from barpc.pointio.gcp_formats import GCP_FORMATS
+from barpc.pointio.gcp_table import GCP_NAMES as NAMES_OF
+from barpc.pointio.gcps import ControlReference, read_gcps
 from barpc.scene import GroundPoints
 
 NAMES = ["left", "right"]
@@ -102,16 +102,16 @@ def test_one_point_in_every_syntax_is_the_same_point(tmp_path: Path, name: str) 
 def test_every_format_has_a_sample() -> None:
     raster = {"image with GCP tags", "GeoPackage or Shapefile"}
     known = {
-        next(name for name, form in FORMATS.items() if form.sniff(text.lstrip(), text.encode()))
+        next(name for name, form in GCP_FORMATS.items() if form.sniff(text.lstrip(), text.encode()))
         for _, text in SAME.values()
     }
-    assert known | raster == set(FORMATS)
+    assert known | raster == set(GCP_FORMATS)
 
 
 # --- reference systems ------------------------------------------------------------------------------------
 
 
-def one(folder: Path, x: float, y: float, z: float, frame: Frame, alt: str = "h"):
+def one(folder: Path, x: float, y: float, z: float, frame: ControlReference, alt: str = "h"):
     path = folder / "g.csv"
     path.write_text(f"id,easting,northing,{alt},col,row\np,{x!r},{y!r},{z!r},1,2\n", encoding="utf-8")
     return read_gcps(path, ["left"], frame)
@@ -152,12 +152,14 @@ def test_heights_are_in_the_unit_and_above_what_the_system_says(
     tmp_path, geoid, crs, horizontal, z, alt, vertical
 ) -> None:
     (x,), (y,) = transform("EPSG:4326", f"EPSG:{horizontal}", [-121.5], [38.5])
-    found = one(tmp_path, x, y, z, Frame(crs, geoid))
+    found = one(tmp_path, x, y, z, ControlReference(crs, geoid))
     near(found, (-121.5, 38.5, alt))
     assert known(found) == (vertical if vertical in (None, "ellipsoid") else "a geoid")
     if vertical not in (None, "ellipsoid"):  # its own geoid, or the nearest that there is, and that is said
-        assert one(tmp_path, x, y, z, Frame(crs, "none")).lonlatalt[0, 2] == pytest.approx(alt + 30.0, abs=1e-6)
-        own = one(tmp_path, x, y, z, Frame(crs))
+        assert one(tmp_path, x, y, z, ControlReference(crs, "none")).lonlatalt[0, 2] == pytest.approx(
+            alt + 30.0, abs=1e-6
+        )
+        own = one(tmp_path, x, y, z, ControlReference(crs))
         assert -35.0 < own.lonlatalt[0, 2] - alt - 30.0 < -25.0  # EGM96 near Sacramento
         assert f"altitudes above {vertical} made ellipsoidal with egm96_15.tif" in own.said[0]
 
@@ -169,7 +171,7 @@ def test_no_grid_is_asked_of_the_network(tmp_path, geoid, monkeypatch) -> None:
     places = []
     for enabled in (False, True):
         pyproj.network.set_network_enabled(enabled)
-        places.append(one(tmp_path, x, y, 100.0, Frame("EPSG:26910+5703", geoid)).lonlatalt)
+        places.append(one(tmp_path, x, y, 100.0, ControlReference("EPSG:26910+5703", geoid)).lonlatalt)
         assert pyproj.network.is_network_enabled() == enabled
     pyproj.network.set_network_enabled(None)
     np.testing.assert_array_equal(*places)
@@ -177,7 +179,7 @@ def test_no_grid_is_asked_of_the_network(tmp_path, geoid, monkeypatch) -> None:
 
 def test_earth_centred_coordinates_have_their_altitude(tmp_path) -> None:
     ground = np.array([-121.5, 38.5, 123.0])
-    found = one(tmp_path, *ecef_from_ground(ground).tolist(), Frame("EPSG:4978"))
+    found = one(tmp_path, *ecef_from_ground(ground).tolist(), ControlReference("EPSG:4978"))
     near(found, ground)
     assert known(found) == "ellipsoid"
 
@@ -196,7 +198,7 @@ def test_earth_centred_coordinates_have_their_altitude(tmp_path) -> None:
 def test_a_column_says_its_unit_and_what_it_counts_from(tmp_path, geoid, column, factor, vertical) -> None:
     path = tmp_path / "g.csv"
     path.write_text(f"lon,lat,{column},col,row\n5,43,100,1,2\n", encoding="utf-8")
-    found = read_gcps(path, ["left"], Frame(None, geoid))
+    found = read_gcps(path, ["left"], ControlReference(None, geoid))
     lift = -30.0 if vertical not in (None, "ellipsoid") else 0.0
     np.testing.assert_allclose(found.lonlatalt[0, 2], 100 * factor + lift, rtol=1e-12)
     assert known(found) == ("alt" if "alt" in column else vertical if vertical in (None, "ellipsoid") else "a geoid")
@@ -206,7 +208,7 @@ def test_the_flag_counts_before_the_file_and_that_is_said(tmp_path) -> None:
     (x,), (y,) = transform("EPSG:4326", "EPSG:32632", [LON], [LAT])
     path = tmp_path / "g.txt"
     path.write_text(f"EPSG:32631\n{x} {y} 100 1 2 left\n", encoding="utf-8")
-    found = read_gcps(path, NAMES, Frame("EPSG:32632"))
+    found = read_gcps(path, NAMES, ControlReference("EPSG:32632"))
     np.testing.assert_allclose(found.lonlatalt[0, :2], [LON, LAT], atol=1e-9)
     assert "not its own reference system 'EPSG:32631'; WGS 84 / UTM zone 32N" in found.said[0]
 
@@ -216,14 +218,14 @@ def test_the_flag_counts_before_the_file_and_that_is_said(tmp_path) -> None:
 )
 def test_what_is_no_reference_system_of_places_is_refused(tmp_path, crs) -> None:
     with pytest.raises(InputError, match=r"no reference system of places|map coordinates\?"):
-        one(tmp_path, EAST, NORTH, 1.0, Frame(crs))
+        one(tmp_path, EAST, NORTH, 1.0, ControlReference(crs))
 
 
 def test_without_a_reference_system_none_is_guessed_and_pyproj_not_imported(tmp_path) -> None:
     with pytest.raises(
         InputError, match=r"g\.csv: CSV, GCP p at 694\d+\.\d+, 4796\d+\.\d+: map coordinates\? Say .* --gcp-crs"
     ):
-        one(tmp_path, EAST, NORTH, 1.0, Frame())
+        one(tmp_path, EAST, NORTH, 1.0, ControlReference())
     (tmp_path / "a.gcp").write_text(SAME["asp"][1])
     code = f"import sys; from barpc.pointio.gcps import read_gcps as r; r({str(tmp_path / 'a.gcp')!r}, ['left']); " \
         "sys.exit('pyproj' in sys.modules)"  # fmt: skip
@@ -330,15 +332,15 @@ def test_a_file_without_images_is_of_the_one_it_is_called_as(tmp_path, name, vie
 def test_altitudes_that_are_not_there_are_zero_whatever_the_others_count_from(tmp_path, geoid) -> None:
     path = tmp_path / "g.csv"
     path.write_text("lon,lat,h,sigma,col,row\n5,43,100,0.1,1,2\n5.1,43,,0.1,1,2\n5.2,43,0,0.1,1,2\n")
-    found = read_gcps(path, ["left"], Frame("EPSG:4326+5773", geoid))
+    found = read_gcps(path, ["left"], ControlReference("EPSG:4326+5773", geoid))
     assert found.lonlatalt[:, 2].tolist() == [70.0, 0.0, 0.0]
     assert found.sigma.tolist() == [[0.1] * 3] * 3
 
 
 def test_two_units_of_altitudes_are_one_too_many(tmp_path) -> None:
     with pytest.raises(InputError, match="altitudes in ft by their column, in another unit by 'EPSG:26910"):
-        one(tmp_path, 5e5, 4e6, 1.0, Frame("EPSG:26910+5703"), "h_ft")
-    assert one(tmp_path, 5e5, 4e6, 1.0, Frame("EPSG:26910+5703", "none"), "h [m]").lonlatalt[0, 2] == 1.0
+        one(tmp_path, 5e5, 4e6, 1.0, ControlReference("EPSG:26910+5703"), "h_ft")
+    assert one(tmp_path, 5e5, 4e6, 1.0, ControlReference("EPSG:26910+5703", "none"), "h [m]").lonlatalt[0, 2] == 1.0
 
 
 # --- ground and image apart -------------------------------------------------------------------------------
@@ -352,7 +354,7 @@ def test_micmacs_image_points_are_found_beside_or_given(tmp_path) -> None:
     ):
         read_gcps(ground, NAMES)
     image.write_text(micmac(ground=False))
-    for frame in (Frame(), Frame(others=(str(ground), str(image)))):
+    for frame in (ControlReference(), ControlReference(others=(str(ground), str(image)))):
         found = read_gcps(ground, NAMES, frame)
         assert found.xy.tolist() == [[COL, ROW]]
         assert found.sigma.tolist() == [[2.0, 3.0, 4.0]]
@@ -363,7 +365,7 @@ def test_micmacs_image_points_are_found_beside_or_given(tmp_path) -> None:
     (tmp_path / "b-S2D.xml").write_text(micmac(ground=False, name="right"))
     with pytest.raises(InputError, match=r"image points in a-S2D\.xml, b-S2D\.xml"):
         read_gcps(ground, NAMES)
-    both = Frame(others=(str(ground), str(image), str(tmp_path / "b-S2D.xml")))
+    both = ControlReference(others=(str(ground), str(image), str(tmp_path / "b-S2D.xml")))
     assert read_gcps(ground, NAMES, both).view.tolist() == [0, 1]
 
 
@@ -374,7 +376,7 @@ def test_metashapes_files_of_an_image_each_go_with_its_reference(tmp_path) -> No
     for view in NAMES:
         (tmp_path / f"{view}.csv").write_text("label,x,y\np,1,2\nq,3,4\n")
     files = tuple(str(tmp_path / name) for name in ("ref.csv", "left.csv", "right.csv"))
-    found = read_gcps(files[0], NAMES, Frame(others=files))
+    found = read_gcps(files[0], NAMES, ControlReference(others=files))
     assert found.view.tolist() == [0, 1]
     assert found.names == ("p",)
 
@@ -459,8 +461,9 @@ def test_errors_of_python_are_said_in_other_words(make, says) -> None:
 # --- the shared cases -------------------------------------------------------------------------------------
 
 CASES = {
-    "gcp_utm.csv": Frame("EPSG:32631"), "odm_gcp_list.txt": Frame(), "qgis.points": Frame(), "envi.pts": Frame(),
-    "gcp_2d.csv": Frame(),
+    "gcp_utm.csv": ControlReference("EPSG:32631"), "odm_gcp_list.txt": ControlReference(),
+    "qgis.points": ControlReference(), "envi.pts": ControlReference(),
+    "gcp_2d.csv": ControlReference(),
 }  # fmt: skip
 
 

@@ -24,7 +24,7 @@ MEASURED = """
 import sys, time
 from barpc.pointio.correspondences import read_altimetry, read_correspondences
 from barpc.pointio.gcps import read_gcps
-from barpc.pointio.foreign import read_pair_files
+from barpc.pointio.third_party_matches import read_pair_files
 from barpc.pointio.matches import read_links
 from barpc.tie.pairing.area import read_area
 from barpc.cameras import open_camera

@@ -57,7 +57,7 @@ def test_a_vrt_that_is_replaced_while_it_is_hashed_is_no_input(image: Path, tmp_
     """Its sources would be those of another one than was hashed."""
     path = vrt(tmp_path / "a.vrt", band("image.tif"))
     (part,) = hashed(path).parts
-    assert part == identity.take(image)
+    assert part == identity.fingerprint(image)
     read = raster.read_vrt
 
     def replaced(file: Path) -> object:

@@ -14,8 +14,8 @@ import pytest
 from barpc import __version__
 from barpc.base import errors
 from barpc.base.errors import BarpcError, ImageError, InputError, has_room, out_of_memory
-from barpc.cli import _told
-from barpc.pipeline import handoff
+from barpc.cli import _exit_message
+from barpc.pipeline import verify_outputs
 from barpc.pipeline.executor import run_batch
 from tests.reliability.trials import SAMPLES, crop
 
@@ -84,7 +84,7 @@ def test_what_says_that_memory_is_out_is_taken_at_its_word(error, room) -> None:
 @pytest.mark.parametrize("error", LIKELY, ids=repr)
 def test_what_may_say_so_is_believed_where_there_is_none(error, room) -> None:
     assert out_of_memory(error) is not room
-    code, said = _told(error)
+    code, said = _exit_message(error)
     assert code == 1
     assert said.startswith("out of memory;") is not room
 
@@ -92,7 +92,7 @@ def test_what_may_say_so_is_believed_where_there_is_none(error, room) -> None:
 @pytest.mark.parametrize("error", OTHER, ids=repr)
 def test_nothing_else_is_called_so(error, room) -> None:
     assert not out_of_memory(error)
-    assert "out of memory;" not in _told(error)[1]
+    assert "out of memory;" not in _exit_message(error)[1]
 
 
 def test_a_chain_that_bites_its_tail_ends() -> None:
@@ -134,9 +134,9 @@ def test_no_reader_of_a_file_that_was_written_is_blamed(tmp_path, monkeypatch) -
     def fail(_path: Path) -> None:
         raise MemoryError
 
-    one = handoff.Consumer("barpc", fail)  # type: ignore[arg-type]
+    one = verify_outputs.Consumer("barpc", fail)  # type: ignore[arg-type]
     with pytest.raises(MemoryError):
-        handoff._readings(tmp_path / "x_RPC.TXT", {"barpc": one}, lambda _, read: (0.0, 0.0))
+        verify_outputs._consumer_readings(tmp_path / "x_RPC.TXT", {"barpc": one}, lambda _, read: (0.0, 0.0))
 
 
 def test_a_worker_says_what_its_own_memory_is(monkeypatch) -> None:

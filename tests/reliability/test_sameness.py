@@ -203,8 +203,8 @@ def test_cameras_of_one_image_may_be_compared_with_others(scene, tmp_path):
 def test_images_that_are_nearly_empty_are_no_twins(scene, tmp_path, monkeypatch):
     """None is read whole, however many there are; a copy among them is found."""
     reads = []
-    whole = views._whole
-    monkeypatch.setattr(views, "_whole", lambda image, band: reads.append(image.name) or whole(image, band))
+    whole = views._whole_digest
+    monkeypatch.setattr(views, "_whole_digest", lambda image, band: reads.append(image.name) or whole(image, band))
     images = []
     for number in range(8):
 

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from barpc.base.errors import ImageError
-from barpc.base.remote import BLOCK, RemoteFile, hosts, located
-from barpc.base.sidefile import IMAGE, read_bytes, versioned
+from barpc.base.remote import REQUEST_BYTES, RemoteFile, hosts, located
+from barpc.base.safe_io import IMAGE, read_bytes, versioned
 from barpc.cameras import open_camera
 from barpc.pipeline import load_views
 
@@ -26,7 +26,7 @@ KEY = "Eby8vdM02xNOcqFlqUwJPLlmEtlCDXJ1OUzFT50uSRZ6IFsuFq2UVErCz4I6tq/K1SZFPTOtr
 
 
 def forget() -> None:
-    for cached in (hosts._store, hosts._pinned, hosts._listed):
+    for cached in (hosts._store, hosts._open_version, hosts._store_listing):
         cached.cache_clear()
     for module, name in (("gcsfs", "GCSFileSystem"), ("adlfs", "AzureBlobFileSystem")):
         if module in sys.modules:
@@ -116,13 +116,13 @@ def test_an_emulated_object_that_is_replaced_is_noticed_by_who_reads_it(scheme: 
 
     at = versioned(located(f"{scheme}://scenes/a/view_01.tif", [f"{scheme}://scenes"]), IMAGE)
     with RemoteFile(at) as file:
-        file.read(BLOCK)
-        file.seek(3 * BLOCK)
-        file.read(BLOCK)
+        file.read(REQUEST_BYTES)
+        file.seek(3 * REQUEST_BYTES)
+        file.read(REQUEST_BYTES)
         fsspec.filesystem(scheme).pipe_file("scenes/a/view_01.tif", bytes(at.size or 0))
-        file.seek(9 * BLOCK)
+        file.seek(9 * REQUEST_BYTES)
         with pytest.raises(OSError, match="changed in its store"):
-            file.read(BLOCK)
+            file.read(REQUEST_BYTES)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -158,7 +158,7 @@ class Stub:
         return self
 
     def info(self, _url: str) -> dict[str, Any]:
-        return {"size": 4 * BLOCK, "etag": self.tags.pop(0) if len(self.tags) > 1 else self.tags[0]}
+        return {"size": 4 * REQUEST_BYTES, "etag": self.tags.pop(0) if len(self.tags) > 1 else self.tags[0]}
 
     def seek(self, position: int) -> None:
         self.position = position
@@ -178,7 +178,7 @@ def test_a_version_is_looked_at_after_each_read_where_the_store_does_not_hold_it
     monkeypatch.setattr(hosts, "_store", lambda _scheme: stub)
     at = located(f"{scheme}://b/stub-{scheme}.tif", [f"{scheme}://b"])
     assert hosts.fetch(at, 0, 10).tag == "1"
-    pinned = type(at)(str(at), 4 * BLOCK, "1")
+    pinned = type(at)(str(at), 4 * REQUEST_BYTES, "1")
     assert hosts.fetch(pinned, 0, 10).data == bytes(10)
     if noticed:
         with pytest.raises(OSError, match="changed in its store"):
@@ -203,4 +203,4 @@ def test_what_a_store_says_is_cut_to_its_first_line() -> None:
         raise ValueError("\nrefused\n<xml>\n  <RequestId>1</RequestId>")
 
     with pytest.raises(OSError, match=r"^its store answers ValueError: refused$"):
-        hosts._told(ask)
+        hosts._store_answer(ask)

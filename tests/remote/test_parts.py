@@ -14,9 +14,20 @@ from typing import Any
 import pytest
 
 from barpc.base import remote
-from barpc.base.remote import BLOCK, Part, Remote, RemoteFile, _Blocks, _runs, beside, hosts, is_url, location
+from barpc.base.remote import (
+    REQUEST_BYTES,
+    Part,
+    Remote,
+    RemoteFile,
+    _BlockCache,
+    _runs,
+    beside,
+    hosts,
+    is_url,
+    location,
+)
 
-AT = Remote("https://a.org/b/x.tif", 20 * BLOCK + 5, "one")
+AT = Remote("https://a.org/b/x.tif", 20 * REQUEST_BYTES + 5, "one")
 
 
 # --- names ------------------------------------------------------------------------------------------------
@@ -47,12 +58,12 @@ def test_a_file_has_the_version_that_it_is_found_to_have(monkeypatch):
 
     def fetch(at, start, stop):
         asked.append((start, stop))
-        return Part(b"x" * BLOCK, 7 * BLOCK, tag)
+        return Part(b"x" * REQUEST_BYTES, 7 * REQUEST_BYTES, tag)
 
-    monkeypatch.setattr(remote, "_fetch", fetch)
+    monkeypatch.setattr(remote, "_fetch_part", fetch)
     tag = "v"
     found = remote.pinned(Remote("https://a.org/new.tif"))
-    assert (found.size, found.tag, asked) == (7 * BLOCK, "v", [(0, BLOCK)])
+    assert (found.size, found.tag, asked) == (7 * REQUEST_BYTES, "v", [(0, REQUEST_BYTES)])
     assert RemoteFile(found).read(10) == b"x" * 10  # the first block is kept
     assert remote.pinned(found) is found
     assert len(asked) == 1
@@ -70,12 +81,12 @@ def asked(monkeypatch) -> list[tuple[int, int]]:
     parts: list[tuple[int, int]] = []
 
     def fetch(at, start, stop):
-        parts.append((start // BLOCK, -(-stop // BLOCK)))
-        data = b"".join(bytes([k]) * BLOCK for k in range(start // BLOCK, -(-stop // BLOCK)))
+        parts.append((start // REQUEST_BYTES, -(-stop // REQUEST_BYTES)))
+        data = b"".join(bytes([k]) * REQUEST_BYTES for k in range(start // REQUEST_BYTES, -(-stop // REQUEST_BYTES)))
         return Part(data[: stop - start], AT.size or 0, "one")
 
-    monkeypatch.setattr(remote, "_fetch", fetch)
-    monkeypatch.setattr(remote, "_blocks", _Blocks())
+    monkeypatch.setattr(remote, "_fetch_part", fetch)
+    monkeypatch.setattr(remote, "_blocks", _BlockCache())
     return parts
 
 
@@ -83,22 +94,25 @@ def test_what_is_read_here_and_there_is_asked_for_block_by_block(asked):
     file = RemoteFile(AT)
     assert (file.readable(), file.seekable()) == (True, True)
     for where in (9, 3, 15):
-        assert file.seek(where * BLOCK + 7) == where * BLOCK + 7
+        assert file.seek(where * REQUEST_BYTES + 7) == where * REQUEST_BYTES + 7
         assert file.read(2) == bytes([where]) * 2
     assert asked == [(9, 10), (3, 4), (15, 16)]
     assert file._ahead == 0
-    file.seek(2 * BLOCK)
-    assert file.read(3 * BLOCK) == bytes([2]) * BLOCK + bytes([3]) * BLOCK + bytes([4]) * BLOCK
+    file.seek(2 * REQUEST_BYTES)
+    assert (
+        file.read(3 * REQUEST_BYTES)
+        == bytes([2]) * REQUEST_BYTES + bytes([3]) * REQUEST_BYTES + bytes([4]) * REQUEST_BYTES
+    )
     assert asked[3:] == [(2, 3), (4, 5)]  # not the one that it has
-    file.seek(2 * BLOCK - 1)
+    file.seek(2 * REQUEST_BYTES - 1)
     assert file.read(2) == b"\1\2"
     assert asked[5:] == [(1, 2)]
 
 
 def test_a_file_that_is_read_in_a_row_is_asked_for_twice_as_much_each_time(asked):
     file = RemoteFile(AT)
-    data = [file.read(BLOCK) for _ in range(20)]
-    assert data == [bytes([k]) * BLOCK for k in range(20)]
+    data = [file.read(REQUEST_BYTES) for _ in range(20)]
+    assert data == [bytes([k]) * REQUEST_BYTES for k in range(20)]
     assert file.read(99) == bytes([20]) * 5  # its end
     assert file.read(99) == b""
     assert asked == [(0, 2), (2, 6), (6, 14), (14, 21)]
@@ -109,29 +123,29 @@ def test_no_more_than_a_mebibyte_is_read_ahead_and_nothing_that_is_there(asked, 
     file._ahead = remote._AHEAD
     file.read(1)
     assert asked == [(0, 17)]  # one, and sixteen ahead
-    blocks = _Blocks()
+    blocks = _BlockCache()
     monkeypatch.setattr(remote, "_blocks", blocks)
-    blocks.put((str(AT), AT.size, AT.tag, 4), b"\4" * BLOCK)
+    blocks.put((str(AT), AT.size, AT.tag, 4), b"\4" * REQUEST_BYTES)
     file = RemoteFile(AT)
     file._ahead = remote._AHEAD
-    assert file.read(5 * BLOCK)[-1] == 4
+    assert file.read(5 * REQUEST_BYTES)[-1] == 4
     assert asked[1:] == [(0, 4)]
 
 
 def test_a_place_is_counted_from_the_start_from_here_or_from_the_end(asked):
     file = RemoteFile(AT)
-    assert file.seek(-4, os.SEEK_END) == 20 * BLOCK + 1
-    assert file.seek(2, os.SEEK_CUR) == 20 * BLOCK + 3
+    assert file.seek(-4, os.SEEK_END) == 20 * REQUEST_BYTES + 1
+    assert file.seek(2, os.SEEK_CUR) == 20 * REQUEST_BYTES + 3
     assert file.read() == bytes([20]) * 2
     assert file.seek(-10) == 0
-    assert file.seek(99 * BLOCK) == 99 * BLOCK
+    assert file.seek(99 * REQUEST_BYTES) == 99 * REQUEST_BYTES
     assert file.read(5) == b""
-    assert file.tell() == 20 * BLOCK + 5
+    assert file.tell() == 20 * REQUEST_BYTES + 5
     assert io.BufferedReader(RemoteFile(AT)).read(3) == b"\0\0\0"
 
 
 def test_a_file_that_changed_is_noticed(asked):
-    for other in (Remote(str(AT), AT.size, "two"), Remote(str(AT), (AT.size or 0) + BLOCK, "one")):
+    for other in (Remote(str(AT), AT.size, "two"), Remote(str(AT), (AT.size or 0) + REQUEST_BYTES, "one")):
         with pytest.raises(OSError, match="changed on its host"):
             RemoteFile(other).read(1)
 
@@ -140,7 +154,7 @@ def test_blocks_are_asked_for_together_but_not_more_than_eight_mebibytes():
     assert list(_runs([3])) == [range(3, 4)]
     assert list(_runs([1, 2, 4, 7, 8])) == [range(1, 3), range(4, 5), range(7, 9)]
     assert [len(run) for run in _runs(list(range(300)))] == [128, 128, 44]
-    assert (remote.BLOCK, remote._AHEAD, remote._LONGEST, remote._KEPT) == (
+    assert (remote.REQUEST_BYTES, remote._AHEAD, remote._MAX_REQUEST_BYTES, remote._CACHE_BYTES) == (
         1 << 16,
         1 << 20,
         8 << 20,
@@ -149,8 +163,8 @@ def test_blocks_are_asked_for_together_but_not_more_than_eight_mebibytes():
 
 
 def test_the_blocks_that_were_used_last_are_kept(monkeypatch):
-    monkeypatch.setattr(remote, "_KEPT", 30)
-    blocks = _Blocks()
+    monkeypatch.setattr(remote, "_CACHE_BYTES", 30)
+    blocks = _BlockCache()
     keys: list[Any] = [("x", 1, "t", k) for k in range(5)]
     for key in keys[:3]:
         blocks.put(key, b"0123456789")
@@ -167,10 +181,10 @@ def test_web_servers_and_stores_are_asked_in_their_own_ways(monkeypatch):
     monkeypatch.setattr(hosts, "_from_server", lambda *args: ("web", *args))
     monkeypatch.setattr(hosts, "_from_store", lambda *args: ("store", *args))
     monkeypatch.setattr(hosts, "_there", lambda at: at.endswith("a"))
-    monkeypatch.setattr(hosts, "_listed", lambda folder, _: ("A", "b"))
+    monkeypatch.setattr(hosts, "_store_listing", lambda folder, _: ("A", "b"))
     store = Remote("s3://b/x")
-    assert remote._fetch(AT, 1, 2) == ("web", AT, 1, 2)
-    assert remote._fetch(store, 1, 2) == ("store", store, 1, 2)
+    assert remote._fetch_part(AT, 1, 2) == ("web", AT, 1, 2)
+    assert remote._fetch_part(store, 1, 2) == ("store", store, 1, 2)
     assert beside(AT, ["a"]) == {"a": "a"}
     assert beside(store, ["a"]) == {"a": "A"}
 
@@ -275,7 +289,7 @@ def test_what_is_compressed_is_refused():
 def test_it_is_asked_four_times_with_longer_waits(monkeypatch):
     waited: list[float] = []
     monkeypatch.setattr(hosts.time, "sleep", waited.append)
-    monkeypatch.setattr(hosts, "_moved", lambda *_: (_ for _ in ()).throw(hosts._PassingError("no")))
+    monkeypatch.setattr(hosts, "_fetch_redirected", lambda *_: (_ for _ in ()).throw(hosts._PassingError("no")))
     with pytest.raises(OSError, match="no; asked 4 times"):
         hosts.fetch(AT, 0, 1)
     assert waited == [0.0, 0.5, 2.0]
@@ -291,18 +305,18 @@ def test_three_moves_are_too_many_and_none_leads_to_another_host(monkeypatch):
     monkeypatch.setattr(hosts, "_once", once)
     part = Part(b"", 0, "")
     answers: list[Any] = ["/1", "2", part]
-    assert hosts._moved(AT, 0, 1) is part
+    assert hosts._fetch_redirected(AT, 0, 1) is part
     assert seen == ["https://a.org/b/x.tif", "https://a.org/1", "https://a.org/2"]
     answers = ["/1", "/2", "/3", part]
     with pytest.raises(OSError, match="on and on"):
-        hosts._moved(AT, 0, 1)
+        hosts._fetch_redirected(AT, 0, 1)
     for address in ("http://a.org/x", "https://b.org/x", "//b.org/x"):
         answers = [address, part]
         with pytest.raises(OSError, match="not followed"):
-            hosts._moved(AT, 0, 1)
+            hosts._fetch_redirected(AT, 0, 1)
     answers = ["https://b.org/" + "x" * 900]
     with pytest.raises(OSError, match="not followed") as caught:
-        hosts._moved(AT, 0, 1)
+        hosts._fetch_redirected(AT, 0, 1)
     assert len(str(caught.value)) < 300
 
 
@@ -433,7 +447,7 @@ def test_a_request_has_a_time_that_grows_with_its_bytes(made, monkeypatch):
     monkeypatch.setattr(hosts.threading, "Timer", Timer)
     hosts._once("https://a.org/x", 10, 14)
     assert [given[0][0], *given[1:]] == [30.0 + 4 / 10_000, "start", "cancel"]
-    assert given[0][1] is hosts._cut
+    assert given[0][1] is hosts._shut_down
     assert given[0][2][0] is None
 
 
@@ -470,7 +484,7 @@ def test_side_files_are_asked_for_as_named_and_with_their_ending_in_lower_case(m
         return Part(b"", 0, "")
 
     monkeypatch.setattr(hosts, "fetch", fetch)
-    found = hosts.beside(AT, ["img_RPC.TXT", "img.RPB", "img.xml", "img_RPC.geom"])
+    found = hosts.present_beside(AT, ["img_RPC.TXT", "img.RPB", "img.xml", "img_RPC.geom"])
     assert sorted(tried) == [
         "img.RPB",
         "img.rpb",
@@ -482,7 +496,7 @@ def test_side_files_are_asked_for_as_named_and_with_their_ending_in_lower_case(m
     ]
     assert found == {"img_rpc.txt": "img_rpc.txt", "img.rpb": "img.RPB", "img_rpc.geom": "img_RPC.geom"}
     present.add("img.rpb")
-    assert hosts.beside(AT, ["img.RPB"]) == {"img.rpb": "img.RPB"}  # the name as it is goes first
+    assert hosts.present_beside(AT, ["img.RPB"]) == {"img.rpb": "img.RPB"}  # the name as it is goes first
 
 
 # --- object stores ----------------------------------------------------------------------------------------
@@ -533,7 +547,7 @@ class Shelf:
 def shelf(monkeypatch) -> Shelf:
     found = Shelf(x=b"0123456789", Y_RPC=b"", Z=b"")
     monkeypatch.setattr(hosts, "_store", lambda _: found)
-    for cached in (hosts._pinned, hosts._listed):
+    for cached in (hosts._open_version, hosts._store_listing):
         cached.cache_clear()
     return found
 
@@ -581,12 +595,12 @@ def test_the_files_beside_an_object_are_listed_once_a_minute(shelf, monkeypatch)
     now = [0.0]
     monkeypatch.setattr(hosts.time, "monotonic", lambda: now[0])
     at = Remote("s3://b/x")
-    assert hosts.beside(at, ["y_rpc", "X", "other"]) == {"y_rpc": "Y_RPC", "x": "x"}
+    assert hosts.present_beside(at, ["y_rpc", "X", "other"]) == {"y_rpc": "Y_RPC", "x": "x"}
     now[0] = 59.0
-    hosts.beside(at, ["z"])
+    hosts.present_beside(at, ["z"])
     assert shelf.asked == [("ls", "s3://b", False)]
     now[0] = 61.0
-    assert hosts.beside(at, ["z"]) == {"z": "Z"}
+    assert hosts.present_beside(at, ["z"]) == {"z": "Z"}
     assert len(shelf.asked) == 2
 
 

@@ -22,10 +22,10 @@ from rasterio.windows import Window
 import barpc
 from barpc.base.errors import BarpcError, ImageError, InputError, RpcError
 from barpc.base.frozen import from_arrays, to_arrays
-from barpc.base.identity import take
+from barpc.base.identity import fingerprint
 from barpc.base.options import RunOptions, TieOptions, read_options, schema
-from barpc.base.remote import BLOCK, Remote, RemoteFile, hosts, located, pinned
-from barpc.base.sidefile import IMAGE, RPC_FILE, read_bytes, read_head, versioned
+from barpc.base.remote import REQUEST_BYTES, Remote, RemoteFile, hosts, located, pinned
+from barpc.base.safe_io import IMAGE, RPC_FILE, read_bytes, read_head, versioned
 from barpc.cameras import open_camera, open_split, split_spec
 from barpc.pipeline import load_views
 from barpc.pipeline.inputs import input_files, with_located
@@ -200,7 +200,7 @@ def test_a_window_of_a_large_image_costs_its_blocks_alone(server: Web) -> None:
     with open_raster(at) as dataset:
         assert (dataset.read(1, window=window) == pixels[700:900, 600:900]).all()
     tiles, tile = 2 * 2, 256 * 256 * 2
-    assert tiles * tile * 0.7 < server.counts["bytes"] < tiles * (tile + 2 * BLOCK) + 2 * BLOCK
+    assert tiles * tile * 0.7 < server.counts["bytes"] < tiles * (tile + 2 * REQUEST_BYTES) + 2 * REQUEST_BYTES
     before = server.counts["requests"]
     with open_raster(at) as dataset:  # what the process holds is not asked again
         dataset.read(1, window=window)
@@ -208,12 +208,12 @@ def test_a_window_of_a_large_image_costs_its_blocks_alone(server: Web) -> None:
 
 
 def test_a_file_is_read_as_any_file_is(server: Web) -> None:
-    content = np.random.default_rng(1).integers(0, 256, 5 * BLOCK + 77, np.uint8).tobytes()
+    content = np.random.default_rng(1).integers(0, 256, 5 * REQUEST_BYTES + 77, np.uint8).tobytes()
     (server.folder / "x").write_bytes(content)
     file = RemoteFile(located(server.url("x"), (server.host,)))  # type: ignore[arg-type]
     rng = np.random.default_rng(2)
-    for start, length in [(0, 10), (BLOCK - 1, 2), (len(content) - 5, 99), (len(content) + 9, 4), (3, 0)] + [
-        (int(rng.integers(len(content))), int(rng.integers(3 * BLOCK))) for _ in range(50)
+    for start, length in [(0, 10), (REQUEST_BYTES - 1, 2), (len(content) - 5, 99), (len(content) + 9, 4), (3, 0)] + [
+        (int(rng.integers(len(content))), int(rng.integers(3 * REQUEST_BYTES))) for _ in range(50)
     ]:
         file.seek(start)
         assert file.read(length) == content[start : start + length]
@@ -249,11 +249,11 @@ def test_a_file_beside_an_image_is_found_as_on_disk(samples: Web, tmp_path: Path
 
 def test_results_belong_to_the_version_that_a_host_names(samples: Web) -> None:
     def of(name: str) -> str:
-        return take(pinned(located(samples.url(name), (samples.host,)))).key  # type: ignore[arg-type]
+        return fingerprint(pinned(located(samples.url(name), (samples.host,)))).key  # type: ignore[arg-type]
 
     first = of(NAMES[0])
     assert of(NAMES[0]) == first != of(NAMES[1])
-    assert samples.counts["bytes"] <= 3 * BLOCK  # no content
+    assert samples.counts["bytes"] <= 3 * REQUEST_BYTES  # no content
     samples.tag = '"two"'
     second = of(NAMES[0])
     assert second != first
@@ -420,7 +420,9 @@ def test_no_pixels_are_made_of_a_file_whose_host_dies(server: Web, kind: str) ->
 
 def test_a_side_file_that_never_ends_is_refused_by_its_size(server: Web) -> None:
     def mood(handler: Any, part: bytes, start: int, _stop: int, _size: int) -> bool:
-        handler.answer(206, b"x" * BLOCK, ETag="x", Content_Range=f"bytes {start}-{start + BLOCK - 1}/{10**15}")
+        handler.answer(
+            206, b"x" * REQUEST_BYTES, ETag="x", Content_Range=f"bytes {start}-{start + REQUEST_BYTES - 1}/{10**15}"
+        )
         return True
 
     server.mood = mood

@@ -16,7 +16,7 @@ import barpc
 from barpc.base.errors import ImageError
 from barpc.base.options import RunOptions, TieOptions
 from barpc.base.remote import hosts, located
-from barpc.base.sidefile import IMAGE, read_bytes, versioned
+from barpc.base.safe_io import IMAGE, read_bytes, versioned
 from barpc.cameras import open_camera
 from barpc.pipeline import load_views
 from barpc.rasters.raster import open_raster
@@ -56,7 +56,7 @@ def store(server: str, monkeypatch: pytest.MonkeyPatch) -> Store:
     names = {"AWS_ENDPOINT_URL": server, "AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "y"}
     for name, value in {**names, "AWS_DEFAULT_REGION": "us-east-1"}.items():
         monkeypatch.setenv(name, value)
-    for cached in (hosts._store, hosts._pinned, hosts._listed):
+    for cached in (hosts._store, hosts._open_version, hosts._store_listing):
         cached.cache_clear()
     client = boto3.client("s3")
     if not any(bucket["Name"] == "scenes" for bucket in client.list_buckets()["Buckets"]):

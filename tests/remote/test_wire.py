@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from barpc.base.remote import BLOCK, Part, Remote, hosts
+from barpc.base.remote import REQUEST_BYTES, Part, Remote, hosts
 from barpc.pipeline import load_views
 from tests.remote.conftest import Web
 
@@ -71,7 +71,7 @@ def fetched(monkeypatch):
             return made
 
         monkeypatch.setattr(hosts, "_connection", connection)
-        return hosts.fetch(AT, 0, BLOCK)
+        return hosts.fetch(AT, 0, REQUEST_BYTES)
 
     monkeypatch.setattr(hosts, "WAITS", ())
     monkeypatch.setattr(hosts, "_idle", {})
@@ -80,20 +80,20 @@ def fetched(monkeypatch):
 
 FOUL: dict[str, Iterable[bytes]] = {
     "a negative chunk": [CHUNKED, b"-5\r\nhello\r\n", END],
-    "a chunk of -1 bytes, which reads to the end": endless(CHUNKED + b"-1\r\n", b"x" * BLOCK),
+    "a chunk of -1 bytes, which reads to the end": endless(CHUNKED + b"-1\r\n", b"x" * REQUEST_BYTES),
     "a negative chunk behind good ones": [CHUNKED, b"8000\r\n", DATA[:32768], b"\r\n-8000\r\n", DATA, b"\r\n", END],
     "a size that is no number": [CHUNKED, b"zz\r\nhello\r\n", END],
     "no size": [CHUNKED, b"\r\n\r\n"],
-    "a size without end": endless(CHUNKED, b"f" * BLOCK),
+    "a size without end": endless(CHUNKED, b"f" * REQUEST_BYTES),
     "a truncated chunk": [CHUNKED, b"10000\r\nabc"],
     "fewer chunks than were said": [CHUNKED, b"10\r\n", DATA[:16], b"\r\n", END],
     "extensions without end": endless(CHUNKED, b"1;" + b"e" * 60000 + b"\r\nx\r\n"),
     "headers without end": endless(HEAD, b"X-A: b\r\n"),
-    "a header without end": endless(HEAD + b"X: ", b"a" * BLOCK),
-    "a status without end": endless(b"HTTP/1.1 206 ", b"a" * BLOCK),
+    "a header without end": endless(HEAD + b"X: ", b"a" * REQUEST_BYTES),
+    "a status without end": endless(b"HTTP/1.1 206 ", b"a" * REQUEST_BYTES),
     "one that goes on and on": endless(b"", b"HTTP/1.1 100 Continue\r\n\r\n"),
     "the words of a missing file without end": endless(
-        b"HTTP/1.1 404 No\r\nTransfer-Encoding: chunked\r\n\r\n-1\r\n", b"x" * BLOCK
+        b"HTTP/1.1 404 No\r\nTransfer-Encoding: chunked\r\n\r\n-1\r\n", b"x" * REQUEST_BYTES
     ),
     "a status that is none": [b"HTTP/1.1 99999 OK\r\n\r\n"],
     "no HTTP": [b"\x15\x03\x01\x00\x02\x02P"],
@@ -147,7 +147,7 @@ def test_damaged_answers_give_the_bytes_that_were_asked_or_an_oserror(fetched):
             outcomes.add(len(found.data))
         except OSError as error:
             outcomes.add(str(error)[:12])
-    assert {0, BLOCK} == {one for one in outcomes if isinstance(one, int)}
+    assert {0, REQUEST_BYTES} == {one for one in outcomes if isinstance(one, int)}
     assert len(outcomes) > 3
 
 

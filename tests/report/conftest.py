@@ -14,7 +14,7 @@ from barpc.base.options import RunOptions
 from barpc.fit import fit_rpc
 from barpc.pipeline.outputs import write_tables
 from barpc.report import Run, Summary
-from barpc.report.records import plain
+from barpc.report.records import json_form
 from barpc.rpcio import write_rpc
 from barpc.scene import View
 from barpc.sensor.geometry import camera_center
@@ -59,7 +59,7 @@ def run_of_block(
 
 def summarize(run: Run) -> dict[str, Any]:
     """What summary.json holds of a run."""
-    return plain(report.summarize(run))
+    return json_form(report.summarize(run))
 
 
 def written(run: Run, folder: Path) -> dict[str, Any]:
@@ -69,7 +69,7 @@ def written(run: Run, folder: Path) -> dict[str, Any]:
         summary = write_tables(workspace, run, summary)
         for view, fit in zip(run.views, run.fits, strict=bool(run.fits)):
             write_rpc(fit.rpc, folder / f"{view.name}_RPC.TXT", overwrite=True)
-    return plain(summary)
+    return json_form(summary)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from barpc.base.geodesy import Array
 from barpc.report.runfiles import ObservationTable, RunFiles
 from barpc.report.summary import SCHEMA, Summary, TablesEntry, TracksEntry
-from barpc.report.summary.known import GcpEntry
+from barpc.report.summary.ground_points import GcpEntry
 from barpc.report.summary.pairs import OffsetEntry, PairEntry
 from barpc.report.summary.views import CorrectionEntry, ViewEntry
 

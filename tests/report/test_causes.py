@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.apart import APART, Apart
+from barpc.ba.apart import FOREIGN_CAMERA, ForeignCamera
 from barpc.ba.evidence.scan import Interval
-from barpc.ba.judging.explanations import EXPLANATIONS, FADE, MOVING, SETTLING, STRIP, SWING, WANDER
+from barpc.ba.judging.explanations import EXPLANATIONS, FADE, MOVING, STRIP, SWING, TRANSIENT, WANDER
 from barpc.ba.judging.judge import Finding
 from barpc.ba.judging.moving import Motion
-from barpc.ba.placing import Look
+from barpc.ba.resection import RpcDiagnosis
 from barpc.report import verdict
-from barpc.report.summary.whole import _WORDS, explanations, left_entries, strangeness
+from barpc.report.summary.block import _EXPLANATION_SENTENCES, explanations, left_entries, strangeness
 
 NAMES = "west", "east"
 
@@ -34,7 +34,7 @@ def reasons(found: Any) -> list[str]:
 
 
 def test_every_explanation_has_its_words() -> None:
-    assert {*EXPLANATIONS, SWING} == set(_WORDS)
+    assert {*EXPLANATIONS, SWING} == set(_EXPLANATION_SENTENCES)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_a_swing_is_said_with_its_period_and_whose_it_may_be(names, or_of, sente
 def test_images_that_settle_alike_are_said_once(rate: float, end: str) -> None:
     places = (1, -6000.0, 12000.0, 0.0, rate), (1, -3000.0, 6000.0, 0.0, rate)
     sizes = np.array([3.0, 4.0]), np.array([0.0, 1.0])
-    each = [Finding(SETTLING, v, places[v], sizes[v], 90.0, 40.0, "moving", sizes[v]) for v in (0, 1)]
+    each = [Finding(TRANSIENT, v, places[v], sizes[v], 90.0, 40.0, "moving", sizes[v]) for v in (0, 1)]
     (entry,) = explanations(adjustment(findings=each))
     assert entry.sentence == (f"rows at the {end} of all images lie off, by up to 5.00 px, which fades within 100 rows")
     assert (entry.image, entry.gain, entry.runner_up, entry.size_px) == (None, 90.0, "moving", 5.0)
@@ -163,22 +163,22 @@ def test_rows_of_which_most_ties_move_may_be_what_is_off() -> None:
     )
 
 
-def apart_of(look: Look, **given: Any) -> Apart:
-    return Apart((1,), 420.0, 17.0, 0, 0.987, look, None, **given)
+def apart_of(look: RpcDiagnosis, **given: Any) -> ForeignCamera:
+    return ForeignCamera((1,), 420.0, 17.0, 0, 0.987, look, None, **given)
 
 
 @pytest.mark.parametrize(
     ("look", "share", "said"),
     [
-        (Look(swapped=True), 1.0, "with its axes swapped, samples taken for lines, it would agree"),
-        (Look(np.array([400.0, -9.0])), 1.0, "moved by -400.0 columns and +9.0 rows it would agree"),
+        (RpcDiagnosis(swapped=True), 1.0, "with its axes swapped, samples taken for lines, it would agree"),
+        (RpcDiagnosis(np.array([400.0, -9.0])), 1.0, "moved by -400.0 columns and +9.0 rows it would agree"),
         (
-            Look(np.array([0.0, 9.0]), -48.0), 1.0,
+            RpcDiagnosis(np.array([0.0, 9.0]), -48.0), 1.0,
             "moved by +0.0 columns and -9.0 rows, or with its heights moved by +48 m, it would agree",
         ),
-        (Look(), 0.987, "more than 98 % of its tie points contradict"),
-        (Look(), 1.0, "all of its tie points contradict"),
-        (Look(as_stated=True), 0.61, "more than 61 % of its tie points contradict"),
+        (RpcDiagnosis(), 0.987, "more than 98 % of its tie points contradict"),
+        (RpcDiagnosis(), 1.0, "all of its tie points contradict"),
+        (RpcDiagnosis(as_stated=True), 0.61, "more than 61 % of its tie points contradict"),
     ],
 )  # fmt: skip
 def test_a_strange_rpc_is_said_with_what_it_looks_like(look, share, said) -> None:
@@ -186,17 +186,17 @@ def test_a_strange_rpc_is_said_with_what_it_looks_like(look, share, said) -> Non
 
 
 def test_of_a_view_that_lies_where_it_is_stated_to_the_rpc_is_not_blamed_alone() -> None:
-    clouds = apart_of(Look(as_stated=True))
+    clouds = apart_of(RpcDiagnosis(as_stated=True))
     assert strangeness(clouds).endswith("as delivered it meets them to what is stated of it")
     (one,) = explanations(adjustment(apart=clouds))
     assert one.sentence.startswith("many tie points of east are wrong, or its RPC is not its own: ")
 
 
 def test_a_strange_rpc_is_an_explanation_where_it_is_clear() -> None:
-    clear = apart_of(Look(swapped=True))
+    clear = apart_of(RpcDiagnosis(swapped=True))
     (one,) = explanations(adjustment(apart=clear))
     assert (one.name, one.image, one.gain, one.gap, one.runner_up) == (
-        APART,
+        FOREIGN_CAMERA,
         "east",
         420.0,
         17.0,

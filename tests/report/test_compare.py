@@ -12,8 +12,8 @@ from click.testing import CliRunner
 
 from barpc.base.errors import InputError
 from barpc.cli import cli
-from barpc.report.compare import _lines, _pairs, _view, compare_runs, flat_options
-from barpc.report.records import plain
+from barpc.report.compare import _compared_pairs, _comparison_lines, _view, compare_runs, flat_options
+from barpc.report.records import json_form
 from barpc.rpcio import read_rpc, write_rpc
 from tests.rpcio.conftest import make_rpc
 
@@ -84,14 +84,14 @@ def rows(*found):
 def test_what_is_said_of_two_runs():
     views = rows(("A", (1.0, 0.1), 3.0, 0.5), ("B", (3.0, 0.3), 4.0, 0.25), ("C", (2.0, 0.2), None, None))
     options = [{"option": "tie.band", "values": [1, None]}]
-    found = _lines({"views": views, "only_a": ["X", "Y"], "only_b": [], "options": options})
+    found = _comparison_lines({"views": views, "only_a": ["X", "Y"], "only_b": [], "options": options})
     assert found == [
         "3 images in both: their tie points agree to 2.000 px in A, 0.200 px in B.",
         "Their RPCs differ by up to 4 px (B), by 0.5 px once the mean shift of each image is taken away.",
         "In A alone: X, Y.",
         "Option tie.band: 1 in A, None in B.",
     ]
-    assert len(_lines({"views": views[2:], "only_a": [], "only_b": ["Z"], "options": []})) == 2
+    assert len(_comparison_lines({"views": views[2:], "only_a": [], "only_b": ["Z"], "options": []})) == 2
 
 
 def test_each_run_s_error_is_that_of_its_last_cameras(tmp_path):
@@ -118,7 +118,7 @@ def test_where_the_first_of_two_cameras_sees_no_ground_no_difference_is_told(tmp
 def test_pairs_in_both_are_set_side_by_side_with_their_last_offsets():
     a = a_summary([], [a_pair("A", "B", 5, epipolar_after=None), a_pair("A", "C"), a_pair("B", "C", 8)])
     b = a_summary([], [a_pair("B", "C", 9), a_pair("A", "B", 7)])
-    assert _pairs(a, b) == [
+    assert _compared_pairs(a, b) == [
         {"a": "A", "b": "B", "num_matches": [5, 7], "epipolar_rms": [0.4, 0.1]},
         {"a": "B", "b": "C", "num_matches": [8, 9], "epipolar_rms": [0.1, 0.1]},
     ]
@@ -132,7 +132,7 @@ def test_options_of_one_run_alone_count_and_those_without_effect_do_not(tmp_path
     ):
         summary = a_summary([a_view("A"), a_view(f"only {name}")], options=options)
         (tmp_path / name).mkdir()
-        (tmp_path / name / "summary.json").write_text(json.dumps(plain(summary)))
+        (tmp_path / name / "summary.json").write_text(json.dumps(json_form(summary)))
         both.append(tmp_path / name)
     found = compare_runs(*both)
     assert found["options"] == [

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.held.ground import TerrainTest
+from barpc.ba.constraints.ground import TerrainTest
 from barpc.report import page
 from barpc.report.page import decisions
 from barpc.report.summary import TracksEntry

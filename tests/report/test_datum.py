@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.held.gauge import SOURCES
-from barpc.ba.held.ground import TerrainTest
+from barpc.ba.constraints.gauge import SOURCES
+from barpc.ba.constraints.ground import TerrainTest
 from barpc.base.geodesy import DEFAULT, INFERRED, STATED, HeightDatum
 from barpc.report.datum import datum_reasons
 

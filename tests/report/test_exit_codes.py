@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barpc.ba.robust.consensus import TwoGroups
-from barpc.report.reservations import GOOD
+from barpc.report.quality_checks import PASSED_STATUS
 from barpc.report.summary import measure_run
 from barpc.report.summary.words import STATUS_WORDS
 from barpc.report.verdict import block_verdict
@@ -25,14 +25,14 @@ def verdict(block_run):
     run, measured = block_run.run, measure_run(block_run.run).views
 
     def said(status, kind="adjust", **changes):
-        views = [replace(view, status=GOOD[kind], advice="") for view in measured]
+        views = [replace(view, status=PASSED_STATUS[kind], advice="") for view in measured]
         views[1] = replace(views[1], status=status, advice=ADVICE.get(status, ""))
         return block_verdict(replace(run, kind=kind, **changes), views)
 
     return said
 
 
-@pytest.mark.parametrize(("kind", "status"), diagonal(GOOD, STATUS_WORDS))
+@pytest.mark.parametrize(("kind", "status"), diagonal(PASSED_STATUS, STATUS_WORDS))
 def test_every_status_of_an_image_decides_the_whole(status, kind, verdict):
     found = verdict(status, kind)
     assert found["status"] == OVERALL.get(status, "good")
@@ -43,9 +43,9 @@ def test_every_status_of_an_image_decides_the_whole(status, kind, verdict):
         assert "(of 9)" in found["headline"]
 
 
-@pytest.mark.parametrize("kind", GOOD)
+@pytest.mark.parametrize("kind", PASSED_STATUS)
 def test_a_file_that_was_left_out_never_passes(kind, verdict):
-    found = verdict(GOOD[kind], kind, left_out=(("bad.tif", "has no RPC"),))
+    found = verdict(PASSED_STATUS[kind], kind, left_out=(("bad.tif", "has no RPC"),))
     assert found["status"] == "bad"
     assert found["reasons"] == ["bad.tif was left out: has no RPC"]
 

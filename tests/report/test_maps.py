@@ -13,8 +13,8 @@ import pytest
 
 from barpc.report import maps
 from barpc.report.maps import Plane, ground_map, residual_cells, residual_panels
-from barpc.report.summary.known import CheckPointEntry
-from barpc.report.summary.whole import ExplanationEntry
+from barpc.report.summary.block import ExplanationEntry
+from barpc.report.summary.ground_points import CheckPointEntry
 
 from .made import (
     Drawing,
@@ -43,7 +43,7 @@ def drawn_graticule(plane: Plane) -> Drawing:
 
 
 def drawn_names(places, taken=()) -> Drawing:
-    return Drawing(f"<svg>{maps.template('drawings.svg.j2').module.names(maps._names(places, taken))}</svg>")
+    return Drawing(f"<svg>{maps.template('drawings.svg.j2').module.names(maps._map_labels(places, taken))}</svg>")
 
 
 def plane(height: float = 300.0, unit: float = 100.0) -> Plane:
@@ -203,13 +203,13 @@ def test_names_stand_in_the_sheet_and_on_nothing_and_long_ones_are_cut_to_their_
     places = [(a_view("view_0137"), np.array([2.0, 100.0])), (a_view("B"), np.array([419.0, 50.0]))]
     drawn = drawn_names(places)
     assert drawn.texts("name") == [("view_0137", 32.4, 104.0, "middle"), ("B", 416.4, 54.0, "middle")]
-    assert len(maps._names(places, [(30.0, 90.0, 20.0)])) == 1
+    assert len(maps._map_labels(places, [(30.0, 90.0, 20.0)])) == 1
     (long,) = drawn_names([(a_view(f"{'x' * 60}_0137"), np.array([210.0, 50.0]))]).texts("name")
     assert (long[0][0], long[0][-5:], len(long[0])) == ("…", "_0137", 16)
     for dx, dy, shown in ((7.3, 0.0, 2), (7.1, 0.0, 1), (0.0, 14.1, 2), (0.0, 13.9, 1)):
         assert (
             len(
-                maps._names(
+                maps._map_labels(
                     [(a_view("V"), np.array([50.0, 50.0])), (a_view("V"), np.array([50.0 + dx, 50.0 + dy]))], []
                 )
             )

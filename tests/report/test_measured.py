@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.robust.smooth import SmoothTest
+from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report import Run
 from barpc.report import outcome as runs
 from barpc.report.outcome import ControlResidual, pair_ties, triangulate_tracks
 from barpc.report.page import decisions
 from barpc.report.summary import measure_run
-from barpc.report.summary.known import GcpEntry, measure_control, measure_gcps, measure_reference
-from barpc.report.summary.views import _in_image, ce90, cell_numbers, rmse_by_view
-from barpc.report.summary.whole import _asked
+from barpc.report.summary.block import _asked
+from barpc.report.summary.ground_points import GcpEntry, measure_control, measure_gcps, measure_reference
+from barpc.report.summary.views import _image_correction_entry, ce90, cell_numbers, rmse_by_view
 from barpc.scene import Tracks
-from barpc.sensor.displaced import RowSpline
 from barpc.sensor.geometry import epipolar_offset
+from barpc.sensor.image_corrections import RowSpline
 from barpc.tie.reference import ReferenceControl, ViewMatch
 from tests.distributions import norm
 
@@ -76,7 +76,7 @@ def test_a_copy_is_an_image_whose_matches_have_one_whole_shift():
     assert not copies(num=19)
     assert copies(others=2)  # nine of ten
     assert not copies(others=3)
-    assert (runs.WHOLE, runs.MOST, runs.FEWEST) == (0.05, 0.9, 20)
+    assert (runs.WHOLE_PIXEL_TOLERANCE, runs.MIN_WHOLE_SHARE, runs.FEWEST) == (0.05, 0.9, 20)
 
 
 def test_errors_of_a_view_are_the_root_of_the_mean_square_distance():
@@ -335,15 +335,15 @@ def test_decisions_end_with_the_test_of_control(block_run):
 def test_what_follows_in_the_image_is_the_rms_over_its_rows_and_of_its_steps():
     """A spline that is a straight line, from -3 px in the first row to 3 px in the last: over the root of three."""
     line = np.array([-9.0, -3.0, 3.0, 9.0])[:, None] * [0.6, 0.8]
-    assert _in_image(None) == {}
-    plain = _in_image(RowSpline(line, 500.0, 400.0))
+    assert _image_correction_entry(None) == {}
+    plain = _image_correction_entry(RowSpline(line, 500.0, 400.0))
     assert set(plain) == {"jitter_px", "jitter_rows"}
     assert plain["jitter_px"] == pytest.approx(3.0 / np.sqrt(3.0), rel=3e-3)
     assert plain["jitter_rows"] == 800.0
     steps = np.array([[0.0, 0.0], [3.0, 4.0], [0.0, -1.0]])
-    both = _in_image(RowSpline(line, 500.0, 400.0, np.array([99.5, 199.5]), steps))
+    both = _image_correction_entry(RowSpline(line, 500.0, 400.0, np.array([99.5, 199.5]), steps))
     assert both["jitter_px"] == plain["jitter_px"]  # the steps are no part of it
     assert both["detector_px"] == pytest.approx(np.sqrt(26.0 / 3.0))
     assert both["detectors"] == (100.0, 200.0)
-    alone = _in_image(RowSpline(np.zeros((0, 2)), 0.0, 1.0, np.array([9.5]), steps[:2]))
+    alone = _image_correction_entry(RowSpline(np.zeros((0, 2)), 0.0, 1.0, np.array([9.5]), steps[:2]))
     assert set(alone) == {"detector_px", "detectors"}

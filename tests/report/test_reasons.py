@@ -19,7 +19,7 @@ from barpc.base.options import TieOptions, declared
 from barpc.cli import COMMANDS, cli
 from barpc.cli.adjust import adjust
 from barpc.report.outcome import Run
-from barpc.report.reservations import view_status
+from barpc.report.quality_checks import view_status
 from barpc.report.summary.words import CAUSES, STATUS_WORDS
 from barpc.scene import Tracks
 

@@ -18,9 +18,9 @@ from barpc.report.records import (
     Number,
     Record,
     cell_of,
+    column,
     column_of,
-    plain,
-    said,
+    json_form,
     table,
     value_of,
 )
@@ -35,8 +35,8 @@ from .made import a_correction, a_pair, a_view
 class Part(Record):
     """A part."""
 
-    size: Number = said("How large", "m", "size", ".1f")
-    both: tuple[float, float] | None = said("Two", "px", ("one", "other"), ".2f", adjusted=True, default=None)
+    size: Number = column("How large", "m", "size", ".1f")
+    both: tuple[float, float] | None = column("Two", "px", ("one", "other"), ".2f", adjusted=True, default=None)
 
 
 class Whole(Record):
@@ -44,9 +44,9 @@ class Whole(Record):
 
     OWN: ClassVar = {"twice": Column("twice", lambda row: 2 * row.num, ".0f")}
 
-    num: int = said("How many", head="num")
-    part: Part | None = said("A part")
-    more: tuple[Part, ...] = said("Parts", default=())
+    num: int = column("How many", head="num")
+    part: Part | None = column("A part")
+    more: tuple[Part, ...] = column("Parts", default=())
 
 
 WHOLE = Whole(3, Part(1.5, (0.25, -1.0)), (Part(None),))
@@ -54,8 +54,8 @@ PLAIN = {"num": 3, "part": {"size": 1.5, "both": [0.25, -1.0]}, "more": [{"size"
 
 
 def test_a_record_is_written_without_what_is_optional_and_not_there():
-    assert plain(WHOLE) == PLAIN
-    assert plain(Whole(3, None)) == {"num": 3, "part": None, "more": []}
+    assert json_form(WHOLE) == PLAIN
+    assert json_form(Whole(3, None)) == {"num": 3, "part": None, "more": []}
 
 
 def test_a_record_comes_back_from_its_file_and_passes_over_what_it_does_not_know():
@@ -71,16 +71,16 @@ def test_what_is_not_finite_is_null_and_arrays_are_lists():
         "d": np.int32(4),
         "e": (True, "x"),
     }
-    assert plain(value) == {"1": None, "b": [[1.0, None]], "c": None, "d": 4, "e": [True, "x"]}
-    assert plain(float("-inf")) is None
-    assert plain(Part) == str(Part)
+    assert json_form(value) == {"1": None, "b": [[1.0, None]], "c": None, "d": 4, "e": [True, "x"]}
+    assert json_form(float("-inf")) is None
+    assert json_form(Part) == str(Part)
 
     @dataclass
     class Other:
         shown: int | None = None
         _hidden: int = 1
 
-    assert plain(Other()) == {"shown": None}  # of no record all fields are kept
+    assert json_form(Other()) == {"shown": None}  # of no record all fields are kept
 
 
 def test_the_schema_of_a_type():

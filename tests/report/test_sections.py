@@ -9,10 +9,10 @@ import pytest
 from barpc.report import page
 from barpc.report.runfiles import Draped, ReliefWindow
 from barpc.report.summary import StageEntry, TablesEntry, TracksEntry
-from barpc.report.summary.known import CheckPointEntry, ReferenceEntry, ReferenceViewEntry, SeenEntry
+from barpc.report.summary.block import DatumEntry, ModeEntry, SceneEntry
+from barpc.report.summary.ground_points import CheckPointEntry, ReferenceEntry, ReferenceViewEntry, SeenEntry
 from barpc.report.summary.pairs import OffsetEntry
 from barpc.report.summary.views import CenterEntry, EllipseEntry, FitEntry
-from barpc.report.summary.whole import DatumEntry, ModeEntry, SceneEntry
 
 from .made import a_correction, a_gcp, a_pair, a_square, a_summary, a_view, files_of, seen
 
@@ -24,7 +24,7 @@ VIEWS = [a_view("A"), a_view("B"), a_view("C")]
 def asked(name: str, views=VIEWS, pairs=(), outlines=(), observed=None, **fields):
     """The section that one of the page's functions makes."""
     files = files_of(a_summary(views, pairs, **fields), outlines, observed=observed)
-    return getattr(page, f"_{name}")(files)
+    return getattr(page, f"_{name}_section")(files)
 
 
 def texts(table) -> list[list[str]]:
@@ -376,10 +376,10 @@ def test_pairs_that_are_torn_are_first():
 @pytest.mark.parametrize(("nmad", "told"), [(0.25, True), (None, False)])
 def test_a_surface_is_shown_by_the_cameras_before_and_after_and_under_two_images(nmad, told):
     files = files_of(a_summary(VIEWS))
-    assert page._surface(files) is None
+    assert page._surface_section(files) is None
     before = ReliefWindow("delivered", (2, 2), 0.412, nmad, "QUJD")
     after = replace(before, cameras="corrected", share=0.933, nmad_m=0.5)
-    section = page._surface(replace(files, reliefs=(before, after)))
+    section = page._surface_section(replace(files, reliefs=(before, after)))
     said = "41 % of its cells have a height with the delivered cameras, 93 % with the corrected ones."
     assert said in section.answer
     assert ("differ by 25.0 cm and by 50.0 cm" in section.answer) == told
@@ -387,6 +387,6 @@ def test_a_surface_is_shown_by_the_cameras_before_and_after_and_under_two_images
         "The ground by the delivered cameras", "The ground by the corrected cameras",
     ]  # fmt: skip
     draped = tuple(Draped(name, (2, 2), "QUJD") for name in "AC")
-    (*_, (chart, words)) = page._surface(replace(files, reliefs=(before, after), draped=draped)).charts
+    (*_, (chart, words)) = page._surface_section(replace(files, reliefs=(before, after), draped=draped)).charts
     assert words.startswith("A (left) and C (right) on the surface by the corrected cameras: ")
     assert str(chart).count("QUJD") == 2

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.held.ground import TerrainTest
+from barpc.ba.constraints.ground import TerrainTest
 from barpc.ba.judging.snooping import ControlTest
 from barpc.ba.robust.consensus import TwoGroups
-from barpc.ba.robust.smooth import SmoothTest
-from barpc.report import reservations
+from barpc.ba.robust.systematic_residuals import SmoothTest
+from barpc.report import quality_checks
 from barpc.report import verdict as verdicts
 from barpc.report.outcome import Run
-from barpc.report.reservations import control_reasons, enu
+from barpc.report.quality_checks import control_reasons, enu
 from barpc.report.summary.views import FitEntry
 from barpc.report.verdict import block_verdict, view_status
 from barpc.scene import Tracks
@@ -72,13 +72,13 @@ def said(run: Any, of: Any = None) -> list[str]:
 
 def test_the_figures_that_decide():
     found = (
-        reservations.GOOD_RMSE,
-        reservations.FEW,
-        reservations.ENOUGH_GCPS,
+        quality_checks.GOOD_RMSE,
+        quality_checks.FEW,
+        quality_checks.ENOUGH_GCPS,
         verdicts.MANY_REJECTED,
     )
     assert found == (0.5, 30, 3, 0.3)
-    found = (reservations.SMOOTH_LEFT, verdicts.PRIOR_WIDENED, verdicts.NOISE_LIMIT, verdicts.SURELY)
+    found = (quality_checks.SMOOTH_LEFT, verdicts.PRIOR_WIDENED, verdicts.NOISE_LIMIT, verdicts.SURELY)
     assert found == (0.06, 2.0, 2.5, 3.0)
 
 

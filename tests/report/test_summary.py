@@ -14,7 +14,7 @@ from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.report import Run
 from barpc.report.outcome import pair_ties, triangulate_tracks
 from barpc.report.page import decisions
-from barpc.report.records import Number, plain, said, table
+from barpc.report.records import Number, column, json_form, table
 from barpc.report.runfiles import read_summary
 from barpc.report.summary import published_schema
 from barpc.report.summary.views import ViewEntry, moved_in_space
@@ -78,7 +78,7 @@ def test_the_summary_of_views_added_to_an_earlier_run_follows_the_schema():
     adjustment = adjust_tracks(block.views, block.tracks, prior=prior)
     record = report.summarize(Run("adjust", block.views, (), block.tracks, adjustment=adjustment))
     assert record.scene.drift_sigma_m == (None,)  # the earlier run's matrix has it
-    assert faults(json.loads(json.dumps(plain(record))), SCHEMA) == []
+    assert faults(json.loads(json.dumps(json_form(record))), SCHEMA) == []
     assert "as in the earlier run" in " ".join(decisions(record))
 
 
@@ -111,13 +111,13 @@ class Sharper(ViewEntry):
     PAGE: ClassVar = f"{ViewEntry.PAGE} sharpness_px"
     TERMINAL: ClassVar = f"{ViewEntry.TERMINAL} sharpness_px"
 
-    sharpness_px: Number = said("How sharp it is", "px", "sharpness", ".2f", default=None)
+    sharpness_px: Number = column("How sharp it is", "px", "sharpness", ".2f", default=None)
 
 
 def test_a_new_value_is_declared_once_and_stands_in_schema_file_and_tables(block_run):
     view = Sharper(**vars(block_run.record.views[0]), sharpness_px=0.125)
-    assert plain(view) == {**block_run.summary["views"][0], "sharpness_px": 0.125}
-    assert faults(plain(view), Sharper.json_schema()) == []
+    assert json_form(view) == {**block_run.summary["views"][0], "sharpness_px": 0.125}
+    assert faults(json_form(view), Sharper.json_schema()) == []
     told = Sharper.json_schema()["properties"]["sharpness_px"]
     assert told == {"type": ["number", "null"], "description": "How sharp it is [px]."}
     for columns in (Sharper.PAGE, Sharper.TERMINAL):
@@ -129,13 +129,13 @@ def test_an_older_summary_without_a_newer_value_is_read(block_run):
     older = block_run.summary["views"][0]
     assert faults(older, Sharper.json_schema()) == []
     assert Sharper.read(older).sharpness_px is None
-    assert plain(Sharper.read(older)) == older
+    assert json_form(Sharper.read(older)) == older
 
 
 def test_a_summary_read_from_its_file_is_the_one_that_was_written(block_run):
     read = read_summary(block_run.folder)
     assert read == block_run.record
-    assert plain(read) == json.loads((block_run.folder / "summary.json").read_text()) == block_run.summary
+    assert json_form(read) == json.loads((block_run.folder / "summary.json").read_text()) == block_run.summary
 
 
 def test_outliers_do_not_bend_the_points_that_errors_are_measured_at(block_run):

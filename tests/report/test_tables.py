@@ -16,19 +16,19 @@ from barpc.base.geodesy import ecef_from_ground, enu_basis
 from barpc.report import outcome as runs
 from barpc.report import runfiles as modules
 from barpc.report import summarize
-from barpc.report.records import plain
+from barpc.report.records import json_form
 from barpc.report.runfiles import (
-    OBSERVATIONS,
+    OBSERVATION_COLUMNS,
     RESIDUALS,
     TABLES,
-    _cell,
-    _columns,
     _floats,
-    _number,
-    _numbers,
-    _observations,
-    _outlines,
-    _points,
+    _formatted_cell,
+    _parse_observations,
+    _parse_outlines,
+    _parse_points,
+    _rounded,
+    _table_columns,
+    _track_numbers,
     gcps_geojson,
     read_tables,
     run_key,
@@ -64,7 +64,7 @@ def test_a_row_of_residuals_is_a_track_where_the_new_cameras_see_it(block_run):
 
 def test_observations_give_the_errors_of_the_summary_back(block_run):
     header, rows = rows_of(block_run.folder / "tables/observations.csv")
-    assert tuple(header) == OBSERVATIONS
+    assert tuple(header) == OBSERVATION_COLUMNS
     for view in block_run.summary["views"]:
         own = [row for row in rows if row[0] == view["name"] and row[8] == "1"]
         assert len(own) == view["num_observations"]
@@ -111,7 +111,7 @@ def test_the_same_run_gives_the_same_bytes(block_run):
     # tables and report count, too, once they are written
     again = replace(summarize(run), stages=summary.stages, inputs=summary.inputs, outputs=summary.outputs)
     assert again == summary
-    assert json.dumps(plain(again)) == json.dumps(block_run.summary)
+    assert json.dumps(json_form(again)) == json.dumps(block_run.summary)
     for name, content in TABLES.items():
         assert content(run, again) == (block_run.folder / "tables" / name).read_bytes(), name
 
@@ -145,22 +145,22 @@ def test_a_check_leaves_the_columns_of_new_cameras_empty(check_run):
 
 # --- read back --------------------------------------------------------------------------------------------
 
-HEAD, ROW = ",".join(OBSERVATIONS), "A,3,1.5,2.5,0.1,0.2,,,1"
+HEAD, ROW = ",".join(OBSERVATION_COLUMNS), "A,3,1.5,2.5,0.1,0.2,,,1"
 PLACES, PLACE = ",".join(RESIDUALS), "10,20,30,0.5,3,0.7,8"
 
 
 def test_observations_are_read_with_what_is_missing():
-    found = _observations(f"{HEAD}\nB,4,1,2,3,4,5,6,0\n{ROW}\n", ["A", "B"])
+    found = _parse_observations(f"{HEAD}\nB,4,1,2,3,4,5,6,0\n{ROW}\n", ["A", "B"])
     assert (found.view.tolist(), found.track.tolist(), found.used.tolist()) == ([1, 0], [4, 3], [False, True])
     assert found.xy.tolist() == [[1, 2], [1.5, 2.5]]
     assert found.before.tolist() == [[3, 4], [0.1, 0.2]]
     assert found.after[0].tolist() == [5, 6]
     assert np.isnan(found.after[1]).all()
-    assert len(_observations(f"{HEAD}\n", ["A"]).view) == 0
+    assert len(_parse_observations(f"{HEAD}\n", ["A"]).view) == 0
 
 
 def test_places_are_read_with_their_numbers():
-    points, tracks = _points(f"{PLACES}\n{PLACE}\n10,20,30,,3,,999999999999999999\n")
+    points, tracks = _parse_points(f"{PLACES}\n{PLACE}\n10,20,30,,3,,999999999999999999\n")
     assert points[0].tolist() == [10, 20, 30, 0.5]
     assert np.isnan(points[1, 3])
     assert tracks.tolist() == [8, 999999999999999999]
@@ -181,9 +181,9 @@ def test_places_are_read_with_their_numbers():
     ],
 )
 def test_an_observation_that_cannot_be_is_refused(row):
-    _observations(f"{HEAD}\n{ROW}\n", ["A"])
+    _parse_observations(f"{HEAD}\n{ROW}\n", ["A"])
     with pytest.raises((ValueError, LookupError)):
-        _observations(f"{HEAD}\n{row}\n", ["A"])
+        _parse_observations(f"{HEAD}\n{row}\n", ["A"])
 
 
 @pytest.mark.parametrize(
@@ -194,13 +194,13 @@ def test_a_place_is_on_the_earth_up_to_a_turn_and_a_half(place):
     ring = {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], list(place), [0, 0]]]}
     outline = json.dumps({"features": [{"geometry": ring}]})
     if abs(place[0]) <= 540 and abs(place[1]) <= 90:
-        assert len(_points(text)[0]) == 1
-        assert len(_outlines(outline)[0][0]) == 4
+        assert len(_parse_points(text)[0]) == 1
+        assert len(_parse_outlines(outline)[0][0]) == 4
         return
     with pytest.raises(ValueError, match="no longitude and latitude"):
-        _points(text)
+        _parse_points(text)
     with pytest.raises(ValueError, match="no longitude and latitude"):
-        _outlines(outline)
+        _parse_outlines(outline)
 
 
 def test_outlines_are_the_outer_rings():
@@ -210,17 +210,17 @@ def test_outlines_are_the_outer_rings():
         {"type": "Polygon", "coordinates": [square]},
         None,
     ]
-    found = _outlines(json.dumps({"features": [{"geometry": part} for part in parts]}))
+    found = _parse_outlines(json.dumps({"features": [{"geometry": part} for part in parts]}))
     assert [len(rings) for rings in found] == [2, 1, 0]
     assert found[1][0].tolist() == square
     for ring in (square[:3], [[0, 0, 0]] * 4, [0, 0, 0, 0]):
         with pytest.raises(ValueError, match="outline of shape"):
-            _outlines(json.dumps({"features": [{"geometry": {"type": "Polygon", "coordinates": [ring]}}]}))
+            _parse_outlines(json.dumps({"features": [{"geometry": {"type": "Polygon", "coordinates": [ring]}}]}))
 
 
 def test_a_table_with_other_columns_is_refused():
-    assert _columns("a,b\n1,2\n3,4\n", ("a", "b")) == [["1", "3"], ["2", "4"]]
-    assert _columns("a,b\n", ("a", "b")) == [[], []]
+    assert _table_columns("a,b\n1,2\n3,4\n", ("a", "b")) == [["1", "3"], ["2", "4"]]
+    assert _table_columns("a,b\n", ("a", "b")) == [[], []]
     wrong = {
         "a,c\n1,2\n": "columns are not a, b",
         "a,b\n1,2,3\n": "rows of 3 cells",
@@ -228,17 +228,17 @@ def test_a_table_with_other_columns_is_refused():
     }
     for text, said in wrong.items():
         with pytest.raises(ValueError, match=said):
-            _columns(text, ("a", "b"))
+            _table_columns(text, ("a", "b"))
     assert _floats([["1", ""], ["", "1e12"]], 0)[1, 1] == 1e12
-    assert _numbers(["0", "12"]).tolist() == [0, 12]
+    assert _track_numbers(["0", "12"]).tolist() == [0, 12]
 
 
 TIE = {"kind": "worst", "a": "A", "b": "B", "offset_px": [1.5, 0.5], "patches": ["QUJD", "QUJD", "QUJDQQ=="]}
 
 
 def test_numbers_of_a_table():
-    assert (_number(None, 4), _number(float("nan"), 4), _number(1.23456, 4)) == ("", "", "1.2346")
-    assert [_cell(value) for value in ("a,b", 7, 0.123456, None)] == ['"a,b"', "7", "0.12346", ""]
+    assert (_rounded(None, 4), _rounded(float("nan"), 4), _rounded(1.23456, 4)) == ("", "", "1.2346")
+    assert [_formatted_cell(value) for value in ("a,b", 7, 0.123456, None)] == ['"a,b"', "7", "0.12346", ""]
 
 
 def test_as_many_outlines_as_images_are_needed(block_run, tmp_path):

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from barpc.ba import adjust_tracks
-from barpc.ba.apart import Apart
-from barpc.ba.held.gauge import MOTIONS
-from barpc.ba.placing import Look
+from barpc.ba.apart import ForeignCamera
+from barpc.ba.constraints.gauge import MOTIONS
+from barpc.ba.resection import RpcDiagnosis
 from barpc.base.errors import BarpcWarning
 from barpc.base.options import RunOptions
 from barpc.fit import FitOptions
 from barpc.report import Run
-from barpc.report.summary.whole import MODES
+from barpc.report.summary.block import MODES
 from barpc.report.summary.words import metres
 from barpc.simulate import simulate_block
 from tests.report.conftest import summarize
@@ -88,7 +88,7 @@ def test_a_view_without_tie_points_to_the_others_is_not_adjusted():
 )
 def test_a_view_whose_rpc_is_not_its_own_is_named(block_run, placed, scale, status, said):
     run = block_run.run
-    told = Apart((2,), 400.0, 400.0, None, 1.0, Look(swapped=True), placed, scale)
+    told = ForeignCamera((2,), 400.0, 400.0, None, 1.0, RpcDiagnosis(swapped=True), placed, scale)
     summary = summarize(replace(run, adjustment=replace(run.adjustment, apart=told)))
     view = summary["views"][2]
     assert view["status"] == status
@@ -106,7 +106,7 @@ def test_a_view_whose_rpc_is_not_its_own_is_named(block_run, placed, scale, stat
 @pytest.mark.slow
 def test_a_view_among_several_whose_rpc_may_be_strange_needs_a_look(block_run):
     run = block_run.run
-    told = Apart((2, 0), 400.0, 9.0, None, 1.0, Look(), None)
+    told = ForeignCamera((2, 0), 400.0, 9.0, None, 1.0, RpcDiagnosis(), None)
     summary = summarize(replace(run, adjustment=replace(run.adjustment, apart=told)))
     assert summary["status"] == "look"
     names = f"{summary['views'][2]['name']}, {summary['views'][0]['name']}"

@@ -14,10 +14,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from barpc.base.errors import BarpcError, ImageError, RpcFormatError
-from barpc.base.sidefile import RPC_FILE
+from barpc.base.safe_io import RPC_FILE
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
 from barpc.rpcio.carried import RPC_TAG, Directory, Entry, read_directory, read_values, tag_values
-from barpc.rpcio.formats import parse
+from barpc.rpcio.formats import parse_rpc
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
 
 RPC = make_rpc()
@@ -35,7 +35,7 @@ each_sample = pytest.mark.parametrize("sample", SAMPLES)
 def outcome(data: bytes) -> str:
     """What becomes of a file's bytes: "read", or the message of the one error that is allowed."""
     try:
-        parse(data, "bad.file")
+        parse_rpc(data, "bad.file")
     except RpcFormatError as error:
         message = str(error)
         assert message.startswith("bad.file"), message
@@ -154,7 +154,7 @@ def test_an_entity_bomb_is_refused(sample):
 def test_an_unexpected_encoding_is_refused_or_read_the_same(sample, encoding):
     data = SAMPLES[sample].encode(encoding)
     if outcome(data) == "read":
-        assert parse(data, "bad.file")[0].coeffs.shape == (4, 20)
+        assert parse_rpc(data, "bad.file")[0].coeffs.shape == (4, 20)
 
 
 @pytest.mark.few(1)

@@ -17,7 +17,7 @@ import rasterio
 from rasterio.windows import Window
 
 from barpc.base.errors import ImageError, InputError, OutputError, RpcError, RpcFormatError
-from barpc.base.sidefile import Kind
+from barpc.base.safe_io import Kind
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import FORMATS, grids, read_rpc, read_rpc_source, write_rpc, write_rpc_copy, write_rpc_vrt
 from barpc.rpcio import formats as formats_module
@@ -31,14 +31,14 @@ from barpc.rpcio.carried import (
     read_tag,
     read_values,
 )
-from barpc.rpcio.formats import files_of, find_rpc, parse, row_of, write_camera
+from barpc.rpcio.formats import files_of, find_rpc, format_for, parse_rpc, write_camera
 from barpc.rpcio.grids import read_correction, write_correction, write_grid
 from barpc.rpcio.images import write_crop, write_rpc_nitf
 from barpc.rpcio.sources import Sunlight, hidden_by, light_of, metadata_beside, shadows, sidecars
 from barpc.rpcio.text import DIRECT, collect_numbered, listed_numbers, number
 from barpc.rpcio.xml import rpc_domain
 from barpc.sensor.direct_grid import DirectGrid
-from barpc.sensor.displaced import CorrectionGrid
+from barpc.sensor.image_corrections import CorrectionGrid
 from barpc.sensor.rpc import RPC
 from tests.rpcio.conftest import dimap_v2, grid, make_rpc, write_image, yaml
 
@@ -339,7 +339,7 @@ def test_an_image_of_one_column_is_resampled(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("far", "ok"), [(4096, True), (4097, False)])
 def test_a_block_is_made_of_4096_pixels_a_side_at_most(far: int, ok: bool, tmp_path: Path, monkeypatch) -> None:
     """Of a row that is stretched: the last column of the block, 16 px around it and itself."""
-    monkeypatch.setattr(grids, "BLOCK", 16)
+    monkeypatch.setattr(grids, "BLOCK_SIZE", 16)
     image = write_image(tmp_path / "a.tif", (1, 16, 9000), dtype="uint8")
     cols, rows = np.array([0.0, 15.0]), np.array([0.0, 15.0])
     shift = np.zeros((2, 2, 2))
@@ -355,12 +355,12 @@ def test_a_block_is_made_of_4096_pixels_a_side_at_most(far: int, ok: bool, tmp_p
 
                 def write(self, *_: object, **__: object) -> None: ...
 
-            grids._fill(dataset, Out(), Window(0, 0, 16, 16), lacking)
+            grids._resample_block(dataset, Out(), Window(0, 0, 16, 16), lacking)
             source = dataset.read(1)
             np.testing.assert_allclose(taken[0][:, 0], source[:, 0], atol=1e-6)
         else:
             with pytest.raises(ImageError, match="spreads a block over 4097 px is none"):
-                grids._fill(dataset, None, Window(0, 0, 16, 16), lacking)
+                grids._resample_block(dataset, None, Window(0, 0, 16, 16), lacking)
 
 
 @pytest.mark.parametrize(
@@ -510,22 +510,22 @@ def test_a_geom_of_another_polynomial_is_refused() -> None:
     text = FORMATS["geom"].write(make_rpc())
     for other in ("C", ""):
         with pytest.raises(RpcFormatError, match=f"order 'RPC00{other}', only RPC00A and RPC00B"):
-            parse(text.replace("polynomial_format:  B", f"polynomial_format:  {other}").encode(), "m")
+            parse_rpc(text.replace("polynomial_format:  B", f"polynomial_format:  {other}").encode(), "m")
     silent = re.sub(r"polynomial_format:.*\n", "", text)
     assert silent != text
-    assert parse(silent.encode(), "m")[0] == make_rpc()
+    assert parse_rpc(silent.encode(), "m")[0] == make_rpc()
 
 
 def test_a_yaml_of_two_images_or_without_numbers() -> None:
     text = yaml(make_rpc())
     with pytest.raises(RpcFormatError, match="given twice; give a file of one image"):
-        parse((text + text.replace("scene", "other")).encode(), "m")
+        parse_rpc((text + text.replace("scene", "other")).encode(), "m")
     unknown = re.sub(r"err_bias: .*", "err_bias: null", text)
     unknown = re.sub(r"err_rand: .*", "err_rand: ~", unknown)
-    found, _ = parse(unknown.encode(), "m")
+    found, _ = parse_rpc(unknown.encode(), "m")
     assert (found.err_bias, found.err_rand) == (None, None)
     dashes = re.sub(r"\[([^\]]*)\]", lambda m: "".join(f"\n        - {v.strip()}" for v in m[1].split(",")), text)
-    assert parse(dashes.encode(), "m")[0] == make_rpc()
+    assert parse_rpc(dashes.encode(), "m")[0] == make_rpc()
 
 
 def test_a_record_of_a_nitf_holds_nine_powers_of_ten_and_whole_pixels() -> None:
@@ -593,7 +593,7 @@ def test_numbered_coefficients_are_gathered_from_0_or_1_on() -> None:
 
 @pytest.mark.parametrize(("name", "row"), [("a_RPC.TXT", "txt"), ("A.rpb", "rpb"), ("a.JSON", "json"), ("a.doc", None)])
 def test_the_end_of_a_name_tells_its_format(name: str, row: str | None) -> None:
-    found = row_of(name)
+    found = format_for(name)
     assert (found is None) if row is None else (found is FORMATS[row])
 
 
@@ -616,7 +616,7 @@ def test_a_camera_is_written_as_the_name_of_its_place_says(tmp_path: Path) -> No
 def test_a_json_may_say_null_for_what_is_not_known() -> None:
     document = json.loads(FORMATS["json"].write(make_rpc()))
     document["rpc"]["err_bias"] = None
-    assert parse(json.dumps(document).encode(), "m")[0] == make_rpc(err_bias=None)
+    assert parse_rpc(json.dumps(document).encode(), "m")[0] == make_rpc(err_bias=None)
 
 
 # --- grids ---------------------------------------------------------------------------------------------------------
@@ -711,7 +711,7 @@ def test_a_correction_grid_is_held_to_what_its_numbers_become(tmp_path: Path, mo
     write_correction(correction(), make_rpc(), path)
     most = 8 * correction().shift.size
     for limit, refused in ((most, False), (most - 1, True)):
-        monkeypatch.setattr("barpc.rpcio.grids._TABLE", Kind("a correction grid", limit, RpcFormatError))
+        monkeypatch.setattr("barpc.rpcio.grids._GRID_KIND", Kind("a correction grid", limit, RpcFormatError))
         if refused:
             with pytest.raises(RpcFormatError, match=f"{most} bytes, too large for a correction grid"):
                 read_correction(path)

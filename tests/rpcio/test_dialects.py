@@ -13,7 +13,7 @@ import rasterio
 
 from barpc.base.errors import RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, write_camera, write_rpc
-from barpc.rpcio.formats import parse
+from barpc.rpcio.formats import parse_rpc
 from barpc.rpcio.sources import described
 from barpc.rpcio.text import COEFFICIENTS, KEYS, fields_from_rpc
 from barpc.rpcio.xml import rpc_domain
@@ -35,7 +35,7 @@ def written(fields, units=UNITS, key=lambda name: name):
 
 
 def read(text):
-    return parse(text.encode(), "memory")[0]
+    return parse_rpc(text.encode(), "memory")[0]
 
 
 # --- units ------------------------------------------------------------------------------------------------

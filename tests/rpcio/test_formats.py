@@ -12,7 +12,7 @@ import pytest
 from barpc.base.errors import ImageError, OutputError, RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, write_rpc
 from barpc.rpcio.carried import nitf_record
-from barpc.rpcio.formats import parse
+from barpc.rpcio.formats import parse_rpc
 from barpc.rpcio.text import COEFFICIENTS, OFFSETS, SCALES, fields_from_rpc, number, write_rpb, write_txt
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, grid, make_rpc, yaml
 
@@ -30,7 +30,7 @@ def test_what_is_written_reads_back_to_the_bit(name, rpc, tmp_path):
 def test_an_unknown_accuracy_is_never_written_as_perfect(row):
     unknown = make_rpc(err_bias=None, err_rand=None)
     text = row.write(unknown)
-    found, name = parse(text.encode(), "memory")
+    found, name = parse_rpc(text.encode(), "memory")
     assert name == row.name
     assert (found.err_bias, found.err_rand) == (None, None)
     if row.name != "geom":  # OSSIM asks for the keys, and takes 0 for unknown
@@ -39,7 +39,7 @@ def test_an_unknown_accuracy_is_never_written_as_perfect(row):
 
 def test_an_accuracy_of_zero_in_a_file_is_unknown(rpc):
     text = write_rpb(rpc).replace("errBias = 3.1", "errBias = 0.0")
-    assert parse(text.encode(), "memory")[0].err_bias is None
+    assert parse_rpc(text.encode(), "memory")[0].err_bias is None
 
 
 def test_an_existing_file_is_kept_unless_overwriting_is_asked_for(rpc, tmp_path):
@@ -71,7 +71,7 @@ DIALECTS = {
 @pytest.mark.parametrize("dialect", DIALECTS)
 def test_a_dialect_that_is_only_read_gives_the_camera_that_went_in(dialect, rpc):
     make, expected = DIALECTS[dialect]
-    found, name = parse(make(rpc).encode(), "memory")
+    found, name = parse_rpc(make(rpc).encode(), "memory")
     assert name == expected
     np.testing.assert_allclose(found.project(grid(rpc)), rpc.project(grid(rpc)), rtol=0, atol=1e-9)
 
@@ -95,7 +95,7 @@ def test_the_pixel_convention_of_a_dimap_can_be_overruled(first, shift, rpc, tmp
 
 
 def test_the_direct_model_and_the_fit_error_of_a_dimap_are_left_behind(rpc):
-    found, _ = parse(dimap_v2(rpc).encode(), "memory")
+    found, _ = parse_rpc(dimap_v2(rpc).encode(), "memory")
     assert found.err_bias is None  # ERR_BIAS_ROW is in pixels, of the vendor's own fit
     for row in WRITABLE:
         assert "7.5" not in row.write(found)
@@ -104,32 +104,32 @@ def test_the_direct_model_and_the_fit_error_of_a_dimap_are_left_behind(rpc):
 def test_maxar_xml_reads_in_a_namespace_too(rpc):
     text = FORMATS["xml"].write(rpc)
     spaced = re.sub(r"<(/?)([A-Za-z]+)", r"<\1lv1b:\2", text).replace("<lv1b:isd>", '<lv1b:isd xmlns:lv1b="http://x">')
-    assert parse(spaced.encode(), "memory") == (rpc, "xml")
+    assert parse_rpc(spaced.encode(), "memory") == (rpc, "xml")
 
 
 def test_maxar_xml_may_begin_with_its_rpb_and_say_nothing_of_errors(rpc):
     text = FORMATS["xml"].write(rpc)
     bare = text.replace("<isd>\n", "").replace("</isd>\n", "")
     assert bare != text
-    assert parse(bare.encode(), "memory") == (rpc, "xml")
+    assert parse_rpc(bare.encode(), "memory") == (rpc, "xml")
     silent = re.sub(r".*<ERR(BIAS|RAND)>.*\n", "", text)
-    assert parse(silent.encode(), "memory") == (replace(rpc, err_bias=None, err_rand=None), "xml")
+    assert parse_rpc(silent.encode(), "memory") == (replace(rpc, err_bias=None, err_rand=None), "xml")
     nameless = re.sub(r".*<SPECID>.*\n", "", text)
-    assert parse(nameless.encode(), "memory") == (rpc, "xml")
+    assert parse_rpc(nameless.encode(), "memory") == (rpc, "xml")
     with pytest.raises(RpcFormatError, match="order 'RPC00C', only RPC00A and RPC00B"):
-        parse(text.replace("RPC00B", "RPC00C").encode(), "memory")
+        parse_rpc(text.replace("RPC00B", "RPC00C").encode(), "memory")
     with pytest.raises(RpcFormatError, match="<LATSCALE> is missing or empty"):
-        parse(re.sub(r".*<LATSCALE>.*\n", "", text).encode(), "memory")
+        parse_rpc(re.sub(r".*<LATSCALE>.*\n", "", text).encode(), "memory")
 
 
 def test_an_envi_header_may_leave_its_last_three_numbers_out(rpc):
     text = envi(rpc)
     less = re.sub(r",\s*0,\s*0,\s*1\s*}", "}", text)
     assert less != text
-    assert parse(less.encode(), "memory")[0] == parse(text.encode(), "memory")[0]
+    assert parse_rpc(less.encode(), "memory")[0] == parse_rpc(text.encode(), "memory")[0]
     for wrong, count in ((text.replace("}", ", 0}"), 94), (less.replace("}", ", 0}"), 91)):
         with pytest.raises(RpcFormatError, match=f"rpc info has {count} numbers, expected 90 or 93"):
-            parse(wrong.encode(), "memory")
+            parse_rpc(wrong.encode(), "memory")
 
 
 @pytest.mark.parametrize(
@@ -149,16 +149,16 @@ def test_an_envi_header_may_leave_its_last_three_numbers_out(rpc):
     ids=lambda v: v if isinstance(v, str) else "",
 )
 def test_the_text_format_is_read_with(change, what, rpc):
-    assert parse(change(write_txt(rpc)).encode(), "memory") == (rpc, "txt")
+    assert parse_rpc(change(write_txt(rpc)).encode(), "memory") == (rpc, "txt")
 
 
 def test_a_latin_1_degree_sign_is_read(rpc):
-    assert parse(write_txt(rpc).replace("LAT_OFF: 43.2", "LAT_OFF: 43.2 °").encode("latin-1"), "m")[0] == rpc
+    assert parse_rpc(write_txt(rpc).replace("LAT_OFF: 43.2", "LAT_OFF: 43.2 °").encode("latin-1"), "m")[0] == rpc
 
 
 def test_a_denominator_that_does_not_start_with_one_is_kept(rpc):
     text = write_txt(rpc).replace("LINE_DEN_COEFF_1: 1\n", "LINE_DEN_COEFF_1: 0.99995\n")
-    assert parse(text.encode(), "memory")[0].coeffs[3, 0] == 0.99995
+    assert parse_rpc(text.encode(), "memory")[0].coeffs[3, 0] == 0.99995
 
 
 def test_both_dialects_of_json_are_read(rpc):
@@ -167,16 +167,16 @@ def test_both_dialects_of_json_are_read(rpc):
     gdal = {key: str(v[0]) if len(v) == 1 else " ".join(map(repr, v)) for key, v in _fields(rpc).items()}
     bare = json.loads(rpcm)["rpc"]
     for document in (json.loads(rpcm), bare, plain, {"rpcs": plain}, gdal):
-        assert parse(json.dumps(document).encode(), "memory") == (rpc, "json")
+        assert parse_rpc(json.dumps(document).encode(), "memory") == (rpc, "json")
 
 
 def test_an_rpc_may_lie_three_objects_deep_in_json_and_no_deeper(rpc):
     document = json.loads(FORMATS["json"].write(rpc))["rpc"]
     for depth in range(4):
-        assert parse(json.dumps(document).encode(), "memory") == (rpc, "json"), depth
+        assert parse_rpc(json.dumps(document).encode(), "memory") == (rpc, "json"), depth
         document = {"other": [1, 2], "inner": document}
     with pytest.raises(RpcFormatError):
-        parse(json.dumps(document).encode(), "memory")
+        parse_rpc(json.dumps(document).encode(), "memory")
 
 
 def _fields(rpc):
@@ -271,7 +271,7 @@ def test_a_constellation_s_way_of_writing_is_read(constellation, rpc):
     assert FORMATS[kind].write is not None
     text = FORMATS[kind].write(rpc)
     assert change(text) != text
-    assert parse(change(text).encode(), "memory") == (rpc, kind)
+    assert parse_rpc(change(text).encode(), "memory") == (rpc, kind)
 
 
 @pytest.mark.parametrize(
@@ -290,7 +290,7 @@ def test_a_constellation_s_way_of_writing_is_read(constellation, rpc):
 )
 def test_an_unknown_file_is_refused_with_what_is_known(text, found):
     with pytest.raises(RpcFormatError, match=found) as told:
-        parse(text.encode(), "memory")
+        parse_rpc(text.encode(), "memory")
     assert "known: txt, rpb" in str(told.value)
 
 
@@ -310,18 +310,18 @@ def plain(rpc, order: tuple[str, ...] = (*OFFSETS, *SCALES, *COEFFICIENTS)) -> l
 @pytest.mark.parametrize("between", [",", " ", "\n", ", ", " ,\r\n", "\t"])
 def test_numbers_without_names_are_read_in_the_order_of_envi(between, rpc):
     text = between.join(plain(rpc)) + "\n"
-    found, kind = parse(text.encode(), "memory")
+    found, kind = parse_rpc(text.encode(), "memory")
     assert kind == "bare"
     assert found == replace(rpc, err_bias=None, err_rand=None)
-    assert parse((text + "0 0 1").encode(), "memory") == (found, "bare")
+    assert parse_rpc((text + "0 0 1").encode(), "memory") == (found, "bare")
 
 
 def test_numbers_without_names_that_are_no_rpc_are_refused_with_what_was_found(rpc):
     with pytest.raises(RpcFormatError, match=r"31st and 71st are .*begin with 1"):
-        parse(" ".join(plain(rpc, (*OFFSETS, *SCALES, *reversed(COEFFICIENTS)))).encode(), "memory")
+        parse_rpc(" ".join(plain(rpc, (*OFFSETS, *SCALES, *reversed(COEFFICIENTS)))).encode(), "memory")
     for wrong in (plain(rpc)[:-1], [*plain(rpc), "1"], [*plain(rpc)[:-1], "x"]):
         with pytest.raises(RpcFormatError, match="no RPC format recognised"):
-            parse(",".join(wrong).encode(), "memory")
+            parse_rpc(",".join(wrong).encode(), "memory")
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be"])

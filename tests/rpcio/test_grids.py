@@ -14,11 +14,11 @@ from barpc.base.errors import BarpcError, OutputError, RpcError, RpcFormatError
 from barpc.base.geodesy import metres_per_unit
 from barpc.cameras import open_camera
 from barpc.fit.points import Sample
-from barpc.pipeline.handoff import unverified, verify_grid
+from barpc.pipeline.verify_outputs import unverified, verify_grid
 from barpc.rpcio import read_rpc
-from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid
+from barpc.rpcio.grids import CORRECTION, GRID_SUFFIX, read_correction, write_correction, write_grid
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
-from barpc.sensor.displaced import CorrectionGrid, Displaced
+from barpc.sensor.image_corrections import CorrectionGrid, Displaced
 from tests.jitter import scene
 from tests.rpcio.conftest import make_rpc
 
@@ -38,7 +38,7 @@ def sample(camera):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, camera) -> Path:
     folder = tmp_path_factory.mktemp("grids")
-    write_grid(DirectGrid.of(camera, SIZE, ALTS), folder / f"a{GRID}")
+    write_grid(DirectGrid.of(camera, SIZE, ALTS), folder / f"a{GRID_SUFFIX}")
     lacking = CorrectionGrid.between(camera.sensor, camera, SIZE, 500.0)
     write_correction(lacking, camera.sensor, folder / f"a{CORRECTION}")
     return folder
@@ -52,7 +52,7 @@ def check_points(camera, count=3000):
 
 def test_a_localisation_grid_reads_back_as_the_camera(folder, camera):
     image, ground = check_points(camera)
-    found = open_camera(folder / f"a{GRID}")
+    found = open_camera(folder / f"a{GRID_SUFFIX}")
     assert (found.format, found.size, found.alt_range) == ("grid", SIZE, ALTS)
     assert np.linalg.norm(found.model.project(ground) - image, axis=1).max() < 1e-4
 
@@ -67,11 +67,11 @@ def test_shareloc_localises_with_the_grid(folder, camera):
     image, ground = check_points(camera)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        model = GeoModel(str(folder / f"a{GRID}"), "GRID")
+        model = GeoModel(str(folder / f"a{GRID_SUFFIX}"), "GRID")
     found = np.asarray(model.direct_loc_h(image[:, 1] + 0.5, image[:, 0] + 0.5, ground[:, 2]))
     off = np.linalg.norm(camera.project(found) - image, axis=1)
     assert LINEAR / 10 < off.max() < LINEAR
-    grid = open_camera(folder / f"a{GRID}").model
+    grid = open_camera(folder / f"a{GRID_SUFFIX}").model
     linear = RegularGridInterpolator((grid.alts, grid.rows, grid.cols), grid.lonlat)
     lonlat = linear(np.column_stack([ground[:, 2], image[:, ::-1]]))
     assert np.abs((found[:, :2] - lonlat) * metres_per_unit(ground)[:, :2]).max() < 1e-3
@@ -82,7 +82,7 @@ def test_shareloc_localises_with_the_grid(folder, camera):
 
 
 def test_the_layout_is_that_of_vendors_grids(folder):
-    with rasterio.open(folder / f"a{GRID}") as grid:
+    with rasterio.open(folder / f"a{GRID_SUFFIX}") as grid:
         layers = grid.count // 2
         assert {grid.tags()[f"ALTITUDE_B{k}"] for k in (0, 1)} == {"0.0"}
         assert float(grid.tags()[f"ALTITUDE_B{2 * layers - 1}"]) == 1000.0
@@ -136,11 +136,11 @@ def test_a_correction_grid_is_known_however_many_nodes_it_has(tmp_path, width, h
 def test_consumers_find_the_error_of_a_grid_and_not_less(folder, camera, sample, tmp_path):
     """A grid of the RPC alone misses by the jitter; one whose columns are moved by half a pixel, as by another idea of
     where pixels begin, by half a pixel more."""
-    for name in (GRID, CORRECTION):
+    for name in (GRID_SUFFIX, CORRECTION):
         for reading in verify_grid(folder / f"a{name}", sample):
             assert 1e-7 < reading.max_error < LINEAR, reading
-    write_grid(DirectGrid.of(camera.sensor, SIZE, ALTS), tmp_path / f"a{GRID}")
-    for reading in verify_grid(tmp_path / f"a{GRID}", sample):
+    write_grid(DirectGrid.of(camera.sensor, SIZE, ALTS), tmp_path / f"a{GRID_SUFFIX}")
+    for reading in verify_grid(tmp_path / f"a{GRID_SUFFIX}", sample):
         assert 0.4 < reading.max_error < 1.5, reading
     lacking = CorrectionGrid.between(camera.sensor, camera, SIZE, 500.0)
     moved = CorrectionGrid(lacking.cols, lacking.rows, lacking.shift + [0.5, 0.0])
@@ -156,31 +156,31 @@ def test_consumers_find_the_error_of_a_grid_and_not_less(folder, camera, sample,
 @pytest.mark.parametrize(("lon", "across"), [(179.98, False), (179.9999, True)])
 def test_a_grid_across_the_antimeridian_is_read_by_all_but_shareloc_which_says_why(lon, across, tmp_path):
     rpc, size, alts = make_rpc(lon=lon), (2000, 1900), (30.0, 300.0)
-    write_grid(DirectGrid.of(rpc, size, alts), tmp_path / f"a{GRID}")
-    for reading in verify_grid(tmp_path / f"a{GRID}", Sample.of(rpc, size, alts)):
+    write_grid(DirectGrid.of(rpc, size, alts), tmp_path / f"a{GRID_SUFFIX}")
+    for reading in verify_grid(tmp_path / f"a{GRID_SUFFIX}", Sample.of(rpc, size, alts)):
         told = "shareloc takes no longitude beyond 180 degrees" in reading.note
         assert told == (across and reading.consumer == "shareloc")
         assert told or reading.max_error < LINEAR, reading
 
 
 def test_a_file_that_cannot_be_read_is_named_with_its_reason(sample, tmp_path):
-    (tmp_path / f"a{GRID}").write_bytes(b"II*\0")
-    for reading in verify_grid(tmp_path / f"a{GRID}", sample):
+    (tmp_path / f"a{GRID_SUFFIX}").write_bytes(b"II*\0")
+    for reading in verify_grid(tmp_path / f"a{GRID_SUFFIX}", sample):
         assert np.isnan(reading.max_error)
         assert reading.note
 
 
 def test_only_tools_that_are_not_installed_are_missed(folder, monkeypatch):
-    monkeypatch.setattr("barpc.pipeline.handoff._is_installed", lambda package: package != "shareloc")
-    (sentence,) = unverified([folder / f"a{GRID}"])
+    monkeypatch.setattr("barpc.pipeline.verify_outputs._is_installed", lambda package: package != "shareloc")
+    (sentence,) = unverified([folder / f"a{GRID_SUFFIX}"])
     assert sentence.endswith("a_grid.tif: only barpc itself has read it (.tif: shareloc would, and is not installed)")
     assert unverified([folder / f"a{CORRECTION}"]) == []  # GDAL has
 
 
 def test_a_grid_that_is_there_is_replaced_only_when_that_is_asked_for(folder, camera, tmp_path):
-    path = tmp_path / f"a{GRID}"
+    path = tmp_path / f"a{GRID_SUFFIX}"
     path.write_text("mine")
-    grid = open_camera(folder / f"a{GRID}").model
+    grid = open_camera(folder / f"a{GRID_SUFFIX}").model
     with pytest.raises(OutputError, match="exists"):
         write_grid(grid, path)
     assert path.read_text() == "mine"

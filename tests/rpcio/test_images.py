@@ -15,7 +15,7 @@ from rasterio.control import GroundControlPoint
 from rasterio.errors import NotGeoreferencedWarning
 
 from barpc.base.errors import ImageError, OutputError, RpcFormatError
-from barpc.pipeline.handoff import CONSUMERS
+from barpc.pipeline.verify_outputs import CONSUMERS
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import (
     images,

@@ -18,7 +18,7 @@ from barpc.fit import fit_rpc
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import grids, read_rpc, write_rpc_vrt
 from barpc.rpcio.grids import write_resampled
-from barpc.sensor.displaced import CorrectionGrid
+from barpc.sensor.image_corrections import CorrectionGrid
 from barpc.simulate import fly, looks
 from tests.jitter import jittered
 from tests.lanes import rest_slow
@@ -32,7 +32,7 @@ SIZE = (420, 360)  # two blocks each way
 
 @pytest.fixture(autouse=True)
 def _small_blocks(monkeypatch):
-    monkeypatch.setattr(grids, "BLOCK", 256)
+    monkeypatch.setattr(grids, "BLOCK_SIZE", 256)
 
 
 def scenery(col, row):
@@ -138,7 +138,7 @@ def test_blocks_leave_no_seams(tmp_path, monkeypatch):
     write_resampled(make_rpc(), grid(), image, tmp_path / "b.tif")
     write_resampled(make_rpc(), grid(), image, tmp_path / "c.tif")
     assert (tmp_path / "b.tif").read_bytes() == (tmp_path / "c.tif").read_bytes()
-    monkeypatch.setattr(grids, "BLOCK", 512)
+    monkeypatch.setattr(grids, "BLOCK_SIZE", 512)
     write_resampled(make_rpc(), grid(), image, tmp_path / "c.tif", overwrite=True)
     assert np.abs(np.subtract(*(pixels(tmp_path / f"{name}.tif").astype(int) for name in "bc"))).max() <= 1
 
@@ -254,14 +254,14 @@ def test_what_cannot_be_resampled_is_one_line_and_leaves_nothing(tmp_path, monke
 
 def test_a_run_that_dies_half_way_leaves_nothing(tmp_path, monkeypatch):
     image = raster(tmp_path / "a.tif", seen(4000.0, "uint16"))
-    real, count = grids._fill, iter(range(10))
+    real, count = grids._resample_block, iter(range(10))
 
     def dying(*given):
         if next(count) == 2:
             raise KeyboardInterrupt
         return real(*given)
 
-    monkeypatch.setattr(grids, "_fill", dying)
+    monkeypatch.setattr(grids, "_resample_block", dying)
     (tmp_path / "out").mkdir()
     with pytest.raises(KeyboardInterrupt):
         write_resampled(make_rpc(), grid(), image, tmp_path / "out" / "b.tif")

@@ -15,7 +15,7 @@ from barpc.sensor import SensorModel, terrasar
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.curve import Orbit, fit_orbit
 from barpc.sensor.direct_grid import DirectGrid
-from barpc.sensor.displaced import CorrectionGrid, Displaced, ImageAffine, ImageCorrected, RowSpline, Splined
+from barpc.sensor.image_corrections import CorrectionGrid, Displaced, ImageAffine, ImageCorrected, RowSpline, Splined
 from barpc.sensor.pushbroom import Light, Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.sentinel1 import range_doppler

@@ -8,7 +8,7 @@ import pytest
 from barpc.base.errors import RpcError
 from barpc.fit import fit_rpc
 from barpc.sensor.direct_grid import LINEAR, DirectGrid, linear_axes
-from barpc.sensor.displaced import CorrectionGrid, Displaced, ImageAffine, ImageCorrected
+from barpc.sensor.image_corrections import CorrectionGrid, Displaced, ImageAffine, ImageCorrected
 from tests.jitter import scene
 
 SIZE, ALTS = (8000, 8000), (0.0, 1000.0)

@@ -8,9 +8,9 @@ from numpy.polynomial import polynomial
 
 from barpc.base.errors import RpcError
 from barpc.sensor.curve import (
-    DEGREES,
     EXTRAPOLATION,
-    MARGIN,
+    ORBIT_DEGREES,
+    ORBIT_MARGIN,
     Curve,
     Turn,
     _fit_orbit,
@@ -112,14 +112,14 @@ def test_the_degree_is_the_lowest_that_serves() -> None:
     fast = sway * np.sin(2 * np.pi * time / 60)[:, None]
     rate = sway * 2 * np.pi / 60 * np.cos(2 * np.pi * time / 60)[:, None]
     degree = fit_orbit(time, position + fast, velocity + rate, (0.0, 5.0)).coeffs.shape[1] - 1
-    assert 7 <= degree <= DEGREES[-1]
+    assert 7 <= degree <= ORBIT_DEGREES[-1]
 
 
 def test_state_vectors_near_the_image_take_part_and_no_others() -> None:
     time = np.arange(-100.0, 130.0, 10.0)
     position, velocity = vectors(time)
     window = (0.0, 30.0)
-    far = (time < window[0] - MARGIN) | (time > window[1] + MARGIN)
+    far = (time < window[0] - ORBIT_MARGIN) | (time > window[1] + ORBIT_MARGIN)
     assert far.sum() == 5
     orbit = fit_orbit(time, position, velocity, window)
     assert fit_orbit(time, position + 1e4 * far[:, None], velocity, window) == orbit

@@ -16,17 +16,7 @@ from barpc.base.errors import InputError, RpcError, RpcFormatError
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.sensor.corrected import Corrected, Correction, RigidMotion
 from barpc.sensor.curve import Curve, about_middle, cross, rotation_matrix
-from barpc.sensor.displaced import (
-    CorrectionGrid,
-    Displaced,
-    ImageAffine,
-    ImageCorrected,
-    RowSpline,
-    Splined,
-    bspline_pieces,
-    bsplines,
-)
-from barpc.sensor.document import Fields, parse_time, seconds
+from barpc.sensor.document import XmlFields, parse_time, seconds
 from barpc.sensor.geometry import (
     Several,
     altitude_range,
@@ -39,6 +29,16 @@ from barpc.sensor.geometry import (
     triangulate,
     view_angles,
 )
+from barpc.sensor.image_corrections import (
+    CorrectionGrid,
+    Displaced,
+    ImageAffine,
+    ImageCorrected,
+    RowSpline,
+    Splined,
+    bspline_pieces,
+    bsplines,
+)
 from barpc.sensor.sicd import ImagePlane, Monostatic, PolarFormat, RangeAzimuth, ZeroDoppler, open_sicd
 from barpc.sensor.timing import Timing, aside, dot, on_circle
 from tests.sensor.conftest import MODELS, make_rpc
@@ -48,8 +48,8 @@ from tests.sensor.test_geometry import tilted_rpc
 # --- documents -------------------------------------------------------------------------------------------------
 
 
-def fields(text: str) -> Fields:
-    return Fields(ElementTree.fromstring(f"<root>{text}</root>"), "a.xml")
+def fields(text: str) -> XmlFields:
+    return XmlFields(ElementTree.fromstring(f"<root>{text}</root>"), "a.xml")
 
 
 def test_a_field_is_its_text_its_number_or_its_numbers() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barpc.ba.estimated.priors import prior_sigmas
+from barpc.ba.parameters.priors import prior_sigmas
 from barpc.base.errors import BarpcError, FitError, InputError, RpcFormatError
 from barpc.base.geodesy import ecef_from_ground, enu_basis
 from barpc.base.options import AdjustOptions

@@ -170,4 +170,4 @@ def test_the_careful_way_takes_few_steps_of_at_most_a_box_width(curved, monkeypa
     assert (left < 1e-9).all()
     assert max(calls) == 1.0
     assert 5 <= len(calls) <= 12
-    assert rational.REACH > 1.0
+    assert rational.TRUSTED_REACH > 1.0

@@ -22,7 +22,7 @@ from click.testing import CliRunner
 
 from barpc.base.errors import BarpcError, BarpcWarning, FitError, InputError, RpcError, RpcFormatError
 from barpc.base.geodesy import ecef_from_ground
-from barpc.base.sidefile import parse_xml
+from barpc.base.safe_io import parse_xml
 from barpc.cli import cli
 from barpc.fit import FitOptions, fit_rpc
 from barpc.rpcio import read_rpc

@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import BSpline
 
 from barpc.base.errors import RpcError
-from barpc.sensor.displaced import RowSpline, Splined, sine_and_cosine
+from barpc.sensor.image_corrections import RowSpline, Splined, sine_and_cosine
 
 from .conftest import make_rpc
 

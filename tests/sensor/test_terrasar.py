@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import BarpcError, BarpcWarning, InputError, RpcFormatError
-from barpc.base.sidefile import parse_xml
+from barpc.base.safe_io import parse_xml
 from barpc.cameras import open_camera
 from barpc.fit import fit_rpc
-from barpc.sensor.document import Fields
+from barpc.sensor.document import XmlFields
 from barpc.sensor.geometry import view_angles
 from barpc.sensor.terrasar import open_terrasar
 from tests.sensor.terrasar_files import INTERVAL, NAME, SIZE, SPACING, START, Terrasar
@@ -232,7 +232,7 @@ def test_the_corners_of_a_delivered_product_are_on_their_rows(shared_data):
     path = next((shared_data / "radar").glob("TDX1_SAR__SSC*.xml"))
     with pytest.warns(BarpcWarning, match=r"no ANNOTATION/GEOREF\.xml"):
         model = open_terrasar(path)
-    corners = Fields(parse_xml(path, strip_namespaces=True), "").all("productInfo/sceneInfo/sceneCornerCoord")
+    corners = XmlFields(parse_xml(path, strip_namespaces=True), "").all("productInfo/sceneInfo/sceneCornerCoord")
     lon, lat, col, row, incidence = np.array(
         [[k.number(tag) for tag in ("lon", "lat", "refColumn", "refRow", "incidenceAngle")] for k in corners]
     ).T

@@ -9,7 +9,7 @@ from barpc.base.errors import InputError
 from barpc.base.geodesy import ecef_from_ground, metres_per_unit
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import camera_center, convergence_angle, triangulate
-from barpc.simulate import BlockOptions, _Grid, _turned, fly, looks, recentred, simulate_block
+from barpc.simulate import BlockOptions, _SiteGrid, _turned, fly, looks, recentred, simulate_block
 
 
 @pytest.fixture(scope="module")
@@ -144,28 +144,28 @@ def test_a_thousand_views_are_simulated():
     ],
 )  # fmt: skip
 def test_sites_stand_on_a_grid_as_square_as_can_be(num_views, per_site, columns, rows):
-    grid = _Grid.square(num_views, BlockOptions(per_site=per_site), 5.0, 43.0)
+    grid = _SiteGrid.square(num_views, BlockOptions(per_site=per_site), 5.0, 43.0)
     assert (grid.columns, grid.rows) == (columns, rows)
 
 
 def test_neighbouring_sites_are_an_image_less_the_overlap_apart():
     options = BlockOptions(size=(4000, 3000), overlap=0.25, gsd=0.5)
-    grid = _Grid.square(12, options, 5.0, 43.0)
+    grid = _SiteGrid.square(12, options, 5.0, 43.0)
     metres = metres_per_unit(np.array([5.0, 43.0, 0.0]))[:2]
     assert np.array(grid.step) * metres == pytest.approx([0.75 * 2000, 0.75 * 1500])
     lon, lat = grid.lonlat([0, 1, 0.5], [0, 1, 0.5])
     assert lon == pytest.approx([5.0 - 0.5 * grid.step[0], 5.0 + 0.5 * grid.step[0], 5.0])
     assert lat == pytest.approx([43.0 + 0.5 * grid.step[1], 43.0 - 0.5 * grid.step[1], 43.0])  # rows run south
-    lon, _ = _Grid(2, 1, 180.0, 0.0, (0.2, 0.1)).lonlat(0, [0, 1])
+    lon, _ = _SiteGrid(2, 1, 180.0, 0.0, (0.2, 0.1)).lonlat(0, [0, 1])
     assert lon == pytest.approx([179.9, -179.9])
 
 
 def test_a_block_ends_before_the_pole():
-    step = _Grid.square(1, BlockOptions(), 0.0, 84.9).step[1]
+    step = _SiteGrid.square(1, BlockOptions(), 0.0, 84.9).step[1]
     for lat, sign in ((85.0 - 0.5 * step - 1e-3, 1), (85.0 - 0.5 * step - 1e-3, -1)):
-        assert _Grid.square(1, BlockOptions(), 0.0, sign * lat).rows == 1
+        assert _SiteGrid.square(1, BlockOptions(), 0.0, sign * lat).rows == 1
         with pytest.raises(InputError, match="beyond 85"):
-            _Grid.square(1, BlockOptions(), 0.0, sign * (lat + 2e-3))
+            _SiteGrid.square(1, BlockOptions(), 0.0, sign * (lat + 2e-3))
 
 
 @pytest.mark.parametrize("wrong", [{"num_views": 0}, {"num_tracks": -1}, {"num_checks": -1}, {"num_gcps": -1}], ids=str)
@@ -247,7 +247,7 @@ def test_a_camera_turned_about_the_earth_s_axis_is_elsewhere_in_longitude_only(b
 def test_corrections_turn_about_where_the_satellite_is_in_the_middle_of_the_image():
     options = BlockOptions(per_site=2, size=(3000, 9000), alt_range=(100.0, 300.0))
     block = simulate_block(4, 50, lon=20.0, lat=10.0, per_site=2, size=(3000, 9000), alt_range=(100.0, 300.0))
-    grid = _Grid.square(4, options, 20.0, 10.0)
+    grid = _SiteGrid.square(4, options, 20.0, 10.0)
     for number, correction in enumerate(block.truth.corrections):
         lon, lat = grid.lonlat(*divmod(number // 2, grid.columns))
         flown = fly(np.array([lon, lat, 200.0]), looks(2)[number % 2], options.size, options.gsd)

@@ -8,7 +8,7 @@ import pytest
 from scipy import ndimage
 
 from barpc.tie.patches.channels import (
-    EDGE,
+    INVALID_MARGIN,
     channels,
     correlation,
 )
@@ -39,7 +39,7 @@ find = Found
 
 def margin(half: int, search: int) -> int:
     """Where decoys end."""
-    return half + 3 * search + EDGE
+    return half + 3 * search + INVALID_MARGIN
 
 
 def texture(seed: int, size: int = SIZE) -> np.ndarray:

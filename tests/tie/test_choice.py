@@ -23,8 +23,8 @@ from barpc.tie.pairing.overlaps import (
     best_pairs,
     forests,
     further_pairs,
-    judged,
     possible_pairs,
+    scored_pair,
     several_dates,
     twice_tied,
 )
@@ -154,10 +154,10 @@ def test_only_what_is_known_to_differ_makes_several_dates() -> None:
 def test_pairs_of_one_date_go_first_unless_they_share_nothing() -> None:
     two = dated(3, {0: "2020-01-01", 1: "2020-01-01", 2: "2020-07-01"})
     pair = Pair((0, 1), 0.9, 5.0)
-    assert judged(two, pair, 30).reason == "same date"
-    assert judged(two, pair, 0).reason == "quick score 0"  # the date is not true, or there are clouds
-    assert judged(two, Pair((1, 2), 0.9, 5.0), 30).reason == "quick score 30"
-    assert judged(dated(3, {}), pair, 30).reason == "quick score 30"
+    assert scored_pair(two, pair, 30).reason == "same date"
+    assert scored_pair(two, pair, 0).reason == "quick score 0"  # the date is not true, or there are clouds
+    assert scored_pair(two, Pair((1, 2), 0.9, 5.0), 30).reason == "quick score 30"
+    assert scored_pair(dated(3, {}), pair, 30).reason == "quick score 30"
 
 
 def test_half_of_the_partners_are_left_for_other_dates() -> None:
@@ -167,7 +167,7 @@ def test_half_of_the_partners_are_left_for_other_dates() -> None:
     for i in range(12):
         for j in range(i + 1, 12):
             same = (i < 6) == (j < 6)
-            pairs.append(judged(many, Pair((i, j), 0.9 if same else 0.5, 5.0), 50 if same else 20))
+            pairs.append(scored_pair(many, Pair((i, j), 0.9 if same else 0.5, 5.0), 50 if same else 20))
     found = best_pairs(pairs, 12, 4)
     across = [pair.views for pair in found if (pair.views[0] < 6) != (pair.views[1] < 6)]
     count = np.bincount(np.array(across).ravel(), minlength=12)

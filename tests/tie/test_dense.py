@@ -6,7 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from barpc.tie.patches.dense import _LEFT, _SLOPE, FINER, _refined, dense_matches, epipolar_frame
+from barpc.tie.patches.dense import (
+    _NOISE_VARIANCE,
+    _SLOPE_VARIANCE,
+    COLUMNS_PER_PIXEL,
+    _refined_disparity,
+    dense_matches,
+    epipolar_frame,
+)
 
 from .conftest import write_image
 
@@ -30,8 +37,8 @@ def test_rows_of_the_frame_run_down_and_columns_to_the_right_whichever_way_the_i
         assert np.linalg.det(one[:, :2]) > 0.0
     np.testing.assert_allclose(first[:, 1], second[:, 1], atol=1e-9)
     disparity = first[:, 0] - second[:, 0]
-    assert disparity.min() == pytest.approx(FINER, abs=1.0)
-    assert frame.num - 16 < disparity.max() + 2 * FINER <= frame.num
+    assert disparity.min() == pytest.approx(COLUMNS_PER_PIXEL, abs=1.0)
+    assert frame.num - 16 < disparity.max() + 2 * COLUMNS_PER_PIXEL <= frame.num
     np.testing.assert_allclose(np.column_stack([first, disparity, np.ones(60)]) @ frame.altitude, alt, atol=1e-6)
 
 
@@ -62,10 +69,10 @@ def test_a_step_of_least_squares_moves_no_match_by_more_than_a_column(off):
     left = cv2.normalize(left, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
     right = np.roll(left, -5, axis=1)
     given = np.full(left.shape, 5.0 + off, np.float32)
-    found = _refined(left, right, given, np.ones(left.shape, dtype=bool))[0][10:-10, 20:-20] - 5.0
+    found = _refined_disparity(left, right, given, np.ones(left.shape, dtype=bool))[0][10:-10, 20:-20] - 5.0
     assert np.abs(found - off).max() <= 1.0
     assert np.median(found) == pytest.approx(0.5 * off)  # towards the right place, as far as it may
-    exact = _refined(left, right, given - off, np.ones(left.shape, dtype=bool))[0][10:-10, 20:-20]
+    exact = _refined_disparity(left, right, given - off, np.ones(left.shape, dtype=bool))[0][10:-10, 20:-20]
     assert np.abs(exact - 5.0).max() < 0.1
 
 
@@ -73,12 +80,12 @@ def test_what_resampling_leaves_of_noise_is_what_sigma_takes_for_it():
     noise = np.random.default_rng(3).standard_normal((700, 700)).astype(np.float32)
     found = []
     for turn in (0.1, 0.5, 0.8, 1.2, 2.0):
-        along = FINER * np.array([np.cos(turn), np.sin(turn)])
-        to_frame = np.array([[*along, 500.3], [-along[1] / FINER, along[0] / FINER, 350.2]])
+        along = COLUMNS_PER_PIXEL * np.array([np.cos(turn), np.sin(turn)])
+        to_frame = np.array([[*along, 500.3], [-along[1] / COLUMNS_PER_PIXEL, along[0] / COLUMNS_PER_PIXEL, 350.2]])
         moved = cv2.warpAffine(noise, to_frame, (1000, 700), flags=cv2.INTER_CUBIC)
         inside = cv2.erode(cv2.warpAffine(np.ones_like(noise), to_frame, (1000, 700)), np.ones((9, 9))) > 0.999
         found.append([moved[inside].var(), np.gradient(moved, axis=1)[inside].var()])
-    np.testing.assert_allclose(np.mean(found, axis=0), [_LEFT, _SLOPE], rtol=0.03)
+    np.testing.assert_allclose(np.mean(found, axis=0), [_NOISE_VARIANCE, _SLOPE_VARIANCE], rtol=0.03)
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(0.7, 40.0), (1.3, -40.0)])
@@ -91,8 +98,10 @@ def test_a_step_finds_the_place_between_columns_and_says_how_well_whatever_gain_
     moved = cv2.remap(texture, cols + 5.3, rows, cv2.INTER_LANCZOS4)
     pictures = [100.0 + texture, offset + gain * (100.0 + moved)]
     noisy = [np.clip(np.rint(one + 2.0 * rng.standard_normal(one.shape)), 0, 255).astype(np.uint8) for one in pictures]
-    found, sigma = _refined(*noisy, np.full(texture.shape, 5.0, np.float32), np.ones(texture.shape, dtype=bool))
-    off, said = found[15:-15, 40:-40] - 5.3, FINER * np.median(sigma[15:-15, 40:-40])
+    found, sigma = _refined_disparity(
+        *noisy, np.full(texture.shape, 5.0, np.float32), np.ones(texture.shape, dtype=bool)
+    )
+    off, said = found[15:-15, 40:-40] - 5.3, COLUMNS_PER_PIXEL * np.median(sigma[15:-15, 40:-40])
     assert abs(off.mean()) < 0.06
     assert off.std() < 0.12
     assert 1.2 < said / off.std() < 1.9

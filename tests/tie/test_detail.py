@@ -14,7 +14,7 @@ from barpc.rasters.raster import open_raster
 from barpc.scene import View
 from barpc.sensor.geometry import footprint
 from barpc.tie import Area, Scope, find_tracks
-from barpc.tie.detail import PARTS, Gap, gap, in_parts
+from barpc.tie.detail import PARTS_PER_SIDE, Gap, gap, in_parts
 from barpc.tie.tracks import TieResult
 
 from .conftest import write_image
@@ -24,16 +24,16 @@ SIZE = (640, 1280)
 
 def counts(rng: np.random.Generator, share: np.ndarray, a_part: float = 60.0) -> tuple[np.ndarray, np.ndarray]:
     """Keypoints, alike in all columns, and ties, of which rows have so large a share."""
-    keypoints = rng.poisson(a_part, (2, PARTS))
+    keypoints = rng.poisson(a_part, (2, PARTS_PER_SIDE))
     ties = rng.binomial(keypoints[1], share)
-    return keypoints, np.stack([rng.multinomial(ties.sum(), np.full(PARTS, 1 / PARTS)), ties])
+    return keypoints, np.stack([rng.multinomial(ties.sum(), np.full(PARTS_PER_SIDE, 1 / PARTS_PER_SIDE)), ties])
 
 
 @pytest.mark.parametrize(("first", "last"), [(20, 26), (0, 9), (50, 64), (12, 44)])
 def test_rows_without_ties_are_found_and_nothing_beside_them(first: int, last: int) -> None:
     """With a false one now and then; where half of the rows lack most of them are named."""
     for seed in range(20):
-        share = np.full(PARTS, 0.5)
+        share = np.full(PARTS_PER_SIDE, 0.5)
         share[first:last] = 0.001
         found = gap(*counts(np.random.default_rng(seed), share), SIZE)
         assert found is not None
@@ -47,20 +47,20 @@ def test_rows_without_ties_are_found_and_nothing_beside_them(first: int, last: i
 @pytest.mark.parametrize("seed", range(5))
 def test_what_varies_is_no_gap(seed: int) -> None:
     """Even ties, shares that fall to a fifth, a slope to nothing, and few keypoints of all."""
-    rng, x = np.random.default_rng(seed), np.linspace(0, 1, PARTS)
-    for share in (np.full(PARTS, 0.4), np.where((x > 0.3) & (x < 0.6), 0.1, 0.5), 0.5 * x):
+    rng, x = np.random.default_rng(seed), np.linspace(0, 1, PARTS_PER_SIDE)
+    for share in (np.full(PARTS_PER_SIDE, 0.4), np.where((x > 0.3) & (x < 0.6), 0.1, 0.5), 0.5 * x):
         for a_part in (2.0, 20.0, 300.0):
             assert gap(*counts(rng, share, a_part), SIZE) is None
-    none = np.zeros((2, PARTS), np.int64)
+    none = np.zeros((2, PARTS_PER_SIDE), np.int64)
     assert gap(none, none, SIZE) is None
-    assert gap(np.full((2, PARTS), 50), none, SIZE) is None  # it is not tied by keypoints at all
+    assert gap(np.full((2, PARTS_PER_SIDE), 50), none, SIZE) is None  # it is not tied by keypoints at all
 
 
 @pytest.mark.parametrize("lost", [0, 3, 10])
 def test_where_there_is_nothing_to_see_nothing_lacks(lost: int) -> None:
     """Water with a shore that no tie is found on, and rows at an end that no partner sees."""
     rng = np.random.default_rng(lost)
-    keypoints, ties = counts(rng, np.full(PARTS, 0.5))
+    keypoints, ties = counts(rng, np.full(PARTS_PER_SIDE, 0.5))
     water = slice(20, 40)
     keypoints[1, water] = rng.poisson(0.3, 20)
     keypoints[1, [20, 39]] = 200
@@ -73,9 +73,9 @@ def test_where_there_is_nothing_to_see_nothing_lacks(lost: int) -> None:
 
 def test_few_of_many_are_found_where_chance_would_not_hide_them() -> None:
     """Once in a million images: so few as none of 19 are borne, none of 38 are not."""
-    detail = np.full((2, PARTS), 10)
+    detail = np.full((2, PARTS_PER_SIDE), 10)
     for parts, told in ((2, False), (4, True)):
-        ties = np.full((2, PARTS), 10)
+        ties = np.full((2, PARTS_PER_SIDE), 10)
         ties[1, 30 : 30 + parts] = 0
         found = gap(detail, ties, SIZE)
         assert (found == Gap(1, 600.0, 679.0, 0, 38)) if told else found is None

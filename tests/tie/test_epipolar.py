@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.base.usual import robust_spread
+from barpc.base.statistics import robust_spread
 from barpc.tie.pairing.epipolar import (
     Affine,
     coherent,
     common_range,
-    frame,
+    epipolar_segments,
     grouped,
     linear_map,
     robust_affine,
@@ -22,7 +22,7 @@ def test_a_frame_predicts_where_a_point_lies_at_any_altitude(scene: Rendered) ->
     one, two = (view.sensor for view in scene.views)
     xy = np.random.default_rng(0).uniform(0, 300, (50, 2))
     low, high = common_range(*scene.views)
-    where = frame(*scene.views, xy)
+    where = epipolar_segments(*scene.views, xy)
     assert np.hypot(*where.axis) == pytest.approx(1.0)
     for alt in np.linspace(low, high, 5):
         seen = two.project(one.localize(xy, np.full(50, alt)))
@@ -33,7 +33,7 @@ def test_a_frame_predicts_where_a_point_lies_at_any_altitude(scene: Rendered) ->
     np.testing.assert_array_equal(where.before, -where.after)
     moved = where.moved(-2.0).errors(seen) - where.errors(seen)
     np.testing.assert_allclose(moved, [[0.0, 2.0]] * 50, atol=1e-9)
-    turned = frame(*scene.views, xy[:7], np.array([0.0, 1.0]))
+    turned = epipolar_segments(*scene.views, xy[:7], np.array([0.0, 1.0]))
     np.testing.assert_array_equal(turned.axis, [0.0, 1.0])
     np.testing.assert_allclose(turned.errors(turned.place(where.after[:7]))[:, 1], 0, atol=1e-9)
 
@@ -140,7 +140,7 @@ def test_a_frames_linear_map_is_that_of_the_middle_of_the_points_that_are_seen(s
     xy = np.random.default_rng(0).uniform(100, 5000, (51, 2))
     xy[:3] = np.nan
     with np.errstate(all="ignore"):
-        where = frame(*scene.views, xy)
+        where = epipolar_segments(*scene.views, xy)
     expected = linear_map(*scene.views, np.median(xy[3:], axis=0))
     np.testing.assert_array_equal(where.linear, expected)
     assert np.abs(linear_map(*scene.views, np.zeros(2)) - expected).max() > 1e-7

@@ -13,7 +13,7 @@ from barpc.pipeline.executor import CachingExecutor
 from barpc.scene import View
 from barpc.tie import TieOptions, detect
 from barpc.tie.matchers import features
-from barpc.tie.matchers.features import KeypointFiles, Share, _an_octave_up, detect_tile, locate, quota
+from barpc.tie.matchers.features import KeypointDensity, KeypointFiles, _an_octave_up, detect_tile, locate, quota
 from barpc.tie.pixels import survey, tiles
 from barpc.tie.tasks import Work, store_of
 from barpc.workspace import Workspace
@@ -148,8 +148,8 @@ def test_every_view_has_the_files_of_its_own_tiles(tmp_path, texture) -> None:
 def test_cells_hold_more_where_less_of_an_image_is_looked_at(tmp_path, texture, monkeypatch) -> None:
     """Keypoints wanted of an image are those of its part that is read."""
     parts: list[float] = []
-    within = Share.within
-    monkeypatch.setattr(Share, "within", lambda self, part: parts.append(part) or within(self, part))
+    within = KeypointDensity.within
+    monkeypatch.setattr(KeypointDensity, "within", lambda self, part: parts.append(part) or within(self, part))
     one = view(write_image(tmp_path / "a.tif", np.ascontiguousarray(texture[:200, :300])), (300, 200))
     monkeypatch.setattr(features, "shared_tiles", lambda views, pairs, options, area, boxes: [boxes[0][:1]])
     with store_of(None) as store:
@@ -187,21 +187,21 @@ def test_an_image_is_looked_at_as_closely_as_the_keypoints_wanted_ask_for(
 ) -> None:
     monkeypatch.setattr(features, "PER_IMAGE", keypoints)
     options = TieOptions(points_per_image=points, tile=tile)
-    share = Share.of((4000, 4000), options)
+    share = KeypointDensity.of((4000, 4000), options)
     assert share.zoom == zoom
     assert share.density == keypoints / 16e6
     monkeypatch.setattr(features, "PER_IMAGE", 10 * keypoints)
-    assert Share.of((4000, 40_000), options).zoom in (zoom, 1, 2)
+    assert KeypointDensity.of((4000, 40_000), options).zoom in (zoom, 1, 2)
 
 
 def test_a_box_may_hold_its_share() -> None:
-    assert Share(0.001).most((7, 9, 100, 50)) == 5
-    assert Share(0.001).most((7, 9, 100, 61)) == 6
+    assert KeypointDensity(0.001).most((7, 9, 100, 50)) == 5
+    assert KeypointDensity(0.001).most((7, 9, 100, 61)) == 6
 
 
 @pytest.mark.parametrize(("side", "cell"), [(10.0, 64), (95.0, 64), (97.0, 128), (159.0, 128), (161.0, 192)])
 def test_cells_hold_about_a_keypoint_and_are_whole_multiples(side, cell) -> None:
-    assert Share(1.0 / side**2).cell == cell
+    assert KeypointDensity(1.0 / side**2).cell == cell
 
 
 def test_the_strongest_of_files_are_the_same_share_of_every_tile() -> None:
@@ -233,7 +233,7 @@ def test_a_spot_is_found_where_it_stands_however_closely_it_is_looked_at(tmp_pat
     path = write_image(tmp_path / "a.tif", (100 + 2000 * np.asarray(picture)).astype(np.uint16))
     known = survey(path)
     assert known is not None
-    found = detect_tile(str(path), (480, 400), (0, 0, 480, 400), known, Share(0.1, zoom), TieOptions())
+    found = detect_tile(str(path), (480, 400), (0, 0, 480, 400), known, KeypointDensity(0.1, zoom), TieOptions())
     near = np.abs(found.xy[:, None] - spots).max(axis=2)
     assert (near.min(axis=0) < 0.3 * zoom).all()  # a quarter of it is OpenCV's own
     scale = found.scale[near.argmin(axis=0)]
@@ -251,7 +251,7 @@ def test_spots_of_a_twentieth_of_the_span_of_grey_values_are_enough(tmp_path, sh
     path = write_image(tmp_path / "a.tif", (100 + 20000 * (share * picture + (col > 420))).astype(np.uint16))
     known = survey(path)
     assert known is not None
-    found = detect_tile(str(path), (480, 400), (0, 0, 480, 400), known, Share(0.1, 1), TieOptions())
+    found = detect_tile(str(path), (480, 400), (0, 0, 480, 400), known, KeypointDensity(0.1, 1), TieOptions())
     near = np.abs(found.xy[:, None] - spots).max(axis=2) < 1.0
     assert least <= near.any(axis=0).sum() <= most
 
@@ -262,7 +262,7 @@ def test_a_box_looked_at_in_parts_has_the_keypoints_that_the_whole_has_there(tmp
     assert known is not None
     boxes, sides = [(0, 0, *size), box, box], [512, 512, 128]
     whole, once, parts = (
-        detect_tile(str(path), size, each, known, Share(1.0, 1), TieOptions(tile=side))
+        detect_tile(str(path), size, each, known, KeypointDensity(1.0, 1), TieOptions(tile=side))
         for each, side in zip(boxes, sides, strict=True)
     )
     first, last = np.array(box[:2]) - 0.5, np.add(box[:2], box[2:]) - 0.5

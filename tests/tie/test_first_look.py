@@ -11,7 +11,7 @@ import pytest
 
 from barpc.tie import TieOptions, TieResult, common_tracks, find_tracks, tracks
 from barpc.tie.matchers import features
-from barpc.tie.matchers.features import Share, worth_a_first_look
+from barpc.tie.matchers.features import KeypointDensity, worth_a_first_look
 from barpc.tie.matchers.matcher import NO_MATCHES
 from barpc.tie.matchers.matching import PairReport, ample
 from barpc.tie.pairing.overlaps import Pair
@@ -64,7 +64,7 @@ def without(monkeypatch):
 )  # fmt: skip
 def test_a_first_look_takes_half_the_detail_and_what_is_wanted_alone(side, points, zoom, worth) -> None:
     options = TieOptions(points_per_image=points)
-    share = Share.of((side, side), options, coarse=True)
+    share = KeypointDensity.of((side, side), options, coarse=True)
     assert share.zoom == zoom
     assert share.density == pytest.approx(min(5 * points, features.PER_IMAGE) / side**2)
     assert worth_a_first_look([(side, side)], options) == worth

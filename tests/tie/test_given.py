@@ -15,7 +15,7 @@ from barpc.base.errors import DisconnectedError, TiePointError
 from barpc.rasters.raster import open_raster
 from barpc.scene import Tracks
 from barpc.tie import Matches, Scope, TieOptions, common_tracks, find_tracks
-from barpc.tie.pairing.epipolar import frame
+from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.tracks import pair_counts
 from tests.lanes import rest_slow
 
@@ -117,7 +117,7 @@ def test_where_nothing_else_ties_what_agrees_by_chance_is_refused(render, tmp_pa
     views = [replace(view, path=str(blank)) for view in scene.views]
     for seed in range(10):
         given = true_matches(scene, (0, 1), count=count)[0, 1]
-        where = frame(*views, given.xy[:, 0])
+        where = epipolar_segments(*views, given.xy[:, 0])
         along = np.random.default_rng(seed).normal(0, [[20.0], [noise]], (2, count))
         places = np.stack([given.xy[:, 0], replace(where, across=where.across + along[1]).place(along[0])], axis=1)
         scope = Scope(given={(0, 1): replace(given, xy=places)})
@@ -223,13 +223,13 @@ def test_no_more_is_read_for_matches_of_others_than_patches_about_them(render, t
         with open_raster(view.path) as image:
             path = write_image(tmp_path / f"{view.name}.tif", np.tile(image.read(1), (10, 10)), tiled=True)
         large.append(replace(view, path=str(path), size=(3000, 3000)))
-    read, pixels = reading._Band.read, []
+    read, pixels = reading._RasterBand.read, []
 
     def watched(band, box, *more):
         pixels.append(box[2] * box[3])
         return read(band, box, *more)
 
-    monkeypatch.setattr(reading._Band, "read", watched)
+    monkeypatch.setattr(reading._RasterBand, "read", watched)
     given = true_matches(scene, (0, 1), count=200)
     assert find_tracks(large, scope=Scope(given=given)).tracks.num_points > 100
     assert 2 * 290**2 < sum(pixels) <= 2 * 356**2  # 300 and a margin of 28 px

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from barpc.tie import TieOptions
-from barpc.tie.matchers.features import Keypoints, Share, Sift, detect_tile, join_keypoints, quota, ranked
-from barpc.tie.matchers.guided import _PAIRS, Guided, _Described, _near
+from barpc.tie.matchers.features import KeypointDensity, Keypoints, Sift, detect_tile, join_keypoints, quota, ranked
+from barpc.tie.matchers.guided import _PAIRS, Guided, _Described, _pairs_in_band
 from barpc.tie.matchers.matcher import Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments
 from barpc.tie.pixels import Stretch, grow, read_pixels, sample_stretch, survey, tiles
@@ -176,7 +176,7 @@ def test_a_tile_holds_the_keypoints_between_its_edges_away_from_nodata(tmp_path)
     assert stored is not None
     with chosen(TieOptions, keypoints_per_cell=10_000, tile=160, cell=32) as options:
         boxes = tiles((320, 320), options)
-        found = [detect_tile(str(path), (320, 320), box, stored, Share(0.1), options) for box in boxes]
+        found = [detect_tile(str(path), (320, 320), box, stored, KeypointDensity(0.1), options) for box in boxes]
     for (col, row, width, height), part in zip(boxes, found, strict=True):
         assert (part.xy >= [col - 0.5, row - 0.5]).all()
         assert (part.xy < [col + width - 0.5, row + height - 0.5]).all()
@@ -249,7 +249,7 @@ def test_all_points_of_slanted_bands_are_looked_at_and_few_others(slope: float, 
         for xy, angle in ((place, rng.uniform(0, 7, 1500)), (turned, rng.uniform(0, 7, 4000)))
     )
     asked, seen, tilt = np.arange(0, 1500, 3), [], 3.0 + abs(slope) * max(abs(end) for end in reach)
-    for rows, cols in _near(where, 3.0, asked, turned, first, second):
+    for rows, cols in _pairs_in_band(where, 3.0, asked, turned, first, second):
         seen.append(np.stack([rows, cols], axis=1))
         assert (np.diff(rows) >= 0).all()
         du, dw = (turned[cols] - place[rows]).T

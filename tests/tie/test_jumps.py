@@ -13,7 +13,7 @@ from barpc.scene import View
 from barpc.tie import common_tracks, find_tracks
 from barpc.tie.matchers.given import verify_given
 from barpc.tie.matchers.matcher import Matches
-from barpc.tie.matchers.matching import _Search
+from barpc.tie.matchers.matching import _PairSearch
 from barpc.tie.pairing.overlaps import Pair
 from barpc.tie.tasks import HERE
 from benchmarks.planted import Plant
@@ -86,8 +86,8 @@ def test_of_given_matches_those_behind_a_jump_stay_and_those_anywhere_go(scene: 
 
 
 def test_a_clean_pair_is_not_looked_at_for_offsets_that_it_does_not_have(scene: Rendered, monkeypatch) -> None:
-    peaks, beside = [], _Search._beside
-    monkeypatch.setattr(_Search, "_beside", lambda *args: peaks.append(beside(*args)) or peaks[-1])
+    peaks, beside = [], _PairSearch._beside
+    monkeypatch.setattr(_PairSearch, "_beside", lambda *args: peaks.append(beside(*args)) or peaks[-1])
     find_tracks(scene.views)
     assert peaks
     assert not any(peaks)

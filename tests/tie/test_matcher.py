@@ -14,7 +14,7 @@ from barpc.base.errors import TiePointError
 from barpc.tie import Keypoints, Matches, TieOptions, common_tracks, find_tracks
 from barpc.tie.matchers.matcher import Prediction
 from barpc.tie.matchers.matching import MATCHERS
-from barpc.tie.pairing.epipolar import frame
+from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.pixels import levelled, read_pixels
 from tests.lanes import rest_slow
 
@@ -116,7 +116,7 @@ def test_a_matcher_that_guesses_is_not_believed(render, monkeypatch) -> None:
 def test_a_place_along_the_line_has_no_error_across_it(render) -> None:
     first, second = render(views=2, size=(300, 300)).views
     xy = np.random.default_rng(0).uniform(0, 299, (50, 2))
-    where, along = frame(first, second, xy), np.linspace(-30, 30, 50)
+    where, along = epipolar_segments(first, second, xy), np.linspace(-30, 30, 50)
     np.testing.assert_allclose(where.errors(where.place(along)), np.stack([along, 0 * along], 1), atol=1e-9)
     np.testing.assert_allclose(
         where.place(where.after),

@@ -14,7 +14,7 @@ from barpc.tie import TieOptions
 from barpc.tie.matchers import matching
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
-from barpc.tie.matchers.matching import MATCHERS, PairReport, _latest, _Search, better, enough
+from barpc.tie.matchers.matching import MATCHERS, PairReport, _latest, _PairSearch, better, enough
 from barpc.tie.pairing.epipolar import (
     EpipolarSegments,
 )
@@ -74,10 +74,10 @@ class Scripted:
 
 
 @pytest.fixture
-def search(monkeypatch) -> Callable[[Scripted], _Search]:
-    def made(matcher: Scripted) -> _Search:
+def search(monkeypatch) -> Callable[[Scripted], _PairSearch]:
+    def made(matcher: Scripted) -> _PairSearch:
         monkeypatch.setitem(MATCHERS, "scripted", lambda *_: matcher)
-        return _Search(
+        return _PairSearch(
             tuple(views(camera(0.0), camera(0.0))),
             (join_keypoints([]), join_keypoints([])),
             TieOptions(matcher="scripted"),
@@ -90,13 +90,15 @@ def test_a_matcher_without_keypoints_has_its_frame_at_the_middles_of_the_tiles_t
     asked: list[Any] = []
     monkeypatch.setitem(MATCHERS, "blind", lambda *_: SimpleNamespace(detects=False))
     monkeypatch.setattr(matching, "shared_tiles", lambda *_: [[(0, 0, 100, 50), (100, 20, 60, 40)]])
-    monkeypatch.setattr(matching, "frame", lambda a, b, points: asked.append(points) or SimpleNamespace(axis=None))
+    monkeypatch.setattr(
+        matching, "epipolar_segments", lambda a, b, points: asked.append(points) or SimpleNamespace(axis=None)
+    )
     ends = tuple(views(camera(0.0), camera(0.0)))
-    _Search(ends, (join_keypoints([]), join_keypoints([])), TieOptions(matcher="blind"))
+    _PairSearch(ends, (join_keypoints([]), join_keypoints([])), TieOptions(matcher="blind"))
     assert [points.tolist() for points in asked] == [[[50.0, 25.0], [130.0, 40.0]]]
     monkeypatch.setitem(MATCHERS, "scripted", lambda *_: Scripted([]))
     keypoints: Any = SimpleNamespace(xy="of the first"), SimpleNamespace(xy="of the second")
-    _Search(ends, keypoints, TieOptions(matcher="scripted"))
+    _PairSearch(ends, keypoints, TieOptions(matcher="scripted"))
     assert asked[1] == "of the first"
 
 

@@ -15,9 +15,9 @@ from barpc.tie import Matches, TieOptions
 from barpc.tie.matchers import matching
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES
-from barpc.tie.matchers.matching import Ground, PairReport, match_pair, match_pairs
+from barpc.tie.matchers.matching import GroundAltitudes, PairReport, match_pair, match_pairs
 from barpc.tie.pairing.overlaps import Pair
-from barpc.tie.tracks import _joined, _unlike, _with_unregistered, link
+from barpc.tie.tracks import _merge_registered, _unlike, _with_unregistered, link
 
 from .test_pairs import camera, views
 
@@ -91,7 +91,7 @@ def test_what_looser_thresholds_cannot_change_is_not_tried_again(attempts, monke
     made = attempts(report(20), report(120))
     assert match_pair((None, None), NOBODY, PAIR, own)[1].verified == 20  # type: ignore[arg-type]
     structure = TieOptions(matcher=matching.STRUCTURE)
-    for matches, second in ((7, matching.FINE), (8, matching.STRUCTURE)):
+    for matches, second in ((7, matching.FINE_STRUCTURE), (8, matching.STRUCTURE)):
         made.clear()
         attempts(report(0, "too few matches", matches), report(120))
         match_pair((None, None), NOBODY, PAIR, structure)  # type: ignore[arg-type]
@@ -101,11 +101,11 @@ def test_what_looser_thresholds_cannot_change_is_not_tried_again(attempts, monke
 def test_whole_pixels_are_looked_at_where_structure_finds_nothing_and_only_there(attempts, shares) -> None:
     """Once, with looser thresholds; what it does not find either is refused for the first reason."""
     structure, nothing = TieOptions(matcher=matching.STRUCTURE), report(0, "no common offset within 700 px")
-    made = attempts(nothing, replace(report(30), matcher=matching.FINE))
+    made = attempts(nothing, replace(report(30), matcher=matching.FINE_STRUCTURE))
     found = match_pair((None, None), NOBODY, PAIR, structure)[1]  # type: ignore[arg-type]
     assert found.means == "fine-structure, loosened"
     assert [(one.matcher, share, one.min_matches) for one, share in zip(made, shares, strict=True)][1:] == [
-        (matching.FINE, 0.05, 8)
+        (matching.FINE_STRUCTURE, 0.05, 8)
     ]
     made.clear()
     attempts(nothing, report(0, "too few matches"))
@@ -114,7 +114,7 @@ def test_whole_pixels_are_looked_at_where_structure_finds_nothing_and_only_there
     made.clear()
     attempts(report(20), report(19))
     match_pair((None, None), NOBODY, PAIR, structure)  # type: ignore[arg-type]
-    assert matching.FINE not in [one.matcher for one in made]
+    assert matching.FINE_STRUCTURE not in [one.matcher for one in made]
 
 
 # --- structure ----------------------------------------------------------------------------------------------
@@ -156,12 +156,12 @@ def test_a_matcher_that_is_named_is_what_is_wanted_unless_the_terrain_tells_stru
     second_look,
 ) -> None:
     few = [report(40)]
-    assert second_look(few, TieOptions(matcher="somewhere:match"), ground=Ground(hills))[0] == []
+    assert second_look(few, TieOptions(matcher="somewhere:match"), ground=GroundAltitudes(hills))[0] == []
     assert second_look(few, TieOptions(matcher="structure"))[0] == []
-    ((_, name, ranges),) = second_look(few, TieOptions(matcher="structure"), ground=Ground(hills))[0]
+    ((_, name, ranges),) = second_look(few, TieOptions(matcher="structure"), ground=GroundAltitudes(hills))[0]
     assert name == "structure"
     assert ranges == [(0.0, 200.0), (20.0, 140.0)]  # 150 m about the terrain, and 50
-    assert second_look([report(100)], TieOptions(matcher="structure"), ground=Ground(hills))[0] == []
+    assert second_look([report(100)], TieOptions(matcher="structure"), ground=GroundAltitudes(hills))[0] == []
 
 
 def test_a_pair_without_keypoints_has_no_match_and_no_share_of_them() -> None:
@@ -178,7 +178,7 @@ def test_altitudes_are_known_from_pairs_whose_segments_are_five_pixels_to_either
         two = tuple(views(camera(0.0, lean=0.0), camera(0.0, lean=lean)))
         ground = np.column_stack([np.linspace(-1e-3, 1e-3, 201), np.zeros(201), np.linspace(0.0, 200.0, 201)])
         xy = np.stack([view.sensor.project(ground) for view in two], axis=1)
-        known = Ground(None, [(two, Matches.of_places(xy, np.zeros(201)))]).altitudes()
+        known = GroundAltitudes(None, [(two, Matches.of_places(xy, np.zeros(201)))]).altitudes()
         assert (known is not None) == tells
         if known is not None:
             assert known == pytest.approx((4.0, 196.0), abs=0.5)  # percentiles 2 and 98
@@ -202,13 +202,13 @@ def test_a_point_that_is_registered_is_one_track_and_what_else_sees_it_goes_with
         (0, 2, 50.0, 50.0), (2, 2, 100.0, 100.0),  # beside another view's
         (0, 3, 302.3, 300.0), (1, 3, 351.0, 299.0), (2, 3, 700.0, 700.0),  # known; the third has its place already
     )  # fmt: skip
-    found = _joined(three, known, other)
+    found = _merge_registered(three, known, other)
     assert found.point.tolist() == [0, 0, 1, 1, 1, 2, 2]
     assert found.view.tolist() == [0, 1, 0, 1, 2, 0, 2]
     expected = [[100, 100], [50, 50], [300, 300], [350, 300], [598, 601], [50, 50], [100, 100]]
     np.testing.assert_allclose(found.xy, expected, atol=1e-6)
     none = Tracks(*(np.empty(0, np.int64),) * 2, np.empty((0, 2)), np.empty(0))
-    assert _joined(three, none, other).num_points == 4
+    assert _merge_registered(three, none, other).num_points == 4
 
 
 def given_matches(count: int) -> Matches:
@@ -278,7 +278,7 @@ def test_the_quick_score_is_of_the_strongest_and_nought_where_there_are_none(ren
 def test_a_pair_is_sought_at_altitudes_that_others_lie_at(known, within) -> None:
     sensor: Any = None
     two = View("a", "a.tif", (50, 40), sensor, (0.0, 900.0)), View("b", "b.tif", (60, 30), sensor, (100.0, 1000.0))
-    found = Ground().within(two, known, 50.0)
+    found = GroundAltitudes().within(two, known, 50.0)
     if within is None:
         assert found is two
     else:

@@ -14,11 +14,11 @@ from barpc.base.errors import InputError
 from barpc.rasters.raster import open_raster
 from barpc.scene import Tracks
 from barpc.tie import TieOptions, detect, find_tracks, link, select_pairs
-from barpc.tie.matchers.features import Keypoints, Share, detect_tile
+from barpc.tie.matchers.features import KeypointDensity, Keypoints, detect_tile
 from barpc.tie.matchers.matching import PairReport, match_pair
 from barpc.tie.pairing.epipolar import (
     common_range,
-    frame,
+    epipolar_segments,
 )
 from barpc.tie.pairing.overlaps import Pair
 from barpc.tie.patches import dense
@@ -150,7 +150,7 @@ def _offset(scene: Rendered) -> tuple[float, float]:
     xy = rng.uniform(20, 280, (200, 2))
     alt = float(np.nanmean(scene.altitude[0]))
     seen = two.project(one.localize(xy, np.full(200, alt)))
-    along, across = np.median(frame(*scene.views, xy).errors(seen), axis=0)
+    along, across = np.median(epipolar_segments(*scene.views, xy).errors(seen), axis=0)
     return float(along), float(across)
 
 
@@ -179,7 +179,7 @@ def test_tiles_are_as_large_as_asked_for(scene: Rendered) -> None:
     view = scene.views[0]
     stored = survey(view.path, 1)
     assert stored is not None
-    small = detect_tile(view.path, view.size, (0, 0, 128, 128), stored, Share(0.1), TieOptions(tile=128))
+    small = detect_tile(view.path, view.size, (0, 0, 128, 128), stored, KeypointDensity(0.1), TieOptions(tile=128))
     assert (small.xy < 128).all()
 
 
@@ -216,7 +216,7 @@ def test_a_view_gets_as_many_partners_as_asked_for() -> None:
 @pytest.mark.slow
 def test_the_search_reaches_as_far_as_asked_for(scene: Rendered) -> None:
     """The second camera is 80 px wrong across the epipolar lines."""
-    where = frame(*scene.views, np.array([[150.0, 150.0]]))
+    where = epipolar_segments(*scene.views, np.array([[150.0, 150.0]]))
     aside = np.array([-where.axis[1], where.axis[0]]) * 80.0
     second = scene.views[1]
     wrong = (scene.views[0], replace(second, sensor=second.sensor.crop(*-aside)))
@@ -296,6 +296,6 @@ def test_common_altitudes_are_those_that_both_ranges_hold() -> None:
 
 def test_the_penalties_of_dense_matching_are_opencv_s_for_disparities_twice_as_fine() -> None:
     """8 and 32 times the pixels of a window, by the manual of StereoSGBM; of one channel."""
-    assert dense.FINER == 2
-    assert dense._SGBM["P1"] == dense.FINER * 8 * dense._SGBM["blockSize"] ** 2 == 400
-    assert dense._SGBM["P2"] == dense.FINER * 32 * dense._SGBM["blockSize"] ** 2 == 1600
+    assert dense.COLUMNS_PER_PIXEL == 2
+    assert dense._SGBM["P1"] == dense.COLUMNS_PER_PIXEL * 8 * dense._SGBM["blockSize"] ** 2 == 400
+    assert dense._SGBM["P2"] == dense.COLUMNS_PER_PIXEL * 32 * dense._SGBM["blockSize"] ** 2 == 1600

@@ -11,7 +11,7 @@ from rasterio import Affine
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import metres_per_unit
-from barpc.tie.patches.channels import Patch, Sheet, of_image, of_reference, picture, shown, ticks
+from barpc.tie.patches.channels import Patch, Sheet, of_image, of_reference, picture, picture_share, ticks
 
 from .conftest import write_image
 from .test_pairs import camera, views
@@ -202,9 +202,9 @@ def test_of_several_orthoimages_the_first_that_shows_a_place_is_seen(tmp_path) -
     np.testing.assert_array_equal(both[west], one[west])
     np.testing.assert_array_equal(both[east], two[east])
     assert np.abs(both[west] - two[west]).max() > 0.1
-    assert 0.4 < shown(one) < 0.8
-    assert shown(both) > 0.9
-    assert shown(of_reference([far], patch)) == 0.0
+    assert 0.4 < picture_share(one) < 0.8
+    assert picture_share(both) > 0.9
+    assert picture_share(of_reference([far], patch)) == 0.0
 
 
 def test_an_image_on_a_patch_is_what_its_camera_sees_there(tmp_path) -> None:
@@ -215,7 +215,7 @@ def test_an_image_on_a_patch_is_what_its_camera_sees_there(tmp_path) -> None:
     patch = Patch.on(lambda x, y: np.full(np.shape(x), 100.0), np.array([lon, lat]), 0.5, (40, 50), np.zeros(2))
     shape = of_image(view, 1, patch)
     assert shape.shape == (2, 40, 50)
-    assert shown(shape) == 1.0
+    assert picture_share(shape) == 1.0
     moved = replace(patch, lonlat=patch.lonlat - np.array([1.0, 2.0]) / METRES, moved=np.array([1.0, 2.0]))
     np.testing.assert_allclose(of_image(view, 1, moved), shape, atol=0.02)
 

@@ -119,7 +119,7 @@ def test_images_that_are_right_are_not_asked(render, triplet, ventoux, monkeypat
     def never(*_: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr(matching, "likeliest", never)
+    monkeypatch.setattr(matching, "likeliest_placing", never)
     for views in (render(views=2, size=(300, 300)).views, triplet[:2], ventoux):
         assert find_tracks(views).tracks.num_points > 200
 
@@ -164,7 +164,7 @@ def test_scale_is_asked_across_the_lines_where_relief_has_no_say(render, scale: 
     scene = render(views=2, size=(300, 300))
     rng = np.random.default_rng(2)
     first = rng.uniform(0, 299, (200, 2))
-    where = matching.frame(*scene.views, first)
+    where = matching.epipolar_segments(*scene.views, first)
     across = where.across.mean() + scale * (where.across - where.across.mean()) + rng.normal(0, 0.3, 200)
     second = replace(where, across=across).place(rng.normal(0, 40, 200))
     assert stretched((scene.views[0], scene.views[1]), first, second) is asked

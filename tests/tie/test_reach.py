@@ -21,8 +21,8 @@ from barpc.tie import PairReport, TieOptions, common_tracks, find_tracks
 from barpc.tie.matchers import matching, structural
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Prediction
-from barpc.tie.matchers.matching import _Search, match_pair
-from barpc.tie.pairing.epipolar import frame
+from barpc.tie.matchers.matching import _PairSearch, match_pair
+from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.pairing.overlaps import Pair, reach_of
 from barpc.tie.patches import oriented
 from barpc.tie.patches.oriented import PatchTile
@@ -86,7 +86,7 @@ def test_no_width_is_searched_twice(monkeypatch, asked, passes) -> None:
 
     monkeypatch.setitem(matching.MATCHERS, "nothing", Nothing)
     two = (*views(camera(0.0), camera(METRE)),)
-    search = _Search(two, (join_keypoints([]), join_keypoints([])), TieOptions(matcher="nothing", search=asked))  # type: ignore[arg-type]
+    search = _PairSearch(two, (join_keypoints([]), join_keypoints([])), TieOptions(matcher="nothing", search=asked))  # type: ignore[arg-type]
     assert search.offset() is None
     assert made == passes
 
@@ -131,7 +131,7 @@ def test_segments_around_an_epipole_stay_near_their_points() -> None:
     """A frame camera above what a satellite sees straight below: points move away from the middle as they grow."""
     below, above = views(camera(0.0, lean=0.0)), replace(*views(camera(0.0)), sensor=Pinhole())
     xy = np.random.default_rng(1).uniform(0, 999, (500, 2))
-    where = frame(above, below[0], xy)
+    where = epipolar_segments(above, below[0], xy)
     assert (np.abs(where.slope) <= 1.0).all()
     ends = np.stack([where.place(where.before - 700.0), where.place(where.after + 700.0)])
     assert np.abs(ends - xy).max() < 1.5 * 750.0  # 1000 times that without a bound
@@ -155,10 +155,10 @@ def test_segments_around_an_epipole_stay_near_their_points() -> None:
 def test_a_search_in_parts_finds_what_a_search_in_one_finds(monkeypatch, scene) -> None:
     """Bands without votes: every point is looked for alone; how many are correlated together changes nothing."""
     options = TieOptions(matcher="structure", search=20.0)
-    search = _Search(tuple(scene.views), (join_keypoints([]), join_keypoints([])), options)
+    search = _PairSearch(tuple(scene.views), (join_keypoints([]), join_keypoints([])), options)
     coarse = search.offset()
     assert coarse is not None
-    whole = structural._Search(*scene.views, 1, coarse).matches()
+    whole = structural._GridSearch(*scene.views, 1, coarse).matches()
     sizes, of = [], PatchTile.surfaces
 
     def watched(self):
@@ -169,7 +169,7 @@ def test_a_search_in_parts_finds_what_a_search_in_one_finds(monkeypatch, scene) 
     monkeypatch.setattr(PatchTile, "surfaces", watched)
     monkeypatch.setattr(structural, "PIECE", 30_000)
     monkeypatch.setattr(oriented, "PIECE", 20_000)
-    parts = structural._Search(*scene.views, 1, coarse).matches()
+    parts = structural._GridSearch(*scene.views, 1, coarse).matches()
     assert len(sizes) >= 8
     assert max(sizes) <= 60_000
     assert len(parts) == len(whole) > 100

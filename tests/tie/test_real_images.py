@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.base.usual import robust_spread
+from barpc.base.statistics import robust_spread
 from barpc.scene import Tracks, View
 from barpc.tie import TieOptions, TieResult, common_tracks, detect, find_tracks, match_pairs, select_pairs
-from barpc.tie.pairing.epipolar import Affine, coherent, frame, robust_affine
+from barpc.tie.pairing.epipolar import Affine, coherent, epipolar_segments, robust_affine
 
 PAIRS = [(0, 1), (0, 2), (1, 2)]
 
 
 def across(views: list[View], i: int, j: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Distance of points of view j from the epipolar lines of points of view i [px]."""
-    return frame(views[i], views[j], first).errors(second)[:, 1]
+    return epipolar_segments(views[i], views[j], first).errors(second)[:, 1]
 
 
 def fit(views: list[View], tracks: Tracks, i: int, j: int) -> tuple[Affine, np.ndarray]:

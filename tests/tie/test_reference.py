@@ -18,7 +18,16 @@ from barpc.rasters.dem import Dem
 from barpc.rpcio import read_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
-from barpc.tie.reference import PEAK, Accuracy, ReferenceControl, ViewMatch, _affine, _Work, peak, register_views
+from barpc.tie.reference import (
+    PEAK,
+    Accuracy,
+    ReferenceControl,
+    ViewMatch,
+    _affine,
+    _ReferenceWork,
+    peak,
+    register_views,
+)
 from barpc.tie.tasks import HERE
 from tests.lanes import rest_slow
 from tests.scenes import ImageOptions, Scene
@@ -281,7 +290,7 @@ def test_a_reference_is_good_to_a_quarter_of_its_pixel_and_to_half_a_metre_at_be
     profile = {"width": 50, "height": 50, "count": 1, "dtype": "uint8", "crs": "EPSG:4326"}
     with rasterio.open(path, "w", "GTiff", transform=corner, **profile) as file:
         file.write(np.ones((50, 50), np.uint8), 1)
-    monkeypatch.setattr(_Work, "vote", lambda self: [(0.0, np.zeros(2))])  # it shows nothing
+    monkeypatch.setattr(_ReferenceWork, "vote", lambda self: [(0.0, np.zeros(2))])  # it shows nothing
     view = View("a", "", (SIDE, SIDE), camera(0.0), (0.0, 200.0))
     assert register_views([view], [str(path)], flat).sigma == pytest.approx(sigma, rel=0.02)
     assert register_views([view], [str(path)], flat, accuracy=Accuracy(7.0)).sigma == 7.0
@@ -298,7 +307,7 @@ def test_in_the_north_points_are_looked_for_where_the_vote_says_that_they_are_se
     view = View("north", "", (SIDE, SIDE), sensor, (0.0, 200.0))
     metres = metres_per_unit(np.array([10.0, 60.0, 0.0]))[:2]
     local = np.stack(np.meshgrid(*[np.arange(-300.0, 301.0, 20.0)] * 2), axis=-1).reshape(-1, 2)
-    work = _Work((view,), [], flat, 1, step=2.0, work=HERE)
+    work = _ReferenceWork((view,), [], flat, 1, step=2.0, work=HERE)
     tiles = work._tiles(view, np.array([100.0, 0.0]), [10.0, 60.0] + local / metres, np.full(len(local), LEVEL), 8)
     found = np.isin(np.arange(len(local)), np.concatenate([tile.points for tile in tiles]))
     edge = scale[:2] * metres - 16.0  # half a template from the border

@@ -12,16 +12,16 @@ import pytest
 from barpc.scene import Tracks
 from barpc.tie import TieOptions
 from barpc.tie.pairing.epipolar import (
-    frame,
+    epipolar_segments,
 )
 from barpc.tie.patches.register import (
     PatchRegistration,
     _at,
-    _joined,
-    _Links,
-    _parts,
-    _shared,
+    _merge_groups,
+    _Registrations,
+    _shared_variance,
     _sparse,
+    _task_parts,
     references,
     register_places,
 )
@@ -71,7 +71,7 @@ def test_the_variance_of_a_registration_is_shared_by_both_ends() -> None:
     of_track = np.array([0, 3, 5])
     rows, xy = np.array([1, 2, 4]), np.array([[1.25, 2.5], [3.25, 4.5], [5.5, 6.5]])
     sigma = np.array([0.2, 0.4, 0.01])
-    found = _shared(tracks, of_track, rows, xy, sigma)
+    found = _shared_variance(tracks, of_track, rows, xy, sigma)
     assert found.point.tolist() == [0, 0, 0, 1, 1]  # the third is found nowhere
     expected = [np.sqrt((0.02 + 0.08) / 2), np.sqrt(0.02), np.sqrt(0.08), 0.02, 0.02]
     np.testing.assert_allclose(found.sigma, expected)
@@ -86,9 +86,9 @@ def test_sigmas_are_those_of_the_epipolar_lines_where_these_say_more(count, nois
     two = views(camera(0.0, lean=0.0), camera(0.0, lean=0.2))
     rng = np.random.default_rng(4)
     places = rng.integers(100, 900, (count, 2)).astype(float)
-    xy = np.stack([places, frame(*two, places).place(np.zeros(count))], axis=1).reshape(-1, 2)
+    xy = np.stack([places, epipolar_segments(*two, places).place(np.zeros(count))], axis=1).reshape(-1, 2)
     tracks = Tracks(np.tile([0, 1], count), np.repeat(np.arange(count), 2), xy, np.full(2 * count, 0.1))
-    links = _Links(two, tracks, np.arange(0, 2 * count, 2), np.arange(1, 2 * count, 2))
+    links = _Registrations(two, tracks, np.arange(0, 2 * count, 2), np.arange(1, 2 * count, 2))
     across = rng.normal(0, noise, count)
     found = PatchRegistration.none(xy[1::2] + np.column_stack([rng.uniform(-5, 5, count), across]))
     found.sigma[:] = 0.1
@@ -96,14 +96,14 @@ def test_sigmas_are_those_of_the_epipolar_lines_where_these_say_more(count, nois
     np.testing.assert_allclose(sigma, scaled, rtol=0.3 if scaled > 0.1 else 1e-12)
 
 
-def links_of(count: int, seen: int) -> _Links:
+def links_of(count: int, seen: int) -> _Registrations:
     """Tracks in a row of `seen` like views, referred to the first."""
     many = views(*(camera(0.0, lean=0.2 * v) for v in range(seen)))
     xy = np.repeat(np.random.default_rng(5).integers(100, 900, (count, 2)).astype(float), seen, axis=0)
     tracks = Tracks(np.tile(np.arange(seen), count), np.repeat(np.arange(count), seen), xy, np.full(seen * count, 0.1))
     rows = np.arange(seen * count)
     other = rows[rows % seen > 0]
-    return _Links(many, tracks, other - other % seen, other)
+    return _Registrations(many, tracks, other - other % seen, other)
 
 
 def test_links_that_disagree_in_altitude_with_all_their_neighbours_are_torn() -> None:
@@ -142,7 +142,7 @@ def test_what_is_verified_is_on_its_line_at_its_altitude_and_no_less_certain_tha
     altitude = np.repeat(np.random.default_rng(1).uniform(-0.5, 0.5, 60), 2)
     xy = np.empty((120, 2))
     for group in links.groups():
-        where = frame(*links.of(group), links.origin[group])
+        where = epipolar_segments(*links.of(group), links.origin[group])
         xy[group] = where.place(altitude[group] * where.after)
         assert 15.0 < np.median(where.after) < 45.0
         aside = np.array([-where.axis[1], where.axis[0]])
@@ -163,17 +163,17 @@ def test_what_is_verified_is_on_its_line_at_its_altitude_and_no_less_certain_tha
 def test_tiles_that_follow_each_other_share_a_task_as_far_as_it_holds_their_points() -> None:
     groups = [np.arange(first, last) for first, last in ((0, 3), (3, 5), (5, 6), (6, 12), (12, 14))]
     for most, lengths in ((1, [3, 2, 1, 6, 2]), (5, [5, 1, 6, 2]), (6, [6, 6, 2]), (14, [14])):
-        joined = _joined(groups, most)
+        joined = _merge_groups(groups, most)
         assert [len(part) for part in joined] == lengths
         np.testing.assert_array_equal(np.concatenate(joined), np.arange(14))
-    assert _joined([], 5) == []
+    assert _merge_groups([], 5) == []
 
 
 @pytest.mark.parametrize("count", [1300, 60_000])
 def test_few_points_are_registered_in_bands_of_rows_swept_by_columns(count: int) -> None:
     places = np.random.default_rng(0).uniform(0, 40_000, (count, 2))
     links = np.arange(count) + 7
-    parts = _parts(places, links, 1024)
+    parts = _task_parts(places, links, 1024)
     assert max(len(part) for part in parts) <= 512
     assert len(parts) <= 1.1 * count / 512 + count / 400  # nearly full
     assert sorted(np.concatenate(parts)) == links.tolist()

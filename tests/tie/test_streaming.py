@@ -20,7 +20,7 @@ from barpc.pipeline.executor import CachingExecutor
 from barpc.scene import View
 from barpc.tie import TieOptions, find_tracks
 from barpc.tie.matchers import features
-from barpc.tie.matchers.features import KeypointFiles, Share, detect_tile, keep_tile, locate
+from barpc.tie.matchers.features import KeypointDensity, KeypointFiles, detect_tile, keep_tile, locate
 from barpc.tie.patches.register import _usual
 from barpc.tie.pixels import Survey, read_picture, survey, tiles
 from barpc.tie.tasks import Store, Work
@@ -84,9 +84,9 @@ def test_the_quiet_half_of_a_scene_has_its_share_however_few_keypoints_it_may_ho
 
 @pytest.mark.parametrize(("side", "zoom"), [(1000, 1), (3000, 1), (4000, 2), (13_000, 2), (15_000, 4), (40_000, 4)])
 def test_larger_images_are_looked_at_in_less_detail(side: int, zoom: int, monkeypatch) -> None:
-    assert Share.of((side, side), TieOptions()).zoom == zoom
+    assert KeypointDensity.of((side, side), TieOptions()).zoom == zoom
     monkeypatch.setattr(features, "PER_IMAGE", 10**7)
-    assert Share.of((side, side), TieOptions(points_per_image=10**6)).zoom <= zoom
+    assert KeypointDensity.of((side, side), TieOptions(points_per_image=10**6)).zoom <= zoom
 
 
 def test_a_sigma_is_judged_beside_those_about_it() -> None:
@@ -99,7 +99,7 @@ def test_a_sigma_is_judged_beside_those_about_it() -> None:
 
 
 def test_a_share_lasts_when_the_cameras_move_a_little() -> None:
-    share = Share.of((4000, 4000), TieOptions())
+    share = KeypointDensity.of((4000, 4000), TieOptions())
     assert share.within(0.9) == share.within(0.6) == share.within(1.0)
     assert share.within(0.2).density == 4 * share.density
     assert share.within(0.0).density > share.density
@@ -141,7 +141,7 @@ def test_a_pair_reads_the_tiles_that_it_needs(pair, tmp_path, monkeypatch) -> No
 def test_a_damaged_tile_is_made_again_and_a_missing_one_is_named(pair, tmp_path, damage: str) -> None:
     store, view, box = Store(str(tmp_path / "kept"), str(tmp_path)), pair[0], (0, 0, 256, 256)
     found, options = survey(view.path), TieOptions()
-    task = (store, "tile/a", (view.path, view.size, box, found, Share(0.002), options))
+    task = (store, "tile/a", (view.path, view.size, box, found, KeypointDensity(0.002), options))
     count = keep_tile(*task)
     path = tmp_path / "kept/tile/a.npz"
     whole = path.read_bytes()
@@ -213,7 +213,7 @@ def test_the_levels_of_a_jpeg_2000_show_the_same_places(tmp_path, zoom: int, sid
         out.write(data, 1)
     found = [survey(path) for path in paths]
     assert [known and known.levels for known in found] == [False, True]
-    options, share = TieOptions(), Share(1.0, zoom)
+    options, share = TieOptions(), KeypointDensity(1.0, zoom)
     at = [
         detect_tile(str(p), (side, side), (0, 0, side, side), f, share, options)
         for p, f in zip(paths, found, strict=True)
@@ -284,20 +284,20 @@ def test_blocks_are_decoded_once_a_stage(pair, tmp_path, monkeypatch, layout, zo
     views, options = [stored(view, tmp_path, layout) for view in pair], TieOptions(tile=512)
     log: list[Any] = []
     opened: list[str] = []
-    read, start = reading._Band.read, reading.open_raster
+    read, start = reading._RasterBand.read, reading.open_raster
     monkeypatch.setattr(reading, "open_raster", lambda path: opened.append(str(path)) or start(path))
 
     def noted(band, box, zoom=1):
         log.append((len(opened), band.dataset.name, band.dataset.block_shapes[0], box, zoom))
         return read(band, box, zoom)
 
-    monkeypatch.setattr(reading._Band, "read", noted)
+    monkeypatch.setattr(reading._RasterBand, "read", noted)
     known = survey(views[0].path)
     assert known is not None
     assert 0.0 < decoded(log)[views[0].path] <= surveyed
     log.clear()
     for box in tiles((SIDE, SIDE), options, zoom, known):
-        detect_tile(views[0].path, (SIDE, SIDE), box, known, Share(0.004, zoom), options)
+        detect_tile(views[0].path, (SIDE, SIDE), box, known, KeypointDensity(0.004, zoom), options)
     assert 0.99 <= decoded(log)[views[0].path] <= found
     if zoom > 1:  # enough for the fast lane
         return
@@ -329,8 +329,10 @@ def test_tiles_are_whole_strips_and_whole_blocks_where_decoding_is_dear(size, zo
 def test_a_wide_tile_is_searched_in_parts_without_a_seam(pair) -> None:
     found, options = survey(pair[0].path), TieOptions(tile=128)
     assert found is not None
-    wide = detect_tile(pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, Share(0.1), options)
-    whole = detect_tile(pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, Share(0.1), replace(options, tile=1024))
+    wide = detect_tile(pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, KeypointDensity(0.1), options)
+    whole = detect_tile(
+        pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, KeypointDensity(0.1), replace(options, tile=1024)
+    )
     small = whole.scale < 8
     seen = {tuple(p) for p in np.round(wide.xy, 1)}
     assert np.mean([tuple(p) in seen for p in np.round(whole.xy[small], 1)]) > 0.95

@@ -26,21 +26,21 @@ from barpc.tie.matchers import matching, structural
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Prediction
 from barpc.tie.matchers.matching import (
-    FINE,
+    FINE_STRUCTURE,
     STRUCTURE,
-    Ground,
+    GroundAltitudes,
     _match_within,
     better,
     match_pair,
 )
 from barpc.tie.matchers.structural import (
-    _lattice,
-    _near,
-    _Search,
+    _adjacency,
+    _grid_points,
+    _GridSearch,
     _supported,
 )
-from barpc.tie.pairing.epipolar import EpipolarSegments, frame, robust_affine
-from barpc.tie.patches.oriented import Files, PatchTile, Sampling, register_oriented, resolution
+from barpc.tie.pairing.epipolar import EpipolarSegments, epipolar_segments, robust_affine
+from barpc.tie.patches.oriented import ImageFiles, PatchTile, Sampling, register_oriented, resolution
 from barpc.tie.pixels import read_pixels
 from tests.scenes.redrawn import redrawn
 from tests.scenes.season import SEASONS, disguised
@@ -164,22 +164,22 @@ def test_terrain_or_other_ties_narrow_the_altitudes(render, small, matched) -> N
     pair, (found, report) = small, matched
     low, high = pair[0].alt_range
     middle = 0.5 * (low + high)
-    flat = Ground(lambda lon, lat: np.full(len(lon), middle)).within(pair, (low, low), 150.0)
+    flat = GroundAltitudes(lambda lon, lat: np.full(len(lon), middle)).within(pair, (low, low), 150.0)
     assert flat[0].alt_range == flat[1].alt_range == (max(low, middle - 150), min(high, middle + 150))
-    assert Ground().within(pair, None, 150.0) == pair
-    assert Ground().within(pair, (high + 1e4, high + 2e4), 150.0) == pair
-    nowhere = Ground(lambda lon, lat: np.full(len(lon), np.nan))
+    assert GroundAltitudes().within(pair, None, 150.0) == pair
+    assert GroundAltitudes().within(pair, (high + 1e4, high + 2e4), 150.0) == pair
+    nowhere = GroundAltitudes(lambda lon, lat: np.full(len(lon), np.nan))
     assert nowhere.within(pair, (low, low), 150.0)[0].alt_range[1] == min(high, low + 150)
-    assert Ground().within(pair, (middle, middle), 50.0)[0].alt_range == (
+    assert GroundAltitudes().within(pair, (middle, middle), 50.0)[0].alt_range == (
         max(low, middle - 50),
         min(high, middle + 50),
     )
-    known = Ground(None, [(pair, found)]).altitudes()
+    known = GroundAltitudes(None, [(pair, found)]).altitudes()
     seen = render(views=2, size=(300, 300)).altitude[0]
     assert known is not None
     assert abs(known[0] - np.nanpercentile(seen, 2)) < 40  # cameras as delivered
     assert abs(known[1] - np.nanpercentile(seen, 98)) < 40
-    assert Ground().altitudes() is None
+    assert GroundAltitudes().altitudes() is None
     assert report.matcher == STRUCTURE
 
 
@@ -197,7 +197,7 @@ def test_only_terrain_that_both_may_see_counts(seen) -> None:
         away = np.hypot((lon - flat[0, 0]) * np.cos(np.radians(lat)), lat - flat[0, 1]) * 111e3
         return np.where(away < 60.0, middle + 20.0, middle)
 
-    found = Ground(hilly).within((first, half), None, 50.0)[0].alt_range[1]
+    found = GroundAltitudes(hilly).within((first, half), None, 50.0)[0].alt_range[1]
     assert found == min(first.alt_range[1], middle + (70.0 if seen else 50.0))
 
 
@@ -247,15 +247,15 @@ def test_pictures_are_as_coarse_as_the_coarser_image_by_a_power_of_two(side, pix
 
 
 def test_a_lattice_holds_the_multiples_of_its_pitch_in_a_box() -> None:
-    at = _lattice((10, 20, 31, 11), 10)
+    at = _grid_points((10, 20, 31, 11), 10)
     assert at.tolist() == [[10, 20], [20, 20], [30, 20], [40, 20], [10, 30], [20, 30], [30, 30], [40, 30]]
-    assert _lattice((11, 21, 9, 9), 10).tolist() == []
-    assert _lattice((11, 21, 10, 10), 10).tolist() == [[20, 30]]
+    assert _grid_points((11, 21, 9, 9), 10).tolist() == []
+    assert _grid_points((11, 21, 10, 10), 10).tolist() == [[20, 30]]
 
 
 def level(half: float, width: float, height: float, probes: int | None = None, band: float = 3.0, least: int = 1):
     """Step and number of points of a look at a window, and their pitch."""
-    search = _Search.__new__(_Search)
+    search = _GridSearch.__new__(_GridSearch)
     search._least, search._whole = least, False
     search._prediction = Prediction(None, band, lambda: [], probes)  # type: ignore[arg-type]
     step, points = search._level(half, [(0, 0, int(width), int(height))])
@@ -293,7 +293,7 @@ def test_how_long_bands_are_is_measured_in_the_middles_of_the_windows(half, step
 
     view: View = SimpleNamespace(path="", size=(4000, 2000))  # type: ignore[assignment]
     for windows, found in (([(0, 0, 2000, 2000), (3000, 0, 900, 900)], step), ([(3000, 0, 900, 900)], 2)):
-        search = _Search(view, view, 1, Prediction(where, 3.0, lambda windows=windows: windows))
+        search = _GridSearch(view, view, 1, Prediction(where, 3.0, lambda windows=windows: windows))
         assert search._step == found
 
 
@@ -319,7 +319,7 @@ def test_points_are_eight_pixels_apart_at_least() -> None:
     ],
 )
 def test_a_segment_is_looked_at_as_far_as_it_lies_in_the_image(start, axis, most, expected) -> None:
-    search = _Search.__new__(_Search)
+    search = _GridSearch.__new__(_GridSearch)
     search._files = (("a", (1, 1)), ("b", (1000, 800)))
     (x, y), half = axis, np.full(1, most)
     along, across = start[0] * x + start[1] * y, start[1] * x - start[0] * y
@@ -331,7 +331,7 @@ def test_a_segment_is_looked_at_as_far_as_it_lies_in_the_image(start, axis, most
 def test_neighbours_speak_for_a_place_and_bend_a_little() -> None:
     """Three points in a row see one place, some pixels apart; the middle one another one better. One is far away."""
     at = np.array([[0.0, 0.0], [10.0, 0.0], [20.0, 0.0], [500.0, 0.0]])
-    near = _near(at, 10.0)
+    near = _adjacency(at, 10.0)
     assert near.tolist() == [[1, 1, 0, 0], [1, 1, 1, 0], [0, 1, 1, 0], [0, 0, 0, 1]]
     seen = np.zeros((4, 9, 9), np.float32)
     seen[0, 4, 3] = seen[1, 4, 5] = seen[2, 4, 7] = seen[3, 1, 1] = 0.3
@@ -359,15 +359,15 @@ def test_lines_that_coarser_pictures_lose_tie_a_pair_where_it_lies(shared_data, 
     """Half of what snow leaves has grown anew, the rest is turned over: check points of the images as they were."""
     views = redrawn_pair(shared_data, tmp_path, lambda pixels: pixels)
     found = find_tracks(views, TieOptions(matcher=STRUCTURE))
-    assert found.pairs[0].matcher == FINE
+    assert found.pairs[0].matcher == FINE_STRUCTURE
     a, b = common_tracks(found.tracks, 0, 1)
     table = np.genfromtxt(
         shared_data / "truth/ties/phr_triplet_north__img_02__img_03__ncc_check.csv", delimiter=",", names=True
     )
     at, xy = (np.stack([table[f"col_{k}"], table[f"row_{k}"]], axis=1) for k in "ab")
-    where = frame(*views, at)
+    where = epipolar_segments(*views, at)
     true = robust_affine(at, where.errors(xy)[:, 1])
-    off = frame(*views, a, where.axis).errors(b)[:, 1] - true(a)
+    off = epipolar_segments(*views, a, where.axis).errors(b)[:, 1] - true(a)
     assert len(off) > 30
     assert np.abs(np.median(off)) < 0.1
     assert np.sqrt((off**2).mean()) < 0.4
@@ -383,7 +383,7 @@ def test_another_place_is_no_more_like_it_by_its_neighbours(shared_data, tmp_pat
 
 
 @pytest.fixture(scope="module")
-def textured(tmp_path_factory) -> tuple[Files, np.ndarray]:
+def textured(tmp_path_factory) -> tuple[ImageFiles, np.ndarray]:
     """Files of an image and of the same moved by as much as is said: x, y [px]."""
     folder, moved = tmp_path_factory.mktemp("textured"), np.array([20, -10])
     grey = 2000 + 400 * ndimage.gaussian_filter(np.random.default_rng(0).normal(size=(300, 300)), 1.5)
@@ -406,7 +406,7 @@ def test_a_place_beyond_the_band_and_its_sides_is_not_found_however_alike(
     half = np.full(3, 25.0)
     where = EpipolarSegments(axis, along, across, np.zeros(3), -half, half, np.eye(2))
     monkeypatch.setattr(structural, "linear_map", lambda *_: np.eye(2))
-    search = _Search.__new__(_Search)
+    search = _GridSearch.__new__(_GridSearch)
     search._views, search._files, search._band, search._whole = (), files, 1, False  # type: ignore[assignment]
     search._points, search._step = at, 1
     search._prediction = Prediction(lambda _: where, 2.0, list)

@@ -26,7 +26,7 @@ class Pairs:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracks:
+class TrackGroup:
     """Tracks of n views each."""
 
     rows: IntArray  # (T, n) their observations, sorted by what views they are of
@@ -69,7 +69,7 @@ class Linear:
     residual: Array  # (2, K)
     by_unknown: Array  # (2, q, K)
     sigma: Array  # (K,) [px]
-    tracks: tuple[Tracks, ...]
+    tracks: tuple[TrackGroup, ...]
     shape: tuple[int, int]  # N views, q unknowns
     precision: Array  # (N q,) of the priors
     offset: Array  # (N q,) unknowns at the state, less the priors' means
@@ -145,7 +145,7 @@ class Linear:
         for tracks in self.tracks:
             view = tracks.view[::every]
             parts = (tracks.follow[::every], tracks.volume[::every], tracks.by_unknown[::every])
-            few.append(Tracks(tracks.rows[::every], view, tracks.subsets, *parts))
+            few.append(TrackGroup(tracks.rows[::every], view, tracks.subsets, *parts))
         return replace(self, tracks=tuple(few))
 
 
@@ -173,7 +173,7 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
         subsets = _subsets(n)
         follow, room = _followed(ground, subsets, held[:, structure.point[rows[:, 0]]])
         of_cameras = np.ascontiguousarray(by_unknown[:, :, rows].transpose(2, 3, 0, 1))
-        tracks.append(Tracks(rows, view, subsets.astype(np.float64), follow, room - np.log(volume), of_cameras))
+        tracks.append(TrackGroup(rows, view, subsets.astype(np.float64), follow, room - np.log(volume), of_cameras))
         ends = ground.reshape(len(rows), n, 2, 3)[:, [0, -1]].reshape(len(rows), 4, 3)
         bases.append(np.sqrt(np.maximum(np.linalg.det(np.swapaxes(ends, 1, 2) @ ends), 0.0)))
     far = max(float(np.quantile(np.linalg.norm(residual[:, order], axis=0), 0.99)), 5.0) if len(order) else 5.0
@@ -194,7 +194,7 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
     )
 
 
-def numbers(count: IntArray) -> float:
+def array_elements(count: IntArray) -> float:
     """Return the count of numbers that tracks of so many views each (T,) need."""
     return float((6.0 * (count + 1.0) * count).sum())
 

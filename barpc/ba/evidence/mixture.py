@@ -21,15 +21,15 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dtrtri
 
-from barpc.ba.evidence.linearised import Linear, Tracks
+from barpc.ba.evidence.linearised import Linear, TrackGroup
 from barpc.base.geodesy import CHUNK, Array
-from barpc.base.usual import BACKFITTING, GROSS, ITERATIONS, LEAST_NOISE, RIDGE, SLIGHT, STANDS, SURE
+from barpc.base.statistics import BACKFITTING, GROSS, ITERATIONS, LEAST_NOISE, RIDGE, SLIGHT, STANDS, SURE
 from barpc.scene import BoolArray, IntArray
 
 NEAR_LIMIT = 4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise is large wrong ones lie no nearer
 COOLED = 0.6  # the noise, from one iteration to the next, at most
-SETTLED = STANDS * SURE  # change of the log-likelihood at the end
-WRONG = 1.0, 10.0  # of so many observations of a view so many are wrong, before any is seen
+LIKELIHOOD_TOLERANCE = STANDS * SURE  # change of the log-likelihood at the end
+WRONG_SHARE_PRIOR = 1.0, 10.0  # of so many observations of a view so many are wrong, before any is seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Group:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class MixtureFit:
     """The result of fitting one explanation to a block."""
 
     evidence: float  # log, but for a constant of the block
@@ -57,13 +57,13 @@ class Fit:
     scatter: float = 0.0  # its noise, observed over stated
 
 
-def fit(
+def fit_mixture(
     linear: Linear,
     extra: Array | None = None,
     sigma: Array | None = None,
-    warm: Fit | None = None,
+    warm: MixtureFit | None = None,
     group: Group | None = None,
-) -> Fit:
+) -> MixtureFit:
     """Fit cameras and extra unknowns, which move observations by `extra` (2, e, K) [px] a unit, to a block as
     a mixture.
 
@@ -73,18 +73,18 @@ def fit(
     return Mixture(linear, extra, sigma, warm, group).run()
 
 
-def moving(linear: Linear, extra: Array, group: Group, found: Fit) -> Array:
+def moving(linear: Linear, extra: Array, group: Group, found: MixtureFit) -> Array:
     """Return the probability (K,) that the track of an observation belongs to a moving group, by a fit with it."""
     left = linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma
     away = np.einsum("cmk,m->ck", group.by_move, found.move) / linear.sigma
-    moved = _Moved(left + away, group.share, found.scatter)
+    moved = _MovedObservations(left + away, group.share, found.scatter)
     out = np.zeros(len(linear.view))
     for tracks in linear.tracks:
         out[tracks.rows] = _expect(linear, tracks, left, found.noise, found.eps, moved).gone[:, None]
     return out
 
 
-def log_likelihoods(linear: Linear, residual: Array, found: Fit) -> Array:
+def log_likelihoods(linear: Linear, residual: Array, found: MixtureFit) -> Array:
     """Return the log-likelihood (K,) of every observation's track, at residuals (2, K) in stated deviations."""
     out = np.zeros(len(linear.view))
     for tracks in linear.tracks:
@@ -115,7 +115,9 @@ def off_from_right(linear: Linear, residual: Array, right: Array) -> tuple[Array
     return out, known
 
 
-def first_guess(linear: Linear, found: Fit, extra: Array, new: Array, precision: Array) -> tuple[Array, float, float]:
+def first_guess(
+    linear: Linear, found: MixtureFit, extra: Array, new: Array, precision: Array
+) -> tuple[Array, float, float]:
     """Estimate starting values (e,) of unknowns that move observations by `new` (2, e, K) [px], beside a fit
     with `extra` [px].
 
@@ -150,7 +152,7 @@ def first_guess(linear: Linear, found: Fit, extra: Array, new: Array, precision:
 
 
 @dataclass(frozen=True, eq=False)
-class _Moved:
+class _MovedObservations:
     """Observations as they are for tracks of a group that moves."""
 
     residual: Array  # (2, K)
@@ -180,13 +182,18 @@ class _Expected:
         still, gone = self.of_subset.sum(axis=1), self.moved.of_subset.sum(axis=1)
         return np.asarray(gone / np.maximum(still + gone, 1e-300))
 
-    def pull(self, tracks: Tracks) -> Array:
+    def pull(self, tracks: TrackGroup) -> Array:
         """Return the residuals (T, 2n), less what ground points follow, as far as they are right."""
         return tracks.weighed(self.values, self.followed, self.of_subset)
 
 
 def _expect(
-    linear: Linear, tracks: Tracks, residual: Array, noise: float, eps: Array, moved: _Moved | None = None
+    linear: Linear,
+    tracks: TrackGroup,
+    residual: Array,
+    noise: float,
+    eps: Array,
+    moved: _MovedObservations | None = None,
 ) -> _Expected:
     n, subsets = tracks.rows.shape[1], tracks.subsets
     size = len(subsets)
@@ -216,7 +223,7 @@ def _expect(
     return _Expected(all_log, still, right_of_all, square, values, followed, of_moved)
 
 
-def _of_subsets(tracks: Tracks, residual: Array, noise: float, area: float) -> tuple[Array, Array, Array, Array]:
+def _of_subsets(tracks: TrackGroup, residual: Array, noise: float, area: float) -> tuple[Array, Array, Array, Array]:
     """Return the log-likelihoods (T, S) if a subset is right, their squares, and what they are made of."""
     n = tracks.rows.shape[1]
     values = tracks.of(residual)
@@ -230,7 +237,7 @@ def _of_subsets(tracks: Tracks, residual: Array, noise: float, area: float) -> t
 
 
 @dataclass(frozen=True, eq=False)
-class _Kind:
+class _Component:
     """Expectations of a mixture for ties that stand, or that move."""
 
     weight: tuple[Array, ...]  # of tracks their subsets' probabilities (T, S)
@@ -241,13 +248,13 @@ class _Kind:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _Expectations:
     """Expectations of a mixture over all tracks at its present unknowns."""
 
     log: float
     right: Array  # (K,)
     moving: Array  # (K,)
-    kinds: tuple[_Kind, ...]
+    kinds: tuple[_Component, ...]
 
 
 class Mixture:
@@ -258,7 +265,12 @@ class Mixture:
     """
 
     def __init__(
-        self, linear: Linear, extra: Array | None, sigma: Array | None, warm: Fit | None, group: Group | None = None
+        self,
+        linear: Linear,
+        extra: Array | None,
+        sigma: Array | None,
+        warm: MixtureFit | None,
+        group: Group | None = None,
     ) -> None:
         self.linear, self.group = linear, group
         self.extra = np.zeros((2, 0, len(linear.sigma))) if extra is None else extra / linear.sigma
@@ -267,7 +279,7 @@ class Mixture:
         self.precision = np.concatenate([linear.precision, further])
         self.offset = np.concatenate([linear.offset, np.zeros(len(further))])
         self.x = np.zeros(len(self.precision))
-        self.noise, self.eps = GROSS, np.full(linear.views, WRONG[0] / WRONG[1])
+        self.noise, self.eps = GROSS, np.full(linear.views, WRONG_SHARE_PRIOR[0] / WRONG_SHARE_PRIOR[1])
         if warm is not None:
             known = warm.step.size + len(warm.extra)
             self.x[:known] = *warm.step.ravel(), *warm.extra
@@ -278,9 +290,9 @@ class Mixture:
                 self.noise = max(self.noise, far)
         self.beside = [self.extra]  # of what stands still, and of what moves
         if group is not None:
-            self.noise, self.eps = GROSS, np.full(linear.views, WRONG[0] / WRONG[1])
+            self.noise, self.eps = GROSS, np.full(linear.views, WRONG_SHARE_PRIOR[0] / WRONG_SHARE_PRIOR[1])
             self.beside.append(np.concatenate([self.extra, group.by_move / linear.sigma], axis=1))
-            self.moved = _Moved(linear.residual, group.share, self.noise)
+            self.moved = _MovedObservations(linear.residual, group.share, self.noise)
         self.squared = [(beside**2).sum(axis=0) for beside in self.beside]
         self.part = np.flatnonzero(linear.taking_part)
         self.count = np.bincount(linear.view[self.part], minlength=linear.views)
@@ -288,7 +300,7 @@ class Mixture:
         self.curvature: list[Array] = []
         self.summed: list[Array] = []
 
-    def run(self, most: int = ITERATIONS, cooled: float = COOLED) -> Fit:
+    def run(self, most: int = ITERATIONS, cooled: float = COOLED) -> MixtureFit:
         """Iterate until nothing changes, or a number of times; goes on where the last run ended."""
         linear, last, known, ends = self.linear, -np.inf, 0.0, False
         self.cooled = cooled
@@ -304,7 +316,7 @@ class Mixture:
                 inverse = np.tril(dtrtri(factor[0], lower=1)[0])
                 known = len(matrix) - float((inverse**2).sum(axis=0) @ self.precision)
             self.x = self.x - cho_solve(factor, self._gradient(seen), check_finite=False)
-            settled = self._noise(seen, known) and abs(seen.log - last) < SETTLED
+            settled = self._noise(seen, known) and abs(seen.log - last) < LIKELIHOOD_TOLERANCE
             last = seen.log
             if settled and is_new:
                 break
@@ -316,23 +328,23 @@ class Mixture:
         step, extra, move = np.split(self.x, sizes)
         scatter = 0.0 if self.group is None else self.moved.noise
         step = step.reshape(linear.shape)
-        return Fit(evidence, step, extra, self.noise, self.eps, seen.right, move, seen.moving, scatter)
+        return MixtureFit(evidence, step, extra, self.noise, self.eps, seen.right, move, seen.moving, scatter)
 
-    def _noise(self, seen: _Seen, known: float) -> bool:
+    def _noise(self, seen: _Expectations, known: float) -> bool:
         """Return the noise, and what is wrong, as they are seen; whether the noise stands."""
         still = seen.kinds[0]
         found = max(float(np.sqrt(still.squares / max(still.freedom - known, 1.0))), LEAST_NOISE)
         cold = self.noise <= found
         noise = found if cold else max(found, self.cooled * self.noise)
         wrong = np.bincount(self.linear.view[self.part], 1.0 - seen.right[self.part], minlength=self.linear.views)
-        self.eps = np.clip((wrong + WRONG[0]) / (self.count + WRONG[1]), SLIGHT, 1.0 - SLIGHT)
+        self.eps = np.clip((wrong + WRONG_SHARE_PRIOR[0]) / (self.count + WRONG_SHARE_PRIOR[1]), SLIGHT, 1.0 - SLIGHT)
         if self.group is not None:
             self._group(seen, noise, noise <= found)
         stands = abs(np.log(noise / self.noise)) < SLIGHT
         self.noise = noise
         return bool(stands)
 
-    def _group(self, seen: _Seen, noise: float, cold: bool) -> None:
+    def _group(self, seen: _Expectations, noise: float, cold: bool) -> None:
         """Estimate the moving share of every cell and the scatter of its tracks."""
         assert self.group is not None
         share, scatter = self.group.share, noise
@@ -343,9 +355,9 @@ class Mixture:
             gone, all_of = (np.bincount(cell[rows], w, cell.max() + 1) for w in weights)
             share = ((gone + 0.5) / (all_of + 1.0))[cell]
             scatter = max(float(np.sqrt(moved.squares / max(moved.freedom, 1.0))), noise)
-        self.moved = _Moved(self.moved.residual, share, scatter)
+        self.moved = _MovedObservations(self.moved.residual, share, scatter)
 
-    def _expected(self) -> _Seen:
+    def _expected(self) -> _Expectations:
         linear, size = self.linear, self.extra.shape[1]
         step, extra, move = np.split(self.x, [linear.precision.size, linear.precision.size + size])
         left = linear.left(step.reshape(linear.shape)) + np.einsum("cek,e->ck", self.extra, extra)
@@ -361,9 +373,9 @@ class Mixture:
             if moved is not None:
                 moving[tracks.rows] = one.gone[:, None]
         kinds = [found] if moved is None else [found, [one.moved for one in found if one.moved is not None]]
-        return _Seen(log, right, moving if moved is not None else moving[:0], tuple(map(self._kind, kinds)))
+        return _Expectations(log, right, moving if moved is not None else moving[:0], tuple(map(self._kind, kinds)))
 
-    def _kind(self, found: Sequence[_Expected]) -> _Kind:
+    def _kind(self, found: Sequence[_Expected]) -> _Component:
         squares, freedom = 0.0, 0.0
         right, pull = np.zeros(len(self.linear.view)), np.zeros((2, len(self.linear.view)))
         for tracks, one in zip(self.linear.tracks, found, strict=True):
@@ -373,13 +385,13 @@ class Mixture:
             freedom += float(often @ (2 * tracks.subsets.sum(axis=1) - 3))
             right[tracks.rows] = one.of_subset @ tracks.subsets
             pull[:, tracks.rows] = one.pull(tracks).reshape(count, n, 2).transpose(2, 0, 1)
-        return _Kind(tuple(one.of_subset for one in found), right, pull, squares, freedom)
+        return _Component(tuple(one.of_subset for one in found), right, pull, squares, freedom)
 
     @property
     def _noises(self) -> list[float]:
         return [self.noise] if self.group is None else [self.noise, self.moved.noise]
 
-    def _has_changed(self, seen: _Seen) -> bool:
+    def _has_changed(self, seen: _Expectations) -> bool:
         """Return whether what views and unknowns rest on is another part of the observations than the curvature's."""
         sums, further = [], self.precision[self.linear.precision.size :]
         for kind, squared, noise in zip(seen.kinds, self.squared, self._noises, strict=True):
@@ -398,7 +410,7 @@ class Mixture:
             out[: len(matrix), : len(matrix)] += matrix / noise**2
         return out
 
-    def _gradient(self, seen: _Seen) -> Array:
+    def _gradient(self, seen: _Expectations) -> Array:
         linear, out = self.linear, self.precision * (self.offset + self.x)
         camera, pulls = linear.precision.size, np.zeros_like(linear.residual)
         for kind, beside, noise in zip(seen.kinds, self.beside, self._noises, strict=True):

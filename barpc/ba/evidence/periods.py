@@ -15,14 +15,14 @@ import numpy as np
 from scipy.special import chdtri
 
 from barpc.base.geodesy import Array
-from barpc.base.usual import FEW, OUTLIER, SURE
+from barpc.base.statistics import FEW, OUTLIER, SURE
 from barpc.scene import IntArray
-from barpc.sensor.displaced import sine_and_cosine
+from barpc.sensor.image_corrections import sine_and_cosine
 
 _SHORTEST = 32.0  # rows: of what is shorter a matcher's window shows the mean
-_FEWEST = 1.5  # waves of an image: fewer are no swing yet, and what is nearer to a peak is its own
-_FINE = 4  # frequencies a wave more
-_BIN = _SHORTEST / _FINE  # rows summed: a tenth of the shortest is lost
+_MIN_PERIODS = 1.5  # waves of an image: fewer are no swing yet, and what is nearer to a peak is its own
+_FREQUENCY_OVERSAMPLING = 4  # frequencies a wave more
+_BIN = _SHORTEST / _FREQUENCY_OVERSAMPLING  # rows summed: a tenth of the shortest is lost
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Swing:
 def price_of_period(rows: float, views: int) -> float:
     """Return the cost of choosing a period, in images of so many rows, and a view [nats]."""
     # as many as the frequencies count as tests (Baluev 2008, near the levels asked for)
-    return float(np.log(max(_FINE * rows / _SHORTEST, 1.0) * views))
+    return float(np.log(max(_FREQUENCY_OVERSAMPLING * rows / _SHORTEST, 1.0) * views))
 
 
 def swings(view: IntArray, row: Array, size: Array, right: Array, off: Array, least: float = SURE) -> list[Swing]:
@@ -57,7 +57,7 @@ def swings(view: IntArray, row: Array, size: Array, right: Array, off: Array, le
     for v, mine in enumerate(np.split(by_view, np.searchsorted(view[by_view], np.arange(1, views)))):
         rows = float(size[1, v])
         costs = price_of_period(rows, views)
-        if len(mine) >= FEW and rows > 2.0 * _FEWEST * _SHORTEST:
+        if len(mine) >= FEW and rows > 2.0 * _MIN_PERIODS * _SHORTEST:
             clipped = np.clip(off[:, mine], -OUTLIER, OUTLIER)
             best = _Rows(row[mine], rows, right[mine], clipped).largest(costs + least)
             if best is not None:
@@ -71,8 +71,8 @@ class _Rows:
     def __init__(self, row: Array, rows: float, right: Array, off: Array) -> None:
         self.row, self.off, self.right = row, off, right
         self.bins = int(np.ceil(rows / _BIN))
-        self.waves = np.arange(int(_FINE * rows / _SHORTEST)) / _FINE  # of an image
-        self.first = int(np.ceil(_FINE * _FEWEST))
+        self.waves = np.arange(int(_FREQUENCY_OVERSAMPLING * rows / _SHORTEST)) / _FREQUENCY_OVERSAMPLING  # of an image
+        self.first = int(np.ceil(_FREQUENCY_OVERSAMPLING * _MIN_PERIODS))
 
     def largest(self, costs: float) -> tuple[float, float] | None:
         """Return the period, and minus the logarithm of its chance at one frequency; None below `costs`."""
@@ -85,7 +85,7 @@ class _Rows:
         for start, stop in pairwise([*starts.tolist(), len(gain)]):
             k = start + int(gain[start:stop].argmax())
             if _worth(gain[k]) > max(costs, 0.0 if best is None else best[1]):
-                period = self.bins * _BIN / (self.waves[k] + _vertex(gain, k) / _FINE)
+                period = self.bins * _BIN / (self.waves[k] + _vertex(gain, k) / _FREQUENCY_OVERSAMPLING)
                 worth = _worth(gain[k] / self._level(k, period))
                 if worth > max(costs, 0.0 if best is None else best[1]):
                     best = float(period), worth
@@ -100,9 +100,11 @@ class _Rows:
         alike = np.linalg.cholesky(np.linalg.inv(spread)).T @ centred  # what noise leaves alike in every direction
         at = (self.row / _BIN).astype(np.int64).clip(0, self.bins - 1)
         sums = np.array([np.bincount(at, weight, self.bins) for weight in alike])
-        found = np.fft.rfft(sums, _FINE * self.bins, axis=1)[:, :last]
+        found = np.fft.rfft(sums, _FREQUENCY_OVERSAMPLING * self.bins, axis=1)[:, :last]
         real, imag = found.real.copy(), found.imag.copy()
-        count = np.fft.rfft(np.bincount(at, right, self.bins), _FINE // 2 * self.bins)[:last]  # of twice the frequency
+        count = np.fft.rfft(np.bincount(at, right, self.bins), _FREQUENCY_OVERSAMPLING // 2 * self.bins)[
+            :last
+        ]  # of twice the frequency
         half, twice, both = 0.5 * right.sum(), 0.5 * count.real, 0.5 * count.imag
         determinant = np.maximum(half**2 - twice**2 - both**2, 1e-12 * half**2)
         gain = (half - twice) * (real * real).sum(axis=0) + (half + twice) * (imag * imag).sum(axis=0)
@@ -114,7 +116,7 @@ class _Rows:
         weighted = basis * self.right
         gain = self._spectrum(self.off - (np.linalg.solve(weighted @ basis.T, weighted @ self.off.T)).T @ basis)
         away = np.abs(self.waves - self.waves[k])
-        beside = (away > _FEWEST) & (away < SURE + self.waves[k])
+        beside = (away > _MIN_PERIODS) & (away < SURE + self.waves[k])
         beside[: self.first] = False
         of_noise = 0.5 * chdtri(4.0, 0.5)  # the median of half a chi-square
         return max(float(np.median(gain[beside]) / of_noise), 1.0) if beside.any() else 1.0

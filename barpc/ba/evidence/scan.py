@@ -19,15 +19,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import entr, fdtrc, gammaln, xlogy
 
-from barpc.ba.estimated.waves import DRIFTS
+from barpc.ba.parameters.additional_parameters import DRIFTS
 from barpc.base.geodesy import CHUNK, Array, parts
-from barpc.base.usual import CHANCE, FEWEST, OUTLIER, SURE
+from barpc.base.statistics import CHANCE, FEWEST, OUTLIER, SURE
 from barpc.scene import BoolArray, IntArray
 
 BINS = 40  # stretches of an image's rows or columns
 _STARTS, _STOPS = np.triu_indices(BINS + 1, 1)  # all intervals of these
 _FINEST = 32  # parts of rows or columns, and a side of the parts of which one observation is taken
-LINE = 0.05  # of the larger extent of residuals: a smaller one is that of epipolar lines, which turn over an image
+MIN_EXTENT_RATIO = (
+    0.05  # of the larger extent of residuals: a smaller one is that of epipolar lines, which turn over an image
+)
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ def scan(
         rows = np.array([np.ones(len(view)), wrong])
         sums = np.array([np.bincount(view * BINS + bin_, row, views * BINS) for row in rows])
         whole = sums.reshape(2, views, BINS)
-        shares = _shares(whole)
+        shares = _share_log_ratios(whole)
         gains, displaced = _displacements(view, bin_, off, told, views, floor)
         for by_share, gain in zip((True, False), (shares, gains), strict=True):
             gain[BINS - 1] = 0.0  # all of an image is no interval
@@ -148,7 +150,7 @@ def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) 
             continue
         axes, size = np.linalg.svd(residual[:, rows], full_matrices=False)[:2]
         # of two views all lie along one line: what is left across it is no direction, or what large ones bend alike
-        along = axes.T[size > LINE * size[0]] @ residual[:, rows]
+        along = axes.T[size > MIN_EXTENT_RATIO * size[0]] @ residual[:, rows]
         along[1:] -= np.median(along[1:], axis=1, keepdims=True)
         for axis in (0, 1):
             signs = along[:, np.argsort(place[axis, rows], kind="stable")] > 0.0
@@ -159,7 +161,7 @@ def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) 
     return out - float(np.log(4 * views))
 
 
-def _shares(bins: Array) -> Array:
+def _share_log_ratios(bins: Array) -> Array:
     """Return the logarithm (intervals, N) of the likelihood ratio of two shares over one, where that inside is larger.
 
     `bins` (2, N, `BINS`) are the numbers of observations and of those that are wrong.
@@ -181,7 +183,7 @@ def _shares(bins: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Place:
+class ImageRegion:
     """Rows, columns or a cell of an image in which held-out tie points are met worse than in the rest."""
 
     view: int
@@ -207,7 +209,7 @@ class Unused:
         return Unused(self.view[rows], self.xy[:, rows], self.residual[:, rows], self.deviation[rows])
 
 
-def met_worse(unused: Unused, size: Array, limit: float, least: float, share: float) -> list[Place]:
+def met_worse(unused: Unused, size: Array, limit: float, least: float, share: float) -> list[ImageRegion]:
     """Find the place of every image in which held-out tie points are met worst, where chance is unlikely to
     explain it.
 
@@ -227,7 +229,7 @@ def met_worse(unused: Unused, size: Array, limit: float, least: float, share: fl
     return sorted(sure, key=lambda one: one.chance)
 
 
-def _places() -> IntArray:
+def _region_bounds() -> IntArray:
     """Return (4, P) of every place parts of the columns, and which, parts of the rows, and which; one part is all.
 
     Of cells as many as of the finest lines.
@@ -238,34 +240,34 @@ def _places() -> IntArray:
     return np.array([*lines, *((rows, n, cols, k) for cols, k, rows, n in lines), *cells]).T
 
 
-_PLACES = _places()
+_PLACES = _region_bounds()
 
 
-def _held() -> BoolArray:
+def _cells_of_regions() -> BoolArray:
     """Return (P, C) which places hold which of the smallest parts of an image."""
     columns, k, rows, n = _PLACES[:, :, None]
     row, col = np.divmod(np.arange(_FINEST**2), _FINEST)
     return np.asarray((col * columns // _FINEST == k) & (row * rows // _FINEST == n))
 
 
-_HELD = _held()
+_CELLS_OF_REGIONS = _cells_of_regions()
 
 
-def _part(unused: Unused, size: Array) -> IntArray:
+def _cell_indices(unused: Unused, size: Array) -> IntArray:
     """Return (2, K) of so many columns and rows of an image, which."""
     return np.clip(unused.xy / size[:, None] * _FINEST, 0, _FINEST - 1).astype(np.int64)
 
 
 def _thinned(unused: Unused, size: Array) -> Unused:
     """Return one observation, the first, of every small part of an image."""
-    col, row = _part(unused, size)
+    col, row = _cell_indices(unused, size)
     return unused.part(np.unique(row * _FINEST + col, return_index=True)[1])
 
 
-def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -> Place | None:
+def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -> ImageRegion | None:
     """Return the place of one image of which chance leaves least, not yet times the places; None without any."""
-    col, row = _part(one, size)
-    inside = _HELD[:, row * _FINEST + col]
+    col, row = _cell_indices(one, size)
+    inside = _CELLS_OF_REGIONS[:, row * _FINEST + col]
     count = inside.sum(axis=1)
     standard = one.residual / one.deviation
     near = np.hypot(*standard) <= limit
@@ -291,8 +293,8 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
     along = along - along[:, near].mean(axis=1, keepdims=True)
     rest = of_near @ along.T / np.maximum(here, 1.0)[:, None]
     told = (here > 1) & (here < near.sum()) & (common > least)
-    known = spread > LINE * spread.max()
-    variance = _variances(along * near, of_near, rest, _cells(near, col, row))
+    known = spread > MIN_EXTENT_RATIO * spread.max()
+    variance = _variances(along * near, of_near, rest, _image_cells(near, col, row))
     squared = (rest[told][:, known] ** 2 / variance[told][:, known]).sum(axis=1)
     free, others = int(known.sum()), max(float(near.sum() - known.sum() - 1), 1.0)
     chances[1, told] = fdtrc(free, others, squared / free)  # Hotelling's T^2, the variance one of so many
@@ -304,7 +306,7 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
         off = float(np.median(np.hypot(*one.residual[:, together[worst]])))
         far = float(together[worst].sum() / count[worst])
     ends = _ends(size[0], *_PLACES[:2, worst]), _ends(size[1], *_PLACES[2:, worst])
-    return Place(int(one.view[0]), *ends, int(count[worst]), far, off, float(chances[test, worst]))
+    return ImageRegion(int(one.view[0]), *ends, int(count[worst]), far, off, float(chances[test, worst]))
 
 
 def _at_least(found: int, count: int, alike: int, whole: int) -> float:
@@ -324,7 +326,7 @@ def _axes(standard: Array) -> tuple[Array, Array]:
     return axes[:, ::-1], np.sqrt(np.maximum(variance[::-1], 0.0))
 
 
-def _cells(near: BoolArray, col: IntArray, row: IntArray) -> Array:
+def _image_cells(near: BoolArray, col: IntArray, row: IntArray) -> Array:
     """Return the part of the image in which each near observation lies (K, C), 1 or 0."""
     parts = max(int(np.sqrt(near.sum() / FEWEST)), 1)
     cell = row * parts // _FINEST * parts + col * parts // _FINEST

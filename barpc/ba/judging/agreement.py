@@ -17,17 +17,19 @@ from itertools import product
 import numpy as np
 from scipy.special import chdtri
 
-from barpc.ba.held.block import Block
+from barpc.ba.constraints.block import Block
 from barpc.ba.robust.heldout import enu_offsets
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import solve_transposed
 from barpc.base.geodesy import Array, enu_basis
-from barpc.base.usual import CRITICAL, GROSS, LEVEL, SURE, TRIALS
+from barpc.base.statistics import CRITICAL, GROSS, LEVEL, SURE, TRIALS
 from barpc.scene import BoolArray
 
-LOOSE = 1e4  # m: a place so uncertain holds nothing, and keeps a point that one ray shows from running away
-_ROOM = 50_000  # points of sets at a time: some 25 MB
-_SCALES = (1.0, 2.0, 3.0, 5.0)  # more than five times is wrong, not optimistic
+UNCONSTRAINED_SIGMA = (
+    1e4  # m: a place so uncertain holds nothing, and keeps a point that one ray shows from running away
+)
+_MAX_SET_POINTS = 50_000  # points of sets at a time: some 25 MB
+_SIGMA_FACTORS = (1.0, 2.0, 3.0, 5.0)  # more than five times is wrong, not optimistic
 _ODDS = float(-np.log(LEVEL))
 """Nats that it costs to call a point wrong, and each factor of e in accuracies or motions; and by which a set must
 beat any other that contradicts it: one in twenty."""
@@ -114,7 +116,7 @@ def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array
     size, root = np.linalg.eigh(covariance.joint(views))
     modes, size, _ = np.linalg.svd(flat @ (root * np.sqrt(np.maximum(size, 0.0))), full_matrices=False)
     modes = (modes * size)[:, size > LEVEL].reshape(count, 3, -1)
-    motions = np.concatenate([modes, LOOSE * whitening @ enu], axis=2)
+    motions = np.concatenate([modes, UNCONSTRAINED_SIGMA * whitening @ enu], axis=2)
     offset = enu_offsets(points[index], gcps.lonlatalt)
     return Offsets((whitening @ offset[..., None])[..., 0], motions)
 
@@ -130,7 +132,7 @@ def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
         return Agreement(np.ones(len(told), dtype=bool))
     if _fits_as_stated(offsets.select(told)):
         return Agreement(np.ones(len(told), dtype=bool))
-    found = _Search(offsets.select(told))
+    found = _SubsetSearch(offsets.select(told))
     best, score, scale = found.best()
     others = found.against(best, score)
 
@@ -150,17 +152,17 @@ def _fits_as_stated(offsets: Offsets) -> bool:
     """Return whether all points are as near as nineteen times of twenty, and no better without one."""
     count = len(offsets.own)
     one_less = np.concatenate([np.ones((1, count), dtype=bool), ~np.eye(count, dtype=bool)])
-    score, _, squares = _evidence(offsets, one_less, 1.0)
+    score, _, squares = _log_evidence(offsets, one_less, 1.0)
     freedom = 3.0 * (count - 1)  # a shift is free
     return bool(squares[0] < chdtri(freedom, LEVEL) and score[0] >= score.max())
 
 
-class _Search:
+class _SubsetSearch:
     """Sets of points that are compared, and their evidence."""
 
     def __init__(self, offsets: Offsets) -> None:
         self.offsets, self.count = offsets, len(offsets.own)
-        every = self.count * 2**self.count <= _ROOM
+        every = self.count * 2**self.count <= _MAX_SET_POINTS
         if every:
             numbers = np.arange(1, 2**self.count)
             self.masks = ((numbers[:, None] >> np.arange(self.count)) & 1).astype(bool)
@@ -199,7 +201,7 @@ class _Search:
             mask[rng.choice(places, 3, replace=False)] = True
             scale = (1.0, 3.0)[trial % 2]
             for _ in range(2):
-                squared = _evidence(self.offsets, mask[None], scale)[1][0]
+                squared = _log_evidence(self.offsets, mask[None], scale)[1][0]
                 mask = among & (squared < CRITICAL**2)
             if mask.any():
                 yield mask
@@ -207,7 +209,7 @@ class _Search:
     def _refine(self, n: int) -> None:
         """Move single points into or out of a set as long as that raises its evidence."""
         for _ in range(self.count):
-            squared = _evidence(self.offsets, self.masks[n][None], self.scale[n])[1][0]
+            squared = _log_evidence(self.offsets, self.masks[n][None], self.scale[n])[1][0]
             doubtful = np.flatnonzero((squared > 0.5 * CRITICAL**2) & (squared < 2.0 * CRITICAL**2))
             before = self.score[n]
             self._add(self.masks[n] ^ np.eye(self.count, dtype=bool)[doubtful])
@@ -224,18 +226,18 @@ class _Search:
     def _scored(self, masks: BoolArray) -> tuple[Array, Array]:
         """Return the evidence (B,) of sets (B, G), and the scale of the accuracies that it has it with."""
         score, scale = np.full(len(masks), -np.inf), np.ones(len(masks))
-        for motions, times in product(_SCALES, _SCALES):
-            found = _evidence(self.offsets.moving(motions), masks, times)[0] - _ODDS * np.log(times * motions)
+        for motions, times in product(_SIGMA_FACTORS, _SIGMA_FACTORS):
+            found = _log_evidence(self.offsets.moving(motions), masks, times)[0] - _ODDS * np.log(times * motions)
             better = found > score
             score[better], scale[better] = found[better], times
         return score, scale
 
 
-def _evidence(offsets: Offsets, masks: BoolArray, scale: float) -> tuple[Array, Array, Array]:
+def _log_evidence(offsets: Offsets, masks: BoolArray, scale: float) -> tuple[Array, Array, Array]:
     """Return the log evidence (B,) of sets (B, G), squared deviations of points (B, G), and of all in a set (B,)."""
     own, motions, variance = offsets.own, offsets.motions, scale**2
-    if len(masks) > (room := max(_ROOM // len(own), 1)):
-        parts = [_evidence(offsets, masks[n : n + room], scale) for n in range(0, len(masks), room)]
+    if len(masks) > (room := max(_MAX_SET_POINTS // len(own), 1)):
+        parts = [_log_evidence(offsets, masks[n : n + room], scale) for n in range(0, len(masks), room)]
         score, squared, squares = (np.concatenate(part) for part in zip(*parts, strict=True))
         return score, squared, squares
     chosen = masks.astype(np.float64)

@@ -7,28 +7,28 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from barpc.ba.estimated.waves import DRIFTS, FEWEST, FIRST_SIGMA, Waves
 from barpc.ba.evidence.linearised import Linear
-from barpc.ba.evidence.mixture import Fit, Group, first_guess, log_likelihoods
+from barpc.ba.evidence.mixture import Group, MixtureFit, first_guess, log_likelihoods
 from barpc.ba.evidence.periods import Swing, price_of_period
 from barpc.ba.evidence.scan import BINS, Interval, price
 from barpc.ba.judging import moving
-from barpc.ba.robust.smooth import SPLINES
+from barpc.ba.parameters.additional_parameters import DRIFTS, FIRST_SIGMA, MIN_SPLINES, AdditionalParameters
+from barpc.ba.robust.systematic_residuals import SPLINES
 from barpc.base.geodesy import Array
-from barpc.base.usual import FEW, TIMES
+from barpc.base.statistics import FEW, TIMES
 from barpc.scene import IntArray
-from barpc.sensor.displaced import profile
-from barpc.sensor.displaced import sine_and_cosine as waves_of
+from barpc.sensor.image_corrections import profile
+from barpc.sensor.image_corrections import sine_and_cosine as waves_of
 
 STRIP = "strip"
 FADE = "fade"
-SETTLING = "settling"
+TRANSIENT = "settling"
 WANDER = "wander"
 SWING = "swing"
 MOVING = "moving"
 LOCAL = STRIP, FADE
 """Those of a part of an image."""
-FOLLOWED = *LOCAL, SETTLING, SWING
+FOLLOWED = *LOCAL, TRANSIENT, SWING
 """Those that the adjustment follows; others may be beside them."""
 _LENGTHS = 2.0 ** np.arange(-7.0, 1.0)  # of an image: over what it may fade
 SCALE = float(np.log(2.0 * np.log(TIMES)))
@@ -55,26 +55,26 @@ Where = tuple[int, float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class BlockResiduals:
     """Observations in the form that explanations use."""
 
     linear: Linear
     few: Linear  # of it some tracks, to choose with
-    ground: moving.Ground
+    ground: moving.GroundMotion
     place: Array  # (2, K) [px]
     size: Array  # (2, N) of the images [px]
-    base: Fit  # what was found so far
+    base: MixtureFit  # what was found so far
     extra: Array  # (2, e, K) what of it is beside the cameras [px]
     sigma: Array  # (e,) its prior [px]
 
 
-def strip(seen: Seen, interval: Interval, sigma: float = FIRST_SIGMA) -> list[Explanation]:
+def strip(seen: BlockResiduals, interval: Interval, sigma: float = FIRST_SIGMA) -> list[Explanation]:
     """Return the explanation that a stretch of rows or columns of one image is displaced as a whole."""
     start, stop = _open_ended(interval.start, interval.stop, float(seen.size[interval.axis, interval.view]))
     return [_local(STRIP, seen, interval.view, (interval.axis, start, stop, 0.0, 0.0), sigma)]
 
 
-def fade(seen: Seen, interval: Interval) -> list[Explanation]:
+def fade(seen: BlockResiduals, interval: Interval) -> list[Explanation]:
     """Return the explanation that rows are displaced at one end of an interval, fading upwards or downwards.
 
     Either the interval lies off, or the rest of its image: what fades is tried on both sides of both ends.
@@ -98,7 +98,7 @@ def fade(seen: Seen, interval: Interval) -> list[Explanation]:
     return found
 
 
-def _local(kind: str, seen: Seen, view: int, where: Where, sigma: float) -> Explanation:
+def _local(kind: str, seen: BlockResiduals, view: int, where: Where, sigma: float) -> Explanation:
     axis, *shape = where
     part = np.where(seen.linear.view == view, profile(seen.place[axis], *map(np.asarray, shape)), 0.0)
     extra = np.zeros((2, 2, len(part)))
@@ -107,29 +107,29 @@ def _local(kind: str, seen: Seen, view: int, where: Where, sigma: float) -> Expl
     return Explanation(kind, view, extra, np.full(2, sigma), cost, where)
 
 
-def settling(seen: Seen, _interval: Interval) -> list[Explanation]:
+def transient(seen: BlockResiduals, _interval: Interval) -> list[Explanation]:
     """Return the explanation that the first, or last, rows of all images are displaced and fade, each image
     by its own amount.
 
     So does a satellite that settles after it has turned, before every image.
     """
     shapes = [sign / length for sign in (1.0, -1.0) for length in _LENGTHS * float(np.median(seen.size[1]))]
-    tried = [_settling(seen, rate, FIRST_SIGMA) for rate in shapes]
+    tried = [_transient(seen, rate, FIRST_SIGMA) for rate in shapes]
     costs = [first_guess(seen.few, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2] for one in tried]
     return [tried[int(np.argmin(costs))]]
 
 
-def _settling(seen: Seen, rate: float, sigma: float) -> Explanation:
+def _transient(seen: BlockResiduals, rate: float, sigma: float) -> Explanation:
     parts = []
     for v, size in enumerate(seen.size[1].tolist()):
         where = (1, *_open_ended(0.0, size, size), 0.0 if rate > 0.0 else size, rate)
         parts.append(_local(FADE, seen, v, where, sigma))
     extra = np.concatenate([part.extra for part in parts], axis=1)
     cost, where = float(np.log(2.0)) + 2.0 * SCALE, (1, -np.inf, np.inf, 0.0, rate)
-    return Explanation(SETTLING, -1, extra, np.full(extra.shape[1], sigma), cost, where, parts=tuple(parts))
+    return Explanation(TRANSIENT, -1, extra, np.full(extra.shape[1], sigma), cost, where, parts=tuple(parts))
 
 
-def bent(seen: Seen, one: Explanation) -> Explanation:
+def bent(seen: BlockResiduals, one: Explanation) -> Explanation:
     """Return a fade with two more unknowns: the effect of a change of the logarithm of its rate."""
     assert one.where is not None
     _, _, _, origin, rate = one.where
@@ -139,7 +139,7 @@ def bent(seen: Seen, one: Explanation) -> Explanation:
     return replace(one, extra=np.concatenate([one.extra, slope], axis=1), sigma=np.tile(one.sigma, 2))
 
 
-def faster(one: Explanation, found: Fit) -> Explanation:
+def faster(one: Explanation, found: MixtureFit) -> Explanation:
     """Return a fade with the rate that a fit of `bent` asks for, changed by a factor e at most; only `where` is new."""
     assert one.where is not None
     moved, slope = np.split(found.extra[-2 * len(one.sigma) :], 2)
@@ -147,7 +147,7 @@ def faster(one: Explanation, found: Fit) -> Explanation:
     return replace(one, where=(*one.where[:4], one.where[4] * float(np.exp(step))))
 
 
-def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explanation:
+def sharpened(seen: BlockResiduals, one: Explanation, found: MixtureFit, others: Array) -> Explanation:
     """Return an explanation with ends where single ties put them and a prior as wide as it is large.
 
     `found` is a fit with it, its own unknowns the last; `others` (2, K) is what those before it move [px].
@@ -157,7 +157,7 @@ def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explan
     if one.where is None:
         return replace(one, sigma=np.full(len(moved), sigma))
     if one.parts:
-        return _settling(seen, one.where[4], sigma)
+        return _transient(seen, one.where[4], sigma)
     axis = one.where[0]
     rows = np.flatnonzero(seen.linear.view == one.view)
     rows = rows[np.argsort(seen.place[axis, rows], kind="stable")]
@@ -176,7 +176,7 @@ def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explan
     return _local(STRIP, seen, one.view, (axis, *ends, 0.0, 0.0), sigma)
 
 
-def _begun(seen: Seen, one: Explanation, gain: Array, place: Array, sigma: float) -> Explanation:
+def _begun(seen: BlockResiduals, one: Explanation, gain: Array, place: Array, sigma: float) -> Explanation:
     """Return a fade that begins where single ties say, by their gains in the order of their places (n,)."""
     assert one.where is not None
     axis, _, _, _, rate = one.where
@@ -201,17 +201,19 @@ def _largest_part(gain: Array) -> tuple[int, int]:
     return int(sums[: last + 1].argmin()), last
 
 
-def wander(seen: Seen, interval: Interval) -> list[Explanation]:
+def wander(seen: BlockResiduals, interval: Interval) -> list[Explanation]:
     """Return the explanation that the rows of an image wander: splines, orthogonal to the drift."""
     view = interval.view
     rows = np.flatnonzero(seen.linear.view == view)
     u = 2.0 * seen.place[1, rows] / seen.size[1, view] - 1.0
     each = int(np.median(np.bincount(seen.linear.view[seen.linear.taking_part]))) // FEW
-    one = _on_both(seen, WANDER, view, rows, Waves(min(max(each, FEWEST), SPLINES)).splines(u), FIRST_SIGMA)
+    one = _on_both(
+        seen, WANDER, view, rows, AdditionalParameters(min(max(each, MIN_SPLINES), SPLINES)).splines(u), FIRST_SIGMA
+    )
     return [replace(one, price=one.price + SCALE)]
 
 
-def swing(seen: Seen, found: Swing) -> Explanation:
+def swing(seen: BlockResiduals, found: Swing) -> Explanation:
     """Return the explanation that all rows of an image swing with one period."""
     rows = np.flatnonzero(seen.linear.view == found.view)
     basis = waves_of(seen.place[1, rows], np.array(found.period))
@@ -220,12 +222,12 @@ def swing(seen: Seen, found: Swing) -> Explanation:
     return replace(one, price=costs, period=found.period)
 
 
-def alike(seen: Seen, one: Explanation, found: Fit) -> list[Explanation]:
+def alike(seen: BlockResiduals, one: Explanation, found: MixtureFit) -> list[Explanation]:
     """Return the strip and the fade that a view's wandering rows resemble most, drift aside."""
     size, view = float(seen.size[1, one.view]), one.view
     rows = (np.arange(BINS) + 0.5) / BINS * size
     unknowns = found.extra[-len(one.sigma) :]
-    curve = unknowns.reshape(2, -1) @ Waves(len(unknowns) // 2 + DRIFTS).splines(2.0 * rows / size - 1.0)
+    curve = unknowns.reshape(2, -1) @ AdditionalParameters(len(unknowns) // 2 + DRIFTS).splines(2.0 * rows / size - 1.0)
     drift = np.linalg.qr(np.vander(rows / size - 0.5, 3))[0]
     ends = np.stack(np.triu_indices(BINS + 1, 1)) / BINS * size
     nothing = np.zeros(ends.shape[1])
@@ -243,13 +245,13 @@ def alike(seen: Seen, one: Explanation, found: Fit) -> list[Explanation]:
     return told
 
 
-def _on_both(seen: Seen, kind: str, view: int, rows: IntArray, basis: Array, sigma: float) -> Explanation:
+def _on_both(seen: BlockResiduals, kind: str, view: int, rows: IntArray, basis: Array, sigma: float) -> Explanation:
     extra = np.zeros((2, 2 * len(basis), len(seen.linear.view)))
     extra[0, : len(basis), rows] = extra[1, len(basis) :, rows] = basis.T
     return Explanation(kind, view, extra, np.full(2 * len(basis), sigma), float(np.log(seen.linear.choices)))
 
 
-def group(seen: Seen, _interval: Interval) -> list[Explanation]:
+def group(seen: BlockResiduals, _interval: Interval) -> list[Explanation]:
     """Return the explanation that the ties of a part of the ground move."""
     one = moving.proposal(seen.linear, seen.ground, seen.base, seen.extra, seen.sigma)
     if one is None:
@@ -258,19 +260,19 @@ def group(seen: Seen, _interval: Interval) -> list[Explanation]:
     return [Explanation(MOVING, -1, none, np.zeros(0), moving.price_of_group(seen.linear, one.cell), group=one)]
 
 
-EXPLANATIONS: dict[str, Callable[[Seen, Interval], list[Explanation]]] = {
+EXPLANATIONS: dict[str, Callable[[BlockResiduals, Interval], list[Explanation]]] = {
     STRIP: strip,
     FADE: fade,
-    SETTLING: settling,
+    TRANSIENT: transient,
     WANDER: wander,
     MOVING: group,
 }
 """Name -> unknowns, proposed where an interval of an image stands out; `SWING` is, where a period does."""
-_OF_BLOCK = (MOVING, SETTLING)
+_OF_BLOCK = (MOVING, TRANSIENT)
 
 
 def proposed(
-    seen: Seen, intervals: list[Interval], periods: list[Swing], known_kinds: Collection[str] = ()
+    seen: BlockResiduals, intervals: list[Interval], periods: list[Swing], known_kinds: Collection[str] = ()
 ) -> Iterator[Explanation]:
     """Yield the explanations proposed by the intervals and periods that stand out; those of a whole image, or
     block, once.
@@ -281,7 +283,7 @@ def proposed(
     known = set[tuple[object, ...]]()
     for interval in intervals:
         for kind in [kind for kind in EXPLANATIONS if kind not in known_kinds]:
-            if kind == SETTLING and not _at_one_end(seen, intervals):
+            if kind == TRANSIENT and not _at_one_end(seen, intervals):
                 continue
             place = (interval.axis, interval.start, interval.stop) if kind in LOCAL else ()
             place = () if kind in _OF_BLOCK else (interval.view, *place)
@@ -290,7 +292,7 @@ def proposed(
                 yield from EXPLANATIONS[kind](seen, interval)
 
 
-def _at_one_end(seen: Seen, intervals: list[Interval]) -> bool:
+def _at_one_end(seen: BlockResiduals, intervals: list[Interval]) -> bool:
     """Return whether all that stands out is where images begin, or all where they end, as no wandering is."""
     at_end = [
         (one.start <= 0.0, one.stop >= seen.size[1, one.view]) if one.axis == 1 else (False, False) for one in intervals

@@ -14,21 +14,23 @@ from itertools import pairwise
 
 import numpy as np
 
-from barpc.ba.estimated.waves import FEWEST, Waves
-from barpc.ba.held.block import Block, make_problem
-from barpc.ba.judging.explanations import FOLLOWED, LOCAL, SETTLING, SWING
-from barpc.ba.judging.judge import Finding, Judgement, shared, standing_out
+from barpc.ba.constraints.block import Block, make_problem
+from barpc.ba.judging.explanations import FOLLOWED, LOCAL, SWING, TRANSIENT
+from barpc.ba.judging.judge import Finding, Selection, correlated_noise_gain, standing_out
 from barpc.ba.judging.solution import MUCH_BETTER, Solution, finished
+from barpc.ba.parameters.additional_parameters import MIN_SPLINES, AdditionalParameters
 from barpc.ba.robust.heldout import is_better
-from barpc.ba.robust.rounds import Rounds, revived
+from barpc.ba.robust.rounds import Rounds, retriangulate_rejected
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array
 from barpc.base.options import AUTO, OFF, AdjustOptions
-from barpc.base.usual import BACKFITTING, FEW, ITERATIONS, LARGEST, SURE
+from barpc.base.statistics import BACKFITTING, FEW, ITERATIONS, LARGEST, SURE
 from barpc.scene import BoolArray
 
-_LARGE = 40.0  # twice the logarithm of a likelihood ratio: the largest of 10,000 places by chance once in 100,000 views
+_MIN_LOG_RATIO = (
+    40.0  # twice the logarithm of a likelihood ratio: the largest of 10,000 places by chance once in 100,000 views
+)
 _A_VIEW = 4.0  # and so much more for every other view of a focal plane
 _AS_LARGE = 0.5  # of the largest change: not what another view's step leaves here, a quarter of it with three views
 _SPACING, _DENSER = 2000.0, 4  # rows between knots at first, and how often they are halved
@@ -84,7 +86,7 @@ class _Columns:
 def find_edges(problem: Problem, state: State, residual: Array, use: BoolArray, sigma: Array) -> Array:
     """Find the columns (N, C) [px] at which residuals (2, K) [px] step; infinite where a view has fewer."""
     weight, widths = use / sigma, problem.cameras.unknowns.half[0]
-    settled = problem.settling(problem.project_points(state.params, state.points), weight)
+    settled = problem.projected_off_points(problem.project_points(state.params, state.points), weight)
     residual, views = settled(_without_steps(problem, state, residual)), list(range(len(widths)))
     edges, cost = _grown(_Columns(problem, use, sigma, [[v] for v in views]), residual, settled, weight)
     if any(edges) and len(views) > 1 and (widths == widths[0]).all():
@@ -119,28 +121,29 @@ def _grown(columns: _Columns, residual: Array, settled: Callable[[Array], Array]
             for stretch in pairwise([-np.inf, *of_group, np.inf])
         ]
         largest = max(gain for _, gain, _ in found)
-        if largest < _LARGE:
+        if largest < _MIN_LOG_RATIO:
             break
         for g, gain, col in found:
-            if gain >= max(_LARGE, _AS_LARGE * largest):
+            if gain >= max(_MIN_LOG_RATIO, _AS_LARGE * largest):
                 edges[g] = sorted([*edges[g], col])
         for _ in range(BACKFITTING):
             part += columns.means(settled(residual - part), edges)
     left = settled(residual - part)
     cost = float(((left * weight) ** 2).sum())
     cost += sum(
-        len(one) * (_LARGE + _A_VIEW * (len(group) - 1)) for one, group in zip(edges, columns.groups, strict=True)
+        len(one) * (_MIN_LOG_RATIO + _A_VIEW * (len(group) - 1))
+        for one, group in zip(edges, columns.groups, strict=True)
     )
-    return [_placed(columns, g, of_group, part + left) for g, of_group in enumerate(edges)], cost
+    return [_edge_positions(columns, g, of_group, part + left) for g, of_group in enumerate(edges)], cost
 
 
-def _placed(columns: _Columns, g: int, edges: list[float], residual: Array) -> list[float]:
+def _edge_positions(columns: _Columns, g: int, edges: list[float], residual: Array) -> list[float]:
     """Return the edges of a group, each where it is best between its neighbours, that explain enough."""
     found: list[float] = []
     for at in range(len(edges)):
         low = found[-1] if found else -np.inf
         gain, col = columns.split(g, low, edges[at + 1] if at + 1 < len(edges) else np.inf, residual)
-        found += [col] if gain >= _LARGE else []
+        found += [col] if gain >= _MIN_LOG_RATIO else []
     return found
 
 
@@ -156,7 +159,7 @@ def follow(found: Solution, block: Block, outer: Block, options: AdjustOptions) 
     for count in _spline_counts(block, options, found.has_waves):
         if misses == _TWICE or not (best.has_waves or (asked and best is found)):
             break
-        waves = Waves(count, _given_edges(block, options))
+        waves = AdditionalParameters(count, _given_edges(block, options))
         if options.detectors:
             tried = _with_waves(found, block, outer, options, waves)
         else:
@@ -173,11 +176,11 @@ def _explains(tried: Solution, found: Solution, block: Block) -> bool:
 
     Ties that took no part err as their neighbours do: they do not tell cameras from noise that many share.
     """
-    left, before = (shared(one.outcome, block) for one in (tried, found))
+    left, before = (correlated_noise_gain(one.outcome, block) for one in (tried, found))
     return left <= max(0.5 * before, SURE) or tried.after.error < MUCH_BETTER * found.after.error
 
 
-def without_strips(found: Solution, judged: Judgement, block: Block, outer: Block, options: AdjustOptions) -> Solution:
+def without_strips(found: Solution, judged: Selection, block: Block, outer: Block, options: AdjustOptions) -> Solution:
     """Solve the block with the strips, fades and swings that the judge found.
 
     Refused where it makes tracks worse that took no part, or no better than what follows an image as a whole.
@@ -186,7 +189,7 @@ def without_strips(found: Solution, judged: Judgement, block: Block, outer: Bloc
     if not parts or options.jitter == OFF or options.is_plain:
         return found
     waves, params = _waves_of(parts, len(block.views))
-    tried = _with_waves(_judged(found, judged, block), block, outer, options, waves, start=params)
+    tried = _with_waves(_at_selection(found, judged, block), block, outer, options, waves, start=params)
     plainly = replace(found, findings=tuple(one for one in found.findings if one.moved is not None))
     if is_better(found.after, tried.after, outer):
         return plainly
@@ -207,7 +210,7 @@ def without_strips(found: Solution, judged: Judgement, block: Block, outer: Bloc
     return plainly if shaken or swing else found
 
 
-def _judged(found: Solution, judged: Judgement, block: Block) -> Solution:
+def _at_selection(found: Solution, judged: Selection, block: Block) -> Solution:
     """Return the block where the judge leaves it: cameras, and tracks that meet where its right observations do."""
     outcome, is_tie = found.outcome, block.point < block.num_tracks
     inlier = np.where(is_tie, block.use & (judged.right > 0.5), outcome.inlier)
@@ -216,11 +219,11 @@ def _judged(found: Solution, judged: Judgement, block: Block) -> Solution:
     return replace(found, outcome=replace(outcome, inlier=inlier, minimum=replace(outcome.minimum, state=moved)))
 
 
-def _waves_of(parts: list[Finding], views: int) -> tuple[Waves, Array]:
+def _waves_of(parts: list[Finding], views: int) -> tuple[AdditionalParameters, Array]:
     """Return the unknowns in the image that explanations are, and what these found (N, size)."""
     own = [
         [[one for one in parts if one.view == v and one.kind in kinds] for v in range(views)]
-        for kinds in ((*LOCAL, SETTLING), (SWING,))
+        for kinds in ((*LOCAL, TRANSIENT), (SWING,))
     ]
     most = [max(map(len, of_kind)) for of_kind in own]
     places, periods = np.full((views, most[0], 5), np.inf), np.full((views, most[1]), np.inf)
@@ -233,7 +236,7 @@ def _waves_of(parts: list[Finding], views: int) -> tuple[Waves, Array]:
             assert one.period is not None
             periods[v, n], swung[v, :, :, n] = one.period, one.unknowns.reshape(2, 2)
     params = np.hstack([moved.reshape(views, -1), swung.reshape(views, -1)])
-    return Waves(0, np.zeros((views, 0)), places, periods), params
+    return AdditionalParameters(0, np.zeros((views, 0)), places, periods), params
 
 
 def _with_edges(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
@@ -250,7 +253,7 @@ def _with_edges(found: Solution, block: Block, outer: Block, options: AdjustOpti
         edges = find_edges(outcome.problem, found.final, outcome.residual, outcome.inlier, sigma)
         if edges.shape[1] <= waves.edges.shape[1]:
             break
-        waves = Waves(waves.count, edges)
+        waves = AdditionalParameters(waves.count, edges)
         found = _with_waves(found, block, outer, options, waves)
     return found if waves.edges.size else _with_waves(found, block, outer, options, waves)
 
@@ -266,10 +269,10 @@ def _spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> lis
         return [0] if options.detectors else []
     most = int(np.median(np.bincount(block.view[block.use], minlength=len(block.views)))) // FEW
     if options.spacing:
-        return [max(min(int(np.ceil(rows / options.spacing)) + 3, most), FEWEST)]
+        return [max(min(int(np.ceil(rows / options.spacing)) + 3, most), MIN_SPLINES)]
     most = min(most, LARGEST // (2 * len(block.views)))
     wanted = [int(np.ceil(rows / (_SPACING / 2**n))) + 3 for n in range(_DENSER)]
-    dense = np.unique(np.clip(wanted, FEWEST, most)).tolist() if has_waves and most >= FEWEST else []
+    dense = np.unique(np.clip(wanted, MIN_SPLINES, most)).tolist() if has_waves and most >= MIN_SPLINES else []
     return dense or [0] * bool(options.detectors)
 
 
@@ -278,7 +281,7 @@ def _with_waves(
     block: Block,
     outer: Block,
     options: AdjustOptions,
-    waves: Waves,
+    waves: AdditionalParameters,
     once: bool = False,
     start: Array | None = None,
 ) -> Solution:
@@ -302,6 +305,6 @@ def _with_waves(
     if start is not None:  # the cameras have moved: every point is seen anew, where any are right by these
         count = np.bincount(block.point[known], minlength=bent.structure.num_points)
         weight, known = weight * (known | (count < 2)[block.point]), np.zeros_like(known)
-    there, _ = revived(bent, replace(ended, params=params), outcome.residual, known, weight)
+    there, _ = retriangulate_rejected(bent, replace(ended, params=params), outcome.residual, known, weight)
     outcome = Rounds(bent, block, there, found.heights, block.use, outcome).run(once)
     return finished(found, bent, block, outer, options, outcome)

@@ -8,23 +8,23 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from barpc.ba.evidence.linearised import Linear, linearise, numbers
-from barpc.ba.evidence.mixture import SETTLED, Fit, fit, off_from_right
+from barpc.ba.constraints.block import Block
+from barpc.ba.evidence.correlated_noise import shared_errors
+from barpc.ba.evidence.linearised import Linear, array_elements, linearise
+from barpc.ba.evidence.mixture import LIKELIHOOD_TOLERANCE, MixtureFit, fit_mixture, off_from_right
 from barpc.ba.evidence.periods import Swing, swings
 from barpc.ba.evidence.scan import Interval, scan
-from barpc.ba.evidence.shared import shared_errors
-from barpc.ba.held.block import Block
 from barpc.ba.judging.explanations import (
     EXPLANATIONS,
     FADE,
     FOLLOWED,
     LOCAL,
     MOVING,
-    SETTLING,
     SWING,
+    TRANSIENT,
     WANDER,
+    BlockResiduals,
     Explanation,
-    Seen,
     Where,
     alike,
     bent,
@@ -32,18 +32,18 @@ from barpc.ba.judging.explanations import (
     proposed,
     sharpened,
 )
-from barpc.ba.judging.moving import Found, Ground, Motion, group_of
-from barpc.ba.robust.rounds import Outcome, revived
+from barpc.ba.judging.moving import GroundMotion, Motion, MovingGroup, group_of
+from barpc.ba.robust.rounds import Outcome, retriangulate_rejected
 from barpc.ba.robust.weights import Observations
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array
-from barpc.base.usual import BACKFITTING, KEPT, LARGEST, OUTLIER, RIVALS, SAMPLE, SMALL, STANDS, SURE, TRIED
+from barpc.base.statistics import BACKFITTING, KEPT, LARGEST, OUTLIER, RIVALS, SAMPLE, SMALL, STANDS, SURE, TRIED
 from barpc.scene import BoolArray, IntArray
 
-_LOG = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
 _SEEN = 2.5  # floors: swings and motions that are taken; sound crops show swings of 1.8, where ties share errors
-OBSERVATIONS = KEPT
+MAX_OBSERVATIONS = KEPT
 """Of a block, up to which parts of it are judged."""
 _NEAREST = 12  # views of a part
 
@@ -64,12 +64,12 @@ class Finding:
     unknowns: Array  # (e,) as `barpc.ba.judging.explanations` has them [px]
     period: float | None = None  # after which it repeats itself [px]
     or_of: tuple[int, ...] = ()  # other views that may be meant: their evidence is within `SURE` of the view's
-    moved: Found | None = field(default=None, repr=False)
+    moved: MovingGroup | None = field(default=None, repr=False)
     motion: Motion | None = None  # what is said of it at the end
 
 
 @dataclass(frozen=True, eq=False)
-class Judgement:
+class Selection:
     """The explanations taken, and the state of cameras and observations with them."""
 
     findings: tuple[Finding, ...] = ()
@@ -105,12 +105,12 @@ def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
     if not all(
         one.by_share for one in found
     ):  # noise that neighbours share makes means of them, and is none of an image's part
-        by_neighbours = shared(outcome, block)
+        by_neighbours = correlated_noise_gain(outcome, block)
         found = [one for one in found if one.by_share or one.gain > by_neighbours]
     if not any(one.by_share for one in found):
         return found
     state, weight = outcome.minimum.state, block.use / block.sigma
-    residual = revived(outcome.problem, state, outcome.residual, outcome.inlier, weight)[1]
+    residual = retriangulate_rejected(outcome.problem, state, outcome.residual, outcome.inlier, weight)[1]
     off = np.hypot(*residual)
     cut = (block.point < block.num_tracks) & block.use & ~outcome.inlier & np.isfinite(off)
     inside = [
@@ -126,16 +126,22 @@ def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
 def swinging(outcome: Outcome, block: Block) -> list[Swing]:
     """Find the periods with which the rows of images swing more than chance allows, at most one an image."""
     rows, off = _whitened(outcome, block)
-    return swings(block.view[rows], block.xy[1, rows], _sizes(block), _told(outcome, block)[rows], off)
+    return swings(
+        block.view[rows], block.xy[1, rows], _sizes(block), _confirmed_observations(outcome, block)[rows], off
+    )
 
 
-def shared(outcome: Outcome, block: Block) -> float:
+def correlated_noise_gain(outcome: Outcome, block: Block) -> float:
     """Return by how much noise that neighbours share explains the ties kept better than noise of each alone [nats]."""
     rows, off = _whitened(outcome, block)
-    return _shared(block.view[rows], block.xy[:, rows], _sizes(block), off, outcome.inlier[rows], block.point[rows])
+    return _correlated_log_ratio(
+        block.view[rows], block.xy[:, rows], _sizes(block), off, outcome.inlier[rows], block.point[rows]
+    )
 
 
-def _shared(view: IntArray, place: Array, size: Array, off: Array, right: BoolArray, track: IntArray) -> float:
+def _correlated_log_ratio(
+    view: IntArray, place: Array, size: Array, off: Array, right: BoolArray, track: IntArray
+) -> float:
     """Return what noise that neighbours share explains [nats], of ties (k,) off by (2, k) standard deviations.
 
     A track of n views leaves 2 n - 3 of its 2 n residuals free.
@@ -145,7 +151,7 @@ def _shared(view: IntArray, place: Array, size: Array, off: Array, right: BoolAr
     return free * float(shared_errors(view[right], place[:, right], size, off[:, right]).sum())
 
 
-def _told(outcome: Outcome, block: Block) -> Array:
+def _confirmed_observations(outcome: Outcome, block: Block) -> Array:
     """Return 1 for observations (K,) of points that others tell: what was cut is seen as well as the rest."""
     right = np.bincount(block.point[outcome.inlier], minlength=block.num_points)
     return (right[block.point] >= 2).astype(np.float64)
@@ -164,7 +170,7 @@ def _sizes(block: Block) -> Array:
     return np.array([view.size for view in block.views], dtype=np.float64).T
 
 
-def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
+def judge(outcome: Outcome, block: Block, floor: float) -> Selection:
     """Find what explains the ties of a block beside its cameras, the first taken first; empty where nothing
     stands out.
 
@@ -172,47 +178,47 @@ def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
     what moves on the ground competes there, but is not followed.
     """
     size, views = outcome.problem.free.size, np.arange(len(block.views))
-    if size > LARGEST or len(block.view) > OBSERVATIONS:
-        return Judgement()
+    if size > LARGEST or len(block.view) > MAX_OBSERVATIONS:
+        return Selection()
     asks = [one.view for one in standing_out(outcome, block, floor)]
     if not asks or size > SMALL:
         asks += [one.view for one in swinging(outcome, block)]
     if size <= SMALL:
-        return _judged_among(outcome, block, floor, views) if asks else Judgement()
-    found = Judgement((), np.zeros((len(views), size // len(views))), outcome.inlier.astype(np.float64))
+        return _judged_among(outcome, block, floor, views) if asks else Selection()
+    found = Selection((), np.zeros((len(views), size // len(views))), outcome.inlier.astype(np.float64))
     done: set[int] = set()
     for view in dict.fromkeys(asks):
         if view not in done:
-            views = _near(block, view)
+            views = _neighbour_views(block, view)
             done.update(views.tolist())
             one = _judged_among(outcome, block, floor, views)
             if one.findings and one.findings[-1].moved is None:
-                found = _joined(found, one, views, np.flatnonzero(np.isin(block.view, views)))
-    return found if found.findings else Judgement()
+                found = _with_findings(found, one, views, np.flatnonzero(np.isin(block.view, views)))
+    return found if found.findings else Selection()
 
 
-def _judged_among(outcome: Outcome, block: Block, floor: float, views: IntArray) -> Judgement:
+def _judged_among(outcome: Outcome, block: Block, floor: float, views: IntArray) -> Selection:
     """Judge the ties that some views have among them; views and observations are renumbered."""
     found = around(outcome, block, views)
     if found is None:
-        return Judgement()
+        return Selection()
     linear, state = found
-    rows, ground = np.flatnonzero(np.isin(block.view, views)), Ground.of(outcome.problem, state)
+    rows, ground = np.flatnonzero(np.isin(block.view, views)), GroundMotion.of(outcome.problem, state)
     linear, ground = linear.among(views), ground.part(rows)
     nothing, place = np.zeros((2, 0, len(rows))), block.xy[:, rows]
     number, outs = np.full(len(block.views), -1), standing_out(outcome, block, floor)
     number[views] = np.arange(len(views))
     try:
-        base, few = fit(linear), linear.thinned(SAMPLE)
-        seen = Seen(linear, few, ground, place, _sizes(block)[:, views], base, nothing, np.zeros(0))
+        base, few = fit_mixture(linear), linear.thinned(SAMPLE)
+        seen = BlockResiduals(linear, few, ground, place, _sizes(block)[:, views], base, nothing, np.zeros(0))
         first = [replace(one, view=int(number[one.view])) for one in outs if number[one.view] >= 0]
-        return _Search(seen, first, floor, float(np.median(block.sigma))).run()
+        return _ExplanationSearch(seen, first, floor, float(np.median(block.sigma))).run()
     except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
-        _LOG.warning("what explains the tie points is not judged: %s", error)
-        return Judgement()
+        logger.warning("what explains the tie points is not judged: %s", error)
+        return Selection()
 
 
-def _near(block: Block, view: int) -> IntArray:
+def _neighbour_views(block: Block, view: int) -> IntArray:
     """Return a view and those that share most tracks with it, in their order."""
     ties = block.use & (block.point < block.num_tracks)
     of_view = np.zeros(block.num_points, dtype=bool)
@@ -223,7 +229,7 @@ def _near(block: Block, view: int) -> IntArray:
     return np.sort(nearest[shared[nearest] > 0])
 
 
-def _joined(all_of: Judgement, one: Judgement, views: IntArray, rows: IntArray) -> Judgement:
+def _with_findings(all_of: Selection, one: Selection, views: IntArray, rows: IntArray) -> Selection:
     """Return a judgement with the findings among some views added, for observations at `rows`."""
     step, right = all_of.step.copy(), all_of.right.copy()
     new = ~step[views].any(axis=1)
@@ -232,7 +238,7 @@ def _joined(all_of: Judgement, one: Judgement, views: IntArray, rows: IntArray) 
     findings = (
         replace(row, view=int(views[row.view]), or_of=tuple(int(views[v]) for v in row.or_of)) for row in one.findings
     )
-    return Judgement((*all_of.findings, *findings), step, right)
+    return Selection((*all_of.findings, *findings), step, right)
 
 
 def around(outcome: Outcome, block: Block, views: IntArray) -> tuple[Linear, State] | None:
@@ -240,24 +246,26 @@ def around(outcome: Outcome, block: Block, views: IntArray) -> tuple[Linear, Sta
     problem = outcome.problem
     use = block.use & (block.point < block.num_tracks) & np.isin(block.view, views)
     unknowns = problem.free.size // len(block.views) * len(views)
-    if unknowns > SMALL or numbers(np.bincount(block.point[use])) > 30 * KEPT:  # 240 MB
+    if unknowns > SMALL or array_elements(np.bincount(block.point[use])) > 30 * KEPT:  # 240 MB
         return None
-    state, _ = revived(problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma)
+    state, _ = retriangulate_rejected(
+        problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
+    )
     low, high = block.alt_range
     return linearise(problem, state, use, block.sigma, high - low), state
 
 
-_Tried = tuple[Explanation, Fit, float]
+_Tried = tuple[Explanation, MixtureFit, float]
 
 
 @dataclass(frozen=True, eq=False)
-class _Taken:
+class _TakenExplanation:
     one: Explanation
     gain: float
     gap: float
     runner_up: str
     or_of: tuple[int, ...]
-    beside: Seen  # what was taken before
+    beside: BlockResiduals  # what was taken before
 
     @property
     def what(self) -> tuple[str, int]:
@@ -266,12 +274,12 @@ class _Taken:
 
 
 @dataclass(frozen=True, eq=False)
-class _State:
+class _SearchState:
     """A search with some explanations taken."""
 
-    seen: Seen
-    followed: Fit  # the last of what the adjustment follows
-    taken: tuple[_Taken, ...] = ()
+    seen: BlockResiduals
+    followed: MixtureFit  # the last of what the adjustment follows
+    taken: tuple[_TakenExplanation, ...] = ()
     ended: bool = False  # nothing may be taken beside what was
 
     @property
@@ -279,37 +287,37 @@ class _State:
         """Evidence gained by all explanations taken."""
         return sum(row.gain for row in self.taken)
 
-    def may_pass(self, best: _State) -> bool:
+    def may_pass(self, best: _SearchState) -> bool:
         """Return whether some more, each gaining less than the last, may explain more than another that ended."""
         left = RIVALS + len(best.taken) - 1 - len(self.taken)
         return self.gain + left * self.taken[-1].gain > best.gain
 
-    def adds_to(self, best: _State, beside: list[_Tried]) -> bool:
+    def adds_to(self, best: _SearchState, beside: list[_Tried]) -> bool:
         """Return whether what was taken last gains as much beside the best: it is no other way then."""
         last, one = self.taken[-1], self.taken[-1].one
         same = [row.what for row in self.taken[:-1]] == [row.what for row in best.taken[:-1]]
         gains = [row[2] for row in beside if row[0].kind == one.kind and not _differs(row[0], one)]
         return same and max(gains, default=0.0) > last.gain - SURE
 
-    def added(self, tried: list[_Tried]) -> _State:
+    def added(self, tried: list[_Tried]) -> _SearchState:
         """Return the state with the first of the explanations tried; the others are its rivals."""
         first = tried[0]
         same = [row for row in tried if row[2] > first[2] - SURE and _of_one_image(row[0], first[0])]
-        one, made, gain = min(same, key=lambda row: _part(row[0], self.seen))  # of two that are as good
+        one, made, gain = min(same, key=lambda row: _image_share(row[0], self.seen))  # of two that are as good
         others = [row for row in tried if row[0] is not one and _differs(row[0], one)]
         other = max(((row[0].kind, row[2]) for row in others), default=("", 0.0), key=lambda row: row[1])
         close = [row[0] for row in others if row[2] > gain - SURE]
         or_of = tuple(sorted({row.view for row in close if one.kind == row.kind == SWING}))
-        _LOG.info("%s of view %d, %s: %.0f nats (%s %.0f)", one.kind, one.view, one.where, gain, *other)
-        taken = (*self.taken, _Taken(one, gain, gain - max(other[1], 0.0), other[0], or_of, self.seen))
+        logger.info("%s of view %d, %s: %.0f nats (%s %.0f)", one.kind, one.view, one.where, gain, *other)
+        taken = (*self.taken, _TakenExplanation(one, gain, gain - max(other[1], 0.0), other[0], or_of, self.seen))
         extra = np.concatenate([self.seen.extra, one.extra], axis=1)
         sigma = np.append(self.seen.sigma, one.sigma)
         seen = replace(self.seen, base=made, extra=extra, sigma=sigma)
         follows = one.kind in FOLLOWED
-        return _State(seen, made if follows else self.followed, taken, not follows or len(taken) == TRIED)
+        return _SearchState(seen, made if follows else self.followed, taken, not follows or len(taken) == TRIED)
 
 
-def _by_neighbours(seen: Seen) -> float:
+def _by_neighbours(seen: BlockResiduals) -> float:
     """Return what noise that neighbours share explains beside what was taken [nats]."""
     found, linear = seen.base, seen.linear
     left = linear.left(found.step) + np.einsum("cek,e->ck", seen.extra, found.extra) / linear.sigma
@@ -319,40 +327,40 @@ def _by_neighbours(seen: Seen) -> float:
         track[tracks.rows] = len(linear.view) * n + np.arange(len(tracks.rows))[:, None]
     right = (track >= 0) & (found.right > 0.5)
     # what is larger than what matchers are stated to err by is no noise of theirs
-    return _shared(linear.view, seen.place, seen.size, off, right, track)
+    return _correlated_log_ratio(linear.view, seen.place, seen.size, off, right, track)
 
 
-class _Search:
+class _ExplanationSearch:
     """Search for explanations, one after the other, by the best and its rivals."""
 
-    def __init__(self, seen: Seen, first: list[Interval], floor: float, sigma: float) -> None:
+    def __init__(self, seen: BlockResiduals, first: list[Interval], floor: float, sigma: float) -> None:
         self.start, self.first, self.floor, self.sigma = seen, first, floor, sigma  # [px]
-        self.seen, self.taken = seen, tuple[_Taken, ...]()
+        self.seen, self.taken = seen, tuple[_TakenExplanation, ...]()
         self.group: list[Explanation] = []  # looked for once
 
-    def run(self) -> Judgement:
+    def run(self) -> Selection:
         """Return all that were taken."""
-        states, ended = [_State(self.start, self.start.base)], False
+        states, ended = [_SearchState(self.start, self.start.base)], False
         while not ended:
             states, ended = self._grown(states)
         best, margin = states[0], states[0].gain - (states[1].gain if len(states) > 1 else 0.0)
         for n, row in enumerate(best.taken):  # what is left, as well
             if sum(one.gain for one in best.taken[n:]) <= _by_neighbours(row.beside):
-                best = _State(row.beside, row.beside.base, best.taken[:n])
+                best = _SearchState(row.beside, row.beside.base, best.taken[:n])
                 break
         if not best.taken:
-            return Judgement()
+            return Selection()
         self.seen = best.seen
         # what was not the best by itself is beside the others: by what these gain together
         taken = [row if row.gap > 0.0 else replace(row, gap=margin) for row in best.taken]
         followed = sum(row.one.kind in FOLLOWED for row in taken)
         base = best.seen.base if followed == len(taken) else best.followed
-        found = tuple(one for n in range(len(taken)) for one in _said(taken, n, best.seen))
-        return Judgement(found, base.step, base.right)
+        found = tuple(one for n in range(len(taken)) for one in _findings_of(taken, n, best.seen))
+        return Selection(found, base.step, base.right)
 
-    def _grown(self, states: list[_State]) -> tuple[list[_State], bool]:
+    def _grown(self, states: list[_SearchState]) -> tuple[list[_SearchState], bool]:
         """Return the best with one more explanation, and whether they are the last."""
-        best, grown, beside = states[0], list[_State](), list[_Tried]()
+        best, grown, beside = states[0], list[_SearchState](), list[_Tried]()
         for state in states:
             if state.ended or (best.ended and not state.may_pass(best)):
                 grown.append(state)
@@ -364,10 +372,10 @@ class _Search:
             if not tried and state is best:  # it explains all
                 return states, True
             beside = tried if state is best else beside
-            for n in [0, *_rivals(tried)] if tried else []:
+            for n in [0, *_rival_states(tried)] if tried else []:
                 grown.append(state.added([tried[n], *tried[:n], *tried[n + 1 :]]))
             grown += [] if tried else [replace(state, ended=True)]
-        kept: list[_State] = []
+        kept: list[_SearchState] = []
         for state in sorted(grown, key=lambda state: -state.gain):
             if not any({row.what for row in state.taken} == {row.what for row in one.taken} for one in kept):
                 kept.append(state)
@@ -388,7 +396,7 @@ class _Search:
             made = self._sorted([row[:2] for row in (*made, *self._moving(out, made))])
         return self._sorted(row[:2] for row in made if not self._is_nothing(*row[:2]))
 
-    def _standing_out(self, found: Fit, extra: Array) -> tuple[list[Interval], list[Swing]]:
+    def _standing_out(self, found: MixtureFit, extra: Array) -> tuple[list[Interval], list[Swing]]:
         """Return the intervals and periods that stand out beside what a fit moves (2, e, K)."""
         seen, linear = self.seen, self.seen.linear
         rows = linear.taking_part
@@ -398,7 +406,7 @@ class _Search:
         off, told = all_off[:, rows] / found.noise, (known[rows] | (wrong < 0.5)).astype(np.float64)
         floor = self.floor / self.sigma / found.noise
         out = [one for one in scan(view, place, seen.size, wrong, off, told, floor) if one.gain > SURE]
-        return _distinct(out)[:RIVALS], swings(view, place[1], seen.size, told, off)[:RIVALS]
+        return _uncovered(out)[:RIVALS], swings(view, place[1], seen.size, told, off)[:RIVALS]
 
     def _leaves_nothing(self, made: list[_Tried]) -> bool:
         """Return whether nothing stands out beside the best of few unknowns: no rival is needed then."""
@@ -426,7 +434,7 @@ class _Search:
         blunt = max(SURE, made[0][2] / RIVALS) if made and made[0][2] > SURE else -np.inf
         return self._sorted(
             self._sharpened(one, found)
-            if gain > blunt and (one in local or one.kind in (SETTLING, SWING, WANDER))
+            if gain > blunt and (one in local or one.kind in (TRANSIENT, SWING, WANDER))
             else (one, found)
             for one, found, gain in made
         )
@@ -436,12 +444,12 @@ class _Search:
         few = self.seen.few
         if few is self.seen.linear or len(offered) < 3:
             return offered
-        base = fit(few, self.seen.extra, self.seen.sigma, self.seen.base)
+        base = fit_mixture(few, self.seen.extra, self.seen.sigma, self.seen.base)
         gains = [self._fit(one, few, base).evidence - base.evidence - one.price for one in offered]
         least = max(gains) / RIVALS if max(gains) > SURE else -np.inf
         return [one for one, gain in zip(offered, gains, strict=True) if gain >= least]
 
-    def _is_nothing(self, one: Explanation, found: Fit) -> bool:
+    def _is_nothing(self, one: Explanation, found: MixtureFit) -> bool:
         """Return whether a swing or a group's motion is smaller than what an adjustment is asked to find."""
         size = np.inf
         if one.kind == SWING:
@@ -451,7 +459,7 @@ class _Search:
             size = float(np.sqrt((away**2).sum(axis=0).mean()))
         return bool(size < self.floor * _SEEN)
 
-    def _members(self, found: Fit, rows: BoolArray) -> Iterator[Explanation]:
+    def _members(self, found: MixtureFit, rows: BoolArray) -> Iterator[Explanation]:
         """Yield the parts of images that hold what a group does: rows that lie off move on the ground, too."""
         seen, none = self.seen, np.zeros((2, int(rows.sum())))
         places = scan(seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none, none[0])
@@ -463,31 +471,31 @@ class _Search:
         """Return the explanations tried so far and more, the best first."""
         return self._sorted([*(row[:2] for row in made), *((one, self._fit(one)) for one in more)])
 
-    def _sorted(self, made: Iterable[tuple[Explanation, Fit]]) -> list[_Tried]:
+    def _sorted(self, made: Iterable[tuple[Explanation, MixtureFit]]) -> list[_Tried]:
         base = self.seen.base.evidence
         return sorted(((*row, row[1].evidence - base - row[0].price) for row in made), key=lambda row: -row[2])
 
-    def _sharpened(self, one: Explanation, found: Fit) -> tuple[Explanation, Fit]:
+    def _sharpened(self, one: Explanation, found: MixtureFit) -> tuple[Explanation, MixtureFit]:
         for _ in range(BACKFITTING):
             others = np.einsum("cek,e->ck", self.seen.extra, found.extra[: -len(one.sigma)])
-            tried = [faster(one, self._fit(bent(self.seen, one))), one] if one.kind in (FADE, SETTLING) else [one]
+            tried = [faster(one, self._fit(bent(self.seen, one))), one] if one.kind in (FADE, TRANSIENT) else [one]
             better, made = found, one
             for shape in tried:
                 again = sharpened(self.seen, shape, found, others)
                 # what is as it was gains no more than another did
-                if better.evidence < found.evidence + SETTLED or not _stands(again, one):
+                if better.evidence < found.evidence + LIKELIHOOD_TOLERANCE or not _stands(again, one):
                     fitted = self._fit(again, base=found)
                     better, made = (fitted, again) if fitted.evidence > better.evidence else (better, made)
             more = better.evidence - found.evidence
             one, found = made, better
-            if more < SETTLED:
+            if more < LIKELIHOOD_TOLERANCE:
                 break
         return one, found
 
-    def _fit(self, one: Explanation, linear: Linear | None = None, base: Fit | None = None) -> Fit:
+    def _fit(self, one: Explanation, linear: Linear | None = None, base: MixtureFit | None = None) -> MixtureFit:
         seen, sigma = self.seen, np.append(self.seen.sigma, one.sigma)
         extra = np.concatenate([seen.extra, one.extra], axis=1)
-        return fit(linear or seen.linear, extra, sigma, base or seen.base, one.group)
+        return fit_mixture(linear or seen.linear, extra, sigma, base or seen.base, one.group)
 
 
 def _stands(one: Explanation, before: Explanation) -> bool:
@@ -501,13 +509,13 @@ def _amplitude(unknowns: Array) -> Array:
     return size
 
 
-def _said(rows: list[_Taken], n: int, seen: Seen) -> Iterator[Finding]:
+def _findings_of(rows: list[_TakenExplanation], n: int, seen: BlockResiduals) -> Iterator[Finding]:
     taken, one = rows[n], rows[n].one
     start = sum(len(row.one.sigma) for row in rows[:n])
     size = unknowns = seen.base.extra[start : start + len(one.sigma)]
     moved = None
     for part, own in zip(one.parts, np.split(unknowns, len(one.parts)) if one.parts else (), strict=True):
-        yield Finding(SETTLING, part.view, part.where, own, taken.gain, taken.gap, taken.runner_up, own)
+        yield Finding(TRANSIENT, part.view, part.where, own, taken.gain, taken.gap, taken.runner_up, own)
     if one.parts:
         return
     if one.group is not None:
@@ -521,7 +529,7 @@ def _said(rows: list[_Taken], n: int, seen: Seen) -> Iterator[Finding]:
     yield Finding(one.kind, one.view, one.where, size, *said, moved)
 
 
-def _rivals(tried: list[_Tried]) -> list[int]:
+def _rival_states(tried: list[_Tried]) -> list[int]:
     """Return the best of other kinds or views that are followed, and may win with some beside."""
     found: dict[tuple[str, int], int] = {}
     for n, (one, _, gain) in enumerate(tried):
@@ -530,7 +538,7 @@ def _rivals(tried: list[_Tried]) -> list[int]:
     return list(found.values())[: RIVALS - 1]
 
 
-def _distinct(intervals: list[Interval]) -> list[Interval]:
+def _uncovered(intervals: list[Interval]) -> list[Interval]:
     """Return the explanations without those that a better one covers."""
     out: list[Interval] = []
     for one in intervals:
@@ -550,7 +558,7 @@ def _of_one_image(one: Explanation, other: Explanation) -> bool:
     return one is other or (one.view == other.view and one.kind in LOCAL and other.kind in LOCAL)
 
 
-def _part(one: Explanation, seen: Seen) -> float:
+def _image_share(one: Explanation, seen: BlockResiduals) -> float:
     """Return the part of its image that it moves: of two that explain as much it is the smaller one."""
     rows = (seen.linear.view == one.view) | (one.view < 0)
     return float(one.extra[:, :, rows].any(axis=(0, 1)).sum() / max(rows.sum(), 1))

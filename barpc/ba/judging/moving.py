@@ -1,9 +1,9 @@
 """Ties that move together on the ground while the views are taken: a cloud, water, shadows.
 
 Such a group is as good a block as what stands still, so that a cut may keep both, or the wrong one. It is taken for the
-smaller part of the ties and for local: its share is free in each of `CELLS` x `CELLS` cells of the ground. Where it
-lies is looked for from several starts, with few tracks: what was cut moves, or each of some cells does, with what is
-far from it standing still.
+smaller part of the ties and for local: its share is free in each of `GROUND_CELLS` x `GROUND_CELLS` cells of the
+ground. Where it lies is looked for from several starts, with few tracks: what was cut moves, or each of some cells
+does, with what is far from it standing still.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from functools import cached_property
 
 import numpy as np
 
+from barpc.ba.constraints.block import Block
 from barpc.ba.evidence.linearised import Linear, linearise
-from barpc.ba.evidence.mixture import COOLED, Fit, Group, Mixture, moving
-from barpc.ba.held.block import Block
+from barpc.ba.evidence.mixture import COOLED, Group, Mixture, MixtureFit, moving
 from barpc.ba.robust.heldout import seen_in
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
-from barpc.base.usual import BACKFITTING, LEVEL, RIVALS, SAMPLE, TIMES
+from barpc.base.statistics import BACKFITTING, LEVEL, RIVALS, SAMPLE, TIMES
 from barpc.scene import BoolArray, IntArray
 
-CELLS = 6  # a side of the ground: the group's share is free in each
+GROUND_CELLS = 6  # a side of the ground: the group's share is free in each
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class GroundMotion:
     """Ground points of a block's tracks in a local frame, and how their motion moves images."""
 
     center: Array  # (3,) [m], ECEF
@@ -38,7 +38,7 @@ class Ground:
     by_ground: Array  # (2, 3, K) how a metre east, north and up moves observations [px]
 
     @classmethod
-    def of(cls, problem: Problem, state: State, like: Ground | None = None) -> Ground:
+    def of(cls, problem: Problem, state: State, like: GroundMotion | None = None) -> GroundMotion:
         """Return the ground of a problem's points, in the frame of another one where it is given."""
         points = state.points[problem.structure.point]
         center = np.nanmedian(points, axis=0) if like is None else like.center
@@ -50,7 +50,7 @@ class Ground:
             return cls(center, np.nanmin(place, axis=1), np.nanmax(place, axis=1), place, by_ground)
         return cls(center, like.low, like.high, place, by_ground)
 
-    def part(self, rows: IntArray) -> Ground:
+    def part(self, rows: IntArray) -> GroundMotion:
         """Return the ground of some observations."""
         return replace(self, place=self.place[:, rows], by_ground=self.by_ground[..., rows])
 
@@ -86,21 +86,21 @@ class Motion:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class MovingGroup:
     """A group of ties that moves, as the judge found it."""
 
     metres: float  # as in `Motion`
     between: tuple[int, int]
     member: BoolArray  # (K,) observations of its tracks
     shares: Array  # (CELLS^2,) of the ground's cells
-    ground: Ground
-    fit: Fit
+    ground: GroundMotion
+    fit: MixtureFit
 
 
-def proposal(linear: Linear, ground: Ground, base: Fit, extra: Array, sigma: Array) -> Group | None:
+def proposal(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Array, sigma: Array) -> Group | None:
     """Return the moving group to start with, beside other explanations, with its unknowns' prior."""
     few = linear.thinned(SAMPLE)
-    by_move, cell = ground.by_moves(linear.view, linear.views), ground.cells(CELLS)
+    by_move, cell = ground.by_moves(linear.view, linear.views), ground.cells(GROUND_CELLS)
     group = Group(by_move, np.full(by_move.shape[1], TIMES), cell, np.full(len(cell), 0.5))
     rows = np.zeros(len(cell), dtype=bool)
     for tracks in few.tracks:
@@ -113,7 +113,7 @@ def proposal(linear: Linear, ground: Ground, base: Fit, extra: Array, sigma: Arr
     best = sorted(range(len(looks)), key=lambda n: -looks[n].evidence)[:RIVALS]
     ended = [(begun[n].run(), starts[n]) for n in best]
     found, start = max(ended, key=lambda row: row[0].evidence)
-    shares = _shares(found.moving, cell, rows)[cell]
+    shares = _cell_shares(found.moving, cell, rows)[cell]
     member = moving(linear, extra, replace(start, share=shares), found)
     if np.mean(member[rows] > 0.5) > 0.5:  # of two groups the larger stands
         member = 1.0 - member
@@ -127,12 +127,12 @@ def price_of_group(linear: Linear, cell: IntArray) -> float:
     return float(0.5 * np.log(count[count > 0]).sum())
 
 
-def _first_shares(ground: Ground, rows: BoolArray, right: Array) -> Iterator[Array]:
+def _first_shares(ground: GroundMotion, rows: BoolArray, right: Array) -> Iterator[Array]:
     """Yield the probabilities (K,) that tracks move, to start from."""
     cut = np.where(right < 0.5, 1.0 - LEVEL, LEVEL)
     if (cut[rows] > 0.5).any():
         yield cut
-    cell, place = ground.cells(CELLS // 2), ground.place
+    cell, place = ground.cells(GROUND_CELLS // 2), ground.place
     for one in np.unique(cell[rows]):
         inside = cell == one
         middle = np.median(place[:, inside & rows], axis=1, keepdims=True)
@@ -142,12 +142,12 @@ def _first_shares(ground: Ground, rows: BoolArray, right: Array) -> Iterator[Arr
         yield share
 
 
-def _shares(member: Array, cell: IntArray, rows: BoolArray) -> Array:
-    gone, count = (np.bincount(cell[rows], w, CELLS**2) for w in (member[rows], np.ones(rows.sum())))
+def _cell_shares(member: Array, cell: IntArray, rows: BoolArray) -> Array:
+    gone, count = (np.bincount(cell[rows], w, GROUND_CELLS**2) for w in (member[rows], np.ones(rows.sum())))
     return np.asarray((gone + 0.5) / (count + 1.0))
 
 
-def group_of(linear: Linear, ground: Ground, group: Group, found: Fit) -> Found:
+def group_of(linear: Linear, ground: GroundMotion, group: Group, found: MixtureFit) -> MovingGroup:
     """Return the motion of a group by a fit with it."""
     rows = np.zeros(len(group.cell), dtype=bool)
     for tracks in linear.tracks:
@@ -166,11 +166,11 @@ def group_of(linear: Linear, ground: Ground, group: Group, found: Fit) -> Found:
         between = np.linalg.norm(flat[:, None] - flat, axis=2)
         i, j = np.unravel_index(int(between.argmax()), between.shape)
         apart = between, (int(seen[min(i, j)]), int(seen[max(i, j)]))
-    shares = _shares(found.moving, group.cell, rows)
-    return Found(float(apart[0].max()), apart[1], member, shares, ground, found)
+    shares = _cell_shares(found.moving, group.cell, rows)
+    return MovingGroup(float(apart[0].max()), apart[1], member, shares, ground, found)
 
 
-def members(problem: Problem, params: Array, one: Found, block: Block) -> BoolArray:
+def members(problem: Problem, params: Array, one: MovingGroup, block: Block) -> BoolArray:
     """Return the held-out observations (K,) that belong to a group found at cameras of unknowns (N, q)."""
     if not len(block.view):
         return np.zeros(0, dtype=bool)
@@ -178,8 +178,8 @@ def members(problem: Problem, params: Array, one: Found, block: Block) -> BoolAr
     state = State(params, points)
     low, high = block.alt_range
     linear = linearise(part, state, np.ones(len(block.view), dtype=bool), block.sigma, high - low)
-    ground = Ground.of(part, state, one.ground)
-    by_move, cell = ground.by_moves(block.view, len(block.views)), ground.cells(CELLS)
+    ground = GroundMotion.of(part, state, one.ground)
+    by_move, cell = ground.by_moves(block.view, len(block.views)), ground.cells(GROUND_CELLS)
     group = Group(by_move, np.full(by_move.shape[1], TIMES), cell, one.shares[cell])
     found = replace(one.fit, extra=np.zeros(0))
     none = np.zeros((2, 0, len(block.view)))

@@ -23,7 +23,7 @@ from barpc.ba.solving.normal import solve_transposed
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array, enu_basis
-from barpc.base.usual import CHANCE, CRITICAL, KEPT, RIDGE
+from barpc.base.statistics import CHANCE, CRITICAL, KEPT, RIDGE
 from barpc.scene import BoolArray, GroundPoints, IntArray
 
 CHECKED = 0.1  # redundancy of a point that something beside the cameras' priors tells about

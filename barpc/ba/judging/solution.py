@@ -7,29 +7,29 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from barpc.ba.estimated.priors import DRIFT_SIGMA, FLOOR
-from barpc.ba.estimated.projected import Projected
-from barpc.ba.held.block import MIN_OBSERVATIONS, Block, first_state, make_problem
-from barpc.ba.held.ground import Heights, staying
-from barpc.ba.held.incremental import BlockPrior
-from barpc.ba.held.terrain import Terrain
-from barpc.ba.judging.agreement import LOOSE, Agreement, agreement, offsets_of
+from barpc.ba.constraints.block import MIN_OBSERVATIONS, Block, first_state, make_problem
+from barpc.ba.constraints.ground import PointConstraints, staying
+from barpc.ba.constraints.incremental import BlockPrior
+from barpc.ba.constraints.terrain import Terrain
+from barpc.ba.judging.agreement import UNCONSTRAINED_SIGMA, Agreement, agreement, offsets_of
 from barpc.ba.judging.judge import Finding
 from barpc.ba.judging.snooping import ControlTest, control_test
+from barpc.ba.parameters.priors import DRIFT_SIGMA, NOISE_FLOOR
+from barpc.ba.parameters.projected import Projected
 from barpc.ba.robust.consensus import agreeing
 from barpc.ba.robust.heldout import HeldOut, is_better, measure
-from barpc.ba.robust.rounds import Outcome, Rounds, faintness, revived
-from barpc.ba.robust.smooth import SmoothTest
+from barpc.ba.robust.rounds import Outcome, Rounds, downweighting, retriangulate_rejected
+from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.ba.solving.structure import Structure
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
-from barpc.base.usual import MUCH_NOISE, SURELY
+from barpc.base.statistics import MUCH_NOISE, SURELY
 from barpc.scene import BoolArray
 
-_TREND = MUCH_NOISE * FLOOR  # px: another model is tried
+_TREND = MUCH_NOISE * NOISE_FLOOR  # px: another model is tried
 _SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
 MUCH_BETTER = 0.7  # of the error on tracks that took no part: another model may do much to heights
 CLEARLY = 0.8  # of what is left, that another start or model leaves at most; or of a view's observations, kept at least
@@ -42,7 +42,7 @@ class Solution:
     problem: Problem  # as it was solved last
     state: State  # where it started: delivered cameras, points triangulated with them
     before: Array  # (2, K) residuals there [px]
-    heights: Heights  # what holds points
+    heights: PointConstraints  # what holds points
     outcome: Outcome  # of the rounds
     start: HeldOut  # what the tracks that took no part say before
     after: HeldOut  # and after
@@ -135,7 +135,7 @@ def solve_block(
     """
     problem = make_problem(block, options, centers, prior)
     state, given = first_state(problem, block, options, dem)
-    heights = given.loose(LOOSE) if block.gcps.names else given
+    heights = given.loose(UNCONSTRAINED_SIGMA) if block.gcps.names else given
     start = measure(problem, state.params, outer)
     rounds = Rounds(problem, block, state, heights, block.use)
     before, agreed, free = rounds.residual, None, None
@@ -151,10 +151,10 @@ def solve_block(
         if again.noise < CLEARLY * outcome.noise and again.inlier.sum() > 0.5 * agree.sum():
             outcome = again
     drift, asked = problem.cameras.unknowns.drift, dict[str, SmoothTest]()
-    if options.drift is None and prior is None and drift and outcome.smooth.found(SURELY * FLOOR).any():
+    if options.drift is None and prior is None and drift and outcome.smooth.found(SURELY * NOISE_FLOOR).any():
         bent = make_problem(block, options, problem.cameras.unknowns.center, None, drift + 1)
         ended, weight = outcome.minimum.state, block.use / block.sigma
-        there, _ = revived(problem, ended, outcome.residual, outcome.inlier, weight)
+        there, _ = retriangulate_rejected(problem, ended, outcome.residual, outcome.inlier, weight)
         there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
         tried = Rounds(bent, block, there, heights, outcome.inlier).run()
         if tried.inlier.sum() > 0.5 * outcome.inlier.sum():  # the few left of many agree with anything
@@ -166,7 +166,11 @@ def solve_block(
     _check_inliers(outcome, block)
     first = Solution(problem, state, before, heights, outcome, start, start, None, asked, (), agreed, by_point)
     found = finished(first, problem, block, outer, options, outcome)
-    return found if free is None or not found.heights.has_control else _untorn(found, free, block, outer, options)
+    return (
+        found
+        if free is None or not found.heights.has_control
+        else _without_distorting_control(found, free, block, outer, options)
+    )
 
 
 def _check_inliers(outcome: Outcome, block: Block) -> None:
@@ -179,7 +183,9 @@ def _check_inliers(outcome: Outcome, block: Block) -> None:
         )
 
 
-def _untorn(found: Solution, free: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
+def _without_distorting_control(
+    found: Solution, free: Solution, block: Block, outer: Block, options: AdjustOptions
+) -> Solution:
     """Return the block held by control; as it was `free` of it where tracks that took no part are met worse with it."""
     without = measure(free.problem, free.final.params, outer)
     raised = found.after.whole_rms**2 - without.whole_rms**2
@@ -192,14 +198,14 @@ def _untorn(found: Solution, free: Solution, block: Block, outer: Block, options
     return finished(replace(free, agreed=none), free.problem, block, outer, options, free.outcome)
 
 
-def _with_control(block: Block, heights: Heights, outcome: Outcome) -> tuple[Agreement, Heights]:
+def _with_control(block: Block, heights: PointConstraints, outcome: Outcome) -> tuple[Agreement, PointConstraints]:
     """Return the control points that agree at an outcome that none of them holds, and what holds points."""
     count, first = len(block.gcps.names), block.num_tracks
     mine = (block.point >= first) & (block.point < block.num_known)
     lost = np.isin(np.arange(count), block.point[mine & block.use & ~outcome.inlier] - first)  # by hundreds of sigmas
     told = np.isin(np.arange(count), block.point[mine & outcome.inlier] - first) & ~lost
     covariance = outcome.minimum.covariance(outcome.problem.free)
-    faint = faintness(block, heights.loose(LOOSE))
+    faint = downweighting(block, heights.loose(UNCONSTRAINED_SIGMA))
     found = agreement(offsets_of(covariance, block, outcome.minimum.state.points, faint), told)
     found = replace(found, used=found.used & ~lost)
     kept = heights.control[0].select(found.used[heights.control[0].index - first])
@@ -214,7 +220,7 @@ def finished(
     tested = None
     if found.agreed is not None:
         covariance, points = outcome.minimum.covariance(problem.free), outcome.minimum.state.points
-        faint = faintness(block, found.heights)[block.num_tracks : block.num_known]
+        faint = downweighting(block, found.heights)[block.num_tracks : block.num_known]
         tested = control_test(covariance, points, block.num_tracks, block.gcps, found.agreed, faint)
     after = measure(problem, outcome.minimum.state.params, outer)
     return replace(found, problem=problem, outcome=outcome, after=after, tested=tested)

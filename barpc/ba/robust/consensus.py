@@ -14,10 +14,10 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.special import expit
 
-from barpc.ba.estimated.projected import Projected
+from barpc.ba.parameters.projected import Projected
 from barpc.ba.solving.structure import Structure
 from barpc.base.geodesy import Array, parts
-from barpc.base.usual import FEW, ITERATIONS, LEVEL, MANY, OUTLIER, SLIGHT, STEPS, SURE, TRIALS
+from barpc.base.statistics import FEW, ITERATIONS, LEVEL, MANY, OUTLIER, SLIGHT, STEPS, SURE, TRIALS
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.curve import cross
 

@@ -14,18 +14,18 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import expit, gammaln
 
-from barpc.ba.evidence.mixture import NEAR_LIMIT, WRONG
-from barpc.ba.held.block import Block
+from barpc.ba.constraints.block import Block
+from barpc.ba.evidence.mixture import NEAR_LIMIT, WRONG_SHARE_PRIOR
 from barpc.ba.robust.weights import Observations, geman_mcclure
 from barpc.ba.solving.problem import Problem
 from barpc.base.errors import InputError, listed
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis
-from barpc.base.usual import BEST, CRITICAL, FEWEST, ITERATIONS, MANY, SLIGHT, STEPS, SURELY
+from barpc.base.statistics import BEST, CRITICAL, FEWEST, ITERATIONS, MANY, SLIGHT, STEPS, SURELY
 from barpc.scene import BoolArray, GroundPoints, IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import triangulate
 
-_SHARE = 0.1
+_CHECK_SHARE = 0.1
 _STEPS_A_PIXEL = 4.0  # so coarse that rounding draws hardly another track
 _NOTHING = float(np.finfo(np.float64).tiny)  # of a variance: residuals may be exactly zero
 
@@ -67,7 +67,7 @@ def keep_out(block: Block) -> BoolArray:
     drawn = np.zeros(block.num_points, dtype=np.uint64)
     col, row = np.rint(block.xy * _STEPS_A_PIXEL).astype(np.int64).astype(np.uint64)
     np.add.at(drawn, block.point, _scrambled(col * np.uint64(0x9E3779B97F4A7C15) + row))
-    chosen = _scrambled(drawn) < np.uint64(_SHARE * 2.0**64)
+    chosen = _scrambled(drawn) < np.uint64(_CHECK_SHARE * 2.0**64)
     chosen &= (count >= 2) & (needed == 0) & (np.arange(block.num_points) < block.num_tracks)
     return chosen[block.point]
 
@@ -137,7 +137,10 @@ def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
     low = ordered[starts + np.floor(at).astype(np.int64)]
     middle = low + (at % 1.0) * (ordered[starts + np.ceil(at).astype(np.int64)] - low)
     far = np.maximum(ordered[starts + count.astype(np.int64) - 1], _NOTHING)
-    variance, wrong = np.maximum(middle / BEST, _NOTHING), np.full(len(count), WRONG[0] / WRONG[1])
+    variance, wrong = (
+        np.maximum(middle / BEST, _NOTHING),
+        np.full(len(count), WRONG_SHARE_PRIOR[0] / WRONG_SHARE_PRIOR[1]),
+    )
     farthest, constant = half * np.log(half * far[view]) - gammaln(half + 1.0), half * squared
     moves = np.ones(len(count), dtype=bool)  # of a view that stands nothing changes any more
     for _ in range(ITERATIONS):
@@ -147,7 +150,7 @@ def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
         found = np.maximum(squares / np.maximum(of_right, 1e-300), _NOTHING)
         stands = np.abs(found - variance) < SLIGHT * variance
         variance = np.where(moves, found, variance)
-        wrong = np.where(moves, (WRONG[0] + count - of_right) / (WRONG[1] + count), wrong)
+        wrong = np.where(moves, (WRONG_SHARE_PRIOR[0] + count - of_right) / (WRONG_SHARE_PRIOR[1] + count), wrong)
         moves &= ~stands
         if not moves.any():
             break

@@ -7,18 +7,18 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from barpc.ba.estimated.projected import Projected
+from barpc.ba.constraints.block import Block
+from barpc.ba.constraints.ground import PointConstraints
 from barpc.ba.evidence.scan import Interval
-from barpc.ba.held.block import Block
-from barpc.ba.held.ground import Heights
-from barpc.ba.robust.smooth import TERMS, Fit, Resemblance, Smooth, SmoothTest
+from barpc.ba.parameters.projected import Projected
+from barpc.ba.robust.systematic_residuals import TERMS, Resemblance, Smooth, SmoothFit, SmoothTest
 from barpc.ba.robust.variances import SAME_PRIOR, PriorTest, Variances, same_prior
 from barpc.ba.robust.weights import LOSSES, MEDIAN, Observations
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
-from barpc.base.usual import (
+from barpc.base.statistics import (
     BACKFITTING,
     BEST,
     CRITICAL,
@@ -35,10 +35,10 @@ from barpc.base.usual import (
 )
 from barpc.scene import BoolArray
 
-_LOG = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
 _SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each view by itself
-_LEAST_NOISE = 0.5  # of the stated sigmas, while outliers are about
+_MIN_NOISE_RATIO = 0.5  # of the stated sigmas, while outliers are about
 _MANY_CUT = 0.01  # of the observations: more are looked at again
 
 
@@ -74,7 +74,7 @@ class Rounds:
         problem: Problem,
         block: Block,
         state: State,
-        heights: Heights,
+        heights: PointConstraints,
         use: BoolArray,
         known: Outcome | None = None,
     ) -> None:
@@ -85,7 +85,7 @@ class Rounds:
         self.robust = options.loss != "linear"
         is_tie = block.point < block.num_tracks
         of_reference = block.point >= block.num_known
-        faint = faintness(block, heights)[block.point]
+        faint = downweighting(block, heights)[block.point]
         sigma = block.sigma * faint
         earlier = problem.joint_prior
         told = 0.0 if earlier is None else earlier.told
@@ -137,7 +137,9 @@ class Rounds:
         many_cut = self.use.sum() < (1.0 - _MANY_CUT) * self.everything.sum()
         if self.robust and self.passes and many_cut:
             weight = self.everything / self.observations.sigma
-            self.state, self.residual = revived(self.problem, self.state, self.residual, self.use, weight)
+            self.state, self.residual = retriangulate_rejected(
+                self.problem, self.state, self.residual, self.use, weight
+            )
             self.scatter = self.projected = None
         self.problem = self.heights.hold(self.problem, self.state.points)
         self.passes += 1
@@ -146,7 +148,7 @@ class Rounds:
         prior, tested = self.variances.learnt(self.problem, found, self.learnt)
         smooth = self._estimate_noise()
         numbers = self.passes, self.use.sum(), len(self.use), self.noise
-        _LOG.info("pass %d: %d of %d observations, noise %.3f", *numbers)
+        logger.info("pass %d: %d of %d observations, noise %.3f", *numbers)
         again = self.passes > 1 or self.goes_on
         same = again and int((self.use != was_in_use).sum()) <= SLIGHT * len(self.use)
         settled = self._weights_stand()
@@ -224,7 +226,7 @@ class Rounds:
         """Return the projection of the state with derivatives by the points at least."""
         return self.projected or self.problem.project_points(self.state.params, self.state.points)
 
-    def _scatter(self, fit: Fit | None = None) -> Array:
+    def _scatter(self, fit: SmoothFit | None = None) -> Array:
         """Return the residuals (2, K) [px] without the smooth parts of all views that see a point.
 
         A point shares what one of its views is wrong by among all of them, and relief moves the rows of the views
@@ -235,13 +237,13 @@ class Rounds:
         size = float(np.sqrt((counted * (part / sigma) ** 2).sum() / max(counted.sum(), 1.0)))
         if size < _SMOOTH_SEEN:
             return residual - part
-        settled = self.problem.settling(self._by_points(), counted**0.5 / sigma)
+        settled = self.problem.projected_off_points(self._by_points(), counted**0.5 / sigma)
         for _ in range(BACKFITTING):
             part += self.smooth.part(settled(residual - part), counted)
         return settled(residual - part)
 
 
-def faintness(block: Block, heights: Heights) -> Array:
+def downweighting(block: Block, heights: PointConstraints) -> Array:
     """Return the factors (P,) on the noise of a point's observations: a control point that holds nothing ties
     nothing.
 
@@ -277,26 +279,28 @@ def _robust(
     s = observations.squared(residual, counted)
     for _ in range(ITERATIONS):
         least = float(np.sqrt(np.quantile(s[use], BEST) / BEST)) if use.any() else 1.0
-        noise = max(float(np.sqrt(_median(s, counted) / MEDIAN)), least, _LEAST_NOISE)
+        noise = max(float(np.sqrt(_weighted_median(s, counted) / MEDIAN)), least, _MIN_NOISE_RATIO)
         if scale <= 3.6 * noise:
             break
         clean = noise < MUCH_NOISE and float((s[use] > (OUTLIER * noise) ** 2).mean()) < SLIGHT
         scale = SURELY * noise if np.isinf(scale) or clean else max(SURELY * noise, SHRINK * scale)
-        counted = _counted(observations, use, s, loss(s / scale**2)[1])
+        counted = _observation_weights(observations, use, s, loss(s / scale**2)[1])
         state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)
         residual, projected = problem.prepare(state.params, state.points)
         near = scale <= SURELY / SHRINK * noise  # a step from the end
         s = observations.squared(residual - smooth.part(residual, counted) if near else residual, counted)
-        counted = _counted(observations, use, s, loss(s / scale**2)[1])
+        counted = _observation_weights(observations, use, s, loss(s / scale**2)[1])
     return state, residual, counted, noise, projected
 
 
-def _counted(observations: Observations, use: BoolArray, squared: Array, by_loss: Array) -> Array:
+def _observation_weights(observations: Observations, use: BoolArray, squared: Array, by_loss: Array) -> Array:
     """Return the weight of each observation (K,)."""
     return np.where(observations.is_spared(squared), use.astype(np.float64), use * by_loss)
 
 
-def revived(problem: Problem, state: State, residual: Array, use: BoolArray, weight: Array) -> tuple[State, Array]:
+def retriangulate_rejected(
+    problem: Problem, state: State, residual: Array, use: BoolArray, weight: Array
+) -> tuple[State, Array]:
     """Return the state with wholly cut tracks triangulated anew by the present cameras, and their residuals
     (2, K).
 
@@ -312,7 +316,7 @@ def revived(problem: Problem, state: State, residual: Array, use: BoolArray, wei
     return replace(state, points=points), np.where(dead[structure.point], again, residual)
 
 
-def _median(values: Array, weights: Array) -> float:
+def _weighted_median(values: Array, weights: Array) -> float:
     """Return the median of `values`, each counted as often as its weight says."""
     order = np.argsort(values)
     total = np.cumsum(weights[order])

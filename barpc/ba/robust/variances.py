@@ -16,23 +16,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc, gammaincinv
 
-from barpc.ba.estimated.priors import FLOOR, CameraPrior, states_accuracy
-from barpc.ba.estimated.unknowns import Unknowns
+from barpc.ba.parameters.priors import NOISE_FLOOR, CameraPrior, states_accuracy
+from barpc.ba.parameters.unknowns import Unknowns
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
-from barpc.base.usual import CHANCE, GROSS, ITERATIONS, KEPT, LEVEL, SMALL, STANDS, STATED, SURE, TIMES
+from barpc.base.statistics import CHANCE, GROSS, ITERATIONS, KEPT, LEVEL, SMALL, STANDS, STATED_FREEDOM, SURE, TIMES
 from barpc.scene import BoolArray, IntArray, View
 
-_LOG = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
 _LIKELIER = -np.log(LEVEL)  # but one odd view is named where all being worse than stated is as improbable beside it
-_MOVING = 0.01  # of a rotation, as drift: the centre it turns about flies some km while an image is taken
+_CENTRE_MOTION_SHARE = 0.01  # of a rotation, as drift: the centre it turns about flies some km while an image is taken
 _LOW = 0.1  # then as much is let be as leaves what is seen this likely: a prior too narrow bends all heights alike
 SAME_PRIOR = 0.2  # change of a standard deviation, as a logarithm, below which a block is not solved again
-_LEAST = 0.5  # degrees of freedom below which nothing is said
+_MIN_FREEDOM = 0.5  # degrees of freedom below which nothing is said
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +215,7 @@ class Variances:
         try:
             return self._learnt(problem, minimum, widened, exact)
         except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
-            _LOG.info("the priors of the cameras are left as they are: %s", error)
+            logger.info("the priors of the cameras are left as they are: %s", error)
             n = len(minimum.state.params)
             nothing = PriorTest(
                 float("nan"), 0.0, np.ones(n), np.zeros(n, dtype=bool), (), shown=self.shown, failed=True
@@ -235,7 +235,7 @@ class Variances:
             _, params, covariance = around.under(prior)
         known = self._known(covariance, prior if around.small else now, exact)
         total, freedom = (float(part.sum()) for part in self._squares(params, known))
-        ratio = total / freedom if freedom > _LEAST else float("nan")
+        ratio = total / freedom if freedom > _MIN_FREEDOM else float("nan")
         shared = self._shared(params, known)
         # constants of a large block that were widened take from the drift, which need not stand again
         stands = not self.learn_drift or (not around.small and widened)
@@ -274,7 +274,7 @@ class Variances:
         if self.stated is None or not self.learn_constant:
             return wider
         (squares, freedom), (count, _) = self._of_stated(params, known)
-        if freedom > _LEAST:
+        if freedom > _MIN_FREEDOM:
             alone = min(float(squares / (2.0 * gammaincinv(0.5 * freedom, CHANCE))), 1.0)
             wider[self.stated] = np.sqrt(max(alone + (1.0 - alone) * count * 3.0 / self.constants, 1.0))
         return wider
@@ -320,8 +320,8 @@ class Variances:
             rows = first + np.flatnonzero(bands == band)
             learnt = np.isfinite(sigma[:, rows[0]])  # those of an earlier block are in its matrix
             squares, freedom = (learnt * part.sum(axis=1) for part in (params[:, rows] ** 2, known[:, rows]))
-            common = (FLOOR**2 + squares.sum()) / (1.0 + freedom.sum())
-            size = np.sqrt((STATED * common + squares) / (STATED + freedom))
+            common = (NOISE_FLOOR**2 + squares.sum()) / (1.0 + freedom.sum())
+            size = np.sqrt((STATED_FREEDOM * common + squares) / (STATED_FREEDOM + freedom))
             out[:, rows] = np.where(learnt, size, np.inf)[:, None]
         return out
 
@@ -344,7 +344,7 @@ class Variances:
             part = self._drift_part(degree)
             sigma[:, part] *= factor
             if degree == 0 and self.learn_drift:
-                sigma[:, part] = np.hypot(sigma[:, part], _MOVING * sigma[:, :3])
+                sigma[:, part] = np.hypot(sigma[:, part], _CENTRE_MOTION_SHARE * sigma[:, :3])
         return CameraPrior(self.given.mean, sigma)
 
     def _known(self, covariance: Covariance, prior: CameraPrior, exact: bool = True) -> Array:
@@ -370,7 +370,7 @@ class Variances:
         squares, free = self._before(0)
         total, freedom = (float(part.sum()) for part in self._squares(params, known, scale))
         total, freedom = total + squares / float(np.min(scale)) ** 2, freedom + free
-        return freedom > _LEAST and float(chdtrc(freedom, total)) < LEVEL
+        return freedom > _MIN_FREEDOM and float(chdtrc(freedom, total)) < LEVEL
 
     def _widened(self, around: _Around, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
         """Return the factors (N,) by which each view's prior is widened, and the views that are odd."""
@@ -390,7 +390,7 @@ class Variances:
     def _common(self, total: Array, freedom: Array) -> float:
         """Return the factor by which the priors of views are widened together, by their squares and freedoms (n,)."""
         squares, free = self._before(0) + np.array([total.sum(), freedom.sum()])
-        factor = max((STATED + squares) / (STATED + free), 1.0)
+        factor = max((STATED_FREEDOM + squares) / (STATED_FREEDOM + free), 1.0)
         if self.cautious:
             factor = max(factor, _possible(squares, free))
         return float(np.sqrt(factor))
@@ -419,7 +419,7 @@ class Variances:
             tops &= evidence - known.evidence >= (gains[-1] if rival is not None and not count else max(SURE, price))
             if not tops.any():
                 break
-            chosen_near = _largest(np.where(tops, evidence, -np.inf), pairs)
+            chosen_near = _neighbour_maximum(np.where(tops, evidence, -np.inf), pairs)
             as_good = (chosen_near > -np.inf) & (evidence > chosen_near - SURE)  # explain as well as one that is
             odd, scale = odd | as_good, np.where(as_good, np.maximum(size, scale), scale)
             chosen[tops] = size[tops]
@@ -433,7 +433,7 @@ class Variances:
         seen = 1.0 - variance / prior.sigma**2
         seen = np.where(known.free & np.isfinite(prior.sigma), seen.clip(0.0, 1.0), 0.0)
         total, freedom = self._squares(offset + self.given.mean, seen)
-        size = np.maximum(np.sqrt((STATED + total) / (STATED + freedom)), scale)
+        size = np.maximum(np.sqrt((STATED_FREEDOM + total) / (STATED_FREEDOM + freedom)), scale)
         return known.alone(self._prior(size, wide).sigma)[0], size
 
     def _drift(self, params: Array, known: Array) -> Array:
@@ -444,13 +444,13 @@ class Variances:
         for degree in range(self._degrees):
             own = self._squares(params, known, part=self._drift_part(degree))
             total, freedom = self._before(3 + degree) + np.array([x.sum() for x in own])
-            factors[degree] = (STATED + total) / (STATED + freedom)
-            if careful and freedom > _LEAST and chdtrc(freedom, total) < CHANCE:
+            factors[degree] = (STATED_FREEDOM + total) / (STATED_FREEDOM + freedom)
+            if careful and freedom > _MIN_FREEDOM and chdtrc(freedom, total) < CHANCE:
                 factors[degree] = max(factors[degree], _possible(total, freedom))
         return np.sqrt(factors)
 
 
-def _largest(values: Array, pairs: IntArray) -> Array:
+def _neighbour_maximum(values: Array, pairs: IntArray) -> Array:
     """Return the largest (N,) of the values of every view and of those that it shares points with."""
     i, j = pairs.T
     out = values.copy()
@@ -462,7 +462,7 @@ def _largest(values: Array, pairs: IntArray) -> Array:
 def _first_of_largest(values: Array, pairs: IntArray) -> BoolArray:
     """Return whether every view (N,) has the largest value of those that it shares points with; the first of equals."""
     i, j = pairs.T
-    tops: BoolArray = values == _largest(values, pairs)
+    tops: BoolArray = values == _neighbour_maximum(values, pairs)
     tops[j[tops[i] & tops[j]]] = False
     return tops
 

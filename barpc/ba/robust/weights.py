@@ -11,11 +11,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from barpc.ba.held.ground import ALIKE
-from barpc.ba.robust.smooth import SPLINES
+from barpc.ba.constraints.ground import MAX_INDEPENDENT_ERRORS
+from barpc.ba.robust.systematic_residuals import SPLINES
 from barpc.ba.solving.problem import Problem
 from barpc.base.geodesy import Array
-from barpc.base.usual import FEWEST, GROSS, OUTLIER
+from barpc.base.statistics import FEWEST, GROSS, OUTLIER
 from barpc.scene import BoolArray
 
 MEDIAN = 0.55  # of |r|^2 over its expectation: chi-square with 1 (two views) to 2 (many) degrees of freedom
@@ -132,7 +132,7 @@ class Observations:
         floor = self.noise_floor**2 / self.stretches + np.minimum(misfit, _LARGEST_MISFIT) ** 2 / SPLINES
         cap = 1.0 / np.sqrt(np.maximum(information * floor, 1.0))
         count = self.structure.sum_views((use & self.of_reference).astype(np.float64)[None])[:, 0]
-        alike = np.sqrt(np.minimum(ALIKE / np.maximum(count, 1.0), 1.0))
+        alike = np.sqrt(np.minimum(MAX_INDEPENDENT_ERRORS / np.maximum(count, 1.0), 1.0))
         weight = np.where(self.of_reference, use / self.sigma * alike[self.structure.view], weight)
         return np.where(self.is_tie, weight * cap[self.structure.view], weight)
 

@@ -11,10 +11,10 @@ import scipy.linalg as la
 from barpc.ba.solving.linear import Blocks, Factor
 from barpc.ba.solving.normal import Reduced, solve_transposed
 from barpc.base.geodesy import Array, parts
-from barpc.base.usual import FEW, KEPT
+from barpc.base.statistics import FEW, KEPT
 from barpc.scene import BoolArray, IntArray
 
-_LARGE = 900  # unknowns up to which the whole matrix is kept, and known exactly
+_DENSE_UNKNOWNS = 900  # unknowns up to which the whole matrix is kept, and known exactly
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Covariance:
     @property
     def is_large(self) -> bool:
         """Whether exact variances take seconds: as long as two factorisations."""
-        return len(self.free) > _LARGE
+        return len(self.free) > _DENSE_UNKNOWNS
 
     def variances(self) -> Array:
         """Return the variances (N, q) of all unknowns; zero for fixed ones."""

@@ -82,7 +82,7 @@ class Blocks:
         return at if at < stop and self.pair_view[at, 1] == j else None
 
 
-class Store:
+class ArrayStore:
     """Arrays in the order they came; in a temporary file once they are more than so many bytes."""
 
     def __init__(self, in_memory: float | None = None) -> None:
@@ -122,7 +122,7 @@ class Cholesky:
     blocks: Blocks
     order: Dissection
     # of every front L of its pivots (p q, p q), above whose diagonal nothing is meant, then of its border (b q, p q)
-    parts: Store = field(default_factory=Store)
+    parts: ArrayStore = field(default_factory=ArrayStore)
 
     @property
     def _size(self) -> int:
@@ -316,7 +316,7 @@ def factorize(matrix: Array, damping: float = 0.0) -> Factor:
         The matrix is not finite.
     """
     diagonal = matrix.diagonal()
-    _check(diagonal)
+    _require_finite(diagonal)
     if not len(diagonal):
         return Factor(lambda b: b, "none", whole_inverse=lambda: matrix, log_determinant=0.0)
     damped = matrix + np.diag(damping * diagonal) if damping else matrix
@@ -337,14 +337,14 @@ def factorize(matrix: Array, damping: float = 0.0) -> Factor:
 
 def factorize_blocks(matrix: Blocks, order: Dissection, damping: float = 0.0, less: Array | None = None) -> Factor:
     """Factorise S, of the views in an order of elimination, less B^T B of a few rows `less` (m, n)."""
-    _check(matrix.diagonal)
+    _require_finite(matrix.diagonal)
     cholesky = Cholesky(matrix, order)
     volume = cholesky.factorize(damping)
     factor = Factor(cholesky.solve, "multifrontal", cholesky.inverse, log_determinant=volume)
     return factor if less is None else _updated(factor, less, order)
 
 
-def _check(diagonal: Array) -> None:
+def _require_finite(diagonal: Array) -> None:
     if not np.isfinite(diagonal).all():
         raise AdjustError("the normal equations are not finite: a camera cannot be evaluated at its tie points")
 

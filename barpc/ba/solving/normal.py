@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 import scipy.linalg as la
 
-from barpc.ba.estimated.priors import PointPrior
+from barpc.ba.parameters.priors import PointPrior
 from barpc.ba.solving.linear import Blocks, Factor, Matrix, factorize, factorize_blocks
 from barpc.ba.solving.structure import LEAF, Structure
 from barpc.base.geodesy import CHUNK, Array, parts
@@ -160,7 +160,7 @@ def reduce_normal(
     gain = float((half**2).sum())
     common = None
     if point_prior is not None and point_prior.common.shape[2]:
-        common = _common(structure, point_prior, lower, half, cross)
+        common = _common_errors(structure, point_prior, lower, half, cross)
         slope_all = slope_all - common.by_camera.T @ common.half
         gain += float(common.half @ common.half)
         if isinstance(matrix, np.ndarray):
@@ -168,7 +168,7 @@ def reduce_normal(
     return Reduced(structure, matrix, slope_all, float((residual**2).sum()), gain, lower, half.T, cross, common)
 
 
-def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, cross: Array) -> Common:
+def _common_errors(structure: Structure, prior: PointPrior, lower: Array, half: Array, cross: Array) -> Common:
     """Return the common errors of the points of a prior; their gradient vanishes before the points move, as
     they are the best.
     """

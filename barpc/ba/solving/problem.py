@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from barpc.ba.estimated.priors import CameraPrior, JointPrior, PointPrior
-from barpc.ba.estimated.projected import Cameras, Projected
+from barpc.ba.parameters.priors import CameraPrior, JointPrior, PointPrior
+from barpc.ba.parameters.projected import Cameras, Projected
 from barpc.ba.solving.normal import (
     TRIANGLE,
     Reduced,
@@ -21,7 +21,7 @@ from barpc.ba.solving.normal import (
 )
 from barpc.ba.solving.structure import Structure
 from barpc.base.geodesy import Array
-from barpc.base.usual import KEPT
+from barpc.base.statistics import KEPT
 from barpc.scene import BoolArray
 
 
@@ -111,7 +111,7 @@ class Problem:
         step = solve_transposed(lower, solve_lower(lower, sums[6:] + gradient))
         return points - step.T
 
-    def settling(self, projected: Projected, weight: Array) -> Callable[[Array], Array]:
+    def projected_off_points(self, projected: Projected, weight: Array) -> Callable[[Array], Array]:
         """Return a function that takes residuals (2, K) [px] to those after the points have settled, to first order."""
         structure, by_point = self.structure, projected.by_point
         sums = structure.sum_points(point_products(by_point * weight, np.zeros_like(projected.image))[:6])

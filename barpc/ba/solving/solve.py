@@ -19,20 +19,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.linalg as la
 
-from barpc.ba.estimated.projected import Projected
+from barpc.ba.parameters.projected import Projected
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.linear import Factor
 from barpc.ba.solving.normal import Reduced
 from barpc.ba.solving.problem import Problem
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
-from barpc.base.usual import ITERATIONS, ROUNDING, SLIGHT
+from barpc.base.statistics import ITERATIONS, ROUNDING, SLIGHT
 from barpc.scene import BoolArray
 
-_LOG = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
 TOLERANCE = 1e-6  # a solve ends when a step would lower the cost by less than this fraction
-SCIPY_UNKNOWNS = 200  # 22 views of nine: beyond, the dense products of `_Compressed` take over a tenth of an adjustment
+SCIPY_UNKNOWNS = (
+    200  # 22 views of nine: beyond, the dense products of `_WhitenedProblem` take over a tenth of an adjustment
+)
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ def minimise(
     """Minimise at fixed weights (K,) [1/px] from a state near the minimum.
 
     The step that is expected to gain less than `tolerance` of the cost is taken and is the last, and so is one
-    that is expected to leave a thousandth of it (see `_settled`). `solver` is "scipy", "sparse" or "auto"
+    that is expected to leave a thousandth of it (see `_has_converged`). `solver` is "scipy", "sparse" or "auto"
     (see the head of this module). `projected` is `Problem.linearise` of the state, and is used up.
 
     Raises
@@ -108,16 +110,16 @@ def minimise(
         try:
             result = _scipy(problem, state, weight, tolerance, projected)
         except np.linalg.LinAlgError as error:  # its SVD may fail on a finite matrix
-            _LOG.warning("least_squares failed (%s): going on by Levenberg-Marquardt", error)
+            logger.warning("least_squares failed (%s): going on by Levenberg-Marquardt", error)
             solver, projected = "sparse", None
     if result is None:
         result = _levenberg_marquardt(problem, state, weight, tolerance, projected)
     seconds = time.process_time() - start
-    _LOG.info("%s: %d unknowns, cost %.6g, %.2f s", solver, unknowns, result.state.cost, seconds)
+    logger.info("%s: %d unknowns, cost %.6g, %.2f s", solver, unknowns, result.state.cost, seconds)
     return result
 
 
-def _settled(gain: float, before: float, cost: float, tolerance: float) -> bool:
+def _has_converged(gain: float, before: float, cost: float, tolerance: float) -> bool:
     """Return whether a step that should gain `gain`, after one that should have gained `before`, is the last.
 
     The gains shrink at least in the proportion of the last two: what the step leaves is gain^2 / before. Of what is met
@@ -140,7 +142,7 @@ def gauss_newton(problem: Problem, state: State, weight: Array, projected: Proje
     """Take one undamped Gauss-Newton step, for rounds whose weights change anyway; `projected` as in `minimise`."""
     reduced = problem.reduce(state.params, state.points, weight, projected)
     step, gain, _ = camera_step(problem, reduced)
-    return state.moved(step, reduced, max(_finite(reduced.cost) - gain, 0.0))
+    return state.moved(step, reduced, max(_finite_cost(reduced.cost) - gain, 0.0))
 
 
 def camera_step(problem: Problem, reduced: Reduced, damping: float = 0.0) -> tuple[Array, float, Factor]:
@@ -161,7 +163,7 @@ def _levenberg_marquardt(
     """Return Gauss-Newton steps, damped only when one fails."""
     damping, before = 0.0, np.inf
     reduced = problem.reduce(state.params, state.points, weight, projected)
-    state = replace(state, cost=_finite(reduced.cost), history=(*state.history, reduced.cost))
+    state = replace(state, cost=_finite_cost(reduced.cost), history=(*state.history, reduced.cost))
     for _ in range(ITERATIONS):
         try:
             step, gain, factor = camera_step(problem, reduced, damping)
@@ -169,7 +171,7 @@ def _levenberg_marquardt(
             damping = max(10.0 * damping, 1e-8)
             continue
         ahead = state.moved(step, reduced, max(state.cost - gain, 0.0))
-        if _settled(gain, before, state.cost, tolerance):
+        if _has_converged(gain, before, state.cost, tolerance):
             status = _status(state, "the next step gains too little")
             return Minimum(ahead, reduced, None if damping else factor, status)
         residual, projected = problem.prepare(ahead.params, ahead.points)
@@ -198,7 +200,7 @@ def _status(state: State, reason: str) -> str:
     return f"sparse Levenberg-Marquardt, {len(state.history)} evaluations in all: {reason}"
 
 
-class _Compressed:
+class _WhitenedProblem:
     """The problem as scipy sees it, in unknowns x = U0 p whitened by the first linearisation.
 
     In them the matrix is nearly the identity: the gradient's size is what a step would gain.
@@ -207,7 +209,7 @@ class _Compressed:
     def __init__(self, problem: Problem, state: State, weight: Array, projected: Projected | None) -> None:
         self.problem, self.weight = problem, weight
         self.reduced = problem.reduce(state.params, state.points, weight, projected)
-        cost = _finite(self.reduced.cost)
+        cost = _finite_cost(self.reduced.cost)
         self.state = replace(state, cost=cost, history=(*state.history, cost))
         self.start = state.params
         self.upper0 = la.cholesky(self.reduced.plain(self.problem.free), check_finite=False)
@@ -249,7 +251,7 @@ class _Compressed:
 def _scipy(problem: Problem, state: State, weight: Array, tolerance: float, projected: Projected | None) -> Minimum:
     from scipy.optimize import least_squares  # a twentieth of a second, which large blocks do not need
 
-    compressed = _Compressed(problem, state, weight, projected)
+    compressed = _WhitenedProblem(problem, state, weight, projected)
     found = least_squares(
         compressed.residual,
         np.zeros(len(compressed.whitened)),
@@ -264,12 +266,12 @@ def _scipy(problem: Problem, state: State, weight: Array, tolerance: float, proj
         max_nfev=ITERATIONS,
     )
     compressed.at(found.x)
-    _finite(compressed.state.cost)
+    _finite_cost(compressed.state.cost)
     status = f"scipy least_squares, {found.nfev} evaluations: {found.message.rstrip('.')}"
     return Minimum(compressed.state, compressed.reduced, status=status, settled=bool(found.success))
 
 
-def _finite(cost: float) -> float:
+def _finite_cost(cost: float) -> float:
     if not np.isfinite(cost):
         raise AdjustError("the cost is not finite: a camera cannot be evaluated at its tie points")
     return cost

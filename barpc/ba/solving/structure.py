@@ -51,7 +51,7 @@ def dissect(pairs: IntArray, place: Array, use: BoolArray, last: IntArray | None
     graph = sp.csr_array((np.ones(len(ties[0]), dtype=np.int8), ties), shape=(n, n))
     pieces: list[IntArray] = []
     last = np.zeros(0, dtype=np.int64) if last is None else last
-    _cut(graph, np.nan_to_num(place), np.setdiff1d(np.flatnonzero(use), last), pieces)
+    _dissect(graph, np.nan_to_num(place), np.setdiff1d(np.flatnonzero(use), last), pieces)
     pieces += [last] if len(last) else []
     rank, owner, at = np.full(n, -1), np.full(n, -1), 0
     for number, piece in enumerate(pieces):
@@ -76,12 +76,12 @@ def _fronts(graph: sp.csr_array, pieces: list[IntArray], rank: IntArray, owner: 
     return fronts
 
 
-def _cut(graph: sp.csr_array, place: Array, views: IntArray, pieces: list[IntArray]) -> None:
+def _dissect(graph: sp.csr_array, place: Array, views: IntArray, pieces: list[IntArray]) -> None:
     """Append the views (n,) piece by piece: one side, the other, what parts them."""
     waiting = [(views, False)]
     while waiting:
         piece, whole = waiting.pop()
-        parted = None if whole or len(piece) <= LEAF else _part(graph, place, piece)
+        parted = None if whole or len(piece) <= LEAF else _separator(graph, place, piece)
         if parted is not None:
             near, far, between = parted
             waiting += [(between, True), (far, False), (near, False)]
@@ -89,7 +89,7 @@ def _cut(graph: sp.csr_array, place: Array, views: IntArray, pieces: list[IntArr
             pieces.append(piece)
 
 
-def _part(graph: sp.csr_array, place: Array, views: IntArray) -> tuple[IntArray, IntArray, IntArray] | None:
+def _separator(graph: sp.csr_array, place: Array, views: IntArray) -> tuple[IntArray, IntArray, IntArray] | None:
     """Return two sides of the views and the fewest between them; None where every cut leaves a side empty."""
     own = graph[views][:, views]
     at = place[views]
@@ -239,7 +239,7 @@ def make_structure(
     """Return the structure of observations (K,) that are already sorted by view; all views `joined` are pairs, too."""
     bounds = np.searchsorted(view, np.arange(num_views + 1))
     by_point, point_bounds = counting_sort(point, num_points)
-    first, second = _pairs(by_point, point_bounds)
+    first, second = _observation_pairs(by_point, point_bounds)
     order, _ = counting_sort(view[second], num_views)
     order = order[counting_sort(view[first[order]], num_views)[0]]
     first, second = first[order], second[order]
@@ -277,7 +277,7 @@ def counting_sort(key: IntArray, size: int) -> tuple[IntArray, IntArray]:
     return order, np.append(0, np.cumsum(np.bincount(key, minlength=size)))
 
 
-def _pairs(by_point: IntArray, starts: IntArray) -> tuple[IntArray, IntArray]:
+def _observation_pairs(by_point: IntArray, starts: IntArray) -> tuple[IntArray, IntArray]:
     """Return all pairs of observations of each point; views ascend within a point, so i < j in every pair."""
     length = np.diff(starts)
     first, second = [], []

@@ -20,15 +20,15 @@ from typing import Any
 
 from barpc.base.errors import ImageError
 
-HOST = re.compile(r"(?:(?:https?|s3|gs|az)://)?(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:]+\])(?::\d{1,5})?")
+HOST_PATTERN = re.compile(r"(?:(?:https?|s3|gs|az)://)?(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:]+\])(?::\d{1,5})?")
 """An entry of the list of hosts: a host is that of https; http, and the buckets of object stores, say so."""
 _URL = re.compile(r"(https?|s3|gs|az)://([^/?#]+)/([^?#]+)", re.IGNORECASE)
-_FLAT = re.compile(r"(?:https?|s3|gs|az):/[^/]")  # what pathlib makes of a URL
+_FLATTENED_URL = re.compile(r"(?:https?|s3|gs|az):/[^/]")  # what pathlib makes of a URL
 
-BLOCK = 1 << 16  # bytes that are asked for at a time, at least
+REQUEST_BYTES = 1 << 16  # bytes that are asked for at a time, at least
 _AHEAD = 1 << 20  # bytes read ahead, at most, of a file that is read in a row
-_LONGEST = 8 << 20  # bytes of a request, at most
-_KEPT = 64 << 20  # bytes of blocks that a process keeps
+_MAX_REQUEST_BYTES = 8 << 20  # bytes of a request, at most
+_CACHE_BYTES = 64 << 20  # bytes of blocks that a process keeps
 
 
 class Remote(str):
@@ -83,7 +83,7 @@ class Remote(str):
         return True
 
 
-Place = Path | Remote
+PathOrUrl = Path | Remote
 
 
 def is_url(text: str | os.PathLike[str]) -> bool:
@@ -92,7 +92,7 @@ def is_url(text: str | os.PathLike[str]) -> bool:
     return found is not None and not os.path.lexists(text)
 
 
-def location(path: str | os.PathLike[str]) -> Place:
+def location(path: str | os.PathLike[str]) -> PathOrUrl:
     """Return a file's location: a Remote as it is, any other text as a path of this machine."""
     return path if isinstance(path, Remote) else Path(path)
 
@@ -102,23 +102,23 @@ def here(names: Iterable[str | os.PathLike[str]]) -> list[Path]:
     return [Path(name) for name in names if not isinstance(name, Remote)]
 
 
-def pure(file: Place) -> PurePath:
+def pure(file: PathOrUrl) -> PurePath:
     """Return a file's folders and name; of a Remote its host and path."""
     return file.pure if isinstance(file, Remote) else file
 
 
-def located(path: str | os.PathLike[str], hosts: Iterable[str]) -> Place:
+def located(path: str | os.PathLike[str], hosts: Iterable[str]) -> PathOrUrl:
     """Return a name that the user gave as `location` does; a URL of a host among `hosts` becomes a Remote.
 
     ImageError for a URL that is refused: its host is not among them, or it holds a user, a query or a fragment.
     """
     text = os.fspath(path)
-    if _FLAT.match(text) and not os.path.lexists(text):
+    if _FLATTENED_URL.match(text) and not os.path.lexists(text):
         raise ImageError(f"{text}: a URL that went through a Path has lost a slash; give it as text")
     if isinstance(path, Remote) or not is_url(text):
         return location(path)
     found = _URL.fullmatch(text)
-    if found is None or not HOST.fullmatch(found[2]) or not _is_host(found[2]):
+    if found is None or not HOST_PATTERN.fullmatch(found[2]) or not _is_host(found[2]):
         raise ImageError(
             f"{text}: a URL is SCHEME://HOST/PATH without user and query, which would be written into outputs"
         )
@@ -154,43 +154,43 @@ class Part:
     tag: str
 
 
-def _fetch(at: Remote, start: int, stop: int) -> Part:
+def _fetch_part(at: Remote, start: int, stop: int) -> Part:
     from barpc.base.remote.hosts import fetch
 
     return fetch(at, start, stop)
 
 
-_Key = tuple[str, int | None, str, int]
+_BlockKey = tuple[str, int | None, str, int]
 
 
-class _Blocks:
+class _BlockCache:
     """The blocks that this process read last."""
 
     def __init__(self) -> None:
-        self._lock, self._held, self._bytes = threading.Lock(), OrderedDict[_Key, bytes](), 0
+        self._lock, self._held, self._bytes = threading.Lock(), OrderedDict[_BlockKey, bytes](), 0
 
-    def get(self, key: _Key) -> bytes | None:
+    def get(self, key: _BlockKey) -> bytes | None:
         with self._lock:
             if key in self._held:
                 self._held.move_to_end(key)
             return self._held.get(key)
 
-    def put(self, key: _Key, data: bytes) -> None:
+    def put(self, key: _BlockKey, data: bytes) -> None:
         with self._lock:
             self._bytes += len(data) - len(self._held.pop(key, b""))
             self._held[key] = data
-            while self._bytes > _KEPT:
+            while self._bytes > _CACHE_BYTES:
                 self._bytes -= len(self._held.popitem(last=False)[1])
 
 
-_blocks = _Blocks()
+_blocks = _BlockCache()
 
 
 def pinned(at: Remote) -> Remote:
     """Return a file with the version that it has now; OSError where there is none, or it does not answer."""
     if at.size is not None:
         return at
-    part = _fetch(at, 0, BLOCK)
+    part = _fetch_part(at, 0, REQUEST_BYTES)
     if not part.tag:
         raise OSError("its host names no version of it (ETag, Last-Modified), so it might change unseen; fetch it")
     found = Remote(at, part.size, part.tag)
@@ -201,7 +201,7 @@ def pinned(at: Remote) -> Remote:
 class RemoteFile(io.RawIOBase):
     """A file on another host, for reading: OSError where it does not answer, or is no longer the same."""
 
-    def __init__(self, at: Place) -> None:
+    def __init__(self, at: PathOrUrl) -> None:
         super().__init__()
         assert isinstance(at, Remote)
         self._at = pinned(at)
@@ -231,28 +231,30 @@ class RemoteFile(io.RawIOBase):
     def _read(self, start: int, stop: int) -> bytes:
         if start == stop:
             return b""
-        first, last = start // BLOCK, (stop - 1) // BLOCK
+        first, last = start // REQUEST_BYTES, (stop - 1) // REQUEST_BYTES
         found = {i: self._known(i) for i in range(first, last + 1)}
         missing = [i for i, data in found.items() if data is None]
         if missing:  # a file that is read in a row is asked for twice as much each time
-            self._ahead = min(2 * self._ahead + BLOCK, _AHEAD) if start == self._end else 0
+            self._ahead = min(2 * self._ahead + REQUEST_BYTES, _AHEAD) if start == self._end else 0
             for run in _runs(missing):
                 found |= self._asked(run.start, run.stop, self._ahead if run.stop == last + 1 else 0)
         self._end = stop
         data = b"".join(found[i] or b"" for i in range(first, last + 1))
-        return data[start - first * BLOCK : stop - first * BLOCK]
+        return data[start - first * REQUEST_BYTES : stop - first * REQUEST_BYTES]
 
     def _known(self, block: int) -> bytes | None:
         return _blocks.get((str(self._at), self._at.size, self._at.tag, block))
 
     def _asked(self, first: int, last: int, ahead: int) -> dict[int, bytes | None]:
-        most = last + ahead // BLOCK
+        most = last + ahead // REQUEST_BYTES
         end = next((i for i in range(last, most) if self._known(i) is not None), most)
-        start, stop = first * BLOCK, min(end * BLOCK, self.size)
-        part = _fetch(self._at, start, stop)
+        start, stop = first * REQUEST_BYTES, min(end * REQUEST_BYTES, self.size)
+        part = _fetch_part(self._at, start, stop)
         if (part.size, part.tag) != (self._at.size, self._at.tag):
             raise OSError("it was changed on its host while it was read; run the same command again")
-        cut = {first + i // BLOCK: part.data[i : i + BLOCK] for i in range(0, stop - start, BLOCK)}
+        cut = {
+            first + i // REQUEST_BYTES: part.data[i : i + REQUEST_BYTES] for i in range(0, stop - start, REQUEST_BYTES)
+        }
         for block, data in cut.items():
             _blocks.put((str(self._at), self._at.size, self._at.tag, block), data)
         return dict(cut)
@@ -262,14 +264,14 @@ def _runs(blocks: list[int]) -> Iterator[range]:
     """Yield the ascending numbers as ranges, none of more bytes than a request has."""
     start = before = blocks[0]
     for block in [*blocks[1:], -1]:
-        if block != before + 1 or (block - start) * BLOCK >= _LONGEST:
+        if block != before + 1 or (block - start) * REQUEST_BYTES >= _MAX_REQUEST_BYTES:
             yield range(start, before + 1)
             start = block
         before = block
 
 
 def beside(image: Remote, names: Iterable[str]) -> dict[str, str]:
-    """See `barpc.base.remote.hosts.beside`."""
-    from barpc.base.remote.hosts import beside as look
+    """See `barpc.base.remote.hosts.present_beside`."""
+    from barpc.base.remote.hosts import present_beside as look
 
     return look(image, names)

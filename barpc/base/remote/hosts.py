@@ -24,7 +24,7 @@ from typing import Any, BinaryIO
 from urllib.parse import quote, urljoin, urlsplit
 
 from barpc.base.errors import visible
-from barpc.base.remote import BLOCK, Part, Remote
+from barpc.base.remote import REQUEST_BYTES, Part, Remote
 
 
 def fetch(at: Remote, start: int, stop: int) -> Part:
@@ -32,7 +32,7 @@ def fetch(at: Remote, start: int, stop: int) -> Part:
     return (_from_server if at.startswith("http") else _from_store)(at, start, stop)
 
 
-def beside(image: Remote, names: Iterable[str]) -> dict[str, str]:
+def present_beside(image: Remote, names: Iterable[str]) -> dict[str, str]:
     """Return the names of those of these files that are in an image's folder, by name in lower case.
 
     A store lists the folder, and case does not count; a web server is asked for each name as it is and with its ending
@@ -40,7 +40,7 @@ def beside(image: Remote, names: Iterable[str]) -> dict[str, str]:
     """
     if not image.startswith("http"):
         wanted = {name.lower() for name in names}
-        present = _listed(image.parent, int(time.monotonic() / _LISTED))
+        present = _store_listing(image.parent, int(time.monotonic() / _LISTED))
         return {name.lower(): name for name in present if name.lower() in wanted}
     tried: dict[str, str] = {}
     for name in dict.fromkeys(names):
@@ -69,7 +69,7 @@ _AGAIN = (408, 425, 429, 500, 502, 503, 504)
 _ELSEWHERE = (301, 302, 303, 307, 308)
 _MOVES = 3
 _EXTRA = 1 << 20  # bytes of an answer beside its data, whose chunks may be of one byte: these take six
-_KEPT = "/%:@!$&'()*+,;=~"  # characters that stand in an address as they are
+_UNQUOTED = "/%:@!$&'()*+,;=~"  # characters that stand in an address as they are
 
 _idle: dict[tuple[int, str, str], list[HTTPConnection]] = {}  # process (a fork shares no socket), scheme, host
 _lock = threading.Lock()
@@ -82,7 +82,7 @@ class _PassingError(OSError):
 def _from_server(at: Remote, start: int, stop: int) -> Part:
     for wait in (*WAITS, None):
         try:
-            return _moved(at, start, stop)
+            return _fetch_redirected(at, start, stop)
         except _PassingError as error:
             if wait is None:
                 raise OSError(f"{error}; asked {len(WAITS) + 1} times") from error
@@ -90,7 +90,7 @@ def _from_server(at: Remote, start: int, stop: int) -> Part:
     raise AssertionError
 
 
-def _moved(at: str, start: int, stop: int) -> Part:
+def _fetch_redirected(at: str, start: int, stop: int) -> Part:
     """Fetch once; a server may redirect within itself."""
     url = at
     for _ in range(_MOVES):
@@ -113,13 +113,13 @@ def _once(url: str, start: int, stop: int) -> Part | str:
     connection = _connection(scheme, host)
     connection.response_class = partial(_response, _EXTRA + 6 * (stop - start))  # type: ignore[assignment]
     longest, late = TIMEOUT + (stop - start) / _SLOWEST, threading.Event()
-    limit = threading.Timer(longest, _cut, (connection.sock, late))
+    limit = threading.Timer(longest, _shut_down, (connection.sock, late))
     limit.start()
     again = False
     try:
         connection.request(
             "GET",
-            quote(path, safe=_KEPT) + (f"?{quote(query, safe=_KEPT + '?')}" if query else ""),
+            quote(path, safe=_UNQUOTED) + (f"?{quote(query, safe=_UNQUOTED + '?')}" if query else ""),
             headers={"Range": f"bytes={start}-{stop - 1}", "Accept-Encoding": "identity"},
         )
         with closing(connection.getresponse()) as answer:
@@ -171,7 +171,7 @@ def _response(most: int, *args: Any, **given: Any) -> HTTPResponse:
     return answer
 
 
-def _cut(connected: socket.socket, late: threading.Event) -> None:
+def _shut_down(connected: socket.socket, late: threading.Event) -> None:
     late.set()
     with suppress(OSError):
         connected.shutdown(socket.SHUT_RDWR)
@@ -206,7 +206,7 @@ def _answered(answer: HTTPResponse, start: int, stop: int) -> Part | str | None:
     if status in _ELSEWHERE:
         return answer.headers.get("Location", "")
     if status in (404, 410):
-        answer.read(BLOCK)  # so that the connection can be used again
+        answer.read(REQUEST_BYTES)  # so that the connection can be used again
         return None
     if answer.headers.get("Content-Encoding", "identity") != "identity":
         raise OSError("its host sends it compressed, though that was not asked")
@@ -236,7 +236,7 @@ def _body(answer: HTTPResponse, wanted: int) -> bytes:
 
 # --- stores -----------------------------------------------------------------------------------------------
 
-_NAMES = {"s3": "s3fs", "gs": "gcsfs", "az": "adlfs"}
+_STORE_PACKAGES = {"s3": "s3fs", "gs": "gcsfs", "az": "adlfs"}
 _S3 = {"connect_timeout": 10, "read_timeout": 30, "retries": {"max_attempts": 3}}
 _LISTED = 60  # s that the list of a folder is used for: the images in it are loaded one after the other
 
@@ -250,7 +250,7 @@ def _store(scheme: str) -> Any:
         return fsspec.filesystem(scheme, use_listings_cache=False, **given)
     except ImportError as error:
         raise OSError(
-            f"{scheme}:// needs the extra: pip install 'barpc[remote]' ({_NAMES[scheme]} is missing)"
+            f"{scheme}:// needs the extra: pip install 'barpc[remote]' ({_STORE_PACKAGES[scheme]} is missing)"
         ) from error
     except Exception as error:  # no credentials
         raise _one_line(error) from error
@@ -262,18 +262,18 @@ class _Opened:
     def __init__(self, at: Remote) -> None:
         store = _store(at.partition(":")[0])
         self._lock, self._store, self._url = threading.Lock(), store, str(at)
-        self._file = _told(store.open, str(at), "rb", cache_type="none")
-        found = _told(store.info, str(at))
+        self._file = _store_answer(store.open, str(at), "rb", cache_type="none")
+        found = _store_answer(store.info, str(at))
         if found.get("type") == "directory":
             raise OSError("a folder")
-        self.version = _told(_version, found)
+        self.version = _store_answer(_version, found)
 
     def read(self, start: int, stop: int) -> bytes:
         with self._lock:
-            _told(self._file.seek, start)
-            data = bytes(_told(self._file.read, stop - start))
+            _store_answer(self._file.seek, start)
+            data = bytes(_store_answer(self._file.read, stop - start))
             if not self._url.startswith("s3:"):  # s3fs asks for bytes of the version that it opened
-                self.require(*_told(_version, _told(self._store.info, self._url)))
+                self.require(*_store_answer(_version, _store_answer(self._store.info, self._url)))
             return data
 
     def require(self, size: int, tag: str) -> None:
@@ -287,14 +287,14 @@ def _version(found: Mapping[str, Any]) -> tuple[int, str]:
 
 
 @lru_cache
-def _pinned(url: str, size: int, tag: str) -> _Opened:
+def _open_version(url: str, size: int, tag: str) -> _Opened:
     found = _Opened(Remote(url))
     found.require(size, tag)
     return found
 
 
 def _from_store(at: Remote, start: int, stop: int) -> Part:
-    file = _Opened(at) if at.size is None else _pinned(str(at), at.size, at.tag)
+    file = _Opened(at) if at.size is None else _open_version(str(at), at.size, at.tag)
     size, tag = file.version
     wanted = max(0, min(stop, size) - start)
     data = file.read(start, start + wanted) if wanted else b""
@@ -304,12 +304,12 @@ def _from_store(at: Remote, start: int, stop: int) -> Part:
 
 
 @lru_cache(8)
-def _listed(folder: str, _minute: int) -> tuple[str, ...]:
-    found = _told(_store(folder.partition(":")[0]).ls, folder, detail=False)
+def _store_listing(folder: str, _minute: int) -> tuple[str, ...]:
+    found = _store_answer(_store(folder.partition(":")[0]).ls, folder, detail=False)
     return tuple(sorted(str(path).rpartition("/")[2] for path in found))
 
 
-def _told(ask: Any, *args: Any, **given: Any) -> Any:
+def _store_answer(ask: Any, *args: Any, **given: Any) -> Any:
     """Return a store's answer; errors of its many classes become an OSError of one line."""
     try:
         return ask(*args, **given)

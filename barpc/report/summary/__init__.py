@@ -1,7 +1,7 @@
 """The summary of a run: what summary.json holds. In here alone stands what a value is, its column, how it is measured.
 
-A new value is a field with what is `said` of it and a line in the function that measures its record; named among the
-columns of a table there, it stands in that, too. A module for each thing: views, pairs, the whole, known points.
+A new value is a field with what is `column` of it and a line in the function that measures its record; named among the
+columns of a table there, it stands in that, too. A module for each thing: views, pairs, the block, ground points.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import numpy as np
 
 from barpc import __version__
 from barpc.report.outcome import Run
-from barpc.report.records import Number, Record, plain, said
-from barpc.report.summary import known
-from barpc.report.summary.known import CheckPointEntry, ControlTestEntry, GcpEntry, ReferenceEntry
+from barpc.report.records import Number, Record, column, json_form
+from barpc.report.summary import ground_points
+from barpc.report.summary.block import SceneEntry, measure_scene
+from barpc.report.summary.ground_points import CheckPointEntry, ControlTestEntry, GcpEntry, ReferenceEntry
 from barpc.report.summary.pairs import PairEntry, measure_pairs
 from barpc.report.summary.views import ViewEntry, measure_views
-from barpc.report.summary.whole import SceneEntry, measure_scene
 from barpc.report.summary.words import ABOVE, Count
 
 SCHEMA = 2  # Version of summary.json
@@ -31,8 +31,8 @@ _Value = _Plain | tuple[_Plain, ...] | tuple[tuple[_Plain, ...], ...]
 class LeftOutEntry(Record):
     """A file that was left out."""
 
-    path: str = said("File")
-    reason: str = said("Why")
+    path: str = column("File")
+    reason: str = column("Why")
 
     @property
     def reason_text(self) -> str:
@@ -43,32 +43,32 @@ class LeftOutEntry(Record):
 class InputEntry(Record):
     """A file that the run read."""
 
-    path: str = said("File; a matcher by its name goes by its module")
-    bytes: Count = said("Its size")
-    sha256: str = said("SHA-256 of its bytes; of a file on another host of its URL and the version named there")
+    path: str = column("File; a matcher by its name goes by its module")
+    bytes: Count = column("Its size")
+    sha256: str = column("SHA-256 of its bytes; of a file on another host of its URL and the version named there")
 
 
 class OutputEntry(Record):
     """A file that the run wrote."""
 
-    file: str = said("Its name in the run folder")
-    sha256: str = said("SHA-256 of its bytes")
+    file: str = column("Its name in the run folder")
+    sha256: str = column("SHA-256 of its bytes")
 
 
 class TracksEntry(Record):
     """The tie points."""
 
-    num_tracks: Count = said("Tie points")
-    num_observations: Count = said("Their observations")
-    by_length: Mapping[str, int] = said("Number of views -> tie points seen in so many")
+    num_tracks: Count = column("Tie points")
+    num_observations: Count = column("Their observations")
+    by_length: Mapping[str, int] = column("Number of views -> tie points seen in so many")
 
 
 class TablesEntry(Record):
     """How much of the tie points the tables hold."""
 
-    num_usable_tracks: Count = said("Tie points with a ground position")
-    num_written_tracks: Count = said("Of these, in the tables (at most 200,000, evenly taken)")
-    complete: bool = said("Whether that is all")
+    num_usable_tracks: Count = column("Tie points with a ground position")
+    num_written_tracks: Count = column("Of these, in the tables (at most 200,000, evenly taken)")
+    complete: bool = column("Whether that is all")
 
 
 class StageEntry(Record):
@@ -76,40 +76,40 @@ class StageEntry(Record):
 
     MORE: ClassVar = _Plain
 
-    stage: str = said("Name", head="stage")
-    seconds: float = said("Wall time in seconds", head="seconds", form=".2f")
-    cpu_seconds: float = said("CPU time in seconds", head="CPU seconds", form=".2f")
-    peak_memory_mb: float = said("Peak memory so far", "MB", "peak memory", ".0f")
+    stage: str = column("Name", head="stage")
+    seconds: float = column("Wall time in seconds", head="seconds", form=".2f")
+    cpu_seconds: float = column("CPU time in seconds", head="CPU seconds", form=".2f")
+    peak_memory_mb: float = column("Peak memory so far", "MB", "peak memory", ".0f")
 
 
 class Summary(Record):
     """summary.json of a run."""
 
-    schema: int = said("Version of this description", const=SCHEMA)
-    barpc: str = said("Release")
-    kind: Literal["adjust", "check", "match"] = said("Whether cameras were adjusted, looked at, or only tied")
-    status: Literal["good", "look", "bad"] = said("The verdict on the whole")
-    headline: str = said("The verdict in a sentence")
-    verdict: tuple[str, ...] = said("What was reached, what is unknown, what needs a look")
-    reasons: tuple[str, ...] = said("Those of its sentences that say why it is not good")
-    passed: bool = said("Whether it is good: no image, point or file has a reservation (exit code 0, else 3)")
-    altitude_m: Number = said("Median altitude of the tie points", ABOVE)
-    views: tuple[ViewEntry, ...] = said("The images", minItems=1)
-    pairs: tuple[PairEntry, ...] = said("Pairs with tie points in common")
-    left_out: tuple[LeftOutEntry, ...] = said("Files that were left out")
-    tracks: TracksEntry = said("Tie points")
-    tables: TablesEntry = said("What the tables hold")
-    scene: SceneEntry | None = said("The block as a whole; null for a check")
-    gcps: tuple[GcpEntry, ...] = said("Ground control")
-    check_points: tuple[CheckPointEntry, ...] = said("Points that stayed out of the adjustment")
-    options: Mapping[str, _Value | Mapping[str, _Value | Mapping[str, _Value]]] | None = said("Options of the run")
-    versions: Mapping[str, str] = said("Versions of Python and packages")
-    control_test: ControlTestEntry | None = said("The residuals of control, each tested", default=None)
-    reference: ReferenceEntry | None = said("A reference orthoimage, where one was given", default=None)
-    inputs: tuple[InputEntry, ...] | None = said("Every file that was read, as `barpc verify` asks", default=None)
-    outputs: tuple[OutputEntry, ...] | None = said("Every file written but this and the report", default=None)
-    out_dir: str | None = said("Where results are; not in the file", default=None)
-    stages: tuple[StageEntry, ...] | None = said("Stages of the run; not in the file", default=None)
+    schema: int = column("Version of this description", const=SCHEMA)
+    barpc: str = column("Release")
+    kind: Literal["adjust", "check", "match"] = column("Whether cameras were adjusted, looked at, or only tied")
+    status: Literal["good", "look", "bad"] = column("The verdict on the whole")
+    headline: str = column("The verdict in a sentence")
+    verdict: tuple[str, ...] = column("What was reached, what is unknown, what needs a look")
+    reasons: tuple[str, ...] = column("Those of its sentences that say why it is not good")
+    passed: bool = column("Whether it is good: no image, point or file has a reservation (exit code 0, else 3)")
+    altitude_m: Number = column("Median altitude of the tie points", ABOVE)
+    views: tuple[ViewEntry, ...] = column("The images", minItems=1)
+    pairs: tuple[PairEntry, ...] = column("Pairs with tie points in common")
+    left_out: tuple[LeftOutEntry, ...] = column("Files that were left out")
+    tracks: TracksEntry = column("Tie points")
+    tables: TablesEntry = column("What the tables hold")
+    scene: SceneEntry | None = column("The block as a whole; null for a check")
+    gcps: tuple[GcpEntry, ...] = column("Ground control")
+    check_points: tuple[CheckPointEntry, ...] = column("Points that stayed out of the adjustment")
+    options: Mapping[str, _Value | Mapping[str, _Value | Mapping[str, _Value]]] | None = column("Options of the run")
+    versions: Mapping[str, str] = column("Versions of Python and packages")
+    control_test: ControlTestEntry | None = column("The residuals of control, each tested", default=None)
+    reference: ReferenceEntry | None = column("A reference orthoimage, where one was given", default=None)
+    inputs: tuple[InputEntry, ...] | None = column("Every file that was read, as `barpc verify` asks", default=None)
+    outputs: tuple[OutputEntry, ...] | None = column("Every file written but this and the report", default=None)
+    out_dir: str | None = column("Where results are; not in the file", default=None)
+    stages: tuple[StageEntry, ...] | None = column("Stages of the run; not in the file", default=None)
 
     def __repr__(self) -> str:
         return f"Summary({self.kind} of {len(self.views)} views, {self.status}: {self.headline})"
@@ -162,11 +162,11 @@ def measure_run(run: Run) -> Summary:
         ),
         tables=TablesEntry(usable, written, complete=written == usable),
         scene=measure_scene(run),
-        gcps=known.measure_gcps(run),
-        control_test=known.measure_control(run),
-        check_points=known.measure_check_points(run),
-        reference=known.measure_reference(run),
+        gcps=ground_points.measure_gcps(run),
+        control_test=ground_points.measure_control(run),
+        check_points=ground_points.measure_check_points(run),
+        reference=ground_points.measure_reference(run),
         stages=tuple(StageEntry.read(stage) for stage in run.stages),
-        options=plain(run.options),
+        options=json_form(run.options),
         versions={"python": platform.python_version(), **_versions()},
     )

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from barpc.base.geodesy import CHUNK, Array, ground_from_ecef
-from barpc.base.usual import MAD
+from barpc.base.statistics import MAD
 from barpc.report.outcome import Run
-from barpc.report.records import Cell, Column, Number, Record, plain, said
+from barpc.report.records import Cell, Column, Number, Record, column, json_form
 from barpc.report.summary.words import Count
 from barpc.scene import IntArray
 from barpc.sensor import SensorModel
@@ -23,10 +23,10 @@ MAX_PER_PAIR = 1000  # Matches of a pair that its epipolar offset is measured on
 class OffsetEntry(Record):
     """Distance of a pair's matches from their epipolar lines."""
 
-    median: float = said("Median signed distance from the epipolar line", "px")
-    spread: float = said("1.4826 times the median absolute deviation", "px")
-    rms: float = said("Root mean square", "px")
-    count: Count = said("Matches measured: at most 1000, evenly taken")
+    median: float = column("Median signed distance from the epipolar line", "px")
+    spread: float = column("1.4826 times the median absolute deviation", "px")
+    rms: float = column("Root mean square", "px")
+    count: Count = column("Matches measured: at most 1000, evenly taken")
 
 
 def _offset_cell(offset: OffsetEntry | None) -> Cell | None:
@@ -55,20 +55,22 @@ class PairEntry(Record):
         "tied_by decoy_share noise_px"
     )
 
-    a: str = said("First view")
-    b: str = said("Second view")
-    num_matches: Count = said("Tie points that both see", head="matches")
-    convergence_deg: Number = said("Angle between the lines of sight", "deg", "angle", ".1f")
-    base_to_height: Number = said("B/H along the lines of sight", head="B/H", form=".2f")
-    height_m_per_px: Number = said("Height whose parallax is a pixel", "m", "height per px", ".3g")
-    epipolar_before: OffsetEntry | None = said("Through the delivered cameras")
-    epipolar_after: OffsetEntry | None = said("Through the new cameras")
-    matching: Mapping[str, Any] | None = said("What became of it in matching; null: not matched")
-    tied_by: str | None = said("Matcher that tied it, whether loosened", head="tied by", default=None)
-    decoy_share: Number = said("Share false, by bands without true matches", head="false", form=".1%", default=None)
-    noise_px: Number = said("Spread across epipolar lines before registration", "px", "as matched", ".2f", default=None)
-    beaten: tuple[str, ...] = said("Attempts that found fewer: matcher, matches of those wanted", default=())
-    chosen_by: str | None = said("Why it was tried: overlap and angle, same date, listed, ...", default=None)
+    a: str = column("First view")
+    b: str = column("Second view")
+    num_matches: Count = column("Tie points that both see", head="matches")
+    convergence_deg: Number = column("Angle between the lines of sight", "deg", "angle", ".1f")
+    base_to_height: Number = column("B/H along the lines of sight", head="B/H", form=".2f")
+    height_m_per_px: Number = column("Height whose parallax is a pixel", "m", "height per px", ".3g")
+    epipolar_before: OffsetEntry | None = column("Through the delivered cameras")
+    epipolar_after: OffsetEntry | None = column("Through the new cameras")
+    matching: Mapping[str, Any] | None = column("What became of it in matching; null: not matched")
+    tied_by: str | None = column("Matcher that tied it, whether loosened", head="tied by", default=None)
+    decoy_share: Number = column("Share false, by bands without true matches", head="false", form=".1%", default=None)
+    noise_px: Number = column(
+        "Spread across epipolar lines before registration", "px", "as matched", ".2f", default=None
+    )
+    beaten: tuple[str, ...] = column("Attempts that found fewer: matcher, matches of those wanted", default=())
+    chosen_by: str | None = column("Why it was tried: overlap and angle, same date, listed, ...", default=None)
 
     @property
     def offset_rms(self) -> tuple[float | None, float | None]:
@@ -79,7 +81,7 @@ class PairEntry(Record):
 
 # --- how they are measured --------------------------------------------------------------------------------
 
-_REPORT = attrgetter("means", "control_share", "spread", "beaten", "reason")
+_PAIR_REPORT_FIELDS = attrgetter("means", "control_share", "spread", "beaten", "reason")
 
 
 def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
@@ -91,19 +93,19 @@ def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
     for ties, (angle, base, height), first, last in zip(run.pairs, _pair_geometry(run), before, after, strict=True):
         names = (run.views[ties.views[0]].name, run.views[ties.views[1]].name)
         report = reports.get(names)
-        told = () if report is None else _REPORT(report)
-        entries.append(PairEntry(*names, len(ties.a), angle, base, height, first, last, plain(report), *told))
+        told = () if report is None else _PAIR_REPORT_FIELDS(report)
+        entries.append(PairEntry(*names, len(ties.a), angle, base, height, first, last, json_form(report), *told))
     return tuple(entries)
 
 
 def _pair_geometry(run: Run) -> list[list[float]]:
     """Return the medians over a hundred of each pair's points: angle [deg], B/H, height of a pixel [m]."""
     picks = [slice(None, None, max(1, len(ties.a) // 100)) for ties in run.pairs]
-    a, b, pair = _rows(run, picks)
+    a, b, pair = _picked_matches(run, picks)
     seen = np.isfinite(run.ground[run.tracks.point[a]]).all(axis=1)
     a, b, pair = a[seen], b[seen], pair[seen]
     values = np.empty((3, len(a)))
-    for part, first, second in _parts(run, run.before, a, b):
+    for part, first, second in _match_parts(run, run.before, a, b):
         at = run.ground[run.tracks.point[a[part]]]
         base = base_to_height(first, second, at)
         finer = np.minimum(ground_sample_distance(first, at)[1], ground_sample_distance(second, at)[1])
@@ -122,12 +124,12 @@ def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> list[
     counts = [len(ties.a) for ties in run.pairs]
     most = MAX_PER_PAIR
     picks = [slice(n) if n <= most else np.linspace(0, n - 1, most).astype(np.int64) for n in counts]
-    a, b, pair = _rows(run, picks)
+    a, b, pair = _picked_matches(run, picks)
     height = alt[run.tracks.point[a]]
     seen = np.isfinite(height)
     a, b, pair = a[seen], b[seen], pair[seen]
     offset, height, xy = np.empty(len(a)), height[seen], run.tracks.xy
-    for part, first, second in _parts(run, sensors, a, b):
+    for part, first, second in _match_parts(run, sensors, a, b):
         offset[part], _ = epipolar_offset(first, second, xy[a[part]], xy[b[part]], height[part], steps=2)
     known = np.isfinite(offset)
     offset, pair, num = offset[known], pair[known], len(counts)
@@ -139,7 +141,7 @@ def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> list[
     return [OffsetEntry(*row) if row[3] else None for row in rows]
 
 
-def _parts(
+def _match_parts(
     run: Run, sensors: Sequence[SensorModel], a: IntArray, b: IntArray
 ) -> Iterator[tuple[slice, Several, Several]]:
     """Yield pieces of matches that stay in cache, and the cameras of their observations a and b."""
@@ -148,7 +150,7 @@ def _parts(
         yield part, Several(sensors, run.tracks.view[a[part]]), Several(sensors, run.tracks.view[b[part]])
 
 
-def _rows(run: Run, picks: Sequence[slice | IntArray]) -> tuple[IntArray, IntArray, IntArray]:
+def _picked_matches(run: Run, picks: Sequence[slice | IntArray]) -> tuple[IntArray, IntArray, IntArray]:
     """Of all pairs together, those matches that are picked: their observations in both views, and which pair it is."""
     none = np.empty(0, dtype=np.int64)
     a, b = ([getattr(t, of)[pick] for t, pick in zip(run.pairs, picks, strict=True)] for of in ("a", "b"))

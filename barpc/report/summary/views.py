@@ -12,31 +12,31 @@ import numpy as np
 from scipy.special import erf
 
 from barpc.ba import Adjustment
-from barpc.ba.estimated.priors import USABLE_ACCURACY
+from barpc.ba.parameters.priors import USABLE_ACCURACY
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit
 from barpc.fit import RpcFit
 from barpc.report.outcome import Run
-from barpc.report.records import Cell, Column, Number, Record, said, value_of
+from barpc.report.records import Cell, Column, Number, Record, column, value_of
 from barpc.report.summary.words import ABOVE, CAUSES, STATUS_WORDS, Count, Pixel, Share, Side, Vector, largest
 from barpc.scene import IntArray, View
 from barpc.sensor.corrected import Corrected
-from barpc.sensor.displaced import ImageCorrected, RowSpline, Splined
 from barpc.sensor.geometry import Several, ground_grids, ground_sample_distance, view_angles
+from barpc.sensor.image_corrections import ImageCorrected, RowSpline, Splined
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.timing import Timed
 
-CELLS = 8  # Cells of an image from left to right and from top to bottom
-_ROWS = 400  # of an image, over which a spline is averaged
+COVERAGE_CELLS = 8  # Cells of an image from left to right and from top to bottom
+_SPLINE_ROWS = 400  # of an image, over which a spline is averaged
 
 
 class EllipseEntry(Record):
     """How well a camera tells where a ground point in the middle of its image is, its altitude given."""
 
-    major_m: Number = said("Larger semi-axis of the one-sigma ellipse", "m", "semi-axis", ".2f")
-    minor_m: Number = said("Smaller semi-axis", "m", "other", ".2f")
-    azimuth_deg: Number = said("Direction of the larger one, clockwise from north", "deg", "azimuth", ".0f")
-    ce90_m: Number = said("Radius of the circle that holds 90 %", "m", "CE90", ".2f")
+    major_m: Number = column("Larger semi-axis of the one-sigma ellipse", "m", "semi-axis", ".2f")
+    minor_m: Number = column("Smaller semi-axis", "m", "other", ".2f")
+    azimuth_deg: Number = column("Direction of the larger one, clockwise from north", "deg", "azimuth", ".0f")
+    ce90_m: Number = column("Radius of the circle that holds 90 %", "m", "CE90", ".2f")
 
 
 def moved_in_space(
@@ -56,17 +56,21 @@ def moved_in_space(
     distance = np.linalg.norm(ecef - model.correction.center)
     parts = {"rotation": by_rotation / distance, "translation": by_translation}
     jacobian = np.hstack([part for name, part in parts.items() if name in unknowns])
-    return _known(image - before, jacobian, covariance, by_point @ enu_basis(ground)[:2].T)
+    return _ground_accuracy(image - before, jacobian, covariance, by_point @ enu_basis(ground)[:2].T)
 
 
 def moved_by_clocks(model: Timed, covariance: Array, ground: Array) -> tuple[Array, Array, EllipseEntry]:
     """As `moved_in_space`, by a radar's clocks: `covariance` begins with range and place along the flight [m]."""
     image, by_timing = model.timing_jacobian(ground)
     by_level = (model.project_jacobian(ground)[1] / metres_per_unit(ground))[:, :2]
-    return _known(image - model.sensor.project(ground), by_timing / [1.0, model.sensor.speed], covariance, by_level)
+    return _ground_accuracy(
+        image - model.sensor.project(ground), by_timing / [1.0, model.sensor.speed], covariance, by_level
+    )
 
 
-def _known(moved: Array, jacobian: Array, covariance: Array, by_level: Array) -> tuple[Array, Array, EllipseEntry]:
+def _ground_accuracy(
+    moved: Array, jacobian: Array, covariance: Array, by_level: Array
+) -> tuple[Array, Array, EllipseEntry]:
     """`jacobian` (2, q): [px] by the first unknowns; `by_level` (2, 2): [px/m] by east and north, at one altitude."""
     q = jacobian.shape[1]
     variance = jacobian @ covariance[:q, :q] @ jacobian.T
@@ -118,59 +122,63 @@ def _circles() -> tuple[Array, Array, Array]:
 class SourceEntry(Record):
     """Where a camera came from."""
 
-    format: str = said("Syntax it was read from", head="RPC read from")
-    path: str = said("File that holds it")
-    notes: tuple[str, ...] = said("What the user should know")
+    format: str = column("Syntax it was read from", head="RPC read from")
+    path: str = column("File that holds it")
+    notes: tuple[str, ...] = column("What the user should know")
 
 
 class CorrectionEntry(Record):
     """How a camera was corrected: in space, or by a shift and slope in the image (no `center_shift_px` then)."""
 
-    model: str = said("Unknowns of the adjustment")
-    unknowns: tuple[float, ...] = said("In metres (rotation: angle x distance), or px in the image")
-    sigma: tuple[float, ...] = said("Their posterior standard deviations, in the same units")
-    center_shift_px: Pixel | None = said("Move of the middle", "px", "shift col, row", "+.2f", adjusted=True)
-    center_sigma_px: Pixel | None = said("Its posterior standard deviation, with the scene's own uncertain place", "px")
-    shift_px: Pixel | None = said("Models in the image: shift col, row", "px", default=None)
-    slope: tuple[Pixel, ...] | None = said("Models in the image: by (col, row)", "px/px", default=None)
-    rotation_urad: Vector | None = said("Rotation vector R, ECEF axes", "urad", default=None)
-    angle_urad: Number = said("Its length", "urad", "rotation", ".2f", default=None)
-    translation_m: Vector | None = said("Translation T, ECEF", "m", default=None)
-    translation_norm_m: Number = said("Its length", "m", "translation", ".2f", default=None)
-    drift_urad: tuple[Vector, ...] | None = said("Drift, for each power of the row", "urad", default=None)
-    range_m: Number = said("Radar: added to the range", "m", "range", "+.3f", default=None)
-    azimuth_ms: Number = said("Radar: added to the azimuth time", "ms", "azimuth", "+.4f", default=None)
-    timing_sigma: Pixel | None = said("Their posterior standard deviations, m and ms", default=None)
-    timing_slopes: tuple[Pixel, ...] | None = said("Radar: added at the end, m and ms, by power", default=None)
-    jitter_px: Number = said("RMS of the spline over the rows", "px", "jitter", ".2f", default=None)
-    jitter_rows: Number = said("Rows between its knots", "px", default=None)
-    detector_px: Number = said("RMS of the steps between detectors", "px", "detectors", ".2f", default=None)
-    strip_px: Number = said("RMS of the strips that lie off", "px", "strips", ".2f", default=None)
-    swing_px: Number = said("Amplitude of the swings of the rows", "px", "swing", ".2f", default=None)
-    swing_rows: tuple[float, ...] | None = said("Their periods", "px", default=None)
-    ellipse: EllipseEntry | None = said("Where its middle is, one sigma, the scene's place in it", default=None)
-    detectors: tuple[float, ...] | None = said("Columns where another detector begins", "px", default=None)
+    model: str = column("Unknowns of the adjustment")
+    unknowns: tuple[float, ...] = column("In metres (rotation: angle x distance), or px in the image")
+    sigma: tuple[float, ...] = column("Their posterior standard deviations, in the same units")
+    center_shift_px: Pixel | None = column("Move of the middle", "px", "shift col, row", "+.2f", adjusted=True)
+    center_sigma_px: Pixel | None = column(
+        "Its posterior standard deviation, with the scene's own uncertain place", "px"
+    )
+    shift_px: Pixel | None = column("Models in the image: shift col, row", "px", default=None)
+    slope: tuple[Pixel, ...] | None = column("Models in the image: by (col, row)", "px/px", default=None)
+    rotation_urad: Vector | None = column("Rotation vector R, ECEF axes", "urad", default=None)
+    angle_urad: Number = column("Its length", "urad", "rotation", ".2f", default=None)
+    translation_m: Vector | None = column("Translation T, ECEF", "m", default=None)
+    translation_norm_m: Number = column("Its length", "m", "translation", ".2f", default=None)
+    drift_urad: tuple[Vector, ...] | None = column("Drift, for each power of the row", "urad", default=None)
+    range_m: Number = column("Radar: added to the range", "m", "range", "+.3f", default=None)
+    azimuth_ms: Number = column("Radar: added to the azimuth time", "ms", "azimuth", "+.4f", default=None)
+    timing_sigma: Pixel | None = column("Their posterior standard deviations, m and ms", default=None)
+    timing_slopes: tuple[Pixel, ...] | None = column("Radar: added at the end, m and ms, by power", default=None)
+    jitter_px: Number = column("RMS of the spline over the rows", "px", "jitter", ".2f", default=None)
+    jitter_rows: Number = column("Rows between its knots", "px", default=None)
+    detector_px: Number = column("RMS of the steps between detectors", "px", "detectors", ".2f", default=None)
+    strip_px: Number = column("RMS of the strips that lie off", "px", "strips", ".2f", default=None)
+    swing_px: Number = column("Amplitude of the swings of the rows", "px", "swing", ".2f", default=None)
+    swing_rows: tuple[float, ...] | None = column("Their periods", "px", default=None)
+    ellipse: EllipseEntry | None = column("Where its middle is, one sigma, the scene's place in it", default=None)
+    detectors: tuple[float, ...] | None = column("Columns where another detector begins", "px", default=None)
 
 
 class CenterEntry(Record):
     """Where a camera stands."""
 
-    ecef_m: Vector = said("Place, ECEF", "m")
-    altitude_m: Number = said("Above the ellipsoid", "m", "camera centre", ",.0f")
-    method: str = said("line, or nominal where that was not plausible", head="found by")
+    ecef_m: Vector = column("Place, ECEF", "m")
+    altitude_m: Number = column("Above the ellipsoid", "m", "camera centre", ",.0f")
+    method: str = column("line, or nominal where that was not plausible", head="found by")
 
 
 class FitEntry(Record):
     """The certificate of a refitted RPC: against P_BA, on points that the fit has not seen."""
 
-    rmse_px: Pixel = said("Error col, row on check points", "px", "RMSE col, row", ".1e")
-    max_px: Pixel = said("Largest error col, row on check points", "px")
-    min_denominator: Number = said("Relative to the centre's", "", "smallest denominator", ".3f")
-    roundtrip_px: Number = said("Largest move by projection and back; null where it fails", "px", "round trip", ".1e")
-    coverage: Number = said("Share of the image that the fit's points cover", head="covered", form=".0%")
-    method: str = said("Solver", head="solver")
-    num_check_points: Count = said("Check points", head="check points")
-    localisation_m: Number = said("Largest distance on the ground of the localisation RPC from P_BA", "m", default=None)
+    rmse_px: Pixel = column("Error col, row on check points", "px", "RMSE col, row", ".1e")
+    max_px: Pixel = column("Largest error col, row on check points", "px")
+    min_denominator: Number = column("Relative to the centre's", "", "smallest denominator", ".3f")
+    roundtrip_px: Number = column("Largest move by projection and back; null where it fails", "px", "round trip", ".1e")
+    coverage: Number = column("Share of the image that the fit's points cover", head="covered", form=".0%")
+    method: str = column("Solver", head="solver")
+    num_check_points: Count = column("Check points", head="check points")
+    localisation_m: Number = column(
+        "Largest distance on the ground of the localisation RPC from P_BA", "m", default=None
+    )
 
 
 def _moves(view: ViewEntry) -> list[Cell]:
@@ -227,48 +235,54 @@ class ViewEntry(Record):
         """Its verdict and what to do as a sentence; of an image of which all is well without a meaning."""
         return f"{self.name}: {STATUS_WORDS[self.status]}: {self.advice}."
 
-    name: str = said("Unique in the run", head="image", minLength=1)
-    path: str = said("The image; empty for a view without pixels")
-    size: tuple[Side, Side] = said("Width, height", "px")
-    alt_range_m: tuple[float, float] = said("Altitudes that the camera is used for", ABOVE)
-    rpc_source: SourceEntry | None = said("Where the camera came from; null: not from a file")
-    gsd_m: Number = said("Ground sampling distance in the middle of the image", "m", "GSD", ".2f")
-    incidence_deg: Number = said("From the vertical to the sensor", "deg", "incidence", ".1f")
-    azimuth_deg: Number = said("Direction to the sensor, clockwise from north", "deg")
-    num_observations: Count = said("Tie-point observations that count", head="tie points")
-    num_rejected: Count = said("Observations that the adjustment cut as wrong", head="cut")
-    num_gcps: Count = said("Observations of ground control points")
-    tie_coverage: Share = said("Share of the cells of an 8 x 8 grid that hold a tie point", head="covered", form=".0%")
-    rmse_before: Number = said("RMS reprojection error through the delivered cameras", "px", "before", ".3f")
-    rmse_after: Number = said("The same through the new cameras; null for a check", "px", "after", ".3f", adjusted=True)
-    smooth_px: Number = said("RMS of what is smooth in the residuals left, less noise", "px", "smooth", ".3f")
-    prior_scale: Number = said("By how much the camera's stated standard deviations were widened", "", "widened", ".1f")
-    correction: CorrectionEntry | None = said("The correction; null for a check")
-    camera_center: CenterEntry | None = said("Centre about which the camera was turned")
-    fit: FitEntry | None = said("Certificate of the refitted RPC; null where none was fitted")
-    outputs: Mapping[str, Mapping[str, float | str | None]] = said(
+    name: str = column("Unique in the run", head="image", minLength=1)
+    path: str = column("The image; empty for a view without pixels")
+    size: tuple[Side, Side] = column("Width, height", "px")
+    alt_range_m: tuple[float, float] = column("Altitudes that the camera is used for", ABOVE)
+    rpc_source: SourceEntry | None = column("Where the camera came from; null: not from a file")
+    gsd_m: Number = column("Ground sampling distance in the middle of the image", "m", "GSD", ".2f")
+    incidence_deg: Number = column("From the vertical to the sensor", "deg", "incidence", ".1f")
+    azimuth_deg: Number = column("Direction to the sensor, clockwise from north", "deg")
+    num_observations: Count = column("Tie-point observations that count", head="tie points")
+    num_rejected: Count = column("Observations that the adjustment cut as wrong", head="cut")
+    num_gcps: Count = column("Observations of ground control points")
+    tie_coverage: Share = column(
+        "Share of the cells of an 8 x 8 grid that hold a tie point", head="covered", form=".0%"
+    )
+    rmse_before: Number = column("RMS reprojection error through the delivered cameras", "px", "before", ".3f")
+    rmse_after: Number = column(
+        "The same through the new cameras; null for a check", "px", "after", ".3f", adjusted=True
+    )
+    smooth_px: Number = column("RMS of what is smooth in the residuals left, less noise", "px", "smooth", ".3f")
+    prior_scale: Number = column(
+        "By how much the camera's stated standard deviations were widened", "", "widened", ".1f"
+    )
+    correction: CorrectionEntry | None = column("The correction; null for a check")
+    camera_center: CenterEntry | None = column("Centre about which the camera was turned")
+    fit: FitEntry | None = column("Certificate of the refitted RPC; null where none was fitted")
+    outputs: Mapping[str, Mapping[str, float | str | None]] = column(
         "File -> consumer -> difference to P_BA in px, or why none",
         propertyNames={"pattern": "^[^/]+$"},
     )
-    status: Literal["adjusted", "consistent", "tied", "weak", "doubtful", "failed"] = said("Verdict on the image")
-    advice: str = said("What to do; empty when all is well")
-    cause: str | None = said("Why, by its name; null when all is well", default=None, enum=[*CAUSES, None])
-    num_moving: Count = said("Observations of tie points that move together, and took no part", default=0)
-    held_out_px: Number = said("RMS of tie points that took no part", "px", "not used", ".3f", default=None)
-    stated_ce90_m: Number = said("CE90 of the delivered camera", "m", "CE90 stated", ".1f", default=None)
-    smooth_p: Number = said("Chance that noise leaves smooth_px (F test)", "", "F test p", ".0e", default=None)
-    shared_px: Number = said("Error shared with the neighbour in row or column", "px", "shared", ".3f", default=None)
-    control_w: Number = said("Largest w of its control (Baarda)", "", "w", ".1f", default=None)
-    control_w_point: str | None = said("Control point that it is of", head="largest at", default=None)
-    date: str | None = said("Day it was taken, where its metadata say so", default=None)
-    certified: tuple[tuple[float, float, float, float, float], ...] | None = said(
+    status: Literal["adjusted", "consistent", "tied", "weak", "doubtful", "failed"] = column("Verdict on the image")
+    advice: str = column("What to do; empty when all is well")
+    cause: str | None = column("Why, by its name; null when all is well", default=None, enum=[*CAUSES, None])
+    num_moving: Count = column("Observations of tie points that move together, and took no part", default=0)
+    held_out_px: Number = column("RMS of tie points that took no part", "px", "not used", ".3f", default=None)
+    stated_ce90_m: Number = column("CE90 of the delivered camera", "m", "CE90 stated", ".1f", default=None)
+    smooth_p: Number = column("Chance that noise leaves smooth_px (F test)", "", "F test p", ".0e", default=None)
+    shared_px: Number = column("Error shared with the neighbour in row or column", "px", "shared", ".3f", default=None)
+    control_w: Number = column("Largest w of its control (Baarda)", "", "w", ".1f", default=None)
+    control_w_point: str | None = column("Control point that it is of", head="largest at", default=None)
+    date: str | None = column("Day it was taken, where its metadata say so", default=None)
+    certified: tuple[tuple[float, float, float, float, float], ...] | None = column(
         "Ground (lon, lat, alt) and where it is seen (col, row)", default=None
     )
 
 
 # --- how they are measured --------------------------------------------------------------------------------
 
-_SOURCE = attrgetter("format", "path", "notes")
+_SOURCE_FIELDS = attrgetter("format", "path", "notes")
 _CENTER = attrgetter("ecef", "altitude", "method")
 _FIT = attrgetter("rmse_ckp", "max_ckp", "min_denominator", "roundtrip", "coverage", "method", "num_ckp")
 
@@ -282,8 +296,8 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
     count, cut, moving = (np.bincount(tracks.view[rows], minlength=num).tolist() for rows in parts)
     gcps = np.zeros(num, np.int64) if run.gcps is None else np.bincount(run.gcps.view, minlength=num)
     cells = cell_numbers(tracks.xy[keep], np.array([view.size for view in run.views])[tracks.view[keep]])
-    filled = np.unique(cells + tracks.view[keep] * CELLS**2) // CELLS**2
-    covered = np.bincount(filled, minlength=num) / CELLS**2
+    filled = np.unique(cells + tracks.view[keep] * COVERAGE_CELLS**2) // COVERAGE_CELLS**2
+    covered = np.bincount(filled, minlength=num) / COVERAGE_CELLS**2
     before = Several(run.before, np.arange(num))
     middle = before.localize((np.array([view.size for view in run.views]) - 1) / 2, np.full(num, run.altitude))
     incidence, azimuth = view_angles(before, middle)
@@ -295,7 +309,7 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
             path=view.path,
             size=view.size,
             alt_range_m=view.alt_range,
-            rpc_source=SourceEntry(*_SOURCE(run.sources[i])) if run.sources else None,
+            rpc_source=SourceEntry(*_SOURCE_FIELDS(run.sources[i])) if run.sources else None,
             gsd_m=float(pixel[i]),
             incidence_deg=float(incidence[i]),
             azimuth_deg=float(azimuth[i]),
@@ -307,7 +321,7 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
             rmse_before=first[i],
             rmse_after=last[i],
             camera_center=CenterEntry(*_CENTER(run.centers[i])) if run.centers else None,
-            fit=_fit(run.fits[i]) if run.fits else None,
+            fit=_fit_entry(run.fits[i]) if run.fits else None,
             outputs=dict(run.written[i]) if run.written else {},
             date=view.date or None,
             stated_ce90_m=stated_ce90(view),
@@ -317,15 +331,15 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
             advice="",
             **adjusted,
         )
-        for i, (view, adjusted) in enumerate(zip(run.views, _adjusted(run, middle), strict=True))
+        for i, (view, adjusted) in enumerate(zip(run.views, _adjustment_values(run, middle), strict=True))
     )
 
 
-def _fit(fit: RpcFit) -> FitEntry:
+def _fit_entry(fit: RpcFit) -> FitEntry:
     return replace(FitEntry(*_FIT(fit)), localisation_m=None if fit.localisation is None else fit.localisation.max_m)
 
 
-def _adjusted(run: Run, middle: Array) -> list[dict[str, Any]]:
+def _adjustment_values(run: Run, middle: Array) -> list[dict[str, Any]]:
     """Return what an adjustment found of every image, at the ground points (N, 3) in the middle of each.
 
     `certified`: ground at its ends, and where its new camera sees it.
@@ -362,9 +376,11 @@ def rmse_by_view(residuals: Array, view: IntArray, num_views: int) -> Array:
 
 
 def cell_numbers(xy: Array, size: Sequence[int] | IntArray) -> IntArray:
-    """Return which of the `CELLS` x `CELLS` cells of an image, or each of its own (n, 2), points (n, 2) [px] lie in."""
-    col, row = ((xy + 0.5) / np.asarray(size) * CELLS).astype(np.int64).clip(0, CELLS - 1).T
-    return np.asarray(row * CELLS + col)
+    """Return which of the `COVERAGE_CELLS` x `COVERAGE_CELLS` cells of an image, or each of its own (n, 2), points (n,
+    2) [px] lie in.
+    """
+    col, row = ((xy + 0.5) / np.asarray(size) * COVERAGE_CELLS).astype(np.int64).clip(0, COVERAGE_CELLS - 1).T
+    return np.asarray(row * COVERAGE_CELLS + col)
 
 
 def _correction(adjustment: Adjustment, i: int, middle: Array, seen: tuple[Array, ...] | None) -> CorrectionEntry:
@@ -397,27 +413,29 @@ def _correction(adjustment: Adjustment, i: int, middle: Array, seen: tuple[Array
         return CorrectionEntry(*common, None, None, shift_px=shift, slope=slope)
     if not strange or isinstance(sensor, Timed):
         known |= {"center_sigma_px": uncertain.tolist(), "ellipse": place}
-    return CorrectionEntry(*common, moved.tolist(), **{"center_sigma_px": None, **known, **_in_image(spline)})
+    return CorrectionEntry(
+        *common, moved.tolist(), **{"center_sigma_px": None, **known, **_image_correction_entry(spline)}
+    )
 
 
-def _in_image(spline: RowSpline | None) -> dict[str, Any]:
+def _image_correction_entry(spline: RowSpline | None) -> dict[str, Any]:
     """Return what follows the correction in the image."""
     found: dict[str, Any] = {}
     if spline is None:
         return found
     if len(spline.coeffs):
-        rows = spline.row_offset + spline.row_scale * np.linspace(-1, 1, _ROWS)
+        rows = spline.row_offset + spline.row_scale * np.linspace(-1, 1, _SPLINE_ROWS)
         along = RowSpline(spline.coeffs, spline.row_offset, spline.row_scale).at(np.column_stack([rows, rows]))
-        found |= {"jitter_px": _size(along), "jitter_rows": spline.spacing}
+        found |= {"jitter_px": _rms_size(along), "jitter_rows": spline.spacing}
     if len(spline.steps):
-        found |= {"detector_px": _size(spline.steps), "detectors": tuple((spline.edges + 0.5).tolist())}
+        found |= {"detector_px": _rms_size(spline.steps), "detectors": tuple((spline.edges + 0.5).tolist())}
     if len(spline.strips):
-        found["strip_px"] = _size(spline.moved)
+        found["strip_px"] = _rms_size(spline.moved)
     if len(spline.swings):
         size = float(np.sqrt((spline.swings**2).sum()))  # of all together
         found |= {"swing_px": size, "swing_rows": tuple(spline.periods.tolist())}
     return found
 
 
-def _size(displacement: Array) -> float:
+def _rms_size(displacement: Array) -> float:
     return float(np.sqrt((displacement**2).sum(axis=-1).mean()))

@@ -18,8 +18,8 @@ import numpy as np
 
 from barpc.base.errors import BarpcError, InputError, RpcError, RpcFormatError, plain, visible
 from barpc.base.geodesy import Array
-from barpc.base.sidefile import MAX_XML, PRODUCT, opened, read_head, unread
-from barpc.base.usual import ROUNDING
+from barpc.base.safe_io import MAX_XML, PRODUCT, opened, read_head, unread
+from barpc.base.statistics import ROUNDING
 from barpc.sensor.curve import Orbit, fit_orbit
 from barpc.sensor.document import seconds
 from barpc.sensor.sentinel1.annotation import Annotation, BurstRows, burst_rows, read_annotation
@@ -45,7 +45,7 @@ __all__ = [
 
 T = TypeVar("T")
 MOSAIC = "mosaic"  # the swath of all swaths
-_NAME = re.compile(r"s1[a-d]-(?P<swath>\w+)-(slc|grd)-(?P<pol>vv|hh|vh|hv)-.*\.xml", re.IGNORECASE)
+_ANNOTATION_PATTERN = re.compile(r"s1[a-d]-(?P<swath>\w+)-(slc|grd)-(?P<pol>vv|hh|vh|hv)-.*\.xml", re.IGNORECASE)
 _POLARISATIONS = ("vv", "hh", "vh", "hv")
 
 
@@ -183,10 +183,10 @@ def _annotations(path: Path) -> list[_File]:
     if path.name == "manifest.safe":
         path = path.parent
     if path.is_dir():
-        files = [_named(file, None) for file in path.glob("annotation/*.xml")]
+        files = [_annotation_file(file, None) for file in path.glob("annotation/*.xml")]
     elif read_head(path, PRODUCT, 4) in (b"PK\3\4", b"PK\5\6"):
         names = _from_zip(path, "a zip file that", zipfile.ZipFile.namelist)
-        files = [_named(path, name) for name in names if PurePosixPath(name).parent.name == "annotation"]
+        files = [_annotation_file(path, name) for name in names if PurePosixPath(name).parent.name == "annotation"]
     else:
         annotation = read_annotation(path)
         if (polarisation := annotation.polarisation.lower()) not in _POLARISATIONS:
@@ -197,9 +197,9 @@ def _annotations(path: Path) -> list[_File]:
     return sorted(file for file in files if file is not None)
 
 
-def _named(path: Path, member: str | None) -> _File | None:
+def _annotation_file(path: Path, member: str | None) -> _File | None:
     """Return the file, if its name is that of an annotation."""
-    match = _NAME.fullmatch(path.name if member is None else PurePosixPath(member).name)
+    match = _ANNOTATION_PATTERN.fullmatch(path.name if member is None else PurePosixPath(member).name)
     return match and _File(match["swath"].lower(), match["pol"].lower(), path, member)
 
 

@@ -16,9 +16,9 @@ import numpy.typing as npt
 
 from barpc.base.errors import RpcFormatError
 from barpc.base.geodesy import Array
-from barpc.base.sidefile import parse_xml
-from barpc.sensor.curve import MARGIN
-from barpc.sensor.document import Fields, seconds
+from barpc.base.safe_io import parse_xml
+from barpc.sensor.curve import ORBIT_MARGIN
+from barpc.sensor.document import XmlFields, seconds
 
 TimeArray = npt.NDArray[np.datetime64]
 
@@ -154,7 +154,7 @@ def read_annotation(source: bytes | Path, name: str | None = None) -> Annotation
             "give annotation/s1?-*.xml, not calibration, noise or rfi"
         )
     info, timing = "imageAnnotation/imageInformation/", "swathTiming/"
-    values, processing = Fields(root, name), "imageAnnotation/processingInformation/"
+    values, processing = XmlFields(root, name), "imageAnnotation/processingInformation/"
     downlink = "generalAnnotation/downlinkInformationList/downlinkInformation/downlinkValues/"
     return Annotation(
         name=name,
@@ -189,7 +189,7 @@ def read_orbit_file(path: Path, annotation: Annotation) -> StateVectors:
     """
     mission, start, stop = annotation.mission, annotation.first_line_time, annotation.last_line_time
     root = parse_xml(path, strip_namespaces=True)
-    vectors = Fields(root, str(path)).all("Data_Block/List_of_OSVs/OSV")
+    vectors = XmlFields(root, str(path)).all("Data_Block/List_of_OSVs/OSV")
     if not vectors:
         raise RpcFormatError(f"{path}: not a Sentinel-1 orbit file (no List_of_OSVs)")
     owner = root.findtext("Earth_Explorer_Header/Fixed_Header/Mission", "").strip()
@@ -198,8 +198,8 @@ def read_orbit_file(path: Path, annotation: Annotation) -> StateVectors:
     frame = root.findtext("Earth_Explorer_Header/Variable_Header/Ref_Frame", "EARTH_FIXED").strip()
     if frame != "EARTH_FIXED":
         raise RpcFormatError(f"{path}: state vectors in {frame}, EARTH_FIXED is needed")
-    times = _times(vectors, "UTC")
-    pad = np.timedelta64(int(MARGIN * 1e9), "ns")
+    times = _row_times(vectors, "UTC")
+    pad = np.timedelta64(int(ORBIT_MARGIN * 1e9), "ns")
     near = np.flatnonzero((times >= start - pad) & (times <= stop + pad))
     if not len(near):
         raise RpcFormatError(
@@ -209,17 +209,17 @@ def read_orbit_file(path: Path, annotation: Annotation) -> StateVectors:
     return _states([vectors[i] for i in near], "UTC", ("X", "Y", "Z", "VX", "VY", "VZ"), kind)
 
 
-def _times(rows: Sequence[Fields], tag: str) -> TimeArray:
+def _row_times(rows: Sequence[XmlFields], tag: str) -> TimeArray:
     return np.array([row.time(tag) for row in rows], dtype="datetime64[ns]")
 
 
-def _states(vectors: Sequence[Fields], time: str, tags: Sequence[str], source: str) -> StateVectors:
+def _states(vectors: Sequence[XmlFields], time: str, tags: Sequence[str], source: str) -> StateVectors:
     """Return the state vectors whose time is named `time`, and x, y, z of position and of velocity by `tags`."""
     table = np.reshape([[v.numbers(tag)[0] for tag in tags] for v in vectors], (-1, 6))
-    return StateVectors(_times(vectors, time), table[:, :3], table[:, 3:], source)
+    return StateVectors(_row_times(vectors, time), table[:, :3], table[:, 3:], source)
 
 
-def _annotated_states(root: Fields) -> StateVectors:
+def _annotated_states(root: XmlFields) -> StateVectors:
     vectors = root.all("generalAnnotation/orbitList/orbit")
     if any(v.text("frame") != "Earth Fixed" for v in vectors):
         raise RpcFormatError(f"{root.name}: orbit state vectors are not Earth fixed; give an orbit file")
@@ -228,31 +228,31 @@ def _annotated_states(root: Fields) -> StateVectors:
     return _states(vectors, "time", tags, source.strip())
 
 
-def _burst(burst: Fields) -> Burst:
+def _burst(burst: XmlFields) -> Burst:
     first, last = (burst.numbers(tag).astype(np.int64) for tag in ("firstValidSample", "lastValidSample"))
     if first.shape != last.shape:
         raise RpcFormatError(f"{burst.name}: a burst lists {len(first)} first and {len(last)} last valid samples")
     return Burst(burst.time("azimuthTime"), first, last)
 
 
-def _ground_range(root: Fields) -> GroundRange | None:
+def _ground_range(root: XmlFields) -> GroundRange | None:
     rows = root.all("coordinateConversion/coordinateConversionList/coordinateConversion")
     if not rows:
         return None
     forward, backward = ([row.numbers(tag) for row in rows] for tag in ("srgrCoefficients", "grsrCoefficients"))
     if len({len(c) for c in forward}) > 1 or len({len(c) for c in backward}) > 1:
         raise RpcFormatError(f"{root.name}: ground range polynomials of different lengths")
-    time = _times(rows, "azimuthTime")
+    time = _row_times(rows, "azimuthTime")
     if not (np.diff(time) > np.timedelta64(0, "ns")).all():
         raise RpcFormatError(f"{root.name}: the times of the ground range polynomials do not rise")
     origin = np.array([row.numbers("sr0")[0] for row in rows])
     return GroundRange(time, origin, np.array(forward), np.array(backward))
 
 
-def _grid(root: Fields) -> GridPoints:
+def _grid(root: XmlFields) -> GridPoints:
     points = root.all("geolocationGrid/geolocationGridPointList/geolocationGridPoint")
     if not points:
         raise RpcFormatError(f"{root.name}: no geolocation grid; is the file complete?")
     tags = ("slantRangeTime", "pixel", "line", "longitude", "latitude", "height")
     table = np.array([[point.numbers(tag)[0] for tag in tags] for point in points])
-    return GridPoints(_times(points, "azimuthTime"), table[:, 0], table[:, 1:3], table[:, 3:6])
+    return GridPoints(_row_times(points, "azimuthTime"), table[:, 0], table[:, 1:3], table[:, 3:6])

@@ -16,7 +16,7 @@ from numpy.polynomial import Polynomial
 
 from barpc.base.errors import InputError
 from barpc.base.frozen import Frozen
-from barpc.base.geodesy import NEWTON_STEPS, SETTLED, SPEED_OF_LIGHT, Array, enu_basis, up
+from barpc.base.geodesy import NEWTON_STEPS, NEWTON_TOLERANCE, SPEED_OF_LIGHT, Array, enu_basis, up
 from barpc.sensor.document import seconds
 from barpc.sensor.sentinel1.annotation import Annotation
 from barpc.sensor.timing import Timing
@@ -80,7 +80,7 @@ class GroundFrame(Frozen):
             ground, by_slant, _ = self._ground_range(time, slant)
             step = (target - ground) / by_slant
             slant = slant + step
-            if not (np.abs(step).max(initial=0.0, where=np.isfinite(step)) > SETTLED):
+            if not (np.abs(step).max(initial=0.0, where=np.isfinite(step)) > NEWTON_TOLERANCE):
                 break
         return np.stack([time, slant * (2.0 / SPEED_OF_LIGHT)])
 
@@ -107,7 +107,7 @@ class GroundFrame(Frozen):
         return self.coeffs[k].T + rates * since, rates, self.origin[k] + drift * since, drift
 
 
-Frame = SlantFrame | GroundFrame
+RangeFrame = SlantFrame | GroundFrame
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import numpy as np
 from barpc.base.errors import InputError, RpcFormatError
 from barpc.base.geodesy import (
     NEWTON_STEPS,
-    SETTLED,
+    NEWTON_TOLERANCE,
     SPEED_OF_LIGHT,
     Array,
     ecef_from_ground,
@@ -26,7 +26,7 @@ from barpc.base.geodesy import (
 from barpc.sensor.curve import Curve, Orbit, fit_orbit
 from barpc.sensor.document import seconds, warn_off_grid
 from barpc.sensor.sentinel1.annotation import Annotation, StateVectors, burst_rows, read_annotation, read_orbit_file
-from barpc.sensor.sentinel1.frames import Bistatic, Delays, Frame, GroundFrame, SlantFrame, bistatic_constant
+from barpc.sensor.sentinel1.frames import Bistatic, Delays, GroundFrame, RangeFrame, SlantFrame, bistatic_constant
 from barpc.sensor.timing import Clocked, Timing, aside, dot, on_circle
 
 RELIEF = (200.0, 500.0)
@@ -36,7 +36,7 @@ ORBITS = {"AUX_POEORB": 0.05, "AUX_RESORB": 0.1, "AUX_PREORB": 0.4, "Auxiliary":
 """Source of an orbit -> its error [m], RMS in space. Precise, restituted: what is required (Copernicus Sentinel news of
 13 April 2021); predicted: 0.15 to 0.35 m (9 September 2022). An annotation does not tell which of these its own is. The
 receiver's own solution, downlinked, and of no known source: 2.43 m (the same news)."""
-LEFT = ((3.5, 0.5), (4.0, 0.5))
+RESIDUAL_DELAYS = ((3.5, 0.5), (4.0, 0.5))
 """What the atmosphere adds to the range at the far side of a swath [m], and of that, corrected, ionosphere and water
 vapour; the bistatic delay along the flight, and of that, corrected, the Doppler rate at another height than assumed."""
 
@@ -62,7 +62,7 @@ class RangeDoppler(Clocked):
 
     orbit: Curve
     epoch: np.datetime64
-    frame: Frame
+    frame: RangeFrame
     size: tuple[int, int]
     alt_range: tuple[float, float]
     look: Literal["right", "left"] = "right"
@@ -142,10 +142,13 @@ class RangeDoppler(Clocked):
         )
         return azimuth_time, range_time
 
-    def _geometry(self, ecef: Array) -> _Seen:
+    def _geometry(self, ecef: Array) -> _ZeroDopplerPoints:
         point = ecef.T
         low, high = self.orbit.span
-        time, settled = np.where(np.isfinite(point[0]), (low + high) / 2, np.nan), SETTLED * self.frame.interval
+        time, settled = (
+            np.where(np.isfinite(point[0]), (low + high) / 2, np.nan),
+            NEWTON_TOLERANCE * self.frame.interval,
+        )
         for _ in range(NEWTON_STEPS):
             position, velocity, acceleration = self.orbit.states(time)
             sight = position - point
@@ -162,7 +165,7 @@ class RangeDoppler(Clocked):
         side = dot(aside(position, velocity, self.look == "right"), sight)
         time[~((time > low) & (time < high) & (side < 0) & (step <= settled))] = np.nan
         times = np.stack([time, distance * (2.0 / SPEED_OF_LIGHT)])
-        return _Seen(times, sight, distance, velocity, -velocity / rate)
+        return _ZeroDopplerPoints(times, sight, distance, velocity, -velocity / rate)
 
     def _to_radar(self, ground: Array) -> Array:
         seen = self._geometry(ecef_from_ground(ground))
@@ -212,7 +215,7 @@ class RangeDoppler(Clocked):
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _ZeroDopplerPoints:
     """Points at zero Doppler: times (2, N), sight (3, N) unit, distance (N,), velocity and dt/dX (3, N)."""
 
     times: Array
@@ -252,11 +255,14 @@ def swaths_model(
     nearest = swaths[0]
     alt = np.concatenate([a.grid.ground[:, 2] for a in swaths])
     states = nearest.states if orbit is None else read_orbit_file(orbit, nearest)
-    of_orbit, left = ORBITS.get(states.source, ORBITS["Downlink"]), (LEFT[0][atmosphere], LEFT[1][bistatic == "full"])
+    of_orbit, left = (
+        ORBITS.get(states.source, ORBITS["Downlink"]),
+        (RESIDUAL_DELAYS[0][atmosphere], RESIDUAL_DELAYS[1][bistatic == "full"]),
+    )
     model = RangeDoppler(
-        orbit=_orbit(nearest, states, epoch),
+        orbit=_fitted_orbit(nearest, states, epoch),
         epoch=epoch,
-        frame=_frame(nearest, epoch),
+        frame=_range_frame(nearest, epoch),
         size=size,
         alt_range=(float(np.floor(alt.min()) - RELIEF[0]), float(np.ceil(alt.max()) + RELIEF[1])),
         delays=Delays(atmosphere, None if bistatic is None else bistatic_constant(nearest, bistatic)),
@@ -276,12 +282,12 @@ def grid_residuals(annotation: Annotation, model: RangeDoppler) -> Array:
     return np.stack([samples, lines], axis=1)
 
 
-def _orbit(annotation: Annotation, states: StateVectors, epoch: np.datetime64) -> Orbit:
+def _fitted_orbit(annotation: Annotation, states: StateVectors, epoch: np.datetime64) -> Orbit:
     start, stop = (float(seconds(t, epoch)) for t in (annotation.first_line_time, annotation.last_line_time))
     return fit_orbit(seconds(states.time, epoch), states.position, states.velocity, (start, stop))
 
 
-def _frame(annotation: Annotation, epoch: np.datetime64) -> Frame:
+def _range_frame(annotation: Annotation, epoch: np.datetime64) -> RangeFrame:
     """Return the frame of an SLC, or of a GRD (which has ground range polynomials)."""
     interval, convert = annotation.azimuth_time_interval, annotation.ground_range
     if annotation.product_type == "SLC":

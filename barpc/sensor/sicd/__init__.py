@@ -13,9 +13,9 @@ import numpy as np
 
 from barpc.base.errors import InputError, RpcFormatError, plain
 from barpc.base.geodesy import ALTITUDES, EARTH_RATE, Array, ground_from_ecef
-from barpc.base.sidefile import MAX_XML, PRODUCT, opened, parse_xml
+from barpc.base.safe_io import MAX_XML, PRODUCT, opened, parse_xml
 from barpc.sensor.curve import Curve
-from barpc.sensor.document import RELIEF_AROUND, Fields, padded
+from barpc.sensor.document import RELIEF_AROUND, XmlFields, padded
 from barpc.sensor.sicd.monostatic import Formation, ImagePlane, Monostatic, PolarFormat, RangeAzimuth, ZeroDoppler
 
 _ORDER = 30  # no polynomial of a document has so high a power
@@ -86,17 +86,17 @@ def open_sicd(path: Path) -> Monostatic:
     data = find_sicd(path)
     if data is None:
         raise RpcFormatError(f"{path}: no SICD metadata in it")
-    root = Fields(parse_xml(data, name=str(path), strip_namespaces=True), str(path))
+    root = XmlFields(parse_xml(data, name=str(path), strip_namespaces=True), str(path))
     if root.element.findtext("CollectionInfo/CollectType", "MONOSTATIC").strip() != "MONOSTATIC":
         raise InputError(f"{path}: a bistatic image; only monostatic ones are read")
     scp = _vector(root, "GeoData/SCP/ECF")
     altitude = float(ground_from_ecef(scp)[2])
     if not ALTITUDES[0] <= altitude <= ALTITUDES[1]:
         raise RpcFormatError(f"{path}: GeoData/SCP/ECF is {altitude:.0f} m above the ellipsoid, not on the ground")
-    first = [_whole(root, f"ImageData/First{axis}") for axis in ("Row", "Col")]
-    center = [_whole(root, f"ImageData/SCPPixel/{axis}") for axis in ("Row", "Col")]
+    first = [_integer(root, f"ImageData/First{axis}") for axis in ("Row", "Col")]
+    center = [_integer(root, f"ImageData/SCPPixel/{axis}") for axis in ("Row", "Col")]
     model = Monostatic(
-        orbit=_orbit(root),
+        orbit=_read_orbit(root),
         formation=_formation(root, scp),
         spacing=(root.positive("Grid/Row/SS"), root.positive("Grid/Col/SS")),
         origin=(center[0] - first[0], center[1] - first[1]),
@@ -114,15 +114,15 @@ def open_sicd(path: Path) -> Monostatic:
     return model
 
 
-def _whole(root: Fields, path: str) -> int:
+def _integer(root: XmlFields, path: str) -> int:
     return int(root.numbers(path)[0])
 
 
-def _vector(root: Fields, path: str) -> Array:
+def _vector(root: XmlFields, path: str) -> Array:
     return np.array([root.numbers(f"{path}/{axis}")[0] for axis in "XYZ"])
 
 
-def _accuracy(root: Fields, scp: Array) -> tuple[float, float] | None:
+def _accuracy(root: XmlFields, scp: Array) -> tuple[float, float] | None:
     """Return the stated accuracy of range and along the flight [m]: of the scene centre, else of orbit and range."""
     whole = _error(root, "CompositeSCP//Rg"), _error(root, "CompositeSCP//Az")
     orbit = np.array([_error(root, f"Components/PosVelErr/P{k}") for k in (1, 2, 3)])
@@ -144,18 +144,18 @@ def _accuracy(root: Fields, scp: Array) -> tuple[float, float] | None:
     return found if np.isfinite(found).all() else None
 
 
-def _error(root: Fields, path: str) -> float:
+def _error(root: XmlFields, path: str) -> float:
     """Return a standard deviation [m]; 0 where it is not stated."""
     return max([0.0, *(float(one.numbers(".")[0]) for one in root.all(f"ErrorStatistics/{path}"))])
 
 
-def _orbit(root: Fields) -> Curve:
+def _read_orbit(root: XmlFields) -> Curve:
     """Read ARPPoly over the time of the collection."""
     coeffs = padded(_polynomial(root, f"Position/ARPPoly/{axis}", 1) for axis in "XYZ")
     return Curve.polynomial(coeffs.T, 0.0, root.positive("Timeline/CollectDuration"))
 
 
-def _polynomial(root: Fields, path: str, variables: int) -> Array:
+def _polynomial(root: XmlFields, path: str, variables: int) -> Array:
     """Return the coefficients by their powers, (K,) or (K, L)."""
     terms = root.all(f"{path}/Coef")
     if not terms:
@@ -170,7 +170,7 @@ def _polynomial(root: Fields, path: str, variables: int) -> Array:
     return coeffs
 
 
-def _formation(root: Fields, scp: Array) -> Formation:
+def _formation(root: XmlFields, scp: Array) -> Formation:
     """Return the formation by Grid/Type and, for RGAZIM, ImageFormation/ImageFormAlgo."""
     time, kind = _polynomial(root, "Grid/TimeCOAPoly", 2), root.text("Grid/Type")
     if kind == "RGAZIM":

@@ -17,12 +17,12 @@ from numpy.polynomial.polynomial import polyder, polyval, polyval2d
 
 from barpc.base.errors import RpcError
 from barpc.base.frozen import Frozen
-from barpc.base.geodesy import NEWTON_STEPS, SETTLED, Array, ecef_from_ground, ecef_from_ground_jacobian
+from barpc.base.geodesy import NEWTON_STEPS, NEWTON_TOLERANCE, Array, ecef_from_ground, ecef_from_ground_jacobian
 from barpc.sensor.curve import Curve
 from barpc.sensor.timing import Clocked, Timing, aside, dot, on_circle
 
-_STEP = 1.0  # m: central differences over so much are exact to 1e-9
-_BEYOND = 1.0  # sides of the image around it that its polynomials are believed for
+_DIFFERENCE_STEP = 1.0  # m: central differences over so much are exact to 1e-9
+_VALIDITY_MARGIN = 1.0  # sides of the image around it that its polynomials are believed for
 
 
 class Aperture(NamedTuple):
@@ -210,7 +210,7 @@ class Monostatic(Clocked):
         """The lowest and highest (x, y) (2, 1) [m] that are believed."""
         sides = np.array([self.size[1], self.size[0]], dtype=np.float64)
         spacing, origin = np.array(self.spacing), np.array(self.origin)
-        low, high = (-_BEYOND * sides - origin) * spacing, ((1 + _BEYOND) * sides - origin) * spacing
+        low, high = (-_VALIDITY_MARGIN * sides - origin) * spacing, ((1 + _VALIDITY_MARGIN) * sides - origin) * spacing
         return low[:, None], high[:, None]
 
     def _image(self, plane: Array) -> Array:
@@ -239,9 +239,9 @@ class Monostatic(Clocked):
 
     def _by_plane(self, plane: Array, point: Array) -> Array:
         """Return the derivative (2, 2, N) of `_miss` by (x, y)."""
-        steps = _STEP * np.eye(2)[:, :, None]
+        steps = _DIFFERENCE_STEP * np.eye(2)[:, :, None]
         columns = [self._miss(plane + s, point)[0] - self._miss(plane - s, point)[0] for s in steps]
-        return np.stack(columns, axis=1) / (2 * _STEP)
+        return np.stack(columns, axis=1) / (2 * _DIFFERENCE_STEP)
 
     def _project(self, ground: Array) -> Array:
         return self._image(self._solve(ecef_from_ground(ground).T)[0])
@@ -252,14 +252,14 @@ class Monostatic(Clocked):
         plane = np.where(np.isfinite(point[:2]), 0.0, np.nan)
         for _ in range(NEWTON_STEPS):
             slope = self._by_plane(plane, point)
-            moved = np.clip(plane - _solve(slope, self._miss(plane, point)[0]), low, high)
+            moved = np.clip(plane - _solve_systems(slope, self._miss(plane, point)[0]), low, high)
             step, plane = np.abs(moved - plane).max(axis=0), moved
-            if not (step.max(initial=0.0, where=np.isfinite(step)) > SETTLED):
+            if not (step.max(initial=0.0, where=np.isfinite(step)) > NEWTON_TOLERANCE):
                 break
         _, seen, sight, _ = self._miss(plane, point)
         side = dot(aside(seen.position, seen.velocity, self.look == "right"), sight)
         inside = ((plane > low) & (plane < high)).all(axis=0)
-        plane[:, ~(inside & (side < 0) & (step <= SETTLED))] = np.nan
+        plane[:, ~(inside & (side < 0) & (step <= NEWTON_TOLERANCE))] = np.nan
         return plane, slope
 
     def _to_radar(self, ground: Array) -> Array:
@@ -273,13 +273,13 @@ class Monostatic(Clocked):
         _, seen, sight, distance = self._miss(plane, point)
         toward = dot(seen.velocity, sight)
         by_point = np.stack([sight, (seen.velocity - toward * sight) / distance])  # (2, 3, N)
-        moved = -np.stack([_solve(slope, by_point[:, k]) for k in range(3)], axis=1)  # d(x, y)/dX
+        moved = -np.stack([_solve_systems(slope, by_point[:, k]) for k in range(3)], axis=1)  # d(x, y)/dX
         by_ground = np.einsum("ikn,nkj->nij", moved, ecef_from_ground_jacobian(ground))
         acceleration = self.orbit.states(seen.time)[2]
         turning = dot(acceleration, sight) + (dot(seen.velocity, seen.velocity) - toward**2) / distance
         zero = np.zeros_like(toward)
         by_late = np.array([[-zero - 1.0, toward], [zero, turning]])  # of the miss, by range and time
-        by_timing = -np.stack([_solve(slope, by_late[:, k]) for k in range(2)], axis=1)
+        by_timing = -np.stack([_solve_systems(slope, by_late[:, k]) for k in range(2)], axis=1)
         image, pixel = self._image(plane), np.array(self.spacing)[:, None]
         timing = np.moveaxis(by_timing, -1, 0) / pixel
         return image, (by_ground / pixel)[:, ::-1], timing[:, ::-1], image[:, 0]
@@ -294,7 +294,7 @@ class Monostatic(Clocked):
         return ground
 
 
-def _solve(matrix: Array, right: Array) -> Array:
+def _solve_systems(matrix: Array, right: Array) -> Array:
     """Return the solutions (2, N) of 2 x 2 systems (2, 2, N)."""
     (a, b), (c, d) = matrix
     solved: Array = np.stack([d * right[0] - b * right[1], a * right[1] - c * right[0]]) / (a * d - b * c)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from barpc.base.geodesy import Array
 from barpc.base.options import TieOptions
-from barpc.base.usual import MANY
+from barpc.base.statistics import MANY
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.overlaps import Pair, shared_tiles
@@ -35,7 +35,9 @@ _HOLDS = {2: 4.5e-3, 4: 1.2e-3}  # keypoints a px that real images hold, looked 
 _PART = 0.1
 """Verified matches of a pair that make a closer look needless, as a part of the points wanted of an image, at least
 `MANY`: with 250 tracks in place of 3664 three real pairs meet check points alike, to 0.139, 0.154, 0.129 px."""
-_HELD = 4.0  # keypoints that images are to hold for each of these, or nothing is gained; the triplet has 2.1 to 2.5
+_MIN_KEYPOINT_RATIO = (
+    4.0  # keypoints that images are to hold for each of these, or nothing is gained; the triplet has 2.1 to 2.5
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +82,11 @@ class Sift:
         found = self._sift.detect(picture, None)
         if not found:  # OpenCV fails where there is nothing to describe
             return join_keypoints([])
-        kept = keep(*_table(found))
+        kept = keep(*_keypoint_arrays(found))
         described, raw = self._sift.compute(picture, [_an_octave_up(found[i]) for i in kept])
         if raw is None:
             return join_keypoints([])
-        xy, scale, response = _table(described)
+        xy, scale, response = _keypoint_arrays(described)
         root = np.sqrt(raw / np.maximum(np.abs(raw).sum(axis=1, keepdims=True), 1e-9))
         angle = np.radians([k.angle for k in described])
         return Keypoints(xy, scale, angle, response, np.rint(255 * root).astype(np.uint8))
@@ -101,34 +103,34 @@ def _an_octave_up(keypoint: Any) -> Any:
     return keypoint
 
 
-def _table(found: Sequence[Any]) -> tuple[Array, Array, Array]:
+def _keypoint_arrays(found: Sequence[Any]) -> tuple[Array, Array, Array]:
     table = np.array([(*k.pt, k.size, k.response) for k in found], dtype=np.float64).reshape(-1, 4)
     return table[:, :2], table[:, 2], table[:, 3]
 
 
 @dataclass(frozen=True)
-class Share:
+class KeypointDensity:
     """How densely a tile's keypoints are looked for."""
 
     density: float  # keypoints a px of the image
     zoom: int = 1  # px of the image a side of a pixel that is looked at
 
     @staticmethod
-    def of(size: tuple[int, int], options: TieOptions, coarse: bool = False) -> Share:
+    def of(size: tuple[int, int], options: TieOptions, coarse: bool = False) -> KeypointDensity:
         """Return the share of a whole image of `size` (width, height); `coarse`: of a first look."""
         area = size[0] * size[1]
         wanted = min(PER_IMAGE, AMPLE * options.points_per_image) / area
         zooms = (zoom for below, zoom in _ZOOMS if wanted < below and min(size) > zoom * options.tile)
         zoom = next(zooms, 1)
         if coarse:
-            return Share(wanted, min(2 * zoom, max(_HOLDS)))
-        return Share(PER_IMAGE / area, zoom)
+            return KeypointDensity(wanted, min(2 * zoom, max(_HOLDS)))
+        return KeypointDensity(PER_IMAGE / area, zoom)
 
     def expected(self, size: tuple[int, int]) -> float:
         """Estimate the number of keypoints of an image of `size` (width, height) with detail all over."""
         return min(self.density, _HOLDS.get(self.zoom, np.inf)) * size[0] * size[1]
 
-    def within(self, used: float) -> Share:
+    def within(self, used: float) -> KeypointDensity:
         """Return the share where only a part of the image is used, in powers of two, so that it seldom changes."""
         return replace(self, density=self.density * 2.0 ** float(np.floor(-np.log2(min(max(used, 1e-6), 1.0)))))
 
@@ -149,12 +151,12 @@ def ample_matches(options: TieOptions) -> int:
 
 def worth_a_first_look(sizes: Sequence[tuple[int, int]], options: TieOptions) -> bool:
     """Return whether images of `sizes` (width, height) are large enough for a first look at less detail."""
-    needed = _HELD * ample_matches(options)
-    return all(Share.of(size, options, coarse=True).expected(size) >= needed for size in sizes)
+    needed = _MIN_KEYPOINT_RATIO * ample_matches(options)
+    return all(KeypointDensity.of(size, options, coarse=True).expected(size) >= needed for size in sizes)
 
 
 def detect_tile(
-    path: str, size: tuple[int, int], box: Box, found: Survey, share: Share, options: TieOptions
+    path: str, size: tuple[int, int], box: Box, found: Survey, share: KeypointDensity, options: TieOptions
 ) -> Keypoints:
     """Detect the keypoints of one tile of an image of `size` (width, height), the most important first.
 
@@ -179,7 +181,7 @@ def detect_tile(
     return every.select(ranked(every.xy, every.response, share.cell, len(every)))
 
 
-def _detect_part(picture: ByteImage, valid: BoolArray, part: Box, origin: Array, share: Share) -> Keypoints:
+def _detect_part(picture: ByteImage, valid: BoolArray, part: Box, origin: Array, share: KeypointDensity) -> Keypoints:
     """Return the keypoints inside a part of an image; the first pixel's centre is at `origin` [px]."""
     inner = np.array(part[:2]) - 0.5, np.add(part[:2], part[2:]) - 0.5
     distance = None
@@ -259,7 +261,9 @@ class KeypointFiles:
         return join_keypoints(parts), np.concatenate(numbers)
 
 
-def keep_tile(store: Store, name: str, task: tuple[str, tuple[int, int], Box, Survey, Share, TieOptions]) -> int:
+def keep_tile(
+    store: Store, name: str, task: tuple[str, tuple[int, int], Box, Survey, KeypointDensity, TieOptions]
+) -> int:
     """Detect the keypoints of a tile by `detect_tile(*task)` and keep them in the store; return their number."""
     known = store.read(name)
     if known is not None and "xy" in known:
@@ -298,7 +302,7 @@ def locate(
     """
     assert work.store is not None
     found = work.ordered(survey, [(v.path, options.band, v.size) for v in views], "read")
-    shares = [Share.of(view.size, options, coarse) for view in views]
+    shares = [KeypointDensity.of(view.size, options, coarse) for view in views]
     each = zip(views, found, shares, strict=True)
     boxes = [tiles(v.size, options, share.zoom, known) if known else [] for v, known, share in each]
     if pairs is not None:

@@ -11,13 +11,13 @@ import numpy as np
 from scipy.special import bdtrc
 
 from barpc.base.options import TieOptions
-from barpc.base.usual import CHANCE
+from barpc.base.statistics import CHANCE
 from barpc.scene import View
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
 from barpc.tie.matchers.matching import Ends, PairReport, better, match_pair
-from barpc.tie.pairing.epipolar import frame, robust_affine
-from barpc.tie.pairing.overlaps import GIVEN, Pair
+from barpc.tie.pairing.epipolar import epipolar_segments, robust_affine
+from barpc.tie.pairing.overlaps import GIVEN_PAIR, Pair
 from barpc.tie.tasks import Work
 
 logger = logging.getLogger(__name__)
@@ -43,14 +43,14 @@ class GivenMatcher:
         return Matches(xy, score, np.stack([rows, rows], axis=1)).select(inside)
 
 
-_GIVEN = f"{__name__}:{GivenMatcher.__name__}"
+_GIVEN_MATCHER = f"{__name__}:{GivenMatcher.__name__}"
 
 
 def verify_given(
     views: Sequence[View], given: GivenMatches, pairs: Sequence[Pair], options: TieOptions, work: Work
 ) -> list[tuple[Matches, PairReport]]:
     """Verify given matches of each pair against the cameras, with its report: `match_pair` with what is given."""
-    chosen = replace(options, matcher=_GIVEN)
+    chosen = replace(options, matcher=_GIVEN_MATCHER)
     tasks = []
     for pair in pairs:
         ends = (views[pair.views[0]], views[pair.views[1]])
@@ -62,7 +62,7 @@ def verify_given(
             report = replace(report, status="too few matches given")
         if report.status == "ok" and not _stand_out(task[0], given[pair.views], found):
             found, report = NO_MATCHES, replace(report, status="no more agree than by chance", verified=0)
-        report = replace(report, matcher=GIVEN)
+        report = replace(report, matcher=GIVEN_PAIR)
         verified.append((replace(found, index=given[pair.views].index[found.index[:, 0]]), report))
     return verified
 
@@ -85,7 +85,7 @@ def _stand_out(ends: Ends, given: Matches, found: Matches) -> bool:
     lie as far again from it, and not by chance: false ones are as many here as there, wherever a matcher looked.
     """
     rows, places = found.index[:, 0], given.xy[:, 0]
-    across = frame(*ends, places).errors(given.xy[:, 1])[:, 1]
+    across = epipolar_segments(*ends, places).errors(given.xy[:, 1])[:, 1]
     off = np.abs(across - robust_affine(places[rows], across[rows])(places))
     within, about = (int((off <= reach).sum()) for reach in off[rows].max() * np.array([1.0, 2.0]))
     return bool(bdtrc(within - 1, about, 0.5) < CHANCE)

@@ -13,7 +13,7 @@ from barpc.base.geodesy import Array
 from barpc.base.options import TieOptions
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.matchers.features import Keypoints
-from barpc.tie.matchers.matcher import APART, NO_MATCHES, Matches, Prediction
+from barpc.tie.matchers.matcher import DUPLICATE_DISTANCE, NO_MATCHES, Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments
 
 FloatArray = npt.NDArray[np.float32]
@@ -44,7 +44,9 @@ class Guided:
             self._prepared = where.turn(self._b.xy), *described
         turned, first, second = self._prepared
         best = _Best(len(self._a), len(self._b))
-        for rows, cols in _near(where, prediction.half_width, prediction.chosen(len(self._a)), turned, first, second):
+        for rows, cols in _pairs_in_band(
+            where, prediction.half_width, prediction.chosen(len(self._a)), turned, first, second
+        ):
             du = turned[cols, 0] - where.along[rows]
             dw = turned[cols, 1] - where.across[rows] - where.slope[rows] * du
             allowed = np.abs(dw) <= prediction.half_width
@@ -108,7 +110,7 @@ class _Best:
         hit = hit[np.argsort(-cols[hit])]
         pick[of[hit]] = hit  # of equals the first of B
         self._of_a[row], self._top[row] = cols[pick], top
-        same = (np.abs(du - du[pick][of]) <= APART) & (np.abs(dw - dw[pick][of]) <= APART)
+        same = (np.abs(du - du[pick][of]) <= DUPLICATE_DISTANCE) & (np.abs(dw - dw[pick][of]) <= DUPLICATE_DISTANCE)
         self._second[row] = np.maximum.reduceat(np.where(same, np.float32(-np.inf), likeness), begin)
         more = np.flatnonzero(likeness > self._top_b[cols])
         np.maximum.at(self._top_b, cols[more], likeness[more])
@@ -128,7 +130,7 @@ class _Best:
         return np.stack([found, self._of_a[found]], axis=1), distance, distance / rival
 
 
-def _near(
+def _pairs_in_band(
     where: EpipolarSegments, across: float, wanted: IntArray, turned: Array, first: _Described, second: _Described
 ) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield pairs (P,), (P,) of points of A and the points of B, `turned`, in a box about their band, row by row.

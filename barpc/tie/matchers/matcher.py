@@ -27,7 +27,7 @@ from barpc.tie.matchers.features import Keypoints
 from barpc.tie.pairing.epipolar import EpipolarSegments
 from barpc.tie.pixels import Box
 
-APART = 2
+DUPLICATE_DISTANCE = 2
 """Places that are no farther apart [px] are the same."""
 
 
@@ -135,7 +135,7 @@ class Hook:
     def match(self, a: View, b: View, prediction: Prediction) -> Matches:
         """Return the function's matches inside the bands; errors name the function and the pair."""
         try:
-            xy, score = _places(self.function(a, b, prediction))
+            xy, score = _match_coordinates(self.function(a, b, prediction))
         except BarpcError:
             raise
         except Exception as error:
@@ -147,7 +147,7 @@ class Hook:
         return Matches.of_places(xy, aside if score is None else score).select(inside)
 
 
-def _places(found: Any) -> tuple[Any, Any]:
+def _match_coordinates(found: Any) -> tuple[Any, Any]:
     """Return the places (M, 2, 2) [px] and how unlike they look (M,), or None, of what a function gave back."""
     if isinstance(found, Matches):
         found = found.xy, found.score

@@ -20,19 +20,19 @@ from scipy.spatial import cKDTree
 
 from barpc.base.geodesy import Array
 from barpc.base.options import TieOptions
-from barpc.base.usual import FEW, MANY, RIVALS, SAMPLE, SURELY, robust_spread
+from barpc.base.statistics import FEW, MANY, RIVALS, SAMPLE, SURELY, robust_spread
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.matchers.features import AMPLE, KeypointFiles, Keypoints, ample_matches, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
-from barpc.tie.matchers.matcher import APART, NO_MATCHES, Hook, Matcher, Matches, Prediction, hooked
-from barpc.tie.matchers.placings import Placing, Placings, likeliest, stretched
+from barpc.tie.matchers.matcher import DUPLICATE_DISTANCE, NO_MATCHES, Hook, Matcher, Matches, Prediction, hooked
+from barpc.tie.matchers.placings import Placing, Placings, likeliest_placing, stretched
 from barpc.tie.matchers.structural import FineStructure, GradientStructure
 from barpc.tie.pairing.epipolar import (
     LEAST_REACH,
     EpipolarSegments,
     coherent,
     common_range,
-    frame,
+    epipolar_segments,
     gradient,
     robust_affine,
 )
@@ -41,9 +41,9 @@ from barpc.tie.tasks import HERE, Work
 
 STRUCTURE = "structure"
 """What tries again where another matcher finds few."""
-FINE = "fine-structure"
+FINE_STRUCTURE = "fine-structure"
 """And where that finds nothing."""
-MATCHERS: dict[str, type[Matcher]] = {"guided": Guided, STRUCTURE: GradientStructure, FINE: FineStructure}
+MATCHERS: dict[str, type[Matcher]] = {"guided": Guided, STRUCTURE: GradientStructure, FINE_STRUCTURE: FineStructure}
 """Name -> matcher."""
 
 
@@ -52,23 +52,27 @@ def matcher_named(name: str) -> type[Matcher] | Hook:
     return MATCHERS[name] if name in MATCHERS else hooked(name)
 
 
-SHARE = 0.3
+SUFFICIENT_SHARE = 0.3
 """A pair of fewer than `MANY` is not tried again where they are this share of the keypoints in its common area, and
 `FEW`: small images have no more to give; nor is a wider pass where this share of the matches stands in the peak."""
-TOLERANCE = 3.0
+BAND_HALFWIDTH = 3.0
 """Half the width of the band about the corrected epipolar line, at most [px]."""
 _DEFAULTS = TieOptions()
 _PASSES = ((20.0, 1500), (80.0, 2000), (float("inf"), 3000))
 """Blind passes: half width [px] (the last: `search`), points of A that are tried."""
 _SIGNIFICANT = 6.0  # standard deviations
-_NEAR, _SPARSE = (
+_NEIGHBOURS_COUNTED, _SPARSE_FACTOR = (
     3,
     2.0,
 )  # so many matches lie about a point, usually; it has none near where they lie so many times as far
 _NOWHERE = "no common offset"
 FALSE_SHARE = 0.01
 """Share of false matches that is accepted, as control bands estimate it."""
-_LOOSE = (0.95, 0.05, 2 / 3)  # ratio and false share of the second attempt; its part of the matches that a pair needs
+_SECOND_ATTEMPT = (
+    0.95,
+    0.05,
+    2 / 3,
+)  # ratio and false share of the second attempt; its part of the matches that a pair needs
 _MARGINS = 150.0, 50.0  # m beyond known altitudes: how wrong cameras make them, and seldom do
 _PROBES = 12  # pixels along a side at which the terrain is asked
 
@@ -109,7 +113,7 @@ class PairReport:
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class GroundAltitudes:
     """What is known of the altitudes of the ground: a terrain, and the matches of pairs that have enough."""
 
     terrain: Terrain | None = None
@@ -119,7 +123,7 @@ class Ground:
         """Return the lowest and the highest altitude [m] that most matches lie at."""
         found = []
         for views, matches in self.ties:
-            where, (low, high) = frame(*views, matches.xy[:, 0]), common_range(*views)
+            where, (low, high) = epipolar_segments(*views, matches.xy[:, 0]), common_range(*views)
             if np.median(where.after) >= LEAST_REACH:
                 along = where.errors(matches.xy[:, 1])[:, 0] / where.after
                 found.append(0.5 * (low + high) + 0.5 * (high - low) * np.percentile(along, [2, 98]))
@@ -144,7 +148,7 @@ class Ground:
         return replace(views[0], alt_range=within), replace(views[1], alt_range=within)
 
 
-_UNKNOWN = Ground()
+_UNKNOWN_GROUND = GroundAltitudes()
 
 
 def match_pair(views: Ends, keypoints: Points, pair: Pair, options: TieOptions) -> tuple[Matches, PairReport]:
@@ -171,31 +175,33 @@ def match_pair(views: Ends, keypoints: Points, pair: Pair, options: TieOptions) 
 def _placing(views: Ends, keypoints: tuple[Keypoints, Keypoints], pair: Pair, options: TieOptions) -> Placing | None:
     """Return how the second picture lies if it matches so, and by the keypoints' own looks not as its camera says."""
     a, b = keypoints
-    placing, count = likeliest(views, keypoints) if len(a) and len(b) else (None, 0)
+    placing, count = likeliest_placing(views, keypoints) if len(a) and len(b) else (None, 0)
     if placing is None or count < options.min_matches or placing.is_stated(reach_of(views[1], options)):
         return None
     return placing if _attempt(views, (a, placing.undone(b)), pair, options)[1].status == "ok" else None
 
 
 def _attempts(views: Ends, keypoints: Points, pair: Pair, options: TieOptions) -> tuple[Matches, PairReport]:
-    looked: dict[str, _Search] = {}
+    looked: dict[str, _PairSearch] = {}
     first = _attempt(views, keypoints, pair, options, looked)
     if enough(first[1]) or "keypoints" in first[1].status or options.matcher not in MATCHERS:
         return first
     loose = replace(
         options,
-        ratio=max(options.ratio, _LOOSE[0]),
-        min_matches=max(4, math.ceil(options.min_matches * _LOOSE[2])),
+        ratio=max(options.ratio, _SECOND_ATTEMPT[0]),
+        min_matches=max(4, math.ceil(options.min_matches * _SECOND_ATTEMPT[2])),
     )
     tried, structural = [first], options.matcher == STRUCTURE
     if not (
         (structural and first[1].matches < loose.min_matches)  # thresholds do not say where it looks
         or (first[1].status.startswith(_NOWHERE) and options.ratio >= CLEAR_RATIO)
     ):  # nor do looser ones let more through where only clear matches count
-        found, report = _attempt(views, keypoints, pair, loose, looked, _LOOSE[1])
+        found, report = _attempt(views, keypoints, pair, loose, looked, _SECOND_ATTEMPT[1])
         tried.append((found, replace(report, loosened=True)))
     if structural and all(report.status != "ok" for _, report in tried):
-        found, report = _attempt(views, keypoints, pair, replace(loose, matcher=FINE), None, _LOOSE[1])
+        found, report = _attempt(
+            views, keypoints, pair, replace(loose, matcher=FINE_STRUCTURE), None, _SECOND_ATTEMPT[1]
+        )
         tried.append((found, replace(report, loosened=True)))
     return better(*tried)
 
@@ -207,7 +213,7 @@ def ample(report: PairReport, options: TieOptions) -> bool:
 
 def enough(report: PairReport) -> bool:
     """Return whether a pair has enough matches not to be tried again."""
-    return report.status == "ok" and report.verified >= _wanted(report)
+    return report.status == "ok" and report.verified >= _wanted_matches(report)
 
 
 def _worth_more(report: PairReport) -> bool:
@@ -215,10 +221,10 @@ def _worth_more(report: PairReport) -> bool:
     return not any(report.placings) and "keypoints" not in report.status
 
 
-def _wanted(report: PairReport) -> int:
+def _wanted_matches(report: PairReport) -> int:
     """Return the number of matches that a pair should have: fewer where little is in common."""
     common = report.overlap * min(report.keypoints)
-    return math.ceil(min(MANY, max(FEW, SHARE * common))) if common > 0 else MANY
+    return math.ceil(min(MANY, max(FEW, SUFFICIENT_SHARE * common))) if common > 0 else MANY
 
 
 def better(*attempts: tuple[Matches, PairReport]) -> tuple[Matches, PairReport]:
@@ -229,7 +235,7 @@ def better(*attempts: tuple[Matches, PairReport]) -> tuple[Matches, PairReport]:
         for _, report in attempts
         for text in (
             *report.beaten,
-            *([] if report is best[1] else [f"{report.means} {report.verified} of {_wanted(report)}"]),
+            *([] if report is best[1] else [f"{report.means} {report.verified} of {_wanted_matches(report)}"]),
         )
     )
     return best[0], replace(best[1], beaten=beaten)
@@ -240,7 +246,7 @@ def _attempt(
     keypoints: Points,
     pair: Pair,
     options: TieOptions,
-    looked: dict[str, _Search] | None = None,
+    looked: dict[str, _PairSearch] | None = None,
     false_share: float | None = None,
 ) -> tuple[Matches, PairReport]:
     """Return all passes over a pair with one matcher; what it `looked` at is known to the next attempt."""
@@ -251,15 +257,15 @@ def _attempt(
     kind = matcher_named(options.matcher)
     if kind.detects and min(counts) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few keypoints")
-    loaded, numbers = _loaded(views, keypoints, options)
+    loaded, numbers = _overlap_keypoints(views, keypoints, options)
     looked = {} if looked is None else looked
     before = looked.get(options.matcher)
-    search = _Search(views, loaded, options) if before is None else before.loosened(loaded, options)
+    search = _PairSearch(views, loaded, options) if before is None else before.loosened(loaded, options)
     looked[options.matcher] = search
     coarse = search.offset()
     if coarse is None:
         return NO_MATCHES, replace(report, status=f"{_NOWHERE} within {search.reach:.4g} px")
-    tight = search.further(search.trusted(coarse, _LOOSE[1])[0])
+    tight = search.further(search.trusted(coarse, _SECOND_ATTEMPT[1])[0])
     report = replace(report, matches=len(tight))
     if len(tight) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches")
@@ -267,7 +273,7 @@ def _attempt(
     errors = search.errors(found)
     keep, residual = coherent(found.xy[:, 0], errors[:, 1])
     report = replace(report, matches=len(found), verified=int(keep.sum()), control_share=control)
-    if _apart(found.xy[keep, 0], search.patch) < options.min_matches:
+    if _count_separate(found.xy[keep, 0], search.patch) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches on common epipolar lines")
     spread, share = robust_spread(residual[keep]), report.verified / len(found)
     along, across = np.median(errors[keep], axis=0).tolist()
@@ -278,12 +284,12 @@ def _attempt(
     return replace(found.select(keep), sigma=max(spread, 0.05)), report
 
 
-def _apart(xy: Array, side: float) -> int:
+def _count_separate(xy: Array, side: float) -> int:
     """Count the points (M, 2) that stand far enough apart not to share their patches."""
     return len(np.unique(np.floor(xy / side), axis=0)) if side else len(xy)
 
 
-def _loaded(
+def _overlap_keypoints(
     views: Ends, keypoints: Points, options: TieOptions
 ) -> tuple[tuple[Keypoints, Keypoints], tuple[IntArray, IntArray] | None]:
     """Return the keypoints of the tiles that both views may see, and their numbers; None: as they stand."""
@@ -302,9 +308,9 @@ def quick_score(views: Ends, keypoints: tuple[KeypointFiles, KeypointFiles], opt
     few = (keypoints[0].strongest(AMPLE * MANY), keypoints[1].strongest(AMPLE * MANY))
     if not (len(few[0]) and len(few[1])):
         return 0
-    search = _Search(views, _loaded(views, few, options)[0], replace(options, ratio=_LOOSE[0]))
+    search = _PairSearch(views, _overlap_keypoints(views, few, options)[0], replace(options, ratio=_SECOND_ATTEMPT[0]))
     coarse = search.offset()
-    return 0 if coarse is None else len(search.trusted(coarse, _LOOSE[1])[0])
+    return 0 if coarse is None else len(search.trusted(coarse, _SECOND_ATTEMPT[1])[0])
 
 
 def first_look(
@@ -326,7 +332,7 @@ def match_pairs(
     keypoints: Sequence[Keypoints | KeypointFiles],
     pairs: Sequence[Pair],
     options: TieOptions = _DEFAULTS,
-    ground: Ground = _UNKNOWN,
+    ground: GroundAltitudes = _UNKNOWN_GROUND,
     work: Work = HERE,
 ) -> list[tuple[Matches, PairReport]]:
     """Match every pair, each with its report: `match_pair` over all, and `STRUCTURE` where it finds few.
@@ -340,7 +346,7 @@ def match_pairs(
         return found
     thin = [k for k, (_, report) in enumerate(found) if not enough(report) and _worth_more(report)]
     good = [(task[0], one[0]) for task, one in zip(tasks, found, strict=True) if thin and enough(one[1])]
-    known = Ground(ground.terrain, (*ground.ties, *good)).altitudes() if thin else None
+    known = GroundAltitudes(ground.terrain, (*ground.ties, *good)).altitudes() if thin else None
     none, other = join_keypoints([]), replace(options, matcher=STRUCTURE)
     again = [
         ([ground.within(tasks[k][0], known, margin) for margin in _MARGINS], (none, none), pairs[k], other)
@@ -382,7 +388,7 @@ class _Peak(NamedTuple):
     significance: float  # in standard deviations beyond chance
 
 
-class _Search:
+class _PairSearch:
     """The passes over one pair of views."""
 
     def __init__(self, views: Ends, keypoints: tuple[Keypoints, Keypoints], options: TieOptions) -> None:
@@ -395,11 +401,11 @@ class _Search:
         if not self._matcher.detects:
             middles = [(col + 0.5 * width, row + 0.5 * height) for col, row, width, height in self._windows()]
             points = np.array(middles).reshape(-1, 2)
-        self._points, first = points, frame(*views, points)
+        self._points, first = points, epipolar_segments(*views, points)
         self._axis = first.axis
-        self._frame = _latest(lambda xy: first if xy is points else frame(*views, xy, first.axis))
+        self._frame = _latest(lambda xy: first if xy is points else epipolar_segments(*views, xy, first.axis))
 
-    def loosened(self, keypoints: tuple[Keypoints, Keypoints], options: TieOptions) -> _Search:
+    def loosened(self, keypoints: tuple[Keypoints, Keypoints], options: TieOptions) -> _PairSearch:
         """Return the search at looser thresholds, which do not change where it looks."""
         other = copy(self)
         if self._matcher.detects:
@@ -415,7 +421,7 @@ class _Search:
 
     def errors(self, found: Matches) -> Array:
         """Return the distance along and across (M, 2) [px] of matches from where the cameras say."""
-        return frame(*self._views, found.xy[:, 0], self._axis).errors(found.xy[:, 1])
+        return epipolar_segments(*self._views, found.xy[:, 0], self._axis).errors(found.xy[:, 1])
 
     def _predicted(self, where: Callable[[Array], EpipolarSegments], half_width: float) -> Prediction:
         return Prediction(_latest(where), half_width, self._windows)
@@ -460,7 +466,7 @@ class _Search:
             found = self._blind(width, probes)
             if found is not None and (best is None or found.significance > best.significance):
                 best = found
-            if best is not None and best.share >= SHARE:
+            if best is not None and best.share >= SUFFICIENT_SHARE:
                 break
         return None if best is None else best.prediction
 
@@ -471,7 +477,7 @@ class _Search:
         """
         for _ in range(RIVALS if self._matcher.detects and len(tight) >= FEW else 0):
             peak = self._beside(tight)
-            more = NO_MATCHES if peak is None else self.trusted(peak.prediction, _LOOSE[1])[0]
+            more = NO_MATCHES if peak is None else self.trusted(peak.prediction, _SECOND_ATTEMPT[1])[0]
             both = tight.and_others(more)
             if len(both) == len(tight):
                 break
@@ -486,12 +492,14 @@ class _Search:
         def nearest(xy: Array, count: int) -> Array:
             return np.asarray(tree.query(xy, k=[count])[0])[:, 0]
 
-        reach = _SPARSE * float(np.median(nearest(places, _NEAR + 1)))
-        count = int((nearest(self._points, _NEAR) > reach).sum())
+        reach = _SPARSE_FACTOR * float(np.median(nearest(places, _NEIGHBOURS_COUNTED + 1)))
+        count = int((nearest(self._points, _NEIGHBOURS_COUNTED) > reach).sum())
         if not count:
             return None
         width, probes = _PASSES[0][0] + abs(offset), _PASSES[0][1]
-        return self._blind(width, probes * len(self._points) // count, lambda xy: nearest(xy, _NEAR) > reach)
+        return self._blind(
+            width, probes * len(self._points) // count, lambda xy: nearest(xy, _NEIGHBOURS_COUNTED) > reach
+        )
 
     def _blind(self, width: float, probes: int, bare: Callable[[Array], BoolArray] | None = None) -> _Peak | None:
         """Return one pass: a peak among the errors across the epipolar lines of some points, if there is one.
@@ -511,7 +519,7 @@ class _Search:
             return None
         errors = self.errors(found)
         values = np.sort(errors[:, 1])
-        window = 2 * APART  # px, in which true matches fall
+        window = 2 * DUPLICATE_DISTANCE  # px, in which true matches fall
         count = np.searchsorted(values, values + window, side="right") - np.arange(len(values))
         start, most = int(count.argmax()), int(count.max())
         middle = float(np.median(values[start : start + most]))
@@ -529,7 +537,7 @@ class _Search:
             where, same = every(xy).moved(across(xy)), np.ones(len(xy))
             return replace(where, before=first * same, after=last * same)
 
-        return _Peak(self._predicted(corrected, TOLERANCE), most / len(values), float(significance))
+        return _Peak(self._predicted(corrected, BAND_HALFWIDTH), most / len(values), float(significance))
 
     def local(self, tight: Matches) -> Prediction:
         """Return the corrected prediction: each point in a band about its neighbours' places by the matches so far."""
@@ -546,4 +554,4 @@ class _Search:
             where = every(xy).moved(xy @ slope + np.median(level[near], axis=1))
             return replace(where, before=middle - half, after=middle + half)
 
-        return self._predicted(nearby, float(np.clip(4.0 * spread, 0.6, TOLERANCE)))
+        return self._predicted(nearby, float(np.clip(4.0 * spread, 0.6, BAND_HALFWIDTH)))

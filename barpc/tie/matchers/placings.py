@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.geodesy import Array
-from barpc.base.usual import OUTLIER
+from barpc.base.statistics import OUTLIER
 from barpc.scene import View, connected_groups
 from barpc.sensor.rpc import RPC
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO
-from barpc.tie.pairing.epipolar import frame
+from barpc.tie.pairing.epipolar import epipolar_segments
 
 Link = tuple[int, int]
 
@@ -107,7 +107,7 @@ def stretched(views: tuple[View, View], first: Array, second: Array) -> bool:
     """
     if not len(first):
         return False
-    where = frame(*views, first)
+    where = epipolar_segments(*views, first)
     said = where.across + where.slope * (where.turn(second)[:, 0] - where.along)
     said, seen = said - said.mean(), where.turn(second)[:, 1]
     sum_of_squares = float(said @ said)
@@ -118,16 +118,16 @@ def stretched(views: tuple[View, View], first: Array, second: Array) -> bool:
     return abs(scale - 1.0) > OUTLIER * sigma and not 0.5**0.5 < scale < 2.0**0.5
 
 
-def likeliest(views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints]) -> tuple[Placing, int]:
+def likeliest_placing(views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints]) -> tuple[Placing, int]:
     """Return how most keypoints say that the second picture lies if the first does as its camera says, and how many."""
     a, b = keypoints
-    where = frame(*views, a.xy)
+    where = epipolar_segments(*views, a.xy)
     places = where.place(np.zeros(len(a)))
     direction = np.stack([np.cos(a.angle), np.sin(a.angle)], axis=-1) @ where.linear.T
     towards, grown = np.arctan2(direction[:, 1], direction[:, 0]), np.sqrt(abs(np.linalg.det(where.linear)))
     best, most = Placing(False, 0, 1.0), 0
     for mirrored in (False, True):
-        rows, cols = _alike(_mirrored(a.descriptors) if mirrored else a.descriptors, b.descriptors)
+        rows, cols = _mutual_nearest(_mirrored(a.descriptors) if mirrored else a.descriptors, b.descriptors)
         turn = b.angle[cols] + (towards if mirrored else -towards)[rows]
         ratio = b.scale[cols] / (grown * a.scale[rows])
         size = np.maximum(np.rint(ratio), 1.0) / np.maximum(np.rint(1.0 / ratio), 1.0)
@@ -142,7 +142,7 @@ def likeliest(views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints]) 
     return best, most
 
 
-def _alike(first: npt.NDArray[np.uint8], second: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.int64], ...]:
+def _mutual_nearest(first: npt.NDArray[np.uint8], second: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.int64], ...]:
     """Return the rows of descriptors that are clearly each other's nearest."""
     a, b = (x.astype(np.float32) for x in (first, second))  # whole numbers: their products are exact on any machine
     if min(len(a), len(b)) < 2:

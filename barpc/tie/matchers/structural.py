@@ -19,12 +19,12 @@ from barpc.base.geodesy import Array
 from barpc.base.options import TieOptions
 from barpc.scene import IntArray, View
 from barpc.tie.matchers.features import Keypoints
-from barpc.tie.matchers.matcher import APART, NO_MATCHES, Matches, Prediction
+from barpc.tie.matchers.matcher import DUPLICATE_DISTANCE, NO_MATCHES, Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments, grouped, linear_map
 from barpc.tie.patches.oriented import HALF, PatchTile, Sampling, found_about, resolution
 from barpc.tie.pixels import PIECE, SPAN, Box, FloatImage
 
-POINTS = 200, 500, 1000
+GRID_POINTS = 200, 500, 1000
 """Points that are looked for: of the cameras' error, in long bands, in short ones."""
 _RING = 3.5  # pitches about a point whose neighbours speak for its places, together
 _SAY = 4.0  # times as loud as it does itself. Of four pairs that were hardest 1 is tied by 1.5 and 1, 3 by this
@@ -53,7 +53,7 @@ class GradientStructure:
         All bands of a prediction, moved aside or not, are looked at at once; the next calls ask of what was found.
         """
         if prediction.where not in self._known:
-            search = _Search(a, b, self._band, prediction, self.whole)
+            search = _GridSearch(a, b, self._band, prediction, self.whole)
             if self.whole:
                 self.patch = 2.0 * _RING * search.pitch
             self._known[prediction.where] = search.matches()
@@ -75,7 +75,7 @@ class FineStructure(GradientStructure):
     whole: ClassVar[bool] = True
 
 
-class _Search:
+class _GridSearch:
     """One look at all points of a grid, at `whole` pixels or in a picture as coarse as the bands are long."""
 
     def __init__(self, a: View, b: View, band: int, prediction: Prediction, whole: bool = False) -> None:
@@ -95,12 +95,12 @@ class _Search:
         if not windows:
             return 1, np.empty((0, 2))
         if self._whole:
-            wanted, count = 1, POINTS[1 + (self._prediction.probes is None)]
+            wanted, count = 1, GRID_POINTS[1 + (self._prediction.probes is None)]
         elif self._prediction.probes is None:
-            wanted, count = (4, POINTS[1]) if half > _LONGER else (2, POINTS[1 + (half < _LONG)])
+            wanted, count = (4, GRID_POINTS[1]) if half > _LONGER else (2, GRID_POINTS[1 + (half < _LONG)])
         else:
             width = self._prediction.half_width  # a twentieth of the image, or the altitudes, may be wide
-            wanted, count = int(max(width / 20.0, min(half / 80.0, 4.0), 2.0)), POINTS[0]
+            wanted, count = int(max(width / 20.0, min(half / 80.0, 4.0), 2.0)), GRID_POINTS[0]
         boxes = np.array(windows)
         side = (boxes[:, :2] + boxes[:, 2:]).max(axis=0) - boxes[:, :2].min(axis=0)
         step = 1 << int(np.ceil(np.log2(wanted)))
@@ -109,7 +109,7 @@ class _Search:
         step *= self._least
         area = float((boxes[:, 2] * boxes[:, 3]).sum())
         self.pitch = step * max(HALF // 2, int((area / count) ** 0.5 / step))
-        return step, np.concatenate([_lattice(box, self.pitch) for box in windows])
+        return step, np.concatenate([_grid_points(box, self.pitch) for box in windows])
 
     def matches(self) -> Matches:
         """Return the best place of every point, on whole bands; found again in finer pictures."""
@@ -165,9 +165,9 @@ class _Search:
         tile = PatchTile.of(sampling, at, centers, reach, HALF)
         surface = tile.surfaces()
         if self._whole:
-            surface = _supported(surface, _near(at, _RING * self.pitch), _SAY)
+            surface = _supported(surface, _adjacency(at, _RING * self.pitch), _SAY)
         elif asked.probes:  # neighbours are moved alike
-            near = _near(at, 1.5 * self.pitch)
+            near = _adjacency(at, 1.5 * self.pitch)
             surface = np.tensordot(near, surface, axes=1) / near.sum(axis=1)[:, None, None]
         off = tile.offsets() @ axes.T  # along, across
         part = (tile.left @ tile.matrix.T @ axes.T)[:, None, None]
@@ -196,7 +196,7 @@ class _Search:
         return (0.5 * (first + last), 0.5 * (last - first)) if first <= last else (0.0, 0.0)
 
 
-def _near(at: Array, reach: float) -> FloatImage:
+def _adjacency(at: Array, reach: float) -> FloatImage:
     """1 where points (n, 2) lie within reach [px] of each other along both axes, else 0: (n, n)."""
     return np.asarray(np.abs(at[:, None] - at[None]).max(axis=2) <= reach, np.float32)
 
@@ -204,13 +204,13 @@ def _near(at: Array, reach: float) -> FloatImage:
 def _supported(surface: FloatImage, near: FloatImage, loud: float) -> FloatImage:
     """Correlations (n, y, x) averaged with the best of neighbours' (n, n) about the same place, so much `loud`er."""
     others = near - np.eye(len(near), dtype=np.float32)
-    kernel = np.ones((2 * APART + 1,) * 2, np.uint8)
+    kernel = np.ones((2 * DUPLICATE_DISTANCE + 1,) * 2, np.uint8)
     about = np.stack([cv2.dilate(one, kernel) for one in surface])
     share = np.float32(loud) / np.maximum(others.sum(axis=1, keepdims=True), 1.0)
     return np.asarray((surface + np.tensordot(share * others, about, axes=1)) / np.float32(1.0 + loud))
 
 
-def _lattice(box: Box, pitch: int) -> Array:
+def _grid_points(box: Box, pitch: int) -> Array:
     """Return the points (n, 2) in a box whose coordinates are multiples of the pitch."""
     axes = [
         np.arange(-(-first // pitch) * pitch, first + length, pitch)

@@ -14,7 +14,7 @@ from shapely import affinity
 
 from barpc.base.errors import InputError, plain
 from barpc.base.geodesy import Array, wrap_longitude
-from barpc.base.sidefile import GEOJSON, read_json
+from barpc.base.safe_io import GEOJSON, read_json
 from barpc.scene import BoolArray
 
 _MALFORMED = (
@@ -98,7 +98,7 @@ def _polygons(data: dict[str, Any]) -> Iterator[shapely.Polygon]:
     elif kind in ("Polygon", "MultiPolygon"):
         parts = data["coordinates"] if kind == "MultiPolygon" else [data["coordinates"]]
         for part in parts:
-            rings = [_ring(ring) for ring in part]
+            rings = [_ring_vertices(ring) for ring in part]
             for hole in rings[1:]:
                 hole[:, 0] += 360.0 * np.rint((rings[0][0, 0] - hole[0, 0]) / 360.0)
             yield shapely.Polygon(rings[0], rings[1:])
@@ -106,7 +106,7 @@ def _polygons(data: dict[str, Any]) -> Iterator[shapely.Polygon]:
         raise ValueError(f"a {kind} is no polygon")
 
 
-def _ring(positions: list[list[float]]) -> Array:
+def _ring_vertices(positions: list[list[float]]) -> Array:
     """Return the vertices (N, 2) of an outline, the first between -180 and 180, its longitudes without jumps."""
     ring = np.array([position[:2] for position in positions], dtype=np.float64).reshape(-1, 2)
     if not (np.isfinite(ring).all() and (np.abs(ring) <= [540.0, 90.0]).all()):

@@ -10,12 +10,12 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from barpc.base.geodesy import Array
-from barpc.base.usual import BIWEIGHT, FEW, SURELY, robust_spread
+from barpc.base.statistics import BIWEIGHT, FEW, SURELY, robust_spread
 from barpc.scene import BoolArray, IntArray, View
 
 LEAST_REACH = 5.0
 """Half a segment [px] below which places along it say nothing of altitudes."""
-_SIDE = 1 / 3
+_MIN_AGREEING_SHARE = 1 / 3
 """Part of the neighbours that agree: beside a straight edge half of them are of one side, less two standard deviations
 of `FEW` draws."""
 
@@ -64,7 +64,7 @@ def common_range(*views: View) -> tuple[float, float]:
     return min(low, high), max(low, high)
 
 
-def frame(first: View, second: View, xy: Array, axis: Array | None = None) -> EpipolarSegments:
+def epipolar_segments(first: View, second: View, xy: Array, axis: Array | None = None) -> EpipolarSegments:
     """Predict points of one view (N, 2) [px] in another, at the altitudes that both are used for.
 
     The axis is by default the mean direction of the points' epipolar segments. NaN where a camera fails.
@@ -164,7 +164,7 @@ def coherent(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, A
     others = level[near]
     residual = level - np.median(others, axis=1)
     agree = np.abs(others - level[:, None]) <= max(SURELY * robust_spread(residual), floor)
-    return agree.sum(axis=1) - 1 >= _SIDE * (near.shape[1] - 1), residual
+    return agree.sum(axis=1) - 1 >= _MIN_AGREEING_SHARE * (near.shape[1] - 1), residual
 
 
 def grouped(*keys: npt.NDArray[Any]) -> list[IntArray]:

@@ -33,10 +33,10 @@ Terrain = Callable[[Array, Array], Array]
 """lon, lat (...) [deg] -> altitude (...) [m above the ellipsoid], NaN where it is unknown."""
 
 _BEST_ANGLE = 15.0  # deg; matches are many and heights still well determined; so many more, and it is worth 1 / e
-ASTRAY = 700.0
+RELATIVE_POINTING_ERROR = 700.0
 """How far two cameras may be wrong about each other [m]: by 350 m each, as SPOT 1 to 4 state it, the worst of all."""
-_REACH = 20.0, 700.0  # px that are searched at least and at most, unless another number is asked for
-GIVEN = "given"
+_SEARCH_LIMITS = 20.0, 700.0  # px that are searched at least and at most, unless another number is asked for
+GIVEN_PAIR = "given"
 """Why a pair is tried that others have matched."""
 
 
@@ -121,7 +121,7 @@ def reach_of(view: View, options: TieOptions) -> float:
         return options.search
     ground = view.sensor.localize((np.array(view.size) - 1.0) / 2.0, np.array(view.altitude))
     pixel = float(ground_sample_distance(view.sensor, ground)[1])
-    return float(np.clip(ASTRAY / pixel, *_REACH)) if pixel > 0.0 else _REACH[1]
+    return float(np.clip(RELATIVE_POINTING_ERROR / pixel, *_SEARCH_LIMITS)) if pixel > 0.0 else _SEARCH_LIMITS[1]
 
 
 def _levels(views: Sequence[View]) -> tuple[float, float, float]:
@@ -185,7 +185,7 @@ def possible_pairs(views: Sequence[View], options: TieOptions, scope: Scope = EV
         logger.warning("%s - %s: listed, but they do not overlap as asked", views[i].name, views[j].name)
     found = {pair: Pair(pair, *(float("nan"),) * 2) for pair in scope.given}
     found |= {pair.views: pair for pair in pairs}
-    said = {**dict.fromkeys(wanted, "listed"), **dict.fromkeys(scope.given, GIVEN)}
+    said = {**dict.fromkeys(wanted, "listed"), **dict.fromkeys(scope.given, GIVEN_PAIR)}
     return [replace(p, reason=said.get(views, p.reason)) for views, p in sorted(found.items())]
 
 
@@ -254,7 +254,7 @@ def shared_tiles(
     return [list(compress(*both)) for both in zip(boxes, seen, strict=True)]
 
 
-SAME_DATE, CONNECTS, PATH, BEYOND = "same date", "connects all", "second path", "between groups"
+SAME_DATE, CONNECTS, PATH, BETWEEN_GROUPS = "same date", "connects all", "second path", "between groups"
 """Why a pair is tried."""
 COMPARED = 48
 """Partners of a view, the best by overlap and angle, that are compared with it."""
@@ -275,7 +275,7 @@ def several_dates(views: Sequence[View]) -> bool:
     return len({view.date for view in views if view.date}) > 1
 
 
-def judged(views: Sequence[View], pair: Pair, likeness: int) -> Pair:
+def scored_pair(views: Sequence[View], pair: Pair, likeness: int) -> Pair:
     """Return a pair with its quick score and the reason for choosing it."""
     dates = {views[i].date for i in pair.views}
     same = len(dates) == 1 and dates != {""} and likeness
@@ -299,7 +299,7 @@ def best_pairs(pairs: Sequence[Pair], num_views: int, neighbours: int, twice: bo
     """
     ranked = sorted(pairs, key=_order)
     tree = {ranked[k].views for k in forests([pair.views for pair in ranked], num_views, 1)}
-    chosen = {pair.views: pair for pair in ranked if pair.reason == GIVEN}
+    chosen = {pair.views: pair for pair in ranked if pair.reason == GIVEN_PAIR}
     taken, half = [0] * num_views, (neighbours + 1) // 2
     seen: set[Link] = set()
     for again in (False, True):
@@ -313,7 +313,7 @@ def best_pairs(pairs: Sequence[Pair], num_views: int, neighbours: int, twice: bo
                 taken[i] += 1
                 taken[j] += 1
     left = [pair for pair in ranked if pair.views not in chosen]
-    more = _beyond(left, num_views, list(chosen), TRIES[0]) if twice else []
+    more = _connecting_pairs(left, num_views, list(chosen), TRIES[0]) if twice else []
     links = [*chosen, *(pair.views for pair in more)]
     known = set(links)
     left = [pair for pair in left if pair.views not in known]
@@ -321,7 +321,7 @@ def best_pairs(pairs: Sequence[Pair], num_views: int, neighbours: int, twice: bo
     return sorted([*chosen.values(), *more], key=lambda pair: pair.views)
 
 
-def _beyond(left: Sequence[Pair], num_views: int, links: Sequence[Link], count: int) -> list[Pair]:
+def _connecting_pairs(left: Sequence[Pair], num_views: int, links: Sequence[Link], count: int) -> list[Pair]:
     """Return the best pairs of each view with views that have no partner in common with it, `count` at most.
 
     The partners most alike are of one season. Two views of a season and two of another tie the seasons by one pair's
@@ -337,7 +337,7 @@ def _beyond(left: Sequence[Pair], num_views: int, links: Sequence[Link], count: 
         if min(taken[i], taken[j]) < count and pair.likeness and not near[i] & near[j]:
             taken[i] += 1
             taken[j] += 1
-            found.append(replace(pair, reason=BEYOND))
+            found.append(replace(pair, reason=BETWEEN_GROUPS))
     return found
 
 
@@ -363,7 +363,7 @@ def further_pairs(
     return [replace(crossing[k], reason=PATH if twice else CONNECTS) for k in kept if k >= 0]
 
 
-def _root(tree: list[int], node: int) -> int:
+def _component_root(tree: list[int], node: int) -> int:
     while tree[node] != node:
         tree[node] = tree[tree[node]]
         node = tree[node]
@@ -379,7 +379,7 @@ def forests(links: Sequence[Link], num: int, count: int) -> list[int]:
     kept, trees = [], [list(range(num)) for _ in range(count)]
     for number, (i, j) in enumerate(links):
         for tree in trees:
-            first, second = _root(tree, i), _root(tree, j)
+            first, second = _component_root(tree, i), _component_root(tree, j)
             if first != second:
                 tree[second] = first
                 kept.append(number)

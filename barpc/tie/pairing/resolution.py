@@ -19,7 +19,7 @@ from barpc.scene import IntArray, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.tie.pairing.overlaps import Pair
 
-Link = tuple[int, int]
+PixelFactors = tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -67,7 +67,7 @@ class Looks:
     """All looks, those of a view together, itself first."""
     pixel: Array  # (L, 2) columns and rows of the file that a look's pixel holds
     of: IntArray  # (L,) the view that each is of
-    ends: Mapping[Link, Link]
+    ends: Mapping[PixelFactors, PixelFactors]
     """Pairs of views, ascending -> the looks, ascending, at which they are compared."""
 
     @classmethod
@@ -76,7 +76,7 @@ class Looks:
         scale, whole = [_scale(view) for view in views], (1, 1)
         most = [(math.isqrt(v.size[0]), math.isqrt(v.size[1])) for v in views]  # a look is not smaller than its pixel
         wanted = {
-            (i, j): _pixels((scale[i], scale[j]), (most[i], most[j])) if apart else (whole, whole)
+            (i, j): _reduction_factors((scale[i], scale[j]), (most[i], most[j])) if apart else (whole, whole)
             for i, j in (p.views for p in pairs)
         }
         each = {(i, whole) for i in range(len(views))}
@@ -84,7 +84,7 @@ class Looks:
         looks = sorted(each)
         number = {look: k for k, look in enumerate(looks)}
         ends = {(i, j): (number[i, pixels[0]], number[j, pixels[1]]) for (i, j), pixels in wanted.items()}
-        seen = tuple(views[i] if pixel == whole else _look(views[i], pixel) for i, pixel in looks)
+        seen = tuple(views[i] if pixel == whole else _reduced_view(views[i], pixel) for i, pixel in looks)
         pixel, of = np.array([pixel for _, pixel in looks]), np.array([i for i, _ in looks])
         return cls(seen, pixel.astype(np.float64).reshape(-1, 2), of, ends)
 
@@ -92,7 +92,7 @@ class Looks:
         """Return a pair of views as a pair of looks."""
         return replace(pair, views=self.ends[pair.views])
 
-    def places(self, pair: Link, xy: Array) -> Array:
+    def places(self, pair: PixelFactors, xy: Array) -> Array:
         """Return places (M, 2, 2) [px] in two views counted in the pixels of their looks."""
         return coarser(xy, self.pixel[list(self.ends[pair])])
 
@@ -109,7 +109,9 @@ def _scale(view: View) -> Array:
     return view.sensor.project_jacobian(ground)[1][:, :2] / metres_per_unit(ground)[:2]
 
 
-def _pixels(scales: tuple[Array, Array], most: tuple[Link, Link]) -> tuple[Link, Link]:
+def _reduction_factors(
+    scales: tuple[Array, Array], most: tuple[PixelFactors, PixelFactors]
+) -> tuple[PixelFactors, PixelFactors]:
     """Return the columns and rows of two images, of scales (2, 2), that a pixel of their looks holds, `most`
     of them each.
 
@@ -126,7 +128,7 @@ def _pixels(scales: tuple[Array, Array], most: tuple[Link, Link]) -> tuple[Link,
     return found[0], found[1]
 
 
-def _look(view: View, pixel: Link) -> View:
+def _reduced_view(view: View, pixel: PixelFactors) -> View:
     """Return a view by means of so many columns and rows."""
     size = view.size[0] // pixel[0], view.size[1] // pixel[1]
     return replace(view, size=size, sensor=Coarser(view.sensor, np.array(pixel, dtype=np.float64)))

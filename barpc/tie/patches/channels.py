@@ -30,7 +30,7 @@ from barpc.tie.pixels import FloatImage, OpenReaders, grow, levelled
 
 _BLUR = 0.75  # px: of pictures before the gradients, and of channels
 _WEAK = 0.5  # of the median gradient: what is weaker is noise
-EDGE = 6
+INVALID_MARGIN = 6
 """Pixels so near to invalid ones know of them [px]; so far beside a search area, where true peaks end, decoys lie."""
 
 
@@ -44,7 +44,7 @@ def channels(pixels: FloatImage, valid: BoolArray) -> FloatImage:
     doubled = np.stack([east**2 - south**2, 2.0 * east * south]) / (length + np.float32(1e-12))
     found = np.stack([cv2.GaussianBlur(part, (0, 0), _BLUR) for part in doubled])
     size = cv2.GaussianBlur(length, (0, 0), _BLUR)
-    known = cv2.erode(valid.astype(np.uint8), np.ones((2 * EDGE + 1,) * 2, np.uint8), borderValue=1) > 0
+    known = cv2.erode(valid.astype(np.uint8), np.ones((2 * INVALID_MARGIN + 1,) * 2, np.uint8), borderValue=1) > 0
     weak = _WEAK * float(np.median(size[known])) if known.any() else 0.0
     return np.asarray(found * (known / (size + np.float32(weak + 1e-12))), np.float32)
 
@@ -66,7 +66,7 @@ def correlation(template: FloatImage, search: FloatImage) -> FloatImage:
         return np.asarray(np.nan_to_num(product / scale), np.float32)
 
 
-def cut(picture: FloatImage, at: IntArray, wide: int, high: int) -> FloatImage:
+def windows_around(picture: FloatImage, at: IntArray, wide: int, high: int) -> FloatImage:
     """Return the windows (n, C, 2 high + 1, 2 wide + 1) around whole px x, y (n, 2)."""
     view = np.lib.stride_tricks.sliding_window_view(picture, (2 * high + 1, 2 * wide + 1), axis=(1, 2))
     return np.moveaxis(view[:, at[:, 1] - high, at[:, 0] - wide], 0, 1)
@@ -112,7 +112,7 @@ class Patch(Frozen):
     def seen(self, view: View, at: Array) -> Array:
         """Return the image points (n, 2) [px] of places x, y (n, 2) [px] of the grid; NaN beside an unknown node."""
         rows, cols, nodes = _between(at[:, 1], self.shape[0]), _between(at[:, 0], self.shape[1]), self.image(view)
-        known = _known(nodes)
+        known = _known_nodes(nodes)
         found = np.einsum("nr,rck,nc->nk", rows, np.where(known[..., None], nodes, 0.0), cols)
         found[np.einsum("nr,rc,nc->n", rows, 1.0 - known, cols) > 0] = np.nan
         return np.asarray(found)
@@ -137,7 +137,7 @@ def _between_all(count: int) -> Array:
     return weights
 
 
-def _known(nodes: Array) -> BoolArray:
+def _known_nodes(nodes: Array) -> BoolArray:
     """Return the nodes (m, n) of which both coordinates (m, n, 2) are known."""
     return np.asarray(np.isfinite(nodes).all(axis=2))
 
@@ -206,7 +206,7 @@ def of_reference(paths: Sequence[str], patch: Patch) -> FloatImage:
     return reduce(lambda first, other: np.where(first.any(axis=0), first, other), each)
 
 
-def shown(picture: FloatImage) -> float:
+def picture_share(picture: FloatImage) -> float:
     """Return the share of the pixels of channels (C, H, W) that are not empty."""
     return float((np.abs(picture).sum(axis=0) > 0).mean())
 
@@ -225,7 +225,7 @@ def picture(
     Where it is finer than the grid, it is averaged first. What lies between nodes of which one is NaN is not valid.
     """
     nothing = np.zeros(shape, np.float32), np.zeros(shape, dtype=bool)
-    known = _known(nodes)
+    known = _known_nodes(nodes)
     if not (known[1:, 1:] & known[:-1, 1:] & known[1:, :-1]).any():
         return nothing
     low, high = np.floor(nodes[known].min(axis=0)).astype(int), np.ceil(nodes[known].max(axis=0)).astype(int)

@@ -16,7 +16,9 @@ from barpc.tie.pixels import Box, FloatImage, Stretch, levelled, read_pixels
 
 ACROSS = 0.02
 """A part in which an affine frame is farther off the epipolar lines [px] is too large for one."""
-FINER = 2  # columns of the frame a pixel: of a Pleiades triplet heights differ by 0.62 m (NMAD), of one by 0.83 m
+COLUMNS_PER_PIXEL = (
+    2  # columns of the frame a pixel: of a Pleiades triplet heights differ by 0.62 m (NMAD), of one by 0.83 m
+)
 WINDOW = 7
 """Pixels a side over which the step of least squares compares grey values, and matches of one surface are averaged."""
 _SGBM = {
@@ -30,7 +32,10 @@ _SGBM = {
     "disp12MaxDiff": -1,  # asked for here, of a second pass
     "mode": cv2.STEREO_SGBM_MODE_SGBM_3WAY,  # 0.64 m, of five ways 0.62 m at half as much time again
 }
-_LEFT, _SLOPE = 0.741, 0.305  # of white noise of variance 1, in the frame: its variance, and that of its slope
+_NOISE_VARIANCE, _SLOPE_VARIANCE = (
+    0.741,
+    0.305,
+)  # of white noise of variance 1, in the frame: its variance, and that of its slope
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +55,7 @@ class EpipolarFrame:
     @property
     def metres(self) -> float:
         """Height that a pixel of disparity stands for [m]."""
-        return abs(float(self.altitude[2])) * FINER
+        return abs(float(self.altitude[2])) * COLUMNS_PER_PIXEL
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +88,7 @@ def epipolar_frame(a: Array, b: Array, alt: Array) -> EpipolarFrame:
     lengths = np.hypot(*normal[:2]), np.hypot(*normal[2:])
     scale = np.sqrt(lengths[0] * lengths[1])
     first = np.zeros((2, 3))
-    first[0, :2] = np.array([normal[1], -normal[0]]) * (FINER / lengths[0])
+    first[0, :2] = np.array([normal[1], -normal[0]]) * (COLUMNS_PER_PIXEL / lengths[0])
     first[1] = np.array([*normal[:2], -normal[:2] @ mean[:2]]) / scale
     along = a @ first[0, :2]
     middle = np.abs(alt - np.median(alt)) < 1e-6 * (1.0 + np.ptp(alt))
@@ -95,9 +100,9 @@ def epipolar_frame(a: Array, b: Array, alt: Array) -> EpipolarFrame:
         ]
     )
     disparity = along - system @ second[0]
-    second[0, 2] += np.floor(disparity.min()) - FINER
+    second[0, 2] += np.floor(disparity.min()) - COLUMNS_PER_PIXEL
     disparity = along - system @ second[0]
-    num = 16 * int(np.ceil((disparity.max() + 2 * FINER) / 16))
+    num = 16 * int(np.ceil((disparity.max() + 2 * COLUMNS_PER_PIXEL) / 16))
     rows = a @ first[1, :2] + first[1, 2]
     across = float(np.abs(rows - system @ second[1]).max())
     known = np.column_stack([along, rows, disparity, np.ones(len(a))])
@@ -116,7 +121,7 @@ def dense_matches(
     frame : EpipolarFrame, of places in these pictures
     band : int, the band that is read, from 1
     """
-    window = _window(sizes, frame)
+    window = _frame_window(sizes, frame)
     if window is None:
         return None
     low, shape = window
@@ -130,13 +135,13 @@ def dense_matches(
     disparity, good = _both_ways(left, right, frame.num)
     seen = shown_left & (_warped(shown_right.astype(np.uint8), disparity, cv2.INTER_NEAREST) > 0)
     good &= seen
-    disparity, sigma = _refined(left, right, disparity, good)
+    disparity, sigma = _refined_disparity(left, right, disparity, good)
     # a match a pixel: the mean of those about it that differ by less than a pixel or so, which is one surface
-    single = np.ascontiguousarray(np.where(good, disparity, -frame.num)[:, ::FINER], np.float32)
-    level = cv2.bilateralFilter(single, WINDOW, sigmaColor=FINER, sigmaSpace=np.inf)
-    row, col = np.nonzero((good & _inside(shape, low, frame))[:, ::FINER])
+    single = np.ascontiguousarray(np.where(good, disparity, -frame.num)[:, ::COLUMNS_PER_PIXEL], np.float32)
+    level = cv2.bilateralFilter(single, WINDOW, sigmaColor=COLUMNS_PER_PIXEL, sigmaSpace=np.inf)
+    row, col = np.nonzero((good & _part_mask(shape, low, frame))[:, ::COLUMNS_PER_PIXEL])
     moves = level[row, col].astype(np.float64)
-    place = np.column_stack([FINER * col, row]) + low
+    place = np.column_stack([COLUMNS_PER_PIXEL * col, row]) + low
     moved = place - np.column_stack([moves, np.zeros(len(row))])
     known = np.column_stack([place, moves, np.ones(len(row))])
     middle = frame.num // 2  # disparity at which both are taken to show the same
@@ -145,14 +150,14 @@ def dense_matches(
         _back(frame.maps[0], place),
         _back(frame.maps[1], moved),
         known @ frame.altitude,
-        sigma[row, FINER * col].astype(np.float64),
+        sigma[row, COLUMNS_PER_PIXEL * col].astype(np.float64),
         np.count_nonzero(good) / max(both, 1),
     )
 
 
-def _window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Array, tuple[int, int]] | None:
+def _frame_window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Array, tuple[int, int]] | None:
     """Return the first pixel (2,) and width, height of the part as far as both images reach, with margins."""
-    margin = FINER * WINDOW  # matched, too: paths of SGBM begin at the ends
+    margin = COLUMNS_PER_PIXEL * WINDOW  # matched, too: paths of SGBM begin at the ends
     low, high = frame.places.min(axis=0) - margin, frame.places.max(axis=0) + margin
     reach = np.array([frame.num, 0.0])
     for size, one, more in zip(sizes, frame.maps, (np.zeros(2), reach), strict=True):
@@ -164,7 +169,7 @@ def _window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Arr
     return low, (int(high[0] - low[0]), int(high[1] - low[1]))
 
 
-def _inside(shape: tuple[int, int], low: Array, frame: EpipolarFrame) -> BoolArray:
+def _part_mask(shape: tuple[int, int], low: Array, frame: EpipolarFrame) -> BoolArray:
     """Return the pixels of the window that belong to the part."""
     hull = cv2.convexHull((frame.places - low).astype(np.float32))
     mask = cv2.fillConvexPoly(np.zeros(shape[::-1], np.uint8), np.rint(hull).astype(np.int32), 1)
@@ -212,11 +217,11 @@ def _both_ways(left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], num: i
     back = matcher.compute(*turned)[:, ::-1].astype(np.float32) / 16.0
     rows, cols = np.ogrid[: left.shape[0], : left.shape[1]]
     at = np.clip(np.rint(cols - there).astype(np.int64), 0, left.shape[1] - 1)
-    good: BoolArray = (there >= 0) & (np.abs(there - back[rows, at]) <= FINER)
+    good: BoolArray = (there >= 0) & (np.abs(there - back[rows, at]) <= COLUMNS_PER_PIXEL)
     return there, good
 
 
-def _refined(
+def _refined_disparity(
     left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], disparity: FloatImage, good: BoolArray
 ) -> tuple[FloatImage, FloatImage]:
     """Return disparities [columns] after a step of least squares matching from SGBM's, and their standard deviation
@@ -226,7 +231,7 @@ def _refined(
     a shift along the line of the other's; noise is what these leave. Noise is in the slopes, too, and is taken out of
     what they tell. The step counts by the variance of SGBM's word over the sum of both.
     """
-    side, weight = (FINER * WINDOW, WINDOW), good.astype(np.float32)
+    side, weight = (COLUMNS_PER_PIXEL * WINDOW, WINDOW), good.astype(np.float32)
     total = np.maximum(cv2.boxFilter(weight, cv2.CV_32F, side), 1e-3)
 
     def mean(values: FloatImage) -> FloatImage:
@@ -247,11 +252,11 @@ def _refined(
     shift = (a_s - ab * bs / bb) / told
     pixels, hat = WINDOW**2 * total, 2 / 12  # variance of two roundings: of grey values, of what SGBM says [columns^2]
     left_over = np.maximum(aa - ab**2 / bb - told * shift**2, 0.0)
-    noise = np.maximum(left_over * pixels / np.maximum(pixels - 3, 1) / _LEFT, hat)  # 3: the unknowns
-    variance = noise / pixels / np.maximum(told - noise * _SLOPE / 4, 0.1 * told)
+    noise = np.maximum(left_over * pixels / np.maximum(pixels - 3, 1) / _NOISE_VARIANCE, hat)  # 3: the unknowns
+    variance = noise / pixels / np.maximum(told - noise * _SLOPE_VARIANCE / 4, 0.1 * told)
     found = start - shift * hat / (hat + variance)
     kept = np.clip(found, disparity - 1.0, disparity + 1.0)
-    return np.asarray(kept, np.float32), np.asarray(np.sqrt(variance) / FINER, np.float32)
+    return np.asarray(kept, np.float32), np.asarray(np.sqrt(variance) / COLUMNS_PER_PIXEL, np.float32)
 
 
 def _warped(values: npt.NDArray[Any], disparity: FloatImage, how: int) -> npt.NDArray[Any]:

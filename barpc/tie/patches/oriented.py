@@ -14,23 +14,23 @@ import numpy as np
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 from barpc.tie.pairing.epipolar import grouped
-from barpc.tie.patches.channels import EDGE, channels, correlation, cut, picture, ticks
+from barpc.tie.patches.channels import INVALID_MARGIN, channels, correlation, picture, ticks, windows_around
 from barpc.tie.pixels import CELL, PIECE, SPAN, FloatImage, OpenReaders
 
-Files = Sequence[tuple[str, tuple[int, int]]]
+ImageFiles = Sequence[tuple[str, tuple[int, int]]]
 """Path and size (width, height) of two images."""
 
-PATCH = 24
+TEMPLATE_REACH = 24
 """How far one reaches when matches are registered [px]."""
 SIGMA = 0.1
 """Standard deviation of a place registered by structure [px]; as much across an epipolar line is always tolerated."""
 HALF = 16
 """How far a template reaches to each side [px]."""
-SHOWN = 0.9
+MIN_PICTURE_SHARE = 0.9
 """Part of a template that must be a picture."""
-REACH = 1.5
+MAX_PATCH_SHIFT = 1.5
 """What a registered patch may move [px], and the way back from a template miss by: beyond, it is another point."""
-_FINER = 3  # px to each side that a finer picture is searched, and the last one, of half its step
+_REFINEMENT_RADIUS = 3  # px to each side that a finer picture is searched, and the last one, of half its step
 
 
 def resolution(linear: Array) -> int:
@@ -42,7 +42,7 @@ def resolution(linear: Array) -> int:
 class Sampling:
     """How two images are seen on grids of one resolution and orientation."""
 
-    files: Files
+    files: ImageFiles
     band: int
     step: float  # px of A that a pixel of the grids holds
     linear: Array  # (2, 2) d(B)/d(A)
@@ -57,13 +57,13 @@ class Sampling:
 
 def found_about(sampling: Sampling, at: Array, xy: Array, half: int = HALF) -> tuple[Array, BoolArray, Array]:
     """Return the places (n, 2) near those given, whether they stand out and the way back returns; correlations."""
-    tile = PatchTile.of(sampling, at, xy, np.full(2, _FINER), half)
+    tile = PatchTile.of(sampling, at, xy, np.full(2, _REFINEMENT_RADIUS), half)
     place, ok, score = tile.found()
     return tile.in_b(place), ok & tile.returns(place), score
 
 
 def register_oriented(
-    files: Files, band: int, reference: Array, start: Array, linear: Array
+    files: ImageFiles, band: int, reference: Array, start: Array, linear: Array
 ) -> tuple[Array, BoolArray, Array]:
     """Register patches of A at `reference` about `start` (n, 2) [px] of B: places, success, correlations.
 
@@ -75,9 +75,9 @@ def register_oriented(
     with OpenReaders() as readers:
         for rows in grouped(*np.floor(reference[:, ::-1] / (step * SPAN)).T):
             at, turn = reference[rows], np.median(linear[rows], axis=0)
-            near, found, _ = found_about(Sampling(files, band, step, turn, readers), at, start[rows], PATCH)
+            near, found, _ = found_about(Sampling(files, band, step, turn, readers), at, start[rows], TEMPLATE_REACH)
             closer = Sampling(files, band, 0.5 * step, turn, readers)
-            tile = PatchTile.of(closer, at, near, np.full(2, _FINER), 2 * HALF)
+            tile = PatchTile.of(closer, at, near, np.full(2, _REFINEMENT_RADIUS), 2 * HALF)
             best, inside, score[rows] = tile.found()
             place[rows], ok[rows] = tile.in_b(best), found & inside
     return place, ok, score
@@ -100,7 +100,7 @@ class PatchTile:
     def of(cls, sampling: Sampling, at: Array, xy: Array, reach: IntArray, half: int) -> PatchTile:
         """Return the pictures of two images about points of A and B (n, 2) [px]."""
         step, matrix = sampling.step, sampling.step * sampling.linear
-        pad = half + EDGE + 2  # beside it, channels do not know what lies beyond
+        pad = half + INVALID_MARGIN + 2  # beside it, channels do not know what lies beyond
         corner = np.floor(at.min(axis=0) / step) * step - pad * step
         first = np.rint((at - corner) / step).astype(np.int64)
         middle = np.median(xy, axis=0)
@@ -126,7 +126,8 @@ class PatchTile:
         x, y = (self.half + self.reach).tolist()
         parts = [
             correlation(
-                cut(self.pictures[0], self.at[i], self.half, self.half), cut(self.pictures[1], self.whole[i], x, y)
+                windows_around(self.pictures[0], self.at[i], self.half, self.half),
+                windows_around(self.pictures[1], self.whole[i], x, y),
             )
             for i in self._batches()
         ]
@@ -144,7 +145,7 @@ class PatchTile:
         """Return the best correlations (n,) beside the search, where nothing true can be, to the right and left in
         turn.
         """
-        aside = np.where(np.arange(len(self.at)) % 2, 1, -1)[:, None] * [2 * self.reach[0] + EDGE, 0]
+        aside = np.where(np.arange(len(self.at)) % 2, 1, -1)[:, None] * [2 * self.reach[0] + INVALID_MARGIN, 0]
         return np.asarray(replace(self, whole=self.whole + aside).surfaces().max(axis=(1, 2)), np.float64)
 
     def _batches(self) -> list[slice]:
@@ -176,17 +177,19 @@ class PatchTile:
         """Return whether matching back from places of the second picture ends where it began."""
         search, missed = 4, []
         for i in self._batches():
-            there = cut(self.pictures[1], np.rint(place[i]).astype(np.int64), self.half, self.half)
-            back = correlation(there, cut(self.pictures[0], self.at[i], self.half + search, self.half + search))
+            there = windows_around(self.pictures[1], np.rint(place[i]).astype(np.int64), self.half, self.half)
+            back = correlation(
+                there, windows_around(self.pictures[0], self.at[i], self.half + search, self.half + search)
+            )
             y, x = np.divmod(back.reshape(len(back), -1).argmax(axis=1), back.shape[2])
             missed.append(np.hypot(x - search, y - search))
-        return np.asarray(np.concatenate(missed) <= REACH)
+        return np.asarray(np.concatenate(missed) <= MAX_PATCH_SHIFT)
 
     def shown(self, which: int = 0, place: Array | None = None) -> BoolArray:
         """Return the places (n, 2) in a picture about which it holds structure: of templates those that do."""
         at = self.at if place is None else np.rint(place).astype(np.int64)
         known = (np.abs(self.pictures[which]).sum(axis=0, keepdims=True) > 0).astype(np.float32)
-        return np.asarray(cut(known, at, self.half, self.half).mean(axis=(1, 2, 3)) > SHOWN)
+        return np.asarray(windows_around(known, at, self.half, self.half).mean(axis=(1, 2, 3)) > MIN_PICTURE_SHARE)
 
     def in_b(self, place: Array) -> Array:
         """Return the places (n, 2) of the second picture in B [px]."""

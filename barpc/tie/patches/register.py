@@ -18,9 +18,9 @@ from scipy.spatial import cKDTree
 
 from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array
 from barpc.base.options import TieOptions
-from barpc.base.usual import FEW, robust_spread
+from barpc.base.statistics import FEW, robust_spread
 from barpc.scene import BoolArray, IntArray, Tracks, View
-from barpc.tie.pairing.epipolar import LEAST_REACH, coherent, frame, grouped, linear_map
+from barpc.tie.pairing.epipolar import LEAST_REACH, coherent, epipolar_segments, grouped, linear_map
 from barpc.tie.patches import oriented
 from barpc.tie.pixels import SPAN, FloatImage, PixelReader, grow, levelled
 from barpc.tie.tasks import HERE, Work
@@ -30,12 +30,14 @@ MIN_CORRELATION = 0.8
 PATCH = 21
 """Side of the patches that are registered [px], odd."""
 _INNER = 0.7  # part of a patch that counts most: its Gaussian weight's sigma; the patch of second tries and the check
-_FINE = 4  # samples a pixel and axis
-_STEPS = cv2.INTER_TAB_SIZE * _FINE  # a pixel and axis: positions that the sampler tells apart, and steps end at
+_SUBPIXEL_SAMPLES = 4  # samples a pixel and axis
+_SAMPLER_STEPS = (
+    cv2.INTER_TAB_SIZE * _SUBPIXEL_SAMPLES
+)  # a pixel and axis: positions that the sampler tells apart, and steps end at
 _TAPS = 6  # samples on either side in the interpolation
 _DISTORTED = 2.0  # times the median sigma about it: the patch lies across a step of the ground
 _LEAST_END_SIGMA = 0.02  # px, of an observation: a rendered one that is matched best
-_EPS = float(np.finfo(np.float32).eps)
+_SINGLE_PRECISION_EPS = float(np.finfo(np.float32).eps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,16 +62,16 @@ class PatchRegistration:
 
 
 def register_places(
-    files: oriented.Files, band: int, reference: Array, start: Array, linear: Array, patch: int
+    files: oriented.ImageFiles, band: int, reference: Array, start: Array, linear: Array, patch: int
 ) -> PatchRegistration:
     """Read what is needed of two images, each a path and its size, and register as `register_patches`, tile by tile.
 
     Where a size is a part of the file's, pixels are means of the file's (`PixelReader`).
     """
     cv2.setNumThreads(1)
-    margin = patch + _TAPS + int(oriented.REACH)
+    margin = patch + _TAPS + int(oriented.MAX_PATCH_SHIFT)
     sparse, every = _sparse(reference, margin), PatchRegistration.none(start)
-    read, groups = (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, SPAN))
+    read, groups = (_mosaics, [np.arange(len(start))]) if sparse else (_window_pixels, _by_tile(reference, SPAN))
     (path, size), (other, beyond) = files
     with PixelReader(path, band, size) as first, PixelReader(other, band, beyond) as second:
         for rows in groups:
@@ -83,7 +85,9 @@ def register_places(
     return every
 
 
-Read = tuple[FloatImage, BoolArray, Array]  # pixels, which are valid, place of the image's origin (2,) or (N, 2) [px]
+ReadWindow = tuple[
+    FloatImage, BoolArray, Array
+]  # pixels, which are valid, place of the image's origin (2,) or (N, 2) [px]
 
 
 def _sparse(xy: Array, margin: int) -> bool:
@@ -91,7 +95,7 @@ def _sparse(xy: Array, margin: int) -> bool:
     return len(xy) * (2 * margin + 1) ** 2 < 0.5 * float(np.prod(np.ptp(xy, axis=0) + 2 * margin + 1))
 
 
-def _window(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int) -> Read:
+def _window_pixels(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int) -> ReadWindow:
     """Return the pixels about all points."""
     low, high = np.floor(xy.min(axis=0)).astype(int), np.ceil(xy.max(axis=0)).astype(int)
     box = grow((low[0], low[1], *(high - low + 1)), margin, size)
@@ -99,7 +103,7 @@ def _window(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int) 
     return levelled(pixels, usable), usable, np.array(box[:2], dtype=np.float64)
 
 
-def _mosaics(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int) -> Read:
+def _mosaics(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int) -> ReadWindow:
     """Return the pixels about every point, side by side in one picture: what lies between points is not worked on."""
     side = 2 * margin + 1
     columns = int(np.ceil(np.sqrt(len(xy))))
@@ -121,14 +125,14 @@ def _mosaics(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int)
     return picture, usable, shift
 
 
-def _parts(origin: Array, links: IntArray, tile: int) -> list[IntArray]:
+def _task_parts(origin: Array, links: IntArray, tile: int) -> list[IntArray]:
     """Return the links of each task: of whole tiles, or, where few, of bands of rows: blocks decode once."""
-    if not _sparse(origin, PATCH + _TAPS + int(oriented.REACH)):
-        return [links[rows] for rows in _joined(_by_tile(origin, tile), CHUNK)]
+    if not _sparse(origin, PATCH + _TAPS + int(oriented.MAX_PATCH_SHIFT)):
+        return [links[rows] for rows in _merge_groups(_by_tile(origin, tile), CHUNK)]
     order = np.lexsort((origin[:, 0], origin[:, 1] // SPAN))
     bands = np.split(order, np.flatnonzero(np.diff(origin[order, 1] // SPAN)) + 1)
     pieces = [band[at : at + SPAN] for band in bands for at in range(0, len(band), SPAN)]
-    return [links[rows] for rows in _joined(pieces, SPAN)]
+    return [links[rows] for rows in _merge_groups(pieces, SPAN)]
 
 
 def _by_tile(xy: Array, tile: int) -> list[IntArray]:
@@ -136,7 +140,7 @@ def _by_tile(xy: Array, tile: int) -> list[IntArray]:
     return grouped(*np.floor(xy[:, ::-1] / tile).astype(np.int64).T)
 
 
-def _joined(groups: Sequence[IntArray], most: int) -> list[IntArray]:
+def _merge_groups(groups: Sequence[IntArray], most: int) -> list[IntArray]:
     """Return the groups that follow each other as one, as far as they hold so many together."""
     parts: list[list[IntArray]] = []
     count = most
@@ -150,7 +154,7 @@ def _joined(groups: Sequence[IntArray], most: int) -> list[IntArray]:
 
 
 def register_part(
-    files: oriented.Files, band: int, reference: Array, start: Array, linear: Array, structural: bool
+    files: oriented.ImageFiles, band: int, reference: Array, start: Array, linear: Array, structural: bool
 ) -> PatchRegistration:
     """Register patches by their grey values, or by channels of oriented gradients; `ok` where they are alike."""
     if structural:
@@ -188,7 +192,7 @@ def register_patches(
             found = template.find(fine, reference[rows].astype(np.int64), start[rows], linear[rows])
             best.put(rows, replace(found, ok=found.ok & _at(usable[1], found.xy)))
     for rows in _chunks(np.flatnonzero(best.ok)):  # on a step of the ground the inner part goes elsewhere
-        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], 10 / _STEPS)
+        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], 10 / _SAMPLER_STEPS)
         apart = np.hypot(*(inner.xy - best.xy[rows]).T)
         best.ok[rows] = apart <= 5.0 * np.maximum(oriented.SIGMA, inner.sigma)
     return best
@@ -206,8 +210,8 @@ def _at(mask: BoolArray, xy: Array) -> BoolArray:
 
 
 def _upsampled(image: FloatImage) -> FloatImage:
-    """Resample with more samples a side by a windowed sinc; the sample `_FINE` (row, col) is the pixel (row,
-    col).
+    """Resample with more samples a side by a windowed sinc; the sample `_SUBPIXEL_SAMPLES` (row, col) is the pixel
+    (row, col).
 
     Between these a linear sample moves no phase; OpenCV's bicubic one would, by up to a twentieth of the step.
     """
@@ -215,18 +219,18 @@ def _upsampled(image: FloatImage) -> FloatImage:
     across, down = (_TAPS - 1, 0), (0, _TAPS - 1)
     columns = [cv2.sepFilter2D(image, -1, kernel, one, None, across, 0.0, border) for kernel in _kernels()]
     wide = cv2.merge([image, *columns]).reshape(len(image), -1)
-    out = np.empty((_FINE * len(image), wide.shape[1]), np.float32)
-    out[::_FINE] = wide
+    out = np.empty((_SUBPIXEL_SAMPLES * len(image), wide.shape[1]), np.float32)
+    out[::_SUBPIXEL_SAMPLES] = wide
     for phase, kernel in enumerate(_kernels(), start=1):
-        cv2.sepFilter2D(wide, -1, one, kernel, out[phase::_FINE], down, 0.0, border)
+        cv2.sepFilter2D(wide, -1, one, kernel, out[phase::_SUBPIXEL_SAMPLES], down, 0.0, border)
     return out
 
 
 def _kernels() -> list[FloatImage]:
     """Return the weights (2 `_TAPS`,) of the pixels about a point, for every fraction of a pixel but 0."""
     kernels = []
-    for phase in range(1, _FINE):
-        offset = np.arange(1 - _TAPS, _TAPS + 1) - phase / _FINE
+    for phase in range(1, _SUBPIXEL_SAMPLES):
+        offset = np.arange(1 - _TAPS, _TAPS + 1) - phase / _SUBPIXEL_SAMPLES
         kernel = np.sinc(offset) * np.cos(0.5 * np.pi * offset / (_TAPS + 1)) ** 2
         kernels.append((kernel / kernel.sum()).astype(np.float32))
     return kernels
@@ -260,12 +264,12 @@ class _Template:
         mean = (patches @ self._weight)[:, None]
         centred = patches - mean
         deviation = np.sqrt((centred * centred) @ self._weight)[:, None]
-        flat = deviation**2 <= _EPS**2 * (1.0 + mean * mean)
+        flat = deviation**2 <= _SINGLE_PRECISION_EPS**2 * (1.0 + mean * mean)
         deviation = np.where(flat, np.float32(np.inf), deviation)
         return centred / deviation, deviation
 
     def find(
-        self, fine: FloatImage, reference: IntArray, start: Array, linear: Array, settled: float = 1 / _STEPS
+        self, fine: FloatImage, reference: IntArray, start: Array, linear: Array, settled: float = 1 / _SAMPLER_STEPS
     ) -> PatchRegistration:
         """Register the patches about `reference` (N, 2), begun at `start` with the distortion `linear`."""
         offset = self._row * self._width + self._col
@@ -279,13 +283,13 @@ class _Template:
             np.multiply(jacobian[:, by], lever, out=jacobian[:, row])
         jacobian[:, 6], jacobian[:, 7] = values * self._root, self._root
         normal = (jacobian @ jacobian.transpose(0, 2, 1)).astype(np.float64)
-        normal += _EPS * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)
+        normal += _SINGLE_PRECISION_EPS * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)
         inverse = np.asarray(np.linalg.inv(normal), np.float64)
         xy, step, correlation = self._iterate(fine, (jacobian, inverse), start.copy(), linear.copy(), settled)
         noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - 8.0)
-        sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_EPS)
+        sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_SINGLE_PRECISION_EPS)
         moved = np.hypot(*(xy - start).T)
-        ok = (step <= 10 * settled) & (moved <= oriented.REACH) & np.isfinite(sigma)
+        ok = (step <= 10 * settled) & (moved <= oriented.MAX_PATCH_SHIFT) & np.isfinite(sigma)
         return PatchRegistration(xy, correlation, sigma, ok)
 
     def _iterate(
@@ -300,7 +304,9 @@ class _Template:
         active = np.arange(len(centre))
         jacobian, inverse = solver
         for _ in range(NEWTON_STEPS):
-            sampled = np.rint(centre[active] * _STEPS) / _STEPS  # else the sampler would round, and we not know
+            sampled = (
+                np.rint(centre[active] * _SAMPLER_STEPS) / _SAMPLER_STEPS
+            )  # else the sampler would round, and we not know
             patches = self._normalized(self._sample(fine, sampled, linear[active]))[0]
             right = (jacobian @ (self._root * patches)[:, :, None]).astype(np.float64)
             solution = (inverse @ right)[:, :, 0]
@@ -322,7 +328,7 @@ class _Template:
     def _sample(self, fine: FloatImage, centre: Array, linear: Array) -> FloatImage:
         """Return the patches (N, P) of the other image about centres (N, 2) under distortions (N, 2, 2)."""
         offsets = np.stack([self._col, self._row]).astype(np.float32)
-        where = _FINE * (linear.astype(np.float32) @ offsets + centre.astype(np.float32)[:, :, None])
+        where = _SUBPIXEL_SAMPLES * (linear.astype(np.float32) @ offsets + centre.astype(np.float32)[:, :, None])
         border = cv2.BORDER_REFLECT_101
         patches = cv2.remap(fine, where[:, 0], where[:, 1], cv2.INTER_LINEAR, borderMode=border)
         return np.asarray(patches, np.float32)
@@ -349,15 +355,15 @@ def refine(
         return tracks
     of_track = references(tracks, spreads, len(views))
     other = np.flatnonzero(np.arange(len(tracks)) != of_track[tracks.point])
-    links = _Links(views, tracks, of_track[tracks.point[other]], other, frozenset(structural))
+    links = _Registrations(views, tracks, of_track[tracks.point[other]], other, frozenset(structural))
     found = links.register(options, work)
     good = links.verified(found, found.ok)
     sigma = links.scaled(found, good)
-    return _shared(tracks, of_track, other[good], found.xy[good], sigma[good])
+    return _shared_variance(tracks, of_track, other[good], found.xy[good], sigma[good])
 
 
 @dataclass(frozen=True, eq=False)
-class _Links:
+class _Registrations:
     """Observations that are registered (`other`), each with the reference of its track; rows of `tracks`."""
 
     views: Sequence[View]
@@ -391,7 +397,7 @@ class _Links:
             linear[group] = linear_map(*self.of(group), origin[group])
         rounding = (origin - self.tracks.xy[self.reference])[:, :, None]
         start = self.tracks.xy[self.other] + (linear @ rounding)[:, :, 0]
-        parts = [part for group in self.groups() for part in _parts(origin[group], group, options.tile)]
+        parts = [part for group in self.groups() for part in _task_parts(origin[group], group, options.tile)]
         tasks = []
         for part in parts:
             first, second = self.of(part)
@@ -407,7 +413,7 @@ class _Links:
 
     def errors(self, found: PatchRegistration, group: IntArray) -> tuple[Array, Array]:
         """Return distances along and across epipolar lines (M, 2) [px] of two views, and half the segments (M,)."""
-        where = frame(*self.of(group), self.origin[group])
+        where = epipolar_segments(*self.of(group), self.origin[group])
         return where.errors(found.xy[group]), where.after
 
     def verified(self, found: PatchRegistration, good: BoolArray) -> BoolArray:
@@ -461,7 +467,7 @@ def _usual(places: Array, sigma: Array) -> Array:
     return out
 
 
-def _shared(tracks: Tracks, of_track: IntArray, rows: IntArray, xy: Array, sigma: Array) -> Tracks:
+def _shared_variance(tracks: Tracks, of_track: IntArray, rows: IntArray, xy: Array, sigma: Array) -> Tracks:
     """Return the registered rows and their references; the variance of a registration is shared by both its ends."""
     points = tracks.point[rows]
     count = np.bincount(points, minlength=tracks.num_points)

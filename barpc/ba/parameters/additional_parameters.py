@@ -17,17 +17,17 @@ import numpy as np
 import scipy.linalg as la
 
 from barpc.base.geodesy import Array
-from barpc.base.usual import SAMPLE
+from barpc.base.statistics import SAMPLE
 from barpc.scene import IntArray
-from barpc.sensor.displaced import RowSpline, bsplines, profile, sine_and_cosine
+from barpc.sensor.image_corrections import RowSpline, bsplines, profile, sine_and_cosine
 
-FEWEST = 7  # splines
+MIN_SPLINES = 7  # splines
 FIRST_SIGMA = 1.0  # px: a prior's standard deviation before anything is known
 DRIFTS = 3  # polynomials of the row that are the drift's, a constant, a slope and a bend: splines are apart from them
 
 
 @dataclass(frozen=True, eq=False)
-class Waves:
+class AdditionalParameters:
     """Layout of a view's unknowns in the image [px]: (col, row) of splines, then of steps, strips and swings."""
 
     count: int  # B-splines over the rows of an image; 0: none
@@ -165,7 +165,7 @@ class Waves:
             found = replace(found, periods=self.periods[view][there], swings=swung[there])
         return found
 
-    def carried(self, params: Array, known: Waves) -> Array:
+    def carried(self, params: Array, known: AdditionalParameters) -> Array:
         """Return unknowns (N, size) started from those of another layout (N, known.size), where kinds agree."""
         out = np.zeros((len(params), self.size))
         same = self.count == known.count, False, bool(known.parts[2]), self.parts[3] == known.parts[3]

@@ -20,14 +20,14 @@ from barpc.fit import RpcFit
 from barpc.fit.points import Sample, widened
 from barpc.fit.refit import fit_only
 from barpc.pipeline.executor import CachingExecutor
-from barpc.pipeline.handoff import verify_grid
-from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid, write_resampled
+from barpc.pipeline.verify_outputs import verify_grid
+from barpc.rpcio.grids import CORRECTION, GRID_SUFFIX, read_correction, write_correction, write_grid, write_resampled
 from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.sensor.csm import STATE_END as STATE
 from barpc.sensor.csm import is_writable, open_state, state_text
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
-from barpc.sensor.displaced import CorrectionGrid, Displaced
+from barpc.sensor.image_corrections import CorrectionGrid, Displaced
 from barpc.sensor.rpc import RPC
 from barpc.tie.tasks import Progress, ordered
 from barpc.workspace import Workspace
@@ -46,7 +46,7 @@ Misses = dict[str, Miss]  # file -> how far it is off the camera that it holds
 
 
 @dataclass(frozen=True)
-class Files:
+class GridFiles:
     """Files to be written of a view beside its RPC."""
 
     grids: bool
@@ -55,13 +55,13 @@ class Files:
 
     def names(self, view: View) -> list[str]:
         """Return their names."""
-        ends = [STATE] * self.state + [GRID] * self.grids + [CORRECTION] * (self.grids or self.resampled)
+        ends = [STATE] * self.state + [GRID_SUFFIX] * self.grids + [CORRECTION] * (self.grids or self.resampled)
         return [view.name + end for end in (*ends, *[RESAMPLED] * self.resampled)]
 
 
 def grid_names(view: View, options: RunOptions) -> list[str]:
     """Return the files that `write_grids` may write for a view, before it is known whether its RPC holds it."""
-    return Files(grids=True, resampled=options.resample, state=is_writable(view.sensor)).names(view)
+    return GridFiles(grids=True, resampled=options.resample, state=is_writable(view.sensor)).names(view)
 
 
 def write_grids(
@@ -78,18 +78,18 @@ def write_grids(
     files = []
     for _, fit, model in fitted:
         grids = options.grids or not np.linalg.norm(fit.max_ckp) <= MISFIT
-        files.append(Files(grids, options.resample, is_writable(model)))
+        files.append(GridFiles(grids, options.resample, is_writable(model)))
     written: list[Written] = [{} for _ in fitted]
     some = [i for i, one in enumerate(files) if one.names(fitted[i][0])]
     if some:
         with run.stage("grids"):
             tasks = [(fitted[i][0], fitted[i][1].rpc, fitted[i][2], files[i]) for i in some]
-            for i, found in zip(some, _write(run, tasks, executor, progress), strict=True):
+            for i, found in zip(some, _write_grids(run, tasks, executor, progress), strict=True):
                 written[i] |= found
     return written
 
 
-Task = tuple[View, RPC, SensorModel, Files]
+GridTask = tuple[View, RPC, SensorModel, GridFiles]
 
 
 def made_in_room(
@@ -117,8 +117,8 @@ def made_in_room(
     return made
 
 
-def _write(
-    run: Workspace, tasks: Sequence[Task], executor: Executor | None, progress: Progress | None
+def _write_grids(
+    run: Workspace, tasks: Sequence[GridTask], executor: Executor | None, progress: Progress | None
 ) -> list[Written]:
     """Write grids, and open them again."""
     with CachingExecutor(run, {}, executor, keep=False) as fresh:
@@ -136,7 +136,7 @@ def _write(
     return written
 
 
-def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str) -> Misses:
+def make_grids(view: View, rpc: RPC, model: SensorModel, files: GridFiles, room: str) -> Misses:
     """Write the grids of a view, and its image resampled, into a temporary folder; return what each misses by [px]."""
     place, alts = Path(room) / view.name, widened(view.alt_range)
     place.mkdir(parents=True, exist_ok=True)
@@ -145,13 +145,13 @@ def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str
         if files.state:
             text = state_text(model, view.size, alts)
             write_text(place / (view.name + STATE), text, overwrite=True)
-            errors[view.name + STATE] = _off(sample, open_state(place / (view.name + STATE))[0])
+            errors[view.name + STATE] = _largest_miss(sample, open_state(place / (view.name + STATE))[0])
         if not (files.grids or files.resampled):
             return errors
         if files.grids:
             grid = DirectGrid.of(model, view.size, alts)
-            errors[view.name + GRID] = _off(sample, grid)
-            write_grid(grid, place / (view.name + GRID), overwrite=True)
+            errors[view.name + GRID_SUFFIX] = _largest_miss(sample, grid)
+            write_grid(grid, place / (view.name + GRID_SUFFIX), overwrite=True)
         rpc, lacking, error = grid_correction(rpc, sample)
         write_correction(lacking, rpc, place / (view.name + CORRECTION), overwrite=True)
     except (RpcError, FitError) as failure:
@@ -179,7 +179,7 @@ def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss
         except (RpcError, FitError) as error:
             failed = error
             continue
-        found.append((*_off(sample, Displaced(one, lacking)), one, lacking))
+        found.append((*_largest_miss(sample, Displaced(one, lacking)), one, lacking))
         if found[-1][1] <= LINEAR:
             break
     if not found:
@@ -190,7 +190,7 @@ def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss
     return replace(best, err_bias=rpc.err_bias, err_rand=rpc.err_rand), lacking, (rms, largest, where)
 
 
-def _off(sample: Sample, camera: SensorModel) -> Miss:
+def _largest_miss(sample: Sample, camera: SensorModel) -> Miss:
     """Return the largest error of a camera against the model of a sample."""
     errors, largest = sample.sought(lambda ground, at: camera.project(ground) - at[:, :2])
     return float(np.linalg.norm(errors.rmse)), float(np.linalg.norm(largest)), errors.worst

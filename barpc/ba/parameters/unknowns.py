@@ -13,13 +13,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from barpc.ba.estimated.waves import Waves
+from barpc.ba.parameters.additional_parameters import AdditionalParameters
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import IntArray, View
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.displaced import ImageAffine, ImageCorrected, Splined
 from barpc.sensor.geometry import camera_centers
+from barpc.sensor.image_corrections import ImageAffine, ImageCorrected, Splined
 from barpc.sensor.rpc import localize_stack
 from barpc.sensor.timing import Clocked, Timed, Timing, is_clocked
 
@@ -39,7 +39,7 @@ class Unknowns:
     half: Array  # (2, N) its half width and height [px]
     # (N, 2) where its scene stands, east and north of the middle of all [m]
     place: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    waves: Waves | None = None  # what is left in the image
+    waves: AdditionalParameters | None = None  # what is left in the image
     radars: Mapping[int, Clocked] = field(default_factory=dict)  # views whose unknowns are those of clocks
 
     @property
@@ -205,7 +205,7 @@ def make_unknowns(
     model: str,
     drift: int = 0,
     centers: Array | None = None,
-    waves: Waves | None = None,
+    waves: AdditionalParameters | None = None,
 ) -> Unknowns:
     """Return the layout for N views; `centers` (N, 3), ECEF [m], are regressed from the sensors where None."""
     size = np.array([view.size for view in views], dtype=np.float64).reshape(-1, 2)

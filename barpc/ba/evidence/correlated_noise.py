@@ -10,11 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from barpc.base.geodesy import Array
-from barpc.base.usual import FEW
+from barpc.base.statistics import FEW
 from barpc.scene import IntArray
 
 _SIDES = 2 ** np.arange(2, 6)  # cells along each side of an image
-_ALIKE = np.linspace(0.0, 1.0, 21)[1:-1]  # part of the noise's variance that a cell shares
+_CORRELATED_SHARES = np.linspace(0.0, 1.0, 21)[1:-1]  # part of the noise's variance that a cell shares
 
 
 def shared_errors(view: IntArray, place: Array, size: Array, off: Array) -> Array:
@@ -35,14 +35,14 @@ def shared_errors(view: IntArray, place: Array, size: Array, off: Array) -> Arra
     count = np.bincount(view, minlength=num)
     scale = np.sqrt(np.bincount(view, (off**2).mean(axis=0), num) / np.maximum(count, 1))
     values = off / np.maximum(scale, np.finfo(np.float64).tiny)[view]
-    found = np.zeros((len(_SIDES), len(_ALIKE), num))
+    found = np.zeros((len(_SIDES), len(_CORRELATED_SHARES), num))
     for k, side in enumerate(_SIDES.tolist()):
         col, row = (place / size[:, view] * side).astype(np.int64).clip(0, side - 1)
         cell = (view * side + row) * side + col
         n = np.bincount(cell, minlength=num * side**2).astype(np.float64)
         between = sum(np.bincount(cell, one, len(n)) ** 2 for one in values) / np.maximum(n, 1.0)
         all_of = np.bincount(cell, (values**2).sum(axis=0), len(n))
-        for j, alike in enumerate(_ALIKE.tolist()):
+        for j, alike in enumerate(_CORRELATED_SHARES.tolist()):
             more = 1.0 + (n - 1.0) * alike  # variance of a cell's sum, over that of as many by themselves
             rooms = (n - 1.0) * np.log(1.0 - alike) + np.log(more)
             squares = (all_of - between) / (1.0 - alike) + between / more - all_of

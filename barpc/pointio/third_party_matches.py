@@ -29,7 +29,17 @@ import numpy.typing as npt
 from barpc.base.errors import BarpcError, InputError, plain
 from barpc.base.frozen import DEFLATED, HEADER, Arrays, load_npz
 from barpc.base.geodesy import Array
-from barpc.base.sidefile import MAX_DEPTH, MAX_ELEMENTS, NUMBER, TABLE, Kind, opened, opened_text, read_bytes, read_head
+from barpc.base.safe_io import (
+    BYTES_PER_NUMBER,
+    MAX_DEPTH,
+    MAX_ELEMENTS,
+    TABLE,
+    Kind,
+    opened,
+    opened_text,
+    read_bytes,
+    read_head,
+)
 from barpc.pointio.names import ViewNames
 from barpc.scene import IntArray
 
@@ -40,7 +50,7 @@ PairPoints = tuple[int, int, Array, Array]
 
 ENDINGS = (".txt", ".match", ".npz")
 _CLEAN = "-clean"  # what ASP adds to a name once its own outliers are gone
-_HEAD = 45  # bytes of a keypoint in ASP's binary files, before its descriptor
+_ASP_KEYPOINT_BYTES = 45  # bytes of a keypoint in ASP's binary files, before its descriptor
 _DATABASE = Kind("a file of keypoints and matches", None)  # most of it are descriptors, which are not read
 _CONTENT = Kind("the keypoints and matches of a COLMAP or HDF5 file", TABLE.most)
 
@@ -62,11 +72,13 @@ def index_pairs(matches: npt.NDArray[np.generic], counts: tuple[int, int]) -> In
     return found
 
 
-_Key = TypeVar("_Key", bound=Hashable)
+_ImageKey = TypeVar("_ImageKey", bound=Hashable)
 
 
-def _joined(
-    views: Mapping[_Key, int], keypoints: Callable[[_Key], Array], matches: Iterable[tuple[_Key, _Key, Any]]
+def _matched_points(
+    views: Mapping[_ImageKey, int],
+    keypoints: Callable[[_ImageKey], Array],
+    matches: Iterable[tuple[_ImageKey, _ImageKey, Any]],
 ) -> Iterator[PairPoints]:
     """Yield the points that matches of keypoints, read when they are needed, join: images are known by their keys."""
     points = cache(keypoints)
@@ -92,7 +104,7 @@ def read_pair_files(paths: Sequence[Path], views: ViewNames) -> Iterator[PairPoi
     for path in paths:
         pair = pair_of(path, views)
         if pair is not None:
-            first, second = _READERS[path.suffix.lower()](path)
+            first, second = _MATCH_READERS[path.suffix.lower()](path)
             if not len(first):
                 logger.warning("%s: holds no match", path)
             yield *pair, first, second
@@ -100,11 +112,11 @@ def read_pair_files(paths: Sequence[Path], views: ViewNames) -> Iterator[PairPoi
 
 def pair_of(path: Path, views: ViewNames) -> tuple[int, int] | None:
     """Return the two views that a file's name means; None where one is none of them."""
-    left, right = (views.find(name) for name in _images(path, views))
+    left, right = (views.find(name) for name in _images_of_file(path, views))
     return None if left is None or right is None or left == right else (left, right)
 
 
-def _images(path: Path, views: ViewNames) -> tuple[str, str]:
+def _images_of_file(path: Path, views: ViewNames) -> tuple[str, str]:
     """Return the two images that a file's name means, a run's prefix before the first one left out."""
     stem = path.stem.removesuffix(_CLEAN)
     cuts = [(stem[:i], stem[i + 2 :]) for i in range(len(stem) - 1) if stem.startswith("__", i)]
@@ -121,7 +133,7 @@ def _images(path: Path, views: ViewNames) -> tuple[str, str]:
     return (cuts or single or [(stem, stem)])[0]
 
 
-def _asp_text(path: Path) -> tuple[Array, Array]:
+def _read_asp_text(path: Path) -> tuple[Array, Array]:
     """Read an ASP text file: counts on the first line, then one keypoint a line, col and row first."""
     try:
         with opened_text(path, TABLE) as lines:
@@ -146,10 +158,14 @@ def _asp_binary(path: Path) -> tuple[Array, Array]:
         return np.empty((0, 2)), np.empty((0, 2))
     try:
         count, other = np.frombuffer(data, "<u8", 2).tolist()
-        size = _HEAD + 4 * int(np.frombuffer(data, "<u8", 1, 16 + _HEAD - 8)[0])
+        size = _ASP_KEYPOINT_BYTES + 4 * int(np.frombuffer(data, "<u8", 1, 16 + _ASP_KEYPOINT_BYTES - 8)[0])
         if count != other or 16 + 2 * count * size != len(data):
             raise ValueError(f"{len(data)} bytes are not {count} and {other} keypoints of {size} bytes")
-        layout: Any = {"names": ["xy", "length"], "formats": [("<f4", 2), "<u8"], "offsets": [0, _HEAD - 8]}
+        layout: Any = {
+            "names": ["xy", "length"],
+            "formats": [("<f4", 2), "<u8"],
+            "offsets": [0, _ASP_KEYPOINT_BYTES - 8],
+        }
         layout["itemsize"] = size
         records: Any = np.frombuffer(data, np.dtype(layout), 2 * count, 16)
         if len(set(records["length"].tolist())) != 1:
@@ -163,7 +179,7 @@ def _asp_binary(path: Path) -> tuple[Array, Array]:
 def matched_keypoints(path: Path, arrays: Arrays) -> tuple[Array, Array]:
     """Return the points (M, 2), (M, 2) that the arrays of one pair say."""
     try:
-        first, second = (_points(arrays[key]) for key in ("keypoints0", "keypoints1"))
+        first, second = (_point_array(arrays[key]) for key in ("keypoints0", "keypoints1"))
         known = arrays.get("matches0", arrays.get("matches"))
         if known is None:
             if len(first) != len(second):
@@ -175,15 +191,15 @@ def matched_keypoints(path: Path, arrays: Arrays) -> tuple[Array, Array]:
     return first[pairs[:, 0]], second[pairs[:, 1]]
 
 
-def _points(array: object) -> Array:
+def _point_array(array: object) -> Array:
     points = np.asarray(array, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(f"keypoints of shape {points.shape}")
     return points
 
 
-_READERS: dict[str, Callable[[Path], tuple[Array, Array]]] = {
-    ".txt": _asp_text,
+_MATCH_READERS: dict[str, Callable[[Path], tuple[Array, Array]]] = {
+    ".txt": _read_asp_text,
     ".match": _asp_binary,
     ".npz": lambda path: matched_keypoints(path, load_npz(path)),
 }
@@ -194,8 +210,8 @@ _READERS: dict[str, Callable[[Path], tuple[Array, Array]]] = {
 COLMAP = b"SQLite format 3\0"
 _JOURNAL = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"  # a rollback journal begins so while it counts
 _IDS = 2147483647  # a pair's number is that of its first image times this, and that of the second
-_TABLES = ("images", "keypoints", "two_view_geometries", "matches")
-_STEPS = 2000  # of 100,000 instructions of SQLite, seconds of work: a damaged file may hold a loop
+_SQL_TABLES = ("images", "keypoints", "two_view_geometries", "matches")
+_MAX_SQLITE_STEPS = 2000  # of 100,000 instructions of SQLite, seconds of work: a damaged file may hold a loop
 
 
 def read_colmap(path: Path, views: ViewNames) -> Iterator[PairPoints]:
@@ -225,7 +241,7 @@ def _pairs_of_database(path: Path, database: sqlite3.Connection, views: ViewName
         if found is None or not found[0]:
             return None
         data = found[2] or b""
-        total += NUMBER * (len(data) // np.dtype(dtype).itemsize)
+        total += BYTES_PER_NUMBER * (len(data) // np.dtype(dtype).itemsize)
         _CONTENT.check(path, total)
         return np.frombuffer(data, dtype).reshape(found[0], found[1])
 
@@ -250,7 +266,7 @@ def _pairs_of_database(path: Path, database: sqlite3.Connection, views: ViewName
                 if rows is not None:
                     yield a, b, rows
 
-    yield from _joined(known, keypoints, matches())
+    yield from _matched_points(known, keypoints, matches())
 
 
 def _plain_tables(database: sqlite3.Connection) -> list[str]:
@@ -259,26 +275,26 @@ def _plain_tables(database: sqlite3.Connection) -> list[str]:
     database.execute("PRAGMA trusted_schema = OFF")
     database.execute("PRAGMA cell_size_check = ON")
     kinds = dict(database.execute("SELECT name, type FROM sqlite_master WHERE type IN ('table', 'view')"))
-    if wrong := [name for name in _TABLES if kinds.get(name, "table") != "table"]:
+    if wrong := [name for name in _SQL_TABLES if kinds.get(name, "table") != "table"]:
         raise ValueError(f"{wrong[0]} is a {kinds[wrong[0]]}")
-    if missing := [name for name in _TABLES[:2] if name not in kinds]:
+    if missing := [name for name in _SQL_TABLES[:2] if name not in kinds]:
         raise ValueError(f"no table {missing[0]}")
     database.set_authorizer(_allowed)
-    steps = iter(range(_STEPS))
+    steps = iter(range(_MAX_SQLITE_STEPS))
     database.set_progress_handler(lambda: int(next(steps, None) is None), 100_000)
-    return [name for name in _TABLES if name in kinds]
+    return [name for name in _SQL_TABLES if name in kinds]
 
 
 def _allowed(action: int, first: str | None, _second: str | None, _base: str | None, source: str | None) -> int:
     """Authorise reading the known tables, and nothing by a view or trigger."""
-    good = action == sqlite3.SQLITE_SELECT or (action == sqlite3.SQLITE_READ and first in _TABLES)
+    good = action == sqlite3.SQLITE_SELECT or (action == sqlite3.SQLITE_READ and first in _SQL_TABLES)
     return sqlite3.SQLITE_OK if good and source is None else sqlite3.SQLITE_DENY
 
 
 # --- HDF5 -------------------------------------------------------------------------------------------------
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
-_KEYPOINTS, _MATCHES = "keypoints", "matches0"
+_KEYPOINTS_DATASET, _MATCHES_DATASET = "keypoints", "matches0"
 _FEATURES = ("features.h5", "keypoints.h5")
 
 
@@ -337,9 +353,9 @@ class _Datasets:
         self.matches: dict[tuple[str, str], Any] = {}
         for name, found in _datasets(file, h5py):
             *parts, last = name.split("/")
-            if last == _KEYPOINTS or (found.ndim == 2 and found.shape[1] == 2 and found.dtype.kind == "f"):
-                self.keypoints["-".join(parts if last == _KEYPOINTS else [*parts, last])] = found
-            elif len(ends := parts if last == _MATCHES else [*parts, last]) == 2 and found.dtype.kind in "iu":
+            if last == _KEYPOINTS_DATASET or (found.ndim == 2 and found.shape[1] == 2 and found.dtype.kind == "f"):
+                self.keypoints["-".join(parts if last == _KEYPOINTS_DATASET else [*parts, last])] = found
+            elif len(ends := parts if last == _MATCHES_DATASET else [*parts, last]) == 2 and found.dtype.kind in "iu":
                 self.matches[ends[0], ends[1]] = found
 
     def array(self, found: Any) -> Any:
@@ -348,7 +364,7 @@ class _Datasets:
             raise ValueError(f"{found.name} lies in another file")
         if found.nbytes > DEFLATED * found.id.get_storage_size() + HEADER:
             raise ValueError(f"{found.name} claims more bytes than it can hold")
-        self._bytes += found.size * max(NUMBER, found.dtype.itemsize)
+        self._bytes += found.size * max(BYTES_PER_NUMBER, found.dtype.itemsize)
         _CONTENT.check(self._path, self._bytes)
         return np.asarray(found[()])
 
@@ -362,11 +378,14 @@ class _Datasets:
 
 def _pairs_of_datasets(matches: _Datasets, keypoints: _Datasets, views: ViewNames) -> Iterator[PairPoints]:
     # an image is known by its name with slashes, its matches by that with dashes for them
-    places = {name: found.name.strip("/").removesuffix(f"/{_KEYPOINTS}") for name, found in keypoints.keypoints.items()}
+    places = {
+        name: found.name.strip("/").removesuffix(f"/{_KEYPOINTS_DATASET}")
+        for name, found in keypoints.keypoints.items()
+    }
     known = {name: view for name, place in places.items() if (view := views.find(place)) is not None}
     wanted = (
         (a, b, matches.array(numbers))
         for (a, b), numbers in matches.matches.items()
         if known.keys() >= {a, b} and known[a] != known[b]
     )
-    yield from _joined(known, keypoints.coordinates, wanted)
+    yield from _matched_points(known, keypoints.coordinates, wanted)

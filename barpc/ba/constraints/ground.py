@@ -8,15 +8,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barpc.ba.estimated.priors import PointPrior
-from barpc.ba.estimated.projected import Projected
-from barpc.ba.held.terrain import NUM_BENDS, Believed, Relief, Terrain, believe, terrain_slopes
+from barpc.ba.constraints.terrain import NUM_BENDS, RegularisedDem, Relief, Terrain, believe, terrain_slopes
+from barpc.ba.parameters.priors import PointPrior
+from barpc.ba.parameters.projected import Projected
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.structure import Structure
 from barpc.base.errors import BarpcWarning
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef, parts
 from barpc.base.options import AdjustOptions
-from barpc.base.usual import robust_spread
+from barpc.base.statistics import robust_spread
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference
 from barpc.sensor.curve import cross
 
@@ -24,12 +24,14 @@ FIRST_PLACED = NUM_BENDS
 """Errors in common in front of altimetry's own: a terrain's bends, or a terrain's and a reference's."""
 DEM_BIAS = 20.0  # m, where none is stated
 KNOWN_BIAS = 5.0  # m: the same, where it is known what its heights count from
-ALIKE = 25.0  # independent errors that those of a reference are worth together, at most: they resemble each other
+MAX_INDEPENDENT_ERRORS = (
+    25.0  # independent errors that those of a reference are worth together, at most: they resemble each other
+)
 _STAYS = 1.0  # m: rays of weak points tell heights to hundreds of metres (0.05 m under 0.01 degrees: 290 m)
 _FLAT_SIGMA = 50.0  # m: least spread of altitudes that tracks held without a DEM are given
 
 
-def _join(priors: Sequence[PointPrior | None]) -> PointPrior | None:
+def _join_priors(priors: Sequence[PointPrior | None]) -> PointPrior | None:
     """Return one block of several that speak of different points, and share their errors; None where all are empty."""
     given = [prior for prior in priors if prior is not None and len(prior.index)]
     if not given:
@@ -51,9 +53,9 @@ def reference_control(reference: Reference, index: IntArray) -> PointPrior:
 
     What they share: the height and slopes of the terrain, as points held to it do, the orthoimage's own place, and
     that what was matched may stand above the terrain (houses, trees). A terrain's errors reach over many points: all
-    of these are worth `ALIKE` independent heights, at most.
+    of these are worth `MAX_INDEPENDENT_ERRORS` independent heights, at most.
     """
-    sigma = reference.points.sigma * [1.0, 1.0, np.sqrt(max(len(index) / ALIKE, 1.0))]
+    sigma = reference.points.sigma * [1.0, 1.0, np.sqrt(max(len(index) / MAX_INDEPENDENT_ERRORS, 1.0))]
     alone = ground_control(replace(reference.points, sigma=sigma), index)
     common = np.zeros((len(index), 3, 6))
     common[:, 2, 0] = reference.bias[2] / sigma[:, 2]
@@ -89,7 +91,7 @@ def terrain_heights(
     return _heights(np.column_stack([ground[:, :2], alt]), index, normal, sigma, common_sigma, span)
 
 
-def _believed_heights(ground: Array, index: IntArray, believed: Believed, common_sigma: Array) -> PointPrior:
+def _believed_heights(ground: Array, index: IntArray, believed: RegularisedDem, common_sigma: Array) -> PointPrior:
     """Return the points `index` (Q,) at ground points (Q, 3) held to what is believed of a DEM.
 
     All of it may be wrong by a level, slopes and bends that are as much as `common_sigma` (`NUM_BENDS`,) [m] at the
@@ -178,7 +180,7 @@ class TerrainTest:
 
 
 @dataclass(frozen=True)
-class Heights:
+class PointConstraints:
     """The priors on points: GCPs, and heights for tracks that need (or are given) them."""
 
     control: tuple[PointPrior, ...]  # GCPs, then a reference if there is one
@@ -192,7 +194,7 @@ class Heights:
     relief: Relief | None = None  # the DEM beside what rays alone say of heights, where these may judge it
     placed: PointPrior | None = None  # tracks that altimetry holds, which nothing else does then
 
-    def loose(self, sigma: float) -> Heights:
+    def loose(self, sigma: float) -> PointConstraints:
         """Return the priors with GCPs known to `sigma` [m] only."""
         first = self.control[0]
         rows = enu_basis(ground_from_ecef(first.mean)) / sigma
@@ -206,9 +208,9 @@ class Heights:
 
     def hold(self, problem: Problem, points: Array) -> Problem:
         """Return the problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
-        return replace(problem, point_prior=_join([*self.control, self._held(points), self.placed]))
+        return replace(problem, point_prior=_join_priors([*self.control, self._held(points), self.placed]))
 
-    def _believed(self, points: Array) -> Believed | None:
+    def _believed(self, points: Array) -> RegularisedDem | None:
         if self.relief is None:
             return None
         return believe(self.relief, self.tracks, ground_from_ecef(points[self.tracks]), self.options.dem_sigma)
@@ -234,9 +236,9 @@ class Heights:
         if dem is not None:
             alike, span = 1.0, None
             if self.reference is not None:
-                alike, span = max(len(index) / ALIKE, 1.0), self.control[1].mean
+                alike, span = max(len(index) / MAX_INDEPENDENT_ERRORS, 1.0), self.control[1].mean
             elif self.relief is not None:
-                alike = max(len(index) / ALIKE, 1.0)
+                alike = max(len(index) / MAX_INDEPENDENT_ERRORS, 1.0)
             level = None if self.relief is None else ~weak[chosen]
             sigma = self.options.dem_sigma * alike**0.5
             return terrain_heights(points, index, dem, sigma, self._bias, span, level)

@@ -16,14 +16,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.linalg as la
 
-from barpc.ba.estimated.priors import EarlierScene, JointPrior
-from barpc.ba.held.ground import FIRST_PLACED
+from barpc.ba.constraints.ground import FIRST_PLACED
+from barpc.ba.parameters.priors import EarlierScene, JointPrior
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import Reduced, solve_lower
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
-from barpc.base.usual import SAMPLE
+from barpc.base.statistics import SAMPLE
 from barpc.scene import BoolArray
 
 MOTIONS = ("east", "north", "up", "tilt east", "tilt north", "turn", "scale", "twist", "bend east", "bend north")
@@ -84,7 +84,7 @@ def gauge_report(
     local = (points[use] - middle) @ enu.T
     radius = max(float(np.sqrt((local[:, :2] ** 2).sum(axis=1).mean())), 1e-6)
     by_unknown, own = _motion_by_unknowns(covariance, local / radius, enu, use, use.sum() / count)
-    found = _report(covariance, enu @ shift, by_unknown, own, radius)
+    found = _assembled_report(covariance, enu @ shift, by_unknown, own, radius)
     if prior is None:
         return found
     variance = np.where(np.isfinite(prior), prior, 0.0).ravel() ** 2
@@ -99,10 +99,12 @@ def earlier_scene(covariance: Covariance, prior: JointPrior, scene: EarlierScene
     by_unknown = np.zeros((len(MOTIONS), params.size))
     by_unknown[:, prior.index] = scene.by_unknown
     moved = scene.by_unknown @ (params.ravel()[prior.index] - prior.mean)
-    return _report(covariance, moved[:3], by_unknown, scene.own, scene.radius)
+    return _assembled_report(covariance, moved[:3], by_unknown, scene.own, scene.radius)
 
 
-def _report(covariance: Covariance, shift: Array, by_unknown: Array, own: Array, radius: float) -> GaugeReport:
+def _assembled_report(
+    covariance: Covariance, shift: Array, by_unknown: Array, own: Array, radius: float
+) -> GaugeReport:
     motion_covariance = by_unknown @ covariance.solve(by_unknown.T) + own
     sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
     return GaugeReport(shift, sigma[:3], sigma, _modes(motion_covariance), radius, by_unknown, own)
@@ -142,14 +144,14 @@ def _motion_of_points(local: Array) -> Array:
     shifts = [[one, zero, zero], [zero, one, zero], [zero, zero, one]]
     motions = np.array([*shifts, [zero, zero, e], [zero, zero, o], [-o, e, zero], [e, o, zero]])
     bends = np.zeros((3, 3, n))
-    bends[:, 2] = _bends(e, o)
+    bends[:, 2] = _bending_modes(e, o)
     motions = np.concatenate([motions, bends])
     flat = np.swapaxes(motions, 1, 2).reshape(len(MOTIONS), -1)
     gram = flat @ flat.T + 1e-9 * n * np.eye(len(MOTIONS))
     return np.linalg.solve(gram, flat).reshape(len(MOTIONS), n, 3)
 
 
-def _bends(east: Array, north: Array) -> Array:
+def _bending_modes(east: Array, north: Array) -> Array:
     """Return the heights (3, n) of a twist and two bends without the plane in them, each a metre in all."""
     plane = np.stack([np.ones_like(east), east, north])
     curved = np.stack([east * north, east**2, north**2])
@@ -198,13 +200,13 @@ def datum_shares(
         asked[[] if prior is None else prior.index] = True
         points = np.zeros((len(number), 3, len(variance)))
         points[asked] = reduced.carried(unknowns, np.flatnonzero(asked))
-        held = _known_points(paid, problem, reduced, unknowns, points, kinds)
-        _observations(paid, problem, state, weight, (unknowns, points), held)
+        held = _point_shares(paid, problem, reduced, unknowns, points, kinds)
+        _add_observation_shares(paid, problem, state, weight, (unknowns, points), held)
     with np.errstate(invalid="ignore"):
         return {source: cost / sum(paid.values()) for source, cost in paid.items()}
 
 
-def _known_points(
+def _point_shares(
     paid: Mapping[str, Array],
     problem: Problem,
     reduced: Reduced,
@@ -235,7 +237,7 @@ def _known_points(
     return held
 
 
-def _observations(
+def _add_observation_shares(
     paid: Mapping[str, Array],
     problem: Problem,
     state: State,

@@ -65,7 +65,7 @@ BEST = 0.2
 TRIALS = 150
 """Draws of three: where half are right, all of them miss three right ones once in 5e8."""
 
-STATED = 4.0
+STATED_FREEDOM = 4.0
 """Observations, or degrees of freedom, that a figure stated counts for beside what is seen."""
 
 RIVALS = 3

@@ -31,18 +31,18 @@ from rasterio.transform import RPCTransformer
 from barpc.base.errors import OutputError, out_of_memory
 from barpc.base.geodesy import Array, wrap_longitude
 from barpc.cameras import open_camera
-from barpc.fit.points import EXACT, Sample
+from barpc.fit.points import NEGLIGIBLE_FIT_ERROR, Sample
 from barpc.rasters.raster import GDAL_OPTIONS
 from barpc.rasters.vrt import Vrt, read_vrt
-from barpc.rpcio import Carrier, read_rpc, row_of, sidecars
-from barpc.rpcio.grids import CORRECTION, GRID
+from barpc.rpcio import Carrier, format_for, read_rpc, sidecars
+from barpc.rpcio.grids import CORRECTION, GRID_SUFFIX
 from barpc.sensor import SensorModel
 from barpc.sensor.csm import STATE_END
 from barpc.sensor.direct_grid import DirectGrid
-from barpc.sensor.displaced import CorrectionGrid
 from barpc.sensor.geometry import ground_grids
+from barpc.sensor.image_corrections import CorrectionGrid
 
-TOLERANCE = EXACT  # Largest difference [px] between a file and its model that passes
+READING_TOLERANCE = NEGLIGIBLE_FIT_ERROR  # Largest difference [px] between a file and its model that passes
 
 Projection = Callable[[Array], Array]
 """Ground points (N, 3) [deg, deg, m] -> image points (N, 2) [px], centre of the first pixel = (0, 0)."""
@@ -65,25 +65,25 @@ class Reading:
     @property
     def passed(self) -> bool:
         """Whether the consumer sees the camera that was meant."""
-        return bool(self.max_error <= TOLERANCE)
+        return bool(self.max_error <= READING_TOLERANCE)
 
 
 def control_grid(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> tuple[Array, Array]:
     """Return the ground points (N, 3) over an image and its altitudes, and where `model` sees them (N, 2) [px]."""
-    return _columns(ground_grids([(model, size, alt_range)])[0])
+    return _ground_and_image(ground_grids([(model, size, alt_range)])[0])
 
 
-def _columns(grid: Array) -> tuple[Array, Array]:
+def _ground_and_image(grid: Array) -> tuple[Array, Array]:
     return np.ascontiguousarray(grid[:, :3]), grid[:, 3:]
 
 
 def difference(model: SensorModel, other: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> float:
     """Return the largest distance [px] between two cameras of an image and its altitudes; NaN if blind."""
     ground, image = control_grid(model, size, alt_range)
-    return _largest(other.project, ground, image) if len(ground) else float("nan")
+    return _max_difference(other.project, ground, image) if len(ground) else float("nan")
 
 
-def _largest(project: Projection, ground: Array, image: Array) -> float:
+def _max_difference(project: Projection, ground: Array, image: Array) -> float:
     return float(np.linalg.norm(project(ground) - image, axis=1).max())
 
 
@@ -100,14 +100,14 @@ def verify(
     the ellipsoid], `grid` its `ground_grids` where that is known. Returns a reading for each file and each consumer
     that reads its kind and is installed; OutputError where the model sees no point of its own image.
     """
-    ground, image = control_grid(model, size, alt_range) if grid is None else _columns(grid)
+    ground, image = control_grid(model, size, alt_range) if grid is None else _ground_and_image(grid)
     if not len(ground):
         raise OutputError("hand-off: the model sees no ground point inside its own image")
 
     def measured(_: Consumer, read: Projection) -> tuple[float, float]:
-        return _largest(read, ground, image), float("nan")
+        return _max_difference(read, ground, image), float("nan")
 
-    return [reading for path in map(Path, paths) for reading in _readings(path, _consumers(path), measured)]
+    return [reading for path in map(Path, paths) for reading in _consumer_readings(path, _consumers(path), measured)]
 
 
 def verify_grid(path: Path, sample: Sample, correction: CorrectionGrid | None = None) -> list[Reading]:
@@ -125,16 +125,16 @@ def verify_grid(path: Path, sample: Sample, correction: CorrectionGrid | None = 
         errors, largest = sample.sought(off)
         return float(np.linalg.norm(largest)), float(np.linalg.norm(errors.rmse))
 
-    return _readings(path, _grid_consumers(path), measured)
+    return _consumer_readings(path, _grid_consumers(path), measured)
 
 
 def unverified(paths: Sequence[Path | str]) -> list[str]:
     """Return a sentence for each kind of these files that no installed tool but barpc reads."""
     # the readers of a state are no packages
     files = [path for path in map(Path, paths) if not path.name.endswith(STATE_END)]
-    kinds = {path.suffix: path for path in files if not any(_readers(path).values())}
+    kinds = {path.suffix: path for path in files if not any(_tools_of(path).values())}
     return [
-        f"{path}: only barpc itself has read it ({kind}: {' and '.join(_readers(path)) or 'no other tool'} would, and "
+        f"{path}: only barpc itself has read it ({kind}: {' and '.join(_tools_of(path)) or 'no other tool'} would, and "
         "is not installed)"
         for kind, path in kinds.items()
     ]
@@ -147,18 +147,18 @@ _MACHINE = frozenset(
 
 def _consumers(path: Path) -> dict[str, Consumer]:
     """Return the tools that read a file of an RPC, those that are not installed too; barpc last."""
-    row = row_of(path)
+    row = format_for(path)
     return {name: CONSUMERS[name] for name in (*(() if row is None else row.consumers), "barpc")}
 
 
-def _readers(path: Path) -> dict[str, bool]:
+def _tools_of(path: Path) -> dict[str, bool]:
     """Return the tools besides barpc that read a file, and whether they are installed."""
-    of_grid = path.name.endswith((GRID, CORRECTION, STATE_END))
+    of_grid = path.name.endswith((GRID_SUFFIX, CORRECTION, STATE_END))
     found = _grid_consumers(path) if of_grid else _consumers(path)
     return {name: one.installed for name, one in found.items() if one.package != "barpc"}
 
 
-def _readings(
+def _consumer_readings(
     path: Path, consumers: Mapping[str, Consumer], measure: Callable[[Consumer, Projection], tuple[float, float]]
 ) -> list[Reading]:
     """Read a file with all consumers; those that are not barpc get it in a folder of its own.
@@ -194,7 +194,7 @@ def _lent(path: Path) -> Iterator[Path]:
     An overview, a mask or an ``.aux.xml`` beside a file may be, or name, a web service, and so may the sources
     of a VRT: the pixels, which no consumer needs, are left out of it.
     """
-    if not isinstance(row_of(path), Carrier):
+    if not isinstance(format_for(path), Carrier):
         yield path
         return
     with tempfile.TemporaryDirectory() as folder:
@@ -262,12 +262,12 @@ def _gdal_text(path: Path) -> Projection:
     """Return what GDAL reads of a text, which it does only beside an image: one of a single pixel, both in memory."""
     stem = path.name[: -len("_rpc.txt")] if path.name.lower().endswith("_rpc.txt") else path.stem
     lend = partial(rasterio.MemoryFile, dirname=uuid.uuid4().hex)
-    with lend(path.read_bytes(), filename=path.name), lend(_pixel(), filename=f"{stem}.tif") as image:
+    with lend(path.read_bytes(), filename=path.name), lend(_pixel_raster(), filename=f"{stem}.tif") as image:
         return _gdal_raster(image.name)
 
 
 @cache
-def _pixel() -> bytes:
+def _pixel_raster() -> bytes:
     with warnings.catch_warnings(), rasterio.MemoryFile() as file:
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with file.open(driver="GTiff", width=1, height=1, count=1, dtype="uint8") as made:
@@ -280,7 +280,7 @@ def _rpcm(path: Path) -> Projection:
     if path.suffix == ".json":
         model = rpcm.RPCModel(json.loads(path.read_text())["rpc"], dict_format="rpcm")
     else:
-        carrier = isinstance(row_of(path), Carrier)
+        carrier = isinstance(format_for(path), Carrier)
         model = (rpcm.rpc_from_geotiff if carrier else rpcm.rpc_from_rpc_file)(str(path))
     return lambda ground: np.column_stack(model.projection(*ground.T))
 
@@ -292,7 +292,7 @@ def _shareloc(path: Path) -> Projection:
         lon = wrap_longitude(ground[:, 0], model.offset_x)  # it adds no whole turns
         with _alone():
             row, col, _ = model.inverse_loc(lon, *np.ascontiguousarray(ground.T[1:]))
-        return _told(np.column_stack([col, row]), lon) - 0.5  # its first pixel's centre is (0.5, 0.5)
+        return _within_shareloc_range(np.column_stack([col, row]), lon) - 0.5  # its first pixel's centre is (0.5, 0.5)
 
     return project
 
@@ -311,7 +311,7 @@ def _alone() -> Iterator[None]:
         numba.set_num_threads(before)
 
 
-def _told(found: Array, lon: Array) -> Array:
+def _within_shareloc_range(found: Array, lon: Array) -> Array:
     """Return what shareloc found (N, ...); OutputError where it fails beyond 180 degrees of longitude alone."""
     lost, beyond = ~np.isfinite(found).all(axis=1), np.abs(lon) > 180.0
     if lost.any() and not (lost & ~beyond).any():
@@ -345,7 +345,7 @@ def _shareloc_grid(path: Path) -> Projection:
     def localize(at: Array) -> Array:
         found = np.asarray(model.direct_loc_h(at[:, 1] + 0.5, at[:, 0] + 0.5, at[:, 2]))
         lost = ~np.isfinite(found).all(axis=1)
-        return _told(found, own.localize(at[:, :2], at[:, 2])[:, 0]) if lost.any() else found
+        return _within_shareloc_range(found, own.localize(at[:, :2], at[:, 2])[:, 0]) if lost.any() else found
 
     return localize
 
@@ -393,7 +393,7 @@ CONSUMERS: dict[str, Consumer] = {
 """Consumer -> how it reads. Which formats it reads stands in their rows; those not installed are passed over."""
 
 _GRIDS: dict[str, dict[str, Consumer]] = {
-    GRID: {
+    GRID_SUFFIX: {
         "shareloc": Consumer("shareloc", _shareloc_grid, locates=True),
         "linear": Consumer("barpc", _linear_grid, locates=True),
         "barpc": Consumer("barpc", _own_grid),

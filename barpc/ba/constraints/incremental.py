@@ -16,23 +16,23 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from barpc.ba.estimated.priors import CameraPrior, EarlierScene, JointPrior
-from barpc.ba.estimated.waves import Waves
-from barpc.ba.held.gauge import MOTIONS
-from barpc.ba.solving.linear import Blocks, Cholesky, Store, woodbury
+from barpc.ba.constraints.gauge import MOTIONS
+from barpc.ba.parameters.additional_parameters import AdditionalParameters
+from barpc.ba.parameters.priors import CameraPrior, EarlierScene, JointPrior
+from barpc.ba.solving.linear import ArrayStore, Blocks, Cholesky, woodbury
 from barpc.ba.solving.structure import dissect
 from barpc.base.errors import InputError, listed, plain
 from barpc.base.frozen import load_npz
 from barpc.base.geodesy import Array
-from barpc.base.sidefile import ARRAYS, LARGEST
+from barpc.base.safe_io import ARRAYS, MAX_NUMBER
 from barpc.scene import IntArray
 
-PRIOR = replace(ARRAYS, words="the prior of an adjusted block")
-_SPARSE = ("diagonal", "pairs", "pair_view")
+PRIOR_KIND = replace(ARRAYS, words="the prior of an adjusted block")
+_SPARSE_ARRAYS = ("diagonal", "pairs", "pair_view")
 _CSR = ("data", "indices", "indptr")  # of release 0.3
 _LEARNT = ("told", "shown")
 _SCENE = ("by_unknown", "own", "radius")
-_IN_MEMORY = 1e8  # bytes of the factor of a whole block, which is read twice: the rest goes to a temporary file
+_FACTOR_BYTES = 1e8  # bytes of the factor of a whole block, which is read twice: the rest goes to a temporary file
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class BlockPrior:
     less : (m, n q)
         Rows B of B^T B that is still to be taken off a sparse matrix: what heights have in common.
     splines, edges, strips, periods : int, (n, C), (n, M, 5), (n, M)
-        Layout of the unknowns in the image (see `barpc.ba.estimated.waves`).
+        Layout of the unknowns in the image (see `barpc.ba.parameters.additional_parameters`).
     radars : tuple of str
         Views of the block whose unknowns are a radar's clocks.
     scene : EarlierScene or None
@@ -93,14 +93,16 @@ class BlockPrior:
     shown: Array | None = None
     rest: Rest | None = None
 
-    def waves(self, names: tuple[str, ...]) -> Waves | None:
+    def waves(self, names: tuple[str, ...]) -> AdditionalParameters | None:
         """Return the unknowns in the image of the views that go on from the block; a new view has splines alone."""
         of_views = self._edges, self._strips, self._periods
         if self.edges is None or not (self.splines or any(one.size for one in of_views)):
             return None
         place = {name: i for i, name in enumerate(self.names)}
         old = np.array([place.get(name, len(place)) for name in names])
-        return Waves(self.splines, *(np.concatenate([x, np.full((1, *x.shape[1:]), np.inf)])[old] for x in of_views))
+        return AdditionalParameters(
+            self.splines, *(np.concatenate([x, np.full((1, *x.shape[1:]), np.inf)])[old] for x in of_views)
+        )
 
     @property
     def _edges(self) -> Array:
@@ -120,7 +122,7 @@ class BlockPrior:
         if isinstance(self.information, np.ndarray):
             arrays["information"] = self.information
         else:
-            arrays |= {name: getattr(self.information, name) for name in _SPARSE}
+            arrays |= {name: getattr(self.information, name) for name in _SPARSE_ARRAYS}
             arrays["less"] = np.zeros((0, self.params.size)) if self.less is None else self.less
         if self.scene is not None:
             arrays |= {f"scene_{name}": np.asarray(getattr(self.scene, name)) for name in _SCENE}
@@ -148,11 +150,11 @@ class BlockPrior:
         InputError
             The file is missing or holds something else.
         """
-        file = load_npz(path, PRIOR)
+        file = load_npz(path, PRIOR_KIND)
         try:
             names = tuple(str(name) for name in file["names"])
             params = file["params"]
-            matrix = file["information"] if "information" in file else _blocks(file, *params.shape)
+            matrix = file["information"] if "information" in file else _read_blocks(file, *params.shape)
             less = None if "information" in file else file["less"]
             splines, edges = int(file.get("splines", 0)), file.get("edges", np.zeros((len(names), 0)))
             known = str(file["model"]), int(file["drift"]), params, matrix, file["center"], less
@@ -188,7 +190,7 @@ class BlockPrior:
             and len(set(self.names)) == n
             and all(arrays[name].shape == shape for name, shape in shapes.items())
             and all(array.dtype == np.float64 for array in arrays.values())
-            and all(_is_plain(array) for array in arrays.values())
+            and all(_is_square_finite(array) for array in arrays.values())
             and bool((diagonal > 0).all())
             and self._edges.ndim == 2
             and len(self._edges) == n
@@ -202,7 +204,7 @@ class BlockPrior:
             and (self.scene is None or _is_scene(self.scene, n * q))
             and (self.told is None or (self.told.shape == (n,) and _is_counted(self.told)))
             and (self.shown is None or (self.shown.shape == (3 + self.drift, 2) and _is_counted(self.shown)))
-            and (self.less is None or (self.less.shape[1:] == (n * q,) and _is_plain(self.less)))
+            and (self.less is None or (self.less.shape[1:] == (n * q,) and _is_square_finite(self.less)))
         )
 
     def dense(self) -> Array:
@@ -255,7 +257,7 @@ class BlockPrior:
         n, q = self.params.shape
         blocks = self.information if isinstance(self.information, Blocks) else Blocks.of(self.information, q)
         order = dissect(blocks.pair_view, self.center[:, :2], np.ones(n, dtype=bool), views)
-        cholesky = Cholesky(blocks, order, Store(_IN_MEMORY))
+        cholesky = Cholesky(blocks, order, ArrayStore(_FACTOR_BYTES))
         cholesky.factorize(0.0)
         index, information = (views[:, None] * q + np.arange(q)).ravel(), cholesky.last()
         if self.less is None or not len(self.less):
@@ -341,22 +343,22 @@ def _is_scene(scene: EarlierScene, size: int) -> bool:
     arrays, count = (scene.by_unknown, scene.own), len(MOTIONS)
     return (
         tuple(array.shape for array in arrays) == ((count, size), (count, count))
-        and all(array.dtype == np.float64 and _is_plain(array) for array in arrays)
-        and 0.0 < scene.radius <= LARGEST
+        and all(array.dtype == np.float64 and _is_square_finite(array) for array in arrays)
+        and 0.0 < scene.radius <= MAX_NUMBER
     )
 
 
-def _is_plain(array: Array) -> bool:
+def _is_square_finite(array: Array) -> bool:
     """Return whether all numbers are finite, and their squares."""
-    return bool(not array.size or (array.min() >= -LARGEST and array.max() <= LARGEST))
+    return bool(not array.size or (array.min() >= -MAX_NUMBER and array.max() <= MAX_NUMBER))
 
 
 def _is_counted(array: Array) -> bool:
     """Return whether all numbers are finite, and none is negative."""
-    return array.dtype == np.float64 and _is_plain(array) and bool((array >= 0.0).all())
+    return array.dtype == np.float64 and _is_square_finite(array) and bool((array >= 0.0).all())
 
 
-def _blocks(file: Mapping[str, Array], n: int, q: int) -> Blocks:
+def _read_blocks(file: Mapping[str, Array], n: int, q: int) -> Blocks:
     """Return the blocks that `save` wrote, or those of the matrix that release 0.3 wrote row by row."""
     if "indptr" in file:
         return Blocks.of(_csr(file, n * q), q)
@@ -365,7 +367,7 @@ def _blocks(file: Mapping[str, Array], n: int, q: int) -> Blocks:
     if not (pairs.ndim == 2 and pairs.shape[1] == 2 and pairs.dtype == np.int64):
         raise ValueError("its pairs of views are none")
     keys = pairs @ [n, 1]
-    if not (_within(pairs.ravel(), n - 1) and (pairs[:, 0] < pairs[:, 1]).all() and (np.diff(keys) > 0).all()):
+    if not (_are_indices(pairs.ravel(), n - 1) and (pairs[:, 0] < pairs[:, 1]).all() and (np.diff(keys) > 0).all()):
         raise ValueError("its pairs of views are not in order")
     return blocks
 
@@ -374,14 +376,14 @@ def _csr(file: Mapping[str, Array], size: int) -> sp.csr_array:
     data, indices, bounds = (file[name] for name in _CSR)
     # scipy's own check takes differences, which wrap round for numbers at the ends: what it then reads is not its own
     ends = bounds.shape == (size + 1,) and bounds[0] == 0 and bounds[-1] == len(indices) == len(data)
-    if not (ends and _within(bounds, len(indices)) and (bounds[1:] >= bounds[:-1]).all()):
+    if not (ends and _are_indices(bounds, len(indices)) and (bounds[1:] >= bounds[:-1]).all()):
         raise ValueError("the bounds of its rows do not go together")
-    if not _within(indices, size - 1):
+    if not _are_indices(indices, size - 1):
         raise ValueError("a column beyond its size")
     return sp.csr_array((data, indices, bounds), shape=(size, size))
 
 
-def _within(numbers: Array | IntArray, most: int) -> bool:
+def _are_indices(numbers: Array | IntArray, most: int) -> bool:
     """Return whether all are whole, and from 0 to `most`."""
     return bool(numbers.ndim == 1 and numbers.dtype.kind in "iu" and ((numbers >= 0) & (numbers <= most)).all())
 

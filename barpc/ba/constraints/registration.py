@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from barpc.base.geodesy import Array
-from barpc.base.usual import (
+from barpc.base.statistics import (
     BIWEIGHT,
     CHANCE,
     CRITICAL,
@@ -23,21 +23,21 @@ from barpc.base.usual import (
     ITERATIONS,
     RIDGE,
     SAMPLE,
-    STATED,
+    STATED_FREEDOM,
     SURELY,
     TIMES,
     robust_spread,
 )
 from barpc.scene import BoolArray, IntArray
 
-NEIGHBOURS = 15  # tie points of a patch: its six unknowns are checked by nine
-_FLAT = 0.01  # m: no ground is flatter, and no motion that is smaller is any
+PATCH_POINTS = 15  # tie points of a patch: its six unknowns are checked by nine
+_MIN_RELIEF = 0.01  # m: no ground is flatter, and no motion that is smaller is any
 _SIDE = 25  # trials along each axis of the search
-_KNOWN = 0.2  # of the information that slopes claim: below, they are their own noise
+_MIN_SLOPE_SHARE = 0.2  # of the information that slopes claim: below, they are their own noise
 
 
 @dataclass(frozen=True)
-class Surface:
+class TieSurface:
     """Quadratic patches around tie points, in a local frame (east, north, up) about their middle.
 
     A patch is in lengths of its reach: height, slopes and half the curvatures times 1, u, v, u^2, u v, v^2.
@@ -52,20 +52,20 @@ class Surface:
     tree: cKDTree
 
     @classmethod
-    def of(cls, points: Array) -> Surface:
-        """Fit the surface of at least `NEIGHBOURS` points (P, 3)."""
+    def of(cls, points: Array) -> TieSurface:
+        """Fit the surface of at least `PATCH_POINTS` points (P, 3)."""
         tree = cKDTree(points[:, :2])
-        distance, near = (np.asarray(part) for part in tree.query(points[:, :2], k=NEIGHBOURS))
+        distance, near = (np.asarray(part) for part in tree.query(points[:, :2], k=PATCH_POINTS))
         reach = np.maximum(distance[:, -1], 1e-3)
         delta = points[near] - points[:, None]
         design = _powers(delta[..., :2] / reach[:, None, None])
         normal, terms = np.swapaxes(design, 1, 2) @ design, design.shape[-1]
-        freedom = NEIGHBOURS - terms
+        freedom = PATCH_POINTS - terms
         inverse = np.linalg.inv(normal + RIDGE * np.eye(terms))
         patch = np.einsum("pij,pkj,pk->pi", inverse, design, delta[..., 2])
         squares = ((delta[..., 2] - np.einsum("pkj,pj->pk", design, patch)) ** 2).sum(axis=1)
-        usual = max(float(np.sqrt(np.median(squares) / freedom)), _FLAT)
-        variance = (squares + STATED * usual**2) / (freedom + STATED)
+        usual = max(float(np.sqrt(np.median(squares) / freedom)), _MIN_RELIEF)
+        variance = (squares + STATED_FREEDOM * usual**2) / (freedom + STATED_FREEDOM)
         patch[:, 0] += points[:, 2]
         return cls(
             points,
@@ -111,23 +111,23 @@ def _powers(away: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Given:
+class GivenHeights:
     """Heights given from elsewhere, in the frame of a surface."""
 
     place: Array  # (n, 3) east, north, up [m]
     sigma: Array  # (n,) of the height [m]
     sigma_flat: Array  # (n,) of the place, along an axis [m]
 
-    def select(self, keep: BoolArray) -> Given:
+    def select(self, keep: BoolArray) -> GivenHeights:
         """Return the heights of a mask (n,)."""
-        return Given(self.place[keep], self.sigma[keep], self.sigma_flat[keep])
+        return GivenHeights(self.place[keep], self.sigma[keep], self.sigma_flat[keep])
 
 
 @dataclass(frozen=True)
 class Registration:
     """The motion of a surface that brings it onto the heights given, and how well these agree on it."""
 
-    motion: Array  # (7,) east, north, up, tilts, turn, scale [m], as `barpc.ba.held.gauge.MOTIONS`
+    motion: Array  # (7,) east, north, up, tilts, turn, scale [m], as `barpc.ba.constraints.gauge.MOTIONS`
     covariance: Array  # (7, 7) of it, what was known before left out but for a hundredth
     near: BoolArray  # (n,) heights on patches of the surface
     agree: BoolArray  # (n,) those of them that agree with the motion
@@ -163,26 +163,26 @@ def displacement(local: Array) -> Array:
     return moves
 
 
-def register(surface: Surface, given: Given, radius: float, before: Array) -> Registration:
+def register(surface: TieSurface, given: GivenHeights, radius: float, before: Array) -> Registration:
     """Find the motion of a surface onto heights, of which the larger part is right.
 
     `before` (7,) are the standard deviations of the motions without these heights [m]: how far is looked, and where
     the heights tell nothing, that stays open.
     """
     free = np.diag((TIMES * before) ** -2)
-    motion, noise = _settled(surface, given, _search(surface, given, before), radius, free)
-    found = _told(surface, given, motion, radius, noise, free)
+    motion, noise = _converged_motion(surface, given, _search_shift(surface, given, before), radius, free)
+    found = _registration_result(surface, given, motion, radius, noise, free)
     wider = _jackknife(surface, given, found, radius, noise, free)
     return replace(found, covariance=wider[:, None] * found.covariance * wider)
 
 
-def _settled(
-    surface: Surface, given: Given, motion: Array, radius: float, free: Array, noise: float | None = None
+def _converged_motion(
+    surface: TieSurface, given: GivenHeights, motion: Array, radius: float, free: Array, noise: float | None = None
 ) -> tuple[Array, float]:
     """Return the motion (7,) that reweighted steps end at, and the noise over what is stated, learnt if None."""
     is_known, noise = noise is not None, SURELY if noise is None else noise
     for step in range(ITERATIONS):
-        seen = _Seen.of(surface, given, motion, radius)
+        seen = _SurfaceMisfit.of(surface, given, motion, radius)
         whitened = seen.residual / seen.sigma
         near = seen.near & (np.abs(whitened) < BIWEIGHT * noise)
         if near.sum() < len(motion):
@@ -195,25 +195,27 @@ def _settled(
         if not is_known and step >= 2:
             among = np.abs(whitened[seen.near & (np.abs(whitened) < 2.0 * BIWEIGHT * noise)])
             noise = float(np.clip(robust_spread(among), 0.5, max(noise, 1.0)))
-        if (is_known or step > 5) and np.abs(change).max() < _FLAT:
+        if (is_known or step > 5) and np.abs(change).max() < _MIN_RELIEF:
             break
     return motion, noise
 
 
-def _jackknife(surface: Surface, given: Given, found: Registration, radius: float, noise: float, free: Array) -> Array:
+def _jackknife(
+    surface: TieSurface, given: GivenHeights, found: Registration, radius: float, noise: float, free: Array
+) -> Array:
     """Return the factors (7,) of standard deviations: how the motion changes where the heights of one part
     are left out.
 
     Slopes tell where heights lie on them, and steps of roofs and trees move with the place that is found: no
     linearisation at its end has that (the delete-a-group jackknife: Shao and Tu, "The Jackknife and Bootstrap", 1995).
     """
-    group, wider = _parts(given.place[:, :2], found.near), np.ones(len(free))
+    group, wider = _scene_parts(given.place[:, :2], found.near), np.ones(len(free))
     count = int(group.max(initial=-1)) + 1
     if count < FEWEST:
         return wider
     without = np.array(
         [
-            _settled(surface, given.select((group != n) & found.near), found.motion, radius, free, noise)[0]
+            _converged_motion(surface, given.select((group != n) & found.near), found.motion, radius, free, noise)[0]
             for n in range(count)
         ]
     )
@@ -224,7 +226,7 @@ def _jackknife(surface: Surface, given: Given, found: Registration, radius: floa
     return wider
 
 
-def _parts(place: Array, near: BoolArray) -> IntArray:
+def _scene_parts(place: Array, near: BoolArray) -> IntArray:
     """Return the part (of some twenty squares of a scene) in which each place (n, 2) lies; -1: none is near."""
     group, number = np.full(len(place), -1), np.zeros(0, dtype=np.int64)
     at = place[near]
@@ -238,7 +240,7 @@ def _parts(place: Array, near: BoolArray) -> IntArray:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _SurfaceMisfit:
     """Heights against a surface that was moved."""
 
     residual: Array  # (n,) given minus predicted [m]
@@ -250,7 +252,7 @@ class _Seen:
     doubt: Array  # (n, 2, 2) covariance of the slopes
 
     @classmethod
-    def of(cls, surface: Surface, given: Given, motion: Array, radius: float) -> _Seen:
+    def of(cls, surface: TieSurface, given: GivenHeights, motion: Array, radius: float) -> _SurfaceMisfit:
         moves = displacement(given.place[:, :2] / radius)
         moved = moves @ motion
         place = given.place[:, :2] - moved[:, :2]
@@ -263,10 +265,10 @@ class _Seen:
         return cls(given.place[:, 2] - height - moved[:, 2], np.sqrt(variance), rows, near, nearest, moves, doubt)
 
 
-def _search(surface: Surface, given: Given, before: Array) -> Array:
+def _search_shift(surface: TieSurface, given: GivenHeights, before: Array) -> Array:
     """Return the shift (7,; tilts, turn and scale 0) on which the most heights agree, east and north within 4 sigma."""
     few = given.select(np.arange(len(given.sigma)) % -(-len(given.sigma) // SAMPLE) == 0)
-    first = _Seen.of(surface, few, np.zeros(7), 1.0)
+    first = _SurfaceMisfit.of(surface, few, np.zeros(7), 1.0)
     steep = float(np.sqrt(((surface.patch[:, 1:3] / surface.reach[:, None]) ** 2).mean()))
     wide = float(np.median(first.sigma))
     reach = CRITICAL * before[:2]
@@ -289,9 +291,11 @@ def _search(surface: Surface, given: Given, before: Array) -> Array:
     return found
 
 
-def _told(surface: Surface, given: Given, motion: Array, radius: float, noise: float, free: Array) -> Registration:
+def _registration_result(
+    surface: TieSurface, given: GivenHeights, motion: Array, radius: float, noise: float, free: Array
+) -> Registration:
     """Return the covariance at the end, and which heights agree."""
-    seen = _Seen.of(surface, given, motion, radius)
+    seen = _SurfaceMisfit.of(surface, given, motion, radius)
     scale = min(max(noise, 1.0), SURELY)
     agree = seen.near & (np.abs(seen.residual) < SURELY * scale * seen.sigma)
     residual = np.where(seen.near, seen.residual, np.nan)
@@ -299,7 +303,7 @@ def _told(surface: Surface, given: Given, motion: Array, radius: float, noise: f
     part = np.where(seen.near, seen.residual / (BIWEIGHT * scale * seen.sigma), 1.0) ** 2
     inside = part < 1.0
     rate = np.where(inside, (1.0 - part) * (1.0 - 5.0 * part), 0.0)[inside].mean() if inside.any() else 0.0
-    rows, inverse = seen.rows[inside], max(float(rate), _KNOWN) / (scale * seen.sigma[inside]) ** 2
+    rows, inverse = seen.rows[inside], max(float(rate), _MIN_SLOPE_SHARE) / (scale * seen.sigma[inside]) ** 2
     pull = (1.0 - part[inside]) ** 2 * seen.residual[inside] / (scale * seen.sigma[inside])
     forms = rows * (pull / (scale * seen.sigma[inside]))[:, None]
     normal = (rows * inverse[:, None]).T @ rows
@@ -316,18 +320,18 @@ def _told(surface: Surface, given: Given, motion: Array, radius: float, noise: f
     told = np.maximum(told, 0.0)
     axes = half.T @ axes
     meat = axes.T @ (group[:, None] * alone * group[None, :] + free) @ axes
-    known = np.where(told > _KNOWN, 1.0 / np.maximum(told, _KNOWN), 0.0)
+    known = np.where(told > _MIN_SLOPE_SHARE, 1.0 / np.maximum(told, _MIN_SLOPE_SHARE), 0.0)
     covariance = axes @ (known[:, None] * meat * known) @ axes.T
-    lost = axes[:, told <= _KNOWN]
-    covariance += lost @ lost.T / _KNOWN**2 if lost.size else 0.0
+    lost = axes[:, told <= _MIN_SLOPE_SHARE]
+    covariance += lost @ lost.T / _MIN_SLOPE_SHARE**2 if lost.size else 0.0
     open_ = np.linalg.inv(free)
     covariance = np.linalg.inv(np.linalg.inv(covariance + 1e-12 * open_) + free)
     covariance = np.asarray(covariance, dtype=np.float64)
-    rivals = _rivals(seen, agree, scale)
+    rivals = _disagreeing_count(seen, agree, scale)
     return Registration(motion, covariance, seen.near, agree, residual, seen.sigma, rivals)
 
 
-def _rivals(seen: _Seen, agree: BoolArray, scale: float) -> int:
+def _disagreeing_count(seen: _SurfaceMisfit, agree: BoolArray, scale: float) -> int:
     """Return the most of the heights that do not agree and lie within each other's noise."""
     others = seen.near & ~agree
     off = np.sort(seen.residual[others])
@@ -337,7 +341,7 @@ def _rivals(seen: _Seen, agree: BoolArray, scale: float) -> int:
     return int((np.searchsorted(off, off + width) - np.arange(len(off))).max())
 
 
-def _inflation(place: Array, forms: Array, alone: Array, surface: Surface) -> Array:
+def _inflation(place: Array, forms: Array, alone: Array, surface: TieSurface) -> Array:
     """Return the factors (7,) of standard deviations: what neighbours share, by groups of growing size (a
     sandwich estimate).
 

@@ -8,16 +8,16 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
-from barpc.ba.estimated.projected import Projected
-from barpc.ba.held.block import Block
+from barpc.ba.constraints.block import Block
 from barpc.ba.judging.solution import Solution
-from barpc.ba.robust.smooth import SPLINES
+from barpc.ba.parameters.projected import Projected
+from barpc.ba.robust.systematic_residuals import SPLINES
 from barpc.ba.robust.weights import geman_mcclure
 from barpc.ba.solving.normal import cholesky3, point_products, whiten
 from barpc.base.geodesy import GEOID, Array, enu_basis, ground_from_ecef
-from barpc.base.usual import FEW, GROSS, MUCH_NOISE, SHRINK, SURELY, TIMES
+from barpc.base.statistics import FEW, GROSS, MUCH_NOISE, SHRINK, SURELY, TIMES
 from barpc.scene import BoolArray
-from barpc.sensor.displaced import bsplines
+from barpc.sensor.image_corrections import bsplines
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class Placed:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class RpcDiagnosis:
     """What would make a view's RPC as good as stated: nothing needed, nothing found, an offset, other
     heights, swapped axes.
 
@@ -80,20 +80,20 @@ class Look:
     as_stated: bool = False
 
 
-def known_points(found: Solution, block: Block) -> BoolArray:
+def retained_tracks(found: Solution, block: Block) -> BoolArray:
     """Return the tracks (P,) with two or more observations kept."""
     kept = np.bincount(block.point[found.outcome.inlier], minlength=block.num_points) >= 2
     kept[block.num_tracks :] = False
     return kept
 
 
-def place(found: Solution, others: Block, block: Block, view: int) -> Placed | None:
+def resect(found: Solution, others: Block, block: Block, view: int) -> Placed | None:
     """Estimate the camera of a view alone against the points of a solution of the `others`; None with too few
     of them.
 
     Its camera is as good as free. Residuals are judged by the others' noise and what their points are known to.
     """
-    rows = (block.view == view) & known_points(found, others)[block.point]
+    rows = (block.view == view) & retained_tracks(found, others)[block.point]
     unknowns = found.problem.cameras.unknowns
     if rows.sum() < FEW:
         return None
@@ -170,7 +170,7 @@ class _Sight:
         return moved[:size], covariance, residual.T
 
 
-def look(found: Solution, block: Block, placed: Placed, view: int) -> Look:
+def diagnose_rpc(found: Solution, block: Block, placed: Placed, view: int) -> RpcDiagnosis:
     """Find the one change with which a view's RPC is as good as stated.
 
     Each is asked of the delivered camera at the points of the others: half of these are then met to what the camera is
@@ -189,16 +189,16 @@ def look(found: Solution, block: Block, placed: Placed, view: int) -> Look:
     metres = float(np.sqrt((problem.camera_prior.sigma[view, :constants:3] ** 2).sum()))
     stated = metres * float(np.nanmedian(np.linalg.norm(projected.by_point, axis=1)))
     if not placed.meets and _half(off) < SURELY * stated:
-        return Look(as_stated=True)
+        return RpcDiagnosis(as_stated=True)
     swapped = projected.image[::-1] - xy
     if _half(swapped) < SURELY * stated < _half(off):
-        return Look(swapped=True)
+        return RpcDiagnosis(swapped=True)
     offset = np.nanmedian(off, axis=1)
     if not (_half(off - offset[:, None]) < stated):
-        return Look()
+        return RpcDiagnosis()
     height = float(np.nanmedian((by_height * off).sum(axis=0) / (by_height**2).sum(axis=0)))
     explains = _half(off - height * by_height) < stated and abs(height) < GEOID  # no mistaken height surface is farther
-    return Look(offset=offset, height=height if explains else None)
+    return RpcDiagnosis(offset=offset, height=height if explains else None)
 
 
 def _half(off: Array) -> float:

@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtrc
 
-from barpc.ba.estimated.unknowns import Unknowns
-from barpc.ba.held.block import Block
-from barpc.ba.held.ground import ALIKE
+from barpc.ba.constraints.block import Block
+from barpc.ba.constraints.ground import MAX_INDEPENDENT_ERRORS
+from barpc.ba.parameters.unknowns import Unknowns
 from barpc.ba.solving.structure import Structure
 from barpc.base.geodesy import Array, metres_per_unit, parts
-from barpc.base.usual import KEPT, MANY, OUTLIER, RIDGE
+from barpc.base.statistics import KEPT, MANY, OUTLIER, RIDGE
 from barpc.scene import BoolArray, IntArray
-from barpc.sensor.displaced import bsplines
+from barpc.sensor.image_corrections import bsplines
 
-Fit = dict[int, tuple[slice, Array]]
+SmoothFit = dict[int, tuple[slice, Array]]
 """View -> where its observations are, coefficients (2, TERMS) of their smooth part."""
 
 SPLINES = 14
@@ -40,7 +40,8 @@ class Resemblance:
 
     Registered points resemble each other: their templates overlap, and seasons, suns and terrains err over many of
     them. What is smooth in a reference's residuals is therefore not all of the camera: of points whose templates share
-    half of their pixels half of the noise is the same, and together they are worth `ALIKE` independent ones at most.
+    half of their pixels half of the noise is the same, and together they are worth `MAX_INDEPENDENT_ERRORS` independent
+    ones at most.
     """
 
     of_reference: BoolArray  # (K,)
@@ -67,7 +68,7 @@ class Resemblance:
             ties = ~rows & (block.view == view)
             asked = own[:: -(-len(own) // MANY)]  # they lie on a grid
             alike = found.overlap(asked[:, None], own[None]).sum(axis=1).mean()
-            share[own] = 1.0 / (alike + len(own) / (TERMS * ALIKE))
+            share[own] = 1.0 / (alike + len(own) / (TERMS * MAX_INDEPENDENT_ERRORS))
             usual = np.median(block.sigma[ties] if ties.any() else block.sigma[own])
             precision[own] = share[own] * (usual / block.sigma[own]) ** 2
         return found
@@ -83,7 +84,7 @@ class Resemblance:
         """Return the correlation (...), 0 to 1, of the noise of two observations of one view."""
         both = self.of_reference[first] & self.of_reference[second]
         same = self.overlap(first, second)
-        return np.asarray(both * (same + (1.0 - same) / ALIKE))
+        return np.asarray(both * (same + (1.0 - same) / MAX_INDEPENDENT_ERRORS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +143,7 @@ class Smooth:
         col, row = self._col[rows], self._row[rows]
         return np.vstack([bsplines(row, SPLINES), col, col * col, col * col * col, row * col])
 
-    def part(self, residual: Array, weight: Array, fit: Fit | None = None) -> Array:
+    def part(self, residual: Array, weight: Array, fit: SmoothFit | None = None) -> Array:
         """Return the smooth part (2, K) of residuals (2, K) [px], fitted with weights (K,) >= 0.
 
         Zero for views with too few observations that count.
@@ -152,7 +153,7 @@ class Smooth:
             out[:, rows] = coefficients @ self._basis(rows)
         return out
 
-    def test(self, residual: Array, use: BoolArray, fit: Fit | None = None) -> SmoothTest:
+    def test(self, residual: Array, use: BoolArray, fit: SmoothFit | None = None) -> SmoothTest:
         """Test whether the residuals (2, K) [px] of the observations in use hold more than scatter.
 
         What is too fine for the smooth part is not looked for.
@@ -214,7 +215,7 @@ class Smooth:
         size = self._sums(view, weight * (1.0 - same) * pairs) / np.maximum(self._sums(view, pairs), 1.0)
         return beyond / np.maximum(size, 1e-12)[view], self._sums(view, self.alike.share[second] * pairs)
 
-    def fit(self, residual: Array, weight: Array) -> Fit:
+    def fit(self, residual: Array, weight: Array) -> SmoothFit:
         """Fit the smooth part of the residuals, of views with enough observations that count."""
         weight = weight * self._tells
         counts = self.structure.sum_views(weight[None])[:, 0]

@@ -10,22 +10,22 @@ from scipy.special import ndtri
 
 from barpc.ba import check_residuals
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.base.usual import CHANCE
+from barpc.base.statistics import CHANCE
 from barpc.report.outcome import Run
-from barpc.report.records import Column, Number, Record, said
+from barpc.report.records import Column, Number, Record, column
 from barpc.report.summary.words import ABOVE, Count, Pixel, Vector
 from barpc.scene import IntArray
 
-GCPS = "GCP residuals, each predicted without that GCP (prediction minus given)"
+GCP_CAPTION = "GCP residuals, each predicted without that GCP (prediction minus given)"
 
 
 class KnownPoint(Record):
     """A point whose place is given."""
 
-    name: str = said("Name")
-    lon: float = said("Longitude", "deg", minimum=-540, maximum=540)
-    lat: float = said("Latitude", "deg", minimum=-90, maximum=90)
-    alt_m: float = said("Altitude", ABOVE)
+    name: str = column("Name")
+    lon: float = column("Longitude", "deg", minimum=-540, maximum=540)
+    lat: float = column("Latitude", "deg", minimum=-90, maximum=90)
+    alt_m: float = column("Altitude", ABOVE)
 
 
 _MISS = "Found minus given place, east, north, up; null where fewer than two views see it"
@@ -38,21 +38,21 @@ class GcpEntry(KnownPoint):
     PAGE: ClassVar = "GCP status residual_enu_m residual_px w image_w image_w_view sigma_m"
     TERMINAL: ClassVar = "GCP status residual_enu_m residual_px w"
 
-    sigma_m: tuple[float, float, float] = said("Stated", "m", "sigma east, north, up", ".2g")
-    residual_enu_m: Vector = said("Place by the others minus given", "m", ("east", "north", "up"), "+.3f")
-    used: bool = said("Whether it holds the block", default=True)
-    status: Literal["used", "contradicts", "rejected", "undecided", "not seen"] = said(
+    sigma_m: tuple[float, float, float] = column("Stated", "m", "sigma east, north, up", ".2g")
+    residual_enu_m: Vector = column("Place by the others minus given", "m", ("east", "north", "up"), "+.3f")
+    used: bool = column("Whether it holds the block", default=True)
+    status: Literal["used", "contradicts", "rejected", "undecided", "not seen"] = column(
         "contradicts: used, off by more than 4 sigma; rejected: the others agree without it; undecided: weighs as much",
         head="verdict",
         default="used",
     )
-    images: tuple[str, ...] = said("Views that show it", default=())
-    w: Number = said("Largest component of the residual over its standard deviation", "", "w", ".1f", default=None)
-    redundancy: Number = said("How far the others can tell, 0 to 1", default=None)
-    residual_px: Number = said("The residual in the images that show it, RMS", "px", "in images", ".2f", default=None)
+    images: tuple[str, ...] = column("Views that show it", default=())
+    w: Number = column("Largest component of the residual over its standard deviation", "", "w", ".1f", default=None)
+    redundancy: Number = column("How far the others can tell, 0 to 1", default=None)
+    residual_px: Number = column("The residual in the images that show it, RMS", "px", "in images", ".2f", default=None)
 
-    image_w: Number = said("Largest w in the images (Baarda)", "", "w in images", ".1f", default=None)
-    image_w_view: str | None = said("View that it is in", head="largest in", default=None)
+    image_w: Number = column("Largest w in the images (Baarda)", "", "w in images", ".1f", default=None)
+    image_w_view: str | None = column("View that it is in", head="largest in", default=None)
 
     @classmethod
     def worst(cls, points: Sequence[GcpEntry], most: int) -> list[GcpEntry]:
@@ -64,13 +64,13 @@ class GcpEntry(KnownPoint):
 class ControlTestEntry(Record):
     """The residuals of ground control, a reference's points too, in the images, each in units of its own deviation."""
 
-    num: Count = said("Observations tested")
-    critical: float = said("What chance exceeds once in a thousand coordinates")
-    num_beyond: Count = said("Observations beyond that in a coordinate")
-    expected: float = said("As many chance alone would put beyond it")
-    largest_w: Number = said("The largest (Baarda's w)")
-    image: str = said("The view that it is in")
-    point: str = said("The point that it is of")
+    num: Count = column("Observations tested")
+    critical: float = column("What chance exceeds once in a thousand coordinates")
+    num_beyond: Count = column("Observations beyond that in a coordinate")
+    expected: float = column("As many chance alone would put beyond it")
+    largest_w: Number = column("The largest (Baarda's w)")
+    image: str = column("The view that it is in")
+    point: str = column("The point that it is of")
 
 
 class ReferenceViewEntry(Record):
@@ -78,33 +78,35 @@ class ReferenceViewEntry(Record):
 
     PAGE: ClassVar = "name peak offset_en_m num_tried num_passed num_points scatter_m"
 
-    name: str = said("View", head="image")
-    peak: Number = said("Standard deviations by which one shift stands out", "", "peak", ".1f")
-    offset_en_m: Pixel | None = said("Offset of the delivered camera, east, north", "m", ("off east", "north"), "+.2f")
-    num_tried: Count = said("Points looked for", head="points tried")
-    num_passed: Count = said("That beat their decoy and came back", head="found")
-    num_points: Count = said("That agree with each other and held the block", head="used")
-    scatter_m: Number = said("Standard deviation of those across the line of sight", "m", "scatter", ".2f")
+    name: str = column("View", head="image")
+    peak: Number = column("Standard deviations by which one shift stands out", "", "peak", ".1f")
+    offset_en_m: Pixel | None = column(
+        "Offset of the delivered camera, east, north", "m", ("off east", "north"), "+.2f"
+    )
+    num_tried: Count = column("Points looked for", head="points tried")
+    num_passed: Count = column("That beat their decoy and came back", head="found")
+    num_points: Count = column("That agree with each other and held the block", head="used")
+    scatter_m: Number = column("Standard deviation of those across the line of sight", "m", "scatter", ".2f")
 
 
 class ReferenceEntry(Record):
     """A reference orthoimage."""
 
-    used: bool = said("Whether it holds the block")
-    step_m: Number = said("Resolution at which it was matched", "m")
-    sigma_m: Number = said("Standard deviation of its own place, along an axis", "m")
-    num_points: Count = said("Points on the ground that hold the block")
-    views: tuple[ReferenceViewEntry, ...] = said("What it says of each image")
+    used: bool = column("Whether it holds the block")
+    step_m: Number = column("Resolution at which it was matched", "m")
+    sigma_m: Number = column("Standard deviation of its own place, along an axis", "m")
+    num_points: Count = column("Points on the ground that hold the block")
+    views: tuple[ReferenceViewEntry, ...] = column("What it says of each image")
 
 
 class SeenEntry(Record):
     """Where a check point is seen."""
 
-    view: str = said("Name")
-    residual_px: Pixel = said("Projected minus observed col, row", "px")
+    view: str = column("Name")
+    residual_px: Pixel = column("Projected minus observed col, row", "px")
 
 
-def _rms(point: CheckPointEntry) -> float | None:
+def _gcp_rms(point: CheckPointEntry) -> float | None:
     return float(np.sqrt(np.mean(np.square(point.seen).sum(axis=1)))) if point.seen else None
 
 
@@ -114,12 +116,12 @@ class CheckPointEntry(KnownPoint):
     OWN: ClassVar = {
         "point": Column("check point", lambda point: point.name),
         "images": Column("images", lambda point: len(point.seen)),
-        "rms": Column("in the images [px]", _rms, ".3f"),
+        "rms": Column("in the images [px]", _gcp_rms, ".3f"),
     }
     PAGE: ClassVar = "point images rms residual_enu_m"
 
-    residual_enu_m: Vector = said(_MISS, "m", ("east", "north", "up"), "+.3f")
-    observations: tuple[SeenEntry, ...] = said("Where it is seen")
+    residual_enu_m: Vector = column(_MISS, "m", ("east", "north", "up"), "+.3f")
+    observations: tuple[SeenEntry, ...] = column("Where it is seen")
 
     @property
     def seen(self) -> list[Any]:
@@ -139,7 +141,9 @@ def measure_gcps(run: Run) -> tuple[GcpEntry, ...]:
     left = np.full_like(points.sigma, np.nan) if tested is None else tested.residual
     worst = {test.point: test for test in sorted(run.control_tests, key=lambda test: test.w)}  # the largest is last
     entries = []
-    for g, (name, rows) in enumerate(zip(points.names, _grouped(points.point, len(points.names)), strict=True)):
+    for g, (name, rows) in enumerate(
+        zip(points.names, _indices_by_number(points.point, len(points.names)), strict=True)
+    ):
         views, test = points.view[rows], worst.get(name)
         lon, lat, alt = points.lonlatalt[g].tolist()
         status = "not seen" if not len(views) else "used" if tested is None else tested.status(g)
@@ -150,7 +154,7 @@ def measure_gcps(run: Run) -> tuple[GcpEntry, ...]:
             images=tuple(run.views[i].name for i in views),
             w=None if tested is None else tested.w[g],
             redundancy=None if tested is None else tested.redundancy[g],
-            residual_px=_in_images(run, points.lonlatalt[g], views, left[g]),
+            residual_px=_shift_in_images(run, points.lonlatalt[g], views, left[g]),
             image_w=None if test is None else test.w,
             image_w_view=None if test is None else run.views[test.view].name,
         )
@@ -171,13 +175,13 @@ def measure_control(run: Run) -> ControlTestEntry | None:
     return ControlTestEntry(count, critical, beyond, chance * count, worst.w, name, worst.point)
 
 
-def _grouped(index: IntArray, num: int) -> list[IntArray]:
+def _indices_by_number(index: IntArray, num: int) -> list[IntArray]:
     """Return the places in `index` (n,) of each number below `num`."""
     order = np.argsort(index, kind="stable")
     return np.split(order, np.searchsorted(index[order], np.arange(1, num)))[:num]
 
 
-def _in_images(run: Run, given: Array, views: IntArray, residual: Array) -> float:
+def _shift_in_images(run: Run, given: Array, views: IntArray, residual: Array) -> float:
     """Return how far a residual (3,), east, north, up [m], moves a ground point in its images, RMS [px]."""
     if run.after is None or not np.isfinite(residual).all():
         return float("nan")
@@ -212,6 +216,6 @@ def measure_check_points(run: Run) -> tuple[CheckPointEntry, ...]:
         return ()
     left = check_residuals(run.before if run.after is None else run.after, points)
     seen = [SeenEntry(run.views[i].name, r) for i, r in zip(points.view, left.image.tolist(), strict=True)]
-    seen_of = [tuple(seen[row] for row in rows) for rows in _grouped(points.point, len(points.names))]
+    seen_of = [tuple(seen[row] for row in rows) for rows in _indices_by_number(points.point, len(points.names))]
     rows = zip(points.names, points.lonlatalt.tolist(), left.ground.tolist(), seen_of, strict=True)
     return tuple(CheckPointEntry(name, lon, lat, alt, miss, found) for name, (lon, lat, alt), miss, found in rows)

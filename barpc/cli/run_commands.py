@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from barpc.dsm import Surface
 
 
-_TARGETS = ("satnerf", "colmap", "s2p", "cars", "asp", "ortho", "stac", "points")
+_TARGET_NAMES = ("satnerf", "colmap", "s2p", "cars", "asp", "ortho", "stac", "points")
 
 
 @click.command("report")
@@ -57,7 +57,7 @@ def report(run_dir: str, other: str | None) -> int:
 @click.command("export")
 @click.argument("run_dir", metavar="RUN_DIR")
 @click.argument("out_dir", metavar="OUT_DIR")
-@click.option("--to", "target", type=click.Choice(_TARGETS), required=True, help="The tool.")
+@click.option("--to", "target", type=click.Choice(_TARGET_NAMES), required=True, help="The tool.")
 @click.option(
     "--alt",
     type=(float, float),
@@ -109,12 +109,12 @@ def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
       barpc verify adjusted
       barpc verify adjusted --expect 4a1e...c09f /archive/images
     """
-    from barpc.pipeline.outputs import GOOD, SAME, prove
+    from barpc.pipeline.outputs import PASSED_STATES, SAME, prove
 
     if expect is not None and not re.fullmatch("[0-9a-fA-F]{64}", expect):
         raise click.UsageError(f"--expect {expect}: a root has 64 hexadecimal digits")
     found = prove(Path(run_dir), [Path(place) for place in places], expect and expect.lower())
-    wrong = [one for one in found if one.now not in GOOD]
+    wrong = [one for one in found if one.now not in PASSED_STATES]
     if wants_json():
         echo(json.dumps([asdict(one) for one in found]))
     else:
@@ -133,7 +133,7 @@ def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
 # --- a surface --------------------------------------------------------------------------------------------
 
 
-def _flag(name: str, kind: Any, metavar: str | None = None) -> Callable[[Function], Function]:
+def _field_option(name: str, kind: Any, metavar: str | None = None) -> Callable[[Function], Function]:
     """Return a click option whose words and default are the field's own."""
     one = declared(DsmOptions)[name]
     default = "" if one.default in (None, False) else f"  [default: {one.default}]"
@@ -145,14 +145,14 @@ def _flag(name: str, kind: Any, metavar: str | None = None) -> Callable[[Functio
 @click.command("dsm")
 @click.argument("source", nargs=-1, required=True, metavar="RUN | IMAGE IMAGE...")
 @click.option("-o", "--out", required=True, metavar="FILE", help="The GeoTIFF to write.")
-@_flag("gsd", float, "M")
-@_flag("crs", str, "NAME")
-@_flag("alt", (float, float), "LOW HIGH")
-@_flag("pairs", int, "N")
-@_flag("band", int, "N")
-@_flag("minus", str, "OTHER_RUN")
+@_field_option("gsd", float, "M")
+@_field_option("crs", str, "NAME")
+@_field_option("alt", (float, float), "LOW HIGH")
+@_field_option("pairs", int, "N")
+@_field_option("band", int, "N")
+@_field_option("minus", str, "OTHER_RUN")
 @jobs_option
-@_flag("overwrite", bool)
+@_field_option("overwrite", bool)
 @click.pass_obj
 def dsm(obj: dict[str, Any], /, source: tuple[str, ...], out: str, jobs: int | str, **flags: Any) -> int:
     r"""Make a first surface model (DSM) of a finished run, or of images with the cameras that come with them.
@@ -183,9 +183,9 @@ def dsm(obj: dict[str, Any], /, source: tuple[str, ...], out: str, jobs: int | s
         raise click.UsageError("--minus goes with a RUN: what two dates share is not known of images")
     surface = made(obj, run or expanded(source), out, options, jobs)
     if surface is not None and wants_json():
-        from barpc.report.records import plain
+        from barpc.report.records import json_form
 
-        echo(json.dumps(plain(surface), indent=1))
+        echo(json.dumps(json_form(surface), indent=1))
     return 3 if surface is None else 0
 
 
@@ -202,11 +202,11 @@ def made(
         tell_gate(f"no surface: {error}", [])
         return None
     if not (wants_json() or obj["quiet"]):
-        _tell(surface)
+        _tell_surface(surface)
     return surface
 
 
-def _tell(surface: Surface) -> None:
+def _tell_surface(surface: Surface) -> None:
     cells = surface.size[0] * surface.size[1]
     echo(f"{surface.known} of {cells} cells of {surface.gsd:g} m have a height, by {', '.join(surface.pairs)}")
     said = {

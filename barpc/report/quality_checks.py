@@ -7,14 +7,14 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.ba.apart import Apart
+from barpc.ba.apart import ForeignCamera
 from barpc.ba.judging.snooping import ControlTest
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array
-from barpc.base.usual import FEW, SURE, SURELY
+from barpc.base.statistics import FEW, SURE, SURELY
 from barpc.report.outcome import MANY_REJECTED, SMOOTH_LEFT, WHOLE_PIXELS, Run
+from barpc.report.summary.block import AXES, LeftEntry, left_entries, strangeness
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.whole import AXES, LeftEntry, left_entries, strangeness
 from barpc.report.summary.words import CAUSES, NAMED, counted, known, metres
 from barpc.scene import GroundPoints
 from barpc.sensor.rpc import RPC
@@ -31,10 +31,10 @@ _CONTROL_WORDS = {
     "or more than one is wrong",
 }
 
-GOOD = {"adjust": "adjusted", "check": "consistent", "match": "tied"}
+PASSED_STATUS = {"adjust": "adjusted", "check": "consistent", "match": "tied"}
 """Kind of a run -> the status of a view without reservation."""
 
-Found = Iterator[tuple[str, Mapping[str, object]]]
+Causes = Iterator[tuple[str, Mapping[str, object]]]
 """Causes that hold, with their figures."""
 
 
@@ -42,10 +42,10 @@ def view_status(view: ViewEntry, run: Run) -> dict[str, str | None]:
     """Return the verdict on a view: a word of `STATUS_WORDS`, what to do (empty when all is well), and the cause."""
     for cause, figures in _reservations(view, run):  # the first that holds is the reason
         return {"status": CAUSES[cause].status, "advice": CAUSES[cause].advice(**figures), "cause": cause}
-    return {"status": GOOD[run.kind], "advice": "", "cause": None}
+    return {"status": PASSED_STATUS[run.kind], "advice": "", "cause": None}
 
 
-def _reservations(view: ViewEntry, run: Run) -> Found:
+def _reservations(view: ViewEntry, run: Run) -> Causes:
     adjustment = run.adjustment
     if adjustment is not None:
         yield from _failed(view, run, adjustment)
@@ -57,7 +57,7 @@ def _reservations(view: ViewEntry, run: Run) -> Found:
     if adjustment is not None:
         yield from _of_camera(view, run, adjustment)
         yield from _of_tie_points(view, run, adjustment)
-        yield from _beyond(view, run)
+        yield from _beyond_one_rpc(view, run)
     error = known(view.rmse_after if run.kind == "adjust" else view.rmse_before)
     if view.num_observations and not error <= GOOD_RMSE:
         disagrees = "disagrees" if run.kind == "check" else "left"
@@ -66,10 +66,10 @@ def _reservations(view: ViewEntry, run: Run) -> Found:
     if moving > MANY_REJECTED:
         yield "moving", {"share": 100 * moving}
     if adjustment is not None:
-        yield from _of_places(view, adjustment)
+        yield from _poorly_fitted_parts(view, adjustment)
 
 
-def _of_places(view: ViewEntry, adjustment: Adjustment) -> Found:
+def _poorly_fitted_parts(view: ViewEntry, adjustment: Adjustment) -> Causes:
     """Return what rows and columns say that stand out."""
     for one in left_entries(adjustment):
         if one.image == view.name and (what := stands_out(one)):
@@ -79,7 +79,7 @@ def _of_places(view: ViewEntry, adjustment: Adjustment) -> Found:
             yield "place", {"place": place, "what": what, "cause": cause}
 
 
-def _weakly_tied(view: ViewEntry, run: Run) -> Found:
+def _weakly_tied(view: ViewEntry, run: Run) -> Causes:
     """Say that a view has few tie points, some that may all be off alike, or a part without where there is detail."""
     by_reference = run.reference is not None and any(v.points and v.name == view.name for v in run.reference.views)
     controlled = by_reference or view.num_gcps >= ENOUGH_GCPS
@@ -95,9 +95,9 @@ def _weakly_tied(view: ViewEntry, run: Run) -> Found:
         yield "gap", {"place": place, "found": gap.found, "due": gap.expected}
 
 
-def _failed(view: ViewEntry, run: Run, adjustment: Adjustment) -> Found:
+def _failed(view: ViewEntry, run: Run, adjustment: Adjustment) -> Causes:
     """Say why an image was not adjusted, or that most of its tie points contradict the others."""
-    apart = _apart(view, run)
+    apart = _foreign_camera_of(view, run)
     if view.name in adjustment.left_out:
         tried = sum(view.name in report.names for report in run.matched)
         words = f" ({tried} pair{'s' * (tried > 1)} with it tried)" if tried else ""
@@ -115,10 +115,10 @@ def _failed(view: ViewEntry, run: Run, adjustment: Adjustment) -> Found:
         yield "contradicted", {"share": 100 * view.lost}
 
 
-def _of_camera(view: ViewEntry, run: Run, adjustment: Adjustment) -> Found:
+def _of_camera(view: ViewEntry, run: Run, adjustment: Adjustment) -> Causes:
     """Say that an RPC is not an image's own, is farther off than stated, or that no correction follows what is left."""
     i, prior, smooth = run.number[view.name], adjustment.prior, adjustment.smooth
-    if (apart := _apart(view, run)) is not None:
+    if (apart := _foreign_camera_of(view, run)) is not None:
         stated = f"{apart.scale:.0f} times farther off than stated" if apart.scale > 1.0 else "not its own"
         yield "apart", {"stated": stated, "strangeness": strangeness(apart)}
     if prior.odd[i]:
@@ -148,7 +148,7 @@ def _why_smooth(adjustment: Adjustment) -> str:
     return f"{why}; or the reference bends, or the heights under it do"
 
 
-def _of_tie_points(view: ViewEntry, run: Run, adjustment: Adjustment) -> Found:
+def _of_tie_points(view: ViewEntry, run: Run, adjustment: Adjustment) -> Causes:
     """Return what tie points say that were rejected, or took no part: the others were chosen to agree."""
     i, many, in_any = run.number[view.name], view.lost > MANY_REJECTED, anywhere(view, run)
     if many and not in_any:
@@ -184,7 +184,7 @@ def _most_in(view: ViewEntry, adjustment: Adjustment) -> str:
     return ""
 
 
-def _beyond(view: ViewEntry, run: Run) -> Found:
+def _beyond_one_rpc(view: ViewEntry, run: Run) -> Causes:
     """Return what one RPC does not hold of a camera that jitter or steps between detectors are corrected in."""
     told = any(getattr(run.options, name, None) for name in ("grids", "tiles", "resample"))
     if view.fit is None or view.correction is None or told or not _follows_more(view, run):
@@ -206,7 +206,7 @@ def anywhere(view: ViewEntry, run: Run) -> bool:
     return run.adjustment is not None and bool(-np.inf < run.adjustment.alike[run.number[view.name]] <= SURE)
 
 
-def _apart(view: ViewEntry, run: Run) -> Apart | None:
+def _foreign_camera_of(view: ViewEntry, run: Run) -> ForeignCamera | None:
     """Return what is known of a view if its RPC is not its own."""
     apart = None if run.adjustment is None else run.adjustment.apart
     return apart if apart is not None and apart.is_view(run.number[view.name]) else None

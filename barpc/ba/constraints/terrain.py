@@ -16,23 +16,32 @@ from dataclasses import dataclass
 import numpy as np
 
 from barpc.base.geodesy import Array, metres_per_unit, wrap_longitude
-from barpc.base.usual import BACKFITTING, CRITICAL, MANY, MUCH_NOISE, OUTLIER, STATED, SURELY, robust_spread
+from barpc.base.statistics import (
+    BACKFITTING,
+    CRITICAL,
+    MANY,
+    MUCH_NOISE,
+    OUTLIER,
+    STATED_FREEDOM,
+    SURELY,
+    robust_spread,
+)
 from barpc.scene import BoolArray, IntArray
 
 Terrain = Callable[[Array, Array], Array]
 """lon, lat (n,) [deg] -> altitude (n,) [m above the ellipsoid], NaN where it is unknown."""
 
 SLOPE_STEP = 15.0  # m: slopes of the DEM itself are taken over twice this distance
-DEGREE = 3  # of the surfaces of which a DEM's are taken whole, wrong by what all its heights are
-_TERMS = [(n - j, j) for n in range(DEGREE + 1) for j in range(n + 1)]  # powers: level, x, y, x^2, ...
-NUM_BENDS = len(_TERMS)
-_NODES = 300  # of the grid on which a DEM is smoothed, along the scene's longer side: 30 m of 10 km
-_MARGIN = 300.0  # m around the scene at least, or as much as that: cameras may be off
-_CELLS = (6, 10, 16)  # along the scene's longer side: 36 sums tell a variance to a quarter
-_WIDEST = _CELLS[-1]  # the widest smoothing is as wide as the smallest of these, as a standard deviation
+SURFACE_DEGREE = 3  # of the surfaces of which a DEM's are taken whole, wrong by what all its heights are
+_SURFACE_POWERS = [(n - j, j) for n in range(SURFACE_DEGREE + 1) for j in range(n + 1)]  # powers: level, x, y, x^2, ...
+NUM_BENDS = len(_SURFACE_POWERS)
+_DEM_NODES = 300  # of the grid on which a DEM is smoothed, along the scene's longer side: 30 m of 10 km
+_DEM_MARGIN = 300.0  # m around the scene at least, or as much as that: cameras may be off
+_VARIANCE_CELLS = (6, 10, 16)  # along the scene's longer side: 36 sums tell a variance to a quarter
+_WIDEST = _VARIANCE_CELLS[-1]  # the widest smoothing is as wide as the smallest of these, as a standard deviation
 _HILLS = 45.0  # slopes that are alike count as one: 49-133 of them in the scenes that hold, 33 in 250 m by SRTM
-_EDGE = 2.0  # the scene's edges lie at most about so many times as far out as its points' RMS distance
-_SHOWN = 0.5  # DEMs whose relief is farther from once that of the tie points are of another terrain
+_EDGE_TO_RMS_DISTANCE = 2.0  # the scene's edges lie at most about so many times as far out as its points' RMS distance
+_MAX_RELIEF_DIFFERENCE = 0.5  # DEMs whose relief is farther from once that of the tie points are of another terrain
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,14 +64,14 @@ class Bands:
         unit = metres_per_unit(np.append((low + high) / 2.0, np.median(ground[:, 2])))[:2]
         side = (high - low) * unit
         extent = float(side.max())
-        margin = max(extent / _WIDEST, _MARGIN)
-        step = max((extent + 2.0 * margin) / _NODES, SLOPE_STEP)
+        margin = max(extent / _WIDEST, _DEM_MARGIN)
+        step = max((extent + 2.0 * margin) / _DEM_NODES, SLOPE_STEP)
         origin = low - margin / unit
         cols, rows = (np.arange(int((s + 2.0 * margin) / step) + 2) * step for s in side)
         lon, lat = np.meshgrid(origin[0] + cols / unit[0], origin[1] + rows / unit[1])
         heights = np.asarray(terrain(lon.ravel(), lat.ravel()), dtype=np.float64).reshape(lon.shape)
         least, most = np.percentile(ground[:, 2], [1, 99])
-        room = most - least + _MARGIN
+        room = most - least + _DEM_MARGIN
         known = (heights > least - room) & (heights < most + room)  # a hole may be filled with any number
         middle = float(np.median(heights[known])) if known.any() else 0.0
         filled, smoothed, width = np.where(known, heights - middle, 0.0), [], step
@@ -87,12 +96,12 @@ class Bands:
         at = self.local(ground).T[::-1] / self.step
         for layer in self.smoothed:
             rising = [np.gradient(layer, self.step, axis=axis) for axis in (1, 0)]
-            heights.append(_sampled(layer, at))
-            slopes.append(np.column_stack([_sampled(np.asarray(a), at) for a in rising]))
+            heights.append(_layer_values(layer, at))
+            slopes.append(np.column_stack([_layer_values(np.asarray(a), at) for a in rising]))
         return _differences(np.array(heights)), _differences(np.array(slopes))
 
 
-def _sampled(layer: Array, at: Array) -> Array:
+def _layer_values(layer: Array, at: Array) -> Array:
     from scipy.ndimage import map_coordinates
 
     return np.asarray(map_coordinates(layer, at, order=1, mode="nearest"), dtype=np.float64)
@@ -112,22 +121,22 @@ def _differences(layers: Array) -> Array:
     return np.concatenate([layers[:-1] - layers[1:], layers[-1:]])
 
 
-def bends(at: Array) -> Array:
+def quadratic_basis(at: Array) -> Array:
     """Return the level, slopes and bends (n, `NUM_BENDS`) of a surface at places (n, 2)."""
     x, y = at.T
-    return np.column_stack([x**i * y**j for i, j in _TERMS])
+    return np.column_stack([x**i * y**j for i, j in _SURFACE_POWERS])
 
 
 def _bend_slopes(at: Array) -> Array:
-    """Return the derivatives (n, `NUM_BENDS`, 2) of `bends` by the places."""
+    """Return the derivatives (n, `NUM_BENDS`, 2) of `quadratic_basis` by the places."""
     x, y = at.T
-    by_x = [i * x ** max(i - 1, 0) * y**j for i, j in _TERMS]
-    by_y = [j * x**i * y ** max(j - 1, 0) for i, j in _TERMS]
+    by_x = [i * x ** max(i - 1, 0) * y**j for i, j in _SURFACE_POWERS]
+    by_y = [j * x**i * y ** max(j - 1, 0) for i, j in _SURFACE_POWERS]
     return np.stack([np.column_stack(by_x), np.column_stack(by_y)], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
-class Believed:
+class RegularisedDem:
     """Heights and slopes that are believed of a DEM at n points."""
 
     alt: Array  # (n,) altitudes to hold the points to [m]; NaN where the DEM has none, or they are far from it
@@ -164,7 +173,7 @@ class Relief:
         """Return the sigmas (`NUM_BENDS`,) [m] of errors in common: `bias`, or more where points contradict it."""
         sigma = np.full(NUM_BENDS, bias)
         contradicts = self.beyond(bias) > SURELY
-        sigma[:3][contradicts] = _EDGE * np.abs(self.delivered)[contradicts]
+        sigma[:3][contradicts] = _EDGE_TO_RMS_DISTANCE * np.abs(self.delivered)[contradicts]
         return sigma
 
     @classmethod
@@ -189,7 +198,7 @@ class Relief:
         flat = np.column_stack([np.ones(len(at)), at / np.sqrt((at**2).sum(axis=1).mean())])
         near = _middling(off)
         for _ in range(BACKFITTING):
-            delivered = _coefficients(flat[near], off[near])
+            delivered = _least_squares_fit(flat[near], off[near])
             left = np.abs(off - flat @ delivered)
             near = left <= OUTLIER * robust_spread(left)
         tell[index[sharp[index] < max(robust_spread(left), stated)]] = True
@@ -201,7 +210,7 @@ class Relief:
         return np.inf if self.posts is None else float(len(np.unique(self.posts[points])))
 
 
-def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Believed | None:
+def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> RegularisedDem | None:
     """Estimate what to believe of a DEM at the points `index` (n,), at (n, 3); None where too few heights
     tell.
 
@@ -221,24 +230,24 @@ def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Be
     at = relief.bands.local(ground)
     at = at - at[tell].mean(axis=0)
     half = max(float(np.abs(at[tell]).max()), 1.0)
-    smooth, by_place = bends(at / half), _bend_slopes(at / half) / half
-    trend = _coefficients(smooth[tell], heights[:, tell].T)
+    smooth, by_place = quadratic_basis(at / half), _bend_slopes(at / half) / half
+    trend = _least_squares_fit(smooth[tell], heights[:, tell].T)
     kept, bent = (smooth @ trend).sum(axis=1), heights.T - smooth @ trend
     bent_slopes = slopes - np.einsum("nmx,mk->knx", by_place, trend)
     above = ground[:, 2] - kept
     found = _compared(at, above, bent, bent_slopes, smooth, tell, relief.independent(index[tell]))
     fits, left, rising = found.fits, found.left, found.rising
     freedom = max(int(fits.sum()) - found.unknowns, 1)
-    pull = rising[fits] - smooth[fits] @ _coefficients(smooth[fits], rising[fits])
+    pull = rising[fits] - smooth[fits] @ _least_squares_fit(smooth[fits], rising[fits])
     alt = np.where(tell, ground[:, 2] - found.part, kept + bent @ found.gains)
     is_held = known & (fits | ~relief.tell[index])
-    times, shows = _shown(bent[fits].sum(axis=1), above[fits], smooth[fits], stated)
-    return Believed(
+    times, shows = _relief_ratio(bent[fits].sum(axis=1), above[fits], smooth[fits], stated)
+    return RegularisedDem(
         np.where(is_held, alt, np.nan),
         rising + np.einsum("nmx,mk->nx", by_place, trend),
         smooth,
         found.gains,
-        float(np.sqrt((STATED * stated**2 + (left[fits] ** 2).sum()) / (STATED + freedom))),
+        float(np.sqrt((STATED_FREEDOM * stated**2 + (left[fits] ** 2).sum()) / (STATED_FREEDOM + freedom))),
         max(_summed(at[fits], pull * left[fits, None]), fits.sum() / relief.independent(index[fits])),
         times,
         shows,
@@ -276,12 +285,12 @@ def _compared(
         moved = smooth
         if believes:  # a shift, a turn, a growth
             moved = np.column_stack([smooth, *(rising * smooth[:, k, None] for k in range(3))])
-            free = both[fits] - moved[fits] @ _coefficients(moved[fits], both[fits])
+            free = both[fits] - moved[fits] @ _least_squares_fit(moved[fits], both[fits])
             gains = lsq_linear(free[:, 1:], free[:, 0], (0.0, 1.0)).x
         else:
             gains, rising = np.zeros(bent.shape[1]), np.zeros_like(rising)
         rest = above - bent @ gains
-        part = moved @ _coefficients(moved[fits], rest[fits])
+        part = moved @ _least_squares_fit(moved[fits], rest[fits])
         left = rest - part
         spread = robust_spread(left[fits])
         fits = tell & (np.abs(left) <= max(OUTLIER * spread, 1e-6))
@@ -294,7 +303,7 @@ def _middling(values: Array) -> BoolArray:
     return np.asarray(off <= OUTLIER * robust_spread(off))
 
 
-def _coefficients(design: Array, values: Array) -> Array:
+def _least_squares_fit(design: Array, values: Array) -> Array:
     return np.asarray(np.linalg.lstsq(design, values, rcond=1e-9)[0], dtype=np.float64)
 
 
@@ -305,7 +314,7 @@ def _summed(at: Array, pull: Array) -> float:
     Squared sums over cells against those of independent pulls, at the size of cells at which they are largest.
     """
     size, of_single, found = max(float(np.ptp(at, axis=0).max()), 1.0), (pull**2).sum(axis=0), 1.0
-    for count in _CELLS:
+    for count in _VARIANCE_CELLS:
         column, row = np.floor((at - at.min(axis=0)) / size * count).astype(np.int64).T
         cell = np.unique(column * (count + 1) + row, return_inverse=True)[1]
         sums = np.stack([np.bincount(cell, one) for one in pull.T])
@@ -313,13 +322,17 @@ def _summed(at: Array, pull: Array) -> float:
     return found
 
 
-def _shown(relief: Array, above: Array, smooth: Array, stated: float) -> tuple[float, bool]:
+def _relief_ratio(relief: Array, above: Array, smooth: Array, stated: float) -> tuple[float, bool]:
     """Return a DEM's relief (n,) as a multiple of that of the tie points (n,) [m], and whether it may be theirs."""
-    seen = above - smooth @ _coefficients(smooth, above)
+    seen = above - smooth @ _least_squares_fit(smooth, above)
     size = max(float(seen @ seen), 1e-12)
     times = float(relief @ seen) / size
     off, rest = relief - seen, relief - times * seen
     sigma = float(np.sqrt(rest @ rest / size / len(seen)) if len(seen) else np.inf)
     far = abs(times - 1.0)
-    wrong = far > _SHOWN and far > CRITICAL * sigma and float(off @ off) > len(off) * (MUCH_NOISE * stated) ** 2
+    wrong = (
+        far > _MAX_RELIEF_DIFFERENCE
+        and far > CRITICAL * sigma
+        and float(off @ off) > len(off) * (MUCH_NOISE * stated) ** 2
+    )
     return times, not wrong

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barpc.ba.estimated.waves import FIRST_SIGMA
+from barpc.ba.parameters.additional_parameters import FIRST_SIGMA
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray, View
@@ -21,10 +21,10 @@ from barpc.sensor.timing import is_clocked
 DEFAULT_ACCURACY = 7.5  # m, of rotation and of translation, 10.6 m of both: the harsh end of what is delivered
 DRIFT_SIGMA = 0.2  # m, at a view's first and last row: 0.3 microradian from 700 km, as good platforms have it
 USABLE_ACCURACY = 0.1  # m: less is stated in pixels of a fit (as Airbus does), not in metres of geolocation
-IMAGE_SIGMA = 20.0  # px, at the edge of the image: of every coefficient of models in the image
+IMAGE_MODEL_SIGMA = 20.0  # px, at the edge of the image: of every coefficient of models in the image
 
 
-FLOOR = AdjustOptions().noise_floor
+NOISE_FLOOR = AdjustOptions().noise_floor
 """Pixels: what all ties of a view share the error of; no camera is known better, and less is let be."""
 
 
@@ -46,7 +46,9 @@ class CameraPrior:
 
 @dataclass(frozen=True, eq=False)
 class EarlierScene:
-    """The scene of an earlier block: its motions (`barpc.ba.held.gauge.MOTIONS`) by the unknowns of its cameras."""
+    """The scene of an earlier block: its motions (`barpc.ba.constraints.gauge.MOTIONS`) by the unknowns of its
+    cameras.
+    """
 
     by_unknown: Array  # (10, n)
     own: Array  # (10, 10) covariance of the motions where the cameras are known [m^2]
@@ -140,7 +142,7 @@ def states_accuracy(view: View) -> bool:
     return stated is not None and stated > USABLE_ACCURACY
 
 
-def _stated(view: View) -> tuple[float, float]:
+def _stated_accuracy(view: View) -> tuple[float, float]:
     """Return the stated accuracies of a view's attitude (metres on the ground) and position, or of its two
     clocks [m].
     """
@@ -158,7 +160,7 @@ def prior_sigmas(
 
     A view that is known to be `off` (N,) [m] by more than it states is not held to that.
     """
-    stated = np.array([_stated(view) for view in views])
+    stated = np.array([_stated_accuracy(view) for view in views])
     if off is not None:
         stated = np.fmax(stated, off[:, None])
     parts, count = [], len(views)
@@ -169,7 +171,7 @@ def prior_sigmas(
             parts.append(np.tile(one[:, None], (1, 3)))
     if not parts:
         size = {"shift": 2, "shift-drift": 4, "affine": 6}[options.first_model]
-        return np.full((count, size), IMAGE_SIGMA)
+        return np.full((count, size), IMAGE_MODEL_SIGMA)
     radars = [is_clocked(view.sensor) for view in views]
     parts[0][radars, :2] = stated[radars] if options.sigma_position is None else options.sigma_position
     parts += [np.full((count, 3), DRIFT_SIGMA)] * drift

@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from barpc.ba.estimated.unknowns import Unknowns
+from barpc.ba.parameters.unknowns import Unknowns
 from barpc.base.geodesy import Array, ground_from_ecef, ground_rows_from_ecef, parts
 from barpc.scene import IntArray, View
 from barpc.sensor.corrected import RigidMotion
@@ -139,7 +139,7 @@ class Cameras:
             out.image[:] = model.project(ground.T).T
             return
         image, by_ground, by_timing, along = model.timing_jacobian(ground.T)
-        out.image[:], out.by_point[:] = image.T, _times(np.moveaxis(by_ground, 0, -1), by_ecef)
+        out.image[:], out.by_point[:] = image.T, _matrix_products(np.moveaxis(by_ground, 0, -1), by_ecef)
         if out.by_unknown.shape[1]:
             out.by_unknown[:] = unknowns.stack_timing(np.moveaxis(by_timing, 0, -1), along, view)
 
@@ -160,10 +160,10 @@ class Cameras:
             points, jacobian = self.sensors[views.start].project_jacobian(ground.T)
             image = points.T  # components laid out anew: products of strided ones take twice as long
             by_ground = np.ascontiguousarray(np.moveaxis(jacobian, 0, -1))
-        return image, _times(by_ground, by_ecef)
+        return image, _matrix_products(by_ground, by_ecef)
 
 
-def _times(a: Array, b: Array) -> Array:
+def _matrix_products(a: Array, b: Array) -> Array:
     """Return the products (i, k, n) of small matrices (i, j, n) and (j, k, n)."""
     out: Array = a[:, 0, None] * b[0]
     for j in range(1, len(b)):

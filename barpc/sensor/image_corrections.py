@@ -18,15 +18,15 @@ import numpy as np
 from barpc.base.errors import RpcError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, IntArray
-from barpc.base.usual import ITERATIONS
+from barpc.base.statistics import ITERATIONS
 from barpc.sensor import Behind, SensorModel
-from barpc.sensor.direct_grid import LINEAR, LONGEST, linear_axes
+from barpc.sensor.direct_grid import LINEAR, MAX_NODE_SPACING, linear_axes
 
 if TYPE_CHECKING:
     from scipy.interpolate import RegularGridInterpolator
 
 
-STANDS = 1e-7
+ITERATION_TOLERANCE = 1e-7
 """Of image points that are iterated [px]: what is left after so small a step is a hundredth of it."""
 
 
@@ -76,7 +76,7 @@ def fixed_point(follow: Callable[[Array], Array], image: Array) -> Array:
         last, change = change, np.abs(image - before)
         with np.errstate(all="ignore"):  # a step leaves a hundredth of itself, or what it was of the step before
             left = np.fmin(change, 100.0 * change * change / last)
-        if not (left.max(initial=0.0, where=np.isfinite(left)) > STANDS):
+        if not (left.max(initial=0.0, where=np.isfinite(left)) > ITERATION_TOLERANCE):
             break
     return image
 
@@ -298,7 +298,7 @@ class CorrectionGrid(Frozen):
             return model.project(rpc.localize(points, np.full(points.shape[:-1], alt))) - points
 
         low, high = np.full(2, -0.5), np.asarray(size) - 0.5
-        cols, rows = linear_axes(lacking, low, high, np.array(LONGEST[:2]), tolerance)
+        cols, rows = linear_axes(lacking, low, high, np.array(MAX_NODE_SPACING[:2]), tolerance)
         nodes = np.stack(np.meshgrid(cols, rows), axis=-1)
         return cls(cols, rows, lacking(nodes).astype(np.float32).astype(np.float64))
 

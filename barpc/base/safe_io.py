@@ -24,17 +24,17 @@ from xml.etree import ElementTree
 
 from barpc.base import identity
 from barpc.base.errors import BarpcError, ImageError, InputError, RpcFormatError, plain, visible
-from barpc.base.remote import BLOCK, Place, Remote, RemoteFile, location, pinned
+from barpc.base.remote import REQUEST_BYTES, PathOrUrl, Remote, RemoteFile, location, pinned
 
 MB = 1 << 20
-NUMBER = 8
+BYTES_PER_NUMBER = 8
 """Bytes of what an element of a file becomes in memory, however small it is kept there."""
 MAX_XML = 32 * MB  # the largest in use, a day of precise orbits, has 5 MB
 _FLAGS = os.O_RDONLY
 for _flag in ("O_NONBLOCK", "O_CLOEXEC", "O_NOCTTY", "O_BINARY"):  # not every system has all
     _FLAGS |= getattr(os, _flag, 0)
 _KINDS = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
-_TOLD, _LETTERS = 16, 4  # bytes that tell an encoding; letters of them, at least
+_ENCODING_BYTES, _MIN_LETTERS = 16, 4  # bytes that tell an encoding; letters of them, at least
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Kind:
     words: str  # what a message calls it
     most: int | None  # larger files are refused [bytes]; None for images, which are never read whole
     error: type[BarpcError] = InputError
-    lines: int | None = None  # texts of more lines, or of a line of more than `LINE` bytes, are refused
+    lines: int | None = None  # texts of more lines, or of a line of more than `MAX_LINE_BYTES` bytes, are refused
     values: int = 8 * MB  # of JSON, which take 60 to 110 bytes each in memory: 1 GB at most
 
     def check(self, path: Path | str, size: int) -> None:
@@ -55,31 +55,31 @@ class Kind:
     def check_lines(self, path: Path | str, file: BinaryIO) -> None:
         """Raise if a text has more or longer lines than are read, before it is parsed; end at its beginning."""
         count = 0
-        for part in iter(lambda: file.read(LINE), b"") if self.lines else ():
+        for part in iter(lambda: file.read(MAX_LINE_BYTES), b"") if self.lines else ():
             ends = max(part.count(b"\n"), part.count(b"\r"))
-            if not ends and len(part) == LINE:
-                raise self.error(f"{path}: a line of more than {LINE} bytes, too long for {self.words}")
+            if not ends and len(part) == MAX_LINE_BYTES:
+                raise self.error(f"{path}: a line of more than {MAX_LINE_BYTES} bytes, too long for {self.words}")
             count += ends
         if self.lines and count > self.lines:
             raise self.error(f"{path}: {count} lines, too many for {self.words} (at most {self.lines} are read)")
         file.seek(0)
 
 
-LINE = MB
+MAX_LINE_BYTES = MB
 """Bytes of a line of a table, a ground point in thousands of images; the longest one may have twice as many."""
-_LINES = 16 * MB  # of a table: names and numbers of a line take 150 bytes in memory, 2.5 GB at most
+_MAX_TABLE_LINES = 16 * MB  # of a table: names and numbers of a line take 150 bytes in memory, 2.5 GB at most
 
 IMAGE = Kind("an image", None, ImageError)
 PRODUCT = Kind("a product", None, RpcFormatError)
 GRID = Kind("a height grid", None)
 RPC_FILE = Kind("an RPC file", 32 * MB, RpcFormatError)
 XML = Kind("an XML file", MAX_XML, RpcFormatError)
-TABLE = Kind("a table of points", 1024 * MB, lines=_LINES)
+TABLE = Kind("a table of points", 1024 * MB, lines=_MAX_TABLE_LINES)
 ARRAYS = Kind("an archive of arrays", 1024 * MB)
 GEOJSON = Kind("a GeoJSON file", 256 * MB)
 OPTIONS = Kind("an options file", MB)
 NAMES = Kind("a list of names", 16 * MB)
-STATE = Kind("a camera's state", 64 * MB, RpcFormatError)
+CAMERA_STATE = Kind("a camera's state", 64 * MB, RpcFormatError)
 SUMMARY = Kind("a run's summary", 512 * MB, values=32 * MB)
 
 
@@ -98,7 +98,7 @@ def opened(path: Path | str, kind: Kind) -> Iterator[BinaryIO]:
         raise kind.error(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
-def versioned(path: Place, kind: Kind) -> Place:
+def versioned(path: PathOrUrl, kind: Kind) -> PathOrUrl:
     """Return a Remote with the version that its file has now, which all who are given it read; a Path as it is."""
     if not isinstance(path, Remote):
         return path
@@ -114,7 +114,7 @@ def _regular(path: Path | str, kind: Kind) -> BinaryIO:
     if isinstance(path, Remote):
         elsewhere = RemoteFile(versioned(path, kind))
         kind.check(path, elsewhere.size)
-        return io.BufferedReader(elsewhere, BLOCK)
+        return io.BufferedReader(elsewhere, REQUEST_BYTES)
     try:
         descriptor = os.open(path, _FLAGS)
     except (FileNotFoundError, NotADirectoryError):
@@ -150,7 +150,7 @@ def encoding_of(head: bytes) -> str:
         ("utf-16-le", head[1:16:2], head[:16:2]),
         ("utf-16-be", head[:16:2], head[1:16:2]),
     ):
-        if len(zeros) >= _LETTERS and not any(zeros) and all(letters):
+        if len(zeros) >= _MIN_LETTERS and not any(zeros) and all(letters):
             return name
     return "utf-8-sig"
 
@@ -165,7 +165,7 @@ def opened_text(path: Path | str, kind: Kind, newline: str | None = None) -> Ite
 @contextmanager
 def _utf8(file: BinaryIO, path: Path | str, kind: Kind, newline: str | None = None) -> Iterator[TextIO]:
     kind.check_lines(path, file)
-    encoding = encoding_of(file.read(_TOLD))
+    encoding = encoding_of(file.read(_ENCODING_BYTES))
     file.seek(0)
     try:
         with io.TextIOWrapper(file, encoding=encoding, newline=newline) as text:
@@ -195,7 +195,7 @@ def read_text(path: Path | str, kind: Kind) -> str:
         return text.read()
 
 
-_LINE = 4 * 4096  # no line of names is longer than two paths can be
+_MAX_NAME_LENGTH = 4 * 4096  # no line of names is longer than two paths can be
 
 
 def read_names(path: Path | str, words: str) -> list[str]:
@@ -203,7 +203,7 @@ def read_names(path: Path | str, words: str) -> list[str]:
     kind = replace(NAMES, words=words)
     lines = read_text(path, kind).splitlines()
     for number, line in enumerate(lines, start=1):
-        if len(line) > _LINE:
+        if len(line) > _MAX_NAME_LENGTH:
             raise kind.error(f"{path}, line {number}: {len(line)} characters, no name is so long")
     return lines
 
@@ -212,7 +212,7 @@ def read_names(path: Path | str, words: str) -> list[str]:
 _REFUSED = "\ufffe\uffff" + ("\\" if os.sep == "/" else "")
 
 
-def plain_path(path: str | os.PathLike[str]) -> Place:
+def plain_path(path: str | os.PathLike[str]) -> PathOrUrl:
     """Return a path or a Remote as it is, once every file that barpc writes can carry it.
 
     InputError for a control character, an end of line, bytes that are no text, a backslash that separates no folders.
@@ -231,13 +231,13 @@ def plain_path(path: str | os.PathLike[str]) -> Place:
 # --- JSON -------------------------------------------------------------------------------------------------
 
 _DIGITS = 18  # of a whole number: more do not fit 64 bits
-LARGEST = 1e100
+MAX_NUMBER = 1e100
 """No number of a side file comes near, and its square is finite."""
 
 MAX_DEPTH = 100
 """Levels of JSON and XML."""
 _NO_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
-_STEPS = bytes.maketrans(b"[]{}", b"\x01\xff\x01\xff")  # one level down or up, as signed bytes
+_BRACKET_STEPS = bytes.maketrans(b"[]{}", b"\x01\xff\x01\xff")  # one level down or up, as signed bytes
 
 
 def read_json(path: Path | str, kind: Kind) -> Any:
@@ -256,7 +256,7 @@ def parse_json(text: str, most: int = Kind.values) -> Any:
         raise ValueError(f"{values} values, at most {most} are read")
     if _depth(text) > MAX_DEPTH:  # how deep json itself goes differs between versions of Python
         raise ValueError(f"nested too deep, at most {MAX_DEPTH} levels are read")
-    return json.loads(text, parse_constant=_refuse, parse_int=_whole, parse_float=_finite)
+    return json.loads(text, parse_constant=_refuse_constant, parse_int=_parse_integer, parse_float=_parse_float)
 
 
 def _depth(text: str) -> int:
@@ -266,23 +266,23 @@ def _depth(text: str) -> int:
         return few
     plain = text.replace(r"\\", "").replace(r"\"", "")
     outside = "".join(plain.split('"')[::2]).encode("ascii", "ignore")
-    return max(accumulate(array("b", outside.translate(_STEPS, _NO_BRACKETS))), default=0)
+    return max(accumulate(array("b", outside.translate(_BRACKET_STEPS, _NO_BRACKETS))), default=0)
 
 
-def _refuse(constant: str) -> NoReturn:
+def _refuse_constant(constant: str) -> NoReturn:
     raise ValueError(f"{constant} is no finite number")
 
 
-def _whole(digits: str) -> int:
+def _parse_integer(digits: str) -> int:
     if len(digits) > _DIGITS:
         raise ValueError(f"a whole number of {len(digits)} digits")
     return int(digits)
 
 
-def _finite(text: str) -> float:
+def _parse_float(text: str) -> float:
     value = float(text)
-    if not math.fabs(value) <= LARGEST:
-        raise ValueError(f"{text[:40]} is beyond {LARGEST:g}")
+    if not math.fabs(value) <= MAX_NUMBER:
+        raise ValueError(f"{text[:40]} is beyond {MAX_NUMBER:g}")
     return value
 
 

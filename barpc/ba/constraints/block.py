@@ -14,13 +14,13 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from barpc.ba.estimated.priors import CameraPrior, prior_sigmas
-from barpc.ba.estimated.projected import Cameras
-from barpc.ba.estimated.unknowns import make_unknowns
-from barpc.ba.estimated.waves import Waves
-from barpc.ba.held.ground import Heights, convergence_angles, ground_control, reference_control
-from barpc.ba.held.incremental import BlockPrior, apply_prior
-from barpc.ba.held.terrain import Relief, Terrain
+from barpc.ba.constraints.ground import PointConstraints, convergence_angles, ground_control, reference_control
+from barpc.ba.constraints.incremental import BlockPrior, apply_prior
+from barpc.ba.constraints.terrain import Relief, Terrain
+from barpc.ba.parameters.additional_parameters import AdditionalParameters
+from barpc.ba.parameters.priors import CameraPrior, prior_sigmas
+from barpc.ba.parameters.projected import Cameras
+from barpc.ba.parameters.unknowns import make_unknowns
 from barpc.ba.solving.normal import cholesky3, point_products, solve_lower, solve_transposed
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
@@ -150,7 +150,7 @@ def join(
             f"too few observations in {listed(few)}: at least {MIN_OBSERVATIONS} tie points are needed, or one ground "
             "control point (--gcp); give more matches (--matches) or leave these views out (--keep-going)"
         )
-    left_out = _left_out(names, view[rows], point[rows], tracks.num_points, keep_largest, is_held)
+    left_out = _disconnected_views(names, view[rows], point[rows], tracks.num_points, keep_largest, is_held)
     order, _ = counting_sort(view, len(views))
     use = ~np.isin(view, np.flatnonzero(np.isin(names, left_out)))
     return Block(
@@ -178,7 +178,7 @@ def _check_names(names: Sequence[str], options: AdjustOptions) -> None:
         raise InputError(f"no view is named {listed(sorted(unknown))}; there are {listed(names)}")
 
 
-def _left_out(
+def _disconnected_views(
     names: Sequence[str], view: IntArray, point: IntArray, num_tracks: int, keep_largest: bool, is_held: BoolArray
 ) -> tuple[str, ...]:
     """Return the views outside the largest group, rows sorted by point; GCPs tie their views to each other."""
@@ -209,7 +209,7 @@ def make_problem(
     centers: Array | None,
     prior: BlockPrior | None,
     drift: int | None = None,
-    waves: Waves | None = None,
+    waves: AdditionalParameters | None = None,
 ) -> Problem:
     """Set up observations, cameras and priors before anything is known about points; `drift` overrides the options'."""
     views = block.views
@@ -252,7 +252,9 @@ def _known_centers(block: Block, options: AdjustOptions, centers: Array | None, 
     return np.array([known.get(name, center) for name, center in zip(block.names, centers, strict=True)])
 
 
-def first_state(problem: Problem, block: Block, options: AdjustOptions, dem: Terrain | None) -> tuple[State, Heights]:
+def first_state(
+    problem: Problem, block: Block, options: AdjustOptions, dem: Terrain | None
+) -> tuple[State, PointConstraints]:
     """Triangulate the points with the delivered cameras, and return priors for those that the rays do not fix."""
     params = problem.camera_prior.mean
     points = block.first_points()
@@ -265,7 +267,7 @@ def first_state(problem: Problem, block: Block, options: AdjustOptions, dem: Ter
     angles = convergence_angles(problem.structure, projected, points)
     weak = seen & (angles < np.radians(options.min_convergence))
     tracks = np.flatnonzero(seen[: block.num_tracks])
-    heights = Heights(tuple(control), weak, tracks, block.alt_range, options, dem, block.reference)
+    heights = PointConstraints(tuple(control), weak, tracks, block.alt_range, options, dem, block.reference)
     weight = block.use / block.sigma
     points = heights.hold(problem, points).triangulate(points, projected, weight)
     projected = problem.project_points(params, points)
@@ -275,7 +277,7 @@ def first_state(problem: Problem, block: Block, options: AdjustOptions, dem: Ter
     return State(params, points), heights
 
 
-def _relief(problem: Problem, heights: Heights, points: Array, weight: Array) -> Relief:
+def _relief(problem: Problem, heights: PointConstraints, points: Array, weight: Array) -> Relief:
     """Return the DEM beside points (P, 3) [m] that stand where the rays of the delivered cameras put them.
 
     What the cameras let expect of how these lie to it is first-order: points move by -V^-1 A^T B with the cameras.
