@@ -115,7 +115,8 @@ class HeightGrid:
 
     def place(self, row: Array, col: Array) -> tuple[Array, Array]:
         """Return the lon, lat (N,) [deg] of fractional row, col (N,): what `locate` takes."""
-        x, y = ~self.to_pixel * (col + 0.5, row + 0.5)
+        a, b, c, d, e, f = (~self.to_pixel)[:6]
+        x, y = a * (col + 0.5) + b * (row + 0.5) + c, d * (col + 0.5) + e * (row + 0.5) + f
         return (x, y) if self.crs.is_geographic else self._warped(self.crs, CRS.from_epsg(4326), x, y)
 
     def _warped(self, start: CRS, end: CRS, x: Array, y: Array) -> tuple[Array, Array]:
