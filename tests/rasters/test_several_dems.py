@@ -123,11 +123,10 @@ def test_a_place_that_a_map_does_not_know_is_left_to_the_next(tmp_path) -> None:
 
 
 def test_tiles_that_meet_at_the_date_line_have_no_seam(tmp_path) -> None:
-    step = rasterio.Affine(STEP, 0, 0, 0, -STEP, LAT)
     parts = []
     for name, west in (("a.tif", 179.8), ("b.tif", -180.0)):
         lon, lat = np.meshgrid(west % 360 + STEP * (np.arange(20) + 0.5), LAT - STEP * (np.arange(20) + 0.5))
-        forward = rasterio.Affine.translation(west, 0) * step
+        forward = rasterio.Affine(STEP, 0, west, 0, -STEP, LAT)
         parts.append(write_dem(tmp_path / name, 4979, plane(lon, lat), transform=forward))
     lon = np.linspace(179.81, 180.19, 300)
     for shift in (0.0, 360.0):
