@@ -57,7 +57,7 @@ def test_where_four_tiles_meet_heights_are_those_of_one_grid(order, tmp_path) ->
     heights, corner = rng.uniform(0, 500, (20, 24)), rasterio.Affine(STEP, 0, 5, 0, -STEP, LAT)
     whole, parts = Dem.open(write_dem(tmp_path / "w.tif", 4979, heights, transform=corner)), []
     for i, (rows, cols) in enumerate((r, c) for r in ((0, 9), (9, 20)) for c in ((0, 11), (11, 24))):
-        moved = corner * rasterio.Affine.translation(cols[0], rows[0])
+        moved = rasterio.Affine(STEP, 0, 5 + STEP * cols[0], 0, -STEP, LAT - STEP * rows[0])
         parts.append(write_dem(tmp_path / f"{i}.tif", 4979, heights[slice(*rows), slice(*cols)], transform=moved))
     lon, lat = rng.uniform((5.01, LAT - 0.19), (5.23, LAT - 0.01), (3000, 2)).T
     found = Dem.open([parts[i] for i in order])(lon, lat)
