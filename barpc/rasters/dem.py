@@ -128,7 +128,8 @@ class HeightGrid:
             except CPLE_BaseError:  # of one place: GDAL does not say of which
                 from pyproj import Transformer
 
-                both = Transformer.from_crs(start.to_wkt(), end.to_wkt(), always_xy=True).transform(x[known], y[known])
+                to = Transformer.from_crs(start.to_wkt(), end.to_wkt(), always_xy=True)
+                both = np.array(to.transform(x[known].tolist(), y[known].tolist()))
                 known[known] = np.isfinite(both).all(axis=0)
                 found[:, known] = warp_points(start, end, x[known], y[known])
         except (CRSError, CPLE_BaseError) as error:

@@ -491,7 +491,7 @@ def test_orthoimages_stand_on_several_dems_each_above_what_it_counted_from(south
     assert "-s_srs" not in lines[0]
     for line, geoid, unit in ((lines[1], "egm96_15.tif", "1"), (lines[2], "g.gtx", "0.3048")):
         system = line[line.index("-s_srs") + 1]
-        assert "+proj=utm +zone=31 +south" in system
+        assert re.match(r"\+proj=utm \+zone=31 \+south|\+init=epsg:32731", system)  # as older GDALs write it
         assert re.search(rf"\+geoidgrids=\S*{geoid} \+vto_meter={unit}$", system)
     assert lines[3][0] == "gdalbuildvrt"
     assert lines[3][-4:] == ["dem.vrt", "dem_3.tif", "dem_2.tif", "dem_1.tif"]  # the first lies above
