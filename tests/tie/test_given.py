@@ -166,9 +166,7 @@ def test_a_negative_is_registered_on_channels(render, tmp_path, caplog) -> None:
         assert pair_counts(tracks)[pair] >= 150
         across = np.abs(scene.errors(*pair, *common_tracks(tracks, *pair))).min(axis=1)
         assert 0.002 < np.median(across) < (0.05 if pair == (0, 2) else 0.1)
-    two = tracks.select(np.bincount(tracks.point)[tracks.point] == 2)
-    assert typical(scene, two, 0, 2) <= 0.1  # of one date: by grey values
-    assert typical(scene, tracks, 0, 2) <= 0.2  # those that the negative shows, too, by what it shares with them
+    assert typical(scene, tracks, 0, 2) <= 0.1  # of one date: by grey values
 
 
 @pytest.mark.slow

@@ -353,7 +353,9 @@ def refine(
     """
     if not len(tracks):
         return tracks
-    of_track = references(tracks, spreads, len(views))
+    # channels register less exactly: what compares by grey values is the better reference
+    exact = {ends: spread + oriented.SIGMA * (ends in structural) for ends, spread in spreads.items()}
+    of_track = references(tracks, exact, len(views))
     other = np.flatnonzero(np.arange(len(tracks)) != of_track[tracks.point])
     links = _Registrations(views, tracks, of_track[tracks.point[other]], other, frozenset(structural))
     found = links.register(options, work)
