@@ -5,7 +5,7 @@ Frozen records of plain float64 arrays. `tie` makes tracks, `ba` reads them; nei
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +16,8 @@ from scipy.sparse.csgraph import connected_components
 from barpc.base.errors import InputError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, HeightDatum
+from barpc.base.geodesy import BoolArray as BoolArray
+from barpc.base.geodesy import IntArray as IntArray
 from barpc.base.remote import PathOrUrl
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
@@ -23,8 +25,8 @@ from barpc.sensor.rpc import RPC
 SIGMA_RANGE = 1e-6, 1e9
 """Standard deviations of ground points [m, px] whose squares can be reckoned with."""
 
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
+Terrain = Callable[[Array, Array], Array]
+"""lon, lat (...) [deg] -> altitude (...) [m above the ellipsoid], NaN where it is unknown."""
 
 
 @dataclass(frozen=True, eq=False)

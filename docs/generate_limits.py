@@ -105,7 +105,7 @@ def rows() -> list[tuple[str, str]]:
         ("an area", f"{many(area._MOST_CROSSED)} times that its outline crosses itself"),
         (
             "numbers of JSON and `block.npz`",
-            f"{many(safe_io.MAX_NUMBER)}; whole ones of JSON {safe_io._DIGITS} digits",
+            f"{many(safe_io.MAX_NUMBER)}; whole ones of JSON {safe_io.MAX_DIGITS} digits",
         ),
         (
             "numbers of options",

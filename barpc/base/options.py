@@ -251,6 +251,9 @@ class TieOptions(Options):
             raise InputError(f"angles: the smallest comes first, found {self.angles}")
 
 
+TIE_DEFAULTS = TieOptions()
+
+
 @dataclass(frozen=True, repr=False)
 class AdjustOptions(Options):
     """Options of the adjustment."""

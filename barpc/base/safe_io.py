@@ -230,7 +230,7 @@ def plain_path(path: str | os.PathLike[str]) -> PathOrUrl:
 
 # --- JSON -------------------------------------------------------------------------------------------------
 
-_DIGITS = 18  # of a whole number: more do not fit 64 bits
+MAX_DIGITS = 18  # of a whole number: more do not fit 64 bits
 MAX_NUMBER = 1e100
 """No number of a side file comes near, and its square is finite."""
 
@@ -274,7 +274,7 @@ def _refuse_constant(constant: str) -> NoReturn:
 
 
 def _parse_integer(digits: str) -> int:
-    if len(digits) > _DIGITS:
+    if len(digits) > MAX_DIGITS:
         raise ValueError(f"a whole number of {len(digits)} digits")
     return int(digits)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from functools import cache, wraps
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import click
 import numpy as np
@@ -21,6 +21,7 @@ from barpc.base.options import GEOID_HELP
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import TABLE, opened_text
 from barpc.cameras import open_camera, split_spec
+from barpc.cli.flags import Function
 from barpc.cli.terminal import echo, remark, tell_gate, wants_json
 from barpc.rasters.dem import Dem, localize_on_terrain
 from barpc.scene import BoolArray, Camera
@@ -33,9 +34,6 @@ _NUMBERS = {"ignore_unknown_options": True}  # -3.5 is a number, not an option
 
 
 # --- altitudes that the command line does not give --------------------------------------------------------
-
-
-Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def with_heights(alt: str, both: bool = False) -> Callable[[Function], Function]:

@@ -35,7 +35,7 @@ from barpc.report.summary import Summary
 from barpc.rpcio.grids import CORRECTION
 from barpc.scene import View
 from barpc.sensor.geometry import is_radar, triangulate
-from barpc.tie.pairing.overlaps import overlapping_pairs
+from barpc.tie.pairing.overlaps import Link, overlapping_pairs
 from barpc.tie.patches.dense import ACROSS, COLUMNS_PER_PIXEL, WINDOW, DenseMatches, dense_matches, epipolar_frame
 
 logger = logging.getLogger(__name__)
@@ -61,7 +61,6 @@ CONVERGENCE_RANGE = 2.0, 45.0
 """Convergence angles [deg] of pairs that are matched: below, a pixel is 30 of height; above, SGBM finds decoys."""
 _RADAR = ("sentinel-1", "terrasar-x", "sicd")
 
-Link = tuple[int, int]
 Groups = Sequence[Sequence[Link]]
 """Pairs of views of a surface, the best first; of a difference those of the surface that is taken away, too."""
 

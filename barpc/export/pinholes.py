@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array
 from barpc.base.remote import is_url
-from barpc.base.statistics import ITERATIONS
 from barpc.export.files import Files, as_json
 from barpc.export.shots import Sampled, Scene, Shot, relative_link
 from barpc.sensor.curve import rotation_matrix
 
 _DISTANCE_FACTORS = 1.0, 2.0, 3.0  # an image that is affine along its flight is best seen from farther away than it was
+_MAX_STEPS = 100  # of Levenberg's method, which ends by itself where the cost stands
 _CORNER = 0.5  # px from the corner of the first pixel, where COLMAP counts from, to its centre
 
 
@@ -75,7 +75,7 @@ def _least_squares_pinhole(start: Pinhole, samples: Sampled) -> Pinhole:
     """Return the least squares solution, by Levenberg's method on small turn, move, focal lengths, principal point."""
     pinhole, damping = start, 1e-3
     cost, left = _cost(pinhole, samples)
-    for _ in range(ITERATIONS):
+    for _ in range(_MAX_STEPS):
         jacobian = _jacobian(pinhole, samples.world)
         scale = np.linalg.norm(jacobian, axis=0)
         system = np.vstack([jacobian / scale, np.sqrt(damping) * np.eye(10)])

@@ -15,7 +15,6 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from barpc.base.geodesy import CHUNK, Array, BoolArray, IntArray
-from barpc.base.statistics import ROUNDING
 from barpc.fit.system import EPS, MAX_PASSES, TriangularSystem, solution
 from barpc.sensor.rational import POWERS, TRUSTED_REACH, monomials
 from barpc.sensor.rpc import RPC
@@ -26,6 +25,7 @@ _PIECES = 8  # of a side
 _BERNSTEIN = np.array([[comb(i, k) / comb(3, k) for k in range(4)] for i in range(4)])
 _HULL_DIRECTIONS = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)  # in which a hull is cut, level with the ground
 _DIRECTIONS = np.column_stack([np.cos(_HULL_DIRECTIONS), np.sin(_HULL_DIRECTIONS)])
+_BOUND_SLACK = 1e-9  # of normalised coordinates and denominators: far above the rounding of float64
 _CUTS = 40  # inequalities that are taken in in a pass of a bounded least squares
 
 
@@ -127,7 +127,7 @@ def _touched_nodes(reach: Array, half: Array) -> BoolArray:
     start = -1.0 + width * np.arange(_PIECES)
     corner = np.stack(np.meshgrid(start, start, indexing="ij"), axis=-1)
     nearest = corner @ level.T + width * np.minimum(level, 0.0).sum(axis=1)
-    touched = (nearest <= reach + ROUNDING).all(axis=-1).astype(np.float64)
+    touched = (nearest <= reach + _BOUND_SLACK).all(axis=-1).astype(np.float64)
     nodes = np.arange(len(_axis()))[:, None] - 3 * np.arange(_PIECES)
     of_piece = ((nodes >= 0) & (nodes <= 3)).astype(np.float64)  # each piece has four, the last is the next one's first
     return np.asarray(of_piece @ touched @ of_piece.T > 0)
@@ -150,14 +150,14 @@ def bounded(system: TriangularSystem, region: Region, active: IntArray) -> Array
     """
     from scipy.optimize import nnls  # a tenth of a second, which smooth cameras do not need
 
-    floor = MIN_DENOMINATOR_RATIO + 10.0 * ROUNDING
+    floor = MIN_DENOMINATOR_RATIO + 10.0 * _BOUND_SLACK
     x, used, cubic, m = solution(system), np.empty(0, dtype=np.int64), np.eye(20)[0], len(active) - 1
     for _ in range(MAX_PASSES):
         cubic[active[1:]] = x[-m:]
         short = region.bernstein(cubic) - floor * (region.there[0] @ cubic)
         short[used] = 0.0
         broken = np.argsort(short, kind="stable")[:_CUTS]
-        broken = broken[short[broken] < -ROUNDING]
+        broken = broken[short[broken] < -_BOUND_SLACK]
         if not len(broken):
             return x
         used = np.append(used, broken)

@@ -25,7 +25,6 @@ from scipy.linalg.lapack import dtpqrt
 from barpc.base.errors import FitError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, IntArray, parts
-from barpc.base.statistics import ROUNDING
 from barpc.sensor.rational import POWERS, monomials
 
 Rounding = Callable[[Array], Array]
@@ -36,6 +35,7 @@ _HOUSEHOLDER_COLUMNS = 8  # columns of a Householder block
 _MONOMIAL_DEGREES = POWERS.sum(axis=1)
 _NUMERATOR = np.array([np.inf, np.inf, 0.1, 0.03])
 _DENOMINATOR = np.array([np.inf, 1.0, 0.1, 0.01])
+_RANK_TOLERANCE = 1e-9  # RMS that a monomial adds to those of lower degree: with less it depends on them
 _SIGMA_STEPS = 2
 TAU = 0.003
 """Standard deviation that ``ridge`` expects of a denominator coefficient of degree one (no unit)."""
@@ -141,7 +141,7 @@ class FitProblem:
         degree one in H. A dependent one would make a = b = 0 a solution.
         """
         first = self.compressed(0)
-        adds = np.abs(np.diag(first.matrix)[: len(self.active)]) > ROUNDING * np.sqrt(len(self.image))
+        adds = np.abs(np.diag(first.matrix)[: len(self.active)]) > _RANK_TOLERANCE * np.sqrt(len(self.image))
         return replace(self, first=first) if adds.all() else replace(self, active=self.active[adds])
 
     def rows(

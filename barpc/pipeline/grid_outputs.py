@@ -40,6 +40,7 @@ RESAMPLED = "_resampled.tif"
 REOPENED = 1e-5  # px: what a reopened file may differ by from what was written (15-digit printing)
 
 Written = dict[str, dict[str, float | str]]
+"""File -> consumer -> difference to P_BA [px], or why it does not read it."""
 Miss = tuple[float, float, Array]
 """RMS and largest distance to a camera [px], and where that is: (M, 3) col, row [px], altitude [m]."""
 Misses = dict[str, Miss]  # file -> how far it is off the camera that it holds

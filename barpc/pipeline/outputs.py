@@ -24,7 +24,7 @@ from barpc.base.remote import is_url
 from barpc.cameras import open_camera
 from barpc.fit import RpcFit
 from barpc.pipeline.executor import CachingExecutor, by_groups
-from barpc.pipeline.grid_outputs import REOPENED, RESAMPLED, grid_names, made_in_room
+from barpc.pipeline.grid_outputs import REOPENED, RESAMPLED, Written, grid_names, made_in_room
 from barpc.pipeline.inputs import IMAGES, PRIOR_FILE
 from barpc.pipeline.verify_outputs import verify
 from barpc.report import Run, Summary
@@ -47,8 +47,6 @@ GCP_FILE = f"{FOLDER}/gcps.geojson"  # of a reference
 
 
 Fitted = tuple[View, RpcFit, SensorModel]  # a view, its refitted RPC and P_BA
-Written = dict[str, dict[str, float | str]]
-"""File -> consumer -> difference to P_BA [px], or why it does not read it."""
 
 
 def write_views(

@@ -15,7 +15,7 @@ import numpy as np
 
 from barpc.base.errors import BarpcError, InputError, plain
 from barpc.base.geodesy import Array
-from barpc.base.safe_io import MAX_NUMBER, OPTIONS, TABLE, opened_text, read_text
+from barpc.base.safe_io import MAX_DIGITS, MAX_NUMBER, OPTIONS, TABLE, opened_text, read_text
 from barpc.pointio.columns import Names, degrees, header_of, numbers_of
 from barpc.pointio.names import from_cell
 from barpc.scene import IntArray
@@ -77,7 +77,6 @@ def _filled(path: Path, rows: Iterator[str], number: int, table: _GrowingTable) 
     return table.whole()
 
 
-_DIGITS = 18  # of whole numbers of 64 bits
 _BATCH = 1 << 12  # lines that are parsed at a time: their cells stay in the processor's cache
 _PARSE_ERRORS = (ValueError, IndexError, csv.Error)
 
@@ -164,10 +163,10 @@ class _Texts:
 def _as_integers(cells: list[str]) -> IntArray | None:
     """Return texts as the numbers (N,) that they are; None unless all are written as `str` does."""
     joined = "".join(cells)
-    if not (all(cells) and joined.isascii() and joined.isdecimal()) or max(map(len, cells)) > _DIGITS:
+    if not (all(cells) and joined.isascii() and joined.isdecimal()) or max(map(len, cells)) > MAX_DIGITS:
         return None
     values = np.array(cells, dtype=np.int64)
-    digits = len(values) + sum(np.count_nonzero(values >= 10**n) for n in range(1, _DIGITS))
+    digits = len(values) + sum(np.count_nonzero(values >= 10**n) for n in range(1, MAX_DIGITS))
     return values if digits == len(joined) else None
 
 

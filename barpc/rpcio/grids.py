@@ -27,7 +27,7 @@ from barpc.base.errors import ImageError, RpcError, RpcFormatError
 from barpc.base.geodesy import MAX_COORDINATE, Array
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import BYTES_PER_NUMBER, Kind
-from barpc.rasters.raster import BLOCK_SIZE, open_raster
+from barpc.rasters.raster import BLOCK_SIZE, PixelArray, open_raster
 from barpc.rpcio.carried import printable, put_tag, read_tag
 from barpc.rpcio.images import TIFF_PROFILE, copying, created, has_mask, require_pixels
 from barpc.scene import BoolArray
@@ -117,8 +117,6 @@ def _write_bands(
 
 
 # --- images -----------------------------------------------------------------------------------------------
-
-PixelArray = npt.NDArray[Any]
 
 _SPLINE_MARGIN = 16  # px around a block: a spline has forgotten what is farther away to 1e-9
 _MAX_BLOCK_SIDE = 4096  # px a side of what a block is made of

@@ -18,7 +18,6 @@ import numpy as np
 from barpc.base.errors import RpcError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, IntArray
-from barpc.base.statistics import ITERATIONS
 from barpc.sensor import Behind, SensorModel
 from barpc.sensor.direct_grid import LINEAR, MAX_NODE_SPACING, linear_axes
 
@@ -28,6 +27,9 @@ if TYPE_CHECKING:
 
 ITERATION_TOLERANCE = 1e-7
 """Of image points that are iterated [px]: what is left after so small a step is a hundredth of it."""
+
+
+_MAX_ITERATIONS = 100  # a step leaves a hundredth of the error: four suffice where it converges at all
 
 
 class Displacement(Protocol):
@@ -71,7 +73,7 @@ class Displaced(Behind):
 def fixed_point(follow: Callable[[Array], Array], image: Array) -> Array:
     """Return the image points (..., 2) [px] that `follow` leaves where they are, from a first guess."""
     change = np.zeros(())
-    for _ in range(ITERATIONS):
+    for _ in range(_MAX_ITERATIONS):
         before, image = image, follow(image)
         last, change = change, np.abs(image - before)
         with np.errstate(all="ignore"):  # a step leaves a hundredth of itself, or what it was of the step before

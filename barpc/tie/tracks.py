@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from barpc.base.errors import TiePointError
 from barpc.base.geodesy import Array, ground_from_ecef
-from barpc.base.options import TieOptions
+from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import FEW, MANY
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
@@ -62,7 +62,6 @@ logger = logging.getLogger(__name__)
 
 NEEDED = 4
 """Tracks of a pair: across the epipolar lines they are a shift and three that could contradict it."""
-_DEFAULTS = TieOptions()
 _QUOTAS = (4, 8, 16)
 """Tracks that a cell takes, round by round; with the first an image of full cells holds what is asked for."""
 
@@ -79,7 +78,7 @@ class TieResult:
 
 def find_tracks(
     views: Sequence[View],
-    options: TieOptions = _DEFAULTS,
+    options: TieOptions = TIE_DEFAULTS,
     scope: Scope = EVERYWHERE,
     *,
     executor: Executor | None = None,
@@ -164,7 +163,7 @@ class _Trials:
     def __init__(self, views: Sequence[View], options: TieOptions, scope: Scope, work: Work) -> None:
         self._views, self._options, self._work = views, options, work
         self._given, self._scope = scope.given, scope
-        self._compares = options.matcher == _DEFAULTS.matcher  # by keypoints
+        self._compares = options.matcher == TIE_DEFAULTS.matcher  # by keypoints
         self.looks = Looks.at(views, [])
         self._coarse, self._closer = False, 0
         self._keypoints: list[KeypointFiles] = []
@@ -234,7 +233,7 @@ class _Trials:
         """
         seen: list[list[Seen]] = [[] for _ in self._views]
         for (i, j), (_, found, report) in self.tried.items():
-            if self._scope.area is None and report.matcher == _DEFAULTS.matcher and len(found) >= FEW:
+            if self._scope.area is None and report.matcher == TIE_DEFAULTS.matcher and len(found) >= FEW:
                 first, second = map(finer, found.ends, self.looks.pixel[list(self.looks.ends[i, j])])
                 seen[i].append((first, second, self._views[j].size))
                 seen[j].append((second, first, self._views[i].size))

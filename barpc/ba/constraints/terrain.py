@@ -10,7 +10,6 @@ chapter 4). What is left of single heights, and how far neighbours share it, is 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,9 +26,7 @@ from barpc.base.statistics import (
     robust_spread,
 )
 from barpc.scene import BoolArray, IntArray
-
-Terrain = Callable[[Array, Array], Array]
-"""lon, lat (n,) [deg] -> altitude (n,) [m above the ellipsoid], NaN where it is unknown."""
+from barpc.scene import Terrain as Terrain
 
 SLOPE_STEP = 15.0  # m: slopes of the DEM itself are taken over twice this distance
 SURFACE_DEGREE = 3  # of the surfaces of which a DEM's are taken whole, wrong by what all its heights are

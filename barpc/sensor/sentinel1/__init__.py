@@ -19,7 +19,6 @@ import numpy as np
 from barpc.base.errors import BarpcError, InputError, RpcError, RpcFormatError, plain, visible
 from barpc.base.geodesy import Array
 from barpc.base.safe_io import MAX_XML, PRODUCT, opened, read_head, unread
-from barpc.base.statistics import ROUNDING
 from barpc.sensor.curve import Orbit, fit_orbit
 from barpc.sensor.document import seconds
 from barpc.sensor.sentinel1.annotation import Annotation, BurstRows, burst_rows, read_annotation
@@ -45,6 +44,7 @@ __all__ = [
 
 T = TypeVar("T")
 MOSAIC = "mosaic"  # the swath of all swaths
+_RATE_TOLERANCE = 1e-9  # of the ratio of two swaths' sampling rates: 1 within a product
 _ANNOTATION_PATTERN = re.compile(r"s1[a-d]-(?P<swath>\w+)-(slc|grd)-(?P<pol>vv|hh|vh|hv)-.*\.xml", re.IGNORECASE)
 _POLARISATIONS = ("vv", "hh", "vh", "hv")
 
@@ -91,7 +91,7 @@ def mosaic_offsets(swaths: Sequence[Annotation]) -> Array:
             other.range_sampling_rate / first.range_sampling_rate,
         )
         late = apart > other.lines * other.azimuth_time_interval
-        if other.mission != first.mission or late or max(abs(rate - 1.0) for rate in rates) > ROUNDING:
+        if other.mission != first.mission or late or max(abs(rate - 1.0) for rate in rates) > _RATE_TOLERANCE:
             raise InputError(f"{other.name}: not of the same product as {first.name}")
     near = min(a.slant_range_time for a in swaths)
     epoch = min(a.first_line_time for a in swaths)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.geodesy import Array
-from barpc.base.options import TieOptions
+from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import MANY
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.area import Area
@@ -26,7 +26,6 @@ PER_IMAGE = 100_000
 """Keypoints an image, at most; its cells hold fewer where more would be found."""
 CONTRAST = 0.01
 """SIFT's contrast threshold."""
-_DEFAULTS = TieOptions()
 AMPLE = 5
 """Keypoints for each tie point wanted."""
 _ZOOMS = ((1.25e-4, 4), (2e-3, 2))
@@ -326,7 +325,7 @@ def locate(
 
 def detect(
     views: Sequence[View],
-    options: TieOptions = _DEFAULTS,
+    options: TieOptions = TIE_DEFAULTS,
     *,
     pairs: Sequence[Pair] | None = None,
     area: Area | None = None,

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from barpc.base.geodesy import Array
-from barpc.base.options import TieOptions
+from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import FEW, MANY, RIVALS, SAMPLE, SURELY, robust_spread
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.matchers.features import AMPLE, KeypointFiles, Keypoints, ample_matches, join_keypoints
@@ -57,7 +57,6 @@ SUFFICIENT_SHARE = 0.3
 `FEW`: small images have no more to give; nor is a wider pass where this share of the matches stands in the peak."""
 BAND_HALFWIDTH = 3.0
 """Half the width of the band about the corrected epipolar line, at most [px]."""
-_DEFAULTS = TieOptions()
 _PASSES = ((20.0, 1500), (80.0, 2000), (float("inf"), 3000))
 """Blind passes: half width [px] (the last: `search`), points of A that are tried."""
 _SIGNIFICANT = 6.0  # standard deviations
@@ -159,7 +158,7 @@ def match_pair(views: Ends, keypoints: Points, pair: Pair, options: TieOptions) 
     of another size than the cameras say, it is asked whether a picture lies otherwise than its camera says.
     """
     found, report = _attempts(views, keypoints, pair, options)
-    if options.matcher != _DEFAULTS.matcher or (report.status == "ok" and not stretched(views, *found.ends)):
+    if options.matcher != TIE_DEFAULTS.matcher or (report.status == "ok" and not stretched(views, *found.ends)):
         return found, report
     a, b = (
         points.strongest(SAMPLE).load()[0] if isinstance(points, KeypointFiles) else points.strongest(SAMPLE)
@@ -331,7 +330,7 @@ def match_pairs(
     views: Sequence[View],
     keypoints: Sequence[Keypoints | KeypointFiles],
     pairs: Sequence[Pair],
-    options: TieOptions = _DEFAULTS,
+    options: TieOptions = TIE_DEFAULTS,
     ground: GroundAltitudes = _UNKNOWN_GROUND,
     work: Work = HERE,
 ) -> list[tuple[Matches, PairReport]]:
@@ -341,7 +340,7 @@ def match_pairs(
     """
     tasks = _tasks(views, keypoints, pairs, options)
     found: list[tuple[Matches, PairReport]] = work.ordered(match_pair, tasks, "match")
-    named = options.matcher != _DEFAULTS.matcher
+    named = options.matcher != TIE_DEFAULTS.matcher
     if named and (options.matcher != STRUCTURE or ground.terrain is None):  # a name is what is wanted
         return found
     thin = [k for k, (_, report) in enumerate(found) if not enough(report) and _worth_more(report)]

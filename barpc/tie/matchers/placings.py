@@ -20,8 +20,7 @@ from barpc.sensor.rpc import RPC
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO
 from barpc.tie.pairing.epipolar import epipolar_segments
-
-Link = tuple[int, int]
+from barpc.tie.pairing.overlaps import Link
 
 _SIZES = {0.25: "a quarter of the size", 1 / 3: "a third of the size", 0.5: "half the size", 2.0: "twice the size"}
 _TURNED = {

@@ -8,7 +8,7 @@ may share no grey value: where the views are of several, pairs are compared by a
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress, pairwise
 from math import isfinite
@@ -20,6 +20,7 @@ import shapely
 from barpc.base.errors import DisconnectedError, TiePointError, listed
 from barpc.base.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.base.options import TieOptions
+from barpc.scene import Terrain as Terrain
 from barpc.scene import View, connected_groups, connected_labels
 from barpc.sensor.geometry import Several, convergence_angle, footprint, ground_sample_distance
 from barpc.tie.pairing.area import Area
@@ -29,8 +30,6 @@ from barpc.tie.pixels import Box, tiles
 logger = logging.getLogger(__name__)
 
 Link = tuple[int, int]
-Terrain = Callable[[Array, Array], Array]
-"""lon, lat (...) [deg] -> altitude (...) [m above the ellipsoid], NaN where it is unknown."""
 
 _BEST_ANGLE = 15.0  # deg; matches are many and heights still well determined; so many more, and it is worth 1 / e
 RELATIVE_POINTING_ERROR = 700.0
