@@ -410,8 +410,8 @@ def _want_cloud(r: Result, _plan: Plan) -> list[str]:
     return _far(r) + ([f"{far:.0f} m from delivered"] if not far <= 60 else []) + _unsaid(r)
 
 
-_WIDENED = r"widened|(?:camera|cameras) (?:is|are) [\d.]+ times|[\d.]+ times farther off"
-_INVENTED = _WIDENED + r"|detector|swing|jitter|jump|spline|degree 2|affine|\bodd\b|cloud|two groups"
+_WIDENED = r"widened|(?:camera|cameras) (?:is|are) [\d.]+ times|[\d.]+ times less accurate"
+_INVENTED = _WIDENED + r"|detector|sinusoid|low-frequency|jitter|jump|spline|degree 2|affine|\bodd\b|cloud|two groups"
 
 
 def _want_agile(r: Result, _plan: Plan) -> list[str]:

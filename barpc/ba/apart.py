@@ -36,7 +36,7 @@ from barpc.scene import BoolArray, IntArray, connected_groups
 
 logger = logging.getLogger(__name__)
 
-FOREIGN_CAMERA = "apart"
+FOREIGN_CAMERA = "foreign_camera"
 _TELLING = 3  # views: without one a pair is left, which agrees about much; so each of three is left out
 
 Solver = Callable[[Block, Block, AdjustOptions], Solution]

@@ -330,7 +330,7 @@ def _exit_code(readings: list[Reading], reasons: Sequence[str] = (), notes: Sequ
     off = [reading for reading in readings if not reading.passed]
     wrong = (f"{r.path}: {r.consumer} {r.note or f'reads it {r.max_error:.1e} px off'}." for r in off)
     reasons = [*reasons, *wrong]
-    return tell_gate("The hand-off needs a look.", reasons) if reasons else 0
+    return tell_gate("The hand-off needs review.", reasons) if reasons else 0
 
 
 def _tell_readings(readings: list[Reading]) -> None:

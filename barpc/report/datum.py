@@ -1,4 +1,4 @@
-"""What heights were taken to count from, held against the cameras as delivered and other heights."""
+"""The vertical datum assumed for heights, tested against the delivered cameras and other heights."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from barpc.base.statistics import SURE, SURELY
 from barpc.report.summary.words import metres
 
 _HEIGHT_SHARES = {"gcps": ("gcps",), "heights": ("heights", "reference"), "altimetry": ("altimetry",)}
-"""Source of heights -> the shares of the scene's height that stand on it."""
+"""Source of heights -> the shares of the scene's height that depend on it."""
 _UP = 2  # place of the scene's height among its motions
 
 Evidence = list[tuple[float, float]]
@@ -21,10 +21,10 @@ Evidence = list[tuple[float, float]]
 
 
 def datum_reasons(datums: Iterable[HeightDatum], adjustment: Adjustment) -> Iterator[str]:
-    """Say which heights seem to count from another surface than they were taken to, and which nothing settles.
+    """Yield heights that seem to have another vertical datum than assumed, and those whose datum stays unknown.
 
-    The likelihoods of both are compared, as `SURE` asks. What nothing settles is said where the file says nothing, and
-    the other would move the scene by more than its height is known to.
+    The likelihoods of both are compared, as `SURE` asks. An unknown datum is reported where the file does not state it,
+    and the other would shift the scene by more than the standard deviation of its height.
     """
     for one in datums:
         share = sum(np.nan_to_num(adjustment.datum[name][_UP]) for name in _HEIGHT_SHARES[one.source])
@@ -38,27 +38,28 @@ def datum_reasons(datums: Iterable[HeightDatum], adjustment: Adjustment) -> Iter
             moves = abs(one.otherwise) * share
             if moves > adjustment.gauge.sigma[_UP]:
                 yield (
-                    f"Nothing says what the heights of {one.name} count from. They were taken as ellipsoidal; if they "
-                    f"count from the sea, the scene lies {metres(moves)} too {'low' if one.otherwise > 0 else 'high'}, "
-                    "and neither the cameras nor other heights tell. Say --heights ellipsoidal, or --heights egm96."
+                    f"The vertical datum of the heights of {one.name} is not stated. They were taken as ellipsoidal; "
+                    f"if they are above sea level, the scene is {metres(moves)} too "
+                    f"{'low' if one.otherwise > 0 else 'high'}, and neither the cameras nor other heights show it. "
+                    "Give --heights ellipsoidal, or --heights egm96."
                 )
 
 
 def _contradicted(one: HeightDatum, offset: float) -> str:
     geoid = f"{metres(abs(one.otherwise))} {'above' if (one.otherwise > 0) != one.converted else 'below'}"
     seems = (
-        ("count from the sea", "--heights egm96") if not one.converted else ("be ellipsoidal", "--heights ellipsoidal")
+        ("be above sea level", "--heights egm96") if not one.converted else ("be ellipsoidal", "--heights ellipsoidal")
     )
     flag = seems[1] if one.source != "heights" else "--geoid egm96" if not one.converted else "--geoid none"
     return (
-        f"The heights of {one.name} lie {metres(abs(offset))} {'above' if offset > 0 else 'below'} what the cameras as "
-        f"delivered, or other heights, let expect, and the geoid lies {geoid} the ellipsoid here: they seem to "
-        f"{seems[0]}. Say {flag}, or the opposite if they were taken rightly."
+        f"The heights of {one.name} lie {metres(abs(offset))} {'above' if offset > 0 else 'below'} the ground by the "
+        f"delivered cameras, or by other heights, and the geoid lies {geoid} the ellipsoid here: they seem to "
+        f"{seems[0]}. Give {flag}, or the opposite to confirm the present datum."
     )
 
 
 def _beside_cameras(source: str, adjustment: Adjustment, share: float) -> Evidence:
-    """Return how far heights lie above what the cameras as delivered make of the tie points."""
+    """Return the offset of heights above the ground by the delivered cameras, and its standard deviation."""
     if source == "heights":
         terrain = adjustment.terrain
         if terrain is None or not terrain.beyond[0] > 0.0:

@@ -256,9 +256,8 @@ def residual_panels(
 ) -> tuple[list[tuple[str, str]], list[float], str]:
     """Draw small maps of the residuals "before" or "after", with captions: `first`, then by their systematic part.
 
-    Cells are darker where the error is larger; thin lines are single residuals; a bold arrow is the mean of a cell
-    where it is larger than chance allows. Returns, too, the systematic part of every image's cells, and what lengths
-    stand for.
+    Darker cells have larger errors; thin lines are single residuals; a bold arrow is the mean of a cell where it is
+    significant. Also returns the systematic share of every image's cells, and the scale in words.
     """
     residuals: Array = getattr(observations, when)
     use = observations.used & np.isfinite(residuals).all(axis=1)
@@ -281,11 +280,10 @@ def residual_panels(
         rows = evenly(rows_of[k], most)
         svg = _panel(when, k, views[k], grids[k], np.hstack([observations.xy[rows], residuals[rows]]), longest)
         charts.append((svg, f"{views[k].name}: {_panel_note(grids[k])}"))
-    words = f"A thin line of a {_PANEL / _ARROW_LENGTH:.0f}th of a panel's width is {longest:.2g} px"
-    key = f"{words}; bold arrows are drawn twice as long."
+    key = f"Scale bar: {longest:.2g} px of a single residual; bold arrows are drawn at twice that scale."
     if len(charts) < len(views):
         key += f" Of {len(views)} images {len(charts)} are shown: "
-        key += "those that need a look, then " * bool(first) + "those with the largest systematic part."
+        key += "those that need review, then " * bool(first) + "those with the largest systematic part."
     return charts, shares, key
 
 
@@ -314,6 +312,7 @@ def _panel(when: str, number: int, view: ViewEntry, cells: Cells, drawn: Array, 
         cells=heat,
         shafts=np.hstack([start, start + drawn[:, 2:] * (_ARROW_LENGTH / longest)]).tolist(),
         arrows=arrows,
+        bar=_ARROW_LENGTH,
         described=f"{len(drawn)} residuals are drawn; {_panel_note(cells)}.",
     )
     return text

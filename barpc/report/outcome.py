@@ -14,7 +14,7 @@ import numpy as np
 from barpc.ba import Adjustment
 from barpc.ba.evidence.scan import ImageRegion, Unused, met_worse
 from barpc.base.geodesy import Array, HeightDatum, ground_from_ecef
-from barpc.base.statistics import CRITICAL, FEWEST
+from barpc.base.statistics import CRITICAL
 from barpc.fit import RpcFit
 from barpc.scene import BoolArray, Camera, GroundPoints, IntArray, Tracks, View, middle_altitude
 from barpc.sensor import SensorModel
@@ -26,7 +26,8 @@ from barpc.tie.matchers.matching import FINE_STRUCTURE
 MAX_TRACKS = 200_000
 """Of more tracks, every n-th is written, so that the files of a huge run can still be opened."""
 WHOLE_PIXEL_TOLERANCE, MIN_WHOLE_SHARE = 0.05, 0.9
-"""A whole shift [px], and the share of a pair's matches, `FEWEST` or more, that must have it."""
+"""A whole shift [px], and the share of a pair's matches, `MIN_COPY_MATCHES` or more, that must have it."""
+MIN_COPY_MATCHES = 20  # Of others a hundredth lies at a whole shift by chance: 18 of 20 never do
 SMOOTH_LEFT = 0.06  # A view whose residuals hold more than this [px] that is no scatter is called doubtful
 WHOLE_PIXELS = 12**-0.5  # px: standard deviation of rounding to whole pixels, alike where images are shifted alike
 MANY_REJECTED = 0.3  # A view that lost a larger share of its observations, not at random, is called doubtful
@@ -224,7 +225,7 @@ class Run:
         for ties in self.pairs:
             shift = self.tracks.xy[ties.b] - self.tracks.xy[ties.a]
             if (
-                len(shift) < FEWEST
+                len(shift) < MIN_COPY_MATCHES
                 or np.mean((np.abs(shift - np.rint(shift)) <= WHOLE_PIXEL_TOLERANCE).all(axis=1)) < MIN_WHOLE_SHARE
             ):
                 continue  # by no whole shift, whichever: most pairs

@@ -1,6 +1,6 @@
 """report.html: one self-contained page, made from summary.json and the tables of a run alone.
 
-A section is a question that a user has, the answer in words, and the charts and tables that show it.
+A section is a user's question, its answer, and the charts and tables behind it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from barpc.base.errors import visible
-from barpc.base.statistics import FEW, LARGEST
+from barpc.base.statistics import LARGEST
 from barpc.report.compare import flat_options
 from barpc.report.maps import ground_map, residual_panels, template
 from barpc.report.quality_checks import GOOD_RMSE
@@ -28,6 +28,7 @@ from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import NAMED, largest
 from barpc.report.verdict import (
+    MIN_PAIR_MATCHES,
     TABLE_ROWS_SHOWN,
     VERDICT_SENTENCES,
     flagged,
@@ -50,7 +51,7 @@ def can_render() -> bool:
 
 
 def report_html(summary: Summary, folder: Path | str) -> str:
-    """Return the page of a run whose tables lie in a folder; the same files give the same text.
+    """Return the page of a run from its summary and the tables of its folder; the same files give the same text.
 
     Raises
     ------
@@ -79,10 +80,10 @@ Pictures = Sequence[tuple[str, str]]  # SVG texts with their captions
 
 @dataclass(frozen=True)
 class Section:
-    """A question and its answer, with what shows it.
+    """A question, its answer, and its charts and tables.
 
-    `points`: sentences; `panels`: small maps; `folds`: words and more of them that open on demand; `folded`: it opens
-    on demand.
+    `points`: sentences; `panels`: small maps; `folds`: captions and further panels that open on demand; `folded`: the
+    section opens on demand.
     """
 
     key: str
@@ -97,24 +98,28 @@ class Section:
 
 
 _TABLE_CAPTIONS: dict[str, tuple[str, type[Record], str]] = {
-    "images": ("Images: errors (RMS) of the tie points that count", ViewEntry, ViewEntry.PAGE),
+    "images": ("Images: residuals (RMS) of the tie points in use", ViewEntry, ViewEntry.PAGE),
     "pairs": ("Pairs: offset from the epipolar line, median ± spread (1.4826 MAD)", PairEntry, PairEntry.PAGE),
-    "corrections": ("Corrections: shift in the middle of the image ± one sigma", ViewEntry, ViewEntry.CORRECTIONS),
+    "corrections": ("Corrections: shift at the image centre ± 1 sigma", ViewEntry, ViewEntry.CORRECTIONS),
     "places": (
-        "Ground in the middle of each image: one-sigma ellipse, CE90 and CE90 stated",
+        "Ground point at each image centre: 1 sigma error ellipse, CE90 and stated CE90",
         ViewEntry,
         ViewEntry.PLACES,
     ),
     "gcps": (GCP_CAPTION, GcpEntry, GcpEntry.PAGE),
     "control": ("Control in each image: the largest residual (Baarda's w)", ViewEntry, ViewEntry.CONTROL),
-    "reference": ("Reference: what it says of each delivered camera", ReferenceViewEntry, ReferenceViewEntry.PAGE),
-    "decided": ("Figures of each image: its prior widened, what was cut, what is left", ViewEntry, ViewEntry.DECISIONS),
-    "explained": ("What explains tie points beside the cameras' errors", ExplanationEntry, ExplanationEntry.PAGE),
-    "left": ("What still stands out", LeftEntry, LeftEntry.PAGE),
-    "worse": ("Tie points that took no part", HeldOutEntry, HeldOutEntry.PAGE),
-    "again": ("Pairs that were tried again, and what found too few matches", PairEntry, PairEntry.AGAIN),
-    "check-points": ("Check points: found minus given place", CheckPointEntry, CheckPointEntry.PAGE),
-    "fits": ("Refitted RPCs against the corrected cameras, on points new to the fit", ViewEntry, ViewEntry.FITS),
+    "reference": ("Reference: offset of each delivered camera", ReferenceViewEntry, ReferenceViewEntry.PAGE),
+    "decided": (
+        "Figures of each image: widening of its prior, rejected observations, systematic residuals",
+        ViewEntry,
+        ViewEntry.DECISIONS,
+    ),
+    "explained": ("Hypotheses selected to explain residuals", ExplanationEntry, ExplanationEntry.PAGE),
+    "left": ("Rows and columns inconsistent with the rest", LeftEntry, LeftEntry.PAGE),
+    "worse": ("Regions with larger residuals of check tie points", HeldOutEntry, HeldOutEntry.PAGE),
+    "again": ("Pairs matched again, and attempts with too few matches", PairEntry, PairEntry.AGAIN),
+    "check-points": ("Check points: intersected minus given position", CheckPointEntry, CheckPointEntry.PAGE),
+    "fits": ("Refitted RPCs against the corrected cameras, on independent points", ViewEntry, ViewEntry.FITS),
 }
 """Key of a table -> its caption, and the columns of its records."""
 _FOLDED = "places", "control", "decided", "again", "options"
@@ -123,7 +128,7 @@ _FOLDED = "places", "control", "decided", "again", "options"
 def _tables_of(
     key: str, rows: Sequence[Record], adjusted: bool = True, without: str = " ", more: str = ""
 ) -> list[Table]:
-    """Return a table, if it has rows; `without`: columns that have nothing to say."""
+    """Return a table, if it has rows; `without`: columns to omit."""
     caption, kind, columns = _TABLE_CAPTIONS[key]
     columns = columns.replace(without, " ") + more
     return [table(key, caption, rows, kind, columns, adjusted)] if rows else []
@@ -131,16 +136,16 @@ def _tables_of(
 
 _QUESTIONS = {
     "images": "Which images can I use?",
-    "map": "Where are the images, and which hold together?",
+    "map": "Where are the images, and which are connected?",
     "random": "Are the residuals random?",
     "pairs": "Do the pairs fit for stereo, and can heights be measured?",
-    "surface": "What do they make of the ground?",
-    "moves": "What was changed in each camera?",
-    "gauge": "What can the images not tell?",
-    "decisions": "What was decided, and why?",
+    "surface": "Which ground do they reconstruct?",
+    "moves": "How was each camera corrected?",
+    "gauge": "How uncertain are position and shape of the scene?",
+    "decisions": "Which decisions were made, and on which figures?",
     "accuracy": "How accurate is it on the ground?",
-    "files": "Do the new RPC files hold the corrected cameras?",
-    "run": "How was this made, and how long did it take?",
+    "files": "Do the new RPC files reproduce the corrected cameras?",
+    "run": "With which options, and how much data?",
 }
 """Key of a section -> its question; its answer is the macro of that name in `answers.html.j2`."""
 
@@ -150,7 +155,7 @@ def _section(key: str, facts: Mapping[str, object], **shown: Any) -> Section:
 
 
 def _words(macro: str, **facts: object) -> Any:
-    """Return what a macro makes of facts: markup in one line, in which they are escaped."""
+    """Return the text of a macro for given facts: markup in one line, facts escaped."""
     text = getattr(template("answers.html.j2").module, macro)(**facts)
     return type(text)(re.sub("[ \n]+", " ", text).strip())
 
@@ -169,11 +174,11 @@ def _map_section(files: RunFiles) -> Section:
     partners = np.bincount(np.array(links, dtype=np.int64).ravel(), minlength=num)
     lonely = [view.name for view, n in zip(summary.views, partners, strict=True) if n == 1 and num > 2]
     caption = (
-        "Outlines at the altitude of the scene, those that need a look on top; dots are tie points, triangles GCPs, "
-        "those on their tip check points; a stronger line stands for more matches; dashed: where tie points move."
+        "Footprints at the altitude of the scene, those that need review on top; dots: tie points; triangles: GCPs; "
+        "inverted triangles: check points; thicker lines: more matches; dashed: tie points that move."
     )
     if num > MAX_SHOWN:
-        caption += f" At most {MAX_SHOWN} of {num} outlines are drawn; all are in footprints.geojson."
+        caption += f" At most {MAX_SHOWN} of {num} footprints are drawn; all are in footprints.geojson."
     facts = {"groups": len(connected_groups(num, links)), "lonely": lonely, "by_length": summary.tracks.by_length}
     return _section("map", facts, charts=[(ground_map(files), caption)] if any(files.outlines) else [])
 
@@ -198,12 +203,12 @@ def _surface_section(files: RunFiles) -> Section | None:
         return None
     before, after = files.reliefs
     picture = template("drawings.svg.j2").module.picture
-    lit = "The ground by the {} cameras, lit from the north-west; black: no height"
+    lit = "Surface from the {} cameras, lit from the north-west; black: no height"
     charts = [(picture(words := lit.format(one.cameras), [one]), f"{words}.") for one in files.reliefs]
     if files.draped:
-        words = "{} (left) and {} (right) on the surface by the corrected cameras"
+        words = "{} (left) and {} (right) draped over the surface from the corrected cameras"
         words = words.format(*(one.image for one in files.draped))
-        more = "move over it to swipe, click to flicker. What stands still has the right height."
+        more = "move over it to swipe, click to flicker. Details at the right height do not move."
         charts.append((picture(words, files.draped), f"{words}: {more}"))
     return _section("surface", {"before": before, "after": after}, charts=charts)
 
@@ -216,7 +221,7 @@ def _pairs_section(files: RunFiles) -> Section | None:
     sure = sure_pairs(files.summary.views, pairs)
     heights = [pair for pair in sure if pair.height_m_per_px and pair.convergence_deg]
     facts = {
-        **{"worst": worst, "offset": offset_of(worst), "wanted": GOOD_RMSE, "enough": FEW},
+        **{"worst": worst, "offset": offset_of(worst), "wanted": GOOD_RMSE, "enough": MIN_PAIR_MATCHES},
         "best": min(heights, key=lambda pair: pair.height_m_per_px or 0.0, default=None),
     }
     (shown,) = _tables_of("pairs", pairs, files.summary.adjusted)
@@ -255,7 +260,7 @@ def _decisions_section(files: RunFiles) -> Section | None:
 
 
 def decisions(summary: Summary) -> list[str]:
-    """Return the decisions on the whole run: what ties its pairs, what each camera may do, what was cut."""
+    """Return the decisions of the run: matchers, camera model, priors, rejection."""
     options = flat_options(summary.options or {})
     matcher, asked = options.get("tie.matcher"), options.get("adjust.drift")
     text = _words("decided", summary=summary, matcher=matcher, asked=asked, many=LARGEST)
@@ -305,4 +310,4 @@ SECTIONS: Sequence[Callable[[RunFiles], Section | None]] = (
     _images_section, _map_section, _randomness_section, _pairs_section, _surface_section, _corrections_section,
     _gauge_section, _decisions_section, _check_points_section, _files_section, _run_section,
 )  # fmt: skip
-"""In the order of the page; a section that has nothing to show is None."""
+"""In the order of the page; an empty section is None."""

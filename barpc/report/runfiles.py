@@ -27,6 +27,7 @@ from barpc.base.safe_io import GEOJSON, SUMMARY, TABLE, Kind, parse_json, read_j
 from barpc.pointio.names import cell, from_cell
 from barpc.report.outcome import Run
 from barpc.report.records import Number, Record, column, value_of
+from barpc.report.renamed import with_new_names
 from barpc.report.summary import SCHEMA, Summary, published_schema
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
@@ -240,6 +241,8 @@ class RunFiles:
 def read_summary(folder: Path) -> Summary:
     """Read the summary.json of a run folder.
 
+    Schema 2 is read under its new names, with a warning.
+
     Raises
     ------
     InputError
@@ -248,7 +251,7 @@ def read_summary(folder: Path) -> Summary:
     path = folder / "summary.json"
     if not path.exists():
         raise InputError(f"{folder}: no summary.json, so no finished run")
-    found = read_json(path, SUMMARY)
+    found = with_new_names(read_json(path, SUMMARY), path)
     version = found.get("schema") if isinstance(found, dict) else None
     if version != SCHEMA:
         raise InputError(f"{path}: schema {version!r}, this release reads {SCHEMA}: run the adjustment again")

@@ -1,4 +1,4 @@
-"""Verdicts in plain words: of each image, of the block, of what the images cannot tell."""
+"""Verdicts in sentences: on each image, the block, its datum and weak modes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from barpc.ba import Adjustment, check_residuals
 from barpc.ba.apart import FOREIGN_CAMERA
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array
-from barpc.base.statistics import FEW, SURE, SURELY
+from barpc.base.statistics import SURE, SURELY
 from barpc.report.datum import datum_reasons
 from barpc.report.outcome import MANY_REJECTED, Added, Run
 from barpc.report.quality_checks import (
@@ -24,11 +24,11 @@ from barpc.report.quality_checks import (
     dem_reasons,
     enu,
     held_lines,
+    inconsistency,
     is_smooth,
     lengths,
     reference_lines,
     reference_reasons,
-    stands_out,
     view_status,
 )
 from barpc.report.records import json_form, value_of
@@ -39,21 +39,22 @@ from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS, counted, median, metres
 
 TABLE_ROWS_SHOWN = 10  # rows of a table on the terminal, images and pairs alike
+MIN_PAIR_MATCHES = 30  # Of a pair that is called good for heights: they tell its offset to a fifth of its scatter
 VERDICT_SENTENCES = 20  # sentences of the verdict that are shown at least
-PRIOR_WIDENED = 2.0  # Cameras that are farther off than stated by more than this factor need a look
+PRIOR_WIDENED = 2.0  # Cameras less accurate than stated by more than this factor need review
 _SAY_REJECTED = "contradicted", "rejected", "wrong_matches"  # causes whose sentence says how many were rejected
 _SAY_WHERE = "rejected", "place"  # causes whose sentence says where in the image
-_LOOKED_AT = "The image was looked at"
+_CHECKED = "The image was checked"
 _ALL_WELL = {
     "adjust": ("The image is adjusted", "Both images are adjusted", "All {} images are adjusted"),
-    "check": (_LOOKED_AT, "The cameras of both images agree", "The cameras of all {} images agree"),
-    "match": (_LOOKED_AT, "Both images are tied together", "All {} images are tied together"),
+    "check": (_CHECKED, "The cameras of both images agree", "The cameras of all {} images agree"),
+    "match": (_CHECKED, "Both images are tied together", "All {} images are tied together"),
 }
-"""Kind of a run -> what is said of one, two and more images of which all is well."""
+"""Kind of a run -> its headline for one, two and more images without reservation."""
 
 
 def summarize(run: Run) -> Summary:
-    """Return the summary of a run with the verdict on it; a number that is not finite is None, as a file has it."""
+    """Return the summary of a run with the verdict on it; numbers that are not finite are None."""
     found = measure_run(run)
     views = tuple(replace(view, **view_status(view, run)) for view in found.views)  # type: ignore[arg-type]
     verdict = block_verdict(run, views)
@@ -62,10 +63,10 @@ def summarize(run: Run) -> Summary:
 
 
 def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
-    """Return the verdict on the whole: `status`, a `headline`, the `verdict`, and which of its lines are `reasons`.
+    """Return the verdict on the run: `status`, `headline`, `verdict` (sentences), and `reasons`, its reservations.
 
     The one rule of what passes: `status` is "good" when no image, no control point and no file has a reservation;
-    "bad" when an image was not adjusted or a file left out; else "look". What is not good ends with exit code 3.
+    "bad" when an image was not adjusted or a file left out; else "look". All but "good" end with exit code 3.
     """
     bad = [view for view in views if view.status == "failed"]
     look = [view for view in views if view.advice and view.status != "failed"]
@@ -90,17 +91,17 @@ def _headline(run: Run, num: int, bad: int, look: int, more: str) -> str:
         word = "not adjusted" if run.kind == "adjust" else "not usable"
         parts.append(f"{bad} {'image is' if bad == 1 else 'images are'} {word}")
     if look:
-        parts.append(f"{look} {'needs' if look == 1 else 'need'} a look")
+        parts.append(f"{counted(look, 'image')} {'needs' if look == 1 else 'need'} review")
     if parts:
         text = f"{', '.join(parts)} (of {num + len(run.left_out)})"
-    return f"{text}; {more} a look." if more else f"{text}."
+    return f"{text}; {more} review." if more else f"{text}."
 
 
-# --- what needs a look ------------------------------------------------------------------------------------
+# --- reservations -----------------------------------------------------------------------------------------
 
 
 def _block_reasons(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
-    """Return what the adjustment says of itself that does not fit: priors, noise, the scene's move, the DEM."""
+    """Yield the reservations on the adjustment: priors, noise, the shift of the scene, the DEM."""
     if (found := run.adjustment) is None:
         return
     if len(run.tracks):
@@ -113,50 +114,53 @@ def _of_cameras(found: Adjustment) -> Iterator[str]:
     common = float(np.min(found.prior.scale)) if len(found.prior.scale) else 1.0
     if common > PRIOR_WIDENED:
         yield (
-            f"The cameras are {common:.1f} times farther off than stated: their standard deviations were widened, and "
-            "what is known of the scene's place with them."
+            f"The cameras are {common:.1f} times less accurate than stated: their standard deviations were widened, "
+            "and with them the uncertainty of the scene's position."
         )
     if found.in_space_rms is not None:
         tilts, bends = (lengths(found.gauge.motion_sigma[part]) for part in (slice(3, 5), slice(7, 10)))
         yield (
-            f"Rotations and translations leave {found.in_space_rms:.3f} px of tie points that took no part; an affine "
-            f"in each image leaves {median(found.held_out_rms):.3f} px and was taken: images that were turned, "
-            "resampled or cropped otherwise than their RPCs say, or RPCs of other images. Its tilts are known to "
-            f"{tilts} (east, north) only, its twist and bending to {bends} (twist, east, north)."
+            f"Check tie points keep residuals of {found.in_space_rms:.3f} px with a rotation and translation an image, "
+            f"of {median(found.held_out_rms):.3f} px with an affine in each image, which was selected. Possible "
+            "causes: images rotated, resampled or cropped after their RPCs were made, or RPCs of other images. The "
+            f"scene's tilts have standard deviations of {tilts} (east, north), its twist and bending of {bends} (twist, east, "
+            "north)."
         )
     if found.apart is not None and not found.apart.clear:
-        what = "RPC, or most tie points of one image," if found.apart.look.as_stated else "RPC"
+        error = "wrong tie points or " * found.apart.look.as_stated + "an RPC that does not match it"
         yield (
-            f"One {what} among those of {listed([found.names[v] for v in found.apart.views])} is not its own: without "
-            "any one of these images the others agree, with all they do not. The tie points do not tell which: check "
-            "the RPCs, or add an image."
+            f"One of the images {listed([found.names[v] for v in found.apart.views])} has {error}: without any one of "
+            "them the rest agree, with all of them they do not. The tie points do not tell which: check the RPCs, or "
+            "add an image."
         )
 
 
 def _of_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry]) -> Iterator[str]:
-    """Name where tie points were cut, or are off, more than elsewhere, or took no part and are; each image's worst.
+    """Yield the worst region of each image: rejected tie points, common residuals, or large check residuals.
 
-    What an image's own reason says is not said again.
+    Regions named by the reservation of their image are left out.
     """
     said = {view.name for view in views if view.cause in _SAY_WHERE}
     found = left_entries(adjustment)
     if moving := [f"rows {one.first:.0f}-{one.last:.0f} of {one.image}" for one in found if one.moving]:
         yield (
-            f"Most tie points of {listed(moving)} are of what moves: it may as well be these rows that lie off, and no "
-            "camera follows them."
+            f"Most tie points of {listed(moving)} move together: moving objects, or a displacement of these rows that "
+            "no camera models."
         )
     worst: dict[str, str] = {}
     for one in found:
-        if what := stands_out(one):
+        if what := inconsistency(one):
             place = f"{one.axis.capitalize()} {one.first:.0f}-{one.last:.0f} of {one.image}"
-            worst.setdefault(one.image, f"{place} stand out: {what}.")
+            worst.setdefault(one.image, f"{place} are inconsistent with the rest: {what}.")
     for unmet in held_out_places(run.met_worse, adjustment.names):  # what was solved with may agree with what it bent
         worst.setdefault(unmet.image, f"{unmet.sentence}.")
     yield from (line for image, line in worst.items() if image not in said)
     rivals = [one.runner_up for one in adjustment.findings if one.motion is not None and one.gap < SURE]
     for rival in filter(None, dict.fromkeys(rivals)):
-        words = f"explains them no better than that {EXPLANATION_WORDS[rival]}"
-        yield f"That tie points move together {words}: look at where they are."
+        yield (
+            f"Moving objects explain the tie points that move together hardly better than {EXPLANATION_WORDS[rival]}: "
+            "check where these tie points lie."
+        )
 
 
 def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
@@ -164,14 +168,14 @@ def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
         i, j = group.views
         if not any(found.prior.odd[v] or is_smooth(v, found) for v in (i, j)):
             yield (
-                f"Tie points of {found.names[i]} and {found.names[j]} fall into two groups, {100 * group.share:.0f} % "
-                f"lying {group.apart:.2f} px from the others: there are two solutions, and this is the one between "
-                "them. Look for a moving cloud or a repeated pattern, or add an image."
+                f"Tie points of {found.names[i]} and {found.names[j]} form two groups, {100 * group.share:.0f} % "
+                f"displaced by {group.apart:.2f} px from the others: there are two solutions, and this one lies "
+                "between them. Check for a moving cloud or a repeated pattern, or add an image."
             )
     if found.noise > NOISE_LIMIT:
         yield (
-            f"Tie points scatter {found.noise:.1f} times as much as stated: wrong matches, or errors that these "
-            "unknowns cannot follow."
+            f"Tie points scatter {found.noise:.1f} times as much as stated: wrong matches, or camera errors that "
+            "the model cannot represent."
         )
     with np.errstate(all="ignore"):
         moved = np.abs(found.gauge.shift) / found.gauge.delivered_sigma
@@ -181,10 +185,10 @@ def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
     by_heights = _holds(found) or bool(_option_value(run, "dem"))
     moved = moved[:2] if by_heights else moved
     if not held and (moved[np.isfinite(moved)] > SURELY).any():
-        which = "heights may be another place's; control points" if by_heights else "control points or a DEM"
+        which = "check that the heights are of this place, or add GCPs" if by_heights else "add GCPs or a DEM"
         yield (
-            f"The scene moved by {enu(found.gauge.shift)}, more than {SURELY:g} times what the accuracies of its "
-            f"cameras let expect: something is not as stated; {which} would tell."
+            f"The scene moved by {enu(found.gauge.shift)}, more than {SURELY:g} times the standard deviation expected "
+            f"from the stated accuracies: one of them is wrong; {which}."
         )
 
 
@@ -193,25 +197,25 @@ def _option_value(run: Run, name: str) -> object:
 
 
 def _holds(found: Adjustment) -> bool:
-    """Whether heights without image coordinates hold the scene."""
+    """Whether altimetry constrains the scene."""
     return found.altimetry is not None and not found.altimetry.why_not
 
 
 def _ground_reasons(run: Run) -> Iterator[str]:
-    """Name ground points that were cut, what was left out of their files, a reference or heights of no use."""
+    """Yield reservations on ground points, their files, the reference and altimetry."""
     adjustment, gcps = run.adjustment, run.gcps
     if adjustment is not None:
         yield from reference_reasons(run, adjustment.options.dem_sigma)
         if (heights := adjustment.altimetry) is not None and heights.why_not:
             counts = f"{heights.agree} of {heights.near} on the tie points' surface agree, of {heights.given} given"
-            yield f"The altimetry holds nothing: {heights.why_not} ({counts})."
+            yield f"The altimetry was not used: {heights.why_not} ({counts})."
         if gcps is not None and adjustment.control is not None:
             yield from control_reasons(gcps.names, adjustment.control)
     for points in (gcps, run.check_points):
         yield from (f"{line}." for line in (() if points is None else points.left_out))
 
 
-# --- what was reached -------------------------------------------------------------------------------------
+# --- results ----------------------------------------------------------------------------------------------
 
 
 def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
@@ -223,17 +227,17 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
         was = f" (before: {before:.3f} px)" if np.isfinite(before) else ""
         yield f"Tie points of {tied} agree to {after:.3f} px{was}."
     else:
-        yield "There are no tie points: the cameras are held by control alone."
+        yield "There are no tie points: control alone constrains the cameras."
     if radars := [_clocks(view) for view in views if view.correction and view.correction.timing_sigma]:
-        yield f"Radar images are corrected by their clocks: {listed(radars, NAMED)}."
+        yield f"Radar timing corrections: {listed(radars, NAMED)}."
     unsaid = [view for view in views if view.lost > MANY_REJECTED and view.cause not in _SAY_REJECTED]
     if many := [view.name for view in unsaid if anywhere(view, run)]:
-        # what is wrong in one image takes the tie points of the others with it
+        # errors in one image reject tie points of the others, too
         alike = [view.name for view in unsaid if view.name not in many]
-        why = f"but those of {listed(alike)} in the same" if alike else "as wrong matches are"
+        why = f"but in {listed(alike)} in the same direction" if alike else "as of wrong matches"
         yield (
-            f"More than {100 * MANY_REJECTED:.0f} % of the tie points of {listed(many)} were rejected, neighbours in "
-            f"any direction, {why}."
+            f"More than {100 * MANY_REJECTED:.0f} % of the tie points of {listed(many)} were rejected, with "
+            f"neighbouring errors in random directions, {why}."
         )
     found = [one.sentence for one in explanations(run.adjustment) if one.name != FOREIGN_CAMERA]
     yield from (f"{sentence[0].upper()}{sentence[1:]}." for sentence in found)
@@ -245,7 +249,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     if (heights := run.adjustment.altimetry) is not None and not heights.why_not:
         yield (
             f"{heights.agree} of {heights.near} altimetry heights agree with the surface of the tie points to "
-            f"{metres(heights.spread)} ({metres(heights.expected)} expected); they moved it by {enu(heights.motion)}."
+            f"{metres(heights.spread)} ({metres(heights.expected)} expected); they shifted it by {enu(heights.motion)}."
         )
     yield from _known_lines(run, run.adjustment, views)
     yield from dem_lines(run.adjustment)
@@ -254,30 +258,30 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
 
 
 def _added_lines(added: Added, num: int) -> Iterator[str]:
-    """Say what was added to which run, and whether its own images should move: which, and by how much."""
+    """Yield the images added, and the changes that they ask of the cameras of the earlier run."""
     new = counted(num - added.met, "image")
-    yield f"{new} added to the {counted(added.images, 'image')} of {added.run}, {added.met} of which they meet."
+    yield f"{new} added to the {counted(added.images, 'image')} of {added.run}, {added.met} of which share tie points."
     name, far = added.largest
     if not added.beyond:
-        yield f"None of these need move: {name} would by {far:.3f} px, no more than the {added.floor:g} px all share."
+        yield f"Their cameras stay valid: the largest change, of {name}, is {far:.3f} px (limit: {added.floor:g} px)."
         return
     some = listed([f"{one} ({px:.2f} px)" for one, px in added.beyond], NAMED)
-    do = "their cameras are written here" if added.updated else "--update writes their cameras, too"
+    do = "their new cameras are written here" if added.updated else "--update writes their new cameras"
     many = counted(len(added.beyond), "image")
-    yield f"{many} of {added.run} should move by more than {added.floor:g} px: {some}; {do}."
+    yield f"The cameras of {many} of {added.run} change by more than {added.floor:g} px: {some}; {do}."
 
 
 def _known_lines(run: Run, found: Adjustment, views: Sequence[ViewEntry]) -> Iterator[str]:
-    """Return how well the scene's place is known, and what tells it."""
-    known = f"its place is known to {lengths(found.gauge.sigma)} (east, north, up; one sigma)"
+    """Yield the uncertainty of the scene's position, and its source."""
+    known = f"the scene's position is uncertain by {lengths(found.gauge.sigma)} (east, north, up; 1 sigma)"
     if run.gcps is not None:
         yield from held_lines(found.control, run.gcps, views, known)
     elif _holds(found) or (run.reference is not None and run.reference.control is not None):
-        yield f"So {known}."
+        yield f"{known[0].upper()}{known[1:]}."
     elif (terrain := found.terrain) is not None and terrain.shows and terrain.held:
-        yield f"With the DEM {known}."
+        yield f"With the DEM, {known}."
     else:
-        yield f"Without ground control {known} only."
+        yield f"Without ground control, {known}."
 
 
 def _clocks(view: ViewEntry) -> str:
@@ -289,19 +293,19 @@ def _clocks(view: ViewEntry) -> str:
 
 def _residual_sentence(rms: tuple[Array, Array], num: int) -> str:
     image, ground = rms
-    met = f"{counted(num, 'check point')}, not used above, {'is' if num == 1 else 'are'}"
+    points = counted(num, "check point")
     if not np.isfinite(image).all():
-        return f"{met} seen by no camera."
-    on_ground = f" and {lengths(ground)} on the ground (east, north, up)" if np.isfinite(ground).all() else ""
-    return f"{met} met to {np.hypot(*image):.2f} px in the images{on_ground} (RMS)."
+        return f"{points}: no camera can project {'it' if num == 1 else 'them'}."
+    on_ground = f", {lengths(ground)} on the ground (east, north, up)" if np.isfinite(ground).all() else ""
+    return f"Residuals of {points} (RMS): {np.hypot(*image):.2f} px in the images{on_ground}."
 
 
 def _checked_lines(_: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     rmse = median([view.rmse_before for view in views])
     if np.isfinite(rmse):
-        yield f"Tie points of {counted(len(views), 'image')} agree to {rmse:.3f} px as the cameras are."
+        yield f"Tie points of {counted(len(views), 'image')} agree to {rmse:.3f} px with the cameras as given."
     else:
-        yield "No camera sees tie points of another image."
+        yield "No residual could be computed: no camera projects tie points of another image."
 
 
 def _matched_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
@@ -309,11 +313,11 @@ def _matched_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     yield f"{points} of {counted(len(views), 'image')}, {counted(len(run.tracks), 'observation')}."
 
 
-# --- what fits on one screen: the worst first, what is alike said once -------------------------------------
+# --- one screen: the worst first, one sentence for the images of one cause ----------------------------------
 
 
 def worst_first(views: Sequence[ViewEntry]) -> list[ViewEntry]:
-    """Return images by verdict, by what is wrong, by error; those without reservation as they come."""
+    """Return images sorted by verdict, cause and error; those without reservation last, in their order."""
     return sorted(views, key=_badness)
 
 
@@ -327,35 +331,35 @@ def _badness(view: ViewEntry) -> tuple[int, int, float]:
 
 
 def flagged(views: Sequence[ViewEntry]) -> list[ViewEntry]:
-    """Return images that need a look, the worst first."""
+    """Return images with a reservation, the worst first."""
     return [view for view in worst_first(views) if view.advice]
 
 
 def offset_of(pair: PairEntry) -> float:
-    """Return the epipolar offset (RMS) of a pair at the end of its run [px]; 0 where it is not known."""
+    """Return the epipolar offset (RMS) of a pair at the end of its run [px]; 0 where unknown."""
     before, after = pair.offset_rms
     return (before if pair.epipolar_after is None else after) or 0.0
 
 
 def worst_pairs(pairs: Sequence[PairEntry]) -> list[PairEntry]:
-    """Return pairs by their epipolar offset, the largest first, where it is more than stereo wants; then the others."""
+    """Return pairs with an epipolar offset above the limit of stereo, the largest first, then the others."""
     return sorted(pairs, key=lambda pair: -max(offset_of(pair), GOOD_RMSE))
 
 
 def sure_pairs(views: Sequence[ViewEntry], pairs: Sequence[PairEntry]) -> list[PairEntry]:
-    """Return pairs of images that need no look, with enough matches to know it."""
+    """Return pairs of images without reservation, with at least `MIN_PAIR_MATCHES` matches."""
     doubted = {view.name for view in views if view.advice}
-    return [pair for pair in pairs if pair.num_matches >= FEW and not {pair.a, pair.b} & doubted]
+    return [pair for pair in pairs if pair.num_matches >= MIN_PAIR_MATCHES and not {pair.a, pair.b} & doubted]
 
 
 def torn(pairs: Sequence[PairEntry]) -> list[PairEntry]:
-    """Return pairs whose epipolar offset is more than stereo wants, the worst first."""
+    """Return pairs whose epipolar offset exceeds the limit of stereo, the worst first."""
     return [pair for pair in worst_pairs(pairs) if offset_of(pair) > GOOD_RMSE]
 
 
 def sentences(summary: Summary) -> list[str]:
     """Return the verdict, one sentence for all images of one cause, one for all files left out for one reason."""
-    alike: dict[tuple[str, str], list[tuple[str, str]]] = {}  # names and what is said of each
+    alike: dict[tuple[str, str], list[tuple[str, str]]] = {}  # names and sentences
     for view in flagged(summary.views):
         alike.setdefault((view.status, view.cause or view.advice), []).append((view.name, view.reservation))
     for file in summary.left_out:  # a reason often begins with the file
@@ -378,6 +382,6 @@ def _status_sentences(status: str, why: str, alike: Sequence[tuple[str, str]]) -
         return [text for _, text in alike]
     if not status:
         return [f"{len(alike)} files were left out, {names}: {why}"]
-    start = f"{len(alike)} images are {STATUS_WORDS[status]}, {CAUSES[why].label}: {names}"
+    start = f"{len(alike)} images: {STATUS_WORDS[status]}, {CAUSES[why].label}: {names}"
     remedy = CAUSES[why].remedy.format(image="IMAGE")
     return [". ".join(filter(None, (start, remedy[:1].upper() + remedy[1:]))) + "."]

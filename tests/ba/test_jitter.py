@@ -95,7 +95,7 @@ def test_a_spline_that_is_subtracted_makes_it_worse():
 def test_fast_jitter_of_one_frequency_is_a_swing():
     """Of all views the differences are seen: which of them swing is not, and heights are bent by what is common."""
     found, after = solved("jitter 0.1 at 5 Hz", 1)
-    assert {one.kind for one in found.findings} == {"swing"}
+    assert {one.kind for one in found.findings} == {"sinusoid"}
     periods = [one.period for one in found.findings]
     assert max(periods) < 1.01 * min(periods)
     assert 0.005 < after.shape < 0.1  # four seeds: 0.07-0.27, and 1.4 as delivered

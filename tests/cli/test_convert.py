@@ -469,7 +469,7 @@ def test_a_hand_off_writes_the_formats_named_and_tells_what_is_wrong(
     assert said.out == f"{out / 'scene.vrt'}: gdal 2.0e-06 px\n{out / 'scene_RPC.TXT'}: rpcm no field\n"
     assert said.err.splitlines() == [
         "barpc: not tried: 3",
-        f"barpc: exit code 3: The hand-off needs a look. {out / 'scene.vrt'}: gdal reads it 2.0e-06 px off. "
+        f"barpc: exit code 3: The hand-off needs review. {out / 'scene.vrt'}: gdal reads it 2.0e-06 px off. "
         f"{out / 'scene_RPC.TXT'}: rpcm no field.",
     ]
     assert run("convert", str(image), *words) == 1  # the folder is not empty

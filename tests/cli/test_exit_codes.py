@@ -53,14 +53,14 @@ def test_a_weak_view_ends_with_3(pristine, ties, tmp_path):  # noqa: F811
     few += [row for row in rows if row.startswith("view_02")][:20]
     (tmp_path / "few.csv").write_text("\n".join([head, *few]))
     said = command("adjust", *pristine, "--matches", tmp_path / "few.csv", "--matches-only", "-o", tmp_path / "out")
-    assert_told(said, "1 needs a look", "view_02: weakly tied")
+    assert_told(said, "1 image needs review", "view_02: weakly tied")
 
 
 def test_doubtful_cameras_end_with_3_and_say_so_even_when_quiet(pristine):  # noqa: F811
     said = command("-q", "check", *pristine[:2])
-    assert_told(said, "view_00: doubtful", "adjust the cameras")
+    assert_told(said, "view_00: needs review", "adjust the cameras")
     assert said.out == ""
-    assert "need a look" not in said.err  # the verdict: with -q there is none, only what is wrong
+    assert "need review" not in said.err  # the verdict: with -q there is none, only what is wrong
 
 
 @pytest.mark.slow
@@ -99,7 +99,7 @@ def test_control_points_that_do_not_count_end_with_3(fault, tmp_path):
         assert_one_line(said, 1, "not in this run")
         assert not CONTROL.search(said.err)
     said = command(*given, tmp_path / "out", "--keep-going")
-    assert_told(said, "ground points need a look", "rejected" if fault == "rejected" else "not in this run")
+    assert_told(said, "ground points need review", "rejected" if fault == "rejected" else "not in this run")
     assert not CONTROL.search(said.out + said.err)
 
 

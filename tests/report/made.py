@@ -18,7 +18,7 @@ from barpc.report.summary.views import CorrectionEntry, ViewEntry
 _VIEW: dict[str, Any] = {
     "path": "", "size": (1000, 800), "alt_range_m": (0.0, 500.0), "rpc_source": None, "gsd_m": 0.5,
     "incidence_deg": 10.0, "azimuth_deg": 90.0, "num_observations": 100, "num_rejected": 0, "num_gcps": 0,
-    "tie_coverage": 0.5, "rmse_before": 2.0, "rmse_after": 0.2, "smooth_px": 0.0, "prior_scale": 1.0,
+    "tie_coverage": 0.5, "rmse_before": 2.0, "rmse_after": 0.2, "systematic_px": 0.0, "prior_scale": 1.0,
     "correction": None, "camera_center": None, "fit": None, "outputs": {}, "status": "adjusted", "advice": "",
 }  # fmt: skip
 

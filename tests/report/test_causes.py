@@ -42,18 +42,19 @@ def test_every_explanation_has_its_words() -> None:
     [
         (
             STRIP, 1, (1, 4999.4, 12000.0, 0.0, 0.0), (3.0, 4.0),
-            "rows 5000-5999 of east (or what west shows of them) lie 5.00 px off the rest of it", (5000.0, 5999.0),
+            "rows 5000-5999 of east (or the same ground in west) are displaced by 5.00 px", (5000.0, 5999.0),
         ),
         (
             STRIP, 0, (0, -8000.0, 100.0, 0.0, 0.0), (0.0, -0.5),
-            "columns 0-99 of west (or what east shows of them) lie 0.50 px off the rest of it", (0.0, 99.0),
+            "columns 0-99 of west (or the same ground in east) are displaced by 0.50 px", (0.0, 99.0),
         ),
         (
             FADE, 0, (1, -12000.0, 24000.0, 0.0, 1 / 400.0), (2.0, 0.0),
-            "rows of west (or what east shows of them) lie 2.00 px off at row 0, which fades within 400 rows",
+            "rows of west (or the same ground in east) are displaced by 2.00 px at row 0, decaying in 400 rows",
             (0.0, 11999.0),
         ),
-        (WANDER, 1, None, (0.3, 0.4), "rows of east or west wander by 0.50 px", (None, None)),
+        (WANDER, 1, None, (0.3, 0.4),
+            "rows of east or west have a low-frequency displacement of 0.50 px", (None, None)),
     ],
 )  # fmt: skip
 def test_a_finding_is_said_with_its_place_and_size(kind, view, where, size, sentence, ends) -> None:
@@ -73,10 +74,22 @@ def test_a_finding_is_said_with_its_place_and_size(kind, view, where, size, sent
 @pytest.mark.parametrize(
     ("names", "or_of", "sentence"),
     [
-        (("west", "east", "north"), (), "rows of east swing by 0.10 px every 200 rows"),
-        (("west", "east", "north"), (0, 2), "rows of east or west or north swing by 0.10 px every 200 rows"),
+        (
+            ("west", "east", "north"),
+            (),
+            "rows of east have a sinusoidal displacement of 0.10 px with a period of 200 rows",
+        ),
+        (
+            ("west", "east", "north"),
+            (0, 2),
+            "rows of east or west or north have a sinusoidal displacement of 0.10 px with a period of 200 rows",
+        ),
         # of two images nobody sees what there is along the epipolar lines
-        (("west", "east"), (0,), "rows of east or west swing by at least 0.10 px every 200 rows"),
+        (
+            ("west", "east"),
+            (0,),
+            "rows of east or west have a sinusoidal displacement of at least 0.10 px with a period of 200 rows",
+        ),
     ],
 )
 def test_a_swing_is_said_with_its_period_and_whose_it_may_be(names, or_of, sentence) -> None:
@@ -86,7 +99,7 @@ def test_a_swing_is_said_with_its_period_and_whose_it_may_be(names, or_of, sente
     (found,) = explanations(of_names)  # type: ignore[arg-type]
     assert found.sentence == sentence
     assert (found.image, found.period, found.first) == ("east", 199.6, None)
-    assert found.or_of == (tuple(names[v] for v in or_of) or None)
+    assert found.candidates == (tuple(names[v] for v in or_of) or None)
     assert found.size_px == pytest.approx(0.1)
 
 
@@ -94,10 +107,10 @@ def test_a_swing_is_said_with_its_period_and_whose_it_may_be(names, or_of, sente
 def test_images_that_settle_alike_are_said_once(rate: float, end: str) -> None:
     places = (1, -6000.0, 12000.0, 0.0, rate), (1, -3000.0, 6000.0, 0.0, rate)
     sizes = np.array([3.0, 4.0]), np.array([0.0, 1.0])
-    each = [Finding(TRANSIENT, v, places[v], sizes[v], 90.0, 40.0, "moving", sizes[v]) for v in (0, 1)]
+    each = [Finding(TRANSIENT, v, places[v], sizes[v], 90.0, 40.0, "moving_objects", sizes[v]) for v in (0, 1)]
     (entry,) = explanations(adjustment(findings=each))
-    assert entry.sentence == (f"rows at the {end} of all images lie off, by up to 5.00 px, which fades within 100 rows")
-    assert (entry.image, entry.gain, entry.runner_up, entry.size_px) == (None, 90.0, "moving", 5.0)
+    assert entry.sentence == (f"rows at the {end} of all images are displaced by up to 5.00 px, decaying in 100 rows")
+    assert (entry.image, entry.gain, entry.runner_up, entry.size_px) == (None, 90.0, "moving_objects", 5.0)
 
 
 @pytest.mark.parametrize(
@@ -115,8 +128,8 @@ def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: st
     finding = Finding(MOVING, -1, None, np.zeros(2), 42.0, 7.0, STRIP, np.zeros(0), motion=motion)
     (found,) = explanations(adjustment([finding]))
     assert found.sentence == (
-        f"{said} (a cloud, water or shadows?), by 1.1 m from east to west beside what may be their height, and took no "
-        "part"
+        f"{said} (a cloud, water or shadows?), by 1.1 m from east to west apart from an effect of height, and "
+        "were excluded"
     )
     assert (found.image, found.share, found.moved_m, found.between) == (None, 0.354, 1.14, ("east", "west"))
     assert found.box == (5.0, 43.0, 5.1, 43.2)
@@ -132,8 +145,8 @@ def test_what_else_a_group_may_be_is_a_reason_where_ties_cannot_tell(gap: float,
     assert bool(said) == told
     if told:
         assert said == [
-            "That tie points move together explains them no better than that rows or columns of an image lie off: look "
-            "at where they are."
+            "Moving objects explain the tie points that move together hardly better than displaced rows or columns of "
+            "an image: check where these tie points lie."
         ]
 
 
@@ -146,10 +159,13 @@ def test_what_is_left_is_a_reason_where_it_is_much() -> None:
     found = adjustment(left=left)
     first, second = reasons(found)
     assert first == (
-        "Rows 100-399 of west stand out: 80 % of their tie points contradict the others, half of these by more than "
+        "Rows 100-399 of west are inconsistent with the rest: 80 % of their tie points contradict the others, "
+        "half of these by more than "
         "2.50 px."
     )
-    assert second == "Rows 100-399 of east stand out: their tie points are left with 0.09 px in common."
+    assert (
+        second == "Rows 100-399 of east are inconsistent with the rest: their tie points share a residual of 0.09 px."
+    )
     assert [one.last for one in left_entries(found)] == [399.0] * 3
     assert reasons(adjustment(left=[interval(0, 0.1, 0.05)])) == []
 
@@ -159,7 +175,7 @@ def test_rows_of_which_most_ties_move_may_be_what_is_off() -> None:
     (said,) = reasons(adjustment(left=left))
     assert said == (
         "Most tie points of rows 100-399 of west, rows 100-399 of east, rows 100-399 of west, rows 100-399 of east "
-        "are of what moves: it may as well be these rows that lie off, and no camera follows them."
+        "move together: moving objects, or a displacement of these rows that no camera models."
     )
 
 
@@ -170,11 +186,11 @@ def apart_of(look: RpcDiagnosis, **given: Any) -> ForeignCamera:
 @pytest.mark.parametrize(
     ("look", "share", "said"),
     [
-        (RpcDiagnosis(swapped=True), 1.0, "with its axes swapped, samples taken for lines, it would agree"),
-        (RpcDiagnosis(np.array([400.0, -9.0])), 1.0, "moved by -400.0 columns and +9.0 rows it would agree"),
+        (RpcDiagnosis(swapped=True), 1.0, "with its axes swapped (samples for lines) it would agree"),
+        (RpcDiagnosis(np.array([400.0, -9.0])), 1.0, "shifted by -400.0 columns and +9.0 rows it would agree"),
         (
             RpcDiagnosis(np.array([0.0, 9.0]), -48.0), 1.0,
-            "moved by +0.0 columns and -9.0 rows, or with its heights moved by +48 m, it would agree",
+            "shifted by +0.0 columns and -9.0 rows, or its heights by +48 m, it would agree",
         ),
         (RpcDiagnosis(), 0.987, "more than 98 % of its tie points contradict"),
         (RpcDiagnosis(), 1.0, "all of its tie points contradict"),
@@ -187,9 +203,9 @@ def test_a_strange_rpc_is_said_with_what_it_looks_like(look, share, said) -> Non
 
 def test_of_a_view_that_lies_where_it_is_stated_to_the_rpc_is_not_blamed_alone() -> None:
     clouds = apart_of(RpcDiagnosis(as_stated=True))
-    assert strangeness(clouds).endswith("as delivered it meets them to what is stated of it")
+    assert strangeness(clouds).endswith("as delivered it agrees with them within its stated accuracy")
     (one,) = explanations(adjustment(apart=clouds))
-    assert one.sentence.startswith("many tie points of east are wrong, or its RPC is not its own: ")
+    assert one.sentence.startswith("many tie points of east are wrong, or its RPC does not match the image: ")
 
 
 def test_a_strange_rpc_is_an_explanation_where_it_is_clear() -> None:
@@ -200,8 +216,8 @@ def test_a_strange_rpc_is_an_explanation_where_it_is_clear() -> None:
         "east",
         420.0,
         17.0,
-        "apart: west",
+        "foreign_camera: west",
     )
-    assert one.sentence == f"the RPC of east is not its own: {strangeness(clear)}"
+    assert one.sentence == f"the RPC of east does not match the image: {strangeness(clear)}"
     for other in (replace(clear, views=(1, 0)), replace(clear, gain=np.nan)):  # several; its prior told
         assert not explanations(adjustment(apart=other))

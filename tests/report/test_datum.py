@@ -38,12 +38,12 @@ def test_heights_that_lie_as_far_off_as_the_geoid_seem_to_count_from_it(provenan
     (why,) = told(block(-sign * 46.0), provenance, sign * GEOID)
     side, geoid = ("below", "above") if sign > 0 else ("above", "below")
     assert why == (
-        f"The heights of 6 GCPs lie 46.0 m {side} what the cameras as delivered, or other heights, let expect, and the "
-        f"geoid lies 48.0 m {geoid} the ellipsoid here: they seem to count from the sea. Say --heights egm96, or the "
-        "opposite if they were taken rightly."
+        f"The heights of 6 GCPs lie 46.0 m {side} the ground by the delivered cameras, or by other heights, and the "
+        f"geoid lies 48.0 m {geoid} the ellipsoid here: they seem to be above sea level. Give --heights egm96, or the "
+        "opposite to confirm the present datum."
     )
     (why,) = told(block(sign * 46.0), provenance, -sign * GEOID, converted=True)
-    assert f"the geoid lies 48.0 m {geoid} the ellipsoid here: they seem to be ellipsoidal. Say --heights elli" in why
+    assert f"the geoid lies 48.0 m {geoid} the ellipsoid here: they seem to be ellipsoidal. Give --heights elli" in why
 
 
 @pytest.mark.parametrize("up", [0.0, 9.0, -9.0, 25.0])
@@ -57,7 +57,7 @@ def test_what_nothing_settles_is_said_where_it_moves_the_scene(cameras, known, s
     assert len(found) == said
     assert told(block(5.0, cameras, known), INFERRED) == []
     if said:
-        assert "if they count from the sea, the scene lies 48.0 m too low" in found[0]
+        assert "if they are above sea level, the scene is 48.0 m too low" in found[0]
         assert "--heights ellipsoidal, or --heights egm96" in found[0]
         assert "48.0 m too high" in told(block(5.0, cameras, known), otherwise=-GEOID)[0]
 
@@ -65,7 +65,7 @@ def test_what_nothing_settles_is_said_where_it_moves_the_scene(cameras, known, s
 def test_heights_that_hold_a_part_of_the_scene_move_a_part_of_it():
     half = block(-23.0, 30.0)
     half.datum["gcps"] = np.full(10, 0.5)
-    assert "the scene lies 24.0 m too low" in told(half)[0]
+    assert "the scene is 24.0 m too low" in told(half)[0]
     half.gauge.delivered_sigma[2] = 10.0  # 46 m, of which half came about
     assert "lie 46.0 m below" in told(half)[0]
 
@@ -74,13 +74,13 @@ def test_other_heights_tell_where_cameras_do_not():
     wide = block(20.0, 500.0)
     assert told(wide, above=((1.0, 6.0),)) == []
     assert "lie 47.0 m below" in told(wide, above=((-47.0, 6.0),))[0]
-    assert "Nothing says" in told(wide, above=((-20.0, 30.0),))[0]
+    assert "is not stated" in told(wide, above=((-20.0, 30.0),))[0]
     assert told(block(-150.0), INFERRED) == []  # neither: something else is wrong, and it is not said of the datum
 
 
 def test_cameras_that_were_widened_by_control_count_as_delivered():
     wide = block(-46.0, 50.0, prior=SimpleNamespace(scale=np.full(3, 5.0)))
-    assert "seem to count from the sea" in told(wide)[0]
+    assert "seem to be above sea level" in told(wide)[0]
 
 
 def test_control_that_was_refused_is_held_against_the_others():
@@ -95,13 +95,13 @@ def test_a_dem_is_held_against_the_tie_points_without_what_it_may_be_wrong_by():
     one = HeightDatum("heights", "the DEM d.tif", GEOID, DEFAULT)
     (why,) = datum_reasons([one], block(source="heights", terrain=terrain))
     assert "The heights of the DEM d.tif lie 47.0 m below" in why
-    assert "Say --geoid egm96" in why
+    assert "Give --geoid egm96" in why
     (why,) = datum_reasons([replace(one, converted=True, otherwise=48.0)], block(source="heights", terrain=terrain))
-    assert "Say --geoid none" in why
+    assert "Give --geoid none" in why
     for off in (1.0, -8.0):
         right = replace(terrain, delivered=(off, 0.0, 0.0), beyond=(abs(off) / 22.4, 0, 0))
         assert [*datum_reasons([one], block(source="heights", terrain=right))] == []
     unknown = block(source="heights", terrain=replace(terrain, beyond=(np.nan,) * 3))
     (why,) = datum_reasons([one], unknown)
-    assert why.startswith("Nothing says what the heights of the DEM d.tif count from.")
+    assert why.startswith("The vertical datum of the heights of the DEM d.tif is not stated.")
     assert [*datum_reasons([one], block(source="reference", terrain=None))] == [why]  # which stands on it

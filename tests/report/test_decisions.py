@@ -10,7 +10,7 @@ import pytest
 from barpc.report import page
 from barpc.report.page import decisions
 from barpc.report.summary import Summary
-from barpc.report.summary.block import AskedEntry, ExplanationEntry, HeldOutEntry, LeftEntry
+from barpc.report.summary.block import ExplanationEntry, HeldOutEntry, JustificationEntry, LeftEntry
 from barpc.report.summary.ground_points import ControlTestEntry
 
 from .made import files_of
@@ -70,14 +70,16 @@ def test_the_matcher_is_said_to_be_asked_for(record):
 
 
 def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
-    given = AskedEntry(image="B", smooth_px=0.31, smooth_p=3e-12, shared_px=0.12, num_images=3)
+    given = JustificationEntry(
+        image="B", systematic_px=0.31, systematic_p=3e-12, neighbour_correlated_px=0.12, num_images=3
+    )
     assert record.options["adjust"]["drift"] is None
     plain = said(record, drift_degree=1, drift_sigma_m=(0.12,))
     assert (
         "as a polynomial of degree 1 (standard deviation at the first and last row: 12.0 cm): no higher degree was "
         "needed" in plain
     )
-    more = said(record, drift_degree=2, drift_sigma_m=(0.12, 0.3), drift_asked=given)
+    more = said(record, drift_degree=2, drift_sigma_m=(0.12, 0.3), drift_justification=given)
     assert (
         "as a polynomial of degree 2 (standard deviation at the first and last row: 12.0 cm, 30.0 cm): degree 1 left "
         in more
@@ -85,7 +87,9 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
     assert "a systematic residual of 0.31 px in B (F test: p = 3e-12; below 1e-4 in 3 images)" in more
     assert "and 0.12 px correlated between neighbours" in more
     assert "no F test" not in more
-    surely = said(record, drift_degree=2, drift_asked=replace(given, smooth_p=0.0, shared_px=0.0))
+    surely = said(
+        record, drift_degree=2, drift_justification=replace(given, systematic_p=0.0, neighbour_correlated_px=0.0)
+    )
     assert "p = 0;" in surely
     assert "neighbours shared" not in surely
     assert "as in the earlier run" in said(record, drift_degree=1, drift_sigma_m=(None,))
@@ -116,7 +120,7 @@ def test_priors_hold_or_were_widened(record):
 def test_the_model_in_the_image_is_said_to_be_better(record):
     assert "Each camera is corrected by rotation+translation." in said(record)
     views = with_views(record, *[{"held_out_px": 0.05}] * 8, {"held_out_px": 0.08})
-    text = said(views, in_space_px=0.4)
+    text = said(views, rigid_model_px=0.4)
     assert "Check tie points keep residuals of 0.400 px with a rotation and translation per image, of at most" in text
     assert "at most 0.080 px with an affine in each image, which was selected" in text
     assert "Each camera is" not in text
@@ -147,14 +151,16 @@ def test_splines_are_said_with_the_rows_between_the_knots_of_the_largest(record)
 
 
 STRIP = ExplanationEntry(
-    "strip", "rows 5-9 of B lie 1.00 px off the rest of it", "B", 120.4, 33.0, "wander", "rows", 5.0, 9.0, 1.0
+    "step", "rows 5-9 of B lie 1.00 px off the rest of it", "B", 120.4, 33.0, "low_frequency", "rows", 5.0, 9.0, 1.0
 )
 
 
 def test_jitter_is_said_with_what_was_left_without_it(record):
-    before = AskedEntry(image="B", smooth_px=0.5, smooth_p=1e-9, shared_px=0.0, num_images=2)
+    before = JustificationEntry(
+        image="B", systematic_px=0.5, systematic_p=1e-9, neighbour_correlated_px=0.0, num_images=2
+    )
     waving = with_views(record, {"jitter_px": 0.1, "jitter_rows": 500.0}, {"jitter_px": 0.3, "jitter_rows": 500.0})
-    text, name = said(waving, jitter_asked=before), record.views[1].name
+    text, name = said(waving, jitter_justification=before), record.views[1].name
     assert (
         f"Splines with a knot every 500 rows model attitude jitter in 2 images, up to 0.30 px RMS ({name}): without"
         in text
@@ -179,8 +185,10 @@ def test_control_is_counted_and_its_test_says_what_chance_does(record):
 
 def test_a_check_and_an_older_summary_say_what_they_know(check_run, record):
     assert decisions(check_run.record) == ["Tie points were given: nothing was matched."]
-    bare = replace(record.scene, drift_asked=None, prior_ratio=None, model="", num_held_out=0, held_out_places=None)
-    older = with_views(record, *[{"shared_px": None, "smooth_p": None, "num_rejected": 0}] * 9)
+    bare = replace(
+        record.scene, drift_justification=None, prior_ratio=None, model="", num_held_out=0, held_out_places=None
+    )
+    older = with_views(record, *[{"neighbour_correlated_px": None, "systematic_p": None, "num_rejected": 0}] * 9)
     found = decisions(replace(older, scene=bare, options=None, control_test=None, gcps=(), pairs=()))
     assert [line.split()[0] for line in found] == ["The", "No"]
 
@@ -191,8 +199,10 @@ def test_an_accuracy_is_widened_from_half_a_percent_on(record):
     slightly = said(with_views(calm, {"prior_scale": 1.006}), prior_ratio=1.0)
     assert "the priors of 1 image were widened, at most 1.0 times" in slightly
     assert "no prior was widened" in said(with_views(calm, *[{"prior_scale": None}] * 9), prior_ratio=1.0)
-    given = AskedEntry(image="B", smooth_px=None, smooth_p=None, shared_px=0.0, num_images=1)
-    unknown = said(calm, drift_degree=2, drift_asked=given)
+    given = JustificationEntry(
+        image="B", systematic_px=None, systematic_p=None, neighbour_correlated_px=0.0, num_images=1
+    )
+    unknown = said(calm, drift_degree=2, drift_justification=given)
     assert "a systematic residual of nan px in B (F test: p = nan; below 1e-4 in 1 image)" in unknown
 
 
@@ -204,20 +214,20 @@ def test_where_nothing_won_it_is_said_why(record):
     assert "Nothing stood out" not in text
     many = with_views(record, *[{"unknowns": (0.0,) * 1500}] * 9)
     assert "in blocks of more than 12,000 unknowns none is" in said(many, left=(left,))
-    strip = ExplanationEntry("strip", "rows lie off", "B", 120.4, 33.0, "wander", "rows", 5.0, 9.0, 1.0)
+    strip = ExplanationEntry("step", "rows lie off", "B", 120.4, 33.0, "low_frequency", "rows", 5.0, 9.0, 1.0)
     assert "None of what was tried" not in said(record, left=(left,), explanations=(strip,))
     assert "Nothing stood out" not in said(record, held_out_places=None)  # of an earlier release
 
 
 def test_what_was_taken_and_what_stands_out_are_tables(record):
-    strip = ExplanationEntry("strip", "Rows lie off", "B", 120.4, 33.0, "wander", "rows", 5.0, 9.0, 1.0)
+    strip = ExplanationEntry("step", "Rows lie off", "B", 120.4, 33.0, "low_frequency", "rows", 5.0, 9.0, 1.0)
     left = LeftEntry("B", "columns", 10.0, 99.0, 0.42, 0.031, 2.0, 17.0)
     one = HeldOutEntry("B", "Rows 0-99 of B: they lie off", None, (0.0, 100.0), 20, 0.0, 0.2, 3e-7)
     pair = replace(record.pairs[0], tied_by="structure", num_matches=240, beaten=("guided 12 of 100", "x 20 of 100"))
     scene = replace(record.scene, explanations=(strip,), left=(left,), held_out_places=(one,))
     section = page._decisions_section(files_of(replace(record, scene=scene, pairs=(pair, *record.pairs[1:]))))
     found = {table.key: [[cell.text for cell in row] for row in table.rows] for table in section.tables}
-    assert found["explained"] == [["Rows lie off", "120", "33", "wander"]]
+    assert found["explained"] == [["Rows lie off", "120", "33", "low_frequency"]]
     assert found["left"] == [["B", "columns", "10", "99", "42%", "0.03", "2.00", "17"]]
     assert found["worse"] == [["Rows 0-99 of B: they lie off", "20", "3e-07"]]
     assert found["again"] == [[f"{pair.a} - {pair.b}", "structure", "240", "guided 12 of 100; x 20 of 100"]]

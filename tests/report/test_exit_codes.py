@@ -94,7 +94,7 @@ def test_ground_points_with_a_reservation_need_a_look(change, word, block_run):
     summary = summarize(change(block_run.run))
     assert summary["status"] == "look"
     assert not summary["passed"]
-    assert summary["headline"] == "All 9 images are adjusted; ground points need a look."
+    assert summary["headline"] == "All 9 images are adjusted; ground points need review."
     assert len(summary["reasons"]) == 1
     assert word in summary["reasons"][0]
 
@@ -115,8 +115,8 @@ def scattered(adjustment):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (in_the_image, ("leave 0.950 px", "affine", "turned, resampled or cropped", "tilts")),
-        (between_two_groups, ("{1} and {4} fall into two groups", "31 %", "0.42 px", "two solutions")),
+        (in_the_image, ("residuals of 0.950 px", "affine", "rotated, resampled or cropped", "tilts")),
+        (between_two_groups, ("{1} and {4} form two groups", "31 %", "0.42 px", "two solutions")),
         (scattered, ("scatter 2.6 times",)),
     ],
 )
@@ -124,7 +124,7 @@ def test_what_the_adjustment_says_of_the_block_needs_a_look(change, words, block
     run = block_run.run
     summary = summarize(replace(run, adjustment=change(run.adjustment)))
     assert summary["status"] == "look"
-    assert summary["headline"] == "All 9 images are adjusted; the block needs a look."
+    assert summary["headline"] == "All 9 images are adjusted; the block needs review."
     (reason,) = summary["reasons"]
     for word in words:
         assert word.format(*run.adjustment.names) in reason
@@ -141,7 +141,7 @@ def test_an_image_is_judged_by_tie_points_that_took_no_part(noise, said, block_r
     assert view["held_out_px"] == 0.31
     assert (view["status"] == "doubtful") == said
     if said:
-        assert "took no part are left with 0.31 px, 2.6 times" in view["advice"]
+        assert "check tie points have residuals of 0.31 px, 2.6 times" in view["advice"]
         assert not summary["passed"]
 
 

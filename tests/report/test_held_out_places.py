@@ -52,7 +52,7 @@ def test_rows_that_only_they_contradict_are_named_and_need_a_look(run: Run, move
     assert one.rows[1] < 0.3 * height
     assert one.off_px == pytest.approx(np.hypot(*move), rel=0.3)
     assert summary.reasons == (f"{one.sentence}.",)
-    assert f"of {one.image}: tie points there that took no part" in one.sentence
+    assert f"of {one.image}: check tie points there" in one.sentence
     assert f"{one.off_px:.2f} px" in one.sentence
     assert (one.far > 0.3) == (move[1] != 0.0)
     median = summary.views[1].held_out_px  # which hides them
@@ -76,7 +76,7 @@ def test_rows_that_stand_out_among_all_are_not_said_twice(run: Run) -> None:
     found: Any = replace(changed.adjustment, left=(first,))  # type: ignore[arg-type, type-var]
     reasons = summarize(replace(changed, adjustment=found)).reasons
     assert len(reasons) == 1
-    assert "stand out" in reasons[0]
+    assert "are inconsistent with the rest" in reasons[0]
 
 
 def test_of_a_view_whose_rpc_is_not_its_own_and_of_plain_least_squares_it_is_not_asked(run: Run) -> None:

@@ -183,8 +183,8 @@ def test_where_tie_points_move_is_outlined_and_says_so():
     views, outlines, pairs = scene()
     box = (9.996, -0.004, 10.004, -0.001)
     groups = (
-        ExplanationEntry("moving", "a <group> & more", None, 50.0, 40.0, box=box),
-        ExplanationEntry("strip", "rows lie off", "A", 9.0, 9.0),
+        ExplanationEntry("moving_objects", "a <group> & more", None, 50.0, 40.0, box=box),
+        ExplanationEntry("step", "rows lie off", "A", 9.0, 9.0),
     )
     drawn = Drawing(ground_map(files_of(a_summary(views, pairs, scene=SimpleNamespace(explanations=groups)), outlines)))
     at = maps._plane_of(np.concatenate([*chain(*outlines)]))
@@ -298,7 +298,7 @@ def test_a_panel_draws_residuals_cells_and_arrows_to_one_length():
     ]
     charts_of, shares, key = panels([*pushed, *one], views)
     longest = float(np.quantile([math.hypot(0.3, 0.02)] * 40 + [0.6], 0.95))
-    assert key == f"A thin line of a 15th of a panel's width is {longest:.2g} px; bold arrows are drawn twice as long."
+    assert key == f"Scale bar: {longest:.2g} px of a single residual; bold arrows are drawn at twice that scale."
     assert shares == [1.0, 0.0]
     assert [caption for _, caption in charts_of] == ["A: 100 % systematic", "B: 0 % systematic"]
     first, second = (Drawing(svg) for svg, _ in charts_of)
@@ -313,6 +313,7 @@ def test_a_panel_draws_residuals_cells_and_arrows_to_one_length():
     assert (x, y) == pytest.approx((60.5 / 5, 60.5 / 5), abs=0.051)
     assert (u - x, v - y) == pytest.approx((0.3 * 12 / longest, 0.02 * 12 / longest), abs=0.11)
     assert vectors.count("M") == 40
+    assert first.rects("scalebar") == [(4, 83, 12, 3)]  # as long as a line of `longest`
     shaft, barbs = first.points("mean")
     length = 0.3 * 24 / longest
     assert np.array(shaft) == pytest.approx(
@@ -376,7 +377,7 @@ def test_of_many_residuals_every_few_th_is_drawn_and_of_many_images_the_most_sys
     assert found[0][1].startswith("V60: 100 %")
     flagged = maps.residual_panels(many, seen([*rows[:101], *pushed]), "after", [7, 3])
     assert [caption.split(":")[0] for _, caption in flagged[0][:3]] == ["V7", "V3", "V60"]
-    assert flagged[2].endswith("60 are shown: those that need a look, then those with the largest systematic part.")
+    assert flagged[2].endswith("60 are shown: those that need review, then those with the largest systematic part.")
     assert len(shares) == 61
     assert key.endswith(" Of 61 images 60 are shown: those with the largest systematic part.")
     assert "are shown" not in panels(rows, many[:60])[2]
@@ -395,9 +396,9 @@ def test_before_and_after_are_two_and_what_is_not_known_or_used_is_left_out():
     assert Drawing(before[0][0][0]).described.startswith("2 residuals")
     assert Drawing(after[0][0][0]).described.startswith("1 residuals")
     assert Drawing(before[0][0][0]).root.get("aria-labelledby") == "panel-before0-t panel-before0-d"
-    assert "is 0.5 px" in after[2]
-    assert "is 2.9 px" in before[2]
-    assert "is 1 px" in panels([(0, 1, (5, 5), (0, 0), (0.0, 0.0), True)], [a_view()])[2]
+    assert "Scale bar: 0.5 px" in after[2]
+    assert "Scale bar: 2.9 px" in before[2]
+    assert "Scale bar: 1 px" in panels([(0, 1, (5, 5), (0, 0), (0.0, 0.0), True)], [a_view()])[2]
 
 
 @pytest.mark.parametrize(("x", "shown"), [(50.5, True), (49.5, False), (375.5, True), (376.5, False), (410.0, False)])

@@ -16,7 +16,7 @@ from barpc.report import outcome as runs
 from barpc.report.outcome import ControlResidual, pair_ties, triangulate_tracks
 from barpc.report.page import decisions
 from barpc.report.summary import measure_run
-from barpc.report.summary.block import _asked
+from barpc.report.summary.block import _justification
 from barpc.report.summary.ground_points import GcpEntry, measure_control, measure_gcps, measure_reference
 from barpc.report.summary.views import _image_correction_entry, ce90, cell_numbers, rmse_by_view
 from barpc.scene import Tracks
@@ -76,7 +76,7 @@ def test_a_copy_is_an_image_whose_matches_have_one_whole_shift():
     assert not copies(num=19)
     assert copies(others=2)  # nine of ten
     assert not copies(others=3)
-    assert (runs.WHOLE_PIXEL_TOLERANCE, runs.MIN_WHOLE_SHARE, runs.FEWEST) == (0.05, 0.9, 20)
+    assert (runs.WHOLE_PIXEL_TOLERANCE, runs.MIN_WHOLE_SHARE, runs.MIN_COPY_MATCHES) == (0.05, 0.9, 20)
 
 
 def test_errors_of_a_view_are_the_root_of_the_mean_square_distance():
@@ -313,8 +313,8 @@ def test_check_points_are_measured_with_the_new_cameras_or_the_old_ones(block_ru
 def test_what_asked_for_more_is_the_image_with_the_largest_part_that_is_no_chance():
     test = SmoothTest(np.array([0.9, 0.4, 0.3]), np.array([1e-3, 1e-9, 1e-5]), np.zeros(3), np.array([0.1, 0.0, 0.35]))
     adjustment = SimpleNamespace(asked={"drift": test}, names=("A", "B", "C"))
-    found = _asked(adjustment, "drift")
-    assert (found.image, found.smooth_px, found.smooth_p, found.shared_px, found.num_images) == (
+    found = _justification(adjustment, "drift")
+    assert (found.image, found.systematic_px, found.systematic_p, found.neighbour_correlated_px, found.num_images) == (
         "B",
         0.4,
         1e-9,
@@ -322,10 +322,10 @@ def test_what_asked_for_more_is_the_image_with_the_largest_part_that_is_no_chanc
         2,
     )
     more = replace(test, shared=np.array([0.5, 0.0, 0.35]))
-    assert _asked(SimpleNamespace(asked={"drift": more}, names=("A", "B", "C")), "drift").image == "A"
+    assert _justification(SimpleNamespace(asked={"drift": more}, names=("A", "B", "C")), "drift").image == "A"
     at = replace(test, significance=np.array([1e-4, 0.99e-4, 1.0]))
-    assert _asked(SimpleNamespace(asked={"drift": at}, names=("A", "B", "C")), "drift").num_images == 1
-    assert _asked(adjustment, "jitter") is None
+    assert _justification(SimpleNamespace(asked={"drift": at}, names=("A", "B", "C")), "drift").num_images == 1
+    assert _justification(adjustment, "jitter") is None
 
 
 def test_decisions_end_with_the_test_of_control(block_run):

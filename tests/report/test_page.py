@@ -77,14 +77,14 @@ def test_every_question_is_asked_of_a_full_run(block_run):
     questions = re.findall(r"<h2[^>]*>([^<]+)</h2>", html)
     assert questions == [
         "Which images can I use?",
-        "Where are the images, and which hold together?",
+        "Where are the images, and which are connected?",
         "Are the residuals random?",
         "Do the pairs fit for stereo, and can heights be measured?",
-        "What was changed in each camera?",
-        "What can the images not tell?",
-        "What was decided, and why?",
-        "Do the new RPC files hold the corrected cameras?",
-        "How was this made, and how long did it take?",
+        "How was each camera corrected?",
+        "How uncertain are position and shape of the scene?",
+        "Which decisions were made, and on which figures?",
+        "Do the new RPC files reproduce the corrected cameras?",
+        "With which options, and how much data?",
     ]
     for view in block_run.summary["views"]:
         assert f"{view['rmse_after']:.3f}" in html
@@ -167,7 +167,7 @@ def test_the_page_of_many_images_is_bounded_and_says_what_it_leaves_out(block_ru
     assert 1e6 < len(html.encode()) < 3e6
     assert (f"And {views - 400} more; all are in summary.json." in html) == (num == 1000)
     assert html.count('class="outline doubtful"') == (views if num == 300 else views // 3)
-    assert ("At most 400 of 1008 outlines are drawn" in html) == (num == 1000)
+    assert ("At most 400 of 1008 footprints are drawn" in html) == (num == 1000)
 
 
 def test_a_run_without_a_single_tie_point_still_has_a_page(block_run, tmp_path):

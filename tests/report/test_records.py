@@ -135,9 +135,9 @@ def test_what_is_said_of_a_value_ends_with_its_unit():
         assert words not in UNITS, text
 
 
-def test_the_version_of_the_file_is_two():
-    assert SCHEMA == 2
-    assert published_schema()["properties"]["schema"]["const"] == 2
+def test_the_version_of_the_file_is_three():
+    assert SCHEMA == 3
+    assert published_schema()["properties"]["schema"]["const"] == 3
 
 
 def test_columns_are_fields_parts_and_own_ones():

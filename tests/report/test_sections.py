@@ -56,7 +56,7 @@ def test_a_row_of_the_table_of_images_is_in_percent_and_pixels():
     assert texts(table) == [
         [
             "A",
-            "doubtful",
+            "needs review",
             "60",
             "25.0%",
             "25%",
@@ -79,18 +79,18 @@ def test_a_map_needs_an_outline_and_says_where_some_are_left_out(monkeypatch):
     outlines = [a_square(10.0, 0.0)] * 3
     assert asked("map", pairs=[a_pair()]).charts == []
     ((_, whole),) = asked("map", outlines=outlines).charts
-    assert whole.startswith("Outlines at the altitude of the scene")
+    assert whole.startswith("Footprints at the altitude of the scene")
     monkeypatch.setattr(page, "MAX_SHOWN", 2)
     ((_, some),) = asked("map", outlines=outlines).charts
-    assert some == f"{whole} At most 2 of 3 outlines are drawn; all are in footprints.geojson."
+    assert some == f"{whole} At most 2 of 3 footprints are drawn; all are in footprints.geojson."
 
 
 def test_how_images_hang_together():
     def answer(pairs, num=4):
         tracks = TracksEntry(10, 26, {"2": 8, "3": 0, "5": 2})
         found = asked("map", [a_view(name) for name in "ABCD"[:num]], pairs, tracks=tracks).answer
-        assert found.endswith(" Tie points by the number of images that see them: 8 in 2, 2 in 5.")
-        return found[: found.rindex(" Tie points")]
+        assert found.endswith(" 8 tie points in 2 images, 2 in 5.")
+        return found.removesuffix(" 8 tie points in 2 images, 2 in 5.")
 
     ring = [a_pair("A", "B"), a_pair("B", "C"), a_pair("C", "D"), a_pair("A", "D")]
     assert answer(ring) == "Tie points connect all images."
@@ -343,10 +343,10 @@ def test_images_that_need_a_look_are_first_by_verdict_then_by_what_is_wrong():
     assert [row[2].text for row in table.rows][:3] == [
         "not tied to the others",
         "contradicts the others",
-        "tie points that took no part lie off",
+        "large residuals of check tie points",
     ]
     assert "first" in table.caption
-    assert table.columns[2] == "what is wrong"
+    assert table.columns[2] == "reservation"
 
 
 def test_heights_are_recommended_of_images_without_reservation_with_thirty_matches():
@@ -384,9 +384,9 @@ def test_a_surface_is_shown_by_the_cameras_before_and_after_and_under_two_images
     assert said in section.answer
     assert ("differ by 25.0 cm and by 50.0 cm" in section.answer) == told
     assert [words.partition(",")[0] for _, words in section.charts] == [
-        "The ground by the delivered cameras", "The ground by the corrected cameras",
+        "Surface from the delivered cameras", "Surface from the corrected cameras",
     ]  # fmt: skip
     draped = tuple(Draped(name, (2, 2), "QUJD") for name in "AC")
     (*_, (chart, words)) = page._surface_section(replace(files, reliefs=(before, after), draped=draped)).charts
-    assert words.startswith("A (left) and C (right) on the surface by the corrected cameras: ")
+    assert words.startswith("A (left) and C (right) draped over the surface from the corrected cameras: ")
     assert str(chart).count("QUJD") == 2

@@ -146,11 +146,11 @@ def test_of_three_hundred_images_the_worst_are_shown_and_the_rest_is_counted(mon
     pairs = [line.split()[2] for line in lines if " - view_" in line]
     assert pairs == [f"view_{k + 1:04d}" for k in range(39, 29, -1)]
     assert "289 more in tables/pairs.csv" in lines
-    causes = [line for line in lines if "images are" in line]
-    assert [line.split(":")[0] for line in causes] == [
-        "100 images are doubtful, contradicts the others",
-        "100 images are doubtful, tie points that took no part lie off",
-        "99 images are weakly tied, few tie points",
+    causes = [line for line in lines if " images: " in line]
+    assert [line.partition(": view_")[0] for line in causes] == [
+        "100 images: needs review, contradicts the others",
+        "100 images: needs review, large residuals of check tie points",
+        "99 images: weakly tied, few tie points",
     ]
     assert "view_0298, view_0295, view_0292, view_0289, view_0286 and 95 more" in causes[0]
 

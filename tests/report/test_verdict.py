@@ -35,7 +35,7 @@ def test_a_block_that_came_out_well_needs_no_advice(block_run):
 def test_a_check_of_wrong_cameras_says_to_adjust_them(check_run):
     summary = check_run.summary
     assert summary["status"] == "look"
-    assert summary["headline"] == "9 need a look (of 9)."
+    assert summary["headline"] == "9 images need review (of 9)."
     assert all(view["advice"].endswith("adjust the cameras") for view in summary["views"])
     assert not summary["passed"]
 
@@ -51,7 +51,7 @@ def test_a_view_with_few_tie_points_is_weakly_tied():
     view = summary["views"][2]
     assert view["status"] == "weak"
     assert str(view["num_observations"]) in view["advice"]
-    assert summary["headline"] == "1 needs a look (of 4)."
+    assert summary["headline"] == "1 image needs review (of 4)."
     assert any(line.startswith(f"{view['name']}: weakly tied: only") for line in summary["verdict"])
 
 
@@ -71,18 +71,18 @@ def test_a_view_without_tie_points_to_the_others_is_not_adjusted():
 @pytest.mark.parametrize(
     ("placed", "scale", "status", "said"),
     [
-        (None, 1.0, "failed", "its RPC is not its own: with its axes swapped"),
+        (None, 1.0, "failed", "its RPC does not match the image: with its axes swapped"),
         (
             SimpleNamespace(covariance=0.04 * np.eye(9)),
             1.0,
             "doubtful",
-            "its RPC is not its own: with its axes",
+            "its RPC does not match the image: with its axes",
         ),
         (
             SimpleNamespace(covariance=0.04 * np.eye(9)),
             33.0,
             "doubtful",
-            "its RPC is 33 times farther off than",
+            "its RPC is 33 times less accurate than",
         ),
     ],
 )
@@ -93,11 +93,11 @@ def test_a_view_whose_rpc_is_not_its_own_is_named(block_run, placed, scale, stat
     view = summary["views"][2]
     assert view["status"] == status
     assert view["advice"].startswith(said)
-    alone = "was left as it was" if placed is None else "adjusted alone, against points of the other images"
+    alone = "was not changed" if placed is None else "resected from the tie points of the other images"
     assert alone in view["advice"]
     assert summary["status"] == ("bad" if placed is None else "look")
     assert not summary["passed"]
-    assert [one["name"] for one in summary["scene"]["explanations"]] == ["apart"]
+    assert [one["name"] for one in summary["scene"]["explanations"]] == ["foreign_camera"]
     assert view["correction"]["center_sigma_px"] is view["correction"].get("ellipse") is None
     if placed is not None:  # with the others' points as they are
         assert view["correction"]["sigma"] == pytest.approx([0.2] * 9)
@@ -110,7 +110,7 @@ def test_a_view_among_several_whose_rpc_may_be_strange_needs_a_look(block_run):
     summary = summarize(replace(run, adjustment=replace(run.adjustment, apart=told)))
     assert summary["status"] == "look"
     names = f"{summary['views'][2]['name']}, {summary['views'][0]['name']}"
-    assert any(f"One RPC among those of {names} is not its own" in line for line in summary["reasons"])
+    assert any(f"One of the images {names} has an RPC that does not match it" in line for line in summary["reasons"])
     assert {view["status"] for view in summary["views"]} == {"adjusted"}
     assert not summary["scene"]["explanations"]
 
@@ -120,7 +120,7 @@ def test_an_rpc_that_misses_its_tolerance_fails_its_view(block_run):
     options = RunOptions(fit=FitOptions(tolerance=1e-15))
     summary = summarize(replace(block_run.run, options=options))
     assert {view["status"] for view in summary["views"]} == {"failed"}
-    assert "cannot hold the corrected camera" in summary["views"][0]["advice"]
+    assert "does not fit the corrected camera" in summary["views"][0]["advice"]
 
 
 def test_a_file_that_was_left_out_is_named(block_run):
@@ -133,8 +133,8 @@ def test_a_file_that_was_left_out_is_named(block_run):
 def test_ground_control_changes_what_is_said_about_the_place(block_run):
     with_control = " ".join(block_run.summary["verdict"])
     without = " ".join(summarize(replace(block_run.run, gcps=None))["verdict"])
-    assert "With 6 GCPs its place is known" in with_control
-    assert "Without ground control its place is known" in without
+    assert "With 6 GCPs, the scene's position is uncertain by" in with_control
+    assert "Without ground control, the scene's position is uncertain" in without
 
 
 @pytest.mark.parametrize("meaning", MOTIONS)

@@ -20,12 +20,12 @@ from barpc.scene import IntArray
 from barpc.sensor.image_corrections import profile
 from barpc.sensor.image_corrections import sine_and_cosine as waves_of
 
-STRIP = "strip"
-FADE = "fade"
-TRANSIENT = "settling"
-WANDER = "wander"
-SWING = "swing"
-MOVING = "moving"
+STRIP = "step"
+FADE = "decay"
+TRANSIENT = "transient"
+WANDER = "low_frequency"
+SWING = "sinusoid"
+MOVING = "moving_objects"
 LOCAL = STRIP, FADE
 """Those of a part of an image."""
 FOLLOWED = *LOCAL, TRANSIENT, SWING

@@ -1,7 +1,7 @@
-"""The summary of a run: what summary.json holds. In here alone stands what a value is, its column, how it is measured.
+"""The summary of a run, which summary.json stores: the one declaration of each value, its column and its measurement.
 
-A new value is a field with what is `column` of it and a line in the function that measures its record; named among the
-columns of a table there, it stands in that, too. A module for each thing: views, pairs, the block, ground points.
+A new value is a field declared by `column` and a line in the function that measures its record; a table shows it if it
+is named among the columns there. A module each: views, pairs, the block, ground points.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from barpc.report.summary.pairs import PairEntry, measure_pairs
 from barpc.report.summary.views import ViewEntry, measure_views
 from barpc.report.summary.words import ABOVE, Count
 
-SCHEMA = 2  # Version of summary.json
+SCHEMA = 3  # Version of summary.json
 _Plain = float | str | bool | None
 _Value = _Plain | tuple[_Plain, ...] | tuple[tuple[_Plain, ...], ...]
 
@@ -32,7 +32,7 @@ class LeftOutEntry(Record):
     """A file that was left out."""
 
     path: str = column("File")
-    reason: str = column("Why")
+    reason: str = column("Reason")
 
     @property
     def reason_text(self) -> str:
@@ -43,9 +43,9 @@ class LeftOutEntry(Record):
 class InputEntry(Record):
     """A file that the run read."""
 
-    path: str = column("File; a matcher by its name goes by its module")
+    path: str = column("File; for a matcher given by name its module")
     bytes: Count = column("Its size")
-    sha256: str = column("SHA-256 of its bytes; of a file on another host of its URL and the version named there")
+    sha256: str = column("SHA-256 of its bytes; for a file on another host, of its URL and version")
 
 
 class OutputEntry(Record):
@@ -60,15 +60,15 @@ class TracksEntry(Record):
 
     num_tracks: Count = column("Tie points")
     num_observations: Count = column("Their observations")
-    by_length: Mapping[str, int] = column("Number of views -> tie points seen in so many")
+    by_length: Mapping[str, int] = column("Number of views -> tie points observed in that many")
 
 
 class TablesEntry(Record):
-    """How much of the tie points the tables hold."""
+    """Share of the tie points in the tables."""
 
     num_usable_tracks: Count = column("Tie points with a ground position")
-    num_written_tracks: Count = column("Of these, in the tables (at most 200,000, evenly taken)")
-    complete: bool = column("Whether that is all")
+    num_written_tracks: Count = column("Of these, in the tables (at most 200,000, evenly sampled)")
+    complete: bool = column("Whether these are all")
 
 
 class StageEntry(Record):
@@ -86,29 +86,29 @@ class Summary(Record):
     """summary.json of a run."""
 
     schema: int = column("Version of this description", const=SCHEMA)
-    barpc: str = column("Release")
-    kind: Literal["adjust", "check", "match"] = column("Whether cameras were adjusted, looked at, or only tied")
-    status: Literal["good", "look", "bad"] = column("The verdict on the whole")
+    barpc: str = column("Release of barpc")
+    kind: Literal["adjust", "check", "match"] = column("Whether cameras were adjusted, checked, or only matched")
+    status: Literal["good", "look", "bad"] = column("The verdict on the run")
     headline: str = column("The verdict in a sentence")
-    verdict: tuple[str, ...] = column("What was reached, what is unknown, what needs a look")
-    reasons: tuple[str, ...] = column("Those of its sentences that say why it is not good")
+    verdict: tuple[str, ...] = column("Sentences: results, uncertainty, reservations")
+    reasons: tuple[str, ...] = column("The reservations among them")
     passed: bool = column("Whether it is good: no image, point or file has a reservation (exit code 0, else 3)")
     altitude_m: Number = column("Median altitude of the tie points", ABOVE)
     views: tuple[ViewEntry, ...] = column("The images", minItems=1)
-    pairs: tuple[PairEntry, ...] = column("Pairs with tie points in common")
+    pairs: tuple[PairEntry, ...] = column("Pairs with common tie points")
     left_out: tuple[LeftOutEntry, ...] = column("Files that were left out")
     tracks: TracksEntry = column("Tie points")
-    tables: TablesEntry = column("What the tables hold")
-    scene: SceneEntry | None = column("The block as a whole; null for a check")
+    tables: TablesEntry = column("Contents of the tables")
+    scene: SceneEntry | None = column("The block; null for a check")
     gcps: tuple[GcpEntry, ...] = column("Ground control")
-    check_points: tuple[CheckPointEntry, ...] = column("Points that stayed out of the adjustment")
+    check_points: tuple[CheckPointEntry, ...] = column("Check points, which the adjustment did not use")
     options: Mapping[str, _Value | Mapping[str, _Value | Mapping[str, _Value]]] | None = column("Options of the run")
     versions: Mapping[str, str] = column("Versions of Python and packages")
-    control_test: ControlTestEntry | None = column("The residuals of control, each tested", default=None)
+    control_test: ControlTestEntry | None = column("Test of the residuals of control", default=None)
     reference: ReferenceEntry | None = column("A reference orthoimage, where one was given", default=None)
-    inputs: tuple[InputEntry, ...] | None = column("Every file that was read, as `barpc verify` asks", default=None)
-    outputs: tuple[OutputEntry, ...] | None = column("Every file written but this and the report", default=None)
-    out_dir: str | None = column("Where results are; not in the file", default=None)
+    inputs: tuple[InputEntry, ...] | None = column("Every input file, for `barpc verify`", default=None)
+    outputs: tuple[OutputEntry, ...] | None = column("Every output file but this and the report", default=None)
+    out_dir: str | None = column("Folder of the results; not in the file", default=None)
     stages: tuple[StageEntry, ...] | None = column("Stages of the run; not in the file", default=None)
 
     def __repr__(self) -> str:
@@ -132,13 +132,13 @@ def published_schema() -> dict[str, Any]:
 
 
 def _versions() -> dict[str, str]:
-    """Return the versions of the libraries that computed, as they say them."""
+    """Return the versions of the libraries in use."""
     names = {"numpy": "numpy", "scipy": "scipy", "cv2": "opencv", "rasterio": "rasterio", "shapely": "shapely"}
     return {name: str(sys.modules[module].__version__) for module, name in names.items() if module in sys.modules}
 
 
 def measure_run(run: Run) -> Summary:
-    """Return the summary of a run, without the verdict on it. Numbers may be NaN here."""
+    """Return the summary of a run without its verdict; numbers may be NaN."""
     usable, written = int(np.isfinite(run.ground).all(axis=1).sum()), len(run.written_tracks)
     lengths = np.bincount(np.bincount(run.tracks.point))
     return Summary(

@@ -1,4 +1,4 @@
-"""The block as a whole: where it went, what holds it, what its images cannot tell, what else explains tie points."""
+"""The block: its shift, datum shares and weak modes, and the explanations of its residuals."""
 
 from __future__ import annotations
 
@@ -33,189 +33,201 @@ MODES = {
     "bend east": "heights may be bent: by {0} from the middle of the scene to its eastern and western edges",
     "bend north": "heights may be bent: by {0} from the middle of the scene to its northern and southern edges",
 }
-"""Motion of the scene -> in words."""
+"""Motion of the scene -> its sentence."""
 _EXPLANATION_SENTENCES = {
-    STRIP: "{axis} {first:.0f}-{last:.0f} of {image} lie {size:.2f} px off the rest of it",
-    FADE: "rows of {image} lie {size:.2f} px off at row {origin:.0f}, which fades within {length:.0f} rows",
-    TRANSIENT: "rows at the {end} of all images lie off, by up to {size:.2f} px, which fades within {length:.0f} rows",
-    WANDER: "rows of {image} wander by {size:.2f} px",
-    SWING: "rows of {image} swing by {least}{size:.2f} px every {period:.0f} rows",
+    STRIP: "{axis} {first:.0f}-{last:.0f} of {image} are displaced by {size:.2f} px",
+    FADE: "rows of {image} are displaced by {size:.2f} px at row {origin:.0f}, decaying in {length:.0f} rows",
+    TRANSIENT: "rows at the {end} of all images are displaced by up to {size:.2f} px, decaying in {length:.0f} rows",
+    WANDER: "rows of {image} have a low-frequency displacement of {size:.2f} px",
+    SWING: "rows of {image} have a sinusoidal displacement of {least}{size:.2f} px with a period of {period:.0f} rows",
     MOVING: "{share:.0f} % of the tie points{side} move together (a cloud, water or shadows?), by {metres:.2g} m from "
-    "{between[0]} to {between[1]} beside what may be their height, and took no part",
+    "{between[0]} to {between[1]} apart from an effect of height, and were excluded",
 }
 EXPLANATION_WORDS = {
-    STRIP: "rows or columns of an image lie off",
-    FADE: "rows of an image lie off and less and less",
-    TRANSIENT: "rows at an end of all images lie off and less and less",
-    WANDER: "rows of an image wander",
-    SWING: "rows of an image swing",
-    MOVING: "tie points move together",
+    STRIP: "displaced rows or columns of an image",
+    FADE: "a decaying displacement of the rows of an image",
+    TRANSIENT: "a decaying displacement at one end of all images",
+    WANDER: "a low-frequency displacement of the rows of an image",
+    SWING: "a sinusoidal displacement of the rows of an image",
+    MOVING: "moving objects",
 }
-"""Explanation -> what it is, in words."""
+"""Explanation -> its noun."""
 
 
 class ModeEntry(Record):
-    """A motion of the scene that the images cannot tell."""
+    """A motion of the scene that the images determine poorly."""
 
     sigma_m: Number = column("Posterior standard deviation", "m")
-    meaning: str = column("Which motion", enum=list(MODES))
+    meaning: str = column("The motion", enum=list(MODES))
     motion_m: tuple[Number, ...] = column(
-        "All motions where this one is off by that: east, north, up, tilts, turn, scale, twist, bending",
+        "All motions for an error of this one by sigma_m: east, north, up, tilts, turn, scale, twist, bending",
         "m",
         minItems=7,
         maxItems=len(MOTIONS),
     )
-    words: str = column("The same in words", minLength=1)
+    words: str = column("Its sentence", minLength=1)
 
 
 class DatumEntry(Record):
     """Sources of a motion of the scene, as shares of its information. Tie points have none."""
 
     part: str = column("Motion of the scene", head="motion", enum=list(MODES))
-    sigma_m: Number = column("Posterior standard deviation (of turns: at the edge)", "m", "known to", ".2f")
+    sigma_m: Number = column("Posterior standard deviation (of turns: at the edge)", "m", "sigma", ".2f")
     cameras: Number = column("Accuracies of the cameras as delivered", head="cameras", form=".0%")
     earlier_run: Number = column("The earlier run", head="earlier run", form=".0%")
-    fixed_views: Number = column("Views that are fixed", head="fixed views", form=".0%")
+    fixed_views: Number = column("Fixed views", head="fixed views", form=".0%")
     gcps: Number = column("Ground control points", head="GCPs", form=".0%")
     heights: Number = column("The DEM, or altitudes assumed", head="heights", form=".0%")
     reference: Number = column("A reference orthoimage", head="reference", form=".0%", default=None)
-    altimetry: Number = column("Heights without image coordinates", head="altimetry", form=".0%", default=None)
+    altimetry: Number = column(
+        "Altimetry: heights without image coordinates", head="altimetry", form=".0%", default=None
+    )
 
     @classmethod
     def columns(cls, entries: Sequence[DatumEntry]) -> str:
-        """Return the columns of a table: sources that tell nothing of any motion are left out."""
+        """Return the columns of a table, without the sources that contribute to no motion."""
         part, sigma, *sources = cls.__dataclass_fields__
         told = [name for name in sources if any((getattr(one, name) or 0.0) >= 0.005 for one in entries)]
         return " ".join([part, sigma, *told])
 
 
 class DemEntry(Record):
-    """What the DEM did, and how the tie points lie to it."""
+    """The constraint by the DEM, and the offset of the tie points from it."""
 
-    num_held: Count = column("Tie points that it holds")
+    num_held: Count = column("Tie points that it constrains")
     num_known: Count = column("Tie points where it has a height")
-    num_tracks: Count = column("Tie points that count")
+    num_tracks: Count = column("Tie points in use")
     offset_m: Number = column("Median of the tie points' altitudes minus the DEM's", "m")
     spread_m: Number = column("1.4826 times the median absolute deviation of these", "m")
-    sigma_m: Number = column("Standard deviation of single heights, where the tie points tell", "m", default=None)
-    alike: Number = column("As many heights are worth one, as their errors resemble each other", default=None)
+    sigma_m: Number = column("Standard deviation of single heights, estimated from the tie points", "m", default=None)
+    correlated_per_independent: Number = column("Number of correlated heights that count as one", default=None)
     relief: Number = column("The DEM's relief over the tie points'", default=None)
 
 
 class AltimetryEntry(Record):
-    """What heights without image coordinates did."""
+    """The constraint by altimetry: heights without image coordinates."""
 
     num_given: Count = column("Heights in the files")
-    num_near: Count = column("Those looked at that lie on the surface of the tie points")
-    num_agreeing: Count = column("Those of them that agree on where the scene lies")
+    num_near: Count = column("Of these, those tested that lie on the surface of the tie points")
+    num_agreeing: Count = column("Of these, those that agree on the position of the scene")
     spread_m: Number = column("1.4826 times the median absolute difference of those to the surface", "m")
-    expected_m: Number = column("What was expected of it by the accuracies stated and the surface", "m")
-    motion_enu_m: Vector = column("By how much they ask the scene to move, once tie points agree", "m")
-    sigma_enu_m: Vector = column("How well they know that by themselves", "m")
-    why_not: str = column("Why they hold nothing; empty where they hold the scene")
+    expected_m: Number = column("The same as expected from the stated accuracies and the surface", "m")
+    motion_enu_m: Vector = column("Shift of the scene by altimetry after the tie points agree", "m")
+    sigma_enu_m: Vector = column("Its standard deviation from altimetry alone", "m")
+    why_not: str = column("Why they were not used; empty where they constrain the scene")
 
 
-class AskedEntry(Record):
-    """What was left in the image with most of it, before more was solved for."""
+class JustificationEntry(Record):
+    """Residuals of the simpler model, in the image where they are largest, that justified more parameters."""
 
     image: str = column("View")
-    smooth_px: Number = column("RMS of what was smooth in its residuals, less noise", "px")
-    smooth_p: Number = column("Probability that noise alone leaves as much (F test)")
-    shared_px: Number = column("Error that an observation shared with its neighbour", "px")
-    num_images: Count = column("Views in which the F test's probability was below 1e-4")
+    systematic_px: Number = column("RMS of its systematic residuals, noise subtracted", "px")
+    systematic_p: Number = column("Probability of as much by noise alone (F test)")
+    neighbour_correlated_px: Number = column("Error correlated between neighbouring observations", "px")
+    num_images: Count = column("Views with a probability of the F test below 1e-4")
 
 
 class ExplanationEntry(Record):
-    """Something that explains tie points, those that were cut among them, better than its rivals."""
+    """A selected hypothesis on the residuals of tie points, rejected ones among them."""
 
     PAGE: ClassVar = "sentence gain gap runner_up"
 
-    name: str = column("What it is", enum=[*_EXPLANATION_SENTENCES, FOREIGN_CAMERA])
-    sentence: str = column("The same in words", head="what explains tie points", minLength=1)
-    image: str | None = column("View; null for what is of no single one")
-    gain: float = column("Logarithm of the evidence, over that without it", "nats", "gain", ".0f")
-    gap: float = column("The same, over the runner-up", "nats", "over the next", ".0f")
-    runner_up: str | None = column("What explains next as much; null for nothing", head="next", default=None)
-    axis: str | None = column("Whether it is of rows or of columns", default=None, enum=[*AXES, None])
+    name: str = column("Its kind", enum=[*_EXPLANATION_SENTENCES, FOREIGN_CAMERA])
+    sentence: str = column("The same as a sentence", head="explanation of residuals", minLength=1)
+    image: str | None = column("View; null where it concerns several")
+    gain: float = column("Logarithm of its evidence over that of the model without it", "nats", "gain", ".0f")
+    gap: float = column("The same over the runner-up", "nats", "over the next", ".0f")
+    runner_up: str | None = column("Kind of the runner-up; null for none", head="next", default=None)
+    axis: str | None = column("Rows or columns", default=None, enum=[*AXES, None])
     first: Number = column("Its first row or column", "px", default=None)
     last: Number = column("Its last row or column", "px", default=None)
-    size_px: Number = column("RMS displacement of what it moves; the amplitude of a swing", "px", default=None)
-    period: Number = column("Rows after which a swing repeats itself", "px", default=None)
-    or_of: tuple[str, ...] | None = column("Views that may be meant as well: ties do not tell which", default=None)
-    share: Number = column("Tie points that move together: part of all of them", default=None)
-    moved_m: Number = column("How far they move on the ground, beside what may be their height", "m", default=None)
+    size_px: Number = column("RMS displacement; of a sinusoid its amplitude", "px", default=None)
+    period: Number = column("Period of a sinusoid in rows", "px", default=None)
+    candidates: tuple[str, ...] | None = column("Other views that tie points cannot tell from this one", default=None)
+    share: Number = column("Share of tie points that move together", default=None)
+    moved_m: Number = column("Their motion on the ground, apart from an effect of height", "m", default=None)
     between: tuple[str, ...] | None = column("From the first of these views to the second", default=None)
-    box: tuple[float, ...] | None = column("West, south, east, north of nine in ten", "deg", default=None)
+    box: tuple[float, ...] | None = column(
+        "West, south, east, north limits of nine in ten of them", "deg", default=None
+    )
 
 
 class LeftEntry(Record):
-    """Rows or columns of an image in which tie points were cut, or are off, more than elsewhere and chance allow."""
+    """Rows or columns of an image with significantly more rejected tie points, or larger residuals, than the rest."""
 
-    PAGE: ClassVar = "image axis first last rejected off_px apart_px gain"
+    PAGE: ClassVar = "image axis first last rejected off_px rejected_median_px gain"
 
     image: str = column("View", head="image")
     axis: str = column("Rows or columns", head="axis", enum=list(AXES))
     first: float = column("The first", "px", "first", ".0f")
     last: float = column("The last", "px", "last", ".0f")
-    rejected: float = column("Share of their tie points that was cut", head="rejected", form=".0%")
-    off_px: float = column("What the others have in common", "px", "off", ".2f")
-    apart_px: float = column("Half of those that were cut contradict the others by more than this", "px", "by", ".2f")
-    gain: float = column("Logarithm of the likelihood, over that of a whole image alike", "nats", "gain", ".0f")
-    moving: bool = column("Whether the share is not of what was cut, but of a group that moves", default=False)
+    rejected: float = column("Share of their tie points that were rejected", head="rejected", form=".0%")
+    off_px: float = column("Common residual of the others", "px", "common", ".2f")
+    rejected_median_px: float = column("Median residual of the rejected ones", "px", "rejected by", ".2f")
+    gain: float = column("Logarithm of the likelihood over that of a uniform image", "nats", "gain", ".0f")
+    moving: bool = column("Whether the share is of a moving group, not of rejected tie points", default=False)
 
 
 class HeldOutEntry(Record):
-    """Rows, columns or a cell of an image in which tie points that took no part are met worse than elsewhere in it."""
+    """Rows, columns or a cell of an image in which check tie points have larger residuals than in the rest."""
 
     PAGE: ClassVar = "sentence count chance"
 
     image: str = column("View")
-    sentence: str = column("The same in words", head="where tie points that took no part are met worse", minLength=1)
+    sentence: str = column("The same as a sentence", head="larger residuals of check tie points", minLength=1)
     columns: tuple[float, float] | None = column("From, to; null for all", "px")
     rows: tuple[float, float] | None = column("From, to; null for all", "px")
-    count: Count = column("Observations there that were looked at", head="looked at")
-    far: float = column("Share of them that lies far off by the same")
-    off_px: float = column("What the far ones are off by, by their median; else what the near ones share", "px")
-    chance: float = column("Chance of as much anywhere, at most", head="p below", form=".0e")
+    count: Count = column("Observations tested there", head="tested")
+    far: float = column("Share of them with the same large residual")
+    off_px: float = column("Median of the large residuals; without any the common residual", "px")
+    chance: float = column("Probability of as much anywhere by chance, at most", head="p below", form=".0e")
 
 
 class SceneEntry(Record):
-    """The block as a whole."""
+    """The block."""
 
     MORE: ClassVar = Any  # of earlier releases
 
-    shift_enu_m: Vector = column("Mean move of the tie points, east, north, up", "m")
-    sigma_enu_m: Vector = column("Posterior standard deviation of the scene's place", "m")
+    shift_enu_m: Vector = column("Mean shift of the tie points, east, north, up", "m")
+    sigma_enu_m: Vector = column("Posterior standard deviation of the scene's position", "m")
     radius_m: Number = column(
-        "RMS distance of the tie points from their middle: the edge of tilts, turn and scale", "m"
+        "RMS distance of the tie points from their centre: the edge of tilts, turn and scale", "m"
     )
-    weakest_modes: tuple[ModeEntry, ...] = column("What the images cannot tell, the weakest first")
+    weakest_modes: tuple[ModeEntry, ...] = column("Poorly determined motions, the weakest first")
     noise: Number = column("Observed over stated standard deviation of the observations")
     drift_degree: Count = column("Degree of the rotation in the row")
     drift_sigma_m: tuple[Number, ...] = column("Its standard deviation at the first and last row, by degree", "m")
     prior_ratio: Number = column("Squared corrections over stated variances and degrees of freedom")
     cost_history: tuple[Number, ...] = column("Sum of squared whitened residuals, by linearisation")
-    num_held_in_height: Count = column("Tie points seen under too small an angle, held in height")
-    gcp_residuals_enu_m: tuple[Vector, ...] = column("Adjusted GCPs minus their given place", "m")
-    solver: str = column("What the solver did")
-    prior_shared: Number = column("Times by which stated accuracies were widened, as shared", default=1.0)
+    num_held_in_height: Count = column("Tie points with too small a convergence angle, constrained in height")
+    gcp_residuals_enu_m: tuple[Vector, ...] = column("Adjusted minus given position of the GCPs", "m")
+    solver: str = column("Termination of the solver")
+    prior_shared: Number = column(
+        "Factor by which stated accuracies were widened as errors common to all images", default=1.0
+    )
     datum: tuple[DatumEntry, ...] = column("Sources of the scene's position and shape", default=())
-    dem: DemEntry | None = column("What the DEM did; null without one", default=None)
-    altimetry: AltimetryEntry | None = column("What heights alone did", default=None)
-    gcp_scatter: Number = column("RMS residual of the GCPs used over what their accuracies let expect", default=None)
-    num_held_out: Count = column("Observations that took no part, to be measured on", default=0)
-    model: str = column("Unknowns of each view that were solved for", default="")
-    drift_asked: AskedEntry | None = column("What a drift of one degree less left, where one was added", default=None)
-    jitter_asked: AskedEntry | None = column(
-        "What was left without splines and steps, where these follow", default=None
+    dem: DemEntry | None = column("Constraint by the DEM; null without one", default=None)
+    altimetry: AltimetryEntry | None = column("Constraint by altimetry; null without any", default=None)
+    gcp_scatter: Number = column(
+        "RMS residual of the GCPs used over its expectation from their accuracies", default=None
     )
-    in_space_px: Number = column("What a rotation and translation left where an affine was taken", "px", default=None)
+    num_held_out: Count = column("Observations of check tie points, kept out of the adjustment", default=0)
+    model: str = column("Unknowns of each view", default="")
+    drift_justification: JustificationEntry | None = column(
+        "Residuals with a drift of one degree less, where one was added", default=None
+    )
+    jitter_justification: JustificationEntry | None = column(
+        "Residuals without splines and steps, where these were added", default=None
+    )
+    rigid_model_px: Number = column(
+        "RMS of check tie points with a rotation and translation, where an affine was selected", "px", default=None
+    )
     explanations: tuple[ExplanationEntry, ...] = column(
-        "What explains tie points beside the cameras, the first first", default=()
+        "Hypotheses on residuals in the order of their selection", default=()
     )
-    left: tuple[LeftEntry, ...] = column("Rows and columns that stand out at the end", default=())
+    left: tuple[LeftEntry, ...] = column("Rows and columns that are inconsistent with the rest in the end", default=())
     held_out_places: tuple[HeldOutEntry, ...] | None = column(
-        "Where tie points that took no part are met worse; null: not tested", default=None
+        "Regions with larger residuals of check tie points; null: not tested", default=None
     )
 
 
@@ -226,7 +238,7 @@ _DEM = attrgetter("held", "known", "total", "offset", "spread", "sigma", "alike"
 
 
 def measure_scene(run: Run) -> SceneEntry | None:
-    """Return the block as a whole; None for a check."""
+    """Return the record of the block; None for a check."""
     adjustment = run.adjustment
     if adjustment is None:
         return None
@@ -249,9 +261,9 @@ def measure_scene(run: Run) -> SceneEntry | None:
         noise=adjustment.noise,
         num_held_out=int(np.count_nonzero(adjustment.held_out)),
         model=adjustment.cameras.unknowns.model,
-        in_space_px=adjustment.in_space_rms,
-        drift_asked=_asked(adjustment, "drift"),
-        jitter_asked=_asked(adjustment, "jitter"),
+        rigid_model_px=adjustment.in_space_rms,
+        drift_justification=_justification(adjustment, "drift"),
+        jitter_justification=_justification(adjustment, "jitter"),
         drift_degree=adjustment.cameras.unknowns.drift,
         drift_sigma_m=tuple(prior.drift_sigma),
         prior_ratio=prior.ratio,
@@ -266,24 +278,24 @@ def measure_scene(run: Run) -> SceneEntry | None:
     )
 
 
-def _asked(adjustment: Adjustment, what: str) -> AskedEntry | None:
+def _justification(adjustment: Adjustment, what: str) -> JustificationEntry | None:
     test = adjustment.asked.get(what)
     if test is None:
         return None
     found = test.found(0.0)
     i = int(np.argmax(np.maximum(np.where(found, test.rms, 0.0), test.shared)))
     rms, significance, shared = (float(values[i]) for values in (test.rms, test.significance, test.shared))
-    return AskedEntry(adjustment.names[i], rms, significance, shared, int(found.sum()))
+    return JustificationEntry(adjustment.names[i], rms, significance, shared, int(found.sum()))
 
 
 def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
-    """Return what was taken, the first first."""
+    """Return the selected hypotheses in their order."""
     found, names = [], adjustment.names
     if (apart := adjustment.apart) is not None and apart.clear and np.isfinite(apart.gain):
         other = None if apart.runner_up is None else f"{FOREIGN_CAMERA}: {names[apart.runner_up]}"
         image = names[apart.view]
-        what = "many tie points of {} are wrong, or its RPC is" if apart.look.as_stated else "the RPC of {} is"
-        sentence = f"{what.format(image)} not its own: {strangeness(apart)}"
+        what = "many tie points of {} are wrong, or its RPC" if apart.look.as_stated else "the RPC of {}"
+        sentence = f"{what.format(image)} does not match the image: {strangeness(apart)}"
         found.append(ExplanationEntry(FOREIGN_CAMERA, sentence, image, apart.gain, apart.gap, other))
     settling = [one for one in adjustment.findings if one.kind == TRANSIENT]
     found += [_explanation_entry(one, adjustment) for one in adjustment.findings if one not in settling[1:]]
@@ -291,20 +303,20 @@ def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
 
 
 def _explanation_entry(one: Finding, adjustment: Adjustment) -> ExplanationEntry:
-    """Return an explanation; of a settling of all images, the largest is told of."""
+    """Return the record of a hypothesis; of a transient in all images, with its largest displacement."""
     names = adjustment.names
-    # of two images each is only seen against the other
+    # two images only determine a relative displacement
     of_pair = len(names) == 2 and one.motion is None
     image, others = names[one.view], tuple(names[v] for v in ((1 - one.view,) if of_pair else one.or_of))
     of_all = one.motion is not None or one.kind == TRANSIENT
     alike = [each for each in adjustment.findings if each.kind == TRANSIENT] if one.kind == TRANSIENT else [one]
     size = max(float(np.hypot(*each.size)) for each in alike)
-    fields: dict[str, Any] = {"size_px": size, "period": one.period, "or_of": None if of_all else others or None}
-    # two images do not tell what there is along their epipolar lines
+    fields: dict[str, Any] = {"size_px": size, "period": one.period, "candidates": None if of_all else others or None}
+    # two images do not determine displacements along their epipolar lines
     words: dict[str, Any] = {"size": size, "least": "at least " if len(names) == 2 else "", **fields}
     words["image"] = " or ".join([image, *others])
     if others and one.kind in (STRIP, FADE):  # places are those of the first
-        words["image"] = f"{image} (or what {' or '.join(others)} shows of them)"
+        words["image"] = f"{image} (or the same ground in {' or '.join(others)})"
     if one.motion is not None:
         box = one.motion.box
         middle = wrap_longitude(box[0] + (box[2] - box[0]) % 360.0 / 2.0), (box[1] + box[3]) / 2.0
@@ -332,30 +344,30 @@ def _explanation_entry(one: Finding, adjustment: Adjustment) -> ExplanationEntry
 
 
 def strangeness(apart: ForeignCamera) -> str:
-    """Return what is known of a view whose RPC is not its own."""
-    look, met = apart.look, "it would agree with the other images as well as is stated of it"
+    """Return the diagnosis of a foreign camera in words."""
+    look, met = apart.look, "it would agree with the other images within its stated accuracy"
     if look.swapped:
-        return f"with its axes swapped, samples taken for lines, {met}"
+        return f"with its axes swapped (samples for lines) {met}"
     if look.offset is not None:
         col, row = 0.0 - look.offset
-        height = "" if look.height is None else f", or with its heights moved by {-look.height:+.0f} m,"
-        return f"moved by {col:+.1f} columns and {row:+.1f} rows{height} {met}"
+        height = "" if look.height is None else f", or its heights by {-look.height:+.0f} m,"
+        return f"shifted by {col:+.1f} columns and {row:+.1f} rows{height} {met}"
     part = "all" if apart.contradicted == 1.0 else f"more than {int(100 * apart.contradicted)} %"
-    where = "; as delivered it meets them to what is stated of it" if look.as_stated else ""
+    where = "; as delivered it agrees with them within its stated accuracy" if look.as_stated else ""
     return (
-        f"{part} of its tie points contradict those of the other images, wherever it is moved or turned to, and these "
+        f"{part} of its tie points contradict those of the other images for every shift and rotation, and these "
         f"agree without it{where}"
     )
 
 
 def left_entries(adjustment: Adjustment) -> tuple[LeftEntry, ...]:
-    """Return where something stands out at the end, the most first."""
+    """Return the regions that are inconsistent with the rest, the most significant first."""
     found = [(adjustment.names[v], AXES[axis], *rest) for v, axis, *rest in map(_REGION_FIELDS, adjustment.left)]
     return tuple(LeftEntry(image, axis, start, stop - 1.0, *rest) for image, axis, start, stop, *rest in found)
 
 
 def held_out_places(places: Sequence[ImageRegion], names: Sequence[str]) -> tuple[HeldOutEntry, ...]:
-    """Return where tie points that took no part are met worse, the surest first."""
+    """Return the regions with larger residuals of check tie points, the most significant first."""
     found = []
     for one in places:
         ends = [
@@ -363,10 +375,10 @@ def held_out_places(places: Sequence[ImageRegion], names: Sequence[str]) -> tupl
             for axis, side in (("rows", one.rows), ("columns", one.columns))
             if side is not None
         ]
-        what = f"lie {one.off:.2f} px off in common"
+        what = f"share a residual of {one.off:.2f} px"
         if one.far:
             what = f"contradict the cameras, {100 * one.far:.0f} % by the same {one.off:.2f} px"
         place = f"{', '.join(ends)} of {names[one.view]}"
-        sentence = f"{place[0].upper()}{place[1:]}: tie points there that took no part {what}"
+        sentence = f"{place[0].upper()}{place[1:]}: check tie points there {what}"
         found.append(HeldOutEntry(names[one.view], sentence, *_HELD_OUT(one)))
     return tuple(found)

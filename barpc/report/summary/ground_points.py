@@ -1,4 +1,4 @@
-"""Points whose place is given: control, a reference, checks; what is said of each, and how it is measured."""
+"""Points of given position (GCPs, reference, check points): their records, and how these are measured."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ GCP_CAPTION = "GCP residuals, each predicted without that GCP (prediction minus 
 
 
 class KnownPoint(Record):
-    """A point whose place is given."""
+    """A point of given position."""
 
     name: str = column("Name")
     lon: float = column("Longitude", "deg", minimum=-540, maximum=540)
@@ -28,7 +28,7 @@ class KnownPoint(Record):
     alt_m: float = column("Altitude", ABOVE)
 
 
-_MISS = "Found minus given place, east, north, up; null where fewer than two views see it"
+_MISS = "Intersected minus given position, east, north, up; null with fewer than two views"
 
 
 class GcpEntry(KnownPoint):
@@ -39,70 +39,70 @@ class GcpEntry(KnownPoint):
     TERMINAL: ClassVar = "GCP status residual_enu_m residual_px w"
 
     sigma_m: tuple[float, float, float] = column("Stated", "m", "sigma east, north, up", ".2g")
-    residual_enu_m: Vector = column("Place by the others minus given", "m", ("east", "north", "up"), "+.3f")
-    used: bool = column("Whether it holds the block", default=True)
+    residual_enu_m: Vector = column("Position predicted without it, minus given", "m", ("east", "north", "up"), "+.3f")
+    used: bool = column("Whether it constrains the block", default=True)
     status: Literal["used", "contradicts", "rejected", "undecided", "not seen"] = column(
-        "contradicts: used, off by more than 4 sigma; rejected: the others agree without it; undecided: weighs as much",
+        "contradicts: used, residual above 4 sigma; rejected: the others contradict it; undecided: as many against it",
         head="verdict",
         default="used",
     )
-    images: tuple[str, ...] = column("Views that show it", default=())
+    images: tuple[str, ...] = column("Views with an observation of it", default=())
     w: Number = column("Largest component of the residual over its standard deviation", "", "w", ".1f", default=None)
-    redundancy: Number = column("How far the others can tell, 0 to 1", default=None)
-    residual_px: Number = column("The residual in the images that show it, RMS", "px", "in images", ".2f", default=None)
+    redundancy: Number = column("Redundancy number, 0 to 1: how far the others control it", default=None)
+    residual_px: Number = column("RMS of the residual in its images", "px", "in images", ".2f", default=None)
 
     image_w: Number = column("Largest w in the images (Baarda)", "", "w in images", ".1f", default=None)
-    image_w_view: str | None = column("View that it is in", head="largest in", default=None)
+    image_w_view: str | None = column("View of the largest w", head="largest in", default=None)
 
     @classmethod
     def worst(cls, points: Sequence[GcpEntry], most: int) -> list[GcpEntry]:
-        """At most so many points, in their order: those that are not used, and of the others the largest w."""
+        """Return at most `most` points in their order: first those not used, then those of the largest w."""
         order = sorted(points, key=lambda point: (point.used, -(point.w or 0.0)))[:most]
         return [point for point in points if any(point is one for one in order)]
 
 
 class ControlTestEntry(Record):
-    """The residuals of ground control, a reference's points too, in the images, each in units of its own deviation."""
+    """Test of the image residuals of GCPs and reference points, each over its standard deviation."""
 
     num: Count = column("Observations tested")
-    critical: float = column("What chance exceeds once in a thousand coordinates")
-    num_beyond: Count = column("Observations beyond that in a coordinate")
-    expected: float = column("As many chance alone would put beyond it")
-    largest_w: Number = column("The largest (Baarda's w)")
-    image: str = column("The view that it is in")
-    point: str = column("The point that it is of")
+    critical: float = column("Critical value, exceeded by chance once in a thousand coordinates")
+    num_beyond: Count = column("Observations beyond it in a coordinate")
+    expected: float = column("Observations expected beyond it by chance")
+    largest_w: Number = column("The largest w (Baarda)")
+    image: str = column("View of the largest w")
+    point: str = column("Point of the largest w")
 
 
 class ReferenceViewEntry(Record):
-    """What a reference says of an image."""
+    """Matches of a reference in an image."""
 
     PAGE: ClassVar = "name peak offset_en_m num_tried num_passed num_points scatter_m"
 
     name: str = column("View", head="image")
-    peak: Number = column("Standard deviations by which one shift stands out", "", "peak", ".1f")
+    peak: Number = column("Height of the correlation peak in standard deviations", "", "peak", ".1f")
     offset_en_m: Pixel | None = column(
-        "Offset of the delivered camera, east, north", "m", ("off east", "north"), "+.2f"
+        "Offset of the delivered camera, east, north", "m", ("offset east", "north"), "+.2f"
     )
-    num_tried: Count = column("Points looked for", head="points tried")
-    num_passed: Count = column("That beat their decoy and came back", head="found")
-    num_points: Count = column("That agree with each other and held the block", head="used")
-    scatter_m: Number = column("Standard deviation of those across the line of sight", "m", "scatter", ".2f")
+    num_tried: Count = column("Points searched for", head="points tried")
+    num_passed: Count = column("Matched better than a decoy, forwards and backwards", head="matched")
+    num_points: Count = column("Consistent ones, which constrain the block", head="used")
+    scatter_m: Number = column("Standard deviation of these across the line of sight", "m", "scatter", ".2f")
 
 
 class ReferenceEntry(Record):
     """A reference orthoimage."""
 
-    used: bool = column("Whether it holds the block")
-    step_m: Number = column("Resolution at which it was matched", "m")
-    sigma_m: Number = column("Standard deviation of its own place, along an axis", "m")
-    num_points: Count = column("Points on the ground that hold the block")
-    views: tuple[ReferenceViewEntry, ...] = column("What it says of each image")
+    used: bool = column("Whether it constrains the block")
+    step_m: Number = column("Resolution of the matches", "m")
+    sigma_m: Number = column("Standard deviation of its own position along an axis", "m")
+    num_points: Count = column("Ground points that constrain the block")
+    views: tuple[ReferenceViewEntry, ...] = column("Its matches in each image")
 
 
 class SeenEntry(Record):
-    """Where a check point is seen."""
+    """Observation of a check point in a view."""
 
-    view: str = column("Name")
+    view: str = column("Name of the view")
     residual_px: Pixel = column("Projected minus observed col, row", "px")
 
 
@@ -111,7 +111,7 @@ def _gcp_rms(point: CheckPointEntry) -> float | None:
 
 
 class CheckPointEntry(KnownPoint):
-    """A known point that stayed out of the adjustment."""
+    """A check point, which the adjustment did not use."""
 
     OWN: ClassVar = {
         "point": Column("check point", lambda point: point.name),
@@ -121,19 +121,19 @@ class CheckPointEntry(KnownPoint):
     PAGE: ClassVar = "point images rms residual_enu_m"
 
     residual_enu_m: Vector = column(_MISS, "m", ("east", "north", "up"), "+.3f")
-    observations: tuple[SeenEntry, ...] = column("Where it is seen")
+    observations: tuple[SeenEntry, ...] = column("Its observations")
 
     @property
     def seen(self) -> list[Any]:
-        """Residuals in the images that see it."""
+        """Finite residuals in its images."""
         return [seen.residual_px for seen in self.observations if None not in seen.residual_px]
 
 
-# --- how they are measured --------------------------------------------------------------------------------
+# --- measurement ------------------------------------------------------------------------------------------
 
 
 def measure_gcps(run: Run) -> tuple[GcpEntry, ...]:
-    """Return the ground control, and what the adjustment said of it."""
+    """Return the records of the GCPs with their test in the adjustment."""
     points = run.gcps
     if points is None:
         return ()
@@ -163,7 +163,7 @@ def measure_gcps(run: Run) -> tuple[GcpEntry, ...]:
 
 
 def measure_control(run: Run) -> ControlTestEntry | None:
-    """Return every residual of control in the images in units of its own deviation; None without any."""
+    """Return the test of all image residuals of control; None without any."""
     tests = run.control_tests
     if not tests:
         return None
@@ -176,13 +176,13 @@ def measure_control(run: Run) -> ControlTestEntry | None:
 
 
 def _indices_by_number(index: IntArray, num: int) -> list[IntArray]:
-    """Return the places in `index` (n,) of each number below `num`."""
+    """Return the positions in `index` (n,) of each number below `num`."""
     order = np.argsort(index, kind="stable")
     return np.split(order, np.searchsorted(index[order], np.arange(1, num)))[:num]
 
 
 def _shift_in_images(run: Run, given: Array, views: IntArray, residual: Array) -> float:
-    """Return how far a residual (3,), east, north, up [m], moves a ground point in its images, RMS [px]."""
+    """Return the RMS image shift [px] of a ground point by its residual (3,) east, north, up [m]."""
     if run.after is None or not np.isfinite(residual).all():
         return float("nan")
     moved = ground_from_ecef(ecef_from_ground(given) + residual @ enu_basis(given))
@@ -191,7 +191,7 @@ def _shift_in_images(run: Run, given: Array, views: IntArray, residual: Array) -
 
 
 def measure_reference(run: Run) -> ReferenceEntry | None:
-    """Return what an orthoimage said of each image; None without one."""
+    """Return the record of the reference orthoimage; None without one."""
     found, adjustment = run.reference, run.adjustment
     if found is None:
         return None
@@ -210,7 +210,7 @@ def measure_reference(run: Run) -> ReferenceEntry | None:
 
 
 def measure_check_points(run: Run) -> tuple[CheckPointEntry, ...]:
-    """Return the points that stayed out of the adjustment: residuals in images, and the ground error."""
+    """Return the records of the check points: residuals in images and on the ground."""
     points = run.check_points
     if points is None:
         return ()

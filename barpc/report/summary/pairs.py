@@ -1,4 +1,4 @@
-"""The pairs of a run: what is said of each, and how it is measured."""
+"""The pairs of a run: their records, and how these are measured."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _offset_cell(offset: OffsetEntry | None) -> Cell | None:
 
 
 class PairEntry(Record):
-    """Two images with tie points in common."""
+    """Two images with common tie points."""
 
     OWN: ClassVar = {
         "pair": Column("pair", lambda pair: f"{pair.a} - {pair.b}"),
@@ -57,20 +57,24 @@ class PairEntry(Record):
 
     a: str = column("First view")
     b: str = column("Second view")
-    num_matches: Count = column("Tie points that both see", head="matches")
+    num_matches: Count = column("Common tie points", head="matches")
     convergence_deg: Number = column("Angle between the lines of sight", "deg", "angle", ".1f")
     base_to_height: Number = column("B/H along the lines of sight", head="B/H", form=".2f")
-    height_m_per_px: Number = column("Height whose parallax is a pixel", "m", "height per px", ".3g")
+    height_m_per_px: Number = column("Height of one pixel of parallax", "m", "height per px", ".3g")
     epipolar_before: OffsetEntry | None = column("Through the delivered cameras")
     epipolar_after: OffsetEntry | None = column("Through the new cameras")
-    matching: Mapping[str, Any] | None = column("What became of it in matching; null: not matched")
-    tied_by: str | None = column("Matcher that tied it, whether loosened", head="tied by", default=None)
-    decoy_share: Number = column("Share false, by bands without true matches", head="false", form=".1%", default=None)
+    matching: Mapping[str, Any] | None = column("Report of the matcher; null: not matched")
+    tied_by: str | None = column(
+        "Matcher that succeeded, and whether its thresholds were relaxed", head="tied by", default=None
+    )
+    decoy_share: Number = column(
+        "Share of false matches, by search bands without true ones", head="false", form=".1%", default=None
+    )
     noise_px: Number = column(
         "Spread across epipolar lines before registration", "px", "as matched", ".2f", default=None
     )
-    beaten: tuple[str, ...] = column("Attempts that found fewer: matcher, matches of those wanted", default=())
-    chosen_by: str | None = column("Why it was tried: overlap and angle, same date, listed, ...", default=None)
+    beaten: tuple[str, ...] = column("Attempts with too few matches: matcher, matches of those required", default=())
+    chosen_by: str | None = column("Reason of its selection: overlap and angle, same date, listed, ...", default=None)
 
     @property
     def offset_rms(self) -> tuple[float | None, float | None]:
@@ -79,13 +83,13 @@ class PairEntry(Record):
         return None if before is None else before.rms, None if after is None else after.rms
 
 
-# --- how they are measured --------------------------------------------------------------------------------
+# --- measurement ------------------------------------------------------------------------------------------
 
 _PAIR_REPORT_FIELDS = attrgetter("means", "control_share", "spread", "beaten", "reason")
 
 
 def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
-    """Return every two images with tie points in common."""
+    """Return the record of every pair of images with common tie points."""
     reports = {report.names: report for report in run.matched}
     before = _pair_offsets(run, run.before, ground_from_ecef(run.ties_before.points)[:, 2])
     after = [None] * len(before) if run.after is None else _pair_offsets(run, run.after, run.ground[:, 2])
@@ -99,7 +103,7 @@ def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
 
 
 def _pair_geometry(run: Run) -> list[list[float]]:
-    """Return the medians over a hundred of each pair's points: angle [deg], B/H, height of a pixel [m]."""
+    """Return the medians over a hundred points of each pair: angle [deg], B/H, height per pixel [m]."""
     picks = [slice(None, None, max(1, len(ties.a) // 100)) for ties in run.pairs]
     a, b, pair = _picked_matches(run, picks)
     seen = np.isfinite(run.ground[run.tracks.point[a]]).all(axis=1)
@@ -118,8 +122,8 @@ def _pair_geometry(run: Run) -> list[list[float]]:
 def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> list[OffsetEntry | None]:
     """Return the epipolar offsets of each pair's matches.
 
-    The tracks' altitudes (P,) [m] through these cameras are so near to where a pair's own rays pass each other that
-    two steps from there arrive.
+    The altitudes (P,) [m] of the tracks through these cameras are near the closest approach of a pair's rays: two steps
+    from there converge.
     """
     counts = [len(ties.a) for ties in run.pairs]
     most = MAX_PER_PAIR
@@ -151,7 +155,7 @@ def _match_parts(
 
 
 def _picked_matches(run: Run, picks: Sequence[slice | IntArray]) -> tuple[IntArray, IntArray, IntArray]:
-    """Of all pairs together, those matches that are picked: their observations in both views, and which pair it is."""
+    """Return the selected matches of all pairs: their observations in both views, and the index of their pair."""
     none = np.empty(0, dtype=np.int64)
     a, b = ([getattr(t, of)[pick] for t, pick in zip(run.pairs, picks, strict=True)] for of in ("a", "b"))
     pair = np.repeat(np.arange(len(a)), [len(rows) for rows in a])

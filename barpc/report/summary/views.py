@@ -1,4 +1,4 @@
-"""The images of a run: what is said of each, and how it is measured; where its camera puts its middle."""
+"""The images of a run: their records, how these are measured, and the accuracy of each image's centre."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ _SPLINE_ROWS = 400  # of an image, over which a spline is averaged
 
 
 class EllipseEntry(Record):
-    """How well a camera tells where a ground point in the middle of its image is, its altitude given."""
+    """Error ellipse of the ground point at the image centre, at a given altitude."""
 
     major_m: Number = column("Larger semi-axis of the one-sigma ellipse", "m", "semi-axis", ".2f")
     minor_m: Number = column("Smaller semi-axis", "m", "other", ".2f")
     azimuth_deg: Number = column("Direction of the larger one, clockwise from north", "deg", "azimuth", ".0f")
-    ce90_m: Number = column("Radius of the circle that holds 90 %", "m", "CE90", ".2f")
+    ce90_m: Number = column("Radius of the circle that contains 90 %", "m", "CE90", ".2f")
 
 
 def moved_in_space(
     model: Corrected, covariance: Array, unknowns: str, ground: Array, seen: tuple[Array, ...] | None = None
 ) -> tuple[Array, Array, EllipseEntry]:
-    """Return how far P_BA moves a ground point near the image's middle (2,) [px], its sigma (2,), and its ellipse.
+    """Return the shift (2,) [px] by P_BA of a ground point near the image centre, its sigma (2,), and its ellipse.
 
     `covariance` (q, q) is of rotation (metres: angle x distance), translation [m], then any drift, which is zero in the
     middle row; `unknowns`: "rotation", "translation" or "rotation+translation"; `ground` (3,): lon, lat [deg], alt [m].
-    `seen`, if known: what `project_ecef` says of it, and where the camera as delivered sees it.
+    `seen`, if known: the result of `project_ecef`, and its projection by the delivered camera.
     """
     ecef = ecef_from_ground(ground)
     image, by_point, by_rotation, by_translation, before = seen or (
@@ -60,7 +60,7 @@ def moved_in_space(
 
 
 def moved_by_clocks(model: Timed, covariance: Array, ground: Array) -> tuple[Array, Array, EllipseEntry]:
-    """As `moved_in_space`, by a radar's clocks: `covariance` begins with range and place along the flight [m]."""
+    """As `moved_in_space`, for radar timing: `covariance` begins with range and position along the flight [m]."""
     image, by_timing = model.timing_jacobian(ground)
     by_level = (model.project_jacobian(ground)[1] / metres_per_unit(ground))[:, :2]
     return _ground_accuracy(
@@ -83,7 +83,7 @@ def _ground_accuracy(
 
 
 def stated_ce90(view: View) -> float | None:
-    """Return CE90 [m] of a camera as delivered, of the accuracies per axis that it states."""
+    """Return CE90 [m] of a delivered camera from its stated accuracies per axis; None without any."""
     sensor, sigma = view.sensor, None
     if isinstance(sensor, Pushbroom) and sensor.accuracy is not None:
         sigma = float(np.hypot(*sensor.accuracy))
@@ -93,7 +93,7 @@ def stated_ce90(view: View) -> float | None:
 
 
 def ce90(major: float, minor: float) -> float:
-    """Return the radius that holds 90 % of a normal distribution with such standard deviations along its axes.
+    """Return the radius that contains 90 % of a normal distribution with the given standard deviations.
 
     Examples
     --------
@@ -105,7 +105,7 @@ def ce90(major: float, minor: float) -> float:
     radius, along, weights = _circles()
     with np.errstate(divide="ignore"):
         held = erf(along / (np.sqrt(2.0) * np.float64(minor / major)))
-    share = (held * weights).sum(axis=1)  # the integral over x of what y holds
+    share = (held * weights).sum(axis=1)  # the integral over x of the share in y
     return major * float(np.interp(0.9, share, radius))  # to some 1e-6
 
 
@@ -120,22 +120,22 @@ def _circles() -> tuple[Array, Array, Array]:
 
 
 class SourceEntry(Record):
-    """Where a camera came from."""
+    """Source of a camera."""
 
-    format: str = column("Syntax it was read from", head="RPC read from")
-    path: str = column("File that holds it")
-    notes: tuple[str, ...] = column("What the user should know")
+    format: str = column("Syntax of its file", head="RPC read from")
+    path: str = column("File with the camera")
+    notes: tuple[str, ...] = column("Remarks")
 
 
 class CorrectionEntry(Record):
-    """How a camera was corrected: in space, or by a shift and slope in the image (no `center_shift_px` then)."""
+    """Correction of a camera: in space, or by a shift and slope in the image (no `center_shift_px` then)."""
 
     model: str = column("Unknowns of the adjustment")
     unknowns: tuple[float, ...] = column("In metres (rotation: angle x distance), or px in the image")
     sigma: tuple[float, ...] = column("Their posterior standard deviations, in the same units")
-    center_shift_px: Pixel | None = column("Move of the middle", "px", "shift col, row", "+.2f", adjusted=True)
+    center_shift_px: Pixel | None = column("Shift at the image centre", "px", "shift col, row", "+.2f", adjusted=True)
     center_sigma_px: Pixel | None = column(
-        "Its posterior standard deviation, with the scene's own uncertain place", "px"
+        "Its posterior standard deviation, including that of the scene's position", "px"
     )
     shift_px: Pixel | None = column("Models in the image: shift col, row", "px", default=None)
     slope: tuple[Pixel, ...] | None = column("Models in the image: by (col, row)", "px/px", default=None)
@@ -144,40 +144,46 @@ class CorrectionEntry(Record):
     translation_m: Vector | None = column("Translation T, ECEF", "m", default=None)
     translation_norm_m: Number = column("Its length", "m", "translation", ".2f", default=None)
     drift_urad: tuple[Vector, ...] | None = column("Drift, for each power of the row", "urad", default=None)
-    range_m: Number = column("Radar: added to the range", "m", "range", "+.3f", default=None)
-    azimuth_ms: Number = column("Radar: added to the azimuth time", "ms", "azimuth", "+.4f", default=None)
+    range_m: Number = column("Radar: correction of the range", "m", "range", "+.3f", default=None)
+    azimuth_ms: Number = column("Radar: correction of the azimuth time", "ms", "azimuth", "+.4f", default=None)
     timing_sigma: Pixel | None = column("Their posterior standard deviations, m and ms", default=None)
-    timing_slopes: tuple[Pixel, ...] | None = column("Radar: added at the end, m and ms, by power", default=None)
+    timing_slopes: tuple[Pixel, ...] | None = column(
+        "Radar: further correction at the end, m and ms, by power", default=None
+    )
     jitter_px: Number = column("RMS of the spline over the rows", "px", "jitter", ".2f", default=None)
     jitter_rows: Number = column("Rows between its knots", "px", default=None)
     detector_px: Number = column("RMS of the steps between detectors", "px", "detectors", ".2f", default=None)
-    strip_px: Number = column("RMS of the strips that lie off", "px", "strips", ".2f", default=None)
-    swing_px: Number = column("Amplitude of the swings of the rows", "px", "swing", ".2f", default=None)
-    swing_rows: tuple[float, ...] | None = column("Their periods", "px", default=None)
-    ellipse: EllipseEntry | None = column("Where its middle is, one sigma, the scene's place in it", default=None)
-    detectors: tuple[float, ...] | None = column("Columns where another detector begins", "px", default=None)
+    step_px: Number = column("RMS of the displaced rows or columns (steps)", "px", "steps", ".2f", default=None)
+    sinusoid_px: Number = column("Amplitude of the sinusoids along the rows", "px", "sinusoids", ".2f", default=None)
+    sinusoid_rows: tuple[float, ...] | None = column("Their periods", "px", default=None)
+    ellipse: EllipseEntry | None = column(
+        "Error ellipse of the image centre, including the scene's position", default=None
+    )
+    detectors: tuple[float, ...] | None = column("Columns at which another detector begins", "px", default=None)
 
 
 class CenterEntry(Record):
-    """Where a camera stands."""
+    """Projection centre of a camera."""
 
-    ecef_m: Vector = column("Place, ECEF", "m")
+    ecef_m: Vector = column("Position, ECEF", "m")
     altitude_m: Number = column("Above the ellipsoid", "m", "camera centre", ",.0f")
-    method: str = column("line, or nominal where that was not plausible", head="found by")
+    method: str = column("line, or nominal where that was not plausible", head="method")
 
 
 class FitEntry(Record):
-    """The certificate of a refitted RPC: against P_BA, on points that the fit has not seen."""
+    """The certificate of a refitted RPC: its error against P_BA on independent check points."""
 
     rmse_px: Pixel = column("Error col, row on check points", "px", "RMSE col, row", ".1e")
     max_px: Pixel = column("Largest error col, row on check points", "px")
     min_denominator: Number = column("Relative to the centre's", "", "smallest denominator", ".3f")
-    roundtrip_px: Number = column("Largest move by projection and back; null where it fails", "px", "round trip", ".1e")
-    coverage: Number = column("Share of the image that the fit's points cover", head="covered", form=".0%")
+    roundtrip_px: Number = column(
+        "Largest change by projection and localisation; null where it fails", "px", "round trip", ".1e"
+    )
+    coverage: Number = column("Share of the image covered by the fit's points", head="covered", form=".0%")
     method: str = column("Solver", head="solver")
     num_check_points: Count = column("Check points", head="check points")
     localisation_m: Number = column(
-        "Largest distance on the ground of the localisation RPC from P_BA", "m", default=None
+        "Largest error of the localisation RPC against P_BA on the ground", "m", default=None
     )
 
 
@@ -195,7 +201,7 @@ class ViewEntry(Record):
 
     OWN: ClassVar = {
         "verdict": Column("verdict", _verdict),
-        "wrong": Column("what is wrong", lambda view: CAUSES[view.cause].label if view.cause in CAUSES else None),
+        "wrong": Column("reservation", lambda view: CAUSES[view.cause].label if view.cause in CAUSES else None),
         "lost": Column(
             "rejected", lambda view: view.lost if view.num_observations + view.num_rejected else None, ".1%"
         ),
@@ -215,8 +221,8 @@ class ViewEntry(Record):
         "correction.ellipse.ce90_m stated_ce90_m"
     )
     DECISIONS: ClassVar = (
-        "name prior_scale num_rejected lost smooth_px smooth_p shared_px correction.jitter_px "
-        "correction.detector_px correction.strip_px correction.swing_px"
+        "name prior_scale num_rejected lost systematic_px systematic_p neighbour_correlated_px correction.jitter_px "
+        "correction.detector_px correction.step_px correction.sinusoid_px"
     )
     FOOTPRINT: ClassVar = "name path status num_observations rmse_before rmse_after gsd_m"
     CONTROL: ClassVar = "name control_w control_w_point"
@@ -227,60 +233,62 @@ class ViewEntry(Record):
 
     @property
     def lost(self) -> float:
-        """Share of its tie points that was rejected."""
+        """Share of its tie points that were rejected."""
         return self.num_rejected / max(self.num_rejected + self.num_observations, 1)
 
     @property
     def reservation(self) -> str:
-        """Its verdict and what to do as a sentence; of an image of which all is well without a meaning."""
+        """Its verdict and advice as a sentence; without meaning for an image without reservation."""
         return f"{self.name}: {STATUS_WORDS[self.status]}: {self.advice}."
 
     name: str = column("Unique in the run", head="image", minLength=1)
     path: str = column("The image; empty for a view without pixels")
     size: tuple[Side, Side] = column("Width, height", "px")
-    alt_range_m: tuple[float, float] = column("Altitudes that the camera is used for", ABOVE)
-    rpc_source: SourceEntry | None = column("Where the camera came from; null: not from a file")
-    gsd_m: Number = column("Ground sampling distance in the middle of the image", "m", "GSD", ".2f")
-    incidence_deg: Number = column("From the vertical to the sensor", "deg", "incidence", ".1f")
+    alt_range_m: tuple[float, float] = column("Altitude range of the camera", ABOVE)
+    rpc_source: SourceEntry | None = column("Source of the camera; null: not from a file")
+    gsd_m: Number = column("Ground sampling distance at the image centre", "m", "GSD", ".2f")
+    incidence_deg: Number = column("Incidence angle, from the vertical to the sensor", "deg", "incidence", ".1f")
     azimuth_deg: Number = column("Direction to the sensor, clockwise from north", "deg")
-    num_observations: Count = column("Tie-point observations that count", head="tie points")
-    num_rejected: Count = column("Observations that the adjustment cut as wrong", head="cut")
+    num_observations: Count = column("Tie-point observations in use", head="tie points")
+    num_rejected: Count = column("Observations rejected as outliers", head="rejected obs.")
     num_gcps: Count = column("Observations of ground control points")
-    tie_coverage: Share = column(
-        "Share of the cells of an 8 x 8 grid that hold a tie point", head="covered", form=".0%"
-    )
+    tie_coverage: Share = column("Share of the cells of an 8 x 8 grid with a tie point", head="covered", form=".0%")
     rmse_before: Number = column("RMS reprojection error through the delivered cameras", "px", "before", ".3f")
     rmse_after: Number = column(
         "The same through the new cameras; null for a check", "px", "after", ".3f", adjusted=True
     )
-    smooth_px: Number = column("RMS of what is smooth in the residuals left, less noise", "px", "smooth", ".3f")
+    systematic_px: Number = column("RMS of systematic residuals, noise subtracted", "px", "systematic", ".3f")
     prior_scale: Number = column(
-        "By how much the camera's stated standard deviations were widened", "", "widened", ".1f"
+        "Factor by which the camera's stated standard deviations were widened", "", "widened", ".1f"
     )
     correction: CorrectionEntry | None = column("The correction; null for a check")
-    camera_center: CenterEntry | None = column("Centre about which the camera was turned")
+    camera_center: CenterEntry | None = column("Projection centre, about which the camera was rotated")
     fit: FitEntry | None = column("Certificate of the refitted RPC; null where none was fitted")
     outputs: Mapping[str, Mapping[str, float | str | None]] = column(
-        "File -> consumer -> difference to P_BA in px, or why none",
+        "File -> consumer -> difference to P_BA in px, or the reason without one",
         propertyNames={"pattern": "^[^/]+$"},
     )
     status: Literal["adjusted", "consistent", "tied", "weak", "doubtful", "failed"] = column("Verdict on the image")
-    advice: str = column("What to do; empty when all is well")
-    cause: str | None = column("Why, by its name; null when all is well", default=None, enum=[*CAUSES, None])
-    num_moving: Count = column("Observations of tie points that move together, and took no part", default=0)
-    held_out_px: Number = column("RMS of tie points that took no part", "px", "not used", ".3f", default=None)
+    advice: str = column("Reservation and remedy; empty without reservation")
+    cause: str | None = column("Name of the reservation; null without one", default=None, enum=[*CAUSES, None])
+    num_moving: Count = column("Observations of tie points that move together, which were excluded", default=0)
+    held_out_px: Number = column("RMS of check tie points", "px", "check", ".3f", default=None)
     stated_ce90_m: Number = column("CE90 of the delivered camera", "m", "CE90 stated", ".1f", default=None)
-    smooth_p: Number = column("Chance that noise leaves smooth_px (F test)", "", "F test p", ".0e", default=None)
-    shared_px: Number = column("Error shared with the neighbour in row or column", "px", "shared", ".3f", default=None)
+    systematic_p: Number = column(
+        "Probability of systematic_px by noise alone (F test)", "", "F test p", ".0e", default=None
+    )
+    neighbour_correlated_px: Number = column(
+        "Error correlated between neighbours in row or column", "px", "correlated", ".3f", default=None
+    )
     control_w: Number = column("Largest w of its control (Baarda)", "", "w", ".1f", default=None)
-    control_w_point: str | None = column("Control point that it is of", head="largest at", default=None)
-    date: str | None = column("Day it was taken, where its metadata say so", default=None)
+    control_w_point: str | None = column("Control point of that w", head="largest at", default=None)
+    date: str | None = column("Acquisition date, where its metadata state it", default=None)
     certified: tuple[tuple[float, float, float, float, float], ...] | None = column(
-        "Ground (lon, lat, alt) and where it is seen (col, row)", default=None
+        "Ground points (lon, lat, alt) and their image points (col, row)", default=None
     )
 
 
-# --- how they are measured --------------------------------------------------------------------------------
+# --- measurement ------------------------------------------------------------------------------------------
 
 _SOURCE_FIELDS = attrgetter("format", "path", "notes")
 _CENTER = attrgetter("ecef", "altitude", "method")
@@ -288,7 +296,7 @@ _FIT = attrgetter("rmse_ckp", "max_ckp", "min_denominator", "roundtrip", "covera
 
 
 def measure_views(run: Run) -> tuple[ViewEntry, ...]:
-    """Return every image of a run; the verdict on it is still to come."""
+    """Return the record of every image of a run, without its verdict."""
     num, tracks, keep, after = len(run.views), run.tracks, run.keep, run.ties_after
     first = rmse_by_view(run.ties_before.residuals[keep], tracks.view[keep], num)
     last = [None] * num if after is None else rmse_by_view(after.residuals[keep], tracks.view[keep], num)
@@ -340,13 +348,13 @@ def _fit_entry(fit: RpcFit) -> FitEntry:
 
 
 def _adjustment_values(run: Run, middle: Array) -> list[dict[str, Any]]:
-    """Return what an adjustment found of every image, at the ground points (N, 3) in the middle of each.
+    """Return the results of an adjustment for every image, at the ground points (N, 3) of the image centres.
 
-    `certified`: ground at its ends, and where its new camera sees it.
+    `certified`: ground points at its ends, and their projections by its new camera.
     """
     found, num = run.adjustment, len(run.views)
     if found is None:
-        return [{"smooth_px": None, "prior_scale": None, "correction": None}] * num
+        return [{"systematic_px": None, "prior_scale": None, "correction": None}] * num
     inner = [model.sensor if isinstance(model, Splined) else model for model in found.sensors]
     behind, seen = Several(inner, np.arange(num)).behind, list[tuple[Array, ...]]()
     if behind is not None:
@@ -355,9 +363,9 @@ def _adjustment_values(run: Run, middle: Array) -> list[dict[str, Any]]:
     grids = ground_grids(ends, (3, 2)) if run.written else None
     return [
         {
-            "smooth_px": found.smooth.rms[i],
-            "smooth_p": found.smooth.significance[i],
-            "shared_px": found.smooth.shared[i],
+            "systematic_px": found.smooth.rms[i],
+            "systematic_p": found.smooth.significance[i],
+            "neighbour_correlated_px": found.smooth.shared[i],
             "held_out_px": found.held_out_rms[i],
             "prior_scale": found.prior.scale[i],
             "correction": _correction(found, i, middle[i], seen[i] if seen else None),
@@ -376,8 +384,9 @@ def rmse_by_view(residuals: Array, view: IntArray, num_views: int) -> Array:
 
 
 def cell_numbers(xy: Array, size: Sequence[int] | IntArray) -> IntArray:
-    """Return which of the `COVERAGE_CELLS` x `COVERAGE_CELLS` cells of an image, or each of its own (n, 2), points (n,
-    2) [px] lie in.
+    """Return the cell numbers (n,), of `COVERAGE_CELLS` x `COVERAGE_CELLS` cells, of points (n, 2) [px] in an image.
+
+    `size`: width and height of the image, or (n, 2) of the image of each point [px].
     """
     col, row = ((xy + 0.5) / np.asarray(size) * COVERAGE_CELLS).astype(np.int64).clip(0, COVERAGE_CELLS - 1).T
     return np.asarray(row * COVERAGE_CELLS + col)
@@ -388,7 +397,7 @@ def _correction(adjustment: Adjustment, i: int, middle: Array, seen: tuple[Array
     whole, model = adjustment.sensors[i], adjustment.cameras.unknowns.model
     sensor, spline = (whole.sensor, whole.correction) if isinstance(whole, Splined) else (whole, None)
     covariance, apart = adjustment.covariance.view(i), adjustment.apart
-    strange = apart is not None and apart.is_view(i)  # what its place is known to, its prior does not tell
+    strange = apart is not None and apart.is_view(i)  # its prior does not state its accuracy
     if strange and apart is not None and apart.placed is not None:
         covariance = apart.placed.covariance
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
@@ -419,7 +428,7 @@ def _correction(adjustment: Adjustment, i: int, middle: Array, seen: tuple[Array
 
 
 def _image_correction_entry(spline: RowSpline | None) -> dict[str, Any]:
-    """Return what follows the correction in the image."""
+    """Return the fields of a correction that are displacements in the image."""
     found: dict[str, Any] = {}
     if spline is None:
         return found
@@ -430,10 +439,10 @@ def _image_correction_entry(spline: RowSpline | None) -> dict[str, Any]:
     if len(spline.steps):
         found |= {"detector_px": _rms_size(spline.steps), "detectors": tuple((spline.edges + 0.5).tolist())}
     if len(spline.strips):
-        found["strip_px"] = _rms_size(spline.moved)
+        found["step_px"] = _rms_size(spline.moved)
     if len(spline.swings):
         size = float(np.sqrt((spline.swings**2).sum()))  # of all together
-        found |= {"swing_px": size, "swing_rows": tuple(spline.periods.tolist())}
+        found |= {"sinusoid_px": size, "sinusoid_rows": tuple(spline.periods.tolist())}
     return found
 
 

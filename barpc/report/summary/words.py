@@ -1,4 +1,4 @@
-"""Types and words that the records of summary.json share, and the one table of what is wrong with an image."""
+"""Types and words that the records of summary.json share; the table of an image's reservations, `CAUSES`."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ STATUS_WORDS = {
     "consistent": "consistent",
     "tied": "tied",
     "weak": "weakly tied",
-    "doubtful": "doubtful",
+    "doubtful": "needs review",
     "failed": "not adjusted",
 }
-"""Status of a view -> what people read, from good to bad."""
+"""Status of a view -> its displayed word, from good to bad."""
 
 Count = Annotated[int, {"minimum": 0}]
 Side = Annotated[int, {"minimum": 1}]
@@ -29,7 +29,7 @@ ABOVE = "m above the ellipsoid"
 
 
 def largest(values: Sequence[float | None] | None) -> float | None:
-    """Return the largest number; None where one is missing, which may be larger."""
+    """Return the largest number; None where any is missing."""
     return None if not values or None in values else max(value for value in values if value is not None)
 
 
@@ -37,15 +37,15 @@ NAMED = 5
 """Images, points or reasons that one sentence names."""
 
 
-def counted(number: int, what: str) -> str:
-    """A number of things.
+def counted(number: int, noun: str) -> str:
+    """Return a number and its noun, in the plural where needed.
 
     Examples
     --------
     >>> counted(1, "image"), counted(2, "image")
     ('1 image', '2 images')
     """
-    return f"{number} {what}{'' if number == 1 else 's'}"
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def median(values: Iterable[float | None]) -> float:
@@ -56,7 +56,7 @@ def median(values: Iterable[float | None]) -> float:
 
 
 def known(value: float | None) -> float:
-    """Return a number, NaN where there is none."""
+    """Return a number; NaN for None."""
     return float("nan") if value is None else value
 
 
@@ -76,7 +76,7 @@ def metres(value: float) -> str:
 
 @dataclass(frozen=True)
 class Cause:
-    """A cause: the verdict it leads to, its name in a few words, its sentence and advice, with figures in braces."""
+    """A reservation: its verdict, its label, its sentence and remedy, with figures in braces."""
 
     status: Literal["failed", "weak", "doubtful"]
     label: str
@@ -84,74 +84,76 @@ class Cause:
     remedy: str = ""
 
     def advice(self, **figures: object) -> str:
-        """Return the sentence with its figures, and what to do."""
+        """Return the sentence with its figures, and the remedy."""
         return ": ".join(filter(None, (self.sentence, self.remedy))).format_map(figures)
 
 
 CAUSES = {
-    "no_overlap": Cause("failed", "overlaps no other image",
-        "it overlaps no other image as asked, and its camera was left as it was",
-        "check its RPC (IMAGE,camera=FILE names another), or lower [tie] min_overlap of a file given with --options"),
+    "no_overlap": Cause("failed", "in no matched pair",
+        "no pair with it was selected for matching (overlap, angle or list), and its camera was not changed",
+        "check its RPC (IMAGE,camera=FILE names another), or lower [tie] min_overlap in a file given with --options"),
     "untied": Cause("failed", "not tied to the others",
-        "not tied to the other images{tried}, its camera was left as it was",
-        "look for clouds, water and other dates, or give matches of your own (--matches)"),
-    "other_rpc": Cause("failed", "RPC not its own",
-        "its RPC is not its own: {strangeness}. They were adjusted without it, and its camera was left as it was",
+        "no tie points connect it to the main group of images{tried}, and its camera was not changed",
+        "check for clouds, water and other dates, or supply matches (--matches)"),
+    "other_rpc": Cause("failed", "RPC does not match the image",
+        "its RPC does not match the image: {strangeness}. These were adjusted without it, and its camera was not "
+        "changed",
         "check that the RPC belongs to this image (IMAGE,camera=FILE names another)"),
     "contradicts_all": Cause("failed", "contradicts the others",
-        "{strangeness}. They were adjusted without it, and its camera was left as it was",
-        "check clouds, water and change, and that the RPC belongs to this image (IMAGE,camera=FILE names another)"),
+        "{strangeness}. They were adjusted without it, and its camera was not changed",
+        "check for clouds, water and change, and that the RPC belongs to this image (IMAGE,camera=FILE names another)"),
     "one_rpc_misses": Cause("failed", "RPC fit misses its tolerance",
-        "one RPC cannot hold the corrected camera to {tolerance:g} px", "lower --drift, or hand its grid on (--grids)"),
+        "one RPC does not fit the corrected camera to {tolerance:g} px", "lower --drift, or use its grid (--grids)"),
     "contradicted": Cause("doubtful", "contradicts the others",
         "{share:.0f} % of its tie points were rejected, as they contradict those of the other images",
-        "check that the RPC belongs to this image (IMAGE,camera=FILE names another); look for clouds, water, change"),
+        "check that the RPC belongs to this image (IMAGE,camera=FILE names another), and for clouds, water, change"),
     "whole_pixels": Cause("weak", "matched at whole pixels",
-        "its tie points were matched at whole pixels: all of them may be off alike by {shared:.1f} px",
-        "give ground points, an image of another date, or matches of your own (--matches)"),
+        "its tie points were matched at whole pixels: an error of {shared:.1f} px may be common to all",
+        "add ground points, an image of another date, or matches (--matches)"),
     "few": Cause("weak", "few tie points", "only {few} tie points", "check overlap, clouds and dates"),
     "none": Cause("weak", "no tie points", "no tie points", "check overlap, clouds and dates"),
-    "few_gcps": Cause("weak", "few GCPs", "it is held by {gcps} alone, in which an error would hardly show",
+    "few_gcps": Cause("weak", "few GCPs", "only {gcps} and no tie point constrain it, so an error would hardly show",
         "give three or more"),
-    "copy": Cause("doubtful", "shown twice", "shows the same pixels as {other}", "give each image once"),
-    "apart": Cause("doubtful", "RPC not its own",
-        "its RPC is {stated}: {strangeness}. It was adjusted alone, against points of the other images",
+    "copy": Cause("doubtful", "duplicate image", "shows the same pixels as {other}", "give each image once"),
+    "foreign_camera": Cause("doubtful", "RPC does not match the image",
+        "its RPC {stated}: {strangeness}. It was resected from the tie points of the other images",
         "check that the RPC belongs to this image (IMAGE,camera=FILE names another)"),
-    "odd": Cause("doubtful", "RPC farther off than stated",
-        "its RPC is {scale:.0f} times farther off than stated, beside the other images{either}",
+    "odd": Cause("doubtful", "RPC less accurate than stated",
+        "its RPC is {scale:.0f} times less accurate than stated, relative to the other images{either}",
         "check that it belongs to this image (IMAGE,camera=FILE names another)"),
-    "smooth": Cause("doubtful", "an error that changes over it",
-        "an error of {size:.2f} px that changes {along} is left: {why}"),
+    "systematic": Cause("doubtful", "systematic residuals",
+        "systematic residuals of {size:.2f} px {along} remain: {why}"),
     "rejected": Cause("doubtful", "many tie points rejected",
-        "{share:.0f} % of its tie points were rejected, neighbours in the same direction{place}",
-        "look for clouds, water, change"),
+        "{share:.0f} % of its tie points were rejected, with neighbouring errors in the same direction{place}",
+        "check for clouds, water, change"),
     "wrong_matches": Cause("doubtful", "wrong matches",
-        "{share:.0f} % of its tie points were rejected, neighbours in any direction, as wrong matches are, and those "
-        "that took no part are left with {error:.2f} px",
-        "look for repeated patterns and noise, or give matches of your own (--matches)"),
-    "place": Cause("doubtful", "a part of it lies off",
-        "{place} stand out, {what}", "look for {cause}"),
-    "gap": Cause("doubtful", "a part of it without tie points",
-        "{place} have {found} of some {due} tie points that their detail lets expect, so an error there would not show",
-        "look for clouds, water, change there, or a jump of the image"),
-    "beside": Cause("doubtful", "beside an image that contradicts",
-        "tie points that took no part are left with {error:.2f} px, and most of these are seen in {other} too, whose "
-        "tie points contradict the others",
-        "look at that image first"),
-    "held_out": Cause("doubtful", "tie points that took no part lie off",
-        "tie points that took no part are left with {error:.2f} px, {noise:.1f} times what the matcher states",
-        "look for wrong matches, moving things, or errors that these unknowns cannot follow"),
-    "follows_more": Cause("doubtful", "more than one RPC holds",
-        "its corrected camera follows {follows}, of which one RPC leaves {left:.2f} px (RMS; {most:.2f} px at most)",
+        "{share:.0f} % of its tie points were rejected, with neighbouring errors in random directions, as of wrong "
+        "matches, and check tie points have residuals of {error:.2f} px",
+        "check for repeated patterns and noise, or supply matches (--matches)"),
+    "place": Cause("doubtful", "inconsistent rows or columns",
+        "{place} are inconsistent with the rest of the image: {what}", "check for {cause}"),
+    "gap": Cause("doubtful", "rows or columns with few tie points",
+        "{place} have {found} of about {due} tie points expected from their detail, so an error there would not show",
+        "check for clouds, water, change there, or a jump in the image"),
+    "beside": Cause("doubtful", "tied to a contradicting image",
+        "check tie points have residuals of {error:.2f} px, and most of them are observed in {other}, too, whose tie "
+        "points contradict the others",
+        "check that image first"),
+    "held_out": Cause("doubtful", "large residuals of check tie points",
+        "check tie points have residuals of {error:.2f} px, {noise:.1f} times the accuracy that the matcher states",
+        "check for wrong matches, moving objects, or camera errors that the model cannot represent"),
+    "follows_more": Cause("doubtful", "one RPC is not enough",
+        "its corrected camera includes {follows}, and one RPC misses it by {left:.2f} px (RMS; {most:.2f} px at most)",
         "use its grids ({image}_grid.tif), or --resample"),
-    "disagrees": Cause("doubtful", "cameras disagree", "tie points disagree by {error:.2f} px", "adjust the cameras"),
+    "disagrees": Cause("doubtful", "cameras disagree",
+        "tie points have residuals of {error:.2f} px", "adjust the cameras"),
     "left": Cause("doubtful", "large residuals",
-        "tie points are left with {error:.2f} px", "look for wrong matches and moving things"),
-    "unseen": Cause("doubtful", "does not see its tie points",
-        "its camera does not see its own tie points where they are",
+        "tie points keep residuals of {error:.2f} px", "check for wrong matches and moving objects"),
+    "unseen": Cause("doubtful", "tie points not projectable",
+        "its camera cannot intersect or project its own tie points",
         "check that the RPC belongs to this image (IMAGE,camera=FILE names another)"),
-    "moving": Cause("doubtful", "tie points move",
-        "{share:.0f} % of its tie points move together and took no part",
-        "check that the others are the ground that stands still"),
+    "moving_objects": Cause("doubtful", "tie points move",
+        "{share:.0f} % of its tie points move together and were excluded",
+        "check that the others lie on stationary ground"),
 }  # fmt: skip
-"""Cause -> its words, the worst first. A flag in a remedy is one of `barpc adjust`, as a test asks its command line."""
+"""Cause -> its reservation, the worst first. A test checks that flags in a remedy are those of `barpc adjust`."""
