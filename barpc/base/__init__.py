@@ -1,1 +1,1 @@
-"""What everything stands on: errors, files opened and written safely, frozen values, options, the ellipsoid."""
+"""Foundations: errors, files opened and written safely, frozen values, options, the ellipsoid."""

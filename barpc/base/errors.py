@@ -159,7 +159,7 @@ _OF_PYTHON = re.compile(
 
 
 def plain(error: BaseException) -> str:
-    """Return what an error says of a file in words that are no Python: of barpc's own its text.
+    """Return the message of an error on a file in plain words; of barpc's own errors their text.
 
     Examples
     --------

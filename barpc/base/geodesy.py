@@ -46,7 +46,7 @@ _RAD = np.pi / 180.0
 
 @dataclass(frozen=True)
 class HeightDatum:
-    """What heights of a source were taken to count from: the ellipsoid, or a geoid; and what speaks for the other."""
+    """The vertical datum assumed for the heights of a source: the ellipsoid, or a geoid; evidence for the other."""
 
     source: str  # of the adjustment's datum: "gcps", "heights" (of a DEM) or "altimetry"
     name: str  # in sentences
@@ -57,7 +57,7 @@ class HeightDatum:
 
 
 def parts(stop: int, size: int = CHUNK, start: int = 0) -> Iterator[slice]:
-    """Yield the pieces of what is numbered start .. stop, of `size` that stay in cache."""
+    """Yield slices of start .. stop, of a `size` that stays in cache."""
     for first in range(start, stop, size):
         yield slice(first, min(first + size, stop))
 

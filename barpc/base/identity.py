@@ -1,4 +1,4 @@
-"""What was read is what was hashed: a file is known by its content and by what the system says of it.
+"""Identity of input files: by content, and by the file system's stamp between hashing and reading.
 
 A run hashes its inputs once. From then on the system is asked whether a file is still that one wherever it matters: as
 a worker opens it, before a result is kept, before outputs appear. Nothing is read for that.
@@ -50,7 +50,7 @@ class Stamp:
 
 @dataclass(frozen=True)
 class Input:
-    """A file as it was hashed, and those that it is made of (the sources of a VRT)."""
+    """A hashed file with its parts (the sources of a VRT)."""
 
     path: str
     size: int
@@ -72,7 +72,7 @@ class Input:
             yield from part.every()
 
     def ask(self) -> None:
-        """Raise InputError unless the input and its parts are still what was hashed."""
+        """Raise InputError where the input or a part of it was changed since it was hashed."""
         for one in self.every():
             if one.stamp is not None and not one._same():
                 raise changed(one.path)
@@ -96,7 +96,7 @@ _stamps: dict[str, Stamp] = {}  # files whose bytes were asked by this process
 
 
 def changed(path: str) -> InputError:
-    """Return the error line for a file that is no longer what it was."""
+    """Return the error message for a file changed since it was hashed."""
     return InputError(
         f"{path}: was changed or replaced while the run was at work; nothing of it is kept; run the same command again"
     )
@@ -143,7 +143,7 @@ def guarded(inputs: Iterable[Input]) -> Iterator[None]:
 
 
 def ask(path: str | os.PathLike[str] | None = None) -> None:
-    """Raise InputError where a file that the block relies on (None: any of them) is no longer what was hashed."""
+    """Raise InputError where a file in use by the block (None: any of them) was changed since it was hashed."""
     known = _guard.get({})
     for one in known.values() if path is None else filter(None, [known.get(os.fspath(path))]):
         one.ask()
@@ -156,7 +156,7 @@ _stamps_of_run: ContextVar[dict[str, Stamp] | None] = ContextVar("seen", default
 
 @contextmanager
 def recorded(seen: dict[str, Stamp]) -> Iterator[dict[str, Stamp]]:
-    """Record every file that `barpc.base.safe_io` opens in the block, as it was the first time."""
+    """Record every file opened by `barpc.base.safe_io` in the block, with its first state."""
     token = _stamps_of_run.set(seen)
     try:
         yield seen

@@ -106,7 +106,7 @@ class Declared:
 
 
 def declared(record: type[Options]) -> Mapping[str, Declared]:
-    """Return what is declared of each field of an option record; a nested record has an empty rule."""
+    """Return the declaration of each field of an option record; a nested record has an empty rule."""
     kind: Any = record  # a class can be hashed
     found: Mapping[str, Declared] = _declared(kind)
     return found
@@ -368,7 +368,7 @@ class AdjustOptions(Options):
 
     @property
     def is_plain(self) -> bool:
-        """Whether rotations are constant and no splines are asked for: such a run reports what these would follow."""
+        """Whether rotations are constant and no splines are requested: such a run reports the remaining trends."""
         return self.jitter == AUTO and self.drift == 0
 
 

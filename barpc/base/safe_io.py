@@ -135,7 +135,7 @@ def _regular(path: Path | str, kind: Kind) -> BinaryIO:
 
 
 def unread(path: Path) -> str:
-    """Return what a message adds about a folder or archive that is not read, and the cure; else nothing."""
+    """Return the addition to a message on a folder or archive that barpc cannot read, with the remedy; else nothing."""
     named = path.name.lower().endswith((".zarr", ".zarr.zip"))
     if not (named or any((path / name).is_file() for name in (".zgroup", ".zmetadata", "zarr.json"))):
         return ""
@@ -213,7 +213,7 @@ _REFUSED = "\ufffe\uffff" + ("\\" if os.sep == "/" else "")
 
 
 def plain_path(path: str | os.PathLike[str]) -> PathOrUrl:
-    """Return a path or a Remote as it is, once every file that barpc writes can carry it.
+    """Return a path or a Remote unchanged if every output format can store it.
 
     InputError for a control character, an end of line, bytes that are no text, a backslash that separates no folders.
     """
@@ -241,7 +241,7 @@ _BRACKET_STEPS = bytes.maketrans(b"[]{}", b"\x01\xff\x01\xff")  # one level down
 
 
 def read_json(path: Path | str, kind: Kind) -> Any:
-    """Read what a JSON file holds (see `parse_json`)."""
+    """Read the content of a JSON file (see `parse_json`)."""
     text = read_text(path, kind)
     try:
         return parse_json(text, kind.values)

@@ -179,7 +179,7 @@ def main(args: list[str] | None = None) -> None:
 
 
 def _exit_message(error: BaseException) -> tuple[int, str]:
-    """Return the exit code of an error, and what to say."""
+    """Return the exit code and the message of an error."""
     if isinstance(error, click.Abort):  # of an end of file, too
         error = error.__cause__ or error
     if isinstance(error, (click.Abort, KeyboardInterrupt)):

@@ -115,7 +115,7 @@ def _run_pipeline(
     fixed: Mapping[str, Any] | None = None,
     **where: str,
 ) -> int:
-    """Run an entry of the pipeline with what the command line says and what the verb has `fixed`, and tell."""
+    """Run an entry of the pipeline with the flags and the options `fixed` by the verb, and print the result."""
     options = replace(run_options(flags, flags["options_file"]), **(fixed or {}))
     paths = _image_arguments(images, flags, options.keep_going)
     with executor_for(flags["jobs"]) as executor, progress_told(obj["quiet"], obj["verbose"]) as progress:

@@ -160,7 +160,7 @@ def _to_target(files: tuple[str, ...], flags: Mapping[str, Any]) -> int:
 
 
 def _copy(camera: Camera, image: Path, target: str, formats: str | None, overwrite: bool) -> int:
-    """Write an RPC as it is, read it back and say how far off it is."""
+    """Write an RPC unchanged, read it back and report the largest difference."""
     if formats is None:
         write_camera(camera.rpc, target, image, overwrite=overwrite, size=camera.size)
     else:
@@ -172,7 +172,7 @@ def _copy(camera: Camera, image: Path, target: str, formats: str | None, overwri
 
 
 def _read_back(rpc: RPC, target: str, row: Mapping[str, object], text: str) -> int:
-    """Say what was written, and how far off a file's RPC is when it is read back; the exit code."""
+    """Report the files written, and the difference of an RPC when it is read back; the exit code."""
     lost = float(rpc.off(read_rpc(target)).max())
     tell(json.dumps({**row, "max_px": lost}) if wants_json() else f"{text} (read back: {lost:.1g} px)")
     if lost <= READING_TOLERANCE:
@@ -185,7 +185,7 @@ def _read_back(rpc: RPC, target: str, row: Mapping[str, object], text: str) -> i
 
 
 def _as_grid(camera: Camera, target: str, overwrite: bool) -> int:
-    """Write a camera as a localisation grid, and say what linear interpolation in it is off by."""
+    """Write a camera as a localisation grid, and report the error of linear interpolation in it."""
     alts = widened(camera.alt_range)
     write_grid(DirectGrid.of(camera.model, camera.extent, alts), target, overwrite=overwrite)
     readings = verify_grid(Path(target), Sample.of(camera.model, camera.extent, alts))
@@ -221,7 +221,7 @@ def check_target(target: str | Path, sources: Sequence[str | Path], overwrite: b
 
 
 def _window_chooser(flags: Mapping[str, Any]) -> Callable[[Camera, Path], Window]:
-    """Return what tells the window of an image that is asked for, or the pixels of a box or area on the ground."""
+    """Return a function from an image to its window: the one given, or that of a box or area on the ground."""
     if sum(flags[name] is not None for name in ("window", "bbox", "aoi")) != 1:
         raise click.UsageError("give one of --window, --bbox and --aoi")
     window: Window | None = flags["window"]
@@ -261,7 +261,10 @@ def window_of(camera: Camera, path: Path, bbox: GroundBox, alt: float | None, de
 def windows_of(
     images: Sequence[tuple[Path, Camera]], window: Callable[[Camera, Path], Window]
 ) -> list[tuple[Path, Camera, Window]]:
-    """Return the images that show what is asked for, and where; a usage error where none does, else it is said."""
+    """Return the images that cover the requested window or area, and their windows.
+
+    Others are named in a remark; a usage error where none covers it.
+    """
     found = []
     for path, camera in images:
         try:
@@ -296,7 +299,7 @@ def _hand_off(
     keep: Sequence[Path],
     overwrite: bool,
 ) -> int:
-    """Write images, or windows of them, with their RPCs, open every file as its readers do, and say what they see."""
+    """Write images, or windows of them, with their RPCs, reopen every file as its readers do, and report the errors."""
     names = [[path.stem + end for end in ends] for path, *_ in images]
     together = [name for row in names for name in row]
     readings: list[Reading] = []
@@ -323,7 +326,7 @@ def _image_size(image: Path) -> tuple[int, int]:
 
 
 def _exit_code(readings: list[Reading], reasons: Sequence[str] = (), notes: Sequence[str] = ()) -> int:
-    """Say what readers of the files see; return the exit code."""
+    """Report the errors of the reopened files; return the exit code."""
     _tell_readings(readings)
     for sentence in notes:
         remark(sentence)
@@ -344,7 +347,7 @@ def _tell_readings(readings: list[Reading]) -> None:
 
 
 def _shadow_reasons(image: Path, written: list[Path]) -> list[str]:
-    """Return what lies beside a new file and hides its RPC; what lies beside the image is only said."""
+    """Return sentences on files that take precedence over the RPC of a new file; beside the image: a remark."""
     for sidecar in shadows(image):
         remark(f"beside {image}: {sidecar.path.name} hides an RPC put into the image")
     hiding = [sidecar.path for sidecar in shadows(written[0]) if sidecar.path not in written]

@@ -134,7 +134,7 @@ def _fit_source(source: str, output: str | None, flags: dict[str, Any]) -> tuple
 
 
 class _Missed(Exception):  # noqa: N818 - it never leaves this page
-    """What was written does not hold the fit: it goes again."""
+    """The written file does not reproduce the fit: it is removed."""
 
 
 def _write_rpc_file(

@@ -49,7 +49,7 @@ def flag_name(target: str) -> str:
 
 
 def field_of(target: str) -> Declared:
-    """Return what is declared of a field, by its name with its table before a dot."""
+    """Return the declaration of a field, by its name with its table before a dot."""
     *table, name = target.split(".")
     record = type(declared(RunOptions)[table[0]].default) if table else RunOptions
     return declared(record)[name]
@@ -64,7 +64,7 @@ _GROUPS = {"Tie points": TIE, "Cameras": CAMERA, "Ground": GROUND}
 
 
 class Grouped(click.Command):
-    """A verb of a run: its help lists the usual flags by what they are about, `--help-all` every one."""
+    """A verb of a run: its help groups the usual flags by subject, `--help-all` lists every one."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -73,7 +73,7 @@ class Grouped(click.Command):
         self.params.append(click.Option(["--help-all"], help=words, **how))
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List what the user gives, then tie points, cameras and ground."""
+        """List the flags of input files first, then those of tie points, cameras and ground."""
         of = {_parameter(target): words for words, targets in _GROUPS.items() for target in targets}
         rows: dict[str, list[tuple[str, str]]] = {"Files and the run": [], **{words: [] for words in _GROUPS}}
         for option in self.get_params(ctx):
@@ -96,7 +96,7 @@ def _help_all(context: click.Context, _parameter: click.Parameter, value: bool) 
 
 
 def _parameter(target: str) -> str:
-    """Return what click calls the flag that sets a field."""
+    """Return click's parameter name of the flag of a field."""
     return "flag_" + target.replace(".", "_")
 
 
@@ -246,7 +246,7 @@ def image_paths(images: tuple[str, ...], image_list: str | None, keep_going: boo
 
 
 def name_of(spec: str) -> str:
-    """Return the file's part of a name with choices behind it, as it was typed."""
+    """Return the file name of an argument with choices behind it, as typed."""
     from barpc.cameras import split_spec
 
     with suppress(BarpcError):

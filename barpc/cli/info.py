@@ -1,4 +1,4 @@
-"""`barpc info`: what an image or an RPC file is, and whether the installation works."""
+"""`barpc info`: camera and coverage of an image or RPC file, and a test of the installation."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ _CENTRE_METHODS = {
 
 
 def _labelled_sentences(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield what is told of a camera in words: label and sentence of each line."""
+    """Yield the label and sentence of each line on a camera."""
     is_rpc = "domain" in report
     yield "camera", f"RPC ({report['rpc'].replace(' in ', ') in ', 1)}" if is_rpc else report["rpc"]
     yield from (("note", note) for note in report["notes"])
@@ -162,7 +162,7 @@ def _outlines_geojson(
 def _viewed_together(
     images: Sequence[str], cameras: Sequence[Camera], i: int, alt: float, at: tuple[float, ...] | None
 ) -> list[dict[str, Any]]:
-    """Return what an image and each later one see together at its centre: the angle between their rays, and B/H."""
+    """Return the convergence angle and B/H of an image and each later one at its centre."""
     first, height = cameras[i], np.asarray(alt)
     point = first.model.localize((np.array(first.extent) - 1) / 2, height) if at is None else np.array(at)
     rows = []
@@ -174,7 +174,7 @@ def _viewed_together(
 
 
 def _describe(camera: Camera, alt: float, at: tuple[float, ...] | None) -> dict[str, Any]:
-    """Return everything that is told of a camera, with plain values."""
+    """Return all figures of a camera as plain values."""
     report: dict[str, Any] = {
         "rpc": f"{camera.format} in {camera.path}",
         "notes": list(camera.notes),
@@ -189,7 +189,7 @@ def _describe(camera: Camera, alt: float, at: tuple[float, ...] | None) -> dict[
 
 
 def _box(rpc: RPC) -> dict[str, Any]:
-    """Return what an RPC alone states: its box on the ground, its accuracy, and how near to a pole it comes there."""
+    """Return the figures of an RPC alone: its ground box, stated accuracy and smallest denominator there."""
     low, high = rpc.ground_offset - np.abs(rpc.ground_scale), rpc.ground_offset + np.abs(rpc.ground_scale)
     lon, lat, _ = np.stack([low, high], axis=1).tolist()
     return {
@@ -201,7 +201,7 @@ def _box(rpc: RPC) -> dict[str, Any]:
 
 
 def _geometry(camera: Camera, size: tuple[int, int], alt: float, at: tuple[float, ...] | None) -> dict[str, Any]:
-    """Return what follows from the camera and the image's size: angles, ground sample distance, footprint."""
+    """Return the figures by camera and image size: angles, ground sample distance, footprint."""
     model = camera.model
     middle = (np.array(size) - 1) / 2
     center = model.localize(middle, np.asarray(alt))

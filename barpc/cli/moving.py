@@ -140,7 +140,7 @@ def _announced(camera: Camera, fit: RpcFit, done: str) -> Camera:
 
 
 def _tell_motion(matrix: Array, middle: Array) -> None:
-    """Say what the motion is at the middle of the images, and what the digits of its matrix are worth there."""
+    """Print the motion at the image centres, and the effect of the digits of its matrix there."""
     at, stretch = ground_from_ecef(middle), np.linalg.svd(matrix[:, :3], compute_uv=False)
     rounding = float((stretch[0] - stretch[-1]) / stretch.mean() * np.linalg.norm(middle))
     if rounding > _NOTEWORTHY_ROUNDING:

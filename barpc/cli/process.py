@@ -69,7 +69,7 @@ _at_last: list[Callable[[], None]] = []
 
 @atexit.register
 def _leave() -> None:
-    """Run at exit behind what libraries do there: registered before they are imported."""
+    """Exit handler that runs after those of libraries: it is registered before they are imported."""
     for work in _at_last:
         work()
 
@@ -98,12 +98,12 @@ class Interrupt:
         return came
 
     def done(self, code: int) -> None:
-        """Take the exit code of what has been said."""
+        """Store the exit code of the finished command."""
         self.end()
         self._code, self._said = code, b""
 
     def leave(self, numbers: Iterable[int]) -> None:
-        """Ignore signals from now on, the last of all at exit, where they go back to what ends a process."""
+        """Ignore signals from now on, as the last exit handler: Python then restores their default actions."""
         for number in numbers:
             signal.signal(number, signal.SIG_IGN)
         if self._code == EXIT_INTERRUPTED and not self._said:

@@ -75,7 +75,7 @@ def altitude_of(camera: Camera, image: PathOrUrl, given: float | None = None) ->
 
 
 def _unknown(camera: Camera) -> str:
-    """Return what it is worth not to know the ground, in words."""
+    """Return the error by an unknown terrain height, in words."""
     text = f"terrain height unknown, {camera.altitude:g} m assumed (the middle of the camera's altitude range)"
     if camera.size is None:
         return text
@@ -108,7 +108,7 @@ def ground_at(camera: Camera, image: Array, alt: Array | float, dem: Dem | None)
 
 
 def exchanged(camera: Camera, ground: Array) -> str:
-    """Return what to say of points (N, 3) far off an image that shows them with lon and lat exchanged; else empty."""
+    """Return a remark on points (N, 3) outside an image that covers them with lon and lat exchanged; else empty."""
     if not len(ground) or (camera.size is None and not isinstance(camera.model, RPC)):
         return ""
     swapped = ground[:, [1, 0, 2]]
@@ -194,7 +194,7 @@ def localize(image: str, numbers: tuple[float, ...], points: str | None, alt: fl
 @click.option("--at", type=(float, float), multiple=True, help="COL ROW, once for each image.")
 @_points_option("col1, row1, col2, row2, ...")
 def triangulate(images: tuple[str, ...], at: tuple[tuple[float, float], ...], points: str | None) -> int:
-    r"""Print the ground points where the lines of sight of several images meet, and the error that is left.
+    r"""Print the ground points intersected from several images, and their residuals.
 
     A point that an image does not see has nan there. `error` is the root mean square distance between a
     point's projections and what was given [px]; exit code 3 where it is a pixel or more, as lines of sight that far

@@ -1,4 +1,4 @@
-"""`barpc report`, `export`, `verify`: what is done with a finished run."""
+"""`barpc report`, `export`, `verify`, `dsm`: commands on a finished run."""
 
 from __future__ import annotations
 

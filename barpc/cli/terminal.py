@@ -70,13 +70,13 @@ def say(message: str) -> None:
 
 
 def remark(message: str) -> None:
-    """Print one line on stderr that is no error; with -q nothing."""
+    """Print one line on stderr, a remark and no error; with -q nothing."""
     if not _general("quiet"):
         say(message)
 
 
 def tell(text: object) -> None:
-    """Print what a command has done, or its JSON, on stdout; with -q the JSON alone."""
+    """Print the result of a command, or its JSON, on stdout; with -q the JSON alone."""
     if wants_json() or not _general("quiet"):
         echo(text)
 
@@ -128,7 +128,7 @@ def print_summary(summary: Summary, root: str = "") -> None:
 
 
 def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str]]:
-    """Return titles, cells and what is said of the rest: of more rows the worst of those that pass a limit."""
+    """Return titles, cells and a remark on omitted rows: of many rows the worst of those beyond a limit are kept."""
     from barpc.report import verdict
     from barpc.report.records import table
     from barpc.report.summary.block import DATUM, DatumEntry
@@ -162,7 +162,7 @@ def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str
 
 
 def _height(table: tuple[str, list[list[str]], str], width: int | None) -> int:
-    """Return lines of a table with its title, what is said of the rest, and empty ones behind."""
+    """Return the number of lines of a table with its title, its remark and the empty line behind."""
     title, texts, more = table
     return (len(_wrapped(title, width)) + len(layout(texts, width)) if texts else 0) + bool(more) + 1
 
@@ -306,7 +306,7 @@ class Lines:
         self._began = self._said = clock()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        """Take in what is done."""
+        """Store the progress of a stage."""
         with self._lock:
             if stage != self._stage:
                 self._stage, self._done, self._began = stage, 0, self._clock()
@@ -329,7 +329,7 @@ class Lines:
         self._say(line)
 
     def watch(self, over: threading.Event) -> None:
-        """Look every second: a stage that is one task says nothing by itself."""
+        """Check every second: a stage of one task reports nothing by itself."""
         while not over.wait(1.0):
             self.look()
 
@@ -343,7 +343,7 @@ def _minutes(seconds: float) -> str:
 
 @contextmanager
 def _bars() -> Iterator[Progress]:
-    """Yield one bar a stage at a time, with the time that is left."""
+    """Yield one bar a stage at a time, with the remaining time."""
     bars: dict[str, ProgressBar[int]] = {}
 
     def finish() -> None:

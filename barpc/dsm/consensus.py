@@ -36,7 +36,7 @@ _NEIGHBOUR_OFFSETS = [
 
 
 def finite_median(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return the median along the first axis of what is known; NaN where nothing is."""
+    """Return the median of finite values along the first axis; NaN where nothing is."""
     ranked, num = np.sort(values, axis=0), np.isfinite(values).sum(axis=0)  # NaN comes last
     low, high = (np.take_along_axis(ranked, at[None], axis=0)[0] for at in ((num - 1) // 2, num // 2))
     return np.asarray((low + high) / 2)
@@ -80,7 +80,7 @@ def consensus(heights: F32, metres: F32) -> BoolArray:
 
 
 def _without_offset(heights: F32) -> F32:
-    """Return the heights without what a pair is off all over, as cameras move them: that is no contradiction."""
+    """Return the heights without the offset of each pair, by camera errors: an offset is no contradiction."""
     several = np.isfinite(heights).sum(axis=0) > 1
     apart = [one[several & np.isfinite(one)] for one in heights - finite_median(heights)]
     off = np.array([np.median(one) if len(one) else 0.0 for one in apart], np.float32)

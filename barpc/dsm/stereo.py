@@ -1,4 +1,4 @@
-"""What a surface is made of: views with the cameras to be believed, their best pairs, and what is known of both.
+"""Inputs of a surface: views with their best cameras, their best pairs, and the accuracy of both.
 
 Tile by tile the best pairs that see it are matched, intersected and gathered into its cells.
 """
@@ -130,7 +130,7 @@ def surface_tile(pairs: Sequence[tuple[View, View]], tile: Tile, band: int) -> t
 
 
 def _tile_points(pair: tuple[View, View], tile: Tile, band: int, halved: int = 0) -> list[TilePoints]:
-    """Return what is found of a tile, part by part; of one unseen nothing. Coarser pictures narrow the altitudes."""
+    """Return the points of a tile, part by part; of one unseen nothing. Coarser pictures narrow the altitudes."""
     zoom, nodes = _COARSE, tile.nodes()
     while True:
         levels = np.repeat(np.linspace(tile.alts[0], max(tile.alts[1], tile.alts[0] + 1.0), _NUM_ALTITUDES), len(nodes))
@@ -184,7 +184,7 @@ def gathered(tile: Tile, ground: Array, sigma: Array) -> F32:
 
 
 def noise_of_mean(side: Array) -> Array:
-    """Return what is left of sigma in the mean of `side` x `side` matches, which look at much the same.
+    """Return the share of sigma that remains in the mean of `side` x `side` matches with overlapping windows.
 
     Each is a mean over WINDOW of steps that look at WINDOW pixels: matches correlate as a cubic B-spline of their
     distance, with knots every WINDOW. A sum over all pairs, axis by axis, interpolated between whole sides.
@@ -328,8 +328,8 @@ def _ranked_pairs(
     flagged: frozenset[int] = frozenset(),
     among: Sequence[int] | None = None,
 ) -> list[Link]:
-    """Return the pairs (`among` some views) by what they say of heights: of one date first, without `flagged` views
-    first, then by tie points times the squared tangent of the angle.
+    """Return the pairs (`among` some views), ranked for heights: those of one date first, those without `flagged`
+    views first, then by tie points times the squared tangent of the angle.
 
     A height's variance is that of a match over (B/H)^2, and where tie points are found, dense matches are. Without
     tie points the overlap and the angle stand for them (`barpc.tie.pairing.overlaps.Pair.score`).

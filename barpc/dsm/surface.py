@@ -1,4 +1,4 @@
-"""A surface model of a block of images, or what changed between two dates, as a Cloud-Optimised GeoTIFF.
+"""A surface model of a block of images, or its change between two dates, as a Cloud-Optimised GeoTIFF.
 
 And the picture that convinces: the same window of the ground by the cameras as delivered, and corrected.
 """
@@ -207,7 +207,7 @@ class Grid:
     def write(
         self, out: Path, made: Path, run: Workspace, executor: Executor | None, progress: Progress | None
     ) -> Surface:
-        """Write the surface that is to be `out` as `made`; each tile is made by a worker and forgotten once written."""
+        """Write the surface for `out` as `made`; a worker makes each tile, and it is forgotten once written."""
         views, known, share, rough = self.block.views, 0, -1.0, run.partial / "tiles.tif"
         tasks = [
             (tuple((views[i], views[j]) for i, j in group), tile, self.options.band)
@@ -365,7 +365,7 @@ def _encoded_picture(grey: npt.NDArray[np.uint8]) -> dict[str, object]:
 
 
 def draped(view: View, tile: Tile, height: F32, band: int) -> npt.NDArray[np.uint8]:
-    """Return what a view shows of a tile's cells of these heights (rows, cols) [m]; black where nothing is known."""
+    """Return the grey values of a view at a tile's cells with these heights (rows, cols) [m]; black where unknown."""
     grey, known = np.zeros(height.shape, np.uint8), np.isfinite(height)
     at = view.sensor.project(np.column_stack([tile.nodes(tile.size, 0.5), height.ravel()])[known.ravel()])
     at = np.clip(np.nan_to_num(at), 0.0, np.array(view.size) - 1.0)

@@ -1,4 +1,4 @@
-"""What other tools read, as bytes: Sat-NeRF, stereo pipelines, catalogues, tables of points, GDAL's commands."""
+"""Files for other tools, as bytes: Sat-NeRF, stereo pipelines, catalogues, tables of points, GDAL's commands."""
 
 from __future__ import annotations
 
@@ -239,7 +239,7 @@ def points(scene: Scene, _out: Path) -> Files:
 
 
 def _covariances(scene: Scene) -> Array:
-    """Return the covariance (P, 3, 3) of the points, east, north, up [m2]: the inverse of what observations tell."""
+    """Return the covariance (P, 3, 3) of the points, east, north, up [m2]: the inverse of their normal matrices."""
     normal = np.zeros((len(scene.points), 3, 3))
     for shot in scene.shots:
         ground = scene.points[shot.index]

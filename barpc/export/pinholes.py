@@ -175,7 +175,7 @@ def colmap(scene: Scene, out: Path) -> Files:
 
 
 def _called(scene: Scene) -> list[str]:
-    """Return what the model calls the images: as their files where these names differ, else as the run."""
+    """Return the names of the images in the model: of their files where these differ, else of the run."""
     names = [PurePath(shot.file).name for shot in scene.shots]
     if len(set(names)) == len(names):
         return names

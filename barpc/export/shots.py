@@ -191,7 +191,7 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
 
 
 def _with_absolute_paths(view: ViewEntry, homes: Homes) -> ViewEntry:
-    """Return what is said of a view, with absolute paths; release 0.3 wrote them so, or as seen from its folder."""
+    """Return the record of a view with absolute paths; release 0.3 wrote them so, or as seen from its folder."""
     source = view.rpc_source
     if PurePath(view.path).is_absolute():
         return view
@@ -228,7 +228,7 @@ def _carrier(folder: Path, view: ViewEntry) -> Path | None:
 
 
 def _noise(files: RunFiles, counted: Any) -> float:
-    """Return the standard deviation [px] of a coordinate: what is left, over the observations not taken by points."""
+    """Return the standard deviation [px] of a coordinate: residuals over their degrees of freedom."""
     left = files.observations.after[counted]
     left = left[np.isfinite(left).all(axis=1)]
     free = left.size - 3 * len(np.unique(files.observations.track[counted]))

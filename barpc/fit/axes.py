@@ -1,4 +1,4 @@
-"""Whether a model's longitude, latitude and altitude are what it takes them for: its lines of sight tell.
+"""Test of a model's longitude, latitude and altitude axes by its lines of sight.
 
 A mirrored image tells nothing: detectors are numbered to the left of the flight or to the right. But the lines of sight
 of a row of an optical image meet where the camera stood, or those of a column, and a radar's row lies in a plane, that
@@ -28,7 +28,7 @@ _LINE_POSITIONS, _POINT_POSITIONS = np.linspace(0.1, 0.9, 5), np.linspace(0.02, 
 
 
 def wrong_axes(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> str:
-    """Return what is wrong with the ground of a model over an image of `size` and altitudes [m], in words; or empty.
+    """Return the fault in the ground axes of a model over an image of `size` and altitudes [m], in words; or empty.
 
     Exchanged longitude and latitude, or altitudes that grow downwards; of models with a noise of some 1e-3 px, of
     places where both orders are about the same (lon = lat = 0) and lines of sight of neither kind nothing is said.
@@ -59,7 +59,7 @@ def wrong_axes_of_grid(ground: Array, image: Array) -> str:
 
 
 def _geometry_fault(ground: Array) -> str:
-    """Return what is wrong with ground points (2, lines, points, 2, 3) of rows and of columns, at two altitudes."""
+    """Return the fault of ground points (2, lines, points, 2, 3) of rows and of columns, at two altitudes."""
     point, plane, _ = _sights(ground)
     for what, other in _interpretations(ground):
         at, within, near = _sights(other)
@@ -69,7 +69,7 @@ def _geometry_fault(ground: Array) -> str:
 
 
 def _interpretations(ground: Array) -> Iterator[tuple[str, Array]]:
-    """Yield what could be meant, in words and as ground points, the lower altitude first."""
+    """Yield alternative axes, in words and as ground points, the lower altitude first."""
     yield "with the altitude's sign changed", ground[..., ::-1, :] * [1.0, 1.0, -1.0]
     if np.nanmax(np.abs(ground[..., 0]), initial=0.0) < 90.0:
         yield "with longitude and latitude exchanged", ground[..., [1, 0, 2]]

@@ -1,4 +1,4 @@
-"""What an RPC is worth over a whole image, and why it misses a camera: poles, round trips, what its errors go by.
+"""Certificate of an RPC over a whole image: its errors, poles and round trips, and the cause of its misfit.
 
 `RpcFit` is a fit with its certificate, and says in words what is wrong with it.
 
@@ -36,7 +36,7 @@ _CAUSE_WORDS = {
 
 @dataclass(frozen=True)
 class Reason:
-    """What most of an RPC's errors depend on: row, column, altitude, a place.
+    """The main dependence of an RPC's errors: row, column, altitude, a region.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ class RpcFit:
         return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
 
     def as_written(self, rpc: RPC) -> RpcFit:
-        """Return the fit of the RPC as read back from its file: what differs over its box is added to the errors."""
+        """Return the fit of the RPC read back from its file: differences over its box are added to the errors."""
         lost = self.rpc.off(rpc)
         return replace(
             self,
@@ -231,7 +231,7 @@ class RpcFit:
 
 
 def reason(rpc: RPC, sample: Sample) -> Reason | None:
-    """Return what most of an RPC's errors at the points of a sample depend on; None where they are not finite."""
+    """Return the main dependence of an RPC's errors at the points of a sample; None where they are not finite."""
     ground, points = sample.ground[: sample.count], sample.points[: sample.count]
     error = rpc.project(ground) - points[:, :2]
     if not (np.isfinite(error).all() and error.any()):
@@ -266,7 +266,7 @@ def _tangent(rpc: RPC, ground: Array, axis: int) -> Array:
 
 
 def _along(left: Array, bases: list[Array], place: Array) -> float:
-    """Return the share of errors (N, 2) that is a function of `place` (N,)."""
+    """Return the share of errors (N, 2) explained by a function of `place` (N,)."""
     order, rest = np.argsort(place, kind="stable"), 0.0
     for error, basis in zip(left[order].T, bases, strict=True):
         change, turn = np.diff(error), np.diff(basis[order], axis=0)

@@ -51,14 +51,14 @@ def _net() -> Array:
 
 @cache
 def _cubic_nodes() -> tuple[Array, Array]:
-    """Return the places (64, 3) in the cube, and what takes values there to the coefficients of a cubic (20, 64)."""
+    """Return nodes (64, 3) in the cube, and the matrix (20, 64) from values there to coefficients of a cubic."""
     places = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 4)] * 3), axis=-1).reshape(-1, 3)
     return places, np.asarray(np.linalg.pinv(monomials(places.T).T))
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Part of the normalised ground: a skew box, without what lies outside the hull of the points in it."""
+    """A part of the normalised ground: a skew box, cut to the hull of its points."""
 
     offset: Array  # (3,) of the centre
     axes: Array  # (3, 3) half axes, margin included, one a row
@@ -66,7 +66,7 @@ class Region:
 
     @classmethod
     def box(cls, box: Array) -> Region:
-        """Return a region that is a box (3, 2) in normalised coordinates."""
+        """Return the region of a box (3, 2) in normalised coordinates."""
         return cls(box.mean(axis=1), np.diag(0.5 * (box[:, 1] - box[:, 0])), np.ones(2 * (len(_axis()),), dtype=bool))
 
     @classmethod
@@ -112,11 +112,11 @@ class Region:
         return float(self.bernstein(cubic).min())
 
     def above(self, cubic: Array) -> bool:
-        """Return whether a denominator (20,) is above `MIN_DENOMINATOR_RATIO` of what it is at the centre."""
+        """Return whether a denominator (20,) is above `MIN_DENOMINATOR_RATIO` of its value at the centre."""
         return self.least(cubic) > MIN_DENOMINATOR_RATIO * float(self.there[0] @ cubic)
 
     def smallest(self, cubics: Array) -> float:
-        """Return a lower bound of cubics (k, 20) over what they are at the centre; NaN where one is 0 there."""
+        """Return a lower bound of cubics (k, 20) relative to their values at the centre; NaN where one is 0 there."""
         with np.errstate(all="ignore"):
             return float(min(self.least(cubic / (self.there[0] @ cubic)) for cubic in cubics))
 
@@ -134,7 +134,7 @@ def _touched_nodes(reach: Array, half: Array) -> BoolArray:
 
 
 def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:
-    """Return a lower bound of the denominators over a box (3,), (3,) and a margin, over what they are at its centre."""
+    """Return a lower bound of the denominators over a box (3,), (3,) and a margin, relative to its centre."""
     box = np.sort(rpc.normalize(np.stack([low, high])), axis=1)
     around = (TRUSTED_REACH - 1.0) * 0.5 * (box[:, 1] - box[:, 0])
     return Region.box(box + around[:, None] * np.array([-1.0, 1.0])).smallest(rpc.coeffs[1::2])

@@ -100,7 +100,7 @@ def fit_rpc(
 
 
 def fit_only(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], method: str) -> RPC:
-    """Return the RPC of a sensor model by one method, without a certificate: whoever calls measures what it misses."""
+    """Return the RPC of a sensor model by one method, without a certificate: the caller measures its misfit."""
     options, alt_range = FitOptions(), widened(alt_range)
     return solve(
         *_points_for_method(model, size, alt_range, options, method), options, method, vendor=underlying_rpc(model)
@@ -213,7 +213,7 @@ def _limited_to_altitudes(rpc: RPC, alt: Array) -> RPC:
 
 
 def _height_unknown(ground: Array, image: Array, rmse: float) -> float:
-    """Return what 100 m of altitude do to a projection [px], as far as points met to `rmse` [px] leave it open.
+    """Return the uncertainty [px] of the shift by 100 m of altitude, from points with residuals `rmse` [px].
 
     The slope of col or row by altitude is known by the altitudes that longitude and latitude do not tell (of a surface
     its relief, less a cubic). Of none of these all is open: 100 m are as much aside under 45 degrees.
@@ -238,7 +238,7 @@ def _looked_at(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Arra
 
 
 def underlying_rpc(model: object) -> RPC | None:
-    """Return the RPC that a model is built on: itself, or what its corrections stand in front of."""
+    """Return the RPC under a model: the model itself, or the one inside its corrections."""
     return inner if isinstance(inner := innermost(model), RPC) else None
 
 

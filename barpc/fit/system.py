@@ -123,7 +123,7 @@ def _take_in(triangle: Array, rows: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class FitProblem:
-    """Points, and the offsets and scales of the RPC that is to be fitted to them."""
+    """Points, and the offsets and scales of the RPC to be fitted to them."""
 
     ground: Array  # (N, 3) lon, lat [deg], alt [m]
     image: Array  # (N, 2) [px]

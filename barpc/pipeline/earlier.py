@@ -67,7 +67,7 @@ class Known:
 
 @dataclass(frozen=True, eq=False)
 class Earlier:
-    """A finished run: its folder, its images and what it knows of their cameras, in one order."""
+    """A finished run: its folder, its images and the prior of their cameras, in one order."""
 
     folder: Path
     images: tuple[Known, ...]
@@ -128,7 +128,7 @@ class Earlier:
         return sorted(found)
 
     def refuse_changed(self, run: Run, inputs: Mapping[str, Input]) -> None:
-        """Raise InputError where an image of the run, or the file with its camera, is not what the run was made of."""
+        """Raise InputError where an image of the run, or the file with its camera, was changed since."""
         for view, source in zip(run.views, run.sources, strict=True):
             image = self.images[self.number[view.name]] if view.name in self.number else None
             if image is not None and _sha(inputs, view.path) != image.sha256:
@@ -273,8 +273,10 @@ def chosen_pairs(views: Sequence[View], is_old: Sequence[bool], tie: TieOptions)
 
 
 def of_new(tracks: Tracks, is_old: BoolArray) -> Tracks:
-    """Return the tracks that a new view observes, with all their observations: what the old block knows of those that
-    old views share is taken off it (`barpc.ba.solving.problem.Problem.counted_once`).
+    """Return the tracks of new views with all their observations.
+
+    The information of old views on these tracks is removed from the prior
+    (`barpc.ba.solving.problem.Problem.counted_once`).
     """
     new = ~is_old[tracks.view]
     return tracks.select((np.bincount(tracks.point, new, minlength=tracks.num_points) > 0)[tracks.point])
@@ -314,7 +316,7 @@ def _row(image: Known, folder: Path) -> dict[str, Any]:
 
 
 def added(run: Run, earlier: Earlier, grown: BlockPrior, floor: float) -> Added:
-    """Return what a run did to the block that it added images to: how far its images should move [px]."""
+    """Return the effect of a run on the block with its added images: the changes of the block's cameras [px]."""
     moved = earlier.moved(grown)
     ranked = [(earlier.images[i].name, float(moved[i])) for i in np.argsort(-moved, kind="stable")]
     beyond = tuple(one for one in ranked if one[1] > floor)

@@ -291,7 +291,7 @@ class _PendingTask(Future[Any]):
 
 @dataclass(frozen=True)
 class Spilled:
-    """Arguments of a task whose large arrays are stored in files: what `to_arrays` made of them, by name."""
+    """Arguments of a task with large arrays stored in files: the arrays of `to_arrays`, by name."""
 
     small: Arrays
     large: Mapping[str, str]

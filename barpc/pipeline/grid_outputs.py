@@ -165,7 +165,7 @@ def make_grids(view: View, rpc: RPC, model: SensorModel, files: GridFiles, room:
 
 
 def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss]:
-    """Return an RPC and what it lacks, and how far both together are off the camera of a sample.
+    """Return an RPC and its correction grid, and the errors of both together against the camera of a sample.
 
     What `rpc` lacks may depend on the altitude: the best RPC of all trades denominators, which see altitudes, for what
     changes with the rows. Then another one serves better here, though it misses by more.

@@ -1,4 +1,4 @@
-"""What a run is given besides images: control, terrain, matches, an earlier block; all of it hashed once."""
+"""Inputs of a run besides images: control, terrain, matches, an earlier block; all of it hashed once."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def read_pairs(path: str | Path, views: Sequence[View], left_out: Sequence[str |
 
 
 def _finder(folder: Path, views: Sequence[View], left_out: Sequence[str | Path]) -> Callable[[str], int | None]:
-    """Return what finds a view by path or name: its index, None if it was left out, InputError if unknown."""
+    """Return a function from a path or name to the index of a view; None if left out, InputError if unknown."""
     names = ViewNames([view.name for view in views], "the list of pairs")
     without = ViewNames([Path(path).name for path in left_out], "")
     places: dict[object, int | None] = {_resolved(path): None for path in left_out}
@@ -347,7 +347,7 @@ def _with_altitudes(
 
 
 def _with_height_above_dem(dem: Dem | None, points: GroundPoints, options: RunOptions) -> GroundPoints:
-    """Return the points with how far they lie above a DEM, where it is known what its heights count from."""
+    """Return the points with their median height above a DEM of known vertical datum."""
     ground = points.lonlatalt[points.lonlatalt[:, 2] != 0.0]
     if dem is None or not dem.known or not points.datums:
         return points

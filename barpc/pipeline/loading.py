@@ -1,4 +1,4 @@
-"""Image files to views: what each file must have before any work starts, and each image once.
+"""Image files to views: the requirements on each file before any work starts, and each image once.
 
 The same image twice ties itself to itself, perfectly and uselessly.
 """
@@ -119,7 +119,7 @@ def _read_all(
     executor: Executor | None,
     progress: Progress | None,
 ) -> tuple[list[_OpenedImage | BarpcError], float]:
-    """Return every image as it was read, and CPU seconds of other processes."""
+    """Return every image read, and the CPU seconds of worker processes."""
     groups = by_groups(executor, read_group, given, how, "cameras", progress)
     spent = 0.0 if executor is None else sum(seconds for _, seconds in groups)
     return [read for group, _ in groups for read in group], spent

@@ -87,7 +87,7 @@ def make_files(view: View, rpc: RPC, images: str, formats: Sequence[str], folder
 
 
 def verify_group(group: Sequence[tuple[Sequence[str], View, RpcFit, SensorModel]]) -> list[Written]:
-    """Return what `verify_files` says of some views, whose cameras are asked at once where they see the ground."""
+    """Return the results of `verify_files` for some views, whose cameras are evaluated together."""
     grids = ground_grids([(model, view.size, view.alt_range) for _, view, _, model in group])
     return [verify_files(*one, grid) for one, grid in zip(group, grids, strict=True)]
 
@@ -139,7 +139,7 @@ def _is_pair(stem: str, names: Set[str]) -> bool:
 
 
 def refuse_shadows(folder: Path, names: Sequence[str]) -> None:
-    """Raise if a file in the folder, not of barpc, would be read in place of an RPC that is to be written."""
+    """Raise if a file in the folder, not of barpc, would take precedence over an RPC to be written."""
     own = (own_files(folder) if folder.is_dir() else set()).union(names)
     for name in names if folder.is_dir() else ():
         for sidecar in sidecars(folder / name) if name.endswith((".vrt", ".tif")) else ():
@@ -187,7 +187,7 @@ CHANGED, MISSING, ADDED = "changed", "missing", "added"
 
 @dataclass(frozen=True)
 class Proved:
-    """What became of a file: its `kind` (root, input, output or camera), a word for its state, and details."""
+    """The state of a verified file: its `kind` (root, input, output or camera), a word for the state, and details."""
 
     kind: str
     file: str
@@ -225,7 +225,7 @@ def prove(folder: Path, places: Sequence[Path] = (), expected: str | None = None
 
 
 def _roots(root: str, noted: str, layers: Sequence[Layer], expected: str | None) -> Iterator[Proved]:
-    """Say whether SHA256SUMS has the expected root, now or before a later layer, and what came after."""
+    """Yield the state of SHA256SUMS against the expected root, now or before a later layer, and later files."""
     if noted != root != expected:
         yield Proved("root", SUMS, CHANGED, f"its root is {root}, and {noted} was noted")
     elif expected in (None, root):
@@ -243,7 +243,7 @@ def _roots(root: str, noted: str, layers: Sequence[Layer], expected: str | None)
 
 
 def _outputs(folder: Path, listed: Mapping[str, str], noted: Mapping[str, str], roots: Set[str]) -> Iterator[Proved]:
-    """Compare every file with what is `listed`; one that is `noted` otherwise is of a command that was ended.
+    """Compare every file with its `listed` hash; one that is `noted` otherwise is of a command that was ended.
 
     Of folders below with a SHA256SUMS, exports of a run with one of the `roots` are compared, too.
     """

@@ -187,7 +187,7 @@ def adjust(
 def _summed_up(
     run: Run, images: Sequence[Image], inputs: Mapping[str, Input], workspace: Workspace, work: Work
 ) -> Summary:
-    """Write what a later run starts from, summary, tables and report: the same in any folder, at any time."""
+    """Write the block for later runs, summary, tables and report: the same bytes in any folder, at any time."""
     progress = work.progress
     if run.adjustment is not None:
         run = _with_block(run, images, inputs, workspace, work)
@@ -235,7 +235,7 @@ def _entries(inputs: Iterable[Input], folder: Path) -> tuple[InputEntry, ...]:
 
 
 def _portable_run(run: Run, folder: Path) -> Run:
-    """Return the run with every path relative to its folder, and without what was only said to this command."""
+    """Return the run with every path relative to its folder, and without `overwrite`."""
 
     def at(path: Any) -> Any:
         return tuple(map(at, path)) if isinstance(path, tuple) else portable(os.fspath(path), folder)
@@ -259,7 +259,7 @@ def _report_progress(progress: Progress | None, stage: str, done: int) -> None:
 
 @contextmanager
 def _stage_progress(workspace: Workspace, stage: str, progress: Progress | None) -> Iterator[None]:
-    """Report the progress of a stage that is one task."""
+    """Report the progress of a stage of one task."""
     _report_progress(progress, stage, 0)
     with workspace.stage(stage):
         yield
@@ -387,7 +387,7 @@ def _register_to_reference(run: Run, options: RunOptions, dem: Dem, work: Work) 
 
 
 def _with_adjustment(run: Run, options: RunOptions, dem: Dem | None) -> Run:
-    """Return the run with an adjustment and what went into it."""
+    """Return the run with an adjustment and its inputs."""
     gcps, checks = (load_gcps(paths, run.views, options, dem) for paths in (options.gcp, options.check_points))
     centers = _centers(run.views, options.adjust.center)
     if run.reference is not None and run.reference.control is None and not len(run.tracks) and gcps is None:
@@ -463,7 +463,7 @@ def _write_asp_matches(run: Run, workspace: Workspace) -> None:
 
 
 def _only(run: Run, names: frozenset[str], said: Mapping[str, str]) -> Run:
-    """Return the run as it was loaded, without the views that the others are not tied to."""
+    """Return the loaded run without the views not tied to the main group."""
     why = "it shares no tie points with the largest group of images"
     dropped = tuple((view.path, said.get(view.name, why)) for view in run.views if view.name not in names)
     kept = [i for i, view in enumerate(run.views) if view.name in names]

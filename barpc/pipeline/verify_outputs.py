@@ -94,7 +94,7 @@ def verify(
     alt_range: tuple[float, float],
     grid: Array | None = None,
 ) -> list[Reading]:
-    """Open files written for one image as their consumers do and compare what they project with the model.
+    """Open the files of one image as their consumers do, and compare their projections with the model.
 
     `model` is the camera that they should hold, over an image of `size` (width, height) [px] and `alt_range` [m above
     the ellipsoid], `grid` its `ground_grids` where that is known. Returns a reading for each file and each consumer
@@ -259,7 +259,7 @@ def _gdal_raster(path: Path | str) -> Projection:
 
 
 def _gdal_text(path: Path) -> Projection:
-    """Return what GDAL reads of a text, which it does only beside an image: one of a single pixel, both in memory."""
+    """Return GDAL's reading of a text, beside an image of a single pixel as GDAL requires, both in memory."""
     stem = path.name[: -len("_rpc.txt")] if path.name.lower().endswith("_rpc.txt") else path.stem
     lend = partial(rasterio.MemoryFile, dirname=uuid.uuid4().hex)
     with lend(path.read_bytes(), filename=path.name), lend(_pixel_raster(), filename=f"{stem}.tif") as image:
@@ -312,7 +312,7 @@ def _alone() -> Iterator[None]:
 
 
 def _within_shareloc_range(found: Array, lon: Array) -> Array:
-    """Return what shareloc found (N, ...); OutputError where it fails beyond 180 degrees of longitude alone."""
+    """Return the results (N, ...) of shareloc; OutputError where it fails beyond 180 degrees of longitude alone."""
     lost, beyond = ~np.isfinite(found).all(axis=1), np.abs(lon) > 180.0
     if lost.any() and not (lost & ~beyond).any():
         raise OutputError(

@@ -1,4 +1,4 @@
-"""What columns of points are called, and what a name and a cell say: quantity, unit, degrees."""
+"""Column names of point tables, and the parsing of names and cells: quantity, unit, degrees."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def guessed(words: Sequence[str], known: Names) -> tuple[dict[str, int], list[st
 
 
 def vertical_of_column(word: str) -> Vertical:
-    """Return what altitudes count from, and their unit, as the name of their column says it."""
+    """Return the vertical datum and unit of altitudes from the name of their column."""
     _, unit, metres = _unit_of(word)
     none = (UNKNOWN, None, DEFAULT)
     name, geoid, known = next((of for sign, of in _LEVELS.items() if re.search(sign, word, re.IGNORECASE)), none)
@@ -182,7 +182,7 @@ def number_of(text: str) -> float:
 
 
 def first_words(head: bytes) -> list[str]:
-    """Return the words of the first line of a text that is no comment, as it begins."""
+    """Return the words of the first line of a text other than comments."""
     lines = head.decode("utf-8-sig", errors="replace").splitlines()
     first = next((line for line in lines if line.strip() and not line.lstrip().startswith("#")), "")
     return [word.strip().strip('"') for word in re.split(r"[,;\t]|\s+", first.strip()) if word.strip()]

@@ -28,7 +28,7 @@ from barpc.rasters.vertical import ELLIPSOID, Vertical
 
 
 class GcpFormat(NamedTuple):
-    """One syntax: how its files begin, its reader, and what its image points have more than barpc's [px]."""
+    """One syntax: the beginning of its files, its reader, and the offset of its image points from barpc's [px]."""
 
     sniff: Callable[[str, bytes], bool]  # of a file's beginning, as a text and as bytes
     read: Callable[[Path], GcpTable]
@@ -36,7 +36,7 @@ class GcpFormat(NamedTuple):
 
 
 def open_gcps(path: Path) -> tuple[str, GcpTable]:
-    """Return the name of a file's format and what it holds; InputError where it does not parse."""
+    """Return the name of a file's format and its content; InputError where it does not parse."""
     text, head = _decoded_head(path)
     name = next(name for name, form in GCP_FORMATS.items() if form.sniff(text.lstrip("\ufeff \t\r\n"), head))
     table = GCP_FORMATS[name].read(path)
@@ -75,7 +75,7 @@ _LINES = re.compile(r"\r\n|\r|\n")
 
 
 def _header(text: str) -> tuple[int, str, list[str]]:
-    """Return which line names columns, what stands between its cells, and these.
+    """Return the number of the line with column names, its delimiter, and the names.
 
     It is counted from 0: the first that is no comment, or a comment before it of as many cells; -1: none.
     """
@@ -311,7 +311,7 @@ _CENTRE_TOLERANCE = 1e-3  # px: GCPs that end so near to a pixel's centre or edg
 
 
 def _first_pixel(at: Array, size: Array) -> float | None:
-    """Return what image points (K, 2) call the first pixel's centre, by what they cover; None where that does not tell.
+    """Return the coordinate of the first pixel's centre in image points (K, 2), by their range; None where unclear.
 
     Those that span a pixel less than the image, as Sentinel-1's, go from centre to centre, those that span all of it
     from edge to edge: they may begin at 0, at 0.5 or, of rasters of points that GDAL wrote and read, at 1.

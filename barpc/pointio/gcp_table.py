@@ -67,7 +67,7 @@ class GcpTable(NamedTuple):
 
 
 def named(path: Path, words: Sequence[str], lax: bool = False) -> tuple[dict[str, int], GcpTable]:
-    """Return the columns of a table by their names, and an empty table that says what these say.
+    """Return the columns of a table by their names, and an empty table with their datum and units.
 
     In a `lax` table columns of errors may stand that are no accuracies. InputError where the names do not tell.
     """

@@ -27,7 +27,7 @@ from barpc.scene import GroundPoints, IntArray
 
 @dataclass(frozen=True)
 class ControlReference:
-    """What is known beside a file of control points."""
+    """Settings and files beside a file of control points."""
 
     crs: str | None = None  # the reference system of its places, whatever the file says
     geoid: str | None = None  # of altitudes that the file says count from one (see `Dem.open`)

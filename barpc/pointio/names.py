@@ -1,4 +1,4 @@
-"""What an image may be called, and which view a file means by a name.
+"""Names of images, and the view meant by a name in a file.
 
 Views get their names before any work, so that every file of a run carries them and reads back to the same image.
 """
@@ -25,7 +25,7 @@ _FORMULA = frozenset("=+-@＝＋－＠\t\r")
 
 
 def unique_names(files: Sequence[PathOrUrl]) -> list[str]:
-    """Return a name for each file: its stem, with as many folders before it as it takes to tell them apart.
+    """Return a unique name for each file: its stem, with as many folders before it as necessary.
 
     Names that differ in case or composition only are taken for one, as file systems and GDAL do; two files of one
     folder that differ in their ending alone keep it. InputError for a name longer than `MAX_NAME`, or files that

@@ -114,7 +114,7 @@ class HeightGrid:
         return _snapped(d * x + e * y + f - 0.5), _snapped(a * x + b * y + c - 0.5)
 
     def place(self, row: Array, col: Array) -> tuple[Array, Array]:
-        """Return the lon, lat (N,) [deg] of fractional row, col (N,): what `locate` takes."""
+        """Return the lon, lat (N,) [deg] of fractional row, col (N,), the inverse of `locate`."""
         a, b, c, d, e, f = (~self.to_pixel)[:6]
         x, y = a * (col + 0.5) + b * (row + 0.5) + c, d * (col + 0.5) + e * (row + 0.5) + f
         return (x, y) if self.crs.is_geographic else self._warped(self.crs, CRS.from_epsg(4326), x, y)
@@ -224,9 +224,10 @@ class Dem:
     def open(
         cls, path: Path | str | Sequence[Path | str], geoid: Path | str | None = None, heights: str | None = None
     ) -> Dem:
-        """Open one DEM or several (``.hgt``, or any raster with a CRS), each with the geoid that it names or that is
-        given: a ``.gtx`` or raster, a name of `GEOIDS`, or "none" for ellipsoidal heights. `heights` is the same of
-        files that say nothing.
+        """Open one DEM or several (``.hgt``, or any raster with a CRS), each with its own geoid or the one given.
+
+        A geoid is a ``.gtx`` or raster, a name of `GEOIDS`, or "none" for ellipsoidal heights; `heights` the same for
+        files that state none.
 
         What is given goes before what one DEM says of itself. Of several each is as it says; what is given holds for
         those that say nothing, and a grid also for those whose own geoid is not at hand.
@@ -307,7 +308,7 @@ class Dem:
         return found
 
     def datums(self, ground: Array) -> tuple[HeightDatum, ...]:
-        """Return what its heights were taken to count from at ground points (n, 3), where no person said it."""
+        """Return the vertical datums assumed for its heights at ground points (n, 3), without one from the user."""
         ground = ground[np.isfinite(ground).all(axis=1)]
         which = self._counted(*ground[:, :2].T)[1]
         return tuple(
@@ -354,7 +355,7 @@ class Dem:
 
 
 def _needs_geoid(own: Vertical, said: str) -> bool:
-    """Return whether a DEM needs what is said of its geoid: it states none, or one of which no grid is at hand."""
+    """Return whether a DEM needs a geoid from the user: it states none, or one without a grid at hand."""
     return not own.stated or (said.lower() != NO_GEOID and geoid_of(own, own, False)[2])
 
 
@@ -430,7 +431,7 @@ def _terrain_intersection(
 
 
 def geoid_of(own: Vertical, said: Vertical, by_person: bool) -> tuple[str | None, str, bool]:
-    """Return the geoid's file for heights as `said` of them, in words what is done, and whether it is said loudly."""
+    """Return the geoid file for heights with a datum as `said`, a remark on it, and whether the remark is a warning."""
     if said.geoid is None:
         if said.provenance != DEFAULT:
             return None, "ellipsoidal" if own.reference == ELLIPSOID else "taken as ellipsoidal, as is said", False
@@ -451,8 +452,9 @@ def geoid_of(own: Vertical, said: Vertical, by_person: bool) -> tuple[str | None
 
 
 def datum_of(vertical: Vertical | None, ground: Array, source: str, name: str) -> tuple[HeightDatum, ...]:
-    """Return what may be otherwise with heights at places (n, 2 or more), taken as `vertical` says; nothing where a
-    person said it (None).
+    """Return the alternative datum of heights at positions (n, 2 or more), taken as `vertical`.
+
+    None of them where the user stated it (`vertical` None).
     """
     if vertical is None or not len(ground):
         return ()

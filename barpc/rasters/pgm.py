@@ -27,7 +27,7 @@ _PGM_HEADER = re.compile(rb"P5\s++((?:#[^\n]*+\n\s*+)*+)(\d{1,6})\s++(\d{1,6})\s
 
 @dataclass(frozen=True)
 class Pgm:
-    """An open grid: what `barpc.rasters.dem` asks of a dataset, under rasterio's names."""
+    """An open grid with the methods of a dataset for `barpc.rasters.dem`, under rasterio's names."""
 
     file: BinaryIO
     start: int  # of the numbers [bytes]

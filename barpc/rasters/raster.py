@@ -198,7 +198,7 @@ _WIDE = ("int32", "uint32", "int64", "uint64", "float64")  # GDAL scales them as
 
 
 class Mosaic:
-    """A VRT, called `name`, opened for reading: what is asked of a dataset in this package, under rasterio's names."""
+    """A VRT, called `name`, opened for reading, with the methods of a dataset in use here, under rasterio's names."""
 
     def __init__(self, name: str, vrt: Vrt, opener: Callable[[Path], Any]) -> None:
         self.name, self._vrt, self._opener = name, vrt, opener
@@ -330,7 +330,7 @@ class Mosaic:
 
 
 def _handed_on(values: PixelArray, source: Source, dtype: str) -> tuple[Any, PixelArray]:
-    """Return the mask of values that a source passes on, and what they become."""
+    """Return the mask of valid values of a source, and their converted values."""
     keep: Any = ...
     if source.plain:
         return keep, values

@@ -1,4 +1,4 @@
-"""What heights count from, and in which unit: one place decides it, by what a file or a person says.
+"""Vertical datum and unit of heights: one place determines them from the file and the user's options.
 
 Readers report a CRS, the unit of a band and a person's word; what follows is a `Vertical`: metres a unit, the reference
 surface, the geoid that leads from it to the ellipsoid, and whether that was stated or is nobody's but the default.
@@ -34,7 +34,7 @@ _VERTICAL = re.compile(r"\b(?:VERTCRS|VERT_CS|VERTICALCRS)\s*\[|CS\[ellipsoidal,
 
 @dataclass(frozen=True)
 class Vertical:
-    """What heights count from."""
+    """Vertical datum of heights."""
 
     reference: str = UNKNOWN  # `ELLIPSOID`, the name of a geoid or datum, or `UNKNOWN`
     metres: float = 1.0  # of a unit, upwards
@@ -44,11 +44,11 @@ class Vertical:
 
     @property
     def stated(self) -> bool:
-        """Whether the file or a person says what heights count from."""
+        """Whether the file or the user states the datum."""
         return self.provenance == STATED
 
     def by(self, geoid: str | None) -> Vertical:
-        """Return the same with what a person says of its geoid: a name or a file, `NO_GEOID`, or nothing (None)."""
+        """Return the same with the user's geoid: a name or a file, `NO_GEOID`, or nothing (None)."""
         if geoid is None:
             return self
         return replace(self, geoid=None if geoid.lower() in (NO_GEOID, ELLIPSOIDAL) else geoid, provenance=STATED)
@@ -60,7 +60,7 @@ def metres_of(unit: str) -> float | None:
 
 
 def vertical_of(wkt: str, unit: str = "", of: str = "heights") -> Vertical:
-    """Return what heights with a CRS (WKT) and the unit of their band, where that is said, count from.
+    """Return the vertical datum of heights with a CRS (WKT) and the unit of their band, if stated.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a run leaves for people and programs: summary.json, tables, the report."""
+"""Results of a run for people and programs: summary.json, tables, the report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two runs side by side: what changed in their errors, their cameras and their options."""
+"""Comparison of two runs: their errors, cameras and options."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _absolute_options(options: Mapping[str, Any], folder: Path) -> dict[str, Any
 
 
 def _other_file(path_a: str, path_b: str, runs: tuple[Summary, Summary]) -> bool:
-    """Whether images of one name are known to be other files, by what was read of them."""
+    """Whether images of one name are different files, by their hashes."""
     content = [
         {one.path: one.sha256 for one in run.inputs or ()}.get(path)
         for path, run in zip((path_a, path_b), runs, strict=True)

@@ -39,7 +39,7 @@ _ARROW_LENGTH = 12.0  # units of a long residual
 
 @cache
 def template(name: str) -> Any:
-    """Return a template of the page: what is put into it is escaped, and a name that it does not know is an error."""
+    """Return a template of the page; values are escaped, and an unknown name is an error."""
     import jinja2
 
     loader, undefined = jinja2.PackageLoader("barpc.report", ""), jinja2.StrictUndefined
@@ -166,7 +166,7 @@ OccupiedAreas = list[tuple[float, float, float]]  # places that words have on th
 def _map_labels(
     places: Sequence[tuple[ViewEntry, Array]], taken: OccupiedAreas
 ) -> list[tuple[ViewEntry, str, float, float]]:
-    """Return names of images at places (2,), but those that would stand on others or on what is taken.
+    """Return labels of images at positions (2,), without those that would cover others or occupied areas.
 
     A name tells how many images have their middle in the same place.
     """
@@ -194,7 +194,7 @@ def _pair_lines(middles: Mapping[str, Array], files: RunFiles) -> list[tuple[Pai
 
 
 def _graticule(plane: Plane) -> tuple[list[Any], list[Any], tuple[float, float, float, str], OccupiedAreas]:
-    """Return lines of longitude and latitude, their degrees (x, y, words, anchor), the scale bar, and what is taken."""
+    """Return lines of longitude and latitude, their labels (x, y, text, anchor), the scale bar, and occupied areas."""
     right, bottom = WIDTH - 4, plane.height - 24
     reach = np.array([WIDTH / 2, plane.height / 2]) / plane.unit
     lines: list[Any] = []

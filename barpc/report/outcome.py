@@ -1,4 +1,4 @@
-"""What a run knows at its end, and what its tie points say of the cameras."""
+"""Results of a run, and the derived figures of its tie points."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class ControlResidual:
 
 @dataclass(frozen=True)
 class Added:
-    """What adding images does to those of a finished run."""
+    """Effect of added images on those of a finished run."""
 
     run: str  # name of its folder
     images: int  # that it has
@@ -117,7 +117,7 @@ class Run:
         return None if self.adjustment is None else self.adjustment.sensors
 
     def _rows(self, name: str, none: bool = False) -> BoolArray:
-        """Observations (K,) by what an adjustment says of them; without one all of them alike."""
+        """Return a mask of the observations (K,) from the adjustment; without one all of them alike."""
         return np.full(len(self.tracks), none) if self.adjustment is None else getattr(self.adjustment, name)
 
     @cached_property

@@ -188,7 +188,7 @@ def _most_in(view: ViewEntry, adjustment: Adjustment) -> str:
 
 
 def _beyond_one_rpc(view: ViewEntry, run: Run) -> Causes:
-    """Yield the misfit of one RPC to a camera that is corrected for jitter or detector steps."""
+    """Yield the misfit of one RPC to a camera with corrections for jitter or detector steps."""
     told = any(getattr(run.options, name, None) for name in ("grids", "tiles", "resample"))
     if view.fit is None or view.correction is None or told or not _follows_more(view, run):
         return

@@ -1,4 +1,4 @@
-"""Typed records: what is declared beside a field is its JSON schema, its column in tables and its line in the docs.
+"""Typed records: the declaration of a field gives its JSON schema, its column in tables and its line in the docs.
 
 A field with a default is optional: it is left out of the file while it is None, and older files need not have it.
 """
@@ -29,7 +29,7 @@ def column(
     default: Any = MISSING,
     **schema: Any,
 ) -> Any:
-    """Return a field of a record, with all that is said of it.
+    """Return a field of a record with its declaration.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class Record:
 
     @classmethod
     def read(cls, found: Mapping[str, Any]) -> Self:
-        """Return the record of what a file holds, checked before; what it does not know is passed over."""
+        """Return the record of a file's validated content; what it does not know is passed over."""
         readers = _field_readers(cls)  # type: ignore[arg-type]  # a class can be hashed
         known = ((key, value, readers[key]) for key, value in found.items() if key in readers)
         return cls(**{key: read(item) if read and item is not None else item for key, item, read in known})
@@ -97,7 +97,7 @@ def _field_readers(record: Any) -> dict[str, Callable[[Any], Any] | None]:
 
 
 def _reader(kind: Any) -> Callable[[Any], Any] | None:
-    """Return what makes a value of a type from JSON; None where it stays as it is."""
+    """Return the function from JSON to a value of a type; None where it stays as it is."""
     if get_origin(kind) in (Union, UnionType):
         kind = next(part for part in get_args(kind) if part is not NoneType)
     if isinstance(kind, type) and issubclass(kind, Record):
@@ -109,7 +109,7 @@ def _reader(kind: Any) -> Callable[[Any], Any] | None:
 
 
 def json_form(value: Any, keep: bool = False) -> Any:
-    """Return a value as JSON holds it: arrays as lists, records as mappings, what is not finite as null.
+    """Return the JSON form of a value: arrays as lists, records as mappings, numbers that are not finite as null.
 
     With `keep` as it is read from there: records stay what they are, lists become tuples.
     """
@@ -143,7 +143,7 @@ MAX_SHOWN = 400  # Rows of a table of the page, sentences, images and ground poi
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell: its text, what it is sorted by, and its CSS class: a status, "number" or "name"."""
+    """A cell: its text, its sort key, and its CSS class: a status, "number" or "name"."""
 
     text: str
     key: float | str

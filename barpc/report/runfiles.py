@@ -279,7 +279,7 @@ def _validate() -> Callable[[Any], Any]:
 
 
 def read_tables(summary: Summary, folder: Path) -> RunFiles:
-    """Read the tables of a run folder, beside a summary that is at hand.
+    """Read the tables of a run folder for a given summary.
 
     Raises
     ------
@@ -300,7 +300,7 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
 
 
 def run_key(summary: Summary) -> str:
-    """Return what a run is known by, a hash of its results: what was made of other results is not shown beside them."""
+    """Return the key of a run, a hash of its results: products of other results are not shown beside them."""
     results = [(one.file, one.sha256) for one in summary.outputs or ()]
     return hashlib.sha256(repr(results).encode()).hexdigest()
 

@@ -123,8 +123,8 @@ def _of_cameras(found: Adjustment) -> Iterator[str]:
             f"Check tie points keep residuals of {found.in_space_rms:.3f} px with a rotation and translation an image, "
             f"of {median(found.held_out_rms):.3f} px with an affine in each image, which was selected. Possible "
             "causes: images rotated, resampled or cropped after their RPCs were made, or RPCs of other images. The "
-            f"scene's tilts have standard deviations of {tilts} (east, north), its twist and bending of {bends} (twist, east, "
-            "north)."
+            f"scene's tilts have standard deviations of {tilts} (east, north), its twist and bending of {bends} "
+            "(twist, east, north)."
         )
     if found.apart is not None and not found.apart.clear:
         error = "wrong tie points or " * found.apart.look.as_stated + "an RPC that does not match it"

@@ -37,7 +37,7 @@ SCANNED = 1 << 24
 
 @dataclass(frozen=True)
 class Entry:
-    """One entry of a TIFF directory: tag, type, count, and its value or offset as it stands in the file."""
+    """One entry of a TIFF directory: tag, type, count, and the raw bytes of its value or offset."""
 
     tag: int
     kind: int
@@ -47,7 +47,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Directory:
-    """The first directory of a TIFF file and what is needed to read its values."""
+    """The first directory of a TIFF file with its byte order and layout."""
 
     order: str  # struct's "<" or ">"
     big: bool

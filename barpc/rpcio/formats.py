@@ -149,7 +149,7 @@ def _folder_listing(folder: Path, _changed: int) -> Mapping[str, str]:
 
 
 def find_rpc(folder: Path, image: Path) -> Path:
-    """Return the file in a folder that holds an image's RPC in a format that is written (or InputError)."""
+    """Return the file in a folder with an image's RPC, in a format of `FORMATS` with a writer (or InputError)."""
     present = files_of(folder)
     ends = [suffix for row in _writable_formats() for suffix in row.suffixes]
     ends += [row.beside for row in WRITABLE.values()]

@@ -1,4 +1,4 @@
-"""Cameras that no RPC holds: small GeoTIFFs of localisation grids and of what an RPC lacks, and resampled images.
+"""Cameras beyond an RPC: small GeoTIFFs of localisation and correction grids, and resampled images.
 
 A localisation grid is laid out as CARS (shareloc) reads it: bands lon, lat of each layer, their altitudes in the tags
 ``ALTITUDE_Bn``, nodes where the geotransform puts the corners of the pixels. A correction grid holds dcol and drow;
@@ -57,7 +57,7 @@ def write_grid(grid: DirectGrid, path: Path | str, *, overwrite: bool = False) -
 
 
 def write_correction(grid: CorrectionGrid, rpc: RPC, path: Path | str, *, overwrite: bool = False) -> None:
-    """Write what is added to the image points of `rpc`; RpcError where its nodes are not evenly spaced."""
+    """Write the correction grid of the image points of `rpc`; RpcError where its nodes are not evenly spaced."""
     origin, steps = _even(grid.cols, grid.rows)
     layers = np.moveaxis(grid.shift, -1, 0).astype(np.float32)
     with replacing(path, overwrite=overwrite) as partial:

@@ -45,7 +45,7 @@ def write_rpc_vrt(
     overwrite: bool = False,
     place: Path | str | None = None,
 ) -> None:
-    """Write a VRT that carries an RPC and takes its pixels from an image that stays as it is.
+    """Write a VRT with an RPC, and with its pixels from an untouched image.
 
     A geotransform without CRS (the origin of a crop in its full image) is left out: the RPC written here is
     the image's own. One with a CRS is kept. Every number of the RPC reads back to the bit.
@@ -91,7 +91,7 @@ def write_rpc_vrt(
 
 
 def plain_source(image_path: Path | str) -> Path:
-    """Return the file that holds an image's pixels: itself, or what a VRT written here points at (or ImageError)."""
+    """Return the file with an image's pixels: itself, or the source of a VRT written here (or ImageError)."""
     source, driver = identify(image_path)
     if not isinstance(source, Path):
         raise ImageError(
@@ -142,7 +142,7 @@ def write_rpc_copy(rpc: RPC, image_path: Path | str, copy_path: Path | str, *, o
 
 
 def write_rpc_nitf(rpc: RPC, image_path: Path | str, nitf_path: Path | str, *, overwrite: bool = False) -> None:
-    """Write a NITF copy of an image with an RPC in its RPC00B extension (`nitf_record` says what it holds)."""
+    """Write a NITF copy of an image with an RPC in its RPC00B extension (content: `nitf_record`)."""
     record = nitf_record(rpc)
     with copying(image_path, nitf_path, overwrite) as (dataset, partial):
         _translate(dataset, partial, Path(nitf_path), driver="NITF", TRE=f"RPC00B={record}")
@@ -260,7 +260,7 @@ def require_pixels(partial: Path, target: Path, sums: Callable[[Window], int]) -
 
 
 def unwritten(target: Path, reason: str) -> OutputError:
-    """Return the error of a file that does not hold what was written; GDAL does not say that a disk is full."""
+    """Return the error of a file that differs from the written content; GDAL does not say that a disk is full."""
     full = shutil.disk_usage(target.parent).free < _FULL
     return OutputError(f"{target}: cannot be written ({os.strerror(errno.ENOSPC) if full else reason})")
 

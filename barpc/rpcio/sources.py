@@ -354,7 +354,7 @@ def _strip_origin(image: PathOrUrl, path: PathOrUrl) -> _RpcWindow:
 
 
 def at_tile(image: PathOrUrl, path: PathOrUrl, rpc: RPC) -> tuple[RPC, str] | None:
-    """Return the RPC of a tile, and what was done, where that of the file `path`, given for it, is its whole image's.
+    """Return the RPC of a tile and a remark on the shift, where the file `path`, given for it, has the whole image's.
 
     The whole image's file is called so, or equal to the one beside the tile. None of an image that is no tile.
     """

@@ -74,7 +74,7 @@ class Behind:
 
     @property
     def advice(self) -> str:
-        """What to do where no RPC follows the model; empty where it does not know."""
+        """Remedy where no RPC represents the model; empty where it does not know."""
         return str(getattr(self.sensor, "advice", ""))
 
 

@@ -189,7 +189,7 @@ class Corrections(Correction):
 
     @classmethod
     def of(cls, corrections: Sequence[Correction], view: IntArray) -> Corrections:
-        """Return what moves point n by the correction of camera `view[n]`; their drifts are of one degree."""
+        """Return the motion of point n by the correction of camera `view[n]`; their drifts are of one degree."""
         rows: dict[str, Any] = {
             name: np.array([getattr(one, name) for one in corrections])[view] for name in corrections[0]._given()
         }
@@ -221,7 +221,7 @@ class Corrected(Behind):
     correction: Correction  # R, T and C
 
     def project(self, ground: Array, near: Array | None = None) -> Array:
-        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px], found from what is `near`."""
+        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px], starting from `near`."""
         ecef = ecef_from_ground(ground)
         if not len(self.correction.drift):
             return self.sensor.project(ground_from_ecef(self.correction.apply(ecef)))

@@ -1,4 +1,4 @@
-"""Position and attitude over time: vectors as polynomial pieces, and what a rotation vector does to others."""
+"""Position and attitude over time: vectors as polynomial pieces, and rotations by a rotation vector."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ class XmlFields:
         return numbers
 
     def chosen(self, path: str, choices: Mapping[str, T]) -> T:
-        """Return what a field's word stands for; RpcFormatError where it is none of the `choices`."""
+        """Return the meaning of a field's word; RpcFormatError where it is none of the `choices`."""
         word = self.text(path)
         if word not in choices:
             raise RpcFormatError(f"{self.name}: {path} is {word[:20]!r}, expected {' or '.join(choices)}")

@@ -1,4 +1,4 @@
-"""What every sensor model implies: footprint, lines of sight, view angles, triangulation, camera centre."""
+"""Geometry of any sensor model: footprint, lines of sight, view angles, triangulation, camera centre."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def base_to_height(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) 
 
 
 class Several:
-    """Many cameras as one, each point with its own: row n of what is asked belongs to camera `view[n]`.
+    """Many cameras as one, each point with its own: row n of an argument belongs to camera `view[n]`.
 
     So what is asked of one camera is asked of a block with one call, not one a pair.
     """
@@ -196,7 +196,7 @@ class Several:
             self.behind = Corrected(inner, Corrections.of([one.correction for one in behind], camera))
 
     def each(self, function: Callable[[SensorModel, Array], Array], ground: Array) -> Array:
-        """Return what a function gives for ground points (N, 3), each with its own camera."""
+        """Return the values of a function at ground points (N, 3), each with its own camera."""
         out = np.empty_like(ground)
         for sensor, rows in zip(self._stack.sensors, np.split(self._order, self._bounds[1:-1]), strict=False):
             out[rows] = function(sensor, ground[rows])
@@ -382,7 +382,7 @@ def epipolar_offset(
     alt: float | npt.ArrayLike = 0.0,
     steps: int = 6,
 ) -> tuple[Array, Array]:
-    """Return the distances of matches from their epipolar lines: what no altitude explains.
+    """Return the distances of matches from their epipolar lines: the part of a mismatch that no altitude explains.
 
     The altitude that brings the ray of a nearest to the point in b is found by Gauss-Newton along the
     ray; the signed distance that is left, across the epipolar line, is the offset.

@@ -1,4 +1,4 @@
-"""What no rotation and no RPC holds: corrections in the image, behind which a model is a model again.
+"""Corrections in the image beyond rotations and RPCs; a model with such a correction is again a sensor model.
 
 An affine map, as others correct RPCs. A spline over the rows, steps, strips and swings: attitude jitter moves image
 rows against each other, a focal plane that is put together of detectors moves its columns, a jump of the attitude or of
@@ -291,7 +291,7 @@ class CorrectionGrid(Frozen):
     def between(
         cls, rpc: SensorModel, model: SensorModel, size: tuple[int, int], alt: float, tolerance: float = LINEAR
     ) -> CorrectionGrid:
-        """Return what takes image points of `rpc` to those of `model`, for ground of one altitude [m].
+        """Return the correction from image points of `rpc` to those of `model`, for ground of one altitude [m].
 
         Linear interpolation misses by no more than `tolerance` [px]. RpcError where a camera sees no ground.
         """

@@ -164,7 +164,7 @@ class Pushbroom(Pointwise):
 
     @property
     def advice(self) -> str:
-        """What to do where no RPC follows this model; empty where its motion is one polynomial."""
+        """Remedy where no RPC represents this model; empty where its motion is one polynomial."""
         sampled = (
             "the attitude may swing within the image, which no RPC follows: raise the tolerance, fit a part, or"
             " let 'barpc adjust --grids' write what the RPC leaves"

@@ -138,7 +138,7 @@ class RPC(Pointwise):
         return cls._of_attributes(rpcs, _RASTERIO)
 
     def to_rasterio(self) -> Any:
-        """Return a ``rasterio.rpc.RPC``: for ``dataset.rpcs`` of a file that is written, for warping."""
+        """Return a ``rasterio.rpc.RPC``, for ``dataset.rpcs`` of an output file or for warping."""
         named = dict(zip(_RASTERIO, self.numbers(), strict=True))
         # by name: the mathematics stands without rasterio
         return import_module("rasterio.rpc").RPC(**named, err_bias=self.err_bias, err_rand=self.err_rand)
@@ -346,7 +346,7 @@ class RpcStack:
         bounds: IntArray,
         *given: Array,
     ) -> list[Array]:
-        """Return what cameras give (..., n) for points: few of RPCs together, else by the camera's method `name`."""
+        """Return values (..., n) of cameras at points: few of RPCs together, else by the camera's method `name`."""
         out = [np.empty((*shape, len(given[0]))) for shape in shapes]
         few = self.is_rpc & (np.diff(bounds) <= _MAX_BATCHED_POINTS) & (len(self.sensors) > 1)
         for views in self.runs(bounds, few):

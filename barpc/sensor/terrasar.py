@@ -71,7 +71,7 @@ def open_terrasar(path: str | Path) -> RangeDoppler:
 
 
 def _refuse_other_geometry(root: XmlFields) -> None:
-    """InputError for what has another geometry."""
+    """Raise InputError for a product of another geometry."""
     projection = root.text("productInfo/productVariantInfo/projection")
     if projection != "SLANTRANGE":
         raise InputError(

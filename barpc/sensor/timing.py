@@ -1,4 +1,4 @@
-"""What radars share: the circle on which a pixel's points lie, the side they look to, and clocks that are off.
+"""Common geometry of radars: the range-Doppler circle of a pixel, the look side, and timing corrections.
 
 The points of one range and one Doppler lie on a circle about the line of flight. Range and azimuth time are off by an
 amount and a slope along the flight, not by an attitude.

@@ -116,8 +116,8 @@ def test_columns_that_lie_off_over_all_rows_are_no_clouds():
     columns = Interval(0, 0, 100.0, 400.0, 30.0, 0.02, 0.16, False, 0.0)
     names = tuple(found_by_judge(left=[]).names)
     for one, told in (
-        (columns, "columns 100-399, over all rows, are inconsistent with the rest of the image: their tie points share a "
-         "residual "
+        (columns, "columns 100-399, over all rows, are inconsistent with the rest of the image: their tie points share "
+         "a residual "
          "of 0.16 px: check for detectors or resampling"),
         (replace(columns, share=0.8, by_share=True, apart=2.5), "check for clouds, water, change there"),
         (replace(columns, axis=1), "check for clouds, water, change there"),

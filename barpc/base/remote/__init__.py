@@ -79,7 +79,7 @@ class Remote(str):
         return False
 
     def is_file(self) -> bool:
-        """Return True: whether there is one shows as it is read."""
+        """Return True: a missing file shows when it is read."""
         return True
 
 
@@ -93,7 +93,7 @@ def is_url(text: str | os.PathLike[str]) -> bool:
 
 
 def location(path: str | os.PathLike[str]) -> PathOrUrl:
-    """Return a file's location: a Remote as it is, any other text as a path of this machine."""
+    """Return the location of a file: a Remote unchanged, any other text as a local path."""
     return path if isinstance(path, Remote) else Path(path)
 
 

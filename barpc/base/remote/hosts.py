@@ -144,7 +144,7 @@ def _once(url: str, start: int, stop: int) -> Part | str:
 
 
 class _Wire(io.RawIOBase):
-    """What a server sends, up to so many bytes: http.client reads headers, chunks and trailers as long as there are."""
+    """The response of a server up to a number of bytes: http.client reads headers and chunks without limit."""
 
     def __init__(self, sent: BinaryIO, most: int) -> None:
         self._sent, self._left = sent, most

@@ -1,4 +1,4 @@
-"""What the geometry needs of a Sentinel-1 annotation file, and of a precise orbit file.
+"""Geometric content of a Sentinel-1 annotation file, and of a precise orbit file.
 
 Names are the annotation's own, in snake case; times are numpy datetime64[ns], which holds the microseconds
 of the files exactly.

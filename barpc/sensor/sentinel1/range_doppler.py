@@ -116,7 +116,7 @@ class RangeDoppler(Clocked):
 
     @property
     def advice(self) -> str:
-        """What to do where no RPC follows this model; empty where nothing special."""
+        """Remedy where no RPC represents this model; empty where nothing special."""
         ground_range = "the ground range of a GRD changes every second, with the terrain: take the SLC of the scene"
         return ground_range if isinstance(self.frame, GroundFrame) else ""
 
